@@ -1,8 +1,7 @@
-"""How fast is it, measured against what it must reach?
+"""Benchmarks with limits: how fast the program is, compared with what it must reach.
 
-``make bench`` runs everything here on the shipped junction and prints ratios from this one run: machines differ and are
-noisy, ratios less so. Kernels are compiled before anything is timed; repeats of what is compared are interleaved;
-medians are shown.
+``make bench`` runs all of them on the shipped junction and prints one table. Kernels are compiled before anything is
+timed; what is compared is measured in turns; medians are printed. Machines differ and are noisy, but ratios less so.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from rich.console import Console
 from rich.table import Table
 
 import egvs
-from benchmarks import casting, clouds, detection, effects, guards, judging, others, savings, stability
+from benchmarks import alternatives, casting, clouds, culling, detection, effects, file_checks, site_costs, stability
 from benchmarks.scenes import run_stage
 from egvs.artefacts.tpog import read_tpog
 from egvs.core.runtime import map_ordered
@@ -42,7 +41,7 @@ REPEATS = 7
 
 
 def seconds(work: Callable[[], Any], repeats: int = REPEATS) -> float:
-    """Median wall time of a call that was made once before."""
+    """Return the median wall time of a call, after one call that is not counted."""
     work()
     times = []
     for _ in range(repeats):
@@ -53,20 +52,20 @@ def seconds(work: Callable[[], Any], repeats: int = REPEATS) -> float:
 
 
 def once(work: Callable[[], Any]) -> float:
-    """Wall time of one call."""
+    """Return the wall time of one call."""
     start = time.perf_counter()
     work()
     return time.perf_counter() - start
 
 
 def every(work: Callable[[Site], object], sites: Iterable[Site], threads: int = 1) -> None:
-    """Do the work for every site."""
+    """Call a function for every site."""
     for _ in map_ordered(work, sites, threads):
         pass
 
 
 def run_egvs(*arguments: str) -> tuple[float, float]:
-    """Wall seconds and peak memory in MB of the command line in a process of its own."""
+    """Run the command line in another process; return wall seconds and peak memory in MB."""
     code = (
         "import resource, sys; from egvs.cli.app import main\n"
         "try: main()\n"
@@ -79,13 +78,13 @@ def run_egvs(*arguments: str) -> tuple[float, float]:
         text=True,
         check=True,
         cwd=ROOT,
-        env=os.environ | {"EGVS_STORE": ""},  # nothing is fetched that is to be measured
+        env=os.environ | {"EGVS_STORE": ""},  # nothing may come from the cache
     )
     return time.perf_counter() - start, float(done.stderr.split()[-1])
 
 
-def whole_run(folder: Path) -> tuple[list[tuple[str, str, str, bool]], float]:
-    """The main job from nothing, and the yardstick: SUMO's own seconds."""
+def time_run(folder: Path) -> tuple[list[tuple[str, str, str, bool]], float]:
+    """Time a complete run without cached results; also return SUMO's own seconds for comparison."""
     run_egvs(
         "run",
         str(SCENARIO),
@@ -99,23 +98,23 @@ def whole_run(folder: Path) -> tuple[list[tuple[str, str, str, bool]], float]:
     took, peak = run_egvs("run", str(SCENARIO), "--out", str(folder / "run"))
     record = json.loads((folder / "run" / "run.json").read_text())
     sumo = record["stages"]["traffic"]["summary"]["sumo_seconds"]
-    helped = statistics.median(run_egvs("--help")[0] for _ in range(5))
+    help_s = statistics.median(run_egvs("--help")[0] for _ in range(5))
     allowed = 2 * sumo + 3
     return [
         (
-            "egvs run nishishinjuku, everything",
+            "egvs run nishishinjuku, all stages",
             f"{took:.2f} s = {took / allowed:.2f} x (2 x SUMO + 3 s)",
             "1 x",
             took <= allowed,
         ),
         ("  SUMO alone", f"{sumo:.2f} s", "", True),
         ("  peak memory of egvs", f"{peak:.0f} MB", "1024 MB", peak < 1024),
-        ("egvs --help", f"{helped:.3f} s", "0.3 s", helped < 0.3),
+        ("egvs --help", f"{help_s:.3f} s", "0.3 s", help_s < 0.3),
     ], sumo
 
 
 def occupancy(folder: Path, sumo: float) -> list[tuple[str, str, str, bool]]:
-    """From trajectories.parquet to tpog.parquet."""
+    """Time the stage tpog: from trajectories.parquet to tpog.parquet."""
     scenario = egvs.load(SCENARIO)
     took = seconds(lambda: run_stage(tpog, scenario, folder / "run"))
     share = took / sumo
@@ -123,42 +122,42 @@ def occupancy(folder: Path, sumo: float) -> list[tuple[str, str, str, bool]]:
 
 
 def sites(folder: Path) -> list[tuple[str, str, str, bool]]:
-    """Scan and score, site by site: from the static world and the TPOG in memory to a score."""
+    """Time scan and score of single sites: from static world and TPOG in memory to a score."""
     scenario, run = egvs.load(SCENARIO), folder / "run"
     scene = inputs.resolve_scene(scenario, read_ply(run / "statics.ply")[0])
-    counted = read_tpog(run / "tpog.parquet")
-    scanner, scorer, visibility = Scanner(scene), Scorer(scene, counted), HitCounter(scene, counted)
+    occupancy_grid = read_tpog(run / "tpog.parquet")
+    scanner, scorer, visibility = Scanner(scene), Scorer(scene, occupancy_grid), HitCounter(scene, occupancy_grid)
     beams = {site: Beams.of(scanner.scan_site(site)) for site in scene.sites}
-    hits = np.zeros(int(np.prod(counted.grid.shape)), dtype=np.uint32)
+    hits = np.zeros(int(np.prod(occupancy_grid.grid.shape)), dtype=np.uint32)
 
     def score_one(site: Site) -> float:
         return scorer.score(scanner.scan_site(site)).egvs
 
-    def march_one(site: Site) -> None:
-        o, d, shape = to_voxel_units(beams[site], counted.grid)
+    def traverse_one(site: Site) -> None:
+        o, d, shape = to_voxel_units(beams[site], occupancy_grid.grid)
         hits.fill(0)
-        traversal.count_hits(o, d, shape, counted.grid.voxel_m, hits)
+        traversal.count_hits(o, d, shape, occupancy_grid.grid.voxel_m, hits)
 
-    whole = statistics.median(seconds(partial(score_one, site)) for site in scene.sites)
-    part = statistics.median(seconds(partial(march_one, site)) for site in scene.sites)
+    site_s = statistics.median(seconds(partial(score_one, site)) for site in scene.sites)
+    traversal_s = statistics.median(seconds(partial(traverse_one, site)) for site in scene.sites)
     times: dict[str, list[float]] = {"1": [], "2": [], "bare": [], "plain": []}
     for _ in range(REPEATS):
         for threads in (1, 2):
             times[str(threads)].append(once(partial(every, score_one, scene.sites * 4, threads)))
-        times["bare"].append(once(partial(every, march_one, scene.sites)))
+        times["bare"].append(once(partial(every, traverse_one, scene.sites)))
         times["plain"].append(once(partial(every, lambda site: visibility.borrowed_hits(beams[site]), scene.sites)))
     gain = statistics.median(a / b for a, b in zip(times["1"], times["2"], strict=True))
     extra = statistics.median(a / b for a, b in zip(times["plain"], times["bare"], strict=True))
     return [
-        ("scan + score of a site, one thread, median", f"{whole * 1e3:.1f} ms", "20 ms", whole < 0.020),
-        ("  of which the march", f"{part * 1e3:.1f} ms", "13 ms", part < 0.013),
+        ("scan + score of a site, one thread, median", f"{site_s * 1e3:.1f} ms", "20 ms", site_s < 0.020),
+        ("  of which the traversal", f"{traversal_s * 1e3:.1f} ms", "13 ms", traversal_s < 0.013),
         ("  two threads against one", f"{gain:.2f} x", "1.7 x", gain >= 1.7),
-        ("  plain scene where effects could be, against the bare march", f"{extra:.3f} x", "1.03 x", extra <= 1.03),
+        ("  scene without effects, compared with the bare traversal", f"{extra:.3f} x", "1.03 x", extra <= 1.03),
     ]
 
 
 def main() -> None:
-    """Measure all, print one table."""
+    """Run all benchmarks, and print the tables."""
     table = Table(
         "what",
         "measured",
@@ -169,7 +168,7 @@ def main() -> None:
     )
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        rows, sumo = whole_run(folder)
+        rows, sumo = time_run(folder)
         rows += occupancy(folder, sumo) + sites(folder) + effects.rows(folder / "run") + detection.rows()
         rows += clouds.rows(SCENARIO, folder / "run")
     for what, measured, bound, reached in rows:
@@ -177,12 +176,12 @@ def main() -> None:
     console = Console(width=140, highlight=False)
     console.print(table)
     for title, measure in (
-        ("what it costs to judge a site, processor time a site", judging.rows),
-        ("what stability costs", stability.rows),
-        ("what exact hits cost", casting.rows),
-        ("what leaving out the unseen saves", savings.rows),
-        ("what it costs not to trust files", guards.rows),
-        ("what other ways cost, and how wrong they are", others.rows),
+        ("cost of scores and of measuring detection, processor time per site", site_costs.rows),
+        ("cost of stable decisions", stability.rows),
+        ("cost of exact hits", casting.rows),
+        ("savings by culling triangles and beams that cannot meet", culling.rows),
+        ("cost of checking files", file_checks.rows),
+        ("cost and errors of alternative methods", alternatives.rows),
     ):
         console.print(f"\n{title}")
         for row in measure():

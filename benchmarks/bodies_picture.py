@@ -1,7 +1,8 @@
-"""Draws the bodies of vehicles and people on one scale, each in its box, for docs/validation.md."""
+"""Draw the bodies of vehicles and people at one scale, each in its box, for docs/validation.md."""
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +17,13 @@ COLOURS = {
 }
 ROWS = (("pedestrian", "bicycle", "kei", "sedan", "taxi", "van"), ("truck", "bus", "tractor", "trailer"))
 LIGHT = np.array([0.3, -0.45, 0.84])
-EYE_DEG = -55.0, 20.0  # azimuth from which one looks, and elevation
-FINEST_M = 0.15  # triangles are cut up to this, so that the one behind is drawn first
+EYE_DEG = -55.0, 20.0  # azimuth and elevation of the viewer
+FINEST_M = 0.15  # triangles are subdivided to this size, so that sorting by distance works
 GAP_M, ROW_M, LABEL_M = 0.8, 7.0, 4.3
 
 
 def draw(path: Path) -> None:
-    """All bodies of the program in one picture."""
+    """Draw all bodies."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -33,12 +34,12 @@ def draw(path: Path) -> None:
     for row, kinds in enumerate(ROWS):
         at = np.array([0.0, -ROW_M * row])
         for kind in kinds:
-            size = np.array(cloud_simulation.drawn_size_m(kind))
-            edges, _ = _seen(_edges(size))
+            size = np.array(tomllib.loads(cloud_simulation.BODIES_FILE.read_text())[kind]["size_m"])
+            edges, _ = _project(_edges(size))
             left, right = edges[:, :, 0].min(), edges[:, :, 0].max()
             spare = max(LABEL_M - (right - left), 0.0) / 2
             at[0] += spare - left
-            shapes, colours = _painted(kind, size)
+            shapes, colours = _paint(kind, size)
             axes.add_collection(PolyCollection(shapes + at, facecolors=colours, edgecolors=colours, linewidths=0.4))
             axes.add_collection(LineCollection(edges + at, colors=(0.55, 0.55, 0.55), linewidths=0.6))
             count = sum(len(part.triangles) for part in cloud_simulation.builtin_bodies()[kind])
@@ -56,19 +57,19 @@ def draw(path: Path) -> None:
     plt.close(figure)
 
 
-def _seen(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points (..., 3) as one sees them from far away: to the right and up (..., 2), and how near they are (...)."""
+def _project(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return points (..., 3) in the picture plane (..., 2), and their distance towards the viewer (...)."""
     azimuth, elevation = np.radians(EYE_DEG)
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     eye = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
     return np.stack([points @ right, points @ np.cross(eye, right)], axis=-1), points @ eye
 
 
-def _painted(kind: str, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The triangles of a body that one sees, cut up, the farthest first; and their colours."""
+def _paint(kind: str, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the visible triangles of a body, subdivided, farthest first; and their colours."""
     import trimesh
 
-    found, colours = [], []
+    pieces, colours = [], []
     for part in cloud_simulation.builtin_bodies()[kind]:
         corners = (part.triangles * size).reshape(-1, 3)
         vertices, faces = trimesh.remesh.subdivide_to_size(
@@ -77,12 +78,12 @@ def _painted(kind: str, size: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         triangles = vertices[faces]
         normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
         normals /= np.linalg.norm(normals, axis=1)[:, None]
-        front = _seen(normals)[1] > 0
+        front = _project(normals)[1] > 0
         shade = 0.6 + 0.4 * np.clip(normals[front] @ LIGHT, 0.0, 1.0)
-        found.append(triangles[front])
+        pieces.append(triangles[front])
         colours.append(np.outer(shade, COLOURS[part.surface]))
-    triangles = np.concatenate(found)
-    flat, near = _seen(triangles)
+    triangles = np.concatenate(pieces)
+    flat, near = _project(triangles)
     order = np.argsort(near.mean(axis=1))
     return flat[order], np.concatenate(colours)[order]
 

@@ -1,10 +1,9 @@
-"""What do hits that float64 decides cost, against Embree alone?
+"""Cost of hits that float64 decides, compared with Embree alone.
 
-For all sites of a shipped scenario, in interleaved runs: Embree alone on the bare triangles, one ray after the other as
-embreex asks it, and eight at a time as the cast does; Embree on the triangles with their rims and fins; placing the
-hits in float64 (``settle``); searching the doubtful beams (``search``); and the whole cast, with the choice of the
-beams that can meet the region of interest. Ratios are medians over the rounds, each against Embree alone in the same
-round.
+For all sites of some shipped scenarios, timed in turns: Embree alone on the bare triangles, one ray at a time as in
+embreex, and eight at a time as in our caster; Embree on triangles with rims and fins; placing the hits in float64;
+searching uncertain beams; and the complete cast, with the selection of beams that can meet the region of interest.
+Ratios are medians over the rounds, each relative to Embree alone in the same round.
 """
 
 from __future__ import annotations
@@ -30,13 +29,13 @@ _ROUNDS = 21
 
 
 def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
-    """What is timed, how many beams each does, and how many of them are doubtful."""
+    """Return what is timed, the number of beams, and how many of them are uncertain."""
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
     scenario = egvs.load(_SCENARIOS / name)
-    places = sites.candidate_sites(scenario)
-    start_m = np.array([site.pose.position_m for site in places])
+    candidates = sites.candidate_sites(scenario)
+    start_m = np.array([site.pose.position_m for site in candidates])
     caster, origin = (
         Caster(build_scene(scenario).world, scenario.roi.box, start_m),
         np.asarray(scenario.roi.box.origin_m),
@@ -46,7 +45,7 @@ def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
     assert caster._tree is not None
     tree = caster._tree
     jobs = []
-    for site in places:
+    for site in candidates:
         sensor = scenario_sensor(site.sensor, scenario, site.name)
         directions = sensor.directions(*site.pose.angles_deg)
         beam = caster.scan(site.pose.position_m, directions, sensor.range_m).beam
@@ -59,7 +58,7 @@ def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
         hits = ray_triangle.Hits(*filled, *ends)
         settled = (tree.nearest(o, beam, directions), caster._owner, mesh, rays, hits, doubtful)
         some = doubtful[: ray_triangle.resolve_hits(*settled)]
-        searched = (some, mesh, ray_triangle.BoxTree(caster._boxes, caster._starts), rays, hits)
+        searched = (some, mesh, ray_triangle.BoxTree(caster._boxes, caster._level_starts), rays, hits)
         jobs.append(
             (
                 (site.pose.position_m, directions, sensor.range_m),
@@ -71,23 +70,23 @@ def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
         )
 
     def cast() -> None:
-        for asked, *_ in jobs:  # each is let go before the next is made, as a run does
-            caster.scan(*asked)
+        for scan_arguments, *_ in jobs:  # each scan is freed before the next, as in a run
+            caster.scan(*scan_arguments)
 
     work: dict[str, Callable[[], Any]] = {
         "Embree alone": lambda: [bare.run(*ray) for _, ray, *_ in jobs],
         "Embree alone, eight beams at a time": lambda: [packets.nearest(*ray) for _, _, ray, *_ in jobs],
         "Embree with rims and fins": lambda: [tree.nearest(*ray) for _, _, ray, *_ in jobs],
-        "settle: hits placed in float64": lambda: [ray_triangle.resolve_hits(*settled) for *_, settled, _ in jobs],
-        "search: doubtful beams": lambda: [ray_triangle.search_triangles(*searched) for *_, searched in jobs],
-        "whole cast": cast,
+        "hits placed in float64": lambda: [ray_triangle.resolve_hits(*settled) for *_, settled, _ in jobs],
+        "search of uncertain beams": lambda: [ray_triangle.search_triangles(*searched) for *_, searched in jobs],
+        "complete cast": cast,
     }
     return work, sum(len(ray[0]) for _, ray, *_ in jobs), sum(len(searched[0]) for *_, searched in jobs)
 
 
 def rows() -> list[tuple[Any, ...]]:
-    """A line for each part: what, times Embree alone, share of the whole cast."""
-    found: list[tuple[Any, ...]] = []
+    """Return a row for each part: what, ratio to Embree alone, and share of the complete cast."""
+    table: list[tuple[Any, ...]] = []
     for name in ("nishishinjuku", "ingolstadt", "hill", "roundabout"):
         work, beams, doubtful = _work(name)
         times: dict[str, list[float]] = {part: [] for part in work}
@@ -99,11 +98,11 @@ def rows() -> list[tuple[Any, ...]]:
         for part in work:
             against = [
                 statistics.median(a / b for a, b in zip(times[part], times[base], strict=True))
-                for base in (next(iter(work)), "whole cast")
+                for base in (next(iter(work)), "complete cast")
             ]
-            found.append((f"{name}: {part}", f"{against[0]:.2f} x Embree alone", f"{against[1]:.1%} of the cast"))
-        found.append((f"{name}: {doubtful} of {beams} beams were doubtful", f"{doubtful / beams:.2%}"))
-    return found
+            table.append((f"{name}: {part}", f"{against[0]:.2f} x Embree alone", f"{against[1]:.1%} of the cast"))
+        table.append((f"{name}: {doubtful} of {beams} beams were uncertain", f"{doubtful / beams:.2%}"))
+    return table
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What does a point cloud with traffic cost: the paper's sensor, all of a frame's vehicles, or the nearest ten?"""
+"""Cost of a simulated point cloud with traffic: with all vehicles of a frame, and with the nearest ten."""
 
 from __future__ import annotations
 
@@ -19,31 +19,33 @@ NEAREST = 10
 
 
 def rows(scenario: Path, run: Path) -> list[tuple[str, str, str, bool]]:
-    """Milliseconds a frame on one core, over the first sites of a scenario and frames of its finished run."""
+    """Return milliseconds per frame on one core, for the first sites of a scenario and frames of its finished run."""
     scene = egvs.build_scene(egvs.load(scenario))
-    makers = [CloudSimulator.of_site(scene, site) for site in scene.sites[:3]]
+    simulators = [CloudSimulator.of_site(scene, site) for site in scene.sites[:3]]
     recorded = list(traffic_frames.read_frames(run / "trajectories.parquet", np.arange(FRAMES, dtype=np.int64) * 50))
     measured = []
-    for what, some in (("all its vehicles", len), (f"the nearest {NEAREST}", lambda _: NEAREST)):
-        took, on = [], []
-        for maker in makers:
-            near = [_nearest(frame, maker.view.pose.position_m[:2], some(frame.boxes)) for frame in recorded]
-            maker.sweep(near[0], sweep_rng(0, "warm", 0))
+    for what, count_boxes in (("all its vehicles", len), (f"the nearest {NEAREST}", lambda _: NEAREST)):
+        seconds, points_on_vehicles = [], []
+        for simulator in simulators:
+            near = [_nearest(frame, simulator.view.pose.position_m[:2], count_boxes(frame.boxes)) for frame in recorded]
+            simulator.sweep(near[0], sweep_rng(0, "warm", 0))
             for frame in near:
-                random = sweep_rng(0, maker.view.site, frame.number)
+                random = sweep_rng(0, simulator.view.site, frame.number)
                 start = time.perf_counter()
-                cloud = maker.sweep(frame, random)
-                took.append(time.perf_counter() - start)
-                on.append(int((cloud.owner >= 0).sum()))
-        ms, points = statistics.median(took) * 1e3, statistics.mean(on)
-        vehicles = statistics.mean(some(frame.boxes) for frame in recorded)
+                cloud = simulator.sweep(frame, random)
+                seconds.append(time.perf_counter() - start)
+                points_on_vehicles.append(int((cloud.owner >= 0).sum()))
+        ms, points = statistics.median(seconds) * 1e3, statistics.mean(points_on_vehicles)
+        vehicles = statistics.mean(count_boxes(frame.boxes) for frame in recorded)
         text = f"{ms:.2f} ms, {vehicles:.0f} vehicles with {points:.0f} points"
-        measured.append((f"a cloud of {maker.view.sensor.beams} beams, {what}", text, "3 ms", ms < 1e3 * BOUND_S))
+        measured.append((f"a cloud of {simulator.view.sensor.beams} beams, {what}", text, "3 ms", ms < 1e3 * BOUND_S))
     return measured
 
 
 def _nearest(frame: TrafficFrame, to_m: tuple[float, float], count: int) -> TrafficFrame:
-    """A frame with only the boxes that are nearest to a place."""
-    kept = np.sort(np.argsort(np.hypot(*(frame.boxes[:, :2] - to_m).T))[:count])
-    vehicles, kinds = (tuple(values[i] for i in kept) for values in (frame.vehicles, frame.kinds))
-    return TrafficFrame(frame.number, vehicles, kinds, frame.boxes[kept], frame.pitch_rad[kept], frame.part[kept])
+    """Return a frame with only the boxes that are nearest to a point."""
+    nearest = np.sort(np.argsort(np.hypot(*(frame.boxes[:, :2] - to_m).T))[:count])
+    vehicles, kinds = (tuple(values[i] for i in nearest) for values in (frame.vehicles, frame.kinds))
+    return TrafficFrame(
+        frame.number, vehicles, kinds, frame.boxes[nearest], frame.pitch_rad[nearest], frame.part[nearest]
+    )

@@ -1,7 +1,7 @@
-"""What do named effects cost, beside the plain march?
+"""Cost of effects, compared with a scene without them.
 
-Each setting's hits of some sites of the shipped junction, from scans that are cast beforehand, on one thread.
-Repeats are interleaved with the plain march of the same sites; medians of the ratios are shown.
+Hits of some sites of the shipped junction, from scans that are cast beforehand, on one thread. Each effect is timed in
+turns with the plain scene; medians of the ratios are printed.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ COSTS: dict[str, tuple[list[str], float | None]] = {
     "moving_occlusion, 500 frames": (["effects.moving_occlusion.frames=500"], 4.0),
     "divergence, 7 sub-beams": (["effects.divergence.sub_beams=7"], 8.0),
 }
-"""Settings, and how many marches each may cost at most."""
+"""Settings, and the largest allowed ratio to the plain scene."""
 
 
 @dataclass(frozen=True)
@@ -49,14 +49,14 @@ class Work:
 
     @classmethod
     def of(cls, settings: list[str], world: World, tpog: Tpog, run: Path) -> Work:
-        """For a finished run's static world, TPOG and trajectories."""
+        """Prepare the static world, TPOG and trajectories of a finished run."""
         scene = inputs.resolve_scene(egvs.load(SCENARIO, settings), world)
         scanner = Scanner(scene)
         beams = [Beams.of(scanner.scan_site(site)) for site in scene.sites[:SITES]]
         return cls(HitCounter(scene, tpog, run / "trajectories.parquet"), beams, np.flatnonzero(tpog.counts))
 
     def seconds(self) -> float:
-        """Processor seconds of a round."""
+        """Return the processor seconds to count the hits once."""
         start = time.process_time()
         for beams in self.beams:
             self.visibility.borrowed_hits(beams, self.cells)
@@ -64,7 +64,7 @@ class Work:
 
 
 def rows(run: Path) -> list[tuple[str, str, str, bool]]:
-    """(what, marches, allowed, reached) for each effect, on the artefacts of a finished run."""
+    """Return name, ratio, limit and whether it holds for each effect."""
     world, tpog = read_ply(run / "statics.ply")[0], read_tpog(run / "tpog.parquet")
     plain = Work.of([], world, tpog, run)
     named = {name: Work.of(settings, world, tpog, run) for name, (settings, _) in COSTS.items()}
@@ -75,9 +75,9 @@ def rows(run: Path) -> list[tuple[str, str, str, bool]]:
             took = work.seconds()
             if turn:  # the first compiles
                 ratios[name].append(took / march)
-    found = []
+    table = []
     for name, (_, most) in COSTS.items():
         ratio = statistics.median(ratios[name])
         bound = "" if most is None else f"{most:g} x"
-        found.append((f"  {name}, against the plain march", f"{ratio:.2f} x", bound, most is None or ratio <= most))
-    return found
+        table.append((f"  {name}, compared with no effect", f"{ratio:.2f} x", bound, most is None or ratio <= most))
+    return table

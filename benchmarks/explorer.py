@@ -30,28 +30,28 @@ _PAGE = resource.getpagesize()
 
 
 def memory_mb() -> float:
-    """Resident memory of this process."""
+    """Return the resident memory of this process."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * _PAGE / 1e6
 
 
-def moved(site: Site, dice: random.Random) -> Site:
-    """A candidate somewhere near."""
+def random_move(site: Site, rng: random.Random) -> Site:
+    """Return a candidate moved to a random pose nearby."""
     pose = site.pose
     return replace(
         site,
         pose=replace(
             pose,
-            x_m=round(pose.x_m + dice.uniform(-5, 5), 3),
-            y_m=round(pose.y_m + dice.uniform(-5, 5), 3),
-            z_m=round(pose.z_m + dice.uniform(0, 4), 3),
-            yaw_deg=round(dice.uniform(-180, 180), 2),
-            pitch_deg=round(dice.uniform(-20, 5), 2),
+            x_m=round(pose.x_m + rng.uniform(-5, 5), 3),
+            y_m=round(pose.y_m + rng.uniform(-5, 5), 3),
+            z_m=round(pose.z_m + rng.uniform(0, 4), 3),
+            yaw_deg=round(rng.uniform(-180, 180), 2),
+            pitch_deg=round(rng.uniform(-20, 5), 2),
         ),
     )
 
 
 def main() -> None:
-    """Move, change sensors and periods, and print."""
+    """Move sensors, change sensors and periods, and print times and memory."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("place", type=Path)
     parser.add_argument("--moves", type=int, default=200)
@@ -59,61 +59,61 @@ def main() -> None:
     parser.add_argument("--periods", type=int, default=5)
     parser.add_argument("--layer", choices=list(LAYERS), default="none")
     parser.add_argument("--out", type=Path)
-    asked = parser.parse_args()
-    session = open_session(asked.place, (), asked.out)
+    options = parser.parse_args()
+    session = open_session(options.place, (), options.out)
     with tempfile.TemporaryDirectory() as scratch:
         page = Page(session, Path(scratch))
         loop = threading.Thread(target=page.run)
         loop.start()
         try:
-            page.ask(layer=asked.layer)
-            page.rest(600)
-            _walk(page, asked)
+            page.request(layer=options.layer)
+            page.wait_until_idle(600)
+            _measure(page, options)
         finally:
             page.end()
             loop.join()
             page.stop()
 
 
-def _walk(page: Page, asked: argparse.Namespace) -> None:
-    dice, sites = random.Random(1), [its.site for its in page.session.ranked]
+def _measure(page: Page, options: argparse.Namespace) -> None:
+    rng, sites = random.Random(1), [candidate.site for candidate in page.session.ranked]
     opened = memory_mb()
-    moves = [moved(dice.choice(sites), dice) for _ in range(asked.moves)]
-    _walked(page, moves[:10], len(CATALOGUE), 1 + len(page.session.periods))
+    moves = [random_move(rng.choice(sites), rng) for _ in range(options.moves)]
+    _time_moves(page, moves[:10], len(CATALOGUE), 1 + len(page.session.periods))
     first = memory_mb()
     begin = time.process_time()
-    taken_ms = _walked(page, moves, 0, 0)
+    times_ms = _time_moves(page, moves, 0, 0)
     busy_ms = 1000.0 * (time.process_time() - begin) / len(moves)
-    _walked(page, moves[-1:], asked.sensors, asked.periods)
+    _time_moves(page, moves[-1:], options.sensors, options.periods)
     last = memory_mb()
-    median, most = np.percentile(taken_ms, [50, 95])
+    median, high = np.percentile(times_ms, [50, 95])
     print(
-        f"end of a move to the number: median {median:.0f} ms, 95 % within {most:.0f} ms; processors {busy_ms:.0f} ms"
+        f"end of a move to the number: median {median:.0f} ms, 95 % within {high:.0f} ms; processors {busy_ms:.0f} ms"
     )
     print(f"memory: {opened:.0f} MB opened, {first:.0f} MB after a few of each, {last:.0f} MB at the end: "
           f"{last / first - 1.0:+.1%}")  # fmt: skip
     again = page.session.rate(page.view.site.name, page.view.site.pose, page.view.site.sensor)
-    print(f"the last score is right: {again == page.rating}")
+    print(f"the last score equals a fresh one: {again == page.rating}")
 
 
-def _walked(page: Page, moves: list[Site], sensors: int, periods: int) -> list[float]:
-    """So many moves, changes of sensor and of period; milliseconds of each move."""
-    taken_ms = [shown_ms(page, site) for site in moves]
+def _time_moves(page: Page, moves: list[Site], sensors: int, periods: int) -> list[float]:
+    """Make moves and changes of sensor and period; return milliseconds of each move."""
+    times_ms = [time_move_ms(page, site) for site in moves]
     for sensor in (list(CATALOGUE) * sensors)[:sensors]:
-        shown_ms(page, replace(page.view.site, sensor=sensor))
-    shown_ms(page, moves[-1])
+        time_move_ms(page, replace(page.view.site, sensor=sensor))
+    time_move_ms(page, moves[-1])
     names = ("", *page.session.periods)
     for number in range(periods if page.session.periods else 0):
-        page.ask(period=names[(number + 1) % len(names)])
-        page.rest(600)
-    return taken_ms
+        page.request(period=names[(number + 1) % len(names)])
+        page.wait_until_idle(600)
+    return times_ms
 
 
-def shown_ms(page: Page, site: Site) -> float:
-    """From the end of a move until all is shown."""
+def time_move_ms(page: Page, site: Site) -> float:
+    """Return the time from the end of a move until everything is shown."""
     begin = time.perf_counter()
-    page.ask(site=site)
-    page.rest(600)
+    page.request(site=site)
+    page.wait_until_idle(600)
     return 1000.0 * (time.perf_counter() - begin)
 
 

@@ -1,7 +1,7 @@
-"""What the explorer takes before a large scene: a million triangles round 5 hectares, and how long a browser draws.
+"""Time and memory of the explorer for a large scene: a million triangles around 5 hectares.
 
-A scene as :mod:`benchmarks.scaling` makes them. Prints what :mod:`benchmarks.explorer` prints, then, of a headless
-browser that draws in software, the time of a frame while the camera turns, and what the browser holds.
+The scene is one of :mod:`benchmarks.scaling`. Prints what :mod:`benchmarks.explorer` prints, and the time per frame of
+a headless browser (software rendering) while the camera turns, and the browser's memory.
 
     python -m benchmarks.explorer_large [--triangles 1000000] [--hectares 5] [--no-browser]
 """
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import scaling
-from benchmarks.explorer import memory_mb, moved, shown_ms
+from benchmarks.explorer import memory_mb, random_move, time_move_ms
 from egvs.explore.page import Page
 from egvs.explore.settings import open_session
 
@@ -33,17 +33,17 @@ _FRAMES = """seconds => new Promise(done => {
 
 
 def main() -> None:
-    """Make the scene, open it, move, and look at it."""
+    """Make and open the scene, move sensors, and measure a browser."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--triangles", type=int, default=1_000_000)
     parser.add_argument("--hectares", type=float, default=5.0)
     parser.add_argument("--moves", type=int, default=50)
     parser.add_argument("--browser", action=argparse.BooleanOptionalAction, default=True)
-    asked = parser.parse_args()
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         scenario = scaling.prepare(
-            scaling.Size(triangles=asked.triangles, hectares=asked.hectares, beams=57_600), folder / "large"
+            scaling.Size(triangles=options.triangles, hectares=options.hectares, beams=57_600), folder / "large"
         )
         begin = time.perf_counter()
         session = open_session(scenario, (), folder / "run")
@@ -55,19 +55,19 @@ def main() -> None:
         loop = threading.Thread(target=page.run)
         loop.start()
         try:
-            dice, sites = random.Random(1), [its.site for its in session.ranked]
-            taken_ms = [shown_ms(page, moved(dice.choice(sites), dice)) for _ in range(asked.moves)]
-            median, most = np.percentile(taken_ms, [50, 95])
-            print(f"a move: median {median:.0f} ms, 95 % within {most:.0f} ms, {memory_mb():.0f} MB")
-            if asked.browser:
-                _look(page)
+            rng, sites = random.Random(1), [candidate.site for candidate in session.ranked]
+            times_ms = [time_move_ms(page, random_move(rng.choice(sites), rng)) for _ in range(options.moves)]
+            median, high = np.percentile(times_ms, [50, 95])
+            print(f"a move: median {median:.0f} ms, 95 % within {high:.0f} ms, {memory_mb():.0f} MB")
+            if options.browser:
+                _measure_browser(page)
         finally:
             page.end()
             loop.join()
             page.stop()
 
 
-def _look(page: Page) -> None:
+def _measure_browser(page: Page) -> None:
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:

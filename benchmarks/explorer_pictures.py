@@ -1,8 +1,8 @@
-"""Draws the pictures of the explorer in the docs and in the README: the page over nishishinjuku, in a headless browser.
+"""Draw the pictures of the explorer for docs and README: the page over nishishinjuku, in a headless browser.
 
     python -m benchmarks.explorer_pictures [--only explore-3-lanes] [--out docs/images]
 
-Needs Chromium and playwright. Drawing is done in software, so it takes a minute or two.
+Needs Chromium and playwright. Software rendering takes a minute or two.
 """
 
 from __future__ import annotations
@@ -41,29 +41,29 @@ PICTURES: dict[str, tuple[Camera, dict[str, Any]]] = {
     "explore-4-difference": (ABOVE, {"layer": "difference", "pose": MOVED, "beside": "c05"}),
     "explore-5-traffic": (NEAR, {"layer": "replay", "pose": MOVED, "frame": 300}),
 }
-"""File, from where, and what is shown."""
+"""File name, camera, and view."""
 
 
 def main() -> None:
-    """Draw them all, or some."""
+    """Draw all pictures, or some."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", nargs="*", choices=list(PICTURES), default=list(PICTURES))
-    parser.add_argument("--run", type=Path, help="a folder of a run, with a plan; a fresh one when left out")
+    parser.add_argument("--run", type=Path, help="a run folder with a plan; a new run by default")
     parser.add_argument("--out", type=Path, default=Path("docs/images"))
-    asked = parser.parse_args()
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
-        run = asked.run or Path(scratch) / "run"
+        run = options.run or Path(scratch) / "run"
         if not (run / "placement.parquet").is_file():
             egvs.place(egvs.load(SCENARIO, ["placement.count=2"]), run)
         with _tab(Path(scratch), run) as (page, tab):
             for name, (camera, view) in PICTURES.items():
-                if name in asked.only:
-                    _draw(page, tab, camera, view, asked.out / f"{name}.png")
+                if name in options.only:
+                    _draw(page, tab, camera, view, options.out / f"{name}.png")
 
 
 @contextmanager
 def _tab(scratch: Path, run: Path) -> Iterator[tuple[Page, Any]]:
-    """The page, and a tab of a browser that shows it."""
+    """Return the page, and a browser tab that shows it."""
     from playwright.sync_api import sync_playwright
 
     page = Page(open_session(SCENARIO, (), run), scratch / "page")
@@ -77,7 +77,7 @@ def _tab(scratch: Path, run: Path) -> Iterator[tuple[Page, Any]]:
             tab.goto(page.address)
             tab.get_by_text("rank 1 of").wait_for(timeout=120_000)
             tab.wait_for_timeout(30_000)
-            tab.add_style_tag(content=".mantine-Notifications-root { display: none }")  # drawn in software, it warns
+            tab.add_style_tag(content=".mantine-Notifications-root { display: none }")  # it warns of software rendering
             yield page, tab
             browser.close()
     finally:
@@ -91,9 +91,9 @@ def _draw(page: Page, tab: Any, camera: Camera, view: dict[str, Any], path: Path
     pose = view.get("pose", site.pose)
     changes = {key: value for key, value in view.items() if key != "pose"}
     blank = {"layer": "none", "beside": "", "frame": 0, "is_dark": False}
-    page.ask(site=replace(site, pose=pose), **{**blank, **changes})
-    assert page.rest(120)
-    (client,) = page._server.get_clients().values()
+    page.request(site=replace(site, pose=pose), **{**blank, **changes})
+    assert page.wait_until_idle(120)
+    (client,) = page.server.get_clients().values()
     client.camera.position = np.subtract(camera.from_m, page.zero_m)
     client.camera.look_at = np.subtract(camera.at_m, page.zero_m)
     tab.wait_for_timeout(15_000)  # drawn in software

@@ -22,9 +22,9 @@ from egvs.studies.score_errors import compare_seeds
 SEEDS = 32
 
 
-def told(name: str, state: str, about: dict[str, Any]) -> None:
-    """A line for each seed."""
-    print(f"{name}: {state} {about.get('why', '')}", file=sys.stderr)
+def print_seed(name: str, state: str, details: dict[str, Any]) -> None:
+    """Print a line for each seed."""
+    print(f"{name}: {state} {details.get('why', '')}", file=sys.stderr)
 
 
 def main() -> None:
@@ -33,18 +33,18 @@ def main() -> None:
     count = int(more.pop(0)) if more and more[0].isdigit() else SEEDS
     with tempfile.TemporaryDirectory() as folder:
         runner = SettingRunner(Path(scenario), tuple(more), Path(folder), 1, no_progress)
-        found = compare_seeds(runner, load(scenario, more), count, told)
-    if found is None:
-        print("fewer than two seeds went through")
+        comparison = compare_seeds(runner, load(scenario, more), count, print_seed)
+    if comparison is None:
+        print("fewer than two runs succeeded")
         return
-    truth = np.array(found.truth)
-    print(f"{found.seeds} seeds of {found.frames} frames, {len(found.sites)} sites")
-    for what, values in (("scatter between runs", found.between), ("standard errors", found.within)):
+    truth = np.array(comparison.truth)
+    print(f"{comparison.seeds} seeds of {comparison.frames} frames, {len(comparison.sites)} sites")
+    for what, values in (("scatter between runs", comparison.between), ("standard errors", comparison.within)):
         shares = 100 * np.array(values) / truth
         print(f"{what}: {shares.min():.1f} to {shares.max():.1f} % of the score")
-    for what, values in (("bias", found.bias), ("bias expected", found.expected_bias)):
+    for what, values in (("bias", comparison.bias), ("bias expected", comparison.expected_bias)):
         print(f"{what}: {100 * (np.array(values) / truth).mean():+.1f} % on average")
-    print(f"90 % intervals hold in {found.covered:.1%} of cases")
+    print(f"90 % intervals contain the score in {comparison.covered:.1%} of cases")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""What does moving occlusion cost and change, and how far off is the model of independent voxels?
+"""Cost and consequences of moving occlusion, and the error of assuming independent voxels.
 
-``python -m benchmarks.occlusion SCENARIO RUN`` compares, on the artefacts of a finished run, the score of each site
-without moving occlusion, with recorded frames replayed, and with voxels taken as independent. Other effects that the
-scenario names stay on.
+``python -m benchmarks.occlusion SCENARIO RUN`` compares, for a finished run, the scores of each site without moving
+occlusion, with recorded frames replayed, and with voxels that are assumed to be independent. Other effects of the
+scenario stay on.
 """
 
 from __future__ import annotations
@@ -26,15 +26,14 @@ from egvs.scenario.effects_config import EffectsConfig
 from egvs.scenario.model import Scenario
 from egvs.scoring.scorer import Scorer, ranks
 from egvs.stages.inputs import get_scene, open_folder
-from egvs.stages.site_scoring import empty_scans
+from egvs.stages.site_scans import empty_scans
 
 Compared = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One way to score: scores (sites,), seconds a site on one thread, and for a replay the boxes ignored at each
-    site."""
+    """Results of one method: scores (sites,), seconds per site on one thread, and ignored boxes per site."""
 
     sites: list[str]
     egvs: NDArray[np.float64]
@@ -76,30 +75,31 @@ def compare(scenario: Scenario, out: Path, *, frames: int = 500) -> Compared:
 
 
 def scored(scenario: Scenario, out: Path, parameters: dict[str, Any] | None) -> Setting:
-    """Scores of all sites with ``[effects.moving_occlusion]`` as given (None: without); kernels are compiled
-    beforehand."""
+    """Score all sites with parameters of ``[effects.moving_occlusion]`` (None: without), with compiled kernels."""
     others = scenario.effects.without("moving_occlusion").model_dump()
-    wanted = others if parameters is None else {**others, "moving_occlusion": parameters}
-    work = open_folder(scenario.with_effects(EffectsConfig.of(wanted)), out)
-    tpog, trajectories, found = read_tpog(out / "tpog.parquet"), out / "trajectories.parquet", list(empty_scans(work))
+    effects = others if parameters is None else {**others, "moving_occlusion": parameters}
+    work = open_folder(scenario.with_effects(EffectsConfig.from_dict(effects)), out)
+    tpog, trajectories, scans = read_tpog(out / "tpog.parquet"), out / "trajectories.parquet", list(empty_scans(work))
     scorer = Scorer(get_scene(work), tpog, trajectories)
-    scorer.score(found[0].beams)
+    scorer.score(scans[0].beams)
     start = time.perf_counter()
-    egvs = [scorer.score(scan.beams).egvs for scan in found]
-    took = (time.perf_counter() - start) / len(found)
+    egvs = [scorer.score(scan.beams).egvs for scan in scans]
+    seconds = (time.perf_counter() - start) / len(scans)
     occlusion = work.scenario.effects.moving_occlusion
-    ignored = [0] * len(found)
+    ignored = [0] * len(scans)
     if occlusion is not None and occlusion.method == "frames":
         replay = read_replay(trajectories, tpog.grid, occlusion.frames)
-        ignored = [replay.holding(tpog.grid.to_grid_m(np.array(scan.site.pose.position_m))) for scan in found]
-    return Setting([scan.site.name for scan in found], np.array(egvs), took, ignored)
+        ignored = [
+            replay.count_boxes_around(tpog.grid.to_grid_m(np.array(scan.site.pose.position_m))) for scan in scans
+        ]
+    return Setting([scan.site.name for scan in scans], np.array(egvs), seconds, ignored)
 
 
-def _error(found: float, true: float) -> float | None:
-    """Relative error; 0 where both are 0, None where only the true value is."""
-    if found == true:
+def _error(scans: float, true: float) -> float | None:
+    """Return the relative error; 0 if both are 0, None if only the true value is 0."""
+    if scans == true:
         return 0.0
-    return (found - true) / true if true else None
+    return (scans - true) / true if true else None
 
 
 def _tau(a: NDArray[np.float64], b: NDArray[np.float64]) -> float | None:
@@ -109,7 +109,7 @@ def _tau(a: NDArray[np.float64], b: NDArray[np.float64]) -> float | None:
 
 
 def show(compared: Compared, console: Console) -> None:
-    """Print what :func:`compare` returns."""
+    """Print the result of :func:`compare`."""
     table = Table(
         "site",
         "plain",
@@ -122,15 +122,17 @@ def show(compared: Compared, console: Console) -> None:
     )
     for row in compared["rows"]:
         plain, frames, independent = (f"{row[name]:.1f}" for name in ("plain", "frames", "independent"))
-        kept = row["frames"] / row["plain"] if row["plain"] else 1.0
+        ratio = row["frames"] / row["plain"] if row["plain"] else 1.0
         error = "" if row["error"] is None else f"{row['error']:+.1%}"
         order = f"{row['rank_plain']}, {row['rank_frames']}, {row['rank_independent']}"
-        table.add_row(row["site"], plain, frames, f"{kept:.3f}", independent, error, order, str(row["ignored"]))
+        table.add_row(row["site"], plain, frames, f"{ratio:.3f}", independent, error, order, str(row["ignored"]))
     console.print(table)
     console.print(
         "Kendall's tau: " + "; ".join(f"{pair} {tau:.3f}" for pair, tau in compared["tau"].items() if tau is not None)
     )
-    console.print("seconds a site: " + "; ".join(f"{name} {took:.3f}" for name, took in compared["seconds"].items()))
+    console.print(
+        "seconds a site: " + "; ".join(f"{name} {seconds:.3f}" for name, seconds in compared["seconds"].items())
+    )
 
 
 def main() -> None:

@@ -1,8 +1,8 @@
-"""Draws the pictures in README and docs.
+"""Draw the pictures of README and docs.
 
-``make pictures`` draws the bodies of vehicles, runs the shipped scenarios and draws: the map of the README, taken from
-the report, and for each effect what the score (or, where an effect changes traffic, the occupancy) looks like from
-above before and after, on one colour scale.
+``make pictures`` draws the bodies of vehicles, runs the shipped scenarios, and draws the map of the README (from the
+report) and, for each effect, the score of columns (or the occupancy, for effects on traffic) before and after, on one
+colour scale.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from egvs.artefacts.tpog import read_tpog
 from egvs.artefacts.traffic_frames import read_trajectories
 from egvs.effects import registry
 from egvs.effects.registry import SELF_ACTIVATING
-from egvs.report.basemap import network_file, outlines_of, roads_within
+from egvs.report.basemap import network_file, roads_within, world_outlines
 from egvs.report.maps import Backdrop, SiteViewFigure, site_view
 from egvs.report.ranking import RankedSite
-from egvs.report.svg_figures import extent, standalone
+from egvs.report.svg_figures import extent, standalone_svg
 from egvs.runs import run
 from egvs.scenario.effects_config import EffectsConfig
 from egvs.scenario.model import Scenario
 from egvs.scoring.egvs import EntropyField
 from egvs.scoring.scorer import Scorer
 from egvs.stages.inputs import get_scene, open_folder
-from egvs.stages.site_scoring import empty_scans
+from egvs.stages.site_scans import empty_scans
 from egvs.world.mesh import read_ply
 
 ROOT = Path(__file__).resolve().parent.parent
 IMAGES = ROOT / "docs" / "images"
 
 # effect -> scenario, parameters, site: strong enough to see
-SHOWN: dict[str, tuple[str, dict[str, Any], str]] = {
+EXAMPLES: dict[str, tuple[str, dict[str, Any], str]] = {
     "range_limit": ("nishishinjuku", {"reflectivity": 0.02}, "c08"),
     "rain": ("nishishinjuku", {"rate_mm_h": 60}, "c08"),
     "fog": ("nishishinjuku", {"visibility_m": 150}, "c08"),
@@ -55,14 +55,13 @@ SHOWN: dict[str, tuple[str, dict[str, Any], str]] = {
 
 
 def figure(page: str, label: str) -> str:
-    """The figure of a report whose accessible label begins with ``label``, as a file of its own."""
-    found = next(svg for svg in re.findall(r"<svg.*?</svg>", page, re.DOTALL) if f'aria-label="{label}' in svg)
-    return standalone(found)
+    """Return the figure of a report whose accessible label begins with ``label``, as a separate file."""
+    figure = next(svg for svg in re.findall(r"<svg.*?</svg>", page, re.DOTALL) if f'aria-label="{label}' in svg)
+    return standalone_svg(figure)
 
 
-def seen(scenario: Scenario, out: Path, site: str) -> tuple[np.ndarray, np.ndarray]:
-    """Score of each column, bits (nx, ny), or its mean occupied voxels where no site is named; the voxels that beams
-    cross."""
+def column_scores(scenario: Scenario, out: Path, site: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return bits of each column (nx, ny), or mean occupied voxels without a site; and voxels with beams."""
     tpog = read_tpog(out / "tpog.parquet")
     if not site:
         return tpog.p.sum(axis=2), np.ones(tpog.grid.shape, dtype=np.bool_)
@@ -70,43 +69,44 @@ def seen(scenario: Scenario, out: Path, site: str) -> tuple[np.ndarray, np.ndarr
     work = open_folder(scenario, out)
     scan = next(empty_scans(work, [site]))
     hits = Scorer(get_scene(work), tpog, out / "trajectories.parquet").hits(scan.beams)
-    worth = field.per_cell_bit * np.minimum(hits.ravel()[field.cells], scenario.gamma)
+    score_bit = field.per_cell_bit * np.minimum(hits.ravel()[field.cells], scenario.gamma)
     nx, ny, nz = tpog.grid.shape
-    return np.bincount(field.cells // nz, weights=worth, minlength=nx * ny).reshape(nx, ny), hits > 0
+    return np.bincount(field.cells // nz, weights=score_bit, minlength=nx * ny).reshape(nx, ny), hits > 0
 
 
 def before_and_after(name: str, folder: Path) -> Iterator[tuple[str, str]]:
-    """File names and figures of one effect."""
-    where, parameters, site = SHOWN[name]
-    base = egvs.load(ROOT / "scenarios" / where)
-    given = base.effects.named.get(name)
-    own = ({} if given is None else given.model_dump(mode="json", exclude_unset=True)) | parameters
-    found = []
-    for word, named in (("before", {}), ("after", {name: own})):
+    """Yield file names and figures of one effect."""
+    scenario_name, parameters, site = EXAMPLES[name]
+    base = egvs.load(ROOT / "scenarios" / scenario_name)
+    named_parameters = base.effects.named.get(name)
+    combined = (
+        {} if named_parameters is None else named_parameters.model_dump(mode="json", exclude_unset=True)
+    ) | parameters
+    figures = []
+    for word, named in (("before", {}), ("after", {name: combined})):
         scenario, out = (
-            base.with_effects(EffectsConfig.of(named)),
-            folder / where / (word if named else "plain") / (name if named else ""),
+            base.with_effects(EffectsConfig.from_dict(named)),
+            folder / scenario_name / (word if named else "plain") / (name if named else ""),
         )
         run.run(scenario, out)
-        found.append((word, *seen(scenario, out, site)))
+        figures.append((word, *column_scores(scenario, out, site)))
     tpog = read_tpog(out / "tpog.parquet")
-    scored = RankedSite.all_of(read_scores(out / "scores.parquet"))
-    place = next(s for s in scored if s.site == (site or scored[0].site))
-    box = extent(tpog.grid, [place])
+    scored = RankedSite.from_table(read_scores(out / "scores.parquet"))
+    ranked_site = next(s for s in scored if s.site == (site or scored[0].site))
+    box = extent(tpog.grid, [ranked_site])
     roads = roads_within(network_file(out), box)
-    backdrop = Backdrop(outlines_of(read_ply(out / "statics.ply")[0], box), roads)
-    peak = max(float(field.max()) for _, field, _ in found)
-    for word, field, crossed in found:
-        view = SiteViewFigure(place, crossed, backdrop, box)
+    backdrop = Backdrop(world_outlines(read_ply(out / "statics.ply")[0], box), roads)
+    peak = max(float(field.max()) for _, field, _ in figures)
+    for word, field, crossed in figures:
+        view = SiteViewFigure(ranked_site, crossed, backdrop, box)
         what = f"score of site {site} by column" if site else "mean occupied voxels by column"
         alt = f"{name}, {word}: {what}, from above, 0 to {peak:.3g}"
         drawn = site_view(tpog.grid, field, peak, view, f"{name}-{word}", alt)
-        yield f"{name}-{word}.svg", standalone(drawn)
+        yield f"{name}-{word}.svg", standalone_svg(drawn)
 
 
 def side_view(out: Path, pitched: bool) -> str:
-    """Boxes of one frame on the hill's main road, seen from the south, heights five times enlarged; flat when not
-    pitched."""
+    """Draw boxes of one frame on the hill's main road from the south, with heights enlarged five times."""
     rows = read_trajectories(out / "trajectories.parquet").to_pylist()
     busiest = max((sum(r["frame"] == f for r in rows if abs(r["y_m"]) < 9), -f) for f in range(0, 2000, 100))
     shapes = []
@@ -126,10 +126,8 @@ def side_view(out: Path, pitched: bool) -> str:
 
 
 def main() -> None:
-    """Draw the picture of the README and those of the effects."""
-    assert set(SHOWN) == set(registry.effect_names()) - set(
-        SELF_ACTIVATING
-    )  # the slope cannot be left out where there is one
+    """Draw all pictures."""
+    assert set(EXAMPLES) == set(registry.effect_names()) - set(SELF_ACTIVATING)  # slopes cannot be switched off
     (IMAGES / "effects").mkdir(parents=True, exist_ok=True)
     bodies_picture.draw(IMAGES / "bodies.png")
     with tempfile.TemporaryDirectory() as temporary:
@@ -137,7 +135,7 @@ def main() -> None:
         egvs.run(egvs.load(ROOT / "scenarios" / "nishishinjuku"), folder / "report")
         page = (folder / "report" / "report.html").read_text(encoding="utf-8")
         (IMAGES / "nishishinjuku.svg").write_text(figure(page, "Map of"), encoding="utf-8")
-        for name in SHOWN:
+        for name in EXAMPLES:
             for file, drawn in before_and_after(name, folder):
                 (IMAGES / "effects" / file).write_text(drawn, encoding="utf-8")
         for word, pitched in (("before", False), ("after", True)):

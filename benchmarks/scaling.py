@@ -1,15 +1,13 @@
-"""How do time and memory grow with the size of the job?
+"""Growth of time and memory with the size of the job.
 
-``python -m benchmarks.scaling`` (``make scaling``) takes a synthetic junction - boxes for buildings, cars that drive
-straight, no SUMO - and makes one thing larger at a time: sites, frames, vehicles, the region of interest, beams,
-triangles. Each size is a whole ``egvs run`` from a finished FCD file with ``scan.keep = false``, in a process of its
-own, after a small run that compiles the kernels; small sizes are run three times and the median is taken. Seconds are
-the processor's, of all threads: they do not depend on what else the machine does. Memory is a stage's peak above what
-the process held before.
+``python -m benchmarks.scaling`` (``make scaling``) uses a synthetic junction (boxes for buildings, cars on straight
+lanes, no SUMO) and enlarges one quantity at a time: sites, frames, vehicles, the region of interest, beams, triangles.
+Each size is a complete ``egvs run`` from a finished FCD file with ``scan.keep = false``, in a new process, after a
+small run that compiles the kernels. Small sizes run three times, and the median counts. Times are processor times of
+all threads. Memory is a stage's peak above what the process held before.
 
-A slope is fitted on log-log axes by least squares over the larger half of the sizes (three at least), where what every
-run costs no longer hides it; 1 is linear. Written are ``docs/images/scaling.png`` and the tables of
-``docs/scaling.md``.
+A slope is fitted on log-log axes by least squares over the larger half of the sizes (at least three), where fixed costs
+matter less; 1 is linear. Writes ``docs/images/scaling.png`` and the tables of ``docs/scaling.md``.
 """
 
 from __future__ import annotations
@@ -33,7 +31,7 @@ import pyarrow as pa
 from pyarrow import csv
 
 import egvs
-from egvs.artefacts.run_folder import StageRecord
+from egvs.artefacts.run_record import StageRecord
 from egvs.core.runtime import release_memory
 from egvs.runs import run
 
@@ -41,13 +39,13 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGE, FIGURE = ROOT / "docs" / "scaling.md", ROOT / "docs" / "images" / "scaling.png"
 BETWEEN = ("<!-- measured -->", "<!-- end -->")
 
-REPEATS, ENOUGH_S = 3, 1.0
-"""A size is run so often, unless that long has passed."""
+REPEATS, MAX_S = 3, 1.0
+"""Number of runs per size, and the time after which no further run starts."""
 
 _LANE_M, _CAR_M = 3.5, 4.5
 
 LINEAR = 1.1
-"""A steeper slope is told."""
+"""Steeper slopes are printed in bold."""
 
 
 @dataclass(frozen=True)
@@ -64,14 +62,14 @@ class Size:
 
 @dataclass(frozen=True)
 class Axis:
-    """One thing that grows: a field of :class:`Size`, its sizes, and the stages that are shown."""
+    """A quantity that grows: a field of :class:`Size`, its values, and the stages that are shown."""
 
     name: str
     label: str
     sizes: tuple[float, ...]
     stages: tuple[str, ...]
     others: Size = field(default_factory=Size)
-    """What stays as it is."""
+    """The quantities that do not grow."""
 
 
 AXES = (
@@ -90,7 +88,7 @@ Points = dict[str, dict[float, tuple[float, float]]]
 
 
 def prepare(size: Size, folder: Path) -> Path:
-    """Write a scenario of this size; its folder."""
+    """Write a scenario of this size, and return its folder."""
     folder.mkdir(parents=True)
     long, wide = sides(size.hectares)
     channels = min(128, max(4, round(math.sqrt(size.beams / 22.5))))
@@ -122,13 +120,13 @@ def prepare(size: Size, folder: Path) -> Path:
 
 
 def sides(hectares: float) -> tuple[float, float]:
-    """Length and width of a region about twice as long as wide, whole voxels."""
+    """Return length and width of a region about twice as long as wide, in whole voxels."""
     wide = round(math.sqrt(hectares * 1e4 / 2) * 4) / 4
     return round(hectares * 1e4 / wide * 4) / 4, wide
 
 
 def _city(buildings: int, long: float, wide: float) -> str:
-    """Square towers of 12 triangles on a lattice 12 m apart, round the region of interest: GeoJSON."""
+    """Return GeoJSON of square towers with 12 triangles each, 12 m apart, around the region of interest."""
     features: list[Any] = []
     ring = 1
     while len(features) < buildings:
@@ -141,25 +139,24 @@ def _city(buildings: int, long: float, wide: float) -> str:
         ]
         for x, y in spots[: buildings - len(features)]:
             corners = [[x - 3, y - 3], [x + 3, y - 3], [x + 3, y + 3], [x - 3, y + 3], [x - 3, y - 3]]
-            about = {"name": f"b{len(features)}", "kind": "building", "height_m": 8 + len(features) % 13}
+            properties = {"name": f"b{len(features)}", "kind": "building", "height_m": 8 + len(features) % 13}
             features.append(
-                {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [corners]}, "properties": about}
+                {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [corners]}, "properties": properties}
             )
         ring += 1
-    return json.dumps({"type": "FeatureCollection", "features": features})
+    return json.dumps({"type": "FeatureCollection", "crs": None, "features": features})
 
 
 def _traffic(size: Size, long: float, wide: float, path: Path) -> None:
-    """Cars on lanes along x, a lane's at equal distances and one speed, that come in again at the other end: SUMO's FCD
-    as CSV."""
+    """Write cars on lanes along x in SUMO's FCD format as CSV; cars of a lane have equal gaps and speeds."""
     rng = np.random.default_rng(1)
     lanes, round_m = max(1, int(wide / _LANE_M)), long + 10.0
-    lane, place = np.arange(size.vehicles) % lanes, np.arange(size.vehicles) // lanes
+    lane, position = np.arange(size.vehicles) % lanes, np.arange(size.vehicles) // lanes
     cars = np.bincount(lane, minlength=lanes)
     if round_m / cars.max() < _CAR_M + 1.0:
         raise ValueError(f"{size.vehicles} cars overlap on {lanes} lanes of {long:g} m")
     speed = rng.uniform(4.0, 14.0, lanes)[lane]
-    y, first = wide * (lane + 0.5) / lanes, rng.uniform(0, round_m, lanes)[lane] + place * round_m / cars[lane]
+    y, first = wide * (lane + 0.5) / lanes, rng.uniform(0, round_m, lanes)[lane] + position * round_m / cars[lane]
     names = np.array([f"v{i}" for i in range(size.vehicles)])
     parts = range(0, size.frames, 2000)
     with path.open("wb") as file:
@@ -187,23 +184,23 @@ def _held_mb() -> float:
 
 
 def measure(size: Size, folder: Path, pipe: Any) -> None:
-    """Send seconds and MB of each stage, medians of some runs."""
-    os.environ["EGVS_STORE"] = ""  # nothing is fetched that is to be measured
+    """Send seconds and MB of each stage, medians of some runs, through a pipe."""
+    os.environ["EGVS_STORE"] = ""  # nothing may come from the cache
     run.run(egvs.load(prepare(Size(sites=2, frames=10), folder / "warm")), folder / "warm" / "run")
     scenario, begin, held = egvs.load(prepare(size, folder / "scene")), time.perf_counter(), _held_mb()
-    found: list[dict[str, tuple[float, float]]] = []
+    results: list[dict[str, tuple[float, float]]] = []
     for turn in range(REPEATS):
         clock = _Clock(held)
         run.run(scenario, folder / f"run{turn}", listener=clock)
-        found.append(clock.costs)
-        if time.perf_counter() - begin > ENOUGH_S:
+        results.append(clock.costs)
+        if time.perf_counter() - begin > MAX_S:
             break
-    both = [{name: statistics.median(run[name][i] for run in found) for name in found[0]} for i in (0, 1)]
+    both = [{name: statistics.median(run[name][i] for run in results) for name in results[0]} for i in (0, 1)]
     pipe.send({name: (both[0][name], both[1][name]) for name in both[0]})
 
 
 class _Clock:
-    """Told of a run's stages, it notes the processor seconds of each and its peak of memory above ``held`` MB."""
+    """Notes the processor seconds of each stage, and its peak memory above ``held`` MB."""
 
     def __init__(self, held: float) -> None:
         self._held, self._start = held, 0.0
@@ -212,12 +209,12 @@ class _Clock:
     def __call__(self, stage: str, state: str, record: StageRecord | None) -> None:
         if state == "done" and record is not None:
             self.costs[stage] = (time.process_time() - self._start, max(record.cost.peak_mb - self._held, 1.0))
-        _held_mb()  # lets go of what the stage left
+        _held_mb()  # frees the memory of the stage
         self._start = time.process_time()
 
 
-def apart(size: Size) -> dict[str, tuple[float, float]]:
-    """:func:`measure` in a process of its own: stage -> (seconds, MB)."""
+def measure_in_process(size: Size) -> dict[str, tuple[float, float]]:
+    """Call :func:`measure` in a new process; return seconds and MB by stage."""
     context = multiprocessing.get_context("spawn")
     with tempfile.TemporaryDirectory() as temporary:
         here, there = context.Pipe(duplex=False)
@@ -225,15 +222,15 @@ def apart(size: Size) -> dict[str, tuple[float, float]]:
         process.start()
         there.close()
         try:
-            found: dict[str, tuple[float, float]] = here.recv()
+            results: dict[str, tuple[float, float]] = here.recv()
         except EOFError:
             raise RuntimeError(f"the run of {size} failed") from None
         process.join()
-    return found
+    return results
 
 
 def slope(sizes: Sequence[float], costs: Sequence[float]) -> float:
-    """Exponent of growth over the larger half of the sizes, three at least: least squares of log cost on log size."""
+    """Return the exponent of growth over the larger half of the sizes (at least three), by least squares."""
     pairs = sorted(zip(sizes, costs, strict=True))
     pairs = pairs[-max(3, (len(pairs) + 1) // 2) :]
     x, y = np.log([pair[0] for pair in pairs]), np.log([pair[1] for pair in pairs])
@@ -242,40 +239,40 @@ def slope(sizes: Sequence[float], costs: Sequence[float]) -> float:
 
 
 def study() -> dict[str, Points]:
-    """Every axis, size by size."""
-    found: dict[str, Points] = {}
+    """Measure every size of every axis."""
+    results: dict[str, Points] = {}
     for axis in AXES:
         points: Points = {}
         for value in axis.sizes:
             start = time.perf_counter()
-            asked: dict[str, Any] = {axis.name: value if axis.name == "hectares" else int(value)}
-            size = replace(axis.others, **asked)
-            costs = apart(size)
+            change: dict[str, Any] = {axis.name: value if axis.name == "hectares" else int(value)}
+            size = replace(axis.others, **change)
+            costs = measure_in_process(size)
             for stage, cost in costs.items():
                 points.setdefault(stage, {})[value] = cost
-            told = ", ".join(f"{stage} {costs[stage][0]:.2f} s {costs[stage][1]:.0f} MB" for stage in axis.stages)
-            print(f"{axis.label} {value:g}: {told}; whole {time.perf_counter() - start:.1f} s", file=sys.stderr)
-        found[axis.name] = points
-    return found
+            texts = ", ".join(f"{stage} {costs[stage][0]:.2f} s {costs[stage][1]:.0f} MB" for stage in axis.stages)
+            print(f"{axis.label} {value:g}: {texts}; complete {time.perf_counter() - start:.1f} s", file=sys.stderr)
+        results[axis.name] = points
+    return results
 
 
-def table(found: dict[str, Points]) -> str:
-    """Markdown: the largest size's cost, and the slopes; those above linear are bold."""
+def table(results: dict[str, Points]) -> str:
+    """Return Markdown with the costs of the smallest and largest size, and slopes; those above linear are bold."""
     lines = ["| grows | stage | smallest | largest | slope of seconds | slope of memory |", "|---|---|---|---|---|---|"]
     for axis in AXES:
         low, high = axis.sizes[0], axis.sizes[-1]
         for stage in axis.stages:
-            points = found[axis.name][stage]
+            points = results[axis.name][stage]
             ends = [f"{points[n][0]:.3g} s, {points[n][1]:.0f} MB" for n in (low, high)]
             slopes = [slope(list(points), [cost[i] for cost in points.values()]) for i in (0, 1)]
-            told = [f"**{s:.2f}**" if s > LINEAR else f"{s:.2f}" for s in slopes]
+            texts = [f"**{s:.2f}**" if s > LINEAR else f"{s:.2f}" for s in slopes]
             lines.append(
-                f"| {axis.label}: {low:g} to {high:,g} | {stage} | {ends[0]} | {ends[1]} | {told[0]} | {told[1]} |"
+                f"| {axis.label}: {low:g} to {high:,g} | {stage} | {ends[0]} | {ends[1]} | {texts[0]} | {texts[1]} |"
             )
     return "\n".join(lines)
 
 
-# Okabe and Ito's colours, told apart by the colour-blind; markers and dashes tell them apart in print.
+# Okabe and Ito's colours are distinguishable for the colour-blind; markers and dashes distinguish them in print.
 LOOKS = {
     "statics": ("#999999", "v", ":"),
     "traffic": ("#E69F00", "s", "--"),
@@ -285,8 +282,8 @@ LOOKS = {
 }
 
 
-def draw(found: dict[str, Points], path: Path) -> None:
-    """Small multiples: seconds above, memory below, one column an axis."""
+def draw(results: dict[str, Points], path: Path) -> None:
+    """Draw seconds and memory, one column per axis."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -298,11 +295,11 @@ def draw(found: dict[str, Points], path: Path) -> None:
             panel = panels[row, column]
             for stage in axis.stages:
                 colour, marker, dashes = LOOKS[stage]
-                points = found[axis.name][stage]
+                points = results[axis.name][stage]
                 costs = [cost[row] for cost in points.values()]
-                told = f"{stage} {slope(list(points), costs):.2f}"
+                texts = f"{stage} {slope(list(points), costs):.2f}"
                 panel.loglog(
-                    list(points), costs, color=colour, marker=marker, linestyle=dashes, markersize=5, label=told
+                    list(points), costs, color=colour, marker=marker, linestyle=dashes, markersize=5, label=texts
                 )
             panel.grid(True, which="major", color="0.88")
             panel.legend(fontsize=8, title="slope", title_fontsize=8, loc="upper left", framealpha=0.85)
@@ -321,15 +318,15 @@ def draw(found: dict[str, Points], path: Path) -> None:
 
 
 def main() -> None:
-    """Measure, draw, and put the table into the page."""
-    found = study()
-    draw(found, FIGURE)
-    told = table(found)
+    """Measure, draw, and write the table to the page."""
+    results = study()
+    draw(results, FIGURE)
+    texts = table(results)
     page = PAGE.read_text(encoding="utf-8")
     start, end = (re.escape(mark) for mark in BETWEEN)
-    page = re.sub(f"{start}.*{end}", lambda _: f"{BETWEEN[0]}\n{told}\n{BETWEEN[1]}", page, flags=re.DOTALL)
+    page = re.sub(f"{start}.*{end}", lambda _: f"{BETWEEN[0]}\n{texts}\n{BETWEEN[1]}", page, flags=re.DOTALL)
     PAGE.write_text(page, encoding="utf-8")
-    print(told)
+    print(texts)
 
 
 if __name__ == "__main__":

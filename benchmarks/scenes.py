@@ -1,4 +1,4 @@
-"""Scenes, recordings and single stages for what is measured here."""
+"""Single stages and recorded traffic for benchmarks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from egvs.artefacts.traffic_frames import FrameBoxes, read_boxes
+from egvs.artefacts.frame_boxes import FrameBoxes, read_boxes
 from egvs.scenario.model import Scenario
 from egvs.scoring.occupancy import near_grid
 from egvs.stages import traffic
@@ -16,14 +16,14 @@ from egvs.stages.inputs import open_folder
 
 
 def run_stage(stage: Any, scenario: Scenario, folder: Path, **options: Any) -> dict[str, Any]:
-    """Run one stage in a folder that holds the artefacts of those before it."""
+    """Run one stage in a folder with the artefacts of the stages before it."""
     work = open_folder(scenario, folder)
-    found: dict[str, Any] = stage.STAGE.run(work, stage.STAGE.dependencies(work), **options)
-    return found
+    summary: dict[str, Any] = stage.STAGE.run(work, stage.STAGE.dependencies(work), **options)
+    return summary
 
 
 def recorded_boxes(scenario: Scenario) -> FrameBoxes:
-    """Boxes near the grid of traffic that is simulated for it, in the grid's frame."""
+    """Simulate the traffic of a scenario, and return boxes near its grid, in the grid's frame."""
     with tempfile.TemporaryDirectory() as temporary:
         run_stage(traffic, scenario, Path(temporary))
         groups = list(read_boxes(Path(temporary) / "trajectories.parquet", scenario.roi.grid))

@@ -1,14 +1,13 @@
-"""What do stable decisions cost?
+"""Cost of stable decisions.
 
-Time of our kernels over the time of the textbook's, and how many voxels the textbook gets wrong, on the shipped
-junction:
+Time of our kernels relative to textbook methods, and how many voxels those get wrong, on the shipped junction:
 
-- march against Amanatides and Woo (1987): t accumulated, every visited voxel counted. Wrong are voxels whose hits exact
-  arithmetic has otherwise, summed over the sites;
-- occupancy by boxes shrunk by 0.1 mm against boxes that may touch, on the shipped traffic. Wrong are voxels whose count
-  changes when every box moves by 1e-9 m.
+- traversal, compared with Amanatides and Woo (1987), who accumulate t and count every visited voxel. Wrong voxels have
+  other hits than by exact arithmetic, summed over the sites;
+- occupancy with boxes shrunk by 0.1 mm, compared with boxes that may touch, for simulated traffic. Wrong voxels change
+  their count when every box moves by 1e-9 m.
 
-Repeats are interleaved; medians are compared. Machines differ, ratios less so.
+Repeats are timed in turns; medians are compared. Machines differ, but ratios less so.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ import numba
 import numpy as np
 
 import egvs
-from benchmarks.numerics.march import beams_of, check
+from benchmarks.numerics.march import check, scene_beams
 from benchmarks.scenes import recorded_boxes
 from egvs.kernels import occupancy, traversal
 
@@ -38,7 +37,7 @@ _kernel = numba.njit(nogil=True, error_model="numpy", cache=True)
 
 @_kernel
 def _start(o, d, n, t):
-    """Voxel at the start, step, first crossing and time between crossings of one axis, as the paper has them."""
+    """Return voxel at the start, step, first crossing and time between crossings of one axis, as in the paper."""
     i = min(max(np.int64(np.floor(o + t * d)), 0), n - 1)
     if d > 0.0:
         return i, 1, (i + 1 - o) / d, 1.0 / d
@@ -48,9 +47,8 @@ def _start(o, d, n, t):
 
 
 @_kernel
-def textbook(o, d, shape, hits):
-    """Amanatides and Woo (1987), "A Fast Voxel Traversal Algorithm for Ray Tracing": add each beam to the voxels it
-    visits."""
+def textbook_march(o, d, shape, hits):
+    """Add each beam to the voxels that it visits: Amanatides and Woo (1987), "A Fast Voxel Traversal Algorithm"."""
     nx, ny, nz = shape[0], shape[1], shape[2]
     for beam in range(d.shape[0]):
         t, t_last = 0.0, 1.0
@@ -90,22 +88,22 @@ def textbook(o, d, shape, hits):
                 tz += dtz
 
 
-def touching() -> Any:
-    """The box kernels with boxes that are not shrunk, compiled anew."""
+def touching_box_kernels() -> Any:
+    """Return the box kernels with boxes that are not shrunk, compiled anew."""
     source = Path(occupancy.__file__).read_text(encoding="utf-8")
     for old, new in (
         (r"^SHRINK_M = .*$", "SHRINK_M = 0.0"),
         (r"njit\(\)$", "numba.njit(nogil=True, error_model='numpy')"),
     ):
-        source, found = re.subn(old, new, source, flags=re.MULTILINE)
-        assert found
+        source, ours_hits = re.subn(old, new, source, flags=re.MULTILINE)
+        assert ours_hits
     namespace: dict[str, Any] = {"__name__": "touching", "numba": numba}
     exec(compile(source, "touching boxes", "exec"), namespace)
     return SimpleNamespace(**namespace)
 
 
-def medians(works: Sequence[Callable[[], object]]) -> list[float]:
-    """Processor seconds of each, measured in turns after one call that is not counted."""
+def median_seconds(works: Sequence[Callable[[], object]]) -> list[float]:
+    """Return the median processor seconds of each call, measured in turns after one call each."""
     times: list[list[float]] = [[] for _ in works]
     for turn in range(REPEATS + 1):
         for work, taken in zip(works, times, strict=True):
@@ -117,8 +115,8 @@ def medians(works: Sequence[Callable[[], object]]) -> list[float]:
 
 
 def march_rows() -> list[tuple[str, float, float, int]]:
-    """Ours and the textbook's on the beams of all sites, a round of the sites at a time."""
-    grid, sites = beams_of(SCENE)
+    """Compare the traversals for the beams of all sites."""
+    grid, sites = scene_beams(SCENE)
     shape = np.asarray(grid.shape, np.int64)
     hits = np.zeros(int(shape.prod()), np.uint32)
 
@@ -128,56 +126,56 @@ def march_rows() -> list[tuple[str, float, float, int]]:
 
     def theirs() -> None:
         for _, o, d in sites:
-            textbook(o, d, shape, hits)
+            textbook_march(o, d, shape, hits)
 
     wrong_ours = wrong_theirs = 0
     for _, o, d in sites:
-        found, other = np.zeros_like(hits), np.zeros_like(hits)
-        traversal.count_hits(o, d, shape, grid.voxel_m, found)
-        textbook(o, d, shape, other)
+        ours_hits, textbook_hits = np.zeros_like(hits), np.zeros_like(hits)
+        traversal.count_hits(o, d, shape, grid.voxel_m, ours_hits)
+        textbook_march(o, d, shape, textbook_hits)
         # Every beam of ours is right by exact arithmetic, or counted here; so what differs from ours is wrong.
         wrong_ours += check(np.broadcast_to(o, d.shape), d, grid.shape, grid.voxel_m)[1]
-        wrong_theirs += int((found != other).sum())
-    mine, textbooks = medians([ours, theirs])
+        wrong_theirs += int((ours_hits != textbook_hits).sum())
+    our_s, textbook_s = median_seconds([ours, theirs])
     return [
-        (f"march, {len(sites)} sites: textbook", textbooks, 1.0, wrong_theirs),
-        (f"march, {len(sites)} sites: ours", mine, mine / textbooks, wrong_ours),
+        (f"march, {len(sites)} sites: textbook", textbook_s, 1.0, wrong_theirs),
+        (f"march, {len(sites)} sites: ours", our_s, our_s / textbook_s, wrong_ours),
     ]
 
 
 def box_rows() -> list[tuple[str, float, float, int]]:
-    """Ours and touching boxes on the shipped traffic, 1000 frames."""
+    """Compare our boxes with touching boxes, for 1000 frames of traffic."""
     frames = 1000
     scenario = egvs.load(ROOT / "scenarios" / SCENE, [f"traffic.frames={frames}"])
     grid = scenario.roi.grid
     boxes_near = recorded_boxes(scenario)
     frame, values = boxes_near.frame, boxes_near.values
     shape, (nx, ny, nz) = np.asarray(grid.shape, np.int64), grid.shape
-    steps, seen = np.zeros((nz + 1, nx, ny), np.int32), np.full((3, nx, ny), -1, np.int64)
+    steps, last_frame = np.zeros((nz + 1, nx, ny), np.int32), np.full((3, nx, ny), -1, np.int64)
 
     def count(kernels: Any, moved: Any) -> Any:
-        steps[:], seen[:] = 0, -1
-        kernels.count_boxes(frame, moved, shape, grid.voxel_m, steps, seen)
+        steps[:], last_frame[:] = 0, -1
+        kernels.count_boxes(frame, moved, shape, grid.voxel_m, steps, last_frame)
         kernels.sum_layers(steps)
         return steps[:-1]
 
-    plain = touching()
+    plain = touching_box_kernels()
     wrong = []
     for kernels in (plain, occupancy):
-        before, turned = count(kernels, values).copy(), np.zeros((nz, nx, ny), bool)
+        before, changed = count(kernels, values).copy(), np.zeros((nz, nx, ny), bool)
         for axis in range(3):
             for nudge in (-1e-9, 1e-9):
-                turned |= count(kernels, values + nudge * np.eye(8)[axis]) != before
-        wrong.append(int(turned.sum()))
-    textbooks, mine = medians([lambda: count(plain, values), lambda: count(occupancy, values)])
+                changed |= count(kernels, values + nudge * np.eye(8)[axis]) != before
+        wrong.append(int(changed.sum()))
+    textbook_s, our_s = median_seconds([lambda: count(plain, values), lambda: count(occupancy, values)])
     return [
-        (f"boxes, {frames} frames: touching", textbooks, 1.0, wrong[0]),
-        (f"boxes, {frames} frames: ours", mine, mine / textbooks, wrong[1]),
+        (f"boxes, {frames} frames: touching", textbook_s, 1.0, wrong[0]),
+        (f"boxes, {frames} frames: ours", our_s, our_s / textbook_s, wrong[1]),
     ]
 
 
 def rows() -> list[tuple[str, float, float, int]]:
-    """(what, seconds, ratio to the textbook, wrong voxels)."""
+    """Return what, seconds, ratio to the textbook's, and wrong voxels."""
     return march_rows() + box_rows()
 
 

@@ -1,9 +1,9 @@
-"""Does the length of SUMO's step bias the scores?
+"""Check whether the length of SUMO's step biases the scores.
 
-``python -m benchmarks.steps [SEEDS]`` runs the shipped junction with as many seeds (16) for each step, 5000 frames 1 s
-apart, and compares the means of each site's share of the limit with those at 0.25 s. Independent runs: t is the
-difference over its standard error. Seconds are of the traffic stage, as shares of those at 0.25 s. About ten minutes on
-two cores.
+``python -m benchmarks.steps [SEEDS]`` runs the shipped junction with each step and several seeds (16), with 5000 frames
+1 s apart, and compares each site's mean share of the limit with that at 0.25 s. Runs are independent: t is the
+difference divided by its standard error. Seconds are those of the traffic stage, as shares of those at 0.25 s. Takes
+about ten minutes on two cores.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from egvs.studies.measurement import SettingRunner
 from egvs.studies.study_settings import Setting
 
 SCENARIO = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku"
-WATCHED = ("traffic.frames=5000", "traffic.frame_period_s=1.0")
-STEPS_S, AGAINST_S, FIRST_SEED, SEEDS = (0.1, 0.25, 0.5, 1.0), 0.25, 100, 16
+TRAFFIC = ("traffic.frames=5000", "traffic.frame_period_s=1.0")
+STEPS_S, REFERENCE_S, FIRST_SEED, SEEDS = (0.1, 0.25, 0.5, 1.0), 0.25, 100, 16
 
 
 def trial(step_s: float, seed: int) -> tuple[list[str], list[float], float]:
-    """Sites, their shares of the limit, and seconds of the traffic stage, of one run."""
-    os.environ["EGVS_STORE"] = ""  # nothing is fetched that is to be measured
+    """Return sites, their shares of the limit, and seconds of the traffic stage, of one run."""
+    os.environ["EGVS_STORE"] = ""  # nothing may come from the cache
     with tempfile.TemporaryDirectory() as folder:
-        runner = SettingRunner(SCENARIO, WATCHED, Path(folder), 1, no_progress)
-        found = runner.run(Setting("run", "seed", "seed", (f"seed={seed}", f"traffic.step_s={step_s}")))
-        return found.sites, found.shares, runner.times("traffic", found.stages["traffic"]).seconds[0]
+        runner = SettingRunner(SCENARIO, TRAFFIC, Path(folder), 1, no_progress)
+        scores = runner.run(Setting("run", "seed", "seed", (f"seed={seed}", f"traffic.step_s={step_s}")))
+        return scores.sites, scores.shares, runner.stage_times("traffic", scores.stages["traffic"]).seconds[0]
 
 
-def change(shares: Any, against: Any) -> tuple[Any, Any]:
-    """Relative change of the mean over runs, and t, of each site: shares are (runs, sites)."""
-    mean = against.mean(axis=0)
-    error = np.sqrt((shares.var(axis=0, ddof=1) + against.var(axis=0, ddof=1)) / len(shares)) / mean
-    part = shares.mean(axis=0) / mean - 1.0
-    return part, np.divide(part, error, out=np.zeros_like(part), where=error > 0)
+def change(shares: Any, reference: Any) -> tuple[Any, Any]:
+    """Return relative change of the mean over runs, and t, of each site; shares are (runs, sites)."""
+    mean = reference.mean(axis=0)
+    error = np.sqrt((shares.var(axis=0, ddof=1) + reference.var(axis=0, ddof=1)) / len(shares)) / mean
+    relative = shares.mean(axis=0) / mean - 1.0
+    return relative, np.divide(relative, error, out=np.zeros_like(relative), where=error > 0)
 
 
 def main() -> None:
@@ -49,19 +49,19 @@ def main() -> None:
     seeds = range(FIRST_SEED, FIRST_SEED + int(sys.argv[1] if len(sys.argv) > 1 else SEEDS))
     with ProcessPoolExecutor(thread_count(None), mp_context=get_context("spawn")) as pool:
         futures = {(step, seed): pool.submit(trial, step, seed) for seed in seeds for step in STEPS_S}
-        found = {key: future.result() for key, future in futures.items()}
-    sites = found[STEPS_S[0], FIRST_SEED][0]
-    shares = {step: np.array([found[step, seed][1] for seed in seeds]) for step in STEPS_S}
-    seconds = {step: float(np.median([found[step, seed][2] for seed in seeds])) for step in STEPS_S}
-    print(f"{len(seeds)} seeds; standard deviation between them {_span(100 * _scatter(shares[AGAINST_S]))} %")
-    print("step s | seconds of 0.25 s' | largest change % | its site | its t | mean change %")
+        scores = {key: future.result() for key, future in futures.items()}
+    sites = scores[STEPS_S[0], FIRST_SEED][0]
+    shares = {step: np.array([scores[step, seed][1] for seed in seeds]) for step in STEPS_S}
+    seconds = {step: float(np.median([scores[step, seed][2] for seed in seeds])) for step in STEPS_S}
+    print(f"{len(seeds)} seeds; standard deviation between them {_span(100 * _scatter(shares[REFERENCE_S]))} %")
+    print("step s | seconds, share of 0.25 s | largest change % | at site | t | mean change %")
     for step in STEPS_S:
-        part, t = change(shares[step], shares[AGAINST_S])
-        worst = int(np.abs(part).argmax())
-        ratio = seconds[step] / seconds[AGAINST_S]
+        relative, t = change(shares[step], shares[REFERENCE_S])
+        worst = int(np.abs(relative).argmax())
+        ratio = seconds[step] / seconds[REFERENCE_S]
         print(
-            f"{step} | {ratio:.2f} | {100 * part[worst]:+.1f} | {sites[worst]} | {t[worst]:+.1f}"
-            f" | {100 * part.mean():+.1f}"
+            f"{step} | {ratio:.2f} | {100 * relative[worst]:+.1f} | {sites[worst]} | {t[worst]:+.1f}"
+            f" | {100 * relative.mean():+.1f}"
         )
 
 

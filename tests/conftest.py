@@ -60,8 +60,9 @@ gamma = 4
 SITES = "site,x_m,y_m,z_m\npole_a,10,12,3\npole_b,30.5,-12,3\n"
 
 SYSTEM = (
-    "tests/city/running/",
-    "tests/effects/test_traffic_effects",
+    "tests/effects/test_articulated",
+    "tests/effects/test_pedestrians_bicycles",
+    "tests/effects/test_slope",
     "tests/importers/",
     "tests/runs/",
     "tests/studies/",
@@ -77,9 +78,10 @@ def feature(geometry: dict, **properties: object) -> dict:
     return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
-def collection(*features: dict) -> str:
-    """A GeoJSON FeatureCollection as text."""
-    return json.dumps({"type": "FeatureCollection", "features": list(features)})
+def collection(*features: dict, crs: str | None = None) -> str:
+    """A GeoJSON FeatureCollection as text, in a named system, or in world-frame metres."""
+    named = None if crs is None else {"type": "name", "properties": {"name": crs}}
+    return json.dumps({"type": "FeatureCollection", "crs": named, "features": list(features)})
 
 
 def fcd() -> str:

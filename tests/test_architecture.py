@@ -1,6 +1,7 @@
-"""Holds the package to what it promises of itself: imports, sizes, docstrings, and the names it offers.
+"""Rules for the whole package: imports, docstrings, and public names.
 
-Which package may import which stands in ``pyproject.toml`` (import-linter); here stands what cannot be said there."""
+Which package may import which is defined in ``pyproject.toml`` (import-linter); here are further rules.
+"""
 
 from __future__ import annotations
 
@@ -24,39 +25,39 @@ FOLDERS = sorted({str(Path(name).parent) for name in MODULES} - {"."})
 
 
 def tree(name: str) -> ast.Module:
-    """The syntax of a module of the package."""
+    """Return the syntax tree of a module of the package."""
     return ast.parse((PACKAGE / name).read_text(encoding="utf-8"))
 
 
-def imported(name: str) -> set[str]:
-    """All that a module imports, at any depth of its code: ``a.b`` for ``import a.b`` and for ``from a import b``."""
-    found = set()
+def imported_names(name: str) -> set[str]:
+    """Return all imports of a module, also inside functions: ``a.b`` for ``import a.b`` and for ``from a import b``."""
+    names = set()
     for node in ast.walk(tree(name)):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
-            found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-    return found
+            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
 
 
-def run_python(code: str, folder: Path = ROOT, told: str = "") -> str:
-    """What a new process prints that runs ``code`` in ``folder`` and is told something."""
-    done = subprocess.run([sys.executable, "-c", code], cwd=folder, input=told, capture_output=True, text=True)
+def run_python(code: str, folder: Path = ROOT, stdin: str = "") -> str:
+    """Run ``code`` in a new process in ``folder`` and return what it prints."""
+    done = subprocess.run([sys.executable, "-c", code], cwd=folder, input=stdin, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
-# ---- what imports what
+# ---- imports
 
 
-def test_the_contracts_on_imports_hold(capsys: pytest.CaptureFixture[str]) -> None:
+def test_import_contracts_hold(capsys: pytest.CaptureFixture[str]) -> None:
     broken = lint_imports(config_filename=str(ROOT / "pyproject.toml"), no_cache=True)
     assert not broken, capsys.readouterr().out
 
 
 @pytest.mark.slow
-def test_no_import_hides_in_a_string() -> None:
-    """What is imported by name is seen by no contract; only plug-ins and the package's own names are."""
+def test_no_import_by_string() -> None:
+    """Import contracts do not see imports by name; only plug-ins and lazy public names use them."""
     hidden = {
         name
         for name in MODULES
@@ -64,12 +65,12 @@ def test_no_import_hides_in_a_string() -> None:
         if (isinstance(node, ast.Attribute) and node.attr == "import_module")
         or (isinstance(node, ast.Name) and node.id in ("__import__", "import_module"))
     }
-    assert hidden <= {"__init__.py", "core/plugins.py"}
+    assert hidden <= {"core/lazy.py"}
 
 
 @pytest.mark.slow
-def test_one_package_reads_parquet_and_one_module_the_schemas() -> None:
-    readers = {name for name in MODULES if "pyarrow.parquet" in imported(name)}
+def test_parquet_and_schemas_are_read_in_one_place() -> None:
+    readers = {name for name in MODULES if "pyarrow.parquet" in imported_names(name)}
     assert readers <= {"artefacts/parquet.py", "traffic/fcd.py"}  # the latter reads what SUMO wrote
     named = {
         name
@@ -82,18 +83,18 @@ def test_one_package_reads_parquet_and_one_module_the_schemas() -> None:
 
 @pytest.mark.system
 @pytest.mark.parametrize("module", ["egvs", "egvs.cli.app"])
-def test_nothing_heavy_is_imported_for_help(module: str) -> None:
+def test_help_imports_nothing_heavy(module: str) -> None:
     heavy = "numpy numba pyarrow pydantic shapely trimesh matplotlib embreex scipy rich.table traci sumolib"
     code = f"import sys, {module}; print([m for m in {heavy.split()} if m in sys.modules])"
     assert run_python(code).strip() == "[]"
 
 
-# ---- how large it is, and how it explains itself
+# ---- docstrings
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MODULES)
-def test_a_module_opens_with_a_plain_sentence(name: str) -> None:
+def test_module_docstring_starts_with_sentence(name: str) -> None:
     opening = re.match(r".+?[.:?!](?=\s|$)", ast.get_docstring(tree(name)) or "", re.DOTALL)
     assert opening, "no docstring, or none that opens with a sentence"
     assert opening[0][-1] in ".:", f"no plain sentence: {opening[0]}"
@@ -104,14 +105,7 @@ def test_every_folder_with_modules_is_a_package() -> None:
     assert [folder for folder in FOLDERS if f"{folder}/__init__.py" not in MODULES] == []
 
 
-# ---- what it offers
-
-
-def test_dir_shows_what_the_package_offers() -> None:
-    assert dir(egvs) == sorted(egvs.__all__)
-    assert len(set(egvs.__all__)) == len(egvs.__all__)
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
-        _ = egvs.nothing
+# ---- public names
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +121,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 SCENE = "from egvs import *; s = load('mini'); scene = build_scene(s); "
 USES = {
     "EgvsError": "EgvsError('text')",
-    "InputError": "InputError('place', 'found', 'right').right == 'right'",
+    "InputError": "InputError('file', 'problem', 'Hint').hint == 'Hint'",
     "JointScore": "JointScore.of(__import__('egvs').load('mini'), 'joint').candidates == ('pole_a', 'pole_b')",
     "Pose": "Pose(1.0, 2.0, 3.0).position_m == (1.0, 2.0, 3.0)",
     "RunError": "RunError('text').exit_code == 1",
@@ -141,7 +135,7 @@ USES = {
     "World": SCENE + "isinstance(scene.world, World) and scene.world.triangles_m.shape[1:] == (3, 3)",
     "build_scene": "build_scene(__import__('egvs').load('mini')).sites",
     "load": "load('mini').name == 'mini'",
-    "place": "len(place(__import__('egvs').load('mini', ['placement.count=1']), 'placed').picks) == 1",
+    "place": "len(place(__import__('egvs').load('mini', ['placement.count=1']), 'placed').sensors) == 1",
     "read_scans": "len(read_scans('run/scans.parquet').to_pandas())",
     "read_scores": "list(read_scores('run/scores.parquet').to_pandas().site) == ['pole_a', 'pole_b']",
     "read_scores_by_period": "from egvs import load, run; "
@@ -154,35 +148,35 @@ USES = {
     "run": "run(__import__('egvs').load('mini'), 'again').stages['score']",
     "verify": "verify('run') == []",
 }
-"""Public name -> something that it is used for, in a folder that holds a scenario and its run."""
+"""Public name to an expression that uses it, in a folder with a scenario and its run."""
 
 
 ONE_EACH = """
 import json, os, sys, tempfile
 import numba, numpy, pydantic, scipy.special, trimesh
 assert not {"egvs", "pyarrow", "pandas", "matplotlib", "pyproj"} & set(sys.modules)
-found = {}
+results = {}
 for name, code in json.loads(sys.stdin.read()).items():
-    with tempfile.TemporaryFile("w+") as said:
+    with tempfile.TemporaryFile("w+") as output:
         child = os.fork()
         if child == 0:
-            os.dup2(said.fileno(), 1)
-            os.dup2(said.fileno(), 2)
+            os.dup2(output.fileno(), 1)
+            os.dup2(output.fileno(), 2)
             exec(compile(code, name, "exec"), {"__name__": "__main__"})
             sys.stdout.flush()
             os._exit(0)
         failed = os.waitpid(child, 0)[1]
-        said.seek(0)
-        found[name] = failed, said.read()
-print(json.dumps(found))
+        output.seek(0)
+        results[name] = failed, output.read()
+print(json.dumps(results))
 """
-"""Runs each code in a process of its own, in which nothing of this program was imported. What is there already are
-libraries that the program imports whole, so that nothing can be forgotten of them: they cost more than the rest."""
+"""Runs each code in a process of its own, in which nothing of this program was imported. Imported before are
+libraries that cost most of the time."""
 
 
 @pytest.mark.slow
 @pytest.mark.system
-def test_each_name_can_be_imported_and_used_first_and_says_what_it_is(run_folder: Path) -> None:
+def test_each_public_name_works_as_first_import_and_has_docstring(run_folder: Path) -> None:
     codes = {}
     for name in sorted(set(egvs.__all__) - {"__version__"}):
         *before, use = USES[name].split("; ")
@@ -190,16 +184,16 @@ def test_each_name_can_be_imported_and_used_first_and_says_what_it_is(run_folder
         codes[name] = "\n".join(
             [*lines, f"import inspect\nprint(inspect.isclass({name}))\nprint(inspect.getdoc({name}))"]
         )
-    for name, (failed, said) in json.loads(run_python(ONE_EACH, run_folder, json.dumps(codes))).items():
-        assert not failed, (name, said)
-        kind, doc = said.split("\n", 1)
+    for name, (failed, output) in json.loads(run_python(ONE_EACH, run_folder, json.dumps(codes))).items():
+        assert not failed, (name, output)
+        kind, doc = output.split("\n", 1)
         assert doc.strip() not in ("", "None"), name
         assert kind == str(name[0].isupper()), name
 
 
 @pytest.mark.slow
 @pytest.mark.system
-def test_a_run_knows_nothing_of_validation(run_folder: Path) -> None:
+def test_run_does_not_import_validation(run_folder: Path) -> None:
     code = (
         "import sys, egvs;"
         "s = egvs.load('mini', ['score.gamma=3']); egvs.run(s, 'other', jobs=1);"

@@ -1,1 +1,1 @@
-"""Learns from what detectors find and miss how likely they find a vehicle, from what a site sees of it."""
+"""Fit models of the probability that a detector finds a vehicle, from what a site sees of it."""

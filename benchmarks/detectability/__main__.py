@@ -1,7 +1,7 @@
-"""``make detectability``: learns anew how likely each detector finds a vehicle, from the study's training junctions.
+"""``make detectability``: fit the probability that each detector finds a vehicle, on the study's training junctions.
 
-Writes the file of models that the program has as data, and the picture of their calibration. Worlds, traffic and what
-detectors find are those of the study of validity (``make validity``): what it left in the store is not made again.
+Writes the file of models that the program contains, and the picture of their calibration. Worlds, traffic and
+detections are those of the validity study (``make validity``), whose cached results are reused.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import sklearn
 
 from benchmarks.detectability import examples, figures, writing
 from benchmarks.detectability.examples import JunctionExamples
-from benchmarks.detectability.fitting import elsewhere, fitted
+from benchmarks.detectability.fitting import cross_validate, fit_model
 from benchmarks.validity import junctions, poses, study
 from benchmarks.validity.junctions import Role
 from benchmarks.validity.study import Extent
@@ -30,13 +30,13 @@ from egvs.validation.detectors.base import Detector
 from egvs.validation.sweeps import POINT_COUNTS_NAME
 
 ROOT = Path(__file__).resolve().parents[2]
-SAID_EVERY_S = 30.0
-FEWEST_JUNCTIONS = 2
-"""Each is foretold by the others."""
+REPORT_EVERY_S = 30.0
+MIN_JUNCTIONS = 2
+"""Each is predicted by the model of the others."""
 
 
 def main(given: Sequence[str] | None = None) -> int:
-    """Learn, and write what was learnt; the exit code."""
+    """Fit and write the models, and return the exit code."""
     try:
         _run(_parser().parse_args(given))
     except EgvsError as error:
@@ -59,97 +59,97 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _run(chosen: argparse.Namespace) -> None:
-    models = chosen.out / MODEL_FILE.name if chosen.out else MODEL_FILE
-    picture = (chosen.out or ROOT / "docs" / "images") / figures.NAME
-    if not chosen.only_draw:
-        text = _learnt(chosen)
+def _run(arguments: argparse.Namespace) -> None:
+    models = arguments.out / MODEL_FILE.name if arguments.out else MODEL_FILE
+    picture = (arguments.out or ROOT / "docs" / "images") / figures.NAME
+    if not arguments.only_draw:
+        text = _fit_models(arguments)
         models.parent.mkdir(parents=True, exist_ok=True)
         with files.atomic_write(models) as partial:
             partial.write_text(text, encoding="utf-8")
         print(models)
     elif not models.is_file():
-        raise InputError("--only-draw", f"no such file ({models})", "a folder that was written by this command")
+        raise InputError("--only-draw", f"no such file ({models})", "Name a folder that this command wrote.")
     figures.draw(picture, models)
     print(picture)
 
 
-def _learnt(chosen: argparse.Namespace) -> str:
-    """The file of models."""
-    begun = time.monotonic()
+def _fit_models(arguments: argparse.Namespace) -> str:
+    """Return the file of models."""
+    start_s = time.monotonic()
 
-    def told(text: str) -> None:
-        print(f"{time.monotonic() - begun:6.0f} s  {text}", flush=True)
+    def report(text: str) -> None:
+        print(f"{time.monotonic() - start_s:6.0f} s  {text}", flush=True)
 
     detectors = {name: base.make_detector(name) for name in DETECTORS}
-    homes = _homes(chosen)
-    chosen.data.mkdir(parents=True, exist_ok=True)
-    told(f"preparing {', '.join(name for name, _, _ in homes)}")
-    each = {name: _examples((name, role, home), detectors, chosen, told) for name, role, home in homes}
+    folders = _junction_folders(arguments)
+    arguments.data.mkdir(parents=True, exist_ok=True)
+    report(f"preparing {', '.join(name for name, _, _ in folders)}")
+    each = {name: _examples((name, role, home), detectors, arguments, report) for name, role, home in folders}
     learnt_on = {
-        name: writing.LearntOn(
-            {detector: len(e.hits) for detector, e in its.by_detector.items()}, its.sensors, its.vehicle_frames
+        name: writing.TrainingJunction(
+            {detector: len(e.hits) for detector, e in value.by_detector.items()}, value.sensors, value.vehicle_frames
         )
-        for name, its in each.items()
+        for name, value in each.items()
     }
     settings = {name: files.hash_json(detector.settings) for name, detector in detectors.items()}
-    about = writing.About(learnt_on, chosen.frames, settings, sklearn.__version__)
+    metadata = writing.TrainingMetadata(learnt_on, arguments.frames, settings, sklearn.__version__)
     models = {}
     for name in detectors:
-        told(f"{name}: learning")
-        mine = {junction: its.by_detector[name] for junction, its in each.items()}
-        models[name] = fitted(list(mine.values())) | {"elsewhere": elsewhere(mine)}
+        report(f"{name}: fitting")
+        by_junction = {junction: value.by_detector[name] for junction, value in each.items()}
+        models[name] = fit_model(list(by_junction.values())) | {"elsewhere": cross_validate(by_junction)}
         rho = models[name]["elsewhere"]["rho_with_ap"]
-        told(f"{name}: rho with AP elsewhere, {', '.join(f'{junction} {its:.3f}' for junction, its in rho.items())}")
-    return writing.text(about, models)
+        by_other = ", ".join(f"{junction} {value:.3f}" for junction, value in rho.items())
+        report(f"{name}: rho with AP at other junctions, {by_other}")
+    return writing.text(metadata, models)
 
 
-def _homes(chosen: argparse.Namespace) -> list[tuple[str, Role, Path]]:
-    """The training junctions."""
+def _junction_folders(arguments: argparse.Namespace) -> list[tuple[str, Role, Path]]:
+    """Return the training junctions."""
     known = [name for name, role in junctions.SHIPPED.items() if role == "training"]
-    names = chosen.junction.split(",") if chosen.junction else known
+    names = arguments.junction.split(",") if arguments.junction else known
     if unknown := [name for name in names if name not in known]:
-        raise InputError(
-            "--junction", repr(unknown[0]), f"one of {', '.join(known)}: others are quoted, not learnt from"
-        )
-    homes = junctions.shipped(names)
-    at = options.latitude_and_longitude(chosen.osm_training_at) if chosen.osm_training_at else None
-    if chosen.osm_training is not None:
-        homes.append(junctions.from_osm("training", chosen.osm_training, at, chosen.data / "junctions"))
+        problem = f"expected training junctions, got {unknown[0]!r}"
+        raise InputError("--junction", problem, f"Use some of {', '.join(known)}.")
+    folders = junctions.shipped(names)
+    at = options.latitude_and_longitude(arguments.osm_training_at) if arguments.osm_training_at else None
+    if arguments.osm_training is not None:
+        folders.append(junctions.from_osm("training", arguments.osm_training, at, arguments.data / "junctions"))
     elif at is not None:
-        raise InputError("--osm-training-at", "no --osm-training", "the extract in which it lies")
-    if len(homes) < FEWEST_JUNCTIONS:
-        there = ", ".join(name for name, _, _ in homes) or "none"
-        raise InputError("--junction", f"{there} alone", "two junctions at least: each is foretold by the others")
-    return homes
+        raise InputError("--osm-training-at", "used without --osm-training", "Name the extract that contains it.")
+    if len(folders) < MIN_JUNCTIONS:
+        there = ", ".join(name for name, _, _ in folders) or "none"
+        raise InputError("--junction", f"expected at least {MIN_JUNCTIONS} junctions, got {there}", "Name another one.")
+    return folders
 
 
 def _examples(
     home: tuple[str, Role, Path],
     detectors: dict[str, Detector],
-    chosen: argparse.Namespace,
-    told: Callable[[str], None],
+    arguments: argparse.Namespace,
+    report: Callable[[str], None],
 ) -> JunctionExamples:
     name = home[0]
-    junction = junctions.ready(*home, chosen.data / "worlds" / name, chosen.places)
+    junction = junctions.ready(*home, arguments.data / "worlds" / name, arguments.places)
     junctions.check_unseen(junction.scenario)
-    extent = Extent(chosen.frames, 0, chosen.places)
-    (part,) = study.parts([junction], [POINT_COUNTS_NAME, *detectors], extent, chosen.data)
+    extent = Extent(arguments.frames, 0, arguments.places)
+    (part,) = study.parts([junction], [POINT_COUNTS_NAME, *detectors], extent, arguments.data)
     looks = ", ".join(f"{detector} from {len(part.detectors[detector])}" for detector in detectors)
-    minutes = study.reckoned_s(part) / 60
-    told(f"{name}: {part.frames} frames {part.apart_s:g} s apart, {looks}; some {minutes:.0f} minutes of one core")
-    return examples.examples_of(part, detectors, chosen.data, jobs=chosen.jobs, progress=_progress(name, told))
+    minutes = study.estimated_s(part) / 60
+    report(f"{name}: {part.frames} frames {part.apart_s:g} s apart, {looks}; about {minutes:.0f} minutes on one core")
+    return examples.examples_of(part, detectors, arguments.data, jobs=arguments.jobs, progress=_progress(name, report))
 
 
-def _progress(name: str, told: Callable[[str], None]) -> ProgressCallback:
-    """A line every half minute."""
-    said_at = time.monotonic()
+def _progress(name: str, report: Callable[[str], None]) -> ProgressCallback:
+    """Return a callback that prints a line every half minute."""
+    reported_at = time.monotonic()
 
     def progress(what: str, done: int, total: int) -> None:
-        nonlocal said_at
-        if time.monotonic() - said_at >= SAID_EVERY_S:
-            said_at = time.monotonic()
-            told(f"{name}: {what} {done}" + (f" of {total}" if total else ""))
+        nonlocal reported_at
+        if time.monotonic() - reported_at >= REPORT_EVERY_S:
+            reported_at = time.monotonic()
+            report(f"{name}: {what} {done}" + (f" of {total}" if total else ""))
 
     return progress
 

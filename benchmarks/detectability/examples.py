@@ -1,10 +1,10 @@
-"""What detectors do at one junction of the study, beside what is seen of each vehicle from the same sites.
+"""Detections at one junction of the study, with what is visible of each vehicle from the same sites.
 
-Steps: bring the unseen traffic of the study; count what each site sees of its vehicles, from the empty scan; let each
-detector look (what the store has is not looked at again); say which vehicles it found, and its AP.
+Steps: simulate the held-out traffic of the study; compute what each site sees of its vehicles, from the empty scan; run
+each detector (cached results are reused); determine which vehicles it found, and its AP.
 
-A vehicle-frame is found in a view (from above, in space) where any detection overlaps it by more than :data:`IOU`: as
-vehicles do not stand in one another, no detection overlaps two by so much, and matching would say the same.
+A vehicle in a frame is found in a view (from above, in space) if any detection overlaps it by more than :data:`IOU`.
+Vehicles do not overlap each other, so no detection overlaps two by so much, and matching would give the same.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.detectability.fitting import Examples, Floats
-from benchmarks.validity.measuring import Part
+from benchmarks.validity.measurement import Part
 from benchmarks.validity.record import BOXED
 from egvs.core import runtime
 from egvs.core.errors import InputError
@@ -37,12 +37,12 @@ from egvs.validation.sweeps import DetectedBoxes, DetectorResult
 
 IOU = IOUS[0]
 AP = BOXED[0]
-"""By which a vehicle is found, and what foretelling is held against."""
+"""Overlap of a found vehicle, and the measure that predictions are compared with."""
 
 
 @dataclass(frozen=True, eq=False)
 class JunctionExamples:
-    """What each detector did at one junction.
+    """Results of each detector at one junction.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ def examples_of(
     jobs: int | None = None,
     progress: ProgressCallback = no_progress,
 ) -> JunctionExamples:
-    """Every vehicle-frame of a junction, as seen from each site, and whether it was found.
+    """Return every vehicle in every frame of a junction, as visible from each site, and whether it was found.
 
     Parameters
     ----------
@@ -83,49 +83,57 @@ def examples_of(
         For traffic without any vehicle in the region of interest.
     """
     with tempfile.TemporaryDirectory(prefix=".work-", dir=folder) as temporary:
-        unseen = prepare_held_out_traffic(
+        held_out = prepare_held_out_traffic(
             part.scenario, Path(temporary), part.frames, apart_s=part.apart_s, jobs=jobs, progress=progress
         )
-        record = TargetRecord.of(list(unseen.read()), part.scenario.roi.grid)
+        record = TargetRecord.of(list(held_out.read()), part.scenario.roi.grid)
         if not len(record):
-            found = f"no vehicle has its centre in the region of interest in {unseen.frames} frames of unseen traffic"
-            raise InputError(f"{part.scenario.file}: roi", found, "traffic that passes the region, or more --frames")
-        features = _features(unseen, record, jobs, progress)
+            results = (
+                f"no vehicle has its centre in the region of interest in {held_out.frames} frames of held-out traffic"
+            )
+            raise InputError(
+                f"{part.scenario.file}: roi", results, "Use traffic that passes the region, or more --frames."
+            )
+        features = _features(held_out, record, jobs, progress)
         by_detector = {}
         for name, detector in detectors.items():
-            sites = [site for site in unseen.scene.sites if site.name in part.detectors[name]]
-            found_from = run_detectors(sites, SiteDetectionTask(unseen, {name: detector}), jobs=jobs, progress=progress)
-            hits = [hits_of(record, _boxes(its[name])) for its in found_from.values()]
-            seen = [features[site] for site in found_from]
-            by_detector[name] = Examples(seen, hits, _ap(unseen, found_from, name))
-    sensors = tuple(sorted({site.sensor for site in unseen.scene.sites}))
+            sites = [site for site in held_out.scene.sites if site.name in part.detectors[name]]
+            results_by_site = run_detectors(
+                sites, SiteDetectionTask(held_out, {name: detector}), jobs=jobs, progress=progress
+            )
+            hits = [hits_of(record, _boxes(result[name])) for result in results_by_site.values()]
+            site_features = [features[site] for site in results_by_site]
+            by_detector[name] = Examples(site_features, hits, _ap(held_out, results_by_site, name))
+    sensors = tuple(sorted({site.sensor for site in held_out.scene.sites}))
     return JunctionExamples(part.name, sensors, len(record), by_detector)
 
 
 def _features(
-    unseen: HeldOutTraffic, record: TargetRecord, jobs: int | None, progress: ProgressCallback
+    held_out: HeldOutTraffic, record: TargetRecord, jobs: int | None, progress: ProgressCallback
 ) -> dict[str, Floats]:
-    """What a model learns from, of each site."""
-    scanner, sites = Scanner(unseen.scene), unseen.scene.sites
+    """Return the features of a model, for each site."""
+    scanner, sites = Scanner(held_out.scene), held_out.scene.sites
 
     def of(site: Site) -> Floats:
         beams = Beams.of(scanner.scan_site(site))
-        return detectability_features(visible_targets(record, beams, detection_probability(unseen.scene, beams.sensor)))
+        return detectability_features(
+            visible_targets(record, beams, detection_probability(held_out.scene, beams.sensor))
+        )
 
-    found: dict[str, Floats] = {}
-    for site, its in zip(sites, runtime.map_ordered(of, sites, runtime.thread_count(jobs)), strict=True):
-        found[site.name] = its
-        progress("sites seen from", len(found), len(sites))
-    return found
-
-
-def _boxes(found: DetectorResult) -> list[Floats]:
-    assert isinstance(found, DetectedBoxes)
-    return [its.boxes for its in found.frames]
+    results: dict[str, Floats] = {}
+    for site, result in zip(sites, runtime.map_ordered(of, sites, runtime.thread_count(jobs)), strict=True):
+        results[site.name] = result
+        progress("visibility of sites", len(results), len(sites))
+    return results
 
 
-def hits_of(record: TargetRecord, found: Sequence[Floats]) -> Floats:
-    """Share of the two views in which each vehicle-frame is found, (n,) float64: 0, 0.5 or 1.
+def _boxes(results: DetectorResult) -> list[Floats]:
+    assert isinstance(results, DetectedBoxes)
+    return [result.boxes for result in results.frames]
+
+
+def hits_of(record: TargetRecord, results: Sequence[Floats]) -> Floats:
+    """Return the share of the two views in which each vehicle is found, (n,) float64: 0, 0.5 or 1.
 
     Parameters
     ----------
@@ -134,18 +142,18 @@ def hits_of(record: TargetRecord, found: Sequence[Floats]) -> Floats:
         :data:`egvs.artefacts.traffic_frames.BOX_COLUMNS`.
     """
     each = np.split(record.boxes, np.searchsorted(record.frame, np.arange(1, len(record.numbers))))
-    return np.concatenate([_overlapped(boxes, its) for boxes, its in zip(each, found, strict=True)])
+    return np.concatenate([_overlapped(boxes, result) for boxes, result in zip(each, results, strict=True)])
 
 
-def _overlapped(boxes: Floats, found: Floats) -> Floats:
-    box, its = (number.ravel() for number in np.indices((len(boxes), len(found))))
-    overlap = paired_overlap(boxes[box], found[its]).reshape(len(VIEWS), len(boxes), len(found))
+def _overlapped(boxes: Floats, results: Floats) -> Floats:
+    box, result = (number.ravel() for number in np.indices((len(boxes), len(results))))
+    overlap = paired_overlap(boxes[box], results[result]).reshape(len(VIEWS), len(boxes), len(results))
     shares: Floats = (overlap > IOU + OVERLAP_TOLERANCE).any(axis=2).mean(axis=0)
     return shares
 
 
-def _ap(unseen: HeldOutTraffic, found: Mapping[str, Mapping[str, DetectorResult]], name: str) -> list[float]:
-    """AP of a detector, of each site."""
-    rows, _ = detection_metrics.measure_detection(list(unseen.read()), unseen.scene.roi, found)
+def _ap(held_out: HeldOutTraffic, results: Mapping[str, Mapping[str, DetectorResult]], name: str) -> list[float]:
+    """Return the AP of a detector at each site."""
+    rows, _ = detection_metrics.measure_detection(list(held_out.read()), held_out.scene.roi, results)
     of = {row.site: row.measures[AP].value for row in rows if row.detector == name and row.objects_of == ALL_OBJECTS}
-    return [of[site] for site in found]
+    return [of[site] for site in results]

@@ -1,8 +1,8 @@
-"""Fits the chance that a detector finds a vehicle, and says how well that holds on a junction it was not learnt from.
+"""Fit the probability that a detector finds a vehicle, and test it on a junction that was not used for fitting.
 
-A boosted model of few small trees (scikit-learn's histogram boosting), held to rise and fall as
-:data:`egvs.scoring.target_scores.MONOTONICITY` says. Its size was settled on the training junctions, each foretold
-by the model of the others: docs/validation.md has what more trees, or none of these directions, would change.
+The model is a boosted ensemble of few small trees (scikit-learn's histogram boosting), with monotonicity as in
+:data:`egvs.scoring.target_scores.MONOTONICITY`. Its size was chosen by cross-validation over the training junctions;
+docs/validation.md shows the effect of more trees and of dropping monotonicity.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from sklearn.ensemble import HistGradientBoostingClassifier
 
 from egvs.scoring.target_scores import MONOTONICITY, DetectabilityModel
 
-TREES, LEAVES, RATE, FEWEST = 60, 12, 0.15, 600
-"""Trees, leaves of each, how much of each is taken, and vehicle-frames (a hit and a miss count as two) in a leaf."""
+TREES, LEAVES, RATE, MIN_SAMPLES = 60, 12, 0.15, 600
+"""Trees, leaves per tree, learning rate, and vehicle-frames per leaf (a hit and a miss count as two)."""
 
 BINS = 10
-"""Of the calibration curve."""
+"""Bins of the calibration curve."""
 
 DIGITS = 6
 """Significant digits of thresholds and leaves."""
@@ -32,7 +32,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Examples:
-    """What one detector did at one junction.
+    """Results of one detector at one junction.
 
     Attributes
     ----------
@@ -49,18 +49,18 @@ class Examples:
     ap: Sequence[float]
 
 
-def fitted(examples: Sequence[Examples]) -> dict[str, Any]:
-    """The model of these junctions, as the file of the program has it."""
-    x = np.concatenate([its for e in examples for its in e.features])
-    y = np.concatenate([its for e in examples for its in e.hits])
+def fit_model(examples: Sequence[Examples]) -> dict[str, Any]:
+    """Return the model of these junctions, in the format of the program's file."""
+    x = np.concatenate([examples_ for e in examples for examples_ in e.features])
+    y = np.concatenate([examples_ for e in examples for examples_ in e.hits])
     weight, label = np.append(y, 1.0 - y), np.append(np.ones(len(y)), np.zeros(len(y)))
-    kept = weight > 0.0
-    found = HistGradientBoostingClassifier(
-        max_iter=TREES, learning_rate=RATE, max_leaf_nodes=LEAVES, min_samples_leaf=FEWEST,
+    is_used = weight > 0.0
+    classifier = HistGradientBoostingClassifier(
+        max_iter=TREES, learning_rate=RATE, max_leaf_nodes=LEAVES, min_samples_leaf=MIN_SAMPLES,
         monotonic_cst=list(MONOTONICITY.values()), early_stopping=False, random_state=0,
-    ).fit(np.concatenate([x, x])[kept], label[kept], sample_weight=weight[kept])  # fmt: skip
-    trees = [[_node(node) for node in predictor[0].nodes] for predictor in found._predictors]
-    return {"base": _short(found._baseline_prediction.item()), "trees": trees}
+    ).fit(np.concatenate([x, x])[is_used], label[is_used], sample_weight=weight[is_used])  # fmt: skip
+    trees = [[_node(node) for node in predictor[0].nodes] for predictor in classifier._predictors]
+    return {"base": _short(classifier._baseline_prediction.item()), "trees": trees}
 
 
 def _node(node: Any) -> list[float | int]:
@@ -73,21 +73,21 @@ def _short(value: float) -> float:
     return float(f"{float(value):.{DIGITS}g}")
 
 
-def elsewhere(examples: Mapping[str, Examples]) -> dict[str, Any]:
-    """Each junction foretold by the model of the others: Spearman's rho with AP, and the calibration curve of all."""
+def cross_validate(examples: Mapping[str, Examples]) -> dict[str, Any]:
+    """Predict each junction with the model of the others: Spearman's rho with AP, and the calibration curve of all."""
     rho = dict[str, float]()
     chances, hits = list[Floats](), list[Floats]()
-    for name, its in examples.items():
-        model = DetectabilityModel.of(fitted([e for other, e in examples.items() if other != name]))
-        each = [model.chances(features) for features in its.features]
-        rho[name] = round(float(spearmanr([c.mean() for c in each], its.ap).statistic), 3)
+    for name, examples_ in examples.items():
+        model = DetectabilityModel.of(fit_model([e for other, e in examples.items() if other != name]))
+        each = [model.chances(features) for features in examples_.features]
+        rho[name] = round(float(spearmanr([c.mean() for c in each], examples_.ap).statistic), 3)
         chances += each
-        hits += its.hits
+        hits += examples_.hits
     return {"rho_with_ap": rho, "calibration": curve(np.concatenate(chances), np.concatenate(hits))}
 
 
 def curve(chances: Floats, hits: Floats) -> list[dict[str, float]]:
-    """Of vehicle-frames with about the same chance: that chance, the share that was found, and how many they are."""
+    """Return probability, share that was found, and number of vehicles, by bins of probability."""
     bin_of = np.minimum((chances * BINS).astype(np.int64), BINS - 1)
     return [
         {

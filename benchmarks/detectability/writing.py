@@ -1,6 +1,6 @@
-"""The file of models, ``pipeline/egvs/scoring/target_scores.json``: what was learnt, from what, how well it holds.
+"""The file of models, ``pipeline/egvs/scoring/target_scores.json``: trees, training data, and cross-validation.
 
-A line a tree and a line a part of the calibration curve, so that a change shows where it is.
+Each tree and each part of the calibration curve has its own line, so that changes are easy to see.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ FINDS = "a box that overlaps the vehicle by more than 0.7, in the mean of seen f
 
 
 @dataclass(frozen=True)
-class LearntOn:
-    """A junction that was learnt from.
+class TrainingJunction:
+    """A training junction.
 
     Attributes
     ----------
@@ -36,8 +36,8 @@ class LearntOn:
 
 
 @dataclass(frozen=True)
-class About:
-    """What the models were learnt from.
+class TrainingMetadata:
+    """What the models were trained with.
 
     Attributes
     ----------
@@ -51,18 +51,18 @@ class About:
         The version that fitted.
     """
 
-    learnt_on: Mapping[str, LearntOn]
+    learnt_on: Mapping[str, TrainingJunction]
     frames: int
     settings: Mapping[str, str]
     scikit_learn: str
 
     def to_json(self) -> dict[str, Any]:
-        """As in the file."""
+        """Return the metadata as in the file."""
         return {"made_by": MADE_BY, "finds": FINDS, "features": list(FEATURES), **asdict(self)}
 
 
-def text(about: About, models: Mapping[str, Mapping[str, Any]]) -> str:
-    """The whole file.
+def text(metadata: TrainingMetadata, models: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the complete file.
 
     Parameters
     ----------
@@ -70,14 +70,14 @@ def text(about: About, models: Mapping[str, Mapping[str, Any]]) -> str:
         By detector: ``base`` and ``trees`` of :func:`benchmarks.detectability.fitting.fitted`, and ``elsewhere`` of
         :func:`benchmarks.detectability.fitting.elsewhere`.
     """
-    head = json.dumps(about.to_json(), indent=1).replace("\n", "\n ")
-    each = ",\n".join(f'  "{name}": {_model(its)}' for name, its in models.items())
+    head = json.dumps(metadata.to_json(), indent=1).replace("\n", "\n ")
+    each = ",\n".join(f'  "{name}": {_model(model)}' for name, model in models.items())
     return f'{{\n "about": {head},\n "detectors": {{\n{each}\n }}\n}}\n'
 
 
-def _model(its: Mapping[str, Any]) -> str:
-    rho, curve = its["elsewhere"]["rho_with_ap"], its["elsewhere"]["calibration"]
+def _model(model: Mapping[str, Any]) -> str:
+    rho, curve = model["elsewhere"]["rho_with_ap"], model["elsewhere"]["calibration"]
     parts = ",\n     ".join(json.dumps(part) for part in curve)
-    trees = ",\n    ".join(json.dumps(tree, separators=(",", ":")) for tree in its["trees"])
+    trees = ",\n    ".join(json.dumps(tree, separators=(",", ":")) for tree in model["trees"])
     elsewhere = f'{{\n    "rho_with_ap": {json.dumps(rho)},\n    "calibration": [\n     {parts}\n    ]\n   }}'
-    return f'{{\n   "elsewhere": {elsewhere},\n   "base": {its["base"]},\n   "trees": [\n    {trees}\n   ]\n  }}'
+    return f'{{\n   "elsewhere": {elsewhere},\n   "base": {model["base"]},\n   "trees": [\n    {trees}\n   ]\n  }}'

@@ -1,5 +1,5 @@
-"""How often does the pipeline decide otherwise than exact arithmetic does?
+"""Count decisions of the program that differ from exact arithmetic.
 
-``make numerics`` runs every hunt at full length and prints one table: case, rule, how it was tested, how many cases,
-how many were excluded because a depth lies within the stated margin of its bound, mismatches, worst figure.
+``make numerics`` runs all checks at full length and prints one table: case, rule, how it was tested, number of cases,
+number of cases excluded because a depth is within the stated margin of its bound, mismatches, worst figure.
 """

@@ -1,7 +1,7 @@
-"""Are there any mismatches?
+"""Run all numerical checks.
 
-``python -m benchmarks.numerics`` hunts at full length (``--scale 1e-3`` is a smoke test), prints one table, and ends
-with 1 when a decision came out other than exact arithmetic has it.
+``python -m benchmarks.numerics`` runs them at full length (``--scale 1e-3`` is a smoke test), prints one table, and
+exits with 1 if a decision differs from exact arithmetic.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ def cells(row: Row) -> tuple[str, ...]:
     return row.case, row.rule, row.tested, f"{row.cases:,}", f"{row.excluded:,}", f"{row.mismatches:,}", row.worst
 
 
-def markdown(found: list[Row]) -> str:
+def markdown(rows: list[Row]) -> str:
     """The rows as a Markdown table."""
-    lines = [HEADINGS, ("---",) * 3 + ("---:",) * 3 + ("---",), *(cells(row) for row in found)]
+    lines = [HEADINGS, ("---",) * 3 + ("---:",) * 3 + ("---",), *(cells(row) for row in rows)]
     return "".join("| " + " | ".join(text.replace("|", "\\|") for text in line) + " |\n" for line in lines)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run all hunts; the exit code."""
+    """Run all checks, and return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.numerics", description=__doc__)
     parser.add_argument("--scale", type=float, default=1.0, help="share of the full length (default 1)")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the table there too")
@@ -42,18 +42,18 @@ def main(arguments: list[str] | None = None) -> int:
     if not 0 < chosen.scale <= 100:
         parser.error(f"--scale {chosen.scale:g}: a number above 0, at most 100")
     console, start = Console(highlight=False), time.perf_counter()
-    found: dict[str, list[Row]] = {}
+    by_module: dict[str, list[Row]] = {}
     with Progress(console=console, transient=True) as progress:
-        for module in progress.track(MODULES, description="hunting"):
-            found[module.__name__.rpartition(".")[2]] = module.rows(chosen.scale)
-    rows = [row for part in found.values() for row in part]
-    table = Table(*HEADINGS, box=None, title=f"Decisions against exact arithmetic, scale {chosen.scale:g}")
+        for module in progress.track(MODULES, description="checking"):
+            by_module[module.__name__.rpartition(".")[2]] = module.rows(chosen.scale)
+    rows = [row for part in by_module.values() for row in part]
+    table = Table(*HEADINGS, box=None, title=f"Decisions compared with exact arithmetic, scale {chosen.scale:g}")
     for row in rows:
         table.add_row(*cells(row), style="red" if row.mismatches else None)
     console.print(table)
     if chosen.markdown is not None:
         chosen.markdown.write_text(markdown(rows), encoding="utf-8")
-    for name, part in found.items():
+    for name, part in by_module.items():
         console.print(
             f"{name}: {sum(row.mismatches for row in part)} mismatches in {sum(row.cases for row in part):,} cases"
         )

@@ -1,9 +1,9 @@
-"""Does the occupancy count other voxels than exact arithmetic does, on a million boxes?
+"""Compare the voxels that the occupancy counts with exact arithmetic, on a million boxes.
 
-Each box is counted by itself and its voxels are compared with the depth of overlap, computed in float64 from the
-fifteen axes of the separating-axis theorem (the flat path of the kernel cuts polygons instead and shares nothing with
-it; the pitched one decides by the same theorem, but not by depth). Where a depth lies within 1e-8 m of the 0.1 mm
-bound, the pair goes to 50-digit arithmetic. So every answer is certain, and only the doubtful ones are slow.
+Each box is counted alone, and its voxels are compared with the depth of overlap, in float64 from the fifteen axes of
+the separating-axis theorem. (The kernel's path for level boxes clips polygons instead; its path for pitched boxes uses
+the same theorem, but not depths.) If a depth is within 1e-8 m of the bound of 0.1 mm, 50-digit arithmetic decides the
+pair instead. So every answer is certain, and only a few are slow.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from tests.oracles import boxes as oracle
 import egvs
 from benchmarks.numerics.row import Row
 from benchmarks.scenes import recorded_boxes
-from egvs.artefacts.traffic_frames import FrameBoxes
+from egvs.artefacts.frame_boxes import FrameBoxes
 from egvs.core.grid import Grid
 from egvs.kernels import occupancy
 from egvs.scoring.occupancy import count_occupancy
@@ -33,7 +33,7 @@ _kernel = numba.njit(nogil=True, error_model="numpy", cache=True)
 
 @_kernel
 def _prepare(box, axes, normals):
-    """Fill the box's axes and the fifteen candidate normals."""
+    """Fill the axes of a box and the fifteen candidate normals."""
     cy, sy, cp, sp = np.cos(box[3]), np.sin(box[3]), np.cos(box[4]), np.sin(box[4])
     axes[0, 0], axes[0, 1], axes[0, 2] = cy * cp, sy * cp, sp
     axes[1, 0], axes[1, 1], axes[1, 2] = -sy, cy, 0.0
@@ -67,7 +67,7 @@ def _depth(box, axes, normals, low, voxel_m):
 
 @_kernel
 def depth_in(box, low, voxel_m):
-    """Depth of one box in the voxel at ``low``."""
+    """Return the depth of a box in the voxel at ``low``."""
     axes, normals = np.empty((3, 3)), np.empty((15, 3))
     _prepare(box, axes, normals)
     return _depth(box, axes, normals, low, voxel_m)
@@ -81,7 +81,7 @@ def compare(values, shape, voxel_m, doubtful, nearest):
     what the kernel says) are filled: pairs within UNSURE_M of the bound. ``nearest`` gets each box's least distance of
     a depth to the bound."""
     nx, ny, nz = shape[0], shape[1], shape[2]
-    steps, seen = np.zeros((nz + 1, nx, ny), np.int32), np.full((3, nx, ny), -1, np.int64)
+    steps, last_frame = np.zeros((nz + 1, nx, ny), np.int32), np.full((3, nx, ny), -1, np.int64)
     axes, normals, low = np.empty((3, 3)), np.empty((15, 3)), np.empty(3)
     first, last, frame = np.empty(3, np.int64), np.empty(3, np.int64), np.zeros(1, np.int64)
     wrong, pairs, n = 0, 0, 0
@@ -89,7 +89,7 @@ def compare(values, shape, voxel_m, doubtful, nearest):
         box = values[b]
         steps[:] = 0
         frame[0] = b
-        occupancy.count_boxes(frame, values[b : b + 1], shape, voxel_m, steps, seen)
+        occupancy.count_boxes(frame, values[b : b + 1], shape, voxel_m, steps, last_frame)
         occupancy.sum_layers(steps)
         _prepare(box, axes, normals)
         for a in range(3):
@@ -105,8 +105,8 @@ def compare(values, shape, voxel_m, doubtful, nearest):
                 for iz in range(first[2], last[2]):
                     low[0], low[1], low[2] = ix * voxel_m, iy * voxel_m, iz * voxel_m
                     deep = _depth(box, axes, normals, low, voxel_m)
-                    said = steps[iz, ix, iy]
-                    inside += said
+                    counted = steps[iz, ix, iy]
+                    inside += counted
                     pairs += 1
                     nearest[b] = min(nearest[b], abs(deep - 1e-4))
                     if abs(deep - 1e-4) <= UNSURE_M:
@@ -116,42 +116,41 @@ def compare(values, shape, voxel_m, doubtful, nearest):
                                 ix,
                                 iy,
                                 iz,
-                                said,
+                                counted,
                             )
                         n += 1
                     else:
-                        wrong += said != (1 if deep > 1e-4 else 0)
+                        wrong += counted != (1 if deep > 1e-4 else 0)
         wrong += abs(steps[:nz].sum() - inside)  # nothing outside the box's own bounds
     return wrong, pairs, n
 
 
 def check(values, shape, voxel_m):
-    """(pairs, asked, excluded, mismatches): voxel and box; settled in 50 digits; within 1e-10 m of the bound; wrong."""
+    """Return numbers of pairs: all, decided in 50 digits, within 1e-10 m of the bound, and wrong."""
     doubtful, nearest = np.empty((40 * len(values) + 100, 5), np.int64), np.empty(len(values))
     wrong, pairs, n = compare(values, np.asarray(shape, np.int64), voxel_m, doubtful, nearest)
     assert n <= len(doubtful)
     excluded = 0
     with mpmath.workdps(oracle.DIGITS):
         bound, margin, voxel = mpmath.mpf(100001) / 10**9, mpmath.mpf(1) / 10**10, mpmath.mpf(voxel_m)
-        for b, ix, iy, iz, said in doubtful[:n].tolist():
+        for b, ix, iy, iz, counted in doubtful[:n].tolist():
             exact = oracle.depth(*oracle.exact_box(values[b]), [ix * voxel, iy * voxel, iz * voxel], voxel) - bound
             if abs(exact) <= margin:
                 excluded += 1
             else:
-                wrong += said != (exact > 0)
+                wrong += counted != (exact > 0)
     return pairs, n, excluded, wrong
 
 
 def hostile(rng, n, shape, voxel_m):
-    """Boxes (n, 8): sides on voxel faces or 0.1 mm, 1e-9 m, an ulp beside; yaw at or beside multiples of 45 degrees;
-    thin, huge."""
+    """Return boxes (n, 8) with sides at or near voxel faces, yaw at or near multiples of 45 degrees, thin, huge."""
     span = np.asarray(shape, float)
-    place = np.rint(rng.uniform(-1, 1, (n, 3)) + rng.uniform(0, 1, (n, 3)) * 2 * span) * voxel_m / 2
-    beside = rng.choice([0.0, 1e-4, -1e-4, 0.9e-4, 1.1e-4, 1e-9, -1e-9, 1e-4 + 3e-9, 1e-4 - 3e-9, 1e-4 + 1e-7], (n, 3))
-    place = np.where(rng.random((n, 3)) < 0.5, place + beside, place)
-    place = np.where(rng.random((n, 3)) < 0.3, np.nextafter(place, rng.choice([-99.0, 99.0], (n, 3))), place)
+    centre_m = np.rint(rng.uniform(-1, 1, (n, 3)) + rng.uniform(0, 1, (n, 3)) * 2 * span) * voxel_m / 2
+    offset = rng.choice([0.0, 1e-4, -1e-4, 0.9e-4, 1.1e-4, 1e-9, -1e-9, 1e-4 + 3e-9, 1e-4 - 3e-9, 1e-4 + 1e-7], (n, 3))
+    centre_m = np.where(rng.random((n, 3)) < 0.5, centre_m + offset, centre_m)
+    centre_m = np.where(rng.random((n, 3)) < 0.3, np.nextafter(centre_m, rng.choice([-99.0, 99.0], (n, 3))), centre_m)
     free = rng.uniform(-0.2, 1.2, (n, 3)) * span * voxel_m
-    place = np.where(rng.random((n, 1)) < 0.3, free, place)
+    centre_m = np.where(rng.random((n, 1)) < 0.3, free, centre_m)
     yaw = rng.integers(-8, 9, n) * np.pi / 4
     yaw = np.where(rng.random(n) < 0.5, np.nextafter(yaw, rng.choice([-9.0, 9.0], n)), yaw)
     yaw = np.where(rng.random(n) < 0.4, rng.uniform(-7, 7, n), yaw)
@@ -159,38 +158,38 @@ def hostile(rng, n, shape, voxel_m):
     pitch = np.where(rng.random(n) < 0.2, rng.uniform(-0.4, 0.4, n), pitch)
     size = np.where(rng.random((n, 3)) < 0.5, rng.integers(1, 7, (n, 3)) * voxel_m, 10 ** rng.uniform(-3, 0.5, (n, 3)))
     size = np.where(rng.random((n, 3)) < 0.03, 50.0, size)
-    return np.column_stack([place, yaw, pitch, size])
+    return np.column_stack([centre_m, yaw, pitch, size])
 
 
 def vehicles(rng, n, shape, voxel_m):
-    """Boxes (n, 8) as traffic makes them: free places and headings, sizes of cars, most of them flat."""
+    """Return boxes (n, 8) as in traffic: random positions and headings, sizes of cars, mostly level."""
     span = np.asarray(shape, float) * voxel_m
-    place = rng.uniform(-0.1, 1.1, (n, 3)) * span
+    centre_m = rng.uniform(-0.1, 1.1, (n, 3)) * span
     size = rng.uniform([1.0, 0.5, 0.5], [5.0, 2.5, 3.5], (n, 3))
-    place[:, 2] = size[:, 2] / 2
+    centre_m[:, 2] = size[:, 2] / 2
     return np.column_stack(
-        [place, rng.uniform(-np.pi, np.pi, n), np.where(rng.random(n) < 0.7, 0.0, rng.uniform(-0.1, 0.1, n)), size]
+        [centre_m, rng.uniform(-np.pi, np.pi, n), np.where(rng.random(n) < 0.7, 0.0, rng.uniform(-0.1, 0.1, n)), size]
     )
 
 
 def hunt(case, make, seed, n, shape, voxel_m):
-    """One row: ``n`` boxes, some thousands at a time."""
+    """Check ``n`` boxes, some thousands at a time, and return a row."""
     rng = np.random.default_rng(seed)
-    done = pairs = asked = excluded = wrong = 0
+    done = pairs = exact_pairs = excluded = wrong = 0
     while done < n:
         size = min(n - done, 5_000)
-        found = check(np.ascontiguousarray(make(rng, size, shape, voxel_m)), shape, voxel_m)
-        pairs, asked, excluded, wrong, done = (
-            pairs + found[0],
-            asked + found[1],
-            excluded + found[2],
-            wrong + found[3],
+        result = check(np.ascontiguousarray(make(rng, size, shape, voxel_m)), shape, voxel_m)
+        pairs, exact_pairs, excluded, wrong, done = (
+            pairs + result[0],
+            exact_pairs + result[1],
+            excluded + result[2],
+            wrong + result[3],
             done + size,
         )
     return Row(
         case,
         RULE,
-        f"depth from 15 axes; {asked} of {pairs} pairs in 50 digits",
+        f"depth from 15 axes; {exact_pairs} of {pairs} pairs in 50 digits",
         done,
         excluded,
         wrong,
@@ -199,16 +198,15 @@ def hunt(case, make, seed, n, shape, voxel_m):
 
 
 def real(scale):
-    """Rows of the shipped traffic: every box against its depths, and the counts after a move of 1e-9 m along each
-    axis."""
+    """Check simulated traffic: every box, and the counts after moving all boxes by 1e-9 m along each axis."""
     frames = max(100, round(5000 * min(scale, 1.0) / 100) * 100)
     scenario = egvs.load(ROOT / "scenarios" / "nishishinjuku", [f"traffic.frames={frames}"])
     grid, recorded = scenario.roi.grid, recorded_boxes(scenario)
     frame, values = recorded.frame, recorded.values
     doubtful, nearest = np.empty((len(values), 5), np.int64), np.empty(len(values))
-    some = np.ascontiguousarray(values[:: max(1, round(1 / max(scale, 1e-9) / 2))])
-    wrong, pairs, _ = compare(some, np.asarray(grid.shape, np.int64), grid.voxel_m, doubtful, nearest)
-    close = int((nearest[: len(some)] <= 1e-9).sum())
+    selected = np.ascontiguousarray(values[:: max(1, round(1 / max(scale, 1e-9) / 2))])
+    wrong, pairs, _ = compare(selected, np.asarray(grid.shape, np.int64), grid.voxel_m, doubtful, nearest)
+    close = int((nearest[: len(selected)] <= 1e-9).sum())
     before = count_occupancy(recorded, grid, frames)
     turned = 0
     for axis in range(3):
@@ -220,10 +218,10 @@ def real(scale):
             "boxes of nishishinjuku",
             RULE,
             f"depth from 15 axes, {pairs} pairs",
-            len(some),
+            len(selected),
             close,
             wrong,
-            f"nearest to the bound {nearest[: len(some)].min():.1e} m",
+            f"nearest to the bound {nearest[: len(selected)].min():.1e} m",
         ),
         Row(
             "boxes of nishishinjuku moved by 1e-9 m, 6 ways",
@@ -246,15 +244,15 @@ def in_decimals(scale):
     for _ in range(n):
         tenths = int(rng.integers(1, 4))
         voxel, moved = Fraction(tenths, 10), Fraction(int(rng.integers(-40_000, 40_000)), 10)
-        beside = rng.choice([0, 1, -1, 2, 1000], (2, 3))
+        offset = rng.choice([0, 1, -1, 2, 1000], (2, 3))
         low, high = np.sort(rng.integers(-2, np.array(shape) + 3, (2, 3)), axis=0)
         sides = [
             [tenths * int(k) * Fraction(1, 10) + int(b) * Fraction(1, 10**4) for k, b in zip(ks, bs, strict=True)]
-            for ks, bs in zip((low, high + 1), beside, strict=True)
+            for ks, bs in zip((low, high + 1), offset, strict=True)
         ]
         if min(b - a for a, b in zip(*sides, strict=True)) < Fraction(1, 100):
             continue  # no box
-        done, on_bound = done + 1, on_bound + bool((np.abs(beside) == 1).any())
+        done, on_bound = done + 1, on_bound + bool((np.abs(offset) == 1).any())
         centre = [float((a + b) / 2 + moved) for a, b in zip(*sides, strict=True)]
         size = [float(b - a) for a, b in zip(*sides, strict=True)]
         grid = Grid((float(moved),) * 3, float(voxel), shape)
@@ -266,20 +264,20 @@ def in_decimals(scale):
         ]
         expected[np.ix_(*spans)] = 1
         mismatches += bool((count_occupancy(FrameBoxes(np.zeros(1, np.int64), values), grid, 1) != expected).any())
-    told = f"rational arithmetic on the decimals; {on_bound} with a side on the bound of 0.1 mm"
-    return Row("boxes with sides on planes of 0.1 to 0.3 m, moved by tenths", RULE, told, done, 0, mismatches, "-")
+    tested = f"rational arithmetic on the decimals; {on_bound} with a side on the bound of 0.1 mm"
+    return Row("boxes with sides on planes of 0.1 to 0.3 m, moved by tenths", RULE, tested, done, 0, mismatches, "-")
 
 
 def rows(scale: float) -> list[Row]:
-    """All hunts of the occupancy; scale 1 is the long run."""
+    """Run all checks of the occupancy; scale 1 is the complete run."""
 
-    def some(n):
+    def selected(n):
         return max(50, round(n * scale))
 
     return [
-        hunt("adversarial boxes, 0.25 m", hostile, 21, some(500_000), (8, 7, 5), 0.25),
-        hunt("adversarial boxes, 0.1 m", hostile, 22, some(200_000), (9, 8, 7), 0.1),
-        hunt("random vehicles", vehicles, 23, some(300_000), (24, 20, 12), 0.25),
+        hunt("adversarial boxes, 0.25 m", hostile, 21, selected(500_000), (8, 7, 5), 0.25),
+        hunt("adversarial boxes, 0.1 m", hostile, 22, selected(200_000), (9, 8, 7), 0.1),
+        hunt("random vehicles", vehicles, 23, selected(300_000), (24, 20, 12), 0.25),
         in_decimals(scale),
         *real(scale),
     ]

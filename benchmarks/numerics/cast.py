@@ -1,7 +1,7 @@
-"""Does a beam ever leak, or end on another surface than the one that it truly meets first?
+"""Check that no beam leaks, and that each ends on the surface that it truly meets first.
 
-Scenes with known answers, hostile ones against a float64 brute force over all triangles, and every beam of every site
-of the shipped scenarios.
+Scenes with known answers, adversarial ones compared with a float64 brute force over all triangles, and every beam of
+every site of the shipped scenarios.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ _FIRST_RULE = "first triangle hit, including 1 micrometre around its edges"
 
 
 def rows(scale: float) -> list[Row]:
-    """All hunts; ``scale`` 1 casts some ten million rays."""
+    """Run all checks; ``scale`` 1 casts some ten million rays."""
     rng = np.random.default_rng(20_240_501)
-    found = [
+    ranges = [
         _walls(rng, scale), _two_walls(rng, scale), _pole(rng, scale), _box(rng, scale), _sphere(),
         *_surfaces(rng, scale), _slivers(rng, scale), _t_junction(rng, scale), _on_a_wall(rng, scale),
         _scenes(rng, scale, True), _scenes(rng, scale, False),
     ]  # fmt: skip
     for name in _SHIPPED:
-        found += [_shipped(name, scale), _aimed(name, rng, scale)]
-    return found
+        ranges += [_shipped(name, scale), _aimed(name, rng, scale)]
+    return ranges
 
 
 def _caster(triangles: Floats) -> Caster:
@@ -55,7 +55,7 @@ def _caster(triangles: Floats) -> Caster:
     return Caster(World(vertices, faces, np.zeros(len(faces), dtype=np.int32), (("scene", "hunt"),)), _ROI)
 
 
-def _many(scale: float, full: int) -> int:
+def _scaled(scale: float, full: int) -> int:
     return max(200, round(full * scale))
 
 
@@ -64,12 +64,12 @@ def _unit(v: Floats) -> Floats:
     return unit
 
 
-def _known(case: str, found: Floats, true: Floats) -> Row:
-    """A row for ranges that geometry gives."""
-    error = np.where(np.isfinite(found), np.abs(found - true), np.inf)
+def _compare_ranges(case: str, ranges: Floats, true: Floats) -> Row:
+    """Return a row for ranges that are known from geometry."""
+    error = np.where(np.isfinite(ranges), np.abs(ranges - true), np.inf)
     met = error[np.isfinite(error)].max(initial=0.0)
     leaks = int(np.isinf(error).sum())
-    return Row(case, _RANGE_RULE, "geometry", len(found), 0, int((error > 1e-3).sum()), f"{met:.1e} m, {leaks} leaks")
+    return Row(case, _RANGE_RULE, "geometry", len(ranges), 0, int((error > 1e-3).sum()), f"{met:.1e} m, {leaks} leaks")
 
 
 def _quad(*corners: list[float]) -> Floats:
@@ -77,7 +77,7 @@ def _quad(*corners: list[float]) -> Floats:
     return np.array([[a, b, c], [a, c, d]], dtype=np.float64)
 
 
-def _turned(degrees: float) -> Floats:
+def _rotation(degrees: float) -> Floats:
     turn: Floats = trimesh.transformations.rotation_matrix(np.radians(degrees), [0, 0, 1])[:3, :3]
     return turn
 
@@ -85,32 +85,32 @@ def _turned(degrees: float) -> Floats:
 def _walls(rng: np.random.Generator, scale: float) -> Row:
     parts = []
     for degrees in (0.0, 37.0, 90.0, 123.4):
-        turn, n = _turned(degrees), _many(scale, 250_000)
+        turn, n = _rotation(degrees), _scaled(scale, 250_000)
         wall = _quad([-50, 0.2, -5], [250, 0.2, -5], [250, 0.2, 5], [-50, 0.2, 5]) @ turn.T + _CENTRE
         angle, tilt = np.radians(0.1 + 89.9 * rng.random(n) ** 4), np.radians(rng.uniform(-1, 1, n))
         d = np.column_stack([np.cos(tilt) * np.cos(angle), np.cos(tilt) * np.sin(angle), np.sin(tilt)])
         parts.append((_caster(wall).first_hits(_CENTRE, d @ turn.T)[0], 0.2 / d[:, 1]))
-    found, true = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return _known("a wall of 300 m seen at 0.1 to 90 degrees", found, true)
+    ranges, true = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return _compare_ranges("a wall of 300 m seen at 0.1 to 90 degrees", ranges, true)
 
 
 def _two_walls(rng: np.random.Generator, scale: float) -> Row:
     far, near = (_quad([-400, y, 0], [400, y, 0], [400, y, 10], [-400, y, 10]) for y in (50.002, 50.001))
-    angle = np.radians(0.1 + 89.9 * rng.random(_many(scale, 1_000_000)) ** 4)
+    angle = np.radians(0.1 + 89.9 * rng.random(_scaled(scale, 1_000_000)) ** 4)
     d = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
-    found, _ = _caster(np.concatenate([far, near])).first_hits(np.array([10.3, 50.0005, 5.0]), d)
-    return _known("two walls 1 mm apart, 0.1 to 90 degrees", found, 0.0005 / d[:, 1])
+    ranges, _ = _caster(np.concatenate([far, near])).first_hits(np.array([10.3, 50.0005, 5.0]), d)
+    return _compare_ranges("two walls 1 mm apart, 0.1 to 90 degrees", ranges, 0.0005 / d[:, 1])
 
 
 def _pole(rng: np.random.Generator, scale: float) -> Row:
     o = np.array([0.0, 50.0, 5.0])
     pole = trimesh.creation.box((0.1, 0.1, 8.0)).triangles + np.array([150.05, 50.0, 5.0])
-    y = rng.uniform(-0.1, 0.1, _many(scale, 1_000_000))
+    y = rng.uniform(-0.1, 0.1, _scaled(scale, 1_000_000))
     near = np.abs(np.abs(y) - 0.05) < 2e-6
-    found, _ = _caster(pole).first_hits(o, _unit(np.column_stack([np.full(len(y), 150.0), y, np.full(len(y), -0.1)])))
+    ranges, _ = _caster(pole).first_hits(o, _unit(np.column_stack([np.full(len(y), 150.0), y, np.full(len(y), -0.1)])))
     met = np.abs(y) < 0.05
-    error = np.abs(found - np.sqrt(150.0**2 + y**2 + 0.01))[np.isfinite(found) & met & ~near]
-    wrong = int(((np.isfinite(found) != met) & ~near).sum()) + int((error > 1e-3).sum())
+    error = np.abs(ranges - np.sqrt(150.0**2 + y**2 + 0.01))[np.isfinite(ranges) & met & ~near]
+    wrong = int(((np.isfinite(ranges) != met) & ~near).sum()) + int((error > 1e-3).sum())
     return Row(
         "a pole of 0.1 m at 150 m", _RANGE_RULE, "geometry", len(y), int(near.sum()), wrong, f"{error.max():.1e} m"
     )
@@ -118,28 +118,30 @@ def _pole(rng: np.random.Generator, scale: float) -> Row:
 
 def _box(rng: np.random.Generator, scale: float) -> Row:
     low, high, o = np.array([10.0, 20.0, 1.0]), np.array([70.0, 90.0, 8.0]), np.array([33.3, 44.4, 5.5])
-    n = _many(scale, 1_000_000)
+    n = _scaled(scale, 1_000_000)
     free = np.eye(3)[rng.integers(0, 3, n // 5)] > 0
     edges = low + (high - low) * np.where(free, rng.random((n // 5, 1)), rng.integers(0, 2, (n // 5, 3)))
     d = np.concatenate([_unit(rng.normal(size=(n, 3))), _unit(edges - o)])
     with np.errstate(divide="ignore"):
         true = np.where(d > 0, (high - o) / d, np.where(d < 0, (low - o) / d, np.inf)).min(axis=1)
-    found, _ = _caster(trimesh.creation.box(high - low).triangles + (low + high) / 2).first_hits(o, d)
-    return _known("a closed box from inside, a sixth aimed at its edges", found, true)
+    ranges, _ = _caster(trimesh.creation.box(high - low).triangles + (low + high) / 2).first_hits(o, d)
+    return _compare_ranges("a closed box from inside, a sixth aimed at its edges", ranges, true)
 
 
 def _sphere() -> Row:
-    """Round the frame's zero, where float32 is finest and Embree alone leaks most."""
+    """Check a sphere around the origin, where float32 is finest and Embree alone leaks most."""
     ball = trimesh.creation.icosphere(subdivisions=5, radius=10.0)
     o, caster = np.array([3.0, 2.0, 1.0]), _caster(ball.triangles)
     targets = np.concatenate([ball.vertices, ball.vertices[ball.edges_unique].mean(axis=1)])
-    row = _known("a closed sphere of 20,480 triangles, aimed at each vertex and edge", *_to(caster, o, targets))
+    row = _compare_ranges(
+        "a closed sphere of 20,480 triangles, aimed at each vertex and edge", *_ranges_to(caster, o, targets)
+    )
     leaks = _bare_leaks(ball.triangles, o, targets[: len(ball.vertices)])
     return replace(row, worst=f"{row.worst} (Embree alone: {leaks} of {len(ball.vertices)} vertices)")
 
 
 def _bare_leaks(triangles: Floats, o: Floats, targets: Floats) -> int:
-    """How many rays get through the bare mesh in Embree."""
+    """Return how many rays pass through the mesh in Embree alone."""
     from embreex.mesh_construction import TriangleMesh
     from embreex.rtcore_scene import EmbreeScene
 
@@ -149,13 +151,13 @@ def _bare_leaks(triangles: Floats, o: Floats, targets: Floats) -> int:
     return int((scene.run(np.tile(o.astype(np.float32), (len(d), 1)), d) < 0).sum())
 
 
-def _to(caster: Caster, o: Floats, targets: Floats) -> tuple[Floats, Floats]:
-    """Ranges found and true of rays to points of a surface that nothing hides."""
+def _ranges_to(caster: Caster, o: Floats, targets: Floats) -> tuple[Floats, Floats]:
+    """Return cast and true ranges of rays to points of a surface that nothing hides."""
     return caster.first_hits(o, _unit(targets - o))[0], np.linalg.norm(targets - o, axis=1)
 
 
 def _surfaces(rng: np.random.Generator, scale: float) -> Iterator[Row]:
-    """A plane of many triangles, seen from low above it, aimed at their sides and corners."""
+    """Check a plane of many triangles at grazing angles, aimed at edges and corners."""
     for graze_deg in (0.1, 0.5, 2.0, 30.0):
         parts = []
         for size_m in (20.0, 80.0, 200.0):
@@ -165,14 +167,16 @@ def _surfaces(rng: np.random.Generator, scale: float) -> Iterator[Row]:
             a, b, c, d = points[:-1, :-1], points[1:, :-1], points[1:, 1:], points[:-1, 1:]
             surface = np.concatenate([np.stack(three, axis=-2).reshape(-1, 3, 3) for three in ((a, b, c), (a, c, d))])
             o = turn @ np.array([-0.2 * size_m, 0.033 * size_m, np.tan(np.radians(graze_deg)) * 0.4 * size_m]) + _CENTRE
-            n = _many(scale, 100_000)
+            n = _scaled(scale, 100_000)
             chosen, side, s = rng.integers(0, len(surface), n), rng.integers(0, 3, n), rng.random((n, 1))
             s[: n // 4] = 0.0
             parts.append(
-                _to(_caster(surface), o, surface[chosen, side] * (1 - s) + surface[chosen, (side + 1) % 3] * s)
+                _ranges_to(_caster(surface), o, surface[chosen, side] * (1 - s) + surface[chosen, (side + 1) % 3] * s)
             )
-        found, true = (np.concatenate(part) for part in zip(*parts, strict=True))
-        yield _known(f"edges and corners of 3,200 coplanar triangles, seen at {graze_deg:g} degrees", found, true)
+        ranges, true = (np.concatenate(part) for part in zip(*parts, strict=True))
+        yield _compare_ranges(
+            f"edges and corners of 3,200 coplanar triangles, seen at {graze_deg:g} degrees", ranges, true
+        )
 
 
 def _slivers(rng: np.random.Generator, scale: float) -> Row:
@@ -182,11 +186,13 @@ def _slivers(rng: np.random.Generator, scale: float) -> Row:
             [np.zeros(count + 1), 50 + (np.arange(count + 1) - count / 2) * width, np.full(count + 1, 5.0)]
         )
         fan = np.stack([rim[:-1], rim[1:], np.broadcast_to(tip, (count, 3))], axis=1)
-        n = _many(scale, 20_000)
+        n = _scaled(scale, 20_000)
         s = rng.random((n, 1)) * 0.99
-        parts.append(_to(_caster(fan), o, tip * s + (rim[[0]] + rng.random((n, 1)) * (rim[[-1]] - rim[[0]])) * (1 - s)))
-    found, true = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return _known("a fan of needles 100 m long, 0.1 m to 0.1 micrometres wide", found, true)
+        parts.append(
+            _ranges_to(_caster(fan), o, tip * s + (rim[[0]] + rng.random((n, 1)) * (rim[[-1]] - rim[[0]])) * (1 - s))
+        )
+    ranges, true = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return _compare_ranges("a fan of needles 100 m long, 0.1 m to 0.1 micrometres wide", ranges, true)
 
 
 def _t_junction(rng: np.random.Generator, scale: float) -> Row:
@@ -194,14 +200,16 @@ def _t_junction(rng: np.random.Generator, scale: float) -> Row:
     side = np.array([20.0, 10.0, 2.0]) + at[:, None] * np.array([50.0, 70.0, 6.0])
     left, right = np.array([10.0, 80.0, 5.0]), np.array([80.0, 20.0, 6.0])
     scene = np.concatenate([[[side[0], side[3], left]], [[side[i], right, side[i + 1]] for i in range(3)]])
-    s = np.concatenate([rng.uniform(0.001, 0.999, (_many(scale, 200_000), 1)), at[1:3, None]])
-    return _known("T-junctions", *_to(_caster(scene), np.array([40.0, 50.0, 20.0]), side[0] + s * (side[3] - side[0])))
+    s = np.concatenate([rng.uniform(0.001, 0.999, (_scaled(scale, 200_000), 1)), at[1:3, None]])
+    return _compare_ranges(
+        "T-junctions", *_ranges_to(_caster(scene), np.array([40.0, 50.0, 20.0]), side[0] + s * (side[3] - side[0]))
+    )
 
 
 def _on_a_wall(rng: np.random.Generator, scale: float) -> Row:
     directions, cases, wrong = sensor.CATALOGUE["VLP-16"].directions()[::7], 0, 0
-    for _ in range(_many(scale, 1000) // 10):
-        turn, away = _turned(rng.uniform(0, 360)), rng.choice([-1e-9, -1e-13, 0.0, 1e-13, 1e-9])
+    for _ in range(_scaled(scale, 1000) // 10):
+        turn, away = _rotation(rng.uniform(0, 360)), rng.choice([-1e-9, -1e-13, 0.0, 1e-13, 1e-9])
         house = trimesh.creation.box((10, 8, 6)).triangles @ turn.T + _CENTRE
         outwards = directions[directions @ turn[:, 0] > 1e-3]
         ranges, _ = _caster(house).first_hits(turn @ np.array([5.0 + away, *rng.uniform(-2, 2, 2)]) + _CENTRE, outwards)
@@ -211,9 +219,9 @@ def _on_a_wall(rng: np.random.Generator, scale: float) -> Row:
 
 
 def _scenes(rng: np.random.Generator, scale: float, lattice: bool) -> Row:
-    """Small scenes; rays aimed at corners, sides, faces and anywhere."""
+    """Check small scenes; rays are aimed at corners, edges, faces and random points."""
     cases, wrong, worst = 0, 0, 0.0
-    for _ in range(_many(scale, 4000) // 4):
+    for _ in range(_scaled(scale, 4000) // 4):
         if lattice:
             scene, o = rng.integers(0, 9, (20, 3, 3)) * 1.25, rng.integers(0, 9, 3) * 1.25 + np.array([0.3, 0.2, 0.1])
         else:
@@ -224,10 +232,10 @@ def _scenes(rng: np.random.Generator, scale: float, lattice: bool) -> Row:
         inside = (scene * rng.dirichlet([1, 1, 1], len(scene))[:, :, None]).sum(axis=1)
         targets = np.concatenate([scene.reshape(-1, 3), scene[:, :2].mean(axis=1), inside, rng.random((100, 3)) * 100])
         d = _unit(targets - o)
-        found, (true, _) = _caster(np.asarray(scene, np.float64)).first_hits(o, d)[0], cast.first_hits(o, d, scene)
-        cases, wrong = cases + len(d), wrong + int(cast.differ(found, true, 1e-5).sum())
-        both = np.isfinite(found) & np.isfinite(true)
-        worst = max(worst, float(np.abs(found[both] - true[both]).max(initial=0.0)))
+        ranges, (true, _) = _caster(np.asarray(scene, np.float64)).first_hits(o, d)[0], cast.first_hits(o, d, scene)
+        cases, wrong = cases + len(d), wrong + int(cast.differ(ranges, true, 1e-5).sum())
+        both = np.isfinite(ranges) & np.isfinite(true)
+        worst = max(worst, float(np.abs(ranges[both] - true[both]).max(initial=0.0)))
     name = "random scenes on a coarse lattice" if lattice else "random scenes, needles down to 1 micrometre"
     return Row(
         f"{name}, aimed at corners, edges, faces", _FIRST_RULE, "float64 brute force", cases, 0, wrong, f"{worst:.1e} m"
@@ -241,14 +249,13 @@ def _scene(name: str) -> tuple[Scenario, Caster, Floats]:
 
 
 def _compare(case: str, jobs: Iterator[tuple[Caster, Floats, Floats, Floats]]) -> Row:
-    """Rays against all triangles. Excluded, and counted: where float32 takes another surface, less than 1 mm behind the
-    first."""
+    """Compare rays with all triangles; surfaces less than 1 mm behind the first are counted as excluded."""
     cases, wrong, close, gap, worst = 0, 0, 0, 0.0, 0.0
     for caster, triangles, o, d in jobs:
-        found, (true, _) = caster.first_hits(o, d)[0], cast.first_hits(o, d, triangles)
-        other, apart = cast.differ(found, true), np.full(len(d), np.inf)
-        both = np.isfinite(found) & np.isfinite(true)
-        apart[both] = np.abs(found[both] - true[both])
+        ranges, (true, _) = caster.first_hits(o, d)[0], cast.first_hits(o, d, triangles)
+        other, apart = cast.differ(ranges, true), np.full(len(d), np.inf)
+        both = np.isfinite(ranges) & np.isfinite(true)
+        apart[both] = np.abs(ranges[both] - true[both])
         near = np.flatnonzero(other & both)
         close, wrong = close + int((apart[near] < 1e-3).sum()), wrong + int((apart[other] >= 1e-3).sum())
         cases += len(d)
@@ -268,8 +275,13 @@ def _shipped(name: str, scale: float) -> Row:
         for site in sites.candidate_sites(scenario):
             sensor = scenario_sensor(site.sensor, scenario, site.name)
             d = sensor.directions(*site.pose.angles_deg)
-            kept = caster.scan(site.pose.position_m, d, sensor.range_m).beam[::step]
-            yield caster, triangles, np.asarray(site.pose.position_m) - np.asarray(scenario.roi.box.origin_m), d[kept]
+            selected = caster.scan(site.pose.position_m, d, sensor.range_m).beam[::step]
+            yield (
+                caster,
+                triangles,
+                np.asarray(site.pose.position_m) - np.asarray(scenario.roi.box.origin_m),
+                d[selected],
+            )
 
     return _compare(f"{name}: {'every beam' if step == 1 else f'one in {step} beams'} of every site", jobs())
 
@@ -280,7 +292,7 @@ def _aimed(name: str, rng: np.random.Generator, scale: float) -> Row:
 
     def jobs() -> Iterator[tuple[Caster, Floats, Floats, Floats]]:
         for site in places:
-            n = _many(scale, 300_000 // len(places))
+            n = _scaled(scale, 300_000 // len(places))
             chosen, side, s = rng.integers(0, len(triangles), n), rng.integers(0, 3, n), rng.random((n, 1))
             on_side = triangles[chosen, side] * (1 - s) + triangles[chosen, (side + 1) % 3] * s
             o = np.asarray(site.pose.position_m) - np.asarray(scenario.roi.box.origin_m)
@@ -290,7 +302,7 @@ def _aimed(name: str, rng: np.random.Generator, scale: float) -> Row:
 
 
 def main() -> Any:
-    """For a look at this part alone: python -m benchmarks.numerics.cast."""
+    """Run this part alone: python -m benchmarks.numerics.cast."""
     for row in rows(0.01):
         print(row)
 

@@ -1,4 +1,4 @@
-"""Is the entropy correctly rounded, the score the exact sum rounded once, and each beam where 30 digits put it?"""
+"""Check that the entropy is correctly rounded, EGVS is the exact sum rounded once, and beams agree with 30 digits."""
 
 from __future__ import annotations
 
@@ -16,13 +16,19 @@ _LARGEST = 2**32 - 1
 
 
 def rows(scale: float) -> list[Row]:
-    """All hunts; ``scale`` 1 takes some minutes."""
+    """Run all checks; ``scale`` 1 takes some minutes."""
     rng = np.random.default_rng(20_240_502)
-    return [_ends(scale), _anywhere(rng, scale), _sums(rng, scale), _order(rng, scale), _directions(scale)]
+    return [
+        _extreme_counts(scale),
+        _random_counts(rng, scale),
+        _sums(rng, scale),
+        _order(rng, scale),
+        _directions(scale),
+    ]
 
 
 def _true(count: int, frames: int) -> mpmath.mpf:
-    """H in 50 digits, from its definition."""
+    """Return H in 50 digits, from its definition."""
     with mpmath.workdps(70):
         p = mpmath.mpf(count) / frames
         return (
@@ -30,33 +36,33 @@ def _true(count: int, frames: int) -> mpmath.mpf:
         )
 
 
-def _held(case: str, pairs: list[tuple[int, int]]) -> Row:
+def _compare_entropy(case: str, pairs: list[tuple[int, int]]) -> Row:
     wrong, worst = 0, 0.0
     for count, frames in pairs:
-        found, true = binary_entropy(count, frames), _true(count, frames)
-        wrong += found != float(mpmath.nstr(true, 45)) or found != binary_entropy(frames - count, frames)
-        worst = max(worst, float(abs(found - true) / true) if true else abs(found))
+        value, true = binary_entropy(count, frames), _true(count, frames)
+        wrong += value != float(mpmath.nstr(true, 45)) or value != binary_entropy(frames - count, frames)
+        worst = max(worst, float(abs(value - true) / true) if true else abs(value))
     return Row(
         case, "H correctly rounded, symmetric", "mpmath, 50 digits", len(pairs), 0, wrong, f"{worst:.2e} relative"
     )
 
 
-def _ends(scale: float) -> Row:
+def _extreme_counts(scale: float) -> Row:
     reach = max(5, round(1000 * scale))
     pairs = []
     for frames in (1, 2, 3, 10, 60, 5000, 10**6, 2**31 - 1, 2**31, _LARGEST):
         near = {c for k in range(reach) for c in (k, frames - k, frames // 2 + k, frames // 2 - k)}
         pairs += [(c, frames) for c in sorted(near) if 0 <= c <= frames]
-    return _held("H at both ends and the middle, T = 1 to 2^32 - 1", pairs)
+    return _compare_entropy("H at both ends and the middle, T = 1 to 2^32 - 1", pairs)
 
 
-def _anywhere(rng: np.random.Generator, scale: float) -> Row:
+def _random_counts(rng: np.random.Generator, scale: float) -> Row:
     pairs = []
     for _ in range(max(200, round(100_000 * scale))):
         frames = int(2 ** rng.uniform(0, 32)) if rng.random() < 0.9 else _LARGEST
         frames = min(max(frames, 1), _LARGEST)
         pairs.append((int(rng.integers(0, frames + 1)), frames))
-    return _held("H of random counts and T", pairs)
+    return _compare_entropy("H of random counts and T", pairs)
 
 
 def _case(rng: np.random.Generator) -> tuple[list[int], int, list[int], float]:
@@ -85,9 +91,9 @@ def _sums(rng: np.random.Generator, scale: float) -> Row:
             ),
             Fraction(0),
         )
-        found = _field(counts, frames).score(np.array(hits, dtype=np.uint32), gamma).egvs
-        wrong += found != float(total)
-        worst = max(worst, abs(found - float(total)))
+        value = _field(counts, frames).score(np.array(hits, dtype=np.uint32), gamma).egvs
+        wrong += value != float(total)
+        worst = max(worst, abs(value - float(total)))
     return Row(
         "EGVS of random fields, gamma 0 to infinity",
         "the exact sum, rounded once",
@@ -119,7 +125,7 @@ def _order(rng: np.random.Generator, scale: float) -> Row:
 
 
 def _angles_of(sensor: Sensor, k: int) -> tuple[float, Fraction]:
-    """Elevation and azimuth of beam ``k``, degrees."""
+    """Return elevation and azimuth of beam ``k``, degrees."""
     if sensor.table is not None:
         return float(sensor.table.elevation_deg[k]), Fraction(repr(float(sensor.table.azimuth_deg[k])))
     a, r = divmod(k, sensor.channels)
@@ -131,7 +137,7 @@ def _angles_of(sensor: Sensor, k: int) -> tuple[float, Fraction]:
 
 
 def _directions(scale: float) -> Row:
-    """Beams of every sensor, upright, against 30 digits."""
+    """Compare upright beams of every sensor with 30 digits."""
     cases, wrong, worst = 0, 0, 0.0
     step = max(7, round(97 / max(scale, 1e-3) ** 0.5))
     for sensor in CATALOGUE.values():

@@ -1,9 +1,9 @@
-"""Does the march cross other voxels than exact arithmetic does, on millions of segments?
+"""Compare the voxels of the march with exact arithmetic, on millions of segments.
 
-Most segments are settled by sorted cuts in float64, a scheme that shares nothing with the march but the formula of a
-crossing: all crossings of all planes, sorted; between two of them the middle decides which voxel it is. Wherever a
-piece is within 2e-8 m of the 1 micrometre bound, or its middle closer to a plane than rounding could move it, the
-segment goes to the rational oracle instead. So every answer is certain, and only the doubtful ones are slow.
+Most segments are decided by sorted crossings in float64, which share only the formula of a crossing with the march:
+the crossings of all planes are sorted, and the middle between two of them decides the voxel. If a piece is within
+2e-8 m of the bound of 1 micrometre, or its middle is closer to a plane than rounding could move it, the rational oracle
+decides the segment instead. So every answer is certain, and only a few are slow.
 """
 
 from __future__ import annotations
@@ -30,14 +30,8 @@ _kernel = numba.njit(nogil=True, error_model="numpy", cache=True)
 
 
 @_kernel
-def cuts(o, d, shape, voxel_m, times, cells):
-    """Cells of one segment by sorted cuts, ascending along it; -1 when float64 cannot be certain."""
-    size = 0.0
-    for a in range(3):
-        size = max(size, abs(d[a]))
-    if size == 0.0 or size > 1e150 or size < 1e-150:
-        return -1
-    length = size * np.sqrt((d[0] / size) ** 2 + (d[1] / size) ** 2 + (d[2] / size) ** 2) * voxel_m
+def crossing_times(o, d, shape, times):
+    """Fill ``times`` with 0, 1 and the crossings of all planes between; return their number."""
     n = 2
     times[0], times[1] = 0.0, 1.0
     for a in range(3):
@@ -48,32 +42,50 @@ def cuts(o, d, shape, voxel_m, times, cells):
             if 0.0 < t < 1.0:
                 times[n] = t
                 n += 1
+    return n
+
+
+@_kernel
+def cell_at(o, d, shape, t):
+    """Cell of a segment's point at ``t``; -1 outside the grid, -2 when rounding could move it across a plane."""
+    is_outside, cell = False, 0
+    for a in range(3):
+        x = o[a] + t * d[a]
+        k = np.floor(x)
+        if d[a] != 0.0:
+            error = 1e-15 * (abs(o[a]) + abs(t * d[a]))
+            if min(x - k, k + 1.0 - x) <= error:
+                if -1.0 <= k <= shape[a]:
+                    return -2
+                is_outside = True
+        if not 0.0 <= x < shape[a]:
+            is_outside = True
+        else:
+            cell = cell * shape[a] + np.int64(k)
+    return -1 if is_outside else cell
+
+
+@_kernel
+def sorted_cells(o, d, shape, voxel_m, times, cells):
+    """Fill ``cells`` with those of one segment, by sorted crossings; return their number, or -1 if uncertain."""
+    size = max(abs(d[0]), abs(d[1]), abs(d[2]))
+    if size == 0.0 or size > 1e150 or size < 1e-150:
+        return -1
+    length = size * np.sqrt((d[0] / size) ** 2 + (d[1] / size) ** 2 + (d[2] / size) ** 2) * voxel_m
+    n = crossing_times(o, d, shape, times)
     pieces = np.sort(times[:n])
     count = 0
-    unsure_m = 2e-8
+    margin_m = 2e-8
     for i in range(n - 1):
         chord = (pieces[i + 1] - pieces[i]) * length
-        if chord < 1e-6 - unsure_m:
+        if chord < 1e-6 - margin_m:
             continue
-        middle, outside, cell = 0.5 * (pieces[i] + pieces[i + 1]), False, 0
-        for a in range(3):
-            x = o[a] + middle * d[a]
-            k = np.floor(x)
-            if d[a] != 0.0:
-                error = 1e-15 * (abs(o[a]) + abs(middle * d[a]))
-                if min(x - k, k + 1.0 - x) <= error:
-                    if -1.0 <= k <= shape[a]:
-                        return -1
-                    outside = True
-            if not 0.0 <= x < shape[a]:
-                outside = True
-            else:
-                cell = cell * shape[a] + np.int64(k)
-        if outside:
+        cell = cell_at(o, d, shape, 0.5 * (pieces[i] + pieces[i + 1]))
+        if cell == -1:
             continue
-        if chord < 1e-6 + unsure_m:
+        if cell == -2 or chord < 1e-6 + margin_m:
             return -1
-        # Two pieces of one voxel: what lies between them was a cut that rounding put into it.
+        # Two pieces of one voxel: rounding has put a crossing between them.
         if count > 0 and cells[count - 1] == cell:
             return -1
         cells[count] = cell
@@ -83,9 +95,9 @@ def cuts(o, d, shape, voxel_m, times, cells):
 
 @_kernel
 def compare(o, d, shape, voxel_m, verdict):
-    """For each segment: 0 the march agrees, 1 it does not, 2 the oracle must say. Returns the voxels crossed."""
+    """Set a verdict for each segment: 0 the march agrees, 1 it does not, 2 undecided. Return the number of voxels."""
     longest = shape.sum() + 8
-    times, mine, cells, t_cells = (
+    times, expected, cells, t_cells = (
         np.empty(longest),
         np.empty(longest, np.int64),
         np.empty(longest, np.int64),
@@ -93,25 +105,25 @@ def compare(o, d, shape, voxel_m, verdict):
     )
     buffer, crossed = traversal.crossing_buffer(shape), 0
     for i in range(o.shape[0]):
-        n = cuts(o[i], d[i], shape, voxel_m, times, mine)
+        n = sorted_cells(o[i], d[i], shape, voxel_m, times, expected)
         count, _, _ = traversal.list_voxels(o[i], d[i], shape, voxel_m, cells, t_cells, buffer)
         crossed += count
-        verdict[i] = 2 if n < 0 else 0 if n == count and np.all(mine[:n] == cells[:count]) else 1
+        verdict[i] = 2 if n < 0 else 0 if n == count and np.all(expected[:n] == cells[:count]) else 1
     return crossed
 
 
 def settle(o, d, shape, voxel_m):
-    """The voxels by sorted cuts, None when float64 cannot be certain."""
+    """Return the voxels by sorted crossings; None if float64 is not certain."""
     n = np.asarray(shape, np.int64)
     cells = np.empty(n.sum() + 8, np.int64)
-    count = cuts(np.asarray(o, float), np.asarray(d, float), n, voxel_m, np.empty(n.sum() + 8), cells)
+    count = sorted_cells(np.asarray(o, float), np.asarray(d, float), n, voxel_m, np.empty(n.sum() + 8), cells)
     if count < 0:
         return None
     return {tuple(int(i) for i in np.unravel_index(c, tuple(n))) for c in cells[:count]}
 
 
 def walk(o, d, shape, voxel_m):
-    """The voxels that the march lists."""
+    """Return the voxels that the march lists."""
     n = np.asarray(shape, np.int64)
     cells, t_cells = np.empty(n.sum() + 8, np.int64), np.empty((n.sum() + 8, 2))
     count, _, _ = traversal.list_voxels(o, d, n, voxel_m, cells, t_cells, traversal.crossing_buffer(n))
@@ -119,8 +131,7 @@ def walk(o, d, shape, voxel_m):
 
 
 def check(o, d, shape, voxel_m):
-    """(excluded, mismatches, asked): segments with a chord within 1e-8 m of the bound; wrong ones; settled by
-    rationals."""
+    """Return how many segments have a chord within 1e-8 m of the bound, are wrong, and were decided by rationals."""
     verdict = np.empty(len(o), np.int64)
     # Contiguous, so that one kernel is compiled for all callers.
     compare(np.ascontiguousarray(o), np.ascontiguousarray(d), np.asarray(shape, np.int64), voxel_m, verdict)
@@ -134,8 +145,7 @@ def check(o, d, shape, voxel_m):
 
 
 def hostile(rng, n, shape, voxel_m):
-    """Starts and extents (n, 3) made of what hurts: lattice points, last bits, 1e-12 to 1e-4 beside, zeros, subnormals,
-    far."""
+    """Return starts and extents (n, 3): lattice points, last bits, 1e-12 to 1e-4 beside, zeros, subnormals, far."""
     span = np.asarray(shape, float)
 
     def points(size):
@@ -167,7 +177,7 @@ def hostile(rng, n, shape, voxel_m):
 
 
 def uniform(rng, n, shape, voxel_m):
-    """Random segments in and round the grid."""
+    """Return random segments in and around the grid."""
     del voxel_m
     span = np.asarray(shape, float)
     start, end = rng.uniform(-0.3, 1.3, (2, n, 3)) * span
@@ -188,21 +198,23 @@ def near_the_bound(rng, n, shape, voxel_m):
 
 
 def hunt(case, make, seed, n, shape, voxel_m, built=False):
-    """One row: ``n`` segments, some tens of thousands at a time."""
+    """Check ``n`` segments, some tens of thousands at a time, and return a row."""
     rng = np.random.default_rng(seed)
-    done = excluded = mismatches = asked = 0
+    done = excluded = mismatches = exact = 0
     while done < n:
         size = min(n - done, 50_000)
         o, d = make(rng, size, shape, voxel_m)
-        found = check(o, d, shape, voxel_m)
-        excluded, mismatches, asked, done = excluded + found[0], mismatches + found[1], asked + found[2], done + size
-    told = f"sorted cuts with a margin; {asked} in rational arithmetic"
-    return Row(case, RULE, told, done, excluded, mismatches, "-" if built else f"{excluded} within 1e-8 m of the bound")
+        result = check(o, d, shape, voxel_m)
+        excluded, mismatches, exact, done = excluded + result[0], mismatches + result[1], exact + result[2], done + size
+    tested = f"sorted crossings with a margin; {exact} in rational arithmetic"
+    return Row(
+        case, RULE, tested, done, excluded, mismatches, "-" if built else f"{excluded} within 1e-8 m of the bound"
+    )
 
 
 @_kernel
 def fragile(o, d, shape, voxel_m, moved_m):
-    """Whether moving an end by ``moved_m`` could change a voxel: see the oracle's ``fragile``; in float64."""
+    """Whether moving an end by ``moved_m`` could change a voxel, in float64; see the oracle's ``fragile``."""
     longest = shape.sum() + 8
     times = np.empty(longest)
     n = 2
@@ -236,7 +248,7 @@ def fragile(o, d, shape, voxel_m, moved_m):
 
 @_kernel
 def _may_turn(o, d, cell, grow, length, moved_m):
-    """Whether the chords of a smaller and of a larger voxel lie on either side of the bound."""
+    """Whether the chords of a smaller and of a larger voxel are on different sides of the bound."""
     low_in, high_in, low_out, high_out = 0.0, 1.0, 0.0, 1.0
     for a in range(3):
         k = float(cell[a])
@@ -256,7 +268,7 @@ def _may_turn(o, d, cell, grow, length, moved_m):
 
 @_kernel
 def count_fragile(o, d, shape, voxel_m, moved_m):
-    """Beams that a move could turn: (in a plane because a component is 0, others)."""
+    """Return the number of beams that a move could change: in a plane because a component is 0, and others."""
     in_plane, others = 0, 0
     for i in range(d.shape[0]):
         if fragile(o, d[i], shape, voxel_m, moved_m):
@@ -270,40 +282,40 @@ def count_fragile(o, d, shape, voxel_m, moved_m):
     return in_plane, others
 
 
-def beams_of(name):
-    """(grid, [(site, o, d)]) of a shipped scene."""
+def scene_beams(name):
+    """Return grid and beams (site, o, d) of a shipped scenario."""
     scenario = egvs.load(ROOT / "scenarios" / name)
     scene, grid = egvs.build_scene(scenario), scenario.roi.grid
     scanner = Scanner(scene)
-    found = [
+    result = [
         (site.name, *grid.segments(site.pose.position_m, scanner.scan_site(site).rows.ends_m)) for site in scene.sites
     ]
-    return grid, found
+    return grid, result
 
 
 def shipped(name, scale):
-    """Rows of a shipped scene: its beams against sorted cuts, the audit, and how many a nanometre could turn."""
-    grid, sites = beams_of(name)
+    """Check a shipped scenario: its beams, the sums of their chords, and how many a nanometre could change."""
+    grid, sites = scene_beams(name)
     shape = np.asarray(grid.shape, np.int64)
     step = max(1, round(1 / max(scale, 1e-9) ** 0.5))
-    total = excluded = mismatches = asked = in_plane = others = 0
+    total = excluded = mismatches = exact = in_plane = others = 0
     worst_sum = longest_gap = 0.0
     broken = 0
     for _, o, ends in sites[::step]:
         d = ends[::step].copy()
         total += len(d)
-        found = check(np.broadcast_to(o, d.shape), d, grid.shape, grid.voxel_m)
-        excluded, mismatches, asked = excluded + found[0], mismatches + found[1], asked + found[2]
-        found = count_fragile(o, d, shape, grid.voxel_m, 1e-9)
-        in_plane, others = in_plane + found[0], others + found[1]
-        found = traversal.audit_beams(o, d, shape, grid.voxel_m, np.zeros(int(shape.prod()), np.uint32))
+        result = check(np.broadcast_to(o, d.shape), d, grid.shape, grid.voxel_m)
+        excluded, mismatches, exact = excluded + result[0], mismatches + result[1], exact + result[2]
+        result = count_fragile(o, d, shape, grid.voxel_m, 1e-9)
+        in_plane, others = in_plane + result[0], others + result[1]
+        result = traversal.audit_beams(o, d, shape, grid.voxel_m, np.zeros(int(shape.prod()), np.uint32))
         worst_sum, longest_gap, broken = (
-            max(worst_sum, found[0]),
-            max(longest_gap, found[1]),
-            broken + found[2] + found[3],
+            max(worst_sum, result[0]),
+            max(longest_gap, result[1]),
+            broken + result[2] + result[3],
         )
     return [
-        Row(f"beams of {name}", RULE, f"sorted cuts with a margin; {asked} in rational arithmetic", total,
+        Row(f"beams of {name}", RULE, f"sorted crossings with a margin; {exact} in rational arithmetic", total,
             excluded, mismatches, "-"),
         Row(f"beams of {name}, sum of chords", "equals the segment to 1e-12, no voxel twice", "march.audit", total, 0,
             broken + (worst_sum > 1e-12), f"{worst_sum:.1e} of the segment; longest gap {longest_gap:.1e} m"),
@@ -314,7 +326,7 @@ def shipped(name, scale):
 
 
 def far_chords(scale):
-    """How exact are chords of beams that start 1e7 m away? Against fractions."""
+    """Compare chords of beams that start 1e7 m away with fractions."""
     rng, n = np.random.default_rng(16), max(10, round(2000 * scale))
     shape, voxel_m, worst = np.array((12, 8, 5), np.int64), 0.25, Fraction(0)
     cells, t_cells = np.empty(40, np.int64), np.empty((40, 2))
@@ -342,7 +354,7 @@ def far_chords(scale):
 
 
 def _tenths(at: np.ndarray) -> tuple[float, float, float]:
-    """Whole tenths of a metre as metres, each the float that its decimal is read as."""
+    """Return whole tenths of a metre as metres, as their decimals are read."""
     x, y, z = (float(Fraction(int(c), 10)) for c in at)
     return x, y, z
 
@@ -361,37 +373,37 @@ def in_decimals(scale):
         end = np.where(rng.random(3) < 0.4, start, end)
         beam_m = [float(Fraction(int(b - a), 10)) for a, b in zip(start, end, strict=True)]
         noise = rng.choice([0.0, 0.0, 3e-17, -5e-16], 3)
-        found = []
+        result = []
         for moved in (0, int(rng.integers(1, 40_000_000))):
             origin, site = (_tenths(at + moved) for at in (low, start))
             grid = Grid(origin, float(Fraction(tenths, 10)), shape)
             o, d = grid.segments(site, np.array([beam_m]) + noise)
-            found.append(walk(o, d[0], shape, grid.voxel_m))
+            result.append(walk(o, d[0], shape, grid.voxel_m))
         exact_o, exact_d = oracle.in_world(site, np.add(beam_m, noise).tolist(), origin, grid.voxel_m)
         in_plane += any(c.denominator == 1 and not x for c, x in zip(exact_o, exact_d, strict=True))
         doubtful = oracle.doubtful(exact_o, exact_d, shape, Fraction(tenths, 10))
         excluded += bool(doubtful)
-        wrong = found[1] ^ oracle.crossed(exact_o, exact_d, shape, Fraction(tenths, 10))
-        mismatches += found[0] != found[1] or not wrong <= doubtful
-    told = f"rational arithmetic on the decimals, and the same moved by up to 4000 km; {in_plane} beams in a plane"
-    return Row("beams on tenths of a metre, voxels of 0.1 to 0.3 m", RULE, told, 2 * n, excluded, mismatches, "-")
+        wrong = result[1] ^ oracle.crossed(exact_o, exact_d, shape, Fraction(tenths, 10))
+        mismatches += result[0] != result[1] or not wrong <= doubtful
+    tested = f"rational arithmetic on the decimals, and the same moved by up to 4000 km; {in_plane} beams in a plane"
+    return Row("beams on tenths of a metre, voxels of 0.1 to 0.3 m", RULE, tested, 2 * n, excluded, mismatches, "-")
 
 
 def rows(scale: float) -> list[Row]:
-    """All hunts of the march; scale 1 is the long run."""
+    """Run all checks of the march; scale 1 is the complete run."""
 
-    def some(n):
+    def scaled(n):
         return max(50, round(n * scale))
 
-    found = [
-        hunt("adversarial segments, 0.25 m", hostile, 11, some(500_000), (7, 5, 4), 0.25),
-        hunt("adversarial segments, 0.1 m, a larger grid", hostile, 12, some(250_000), (40, 24, 10), 0.1),
-        hunt("adversarial segments, 16 m", hostile, 13, some(250_000), (12, 9, 6), 16.0),
-        hunt("random segments", uniform, 14, some(10_000_000), (40, 20, 10), 0.25),
-        hunt("corners cut by 0.5 to 2 micrometres", near_the_bound, 15, some(20_000), (20, 20, 6), 0.25),
+    result = [
+        hunt("adversarial segments, 0.25 m", hostile, 11, scaled(500_000), (7, 5, 4), 0.25),
+        hunt("adversarial segments, 0.1 m, a larger grid", hostile, 12, scaled(250_000), (40, 24, 10), 0.1),
+        hunt("adversarial segments, 16 m", hostile, 13, scaled(250_000), (12, 9, 6), 16.0),
+        hunt("random segments", uniform, 14, scaled(10_000_000), (40, 20, 10), 0.25),
+        hunt("corners cut by 0.5 to 2 micrometres", near_the_bound, 15, scaled(20_000), (20, 20, 6), 0.25),
         far_chords(scale),
         in_decimals(scale),
     ]
     for name in SCENES:
-        found += shipped(name, scale)
-    return found
+        result += shipped(name, scale)
+    return result

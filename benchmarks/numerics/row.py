@@ -1,4 +1,4 @@
-"""One line of the table of hunts."""
+"""One row of the table of numerical checks."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Row:
-    """What one hunt found.
+    """Result of one check.
 
     Attributes
     ----------
     case, rule, tested
-        What was tried; the rule that decides; the oracle that it was held against.
+        What was checked; the rule that decides; the oracle that it was compared with.
     cases, excluded, mismatches
-        How many were tried; how many lie within the rule's stated margin (built to be); how many came out wrong.
+        Numbers of all cases; of cases within the stated margin of the rule; of wrong decisions.
     worst
         The worst figure measured, with its unit, e.g. ``"2.1e-13 m"``.
     """

@@ -1,11 +1,11 @@
-"""What a second and a third LiDAR bring in detection, and by which score a plan is best chosen.
+"""Detection with a second and a third LiDAR, and the best score to choose a plan by.
 
     python -m benchmarks.placement.fused scenarios/nishishinjuku --out runs/fused
 
-For each junction, score and number of sensors: the best plan by that score, proved where the search ends in time; what
-detectors find in its fused clouds, in frames of traffic that no score has seen. Differences, to the plan of one sensor
-less and to the plan of the same size by EGVS, are of the same frames, and so are their standard errors. Prints Markdown
-and writes it beside the runs. What was looked at is kept in the store, so a second call goes on.
+For each junction, score and number of sensors: the best plan by that score (proved if the search ends in time), and
+what detectors find in its fused clouds, in frames of held-out traffic. Differences from the plan with one sensor less,
+and from the plan of the same size by EGVS, are of the same frames, as are their standard errors. Prints Markdown, and
+writes it to the run folders. Detections are cached, so a second call continues.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from egvs.cli.validation_tables import PlanRunDisplay
 from egvs.core import files
 from egvs.placement import plan
 from egvs.scenario.loading import load
+from egvs.sensors.sites import candidate_sites
 from egvs.validation import detection_metrics
 from egvs.validation.detection_metrics import ALL_OBJECTS, JackknifeEstimate, SiteDetection
 from egvs.validation.detector_runs import run_detectors
@@ -31,13 +32,13 @@ SCORES = ("egvs", "points_on_target", "expected_detections")
 APART_S = 7.0
 """Between frames, as in the study of validity."""
 
-Found = Mapping[tuple[str, str], SiteDetection]
+DetectionByPlan = Mapping[tuple[str, str], SiteDetection]
 """By group and detector, over all vehicles."""
 
 
 @dataclass(frozen=True)
-class Chosen:
-    """The best plan of so many sensors by one score."""
+class BestPlan:
+    """The best plan with some number of sensors by one score."""
 
     score: str
     group: SensorGroup
@@ -45,58 +46,67 @@ class Chosen:
     is_best: bool
 
 
-def chosen(home: Path, folder: Path, counts: Sequence[int], jobs: int | None) -> Iterator[Chosen]:
-    """Every plan of a junction."""
+def best_plans(scenario_folder: Path, folder: Path, counts: Sequence[int], jobs: int | None) -> Iterator[BestPlan]:
+    """Yield every plan of a junction."""
     for score in SCORES:
         for count in counts:
-            scenario = load(home, [f"score.rank_by={score!r}", f"placement.count={count}"])
+            scenario = load(scenario_folder, [f"score.rank_by={score!r}", f"placement.count={count}"])
             placed = plan.place(scenario, folder / score, exact=True, jobs=jobs)
-            group = SensorGroup(tuple(pick.site for pick in placed.sensors))
-            yield Chosen(score, group, placed.joint / placed.together, placed.solution.is_best)
+            sites = {site.name: site for site in candidate_sites(scenario)}
+            group = SensorGroup(tuple(sites[sensor.site] for sensor in placed.sensors))
+            yield BestPlan(score, group, placed.joint / placed.joint_of_all, placed.solution.is_best)
 
 
-def look(
-    home: Path, folder: Path, plans: Sequence[Chosen], frames: int, detectors: Sequence[str], jobs: int | None
-) -> Found:
-    """What detectors find in the clouds of each plan."""
-    record = prepare_held_out_traffic(load(home), folder / "unseen", frames, apart_s=APART_S, jobs=jobs)
+def detect(
+    scenario_folder: Path,
+    folder: Path,
+    plans: Sequence[BestPlan],
+    frames: int,
+    detectors: Sequence[str],
+    jobs: int | None,
+) -> DetectionByPlan:
+    """Return what detectors find in the clouds of each plan."""
+    record = prepare_held_out_traffic(load(scenario_folder), folder / "unseen", frames, apart_s=APART_S, jobs=jobs)
     groups = list({plan.group.name: plan.group for plan in plans}.values())
     fused = FusedDetectionTask(record, joint_detectors(detectors))
-    found = run_detectors(groups, fused, jobs=jobs, listener=PlanRunDisplay(print))
-    rows, _ = detection_metrics.measure_detection(list(record.read()), record.scene.roi, found)
+    detection = run_detectors(groups, fused, jobs=jobs, listener=PlanRunDisplay(print))
+    rows, _ = detection_metrics.measure_detection(list(record.read()), record.scene.roi, detection)
     return {(row.site, row.detector): row for row in rows if row.objects_of == ALL_OBJECTS}
 
 
-def lines(plans: Sequence[Chosen], found: Found, detector: str) -> Iterator[str]:
-    """A table of one detector."""
-    measure, by = main_measure(detector), {(chosen.score, len(chosen.group.sites)): chosen for chosen in plans}
-    shown = ("seen_5", "seen_20", "seen_50") if detector == POINT_COUNTS_NAME else _SHOWN
-    yield f"| plan by | K | sites | share | {' | '.join(shown)} | {measure}, more than K - 1 | than by egvs |"
-    yield f"|---|---:|---|---:|{'---:|' * (len(shown) + 2)}"
-    for (score, count), chosen in by.items():
-        row = found[chosen.group.name, detector]
+def lines(plans: Sequence[BestPlan], detection: DetectionByPlan, detector: str) -> Iterator[str]:
+    """Yield the table of one detector."""
+    measure, by = (
+        main_measure(detector),
+        {(best.score, len(best.group.sites)): best for best in plans},
+    )
+    measures = ("seen_5", "seen_20", "seen_50") if detector == POINT_COUNTS_NAME else _BOX_MEASURES
+    yield f"| plan by | K | sites | share | {' | '.join(measures)} | {measure}, more than K - 1 | than by egvs |"
+    yield f"|---|---:|---|---:|{'---:|' * (len(measures) + 2)}"
+    for (score, count), best in by.items():
+        row = detection[best.group.name, detector]
 
-        def more(other: Chosen | None, row: SiteDetection = row) -> str:
+        def gain(other: BestPlan | None, row: SiteDetection = row) -> str:
             if other is None:
                 return ""
-            less = found[other.group.name, detector]
+            less = detection[other.group.name, detector]
             return _percent(estimate_difference(row.measures[measure], less.measures[measure], row.frames))
 
-        values = " | ".join(_percent(row.measures[name]) for name in shown)
-        names = chosen.group.name + ("" if chosen.is_best else " (not proved)")
+        values = " | ".join(_percent(row.measures[name]) for name in measures)
+        names = best.group.name + ("" if best.is_best else " (not proved)")
         fewer, egvs = by.get((score, count - 1)), None if score == SCORES[0] else by[SCORES[0], count]
-        yield f"| `{score}` | {count} | {names} | {chosen.share:.1%} | {values} | {more(fewer)} | {more(egvs)} |"
+        yield f"| `{score}` | {count} | {names} | {best.share:.1%} | {values} | {gain(fewer)} | {gain(egvs)} |"
 
 
-_SHOWN = ("ap_bev_r40_iou70", "ap_3d_r40_iou70", "ap_bev_r40_iou50", "ap_3d_r40_iou50")
+_BOX_MEASURES = ("ap_bev_r40_iou70", "ap_3d_r40_iou70", "ap_bev_r40_iou50", "ap_3d_r40_iou50")
 
 
-def _percent(its: JackknifeEstimate) -> str:
-    return f"{100 * its.value:.1f} ± {100 * its.se:.1f}"
+def _percent(estimate: JackknifeEstimate) -> str:
+    return f"{100 * estimate.value:.1f} ± {100 * estimate.se:.1f}"
 
 
 def main() -> None:
-    """All junctions that are named."""
+    """Compare the plans of all junctions."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scenarios", nargs="+", type=Path)
     parser.add_argument("--out", type=Path, required=True)
@@ -104,16 +114,19 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=300)
     parser.add_argument("--detectors", nargs="+", default=[POINT_COUNTS_NAME, "cluster", "pointpillars"])
     parser.add_argument("--jobs", type=int)
-    given = parser.parse_args()
-    for home in given.scenarios:
-        folder = given.out / home.name
-        plans = list(chosen(home, folder, given.counts, given.jobs))
-        found = look(home, folder, plans, given.frames, given.detectors, given.jobs)
-        some = next(iter(found.values()))
-        told = [f"### {home.name}", f"{some.objects} vehicles in {some.frames} frames of unseen traffic, in percent."]
-        for detector in dict.fromkeys([POINT_COUNTS_NAME, *given.detectors]):
-            told += ["", f"`{detector}`", "", *lines(plans, found, detector)]
-        text = "\n".join([*told, ""])
+    arguments = parser.parse_args()
+    for scenario_folder in arguments.scenarios:
+        folder = arguments.out / scenario_folder.name
+        plans = list(best_plans(scenario_folder, folder, arguments.counts, arguments.jobs))
+        detection = detect(scenario_folder, folder, plans, arguments.frames, arguments.detectors, arguments.jobs)
+        first_row = next(iter(detection.values()))
+        text_lines = [
+            f"### {scenario_folder.name}",
+            f"{first_row.objects} vehicles in {first_row.frames} frames of unseen traffic, in percent.",
+        ]
+        for detector in dict.fromkeys([POINT_COUNTS_NAME, *arguments.detectors]):
+            text_lines += ["", f"`{detector}`", "", *lines(plans, detection, detector)]
+        text = "\n".join([*text_lines, ""])
         files.write_text(folder / "fused.md", text)
         print(text)
 

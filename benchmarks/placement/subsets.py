@@ -1,9 +1,9 @@
-"""Plans of nishishinjuku's 13 sites against every subset, and the time that many candidates take.
+"""Compare plans of nishishinjuku's 13 sites with every subset, and measure a plan of many candidates.
 
     python -m benchmarks.placement.subsets [SCENARIO]
 
-For 1 to 4 sensors: the exact plan is the best of all subsets, to the last bit. Then, of SCENARIO, a plan of five
-sensors once its traffic is simulated: what is proved, seconds, memory.
+For 1 to 4 sensors, the exact plan must be the best of all subsets, to the last bit. Then, for SCENARIO, a plan of five
+sensors: what is proved, seconds, and memory.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pathlib import Path
 from time import perf_counter
 
 import egvs
-from egvs.artefacts.run_folder import RunRecord
+from egvs.artefacts.run_record import RunRecord
 from egvs.placement import plan, problem_builder, solver
 from egvs.placement.plan import REQUIRED_STAGES
 from egvs.runs import run, stages
@@ -36,17 +36,17 @@ def main() -> None:
 def _subsets(out: Path) -> None:
     scenario = egvs.load(SCENARIOS / "nishishinjuku", ["placement.count=4"])
     record: RunRecord = run.run(scenario, out)
-    asked = problem_builder.build_problem(
+    built = problem_builder.build_problem(
         open_folder(scenario, out, recorded=stages.recorded_digests(record)), lambda _: None
     )
     for count in (1, 2, 3, 4):
-        problem = asked.problem.with_count(count)
-        found = solver.best_plan(problem, search_all=True, time_limit_s=600.0, on_progress=lambda _: None)
-        every = itertools.combinations(range(len(asked.sites)), count)
+        problem = built.problem.with_count(count)
+        solution = solver.best_plan(problem, search_all=True, time_limit_s=600.0, on_progress=lambda _: None)
+        every = itertools.combinations(range(len(built.sites)), count)
         best = max(problem.plan_value(plan).value for plan in every)
-        names = ", ".join(asked.names[i] for i in found.order)
-        same = "the best of all subsets to the last bit" if found.point.plan_value.value == best else "NOT THE BEST"
-        print(f"{count}: {names}: {found.point.plan_value.value!r}, {same}; {found.nodes} nodes")
+        names = ", ".join(built.names[i] for i in solution.order)
+        same = "the best of all subsets to the last bit" if solution.point.plan_value.value == best else "NOT THE BEST"
+        print(f"{count}: {names}: {solution.point.plan_value.value!r}, {same}; {solution.nodes} nodes")
     best_site = record.stages["score"].summary["best"]
     print(f"egvs run: best {', '.join(best_site)}")
 
@@ -58,7 +58,7 @@ def _many(path: Path, out: Path) -> None:
     placed = plan.place(scenario, out)
     seconds = perf_counter() - started
     memory_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-    picks = ", ".join(pick.site.name for pick in placed.sensors)
+    picks = ", ".join(sensor.site for sensor in placed.sensors)
     print(f"{placed.candidates} candidates, {len(placed.sensors)} sensors: {picks}")
     print(f"proved: {placed.certificate:.2%} of the best; {seconds:.1f} s, {memory_gb:.2f} GB at most")
 

@@ -1,6 +1,6 @@
-"""Does EGVS foretell detection, with which gamma, and does another score do better? The tables of A, B and D.
+"""Tables A, B and D: does EGVS predict detection, with which gamma, and does another score predict it better?
 
-What is chosen (gamma, the best score) is chosen on training junctions; held-out ones are only quoted.
+Gamma and the best score are chosen on training junctions only; results of held-out junctions are only reported.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ WORDS = {
 }
 
 
-def told(found: Correlation | None) -> Cell:
-    """A coefficient as a cell."""
-    return None if found is None else with_interval(found.value, found.interval)
+def coefficient_cell(correlation: Correlation | None) -> Cell:
+    """Return a coefficient as a cell."""
+    return None if correlation is None else with_interval(correlation.value, correlation.interval)
 
 
 def gamma_word(gamma: float) -> str:
-    """A gamma as text."""
+    """Return a gamma as text."""
     return f"{gamma:g}"
 
 
 def by_setting(pools: Pools) -> Iterator[Table]:
-    """A: EGVS against detection by gamma, voxel size and moving occlusion; a table a measure."""
+    """A: yield EGVS against detection by gamma, voxel size and moving occlusion, one table per measure."""
     names = list(pools.studies)
     for measure in measures_of(pools.detector):
         rows: list[list[Cell]] = []
         for setting in pools.settings():
-            cells = [told(pools.rho(name, str(setting), measure)) for name in names]
+            cells = [coefficient_cell(pools.rho(name, str(setting), measure)) for name in names]
             rows.append([gamma_word(setting.gamma), f"{setting.voxel_m:g}", _yes(setting.occlusion), *cells])
         head = [Column("gamma"), Column("voxel, m"), Column("moving occlusion"), *(Column(n, "two") for n in names)]
         caption = f"Spearman's rho between EGVS and {WORDS[measure]} ({pools.detector})."
@@ -50,7 +50,7 @@ def by_setting(pools: Pools) -> Iterator[Table]:
 
 
 def by_kind_of_site(pools: Pools) -> Iterator[Table]:
-    """A: the default EGVS and the setting that is best on training junctions, on some of the sites alone."""
+    """A: yield the default EGVS and the best setting on training junctions, for some of the sites only."""
     kinds: dict[str, Callable[[StudySite], bool]] = {
         "all": lambda site: True,
         "given": lambda site: site.is_given,
@@ -58,15 +58,18 @@ def by_kind_of_site(pools: Pools) -> Iterator[Table]:
     }
     for height_m in HEIGHTS_M:
         kinds[f"grid, {height_m:g} m"] = lambda site, h=height_m: not site.is_given and site.height_m == h  # type: ignore[misc]
-    some = {kind: Pools([its.only(wanted) for its in pools.records], pools.detector) for kind, wanted in kinds.items()}
+    some = {
+        kind: Pools([pools_.only(is_selected) for pools_ in pools.records], pools.detector)
+        for kind, is_selected in kinds.items()
+    }
     names = list(pools.studies)
     for measure in measures_of(pools.detector):
         settings = {str(setting) for setting in pools.settings()}
         best = pools.best(TRAINING, [name for name in pools.scores if name in settings], measure)
         rows: list[list[Cell]] = [
-            [score, kind, *(told(its.rho(name, score, measure)) for name in names)]
+            [score, kind, *(coefficient_cell(pools_.rho(name, score, measure)) for name in names)]
             for score in dict.fromkeys(name for name in (str(DEFAULT), best) if name is not None)
-            for kind, its in some.items()
+            for kind, pools_ in some.items()
         ]
         head = [Column("score"), Column("sites"), *(Column(name, "two") for name in names)]
         caption = (
@@ -94,7 +97,7 @@ _B_COLUMNS = [
 
 
 def chosen_gamma(each: Sequence[Pools]) -> Table:
-    """B: gamma chosen on training junctions, for each voxel size, quoted on held-out ones."""
+    """B: return gamma chosen on training junctions for each voxel size, and its result on held-out ones."""
     rows = [
         _chosen_row(pools, measure, [s for s in pools.settings() if (s.voxel_m, s.occlusion) == ground])
         for pools in each
@@ -111,25 +114,30 @@ def chosen_gamma(each: Sequence[Pools]) -> Table:
 
 
 def _chosen_row(pools: Pools, measure: str, settings: Sequence[Setting]) -> list[Cell]:
-    of = {str(setting): setting for setting in settings}
+    by_name = {str(setting): setting for setting in settings}
     ground = settings[0]
     head: list[Cell] = [pools.detector, WORDS[measure], f"{ground.voxel_m:g}", _yes(ground.occlusion)]
-    name = pools.best(TRAINING, list(of), measure)
+    name = pools.best(TRAINING, list(by_name), measure)
     if name is None:
         return [*head, *[None] * 7]
     ten = str(Setting(DEFAULT.gamma, ground.voxel_m, ground.occlusion))
-    as_good = [gamma_word(s.gamma) for s in pools.as_good(TRAINING, of[name], settings, measure)]
-    cells = [told(pools.rho(TRAINING, name, measure)), told(pools.difference(TRAINING, name, ten, measure))]
+    indistinguishable = [
+        gamma_word(s.gamma) for s in pools.indistinguishable(TRAINING, by_name[name], settings, measure)
+    ]
+    cells = [
+        coefficient_cell(pools.rho(TRAINING, name, measure)),
+        coefficient_cell(pools.difference(TRAINING, name, ten, measure)),
+    ]
     if HELD_OUT in pools.studies:
-        quoted = [told(pools.rho(HELD_OUT, which, measure)) for which in (name, ten)]
-        cells += [*quoted, told(pools.difference(HELD_OUT, name, ten, measure))]
+        quoted = [coefficient_cell(pools.rho(HELD_OUT, which, measure)) for which in (name, ten)]
+        cells += [*quoted, coefficient_cell(pools.difference(HELD_OUT, name, ten, measure))]
     else:
         cells += [None] * 3
-    return [*head, gamma_word(of[name].gamma), ", ".join(as_good), *cells]
+    return [*head, gamma_word(by_name[name].gamma), ", ".join(indistinguishable), *cells]
 
 
 def by_sensor(records: Sequence[Record], detectors: Sequence[str]) -> list[Table]:
-    """B: the best gamma by sensor and voxel size on training junctions, and whether one gamma would do for all."""
+    """B: return the best gamma by sensor and voxel size on training junctions, and whether one gamma suits all."""
     sensors = list(dict.fromkeys(record.sensor for record in records))
     rows: list[list[Cell]] = []
     verdicts: list[list[Cell]] = []
@@ -165,34 +173,43 @@ def by_sensor(records: Sequence[Record], detectors: Sequence[str]) -> list[Table
 
 
 def _sensor_row(sensor: str, pools: Pools, settings: Sequence[Setting], measure: str) -> list[Cell]:
-    of = {str(setting): setting for setting in settings}
+    by_name = {str(setting): setting for setting in settings}
     head: list[Cell] = [pools.detector, WORDS[measure], sensor, f"{settings[0].voxel_m:g}"]
-    name = pools.best(TRAINING, list(of), measure)
+    name = pools.best(TRAINING, list(by_name), measure)
     if name is None:
         return [*head, None, None, None]
-    as_good = ", ".join(gamma_word(s.gamma) for s in pools.as_good(TRAINING, of[name], settings, measure))
-    return [*head, gamma_word(of[name].gamma), as_good, told(pools.rho(TRAINING, name, measure))]
+    indistinguishable = ", ".join(
+        gamma_word(s.gamma) for s in pools.indistinguishable(TRAINING, by_name[name], settings, measure)
+    )
+    return [
+        *head,
+        gamma_word(by_name[name].gamma),
+        indistinguishable,
+        coefficient_cell(pools.rho(TRAINING, name, measure)),
+    ]
 
 
 def _verdict(detector: str, measure: str, cells: Sequence[tuple[str, Pools, Sequence[Setting]]]) -> list[Cell]:
-    """The one gamma, and the cells that another suits better."""
+    """Return the one gamma, and the cells where another is better."""
 
     def mean_rho(gamma: float) -> float:
-        all_ = [pools.rho(TRAINING, str(s), measure).value for _, pools, its in cells for s in its if s.gamma == gamma]
+        all_ = [
+            pools.rho(TRAINING, str(s), measure).value for _, pools, pools_ in cells for s in pools_ if s.gamma == gamma
+        ]
         return sum(all_) / len(all_)
 
-    means = {gamma: mean_rho(gamma) for gamma in dict.fromkeys(s.gamma for _, _, its in cells for s in its)}
+    means = {gamma: mean_rho(gamma) for gamma in dict.fromkeys(s.gamma for _, _, pools_ in cells for s in pools_)}
     known = {gamma: mean for gamma, mean in means.items() if mean == mean}
     if not known:
         return [detector, WORDS[measure], None, None, len(cells), *[None] * 4]
     one = max(known, key=lambda gamma: known[gamma])
     higher, lower = list[str](), list[str]()
     for sensor, pools, settings in cells:
-        its = next(s for s in settings if s.gamma == one)
+        pools_ = next(s for s in settings if s.gamma == one)
         for other in settings:
-            gap = pools.difference(TRAINING, str(other), str(its), measure)
+            gap = pools.difference(TRAINING, str(other), str(pools_), measure)
             if gap is not None and gap.interval.low > 0.0:
-                (higher if other.gamma > one else lower).append(f"{sensor} at {its.voxel_m:g} m")
+                (higher if other.gamma > one else lower).append(f"{sensor} at {pools_.voxel_m:g} m")
     cell: list[Cell] = [detector, WORDS[measure], gamma_word(one), round(known[one], 4), len(cells)]
     for where in (higher, lower):
         cell += [len(set(where)), ", ".join(dict.fromkeys(where)) or None]
@@ -200,7 +217,7 @@ def _verdict(detector: str, measure: str, cells: Sequence[tuple[str, Pools, Sequ
 
 
 def ranked(pools: Pools) -> Iterator[Table]:
-    """D: all scores by their rho on training junctions, quoted on held-out ones."""
+    """D: yield all scores by their rho on training junctions, with their rho on held-out ones."""
     if TRAINING not in pools.studies:
         return
     for measure in measures_of(pools.detector):
@@ -210,11 +227,11 @@ def ranked(pools: Pools) -> Iterator[Table]:
         best, default = order[0], str(DEFAULT)
         rows: list[list[Cell]] = []
         for name in order:
-            quoted = told(pools.rho(HELD_OUT, name, measure)) if HELD_OUT in pools.studies else None
+            quoted = coefficient_cell(pools.rho(HELD_OUT, name, measure)) if HELD_OUT in pools.studies else None
             rows.append([
-                name, told(pools.rho(TRAINING, name, measure)), quoted,
-                told(pools.difference(HELD_OUT, name, default, measure)),
-                told(pools.difference(HELD_OUT, name, best, measure)),
+                name, coefficient_cell(pools.rho(TRAINING, name, measure)), quoted,
+                coefficient_cell(pools.difference(HELD_OUT, name, default, measure)),
+                coefficient_cell(pools.difference(HELD_OUT, name, best, measure)),
             ])  # fmt: skip
         head = [Column("score")] + [
             Column(heading, "two")
@@ -233,11 +250,11 @@ def ranked(pools: Pools) -> Iterator[Table]:
 
 
 def candidates(pools: Pools, measure: str) -> list[str]:
-    """The scores that are compared: each, and of EGVS the default and the setting that is best on training ones."""
+    """Return the compared scores; of EGVS only the default and the best setting on training junctions."""
     settings = {str(setting) for setting in pools.settings()}
     best = pools.best(TRAINING, [name for name in pools.scores if name in settings], measure)
-    kept = {str(DEFAULT), best}
-    return [name for name in pools.scores if name not in settings or name in kept]
+    egvs_settings = {str(DEFAULT), best}
+    return [name for name in pools.scores if name not in settings or name in egvs_settings]
 
 
 def _yes(value: bool) -> str:

@@ -1,7 +1,7 @@
-"""Where does a score fail? The table of E: the sites whose rank by score is farthest from their rank by detection.
+"""Table E: where a score fails, i.e. the sites whose ranks by score and by detection differ most.
 
-With each stand numbers that say why it may be: how many vehicles it never sees or sees with few points, what static
-geometry and other vehicles hide, how far vehicles are.
+Further columns help to explain it: vehicles that are never seen or have few points, what static geometry and other
+vehicles hide, and the distance of vehicles.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from benchmarks.validity.tables import Cell, Column, Table, number
 from egvs.validation.sweeps import POINT_COUNTS_NAME
 
 WORST = 3
-"""Sites that are named a junction and score."""
+"""Number of sites per junction and score."""
 
 _PER_CENT = 100.0
 
@@ -32,7 +32,7 @@ COLUMNS = [
 
 
 def tables(each: Sequence[Pools]) -> Iterator[Table]:
-    """E: a table a detector, for the default EGVS and the score that is best on training junctions."""
+    """E: yield a table per detector, for the default EGVS and the best score on training junctions."""
     for pools in each:
         measure = measures_of(pools.detector)[0]
         best = pools.best(TRAINING, candidates(pools, measure), measure) if TRAINING in pools.studies else None
@@ -49,30 +49,30 @@ def tables(each: Sequence[Pools]) -> Iterator[Table]:
 
 
 def worst(record: Record, detector: str, measure: str, score: str) -> list[list[Cell]]:
-    """Rows of the sites with the largest differences of ranks; of equals the first."""
-    its = record.detections[detector][measure]
-    sites = np.array(its.sites)
-    values, foretold = np.array(its.values), np.array(record.scores[score])[sites]
-    known = np.isfinite(values) & np.isfinite(foretold)
-    sites, values, foretold = sites[known], values[known], foretold[known]
-    by_score, by_detection = (rankdata(-its, method="min") for its in (foretold, values))
+    """Return rows of the sites with the largest differences of ranks; the first ones of equals."""
+    estimates = record.detections[detector][measure]
+    sites = np.array(estimates.sites)
+    values, scores = np.array(estimates.values), np.array(record.scores[score])[sites]
+    known = np.isfinite(values) & np.isfinite(scores)
+    sites, values, scores = sites[known], values[known], scores[known]
+    by_score, by_detection = (rankdata(-estimates, method="min") for estimates in (scores, values))
     far = np.argsort(-np.abs(by_score - by_detection), kind="stable")[:WORST]
     return [
         [
             record.junction, score, record.sites[sites[i]].name, number(record.sites[sites[i]].height_m),
             number(_PER_CENT * values[i]), int(by_score[i]), int(by_detection[i]), len(sites),
-            *_why(record, int(sites[i])),
+            *_explanation(record, int(sites[i])),
         ]
         for i in far.tolist()
     ]  # fmt: skip
 
 
-def _why(record: Record, site: int) -> list[Cell]:
+def _explanation(record: Record, site: int) -> list[Cell]:
     points = record.detections[POINT_COUNTS_NAME]
     seen_1, seen_20 = (points[name].values[site] for name in ("seen_1", "seen_20"))
-    seen = record.scores["entropy_seen"][site]
+    entropy_seen = record.scores["entropy_seen"][site]
     alone, in_traffic = (str(Setting(1.0, DEFAULT.voxel_m, occlusion)) for occlusion in (False, True))
     crossed = record.scores[alone][site]
     hidden = 1.0 - record.scores[in_traffic][site] / crossed if crossed > 0 else math.nan
-    shares = (1.0 - seen_1, seen_1 - seen_20, 1.0 - seen, hidden)
+    shares = (1.0 - seen_1, seen_1 - seen_20, 1.0 - entropy_seen, hidden)
     return [*(number(_PER_CENT * share) for share in shares), number(record.sites[site].distance_m)]

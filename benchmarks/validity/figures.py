@@ -75,13 +75,17 @@ def _gamma_lines(axes: Any, table: Table, role: str) -> None:
             table.column("gamma"), table.column("voxel, m"), table.column("moving occlusion"), table.column(role),
             strict=True,
         )  # fmt: skip
-        its = [(gammas.index(g), cell) for g, v, o, cell in rows if (v, o) == (voxel, occlusion) and cell is not None]
+        points = [
+            (gammas.index(g), cell) for g, v, o, cell in rows if (v, o) == (voxel, occlusion) and cell is not None
+        ]
         colour, marker = _STYLES[voxel]
         line = "--" if occlusion == "yes" else "-"
         label = f"voxel {voxel} m" + (", moving occlusion" if occlusion == "yes" else "")
-        axes.plot([x for x, _ in its], [c[0] for _, c in its], line, color=colour, marker=marker, ms=4, label=label)
+        axes.plot(
+            [x for x, _ in points], [c[0] for _, c in points], line, color=colour, marker=marker, ms=4, label=label
+        )
         if (voxel, occlusion) == ("0.25", "no"):
-            known = [(x, c) for x, c in its if c[1] is not None]
+            known = [(x, c) for x, c in points if c[1] is not None]
             axes.fill_between(
                 [x for x, _ in known], [c[1] for _, c in known], [c[2] for _, c in known], color=colour, alpha=0.12
             )
@@ -92,7 +96,7 @@ def heights(table: Table) -> Figure:
     """Detection against mounting height: a panel a detector and measure, a line a junction, training ones dashed,
     held-out ones together in bold."""
     pairs = dict.fromkeys(zip(table.column("detector"), table.column("measure"), strict=True))
-    kinds = [(name, its) for name, its in pairs if its == WORDS[measures_of(name)[0]] and " " not in name]
+    kinds = [(name, measure) for name, measure in pairs if measure == WORDS[measures_of(name)[0]] and " " not in name]
     rows = -(-len(kinds) // _ABREAST)
     figure, panels = _panels(rows, min(len(kinds), _ABREAST), 4.0, 3.4)
     marks = [
@@ -163,7 +167,7 @@ def recommendation(tables: Sequence[Table]) -> Figure:
                 if heading == "recommended" and cell[1] is not None:
                     axes.plot(cell[1:], [line, line], color=edge, linewidth=1.3, zorder=2)
         names = zip(table.column("junction"), table.column("sites"), table.column("number of sites"), strict=True)
-        axes.set_yticks(range(len(table.rows)), [f"{name}, {its}: {n}" for name, its, n in names], fontsize=7)
+        axes.set_yticks(range(len(table.rows)), [f"{name}, {sensor}: {n}" for name, sensor, n in names], fontsize=7)
         axes.set(ylim=(len(table.rows) - 0.5, -0.5), xlim=(0.0, 1.02), xlabel="rho")
         axes.set_title(_what(table), fontsize=9)
     handles, labels = panels[0, 0].get_legend_handles_labels()

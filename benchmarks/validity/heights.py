@@ -1,7 +1,7 @@
-"""Does a higher mount detect less? The table of C: the same places at four heights, compared place by place.
+"""Table C: does a higher mount detect less? The same locations at four heights, compared with each other.
 
-Intervals resample places and blocks of frames together, as those of correlations do; differences are of the same place
-and the same frames. Junctions of one role are taken together: the mean of theirs, weighted by their numbers of places.
+Intervals resample locations and blocks of frames together, as those of correlations do; differences are for the same
+location and frames. For several junctions of one role: the mean weighted by their numbers of locations.
 """
 
 from __future__ import annotations
@@ -12,32 +12,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.validity.agreement import WORDS
+from benchmarks.validity.detector_sites import FAST, FEW_PLACES
 from benchmarks.validity.junctions import ROLES
-from benchmarks.validity.looking_from import FAST, FEW_PLACES
 from benchmarks.validity.low_models import LOW, SENSOR
 from benchmarks.validity.pools import SEED
 from benchmarks.validity.poses import HEIGHTS_M
 from benchmarks.validity.record import Record, measures_of
 from benchmarks.validity.tables import Cell, Column, Table, with_interval
-from egvs.validation.correlation import MIN_PLACES, RESAMPLES, ConfidenceInterval, MeasureValues, Resamples
+from egvs.validation.correlation import MIN_POLES, RESAMPLES, ConfidenceInterval, MeasureValues, Resamples
 from egvs.validation.detectors.pointpillars import PointPillars
 
 Floats = NDArray[np.float64]
 
 
 LESS = {LOW: PointPillars.NAME, SENSOR: LOW}
-"""Detectors that are compared with others: what training at one height does, and what the convention does."""
+"""Detectors that are compared with others: the effect of training at one height, and of the height convention."""
 
 
 def table(records: Sequence[Record], detectors: Sequence[str]) -> Table:
-    """C: means at each height and differences to the lowest; shares and AP in per cent."""
+    """C: return means at each height and differences from the lowest; shares and AP in per cent."""
     rows: list[list[Cell]] = []
     for what, first, second, few in _compared(detectors):
-        mine = [record for record in records if {first, second or first} <= set(record.detections)]
-        for measure in measures_of(first) if mine else ():
+        with_detectors = [record for record in records if {first, second or first} <= set(record.detections)]
+        for measure in measures_of(first) if with_detectors else ():
             groups = [
-                *((r.junction, [r]) for r in mine),
-                *((role, [r for r in mine if r.role == role]) for role in ROLES),
+                *((r.junction, [r]) for r in with_detectors),
+                *((role, [r for r in with_detectors if r.role == role]) for role in ROLES),
             ]
             for name, group in ((name, group) for name, group in groups if group):
                 each = [by_height(record, first, second, measure, few) for record in group]
@@ -54,7 +54,7 @@ def table(records: Sequence[Record], detectors: Sequence[str]) -> Table:
 
 
 def _compared(detectors: Sequence[str]) -> Iterator[tuple[str, str, str | None, int | None]]:
-    """What a row is called, its detector, one that is taken from it, and from how many places at most."""
+    """Yield the title of a row, its detector, one that is subtracted, and the largest number of locations."""
     for name in detectors:
         yield name, name, None, None
     if any(name in detectors for name in LESS):
@@ -67,47 +67,54 @@ def _compared(detectors: Sequence[str]) -> Iterator[tuple[str, str, str | None, 
 
 
 def _cells(junctions: Sequence[str], each: Sequence[list[MeasureValues]]) -> list[Cell]:
-    number = sum(len(its[0].values) for its in each)
+    number = sum(len(values[0].values) for values in each)
     if not number:
         return [0, *[None] * (2 * len(HEIGHTS_M) - 1)]
-    means = [_mean(junctions, [its[i] for its in each]) for i in range(len(HEIGHTS_M))]
-    gaps = [_mean(junctions, [_less(its[i], its[0]) for its in each]) for i in range(1, len(HEIGHTS_M))]
+    means = [_mean(junctions, [values[i] for values in each]) for i in range(len(HEIGHTS_M))]
+    gaps = [_mean(junctions, [_less(values[i], values[0]) for values in each]) for i in range(1, len(HEIGHTS_M))]
     return [number, *means, *gaps]
 
 
-def by_height(record: Record, detector: str, less: str | None, measure: str, few: int | None) -> list[MeasureValues]:
-    """The measure at the places that have all heights, one a height, place by place in the same order.
+def by_height(
+    record: Record, detector: str, subtracted: str | None, measure: str, few: int | None
+) -> list[MeasureValues]:
+    """Return the measure at the locations that have all heights, one entry per height, in the same order.
 
     Parameters
     ----------
     less
-        Another detector, whose measure is taken from it.
+        Another detector, whose measure is subtracted.
     few
-        The first so many places; all when None.
+        Number of locations; all if None.
     """
-    every = [_places(record, name, measure) for name in (detector, less) if name is not None]
-    shared = [place for place in every[0] if all(place in its for its in every)][:few]
-    found = []
+    every = [_places(record, name, measure) for name in (detector, subtracted) if name is not None]
+    shared = [location for location in every[0] if all(location in values for values in every)][:few]
+    measures = []
     for height_m in HEIGHTS_M:
         each = []
-        for name, places in zip((detector, less), every, strict=False):
+        for name, places in zip((detector, subtracted), every, strict=False):
             assert name is not None
-            measured, rows = record.detections[name][measure].measured(), [places[place][height_m] for place in shared]
+            measured, rows = (
+                record.detections[name][measure].measured(),
+                [places[location][height_m] for location in shared],
+            )
             each.append(MeasureValues(measured.values[rows], measured.left_out[rows]))
-        found.append(each[0] if less is None else _less(*each))
-    return found
+        measures.append(each[0] if subtracted is None else _less(*each))
+    return measures
 
 
 def _places(record: Record, detector: str, measure: str) -> dict[str, dict[float, int]]:
-    """Of each place of the grid where the measure is defined at all heights, the row of each height."""
-    its = record.detections[detector][measure]
+    """Return the row of each height, for locations of the grid where the measure is defined at all heights."""
+    values = record.detections[detector][measure]
     at: dict[str, dict[float, int]] = {}
-    for row, site in enumerate(record.sites[i] for i in its.sites):
+    for row, site in enumerate(record.sites[i] for i in values.sites):
         if not site.is_given:
             at.setdefault(site.place, {})[site.height_m] = row
-    known = its.measured().known
+    known = values.measured().defined
     return {
-        place: rows for place, rows in at.items() if set(rows) == set(HEIGHTS_M) and known[list(rows.values())].all()
+        location: rows
+        for location, rows in at.items()
+        if set(rows) == set(HEIGHTS_M) and known[list(rows.values())].all()
     }
 
 
@@ -116,14 +123,14 @@ def _less(first: MeasureValues, second: MeasureValues) -> MeasureValues:
 
 
 def _mean(junctions: Sequence[str], each: Sequence[MeasureValues]) -> Cell:
-    """The mean over places of all junctions, in per cent, with its interval."""
-    weights = np.array([len(its.values) for its in each], dtype=np.float64)
-    value = sum(float(its.values.sum()) for its in each) / weights.sum()
+    """Return the mean over locations of all junctions, in per cent, with its interval."""
+    weights = np.array([len(values.values) for values in each], dtype=np.float64)
+    value = sum(float(values.values.sum()) for values in each) / weights.sum()
     draws: Floats = np.zeros(RESAMPLES)
-    for name, its, weight in zip(junctions, each, weights.tolist(), strict=True):
+    for name, values, weight in zip(junctions, each, weights.tolist(), strict=True):
         if weight:
-            drawn = Resamples.of(name, len(its.values), its.left_out.shape[1], RESAMPLES, SEED)
-            draws += drawn.of_measure(its, np.ones(len(its.values), dtype=np.bool_)).mean(axis=1) * weight
-    if 0 < min(filter(None, weights.tolist())) < MIN_PLACES:
-        return with_interval(100.0 * value, ConfidenceInterval.unknown("too few places"))
-    return with_interval(100.0 * value, ConfidenceInterval.of(100.0 * value, 100.0 * draws / weights.sum()))
+            drawn = Resamples.draw(name, len(values.values), values.left_out.shape[1], RESAMPLES, SEED)
+            draws += drawn.resample_measure(values, np.ones(len(values.values), dtype=np.bool_)).mean(axis=1) * weight
+    if 0 < min(filter(None, weights.tolist())) < MIN_POLES:
+        return with_interval(100.0 * value, ConfidenceInterval.undefined("too few places"))
+    return with_interval(100.0 * value, ConfidenceInterval.from_resamples(100.0 * value, 100.0 * draws / weights.sum()))

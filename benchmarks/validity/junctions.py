@@ -1,9 +1,9 @@
-"""The junctions of the study, what each is there for, and its sites.
+"""The junctions of the study, their roles, and their sites.
 
-*Training* junctions may choose (gamma, the best score, a detector's weights); *held-out* ones are what is quoted; the
-*unseen* one was not looked at before all was chosen and answered, and is quoted for the score that came of it.
-Junctions from OpenStreetMap are made from extracts that the user names, since none is shipped; without them the study
-runs on the others, and its tables say so.
+*Training* junctions are used for choices (gamma, the best score, a detector's weights); *held-out* junctions are used
+for the reported results; the *unseen* junction was first evaluated after all choices were made, and is reported for the
+recommended score. Junctions from OpenStreetMap are made from extracts that the user names, since none is shipped;
+without them the study uses the others, and its tables say so.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ SHIPPED: dict[str, Role] = {
     "nishishinjuku": "held out",
 }
 OSM: dict[Role, str] = {"training": "osm_training", "held out": "osm_held_out", "unseen": "osm_unseen"}
-"""What junctions from OpenStreetMap are called."""
+"""Names of junctions from OpenStreetMap."""
 
 APART_M = 700.0
-"""Between junctions from OpenStreetMap of different roles, at least: twice what is seen round one."""
+"""Smallest distance between junctions from OpenStreetMap of different roles: twice the surroundings of one."""
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "scenarios"
 
@@ -64,30 +64,30 @@ class StudyJunction:
 
 
 def shipped(names: Sequence[str] = ()) -> list[tuple[str, Role, Path]]:
-    """The scenarios of this project that the study looks at, and their folders."""
+    """Return the shipped scenarios of the study, and their folders."""
     return [
         (n, role, SCENARIOS / n) for n, role in SHIPPED.items() if (SCENARIOS / n).is_dir() and n in (names or (n,))
     ]
 
 
 def from_osm(role: Role, extract: Path, at: tuple[float, float] | None, folder: Path) -> tuple[str, Role, Path]:
-    """The scenario made from an extract, in a folder of the study; made once for the same extract and place."""
+    """Return the scenario made from an extract, in a folder of the study; it is made once per extract and location."""
     name = OSM[role]
-    home, note = folder / name, folder / f"{name}.json"
+    scenario_folder, note = folder / name, folder / f"{name}.json"
     if not extract.is_file():
-        raise InputError(_option(role), f"no such file ({extract})", "an OpenStreetMap extract")
+        raise InputError(_option(role), f"no such file ({extract})", "Name an OpenStreetMap extract.")
     key = files.canonical_json({"extract": files.hash_file(extract), "at": at})
-    if not (home.is_dir() and note.is_file() and note.read_bytes() == key):
-        if home.is_dir():
-            raise InputError(home, "is of another extract or place", "to remove it, so that it is made anew")
+    if not (scenario_folder.is_dir() and note.is_file() and note.read_bytes() == key):
+        if scenario_folder.is_dir():
+            raise InputError(scenario_folder, "was made from another extract or location", "Remove it.")
         folder.mkdir(parents=True, exist_ok=True)
-        openstreetmap.create_scenario(home, extract, at)
+        openstreetmap.create_scenario(scenario_folder, extract, at)
         note.write_bytes(key)
-    return name, role, home
+    return name, role, scenario_folder
 
 
 def check_unseen(scenario: Scenario) -> None:
-    """Refuse traffic that scores and detectors would share.
+    """Reject traffic that scores and detectors would share.
 
     Raises
     ------
@@ -95,48 +95,50 @@ def check_unseen(scenario: Scenario) -> None:
         For traffic that is a finished file.
     """
     if scenario.is_recorded:
-        found = "the traffic is a finished file: scores and detectors would see the same"
-        raise InputError(f"{scenario.file}: traffic.fcd", found, "a network, whose traffic has another seed")
+        problem = "the traffic is a finished file, so scores and detectors would use the same frames"
+        raise InputError(
+            f"{scenario.file}: traffic.fcd", problem, "Use a network, whose traffic can have another seed."
+        )
 
 
-def check_apart(homes: Sequence[tuple[str, Role, Path]]) -> None:
-    """Refuse two junctions from OpenStreetMap whose surroundings may meet.
+def check_apart(folders: Sequence[tuple[str, Role, Path]]) -> None:
+    """Reject two junctions from OpenStreetMap whose surroundings may overlap.
 
     Raises
     ------
     InputError
         For regions of interest nearer than :data:`APART_M`.
     """
-    places = [(role, _on_map(home)) for name, role, home in homes if name in OSM.values()]
+    places = [(role, _on_map(scenario_folder)) for name, role, scenario_folder in folders if name in OSM.values()]
     for (first, one), (second, other) in itertools.combinations(places, 2):
         away_m = math.hypot(one[1] - other[1], one[2] - other[2])
         if one[0] == other[0] and away_m < APART_M:
-            found = f"{away_m:.0f} m from the junction of {_option(first)}"
-            raise InputError(_option(second), found, f"one at least {APART_M:g} m from it, which nothing was chosen on")
+            problem = f"expected at least {APART_M:g} m to the junction of {_option(first)}, got {away_m:.0f} m"
+            raise InputError(_option(second), problem, "Use another junction.")
 
 
 def _option(role: Role) -> str:
     return f"--osm-{role.replace(' ', '-')}"
 
 
-def _on_map(home: Path) -> tuple[str, float, float]:
-    """The projection of a scenario from OpenStreetMap, and where its region of interest is in it, in metres."""
-    scenario = load(home)
-    location = network.read_location(home / "network.net.xml")
+def _on_map(scenario_folder: Path) -> tuple[str, float, float]:
+    """Return the projection of a scenario from OpenStreetMap, and the position of its region of interest, in metres."""
+    scenario = load(scenario_folder)
+    location = network.read_location(scenario_folder / "network.net.xml")
     assert location is not None, "netconvert says where a map's network lies"
     x, y, _ = scenario.roi.center_m
     return location.projection, x - location.offset_m[0], y - location.offset_m[1]
 
 
-def ready(name: str, role: Role, home: Path, folder: Path, places: int = poses.PLACES) -> StudyJunction:
-    """A junction with its sites: its own upright ones, and the grid.
+def ready(name: str, role: Role, scenario_folder: Path, folder: Path, places: int = poses.PLACES) -> StudyJunction:
+    """Return a junction with its sites: its own upright ones, and the grid.
 
     Parameters
     ----------
     folder
         For the static world, from the store where it is there.
     """
-    scenario = load(home)
+    scenario = load(scenario_folder)
     folder.mkdir(parents=True, exist_ok=True)
     work = open_folder(scenario, folder)
     ensure_stages(work, "statics")
@@ -148,8 +150,8 @@ def ready(name: str, role: Role, home: Path, folder: Path, places: int = poses.P
     return StudyJunction(name, role, scenario, given, grid)
 
 
-def posed(scenario: Scenario, sites: Sequence[Site], file: Path, sensor: str | None = None) -> Scenario:
-    """The scenario with these sites, written as a CSV; all with another sensor where one is named."""
+def with_sites(scenario: Scenario, sites: Sequence[Site], file: Path, sensor: str | None = None) -> Scenario:
+    """Return the scenario with these sites, written as CSV; all with another sensor if one is given."""
     with files.atomic_write(file) as partial, partial.open("w", encoding="utf-8", newline="") as out:
         rows = csv.writer(out, lineterminator="\n")
         rows.writerow(["site", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg", "sensor"])

@@ -1,4 +1,4 @@
-"""The study's coefficients: of each junction, of the training junctions together, of the held-out ones together."""
+"""Correlations of the study: for each junction, and for all training, held-out and unseen junctions together."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from egvs.validation.correlation import RESAMPLES, CoefficientKind, Correlation,
 from egvs.validation.results import ScoreName
 
 SEED = 2504
-"""Of the resamples of sites and blocks."""
+"""Seed of the resamples of sites and blocks."""
 
 KIND: CoefficientKind = "spearman"
-"""The study compares orders: a planner takes the first of a list."""
+"""The study compares rankings, because planners choose the first sites of a list."""
 
 GAMMAS = (1.0, 2.0, 5.0, 10.0, 20.0, math.inf)
 VOXELS_M = (0.25, 0.5, 1.0)
@@ -33,26 +33,26 @@ class Setting:
     occlusion: bool
 
     def __str__(self) -> str:
-        """The score's name in a record."""
-        told = {
+        """Return the score's name in a record."""
+        parameters = {
             "gamma": "inf" if self.gamma == math.inf else self.gamma,
             "moving_occlusion": self.occlusion,
             "voxel_m": self.voxel_m,
         }
-        return str(ScoreName("egvs", files.canonical_json(told).decode()))
+        return str(ScoreName("egvs", files.canonical_json(parameters).decode()))
 
 
 DEFAULT = Setting(10.0, 0.25, False)
-"""What a scenario has that says nothing else."""
+"""The default of a scenario when the study was made."""
 
 
 class Pools:
-    """Every junction's coefficients and the pooled ones, of one detector.
+    """Correlations of one detector, for each junction and for several together.
 
     Parameters
     ----------
     records
-        Of one sensor; those that the detector looked at count.
+        Records of one sensor; those with results of the detector are used.
     """
 
     def __init__(self, records: Sequence[Record], detector: str, resamples: int = RESAMPLES) -> None:
@@ -62,19 +62,19 @@ class Pools:
 
     @cached_property
     def studies(self) -> dict[str, CorrelationStudy]:
-        """By name of the junction, or by role."""
+        """Studies by name of the junction, or by role."""
         together: dict[str, list[Record]] = {record.junction: [record] for record in self.records}
         for role in ROLES:
-            if its := [record for record in self.records if record.role == role]:
-                together[role] = its
+            if records := [record for record in self.records if record.role == role]:
+                together[role] = records
         return {
-            name: CorrelationStudy([record.junction_of(self.detector) for record in its], SEED, self.resamples)
-            for name, its in together.items()
+            name: CorrelationStudy([record.junction_of(self.detector) for record in records], SEED, self.resamples)
+            for name, records in together.items()
         }
 
     @cached_property
     def scores(self) -> list[str]:
-        """Those that all records have, in their order."""
+        """Scores that all records contain, in their order."""
         first, *others = (record.scores for record in self.records)
         return [name for name in first if all(name in other for other in others)]
 
@@ -98,16 +98,16 @@ class Pools:
         return self._known[key]
 
     def best(self, pool: str, names: Sequence[str], measure: str) -> str | None:
-        """The score that goes best with a measure, of equals the first; None where none has a coefficient."""
+        """Return the score with the highest correlation with a measure (the first of equals); None if there is none."""
         known = [(self.rho(pool, name, measure).value, name) for name in names] if pool in self.studies else []
-        known = [its for its in known if not math.isnan(its[0])]
-        return max(known, key=lambda its: its[0])[1] if known else None
+        known = [(rho, name) for rho, name in known if not math.isnan(rho)]
+        return max(known, key=lambda pair: pair[0])[1] if known else None
 
-    def as_good(self, pool: str, best: Setting, others: Sequence[Setting], measure: str) -> list[Setting]:
-        """Those that the data cannot tell from the best: the interval of the difference does not lie above 0."""
-        kept = []
+    def indistinguishable(self, pool: str, best: Setting, others: Sequence[Setting], measure: str) -> list[Setting]:
+        """Return settings that the data cannot distinguish from the best: the interval of the difference contains 0."""
+        settings = []
         for other in others:
             gap = self.difference(pool, str(best), str(other), measure)
             if gap is None or not gap.interval.low > 0.0:
-                kept.append(other)
-        return kept
+                settings.append(other)
+        return settings

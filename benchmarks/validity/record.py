@@ -1,7 +1,7 @@
-"""What was measured at the sites of one junction with one sensor: all that the analyses start from, kept as JSON.
+"""Measurements at the sites of one junction with one sensor, saved as JSON; all analyses start from them.
 
-Numbers are kept in full, so that analyses of what was kept and of what was just measured are the same. What was
-measured with a clock is not in here.
+Numbers are saved with all digits, so analyses of saved and of new measurements are the same. Measured times are not
+included.
 """
 
 from __future__ import annotations
@@ -20,26 +20,25 @@ from egvs.validation.sweeps import POINT_COUNTS_NAME
 
 COUNTED = ("seen_20", "log_points")
 BOXED = ("ap_combined_r40_iou70", "ap_combined_r40_iou50")
-"""What detection is measured by; the first is what a detector is shown by."""
+"""Measures of detection; tables show the first one of each."""
 
-BESIDE_COUNTED, BESIDE_BOXED = ("seen_1", "seen_5"), ("ap_bev_r40_iou70", "ap_3d_r40_iou70")
-"""Kept beside them: of points on vehicles to explain failures, of boxes since their standard errors are aimed at."""
+FURTHER_COUNT_MEASURES, FURTHER_BOX_MEASURES = ("seen_1", "seen_5"), ("ap_bev_r40_iou70", "ap_3d_r40_iou70")
+"""Further measures: of points, to explain failures; of boxes, for their standard errors."""
 
 
 def measures_of(detector: str) -> tuple[str, ...]:
-    """The measures of a detector."""
+    """Return the measures of a detector."""
     return COUNTED if detector == POINT_COUNTS_NAME else BOXED
 
 
-def beside_of(detector: str) -> tuple[str, ...]:
-    """What is kept beside them."""
-    return BESIDE_COUNTED if detector == POINT_COUNTS_NAME else BESIDE_BOXED
+def further_measures(detector: str) -> tuple[str, ...]:
+    """Return further measures that are saved."""
+    return FURTHER_COUNT_MEASURES if detector == POINT_COUNTS_NAME else FURTHER_BOX_MEASURES
 
 
 @dataclass(frozen=True)
 class StudySite:
-    """A site: its name, the place that it shares with sites of other heights, its height above the ground, its mean
-    horizontal distance to vehicles."""
+    """A site: name, location (shared by sites of other heights), height above the ground, mean distance to vehicles."""
 
     name: str
     place: str
@@ -50,16 +49,16 @@ class StudySite:
 
 @dataclass(frozen=True)
 class Estimates:
-    """One measure of one detector, at the sites that it looked from.
+    """One measure of one detector, at the sites where it ran.
 
     Attributes
     ----------
     sites
-        Their numbers among the sites of the record.
+        Indices of the sites in the record.
     values, se
-        One a site; NaN where it is not defined.
+        One per site; NaN if undefined.
     left_out
-        With each block of frames left out, one list a site.
+        Values with each block of frames left out, one list per site.
     """
 
     sites: list[int]
@@ -68,7 +67,7 @@ class Estimates:
     left_out: list[list[float]]
 
     def only(self, sites: Set[int]) -> Estimates:
-        """At some of the sites."""
+        """Return the estimates at some of the sites."""
         rows = [row for row, site in enumerate(self.sites) if site in sites]
         return Estimates(
             [self.sites[row] for row in rows],
@@ -78,13 +77,13 @@ class Estimates:
         )
 
     def measured(self) -> MeasureValues:
-        """As the statistics take it."""
+        """Return the values as the statistics need them."""
         return MeasureValues(np.array(self.values, dtype=np.float64), np.array(self.left_out).reshape(-1, BLOCKS))
 
 
 @dataclass(frozen=True)
 class Record:
-    """What was measured.
+    """All measurements of one junction and sensor.
 
     Attributes
     ----------
@@ -93,11 +92,11 @@ class Record:
     objects
         Vehicle-frames that a detector should find.
     scores
-        By name, one a site, turned so that more is better.
+        One value per site, by name, with a sign such that more is better.
     detections
         By detector and measure.
     skipped
-        What of the scores could not be worked out, as told.
+        Scores that could not be computed, with the reason.
     """
 
     key: str
@@ -113,34 +112,36 @@ class Record:
     skipped: list[str] = field(default_factory=list)
 
     def write(self, path: Path) -> None:
-        """As JSON."""
+        """Write JSON."""
         with files.atomic_write(path) as partial:
             partial.write_text(json.dumps(asdict(self), indent=None, separators=(",", ":")) + "\n", encoding="utf-8")
 
     @classmethod
     def read(cls, path: Path) -> Record:
-        """The inverse of :meth:`write`."""
+        """Read what :meth:`write` wrote."""
         value = json.loads(path.read_text(encoding="utf-8"))
         sites = [StudySite(**site) for site in value.pop("sites")]
-        found = {d: {m: Estimates(**its) for m, its in by.items()} for d, by in value.pop("detections").items()}
-        return cls(sites=sites, detections=found, **value)
+        detections = {
+            d: {m: Estimates(**entry) for m, entry in by.items()} for d, by in value.pop("detections").items()
+        }
+        return cls(sites=sites, detections=detections, **value)
 
     def junction_of(self, detector: str) -> JunctionScores:
-        """The sites that a detector looked from, with all scores."""
+        """Return the sites where a detector ran, with all scores."""
         by_measure = self.detections[detector]
         rows = next(iter(by_measure.values())).sites
-        values = {name: np.array(its, dtype=np.float64)[rows] for name, its in self.scores.items()}
-        measures = {name: its.measured() for name, its in by_measure.items()}
-        its = [self.sites[row] for row in rows]
+        values = {name: np.array(entry, dtype=np.float64)[rows] for name, entry in self.scores.items()}
+        measures = {name: entry.measured() for name, entry in by_measure.items()}
+        entry = [self.sites[row] for row in rows]
         return JunctionScores(
-            self.junction, tuple(site.name for site in its), values, measures, tuple(site.place for site in its)
+            self.junction, tuple(site.name for site in entry), values, measures, tuple(site.place for site in entry)
         )
 
-    def only(self, wanted: Callable[[StudySite], bool]) -> Record:
-        """What was found from some of the sites."""
-        kept = {number for number, site in enumerate(self.sites) if wanted(site)}
-        found = {
-            detector: {measure: its.only(kept) for measure, its in by_measure.items()}
+    def only(self, is_selected: Callable[[StudySite], bool]) -> Record:
+        """Return the measurements at some of the sites."""
+        selected = {number for number, site in enumerate(self.sites) if is_selected(site)}
+        detections = {
+            detector: {measure: entry.only(selected) for measure, entry in by_measure.items()}
             for detector, by_measure in self.detections.items()
         }
-        return replace(self, detections=found)
+        return replace(self, detections=detections)

@@ -23,7 +23,7 @@ Form = Literal["text", "whole", "one", "two"]
 Cell = str | float | int | None | list[float | None]
 
 _DIGITS = {"whole": 0, "one": 1, "two": 2}
-KEPT_DIGITS = 4
+SAVED_DIGITS = 4
 
 INDEX = "tables.json"
 """Beside the CSV files: preface, captions and columns."""
@@ -59,32 +59,32 @@ class Table:
 
     def column(self, heading: str) -> list[Any]:
         """The cells of a column."""
-        place = [column.heading for column in self.columns].index(heading)
-        return [row[place] for row in self.rows]
+        column_index = [column.heading for column in self.columns].index(heading)
+        return [row[column_index] for row in self.rows]
 
 
 def with_interval(value: float, interval: ConfidenceInterval) -> Cell:
     """A number with its interval of 95 %."""
-    return None if math.isnan(value) else [_kept(value), _kept(interval.low), _kept(interval.high)]
+    return None if math.isnan(value) else [_rounded(value), _rounded(interval.low), _rounded(interval.high)]
 
 
 def number(value: float) -> Cell:
     """A number."""
-    return _kept(value)
+    return _rounded(value)
 
 
-def _kept(value: float) -> float | None:
-    return None if math.isnan(value) else round(float(value), KEPT_DIGITS) + 0.0
+def _rounded(value: float) -> float | None:
+    return None if math.isnan(value) else round(float(value), SAVED_DIGITS) + 0.0
 
 
-def shown(cell: Cell, form: Form) -> str:
+def format_number(cell: Cell, form: Form) -> str:
     """A cell as text."""
     if cell is None:
         return "-"
     if isinstance(cell, str):
         return cell.replace("|", "\\|")
     if isinstance(cell, list):
-        value, low, high = (shown(part, form) for part in cell)
+        value, low, high = (format_number(part, form) for part in cell)
         return value if cell[1] is None else f"{value} ({low} to {high})"
     digits = _DIGITS[form]
     return f"{round(cell, digits) + 0.0:.{digits}f}"
@@ -93,7 +93,10 @@ def shown(cell: Cell, form: Form) -> str:
 def markdown(table: Table) -> str:
     """A table with its caption."""
     align = ["---" if column.form == "text" else "---:" for column in table.columns]
-    body = [[shown(cell, column.form) for cell, column in zip(row, table.columns, strict=True)] for row in table.rows]
+    body = [
+        [format_number(cell, column.form) for cell, column in zip(row, table.columns, strict=True)]
+        for row in table.rows
+    ]
     lines = [[column.heading for column in table.columns], align, *body]
     drawn = "".join("| " + " | ".join(line) + " |\n" for line in lines)
     return f"{table.caption}\n\n{drawn}"

@@ -34,10 +34,10 @@ Names are imported when they are first used, so that ``import egvs`` costs nothi
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from egvs._version import __version__
+from egvs.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from egvs.artefacts.readers import read_scans, read_scores, read_scores_by_period, read_visibility
@@ -56,35 +56,6 @@ if TYPE_CHECKING:
     from egvs.sensors.sites import Pose, Site
     from egvs.stages.inputs import build_scene
     from egvs.world.mesh import World
-
-
-_HOME = {
-    "EgvsError": "core.errors",
-    "InputError": "core.errors",
-    "JointScore": "placement.plan",
-    "Pose": "sensors.sites",
-    "RunError": "core.errors",
-    "Scanner": "sensors.scanner",
-    "Scenario": "scenario.model",
-    "Scene": "sensors.scene",
-    "Scorer": "scoring.scorer",
-    "Sensor": "sensors.sensor",
-    "Site": "sensors.sites",
-    "Tpog": "artefacts.tpog",
-    "World": "world.mesh",
-    "build_scene": "stages.inputs",
-    "load": "scenario.loading",
-    "place": "placement.plan",
-    "read_scans": "artefacts.readers",
-    "read_scores": "artefacts.readers",
-    "read_scores_by_period": "artefacts.readers",
-    "read_tpog": "artefacts.tpog",
-    "read_trajectories": "artefacts.traffic_frames",
-    "read_visibility": "artefacts.readers",
-    "run": "runs.run",
-    "verify": "runs.verification",
-}
-"""Public name -> the module that it is from."""
 
 __all__ = [
     "EgvsError",
@@ -114,12 +85,25 @@ __all__ = [
     "verify",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        return getattr(importlib.import_module(f"egvs.{_HOME[name]}"), name)
-    raise AttributeError(f"module 'egvs' has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__ = lazy_exports(
+    __name__,
+    {
+        "artefacts.readers": ["read_scans", "read_scores", "read_scores_by_period", "read_visibility"],
+        "artefacts.tpog": ["Tpog", "read_tpog"],
+        "artefacts.traffic_frames": ["read_trajectories"],
+        "core.errors": ["EgvsError", "InputError", "RunError"],
+        "placement.plan": ["JointScore", "place"],
+        "runs.run": ["run"],
+        "runs.verification": ["verify"],
+        "scenario.loading": ["load"],
+        "scenario.model": ["Scenario"],
+        "scoring.scorer": ["Scorer"],
+        "sensors.scanner": ["Scanner"],
+        "sensors.scene": ["Scene"],
+        "sensors.sensor": ["Sensor"],
+        "sensors.sites": ["Pose", "Site"],
+        "stages.inputs": ["build_scene"],
+        "world.mesh": ["World"],
+        "_version": ["__version__"],
+    },
+)

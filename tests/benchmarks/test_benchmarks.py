@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from benchmarks import casting, others, savings, scaling, steps
+from benchmarks import alternatives, casting, culling, scaling, steps
 from scipy import stats
 
-from egvs.artefacts.traffic_frames import FrameBoxes
+from egvs.artefacts.frame_boxes import FrameBoxes
 from egvs.core.grid import Grid
 
 SHAPE = np.array([12, 6, 4], np.int64)
@@ -21,11 +21,11 @@ ALONG = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ALONG)
-@pytest.mark.parametrize("way", others.MARCHES)
+@pytest.mark.parametrize("way", alternatives.MARCHES)
 def test_along_an_axis_all_marches_give_the_same_voxels(way: str, case: str) -> None:
     start, extent, crossed = ALONG[case]
     hits = np.zeros(int(SHAPE.prod()), np.uint32)
-    others.MARCHES[way](np.array(start), np.array([extent, extent]), SHAPE, 0.25, hits)
+    alternatives.MARCHES[way](np.array(start), np.array([extent, extent]), SHAPE, 0.25, hits)
     expected = np.zeros(tuple(SHAPE), np.uint32)
     for voxel in crossed:
         expected[voxel] = 2
@@ -37,9 +37,9 @@ def test_samples_are_the_same_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None
     o, d = np.array([-2.0, 3.3, 1.7]), rng.uniform(-15, 15, (200, 3))
     found = []
     for chunk in (10, 10**6):
-        monkeypatch.setattr(others, "_CHUNK", chunk)
+        monkeypatch.setattr(alternatives, "_CHUNK", chunk)
         hits = np.zeros(int(SHAPE.prod()), np.uint32)
-        others.sampled(0.5)(o, d, SHAPE, 0.25, hits)
+        alternatives.sampled(0.5)(o, d, SHAPE, 0.25, hits)
         found.append(hits)
     assert found[0].any() and (found[0] == found[1]).all()
 
@@ -48,11 +48,11 @@ def test_fine_samples_miss_no_voxel_that_a_beam_crosses_at_length() -> None:
     rng = np.random.default_rng(4)
     o, d = np.array([-2.0, 3.3, 1.7]), rng.uniform(-15, 15, (200, 3))
     shares = []
-    for way in (others.sampled(1.0), others.sampled(0.01)):
+    for way in (alternatives.sampled(1.0), alternatives.sampled(0.01)):
         true, hits = (np.zeros(int(SHAPE.prod()), np.uint32) for _ in range(2))
-        others.MARCHES["ours"](o, d, SHAPE, 0.25, true)
+        alternatives.MARCHES["ours"](o, d, SHAPE, 0.25, true)
         way(o, d, SHAPE, 0.25, hits)
-        shares.append(others.wrong(hits, true)[1])
+        shares.append(alternatives.error_shares(hits, true)[1])
     assert shares[1] < 0.01 < shares[0]
 
 
@@ -63,21 +63,21 @@ def test_a_box_off_the_faces_occupies_the_same_by_all_ways() -> None:
         [[2.5, 1.5, 0.75, 0.0, 0.0, 1.8, 0.8, 1.3]]
     )  # reaches beyond the centres it covers, not to the next faces
     batch = FrameBoxes(np.array([0]), box)
-    ours = others.by_boxes(batch, grid)
+    ours = alternatives.by_boxes(batch, grid)
     assert ours.sum() == 4 * 2 * 3
-    assert (others.by_centre(batch, grid) == ours).all()
+    assert (alternatives.occupancy_by_centre(batch, grid) == ours).all()
 
 
 def test_casts_meet_the_same_wall() -> None:
     wall = np.array([[[5.0, -9.0, -9.0], [5.0, 9.0, -9.0], [5.0, 0.0, 9.0]]])
     o, d = np.zeros(3), np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
-    for cast in (others.by_trimesh(wall), others.by_embree(wall)):
+    for cast in (alternatives.trimesh_caster(wall), alternatives.embree_caster(wall)):
         assert np.abs(cast(o, d, 20.0) - [[5.0, 0.0, 0.0], [-20.0, 0.0, 0.0]]).max() < 1e-6
 
 
 def test_wrong_counts_both_ways() -> None:
     true, found = np.array([4, 0, 2, 4], np.uint32), np.array([3, 1, 2, 4], np.uint32)
-    assert others.wrong(found, true) == (2 / 3, 0.1, 0.1)
+    assert alternatives.error_shares(found, true) == (2 / 3, 0.1, 0.1)
 
 
 def test_the_slope_is_that_of_the_larger_half() -> None:
@@ -118,7 +118,7 @@ def test_tables_of_one_round_are_filled(monkeypatch: pytest.MonkeyPatch) -> None
     """What they measure is another matter; the type checker reads the dearer tables, such as those of kernels that are
     compiled anew without what they are compared for."""
     monkeypatch.setattr(casting, "_ROUNDS", 1)
-    monkeypatch.setattr(savings, "REPEATS", 1)
+    monkeypatch.setattr(culling, "REPEATS", 1)
     shares = [row[1] for row in casting.rows() if row[0].endswith("Embree alone")]
     assert shares == ["1.00 x Embree alone"] * 4
-    assert savings._beams()[0][3]
+    assert culling._beam_rows()[0][3]

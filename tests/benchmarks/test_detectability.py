@@ -79,7 +79,7 @@ def test_no_detections_and_no_vehicles() -> None:
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Small models for little data; on one thread, else scikit-learn starts a program that counts the cores."""
     monkeypatch.setattr(fitting, "TREES", 20)
-    monkeypatch.setattr(fitting, "FEWEST", 20)
+    monkeypatch.setattr(fitting, "MIN_SAMPLES", 20)
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
 
 
@@ -92,7 +92,7 @@ def test_the_curve_by_hand() -> None:
     ]
 
 
-def made_up(seed: int, sites: int = 4, rows: int = 500) -> Examples:
+def random_detections(seed: int, sites: int = 4, rows: int = 500) -> Examples:
     """Found with a chance that rises with points, and half as likely where a neighbour is near."""
     rng = np.random.default_rng(seed)
     features, hits, ap = [], [], []
@@ -113,9 +113,9 @@ def truth(x: np.ndarray) -> np.ndarray:
 
 @pytest.mark.slow
 def test_a_planted_dependence_is_found_and_holds_elsewhere() -> None:
-    given = {name: made_up(seed) for seed, name in enumerate(("one", "two", "three"), start=1)}
-    learnt = fitting.fitted(list(given.values()))
-    assert learnt == fitting.fitted(list(given.values())) and len(learnt["trees"]) == fitting.TREES
+    given = {name: random_detections(seed) for seed, name in enumerate(("one", "two", "three"), start=1)}
+    learnt = fitting.fit_model(list(given.values()))
+    assert learnt == fitting.fit_model(list(given.values())) and len(learnt["trees"]) == fitting.TREES
     model = DetectabilityModel.of(learnt)
     x = np.full((50, len(FEATURES)), 0.5)
     x[:, 0], x[:, FEATURES.index("gap_m")] = np.linspace(0.0, 7.0, 50), 12.0
@@ -124,7 +124,7 @@ def test_a_planted_dependence_is_found_and_holds_elsewhere() -> None:
     x[:, FEATURES.index("gap_m")] = 2.0
     assert np.abs(model.chances(x) - truth(x)).mean() < 0.05
 
-    held = fitting.elsewhere(given)
+    held = fitting.cross_validate(given)
     assert list(held["rho_with_ap"]) == list(given) and min(held["rho_with_ap"].values()) == 1.0
     parts = held["calibration"]
     assert sum(part["vehicle_frames"] for part in parts) == 3 * 4 * 500
@@ -134,12 +134,13 @@ def test_a_planted_dependence_is_found_and_holds_elsewhere() -> None:
 # the file
 
 
-def about_of(shipped: dict) -> writing.About:
+def about_of(shipped: dict) -> writing.TrainingMetadata:
     its = shipped["about"]
     on = {
-        n: writing.LearntOn(j["sites"], tuple(j["sensors"]), j["vehicle_frames"]) for n, j in its["learnt_on"].items()
+        n: writing.TrainingJunction(j["sites"], tuple(j["sensors"]), j["vehicle_frames"])
+        for n, j in its["learnt_on"].items()
     }
-    return writing.About(on, its["frames"], its["settings"], its["scikit_learn"])
+    return writing.TrainingMetadata(on, its["frames"], its["settings"], its["scikit_learn"])
 
 
 def test_the_shipped_file_is_as_it_would_be_written_again() -> None:
@@ -173,13 +174,13 @@ def test_the_picture_shows_every_part_of_the_curves(tmp_path: Path) -> None:
 # the command
 
 
-def test_wrong_arguments_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_arguments_are_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     paths = ["--data", str(tmp_path / "data"), "--out", str(tmp_path / "out")]
     for options, said in {
-        ("--junction", "nishishinjuku"): "--junction: 'nishishinjuku'; one of ingolstadt, hill, roundabout",
-        ("--junction", "hill"): "--junction: hill alone; two junctions at least",
+        ("--junction", "nishishinjuku"): "got 'nishishinjuku'. Use some of ingolstadt, hill, roundabout",
+        ("--junction", "hill"): "--junction: expected at least 2 junctions, got hill",
         ("--junction", "hill", "--osm-training", str(tmp_path / "no.osm")): "--osm-training: no such file",
-        ("--osm-training-at", "50.1,9.2"): "--osm-training-at: no --osm-training",
+        ("--osm-training-at", "50.1,9.2"): "--osm-training-at: used without --osm-training",
         ("--osm-training-at", "here", "--osm-training", "east.osm"): "here",
         ("--only-draw",): "--only-draw: no such file",
     }.items():
@@ -189,7 +190,7 @@ def test_wrong_arguments_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 
 @pytest.mark.slow
-def test_the_whole_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+def test_complete_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     (tmp_path / "scenarios").mkdir()
     for name in ("ingolstadt", "hill"):
         write_mini(tmp_path / "scenarios" / name)
@@ -206,4 +207,4 @@ def test_the_whole_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caps
     curve = learnt["detectors"]["cluster"]["elsewhere"]["calibration"]
     assert sum(part["vehicle_frames"] for part in curve) == 2 * 6 * its["vehicle_frames"] > 0
     said = capsys.readouterr().out
-    assert "hill: 10 frames 2 s apart, cluster from 6" in said and "cluster: rho with AP elsewhere" in said
+    assert "hill: 10 frames 2 s apart, cluster from 6" in said and "cluster: rho with AP at other junctions" in said

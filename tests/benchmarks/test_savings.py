@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 import egvs
-from egvs.artefacts.traffic_frames import FrameBoxes
+from egvs.artefacts.frame_boxes import FrameBoxes
 from egvs.kernels import ray_triangle
 from egvs.scoring.occupancy import count_occupancy
 from egvs.sensors.scanner import Scanner

@@ -12,25 +12,25 @@ import pytest
 from benchmarks.validity import __main__ as command
 from benchmarks.validity import (
     agreement,
+    detector_sites,
     failures,
     figures,
-    foretold,
-    gaps,
     heights,
     junctions,
-    looking_from,
     low_models,
-    measuring,
+    measurement,
     poses,
+    recommended_score,
     study,
     tables,
+    undefined_values,
 )
 from benchmarks.validity.pools import DEFAULT, Pools, Setting
 from benchmarks.validity.record import (
-    BESIDE_BOXED,
-    BESIDE_COUNTED,
     BOXED,
     COUNTED,
+    FURTHER_BOX_MEASURES,
+    FURTHER_COUNT_MEASURES,
     Estimates,
     Record,
     StudySite,
@@ -102,18 +102,18 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(study, "SENSOR_APART_S", 2.0)
 
 
-def part_of(mini: Path, folder: Path) -> measuring.Part:
+def part_of(mini: Path, folder: Path) -> measurement.Part:
     junction = junctions.ready("mini", "training", mini, folder / "world", places=2)
     extent = study.Extent(frames=10, sensor_frames=0, places=2)
     part, *others = study.parts([junction], ["points"], extent, folder)
     assert not others and len(part.sites) == 10 and part.given == {"pole_a", "pole_b"}
-    return measuring.Part(**{**vars(part), "scores": ("entropy_seen",)})
+    return measurement.Part(**{**vars(part), "scores": ("entropy_seen",)})
 
 
 def test_a_part_that_was_measured_is_kept_and_an_interrupted_one_goes_on(mini, tmp_path, monkeypatch, short) -> None:
     said: list[str] = []
     part = part_of(mini, tmp_path)
-    made = measuring.measure(part, tmp_path, jobs=1, told=said.append)
+    made = measurement.measure(part, tmp_path, jobs=1, report=said.append)
     assert not said and made.frames == 10 and [site.is_given for site in made.sites[:3]] == [True, True, False]
     assert made.sites[2].height_m == 2.0 and {site.place for site in made.sites[2:6]} == {"g01h2"}
     points = made.detections["points"]["seen_20"]
@@ -121,19 +121,19 @@ def test_a_part_that_was_measured_is_kept_and_an_interrupted_one_goes_on(mini, t
     assert len(made.scores["entropy_seen"]) == 10 and made.sites[9].name == "g02h6"
 
     monkeypatch.setattr(SiteDetectionTask, "at", lambda *_: pytest.fail("looked again"))
-    assert measuring.measure(part_of(mini, tmp_path), tmp_path, jobs=1, told=said.append) == made
-    assert said == ["mini: kept"]
+    assert measurement.measure(part_of(mini, tmp_path), tmp_path, jobs=1, report=said.append) == made
+    assert said == ["mini: saved before"]
     kept = (tmp_path / "mini.json").read_bytes()
     (tmp_path / "mini.json").unlink()  # as if it had been interrupted before it was whole
-    assert measuring.measure(part, tmp_path, jobs=1, told=said.append) == made
-    assert said == ["mini: kept"] and (tmp_path / "mini.json").read_bytes() == kept
+    assert measurement.measure(part, tmp_path, jobs=1, report=said.append) == made
+    assert said == ["mini: saved before"] and (tmp_path / "mini.json").read_bytes() == kept
 
 
 def test_a_posed_scenario_has_these_sites_and_no_keys_of_the_old_ones(mini: Path, tmp_path: Path) -> None:
     scenario = egvs.load(mini, ["sites.yaw_deg=30"])
     grid = poses.grid_poses(egvs.build_scene(scenario), None, "small", places=1)
     for sensor in (None, "VLP-16"):
-        sites = egvs.build_scene(junctions.posed(scenario, grid, tmp_path / "its.csv", sensor)).sites
+        sites = egvs.build_scene(junctions.with_sites(scenario, grid, tmp_path / "its.csv", sensor)).sites
         assert [(s.name, s.pose) for s in sites] == [(s.name, s.pose) for s in grid]
         assert {s.sensor for s in sites} == {sensor or "small"}
 
@@ -141,7 +141,7 @@ def test_a_posed_scenario_has_these_sites_and_no_keys_of_the_old_ones(mini: Path
 def test_wrong_arguments_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = ["--data", str(tmp_path)]
     assert command.main([*data, "--junction", "tokyo"]) == 2
-    assert "--junction: 'tokyo'; one of ingolstadt" in capsys.readouterr().err
+    assert "--junction: expected some of ingolstadt" in capsys.readouterr().err
     assert command.main([*data, "--detector", "crystal_ball"]) == 2
     assert "unknown detector 'crystal_ball'" in capsys.readouterr().err
     assert command.main([*data, "--junction", "hill", "--osm-held-out", str(tmp_path / "no.osm")]) == 2
@@ -171,7 +171,8 @@ def test_junctions_of_different_roles_lie_apart(
         junctions.check_apart(homes)
     else:
         with pytest.raises(
-            InputError, match=rf"{other.replace(' ', '-')}: 699 m from the junction of --osm-training; one"
+            InputError,
+            match=rf"{other.replace(' ', '-')}: expected at least 700 m to .*, got 699 m",
         ):
             junctions.check_apart(homes)
 
@@ -182,15 +183,15 @@ def given_site(number: int, pole: str, z_m: float) -> Site:
 
 def test_some_of_the_given_sites_are_of_many_poles_and_all_heights() -> None:
     sites = [given_site(3 * p + i, f"p{p}", z) for p in range(12) for i, z in enumerate((3.0, 4.5, 6.0))]
-    few = looking_from.some(sites, 6)
+    few = detector_sites.evenly_chosen(sites, 6)
     assert [site.pole for site in few] == ["p0", "p2", "p4", "p6", "p8", "p10"]
     assert [site.pose.z_m for site in few] == [3.0, 4.5, 6.0, 3.0, 4.5, 6.0]
-    more = looking_from.some(sites, 13)
+    more = detector_sites.evenly_chosen(sites, 13)
     assert len({site.name for site in more}) == 13 and len({site.pole for site in more}) == 12
     assert sorted(site.pose.z_m for site in more).count(6.0) == 4
-    assert looking_from.some(sites, 36) == looking_from.some(sites, 99) == sites
+    assert detector_sites.evenly_chosen(sites, 36) == detector_sites.evenly_chosen(sites, 99) == sites
     pair = [given_site(0, "a", 2.0), given_site(1, "a", 3.0), given_site(2, "b", 2.0)]
-    assert [site.name for site in looking_from.some(pair, 2)] == ["k0", "k2"]
+    assert [site.name for site in detector_sites.evenly_chosen(pair, 2)] == ["k0", "k2"]
 
 
 def test_the_whole_study_is_the_same_bytes_twice_and_says_what_it_went_without(
@@ -209,8 +210,8 @@ def test_the_whole_study_is_the_same_bytes_twice_and_says_what_it_went_without(
         out, err = capsys.readouterr()
         assert code == 0, err
         assert "ingolstadt: training, small, 10 frames 2 s apart, points from 10" in out
-        assert "3 parts; looking from all sites takes some 0 minutes on 1 cores" in out
-    assert out.count(": kept") == 3
+        assert "3 parts; detectors take about 0 minutes on 1 cores" in out
+    assert out.count(": saved before") == 3
     made = sorted(path.relative_to(docs[0]) for path in docs[0].rglob("*") if path.is_file())
     assert {str(path) for path in made if path.suffix not in (".png", ".csv")} == {
         "data/validity/tables.json", "validity-costs.md",
@@ -228,7 +229,7 @@ def test_the_whole_study_is_the_same_bytes_twice_and_says_what_it_went_without(
 # tables from made-up findings
 
 
-def made_up(name: str, role: str, *, boxes: bool = True) -> Record:
+def make_record(name: str, role: str, *, boxes: bool = True) -> Record:
     """Six places at four heights and six given sites; detection falls by a hundredth a metre of height, and grows with
     the number of the place; ``entropy_seen`` foretells it, EGVS the opposite but for gamma 2."""
     rng = np.random.default_rng(len(name))
@@ -237,9 +238,9 @@ def made_up(name: str, role: str, *, boxes: bool = True) -> Record:
     values = np.array([0.5 + 0.05 * int(s.place[1:]) - 0.01 * s.height_m + (0.003 if s.is_given else 0) for s in sites])
     left_out = values[:, None] + 0.001 * rng.normal(size=(len(sites), 10))
     its = Estimates(list(range(len(sites))), values.tolist(), [0.01] * len(sites), left_out.tolist())
-    detections = {"points": {m: its for m in (*COUNTED, *BESIDE_COUNTED)}}
+    detections = {"points": {m: its for m in (*COUNTED, *FURTHER_COUNT_MEASURES)}}
     if boxes:
-        detections["cluster"] = {m: its for m in (*BOXED, *BESIDE_BOXED)}
+        detections["cluster"] = {m: its for m in (*BOXED, *FURTHER_BOX_MEASURES)}
         detections[low_models.SENSOR] = {m: its.only(set(range(6, 26))) for m in detections["cluster"]}
     settings = [Setting(g, v, o) for g in (1.0, 2.0, 10.0) for v in (0.25, 1.0) for o in (False, True)]
     scores = {str(s): (values * (1 if s.gamma == 2 else -1) + 3).tolist() for s in settings}
@@ -250,7 +251,11 @@ def made_up(name: str, role: str, *, boxes: bool = True) -> Record:
 
 @pytest.fixture(scope="module")
 def records() -> list[Record]:
-    return [made_up("left", "training"), made_up("hilly", "training", boxes=False), made_up("right", "held out")]
+    return [
+        make_record("left", "training"),
+        make_record("hilly", "training", boxes=False),
+        make_record("right", "held out"),
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -283,8 +288,8 @@ def test_where_each_detector_looks_from(mini: Path, tmp_path: Path) -> None:
     each = ("points", "cluster", "other", *low_models.NAMES)
     for role, right in (("training", [42, 42, 22, 0, 0]), ("held out", [42, 42, 22, 20, 20])):
         its = replace(junction, role=role)
-        assert [len(looking_from.sites_of(name, its)) for name in each] == right
-    assert {site.name[:3] for site in looking_from.sites_of(low_models.LOW, its)} == {f"g0{n}" for n in range(1, 6)}
+        assert [len(detector_sites.sites_of(name, its)) for name in each] == right
+    assert {site.name[:3] for site in detector_sites.sites_of(low_models.LOW, its)} == {f"g0{n}" for n in range(1, 6)}
 
 
 def test_no_shipped_model_has_seen_a_held_out_junction() -> None:
@@ -293,7 +298,7 @@ def test_no_shipped_model_has_seen_a_held_out_junction() -> None:
         (low_models.model(low_models.LOW), "ground", [2.0, 2.0]),
         (low_models.model(low_models.SENSOR), "sensor", [2.0, 2.0]),
     ):
-        about = OnnxModel.of(model).metadata
+        about = OnnxModel.load(model).metadata
         assert about["convention"] == convention and about["recipe"]["heights_m"] == heights_m
         assert about["junctions"] == ["ingolstadt", "hill", "roundabout", "east"]
 
@@ -370,7 +375,7 @@ def test_what_is_not_defined_is_listed(records: list[Record]) -> None:
         detections={"points": its | {"seen_20": replace(its["seen_20"], values=values)}},
         skipped=["voxel 1 m: does not fit"],
     )
-    rows = gaps.table([Pools([holed], "points", 200)], [holed]).rows
+    rows = undefined_values.table([Pools([holed], "points", 200)], [holed]).rows
     assert ["points", "share of vehicles with 20 points", "training", "entropy_seen", 29, "left k0", None] in rows
     assert [row[6] for row in rows if row[3] == "constant"] == ["constant is the same at all sites of left"] * 2
     assert rows[-1] == [None, None, "left", None, None, None, "voxel 1 m: does not fit"]
@@ -422,7 +427,7 @@ def test_files_of_an_earlier_study_are_removed(all_tables: list[tables.Table], t
     ],
 )
 def test_cells_as_text(cell: tables.Cell, text: str) -> None:
-    assert tables.shown(cell, "two") == text
+    assert tables.format_number(cell, "two") == text
 
 
 # the page
@@ -451,12 +456,12 @@ def test_the_protocol_says_the_numbers_of_the_program() -> None:
     assert f"evaluated with {study.FRAMES} frames of another seed, {study.APART_S:g} s apart" in page
     assert f"on {study.SENSOR_FRAMES} frames {study.SENSOR_APART_S:g} s apart" in page
     assert (
-        f"first {looking_from.FEW_PLACES} locations" in page
-        and f"at most {looking_from.FEW_GIVEN['held out']} of the given" in page
+        f"first {detector_sites.FEW_PLACES} locations" in page
+        and f"at most {detector_sites.FEW_GIVEN['held out']} of the given" in page
     )
-    assert f"{looking_from.FEW_GIVEN['training']} of a training one" in page
+    assert f"{detector_sites.FEW_GIVEN['training']} of a training one" in page
     assert ", ".join(study.SENSORS) in page and f"{poses.PLACES} locations, each at 2, 3, 4.5 and 6 m" in page
-    assert f"lattice of {poses.SPACING_M:g} m that reaches {poses.BESIDE_M:g} m" in page
+    assert f"lattice of {poses.SPACING_M:g} m that reaches {poses.MARGIN_M:g} m" in page
     assert f"within {poses.ROAD_M:g} m of a lane" in page
     for name, role in junctions.SHIPPED.items():
         assert re.search(rf"\| {name} \|[^|]*\| {role} \|", page), name
@@ -468,14 +473,14 @@ def test_the_protocol_says_the_numbers_of_the_program() -> None:
 
 def recommended(name: str, role: str) -> Record:
     """As above, with the recommended score as good as can be, and a junction that is unseen beside one held out."""
-    record = made_up(name, role)
+    record = make_record(name, role)
     values = record.detections["cluster"][BOXED[0]].values
-    return replace(record, scores=record.scores | {foretold.RECOMMENDED: values, "seen_well": values})
+    return replace(record, scores=record.scores | {recommended_score.RECOMMENDED: values, "seen_well": values})
 
 
 def test_the_recommended_score_is_quoted_where_nothing_was_learnt_and_has_no_part_in_what_came_before() -> None:
     its = [recommended("left", "training"), recommended("right", "held out"), recommended("north", "unseen")]
-    made = list(foretold.tables(its, ["cluster", low_models.SENSOR]))
+    made = list(recommended_score.tables(its, ["cluster", low_models.SENSOR]))
     found = table(made, f"F cluster {BOXED[0]}")
     assert found.column("junction")[:3] == ["right", "north", "together"]
     assert found.column("number of sites")[:9] == [30, 30, 60, 6, 6, 12, 24, 24, 48]
@@ -488,10 +493,13 @@ def test_the_recommended_score_is_quoted_where_nothing_was_learnt_and_has_no_par
     assert len(worst.rows) == 6 and worst.column("rank by score") == worst.column("rank by detection")
     every = table(made, "F all")
     rho = dict(zip(every.column("score"), every.column("cluster"), strict=True))
-    assert rho[foretold.RECOMMENDED][0] == 1.0 and rho[str(DEFAULT)][0] == -1.0
+    assert rho[recommended_score.RECOMMENDED][0] == 1.0 and rho[str(DEFAULT)][0] == -1.0
     assert every.column("score")[-1] == "constant" and rho["constant"] is None  # the same everywhere
     assert len(made) == 4  # none of detectors that are there for heights alone
-    assert foretold.before(its) == [made_up("left", "training"), made_up("right", "held out")]
+    assert recommended_score.without_later_scores(its) == [
+        make_record("left", "training"),
+        make_record("right", "held out"),
+    ]
 
 
 def test_records_without_the_recommended_score_have_no_such_table(all_tables: list[tables.Table]) -> None:

@@ -1,19 +1,34 @@
-"""A small city of two junctions, whose traffic is a finished file: two cars on one road, and a bus that turns."""
+"""A small city, a cluster in this process, and jobs of small junctions.
+
+The city has two junctions and a finished file of traffic: two cars on one road, and a bus that turns.
+"""
 
 from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+import egvs
+from egvs.artefacts.run_folder import STAGE_NAMES
+from egvs.artefacts.run_record import RunRecord
+from egvs.city import scheduler
 from egvs.city.model import City, load_city
+from egvs.city.tasks import Job
+from egvs.runs import run
 from tests.conftest import SCENARIO, SITES, collection, write_mini
 
 FRAMES = 60
+OVERRIDES = ("scan.keep=false", 'score.keep_visibility="all"', 'score.others=["seen_well", "coverage"]')
+"""With these, scores of a site have all kinds of arrays."""
+
 WEST, EAST = (20.0, 0.0), (520.0, 0.0)
-"""The middles of the two junctions' regions."""
+"""Centres of the two regions of interest."""
 
 CITY = """\
 seed = 7
@@ -39,8 +54,10 @@ height_m = 3.0
 
 
 def fcd() -> str:
-    """Cars go from west to east, the bus circles far from both junctions before it comes through the western one; the
-    eastern one is empty in the first frames and in the last."""
+    """Return the traffic: cars along the road, and a bus that turns before it passes the western junction.
+
+    The eastern junction is empty in the first and in the last frames.
+    """
     lines = ["timestep_time;vehicle_id;vehicle_x;vehicle_y;vehicle_angle;vehicle_type;vehicle_speed"]
     for frame in range(FRAMES):
         t = 0.5 * frame
@@ -52,7 +69,7 @@ def fcd() -> str:
 
 
 def write_city(folder: Path) -> Path:
-    """The city's folder: two junctions alike, 500 m apart."""
+    """Write the folder of a city with two equal junctions, 500 m apart."""
     folder.mkdir(parents=True)
     (folder / "city.toml").write_text(CITY)
     (folder / "fcd.csv").write_text(fcd())
@@ -65,7 +82,7 @@ def write_city(folder: Path) -> Path:
 
 
 def write_junction(folder: Path, name: str, east_m: float) -> None:
-    """A scenario like the small one of all tests, so far to the east, with the city's traffic."""
+    """Write the small scenario of all tests, moved to the east, with the city's traffic."""
     folder.parent.mkdir(exist_ok=True)
     write_mini(folder)
     (folder / "fcd.csv").unlink()
@@ -82,5 +99,60 @@ def write_junction(folder: Path, name: str, east_m: float) -> None:
 
 @pytest.fixture
 def city(tmp_path: Path) -> City:
-    """The small city, read."""
+    """The small city."""
     return load_city(write_city(tmp_path / "town"))
+
+
+@pytest.fixture(scope="session")
+def client() -> Iterator[Any]:
+    """A client of two workers in this process, which behave as in processes of their own, but cannot be killed."""
+    from distributed import Client, LocalCluster
+
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0") as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        yield client
+
+
+@pytest.fixture
+def in_process_cluster(client: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make city runs use the cluster of this process."""
+
+    @contextmanager
+    def connect(_cluster: str) -> Iterator[Any]:
+        yield client
+
+    monkeypatch.setattr(scheduler, "connect", connect)
+
+
+@pytest.fixture
+def jobs(tmp_path: Path) -> list[Job]:
+    """Jobs of three small junctions, with two, three and four poles."""
+    jobs = []
+    for number, name in enumerate(("a", "b", "c")):
+        folder = write_mini(tmp_path / name)
+        more = "".join(f"pole_{i},{12 + i}.25,-11,3.5\n" for i in range(number))
+        (folder / "sites.csv").write_text((folder / "sites.csv").read_text() + more)
+        jobs.append(Job(name, folder, tmp_path / "out" / name))
+    return jobs
+
+
+def run_separately(job: Job, folder: Path, monkeypatch: pytest.MonkeyPatch) -> RunRecord:
+    """Run a junction as ``egvs run`` does, into FOLDER/run, with a store of its own."""
+    with monkeypatch.context() as patch:
+        patch.setenv("EGVS_STORE", str(folder / "store"))
+        return run.run(egvs.load(job.folder, job.overrides), folder / "run")
+
+
+def assert_same_run(job: Job, folder: Path) -> None:
+    """Assert that a job gave the same artefacts, byte for byte, and the same record except for costs."""
+    actual, expected = RunRecord.read(job.out), RunRecord.read(folder / "run")
+    for name in STAGE_NAMES:
+        if name == "report":  # it shows costs
+            continue
+        a, b = actual.stages[name], expected.stages[name]
+        assert (a.inputs, a.artefacts, a.summary, a.files) == (b.inputs, b.artefacts, b.summary, b.files)
+    for name in (name for stage in actual.stages.values() for name in stage.artefacts):
+        if name != "report.html":
+            assert (job.out / name).read_bytes() == (folder / "run" / name).read_bytes()

@@ -21,7 +21,7 @@ PACKAGE = Path(egvs.__file__).parent
 STAGES = ("check", "statics", "scan", "traffic", "tpog", "score", "report")
 
 
-def by_syntax_tree(text: str, package: str) -> set[str]:
+def imports_by_syntax_tree(text: str, package: str) -> set[str]:
     """What a module imports when it runs, from its syntax tree."""
     tree = ast.parse(text)
     never = {
@@ -46,13 +46,15 @@ def by_syntax_tree(text: str, package: str) -> set[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(PACKAGE)))
-def test_the_pattern_sees_what_the_syntax_tree_sees(path: Path) -> None:
+def test_import_pattern_matches_syntax_tree(path: Path) -> None:
     text, package = path.read_text(encoding="utf-8"), "egvs.x"
-    assert by_syntax_tree(text, package) <= set(stages.imported_names(text, package))
-    assert set(stages.imported_names(text, package)) - by_syntax_tree(text, package) <= {"egvs"}  # in docstrings
+    assert imports_by_syntax_tree(text, package) <= set(stages.imported_names(text, package))
+    assert set(stages.imported_names(text, package)) - imports_by_syntax_tree(text, package) <= {
+        "egvs"
+    }  # in docstrings
 
 
-ODD = """
+KINDS_OF_IMPORT = """
 import a, b.c as d  # , no
 from . import e
 from ..f import (
@@ -68,10 +70,10 @@ def n():
 """
 
 
-def test_every_way_to_import_is_seen() -> None:
+def test_finds_every_kind_of_import() -> None:
     expected = ["a", "b.c", "x.y", "x.y.e", "x.f", "x.f.g", "x.f.i", "o.p", "o.p.q", "o.p.r"]
-    assert list(stages.imported_names(ODD, "x.y")) == expected
-    assert by_syntax_tree(ODD, "x.y") == set(expected)
+    assert list(stages.imported_names(KINDS_OF_IMPORT, "x.y")) == expected
+    assert imports_by_syntax_tree(KINDS_OF_IMPORT, "x.y") == set(expected)
 
 
 ROOTS = [(stage.module, *stage.code) for stage in map(stages.stage, STAGES)]
@@ -122,7 +124,7 @@ CHANGED = {
 @pytest.mark.slow
 @pytest.mark.system
 @pytest.mark.parametrize("file", CHANGED)
-def test_a_changed_line_changes_the_digest_of_what_imports_it(file: str, tmp_path: Path) -> None:
+def test_changed_line_changes_digest_of_importers(file: str, tmp_path: Path) -> None:
     shutil.copytree(PACKAGE, tmp_path / "egvs", ignore=shutil.ignore_patterns("__pycache__"))
     before = digests(tmp_path)
     assert before == [
@@ -134,7 +136,7 @@ def test_a_changed_line_changes_the_digest_of_what_imports_it(file: str, tmp_pat
     assert {name for name, one, other in zip(STAGES, before, after, strict=True) if one != other} == CHANGED[file]
 
 
-def test_the_module_of_somebody_elses_class_counts_with_what_it_imports(tmp_path: Path, monkeypatch) -> None:
+def test_module_of_other_package_counts_with_its_imports(tmp_path: Path, monkeypatch) -> None:
     package = tmp_path / "somebody"
     package.mkdir()
     (package / "__init__.py").write_text("")
@@ -154,7 +156,7 @@ def test_the_module_of_somebody_elses_class_counts_with_what_it_imports(tmp_path
     assert digest() != before
 
 
-def test_versions_are_those_installed() -> None:
+def test_library_versions_are_those_installed() -> None:
     import numpy
 
     assert stages.library_versions(frozenset({"numpy"})) == {"numpy": numpy.__version__}
@@ -173,8 +175,8 @@ SOURCE_BEFORE = {
 }
 """Code lines behind the key of each stage before the layout with one module per subject."""
 
-GROWTH = {"scan": 1.14, "tpog": 1.18, "report": 1.26}
-"""A stage runs again whenever a line behind its key changes, so the source behind a key may hardly grow."""
+GROWTH = {"tpog": 1.125, "report": 1.2}
+"""Allowed growth, 1.1 for the others: a stage runs again whenever a line behind its key changes."""
 
 
 def code_lines(path: Path) -> int:
@@ -197,5 +199,6 @@ def test_source_behind_stage_key_stays_small(name: str) -> None:
     stage = stages.stage(name)
     modules = [module for module in stages.source_modules(stage.module, *stage.code) if module.startswith("egvs")]
     paths = [stages._module_path(module) for module in modules]
-    total = sum(code_lines(path) for path in paths if path is not None)
+    # An __init__.py lists public names and computes nothing.
+    total = sum(code_lines(path) for path in paths if path is not None and path.name != "__init__.py")
     assert total <= GROWTH.get(name, 1.1) * SOURCE_BEFORE[name]

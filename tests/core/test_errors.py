@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
-from egvs.artefacts.run_folder import StageRecord
+from egvs.artefacts.run_record import StageRecord
 from egvs.cli.console import ProgressDisplay
 from egvs.core.errors import WARNINGS_KEY, Diagnostic, DiagnosticsError, collect_warnings, with_relative_paths
 from egvs.core.runtime import ResourceUsage
@@ -13,18 +13,18 @@ from egvs.core.runtime import ResourceUsage
 ONE = Diagnostic("sites on lanes", "sites.csv: row 3 (k2)", "stands on lane e1_0", "move it by 2 m")
 
 
-def test_warnings_come_back_from_summaries_as_they_were() -> None:
+def test_collect_warnings_inverts_to_json() -> None:
     summary = json.loads(json.dumps({WARNINGS_KEY: [ONE.to_json()]}))
     assert collect_warnings([{}, summary]) == [ONE]
 
 
-def test_all_errors_are_told_at_once() -> None:
+def test_diagnostics_error_lists_all_errors() -> None:
     error = DiagnosticsError([ONE, Diagnostic("roi", "roi", "no lane inside", "")])
     assert str(error) == "sites.csv: row 3 (k2): stands on lane e1_0; move it by 2 m\nroi: no lane inside"
     assert error.exit_code == 2
 
 
-def test_a_warning_is_a_line_of_its_own(capsys) -> None:
+def test_warning_is_printed_on_one_line(capsys) -> None:
     record = StageRecord(
         "", {}, {}, {"sites": 2, WARNINGS_KEY: [ONE.to_json()]}, ResourceUsage(seconds=1.0, peak_mb=1.0)
     )
@@ -32,7 +32,7 @@ def test_a_warning_is_a_line_of_its_own(capsys) -> None:
     assert capsys.readouterr().err.splitlines()[1:] == [f"warning: {ONE}"]
 
 
-def test_a_warning_names_files_as_seen_from_the_scenario(tmp_path) -> None:
+def test_warning_names_files_relative_to_scenario(tmp_path) -> None:
     place = str(tmp_path / "maps" / "a.poly.xml")
     summary = {"solids": 1, WARNINGS_KEY: [replace(ONE, where=place).to_json(), ONE.to_json()]}
     assert [warning.where for warning in collect_warnings([with_relative_paths(tmp_path, summary)])] == [

@@ -11,7 +11,7 @@ from egvs.core import files
 from egvs.core.errors import InputError
 
 
-def test_room_is_made_and_nothing_else(tmp_path: Path) -> None:
+def test_ensure_writable_folder_makes_only_the_folder(tmp_path: Path) -> None:
     files.ensure_writable_folder(tmp_path / "a" / "b" / "model.onnx")
     assert [path.relative_to(tmp_path).as_posix() for path in sorted(tmp_path.rglob("*"))] == ["a", "a/b"]
     (tmp_path / "mine").write_text("kept")
@@ -19,7 +19,7 @@ def test_room_is_made_and_nothing_else(tmp_path: Path) -> None:
     assert (tmp_path / "mine").read_text() == "kept"
 
 
-def test_room_is_seen_and_nothing_made(tmp_path: Path) -> None:
+def test_check_writable_makes_nothing(tmp_path: Path) -> None:
     files.check_writable(tmp_path / "a" / "b" / "map.gpkg")
     assert not list(tmp_path.iterdir())
     (tmp_path / "file").write_text("")
@@ -29,7 +29,7 @@ def test_room_is_seen_and_nothing_made(tmp_path: Path) -> None:
         files.check_writable(tmp_path)
 
 
-def test_where_there_is_no_room_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rejects_locations_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match=r"file/m\.onnx: cannot be written \(.+\)\. Choose a folder"):
         files.ensure_writable_folder(tmp_path / "file" / "m.onnx")
@@ -37,15 +37,17 @@ def test_where_there_is_no_room_is_told(tmp_path: Path, monkeypatch: pytest.Monk
     with pytest.raises(InputError, match=r"folder: expected a file, got a folder"):
         files.ensure_writable_folder(tmp_path / "folder")
 
-    def refused(**_: object) -> None:
+    def raise_permission_error(**_: object) -> None:
         raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr(files.tempfile, "TemporaryFile", refused)  # whoever runs this may write everywhere
+    monkeypatch.setattr(
+        files.tempfile, "TemporaryFile", raise_permission_error
+    )  # whoever runs this may write everywhere
     with pytest.raises(InputError, match=r"m\.onnx: cannot be written \(Permission denied\)"):
         files.ensure_writable_folder(tmp_path / "m.onnx")
 
 
-def test_a_full_disk_is_told_with_the_file_that_is_written(tmp_path: Path) -> None:
+def test_error_of_full_disk_names_the_file(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="left on device") as caught, files.atomic_write(tmp_path / "a"):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert caught.value.filename == str(tmp_path / "a")
@@ -56,7 +58,7 @@ def test_a_full_disk_is_told_with_the_file_that_is_written(tmp_path: Path) -> No
 
 
 @pytest.mark.system
-def test_folders_for_work_of_killed_programs_are_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_removes_temporary_folders_of_killed_programs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from tests.processes import python
 
     monkeypatch.setenv("TMPDIR", str(tmp_path))
@@ -82,11 +84,11 @@ with files.temporary_folder() as folder:
     files._remove_stale_folders.cache_clear()
 
 
-def test_where_nothing_can_be_locked_there_are_folders_for_work_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    def unknown(*_: object) -> None:
+def test_temporary_folders_work_without_file_locks(monkeypatch: pytest.MonkeyPatch) -> None:
+    def raise_not_supported(*_: object) -> None:
         raise OSError(errno.ENOLCK, "No locks available")
 
-    monkeypatch.setattr(files.fcntl, "flock", unknown)
+    monkeypatch.setattr(files.fcntl, "flock", raise_not_supported)
     with files.temporary_folder() as folder:
         assert folder.is_dir()
     assert not folder.exists()

@@ -23,11 +23,11 @@ VALUES = st.recursive(
 
 @pytest.mark.slow
 @given(st.dictionaries(st.text(st.characters(codec="utf-8"), min_size=1), VALUES, max_size=5))
-def test_what_is_written_is_found_again(value: dict[str, Any]) -> None:
+def test_added_checksum_is_valid(value: dict[str, Any]) -> None:
     assert has_valid_checksum(json.loads(json.dumps(add_checksum(value))))
 
 
-def test_any_change_is_noticed() -> None:
+def test_any_change_invalidates_the_checksum() -> None:
     record = {
         "stages": {"scan": {"files": {"a": "0"}, "n": 3, "nothing": None}},
         "x": [1.5, math.inf],

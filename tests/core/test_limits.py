@@ -12,13 +12,15 @@ from egvs.core import limits
 from egvs.core.errors import InputError, RunError
 from egvs.core.reading import translate_errors
 
+LIMITS = [value for value in vars(limits).values() if isinstance(value, limits.Limit)]
 
-def test_a_bound_is_held_told_and_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+
+def test_limit_is_checked_reported_and_raised_by_variable(monkeypatch: pytest.MonkeyPatch) -> None:
     limits.POINTS.check("a.ply", 30_000_000)
     with pytest.raises(InputError) as refused:
         limits.POINTS.check("a.ply", 30_000_001)
-    said = "a.ply: has 30,000,001 points. The limit is 30,000,000 points; set EGVS_MAX_POINTS to raise it."
-    assert str(refused.value) == said
+    message = "a.ply: has 30,000,001 points. The limit is 30,000,000 points; set EGVS_MAX_POINTS to raise it."
+    assert str(refused.value) == message
     monkeypatch.setenv("EGVS_MAX_POINTS", "30000001")
     limits.POINTS.check("a.ply", 30_000_001)
     with pytest.raises(InputError):
@@ -26,21 +28,20 @@ def test_a_bound_is_held_told_and_raised(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.parametrize("text", ["", "0", "-1", "1e9", "many", "٣", "9" * 19])
-def test_a_bound_that_is_none_is_told(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+def test_rejects_invalid_value_of_variable(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
     monkeypatch.setenv("EGVS_MAX_FILE_MB", text)
     with pytest.raises(InputError, match=r"^EGVS_MAX_FILE_MB: expected how many MB .*for example 1000\.$"):
         _ = limits.FILE.maximum
 
 
-def test_each_bound_has_a_name_of_its_own() -> None:
-    names = [limit.name for limit in limits.ALL_LIMITS]
+def test_names_of_limits_are_unique() -> None:
+    names = [limit.name for limit in LIMITS]
     assert len(set(names)) == len(names)
     assert all(re.fullmatch(r"EGVS_MAX_[A-Z_]+", name) for name in names)
-    assert set(limits.ALL_LIMITS) == {value for value in vars(limits).values() if isinstance(value, limits.Limit)}
 
 
 @pytest.mark.parametrize(
-    ("error", "said"),
+    ("error", "message"),
     [
         (MemoryError(), "it asks for more memory than there is"),
         (RecursionError("maximum"), "it is nested too deeply"),
@@ -52,26 +53,24 @@ def test_each_bound_has_a_name_of_its_own() -> None:
         (UnicodeDecodeError("utf-8", b"\xff", 0, 1, ""), "it is no utf-8 text: byte 0 is 0xff"),
     ],
 )
-def test_what_a_reader_raises_is_told_of_its_file(error: Exception, said: str) -> None:
+def test_translate_errors_names_the_file(error: Exception, message: str) -> None:
     with pytest.raises(InputError) as refused, translate_errors("x.ply", "Use a mesh."):
         raise error
-    assert str(refused.value) == f"x.ply: cannot be read ({said}). Use a mesh."
+    assert str(refused.value) == f"x.ply: cannot be read ({message}). Use a mesh."
     assert refused.value.__cause__ is error
 
 
 @pytest.mark.parametrize(
     "error", [InputError("y", "z"), RunError("no"), OSError(errno.ENOSPC, "No space"), SystemExit()]
 )
-def test_what_is_no_fault_of_the_file_passes(error: BaseException) -> None:
+def test_translate_errors_passes_other_errors(error: BaseException) -> None:
     with pytest.raises(type(error)) as passed, translate_errors("x.ply"):
         raise error
     assert passed.value is error
 
 
-def test_the_documentation_lists_each_bound() -> None:
+def test_documentation_lists_every_limit() -> None:
     page = (Path(__file__).parents[2] / "docs" / "security.md").read_text(encoding="utf-8")
     rows = [line for line in page.splitlines() if line.startswith("| `EGVS_MAX_")]
-    defaults = {
-        limit: str(limit.default) if limit.unit == "MB" else f"{limit.default:,}" for limit in limits.ALL_LIMITS
-    }
-    assert rows == [f"| `{limit.name}` | {said} {limit.unit} | {limit.what} |" for limit, said in defaults.items()]
+    defaults = {limit: str(limit.default) if limit.unit == "MB" else f"{limit.default:,}" for limit in LIMITS}
+    assert rows == [f"| `{limit.name}` | {value} {limit.unit} | {limit.what} |" for limit, value in defaults.items()]

@@ -29,20 +29,20 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A folder on the path, as site-packages is."""
     before = set(sys.modules)
     monkeypatch.syspath_prepend(str(tmp_path))
-    forget()
+    clear_caches()
     yield tmp_path
-    forget()
+    clear_caches()
     for name in set(sys.modules) - before:
         if name.startswith("plug_"):
             del sys.modules[name]
 
 
-def forget() -> None:
+def clear_caches() -> None:
     plugins.load_plugin.cache_clear()
     plugins._entry_points_by_name.cache_clear()
 
 
-def test_names_are_sorted_and_nothing_is_imported(site: Path) -> None:
+def test_plugin_names_are_sorted_without_imports(site: Path) -> None:
     install(site, "two", "b = plug_b:PART\na = plug_a", {"plug_a": "raise RuntimeError", "plug_b": "PART = [7]"})
     assert plugins.plugin_names(GROUP) == ["a", "b"]
     assert "plug_a" not in sys.modules and "plug_b" not in sys.modules
@@ -50,14 +50,14 @@ def test_names_are_sorted_and_nothing_is_imported(site: Path) -> None:
     assert plugins.load_plugin(GROUP, "b") is plugins.load_plugin(GROUP, "b")
 
 
-def test_of_two_packages_this_programs_own_comes_first_then_the_first_by_name(site: Path) -> None:
+def test_this_program_has_priority_then_packages_by_name(site: Path) -> None:
     install(site, "zebra", "a = plug_z:PART\nb = plug_z:PART", {"plug_z": "PART = 'zebra'"})
     install(site, "antelope", "a = plug_c:PART\nb = plug_c:PART", {"plug_c": "PART = 'antelope'"})
     install(site, "egvs", "a = plug_e:PART", {"plug_e": "PART = 'own'"})
     assert (plugins.load_plugin(GROUP, "a"), plugins.load_plugin(GROUP, "b")) == ("own", "antelope")
 
 
-def test_an_unknown_name_is_said_with_those_that_are_known(site: Path) -> None:
+def test_message_of_unknown_name_lists_known_ones(site: Path) -> None:
     install(site, "one", "a = plug_a", {})
     with pytest.raises(InputError, match=r"^egvs\.test_group: knows no 'c'\. Choose one of a\.$"):
         plugins.load_plugin(GROUP, "c")
@@ -77,14 +77,14 @@ def test_an_unknown_name_is_said_with_those_that_are_known(site: Path) -> None:
         ("plug_a", "raise SystemExit(0)", r"its module ended with SystemExit\(0\)"),
     ],
 )
-def test_one_that_cannot_be_loaded_names_its_package(site: Path, entry: str, source: str, problem: str) -> None:
+def test_message_of_broken_plugin_names_its_package(site: Path, entry: str, source: str, problem: str) -> None:
     install(site, "somebody-elses", f"a = {entry}", {"plug_a": source})
     place = rf"\(entry point '{entry}' of the package somebody-elses\)"
     with pytest.raises(MissingBackendError, match=rf"^'a' of egvs\.test_group cannot be loaded: {problem}.*{place}"):
         plugins.load_plugin(GROUP, "a")
 
 
-def test_an_interrupt_while_loading_is_no_fault_of_the_plug_in(site: Path) -> None:
+def test_interrupt_while_loading_is_passed_on(site: Path) -> None:
     install(site, "somebody-elses", "a = plug_a", {"plug_a": "raise KeyboardInterrupt"})
     with pytest.raises(KeyboardInterrupt):
         plugins.load_plugin(GROUP, "a")
@@ -93,27 +93,27 @@ def test_an_interrupt_while_loading_is_no_fault_of_the_plug_in(site: Path) -> No
 @pytest.mark.parametrize(
     ("group", "entry", "lacks"),
     [
-        ("egvs.effects", "collections:OrderedDict", "NAME, SOURCE, STAGE, KIND, Model.of; expected a subclass"),
-        ("egvs.effects", "plug_a:TABLE", "NAME, SOURCE, STAGE, KIND, Model.of; expected a subclass"),
-        ("egvs.effects", "plug_a", "NAME, SOURCE, STAGE, KIND, Model.of; expected a subclass"),
-        ("egvs.effects", "egvs.effects.base:Detect", "NAME, SOURCE, Model.of; expected a subclass"),
+        ("egvs.effects", "collections:OrderedDict", "NAME, SOURCE, STAGE, KIND, Model.from_dict; expected a subclass"),
+        ("egvs.effects", "plug_a:TABLE", "NAME, SOURCE, STAGE, KIND, Model.from_dict; expected a subclass"),
+        ("egvs.effects", "plug_a", "NAME, SOURCE, STAGE, KIND, Model.from_dict; expected a subclass"),
+        ("egvs.effects", "egvs.effects.base:Detect", "NAME, SOURCE, Model.from_dict; expected a subclass"),
         ("egvs.point_clouds", "plug_a", "read; expected a module or an object with a function read"),
     ],
 )
-def test_an_object_of_another_kind_is_refused(site: Path, group: str, entry: str, lacks: str) -> None:
+def test_rejects_object_without_required_attributes(site: Path, group: str, entry: str, lacks: str) -> None:
     install(site, "somebody-elses", f"zz = {entry}", {"plug_a": "TABLE = {}"}, group)
     message = rf"cannot be loaded: it has no {lacks}.* \(entry point '{entry}' of the package somebody-elses\)"
     with pytest.raises(MissingBackendError, match=message):
         plugins.load_plugin(group, "zz")
 
 
-def test_a_value_that_names_no_module_is_refused(site: Path) -> None:
+def test_rejects_entry_point_without_module(site: Path) -> None:
     install(site, "somebody-elses", "a = !!no module", {})
     with pytest.raises(MissingBackendError, match=r"names no module.*'!!no module' of the package somebody-elses"):
         plugins.plugin_module(GROUP, "a")
 
 
-def test_packages_without_a_name_are_sorted_too(site: Path) -> None:
+def test_sorts_packages_without_name(site: Path) -> None:
     for package in ("one", "two"):
         install(site, package, f"{package} = plug_{package}", {})
     (site / "two-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\n", encoding="utf-8")
@@ -128,7 +128,7 @@ def test_packages_without_a_name_are_sorted_too(site: Path) -> None:
         ({"sklearn": None, "torch": None}, r"^it needs scikit-learn, PyTorch, which are not installed: pip install"),
     ],
 )
-def test_what_needs_an_extra_is_refused_by_what_to_install(
+def test_message_of_missing_extra_tells_what_to_install(
     there: dict[str, None], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in there:
@@ -138,7 +138,7 @@ def test_what_needs_an_extra_is_refused_by_what_to_install(
     assert refused.value.exit_code == 2
 
 
-def test_what_is_installed_is_not_imported_to_see_that(site: Path) -> None:
+def test_require_extra_imports_nothing(site: Path) -> None:
     (site / "plug_there.py").write_text("raise SystemExit", encoding="utf-8")
     plugins.require_libraries("it", "some", "plug_there")
     assert "plug_there" not in sys.modules

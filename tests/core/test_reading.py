@@ -14,7 +14,7 @@ DIGITS = "9" * 5000
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         (f"a = {DEEP}", "nested too deeply"),
         (f"a = {'[' * 101}{']' * 101}", "nested more than 100 deep"),
@@ -26,17 +26,17 @@ DIGITS = "9" * 5000
         ("a = 1\na = 2", "Cannot overwrite a value"),
     ],
 )
-def test_toml_that_is_none(tmp_path: Path, text: str, said: str) -> None:
+def test_rejects_invalid_toml(tmp_path: Path, text: str, message: str) -> None:
     file = tmp_path / "some.toml"
     file.write_bytes(text.encode("utf-8", "surrogateescape"))
     with pytest.raises(InputError) as refused:
         reading.read_toml(file)
     assert str(refused.value).startswith(f"{file}: is not valid TOML: ")
-    assert said in str(refused.value)
+    assert message in str(refused.value)
 
 
 @pytest.mark.parametrize(
-    ("data", "said"),
+    ("data", "message"),
     [
         (DEEP.encode(), "nested too deeply"),
         (b"[" * 101 + b"]" * 101, "nested more than 100 deep"),
@@ -48,17 +48,17 @@ def test_toml_that_is_none(tmp_path: Path, text: str, said: str) -> None:
         (b"{", "Expecting property name"),
     ],
 )
-def test_json_that_is_none(tmp_path: Path, data: bytes, said: str) -> None:
+def test_rejects_invalid_json(tmp_path: Path, data: bytes, message: str) -> None:
     file = tmp_path / "some.json"
     file.write_bytes(data)
     with pytest.raises(InputError) as refused:
         reading.read_json(file, "Write a list of stations.")
     assert str(refused.value).startswith(f"{file}: is not valid JSON: ")
     assert str(refused.value).endswith(". Write a list of stations.")
-    assert said in str(refused.value)
+    assert message in str(refused.value)
 
 
-def test_what_is_sound_is_read_as_it_stands(tmp_path: Path) -> None:
+def test_reads_valid_documents(tmp_path: Path) -> None:
     file = tmp_path / "some.json"
     file.write_text('\ufeff{"a": "\\ud83d\\ude00", "b": [[1e400], {}]}', encoding="utf-8")
     assert reading.read_json(file) == {"a": "😀", "b": [[float("inf")], {}]}
@@ -67,7 +67,7 @@ def test_what_is_sound_is_read_as_it_stands(tmp_path: Path) -> None:
     assert reading.read_toml(toml) == {"a": 1, "b": "x\ny"}
 
 
-def test_a_document_is_not_opened_that_is_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rejects_large_document_without_opening_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EGVS_MAX_DOCUMENT_MB", "1")
     file = tmp_path / "large.json"
     with file.open("wb") as sparse:

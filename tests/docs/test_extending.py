@@ -155,7 +155,7 @@ from egvs.validation.sweeps import SiteView, Sweep
 assert "middle" in base.detector_names(), base.detector_names()
 sensor = CATALOGUE["VLP-32C"]
 view = SiteView("s", Pose(1.0, 2.0, 3.0), sensor, np.full(sensor.beams, 50.0))
-ready = base.make_detector("middle").at(view, Roi((0.0, 0.0, 0.0), (9.0, 9.0, 9.0)))
+ready = base.make_detector("middle").at_site(view, Roi((0.0, 0.0, 0.0), (9.0, 9.0, 9.0)))
 beam = np.arange(3, dtype=np.uint32)
 far = np.array([10.0, 10.0, 50.0])  # the last is background
 points = np.column_stack([sensor.directions()[beam] * far[:, None], np.ones(3)]).astype(np.float32)

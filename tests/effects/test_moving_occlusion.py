@@ -1,4 +1,4 @@
-"""Do vehicles hide what is behind them, as often as a brute-force count says?
+"""Moving occlusion, compared with a brute-force count.
 
 The twin below shares no code with the effect: half-spaces from rotation matrices instead of slabs, every voxel of the
 grid instead of a march, every box for every beam. It must find the same whole numbers."""
@@ -29,7 +29,7 @@ from egvs.scoring.visibility import UNIT, Beams, HitCounter
 from egvs.sensors import voxel_crossings
 from egvs.sensors.sites import Pose
 from egvs.stages import score
-from tests.stages import inputs_of, run_stage
+from tests.stage_runner import inputs_of, run_stage
 
 ON = "effects.moving_occlusion.method=frames"
 ALL = "effects.moving_occlusion.frames=all"
@@ -39,10 +39,10 @@ WIDE = Grid.over(Roi((0.0, 0.0, 0.0), (80.0, 80.0, 80.0)), 1.0)
 SHRINK, CHORD = 1e-4 + 1e-9, 1e-6
 
 
-# The twin
+# Reference implementation
 
 
-def twin_ranges(o: np.ndarray, d: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+def reference_ranges(o: np.ndarray, d: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     """Range (n,) at which rays from ``o`` with unit directions ``d`` enter the first of ``boxes`` (m, 8): six
     half-spaces each."""
     first = np.full(len(d), np.inf)
@@ -65,8 +65,8 @@ def twin_ranges(o: np.ndarray, d: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     return first
 
 
-def twin_crossings(o: np.ndarray, end: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Flat voxels that a segment crosses and the ranges of entry, sorted by range: every voxel of the grid is asked."""
+def reference_crossings(o: np.ndarray, end: np.ndarray, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Flat voxels that a segment crosses and the ranges of entry, sorted by range; tests every voxel of the grid."""
     length = math.sqrt((end**2).sum())
     corner = (
         np.stack(np.meshgrid(*(np.arange(n) for n in grid.shape), indexing="ij"), axis=-1).reshape(-1, 3) * grid.voxel_m
@@ -86,7 +86,7 @@ def twin_crossings(o: np.ndarray, end: np.ndarray, grid: Grid) -> tuple[np.ndarr
     return met[order], t0[met][order] * length
 
 
-def twin_blocked(
+def reference_blocked(
     o: np.ndarray, ends: np.ndarray, first: np.ndarray, enter: np.ndarray, frames: dict[int, np.ndarray]
 ) -> np.ndarray:
     """Frames in which each crossing is not reached."""
@@ -94,7 +94,7 @@ def twin_blocked(
     directions = ends / np.sqrt((ends**2).sum(axis=1))[:, None]
     blocked = np.zeros(len(enter), dtype=np.int64)
     for boxes in frames.values():
-        blocked += twin_ranges(o, directions, boxes)[beam] < enter
+        blocked += reference_ranges(o, directions, boxes)[beam] < enter
     return blocked
 
 
@@ -104,21 +104,21 @@ def twin_blocked(
 def occlusion(out: Path, **parameters: Any) -> moving_occlusion.MovingOcclusion:
     """The effect, prepared from a finished run."""
     tpog = egvs.read_tpog(out / "tpog.parquet")
-    made = moving_occlusion.MovingOcclusion(MovingOcclusionParameters.of(parameters))
+    made = moving_occlusion.MovingOcclusion(MovingOcclusionParameters.from_dict(parameters))
     return made.prepare(None, tpog, out / "trajectories.parquet")  # type: ignore[arg-type]
 
 
 class Replayed:
-    """A replay, asked about crossings of any sensor."""
+    """A replay with the shares of crossings of any sensor."""
 
     def __init__(self, boxes: moving_occlusion.Replay) -> None:
         self.boxes = boxes
 
-    def share(self, found: voxel_crossings.Crossings) -> np.ndarray:
-        return self.boxes.facing(found.sensor_m, found.grid).share(found)
+    def share(self, result: voxel_crossings.Crossings) -> np.ndarray:
+        return self.boxes.facing(result.sensor_m, result.grid).share(result)
 
-    def blocked(self, found: voxel_crossings.Crossings) -> np.ndarray:
-        return np.rint((1 - self.share(found)) * self.boxes.frames).astype(np.int64)
+    def blocked(self, result: voxel_crossings.Crossings) -> np.ndarray:
+        return np.rint((1 - self.share(result)) * self.boxes.frames).astype(np.int64)
 
 
 def replay(frames: dict[int, list[list[float]]], count: int, grid: Grid = GRID) -> Replayed:
@@ -131,8 +131,8 @@ def replay(frames: dict[int, list[list[float]]], count: int, grid: Grid = GRID) 
 
 def listed(where: tuple[float, float, float], ends: Any, grid: Grid = GRID) -> voxel_crossings.Crossings:
     """The crossings of fewer beams than one chunk holds."""
-    (found,) = voxel_crossings.list_crossings(where, np.asarray(ends, dtype=np.float64), grid)
-    return found
+    (result,) = voxel_crossings.list_crossings(where, np.asarray(ends, dtype=np.float64), grid)
+    return result
 
 
 def car(
@@ -187,13 +187,13 @@ def scores(folder: Path, out: Path, *overrides: str, jobs: int | None = None) ->
 
 
 def with_trajectories(out: Path, table: pa.Table, groups: int = 1) -> None:
-    """Put other boxes in the place of those recorded, in ``groups`` row groups of whole frames."""
-    about = parquet.read_metadata(out / "trajectories.parquet", "trajectories")
-    cuts = np.searchsorted(table.column("frame").to_numpy(), np.linspace(0, about["frames"], groups + 1))
+    """Replace the recorded boxes, in ``groups`` row groups."""
+    metadata = parquet.read_metadata(out / "trajectories.parquet", "trajectories")
+    cuts = np.searchsorted(table.column("frame").to_numpy(), np.linspace(0, metadata["frames"], groups + 1))
     with parquet.artefact_writer(out / "trajectories.parquet", "trajectories") as file:
         for low, high in pairwise(cuts):
             file.write({name: table.column(name).slice(low, high - low).to_pylist() for name in table.column_names})
-        file.describe(about)
+        file.describe(metadata)
 
 
 def trajectories(out: Path) -> pa.Table:
@@ -214,19 +214,19 @@ def recorded(out: Path, grid: Grid) -> dict[int, np.ndarray]:
 
 
 @pytest.mark.slow
-def test_a_car_parked_in_half_of_the_frames_halves_what_is_behind_it() -> None:
+def test_car_parked_in_half_of_the_frames_halves_shares_behind_it() -> None:
     half = replay({0: [car(10, 0.25)], 2: [car(10, 0.25)]}, 4)  # from x = 8 to 12
     share = half.share(listed((0, 0.25, 1), [[20, 0, 0]]))
     assert share.tolist() == [1.0] * 17 + [0.5] * 23  # 16 voxels before it, and the first of its own
 
 
-def test_the_nearest_of_two_cars_counts_once() -> None:
+def test_nearest_of_two_cars_counts_once() -> None:
     both = replay({0: [car(15, 0.25), car(5, 0.25)], 1: [car(15, 0.25)]}, 2)
     share = both.share(listed((0, 0.25, 1), [[20, 0, 0]]))
     assert share.tolist() == [1.0] * 7 + [0.5] * 20 + [0.0] * 13
 
 
-def test_a_beam_passes_over_under_and_beside() -> None:
+def test_beam_passes_over_under_and_beside_a_vehicle() -> None:
     one = replay({0: [car(10, 0)]}, 1)
     for ends, z in (([20, 0, 0], 1.75), ([20, 0, 0], 1.5), ([20, 1.25, 0], 1.75)):
         assert (one.share(listed((0, 0.25, z), [ends])) == 1).all()
@@ -235,14 +235,14 @@ def test_a_beam_passes_over_under_and_beside() -> None:
     assert (one.share(listed((0, 1.0 - 2e-4, 1), [[20, 0, 0]])) == 1).sum() == 17  # 0.2 mm deep
 
 
-def test_a_face_on_a_voxel_face_hides_from_the_second_voxel_on_from_either_side() -> None:
+def test_box_face_on_a_voxel_face_occludes_from_the_second_voxel_on() -> None:
     one = replay({0: [car(10, 0.25)]}, 1)
     there = one.share(listed((0, 0.25, 1), [[20, 0, 0]]))
     back = one.share(listed((20, 0.25, 1), [[-20, 0, 0]]))
     assert there.tolist() == back.tolist() == [1.0] * 17 + [0.0] * 23
 
 
-def test_where_a_beam_ends_at_the_very_range_of_a_voxel_that_voxel_counts() -> None:
+def test_voxel_at_the_end_of_a_beam_counts() -> None:
     stop = -(2 - SHRINK) + 10  # as the slab gives it
     enter = np.array([stop, np.nextafter(stop, 20)])
     ends, none = np.array([[20.0, 0, 0]]), np.zeros(2, np.int64)
@@ -252,7 +252,7 @@ def test_where_a_beam_ends_at_the_very_range_of_a_voxel_that_voxel_counts() -> N
     assert replay({0: [car(10, 0.25)]}, 1).share(beam).tolist() == [1.0, 0.0]
 
 
-def test_a_raised_nose_lets_beams_pass_under_it() -> None:
+def test_beams_pass_under_a_pitched_box() -> None:
     level, raised = car(10, 0.25, size=(4, 2, 0.5)), car(10, 0.25, size=(4, 2, 0.5), pitch=0.3)
     level[2] = raised[2] = 1.0
     beams = listed((20, 0.25, 0.8), [[-20, 0, 0]])  # from the front: its nose is 0.59 m up
@@ -263,26 +263,26 @@ def test_a_raised_nose_lets_beams_pass_under_it() -> None:
     assert np.argmin(replay({0: [raised]}, 1).share(beams)) == 20
 
 
-def test_a_vehicle_round_the_sensor_is_ignored_and_counted() -> None:
+def test_vehicle_around_the_sensor_is_ignored_and_counted() -> None:
     beams = listed((10, 0.25, 1), [[9, 0, 0], [0, 0, -0.9], [-9, 1, 0.1]])
     inside = replay({0: [car(10, 0.25)], 1: [car(10, 0.25), car(15, 0.25)]}, 2)
     where = np.array([10, 0.25, 1]) - GRID.origin_m
-    assert inside.boxes.holding(where) == 2
-    assert inside.boxes.holding(where + np.array([0, 0, 0.5])) == 0  # on the roof
+    assert inside.boxes.count_boxes_around(where) == 2
+    assert inside.boxes.count_boxes_around(where + np.array([0, 0, 0.5])) == 0  # on the roof
     share = inside.share(beams)
     assert share[: beams.first[1]].tolist() == [1.0] * 7 + [0.5] * 11
     assert (share[beams.first[1] :] == 1).all()
 
 
-# Against the twin
+# Comparison with the reference
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_random_boxes_and_rays_give_the_twins_numbers(seed: int) -> None:
+def test_random_boxes_and_rays_agree_with_reference(seed: int) -> None:
     o, rays, frames = random_scene(seed)
-    expected = twin_blocked(o, rays.ends_m, rays.first, rays.enter_m, frames)
-    found = replay_of(frames).blocked(rays)
-    assert found.tolist() == expected.tolist()
+    expected = reference_blocked(o, rays.ends_m, rays.first, rays.enter_m, frames)
+    result = replay_of(frames).blocked(rays)
+    assert result.tolist() == expected.tolist()
     assert expected.any()
 
 
@@ -300,7 +300,7 @@ def fan(tilt: float, step: float, draw: np.random.Generator) -> np.ndarray:
 @pytest.mark.parametrize("step", [15.0, 0.02])
 @pytest.mark.parametrize("tilt", [0.0, 1e-11, 7.0])
 @pytest.mark.parametrize("seed", range(4))
-def test_columns_of_channels_give_the_twins_numbers(seed: int, tilt: float, step: float) -> None:
+def test_columns_of_channels_agree_with_reference(seed: int, tilt: float, step: float) -> None:
     draw = np.random.default_rng(seed)
     o, _, frames = random_scene(seed)
     standing = [
@@ -313,13 +313,13 @@ def test_columns_of_channels_give_the_twins_numbers(seed: int, tilt: float, step
     enter = np.sort(draw.uniform(0, 25, (len(ends), 8)), axis=1).ravel()
     none = np.zeros(len(enter), dtype=np.int64)
     rays = voxel_crossings.Crossings(o, WIDE, slice(0, len(ends)), first, ends, none, enter, enter)
-    expected = twin_blocked(o, ends, first, enter, frames)
+    expected = reference_blocked(o, ends, first, enter, frames)
     assert replay_of(frames, 40).blocked(rays).tolist() == expected.tolist()
     assert len(set(expected.tolist())) > 3
 
 
 @pytest.mark.slow
-def test_beams_of_any_weight_add_as_many_hits_as_their_listed_crossings(
+def test_hits_of_weighted_beams_agree_with_listed_crossings(
     ran: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, out = ran
@@ -333,7 +333,7 @@ def test_beams_of_any_weight_add_as_many_hits_as_their_listed_crossings(
     walked = visibility.borrowed_hits(beams).copy()
     monkeypatch.setattr(moving_occlusion, "_BUFFER_SIZE", 1)  # a few beams at a time
     assert walked.tolist() == visibility.borrowed_hits(beams).tolist()
-    monkeypatch.setattr(moving_occlusion.MovingOcclusion, "falls", lambda *_: None)
+    monkeypatch.setattr(moving_occlusion.MovingOcclusion, "transmittance_steps", lambda *_: None)
     assert walked.tolist() == visibility.borrowed_hits(beams).tolist()
     plain = HitCounter(
         egvs.build_scene(egvs.load(folder, ["effects.dropout.share=1e-9"])),
@@ -342,7 +342,7 @@ def test_beams_of_any_weight_add_as_many_hits_as_their_listed_crossings(
     assert 0 < walked.sum() < 0.995 * plain.borrowed_hits(beams).sum()
 
 
-def test_a_whole_run_gives_the_twins_hits(ran: tuple[Path, Path]) -> None:
+def test_hits_of_a_run_agree_with_reference(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     settings = ("roi.voxel_m=1", "sensors.small.azimuth_step_deg=4", 'score.keep_visibility="all"', ON, ALL)
     scenario = egvs.load(folder, settings)
@@ -351,24 +351,26 @@ def test_a_whole_run_gives_the_twins_hits(ran: tuple[Path, Path]) -> None:
     frames = recorded(out, grid)
     scans = parquet.read_artefact(out / "scans.parquet", "scans")[0]
     hidden = 0
-    for about in parquet.read_metadata(out / "scans.parquet", "scans")["sites"]:
-        mine = scans.filter(pa.compute.equal(scans.column("site"), about["site"]))
+    for metadata in parquet.read_metadata(out / "scans.parquet", "scans")["sites"]:
+        mine = scans.filter(pa.compute.equal(scans.column("site"), metadata["site"]))
         ends = np.column_stack([mine.column(name).to_numpy() for name in ("dx_m", "dy_m", "dz_m")])
-        o = np.array([about["x_m"], about["y_m"], about["z_m"]]) - grid.origin_m
-        lists = [twin_crossings(o, end, grid) for end in ends]
+        o = np.array([metadata["x_m"], metadata["y_m"], metadata["z_m"]]) - grid.origin_m
+        lists = [reference_crossings(o, end, grid) for end in ends]
         first = np.append(0, np.cumsum([len(cells) for cells, _ in lists]))
-        blocked = twin_blocked(o, ends, first, np.concatenate([enter for _, enter in lists]), frames)
-        whole = np.zeros(np.prod(grid.shape), dtype=np.int64)
+        blocked = reference_blocked(o, ends, first, np.concatenate([enter for _, enter in lists]), frames)
+        complete = np.zeros(np.prod(grid.shape), dtype=np.int64)
         np.add.at(
-            whole, np.concatenate([cells for cells, _ in lists]), np.rint((40 - blocked) / 40 * UNIT).astype(np.int64)
+            complete,
+            np.concatenate([cells for cells, _ in lists]),
+            np.rint((40 - blocked) / 40 * UNIT).astype(np.int64),
         )
-        hits = egvs.read_visibility(out / "visibility.parquet", about["site"])
-        assert (hits.ravel() * UNIT).tolist() == whole.tolist()
+        hits = egvs.read_visibility(out / "visibility.parquet", metadata["site"])
+        assert (hits.ravel() * UNIT).tolist() == complete.tolist()
         hidden += int(blocked.sum())
     assert hidden > 1000
 
 
-def test_independent_is_the_product_over_the_voxels_before(ran: tuple[Path, Path]) -> None:
+def test_independent_method_is_a_product_over_voxels(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     scenario = egvs.load(folder, ["roi.voxel_m=1"])
     egvs.run(scenario, out)
@@ -376,12 +378,12 @@ def test_independent_is_the_product_over_the_voxels_before(ran: tuple[Path, Path
     made = occlusion(out, method="independent")
     draw, where = np.random.default_rng(3), (10.0, 12.0, 3.0)
     ends = np.column_stack([draw.uniform(-12, 28, 60), draw.uniform(-22, -11, 60), np.full(60, -2.9)])
-    found = listed(where, ends, grid)
-    share, darkest = made.share(found), 1.0
+    result = listed(where, ends, grid)
+    share, darkest = made.share(result), 1.0
     for n, end in enumerate(ends):
-        cells, _ = twin_crossings(np.array([10, 12, 3]) - grid.origin_m, end, grid)
+        cells, _ = reference_crossings(np.array([10, 12, 3]) - grid.origin_m, end, grid)
         free = 1.0
-        for cell, got in zip(cells, share[found.first[n] : found.first[n + 1]], strict=True):
+        for cell, got in zip(cells, share[result.first[n] : result.first[n + 1]], strict=True):
             assert got == pytest.approx(free, rel=1e-12)
             free *= 1 - counts[cell] / 40
         darkest = min(darkest, free)
@@ -391,7 +393,7 @@ def test_independent_is_the_product_over_the_voxels_before(ran: tuple[Path, Path
 # Limits
 
 
-def test_without_vehicles_in_reach_the_scores_are_the_plain_ones(ran: tuple[Path, Path]) -> None:
+def test_without_vehicles_in_reach_scores_do_not_change(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     plain = parquet.read_artefact(out / "scores.parquet", "scores")[0]
     boxes = trajectories(out)
@@ -403,19 +405,19 @@ def test_without_vehicles_in_reach_the_scores_are_the_plain_ones(ran: tuple[Path
             assert scores(folder, out, f"effects.moving_occlusion.frames={frames}") == plain.column("egvs").to_pylist()
 
 
-def test_independent_without_occupancy_changes_nothing() -> None:
+def test_independent_method_without_occupancy_changes_nothing() -> None:
     free = moving_occlusion.IndependentVoxels(10, np.zeros(np.prod(GRID.shape), dtype=np.uint32))
     assert (free.share(listed((-1, 0.3, 3), [[20, 1, -2], [3, 3, -3]])) == 1).all()
 
 
-def test_what_is_always_occupied_hides_everything_behind_it() -> None:
+def test_always_occupied_voxel_occludes_everything_behind_it() -> None:
     counts = np.zeros(GRID.shape, dtype=np.uint32)
     counts[16] = 10
     share = moving_occlusion.IndependentVoxels(10, counts.ravel()).share(listed((0, 0.25, 1), [[20, 0, 0]]))
     assert share.tolist() == [1.0] * 17 + [0.0] * 23
 
 
-def test_boxes_behind_the_last_crossing_and_behind_the_sensor_hide_nothing() -> None:
+def test_boxes_behind_sensor_and_last_crossing_occlude_nothing() -> None:
     none = replay({0: [car(18, 0.25), car(-4, 0.25), car(1, 4)]}, 1)
     assert (none.share(listed((0, 0.25, 1), [[15, 0, 0]])) == 1).all()
 
@@ -436,7 +438,7 @@ def test_more_vehicles_never_raise_a_share(seed: int) -> None:
     assert (all_of_them < fewer).any()
 
 
-def test_all_frames_are_the_mean_of_each_and_their_order_does_not_matter() -> None:
+def test_share_is_the_mean_over_frames_in_any_order() -> None:
     _, rays, frames = random_scene(7)
     single = [replay_of({0: boxes}, 1).blocked(rays) for boxes in frames.values()]
     assert sum(single).tolist() == replay_of(frames).blocked(rays).tolist()
@@ -445,23 +447,23 @@ def test_all_frames_are_the_mean_of_each_and_their_order_does_not_matter() -> No
 
 
 @pytest.mark.slow
-def test_it_multiplies_with_rain(ran: tuple[Path, Path]) -> None:
+def test_occlusion_multiplies_with_rain(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     scenario = egvs.load(folder, [ON, ALL, "effects.rain.rate_mm_h=30"])
     pose, ends = Pose(1, -9, 3), np.array([[20.0, 9.0, -2.5]])
-    found = listed(pose.position_m, ends, scenario.roi.grid)
-    occluded = occlusion(out, frames="all").for_sensor(found.sensor_m, found.grid).share(found)
-    centres_m = (np.column_stack(np.unravel_index(found.cells, found.grid.shape)) + 0.5) * found.grid.voxel_m
-    range_m = np.sqrt(((centres_m - found.sensor_m) ** 2).sum(axis=1))
+    result = listed(pose.position_m, ends, scenario.roi.grid)
+    occluded = occlusion(out, frames="all").for_sensor(result.sensor_m, result.grid).share(result)
+    centres_m = (np.column_stack(np.unravel_index(result.cells, result.grid.shape)) + 0.5) * result.grid.voxel_m
+    range_m = np.sqrt(((centres_m - result.sensor_m) ** 2).sum(axis=1))
     rain = Rain(RainParameters(rate_mm_h=30)).detect(range_m, None)  # type: ignore[arg-type]
     scene = egvs.build_scene(scenario)
     visibility = HitCounter(scene, egvs.read_tpog(out / "tpog.parquet"), out / "trajectories.parquet")
     hits = visibility.borrowed_hits(Beams(pose, scene.sensor("small"), ends))
-    assert np.abs(hits[found.cells] - rain * np.rint(occluded * UNIT)).max() <= 1
+    assert np.abs(hits[result.cells] - rain * np.rint(occluded * UNIT)).max() <= 1
     assert occluded.min() < 1 > rain.max()
 
 
-def test_a_scene_that_is_moved_far_away_gives_the_same_shares() -> None:
+def test_shares_do_not_depend_on_the_position_of_the_scene() -> None:
     far = Grid((GRID.origin_m[0] + 2.0**18, GRID.origin_m[1] - 2.0**21, 0.0), GRID.voxel_m, GRID.shape)
     boxes, ends = {0: [car(8, 0.5, yaw=0.5)], 1: [car(12, -0.25, yaw=-1)]}, [[20, 0, 0], [19, 1, 0.125]]
     moved = {f: [[x + 2.0**18, y - 2.0**21, *rest] for x, y, *rest in cars] for f, cars in boxes.items()}
@@ -472,7 +474,7 @@ def test_a_scene_that_is_moved_far_away_gives_the_same_shares() -> None:
 
 
 @pytest.mark.parametrize("switch", [ON, INDEPENDENT])
-def test_threads_change_no_byte(ran: tuple[Path, Path], switch: str) -> None:
+def test_occlusion_does_not_depend_on_threads(ran: tuple[Path, Path], switch: str) -> None:
     folder, out = ran
     digests = set()
     for jobs in (1, 2, 3):
@@ -484,20 +486,20 @@ def test_threads_change_no_byte(ran: tuple[Path, Path], switch: str) -> None:
 # Which frames
 
 
-def test_a_subset_is_the_same_each_time_and_too_many_are_all(ran: tuple[Path, Path]) -> None:
+def test_subset_of_frames_is_reproducible(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     few = scores(folder, out, "effects.moving_occlusion.frames=9")
     assert few == scores(folder, out, "effects.moving_occlusion.frames=9")
-    whole = scores(folder, out, ON, ALL)
-    assert whole != few
+    complete = scores(folder, out, ON, ALL)
+    assert complete != few
     for frames in (0, 40, 41, 500):
-        assert scores(folder, out, f"effects.moving_occlusion.frames={frames}") == whole
-    assert scores(folder, out, ON) == whole  # the default is more than this scenario records
+        assert scores(folder, out, f"effects.moving_occlusion.frames={frames}") == complete
+    assert scores(folder, out, ON) == complete  # the default is more than this scenario records
 
 
-def test_only_row_groups_with_replayed_frames_are_read(ran: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reads_only_row_groups_with_replayed_frames(ran: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     _, out = ran
-    whole = occlusion(out, frames=1).ready
+    complete = occlusion(out, frames=1).ready
     with_trajectories(out, trajectories(out), groups=40)
     read: list[int] = []
     true = parquet.read_row_group
@@ -507,11 +509,11 @@ def test_only_row_groups_with_replayed_frames_are_read(ran: tuple[Path, Path], m
     read.clear()
     parts = occlusion(out, frames=1).ready
     assert read[-1] == 20 and read.count(20) == 1
-    assert isinstance(whole, moving_occlusion.Replay) and isinstance(parts, moving_occlusion.Replay)
-    assert whole.values.tolist() == parts.values.tolist() and len(parts.values) == 2
+    assert isinstance(complete, moving_occlusion.Replay) and isinstance(parts, moving_occlusion.Replay)
+    assert complete.values.tolist() == parts.values.tolist() and len(parts.values) == 2
 
 
-def test_boxes_beyond_the_sites_and_the_region_hide_nothing(ran: tuple[Path, Path]) -> None:
+def test_boxes_beyond_sites_and_region_occlude_nothing(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     boxes, before = trajectories(out), scores(folder, out, ON, ALL)
     away = boxes.set_column(boxes.column_names.index("x_m"), "x_m", pa.compute.add(boxes.column("x_m"), 80.0))
@@ -519,7 +521,7 @@ def test_boxes_beyond_the_sites_and_the_region_hide_nothing(ran: tuple[Path, Pat
     assert scores(folder, out, ON, ALL) == before
 
 
-def test_a_vehicle_between_a_site_and_the_region_hides(ran: tuple[Path, Path]) -> None:
+def test_vehicle_between_site_and_region_occludes(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     plain = scores(folder, out)
     boxes = trajectories(out)
@@ -534,14 +536,14 @@ def test_a_vehicle_between_a_site_and_the_region_hides(ran: tuple[Path, Path]) -
     assert 0.95 * plain[1] < other <= plain[1]
 
 
-def test_without_kept_scans_the_scores_are_the_same(ran: tuple[Path, Path]) -> None:
+def test_scores_are_the_same_without_stored_scans(ran: tuple[Path, Path]) -> None:
     folder, out = ran
-    kept = scores(folder, out, ON)
+    remaining = scores(folder, out, ON)
     (out / "scans.parquet").unlink()
-    assert scores(folder, out, ON, "scan.keep=false") == kept
+    assert scores(folder, out, ON, "scan.keep=false") == remaining
 
 
-# What the stage says, and what it refuses
+# Messages of the stage
 
 
 def test_scores_depend_on_the_trajectories_only_when_they_are_replayed(ran: tuple[Path, Path]) -> None:
@@ -553,35 +555,33 @@ def test_scores_depend_on_the_trajectories_only_when_they_are_replayed(ran: tupl
     assert inputs_of(score, egvs.load(folder, ["effects.rain.rate_mm_h=3"]), out).files == plain
 
 
-def test_all_and_zero_are_one_setting(mini: Path, tmp_path: Path) -> None:
+def test_frames_all_and_zero_are_the_same_setting(mini: Path, tmp_path: Path) -> None:
     assert MovingOcclusionParameters(frames="all") == MovingOcclusionParameters(frames=0)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        (["method=sometimes"], "moving_occlusion.method: 'sometimes'; input should be 'frames' or 'independent'"),
-        (["frames=-1"], "moving_occlusion.frames: -1; input should be greater than or equal to 0"),
-        (["frames=2.5"], "moving_occlusion.frames: 2.5; input should be a valid integer"),
-        (["frames=true"], "moving_occlusion.frames: True; input should be a valid integer"),
-        (["frames=most"], "moving_occlusion.frames: 'most'; input should be a valid integer"),
-        (["frame=7"], "moving_occlusion.frame: unknown key; did you mean frames?"),
+        (["method=sometimes"], "moving_occlusion.method: expected 'frames' or 'independent', got 'sometimes'"),
+        (["frames=-1"], "moving_occlusion.frames: expected a value greater than or equal to 0, got -1"),
+        (["frames=2.5"], "moving_occlusion.frames: expected a valid integer, got 2.5"),
+        (["frames=true"], "moving_occlusion.frames: expected a valid integer, got True"),
+        (["frames=most"], "moving_occlusion.frames: expected a valid integer, got 'most'"),
+        (["frame=7"], "moving_occlusion.frame: unknown key. Did you mean frames?"),
         (
             ["method=independent", "frames=7"],
-            'moving_occlusion.frames: 7; acts on nothing with method = "independent"',
+            'moving_occlusion.frames: 7: has no effect with method = "independent"',
         ),
     ],
 )
-def test_bad_parameters_are_refused(
-    run_egvs: Any, mini: Path, tmp_path: Path, settings: list[str], message: str
-) -> None:
+def test_rejects_bad_parameters(run_egvs: Any, mini: Path, tmp_path: Path, settings: list[str], message: str) -> None:
     overrides = [word for setting in settings for word in ("--set", f"effects.moving_occlusion.{setting}")]
     code, _, err = run_egvs("run", mini, "--out", tmp_path / "out", *overrides)
     assert code == 2
     assert message in " ".join(err.split())
 
 
-def test_bad_trajectories_are_refused(ran: tuple[Path, Path]) -> None:
+def test_rejects_bad_trajectories(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     boxes = trajectories(out)
     width = boxes.column_names.index("width_m")
@@ -597,7 +597,7 @@ def test_bad_trajectories_are_refused(ran: tuple[Path, Path]) -> None:
         scores(folder, out, ON)
 
 
-def test_it_shares_only_when_prepared() -> None:
+def test_share_needs_preparation() -> None:
     with pytest.raises(RuntimeError, match="prepare"):
         moving_occlusion.MovingOcclusion(MovingOcclusionParameters()).share(listed((0, 0, 1), [[20, 0, 0]]))
 
@@ -605,16 +605,16 @@ def test_it_shares_only_when_prepared() -> None:
 # The comparison
 
 
-def test_the_error_of_independent_is_reported(ran: tuple[Path, Path]) -> None:
+def test_reports_the_error_of_the_independent_method(ran: tuple[Path, Path]) -> None:
     folder, out = ran
     plain, framed, independent = scores(folder, out), scores(folder, out, ON), scores(folder, out, INDEPENDENT)
-    found = benchmark.compare(egvs.load(folder, [ON]), out)
-    rows = found["rows"]
+    result = benchmark.compare(egvs.load(folder, [ON]), out)
+    rows = result["rows"]
     assert [row["site"] for row in rows] == ["pole_a", "pole_b"]
     assert [row["plain"] for row in rows] == plain
     assert [row["frames"] for row in rows] == framed
     assert [row["independent"] for row in rows] == independent
     assert [row["error"] for row in rows] == [(i - f) / f for i, f in zip(independent, framed, strict=True)]
     assert all(0 < i < f < p for i, f, p in zip(independent, framed, plain, strict=True))
-    assert set(found["tau"]) == {"plain, frames", "independent, frames", "independent, plain"}
-    assert all(tau in (-1.0, 1.0) for tau in found["tau"].values())
+    assert set(result["tau"]) == {"plain, frames", "independent, frames", "independent, plain"}
+    assert all(tau in (-1.0, 1.0) for tau in result["tau"].values())

@@ -1,4 +1,4 @@
-"""Serves a page while a test looks at it."""
+"""Serve a page during a test."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from egvs.explore.page import Page
 
 @contextmanager
 def serving(page: Page) -> Iterator[Page]:
-    """With its loop in a thread."""
+    """Run the page's loop in a thread."""
     loop = threading.Thread(target=page.run)
     loop.start()
     try:

@@ -1,4 +1,4 @@
-"""What a setting shows is what ``egvs run --set`` gives; the run that is explored stays as it is."""
+"""Settings give the scores of ``egvs run --set``; the explored run does not change."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from egvs.core.errors import InputError
 from egvs.explore.session import Session
 from egvs.explore.settings import SessionFactory, Settings, offered_effects, open_session, trial_parameters
 from egvs.runs import stages
-from tests.explore.test_plan import SITES as FOUR_SITES
 from tests.explore.test_session import MOVED, scored, write_site
+from tests.explore.test_session import SITES as FOUR_SITES
 
 ANOTHER = {
     "gamma": (Settings(2.5, "egvs", frozenset()), ["score.gamma=2.5"]),
@@ -28,12 +28,12 @@ ANOTHER = {
 
 @pytest.fixture
 def session(mini: Path, tmp_path: Path) -> Session:
-    """Over the small scenario."""
+    """A session over the small scenario."""
     return open_session(mini, (), tmp_path / "run")
 
 
 @pytest.mark.parametrize("name", ANOTHER)
-def test_a_setting_is_what_a_run_with_it_gives(session: Session, mini: Path, tmp_path: Path, name: str) -> None:
+def test_session_with_settings_has_the_scores_of_a_run(session: Session, mini: Path, tmp_path: Path, name: str) -> None:
     settings, overrides = ANOTHER[name]
     before = {path.name: path.read_bytes() for path in session.work.folder.path.iterdir()}
     tried = SessionFactory(session, tmp_path / "scratch").session(settings)
@@ -42,15 +42,15 @@ def test_a_setting_is_what_a_run_with_it_gives(session: Session, mini: Path, tmp
     assert {path.name: path.read_bytes() for path in session.work.folder.path.iterdir()} == before
     rows = scored(mini, *overrides)
     assert candidates == {site: {key: row[key] for key in candidates[site]} for site, row in rows.items()}
-    assert all(its.rank == rows[site]["rank"] for site, its in tried.candidates.items())
+    assert all(candidate.rank == rows[site]["rank"] for site, candidate in tried.candidates.items())
     write_site(mini, "pole_a", MOVED)
     row = scored(mini, *overrides)["pole_a"]
     assert dict(moved.scores) == {key: row[key] for key in moved.scores}
     assert moved.rank == row["rank"]
-    assert settings.in_words(session.scenario) == tuple(sorted(overrides))
+    assert settings.overrides(session.scenario) == tuple(sorted(overrides))
 
 
-def test_an_effect_is_left_out_as_if_nobody_had_named_it(mini: Path, tmp_path: Path) -> None:
+def test_effect_can_be_switched_off(mini: Path, tmp_path: Path) -> None:
     rainy = open_session(mini, ["effects.rain.rate_mm_h=20"], tmp_path / "run")
     dry = Settings(None, "egvs", frozenset())
     tried = SessionFactory(rainy, tmp_path / "scratch").session(dry)
@@ -58,17 +58,17 @@ def test_an_effect_is_left_out_as_if_nobody_had_named_it(mini: Path, tmp_path: P
         key: scored(mini)["pole_a"][key] for key in ("egvs", "entropy_seen", "expected_detections")
     }
     assert rainy.candidates["pole_a"].scores["egvs"] < tried.candidates["pole_a"].scores["egvs"]
-    assert dry.in_words(rainy.scenario) == ("without effects.rain",)
+    assert dry.overrides(rainy.scenario) == ("without effects.rain",)
 
 
-def test_the_scenarios_own_settings_are_the_session_that_was_opened(session: Session, tmp_path: Path) -> None:
+def test_unchanged_settings_give_the_initial_session(session: Session, tmp_path: Path) -> None:
     variants = SessionFactory(session, tmp_path / "scratch")
-    assert variants.session(Settings.of(session.scenario)) is session
+    assert variants.session(Settings.from_scenario(session.scenario)) is session
     assert not (tmp_path / "scratch").exists()
-    assert Settings.of(session.scenario).in_words(session.scenario) == ()
+    assert Settings.from_scenario(session.scenario).overrides(session.scenario) == ()
 
 
-def test_what_a_setting_does_not_touch_is_taken_over(
+def test_only_stages_that_depend_on_a_setting_run(
     session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("EGVS_STORE", "")  # else it would come from there
@@ -80,7 +80,7 @@ def test_what_a_setting_does_not_touch_is_taken_over(
     assert made == ["score"]
 
 
-def test_a_plan_is_worth_with_a_setting_what_egvs_place_says(mini: Path, tmp_path: Path) -> None:
+def test_plan_with_other_gamma_has_its_joint_score(mini: Path, tmp_path: Path) -> None:
     (mini / "sites.csv").write_text(FOUR_SITES)
     egvs.place(egvs.load(mini, ["placement.count=2"]), tmp_path / "run")
     session = open_session(mini, (), tmp_path / "run")
@@ -94,7 +94,7 @@ def test_a_plan_is_worth_with_a_setting_what_egvs_place_says(mini: Path, tmp_pat
     assert tried.plan.joint < session.plan.joint
 
 
-def test_what_a_run_would_refuse_is_refused(session: Session, tmp_path: Path) -> None:
+def test_rejects_invalid_settings(session: Session, tmp_path: Path) -> None:
     variants = SessionFactory(session, tmp_path / "scratch")
     with pytest.raises(InputError, match=r"score\.gamma: -1\.0; input should be greater than or equal to 0"):
         variants.session(Settings(-1.0, "egvs", frozenset()))
@@ -103,7 +103,7 @@ def test_what_a_run_would_refuse_is_refused(session: Session, tmp_path: Path) ->
     assert variants.session(Settings(2.0, "egvs", frozenset())).scenario.gamma == 2.0
 
 
-def test_effects_that_the_scene_calls_for_are_offered(mini: Path, tmp_path: Path, session: Session) -> None:
+def test_offers_effects_that_the_scene_calls_for(mini: Path, tmp_path: Path, session: Session) -> None:
     assert set(offered_effects(session)) == {"divergence", "moving_occlusion"}
     assert trial_parameters("moving_occlusion") == {}
     rainy = open_session(mini, ["effects.rain.rate_mm_h=20"], tmp_path / "rainy")

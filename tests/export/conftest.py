@@ -1,4 +1,4 @@
-"""Runs to export: one that says where it lies, and one that does not."""
+"""Runs to export, with and without a reference system."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from egvs.runs import run
 from tests.conftest import collection, feature, write_mini
 
 EPSG, OFFSET_M = 25832, (-550000.0, -5630000.0)
-"""UTM zone 32, and what is added to eastings and northings to reach the scenario's x, y."""
+"""UTM zone 32, and the offset from eastings and northings to x, y of the scenario."""
 
 
-def _made(folder: Path, text: str = "", sites: str | None = None) -> Path:
+def _make_run(folder: Path, text: str = "", sites: str | None = None) -> Path:
     scenario = write_mini(folder / "mini")
     file = scenario / "scenario.toml"
     file.write_text(file.read_text() + text)
@@ -27,20 +27,20 @@ def _made(folder: Path, text: str = "", sites: str | None = None) -> Path:
 
 @pytest.fixture(scope="session")
 def located(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run in UTM zone 32; its sites have columns of the user's own, some called as a format's."""
+    """A run in UTM zone 32; its sites file has user columns, some with names that formats reserve."""
     text = f"\n[crs]\nepsg = {EPSG}\noffset_m = [{OFFSET_M[0]}, {OFFSET_M[1]}]\n"
     sites = (
         "site,x_m,y_m,z_m,fid,Geometry,note\n"
         "pole_a,10,12,3,7,old,=1+1\n"
         "pole & <b>,30.5,-12,3.25,7,new,\"it's, 'quoted'\"\n"
     )  # fmt: skip
-    return _made(tmp_path_factory.mktemp("located"), text, sites)
+    return _make_run(tmp_path_factory.mktemp("located"), text, sites)
 
 
 @pytest.fixture(scope="session")
 def local(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of which nobody knows where it lies."""
-    return _made(tmp_path_factory.mktemp("local"))
+    """A run without a reference system."""
+    return _make_run(tmp_path_factory.mktemp("local"))
 
 
 HOUSE = [[150, 206], [158, 206], [158, 209.5], [150, 209.5], [150, 206]]
@@ -49,7 +49,7 @@ LAMP = (152.0, 252.0)
 
 @pytest.fixture(scope="session")
 def on_roads(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run in which SUMO drove, a minute on the shipped junction seen from two sites, and a plan of both."""
+    """A run with SUMO traffic: a minute on a shipped junction with two sites, and a plan with both."""
     scenario = tmp_path_factory.mktemp("on_roads") / "junction"
     shutil.copytree(Path(__file__).resolve().parents[2] / "scenarios" / "nishishinjuku", scenario)
     file = scenario / "scenario.toml"

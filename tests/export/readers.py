@@ -8,8 +8,8 @@ import struct
 
 def points_of_wkb(blob: bytes) -> list[tuple[float, float]]:
     """The positions of a geometry as Well-Known Binary without heights, in its order."""
-    found, _ = _read(blob, 0)
-    return found
+    points, _ = _read(blob, 0)
+    return points
 
 
 def _read(blob: bytes, at: int) -> tuple[list[tuple[float, float]], int]:
@@ -19,21 +19,21 @@ def _read(blob: bytes, at: int) -> tuple[list[tuple[float, float]], int]:
     if kind == 1:
         return [struct.unpack_from(f"{order}2d", blob, at)], at + 16
     (count,) = struct.unpack_from(f"{order}I", blob, at)
-    at, found = at + 4, []
+    at, points = at + 4, []
     for _ in range(count):
         if kind == 2:
-            found.append(struct.unpack_from(f"{order}2d", blob, at))
+            points.append(struct.unpack_from(f"{order}2d", blob, at))
             at += 16
         elif kind == 3:
             (corners,) = struct.unpack_from(f"{order}I", blob, at)
             at += 4
             for _ in range(corners):
-                found.append(struct.unpack_from(f"{order}2d", blob, at))
+                points.append(struct.unpack_from(f"{order}2d", blob, at))
                 at += 16
         else:
             inner, at = _read(blob, at)
-            found += inner
-    return found, at
+            points += inner
+    return points, at
 
 
 def points_of_gpkg(blob: bytes) -> list[tuple[float, float]]:

@@ -35,7 +35,7 @@ def opened(path: Path) -> tuple[NDArray[np.float64], dict[int, object]]:
         return np.array(image, dtype=np.float64), dict(image.tag_v2)
 
 
-def test_the_tpog_from_above_is_that_of_the_artefact(located: Path, tmp_path: Path) -> None:
+def test_occupancy_raster_equals_the_artefact(located: Path, tmp_path: Path) -> None:
     export_run(located, "geotiff", out=tmp_path)
     values, tags = opened(tmp_path / "tpog.tif")
     tpog = read_tpog(located / "tpog.parquet")
@@ -50,32 +50,32 @@ def test_the_tpog_from_above_is_that_of_the_artefact(located: Path, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_seen_and_missed_add_up_to_the_entropy_and_to_the_score_s_share(located: Path, tmp_path: Path) -> None:
+def test_visible_and_missed_add_up_to_the_entropy(located: Path, tmp_path: Path) -> None:
     name = "pole_a"
     export_run(located, "geotiff", out=tmp_path, sites=[name])
-    (seen, _), (missed, _) = (opened(tmp_path / f"{word}_{name}.tif") for word in ("seen", "missed"))
+    (visible, _), (missed, _) = (opened(tmp_path / f"{word}_{name}.tif") for word in ("seen", "missed"))
     tpog = read_tpog(located / "tpog.parquet")
-    whole = np.array([[sum(binary_entropy(int(c), 40) for c in column) for column in row] for row in tpog.counts])
-    known = np.flipud(whole.T) > 0
-    assert ((seen == -9999) == ~known).all()
-    assert (seen + missed)[known] == pytest.approx(np.flipud(whole.T)[known], rel=1e-5)
+    entropy = np.array([[sum(binary_entropy(int(c), 40) for c in column) for column in row] for row in tpog.counts])
+    known = np.flipud(entropy.T) > 0
+    assert ((visible == -9999) == ~known).all()
+    assert (visible + missed)[known] == pytest.approx(np.flipud(entropy.T)[known], rel=1e-5)
     share = next(
         row["entropy_seen"] for row in read_scores(located / "scores.parquet").to_pylist() if row["site"] == name
     )
-    assert seen[known].sum() / whole.sum() == pytest.approx(share, rel=1e-5)
+    assert visible[known].sum() / entropy.sum() == pytest.approx(share, rel=1e-5)
     assert 0 < share < 1
 
 
-def test_vehicles_missed_are_those_of_the_blind_spots(located: Path, tmp_path: Path) -> None:
+def test_missed_vehicles_equal_the_blind_spots(located: Path, tmp_path: Path) -> None:
     export_run(located, "geotiff", out=tmp_path, sites=["pole_a"])
     values, tags = opened(tmp_path / "vehicles_missed_pole_a.tif")
-    its = next(read_blindspots(located / "blindspots.parquet", {"pole_a"}))
-    expected = np.flipud(np.nan_to_num(its.share_missed, nan=-9999).T)
+    spots = next(read_blindspots(located / "blindspots.parquet", {"pole_a"}))
+    expected = np.flipud(np.nan_to_num(spots.share_missed, nan=-9999).T)
     assert values == pytest.approx(expected, rel=1e-6)
-    assert tags[SCALE][0] == its.cell_m
+    assert tags[SCALE][0] == spots.cell_m
 
 
-def test_the_picture_has_a_colour_table_and_no_data_is_0(located: Path, tmp_path: Path) -> None:
+def test_image_has_a_colour_table_and_no_data_is_0(located: Path, tmp_path: Path) -> None:
     export_run(located, "geotiff", out=tmp_path)
     values, _ = opened(tmp_path / "tpog.tif")
     with Image.open(tmp_path / "tpog_colours.tif") as image:
@@ -85,17 +85,17 @@ def test_the_picture_has_a_colour_table_and_no_data_is_0(located: Path, tmp_path
     assert float(tags[NODATA]) == 0
     assert ((steps == 0) == (values == -9999)).all()
     assert steps.max() == 254
-    told = re.fullmatch(
+    output = re.fullmatch(
         r"Occupied voxels in the column on average \(voxel\): \(step - 1\) \* ([0-9.e-]+), steps of 1 to 254;"
         " 0 where there is no data",
         str(tags[WORDS]),
     )
-    assert values[values != -9999] == pytest.approx((steps[steps > 0] - 1.0) * float(told[1]), abs=values.max() / 500)
+    assert values[values != -9999] == pytest.approx((steps[steps > 0] - 1.0) * float(output[1]), abs=values.max() / 500)
     assert palette[3:6] == [0xFD, 0xE7, 0x25]  # the least is light, the most dark: viridis
     assert palette[254 * 3 :][:3] == [0x44, 0x01, 0x54]
 
 
-def test_its_style_spans_the_values(located: Path, tmp_path: Path) -> None:
+def test_style_spans_the_values(located: Path, tmp_path: Path) -> None:
     export_run(located, "geotiff", out=tmp_path)
     values, _ = opened(tmp_path / "tpog.tif")
     items = list(ET.parse(tmp_path / "tpog.qml").getroot().iter("item"))
@@ -103,7 +103,7 @@ def test_its_style_spans_the_values(located: Path, tmp_path: Path) -> None:
     assert (items[0].get("color"), items[-1].get("color")) == ("#fde725", "#440154")
 
 
-def test_in_degrees_each_cell_has_the_value_of_its_place(located: Path, tmp_path: Path) -> None:
+def test_cells_in_degrees_have_the_value_at_their_position(located: Path, tmp_path: Path) -> None:
     """The middle of each cell, brought into the world frame by the projection's formulas, lies in the column of voxels
     whose value it has."""
     export_run(located, "geotiff", crs="wgs84", out=tmp_path)
@@ -128,23 +128,21 @@ def test_in_degrees_each_cell_has_the_value_of_its_place(located: Path, tmp_path
     assert checked > 300
 
 
-def test_what_was_not_kept_is_cast_from_what_the_scores_were_made_from(
-    mini: Path, tmp_path: Path, run_egvs: Call
-) -> None:
+def test_scans_that_were_not_saved_need_unchanged_inputs(mini: Path, tmp_path: Path, run_egvs: Call) -> None:
     """A site that hangs elsewhere by now would be shown with views that its score does not say."""
     run = tmp_path / "run"
     egvs.run(egvs.load(mini, ["scan.keep=false"]), run)
-    code, told, _ = run_egvs("export", run, "--to", "geotiff", "--out", tmp_path / "a")
+    code, output, _ = run_egvs("export", run, "--to", "geotiff", "--out", tmp_path / "a")
     assert code == 0
     (mini / "sites.csv").write_text((mini / "sites.csv").read_text().replace("pole_a,10,", "pole_a,11,"))
-    told = f"egvs: {run / 'run.json'}: sites.csv is not what scores were made from; egvs run makes them anew\n"
-    assert run_egvs("export", run, "--to", "geotiff", "--out", tmp_path / "b") == (2, "", told)
+    output = f"egvs: {run / 'run.json'}: sites.csv has changed since the sites were scored. Run egvs run again\n"
+    assert run_egvs("export", run, "--to", "geotiff", "--out", tmp_path / "b") == (2, "", output)
     assert not (tmp_path / "b").exists()
-    assert run_egvs("figure", run, "--what", "seen", "--format", "svg", "--out", tmp_path / "b.svg") == (2, "", told)
+    assert run_egvs("figure", run, "--what", "seen", "--format", "svg", "--out", tmp_path / "b.svg") == (2, "", output)
     assert run_egvs("export", run, "--to", "csv", "--out", tmp_path / "b")[0] == 0
 
 
-def test_sites_of_nearly_the_same_name_have_files_of_their_own(mini: Path, tmp_path: Path) -> None:
+def test_sites_with_similar_names_have_separate_files(mini: Path, tmp_path: Path) -> None:
     """Signs that no file can have, capitals, and what pictures are called."""
     names = ["a.b", "A_B", "a_b_colours"]
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\n" + "".join(f"{n},{10 + i},12,3\n" for i, n in enumerate(names)))
@@ -155,7 +153,7 @@ def test_sites_of_nearly_the_same_name_have_files_of_their_own(mini: Path, tmp_p
         assert image.mode == "P"
 
 
-def test_the_same_bytes_twice(located: Path, tmp_path: Path) -> None:
+def test_files_have_the_same_bytes_twice(located: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
         export_run(located, "geotiff", out=tmp_path / name)
     files = sorted(path.name for path in (tmp_path / "a").iterdir())

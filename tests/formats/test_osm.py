@@ -1,6 +1,6 @@
-"""OpenStreetMap files: XML and PBF give the same, whatever they are called, and what is no map is refused.
+"""OpenStreetMap files: XML and PBF give equal results under any name; invalid files are rejected.
 
-The PBF files are written here by osmium's own writer; those of XML by hand."""
+osmium writes the PBF files."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def osm_xml(inside: str) -> str:
 
 
 def pbf_of(source: Path, path: Path, with_bounds: bool = True) -> Path:
-    """The same map as PBF, by osmium alone."""
+    """Convert a map to PBF with osmium alone."""
     objects = osmium.FileProcessor(source)
     header = osmium.io.Header()
     if with_bounds:
@@ -39,31 +39,31 @@ def pbf_of(source: Path, path: Path, with_bounds: bool = True) -> Path:
     return path
 
 
-# --- the same map -----------------------------------------------------------------------------------------------------
+# --- equal results ---
 
 
 @pytest.mark.parametrize("name", ["a.osm.pbf", "a.osm"])
-def test_pbf_gives_the_same_as_xml_whatever_its_name(tmp_path: Path, name: str) -> None:
+def test_pbf_equals_xml_under_any_name(tmp_path: Path, name: str) -> None:
     path = pbf_of(SMALL, tmp_path / name)
     assert osm.is_pbf(path) and not osm.is_pbf(SMALL)
     assert osm.read_osm(path) == osm.read_osm(SMALL)
 
 
 @pytest.mark.parametrize("name", ["a.osm.gz", "a.osm.xml.gz", "a.osm"])
-def test_gzip_gives_the_same_whatever_its_name(tmp_path: Path, name: str) -> None:
+def test_gzip_equals_xml_under_any_name(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     path.write_bytes(gzip.compress(SMALL.read_bytes()))
     assert osm.read_osm(path) == osm.read_osm(SMALL)
 
 
-def test_xml_written_from_pbf_gives_the_same(tmp_path: Path) -> None:
-    pbf, xml = pbf_of(SMALL, tmp_path / "a.osm.pbf"), put(tmp_path, "what is there is written over", "b.osm.xml")
+def test_xml_written_from_pbf_equals_it(tmp_path: Path) -> None:
+    pbf, xml = pbf_of(SMALL, tmp_path / "a.osm.pbf"), put(tmp_path, "overwritten", "b.osm.xml")
     osm.write_xml(pbf, xml)
     assert xml.read_bytes().startswith(b"<?xml")
     assert osm.read_osm(xml) == osm.read_osm(SMALL)
 
 
-def test_without_declared_bounds_those_of_the_nodes_hold(tmp_path: Path) -> None:
+def test_bounds_default_to_those_of_the_nodes(tmp_path: Path) -> None:
     inside = '<node id="2" lat="51.1234567" lon="-9.7654321"/><node id="1" lat="52.5" lon="9"><tag k="a" v="b"/></node>'
     for path in (xml := put(tmp_path, osm_xml(inside)), pbf_of(xml, tmp_path / "a.osm.pbf", with_bounds=False)):
         extract = osm.read_osm(path)
@@ -72,7 +72,7 @@ def test_without_declared_bounds_those_of_the_nodes_hold(tmp_path: Path) -> None
         assert (extract.bounds, extract.declared) == (osm.Bounds(51.1234567, -9.7654321, 52.5, 9.0), False)
 
 
-def test_ways_and_relations_are_sorted_and_whole(tmp_path: Path) -> None:
+def test_ways_and_relations_are_sorted_and_complete(tmp_path: Path) -> None:
     inside = (
         f'{NODE}<way id="9"><nd ref="1"/><nd ref="5"/></way><way id="-3"><nd ref="1"/><tag k="a" v="&lt;ü&gt;"/></way>'
         '<relation id="8"/><relation id="7"><member type="way" ref="9" role="outer"/>'
@@ -86,70 +86,76 @@ def test_ways_and_relations_are_sorted_and_whole(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mark", ['action="delete"', 'visible="false"'])
-def test_what_is_deleted_does_not_count(tmp_path: Path, mark: str) -> None:
-    gone = (
+def test_ignores_deleted_objects(tmp_path: Path, mark: str) -> None:
+    deleted = (
         f'<node id="2" {mark} lat="5" lon="6"><tag k="a" v="b"/></node><node id="3" {mark}/>'
         f'<way id="1" {mark}><nd ref="1"/></way><way id="2"><nd ref="1"/></way>'
         f'<relation id="2" {mark}/><relation id="1"/>'
     )
-    extract = osm.read_osm(put(tmp_path, osm_xml(NODE + gone)))
+    extract = osm.read_osm(put(tmp_path, osm_xml(NODE + deleted)))
     assert (list(extract.nodes), extract.node_tags, list(extract.ways)) == ([1], {}, [2])
     assert [relation.id for relation in extract.relations] == [1]
 
 
-# --- no map -----------------------------------------------------------------------------------------------------------
+# --- invalid files ---
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (osm_xml(NODE).replace("<osm", '<!DOCTYPE osm [<!ENTITY a "b">]><osm'), "declares XML entities"),
+        (
+            osm_xml(NODE).replace("<osm", '<!DOCTYPE osm [<!ENTITY a "b">]><osm'),
+            "declares XML entities",
+        ),
         (osm_xml(NODE).replace("<osm", '<!DOCTYPE osm [<!ENTITY a SYSTEM "file:///etc/passwd">]><osm'), "XML entities"),
         (osm_xml(NODE).replace("</osm>", ""), "is not well-formed XML: no element found"),
-        ("<gpx/>", "its root is <gpx>; a file whose root is <osm>"),
-        (osm_xml(""), "holds no node"),
-        (osm_xml('<node id="1" lat="1" lon="2" action="delete"/>'), "holds no node"),
+        ("<gpx/>", "expected the root <osm>, got <gpx>"),
+        (osm_xml(""), "has no nodes"),
+        (osm_xml('<node id="1" lat="1" lon="2" action="delete"/>'), "has no nodes"),
         (osm_xml(NODE).replace(' version="0.6"', ""), "cannot be read as OpenStreetMap data .*version"),
-        (osm_xml('<node lat="1" lon="2"/>'), "<node> id: None; a whole number"),
-        (osm_xml('<node id="1.5" lat="1" lon="2"/>'), "<node> id: '1.5'; a whole number"),
-        (osm_xml('<node id="1" lat="90.1" lon="2"/>'), "node 1: lat: '90.1'; degrees from -90 to 90"),
-        (osm_xml('<node id="1" lat="1" lon="-180.1"/>'), "node 1: lon: '-180.1'; degrees from -180 to 180"),
-        (osm_xml('<node id="1" lat="1"/>'), "node 1: lon: None"),
-        (osm_xml('<node id="1" lat="1" lon="2 E"/>'), "node 1: lon: '2 E'"),
-        (osm_xml('<bounds minlat="0" minlon="0" maxlat="91" maxlon="9"/>' + NODE), "bounds: maxlat: '91'"),
-        (osm_xml(NODE + '<way id="4"><nd/></way>'), "way 4: ref: None; a whole number"),
-        (osm_xml(NODE + '<relation id="4"><member type="way" ref="x"/></relation>'), "relation 4: ref: 'x'"),
+        (osm_xml('<node lat="1" lon="2"/>'), "<node> id: expected a whole number, got None"),
+        (osm_xml('<node id="1.5" lat="1" lon="2"/>'), "<node> id: expected a whole number, got '1.5'"),
+        (osm_xml('<node id="1" lat="90.1" lon="2"/>'), "node 1: lat: expected degrees from -90 to 90, got '90.1'"),
+        (
+            osm_xml('<node id="1" lat="1" lon="-180.1"/>'),
+            "node 1: lon: expected degrees from -180 to 180, got '-180.1'",
+        ),
+        (osm_xml('<node id="1" lat="1"/>'), "node 1: lon: .* got None"),
+        (osm_xml('<node id="1" lat="1" lon="2 E"/>'), "node 1: lon: .* got '2 E'"),
+        (osm_xml('<bounds minlat="0" minlon="0" maxlat="91" maxlon="9"/>' + NODE), "bounds: maxlat: .* got '91'"),
+        (osm_xml(NODE + '<way id="4"><nd/></way>'), "way 4: ref: expected a whole number, got None"),
+        (osm_xml(NODE + '<relation id="4"><member type="way" ref="x"/></relation>'), "relation 4: ref: .* got 'x'"),
         (
             osm_xml(NODE + '<relation id="4"><member type="cat" ref="1" role=""/></relation>'),
             "cannot be read as OpenStr",
         ),
     ],
 )
-def test_bad_xml_is_refused(tmp_path: Path, content: str, message: str) -> None:
+def test_rejects_invalid_xml(tmp_path: Path, content: str, message: str) -> None:
     path = put(tmp_path, content)
     with pytest.raises(InputError, match=message) as caught:
         osm.read_osm(path)
     assert str(caught.value).startswith(str(path)) and "\n" not in str(caught.value)
 
 
-def test_a_pbf_file_cut_anywhere_or_damaged_is_refused(tmp_path: Path) -> None:
+def test_rejects_truncated_or_damaged_pbf(tmp_path: Path) -> None:
     path = pbf_of(SMALL, tmp_path / "a.osm.pbf")
-    whole = path.read_bytes()
-    damaged = bytearray(whole)
-    damaged[len(whole) // 2] ^= 255
-    for content in [*(whole[:end] for end in (20, 100, len(whole) // 2, len(whole) - 1)), bytes(damaged)]:
-        path.write_bytes(content)
-        with pytest.raises(InputError, match=r"a\.osm\.pbf: cannot be read as OpenStreetMap data \(.*\); a whole file"):
+    content = path.read_bytes()
+    damaged = bytearray(content)
+    damaged[len(content) // 2] ^= 255
+    for part in [*(content[:end] for end in (20, 100, len(content) // 2, len(content) - 1)), bytes(damaged)]:
+        path.write_bytes(part)
+        with pytest.raises(InputError, match=r"a\.osm\.pbf: cannot be read as OpenStreetMap data \(.*\)\. Download"):
             osm.read_osm(path)
 
 
-def test_a_pbf_file_with_a_node_beyond_the_pole_is_refused(tmp_path: Path) -> None:
+def test_rejects_pbf_with_node_beyond_the_pole(tmp_path: Path) -> None:
     path = pbf_of(put(tmp_path, osm_xml('<node id="6" lat="91" lon="2"/>')), tmp_path / "a.osm.pbf", with_bounds=False)
-    with pytest.raises(InputError, match=r"a\.osm\.pbf: node 6: has no position on the globe"):
+    with pytest.raises(InputError, match=r"a\.osm\.pbf: node 6: has no valid position"):
         osm.read_osm(path)
 
 
-# --- values -----------------------------------------------------------------------------------------------------------
+# --- values ---
 
 
 @pytest.mark.parametrize(
@@ -174,26 +180,26 @@ def test_a_pbf_file_with_a_node_beyond_the_pole_is_refused(tmp_path: Path) -> No
         ("", None),
     ],
 )
-def test_lengths(text: str, metres: float | None) -> None:
+def test_parse_length(text: str, metres: float | None) -> None:
     assert osm.parse_length_m(text) == (None if metres is None else pytest.approx(metres))
 
 
 @pytest.mark.parametrize(("declared", "codec"), [("Shift_JIS", "cp932"), ("EUC-JP", "euc_jp"), ("UTF-16", "utf-16")])
 @pytest.mark.parametrize("packed", [False, True])
-def test_a_map_in_another_encoding_is_read(tmp_path: Path, declared: str, codec: str, packed: bool) -> None:
+def test_reads_other_encodings(tmp_path: Path, declared: str, codec: str, packed: bool) -> None:
     tag = '<way id="3"><nd ref="1"/><nd ref="1"/><tag k="name" v="青梅街道"/></way>'
     data = osm_xml(NODE + tag).replace("UTF-8", declared).encode(codec)
     (tmp_path / "a.osm").write_bytes(gzip.compress(data, mtime=0) if packed else data)
     assert osm.read_osm(tmp_path / "a.osm").ways[3].tags == {"name": "青梅街道"}
 
 
-def test_a_map_of_too_many_objects_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rejects_more_objects_than_the_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EGVS_MAX_MAP_OBJECTS", "10")
     pbf = pbf_of(SMALL, tmp_path / "a.osm.pbf")
     for path in (SMALL, pbf):
-        told = (
+        message = (
             rf"{path.name}: has more than 10 objects\. Use a part of the map\. The limit is 10 objects; set "
             rf"EGVS_MAX_MAP_OBJECTS"
         )
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=message):
             osm.read_osm(path)

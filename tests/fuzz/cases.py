@@ -47,7 +47,7 @@ _ROW = re.compile(r"\bsite '?[^\s:']+'?(?: and \d+ more)?:")
 """A message may name a row, a site, in place of the file that it stands in."""
 
 _SCORES = ("egvs", "egvs_limit", "rank", "entropy_seen")
-_NO_VEHICLE = ("no vehicle in the region", "so none is best")
+_NO_VEHICLE = ("no vehicle in the region", "so there is no ranking")
 _OF_VEHICLES = ("expected_detections", "points_on_target", "seen_well")
 WELL = ("refused", "same", "legal", "unkept")
 

@@ -21,13 +21,13 @@ SLICE = "fcd.csv.gz,statics.geojson,sites.csv,scan.pcd binary,beams.csv,tpog.par
 FUZZ = "import sys; from tests.fuzz.__main__ import main; sys.exit(main())"
 
 
-def test_there_are_kinds_enough_and_each_has_its_own_file() -> None:
+def test_kinds_are_distinct_and_complete() -> None:
     assert len(KINDS) >= 29
     assert len({(kind.make, kind.file, kind.verb) for kind in KINDS.values()}) == len(KINDS)
 
 
 @pytest.mark.system
-def test_mutants_of_some_kinds_fare_well(tmp_path: Path) -> None:
+def test_mutants_of_some_kinds_give_no_fault(tmp_path: Path) -> None:
     """And a second call has nothing left to do."""
     options = ("--cases", 18, "--seed", 11, "--kinds", SLICE, "--keep", tmp_path)
     done = python(FUZZ, *options)
@@ -51,7 +51,7 @@ FAULTS = {
 
 @pytest.mark.slow
 @pytest.mark.system
-def test_faults_are_told(tmp_path: Path) -> None:
+def test_faults_get_their_verdicts(tmp_path: Path) -> None:
     """A program that does what it should not gets the verdict that it deserves."""
     code = f"""
 import os, pathlib, sys
@@ -75,14 +75,14 @@ for fault, line in {FAULTS!r}.items():
 
 @pytest.mark.slow
 @pytest.mark.system
-def test_killed_runs_come_to_the_same_bytes() -> None:
+def test_killed_runs_reproduce_same_bytes() -> None:
     """One that is killed with all its processes, and one that is killed alone."""
     done = python(FUZZ, "--kills", 2)
     assert (done.returncode, done.stdout) == (0, "2 kills: 2 same bytes\n"), done.stderr
 
 
 @pytest.mark.slow
-def test_a_seed_gives_the_same_mutants() -> None:
+def test_same_seed_gives_same_mutants() -> None:
     """And never the file as it was."""
     for data in (b"", b"a,b\n1,2\n", gzip.compress(b"<a b='1'/>", mtime=0), bytes(range(256))):
         one, again = ([mutant(random.Random(f"x{case}"), data) for case in range(40)] for _ in range(2))
@@ -100,7 +100,9 @@ def test_a_seed_gives_the_same_mutants() -> None:
         (meaning.obj, b"v 0 0 0\nf 1 1 1", b"# one\nv 0 0.0 0\nf 1//1 1 1", b"v 0 0 1\nf 1 1 1", b"v 0 0 0\nf 1 2 3"),
     ],
 )
-def test_meaning(reader: meaning.Meaning, one: bytes, same: bytes, other: bytes, damaged: bytes) -> None:
+def test_meaning_ignores_form_and_detects_damage(
+    reader: meaning.Meaning, one: bytes, same: bytes, other: bytes, damaged: bytes
+) -> None:
     assert reader(one) == reader(same)
     assert reader(one) != reader(other)
     with pytest.raises(meaning.DAMAGED):

@@ -1,8 +1,4 @@
-"""``egvs new`` makes a sound scenario of an OpenStreetMap extract.
-
-``data/small.osm`` is invented: a signalised cross in the middle, and one object for each thing that must be counted;
-comments in the file say what stands where. The counts below were made by hand from those comments. The projection is
-checked against sumolib, and distances against sumolib's lanes, neither of which the program uses."""
+"""Scenarios from OpenStreetMap extracts, small and real, and rejected extracts."""
 
 from __future__ import annotations
 
@@ -14,22 +10,30 @@ import math
 import re
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import pytest
 import shapely
 from shapely.geometry import LineString, Point, shape
 
+from egvs.cli import app
+from egvs.core.errors import InputError
 from egvs.formats import osm
 from egvs.importers import openstreetmap
 from egvs.scenario import loading
 from egvs.sensors import sites
 from tests.formats.test_osm import pbf_of
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 
 SMALL = Path(__file__).parent / "data" / "small.osm"
+
+
 REAL = Path(__file__).parents[3] / "shared" / "real" / "bad_hersfeld.osm"
+
+
 Made = tuple[Path, openstreetmap.NewScenario]
+
+
 NAMES = ["network.net.xml", "scenario.toml", "sites.csv", "statics.geojson"]
 
 
@@ -82,8 +86,6 @@ def edited(tmp_path: Path, *changes: tuple[str, str]) -> Path:
 
 
 # --- what is in the scenario ---------------------------------------------------------------------------------------
-
-
 def test_heights_by_source(made: Made) -> None:
     heights = made[1].statics.heights
     assert heights["building"] == {"height": 5, "levels": 3, "default": 3}
@@ -111,8 +113,8 @@ def test_counts_changed_and_dropped_objects(made: Made) -> None:
 
 
 def test_every_object_is_used_or_counted(footprints: dict[str, Any], made: Made) -> None:
-    whole = Counter(f["properties"]["kind"] for name, f in footprints.items() if not name.endswith("#2"))
-    assert whole == made[1].statics.objects
+    complete = Counter(f["properties"]["kind"] for name, f in footprints.items() if not name.endswith("#2"))
+    assert complete == made[1].statics.objects
 
 
 @pytest.mark.parametrize(
@@ -199,10 +201,10 @@ def check_sites(folder: Path, poles: int) -> None:
     solids = [area_of(f) for f in features]
     low, size = (loading.load(folder).roi.box.origin_m, loading.load(folder).roi.box.size_m)
     box = shapely.box(low[0], low[1], low[0] + size[0], low[1] + size[1])
-    for place in map(Point, set(places)):
-        assert min(line.distance(place) - half_width_m for line, half_width_m in lanes) >= 0.5
-        assert min(solid.distance(place) for solid in solids) >= 1.0
-        assert box.distance(place) <= 5.0 * 2**0.5
+    for where in map(Point, set(places)):
+        assert min(line.distance(where) - half_width_m for line, half_width_m in lanes) >= 0.5
+        assert min(solid.distance(where) for solid in solids) >= 1.0
+        assert box.distance(where) <= 5.0 * 2**0.5
     assert min(Point(a).distance(Point(b)) for a in places for b in places if a != b) >= 5.0
 
 
@@ -212,11 +214,11 @@ def test_sites_are_beside_kerb(made: Made) -> None:
 
 def test_each_pole_has_three_heights_and_tilts_aimed_at_region(made: Made) -> None:
     scenario = loading.load(made[0])
-    found = sites.candidate_sites(scenario)
-    assert len(found) == made[1].sites == 9 * made[1].poles == 9 * 12
-    assert [site.name for site in found[:4]] == ["k01@3m+0deg", "k01@3m-10deg", "k01@3m+aim", "k01@4.5m+0deg"]
+    result = sites.candidate_sites(scenario)
+    assert len(result) == made[1].sites == 9 * made[1].poles == 9 * 12
+    assert [site.name for site in result[:4]] == ["k01@3m+0deg", "k01@3m-10deg", "k01@3m+aim", "k01@4.5m+0deg"]
     x_m, y_m, z_m = scenario.roi.center_m
-    for site in found:
+    for site in result:
         east_m, north_m = x_m - site.pose.x_m, y_m - site.pose.y_m
         off_deg = math.degrees(math.atan2(north_m, east_m)) - site.pose.yaw_deg
         assert (off_deg + 180) % 360 - 180 == pytest.approx(0, abs=1e-5)
@@ -256,8 +258,6 @@ def test_special_characters_in_street_name_and_comments(tmp_path: Path) -> None:
 
 
 # --- the same input, the same bytes --------------------------------------------------------------------------------
-
-
 @pytest.mark.slow
 def test_same_bytes_from_other_folder_pbf_and_other_order(made: Made, tmp_path: Path) -> None:
     text = SMALL.read_text(encoding="utf-8")
@@ -276,8 +276,6 @@ def test_same_bytes_from_other_folder_pbf_and_other_order(made: Made, tmp_path: 
 
 
 # --- variants ------------------------------------------------------------------------------------------------------
-
-
 def test_left_hand_traffic(tmp_path: Path) -> None:
     openstreetmap.create_scenario(tmp_path / "left", SMALL, lefthand=True)
     assert 'lefthand="true"' in (tmp_path / "left" / "network.net.xml").read_text(encoding="utf-8")
@@ -321,8 +319,6 @@ def test_counts_open_ring(tmp_path: Path) -> None:
 
 
 # --- a real town ---------------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def town(tmp_path_factory: pytest.TempPathFactory) -> Made:
     """The scenario of a real extract."""
@@ -385,3 +381,114 @@ def test_traffic_of_real_junction_flows(town: Made, tmp_path: Path) -> None:
     summary = run_stage(traffic, loading.load(tmp_path / "town", ["traffic.frames=400"]), tmp_path)
     assert all(count["geh"] < 5 for count in summary["counts"]) and summary["longest_standing_s"] < 120
     assert not {"counts", "standing", "waiting"} & {warning["rule"] for warning in summary["warnings"]}
+
+
+COVER = (
+    '<node id="1" ',
+    '<node id="901" lat="51.99" lon="9.99"/><node id="902" lat="51.99" lon="10.01"/>'
+    '<node id="903" lat="52.01" lon="10.01"/><node id="904" lat="52.01" lon="9.99"/><node id="1" ',
+)
+
+
+BLOCK = (
+    "<relation",
+    '<way id="9"><nd ref="901"/><nd ref="902"/><nd ref="903"/><nd ref="904"/><nd ref="901"/>'
+    '<tag k="building" v="yes"/></way><relation',
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ([("</osm>", "")], "is not well-formed XML"),
+        ([("^.*", "")], "is not well-formed XML"),
+        ([("^.*", '{"elements": []}')], "is not well-formed XML"),
+        ([("^.*", '<gpx version="1.1"></gpx>')], "expected the root <osm>, got <gpx>"),
+        ([("^.*", '<osm version="0.6"></osm>')], "has no nodes"),
+        ([("<osm ", '<!DOCTYPE osm [<!ENTITY a "b">]><osm ')], "entities"),
+        ([('"52.0000000"', '"52 N"')], "node 1: lat: '52 N'; degrees from -90 to 90"),
+        ([('"52.0000000"', '"nan"')], "node 1: lat: 'nan'"),
+        ([('lon="10.0000000"', "")], "node 1: lon: None; degrees from -180 to 180"),
+        ([('maxlat="', 'maxlat="9')], "bounds: maxlat"),
+        ([('<way id="1001">', "<way>")], "<way> id: None; a whole number"),
+        ([('<nd ref="1"/>', '<nd ref="one"/>')], "way 1001: ref: 'one'; a whole number"),
+        ([('"(secondary|tertiary)"', '"footway"')], "has no drivable streets that meet"),
+        ([('"highway"', '"was:highway"')], "has no drivable streets that meet"),
+        ([(' <way id="1002">.*?</way>', "")], "has no drivable streets that meet"),
+        ([COVER, BLOCK], "no place for a pole is free along the kerbs of the signalised junction of East Street"),
+    ],
+)
+def test_rejects_bad_extract(tmp_path: Path, changes: list[tuple[str, str]], message: str) -> None:
+    if changes[0][0] == "^.*":
+        bad = tmp_path / "edited.osm"
+        bad.write_text(changes[0][1], encoding="utf-8")
+    else:
+        bad = edited(tmp_path, *changes)
+    with pytest.raises(InputError) as caught:
+        openstreetmap.create_scenario(tmp_path / "out", bad)
+    assert message in str(caught.value) and str(bad) in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == [bad], "something was written"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (gzip.compress(b"<osm></osm>", mtime=0)[:-6], "damaged gzip"),
+        (b"\x00\x00\x00\x0d\x0a\x09OSMHeader\x18\x7d", r"cannot be read as OpenStreetMap data \(PBF error"),
+        (b"\x89PNG\r\n\x1a\n" + bytes(64), "is not well-formed XML"),
+    ],
+)
+def test_rejects_bad_file(tmp_path: Path, content: bytes, message: str) -> None:
+    bad = tmp_path / "bad.osm"
+    bad.write_bytes(content)
+    with pytest.raises(InputError, match=re.escape(str(bad)) + ".*" + message):
+        openstreetmap.create_scenario(tmp_path / "out", bad)
+    assert list(tmp_path.iterdir()) == [bad]
+
+
+def test_rejects_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"nowhere\.osm: no such file"):
+        openstreetmap.create_scenario(tmp_path / "out", tmp_path / "nowhere.osm")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("at", [(0.0, 0.0), (10.0, 52.0), (float("nan"), 10.0)])
+def test_rejects_position_outside_extract(tmp_path: Path, at: tuple[float, float]) -> None:
+    with pytest.raises(InputError, match=r"--at: .* is outside the extract.*latitude 51\.998"):
+        openstreetmap.create_scenario(tmp_path / "out", SMALL, at=at)
+    assert not list(tmp_path.iterdir())
+
+
+def test_rejects_folder_with_content(tmp_path: Path) -> None:
+    (tmp_path / "mine.txt").write_text("keep me", encoding="utf-8")
+    with pytest.raises(InputError, match="not empty"):
+        openstreetmap.create_scenario(tmp_path, SMALL)
+    with pytest.raises(InputError, match=r"mine\.txt: .*existing file"):
+        openstreetmap.create_scenario(tmp_path / "mine.txt", SMALL)
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.slow
+def test_smaller_surroundings_keep_sites_and_flows(tmp_path: Path) -> None:
+    made = {r: openstreetmap.create_scenario(tmp_path / str(r), SMALL, surroundings_m=r) for r in (120.0, 150.0, None)}
+    lengths = [summary.streets.lane_length_m for summary in made.values()]
+    assert lengths == sorted(lengths) and lengths[0] < 0.8 * lengths[-1]
+    for name in ("sites.csv", "statics.geojson"):
+        assert len({(tmp_path / str(r) / name).read_bytes() for r in made}) == 1
+    flows = [sorted(flow.per_hour for flow in summary.flows) for summary in made.values()]
+    assert flows[0] == flows[1] == flows[2] and len(flows[0]) == 12 and sum(flows[0]) > 500
+    assert len({summary.roi for summary in made.values()}) == 1
+    assert loading.load(tmp_path / "None").traffic.counts == made[None].flows
+
+
+def test_help_names_default_surroundings() -> None:
+    (option,) = get_type_hints(app.new, include_extras=True)["surroundings"].__metadata__
+    assert f"; {openstreetmap.SURROUNDINGS_M:g} by default" in option.help
+
+
+def test_rejects_surroundings_smaller_than_junction(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"--surroundings: expected at least 100 m, got 60 m"):
+        openstreetmap.create_scenario(tmp_path / "small", SMALL, surroundings_m=60.0)
+    assert not (tmp_path / "small").exists()

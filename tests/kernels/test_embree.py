@@ -1,4 +1,4 @@
-"""Does Embree, asked for packets of beams that are sorted, say what it says of each ray alone?"""
+"""Embree queried with sorted packets of beams gives the same hits as with single rays."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from egvs.kernels.embree import TriangleTree, coherent_order
 from egvs.sensors.sensor import CATALOGUE
 
 
-def scattered(count: int, seed: int = 4) -> np.ndarray:
+def random_triangles(count: int, seed: int = 4) -> np.ndarray:
     """Triangles of a metre or two round the origin, none of which comes near another's edge by intent."""
     rng = np.random.default_rng(seed)
     return rng.uniform(-20, 20, (count, 1, 3)) + rng.uniform(-1, 1, (count, 3, 3))
 
 
-def fired(azimuths: int, channels: int = 32) -> np.ndarray:
+def sensor_directions(azimuths: int, channels: int = 32) -> np.ndarray:
     """Unit vectors of a sensor in its firing order: all channels, shuffled, then the next azimuth."""
     elevation = np.random.default_rng(1).permutation(np.radians(np.linspace(-40, 40, channels)))
     azimuth, elevation = (grid.ravel() for grid in np.meshgrid(
@@ -35,27 +35,27 @@ def fired(azimuths: int, channels: int = 32) -> np.ndarray:
     return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
 
 
-def alone(triangles: np.ndarray, o: np.ndarray, d: np.ndarray) -> np.ndarray:
+def hits_one_by_one(triangles: np.ndarray, o: np.ndarray, d: np.ndarray) -> np.ndarray:
     """What embreex says, one ray after the other."""
     scene = EmbreeScene()
     TriangleMesh(scene, triangles.astype(np.float32))
     return scene.run(np.tile(o, (len(d), 1)).astype(np.float32), d.astype(np.float32))
 
 
-def asked(triangles: np.ndarray, o: np.ndarray, d: np.ndarray, beam: np.ndarray | None = None) -> np.ndarray:
+def hits_in_packets(triangles: np.ndarray, o: np.ndarray, d: np.ndarray, beam: np.ndarray | None = None) -> np.ndarray:
     beam = np.arange(len(d), dtype=np.uint32) if beam is None else beam
     return TriangleTree(triangles).nearest(o, beam, d)
 
 
-def test_beams_of_a_sensor_meet_what_each_meets_alone() -> None:
-    triangles, o, d = scattered(3000), np.array([0.5, -0.25, 1.0]), fired(900)
-    found, true = asked(triangles, o, d), alone(triangles, o, d)
+def test_beams_of_sensor_hit_the_same_as_one_by_one() -> None:
+    triangles, o, d = random_triangles(3000), np.array([0.5, -0.25, 1.0]), sensor_directions(900)
+    found, true = hits_in_packets(triangles, o, d), hits_one_by_one(triangles, o, d)
     assert 0.1 < (true >= 0).mean() < 0.99
     np.testing.assert_array_equal(found, true)
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 511, 512, 513, 1029])
-def test_any_number_of_beams_is_asked(count: int) -> None:
+def test_any_number_of_beams(count: int) -> None:
     """A square on each side of the origin: which of the 12 triangles is met can be told by hand."""
     corners = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]) * 5.0
     squares = [(0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5)]  # -x +x -y +y -z +z
@@ -65,20 +65,20 @@ def test_any_number_of_beams_is_asked(count: int) -> None:
     beam = np.arange(1, 2 * count, 2, dtype=np.uint32)  # every second one is cast
     axis = np.abs(d[beam]).argmax(axis=1)
     side = 2 * axis + (d[beam, axis] > 0)
-    np.testing.assert_array_equal(asked(box, np.zeros(3), d, beam) // 2, side)
+    np.testing.assert_array_equal(hits_in_packets(box, np.zeros(3), d, beam) // 2, side)
 
 
-def test_what_meets_nothing_is_minus_one() -> None:
-    d = fired(64)
+def test_beams_without_hit_are_minus_one() -> None:
+    d = sensor_directions(64)
     one = np.array([[[9.0, -1.0, -1.0], [9.0, 1.0, -1.0], [9.0, 0.0, 1.0]]])
-    found = asked(one, np.zeros(3), d)
+    found = hits_in_packets(one, np.zeros(3), d)
     assert set(found) == {0, -1}
     assert (d[found == 0, 0] > 0.9).all()
-    assert (asked(one, np.array([20.0, 0.0, 0.0]), np.abs(d)) == -1).all()  # it is behind all of them
+    assert (hits_in_packets(one, np.array([20.0, 0.0, 0.0]), np.abs(d)) == -1).all()  # it is behind all of them
 
 
-def test_whatever_stands_beside_a_beam_it_meets_the_same() -> None:
-    triangles, o, d = scattered(500), np.zeros(3), fired(120)
+def test_hit_does_not_depend_on_other_beams_of_the_packet() -> None:
+    triangles, o, d = random_triangles(500), np.zeros(3), sensor_directions(120)
     tree, beam = TriangleTree(triangles), np.arange(len(d), dtype=np.uint32)
     found = tree.nearest(o, beam, d)
     for other in (beam[::-1].copy(), np.random.default_rng(2).permutation(beam), beam[::7].copy()):
@@ -86,9 +86,9 @@ def test_whatever_stands_beside_a_beam_it_meets_the_same() -> None:
 
 
 @pytest.mark.parametrize("tilt", [[0, 1, 2], [2, 0, 1], [1, 2, 0]])
-def test_beams_of_a_channel_stand_side_by_side(tilt: list[int]) -> None:
+def test_beams_of_a_channel_share_packets(tilt: list[int]) -> None:
     """32 channels that fire in a shuffled order, upright or lying on a side, 16 azimuths in a block."""
-    d, beam = fired(900)[:, tilt], np.arange(900 * 32, dtype=np.uint32)
+    d, beam = sensor_directions(900)[:, tilt], np.arange(900 * 32, dtype=np.uint32)
     order = coherent_order(beam, d)
     np.testing.assert_array_equal(np.sort(order), beam)
     for block in np.split(order[: 512 * 56], 56):
@@ -106,22 +106,22 @@ def ball() -> np.ndarray:
 
 @pytest.mark.parametrize("tiny", [-9e-19, -8.67e-19, -1e-19, -1e-30, -1e-44, -5e-324, -0.0, 0.0, 1e-19, -1.1e-18])
 @pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_component_of_almost_nothing_hides_no_hit(tiny: float, axis: int) -> None:
+def test_tiny_component_of_direction_hides_no_hit(tiny: float, axis: int) -> None:
     """What rounding leaves of a turned sensor's 0: Embree takes it for positive here, for negative there."""
     d = np.random.default_rng(axis).normal(size=(64, 3))
     d /= np.linalg.norm(d, axis=1)[:, None]
     d[::8, axis] = tiny
-    assert (asked(ball(), np.zeros(3), d) >= 0).all()
+    assert (hits_in_packets(ball(), np.zeros(3), d) >= 0).all()
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e30])
-def test_a_direction_that_is_no_number_spoils_no_other(bad: float) -> None:
-    d = fired(90)
+def test_nan_direction_does_not_affect_other_beams(bad: float) -> None:
+    d = sensor_directions(90)
     rows = np.random.default_rng(6).choice(len(d), 300, replace=False)
     d[rows] = bad
     order = coherent_order(np.arange(len(d), dtype=np.uint32), d)
     np.testing.assert_array_equal(np.sort(order), np.arange(len(d)))
-    assert (np.delete(asked(ball(), np.zeros(3), d), rows) >= 0).all()
+    assert (np.delete(hits_in_packets(ball(), np.zeros(3), d), rows) >= 0).all()
 
 
 @pytest.mark.slow
@@ -129,13 +129,13 @@ def test_a_direction_that_is_no_number_spoils_no_other(bad: float) -> None:
     ("sensor", "angles_deg"),
     [("RS-Ruby Plus", (15.0, -1.0, -90.0)), ("Pandar XT-32", (195.0, 89.0, 180.0)), ("VLP-32C", (90.0, 90.0, 0.0))],
 )
-def test_no_beam_of_a_turned_sensor_leaves_a_closed_room(sensor: str, angles_deg: tuple[float, float, float]) -> None:
+def test_no_beam_of_rotated_sensor_leaves_closed_room(sensor: str, angles_deg: tuple[float, float, float]) -> None:
     d = CATALOGUE[sensor].directions(*angles_deg)
-    assert (asked(ball(), np.array([0.5, -0.25, 1.0]), d) >= 0).all()
+    assert (hits_in_packets(ball(), np.array([0.5, -0.25, 1.0]), d) >= 0).all()
 
 
 def test_threads_share_a_tree() -> None:
-    triangles, o, d = scattered(2000), np.zeros(3), fired(600)
+    triangles, o, d = random_triangles(2000), np.zeros(3), sensor_directions(600)
     tree, beam = TriangleTree(triangles), np.arange(len(d), dtype=np.uint32)
     true, found = tree.nearest(o, beam, d), [np.empty(0)] * 4
     threads = [threading.Thread(target=lambda n=n: found.__setitem__(n, tree.nearest(o, beam, d))) for n in range(4)]
@@ -147,8 +147,8 @@ def test_threads_share_a_tree() -> None:
 
 
 @pytest.mark.slow
-def test_a_tree_that_is_let_go_leaves_no_memory() -> None:
-    triangles = scattered(50_000)
+def test_released_tree_frees_its_memory() -> None:
+    triangles = random_triangles(50_000)
     peak = []
     for _ in range(20):
         TriangleTree(triangles)
@@ -177,21 +177,21 @@ for more in (90, 150, 250):
 
 @pytest.mark.system
 @pytest.mark.slow
-def test_too_little_memory_is_told_and_the_next_tree_is_whole() -> None:
+def test_error_without_memory_and_complete_tree_afterwards() -> None:
     done = run_python(WITHOUT)
     assert done.returncode == 0, done.stderr
     assert "72,000,000 bytes" in done.stdout
 
 
-def test_too_little_memory_is_no_smaller_world(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tree_without_memory_is_never_partial(monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(embree._library, "rtcSetNewGeometryBuffer", lambda *_: None)
         with pytest.raises(MemoryError, match="no room for 360 bytes"):
-            TriangleTree(scattered(10))
+            TriangleTree(random_triangles(10))
     with monkeypatch.context() as patch:
         patch.setattr(embree._library, "rtcGetDeviceError", lambda _: 4)
         with pytest.raises(MemoryError, match="no tree of 10 triangles: its error 4"):
-            TriangleTree(scattered(10))
+            TriangleTree(random_triangles(10))
 
 
 ENDS = """
@@ -214,7 +214,7 @@ time.sleep(0.5)
 
 @pytest.mark.system
 @pytest.mark.slow
-def test_a_program_may_end_while_a_thread_casts() -> None:
+def test_program_can_end_while_a_thread_casts() -> None:
     assert run_python(ENDS).returncode == 0
 
 
@@ -228,7 +228,7 @@ print(TriangleTree(ahead).nearest(np.zeros(3), np.arange(2, dtype=np.uint32), d)
 
 
 @pytest.mark.system
-def test_without_a_compiler_beams_meet_the_same() -> None:
+def test_same_hits_without_compiler() -> None:
     done = run_python(INTERPRETED, NUMBA_DISABLE_JIT="1")
     assert (done.stdout, done.returncode) == ("[0, -1]\n", 0), done.stderr
 
@@ -239,7 +239,7 @@ def run_python(code: str, **environment: str) -> subprocess.CompletedProcess[str
     return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=around, check=False)
 
 
-def test_another_embree_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rejects_other_version_of_embree(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(embree._library, "rtcGetDeviceProperty", lambda *_: 5)
     with pytest.raises(RuntimeError, match="brings Embree 5"):
         embree._device.__wrapped__()

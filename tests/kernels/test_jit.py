@@ -1,4 +1,4 @@
-"""Compiled kernels are kept from one process to the next, and made again when one that they call has changed."""
+"""Compiled kernels are cached between processes, and compiled again when a kernel that they call has changed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ OUTER = (
 )
 CALL = """
 from egvs.kernels.outer import outer
-print(outer(1), "compiled" if outer.stats.cache_misses else "kept")
+print(outer(1), "compiled" if outer.stats.cache_misses else "cached")
 """
 
 
@@ -48,78 +48,78 @@ def call(package: Path, code: str = CALL, **environment: str) -> str:
     return done.stdout.strip()
 
 
-def kept(folder: Path) -> int:
+def cache_file_count(folder: Path) -> int:
     return len(list(folder.glob("numba-*")))
 
 
 @pytest.mark.slow
-def test_a_called_kernel_that_changed_is_noticed(package: Path) -> None:
+def test_change_of_called_kernel_recompiles(package: Path) -> None:
     assert call(package) == "2 compiled"
-    assert call(package) == "2 kept"
+    assert call(package) == "2 cached"
     (package / "egvs" / "kernels" / "inner.py").write_text(INNER.format(2))
     assert call(package) == "3 compiled"
-    assert call(package) == "3 kept"
+    assert call(package) == "3 cached"
     folder = package / "egvs" / "kernels" / "__pycache__"
-    assert kept(folder) == 2
+    assert cache_file_count(folder) == 2
     for number in range(3):
         (folder / f"numba-{number:012}").mkdir()
         os.utime(folder / f"numba-{number:012}", (number, number))
     (package / "egvs" / "kernels" / "inner.py").write_text(INNER.format(3))
     assert call(package) == "4 compiled"
-    assert kept(folder) == 3  # the present one, and two that a program may still use
+    assert cache_file_count(folder) == 3  # the present one, and two that a program may still use
     assert not list(folder.glob("numba-000*")), "those that were used longest ago went"
 
 
 @pytest.mark.slow
-def test_a_folder_of_the_users_is_used(package: Path, tmp_path: Path) -> None:
+def test_uses_folder_set_by_user(package: Path, tmp_path: Path) -> None:
     assert call(package, NUMBA_CACHE_DIR=str(tmp_path / "mine")) == "2 compiled"
-    assert call(package, NUMBA_CACHE_DIR=str(tmp_path / "mine")) == "2 kept"
-    assert kept(tmp_path / "mine") == 1
-    assert kept(package / "egvs" / "kernels" / "__pycache__") == 0
+    assert call(package, NUMBA_CACHE_DIR=str(tmp_path / "mine")) == "2 cached"
+    assert cache_file_count(tmp_path / "mine") == 1
+    assert cache_file_count(package / "egvs" / "kernels" / "__pycache__") == 0
 
 
 @pytest.mark.slow
-def test_where_the_package_cannot_be_written_the_users_cache_is_used(package: Path, tmp_path: Path) -> None:
+def test_uses_user_cache_where_package_is_read_only(package: Path, tmp_path: Path) -> None:
     (package / "egvs" / "kernels" / "__pycache__").write_text("a file where the folder would be")
     home = {"XDG_CACHE_HOME": str(tmp_path / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
     assert call(package, **home) == "2 compiled"
-    assert call(package, **home) == "2 kept"
-    assert kept(tmp_path / "cache" / "egvs") == 1
+    assert call(package, **home) == "2 cached"
+    assert cache_file_count(tmp_path / "cache" / "egvs") == 1
 
 
 DAMAGES = """
 import hashlib, importlib, pathlib, pickle
 from egvs.kernels import outer
 assert outer.outer(1) == 2
-kept, = pathlib.Path("egvs/kernels/__pycache__").rglob("outer.outer-*.kernel")
-whole, other = kept.read_bytes(), pickle.dumps((0, 1))
+cached, = pathlib.Path("egvs/kernels/__pycache__").rglob("outer.outer-*.kernel")
+whole, other = cached.read_bytes(), pickle.dumps((0, 1))
 for data in (
     whole, whole[:len(whole) // 2], whole[:32], whole[:1], b"", whole[:-9] + bytes([whole[-9] ^ 4]) + whole[-8:],
     hashlib.sha256(other).digest() + other, whole,
 ):
-    kept.write_bytes(data)
+    cached.write_bytes(data)
     importlib.reload(outer)
     assert outer.outer(1) == 2
-    print("compiled" if outer.outer.stats.cache_misses else "kept")
+    print("compiled" if outer.outer.stats.cache_misses else "cached")
 """
 
 
 @pytest.mark.slow
-def test_what_is_damaged_is_compiled_again(package: Path) -> None:
-    assert call(package, DAMAGES).split() == ["kept", *["compiled"] * 6, "kept"]
+def test_recompiles_damaged_cache_file(package: Path) -> None:
+    assert call(package, DAMAGES).split() == ["cached", *["compiled"] * 6, "cached"]
 
 
 @pytest.mark.slow
-def test_where_nothing_can_be_written_the_temporary_directory_is_used(package: Path, tmp_path: Path) -> None:
+def test_uses_temporary_folder_where_nothing_is_writable(package: Path, tmp_path: Path) -> None:
     (package / "egvs" / "kernels" / "__pycache__").write_text("a file where the folder would be")
     (tmp_path / "cache").write_text("and here")
     (tmp_path / "tmp").mkdir()
     none = {"XDG_CACHE_HOME": str(tmp_path / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
     temporary = none | {"TMPDIR": str(tmp_path / "tmp")}
     assert call(package, **temporary) == "2 compiled"
-    assert call(package, **temporary) == "2 kept"
+    assert call(package, **temporary) == "2 cached"
     (own,) = (tmp_path / "tmp").iterdir()
-    assert (own.name, kept(own), own.stat().st_mode & 0o777) == (f"egvs-{os.geteuid()}", 1, 0o700)
+    assert (own.name, cache_file_count(own), own.stat().st_mode & 0o777) == (f"egvs-{os.geteuid()}", 1, 0o700)
     own.chmod(0o777)  # anybody could lay a kernel there
     assert call(package, **temporary) == "2 compiled"
     assert call(package, **none | {"NUMBA_CACHE_DIR": str(tmp_path / "cache" / "x"), **temporary}) == "2 compiled"

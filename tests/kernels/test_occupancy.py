@@ -1,7 +1,7 @@
 """Is a voxel occupied exactly when a vehicle's box overlaps it by more than 0.1 mm?
 
 Evidence: separating axes in rationals and in 50 digits (tests/oracles/boxes.py); a TPOG by brute force; limits and
-symmetries; real trajectories moved by a nanometre; and faults put into the kernel on purpose."""
+symmetries; recorded trajectories moved by a nanometre; and faults put into the kernel on purpose."""
 
 import itertools
 import math
@@ -18,14 +18,14 @@ from hypothesis import strategies as st
 
 import egvs
 from egvs.artefacts import parquet
-from egvs.artefacts.traffic_frames import FrameBoxes, read_boxes
+from egvs.artefacts.frame_boxes import FrameBoxes, read_boxes
 from egvs.core.errors import InputError
 from egvs.core.grid import Grid
 from egvs.kernels import occupancy as kernels_occupancy
 from egvs.scoring import occupancy as scoring_occupancy
 from egvs.stages import traffic
 from tests.oracles import boxes as oracle
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 
 SHAPE, VOXEL_M = (8, 7, 5), 0.25
 SCENARIO = Path(__file__).resolve().parents[2] / "scenarios" / "nishishinjuku"
@@ -62,7 +62,7 @@ def ulps(value, n):
     return value
 
 
-# --- box against voxel ------------------------------------------------------------------------------------------------
+# --- box against voxel ---
 
 
 def rational_pose(draw):
@@ -92,7 +92,7 @@ def rational_pairs(draw):
 @pytest.mark.slow
 @settings(often, max_examples=400)
 @given(rational_pairs())
-def test_a_pair_like_exact_separating_axes(pair):
+def test_random_pair_agrees_with_exact_separating_axes(pair):
     centre, axes, half = pair
     if min(half) < Fraction(1, 1000):
         return
@@ -105,7 +105,7 @@ def test_a_pair_like_exact_separating_axes(pair):
     assert kernels_occupancy.overlaps(*floats, np.zeros(3), 0.25) == (exact > oracle.SHRINK_M)
 
 
-def test_edges_that_are_nearly_parallel():
+def test_nearly_parallel_edges():
     """A box turned by less than 1e-6 whose edge passes an edge of the voxel: only the very short cross product parts
     them."""
     rng, unlike = np.random.default_rng(8), 0
@@ -162,7 +162,7 @@ any_box = st.tuples(where_m, where_m, where_m, angle, slope, size_m, size_m, siz
 @pytest.mark.slow
 @often
 @given(any_box)
-def test_any_box_like_50_digits(box):
+def test_random_box_agrees_with_50_digits(box):
     _, unsure = check(box)
     event(f"flat: {box[4] == 0}; within 1e-9 m of the bound: {bool(unsure)}")
 
@@ -170,7 +170,7 @@ def test_any_box_like_50_digits(box):
 @pytest.mark.parametrize("pitch", [0.0, 1e-300, 1e-13, 0.02])
 @pytest.mark.parametrize("beside", [-1, 0, 1])
 @pytest.mark.parametrize("eighths", range(-4, 5))
-def test_yaw_at_every_multiple_of_45_degrees_and_beside(eighths, beside, pitch):
+def test_yaw_at_and_near_multiples_of_45_degrees(eighths, beside, pitch):
     box = (1.0, 0.875, 0.5, ulps(eighths * math.pi / 4, beside), pitch, 1.0, 0.75, 0.5)
     found, unsure = check(box)
     assert not unsure
@@ -183,7 +183,7 @@ def test_yaw_at_every_multiple_of_45_degrees_and_beside(eighths, beside, pitch):
 @pytest.mark.parametrize("pitch", [0.0, 1e-12])
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_faces_that_coincide_with_voxel_faces_and_0_1_mm_beside(axis, sign, pitch):
+def test_faces_at_and_0_1_mm_from_voxel_faces(axis, sign, pitch):
     inside = set(itertools.product((2, 3), (2, 3), (2, 3)))
     for move, more in (
         (0.0, False),
@@ -207,12 +207,12 @@ def test_faces_that_coincide_with_voxel_faces_and_0_1_mm_beside(axis, sign, pitc
 
 
 @pytest.mark.parametrize("pitch", [0.0, 1e-12, 0.1])
-def test_a_box_larger_than_the_region_fills_it(pitch):
+def test_box_larger_than_region_fills_it(pitch):
     assert len(cells_of((1.0, 1.0, 0.5, 0.3, pitch, 40.0, 40.0, 40.0))) == math.prod(SHAPE)
 
 
 @pytest.mark.parametrize("pitch", [0.0, 0.05])
-def test_a_box_thinner_than_a_voxel(pitch):
+def test_box_thinner_than_voxel(pitch):
     found, unsure = check((1.13, 0.88, 0.63, 0.4, pitch, 1.2, 0.002, 0.003))
     assert found
     assert not unsure
@@ -241,7 +241,7 @@ def test_pitched_and_flat_agree_as_pitch_goes_to_zero():
             assert cells_of(steep) ^ cells_of(box) <= unsure
 
 
-def test_turning_by_half_a_turn_and_swapping_sides_changes_nothing():
+def test_half_turn_and_swapped_sides_give_same_voxels():
     rng = np.random.default_rng(2)
     for _ in range(60):
         x, y, z, yaw, length, width, height = *rng.uniform(0, 2, 3), rng.uniform(-3, 3), *rng.uniform(0.01, 2, 3)
@@ -267,7 +267,7 @@ def test_other_voxel_sizes(voxel_m):
 
 
 @pytest.mark.slow
-def test_large_coordinates_keep_the_margin():
+def test_margin_holds_at_large_coordinates():
     """The bound that holds: 2**-48 of the largest coordinate or size; 1e-9 m covers boxes of up to 100 km."""
     rng = np.random.default_rng(4)
     for _ in range(25):
@@ -281,7 +281,7 @@ def test_large_coordinates_keep_the_margin():
         check([*(tip - forward * far / 2), yaw, pitch, far, 0.6, 0.5])
 
 
-# --- what is no box ---------------------------------------------------------------------------------------------------
+# --- what is no box ---
 
 COLUMNS = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "length_m", "width_m", "height_m")
 GOOD = dict(zip(COLUMNS, (1.0, 1.0, 0.5, 0.1, 0.0, 4.5, 1.8, 1.5), strict=True))
@@ -289,7 +289,7 @@ GOOD = dict(zip(COLUMNS, (1.0, 1.0, 0.5, 0.1, 0.0, 4.5, 1.8, 1.5), strict=True))
 
 @pytest.mark.parametrize("bad", [0.0, -0.0, -1.0, 5e-324, 0.9e-3, 2001.0, math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("name", COLUMNS)
-def test_what_is_no_box_is_refused(name, bad, tmp_path):
+def test_rejects_invalid_box(name, bad, tmp_path):
     if math.isfinite(bad) and not name.startswith(("length", "width", "height")):
         return
     rows = [GOOD, GOOD | {name: bad}]
@@ -297,13 +297,13 @@ def test_what_is_no_box_is_refused(name, bad, tmp_path):
     columns = {"frame": [6, 7], **others} | {c: [row[c] for row in rows] for c in COLUMNS}
     parquet.write_artefact(tmp_path / "trajectories.parquet", "trajectories", columns, {"schema": 1, "frames": 8})
     with pytest.raises(
-        InputError, match=r"trajectories.parquet: frame 7: a box with .*; finite values, sizes of at least 0.001 m"
+        InputError, match=r"trajectories.parquet: frame 7: expected finite values and sizes from 0.001 m"
     ) as caught:
         list(read_boxes(tmp_path / "trajectories.parquet", grid_of()))
     assert f"{name} = {bad:g}" in str(caught.value)
 
 
-# --- the TPOG by brute force ------------------------------------------------------------------------------------------
+# --- the TPOG by brute force ---
 
 
 def traffic_of(rng, frames, crowd=4):
@@ -321,7 +321,7 @@ def traffic_of(rng, frames, crowd=4):
     return np.array(frame, np.int64), np.array(values).reshape(-1, 8)
 
 
-def test_a_small_traffic_by_brute_force():
+def test_small_traffic_agrees_with_brute_force():
     """Overlapping vehicles count once a frame; blocks add up; row groups need not end where blocks do."""
     rng = np.random.default_rng(5)
     shape, frames = (6, 6, 5), 12
@@ -407,7 +407,7 @@ def test_vehicles_in_one_column_at_different_heights(intervals):
         max_size=14,
     )
 )
-def test_any_pile_of_boxes_counts_like_sets(pile):
+def test_random_pile_of_boxes_agrees_with_sets(pile):
     """Boxes on voxel faces: what each occupies is known, so any number may be piled up."""
     pile = sorted(pile)
     frames = [p[0] for p in pile]
@@ -423,7 +423,7 @@ def test_any_pile_of_boxes_counts_like_sets(pile):
     assert np.array_equal(count(frames, rows, total=4), expected)
 
 
-def test_more_boxes_in_a_column_than_the_scratch_starts_with():
+def test_scratch_grows_with_boxes_in_a_column():
     shape = (4, 4, 300)
     order = np.random.default_rng(6).permutation(150)
     rows = [[0.5, 0.5, (2 * n + 0.5) * VOXEL_M, 0.0, 0.0, 0.5, 0.5, VOXEL_M] for n in order]
@@ -432,13 +432,13 @@ def test_more_boxes_in_a_column_than_the_scratch_starts_with():
     assert counts.sum() == 4 * 150
 
 
-# --- real trajectories ------------------------------------------------------------------------------------------------
+# --- recorded trajectories ---
 
 
 @pytest.fixture(scope="session")
-def real(tmp_path_factory):
+def recorded(tmp_path_factory):
     """Boxes of a short run of the shipped scenario, in the grid's frame, and its grid."""
-    out = tmp_path_factory.mktemp("real")
+    out = tmp_path_factory.mktemp("recorded")
     scenario = egvs.load(SCENARIO, ["traffic.frames=200"])
     run_stage(traffic, scenario, out)
     batches = list(read_boxes(out / "trajectories.parquet", scenario.roi.grid))
@@ -449,8 +449,8 @@ NUDGES = [sign * 1e-9 * np.eye(8)[axis] for axis in range(3) for sign in (-1, 1)
 
 
 @pytest.mark.system
-def test_moving_real_boxes_by_a_nanometre_changes_no_count(real):
-    frame, values, grid = real
+def test_moving_recorded_boxes_by_a_nanometre_keeps_counts(recorded):
+    frame, values, grid = recorded
     before = count(frame, values, grid, 200)
     assert before.sum() > 100_000
     for nudge in NUDGES:
@@ -478,8 +478,8 @@ def counted_by(kernels, frame, values, shape, voxel_m):
 
 @pytest.mark.slow
 @pytest.mark.system
-def test_the_touching_rule_fails_where_the_0_1_mm_rule_holds(real):
-    frame, values, grid = real
+def test_rule_without_margin_is_unstable_where_0_1_mm_rule_is_stable(recorded):
+    frame, values, grid = recorded
     few = (frame < 3) & scoring_occupancy.near_grid(values, grid)
     frame, values = frame[few], values[few]
     for kernels, changes in ((with_fault(), False), (with_fault(("SHRINK_M = 1e-4 + 1e-9", "SHRINK_M = 0.0")), True)):
@@ -511,7 +511,7 @@ FAULTS = {
 
 
 @pytest.fixture(scope="module")
-def awkward():
+def hard_boxes():
     """A handful of vehicles, one frame each but for a pile of four, and their counts by brute force."""
     frame = np.array([0, 1, 2, 3, 4, 5, 6, 6, 6, 6])
     values = np.array([
@@ -529,27 +529,27 @@ def awkward():
 
 
 @pytest.mark.parametrize("fault", list(FAULTS))
-def test_a_fault_in_the_box_test_shows(fault, awkward):
-    frame, values, expected = awkward
+def test_detects_fault_in_box_test(fault, hard_boxes):
+    frame, values, expected = hard_boxes
     with np.errstate(all="ignore"):
         counts = counted_by(with_fault(*FAULTS[fault]), frame, values, SHAPE, VOXEL_M)
     assert np.array_equal(counts, expected) == (fault == "none")
 
 
-# --- the long hunt, in short ------------------------------------------------------------------------------------------
+# --- the long hunt, in short ---
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "seed", "voxel_m"), [(hunt.hostile, 31, 0.25), (hunt.hostile, 32, 0.1), (hunt.vehicles, 33, 0.25)]
 )
-def test_the_hunt_finds_nothing(make, seed, voxel_m):
+def test_random_search_finds_no_difference(make, seed, voxel_m):
     row = hunt.hunt("in short", make, seed, 400, SHAPE, voxel_m)
     assert (row.cases, row.mismatches) == (400, 0)
 
 
 @pytest.mark.slow
-def test_the_hunts_quick_depth_is_the_oracles():
+def test_fast_depth_of_search_agrees_with_oracle():
     rng = np.random.default_rng(7)
     for box in hunt.hostile(rng, 15, SHAPE, VOXEL_M):
         for cell, exact in itertools.islice(oracle.depths(box, SHAPE, VOXEL_M).items(), 40):

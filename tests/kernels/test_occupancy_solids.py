@@ -83,15 +83,15 @@ corner = st.tuples(where, where, where)
 @pytest.mark.slow
 @often
 @given(corner, corner, corner)
-def test_any_triangle_like_clipping_in_rationals(a, b, c):
+def test_random_triangle_agrees_with_rational_clipping(a, b, c):
     event(f"within 1e-9 m of the bound: {check_triangle((a, b, c)) > 0}")
 
 
 @pytest.mark.slow
 @often
 @given(corner, corner, st.floats(0, 1), st.sampled_from([0.0, 1e-3, 1e-5, 1e-7]), st.tuples(*[st.floats(-1, 1)] * 3))
-def test_slivers_and_degenerate_triangles(a, b, share, width, aside):
-    c = tuple(x + share * (y - x) + width * w for x, y, w in zip(a, b, aside, strict=True))
+def test_slivers_and_degenerate_triangles(a, b, share, width, offset):
+    c = tuple(x + share * (y - x) + width * w for x, y, w in zip(a, b, offset, strict=True))
     check_triangle((a, b, c))
 
 
@@ -150,7 +150,7 @@ def test_other_voxel_sizes(voxel_m):
         (1.5, []),
     ],
 )
-def test_a_plane_beside_voxel_faces(axis, height, layers):
+def test_plane_near_voxel_faces(axis, height, layers):
     far = np.array([[-9.0, -9.0], [20.0, -9.0], [-9.0, 20.0]])
     triangle = np.insert(far, axis, height, axis=1)
     expected = np.zeros(SHAPE, bool)
@@ -241,13 +241,13 @@ def cells(*ranges):
 
 @pytest.mark.parametrize("inward", [False, True], ids=["outward", "inward"])
 @pytest.mark.parametrize("flip", [False, True])
-def test_a_box_on_voxel_faces_fills_just_its_voxels(inward, flip):
+def test_box_on_voxel_faces_fills_only_its_voxels(inward, flip):
     found = filled_by(box((0.25, 0.5, 0.25), (1.25, 1.0, 1.0), inward=inward, flip=flip))
     assert np.array_equal(found, cells(range(1, 5), range(2, 4), range(1, 4)))
 
 
 @pytest.mark.parametrize("inward", [False, True], ids=["outward", "inward"])
-def test_a_box_between_voxel_centres(inward):
+def test_box_between_voxel_centres(inward):
     """Its sides run through voxel centres: edges, corners and the diagonals of its roof lie exactly above them."""
     for low, high in (((0.125, 0.125, 0.125), (1.375, 1.375, 1.375)), ((0.375, 0.125, 0.625), (0.875, 1.125, 1.125))):
         expected = cells(*(range(int(a // VOXEL_M), int(b // VOXEL_M) + 1) for a, b in zip(low, high, strict=True)))
@@ -263,7 +263,7 @@ def test_a_box_between_voxel_centres(inward):
     st.tuples(*[st.floats(0.05, 1.4)] * 3),
     st.booleans(),
 )
-def test_a_rotated_box_like_separating_axes(yaw, pitch, centre, size, inward):
+def test_rotated_box_agrees_with_separating_axes(yaw, pitch, centre, size, inward):
     """A box fills the voxels that, made 0.1 mm smaller, it still overlaps."""
     low, high = np.subtract(centre, np.divide(size, 2)), np.add(centre, np.divide(size, 2))
     found = filled_by(box(low, high, yaw, pitch, inward))
@@ -290,7 +290,7 @@ def distances(centre, axes):
 
 
 @pytest.mark.parametrize("centre", [(0.75, 0.75, 0.75), (0.625, 0.625, 0.625), (0.7, 0.66, 0.81)])
-def test_a_sphere(centre):
+def test_sphere(centre):
     radius, rings, sides = 0.55, 24, 48
     found = filled_by(sphere(centre, radius, rings, sides))
     near, _ = distances(centre, (0, 1, 2))
@@ -301,7 +301,7 @@ def test_a_sphere(centre):
 
 
 @pytest.mark.parametrize("centre", [(0.75, 0.75), (0.625, 0.625), (0.7, 0.66)])
-def test_a_cylinder(centre):
+def test_cylinder(centre):
     radius, sides = 0.55, 64
     found = filled_by(prism(centre, radius, 0.25, 1.0, sides))
     near, _ = distances((*centre, 0.0), (0, 1))
@@ -329,7 +329,7 @@ def test_nested_overlapping_and_hollow_solids():
     )
 
 
-def test_a_solid_that_holds_the_whole_region_and_one_beside_it():
+def test_solid_around_region_and_solid_outside_it():
     assert filled_by(box((-5, -5, -5), (9, 9, 9), yaw=0.3)).all()
     assert not filled_by(box((1.5, 0, 0), (3, 3, 3))).any()
     assert not filled_by(box((0, 0, 1.5), (1.5, 1.5, 3))).any(), "a roof above the region fills nothing of it"
@@ -337,7 +337,7 @@ def test_a_solid_that_holds_the_whole_region_and_one_beside_it():
 
 
 @pytest.mark.parametrize("z", [0.0, -0.0, 0.9e-4, -1.0])
-def test_the_ground_plane_fills_nothing(z):
+def test_ground_plane_fills_nothing(z):
     ground = (
         np.array([[-500, -500, z], [500, -500, z], [500, 500, z], [-500, 500, z]]),
         np.array([[0, 1, 2], [0, 2, 3]]),
@@ -345,7 +345,7 @@ def test_the_ground_plane_fills_nothing(z):
     assert not filled_by(ground).any()
 
 
-def test_400_km_away_the_same_voxels_are_filled():
+def test_same_voxels_400_km_from_origin():
     shift = (393216.0, 3932160.0, 64.0)
     parts = box((0.3, 0.25, 0.0), (1.1, 1.25, 1.0), yaw=0.4), prism((0.625, 0.625), 0.4, 0.0, 1.25, 12)
     parts = [(np.round(corners * 2**12) / 2**12, faces) for corners, faces in parts]
@@ -374,7 +374,7 @@ def solid_angles(points, corners, faces):
     return 2 * np.arctan2(volume, below).sum(axis=1) / (4 * np.pi)
 
 
-def known(point, corners, faces):
+def expected_inside(point, corners, faces):
     """The winding number by solid angles where it is the same all round the point, None near the surface."""
     beside = np.asarray(point) + 2e-4 * np.array(list(itertools.product((-1, 0, 1), repeat=3)))
     found = solid_angles(beside, corners, faces)
@@ -391,13 +391,13 @@ SHAPES = {
 
 
 @pytest.mark.parametrize("name", list(SHAPES))
-def test_points_like_solid_angles(name):
+def test_points_agree_with_solid_angles(name):
     corners, faces = SHAPES[name]
     rng = np.random.default_rng(3)
     points = np.concatenate([rng.uniform(0, 1.5, (300, 3)), rng.integers(0, 13, (200, 3)) / 8])
     tried = 0
     for point in points:
-        exact = known(point, corners, faces)
+        exact = expected_inside(point, corners, faces)
         if exact is None:
             continue
         tried += 1
@@ -422,11 +422,11 @@ def test_points_exactly_and_nearly_above_edges_and_vertices(name):
             assert winding((*xy, low - 0.1), corners, faces) == 0
             assert winding((*xy, high + 0.1), corners, faces) == 0
             for z in rng.uniform(low, high, 2):
-                exact = known((*xy, z), corners, faces)
+                exact = expected_inside((*xy, z), corners, faces)
                 assert exact is None or winding((*xy, z), corners, faces) == exact, (*xy, z)
 
 
-def test_a_fan_round_a_point_is_met_once():
+def test_fan_around_a_point_counts_once():
     """Triangles round a common vertex: a vertical that passes within a few ulps of it crosses exactly one of them."""
     rng = np.random.default_rng(5)
     for _ in range(150):
@@ -445,7 +445,7 @@ def test_a_fan_round_a_point_is_met_once():
             assert sorted(map(abs, signs)) == [0] * (n - 1) + [1]
 
 
-def test_a_steep_wall_is_crossed_between_its_ends():
+def test_steep_wall_is_crossed_between_its_ends():
     """However steep a triangle is: the crossing lies between its lowest and its highest corner."""
     rng = np.random.default_rng(6)
     crossed = 0

@@ -36,7 +36,7 @@ often = settings(derandomize=True, deadline=None, max_examples=600, database=Non
 seldom = settings(often, max_examples=150)
 
 
-def listed(kernels, o, d, shape, voxel_m):
+def list_voxels(kernels, o, d, shape, voxel_m):
     """The voxels that ``walk`` lists, in order."""
     shape = np.asarray(shape, np.int64)
     cells, t_cells = np.empty(shape.sum() + 3, np.int64), np.empty((shape.sum() + 3, 2))
@@ -51,18 +51,18 @@ def listed(kernels, o, d, shape, voxel_m):
     return [tuple(int(i) for i in np.unravel_index(c, tuple(shape))) for c in cells[:count]]
 
 
-def counted(kernels, o, d, shape, voxel_m):
-    """The voxels that ``count_hits`` counts; none is counted twice."""
+def count_voxels(kernels, o, d, shape, voxel_m):
+    """Return the voxels that ``count_hits`` counts, none of them twice."""
     hits = np.zeros(int(np.prod(shape)), np.uint32)
     kernels.count_hits(np.array(o, float), np.array([d], float), np.asarray(shape, np.int64), voxel_m, hits)
     assert hits.max() <= 1
     return {tuple(int(i) for i in np.unravel_index(c, tuple(shape))) for c in np.flatnonzero(hits)}
 
 
-def walked(o, d, shape, voxel_m):
+def march_voxels(o, d, shape, voxel_m):
     """What both kernels say."""
-    found = listed(traversal, o, d, shape, voxel_m)
-    assert counted(traversal, o, d, shape, voxel_m) == set(found)
+    found = list_voxels(traversal, o, d, shape, voxel_m)
+    assert count_voxels(traversal, o, d, shape, voxel_m) == set(found)
     assert len(set(found)) == len(found)
     return set(found)
 
@@ -103,10 +103,10 @@ BOTH_WAYS = [(entry, backwards) for entry in SOUND for backwards in (False, True
 
 
 @pytest.mark.parametrize(("entry", "backwards"), BOTH_WAYS, ids=[f"{e['name']}{', back' * b}" for e, b in BOTH_WAYS])
-def test_hostile_segment(entry, backwards):
+def test_hard_segment(entry, backwards):
     start, beam, origin, voxel_m, shape = of_entry(entry, backwards)
     o, d = converted(start, beam, origin, voxel_m, shape)
-    found = walked(o, d, shape, voxel_m)
+    found = march_voxels(o, d, shape, voxel_m)
     wrong = found ^ oracle.crossed(o, d, shape, voxel_m)
     assert wrong <= oracle.doubtful(o, d, shape, voxel_m)
     assert bool(oracle.doubtful(o, d, shape, voxel_m)) == entry.get("excluded", False), "excluded are those built to be"
@@ -121,7 +121,7 @@ def test_hostile_segment(entry, backwards):
         )
 
 
-def test_turning_round_changes_nothing_in_the_corpus():
+def test_reversed_hard_segments_cross_same_voxels():
     turned = 0
     for entry in SOUND:
         start, beam, origin, voxel_m, shape = of_entry(entry)
@@ -132,25 +132,25 @@ def test_turning_round_changes_nothing_in_the_corpus():
         ]:
             continue  # turned round it would be another segment
         turned += 1
-        assert walked(end, -d, shape, voxel_m) ^ walked(o, d, shape, voxel_m) <= oracle.doubtful(
+        assert march_voxels(end, -d, shape, voxel_m) ^ march_voxels(o, d, shape, voxel_m) <= oracle.doubtful(
             o, d, shape, voxel_m
         ), entry["name"]
     assert turned > 60
 
 
 @pytest.mark.parametrize("entry", REFUSED, ids=[entry["name"] for entry in REFUSED])
-def test_what_is_no_number_is_refused(entry):
+def test_rejects_nan_and_inf(entry):
     with pytest.raises(InputError, match=r"scans.parquet: site s: a beam has an end that is not finite"):
         converted(*of_entry(entry))
 
 
-def test_the_cases_that_others_got_wrong():
+def test_cases_where_other_implementations_fail():
     """Known answers, so that the oracle is held against something too."""
     by_name = {entry["name"]: entry for entry in CORPUS}
 
     def found(name):
         start, beam, origin, voxel_m, shape = of_entry(by_name[name])
-        return walked(*converted(start, beam, origin, voxel_m, shape), shape, voxel_m)
+        return march_voxels(*converted(start, beam, origin, voxel_m, shape), shape, voxel_m)
 
     first, second = found("fast_voxel_traversal 2"), found("fast_voxel_traversal 5")
     assert {(4, 3, 4), (9, 3, 6)} <= first  # the voxels of both ends, (0, 0-, 0) and (90, -16+, 45), 16 m each
@@ -216,9 +216,9 @@ def segments(draw):
 @often
 @given(segments())
 @example(((-3.0, -3.0, -3.0), (16.0, 16.0, 16.0), 0.25))
-def test_any_segment_like_rational_arithmetic(segment):
+def test_random_segment_agrees_with_rational_arithmetic(segment):
     o, d, voxel_m = segment
-    wrong = walked(o, d, SHAPE, voxel_m) ^ oracle.crossed(o, d, SHAPE, voxel_m)
+    wrong = march_voxels(o, d, SHAPE, voxel_m) ^ oracle.crossed(o, d, SHAPE, voxel_m)
     if wrong:
         event("a chord within 1e-8 m of the bound")
     assert wrong <= oracle.doubtful(o, d, SHAPE, voxel_m)
@@ -234,31 +234,34 @@ def test_any_segment_like_rational_arithmetic(segment):
 @example((1e308, 1e308, 1e308), (-1.7e308, -1.7e308, -1.7e308), (0.0, 0.0, 0.0))
 @example((1e17, 1e17, 1e17), (-2e17, -2e17, -2e17), (0.0, 0.0, 0.0))
 @example((5e-324, 5e-324, 5e-324), (-5e-324, 5e-324, 1e308), (0.0, 0.0, 0.0))
-def test_any_finite_numbers_end(o, d, near):
-    """From anywhere: bounded, within the grid, nothing twice (``listed`` checks). From nearby, to anywhere: right as
-    well."""
-    walked(o, d, SHAPE, 0.25)
-    assert walked(near, d, SHAPE, 0.25) ^ oracle.crossed(near, d, SHAPE, 0.25) <= oracle.doubtful(near, d, SHAPE, 0.25)
+def test_any_finite_segment_terminates(o, d, near):
+    """From anywhere: bounded, within the grid, nothing twice. From nearby, to anywhere: also correct."""
+    march_voxels(o, d, SHAPE, 0.25)
+    assert march_voxels(near, d, SHAPE, 0.25) ^ oracle.crossed(near, d, SHAPE, 0.25) <= oracle.doubtful(
+        near, d, SHAPE, 0.25
+    )
 
 
 @pytest.mark.slow
 @often
 @given(segments())
-def test_turning_round_changes_nothing(segment):
+def test_reversed_segment_crosses_same_voxels(segment):
     o, d, voxel_m = segment
     end = [a + b for a, b in zip(o, d, strict=True)]
     back = [-x for x in d]
     exact = all(Fraction(e) == Fraction(a) + Fraction(b) for e, a, b in zip(end, o, d, strict=True))
     event("exact" if exact else "the end is rounded")
     if exact:
-        assert walked(o, d, SHAPE, voxel_m) ^ walked(end, back, SHAPE, voxel_m) <= oracle.doubtful(o, d, SHAPE, voxel_m)
+        assert march_voxels(o, d, SHAPE, voxel_m) ^ march_voxels(end, back, SHAPE, voxel_m) <= oracle.doubtful(
+            o, d, SHAPE, voxel_m
+        )
 
 
 @pytest.mark.slow
 @often
 @given(point, st.tuples(*[st.sampled_from([0.0, -0.0])] * 3), voxel_size)
-def test_a_segment_without_length_crosses_nothing(o, d, voxel_m):
-    assert walked(o, d, SHAPE, voxel_m) == set()
+def test_segment_without_length_crosses_nothing(o, d, voxel_m):
+    assert march_voxels(o, d, SHAPE, voxel_m) == set()
 
 
 moves = st.tuples(*[st.one_of(st.sampled_from([-1.0, 0.0, 1.0]), st.floats(-1, 1))] * 3)
@@ -267,15 +270,15 @@ moves = st.tuples(*[st.one_of(st.sampled_from([-1.0, 0.0, 1.0]), st.floats(-1, 1
 @pytest.mark.slow
 @often
 @given(segments(), moves, moves)
-def test_moving_the_ends_by_a_nanometre_changes_nothing_but_what_is_fragile(segment, by_start, by_end):
+def test_moving_ends_by_a_nanometre_changes_fragile_voxels_only(segment, by_start, by_end):
     o, d, voxel_m = segment
     if max(map(abs, (*o, *d))) > 1e6:
         return  # a nanometre is less than the last bit there
-    before = walked(o, d, SHAPE, voxel_m)
+    before = march_voxels(o, d, SHAPE, voxel_m)
     reach = 1e-9 / voxel_m
     start = [a + reach * m / max(1.0, math.hypot(*by_start)) for a, m in zip(o, by_start, strict=True)]
     end = [a + b + reach * m / max(1.0, math.hypot(*by_end)) for a, b, m in zip(o, d, by_end, strict=True)]
-    after = walked(start, [b - a for a, b in zip(start, end, strict=True)], SHAPE, voxel_m)
+    after = march_voxels(start, [b - a for a, b in zip(start, end, strict=True)], SHAPE, voxel_m)
     if before != after:
         by_chord, along_face = oracle.fragile(o, d, SHAPE, voxel_m, 1.01e-9)
         event(f"changed; along a face plane: {bool(along_face)}")
@@ -283,7 +286,7 @@ def test_moving_the_ends_by_a_nanometre_changes_nothing_but_what_is_fragile(segm
         assert before ^ after <= by_chord | along_face | oracle.doubtful(o, d, SHAPE, voxel_m)
 
 
-def test_fragile_segments_are_those_built_to_be():
+def test_fragile_segments_are_those_constructed():
     """Counted: random segments have none; each built one has, and moving it by a nanometre does change a voxel."""
     rng = np.random.default_rng(1)
     fragile = 0
@@ -305,11 +308,11 @@ def test_fragile_segments_are_those_built_to_be():
             by_chord, along_face = oracle.fragile(o, d, SHAPE, 0.25, 1e-9)
             assert along_face if kind == "along a face" else by_chord
             moved = (
-                walked(np.add(o, move), d, SHAPE, 0.25)
+                march_voxels(np.add(o, move), d, SHAPE, 0.25)
                 if kind == "along a face"
-                else walked(o, np.add(d, move), SHAPE, 0.25)
+                else march_voxels(o, np.add(d, move), SHAPE, 0.25)
             )
-            assert moved != walked(o, d, SHAPE, 0.25)
+            assert moved != march_voxels(o, d, SHAPE, 0.25)
             counts[kind] = counts.get(kind, 0) + 1
     assert counts == {"by chord": 5, "along a face": 7}
 
@@ -328,7 +331,7 @@ origins = st.sampled_from(
 def test_beams_in_the_world_frame(origin, start, beam, voxel_m):
     """From site, beam end, origin and voxel as floats: right but for what the rounding of the conversion can turn."""
     site = [z + s for z, s in zip(origin, start, strict=True)]
-    found = walked(*converted(site, beam, origin, voxel_m, SHAPE), SHAPE, voxel_m)
+    found = march_voxels(*converted(site, beam, origin, voxel_m, SHAPE), SHAPE, voxel_m)
     o, d = oracle.in_world(site, beam, origin, voxel_m)
     wrong = found ^ oracle.crossed(o, d, SHAPE, voxel_m)
     if wrong:
@@ -338,7 +341,7 @@ def test_beams_in_the_world_frame(origin, start, beam, voxel_m):
 
 @seldom
 @given(st.tuples(*[st.integers(-40, 400)] * 3), st.tuples(*[st.integers(-400, 400)] * 3))
-def test_a_scene_400_km_away_is_the_same(start, beam):
+def test_same_voxels_400_km_from_origin(start, beam):
     """Exactly representable shifts change nothing, bit for bit."""
     shift = (393216.0, 3932160.0, 64.0)
     site, ends = [s / 64 for s in start], [b / 64 for b in beam]
@@ -349,7 +352,7 @@ def test_a_scene_400_km_away_is_the_same(start, beam):
 
 
 @pytest.mark.slow
-def test_from_1e7_m_near_corners_of_a_long_grid():
+def test_corners_of_long_grid_from_1e7_m():
     """Corner cuts of about 1 micrometre, 1e7 m from the start and behind hundreds of planes: an accumulated t is lost
     here."""
     rng = np.random.default_rng(3)
@@ -362,14 +365,14 @@ def test_from_1e7_m_near_corners_of_a_long_grid():
         far = rng.uniform(0.9, 0.99) * FAR_M / voxel_m
         o = corner + aside + [0.0, 0.0, 0.5] - far * u
         d = 2 * far * u
-        wrong = walked(o, d, shape, voxel_m) ^ oracle.crossed(o, d, shape, voxel_m)
+        wrong = march_voxels(o, d, shape, voxel_m) ^ oracle.crossed(o, d, shape, voxel_m)
         doubtful = oracle.doubtful(o, d, shape, voxel_m)
         excluded += bool(doubtful)
         assert wrong <= doubtful
     assert excluded < 15
 
 
-def test_beyond_the_stated_range_the_error_grows_as_stated():
+def test_error_beyond_documented_range():
     """From 1e9 m away chords are good to 4 u R = 4.4e-7 m, not to 1e-8 m: the limit is real, and it is where it is said
     to be."""
     rng = np.random.default_rng(4)
@@ -378,7 +381,7 @@ def test_beyond_the_stated_range_the_error_grows_as_stated():
         target, u = rng.uniform(0, 1, 3) * SHAPE, rng.normal(size=3)
         o = target - u / math.hypot(*u) * 1e9 / 0.25
         d = 2 * (target - o)
-        differing = walked(o, d, SHAPE, 0.25) ^ oracle.crossed(o, d, SHAPE, 0.25)
+        differing = march_voxels(o, d, SHAPE, 0.25) ^ oracle.crossed(o, d, SHAPE, 0.25)
         assert differing <= oracle.doubtful(o, d, SHAPE, 0.25, Fraction(45, 10**8))
         wrong += bool(differing - oracle.doubtful(o, d, SHAPE, 0.25))
     assert wrong < 5
@@ -397,7 +400,7 @@ def audited(kernels, o, d, shape=SHAPE, voxel_m=0.25):
     )
 
 
-def good_beams(n=400, seed=5):
+def ordinary_beams(n=400, seed=5):
     rng = np.random.default_rng(seed)
     lattice_ends = rng.integers(-3, 10, (n, 3)).astype(float) - [2.0, 1.5, 1.0]
     random_ends = rng.uniform(-9, 9, (n, 3))
@@ -405,8 +408,8 @@ def good_beams(n=400, seed=5):
 
 
 @pytest.mark.slow
-def test_the_audit_is_quiet_on_good_beams():
-    worst_sum, longest_gap_m, misplaced, doubled = audited(traversal, *good_beams())
+def test_audit_accepts_ordinary_beams():
+    worst_sum, longest_gap_m, misplaced, doubled = audited(traversal, *ordinary_beams())
     assert worst_sum < 1e-12
     assert longest_gap_m < 3e-6
     assert (misplaced, doubled) == (0, 0)
@@ -415,7 +418,7 @@ def test_the_audit_is_quiet_on_good_beams():
 @pytest.mark.slow
 @seldom
 @given(st.lists(segments().filter(lambda s: s[2] == 0.25 and max(map(abs, s[0])) < 1e6), min_size=1, max_size=5))
-def test_the_audit_is_quiet_on_hostile_beams(found):
+def test_audit_accepts_hard_beams(found):
     for o, d, voxel_m in found:
         worst_sum, longest_gap_m, misplaced, doubled = audited(traversal, o, [d], voxel_m=voxel_m)
         assert worst_sum < 1e-12
@@ -444,7 +447,7 @@ AUDIT_FAULTS = {
 
 
 @pytest.mark.parametrize(("figure", "fault"), list(AUDIT_FAULTS.items()), ids=list(AUDIT_FAULTS))
-def test_each_figure_of_the_audit_reacts(figure, fault):
+def test_each_figure_of_audit_detects_its_fault(figure, fault):
     # Far from the upper border: a faulty index stays within the counters.
     o, d = np.array([1.1, 0.6, 0.7]), np.array([[3.0, 1.3, 0.9], [2.5, 0.2, 0.4], [1.5, 2.0, 0.1]])
     with np.errstate(all="ignore"):
@@ -481,7 +484,7 @@ FAULTS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", list(FAULTS))
-def test_a_fault_in_the_march_shows_in_the_corpus(fault):
+def test_detects_fault_in_march(fault):
     faulty = with_fault(*FAULTS[fault])
     shown = []
     for entry in SOUND:
@@ -489,7 +492,7 @@ def test_a_fault_in_the_march_shows_in_the_corpus(fault):
         o, d = np.subtract(start, origin) / voxel_m, np.array(beam) / voxel_m  # not moved to planes: more hostile
         try:
             with np.errstate(all="ignore"):
-                wrong = set(listed(faulty, o, d, shape, voxel_m)) ^ oracle.crossed(o, d, shape, voxel_m)
+                wrong = set(list_voxels(faulty, o, d, shape, voxel_m)) ^ oracle.crossed(o, d, shape, voxel_m)
         except (IndexError, AssertionError, ValueError, OverflowError):
             shown.append(entry["name"])
             continue
@@ -502,14 +505,14 @@ def test_a_fault_in_the_march_shows_in_the_corpus(fault):
 
 
 @pytest.mark.slow
-def test_the_hunt_finds_nothing():
+def test_random_search_finds_no_difference():
     rows = hunt.rows(1e-4)
     assert [row.case for row in rows if row.mismatches] == []
     assert all(row.cases > 0 for row in rows)
 
 
 @pytest.mark.slow
-def test_the_hunts_quick_answers_are_the_oracles():
+def test_fast_answers_of_search_agree_with_oracle():
     """The hunt settles most segments in float64 with a margin, and asks the oracle about the rest; both must agree."""
     rng = np.random.default_rng(6)
     settled = 0
@@ -522,7 +525,7 @@ def test_the_hunts_quick_answers_are_the_oracles():
 
 
 @pytest.mark.slow
-def test_the_hunts_count_of_fragile_beams_is_the_oracles():
+def test_fragile_count_of_search_agrees_with_oracle():
     rng = np.random.default_rng(7)
     shape = np.array(SHAPE, np.int64)
     for o, d in zip(*hunt.hostile(rng, 100, shape, 0.25), strict=True):

@@ -26,7 +26,7 @@ SITES = {
 }
 
 
-def listed(kernels, o, d, shape, voxel_m):
+def list_voxels(kernels, o, d, shape, voxel_m):
     """The voxels that ``crossed`` lists, once each; None where it is not certain."""
     o, d, shape = np.array(o, float), np.array(d, float), np.asarray(shape, np.int64)
     cells = kernels.cell_buffer(shape)
@@ -45,9 +45,9 @@ def exact(o, d, shape, voxel_m):
     return None if oracle.doubtful(o, d, shape, voxel_m) else oracle.crossed(o, d, shape, voxel_m)
 
 
-def is_right(kernels, o, d, shape, voxel_m):
-    """Whether what is listed is what rational arithmetic says, and nothing doubtful; True where not certain."""
-    found = listed(kernels, o, d, shape, voxel_m)
+def agrees_with_exact_march(kernels, o, d, shape, voxel_m):
+    """Whether the listed voxels agree with rational arithmetic; True where the kernel is not certain."""
+    found = list_voxels(kernels, o, d, shape, voxel_m)
     return found is None or found == exact(tuple(o), tuple(d), tuple(shape), voxel_m)
 
 
@@ -66,7 +66,7 @@ def beams(o, n=400, seed=3):
     return ends - o
 
 
-def exactly(o, d, shape, voxel_m, weights):
+def exact_hits(o, d, shape, voxel_m, weights):
     """Hits by the lists of the exact march."""
     hits, shape = np.zeros(np.prod(shape), np.int64), np.asarray(shape, np.int64)
     cells, t_cells = np.empty(shape.sum() + 3, np.int64), np.empty((shape.sum() + 3, 2))
@@ -79,22 +79,22 @@ def exactly(o, d, shape, voxel_m, weights):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("entry", SOUND, ids=[entry["name"] for entry in SOUND])
-def test_hostile_segment(entry):
+def test_hard_segment(entry):
     o, d, shape, voxel_m = in_voxels(entry)
     if is_near(entry, False):
-        assert is_right(traversal, o, d, shape, voxel_m)
+        assert agrees_with_exact_march(traversal, o, d, shape, voxel_m)
 
 
 @seldom
 @given(segments())
-def test_any_segment_like_rational_arithmetic(segment):
+def test_random_segment_agrees_with_rational_arithmetic(segment):
     o, d, voxel_m = segment
-    event("certain" if listed(traversal, o, d, SHAPE, voxel_m) is not None else "not certain")
-    assert is_right(traversal, o, d, SHAPE, voxel_m)
+    event("certain" if list_voxels(traversal, o, d, SHAPE, voxel_m) is not None else "not certain")
+    assert agrees_with_exact_march(traversal, o, d, SHAPE, voxel_m)
 
 
 @pytest.mark.parametrize("site", list(SITES))
-def test_a_sensors_beams_are_counted_as_the_exact_march_does(site):
+def test_beams_of_sensor_agree_with_exact_march(site):
     o, shape = np.array(SITES[site]), np.array(GRID, np.int64)
     d = beams(o)
     weights = np.arange(1, len(d) + 1)
@@ -102,22 +102,22 @@ def test_a_sensors_beams_are_counted_as_the_exact_march_does(site):
     traversal.count_hits(o, d, shape, VOXEL_M, hits)
     traversal.add_hits(o, d, shape, VOXEL_M, weights, weighted)
     assert hits.sum() > len(d)
-    assert np.array_equal(hits, exactly(o, d, shape, VOXEL_M, np.ones_like(weights)))
-    assert np.array_equal(weighted, exactly(o, d, shape, VOXEL_M, weights))
+    assert np.array_equal(hits, exact_hits(o, d, shape, VOXEL_M, np.ones_like(weights)))
+    assert np.array_equal(weighted, exact_hits(o, d, shape, VOXEL_M, weights))
 
 
 @pytest.mark.parametrize("site", list(SITES))
-def test_few_beams_are_left_to_the_exact_march(site):
+def test_few_beams_need_the_exact_march(site):
     o = np.array(SITES[site])
-    crossing = [beam for beam in beams(o) if exactly(o, [beam], GRID, VOXEL_M, [1]).any()]
-    left = sum(listed(traversal, o, beam, GRID, VOXEL_M) is None for beam in crossing)
+    crossing = [beam for beam in beams(o) if exact_hits(o, [beam], GRID, VOXEL_M, [1]).any()]
+    left = sum(list_voxels(traversal, o, beam, GRID, VOXEL_M) is None for beam in crossing)
     assert left <= 0.01 * len(crossing)
 
 
 def test_level_beams_from_a_plane_are_certain():
     o, turn = np.array([30.25, 20.5, 4.0]), np.deg2rad(np.arange(0.7, 360, 7.3))
     for level in np.column_stack([np.cos(turn), np.sin(turn), np.zeros(len(turn))]) * 100:
-        found = listed(traversal, o, level, GRID, VOXEL_M)
+        found = list_voxels(traversal, o, level, GRID, VOXEL_M)
         assert found is not None
         assert {k for _, _, k in found} == {4}
 
@@ -133,7 +133,7 @@ def test_level_beams_from_a_plane_are_certain():
     ],
     ids=["a long axis", "too many voxels", "voxels as small as the chord", "from too far", "from nowhere"],
 )
-def test_where_nothing_is_certain_it_says_so(shape, voxel_m, o):
+def test_reports_uncertain_beams(shape, voxel_m, o):
     o, shape = np.array(o), np.array(shape, np.int64)
     near = traversal.make_tolerances(o, shape, traversal.CHORD_M / voxel_m)
     assert near.plane == np.inf
@@ -141,7 +141,7 @@ def test_where_nothing_is_certain_it_says_so(shape, voxel_m, o):
 
 
 @pytest.mark.slow
-def test_digits_that_a_million_steps_cut_off_have_room():
+def test_margin_covers_truncation_of_a_million_steps():
     """Each step is nearly a digit too short, so y is wrong by some 1e-6 where it has just passed a plane: not certain.
     Without room for a whole digit a step, voxels on the wrong side of the plane would be listed."""
     shape, voxel_m, step = np.array([2**20, 2, 2], np.int64), 1e4, (2.0**16 + 0.9999) / 2.0**40
@@ -158,9 +158,9 @@ def test_digits_that_a_million_steps_cut_off_have_room():
 
 
 @pytest.mark.parametrize("x", [5e-324, 1e-310, 1e-300, 1e200, 1.7e308])
-def test_extents_that_vanish_or_overflow_are_left_to_the_exact_march(x):
-    assert listed(traversal, (0.5, 0.5, 0.5), (3.0, x, 0.1), SHAPE, VOXEL_M) is None
-    assert listed(traversal, (0.5, 0.5, 0.5), (0.0, 0.0, -x), SHAPE, VOXEL_M) is None
+def test_zero_or_overflowing_extents_need_the_exact_march(x):
+    assert list_voxels(traversal, (0.5, 0.5, 0.5), (3.0, x, 0.1), SHAPE, VOXEL_M) is None
+    assert list_voxels(traversal, (0.5, 0.5, 0.5), (0.0, 0.0, -x), SHAPE, VOXEL_M) is None
 
 
 # --- faults -----------------------------------------------------------------------------------------------------------
@@ -196,7 +196,7 @@ FAULTS = {
 }
 
 
-def crooked():
+def hard_beams():
     """Segments of a few voxels that cut corners and end on planes, beside the corpus: (o, d, shape, voxel_m)."""
     rng = np.random.default_rng(8)
     shape = (9, 7, 5)
@@ -218,18 +218,18 @@ def crooked():
         yield ends[0], ends[1] - ends[0], shape, VOXEL_M
 
 
-CASES = [*(in_voxels(entry) for entry in SOUND if is_near(entry, False)), *crooked()]
+CASES = [*(in_voxels(entry) for entry in SOUND if is_near(entry, False)), *hard_beams()]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", list(FAULTS))
-def test_a_fault_shows(fault):
+def test_detects_fault(fault):
     faulty = with_fault(*FAULTS[fault])
     shown = 0
     for o, d, shape, voxel_m in CASES:
         try:
             with np.errstate(all="ignore"):
-                shown += not is_right(faulty, o, d, shape, voxel_m)
+                shown += not agrees_with_exact_march(faulty, o, d, shape, voxel_m)
         except (IndexError, AssertionError, ValueError, OverflowError):
             shown += 1
     assert bool(shown) == (fault != "none"), shown

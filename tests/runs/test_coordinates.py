@@ -17,9 +17,9 @@ from egvs.core.errors import InputError
 from egvs.formats.georeference import WorldFrame
 from egvs.report.ranking import Ranking
 from egvs.stages import traffic
-from tests.checks.conftest import net_xml
 from tests.conftest import write_mini
-from tests.stages import inputs_of
+from tests.stage_runner import inputs_of
+from tests.stages.conftest import net_xml
 
 CRS = "\n[crs]\nepsg = 32632\noffset_m = [-550700, -5635200]\n"
 FRAME = WorldFrame("EPSG:32632", (-550_700.0, -5_635_200.0))
@@ -47,7 +47,7 @@ def named(crs: str) -> dict[str, Any]:
 
 
 def write_geojson(path: Path, features: list[dict[str, Any]], move: Move, crs: str | None) -> None:
-    """As geopandas writes it: ``type, name, crs, features``; without ``crs`` as RFC 7946 has it."""
+    """Write the members of geopandas: ``type, name, crs, features``; without ``crs``, those of RFC 7946."""
 
     def moved(value: Any) -> Any:
         if isinstance(value[0], list):
@@ -97,14 +97,11 @@ def in_metres(tmp_path_factory: pytest.TempPathFactory) -> pa.Table:
     ("move", "crs"),
     [
         pytest.param(to_degrees, "urn:ogc:def:crs:OGC:1.3:CRS84", id="geopandas-4326"),
-        pytest.param(to_degrees, None, id="rfc-7946"),
         pytest.param(to_utm, "urn:ogc:def:crs:EPSG::32632", id="geopandas-projected"),
         pytest.param(to_gauss_kruger, "urn:ogc:def:crs:EPSG::31467", id="geopandas-another-datum"),
     ],
 )
-def test_geojson_in_every_system_ends_in_the_scores_of_metres(
-    tmp_path: Path, in_metres: pa.Table, move: Move, crs: str | None
-) -> None:
+def test_geojson_in_any_crs_gives_same_scores(tmp_path: Path, in_metres: pa.Table, move: Move, crs: str | None) -> None:
     found = scores(moved_mini(tmp_path / "mini", move, crs), tmp_path / "run")
     assert len(set(in_metres["egvs"].to_pylist())) == 2
     if move is to_gauss_kruger:
@@ -115,8 +112,13 @@ def test_geojson_in_every_system_ends_in_the_scores_of_metres(
         assert found.equals(in_metres)
 
 
+def test_rejects_geojson_without_crs(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r'geojson.*: the file does not declare its coordinate system.*Set "crs"'):
+        scores(moved_mini(tmp_path / "mini", to_degrees, None), tmp_path / "run")
+
+
 @pytest.mark.parametrize("columns", ["lon,lat", "Longitude,Latitude", "longitude_deg,latitude_deg", "x_m,y_m,lon,lat"])
-def test_a_csv_may_have_longitude_and_latitude(tmp_path: Path, in_metres: pa.Table, columns: str) -> None:
+def test_csv_with_longitude_and_latitude_gives_same_scores(tmp_path: Path, in_metres: pa.Table, columns: str) -> None:
     folder = write_mini(tmp_path / "mini")
     rows = [f"site,z_m,{columns}"]
     for name, x, y, z in (("pole_a", 10.0, 12.0, 3), ("pole_b", 30.5, -12.0, 3)):
@@ -127,7 +129,7 @@ def test_a_csv_may_have_longitude_and_latitude(tmp_path: Path, in_metres: pa.Tab
     assert scores(folder, tmp_path / "run").equals(in_metres)
 
 
-def fcd_in_degrees(folder: Path) -> None:
+def write_fcd_in_degrees(folder: Path) -> None:
     head, *rows = (folder / "fcd.csv").read_text().splitlines()
     moved = []
     for row in rows:
@@ -137,17 +139,19 @@ def fcd_in_degrees(folder: Path) -> None:
     (folder / "fcd.csv").write_text("\n".join([head, *moved]) + "\n")
 
 
-def test_a_periods_fcd_lies_where_the_scenarios_network_says(tmp_path: Path, in_metres: pa.Table) -> None:
+def test_period_fcd_uses_georeference_of_network(tmp_path: Path, in_metres: pa.Table) -> None:
     """Another place for the world is other traffic: the stage runs again."""
     folder = write_mini(tmp_path / "mini")
-    fcd_in_degrees(folder)
+    write_fcd_in_degrees(folder)
     location = 'netOffset="-550700,-5635200" projParameter="+proj=utm +zone=32 +datum=WGS84 +units=m +no_defs"'
     lanes = net_xml().replace('netOffset="0.00,0.00" projParameter="!"', location)
     (folder / "net.net.xml").write_text(lanes)
     scenario = folder / "scenario.toml"
     period = '[[traffic.periods]]\nname = "day"\nfcd = "fcd.csv"\n\n[[traffic.kinds]]'
     text = (
-        scenario.read_text().replace('fcd = "fcd.csv"', 'network = "net.net.xml"').replace("[[traffic.kinds]]", period)
+        scenario.read_text()
+        .replace('fcd = "fcd.csv"', 'network = "net.net.xml"\nfcd_geo = true')
+        .replace("[[traffic.kinds]]", period)
     )
     scenario.write_text(text)
     assert scores(folder, tmp_path / "run")["egvs"].to_pylist() == in_metres["egvs"].to_pylist()
@@ -156,19 +160,23 @@ def test_a_periods_fcd_lies_where_the_scenarios_network_says(tmp_path: Path, in_
     assert inputs_of(traffic, egvs.load(folder), tmp_path / "run").to_json() != before
 
 
-def test_fcd_in_degrees_ends_in_the_scores_of_metres(tmp_path: Path, in_metres: pa.Table) -> None:
-    """As ``--fcd-output.geo`` writes it; a scene whose frame is unknown refuses it."""
+def test_fcd_in_degrees_gives_same_scores(tmp_path: Path, in_metres: pa.Table) -> None:
+    """As ``--fcd-output.geo`` writes it; it must be declared, and the position of the world frame known."""
     folder = write_mini(tmp_path / "mini")
-    fcd_in_degrees(folder)
+    write_fcd_in_degrees(folder)
     with pytest.raises(
-        InputError, match=r"fcd.csv: its coordinates \(9.72.* look like longitude and latitude, and nothing"
+        InputError, match=r"fcd.csv: x and y look like longitude and latitude, but the position of the world frame"
     ):
-        scores(folder, tmp_path / "refused")
-    (folder / "scenario.toml").write_text((folder / "scenario.toml").read_text() + CRS)
+        scores(folder, tmp_path / "no_frame")
+    scenario = folder / "scenario.toml"
+    scenario.write_text(scenario.read_text() + CRS)
+    with pytest.raises(InputError, match=r"fcd.csv: .*got longitude and latitude.*Set traffic.fcd_geo = true"):
+        scores(folder, tmp_path / "not_declared")
+    scenario.write_text(scenario.read_text().replace('fcd = "fcd.csv"', 'fcd = "fcd.csv"\nfcd_geo = true'))
     assert scores(folder, tmp_path / "run").equals(in_metres)
 
 
-def test_scores_say_where_the_sites_are_and_nothing_else_changes(tmp_path: Path, in_metres: pa.Table) -> None:
+def test_scores_have_longitude_and_latitude(tmp_path: Path, in_metres: pa.Table) -> None:
     places = zip(in_metres["longitude_deg"].to_pylist(), in_metres["latitude_deg"].to_pylist(), strict=True)
     for place, metres in zip(places, [(10.0, 12.0), (30.5, -12.0)], strict=True):
         assert place == pytest.approx(to_degrees(*metres), abs=1e-9)
@@ -179,7 +187,7 @@ def test_scores_say_where_the_sites_are_and_nothing_else_changes(tmp_path: Path,
     assert "Latitude" not in (tmp_path / "run" / "report.html").read_text()
 
 
-def test_the_report_says_where_the_sites_are(tmp_path: Path) -> None:
+def test_report_shows_coordinates(tmp_path: Path) -> None:
     folder = write_mini(tmp_path / "mini")
     (folder / "scenario.toml").write_text((folder / "scenario.toml").read_text() + CRS)
     scores(folder, tmp_path / "run")
@@ -190,9 +198,9 @@ def test_the_report_says_where_the_sites_are(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_new_crs_makes_the_sites_stand_elsewhere(tmp_path: Path) -> None:
+def test_changed_crs_moves_sites(tmp_path: Path) -> None:
     """Stages that read degrees run again when the frame is another; those that do not know it are left."""
-    folder = moved_mini(tmp_path / "mini", to_degrees, None)
+    folder = moved_mini(tmp_path / "mini", to_degrees, "urn:ogc:def:crs:OGC:1.3:CRS84")
     scores(folder, tmp_path / "run")
     text = (folder / "scenario.toml").read_text().replace("-550700", "-550690")
     (folder / "scenario.toml").write_text(text)

@@ -68,7 +68,7 @@ INPUTS = {
 
 @pytest.mark.parametrize("verb", ["run", "statics", "report", "accuracy", "validate"])
 @pytest.mark.parametrize(("put", "message"), INPUTS.values(), ids=INPUTS.keys())
-def test_an_input_is_not_written_over(mini: Path, run_egvs, put, message: str, verb: str) -> None:
+def test_run_does_not_overwrite_input(mini: Path, run_egvs, put, message: str, verb: str) -> None:
     put(mini)
     before = tree(mini)
     code, _, error = run_egvs(verb, mini, "--out", mini)
@@ -86,7 +86,7 @@ STUDIES = {
 
 
 @pytest.mark.parametrize(("words", "name"), STUDIES.values(), ids=STUDIES.keys())
-def test_a_study_writes_over_no_input(mini: Path, run_egvs, words: tuple[str, ...], name: str) -> None:
+def test_study_does_not_overwrite_input(mini: Path, run_egvs, words: tuple[str, ...], name: str) -> None:
     (mini / name).parent.mkdir(exist_ok=True)
     (mini / name).write_text(fcd())
     named(mini, "fcd.csv", name)
@@ -96,7 +96,7 @@ def test_a_study_writes_over_no_input(mini: Path, run_egvs, words: tuple[str, ..
     assert tree(mini) == before
 
 
-def test_results_are_not_read_where_they_are_written_anew(mini: Path, tmp_path: Path, run_egvs) -> None:
+def test_rejects_input_in_results_folder(mini: Path, tmp_path: Path, run_egvs) -> None:
     theirs = tmp_path / "out" / "validation_kitti"
     theirs.mkdir(parents=True)
     code, _, error = run_egvs("validate", mini, "--out", tmp_path / "out", "--keep", "--detections", theirs)
@@ -104,7 +104,7 @@ def test_results_are_not_read_where_they_are_written_anew(mini: Path, tmp_path: 
     assert error.startswith(f"egvs: --detections {theirs}: ") and "--keep" in error
 
 
-def test_an_input_is_known_through_another_path(mini: Path, tmp_path: Path, run_egvs) -> None:
+def test_input_is_recognised_through_link(mini: Path, tmp_path: Path, run_egvs) -> None:
     a_mesh(mini)
     (tmp_path / "link").symlink_to(mini)
     code, _, error = run_egvs("run", mini, "--out", tmp_path / "link")
@@ -116,14 +116,14 @@ def test_an_input_is_known_through_another_path(mini: Path, tmp_path: Path, run_
     assert (code, "write over tpog.parquet, which the scenario names (traffic.fcd)" in error) == (2, True)
 
 
-def test_a_run_within_the_folder_that_writes_over_nothing_is_made(mini: Path, run_egvs) -> None:
+def test_run_inside_scenario_folder_is_allowed(mini: Path, run_egvs) -> None:
     before = tree(mini)
     code, _, error = run_egvs("run", mini, "--out", mini)
     assert code == 0, error
     assert {name: tree(mini)[name] for name in before} == before
 
 
-def test_a_lock_that_is_a_link_is_refused(mini: Path, tmp_path: Path, run_egvs) -> None:
+def test_rejects_lock_that_is_link(mini: Path, tmp_path: Path, run_egvs) -> None:
     (tmp_path / "mine").write_text("kept")
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / ".lock").symlink_to(tmp_path / "mine")
@@ -134,7 +134,7 @@ def test_a_lock_that_is_a_link_is_refused(mini: Path, tmp_path: Path, run_egvs) 
 
 
 @pytest.mark.parametrize("place", ["sumo", "sumo/log.txt", "sumo/am"])
-def test_a_link_where_sumo_writes_is_refused(mini: Path, tmp_path: Path, run_egvs, place: str) -> None:
+def test_rejects_link_in_sumo_folder(mini: Path, tmp_path: Path, run_egvs, place: str) -> None:
     link = tmp_path / "out" / place
     link.parent.mkdir(parents=True)
     link.symlink_to(tmp_path / "elsewhere")
@@ -144,7 +144,7 @@ def test_a_link_where_sumo_writes_is_refused(mini: Path, tmp_path: Path, run_egv
 
 
 @pytest.mark.parametrize("place", ["validation_kitti", ".validation_kitti.partial", "validation_kitti/pole_a"])
-def test_a_link_where_detections_are_kept_is_refused(mini: Path, tmp_path: Path, run_egvs, place: str) -> None:
+def test_rejects_link_in_detections_folder(mini: Path, tmp_path: Path, run_egvs, place: str) -> None:
     link = tmp_path / "out" / place
     link.parent.mkdir(parents=True)
     (tmp_path / "elsewhere").mkdir()
@@ -154,7 +154,7 @@ def test_a_link_where_detections_are_kept_is_refused(mini: Path, tmp_path: Path,
     assert (code, error) == (2, f"egvs: {link}: {what}\n")
 
 
-def test_artefacts_and_what_becomes_one_replace_links(mini: Path, tmp_path: Path) -> None:
+def test_artefacts_replace_links(mini: Path, tmp_path: Path) -> None:
     (tmp_path / "mine").write_text("kept")
     out = tmp_path / "out"
     out.mkdir()
@@ -169,7 +169,7 @@ def test_artefacts_and_what_becomes_one_replace_links(mini: Path, tmp_path: Path
 
 
 @pytest.mark.slow
-def test_a_gamma_without_bound_is_json_and_comes_back(mini: Path, tmp_path: Path, run_egvs) -> None:
+def test_infinite_gamma_round_trips_through_json(mini: Path, tmp_path: Path, run_egvs) -> None:
     def no_constant(name: str) -> float:
         raise AssertionError(f"{name} is no JSON")
 
@@ -186,29 +186,32 @@ def test_a_gamma_without_bound_is_json_and_comes_back(mini: Path, tmp_path: Path
 
 
 NOTHING = {
-    "gamma": (["score.gamma=0"], "score.gamma: egvs is 0 at every site, so none is best: gamma is 0; a gamma above 0"),
+    "gamma": (
+        ["score.gamma=0"],
+        "score.gamma: egvs is 0 at every site, so there is no ranking: gamma is 0. Set gamma above 0.",
+    ),
     "roi above the traffic": (
         ["roi.center_m=[20,0,42.5]"],
-        "roi: egvs is 0 at every site, so none is best: no traffic comes and goes in the region; "
-        "a region with traffic in it",
+        "roi: egvs is 0 at every site, so there is no ranking: the traffic in the region never changes. "
+        "Move or enlarge the region of interest.",
     ),
     "sensors that look up": (
         ["sensors.small.elevations_deg=[60,80]"],
-        "sites: egvs is 0 at every site, so none is best: no beam crosses a place with traffic; "
-        "sites and sensors that look at the traffic in the region",
+        "sites: egvs is 0 at every site, so there is no ranking: no beam crosses a voxel with traffic. "
+        "Check poses, sensors and the region of interest.",
     ),
 } | {
     score: (
         ["sensors.small.elevations_deg=[60,80]", f"score.rank_by='{score}'"],
-        f"sites: {score} is 0 at every site, so none is best: no beam crosses a place with traffic; "
-        "sites and sensors that look at the traffic in the region",
+        f"sites: {score} is 0 at every site, so there is no ranking: no beam crosses a voxel with traffic. "
+        "Check poses, sensors and the region of interest.",
     )
     for score in ("expected_detections", "seen_well", "points_on_target", "entropy_seen", "coverage")
 }
 
 
 @pytest.mark.parametrize(("settings", "message"), NOTHING.values(), ids=NOTHING.keys())
-def test_nothing_seen_at_any_site_is_no_ranking(mini: Path, tmp_path: Path, run_egvs, settings, message: str) -> None:
+def test_warns_that_scores_are_zero_at_every_site(mini: Path, tmp_path: Path, run_egvs, settings, message: str) -> None:
     changes = [word for setting in settings for word in ("--set", setting)]
     code, printed, error = run_egvs("run", mini, "--out", tmp_path / "out", *changes)
     assert code == 0, error
@@ -218,7 +221,7 @@ def test_nothing_seen_at_any_site_is_no_ranking(mini: Path, tmp_path: Path, run_
     assert json.loads((tmp_path / "out" / "run.json").read_text())["stages"]["score"]["summary"]["best"] == []
 
 
-def test_names_are_no_markup(mini: Path, tmp_path: Path, run_egvs) -> None:
+def test_names_are_not_taken_for_markup(mini: Path, tmp_path: Path, run_egvs) -> None:
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\n[red]S1,10,12,3\n[x] :car:,30.5,-12,3\n")
     code, printed, error = run_egvs("run", mini, "--out", tmp_path / "out")
     assert code == 0, error
@@ -226,13 +229,13 @@ def test_names_are_no_markup(mini: Path, tmp_path: Path, run_egvs) -> None:
 
 
 @pytest.mark.slow
-def test_another_score_that_is_0_everywhere_is_told(mini: Path, tmp_path: Path, run_egvs) -> None:
+def test_warns_of_additional_score_that_is_zero_everywhere(mini: Path, tmp_path: Path, run_egvs) -> None:
     settings = ("--set", "score.rank_by='seen_well'", "--set", "score.gamma=0")
     code, printed, error = run_egvs("run", mini, "--out", tmp_path / "out", *settings)
     assert code == 0, error
-    told = "egvs is 0 at every site, so it tells none from another; sites, sensors and settings by which it is above 0"
     assert [line for line in error.splitlines() if "is 0 at" in line] == [
-        f"warning: scenario.toml: score: {told} somewhere"
+        "warning: scenario.toml: score: egvs is 0 at every site, so it does not distinguish them. "
+        "Check sites, sensors and effects."
     ]
     assert "   1  pole_" in printed, "the other score ranks all the same"
     assert "is 0 at every site" not in run_egvs("run", mini, "--out", tmp_path / "two")[2]

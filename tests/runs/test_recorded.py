@@ -15,7 +15,6 @@ from egvs.core.errors import InputError
 from egvs.core.files import add_checksum
 from egvs.runs import run
 from egvs.stages import inputs
-from egvs.stages.base import static_world
 from egvs.stages.inputs import open_folder
 from egvs.studies.effect_study import EffectTrials
 
@@ -64,7 +63,7 @@ def answer(verb: str, scenario: egvs.Scenario, out: Path) -> str:
 
 
 @pytest.mark.parametrize(("name", "verb"), PAIRS)
-def test_any_flipped_bit_is_refused(runs, out: Path, name: str, verb: str) -> None:
+def test_rejects_artefact_with_flipped_bit(runs, out: Path, name: str, verb: str) -> None:
     whole, draw = (out / name).read_bytes(), random.Random(f"{name} {verb}")
     for _ in range(5):
         data = bytearray(whole)
@@ -82,13 +81,13 @@ def test_any_flipped_bit_is_refused(runs, out: Path, name: str, verb: str) -> No
 
 
 @pytest.mark.parametrize(("name", "verb"), PAIRS)
-def test_a_file_of_another_run_is_refused(runs, out: Path, name: str, verb: str) -> None:
+def test_rejects_artefact_of_another_run(runs, out: Path, name: str, verb: str) -> None:
     scenario, _, other = runs
     shutil.copyfile(other / name, out / name)
     assert f"{out / name}: was altered or replaced" in answer(verb, scenario, out)
 
 
-def test_a_file_that_no_stage_made_here_is_refused(runs, tmp_path: Path, run_egvs) -> None:
+def test_rejects_artefact_that_no_stage_wrote(runs, tmp_path: Path, run_egvs) -> None:
     scenario, made, _ = runs
     fresh = tmp_path / "fresh"
     fresh.mkdir()
@@ -100,7 +99,7 @@ def test_a_file_that_no_stage_made_here_is_refused(runs, tmp_path: Path, run_egv
     assert not (fresh / "tpog.parquet").exists()
 
 
-def test_the_run_that_the_message_asks_for_mends_it(runs, out: Path) -> None:
+def test_run_repairs_altered_artefact(runs, out: Path) -> None:
     for name in READ_BY:
         shutil.copyfile(runs[2] / name, out / name)
     run.run(runs[0], out)
@@ -108,7 +107,7 @@ def test_the_run_that_the_message_asks_for_mends_it(runs, out: Path) -> None:
 
 
 @pytest.mark.slow
-def test_stages_one_by_one_still_go_on_from_what_lies_there(runs, tmp_path: Path, run_egvs) -> None:
+def test_single_stages_continue_from_existing_artefacts(runs, tmp_path: Path, run_egvs) -> None:
     scenario, made, _ = runs
     for verb in ("statics", "scan", "traffic", "tpog", "score", "report"):
         code, _, error = run_egvs(verb, scenario.folder, "--out", tmp_path / "out")
@@ -117,7 +116,7 @@ def test_stages_one_by_one_still_go_on_from_what_lies_there(runs, tmp_path: Path
         assert files.hash_file(tmp_path / "out" / name) == files.hash_file(made / name)
 
 
-def test_what_a_stage_read_is_known_though_its_maker_is_of_other_settings_now(runs, out: Path, run_egvs) -> None:
+def test_digest_of_read_artefact_is_known_after_setting_change(runs, out: Path, run_egvs) -> None:
     """Traffic of other settings is no longer what the scenario says, and its record goes; the file is still known."""
     for _ in range(2):
         code, _, error = run_egvs("score", runs[0].folder, "--out", out, "--set", "traffic.frames=20")
@@ -125,7 +124,7 @@ def test_what_a_stage_read_is_known_though_its_maker_is_of_other_settings_now(ru
         assert "traffic" not in json.loads((out / "run.json").read_text())["stages"]
 
 
-def test_the_report_of_a_run_is_not_drawn_anew_of_altered_artefacts(runs, out: Path) -> None:
+def test_report_is_not_refreshed_from_altered_artefacts(runs, out: Path) -> None:
     assert run.refresh_report(out) is not None
     before = contents(out)["report.html"]
     shutil.copyfile(runs[2] / "scores.parquet", out / "scores.parquet")
@@ -134,8 +133,8 @@ def test_the_report_of_a_run_is_not_drawn_anew_of_altered_artefacts(runs, out: P
 
 
 @pytest.mark.parametrize("name", ["trajectories.parquet", "tpog.parquet", "statics.ply"])
-def test_effects_are_tried_on_no_altered_traffic(runs, out: Path, name: str) -> None:
-    scene = inputs.resolve_scene(runs[0], static_world(open_folder(runs[0], out)))
-    assert EffectTrials.of(scene, out) is not None
+def test_effect_study_rejects_altered_traffic(runs, out: Path, name: str) -> None:
+    scene = inputs.resolve_scene(runs[0], open_folder(runs[0], out).world)
+    assert EffectTrials.from_run(scene, out) is not None
     shutil.copyfile(runs[2] / name, out / name)
-    assert EffectTrials.of(scene, out) is None
+    assert EffectTrials.from_run(scene, out) is None

@@ -38,7 +38,7 @@ def machine(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def test_what_one_machine_made_another_one_fetches(
+def test_machine_fetches_entry_of_another_machine(
     mini: Path, tmp_path: Path, shared: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scenario = egvs.load(mini)
@@ -54,7 +54,7 @@ def test_what_one_machine_made_another_one_fetches(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("damage", ["bytes", "missing", "record", "climbs"])
-def test_what_is_damaged_there_is_made_again(
+def test_damaged_remote_entry_is_made_again(
     damage: str, mini: Path, tmp_path: Path, shared: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scenario = egvs.load(mini)
@@ -83,12 +83,12 @@ def test_what_is_damaged_there_is_made_again(
     assert not (tmp_path / "tpog.parquet").exists()
 
 
-def test_an_entry_without_its_record_is_none(shared: Any, tmp_path: Path) -> None:
+def test_entry_without_record_is_ignored(shared: Any, tmp_path: Path) -> None:
     shared.pipe_file("/shared/store/tpog-x/tpog.parquet", b"half")
     assert not RemoteStore(URL).fetch("tpog-x", tmp_path)
 
 
-def test_a_place_that_cannot_be_reached_is_told_once(
+def test_unreachable_store_is_reported_once(
     mini: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     machine(tmp_path / "one", monkeypatch)
@@ -97,17 +97,17 @@ def test_a_place_that_cannot_be_reached_is_told_once(
     monkeypatch.setenv("EGVS_STORE", url)
     run.run(egvs.load(mini), tmp_path / "out")
     told = [line for line in capsys.readouterr().err.splitlines() if url in line]
-    assert told and all("the run goes on without it" in line for line in told)
+    assert told and all("The run continues without it" in line for line in told)
     with pytest.raises(InputError, match="cannot be written"):
         RemoteStore(url).check()
 
 
-def test_an_unknown_kind_is_refused() -> None:
-    with pytest.raises(InputError, match=r"nowhere://x: cannot be reached .*; a place that this machine may read and"):
+def test_rejects_unknown_url_scheme() -> None:
+    with pytest.raises(InputError, match=r"nowhere://x: cannot be reached .*\. Check that this machine may read and"):
         RemoteStore("nowhere://x")
 
 
-def test_what_the_environment_says(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_environment_variables_select_store(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EGVS_STORE", "s3://bucket/store")
     assert store.read_store_settings()[0] == store.DEFAULT_FOLDER
     assert store.remote_url() == "s3://bucket/store"
@@ -119,6 +119,6 @@ def test_what_the_environment_says(monkeypatch: pytest.MonkeyPatch) -> None:
     assert store.remote_url() is None
 
 
-def test_a_place_is_probed_and_left_as_it_was(shared: Any) -> None:
+def test_check_leaves_remote_store_unchanged(shared: Any) -> None:
     RemoteStore(URL).check()
     assert not shared.find("/shared")

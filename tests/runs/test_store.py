@@ -235,7 +235,7 @@ def test_a_damaged_entry_is_named_and_made_again(
     del found["report"], expected["report"]  # which shows what the tpog cost
     assert found == expected
     said = capsys.readouterr().err
-    assert "the kept tpog is damaged" in said and "Traceback" not in said
+    assert "the cached tpog is damaged" in said and "Traceback" not in said
     assert digests(tmp_path / "other") == digests(out)
     assert_whole(store)
     assert states(scenario, tmp_path / "third")["tpog"] == "fetched"
@@ -339,7 +339,7 @@ def test_the_bound_holds_from_the_first_entry_on(
     entries = assert_whole(store)
     assert 0 < sum(entry.bytes for entry in entries) <= 1.5e5 and len(entries) < len(STAGE_NAMES)
     monkeypatch.setenv("EGVS_STORE_MAX_GB", "lots")
-    with pytest.raises(InputError, match="EGVS_STORE_MAX_GB: 'lots'"):
+    with pytest.raises(InputError, match="EGVS_STORE_MAX_GB: expected a number of GB, got 'lots'"):
         egvs.run(scenario, tmp_path / "other")
     assert not (tmp_path / "other").exists()
 

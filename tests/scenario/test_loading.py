@@ -1,4 +1,4 @@
-"""Scenarios that build on others: what takes the place of what."""
+"""Scenarios that extend others: which keys replace which."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def extended(tmp_path: Path, above: str, below: str = DRAWN, *overrides: str) ->
     return egvs.load(tmp_path / "above", overrides)
 
 
-def test_a_rule_for_sites_takes_the_place_of_a_file_and_of_its_measured_scan(tmp_path: Path) -> None:
+def test_rule_replaces_site_file_and_measured_scan(tmp_path: Path) -> None:
     sites = extended(tmp_path, GRID).sites
     assert (sites.file, sites.points, sites.pitch_deg) == (None, None, -5)
     assert sites.grid is not None and sites.grid.spacing_m == 3
@@ -53,7 +53,7 @@ def test_a_rule_for_sites_takes_the_place_of_a_file_and_of_its_measured_scan(tmp
     assert (back.file, back.grid) == ("other.csv", None)
 
 
-def test_a_table_of_the_same_source_still_merges(tmp_path: Path) -> None:
+def test_merges_table_of_same_source(tmp_path: Path) -> None:
     sites = extended(tmp_path, "[sites.grid]\nspacing_m = 1\n", DRAWN.split("[sites]")[0] + GRID).sites
     assert sites.grid is not None
     assert (sites.grid.spacing_m, sites.grid.high_m) == (1, (9, 0))
@@ -61,7 +61,7 @@ def test_a_table_of_the_same_source_still_merges(tmp_path: Path) -> None:
     assert (traffic.network, traffic.vehicles) == ("b.net.xml", 30)
 
 
-def test_a_finished_file_takes_the_place_of_a_network_and_of_what_it_alone_needed(tmp_path: Path) -> None:
+def test_finished_file_replaces_network_and_its_keys(tmp_path: Path) -> None:
     traffic = extended(tmp_path, '[traffic]\nfcd = "fcd.csv"\n').traffic
     assert (traffic.network, traffic.fcd) == (None, "fcd.csv")
     assert (traffic.warmup_s, traffic.frames, traffic.frame_period_s) == (0, None, 1.0)
@@ -71,7 +71,7 @@ def test_a_finished_file_takes_the_place_of_a_network_and_of_what_it_alone_neede
 
 @pytest.mark.parametrize("source", ["network", "sumocfg", "fcd"])
 @pytest.mark.parametrize("old", ["network", "sumocfg", "fcd"])
-def test_the_new_source_of_traffic_wins(tmp_path: Path, old: str, source: str) -> None:
+def test_new_source_of_traffic_replaces_old(tmp_path: Path, old: str, source: str) -> None:
     below = f'[roi]\ncenter_m = [0, 0, 1]\nsize_m = [4, 4, 2]\n[sites]\nfile = "s.csv"\n[traffic]\n{old} = "old"\n'
     traffic = extended(tmp_path, f'[traffic]\n{source} = "new"\n', below).traffic
     assert {key: getattr(traffic, key) for key in ("network", "sumocfg", "fcd") if getattr(traffic, key)} == {
@@ -79,26 +79,26 @@ def test_the_new_source_of_traffic_wins(tmp_path: Path, old: str, source: str) -
     }
 
 
-def test_routes_of_another_source_are_left_behind(tmp_path: Path) -> None:
+def test_routes_are_dropped_with_their_source(tmp_path: Path) -> None:
     below = BASE.split("[[traffic.kinds]]")[0] + "[sites]" + BASE.split("[sites]")[1]
     assert extended(tmp_path, '[traffic]\nsumocfg = "x.sumocfg"\n', below).traffic.routes == ()
     assert extended(tmp_path, '[traffic]\nnetwork = "b.net.xml"\n', below).traffic.routes == ("a.rou.xml",)
 
 
-def test_an_override_takes_the_place_of_a_source_too(tmp_path: Path) -> None:
+def test_override_replaces_source(tmp_path: Path) -> None:
     scenario = extended(tmp_path, "", DRAWN, "traffic.fcd=x.csv", "sites.along=[]", "sites.file=y.csv")
     assert (scenario.traffic.network, scenario.traffic.fcd, scenario.sites.file) == (None, "x.csv", "y.csv")
 
 
-def test_two_sources_in_one_place_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="exactly one of network, sumocfg and fcd is needed, found network and fcd"):
+def test_rejects_two_sources(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="expected exactly one of network, sumocfg and fcd, got network and fcd"):
         extended(tmp_path, '[traffic]\nfcd = "x.csv"\nnetwork = "b.net.xml"\n')
-    with pytest.raises(InputError, match="vehicles would act on nothing beside fcd"):
+    with pytest.raises(InputError, match="vehicles has no effect with fcd"):
         extended(tmp_path, '[traffic]\nfcd = "x.csv"\nvehicles = 5\n')
 
 
 @pytest.mark.parametrize("row", ["car", "0"])
-def test_a_row_of_a_table_is_set_by_its_name_or_its_number(mini: Path, row: str) -> None:
+def test_override_finds_row_by_name_or_number(mini: Path, row: str) -> None:
     scenario = egvs.load(mini, [f"traffic.kinds.{row}.length_m=6.5"])
     assert scenario.traffic.kinds[0].length_m == 6.5
     assert scenario.traffic.kinds[1:] == egvs.load(mini).traffic.kinds[1:]

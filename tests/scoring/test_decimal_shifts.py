@@ -17,7 +17,7 @@ from egvs.scoring.scorer import Scorer
 from egvs.sensors.scanner import Scanner
 from egvs.stages import statics, tpog, traffic
 from tests.conftest import collection, feature
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 
 SCENARIO = """\
 [roi]

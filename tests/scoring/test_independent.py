@@ -24,7 +24,7 @@ from egvs.scenario import loading
 from egvs.stages import scan, score, statics, tpog, traffic
 from egvs.world.mesh import World, read_ply, write_ply
 from tests.oracles import cast
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]  # SUMO makes the traffic
 

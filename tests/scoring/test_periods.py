@@ -21,9 +21,10 @@ from egvs.artefacts.readers import PeriodRanking, read_scores_by_period
 from egvs.artefacts.tpog import read_periods, read_tpog
 from egvs.core.errors import Diagnostic, InputError, collect_warnings
 from egvs.core.grid import Grid
-from egvs.scoring import score_table, scorer
+from egvs.scoring import score_table
 from egvs.scoring.egvs import EntropyField, binary_entropy
-from egvs.scoring.score_table import ScoreColumn
+from egvs.scoring.score_table import ScoreTable, SiteScores
+from egvs.scoring.scorer import SiteScore
 from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, ScoreUncertainty
 from egvs.stages import traffic
 from egvs.stages.inputs import open_folder
@@ -54,7 +55,7 @@ def of(table: object) -> list[dict[str, object]]:
     return table.to_pylist()  # type: ignore[attr-defined, no-any-return]
 
 
-def test_the_mix_is_exact(split: Path, tmp_path: Path) -> None:
+def test_mix_is_exact(split: Path, tmp_path: Path) -> None:
     record = egvs.run(egvs.load(split), tmp_path)
     path = tmp_path / "tpog.parquet"
     day, night, mix = read_tpog(path, "day"), read_tpog(path, "night"), read_tpog(path)
@@ -77,7 +78,7 @@ def test_the_mix_is_exact(split: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_each_period_is_scored_as_if_it_were_alone(split: Path, tmp_path: Path) -> None:
+def test_period_scores_equal_those_of_separate_run(split: Path, tmp_path: Path) -> None:
     egvs.run(egvs.load(split), tmp_path / "both")
     by_period = of(read_scores_by_period(tmp_path / "both" / "scores_by_period.parquet"))
     text = (split / "scenario.toml").read_text().replace(PERIODS, "")
@@ -94,7 +95,7 @@ def test_each_period_is_scored_as_if_it_were_alone(split: Path, tmp_path: Path) 
 
 
 @pytest.mark.slow
-def test_frames_stand_one_after_another_and_weights_need_no_new_traffic(split: Path, tmp_path: Path) -> None:
+def test_changed_weights_need_no_new_traffic(split: Path, tmp_path: Path) -> None:
     egvs.run(egvs.load(split), tmp_path)
     table, about = parquet.read_artefact(tmp_path / "trajectories.parquet", "trajectories")
     assert (about["frames"], about["periods"]) == (40, [{"name": "day", "frames": 24}, {"name": "night", "frames": 16}])
@@ -109,7 +110,7 @@ def test_frames_stand_one_after_another_and_weights_need_no_new_traffic(split: P
 
 
 @pytest.mark.slow
-def test_a_run_with_periods_is_the_same_again_and_shows_them(split: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
+def test_run_with_periods_is_reproducible_and_reported(split: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
     code, printed, told = run_egvs("run", split, "--out", tmp_path / "out")
     assert code == 0
     (night,) = (line for line in told.splitlines() if line.split()[0] == "night")
@@ -120,8 +121,8 @@ def test_a_run_with_periods_is_the_same_again_and_shows_them(split: Path, tmp_pa
     page = (tmp_path / "out" / "report.html").read_text()
     assert "By period" in page
     assert "night<br>(28.6%)" in page
-    assert ">40 frames<small>one each 0.5 s, 20 s in all, in 2 periods" in page
-    assert "<dt>day</dt><dd>24 frames; 2 vehicles at a time, 2 different;" in page
+    assert ">40 frames<small>one every 0.5 s, 20 s in total, in 2 periods" in page
+    assert "<dt>day</dt><dd>24 frames; 2 vehicles at a time, 2 in total;" in page
     assert page.index("<h2>By period") < page.index("<h2>Where the sites stand")
     ranking = PeriodRanking.read(tmp_path / "out")
     assert ranking is not None
@@ -146,7 +147,7 @@ def test_frames_count_in_the_ratio_of_the_weights(rows: list[tuple[int, int]], u
     assert np.gcd.reduce(found) == 1
 
 
-def test_of_a_mix_each_group_is_left_out_of_its_own_record() -> None:
+def test_jackknife_of_mix_leaves_groups_out_by_period() -> None:
     rng, grid = np.random.default_rng(2), Grid.from_json({"origin_m": [0.0] * 3, "voxel_m": 1.0, "shape": [5, 4, 1]})
     records = (BlockGroups(np.array([10, 20]), 0.0), BlockGroups(np.array([8, 8, 8]), 0.0))
     counts = [rng.integers(0, 8, size=(k, 20)).astype(np.uint32) for k in (2, 3)]
@@ -189,7 +190,7 @@ def test_variances_and_biases_of_a_mix_add_up_by_hand() -> None:
     assert estimate.freedom == pytest.approx((1 + 121 / 18) ** 2 / (1 + (121 / 18) ** 2))  # one degree each
 
 
-def test_errors_of_a_mix_and_of_its_periods_are_told(split: Path, tmp_path: Path) -> None:
+def test_standard_errors_of_mix_and_periods_are_reported(split: Path, tmp_path: Path) -> None:
     record = egvs.run(egvs.load(split), tmp_path)
     rows = of(egvs.read_scores(tmp_path / "scores.parquet"))
     assert all(row["egvs_se"] > 0 for row in rows)  # type: ignore[operator]
@@ -206,21 +207,45 @@ def test_errors_of_a_mix_and_of_its_periods_are_told(split: Path, tmp_path: Path
     assert all(finding.hint.startswith("Set length_s to at least ") for finding in doubts)
 
 
-def test_a_period_whose_best_site_is_another_is_told() -> None:
-    tpog = egvs.Tpog(
-        Grid.from_json({"origin_m": [0.0] * 3, "voxel_m": 1.0, "shape": [1, 1, 1]}), 1, np.zeros((1, 1, 1), np.int64)
-    )
-    named = [scorer.PeriodTpog(name, tpog) for name in ("morning", "night")]
+def score_table_of(**sites: tuple[float, ...]) -> ScoreTable:
+    """The EGVS of each site: of the mix, then of the periods ``morning`` and ``night``."""
+    scores = []
+    for name, (mix, *by_period) in sites.items():
+        periods = tuple(SiteScore(value, 0.0) for value in by_period)
+        scores.append(SiteScores(name, SiteScore(mix, 0.0, by_period=periods), None))
+    return ScoreTable.of(scores, {}, periods=("morning", "night"))
 
-    def judged(*sites: tuple[float, ...]) -> ScoreColumn:
-        mix, *apart = (np.array(values) for values in zip(*sites, strict=True))
-        return ScoreColumn("egvs", mix, None, (), tuple(apart))
 
-    (found,) = score_table.period_disagreements(["a", "b"], judged((9.0, 9.0, 3.0), (7.0, 6.0, 4.0)), named)
-    assert found.where == "scenario.toml: traffic.periods (night)"
-    assert found.problem == "b is the best site, not a of the mix, which is rank 2 there and scores 25.0% less"
-    assert score_table.period_disagreements(["a", "b"], judged((9.0, 9.0, 4.0), (7.0, 6.0, 4.0)), named) == []
-    assert score_table.period_disagreements(["a"], judged((9.0, 0.0, math.nan)), named) == []
+def test_warns_of_period_with_other_best_site() -> None:
+    table = score_table_of(a=(9.0, 9.0, 3.0), b=(7.0, 6.0, 4.0))
+    (warning,) = score_table.warn_period_disagreements(table, "egvs")
+    assert warning.where == "scenario.toml: traffic.periods (night)"
+    assert warning.problem == "the best site is b; a, the best of the mix, has rank 2 and scores 25.0% less"
+    assert not list(score_table.warn_period_disagreements(score_table_of(a=(9, 9, 4), b=(7, 6, 4)), "egvs"))
+    assert not list(score_table.warn_period_disagreements(score_table_of(a=(9, 0, math.nan)), "egvs"))
+
+
+def test_score_table_is_long_and_labelled() -> None:
+    table = score_table_of(a=(9.0, 9.0, 3.0), b=(7.0, 6.0, 4.0))
+    assert table.table.column_names == ["site", "period", "replicate", "score", "value"]
+    rows = [tuple(row.values()) for row in table.table.to_pylist() if row["score"] == "egvs"]
+    assert rows[:3] == [("a", "", 0, "egvs", 9.0), ("a", "morning", 0, "egvs", 9.0), ("a", "night", 0, "egvs", 3.0)]
+    assert table.column("egvs", "night").values.tolist() == [3.0, 4.0]
+    assert [column.best for column in table.by_period("egvs").values()] == [{0}, {1}]
+    assert table.ranking("egvs", "night") == [(1, "b", 4.0), (2, "a", 3.0)]
+
+
+def test_score_table_keeps_replicates_of_each_period() -> None:
+    groups = {"": (BlockGroups(np.array([5, 5]), 0.0),)}
+    scores = SiteScore(9.0, 0.5, np.array([9.1, 8.0, 10.0]), {"coverage": np.array([0.5, 0.4, 0.6])})
+    table = ScoreTable.of([SiteScores("a", scores, None)], groups)
+    egvs = table.column("egvs")
+    assert egvs.values.tolist() == [9.0]
+    assert egvs.left_out is not None and egvs.left_out.tolist() == [[9.1, 8.0, 10.0]]
+    coverage = table.column("coverage")
+    assert coverage.left_out is not None and coverage.left_out.tolist() == [[0.5, 0.4, 0.6]]
+    assert table.column("entropy_seen").left_out is None
+    assert math.isnan(table.column("entropy_seen").se[0])
 
 
 @pytest.mark.slow
@@ -228,27 +253,25 @@ def test_periods_disagree_without_standard_errors_too(
     split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told = Diagnostic("periods disagree", "scenario.toml: traffic.periods (night)", "b is the best site, not a", "")
-    monkeypatch.setattr(score_table, "period_disagreements", lambda *_: [told])
+    monkeypatch.setattr(score_table, "warn_period_disagreements", lambda *_: [told])
     for override in ("score.standard_error=true", "score.standard_error=false", "tpog.blocks=1"):
         record = egvs.run(egvs.load(split, [override]), tmp_path / override)
         assert told in collect_warnings([record.stages["score"].summary]), override
 
 
-def test_the_report_tells_what_its_tables_leave_out(
-    split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_report_counts_rows_that_are_not_shown(split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = "".join(f"p{n},{10 + n},12,3\n" for n in range(4))
     (split / "sites.csv").write_text(f"site,x_m,y_m,z_m\n{rows}")
     for name, count in (("LISTED", 2), ("FIRST", 1), ("LAST", 1)):
         monkeypatch.setattr(f"egvs.report.page.{name}", count)
     egvs.run(egvs.load(split), tmp_path)
     html = (tmp_path / "report.html").read_text()
-    assert "2 more are not shown; scores_by_period.parquet holds them all" in html
+    assert "2 more are not shown; scores_by_period.parquet has all sites" in html
     assert "Choose any site here" in html
     assert re.search(r"Vehicles at a time</dt><dd>2<small>", html)
 
 
-def test_an_effect_that_periods_forbid_is_not_advised(split: Path) -> None:
+def test_effect_that_periods_forbid_is_not_recommended(split: Path) -> None:
     """Replaying the frames of all periods alike is refused in a scenario; it must not be recommended for one."""
     (found,) = (call for call in effect_statuses(egvs.load(split)) if call.name == "moving_occlusion")
     assert (found.state, found.why) == (
@@ -282,29 +305,29 @@ def test_the_world_frame_counts_where_a_period_alone_is_a_finished_file(
         (
             'name = "night"',
             'name = ".."',
-            r"traffic\.periods\.1\.name: '\.\.'; a name without spaces .*not of dots",
+            r"traffic\.periods\.1\.name: expected a name, got '\.\.'. Use a name .*not only dots",
         ),
         ('name = "night"', f'name = "{"n" * 81}"', r"traffic\.periods\.1\.name: 'n+'; string should have at most 80"),
-        ('name = "night"', 'name = "a\\u0000b"', r"traffic\.periods\.1\.name: 'a.*b'; a name without spaces"),
-        ("length_s = 8", "length_s = 8.1", "period 'night': length_s = 8.1 is no whole number of 0.5 s"),
+        ('name = "night"', 'name = "a\\u0000b"', r"traffic\.periods\.1\.name: expected a name, got 'a.*b'"),
+        ("length_s = 8", "length_s = 8.1", "period 'night': length_s = 8.1 is not a multiple of 0.5 s"),
         ("length_s = 8", "length_s = 9", "tpog.blocks = 4 does not divide traffic.frames = 18 of the period 'night'"),
-        ("weight = 2.5", "weight = 0", r"traffic\.periods\.0\.weight: 0; input should be greater than 0\n$"),
-        ("weight = 2.5", "weight = 2.123456789", "make a mix of .* frames; weights with fewer digits"),
+        ("weight = 2.5", "weight = 0", r"traffic\.periods\.0\.weight: expected a value greater than 0, got 0\n$"),
+        ("weight = 2.5", "weight = 2.123456789", "make a mix of .* frames\\. Use weights with fewer digits"),
         ("begin_s = 12", "begin = 12", "begin"),
-        ("blocks = 4", "blocks = 40000", "blocks = 40000 in each period are 80000 blocks: at most 65535"),
+        ("blocks = 4", "blocks = 40000", "blocks = 40000 gives 80000 blocks in all periods, at most 65535"),
         ("length_s = 8", "length_s = 80", "frames"),
-        ("length_s = 8", 'fcd = "a"\nsumocfg = "b"', "sumocfg and fcd: a period has one source"),
+        ("length_s = 8", 'fcd = "a"\nsumocfg = "b"', "expected sumocfg or fcd, got both"),
         (
             "length_s = 8",
             "vehicles = 5",
-            r"traffic.periods \(night\): vehicles would act on nothing beside fcd; remove it",
+            r"traffic.periods \(night\): vehicles has no effect with fcd. Remove vehicles",
         ),
-        ("length_s = 8", 'counts = [{edge = "e", per_hour = 5}]', r"\(night\): counts would act on nothing beside fcd"),
-        ("frames = 40", "step_s = 1.0", "traffic: step_s would act on nothing beside fcd"),
-        ("[score]", "[effects.moving_occlusion]\n[score]", 'method = "frames" replays all periods alike'),
+        ("length_s = 8", 'counts = [{edge = "e", per_hour = 5}]', r"\(night\): counts has no effect with fcd"),
+        ("frames = 40", "step_s = 1.0", "traffic: step_s has no effect with fcd"),
+        ("[score]", "[effects.moving_occlusion]\n[score]", 'method = "frames" cannot weight the periods'),
     ],
 )
-def test_periods_that_cannot_be_are_refused(
+def test_rejects_invalid_periods(
     split: Path,
     tmp_path: Path,
     old: str,
@@ -328,16 +351,16 @@ def test_a_key_that_acts_in_one_period_may_stand_for_all(split: Path) -> None:
     assert (day.fcd, night.sumocfg, night.step_s) == ("fcd.csv", "night.sumocfg", 0.5)
 
 
-def test_a_period_that_is_not_there_is_refused(split: Path, tmp_path: Path) -> None:
+def test_rejects_unknown_period(split: Path, tmp_path: Path) -> None:
     egvs.run(egvs.load(split), tmp_path)
-    with pytest.raises(InputError, match="no period 'noon'; one of day, night"):
+    with pytest.raises(InputError, match=r"there is no period 'noon'\. The periods are day, night"):
         read_tpog(tmp_path / "tpog.parquet", "noon")
     path = tmp_path / "tpog.parquet"
     table, about = parquet.read_artefact(path, "tpog")
     columns = {name: table.column(name).to_numpy() for name in table.column_names}
     for broken in ([], [{}], [about["periods"][0] | {"times": 0}], "day"):
         parquet.write_artefact(path, "tpog", columns, about | {"periods": broken})
-        with pytest.raises(InputError, match="its metadata says periods"):
+        with pytest.raises(InputError, match="invalid metadata: periods = "):
             read_tpog(path)
 
 
@@ -345,7 +368,7 @@ def test_entropy_of_a_mix_is_that_of_its_share() -> None:
     assert binary_entropy(3, 8) == binary_entropy(15, 40)
 
 
-def test_a_file_that_a_period_lacks_is_told_before_the_first_stage(split: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
+def test_rejects_missing_file_of_period(split: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
     file = split / "scenario.toml"
     file.write_text(file.read_text().replace("begin_s = 12", 'fcd = "nacht.csv"'))
     code, _, complaint = run_egvs("run", split, "--out", tmp_path / "out")

@@ -26,8 +26,8 @@ from egvs.scoring.targets import TargetRecord, visible_targets
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
 from egvs.stages import score
-from tests.scoring.targets import scenes
-from tests.stages import inputs_of, run_stage
+from tests.scoring import target_scenes as scenes
+from tests.stage_runner import inputs_of, run_stage
 
 ALL = 'score.others=["expected_detections", "seen_well", "points_on_target", "entropy_seen"]'
 SITES = "site,x_m,y_m,z_m\n" + "".join(f"s{n},{5 + 6 * n},{11 - 22 * (n % 2)},{2 + n}\n" for n in range(5))
@@ -44,9 +44,7 @@ def by_rank(rows: dict[str, dict[str, float]], name: str) -> bool:
 
 
 @pytest.mark.slow
-def test_means_over_vehicles_are_those_of_the_slow_twin(
-    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_target_scores_match_slow_reference(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = run(mini, tmp_path / "run", ALL)
     scenario = loading.load(mini)
     frames = list(read_frames(tmp_path / "run" / "trajectories.parquet", np.arange(40)))
@@ -66,7 +64,7 @@ def test_means_over_vehicles_are_those_of_the_slow_twin(
 
 
 @pytest.mark.parametrize("name", ["egvs", *get_args(OtherScore)])
-def test_sites_rank_by_the_score_that_is_named(mini: Path, tmp_path: Path, name: str) -> None:
+def test_sites_rank_by_named_score(mini: Path, tmp_path: Path, name: str) -> None:
     (mini / "sites.csv").write_text(SITES)
     rows = run(mini, tmp_path / "run", f"score.rank_by={name}", "score.others=[]")
     assert by_rank(rows, name)
@@ -80,7 +78,7 @@ def test_sites_rank_by_the_score_that_is_named(mini: Path, tmp_path: Path, name:
 
 
 @pytest.mark.slow
-def test_what_ranks_changes_no_score(mini: Path, tmp_path: Path) -> None:
+def test_rank_by_changes_no_score(mini: Path, tmp_path: Path) -> None:
     (mini / "sites.csv").write_text(SITES)
     plain, other = run(mini, tmp_path / "a"), run(mini, tmp_path / "b", "score.rank_by=points_on_target", ALL)
     shared = set(plain["s0"]) - {"rank", "beats_next"}
@@ -90,7 +88,7 @@ def test_what_ranks_changes_no_score(mini: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["entropy_seen", "coverage", "expected_visibility"])
-def test_the_error_of_a_share_of_voxels_is_that_of_its_groups(mini: Path, tmp_path: Path, name: str) -> None:
+def test_standard_error_of_voxel_share_matches_groups(mini: Path, tmp_path: Path, name: str) -> None:
     """With two blocks a group left out is the other block: its share by hand, voxel by voxel."""
     more = ("tpog.blocks=2", "score.keep_visibility=all")
     rows = run(mini, tmp_path / "run", f'score.others=["{name}"]', *more)
@@ -116,7 +114,7 @@ def test_the_error_of_a_share_of_voxels_is_that_of_its_groups(mini: Path, tmp_pa
         assert row[f"{name}_se"] < 3 * scatter
 
 
-def test_without_standard_errors_there_are_none(mini: Path, tmp_path: Path) -> None:
+def test_no_standard_errors_when_disabled(mini: Path, tmp_path: Path) -> None:
     for number, override in enumerate(("score.standard_error=false", "tpog.blocks=1")):
         rows = run(mini, tmp_path / str(number), ALL, override, "score.rank_by=seen_well")
         assert by_rank(rows, "seen_well")
@@ -148,13 +146,13 @@ def test_a_mix_of_periods_weighs_vehicles_with_and_without_errors(mini: Path, tm
         assert [its.rank for its in periods] == [its["rank"] for its in own]
 
 
-def test_no_vehicle_in_the_region_is_refused_where_vehicles_rank(mini: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
+def test_rejects_region_without_vehicles_for_target_ranking(mini: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
     away = ("--set", "roi.center_m=[20, 60, 2.5]", "--set", "sites.file=far.csv")
     (mini / "far.csv").write_text("site,x_m,y_m,z_m\nfar,20,72,3\n")
     code, _, told = run_egvs("run", mini, "--out", tmp_path / "a", *away, "--set", "score.rank_by=seen_well")
     assert code == 2
     assert "scenario.toml: score.rank_by = 'seen_well': no vehicle has its centre in the region of interest" in told
-    assert 'or rank_by = "egvs"' in told
+    assert 'set rank_by = "egvs"' in told
     assert not (tmp_path / "a" / "scores.parquet").exists()
     record = egvs.run(loading.load(mini, away[1::2]), tmp_path / "b", jobs=1)
     assert [it.rule for it in collect_warnings(stage.summary for stage in record.stages.values())] == [
@@ -164,7 +162,7 @@ def test_no_vehicle_in_the_region_is_refused_where_vehicles_rank(mini: Path, tmp
     assert math.isnan(read_scores(tmp_path / "b" / "scores.parquet")["expected_detections"][0].as_py())
 
 
-def test_errors_that_are_not_known_are_told_as_such(mini: Path, tmp_path: Path) -> None:
+def test_warns_of_unknown_standard_errors(mini: Path, tmp_path: Path) -> None:
     """All vehicles are in one block of frames: without it there are none."""
     lines = (mini / "fcd.csv").read_text().splitlines()
     late = [line.replace(";-2.0;", ";40.0;") if float(line.split(";")[0]) >= 5.0 else line for line in lines[1:]]
@@ -176,7 +174,7 @@ def test_errors_that_are_not_known_are_told_as_such(mini: Path, tmp_path: Path) 
     sets = ["score.rank_by=seen_well", "score.others=[]"]
     record = egvs.run(loading.load(mini, sets), tmp_path / "run", jobs=1)
     (doubt,) = (it for it in collect_warnings([record.stages["score"].summary]) if it.rule == "no standard error")
-    assert "all vehicles in the region are in one of the 4 groups of frames" in doubt.problem
+    assert "all vehicles in the region are in one of 4 groups of frames" in doubt.problem
 
 
 def test_only_scores_over_vehicles_read_trajectories(mini: Path, tmp_path: Path) -> None:
@@ -191,7 +189,7 @@ def test_only_scores_over_vehicles_read_trajectories(mini: Path, tmp_path: Path)
     assert read_tpog(tmp_path / "tpog.parquet").frames == 40
 
 
-def test_what_is_asked_for_comes_once() -> None:
+def test_additional_scores_are_unique() -> None:
     model = ScoreConfig(rank_by="seen_well", others=("entropy_seen", "seen_well"))
     assert model.additional == ("seen_well", "entropy_seen")
     assert ScoreConfig(others=()).additional == ()
@@ -200,18 +198,18 @@ def test_what_is_asked_for_comes_once() -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("score.rank_by=detections", "score.rank_by: 'detections'; input should be 'egvs'"),
-        ('score.others=["egvs"]', "score.others.0: 'egvs'; input should be 'expected_detections'"),
-        ('score.others=["seen_well","seen_well"]', "seen_well stands there twice"),
+        ("score.rank_by=detections", "score.rank_by: expected 'egvs'"),
+        ('score.others=["egvs"]', "score.others.0: expected 'expected_detections'"),
+        ('score.others=["seen_well","seen_well"]', "seen_well is listed twice"),
     ],
 )
-def test_unknown_scores_are_refused(mini: Path, tmp_path: Path, run_egvs, override: str, message: str) -> None:  # type: ignore[no-untyped-def]
+def test_rejects_unknown_scores(mini: Path, tmp_path: Path, run_egvs, override: str, message: str) -> None:  # type: ignore[no-untyped-def]
     code, _, told = run_egvs("run", mini, "--out", tmp_path / "run", "--set", override)
     assert code == 2
     assert message in told, told
 
 
-def test_traffic_without_a_vehicles_centre_is_told(mini: Path, tmp_path: Path) -> None:
+def test_warns_of_undefined_target_scores(mini: Path, tmp_path: Path) -> None:
     """Cars reach into a narrow region, but none has its centre there."""
     (mini / "near.csv").write_text("site,x_m,y_m,z_m\nnear,20,12,3\n")
     edge = ["roi.center_m=[20, 12.9, 2.5]", "roi.size_m=[40, 20, 5]", "sites.file=near.csv"]
@@ -219,8 +217,8 @@ def test_traffic_without_a_vehicles_centre_is_told(mini: Path, tmp_path: Path) -
     told = [it for it in collect_warnings([record.stages["score"].summary]) if it.rule == "no vehicles"]
     values = read_scores(tmp_path / "run" / "scores.parquet")["expected_detections"].to_pylist()
     assert read_tpog(tmp_path / "run" / "tpog.parquet").counts.any()
-    nobody = "no vehicle has its centre in the region of interest in the 40 frames looked at"
-    assert [it.problem for it in told] == [f"{nobody}: expected_detections is no number"]
+    nobody = "no vehicle has its centre in the region of interest in the 40 frames examined"
+    assert [it.problem for it in told] == [f"{nobody}: expected_detections is NaN"]
     assert math.isnan(values[0])
 
 

@@ -18,7 +18,7 @@ from egvs.scenario import loading
 from egvs.scoring.egvs import binary_entropy
 from egvs.scoring.scorer import ranks
 from egvs.stages import scan, score, statics, tpog, traffic
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 
 STAGES = (traffic, statics, tpog, scan, score)
 
@@ -59,7 +59,7 @@ def test_score_is_its_definition(mini, tmp_path, gamma):
     assert float(about["gamma"]) == gamma
 
 
-def test_threads_change_no_byte(mini, tmp_path):
+def test_number_of_threads_changes_no_byte(mini, tmp_path):
     write_sites(mini, *(f"s{n},{9 + 3 * n},11,{3 + n / 2},small" for n in range(8)))
     run(mini, tmp_path)
     files = ("scans.parquet", "scores.parquet", "visibility.parquet")
@@ -140,6 +140,7 @@ def test_static_voxels_have_no_entropy(mini, tmp_path):
         json.dumps(
             {
                 "type": "FeatureCollection",
+                "crs": None,
                 "features": [{"type": "Feature", "geometry": geometry, "properties": {"height_m": 5}}],
             }
         )
@@ -179,17 +180,17 @@ def put(name, row, value):
 @pytest.mark.parametrize(
     ("artefact", "change", "message"),
     [
-        ("tpog", put("ix", 0, 10**6), "ix leaves the grid"),
-        ("tpog", put("iz", -1, -1), "iz leaves the grid"),
+        ("tpog", put("ix", 0, 10**6), "expected ix from 0 to "),
+        ("tpog", put("iz", -1, -1), "expected iz from 0 to "),
         ("tpog", put("count", 0, 41), "occupied in 41 of 40 frames"),
         ("tpog", put("count", 0, 2**32 - 1), "of 40 frames"),
-        ("tpog", lambda t, a: (t, a | {"schema": 999}), "schema version 999"),
-        ("tpog", lambda t, a: (t.drop_columns("count"), a), "column 'count' is missing"),
+        ("tpog", lambda t, a: (t, a | {"schema": 999}), "expected schema version 1, got 999"),
+        ("tpog", lambda t, a: (t.drop_columns("count"), a), "the column 'count' is missing"),
         ("scans", put("dx_m", 5, np.nan), "not finite"),
         ("scans", put("dz_m", 5, np.inf), "not finite"),
     ],
 )
-def test_altered_artefacts_are_refused(mini, tmp_path, artefact, change, message):
+def test_rejects_altered_artefacts(mini, tmp_path, artefact, change, message):
     run(mini, tmp_path)
     rewrite(tmp_path / f"{artefact}.parquet", change)
     if artefact == "scans":  # one row group a site, as the stage writes it

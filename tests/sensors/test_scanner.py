@@ -1,7 +1,9 @@
-"""A scanner scans from any pose, shares nothing with its callers, and is cheap to build again elsewhere."""
+"""Empty scans from any pose, and measured scans."""
 
 from __future__ import annotations
 
+import importlib.util
+import math
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -9,12 +11,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import egvs
+from egvs.artefacts import parquet
+from egvs.core import files
 from egvs.core.errors import InputError
-from egvs.sensors.scanner import Scanner
+from egvs.core.grid import Roi
+from egvs.formats import point_clouds
+from egvs.formats.georeference import WorldFrame
+from egvs.sensors.scanner import Scan, Scanner
 from egvs.sensors.scene import Scene
 from egvs.sensors.sites import Pose
+from egvs.stages.inputs import build_scene
+from egvs.world import ray_casting
+from egvs.world.mesh import read_ply
+from egvs.world.ray_casting import Caster
+from tests.effects.scan_helpers import CROWNS, ROI, _world, prism, run_scan, write_scene
 
 EFFECTS = ["effects.mount_sway.tilt_deg=0.5", "effects.divergence.sub_beams=7"]
 
@@ -35,7 +48,7 @@ def same(one, other) -> bool:
     )
 
 
-def test_a_site_s_pose_gives_the_site_s_scan(scene):
+def test_pose_of_a_site_gives_its_scan(scene):
     scanner = Scanner(scene)
     for site in scene.sites:
         scan = scanner.scan(site.pose, scene.sensor(site.sensor))
@@ -43,8 +56,8 @@ def test_a_site_s_pose_gives_the_site_s_scan(scene):
 
 
 @pytest.mark.parametrize("settings", [[], EFFECTS], ids=["plain", "weighted"])
-def test_a_pose_that_is_no_site_s_gives_what_a_site_there_would(mini, settings):
-    """The tree of triangles is cut for the sites; another pose must not miss what was left out for them."""
+def test_any_pose_gives_the_scan_of_a_site_there(mini, settings):
+    """The triangles are culled for the sites; another pose must not miss any."""
     pose = Pose(25.0, 30.0, 4.0, yaw_deg=200.0, pitch_deg=-8.0)
     scene = egvs.build_scene(egvs.load(mini, settings))
     moved = replace(scene, sites=(replace(scene.sites[0], pose=pose),))
@@ -53,17 +66,17 @@ def test_a_pose_that_is_no_site_s_gives_what_a_site_there_would(mini, settings):
     assert same(free, named) and (free.rows.weight is not None) == bool(settings)
 
 
-def test_a_scan_belongs_to_its_caller(scene):
+def test_scan_shares_no_data_with_the_scanner(scene):
     scanner, sensor = Scanner(scene), scene.sensor("small")
     first = scanner.scan(scene.sites[0].pose, sensor)
-    kept = first.rows.ends_m.copy()
+    remaining = first.rows.ends_m.copy()
     scanner.scan(scene.sites[1].pose, sensor).rows.ends_m[:] = 0.0
-    assert np.array_equal(first.rows.ends_m, kept)
+    assert np.array_equal(first.rows.ends_m, remaining)
     first.rows.ends_m[:] = np.nan
-    assert np.array_equal(scanner.scan(scene.sites[0].pose, sensor).rows.ends_m, kept)
+    assert np.array_equal(scanner.scan(scene.sites[0].pose, sensor).rows.ends_m, remaining)
 
 
-def test_threads_may_share_one(scene):
+def test_threads_may_share_a_scanner(scene):
     scanner, sensor = Scanner(scene), scene.sensor("small")
     poses = [Pose(5.0 + i, 14.0, 3.0, yaw_deg=3.0 * i) for i in range(24)]
     alone = [Scanner(scene).scan(pose, sensor) for pose in poses]
@@ -72,7 +85,7 @@ def test_threads_may_share_one(scene):
     assert all(same(one, other) for one, other in zip(alone, shared, strict=True))
 
 
-def test_no_more_mounts_are_remembered_than_it_is_told(mini: Path) -> None:
+def test_number_of_cached_mounts_is_limited(mini: Path) -> None:
     scene = egvs.build_scene(egvs.load(mini))
     one, many = Scanner(scene, mounts=1), Scanner(scene)
     for yaw_deg in (0.0, 10.0, 20.0, 10.0):
@@ -84,7 +97,7 @@ def test_no_more_mounts_are_remembered_than_it_is_told(mini: Path) -> None:
     assert pickle.loads(pickle.dumps(one))._mounts == 1
 
 
-def test_it_pickles_to_what_it_was_built_from(mini: Path) -> None:
+def test_scanner_is_pickled_as_its_scene(mini: Path) -> None:
     scene = egvs.build_scene(egvs.load(mini, EFFECTS))
     scanner = Scanner(scene)
     pose, sensor = scene.sites[0].pose, scene.sensor("small")
@@ -93,7 +106,7 @@ def test_it_pickles_to_what_it_was_built_from(mini: Path) -> None:
     assert same(scanner.scan(pose, sensor), again.scan(pose, sensor))
 
 
-def test_one_bad_site_refuses_itself_alone(mini: Path) -> None:
+def test_error_of_one_site_does_not_affect_others(mini: Path) -> None:
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m,sensor\ngood,10,12,3,\nwall,16,6,3,\ntypo,10,12,3,VLP-99\n")
     scene = egvs.build_scene(egvs.load(mini))
     scanner = Scanner(scene)
@@ -114,14 +127,164 @@ def test_one_bad_site_refuses_itself_alone(mini: Path) -> None:
         (Pose(900, 0, 3), "from the region of interest"),
     ],
 )
-def test_where_no_sensor_can_stand_is_told_with_the_coordinates(scene, pose, message):
+def test_rejects_impossible_position_with_its_coordinates(scene, pose, message):
     with pytest.raises(InputError, match=message) as error:
         Scanner(scene).scan(pose, scene.sensor("small"))
     assert f"pose ({pose.x_m:g}, {pose.y_m:g}, {pose.z_m:g})" in str(error.value)
 
 
-def test_a_mount_s_directions_are_kept_but_not_for_ever(scene):
+def test_directions_of_mounts_are_cached_with_a_limit(scene):
     scanner, sensor = Scanner(scene), scene.sensor("small")
     for yaw in range(80):
         scanner.scan(Pose(10, 12, 3, yaw_deg=float(yaw)), sensor)
     assert len(scanner._directions) <= 32
+
+
+# --- culling
+def test_culling_unreachable_geometry_does_not_change_scans(
+    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(8)
+    corners = rng.uniform([-200, -200], [240, 200], (150, 2))
+    blocks = [prism(x, y, x + 3, y + 2, 0, 2 + i % 7, "building", f"b{i}") for i, (x, y) in enumerate(corners)]
+    free = [
+        b
+        for b, (x, y) in zip(blocks, corners, strict=True)
+        if math.hypot(x - 10, y - 12) > 9 and math.hypot(x - 30.5, y - 16) > 9
+    ]
+    write_scene(mini, *free, sites="pole_a,10,12,3\npole_b,30.5,16,7\n")
+    _, culled = run_scan(mini, tmp_path / "a")
+    held = []
+    monkeypatch.setattr(
+        ray_casting,
+        "reachable_shapes",
+        lambda shapes, *_: held.append(len(shapes)) or np.ones(len(shapes), dtype=np.bool_),
+    )
+    _, complete = run_scan(mini, tmp_path / "b")
+    assert files.hash_file(culled / "scans.parquet") == files.hash_file(complete / "scans.parquet")
+    monkeypatch.undo()
+    world, _ = read_ply(complete / "statics.ply")
+    sites = np.array([[10, 12, 3], [30.5, 16, 7.0]])
+    remaining = ray_casting.reachable_shapes(world.triangles_m, egvs.load(mini).roi.box, sites, 100.0)
+    assert 0.05 * held[0] < remaining.sum() < 0.5 * held[0]
+
+
+def test_culling_keeps_all_shapes_that_beams_meet() -> None:
+    rng = np.random.default_rng(9)
+    roi = Roi((0.0, 0.0, 0.0), (10.0, 6.0, 4.0))
+    for _ in range(30):
+        sites = rng.uniform([-15, -15, 1], [25, 25, 12], (3, 3))
+        start, through = sites[rng.integers(3, size=200)], rng.uniform([0, 0, 0], [10, 6, 4], (200, 3))
+        far = rng.uniform(0, 6, 200)[:, None]
+        met = start + far * (through - start)
+        shapes = met[:, None] + rng.normal(0, 0.5, (200, 3, 3))
+        shapes[:, 0] = met
+        assert ray_casting.reachable_shapes(shapes, roi, sites, float(np.linalg.norm(met - start, axis=1).max())).all()
+        assert ray_casting.shapes_between(shapes[far[:, 0] <= 1], roi, sites).all()
+
+
+def test_builds_no_tree_without_geometry_in_reach(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ray_casting, "TriangleTree", lambda triangles: pytest.fail("a tree was built"))
+    for number, solids in enumerate(((), (prism(5, 60, 9, 70, 0, 9, "building"),))):
+        _, out = run_scan(
+            write_scene(mini, *solids, sites="pole_a,10,12,3\n"), tmp_path / str(number), "statics.ground=false"
+        )
+        table, _ = parquet.read_artefact(out / "scans.parquet", "scans")
+        assert table.num_rows > 0 and not any(table.column("returned").to_pylist())
+
+
+def test_caster_without_sites_has_all_triangles() -> None:
+    world = _world(*CROWNS)
+    assert len(Caster(world, ROI)._triangles) == len(world.faces)
+
+
+WORLD_FRAME = WorldFrame("EPSG:32632", (-550_700.0, -5_635_200.0))
+
+
+CRS = "\n[crs]\nepsg = 32632\noffset_m = [-550700, -5635200]\nzero_height_m = 210.0\n"
+
+
+POINTS = np.array([[12.0, 3.0, 0.5], [20.0, -4.0, 1.25], [35.0, 8.0, 2.0]])
+
+
+needs_laspy = pytest.mark.skipif(importlib.util.find_spec("laspy") is None, reason="laspy is not installed (egvs[las])")
+
+
+def write_las(path: Path, points_m: NDArray[np.float64], crs: str | None, point_format: int = 6) -> None:
+    import laspy
+    import pyproj
+
+    header = laspy.LasHeader(version="1.4" if point_format >= 6 else "1.2", point_format=point_format)
+    header.scales, header.offsets = [1e-4] * 3, np.floor(points_m[0])
+    if crs is not None:
+        header.add_crs(pyproj.CRS(crs))
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = points_m.T
+    cloud.write(path)
+
+
+def scan_file(mini: Path, name: str, crs: str = CRS) -> Scan:
+    (mini / "sites.csv").write_text(f"site,x_m,y_m,z_m,points\npole_a,10,12,3,{name}\n")
+    text = (mini / "scenario.toml").read_text().partition("\n[crs]")[0]
+    (mini / "scenario.toml").write_text(text + crs)
+    scene = build_scene(egvs.load(mini))
+    return Scanner(scene).scan_site(scene.sites[0])
+
+
+@needs_laspy
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:32632+5783", "EPSG:31467"])
+@pytest.mark.parametrize("point_format", [3, 6])
+def test_las_in_a_projection_gives_the_same_scan_as_metres(mini: Path, crs: str, point_format: int) -> None:
+    """Heights above the sea become heights above the world's z = 0."""
+    if point_format == 3 and "+" in crs:
+        pytest.skip("LAS 1.2 names its system by a single code")
+    point_clouds.write_points(mini / "m.ply", POINTS)
+    by_metres = scan_file(mini, "m.ply")
+    lon_lat_deg = WORLD_FRAME.to_degrees(POINTS[:, :2])
+    xy = WorldFrame(crs.partition("+")[0]).from_degrees(lon_lat_deg)
+    write_las(mini / "m.las", np.column_stack([xy, POINTS[:, 2] + 210.0]), crs, point_format)
+    by_las = scan_file(mini, "m.las")
+    assert len(by_las.rows.ends_m) == 3
+    assert by_las.rows.ends_m == pytest.approx(by_metres.rows.ends_m, abs=2e-3 if "31467" in crs else 2e-4)
+
+
+@needs_laspy
+@pytest.mark.parametrize(("vertical", "unit_m"), [("+6360", 1200 / 3937), ("+5703", 1.0), ("", 1200 / 3937)])
+def test_las_in_feet_gives_the_same_scan_as_metres(mini: Path, vertical: str, unit_m: float) -> None:
+    """New York's plane counts in US survey feet; its heights too, where no vertical system says otherwise."""
+    frame = WorldFrame("EPSG:32618", (-585_000.0, -4_510_000.0))
+    known = "\n[crs]\nepsg = 32618\noffset_m = [-585000, -4510000]\nzero_height_m = 5.0\n"
+    feet = WorldFrame("EPSG:2263").from_degrees(frame.to_degrees(POINTS[:, :2]))
+    write_las(mini / "m.las", np.column_stack([feet, (POINTS[:, 2] + 5.0) / unit_m]), f"EPSG:2263{vertical}")
+    assert scan_file(mini, "m.las", known).rows.ends_m == pytest.approx(POINTS - [10, 12, 3], abs=2e-3)
+
+
+@needs_laspy
+def test_las_without_crs_is_in_metres(mini: Path) -> None:
+    write_las(mini / "m.las", POINTS, None)
+    assert scan_file(mini, "m.las").rows.ends_m == pytest.approx(POINTS - [10, 12, 3], abs=1e-4)
+
+
+@needs_laspy
+def test_rejects_scan_far_from_the_region(mini: Path) -> None:
+    utm = np.add(POINTS, (550_700, 5_635_200, 210))
+    write_las(mini / "m.las", utm, None)
+    message = "They would be near it as eastings and northings of EPSG:32632. Save the points"
+    with pytest.raises(InputError, match=rf"site pole_a: points: .*m.las: coordinates .*{message}"):
+        scan_file(mini, "m.las")
+    write_las(mini / "m.las", utm, "EPSG:25833")
+    with pytest.raises(InputError, match=r"are [\d,]+ km from the region of interest as ETRS89 / UTM zone 33N"):
+        scan_file(mini, "m.las")
+    write_las(mini / "m.las", utm, "EPSG:25832")
+    with pytest.raises(InputError, match=r"from the region of interest as ETRS89 / UTM zone 32N, which must"):
+        scan_file(mini, "m.las", crs="")
+
+
+def test_rejects_points_in_degrees(mini: Path) -> None:
+    degrees = np.column_stack([WORLD_FRAME.to_degrees(POINTS[:, :2]), POINTS[:, 2]])
+    point_clouds.write_points(mini / "m.ply", degrees)
+    with pytest.raises(
+        InputError,
+        match=r"m.ply: expected metres .*, got longitude and latitude: .*, 0 m from the region",
+    ):
+        scan_file(mini, "m.ply")

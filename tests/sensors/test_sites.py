@@ -1,4 +1,4 @@
-"""Candidate sites from GeoJSON and along lines: where they stand, what they are called, and what is refused."""
+"""Candidate sites: rules, mounts, aiming."""
 
 from __future__ import annotations
 
@@ -7,29 +7,283 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import egvs
 from egvs.core.errors import InputError
-from egvs.sensors import sites
-from tests.conftest import collection, feature
+from egvs.scenario.loading import scenario_from_dict
+from egvs.sensors import sensor, sites
+from egvs.sensors.sensor import CATALOGUE, Sensor, rotation_world_sensor
+from egvs.studies import measurement
+from tests.sensors.helpers import angles_of, site_positions, sites_from
+
+ROW = "site,x_m,y_m,z_m\np,0,0,6\n"
 
 
-def point(*coordinates: object, **properties: object) -> dict[str, Any]:
-    return feature({"type": "Point", "coordinates": coordinates}, **properties)
+# --- where an aimed sensor points -------------------------------------------------------------------------------------
+def test_vlp_32c_is_tilted_by_the_elevation_of_the_target(mini: Path) -> None:
+    """Its rings go from -25 to 15 degrees: the middle is -5. From 6 m up, a point on the ground 10 m ahead lies
+    atan(6 / 10) = 30.963757 degrees below level, so the nose goes down by 25.963757."""
+    assert CATALOGUE["VLP-32C"].middle_deg == (-5.0, 0.0)
+    (site,) = sites_from(mini, ROW, sensor="VLP-32C", aim_m="[10, 0, 0]")
+    assert angles_of((site,)) == [("p", 6, 0, -25.963757)]
 
 
-def named(crs: str) -> dict[str, Any]:
-    """What GeoJSON of 2008 could hold as ``crs``."""
-    return {"type": "name", "properties": {"name": crs}}
+@pytest.mark.parametrize(
+    ("target", "yaw_deg", "pitch_deg"),
+    [
+        ([0, 6, 0], 90, -45 + 5),
+        ([-6, 0, 0], 180, -45 + 5),
+        ([0, -6, 12], -90, 45 + 5),
+        ([3, 3, 6], 45, 0 + 5),
+        ([6 * math.sqrt(3), 0, 0], 0, -30 + 5),
+    ],
+)
+def test_aiming_angles_equal_hand_computed_ones(target: list[float], yaw_deg: float, pitch_deg: float) -> None:
+    """The sensor of the small scenario has rings from -15 to 5 degrees, so the VLP-32C's middle, -5."""
+    sensor = Sensor("s", (-15.0, 5.0), (0.0, 0.0), 4, 100.0, "")
+    x, y, z = target
+    assert sites.aiming_angles("here", (0, 0, 6), (x, y, z), 0.0, sensor) == (yaw_deg, pitch_deg)
 
 
-def of_geojson(mini: Path, text: str, name: str = "sites.geojson") -> tuple[sites.Site, ...]:
-    (mini / name).write_text(text, encoding="utf-8")
-    return sites.candidate_sites(egvs.load(mini, [f'sites.file="{name}"']))
+@given(
+    st.tuples(*[st.floats(-60, 60)] * 3),
+    st.floats(-30, 30),
+    st.one_of(st.floats(-40, 40), st.floats(140, 220)),
+    st.floats(-30, 30),
+)  # to, elevation, azimuth, roll
+def test_middle_ray_meets_the_target(
+    to_m: tuple[float, float, float], elevation: float, azimuth: float, roll_deg: float
+) -> None:
+    """Compared with the rotation matrix, for any middle ray and roll."""
+    at_m = 3.0, -2.0, 5.0
+    ray = np.array([
+        math.cos(math.radians(elevation)) * math.cos(math.radians(azimuth)),
+        math.cos(math.radians(elevation)) * math.sin(math.radians(azimuth)),
+        math.sin(math.radians(elevation)),
+    ])  # fmt: skip
+
+    class Looking(Sensor):
+        @property
+        def middle_deg(self) -> tuple[float, float]:
+            return elevation, azimuth
+
+    sensor = Looking("s", (elevation,), (0.0,), 1, 100.0, "")
+    way = np.subtract(to_m, at_m)
+    try:
+        yaw_deg, pitch_deg = sites.aiming_angles("here", at_m, to_m, roll_deg, sensor)
+    except InputError:
+        flat = math.hypot(way[0], way[1]) / max(float(np.linalg.norm(way)), 1e-9)
+        assert flat < 0.9  # steep ones alone are out of reach of a pitch between -90 and 90
+        return
+    pointed = rotation_world_sensor(yaw_deg, pitch_deg, roll_deg) @ ray
+    assert np.cross(pointed, way / np.linalg.norm(way)) == pytest.approx(np.zeros(3), abs=1e-7)
+    assert pointed @ way > 0
 
 
-def of_lines(mini: Path, *rules: dict[str, Any]) -> tuple[sites.Site, ...]:
+def test_sensor_facing_backwards_is_turned_around() -> None:
+    """Its middle ray has azimuth 180: the point to the east is met with the nose to the west. It lies 45 degrees below
+    level, so the back goes down, and the nose up."""
+    back = Sensor("back", (-10.0, 10.0), (0.0, 0.0), 61, 100.0, "", azimuth_deg=(150.0, 210.0))
+    assert sites.aiming_angles("here", (0, 0, 6), (6, 0, 0), 0.0, back) == (180.0, 45.0)
+    temp_path = Sensor("aside", (0.0,), (0.0,), 61, 100.0, "", azimuth_deg=(90.0, 150.0))
+    assert sites.aiming_angles("here", (0, 0, 6), (6, 0, 6), 0.0, temp_path) == (-120.0, 0.0)
+
+
+def test_aim_roi_is_the_centre_of_the_region(mini: Path) -> None:
+    """The region's middle is (20, 0, 2.5); a height that an aim does not name is the same."""
+    by_name, by_point, by_columns, by_column = (
+        sites_from(mini, "site,x_m,y_m,z_m\np,0,0,6\n", aim="roi"),
+        sites_from(mini, "site,x_m,y_m,z_m\np,0,0,6\n", aim_m="[20, 0]"),
+        sites_from(mini, "site,x_m,y_m,z_m,aim_x_m,aim_y_m\np,0,0,6,20,0\n"),
+        sites_from(mini, "site,x_m,y_m,z_m,aim\np,0,0,6,roi\n"),
+    )
+    pitch_deg = round(math.degrees(math.atan2(-3.5, 20)) + 5, 6)
+    assert by_name == by_point == by_columns == by_column
+    assert angles_of(by_name) == [("p", 6, 0, pitch_deg)]
+
+
+# --- every combination is a candidate ---------------------------------------------------------------------------------
+def test_all_heights_and_pitches_of_a_file_are_candidates(mini: Path) -> None:
+    result = sites_from(
+        mini, "site,x_m,y_m\nc01,0,0\nc02,0,9\n", heights_m="[3, 4.5]", pitch_deg='[0, -10, "aim"]', aim="roi"
+    )
+    assert [site.name for site in result[:6]] == [
+        "c01@3m+0deg", "c01@3m-10deg", "c01@3m+aim", "c01@4.5m+0deg", "c01@4.5m-10deg", "c01@4.5m+aim",
+    ]  # fmt: skip
+    assert [site.pole for site in result] == ["c01"] * 6 + ["c02"] * 6
+    assert {site.pose.yaw_deg for site in result[:6]} == {0}  # the aim turns those that it does not tilt as well
+    assert [site.pose.pitch_deg for site in result[:2]] == [0, -10]
+    assert result[5].pose.pitch_deg == round(math.degrees(math.atan2(-2, 20)) + 5, 6)
+
+
+def test_name_has_only_the_values_that_vary(mini: Path) -> None:
+    rows = "site,x_m,y_m,z_m\nc01,0,0,5\n"
+    assert [s.name for s in sites_from(mini, rows, pitch_deg="[0, -10, 2.5]")] == [
+        "c01@0deg",
+        "c01@-10deg",
+        "c01@2.5deg",
+    ]
+    assert [s.name for s in sites_from(mini, rows, pitch_deg='["aim", -10]', aim="roi")] == ["c01@aim", "c01@-10deg"]
+    assert [s.name for s in sites_from(mini, rows, pitch_deg="-10")] == ["c01"]
+
+
+def test_rules_accept_pitches_and_aims(mini: Path) -> None:
+    path = mini / "scenario.toml"
+    rule = 'aim = "roi"\npitch_deg = ["aim", 0]\n[sites.grid]\nlow_m = [0, 0]\nhigh_m = [0, 0]\nspacing_m = 1\n'
+    path.write_text(path.read_text().replace('file = "sites.csv"\n', "").replace(
+        'sensor = "small"\n', f'sensor = "small"\n{rule}heights_m = [4, 6]\n'))  # fmt: skip
+    result = sites.candidate_sites(egvs.load(mini))
+    assert [site.name for site in result] == ["g01@4m+aim", "g01@4m+0deg", "g01@6m+aim", "g01@6m+0deg"]
+
+
+def test_recorded_scenario_gives_the_same_candidates(mini: Path) -> None:
+    """As `verify` reads it: with all keys, including defaults."""
+    (mini / "sites.csv").write_text("site,x_m,y_m\nc01,10,12\nc02,30.5,-12\n")
+    scenario = egvs.load(mini, ["sites.heights_m=[3, 4.5]", 'sites.pitch_deg=["aim", 0]', "sites.aim_m=[1, 2]"])
+    recorded = json.loads(json.dumps(scenario.model_dump(mode="json")))
+    assert sites.candidate_sites(scenario_from_dict(recorded, mini, "run.json")) == sites.candidate_sites(scenario)
+
+
+def test_rows_at_one_position_share_a_pole(mini: Path) -> None:
+    result = sites_from(mini, "site,x_m,y_m,z_m\nlow,0,0,3\nhigh,0,0,5\nelse,0.5,0,3\n")
+    assert [site.pole for site in result] == ["low", "low", "else"]
+
+
+def test_run_ranks_candidates_and_groups_them_by_pole(mini: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
+    (mini / "sites.csv").write_text("site,x_m,y_m\nc01,10,12\nc02,30.5,-12\n")
+    expected = ["sites.heights_m=[3, 4.5]", 'sites.pitch_deg=[0, "aim"]', "sites.aim=roi", "score.standard_error=false"]
+    code, out, _ = run_egvs("run", mini, "--out", tmp_path / "run", *(part for w in expected for part in ("--set", w)))
+    assert code == 0
+    scores = egvs.read_scores(tmp_path / "run" / "scores.parquet").to_pylist()
+    assert [row["pole"] for row in scores] == ["c01"] * 4 + ["c02"] * 4
+    best = {pole: max((r for r in scores if r["pole"] == pole), key=lambda r: r["egvs"]) for pole in ("c01", "c02")}
+    table = out[out.index("best candidate of each pole") :]
+    html = (tmp_path / "run" / "report.html").read_text()
+    section = html[html.index("The best site on each pole") :]
+    for pole, row in best.items():
+        assert f"{pole}  " in table
+        assert row["site"] in table.split("\n\n")[0]
+        assert f'<th scope="row">{pole}</th><td>{row["site"]}</td>' in section
+
+
+def test_no_table_of_poles_with_one_candidate_each(mini: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
+    _, out, _ = run_egvs("run", mini, "--out", tmp_path / "run")
+    assert "best candidate of each pole" not in out
+    assert "The best site on each pole" not in (tmp_path / "run" / "report.html").read_text()
+
+
+def test_study_uses_the_first_candidate(mini: Path) -> None:
+    (mini / "sites.csv").write_text("site,x_m,y_m\nc01,10,12\nc02,30.5,-12\n")
+    scenario = egvs.load(mini, ["sites.heights_m=[3, 4.5]", 'sites.pitch_deg=["aim", 0]', "sites.aim=roi"])
+    first, (alone,) = sites.candidate_sites(scenario)[0], sites.candidate_sites(measurement.with_one_site(scenario))
+    assert alone.pose == first.pose
+
+
+# --- errors
+PLACE = "site,x_m,y_m\np,0,0\n"
+
+
+@pytest.mark.parametrize(
+    ("rows", "keys", "message"),
+    [
+        (PLACE, {}, r"row p: z_m is missing.*site, x_m, y_m, z_m"),
+        (ROW, {"heights_m": "[3, 4]"}, r"sites\.heights_m: .*no effect on any site.*z_m from the rows of sites"),
+        (
+            "site,x_m,y_m,z_m,yaw_deg\np,0,0,6,0\n",
+            {"aim": "roi"},
+            r"sites\.aim: .*no effect on any site.*yaw_deg or aim from",
+        ),
+        ("site,x_m,y_m,z_m,pitch_deg\np,0,0,6,0\n", {"pitch_deg": "-10"}, r"sites\.pitch_deg: .*no effect on any site"),
+        (ROW, {"pitch_deg": '"aim"'}, r"row p: pitch_deg: .*'aim', but there is no aim.*aim = \"roi\", or aim_m"),
+        (
+            "site,x_m,y_m,z_m,yaw_deg\np,0,0,6,30\n",
+            {"aim": "roi", "pitch_deg": '"aim"'},
+            r"row p: pitch_deg: .*'aim', but .*yaw_deg, 30",
+        ),
+        (ROW, {"aim_m": "[0, 0, 1]"}, r"row p: aim: \(0, 0, 1\) is straight above or below the sensor"),
+        (ROW, {"aim": "roi", "sensor": "VLP-33"}, r"row p: sensor: unknown sensor 'VLP-33'. Did you mean VLP-32C"),
+        ("site,x_m,y_m,z_m,aim_x_m\np,0,0,6,5\n", {}, r"row p: aim: one of aim_x_m and aim_y_m is missing"),
+        ("site,x_m,y_m,z_m,aim\np,0,0,6,ROI\n", {}, r"row p: aim: .*'roi', got 'ROI'.*aim_x_m and aim_y_m"),
+        ("site,x_m,y_m,z_m,aim,aim_x_m\np,0,0,6,roi,3\n", {}, r"row p: aim: .*'roi' and at a point"),
+        ("site,x_m,y_m,z_m,aim_x_m,aim_y_m\np,0,0,6,5,north\n", {}, r"row p: aim_y_m: .*finite number.*'north'"),
+        ("site,x_m,y_m,z_m,yaw_deg,aim_x_m,aim_y_m\np,0,0,6,9,5,5\n", {}, r"row p: yaw_deg: .*yaw_deg = 9 and an aim"),
+        (
+            "site,x_m,y_m,z_m,points\np,0,0,6,a.ply\n",
+            {"pitch_deg": "[0, -10]"},
+            r"row p: points: .*one measured scan for 2 mounts",
+        ),
+        (
+            "site,x_m,y_m,z_m,pitch_deg\np,0,0,6,\np@0deg,1,1,5,3\n",
+            {"pitch_deg": "[0, -9]"},
+            r"two sites 'p@0deg'",
+        ),
+    ],
+)
+def test_rejects_invalid_aim(mini: Path, rows: str, keys: dict[str, str], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        sites_from(mini, rows, **keys)
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"aim": "junction"}, r"sites\.aim: expected 'roi', got 'junction'"),
+        ({"aim_m": "[1]"}, r"sites\.aim_m"),
+        ({"pitch_deg": "[]"}, r"pitch_deg = \[\] leaves no candidate"),
+        ({"pitch_deg": "[0, 0]"}, "has a value twice"),
+        ({"pitch_deg": "[-91]"}, r"sites\.pitch_deg"),
+        ({"heights_m": "[3, 3]"}, "has a value twice"),
+        ({"heights_m": "[-3]"}, r"sites\.heights_m"),
+    ],
+)
+def test_rejects_invalid_mount_keys(mini: Path, keys: dict[str, str], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        sites_from(mini, **keys)
+
+
+@pytest.mark.parametrize(("other", "result"), [("aim_m = [1, 2]", "aim and aim_m"), ("yaw_deg = 0", "aim and yaw_deg")])
+def test_rejects_two_directions_at_once(mini: Path, other: str, result: str) -> None:
+    path = mini / "scenario.toml"
+    path.write_text(path.read_text().replace('sensor = "small"\n', f'sensor = "small"\naim = "roi"\n{other}\n'))
+    with pytest.raises(InputError, match=f"expected at most one of aim, aim_m and yaw_deg, got {result}"):
+        egvs.load(mini)
+
+
+def test_new_direction_replaces_the_old_one(mini: Path) -> None:
+    """As a new source does: in --set, and in a scenario that extends another."""
+    path = mini / "scenario.toml"
+    path.write_text(path.read_text().replace('sensor = "small"\n', 'sensor = "small"\naim = "roi"\nheights_m = [3]\n'))
+    (mini / "sites.csv").write_text("site,x_m,y_m\np,0,0\n")
+    assert sites_from(mini, aim_m="[0, 9]")[0].pose.yaw_deg == 90
+    assert angles_of(sites_from(mini, yaw_deg="30")) == [("p", 3, 30, 0)]
+    heir = mini.parent / "heir"
+    heir.mkdir()
+    rule = "[sites.grid]\nlow_m = [0, 0]\nhigh_m = [0, 0]\nspacing_m = 1\nheights_m = [5]\n"
+    (heir / "scenario.toml").write_text(f'extends = "../mini"\n[sites]\nyaw_deg = -45\n{rule}')
+    assert angles_of(sites.candidate_sites(egvs.load(heir))) == [("g01", 5, -45, 0)]
+
+
+def test_rejects_heights_with_a_rule(mini: Path) -> None:
+    path = mini / "scenario.toml"
+    rule = "heights_m = [3]\n[[sites.along]]\nline_m = [[0, 0], [1, 0]]\nspacing_m = 1\nheights_m = [3]\n"
+    path.write_text(path.read_text().replace('file = "sites.csv"\n', "").replace(
+        'sensor = "small"\n', f'sensor = "small"\n{rule}'))  # fmt: skip
+    with pytest.raises(InputError, match=r"heights_m has no effect with along\. Set along\.heights_m"):
+        egvs.load(mini)
+
+
+def test_rejects_target_out_of_reach_of_the_middle_ray() -> None:
+    up = Sensor("up", (30.0,), (0.0,), 1, 100.0, "")
+    with pytest.raises(InputError, match=r"up cannot be tilted so that its middle ray meets \(0.1, 0, 0\)"):
+        sites.aiming_angles("here", (0, 0, 6), (0.1, 0, 0), 0.0, up)
+    assert sensor.CATALOGUE["OS1-128"].middle_deg == (0.0, 0.0)
+
+
+def sites_of_lines(mini: Path, *rules: dict[str, Any]) -> tuple[sites.Site, ...]:
     tables = "".join(
         f"[[sites.along]]\nline_m = {rule['line']}\nspacing_m = {rule['spacing']}\nheights_m = {rule['heights']}\n"
         for rule in rules
@@ -39,159 +293,47 @@ def of_lines(mini: Path, *rules: dict[str, Any]) -> tuple[sites.Site, ...]:
     return sites.candidate_sites(egvs.load(mini))
 
 
-def places(found: tuple[sites.Site, ...]) -> list[tuple[str, float, float, float]]:
-    return [(site.name, *site.pose.position_m) for site in found]
-
-
-# --- GeoJSON ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", ["sites.geojson", "sites.json", "SITES.GeoJSON"])
-def test_geojson_says_the_same_as_csv(mini: Path, name: str) -> None:
-    by_csv = sites.candidate_sites(egvs.load(mini))
-    text = collection(point(10, 12, 3, name="pole_a"), point(30.5, -12, 3, name="pole_b"))
-    assert of_geojson(mini, text, name) == by_csv
-    assert places(by_csv) == [("pole_a", 10, 12, 3), ("pole_b", 30.5, -12, 3)]
-
-
-def test_properties_of_a_feature_are_its_pose_sensor_and_scan(mini: Path) -> None:
-    own = {"yaw_deg": 90, "pitch_deg": -7.5, "roll_deg": 1, "sensor": "VLP-16", "points": "measured.ply"}
-    first, second = of_geojson(
-        mini, collection(point(0, 1, 2, name="a", **own), point(3, 4, 5, name="b", yaw_deg=None))
-    )
-    assert first == sites.Site("a", sites.Pose(0, 1, 2, 90, -7.5, 1), "VLP-16", "measured.ply", "a")
-    assert second == sites.Site("b", sites.Pose(3, 4, 5), "small", pole="b")
-
-
-def test_a_height_may_be_a_property_and_a_name_a_number_as_in_csv(mini: Path) -> None:
-    found = of_geojson(mini, collection(point(0, 1, z_m=2, name=5), point(0, 1, 3, z_m=3.0, site="b"),
-                                        point(0, 1, 4, z_m=None, name="c")))  # fmt: skip
-    assert places(found) == [("5", 0, 1, 2), ("b", 0, 1, 3), ("c", 0, 1, 4)]
-
-
-@pytest.mark.parametrize("crs", [None, named("urn:ogc:def:crs:EPSG::25832"), named('LOCAL_CS["site",UNIT["metre",1]]')])
-def test_a_crs_in_metres_is_taken(mini: Path, crs: object) -> None:
-    text = json.dumps({"crs": crs, "features": [point(0, 1, 2, name="a")]})
-    assert places(of_geojson(mini, text)) == [("a", 0, 1, 2)]
-
-
-@pytest.mark.slow
-def test_a_run_from_geojson_scores_what_a_run_from_csv_does(mini: Path, tmp_path: Path) -> None:
-    settings = ["score.standard_error=false"]
-    egvs.run(egvs.load(mini, settings), tmp_path / "csv")
-    text = collection(point(10, 12, 3, name="pole_a"), point(30.5, -12, 3, name="pole_b"))
-    (mini / "sites.geojson").write_text(text)
-    egvs.run(egvs.load(mini, [*settings, 'sites.file="sites.geojson"']), tmp_path / "geojson")
-    by_csv, by_geojson = (egvs.read_scores(tmp_path / way / "scores.parquet") for way in ("csv", "geojson"))
-    assert by_csv.num_rows == 2
-    assert by_geojson.equals(by_csv)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "is not valid JSON"),
-        *((text, r"sites\.geojson: expected a FeatureCollection of Points, got ")
-          for text in ("[1, 2]", '{"type": "Point"}', "[]", "null", "5", '{"features": null}', '{"features": {}}')),
-        pytest.param("[" * 100_000, "is not valid JSON", id="deep"),
-        (collection(), "expected at least one site"),
-        *((collection(point(0, 0, 3, name="a"), wrong), "feature 1: expected a Feature with properties")
-          for wrong in (None, 5, [], {"type": "Feature", "geometry": None}, feature({"type": "Point"}, name="b"),
-                        feature({"type": "Point", "coordinates": None}, name="b"), point(0, name="b"),
-                        feature({"type": "Point", "coordinates": "195"}, name="b"), point(0, 0, 3, 4, name="b"),
-                        {**point(0, 0, 3), "properties": None})),
-        (collection(point(0, "195", 3, name="a")), "feature 0: y_m: expected a number.*text '195'"),
-        (collection(point(0, True, 3, name="a")), "feature 0: y_m: .*finite number.*True"),
-        (collection(point(0, None, 3, name="a")), "feature 0: y_m is missing"),
-        (collection(point(0, 0, 10**400, name="a")), "is not valid JSON: a number has too many digits"),
-        (collection(point(0, 0, 3, name="a", z_m=4)), "feature 0: z_m: there are two values, 4 and 3"),
-        (collection(point(0, 0, 3, name="a", site="b")), "feature 0: site: there are two values, 'b' and 'a'"),
-        *((collection(point(0, 0, 3, **{"name": "a", key: value})), f"feature 0: {found}: expected a text")
-          for key, found in (("name", "site"), ("sensor", "sensor"), ("points", "points"))
-          for value in ([], ["b"], {}, True)),
-        (collection(point(0, 0, 3, name="\ud800")), r"is not valid JSON: it is not valid text"),
-        *((json.dumps({"crs": crs, "features": [point(0, 0, 3, name="a")]}),
-           r"sites\.geojson: crs: .*; .*or null$") for crs in (5, "EPSG:25832", {}, {"properties": {"name": 5}})),
-        (json.dumps({"crs": named("local"), "features": [point(0, 0, 3, name="a")]}),
-           r"sites\.geojson: crs: 'local' is none that is known; a coordinate reference system, for example"),
-        *((json.dumps({"crs": named(crs), "features": [point(9, 51, 3, name="a")]}),
-           rf"sites\.geojson: is in {name}.*, and nothing says where the scenario's world frame lies on the Earth; "
-           r"\[crs\] with epsg .*scenario\.toml, or a network with a <location>")
-          for crs, name in (("EPSG:4326", "WGS 84"), ("urn:ogc:def:crs:OGC:1.3:CRS84", "WGS"), ("EPSG:2263", "NAD83"))),
-        (
-            collection(feature({"type": "LineString", "coordinates": [[0, 0, 3], [1, 1, 3]]}, name="a")),
-            "feature 0: expected .*a Point.*'LineString'",
-        ),
-        (collection(point(0, 0, 3, name="a"), point(0, 0, name="b")), "feature 1.*z_m is missing"),
-        (collection(point(0, 0, 3)), "feature 0.*site is missing"),
-        (collection(point(0, 0, 3, name="")), "feature 0.*site is missing"),
-        (collection(point(0, 0, 3, name="a/b")), "feature 0: site.*'a/b'"),
-        (collection(point(0, 0, 3, name="a"), point(1, 0, 3, name="a")), "feature 1.*two sites 'a'"),
-        *((collection(point(0, 0, 3, **{"name": "a", key: 90})), f"unknown column '{key}'. Did you mean yaw_deg[?]")
-          for key in ("yaw", "Yaw_deg", "yaw_dge", "yaw_rad", "yawdeg")),
-        (collection(point(0, 0, 3, name="a", pitch_deg=91)), "feature 0: pitch_deg.*91"),
-        (collection(point(0, 0, 3, name="a", yaw_deg="north")), "feature 0: yaw_deg.*'north'"),
-        (collection(point(0, 0, math.nan, name="a")), "feature 0: z_m.*nan"),
-        (
-            json.dumps({"features": [feature({"type": "Point", "coordinates": ["x", 0, 3]}, name="a")]}),
-            "feature 0: x_m.*'x'",
-        ),
-    ],
-)  # fmt: skip
-def test_what_is_wrong_with_geojson_is_said(mini: Path, text: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        of_geojson(mini, text)
-
-
-def test_geojson_that_is_no_utf8_is_refused(mini: Path) -> None:
-    (mini / "sites.geojson").write_bytes(b'{"features": "\xff"}')
-    with pytest.raises(InputError, match="is not valid JSON"):
-        sites.candidate_sites(egvs.load(mini, ['sites.file="sites.geojson"']))
-
-
 # --- along lines ------------------------------------------------------------------------------------------------------
-
-
-def test_sites_stand_along_a_line_and_round_its_corner(mini: Path) -> None:
+def test_sites_follow_a_line_around_its_corner(mini: Path) -> None:
     """25 m east, then north: the distance of 10 m is counted round the corner."""
-    found = of_lines(mini, {"line": [[0, 5], [25, 5], [25, 20]], "spacing": 10, "heights": [4]})
-    assert places(found) == [
+    result = sites_of_lines(mini, {"line": [[0, 5], [25, 5], [25, 20]], "spacing": 10, "heights": [4]})
+    assert site_positions(result) == [
         ("a01", 0, 5, 4),
         ("a02", 10, 5, 4),
         ("a03", 20, 5, 4),
         ("a04", 25, 10, 4),
         ("a05", 25, 20, 4),
     ]
-    assert {(site.pose.yaw_deg, site.pose.pitch_deg, site.sensor, site.points) for site in found} == {
+    assert {(site.pose.yaw_deg, site.pose.pitch_deg, site.sensor, site.points) for site in result} == {
         (15, 0, "small", None)
     }
 
 
-def test_each_place_has_all_heights_and_names_go_on_from_line_to_line(mini: Path) -> None:
-    found = of_lines(
+def test_each_position_has_all_heights_and_names_continue_across_lines(mini: Path) -> None:
+    result = sites_of_lines(
         mini,
         {"line": [[0, 0], [0, -3.5]], "spacing": 2, "heights": [3, 5]},
         {"line": [[7, 7], [8, 7]], "spacing": 2, "heights": [6]},
     )
-    assert places(found) == [
+    assert site_positions(result) == [
         ("a01@3m", 0, 0, 3),
         ("a01@5m", 0, 0, 5),
         ("a02@3m", 0, -2, 3),
         ("a02@5m", 0, -2, 5),
         ("a03", 7, 7, 6),
     ]
-    assert [site.pole for site in found] == ["a01", "a01", "a02", "a02", "a03"]
+    assert [site.pole for site in result] == ["a01", "a01", "a02", "a02", "a03"]
 
 
-def test_the_end_of_a_line_has_a_site_though_tenths_do_not_add_up(mini: Path) -> None:
-    found = of_lines(mini, {"line": [[0, 0], [0.3, 0], [0.7, 0]], "spacing": 0.1, "heights": [3]})
-    assert len(found) == 8
-    assert found[-1].pose.x_m == pytest.approx(0.7, abs=1e-12)
+def test_end_of_a_line_has_a_site_despite_rounding(mini: Path) -> None:
+    result = sites_of_lines(mini, {"line": [[0, 0], [0.3, 0], [0.7, 0]], "spacing": 0.1, "heights": [3]})
+    assert len(result) == 8
+    assert result[-1].pose.x_m == pytest.approx(0.7, abs=1e-12)
 
 
-def test_many_sites_have_names_of_one_length(mini: Path) -> None:
-    found = of_lines(mini, {"line": [[0, 0], [120, 0]], "spacing": 1, "heights": [3]})
-    assert [found[i].name for i in (0, 9, 120)] == ["a001", "a010", "a121"]
+def test_names_of_many_sites_have_equal_length(mini: Path) -> None:
+    result = sites_of_lines(mini, {"line": [[0, 0], [120, 0]], "spacing": 1, "heights": [3]})
+    assert [result[i].name for i in (0, 9, 120)] == ["a001", "a010", "a121"]
 
 
 @pytest.mark.parametrize(
@@ -203,21 +345,19 @@ def test_many_sites_have_names_of_one_length(mini: Path) -> None:
         ({"line": [[0, 0], [1, 0, 2]], "spacing": 1, "heights": [3]}, "line_m"),
     ],
 )
-def test_senseless_lines_are_refused(mini: Path, rule: dict[str, Any], message: str) -> None:
+def test_rejects_invalid_lines(mini: Path, rule: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        of_lines(mini, rule)
+        sites_of_lines(mini, rule)
 
 
-def test_a_line_beside_a_file_is_refused(mini: Path) -> None:
+def test_rejects_line_with_a_file(mini: Path) -> None:
     path = mini / "scenario.toml"
     path.write_text(path.read_text() + "[[sites.along]]\nline_m = [[0, 0], [1, 0]]\nspacing_m = 1\nheights_m = [3]\n")
-    with pytest.raises(InputError, match="exactly one of file, grid and along is needed, found file and along"):
+    with pytest.raises(InputError, match="expected exactly one of file, grid and along, got file and along"):
         egvs.load(mini)
 
 
 # --- too many ---------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
@@ -239,13 +379,13 @@ def test_a_line_beside_a_file_is_refused(mini: Path) -> None:
         ),
     ],
 )
-def test_a_rule_of_too_many_places_is_refused_at_once(mini: Path, setting: str, message: str) -> None:
+def test_rejects_rule_with_too_many_positions(mini: Path, setting: str, message: str) -> None:
     key, _, rule = setting.partition("=")
     with pytest.raises(InputError, match=message):
         sites.candidate_sites(egvs.load(mini, [f"sites.{key}={rule}"]))
 
 
-def test_too_many_combinations_are_refused(mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rejects_too_many_combinations(mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EGVS_MAX_SITES", "5")
     rule = "sites.grid={low_m=[0,0],high_m=[1,0],spacing_m=1,heights_m=[3,4,5]}"
     with pytest.raises(

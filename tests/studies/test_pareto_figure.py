@@ -1,4 +1,4 @@
-"""The picture of an accuracy study: nothing in it covers anything else."""
+"""The figure of an accuracy study: no legend or label covers a marker."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def row(setting: str, kind: str, knob: str, seconds: float, judged: float, **mor
 
 
 def settings(seconds: float, judged: float) -> list[SettingResult]:
-    """Settings on a front from 1 s and 10 % to 32 s and 0.3 %, and the scenario's own somewhere."""
+    """Settings on a front from 1 s and 10 % to 32 s and 0.3 %, and the scenario's own anywhere."""
     knobs = ("frames", "step", "grid", "period", "azimuth", "channels")
     front = [row(f"{250 << i} frames", APPROXIMATES, knobs[i], 2.0**i, 0.1 / 2**i, front=True) for i in range(6)]
     measures = [row(f"gamma {i}", MEASURES, "gamma", 1.0, 0.5) for i in range(5)]
@@ -28,7 +28,7 @@ def settings(seconds: float, judged: float) -> list[SettingResult]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("seconds", "judged"), [(0.8, 0.3), (40.0, 0.3), (40.0, 0.0), (5.0, 0.01)])
-def test_the_legend_covers_no_setting_wherever_the_scenario_lies(seconds: float, judged: float) -> None:
+def test_legend_and_labels_cover_no_marker(seconds: float, judged: float) -> None:
     figure = make_figure(settings(seconds, judged), 0.02, "trial")
     panel = figure.axes[0]
     legend = panel.get_legend().get_window_extent(figure.canvas.get_renderer())

@@ -1,6 +1,7 @@
-"""Are runs put side by side as they are: scores, ranks, agreement, and what differs?
+"""Comparisons of runs: scores, ranks, agreement, differences, and messages.
 
-Evidence: small runs of known settings, numbers taken from their artefacts, and each wrong use with its message."""
+The expected numbers are read from the artefacts of small runs.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ from egvs.studies.run_comparison import SiteResult, compare_runs
 
 @pytest.fixture
 def two(mini: Path, tmp_path: Path) -> tuple[Path, Path]:
-    """The small scenario, and the same with another gamma and a third site in the place of the second."""
+    """The small scenario, and the same with another gamma and a third site instead of the second."""
     first, second = tmp_path / "first", tmp_path / "second"
     egvs.run(egvs.load(mini), first)
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,10,12,3.5\npole_c,12,12,3\n")
@@ -30,58 +31,60 @@ def two(mini: Path, tmp_path: Path) -> tuple[Path, Path]:
     return first, second
 
 
-def test_scores_shares_ranks_and_settings_are_those_of_the_runs(two: tuple[Path, Path]) -> None:
-    found = compare_runs(two)
-    assert [run.label for run in found.runs] == ["A", "B"]
-    assert set(found.sites) == {"pole_a", "pole_b", "pole_c"}
-    for run, folder in zip(found.runs, two, strict=True):
+def test_compares_scores_shares_ranks_and_settings(two: tuple[Path, Path]) -> None:
+    comparison = compare_runs(two)
+    assert [run.label for run in comparison.runs] == ["A", "B"]
+    assert set(comparison.sites) == {"pole_a", "pole_b", "pole_c"}
+    for run, folder in zip(comparison.runs, two, strict=True):
         for row in egvs.read_scores(folder / "scores.parquet").to_pylist():
             site = run.sites[row["site"]]
             assert (site.egvs, site.rank, site.egvs_se) == (row["egvs"], row["rank"], row["egvs_se"])
             assert site.share == pytest.approx(row["egvs"] / row["egvs_limit"])
-    differing = {difference.what: difference.values for difference in found.differences}
+    differing = {difference.what: difference.values for difference in comparison.differences}
     assert differing["score.gamma"] == (4.0, 2.0)
     assert differing["seed"] == (7, 8)
     changed = differing.pop("content of sites.csv")
     assert changed[0] != changed[1]
     assert set(differing) == {"score.gamma", "seed"}
-    (pair,) = found.agreements
+    (pair,) = comparison.agreements
     assert (pair.shared, pair.tau, pair.best_a, pair.regret_a) == (1, None, ("pole_a",), 0.0)
-    assert found.notes == (
-        "1 site has the same name in A and B but another place, angle or sensor: pole_a",
+    assert comparison.notes == (
+        "1 site has the same name in A and B but another position, angle or sensor: pole_a",
         "A and B differ in score.gamma: compare ranks and shares, not bits",
     )
 
 
-def test_a_run_beside_itself_agrees_and_differs_in_nothing(two: tuple[Path, Path]) -> None:
-    found = compare_runs([two[0], two[0]])
-    (pair,) = found.agreements
+def test_run_compared_with_itself_has_no_differences(two: tuple[Path, Path]) -> None:
+    comparison = compare_runs([two[0], two[0]])
+    (pair,) = comparison.agreements
     assert (pair.tau, pair.rho, pair.regret_a) == pytest.approx((1.0, 1.0, 0.0))
-    assert (found.differences, found.notes) == ((), ())
+    assert (comparison.differences, comparison.notes) == ((), ())
 
 
 @pytest.mark.slow
-def test_runs_agree_by_the_scores_that_rank_them(mini: Path, tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
+def test_agreement_uses_the_scores_that_rank(mini: Path, tmp_path: Path, capsys) -> None:  # type: ignore[no-untyped-def]
     rows = "".join(f"p{n},{4 + 7 * n},{12 - 24 * (n % 2)},{2 + n}\n" for n in range(5))
     (mini / "sites.csv").write_text(f"site,x_m,y_m,z_m\n{rows}")
     for name, by in (("a", "egvs"), ("b", "seen_well"), ("c", "seen_well")):
         egvs.run(egvs.load(mini, [f"score.rank_by={by}"]), tmp_path / name)
-    found = compare_runs([tmp_path / name for name in "abc"])
+    comparison = compare_runs([tmp_path / name for name in "abc"])
     scores = [egvs.read_scores(tmp_path / name / "scores.parquet").to_pydict() for name in "ab"]
-    assert found.agreements[0].tau == pytest.approx(kendalltau(scores[0]["egvs"], scores[1]["seen_well"]).statistic)
-    assert found.agreements[2].tau == pytest.approx(1.0)
-    assert found.notes == tuple(f"A ranks by egvs, {other} by seen_well: compare ranks alone" for other in "BC")
-    study_tables.print_comparison(found)
-    told = capsys.readouterr().out
-    assert "B seen well" in told
-    assert all(f"{value:.1%}" in told for value in scores[1]["seen_well"])
+    assert comparison.agreements[0].tau == pytest.approx(
+        kendalltau(scores[0]["egvs"], scores[1]["seen_well"]).statistic
+    )
+    assert comparison.agreements[2].tau == pytest.approx(1.0)
+    assert comparison.notes == tuple(f"A ranks by egvs, {other} by seen_well: compare ranks only" for other in "BC")
+    study_tables.print_comparison(comparison)
+    printed = capsys.readouterr().out
+    assert "B seen well" in printed
+    assert all(f"{value:.1%}" in printed for value in scores[1]["seen_well"])
 
 
 def row(site: str, run_egvs: float, rank: int) -> SiteResult:
     return SiteResult(site, (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, "s"), 135.5, 34.6, run_egvs, None, rank, run_egvs / 100)
 
 
-def test_agreement_by_hand() -> None:
+def test_rank_agreement_computed_by_hand() -> None:
     """Three sites of four in common; two of their three pairs in the same order: tau = (2 - 1) / 3."""
     a = run_comparison.ComparedRun(
         "A", Path("a"), {s: row(s, v, 0) for s, v in (("p", 9.0), ("q", 8.0), ("r", 4.0), ("x", 99.0))}, {}, {}
@@ -89,22 +92,22 @@ def test_agreement_by_hand() -> None:
     b = run_comparison.ComparedRun(
         "B", Path("b"), {s: row(s, v, 0) for s, v in zip("pqr", (6, 8, 2), strict=True)}, {}, {}
     )
-    pair = run_comparison._agreement(a, b)
+    pair = run_comparison.compare_rankings(a, b)
     assert (pair.shared, pair.best_a, pair.best_b) == (3, ("p",), ("q",))
     assert pair.tau == pytest.approx(1 / 3)
     assert pair.rho == pytest.approx(0.5)
     assert pair.regret_a == pytest.approx(0.25)
 
 
-def test_runs_that_share_no_site_are_told(two: tuple[Path, Path], mini: Path, tmp_path: Path, run_egvs) -> None:
+def test_runs_without_common_site_are_noted(two: tuple[Path, Path], mini: Path, tmp_path: Path, run_egvs) -> None:
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\nlamp,10,12,3\n")
     egvs.run(egvs.load(mini), tmp_path / "third")
     code, printed, _ = run_egvs("compare", two[0], tmp_path / "third")
     assert code == 0
-    assert "note: A and B share no site: their rankings cannot be held against each other" in printed
+    assert "note: A and B have no site in common, so their rankings cannot be compared" in printed
 
 
-def test_the_command_line_prints_it(two: tuple[Path, Path], run_egvs) -> None:
+def test_compare_command_prints_tables_and_notes(two: tuple[Path, Path], run_egvs) -> None:
     code, printed, _ = run_egvs("compare", *two)
     assert code == 0
     for part in ("A bit", "B rank", "score.gamma", "note: 1 site has the same name", str(two[0])):
@@ -120,18 +123,19 @@ def test_tables_fit_the_terminal(width: int, runs: int, monkeypatch: pytest.Monk
     sites = {f"site_{n:02}": row(f"site_{n:02}", 123456.7 - n, n + 1) for n in range(3)}
     one = run_comparison.ComparedRun("A", Path("runs/base"), sites, {"seed": 1}, {})
     all_runs = tuple(
-        replace(one, label=run_comparison._letter(n), settings={"traffic.kinds[car].length_m": n}) for n in range(runs)
+        replace(one, label=run_comparison.run_label(n), settings={"traffic.kinds[car].length_m": n})
+        for n in range(runs)
     )
-    found = run_comparison.Comparison(
+    comparison = run_comparison.Comparison(
         all_runs,
         tuple(sites),
-        (run_comparison._agreement(one, all_runs[1]),),
-        tuple(run_comparison._differences(all_runs)),
+        (run_comparison.compare_rankings(one, all_runs[1]),),
+        tuple(run_comparison.find_differences(all_runs)),
         (),
     )
     console = Console(width=width, record=True)
     monkeypatch.setattr(study_tables, "console", lambda *_, **__: console)
-    study_tables.print_comparison(found)
+    study_tables.print_comparison(comparison)
     lines = console.export_text().splitlines()
     assert max(map(len, lines)) <= width
     assert sum("123456.7" in line for line in lines) >= 1  # no number is cut
@@ -141,7 +145,7 @@ def test_tables_fit_the_terminal(width: int, runs: int, monkeypatch: pytest.Monk
 
 
 @pytest.mark.slow
-def test_a_row_that_a_run_lacks_is_told_once_and_by_its_name(
+def test_missing_table_row_is_one_difference(
     mini: Path,
     tmp_path: Path,
     run_egvs,  # type: ignore[no-untyped-def]
@@ -153,14 +157,14 @@ def test_a_row_that_a_run_lacks_is_told_once_and_by_its_name(
         file.read_text().replace("[statics]", f"{van}\n[statics]").replace("length_m = 4.5", "length_m = 4.4")
     )
     egvs.run(egvs.load(mini), tmp_path / "second")
-    found = {d.what: d.values for d in compare_runs([tmp_path / "first", tmp_path / "second"]).differences}
-    assert found == {"traffic.kinds[car].length_m": (4.5, 4.4), "traffic.kinds[van]": (None, "there")}
+    comparison = {d.what: d.values for d in compare_runs([tmp_path / "first", tmp_path / "second"]).differences}
+    assert comparison == {"traffic.kinds[car].length_m": (4.5, 4.4), "traffic.kinds[van]": (None, "present")}
     _, printed, _ = run_egvs("compare", tmp_path / "first", tmp_path / "second")
     assert "traffic.kinds[car].length_m" in printed
 
 
 @pytest.mark.slow
-def test_an_effect_that_a_run_lacks_is_told_by_its_parameters_alone(mini: Path, tmp_path: Path) -> None:
+def test_missing_effect_is_listed_by_its_parameters(mini: Path, tmp_path: Path) -> None:
     folders = tmp_path / "plain", tmp_path / "rain"
     for folder, named in zip(folders, ([], ["effects.rain.rate_mm_h=30"]), strict=True):
         egvs.run(egvs.load(mini, named), folder)
@@ -169,7 +173,7 @@ def test_an_effect_that_a_run_lacks_is_told_by_its_parameters_alone(mini: Path, 
     ]
 
 
-def test_a_table_that_is_empty_in_one_run_is_told_by_the_others_rows() -> None:
+def test_empty_table_is_listed_by_rows_of_other_run() -> None:
     runs = [
         run_comparison.ComparedRun(label, Path(), {}, settings, {})
         for label, settings in (
@@ -177,24 +181,24 @@ def test_a_table_that_is_empty_in_one_run_is_told_by_the_others_rows() -> None:
             ("B", {"traffic.periods[day].weight": 1.0, "seed": 1}),
         )
     ]
-    found = [(d.what, d.values) for d in run_comparison._differences(runs)]
-    assert found == [("traffic.periods[day]", (None, "there"))]
+    comparison = [(d.what, d.values) for d in run_comparison.find_differences(runs)]
+    assert comparison == [("traffic.periods[day]", (None, "present"))]
 
 
-def test_letters_go_on_after_z() -> None:
-    assert [run_comparison._letter(n) for n in (0, 25, 26, 27, 52)] == ["A", "Z", "AA", "AB", "BA"]
+def test_labels_continue_after_z() -> None:
+    assert [run_comparison.run_label(n) for n in (0, 25, 26, 27, 52)] == ["A", "Z", "AA", "AB", "BA"]
 
 
-def test_what_is_no_finished_run_is_refused(two: tuple[Path, Path], tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="1 run; two or more folders of finished runs"):
+def test_rejects_folders_without_finished_run(two: tuple[Path, Path], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="expected at least two runs, got 1"):
         compare_runs(two[:1])
     with pytest.raises(InputError, match=r"run\.json: no such file. Name a folder that egvs run has written."):
         compare_runs([two[0], tmp_path / "nowhere"])
     record = json.loads((two[1] / "run.json").read_text())
     (two[1] / "scores.parquet").write_bytes((two[0] / "scores.parquet").read_bytes())
-    with pytest.raises(InputError, match="is not what the run in its folder made"):
+    with pytest.raises(InputError, match="is not the file that the run wrote"):
         compare_runs(two)
     del record["stages"]["score"]
     (two[1] / "run.json").write_text(json.dumps(add_checksum(record)))
-    with pytest.raises(InputError, match="the stage score is not done; a finished run"):
+    with pytest.raises(InputError, match="the stage score was not run"):
         compare_runs(two)

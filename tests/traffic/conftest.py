@@ -1,12 +1,15 @@
 """A town with traffic, made once for all tests of the traffic."""
 
+import shutil
+from pathlib import Path
+
 import pytest
 
 from egvs.artefacts import parquet
 from egvs.stages import traffic
 from egvs.traffic import sumo
-from tests.stages import run_stage
-from tests.traffic.helpers import SMALL, netgenerate, scenario
+from tests.stage_runner import run_stage
+from tests.traffic.helpers import FOREIGN_TEXT, SMALL, first_lane, netgenerate, scenario
 
 
 @pytest.fixture(scope="session")
@@ -30,7 +33,7 @@ def recorded(town, tmp_path_factory):
 
 
 @pytest.fixture
-def patient(monkeypatch):
+def retry_connecting(monkeypatch):
     """SUMO listens a moment after it was started."""
     connect = sumo._connect
 
@@ -38,3 +41,16 @@ def patient(monkeypatch):
         return next(filter(None, (connect(host, port) for _ in range(1_000_000))))
 
     monkeypatch.setattr(sumo, "_connect", again)
+
+
+@pytest.fixture
+def demand_folder(town, tmp_path) -> Path:
+    """A folder with the town and the route of a car; next to it, a file that SUMO must not change."""
+    folder = tmp_path / "in"
+    folder.mkdir()
+    shutil.copy(town / "net.xml", folder)
+    edge = first_lane(town / "net.xml")[0]
+    route = f'<vehicle id="v" depart="0"><route edges="{edge}"/></vehicle>'
+    (folder / "own.rou.xml").write_text(f"<routes>{route}</routes>")
+    (tmp_path / "foreign.txt").write_text(FOREIGN_TEXT)
+    return folder

@@ -1,4 +1,4 @@
-"""Does every format of floating car data give the same rows, and is every damaged one refused with a clear message?"""
+"""Formats of floating car data, damaged files, and groups of frames."""
 
 import gzip
 import re
@@ -16,12 +16,16 @@ from egvs.traffic import fcd
 from egvs.traffic.fcd import FrameWindow, group_frames
 
 HEADER = "timestep_time;vehicle_id;vehicle_x;vehicle_y;vehicle_angle;vehicle_type;vehicle_speed"
+
+
 CSV = f"""{HEADER}
 0.000;;;;;;
 0.500;b;1.00000000;2.00000000;90.00000000;car;3.50000000
 0.500;a;-1.25000000;1e3;360.00000000;bus;0.00000000
 1.000;b;2.50000000;2.00000000;90.00000000;car;3.00000000
 """
+
+
 XML = """<?xml version="1.0"?>
 <fcd-export>
   <timestep time="0.00"/>
@@ -33,6 +37,8 @@ XML = """<?xml version="1.0"?>
   <timestep time="1.00"><vehicle id="b" x="2.50" y="2.00" angle="90.00" type="car" speed="3.00"/></timestep>
 </fcd-export>
 """
+
+
 ROWS = {
     "time_ms": [500, 500, 1000],
     "id": ["b", "a", "b"],
@@ -71,14 +77,14 @@ def read_all(path):
 
 @pytest.mark.parametrize("zipped", [False, True], ids=["plain", "gzipped"])
 @pytest.mark.parametrize("form", ["csv", "xml", "parquet"])
-def test_every_format_gives_the_same_rows(tmp_path, form, zipped):
+def test_all_formats_give_the_same_rows(tmp_path, form, zipped):
     content = {"csv": CSV.encode(), "xml": XML.encode(), "parquet": parquet_bytes()}[form]
     path = tmp_path / "recorded"  # the name says nothing, the first bytes do
     path.write_bytes(gzip.compress(content) if zipped else content)
     assert read_all(path).to_pydict() == ROWS
 
 
-def test_columns_may_stand_in_any_order_and_beside_others(tmp_path):
+def test_columns_in_any_order_with_others_between(tmp_path):
     path = tmp_path / "fcd.csv"
     path.write_text(
         "vehicle_lane;vehicle_slope;vehicle_type;vehicle_angle;vehicle_z;vehicle_y;vehicle_x;vehicle_id;timestep_time\n"
@@ -89,7 +95,7 @@ def test_columns_may_stand_in_any_order_and_beside_others(tmp_path):
     assert np.isnan(row["speed"])
 
 
-def test_persons_in_a_csv_are_left_out(tmp_path):
+def test_persons_in_csv_are_skipped(tmp_path):
     path = tmp_path / "fcd.csv"
     path.write_text(f"{HEADER};person_id;person_x\n1;;;;;;;p;3\n1;v;1;2;3;car;4;;\n")
     assert read_all(path)["id"].to_pylist() == ["v"]
@@ -105,23 +111,26 @@ BAD = {
     "without angle": (HEADER.replace("vehicle_angle", "vehicle_lane").encode() + b"\n", "no column for 'angle'"),
     "without type": (HEADER.replace("vehicle_type", "vehicle_lane").encode() + b"\n", "no column for 'type'"),
     "not a number": (f"{HEADER}\n{row(x='here')}\n".encode(), r"cannot be read as CSV.*here"),
-    "NaN angle": (f"{HEADER}\n{row()}\n{row(angle='nan')}\n".encode(), r"row 2: angle of vehicle 'v' is nan; a finite"),
+    "NaN angle": (
+        f"{HEADER}\n{row()}\n{row(angle='nan')}\n".encode(),
+        r"row 2: angle of vehicle 'v' is nan. Use a finite",
+    ),
     "empty angle": (f"{HEADER}\n{row(angle='')}\n".encode(), r"row 1: angle of vehicle 'v' is empty"),
     "x beyond the Earth": (
         f"{HEADER}\n{row(x='1e9')}\n".encode(),
-        r"row 1: x of vehicle 'v' is 1000000000.0; a finite number, at most",
+        r"row 1: x of vehicle 'v' is 1000000000.0. Use a finite number, at most",
     ),
     "infinite x": (f"{HEADER}\n{row(x='inf')}\n".encode(), r"row 1: x of vehicle 'v' is inf"),
     "no type given": (f"{HEADER}\n{row(type='')}\n".encode(), r"row 1: vehicle 'v' has no type"),
     "time runs back": (f"{HEADER}\n{row(time='2')}\n{row()}\n".encode(), r"row 2: time 1 s comes after 2 s"),
-    "time too fine": (f"{HEADER}\n{row(time='0.0005')}\n".encode(), r"row 1: time 0\.000500 s.*milliseconds"),
+    "time too fine": (f"{HEADER}\n{row(time='0.0005')}\n".encode(), r"row 1: .*milliseconds, got time 0\.000500 s"),
     "clock time": (f"{HEADER}\n{row(time='00:00:01')}\n".encode(), r"cannot be read as CSV"),
     "short row": (f"{HEADER}\n{row()}\n1.0;v;1\n".encode(), r"cannot be read as CSV"),
     "truncated gzip, CSV": (gzip.compress(CSV.encode() * 900)[:-30], r"damaged gzip|cannot be read as CSV"),
     "truncated gzip, XML": (gzip.compress(XML.encode())[:-30], r"damaged gzip"),
     "truncated gzip, Parquet": (gzip.compress(parquet_bytes())[:-30], r"damaged gzip"),
     "truncated XML": (XML[:-40].encode(), r"not well-formed XML"),
-    "XML of another kind": (b"<net/>", r"its root is <net>; a file whose root is <fcd-export>"),
+    "XML of another kind": (b"<net/>", r"expected the root <fcd-export>, got <net>"),
     "XML without angle": (XML.replace('angle="90.00"', "").encode(), r"vehicle 'b' at time '0\.50' has no angle"),
     "XML with a bad number": (XML.replace('"-1.25"', '"west"').encode(), r"x: .*west"),
     "XML with NaN": (XML.replace('"360.00"', '"nan"').encode(), r"vehicle element 2: angle of vehicle 'a' is nan"),
@@ -134,13 +143,13 @@ BAD = {
     "Parquet with an id that is no text": (parquet_bytes(b"\xff"), r"cannot be read as Parquet \(.*UTF8"),
     "infinite speed": (
         f"{HEADER}\n{row(speed='inf')}\n".encode(),
-        r"row 1: speed of vehicle 'v' is inf; a finite number",
+        r"row 1: speed of vehicle 'v' is inf. Use a finite number",
     ),
 }
 
 
 @pytest.mark.parametrize(("content", "message"), BAD.values(), ids=BAD.keys())
-def test_damaged_file_is_refused(tmp_path, content, message):
+def test_rejects_damaged_file(tmp_path, content, message):
     path = tmp_path / "bad.fcd"
     path.write_bytes(content)
     with pytest.raises(InputError, match=message) as caught:
@@ -149,7 +158,7 @@ def test_damaged_file_is_refused(tmp_path, content, message):
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_missing_file_is_refused(tmp_path):
+def test_rejects_missing_file(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         list(fcd.read_fcd(tmp_path / "none.csv"))
 
@@ -169,13 +178,13 @@ def steps(*times_s, vehicle="v"):
 
 
 def picked(tables, window, each=2):
-    found = list(group_frames(tables, window, each, "place"))
-    assert [g.first_frame for g in found] == list(np.cumsum([0] + [g.frames for g in found[:-1]]))
-    assert sum(g.frames for g in found) == window.count
-    return [(int(f), t) for g in found for f, t in zip(g.frame, g.rows["time_ms"].to_pylist(), strict=True)]
+    result = list(group_frames(tables, window, each, "place"))
+    assert [g.first_frame for g in result] == list(np.cumsum([0] + [g.frames for g in result[:-1]]))
+    assert sum(g.frames for g in result) == window.count
+    return [(int(f), t) for g in result for f, t in zip(g.frame, g.rows["time_ms"].to_pylist(), strict=True)]
 
 
-def test_warm_up_and_period_choose_the_time_steps():
+def test_warm_up_and_period_select_time_steps():
     times = np.arange(25_200, 25_205, 0.25)
     assert picked([steps(*times)], FrameWindow(3, 500, skip_ms=1000)) == [
         (0, 25_201_000),
@@ -184,26 +193,26 @@ def test_warm_up_and_period_choose_the_time_steps():
     ]
 
 
-def test_an_empty_step_of_a_complete_recording_is_an_empty_frame():
+def test_step_without_rows_of_complete_recording_is_an_empty_frame():
     window = FrameWindow(5, 1000, first_ms=1000, complete=True)
     assert picked([steps(0, 1, 3)], window) == [(0, 1000), (2, 3000)]
     assert picked([], window) == []
 
 
-def test_too_few_frames_are_counted():
+def test_rejects_too_few_frames():
     with pytest.raises(
         InputError, match=r"frames = 5: the file has 3 frames 1 s apart after a warm-up of 1 s \(4 time steps in all"
     ):
         list(group_frames([steps(0, 1, 2, 3)], FrameWindow(5, 1000, skip_ms=1000), 10, "place"))
 
 
-def test_a_period_between_the_files_steps_is_refused():
-    with pytest.raises(InputError, match=r"frame_period_s = 0.25: the file's time steps are 1 s apart"):
+def test_rejects_period_between_time_steps():
+    with pytest.raises(InputError, match=r"frame_period_s = 0.25: the time steps of the file are 1 s apart"):
         list(group_frames([steps(0, 1, 2, 3)], FrameWindow(2, 250), 10, "place"))
 
 
-def test_a_file_without_vehicles_is_refused():
-    with pytest.raises(InputError, match="holds no vehicle"):
+def test_rejects_file_without_vehicles():
+    with pytest.raises(InputError, match="the file has no vehicle"):
         list(group_frames([], FrameWindow(2, 250), 10, "place"))
 
 
@@ -213,15 +222,15 @@ def test_a_file_without_vehicles_is_refused():
     each=st.integers(1, 7),
 )
 def test_groups_do_not_depend_on_how_rows_arrive(present, cuts, each):
-    whole = steps(*np.repeat(np.arange(len(present)), present).tolist())
-    edges = sorted({0, whole.num_rows, *(c for c in cuts if c < whole.num_rows)})
-    pieces = [whole.slice(a, b - a) for a, b in pairwise(edges) if b > a]
+    full = steps(*np.repeat(np.arange(len(present)), present).tolist())
+    edges = sorted({0, full.num_rows, *(c for c in cuts if c < full.num_rows)})
+    pieces = [full.slice(a, b - a) for a, b in pairwise(edges) if b > a]
     window = FrameWindow(len(present), 1000, first_ms=0, complete=True)
     expected = [(f, f * 1000) for f, n in enumerate(present) for _ in range(n)]
     assert picked(pieces, window, each) == expected
 
 
-def test_the_message_names_the_file_only_once(tmp_path):
+def test_message_names_the_file_once(tmp_path):
     path = tmp_path / "x.csv"
     path.write_text("a;b\n1;2\n")
     with pytest.raises(InputError) as caught:
@@ -229,16 +238,16 @@ def test_the_message_names_the_file_only_once(tmp_path):
     assert len(re.findall("x.csv", str(caught.value))) == 1
 
 
-def test_frames_of_too_many_vehicles_are_refused(monkeypatch):
+def test_rejects_frames_with_too_many_vehicles(monkeypatch):
     monkeypatch.setenv("EGVS_MAX_ROWS", "5")
     tables = [steps(*[0.0] * 4), steps(*[0.0] * 4)]
     with pytest.raises(
-        InputError, match=r"has more than 5 vehicles in frames side by side\. The limit is 5 rows; set EGVS_MAX_RO"
+        InputError, match=r"has more than 5 vehicles in the frames of a group\. The limit is 5 rows; set EGVS_MAX_RO"
     ):
         list(group_frames(tables, FrameWindow(1, 1000), 1, "here"))
 
 
-def test_a_parquet_file_of_more_rows_than_it_can_hold_is_refused(tmp_path):
+def test_rejects_parquet_file_with_implausible_number_of_rows(tmp_path):
     """Three million rows that are all the same, in a few kilobytes."""
     n = 3_000_000
     columns = {"timestep_time": pa.array(np.zeros(n)), "vehicle_id": pa.array(["v"] * n).dictionary_encode()}
@@ -247,11 +256,11 @@ def test_a_parquet_file_of_more_rows_than_it_can_hold_is_refused(tmp_path):
     pq.write_table(pa.table(columns), tmp_path / "f.parquet", compression="zstd")
     (tmp_path / "f.parquet.gz").write_bytes(gzip.compress((tmp_path / "f.parquet").read_bytes()))
     for name in ("f.parquet", "f.parquet.gz"):
-        with pytest.raises(InputError, match=rf"{name}: says that it holds 3,000,000 rows in [0-9,]+ bytes; a whole"):
+        with pytest.raises(InputError, match=rf"{name}: declares 3,000,000 rows in [0-9,]+ bytes"):
             read_all(tmp_path / name)
 
 
-def test_a_row_group_of_more_than_the_bound_is_not_unpacked(tmp_path, monkeypatch):
+def test_rejects_row_group_above_limit(tmp_path, monkeypatch):
     monkeypatch.setenv("EGVS_MAX_UNPACKED_MB", "1")
     n = 30_000
     columns = {f"vehicle_{key}": np.random.default_rng(1).random(n) for key in ("x", "y", "angle", "z", "speed")}
@@ -263,8 +272,8 @@ def test_a_row_group_of_more_than_the_bound_is_not_unpacked(tmp_path, monkeypatc
         read_all(tmp_path / "f.parquet")
 
 
-def test_a_header_that_is_no_text_is_refused(tmp_path):
-    """The name of a column that is not needed is damaged: who knows what else is."""
+def test_rejects_header_that_is_not_text(tmp_path):
+    """Even if only the name of an unused column is damaged."""
     path = tmp_path / "fcd.csv"
     head = b"timestep_time;vehicle_id;vehicle_x;vehicle_y;vehicle_angle;vehicle_type;vehic\xff\xffpeed\n"
     path.write_bytes(head + b"0.00;east;1.0;-2.0;90.0;car;2.0\n")

@@ -1,50 +1,52 @@
-"""Is what goes wrong with SUMO's programs told with its own words?"""
+"""Starting and querying SUMO."""
 
 import os
+import signal
+import socket
+import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from egvs.core.errors import MissingBackendError, RunError
+from egvs.core.errors import InputError, MissingBackendError, RunError
+from egvs.stages import traffic
 from egvs.traffic import sumo
+from tests.stage_runner import run_stage
+from tests.traffic.helpers import SMALL, fake_sumo, scenario, serve
 
 
-def fake_sumo(folder, monkeypatch, script):
-    path = folder / "sumo"
-    path.write_text(f"#!/bin/sh\n{script}\n")
-    path.chmod(0o755)
-    monkeypatch.setenv("SUMO_BINARY", str(path))
-
-
-def test_a_missing_system_library_is_named_with_its_packages(tmp_path, monkeypatch):
+def test_missing_system_library_is_named_with_its_package(tmp_path, monkeypatch):
     says = "sumo: error while loading shared libraries: libX11.so.6: cannot open shared object file: No such file"
     fake_sumo(tmp_path, monkeypatch, f"echo '{says}' >&2; exit 127")
-    with pytest.raises(MissingBackendError, match=r"libX11\.so\.6 is missing; on Debian: apt-get install .*libx11-6"):
+    with pytest.raises(
+        MissingBackendError, match=r"libX11\.so\.6 is missing. On Debian, run apt-get install .*libx11-6"
+    ):
         sumo.run_program("sumo", ["--version"], tmp_path)
 
 
-def test_sumo_killed_from_outside_is_told(tmp_path, monkeypatch):
+def test_reports_killed_sumo(tmp_path, monkeypatch):
     fake_sumo(tmp_path, monkeypatch, "kill -9 $$")
     with pytest.raises(RunError, match="sumo was killed by signal 9"):
         sumo.run_program("sumo", [], tmp_path)
 
 
 @pytest.mark.parametrize("signal", [6, 8, 11])
-def test_a_crash_is_what_it_was_given(tmp_path, monkeypatch, signal):
+def test_crash_is_an_error_of_the_input(tmp_path, monkeypatch, signal):
     """By damaged networks, some of which SUMO does not survive."""
     fake_sumo(tmp_path, monkeypatch, f"echo {'x' * 1000} >&2; kill -{signal} $$")
     with pytest.raises(sumo.SumoInputError, match=f"sumo crashed with signal {signal}:\n  x{{300}}$"):
         sumo.run_program("sumo", [], tmp_path)
 
 
-def test_a_binary_that_is_none_is_told(tmp_path, monkeypatch):
+def test_rejects_invalid_binary(tmp_path, monkeypatch):
     fake_sumo(tmp_path, monkeypatch, "")
     (tmp_path / "sumo").write_bytes(b"\x00not a program")
     with pytest.raises(MissingBackendError, match="sumo cannot be started"):
         sumo.run_program("sumo", [], tmp_path)
 
 
-def test_finding_sumo_leaves_this_process_its_own_projections(monkeypatch):
+def test_finding_sumo_preserves_proj_variables(monkeypatch):
     """The wheel's data is of a PROJ that rasterio's refuses."""
     for name in ("PROJ_DATA", "PROJ_LIB", "SUMO_HOME"):
         monkeypatch.delenv(name, raising=False)
@@ -57,10 +59,67 @@ def test_finding_sumo_leaves_this_process_its_own_projections(monkeypatch):
     assert os.environ["PROJ_DATA"] == sumo.sumo_environment()["PROJ_DATA"] == "mine"
 
 
-def test_another_sumos_version_is_asked(tmp_path, monkeypatch):
+def test_version_of_another_sumo_is_parsed(tmp_path, monkeypatch):
     fake_sumo(tmp_path, monkeypatch, "echo 'Eclipse SUMO sumo v1_27_0+0045-abc'")
     sumo.sumo_version.cache_clear()
     try:
         assert sumo.sumo_version() == "1.27.0+0045-abc"
     finally:
         sumo.sumo_version.cache_clear()
+
+
+def test_rejects_incomplete_network_from_netconvert(tmp_path, monkeypatch):
+    monkeypatch.setattr(sumo, "run_program", lambda *_: (tmp_path / "a.net.xml").write_text("<net>\n <edge"))
+    with pytest.raises(RunError, match=r"a\.net\.xml: SUMO wrote an incomplete file. Is the disk full\?"):
+        sumo.run_netconvert([], tmp_path, "a.net.xml")
+    monkeypatch.setattr(sumo, "run_program", lambda *_: (tmp_path / "a.net.xml").write_text("<net>\n</net>\n"))
+    sumo.run_netconvert([], tmp_path, "a.net.xml")
+
+
+def test_rejects_traci_address_without_server(town, tmp_path):
+    from sumolib.miscutils import getFreeSocketPort
+
+    with pytest.raises(InputError, match="no SUMO answers there"):
+        run_stage(
+            traffic, scenario(town, network="net.xml", **SMALL), tmp_path, traci=("localhost", getFreeSocketPort())
+        )
+
+
+@pytest.mark.parametrize(
+    "answer", [b"", b"HTTP/1.1 400 Bad Request\r\n", b"\0\0\0\5\0", b"\0\0\0\x0b\7\0\0\0\0\0\0", b"\0\0\0\4"]
+)
+def test_rejects_server_that_is_not_sumo(town, tmp_path, monkeypatch, answer):
+    """One that listens and is silent, and some that say something else, and wait."""
+    monkeypatch.setattr(sumo, "_ANSWER_TIMEOUT_S", 0.2)
+    with socket.create_server(("localhost", 0)) as server, ThreadPoolExecutor(1) as threads:
+        taken = threads.submit(server.accept)
+        port = server.getsockname()[1]
+        answered = threads.submit(lambda: taken.result()[0].sendall(answer))
+        with pytest.raises(InputError, match=r"the server there does not answer as SUMO does within 0\.2 s"):
+            run_stage(traffic, scenario(town, network="net.xml", **SMALL), tmp_path, traci=("localhost", port))
+        answered.result()
+        taken.result()[0].close()
+    assert not (tmp_path / "trajectories.parquet").exists()
+
+
+@pytest.mark.usefixtures("retry_connecting")
+def test_reports_sumo_that_stops_answering(town, recorded, tmp_path, monkeypatch):
+    monkeypatch.setattr(sumo, "_STEP_TIMEOUT_S", 0.2)
+    process, port = serve(recorded[3] / "sumo")
+    with process:
+        try:
+            with (
+                pytest.raises(RunError, match=rf"SUMO at localhost:{port} closed .*, or did not answer for 0\.2 s"),
+                sumo.connect_traci("localhost", port) as connection,
+            ):
+                process.send_signal(signal.SIGSTOP)
+                connection.simulationStep()
+        finally:
+            process.kill()
+
+
+@pytest.mark.slow
+def test_importing_the_stage_does_not_import_sumo_tools():
+    code = "import sys, egvs.stages.traffic; print([m for m in ('sumolib', 'traci') if m in sys.modules])"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.strip() == "[]"

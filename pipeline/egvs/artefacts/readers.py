@@ -1,13 +1,7 @@
-"""Read the artefacts of a run folder as tables and arrays.
+"""Read the artefacts of a run folder: Arrow tables, NumPy arrays, blind spots of sites, rankings by period.
 
-``blindspots.parquet`` as it is read: the map of each site, and its worst places in words.
-
-Artefacts as arrays and tables, for notebooks, stages, and people who want to compute further.
-
-Each reader checks what it reads and says which file is wrong. Tables come as Arrow tables (``.to_pandas()`` makes a
-data frame of one), grids as NumPy arrays.
-
-The ranking of the sites in each period, side by side with that of the mix.
+Each reader checks what it reads and names the file that is wrong. ``.to_pandas()`` makes a data frame of an Arrow
+table.
 """
 
 from __future__ import annotations
@@ -15,45 +9,48 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
-from egvs.artefacts import parquet, run_folder
+from egvs.artefacts import checksums, parquet
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import read_periods
 from egvs.core.errors import InputError
-from egvs.core.grid import Grid
+from egvs.core.grid import FloatArray, Grid
 
 MIN_VEHICLES = 10
-"""Of fewer different vehicles nothing is said in words: a share of three cars is no fact about a lane."""
+"""Locations with fewer different vehicles are not listed: a share of three cars says nothing about a lane."""
 
 MAX_LOCATIONS = 5
-"""The worst places that are listed of a site."""
+"""Number of worst locations that are listed for a site."""
 
 _MAX_ROW_GROUPS = 1000
-"""Row groups of a file; where there are more sites, some share one."""
+"""Most row groups of a file; where there are more sites, some share a row group."""
 
 _LISTED_KINDS = ("lane", "turn", "crossing")
+
+_REMAKE_HINT = "Make the file again."
+
+Rows = list[dict[str, Any]]
 
 
 @dataclass(frozen=True)
 class LocationVisibility:
-    """A place, and what a site sees there.
+    """A location, and the vehicles there that a site sees.
 
     Attributes
     ----------
     by, words
-        As in the artefact.
-    vehicle_frames, vehicles
-        Vehicles there, counted in each frame; how many different ones.
-    share, se
-        Of them that is seen, 0 to 1, and its standard error; not a number of one vehicle.
+        Kind and name of the location, as in the artefact.
     x_m, y_m
-        Where they were on average, world frame.
+        Mean position of the vehicles, world frame.
+    vehicle_frames, vehicles
+        Number of vehicles counted in each frame, and of different vehicles.
+    share, se
+        Share of the vehicles that the site sees, 0 to 1, and its standard error; NaN with one vehicle.
     """
 
     by: str
@@ -68,88 +65,90 @@ class LocationVisibility:
 
 @dataclass(frozen=True, eq=False)
 class SiteBlindspots:
-    """One site's rows.
+    """The rows of one site in ``blindspots.parquet``.
 
     Attributes
     ----------
     site
-        Its name.
+        Name of the site.
     points
-        A vehicle with so many points is seen.
+        A vehicle with this many points is seen.
     locations
-        All but the squares, in the order of the artefact.
+        All locations except the cells of the map, in the order of the artefact.
     share_missed
-        Of the vehicles over each square, the share that is not seen, (nx, ny) float64; not a number where none was
-        recorded.
+        Share of the vehicles over each cell that the site misses, (nx, ny) float64; NaN where none was recorded.
     origin_m, cell_m
-        The squares' south-western corner in the world frame, and their edge.
+        South-western corner of the cells in the world frame, and their edge.
     """
 
     site: str
     points: float
     locations: tuple[LocationVisibility, ...]
-    share_missed: NDArray[np.float64]
+    share_missed: FloatArray
     origin_m: tuple[float, float]
     cell_m: float
 
     @property
     def overall(self) -> LocationVisibility | None:
         """All vehicles of the region; None where there are none."""
-        return next((place for place in self.locations if place.by == "all"), None)
+        for location in self.locations:
+            if location.by == "all":
+                return location
+        return None
 
     @property
     def off_lanes(self) -> int:
-        """Vehicle-frames that were on no lane."""
-        return sum(place.vehicle_frames for place in self.locations if place.by == "no lane")
+        """Number of vehicle-frames that were on no lane."""
+        return sum(location.vehicle_frames for location in self.locations if location.by == "no lane")
 
     def of_kind(self, *kinds: str) -> list[LocationVisibility]:
-        """Places of some kinds with enough vehicles to speak of, the worst first."""
-        found = [place for place in self.locations if place.by in kinds and place.vehicles >= MIN_VEHICLES]
-        return sorted(found, key=lambda place: (place.share, -place.vehicle_frames, place.words))
+        """Return the locations of some kinds with at least :data:`MIN_VEHICLES` vehicles, the worst first."""
+        selected = [loc for loc in self.locations if loc.by in kinds and loc.vehicles >= MIN_VEHICLES]
+        return sorted(selected, key=lambda location: (location.share, -location.vehicle_frames, location.words))
 
     @property
     def worst(self) -> list[LocationVisibility]:
-        """The lanes, ways through junctions and crossings that are seen worse than the region as a whole, the worst
-        first; a handful at most."""
+        """The lanes, turns and crossings that are seen worse than the whole region, the worst first."""
         mean = self.overall.share if self.overall else 0.0
-        return [place for place in self.of_kind(*_LISTED_KINDS) if place.share < mean][:MAX_LOCATIONS]
+        worse = [location for location in self.of_kind(*_LISTED_KINDS) if location.share < mean]
+        return worse[:MAX_LOCATIONS]
 
     def in_words(self) -> str:
-        """Where vehicles are missed, in one line, with the two worst places."""
+        """Return in one line what share of the vehicles the site misses, and the two worst locations."""
         if self.overall is None:
             return f"no vehicle in the region of interest, so none that {self.site} misses"
         share = f"{self.site} misses {1.0 - self.overall.share:.1%} of the vehicles (fewer than {self.points:g} points)"
-        worst = "; ".join(f"{place.words}, {place.share:.0%} seen" for place in self.worst[:2])
+        worst = "; ".join(f"{location.words}, {location.share:.0%} seen" for location in self.worst[:2])
         return f"{share}; worst: {worst}" if worst else share
 
 
 def read_blindspots(path: Path, only: Collection[str] | None = None) -> Iterator[SiteBlindspots]:
-    """The sites in their order; those named in ``only``, or all.
+    """Yield the sites of ``blindspots.parquet`` in their order; those named in ``only``, or all.
 
     Raises
     ------
     InputError
         When the file is corrupt, or a row lies outside the region.
     """
-    with parquet.open_artefact(path, "blindspots") as (file, about):
-        names = [site["site"] for site in about["sites"]]
-        at_once = sites_per_row_group(len(names))
-        groups = [names[first : first + at_once] for first in range(0, len(names), at_once)]
+    with parquet.open_artefact(path, "blindspots") as (file, metadata):
+        names = [site["site"] for site in metadata["sites"]]
+        group_size = sites_per_row_group(len(names))
+        groups = [names[first : first + group_size] for first in range(0, len(names), group_size)]
         if file.num_row_groups != len(groups):
-            right = "one a site" if at_once == 1 else f"one for {at_once} of them"
-            raise InputError(path, f"{file.num_row_groups} row groups for {len(names)} sites", right)
+            problem = f"expected {len(groups)} row groups for {len(names)} sites, got {file.num_row_groups}"
+            raise InputError(path, problem, _REMAKE_HINT)
         for number, group in enumerate(groups):
             if only is not None and not any(name in only for name in group):
                 continue
             table = parquet.read_row_group(file, number, path)
             rows = table.num_rows // len(group)
-            for place, name in enumerate(group):
+            for position, name in enumerate(group):
                 if only is None or name in only:
-                    yield _site_blindspots(name, table.slice(place * rows, rows).to_pydict(), about, path)
+                    yield _site_blindspots(name, table.slice(position * rows, rows).to_pydict(), metadata, path)
 
 
 def sites_per_row_group(sites: int) -> int:
-    """How many sites share a row group: Arrow keeps more of a group than the rows of a site take."""
+    """Return how many sites share a row group: Arrow needs more memory for a group than for the rows of a site."""
     return max(1, -(-sites // _MAX_ROW_GROUPS))
 
 
@@ -157,21 +156,22 @@ def _site_blindspots(
     site: str, columns: Mapping[str, list[Any]], metadata: Mapping[str, Any], path: Path
 ) -> SiteBlindspots:
     cells = metadata["cells"]
-    share_missed = np.full(cells["shape"], np.nan)
-    by, share = np.array(columns["by"], dtype=str), np.array(columns["share_seen"], dtype=np.float64)
-    index = np.array([columns["ix"], columns["iy"]], dtype=np.int64)[:, by == "cell"]
+    is_cell = np.array(columns["by"], dtype=str) == "cell"
+    index = np.array([columns["ix"], columns["iy"]], dtype=np.int64)[:, is_cell]
     if index.size and not ((index >= 0) & (index < np.array([cells["shape"]]).T)).all():
-        raise InputError(path, f"a square of site {site} lies outside the region", "an unaltered file; make it again")
-    share_missed[tuple(index)] = 1.0 - share[by == "cell"]
+        raise InputError(path, f"a cell of site {site} lies outside the region", _REMAKE_HINT)
+    share_missed = np.full(cells["shape"], np.nan)
+    share_missed[tuple(index)] = 1.0 - np.array(columns["share_seen"], dtype=np.float64)[is_cell]
+
     names = ("by", "words", "x_m", "y_m", "vehicle_frames", "vehicles", "share_seen", "share_se")
     rows = zip(*(columns[name] for name in names), strict=True)
-    places = tuple(LocationVisibility(*row) for row in rows if row[0] != "cell")
-    x, y = cells["origin_m"]
-    return SiteBlindspots(site, metadata["points"], places, share_missed, (x, y), cells["cell_m"])
+    locations = tuple(LocationVisibility(*row) for row in rows if row[0] != "cell")
+    x_m, y_m = cells["origin_m"]
+    return SiteBlindspots(site, metadata["points"], locations, share_missed, (x_m, y_m), cells["cell_m"])
 
 
 DISTINCT_PROBABILITY = 0.9
-"""Neighbours in rank are told apart when the chance that the better is better (``beats_next``) reaches this."""
+"""Neighbours in rank are distinct when the probability that the better one is better (``beats_next``) reaches this."""
 
 
 def read_scores(path: str | Path) -> pa.Table:
@@ -180,7 +180,7 @@ def read_scores(path: str | Path) -> pa.Table:
 
 
 def read_scores_by_period(path: str | Path) -> pa.Table:
-    """Read ``scores_by_period.parquet``, which a run leaves where its traffic has periods."""
+    """Read ``scores_by_period.parquet``, which a run writes where its traffic has periods."""
     return parquet.read_artefact(Path(path), "scores_by_period")[0]
 
 
@@ -189,119 +189,135 @@ def read_scans(path: str | Path) -> pa.Table:
     return parquet.read_artefact(Path(path), "scans")[0]
 
 
-def read_accuracy(path: str | Path) -> tuple[list[dict[str, Any]], dict[str, Any]] | None:
-    """Rows and metadata of ``accuracy.parquet``; None where there is none."""
+def read_accuracy(path: str | Path) -> tuple[Rows, dict[str, Any]] | None:
+    """Return the rows and the metadata of ``accuracy.parquet``; None where there is none."""
     path = Path(path)
     if not path.is_file():
         return None
-    run_folder.verify_checksums(
-        path.with_name(RunFolder.accuracy_checksums.name), "remove it, or run egvs accuracy again"
-    )
-    try:
-        table, about = parquet.read_artefact(path, "accuracy")
-    except InputError as error:
-        raise InputError(path, "is no accuracy study", f"remove it, or run egvs accuracy again ({error})") from None
-    return table.to_pylist(), about
+    study = _read_study([path], RunFolder.accuracy_checksums.name, "an accuracy study", "egvs accuracy")
+    return study[0]
 
 
-def read_placement(
-    placement: str | Path, curve: str | Path
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]], dict[str, Any]] | None:
-    """Rows of ``placement.parquet`` and of ``curve.parquet``, and their metadata; None where one of them is not there,
-    or they are of different plans."""
-    paths = Path(placement), Path(curve)
-    if not all(path.is_file() for path in paths):
-        return None
-    run_folder.verify_checksums(
-        paths[0].with_name(RunFolder.placement_checksums.name), "remove it, or run egvs place again"
-    )
-    found = []
-    for path in paths:
-        try:
-            found.append(parquet.read_artefact(path, path.stem))
-        except InputError as error:
-            raise InputError(path, "is no plan", f"remove it, or run egvs place again ({error})") from None
-    (rows, about), (points, other) = found
-    return None if about != other else (rows.to_pylist(), points.to_pylist(), about)
+def read_placement(placement: str | Path, curve: str | Path) -> tuple[Rows, Rows, dict[str, Any]] | None:
+    """Return the rows of ``placement.parquet`` and of ``curve.parquet``, and their metadata.
 
-
-def read_validation(
-    detection: str | Path, correlation: str | Path
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]], dict[str, Any]] | None:
-    """Rows of ``detection.parquet`` and of ``correlation.parquet``, and the latter's metadata; None where one of them
-    is not there, or they are of different validations.
+    None where one of them does not exist, or they belong to different plans.
     """
-    paths = Path(detection), Path(correlation)
+    paths = [Path(placement), Path(curve)]
     if not all(path.is_file() for path in paths):
         return None
-    run_folder.verify_checksums(
-        paths[0].with_name(RunFolder.validation_checksums.name), "remove it, or run egvs validate again"
+    (rows, metadata), (points, curve_metadata) = _read_study(
+        paths, RunFolder.placement_checksums.name, "a plan", "egvs place"
     )
-    found = []
+    if metadata != curve_metadata:
+        return None
+    return rows, points, metadata
+
+
+def read_validation(detection: str | Path, correlation: str | Path) -> tuple[Rows, Rows, dict[str, Any]] | None:
+    """Return the rows of ``detection.parquet`` and of ``correlation.parquet``, and the metadata of the latter.
+
+    None where one of them does not exist, or they belong to different validations.
+    """
+    paths = [Path(detection), Path(correlation)]
+    if not all(path.is_file() for path in paths):
+        return None
+    (detected, detection_metadata), (correlated, metadata) = _read_study(
+        paths, RunFolder.validation_checksums.name, "a validation", "egvs validate"
+    )
+    if detection_metadata["inputs"] != metadata["inputs"]:
+        return None
+    return detected, correlated, metadata
+
+
+def _read_study(paths: list[Path], checksum_file: str, what: str, command: str) -> list[tuple[Rows, dict[str, Any]]]:
+    """Rows and metadata of the files of a study; InputError where they were changed."""
+    checksums.verify_checksums(paths[0].with_name(checksum_file), f"Remove it, or run {command} again.")
+    study = []
     for path in paths:
         try:
-            found.append(parquet.read_artefact(path, path.stem))
+            table, metadata = parquet.read_artefact(path, path.stem)
         except InputError as error:
-            right = f"remove it, or run egvs validate again ({error})"
-            raise InputError(path, "is not what egvs validate writes", right) from None
-    (detected, one), (correlated, about) = found
-    return (detected.to_pylist(), correlated.to_pylist(), about) if one["inputs"] == about["inputs"] else None
+            raise InputError(path, f"is not {what} ({error})", f"Remove it, or run {command} again.") from None
+        study.append((table.to_pylist(), metadata))
+    return study
 
 
-def read_visibility(path: str | Path, site: str) -> NDArray[np.float64]:
-    """Hits of one site in every voxel, (nx, ny, nz) float64, from ``visibility.parquet``."""
+def read_visibility(path: str | Path, site: str) -> FloatArray:
+    """Return the hits of one site in every voxel, (nx, ny, nz) float64, from ``visibility.parquet``."""
     path = Path(path)
-    table, about = parquet.read_artefact(path, "visibility")
-    mine = table.filter(pc.equal(table.column("site"), site))
-    if len(mine) == 0 and site not in {s["site"] for s in about["sites"]}:
-        raise InputError(path, f"no site {site!r}", "a site that score.keep_visibility names")
-    hits = np.zeros(Grid.from_json(about["grid"]).shape)
-    hits[tuple(mine.column(name).to_numpy() for name in ("ix", "iy", "iz"))] = mine.column("hits").to_numpy()
+    table, metadata = parquet.read_artefact(path, "visibility")
+    rows = table.filter(pc.equal(table.column("site"), site))
+    if len(rows) == 0 and site not in {entry["site"] for entry in metadata["sites"]}:
+        raise InputError(path, f"there is no site {site!r}", "Use a site that score.keep_visibility names.")
+    hits = np.zeros(Grid.from_json(metadata["grid"]).shape)
+    hits[tuple(rows.column(name).to_numpy() for name in ("ix", "iy", "iz"))] = rows.column("hits").to_numpy()
     return hits
 
 
 @dataclass(frozen=True)
 class PeriodRank:
-    """A site in one period: its rank, and its score, the one that ranks, as a share of the best there; 0 where that is
-    0."""
+    """A site in one period: its rank, and its score as a share of the best there; 0 where the best is 0."""
 
     rank: int
     of_best: float
+
+
+class SitePeriodRanks(NamedTuple):
+    """A site, its rank in the mix, and its ranks in the periods."""
+
+    site: str
+    rank: int
+    by_period: tuple[PeriodRank, ...]
 
 
 @dataclass(frozen=True)
 class PeriodRanking:
     """Sites by rank in the mix, and each of them in every period.
 
-    ``shares`` are the periods' weights in the mix, adding up to 1; ``frames`` those recorded in all of them.
+    Attributes
+    ----------
+    periods
+        Names of the periods.
+    shares
+        Their weights in the mix, with the sum 1.
+    frames
+        Number of frames recorded in all periods.
+    sites
+        One entry per site, the best first.
     """
 
     periods: tuple[str, ...]
     shares: tuple[float, ...]
     frames: int
-    sites: tuple[tuple[str, int, tuple[PeriodRank, ...]], ...]
+    sites: tuple[SitePeriodRanks, ...]
 
     @classmethod
     def read(cls, folder: Path) -> PeriodRanking | None:
-        """From a run's folder; None where its traffic has no periods."""
-        if not RunFolder(folder).scores_by_period.is_file():
+        """Read it from a run folder; None where the traffic has no periods."""
+        run_folder = RunFolder(folder)
+        if not run_folder.scores_by_period.is_file():
             return None
-        periods = read_periods(RunFolder(folder).tpog)
-        table, about = parquet.read_artefact(RunFolder(folder).scores_by_period, "scores_by_period")
-        rows, by = table.to_pylist(), about.get("rank_by", "egvs")
-        most: dict[str, float] = {}
+        periods = read_periods(run_folder.tpog)
+        table, metadata = parquet.read_artefact(run_folder.scores_by_period, "scores_by_period")
+        rows = table.to_pylist()
+        rank_by = metadata.get("rank_by", "egvs")
+        best: dict[str, float] = {}
         for row in rows:
-            most[row["period"]] = max(most.get(row["period"], 0.0), row[by])
-        of_site: dict[str, list[PeriodRank]] = {}
+            best[row["period"]] = max(best.get(row["period"], 0.0), row[rank_by])
+        ranks: dict[str, list[PeriodRank]] = {}
         for row in rows:
-            best = most[row["period"]]
-            of_best = row[by] / best if best > 0 else 0.0
-            of_site.setdefault(row["site"], []).append(PeriodRank(row["rank"], of_best))
-        mix = sorted(read_scores(RunFolder(folder).scores).to_pylist(), key=lambda row: int(row["rank"]))
-        weight = sum(period.weight for period in periods)
+            best_score = best[row["period"]]
+            share = row[rank_by] / best_score if best_score > 0 else 0.0
+            ranks.setdefault(row["site"], []).append(PeriodRank(row["rank"], share))
+
+        sites = []
+        for row in sorted(read_scores(run_folder.scores).to_pylist(), key=lambda row: int(row["rank"])):
+            sites.append(SitePeriodRanks(row["site"], row["rank"], tuple(ranks[row["site"]])))
+        total_weight = sum(period.weight for period in periods)
         return cls(
             tuple(period.name for period in periods),
-            tuple(period.weight / weight for period in periods),
+            tuple(period.weight / total_weight for period in periods),
             sum(period.frames for period in periods),
-            tuple((row["site"], row["rank"], tuple(of_site[row["site"]])) for row in mix),
+            tuple(sites),
         )

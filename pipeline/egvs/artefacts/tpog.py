@@ -1,18 +1,12 @@
-r"""The traffic probabilistic occupancy grid (TPOG): reading it, its blocks and its periods.
+r"""The traffic probabilistic occupancy grid (TPOG), its blocks and its periods.
 
-Periods in the metadata of a TPOG: which blocks are whose, and how much each counts in the mix.
-
-With c_q the counts of period q over its T_q frames and w_q its weight, the mix is
+Where the traffic has periods, the metadata says which blocks belong to which period, and how much each period counts in
+the mix. With c_q the counts of period q over its T_q frames and w_q its weight, the mix is
 
 .. math:: p(v) = \sum_q w_q c_q(v) / T_q \Big/ \sum_q w_q = \sum_q m_q c_q(v) \Big/ \sum_q m_q T_q
 
 with the smallest whole numbers m_q in the ratio of w_q / T_q: it stays a count of frames, and its entropy exact.
 Weights are the decimal numbers that the scenario writes.
-
-Artefacts as arrays and tables, for notebooks, stages, and people who want to compute further.
-
-Each reader checks what it reads and says which file is wrong. Tables come as Arrow tables (``.to_pandas()`` makes a
-data frame of one), grids as NumPy arrays.
 """
 
 from __future__ import annotations
@@ -30,25 +24,25 @@ from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
 from egvs.core.errors import InputError
-from egvs.core.grid import Grid
+from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.kernels.occupancy import accumulate
 
 MAX_FRAMES = 2**32 - 1
-"""Of a mix, so that entropies keep their digits."""
+"""Most frames of a mix, so that entropies keep their digits."""
 
 
 @dataclass(frozen=True)
 class PeriodBlocks:
-    """The blocks of one period, those after the ones of the periods before it; all blocks where there are no periods.
+    """The blocks of one period; they follow those of the periods before it. All blocks where there are no periods.
 
     Attributes
     ----------
     name, weight
-        As the scenario says.
+        As in the scenario; the name is empty where there are no periods.
     frames, block_frames
-        Recorded in the period, and in each of its blocks.
+        Number of recorded frames in the period, and in each of its blocks.
     memory_frames
-        The traffic's memory.
+        Autocorrelation time of the traffic.
     times
         How often each of its frames counts in the mix.
     """
@@ -62,45 +56,62 @@ class PeriodBlocks:
 
     @property
     def blocks(self) -> int:
-        """How many."""
+        """Number of blocks."""
         return self.frames // self.block_frames
 
     def to_json(self) -> dict[str, Any]:
-        """As the metadata holds it."""
+        """Return the entry of the metadata."""
         return asdict(self)
 
 
 def frame_multiplicities(weights: Sequence[float], frames: Sequence[int], where: str) -> tuple[int, ...]:
-    """How often a frame of each period counts; InputError where weights are so odd that a mix has too many frames."""
+    """Return how often a frame of each period counts in the mix.
+
+    Parameters
+    ----------
+    weights, frames
+        Weight of each period, and its number of frames.
+    where
+        Key of the traffic, for messages.
+
+    Raises
+    ------
+    InputError
+        When the weights have so many digits that the mix has too many frames.
+    """
     shares = [Fraction(repr(weight)) / count for weight, count in zip(weights, frames, strict=True)]
-    scaled = [int(share * lcm(*(share.denominator for share in shares))) for share in shares]
-    smallest = tuple(value // gcd(*scaled) for value in scaled)
+    denominator = lcm(*(share.denominator for share in shares))
+    scaled = [int(share * denominator) for share in shares]
+    divisor = gcd(*scaled)
+    smallest = tuple(value // divisor for value in scaled)
     total = sum(count * number for count, number in zip(smallest, frames, strict=True))
     if total > MAX_FRAMES:
-        found = f"weights {', '.join(f'{w:g}' for w in weights)} of {', '.join(map(str, frames))} frames"
-        what = f"{found} make a mix of more than {MAX_FRAMES:,} frames"
-        raise InputError(f"{where}.periods", what, "weights with fewer digits, nearer to each other")
+        listed = f"weights {', '.join(f'{w:g}' for w in weights)} of {', '.join(map(str, frames))} frames"
+        problem = f"{listed} make a mix of more than {MAX_FRAMES:,} frames"
+        raise InputError(f"{where}.periods", problem, "Use weights with fewer digits that differ less.")
     return smallest
 
 
 def periods_from_metadata(metadata: dict[str, Any], path: Path) -> tuple[PeriodBlocks, ...]:
-    """From the metadata of ``tpog.parquet``; one without a name where there are no periods."""
-    if "periods" not in metadata:
-        whole = PeriodBlocks("", 1.0, metadata["frames"], metadata["block_frames"], metadata["memory_frames"])
-        found: tuple[PeriodBlocks, ...] = (whole,)
+    """Return the periods from the metadata of ``tpog.parquet``; one without a name where there are no periods."""
+    if "periods" in metadata:
+        periods = tuple(PeriodBlocks(**row) for row in metadata["periods"])
     else:
-        found = tuple(PeriodBlocks(**row) for row in metadata["periods"])
-    for period in found:
+        periods = (PeriodBlocks("", 1.0, metadata["frames"], metadata["block_frames"], metadata["memory_frames"]),)
+    for period in periods:
         if period.frames % period.block_frames:
-            what = f"{period.frames} frames in blocks of {period.block_frames}"
-            raise InputError(path, what, "whole blocks; make it again")
-    return found
+            problem = f"{period.frames} frames do not fill blocks of {period.block_frames} frames"
+            raise InputError(path, problem, "Make the file again.")
+    return periods
 
 
-def block_multiplicities(periods: Sequence[PeriodBlocks], only: str | None = None) -> NDArray[np.int64]:
-    """How often each block counts, (blocks,): in the mix, or in one period alone."""
-    numbers = [period.times if only is None else int(period.name == only) for period in periods]
-    return np.repeat(np.array(numbers, dtype=np.int64), [period.blocks for period in periods])
+def block_multiplicities(periods: Sequence[PeriodBlocks], only: str | None = None) -> IntArray:
+    """Return how often each block counts, (blocks,) int64: in the mix, or in the period ``only``."""
+    numbers = []
+    for period in periods:
+        times = period.times if only is None else int(period.name == only)
+        numbers.append(np.full(period.blocks, times, dtype=np.int64))
+    return np.concatenate(numbers)
 
 
 @dataclass(frozen=True)
@@ -110,60 +121,80 @@ class Tpog:
     Attributes
     ----------
     grid
-        Where the voxels are.
+        Position and size of the voxels.
     frames
-        T, the number of frames.
+        Number of frames T.
     counts
-        Frames in which each voxel is occupied, all blocks added up, (nx, ny, nz) int64.
+        Number of frames in which each voxel is occupied, summed over all blocks, (nx, ny, nz) int64.
     """
 
     grid: Grid
     frames: int
-    counts: NDArray[np.int64]
+    counts: IntArray
 
     @property
-    def p(self) -> NDArray[np.float64]:
+    def p(self) -> FloatArray:
         """Share of the frames in which each voxel is occupied, (nx, ny, nz) float64."""
         return self.counts / self.frames
 
 
 def read_tpog(path: str | Path, period: str | None = None) -> Tpog:
-    """Read ``tpog.parquet``: the mix of its periods, or one of them alone.
+    """Read ``tpog.parquet``.
 
-    InputError when it is corrupt, a row lies outside the grid, or it has no such period.
+    Parameters
+    ----------
+    path
+        The file.
+    period
+        Name of a period; the mix of all periods if None.
+
+    Raises
+    ------
+    InputError
+        When the file is corrupt, a row lies outside the grid, or there is no such period.
     """
     path = Path(path)
-    with parquet.open_artefact(path, "tpog") as (file, about):
-        grid, periods = Grid.from_json(about["grid"]), periods_from_metadata(about, path)
-        names = [its.name for its in periods]
-        if period is not None and period not in names:
-            raise InputError(path, f"no period {period!r}", f"one of {', '.join(names)}")
-        frames = int(about["frames"]) if period is None else periods[names.index(period)].frames
+    with parquet.open_artefact(path, "tpog") as (file, metadata):
+        grid = Grid.from_json(metadata["grid"])
+        periods = periods_from_metadata(metadata, path)
+        frames = int(metadata["frames"])
+        if period is not None:
+            names = [record.name for record in periods]
+            if period not in names:
+                raise InputError(path, f"there is no period {period!r}", f"The periods are {', '.join(names)}.")
+            frames = periods[names.index(period)].frames
+
         times = block_multiplicities(periods, period)
         counts = np.zeros(int(np.prod(grid.shape)), dtype=np.int64)
         for group in range(file.num_row_groups):  # one block each: memory does not grow with their number
-            table = parquet.read_row_group(file, group, path)
-            index = [table.column(name).to_numpy() for name in ("ix", "iy", "iz")]
-            for axis, (values, size) in enumerate(zip(index, grid.shape, strict=True)):
-                if len(values) and not (values.min() >= 0 and values.max() < size):
-                    raise InputError(path, f"i{'xyz'[axis]} leaves the grid", f"0 to {size - 1}")
-            if len(table):
-                flat, block = np.ravel_multi_index(index, grid.shape), block_numbers(table, path, len(times))
-                accumulate(flat, table.column("count").to_numpy().astype(np.int64) * times[block], counts)
+            _add_block(parquet.read_row_group(file, group, path), path, grid, times, counts)
     if counts.max(initial=0) > frames:
-        raise InputError(path, f"a voxel is occupied in {counts.max()} of {frames} frames", "counts up to the frames")
+        raise InputError(path, f"a voxel is occupied in {counts.max()} of {frames} frames", "Make the file again.")
     return Tpog(grid, frames, counts.reshape(grid.shape))
 
 
+def _add_block(table: pa.Table, path: Path, grid: Grid, times: IntArray, counts: IntArray) -> None:
+    """Add the rows of a block to the counts of all voxels, each row as often as its block counts."""
+    index = [table.column(name).to_numpy() for name in ("ix", "iy", "iz")]
+    for axis, values, size in zip("xyz", index, grid.shape, strict=True):
+        if len(values) and not (values.min() >= 0 and values.max() < size):
+            raise InputError(path, f"expected i{axis} from 0 to {size - 1}", "Make the file again.")
+    if not len(table):
+        return
+    cells = np.ravel_multi_index(index, grid.shape)
+    block = block_numbers(table, path, len(times))
+    accumulate(cells, table.column("count").to_numpy().astype(np.int64) * times[block], counts)
+
+
 def block_numbers(table: pa.Table, path: Path, blocks: int) -> NDArray[np.uint16]:
-    """The blocks of rows of a TPOG; InputError where there is no such block."""
+    """Return the block of each row of a TPOG; InputError where there is no such block."""
     block: NDArray[np.uint16] = table.column("block").to_numpy()
     if block.max(initial=0) >= blocks:
-        raise InputError(path, f"block {block.max()} of {blocks}", f"0 to {blocks - 1}")
+        raise InputError(path, f"expected blocks 0 to {blocks - 1}, got {block.max()}", "Make the file again.")
     return block
 
 
 def read_periods(path: str | Path) -> tuple[PeriodBlocks, ...]:
-    """The periods of ``tpog.parquet``; one without a name where it has none."""
+    """Return the periods of ``tpog.parquet``; one without a name where it has none."""
     path = Path(path)
     return periods_from_metadata(parquet.read_metadata(path, "tpog"), path)

@@ -1,17 +1,8 @@
-"""Recorded frames: boxes near a grid, vehicles of a frame.
+"""Frames of recorded traffic, and the boxes that sites should see in them.
 
-Artefacts as arrays and tables, for notebooks, stages, and people who want to compute further.
-
-Each reader checks what it reads and says which file is wrong. Tables come as Arrow tables (``.to_pandas()`` makes a
-data frame of one), grids as NumPy arrays.
-
-Reads the vehicle boxes of a recording back, some whole frames at a time, in a grid's own frame.
-
-Frames of recorded traffic, and which of their boxes a site should see.
-
-A frame holds every box of a recorded moment. To be seen are those vehicles whose centre is in the region of interest:
-one box a vehicle (the parts of an articulated one have a box each), whether a beam meets it or not - a blind spot is
-the site's fault. People on foot and on bicycles are in the frame, and in the way, but no vehicles.
+A frame has every box of a recorded moment. Targets are the vehicles whose centre is in the region of interest: one box
+per vehicle (each part of an articulated vehicle has its own box), whether or not a beam meets it. Pedestrians and
+bicycles are in the frame, and hide what is behind them, but are not vehicles.
 """
 
 from __future__ import annotations
@@ -19,95 +10,26 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
-from egvs.core.errors import InputError
-from egvs.core.grid import Grid, Roi
+from egvs.artefacts.frame_boxes import check_frame_order
+from egvs.core.grid import Roi
 
 
 def read_trajectories(path: str | Path) -> pa.Table:
-    """Read ``trajectories.parquet``."""
+    """Read ``trajectories.parquet`` as an Arrow table."""
     return parquet.read_artefact(Path(path), "trajectories")[0]
 
 
-PITCHED_BOX_COLUMNS = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "length_m", "width_m", "height_m")
-MIN_BOX_M, MAX_BOX_M = 1e-3, 2000.0
-"""What is smaller than this is no box: it must stay one when it is made smaller on each side; what is larger than any
-train, no vehicle."""
-
-
-@dataclass(frozen=True)
-class FrameBoxes:
-    """Vehicle boxes of some whole frames."""
-
-    frame: NDArray[np.int64]
-    """(n,), ascending."""
-    values: NDArray[np.float64]
-    """(n, 8), as ``COLUMNS``; the centre in the grid's frame."""
-
-
-def read_boxes(path: Path, grid: Grid, frames: NDArray[np.int64] | None = None) -> Iterator[FrameBoxes]:
-    """Boxes of ``trajectories.parquet``, row group by row group (each holds whole frames).
-
-    Parameters
-    ----------
-    frames
-        Only these frames, ascending; row groups that hold none of them are not read.
-
-    Raises
-    ------
-    InputError
-        For a file that is corrupt or out of order, or a box that is none.
-    """
-    with parquet.open_artefact(path, "trajectories") as (file, _):
-        last, column = -1, file.schema_arrow.get_field_index("frame")
-        for group in range(file.num_row_groups):
-            statistics = file.metadata.row_group(group).column(column).statistics
-            if frames is not None and not _may_contain(statistics, frames):
-                continue
-            table = parquet.read_row_group(file, group, path, ["frame", *PITCHED_BOX_COLUMNS])
-            if not len(frame := table.column("frame").to_numpy().astype(np.int64)):
-                continue
-            if np.any(np.diff(frame) < 0) or frame[0] <= last:
-                raise InputError(path, f"frames are out of order near frame {frame[0]}", "rows sorted by frame")
-            last = int(frame[-1])
-            kept = slice(None) if frames is None else np.isin(frame, frames)
-            values = np.column_stack([table.column(name).to_numpy()[kept] for name in PITCHED_BOX_COLUMNS])
-            _check_box_values(path, frame[kept], values)
-            values[:, :3] = grid.to_grid_m(values[:, :3])
-            yield FrameBoxes(frame[kept], values)
-
-
-def _may_contain(statistics: Any, frames: NDArray[np.int64]) -> bool:
-    """Whether a row group may hold one of these frames; yes where the file does not say which it holds."""
-    if statistics is None or not statistics.has_min_max:
-        return True
-    return bool(np.searchsorted(frames, statistics.min) < np.searchsorted(frames, statistics.max, side="right"))
-
-
-def _check_box_values(path: Path, frame: NDArray[np.int64], values: NDArray[np.float64]) -> None:
-    of_vehicles = (values[:, 5:8] >= MIN_BOX_M) & (values[:, 5:8] <= MAX_BOX_M)
-    sound = np.isfinite(values).all(axis=1) & of_vehicles.all(axis=1)
-    if not sound.all():
-        bad = int(np.flatnonzero(~sound)[0])
-        shown = ", ".join(f"{name} = {value:g}" for name, value in zip(PITCHED_BOX_COLUMNS, values[bad], strict=True))
-        raise InputError(
-            f"{path}: frame {frame[bad]}",
-            f"a box with {shown}",
-            f"finite values, sizes of at least {MIN_BOX_M} m and at most {MAX_BOX_M:g} m",
-        )
-
-
 BOX_COLUMNS = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
-"""Columns of a box of ground truth or of a detection: its centre in the world frame, its size, its heading."""
+"""Columns of a box of ground truth or of a detection: centre in the world frame, size, heading."""
 
 NON_VEHICLE_KINDS = frozenset({"pedestrian", "bicycle", "scooter", "wheelchair"})
-"""SUMO vClasses that are no vehicles: nobody who looks for vehicles is asked to find them."""
+"""SUMO vClasses that are not vehicles, and not expected to be detected as such."""
 
 
 @dataclass(frozen=True)
@@ -117,15 +39,15 @@ class TrafficFrame:
     Attributes
     ----------
     number
-        Of the frame in its record.
+        Number of the frame in its record.
     vehicles, kinds
-        SUMO's identifier and vClass of each box.
+        SUMO's id and vClass of each box.
     boxes
-        (n, 7) float64, as :data:`BOX_COLUMNS`.
+        Boxes as :data:`BOX_COLUMNS`, (n, 7) float64.
     pitch_rad
-        Nose up, (n,) float64.
+        Pitch of each box, nose up, (n,) float64.
     part
-        0, or 1.. for the rear parts of an articulated vehicle, (n,) int64; all 0 where it is not given.
+        0, or 1.. for the rear parts of an articulated vehicle, (n,) int64; all 0 by default.
     """
 
     number: int
@@ -140,17 +62,19 @@ class TrafficFrame:
             object.__setattr__(self, "part", np.zeros(len(self.boxes), dtype=np.int64))
 
     def several_parts(self) -> NDArray[np.bool_]:
-        """Which boxes are of vehicles with more than one part, (n,)."""
-        jointed = {name for name, part in zip(self.vehicles, self.part.tolist(), strict=True) if part}
-        return np.array([name in jointed for name in self.vehicles], dtype=np.bool_)
+        """Return which boxes belong to vehicles with more than one part, (n,) bool."""
+        articulated = {name for name, part in zip(self.vehicles, self.part.tolist(), strict=True) if part}
+        return np.array([name in articulated for name in self.vehicles], dtype=np.bool_)
 
     def are_vehicles(self) -> NDArray[np.bool_]:
-        """Which boxes are vehicles or parts of them, (n,)."""
+        """Return which boxes are vehicles or parts of them, (n,) bool."""
         return np.array([kind not in NON_VEHICLE_KINDS for kind in self.kinds], dtype=np.bool_)
 
     def target_rows(self, roi: Roi, people: Collection[str] = ()) -> NDArray[np.int64]:
-        """The rows that are to be seen: vehicles whose centre is in the region of interest (half-open, as voxels), and
-        those of :data:`NON_VEHICLE_KINDS` that ``people`` names."""
+        """Return the rows of the targets: vehicles whose centre is in the region of interest (half-open, as voxels).
+
+        ``people`` names those of :data:`NON_VEHICLE_KINDS` that are targets too.
+        """
         centre = self.boxes[:, :3] - np.asarray(roi.origin_m)
         inside = ((centre >= 0.0) & (centre < np.asarray(roi.size_m))).all(axis=1)
         named = np.array([kind in people for kind in self.kinds], dtype=np.bool_)
@@ -158,20 +82,24 @@ class TrafficFrame:
 
 
 def spaced_frames(recorded: int, count: int) -> NDArray[np.int64]:
-    """Some of the frames 0 .. recorded - 1, evenly spaced: the middles of ``count`` equal parts; all when 0 or more
-    are wanted."""
+    """Return ``count`` evenly spaced frames of 0 to ``recorded`` - 1, the middles of equal parts, ascending int64.
+
+    All frames where ``count`` is 0, or not below their number.
+    """
     if count == 0 or count >= recorded:
         return np.arange(recorded, dtype=np.int64)
     return (2 * np.arange(count, dtype=np.int64) + 1) * recorded // (2 * count)
 
 
 def read_frames(path: Path, numbers: NDArray[np.int64]) -> Iterator[TrafficFrame]:
-    """Some frames of ``trajectories.parquet``, in order; a frame without any box is told as such.
+    """Yield some frames of ``trajectories.parquet``, in order; also those without any box.
 
     Parameters
     ----------
+    path
+        The file.
     numbers
-        Of the frames, ascending.
+        Numbers of the frames, ascending.
 
     Raises
     ------
@@ -179,25 +107,26 @@ def read_frames(path: Path, numbers: NDArray[np.int64]) -> Iterator[TrafficFrame
         For a file that is corrupt or out of order.
     """
     columns = ["frame", "vehicle", "part", "kind", *BOX_COLUMNS, "pitch_rad"]
-    left = list(numbers.tolist())
+    remaining = list(numbers.tolist())
     with parquet.open_artefact(path, "trajectories") as (file, _):
-        last = -1
+        last_frame = -1
         for group in range(file.num_row_groups):
             table = parquet.read_row_group(file, group, path, columns)
             frame = table.column("frame").to_numpy().astype(np.int64)
             if not len(frame):
                 continue
-            if np.any(np.diff(frame) < 0) or frame[0] <= last:
-                raise InputError(path, f"frames are out of order near frame {frame[0]}", "rows sorted by frame")
-            last = int(frame[-1])
+            check_frame_order(path, frame, last_frame)
+            last_frame = int(frame[-1])
             values = np.column_stack([table.column(name).to_numpy() for name in (*BOX_COLUMNS, "pitch_rad")])
             part = table.column("part").to_numpy().astype(np.int64)
-            names, kinds = table.column("vehicle"), table.column("kind")
-            while left and left[0] <= last:
-                number = left.pop(0)
+            while remaining and remaining[0] <= last_frame:
+                number = remaining.pop(0)
                 rows = slice(*np.searchsorted(frame, [number, number + 1]).tolist())
-                boxes, pitch, its_part = values[rows, :7], values[rows, 7].copy(), part[rows].copy()
-                vehicles = tuple(names[rows].to_pylist())  # of these rows alone: text is slow to make
-                yield TrafficFrame(number, vehicles, tuple(kinds[rows].to_pylist()), boxes, pitch, its_part)
-    for number in left:
+                vehicles = table.column("vehicle")[rows].to_pylist()  # of these rows only: making text is slow
+                kinds = table.column("kind")[rows].to_pylist()
+                pitch_rad = values[rows, 7].copy()
+                yield TrafficFrame(
+                    number, tuple(vehicles), tuple(kinds), values[rows, :7], pitch_rad, part[rows].copy()
+                )
+    for number in remaining:
         yield TrafficFrame(number, (), (), np.empty((0, 7)), np.empty(0))

@@ -1,16 +1,14 @@
-"""A budget shared among junctions.
+"""Allocate a number of sensors, or a budget, to the junctions of a city.
 
-What a junction could get: the best plan of 1, 2, ... sensors that is found there, and what none exceeds.
+Each junction contributes its best plans of 1, 2, ... sensors, and an upper bound for all its other plans
+(:func:`junction_plans`, on workers). Junctions are independent, so the city's joint score is the sum of theirs. What
+remains is to choose one plan per junction: a multiple-choice knapsack problem, solved exactly by dynamic programming.
+For a count this takes (junctions x count^2) steps. A greedy choice would be exact only if the gains of each junction
+decreased, which is not guaranteed, because the best plan of three sensors need not contain the best two.
 
-Shares one count, or one budget, among junctions, and says what is proved of it.
-
-Junctions are independent of one another, so a city's joint score is the sum of theirs, and all that is to be decided is
-which of its plans each junction gets: a knapsack with one choice a junction, solved exactly by dynamic programming. For
-a count that takes junctions times count squared steps. Were every junction's gains falling, taking the largest gain
-again and again would give the same; plans of more sensors need not hold those of fewer, so it is not taken for granted.
-
-What no plan exceeds is the same knapsack over the junctions' bounds; for a budget its relaxation, in which the last
-step may be taken in part (Sinha and Zoltners 1979).
+The upper bound for the city is the same knapsack problem with the bounds of the junctions; for a budget its linear
+relaxation, in which the last step may be taken in part (P. Sinha and A. A. Zoltners, The multiple-choice knapsack
+problem, Operations Research 27, 1979).
 """
 
 from __future__ import annotations
@@ -19,330 +17,354 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from egvs.artefacts.planned_sensor import PlannedSensor
 from egvs.city.results import mean_vehicles, score_factor
 from egvs.city.tasks import SCENE_CACHE, Job, RunSettings, catch_input_errors
 from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray, IntArray
+from egvs.placement import plan as placement_plan
 from egvs.placement import problem_builder, solver
 from egvs.placement.branch_and_bound import BOUND_ROUNDING
 from egvs.placement.problem import PlanRules, Problem
 from egvs.placement.problem_builder import PlacementProblem
 from egvs.scenario.model import Scenario
-from egvs.sensors.sites import Site
+from egvs.scenario.score_config import PlacementConfig
 from egvs.stages.inputs import open_folder
 
+_UNLIMITED_BUDGET = 1e15
 
-@dataclass(frozen=True)
-class JunctionSensor:
-    """One sensor of a plan: what it adds to the joint score of those before it, and to the cost."""
+_MAX_STATES = 100_000
+"""Maximum number of costs that the dynamic programming for a budget distinguishes. With more, costs within a
+1 / _MAX_STATES of the budget are merged, and the best of them is kept."""
 
-    site: Site
-    is_forced: bool
-    gain: float
-    cost: float
+_COST_TOLERANCE = 1e-9
+"""Costs are sums of decimal numbers: a budget is exceeded if the cost is higher by more than this share."""
 
 
 @dataclass(frozen=True)
 class JunctionPlan:
-    """Sensors at one junction, in the order in which they would be put up; their joint score, and what they cost."""
+    """Sensors at one junction, in the order of installation; their joint score and cost."""
 
-    sensors: tuple[JunctionSensor, ...]
+    sensors: tuple[PlannedSensor, ...]
     value: float
     cost: float
 
     @property
     def count(self) -> int:
-        """How many sensors."""
+        """Number of sensors."""
         return len(self.sensors)
 
 
 @dataclass(frozen=True)
 class JunctionPlans:
-    """What one junction could get.
+    """The plans that one junction may get.
 
     Attributes
     ----------
     junction
-        Its name.
+        Name of the junction.
     plans
-        Those that were found, of fewest sensors first; the first one holds what is there already, or nothing.
+        From the fewest sensors on; the first one has only the forced sensors.
     bounds
-        What no plan of at most 0, 1, ... sensors exceeds, as far as plans were looked for.
+        Upper bounds of all plans of at most 0, 1, ... sensors.
     min_costs
-        What no plan of so many sensors costs less than.
-    together
-        The joint score of all candidates; no plan exceeds it.
+        Lower bounds of the cost of 0, 1, ... sensors.
+    joint_of_all
+        Joint score of all candidates, which no plan exceeds.
     is_complete
-        Whether further sensors would add nothing, or are none.
+        Whether no plan of more sensors is better.
     """
 
     junction: str
     plans: tuple[JunctionPlan, ...]
     bounds: tuple[float, ...]
     min_costs: tuple[float, ...]
-    together: float
+    joint_of_all: float
     is_complete: bool
 
     @property
     def max_count(self) -> int:
-        """The number of sensors up to which plans were looked for."""
+        """Maximum number of sensors for which plans were computed."""
         return len(self.bounds) - 1
 
     def bound(self, count: int) -> float:
-        """What no plan of at most so many sensors exceeds. Beyond :attr:`most`: m of n sensors of a plan, well chosen,
-        are worth at least m/n of it, since gains fall."""
+        """Return an upper bound of all plans of at most ``count`` sensors.
+
+        Beyond :attr:`max_count` it follows from submodularity: the best m of the n sensors of a plan reach at least m/n
+        of its joint score.
+        """
         if count <= self.max_count:
             return self.bounds[count]
         if self.is_complete:
             return self.bounds[-1]
-        return min(self.together, self.bounds[-1] * count / max(1, self.max_count)) if self.max_count else self.together
+        if self.max_count == 0:
+            return self.joint_of_all
+        return min(self.joint_of_all, self.bounds[-1] * count / self.max_count)
 
-    def times(self, factor: float) -> JunctionPlans:
-        """The same where all that is added up counts so much more."""
+    def scaled(self, factor: float) -> JunctionPlans:
+        """Return the same plans with all joint scores multiplied by a factor."""
         if factor == 1.0:
             return self
-        plans = (
-            replace(
-                plan, value=plan.value * factor, sensors=tuple(replace(p, gain=p.gain * factor) for p in plan.sensors)
-            )
-            for plan in self.plans
-        )
+        plans = []
+        for plan in self.plans:
+            sensors = tuple(replace(sensor, gain=sensor.gain * factor) for sensor in plan.sensors)
+            plans.append(replace(plan, value=plan.value * factor, sensors=sensors))
         bounds = tuple(bound * factor for bound in self.bounds)
-        return replace(self, plans=tuple(plans), bounds=bounds, together=self.together * factor)
-
-
-def check_additive_config(scenario: Scenario) -> None:
-    """InputError where a scenario asks for what cannot be added up over junctions."""
-    wanted = scenario.placement
-    idle = {
-        "zones": bool(wanted.zones), "survives": bool(wanted.survives), "objective": wanted.objective != "mean",
-        "reach": wanted.reach is not None, "refine": wanted.refine is not None, "budget": wanted.budget is not None,
-        "count": wanted.count is not None,
-    }  # fmt: skip
-    if named := [key for key, is_there in idle.items() if is_there]:
-        found = "a plan of the whole city adds up joint scores, and shares one count or budget"
-        raise InputError(f"{scenario.file}: placement.{named[0]}", found, f"no such key; egvs place {scenario.folder}")
-
-
-@catch_input_errors
-def junction_plans(job: Job, settings: RunSettings, most: int, costs_count: bool) -> JunctionPlans:
-    """What a junction could get, up to ``most`` sensors; ``costs_count`` asks for what they cost, and for single
-    sensors that are cheaper than the best one."""
-    with settings.applied(), SCENE_CACHE.borrow(settings.token, job) as built:
-        built.ensure_artefacts()
-        scenario = built.work.scenario
-        check_additive_config(scenario)
-        if costs_count:  # with a budget, somebody has to say what a candidate costs
-            placement = scenario.placement.model_copy(update={"budget": _UNLIMITED_BUDGET})
-            scenario = scenario.model_copy(update={"placement": placement})
-        work = open_folder(scenario, built.work.folder.path, jobs=1)
-        factor = score_factor(scenario.score.rank_by, mean_vehicles(job.out))
-        return plan_junction(
-            problem_builder.build_problem(work, lambda _: None), job.junction, most, singles=costs_count
-        ).times(factor)
-
-
-_UNLIMITED_BUDGET = 1e15
-
-
-def plan_junction(
-    placement_problem: PlacementProblem, junction: str, most: int, *, singles: bool = False
-) -> JunctionPlans:
-    """Plans of up to ``most`` sensors of a problem, whatever they cost; with ``singles`` also those of one sensor of
-    which none that is cheaper is worth more."""
-    rules = placement_problem.problem.rules
-    free = int(np.count_nonzero(~rules.excluded))
-    count = min(max(most, len(rules.forced), 1), free)
-    problem = replace(placement_problem.problem, rules=replace(rules, budget=np.inf, count=count))
-    curve = solver.best_plan(problem, search_all=False, time_limit_s=0.0, on_progress=lambda _: None).curve
-    there = make_junction_plan(problem, placement_problem.sites, rules.forced)
-    plans = [
-        there,
-        *(
-            make_junction_plan(problem, placement_problem.sites, solver.greedy_order(problem, point.plan))
-            for point in curve
-        ),
-    ]
-    if singles and len(rules.forced) < count:
-        plans += [
-            make_junction_plan(problem, placement_problem.sites, (*rules.forced, one))
-            for one in _efficient_candidates(problem)
-        ]
-    return JunctionPlans(
-        junction,
-        tuple(plans),
-        (*[there.value] * curve[0].count, *(point.bound for point in curve)),
-        min_costs_by_count(rules),
-        placement_problem.joint_of_all * (1.0 + BOUND_ROUNDING),
-        count == free or curve[-1].count < count,
-    )
-
-
-def make_junction_plan(problem: Problem, sites: Sequence[Site], chosen: Sequence[int]) -> JunctionPlan:
-    """Some candidates in an order, with what each adds."""
-    seen, rules, picks = problem.coverage_state(), problem.rules, []
-    value = seen.value(problem.joint)
-    for number, one in enumerate(chosen):
-        seen.add(one)
-        before, value = value, seen.value(problem.joint)
-        cost = rules.cost_of(chosen[: number + 1]) - rules.cost_of(chosen[:number])
-        picks.append(JunctionSensor(sites[one], one in rules.forced, value - before, cost))
-    return JunctionPlan(tuple(picks), value, rules.cost_of(chosen))
-
-
-def _efficient_candidates(problem: Problem) -> list[int]:
-    """Candidates of which none that costs less, or the same, adds more to what is there already."""
-    rules = problem.rules
-    candidates = np.flatnonzero(rules.allowed_additions(rules.forced))
-    gains = problem.coverage_state(rules.forced).gains(problem.joint, candidates)
-    cost, best, found = rules.further_cost(rules.forced)[candidates], 0.0, []
-    for at in np.lexsort((-gains, cost)).tolist():
-        if gains[at] > best:
-            best = float(gains[at])
-            found.append(int(candidates[at]))
-    return found
-
-
-def min_costs_by_count(rules: PlanRules) -> tuple[float, ...]:
-    """What no plan of 0, 1, ... sensors costs less than: each is as cheap as any, at poles as cheap as any."""
-    others = np.setdiff1d(np.flatnonzero(~rules.excluded), rules.forced)
-    alone = np.sort(rules.cost[others]) if rules.most_per_pole == 1 and not rules.forced else None
-    sensors = np.sort((rules.cost - rules.pole_cost)[others]) if alone is None else alone
-    pole = 0.0 if rules.forced or alone is not None or not len(others) else float(rules.pole_cost[others].min())
-    new = np.arange(len(sensors) + 1)
-    cost = np.append(0.0, np.cumsum(sensors)) + pole * -(-new // rules.most_per_pole)
-    return (*[0.0] * len(rules.forced), *cost.tolist())
-
-
-Floats = NDArray[np.float64]
-
-_MAX_STATES = 100_000
-"""Costs that are told apart on the way to a budget; of more, those of a hundred-thousandth of it are taken for one,
-the best of them."""
-
-_COST_TOLERANCE = 1e-9
-"""Costs are sums of decimal numbers: a budget is exceeded by more than this share of it."""
+        return replace(self, plans=tuple(plans), bounds=bounds, joint_of_all=self.joint_of_all * factor)
 
 
 @dataclass(frozen=True)
 class Allocation:
-    """Which plan each junction gets.
+    """The plan that each junction gets.
 
     Attributes
     ----------
     chosen
-        Index into :attr:`JunctionPlans.plans` of each junction, in their order.
+        Index into :attr:`JunctionPlans.plans` for each junction.
     value
-        The sum of joint scores.
+        Sum of the joint scores.
     bound
-        What no plan of the city exceeds.
+        Upper bound of all plans of the city.
     curve
-        Of a count: the best sum and the bound for 0, 1, ... sensors, (count + 1, 2) float64; empty for a budget.
+        For a count: the best sum and the upper bound for 0, 1, ... sensors, (count + 1, 2) float64; empty for a budget.
     """
 
     chosen: tuple[int, ...]
     value: float
     bound: float
-    curve: Floats
+    curve: FloatArray
+
+
+class CostPoint(NamedTuple):
+    """A cost, and the most that can be reached with it."""
+
+    cost: float
+    value: float
+
+
+def check_additive_config(scenario: Scenario) -> None:
+    """Raise an InputError if ``[placement]`` has settings that cannot be summed over junctions."""
+    config, default = scenario.placement, PlacementConfig()
+    for key in ("zones", "survives", "objective", "reach", "refine", "budget", "count"):
+        if getattr(config, key) != getattr(default, key):
+            raise InputError(
+                f"{scenario.file}: placement.{key}",
+                "has no effect in a city, where joint scores are summed and one count or budget is shared",
+                f"Remove the key, or use egvs place {scenario.folder}.",
+            )
+
+
+@catch_input_errors
+def junction_plans(job: Job, settings: RunSettings, max_count: int, with_costs: bool) -> JunctionPlans:
+    """Compute the plans of a junction; a task of a worker.
+
+    Parameters
+    ----------
+    job, settings
+        The junction, and the settings of the city run.
+    max_count
+        Maximum number of sensors.
+    with_costs
+        Whether costs are needed, and single sensors that are cheaper than the best one.
+    """
+    with settings.applied(), SCENE_CACHE.borrow(settings.token, job) as scene:
+        scene.ensure_artefacts()
+        scenario = scene.context.scenario
+        check_additive_config(scenario)
+        if with_costs:  # with a budget, unknown costs are an error
+            placement = scenario.placement.model_copy(update={"budget": _UNLIMITED_BUDGET})
+            scenario = scenario.model_copy(update={"placement": placement})
+        context = open_folder(scenario, scene.context.folder.path, jobs=1)
+        problem = problem_builder.build_problem(context, lambda _: None)
+        plans = plan_junction(problem, job.junction, max_count, with_single_sensors=with_costs)
+        return plans.scaled(score_factor(scenario.score.rank_by, mean_vehicles(job.out)))
+
+
+def plan_junction(
+    placement_problem: PlacementProblem, junction: str, max_count: int, *, with_single_sensors: bool = False
+) -> JunctionPlans:
+    """Solve the placement problem of a junction for 1, 2, ... sensors, at any cost.
+
+    Parameters
+    ----------
+    placement_problem
+        The problem of the junction.
+    junction
+        Name of the junction.
+    max_count
+        Maximum number of sensors.
+    with_single_sensors
+        Whether to add the plans with one sensor that no cheaper sensor beats.
+    """
+    rules = placement_problem.problem.rules
+    n_candidates = int(np.count_nonzero(~rules.excluded))
+    count = min(max(max_count, len(rules.forced), 1), n_candidates)
+    problem = replace(placement_problem.problem, rules=replace(rules, budget=np.inf, count=count))
+    curve = solver.best_plan(problem, search_all=False, time_limit_s=0.0, on_progress=lambda _: None).curve
+
+    orders = [rules.forced]
+    orders += [solver.greedy_order(problem, point.plan) for point in curve]
+    if with_single_sensors and len(rules.forced) < count:
+        orders += [(*rules.forced, candidate) for candidate in _efficient_candidates(problem)]
+    plans = []
+    for order in orders:
+        sensors = placement_plan.planned_sensors(problem, [placement_problem.sites[i] for i in order], order)
+        value = problem.coverage_state(order).value(problem.joint)
+        plans.append(JunctionPlan(tuple(sensors), value, problem.rules.cost_of(order)))
+
+    bounds_below_curve = [plans[0].value] * curve[0].count
+    return JunctionPlans(
+        junction,
+        tuple(plans),
+        (*bounds_below_curve, *(point.bound for point in curve)),
+        min_costs_by_count(rules),
+        placement_problem.joint_of_all * (1.0 + BOUND_ROUNDING),
+        is_complete=count == n_candidates or curve[-1].count < count,
+    )
+
+
+def _efficient_candidates(problem: Problem) -> list[int]:
+    """Return the candidates that add more to the forced sensors than any other of at most the same cost."""
+    rules = problem.rules
+    candidates = np.flatnonzero(rules.allowed_additions(rules.forced))
+    gains = problem.coverage_state(rules.forced).gains(problem.joint, candidates)
+    cost = rules.further_cost(rules.forced)[candidates]
+    efficient, best_gain = [], 0.0
+    for i in np.lexsort((-gains, cost)).tolist():
+        if gains[i] > best_gain:
+            best_gain = float(gains[i])
+            efficient.append(int(candidates[i]))
+    return efficient
+
+
+def min_costs_by_count(rules: PlanRules) -> tuple[float, ...]:
+    """Return lower bounds of the cost of 0, 1, ... sensors: the cheapest sensors at the cheapest poles."""
+    others = np.setdiff1d(np.flatnonzero(~rules.excluded), rules.forced)
+    if rules.most_per_pole == 1 and not rules.forced:  # every sensor pays for a pole of its own
+        sensor_costs, pole_cost = np.sort(rules.cost[others]), 0.0
+    else:
+        sensor_costs, pole_cost = np.sort((rules.cost - rules.pole_cost)[others]), 0.0
+        if not rules.forced and len(others):  # more sensors can hang on the pole of a forced one for free
+            pole_cost = float(rules.pole_cost[others].min())
+    n_poles = -(-np.arange(len(sensor_costs) + 1) // rules.most_per_pole)
+    costs = np.append(0.0, np.cumsum(sensor_costs)) + pole_cost * n_poles
+    return (*[0.0] * len(rules.forced), *costs.tolist())
 
 
 def allocate_count(junctions: Sequence[JunctionPlans], count: int) -> Allocation:
-    """The best choice of at most ``count`` sensors in all, those that are there already among them."""
-    best, choice = np.full(count + 1, -math.inf), []
-    best[:] = 0.0
-    for its in junctions:
-        tried = np.full((len(its.plans), count + 1), -math.inf)
-        for number, plan in enumerate(its.plans):
+    """Return the best allocation of at most ``count`` sensors, forced ones included."""
+    best = np.zeros(count + 1)
+    choices: list[IntArray] = []
+    for junction in junctions:
+        values = np.full((len(junction.plans), count + 1), -math.inf)
+        for i, plan in enumerate(junction.plans):
             if plan.count <= count:
-                tried[number, plan.count :] = best[: count + 1 - plan.count] + plan.value
-        choice.append(tried.argmax(axis=0))
-        best = tried.max(axis=0)
-    chosen, left = [], count
-    for its, of in zip(reversed(junctions), reversed(choice), strict=True):
-        chosen.append(int(of[left]))
-        left -= its.plans[chosen[-1]].count
+                values[i, plan.count :] = best[: count + 1 - plan.count] + plan.value
+        choices.append(values.argmax(axis=0))
+        best = values.max(axis=0)
+
+    chosen: list[int] = []
+    remaining = count
+    for junction, choice in zip(reversed(junctions), reversed(choices), strict=True):
+        chosen.append(int(choice[remaining]))
+        remaining -= junction.plans[chosen[-1]].count
     bounds = np.maximum(_bounds_by_count(junctions, count), best)
     return Allocation(tuple(reversed(chosen)), float(best[-1]), float(bounds[-1]), np.column_stack([best, bounds]))
 
 
-def _bounds_by_count(junctions: Sequence[JunctionPlans], count: int) -> Floats:
+def _bounds_by_count(junctions: Sequence[JunctionPlans], count: int) -> FloatArray:
+    """Return the upper bounds of all plans of the city with at most 0, 1, ... sensors, shape (count + 1,)."""
     best = np.zeros(count + 1)
-    for its in junctions:
-        bound = np.array([its.bound(number) for number in range(min(count, len(its.min_costs) - 1) + 1)])
-        more = np.full(count + 1, -math.inf)
-        for number, value in enumerate(bound.tolist()):
-            more[number:] = np.maximum(more[number:], best[: count + 1 - number] + value)
-        best = more
+    for junction in junctions:
+        extended = np.full(count + 1, -math.inf)
+        for number in range(min(count, len(junction.min_costs) - 1) + 1):
+            extended[number:] = np.maximum(extended[number:], best[: count + 1 - number] + junction.bound(number))
+        best = extended
     return best
 
 
 def allocate_budget(junctions: Sequence[JunctionPlans], budget: float) -> Allocation:
-    """The best choice that costs no more than ``budget`` in all."""
+    """Return the best allocation whose cost is at most ``budget``."""
     limit = budget * (1.0 + _COST_TOLERANCE)
     costs, values = np.zeros(1), np.zeros(1)
-    steps: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
-    for its in junctions:
-        cost = (costs[None, :] + np.array([plan.cost for plan in its.plans])[:, None]).ravel()
-        value = (values[None, :] + np.array([plan.value for plan in its.plans])[:, None]).ravel()
-        kept = _pareto_front(cost, value, limit)
-        steps.append((kept // len(costs), kept % len(costs)))
-        costs, values = cost[kept], value[kept]
-    at, chosen = len(values) - 1, []
-    for plan, before in reversed(steps):
-        chosen.append(int(plan[at]))
-        at = int(before[at])
+    steps: list[tuple[IntArray, IntArray]] = []  # for each state: the plan, and the state before it
+    for junction in junctions:
+        plan_costs = np.array([plan.cost for plan in junction.plans])
+        plan_values = np.array([plan.value for plan in junction.plans])
+        new_costs = (costs[None, :] + plan_costs[:, None]).ravel()
+        new_values = (values[None, :] + plan_values[:, None]).ravel()
+        states = _pareto_front(new_costs, new_values, limit)
+        steps.append((states // len(costs), states % len(costs)))
+        costs, values = new_costs[states], new_values[states]
+
+    chosen: list[int] = []
+    state = len(values) - 1
+    for plan_of_state, state_before in reversed(steps):
+        chosen.append(int(plan_of_state[state]))
+        state = int(state_before[state])
     value = float(values[-1])
-    return Allocation(tuple(reversed(chosen)), value, max(value, relaxed_bound(junctions, limit)), np.empty((0, 2)))
+    bound = max(value, relaxed_bound(junctions, limit))
+    return Allocation(tuple(reversed(chosen)), value, bound, np.empty((0, 2)))
 
 
-def _pareto_front(cost: Floats, value: Floats, limit: float) -> NDArray[np.int64]:
-    """Those within the limit of which none that costs no more is worth as much, by ascending cost."""
-    order = np.lexsort((-value, cost))
-    order = order[cost[order] <= limit]
-    best = np.maximum.accumulate(np.append(-math.inf, value[order]))
-    kept = order[value[order] > best[:-1]]
-    if len(kept) > _MAX_STATES:
-        bucket = np.floor(cost[kept] / limit * _MAX_STATES)
-        kept = kept[np.append(bucket[1:] != bucket[:-1], True)]  # the last of each is worth most
-    return kept
+def _pareto_front(costs: FloatArray, values: FloatArray, limit: float) -> IntArray:
+    """Return the states within the limit that no other of at most the same cost equals, by ascending cost."""
+    order = np.lexsort((-values, costs))
+    order = order[costs[order] <= limit]
+    best_before = np.maximum.accumulate(np.append(-math.inf, values[order]))[:-1]
+    front = order[values[order] > best_before]
+    if len(front) > _MAX_STATES:
+        bucket = np.floor(costs[front] / limit * _MAX_STATES)
+        front = front[np.append(bucket[1:] != bucket[:-1], True)]  # the last one of each bucket is the best
+    return front
 
 
 def relaxed_bound(junctions: Sequence[JunctionPlans], limit: float) -> float:
-    """What no choice within a limit of cost exceeds: each junction's bounds over least costs, made concave, taken step
-    by step, the steepest first, the last one in part."""
-    total, steps = 0.0, []
-    for its in junctions:
-        points = _upper_hull([(cost, its.bound(number)) for number, cost in enumerate(its.min_costs) if cost <= limit])
-        total += points[0][1]
-        steps += [(b[1] - a[1], b[0] - a[0]) for a, b in pairwise(points)]
-    left = limit
-    for gain, cost in sorted(steps, key=lambda step: -step[0] / step[1]):
-        share = min(1.0, left / cost)
-        total += share * gain
-        left -= share * cost
-        if not left > 0.0:
+    """Return an upper bound of all allocations within a cost limit.
+
+    The bounds of each junction over its minimum costs are replaced by their upper hull. Steps along all hulls are taken
+    by descending slope, the last one in part.
+    """
+    total = 0.0
+    steps: list[CostPoint] = []
+    for junction in junctions:
+        points = []
+        for number, cost in enumerate(junction.min_costs):
+            if cost <= limit:
+                points.append(CostPoint(cost, junction.bound(number)))
+        hull = _upper_hull(points)
+        total += hull[0].value
+        steps += [CostPoint(b.cost - a.cost, b.value - a.value) for a, b in pairwise(hull)]
+
+    remaining = limit
+    for step in sorted(steps, key=lambda step: -step.value / step.cost):
+        share = min(1.0, remaining / step.cost)
+        total += share * step.value
+        remaining -= share * step.cost
+        if remaining <= 0.0:
             break
     return total
 
 
-def _upper_hull(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """The upper hull of (cost, value), from the cheapest on, as far as it rises."""
+def _upper_hull(points: Sequence[CostPoint]) -> list[CostPoint]:
+    """Return the upper hull, from the lowest cost on, as far as it rises."""
     best: dict[float, float] = {}
-    for cost, value in points:
-        best[cost] = max(value, best.get(cost, -math.inf))
-    hull: list[tuple[float, float]] = []
-    for cost, value in sorted(best.items()):
-        if hull and value <= hull[-1][1]:
+    for point in points:
+        best[point.cost] = max(point.value, best.get(point.cost, -math.inf))
+    hull: list[CostPoint] = []
+    for point in [CostPoint(cost, value) for cost, value in sorted(best.items())]:
+        if hull and point.value <= hull[-1].value:
             continue
-        while len(hull) > 1 and _turns_up(hull[-2], hull[-1], (cost, value)):
+        while len(hull) > 1 and _turns_up(hull[-2], hull[-1], point):
             hull.pop()
-        hull.append((cost, value))
+        hull.append(point)
     return hull
 
 
-def _turns_up(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
-    """Whether b lies on or below the line from a to c."""
-    return (b[1] - a[1]) * (c[0] - a[0]) <= (c[1] - a[1]) * (b[0] - a[0])
+def _turns_up(a: CostPoint, b: CostPoint, c: CostPoint) -> bool:
+    """Return whether b is on or below the line from a to c."""
+    return (b.value - a.value) * (c.cost - a.cost) <= (c.value - a.value) * (b.cost - a.cost)

@@ -1,41 +1,74 @@
-"""Egvs city run, egvs city place.
+"""``egvs city run`` and ``egvs city place``: run all junctions on a cluster, and plan sensors for the whole city.
 
-A whole city run: the traffic once, every junction on a cluster, and what came of them brought together.
+Steps of :func:`run_city`: simulate the traffic once (:mod:`egvs.city.traffic_split`); run every junction
+(:mod:`egvs.city.scheduler`); collect the results (:mod:`egvs.city.results`); write the page (:mod:`egvs.city.page`).
+The folder of each junction is byte for byte what ``egvs run`` of its scenario alone writes.
 
-Each junction's folder holds, byte for byte, what ``egvs run`` of its scenario alone would write: tasks call the same
-stages, and share what they make through the store.
-
-Which poles of a whole city: so many sensors, or so much money, where they see most together.
-
-Steps: bring all junctions up to date, as a city run does; ask each what it would make of 1, 2, ... sensors
-(:mod:`egvs.city.allocation`, tasks of the cluster); share them out (:mod:`egvs.city.allocation`).
-Where a junction would get as many as it was asked about, it is asked about twice as many.
+Steps of :func:`place_city`: run all junctions; compute the best plans of 1, 2, ... sensors for each, on the cluster;
+allocate sensors to the junctions (:mod:`egvs.city.allocation`). Where a junction gets as many sensors as its largest
+plan has, its plans are computed for twice as many, and the allocation is repeated.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from egvs.artefacts.planned_sensor import PlannedSensor
 from egvs.city import allocation, page, results, scheduler, traffic_split
-from egvs.city.allocation import Allocation, JunctionPlan, JunctionPlans
-from egvs.city.model import City, CityJunction
-from egvs.city.results import CityPlan, JunctionResult, PlannedSensor, read_junction_results, write_results
+from egvs.city.allocation import Allocation, JunctionPlans
+from egvs.city.model import City
+from egvs.city.results import CityPlan, JunctionResult, read_junction_results, write_results
 from egvs.city.tasks import Job, JobFailure, JobResult, RunSettings
 from egvs.core.errors import Diagnostic, InputError, collect_warnings
+from egvs.core.grid import Roi
 from egvs.core.runtime import ProgressCallback, no_progress
 from egvs.runs.run import lock_run_folder
 
 if TYPE_CHECKING:
     from distributed import Client
 
+_MIN_FIRST_COUNT = 4
+"""Plans of each junction are computed for at least this number of sensors."""
+
+_MAX_SENSORS = 10**6
+"""Limit of the number of sensors for a budget."""
+
+_MAX_PAIRS = 5
+"""Number of pairs that a warning lists."""
+
+_OVERLAP_TOLERANCE_M = 1e-9
+
+
+@dataclass(frozen=True)
+class CityRunOptions:
+    """Options of a city run.
+
+    Attributes
+    ----------
+    cluster
+        Where tasks run, see :func:`egvs.city.scheduler.connect`.
+    junctions
+        Names of the junctions to run; all if empty.
+    overrides
+        ``KEY=VALUE`` for the scenarios of all junctions, as in ``egvs run --set``; no keys of the traffic.
+    progress, on_done
+        Called with the number of finished junctions, and with each of them.
+    """
+
+    cluster: str = scheduler.LOCAL_CLUSTER
+    junctions: Sequence[str] = ()
+    overrides: Sequence[str] = ()
+    progress: ProgressCallback = no_progress
+    on_done: Callable[[JobResult], None] = lambda _: None
+
 
 @dataclass(frozen=True)
 class CityRun:
-    """What came of a city: its junctions, the best first, and the files beside their runs."""
+    """The result of a city run: the folder, its junctions, the best first, and the files beside their runs."""
 
     out: Path
     results: tuple[JunctionResult, ...]
@@ -43,277 +76,262 @@ class CityRun:
     warnings: tuple[Diagnostic, ...] = ()
 
 
-def run_city(
-    city: City,
-    out: str | Path | None = None,
-    *,
-    where: str = scheduler.LOCAL_CLUSTER,
-    only: Collection[str] = (),
-    sets: Sequence[str] = (),
-    progress: ProgressCallback = no_progress,
-    on_done: Callable[[JobResult], None] = lambda _: None,
-) -> CityRun:
-    """Run a city's junctions.
-
-    Parameters
-    ----------
-    out
-        Its folder; ``runs/<city's name>`` when None.
-    where
-        As ``--cluster`` says it, see :func:`egvs.city.scheduler.connect`.
-    only
-        Names of junctions; all when there is none.
-    sets
-        Laid over every junction's scenario, as ``egvs run --set`` does; no key of the traffic, which is the city's.
-    on_done
-        Called with each junction as it is done.
-
-    Raises
-    ------
-    InputError
-        Where the city, a scenario or ``where`` is wrong.
-    RunError
-        Where the traffic or a run cannot keep its promise, or the cluster is lost; what is done is kept then.
-    """
-    chosen, folder = select_junctions(city, only), city_run_folder(city, out)
-    _refuse_traffic_overrides(city, sets)
-    with lock_run_folder(folder):
-        scheduler.check_cluster(where)
-        with scheduler.connect(where) as client:
-            ran = run_city_on(client, city, folder, chosen, sets, progress, on_done)
-        planned = results.read_plan(folder, [junction.id for junction in chosen])
-        return replace(ran, files=(*ran.files, page.write_page(folder, city, ran.results, ran.warnings, planned)))
-
-
-def run_city_on(
-    client: Client,
-    city: City,
-    folder: Path,
-    chosen: Sequence[CityJunction],
-    sets: Sequence[str],
-    progress: ProgressCallback,
-    on_done: Callable[[JobResult], None],
-) -> CityRun:
-    """Run junctions on a cluster that is there, and bring their scores together; for those who hold the folder."""
-    order = scheduler.make_run_settings()
-    made = traffic_split.make_city_traffic(city, progress, sets)
-    scheduler.run_jobs(client, make_jobs(city, folder, chosen, sets), order, on_done=on_done, progress=progress)
-    results = read_junction_results(folder, chosen)
-    return CityRun(folder, results, write_results(folder, city, results), tuple(collect_warnings([made.summary])))
-
-
-def select_junctions(city: City, only: Collection[str]) -> tuple[CityJunction, ...]:
-    """The junctions of these names, in the city's order; all where there is none."""
-    names = {city.junction(name).id for name in only}
-    return tuple(junction for junction in city.junctions if not names or junction.id in names)
-
-
-def make_jobs(city: City, out: Path, chosen: Sequence[CityJunction], sets: Sequence[str]) -> list[Job]:
-    """What workers get of junctions."""
-    _refuse_traffic_overrides(city, sets)
-    return [
-        Job(
-            its.id,
-            its.scenario_folder(city).absolute(),
-            results.junction_run_folder(out, its.id).absolute(),
-            tuple(sets),
-        )
-        for its in chosen
-    ]
-
-
-def _refuse_traffic_overrides(city: City, sets: Sequence[str]) -> None:
-    for override in sets:
-        key = override.partition("=")[0].strip()
-        if key.split(".")[0] == "traffic":
-            found = "the traffic of a city is simulated once, for all of its junctions"
-            raise InputError(f"--set {override}", found, f"{key} in {city.file}, then this command without it")
-
-
-def city_run_folder(city: City, out: str | Path | None) -> Path:
-    """Where a city run goes: ``runs/<city's name>`` where no folder is given."""
-    return Path(out) if out is not None else Path("runs") / city.name
-
-
-_MIN_FIRST_COUNT = 4
-"""Sensors that junctions are asked about at first, at least."""
-
-
 @dataclass(frozen=True)
 class CityPlacement:
-    """A city's plan, the run that it is made from, and what was written."""
+    """A city's plan, the city run that it was made from, and the files that were written."""
 
     city_run: CityRun
     plan: CityPlan
     files: tuple[Path, ...]
 
 
-def place_city(
-    city: City,
-    out: str | Path | None = None,
-    *,
-    count: int | None = None,
-    budget: float | None = None,
-    where: str = scheduler.LOCAL_CLUSTER,
-    only: Collection[str] = (),
-    sets: Sequence[str] = (),
-    progress: ProgressCallback = no_progress,
-    on_done: Callable[[JobResult], None] = lambda _: None,
-) -> CityPlacement:
-    """The poles of a city that are best together.
+def run_city(city: City, out: str | Path | None = None, options: CityRunOptions | None = None) -> CityRun:
+    """Run the junctions of a city.
 
     Parameters
     ----------
-    count, budget
-        One of them: sensors at most, or what they may cost.
-    out, where, only, sets, heard
-        As :func:`egvs.city.city_run.run_city` takes them.
+    city
+        From :func:`egvs.city.model.load_city`.
+    out
+        The folder of the city run; ``runs/<name of the city>`` when None.
+    options
+        Options of the run; the defaults when None.
 
     Raises
     ------
     InputError
-        For what cannot be asked, or cannot be added up over junctions.
+        When the city, a scenario or an option is wrong.
+    RunError
+        When the traffic or a run fails, or the cluster is lost; finished results are kept.
     """
-    if (count is None) == (budget is None):
-        found = "neither is given" if count is None else "both are given"
-        raise InputError("--count, --budget", found, "one of them: --count 20 or --budget 800000")
-    if budget is not None and not 0 < budget < float("inf"):
-        raise InputError("--budget", f"{budget:g}", "a cost above 0")
-    chosen, folder = select_junctions(city, only), city_run_folder(city, out)
-    jobs = make_jobs(city, folder, chosen, sets)
+    options = options or CityRunOptions()
+    folder = _run_folder(city, out)
+    jobs = make_jobs(city, folder, options)
+    with lock_run_folder(folder):
+        scheduler.check_cluster(options.cluster)
+        with scheduler.connect(options.cluster) as client:
+            ran = _run_jobs(client, city, folder, jobs, options)
+        plan = results.read_plan(folder, [job.junction for job in jobs])
+        page_file = page.write_page(folder, city, ran.results, ran.warnings, plan)
+        return replace(ran, files=(*ran.files, page_file))
+
+
+def _run_jobs(client: Client, city: City, folder: Path, jobs: Sequence[Job], options: CityRunOptions) -> CityRun:
+    """Run junctions, and write the tables of their results; the folder is locked."""
+    settings = scheduler.make_run_settings()
+    traffic = traffic_split.make_city_traffic(city, options.progress, options.overrides)
+    scheduler.run_jobs(client, jobs, settings, on_done=options.on_done, progress=options.progress)
+    junction_results = read_junction_results(folder, [city.junction(job.junction) for job in jobs])
+    written = write_results(folder, city, junction_results)
+    return CityRun(folder, junction_results, written, tuple(collect_warnings([traffic.summary])))
+
+
+def make_jobs(city: City, out: Path, options: CityRunOptions) -> list[Job]:
+    """Return the jobs of the selected junctions, in the city's order.
+
+    Parameters
+    ----------
+    city, out, options
+        The city, the folder of the city run, and its options.
+
+    Raises
+    ------
+    InputError
+        When a junction is unknown, or an override changes the traffic.
+    """
+    for override in options.overrides:
+        key = override.partition("=")[0].strip()
+        if key.split(".")[0] == "traffic":
+            problem = "the traffic of a city is simulated once for all junctions"
+            raise InputError(f"--set {override}", problem, f"Set {key} in {city.file} instead.")
+    selected = {city.junction(name).id for name in options.junctions}
+    jobs = []
+    for junction in city.junctions:
+        if not selected or junction.id in selected:
+            run_folder = results.junction_run_folder(out, junction.id).absolute()
+            scenario_folder = junction.scenario_folder(city).absolute()
+            jobs.append(Job(junction.id, scenario_folder, run_folder, tuple(options.overrides)))
+    return jobs
+
+
+def _run_folder(city: City, out: str | Path | None) -> Path:
+    return Path(out) if out is not None else Path("runs") / city.name
+
+
+def place_city(
+    city: City,
+    out: str | Path | None = None,
+    options: CityRunOptions | None = None,
+    *,
+    count: int | None = None,
+    budget: float | None = None,
+) -> CityPlacement:
+    """Find the sensors of a city that are best together.
+
+    Parameters
+    ----------
+    city, out, options
+        As in :func:`run_city`.
+    count, budget
+        Maximum number of sensors, or maximum cost: exactly one of them.
+
+    Raises
+    ------
+    InputError
+        When the request is invalid, or cannot be summed over junctions.
+    """
+    options = options or CityRunOptions()
+    requested = _check_request(count, budget)
+    folder = _run_folder(city, out)
+    jobs = make_jobs(city, folder, options)
     for job in jobs:
         allocation.check_additive_config(job.scenario())
+
     with lock_run_folder(folder):
-        scheduler.check_cluster(where)
-        with scheduler.connect(where) as client:
-            ran = run_city_on(client, city, folder, chosen, sets, progress, on_done)
-            seen = [its.junction.id for its in ran.results if its.gain > 0]
-            wanted = [job for job in jobs if job.junction in seen]
-            if not wanted:
-                raise InputError(city.file, "no pole sees anything of the traffic", "a city with traffic")
-            shared, of = _allocate_sensors(client, wanted, count, budget, progress)
-        rank_by = ran.results[0].best.rank_by
-        told = _make_city_plan(wanted, of, shared, rank_by, {"count": count} if budget is None else {"budget": budget})
-        ids = [junction.id for junction in chosen]
-        warnings = (
-            *ran.warnings,
-            *overlap_warnings(jobs),
-            *_no_traffic_visible_warnings(city, [i for i in ids if i not in seen]),
-        )
-        written = (
-            results.write_plan(folder, city, told, ids),
-            page.write_page(folder, city, ran.results, warnings, told),
-        )
-    return CityPlacement(CityRun(folder, ran.results, ran.files, warnings), told, written)
+        scheduler.check_cluster(options.cluster)
+        with scheduler.connect(options.cluster) as client:
+            ran = _run_jobs(client, city, folder, jobs, options)
+            with_gain = {result.junction.id for result in ran.results if result.gain > 0}
+            useful_jobs = [job for job in jobs if job.junction in with_gain]
+            if not useful_jobs:
+                raise InputError(city.file, "no site sees any traffic", "Use a city with traffic.")
+            plans, shares = _allocate_sensors(client, useful_jobs, count, budget, options.progress)
+
+        plan = _make_city_plan(plans, shares, ran.results[0].best.rank_by, requested)
+        without_gain = [job.junction for job in jobs if job.junction not in with_gain]
+        warnings = (*ran.warnings, *overlap_warnings(jobs), *_no_gain_warnings(city, without_gain))
+        plan_file = results.write_plan(folder, city, plan, [job.junction for job in jobs])
+        page_file = page.write_page(folder, city, ran.results, warnings, plan)
+    return CityPlacement(replace(ran, warnings=warnings), plan, (plan_file, page_file))
+
+
+def _check_request(count: int | None, budget: float | None) -> dict[str, float]:
+    """Return the request by the name of its option; raise an InputError if it is invalid."""
+    requested = {key: float(value) for key, value in (("count", count), ("budget", budget)) if value is not None}
+    if len(requested) != 1:
+        problem = f"expected one of them, got {' and '.join(requested) or 'neither'}"
+        raise InputError("--count, --budget", problem, "Give for example --count 20 or --budget 800000.")
+    if budget is not None and not 0 < budget < float("inf"):
+        raise InputError("--budget", f"expected a cost above 0, got {budget:g}", "Give for example --budget 800000.")
+    return requested
 
 
 def _allocate_sensors(
     client: Client, jobs: Sequence[Job], count: int | None, budget: float | None, progress: ProgressCallback
-) -> tuple[Allocation, dict[str, JunctionPlans]]:
-    """The plan that each junction gets, and what each could get."""
-    order, found = scheduler.make_run_settings(), dict[str, JunctionPlans]()
-    limit = count if count is not None else 10**6
-    most = dict.fromkeys((job.junction for job in jobs), min(limit, max(_MIN_FIRST_COUNT, 2 * -(-limit // len(jobs)))))
-    if budget is not None:
-        most = dict.fromkeys(most, _MIN_FIRST_COUNT)
-    asked: Sequence[Job] = jobs
+) -> tuple[list[JunctionPlans], Allocation]:
+    """Return the plans of each junction, and the allocation of the count or budget to them."""
+    settings = scheduler.make_run_settings()
+    limit, first_count = _MAX_SENSORS, _MIN_FIRST_COUNT
+    if count is not None:
+        twice_the_average = 2 * -(-count // len(jobs))
+        limit, first_count = count, min(count, max(_MIN_FIRST_COUNT, twice_the_average))
+
+    max_counts = {job.junction: first_count for job in jobs}
+    plans: dict[str, JunctionPlans] = {}
     while True:
-        failed = []
-        for job, its in _iter_junction_plans(client, asked, order, most, budget is not None):
-            if isinstance(its, JobFailure):
-                failed.append(its)
+        for result in _compute_plans(client, jobs, max_counts, settings, with_costs=budget is not None):
+            plans[result.junction] = result
+            progress("junctions planned", len(plans), len(jobs))
+
+        all_plans = [plans[job.junction] for job in jobs]
+        shares = _solve_allocation(all_plans, count, budget)
+        max_counts = {}
+        for junction, chosen in zip(all_plans, shares.chosen, strict=True):
+            uses_largest_plan = junction.plans[chosen].count >= junction.max_count
+            if uses_largest_plan and not junction.is_complete and junction.max_count < limit:
+                max_counts[junction.junction] = min(limit, 2 * junction.max_count)
+        if not max_counts:
+            return all_plans, shares
+
+
+def _compute_plans(
+    client: Client, jobs: Sequence[Job], max_counts: Mapping[str, int], settings: RunSettings, *, with_costs: bool
+) -> Iterator[JunctionPlans]:
+    """Yield the plans of the junctions in ``max_counts``; finally raise an EgvsError if any of them failed."""
+    failures = []
+    for count in sorted(set(max_counts.values())):
+        count_jobs = [job for job in jobs if max_counts.get(job.junction) == count]
+        task = allocation.junction_plans
+        for _, result in scheduler.map_junctions(client, task, count_jobs, settings, count, with_costs):
+            if isinstance(result, JobFailure):
+                failures.append(result)
             else:
-                found[job.junction] = its
-            progress("junctions asked", len(found), len(jobs))
-        scheduler.raise_failures(failed, len(jobs))
-        every = [found[job.junction] for job in jobs]
-        shared = _solve_allocation(every, count, budget)
-        short = [its for its, at in zip(every, shared.chosen, strict=True) if _needs_more_plans(its, at, limit)]
-        if not short:
-            return shared, found
-        most |= {its.junction: min(limit, 2 * its.max_count) for its in short}
-        asked = [job for job in jobs if job.junction in {its.junction for its in short}]
+                yield result
+    scheduler.raise_failures(failures, len(jobs))
 
 
-def _iter_junction_plans(
-    client: Client, jobs: Sequence[Job], settings: RunSettings, most: Mapping[str, int], costs_count: bool
-) -> Iterator[tuple[Job, JunctionPlans | JobFailure]]:
-    for number in sorted({most[job.junction] for job in jobs}):
-        alike = [job for job in jobs if most[job.junction] == number]
-        yield from scheduler.map_junctions(client, allocation.junction_plans, alike, settings, number, costs_count)
-
-
-def _solve_allocation(every: Sequence[JunctionPlans], count: int | None, budget: float | None) -> Allocation:
-    """InputError where what is there already is more than was asked for."""
-    if count is None:
-        assert budget is not None
-        return allocation.allocate_budget(every, budget)
-    there = sum(its.plans[0].count for its in every)
-    if there > count:
-        raise InputError(
-            f"--count {count}", f"{there} sensors are there already (placement.forced)", f"at least {there}"
-        )
-    return allocation.allocate_count(every, count)
-
-
-def _needs_more_plans(plans: JunctionPlans, at: int, limit: int) -> bool:
-    """Whether a junction gets as many sensors as it was asked about, and more could add something."""
-    return not plans.is_complete and plans.plans[at].count >= plans.max_count and plans.max_count < limit
+def _solve_allocation(plans: Sequence[JunctionPlans], count: int | None, budget: float | None) -> Allocation:
+    """Allocate a count or a budget; raise an InputError if there are more forced sensors than the count."""
+    if budget is not None:
+        return allocation.allocate_budget(plans, budget)
+    assert count is not None
+    n_forced = sum(junction.plans[0].count for junction in plans)
+    if n_forced > count:
+        problem = f"{n_forced} sensors are already installed (placement.forced)"
+        raise InputError(f"--count {count}", problem, f"Use a count of at least {n_forced}.")
+    return allocation.allocate_count(plans, count)
 
 
 def _make_city_plan(
-    jobs: Sequence[Job],
-    of: Mapping[str, JunctionPlans],
-    shared: Allocation,
-    rank_by: str,
-    requested: Mapping[str, float | None],
+    plans: Sequence[JunctionPlans], shares: Allocation, rank_by: str, requested: Mapping[str, float]
 ) -> CityPlan:
-    """The plan of the city in the order in which its sensors would be put up."""
-    plans = {job.junction: of[job.junction].plans[at] for job, at in zip(jobs, shared.chosen, strict=True)}
+    """Return the plan of the city, its sensors in the order of installation."""
+    sensors_by_junction = {}
+    for junction, chosen in zip(plans, shares.chosen, strict=True):
+        sensors_by_junction[junction.junction] = junction.plans[chosen].sensors
     sensors, score = [], 0.0
-    for number, (junction, pick) in enumerate(_merge_by_gain(plans), start=1):
-        score += pick.gain
-        site = pick.site
-        sensors.append(
-            PlannedSensor(
-                number, junction, site.name, site.pole or site.name, **asdict(site.pose), sensor=site.sensor,
-                forced=pick.is_forced, gain=pick.gain, score=score, cost=pick.cost,
-            )
-        )  # fmt: skip
-    every = [of[job.junction] for job in jobs]
-    together, candidates = sum(its.together for its in every), sum(len(its.min_costs) - 1 for its in every)
-    curve = tuple((float(best), float(bound)) for best, bound in shared.curve)
-    numbers = {key: float(value) for key, value in requested.items() if value is not None}
+    for number, sensor in enumerate(_merge_by_gain(sensors_by_junction), start=1):
+        score += sensor.gain
+        sensors.append(replace(sensor, order=number, score=score))
     return CityPlan(
-        tuple(sensors), rank_by, numbers, shared.value, shared.bound, together, candidates, len(jobs), curve
+        sensors=tuple(sensors),
+        rank_by=rank_by,
+        requested=requested,
+        joint=shares.value,
+        bound=shares.bound,
+        joint_of_all=sum(junction.joint_of_all for junction in plans),
+        candidates=sum(len(junction.min_costs) - 1 for junction in plans),
+        junctions=len(plans),
+        curve=tuple((float(best), float(bound)) for best, bound in shares.curve),
     )
 
 
-def _merge_by_gain(plans: Mapping[str, JunctionPlan]) -> Iterator[tuple[str, allocation.JunctionSensor]]:
-    """What is there already; then, of the junctions' next sensors, each time the one that adds most."""
-    left = {name: list(plan.sensors) for name, plan in plans.items() if plan.sensors}
-    while left:
-        name = max(left, key=lambda its: (left[its][0].is_forced, left[its][0].gain))
-        yield name, left[name].pop(0)
-        if not left[name]:
-            del left[name]
+def _merge_by_gain(sensors_by_junction: Mapping[str, Sequence[PlannedSensor]]) -> Iterator[PlannedSensor]:
+    """Yield forced sensors first, then each time the next sensor of the junction where it adds most."""
+    remaining = {name: list(sensors) for name, sensors in sensors_by_junction.items() if sensors}
+    while remaining:
+        name = max(remaining, key=lambda name: (remaining[name][0].forced, remaining[name][0].gain))
+        yield replace(remaining[name].pop(0), junction=name)
+        if not remaining[name]:
+            del remaining[name]
 
 
 def overlap_warnings(jobs: Sequence[Job]) -> Iterator[Diagnostic]:
-    """A warning where regions of junctions overlap: what lies in two is counted twice."""
+    """Warn about junctions whose regions of interest overlap: the common part counts twice."""
     boxes = [(job.junction, job.scenario().roi.box) for job in jobs]
-    pairs = [
-        f"{a} and {b}" for (a, one), (b, other) in combinations(boxes, 2)
-        if all(one.origin_m[i] < other.origin_m[i] + other.size_m[i] - 1e-9 for i in (0, 1))
-        and all(other.origin_m[i] < one.origin_m[i] + one.size_m[i] - 1e-9 for i in (0, 1))
-    ]  # fmt: skip
-    if pairs:
-        few = ", ".join(pairs[:5]) + (f" and {len(pairs) - 5} more pairs" if len(pairs) > 5 else "")
-        found = f"the regions of {few} overlap: what lies in both is counted twice in the city's sum"
-        yield Diagnostic("regions overlap", "junctions", found, "smaller regions, or one of the two junctions")
+    pairs = [f"{a} and {b}" for (a, box), (b, other) in combinations(boxes, 2) if _overlap(box, other)]
+    if not pairs:
+        return
+    names = ", ".join(pairs[:_MAX_PAIRS])
+    if len(pairs) > _MAX_PAIRS:
+        names += f" and {len(pairs) - _MAX_PAIRS} more pairs"
+    problem = f"the regions of {names} overlap, so the common part counts twice in the city's score"
+    yield Diagnostic("regions overlap", "junctions", problem, "Use smaller regions, or one of the two junctions.")
 
 
-def _no_traffic_visible_warnings(city: City, names: Sequence[str]) -> Iterator[Diagnostic]:
+def _overlap(box: Roi, other: Roi) -> bool:
+    """Return whether two boxes overlap, seen from above."""
+    for axis in (0, 1):
+        end_m = box.origin_m[axis] + box.size_m[axis]
+        other_end_m = other.origin_m[axis] + other.size_m[axis]
+        if box.origin_m[axis] >= other_end_m - _OVERLAP_TOLERANCE_M:
+            return False
+        if other.origin_m[axis] >= end_m - _OVERLAP_TOLERANCE_M:
+            return False
+    return True
+
+
+def _no_gain_warnings(city: City, names: Sequence[str]) -> Iterator[Diagnostic]:
     if names:
-        found = f"no pole of {', '.join(names)} sees anything of the traffic: no sensor is planned there"
-        yield Diagnostic("junctions unseen", str(city.file), found, "more traffic, or other candidates")
+        problem = f"no site of {', '.join(names)} sees any traffic, so no sensor is planned there"
+        yield Diagnostic("junctions unseen", str(city.file), problem, "Use more traffic, or other candidates.")

@@ -1,55 +1,32 @@
-"""Egvs city new.
+"""Create a city from an OpenStreetMap extract: one network, and a scenario for each junction.
 
-Chooses the junctions of a city.
+Steps of :func:`create_city`: read the extract, with its streets cut to a circle on request; run netconvert on the
+streets; choose junctions (:func:`choose_junctions`); map buildings, trees, barriers and poles to solids; for each
+junction set the region of interest, find pole locations along its kerbs, and select the solids that a sensor there can
+reach; write the folder that :mod:`egvs.city.model` describes.
 
-Either all with signals, or all, or those nearest to places of a table. A junction is where at least three streets meet,
-so that the signals of a mere crossing for pedestrians are none. The largest come first: by incoming lanes, then by
-area. World frame, metres; places of tables in degrees (WGS 84).
+Traffic demand is drawn for the complete network, in proportion to the length of its lanes: flows assumed for each
+junction alone would count a vehicle several times that passes several junctions.
 
-The texts that a new city is made of: ``city.toml``, its table, what junctions have in common, each one's scenario.
-
-The traffic is drawn for the whole network, by the length of its lanes: flows that are assumed for each junction alone
-would count whoever passes several of them more than once.
-
-A city is made from OpenStreetMap: one network, and a scenario for each junction.
-
-Steps of :func:`create_city`: read the extract, its streets cut to a circle if one is asked for; netconvert makes them
-one SUMO
-network; choose the junctions (:mod:`egvs.city.creation`); take buildings, trees, barriers, poles as solids, once;
-for each junction lay the region of interest round it, find candidate sites along its kerbs, and keep the solids that a
-sensor there can reach; write the folder (:mod:`egvs.city.model`, :mod:`egvs.city.creation`).
-
-World frame: the network's x (east), y (north) in metres; the ground is z = 0. The same extract gives the same bytes.
+World frame: x (east), y (north) of the network in metres; the ground is z = 0. Tables have degrees (WGS 84). The same
+extract gives the same bytes.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import shapely
 import tomlkit
-from pydantic import TypeAdapter, ValidationError
 from shapely.geometry import MultiPoint, Point, box
 from shapely.geometry.base import BaseGeometry
 
 from egvs.city import model
-from egvs.city.model import (
-    CITY_FILE,
-    COLUMNS,
-    JUNCTIONS_FILE,
-    JUNCTIONS_FOLDER,
-    TRAFFIC_FOLDER,
-    City,
-    CityJunction,
-    csv_rows,
-    parse_number,
-)
+from egvs.city.model import CITY_FILE, JUNCTIONS_FILE, JUNCTIONS_FOLDER, TRAFFIC_FOLDER, CityJunction
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.runtime import ProgressCallback, no_progress
@@ -59,7 +36,6 @@ from egvs.importers.junctions import HEIGHTS_M, JunctionRegion, KerbsidePole, St
 from egvs.importers.openstreetmap import PITCHES_DEG, SENSOR, SITES_FILE, STATICS_FILE, TomlTable, check_inside_extract
 from egvs.importers.osm_network import ATTRIBUTION, NETWORK_FILE, NetworkExcerpts
 from egvs.importers.osm_solids import ImportCounts, MappedSolid
-from egvs.scenario.fields import NAME_DESCRIPTION, Name
 from egvs.scenario.loading import load
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, TrafficConfig
@@ -68,221 +44,75 @@ from egvs.traffic import demand
 
 SIGNALISED, ALL = "signalised", "all"
 REQUIRED_COLUMNS = ("junction", "lat_deg", "lon_deg")
-"""Columns of a table of junctions; those of a city's own table may be there too."""
+"""Columns that a table of junctions must have; it may have the other columns of ``junctions.csv`` as well."""
 
 MAX_DISTANCE_M = 50.0
-"""A place of a table is so near to its junction."""
+"""Maximum distance from the coordinates in a table to the junction that they select."""
+
+DEFAULT_RADIUS_M = 2000.0
+RIM_WIDTH_M = 100.0
+"""Junctions nearer to the rim of the circle are left out, because their approaches are cut."""
+
+NEAR_RIM, NO_SIGNALS, TOO_FEW_ARMS = "too near to the rim", "without signals", "fewer than three streets meet"
+NO_FREE_KERB = "no place for a pole is free along the kerbs"
+"""Reasons to leave a junction out."""
+
+PEDESTRIANS_NOTE = (
+    f"for pedestrians, add [effects.pedestrians_bicycles] pedestrians_per_h = 300 to {CITY_FILE} (and bicycles_per_h)"
+)
+ROADS_FILE = "roads.net.xml"
+"""The streets near a junction, for its maps, lanes and checks."""
+
+IMPORT_FILE = "import.json"
+"""What was created, assumed and left out."""
 
 _MIN_ARMS = 3
-NEAR_RIM, NO_SIGNALS, TOO_FEW_ARMS = "too near to the rim", "without signals", "fewer than three streets meet"
 
-
-@dataclass(frozen=True)
-class JunctionChoice:
-    """The junctions that were chosen, by the names of their folders; and those that were not, by why."""
-
-    junctions: dict[str, StreetJunction]
-    left_out: dict[str, list[str]]
-
-
-def choose_junctions(streets: Streets, which: str, within: BaseGeometry | None) -> JunctionChoice:
-    """The junctions of a network: ``"signalised"``, ``"all"``, or those of a table, given its path.
-
-    InputError where the table is wrong, or no junction is left. Those that ``within`` does not hold are left out.
-    """
-    if which not in (SIGNALISED, ALL):
-        return JunctionChoice(dict(_junctions_from_table(streets, Path(which))), {})
-    chosen: list[StreetJunction] = []
-    left_out: dict[str, list[str]] = {}
-    for junction in sorted(streets.junctions, key=lambda j: (-j.lanes_in, -j.area.area, j.id)):
-        if which == SIGNALISED and not junction.signalised:
-            why = NO_SIGNALS
-        elif junction.arms < _MIN_ARMS:
-            why = TOO_FEW_ARMS
-        elif within is not None and not within.contains(Point(junction.at_m)):
-            why = NEAR_RIM
-        else:
-            chosen.append(junction)
-            continue
-        left_out.setdefault(why, []).append(junction.id)
-    width = max(2, len(str(len(chosen))))
-    return JunctionChoice({f"j{number:0{width}d}": junction for number, junction in enumerate(chosen, 1)}, left_out)
-
-
-def _junctions_from_table(streets: Streets, path: Path) -> Iterator[tuple[str, StreetJunction]]:
-    seen: dict[str, str] = {}
-    names = set[str]()
-    for place, row in csv_rows(path, REQUIRED_COLUMNS, COLUMNS):
-        name = row["junction"]
-        try:
-            TypeAdapter(Name).validate_python(name)
-        except ValidationError:
-            raise InputError(f"{place}: junction", repr(name)[:80], NAME_DESCRIPTION) from None
-        if name.casefold() in names:
-            raise InputError(place, "stands there twice", "a name of its own for each junction")
-        names.add(name.casefold())
-        lat_deg, lon_deg = (
-            parse_number(f"{place}: {key}", row[key], most) for key, most in (("lat_deg", 90), ("lon_deg", 180))
-        )
-        junction = _nearest_junction(streets, Point(streets.to_xy([lon_deg], [lat_deg])[0]), place)
-        if junction.id in seen:
-            raise InputError(place, f"is the same junction as {seen[junction.id]}", "one row for each junction")
-        seen[junction.id] = name
-        yield name, junction
-    if not names:
-        raise InputError(path, "names no junction", "a row for each, or --junctions signalised or all")
-
-
-def _nearest_junction(streets: Streets, at: Point, location: str) -> StreetJunction:
-    met = [junction for junction in streets.junctions if junction.arms >= _MIN_ARMS]
-    away = {junction.id: at.distance(junction.area) if math.isfinite(at.x + at.y) else math.inf for junction in met}
-    nearest = min(met, key=lambda j: (away[j.id], j.id), default=None)
-    if nearest is None or not away[nearest.id] <= MAX_DISTANCE_M:
-        far = "there is none" if nearest is None else f"the nearest is {away[nearest.id]:,.0f} m away"
-        raise InputError(
-            location, f"no junction of three streets or more is there ({far})", f"one within {MAX_DISTANCE_M:g} m"
-        )
-    return nearest
-
-
-_CROSSING_SPEED_M_S, _ROUND_TO_S = 8.0, 60.0
-"""A network is full once one could have crossed it at this speed."""
+_CROSSING_SPEED_M_S, _WARMUP_STEP_S = 8.0, 60.0
+"""The warm-up lasts until a vehicle could have crossed the network at this speed, in whole steps."""
 
 _MIN_TRIP_S = 100.0
-"""Trips last longer than this: so many a second keep the vehicles of a network."""
+"""Trips last longer than this, so one N-th of it between departures is enough for N vehicles."""
 
-ROADS_FILE = "roads.net.xml"
-"""Of a junction: the streets near it, for maps, lanes and checks."""
+_KERB_MARGIN_M, _ROADS_MARGIN_M = 60.0, 100.0
+"""Distances from the region of interest within which solids can block kerbs, and streets are written."""
 
 _SOURCE_COMMENT = f"Made from OpenStreetMap. Map data {ATTRIBUTION} (openstreetmap.org/copyright)."
 _FRAME_COMMENT = f"World frame: x east, y north in metres as in {NETWORK_FILE}, z up from the flat ground."
 
 
-def traffic_amount(streets: Streets) -> dict[str, Any]:
-    """How much is simulated, and for how long: what of ``[traffic]`` depends on the network's size."""
-    vehicles = demand.target_vehicle_count(TrafficConfig(network=NETWORK_FILE), streets.network)
-    fill_s = _ROUND_TO_S * math.ceil(streets.network.diagonal_m / _CROSSING_SPEED_M_S / _ROUND_TO_S)
-    own = float(TrafficConfig.model_fields["trips_per_s"].default)
-    return {
-        "vehicles": vehicles,
-        "warmup_s": max(DEFAULT_WARMUP_S, fill_s),
-        "trips_per_s": max(own, vehicles / _MIN_TRIP_S),
-    }
+@dataclass(frozen=True)
+class JunctionChoice:
+    """The chosen junctions by the names of their folders, and the ids of the others by reason."""
 
-
-def city_toml(name: str, streets: Streets, count: int) -> str:
-    """``city.toml``."""
-    amount, fields = traffic_amount(streets), TrafficConfig.model_fields
-    values = ({"name": name} if name else {}) | {
-        "description": f"{count} junctions", "attribution": ATTRIBUTION, "seed": 1,
-    }  # fmt: skip
-    traffic = {
-        "network": NETWORK_FILE, "vehicles_per_lane_km": fields["vehicles_per_lane_km"].default,
-        "frames": DEFAULT_FRAMES,
-        "frame_period_s": fields["frame_period_s"].default, "warmup_s": amount["warmup_s"],
-        "trips_per_s": amount["trips_per_s"],
-    }  # fmt: skip
-    about = "one simulation for all junctions, trips drawn through the whole network; or your own sumocfg, counts, fcd"
-    document = openstreetmap.toml_document(
-        [f"A city. {_SOURCE_COMMENT}", _FRAME_COMMENT], values, {"traffic": (about, traffic)}
-    )
-    shown = f"{amount['vehicles']} vehicles in this network"
-    document["traffic"]["vehicles_per_lane_km"].comment(shown)
-    return tomlkit.dumps(document)
-
-
-def common_toml() -> str:
-    """``junctions/scenario.toml``: what every junction's scenario extends."""
-    period_s = TrafficConfig.model_fields["frame_period_s"].default
-    tables: dict[str, TomlTable] = {
-        "roi": ("", openstreetmap.voxel_keys()),
-        "traffic": (f"as in {model.CITY_FILE}, or a multiple of it", {"frame_period_s": period_s}),
-        "sites": ("", openstreetmap.mount_keys()),
-        "scan": ("sites are scanned as they are scored; true keeps their scans, 0.7 MB a site", {"keep": False}),
-        "score": openstreetmap.score_table(),
-    }
-    about = "What the scenarios of all junctions have in common; each may say otherwise."
-    return tomlkit.dumps(openstreetmap.toml_document([about], {"seed": 1}, tables))
-
-
-def junction_toml(junction_id: str, title: str, roi: JunctionRegion) -> str:
-    """A junction's ``scenario.toml``."""
-    values = {"extends": "..", "description": title[0].upper() + title[1:]}
-    tables = {
-        "roi": openstreetmap.roi_table(roi),
-        "traffic": (
-            "the city's, cut to this junction: egvs city traffic makes it",
-            {
-                "fcd": f"../../{TRAFFIC_FOLDER}/{junction_id}.parquet",
-                "roads": ROADS_FILE,
-            },
-        ),
-        "statics": openstreetmap.statics_table(),
-        "sites": openstreetmap.sites_table(),
-    }
-    return tomlkit.dumps(openstreetmap.toml_document([f"A junction of a city. {_SOURCE_COMMENT}"], values, tables))
-
-
-def junctions_csv(rows: Iterable[CityJunction]) -> str:
-    """``junctions.csv``."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(model.table_rows(tuple(rows)))
-    return text.getvalue()
-
-
-def import_counts(solids: Sequence[MappedSolid]) -> ImportCounts:
-    """The objects of one junction, and where their heights are from."""
-    counts = ImportCounts()
-    for solid in solids:
-        counts.keep(solid)
-    return counts
-
-
-def import_notes(larger: int, counts: ImportCounts) -> list[str]:
-    """What to know before trusting a city of which so many junctions are larger than their regions."""
-    found = openstreetmap.scenario_notes(True, counts)
-    if larger:
-        found.append(
-            f"{larger} junctions are larger than their regions of interest ({junctions.ROI_MAX_M:g} m at most)"
-        )
-    return found
-
-
-DEFAULT_RADIUS_M = 2000.0
-"""Of the circle, where a place is named and no radius."""
-
-RIM_WIDTH_M = 100.0
-"""Junctions that are nearer to the circle are left out: their approaches are cut."""
-
-PEDESTRIANS_NOTE = (
-    f"people come with [effects.pedestrians_bicycles] pedestrians_per_h = 300 in {CITY_FILE} (and bicycles_per_h)"
-)
-NO_FREE_KERB = "no place for a pole is free along the kerbs"
-IMPORT_FILE = "import.json"
-"""What was made, assumed and left out, in the city's folder."""
-
-_LOCAL_M, _ROADS_M = 60.0, 100.0
-"""How far round a region kerbs look at what is there, and streets are drawn."""
+    junctions: dict[str, StreetJunction]
+    left_out: dict[str, list[str]]
 
 
 @dataclass(frozen=True)
 class NewJunction:
-    """A junction with what its scenario is made of."""
+    """A junction and the parts of its scenario; ``id`` is the name of its folder."""
 
     id: str
     junction: StreetJunction
     roi: JunctionRegion
-    places: list[KerbsidePole]
+    poles: list[KerbsidePole]
 
     @property
     def sites(self) -> int:
-        """Candidates: each pole with each height and each tilt."""
-        return len(self.places) * len(HEIGHTS_M) * len(PITCHES_DEG)
+        """Number of candidates: each pole with each height and each tilt."""
+        return len(self.poles) * len(HEIGHTS_M) * len(PITCHES_DEG)
+
+    @property
+    def reachable_area(self) -> shapely.Geometry:
+        """Where beams from any site may end."""
+        locations = MultiPoint([(pole.x_m, pole.y_m) for pole in self.poles]).union(self.roi.area)
+        return box(*locations.bounds).buffer(CATALOGUE[SENSOR].range_m, join_style="mitre")
 
 
 @dataclass(frozen=True)
 class NewCity:
-    """What :func:`create_city` made; ``left_out`` are ids of the network's junctions, by why they have no scenario."""
+    """What :func:`create_city` made; ``left_out`` are ids of junctions without scenario, by reason."""
 
     folder: Path
     junctions: tuple[NewJunction, ...]
@@ -292,19 +122,19 @@ class NewCity:
     notes: tuple[str, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """All of it as plain JSON, in the order of interest."""
-        streets, its = self.streets, self.junctions
+        """Return a summary as plain JSON, the most interesting keys first."""
+        streets, made = self.streets, self.junctions
         return {
             "attribution": ATTRIBUTION,
-            "junctions": {"made": len(its), "signalised": sum(j.junction.signalised for j in its)},
-            "left_out": {why: len(ids) for why, ids in self.left_out.items()},
+            "junctions": {"made": len(made), "signalised": sum(j.junction.signalised for j in made)},
+            "left_out": {reason: len(ids) for reason, ids in self.left_out.items()},
             "network": {
                 "edges": len(streets.network.edges), "lane_length_m": round(streets.lane_length_m),
                 "signalised_junctions": sum(j.signalised for j in streets.junctions),
             },
             "traffic": traffic_amount(streets),
-            "poles": sum(len(j.places) for j in its),
-            "sites": sum(j.sites for j in its),
+            "poles": sum(len(j.poles) for j in made),
+            "sites": sum(j.sites for j in made),
             "statics": self.statics.to_json(),
             "notes": list(self.notes),
         }  # fmt: skip
@@ -314,113 +144,262 @@ def create_city(
     folder: Path, osm: Path, *, around: tuple[float, float] | None = None, radius_m: float | None = None,
     which: str = SIGNALISED, lefthand: bool = False, walk: bool = False, progress: ProgressCallback = no_progress,
 ) -> NewCity:  # fmt: skip
-    """Make a city's folder from an OpenStreetMap extract.
+    """Make the folder of a city from an OpenStreetMap extract.
 
     Parameters
     ----------
     folder
-        Made by this function; may exist when it is empty.
+        Created by this function; may exist if it is empty.
     osm
-        An OpenStreetMap file: XML (may be gzipped) or PBF.
+        An OpenStreetMap file: XML (plain or gzipped) or PBF.
     around, radius_m
-        Streets within so many metres of a latitude, longitude; without a place, all of the extract.
+        Latitude, longitude in degrees, and the distance within which streets are used; the complete extract if
+        ``around`` is None.
     which
-        ``"signalised"``, ``"all"``, or the path of a table of junctions, see
-        :func:`egvs.city.creation.choose_junctions`.
+        ``"signalised"``, ``"all"``, or the path of a table, see :func:`choose_junctions`.
     lefthand, walk
-        As :func:`egvs.importers.openstreetmap.create_scenario`.
+        As in :func:`egvs.importers.openstreetmap.create_scenario`.
+    progress
+        Called with the number of finished junctions.
 
     Raises
     ------
     InputError
-        When the folder is not empty, the file is no sound extract with drivable streets, ``around`` lies outside it, a
-        table is wrong, or no junction is left. Nothing is written then.
+        When the folder is not empty, the file is damaged or has no drivable streets, ``around`` is outside the extract,
+        a table is wrong, or no junction is left. Nothing is written then.
     """
     name = openstreetmap.check_new_folder(folder)
     if radius_m is not None and around is None:
-        raise InputError("--radius", f"{radius_m:g} m round no place", "--around LAT,LON as well")
+        raise InputError("--radius", f"{radius_m:g} m around no point", "Add --around LAT,LON.")
     extract = read_extract(osm)
     check_inside_extract(extract, around, "--around")
-    reach_m = radius_m or DEFAULT_RADIUS_M
-    cut = extract if around is None else osm_network.cut_surroundings(extract, around, reach_m)
-    network, streets = osm_network.build_network(
-        cut, osm, osm_network.netconvert_flags(extract, lefthand=lefthand, walk=walk)
-    )
-    within = None if around is None else Point(streets.to_xy([around[1]], [around[0]])[0]).buffer(reach_m - RIM_WIDTH_M)
+
+    street_extract, rim_m = extract, radius_m or DEFAULT_RADIUS_M
+    if around is not None:
+        street_extract = osm_network.cut_surroundings(extract, around, rim_m)
+    flags = osm_network.netconvert_flags(extract, lefthand=lefthand, walk=walk)
+    network, streets = osm_network.build_network(street_extract, osm, flags)
+    within = None
+    if around is not None:
+        within = Point(streets.to_xy([around[1]], [around[0]])[0]).buffer(rim_m - RIM_WIDTH_M)
     choice = choose_junctions(streets, which, within)
-    mapped, counts = osm_solids.map_solids(extract, streets)
-    areas = shapely.STRtree([solid.area for solid in mapped])
-    made, blocked = [], []
-    for number, (its_id, junction) in enumerate(choice.junctions.items(), 1):
-        its = _make_junction(its_id, junction, streets, areas)
-        made += [its] if its.places else []
-        blocked += [] if its.places else [junction.id]
+
+    solids, counts = osm_solids.map_solids(extract, streets)
+    areas = shapely.STRtree([solid.area for solid in solids])
+    made = []
+    left_out = dict(choice.left_out)
+    for number, (junction_id, street_junction) in enumerate(choice.junctions.items(), 1):
+        junction = _make_junction(junction_id, street_junction, streets, areas)
+        if junction.poles:
+            made.append(junction)
+        else:
+            left_out.setdefault(NO_FREE_KERB, []).append(street_junction.id)
         progress("junctions", number, len(choice.junctions))
-    left_out = choice.left_out | ({NO_FREE_KERB: blocked} if blocked else {})
     if not made:
-        right = "--junctions all" if which == SIGNALISED else "another extract, or a wider --radius"
-        raise InputError(osm, f"no junction is left ({_format_left_out(left_out)})", right)
-    larger = sum(not its.roi.area.covers(its.junction.area) for its in made)
-    notes = (*import_notes(larger, counts), *([PEDESTRIANS_NOTE] if walk else []))
+        reasons = ", ".join(f"{len(ids)} {reason}" for reason, ids in left_out.items()) or "no streets meet"
+        hint = "Choose another extract, or a larger --radius."
+        if which == SIGNALISED:
+            hint = "Try --junctions all."
+        raise InputError(osm, f"no junction is left ({reasons})", hint)
+
+    notes = _import_notes(made, counts, walk)
     city = NewCity(folder, tuple(made), left_out, streets, counts, notes)
-    openstreetmap.publish_folder(folder, _city_files(city, name, network, mapped, areas), _check_city)
+    openstreetmap.publish_folder(folder, _city_files(city, name, network, solids, areas), _check_city)
     return city
 
 
-def _format_left_out(left_out: dict[str, list[str]]) -> str:
-    return ", ".join(f"{len(ids)} {why}" for why, ids in left_out.items()) or "its streets meet nowhere"
+def _import_notes(made: Sequence[NewJunction], counts: ImportCounts, walk: bool) -> tuple[str, ...]:
+    """Return what to know before trusting the city."""
+    notes = openstreetmap.scenario_notes(True, counts)
+    n_larger = sum(not junction.roi.area.covers(junction.junction.area) for junction in made)
+    if n_larger:
+        limit = f"at most {junctions.ROI_MAX_M:g} m"
+        notes.append(f"{n_larger} junctions are larger than their regions of interest ({limit})")
+    if walk:
+        notes.append(PEDESTRIANS_NOTE)
+    return tuple(notes)
+
+
+def choose_junctions(streets: Streets, which: str, within: BaseGeometry | None) -> JunctionChoice:
+    """Choose the junctions of a city.
+
+    A junction connects at least three streets, so pedestrian-only signals are ignored. The largest come first: by
+    incoming lanes, then by area.
+
+    Parameters
+    ----------
+    streets
+        The network.
+    which
+        ``"signalised"``, ``"all"``, or the path of a table, each row of which selects the nearest junction.
+    within
+        Junctions outside this area are left out; None for no limit. It does not apply to a table.
+
+    Raises
+    ------
+    InputError
+        When the table is wrong.
+    """
+    if which not in (SIGNALISED, ALL):
+        return JunctionChoice(dict(_junctions_from_table(streets, Path(which))), {})
+    chosen: list[StreetJunction] = []
+    left_out: dict[str, list[str]] = {}
+    for junction in sorted(streets.junctions, key=lambda j: (-j.lanes_in, -j.area.area, j.id)):
+        if which == SIGNALISED and not junction.signalised:
+            left_out.setdefault(NO_SIGNALS, []).append(junction.id)
+        elif junction.arms < _MIN_ARMS:
+            left_out.setdefault(TOO_FEW_ARMS, []).append(junction.id)
+        elif within is not None and not within.contains(Point(junction.at_m)):
+            left_out.setdefault(NEAR_RIM, []).append(junction.id)
+        else:
+            chosen.append(junction)
+    width = max(2, len(str(len(chosen))))
+    return JunctionChoice({f"j{number:0{width}d}": junction for number, junction in enumerate(chosen, 1)}, left_out)
+
+
+def _junctions_from_table(streets: Streets, path: Path) -> Iterator[tuple[str, StreetJunction]]:
+    names_by_id: dict[str, str] = {}
+    for where, row in model.read_junction_rows(path, REQUIRED_COLUMNS):
+        lat_deg, lon_deg = model.parse_number(where, row, "lat_deg"), model.parse_number(where, row, "lon_deg")
+        junction = _nearest_junction(streets, Point(streets.to_xy([lon_deg], [lat_deg])[0]), where)
+        if junction.id in names_by_id:
+            problem = f"these coordinates select the same junction as {names_by_id[junction.id]}"
+            raise InputError(where, problem, "Give each junction one row.")
+        names_by_id[junction.id] = row["junction"]
+        yield row["junction"], junction
+
+
+def _nearest_junction(streets: Streets, point: Point, where: str) -> StreetJunction:
+    """Return the junction whose area is nearest to a point; raise an InputError if it is too far away."""
+    nearest, distance_m = None, math.inf
+    if math.isfinite(point.x + point.y):
+        for junction in sorted(streets.junctions, key=lambda j: j.id):
+            junction_m = point.distance(junction.area)
+            if junction.arms >= _MIN_ARMS and junction_m < distance_m:
+                nearest, distance_m = junction, junction_m
+    if nearest is None or distance_m > MAX_DISTANCE_M:
+        problem = f"the nearest junction of three or more streets is {distance_m:,.0f} m away"
+        raise InputError(where, problem, f"Use coordinates within {MAX_DISTANCE_M:g} m of a junction.")
+    return nearest
 
 
 def _make_junction(junction_id: str, junction: StreetJunction, streets: Streets, areas: shapely.STRtree) -> NewJunction:
-    """The region round a junction, and places for poles; the solids are those of ``areas``."""
+    """Set the region of a junction, and find pole locations that are free of solids (``areas``)."""
     roi = junctions.region_around(junction)
-    local = _window(roi, _LOCAL_M)
-    objects = list(areas.geometries[sorted(areas.query(local))])
-    return NewJunction(
-        junction_id, junction, roi, junctions.kerbside_poles(streets.near(local), junction, roi, objects)
-    )
+    surroundings = _surroundings(roi, _KERB_MARGIN_M)
+    obstacles = list(areas.geometries[sorted(areas.query(surroundings))])
+    poles = junctions.kerbside_poles(streets.near(surroundings), junction, roi, obstacles)
+    return NewJunction(junction_id, junction, roi, poles)
 
 
-def _window(roi: JunctionRegion, margin_m: float) -> shapely.Geometry:
+def _surroundings(roi: JunctionRegion, margin_m: float) -> shapely.Geometry:
     return box(*roi.area.bounds).buffer(margin_m, join_style="mitre")
 
 
 def _city_files(
-    city: NewCity, name: str, network: str, mapped: list[MappedSolid], areas: shapely.STRtree
+    city: NewCity, name: str, network: str, solids: list[MappedSolid], areas: shapely.STRtree
 ) -> Iterator[tuple[str, str]]:
-    """Every file of the folder, one after another."""
+    """Yield path and text of every file of the folder."""
     yield CITY_FILE, city_toml(name, city.streets, len(city.junctions))
     yield NETWORK_FILE, network
-    yield JUNCTIONS_FILE, junctions_csv(_table_junctions(city))
+    yield JUNCTIONS_FILE, model.junctions_csv(_table_junctions(city))
     yield IMPORT_FILE, files.to_json_text(city.to_json() | {"left_out": city.left_out}, indent=1) + "\n"
     yield f"{JUNCTIONS_FOLDER}/{SCENARIO_FILE}", common_toml()
-    pieces = NetworkExcerpts(network)
-    for its in city.junctions:
-        near = [mapped[i] for i in sorted(areas.query(_reachable_area(its), predicate="intersects"))]
-        folder = f"{JUNCTIONS_FOLDER}/{its.id}"
-        yield f"{folder}/{STATICS_FILE}", openstreetmap.solids_geojson(near, import_counts(near))
-        yield f"{folder}/{SITES_FILE}", openstreetmap.sites_csv(its.places)
-        yield f"{folder}/{ROADS_FILE}", pieces.near(city.streets.near(_window(its.roi, _ROADS_M)))
-        yield f"{folder}/{SCENARIO_FILE}", junction_toml(its.id, its.junction.title, its.roi)
-
-
-def _reachable_area(junction: NewJunction) -> shapely.Geometry:
-    """Where the beams of any of its sites may end."""
-    spots = MultiPoint([(place.x_m, place.y_m) for place in junction.places]).union(junction.roi.area)
-    return box(*spots.bounds).buffer(CATALOGUE[SENSOR].range_m, join_style="mitre")
+    excerpts = NetworkExcerpts(network)
+    for junction in city.junctions:
+        near = [solids[i] for i in sorted(areas.query(junction.reachable_area, predicate="intersects"))]
+        roads = excerpts.near(city.streets.near(_surroundings(junction.roi, _ROADS_MARGIN_M)))
+        folder = f"{JUNCTIONS_FOLDER}/{junction.id}"
+        yield f"{folder}/{STATICS_FILE}", openstreetmap.solids_geojson(near, _count_solids(near))
+        yield f"{folder}/{SITES_FILE}", openstreetmap.sites_csv(junction.poles)
+        yield f"{folder}/{ROADS_FILE}", roads
+        yield f"{folder}/{SCENARIO_FILE}", junction_toml(junction.id, junction.junction.title, junction.roi)
 
 
 def _table_junctions(city: NewCity) -> Iterator[CityJunction]:
-    places = city.streets.to_degrees([its.junction.at_m for its in city.junctions])
-    for its, (lon_deg, lat_deg) in zip(city.junctions, places, strict=True):
-        x_m, y_m = its.junction.at_m
-        yield CityJunction(
-            its.id, its.junction.title, x_m, y_m, round(lat_deg, 7), round(lon_deg, 7), its.junction.signalised
-        )
+    degrees = city.streets.to_degrees([new.junction.at_m for new in city.junctions])
+    for new, (lon_deg, lat_deg) in zip(city.junctions, degrees, strict=True):
+        junction = new.junction
+        lat_deg, lon_deg = round(lat_deg, 7), round(lon_deg, 7)
+        yield CityJunction(new.id, junction.title, *junction.at_m, lat_deg, lon_deg, junction.signalised)
 
 
-def _check_city(folder: Path) -> City:
+def _check_city(folder: Path) -> None:
     city = model.load_city(folder)
     for junction in city.junctions:
         load(junction.scenario_folder(city))
-    return city
+
+
+def _count_solids(solids: Sequence[MappedSolid]) -> ImportCounts:
+    counts = ImportCounts()
+    for solid in solids:
+        counts.keep(solid)
+    return counts
+
+
+def traffic_amount(streets: Streets) -> dict[str, Any]:
+    """Return the keys of ``[traffic]`` that depend on the size of the network."""
+    vehicles = demand.target_vehicle_count(TrafficConfig(network=NETWORK_FILE), streets.network)
+    crossing_steps = math.ceil(streets.network.diagonal_m / _CROSSING_SPEED_M_S / _WARMUP_STEP_S)
+    min_trips_per_s = float(TrafficConfig.model_fields["trips_per_s"].default)
+    return {
+        "vehicles": vehicles,
+        "warmup_s": max(DEFAULT_WARMUP_S, _WARMUP_STEP_S * crossing_steps),
+        "trips_per_s": max(min_trips_per_s, vehicles / _MIN_TRIP_S),
+    }
+
+
+def city_toml(name: str, streets: Streets, n_junctions: int) -> str:
+    """Return the text of ``city.toml``.
+
+    Parameters
+    ----------
+    name
+        The name of the city; "" if it is that of the folder.
+    streets
+        The network.
+    n_junctions
+        Number of junctions.
+    """
+    amount, fields = traffic_amount(streets), TrafficConfig.model_fields
+    values: dict[str, Any] = {"description": f"{n_junctions} junctions", "attribution": ATTRIBUTION, "seed": 1}
+    if name:
+        values = {"name": name, **values}
+    traffic = {
+        "network": NETWORK_FILE, "vehicles_per_lane_km": fields["vehicles_per_lane_km"].default,
+        "frames": DEFAULT_FRAMES,
+        "frame_period_s": fields["frame_period_s"].default, "warmup_s": amount["warmup_s"],
+        "trips_per_s": amount["trips_per_s"],
+    }  # fmt: skip
+    comment = "one simulation for all junctions, trips drawn in the whole network; or your own sumocfg, counts, fcd"
+    comments = [f"A city. {_SOURCE_COMMENT}", _FRAME_COMMENT]
+    document = openstreetmap.toml_document(comments, values, {"traffic": (comment, traffic)})
+    document["traffic"]["vehicles_per_lane_km"].comment(f"{amount['vehicles']} vehicles in this network")
+    return tomlkit.dumps(document)
+
+
+def common_toml() -> str:
+    """Return the text of ``junctions/scenario.toml``, which the scenarios of all junctions extend."""
+    period_s = TrafficConfig.model_fields["frame_period_s"].default
+    tables: dict[str, TomlTable] = {
+        "roi": ("", openstreetmap.voxel_keys()),
+        "traffic": (f"as in {CITY_FILE}, or a multiple of it", {"frame_period_s": period_s}),
+        "sites": ("", openstreetmap.mount_keys()),
+        "scan": ("sites are scanned while they are scored; true keeps the scans, 0.7 MB per site", {"keep": False}),
+        "score": openstreetmap.score_table(),
+    }
+    comment = "Common settings of all junctions; the scenario of a junction may override them."
+    return tomlkit.dumps(openstreetmap.toml_document([comment], {"seed": 1}, tables))
+
+
+def junction_toml(junction_id: str, title: str, roi: JunctionRegion) -> str:
+    """Return the text of a junction's ``scenario.toml``."""
+    traffic = {"fcd": f"../../{TRAFFIC_FOLDER}/{junction_id}.parquet", "roads": ROADS_FILE}
+    tables = {
+        "roi": openstreetmap.roi_table(roi),
+        "traffic": ("the city's traffic near this junction, written by egvs city traffic", traffic),
+        "statics": openstreetmap.statics_table(),
+        "sites": openstreetmap.sites_table(),
+    }
+    values = {"extends": "..", "description": title[0].upper() + title[1:]}
+    return tomlkit.dumps(openstreetmap.toml_document([f"A junction of a city. {_SOURCE_COMMENT}"], values, tables))

@@ -1,26 +1,26 @@
-"""Reads and checks the folder of a city.
+"""Read and check the folder of a city.
 
-A city is a folder of ordinary scenarios that share one traffic:
+A city is a folder of ordinary scenarios that share one traffic simulation:
 
     city.toml                      name, seed, [traffic], [effects]: the traffic of all junctions
-    junctions.csv                  which junctions there are, one a row
-    junctions/scenario.toml        what their scenarios have in common
+    junctions.csv                  one row per junction
+    junctions/scenario.toml        common settings of all junctions
     junctions/<ID>/scenario.toml   an ordinary scenario; its traffic is the file below
-    traffic/<ID>.parquet           the city's traffic, cut to the junction (egvs.city.traffic_split makes it); where it
-                                   has periods, traffic/periods/<NAME>/<ID>.parquet
+    traffic/<ID>.parquet           the city's traffic near this junction, written by egvs.city.traffic_split; with
+                                   periods, traffic/periods/<NAME>/<ID>.parquet
 
-Positions are in the network's x, y in metres, and in degrees (WGS 84).
+Positions are x, y of the network in metres, and degrees (WGS 84).
 """
 
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from pydantic import Field, TypeAdapter, ValidationError
 
@@ -34,8 +34,8 @@ from egvs.scenario.traffic_config import TrafficConfig
 
 CITY_FILE, NETWORK_FILE, JUNCTIONS_FILE = "city.toml", "network.net.xml", "junctions.csv"
 JUNCTIONS_FOLDER, TRAFFIC_FOLDER, PERIODS_FOLDER = "junctions", "traffic", "periods"
-COLUMNS = ("junction", "title", "x_m", "y_m", "lat_deg", "lon_deg", "signalised")
-"""Of ``junctions.csv``."""
+JUNCTION_COLUMNS = ("junction", "title", "x_m", "y_m", "lat_deg", "lon_deg", "signalised")
+"""Columns of ``junctions.csv``."""
 
 _MAX_COORDINATES = {"x_m": MAX_COORDINATE_M, "y_m": MAX_COORDINATE_M, "lat_deg": 90.0, "lon_deg": 180.0}
 _BOOLEANS = {"true": True, "false": False}
@@ -47,14 +47,14 @@ class CityModel(StrictModel):
     name: Name = Field("", min_length=0, validate_default=False, description="Defaults to the folder's name")
     description: str = ""
     attribution: str = Field("", description="Whose map this is; shown with results")
-    seed: int = Field(0, ge=0, le=2**63 - 1, description="Of the traffic")
+    seed: int = Field(0, ge=0, le=2**63 - 1, description="Seed of the traffic simulation")
     traffic: TrafficConfig = Field(description="The traffic of all junctions, as in a scenario")
     effects: EffectsConfig = Field(EffectsConfig(), description="Effects that add traffic: people on foot, on bicycles")
 
 
 @dataclass(frozen=True)
 class CityJunction:
-    """A junction: its ``id`` is the name of its folder."""
+    """A junction; its ``id`` is the name of its folder."""
 
     id: str
     title: str
@@ -65,18 +65,20 @@ class CityJunction:
     signalised: bool
 
     def scenario_folder(self, city: City) -> Path:
-        """The folder of its scenario."""
+        """Return the folder of the junction's scenario."""
         return city.folder / JUNCTIONS_FOLDER / self.id
 
     def traffic_file(self, city: City, period: str = "") -> Path:
-        """The city's traffic, or that of a period of it, cut to this junction."""
+        """Return the file with the city's traffic near this junction, of all traffic or of one period."""
         folder = city.folder / TRAFFIC_FOLDER
-        return (folder / PERIODS_FOLDER / period if period else folder) / f"{self.id}.parquet"
+        if period:
+            folder = folder / PERIODS_FOLDER / period
+        return folder / f"{self.id}.parquet"
 
 
 @dataclass(frozen=True)
 class City:
-    """A city that was read; ``junctions`` in the order of the table."""
+    """A city; its ``junctions`` are in the order of the table."""
 
     folder: Path
     name: str
@@ -93,116 +95,141 @@ class City:
         return self.folder / CITY_FILE
 
     def junction(self, name: str) -> CityJunction:
-        """The junction of this name; InputError where there is none."""
+        """Return the junction of this name; raise an InputError if there is none."""
         for junction in self.junctions:
             if junction.id == name:
                 return junction
+        problem = f"no such junction in {self.folder / JUNCTIONS_FILE}"
         names = ", ".join(junction.id for junction in self.junctions)
-        raise InputError(f"--junction {name}", f"no such junction in {self.folder / JUNCTIONS_FILE}", f"one of {names}")
+        raise InputError(f"--junction {name}", problem, f"Use one of {names}.")
 
 
 def load_city(folder: str | Path) -> City:
-    """Read and check a city, given its folder or its ``city.toml``.
+    """Read and check a city.
+
+    Parameters
+    ----------
+    folder
+        The folder of the city, or its ``city.toml``.
 
     Raises
     ------
     InputError
-        Naming file, key or row, value, and what would be right: a file is missing or no sound one, a key is unknown, a
-        junction stands there twice or has no scenario.
+        When a file is missing or damaged, a key is unknown, or a junction occurs twice or has no scenario.
     """
     path = Path(folder)
     file = path if path.is_file() else path / CITY_FILE
     if not file.is_file():
-        raise InputError(path, f"no {CITY_FILE} there", "a folder that egvs city new made")
-    model = _read_model(file)
-    junctions = tuple(_read_junctions(file.parent / JUNCTIONS_FILE))
+        raise InputError(path, f"there is no {CITY_FILE} in this folder", "Name a folder created by egvs city new.")
+    values = reading.read_toml(file)
+    values.setdefault("name", default_name(file.parent) or "city")
+    try:
+        model = CityModel.from_dict(values)
+    except ValidationError as error:
+        raise format_validation_error(error, str(file), CityModel) from None
+    check_unused_keys(model.traffic, file)
+
+    rows = read_junction_rows(file.parent / JUNCTIONS_FILE, JUNCTION_COLUMNS)
     city = City(
-        file.parent, model.name, model.seed, model.traffic, junctions, model.attribution, model.description,
+        file.parent,
+        model.name,
+        model.seed,
+        model.traffic,
+        tuple(_parse_junction(where, row) for where, row in rows),
+        model.attribution,
+        model.description,
         model.effects,
-    )  # fmt: skip
-    for junction in junctions:
-        if not (its := junction.scenario_folder(city) / SCENARIO_FILE).is_file():
-            right = f"a scenario there, or no row {junction.id} in {JUNCTIONS_FILE}"
-            raise InputError(its, "no such file", right)
+    )
+    for junction in city.junctions:
+        scenario_file = junction.scenario_folder(city) / SCENARIO_FILE
+        if not scenario_file.is_file():
+            hint = f"Create the scenario, or remove the row {junction.id} from {JUNCTIONS_FILE}."
+            raise InputError(scenario_file, "no such file", hint)
     return city
 
 
 def city_json_schema() -> str:
-    """The JSON Schema that editors use to complete and check a city.toml."""
+    """Return the JSON Schema with which editors complete and check a city.toml."""
     return json.dumps(CityModel.model_json_schema(), indent=2, ensure_ascii=False) + "\n"
 
 
-def _read_model(file: Path) -> CityModel:
-    values = reading.read_toml(file)
-    values.setdefault("name", default_name(file.parent) or "city")
-    try:
-        model = CityModel.of(values)
-    except ValidationError as error:
-        raise format_validation_error(error, str(file), CityModel) from None
-    check_unused_keys(model.traffic, file)
-    return model
+def read_junction_rows(path: Path, required: Sequence[str]) -> Iterator[tuple[str, dict[str, str]]]:
+    """Yield the rows of a table of junctions, each with its location for messages.
 
+    Parameters
+    ----------
+    path
+        The CSV file.
+    required
+        Columns that it must have, among them ``junction``; it may have all of :data:`JUNCTION_COLUMNS`.
 
-def _read_junctions(path: Path) -> Iterator[CityJunction]:
-    seen = set[str]()
-    for place, row in csv_rows(path, COLUMNS, COLUMNS):
-        junction = _parse_junction(place, row)
-        if junction.id.casefold() in seen:  # folders that some systems do not tell apart
-            raise InputError(place, "stands there twice", "a name of its own for each junction")
-        seen.add(junction.id.casefold())
-        yield junction
-    if not seen:
-        raise InputError(path, "holds no junction", "at least one")
-
-
-def csv_rows(path: Path, needed: Sequence[str], known: Sequence[str]) -> Iterator[tuple[str, dict[str, str]]]:
-    """The rows of a table of junctions, each with its place for messages.
-
-    InputError where it has not the ``needed`` columns, or others than those ``known``.
+    Raises
+    ------
+    InputError
+        When the file is missing, is no CSV table with these columns, has no rows, or a junction's name is invalid or
+        occurs twice.
     """
-    right = f"the columns {', '.join(needed)}"
+    hint = f"Use the columns {', '.join(required)}, separated by commas."
     if not path.is_file():
-        raise InputError(path, "no such file", f"a table with {right}")
-    text = limits.read_bytes(path, limits.DOCUMENT)
+        raise InputError(path, "no such file", f"Name a CSV table of junctions. {hint}")
+    data = limits.read_bytes(path, limits.DOCUMENT)
+    names = set[str]()
     try:
-        reader = csv.DictReader(text.decode("utf-8-sig").splitlines(), skipinitialspace=True, strict=True)
-        names = list(reader.fieldnames or ())
-        if not set(needed) <= set(names) <= set(known) or len(set(names)) < len(names):
-            raise InputError(path, f"has the columns {', '.join(names) or 'none'}", f"{right}, with commas")
+        reader = csv.DictReader(data.decode("utf-8-sig").splitlines(), skipinitialspace=True, strict=True)
+        columns = list(reader.fieldnames or ())
+        if not set(required) <= set(columns) <= set(JUNCTION_COLUMNS) or len(set(columns)) < len(columns):
+            raise InputError(path, f"the columns are {', '.join(columns) or 'missing'}", hint)
         for row in reader:
-            place = f"{path}: junction {row.get('junction') or '?'}"
+            where = f"{path}: junction {row.get('junction') or '?'}"
             if None in row or None in row.values():
-                raise InputError(place, "has more or fewer values than the header has columns", "one value a column")
-            yield place, row
+                problem = "has more or fewer values than the header has columns"
+                raise InputError(where, problem, "Give one value per column.")
+            _check_name(where, row["junction"], names)
+            names.add(row["junction"].casefold())
+            yield where, row
     except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(path, f"cannot be read as CSV ({error})", "UTF-8 text with a header row") from None
+        raise InputError(path, f"cannot be read as CSV ({error})", "Use UTF-8 text with a header row.") from None
+    if not names:
+        raise InputError(path, "the table has no junctions", "Add at least one row.")
 
 
-def _parse_junction(location: str, row: dict[str, str]) -> CityJunction:
+def _check_name(where: str, name: str, other_names: Collection[str]) -> None:
+    """Raise an InputError for a name that no folder can have; some file systems ignore case."""
     try:
-        TypeAdapter(Name).validate_python(row["junction"])
+        TypeAdapter(Name).validate_python(name)
     except ValidationError:
-        raise InputError(f"{location}: junction", repr(row["junction"])[:80], NAME_DESCRIPTION) from None
-    numbers = {key: parse_number(f"{location}: {key}", row[key], most) for key, most in _MAX_COORDINATES.items()}
+        raise InputError(f"{where}: junction", f"invalid name {repr(name)[:80]}", NAME_DESCRIPTION) from None
+    if name.casefold() in other_names:
+        raise InputError(where, "this name occurs twice", "Give each junction a name of its own.")
+
+
+def _parse_junction(where: str, row: dict[str, str]) -> CityJunction:
+    x_m, y_m, lat_deg, lon_deg = (parse_number(where, row, key) for key in _MAX_COORDINATES)
     signalised = _BOOLEANS.get(row["signalised"].strip().lower())
     if signalised is None:
-        raise InputError(f"{location}: signalised", repr(row["signalised"])[:80], "true or false")
-    return CityJunction(row["junction"], row["title"], **numbers, signalised=signalised)
+        problem = f"expected true or false, got {repr(row['signalised'])[:80]}"
+        raise InputError(f"{where}: signalised", problem, "Say whether the junction has traffic lights.")
+    return CityJunction(row["junction"], row["title"], x_m, y_m, lat_deg, lon_deg, signalised)
 
 
-def parse_number(location: str, text: str, most: float) -> float:
-    """A number of a table, at most ``most`` either way; InputError where it is none."""
+def parse_number(where: str, row: dict[str, str], column: str) -> float:
+    """Return a coordinate of a table of junctions; raise an InputError if it is no number or out of range."""
+    limit = _MAX_COORDINATES[column]
     try:
-        value = float(text)
+        value = float(row[column])
     except ValueError:
         value = math.nan
-    if not abs(value) <= most:
-        raise InputError(location, repr(text)[:80], f"a number from {-most:g} to {most:g}")
+    if not abs(value) <= limit:
+        problem = f"expected a number from {-limit:g} to {limit:g}, got {repr(row[column])[:80]}"
+        raise InputError(f"{where}: {column}", problem, "Correct the table.")
     return value
 
 
-def table_rows(junctions: tuple[CityJunction, ...]) -> Iterator[list[Any]]:
-    """The rows of ``junctions.csv``, its header first."""
-    yield list(COLUMNS)
+def junctions_csv(junctions: Iterable[CityJunction]) -> str:
+    """Return the text of ``junctions.csv``."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(JUNCTION_COLUMNS)
     for j in junctions:
-        yield [j.id, j.title, j.x_m, j.y_m, j.lat_deg, j.lon_deg, str(j.signalised).lower()]
+        writer.writerow([j.id, j.title, j.x_m, j.y_m, j.lat_deg, j.lon_deg, str(j.signalised).lower()])
+    return text.getvalue()

@@ -1,11 +1,7 @@
-"""City.html and its map.
+"""``city.html``: the page of a city run, with maps of its junctions.
 
-The map of a city's junctions over its streets, coloured by a value of each.
-
-The page of a city run, ``city.html``: where a sensor brings most, junction by junction.
-
-It is a function of the junctions' scores and of the plan alone: no clock, no path, no machine. One file that fetches
-nothing; its links lead to the reports of the junctions beside it.
+The page depends on the scores of the junctions and on the plan alone, not on a clock, a path or a machine. It is one
+file that loads nothing; its links lead to the reports of the junctions.
 """
 
 from __future__ import annotations
@@ -15,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
+from typing import NamedTuple
 from urllib.parse import quote
 
 import numpy as np
@@ -26,17 +23,22 @@ from egvs.core import files
 from egvs.core.errors import Diagnostic
 from egvs.report import colours, formatting, maps, page
 from egvs.report.colours import STYLE_SHEET
-from egvs.report.formatting import ScoreLabel
 from egvs.report.svg_figures import Box, ColourBar, CurveStep, MapFrame, sensor_count_chart
 from egvs.traffic import network
 
+PAGE_FILE = "city.html"
+CITY_TEMPLATES = Path(__file__).parent / "templates"
+
 _WIDTH, _MAX_HEIGHT = 760.0, 720.0
 _MAX_NAMES = 12
-"""Junctions whose names stand on the map, the first ones; every one tells its own under the pointer."""
+"""Number of junctions whose names are on the map, the best ones first."""
+
 _MAX_NUMBERS = 120
-"""With more junctions than this, circles have no room for numbers."""
+"""With more junctions than this, the circles have no numbers."""
+
 _MIN_EXTENT_M = 300.0
-"""What is shown round a single junction, at least."""
+_MARGIN_SHARE = 0.08
+"""A map shows at least this extent, and a margin of this share."""
 
 
 @dataclass(frozen=True)
@@ -45,82 +47,109 @@ class MapJunction:
 
     Attributes
     ----------
+    name, x_m, y_m
+        Its name and position.
     value
-        What it is coloured by.
-    mark
-        What stands in its circle.
+        The value that its colour shows.
+    number
+        The text in its circle.
     title
-        What it tells under the pointer.
+        Its tooltip.
     link
-        Where a click on it leads; "" for nowhere.
+        Target of a click; "" for none.
     """
 
     name: str
     x_m: float
     y_m: float
     value: float
-    mark: str
+    number: str
     title: str
     link: str = ""
+
+
+class MapFigure(NamedTuple):
+    """A map of the page: its key in the page's script, its title, and its SVG text."""
+
+    key: str
+    title: str
+    svg: str
 
 
 def junction_map(
     junctions: Sequence[MapJunction], streets: Sequence[str], box: Box, prefix: str, label: str, alt: str
 ) -> str:
-    """Junctions, the first ones above all others, over streets (paths of this box's :func:`map_frame`)."""
-    plan = map_frame(box, prefix)
-    low, high = min(its.value for its in junctions), max(its.value for its in junctions)
-    radius = 9.0 if len(junctions) <= _MAX_NUMBERS else 6.0
-    parts = [f'<g class="roads"><path class="street-line" d="{"".join(streets)}"/></g>'] if streets else []
-    parts += [_circle(plan, its, low, high, radius, len(junctions) <= _MAX_NUMBERS) for its in reversed(junctions)]
-    parts += maps.labels(plan, [(plan.x(its.x_m), plan.y(its.y_m), its.name, radius) for its in junctions[:_MAX_NAMES]])
-    return plan.svg(parts, alt, bar=ColourBar(low, high, label, even=True) if high > low else None)
+    """Draw junctions over streets, coloured by value.
+
+    Parameters
+    ----------
+    junctions
+        The first ones are drawn above all others.
+    streets
+        From :func:`street_paths` of the same box.
+    box
+        The area shown, in world metres.
+    prefix
+        Prefix of ids in the SVG.
+    label, alt
+        Title of the colour bar, and text for screen readers.
+    """
+    frame = map_frame(box, prefix)
+    low, high = min(junction.value for junction in junctions), max(junction.value for junction in junctions)
+    has_numbers = len(junctions) <= _MAX_NUMBERS
+    radius = 9.0 if has_numbers else 6.0
+
+    parts = []
+    if streets:
+        parts.append(f'<g class="roads"><path class="street-line" d="{"".join(streets)}"/></g>')
+    for junction in reversed(junctions):
+        colour = colours.colour_class(junction.value, low, high)
+        parts.append(_circle(frame, junction, colour, radius, has_numbers))
+    named = junctions[:_MAX_NAMES]
+    parts += maps.labels(frame, [(frame.x(j.x_m), frame.y(j.y_m), j.name, radius) for j in named])
+    bar = ColourBar(low, high, label, even=True) if high > low else None
+    return frame.svg(parts, alt, bar=bar)
 
 
 def map_frame(box: Box, prefix: str = "") -> MapFrame:
-    """The frame of maps of a city."""
+    """Return the frame of maps of a city."""
     return MapFrame(box, prefix, width=_WIDTH, tallest=_MAX_HEIGHT, north=True)
 
 
-def map_box(places_m: Sequence[tuple[float, float]]) -> Box:
-    """All junctions (x, y), with a margin."""
-    xs, ys = [x for x, _ in places_m], [y for _, y in places_m]
-    margin = max(0.08 * max(max(xs) - min(xs), max(ys) - min(ys)), _MIN_EXTENT_M / 2)
-    return min(xs) - margin, min(ys) - margin, max(xs) + margin, max(ys) + margin
+def map_box(positions_m: Sequence[tuple[float, float]]) -> Box:
+    """Return the box around positions (x, y), with a margin."""
+    xs, ys = [x for x, _ in positions_m], [y for _, y in positions_m]
+    extent_m = max(max(xs) - min(xs), max(ys) - min(ys))
+    margin_m = max(_MARGIN_SHARE * extent_m, _MIN_EXTENT_M / 2)
+    return min(xs) - margin_m, min(ys) - margin_m, max(xs) + margin_m, max(ys) + margin_m
 
 
 def street_paths(path: Path | None, box: Box) -> list[str]:
-    """The middle lines of a network's roads within a box, those over junctions as well, as paths of its
-    :func:`map_frame`;
-    none without a network."""
+    """Return the streets of a network within a box as SVG paths in its :func:`map_frame`; none without a network."""
     if path is None:
         return []
-    plan, paths = map_frame(box), []
+    frame, paths = map_frame(box), []
     for edge in network.read_net_xml(path).all_edges:
         if edge.function not in ("", "internal") or not edge.lanes:
             continue
-        line = edge.lanes[-1].shape_m[:, :2]
+        line = edge.lanes[-1].shape_m[:, :2]  # the lane next to the middle of the road
         low, high = line.min(axis=0), line.max(axis=0)
         if low[0] < box[2] and high[0] > box[0] and low[1] < box[3] and high[1] > box[1]:
-            points = np.column_stack([plan.x(line[:, 0]), plan.y(line[:, 1])]).round(1).tolist()
+            points = np.column_stack([frame.x(line[:, 0]), frame.y(line[:, 1])]).round(1).tolist()
             paths.append("M" + "L".join(f"{x:g} {y:g}" for x, y in points))
     return paths
 
 
-def _circle(plan: MapFrame, junction: MapJunction, low: float, high: float, radius: float, numbered: bool) -> str:
-    x, y, step = plan.x(junction.x_m), plan.y(junction.y_m), colours.colour_class(junction.value, low, high)
-    tone = "high" if 2 * step > colours.STEPS else "low"
-    number = (
-        f'<text class="rank {tone}" x="{x:.1f}" y="{y + 3.4:.1f}">{escape(junction.mark)}</text>' if numbered else ""
-    )
-    shape = f'<circle class="q{step}" cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}"/>{number}'
-    drawn = f'<g class="site"><title>{escape(junction.title)}</title>{shape}</g>'
-    return f'<a href="{escape(junction.link)}">{drawn}</a>' if junction.link else drawn
-
-
-PAGE_FILE = "city.html"
-
-CITY_TEMPLATES = Path(__file__).parent / "templates"
+def _circle(frame: MapFrame, junction: MapJunction, colour: int, radius: float, has_number: bool) -> str:
+    x, y = frame.x(junction.x_m), frame.y(junction.y_m)
+    circle = f'<circle class="q{colour}" cx="{x:.1f}" cy="{y:.1f}" r="{radius:g}"/>'
+    if has_number:
+        tone = "high" if 2 * colour > colours.STEPS else "low"
+        circle += f'<text class="rank {tone}" x="{x:.1f}" y="{y + 3.4:.1f}">{escape(junction.number)}</text>'
+    group = f'<g class="site"><title>{escape(junction.title)}</title>{circle}</g>'
+    if not junction.link:
+        return group
+    return f'<a href="{escape(junction.link)}">{group}</a>'
 
 
 def write_page(
@@ -130,7 +159,7 @@ def write_page(
     warnings: Sequence[Diagnostic],
     plan: CityPlan | None = None,
 ) -> Path:
-    """Write the page; its path."""
+    """Write the page into the folder of a city run; return its path. Parameters as in :func:`render_page`."""
     files.write_text(out / PAGE_FILE, render_page(city, results, warnings, plan))
     return out / PAGE_FILE
 
@@ -138,7 +167,19 @@ def write_page(
 def render_page(
     city: City, results: Sequence[JunctionResult], warnings: Sequence[Diagnostic], plan: CityPlan | None = None
 ) -> str:
-    """The whole page, HTML text."""
+    """Return the page, HTML text.
+
+    Parameters
+    ----------
+    city
+        The city.
+    results
+        Its junctions, the best first.
+    warnings
+        What to know before trusting the results.
+    plan
+        The plan of the city, if there is one.
+    """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
@@ -146,115 +187,100 @@ def render_page(
         loader=FileSystemLoader([CITY_TEMPLATES, page.TEMPLATES]), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    environment.filters |= {"svg": Markup, "share": formatting.format_percent, "whole": formatting.format_count}
-    by = results[0].best.by
+    environment.filters |= {"svg": Markup, "percent": formatting.format_percent, "integer": formatting.format_count}
+    score = results[0].best.by
     return environment.get_template("city.html.j2").render(
         city=city,
         results=results,
-        by=by,
-        by_is_egvs=by.name == "egvs",
-        gain=gain_label(by.name),
+        score=score,
+        is_egvs=score.name == "egvs",
+        gain=gain_label(score.name),
         headline=format_headline(results),
-        links={its.junction.id: report_link(its) for its in results},
-        maps=page_figures(city, results, plan),
+        links={result.junction.id: report_link(result) for result in results},
+        maps=page_maps(city, results, plan),
         plan=plan,
-        curve=_curve_figure(plan),
-        most=max(its.gain for its in results),
-        sites=sum(its.sites for its in results),
+        curve=_curve_chart(plan),
+        max_gain=max(result.gain for result in results),
+        sites=sum(result.sites for result in results),
         warnings=warnings,
         style=Markup(STYLE_SHEET),
-        sort=Markup((CITY_TEMPLATES / "sort.js").read_text(encoding="utf-8")),
+        script=Markup((CITY_TEMPLATES / "sort.js").read_text(encoding="utf-8")),
         version=__version__,
     )
 
 
 def format_headline(results: Sequence[JunctionResult]) -> str:
-    """Where the first sensor brings most, in one sentence."""
+    """Say in one sentence where the first sensor has the largest gain."""
     first = results[0]
-    if not first.gain > 0:
-        return "No pole sees anything of the traffic"
-    id_, title = first.junction.id, first.junction.title
-    name = f"{id_}, {title}" if title and title != id_ else id_
+    if first.gain <= 0:
+        return "No site sees any traffic"
+    name = first.junction.id
+    if first.junction.title not in ("", name):
+        name += f", {first.junction.title}"
     if len(results) == 1:
         return f"{name}, the only junction: {first.best.by.sentence(first.score)}"
-    equal = sum(its.rank == 1 for its in results)
-    if equal > 1:
-        return f"{equal} of {len(results)} junctions share the first place"
-    return f"Of {len(results)} junctions, a first sensor brings most at {name}"
+    n_best = sum(result.rank == 1 for result in results)
+    if n_best > 1:
+        return f"{n_best} of {len(results)} junctions share the first place"
+    return f"Of {len(results)} junctions, a first sensor has the largest gain at {name}"
 
 
 def report_link(result: JunctionResult) -> str:
-    """The report of a junction, seen from the page."""
+    """Return the link from the page to the report of a junction."""
     return f"{RUNS_FOLDER}/{quote(result.junction.id)}/report.html"
 
 
-def page_figures(
-    city: City, results: Sequence[JunctionResult], plan: CityPlan | None = None
-) -> list[tuple[str, str, str]]:
-    """Key, title and figure of each map: by what it brings, by what the best pole would see, by the plan."""
-    box = map_box([(its.junction.x_m, its.junction.y_m) for its in results])
-    streets, by = street_paths(_network_path(city), box), results[0].best.by
-    gain = gain_label(by.name)
-    values = [("gain", f"by gain: {gain.label}", gain.label, [its.gain for its in results])]
-    values.append(
-        (
-            "seen",
-            f"by what the best pole would see: {_visible_share_label(by)}",
-            _visible_share_label(by),
-            _visible_shares(results),
-        )
-    )
+def page_maps(city: City, results: Sequence[JunctionResult], plan: CityPlan | None = None) -> list[MapFigure]:
+    """Return the maps of the page: by gain, by the share that the best site sees, and by the sensors of the plan."""
+    box = map_box([(result.junction.x_m, result.junction.y_m) for result in results])
+    streets, score = street_paths(_network_path(city), box), results[0].best.by
+    ranks = [str(result.rank) for result in results]
+
+    def draw(key: str, title: str, label: str, values: Sequence[float], numbers: Sequence[str]) -> MapFigure:
+        junctions = [_map_junction(*row) for row in zip(results, values, numbers, strict=True)]
+        return MapFigure(key, title, junction_map(junctions, streets, box, key, label, f"Junctions {title}"))
+
+    gain = gain_label(score.name).label
+    figures = [draw("gain", f"by gain: {gain}", gain, [result.gain for result in results], ranks)]
+    label = score.noun if score.is_share else "share of the traffic’s uncertainty seen"
+    shares = [_visible_share(result) for result in results]
+    figures.append(draw("seen", f"by the best site of each junction: {label}", label, shares, ranks))
     if plan is not None:
-        counts = [float(plan.by_junction.get(its.junction.id, 0)) for its in results]
-        values.append(("plan", "by the sensors of the plan", "sensors", counts))
-    return [
-        (
-            key,
-            title,
-            junction_map(
-                _map_junctions(results, its, by_count=key == "plan"), streets, box, key, label, f"Junctions {title}"
-            ),
-        )
-        for key, title, label, its in values
-    ]
+        counts = [float(plan.by_junction.get(result.junction.id, 0)) for result in results]
+        numbers = [f"{count:g}" for count in counts]
+        figures.append(draw("plan", "by number of planned sensors", "sensors", counts, numbers))
+    return figures
 
 
-def _visible_shares(results: Sequence[JunctionResult]) -> list[float]:
-    """What the best pole of each junction would see of it: by the score that ranks where that is a share."""
-    return [0.0 if math.isnan(its.score) else its.score if its.best.by.is_share else its.best.entropy_seen
-            for its in results]  # fmt: skip
+def _visible_share(result: JunctionResult) -> float:
+    """Return the score of the best site if it is a share, otherwise the share of entropy that it sees."""
+    if math.isnan(result.score):
+        return 0.0
+    return result.score if result.best.by.is_share else result.best.entropy_seen
 
 
-def _visible_share_label(by: ScoreLabel) -> str:
-    return by.noun if by.is_share else "the share of the traffic’s uncertainty"
+def _map_junction(result: JunctionResult, value: float, number: str) -> MapJunction:
+    junction, best = result.junction, result.best
+    title = (
+        f"{result.rank}. {junction.title or junction.id}: {best.site}, {best.by.with_noun(result.score)}, "
+        f"sees {formatting.format_percent(best.entropy_seen)}"
+    )
+    return MapJunction(junction.id, junction.x_m, junction.y_m, value, number, title, report_link(result))
 
 
-def _curve_figure(plan: CityPlan | None) -> str:
-    """How much 1, 2, ... sensors of the city are worth; nothing of a budget."""
+def _curve_chart(plan: CityPlan | None) -> str:
+    """Draw the joint score for 1, 2, ... sensors of the city; "" for a budget."""
     if plan is None or len(plan.curve) < 2:
         return ""
-    steps = [
-        CurveStep(number, best / plan.together, bound / plan.together)
-        for number, (best, bound) in enumerate(plan.curve)
-        if number
-    ]
-    return sensor_count_chart(steps, "How much so many sensors are worth, as a share of all candidates together")
-
-
-def _map_junctions(results: Sequence[JunctionResult], values: Sequence[float], *, by_count: bool) -> list[MapJunction]:
-    return [
-        MapJunction(
-            its.junction.id, its.junction.x_m, its.junction.y_m, value, f"{value:g}" if by_count else str(its.rank),
-            f"{its.rank}. {its.junction.title or its.junction.id}: {its.best.site}, "
-            f"{its.best.by.with_noun(its.score)}, "
-            f"sees {formatting.format_percent(its.best.entropy_seen)}",
-            report_link(its),
-        )
-        for its, value in zip(results, values, strict=True)
-    ]  # fmt: skip
+    steps = []
+    for number, (best, bound) in enumerate(plan.curve[1:], start=1):
+        steps.append(CurveStep(number, best / plan.joint_of_all, bound / plan.joint_of_all))
+    return sensor_count_chart(steps, "Joint score by number of sensors, as a share of all candidates together")
 
 
 def _network_path(city: City) -> Path | None:
-    """The city's network; None where its traffic comes from elsewhere."""
+    """Return the city's network; None if its traffic comes from a file."""
     path = city.folder / (city.traffic.network or NETWORK_FILE)
-    return path if path.is_file() and path.name.endswith((".net.xml", ".net.xml.gz")) else None
+    if path.is_file() and path.name.endswith((".net.xml", ".net.xml.gz")):
+        return path
+    return None

@@ -1,13 +1,10 @@
-"""Dask cluster, task graph, waiting for results.
+"""Run the junctions of a city on a Dask cluster: processes of this machine, or the workers of a running scheduler.
 
-Where tasks run: processes of this machine, or a cluster whose scheduler is named; all of it is Dask's.
+Steps of :func:`run_jobs`: estimate the work of each junction; build one graph of tasks, in which large junctions are
+split and small ones are grouped; wait for the results, and replace local processes that are lost.
 
-One graph of Dask's for a whole city: large junctions are cut, small ones are joined.
-
-Runs the junctions of a city on a cluster: sizes them, builds one graph, and waits for its ends.
-
-Nothing here decides what comes out: tasks bring stages up to date as ``egvs run`` does, each from the store where it is
-there. So a run that was broken off, wherever, goes on when it is started again.
+Dask decides only where and when a task runs. Tasks bring stages up to date as ``egvs run`` does and use the store, so
+an interrupted run continues where it stopped.
 """
 
 from __future__ import annotations
@@ -21,7 +18,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from egvs.city import tasks
-from egvs.city.tasks import Job, JobFailure, JobResult, RunSettings, program_id
+from egvs.city.tasks import Job, JobFailure, JobResult, Part, RunSettings, program_id
 from egvs.core import plugins, runtime
 from egvs.core.errors import EgvsError, InputError, RunError
 from egvs.core.runtime import ProgressCallback, no_progress
@@ -32,12 +29,33 @@ if TYPE_CHECKING:
     from dask.delayed import Delayed
     from distributed import Client, Future
 
+T = TypeVar("T")
+
+DoneCallback = Callable[[JobResult], None]
+"""Called with each junction when its run is complete."""
 
 LOCAL_CLUSTER = "local"
-ADDRESSES = ("tcp://", "tls://")
+ADDRESS_PREFIXES = ("tcp://", "tls://")
 
-# malloc's thresholds: by Dask's own, every larger array goes back to the system at once, and its pages are asked for
-# anew at each site, which takes a third of a worker's time and no less memory.
+MIN_TASK_BEAMS, MAX_TASK_BEAMS = 2**24, 2**25
+"""Limits of the work of a task. 2**24 beams take about ten seconds, so the overhead of a task is negligible."""
+
+TASKS_PER_WORKER = 4
+"""Number of tasks per worker, if they are large enough."""
+
+JUNCTION_BEAMS = 2**21
+"""Work of the other stages of a junction, in beams."""
+
+CHECK_INTERVAL_S = 5.0
+"""How often a run that waits for results checks the processes of this machine."""
+
+_MAX_ABSENCE_S, _MAX_REPLACEMENTS = 60.0, 3
+"""A process that is missing for longer is replaced, at most this often without any result in between."""
+
+_MAX_PROCESSES = 1000
+
+# With Dask's own thresholds of malloc, every larger array returns to the system at once, and its pages are requested
+# again at each site. This takes a third of a worker's time and saves no memory.
 _DASK_SETTINGS = {
     "distributed.scheduler.allowed-failures": 5,
     "distributed.worker.daemon": True,
@@ -51,49 +69,40 @@ _DASK_SETTINGS = {
 _LOGGERS = ("distributed", "distributed.client", "tornado.application")
 """Loggers that have levels of their own."""
 
-_MAX_PROCESSES = 1000
-"""Processes on one machine."""
-
-LOOK_S = 5.0
-"""So often a run that hears nothing looks after the processes of this machine."""
-
-_GONE_S, _MOST_TIMES = 60.0, 3
-"""A process that is away for so long is replaced; so often, while nothing is done."""
-
 
 @contextmanager
-def connect(where: str, *, memory_limit: str = "auto") -> Iterator[Client]:
-    """A client of the cluster that ``--cluster`` names.
+def connect(cluster: str, *, memory_limit: str = "auto") -> Iterator[Client]:
+    """Connect to a cluster, which is started if it is one of this machine.
 
     Parameters
     ----------
-    where
-        ``local``: a process a core of this machine; ``processes=N``; or the address of a scheduler, ``tcp://host:8786``.
+    cluster
+        ``local`` (one process per core), ``processes=N``, or the address of a scheduler such as ``tcp://host:8786``.
     memory_limit
-        Of a process on this machine, as Dask writes it; a process that takes more is ended. Its share of the machine's
-        memory by default.
+        Of each local process, as Dask writes it; a process that exceeds it is killed. By default its share of the
+        machine's memory.
 
     Raises
     ------
     InputError
-        For a word that is none of these, or where no scheduler answers.
+        When the text is none of these, or no scheduler answers.
     MissingExtraError
-        Where Dask is not installed.
+        When Dask is not installed.
     """
-    check_cluster(where)
-    count = _process_count(where)
+    check_cluster(cluster)
+    count = _process_count(cluster)
     import dask
-    from distributed import Client, LocalCluster  # before the settings: what it adds to them is to stay
+    from distributed import Client, LocalCluster  # before the settings: the import adds settings that must stay
 
     with dask.config.set(_DASK_SETTINGS):
-        for name in _LOGGERS:  # what goes wrong is told by the run
+        for name in _LOGGERS:  # the run reports errors itself
             logging.getLogger(name).setLevel(logging.CRITICAL)
         if count is None:
             try:
-                client = Client(where, timeout="20s", set_as_default=False)
+                client = Client(cluster, timeout="20s", set_as_default=False)
             except (OSError, ValueError) as error:
-                right = "the address of a running dask scheduler"
-                raise InputError(f"--cluster {where}", f"no scheduler answers there ({error})", right) from None
+                hint = "Give the address of a running Dask scheduler."
+                raise InputError(f"--cluster {cluster}", f"no scheduler answers ({error})", hint) from None
             with client:
                 yield client
             return
@@ -101,104 +110,115 @@ def connect(where: str, *, memory_limit: str = "auto") -> Iterator[Client]:
             LocalCluster(
                 n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", memory_limit=memory_limit,
                 dashboard_address="127.0.0.1:0",
-            ) as cluster,
-            Client(cluster, set_as_default=False) as client,
+            ) as local_cluster,
+            Client(local_cluster, set_as_default=False) as client,
         ):  # fmt: skip
             yield client
 
 
+def check_cluster(cluster: str) -> None:
+    """Raise an InputError for an invalid name of a cluster, or a MissingExtraError if Dask is not installed."""
+    _process_count(cluster)
+    plugins.require_libraries("a city run", "cluster", "dask", "distributed", "fsspec")
+
+
+def _process_count(cluster: str) -> int | None:
+    """Return the number of local processes; None for the address of a scheduler."""
+    if cluster == LOCAL_CLUSTER:
+        return runtime.thread_count(None)
+    if cluster.startswith(ADDRESS_PREFIXES) and len(cluster) > len(ADDRESS_PREFIXES[0]):
+        return None
+    match = re.fullmatch(r"processes=([0-9]{1,4})", cluster)
+    if match is None or not 1 <= int(match[1]) <= _MAX_PROCESSES:
+        expected = f"local, processes=N (1 to {_MAX_PROCESSES}), or the address of a scheduler"
+        problem = f"expected {expected}, got {repr(cluster)[:80]}"
+        raise InputError("--cluster", problem, "An address is for example tcp://host:8786.")
+    return int(match[1])
+
+
 class LocalWorkers:
-    """The processes of a cluster on this machine: Dask starts one again that was ended, but not when it is ended while
-    it starts; then nobody would do its work, and the run would wait for ever. Of another cluster nothing is asked.
+    """The worker processes of a cluster on this machine; other clusters are ignored.
+
+    Dask restarts a process that was killed, but not if it is killed again while it starts. Its tasks would then wait
+    for ever.
 
     Parameters
     ----------
     client
-        Of the cluster.
+        Client of the cluster.
     """
 
     def __init__(self, client: Client) -> None:
-        self._client, self._times = client, 0
+        self._client, self._replacements = client, 0
         self._last_check = self._last_complete = time.monotonic()
 
     def note_progress(self) -> None:
-        """Something was done."""
-        self._times = 0
+        """Record that a task has finished."""
+        self._replacements = 0
 
     def replace_lost(self) -> None:
-        """Replace processes that are away for long, if it is time to look; RunError where that was of no use."""
+        """Replace processes that are missing for long; raise a RunError if that did not help.
+
+        The processes are checked every :data:`CHECK_INTERVAL_S` at most.
+        """
         cluster, now = self._client.cluster, time.monotonic()
-        if cluster is None or now - self._last_check < LOOK_S:
+        if cluster is None or now - self._last_check < CHECK_INTERVAL_S:
             return
         self._last_check = now
-        there = {its["name"] for its in self._client.scheduler_info(n_workers=-1)["workers"].values()}
-        gone = [name for name in cluster.worker_spec if name not in there]
-        if not gone:
+        workers = self._client.scheduler_info(n_workers=-1)["workers"].values()
+        running = {worker["name"] for worker in workers}
+        missing = [name for name in cluster.worker_spec if name not in running]
+        if not missing:
             self._last_complete = now
-        elif now - self._last_complete > _GONE_S:
-            if self._times == _MOST_TIMES:
-                found = f"{len(gone)} processes of this machine ended as soon as they were started"
-                raise RunError(f"{found}; mostly memory is wanting: fewer processes; what is done is kept")
-            self._last_complete, self._times = now, self._times + 1
-            count = len(cluster.worker_spec)
-            for name in gone:
-                del cluster.worker_spec[name]
-            cluster.scale(count)
-
-
-def check_cluster(where: str) -> None:
-    """InputError for a word that names no cluster; MissingExtraError where Dask is not installed."""
-    _process_count(where)
-    plugins.require_libraries("a city run", "cluster", "dask", "distributed", "fsspec")
-
-
-def _process_count(where: str) -> int | None:
-    """How many processes on this machine; None for the address of a scheduler."""
-    if where == LOCAL_CLUSTER:
-        return runtime.thread_count(None)
-    if where.startswith(ADDRESSES) and len(where) > len(ADDRESSES[0]):
-        return None
-    match = re.fullmatch(r"processes=([0-9]{1,4})", where)
-    if match is None or not 1 <= int(match[1]) <= _MAX_PROCESSES:
-        right = (
-            f"local, processes=N (1 to {_MAX_PROCESSES}), or the address of a scheduler, for example tcp://host:8786"
-        )
-        raise InputError("--cluster", repr(where)[:80], right)
-    return int(match[1])
-
-
-LEAST_BEAMS, MOST_BEAMS = 2**24, 2**25
-"""Beams of a task: 2**24 take some ten seconds, beside which what a task costs by itself does not count."""
-
-TASKS_PER_WORKER = 4
-"""So many tasks for each worker, where they are large enough."""
-
-EMPTY_BEAMS = 2**21
-"""What a junction's other stages take, as beams."""
+            return
+        if now - self._last_complete <= _MAX_ABSENCE_S:
+            return
+        if self._replacements == _MAX_REPLACEMENTS:
+            raise RunError(
+                f"{len(missing)} worker processes ended as soon as they were started, usually for lack of memory. "
+                "Use fewer processes; finished results are kept."
+            )
+        self._last_complete = now
+        self._replacements += 1
+        count = len(cluster.worker_spec)
+        for name in missing:
+            del cluster.worker_spec[name]
+        cluster.scale(count)
 
 
 def beams_per_task(beams: Mapping[str, int], workers: int) -> int:
-    """How much work is put into one task; a power of two, so that a run that goes on mostly cuts as it did before."""
-    wanted = sum(beams.values()) // max(1, TASKS_PER_WORKER * workers)
-    return int(min(MOST_BEAMS, max(LEAST_BEAMS, 1 << max(0, wanted.bit_length() - 1))))
+    """Return the work of one task, in beams.
+
+    It is a power of two, so that an interrupted run, or one with some more sites, is usually split in the same way.
+
+    Parameters
+    ----------
+    beams
+        Work of each junction, see :func:`egvs.city.tasks.estimate_beams`.
+    workers
+        Number of workers.
+    """
+    target = sum(beams.values()) // max(1, TASKS_PER_WORKER * workers)
+    power_of_two = 1 << max(0, target.bit_length() - 1)
+    return int(min(MAX_TASK_BEAMS, max(MIN_TASK_BEAMS, power_of_two)))
 
 
-def part_count(beams: int, most: int) -> int:
-    """Into how many parts a junction's sites are cut; 1 where it is run whole."""
-    return 1 if beams <= most else -(-beams // most)
+def part_count(beams: int, max_beams: int) -> int:
+    """Return the number of parts into which the sites of a junction are split, with at most ``max_beams`` of work."""
+    return max(1, -(-beams // max_beams))
 
 
-def join_jobs(jobs: Sequence[Job], beams: Mapping[str, int], most: int) -> Iterator[tuple[Job, ...]]:
-    """Small junctions, some of them together, in their order."""
+def group_jobs(jobs: Sequence[Job], beams: Mapping[str, int], max_beams: int) -> Iterator[tuple[Job, ...]]:
+    """Yield groups of small junctions, in order, with at most ``max_beams`` of work if there are several."""
     group: list[Job] = []
-    filled = 0
+    group_beams = 0
     for job in jobs:
-        its = beams[job.junction] + EMPTY_BEAMS
-        if group and filled + its > most:
+        job_beams = beams[job.junction] + JUNCTION_BEAMS
+        if group and group_beams + job_beams > max_beams:
             yield tuple(group)
-            group, filled = [], 0
+            group, group_beams = [], 0
         group.append(job)
-        filled += its
+        group_beams += job_beams
     if group:
         yield tuple(group)
 
@@ -206,41 +226,53 @@ def join_jobs(jobs: Sequence[Job], beams: Mapping[str, int], most: int) -> Itera
 def build_graph(
     jobs: Sequence[Job], beams: Mapping[str, int], settings: RunSettings, workers: int
 ) -> dict[Delayed, tuple[Job, ...]]:
-    """The ends of the graph, each with the junctions that it answers for as a list of Done or Failed.
+    """Build the graph of tasks.
 
     Parameters
     ----------
+    jobs
+        The junctions.
     beams
-        Of each junction, see :func:`egvs.city.tasks.estimate_beams`.
+        Work of each junction, see :func:`egvs.city.tasks.estimate_beams`.
+    settings
+        Settings of the city run.
+    workers
+        Number of workers.
+
+    Returns
+    -------
+    dict
+        The last tasks of the graph, each with the junctions of its results.
     """
+    max_beams = beams_per_task(beams, workers)
+    small_jobs = []
+    graph: dict[Delayed, tuple[Job, ...]] = {}
+    for job in jobs:
+        n_parts = part_count(beams[job.junction], max_beams)
+        if n_parts > 1:
+            graph[_split_job(job, settings, n_parts)] = (job,)
+        else:
+            small_jobs.append(job)
+    for group in group_jobs(small_jobs, beams, max_beams):
+        name = f"run-{group[0].junction}-{settings.token}"
+        graph[_delay(tasks.run_junctions, name, group, settings)] = group
+    return graph
+
+
+def _split_job(job: Job, settings: RunSettings, n_parts: int) -> Delayed:
+    name = f"{job.junction}-{settings.token}"
+    prepared = _delay(tasks.prepare_junction, f"prepare-{name}", job, settings)
+    scored = []
+    for number in range(n_parts):
+        part = Part(number, n_parts)
+        scored.append(_delay(tasks.score_part, f"score-{name}-{number}", job, settings, part, prepared))
+    return _delay(tasks.finish_junction, f"finish-{name}", job, settings, scored)
+
+
+def _delay(task: Callable[..., Any], name: str, *args: Any) -> Delayed:
     from dask import delayed
 
-    most = beams_per_task(beams, workers)
-    small = [job for job in jobs if part_count(beams[job.junction], most) == 1]
-    ends: dict[Delayed, tuple[Job, ...]] = {}
-    for job in jobs:
-        if (count := part_count(beams[job.junction], most)) > 1:
-            name = f"{job.junction}-{settings.token}"
-            prepared = delayed(tasks.prepare_junction, pure=False)(job, settings, dask_key_name=f"prepare-{name}")
-            scored = [
-                delayed(tasks.score_part, pure=False)(
-                    job, settings, (number, count), prepared, dask_key_name=f"score-{name}-{number}"
-                )
-                for number in range(count)
-            ]
-            ends[delayed(tasks.finish_junction, pure=False)(job, settings, scored, dask_key_name=f"finish-{name}")] = (
-                job,
-            )
-    for group in join_jobs(small, beams, most):
-        name = f"{group[0].junction}-{settings.token}"
-        ends[delayed(tasks.run_junctions, pure=False)(group, settings, dask_key_name=f"run-{name}")] = group
-    return ends
-
-
-T = TypeVar("T")
-
-DoneCallback = Callable[[JobResult], None]
-"""Called with each junction as it is done."""
+    return delayed(task, pure=False)(*args, dask_key_name=name)
 
 
 def run_jobs(
@@ -251,112 +283,138 @@ def run_jobs(
     on_done: DoneCallback = lambda _: None,
     progress: ProgressCallback = no_progress,
 ) -> None:
-    """Run junctions, each into its own folder; ``settings`` is :func:`make_run_settings`'s, asked for here when None.
+    """Run junctions, each into its own folder.
+
+    Parameters
+    ----------
+    client
+        Client of the cluster.
+    jobs
+        The junctions.
+    settings
+        From :func:`make_run_settings`, which is called when None.
+    on_done, progress
+        Called with each junction when its run is complete, and with the number of finished junctions.
 
     Raises
     ------
     EgvsError
-        Where junctions cannot be run, with what each of them says; all others are done by then.
+        When junctions failed, with their messages; all others are complete by then.
     RunError
-        Where the cluster is lost, or a worker is ended again and again.
+        When the scheduler is lost, or workers are killed again and again.
     """
     settings = settings or make_run_settings()
-    sizes = dict(map_junctions(client, tasks.estimate_beams, jobs, settings))
-    beams = {job.junction: size for job, size in sizes.items() if isinstance(size, int)}
-    failed = [its for its in sizes.values() if isinstance(its, JobFailure)]
-    sound = [job for job in jobs if job.junction in beams]
-    progress("junctions", 0, len(jobs))
-    done = 0
+    beams: dict[str, int] = {}
+    failures: list[JobFailure] = []
+    for job, result in map_junctions(client, tasks.estimate_beams, jobs, settings):
+        if isinstance(result, JobFailure):
+            failures.append(result)
+        else:
+            beams[job.junction] = result
+
+    n_done = 0
+    progress("junctions", n_done, len(jobs))
     with _watch_scheduler(client):
-        ends = build_graph(sound, beams, settings, _worker_count(client))
-        futures = client.compute(list(ends))
-        names = {future.key: group for future, group in zip(futures, ends.values(), strict=True)}
+        n_workers = max(1, sum(client.nthreads().values()))
+        graph = build_graph([job for job in jobs if job.junction in beams], beams, settings, n_workers)
+        futures = client.compute(list(graph))
+        group_of_key = {future.key: group for future, group in zip(futures, graph.values(), strict=True)}
         for future in _as_finished(client, futures):
-            for its in _task_result(future, [job.junction for job in names[future.key]]):
-                done += 1
-                progress("junctions", done, len(jobs))
-                if isinstance(its, JobFailure):
-                    failed.append(its)
+            for result in _task_result(future, [job.junction for job in group_of_key[future.key]]):
+                n_done += 1
+                progress("junctions", n_done, len(jobs))
+                if isinstance(result, JobFailure):
+                    failures.append(result)
                 else:
-                    on_done(its)
-    raise_failures(failed, len(jobs))
+                    on_done(result)
+    raise_failures(failures, len(jobs))
 
 
 def map_junctions(
-    client: Client, task: Callable[..., T], jobs: Iterable[Job], settings: RunSettings, *more: Any
+    client: Client, task: Callable[..., T], jobs: Iterable[Job], settings: RunSettings, *args: Any
 ) -> Iterator[tuple[Job, T]]:
-    """One task a junction, its answers as they come."""
+    """Run one task per junction; yield the results in the order in which they finish.
+
+    Parameters
+    ----------
+    client
+        Client of the cluster.
+    task
+        Called with a job, the settings and ``args``.
+    jobs, settings
+        The junctions, and the settings of the city run.
+    """
     with _watch_scheduler(client):
-        of = {client.submit(task, job, settings, *more, pure=False): job for job in jobs}
-        for future in _as_finished(client, list(of)):
-            yield of[future], _task_result(future, [of[future].junction])
+        jobs_by_future = {client.submit(task, job, settings, *args, pure=False): job for job in jobs}
+        for future in _as_finished(client, list(jobs_by_future)):
+            job = jobs_by_future[future]
+            yield job, _task_result(future, [job.junction])
 
 
 def make_run_settings() -> RunSettings:
-    """What holds for all tasks: this program, and the store; InputError where there is none, or it is out of reach."""
-    place, most_bytes = store.read_store_settings()
-    if place is None:
-        found = "empty, so that there is no store: what workers make for one another is kept there"
-        raise InputError(store.STORE_VARIABLE, found, "a folder that all workers see")
-    if (url := store.remote_url()) is not None:
+    """Return settings for a new city run; raise an InputError if there is no store, or it cannot be reached."""
+    folder, max_bytes = store.read_store_settings()
+    if folder is None:
+        problem = "is empty, so there is no store, which a city run needs to pass results between workers"
+        raise InputError(store.STORE_VARIABLE, problem, "Set it to a folder that all workers can access.")
+    url = store.remote_url()
+    if url is not None:
         RemoteStore(url).check()
-    return RunSettings(uuid.uuid4().hex[:8], program_id(), url or str(place.absolute()), most_bytes)
+    return RunSettings(uuid.uuid4().hex[:8], program_id(), url or str(folder.absolute()), max_bytes)
 
 
-def raise_failures(failed: Sequence[JobFailure], junctions: int) -> None:
-    """EgvsError where there are any: all that they say, the exit code of wrong input where any is."""
-    if not failed:
+def raise_failures(failures: Sequence[JobFailure], n_junctions: int) -> None:
+    """Raise an EgvsError with all messages, each text once, if any of ``n_junctions`` junctions failed."""
+    if not failures:
         return
-    alike: dict[str, list[str]] = {}
-    for its in failed:
-        alike.setdefault(its.message, []).append(its.junction)
-    lines = [f"junction{'s' * (len(names) > 1)} {', '.join(names)}: {what}" for what, names in alike.items()]
-    if len(failed) < junctions:
-        lines.append(f"{len(failed)} of {junctions} junctions failed; the others are done")
+    junctions_by_message: dict[str, list[str]] = {}
+    for failure in failures:
+        junctions_by_message.setdefault(failure.message, []).append(failure.junction)
+    lines = []
+    for message, names in junctions_by_message.items():
+        noun = "junction" if len(names) == 1 else "junctions"
+        lines.append(f"{noun} {', '.join(names)}: {message}")
+    if len(failures) < n_junctions:
+        lines.append(f"{len(failures)} of {n_junctions} junctions failed; the others are done")
     error = EgvsError("\n".join(lines))
-    error.exit_code = max(its.exit_code for its in failed)
+    error.exit_code = max(failure.exit_code for failure in failures)  # wrong input wins
     raise error
 
 
-def _worker_count(client: Client) -> int:
-    threads: dict[str, int] = client.nthreads()
-    return max(1, sum(threads.values()))
-
-
 def _as_finished(client: Client, futures: list[Future]) -> Iterator[Future]:
-    """Futures as they are done, while there are workers; see :class:`egvs.city.scheduler.LocalWorkers`."""
+    """Yield futures in the order in which they finish; replace local workers that are lost meanwhile."""
     from distributed import wait
 
-    left, crew = list(futures), LocalWorkers(client)
-    while left:
-        crew.replace_lost()
+    remaining, workers = list(futures), LocalWorkers(client)
+    while remaining:
+        workers.replace_lost()
         try:
             with client.as_current():
-                done = wait(left, timeout=LOOK_S, return_when="FIRST_COMPLETED").done
+                done = wait(remaining, timeout=CHECK_INTERVAL_S, return_when="FIRST_COMPLETED").done
         except TimeoutError:
             continue
-        crew.note_progress()
-        yield from (future for future in left if future in done)
-        left = [future for future in left if future not in done]
+        workers.note_progress()
+        yield from (future for future in remaining if future in done)
+        remaining = [future for future in remaining if future not in done]
 
 
 def _task_result(future: Future, junctions: Sequence[str]) -> Any:
-    """What a task answered; RunError where workers ended in it again and again."""
+    """Return the result of a task; raise a RunError if workers were killed again and again while running it."""
     from distributed import KilledWorker
 
     try:
         return future.result()
     except KilledWorker as error:
-        where = ", ".join(junctions)
         attempts = getattr(error, "allowed_failures", 0) + 1
-        found = f"a worker was ended {attempts} times at this, mostly for want of memory"
-        cure = "fewer processes, a machine with more memory, larger voxels or a smaller region; what is done is kept"
-        raise RunError(f"junction {where}: {found}; {cure}") from None
+        raise RunError(
+            f"junction {', '.join(junctions)}: a worker was killed {attempts} times, usually for lack of memory. "
+            "Use fewer processes, more memory, larger voxels or a smaller region; finished results are kept."
+        ) from None
 
 
 @contextmanager
 def _watch_scheduler(client: Client) -> Iterator[None]:
-    """RunError where the scheduler is lost within the block."""
+    """Raise a RunError if the scheduler is lost within the block."""
     from concurrent.futures import CancelledError
 
     from distributed.comm import CommClosedError
@@ -365,5 +423,5 @@ def _watch_scheduler(client: Client) -> Iterator[None]:
     try:
         yield
     except (CancelledError, CommClosedError, TimeoutError):
-        found = f"the scheduler at {address} was lost"
-        raise RunError(f"{found}; run the same command again to go on from what is done") from None
+        message = f"the connection to the scheduler at {address} was lost. Run the same command again to continue."
+        raise RunError(message) from None

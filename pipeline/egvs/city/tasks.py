@@ -1,24 +1,16 @@
-"""What a worker does: jobs, tasks, cached scenes, part.npz.
+"""What a worker of a city run does: jobs, tasks, cached scenes, and the scores of some sites (``part.npz``).
 
-What is sent to workers and what comes back: paths, names and numbers, never meshes or grids.
+Tasks exchange paths, names and numbers, never meshes or grids. Each task may run anywhere and any number of times, and
+gives the same bytes.
 
-Scenes that a worker has built, kept for its next tasks: the last few, each in a folder for work of its own.
+A small junction is run completely, several of them in one task (:func:`run_junctions`). A large junction takes three
+kinds of tasks: :func:`prepare_junction` makes the artefacts that sites are scored from, :func:`score_part` scores some
+of its sites, and :func:`finish_junction` completes its run. Results pass from one task to the next through the store;
+what is missing there is computed again. Each task first releases the memory of the previous one, so that a worker
+needs hardly more memory for many sites than for a few.
 
-Files of sites that were scored, for who puts the parts of a scenario together: ``part.npz``.
-
-Numbers stand in one array for each type; a JSON text says which of them belong where. So a part is read back to the
-last bit, and reading one runs nothing that stands in it.
-
-Some sites of a junction, scored: from the store, else scored here, and kept there.
-
-What workers do, one function a kind of task. Each may run anywhere, any number of times, and gives the same bytes.
-
-A small junction is run whole, some of them in one task. Of a large one the artefacts that sites are scored from are
-made (:func:`prepare_junction`), then its sites are scored in parts (:func:`score_part`), then its run is brought to
-its end
-(:func:`finish_junction`), which takes from the store what the others have put there, and makes what is missing. What
-a task
-has left of memory, the next one gives back first: so a worker takes hardly more for many sites than for a few.
+``part.npz`` has one array for each dtype, and a JSON text with the objects of all sites, which refer to these arrays.
+So a part is read back to the last bit, and no code in it is run.
 """
 
 from __future__ import annotations
@@ -29,12 +21,12 @@ import zipfile
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property, wraps
 from itertools import pairwise
 from pathlib import Path
 from time import perf_counter
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,28 +44,51 @@ from egvs.scoring.blindspots import SpotVisibility
 from egvs.scoring.scorer import SiteScore
 from egvs.scoring.target_scores import SiteTargetScores
 from egvs.sensors import sensor, sites
-from egvs.sensors.sites import ScannedSite
+from egvs.sensors.sites import Pose, ScannedSite
 from egvs.stages.inputs import open_folder
-from egvs.stages.site_scoring import ScoredSite, SiteScoring
+from egvs.stages.site_scoring import BeamAudit, ScoredSite, SiteScoring
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
+PART_FILE, PART_KIND = "part.npz", "part"
+"""Name of the file with the scores of some sites, and of its kind in the store."""
+
+MAX_CACHED_SCENES = 2
+"""Number of scenes that a worker keeps in memory; a large one takes some hundred MB."""
+
+STAGES_BEFORE_SCORE = ("statics", "scan", "traffic", "tpog")
+"""The stages whose artefacts sites are scored from."""
+
+SITE_BEAMS = 2**14
+"""Work per site that does not depend on its beams, in beams: mainly the sum over all voxels."""
+
+_STAGE_MODULES = tuple(f"egvs.stages.{name}" for name in ("check", "statics", "scan", "traffic", "tpog", "score"))
+
+_PART_CLASSES = (ScoredSite, ScannedSite, Pose, SiteScore, SiteTargetScores, SpotVisibility, BeamAudit)
+"""Classes that occur in a part."""
+
+_DTYPES = ("float64", "int64", "int32")
+_METADATA = "metadata"
+
+_LOCK_WAIT_S = 60.0
+"""A worker that was killed, or was thought to be, may still use the folder of a junction for a moment."""
+
 
 @dataclass(frozen=True)
 class RunSettings:
-    """What holds for every task of one city run.
+    """Settings of all tasks of one city run.
 
     Attributes
     ----------
     token
-        No two runs have the same: what a worker keeps between tasks is of one run.
+        Unique to the run: scenes that workers cache belong to one run.
     program
-        Of who gave the order, see :func:`program_id`.
+        The program that started the run, see :func:`program_id`.
     store
-        As ``EGVS_STORE`` would say it there: an absolute path, or a URL.
+        The store as in ``EGVS_STORE``: an absolute path, or a URL.
     store_bytes
-        How much the store may hold.
+        Maximum size of the store.
     """
 
     token: str
@@ -83,64 +98,71 @@ class RunSettings:
 
     @contextmanager
     def applied(self) -> Iterator[None]:
-        """Use its store within the block; RunError where this is another version of the program."""
+        """Use the store within the block; raise a RunError if this worker runs another version of the program."""
         if self.program != program_id():
-            found = f"this worker's egvs is not the one that gave the work ({program_id()}, not {self.program})"
-            raise RunError(f"{found}; install the same on every machine")
+            raise RunError(
+                f"this worker runs another version of egvs ({program_id()}, expected {self.program}). "
+                "Install the same version on every machine."
+            )
         with store.use_store(self.store, self.store_bytes):
             yield
 
 
 @dataclass(frozen=True)
 class Job:
-    """One junction: its scenario's folder, what is laid over it, and the folder of its run; absolute paths."""
+    """One junction: the folder of its scenario, the folder of its run (absolute paths), and overrides of its keys."""
 
     junction: str
     folder: Path
     out: Path
-    sets: tuple[str, ...] = ()
+    overrides: tuple[str, ...] = ()
 
     def scenario(self) -> Scenario:
-        """Its scenario; InputError where that is wrong."""
-        return load(self.folder, self.sets)
+        """Load the scenario; raise an InputError if it is wrong."""
+        return load(self.folder, self.overrides)
 
 
 @dataclass(frozen=True)
 class JobResult:
-    """A junction whose run is whole: how many sites it has, what the task took, and which stages were made in it."""
+    """A junction whose run is complete: its number of sites, the duration of the task, and the stages that it ran."""
 
     junction: str
     sites: int
     seconds: float
-    made: tuple[str, ...]
+    stages_run: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class JobFailure:
-    """A junction whose run cannot be: what :class:`EgvsError` said, and its exit code."""
+    """A junction whose run failed: the message and the exit code of the error."""
 
     junction: str
     message: str
     exit_code: int
 
 
+class Part(NamedTuple):
+    """One of ``total`` parts of the sites of a junction; the first part is number 0."""
+
+    number: int
+    total: int
+
+
 def program_id() -> str:
-    """This program as a short text; it is the same where the same bytes would be made."""
+    """Return a text that is equal for programs that give the same bytes: version, source and libraries."""
     source = stages.source_digest("egvs.runs.run", "egvs.report.page", *_STAGE_MODULES)
     libraries = sorted(stages.library_versions(source.libraries).items())
     return f"{__version__}, source {source.digest[:12]}, {', '.join(' '.join(pair) for pair in libraries)}"
 
 
-_STAGE_MODULES = tuple(f"egvs.stages.{name}" for name in ("check", "statics", "scan", "traffic", "tpog", "score"))
-
-
 def catch_input_errors(task: Callable[P, T]) -> Callable[P, T | JobFailure]:
-    """A task whose first argument is a :class:`Job` answers :class:`JobFailure` where the input is wrong or a run
-    cannot
-    keep its promise: that another attempt would end alike."""
+    """Make a task, whose first argument is a :class:`Job`, return a :class:`JobFailure` instead of raising an error.
+
+    Only an :class:`EgvsError` is caught: another attempt would fail in the same way.
+    """
 
     @wraps(task)
-    def telling(*args: P.args, **kwargs: P.kwargs) -> T | JobFailure:
+    def task_or_failure(*args: P.args, **kwargs: P.kwargs) -> T | JobFailure:
         try:
             return task(*args, **kwargs)
         except EgvsError as error:
@@ -148,74 +170,73 @@ def catch_input_errors(task: Callable[P, T]) -> Callable[P, T | JobFailure]:
             assert isinstance(job, Job)
             return JobFailure(job.junction, str(error), error.exit_code)
 
-    return telling
-
-
-MAX_CACHED_SCENES = 2
-"""Scenes that a worker keeps; a large one takes some hundred MB."""
-
-STAGES_BEFORE_SCORE = ("statics", "scan", "traffic", "tpog")
-"""The stages whose artefacts sites are scored from."""
+    return task_or_failure
 
 
 class CachedScene:
-    """What the sites of one junction are scored from: artefacts in a folder for work, and what was built of them."""
+    """The artefacts of a junction that its sites are scored from, in a temporary folder, and what was built of them."""
 
     def __init__(self, job: Job, folder: Path) -> None:
-        self._job, self._lock = job, threading.Lock()
-        self.work = open_folder(job.scenario(), folder, jobs=1)
+        self._lock = threading.Lock()
+        self.context = open_folder(job.scenario(), folder, jobs=1)
         self.users = 0
 
     def ensure_artefacts(self) -> None:
-        """Have the artefacts, from the store or made."""
+        """Fetch the artefacts from the store, or make them."""
         with self._lock:
-            run.ensure_stages(self.work, *STAGES_BEFORE_SCORE)
+            run.ensure_stages(self.context, *STAGES_BEFORE_SCORE)
 
-    def ready(self) -> SiteScoring:
-        """What scores its sites."""
+    def scoring(self) -> SiteScoring:
+        """Return the object that scores the sites."""
         with self._lock:
             return self._scoring
 
     @cached_property
     def _scoring(self) -> SiteScoring:
-        run.ensure_stages(self.work, *STAGES_BEFORE_SCORE)
-        return SiteScoring(self.work)
+        run.ensure_stages(self.context, *STAGES_BEFORE_SCORE)
+        return SiteScoring(self.context)
 
     @cached_property
     def score_key(self) -> str:
-        """The key of its score stage."""
-        return stages.stage_key("score", self.work).key
+        """Key of the score stage."""
+        return stages.stage_key("score", self.context).key
 
 
 class SceneCache:
-    """The scenes of one process; threads share it."""
+    """The scenes of one process, shared by its threads; the least recently used ones are dropped.
 
-    def __init__(self, most: int = MAX_CACHED_SCENES) -> None:
-        self._most, self._lock = most, threading.Lock()
+    Parameters
+    ----------
+    max_scenes
+        Number of scenes that are kept. Scenes in use are kept in any case.
+    """
+
+    def __init__(self, max_scenes: int = MAX_CACHED_SCENES) -> None:
+        self._max_scenes, self._lock = max_scenes, threading.Lock()
         self._scenes: OrderedDict[tuple[str, Job], tuple[CachedScene, ExitStack]] = OrderedDict()
 
     @contextmanager
     def borrow(self, token: str, job: Job) -> Iterator[CachedScene]:
-        """The scene of a junction in one city run; while it is lent, its folder stays."""
+        """Use the scene of a junction within the block; its folder exists at least as long."""
         with self._lock:
-            built = self._take((token, job))
-            built.users += 1
+            scene = self._get((token, job))
+            scene.users += 1
         try:
-            yield built
+            yield scene
         finally:
             with self._lock:
-                built.users -= 1
+                scene.users -= 1
                 self._drop_oldest()
 
     def drop(self, token: str, job: Job) -> None:
-        """Nobody here will ask for the scene of a junction again; one that is lent stays."""
+        """Drop the scene of a junction, unless it is in use."""
         with self._lock:
-            built, stack = self._scenes.get((token, job), (None, None))
-            if built is not None and stack is not None and not built.users:
+            scene, stack = self._scenes.get((token, job), (None, None))
+            if scene is not None and stack is not None and not scene.users:
                 del self._scenes[token, job]
                 stack.close()
 
-    def _take(self, key: tuple[str, Job]) -> CachedScene:
+    def _get(self, key: tuple[str, Job]) -> CachedScene:
         if key not in self._scenes:
             stack = ExitStack()
             self._scenes[key] = CachedScene(key[1], stack.enter_context(files.temporary_folder())), stack
@@ -223,232 +244,184 @@ class SceneCache:
         return self._scenes[key][0]
 
     def _drop_oldest(self) -> None:
-        idle = [key for key, (built, _) in self._scenes.items() if not built.users]
-        for key in idle[: max(0, len(self._scenes) - self._most)]:
+        idle = [key for key, (scene, _) in self._scenes.items() if not scene.users]
+        for key in idle[: max(0, len(self._scenes) - self._max_scenes)]:
             _, stack = self._scenes.pop(key)
             stack.close()
 
 
 SCENE_CACHE = SceneCache()
 
-PART = "part.npz"
 
-_DTYPES = ("float64", "int64", "int32")
-_METADATA = "about"
-
-
-def write_part(path: Path, sites: Iterable[ScoredSite]) -> None:
-    """Write some sites (none of them audited), in order; no more than one is held beside its numbers."""
-    pool = _ArrayPool()
-    about = [pool.of_site(site) for site in sites]
+def write_part(path: Path, scored_sites: Iterable[ScoredSite]) -> None:
+    """Write the scores of some sites; only one site at a time is in memory as an object."""
+    encoder = _PartEncoder()
+    metadata = [encoder.encode(site) for site in scored_sites]
     with files.atomic_write(path) as partial, partial.open("wb") as file:
-        text = np.frombuffer(json.dumps(about).encode("utf-8"), dtype=np.uint8)
-        np.savez(file, allow_pickle=False, **{_METADATA: text}, **pool.joined())
+        text = np.frombuffer(json.dumps(metadata).encode("utf-8"), dtype=np.uint8)
+        np.savez(file, allow_pickle=False, **{_METADATA: text}, **encoder.arrays())
 
 
 def read_part(path: Path) -> Iterator[ScoredSite]:
-    """The sites of a file, one by one; InputError where it is none."""
+    """Yield the sites of a part, in order; raise an InputError if the file is damaged."""
     try:
         with np.load(path, allow_pickle=False) as stored:
-            about = json.loads(stored[_METADATA].tobytes())
-            find = _array_finder({kind: stored[kind] for kind in _DTYPES})
-        for value in about:
-            yield _parse_site(value, find, path)
+            metadata = json.loads(stored[_METADATA].tobytes())
+            arrays = {dtype: stored[dtype] for dtype in _DTYPES}
+        for value in metadata:
+            yield _decode(value, arrays)
     except (OSError, EOFError, ValueError, LookupError, TypeError, zipfile.BadZipFile) as error:
-        raise InputError(path, f"is no part of a score ({error})", "remove it, and run again") from None
+        raise InputError(path, f"cannot be read as a part of scores ({error})", "Remove it, and run again.") from None
 
 
-class _ArrayPool:
-    """Arrays, one after another, by their type."""
+class _PartEncoder:
+    """Turns sites into JSON, and collects their arrays in one array for each dtype.
+
+    JSON lists are tuples. JSON objects are ``{"class": name, "fields": {...}}``, ``{"mapping": {...}}``, or
+    ``{"array": [dtype, start, length]}``.
+    """
 
     def __init__(self) -> None:
-        self._numbers = {kind: bytearray() for kind in _DTYPES}
+        self._bytes = {dtype: bytearray() for dtype in _DTYPES}
 
-    def add(self, array: NDArray[Any] | None) -> list[Any] | None:
-        """Where an array (n,) stands; None for none."""
-        if array is None:
-            return None
-        kind = str(array.dtype)
-        start = len(self._numbers[kind]) // array.itemsize
-        self._numbers[kind] += array.tobytes()
-        return [kind, start, len(array)]
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        return {dtype: np.frombuffer(data, dtype=dtype) for dtype, data in self._bytes.items()}
 
-    def many(self, arrays: Mapping[str, NDArray[Any]] | None) -> dict[str, Any] | None:
-        """The same by name."""
-        return None if arrays is None else {name: self.add(array) for name, array in arrays.items()}
-
-    def joined(self) -> dict[str, NDArray[Any]]:
-        """All of them, one array a type."""
-        return {kind: np.frombuffer(numbers, dtype=kind) for kind, numbers in self._numbers.items()}
-
-    def of_site(self, site: ScoredSite) -> dict[str, Any]:
-        """A site, its arrays by where they stand."""
-        return {
-            "site": site.site.to_json(),
-            "score": self._of_score(site.score),
-            "targets": None if site.targets is None else self._of_targets(site.targets),
-            "visible": self.many(site.visible),
-        }
-
-    def _of_score(self, score: SiteScore) -> dict[str, Any]:
-        return {
-            "worth": [score.egvs, score.entropy_seen],
-            "left_out": self.add(score.left_out),
-            "shares": self.many(score.shares),
-            "by_period": [self._of_score(period) for period in score.by_period],
-        }
-
-    def _of_targets(self, targets: SiteTargetScores) -> dict[str, Any]:
-        missed = targets.missed
-        return {
-            "scores": self.many(targets.scores),
-            "by_period": [dict(period) for period in targets.by_period],
-            "missed": None if missed is None else [self.add(a) for a in (missed.seen, missed.share, missed.se)],
-        }
+    def encode(self, value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            dtype = str(value.dtype)
+            start = len(self._bytes[dtype]) // value.itemsize
+            self._bytes[dtype] += value.tobytes()
+            return {"array": [dtype, start, len(value)]}
+        if isinstance(value, _PART_CLASSES):
+            encoded = {field.name: self.encode(getattr(value, field.name)) for field in fields(value)}
+            return {"class": type(value).__name__, "fields": encoded}
+        if isinstance(value, Mapping):
+            return {"mapping": {key: self.encode(item) for key, item in value.items()}}
+        if isinstance(value, tuple):
+            return [self.encode(item) for item in value]
+        return value
 
 
-ArrayFinder = Callable[[Any], Any]
-"""The array that stands somewhere; None for None."""
-
-
-def _array_finder(arrays: Mapping[str, NDArray[Any]]) -> ArrayFinder:
-    def find(where: Any) -> Any:
-        if where is None:
-            return None
-        kind, start, length = where
-        found = arrays[kind][start : start + length]
-        if len(found) != length:
+def _decode(value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
+    """Invert :meth:`_PartEncoder.encode`."""
+    if isinstance(value, list):
+        return tuple(_decode(item, arrays) for item in value)
+    if not isinstance(value, dict):
+        return value
+    if "array" in value:
+        dtype, start, length = value["array"]
+        array = arrays[dtype][start : start + length]
+        if len(array) != length:
             raise ValueError("numbers are missing")
-        return found.copy()  # a view would hold the whole file's numbers for as long as one site's score is known
-
-    return find
-
-
-def _parse_site(value: dict[str, Any], find: ArrayFinder, path: Path) -> ScoredSite:
-    targets, visible = value["targets"], value["visible"]
-    return ScoredSite(
-        ScannedSite.from_json(value["site"], path),
-        _parse_score(value["score"], find),
-        None if targets is None else _parse_targets(targets, find),
-        None,
-        None if visible is None else _parse_arrays(visible, find),
-    )
-
-
-def _parse_score(value: dict[str, Any], find: ArrayFinder) -> SiteScore:
-    egvs, seen = (float(number) for number in value["worth"])
-    by_period = tuple(_parse_score(period, find) for period in value["by_period"])
-    return SiteScore(egvs, seen, find(value["left_out"]), _parse_arrays(value["shares"], find), by_period)
-
-
-def _parse_targets(value: dict[str, Any], find: ArrayFinder) -> SiteTargetScores:
-    missed = value["missed"]
-    by_period = tuple({name: float(number) for name, number in period.items()} for period in value["by_period"])
-    return SiteTargetScores(
-        _parse_arrays(value["scores"], find),
-        by_period,
-        None if missed is None else SpotVisibility(*(find(its) for its in missed)),
-    )
-
-
-def _parse_arrays(value: dict[str, Any], find: ArrayFinder) -> dict[str, NDArray[Any]]:
-    return {name: find(where) for name, where in value.items()}
-
-
-PART_KIND = "part"
+        return array.copy()  # a view would keep the arrays of all sites in memory
+    if "class" in value:
+        decoded = {name: _decode(item, arrays) for name, item in value["fields"].items()}
+        return {cls.__name__: cls for cls in _PART_CLASSES}[value["class"]](**decoded)
+    return {key: _decode(item, arrays) for key, item in value["mapping"].items()}
 
 
 def split_sites(count: int, parts: int) -> list[slice]:
-    """``count`` sites in so many parts, as equal as can be."""
+    """Split ``count`` sites into parts whose sizes differ by at most one."""
     ends = [count * number // parts for number in range(parts + 1)]
     return [slice(low, high) for low, high in pairwise(ends)]
 
 
-def score_and_store(scoring: SiteScoring, score_key: str, part: slice) -> int:
-    """Score some sites unless the store has them; how many there are."""
-    names = scoring.names[part]
-    if names:
-        with files.temporary_folder() as folder:
-            _fetch_or_score(scoring, score_key, names, folder)
-    return len(names)
-
-
 def read_stored_scores(parts: int) -> Callable[[SiteScoring], Iterator[ScoredSite]]:
-    """All sites of a junction that was cut in so many parts, for the score stage; what the store has lost is scored
-    again."""
+    """Return a function that yields all sites of a junction for the score stage, from its parts in the store.
 
-    def scored(scoring: SiteScoring) -> Iterator[ScoredSite]:
-        score_key = stages.stage_key("score", scoring.work).key
+    Parts that the store has lost are scored again.
+    """
+
+    def scored_sites(scoring: SiteScoring) -> Iterator[ScoredSite]:
+        score_key = stages.stage_key("score", scoring.context).key
         for part in split_sites(len(scoring.names), parts):
-            if names := scoring.names[part]:
+            names = scoring.names[part]
+            if names:
                 with files.temporary_folder() as folder:
                     yield from read_part(_fetch_or_score(scoring, score_key, names, folder))
 
-    return scored
+    return scored_sites
 
 
 def _fetch_or_score(scoring: SiteScoring, score_key: str, names: tuple[str, ...], folder: Path) -> Path:
-    """The file of some sites in a folder, from the store, where it is put if it is not there."""
-    store, path = Store.default(), folder / PART
+    """Fetch the scores of some sites from the store into a folder, or compute and store them; return the file."""
+    part_store, path = Store.default(), folder / PART_FILE
     program = stages.source_digest(__name__).digest
     key = files.hash_json({"score": score_key, "sites": names, "program": program})
-    if store.take(PART_KIND, key, folder) is None:
-        with store.maker(PART_KIND, key):
-            store.fetch(PART_KIND, key)
-            if store.take(PART_KIND, key, folder) is None:  # nor has another one made it meanwhile
-                with measure_usage() as cost:
-                    write_part(path, scoring.all_sites(only=names))
-                store.put(PART_KIND, key, folder, StageResult({PART: files.hash_file(path)}, {}, {}, cost))
+    if part_store.take(PART_KIND, key, folder) is not None:
+        return path
+    with part_store.maker(PART_KIND, key):
+        part_store.fetch(PART_KIND, key)
+        if part_store.take(PART_KIND, key, folder) is None:  # another worker may have stored it meanwhile
+            with measure_usage() as cost:
+                write_part(path, scoring.all_sites(only=names))
+            result = StageResult({PART_FILE: files.hash_file(path)}, {}, {}, cost)
+            part_store.put(PART_KIND, key, folder, result)
     return path
-
-
-_LOCK_WAIT_S = 60.0
-"""A worker that was killed, or was only taken for lost, may be at a junction for a moment more."""
-
-SITE_BEAMS = 2**14
-"""What a site takes beside its beams, as beams: few take less than adding up what all voxels are worth."""
 
 
 @catch_input_errors
 def estimate_beams(job: Job, settings: RunSettings) -> int:
-    """The work of a junction's candidates: their beams, and as many more as a site by itself takes the time of."""
+    """Return the work of a junction's candidates: their beams, and :data:`SITE_BEAMS` for each."""
     with settings.applied():
         scenario = job.scenario()
         candidates = sites.candidate_sites(scenario)
-        its = {name: sensor.scenario_sensor(name, scenario, "sites").beams for name in {s.sensor for s in candidates}}
-        return sum(its[site.sensor] + SITE_BEAMS for site in candidates)
+        beams = {}
+        for name in {site.sensor for site in candidates}:
+            beams[name] = sensor.scenario_sensor(name, scenario, "sites").beams
+        return sum(beams[site.sensor] + SITE_BEAMS for site in candidates)
 
 
 def run_junctions(jobs: Sequence[Job], settings: RunSettings) -> list[JobResult | JobFailure]:
-    """Run some junctions from beginning to end."""
+    """Run some junctions completely."""
     return [_run_junction(job, settings, {}) for job in jobs]
 
 
 @catch_input_errors
 def prepare_junction(job: Job, settings: RunSettings) -> None:
-    """Put into the store what sites are scored from."""
-    with settings.applied(), SCENE_CACHE.borrow(settings.token, job) as built:
-        built.ensure_artefacts()
+    """Put the artefacts that the sites of a junction are scored from into the store."""
+    with settings.applied(), SCENE_CACHE.borrow(settings.token, job) as scene:
+        scene.ensure_artefacts()
 
 
 @catch_input_errors
-def score_part(job: Job, settings: RunSettings, part: tuple[int, int], prepared: JobFailure | None) -> int | JobFailure:
-    """Score one of some parts of the sites, (number, of how many); how many sites that were."""
+def score_part(job: Job, settings: RunSettings, part: Part, prepared: JobFailure | None) -> int | JobFailure:
+    """Score a part of a junction's sites, unless the store has the scores.
+
+    Parameters
+    ----------
+    job, settings
+        The junction, and the settings of the city run.
+    part
+        Which sites.
+    prepared
+        Result of :func:`prepare_junction`; a failure is passed on.
+
+    Returns
+    -------
+    int or JobFailure
+        Number of sites.
+    """
     if prepared is not None:
         return prepared
     release_memory()
-    with settings.applied(), SCENE_CACHE.borrow(settings.token, job) as built:
-        scoring = built.ready()
-        return score_and_store(scoring, built.score_key, split_sites(len(scoring.names), part[1])[part[0]])
+    with settings.applied(), SCENE_CACHE.borrow(settings.token, job) as scene:
+        scoring = scene.scoring()
+        names = scoring.names[split_sites(len(scoring.names), part.total)[part.number]]
+        if names:
+            with files.temporary_folder() as folder:
+                _fetch_or_score(scoring, scene.score_key, names, folder)
+        return len(names)
 
 
 def finish_junction(
     job: Job, settings: RunSettings, scored: Sequence[int | JobFailure]
 ) -> Sequence[JobResult | JobFailure]:
-    """The run of a junction whose sites were scored in parts."""
-    failed = [its for its in scored if isinstance(its, JobFailure)]
-    if failed:
-        return failed[:1]
+    """Complete the run of a junction whose sites were scored in parts; ``scored`` are the results of the parts."""
+    for result in scored:
+        if isinstance(result, JobFailure):
+            return [result]
     SCENE_CACHE.drop(settings.token, job)
     return [_run_junction(job, settings, {"score": {"scored_elsewhere": read_stored_scores(len(scored))}})]
 
@@ -456,11 +429,14 @@ def finish_junction(
 @catch_input_errors
 def _run_junction(job: Job, settings: RunSettings, help_from: dict[str, dict[str, Any]]) -> JobResult:
     release_memory()
-    made: list[str] = []
-    begin = perf_counter()
+    stages_run: list[str] = []
+
+    def listener(stage: str, state: str, _record: object) -> None:
+        if state == "done":
+            stages_run.append(stage)
+
+    start_s = perf_counter()
     with settings.applied():
-        record = run.run(
-            job.scenario(), job.out, jobs=1, help_from=help_from, wait_s=_LOCK_WAIT_S,
-            listener=lambda stage, state, _: made.append(stage) if state == "done" else None,
-        )  # fmt: skip
-        return JobResult(job.junction, record.stages["score"].summary["sites"], perf_counter() - begin, tuple(made))
+        record = run.run(job.scenario(), job.out, jobs=1, options=help_from, wait_s=_LOCK_WAIT_S, listener=listener)
+        n_sites = record.stages["score"].summary["sites"]
+        return JobResult(job.junction, n_sites, perf_counter() - start_s, tuple(stages_run))

@@ -1,42 +1,30 @@
-"""One simulation cut to every junction.
+"""Simulate the traffic of a city once, and split the recording into one file per junction.
 
-Makes the scenarios of junctions name the city's traffic: one file each, or one for each period of ``city.toml``.
+Steps of :func:`make_city_traffic`: make the scenarios of the junctions name the city's files; find the region of each
+junction; hash everything that the files depend on. If ``traffic.json`` has the same hash and no file was changed,
+nothing is done. Otherwise record the traffic as for any scenario (:mod:`egvs.traffic.recording`), once per period,
+and write all files in one pass. Files appear complete and ``traffic.json`` last, so an interrupted command is repeated.
+The same city gives the same bytes.
 
-Only ``[traffic]`` is written, and only where it names other files of the city's, other periods, or other weights than
-``city.toml`` has now; comments and all other keys stay.
+**Which vehicles.** The results of a run depend on vehicles whose boxes meet the region of interest (TPOG), are between
+a site and the region (points on vehicles, moving occlusion), or are within
+:data:`egvs.scoring.target_scores.ISOLATED_GAP_M` of a vehicle in the region. The rectangle around the region and all
+sites, extended by :data:`MARGIN_M`, contains them all. A junction gets every row whose box may be partly inside.
 
-How much of a city's traffic a junction needs.
+**Files.** Floating car data with frames and sizes in the metadata (:mod:`egvs.traffic.finished_fcd`), times from the
+first frame on. Boxes are counted and checked while they pass, as for any scenario. Memory does not depend on the number
+of frames.
 
-What a run makes of traffic depends on the boxes that can meet the region of interest (the TPOG), that can stand between
-a site and the region, or a vehicle in it (points on target, moving occlusion), and that stand within
-:data:`egvs.scoring.target_scores.ISOLATED_GAP_M` of such a vehicle. So the rectangle round the region and all
-sites, grown by :data:`MARGIN_M`, has them all: a vehicle belongs to it when any of its box may lie there. World frame,
-metres.
-
-Cuts one recording of a city's traffic to all its junctions in one pass.
-
-Steps, for some whole frames at a time: rows become boxes, and are counted, as for any scenario, so that the same
-promises are kept; each junction takes the rows whose boxes may lie in its region (:mod:`egvs.city.traffic_split`), as
-they are, and writes them as floating car data that state their frames (:mod:`egvs.traffic.finished_fcd`). Times
-count from the first frame. Memory does not grow with the number of frames.
+**Scenarios.** Only the keys ``fcd`` and ``periods`` of ``[traffic]`` are written, and only if they name other files of
+the city, other periods or other weights than ``city.toml``. Comments and all other keys stay.
 
 World frame, metres, milliseconds.
-
-Makes a city's traffic: one simulation, cut to every junction while it is read.
-
-Steps of :func:`make_city_traffic`: have junctions name the city's files; find the region of each; hash all that the
-files depend on;
-where the seal beside them says the same and no file was altered, nothing is to be done; else record the traffic once,
-or once a period, as any scenario's (:mod:`egvs.traffic.recording`), and write all junctions' files
-(:mod:`egvs.city.traffic_split`). Files appear whole, the seal last: what was killed is made again. The same city gives
-the same bytes.
 """
 
 from __future__ import annotations
 
 import math
 import os
-import resource
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -53,8 +41,9 @@ from tomlkit.exceptions import TOMLKitError
 
 from egvs.artefacts import parquet
 from egvs.city.model import CITY_FILE, JUNCTIONS_FILE, JUNCTIONS_FOLDER, TRAFFIC_FOLDER, City, CityJunction
-from egvs.core import files, reading
+from egvs.core import files, platform, reading
 from egvs.core.errors import WARNINGS_KEY, Diagnostic, InputError
+from egvs.core.grid import FloatArray
 from egvs.core.runtime import ProgressCallback, no_progress
 from egvs.effects import registry
 from egvs.runs import stages
@@ -74,85 +63,60 @@ from egvs.traffic.trajectories import TrafficStatistics
 from egvs.traffic.vehicle_boxes import TrafficHook, VehicleSize
 from egvs.world import geolocation
 
-_UP = "../../"
-_SOURCE_KEYS = ("fcd", "periods")
-
-
-def link_scenarios(city: City) -> tuple[str, ...]:
-    """Write what has to be; the junctions whose scenarios were changed.
-
-    A scenario whose traffic comes from elsewhere is left as it is, and refused when the traffic is made.
-    """
-    return tuple(junction.id for junction in city.junctions if _link_scenario(city, junction))
-
-
-def _link_scenario(city: City, junction: CityJunction) -> bool:
-    path = junction.scenario_folder(city) / SCENARIO_FILE
-    values = reading.read_toml(path)
-    own = values.get("traffic", {})
-    its = {key: own[key] for key in _SOURCE_KEYS if key in own} if isinstance(own, dict) else {}
-    wanted = _expected_traffic(city, junction)
-    if (
-        its == wanted
-        or not its
-        or not all(str(name).startswith(f"{_UP}{TRAFFIC_FOLDER}/") for name in _named_files(its))
-    ):
-        return False
-    try:
-        document = tomlkit.parse(path.read_text(encoding="utf-8"))
-    except (TOMLKitError, UnicodeDecodeError):  # what one reader takes and the other does not
-        return False
-    table: Any = document["traffic"]
-    for key in its:
-        del table[key]
-    if "fcd" in wanted:
-        table["fcd"] = wanted["fcd"]
-    else:
-        periods = tomlkit.aot()
-        for period in wanted["periods"]:
-            periods.append(tomlkit.item(period))
-        periods[-1].add(tomlkit.nl())
-        table["periods"] = periods
-    files.write_text(path, tomlkit.dumps(document))
-    return True
-
-
-def _expected_traffic(city: City, junction: CityJunction) -> dict[str, Any]:
-    """What of ``[traffic]`` follows from the city."""
-    if not city.traffic.periods:
-        return {"fcd": _relative_traffic_path(city, junction, "")}
-    return {
-        "periods": [
-            {"name": period.name, "weight": period.weight, "fcd": _relative_traffic_path(city, junction, period.name)}
-            for period in city.traffic.periods
-        ]
-    }
-
-
-def _relative_traffic_path(city: City, junction: CityJunction, period: str) -> str:
-    return _UP + junction.traffic_file(city, period).relative_to(city.folder).as_posix()
-
-
-def _named_files(sources: dict[str, Any]) -> Iterator[Any]:
-    """The files that a scenario's traffic comes from."""
-    if "fcd" in sources:
-        yield sources["fcd"]
-    periods = sources.get("periods", [])
-    for period in periods if isinstance(periods, list) else [periods]:
-        yield period.get("fcd", "") if isinstance(period, dict) else ""
-
+RECORD_FILE, SUMO_FOLDER = "traffic.json", "sumo"
+"""In the folder of the traffic: the inputs and hashes of its files, and the folder that opens in sumo-gui."""
 
 MAX_VEHICLE_LENGTH_M = 80.0
-"""A vehicle in the region may reach half of this beyond it; a longer tram's neighbours may be missed."""
+"""A vehicle in the region may extend by half of this beyond it; neighbours of longer vehicles may be missing."""
 
 MARGIN_M = ISOLATED_GAP_M + MAX_VEHICLE_LENGTH_M / 2
 ROUNDING_M = 10.0
-"""Rectangles are rounded outwards to this, so that a pole that moves a little needs no new simulation."""
+"""Rectangles are rounded outwards to this, so that a pole can move a little without a new simulation."""
+
+GROUP_FRAMES = 20
+"""Number of frames of the whole city that are in memory at a time."""
+
+_TO_CITY_FOLDER = "../../"
+_SOURCE_KEYS = ("fcd", "periods")
+_COLUMNS = ("id", "type", "x", "y", "z", "angle", "slope", "speed")
+
+_FLUSH_ROWS = 8192
+"""Number of rows of a junction that are written together."""
+
+_OTHER_OPEN_FILES = 64
+_CITY_HEIGHT_M = 5.0
+
+
+@dataclass(frozen=True)
+class CityTraffic:
+    """The traffic of a city.
+
+    Attributes
+    ----------
+    is_new
+        Whether it was made by this call.
+    summary
+        Summary of the complete traffic, as in the ``run.json`` of a scenario.
+    rows
+        Number of rows of each junction, over all periods.
+    linked
+        Names of the junctions whose scenarios were changed.
+    """
+
+    is_new: bool
+    summary: Mapping[str, Any]
+    rows: Mapping[str, int]
+    linked: tuple[str, ...] = ()
+
+    @property
+    def frames(self) -> int:
+        """Number of frames of every junction, over all periods."""
+        return int(self.summary["frames"])
 
 
 @dataclass(frozen=True)
 class TrafficRegion:
-    """What a junction needs: a rectangle, and the effects that ask for whole ways."""
+    """The rectangle of a junction, and its scenario, whose effects may need complete paths."""
 
     low_x_m: float
     low_y_m: float
@@ -161,87 +125,355 @@ class TrafficRegion:
     scenario: Scenario
 
     def to_json(self) -> list[float]:
-        """The rectangle."""
+        """Return the rectangle."""
         return [self.low_x_m, self.low_y_m, self.high_x_m, self.high_y_m]
 
     def followed_types(self, sizes: Mapping[str, VehicleSize]) -> frozenset[str]:
-        """Types of which every row is kept, wherever it is."""
+        """Return the vehicle types of which every row is needed."""
         return registry.followed_types(self.scenario, sizes)
 
+    def may_contain(self, x_m: FloatArray, y_m: FloatArray, reach_m: FloatArray) -> NDArray[np.bool_]:
+        """Return which boxes may be partly inside.
 
-def find_traffic_regions(city: City, sets: Sequence[str] = ()) -> dict[str, TrafficRegion]:
-    """The region of each junction, with ``sets`` laid over its scenario.
+        Parameters
+        ----------
+        x_m, y_m
+            Centres of the front bumpers, shape (n,).
+        reach_m
+            Largest distances from there to a corner, shape (n,).
+        """
+        inside: NDArray[np.bool_] = (x_m >= self.low_x_m - reach_m) & (x_m <= self.high_x_m + reach_m)
+        inside &= (y_m >= self.low_y_m - reach_m) & (y_m <= self.high_y_m + reach_m)
+        return inside
 
-    InputError where a scenario is wrong, or has other traffic than the city's.
+
+def make_city_traffic(
+    city: City, progress: ProgressCallback = no_progress, overrides: Sequence[str] = ()
+) -> CityTraffic:
+    """Make the traffic files of a city's junctions, unless they are up to date.
+
+    Parameters
+    ----------
+    city
+        From :func:`egvs.city.model.load_city`.
+    progress
+        Called with the number of frames that were written.
+    overrides
+        ``KEY=VALUE`` for the scenarios of all junctions: they may need more of the traffic.
+
+    Raises
+    ------
+    InputError
+        When the city, a junction's scenario, or a file that they name is wrong.
+    RunError
+        When SUMO fails, the number of vehicles is not held, vehicles are stuck, or another process uses the folder.
     """
-    return {junction.id: _traffic_region(city, junction, sets) for junction in city.junctions}
+    folder = city.folder / TRAFFIC_FOLDER
+    with lock_run_folder(folder):
+        linked = tuple(junction.id for junction in city.junctions if _link_scenario(city, junction))
+        regions = find_traffic_regions(city, overrides)
+        scenario = city_traffic_scenario(city, regions)
+        key = _traffic_key(scenario, folder, regions)
+        existing = _read_existing_traffic(city, key)
+        if existing is not None:
+            return replace(existing, linked=linked)
+
+        summaries, rows = dict[str, Summary](), Counter[str]()
+        for period, period_scenario in scenario.by_period().items():
+            paths = {junction.id: junction.traffic_file(city, period) for junction in city.junctions}
+            sumo_path = folder / SUMO_FOLDER / period
+            summaries[period], period_rows = _record_period(period_scenario, sumo_path, regions, paths, progress)
+            rows.update(period_rows)
+        summary = traffic.merge_summaries(summaries) if city.traffic.periods else summaries[""]
+        warnings = [warning.to_json() for warning in _no_traffic_warnings(scenario, rows)]
+        summary[WARNINGS_KEY] = [*summary.get(WARNINGS_KEY, []), *warnings]
+
+        digests = {_traffic_label(city, path): files.hash_file(path) for path in _traffic_paths(city)}
+        record = {"key": key, "files": digests, "rows": dict(rows), "summary": summary}
+        files.write_text(folder / RECORD_FILE, files.to_json_text(record, indent=1) + "\n")
+    return CityTraffic(True, summary, dict(rows), linked)
 
 
-def _traffic_region(city: City, junction: CityJunction, sets: Sequence[str]) -> TrafficRegion:
-    scenario = load(junction.scenario_folder(city), sets)
+def _traffic_paths(city: City) -> Iterator[Path]:
+    """Yield the files of all periods and junctions."""
+    for period in [period.name for period in city.traffic.periods] or [""]:
+        for junction in city.junctions:
+            yield junction.traffic_file(city, period)
+
+
+def _traffic_label(city: City, path: Path) -> str:
+    return path.relative_to(city.folder / TRAFFIC_FOLDER).as_posix()
+
+
+def _read_existing_traffic(city: City, key: str) -> CityTraffic | None:
+    """Return the traffic in the folder; None if it has another key, or a file is missing or was changed."""
+    path = city.folder / TRAFFIC_FOLDER / RECORD_FILE
+    if not path.is_file():
+        return None
+    match reading.read_json(path):
+        case {"key": str(old_key), "files": dict(digests), "rows": dict(rows), "summary": dict(summary)}:
+            pass
+        case _:
+            return None
+    if old_key != key:
+        return None
+    for traffic_path in _traffic_paths(city):
+        if not traffic_path.is_file() or files.hash_file(traffic_path) != digests.get(
+            _traffic_label(city, traffic_path)
+        ):
+            return None
+    return CityTraffic(False, summary, rows)
+
+
+def _traffic_key(scenario: Scenario, folder: Path, regions: Mapping[str, TrafficRegion]) -> str:
+    """Return a hash of all inputs: the traffic, the regions, the effects of the junctions, the program."""
+    dependencies = traffic.dependencies(open_folder(scenario, folder))
+    effects = {}
+    for name, region in regions.items():
+        effects[name] = registry.effect_settings(registry.scenario_effects(region.scenario, traffic.STAGE.name))
+    return files.hash_json(
+        {
+            "inputs": dependencies.to_json(),
+            "regions": {name: region.to_json() for name, region in regions.items()},
+            "effects": effects,
+            "program": stages.program_inputs(traffic.STAGE.name, scenario, dependencies.modules),
+            "splitting": stages.source_digest(__name__).digest,
+        }
+    )
+
+
+def city_traffic_scenario(city: City, regions: Mapping[str, TrafficRegion]) -> Scenario:
+    """Return the city's traffic as a scenario, with a region of interest that contains all regions.
+
+    InputError for an effect that adds no traffic.
+    """
+    for name in city.effects.named:
+        if not getattr(registry.find_effect_class(name), "ADDS_TRAFFIC", False):
+            hint = f"Move it to {JUNCTIONS_FOLDER}/{SCENARIO_FILE}, or to the scenarios of some junctions."
+            raise InputError(f"{city.file}: effects.{name}", "adds no traffic", hint)
+    low_x_m = min(region.low_x_m for region in regions.values())
+    low_y_m = min(region.low_y_m for region in regions.values())
+    high_x_m = max(region.high_x_m for region in regions.values())
+    high_y_m = max(region.high_y_m for region in regions.values())
+    values = {
+        "name": "city",  # a renamed folder has the same traffic
+        "seed": city.seed,
+        "roi": {
+            "center_m": [(low_x_m + high_x_m) / 2, (low_y_m + high_y_m) / 2, _CITY_HEIGHT_M / 2],
+            "size_m": [high_x_m - low_x_m, high_y_m - low_y_m, _CITY_HEIGHT_M],
+            "voxel_m": _CITY_HEIGHT_M,
+        },
+        "tpog": {"blocks": 1},  # possible with any number of frames
+        "traffic": city.traffic.model_dump(mode="json", exclude_unset=True),
+        "effects": city.effects.model_dump(mode="json"),
+        "sites": {"file": JUNCTIONS_FILE},
+    }
+    scenario = scenario_from_dict(values, city.folder, str(city.file))
+    scenario._file_name = CITY_FILE
+    return scenario
+
+
+def _link_scenario(city: City, junction: CityJunction) -> bool:
+    """Make the scenario of a junction name the city's files and periods; return whether it was changed.
+
+    A scenario with traffic from elsewhere is not changed, and is an error in :func:`find_traffic_regions`.
+    """
+    path = junction.scenario_folder(city) / SCENARIO_FILE
+    table = reading.read_toml(path).get("traffic", {})
+    if not isinstance(table, dict):
+        return False
+    sources = {key: table[key] for key in _SOURCE_KEYS if key in table}
+    expected = _expected_sources(city, junction)
+    if not sources or sources == expected or not _are_city_files(sources):
+        return False
+    try:
+        document = tomlkit.parse(path.read_text(encoding="utf-8"))
+    except (TOMLKitError, UnicodeDecodeError):  # TOML readers differ in what they accept
+        return False
+
+    traffic_table: Any = document["traffic"]
+    for key in sources:
+        del traffic_table[key]
+    if "fcd" in expected:
+        traffic_table["fcd"] = expected["fcd"]
+    else:
+        periods = tomlkit.aot()
+        for period in expected["periods"]:
+            periods.append(tomlkit.item(period))
+        periods[-1].add(tomlkit.nl())
+        traffic_table["periods"] = periods
+    files.write_text(path, tomlkit.dumps(document))
+    return True
+
+
+def _expected_sources(city: City, junction: CityJunction) -> dict[str, Any]:
+    """Return the keys of a junction's ``[traffic]`` that follow from the city."""
+    if not city.traffic.periods:
+        return {"fcd": _relative_traffic_path(city, junction, "")}
+    periods = []
+    for period in city.traffic.periods:
+        file = _relative_traffic_path(city, junction, period.name)
+        periods.append({"name": period.name, "weight": period.weight, "fcd": file})
+    return {"periods": periods}
+
+
+def _relative_traffic_path(city: City, junction: CityJunction, period: str) -> str:
+    return _TO_CITY_FOLDER + junction.traffic_file(city, period).relative_to(city.folder).as_posix()
+
+
+def _are_city_files(sources: dict[str, Any]) -> bool:
+    """Return whether all files of a ``[traffic]`` table are in the city's traffic folder."""
+    periods = sources.get("periods", [])
+    if not isinstance(periods, list) or not all(isinstance(period, dict) for period in periods):
+        return False
+    names = [period.get("fcd", "") for period in periods]
+    if "fcd" in sources:
+        names.append(sources["fcd"])
+    return all(str(name).startswith(f"{_TO_CITY_FOLDER}{TRAFFIC_FOLDER}/") for name in names)
+
+
+def find_traffic_regions(city: City, overrides: Sequence[str] = ()) -> dict[str, TrafficRegion]:
+    """Return the region of each junction, by name.
+
+    Parameters
+    ----------
+    city
+        The city.
+    overrides
+        ``KEY=VALUE`` for the scenarios of all junctions.
+
+    Raises
+    ------
+    InputError
+        When a scenario is wrong, or its traffic is not the city's.
+    """
+    return {junction.id: _traffic_region(city, junction, overrides) for junction in city.junctions}
+
+
+def _traffic_region(city: City, junction: CityJunction, overrides: Sequence[str]) -> TrafficRegion:
+    scenario = load(junction.scenario_folder(city), overrides)
     _check_traffic(city, junction, scenario)
+    poses = [site.pose for site in sites.candidate_sites(scenario)]
     roi = scenario.roi.box
-    spots = [(site.pose.x_m, site.pose.y_m) for site in sites.candidate_sites(scenario)]
-    low = [min(roi.origin_m[i], *(spot[i] for spot in spots)) for i in (0, 1)]
-    high = [max(roi.origin_m[i] + roi.size_m[i], *(spot[i] for spot in spots)) for i in (0, 1)]
-    x0, y0 = (ROUNDING_M * math.floor((value - MARGIN_M) / ROUNDING_M) for value in low)
-    x1, y1 = (ROUNDING_M * math.ceil((value + MARGIN_M) / ROUNDING_M) for value in high)
-    return TrafficRegion(x0, y0, x1, y1, scenario)
+    xs_m = [roi.origin_m[0], roi.origin_m[0] + roi.size_m[0], *(pose.x_m for pose in poses)]
+    ys_m = [roi.origin_m[1], roi.origin_m[1] + roi.size_m[1], *(pose.y_m for pose in poses)]
+    return TrafficRegion(
+        ROUNDING_M * math.floor((min(xs_m) - MARGIN_M) / ROUNDING_M),
+        ROUNDING_M * math.floor((min(ys_m) - MARGIN_M) / ROUNDING_M),
+        ROUNDING_M * math.ceil((max(xs_m) + MARGIN_M) / ROUNDING_M),
+        ROUNDING_M * math.ceil((max(ys_m) + MARGIN_M) / ROUNDING_M),
+        scenario,
+    )
 
 
 def _check_traffic(city: City, junction: CityJunction, scenario: Scenario) -> None:
-    """InputError where a junction's scenario does not take the city's traffic as it is."""
-    traffic, alone = scenario.traffic, scenario.by_period()
-    its = {period.name for period in city.traffic.periods} or {""}
-    if alone.keys() != its:
-        found = f"has {_format_periods(alone)}, the city {_format_periods(its)}"
-        raise InputError(f"{scenario.file}: traffic", found, f"a period for each of {city.file}, with the city's files")
-    for name, of_period in alone.items():
-        wanted, given = junction.traffic_file(city, name), of_period.traffic
-        if given.fcd is None or os.path.realpath(scenario.folder / given.fcd) != os.path.realpath(wanted):
-            source = given.fcd or given.network or given.sumocfg
-            right = f'fcd = "../../{wanted.relative_to(city.folder).as_posix()}"'
-            raise InputError(f"{scenario.file}: traffic", f"comes from {source}, not from the city's", right)
-    strides = traffic.frame_period_s / city.traffic.frame_period_s
-    if abs(strides - round(strides)) > 1e-9 or round(strides) < 1:
-        found = f"{traffic.frame_period_s:g} s, but {city.file} has a frame each {city.traffic.frame_period_s:g} s"
-        raise InputError(f"{scenario.file}: traffic.frame_period_s", found, "the same, or a multiple of it")
+    """Raise an InputError unless a junction's scenario uses the city's files, periods and frames."""
+    by_period = scenario.by_period()
+    city_periods = {period.name for period in city.traffic.periods} or {""}
+    if by_period.keys() != city_periods:
+        problem = f"has {_format_periods(by_period)}, but the city has {_format_periods(city_periods)}"
+        hint = f"Use the periods of {city.file}, with the city's files."
+        raise InputError(f"{scenario.file}: traffic", problem, hint)
+
+    for name, period_scenario in by_period.items():
+        config, expected = period_scenario.traffic, junction.traffic_file(city, name)
+        if config.fcd is None or os.path.realpath(scenario.folder / config.fcd) != os.path.realpath(expected):
+            source = config.fcd or config.network or config.sumocfg
+            hint = f'Set fcd = "{_relative_traffic_path(city, junction, name)}".'
+            raise InputError(f"{scenario.file}: traffic", f"comes from {source}, not from the city's files", hint)
+
+    period_s, city_period_s = scenario.traffic.frame_period_s, city.traffic.frame_period_s
+    stride = period_s / city_period_s
+    if abs(stride - round(stride)) > 1e-9 or round(stride) < 1:
+        problem = f"expected a multiple of {city_period_s:g} s, the frame period of {city.file}, got {period_s:g} s"
+        hint = f"Use for example {city_period_s:g}."
+        raise InputError(f"{scenario.file}: traffic.frame_period_s", problem, hint)
 
 
 def _format_periods(names: Iterable[str]) -> str:
-    return f"the periods {', '.join(sorted(names))}" if any(names) else "no periods"
+    if not any(names):
+        return "no periods"
+    return f"the periods {', '.join(sorted(names))}"
 
 
-GROUP_FRAMES = 20
-"""Frames that are held at a time, with every vehicle of the city."""
+def _record_period(
+    scenario: Scenario,
+    folder: Path,
+    regions: Mapping[str, TrafficRegion],
+    paths: Mapping[str, Path],
+    progress: ProgressCallback,
+) -> tuple[Summary, dict[str, int]]:
+    """Record the traffic of one period and write all files; return its summary, and the rows of each junction."""
+    effects, notes = registry.active_traffic_effects(scenario)
+    world = geolocation.scenario_georeference(scenario)
+    with recording.record_traffic(scenario, folder, effects, progress, None, world) as recorded:
+        statistics, rows = split_recording(scenario, recorded, regions, paths, effects, progress)
+        recording_summary = recorded.summary()
+        warnings = trajectories.traffic_warnings(statistics, recorded, scenario.roi.box)
+    summary = statistics.to_json(recorded.window.period_ms / 1000.0)
+    if recording_summary is not None:
+        summary |= asdict(recording_summary)
 
-_FLUSH_ROWS = 8192
-"""Rows of a junction that are written together."""
+    # The share of frames with overlaps is a matter of each junction.
+    warnings = [warning for warning in warnings if warning.rule != "overlaps"]
+    if any(not effect.ADDS_TRAFFIC for effect in effects):
+        warnings += _slope_warnings(scenario, regions)
+    all_warnings = [*summary.get(WARNINGS_KEY, []), *(warning.to_json() for warning in warnings)]
+    summary[WARNINGS_KEY] = [_reword_for_city(warning) for warning in all_warnings]
+    if notes:
+        summary["notes"] = [*summary.get("notes", []), *notes]
+    return summary, rows
 
-_SPARE_FILES = 64
-_COLUMNS = ("id", "type", "x", "y", "z", "angle", "slope", "speed")
+
+def _reword_for_city(warning: Mapping[str, Any]) -> dict[str, Any]:
+    """Adapt the texts of a warning: the region of interest of the city's scenario surrounds all junctions."""
+    reworded = dict(warning)
+    for key, value in warning.items():
+        if isinstance(value, str):
+            reworded[key] = value.replace("the region of interest", "the city's junctions")
+    return reworded
+
+
+def _slope_warnings(scenario: Scenario, regions: Mapping[str, TrafficRegion]) -> Iterator[Diagnostic]:
+    """Warn about junctions that would treat a hilly network as flat."""
+    flat = [name for name, region in regions.items() if region.scenario.traffic.roads is None]
+    if flat:
+        problem = f"the network has slopes, but the ground of {', '.join(flat)} is level, because they name no roads"
+        hint = "Set traffic.roads in their scenarios."
+        yield Diagnostic("relief", sumo_folder.traffic_key(scenario), problem, hint)
+
+
+def _no_traffic_warnings(scenario: Scenario, rows: Mapping[str, int]) -> Iterator[Diagnostic]:
+    empty = [name for name, count in rows.items() if not count]
+    if empty:
+        problem = f"no vehicle comes near {', '.join(empty)}"
+        hint = f"Use more traffic, or remove their rows from {JUNCTIONS_FILE}."
+        yield Diagnostic("junctions without traffic", sumo_folder.traffic_key(scenario), problem, hint)
 
 
 @dataclass
 class _JunctionWriter:
-    """A junction's rows on their way into its file."""
+    """Writes the rows of a junction into its file, many at a time."""
 
     region: TrafficRegion
+    followed_types: frozenset[str]
     file: parquet.ArtefactWriter
     rows: int = 0
-    _waiting: list[pa.Table] = field(default_factory=list)
+    _pending: list[pa.Table] = field(default_factory=list)
 
     def add(self, rows: pa.Table) -> None:
-        self._waiting.append(rows)
+        self._pending.append(rows)
         self.rows += rows.num_rows
-        if sum(table.num_rows for table in self._waiting) >= _FLUSH_ROWS:
+        if sum(table.num_rows for table in self._pending) >= _FLUSH_ROWS:
             self.flush()
 
     def flush(self) -> None:
-        if self._waiting and (rows := pa.concat_tables(self._waiting).combine_chunks()).num_rows:
-            columns = {f"vehicle_{name}": rows[name].chunk(0) for name in _COLUMNS}
-            self.file.write({"timestep_time": rows["time_ms"].to_numpy() / 1000.0, **columns})
-        self._waiting.clear()
+        if not self._pending:
+            return
+        rows = pa.concat_tables(self._pending).combine_chunks()
+        columns = {f"vehicle_{name}": rows[name].chunk(0) for name in _COLUMNS}
+        self.file.write({"timestep_time": rows["time_ms"].to_numpy() / 1000.0, **columns})
+        self._pending.clear()
 
 
 def split_recording(
@@ -252,268 +484,78 @@ def split_recording(
     extensions: Sequence[TrafficHook],
     progress: ProgressCallback,
 ) -> tuple[TrafficStatistics, dict[str, int]]:
-    """Write the file of every junction; what the whole traffic adds up to, and the rows of each junction.
-
-    No file appears before the recording is through and keeps its promises: InputError and RunError as
-    :func:`egvs.traffic.trajectories.write_trajectories`.
-    """
-    tally = TrafficStatistics(recording.window.count, stopped_on_purpose=recording.stopped_on_purpose)
-    period_ms, place = recording.window.period_ms, recording.source or recording.where
-    uncounted = frozenset[str]().union(*(extension.uncounted_types(recording.sizes) for extension in extensions))
-    followed = {name: region.followed_types(recording.sizes) for name, region in regions.items()}
-    _raise_file_limit(len(regions))
-    with ExitStack() as stack:
-        cuts = {
-            name: _JunctionWriter(region, stack.enter_context(parquet.artefact_writer(paths[name], "fcd")))
-            for name, region in regions.items()
-        }
-        for group in trajectories.frame_groups(recording, GROUP_FRAMES):
-            tally.add(vehicle_boxes.boxes_from_bumpers(group, recording.sizes, period_ms / 1000.0, place, uncounted))
-            for name, rows in _junction_rows(group, period_ms, cuts, recording.sizes, followed):
-                cuts[name].add(rows)
-            progress("frames written", group.first_frame + group.frames, tally.frames)
-        trajectories.check_recording(scenario, tally, recording)
-        stated = FcdMetadata.for_recording(period_ms, tally.frames, dict(recording.sizes))
-        for cut in cuts.values():
-            cut.flush()
-            cut.file.describe({"schema": parquet.SCHEMA_VERSION, **stated.model_dump(mode="json")})
-    return tally, {name: cut.rows for name, cut in cuts.items()}
-
-
-def _raise_file_limit(count: int) -> None:
-    """All junctions' files are open at a time: more than a process has by default, in a large city."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = count + _SPARE_FILES
-    if soft != resource.RLIM_INFINITY and soft < wanted and (hard == resource.RLIM_INFINITY or hard >= wanted):
-        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-
-
-def _junction_rows(
-    group: FrameGroup,
-    period_ms: int,
-    cuts: Mapping[str, _JunctionWriter],
-    sizes: Mapping[str, vehicle_boxes.VehicleSize],
-    followed: Mapping[str, frozenset[str]],
-) -> Iterator[tuple[str, pa.Table]]:
-    """The rows of a group that each junction takes, in order of time; those that take none are left out."""
-    rows = _with_frame_times(group, period_ms)
-    x, y = rows["x"].to_numpy(), rows["y"].to_numpy()
-    types = rows["type"].combine_chunks().dictionary_encode()
-    names, code = types.dictionary.to_pylist(), types.indices.to_numpy()
-    reach_m = np.array([np.hypot(sizes[name].length_m, sizes[name].width_m) for name in names])[code]
-    eastward = np.argsort(x, kind="stable")
-    far_m = float(reach_m.max(initial=0.0))
-    for name, cut in cuts.items():
-        region = cut.region
-        bounds = np.searchsorted(x[eastward], [region.low_x_m - far_m, region.high_x_m + far_m])
-        near = eastward[bounds[0] : bounds[1]]
-        near = near[_may_reach(region, x[near], y[near], reach_m[near])]
-        if followed[name]:
-            whole = np.flatnonzero(np.array([its in followed[name] for its in names])[code])
-            near = np.union1d(near, whole)
-        if near.size:
-            yield name, rows.take(pa.array(np.sort(near)))
-
-
-def _with_frame_times(group: FrameGroup, period_ms: int) -> pa.Table:
-    """The group's rows in order of their frames, with times from the first frame on."""
-    order = np.argsort(group.frame, kind="stable")  # persons come after the vehicles of the whole group
-    rows = group.rows.take(pa.array(order)) if np.any(np.diff(group.frame) < 0) else group.rows
-    index = rows.schema.get_field_index("time_ms")
-    return rows.set_column(index, "time_ms", pc.cast(pa.array(group.frame[order] * period_ms), pa.int64()))
-
-
-def _may_reach(
-    region: TrafficRegion, x_m: NDArray[np.float64], y_m: NDArray[np.float64], reach_m: NDArray[np.float64]
-) -> NDArray[np.bool_]:
-    """Whether boxes with these front bumpers may lie in the region in part."""
-    inside = (x_m >= region.low_x_m - reach_m) & (x_m <= region.high_x_m + reach_m)
-    found: NDArray[np.bool_] = inside & (y_m >= region.low_y_m - reach_m) & (y_m <= region.high_y_m + reach_m)
-    return found
-
-
-SEAL_FILE, SUMO_FOLDER = "traffic.json", "sumo"
-"""In the folder of the traffic: what its files were made of, and the folder that opens in sumo-gui."""
-
-_HEIGHT_M = 5.0
-
-
-@dataclass(frozen=True)
-class CityTraffic:
-    """A city's traffic.
-
-    Attributes
-    ----------
-    is_new
-        Whether it was made now.
-    summary
-        What came out of the whole, as ``run.json`` has it of a scenario's traffic.
-    rows
-        Rows of each junction, of all periods.
-    linked
-        Junctions whose scenarios were changed, to name the city's periods.
-    """
-
-    is_new: bool
-    summary: Mapping[str, Any]
-    rows: Mapping[str, int]
-    linked: tuple[str, ...] = ()
-
-    @property
-    def frames(self) -> int:
-        """Frames of every junction, of all periods."""
-        return int(self.summary["frames"])
-
-
-def make_city_traffic(city: City, progress: ProgressCallback = no_progress, sets: Sequence[str] = ()) -> CityTraffic:
-    """Make the traffic of a city's junctions, unless it is there.
+    """Write the files of all junctions. No file appears before the recording is complete and checked.
 
     Parameters
     ----------
-    sets
-        Laid over every junction's scenario, as ``--set`` does: they may ask for more of the traffic.
+    scenario, recording
+        The city's traffic as a scenario, and its recording.
+    regions, paths
+        Region and file of each junction, by name.
+    extensions
+        Effects that change the traffic.
+    progress
+        Called with the number of frames that were written.
+
+    Returns
+    -------
+    tuple
+        Statistics of the complete traffic, and the number of rows of each junction.
 
     Raises
     ------
-    InputError
-        When the city, a junction's scenario, or a file that they name is wrong.
-    RunError
-        When SUMO fails, N vehicles are not held, a vehicle stands without end, or another process is at work there.
+    InputError, RunError
+        As :func:`egvs.traffic.trajectories.write_trajectories`.
     """
-    folder = city.folder / TRAFFIC_FOLDER
-    with lock_run_folder(folder):
-        linked = link_scenarios(city)
-        its_regions = find_traffic_regions(city, sets)
-        scenario = city_traffic_scenario(city, its_regions)
-        key = _traffic_key(scenario, folder, its_regions)
-        if (known := _read_sealed_traffic(city, key)) is not None:
-            return replace(known, linked=linked)
-        summaries, rows = dict[str, Summary](), Counter[str]()
-        for period, of_period in scenario.by_period().items():
-            paths = {junction.id: junction.traffic_file(city, period) for junction in city.junctions}
-            summaries[period], its_rows = _record_period(
-                of_period, folder / SUMO_FOLDER / period, its_regions, paths, progress
-            )
-            rows.update(its_rows)
-        summary = summaries[""] if "" in summaries else traffic.merge_summaries(summaries)
-        summary[WARNINGS_KEY] = [*summary.get(WARNINGS_KEY, []), *_no_traffic_warnings(scenario, rows)]
-        digests = {_traffic_label(city, path): files.hash_file(path) for path in _traffic_paths(city)}
-        seal = {"key": key, "files": digests, "rows": dict(rows), "summary": summary}
-        files.write_text(folder / SEAL_FILE, files.to_json_text(seal, indent=1) + "\n")
-    return CityTraffic(True, summary, dict(rows), linked)
+    period_ms, where = recording.window.period_ms, recording.source or recording.where
+    statistics = TrafficStatistics(recording.window.count, stopped_on_purpose=recording.stopped_on_purpose)
+    uncounted = frozenset[str]().union(*(extension.uncounted_types(recording.sizes) for extension in extensions))
+    platform.raise_open_file_limit(len(regions) + _OTHER_OPEN_FILES)
+    with ExitStack() as stack:
+        writers = {}
+        for name, region in regions.items():
+            file = stack.enter_context(parquet.artefact_writer(paths[name], "fcd"))
+            writers[name] = _JunctionWriter(region, region.followed_types(recording.sizes), file)
+        for group in trajectories.frame_groups(recording, GROUP_FRAMES):
+            boxes = vehicle_boxes.boxes_from_bumpers(group, recording.sizes, period_ms / 1000.0, where, uncounted)
+            statistics.add(boxes)
+            _write_rows(_with_frame_times(group, period_ms), writers.values(), recording.sizes)
+            progress("frames written", group.first_frame + group.frames, statistics.frames)
+        trajectories.check_recording(scenario, statistics, recording)
+        fcd_metadata = FcdMetadata.for_recording(period_ms, statistics.frames, dict(recording.sizes))
+        for writer in writers.values():
+            writer.flush()
+            writer.file.describe({"schema": parquet.SCHEMA_VERSION, **fcd_metadata.model_dump(mode="json")})
+    return statistics, {name: writer.rows for name, writer in writers.items()}
 
 
-def _traffic_paths(city: City) -> Iterator[Path]:
-    """The files of all junctions and periods."""
-    for period in [period.name for period in city.traffic.periods] or [""]:
-        yield from (junction.traffic_file(city, period) for junction in city.junctions)
+def _write_rows(rows: pa.Table, writers: Iterable[_JunctionWriter], sizes: Mapping[str, VehicleSize]) -> None:
+    """Give each junction the rows of its region, and all rows of the types that it follows, in the order of time."""
+    x_m, y_m = rows["x"].to_numpy(), rows["y"].to_numpy()
+    types = rows["type"].combine_chunks().dictionary_encode()
+    names, type_of_row = types.dictionary.to_pylist(), types.indices.to_numpy()
+    reach_m = np.array([np.hypot(sizes[name].length_m, sizes[name].width_m) for name in names])[type_of_row]
+    max_reach_m = float(reach_m.max(initial=0.0))
+
+    # Search along x first: most rows of a large city are far from a junction.
+    by_x = np.argsort(x_m, kind="stable")
+    for writer in writers:
+        region = writer.region
+        first, last = np.searchsorted(x_m[by_x], [region.low_x_m - max_reach_m, region.high_x_m + max_reach_m])
+        chosen = by_x[first:last]
+        chosen = chosen[region.may_contain(x_m[chosen], y_m[chosen], reach_m[chosen])]
+        if writer.followed_types:
+            is_followed = np.array([name in writer.followed_types for name in names])[type_of_row]
+            chosen = np.union1d(chosen, np.flatnonzero(is_followed))
+        if chosen.size:
+            writer.add(rows.take(pa.array(np.sort(chosen))))
 
 
-def _traffic_label(city: City, path: Path) -> str:
-    return path.relative_to(city.folder / TRAFFIC_FOLDER).as_posix()
-
-
-def city_traffic_scenario(city: City, traffic_regions: Mapping[str, TrafficRegion]) -> Scenario:
-    """The city's traffic as a scenario, whose region of interest holds all junctions' regions."""
-    for name in city.effects.named:
-        if not getattr(registry.find_effect_class(name), "ADDS_TRAFFIC", False):
-            right = f"in {JUNCTIONS_FOLDER}/{SCENARIO_FILE}, for every junction, or in those of some"
-            raise InputError(f"{city.file}: effects.{name}", "adds no traffic", right)
-    low = [min(getattr(region, key) for region in traffic_regions.values()) for key in ("low_x_m", "low_y_m")]
-    high = [max(getattr(region, key) for region in traffic_regions.values()) for key in ("high_x_m", "high_y_m")]
-    middle, size = (
-        [(a + b) / 2 for a, b in zip(low, high, strict=True)],
-        [b - a for a, b in zip(low, high, strict=True)],
-    )
-    values = {
-        "name": "city",  # a folder that is renamed has the same traffic
-        "seed": city.seed,
-        "roi": {"center_m": [*middle, _HEIGHT_M / 2], "size_m": [*size, _HEIGHT_M], "voxel_m": _HEIGHT_M},
-        "tpog": {"blocks": 1},  # of any number of frames
-        "traffic": city.traffic.model_dump(mode="json", exclude_unset=True),
-        "effects": city.effects.model_dump(mode="json"),
-        "sites": {"file": JUNCTIONS_FILE},
-    }
-    scenario = scenario_from_dict(values, city.folder, str(city.file))
-    scenario._file_name = CITY_FILE
-    return scenario
-
-
-def _traffic_key(scenario: Scenario, folder: Path, traffic_regions: Mapping[str, TrafficRegion]) -> str:
-    """A hash of all that the files depend on: the traffic, the regions, the effects that follow ways, the program."""
-    read = traffic.dependencies(open_folder(scenario, folder))
-    own = {
-        name: registry.effect_settings(registry.scenario_effects(its.scenario, traffic.STAGE.name))
-        for name, its in traffic_regions.items()
-    }
-    about = {
-        "inputs": read.to_json(),
-        "regions": {name: region.to_json() for name, region in traffic_regions.items()},
-        "effects": own,
-        "program": stages.program_inputs(traffic.STAGE.name, scenario, read.modules),
-        "cutting": stages.source_digest(__name__).digest,
-    }
-    return files.hash_json(about)
-
-
-def _read_sealed_traffic(city: City, key: str) -> CityTraffic | None:
-    """The traffic that is there, where it is this one and whole."""
-    path = city.folder / TRAFFIC_FOLDER / SEAL_FILE
-    if not path.is_file():
-        return None
-    match reading.read_json(path):
-        case {"key": str(its), "files": dict(digests), "rows": dict(rows), "summary": dict(summary)} if its == key:
-            pass
-        case _:
-            return None
-    for its_file in _traffic_paths(city):
-        if not its_file.is_file() or files.hash_file(its_file) != digests.get(_traffic_label(city, its_file)):
-            return None
-    return CityTraffic(False, summary, rows)
-
-
-def _record_period(
-    scenario: Scenario,
-    folder: Path,
-    traffic_regions: Mapping[str, TrafficRegion],
-    paths: Mapping[str, Path],
-    progress: ProgressCallback,
-) -> tuple[Summary, dict[str, int]]:
-    """Record the traffic of one period and write every junction's file; what came out, and the rows of each."""
-    effects, notes = registry.active_traffic_effects(scenario)
-    world = geolocation.scenario_georeference(scenario)
-    with recording.record_traffic(scenario, folder, effects, progress, None, world) as recorded:
-        tally, rows = split_recording(scenario, recorded, traffic_regions, paths, effects, progress)
-        done = recorded.summary()
-        doubts = trajectories.traffic_warnings(tally, recorded, scenario.roi.box)
-    summary = tally.to_json(recorded.window.period_ms / 1000.0) | ({} if done is None else asdict(done))
-    doubts = [doubt for doubt in doubts if doubt.rule != "overlaps"]  # a share of frames: each junction tells its own
-    if any(not effect.ADDS_TRAFFIC for effect in effects):
-        doubts += _slope_warnings(scenario, traffic_regions)
-    told = [*summary.get(WARNINGS_KEY, []), *(finding.to_json() for finding in doubts)]
-    summary[WARNINGS_KEY] = [{key: _reword_for_city(value) for key, value in warning.items()} for warning in told]
-    if notes:
-        summary["notes"] = [*summary.get("notes", []), *notes]
-    return summary, rows
-
-
-def _slope_warnings(scenario: Scenario, traffic_regions: Mapping[str, TrafficRegion]) -> Iterator[Diagnostic]:
-    """A warning of junctions that do not know the relief of the network."""
-    flat = [name for name, region in traffic_regions.items() if region.scenario.traffic.roads is None]
-    if flat:
-        found = f"the network goes up and down, but {', '.join(flat)} name no roads: the ground is level there"
-        cure = "traffic.roads in their scenarios"
-        yield Diagnostic("relief", sumo_folder.traffic_key(scenario), found, cure)
-
-
-def _no_traffic_warnings(scenario: Scenario, rows: Mapping[str, int]) -> list[dict[str, Any]]:
-    """A warning of junctions to which nobody comes."""
-    if not (empty := [name for name, count in rows.items() if not count]):
-        return []
-    found, cure = f"no vehicle comes near {', '.join(empty)}", f"more traffic, or no row for them in {JUNCTIONS_FILE}"
-    return [Diagnostic("junctions without traffic", sumo_folder.traffic_key(scenario), found, cure).to_json()]
-
-
-def _reword_for_city(value: Any) -> Any:
-    """A warning's words: what stands for the region of interest is the rectangle round all junctions."""
-    return value.replace("the region of interest", "the city's junctions") if isinstance(value, str) else value
+def _with_frame_times(group: FrameGroup, period_ms: int) -> pa.Table:
+    """Return the rows of a group by ascending frame, with times from the first frame on."""
+    order = np.argsort(group.frame, kind="stable")  # pedestrians come after the vehicles of the whole group
+    rows = group.rows
+    if np.any(np.diff(group.frame) < 0):
+        rows = rows.take(pa.array(order))
+    times_ms = pc.cast(pa.array(group.frame[order] * period_ms), pa.int64())
+    return rows.set_column(rows.schema.get_field_index("time_ms"), "time_ms", times_ms)

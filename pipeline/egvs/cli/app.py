@@ -273,20 +273,13 @@ def accuracy(
     """Measure error against run time for many settings, and recommend the cheapest within a tolerance."""
     from egvs.cli import study_tables
     from egvs.cli.console import ProgressDisplay
-    from egvs.studies.accuracy import run_accuracy_study
+    from egvs.studies.accuracy import StudyOptions, run_accuracy_study
 
     _, folder = _load(scenario, set_, out)
+    options = StudyOptions(tolerance, cli_options.duration_s(budget), seeds, jobs)
     with ProgressDisplay("accuracy") as screen:
         study = run_accuracy_study(
-            scenario,
-            set_ or (),
-            folder,
-            tolerance=tolerance,
-            budget_s=cli_options.duration_s(budget),
-            seeds=seeds,
-            jobs=jobs,
-            progress=screen.progress,
-            listener=screen.setting_event,
+            scenario, set_ or (), folder, options, progress=screen.progress, listener=screen.setting_event
         )
     study_tables.print_study(study, cli_options.command("run", scenario, set_))
 
@@ -388,7 +381,7 @@ def explore(
         page = Page(session, scratch, port, tuple(command))
         try:
             if view:
-                page.open_at(view, "--view")
+                page.open_link(view, "--view")
             print(f"{page.address}  (press Ctrl-C to stop)", flush=True)
             if browser:
                 webbrowser.open(page.address)

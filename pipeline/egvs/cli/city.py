@@ -12,10 +12,11 @@ import typer
 from egvs.cli import options
 
 if TYPE_CHECKING:
-    from egvs.city.city_run import CityPlacement, CityRun
+    from egvs.city.city_run import CityPlacement, CityRun, CityRunOptions
     from egvs.city.creation import NewCity
     from egvs.city.tasks import JobResult
     from egvs.city.traffic_split import CityTraffic
+    from egvs.cli.console import ProgressDisplay
 
 _WIDTH = 150
 
@@ -100,10 +101,8 @@ def run(
     from egvs.cli.console import ProgressDisplay
 
     with ProgressDisplay("city") as screen:
-        result = city_run.run_city(
-            model.load_city(city), out, where=cluster, only=junction or (), sets=set_ or (), progress=screen.progress,
-            on_done=lambda done: screen.say(describe_done(done)),
-        )  # fmt: skip
+        run_options = _run_options(cluster, junction, set_, screen)
+        result = city_run.run_city(model.load_city(city), out, run_options)
         for warning in result.warnings:
             screen.say(f"warning: {warning}")
     print_junctions(result)
@@ -125,13 +124,22 @@ def place(
     from egvs.cli.console import ProgressDisplay
 
     with ProgressDisplay("city") as screen:
-        placed = city_run.place_city(
-            model.load_city(city), out, count=count, budget=budget, where=cluster, only=junction or (), sets=set_ or (),
-            progress=screen.progress, on_done=lambda done: screen.say(describe_done(done)),
-        )  # fmt: skip
+        run_options = _run_options(cluster, junction, set_, screen)
+        placed = city_run.place_city(model.load_city(city), out, run_options, count=count, budget=budget)
         for warning in placed.city_run.warnings:
             screen.say(f"warning: {warning}")
     print_plan(placed)
+
+
+def _run_options(
+    cluster: str, junctions: list[str] | None, overrides: list[str] | None, screen: ProgressDisplay
+) -> CityRunOptions:
+    from egvs.city.city_run import CityRunOptions
+
+    def on_done(done: JobResult) -> None:
+        screen.say(describe_done(done))
+
+    return CityRunOptions(cluster, junctions or (), overrides or (), screen.progress, on_done)
 
 
 def _print_new(city: NewCity) -> None:
@@ -141,7 +149,7 @@ def _print_new(city: NewCity) -> None:
         Column("junction", lambda row: row.id, "left"),
         Column("title", lambda row: row.junction.title, "left", wrap=True),
         Column("lanes in", lambda row: str(row.junction.lanes_in)),
-        Column("poles", lambda row: str(len(row.places))),
+        Column("poles", lambda row: str(len(row.poles))),
         Column("sites", lambda row: str(row.sites)),
     ]
     out = console(WIDE)
@@ -194,7 +202,7 @@ def _print_mapping(values: Mapping[str, Any]) -> None:
 
 def describe_done(done: JobResult) -> str:
     """Return one line about a finished junction."""
-    stages = ", ".join(done.made) or "nothing, all results were up to date"
+    stages = ", ".join(done.stages_run) or "nothing, all results were up to date"
     return f"{done.junction:<14} {done.seconds:>8.2f} s   {done.sites} sites; ran {stages}"
 
 
@@ -250,7 +258,7 @@ def print_plan(placed: CityPlacement) -> None:
         out.print("* already installed")
 
     cost = f" for {plan.cost:g}" if plan.cost else ""
-    share = plan.joint / plan.together if plan.together > 0 else 0.0
+    share = plan.joint / plan.joint_of_all if plan.joint_of_all > 0 else 0.0
     proved = math.floor(plan.certificate * 1e4) / 1e2  # never rounded up
     out.print(
         f"{len(plan.sensors)} sensors at {len(plan.by_junction)} of {plan.junctions} junctions{cost}: "

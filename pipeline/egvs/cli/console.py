@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from egvs.artefacts.run_folder import StageRecord
+from egvs.artefacts.run_record import StageRecord
 from egvs.cli import stage_summary
 from egvs.core.errors import collect_warnings
 

@@ -13,6 +13,7 @@ from egvs.cli.options import Jobs, Out, ScenarioPath, Set
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from egvs.artefacts.planned_sensor import PlannedSensor
     from egvs.placement.plan import Placement, RefinementSummary
 
 
@@ -73,15 +74,15 @@ def print_placement(placed: Placement) -> None:
 
     out = console(WIDE)
     out.print(_sensor_table(placed))
-    if any(pick.is_forced for pick in placed.sensors):
+    if any(sensor.forced for sensor in placed.sensors):
         out.print("* already installed")
     out.print(_curve_table(placed))
     for zone in placed.zones:
         sensors = f" by {zone.by} sensors" if zone.by > 1 else ""
         out.print(f"zone {zone.name}: {zone.seen:.1%} of its entropy seen{sensors}, {zone.share:.1%} required")
     out.print(describe_plan(placed))
-    if placed.moves is not None:
-        out.print(describe_moves(placed, placed.moves))
+    if placed.refinement is not None:
+        out.print(describe_refinement(placed, placed.refinement))
     for path in placed.files:
         out.print(str(path))
 
@@ -89,30 +90,29 @@ def print_placement(placed: Placement) -> None:
 def _sensor_table(placed: Placement) -> Table:
     from egvs.cli.console import Column, make_table
 
-    sensors = placed.sensors
-    columns = [
-        Column[int]("", lambda i: f"{i + 1}*" if sensors[i].is_forced else str(i + 1)),
-        Column[int]("site", lambda i: sensors[i].site.name, "left"),
-        Column[int]("z m", lambda i: f"{sensors[i].site.pose.z_m:g}"),
-        Column[int]("yaw deg", lambda i: f"{sensors[i].site.pose.yaw_deg:.1f}"),
-        Column[int]("pitch deg", lambda i: f"{sensors[i].site.pose.pitch_deg:.1f}"),
-        Column[int]("sensor", lambda i: sensors[i].site.sensor, "left"),
-        Column[int]("gain", lambda i: f"{sensors[i].gain:.6g}"),
-        Column[int]("joint score", lambda i: f"{sensors[i].score:.6g}"),
-        Column[int]("lost if it fails", lambda i: f"{_loss_share(placed, i):.1%}"),
-        Column[int]("cost", lambda i: f"{sensors[i].cost:g}"),
+    columns: list[Column[PlannedSensor]] = [
+        Column("", lambda row: f"{row.order}*" if row.forced else str(row.order)),
+        Column("site", lambda row: row.site, "left"),
+        Column("z m", lambda row: f"{row.z_m:g}"),
+        Column("yaw deg", lambda row: f"{row.yaw_deg:.1f}"),
+        Column("pitch deg", lambda row: f"{row.pitch_deg:.1f}"),
+        Column("sensor", lambda row: row.sensor, "left"),
+        Column("gain", lambda row: f"{row.gain:.6g}"),
+        Column("joint score", lambda row: f"{row.score:.6g}"),
+        Column("lost if it fails", lambda row: f"{_loss_share(placed, row):.1%}"),
+        Column("cost", lambda row: f"{row.cost:g}"),
     ]
-    if placed.moves is not None:
-        columns.append(Column("moved m", lambda i: f"{sensors[i].moved_m:.2f}"))
-        columns.append(Column("gained by moving", lambda i: f"{sensors[i].gain_by_refining:.6g}"))
-    return make_table(columns, range(len(sensors)))
+    if placed.refinement is not None:
+        columns.append(Column("moved m", lambda row: f"{row.moved_m:.2f}"))
+        columns.append(Column("gained by moving", lambda row: f"{row.gain_by_refining:.6g}"))
+    return make_table(columns, placed.sensors)
 
 
-def _loss_share(placed: Placement, number: int) -> float:
+def _loss_share(placed: Placement, sensor: PlannedSensor) -> float:
     """Return the share of the joint score that is lost if one sensor fails."""
     if not placed.joint > 0:
         return 0.0
-    return placed.sensors[number].loss / placed.joint
+    return sensor.loss / placed.joint
 
 
 def _curve_table(placed: Placement) -> Table:
@@ -133,18 +133,18 @@ def _curve_table(placed: Placement) -> Table:
 
 def _score_share(placed: Placement, joint: float) -> float:
     """Return a joint score as a share of that of all candidates together."""
-    if not placed.together > 0:
+    if not placed.joint_of_all > 0:
         return 0.0
-    return joint / placed.together
+    return joint / placed.joint_of_all
 
 
 def describe_plan(placed: Placement) -> str:
     """Return the plan and its certificate in one sentence."""
     joint = placed.solution.point.plan_value.joint
-    sites = ", ".join(pick.site.name for pick in placed.sensors) or "no sensor"
+    sites = ", ".join(sensor.site for sensor in placed.sensors) or "no sensor"
     cost = f" for {placed.curve_costs[-1]:g}" if placed.curve_costs[-1] else ""
     score = f"{placed.score} {joint:.6g}"
-    if placed.together > 0:
+    if placed.joint_of_all > 0:
         share = _score_share(placed, joint)
         score += f", {share:.1%} of the score of all {placed.candidates} candidates together"
     return f"{sites}{cost}: {score}; {_describe_proof(placed)}"
@@ -164,17 +164,17 @@ def _describe_proof(placed: Placement) -> str:
     return f"proved: at least {_format_rounded_down(placed.certificate)} of the best possible"
 
 
-def describe_moves(placed: Placement, moves: RefinementSummary) -> str:
+def describe_refinement(placed: Placement, summary: RefinementSummary) -> str:
     """Return what the refinement of poses changed."""
-    change = f" ({placed.joint / moves.before - 1.0:+.1%})" if moves.before > 0 else ""
+    change = f" ({placed.joint / summary.joint_before - 1.0:+.1%})" if summary.joint_before > 0 else ""
     cost = f", for {placed.cost:g}" if placed.cost else ""
     objective = ""
-    if (moves.value_before, moves.value) != (moves.before, placed.joint):
-        objective = f"; objective {moves.value_before:.6g} before, {moves.value:.6g} after"
+    if (summary.value_before, summary.value_after) != (summary.joint_before, placed.joint):
+        objective = f"; objective {summary.value_before:.6g} before, {summary.value_after:.6g} after"
     return (
-        f"refined: {placed.score} {moves.before:.6g} before, {placed.joint:.6g} after{change}{objective}{cost}; "
-        f"{moves.tried} poses tried in {moves.turns} turns and {moves.seconds:.1f} s, {moves.impossible} of them "
-        f"infeasible; the proof applies to the candidates at their original poses"
+        f"refined: {placed.score} {summary.joint_before:.6g} before, {placed.joint:.6g} after{change}"
+        f"{objective}{cost}; {summary.poses_tried} poses tried in {summary.turns} turns and {summary.seconds:.1f} s, "
+        f"{summary.poses_infeasible} of them infeasible; the proof applies to the candidates at their original poses"
     )
 
 

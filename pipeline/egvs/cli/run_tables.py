@@ -18,7 +18,7 @@ from rich.table import Table
 
 from egvs.artefacts import parquet
 from egvs.artefacts.readers import DISTINCT_PROBABILITY, PeriodRank, PeriodRanking
-from egvs.artefacts.run_folder import RunRecord
+from egvs.artefacts.run_record import RunRecord
 from egvs.cli.console import NARROW, WIDE, Column, console, format_value, format_values, make_table, print_table
 from egvs.core.errors import collect_warnings
 from egvs.report import sections

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from egvs.artefacts.run_folder import StageRecord
+from egvs.artefacts.run_record import StageRecord
 from egvs.core.errors import WARNINGS_KEY
 from egvs.report.formatting import SCORE_LABELS
 

@@ -62,7 +62,8 @@ def print_study(study: AccuracyStudy, command: str) -> None:
 def _describe_reference(study: AccuracyStudy) -> str:
     for row in study.rows:
         if row.kind == "reference":
-            return f"traffic {study.times} times as long, with a largest standard error of {row.error_se:.2%}"
+            factor = study.reference_factor
+            return f"traffic {factor} times as long, with a largest standard error of {row.error_se:.2%}"
     return "the scenario itself, because longer traffic is not available, or not within the budget"
 
 
@@ -128,7 +129,7 @@ def _print_seeds(out: Console, seeds: SeedComparison) -> None:
 def _describe_recommendation(study: AccuracyStudy, command: str) -> str:
     from egvs.studies.score_errors import MIN_TIME_SAVING
 
-    if study.empty:
+    if study.all_zero:
         return "every score is 0, so there is nothing to compare: check the region of interest and the traffic"
     candidates = [row for row in study.rows if row.kind in ("approximates", "scenario")]
     best = study.best

@@ -46,6 +46,7 @@ def validate(
     from egvs.runs.run import default_folder
     from egvs.scenario.loading import load
     from egvs.validation import plan_validation, site_validation
+    from egvs.validation.kitti_results import KittiFiles
 
     loaded = load(scenario, set_ or ())
     folder = out or default_folder(loaded)
@@ -53,7 +54,7 @@ def validate(
     if not plan and plan_from is None:
         with ProgressDisplay("validate") as screen:
             validation = site_validation.validate_sites(
-                loaded, folder, frames=frames, detectors=detectors, detections=detections, keep=keep, jobs=jobs,
+                loaded, folder, frames=frames, detectors=detectors, kitti=KittiFiles(detections, keep), jobs=jobs,
                 progress=screen.progress, listener=validation_tables.DetectorRunDisplay(screen.say),
             )  # fmt: skip
         validation_tables.print_validation(loaded, folder, validation)

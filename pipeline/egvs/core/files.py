@@ -10,7 +10,6 @@ write the file can compute it anew.
 from __future__ import annotations
 
 import errno
-import fcntl
 import hashlib
 import io
 import json
@@ -25,8 +24,9 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+from egvs.core import platform
 from egvs.core.errors import InputError
 
 DISK_FULL_ERRNOS = (errno.ENOSPC, errno.EDQUOT)
@@ -96,13 +96,13 @@ def _remove_stale_folders(parent: Path) -> None:
 
 def _try_lock(folder: Path) -> int | None:
     """Lock a folder of this user until the descriptor is closed; None where it is not this user's, locked, or gone."""
-    with suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    with suppress(OSError):  # Windows opens no folders: there, folders of killed programs stay
+        descriptor = os.open(folder, os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | platform.OPEN_NO_LINK)
         with suppress(OSError):
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            status = os.fstat(descriptor)
-            if status.st_uid == os.geteuid() and os.path.samestat(status, folder.stat()):
-                return descriptor
+            if platform.try_lock(descriptor):
+                status = os.fstat(descriptor)
+                if platform.is_own_file(status) and os.path.samestat(status, folder.stat()):
+                    return descriptor
         os.close(descriptor)
     return None
 
@@ -155,9 +155,16 @@ def write_text(path: Path, text: str) -> None:
 
 
 def hash_file(path: Path) -> str:
-    """Return the SHA-256 hex digest of a file; InputError when it does not exist."""
+    """Return the SHA-256 hex digest of a file; InputError when it does not exist.
+
+    An input that :func:`open_input` holds in memory is not opened again.
+    """
     if not path.is_file():
         raise InputError(path, "no such file", f"Run the stage that writes {path.name} first.")
+    held = _HELD_FILES.get()
+    content = None if held is None else held.contents.get(_file_stamp(path))
+    if content is not None:
+        return hashlib.sha256(content).hexdigest()
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
@@ -166,12 +173,28 @@ _MAX_HELD_BYTES = 128_000_000
 """Size of all files together that are held in memory."""
 
 
+class _FileStamp(NamedTuple):
+    """Changes when a file is written."""
+
+    real_path: Path
+    is_regular: bool
+    mtime_ns: int
+    inode: int
+    size: int
+
+
+def _file_stamp(path: Path) -> _FileStamp:
+    status = path.stat()
+    real_path = Path(os.path.realpath(path))
+    return _FileStamp(real_path, stat.S_ISREG(status.st_mode), status.st_mtime_ns, status.st_ino, status.st_size)
+
+
 @dataclass
 class _HeldFiles:
-    """Contents of input files, by path and by the stamp that changes when a file is written."""
+    """Contents of input files."""
 
     except_in: Path
-    contents: dict[tuple[Path, int, int, int], bytes] = field(default_factory=dict)
+    contents: dict[_FileStamp, bytes] = field(default_factory=dict)
     size: int = 0
 
 
@@ -197,16 +220,14 @@ def open_input(path: Path) -> io.BufferedReader | io.BytesIO:
     held = _HELD_FILES.get()
     if held is None:
         return path.open("rb")
-    real_path = Path(os.path.realpath(path))
-    status = path.stat()
-    fits = stat.S_ISREG(status.st_mode) and held.size + status.st_size <= _MAX_HELD_BYTES
-    key = (real_path, status.st_mtime_ns, status.st_ino, status.st_size)
-    if key not in held.contents:
-        if not fits or real_path.is_relative_to(held.except_in):
+    stamp = _file_stamp(path)
+    if stamp not in held.contents:
+        fits = stamp.is_regular and held.size + stamp.size <= _MAX_HELD_BYTES
+        if not fits or stamp.real_path.is_relative_to(held.except_in):
             return path.open("rb")
-        held.contents[key] = path.read_bytes()
-        held.size += status.st_size
-    return io.BytesIO(held.contents[key])
+        held.contents[stamp] = path.read_bytes()
+        held.size += stamp.size
+    return io.BytesIO(held.contents[stamp])
 
 
 def hash_json(value: Any) -> str:

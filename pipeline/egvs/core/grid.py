@@ -54,7 +54,14 @@ class Roi:
 
 @dataclass(frozen=True)
 class Grid:
-    """A regular grid of cubes over the region of interest."""
+    """A regular grid of cubes over the region of interest.
+
+    Examples
+    --------
+    >>> roi = Roi.around((0.0, 0.0, 1.5), (60.0, 40.0, 3.0))
+    >>> Grid.over(roi, voxel_m=0.5)
+    Grid(origin_m=(-30.0, -20.0, 0.0), voxel_m=0.5, shape=(120, 80, 6))
+    """
 
     origin_m: Vec3
     voxel_m: float

@@ -89,22 +89,6 @@ MAP_OBJECTS = Limit("EGVS_MAX_MAP_OBJECTS", 5_000_000, "objects", "a map of Open
 GROUND_POINTS = Limit("EGVS_MAX_GROUND_POINTS", 2_000_000, "points", "the ground that is laid through a network")
 READER_MEMORY = Limit("EGVS_MAX_READER_MB", 2000, "MB", "the program that unpacks a LAZ file")
 
-ALL_LIMITS = (
-    DOCUMENT,
-    FILE,
-    UNPACKED,
-    ELEMENT,
-    POINTS,
-    TRIANGLES,
-    SITES,
-    BEAMS,
-    VOXELS,
-    ROWS,
-    MAP_OBJECTS,
-    GROUND_POINTS,
-    READER_MEMORY,
-)
-
 
 def checked_size(path: Path, limit: Limit, where: object = "") -> int:
     """Return a file's size in bytes; InputError when it exceeds a limit in MB, or the file cannot be read."""

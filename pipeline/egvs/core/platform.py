@@ -1,18 +1,12 @@
-"""Everything that differs between operating systems: file locks, links, memory, and the limits of a process.
+"""What differs between operating systems: file locks, links, memory, and the limits of a process.
 
-Linux and macOS lock files with ``flock``. Elsewhere (Windows) the library filelock does: its locks are exclusive, so a
-shared lock is exclusive there too. Functions that a system does not have are described where they are replaced.
+Linux and macOS have the modules ``fcntl`` and ``resource``; Windows has ``msvcrt``, whose locks are always exclusive.
 """
 
 from __future__ import annotations
 
-import errno
 import os
-import signal
 import sys
-from pathlib import Path
-
-import psutil
 
 try:
     import fcntl
@@ -22,110 +16,61 @@ except ImportError:  # Windows
 else:
     HAS_POSIX = True
 
-IS_LINUX = sys.platform.startswith("linux")
+if sys.platform == "win32":
+    import msvcrt
 
-NO_LINK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
+OPEN_NO_LINK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_CLOEXEC", 0)
 """Flags of ``os.open`` that refuse a symbolic link, where the system knows them."""
 
-INTERRUPT_LATER = getattr(signal, "SIGALRM", None)
-"""The signal of the process' timer; None where there is none (Windows)."""
+_LOCKED_BYTE = 1 << 30
+"""Windows locks bytes of a file: one far behind its end."""
 
 
-class FileLock:
-    """A lock on a file, held by one process at a time; it ends with the process, however that ends.
+def try_lock(descriptor: int, *, shared: bool = False) -> bool:
+    """Lock an open file until it is closed, or its process ends.
 
     Parameters
     ----------
-    path
-        The lock file; it is created where there is none.
+    descriptor
+        Of a file that is open for writing, unless the lock is shared.
     shared
-        Other processes may hold the lock too, if they also share it. A file that cannot be written will do then.
+        Allow other shared locks (not on Windows).
+
+    Returns
+    -------
+    bool
+        False when another process holds the lock.
     """
-
-    def __init__(self, path: Path, *, shared: bool = False) -> None:
-        self.path = path
-        self._shared = shared
-        self._descriptor: int | None = None
-        self._other: object | None = None
-
-    def try_acquire(self) -> bool:
-        """Take the lock if it is free; return whether it is held now.
-
-        Raises
-        ------
-        OSError
-            When the file cannot be opened; ``errno.ELOOP`` for a symbolic link.
-        """
+    try:
         if HAS_POSIX:
-            return self._try_flock()
-        import filelock
-
-        lock = filelock.FileLock(self.path)
-        try:
-            lock.acquire(timeout=0)
-        except filelock.Timeout:
-            return False
-        self._other = lock
-        return True
-
-    def release(self) -> None:
-        """Give the lock back; nothing happens where it is not held."""
-        if self._descriptor is not None:
-            os.close(self._descriptor)
-            self._descriptor = None
-        if self._other is not None:
-            self._other.release()  # type: ignore[attr-defined]
-            self._other = None
-
-    def _try_flock(self) -> bool:
-        kind = fcntl.LOCK_SH if self._shared else fcntl.LOCK_EX
-        while True:
-            descriptor = _open_lock_file(self.path, self._shared)
-            try:
-                fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
-            except BlockingIOError:
-                os.close(descriptor)
-                return False
-            except BaseException:
-                os.close(descriptor)
-                raise
-            if _is_current(descriptor, self.path):
-                self._descriptor = descriptor
-                return True
-            os.close(descriptor)
-
-
-def _open_lock_file(path: Path, shared: bool) -> int:
-    if not NO_LINK and path.is_symlink():
-        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
-    try:
-        return os.open(path, os.O_RDWR | os.O_CREAT | NO_LINK, 0o666)
-    except PermissionError:
-        if not shared:
-            raise
-    return os.open(path, os.O_RDONLY | NO_LINK)
-
-
-def _is_current(descriptor: int, path: Path) -> bool:
-    """Return whether an open file is the one at ``path``: the process that held it before may have removed it."""
-    try:
-        return os.path.samestat(os.fstat(descriptor), path.stat())
-    except FileNotFoundError:
+            fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+        elif sys.platform == "win32":
+            os.lseek(descriptor, _LOCKED_BYTE, os.SEEK_SET)
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+        elif not shared:
+            os.lockf(descriptor, os.F_TLOCK, 0)
+    except (BlockingIOError, PermissionError):
         return False
+    return True
 
 
-def owns(path: Path) -> bool:
-    """Return whether a file or folder belongs to this user; Windows has no such number, so always True there."""
-    if not hasattr(os, "geteuid"):
-        return True
-    return path.lstat().st_uid == os.geteuid()
+def is_own_file(status: os.stat_result) -> bool:
+    """Return whether a file belongs to this user; always True on Windows, which has no user numbers."""
+    return not hasattr(os, "geteuid") or status.st_uid == os.geteuid()
+
+
+def user_name() -> str:
+    """Return a name of this user for file names: the user number, or the login name on Windows."""
+    return str(os.geteuid()) if hasattr(os, "geteuid") else os.environ.get("USERNAME", "user")
 
 
 def peak_memory_mb() -> float:
-    """Return the highest memory of this process so far, in MB of 2^20 bytes."""
+    """Return the highest memory of this process so far, in MB of 2**20 bytes."""
     if HAS_POSIX:
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         return float(peak) / (1024 * 1024 if sys.platform == "darwin" else 1024)
+    import psutil
+
     memory = psutil.Process().memory_info()
     return float(getattr(memory, "peak_wset", memory.rss)) / (1024 * 1024)
 

@@ -22,12 +22,12 @@ PACKAGE_NAME = "egvs"
 
 _REQUIREMENTS = {
     "egvs.effects": (
-        ("NAME", "SOURCE", "STAGE", "KIND", "Model.of"),
+        ("NAME", "SOURCE", "STAGE", "KIND", "Model.from_dict"),
         "a subclass of Detect or another kind in egvs.effects.base, with NAME, SOURCE and Model",
     ),
     "egvs.detectors": (
-        ("NAME", "SOURCE", "settings", "at"),
-        "a class with NAME, SOURCE, settings and at, see egvs.validation.detectors.base",
+        ("NAME", "SOURCE", "settings", "at_site"),
+        "a class with NAME, SOURCE, settings and at_site, see egvs.validation.detectors.base",
     ),
     "egvs.scores": (
         ("name", "formula", "source", "sign", "function"),

@@ -85,17 +85,14 @@ class Effect(Generic[P]):
 
     def why_idle(self, scene: Scene) -> str | None:
         """Return why the effect provably cannot change the result in this scene; None when it can."""
-        del scene
         return None
 
     def refusal(self, scene: Scene) -> InputError | None:
         """Return the error with which a run of this scene would stop; None when nothing is missing."""
-        del scene
         return None
 
     def summary(self, scene: Scene) -> str:
         """Return what in the scene the effect acts on, with numbers; empty where there is nothing to say."""
-        del scene
         return ""
 
     @property
@@ -143,14 +140,13 @@ class TransmitScore(Effect[P]):
 
         Called from several threads.
         """
-        del sensor_m, grid
         return self
 
     def share(self, crossings: Crossings) -> FloatArray:
         """Return the share of its beam, 0 to 1, that reaches each crossing, (k,). Called from several threads."""
         raise NotImplementedError
 
-    def falls(self, ends_m: FloatArray) -> Iterator[TransmittanceSteps] | None:
+    def transmittance_steps(self, ends_m: FloatArray) -> Iterator[TransmittanceSteps] | None:
         """Yield where the transmitted shares of beams drop, some beams at a time.
 
         This is the information of :meth:`share` without a list of crossings; None where the effect needs that list.
@@ -160,7 +156,6 @@ class TransmitScore(Effect[P]):
         ends_m
             Ends of all beams relative to the sensor, (n, 3).
         """
-        del ends_m
         return None
 
 
@@ -179,7 +174,7 @@ class Detect(Effect[P]):
             return error
         return None
 
-    def noticed_shares(self, scene: Scene) -> tuple[float, float]:
+    def detection_shares(self, scene: Scene) -> tuple[float, float]:
         """Return the mean detection probability over the region of interest, at its worst and its best site."""
         low = np.asarray(scene.roi.origin_m)
         size = np.asarray(scene.roi.size_m)
@@ -193,7 +188,7 @@ class Detect(Effect[P]):
 
     def summary(self, scene: Scene) -> str:
         """Return the share of returns from the region of interest that is detected, as a sentence."""
-        worst, best = (f"{share:.0%}" for share in self.noticed_shares(scene))
+        worst, best = (f"{share:.0%}" for share in self.detection_shares(scene))
         shares = best if worst == best else f"{worst} to {best}"
         return f"by its formula, {shares} of returns from the region are detected"
 
@@ -226,8 +221,8 @@ class Traffic(Effect[P], TrafficHook):
         return None if on else reason
 
     def refusal(self, scene: Scene) -> InputError | None:
-        """Return the error of ``refuses``."""
-        return self.refuses(scene.scenario)
+        """Return the error of ``scenario_error``."""
+        return self.scenario_error(scene.scenario)
 
     def config_key(self, scenario: Scenario) -> str:
         """Return the file and key that messages point to."""

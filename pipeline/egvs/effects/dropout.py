@@ -33,12 +33,10 @@ class Dropout(Detect[DropoutParameters]):
 
     def why_idle(self, scene: Scene) -> str | None:
         """A share of 0 changes nothing."""
-        del scene
         if self.parameters.share == 0:
             return "share is 0"
         return None
 
     def detect(self, range_m: FloatArray, sensor: Sensor) -> FloatArray:
         """Return 1 - share."""
-        del sensor
         return np.full(len(range_m), 1.0 - self.parameters.share)

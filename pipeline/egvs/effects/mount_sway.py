@@ -71,7 +71,6 @@ class MountSway(Expand[MountSwayParameters]):
 
     def expand(self, directions: FloatArray, sensor: Sensor, pose: Pose) -> SubBeams:
         """Return each beam once for each tilt."""
-        del sensor, pose
         tilts, weights = tilt_nodes(self.parameters.samples if self.parameters.tilt_deg > 0 else 1)
         rays = np.empty((len(directions), len(weights), 3))
         for i, (about_x, about_y) in enumerate(tilts * self.parameters.tilt_deg):

@@ -21,7 +21,7 @@ smaller the voxels. It is included because grid-based planners use it; use it to
 
 Contact: a box stops a beam that passes more than 0.1 mm inside it (the same shrunk box that occupies voxels), so that a
 side that coincides with a voxel's face or a beam does not matter. A box that contains the sensor is ignored
-(:meth:`Replay.holding` counts them): no pole stands in a lane, but a recorded box may still sweep over one.
+(:meth:`Replay.count_boxes_around` counts them): no pole stands in a lane, but a recorded box may still sweep over one.
 
 Source: replayed vehicle shapes as dynamic blind zones, as in the roadside LiDAR simulation of
 doi:10.1177/03611981251327575 (Transp. Res. Rec., 2025). Independent cells: the inverse beam model of Julian, Karaman
@@ -44,8 +44,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
+from egvs.artefacts.frame_boxes import FrameBoxes, read_boxes
 from egvs.artefacts.tpog import Tpog
-from egvs.artefacts.traffic_frames import FrameBoxes, read_boxes, spaced_frames
+from egvs.artefacts.traffic_frames import spaced_frames
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.effects.base import TransmitScore
@@ -78,7 +79,6 @@ class MovingOcclusion(TransmitScore[MovingOcclusionParameters]):
 
     def summary(self, scene: Scene) -> str:
         """Occlusion matters wherever there is traffic."""
-        del scene
         return "vehicles hide what is behind them"
 
     @property
@@ -88,7 +88,6 @@ class MovingOcclusion(TransmitScore[MovingOcclusionParameters]):
 
     def prepare(self, scene: Scene, tpog: Tpog, trajectories: Path | None) -> MovingOcclusion:
         """Read the boxes of the replayed frames, or take the counts of the TPOG."""
-        del scene
         if self.parameters.method == "independent":
             return replace(self, ready=IndependentVoxels(tpog.frames, tpog.counts.ravel().astype(np.uint32)))
         if trajectories is None:
@@ -108,10 +107,10 @@ class MovingOcclusion(TransmitScore[MovingOcclusionParameters]):
             raise RuntimeError("moving_occlusion: share() needs the effect that prepare() and for_sensor() return")
         return self.ready.share(crossings)
 
-    def falls(self, ends_m: FloatArray) -> Iterator[TransmittanceSteps] | None:
+    def transmittance_steps(self, ends_m: FloatArray) -> Iterator[TransmittanceSteps] | None:
         """Yield where the share of each beam drops, if boxes are replayed."""
         if isinstance(self.ready, FacingBoxes):
-            return self.ready.falls(ends_m)
+            return self.ready.transmittance_steps(ends_m)
         return None
 
 
@@ -150,7 +149,7 @@ class Replay:
         first = np.append(0, np.cumsum(np.bincount(box, minlength=len(distinct))))
         return cls(frames, first, numbers[np.argsort(box, kind="stable")], distinct, low, high)
 
-    def holding(self, sensor_m: FloatArray) -> int:
+    def count_boxes_around(self, sensor_m: FloatArray) -> int:
         """Count the boxes (once per frame) that contain a sensor (3,) in the grid frame; they are ignored for it."""
         near = np.flatnonzero(((self.low < sensor_m) & (sensor_m < self.high)).all(axis=1))
         n_frames = np.diff(self.first_frame)
@@ -192,13 +191,13 @@ class FacingBoxes:
     def share(self, crossings: Crossings) -> FloatArray:
         """Return the share of the frames in which the beam reaches each crossing, (k,) float64."""
         reached = np.ones(len(crossings.cells))
-        for part in self.falls(crossings.ends_m):
+        for part in self.transmittance_steps(crossings.ends_m):
             occlusion.share_at_crossings(
                 crossings.first, crossings.enter_m, part.rows, part.first, part.range_m, part.share, reached
             )
         return reached
 
-    def falls(self, ends_m: FloatArray) -> Iterator[TransmittanceSteps]:
+    def transmittance_steps(self, ends_m: FloatArray) -> Iterator[TransmittanceSteps]:
         """Yield where the shares of beams drop; ``ends_m`` (n, 3) are their ends relative to the sensor."""
         n_frames = self.replay.frames
         run_m = np.hypot(ends_m[:, 0], ends_m[:, 1])

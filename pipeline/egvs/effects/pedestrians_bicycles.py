@@ -86,7 +86,7 @@ class PedestriansBicycles(Traffic[PedestriansBicyclesParameters]):
     DECIDED_BY: ClassVar[str] = "whether people must be seen"
     ADDS_TRAFFIC: ClassVar[bool] = True
 
-    def refuses(self, scenario: Scenario) -> InputError | None:
+    def scenario_error(self, scenario: Scenario) -> InputError | None:
         """Return the error for a finished FCD file, to which nobody can be added."""
         if scenario.traffic.fcd is None or not self.acts(scenario)[0]:
             return None

@@ -62,7 +62,6 @@ class Rain(Detect[RainParameters]):
 
     def why_idle(self, scene: Scene) -> str | None:
         """A rain rate of 0 changes nothing."""
-        del scene
         if self.parameters.rate_mm_h == 0:
             return "rate_mm_h is 0"
         return None
@@ -74,6 +73,5 @@ class Rain(Detect[RainParameters]):
 
     def detect(self, range_m: FloatArray, sensor: Sensor) -> FloatArray:
         """Return exp(-2 alpha r)."""
-        del sensor
         share: FloatArray = np.exp(-2 * self.extinction_per_m() * range_m)
         return share

@@ -10,7 +10,7 @@ Effects on traffic and ground may also activate themselves where leaving them ou
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 from egvs.core import plugins
 from egvs.effects import base
@@ -18,7 +18,9 @@ from egvs.scenario.effects_config import GROUP, EffectParameters, EffectsConfig
 from egvs.scenario.model import Scenario
 from egvs.traffic import sumo_folder
 from egvs.traffic.vehicle_boxes import VehicleSize
-from egvs.world.terrain import GroundSource
+
+if TYPE_CHECKING:
+    from egvs.world.terrain import GroundSource
 
 _BASE_CLASSES = (base.Expand, base.TransmitScan, base.TransmitScore, base.Detect, base.Traffic)
 
@@ -114,8 +116,8 @@ def followed_types(scenario: Scenario, sizes: Mapping[str, VehicleSize]) -> froz
 def ground_effect(scenario: Scenario) -> GroundSource | None:
     """Return the effect that provides the ground; None where it is flat."""
     for effect in _candidate_effects(scenario):
-        if isinstance(effect, GroundSource) and effect.acts(scenario)[0]:
-            return effect
+        if hasattr(effect, "ground") and effect.acts(scenario)[0]:
+            return cast("GroundSource", effect)
     return None
 
 

@@ -1,9 +1,9 @@
-"""Who may use the page: browsers that opened the address that ``egvs explore`` printed, and nobody else.
+"""Restrict the explorer's page to browsers that opened the address that ``egvs explore`` printed.
 
-The address holds a key that is drawn afresh at every start. Who brings it gets a cookie, and every other request must
-show that cookie: so no other user or program of this machine gets in. A page of another origin that a browser has open
-cannot use the browser's cookie either, as the origin of a connection has to be this one; nor can a name that its owner
-has pointed at this machine (DNS rebinding), as a request has to name this machine as its host.
+The address contains a random key, new at every start. A request with the key gets a cookie, and all other requests
+must have that cookie, so other users and programs of the machine have no access. Web pages of another origin cannot
+use the browser's cookie, because the origin of a connection must be this page; host names that somebody points at this
+machine (DNS rebinding) do not work either, because requests must name this machine as their host.
 """
 
 from __future__ import annotations
@@ -21,92 +21,119 @@ from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 KEY_PARAMETER = "key"
-"""Of the query of the address."""
+"""Parameter of the address's query."""
 
 _HOSTS = ("127.0.0.1", "localhost")
-_MAX_QUERY_LENGTH = 4096
-_REFUSAL = "egvs explore: open the address that it printed; it holds the key to this page.\n"
+_MAX_PATH_LENGTH = 4096
+_REFUSAL = "egvs explore: open the address that it printed; it contains the key to this page.\n"
 
 RequestHandler = Callable[[ServerConnection, Request], Response | None]
 
 
 class AccessGuard:
-    """Stands before a server.
+    """Checks the requests to a server.
 
     Parameters
     ----------
-    opened
-        Called with the rest of an address's query (key and value), from the server's thread; gives the query that the
-        browser is sent on to.
+    on_open
+        Called with the rest of an address's query when a browser opens it, in the server's thread; returns the query
+        that the browser is redirected to.
+
+    Attributes
+    ----------
+    key
+        The key in the address.
+    is_active
+        Whether a server uses this guard.
     """
 
-    def __init__(self, opened: Callable[[dict[str, str]], dict[str, str]]) -> None:
+    def __init__(self, on_open: Callable[[dict[str, str]], dict[str, str]]) -> None:
         self.key = secrets.token_urlsafe(24)
         self.is_active = False
-        self._opened = opened
+        self._on_open = on_open
 
     @contextmanager
-    def before_a_server(self) -> Iterator[None]:
-        """A server of websockets that is started in the meantime asks this guard before it answers."""
-        real = websockets.asyncio.server.serve
+    def protect_new_servers(self) -> Iterator[None]:
+        """Protect every websocket server that is started inside the ``with`` block."""
+        original = websockets.asyncio.server.serve
 
-        def serve(*args: Any, process_request: RequestHandler, **more: Any) -> Any:
+        def serve(*args: Any, process_request: RequestHandler, **options: Any) -> Any:
             self.is_active = True
-            return real(*args, process_request=self.before(process_request), **more)
+            return original(*args, process_request=self._guarded(process_request), **options)
 
         websockets.asyncio.server.serve = serve  # type: ignore[assignment, misc]
         try:
             yield
         finally:
-            websockets.asyncio.server.serve = real  # type: ignore[misc]
+            websockets.asyncio.server.serve = original  # type: ignore[misc]
 
-    def before(self, answer: RequestHandler) -> RequestHandler:
-        """An answer to requests that are let through."""
-
+    def _guarded(self, answer: RequestHandler) -> RequestHandler:
         def guarded(connection: ServerConnection, request: Request) -> Response | None:
             port = connection.local_address[1]
-            return self.refusal_or_welcome(port, request) or answer(connection, request)
+            return self.check_request(port, request) or answer(connection, request)
 
         return guarded
 
-    def refusal_or_welcome(self, port: int, request: Request) -> Response | None:
-        """What is said to a request that brings the key, or must not pass; None for one that passes."""
-        headers, ours = request.headers, [f"{host}:{port}" for host in _HOSTS]
-        is_page, origins = "Upgrade" not in headers, [[f"http://{its}"] for its in ours]
+    def check_request(self, port: int, request: Request) -> Response | None:
+        """Check a request.
+
+        Parameters
+        ----------
+        port
+            Port of the server.
+        request
+            The request.
+
+        Returns
+        -------
+        Response or None
+            A redirection for a request with the key, a refusal, or None for a request that may pass.
+        """
+        headers = request.headers
+        is_page = "Upgrade" not in headers
+        hosts = [f"{host}:{port}" for host in _HOSTS]
+        origins = [[f"http://{host}"] for host in hosts]
         if is_page:
-            origins.append([])  # browsers name none where somebody opens an address
-        is_ours = headers.get_all("Host") in [[its] for its in ours] and headers.get_all("Origin") in origins
-        if not is_ours or len(request.path) > _MAX_QUERY_LENGTH:
+            origins.append([])  # browsers send no origin when somebody opens an address
+        has_host = headers.get_all("Host") in [[host] for host in hosts]
+        if not has_host or headers.get_all("Origin") not in origins or len(request.path) > _MAX_PATH_LENGTH:
             return _response(http.HTTPStatus.FORBIDDEN)
         query = dict(parse_qsl(urlsplit(request.path).query))
         if is_page and self._is_key(query.pop(KEY_PARAMETER, "")):
-            to = urlencode(self._opened(query), safe=",")
+            target = urlencode(self._on_open(query), safe=",")
+            location = f"/?{target}" if target else "/"
             cookie = f"{_cookie_name(port)}={self.key}; HttpOnly; SameSite=Strict; Path=/"
-            return _response(http.HTTPStatus.SEE_OTHER, {"Location": f"/?{to}" if to else "/", "Set-Cookie": cookie})
-        return None if self._is_key(_cookie_key(headers, port)) else _response(http.HTTPStatus.FORBIDDEN)
+            return _response(http.HTTPStatus.SEE_OTHER, {"Location": location, "Set-Cookie": cookie})
+        if self._is_key(_cookie_key(headers, port)):
+            return None
+        return _response(http.HTTPStatus.FORBIDDEN)
 
     def _is_key(self, value: str) -> bool:
         return secrets.compare_digest(value.encode(), self.key.encode())
 
 
 def _cookie_name(port: int) -> str:
-    """A name of its own for each port: browsers keep cookies by machine."""
+    """Return a name that depends on the port, because browsers do not separate cookies by port."""
     return f"egvs_explore_{port}"
 
 
 def _cookie_key(headers: Headers, port: int) -> str:
-    """The key in the cookie; empty where there is none."""
-    pairs = (pair.strip().partition("=") for its in headers.get_all("Cookie") for pair in its.split(";"))
-    return next((value for name, _, value in pairs if name == _cookie_name(port)), "")
+    """Return the key in the cookie; empty without one."""
+    for header in headers.get_all("Cookie"):
+        for pair in header.split(";"):
+            name, _, value = pair.strip().partition("=")
+            if name == _cookie_name(port):
+                return value
+    return ""
 
 
-def _response(status: http.HTTPStatus, more: dict[str, str] | None = None) -> Response:
+def _response(status: http.HTTPStatus, extra_headers: dict[str, str] | None = None) -> Response:
     body = b"" if status is http.HTTPStatus.SEE_OTHER else _REFUSAL.encode()
     headers = {
         "Content-Type": "text/plain; charset=utf-8",
         "Content-Length": str(len(body)),
         "Cache-Control": "no-store",
         "Referrer-Policy": "no-referrer",
-        **(more or {}),
+        **(extra_headers or {}),
     }
     return Response(status.value, status.phrase, Headers(headers), body)

@@ -1,8 +1,8 @@
-"""The page of a session: the scene in three dimensions, the candidates, and a gizmo that moves one of them.
+"""The explorer's page: the scene in 3D, the candidates, and a gizmo that moves a sensor.
 
-All browsers that look at it share one state. Whatever they do (gizmo, numbers, a click, a link) only says what is
-wanted; :meth:`Page.run` shows the last that was wanted, in the thread that called it. So the number that rests is that
-of the pose that rests, however fast somebody drags.
+All browsers share one state. What users do (gizmo, numbers, clicks, links) only requests a view;
+:meth:`Page.run` shows the latest requested view, in the thread that called it. So however fast somebody drags, the
+last number is that of the last pose.
 """
 
 from __future__ import annotations
@@ -24,44 +24,53 @@ import viser
 from matplotlib import image
 
 from egvs.core.errors import EgvsError, InputError, RunError
+from egvs.core.grid import Vec3
 from egvs.core.runtime import release_memory
 from egvs.explore import controls, drawing, settings
 from egvs.explore.access import KEY_PARAMETER, AccessGuard
-from egvs.explore.controls import Controls, show_modal
+from egvs.explore.controls import Controls, PanelContent, show_modal
 from egvs.explore.session import MovingPlan, Playback, Session
 from egvs.explore.settings import SessionFactory
 from egvs.explore.view_state import SAVED_SITES, Camera, View, decode_view, encode_view, save_pose, unused_file_name
-from egvs.sensors.sites import Site
+from egvs.sensors.sites import Pose, Site
 
 HOST = "127.0.0.1"
-"""Nobody else's machine can reach it."""
+"""The page cannot be reached from other machines."""
 
 GIZMO_M = 6.0
 FRAME_S = 0.25
-"""So long a frame stays while recorded traffic plays; longer where the machine needs it."""
+"""Shortest time between frames when recorded traffic plays."""
 
 FREE_MEMORY_EVERY = 32
-"""After so many moves memory that is kept for later is given back: it grows as arrays of many sizes come and go."""
+"""Moves after which unused memory is returned to the system."""
 
 _SHUTDOWN_S = 5.0
 
 
 def check_port_free(port: int) -> None:
-    """InputError where no page can be served on a port: told before long work is done for it."""
+    """Raise an InputError if a port cannot be used; called before long computations."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((HOST, port))
         except OSError as error:
-            found = "is taken" if error.errno == errno.EADDRINUSE else f"cannot be used ({error.strerror})"
-            raise InputError("--port", f"{port} {found}", "another one, or 0 for any that is free") from None
+            if error.errno == errno.EADDRINUSE:
+                raise _port_taken(port) from None
+            raise InputError("--port", f"port {port} cannot be used ({error.strerror})", _PORT_HINT) from None
+
+
+_PORT_HINT = "Use another port, or 0 for any free one."
+
+
+def _port_taken(port: int) -> InputError:
+    return InputError("--port", f"port {port} is in use", _PORT_HINT)
 
 
 class _Server(viser.ViserServer):
-    """A server that stays on this machine: whoever opens the page cannot have it published."""
+    """A server whose page cannot be published."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """Nothing is shared."""
+        """Refuse to publish the page."""
         return None
 
 
@@ -70,287 +79,361 @@ class Page:
 
     Parameters
     ----------
+    session
+        The session without changes.
     scratch
-        A folder for runs with other settings, which goes with the page.
+        A temporary folder for runs with other settings.
     port
-        On this machine; 0 for any that is free.
-    opened_with
-        The words of the command that opens it again; for links.
+        Port on this machine; 0 for any free one.
+    command
+        Words of the command that opens the session, for links.
+
+    Attributes
+    ----------
+    session, view, plan, rating
+        What the page shows: session with its settings, view, plan, and scores of the selected sensor.
+    controls, server, gizmo, label, world
+        The panel, the server, and parts of the scene.
+    guard
+        Restricts access.
+    zero_m
+        Origin of the drawing in the world frame.
 
     Raises
     ------
     InputError
-        When the port is taken.
+        If the port is in use.
     """
 
-    def __init__(self, session: Session, scratch: Path, port: int = 0, opened_with: Sequence[str] = ()) -> None:
-        self.session = self._mix = session
-        self._initial_session, self._variants, self._opened_with = (
-            session,
-            SessionFactory(session, scratch),
-            tuple(opened_with),
-        )
+    def __init__(self, session: Session, scratch: Path, port: int = 0, command: Sequence[str] = ()) -> None:
+        self.session = self._all_periods = self._initial_session = session
+        self._variants, self._command = SessionFactory(session, scratch), tuple(command)
         self.zero_m = drawing.drawing_origin(session.scene.roi)
-        self.view = self._opened = View.of(session)
+        self.view = self._initial_view = View.from_session(session)
         site = self.view.site
-        self.rating = session.rate(site.name, site.pose)  # compiles what is needed before anybody waits
+        self.rating = session.rate(site.name, site.pose)  # compiles everything before the first request
         self.plan, self._playback = session.plan, Playback(session)
         self._changed = threading.Condition()
-        self._latest, self._has_request = self.view, False
-        self._ended = self._is_busy = False
-        self._dragging: int | None = None
+        self._requested, self._has_request = self.view, False
+        self._is_stopped = self._is_busy = False
+        self._dragging_client: int | None = None
         self._notice, self._draw_count = "", 0
-        self.guard = AccessGuard(self._followed)
-        with redirect_stdout(io.StringIO()), self.guard.before_a_server():  # it greets in its own words
-            self._server = _Server(host=HOST, port=port, label="egvs explore", verbose=False)
+        self.guard = AccessGuard(self._open_query)
+        with redirect_stdout(io.StringIO()), self.guard.protect_new_servers():  # viser prints a banner
+            self.server = _Server(host=HOST, port=port, label="egvs explore", verbose=False)
         if not self.guard.is_active:
             self.stop()
-            raise RunError("viser serves pages in another way than egvs explore knows how to guard")
-        if port and self._server.get_port() != port:  # it has looked for another one
+            raise RunError("this version of viser starts its server in another way, so the page cannot be protected")
+        if port and self.server.get_port() != port:  # viser uses another port instead
             self.stop()
-            raise InputError("--port", f"{port} is taken", "another one, or 0 for any that is free")
-        self._draw()
+            raise _port_taken(port)
+        self._draw_scene()
         self._show(self.view)
-        release_memory()  # what the run that came before has left
+        release_memory()  # of the run before
 
     @property
     def address(self) -> str:
-        """What a browser opens: with the key, without which nobody gets in."""
-        return f"{self._origin}/?{KEY_PARAMETER}={self.guard.key}"
+        """The address to open, with the key."""
+        return f"{self.origin}/?{KEY_PARAMETER}={self.guard.key}"
 
     @property
-    def _origin(self) -> str:
-        return f"http://{HOST}:{self._server.get_port()}"
+    def origin(self) -> str:
+        """The address without path and key."""
+        return f"http://{HOST}:{self.server.get_port()}"
 
-    def ask(self, **changes: Any) -> None:
-        """Want something else of the view (its fields by name); the rest of what was wanted last stays."""
+    def request(self, **changes: Any) -> None:
+        """Request changes of the view (fields by name), in addition to those that were requested before."""
         with self._changed:
-            self._latest, self._has_request = replace(self._latest, **changes), True
+            self._requested, self._has_request = replace(self._requested, **changes), True
             self._changed.notify_all()
 
     def run(self) -> None:
-        """Show what is wanted, until :meth:`end` or an interrupt."""
+        """Show requested views until :meth:`end` or an interrupt."""
         while True:
             with self._changed:
-                is_asked = self._changed.wait_for(lambda: self._has_request or self._ended, self._patience_s())
-                if self._ended:
+                self._changed.wait_for(lambda: self._has_request or self._is_stopped, self._playback_timeout_s())
+                if self._is_stopped:
                     return
-                if not is_asked:
-                    self._latest = replace(self._latest, frame=(self._latest.frame + 1) % self._playback.frames)
-                wanted, self._has_request, self._is_busy = self._latest, False, True
-            self._show(wanted)
+                if not self._has_request:
+                    next_frame = (self._requested.frame + 1) % self._playback.frames
+                    self._requested = replace(self._requested, frame=next_frame)
+                view, self._has_request, self._is_busy = self._requested, False, True
+            self._show(view)
             with self._changed:
                 self._is_busy = False
                 self._changed.notify_all()
 
-    def rest(self, timeout_s: float) -> bool:
-        """Wait until all that was wanted is shown; whether that came in time."""
+    def wait_until_idle(self, timeout_s: float) -> bool:
+        """Wait until all requests are shown; False after a timeout."""
         with self._changed:
             return self._changed.wait_for(lambda: not self._has_request and not self._is_busy, timeout_s)
 
     def end(self) -> None:
         """Let :meth:`run` return."""
         with self._changed:
-            self._ended = True
+            self._is_stopped = True
             self._changed.notify_all()
 
     def stop(self) -> None:
-        """Serve no more."""
-        with redirect_stdout(io.StringIO()):  # it says good-bye in its own words, at the end of its thread
-            self._server.stop()
-            if (thread := self._server._websock_server._server_thread) is not None:
+        """Stop serving."""
+        with redirect_stdout(io.StringIO()):  # viser prints a message at the end of its thread
+            self.server.stop()
+            thread = self.server._websock_server._server_thread
+            if thread is not None:
                 thread.join(_SHUTDOWN_S)
 
-    def present(self, candidate: Site) -> Site:
-        """Where a candidate's sensor is in the plan now; the candidate itself where it is in none."""
+    def current_site(self, candidate: Site) -> Site:
+        """Return where a candidate's sensor is in the plan now; the candidate itself if the plan does not use it."""
         return candidate if self.plan is None else self.plan.sites.get(candidate.name, candidate)
 
-    def look_from(self, camera: Camera) -> None:
-        """Where a browser that opens the page looks from."""
-        self._server.initial_camera.position = np.subtract(camera.from_m, self.zero_m)
-        self._server.initial_camera.look_at = np.subtract(camera.at_m, self.zero_m)
+    def set_camera(self, camera: Camera) -> None:
+        """Set the camera of browsers that open the page."""
+        self.server.initial_camera.position = np.subtract(camera.from_m, self.zero_m)
+        self.server.initial_camera.look_at = np.subtract(camera.at_m, self.zero_m)
 
-    def open_at(self, text: str, where: str) -> None:
-        """Begin with the view that a link's text asks for; InputError where it asks for what is not there."""
-        view, camera = decode_view(text, self._initial_session, self._opened, where)
-        self.ask(**vars(view))
+    def open_link(self, link: str, where: str) -> None:
+        """Request the view of a link.
+
+        Parameters
+        ----------
+        link
+            Its text.
+        where
+            Used in messages.
+
+        Raises
+        ------
+        InputError
+            If the link is not valid.
+        """
+        view, camera = decode_view(link, self._initial_session, self._initial_view, where)
+        self.request(**vars(view))
         if camera is not None:
-            self.look_from(camera)
+            self.set_camera(camera)
 
-    def _patience_s(self) -> float | None:
-        """How long nothing has to happen until the next recorded frame is shown; None: for ever."""
-        return FRAME_S if self.view.layer == "replay" and self.controls.plays.value else None
+    def drag(self, client_id: int | None, pose: Pose, *, is_finished: bool) -> None:
+        """Move the sensor to a pose; layers and gizmo are updated when the drag is finished.
 
-    # ---- what is drawn once
+        Parameters
+        ----------
+        client_id
+            The browser.
+        pose
+            Current pose of the gizmo.
+        is_finished
+            Whether the gizmo was released.
+        """
+        self._dragging_client = None if is_finished else client_id
+        self.request(site=replace(self.view.site, pose=pose))
 
-    def _draw(self) -> None:
-        scene, session = self._server.scene, self.session
-        self._world = drawing.SceneMeshes.draw(scene, session, self.zero_m)
-        drawing.draw_sites(scene, session, self.zero_m, self._choose)
-        drawing.draw_plan(scene, self.plan, self.view.site.name, self.zero_m, self._choose)
-        self._gizmo = scene.add_transform_controls("/sensor", scale=GIZMO_M, depth_test=False)
-        self._label = scene.add_label("/sensor/label", "", anchor="top-center")
-        self._gizmo.on_update(self._dragged)
-        self._server.on_client_disconnect(self._lost)
-        reach_m = max(session.scene.roi.size_m)
+    def disconnect(self, client_id: int) -> None:
+        """Finish the drag of a browser that has disconnected."""
+        if self._dragging_client == client_id:
+            self._dragging_client = None
+            self.request()
+
+    def _playback_timeout_s(self) -> float | None:
+        """Return the time until the next recorded frame; None if traffic is not played."""
+        if self.view.layer == "replay" and self.controls.plays.value:
+            return FRAME_S
+        return None
+
+    def _draw_scene(self) -> None:
+        """Draw what does not change, and add the panel."""
+        scene, session = self.server.scene, self.session
+        self.world = drawing.SceneMeshes.draw(scene, session, self.zero_m)
+        drawing.draw_sites(scene, session, self.zero_m, self._select)
+        drawing.draw_plan(scene, self.plan, self.view.site.name, self.zero_m, self._select)
+        self.gizmo = scene.add_transform_controls("/sensor", scale=GIZMO_M, depth_test=False)
+        self.label = scene.add_label("/sensor/label", "", anchor="top-center")
+        self.gizmo.on_update(self._on_gizmo)
+        self.server.on_client_disconnect(lambda client: self.disconnect(client.client_id))
+        size_m = max(session.scene.roi.size_m)
         x, y, z = self.zero_m
-        self.look_from(Camera((x, y - 0.4 * reach_m, z + 0.6 * reach_m), self.zero_m))
-        buttons = {"Keep this pose": self._keep, "Link to this view": self._link, "Picture (PNG)": self._picture}
-        effects, frames = settings.offered_effects(session), self._playback.frames
-        note = controls.describe_drawn_triangles(self._world.drawn, self._world.triangles)
-        self.controls = Controls(self._server.gui, session, self.view, self, effects, frames, buttons, note)
+        self.set_camera(Camera((x, y - 0.4 * size_m, z + 0.6 * size_m), self.zero_m))
+        content = PanelContent(
+            effects=settings.offered_effects(session),
+            frames=self._playback.frames,
+            buttons={
+                "Save this pose": self._save_pose,
+                "Link to this view": self._show_link,
+                "Picture (PNG)": self._send_picture,
+            },
+            note=controls.describe_drawn_triangles(self.world.drawn, self.world.triangles),
+        )
+        self.controls = Controls(self.server.gui, session, self.view, self, content)
 
-    # ---- what somebody does
+    # ---- what users do
 
-    async def _dragged(self, event: viser.TransformControlsEvent) -> None:
-        """A coroutine, so that drags come in their order."""
-        self._dragging = None if event.phase == "end" else event.client_id
-        own = self.view.site
+    async def _on_gizmo(self, event: viser.TransformControlsEvent) -> None:
+        """Handle a drag; a coroutine, so that viser keeps the order of events."""
         position_m = np.asarray(event.target.position, dtype=np.float64) + self.zero_m
-        self.ask(site=replace(own, pose=drawing.moved_pose(own.pose, position_m.tolist(), event.target.wxyz.tolist())))
+        pose = drawing.dragged_pose(self.view.site.pose, position_m.tolist(), event.target.wxyz.tolist())
+        self.drag(event.client_id, pose, is_finished=event.phase == "end")
 
-    def _lost(self, client: viser.ClientHandle) -> None:
-        """Who is gone holds nothing any more."""
-        if self._dragging == client.client_id:
-            self._dragging = None
-            self.ask()
+    def _select(self, site: Site) -> None:
+        self.request(site=self.current_site(self.session.candidates[site.name].site))
 
-    def _choose(self, site: Site) -> None:
-        self.ask(site=self.present(self.session.candidates[site.name].site))
-
-    def _followed(self, query: dict[str, str]) -> dict[str, str]:
-        """Somebody opens a link; where its browser is to look from."""
+    def _open_query(self, query: dict[str, str]) -> dict[str, str]:
+        """Request the view of an opened link, and return the query that sets the browser's camera."""
         if not query:
             return {}
         try:
-            view, camera = decode_view(query, self._initial_session, self._opened, "the link")
+            view, camera = decode_view(query, self._initial_session, self._initial_view, "the link")
         except InputError as error:
             self._notice = str(error)
-            self.ask()
+            self.request()
             return {}
-        self.ask(**vars(view))
+        self.request(**vars(view))
         if camera is None:
             return {}
-        places = {"initialCameraPosition": camera.from_m, "initialCameraLookAt": camera.at_m}
-        return {key: ",".join(f"{x:.6g}" for x in np.subtract(at, self.zero_m)) for key, at in places.items()}
+        return {
+            "initialCameraPosition": self._camera_text(camera.from_m),
+            "initialCameraLookAt": self._camera_text(camera.at_m),
+        }
 
-    def _keep(self, client: viser.ClientHandle, name: str = SAVED_SITES) -> None:
-        path = self.session.scenario.folder / name
+    def _camera_text(self, point_m: Vec3) -> str:
+        return ",".join(f"{value:.6g}" for value in np.subtract(point_m, self.zero_m))
+
+    def _save_pose(self, client: viser.ClientHandle, file: str = SAVED_SITES) -> None:
+        path = self.session.scenario.folder / file
+        site = self.rating.site
+        if not self.rating.is_feasible:
+            error = InputError(f"site {site.name}", "no sensor can be mounted there", "Move it to a free place.")
+            show_modal(client, "Not saved", [controls.escape_markdown(str(error))], {"Close": _do_nothing})
+            return
         try:
-            if not self.rating.is_feasible:
-                raise InputError(f"site {self.rating.site.name}", "no sensor can stand there", "a free place")
-            kept = save_pose(path, self.rating.site, self.session.candidates)
-        except InputError as error:
+            name = save_pose(path, site, self.session.candidates)
+        except InputError as error:  # somebody else's file
             other = unused_file_name(path.parent)
-            answers = {f"Keep in {other}": lambda: self._keep(client, other)} if self.rating.is_feasible else {}
-            show_modal(
-                client, "Not kept", [controls.escape_markdown(str(error))], {**answers, "Keep nothing": lambda: None}
-            )
+            answers = {f"Save to {other}": lambda: self._save_pose(client, other), "Cancel": _do_nothing}
+            show_modal(client, "Not saved", [controls.escape_markdown(str(error))], answers)
         except OSError as error:
-            show_modal(client, "Not kept", [controls.escape_markdown(str(error))], {"Close": lambda: None})
+            show_modal(client, "Not saved", [controls.escape_markdown(str(error))], {"Close": _do_nothing})
         else:
-            client.add_notification(f"kept as {kept}", f"in {path}")
+            client.add_notification(f"saved as {name}", f"in {path}")
 
-    def _link(self, client: viser.ClientHandle) -> None:
-        from_m, at_m = (np.add(at, self.zero_m) for at in (client.camera.position, client.camera.look_at))
+    def _show_link(self, client: viser.ClientHandle) -> None:
+        from_m, at_m = (np.add(point, self.zero_m) for point in (client.camera.position, client.camera.look_at))
         camera = Camera(tuple(from_m.tolist()), tuple(at_m.tolist()))
-        text = encode_view(self.view, self._opened, camera)
-        command = shlex.join((*(self._opened_with or ("egvs", "explore", "RUN")), "--view", text))
-        texts = ["While this page is served, on this machine:", f"```\n{self.address}&{text}\n```",
-                 "At any time:", f"```\n{command}\n```"]  # fmt: skip
-        show_modal(client, "Link to this view", texts, {"Close": lambda: None})
+        link = encode_view(self.view, self._initial_view, camera)
+        command = shlex.join((*(self._command or ("egvs", "explore", "RUN")), "--view", link))
+        texts = [
+            "While this page is open, on this machine:",
+            f"```\n{self.address}&{link}\n```",
+            "At any time:",
+            f"```\n{command}\n```",
+        ]
+        show_modal(client, "Link to this view", texts, {"Close": _do_nothing})
 
-    def _picture(self, client: viser.ClientHandle) -> None:
+    def _send_picture(self, client: viser.ClientHandle) -> None:
         file = io.BytesIO()
-        drawn = client.get_render(client.camera.image_height, client.camera.image_width, transport_format="png")
-        image.imsave(file, drawn, format="png")
+        picture = client.get_render(client.camera.image_height, client.camera.image_width, transport_format="png")
+        image.imsave(file, picture, format="png")
         client.send_file_download(f"{self.session.scenario.name}.png", file.getvalue(), save_immediately=True)
 
-    # ---- what changes
+    # ---- showing a view
 
     def _show(self, view: View) -> None:
-        """Show what is wanted, and bring controls and gizmo to it."""
-        session_before, plan_before, before = self.session, self.plan, self.view
+        """Compute the scores of a view, and update scene and panel."""
+        session_before, plan_before, view_before = self.session, self.plan, self.view
         view = self._apply_settings(view)
-        site, is_new, rests = view.site, self.session is not session_before, self._dragging is None
-        is_another = is_new or site.sensor != self.rating.site.sensor
-        if is_new or site != self.rating.site:
+        site = view.site
+        is_new_session = self.session is not session_before
+        is_new_sensor = is_new_session or site.sensor != self.rating.site.sensor
+        if is_new_session or site != self.rating.site:
             self.rating = self.session.rate(site.name, site.pose, site.sensor)
-        self.view, rating = view, self.rating
-        if rests and rating.is_feasible and self.plan is not None and self.plan.sites.get(site.name, site) != site:
-            self.plan = self.plan.moved(site, self.session.beams(site))
-        with self._server.atomic():
-            if is_new:
-                drawing.draw_sites(self._server.scene, self.session, self.zero_m, self._choose)
-            if self.plan is not plan_before or site.name != before.site.name:
-                drawing.draw_plan(self._server.scene, self.plan, site.name, self.zero_m, self._choose)
-            if view.is_dark != before.is_dark:
-                self._world.colour(view.is_dark)
-            self._label.text = (
-                f"{site.name}  rank {rating.rank}" if rating.is_feasible else f"{site.name}: cannot stand"
-            )
+        self.view = view
+        is_dragging = self._dragging_client is not None
+        is_plan_changed = self.plan is not None and self.plan.sites.get(site.name, site) != site
+        if self.plan is not None and is_plan_changed and self.rating.is_feasible and not is_dragging:
+            self.plan = self.plan.with_moved(site, self.session.beams(site))
+
+        scene = self.server.scene
+        with self.server.atomic():
+            if is_new_session:
+                drawing.draw_sites(scene, self.session, self.zero_m, self._select)
+            if self.plan is not plan_before or site.name != view_before.site.name:
+                drawing.draw_plan(scene, self.plan, site.name, self.zero_m, self._select)
+            if view.is_dark != view_before.is_dark:
+                self.world.set_dark(view.is_dark)
+            self.label.text = f"{site.name}: not possible here"
+            if self.rating.is_feasible:
+                self.label.text = f"{site.name}  rank {self.rating.rank}"
             legend = None
-            if rests:  # else it would be pulled out of a hand
-                self._gizmo.position = np.subtract(site.pose.position_m, self.zero_m)
-                self._gizmo.wxyz = np.array(drawing.quaternion(site.pose))
+            if not is_dragging:  # the gizmo must not move under the mouse
+                self.gizmo.position = np.subtract(site.pose.position_m, self.zero_m)
+                self.gizmo.wxyz = np.array(drawing.pose_quaternion(site.pose))
                 legend = drawing.draw_layer(self._layer_context())
-            self.controls.show(self.session, view, rating, self._status_text(rests), legend)
+            self.controls.show(self.session, view, self._status_text(is_dragging), legend)
+
         self._draw_count += 1
-        if is_another:
-            gc.collect()  # what was made for the session or the sensor before
-        if is_another or self._draw_count % FREE_MEMORY_EVERY == 0:
+        if is_new_sensor:
+            gc.collect()  # frees the previous session or sensor
+        if is_new_sensor or self._draw_count % FREE_MEMORY_EVERY == 0:
             release_memory()
 
     def _apply_settings(self, view: View) -> View:
-        """Bring the session to the settings and the period of a view; settings that are refused stay as they are."""
-        mix = self._mix
+        """Change session and period to those of a view; return the view, without settings that are not valid."""
+        session = self._all_periods
         if view.settings != self.view.settings:
             self.controls.status.content = controls.WORKING_TITLE
             try:
-                mix = self._variants.session(view.settings)
+                session = self._variants.session(view.settings)
             except (EgvsError, OSError) as error:
                 self._notice = str(error)
                 with self._changed:
-                    self._latest = replace(self._latest, settings=self.view.settings)
+                    self._requested = replace(self._requested, settings=self.view.settings)
                 view = replace(view, settings=self.view.settings)
-        if mix is not self._mix:
-            self.plan = _with_moved_sensors(self.plan, mix)
-        if mix is not self._mix or view.period != self.session.period:
-            self.session.forget()  # it may be wanted again, but not now
-            self._mix, self.session = mix, mix.in_period(view.period) if view.period else mix
+        is_new = session is not self._all_periods
+        if is_new:
+            self.plan = _with_moved_sensors(self.plan, session)
+        if is_new or view.period != self.session.period:
+            self.session.clear_caches()
+            self.session = self._all_periods = session
+            if view.period:
+                self.session = session.in_period(view.period)
             self._playback = Playback(self.session)
         return view
 
     def _layer_context(self) -> drawing.LayerContext:
-        beside = self.view.beside or next(
-            (its.site.name for its in self.session.ranked if its.site.name != self.view.site.name), ""
-        )
-        other = self.session.candidates.get(beside)
-        if other is not None and (site := self.present(other.site)) != other.site:
-            other = self.session.rate(beside, site.pose, site.sensor)
+        name = self.view.beside
+        if not name:
+            others = [one.site.name for one in self.session.ranked if one.site.name != self.view.site.name]
+            name = others[0] if others else ""
+        other = self.session.candidates.get(name)
+        if other is not None:
+            site = self.current_site(other.site)
+            if site != other.site:
+                other = self.session.rate(name, site.pose, site.sensor)
         return drawing.LayerContext(
-            self._server.scene, self.session, self._playback, self.rating, self.view, other, self.zero_m
+            self.server.scene, self.session, self._playback, self.rating, self.view, other, self.zero_m
         )
 
-    def _status_text(self, rests: bool) -> str:
-        """What is said of the sensor, and of the plan; what went wrong comes first, once."""
-        notice, self._notice = self._notice, ""
-        name = self.view.site.name
-        said = controls.describe_score(
-            self.rating, self.session.rank_by, self.session.candidates[name], len(self.session.candidates)
-        )
-        of_plan = (
-            controls.describe_plan(self.plan) if rests and self.plan is not None and self.rating.is_feasible else ""
-        )
-        return (controls.format_notice(notice) if notice else "") + said + of_plan
+    def _status_text(self, is_dragging: bool) -> str:
+        """Return the text about the sensor and the plan, after the last error, which is shown once."""
+        text = ""
+        if self._notice:
+            text = f"**{controls.escape_markdown(self._notice)}**\n\n"
+            self._notice = ""
+        candidates = self.session.candidates
+        candidate = candidates[self.view.site.name]
+        text += controls.describe_score(self.rating, self.session.rank_by, candidate, len(candidates))
+        if not is_dragging and self.plan is not None and self.rating.is_feasible:
+            text += controls.describe_plan(self.plan)
+        return text
+
+
+def _do_nothing() -> None:
+    """Close a window without further action."""
 
 
 def _with_moved_sensors(before: MovingPlan | None, session: Session) -> MovingPlan | None:
-    """A session's plan, with its sensors where somebody has moved them."""
+    """Return the plan of a session with its sensors where users have moved them."""
     plan = session.plan
     if plan is None or before is None:
         return plan
     for name, site in before.sites.items():
         if plan.sites.get(name, site) != site:
-            plan = plan.moved(site, session.beams(site))
+            plan = plan.with_moved(site, session.beams(site))
     return plan

@@ -1,23 +1,12 @@
-"""Scores, plan and recorded frames from any pose.
+"""Scores, plan and recorded traffic for a sensor in any pose, as the explorer shows them.
 
-Where a moved sensor misses vehicles, as ``blindspots.parquet`` has it of the candidates.
+:meth:`Session.rate` gives the numbers of ``egvs score``: apply the rules of ``egvs check`` for one site; cast the empty
+scan from there; score it with the TPOG, and with recorded vehicles if the scenario requests such scores; rank it among
+the candidates, as if the sensor replaced its own candidate. :class:`MovingPlan` is a plan of ``egvs place`` whose
+sensors are moved, with the joint score of :mod:`egvs.placement.refinement`. :class:`Playback` shows recorded traffic
+with simulated returns, as in the point clouds of :mod:`egvs.validation.cloud_simulation`.
 
-A plan of ``egvs place`` whose sensors are being moved: what they are worth together, and where one more is best.
-
-The worth is that of :mod:`egvs.placement.refinement`, which ``egvs place --refine`` goes by.
-
-What a sensor is worth where somebody has moved it: the numbers of ``egvs score``, from any pose.
-
-Steps for a pose: ask the rules of ``egvs check`` that are about one site; cast the empty scan from there; score it
-against the TPOG, and against the vehicles of recorded frames where the scenario asks for that; rank it among the
-candidates, as if the moved one hung there in place of its own. Nothing here knows of a page or a browser.
-
-A recorded frame of traffic before a moved sensor: which vehicles there are, and the returns that they give.
-
-The returns are those of a point cloud as ``egvs clouds`` makes it (:mod:`egvs.validation.cloud_simulation`), of
-the traffic that the run was scored with. A vehicle with :data:`SEEN_WELL_POINTS` of them is seen.
-
-World frame, metres.
+Nothing here depends on a page or a browser. World frame, metres.
 """
 
 from __future__ import annotations
@@ -67,118 +56,101 @@ from egvs.validation import cloud_simulation
 from egvs.validation.cloud_simulation import CloudSimulator, VehicleMeshes, sweep_rng
 from egvs.world.carriageway import Carriageway
 
-
-def site_blindspots(site: str, spots: VehicleSpots, visibility: SpotVisibility, grid: Grid) -> SiteBlindspots:
-    """What a site sees at each spot of the region of a grid."""
-    count = len(spots.locations)
-    columns = (
-        spots.at_m[:, 0],
-        spots.at_m[:, 1],
-        spots.vehicle_frames,
-        spots.vehicles,
-        visibility.share,
-        visibility.se,
-    )
-    rows = zip(*(column[:count].tolist() for column in columns), strict=True)
-    places = tuple(
-        LocationVisibility(place.by, place.words, *row) for place, row in zip(spots.locations, rows, strict=True)
-    )
-    share_missed = np.full(blindspots.map_shape(grid), np.nan)
-    share_missed[tuple(spots.cells.T)] = 1.0 - visibility.share[count:]
-    x, y, _ = grid.origin_m
-    return SiteBlindspots(site, SEEN_WELL_POINTS, places, share_missed, (x, y), CELL_M)
+Floats = NDArray[np.float64]
 
 
-_MADE_FROM = ("statics", "scan", "traffic", "tpog")
-"""Stages of which a plan must be; the check also asks what was wanted of the plan."""
+_SCORES = RunFolder.scores.name
+_RECORDED = (RunFolder.trajectories.name, RunFolder.tpog.name)
+_PLAN_STAGES = ("statics", "scan", "traffic", "tpog")
+"""Stages that a plan depends on."""
 
 
 @dataclass(frozen=True, eq=False)
 class MovingPlan:
-    """Sensors that are to work together.
-
-    Attributes
-    ----------
-    poses
-        Where each is now, and what it sees.
-    """
+    """A plan whose sensors can be moved; ``poses`` says where they are and what they see."""
 
     poses: PlanPoses
 
     @classmethod
-    def of(cls, work: StageContext, stages: Mapping[str, str]) -> MovingPlan | None:
-        """The plan in a run's folder; None where there is none, or one of other traffic, scans or settings.
+    def from_run(cls, work: StageContext, stages: Mapping[str, str]) -> MovingPlan | None:
+        """Read the plan in a run folder; None if there is none, or if it belongs to other traffic, scans or settings.
 
         Parameters
         ----------
+        work
+            The run.
         stages
-            Keys of the run's stages, by name.
+            Keys of its stages.
         """
-        found = read_placement(work.folder.placement, work.folder.curve)
-        if found is None or any(found[2]["stages"].get(name) != stages.get(name) for name in _MADE_FROM):
+        placement = read_placement(work.folder.placement, work.folder.curve)
+        if placement is None:
             return None
-        free = copy(work)  # of what was asked for of the plan: it may be moved anywhere
-        free.scenario = work.scenario.model_copy(update={"placement": type(work.scenario.placement)()})
-        asked = problem_builder.build_problem(free, lambda _: None)
-        rows = found[0]
-        poses = PlanPoses.of(free.scenario, asked, [asked.names.index(row["site"]) for row in rows])
-        plan, scanner = cls(poses), Scanner(replace(get_scene(work), sites=()))
-        for row, site in zip(rows, poses.sites, strict=True):
+        rows, _, metadata = placement
+        if any(metadata["stages"].get(name) != stages.get(name) for name in _PLAN_STAGES):
+            return None
+        unconstrained = copy(work)  # sensors may be moved anywhere, whatever [placement] requires
+        unconstrained.scenario = work.scenario.model_copy(update={"placement": type(work.scenario.placement)()})
+        problem = problem_builder.build_problem(unconstrained, lambda _: None)
+        indices = [problem.names.index(row["site"]) for row in rows]
+        plan = cls(PlanPoses.of(unconstrained.scenario, problem, indices))
+        scanner = Scanner(replace(get_scene(work), sites=()))
+        for row, site in zip(rows, plan.poses.sites, strict=True):
             pose = Pose(**{field.name: row[field.name] for field in fields(Pose)})
             if pose != site.pose:  # after --refine
-                there = replace(site, pose=pose)
-                plan = plan.moved(there, Beams.of(scanner.scan_site(there)))
+                moved = replace(site, pose=pose)
+                plan = plan.with_moved(moved, Beams.of(scanner.scan_site(moved)))
         return plan
 
     @property
     def sites(self) -> dict[str, Site]:
-        """Its sensors by the names of their candidates, where they are now."""
+        """Current sites by the names of their candidates."""
         return {site.name: site for site in self.poses.sites}
 
     @cached_property
     def joint(self) -> float:
-        """Its joint score."""
+        """The joint score."""
         return float(self.poses.plan_value.joint)
 
-    def moved(self, site: Site, beams: Beams) -> MovingPlan:
-        """The plan with one of its sensors elsewhere, from where it sees ``beams``."""
+    def with_moved(self, site: Site, beams: Beams) -> MovingPlan:
+        """Return the plan with one sensor moved to ``site``, whose empty scan is ``beams``."""
         rows = tuple(view.row(beams) for view in self.poses.placement_problem.views)
         return MovingPlan(self.poses.with_sensor(list(self.sites).index(site.name), site, rows))
 
     def gain(self, candidate: str) -> float:
-        """What a candidate that is not in it would add to its joint score."""
-        poses, index = self.poses, self.poses.placement_problem.names.index(candidate)
-        rows = tuple(sight.row(index) for sight in poses.placement_problem.visibilities)
-        site = poses.placement_problem.sites[index]
-        more = replace(poses, plan=(*poses.plan, index), sites=(*poses.sites, site), rows=(*poses.rows, rows))
-        return float(more.plan_value.joint) - self.joint
+        """Return the increase of the joint score if a candidate is added."""
+        problem = self.poses.placement_problem
+        index = problem.names.index(candidate)
+        rows = tuple(visibility.row(index) for visibility in problem.visibilities)
+        extended = replace(
+            self.poses,
+            plan=(*self.poses.plan, index),
+            sites=(*self.poses.sites, problem.sites[index]),
+            rows=(*self.poses.rows, rows),
+        )
+        return float(extended.plan_value.joint) - self.joint
 
     @cached_property
     def best_next(self) -> tuple[str, float] | None:
-        """The candidate that would add most to it, and how much; None where all are in it."""
+        """The candidate with the largest gain, and its gain; None if the plan contains all."""
         gains = {name: self.gain(name) for name in self.poses.placement_problem.names if name not in self.sites}
         return max(gains.items(), key=lambda item: item[1], default=None)
 
 
-SCORES = RunFolder.scores.name
-_RECORDED = (RunFolder.trajectories.name, RunFolder.tpog.name)
-
-
 @dataclass(frozen=True)
 class PoseScore:
-    """What a sensor is worth in a pose.
+    """Scores of a sensor in a pose.
 
     Attributes
     ----------
     site
-        The candidate that it comes from.
+        The sensor, with the name of its candidate.
     scores
-        By name: ``egvs`` in bits, ``entropy_seen`` as a share, and what else the scenario asks for; empty where no
-        sensor can stand.
+        ``egvs`` in bits, ``entropy_seen`` as a share, and the other scores of the scenario; empty if no sensor can be
+        mounted there.
     rank
-        Among the candidates, 1 is best; 0 where no sensor can stand.
+        Among the candidates, 1 is best; 0 if no sensor can be mounted there.
     findings
-        What the check says of the place; one of them is an error where no sensor can stand.
+        Warnings of the check, and errors if no sensor can be mounted there.
     """
 
     site: Site
@@ -188,13 +160,13 @@ class PoseScore:
 
     @property
     def is_feasible(self) -> bool:
-        """Whether a sensor can stand there."""
+        """Whether a sensor can be mounted there."""
         return bool(self.scores)
 
 
 @dataclass(frozen=True)
-class _Engine:
-    """What scans and scores with certain effects."""
+class Engine:
+    """Scans and scores with certain effects."""
 
     scene: Scene
     scanner: Scanner
@@ -202,40 +174,47 @@ class _Engine:
 
 
 class Session:
-    """A run that is being explored. It changes nothing in the run's folder.
+    """A run that is explored; it changes nothing in the run folder.
 
     Parameters
     ----------
     work
-        A folder in which all stages up to ``score`` are done.
+        A run folder with all stages up to ``score``.
     stages
-        Their keys, by name: a plan in the folder is taken only where it was made from them.
+        Keys of the stages; a plan is read only if it belongs to them.
     period
-        Of the traffic, whose scores are told; the mix of all when empty.
+        Scores are those of this traffic period; empty for all periods together.
+
+    Attributes
+    ----------
+    candidates
+        Scores of all candidates by name.
+    engines
+        Cached scanners and scorers, by the names of the active effects.
     """
 
     def __init__(self, work: StageContext, stages: Mapping[str, str], period: str = "") -> None:
         self.work, self._stages, self.period = work, stages, period
         self.scenario: Scenario = work.scenario
         self.scene: Scene = get_scene(work)
-        self.periods: tuple[str, ...] = tuple(its.name for its in read_periods(work.folder.tpog) if its.name)
+        self.periods: tuple[str, ...] = tuple(entry.name for entry in read_periods(work.folder.tpog) if entry.name)
         self.tpog: Tpog = read_tpog(work.folder.tpog, period or None)
-        self.candidates: dict[str, PoseScore] = self._rated()
-        self._engines: dict[tuple[str, ...], _Engine] = {}
+        self.candidates: dict[str, PoseScore] = self._read_candidates()
+        self.engines: dict[tuple[str, ...], Engine] = {}
 
     def in_period(self, period: str) -> Session:
-        """The same run, seen in another period alone; in the mix of all for an empty name."""
+        """Return the same run in one period, or in all periods for an empty name."""
         return Session(self.work, self._stages, period)
 
-    def forget(self) -> None:
-        """Let go of what scores poses quickly; it is made again when it is asked for."""
-        self._engines.clear()
+    def clear_caches(self) -> None:
+        """Free the memory of scanners and scorers; they are made again when needed."""
+        self.engines.clear()
         self.__dict__.pop("entropy_bit", None)
 
     @cached_property
     def plan(self) -> MovingPlan | None:
-        """The plan in the run's folder, where there is one that was made from the same traffic and scans."""
-        return MovingPlan.of(self.work, self._stages)
+        """The plan in the run folder, if it belongs to the same traffic and scans."""
+        return MovingPlan.from_run(self.work, self._stages)
 
     @property
     def rank_by(self) -> str:
@@ -244,182 +223,238 @@ class Session:
 
     @property
     def ranked(self) -> list[PoseScore]:
-        """The candidates, the best first."""
-        return sorted(self.candidates.values(), key=lambda rating: rating.rank)
+        """The candidates, best first."""
+        return sorted(self.candidates.values(), key=lambda candidate: candidate.rank)
 
     @property
     def network(self) -> Network | None:
-        """The roads, where the scenario has some."""
+        """The street network, if the scenario has one."""
         return self.work.remember("explored roads", (), lambda: sumo_folder.read_network(self.scenario))
 
     @property
     def carriageway(self) -> Carriageway | None:
-        """The lanes that vehicles drive on, where the scenario has some."""
+        """The lanes for vehicles, if the scenario has any."""
+        return self.work.remember("explored lanes", (), self._make_carriageway)
 
-        def found() -> Carriageway | None:
-            its = None if self.network is None else Carriageway.of(self.network)
-            return its if its is not None and its.lanes else None
-
-        return self.work.remember("explored lanes", (), found)
+    def _make_carriageway(self) -> Carriageway | None:
+        if self.network is None:
+            return None
+        carriageway = Carriageway.of(self.network)
+        return carriageway if carriageway.lanes else None
 
     def rate(self, name: str, pose: Pose, sensor: str | None = None) -> PoseScore:
-        """What a candidate's sensor, or another one, is worth in a pose; KeyError where there is no such candidate.
+        """Score a candidate's sensor, or another one, in a pose.
 
-        InputError where there is no such sensor.
+        Parameters
+        ----------
+        name
+            The candidate.
+        pose
+            Where it is moved to.
+        sensor
+            Name of another sensor.
+
+        Raises
+        ------
+        KeyError
+            If there is no such candidate.
+        InputError
+            If there is no such sensor.
         """
-        own = self.candidates[name].site
-        site = replace(own, pose=pose, sensor=sensor or own.sensor)
+        candidate = self.candidates[name].site
+        site = replace(candidate, pose=pose, sensor=sensor or candidate.sensor)
         self.scene.sensor(site.sensor)
-        if site.points is not None and site != own:
-            finding = Diagnostic("measured scan", f"site {name}", "its empty scan was measured",
-                              "its own pose: what would be measured elsewhere is not known", is_error=True)  # fmt: skip
+        if site.points is not None and site != candidate:
+            problem = "its empty scan was measured, so scans from other poses are unknown"
+            hint = "Go back to the candidate."
+            finding = Diagnostic("measured scan", f"site {name}", problem, hint, is_error=True)
             return PoseScore(site, {}, 0, (finding,))
-        findings = self._findings(site)
+        findings = self._check(site)
         if any(finding.is_error for finding in findings):
             return PoseScore(site, {}, 0, findings)
         try:
             scores = self._scores(site)
-        except InputError as error:  # an effect that has to know of the sensor what nobody has said
+        except InputError as error:  # an effect needs a property of the sensor that is unknown
             return PoseScore(site, {}, 0, (*findings, Diagnostic.of("score", error)))
-        return PoseScore(site, scores, self._rank(name, scores[self.rank_by]), findings)
+        score = scores[self.rank_by]
+        others = (other.scores[self.rank_by] for key, other in self.candidates.items() if key != name)
+        rank = 1 + sum(other > score for other in others)
+        return PoseScore(site, scores, rank, findings)
 
-    def hits(self, site: Site) -> NDArray[np.float64]:
-        """The beams of a sensor that cross each voxel, (nx, ny, nz) float64; InputError where it cannot stand."""
+    def hits(self, site: Site) -> Floats:
+        """Return the number of beams of a sensor that cross each voxel, (nx, ny, nz) float64.
+
+        This and the following methods raise an InputError if no sensor can be mounted there.
+        """
         engine = self._engine(site)
         return engine.scorer.hits(engine.scanner.scan_site(site))
 
     def beams(self, site: Site) -> Beams:
-        """The empty scan of a sensor as scores take it; InputError as above."""
+        """Return the empty scan of a sensor, as scores use it."""
         return Beams.of(self._engine(site).scanner.scan_site(site))
 
-    def returns_m(self, site: Site) -> NDArray[np.float64]:
-        """Where the empty scan of a sensor met something, (n, 3) float64, world frame; InputError as above."""
+    def returns_m(self, site: Site) -> Floats:
+        """Return the points of the empty scan, (n, 3) float64, world frame."""
         rows = self._engine(site).scanner.scan_site(site).rows
         return rows.ends_m[rows.returned] + site.pose.position_m
 
-    def beams_m(self, site: Site, ring: int) -> NDArray[np.float64]:
-        """The beams of one ring that can meet the region, (n, 2, 3) float64: from the sensor to where each ends, world
-        frame. None of a sensor without rings; the last ring for a higher number. InputError as above."""
+    def beams_m(self, site: Site, ring: int) -> Floats:
+        """Return start and end of the beams of one ring that can meet the region, (n, 2, 3) float64, world frame.
+
+        Parameters
+        ----------
+        site
+            The sensor.
+        ring
+            Index of the ring; the last one for higher numbers. A sensor without rings has all beams.
+        """
         scan = self._engine(site).scanner.scan_site(site)
         channels = scan.sensor.channels
-        has_rings = channels > 0 and site.points is None
-        of_ring = scan.rows.beam % channels == min(ring, channels - 1) if has_rings else slice(0)
-        ends = scan.rows.ends_m[of_ring] + site.pose.position_m
+        ends = scan.rows.ends_m
+        if channels > 0 and site.points is None:
+            ends = ends[scan.rows.beam % channels == min(ring, channels - 1)]
+        ends = ends + site.pose.position_m
         return np.stack([np.broadcast_to(site.pose.position_m, ends.shape), ends], axis=1)
 
     def blindspots(self, site: Site) -> SiteBlindspots:
-        """Where a sensor misses vehicles, of all periods together; InputError as above."""
-        asking = _with_blindspots(self.work, True)
-        targets = self.work.remember("targets at places", _RECORDED, lambda: TargetScorer(asking, self.tpog.grid))
-        beams = self.beams(site)
-        seen = visible_targets(targets.record, beams, detection_probability(self.scene_before(site), beams.sensor))
+        """Return where a sensor misses vehicles, over all periods; see ``blindspots.parquet``."""
+        work = _with_blindspots(self.work, True)
+        targets = self.work.remember("targets at places", _RECORDED, lambda: TargetScorer(work, self.tpog.grid))
         assert targets.spots is not None
-        return site_blindspots(site.name, targets.spots, targets.spots.visibility(seen.points), self.tpog.grid)
+        beams = self.beams(site)
+        probability = detection_probability(self.scene_with(site), beams.sensor)
+        points = visible_targets(targets.record, beams, probability).points
+        return site_blindspots(site.name, targets.spots, targets.spots.visibility(points), self.tpog.grid)
 
-    def scene_before(self, site: Site) -> Scene:
-        """The scene with the effects that act while a sensor is as it is now."""
+    def scene_with(self, site: Site) -> Scene:
+        """Return the scene with the effects that act when the candidate of a site is moved there."""
         return self._engine(site).scene
 
     @cached_property
-    def entropy_bit(self) -> NDArray[np.float64]:
+    def entropy_bit(self) -> Floats:
         """Entropy of each voxel, (nx, ny, nz) float64."""
         field = EntropyField.of(self.tpog.counts, self.tpog.frames, self.tpog.grid)
-        found = np.zeros(self.tpog.counts.size)
-        found[field.cells] = field.per_cell_bit
-        return found.reshape(self.tpog.grid.shape)
+        entropy = np.zeros(self.tpog.counts.size)
+        entropy[field.cells] = field.per_cell_bit
+        return entropy.reshape(self.tpog.grid.shape)
 
-    def _rated(self) -> dict[str, PoseScore]:
-        """The candidates as ``scores.parquet`` has them, or ``scores_by_period.parquet``."""
-        path = self.work.path(RunFolder.scores_by_period.name if self.period else SCORES)
+    def _read_candidates(self) -> dict[str, PoseScore]:
+        """Read ``scores.parquet``, or ``scores_by_period.parquet``."""
+        path = self.work.path(RunFolder.scores_by_period.name if self.period else _SCORES)
         self.work.digest(path.name)
-        every = (read_scores_by_period if self.period else read_scores)(path).to_pylist()
-        rows = {row["site"]: row for row in every if row.get("period", "") == self.period}
+        read = read_scores_by_period if self.period else read_scores
+        rows = {row["site"]: row for row in read(path).to_pylist() if row.get("period", "") == self.period}
         if rows.keys() != {site.name for site in self.scene.sites}:
-            raise InputError(path, "holds other sites than the scenario", "egvs run makes it again")
+            raise InputError(path, "contains other sites than the scenario", "Call egvs run again.")
         names = dict.fromkeys(("egvs", "entropy_seen", *self.scenario.score.additional))
-        return {
-            site.name: PoseScore(site, {name: rows[site.name][name] for name in names}, rows[site.name]["rank"])
-            for site in self.scene.sites
-        }
+        candidates = {}
+        for site in self.scene.sites:
+            row = rows[site.name]
+            candidates[site.name] = PoseScore(site, {name: row[name] for name in names}, row["rank"])
+        return candidates
 
     @cached_property
     def _targets(self) -> TargetScorer | None:
-        """The vehicles that scores look at; None where no score does."""
+        """Scores visible vehicles; None if the scenario requests no such score."""
         if not any(name in TARGET_SCORES for name in self.scenario.score.additional):
             return None
-        lean = _with_blindspots(self.work, False)
-        return self.work.remember("targets", _RECORDED, lambda: TargetScorer(lean, self.tpog.grid))
+        work = _with_blindspots(self.work, False)
+        return self.work.remember("targets", _RECORDED, lambda: TargetScorer(work, self.tpog.grid))
 
-    def _findings(self, site: Site) -> tuple[Diagnostic, ...]:
-        """What the check says of a place, candidates of a rule included: nobody has sorted this one out."""
-        asked = self.scenario.sites.model_copy(update={"only_free": False})
-        scenario = self.scenario.model_copy(update={"sites": asked})
-        subject = CheckInputs(scenario, self.network, self.carriageway, self.scene.world, (site,), self.scene)
-        return (*scene_checks.check_poses(subject), *scene_checks.warn_sites_on_lanes(subject))
+    def _check(self, site: Site) -> tuple[Diagnostic, ...]:
+        """Apply the rules for sites; ``only_free`` is off, because it drops sites instead of reporting them."""
+        sites_config = self.scenario.sites.model_copy(update={"only_free": False})
+        scenario = self.scenario.model_copy(update={"sites": sites_config})
+        checked = CheckInputs(scenario, self.network, self.carriageway, self.scene.world, (site,), self.scene)
+        return (*scene_checks.check_poses(checked), *scene_checks.warn_sites_on_lanes(checked))
 
-    def _engine(self, site: Site) -> _Engine:
-        """What scans and scores while a site is as it is now: an effect that changes nothing for the candidates as they
-        are given may do so then, and the other way round."""
-        sites = tuple(site if its.name == site.name else its for its in self.scene.sites)
+    def _engine(self, site: Site) -> Engine:
+        """Return scanner and scorer with the effects that act when a candidate is moved to ``site``."""
+        sites = tuple(site if other.name == site.name else other for other in self.scene.sites)
         scene = inputs.with_effects(replace(self.scene, sites=sites, effects=(), inactive_effects=()))
         key = tuple(effect.NAME for effect in scene.effects)
-        if key not in self._engines:
-            scene = replace(scene, sites=())  # one caster serves every pose
-            self._engines[key] = _Engine(scene, Scanner(scene, mounts=1), self._scorer(scene))
-        return self._engines[key]
+        if key not in self.engines:
+            scene = replace(scene, sites=())  # one scanner for all poses
+            self.engines[key] = Engine(scene, Scanner(scene, mounts=1), self._make_scorer(scene))
+        return self.engines[key]
 
-    def _scorer(self, scene: Scene) -> Scorer:
-        """Effects on what is seen know the mix, in a period too."""
-        tpog, trajectories = self.work.folder.tpog, self.work.folder.trajectories
-        mix = read_tpog(tpog) if self.period else self.tpog
-        alone = (PeriodTpog(self.period, self.tpog),) if self.period else ()
-        return Scorer(scene, mix, trajectories, periods=alone)
+    def _make_scorer(self, scene: Scene) -> Scorer:
+        folder = self.work.folder
+        if not self.period:
+            return Scorer(scene, self.tpog, folder.trajectories)
+        # effects need the TPOG of all periods, in a period too
+        return Scorer(scene, read_tpog(folder.tpog), folder.trajectories, periods=(PeriodTpog(self.period, self.tpog),))
 
     def _scores(self, site: Site) -> dict[str, float]:
         engine = self._engine(site)
         beams = Beams.of(engine.scanner.scan_site(site))
-        found = engine.scorer.score(beams)
-        found = found.by_period[0] if self.period else found
-        scores = {"egvs": found.egvs, "entropy_seen": found.entropy_seen}
-        scores |= {name: float(value[0]) for name, value in found.shares.items()}
-        if self._targets is not None:
-            seen = visible_targets(self._targets.record, beams, detection_probability(engine.scene, beams.sensor))
-            worth = self._targets.scores(seen)
-            whole = {name: float(value[0]) for name, value in worth.scores.items()}
-            scores |= worth.by_period[self.periods.index(self.period)] if self.period else whole
-        return scores
-
-    def _rank(self, name: str, score: float) -> int:
-        others = (its.scores[self.rank_by] for other, its in self.candidates.items() if other != name)
-        return 1 + sum(other > score for other in others)
+        result = engine.scorer.score(beams)
+        if self.period:
+            result = result.by_period[0]
+        scores = {"egvs": result.egvs, "entropy_seen": result.entropy_seen}
+        scores |= {name: float(values[0]) for name, values in result.shares.items()}
+        if self._targets is None:
+            return scores
+        visible = visible_targets(self._targets.record, beams, detection_probability(engine.scene, beams.sensor))
+        target_scores = self._targets.scores(visible)
+        if self.period:
+            return {**scores, **target_scores.by_period[self.periods.index(self.period)]}
+        return scores | {name: float(values[0]) for name, values in target_scores.scores.items()}
 
 
 def _with_blindspots(work: StageContext, enabled: bool) -> StageContext:
-    """The same folder where blind spots are asked for, or not: they cost time for every pose, and change no score."""
+    """Return the same run with or without blind spots, which take time for every pose but change no score."""
     score = work.scenario.score.model_copy(update={"blindspots": enabled})
     other = copy(work)
     other.scenario = work.scenario.model_copy(update={"score": score})
     return other
 
 
-Floats = NDArray[np.float64]
+def site_blindspots(site: str, spots: VehicleSpots, visibility: SpotVisibility, grid: Grid) -> SiteBlindspots:
+    """Return the blind spots of a site.
 
-FRAMES_PER_CHUNK = 240
-"""Frames that are read and held together: what is played is a stretch of the record."""
+    Parameters
+    ----------
+    site
+        Its name.
+    spots
+        Locations, and cells of the map.
+    visibility
+        Share of vehicles that are visible at each spot.
+    grid
+        The region of interest.
+    """
+    locations = []
+    for index, location in enumerate(spots.locations):
+        location_visibility = LocationVisibility(
+            location.by,
+            location.words,
+            spots.at_m[index, 0].item(),
+            spots.at_m[index, 1].item(),
+            spots.vehicle_frames[index].item(),
+            spots.vehicles[index].item(),
+            visibility.share[index].item(),
+            visibility.se[index].item(),
+        )
+        locations.append(location_visibility)
+    share_missed = np.full(blindspots.map_shape(grid), np.nan)
+    share_missed[tuple(spots.cells.T)] = 1.0 - visibility.share[len(locations) :]
+    x, y, _ = grid.origin_m
+    return SiteBlindspots(site, SEEN_WELL_POINTS, tuple(locations), share_missed, (x, y), CELL_M)
 
 
 @dataclass(frozen=True, eq=False)
 class PlaybackFrame:
-    """A frame, and what a sensor takes of it.
+    """A recorded frame with the returns of one sensor.
 
     Attributes
     ----------
     frame
-        Every box.
+        All vehicle boxes.
     returns_m
-        World frame, (n, 3) float64.
+        Points, (n, 3) float64, world frame.
     owner
-        The box that each return is of, -1 for the static world, (n,) int64.
+        Index of the box that each return is from, -1 for the static world, (n,) int64.
     """
 
     frame: TrafficFrame
@@ -428,53 +463,68 @@ class PlaybackFrame:
 
     @property
     def is_visible(self) -> NDArray[np.bool_]:
-        """Of each box, whether it has enough returns, (boxes,)."""
+        """Whether each box has enough returns, (boxes,)."""
         counts = np.bincount(self.owner[self.owner >= 0], minlength=len(self.frame.boxes))
         return np.asarray(counts >= SEEN_WELL_POINTS)
 
 
 class Playback:
-    """The record of a session. It holds one stretch of it, and one sensor's empty scan."""
+    """The recorded traffic of a session; it caches some frames and one sensor's empty scan.
 
-    def __init__(self, session: Session) -> None:
+    Parameters
+    ----------
+    session
+        The session.
+    frames_per_chunk
+        Number of frames that are read at once.
+    """
+
+    def __init__(self, session: Session, frames_per_chunk: int = 240) -> None:
         self._session, self._path = session, session.work.folder.trajectories
+        self._frames_per_chunk = frames_per_chunk
         self.frames = int(parquet.read_metadata(self._path, "trajectories")["frames"])
         self.parts = cloud_simulation.body_parts(session.scenario)
-        self._shapes = VehicleMeshes.of(self.parts)
-        self._stretch: tuple[int, list[TrafficFrame]] = (-1, [])
+        self._meshes = VehicleMeshes.from_parts(self.parts)
+        self._first_cached, self._cached_frames = -1, list[TrafficFrame]()
         self._scanner: tuple[Scene, Scanner] | None = None
-        self._maker: tuple[Site, CloudSimulator] | None = None
+        self._simulator: tuple[Site, CloudSimulator] | None = None
 
     def frame(self, number: int) -> TrafficFrame:
-        """A frame of the record; the last one for a higher number."""
+        """Return a frame; the first or last one for numbers outside the recording."""
         number = max(0, min(number, self.frames - 1))
-        first = number - number % FRAMES_PER_CHUNK
-        if self._stretch[0] != first:
-            numbers = np.arange(first, min(first + FRAMES_PER_CHUNK, self.frames), dtype=np.int64)
-            self._stretch = (first, list(traffic_frames.read_frames(self._path, numbers)))
-        return self._stretch[1][number - first]
+        first = number - number % self._frames_per_chunk
+        if self._first_cached != first:
+            numbers = np.arange(first, min(first + self._frames_per_chunk, self.frames), dtype=np.int64)
+            self._first_cached, self._cached_frames = first, list(traffic_frames.read_frames(self._path, numbers))
+        return self._cached_frames[number - first]
 
-    def moment(self, site: Site, number: int) -> PlaybackFrame:
-        """A frame before a sensor; without returns where none are known: its empty scan was measured, or no sensor can
-        stand there."""
-        frame = self.frame(number)
+    def simulate(self, site: Site, frame: TrafficFrame) -> PlaybackFrame:
+        """Simulate the returns of a sensor.
+
+        Parameters
+        ----------
+        site
+            The sensor; there are no returns if its empty scan was measured, or if it cannot be mounted there.
+        frame
+            A recorded frame.
+        """
         try:
-            maker = self._maker_of(site)
+            simulator = self._site_simulator(site)
         except InputError:
             return PlaybackFrame(frame, np.empty((0, 3)), np.empty(0, dtype=np.int64))
-        swept = maker.sweep(frame, sweep_rng(self._session.scenario.seed, site.name, frame.number))
-        points = swept.sweep.points[:, :3].astype(np.float64) @ rotation_world_sensor(*site.pose.angles_deg).T
-        return PlaybackFrame(frame, points + site.pose.position_m, swept.owner.astype(np.int64))
+        labelled = simulator.sweep(frame, sweep_rng(self._session.scenario.seed, site.name, frame.number))
+        points = labelled.sweep.points[:, :3].astype(np.float64) @ rotation_world_sensor(*site.pose.angles_deg).T
+        return PlaybackFrame(frame, points + site.pose.position_m, labelled.owner.astype(np.int64))
 
     def kinds(self, frame: TrafficFrame) -> list[str]:
-        """The body of each box of a frame."""
-        return [self._shapes.kinds[kind] for kind in self._shapes.of_frame(frame).tolist()]
+        """Return the body of each box of a frame."""
+        return [self._meshes.kinds[kind] for kind in self._meshes.kinds_of_boxes(frame).tolist()]
 
-    def _maker_of(self, site: Site) -> CloudSimulator:
-        scene = self._session.scene_before(site)
+    def _site_simulator(self, site: Site) -> CloudSimulator:
+        scene = self._session.scene_with(site)
         if self._scanner is None or self._scanner[0] is not scene:
             self._scanner = (scene, Scanner(scene, full_sweep=True, mounts=1))
-            self._maker = None
-        if self._maker is None or self._maker[0] != site:
-            self._maker = (site, CloudSimulator.of_site(scene, site, self._scanner[1], self._shapes))
-        return self._maker[1]
+            self._simulator = None
+        if self._simulator is None or self._simulator[0] != site:
+            self._simulator = (site, CloudSimulator.of_site(scene, site, self._scanner[1], self._meshes))
+        return self._simulator[1]

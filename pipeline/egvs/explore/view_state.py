@@ -1,13 +1,10 @@
-"""What a page shows, as a value and in a link; poses saved as sites.
+"""What the explorer's page shows, as a value and as a link; poses saved to a file of sites.
 
-Poses that a planner keeps: a file of sites in the scenario's folder, which ``sites.file`` can name.
+A link has the form of the query of a web address, ``site=c03&pose=190,255,4.5,0,0,0``: world frame, metres and degrees.
+Values that are the same as when the page was opened are left out.
 
-A file of that name that this program did not write is a user's own: it stays as it is.
-
-What a page shows, as a value, and as text in a link: a sensor in its pose, settings, what is laid over the scene.
-
-A link's text is that of a web address after its question mark, ``site=c03&pose=195,255,4.5,0,0,0``: numbers
-as the scenario has them, world frame, metres and degrees. What is as it was opened is left out.
+Saved poses are rows of a file in the scenario's folder that ``sites.file`` can name. A file of that name that the
+explorer did not write is never changed.
 """
 
 from __future__ import annotations
@@ -15,11 +12,11 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 from urllib.parse import parse_qsl, urlencode
 
 from egvs.core import files
@@ -31,31 +28,50 @@ from egvs.explore.settings import Settings
 from egvs.sensors.sites import Pose, Site
 
 SAVED_SITES = "kept_sites.csv"
-"""In the scenario's folder."""
+"""Name of the file in the scenario's folder."""
 
 _COLUMNS = ("site", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg", "sensor")
 
+LAYERS = {
+    "none": "none",
+    "traffic": "traffic (TPOG)",
+    "seen": "entropy seen",
+    "missed": "entropy missed",
+    "blindspots": "vehicles missed",
+    "difference": "compare with another site",
+    "scan": "empty scan",
+    "ring": "beams of one ring",
+    "replay": "recorded traffic",
+}
+"""Layers over the scene: name in a link, and on the page."""
+
+T = TypeVar("T")
+D = TypeVar("D")
+_POSE_PARTS = ("x", "y", "z", "yaw", "tilt", "roll")
+_WHOLE_NUMBER = "a whole number from 0"
+
 
 def save_pose(path: Path, site: Site, candidates: Collection[str]) -> str:
-    """Add a pose to a file of kept sites, or begin one; the name that it has there.
+    """Add a pose to a file of saved sites, and return its name in the file.
 
     Parameters
     ----------
     path
-        Of the file.
+        The file; it is created if it does not exist.
     site
-        The candidate whose sensor it is, as it stands now.
+        A candidate in its current pose.
     candidates
-        Names that are taken.
+        Names that cannot be used.
 
     Raises
     ------
     InputError
-        Where the file is another one than this program's own: it stays as it is.
+        If the file was not written by the explorer; it is not changed.
     """
     rows = _read_saved_rows(path)
     taken = {row[0] for row in rows} | set(candidates)
-    name = next(new for n in range(1, len(taken) + 2) if (new := f"{site.name[:72]}-{n}") not in taken)
+    numbered = (f"{site.name[:72]}-{number}" for number in count(1))
+    name = next(name for name in numbered if name not in taken)
     pose = site.pose
     rows.append([name, *(repr(float(value)) for value in (*pose.position_m, *pose.angles_deg)), site.sensor])
     text = io.StringIO()
@@ -65,57 +81,42 @@ def save_pose(path: Path, site: Site, candidates: Collection[str]) -> str:
 
 
 def unused_file_name(folder: Path) -> str:
-    """The name of a file that is not there yet, for somebody whose own file has the usual one."""
+    """Return a name for saved sites that does not exist yet, for users whose own file has the usual name."""
     stem, suffix = SAVED_SITES.split(".")
-    return next(name for n in count(2) if not (folder / (name := f"{stem}-{n}.{suffix}")).exists())
+    names = (f"{stem}-{number}.{suffix}" for number in count(2))
+    return next(name for name in names if not (folder / name).exists())
 
 
 def _read_saved_rows(path: Path) -> list[list[str]]:
-    """The rows of a file of kept sites; none where there is no file yet."""
     if not path.is_file():
         return []
     with path.open(newline="", encoding="utf-8", errors="replace") as file:
-        header, *rows = [row for row in csv.reader(file) if row] or [[]]
-    if tuple(header) != _COLUMNS or any(len(row) != len(_COLUMNS) for row in rows):
-        raise InputError(path, "was not written by egvs explore, and stays as it is", "another name to keep poses in")
-    return rows
-
-
-LAYERS = {
-    "none": "none",
-    "traffic": "traffic (TPOG)",
-    "seen": "entropy seen",
-    "missed": "entropy missed",
-    "blindspots": "vehicles missed",
-    "difference": "difference to a site",
-    "scan": "empty scan",
-    "ring": "beams of a ring",
-    "replay": "recorded traffic",
-}
-"""What may be laid over the scene: its name in a link, and on the page."""
-
-T = TypeVar("T")
-_POSE_PARTS = ("x", "y", "z", "yaw", "tilt", "roll")
+        rows = [row for row in csv.reader(file) if row]
+    if not rows or tuple(rows[0]) != _COLUMNS or any(len(row) != len(_COLUMNS) for row in rows):
+        raise InputError(path, "was not written by egvs explore, and is not changed", "Save to another file.")
+    return rows[1:]
 
 
 @dataclass(frozen=True)
 class View:
-    """What is shown.
+    """What the page shows.
 
     Attributes
     ----------
     site
-        A candidate, its sensor as it hangs now.
+        A candidate with its current pose and sensor.
+    settings
+        Gamma, score and effects.
     period
-        Of the traffic; empty for all.
+        Traffic period; empty for all.
     layer
         One of :data:`LAYERS`.
     ring, frame
-        Which ring of beams, and which recorded frame, the layers of these show.
+        Shown by the layers of these names.
     beside
-        The candidate that the layer of differences compares with; empty for the best other one.
+        The candidate that the layer ``difference`` compares with; empty for the best other one.
     is_dark
-        The page's colours.
+        Whether the page is dark.
     """
 
     site: Site
@@ -128,141 +129,179 @@ class View:
     is_dark: bool = False
 
     @classmethod
-    def of(cls, session: Session) -> View:
-        """That with which a session is opened: its best candidate."""
-        return cls(session.ranked[0].site, Settings.of(session.scenario))
+    def from_session(cls, session: Session) -> View:
+        """Return the first view of a session: its best candidate."""
+        return cls(session.ranked[0].site, Settings.from_scenario(session.scenario))
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Where somebody looks from, and at what, world frame, metres."""
+    """Position of a camera, and the point that it looks at; world frame, metres."""
 
     from_m: Vec3
     at_m: Vec3
 
 
-def encode_view(view: View, opened: View, camera: Camera | None = None) -> str:
-    """A view as a link has it, beside the one with which the session was opened."""
-    site, said = view.site, {"site": view.site.name}
-    said["pose"] = ",".join(_digits(value) for value in (*site.pose.position_m, *site.pose.angles_deg))
-    said["sensor"] = site.sensor
-    if view.settings.gamma is not None:
-        said["gamma"] = _digits(view.settings.gamma)
-    if view.settings.rank_by != opened.settings.rank_by:
-        said["score"] = view.settings.rank_by
-    if view.settings.effects != opened.settings.effects:
-        said["effects"] = ",".join(sorted(view.settings.effects))
-    for name, default in (("period", ""), ("layer", "none"), ("ring", 0), ("frame", 0), ("beside", "")):
-        if (value := getattr(view, name)) != default:
-            said[name] = str(value)
-    if view.is_dark:
-        said["dark"] = "1"
-    if camera is not None:
-        said["camera"] = ",".join(f"{value:.6g}" for value in (*camera.from_m, *camera.at_m))
-    return urlencode(said, safe=",")
-
-
-def decode_view(
-    text: str | Mapping[str, str], session: Session, opened: View, where: str
-) -> tuple[View, Camera | None]:
-    """The view that a link asks for, and from where.
+def encode_view(view: View, initial: View, camera: Camera | None = None) -> str:
+    """Write a view as a link.
 
     Parameters
     ----------
+    view
+        The view.
+    initial
+        The first view of the session; the same settings are left out.
+    camera
+        Added to the link.
+    """
+    site = view.site
+    parts = {"site": site.name}
+    parts["pose"] = ",".join(_shortest(value) for value in (*site.pose.position_m, *site.pose.angles_deg))
+    parts["sensor"] = site.sensor
+    if view.settings.gamma is not None:
+        parts["gamma"] = _shortest(view.settings.gamma)
+    if view.settings.rank_by != initial.settings.rank_by:
+        parts["score"] = view.settings.rank_by
+    if view.settings.effects != initial.settings.effects:
+        parts["effects"] = ",".join(sorted(view.settings.effects))
+    for name, default in (("period", ""), ("layer", "none"), ("ring", 0), ("frame", 0), ("beside", "")):
+        value = getattr(view, name)
+        if value != default:
+            parts[name] = str(value)
+    if view.is_dark:
+        parts["dark"] = "1"
+    if camera is not None:
+        parts["camera"] = ",".join(f"{value:.6g}" for value in (*camera.from_m, *camera.at_m))
+    return urlencode(parts, safe=",")
+
+
+def decode_view(
+    link: str | Mapping[str, str], session: Session, initial: View, where: str
+) -> tuple[View, Camera | None]:
+    """Read a link.
+
+    Parameters
+    ----------
+    link
+        Its text, or its parts.
     session
-        As it was opened, and ``opened`` its view.
+        The session without changes.
+    initial
+        The first view of the session, for parts that are missing.
     where
-        Named in messages.
+        Used in messages.
 
     Raises
     ------
     InputError
-        Where it asks for what is not there.
+        If a part is unknown or not valid.
     """
-    said = dict(text if isinstance(text, Mapping) else parse_qsl(text.removeprefix("?"), keep_blank_values=True))
-    read = _LinkReader(said, where)
-    name = read.one_of("site", session.candidates, opened.site.name)
-    site = session.candidates[name].site
-    pose = read.numbers("pose", len(_POSE_PARTS), ",".join(_POSE_PARTS))
-    site = replace(site, pose=Pose(*pose) if pose else site.pose)
-    if "sensor" in said:
-        site = replace(site, sensor=said["sensor"])
-        session.scene.sensor(site.sensor, f"{where}: sensor")
+    if isinstance(link, str):
+        link = dict(parse_qsl(link.removeprefix("?"), keep_blank_values=True))
+    reader = _LinkReader(link, where)
+    site = session.candidates[reader.choice("site", session.candidates, initial.site.name)].site
+    pose = reader.numbers("pose", _POSE_PARTS)
+    if pose:
+        site = replace(site, pose=Pose(*pose))
+    sensor = reader.text("sensor", site.sensor)
+    if sensor != site.sensor:
+        session.scene.sensor(sensor, f"{where}: sensor")
+        site = replace(site, sensor=sensor)
+    gamma = reader.number("gamma", None, float, "a number from 0")
+    rank_by = reader.text("score", initial.settings.rank_by)
+    settings = Settings(gamma, rank_by, reader.effects(initial.settings.effects))
     view = View(
-        site,
-        Settings(read.gamma(), said.get("score", opened.settings.rank_by), read.effects(opened.settings.effects)),
-        read.one_of("period", ("", *session.periods), ""),
-        read.one_of("layer", LAYERS, "none"),
-        read.integer("ring"),
-        read.integer("frame"),
-        read.one_of("beside", ("", *session.candidates), ""),
-        said.get("dark", "") == "1",
+        site=site,
+        settings=settings,
+        period=reader.choice("period", ("", *session.periods), ""),
+        layer=reader.choice("layer", LAYERS, "none"),
+        ring=reader.whole_number("ring"),
+        frame=reader.whole_number("frame"),
+        beside=reader.choice("beside", ("", *session.candidates), ""),
+        is_dark=reader.text("dark", "") == "1",
     )
-    view.settings.applied_to(session.scenario, where)
-    camera = read.numbers("camera", 6, "x,y,z,x,y,z: from where, and at what")
-    unknown = sorted(said.keys() - read.known)
-    if unknown:
-        raise InputError(where, f"unknown {unknown[0]!r}", f"one of {', '.join(sorted(read.known))}")
-    return view, Camera((camera[0], camera[1], camera[2]), (camera[3], camera[4], camera[5])) if camera else None
+    settings.apply(session.scenario, where)
+    camera = None
+    coordinates = reader.numbers("camera", ("x", "y", "z", "x", "y", "z"))
+    if coordinates:
+        from_x, from_y, from_z, at_x, at_y, at_z = coordinates
+        camera = Camera((from_x, from_y, from_z), (at_x, at_y, at_z))
+    reader.reject_unknown_keys()
+    return view, camera
 
 
 class _LinkReader:
-    """Reads the parts of a link one by one."""
+    """Reads the parts of a link one by one, and raises an InputError for those that are not valid."""
 
     def __init__(self, parts: Mapping[str, str], where: str) -> None:
-        self.parts, self.where = parts, where
-        self.known = {"sensor", "score", "dark"}
+        self._parts, self._where = parts, where
+        self._known: set[str] = set()
 
-    def one_of(self, key: str, known: Any, default: str) -> str:
-        """A name that is known."""
-        self.known.add(key)
-        found = self.parts.get(key, default)
-        if found not in known:
-            right = f"one of {', '.join(name for name in known if name)}"
-            raise InputError(f"{self.where}: {key}", repr(found), right if any(known) else "none")
-        return found
+    def text(self, key: str, default: str) -> str:
+        """Return any text."""
+        self._known.add(key)
+        return self._parts.get(key, default)
 
-    def numbers(self, key: str, count: int, expected: str) -> list[float]:
-        """So many finite numbers; none where the key is not there."""
-        self.known.add(key)
-        if key not in self.parts:
+    def choice(self, key: str, choices: Collection[str], default: str) -> str:
+        """Return one of several names."""
+        text = self.text(key, default)
+        if text not in choices:
+            names = ", ".join(name for name in choices if name)
+            raise self._error(key, f"one of {names}" if names else "no value", text)
+        return text
+
+    def numbers(self, key: str, names: Sequence[str]) -> list[float]:
+        """Return one finite number for each name; nothing if the part is missing."""
+        self._known.add(key)
+        if key not in self._parts:
             return []
-        parts = self.parts[key].split(",")
-        found = [self._number(key, part, float, expected) for part in parts]
-        if len(found) != count or not all(map(math.isfinite, found)):
-            raise InputError(f"{self.where}: {key}", repr(self.parts[key]), expected)
-        return found
+        expected = f"numbers {','.join(names)}"
+        values = [self._convert(key, part, float, expected) for part in self._parts[key].split(",")]
+        if len(values) != len(names) or not all(map(math.isfinite, values)):
+            raise self._error(key, expected, self._parts[key])
+        return values
 
-    def gamma(self) -> float | None:
-        """None where it is as the scenario has it."""
-        self.known.add("gamma")
-        return self._number("gamma", self.parts["gamma"], float, "a number from 0") if "gamma" in self.parts else None
+    def number(self, key: str, default: D, kind: Callable[[str], T], expected: str) -> T | D:
+        """Return a number of some kind."""
+        self._known.add(key)
+        if key not in self._parts:
+            return default
+        return self._convert(key, self._parts[key], kind, expected)
 
-    def integer(self, key: str) -> int:
-        """A number from 0."""
-        self.known.add(key)
-        found = self._number(key, self.parts.get(key, "0"), int, "a whole number from 0")
-        if found < 0:
-            raise InputError(f"{self.where}: {key}", str(found), "a whole number from 0")
-        return found
+    def whole_number(self, key: str) -> int:
+        """Return a whole number from 0, which is the default."""
+        value = self.number(key, 0, int, _WHOLE_NUMBER)
+        if value < 0:
+            raise self._error(key, _WHOLE_NUMBER, value)
+        return value
 
     def effects(self, default: frozenset[str]) -> frozenset[str]:
-        """Names, with commas between them."""
-        self.known.add("effects")
-        if "effects" not in self.parts:
+        """Return names of effects, which are separated by commas."""
+        if "effects" not in self._parts:
+            self._known.add("effects")
             return default
-        found, known = frozenset(filter(None, self.parts["effects"].split(","))), registry.effect_names()
-        for name in sorted(found.difference(known)):
-            raise InputError(f"{self.where}: effects", repr(name), f"one of {', '.join(known)}")
-        return found
+        names = frozenset(filter(None, self.text("effects", "").split(",")))
+        for name in sorted(names.difference(registry.effect_names())):
+            raise self._error("effects", f"some of {', '.join(registry.effect_names())}", name)
+        return names
 
-    def _number(self, key: str, text: str, kind: Callable[[str], T], expected: str) -> T:
+    def reject_unknown_keys(self) -> None:
+        """Raise an InputError if the link has parts that nothing has read."""
+        for key in sorted(self._parts.keys() - self._known):
+            raise InputError(self._where, f"unknown {key!r}", f"Use some of {', '.join(sorted(self._known))}.")
+
+    def _convert(self, key: str, text: str, kind: Callable[[str], T], expected: str) -> T:
         try:
             return kind(text)
         except ValueError:
-            raise InputError(f"{self.where}: {key}", repr(text), expected) from None
+            raise self._error(key, expected, text) from None
+
+    def _error(self, key: str, expected: str, value: object) -> InputError:
+        return InputError(f"{self._where}: {key}", f"expected {expected}, got {value!r}")
 
 
-def _digits(value: float) -> str:
-    """All digits that tell a number from its neighbours, and no more."""
-    return f"{value:.0f}" if float(value).is_integer() and abs(value) < 1e15 else repr(float(value))
+def _shortest(value: float) -> str:
+    """Return the shortest text that gives the same number."""
+    if float(value).is_integer() and abs(value) < 1e15:
+        return f"{value:.0f}"
+    return repr(float(value))

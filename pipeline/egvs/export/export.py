@@ -1,7 +1,7 @@
-"""Exports a run, or a city's: vector layers as GeoPackage, GeoJSON, GeoParquet, KML or CSV, rasters as GeoTIFF.
+"""Exports a run or a city: vector layers as GeoPackage, GeoJSON, GeoParquet, KML or CSV, rasters as GeoTIFF.
 
-Steps: refuse what cannot be done before any work; open the run, and choose the reference system; make the layers or
-rasters; write them aside, and bring them under their names when all are whole.
+Steps: check the request; open the run and choose the reference system; make the layers or rasters; write the files to a
+temporary folder, and move them to their names when all are complete.
 """
 
 from __future__ import annotations
@@ -19,40 +19,49 @@ from egvs.core import files, plugins
 from egvs.core.errors import InputError
 from egvs.core.runtime import ProgressCallback, no_progress
 from egvs.export.finished_run import CRS_CHOICES, SCENARIO_CRS, WGS84_CRS, ExportCrs, FinishedRun
-from egvs.export.layers import NAMES, Layer, best_site, city_layers, city_name, is_city, open_any_run, run_layers
+from egvs.export.layers import NAMES, Layer, best_site, city_layers, city_name, is_city, open_junction_run, run_layers
 
 EXPORT_FOLDER = "export"
-"""In a run's folder, where exports go by default."""
+"""The default folder for exports, in the run folder."""
 
 
 @dataclass(frozen=True)
 class Format:
-    """A format: how its files end, whether all layers are in one, in which system it is by default, and the libraries
-    that write it."""
+    """A file format.
+
+    Attributes
+    ----------
+    name, suffix
+        Name on the command line, and suffix of the files.
+    is_one_file
+        Whether one file has all layers.
+    crs
+        Default reference system, one of :data:`egvs.export.finished_run.CRS_CHOICES`.
+    libraries
+        Optional libraries that write the format.
+    """
 
     name: str
     suffix: str
     is_one_file: bool
     crs: str
-    libraries: tuple[str, ...]
+    libraries: tuple[str, ...] = ()
 
 
-FORMATS = {
-    its.name: its
-    for its in (
-        Format("gpkg", ".gpkg", True, SCENARIO_CRS, ("pyogrio",)),
-        Format("geojson", ".geojson", False, WGS84_CRS, ()),
-        Format("geoparquet", ".parquet", False, SCENARIO_CRS, ("geopandas",)),
-        Format("kml", ".kml", True, WGS84_CRS, ()),
-        Format("csv", ".csv", False, SCENARIO_CRS, ()),
-        Format("geotiff", ".tif", False, SCENARIO_CRS, ("rasterio",)),
-    )
-}
+_FORMATS = (
+    Format("gpkg", ".gpkg", True, SCENARIO_CRS, ("pyogrio",)),
+    Format("geojson", ".geojson", False, WGS84_CRS),
+    Format("geoparquet", ".parquet", False, SCENARIO_CRS, ("geopandas",)),
+    Format("kml", ".kml", True, WGS84_CRS),
+    Format("csv", ".csv", False, SCENARIO_CRS),
+    Format("geotiff", ".tif", False, SCENARIO_CRS, ("rasterio",)),
+)
+FORMATS = {file_format.name: file_format for file_format in _FORMATS}
 
 
 @dataclass(frozen=True)
 class ExportResult:
-    """What was written: files, the reference system in words, and what was left out and why."""
+    """The files, a description of their reference system, and notes on layers that were left out."""
 
     paths: tuple[Path, ...]
     reference: str
@@ -68,65 +77,79 @@ def export_run(
     sites: Collection[str] = (),
     progress: ProgressCallback = no_progress,
 ) -> ExportResult:
-    """Export a finished run.
+    """Export a finished run, or a city.
 
     Parameters
     ----------
     folder
-        The run's.
+        Folder of the run or of the city.
     to
         One of :data:`FORMATS`.
     crs
-        One of :data:`egvs.export.finished_run.CRS_CHOICES`; the format's own by default, and local metres where it is
-        degrees and nobody knows where the scenario lies.
+        One of :data:`egvs.export.finished_run.CRS_CHOICES`; by default that of the format, or local metres if the
+        format would use degrees and the scenario has no reference system.
     out
-        A file, or a folder for formats of several files; in the run's folder ``export`` by default.
+        A file, or a folder for formats with several files; ``export`` in the run folder by default.
     sites
-        Of rasters: those whose view is written; the best one by default.
+        Sites whose views are written as rasters; the best one by default.
+    progress
+        Called after each step.
+
+    Returns
+    -------
+    ExportResult
+        What was written.
 
     Raises
     ------
     InputError
-        Names what is unknown, missing, damaged, or cannot be written; nothing is written then.
+        If an option is unknown, an artefact is missing or damaged, or a file cannot be written. Nothing is written
+        then.
     MissingExtraError
-        Where the libraries are not installed.
+        If the libraries are not installed.
     """
-    its = _get_format(to, crs, sites)
-    whole = is_city(folder)
-    if whole and to == "geotiff":
-        raise InputError("--to geotiff", f"{folder} is a city's run", f"a junction's: {folder / 'junctions' / 'NAME'}")
-    run = open_any_run(folder) if whole else FinishedRun.open(folder)
-    name = city_name(folder) if whole else run.scenario.name
-    reference = _export_crs(run, its, crs)
-    chosen = _selected_sites(run, sites)
-    target = out or folder / EXPORT_FOLDER / (f"{safe_file_name(name)}{its.suffix}" if its.is_one_file else to)
-    _check_target(target, its)
-    _check_free([target] if its.is_one_file else [], out)
-    with files.temporary_folder() as aside:
-        if its.name == "geotiff":
-            made, notes = list(_write_rasters(run, reference, aside, chosen, progress)), list[str]()
+    file_format = _check_request(to, crs, sites)
+    of_city = is_city(folder)
+    if of_city and to == "geotiff":
+        hint = f"Export a junction: {folder / 'junctions' / 'NAME'}"
+        raise InputError("--to geotiff", f"{folder} is the folder of a city", hint)
+    run = open_junction_run(folder) if of_city else FinishedRun.open(folder)
+    title = city_name(folder) if of_city else run.scenario.name
+    reference = _export_crs(run, file_format, crs)
+    selected = _selected_sites(run, sites)
+    target = out or _default_target(folder, file_format, title)
+    _check_target(target, file_format)
+    if file_format.is_one_file:
+        _check_not_existing([target], out)
+
+    notes: list[str] = []
+    with files.temporary_folder() as temp_folder:
+        if file_format.name == "geotiff":
+            written = list(_write_rasters(run, reference, temp_folder, selected, progress))
         else:
-            layers, notes = city_layers(folder) if whole else run_layers(run)
+            layers, notes = city_layers(folder) if of_city else run_layers(run)
             progress("layers made", 1, 2)
-            made = list(_write_vectors(its, layers, reference, aside, target.name, name))
+            written = list(_write_vectors(file_format, layers, reference, temp_folder, target.name, title))
             progress("files written", 2, 2)
-        paths = [target if its.is_one_file else target / path.name for path in made]
-        _check_free(paths, out)
-        _move_all(made, paths)
-    if out is None and not its.is_one_file:
+        paths = [target] if file_format.is_one_file else [target / path.name for path in written]
+        _check_not_existing(paths, out)
+        _move_all(written, paths)
+    if out is None and not file_format.is_one_file:
         _remove_stale_layers(target, paths)
-    return ExportResult(tuple(paths), reference.words, tuple(notes))
+    return ExportResult(tuple(paths), reference.description, tuple(notes))
 
 
-def _get_format(to: str, crs: str | None, sites: Collection[str]) -> Format:
+def _check_request(to: str, crs: str | None, sites: Collection[str]) -> Format:
     if to not in FORMATS:
-        raise InputError("--to", repr(to), f"one of {', '.join(FORMATS)}")
+        raise InputError("--to", f"expected one of {', '.join(FORMATS)}, got {to!r}")
     if crs is not None and crs not in CRS_CHOICES:
-        raise InputError("--crs", repr(crs), f"{SCENARIO_CRS} (its reference system) or {WGS84_CRS} (degrees)")
+        hint = f"{SCENARIO_CRS.capitalize()} is the scenario's reference system, {WGS84_CRS} are degrees"
+        raise InputError("--crs", f"expected {' or '.join(CRS_CHOICES)}, got {crs!r}", hint)
     if to == "kml" and crs == SCENARIO_CRS:
-        raise InputError("--crs", f"{SCENARIO_CRS} with --to kml", f"{WGS84_CRS}: KML knows degrees only")
+        raise InputError("--crs", "KML files are always in degrees", f"Use --crs {WGS84_CRS}, or leave --crs out")
     if sites and to != "geotiff":
-        raise InputError("--site", f"with --to {to}", "--to geotiff: the other formats hold all sites")
+        hint = "Leave --site out: the other formats have all sites"
+        raise InputError("--site", f"works only with --to geotiff, got --to {to}", hint)
     plugins.require_libraries(f"export to {to}", "gis", *FORMATS[to].libraries)
     return FORMATS[to]
 
@@ -136,52 +159,65 @@ def _export_crs(run: FinishedRun, file_format: Format, crs: str | None) -> Expor
     if crs is None and run.frame is None and file_format.name != "kml":
         choice = SCENARIO_CRS
     x, y, _ = run.scenario.roi.center_m
-    return ExportCrs.of(run.frame, choice, (x, y), f"{run.work.folder}: --to {file_format.name}")
+    return ExportCrs.from_choice(run.frame, choice, (x, y), f"{run.work.folder}: --to {file_format.name}")
 
 
 def _selected_sites(run: FinishedRun, sites: Collection[str]) -> Collection[str]:
-    """The sites whose views are written; InputError for one that the run has not."""
+    """The sites whose views are written; InputError for an unknown one."""
     known = parquet.read_artefact(run.artefact(RunFolder.scores.name), "scores")[0].column("site").to_pylist()
     for name in sites:
         if name not in known:
-            some = ", ".join(known[:10]) + (", ..." if len(known) > 10 else "")
-            raise InputError("--site", f"{name!r} is no site of this run", f"one of {some}")
+            raise unknown_site(name, known)
     return tuple(dict.fromkeys(sites)) or (best_site(run),)
 
 
+def unknown_site(name: str, known: Sequence[str]) -> InputError:
+    """Return an error for a site that a run does not have."""
+    listed = ", ".join(known[:10]) + (", ..." if len(known) > 10 else "")
+    return InputError("--site", f"this run has no site {name!r}", f"Choose one of {listed}")
+
+
+def _default_target(folder: Path, file_format: Format, title: str) -> Path:
+    if file_format.is_one_file:
+        return folder / EXPORT_FOLDER / f"{safe_file_name(title)}{file_format.suffix}"
+    return folder / EXPORT_FOLDER / file_format.name
+
+
 def _check_target(target: Path, file_format: Format) -> None:
-    """InputError where files could not be written, or would replace one that is no export."""
+    """InputError if the files cannot be written, or the target is a file of the wrong kind."""
+    option = f"--to {file_format.name}"
     if file_format.is_one_file:
         if target.suffix != file_format.suffix:
-            raise InputError(
-                "--out", repr(str(target)), f"a file that ends in {file_format.suffix} for --to {file_format.name}"
-            )
+            problem = f"expected a file name ending in {file_format.suffix} for {option}, got {str(target)!r}"
+            raise InputError("--out", problem, "Change its ending, or --to")
         files.check_writable(target)
         return
     if target.exists() and not target.is_dir():
-        raise InputError("--out", f"{target} is a file", f"a folder: --to {file_format.name} writes several files")
+        raise InputError("--out", f"{target} is a file", f"Name a folder: {option} writes several files")
     files.check_writable(target / f"any{file_format.suffix}")
 
 
-def _check_free(paths: Sequence[Path], out: Path | None) -> None:
-    """InputError where a file that the user names, or in a folder that the user names, would be replaced: a scenario
-    has a ``sites.csv`` too, and a GeoPackage may hold other layers."""
-    if out is not None and (there := [path for path in paths if path.exists()]):
-        right = "another name" if there[0] == out else "a new folder, or one without such files"
-        raise InputError("--out", f"{there[0]} is there already", right)
-
-
-def _move_all(made: Sequence[Path], paths: Sequence[Path]) -> None:
-    """All files to where they belong, or none."""
+def _check_not_existing(paths: Sequence[Path], out: Path | None) -> None:
+    """InputError if a file would be replaced that the user may have made: a scenario has a ``sites.csv`` too."""
+    if out is None:
+        return
     for path in paths:
-        files.ensure_writable_folder(path)
+        if path.exists():
+            hint = "Choose another name" if path == out else "Choose a new folder, or one without such files"
+            raise InputError("--out", f"{path} exists already", hint)
+
+
+def _move_all(sources: Sequence[Path], targets: Sequence[Path]) -> None:
+    """Move all files, or none."""
+    for target in targets:
+        files.ensure_writable_folder(target)
     with ExitStack() as partials:
-        for path, done in zip(paths, made, strict=True):
-            shutil.copyfile(done, partials.enter_context(files.atomic_write(path)))
+        for source, target in zip(sources, targets, strict=True):
+            shutil.copyfile(source, partials.enter_context(files.atomic_write(target)))
 
 
 def _remove_stale_layers(folder: Path, paths: Sequence[Path]) -> None:
-    """Remove the layers that an earlier export left in a run's folder and that are no more: a plan of other sites."""
+    """Remove layers of an earlier export that the run no longer has, such as an outdated plan."""
     for layer in NAMES:
         path = folder / f"{layer}{paths[0].suffix}"
         if path not in paths:
@@ -189,42 +225,48 @@ def _remove_stale_layers(folder: Path, paths: Sequence[Path]) -> None:
 
 
 def _write_vectors(
-    file_format: Format, layers: Sequence[Layer], reference: ExportCrs, temp_path: Path, name: str, title: str
+    file_format: Format, layers: Sequence[Layer], reference: ExportCrs, folder: Path, name: str, title: str
 ) -> Iterator[Path]:
     from egvs.export import vector_files
 
-    each: dict[str, Callable[[Path, Layer, ExportCrs], None]] = {
-        "geojson": vector_files.write_geojson, "geoparquet": vector_files.write_geoparquet,
-        "csv": vector_files.write_csv,
-    }  # fmt: skip
     if file_format.name == "gpkg":
-        vector_files.write_geopackage(temp_path / name, layers, reference)
-        yield temp_path / name
-    elif file_format.name == "kml":
-        vector_files.write_kml(temp_path / name, title, layers, reference)
-        yield temp_path / name
-    else:
-        for layer in layers:
-            each[file_format.name](path := temp_path / f"{layer.name}{file_format.suffix}", layer, reference)
-            yield path
+        vector_files.write_geopackage(folder / name, layers, reference)
+        yield folder / name
+        return
+    if file_format.name == "kml":
+        vector_files.write_kml(folder / name, title, layers, reference)
+        yield folder / name
+        return
+    writers: dict[str, Callable[[Path, Layer, ExportCrs], None]] = {
+        "geojson": vector_files.write_geojson,
+        "geoparquet": vector_files.write_geoparquet,
+        "csv": vector_files.write_csv,
+    }
+    for layer in layers:
+        path = folder / f"{layer.name}{file_format.suffix}"
+        writers[file_format.name](path, layer, reference)
+        yield path
 
 
 def _write_rasters(
-    run: FinishedRun, reference: ExportCrs, temp_path: Path, sites: Collection[str], progress: ProgressCallback
+    run: FinishedRun, reference: ExportCrs, folder: Path, sites: Collection[str], progress: ProgressCallback
 ) -> Iterator[Path]:
     from egvs.export import rasters
-    from egvs.export.rasters import run_rasters
 
-    taken: set[str] = set()
-    for number, raster in enumerate(run_rasters(run, sites), start=1):
+    used: set[str] = set()
+    for number, raster in enumerate(rasters.run_rasters(run, sites), start=1):
         name = safe_file_name(raster.name)
-        while taken & (its := {name.lower(), f"{name.lower()}_colours"}):  # of sites whose names differ in signs alone
+        while not used.isdisjoint(_raster_file_stems(name)):  # names that differ only in replaced characters
             name += "_"
-        taken |= its
-        yield from rasters.write_geotiff(temp_path, raster, reference, name)
+        used |= _raster_file_stems(name)
+        yield from rasters.write_geotiff(folder, raster, reference, name)
         progress(f"{raster.name} written", number, 1 + 3 * len(sites))
 
 
+def _raster_file_stems(name: str) -> set[str]:
+    return {name.lower(), f"{name.lower()}_colours"}
+
+
 def safe_file_name(name: str) -> str:
-    """A name that every disk takes."""
+    """Return a file name that is valid on every file system."""
     return re.sub(r'[\s\x00-\x1f\x7f/\\:*?"<>|.]+', "_", name)[:80] or "_"

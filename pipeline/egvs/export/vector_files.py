@@ -1,24 +1,16 @@
-"""GeoPackage, GeoJSON, GeoParquet, KML, CSV.
+"""Writers of layers: GeoPackage with QGIS styles, KML, GeoJSON, GeoParquet, CSV.
 
-Writes layers as one GeoPackage, with the styles that QGIS shows them in.
+GeoPackage (https://www.geopackage.org/spec120/) is written by GDAL (pyogrio); the styles are rows of its table
+``layer_styles``, where QGIS looks for them.
 
-GDAL (pyogrio) writes the layers; the styles are rows of the table ``layer_styles``, where QGIS looks for them. The
-bytes depend on no clock.
+KML (https://docs.ogc.org/is/12-007r2/12-007r2.html) is written here: the KML driver of GDAL in pyogrio writes neither
+styles, nor folders, nor heights above the ground. Its coordinates are always degrees.
 
-https://www.geopackage.org/spec120/
+GeoJSON in degrees is that of RFC 7946. In another reference system it has the member ``crs`` of GeoJSON 2008, which
+GDAL, QGIS and this program read; for local metres that is null. GeoParquet 1.1 (https://geoparquet.org) is written by
+geopandas. CSV is for spreadsheets: UTF-8 with a byte order mark, positions in two columns, lines and areas as WKT.
 
-Writes layers as one KML document that Google Earth colours: a folder a layer, of blind spots one a site.
-
-KML knows degrees only. Sensors hang at their height above the ground as the scenario has it.
-
-https://docs.ogc.org/is/12-007r2/12-007r2.html
-
-Writes a layer as GeoJSON, GeoParquet or CSV, one file each.
-
-- GeoJSON in degrees is that of RFC 7946. In another system it has the member ``crs`` of GeoJSON 2008, which GDAL, QGIS
-  and this program read; of local metres that is null.
-- GeoParquet 1.1 (https://geoparquet.org), by geopandas.
-- CSV for a spreadsheet: UTF-8 with its mark, positions of points in two columns, of lines and areas as WKT.
+The bytes of all files do not depend on the time.
 """
 
 from __future__ import annotations
@@ -50,10 +42,10 @@ from egvs.export.layers import (
 )
 
 _EPOCH = "2000-01-01T00:00:00.000Z"
-"""When everything is said to have been written."""
+"""Time of writing in all files."""
 
 _VERSION = "1.2"
-"""Programs that are some years old open this one without a warning; nothing of a later one is used."""
+"""A version that older programs open without a warning; no feature of a later one is used."""
 
 _GEOMETRY, _NUMBER = "geom", "fid"
 _KINDS = {FOOTPRINTS: "MultiPolygon", REGION: "Polygon", MISSED_LANES: "LineString"}
@@ -69,7 +61,7 @@ INSERT INTO gpkg_contents (table_name, data_type, identifier, description, last_
 
 
 def write_geopackage(path: Path, layers: Sequence[Layer], reference: ExportCrs) -> None:
-    """Write layers to a file that is not there yet."""
+    """Write layers, with their QGIS styles, to a new file."""
     import pyogrio
     import shapely
 
@@ -96,7 +88,7 @@ def write_geopackage(path: Path, layers: Sequence[Layer], reference: ExportCrs) 
 
 @contextmanager
 def _fixed_time() -> Iterator[None]:
-    """GDAL writes :data:`_EPOCH` for the time."""
+    """Make GDAL write :data:`_EPOCH` as the time."""
     import pyogrio
 
     pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": _EPOCH})
@@ -108,42 +100,61 @@ def _fixed_time() -> Iterator[None]:
 
 _NAMESPACE = "http://www.opengis.net/kml/2.2"
 _DOT_ICON = "http://maps.google.com/mapfiles/kml/shapes/placemark_circle.png"
-"""Google Earth's own round mark; where it is not to be had, a mark of the program's stands there."""
+"""A round icon of Google Earth; programs that cannot load it use their default icon."""
 
 _INVALID_XML = re.compile("[\x00-\x08\x0b-\x1f\ud800-\udfff\ufffe\uffff]")
-"""Signs that XML cannot hold."""
+"""Characters that XML does not allow."""
 _TITLE_COLUMNS = {
     SITES: "site", PLAN: "site", MISSED: "words", MISSED_LANES: "words", FOOTPRINTS: "name", REGION: "name",
     JUNCTIONS: "junction",
 }  # fmt: skip
-"""The column that a thing is called by."""
+"""The column with the name of a row."""
 _ALPHA = {FOOTPRINTS: "a0", REGION: "00"}
 
 
 def write_kml(path: Path, name: str, layers: Sequence[Layer], reference: ExportCrs) -> None:
-    """Write a document; ``reference`` is in degrees."""
+    """Write a document with one folder per layer, and in it one per site if the layer has rows of each site.
+
+    Parameters
+    ----------
+    path
+        The file.
+    name
+        Name of the document.
+    layers
+        The layers.
+    reference
+        The reference system, in degrees.
+    """
     root = ET.Element("kml", xmlns=_NAMESPACE)
     document = ET.SubElement(root, "Document")
     ET.SubElement(document, "name").text = _remove_invalid_xml(name)
-    used: dict[str, tuple[Layer, str]] = {}
+    styles: dict[str, ET.Element] = {}
     for layer in layers:
-        folder = ET.SubElement(document, "Folder")
-        ET.SubElement(folder, "name").text = layer.name
-        folders: dict[str, ET.Element] = {}
+        layer_folder = _folder(document, layer.name)
+        site_folders: dict[str, ET.Element] = {}
         for row, shape in zip(layer.rows.to_pylist(), reference.geometries(layer.geometries), strict=True):
-            into, site = folder, row["site"] if layer.initial_site else ""
+            folder, is_visible = layer_folder, True
             if layer.initial_site:
-                if site not in folders:
-                    folders[site] = ET.SubElement(folder, "Folder")
-                    ET.SubElement(folders[site], "name").text = _remove_invalid_xml(site)
-                into = folders[site]
-            paint = row_colour(layer, row.get(layer.colours_by))
-            used.setdefault(style := f"{layer.name}-{paint}", (layer, paint))
-            _placemark(into, layer, row, shape, style, site == layer.initial_site)
-    for number, (style, (layer, paint)) in enumerate(used.items(), start=1):
-        document.insert(number, _style(style, layer, paint))
+                site = row["site"]
+                if site not in site_folders:
+                    site_folders[site] = _folder(layer_folder, site)
+                folder, is_visible = site_folders[site], site == layer.initial_site
+            colour = row_colour(layer, row.get(layer.colours_by))
+            style = f"{layer.name}-{colour}"
+            if style not in styles:
+                styles[style] = _style(style, layer, colour)
+            _placemark(folder, layer, row, shape, style, is_visible)
+    for number, element in enumerate(styles.values(), start=1):
+        document.insert(number, element)
     ET.indent(root)
     path.write_bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
+
+
+def _folder(parent: ET.Element, name: str) -> ET.Element:
+    folder = ET.SubElement(parent, "Folder")
+    ET.SubElement(folder, "name").text = _remove_invalid_xml(name)
+    return folder
 
 
 def _placemark(
@@ -156,10 +167,9 @@ def _placemark(
     extended = ET.SubElement(mark, "ExtendedData")
     for key, value in row.items():
         if value is not None:
+            text = repr(value) if isinstance(value, float) else str(value)
             data = ET.SubElement(extended, "Data", name=_remove_invalid_xml(key))
-            ET.SubElement(data, "value").text = _remove_invalid_xml(
-                repr(value) if isinstance(value, float) else str(value)
-            )
+            ET.SubElement(data, "value").text = _remove_invalid_xml(text)
     _geometry(mark, shape, row.get("z_m") if layer.has_points else None)
 
 
@@ -179,13 +189,18 @@ def _geometry(parent: ET.Element, shape: Any, z_m: float | None) -> None:
             ET.SubElement(line, "coordinates").text = _coordinates(shape)
         case "Polygon":
             polygon = ET.SubElement(parent, "Polygon")
-            for ring, where in ((shape.exterior, "outer"), *((hole, "inner") for hole in shape.interiors)):
-                border = ET.SubElement(polygon, f"{where}BoundaryIs")
-                ET.SubElement(ET.SubElement(border, "LinearRing"), "coordinates").text = _coordinates(ring)
+            _boundary(polygon, "outerBoundaryIs", shape.exterior)
+            for hole in shape.interiors:
+                _boundary(polygon, "innerBoundaryIs", hole)
         case _:
-            several = ET.SubElement(parent, "MultiGeometry")
+            multi_geometry = ET.SubElement(parent, "MultiGeometry")
             for part in shapely.get_parts(shape):
-                _geometry(several, part, z_m)
+                _geometry(multi_geometry, part, z_m)
+
+
+def _boundary(polygon: ET.Element, tag: str, ring: Any) -> None:
+    linear_ring = ET.SubElement(ET.SubElement(polygon, tag), "LinearRing")
+    ET.SubElement(linear_ring, "coordinates").text = _coordinates(ring)
 
 
 def _coordinates(shape: Any, z_m: float | None = None) -> str:
@@ -195,9 +210,8 @@ def _coordinates(shape: Any, z_m: float | None = None) -> str:
     return " ".join(f"{x!r},{y!r}{height}" for x, y in shapely.get_coordinates(shape).tolist())
 
 
-def _style(name: str, layer: Layer, paint: str) -> ET.Element:
-    """Colours are written alpha, blue, green, red."""
-    code = f"ff{paint[4:]}{paint[2:4]}{paint[:2]}"
+def _style(name: str, layer: Layer, colour: str) -> ET.Element:
+    code = f"ff{colour[4:]}{colour[2:4]}{colour[:2]}"  # alpha, blue, green, red
     style = ET.Element("Style", id=name)
     icon = ET.SubElement(style, "IconStyle")
     ET.SubElement(icon, "color").text = code
@@ -211,17 +225,16 @@ def _style(name: str, layer: Layer, paint: str) -> ET.Element:
 
 
 def _remove_invalid_xml(text: str) -> str:
-    """A text without signs that XML cannot hold."""
     return _INVALID_XML.sub("", text)
 
 
 def write_geojson(path: Path, layer: Layer, reference: ExportCrs) -> None:
-    """Write a FeatureCollection."""
+    """Write a layer as a FeatureCollection."""
     import shapely
 
     shapes = reference.geometries(layer.geometries)
     if reference.is_degrees:
-        shapes = shapely.orient_polygons(shapes)  # counter-clockwise, as the RFC asks
+        shapes = shapely.orient_polygons(shapes)  # counter-clockwise, as RFC 7946 requires
     document: dict[str, Any] = {"type": "FeatureCollection", "name": layer.name}
     if reference.is_local:
         document["crs"] = None
@@ -235,13 +248,13 @@ def write_geojson(path: Path, layer: Layer, reference: ExportCrs) -> None:
 
 
 def _crs_urn(crs: str) -> str:
-    """The name of a system in GeoJSON 2008."""
+    """Name of a reference system in GeoJSON 2008."""
     authority, _, code = crs.partition(":")
     return f"urn:ogc:def:crs:EPSG::{code}" if authority == "EPSG" else crs
 
 
 def write_geoparquet(path: Path, layer: Layer, reference: ExportCrs) -> None:
-    """Write GeoParquet."""
+    """Write a layer as GeoParquet."""
     import geopandas
 
     shapes = reference.geometries(layer.geometries)
@@ -250,30 +263,28 @@ def write_geoparquet(path: Path, layer: Layer, reference: ExportCrs) -> None:
 
 
 def write_csv(path: Path, layer: Layer, reference: ExportCrs) -> None:
-    """Write a table with a line of names."""
+    """Write a layer as a table with column names in the first line."""
     import shapely
 
     shapes = reference.geometries(layer.geometries)
+    positions: list[list[str]]
     if layer.has_points:
-        names: tuple[str, ...] = (
-            ("longitude_deg", "latitude_deg") if reference.is_degrees else ("easting_m", "northing_m")
-        )
-        places: list[tuple[str, ...]] = [tuple(map(repr, pair)) for pair in shapely.get_coordinates(shapes).tolist()]
+        position_names = ["longitude_deg", "latitude_deg"] if reference.is_degrees else ["easting_m", "northing_m"]
+        positions = [[repr(x), repr(y)] for x, y in shapely.get_coordinates(shapes).tolist()]
     else:
-        names = ("wkt",)
-        places = [(text,) for text in shapely.to_wkt(shapes, rounding_precision=9 if reference.is_degrees else 6)]
-    own = [name for name in layer.rows.column_names if name not in names]
+        position_names = ["wkt"]
+        digits = 9 if reference.is_degrees else 6
+        positions = [[text] for text in shapely.to_wkt(shapes, rounding_precision=digits)]
+    names = [name for name in layer.rows.column_names if name not in position_names]
     with path.open("w", encoding="utf-8-sig", newline="") as file:
-        out = csv.writer(file)
-        out.writerow((*own, *names))
-        rows = layer.rows.select(own).to_pylist()
-        out.writerows(
-            (*(_spreadsheet_cell(row[name]) for name in own), *place) for row, place in zip(rows, places, strict=True)
-        )
+        writer = csv.writer(file)
+        writer.writerow([*names, *position_names])
+        for row, position in zip(layer.rows.select(names).to_pylist(), positions, strict=True):
+            writer.writerow([*(_spreadsheet_cell(row[name]) for name in names), *position])
 
 
 def _spreadsheet_cell(value: object) -> object:
-    """A value as a spreadsheet takes it: a text that it would take for a formula gets an apostrophe in front."""
+    """A value for a spreadsheet: text that looks like a formula gets a leading apostrophe."""
     if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r"):
         return f"'{value}"
     return value

@@ -1,15 +1,15 @@
-r"""KITTI's files of the 3D object benchmark: lines of labels and results, and the calibration that goes with them.
+r"""Read and write files of KITTI's 3D object benchmark: labels and results, and their calibration.
 
-A box of a LiDAR is its centre x, y, z, length, width, height and heading (counter-clockwise from x, seen from above),
-in a frame whose z axis is up. KITTI writes it in a camera's frame (x right, y down, z ahead), by the middle of its
-*bottom*, as height, width, length and the turn about y. The camera of these files is thought: it stands where the LiDAR
-stands and looks along its x axis, so that
+A LiDAR box is its centre x, y, z, length, width, height and heading (counter-clockwise from x, seen from above), in a
+frame whose z axis points up. KITTI stores it in a camera's frame (x right, y down, z ahead), by the centre of its
+*bottom*, as height, width, length and the rotation about y. The camera of these files is virtual: it is at the LiDAR
+and looks along its x axis, so that
 
 .. math:: x_c = -y, \quad y_c = -(z - h/2), \quad z_c = x, \quad r_y = -\theta - \pi/2, \quad
           \alpha = r_y - \operatorname{atan2}(x_c, z_c)
 
-and back without loss. There is no picture: every rectangle in the picture is the same, 0 0 50 50, which no evaluation
-takes for too small.
+and the inverse is exact. There is no image: the rectangle in it is always 0 0 50 50, which no evaluation takes for too
+small.
 
 Source: Geiger, Lenz, Urtasun 2012, the development kit of the benchmark (readme.txt).
 """
@@ -22,15 +22,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray, IntArray
 
-Floats = NDArray[np.float64]
-
-_TRUNCATED = "0.00 0"  # and not occluded: both are said of pictures
+_NOT_TRUNCATED_NOT_OCCLUDED = "0.00 0"
 _RECTANGLE = "0.00 0.00 50.00 50.00"
-_VALUES_PER_LINE = 15  # of a label; a result has its score too
+_LABEL_VALUES, _RESULT_VALUES = 15, 16
+_LABELS_HINT = "Write one object per line, as KITTI does; the file is empty where there is none."
 
 _CAMERA = "1 0 0 0 0 1 0 0 0 0 1 0"
 CALIBRATION = (
@@ -40,121 +39,128 @@ CALIBRATION = (
 """The text of a file ``calib/*.txt``; the same for every frame."""
 
 _CAMERA_KEYS = ("R0_rect", "Tr_velo_to_cam")
+_CALIBRATION_HINT = "Use the calibration that egvs clouds writes."
 
 
 @dataclass(frozen=True)
 class KittiObjects:
-    """The lines of one file.
+    """The objects of one file.
 
     Attributes
     ----------
     names
-        The class of each, as it stands there.
+        Class of each, as in the file.
     boxes
         (n, 7) float64, in the LiDAR's frame: centre, length, width, height, heading from -pi to pi.
     scores
-        (n,) float64; NaN for a label, which has none.
+        (n,) float64; NaN for labels.
     lines
-        Where each stands, counted from 1, (n,) int64.
+        Line number of each, from 1, (n,) int64.
     """
 
     names: tuple[str, ...]
-    boxes: Floats
-    scores: Floats
-    lines: NDArray[np.int64]
+    boxes: FloatArray
+    scores: FloatArray
+    lines: IntArray
 
 
-def wrap_angle(angle_rad: Floats) -> Floats:
-    """Angles from -pi to just below pi."""
+def wrap_angle(angle_rad: FloatArray) -> FloatArray:
+    """Return angles from -pi to just below pi."""
     return np.mod(angle_rad + math.pi, 2.0 * math.pi) - math.pi
 
 
-def to_camera(boxes: Floats) -> Floats:
-    """Boxes of the LiDAR's frame (n, 7) as KITTI has them: height, width, length, x, y, z of the bottom, turn."""
+def to_camera(boxes: FloatArray) -> FloatArray:
+    """Convert LiDAR boxes (n, 7) to KITTI's order: height, width, length, x, y, z of the bottom, rotation."""
     x, y, z, length, width, height, heading = boxes.T
-    turn = wrap_angle(-heading - math.pi / 2)
-    return np.column_stack([height, width, length, -y, -(z - height / 2), x, turn])
+    rotation = wrap_angle(-heading - math.pi / 2)
+    return np.column_stack([height, width, length, -y, -(z - height / 2), x, rotation])
 
 
-def from_camera(boxes: Floats) -> Floats:
-    """The inverse of :func:`to_camera`, for the calibration of these files."""
-    height, width, length, x, y, z, turn = boxes.T
-    return np.column_stack([z, -x, -y + height / 2, length, width, height, wrap_angle(-turn - math.pi / 2)])
+def from_camera(boxes: FloatArray) -> FloatArray:
+    """Convert KITTI boxes (n, 7) to LiDAR boxes, the inverse of :func:`to_camera`."""
+    height, width, length, x, y, z, rotation = boxes.T
+    return np.column_stack([z, -x, -y + height / 2, length, width, height, wrap_angle(-rotation - math.pi / 2)])
 
 
-def format_labels(names: Sequence[str], boxes: Floats, scores: Floats | None = None) -> str:
-    """The text of a file: one line a box, with its score where it has one."""
+def format_labels(names: Sequence[str], boxes: FloatArray, scores: FloatArray | None = None) -> str:
+    """Return the text of a file: one line per box, with its score if there are ``scores``."""
     camera = to_camera(boxes)
     alpha = wrap_angle(camera[:, 6] - np.arctan2(camera[:, 3], camera[:, 5]))
-    rows = []
-    for at, (name, values) in enumerate(zip(names, camera.tolist(), strict=True)):
+    lines = []
+    for i, (name, values) in enumerate(zip(names, camera.tolist(), strict=True)):
         numbers = " ".join(f"{value:.6f}" for value in values)
-        score = "" if scores is None else f" {scores[at]:.6f}"
-        rows.append(f"{name} {_TRUNCATED} {alpha[at]:.6f} {_RECTANGLE} {numbers}{score}\n")
-    return "".join(rows)
+        line = f"{name} {_NOT_TRUNCATED_NOT_OCCLUDED} {alpha[i]:.6f} {_RECTANGLE} {numbers}"
+        if scores is not None:
+            line += f" {scores[i]:.6f}"
+        lines.append(f"{line}\n")
+    return "".join(lines)
 
 
 def read_labels(path: Path) -> KittiObjects:
-    """The lines of a file of labels or results, in the LiDAR's frame; those of the class DontCare are left out.
+    """Read a file of labels or results, in the LiDAR's frame, without objects of the class DontCare.
 
     Raises
     ------
     InputError
-        For a file that is not there or no text; naming the line: too few or too many values, what is no finite number,
-        a size that is not above 0.
+        When the file does not exist or is not text, or when a line has too few or too many values, a value that is not
+        a finite number, or a size that is not above 0.
     """
     try:
         text = path.read_text(encoding="utf-8")
     except (FileNotFoundError, IsADirectoryError):
-        raise InputError(path, "no such file", "a text file, one line an object (empty where there is none)") from None
+        raise InputError(path, "no such file", _LABELS_HINT) from None
     except UnicodeDecodeError:
-        raise InputError(path, "is no text", "one line an object, as KITTI has them") from None
-    names, boxes, scores, at = [], [], [], []
+        raise InputError(path, "the file is not text", _LABELS_HINT) from None
+    names, boxes, scores, lines = [], [], [], []
     for number, line in enumerate(text.splitlines(), 1):
-        if not (words := line.split()) or words[0] == "DontCare":
+        words = line.split()
+        if not words or words[0] == "DontCare":
             continue
-        values = _numbers(f"{path}: line {number}", words)
-        at.append(number)
+        values = _parse_values(f"{path}: line {number}", words)
+        lines.append(number)
         names.append(words[0])
         boxes.append(values[7:14])
-        scores.append(values[14] if len(words) > _VALUES_PER_LINE else math.nan)
+        scores.append(values[14] if len(words) == _RESULT_VALUES else math.nan)
     camera = np.array(boxes, dtype=np.float64).reshape(-1, 7)
-    numbers = np.array(at, dtype=np.int64)
-    return KittiObjects(tuple(names), from_camera(camera), np.array(scores, dtype=np.float64), numbers)
+    return KittiObjects(
+        tuple(names), from_camera(camera), np.array(scores, dtype=np.float64), np.array(lines, dtype=np.int64)
+    )
 
 
 def check_calibration(path: Path) -> None:
-    """Hold a file of calibration against :data:`CALIBRATION`, which alone brings boxes back without loss.
+    """Check that a calibration file has the camera of :data:`CALIBRATION`, whose boxes are converted exactly.
 
     Raises
     ------
     InputError
-        When it cannot be read, or the camera stands otherwise.
+        When it cannot be read, or has another camera.
     """
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
-        raise InputError(path, "cannot be read", "a calibration as `egvs clouds` writes it") from None
+        raise InputError(path, "cannot be read", _CALIBRATION_HINT) from None
     entries = dict(line.split(":", 1) for line in text.splitlines() if ":" in line)
     for line in CALIBRATION.splitlines():
         key, values = line.split(":")
-        if key in _CAMERA_KEYS and _floats(entries.get(key, "")) != _floats(values):
-            found = f"{key} is{entries[key]}" if key in entries else f"has no {key}"
-            raise InputError(path, found, f"{key}:{values}, as `egvs clouds` writes it")
+        if key in _CAMERA_KEYS and _parse_floats(entries.get(key, "")) != _parse_floats(values):
+            problem = f"expected {key}:{values}, got{entries.get(key, ' none')}"
+            raise InputError(path, problem, _CALIBRATION_HINT)
 
 
-def _floats(text: str) -> list[float] | None:
+def _parse_floats(text: str) -> list[float] | None:
     try:
         return [float(word) for word in text.split()]
     except ValueError:
         return None
 
 
-def _numbers(where: str, words: list[str]) -> list[float]:
-    """The numbers after the class; InputError where they are not as they should be."""
-    if len(words) not in (_VALUES_PER_LINE, _VALUES_PER_LINE + 1):
-        right = f"{_VALUES_PER_LINE} (a label) or {_VALUES_PER_LINE + 1} (a result, whose last is its score)"
-        raise InputError(where, f"holds {len(words)} values", right)
+def _parse_values(where: str, words: list[str]) -> list[float]:
+    """Parse and check the numbers after the class."""
+    if len(words) not in (_LABEL_VALUES, _RESULT_VALUES):
+        problem = (
+            f"expected {_LABEL_VALUES} values (a label) or {_RESULT_VALUES} (a result with score), got {len(words)}"
+        )
+        raise InputError(where, problem, _LABELS_HINT)
     values = []
     for word in words[1:]:
         try:
@@ -162,8 +168,9 @@ def _numbers(where: str, words: list[str]) -> list[float]:
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise InputError(where, repr(word), "a finite number")
+            raise InputError(where, f"expected a finite number, got {word!r}", _LABELS_HINT)
         values.append(value)
     if min(values[7:10]) <= 0:
-        raise InputError(where, f"a size of {' x '.join(words[8:11])} m", "height, width and length above 0")
+        problem = f"expected height, width and length above 0, got {' x '.join(words[8:11])} m"
+        raise InputError(where, problem, "Correct the size.")
     return values

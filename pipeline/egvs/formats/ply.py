@@ -1,8 +1,9 @@
-"""PLY files (Stanford polygon format) are read in ascii and in binary, little or big endian; everything but the
-vertices' x, y and z is ignored, faces included.
+"""Read PLY files (Stanford polygon format) in ascii and in binary, little or big endian; write them as binary.
 
-Frame: the world's, metres. Read by hand, because plyfile narrows text to the header's float, takes a file with more
-points than its header says, and reads all faces only to have them thrown away.
+Everything except the vertices' x, y and z is ignored, including faces. World frame, metres.
+
+Not trimesh: it rounds text to the header's float and accepts text with fewer or more points than the header declares.
+Not plyfile, for the same reasons.
 """
 
 from __future__ import annotations
@@ -10,11 +11,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray
+from egvs.core.reading import COMPLETE_FILE
 from egvs.formats.point_clouds import AXES, RecordLayout, pack_records, parse_count
 
 _HEADER = "ply\nformat binary_little_endian 1.0\nelement vertex {n}\n{properties}end_header\n"
@@ -31,38 +35,51 @@ _NAMES = {numpy: ply for ply, numpy in _TYPES.items() if ply.isalpha()}
 
 @dataclass
 class _Element:
-    """One element of a PLY header: its name, how many there are, and its properties (a list's format is None)."""
+    """An element of a PLY header: name, count, and numpy format by property (None for a list)."""
 
     name: str
     n: int
     properties: dict[str, str | None]
 
 
-def read(path: Path, where: str) -> NDArray[np.float64]:
-    """The vertices, (n, 3) float64; a damaged file is an InputError at ``where``."""
+class _Header(NamedTuple):
+    """A PLY header: numpy's byte order (``"="``: text), elements, offset of the data, number of lines."""
+
+    order: str
+    elements: list[_Element]
+    data_start: int
+    lines: int
+
+
+def read(path: Path, where: str) -> FloatArray:
+    """Return the vertices, (n, 3) float64; InputError at ``where`` for a damaged file."""
     data = path.read_bytes()
-    order, elements, start, lines = _header(where, data)
-    names = [element.name for element in elements]
+    header = _read_header(where, data)
+    names = [element.name for element in header.elements]
     if "vertex" not in names:
-        problem = f"has no element 'vertex' (its elements: {' '.join(names) or 'none'})"
-        raise InputError(where, problem, "vertices with x, y and z")
+        problem = f"expected an element 'vertex', got {' '.join(names) or 'none'}"
+        raise InputError(where, problem, "Write the points as vertices with x, y and z.")
     at = names.index("vertex")
-    vertex, last = elements[at], at == len(elements) - 1
-    formats = _formats(where, vertex, order)
-    layout = RecordLayout.of(where, vertex.n, list(vertex.properties), formats, [1] * len(formats))
-    if order == "=":
-        return layout.from_text(data[start:], lines + 1, sum(element.n for element in elements[:at]), last)
-    before = sum(e.n * sum(np.dtype(f).itemsize for f in _formats(where, e, order)) for e in elements[:at])
-    return layout.from_records(memoryview(data)[start + before :], last)
+    vertex = header.elements[at]
+    is_last = at == len(names) - 1
+    formats = _formats(where, vertex, header.order)
+    layout = RecordLayout.from_fields(where, vertex.n, list(vertex.properties), formats, [1] * len(formats))
+    if header.order == "=":
+        skip = sum(element.n for element in header.elements[:at])
+        return layout.from_text(data[header.data_start :], header.lines + 1, skip, is_last)
+    start = header.data_start
+    for element in header.elements[:at]:
+        start += element.n * sum(np.dtype(kind).itemsize for kind in _formats(where, element, header.order))
+    return layout.from_records(memoryview(data)[start:], is_last)
 
 
-def write(path: Path, points_m: NDArray[np.float64]) -> None:
+def write(path: Path, points_m: FloatArray) -> None:
     """Write world-frame points, (n, 3) float64, binary, little endian."""
     write_columns(path, dict(zip(AXES, np.asarray(points_m, dtype=np.float64).T, strict=True)))
 
 
 def write_columns(path: Path, columns: Mapping[str, NDArray[np.generic]]) -> None:
-    """Write points with any properties, each (n,) of one of PLY's types, binary, little endian; x, y, z among them."""
+    """Write points with any properties, each (n,) of a type of PLY, binary, little endian; x, y, z are among them."""
     records = pack_records(columns)
     properties = "".join(f"property {_NAMES[records.dtype[name].str[1:]]} {name}\n" for name in columns)
     with path.open("wb") as file:
@@ -73,16 +90,15 @@ def write_columns(path: Path, columns: Mapping[str, NDArray[np.generic]]) -> Non
 def _formats(where: str, element: _Element, order: str) -> list[str]:
     formats = [order + kind for kind in element.properties.values() if kind is not None]
     if len(formats) < len(element.properties):
-        right = "no list among the vertices' properties, nor in a binary file before the vertices"
-        raise InputError(where, f"the element {element.name!r} holds a list", right)
+        hint = "Write no list among the vertices' properties, and in a binary file none before the vertices."
+        raise InputError(where, f"the element {element.name!r} has a list", hint)
     return formats
 
 
-def _header(where: str, data: bytes) -> tuple[str, list[_Element], int, int]:
-    """Byte order, elements, where the data start, and how many lines come before."""
+def _read_header(where: str, data: bytes) -> _Header:
     stop = data.find(b"\nend_header")
     if not data.startswith(b"ply") or stop < 0:
-        raise InputError(where, "is not a whole PLY file (from 'ply' to 'end_header')", "a PLY file, ascii or binary")
+        raise InputError(where, "not a PLY file with a header from 'ply' to 'end_header'", COMPLETE_FILE)
     start = data.find(b"\n", stop + 1) + 1 or len(data)
     order, elements = "", list[_Element]()
     lines = data[:start].splitlines()
@@ -91,7 +107,7 @@ def _header(where: str, data: bytes) -> tuple[str, list[_Element], int, int]:
             case ["format", kind, _] if kind in _ORDERS:
                 order = _ORDERS[kind]
             case ["element", name, count]:
-                elements.append(_Element(name, parse_count(where, f"the count of element {name!r}", [count]), {}))
+                elements.append(_Element(name, parse_count(where, f"count of element {name!r}", [count]), {}))
             case ["property", "list", _, _, name] if elements:
                 elements[-1].properties[name] = None
             case ["property", kind, name] if elements and kind in _TYPES and name not in elements[-1].properties:
@@ -99,8 +115,9 @@ def _header(where: str, data: bytes) -> tuple[str, list[_Element], int, int]:
             case ["ply" | "comment" | "obj_info" | "end_header", *_] | []:
                 pass
             case _:
-                right = "a format, an element, or a property of a known type, each name once"
-                raise InputError(f"{where}: line {number}", f"{line.strip()[:60]!r} in its PLY header", right)
+                problem = f"expected a format, an element, or a property of a known type, got {line.strip()[:60]!r}"
+                raise InputError(f"{where}: line {number}", problem, "Correct the PLY header; each name occurs once.")
     if not order:
-        raise InputError(where, "its PLY header has no line 'format'", f"one of {', '.join(_ORDERS)}")
-    return order, elements, start, len(lines)
+        hint = f"Add a line 'format' with one of {', '.join(_ORDERS)}."
+        raise InputError(where, "the PLY header has no line 'format'", hint)
+    return _Header(order, elements, start, len(lines))

@@ -342,7 +342,7 @@ def _solid_type(tags: Tags, key: str) -> SolidType | None:
     value = tags.get(key, "no")
     if value == "no":
         return None
-    return _SOLID_TYPES.named(f"{key.removesuffix(':part')}.{value}")
+    return _SOLID_TYPES.area_type(f"{key.removesuffix(':part')}.{value}")
 
 
 def _is_outline(tags: Tags) -> bool:
@@ -443,7 +443,7 @@ def find_barriers(extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts) 
         value = way.tags.get("barrier", "no")
         if value == "no":
             continue
-        solid = _SOLID_TYPES.named(f"barrier.{value}")
+        solid = _SOLID_TYPES.area_type(f"barrier.{value}")
         if solid is None:
             counts.not_modelled[f"barrier={value}"] += 1
             continue

@@ -1,1 +1,14 @@
 """Which sensors together: plans of several LiDARs and proofs of how good they are."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from egvs.core.lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from egvs.placement.plan import JointScore, Placement, place
+
+__all__ = ["JointScore", "Placement", "place"]
+
+__getattr__, __dir__ = lazy_exports(__name__, {"plan": ["JointScore", "Placement", "place"]})

@@ -9,7 +9,7 @@ number of sensors); refresh the report of the run, if there is one.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -17,13 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from egvs.artefacts import parquet, run_folder
+from egvs.artefacts import checksums, parquet
+from egvs.artefacts.planned_sensor import PlannedSensor, plan_columns
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.runtime import ProgressCallback, no_progress
 from egvs.placement import problem_builder, refinement, solver
-from egvs.placement.problem import Plan, Problem
+from egvs.placement.problem import Problem
 from egvs.placement.problem_builder import PlacementProblem
 from egvs.placement.solver import Solution
 from egvs.runs import run, stages
@@ -37,11 +38,17 @@ from egvs.stages.base import StageContext
 from egvs.stages.inputs import open_folder
 
 REQUIRED_STAGES = ("check", "statics", "scan", "traffic", "tpog")
-"""The stages that candidates are looked from after."""
+"""The stages whose artefacts a placement problem is built from."""
+
+_REFINEMENT_COLUMNS = ("moved_m", "gain_by_refining")
+"""Columns of a plan whose poses were refined."""
+
+_MAX_NAMES = 20
+"""Number of names that a message lists."""
 
 
 class JointScore:
-    """What a set of candidates is worth together, by the score that ``score.rank_by`` names.
+    """The joint score of a set of candidates, by the score that ``score.rank_by`` names.
 
     A gain takes about 2.5 ns for each cell that the candidate hits: well below a millisecond at 0.5 m voxels.
 
@@ -54,7 +61,8 @@ class JointScore:
 
     def __init__(self, placement_problem: PlacementProblem) -> None:
         self._placement_problem = placement_problem
-        self._coverage_state = placement_problem.problem.coverage_state()
+        self._joint = placement_problem.problem.joint
+        self._state = placement_problem.problem.coverage_state()
         self._index_of_name = {name: i for i, name in enumerate(placement_problem.names)}
 
     @classmethod
@@ -66,202 +74,100 @@ class JointScore:
         jobs: int | None = None,
         progress: ProgressCallback = no_progress,
     ) -> JointScore:
-        """Of a scenario's candidates; brings what it needs up to date in the run's folder."""
+        """Return the joint score of a scenario's candidates, for the empty set.
+
+        Parameters
+        ----------
+        scenario
+            From :func:`egvs.load`.
+        out
+            The run's folder, where artefacts are brought up to date; ``runs/<scenario name>`` when None.
+        jobs
+            Number of threads; one per core when None.
+        progress
+            Called with the progress of stages and scans.
+        """
         folder = Path(out) if out is not None else run.default_folder(scenario)
         record = run.run(scenario, folder, only=REQUIRED_STAGES, jobs=jobs, progress=progress)
-        work = open_folder(scenario, folder, jobs=jobs, progress=progress, recorded=stages.recorded_digests(record))
-        return cls(problem_builder.build_problem(work, lambda done: progress("candidates", done, 0)))
+        context = open_folder(scenario, folder, jobs=jobs, progress=progress, recorded=stages.recorded_digests(record))
+        return cls(problem_builder.build_problem(context, lambda done: progress("candidates", done, 0)))
 
     @property
     def candidates(self) -> tuple[str, ...]:
-        """Their names, in the order of the sites."""
+        """Names of all candidates, in the order of the sites."""
         return tuple(self._index_of_name)
 
     @property
     def chosen(self) -> tuple[str, ...]:
-        """Those in the set, in the order in which they came."""
-        return tuple(self._placement_problem.names[i] for i in self._coverage_state.chosen)
+        """Names of the candidates in the set, in the order in which they were added."""
+        return tuple(self._placement_problem.names[i] for i in self._state.chosen)
 
     @property
     def value(self) -> float:
-        """The joint score of the set; the same for any order."""
-        return self._coverage_state.value(self._placement_problem.problem.joint)
+        """Joint score of the set; it does not depend on the order."""
+        return self._state.value(self._joint)
 
     @property
-    def together(self) -> float:
-        """That of all candidates."""
+    def joint_of_all(self) -> float:
+        """Joint score of all candidates that are not excluded."""
         return self._placement_problem.joint_of_all
 
     def add(self, *names: str) -> None:
         """Put candidates into the set."""
         for i in self._indices(names):
-            if i not in self._coverage_state.chosen:
-                self._coverage_state.add(i)
+            if i not in self._state.chosen:
+                self._state.add(i)
 
     def remove(self, *names: str) -> None:
         """Take candidates out of the set."""
         for i in self._indices(names):
-            if i in self._coverage_state.chosen:
-                self._coverage_state.remove(i)
+            if i in self._state.chosen:
+                self._state.remove(i)
 
     def gain(self, pose: str | Scan) -> float:
-        """What a candidate, or the empty scan of any pose (:meth:`egvs.Scanner.scan`), would add to the set; 0 for
-        a candidate that is in it."""
+        """Return what one more sensor adds to the joint score of the set.
+
+        Parameters
+        ----------
+        pose
+            Name of a candidate, whose gain is 0 if it is in the set; or the empty scan of any pose, from
+            :meth:`egvs.Scanner.scan`.
+        """
         if isinstance(pose, Scan):
-            return (
-                self._coverage_state.value_with(
-                    self._placement_problem.problem.joint, self._placement_problem.row(Beams.of(pose))
-                )
-                - self.value
-            )
+            row = self._placement_problem.row(Beams.of(pose))
+            return self._state.value_with(self._joint, row) - self.value
         (i,) = self._indices([pose])
-        if i in self._coverage_state.chosen:
+        if i in self._state.chosen:
             return 0.0
-        return float(
-            self._coverage_state.gains(self._placement_problem.problem.joint, np.array([i], dtype=np.int64))[0]
-        )
+        return float(self._state.gains(self._joint, np.array([i], dtype=np.int64))[0])
 
     def gains(self) -> dict[str, float]:
-        """What each candidate would add."""
-        every = np.arange(len(self._index_of_name), dtype=np.int64)
-        gained = self._coverage_state.gains(self._placement_problem.problem.joint, every)
-        gained[self._coverage_state.chosen] = 0.0
-        return dict(zip(self.candidates, gained.tolist(), strict=True))
+        """Return what each candidate adds to the joint score of the set, by name."""
+        gains = self._state.gains(self._joint, np.arange(len(self._index_of_name), dtype=np.int64))
+        gains[self._state.chosen] = 0.0
+        return dict(zip(self.candidates, gains.tolist(), strict=True))
 
     def _indices(self, names: Iterable[str]) -> list[int]:
         for name in names:
             if name not in self._index_of_name:
-                raise InputError(
-                    f"candidate {name!r}", "no such candidate", f"Use one of {', '.join(self.candidates[:20])}."
-                )
+                hint = f"Use one of {', '.join(self.candidates[:_MAX_NAMES])}."
+                raise InputError(f"candidate {name!r}", "no such candidate", hint)
         return [self._index_of_name[name] for name in names]
-
-
-def check_output_files(folder: Path) -> None:
-    """InputError where a folder stands in the place of a file that is written."""
-    for name in (RunFolder.placement.name, RunFolder.curve.name):
-        if (folder / name).is_dir():
-            raise InputError(folder / name, "is a folder", "Remove it: the plan is written to this file.")
-
-
-def write_placement(
-    folder: Path, scenario: Scenario, placed: Placement, stages: Mapping[str, str]
-) -> tuple[Path, Path]:
-    """Write both files; their paths.
-
-    Parameters
-    ----------
-    stages
-        Keys of the stages that the plan was made from, by name.
-    """
-    about = _placement_metadata(scenario, placed, stages)
-    RunFolder(folder).placement_checksums.unlink(missing_ok=True)
-    picks, points = placed.sensors, placed.solution.curve
-    bounds = {point.count: point.bound for point in points}
-    columns: dict[str, Any] = {
-        "order": np.arange(1, len(picks) + 1, dtype=np.int32),
-        "site": [pick.site.name for pick in picks],
-        "pole": [pick.site.pole or pick.site.name for pick in picks],
-        **{key: [asdict(pick.site.pose)[key] for pick in picks] for key in _POSE_COLUMNS},
-        "sensor": [pick.site.sensor for pick in picks],
-        "forced": [pick.is_forced for pick in picks],
-        **{key: [getattr(pick, key) for pick in picks] for key in ("gain", "score", "cost", "loss")},
-        "bound": [bounds.get(number, bounds[min(bounds)]) for number in range(1, len(picks) + 1)],
-    }
-    moves = _REFINEMENT_COLUMNS if placed.moves is not None else ()
-    columns |= {key: [getattr(pick, key) for pick in picks] for key in moves}
-    with parquet.artefact_writer(RunFolder(folder).placement, "placement", moves) as out:
-        out.write(columns)
-        out.describe(about)
-    curve = {
-        "count": np.array([point.count for point in points], dtype=np.int32),
-        "score": [point.plan_value.joint for point in points],
-        "value": [point.plan_value.value for point in points],
-        "bound": [point.bound for point in points],
-        "cost": list(placed.curve_costs),
-        "met": [point.plan_value.met >= 0.0 for point in points],
-        "sites": [json.dumps(list(names), ensure_ascii=False) for names in placed.curve_sites],
-    }
-    parquet.write_artefact(RunFolder(folder).curve, "curve", curve, about)
-    written = RunFolder(folder).placement, RunFolder(folder).curve
-    run_folder.write_checksums(RunFolder(folder).placement_checksums, written)
-    return written
-
-
-_POSE_COLUMNS = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
-_REFINEMENT_COLUMNS = ("moved_m", "gain_by_refining")
-"""Columns that a plan has whose sensors were to move."""
-_REFINEMENT_METADATA = ("before", "value_before", "value", "tried", "impossible", "turns")
-"""What is told of its moves; how long they took is no part of a file."""
-
-
-def _placement_metadata(scenario: Scenario, placed: Placement, stages: Mapping[str, str]) -> dict[str, Any]:
-    asked = scenario.placement.model_dump(mode="json")
-    settings = {
-        "placement": asked,
-        "costs": scenario.costs.model_dump(mode="json"),
-        "score": scenario.score.model_copy(update={"gamma": scenario.gamma}).model_dump(mode="json"),
-    }
-    solution, moves = placed.solution, placed.moves
-    return {
-        "schema": parquet.SCHEMA_VERSION,
-        "scenario": {"name": scenario.name, "hash": files.hash_json(settings)},
-        "inputs": files.hash_json({**settings, "stages": dict(stages)}),
-        "seed": scenario.seed,
-        "stages": dict(stages),
-        "plan": {
-            "score": placed.score,
-            "asked": asked,
-            "candidates": placed.candidates,
-            "joint": placed.joint,
-            "value": solution.point.plan_value.value,
-            "bound": solution.point.bound,
-            "certificate": placed.certificate,
-            "together": placed.together,
-            "cost": placed.cost,
-            "is_best": solution.is_best,
-            "fewest_is_proved": solution.fewest_is_proved,
-            "zones": [asdict(zone) for zone in placed.zones],
-            **({} if moves is None else {"moves": {key: getattr(moves, key) for key in _REFINEMENT_METADATA}}),
-        },
-    }
-
-
-@dataclass(frozen=True)
-class PlacedSensor:
-    """One sensor of a plan.
-
-    Attributes
-    ----------
-    site
-        The candidate.
-    is_forced
-        Whether it is there already.
-    gain, score
-        What it adds to the joint score of those before it, and that with it.
-    cost
-        What it adds to the cost.
-    loss
-        What the whole plan loses of its joint score when it fails.
-    moved_m
-        How far it is from where its candidate hangs; 0 where sensors were not to move.
-    gain_by_refining
-        What the joint score would lose were it alone put back as its candidate hangs.
-    """
-
-    site: Site
-    is_forced: bool
-    gain: float
-    score: float
-    cost: float
-    loss: float
-    moved_m: float = 0.0
-    gain_by_refining: float = 0.0
 
 
 @dataclass(frozen=True)
 class ZoneCoverage:
-    """A zone that was demanded: the share of its entropy that the plan sees, by so many sensors."""
+    """How a plan covers a required zone.
+
+    Attributes
+    ----------
+    name
+        Name of the zone.
+    seen, share
+        The share of the zone's entropy that the plan sees, and the required share.
+    by
+        Number of sensors that have to see it.
+    """
 
     name: str
     seen: float
@@ -271,73 +177,78 @@ class ZoneCoverage:
 
 @dataclass(frozen=True)
 class RefinementSummary:
-    """What it took to move the sensors of a plan.
+    """What the refinement of a plan's poses did.
 
     Attributes
     ----------
-    before
-        The joint score of the plan as its candidates hang.
-    value_before, value
-        What was asked for of the plan, then and now: :attr:`Worth.value`. Never less now; the joint score may be.
-    tried, impossible
-        Poses, and those of them that cannot be.
+    joint_before
+        Joint score of the plan at the poses of its candidates.
+    value_before, value_after
+        The objective (:attr:`egvs.placement.problem.PlanValue.value`) before and after. It never drops; the joint score
+        may.
+    poses_tried, poses_infeasible
+        Number of poses that were tried, and of those that break a rule or cannot be scanned.
     turns
-        Of one sensor each.
+        Number of turns; each moves one sensor.
     seconds
-        Spent on it.
+        Duration.
     """
 
-    before: float
+    joint_before: float
     value_before: float
-    value: float
-    tried: int
-    impossible: int
+    value_after: float
+    poses_tried: int
+    poses_infeasible: int
     turns: int
     seconds: float
 
 
 @dataclass(frozen=True)
 class Placement:
-    """A plan, and what is proved of it.
+    """A plan and its certificate.
 
     Attributes
     ----------
     sensors
-        In the order in which they would be put up: forced ones first, then what adds most.
+        In the order of installation: forced ones first, then each time the one with the largest gain.
     score
-        The name of the joint score.
+        Name of the joint score.
     joint
-        That score of the plan.
-    together
-        That of all candidates.
+        Joint score of the plan.
+    joint_of_all
+        Joint score of all candidates that are not excluded.
+    cost
+        Cost of the plan.
+    candidates
+        Number of candidates that are not excluded.
     zones
-        Those that were demanded.
+        The required zones.
     solution
-        The curve, the bound, what was proved; all of it of candidates as they are given.
+        The curve and the bounds; they apply to the candidates at their original poses.
     curve_sites, curve_costs
-        Names and cost of the plan of each point of the curve.
-    moves
-        Of a plan whose sensors were to move: then picks, joint, cost and zones are those after it.
+        Names of the sites, and the cost, of each plan of the curve.
+    refinement
+        With refined poses, what the refinement did; ``sensors``, ``joint``, ``cost`` and ``zones`` are those after it.
     files
-        What was written.
+        The files that were written.
     """
 
-    sensors: tuple[PlacedSensor, ...]
+    sensors: tuple[PlannedSensor, ...]
     score: str
     joint: float
-    together: float
+    joint_of_all: float
     cost: float
     candidates: int
     zones: tuple[ZoneCoverage, ...]
     solution: Solution
     curve_sites: tuple[tuple[str, ...], ...]
     curve_costs: tuple[float, ...]
-    moves: RefinementSummary | None = None
+    refinement: RefinementSummary | None = None
     files: tuple[Path, ...] = ()
 
     @property
     def certificate(self) -> float:
-        """The share of the best possible that is proved."""
+        """Proved share of the best possible objective."""
         return self.solution.point.certificate
 
 
@@ -352,7 +263,7 @@ def place(
     progress: ProgressCallback = no_progress,
     listener: StageListener = ignore_stage,
 ) -> Placement:
-    """The poles that are best together, as a scenario's ``[placement]`` asks for.
+    """Choose the sensors that a scenario's ``[placement]`` asks for, and write the plan.
 
     Parameters
     ----------
@@ -361,121 +272,185 @@ def place(
     out
         The run's folder; ``runs/<scenario name>`` when None.
     exact
-        Search until the best plan is proved, or the time ends.
+        Search until the best plan is proved or the time limit is reached.
     time_limit_s
-        Of that search, and of the proof that fewer sensors do not reach what is demanded.
+        Time limit of that search, and of the proof that fewer sensors are not enough.
     refine
-        Then let the sensors of the plan move, as ``[placement.refine]`` does by itself.
+        Refine the poses even without ``[placement.refine]``.
+    jobs
+        Number of threads; one per core when None. Results do not depend on it.
+    progress, listener
+        Called with the progress of stages and candidates, and when a stage begins or ends.
 
     Raises
     ------
     InputError
-        For a demand that cannot be met, with what can.
+        When no plan meets ``[placement]``; the message names the nearest request that can be met.
     """
     folder = Path(out) if out is not None else run.default_folder(scenario)
     if refine and scenario.placement.refine is None:
         placement = scenario.placement.model_copy(update={"refine": RefinementConfig()})
         scenario = scenario.model_copy(update={"placement": placement})
     problem_builder.check_placement_config(scenario)
-    check_output_files(folder)
+    for path in (RunFolder(folder).placement, RunFolder(folder).curve):
+        if path.is_dir():
+            raise InputError(path, "is a folder", "Remove it: the plan is written to this file.")
     if scenario.placement.refine is not None:
         refinement.check_refine_config(scenario, scenario.placement.refine)
+
     record = run.run(scenario, folder, only=REQUIRED_STAGES, jobs=jobs, progress=progress, listener=listener)
     with lock_run_folder(folder):
-        work = open_folder(scenario, folder, jobs=jobs, progress=progress, recorded=stages.recorded_digests(record))
-        placed = solve_placement(work, exact=exact, time_limit_s=time_limit_s)
-        keys = {name: record.stages[name].inputs for name in REQUIRED_STAGES}
-        files = write_placement(folder, scenario, placed, keys)
+        context = open_folder(scenario, folder, jobs=jobs, progress=progress, recorded=stages.recorded_digests(record))
+        placed = solve_placement(context, exact=exact, time_limit_s=time_limit_s)
+        stage_keys = {name: record.stages[name].inputs for name in REQUIRED_STAGES}
+        written = write_placement(folder, scenario, placed, stage_keys)
         report = run.refresh_report(folder)
-        return replace(placed, files=files if report is None else (*files, report))
+        if report is not None:
+            written = (*written, report)
+        return replace(placed, files=written)
 
 
-def solve_placement(work: StageContext, *, exact: bool, time_limit_s: float) -> Placement:
-    """The plan that ``[placement]`` asks for, from a run's folder; nothing is written."""
-    scenario = work.scenario
-    asked = problem_builder.build_problem(work, lambda done: work.progress("candidates", done, 0))
-    problem, wanted = asked.problem, scenario.placement
+def solve_placement(context: StageContext, *, exact: bool, time_limit_s: float) -> Placement:
+    """Find the plan that ``[placement]`` asks for; nothing is written.
 
-    def heard(count: int) -> None:
-        work.progress("sensors", count, 0)
+    Parameters
+    ----------
+    context
+        The run, with :data:`REQUIRED_STAGES` up to date.
+    exact, time_limit_s
+        As in :func:`place`.
 
-    if wanted.reach is None:
-        solution = solver.best_plan(problem, search_all=exact, time_limit_s=time_limit_s, on_progress=heard)
+    Raises
+    ------
+    InputError
+        When no plan meets ``[placement]``.
+    """
+    scenario, config = context.scenario, context.scenario.placement
+    placement_problem = problem_builder.build_problem(context, lambda done: context.progress("candidates", done, 0))
+    problem = placement_problem.problem
+
+    def on_progress(count: int) -> None:
+        context.progress("sensors", count, 0)
+
+    if config.reach is None:
+        solution = solver.best_plan(problem, search_all=exact, time_limit_s=time_limit_s, on_progress=on_progress)
     else:
-        reaching = problem_builder.share_demand(problem, wanted.reach, asked.joint_of_all)
-        problem = replace(problem, demands=(*problem.demands, reaching))
-        found = solver.smallest_plan(problem, time_limit_s=time_limit_s, on_progress=heard)
-        if found is None:
-            raise _unreachable_share_error(scenario, problem, asked)
-        solution = found
+        reach = problem_builder.share_demand(problem, config.reach, placement_problem.joint_of_all)
+        problem = replace(problem, demands=(*problem.demands, reach))
+        smallest = solver.smallest_plan(problem, time_limit_s=time_limit_s, on_progress=on_progress)
+        if smallest is None:
+            raise _unreachable_share_error(scenario, problem, placement_problem)
+        solution = smallest
     if solution.point.plan_value.met < 0.0:
-        raise _unmet_zone_error(scenario, problem, asked, solution)
-    asked = replace(asked, problem=problem)
-    placed = _make_placement(scenario, asked, asked.sites, problem, solution.order, solution)
-    if wanted.refine is None or not placed.sensors:
+        raise _unmet_zone_error(scenario, problem, placement_problem, solution)
+
+    placement_problem = replace(placement_problem, problem=problem)
+    sites = [placement_problem.sites[i] for i in solution.order]
+    placed = _make_placement(scenario, placement_problem, problem, sites, solution.order, solution)
+    if config.refine is None or not placed.sensors:
         return placed
-    return _refine_placement(work, asked, wanted.refine, placed)
+    return _refine_placement(context, placement_problem, config.refine, placed)
 
 
 def _refine_placement(
-    work: StageContext, placement_problem: PlacementProblem, config: RefinementConfig, placed: Placement
+    context: StageContext, placement_problem: PlacementProblem, config: RefinementConfig, placed: Placement
 ) -> Placement:
-    """A plan after its sensors have moved."""
-    started, solution = perf_counter(), placed.solution
-    refined = refinement.refine_plan(work, placement_problem, solution.order, config)
-    problem, sites = refined.after.problem, refined.after.sites
-    order = solver.greedy_order(problem, tuple(range(len(sites))))
-    told = _make_placement(work.scenario, placement_problem, sites, problem, order, solution)
-    picks = tuple(
-        replace(pick, moved_m=refined.moved_m(number), gain_by_refining=refined.gain(number))
-        for pick, number in zip(told.sensors, order, strict=True)
-    )
-    seconds = perf_counter() - started
-    values = refined.before.plan_value.value, refined.after.plan_value.value
-    moves = RefinementSummary(placed.joint, *values, refined.tried, refined.impossible, refined.turns, seconds)
-    return replace(told, sensors=picks, moves=moves)
+    start_s = perf_counter()
+    solution = placed.solution
+    refined = refinement.refine_plan(context, placement_problem, solution.order, config)
+    before, after = refined.before.plan_value, refined.after.plan_value
+    order = solver.greedy_order(refined.after.problem, tuple(range(len(refined.after.sites))))
+    sites = [refined.after.sites[i] for i in order]
+    result = _make_placement(context.scenario, placement_problem, refined.after.problem, sites, order, solution)
+    sensors = []
+    for sensor, i in zip(result.sensors, order, strict=True):
+        sensors.append(replace(sensor, moved_m=refined.moved_m(i), gain_by_refining=refined.gain(i)))
+    seconds = perf_counter() - start_s
+    counts = (refined.tried, refined.impossible, refined.turns)
+    summary = RefinementSummary(placed.joint, before.value, after.value, *counts, seconds)
+    return replace(result, sensors=tuple(sensors), refinement=summary)
 
 
 def _make_placement(
     scenario: Scenario,
     placement_problem: PlacementProblem,
-    sites: Sequence[Site],
     problem: Problem,
-    plan: Plan,
+    sites: Sequence[Site],
+    order: Sequence[int],
     solution: Solution,
 ) -> Placement:
-    """A plan in the words of the scenario; ``sites`` and ``plan`` are those of ``problem``, which need not be the one
-    that was solved."""
-    rules, whole, demanded = problem.rules, problem.coverage_state(plan), scenario.placement.zones
-    joint, before = whole.value(problem.joint), problem.coverage_state()
-    picks = []
-    for number, candidate in enumerate(plan):
-        so_far = before.value(problem.joint)
-        before.add(candidate)
-        score = before.value(problem.joint)
-        whole.remove(candidate)
-        loss = joint - whole.value(problem.joint)
-        whole.add(candidate)
-        cost = rules.cost_of(plan[: number + 1]) - rules.cost_of(plan[:number])
-        is_forced = candidate in rules.forced
-        picks.append(PlacedSensor(sites[candidate], is_forced, score - so_far, score, cost, loss))
-    zones = tuple(
-        ZoneCoverage(demand.term.name, whole.value(demand.term), demand.least, demanded[demand.term.name].by)
-        for demand in problem.demands
-        if demand.term.name in demanded
-    )
+    """Describe a plan.
+
+    Parameters
+    ----------
+    scenario
+        Its ``[placement]`` names the zones.
+    placement_problem, solution
+        The problem with the candidates as they are given, and its solution.
+    problem
+        The problem in which the plan is evaluated: the same one, or that of the refined poses.
+    sites, order
+        The sensors of the plan in the order of installation, and their candidates in ``problem``.
+    """
+    state = problem.coverage_state(order)
+    joint = state.value(problem.joint)
+    bounds = {point.count: point.bound for point in solution.curve}
+    sensors = []
+    for sensor, candidate in zip(planned_sensors(problem, sites, order), order, strict=True):
+        state.remove(candidate)
+        loss = joint - state.value(problem.joint)
+        state.add(candidate)
+        bound = bounds.get(sensor.order, bounds[min(bounds)])  # the curve begins at the number of forced sensors
+        sensors.append(replace(sensor, loss=loss, bound=bound))
+
+    zones = []
+    for demand in problem.demands:
+        name = demand.term.name
+        if name in scenario.placement.zones:
+            required_by = scenario.placement.zones[name].by
+            zones.append(ZoneCoverage(name, state.value(demand.term), demand.least, required_by))
+    given = placement_problem.problem
     return Placement(
-        sensors=tuple(picks),
+        sensors=tuple(sensors),
         score=placement_problem.score,
         joint=joint,
-        together=placement_problem.joint_of_all,
-        cost=rules.cost_of(plan),
-        candidates=len(placement_problem.problem.candidates),
-        zones=zones,
+        joint_of_all=placement_problem.joint_of_all,
+        cost=problem.rules.cost_of(order),
+        candidates=len(given.candidates),
+        zones=tuple(zones),
         solution=solution,
         curve_sites=tuple(_site_names(placement_problem, point.plan) for point in solution.curve),
-        curve_costs=tuple(placement_problem.problem.rules.cost_of(point.plan) for point in solution.curve),
+        curve_costs=tuple(given.rules.cost_of(point.plan) for point in solution.curve),
     )
+
+
+def planned_sensors(problem: Problem, sites: Sequence[Site], order: Sequence[int]) -> Iterator[PlannedSensor]:
+    """Yield the sensors of a plan with their gains and costs; ``loss`` and ``bound`` are not set.
+
+    Parameters
+    ----------
+    problem
+        Its joint score and its costs are used.
+    sites, order
+        The sites of the sensors in the order of installation, and their candidates in the problem.
+    """
+    state, rules = problem.coverage_state(), problem.rules
+    score, cost = state.value(problem.joint), rules.cost_of([])
+    for number, (site, candidate) in enumerate(zip(sites, order, strict=True), start=1):
+        state.add(candidate)
+        score_before, score = score, state.value(problem.joint)
+        cost_before, cost = cost, rules.cost_of(order[:number])
+        yield PlannedSensor(
+            order=number,
+            site=site.name,
+            pole=site.pole or site.name,
+            **asdict(site.pose),
+            sensor=site.sensor,
+            forced=candidate in rules.forced,
+            gain=score - score_before,
+            score=score,
+            cost=cost - cost_before,
+        )
 
 
 def _site_names(placement_problem: PlacementProblem, plan: Sequence[int]) -> tuple[str, ...]:
@@ -523,3 +498,86 @@ def _unmet_zone_error(
         + " and ".join(shares),
         hint,
     )
+
+
+def write_placement(
+    folder: Path, scenario: Scenario, placed: Placement, stage_keys: Mapping[str, str]
+) -> tuple[Path, ...]:
+    """Write ``placement.parquet``, ``curve.parquet`` and their checksums.
+
+    Parameters
+    ----------
+    folder
+        The run's folder.
+    scenario, placed
+        The scenario and its plan.
+    stage_keys
+        Keys of the stages that the plan was made from, by name.
+
+    Returns
+    -------
+    tuple of pathlib.Path
+        The two tables.
+    """
+    paths = RunFolder(folder)
+    metadata = _placement_metadata(scenario, placed, stage_keys)
+    paths.placement_checksums.unlink(missing_ok=True)
+    optional_columns = () if placed.refinement is None else _REFINEMENT_COLUMNS
+    with parquet.artefact_writer(paths.placement, "placement", optional_columns) as out:
+        out.write(plan_columns(placed.sensors))
+        out.describe(metadata)
+
+    points = placed.solution.curve
+    curve = {
+        "count": [point.count for point in points],
+        "score": [point.plan_value.joint for point in points],
+        "value": [point.plan_value.value for point in points],
+        "bound": [point.bound for point in points],
+        "cost": list(placed.curve_costs),
+        "met": [point.plan_value.met >= 0.0 for point in points],
+        "sites": [json.dumps(list(names), ensure_ascii=False) for names in placed.curve_sites],
+    }
+    parquet.write_artefact(paths.curve, "curve", curve, metadata)
+    checksums.write_checksums(paths.placement_checksums, (paths.placement, paths.curve))
+    return paths.placement, paths.curve
+
+
+def _placement_metadata(scenario: Scenario, placed: Placement, stage_keys: Mapping[str, str]) -> dict[str, Any]:
+    requested = scenario.placement.model_dump(mode="json")
+    settings = {
+        "placement": requested,
+        "costs": scenario.costs.model_dump(mode="json"),
+        "score": scenario.score.model_copy(update={"gamma": scenario.gamma}).model_dump(mode="json"),
+    }
+    solution, refined = placed.solution, placed.refinement
+    plan = {
+        "score": placed.score,
+        "asked": requested,
+        "candidates": placed.candidates,
+        "joint": placed.joint,
+        "value": solution.point.plan_value.value,
+        "bound": solution.point.bound,
+        "certificate": placed.certificate,
+        "together": placed.joint_of_all,
+        "cost": placed.cost,
+        "is_best": solution.is_best,
+        "fewest_is_proved": solution.fewest_is_proved,
+        "zones": [asdict(zone) for zone in placed.zones],
+    }
+    if refined is not None:  # without its duration: equal plans are equal files
+        plan["moves"] = {
+            "before": refined.joint_before,
+            "value_before": refined.value_before,
+            "value": refined.value_after,
+            "tried": refined.poses_tried,
+            "impossible": refined.poses_infeasible,
+            "turns": refined.turns,
+        }
+    return {
+        "schema": parquet.SCHEMA_VERSION,
+        "scenario": {"name": scenario.name, "hash": files.hash_json(settings)},
+        "inputs": files.hash_json({**settings, "stages": dict(stage_keys)}),
+        "seed": scenario.seed,
+        "stages": dict(stage_keys),
+        "plan": plan,
+    }

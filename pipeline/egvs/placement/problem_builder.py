@@ -30,7 +30,8 @@ from egvs.scoring.visibility import Beams, HitCounter
 from egvs.sensors.sites import Site, candidate_sites
 from egvs.stages.base import StageContext
 from egvs.stages.inputs import get_scene
-from egvs.stages.site_scoring import SiteScan, TargetScorer, empty_scans
+from egvs.stages.site_scans import SiteScan, empty_scans
+from egvs.stages.site_scoring import TargetScorer
 
 COST_COLUMN = "cost"
 """Column of a sites file with the cost of each candidate."""
@@ -104,7 +105,7 @@ class TargetView:
 
     def row(self, beams: Beams) -> VisibilityRow:
         """Return the amounts of a scan on all vehicle-frames."""
-        amounts = self._amounts(self._targets.see(beams))
+        amounts = self._amounts(self._targets.visible(beams))
         return VisibilityRow.of(np.rint(amounts * self.unit).astype(np.int64), _MAX_WEIGHTED_HITS)
 
     def _amounts(self, visible: VisibleTargets) -> FloatArray:
@@ -161,7 +162,7 @@ class DetectionObjective:
 
     def terms(self, visibility: VisibilityMatrix) -> dict[str, CoverageTerm]:
         """Return the term of each period; "" is all traffic and comes first."""
-        counts_by_period = {"": self._targets.counts, **self._targets.counts_by_period()}
+        counts_by_period = {"": self._targets.weight, **self._targets.weights_by_period()}
         return {
             name: problem.target_term(name, self._score, visibility, counts, self.view.unit)
             for name, counts in counts_by_period.items()

@@ -1,36 +1,32 @@
-"""Score labels; percent, counts, degrees, durations as text.
-
-How scores are told to a planner: what each is called, and what a value of it says.
-
-The sentences and numbers of the report, in plain words.
-"""
+"""Names and units of the scores as people read them, and numbers as text."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class ScoreLabel:
-    """One score in words.
+    """Names of a score, and how its values are written.
 
     Attributes
     ----------
     name
-        As ``[score] rank_by`` has it.
+        The value of ``[score] rank_by``.
     noun, head
-        What it is called in a sentence, and at the head of a column.
+        Name in a sentence, and at the head of a column.
     says
-        What a site does that has a value of it.
+        What a site with a score does, with ``{}`` for the score.
     means
-        What is added up, in a sentence.
+        How the score is defined, in one or two sentences.
     is_share
-        Whether values are shares, told in per cent.
+        Whether values are shares, written in per cent.
     digits
-        Decimals of its values.
+        Number of decimals.
     unit
-        Of values that are no shares.
+        Unit of values that are not shares.
     """
 
     name: str
@@ -44,108 +40,129 @@ class ScoreLabel:
 
     @property
     def counts_vehicles(self) -> bool:
-        """Whether it is a mean over vehicles."""
+        """Whether the score is a mean over vehicles."""
         return self.means.endswith(_VEHICLES_NOTE)
 
     @property
     def title(self) -> str:
-        """At the head of a column of the report, two lines of HTML."""
+        """Head of a column of the report: two lines of HTML."""
         first, _, rest = self.head.partition(" ")
-        return f"{first[0].upper()}{first[1:]}<br>" + (f"({self.unit})" if self.unit else rest or "of all")
+        second = f"({self.unit})" if self.unit else rest or "of all"
+        return f"{first[0].upper()}{first[1:]}<br>{second}"
 
     @property
     def label(self) -> str:
-        """Of an axis."""
+        """Title of an axis."""
         return f"{self.noun} ({self.unit})" if self.unit else self.noun
 
     def with_noun(self, value: float) -> str:
-        """Beside a site: "EGVS 247,397 bit"."""
+        """Return a value with name and unit, e.g. "EGVS 247,397 bit"."""
         return f"{self.noun} {self.value(value)} {self.unit}".strip()
 
     def value(self, value: float) -> str:
-        """A value in a table; its unit stands in the head."""
+        """Return a value as text, without its unit."""
         if math.isnan(value):
             return "-"
         return f"{value:.{self.digits}%}" if self.is_share else f"{value:,.{self.digits}f}"
 
     def error(self, value: float, se: float | None) -> str:
-        """A standard error in a table: of shares in per cent of the whole, of others as a share of the value."""
+        """Return a standard error as text: in percentage points for shares, relative to the value otherwise."""
         if se is None or math.isnan(se) or not value > 0:
             return "-"
         return f"±{se:.1%}" if self.is_share else f"{se / value:.1%}"
 
     def sentence(self, value: float) -> str:
-        """What a site with this value does."""
-        return self.says.format(f"{value:.0%}" if self.is_share else f"{self.value(value)} {self.unit}".strip())
+        """Return what a site with this score does, e.g. "should find 87% of vehicles"."""
+        text = f"{value:.0%}" if self.is_share else f"{self.value(value)} {self.unit}".strip()
+        return self.says.format(text)
 
+
+_MAX_LETTERS = 18
 
 _VEHICLES_NOTE = (
-    "Each vehicle whose centre is in the region counts, in some frames of the recorded traffic, by the beams that meet "
-    "it first: buildings, trees, poles and other vehicles are in the way."
+    "Vehicles with their centre in the region are counted in a sample of the recorded frames, each by the beams that "
+    "hit it; buildings, trees, poles and other vehicles block beams."
 )
 
-SCORE_LABELS = {
-    its.name: its
-    for its in (
-        ScoreLabel("egvs", "EGVS", "EGVS bit", "scores {}", "",
-            is_share=False, digits=0, unit="bit"),
-        ScoreLabel(
-            "entropy_seen", "the entropy seen", "entropy seen", "sees {} of the traffic’s uncertainty",
-            "Sites are ranked by the share of the traffic’s uncertainty in voxels that at least one beam crosses.",
-        ),
-        ScoreLabel(
-            "coverage", "the coverage", "coverage", "crosses {} of the voxels where traffic ever is",
-            "Sites are ranked by the share of the voxels that traffic ever occupies that at least one beam crosses.",
-        ),
-        ScoreLabel(
-            "expected_visibility", "the occupancy seen", "visibility", "sees {} of what traffic occupies",
-            "Sites are ranked by the share of occupancy, the sum of its chances, in voxels that a beam crosses.",
-        ),
-        ScoreLabel(
-            "points_on_target", "the points on vehicles", "log points", "has a mean log(1 + points) of {} on vehicles",
-            f"Sites are ranked by the points that they get from vehicles: the mean of log(1 + points). "
-            f"{_VEHICLES_NOTE}",
-            is_share=False, digits=2,
-        ),
-        ScoreLabel(
-            "seen_well", "the share of vehicles seen well", "seen well", "sees {} of vehicles well",
-            "Sites are ranked by the share of vehicles that they see well, one with n points by 1 − exp(−n / 20). "
-            + _VEHICLES_NOTE,
-        ),
-        ScoreLabel(
-            "expected_detections", "the share of vehicles found", "found", "should find {} of vehicles",
-            "Sites are ranked by the share of vehicles that detectors are expected to find, by the points on each, how "
-            f"far they spread over it, how far away it is and how near the next one. {_VEHICLES_NOTE}",
-        ),
-    )
-}  # fmt: skip
-"""By name."""
+_LABELS = (
+    ScoreLabel("egvs", "EGVS", "EGVS bit", "scores {}", "",
+        is_share=False, digits=0, unit="bit"),
+    ScoreLabel(
+        "entropy_seen", "the entropy seen", "entropy seen", "sees {} of the traffic’s uncertainty",
+        "Sites are ranked by the share of the traffic’s uncertainty in voxels that at least one beam crosses.",
+    ),
+    ScoreLabel(
+        "coverage", "the coverage", "coverage", "crosses {} of the voxels where traffic ever is",
+        "Sites are ranked by coverage: of the voxels that traffic ever occupies, the share that at least one beam "
+        "crosses.",
+    ),
+    ScoreLabel(
+        "expected_visibility", "the occupancy seen", "visibility", "sees {} of what traffic occupies",
+        "Sites are ranked by the occupancy seen: of the summed occupancy probabilities, the share in voxels that at "
+        "least one beam crosses.",
+    ),
+    ScoreLabel(
+        "points_on_target", "the points on vehicles", "log points", "has a mean log(1 + points) of {} on vehicles",
+        f"Sites are ranked by the points that they get from vehicles: the mean of log(1 + points). "
+        f"{_VEHICLES_NOTE}",
+        is_share=False, digits=2,
+    ),
+    ScoreLabel(
+        "seen_well", "the share of vehicles seen well", "seen well", "sees {} of vehicles well",
+        "Sites are ranked by the share of vehicles that they see well: a vehicle with n points counts 1 − exp(−n / 20)."
+        f" {_VEHICLES_NOTE}",
+    ),
+    ScoreLabel(
+        "expected_detections", "the share of vehicles found", "found", "should find {} of vehicles",
+        "Sites are ranked by the share of vehicles that detectors are expected to find, given the points on each "
+        "vehicle, how far they spread over it, its distance, and the distance to the next vehicle. "
+        f"{_VEHICLES_NOTE}",
+    ),
+)  # fmt: skip
+
+SCORE_LABELS = {label.name: label for label in _LABELS}
+"""Labels by the name of the score."""
 
 
 def format_percent(value: float) -> str:
-    """A share in per cent."""
+    """Return a share in per cent, e.g. "12.5%"."""
     return f"{value:.1%}"
 
 
 def format_count(value: float) -> str:
-    """A number without decimals, thousands apart."""
+    """Return a number without decimals, e.g. "12,500"."""
     return f"{value:,.0f}"
 
 
 def format_number(value: float) -> str:
-    """A number as a person would write it."""
+    """Return a number with up to two decimals, e.g. "12.5"."""
     return f"{value:,.2f}".rstrip("0").rstrip(".")
 
 
 def format_degrees(value: float) -> str:
-    """A longitude or latitude, to about a decimetre."""
+    """Return a longitude or latitude with a resolution of about a decimetre."""
     return f"{value:.6f}"
 
 
 def format_duration(seconds: float) -> str:
-    """A time in hours, minutes and seconds."""
+    """Return a time in hours, minutes and seconds, e.g. "1 h 5 min"; times below a minute keep their decimals."""
     minutes, rest = divmod(round(seconds), 60)
     if not minutes:
         return f"{seconds:g} s"
     hours, minutes = divmod(minutes, 60)
-    return " ".join(f"{n} {unit}" for n, unit in ((hours, "h"), (minutes, "min"), (rest, "s")) if n)
+    parts = ((hours, "h"), (minutes, "min"), (rest, "s"))
+    return " ".join(f"{number} {unit}" for number, unit in parts if number)
+
+
+def join_names(names: Sequence[str]) -> str:
+    """Return names as a list in a sentence, e.g. "a, b and c"."""
+    if len(names) == 1:
+        return names[0]
+    return f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def shorten_name(name: str) -> str:
+    """Return a name for a figure, cut after 18 letters."""
+    if len(name) <= _MAX_LETTERS:
+        return name
+    return f"{name[: _MAX_LETTERS - 1]}…"

@@ -1,19 +1,14 @@
-"""Maps of a run as SVG.
+"""Maps of a run as SVG figures, seen from above, for the report and for other pages.
 
-Maps of a run, each an SVG figure seen from above, for the report and for any other page.
-
-- :func:`occupancy`: a field over the region, summed along z, with the static outlines and the sites;
+- :func:`occupancy`: values over the region, summed along z, with the static outlines and the sites;
 - :func:`site_map`: the sites, coloured by score, numbered by rank;
-- :func:`site_view`: what one site sees or misses; such figures share the colour scale
+- :func:`site_view`: what one site sees or misses; these share the colour scale
   :func:`egvs.report.svg_figures.shared_scale`;
-- :func:`scan_view`: where the beams of its empty scan end;
-- :func:`missed_view`: the share of the vehicles that it misses, square by square, with the worst places numbered.
+- :func:`scan_view`: where the beams of an empty scan end;
+- :func:`missed_view`: the share of vehicles that a site misses in each cell, with the worst locations numbered;
+- :func:`plan_map`: the poles of a plan.
 
-Roads lie under all of them but the empty scan.
-
-Names of sites are placed so that they hide little.
-
-Figures of a plan of several sensors: the map of its poles, and how much each number of sensors is worth.
+All but the empty scan have roads in the background. Labels are placed so that they hide little.
 """
 
 from __future__ import annotations
@@ -22,6 +17,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,28 +27,27 @@ from egvs.core.grid import Grid
 from egvs.report import colours
 from egvs.report.basemap import Outlines, Roads, StreetName
 from egvs.report.colours import ColumnValues, IndexedImage
-from egvs.report.svg_figures import Box, ColourBar, MapFrame, MapSite, extent
+from egvs.report.formatting import shorten_name
+from egvs.report.svg_figures import PAGE_STYLE, Box, ColourBar, FigureStyle, MapFrame, MapSite, extent
 
 StackedSites = list[MapSite]
-"""Sites that stand above one another, the best first."""
+"""Sites at the same x, y, the best first."""
 
-WIDTH, _TALLEST = 760.0, 560.0
-"""Of the maps of a page, in their own units."""
-_MAX_LETTERS = 18
-"""Letters of a name; longer ones are cut."""
+_MAX_HEIGHT = 560.0
 _LABEL_GAP = 4.0
-"""Between a spot and its name."""
+"""Gap between a spot and its label, in the figure's units."""
+_LETTER_WIDTH, _LABEL_HEIGHT = 7.2, 15.0
 _CROWDED = 40
-"""With more places than this, a map has no room for numbers and names."""
+"""A map with more locations than this has no room for numbers and names."""
 _STREET_NAME_POSITIONS = (0.5, 0.3, 0.7, 0.15, 0.85)
-"""Where along its piece of street a name may stand; the first that is free."""
+"""Positions of a street name along its street; the first that is free is used."""
 _LABEL_SIDES = ((1, 0), (0, -1), (0, 1), (-1, 0), (0.71, -0.71), (-0.71, -0.71), (0.71, 0.71), (-0.71, 0.71))
 """East, north, south, west, then the diagonals."""
 
 
 @dataclass(frozen=True)
 class Backdrop:
-    """What lies under every map: the static outlines, and the roads."""
+    """What every map shows in the background: static outlines and roads."""
 
     outlines: Sequence[Outlines]
     roads: Roads
@@ -60,7 +55,7 @@ class Backdrop:
 
 @dataclass(frozen=True)
 class SiteViewFigure:
-    """A sensor in its place: the voxels that its beams cross, (nx, ny, nz) bool, and what lies under the figure."""
+    """A sensor, the voxels that its beams cross (shape (nx, ny, nz)), and the background of the figure."""
 
     site: MapSite
     crossed: NDArray[np.bool_]
@@ -75,55 +70,82 @@ def occupancy(
     backdrop: Backdrop,
     sites: Sequence[MapSite],
     alt: str,
-    width: float = WIDTH,
+    style: FigureStyle = PAGE_STYLE,
 ) -> str:
-    """A field over the region of interest, with the roads, the static outlines and the sites."""
-    plan = _sites_frame(extent(grid, sites), "tpog", width)
+    """Return a map of values over the region of interest, with roads, static outlines and sites.
+
+    Parameters
+    ----------
+    grid, values
+        The voxel grid, and a value per column.
+    label
+        Title of the colour bar.
+    backdrop
+        Roads and outlines.
+    sites
+        Shown as circles.
+    alt
+        Text for people who do not see the figure.
+    style
+        Width and colours.
+    """
+    plan = _sites_frame(extent(grid, sites), "tpog", style)
     peak = float(values.max(initial=0.0))
+    street_names, _ = _street_names(plan, backdrop.roads.names, sites)
     parts = [
         _road_paths(plan, backdrop.roads),
         _field_image(plan, grid, values, peak),
         _outline_paths(plan, backdrop.outlines),
         plan.roi(grid),
-        *_street_names(plan, backdrop.roads.names, sites)[0],
+        *street_names,
     ]
-    for s in sites:
-        dot = f'<circle class="spot" cx="{plan.x(s.x_m):.1f}" cy="{plan.y(s.y_m):.1f}" r="4"/>'
-        parts.append(_with_title(dot, f"{s.site}: rank {s.rank}"))
+    for site in sites:
+        dot = f'<circle {style.shape("spot")} cx="{plan.x(site.x_m):.1f}" cy="{plan.y(site.y_m):.1f}" r="4"/>'
+        parts.append(f"<g><title>{escape(f'{site.site}: rank {site.rank}')}</title>{dot}</g>")
     return plan.svg(parts, alt, bar=ColourBar(0.0, peak, label))
 
 
 def site_map(
-    grid: Grid, values: ColumnValues, backdrop: Backdrop, sites: Sequence[MapSite], alt: str, width: float = WIDTH
+    grid: Grid,
+    values: ColumnValues,
+    backdrop: Backdrop,
+    sites: Sequence[MapSite],
+    alt: str,
+    style: FigureStyle = PAGE_STYLE,
 ) -> str:
-    """The sites over roads and static outlines: colour by score, number by rank, name beside it; traffic faint below.
+    """Return a map of the sites: colour by score, number by rank, a label beside each; traffic faint below.
 
-    Of sites that share a place, the best is in the middle of its rings. Where many sites stand, only the first ten and
-    the last keep a name; every site tells its own under the pointer.
+    Sites at the same location are rings, the best innermost. Where there are many, only the first ten and the last
+    have labels; the others show their name under the pointer. See :func:`occupancy` for the parameters.
     """
-    plan = _sites_frame(extent(grid, sites), "sites", width)
-    places = _stack_sites(sites)
-    crowded, low, high = is_crowded(sites), min(s.score for s in sites), max(s.score for s in sites)
-    streets, street_boxes = _street_names(plan, backdrop.roads.names, sites)
-    radius = 8.5 if not crowded else 6.0 if len(places) <= 120 else 4.0
-    parts = [*base_layers(plan, grid, values, backdrop), *streets]
-    parts += [_site_rings(plan, place, low, high, radius, crowded) for place in reversed(places)]
-    named = places if not crowded else [*places[:10], places[-1]]
-    parts += _labels(plan, places, named, radius, street_boxes)
+    plan = _sites_frame(extent(grid, sites), "sites", style)
+    stacks = _stack_sites(sites)
+    crowded = is_crowded(sites)
+    low, high = min(site.score for site in sites), max(site.score for site in sites)
+    street_names, street_boxes = _street_names(plan, backdrop.roads.names, sites)
+    radius = 8.5
+    labelled = stacks
+    if crowded:
+        radius = 6.0 if len(stacks) <= 120 else 4.0
+        labelled = [*stacks[:10], stacks[-1]]
+    parts = [*base_layers(plan, grid, values, backdrop), *street_names]
+    parts += [_site_rings(plan, stack, low, high, radius, crowded) for stack in reversed(stacks)]
+    parts += _stack_labels(plan, stacks, labelled, radius, street_boxes)
     bar = ColourBar(low, high, sites[0].by.label, even=True) if high > low else None
     return plan.svg(parts, alt, bar=bar)
 
 
-def _sites_frame(box: Box, prefix: str, width: float) -> MapFrame:
-    """The frame of a map of all sites; as tall as it needs to be where it is narrow."""
-    return MapFrame(box, prefix, width=width, tallest=max(_TALLEST, width), north=True)
+def _sites_frame(box: Box, prefix: str, style: FigureStyle) -> MapFrame:
+    """Frame of a map of all sites; at least as high as wide if the area needs it."""
+    return MapFrame(box, prefix, width=style.width, tallest=max(_MAX_HEIGHT, style.width), north=True, style=style)
 
 
 def base_layers(plan: MapFrame, grid: Grid, values: ColumnValues, backdrop: Backdrop) -> list[str]:
-    """What lies under sites: roads, faint traffic, static outlines, the region."""
+    """Return the layers below the sites: roads, faint traffic, static outlines, the region."""
+    traffic = _field_image(plan, grid, values, float(values.max(initial=0.0)))
     return [
         _road_paths(plan, backdrop.roads),
-        f'<g class="faint">{_field_image(plan, grid, values, float(values.max(initial=0.0)))}</g>',
+        f"<g {plan.style.shape('faint')}>{traffic}</g>",
         f"<g>{_outline_paths(plan, backdrop.outlines)}</g>",
         plan.roi(grid),
     ]
@@ -136,26 +158,31 @@ def site_view(
     view: SiteViewFigure,
     prefix: str,
     alt: str,
-    width: float | None = None,
+    style: FigureStyle | None = None,
     label: str = "",
 ) -> str:
-    """Entropy from above that one site sees, or misses; columns of voxels that no beam crosses at any height are
-    shaded. Its images carry classes (``shade``, ``field``) by which a page may exchange them.
+    """Return the entropy that one site sees or misses, from above; columns that no beam crosses are shaded.
+
+    A page can replace the images, which have the classes ``shade`` and ``field``.
 
     Parameters
     ----------
-    values
-        Entropy summed along z, bits, (nx, ny).
+    grid, values
+        The voxel grid, and the entropy of each column, bits.
     peak
-        The value at the end of the colour scale.
+        Value at the end of the colour scale.
+    view
+        The sensor and the voxels that its beams cross.
     prefix
         Makes ids unique on a page.
-    width
-        Of the figure, in its own units; that of a page's panels for None.
+    alt
+        Text for people who do not see the figure.
+    style
+        Width and colours; by default those of a panel of the report.
     label
-        Of a colour scale below it; none without.
+        Title of a colour bar below the map; no bar by default.
     """
-    plan = site_view_frame(view.box, prefix) if width is None else _sites_frame(view.box, prefix, width)
+    plan = site_view_frame(view.box, prefix) if style is None else _sites_frame(view.box, prefix, style)
     shade = colours.shade_image(np.logical_not(view.crossed.any(axis=2)))
     parts = [
         _road_paths(plan, view.backdrop.roads),
@@ -169,122 +196,127 @@ def site_view(
 
 
 def scan_view(grid: Grid, image: IndexedImage, view: SiteViewFigure, prefix: str, alt: str) -> str:
-    """Where the beams of one site's empty scan end, from above; ``image`` covers the view's box."""
+    """Return where the beams of an empty scan end, from above; ``image`` covers the box of the view."""
     plan = site_view_frame(view.box, prefix)
-    images = (
-        plan.image(plan.full_extent, image.uri(colours.DOT_PALETTES[look]), f"field {look}") for look in colours.THEMES
-    )
-    parts = [_outline_paths(plan, view.backdrop.outlines), *images, plan.roi(grid), _sensor_mark(plan, view.site)]
-    return plan.svg(parts, alt)
+    images = [
+        plan.image(plan.full_extent, image.uri(colours.DOT_PALETTES[theme]), f"field {theme}")
+        for theme in colours.THEMES
+    ]
+    outlines = _outline_paths(plan, view.backdrop.outlines)
+    return plan.svg([outlines, *images, plan.roi(grid), _sensor_mark(plan, view.site)], alt)
 
 
 def missed_view(
     grid: Grid, blindspots: SiteBlindspots, site: MapSite, backdrop: Backdrop, box: Box, prefix: str
 ) -> str:
-    """Which share of the vehicles over each square one site misses, with its worst places numbered. Its
-    image carries a class by which a page may exchange it; numbers beyond those of the worst places are hidden."""
+    """Return the share of vehicles that a site misses in each cell, with the worst locations numbered.
+
+    A page can replace the image, which has the class ``share``; unused numbers are hidden. See :func:`site_view` for
+    the parameters.
+    """
     plan, image = site_view_frame(box, prefix), colours.share_image(blindspots.share_missed)
-    (x, y), (nx, ny) = blindspots.origin_m, blindspots.share_missed.shape
-    place = (
-        plan.x(x),
-        plan.y(y + ny * blindspots.cell_m),
-        nx * blindspots.cell_m * plan.scale,
-        ny * blindspots.cell_m * plan.scale,
-    )
-    parts = [
-        _road_paths(plan, backdrop.roads),
-        *(plan.image(place, image.uri(colours.SHARE_PALETTES[look]), f"field share {look}") for look in colours.THEMES),
-        _outline_paths(plan, backdrop.outlines),
-        plan.roi(grid),
-        _sensor_mark(plan, site),
-        *(_number_mark(number, at) for number, at in enumerate(label_positions(plan, blindspots), 1)),
-    ]
-    missed = (
-        f"{1.0 - blindspots.overall.share:.1%} of the vehicles"
-        if blindspots.overall
-        else "vehicles, of which there are none"
-    )
+    (x, y), (nx, ny), cell_m = blindspots.origin_m, blindspots.share_missed.shape, blindspots.cell_m
+    rectangle = (plan.x(x), plan.y(y + ny * cell_m), nx * cell_m * plan.scale, ny * cell_m * plan.scale)
+    parts = [_road_paths(plan, backdrop.roads)]
+    for theme in colours.THEMES:
+        parts.append(plan.image(rectangle, image.uri(colours.SHARE_PALETTES[theme]), f"field share {theme}"))
+    parts += [_outline_paths(plan, backdrop.outlines), plan.roi(grid), _sensor_mark(plan, site)]
+    for number, position in enumerate(label_positions(plan, blindspots), start=1):
+        transform = f'transform="translate({position[0]} {position[1]})"' if position else 'display="none"'
+        parts.append(f'<g class="worst" {transform}><circle r="8.5"/><text y="4">{number}</text></g>')
+
+    alt = f"From above: no vehicles for {site.site} to see."
+    if blindspots.overall:
+        alt = f"From above: {site.site} misses {1.0 - blindspots.overall.share:.1%} of the vehicles; share by cell."
     bar = ColourBar(0.0, 100.0, "Share of the vehicles that is missed (%)", even=True)
-    return plan.svg(parts, f"From above: where {site.site} misses {missed}, square by square.", bar)
+    return plan.svg(parts, alt, bar)
 
 
 def label_positions(plan: MapFrame, blindspots: SiteBlindspots) -> list[tuple[float, float] | None]:
-    """Where the numbers of a site's worst places stand on a figure; None for those that it has not."""
-    worst = [(round(plan.x(place.x_m), 1), round(plan.y(place.y_m), 1)) for place in blindspots.worst]
+    """Return the positions of the numbers of the worst locations on a figure; None for unused numbers."""
+    worst = [(round(plan.x(location.x_m), 1), round(plan.y(location.y_m), 1)) for location in blindspots.worst]
     return [*worst, *[None] * (MAX_LOCATIONS - len(worst))]
 
 
-def _number_mark(number: int, at: tuple[float, float] | None) -> str:
-    place = f'transform="translate({at[0]} {at[1]})"' if at else 'display="none"'
-    return f'<g class="worst" {place}><circle r="8.5"/><text y="4">{number}</text></g>'
-
-
 def site_view_frame(box: Box, prefix: str = "") -> MapFrame:
-    """The frame of the figures that show one site."""
+    """Return the frame of the figures of a single site."""
     return MapFrame(box, prefix, width=460.0, tallest=420.0)
 
 
 def _sensor_mark(plan: MapFrame, site: MapSite) -> str:
-    place = f'transform="translate({plan.x(site.x_m):.1f} {plan.y(site.y_m):.1f})"'
-    return f'<path class="sensor" {place} d="M0 -9l7.8 13.5h-15.6z"/>'
+    position = f'transform="translate({plan.x(site.x_m):.1f} {plan.y(site.y_m):.1f})"'
+    return f'<path {plan.style.shape("sensor")} {position} d="M0 -9l7.8 13.5h-15.6z"/>'
 
 
 def _field_image(plan: MapFrame, grid: Grid, values: ColumnValues, peak: float) -> str:
     if not peak > 0:
         return ""
-    image, place = colours.field_image(values, peak), plan.region(grid)
-    return "".join(
-        plan.image(place, image.uri(colours.FIELD_PALETTES[look]), f"field {look}") for look in colours.THEMES
-    )
+    image, rectangle = colours.field_image(values, peak), plan.region(grid)
+    images = [
+        plan.image(rectangle, image.uri(colours.FIELD_PALETTES[theme]), f"field {theme}")
+        for theme in plan.style.image_themes
+    ]
+    return "".join(images)
 
 
 def _road_paths(plan: MapFrame, roads: Roads) -> str:
-    """Junctions, and lanes with a fine line between them: each is drawn twice, the second time a little narrower."""
-    outlines = "".join(_closed_path(plan, outline) for outline in roads.junctions)
-    by_look: dict[tuple[str, float], list[str]] = {}
+    """Junctions, and lanes with a fine line between them: each lane is drawn twice, the second time narrower."""
+    paths_of: dict[tuple[str, float], list[str]] = {}
     for piece in roads.lanes:
-        by_look.setdefault((piece.look, piece.width_m), []).append(_open_path(plan, piece.line))
-    wide, narrow = [], []
-    for (look, width_m), paths in by_look.items():
+        paths_of.setdefault((piece.css_class, piece.width_m), []).append(_open_path(plan, piece.line))
+    if not paths_of:
+        return ""
+    edges, lanes = [], []
+    for (css_class, width_m), paths in paths_of.items():
         width, d = width_m * plan.scale, "".join(paths)
-        wide.append(f'<path class="edge" style="stroke-width:{width:.2f}px" d="{d}"/>')
-        narrow.append(f'<path class="lane {look}" style="stroke-width:{max(width - 1.0, 0.6 * width):.2f}px" d="{d}"/>')
-    junctions = f'<path class="junction" d="{outlines}"/>' if outlines else ""
-    return f'<g class="roads">{"".join(wide)}{junctions}{"".join(narrow)}</g>' if wide else ""
+        narrow = max(width - 1.0, 0.6 * width)
+        edges.append(f'<path {plan.style.shape("edge")} style="stroke-width:{width:.2f}px" d="{d}"/>')
+        lanes.append(f'<path {plan.style.shape("lane", css_class)} style="stroke-width:{narrow:.2f}px" d="{d}"/>')
+    outlines = "".join(_closed_path(plan, outline) for outline in roads.junctions)
+    junctions = f'<path {plan.style.shape("junction")} d="{outlines}"/>' if outlines else ""
+    return f"<g {plan.style.shape('roads')}>{''.join(edges)}{junctions}{''.join(lanes)}</g>"
 
 
 def _street_names(plan: MapFrame, names: Sequence[StreetName], sites: Sequence[MapSite]) -> tuple[list[str], list[Box]]:
-    """Names along their streets, where they fit into the frame, onto no site and onto no other name; those of the
-    longest pieces first. Also the boxes that they take.
+    """Street names and the boxes that they cover: within the map, clear of sites and of each other.
+
+    Names on the longest streets come first; a name that finds no room is left out.
     """
     drawn: list[str] = []
-    taken = [_square(plan.x(s.x_m), plan.y(s.y_m), 9.0) for s in sites]
+    covered: list[Box] = []
+    site_boxes = [_square(plan.x(site.x_m), plan.y(site.y_m), 9.0) for site in sites]
     for name in sorted(names, key=lambda name: -name.length_m):
-        (x0, y0), (x1, y1) = ((plan.x(x), plan.y(y)) for x, y in (name.start_m, name.end_m))
+        x0, y0 = plan.x(name.start_m[0]), plan.y(name.start_m[1])
+        x1, y1 = plan.x(name.end_m[0]), plan.y(name.end_m[1])
         angle, half = math.atan2(y1 - y0, x1 - x0), 3.3 * len(name.text) + 4.0
         for along in _STREET_NAME_POSITIONS:
             x, y = x0 + along * (x1 - x0), y0 + along * (y1 - y0)
             boxes = [
-                _square(x + at * math.cos(angle), y + at * math.sin(angle), 7.0) for at in np.arange(-half, half, 7)
+                _square(x + offset * math.cos(angle), y + offset * math.sin(angle), 7.0)
+                for offset in np.arange(-half, half, 7)
             ]
-            if all(_within(b, plan) and not any(_overlap(b, other) for other in taken) for b in boxes):
-                taken += boxes
-                place = f"translate({x:.1f} {y:.1f}) rotate({math.degrees(angle):.1f})"
-                drawn.append(f'<text class="street" transform="{place}" dy="4">{escape(name.text)}</text>')
+            if all(_is_free(box, plan, [*site_boxes, *covered]) for box in boxes):
+                covered += boxes
+                position = f'transform="translate({x:.1f} {y:.1f}) rotate({math.degrees(angle):.1f})" dy="4"'
+                drawn.append(plan.style.text_with_halo("street", position, name.text))
                 break
-    return drawn, taken[len(sites) :]
+    return drawn, covered
+
+
+def _is_free(box: Box, plan: MapFrame, covered: Sequence[Box]) -> bool:
+    return _within(box, plan) and not any(_overlap(box, other) for other in covered)
 
 
 def _outline_paths(plan: MapFrame, outlines: Sequence[Outlines]) -> str:
-    return "".join(
-        f'<path class="{group.look}" fill-rule="evenodd" '
-        f'd="{"".join(_closed_path(plan, r[:-1]) for r in group.rings)}"/>'
-        for group in outlines
-    )
+    paths = []
+    for group in outlines:
+        d = "".join(_closed_path(plan, ring[:-1]) for ring in group.rings)
+        paths.append(f'<path {plan.style.shape(group.css_class)} fill-rule="evenodd" d="{d}"/>')
+    return "".join(paths)
 
 
 def _open_path(plan: MapFrame, line: NDArray[np.float64]) -> str:
-    """The path along some points, (n, 2) metres."""
+    """SVG path along points, shape (n, 2), metres."""
     xs, ys = plan.x(line[:, 0]), plan.y(line[:, 1])
     return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in zip(xs.tolist(), ys.tolist(), strict=True))
 
@@ -293,111 +325,132 @@ def _closed_path(plan: MapFrame, ring: NDArray[np.float64]) -> str:
     return _open_path(plan, ring) + "z"
 
 
-def _with_title(shape: str, title: str) -> str:
-    return f"<g><title>{escape(title)}</title>{shape}</g>"
-
-
 def _site_rings(plan: MapFrame, stack: StackedSites, low: float, high: float, radius: float, crowded: bool) -> str:
-    """Rings round each other, the best in the middle, with its rank unless places are crowded."""
-    x, y = plan.x(stack[0].x_m), plan.y(stack[0].y_m)
-    shown = [*stack[:3], stack[-1]] if len(stack) > 4 else stack
-    circles = [
-        f'<circle class="q{colours.colour_class(s.score, low, high)}" cx="{x:.1f}" cy="{y:.1f}" '
-        f'r="{radius + 3.5 * i:.1f}"/>'
-        for i, s in reversed(list(enumerate(shown)))
-    ]
-    tone = "high" if 2 * colours.colour_class(stack[0].score, low, high) > colours.STEPS else "low"
-    rank = "" if crowded else f'<text class="rank {tone}" x="{x:.1f}" y="{y + 3.4:.1f}">{stack[0].rank}</text>'
-    title = "; ".join(f"{s.site}: rank {s.rank}, {s.by.with_noun(s.score)}, height {s.z_m:g} m" for s in stack)
-    first = " first" if stack[0].rank == 1 else ""
-    shown_by = f'class="site{first}" data-site="{escape(stack[0].site)}"'
-    return f"<g {shown_by}><title>{escape(title)}</title>{''.join(circles)}{rank}</g>"
+    """Concentric rings, the best site innermost, with its rank unless the map is crowded."""
+    best = stack[0]
+    x, y = plan.x(best.x_m), plan.y(best.y_m)
+    displayed = [*stack[:3], stack[-1]] if len(stack) > 4 else stack
+    shapes = []
+    for i, site in reversed(list(enumerate(displayed))):
+        colour = plan.style.shape(f"q{colours.colour_class(site.score, low, high)}")
+        shapes.append(f'<circle {colour} cx="{x:.1f}" cy="{y:.1f}" r="{radius + 3.5 * i:.1f}"/>')
+    if not crowded:
+        is_dark = 2 * colours.colour_class(best.score, low, high) > colours.STEPS
+        tone = plan.style.shape("rank", "high" if is_dark else "low")
+        shapes.append(f'<text {tone} x="{x:.1f}" y="{y + 3.4:.1f}">{best.rank}</text>')
+
+    sites = [f"{site.site}: rank {site.rank}, {site.by.with_noun(site.score)}, height {site.z_m:g} m" for site in stack]
+    group = plan.style.shape("site", "first") if best.rank == 1 else plan.style.shape("site")
+    title = f"<title>{escape('; '.join(sites))}</title>"
+    return f'<g {group} data-site="{escape(best.site)}">{title}{"".join(shapes)}</g>'
 
 
 def _stack_sites(sites: Sequence[MapSite]) -> list[StackedSites]:
-    """Sites that share a place, the best first; places by their best."""
-    places: dict[tuple[float, float], StackedSites] = {}
-    for site in sorted(sites, key=lambda s: s.rank):
-        places.setdefault((site.x_m, site.y_m), []).append(site)
-    return list(places.values())
+    """Sites by location, the location of the best site first."""
+    stacks: dict[tuple[float, float], StackedSites] = {}
+    for site in sorted(sites, key=lambda site: site.rank):
+        stacks.setdefault((site.x_m, site.y_m), []).append(site)
+    return list(stacks.values())
 
 
 def is_crowded(sites: Sequence[MapSite]) -> bool:
-    """Whether the sites stand at too many places for numbers and names."""
+    """Return whether the sites have too many locations for numbers and names."""
     return len(_stack_sites(sites)) > _CROWDED
 
 
 def has_stacked_sites(sites: Sequence[MapSite]) -> bool:
-    """Whether some sites share a place."""
+    """Return whether several sites have the same location."""
     return len(_stack_sites(sites)) < len(sites)
 
 
-def _labels(
-    plan: MapFrame, places: Sequence[StackedSites], named: Sequence[StackedSites], radius: float, others: Sequence[Box]
+class LabelSpot(NamedTuple):
+    """A spot that gets a label: its centre and radius in the figure's units."""
+
+    x: float
+    y: float
+    text: str
+    radius: float
+
+
+def _stack_labels(
+    plan: MapFrame,
+    stacks: Sequence[StackedSites],
+    labelled: Sequence[StackedSites],
+    radius: float,
+    covered: Sequence[Box],
 ) -> list[str]:
-    """Names of the ``named`` places, so that they hide little, of ``others`` too; ``radius`` is that of a place's
-    innermost ring."""
-    taken = [_square(plan.x(p[0].x_m), plan.y(p[0].y_m), _stack_radius(p, radius) + 1) for p in places]
-    spots = [(plan.x(p[0].x_m), plan.y(p[0].y_m), _stack_name(p), _stack_radius(p, radius) + _LABEL_GAP) for p in named]
-    return _label_spots(plan, spots, [*taken, *others])
+    """Labels of some stacks; ``radius`` is that of the innermost ring, ``covered`` are boxes to leave free."""
+    circles = [_square(spot.x, spot.y, spot.radius + 1) for spot in (_stack_spot(plan, s, radius) for s in stacks)]
+    return _label_spots(plan, [_stack_spot(plan, stack, radius) for stack in labelled], [*circles, *covered])
+
+
+def _stack_spot(plan: MapFrame, stack: StackedSites, radius: float) -> LabelSpot:
+    names = [shorten_name(site.site) for site in stack]
+    text = ", ".join(names) if len(names) <= 2 else f"{names[0]} +{len(names) - 1}"
+    outer_radius = radius + 3.5 * min(3, len(stack) - 1)
+    return LabelSpot(plan.x(stack[0].x_m), plan.y(stack[0].y_m), text, outer_radius)
 
 
 def labels(plan: MapFrame, spots: Sequence[tuple[float, float, str, float]]) -> list[str]:
-    """Texts beside spots (x, y, text, radius; in the figure's units), so that they hide little."""
-    taken = [_square(x, y, radius + 1.0) for x, y, _, radius in spots]
-    return _label_spots(plan, [(x, y, text, radius + _LABEL_GAP) for x, y, text, radius in spots], taken)
+    """Return labels beside spots (x, y, text, radius; in the figure's units), placed so that they hide little."""
+    circles = [_square(x, y, radius + 1.0) for x, y, _, radius in spots]
+    return _label_spots(plan, [LabelSpot(*spot) for spot in spots], circles)
 
 
-def _label_spots(plan: MapFrame, spots: Sequence[tuple[float, float, str, float]], hidden: Sequence[Box]) -> list[str]:
-    """Texts beside spots: x, y, the text, and how far away it may begin; ``hidden`` should not be.
+def _label_spots(plan: MapFrame, spots: Sequence[LabelSpot], circles: Sequence[Box]) -> list[str]:
+    """Labels beside spots, at the position among eight sides and four distances that covers least.
 
-    Steps, for each: try eight sides at four distances; take the first spot that covers nothing, or else the one that
-    covers least; draw a line to one that is further out.
+    A line leads to a label that is not next to its spot.
     """
-    taken, drawn = list(hidden), []
-    for x, y, text, near in spots:
-        wide = 7.2 * len(text)
-        distances = (near, near + 12, near + 26, near + 42)
-        options = [(away, _label_box(x, y, away, wide, side)) for away in distances for side in _LABEL_SIDES]
-        inside = [o for o in options if _within(o[1], plan)] or options
-        away, box = min(inside, key=lambda o: sum(_overlap(o[1], t) for t in taken))
-        taken.append(box)
-        if away > near:
-            end_x, end_y = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2
-            share = (near - _LABEL_GAP) / math.hypot(
-                end_x - x, end_y - y
-            )  # from the spot's edge: a rank may stand in it
-            start_x, start_y = x + share * (end_x - x), y + share * (end_y - y)
-            drawn.append(f'<path class="lead" d="M{start_x:.1f} {start_y:.1f}L{end_x:.1f} {end_y:.1f}"/>')
-        drawn.append(f'<text class="label" x="{box[0]:.1f}" y="{box[3] - 3:.1f}">{escape(text)}</text>')
+    covered, drawn = list(circles), []
+    for spot in spots:
+        near = spot.radius + _LABEL_GAP
+        options = [
+            (distance, _label_box(spot, distance, side))
+            for distance in (near, near + 12, near + 26, near + 42)
+            for side in _LABEL_SIDES
+        ]
+        inside = [option for option in options if _within(option[1], plan)] or options
+        distance, box = min(inside, key=lambda option: sum(_overlap(option[1], other) for other in covered))
+        covered.append(box)
+        if distance > near:
+            drawn.append(_label_line(plan, spot, box))
+        position = f'x="{box[0]:.1f}" y="{box[3] - 3:.1f}"'
+        drawn.append(plan.style.text_with_halo("label", position, spot.text))
     return drawn
 
 
-def _stack_radius(stack: StackedSites, radius: float) -> float:
-    """Radius of a place's outermost ring."""
-    return radius + 3.5 * min(3, len(stack) - 1)
-
-
-def _stack_name(stack: StackedSites) -> str:
-    names = [s.site if len(s.site) <= _MAX_LETTERS else s.site[: _MAX_LETTERS - 1] + "…" for s in stack]
-    return ", ".join(names) if len(names) <= 2 else f"{names[0]} +{len(names) - 1}"
+def _label_line(plan: MapFrame, spot: LabelSpot, box: Box) -> str:
+    """A line from the edge of a spot, which may have a number in it, to the middle of its label."""
+    end_x, end_y = (box[0] + box[2]) / 2, (box[1] + box[3]) / 2
+    share = spot.radius / math.hypot(end_x - spot.x, end_y - spot.y)
+    start_x, start_y = spot.x + share * (end_x - spot.x), spot.y + share * (end_y - spot.y)
+    return f'<path {plan.style.shape("lead")} d="M{start_x:.1f} {start_y:.1f}L{end_x:.1f} {end_y:.1f}"/>'
 
 
 def _square(x: float, y: float, half: float) -> Box:
     return x - half, y - half, x + half, y + half
 
 
-def _label_box(x: float, y: float, away: float, wide: float, side: tuple[float, float]) -> Box:
-    """A label's box on one side of a place."""
+def _label_box(spot: LabelSpot, distance: float, side: tuple[float, float]) -> Box:
+    """Box of a label on one side of a spot."""
     dx, dy = side
-    left = x + away * dx - wide * (0.0 if dx > 0 else 1.0 if dx < 0 else 0.5)
-    top = y + away * dy - 15.0 * (0.0 if dy > 0 else 1.0 if dy < 0 else 0.5)
-    return left, top, left + wide, top + 15.0
+    width = _LETTER_WIDTH * len(spot.text)
+    left = spot.x + distance * dx - width * _share_before(dx)
+    top = spot.y + distance * dy - _LABEL_HEIGHT * _share_before(dy)
+    return left, top, left + width, top + _LABEL_HEIGHT
+
+
+def _share_before(direction: float) -> float:
+    """Share of a label that lies left of, or above, its anchor."""
+    if direction == 0:
+        return 0.5
+    return 0.0 if direction > 0 else 1.0
 
 
 def _within(box: Box, plan: MapFrame) -> bool:
-    right, base = plan.left + plan.frame_width, plan.top + plan.frame_height
-    return plan.left + 3 <= box[0] and box[2] <= right - 3 and plan.top + 2 <= box[1] and box[3] <= base - 2
+    edge, base = plan.left + plan.frame_width, plan.top + plan.frame_height
+    return plan.left + 3 <= box[0] and box[2] <= edge - 3 and plan.top + 2 <= box[1] and box[3] <= base - 2
 
 
 def _overlap(a: Box, b: Box) -> float:
@@ -406,13 +459,18 @@ def _overlap(a: Box, b: Box) -> float:
 
 @dataclass(frozen=True)
 class PlannedPole:
-    """A pole of a plan on a map: where, the numbers of its sensors ("1, 3"), and what they are and add, in words."""
+    """A pole of a plan on a map: the numbers of its sensors ("1, 3"), a label, and a text under the pointer."""
 
     x_m: float
     y_m: float
     numbers: str
     label: str
     title: str
+
+    @property
+    def half_width(self) -> float:
+        """Half the width of the mark with the numbers, in the figure's units."""
+        return 10.0 + 3.4 * max(0, len(self.numbers) - 1)
 
 
 def plan_map(
@@ -423,23 +481,19 @@ def plan_map(
     poles: Sequence[PlannedPole],
     alt: str,
 ) -> str:
-    """The poles of a plan, numbered in their order, over all candidates; traffic faint below."""
+    """Return a map of the poles of a plan, numbered in their order, over all candidates; traffic faint below.
+
+    See :func:`occupancy` for the parameters.
+    """
     plan = MapFrame(extent(grid, candidates), "plan", north=True)
     parts = base_layers(plan, grid, values, backdrop)
     for x_m, y_m in dict.fromkeys((site.x_m, site.y_m) for site in candidates):
         parts.append(f'<circle class="spot" cx="{plan.x(x_m):.1f}" cy="{plan.y(y_m):.1f}" r="3"/>')
-    spots = [(plan.x(pole.x_m), plan.y(pole.y_m)) for pole in poles]
-    for pole, (x, y) in zip(poles, spots, strict=True):
-        wide = _mark_half_width(pole)
-        shape = f'<rect x="{x - wide:.1f}" y="{y - 10:.1f}" width="{2 * wide:.1f}" height="20" rx="10"/>'
+    spots = []
+    for pole in poles:
+        x, y, half = plan.x(pole.x_m), plan.y(pole.y_m), pole.half_width
+        shape = f'<rect x="{x - half:.1f}" y="{y - 10:.1f}" width="{2 * half:.1f}" height="20" rx="10"/>'
         number = f'<text x="{x:.1f}" y="{y + 4:.1f}">{escape(pole.numbers)}</text>'
         parts.append(f'<g class="planned"><title>{escape(pole.title)}</title>{shape}{number}</g>')
-    parts += labels(
-        plan, [(x, y, pole.label, _mark_half_width(pole)) for pole, (x, y) in zip(poles, spots, strict=True)]
-    )
-    return plan.svg(parts, alt)
-
-
-def _mark_half_width(pole: PlannedPole) -> float:
-    """Of the mark that holds its numbers."""
-    return 10.0 + 3.4 * max(0, len(pole.numbers) - 1)
+        spots.append(LabelSpot(x, y, pole.label, half))
+    return plan.svg([*parts, *labels(plan, spots)], alt)

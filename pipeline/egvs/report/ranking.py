@@ -1,9 +1,4 @@
-"""The order of sites, poles, close runners-up, and the sentences about them.
-
-The ranking of the sites: their order, the best, those that come close, the extremes.
-
-The sentences and numbers of the report, in plain words.
-"""
+"""Sites in the order of their scores, the poles that they are mounted on, and sentences about them."""
 
 from __future__ import annotations
 
@@ -13,28 +8,48 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pyarrow as pa
 
 from egvs.artefacts import parquet
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.core.errors import InputError
-from egvs.report.formatting import SCORE_LABELS, ScoreLabel, format_count, format_number, format_percent
+from egvs.report.formatting import SCORE_LABELS, ScoreLabel, format_count, format_number, format_percent, join_names
 from egvs.report.svg_figures import MapSite
 from egvs.scenario.score_config import DEFAULT_SCORE
 
 CLOSE_SHARE = 0.01
-"""Sites within this share of the best score are named beside it."""
+"""The report names the sites whose score is this close to the best, as a share of the best score."""
+
+_MIN_LEAD = 0.0005
+"""Shares that differ by less than this look the same with one decimal."""
+
+
+class ScoreValue(NamedTuple):
+    """A value of a score other than the EGVS, and its standard error (None if unknown)."""
+
+    name: str
+    value: float
+    se: float | None
 
 
 @dataclass(frozen=True)
 class RankedSite(MapSite):
-    """What is shown of a row of ``scores.parquet``; see its schema for units.
+    """A row of ``scores.parquet``; its schema has the units.
 
-    ``egvs_se`` and ``beats_next`` are None where no standard errors were computed, longitude and latitude where nobody
-    knows where the world frame lies. ``others`` are the scores that stand beside the EGVS, with value and standard
-    error.
+    Attributes
+    ----------
+    egvs_se, beats_next
+        None where no standard errors were computed.
+    longitude_deg, latitude_deg
+        None where the scenario has no reference system.
+    user_columns
+        Names and texts of the user's columns of the sites file.
+    rank_by
+        Name of the score that ranks.
+    others
+        Scores other than the EGVS.
     """
 
     pole: str
@@ -51,131 +66,148 @@ class RankedSite(MapSite):
     longitude_deg: float | None = None
     latitude_deg: float | None = None
     user_columns: tuple[tuple[str, str], ...] = ()
-    """The user's own columns of the sites file and what stands there, as texts."""
     rank_by: str = "egvs"
-    others: tuple[tuple[str, float, float | None], ...] = ()
+    others: tuple[ScoreValue, ...] = ()
 
     @classmethod
-    def all_of(cls, scores: pa.Table, rank_by: str = "egvs") -> tuple[RankedSite, ...]:
-        """The rows of ``scores.parquet``, in its order; ``rank_by`` is what its metadata says."""
+    def from_table(cls, scores: pa.Table, rank_by: str = "egvs") -> tuple[RankedSite, ...]:
+        """Return the rows of ``scores.parquet``, in its order.
+
+        Parameters
+        ----------
+        scores
+            The table.
+        rank_by
+            Name of the score that ranks; the metadata of the table has it.
+        """
         names = [column.name for column in fields(cls) if column.name in scores.column_names]
         known = {*parquet.column_names("scores"), *names}
-        foreign = [name for name in scores.column_names if name not in known]
-        rows, own = scores.select(names).to_pylist(), scores.select(foreign).to_pylist()
-        texts = (tuple((name, _format_user_value(value)) for name, value in values.items()) for values in own)
-        others = _other_scores(scores)
-        return tuple(
-            cls(
-                **{name: _none_if_nan(value) for name, value in row.items()},
-                user_columns=its,
-                rank_by=rank_by,
-                others=values,
-            )
-            for row, its, values in zip(rows, texts, others, strict=True)
-        )
+        user_names = [name for name in scores.column_names if name not in known]
+        other_names = [name for name in SCORE_LABELS if name != "egvs" and name in scores.column_names]
+
+        sites = []
+        for row in scores.to_pylist():
+            values = {name: _none_if_nan(row[name]) for name in names}
+            user_columns = tuple((name, _format_user_value(row[name])) for name in user_names)
+            others = tuple(ScoreValue(name, row[name], _none_if_nan(row.get(f"{name}_se"))) for name in other_names)
+            sites.append(cls(**values, user_columns=user_columns, rank_by=rank_by, others=others))
+        return tuple(sites)
 
     @classmethod
     def read(cls, path: Path) -> tuple[RankedSite, ...]:
-        """From ``scores.parquet``."""
-        scores, about = parquet.read_artefact(path, "scores")
-        return cls.all_of(scores, about.get("rank_by", "egvs"))
+        """Read ``scores.parquet``."""
+        scores, metadata = parquet.read_artefact(path, "scores")
+        return cls.from_table(scores, metadata.get("rank_by", "egvs"))
 
     @property
     def by(self) -> ScoreLabel:
-        """The score that ranks."""
+        """Label of the score that ranks."""
         return SCORE_LABELS[self.rank_by]
 
     @property
     def score(self) -> float:
-        """Its value of the score that ranks."""
+        """Value of the score that ranks."""
         value = self.value_of(self.rank_by)
         return self.egvs if value is None else value
 
     @property
     def score_se(self) -> float | None:
-        """The standard error of the score that ranks; None where it is not known."""
-        return (
-            self.egvs_se if self.rank_by == "egvs" else next((s for n, _, s in self.others if n == self.rank_by), None)
-        )
+        """Standard error of the score that ranks; None if unknown."""
+        if self.rank_by == "egvs":
+            return self.egvs_se
+        return next((other.se for other in self.others if other.name == self.rank_by), None)
 
     def value_of(self, name: str) -> float | None:
-        """Its value of a score; None where there is none, or it is not defined."""
-        known = {"egvs": self.egvs, "entropy_seen": self.entropy_seen} | {n: value for n, value, _ in self.others}
-        value: float | None = _none_if_nan(known.get(name))
+        """Return the value of a score; None where it was not computed, or is not defined."""
+        values = {"egvs": self.egvs, "entropy_seen": self.entropy_seen}
+        for other in self.others:
+            values[other.name] = other.value
+        value: float | None = _none_if_nan(values.get(name))
         return value
 
     @property
     def is_separable(self) -> bool:
-        """Whether the site is told apart from the one below it, as far as is known."""
+        """Whether the site is known to be better than the next one, or standard errors are unknown."""
         return self.beats_next is None or self.beats_next >= DISTINCT_PROBABILITY
 
 
-def _other_scores(scores: pa.Table) -> list[tuple[tuple[str, float, float | None], ...]]:
-    """The scores beside the EGVS that have a column of their own, site by site."""
-    columns = scores.select(
-        [name for name in scores.column_names if name.removesuffix("_se") in SCORE_LABELS]
-    ).to_pydict()
-    names = [name for name in SCORE_LABELS if name != "egvs" and name in columns]
-    return [tuple((n, columns[n][i],
-    _none_if_nan(columns[n + "_se"][i]) if n + "_se" in columns else None) for n in names)
-            for i in range(len(scores))]  # fmt: skip
-
-
 def _none_if_nan(value: Any) -> Any:
-    """A value, None where it is not a number."""
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def _format_user_value(value: object) -> str:
-    """A value of a user's own column as text; empty where there is none."""
-    return "" if value is None else f"{value:.12g}" if isinstance(value, float) else str(value)
+    if value is None:
+        return ""
+    if isinstance(value, float):
+        return f"{value:.12g}"
+    return str(value)
 
 
 @dataclass(frozen=True)
 class Pole:
-    """The candidates of one place, by rank; at least one."""
+    """The candidate sites on one pole, the best first; at least one."""
 
     name: str
     sites: tuple[RankedSite, ...]
 
     @property
     def best(self) -> RankedSite:
-        """The best candidate there."""
+        """The best site."""
         return self.sites[0]
 
     @property
     def gain(self) -> float | None:
-        """By how much its best candidate beats its worst, as a share of the worst; None for one, or from nothing."""
+        """Lead of the best site over the worst, as a share of the worst; None for a single site, or a worst of 0."""
         worst = self.sites[-1].score
-        return self.best.score / worst - 1 if len(self.sites) > 1 and worst > 0 else None
+        if len(self.sites) == 1 or not worst > 0:
+            return None
+        return self.best.score / worst - 1
 
     @property
     def user_columns(self) -> tuple[str, ...]:
-        """What the user's own columns say there; several texts of one column side by side."""
-        columns = zip(*(site.user_columns for site in self.sites), strict=True)
-        return tuple(", ".join(filter(None, dict.fromkeys(text for _, text in column))) for column in columns)
+        """Text of each of the user's columns; different texts of the sites are separated by commas."""
+        columns = []
+        for column in zip(*(site.user_columns for site in self.sites), strict=True):
+            texts = dict.fromkeys(text for _, text in column if text)
+            columns.append(", ".join(texts))
+        return tuple(columns)
 
 
 def companion_score(sites: Sequence[RankedSite]) -> ScoreLabel | None:
-    """The score that is shown beside the one that ranks these sites: the EGVS; where that ranks, the recommended one or
-    the share of vehicles seen well. None where that has no values."""
-    names = (DEFAULT_SCORE, "seen_well") if sites and sites[0].rank_by == "egvs" else ("egvs",)
-    return next((SCORE_LABELS[n] for n in names if sites and all(site.value_of(n) is not None for site in sites)), None)
+    """Return the score shown beside the one that ranks; None if it was not computed.
+
+    Beside the EGVS it is the recommended score or, failing that, the share of vehicles seen well; beside any other
+    score it is the EGVS.
+    """
+    if not sites:
+        return None
+    names = (DEFAULT_SCORE, "seen_well") if sites[0].rank_by == "egvs" else ("egvs",)
+    for name in names:
+        if all(site.value_of(name) is not None for site in sites):
+            return SCORE_LABELS[name]
+    return None
 
 
-def group_by_pole(by_rank: Iterable[RankedSite]) -> tuple[Pole, ...]:
-    """The poles, the one with the best candidate first, of candidates by rank."""
-    grouped: dict[str, list[RankedSite]] = {}
-    for site in by_rank:
-        grouped.setdefault(site.pole, []).append(site)
-    return tuple(Pole(name, tuple(sites)) for name, sites in grouped.items())
+def group_by_pole(sites: Iterable[RankedSite]) -> tuple[Pole, ...]:
+    """Return the poles of sites in the order of their ranks: the pole with the best site first."""
+    sites_of_pole: dict[str, list[RankedSite]] = {}
+    for site in sites:
+        sites_of_pole.setdefault(site.pole, []).append(site)
+    return tuple(Pole(name, tuple(members)) for name, members in sites_of_pole.items())
 
 
 @dataclass(frozen=True)
 class Ranking:
-    """Sites by rank, those of equal rank in the order of the sites; at least one.
+    """Sites by rank; at least one.
 
-    The ``best`` are those of rank 1, the ``close`` ones follow within ``CLOSE`` of the best score.
+    Attributes
+    ----------
+    sites
+        All sites; those of equal rank are in the order of the sites file.
+    best
+        The sites of rank 1.
+    close
+        The other sites within :data:`CLOSE_SHARE` of the best score.
     """
 
     sites: tuple[RankedSite, ...]
@@ -184,14 +216,13 @@ class Ranking:
 
     @classmethod
     def read(cls, path: Path) -> Ranking:
-        """From ``scores.parquet``; InputError when it holds no site."""
-        scored = RankedSite.read(path)
-        if not scored:
-            raise InputError(path, "holds no site", "at least one; run the score stage again")
-        sites = tuple(sorted(scored, key=lambda s: s.rank))
-        best = tuple(s for s in sites if s.rank == 1)
+        """Read ``scores.parquet``; InputError if it has no site."""
+        sites = tuple(sorted(RankedSite.read(path), key=lambda site: site.rank))
+        if not sites:
+            raise InputError(path, "expected at least one site, got none", "Run the score stage again")
+        best = tuple(site for site in sites if site.rank == 1)
         near = (1 - CLOSE_SHARE) * best[0].score
-        return cls(sites, best, tuple(s for s in sites if s.rank > 1 and s.score >= near > 0))
+        return cls(sites, best, tuple(site for site in sites if site.rank > 1 and site.score >= near > 0))
 
     @property
     def last(self) -> RankedSite:
@@ -200,22 +231,22 @@ class Ranking:
 
     @cached_property
     def poles(self) -> tuple[Pole, ...]:
-        """The poles, the one with the best candidate first."""
+        """The poles, the one with the best site first."""
         return group_by_pole(self.sites)
 
     @property
     def user_column_names(self) -> tuple[str, ...]:
-        """The user's own columns of the sites file."""
+        """Names of the user's columns of the sites file."""
         return tuple(name for name, _ in self.sites[0].user_columns)
 
     @property
     def is_tie(self) -> bool:
-        """Whether no site is better than another."""
+        """Whether all sites have the same score."""
         return len(self.best) == len(self.sites)
 
     @property
     def extremes(self) -> tuple[RankedSite, ...]:
-        """The best and the worst site; one where they score the same."""
+        """The best and the worst site; only one where all have the same score."""
         return self.sites[:1] if self.is_tie else (self.sites[0], self.last)
 
     @property
@@ -225,13 +256,12 @@ class Ranking:
 
     @property
     def by(self) -> ScoreLabel:
-        """The score that ranks."""
+        """Label of the score that ranks."""
         return self.best[0].by
 
     @property
     def companion_score(self) -> ScoreLabel | None:
-        """The score that is shown beside it: the EGVS, or the recommended one where that ranks; None where it has no
-        values."""
+        """The score shown beside the one that ranks; None if it was not computed."""
         return companion_score(self.sites)
 
     @property
@@ -241,86 +271,95 @@ class Ranking:
 
     @cached_property
     def shared_ranks(self) -> set[int]:
-        """Ranks that several sites have."""
-        return {rank for rank, count in Counter(s.rank for s in self.sites).items() if count > 1}
+        """Ranks of several sites."""
+        return {rank for rank, count in Counter(site.rank for site in self.sites).items() if count > 1}
 
-    def of_best(self, site: RankedSite) -> float:
-        """A score as a share of the best one; 0 where that is 0."""
-        top = self.best[0].score
-        return site.score / top if top > 0 else 0.0
+    def share_of_best(self, site: RankedSite) -> float:
+        """Return the score of a site as a share of the best score; 0 if that is 0."""
+        best_score = self.best[0].score
+        return site.score / best_score if best_score > 0 else 0.0
 
 
 def headline(ranking: Ranking, has_traffic: bool) -> str:
-    """The outcome in one sentence."""
-    best, others = ranking.best, len(ranking.sites) - 1
+    """Return the result in one sentence."""
+    best, count = ranking.best, len(ranking.sites)
     top = best[0]
     if not has_traffic:
         return "No traffic in the region: the sites cannot be ranked"
     if not top.score > 0:
-        return "No site sees anything of the traffic" if others else f"{top.site} sees nothing of the traffic"
-    sees = f"sees {format_percent(top.entropy_seen)} of the traffic’s uncertainty"
-    if top.rank_by != "egvs":
-        sees = top.by.sentence(top.score)
-    if not others:
-        return f"{top.site}, the only site, {sees}"
+        return "No site sees any of the traffic" if count > 1 else f"{top.site} sees none of the traffic"
+
+    by_egvs = top.rank_by == "egvs"
+    result = top.by.sentence(top.score)
+    if by_egvs:
+        result = f"sees {format_percent(top.entropy_seen)} of the traffic’s uncertainty"
+    if count == 1:
+        return f"{top.site}, the only site, {result}"
     if ranking.is_tie:
-        same = f"All {len(best)} sites score the same"
-        return f"{same}: each {sees}" if top.rank_by != "egvs" or len({s.entropy_seen for s in best}) == 1 else same
+        text = f"All {count} sites score the same"
+        if by_egvs and len({site.entropy_seen for site in best}) > 1:
+            return text
+        return f"{text}: each {result}"
+    if len(best) > 4:
+        return f"{top.site} and {len(best) - 1} others share the first place of {count}: {top.site} {result}"
     if len(best) > 1:
-        few = len(best) <= 4
-        names = ", ".join(s.site for s in best[:-1]) if few else f"{top.site} and {len(best) - 2} others"
-        return f"{names} and {best[-1].site} share the first place of {others + 1}: {top.site} {sees}"
-    outcome = f"{top.site} is the best of {others + 1} sites"
-    return outcome if top.rank_by == "egvs" else f"{outcome}: it {sees}"
+        names = join_names([site.site for site in best])
+        return f"{names} share the first place of {count}: {top.site} {result}"
+    text = f"{top.site} is the best of {count} sites"
+    return text if by_egvs else f"{text}: it {result}"
 
 
 def lead(ranking: Ranking) -> str:
-    """By how much the best leads, and who comes close; nothing where nobody leads."""
+    """Return sentences about the lead of the best site and the sites close to it; empty if none leads."""
     if ranking.is_tie or not ranking.best[0].score > 0:
         return ""
     second = ranking.sites[len(ranking.best)]
-    behind = 1 - ranking.of_best(second)
-    by = f"{behind:.1%}" if behind >= 0.0005 else "less than 0.1%"
-    subject, whose = ("It leads", "its") if len(ranking.best) == 1 else ("They lead", "their")
-    text = f"{subject} {second.site}, the next, by {by} of {whose} score."
-    if not ranking.best[-1].is_separable:  # the last of the best is the one beside the next
-        text += " With this much traffic they cannot be told apart."
+    gap = 1 - ranking.share_of_best(second)
+    gap_text = f"{gap:.1%}" if gap >= _MIN_LEAD else "less than 0.1%"
+    if len(ranking.best) == 1:
+        text = f"It leads the next site, {second.site}, by {gap_text} of its score."
+    else:
+        text = f"They lead the next site, {second.site}, by {gap_text} of their score."
+    if not ranking.best[-1].is_separable:  # ``beats_next`` of the last of the best refers to the second
+        text += " This much traffic is not enough to tell which of them is better."
     if len(ranking.close) > 1:
-        names = ", ".join(s.site for s in ranking.close[:4])
-        more = f" and {len(ranking.close) - 4} more" if len(ranking.close) > 4 else ""
-        text += f" Within {CLOSE_SHARE:.0%} of the best are {len(ranking.close)} others: {names}{more}."
+        names = ", ".join(site.site for site in ranking.close[:4])
+        if len(ranking.close) > 4:
+            names += f" and {len(ranking.close) - 4} more"
+        text += f" {len(ranking.close)} other sites score within {CLOSE_SHARE:.0%} of the best: {names}."
     return text
 
 
 def entropy_seen_note(ranking: Ranking) -> str:
-    """What entropy seen says beside the EGVS; nothing where another score ranks."""
-    top, most = (max(sites, key=lambda site: site.entropy_seen) for sites in (ranking.best, ranking.sites))
+    """Return a sentence on the site that sees most entropy; empty if a score other than the EGVS ranks."""
+    top = max(ranking.best, key=lambda site: site.entropy_seen)
+    most = max(ranking.sites, key=lambda site: site.entropy_seen)
     if ranking.is_tie or top.rank_by != "egvs" or not top.egvs > 0:
         return ""
-    if most.entropy_seen - top.entropy_seen < 0.0005:
-        it = "It" if len(ranking.best) == 1 else top.site
-        return f"{it} also sees most of the traffic’s uncertainty, {format_percent(top.entropy_seen)}."
+    if most.entropy_seen - top.entropy_seen < _MIN_LEAD:
+        subject = "It" if len(ranking.best) == 1 else top.site
+        return (
+            f"{subject} also sees the largest share of the traffic’s uncertainty, {format_percent(top.entropy_seen)}."
+        )
     return (
         f"{most.site}, rank {most.rank}, sees more of the traffic’s uncertainty "
-        f"({format_percent(most.entropy_seen)} against "
-        f"{format_percent(top.entropy_seen)}), but with fewer beams on it. A voxel counts as "
-        f"seen from one beam on, and one beam detects no vehicle."
+        f"({format_percent(most.entropy_seen)} against {format_percent(top.entropy_seen)}), but with fewer beams. "
+        "One beam is enough for a voxel to count as seen, but not to detect a vehicle."
     )
 
 
 def site_caption(site: RankedSite, visible_voxels: int, voxels: int) -> str:
-    """One site in numbers."""
+    """Return the position and the counts of one site."""
     return (
         f"{site.site}: rank {site.rank}, {site.by.with_noun(site.score)}, at x = {format_number(site.x_m)} m, "
         f"y = {format_number(site.y_m)} m, z = {format_number(site.z_m)} m, with a {site.sensor}. "
         f"It sees {format_count(visible_voxels)} of {format_count(voxels)} uncertain voxels. "
-        f"{format_count(site.returns)} of its {format_count(site.beams_in_roi)} beams towards the region end on "
-        f"the ground "
-        f"or on what stands there."
+        f"{format_count(site.beams_in_roi)} of its beams can reach the region; {format_count(site.returns)} of "
+        "them hit the ground or an object."
     )
 
 
 def share_of_limit(site: RankedSite) -> float | None:
-    """A score as a share of what no site could exceed."""
+    """Return the EGVS as a share of its upper limit; None if there is no finite limit above 0."""
     limit = site.egvs_limit
     return site.egvs / limit if limit > 0 and math.isfinite(limit) else None

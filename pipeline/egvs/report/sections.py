@@ -1,15 +1,9 @@
-"""What other commands add to the page: plan, validation, accuracy study, evidence.
+"""Sections of the page on the results of other commands: ``egvs validate``, ``egvs place``, ``egvs accuracy``.
 
-What validation found of the sites of a run: how far the order by EGVS and the order by detection agree.
+A result is shown if it was computed from the same inputs as the run (:func:`_is_current`).
 
-What the study says of scores (docs/validity.md), and where two of them rank the first sites of a run otherwise.
-
-The numbers stand here alone, taken from the study's tables: Spearman's rho of a score with what a detector finds, over
-the sites of the junctions that chose nothing. What is not measured is not there, and nothing is said of it.
-
-A plan of several sensors that was made of what a run ran on: who stands where, what each adds, what is proved.
-
-An accuracy study of what a run ran on: the settings that the page shows, and the study's figure.
+:func:`ranking_disagreement` compares the EGVS with the recommended score by the evidence of the validation study
+(docs/validity.md), which is a table beside this module; a setting that was not measured is not in it.
 """
 
 from __future__ import annotations
@@ -21,39 +15,65 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from egvs.artefacts.readers import read_accuracy, read_placement, read_validation
-from egvs.artefacts.run_folder import ACCURACY_FILES, PLACEMENT_FILES, VALIDATION_FILES, StageRecord
+from egvs.artefacts.run_folder import ACCURACY_FILES, PLACEMENT_FILES, VALIDATION_FILES
+from egvs.artefacts.run_record import StageRecord
 from egvs.artefacts.tpog import Tpog
 from egvs.core.errors import Diagnostic, collect_warnings
 from egvs.report import maps, svg_figures
-from egvs.report.formatting import SCORE_LABELS, ScoreLabel
+from egvs.report.formatting import SCORE_LABELS, ScoreLabel, join_names
 from egvs.report.maps import Backdrop, PlannedPole
 from egvs.report.ranking import RankedSite
 from egvs.report.svg_figures import CurveStep, MapSite
 from egvs.scenario.score_config import DEFAULT_SCORE
 
+COMPARED_SITES = 3
+"""Number of best sites that :func:`ranking_disagreement` compares."""
+
+RHO: Mapping[str, Mapping[str, float]] = json.loads(
+    Path(__file__).with_name("sections.json").read_text(encoding="utf-8")
+)
+"""Rank correlation (Spearman's rho) of scores with detection at the held-out junctions of the study: score -> detector
+-> rho with AP (BEV + 3D, IoU 0.7), from the table of all scores under F in docs/validity-tables.md. The EGVS has one
+entry per setting, named by :func:`egvs_setting`."""
+
 _ALL_OBJECTS = "vehicles"
-"""The set of all objects, in ``detection.parquet``."""
+"""Name of the set of all objects in ``detection.parquet``."""
 
 _MEASURE_LABELS = {
-    "ap_combined_r40_iou70": "average precision from above plus that in space, up to 200 %",
+    "ap_combined_r40_iou70": "average precision from above plus average precision in space, at most 200 %",
     "seen_20": "vehicles with 20 points or more",
 }
-"""Measures in words."""
+
+
+def _is_current(metadata: Mapping[str, Any], stages: Mapping[str, StageRecord]) -> bool:
+    """Whether a result was computed from the same inputs as the run."""
+    return all(name in stages and stages[name].inputs == key for name, key in metadata["stages"].items())
+
+
+def _read_base64(path: Path) -> str:
+    return base64.b64encode(path.read_bytes()).decode("ascii")
+
+
+def _count_sites(count: int) -> str:
+    return "1 site" if count == 1 else f"{count} sites"
+
+
+# ---- egvs validate
 
 
 @dataclass(frozen=True)
 class SiteDetection:
-    """What a detector finds from a site.
+    """Detection from a site by one detector.
 
     Attributes
     ----------
     value, se
-        A share; None where it is not defined.
+        A share and its standard error; None if not defined.
     rank
-        1 is best, equal ones share a rank; None without a value.
+        1 is best, equal values share a rank; None without a value.
     """
 
     value: float | None
@@ -61,75 +81,90 @@ class SiteDetection:
     rank: int | None
 
 
+class Tau(NamedTuple):
+    """Kendall's tau and the ends of its 95 % confidence interval; NaN if not defined."""
+
+    value: float
+    low: float
+    high: float
+
+
 @dataclass(frozen=True)
 class DetectorSummary:
-    """How detection by one detector goes with the score.
+    """Agreement of the score with one detector.
 
     Attributes
     ----------
-    measure
-        What stands for detection, in words.
+    name, measure
+        The detector, and a description of its measure.
     tau
-        Kendall's, with the ends of its interval of 95 %; not a number where they are not defined.
+        Agreement of the orders of the sites by EGVS and by detection.
     sites
-        By name.
+        Detection by name of the site.
     """
 
     name: str
     measure: str
-    tau: tuple[float, float, float]
+    tau: Tau
     sites: Mapping[str, SiteDetection]
 
     def agreement(self, scored: Sequence[RankedSite]) -> str:
-        """How far the two orders agree, in a sentence."""
-        tau, low, high = self.tau
-        known = [(site.egvs, its.value) for site in scored if (its := self.sites[site.site]).value is not None]
-        turns = [
-            math.copysign(1.0, (a - c) * (b - d)) for (a, b), (c, d) in combinations(known, 2) if a != c and b != d
-        ]
-        if math.isnan(tau) or not turns:
-            return f"{_format_sites(len(known))} with values: too few, or too much alike, to compare two orders."
-        share = sum(turn > 0 for turn in turns) / len(turns)
-        between = "" if math.isnan(low) else f", between {low:.2f} and {high:.2f} with 95 % confidence"
+        """Return how far the orders by EGVS and by detection agree, in a sentence."""
+        values = []
+        for site in scored:
+            detected = self.sites[site.site].value
+            if detected is not None:
+                values.append((site.egvs, detected))
+        agreeing = compared = 0
+        for (egvs, detected), (other_egvs, other_detected) in combinations(values, 2):
+            if egvs != other_egvs and detected != other_detected:
+                compared += 1
+                agreeing += (egvs > other_egvs) == (detected > other_detected)
+        if math.isnan(self.tau.value) or not compared:
+            return f"{_count_sites(len(values))} with values: too few, or too similar, to compare the two orders."
+        interval = ""
+        if not math.isnan(self.tau.low):
+            interval = f", 95 % confidence interval {self.tau.low:.2f} to {self.tau.high:.2f}"
         return (
-            f"Of {_format_sites(len(known))}, the order by EGVS and the order by detection agree in {share:.0%} "
-            f"of pairs "
-            f"(Kendall's tau {tau:.2f}{between})."
+            f"EGVS and detection agree on which of two sites is better in {agreeing / compared:.0%} of the pairs of "
+            f"{_count_sites(len(values))} (Kendall's tau {self.tau.value:.2f}{interval})."
         )
 
     def judgement(self, scored: Sequence[RankedSite]) -> str:
-        """What a planner may take from it."""
-        tau, low, high = self.tau
-        count = _format_sites(sum(its.value is not None for its in self.sites.values()))
-        if math.isnan(tau):
+        """Return what a planner can conclude from it."""
+        if math.isnan(self.tau.value):
             return ""
-        if math.isnan(low):
-            verdict = f"How sure that is cannot be told from {count}."
-        elif low <= 0.0 <= high:
-            verdict = f"{count} do not tell: the interval holds 0, and chance alone may order sites like this."
-        elif low > 0.0:
-            verdict = "That is more than chance: a site with a higher score tends to detect more."
+        count = _count_sites(sum(site.value is not None for site in self.sites.values()))
+        if math.isnan(self.tau.low):
+            verdict = f"From {count} it cannot be said how certain this is."
+        elif self.tau.low <= 0.0 <= self.tau.high:
+            verdict = f"{count} are too few to tell: the interval includes 0, so the agreement may be chance."
+        elif self.tau.low > 0.0:
+            verdict = "This is more than chance: sites with a higher score tend to detect more."
         else:
-            verdict = "The score orders these sites the wrong way round: one with a higher score tends to detect less."
+            verdict = "The score orders these sites the wrong way round: sites with a higher score tend to detect less."
         best = self.sites[scored[0].site]
-        where = "" if best.rank is None else f" The best by score, {scored[0].site}, has rank {best.rank} by detection."
-        return verdict + where
+        if best.rank is None:
+            return verdict
+        return f"{verdict} The best site by score, {scored[0].site}, has rank {best.rank} by detection."
 
 
 @dataclass(frozen=True)
 class ValidationSummary:
-    """What ``egvs validate`` found, as the page shows it.
+    """Results of ``egvs validate``.
 
     Attributes
     ----------
+    detectors
+        Agreement of the score with each detector.
     frames, objects
-        Of the traffic that sites were judged by.
+        Frames of the traffic used, and vehicles in them.
     apart_s
-        Time between two frames, at least.
+        Minimum time between two frames.
     warnings
-        What was not unseen, or is not defined.
+        Warnings of the validation.
     figure
-        In base 64.
+        PNG in base 64.
     """
 
     detectors: tuple[DetectorSummary, ...]
@@ -141,32 +176,38 @@ class ValidationSummary:
 
     @classmethod
     def read(cls, out: Path, stages: Mapping[str, StageRecord]) -> ValidationSummary | None:
-        """The validation of what ``stages`` ran on; None where there is none."""
+        """Read the validation in a run folder; None if there is none of this run."""
         detection, correlation, figure = (out / name for name in VALIDATION_FILES)
-        found = read_validation(detection, correlation) if figure.is_file() else None
-        if found is None:
+        result = read_validation(detection, correlation) if figure.is_file() else None
+        if result is None:
             return None
-        rows, correlations, about = found
-        if any(name not in stages or stages[name].inputs != key for name, key in about["stages"].items()):
+        detection_rows, correlation_rows, metadata = result
+        if not _is_current(metadata, stages):
             return None
-        mine = [row for row in rows if row["objects_of"] == _ALL_OBJECTS]
-        own = [row for row in correlations if about["own_score"] == {key: row[key] for key in ("score", "parameters")}]
-        shown = [(name, about["shown"][name]) for name in dict.fromkeys(row["detector"] for row in mine)]
-        detectors = tuple(_detector_summary(name, measure, mine, own) for name, measure in shown)
-        picture = base64.b64encode(figure.read_bytes()).decode("ascii")
+        rows = [row for row in detection_rows if row["objects_of"] == _ALL_OBJECTS]
+        correlations = []
+        for row in correlation_rows:
+            if metadata["own_score"] == {"score": row["score"], "parameters": row["parameters"]}:
+                correlations.append(row)
+        names = dict.fromkeys(row["detector"] for row in rows)
         return cls(
-            detectors, about["frames"], mine[0]["objects"], about["apart_s"], tuple(collect_warnings([about])), picture
+            detectors=tuple(_detector_summary(name, metadata["shown"][name], rows, correlations) for name in names),
+            frames=metadata["frames"],
+            objects=rows[0]["objects"],
+            apart_s=metadata["apart_s"],
+            warnings=tuple(collect_warnings([metadata])),
+            figure=_read_base64(figure),
         )
 
 
 def _detector_summary(
     name: str, measure: str, rows: Sequence[Mapping[str, Any]], correlations: Sequence[Mapping[str, Any]]
 ) -> DetectorSummary:
-    (row,) = (its for its in correlations if (its["detector"], its["measure"]) == (name, measure))
-    tau = (row["kendall"], row["kendall_low"], row["kendall_high"])
-    mine = [row for row in rows if row["detector"] == name]
-    values = [row[measure] for row in mine if not math.isnan(row[measure])]
-    sites = {row["site"]: _site_detection(row[measure], row[f"{measure}_se"], values) for row in mine}
+    (correlation,) = (row for row in correlations if (row["detector"], row["measure"]) == (name, measure))
+    tau = Tau(correlation["kendall"], correlation["kendall_low"], correlation["kendall_high"])
+    rows = [row for row in rows if row["detector"] == name]
+    values = [row[measure] for row in rows if not math.isnan(row[measure])]
+    sites = {row["site"]: _site_detection(row[measure], row[f"{measure}_se"], values) for row in rows}
     return DetectorSummary(name, _MEASURE_LABELS.get(measure, measure.replace("_", " ")), tau, sites)
 
 
@@ -176,77 +217,79 @@ def _site_detection(value: float, se: float, values: Sequence[float]) -> SiteDet
     return SiteDetection(value, None if math.isnan(se) else se, 1 + sum(other > value for other in values))
 
 
-def _format_sites(count: int) -> str:
-    return f"{count} site{'' if count == 1 else 's'}"
-
-
-COMPARED_SITES = 3
-"""So many of the best sites are held against each other."""
-
-RHO: Mapping[str, Mapping[str, float]] = json.loads(
-    Path(__file__).with_name("sections.json").read_text(encoding="utf-8")
-)
-"""Score -> detector -> rho with AP (BEV + 3D, IoU 0.7), given sites and grid of these junctions together: the table of
-all scores under F in docs/validity-tables.md. The EGVS goes by its setting, as :func:`egvs_setting` names it."""
+# ---- evidence of the validation study
 
 
 def egvs_setting(gamma: float, voxel_m: float, *, moving_occlusion: bool = False) -> str:
-    """The EGVS of a run, as :data:`RHO` names it."""
-    return f"egvs (gamma {gamma:g}, {'moving occlusion, ' if moving_occlusion else ''}voxel {voxel_m:g})"
+    """Return the key of an EGVS setting in :data:`RHO`."""
+    occlusion = "moving occlusion, " if moving_occlusion else ""
+    return f"egvs (gamma {gamma:g}, {occlusion}voxel {voxel_m:g})"
 
 
 def ranking_disagreement(
     sites: Sequence[RankedSite], egvs: str, rho: Mapping[str, Mapping[str, float]] | None = None
 ) -> str:
-    """Where the EGVS and the recommended score put other sites first: which ones, and which of the two goes better with
-    detection; nothing where they agree, or a score is not there.
+    """Return sentences if the EGVS and the recommended score have different best sites; empty otherwise.
 
     Parameters
     ----------
+    sites
+        Sites with both scores; the result is empty if one is missing.
     egvs
-        The setting of the run's EGVS, see :func:`egvs_setting`.
+        The EGVS setting of the run, from :func:`egvs_setting`.
     rho
-        Evidence, :data:`RHO` by default.
+        The evidence; :data:`RHO` by default.
     """
-    by_egvs, by_other = (_first_sites(sites, name) for name in ("egvs", DEFAULT_SCORE))
+    by_egvs, by_other = _best_sites(sites, "egvs"), _best_sites(sites, DEFAULT_SCORE)
     if not by_egvs or not by_other or (by_egvs[0] == by_other[0] and set(by_egvs) == set(by_other)):
         return ""
     noun = SCORE_LABELS[DEFAULT_SCORE].noun
-    what = f"The EGVS has {_join_names(by_egvs)} first, {noun} has {_join_names(by_other)}"
-    return f"{what}: {_verdict(noun, egvs, RHO if rho is None else rho)}"
+    return (
+        f"The best sites by EGVS are {join_names(by_egvs)}; by {noun} they are {join_names(by_other)}. "
+        f"{_describe_evidence(noun, egvs, RHO if rho is None else rho)}"
+    )
 
 
-def _first_sites(sites: Sequence[RankedSite], name: str) -> tuple[str, ...]:
-    """The best sites by one score, those of equal scores in the order of the sites; none where a value is missing."""
+def _best_sites(sites: Sequence[RankedSite], name: str) -> tuple[str, ...]:
+    """The best sites by one score, those of equal scores in the order of the sites; empty if a value is missing."""
     values = [site.value_of(name) for site in sites]
     if any(value is None for value in values):
         return ()
-    ranked = sorted(zip(sites, values, strict=True), key=lambda its: -float(its[1] or 0.0))
+    ranked = sorted(zip(sites, values, strict=True), key=lambda pair: -float(pair[1] or 0.0))
     return tuple(site.site for site, _ in ranked[:COMPARED_SITES])
 
 
-def _verdict(noun: str, egvs: str, rho: Mapping[str, Mapping[str, float]]) -> str:
-    """Which of the two detection agrees with, as far as was measured."""
-    theirs, own = rho.get(DEFAULT_SCORE, {}), rho.get(egvs, {})
-    shared = [name for name in theirs if name in own]
-    if not shared:
-        known = " and ".join(f"{value:.2f} ({name})" for name, value in theirs.items())
-        besides = f"; {noun} goes with it at rho {known}, see docs/validity.md" if known else ""
-        return f"how well this setting of the EGVS goes with detection was not measured{besides}."
-    numbers = " and ".join(f"{theirs[name]:.2f} against {own[name]:.2f} ({name})" for name in shared)
-    better = [theirs[name] > own[name] for name in shared]
-    who = noun if all(better) else "the EGVS" if not any(better) else "neither"
-    where = "rho with what is detected at junctions that chose nothing"
-    return f"detection agrees with {who}, {where}: {numbers}; see docs/validity.md."
+def _describe_evidence(noun: str, egvs: str, rho: Mapping[str, Mapping[str, float]]) -> str:
+    """Sentences on how well both scores predicted detection in the study."""
+    recommended, this_egvs = rho.get(DEFAULT_SCORE, {}), rho.get(egvs, {})
+    detectors = [detector for detector in recommended if detector in this_egvs]
+    if not detectors:
+        text = "How well this setting of the EGVS predicts detection was not measured."
+        if recommended:
+            values = join_names([f"{value:.2f} ({detector})" for detector, value in recommended.items()])
+            text += f" The rank correlation of {noun} with detection is {values}; see docs/validity.md."
+        return text
+
+    is_better = [recommended[detector] > this_egvs[detector] for detector in detectors]
+    if all(is_better):
+        better = noun
+    elif any(is_better):
+        better = "neither of the two"
+    else:
+        better = "the EGVS"
+    values = join_names([f"{recommended[name]:.2f} against {this_egvs[name]:.2f} ({name})" for name in detectors])
+    return (
+        f"At the held-out junctions of the validation study, {better} predicted detection better: rank correlation "
+        f"{values}; see docs/validity.md."
+    )
 
 
-def _join_names(names: Sequence[str]) -> str:
-    return ", ".join(names[:-1]) + f" and {names[-1]}" if len(names) > 1 else names[0]
+# ---- egvs place
 
 
 @dataclass(frozen=True)
 class PlanRow:
-    """One sensor of the plan: the columns of ``placement.parquet`` that the page shows."""
+    """One sensor of a plan: the columns of ``placement.parquet`` that the page shows."""
 
     order: int
     site: str
@@ -266,7 +309,7 @@ class PlanRow:
 
 @dataclass(frozen=True)
 class CurveRow:
-    """What the best plan of so many sensors is worth; shares of what all candidates together would be."""
+    """The best plan of ``count`` sensors; ``share`` is its part of the score of all candidates together."""
 
     count: int
     sites: tuple[str, ...]
@@ -277,20 +320,30 @@ class CurveRow:
 
 @dataclass(frozen=True)
 class PlacementSummary:
-    """What ``egvs place`` found.
+    """Results of ``egvs place``.
 
     Attributes
     ----------
     by
-        The joint score in words.
+        Label of the joint score.
     picks
-        In the order in which they would be put up.
+        Sensors in the order of the plan.
     curve
-        For 1, 2, ... sensors.
+        Best plans of 1, 2, ... sensors.
+    joint, together
+        Joint score of the plan, and of all candidates together.
+    cost
+        Total cost; 0 without costs.
+    candidates
+        Number of candidates.
     proof
-        What is proved, in a sentence.
+        What is proved about the plan, in a sentence.
+    objective
+        What the plan maximises, if not the joint score; empty otherwise.
+    zones
+        Zones with a minimum share.
     before
-        The joint score as the candidates hang, where sensors were to move from there; None else.
+        Joint score before the sensors were moved; None if they were not.
     map, chart
         Figures, SVG text.
     """
@@ -318,108 +371,121 @@ class PlacementSummary:
         tpog: Tpog,
         backdrop: Backdrop,
     ) -> PlacementSummary | None:
-        """The plan in a run's folder; None where there is none of what ``stages`` ran on."""
-        found = read_placement(*(out / name for name in PLACEMENT_FILES))
-        if found is None:
+        """Read the plan in a run folder; None if there is none of this run.
+
+        Parameters
+        ----------
+        out
+            The run folder.
+        stages
+            Records of the stages of the run.
+        candidates, tpog, backdrop
+            Contents of the map.
+        """
+        result = read_placement(*(out / name for name in PLACEMENT_FILES))
+        if result is None:
             return None
-        rows, points, about = found
-        if any(name not in stages or stages[name].inputs != key for name, key in about["stages"].items()):
+        rows, curve_rows, metadata = result
+        if not _is_current(metadata, stages):
             return None
-        picks = tuple(PlanRow(**{name: row[name] for name in PlanRow.__dataclass_fields__}) for row in rows)
-        its = about["plan"]
-        by, together = SCORE_LABELS[its["score"]], its["together"] or math.inf
-        curve = tuple(
-            CurveRow(
-                row["count"],
-                tuple(json.loads(row["sites"])),
-                row["score"] / together,
-                _certificate(row["value"], row["bound"]),
-                row["cost"],
-            )
-            for row in points
-        )
-        whole = 1.0 if its["asked"]["objective"] == "worst" else together  # of which values are shares already
-        steps = [CurveStep(row["count"], row["value"] / whole, row["bound"] / whole) for row in points]
-        occupied = tpog.counts.sum(axis=2) / tpog.frames
+        plan = metadata["plan"]
+        by, joint = SCORE_LABELS[plan["score"]], plan["joint"]
+        picks = tuple(PlanRow(**{field.name: row[field.name] for field in fields(PlanRow)}) for row in rows)
         names = ", ".join(pick.site for pick in picks)
+        occupied = tpog.counts.sum(axis=2) / tpog.frames
+        poles = _planned_poles(picks, joint, by)
         return cls(
             by=by,
             picks=picks,
-            curve=curve,
-            joint=its["joint"],
-            together=its["together"],
-            cost=its["cost"],
-            candidates=its["candidates"],
-            proof=_describe_proof(its, len(picks)),
-            objective=_describe_objective(its["asked"]),
-            zones=tuple(its["zones"]),
-            before=its["moves"]["before"] if "moves" in its else None,
-            map=maps.plan_map(
-                tpog.grid,
-                occupied,
-                backdrop,
-                candidates,
-                _planned_poles(picks, its["joint"], by),
-                f"Map of the plan: {names}.",
-            ),
-            chart=svg_figures.sensor_count_chart(
-                steps, "How much each number of sensors is worth, and what no plan of so many exceeds."
-            ),
+            curve=_curve(curve_rows, plan["together"] or math.inf),
+            joint=joint,
+            together=plan["together"],
+            cost=plan["cost"],
+            candidates=plan["candidates"],
+            proof=_describe_proof(plan, len(picks)),
+            objective=_describe_objective(plan["asked"]),
+            zones=tuple(plan["zones"]),
+            before=plan["moves"]["before"] if "moves" in plan else None,
+            map=maps.plan_map(tpog.grid, occupied, backdrop, candidates, poles, f"Map of the plan: {names}."),
+            chart=_curve_chart(curve_rows, plan),
         )
 
     @property
     def share(self) -> float:
-        """Of what all candidates together would be worth."""
+        """Joint score as a share of that of all candidates together."""
         return self.joint / self.together if self.together else 0.0
 
     def lost(self, pick: PlanRow) -> float:
-        """The share of the plan's score that goes when a sensor fails."""
+        """Return the share of the joint score that is lost if a sensor fails."""
         return pick.loss / self.joint if self.joint else 0.0
 
 
+def _curve(rows: Sequence[Mapping[str, Any]], together: float) -> tuple[CurveRow, ...]:
+    curve = []
+    for row in rows:
+        sites = tuple(json.loads(row["sites"]))
+        certificate = _certificate(row["value"], row["bound"])
+        curve.append(CurveRow(row["count"], sites, row["score"] / together, certificate, row["cost"]))
+    return tuple(curve)
+
+
+def _curve_chart(rows: Sequence[Mapping[str, Any]], plan: Mapping[str, Any]) -> str:
+    together = plan["together"] or math.inf
+    if plan["asked"]["objective"] == "worst":
+        together = 1.0  # the values of this objective are shares already
+    steps = [CurveStep(row["count"], row["value"] / together, row["bound"] / together) for row in rows]
+    alt = "Score of the best plan for each number of sensors, and its upper bound."
+    return svg_figures.sensor_count_chart(steps, alt)
+
+
 def _certificate(value: float, bound: float) -> float:
-    """The share of the best possible that is proved; 1 up to the rounding of bounds."""
+    """Share of the best possible value that is proved to be reached; 1 up to the rounding of bounds."""
     return 1.0 if bound <= value * (1.0 + 2e-9) else value / bound
 
 
-def _describe_proof(metadata: Mapping[str, Any], sensors: int) -> str:
-    proved = f"at least {math.floor(1e4 * metadata['certificate']) / 1e2:.2f} % of the best possible is proved"
-    if metadata["fewest_is_proved"] is not None:
-        if sensors == 1:
-            return "one is enough"
-        fewer = f"{sensors - 1} sensor{'' if sensors == 2 else 's'}"
-        return f"that {fewer} cannot reach it is {'proved' if metadata['fewest_is_proved'] else 'not proved'}"
-    return "that no plan within the rules is better is proved" if metadata["is_best"] else proved
+def _describe_proof(plan: Mapping[str, Any], sensors: int) -> str:
+    if plan["fewest_is_proved"] is None:
+        if plan["is_best"]:
+            return "it is proved that no plan within the rules is better"
+        percent = math.floor(1e4 * plan["certificate"]) / 1e2
+        return f"the plan is proved to reach at least {percent:.2f} % of the best possible score"
+    if sensors == 1:
+        return "one sensor is enough"
+    fewer = "1 sensor is" if sensors == 2 else f"{sensors - 1} sensors are"
+    if plan["fewest_is_proved"]:
+        return f"it is proved that {fewer} not enough"
+    return f"it is not proved that {fewer} not enough"
 
 
 def _describe_objective(request: Mapping[str, Any]) -> str:
-    """What was asked for, where it is not the joint score itself; empty else."""
-    parts = ["the period that is seen worst"] if request["objective"] == "worst" else []
-    parts += ["what is left when the sensor that is missed most has failed"] if request["survives"] else []
+    """What the plan maximises, if not the joint score; empty otherwise."""
+    parts = []
+    if request["objective"] == "worst":
+        parts.append("the score in the period with the lowest share")
+    if request["survives"]:
+        parts.append("the score that remains if the most important sensor fails")
     return " and ".join(parts)
 
 
 def _planned_poles(picks: Sequence[PlanRow], joint: float, by: ScoreLabel) -> list[PlannedPole]:
-    """One mark a place; sensors at one place share it."""
-    places: dict[tuple[float, float], list[PlanRow]] = {}
+    """One mark per location; sensors at the same location share it."""
+    picks_of: dict[tuple[float, float], list[PlanRow]] = {}
     for pick in picks:
-        places.setdefault((pick.x_m, pick.y_m), []).append(pick)
-    return [
-        PlannedPole(
-            x_m,
-            y_m,
-            ", ".join(str(pick.order) for pick in those),
-            f"{those[0].site}{f' +{len(those) - 1}' if len(those) > 1 else ''}: {_gain_share(those, joint):.0%}",
-            "; ".join(
-                f"{p.order}. {p.site}, {p.z_m:g} m high, adds {by.value(p.gain)} {by.unit}".strip() for p in those
-            ),
-        )
-        for (x_m, y_m), those in places.items()
-    ]
+        picks_of.setdefault((pick.x_m, pick.y_m), []).append(pick)
+    poles = []
+    for (x_m, y_m), members in picks_of.items():
+        name = members[0].site if len(members) == 1 else f"{members[0].site} +{len(members) - 1}"
+        gain = sum(pick.gain for pick in members) / joint if joint else 0.0
+        sensors = [
+            f"{pick.order}. {pick.site}, {pick.z_m:g} m high, adds {by.value(pick.gain)} {by.unit}".strip()
+            for pick in members
+        ]
+        numbers = ", ".join(str(pick.order) for pick in members)
+        poles.append(PlannedPole(x_m, y_m, numbers, f"{name}: {gain:.0%}", "; ".join(sensors)))
+    return poles
 
 
-def _gain_share(picks: Sequence[PlanRow], joint: float) -> float:
-    return sum(pick.gain for pick in picks) / joint if joint else 0.0
+# ---- egvs accuracy
 
 
 @dataclass(frozen=True)
@@ -439,10 +505,15 @@ class StudiedSetting:
     front: bool
     recommended: bool
 
+    @property
+    def is_listed(self) -> bool:
+        """Whether the page shows it."""
+        return self.kind in ("scenario", "reference") or self.front or self.recommended or self.default
+
 
 @dataclass(frozen=True)
 class StudySummary:
-    """What ``egvs accuracy`` found: the settings that the page shows, and the figure in base 64."""
+    """Results of ``egvs accuracy``: the settings that the page shows, and the figure (PNG in base 64)."""
 
     settings: tuple[StudiedSetting, ...]
     tolerance: float
@@ -450,21 +521,18 @@ class StudySummary:
 
     @classmethod
     def read(cls, out: Path, stages: Mapping[str, StageRecord]) -> StudySummary | None:
-        """A study of what ``stages`` ran on: the scenario's own setting, the reference, the front, the default; None
-        where there is no such study.
-        """
+        """Read the study in a run folder; None if there is none of this run."""
         table, figure = (out / name for name in ACCURACY_FILES)
         study = read_accuracy(table) if figure.is_file() else None
         if study is None:
             return None
-        rows, about = study
-        if any(name not in stages or stages[name].inputs != key for name, key in about["stages"].items()):
+        rows, metadata = study
+        if not _is_current(metadata, stages):
             return None
-        names = [column.name for column in fields(StudiedSetting)]
-        settings = (StudiedSetting(**{name: row[name] for name in names}) for row in rows)
-        kinds = ("scenario", "reference")
-        shown = tuple(s for s in settings if s.kind in kinds or s.front or s.recommended or s.default)
-        return cls(shown, about["tolerance"], base64.b64encode(figure.read_bytes()).decode("ascii"))
+        names = [field.name for field in fields(StudiedSetting)]
+        settings = [StudiedSetting(**{name: row[name] for name in names}) for row in rows]
+        listed = tuple(setting for setting in settings if setting.is_listed)
+        return cls(listed, metadata["tolerance"], _read_base64(figure))
 
     @property
     def best(self) -> StudiedSetting | None:

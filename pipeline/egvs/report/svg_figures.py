@@ -1,15 +1,7 @@
-"""Axes, legends, charts: ranking, plan curve.
+"""Parts of SVG figures (axes, colour bars, north arrow), and the bar charts of rankings and plans.
 
-The frame of a figure seen from above: world metres (x east, y north; north is up) to a figure's units, axes, the
-region of interest, colour bar.
-
-A figure is SVG text. It is written here, not by a plotting library: colours then follow the page (light, dark, print)
-through the classes in :data:`egvs.report.colours.STYLE_SHEET`, lettering stays text, and the bytes depend
-on no installed font.
-
-Figures of a plan of several sensors: the map of its poles, and how much each number of sensors is worth.
-
-A figure of a ranking: a bar a site, with how far its score may be off.
+Figures are written as SVG text, not by a plotting library: their colours can then follow the light or dark theme of a
+page, lettering stays text, and the bytes do not depend on installed fonts.
 """
 
 from __future__ import annotations
@@ -18,15 +10,15 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.grid import Grid
 from egvs.report import colours
-from egvs.report.colours import STEPS, STYLE_SHEET, opacity
-from egvs.report.formatting import SCORE_LABELS, ScoreLabel
+from egvs.report.colours import LIGHT, STEPS, STYLE_SHEET, Theme, opacity, shape_attributes
+from egvs.report.formatting import SCORE_LABELS, ScoreLabel, shorten_name
 
 Box = tuple[float, float, float, float]
 """x0, y0, x1, y1: in the world frame, metres, or in a figure's units."""
@@ -34,6 +26,64 @@ Box = tuple[float, float, float, float]
 Rectangle = tuple[float, float, float, float]
 """x, y, width, height, in a figure's units."""
 Metres = TypeVar("Metres", float, NDArray[np.float64])
+
+FONTS = "DejaVu Sans, Arial, Helvetica, sans-serif"
+"""Fonts of printed figures."""
+
+FONT_SIZE_PT = 7.0
+"""Font size of printed figures, which is 12 units of a figure."""
+
+_NAMESPACE = "http://www.w3.org/2000/svg"
+
+
+@dataclass(frozen=True)
+class FigureStyle:
+    """Width of a figure, and where its shapes get their colours from.
+
+    On a page, shapes have classes of :data:`egvs.report.colours.STYLE_SHEET`. For print, their final colours are
+    written on each shape, because many programs that read SVG (cairo, slides) do not know style sheets with variables.
+
+    Attributes
+    ----------
+    width
+        In the figure's units.
+    theme
+        Colours of a printed figure; None for a page.
+    width_mm
+        Width on paper.
+    """
+
+    width: float = 760.0
+    theme: Theme | None = None
+    width_mm: float = 0.0
+
+    @classmethod
+    def for_print(cls, width_mm: float) -> FigureStyle:
+        """Return the style of a figure on white paper, with lettering of :data:`FONT_SIZE_PT`."""
+        return cls(width_mm / 25.4 * 72.0 * 12.0 / FONT_SIZE_PT, LIGHT, width_mm)
+
+    @property
+    def image_themes(self) -> tuple[str, ...]:
+        """Themes in which images are drawn: on a page both, of which one is visible."""
+        return colours.THEMES if self.theme is None else colours.THEMES[:1]
+
+    def shape(self, *names: str) -> str:
+        """Return the attributes of a shape of some classes; of conflicting ones, the last counts."""
+        attributes = {"class": " ".join(names)}
+        if self.theme is not None:
+            for name in names:
+                attributes |= shape_attributes(name, self.theme)
+        return " ".join(f'{key}="{value}"' for key, value in attributes.items())
+
+    def text_with_halo(self, name: str, position: str, text: str) -> str:
+        """Return a text with an outline in the colour of the paper; ``position`` has its attributes."""
+        letters = f"<text {self.shape(name)} {position}>{escape(text)}</text>"
+        if self.theme is None:
+            return letters
+        return f"<text {self.shape(name, f'{name}-halo')} {position}>{escape(text)}</text>{letters}"
+
+
+PAGE_STYLE = FigureStyle()
 
 
 @dataclass(frozen=True)
@@ -49,125 +99,156 @@ class MapSite:
 
     @property
     def score(self) -> float:
-        """Its value of the score that ranks."""
+        """Value of the score that ranks."""
         return self.egvs
 
     @property
     def by(self) -> ScoreLabel:
-        """The score that ranks."""
+        """Label of the score that ranks."""
         return SCORE_LABELS["egvs"]
 
 
 def extent(grid: Grid, sites: Sequence[MapSite]) -> Box:
-    """The region of interest and all sites, with a margin, in metres."""
-    (x0, y0, _), (w, h, _) = grid.origin_m, grid.roi.size_m
-    xs, ys = [x0, x0 + w, *(s.x_m for s in sites)], [y0, y0 + h, *(s.y_m for s in sites)]
+    """Return a box around the region of interest and all sites, with a margin, in metres."""
+    (x0, y0, _), (width, height, _) = grid.origin_m, grid.roi.size_m
+    xs = [x0, x0 + width, *(site.x_m for site in sites)]
+    ys = [y0, y0 + height, *(site.y_m for site in sites)]
     margin = 0.04 * max(max(xs) - min(xs), max(ys) - min(ys))
     return min(xs) - margin, min(ys) - margin, max(xs) + margin, max(ys) + margin
 
 
 def shared_scale(peak: float, label: str) -> str:
-    """The colour scale that several figures share, alone."""
+    """Return the colour scale of several figures as a figure of its own."""
     bar = ColourBar(0.0, peak, label)
     start = svg_start(460.0, 52.0, f"Colour scale: {label}, 0 to {peak:.3g}")
-    return start + bar.svg("scale", 16.0, 4.0, 428.0) + "</svg>"
+    return f"{start}{bar.svg('scale', 16.0, 4.0, 428.0)}</svg>"
 
 
-def standalone(figure: str) -> str:
-    """A figure as the content of a file of its own."""
+def standalone_svg(figure: str) -> str:
+    """Return a figure of a page as the content of a file, with its style sheet."""
     head, _, rest = figure.partition(">")
-    return f'{head} xmlns="http://www.w3.org/2000/svg"><style>{STYLE_SHEET}</style>{rest}\n'
+    return f'{head} xmlns="{_NAMESPACE}"><style>{STYLE_SHEET}</style>{rest}\n'
+
+
+class Tick(NamedTuple):
+    """A value on an axis, and its text."""
+
+    value: float
+    text: str
 
 
 class MapFrame:
-    """From world metres to a figure's units, and what every figure has: axes, frame, colour bar.
+    """The frame of a map: from world metres (x east, y north) to a figure's units, axes, colour bar.
 
     Parameters
     ----------
     box
-        What is shown, world frame, metres.
+        The area shown, world frame, metres.
     prefix
         Makes ids unique on a page.
     width, tallest
-        The figure's width, and the most that its height may be, without lettering; in its own units.
+        Width of the figure, and the maximum height of the map without lettering; in the figure's units.
     north
-        Whether an arrow points north.
+        Whether to draw a north arrow.
+    style
+        Where colours come from.
     """
 
     def __init__(
-        self, box: Box, prefix: str, width: float = 760.0, tallest: float = 560.0, north: bool = False
+        self,
+        box: Box,
+        prefix: str,
+        width: float = 760.0,
+        tallest: float = 560.0,
+        north: bool = False,
+        style: FigureStyle = PAGE_STYLE,
     ) -> None:
-        self.box, self.prefix, self.width, self.north = box, prefix, width, north
-        self._ticks = [round_values(box[0], box[2], 9 if width > 600 else 6), round_values(box[1], box[3], 6)]
-        self.left = 34.0 + 7.0 * max(len(t) for _, t in self._ticks[1])
-        self.top, right = 12.0, 40.0 if north else 16.0
-        self.scale = min((width - self.left - right) / (box[2] - box[0]), tallest / (box[3] - box[1]))
-        self.frame_width, self.frame_height = (box[2] - box[0]) * self.scale, (box[3] - box[1]) * self.scale
-        self.left += (width - self.left - right - self.frame_width) / 2
+        self.box, self.prefix, self.width, self.north, self.style = box, prefix, width, north, style
+        self._x_ticks = round_values(box[0], box[2], 9 if width > 600 else 6)
+        self._y_ticks = round_values(box[1], box[3], 6)
+        self._y_tick_width = 7.0 * max(len(tick.text) for tick in self._y_ticks)
+        self.left = 34.0 + self._y_tick_width
+        self.top = 12.0
+        right_margin = 40.0 if north else 16.0
+        self.scale = min((width - self.left - right_margin) / (box[2] - box[0]), tallest / (box[3] - box[1]))
+        self.frame_width = (box[2] - box[0]) * self.scale
+        self.frame_height = (box[3] - box[1]) * self.scale
+        self.left += (width - self.left - right_margin - self.frame_width) / 2
 
     def x(self, x_m: Metres) -> Metres:
-        """Rightwards with east."""
+        """Return x in the figure's units, to the right."""
         return self.left + (x_m - self.box[0]) * self.scale
 
     def y(self, y_m: Metres) -> Metres:
-        """Downwards with south."""
+        """Return y in the figure's units, downwards."""
         return self.top + (self.box[3] - y_m) * self.scale
 
     @property
     def full_extent(self) -> Rectangle:
-        """All that is shown."""
+        """Rectangle of the map."""
         return self.left, self.top, self.frame_width, self.frame_height
 
     def region(self, grid: Grid) -> Rectangle:
-        """The region of interest."""
-        (x, y, _), (w, h, _) = grid.origin_m, grid.roi.size_m
-        return self.x(x), self.y(y + h), w * self.scale, h * self.scale
+        """Return the rectangle of the region of interest."""
+        (x, y, _), (width, height, _) = grid.origin_m, grid.roi.size_m
+        return self.x(x), self.y(y + height), width * self.scale, height * self.scale
 
     def roi(self, grid: Grid) -> str:
-        """The region of interest."""
-        x, y, w, h = self.region(grid)
-        return f'<rect class="roi" x="{x:.1f}" y="{y:.1f}" width="{w:.1f}" height="{h:.1f}"/>'
+        """Return the outline of the region of interest."""
+        x, y, width, height = self.region(grid)
+        return f'<rect {self.style.shape("roi")} x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}"/>'
 
-    def image(self, rectangle: Rectangle, png: str, look: str) -> str:
-        """A raster over a rectangle."""
-        x, y, w, h = rectangle
-        place = f'x="{x:.2f}" y="{y:.2f}" width="{w:.2f}" height="{h:.2f}"'
-        return f'<image class="{look}" {place} preserveAspectRatio="none" href="{png}"/>'
+    def image(self, rectangle: Rectangle, png: str, css_class: str) -> str:
+        """Return a raster image (a data URI) that fills a rectangle."""
+        x, y, width, height = rectangle
+        position = f'x="{x:.2f}" y="{y:.2f}" width="{width:.2f}" height="{height:.2f}"'
+        rendering = 'preserveAspectRatio="none" image-rendering="pixelated"'
+        return f'<image class="{css_class}" {position} {rendering} href="{png}"/>'
 
     def svg(self, parts: Iterable[str], alt: str, bar: ColourBar | None = None) -> str:
-        """The whole figure."""
+        """Return the complete figure.
+
+        Parameters
+        ----------
+        parts
+            Shapes of the map, those at the bottom first.
+        alt
+            Text for people who do not see the figure.
+        bar
+            A colour bar below the map.
+        """
         base = self.top + self.frame_height
-        tall = base + 40.0 + (56.0 if bar else 0.0)
-        place = f'x="{self.left:.1f}" y="{self.top:.1f}"'
-        frame = f'<rect {place} width="{self.frame_width:.1f}" height="{self.frame_height:.1f}"/>'
+        height = base + 40.0 + (56.0 if bar else 0.0)
+        position = f'x="{self.left:.1f}" y="{self.top:.1f}"'
+        frame = f'<rect {position} width="{self.frame_width:.1f}" height="{self.frame_height:.1f}"/>'
         clip = f'<clipPath id="{self.prefix}-clip">{frame}</clipPath>'
         drawing = "\n".join(parts)
-        return "\n".join(
-            (
-                svg_start(self.width, tall, alt),
-                f'<defs>{clip}</defs>{self._axes(base)}\n<g clip-path="url(#{self.prefix}-clip)">{drawing}</g>',
-                self._north_arrow() if self.north else "",
-                bar.svg(self.prefix, self.left, base + 46.0, self.frame_width) if bar else "",
-                "</svg>",
-            )
-        )
+        lines = [
+            svg_start(self.width, height, alt, self.style),
+            f'<defs>{clip}</defs>{self._axes(base)}\n<g clip-path="url(#{self.prefix}-clip)">{drawing}</g>',
+            self._north_arrow() if self.north else "",
+            bar.svg(self.prefix, self.left, base + 46.0, self.frame_width, self.style) if bar else "",
+            "</svg>",
+        ]
+        return "\n".join(lines)
 
     def _axes(self, base: float) -> str:
-        wide, tall = self.frame_width, self.frame_height
+        width, height = self.frame_width, self.frame_height
         lines, texts = [], []
-        ticks = [f"M{self.left:.1f} {self.top:.1f}h{wide:.1f}v{tall:.1f}h{-wide:.1f}z"]
-        for value, text in self._ticks[0]:
+        ticks = [f"M{self.left:.1f} {self.top:.1f}h{width:.1f}v{height:.1f}h{-width:.1f}z"]
+        for value, text in self._x_ticks:
             x = self.x(value)
             lines.append(f"M{x:.1f} {self.top:.1f}V{base:.1f}")
             ticks.append(f"M{x:.1f} {base:.1f}v5")
-            texts.append(f'<text x="{x:.1f}" y="{base + 18:.1f}" text-anchor="middle">{text}</text>')
-        for value, text in self._ticks[1]:
+            texts.append(_text(x, base + 18, text))
+        for value, text in self._y_ticks:
             y = self.y(value)
-            lines.append(f"M{self.left:.1f} {y:.1f}H{self.left + wide:.1f}")
+            lines.append(f"M{self.left:.1f} {y:.1f}H{self.left + width:.1f}")
             ticks.append(f"M{self.left:.1f} {y:.1f}h-5")
-            texts.append(f'<text x="{self.left - 8:.1f}" y="{y + 4:.1f}" text-anchor="end">{text}</text>')
-        side = self.left - 16.0 - 7.0 * max(len(t) for _, t in self._ticks[1])
-        centre, middle = self.left + wide / 2, self.top + tall / 2
+            texts.append(_text(self.left - 8, y + 4, text, "end"))
+
+        side = self.left - 16.0 - self._y_tick_width
+        centre, middle = self.left + width / 2, self.top + height / 2
         texts.append(
             f'<text x="{centre:.1f}" y="{base + 34:.1f}" class="title" text-anchor="middle">x, east (m)</text>'
         )
@@ -175,77 +256,94 @@ class MapFrame:
             f'<text class="title" transform="translate({side:.1f} {middle:.1f}) rotate(-90)" text-anchor="middle">'
             "y, north (m)</text>"
         )
-        return f'<path class="grid" d="{"".join(lines)}"/><path class="axis" d="{"".join(ticks)}"/>{"".join(texts)}'
+        grid = f'<path {self.style.shape("grid")} d="{"".join(lines)}"/>'
+        return f'{grid}<path {self.style.shape("axis")} d="{"".join(ticks)}"/>{"".join(texts)}'
 
     def _north_arrow(self) -> str:
         x, y = self.left + self.frame_width + 20.0, self.top
-        arrow = f'<path d="M{x:.1f} {y + 14:.1f}l7 24l-7 -6l-7 6z" fill="currentColor"/>'
+        arrow = f'<path {self.style.shape("north")} d="M{x:.1f} {y + 14:.1f}l7 24l-7 -6l-7 6z"/>'
         return f'<g>{arrow}<text x="{x:.1f}" y="{y + 10:.1f}" text-anchor="middle" font-weight="700">N</text></g>'
+
+
+def _text(x: float, y: float, text: str, anchor: str = "middle") -> str:
+    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
 
 
 @dataclass(frozen=True)
 class ColourBar:
-    """A colour bar: from ``low`` to ``high`` (above it), with a square-root scale unless ``even``."""
+    """A colour bar from ``low`` to ``high`` (which is larger), with a square-root scale unless ``even``."""
 
     low: float
     high: float
     label: str
     even: bool = False
 
-    def svg(self, prefix: str, x: float, y: float, width: float) -> str:
-        covers = [1.0 if self.even else opacity(i / STEPS) for i in range(STEPS + 1)]
-        stops = "".join(
-            f'<stop class="q{i}" offset="{i / STEPS:.4f}" stop-opacity="{part:.2f}"/>' for i, part in enumerate(covers)
-        )
-        fill = f'<linearGradient id="{prefix}-scale">{stops}</linearGradient>'
-        place = f'x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="12"'
-        bar = f'<rect class="axis" style="fill:url(#{prefix}-scale)" {place}/>'
-        ticks = "".join(
-            f'<path class="axis" d="M{at:.1f} {y + 12:.1f}v4"/>'
-            f'<text x="{at:.1f}" y="{y + 28:.1f}" text-anchor="middle">{text}</text>'
-            for at, text in self._ticks(x, width)
-        )
+    def svg(self, prefix: str, x: float, y: float, width: float, style: FigureStyle = PAGE_STYLE) -> str:
+        """Return the bar with its left upper corner at ``x``, ``y``; ``prefix`` makes its id unique."""
+        stops = []
+        for i in range(STEPS + 1):
+            share = i / STEPS
+            alpha = 1.0 if self.even else opacity(share)
+            stops.append(f'<stop {style.shape(f"q{i}")} offset="{share:.4f}" stop-opacity="{alpha:.2f}"/>')
+        gradient = f'<linearGradient id="{prefix}-scale">{"".join(stops)}</linearGradient>'
+        axis = style.shape("axis")
+        position = f'x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="12"'
+        bar = f'<rect {axis} style="fill:url(#{prefix}-scale)" {position}/>'
+        ticks = [
+            f'<path {axis} d="M{tick_x:.1f} {y + 12:.1f}v4"/>{_text(tick_x, y + 28, text)}'
+            for tick_x, text in self._ticks(x, width)
+        ]
         note = "" if self.even else " · square-root scale"
-        place = f'x="{x + width / 2:.1f}" y="{y + 44:.1f}"'
-        title = f'<text class="title" {place} text-anchor="middle">{escape(self.label)}{note}</text>'
-        return f"<g>{fill}{bar}{ticks}{title}</g>"
+        position = f'x="{x + width / 2:.1f}" y="{y + 44:.1f}"'
+        title = f'<text class="title" {position} text-anchor="middle">{escape(self.label)}{note}</text>'
+        return f"<g>{gradient}{bar}{''.join(ticks)}{title}</g>"
 
-    def _ticks(self, x: float, width: float) -> list[tuple[float, str]]:
-        """Round values, no closer than their lettering allows; on a square-root scale, finer towards zero."""
+    def _ticks(self, x: float, width: float) -> list[Tick]:
+        """Positions and texts of round values; a square-root scale has more of them near its low end."""
         span = self.high - self.low
-        values = round_values(self.low, self.high, 6)
+        ticks = round_values(self.low, self.high, 6)
         if not self.even:
-            values = [*round_values(0.0, span / 25, 2), *round_values(0.0, span / 4, 4), *values]
-        placed: list[tuple[float, str]] = []
-        for value in sorted({value for value, _ in values}, reverse=True):
+            ticks = [*round_values(0.0, span / 25, 2), *round_values(0.0, span / 4, 4), *ticks]
+        placed: list[Tick] = []
+        for value in sorted({tick.value for tick in ticks}, reverse=True):
             text = f"{value:,.6g}"
             share = (value - self.low) / span
-            at = x + width * (share if self.even else math.sqrt(share))
-            if all(abs(at - other) > 5.0 * (len(text) + len(shown)) for other, shown in placed):
-                placed.append((at, text))
+            tick_x = x + width * (share if self.even else math.sqrt(share))
+            if all(abs(tick_x - other.value) > 5.0 * (len(text) + len(other.text)) for other in placed):
+                placed.append(Tick(tick_x, text))
         return placed
 
 
-def svg_start(width: float, height: float, alt: str) -> str:
-    """The first tag of a figure."""
-    return f'<svg class="plan" viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{escape(alt)}">'
+def svg_start(width: float, height: float, alt: str, style: FigureStyle = PAGE_STYLE) -> str:
+    """Return the first tag of a figure."""
+    attributes = f'class="plan" viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{escape(alt)}"'
+    if style.theme is not None:
+        height_mm = style.width_mm * float(f"{height:.0f}") / float(f"{width:.0f}")
+        attributes += (
+            f' xmlns="{_NAMESPACE}" width="{style.width_mm:g}mm" height="{height_mm:.3f}mm"'
+            f' fill="{style.theme.ink}" font-size="12" font-family="{FONTS}"'
+        )
+    return f"<svg {attributes}>"
 
 
-def round_values(low: float, high: float, most: int) -> list[tuple[float, str]]:
-    """Round values between two others, at most about ``most``, and how they are written."""
+def round_values(low: float, high: float, count: int) -> list[Tick]:
+    """Return about ``count`` round values from ``low`` to ``high``, or fewer."""
     span = high - low
     if not span > 0:
         return []
-    exponent = math.floor(math.log10(span / most))
-    tens = [(m, e) for e in (exponent - 1, exponent, exponent + 1) for m in (1, 2, 5)]
-    size, power = next((float(f"{m}e{e}"), e) for m, e in tens if float(f"{m}e{e}") >= 0.999 * span / most)
-    first, last = math.ceil(low / size - 1e-9), math.floor(high / size + 1e-9)
-    return [(i * size, f"{i * size:,.{max(0, -power)}f}") for i in range(first, last + 1)]
+    exponent = math.floor(math.log10(span / count))
+    for power in (exponent - 1, exponent, exponent + 1):
+        for digit in (1, 2, 5):
+            step = float(f"{digit}e{power}")
+            if step >= 0.999 * span / count:
+                first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+                return [Tick(i * step, f"{i * step:,.{max(0, -power)}f}") for i in range(first, last + 1)]
+    raise AssertionError(f"no round step for {low} to {high}")
 
 
 @dataclass(frozen=True)
 class CurveStep:
-    """What so many sensors are worth: of the plan, and what no plan exceeds; shares of what all candidates would."""
+    """Score of the best plan found with ``count`` sensors, and its upper bound; shares of that of all candidates."""
 
     count: int
     share: float
@@ -258,92 +356,94 @@ _MAX_LABELS = 12
 
 
 def sensor_count_chart(steps: Sequence[CurveStep], alt: str) -> str:
-    """How many are enough: a bar for each number of sensors, and a mark above it for what no plan exceeds."""
-    wide, tall = _CURVE_WIDTH - _CURVE_LEFT - 12.0, _CURVE_HEIGHT - _CURVE_TOP - _CURVE_BOTTOM
-    most = max(1.0, *(step.bound for step in steps))
-    base, each = _CURVE_TOP + tall, wide / len(steps)
+    """Return a chart with one bar per number of sensors, and a mark above it for the upper bound."""
+    width, height = _CURVE_WIDTH - _CURVE_LEFT - 12.0, _CURVE_HEIGHT - _CURVE_TOP - _CURVE_BOTTOM
+    top = max(1.0, *(step.bound for step in steps))
+    base, spacing = _CURVE_TOP + height, width / len(steps)
     parts = [svg_start(_CURVE_WIDTH, _CURVE_HEIGHT, alt)]
-    for value, _ in round_values(0.0, 100.0 * most, 5):
-        y = base - tall * value / 100.0 / most
-        parts.append(f'<path class="grid" d="M{_CURVE_LEFT:.1f} {y:.1f}h{wide:.1f}"/>')
-        parts.append(f'<text x="{_CURVE_LEFT - 8:.1f}" y="{y + 4:.1f}" text-anchor="end">{value:g} %</text>')
+    for value, _ in round_values(0.0, 100.0 * top, 5):
+        y = base - height * value / 100.0 / top
+        parts.append(f'<path class="grid" d="M{_CURVE_LEFT:.1f} {y:.1f}h{width:.1f}"/>')
+        parts.append(_text(_CURVE_LEFT - 8, y + 4, f"{value:g} %", "end"))
+    label_step = 1 if len(steps) <= _MAX_LABELS else 1 + len(steps) // _MAX_LABELS
     for i, step in enumerate(steps):
-        x, bar = _CURVE_LEFT + i * each, tall * step.share / most
-        bound = base - tall * step.bound / most
-        title = f"{step.count} sensors: {step.share:.1%} of what all would; no plan exceeds {step.bound:.1%}"
+        x, bar = _CURVE_LEFT + i * spacing, height * step.share / top
+        bound = base - height * step.bound / top
+        title = f"{step.count} sensors: {step.share:.1%} of the score of all candidates; at most {step.bound:.1%}"
         parts.append(
             f'<g class="step"><title>{escape(title)}</title>'
-            f'<rect x="{x + 0.14 * each:.1f}" y="{base - bar:.1f}" width="{0.72 * each:.1f}" height="{bar:.1f}"/>'
-            f'<path d="M{x + 0.06 * each:.1f} {bound:.1f}h{0.88 * each:.1f}"/></g>'
+            f'<rect x="{x + 0.14 * spacing:.1f}" y="{base - bar:.1f}" width="{0.72 * spacing:.1f}" height="{bar:.1f}"/>'
+            f'<path d="M{x + 0.06 * spacing:.1f} {bound:.1f}h{0.88 * spacing:.1f}"/></g>'
         )
-        if len(steps) <= _MAX_LABELS or i % (1 + len(steps) // _MAX_LABELS) == 0:
-            parts.append(f'<text x="{x + each / 2:.1f}" y="{base + 17:.1f}" text-anchor="middle">{step.count}</text>')
-    parts.append(f'<path class="axis" d="M{_CURVE_LEFT:.1f} {_CURVE_TOP:.1f}v{tall:.1f}h{wide:.1f}"/>')
-    parts.append(
-        f'<text x="{_CURVE_LEFT + wide / 2:.1f}" y="{base + 36:.1f}" text-anchor="middle">sensors</text></svg>'
-    )
-    return "".join(parts)
+        if i % label_step == 0:
+            parts.append(_text(x + spacing / 2, base + 17, str(step.count)))
+    parts.append(f'<path class="axis" d="M{_CURVE_LEFT:.1f} {_CURVE_TOP:.1f}v{height:.1f}h{width:.1f}"/>')
+    parts.append(_text(_CURVE_LEFT + width / 2, base + 36, "sensors"))
+    return "".join([*parts, "</svg>"])
 
 
 _BARS_TOP, _BAR_SPACING, _BARS_BOTTOM, _BARS_MARGIN = 8.0, 18.0, 44.0, 16.0
-_MAX_LETTERS = 18
-"""Letters of a name; longer ones are cut."""
 
 
 @dataclass(frozen=True)
 class Bar:
-    """A site's name, its score, its standard error (None where it is not known), and its score in words."""
+    """A bar of a chart: name of the site, its score, standard error (None if unknown), and a description."""
 
     name: str
     value: float
     se: float | None
-    words: str
+    description: str
 
 
-def bar_chart(bars: Sequence[Bar], label: str, alt: str, width: float, factor: float = 1.0) -> str:
-    """Bars below each other, the first on top, SVG text.
+def bar_chart(bars: Sequence[Bar], label: str, alt: str, factor: float = 1.0, style: FigureStyle = PAGE_STYLE) -> str:
+    """Return horizontal bars, the first at the top.
 
     Parameters
     ----------
+    bars
+        At least one.
     label
-        Of the axis.
-    width
-        Of the figure, in its own units.
+        Title of the axis.
+    alt
+        Text for people who do not see the figure.
     factor
-        Numbers of the axis are values times this: 100 for per cent.
+        Numbers on the axis are values times this: 100 for per cent.
+    style
+        Width and colours.
     """
-    names = [bar.name if len(bar.name) <= _MAX_LETTERS else f"{bar.name[: _MAX_LETTERS - 1]}…" for bar in bars]
+    names = [shorten_name(bar.name) for bar in bars]
     left = 16.0 + 7.0 * max(len(name) for name in names)
-    wide, tall = width - left - _BARS_MARGIN, _BAR_SPACING * len(bars)
+    width, height = style.width - left - _BARS_MARGIN, _BAR_SPACING * len(bars)
     most = max(bar.value + (bar.se or 0.0) for bar in bars) or 1.0
-    low, high, base = min(bar.value for bar in bars), max(bar.value for bar in bars), _BARS_TOP + tall
-    parts = [svg_start(width, base + _BARS_BOTTOM, alt)]
-    for value, text in round_values(0.0, most * factor, max(2, int(wide // 70))):
-        x = left + wide * value / factor / most
-        parts.append(f'<path class="grid" d="M{x:.1f} {_BARS_TOP:.1f}V{base:.1f}"/>')
-        parts.append(f'<text x="{x:.1f}" y="{base + 17:.1f}" text-anchor="middle">{text}</text>')
+    low, high = min(bar.value for bar in bars), max(bar.value for bar in bars)
+    base = _BARS_TOP + height
+    parts = [svg_start(style.width, base + _BARS_BOTTOM, alt, style)]
+    for value, text in round_values(0.0, most * factor, max(2, int(width // 70))):
+        x = left + width * value / factor / most
+        parts.append(f'<path {style.shape("grid")} d="M{x:.1f} {_BARS_TOP:.1f}V{base:.1f}"/>')
+        parts.append(_text(x, base + 17, text))
     for row, (bar, name) in enumerate(zip(bars, names, strict=True)):
-        y, long = _BARS_TOP + _BAR_SPACING * row, wide * bar.value / most
-        shape = f'x="{left:.1f}" y="{y + 3:.1f}" width="{long:.1f}" height="{_BAR_SPACING - 6:.1f}"'
-        parts.append(f'<g class="bar"><title>{escape(f"{bar.name}: {bar.words}")}</title>')
+        y, length = _BARS_TOP + _BAR_SPACING * row, width * bar.value / most
+        colour = style.shape(f"q{colours.colour_class(bar.value, low, high)}")
+        position = f'x="{left:.1f}" y="{y + 3:.1f}" width="{length:.1f}" height="{_BAR_SPACING - 6:.1f}"'
         parts.append(
-            f'<rect class="q{colours.colour_class(bar.value, low, high)}" '
-            f"{shape}/>{_error_bar(bar, left, y, wide / most)}</g>"
+            f'<g class="bar"><title>{escape(f"{bar.name}: {bar.description}")}</title><rect {colour} {position}/>'
         )
-        parts.append(f'<text x="{left - 7:.1f}" y="{y + 13:.1f}" text-anchor="end">{escape(name)}</text>')
-    parts.append(f'<path class="axis" d="M{left:.1f} {_BARS_TOP:.1f}V{base:.1f}H{left + wide:.1f}"/>')
-    parts.append(
-        f'<text x="{left + wide / 2:.1f}" y="{base + 36:.1f}" text-anchor="middle">{escape(label)}</text></svg>'
-    )
-    return "".join(parts)
+        parts.append(f"{_error_bar(bar, left, y, width / most, style)}</g>")
+        parts.append(_text(left - 7, y + 13, name, "end"))
+    parts.append(f'<path {style.shape("axis")} d="M{left:.1f} {_BARS_TOP:.1f}V{base:.1f}H{left + width:.1f}"/>')
+    parts.append(_text(left + width / 2, base + 36, label))
+    return "".join([*parts, "</svg>"])
 
 
-def _error_bar(bar: Bar, left: float, y: float, scale: float) -> str:
+def _error_bar(bar: Bar, left: float, y: float, scale: float, style: FigureStyle) -> str:
     """One standard error to either side."""
     if not bar.se:
         return ""
-    start, end = (left + max(0.0, bar.value + side * bar.se) * scale for side in (-1.0, 1.0))
+    start = left + max(0.0, bar.value - bar.se) * scale
+    end = left + max(0.0, bar.value + bar.se) * scale
     middle = y + _BAR_SPACING / 2
-    ends = "".join(f"M{x:.1f} {middle - 3:.1f}v6" for x in (start, end))
-    line = f'd="M{start:.1f} {middle:.1f}H{end:.1f}{ends}"/>'
-    return f'<path style="stroke:#ffffff;stroke-width:2.8;fill:none" {line}<path class="lead" {line}'
+    caps = "".join(f"M{x:.1f} {middle - 3:.1f}v6" for x in (start, end))
+    line = f'd="M{start:.1f} {middle:.1f}H{end:.1f}{caps}"'
+    halo = f'<path style="stroke:#ffffff;stroke-width:2.8;fill:none" {line}/>'
+    return f"{halo}<path {style.shape('lead')} {line}/>"

@@ -1,36 +1,40 @@
-"""Locks that keep processes apart; each goes with its process, however that ends."""
+"""Locks between processes; the system releases them when a process ends, however it ends."""
 
 from __future__ import annotations
 
 import errno
-import fcntl
+import math
 import os
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from egvs.core import platform
 from egvs.core.errors import InputError
 
-_NO_LINK = os.O_CLOEXEC | os.O_NOFOLLOW
 _PAUSE_S = 0.05
 
 
 @contextmanager
 def locked(path: Path, *, shared: bool = False, wait: bool = True, remove: bool = False) -> Iterator[bool]:
-    """Hold a lock file; yields whether it is held (without ``wait`` it may not be).
+    """Lock a file during the block; yield whether it is locked.
 
     Parameters
     ----------
+    path
+        Lock file; it is created if it does not exist.
     shared
-        Others may share it; a file that cannot be written will do then.
+        Allow other shared locks; the file need not be writable.
+    wait
+        Wait until the lock is free; else yield False when it is not.
     remove
-        Remove the file at the end. Who waited for it then takes the one that stands in its place.
+        Remove the file at the end. A process that waited for it then locks the new file of that name.
     """
-    kind = (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | (0 if wait else fcntl.LOCK_NB)
     while True:
-        descriptor = _open_lock(path, shared)
+        descriptor = open_lock(path, shared=shared)
         try:
-            if not _try_lock(descriptor, kind):
+            if not wait_for_lock(descriptor, math.inf if wait else 0.0, shared=shared):
                 yield False
                 return
             if not _is_current_lock(descriptor, path):
@@ -39,43 +43,48 @@ def locked(path: Path, *, shared: bool = False, wait: bool = True, remove: bool 
                 yield True
             finally:
                 if remove:
-                    path.unlink(missing_ok=True)
+                    with suppress(PermissionError):  # Windows removes no open file
+                        path.unlink(missing_ok=True)
             return
         finally:
             os.close(descriptor)
 
 
 def create_lock(path: Path) -> None:
-    """Make a lock file where there is none; InputError where it is a symbolic link."""
-    os.close(_open_lock(path, shared=False))
+    """Create a lock file if it does not exist; InputError where it is a symbolic link."""
+    os.close(open_lock(path))
 
 
-def _open_lock(path: Path, shared: bool) -> int:
-    """A lock file, made where there is none; InputError where it is a symbolic link."""
+def open_lock(path: Path, *, shared: bool = False) -> int:
+    """Return the descriptor of a lock file, created if it does not exist; InputError where it is a symbolic link."""
     try:
+        if not platform.OPEN_NO_LINK and path.is_symlink():
+            raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
         try:
-            return os.open(path, os.O_RDWR | os.O_CREAT | _NO_LINK, 0o666)
+            return os.open(path, os.O_RDWR | os.O_CREAT | platform.OPEN_NO_LINK, 0o666)
         except PermissionError:
             if not shared:
                 raise
-        return os.open(path, os.O_RDONLY | _NO_LINK)
+        return os.open(path, os.O_RDONLY | platform.OPEN_NO_LINK)
     except OSError as error:
         if error.errno == errno.ELOOP:
-            found = "is a symbolic link, and nothing is written through links"
-            raise InputError(path, found, "Remove it.") from None
+            problem = "is a symbolic link, and nothing is written through links"
+            raise InputError(path, problem, "Remove it.") from None
         raise
 
 
-def _try_lock(descriptor: int, kind: int) -> bool:
-    try:
-        fcntl.flock(descriptor, kind)
-    except BlockingIOError:
-        return False
+def wait_for_lock(descriptor: int, timeout_s: float, *, shared: bool = False) -> bool:
+    """Lock an open file; return False where it is not free in time."""
+    deadline = time.monotonic() + timeout_s
+    while not platform.try_lock(descriptor, shared=shared):
+        if time.monotonic() >= deadline:
+            return False
+        time.sleep(_PAUSE_S)
     return True
 
 
 def _is_current_lock(descriptor: int, path: Path) -> bool:
-    """Whether the file that is held is the one that stands at ``path``: its holder before may have removed it."""
+    """Whether the locked file is still the one at ``path``; the process that held the lock may have removed it."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat())
     except FileNotFoundError:

@@ -1,45 +1,32 @@
-"""Run(): every stage up to date, one run a folder, never over a user's file.
+"""The whole program: a scenario becomes static world, scans, traffic, TPOG, scores and report in one folder.
 
-What the user made is not written over: no input lies where a run writes, and nothing is written through a link.
+:func:`run` brings every stage up to date. A stage is skipped when its key (settings by value, files by hash, source of
+the program) is that of the last run and its artefacts are unchanged; otherwise it is restored from the store, or runs
+and its artefacts are saved in the store. ``run.json`` is written after each stage that made something, with that stage
+and those before it: an interrupted run continues from there, and no record names artefacts of another scenario. A run
+that is rejected before any stage ran leaves the folder as it was.
 
-Locks that keep processes apart; each goes with its process, however that ends.
-
-A scenario becomes a ranking: static world and empty scans, traffic and the TPOG, scores, the report.
-
-:func:`run` is the whole program. A stage whose inputs (settings by value, files by hash, the program's source) are
-those of the last run, and whose artefacts are still what it wrote, is skipped; one that the store knows is fetched from
-there; any other one is made, and kept in the store. After each stage that was made ``run.json`` is written anew, with
-that stage and those before it, so that an interrupted run goes on from the last whole stage, and no record names
-artefacts of another scenario than its own. A run that is refused before anything was made leaves the folder as it was.
-
-:func:`verify` runs again what ``run.json`` says and compares every artefact byte for byte.
+User files are not overwritten: no input lies where a run writes, and nothing is written through a link.
 """
 
 from __future__ import annotations
 
-import fcntl
 import os
 import re
-import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from egvs._version import __version__
-from egvs.artefacts.run_folder import (
-    STAGE_NAMES,
-    RunFolder,
-    RunRecord,
-    StageRecord,
-)
+from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
+from egvs.artefacts.run_record import RunRecord, StageRecord
 from egvs.core import files
 from egvs.core.errors import InputError, RunError
 from egvs.core.runtime import ProgressCallback, no_progress
 from egvs.formats.meshes import referenced_files
-from egvs.runs import stages, store
-from egvs.runs.locks import _PAUSE_S, _open_lock, _try_lock
+from egvs.runs import locks, stages, store
 from egvs.runs.stages import StageKey, StageResult
 from egvs.runs.store import Store
 from egvs.scenario.loading import scenario_from_dict
@@ -48,6 +35,322 @@ from egvs.stages import inputs as stage_inputs
 from egvs.stages.base import StageContext
 from egvs.stages.inputs import Inputs, open_folder
 from egvs.traffic.sumo_folder import NETWORK_FILE
+
+StageListener = Callable[[str, str, StageRecord | None], None]
+"""Called with (stage, state, record) as a run proceeds.
+
+States: "runs" (without a record), then "done"; or "skipped" (nothing changed), or "fetched" (restored from the store).
+"""
+
+StageOptions = Mapping[str, Mapping[str, Any]]
+"""Further keyword arguments of single stages, for example ``{"score": {"audit": True}}``."""
+
+
+def ignore_stage(_stage: str, _state: str, _record: StageRecord | None) -> None:
+    """A :data:`StageListener` that does nothing."""
+
+
+def run(
+    scenario: Scenario,
+    out: str | Path | None = None,
+    *,
+    jobs: int | None = None,
+    progress: ProgressCallback = no_progress,
+    listener: StageListener = ignore_stage,
+    options: StageOptions | None = None,
+    only: Collection[str] = STAGE_NAMES,
+    wait_s: float = 0.0,
+) -> RunRecord:
+    """Run every stage whose inputs changed, in order; restore artefacts from the store where it has them.
+
+    Parameters
+    ----------
+    scenario
+        From :func:`egvs.load`.
+    out
+        Run folder; ``runs/<scenario name>`` when None.
+    jobs
+        Number of threads; one per core when None. Results do not depend on it.
+    progress
+        Called as the work proceeds.
+    listener
+        Called when a stage starts and ends.
+    options
+        Further keyword arguments of single stages. A stage with options always runs and its artefacts are not saved in
+        the store, unless the stage declares that they change no artefact.
+    only
+        Names of the stages to run, which must read nothing of the others.
+    wait_s
+        How long to wait for the end of another run in the folder.
+
+    Returns
+    -------
+    RunRecord
+        Contents of ``run.json``.
+    """
+    folder = Path(out) if out is not None else default_folder(scenario)
+    check_no_overwrite(scenario, folder)
+    with lock_run_folder(folder, wait_s), files.hold_inputs(except_in=folder):
+        context = open_folder(scenario, folder, jobs=jobs, progress=progress)
+        current = _Run(context, start_record(scenario, folder), listener)
+        for stage in STAGE_NAMES:
+            if stage in only:
+                current.ensure_stage(stage, (options or {}).get(stage, {}))
+        return current.finish(keep=(*only, "report"))
+
+
+def run_one(
+    stage: str,
+    scenario: Scenario,
+    out: Path,
+    *,
+    jobs: int | None = None,
+    progress: ProgressCallback = no_progress,
+    listener: StageListener = ignore_stage,
+    **options: Any,
+) -> RunRecord:
+    """Run a single stage, even if its inputs did not change, and record it in ``run.json``.
+
+    Parameters are those of :func:`run`; ``options`` are further keyword arguments of the stage.
+    """
+    check_no_overwrite(scenario, out)
+    with lock_run_folder(out), files.hold_inputs(except_in=out):
+        record = start_record(scenario, out)
+        recorded = stages.recorded_digests(record)
+        context = open_folder(scenario, out, jobs=jobs, progress=progress, recorded=recorded)
+        current = _Run(context, record, listener)
+        current.ensure_stage(stage, options, again=True)
+        return current.finish(keep=(stage,))
+
+
+def refresh_report(out: Path) -> Path | None:
+    """Draw the report of a complete run again if something that it shows has changed, for example a study.
+
+    The caller holds the lock of the folder (:func:`lock_run_folder`).
+
+    Returns
+    -------
+    Path, or None
+        The report; None, and nothing is done, where there is no complete run of these settings and files.
+    """
+    folder = RunFolder(out)
+    if not folder.has_record:
+        return None
+    record = RunRecord.read(out)
+    source = Path(os.path.normpath(out / record.scenario_folder))
+    if not all(stage in record.stages for stage in STAGE_NAMES) or not source.is_dir():
+        return None
+
+    scenario = scenario_from_dict(record.scenario, source, str(folder.run_record))
+    context = open_folder(scenario, out)
+    inputs = [stage for stage in record.stages if stage != "report"]
+    for stage in inputs:
+        if not _is_up_to_date(stage, context, record) or not _is_intact(context, record.stages[stage]):
+            return None
+    current = _Run(context, record, complete=set(inputs))
+    current.ensure_stage("report", {})
+    current.finish(keep=STAGE_NAMES)
+    return folder.report
+
+
+def default_folder(scenario: Scenario) -> Path:
+    """Return the run folder where none is given."""
+    return Path("runs") / scenario.name
+
+
+def start_record(scenario: Scenario, folder: Path) -> RunRecord:
+    """Return the record of earlier runs in a folder, with the scenario as it is now."""
+    scenario_folder = Path(os.path.relpath(scenario.folder, folder)).as_posix()
+    recorded = RunRecord.read(folder).stages if RunFolder(folder).has_record else {}
+    return RunRecord(__version__, scenario.seed, scenario.model_dump(mode="json"), scenario_folder, recorded)
+
+
+def fetch_or_run(
+    name: str,
+    context: StageContext,
+    key: str,
+    store: Store,
+    make: Callable[[], StageResult],
+    *,
+    link: bool = False,
+) -> tuple[StageResult, bool]:
+    """Restore the artefacts of a stage from the store; else run the stage and save them there.
+
+    Of several processes that need the same artefacts, one makes them.
+
+    Parameters
+    ----------
+    name, key
+        The stage, and its key.
+    context
+        The folder of the artefacts.
+    store
+        Where results are cached.
+    make
+        Runs the stage.
+    link
+        Link files instead of copying them.
+
+    Returns
+    -------
+    tuple
+        The result, and whether it was restored.
+    """
+    out = context.folder.path
+    context.forget(*stages.written_by(name))
+    entry = store.take(name, key, out, link=link)
+    if entry is None:
+        with store.maker(name, key, progress=context.progress):
+            store.fetch(name, key)
+            entry = store.take(name, key, out, link=link)  # another process may have made it meanwhile
+            if entry is None:
+                result = make()
+                store.put(name, key, out, result, link=link)
+                return result, False
+    for other in set(stages.stage(name).artefacts) - set(entry.made.artefacts):
+        (out / other).unlink(missing_ok=True)  # as the stage does
+    return entry.made, True
+
+
+def ensure_stages(context: StageContext, *names: str) -> dict[str, str]:
+    """Bring some stages up to date, in this order, in a folder without ``run.json``; return their keys."""
+    keys = {}
+    store = Store.default()
+    for name in names:
+        key = stages.stage_key(name, context)
+
+        def make(name: str = name, key: StageKey = key) -> StageResult:
+            return stages.run_stage(name, context, key.dependencies)
+
+        fetch_or_run(name, context, key.key, store, make, link=True)
+        keys[name] = key.key
+    return keys
+
+
+@dataclass
+class _Run:
+    """A run in progress: one scenario in one folder.
+
+    Attributes
+    ----------
+    context
+        The folder and the inputs.
+    record
+        What is known of the stages so far; of some from earlier runs, perhaps of other settings.
+    listener
+        Called when a stage starts and ends.
+    complete
+        The stages that belong to this scenario for certain.
+    has_changed
+        Whether the folder has other artefacts than before.
+    """
+
+    context: StageContext
+    record: RunRecord
+    listener: StageListener = ignore_stage
+    store: Store = field(default_factory=Store.default)
+    complete: set[str] = field(default_factory=set)
+    has_changed: bool = False
+
+    def ensure_stage(self, name: str, options: Mapping[str, Any], *, again: bool = False) -> None:
+        """Bring one stage up to date; with ``again``, or with options that change artefacts, it always runs."""
+        key = stages.stage_key(name, self.context)
+        has_options = any(option not in stages.stage(name).neutral_options for option in options)
+        last = self.record.stages.get(name)
+        if last and not (again or has_options) and last.inputs == key.key and _is_intact(self.context, last):
+            self._record_stage(name, last)
+            self.listener(name, "skipped", last)
+            return
+
+        def make() -> StageResult:
+            self.listener(name, "runs", None)
+            return stages.run_stage(name, self.context, key.dependencies, **options)
+
+        fetched = False
+        if has_options:
+            result = make()
+        elif again:
+            result = make()
+            self._save(name, key, result)
+        else:
+            result, fetched = fetch_or_run(name, self.context, key.key, self.store, make)
+        stage_record = key.record(result)
+        self.has_changed |= bool(stage_record.artefacts)
+        self._record_stage(name, stage_record)
+        self.listener(name, "fetched" if fetched else "done", stage_record)
+
+    def _save(self, name: str, key: StageKey, result: StageResult) -> None:
+        """Save a result in the store, unless another process is making the same."""
+        with self.store.maker(name, key.key, wait=False) as is_only_one:
+            if is_only_one:
+                self.store.put(name, key.key, self.context.folder.path, result)
+
+    def _record_stage(self, name: str, stage: StageRecord) -> None:
+        """Record a stage; write ``run.json`` with the complete stages if artefacts changed."""
+        self.complete.add(name)
+        self.record = self.record.having(name, stage)
+        if self.has_changed:
+            complete = {name: stage for name, stage in self.record.stages.items() if name in self.complete}
+            replace(self.record, stages=complete).write(self.context.folder.path)
+
+    def finish(self, keep: Collection[str]) -> RunRecord:
+        """Write ``run.json`` if it changed; drop stages of other settings, except those in ``keep``."""
+        for stage in list(self.record.stages):
+            if stage not in keep and not _is_up_to_date(stage, self.context, self.record):
+                self.record = self.record.having(stage, None)
+        folder = self.context.folder
+        if not folder.has_record or RunRecord.read(folder.path) != self.record:
+            self.record.write(folder.path)
+        return self.record
+
+
+def _is_up_to_date(name: str, context: StageContext, record: RunRecord) -> bool:
+    """Whether a recorded stage has the key that follows from this scenario and the present artefacts."""
+    try:
+        return record.stages[name].inputs == stages.stage_key(name, context).key
+    except InputError:
+        return False
+
+
+def _is_intact(context: StageContext, stage: StageRecord) -> bool:
+    """Whether artefacts are as the stage wrote them, and the network that the report draws, if it exists."""
+    digests = dict(stage.artefacts)
+    for name, digest in stage.companions.items():
+        if name.endswith(NETWORK_FILE) and context.path(name).is_file():
+            digests[name] = digest
+    return all(context.path(name).is_file() and context.digest(name) == digest for name, digest in digests.items())
+
+
+@contextmanager
+def lock_run_folder(folder: Path, wait_s: float = 0.0) -> Iterator[None]:
+    """Keep other runs out of a folder, and every run out of the folder of the store.
+
+    Parameters
+    ----------
+    folder
+        Run folder; it is created if it does not exist.
+    wait_s
+        How long to wait for the end of another run.
+
+    Raises
+    ------
+    RunError
+        When another run is still at work there.
+    """
+    store.check_outside_store(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = locks.open_lock(folder / RunFolder.lock.name)
+    except OSError as error:
+        problem = f"cannot be written ({error.strerror})"
+        raise InputError(folder, problem, "Choose a folder that you may write to.") from None
+    try:
+        if not locks.wait_for_lock(descriptor, wait_s):
+            raise RunError(f"{folder}: another run is at work there")
+        yield
+    finally:
+        os.close(descriptor)
+
 
 _CLOUD_NAME = re.compile(r"scan_.*\.(ply|pcd)", re.DOTALL)
 """Name of a point cloud that ``egvs scan --points`` writes."""
@@ -109,264 +412,3 @@ def _input_files(scenario: Scenario) -> Iterator[tuple[str, Path]]:
         if key == "statics.meshes" or key.startswith("validation.bodies."):
             yield from ((key, part) for part in referenced_files(path))
     yield from (("traffic.sumocfg", path) for path in stage_inputs.sumo_config_files(scenario))
-
-
-@contextmanager
-def lock_run_folder(folder: Path, wait_s: float = 0.0) -> Iterator[None]:
-    """Keep two runs out of one folder, and every run out of the store; the store's settings are right then.
-
-    Another run's end is waited for so long; RunError where it is at work there then.
-    """
-    store.check_outside_store(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        descriptor = _open_lock(folder / ".lock", shared=False)
-    except OSError as error:
-        raise InputError(folder, f"cannot be written ({error.strerror})", "a folder of yours") from None
-    try:
-        until = time.monotonic() + wait_s
-        while not _try_lock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB):
-            if time.monotonic() >= until:
-                raise RunError(f"{folder}: another run is at work there")
-            time.sleep(_PAUSE_S)
-        yield
-    finally:
-        os.close(descriptor)
-
-
-StageListener = Callable[[str, str, StageRecord | None], None]
-"""Called with (stage, state, its record) as a run goes on.
-
-States: "runs" (no record yet), then "done"; or "skipped" (nothing changed), or "fetched" (from the store).
-"""
-
-
-def ignore_stage(_stage: str, _state: str, _record: StageRecord | None) -> None:
-    """A :data:`StageListener` that says nothing."""
-
-
-def run(
-    scenario: Scenario,
-    out: str | Path | None = None,
-    *,
-    jobs: int | None = None,
-    progress: ProgressCallback = no_progress,
-    listener: StageListener = ignore_stage,
-    options: dict[str, dict[str, Any]] | None = None,
-    help_from: dict[str, dict[str, Any]] | None = None,
-    only: Collection[str] = STAGE_NAMES,
-    wait_s: float = 0.0,
-) -> RunRecord:
-    """Bring every stage up to date, in order.
-
-    Parameters
-    ----------
-    scenario
-        From :func:`egvs.load`.
-    out
-        The run's folder; ``runs/<scenario name>`` when None.
-    jobs
-        Threads; one a core when None. Results do not depend on it.
-    options
-        Further keyword arguments of single stages, e.g. ``{"score": {"audit": True}}``; such a stage is always run, and
-        not kept in the store.
-    help_from
-        Further keyword arguments of single stages that change no byte of what they make, but who makes it; such a stage
-        is skipped, fetched and kept as any.
-    only
-        These stages alone, which must read nothing of others.
-    wait_s
-        How long to wait for the end of another run in the folder.
-
-    Returns
-    -------
-    RunRecord
-        What ``run.json`` holds.
-    """
-    folder = Path(out) if out is not None else default_folder(scenario)
-    check_no_overwrite(scenario, folder)
-    with lock_run_folder(folder, wait_s), files.hold_inputs(except_in=folder):
-        run = _Run(open_folder(scenario, folder, jobs=jobs, progress=progress), listener, help_from or {})
-        record = _record_so_far(scenario, folder)
-        for name in (stage for stage in STAGE_NAMES if stage in only):
-            record = run.ensure_stage(name, record, **(options or {}).get(name, {}))
-        return run.end(record, [stage for stage in record.stages if stage not in (*only, "report")])
-
-
-def run_one(
-    name: str,
-    scenario: Scenario,
-    out: Path,
-    *,
-    jobs: int | None = None,
-    progress: ProgressCallback = no_progress,
-    listener: StageListener = ignore_stage,
-    **options: Any,
-) -> RunRecord:
-    """Run a single stage, whether its inputs changed or not, and note it in ``run.json``."""
-    check_no_overwrite(scenario, out)
-    with lock_run_folder(out), files.hold_inputs(except_in=out):
-        record = _record_so_far(scenario, out)
-        work = open_folder(scenario, out, jobs=jobs, progress=progress, recorded=stages.recorded_digests(record))
-        run = _Run(work, listener)
-        record = run.ensure_stage(name, record, again=True, **options)
-        return run.end(record, [stage for stage in record.stages if stage != name])
-
-
-def refresh_report(out: Path) -> Path | None:
-    """Draw the report of a whole run anew where something that it shows has changed (an accuracy study); its path.
-
-    None, and nothing is done, where there is no whole run. For those who hold the folder
-    (:func:`egvs.runs.run.lock_run_folder`).
-    """
-    if not RunFolder(out).run_record.is_file():
-        return None
-    record = RunRecord.read(out)
-    source = Path(os.path.normpath(out / record.scenario_folder))
-    if not all(name in record.stages for name in STAGE_NAMES) or not source.is_dir():
-        return None
-    scenario = scenario_from_dict(record.scenario, source, str(RunFolder(out).run_record))
-    work = open_folder(scenario, out)
-    before = {name: stage for name, stage in record.stages.items() if name != "report"}
-    if not all(_is_up_to_date(name, work, record) and _is_intact(work, stage) for name, stage in before.items()):
-        return None
-    run = _Run(work, ignore_stage, complete=set(before))
-    run.end(run.ensure_stage("report", record), ())
-    return RunFolder(out).report
-
-
-def default_folder(scenario: Scenario) -> Path:
-    """Where a run goes when no folder is given."""
-    return Path("runs") / scenario.name
-
-
-def fetch_or_run(
-    name: str, work: StageContext, key: str, store: Store, make: Callable[[], StageResult], *, link: bool = False
-) -> tuple[StageResult, bool]:
-    """A stage's artefacts in a workspace: from the store, else made, and kept there.
-
-    Of several processes that want the same, one makes it. Returns what came of it, and whether it came from the store.
-    """
-    out = work.folder.path
-    work.forget(*stages.written_by(name))
-    if (entry := store.take(name, key, out, link=link)) is None:
-        with store.maker(name, key, progress=work.progress):
-            store.fetch(name, key)
-            if (entry := store.take(name, key, out, link=link)) is None:  # nor has another one made it meanwhile
-                made = make()
-                store.put(name, key, out, made, link=link)
-                return made, False
-    for other in set(stages.stage(name).artefacts) - set(entry.made.artefacts):
-        (out / other).unlink(missing_ok=True)  # as the stage does
-    return entry.made, True
-
-
-def ensure_stages(work: StageContext, *names: str) -> dict[str, str]:
-    """The artefacts of some stages, in their order, into a workspace that is no run's folder: from the store, else
-    made, and kept there. Returns their keys."""
-    keys = {}
-    for name in names:
-        inputs = stages.stage_key(name, work)
-        read = inputs.dependencies
-        fetch_or_run(name, work, inputs.key, Store.default(), lambda: stages.run_stage(name, work, read), link=True)  # noqa: B023 - called at once
-        keys[name] = inputs.key
-    return keys
-
-
-@dataclass
-class _Run:
-    """One scenario in one folder.
-
-    Attributes
-    ----------
-    complete
-        The stages that are known to be this scenario's. Of the others a record may know from earlier runs.
-    is_other
-        Whether artefacts in the folder are others than they were.
-    """
-
-    work: StageContext
-    listener: StageListener
-    help_from: dict[str, dict[str, Any]] = field(default_factory=dict)
-    store: Store = field(default_factory=Store.default)
-    complete: set[str] = field(default_factory=set)
-    is_other: bool = False
-
-    def ensure_stage(self, name: str, record: RunRecord, *, again: bool = False, **options: Any) -> RunRecord:
-        """Bring one stage up to date; the record of the run with it. What is whole of it is written once artefacts were
-        made.
-
-        A stage with ``options`` is always run, and its artefacts are not kept in the store; ``again``: always run.
-        """
-        work = self.work
-        inputs = stages.stage_key(name, work)
-        last = record.stages.get(name)
-        if last and not (again or options) and last.inputs == inputs.key and _is_intact(work, last):
-            self.listener(name, "skipped", last)
-            return self._record_stage(name, last, record)
-        made, fetched = self._fetch_or_run(name, inputs, again, options)
-        done = inputs.record(made)
-        self.is_other |= bool(done.artefacts)
-        record = self._record_stage(name, done, record)
-        self.listener(name, "fetched" if fetched else "done", done)
-        return record
-
-    def end(self, record: RunRecord, others: Collection[str]) -> RunRecord:
-        """The record without those of the other stages that are of other settings, which it would contradict; written
-        where it is another one than before."""
-        for name in [stage for stage in others if not _is_up_to_date(stage, self.work, record)]:
-            record = record.having(name, None)
-        folder = self.work.folder.path
-        if not RunFolder(folder).run_record.is_file() or RunRecord.read(folder) != record:
-            record.write(folder)
-        return record
-
-    def _record_stage(self, name: str, stage: StageRecord, record: RunRecord) -> RunRecord:
-        self.complete.add(name)
-        record = record.having(name, stage)
-        if self.is_other:
-            whole = {name: stage for name, stage in record.stages.items() if name in self.complete}
-            replace(record, stages=whole).write(self.work.folder.path)
-        return record
-
-    def _fetch_or_run(
-        self, name: str, inputs: StageKey, again: bool, options: dict[str, Any]
-    ) -> tuple[StageResult, bool]:
-        work = self.work
-
-        def make() -> StageResult:
-            self.listener(name, "runs", None)
-            return stages.run_stage(name, work, inputs.dependencies, **self.help_from.get(name, {}), **options)
-
-        if not (again or options):
-            return fetch_or_run(name, work, inputs.key, self.store, make)
-        made = make()
-        if not options:
-            with self.store.maker(name, inputs.key, wait=False) as mine:
-                if mine:
-                    self.store.put(name, inputs.key, work.folder.path, made)
-        return made, False
-
-
-def _record_so_far(scenario: Scenario, folder: Path) -> RunRecord:
-    """What is known of earlier work in this folder, with the scenario as it is now."""
-    home = Path(os.path.relpath(scenario.folder, folder)).as_posix()
-    known = RunRecord.read(folder).stages if RunFolder(folder).run_record.is_file() else {}
-    return RunRecord(__version__, scenario.seed, scenario.model_dump(mode="json"), home, known)
-
-
-def _is_up_to_date(name: str, work: StageContext, record: RunRecord) -> bool:
-    """Whether a stage's last run is what this scenario, and the artefacts as they are now, would give."""
-    try:
-        return record.stages[name].inputs == stages.stage_key(name, work).key
-    except InputError:
-        return False
-
-
-def _is_intact(work: StageContext, stage: StageRecord) -> bool:
-    """Whether artefacts are what the stage wrote, and a network that the report draws, where it is still there."""
-    artefacts = stage.artefacts.items()
-    networks = [
-        (n, digest) for n, digest in stage.companions.items() if n.endswith(NETWORK_FILE) and work.path(n).is_file()
-    ]
-    return all(work.path(name).is_file() and work.digest(name) == digest for name, digest in (*artefacts, *networks))

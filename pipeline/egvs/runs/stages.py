@@ -1,18 +1,12 @@
-"""The registered stages; a stage's key: inputs, settings, digest of the source.
+"""The registered stages, running one, and the key of a stage.
 
-The program's own source as one digest, so that what was made by another version of the code is not taken for new.
+The key is a hash of everything that the artefacts of a stage depend on: settings by value, input files by hash, the
+source of the program, versions of libraries. A stage runs again when its key changes.
 
-Steps: from some modules of this package, follow every import down (those inside functions too, those for type checking
-alone not); hash the sources. What is loaded by name only (effects, plug-ins) is not seen from the text: name its module
-as well. A module of another package counts with its file, and with what it imports of its own package and of this one.
-
-Imports are read by their pattern, not by a parser, which takes a tenth of the time; a line of a docstring that looks
-like an import may add a module, none is missed. A file is read once in a process: one that is edited while the program
-runs counts as it was when it was first asked for.
-
-Calls the stages, which nothing else does, and says what came of one when it was made.
-
-The key of a stage: a hash of everything that its artefacts depend on. A stage runs again when its key is another.
+The source is followed from the module of the stage through every import (also those inside functions, but not those for
+type checking only). Modules that are loaded by name (effects, plug-ins) are not visible in the text, so they are named.
+Imports are matched by a pattern instead of a parser, which takes a tenth of the time: a line of a docstring that looks
+like an import may add a module, but none is missed. A file is read once per process.
 """
 
 from __future__ import annotations
@@ -28,7 +22,8 @@ from pathlib import Path
 from typing import Any
 
 from egvs.artefacts import parquet
-from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder, RunRecord, StageRecord
+from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
+from egvs.artefacts.run_record import RunRecord, StageRecord
 from egvs.core import files
 from egvs.core.errors import with_relative_paths
 from egvs.core.runtime import ResourceUsage, measure_usage
@@ -63,7 +58,7 @@ _IMPORT = re.compile(
 
 @dataclass(frozen=True)
 class SourceDigest:
-    """The digest of some modules' sources, and the libraries of :data:`LIBRARIES` that they import."""
+    """Digest of the source of some modules, and the libraries of :data:`LIBRARIES` that they import."""
 
     digest: str
     libraries: frozenset[str]
@@ -71,7 +66,10 @@ class SourceDigest:
 
 @cache
 def source_digest(*modules: str) -> SourceDigest:
-    """Return the digest of modules, e.g. ``"egvs.stages.score"``, and of everything that they import."""
+    """Return the digest of modules, e.g. ``"egvs.stages.score"``, and of everything that they import.
+
+    Modules of other packages count with what they import of their own package and of this one.
+    """
     digests: dict[str, str] = {}
     libraries: set[str] = set()
     for module, (digest, imports) in source_modules(*modules).items():
@@ -84,30 +82,31 @@ def source_digest(*modules: str) -> SourceDigest:
 def source_modules(*modules: str) -> dict[str, tuple[str, tuple[str, ...]]]:
     """Return the modules and all that they import, of this package and of their own: digest and imports by name."""
     packages = {PACKAGE, *(module.partition(".")[0] for module in modules)}
-    found: dict[str, tuple[str, tuple[str, ...]]] = {}
-    waiting = list(modules)
-    while waiting:
-        module = waiting.pop()
-        if module in found or module.partition(".")[0] not in packages:
+    sources: dict[str, tuple[str, tuple[str, ...]]] = {}
+    pending = list(modules)
+    while pending:
+        module = pending.pop()
+        if module in sources or module.partition(".")[0] not in packages:
             continue
         path = _module_path(module)
         if path is None:
             continue
         parent = module.rpartition(".")[0]
         package = module if path.name == "__init__.py" else parent
-        found[module] = _digest_module(path, package)
-        waiting += (*found[module][1], parent)
-    return found
+        sources[module] = _digest_module(path, package)
+        pending += (*sources[module][1], parent)
+    return sources
 
 
 def library_versions(libraries: frozenset[str]) -> dict[str, str]:
-    """Library -> version, of those installed."""
-    return {
-        name: text
-        for key in sorted(libraries)
-        for name in LIBRARIES[key]
-        if (text := _installed_version(name)) is not None
-    }
+    """Return the versions of the installed distributions of some libraries, by name."""
+    versions = {}
+    for library in sorted(libraries):
+        for distribution in LIBRARIES[library]:
+            installed = _installed_version(distribution)
+            if installed is not None:
+                versions[distribution] = installed
+    return versions
 
 
 @cache
@@ -120,17 +119,28 @@ def _installed_version(distribution: str) -> str | None:
 
 @cache
 def _digest_module(path: Path, package: str) -> tuple[str, tuple[str, ...]]:
-    """A file's digest, that of its numbers in a JSON file of its name included, and what it imports."""
-    content, data = path.read_bytes(), path.with_suffix(".json")
-    digest = hashlib.sha256(content + (data.read_bytes() if data.is_file() else b"")).hexdigest()
-    return digest, tuple(imported_names(content.decode("utf-8"), package))
+    """Digest of a file and of the JSON file of the same name, if there is one; names that it imports."""
+    content = path.read_bytes()
+    data = path.with_suffix(".json")
+    numbers = data.read_bytes() if data.is_file() else b""
+    return hashlib.sha256(content + numbers).hexdigest(), tuple(imported_names(content.decode("utf-8"), package))
 
 
 def imported_names(text: str, package: str) -> Iterator[str]:
-    """The names that a module's text imports when it runs, modules and their attributes alike."""
-    for source, names, whole in _IMPORT.findall(_TYPES_ONLY.sub("", text)):
-        if whole:
-            yield from (part.split()[0] for part in whole.partition("#")[0].split(",") if part.strip())
+    """Yield the names of modules, and of attributes of modules, that the text of a module imports.
+
+    Parameters
+    ----------
+    text
+        Source of the module.
+    package
+        Its package, for relative imports.
+    """
+    for source, names, modules in _IMPORT.findall(_TYPES_ONLY.sub("", text)):
+        if modules:  # import a, b as c
+            for part in modules.partition("#")[0].split(","):
+                if part.strip():
+                    yield part.split()[0]
             continue
         if source.startswith("."):
             source = importlib.util.resolve_name(source, package)
@@ -142,35 +152,43 @@ def imported_names(text: str, package: str) -> Iterator[str]:
 
 @cache
 def _module_path(module: str) -> Path | None:
-    """A module's file; None for an attribute of a module, and for this package's door, whose lazy names lead far."""
+    """The file of a module; None for an attribute of a module, and for ``egvs`` itself, which exports everything."""
+    if module == PACKAGE:
+        return None
     top, _, rest = module.partition(".")
     if top == PACKAGE:
-        inside = _ROOT.joinpath(*rest.split("."))
-        here = (inside.with_suffix(".py"), inside / "__init__.py") if rest else ()
-        return next((path for path in here if path.is_file()), None)
+        base = _ROOT.joinpath(*rest.split("."))
+        for path in (base.with_suffix(".py"), base / "__init__.py"):
+            if path.is_file():
+                return path
+        return None
     try:
         spec = importlib.util.find_spec(module)
     except (ImportError, ValueError):
         return None
-    return Path(spec.origin) if spec is not None and spec.origin is not None and spec.origin.endswith(".py") else None
+    if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
+        return None
+    return Path(spec.origin)
 
 
 RANKING_STAGES = STAGE_NAMES[1:-1]
-"""What a ranking takes; the check and the report are left out."""
+"""The stages that a ranking needs: all but the check and the report."""
 
 
 @dataclass(frozen=True)
 class StageResult:
-    """What came of a stage.
+    """Result of a stage.
 
     Attributes
     ----------
     artefacts
-        Name -> sha256 of each file that it wrote.
+        Name -> sha256 of each file that the stage wrote.
     companions
-        The same of further files that belong to them, by their path in the run's folder: those that open in sumo-gui.
+        Path in the run folder -> sha256 of further files, such as those that open in sumo-gui.
     summary
-        What the stage says of it, a JSON value.
+        Outcome in numbers, a JSON value.
+    cost
+        Resources that the stage used.
     """
 
     artefacts: dict[str, str]
@@ -180,7 +198,7 @@ class StageResult:
 
     @property
     def files(self) -> dict[str, str]:
-        """Name -> sha256 of all of them."""
+        """Name -> sha256 of artefacts and companions."""
         return self.artefacts | self.companions
 
 
@@ -241,7 +259,7 @@ def run_stage(name: str, context: StageContext, dependencies: StageDependencies,
     running = stage(name)
     stamps_before = _companion_stamps(running, context.folder.path)
     context.forget(*written_by(name))
-    with measure_usage() as cost:
+    with measure_usage() as cost, parquet.share_open_files():
         summary = with_relative_paths(context.scenario.folder, running.run(context, dependencies, **options))
 
     written = [artefact for artefact in running.artefacts if context.path(artefact).exists()]

@@ -1,29 +1,21 @@
-"""A scenario becomes a ranking: static world and empty scans, traffic and the TPOG, scores, the report.
-
-:func:`run` is the whole program. A stage whose inputs (settings by value, files by hash, the program's source) are
-those of the last run, and whose artefacts are still what it wrote, is skipped; one that the store knows is fetched from
-there; any other one is made, and kept in the store. After each stage that was made ``run.json`` is written anew, with
-that stage and those before it, so that an interrupted run goes on from the last whole stage, and no record names
-artefacts of another scenario than its own. A run that is refused before anything was made leaves the folder as it was.
-
-:func:`verify` runs again what ``run.json`` says and compares every artefact byte for byte.
-"""
+"""Verify a run: run it again from ``run.json`` in another folder, and compare every artefact byte for byte."""
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from egvs.artefacts import run_folder
-from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder, RunRecord, StageRecord
+from egvs.artefacts import checksums
+from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
+from egvs.artefacts.run_record import RunRecord, StageRecord
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.runtime import ProgressCallback, no_progress
 from egvs.runs import stages
-from egvs.runs.run import StageListener, _record_so_far, ignore_stage
+from egvs.runs.run import StageListener, ignore_stage, start_record
 from egvs.scenario.loading import scenario_from_dict
 from egvs.stages.inputs import open_folder
 
@@ -36,82 +28,92 @@ def verify(
     progress: ProgressCallback = no_progress,
     listener: StageListener = ignore_stage,
 ) -> list[str]:
-    """Run again what ``folder/run.json`` says, elsewhere, and compare. Nothing is taken from the store.
+    """Run again what ``run.json`` records, in a temporary folder and without the store, and compare.
 
     Parameters
     ----------
+    folder
+        Run folder.
     scenario_folder
-        Where the scenario's files are; where ``run.json`` says when None.
+        Folder of the scenario's files; the one in ``run.json`` when None.
+    jobs, progress, listener
+        As of :func:`egvs.runs.run.run`.
 
     Returns
     -------
     list of str
-        One line for each artefact that differs: altered since the run, or not reproduced by it. Empty when all is well.
+        One line for each artefact that was changed after the run, or that the new run does not reproduce.
     """
     folder = Path(folder)
     record = RunRecord.read(folder)
-    missing = [name for name in STAGE_NAMES if name not in record.stages]
-    if missing:
-        raise InputError(
-            RunFolder(folder).run_record, f"the stage {missing[0]} is not done", "a finished run; call egvs run first"
-        )
+    record_file = RunFolder(folder).run_record
+    for stage in STAGE_NAMES:
+        if stage not in record.stages:
+            raise InputError(record_file, f"the stage {stage} is not done", "Call egvs run to finish the run first.")
     source = Path(scenario_folder or os.path.normpath(folder / record.scenario_folder))
     if not source.is_dir():
-        raise InputError(
-            RunFolder(folder).run_record, f"the scenario's folder {source} is not there", "name it with --scenario"
-        )
-    scenario = scenario_from_dict(record.scenario, source, str(RunFolder(folder).run_record))
-    made_by_stages = {name: digest for stage in record.stages.values() for name, digest in stage.artefacts.items()}
-    wrong = [
-        f"{name} was altered after the run"
-        for name in made_by_stages
-        if not _is_unchanged(folder, name, made_by_stages)
-    ]
-    wrong += _altered_companions(folder, record)
-    with files.temporary_folder() as elsewhere:
-        work = open_folder(scenario, elsewhere, jobs=jobs, progress=progress)
-        again = _record_so_far(scenario, elsewhere)
+        problem = f"the folder of the scenario, {source}, does not exist"
+        raise InputError(record_file, problem, "Name it with --scenario.")
+    scenario = scenario_from_dict(record.scenario, source, str(record_file))
+
+    differences = [*_changed_artefacts(folder, record), *_changed_companions(folder, record)]
+    artefacts = {name for stage in record.stages.values() for name in stage.artefacts}
+    with files.temporary_folder() as temporary:
+        context = open_folder(scenario, temporary, jobs=jobs, progress=progress)
+        new_record = start_record(scenario, temporary)
         for name, before in record.stages.items():
-            beside = before.files.keys() - made_by_stages.keys()
-            for file in beside:  # an accuracy study, which the report shows
-                if Path(file).name == file and _is_unchanged(folder, file, before.files):
-                    shutil.copyfile(folder / file, elsewhere / file)
-            inputs = stages.stage_key(name, work)
-            for file in sorted(file for file in beside if inputs.dependencies.files.get(file) != before.files[file]):
-                made_of_it = " and ".join(before.artefacts) or f"the stage {name}"
-                wrong.append(f"{made_of_it} shows {file}, which was replaced since; egvs {name} makes it anew")
+            studies = before.files.keys() - artefacts  # files of a study that the report shows
+            _copy_unchanged(folder, temporary, {study: before.files[study] for study in studies})
+            key = stages.stage_key(name, context)
+            for study in sorted(studies):
+                if key.dependencies.files.get(study) != before.files[study]:
+                    shown_in = " and ".join(before.artefacts) or f"the stage {name}"
+                    differences.append(f"{shown_in} shows {study}, which was replaced since: run egvs {name} again")
             listener(name, "runs", None)
-            made = stages.run_stage(name, work, inputs.dependencies)
-            after = inputs.record(made)
+            after = key.record(stages.run_stage(name, context, key.dependencies))
             listener(name, "done", after)
-            again = again.having(name, replace(after, cost=before.cost))  # which the report shows
-            again.write(elsewhere)
-            wrong += _differences(before, after)
-    return wrong
+            new_record = new_record.having(name, replace(after, cost=before.cost))  # the report shows the cost
+            new_record.write(temporary)
+            differences += _differences(before, after)
+    return differences
 
 
-def _altered_companions(folder: Path, record: RunRecord) -> Iterator[str]:
-    """A line for each file beside the artefacts that is there, and is another one by now."""
+def _copy_unchanged(folder: Path, target: Path, digests: Mapping[str, str]) -> None:
+    """Copy the files that are still in the run folder with these digests."""
+    for name in digests:
+        if Path(name).name == name and _is_unchanged(folder, name, digests):
+            shutil.copyfile(folder / name, target / name)
+
+
+def _changed_artefacts(folder: Path, record: RunRecord) -> Iterator[str]:
+    """A line for each artefact that is missing or was changed."""
+    for stage in record.stages.values():
+        for name in stage.artefacts:
+            if not _is_unchanged(folder, name, stage.artefacts):
+                yield f"{name} was altered after the run"
+
+
+def _changed_companions(folder: Path, record: RunRecord) -> Iterator[str]:
+    """A line for each existing file beside the artefacts, or of a study, that was changed."""
     for stage in record.stages.values():
         for name in stage.companions:
             if (folder / name).is_file() and not _is_unchanged(folder, name, stage.companions):
                 yield f"{name} was altered after the run"
-    for sums in (
-        RunFolder.accuracy_checksums.name,
-        RunFolder.validation_checksums.name,
-        RunFolder.placement_checksums.name,
-    ):
-        for name in run_folder.changed_files(folder / sums, "remove it"):
+    studies = (RunFolder.accuracy_checksums, RunFolder.validation_checksums, RunFolder.placement_checksums)
+    for study in studies:
+        for name in checksums.changed_files(folder / study.name, "Remove it."):
             yield f"{name} was altered after the study that made it"
 
 
-def _is_unchanged(folder: Path, name: str, digests: dict[str, str]) -> bool:
-    """Whether a file is there as it was."""
+def _is_unchanged(folder: Path, name: str, digests: Mapping[str, str]) -> bool:
+    """Whether a file exists and has its recorded digest."""
     return (folder / name).is_file() and files.hash_file(folder / name) == digests[name]
 
 
 def _differences(before: StageRecord, after: StageRecord) -> Iterator[str]:
+    """A line for each artefact that two runs of a stage made differently."""
     for artefact in sorted(before.artefacts.keys() | after.artefacts.keys()):
-        then, now = (stage.artefacts.get(artefact, "absent")[:12] for stage in (before, after))
-        if then != now:
-            yield f"{artefact} differs from what the run made: {then} then, {now} now"
+        old = before.artefacts.get(artefact, "absent")
+        new = after.artefacts.get(artefact, "absent")
+        if old != new:
+            yield f"{artefact} differs from that of the run: {old[:12]} then, {new[:12]} now"

@@ -1,8 +1,8 @@
-"""The keys of ``[effects.<name>]``: what goes beyond the plain scene, effect by effect.
+"""The keys of ``[effects.<name>]``: parameters of the effects that extend the plain simulation.
 
-Parameters stand here, so that a scenario is checked and completed by editors without any effect's code; what an effect
-does, its source and its limits stand in its module under :mod:`egvs.effects`. Effects of other packages (entry
-points ``egvs.effects``) bring models of their own, which are asked only when a scenario names them.
+The parameters are defined here, so that a scenario is checked, and completed by editors, without importing any effect.
+What an effect does, its source and its limits are documented in its module in :mod:`egvs.effects`. Effects of other
+packages (entry points ``egvs.effects``) have models of their own, which are imported only when a scenario names them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from egvs.core import plugins
 from egvs.scenario.fields import Positive, StrictModel
 
 GROUP = "egvs.effects"
-"""The entry points that effects are found by, this program's own too."""
+"""Entry points of effects, including the built-in ones."""
 
 
 class EffectParameters(StrictModel):
@@ -34,66 +34,61 @@ class EffectParameters(StrictModel):
 
 
 class RangeLimitParameters(EffectParameters):
-    """From how far a target of some reflectivity comes back."""
+    """Detection range by the reflectivity of the target."""
 
-    reflectivity: float = Field(
-        0.1,
-        gt=0,
-        description="Of the targets, diffuse; a dark vehicle 0.1, a white one 0.8, a retroreflector far above 1",
-    )
-    incidence_deg: float = Field(0.0, ge=0, lt=90, description="Angle between the beam and the target's normal")
-    softness: float = Field(0.3, ge=0, description="Spread of the logarithm of power; 0: all up to the limit")
-    rated_range_m: float | None = Field(None, gt=0, description="Instead of each sensor's own")
-    rated_reflectivity: float | None = Field(None, gt=0, description="Instead of each sensor's own")
+    reflectivity: float = Field(0.1, gt=0, description="Reflectivity of targets: dark vehicles 0.1, white ones 0.8")
+    incidence_deg: float = Field(0.0, ge=0, lt=90, description="Angle between the beam and the normal of the target")
+    softness: float = Field(0.3, ge=0, description="Standard deviation of the logarithm of the received power")
+    rated_range_m: float | None = Field(None, gt=0, description="Rated range, instead of each sensor's")
+    rated_reflectivity: float | None = Field(None, gt=0, description="Reflectivity there, instead of each sensor's")
 
 
 class RainParameters(EffectParameters):
     """Two-way extinction by rain."""
 
-    rate_mm_h: float = Field(ge=0, le=300, description="Rain rate; 2 is light, 10 moderate, 50 violent")
+    rate_mm_h: float = Field(ge=0, le=300, description="Rain rate: 2 is light, 10 moderate, 50 violent")
     law: Literal["japan", "france", "itu2025", "goodin"] = Field(
-        "japan", description="Which power law; the module's table says whose"
+        "japan", description="Power law from rain rate to extinction; docs/effects.md lists their sources"
     )
 
 
 class FogParameters(EffectParameters):
     """Two-way extinction by fog."""
 
-    visibility_m: float = Field(gt=0, description="How far one sees; fog is below 1000, dense fog below 200")
+    visibility_m: float = Field(gt=0, description="Visibility: below 1000 in fog, below 200 in dense fog")
     model: Literal["kim", "kruse"] = Field(
-        "kim", description="How the exponent of the wavelength follows from the visibility"
+        "kim", description="Model for the exponent of the wavelength as a function of the visibility"
     )
     contrast: float = Field(
-        0.02, gt=0, lt=1, description="At which visibility_m was measured; 0.05 for the meteorological optical range"
+        0.02, gt=0, lt=1, description="Contrast of visibility_m; 0.05 for meteorological optical range"
     )
 
 
 class DropoutParameters(EffectParameters):
-    """A constant share of returns lost."""
+    """A constant share of returns is lost."""
 
     share: float = Field(ge=0, le=1, description="Share of the returns that are lost")
 
 
-def _all_to_zero(given: object) -> object:
-    return 0 if given == "all" else given
+def _parse_all(frames: object) -> object:
+    return 0 if frames == "all" else frames
 
 
 class MovingOcclusionParameters(EffectParameters):
-    """Vehicles hide what is behind them."""
+    """Vehicles occlude what is behind them."""
 
     method: Literal["frames", "independent"] = Field(
-        "frames", description="Replay recorded frames, or take the TPOG's voxels as independent"
+        "frames", description="Replay recorded frames, or take the voxels of the TPOG as independent"
     )
-    frames: Annotated[int, Field(ge=0, strict=True), BeforeValidator(_all_to_zero)] = Field(
-        500,
-        description='Recorded frames that are replayed, evenly spaced; 0, "all", or more than there are: all of them',
+    frames: Annotated[int, Field(ge=0, strict=True), BeforeValidator(_parse_all)] = Field(
+        500, description='Number of recorded frames that are replayed, evenly spaced; 0 or "all" for all'
     )
 
     @field_validator("frames")
     @classmethod
-    def _frames_are_replayed(cls, frames: int, info: ValidationInfo) -> int:
+    def _check_frames(cls, frames: int, info: ValidationInfo) -> int:
         if info.data.get("method") == "independent":
-            raise PydanticCustomError("idle", 'acts on nothing with method = "independent"; remove it')
+            raise PydanticCustomError("unused_key", 'has no effect with method = "independent"')
         return frames
 
 
@@ -103,76 +98,74 @@ _Mrad = Annotated[float, Field(ge=0, le=100)]
 class DivergenceParameters(EffectParameters):
     """A beam as a cone of weighted sub-beams."""
 
-    sub_beams: Literal[1, 7, 19] = Field(7, description="Sub-beams a beam; 1 is the plain beam")
+    sub_beams: Literal[1, 7, 19] = Field(7, description="Sub-beams per beam; 1 is the plain beam")
     divergence_mrad: tuple[_Mrad, _Mrad] | None = Field(
-        None, description="Full angles across and along the elevation, 1/e^2, in place of the sensors' own"
+        None, description="Full angles in azimuth and elevation, at 1/e^2. By default those of each sensor"
     )
 
 
 class MountSwayParameters(EffectParameters):
-    """A pose averaged over a tilt distribution."""
+    """A pose averaged over a distribution of tilts."""
 
     tilt_deg: float = Field(ge=0, le=10, description="Standard deviation of the tilt about each horizontal axis")
-    samples: Literal[1, 4, 9, 16] = Field(4, description="Poses that are averaged; 1 is the pole at rest")
+    samples: Literal[1, 4, 9, 16] = Field(4, description="Number of poses that are averaged; 1 is the pole at rest")
 
 
 class FoliageParameters(EffectParameters):
     """Porous tree crowns."""
 
     leaf_area_density: float = Field(
-        1.0, ge=0, le=1e15, description="Leaf area a volume of crown in summer, m2/m3; 0.5 is thin, 2 is dense"
+        1.0, ge=0, le=1e15, description="Leaf area per volume of crown in summer, m2/m3: 0.5 is thin, 2 is dense"
     )
     season: Literal["summer", "autumn", "winter"] | Annotated[float, Field(ge=0, le=1)] = Field(
-        "summer", description="Or the share of the summer's optical depth, 0 to 1"
+        "summer", description="Season, or the share of the summer's optical depth, 0 to 1"
     )
-    projection: float = Field(0.5, gt=0, le=1, description="G, mean projection of a unit of leaf area")
-    step_m: float = Field(2.0, ge=0.01, le=100, description="Longest step in which a crown is cut")
+    projection: float = Field(0.5, gt=0, le=1, description="Mean projection G of a unit of leaf area")
+    step_m: float = Field(2.0, ge=0.01, le=100, description="Maximum length of the steps into which a crown is divided")
 
 
 class SlopeParameters(EffectParameters):
-    """Pitched boxes and a ground that follows the roads; no parameters."""
+    """Pitched vehicles, and a ground that follows the roads; no parameters."""
 
 
 class VehicleParts(EffectParameters):
-    """How a kind of vehicle is put together; each list from front to rear."""
+    """The parts of a kind of vehicle, from front to rear."""
 
     parts_m: tuple[Positive, ...] = Field(min_length=1, max_length=8, description="Length of each part")
     hinges_m: tuple[Positive, ...] = Field(
-        (), description="Each joint's distance from the front bumper; none: in the middle of its gap"
+        (), description="Distance of each joint from the front bumper. By default halfway between its parts"
     )
     axles_m: tuple[Positive, ...] = Field(
-        (), description="From each joint back to the axle of the part behind it; none: 0.75 of that part"
+        (), description="Distance from each joint back to the axle of its rear part. By default 0.75 of it"
     )
 
     @model_validator(mode="after")
-    def _fits(self) -> VehicleParts:
+    def _check_joints(self) -> VehicleParts:
         joints = len(self.parts_m) - 1
         for key in ("hinges_m", "axles_m"):
-            if (count := len(getattr(self, key))) not in (0, joints):
-                raise ValueError(f"{key} has {count} values for {joints + 1} parts, {joints} are needed (or none)")
+            count = len(getattr(self, key))
+            if count not in (0, joints):
+                raise ValueError(f"expected {joints} {key} for {joints + 1} parts, or none, got {count}")
         if list(self.hinges_m) != sorted(self.hinges_m):
-            raise ValueError("hinges_m run back; they count from the front bumper")
+            raise ValueError("hinges_m must be ascending: they are distances from the front bumper")
         return self
 
 
 class ArticulatedParameters(EffectParameters):
-    """Rear parts of articulated vehicles."""
+    """Articulated vehicles, whose rear parts swing."""
 
     kinds: dict[str, VehicleParts] = Field(
-        default_factory=dict, description="Kind of vehicle (name of its SUMO vType) -> its parts"
+        default_factory=dict, description="Parts of a kind of vehicle, by the name of its SUMO vType"
     )
-    auto: bool = Field(
-        True,
-        description="Whether buses, coaches, trucks and trailers of 16 m and more that `kinds` leaves out get parts",
-    )
+    auto: bool = Field(True, description="Also divide buses, coaches, trucks and trailers of 16 m or more into parts")
 
 
 BoxSize = Annotated[tuple[Positive, Positive, Positive], Field(description="Length, width and height of the box")]
-PerHour = Annotated[float, Field(ge=0, le=100_000, description="Departures in an hour, in the whole network")]
+PerHour = Annotated[float, Field(ge=0, le=100_000, description="Departures per hour in the whole network")]
 
 
 class PedestriansBicyclesParameters(EffectParameters):
-    """People on foot and on bicycles beside the scenario's vehicles."""
+    """Pedestrians and bicycles in addition to the vehicles of the scenario."""
 
     pedestrians_per_h: PerHour = 0.0
     bicycles_per_h: PerHour = 0.0
@@ -181,7 +174,7 @@ class PedestriansBicyclesParameters(EffectParameters):
 
 
 class EffectsConfig(StrictModel):
-    """What goes beyond the plain scene; `egvs effects` prints names and parameters."""
+    """Effects beyond the plain simulation; `egvs effects` prints names and parameters."""
 
     model_config = ConfigDict(extra="allow", json_schema_extra={"additionalProperties": False})
 
@@ -199,48 +192,50 @@ class EffectsConfig(StrictModel):
 
     __pydantic_extra__: dict[str, Any]
     BUILT_IN: ClassVar[tuple[str, ...]]
-    """This program's own effects, in the order in which they are composed."""
+    """The built-in effects, in the order in which they are composed."""
 
     @property
     def named(self) -> dict[str, EffectParameters]:
-        """The effects that the scenario names, in the order of their composition: this program's, then others'."""
-        own = {name: getattr(self, name) for name in self.BUILT_IN}
-        return {name: value for name, value in own.items() if value is not None} | self.__pydantic_extra__
+        """The effects that the scenario names, in the order of composition: built-in ones, then those of plugins."""
+        built_in = {name: getattr(self, name) for name in self.BUILT_IN if getattr(self, name) is not None}
+        return built_in | self.__pydantic_extra__
 
     def only(self, *names: str) -> Self:
-        """Of the named effects, these."""
+        """Return the named effects, limited to ``names``."""
         return self.model_validate({name: value for name, value in self.named.items() if name in names})
 
     def without(self, name: str) -> Self:
-        """The named effects but one."""
+        """Return the named effects except one."""
         return self.only(*(other for other in self.named if other != name))
 
     @model_validator(mode="after")
-    def _check_others(self) -> Self:
+    def _check_plugins(self) -> Self:
         others = self.__pydantic_extra__
         for name in sorted(others):
             others[name] = _check_plugin_parameters(name, others.pop(name))
         return self
 
     @model_serializer(mode="plain")
-    def _as_written(self) -> dict[str, Any]:
+    def _serialize(self) -> dict[str, Any]:
+        """As the user wrote them, without defaults."""
         return {name: value.model_dump(mode="json", exclude_unset=True) for name, value in self.named.items()}
 
 
 EffectsConfig.BUILT_IN = tuple(EffectsConfig.model_fields)
 
 
-def _check_plugin_parameters(name: str, given: object) -> EffectParameters:
-    """The parameters of an effect that some other package brings."""
-    known = [*EffectsConfig.BUILT_IN, *(n for n in plugins.plugin_names(GROUP) if n not in EffectsConfig.BUILT_IN)]
+def _check_plugin_parameters(name: str, values: object) -> EffectParameters:
+    """Return the parameters of an effect of another package."""
+    known = list(dict.fromkeys([*EffectsConfig.BUILT_IN, *plugins.plugin_names(GROUP)]))
     if name not in known:
-        near = difflib.get_close_matches(name, known, 1, 0.4)
-        right = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
-        raise PydanticCustomError("unknown_effect", "unknown effect", {"name": name, "right": right})
-    if isinstance(given, EffectParameters):
-        return given
+        similar = difflib.get_close_matches(name, known, 1, 0.4)
+        hint = f"Did you mean {similar[0]}?" if similar else f"Known effects: {', '.join(known)}"
+        raise PydanticCustomError("unknown_effect", "unknown effect", {"name": name, "hint": hint})
+    if isinstance(values, EffectParameters):
+        return values
     model: type[EffectParameters] = plugins.load_plugin(GROUP, name).Model
     try:
-        return model.of(given)  # type: ignore[arg-type]
+        return model.from_dict(values)  # type: ignore[arg-type]
     except ValidationError as error:
-        raise PydanticCustomError("of_an_effect", "wrong", {"name": name, "model": model, "error": error}) from None
+        context = {"name": name, "model": model, "error": error}
+        raise PydanticCustomError("effect_parameters", "invalid parameters", context) from None

@@ -1,38 +1,41 @@
-"""StrictModel and the value types of scenario keys.
+"""The base class of the tables of a scenario, and types of values that several tables share: lengths, points, names.
 
-The base of what users write: values checked the same way everywhere.
-
-Models are frozen, unknown keys are errors, and numbers are finite unless a field says otherwise. No text or truth value
-passes for a number, no fraction for a count; lists pass for tuples, as in JSON.
-
-Kinds of values that a scenario holds: lengths, points, names.
+All tables are checked in the same way: they cannot be changed, unknown keys are errors, and numbers are finite unless a
+field allows otherwise. A text or a truth value is not accepted as a number, nor a fraction as a count. Lists are
+accepted as tuples, as in JSON.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field
 
 
 class StrictModel(BaseModel):
-    """Base of everything that is read from a scenario."""
+    """Base of all tables of a scenario."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     @classmethod
-    def of(cls, values: dict[str, Any]) -> Self:
-        """From values as TOML gives them; pydantic's ValidationError when they are wrong."""
+    def from_dict(cls, values: dict[str, Any]) -> Self:
+        """Return the table with values as TOML gives them; pydantic's ValidationError when some are invalid."""
         return cls.model_validate_json(json.dumps(values, default=str), strict=True)
 
 
+def find_duplicates(names: Sequence[Any]) -> list[Any]:
+    """Return the names that occur more than once, sorted."""
+    return sorted({name for name in names if names.count(name) > 1})
+
+
 MAX_COORDINATE_M = 1e8
-"""Coordinates beyond this are a mistake: the Earth is 4e7 m round."""
+"""A coordinate beyond this is a mistake: the circumference of the Earth is 4e7 m."""
 
 
 def parse_coordinate_m(text: str) -> float:
-    """A coordinate as a file writes it; ValueError where it is none, or no place on Earth has it."""
+    """Return a coordinate that is written in a file; ValueError when it is not a number, or too large for the Earth."""
     value = float(text)
     if not abs(value) <= MAX_COORDINATE_M:
         raise ValueError(f"the coordinate {text[:40]} is beyond {MAX_COORDINATE_M:g} m")
@@ -46,10 +49,8 @@ Longitude = Annotated[float, Field(ge=-180, le=180)]
 Latitude = Annotated[float, Field(ge=-90, le=90)]
 Point2 = tuple[Coordinate, Coordinate]
 Point3 = tuple[Coordinate, Coordinate, Coordinate]
-NAME_DESCRIPTION = (
-    "a name without spaces and without any of / \\ : * ? \" < > |, and not of dots alone, for it may become a folder's"
-)
-"""What :data:`Name` asks for; no other kind of text here has a pattern."""
+NAME_DESCRIPTION = 'Use a name that can name a folder: no spaces, none of / \\ : * ? " < > |, and not only dots'
+"""Hint for a text that is not a :data:`Name`; no other text in a scenario has a pattern."""
 _NAME_CHARACTER = r"[^\s\x00-\x1f\x7f/\\:*?\"<>|"
 Name = Annotated[
     str, Field(min_length=1, max_length=80, pattern=rf"^{_NAME_CHARACTER}]*{_NAME_CHARACTER}.]{_NAME_CHARACTER}]*$")

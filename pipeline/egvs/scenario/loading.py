@@ -1,11 +1,9 @@
-"""Load(): base files, --set, messages that name key, value and hint; JSON schema.
+"""Load a scenario: its file, the scenarios that it extends, and overrides of the command line.
 
-What is wrong with a scenario, in words: key, value, what would be right.
+Steps of :func:`load`: read the TOML file and those that it extends; apply the ``--set`` overrides; validate. Paths in a
+scenario are relative to its folder; ``$SUMO_HOME/`` at the start of a path refers to the files that SUMO ships.
 
-Reads and checks a scenario.
-
-Steps of :func:`load`: read the TOML file, lay the ``--set`` overrides over it, validate. Files that it names are
-found relative to the folder; ``$SUMO_HOME/`` in front names a file that SUMO ships.
+Messages about invalid values name the key, the value, and what is expected.
 """
 
 from __future__ import annotations
@@ -15,91 +13,136 @@ import json
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 
 from egvs.core import reading
-from egvs.core.errors import InputError
+from egvs.core.errors import InputError, format_problem
 from egvs.core.grid import Grid
 from egvs.scenario.fields import NAME_DESCRIPTION
 from egvs.scenario.model import SCENARIO_FILE, SITE_DIRECTIONS, SITE_SOURCES, Scenario
-from egvs.scenario.traffic_config import TRAFFIC_SOURCES, TrafficConfig, unused_keys
+from egvs.scenario.traffic_config import TRAFFIC_SOURCES, TrafficConfig, keys_without_effect
 
 _ALTERNATIVE = re.compile(r"\.(?:(?:constrained-)?(?:float|int|str)|(?:literal|tuple)\[.*\])$")
-"""How pydantic's place of an error ends in a value that may be of several types."""
+"""End of pydantic's location of an error in a value that may have one of several types."""
 
-_SHOULD_BE = "input should be "
+_EXPECTATION = re.compile(r"[A-Z]\w+ should (?:be|have) (?P<what>.+?)(?: after validation, not .+)?$")
+"""Most messages of pydantic: "Input should be a valid number"."""
+
+_TOML_TERMS = {"an object": "a table", "a valid array": "a list"}
+
+
+class _KeyProblem(NamedTuple):
+    """What is wrong with a key.
+
+    Attributes
+    ----------
+    key
+        The key with its tables, e.g. ``"roi.voxel_m"``.
+    problem
+        What is wrong; only the value where ``expected`` is set.
+    hint
+        What to do about it.
+    expected
+        What the value should be.
+    """
+
+    key: str
+    problem: str
+    hint: str = ""
+    expected: str = ""
 
 
 def format_validation_error(error: ValidationError, where: str, model: type[BaseModel] = Scenario) -> InputError:
-    """One line for each thing that is wrong with a ``model``: key, value, what would be right."""
-    lines = list(_joined(_lines(error, model, ())))
-    key, found, right = lines[0]
-    more = "".join(f"\n{where}: {k}: {f}" + (f"; {r}" if r else "") for k, f, r in lines[1:])
-    return InputError(f"{where}: {key}", found, right + more)
+    """Convert an error of pydantic to an InputError with one line for each problem.
+
+    Parameters
+    ----------
+    error
+        The error of pydantic.
+    where
+        The file, for messages.
+    model
+        The table that was validated.
+    """
+    problems = _merge_alternatives(_key_problems(error, model, ()))
+    first = f"{where}: {problems[0].key}"
+    lines = [format_problem(f"{where}: {problem.key}", problem.problem, problem.hint) for problem in problems]
+    return InputError(first, "\n".join(lines).removeprefix(f"{first}: "))
 
 
-def _joined(lines: Iterator[tuple[str, str, str]]) -> Iterator[tuple[str, str, str]]:
-    """What every alternative of a value says, in one line: "a valid number or 'auto'"."""
-    said: dict[tuple[str, str], list[str]] = {}
-    for key, found, right in lines:
-        said.setdefault((_ALTERNATIVE.sub("", key), found), []).append(right)
-    for (key, found), rights in said.items():
-        first, *others = dict.fromkeys(rights)
-        yield key, found, " or ".join([first, *(other.removeprefix(_SHOULD_BE) for other in others)])
+def _merge_alternatives(problems: Iterable[_KeyProblem]) -> list[_KeyProblem]:
+    """Merge the problems that pydantic reports for each type that a value may have: "a valid number or 'auto'"."""
+    alternatives: dict[_KeyProblem, dict[str, None]] = {}
+    for problem in problems:
+        merged = problem._replace(key=_ALTERNATIVE.sub("", problem.key), expected="")
+        alternatives.setdefault(merged, {})[problem.expected] = None
+    return [problem._replace(problem=_describe(problem, list(expected))) for problem, expected in alternatives.items()]
 
 
-def _lines(error: ValidationError, model: type[BaseModel], above: tuple[str, ...]) -> Iterator[tuple[str, str, str]]:
-    """Key, what stands there, and what would be right, of all that is wrong in ``model``, found under ``above``."""
+def _describe(problem: _KeyProblem, expected: list[str]) -> str:
+    return f"expected {' or '.join(expected)}, got {problem.problem}" if any(expected) else problem.problem
+
+
+def _key_problems(error: ValidationError, model: type[BaseModel], parents: tuple[str, ...]) -> Iterator[_KeyProblem]:
+    """Yield all problems of a table of a type ``model``; ``parents`` are the keys of the tables around it."""
     for item in error.errors():
-        key = ".".join(str(part) for part in (*above, *item["loc"]) if part != "[key]")
+        key = ".".join(str(part) for part in (*parents, *item["loc"]) if part != "[key]")
+        value = repr(item["input"])
         context = item.get("ctx", {})
-        if item["type"] == "default_factory_not_called":
-            continue  # follows from another key that is wrong, which is told
-        if item["type"] == "extra_forbidden":
-            yield key, "unknown key", nearest_key(item["loc"], model)
-        elif item["type"] == "missing":
-            yield key, "missing", "this key is needed"
-        elif item["type"] == "string_pattern_mismatch":
-            yield key, f"{item['input']!r}", NAME_DESCRIPTION
-        elif item["type"] == "value_error":
-            yield key or "scenario", str(context["error"]), ""
-        elif item["type"] == "unknown_effect":
-            yield f"{key}.{context['name']}", "unknown effect", context["right"]
-        elif item["type"] == "of_an_effect":
-            yield from _lines(context["error"], context["model"], (key, context["name"]))
-        else:
-            yield key, f"{item['input']!r}", item["msg"][0].lower() + item["msg"][1:]
+        match item["type"]:
+            case "default_factory_not_called":
+                continue  # follows from another problem, which is reported
+            case "extra_forbidden":
+                yield _KeyProblem(key, "unknown key", _suggest_key(item["loc"], model))
+            case "missing":
+                yield _KeyProblem(key, "this key is required")
+            case "string_pattern_mismatch":
+                yield _KeyProblem(key, value, NAME_DESCRIPTION, "a name")
+            case "value_error":
+                yield _KeyProblem(key or "scenario", str(context["error"]))
+            case "unknown_effect":
+                yield _KeyProblem(f"{key}.{context['name']}", "unknown effect", context["hint"])
+            case "effect_parameters":
+                yield from _key_problems(context["error"], context["model"], (key, context["name"]))
+            case _:
+                yield _wrong_value(key, value, item["msg"])
 
 
-def nearest_key(loc: Sequence[str | int], top: type[BaseModel]) -> str:
-    """What the user may have meant by an unknown key of ``top``."""
-    model: type[BaseModel] | None = top
-    if len(loc) == 1 and (inner := _tables_with(str(loc[0]), top)):
-        return f"did you mean {' or '.join(f'{table}.{loc[0]}' for table in inner)}?"
-    for part in loc[:-1]:
-        if model is not None and part in model.model_fields:
-            model = _model_of(model.model_fields[str(part)].annotation)
-    known = sorted(model.model_fields) if model is not None else []
-    near = difflib.get_close_matches(str(loc[-1]), known, 1, 0.5)
-    return f"did you mean {near[0]}?" if near else f"known here are {', '.join(known)}"
+def _wrong_value(key: str, value: str, message: str) -> _KeyProblem:
+    """Return the problem of pydantic's ``message`` about a value."""
+    expectation = _EXPECTATION.match(message)
+    if expectation is None:
+        return _KeyProblem(key, f"{value}: {message[0].lower()}{message[1:]}")
+    expected = expectation["what"]
+    if expected.startswith(("greater ", "less ")):
+        expected = f"a value {expected}"
+    return _KeyProblem(key, value, expected=_TOML_TERMS.get(expected, expected))
 
 
-def _tables_with(key: str, top: type[BaseModel]) -> list[str]:
-    """The tables of ``top`` that know a key."""
-    models = {name: _model_of(field.annotation) for name, field in top.model_fields.items()}
-    return [name for name, model in models.items() if model is not None and key in model.model_fields]
+def _suggest_key(location: Sequence[str | int], top: type[BaseModel]) -> str:
+    """Return a hint at the key of ``top`` that the user may have meant."""
+    key = str(location[-1])
+    fields = top.model_fields
+    if len(location) == 1:
+        tables = [f"{name}.{key}" for name, table in fields.items() if key in _table_fields(table.annotation)]
+        if tables:
+            return f"Did you mean {' or '.join(tables)}?"
+    for part in location[:-1]:
+        if part in fields:
+            fields = _table_fields(fields[str(part)].annotation)
+    similar = difflib.get_close_matches(key, sorted(fields), 1, 0.5)
+    return f"Did you mean {similar[0]}?" if similar else f"Known keys: {', '.join(sorted(fields))}"
 
 
-def _model_of(annotation: Any) -> type[BaseModel] | None:
-    """The model inside an annotation such as ``tuple[SiteLine, ...]`` or ``SiteGrid | None``."""
+def _table_fields(annotation: Any) -> dict[str, FieldInfo]:
+    """Return the keys of the table in an annotation such as ``tuple[SiteLine, ...]`` or ``SiteGrid | None``."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    for inner in getattr(annotation, "__args__", ()):
-        if found := _model_of(inner):
-            return found
-    return None
+        return annotation.model_fields
+    fields = (_table_fields(argument) for argument in getattr(annotation, "__args__", ()))
+    return next(filter(None, fields), {})
 
 
 def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
@@ -110,28 +153,36 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
     path
         The folder, or its ``scenario.toml``.
     overrides
-        ``"key.key=value"``, the value as in TOML (a bare word is taken as a string).
+        ``"table.key=value"``, the value as in TOML; a word without quotes is a string.
 
     Raises
     ------
     InputError
-        Naming file, key, value, and what would be right.
+        When the scenario is invalid, naming the file, the key, the value, and what is expected.
+
+    Examples
+    --------
+    >>> import egvs
+    >>> scenario = egvs.load("scenarios/roundabout", ["traffic.frames=100"])
+    >>> scenario.roi.size_m
+    (70.0, 70.0, 5.0)
     """
-    path, overrides = Path(path), tuple(overrides)
+    path = Path(path)
+    overrides = tuple(overrides)
     file = path / SCENARIO_FILE if path.is_dir() else path
     values = _read_with_bases(file, ())
     for override in overrides:
         if override.partition("=")[0].strip() == "extends":
-            found = "a scenario is extended by its file alone"
-            raise InputError(f"--set {override}", found, "extends = ... in a scenario.toml")
+            hint = f"Write extends = ... into a {SCENARIO_FILE}"
+            raise InputError(f"--set {override}", "the key extends cannot be set here", hint)
         values = _apply_override(values, override)
     try:
         return _build_scenario(values, file)
     except InputError as error:
         if not overrides or not _is_valid_alone(file):
             raise
-        place, right = (text.replace(str(file), "--set") for text in (error.where, error.hint))
-        raise InputError(place, error.problem, right) from None
+        texts = [text.replace(str(file), "--set") for text in (error.where, error.problem, error.hint)]
+        raise InputError(*texts) from None
 
 
 def _build_scenario(values: dict[str, Any], file: Path) -> Scenario:
@@ -141,7 +192,7 @@ def _build_scenario(values: dict[str, Any], file: Path) -> Scenario:
 
 
 def _is_valid_alone(file: Path) -> bool:
-    """Whether a file alone makes a scenario, without what is laid over it."""
+    """Return whether a scenario is valid without overrides."""
     try:
         _build_scenario(_read_with_bases(file, ()), file)
     except InputError:
@@ -150,136 +201,174 @@ def _is_valid_alone(file: Path) -> bool:
 
 
 def check_unused_keys(traffic: TrafficConfig, file: Path) -> None:
-    """InputError where a file sets a key of its traffic that would act on nothing."""
-    for table, source, idle in traffic.unused_keys():
-        found = f"{', '.join(sorted(idle))} would act on nothing beside {source}"
-        raise InputError(f"{file}: {table}", found, "remove it")
+    """Raise an InputError when a file sets keys of ``[traffic]`` that have no effect.
+
+    Parameters
+    ----------
+    traffic
+        The traffic of the file.
+    file
+        The scenario or city, for messages.
+    """
+    for unused in traffic.unused_keys():
+        names = ", ".join(sorted(unused.keys))
+        problem = f"{names} {'have' if len(unused.keys) > 1 else 'has'} no effect with {unused.source}"
+        raise InputError(f"{file}: {unused.table}", problem, f"Remove {names}")
 
 
-def _read_with_bases(file: Path, heirs: tuple[Path, ...]) -> dict[str, Any]:
-    """The values of a scenario file, laid over those of the scenario that it extends."""
+def _read_with_bases(file: Path, extending: tuple[Path, ...]) -> dict[str, Any]:
+    """Return the values of a scenario file and of those that it extends; ``extending`` are the files that extend it."""
     if not file.is_file():
-        place = file.parent if file.name == SCENARIO_FILE else file
-        raise InputError(place, f"no {SCENARIO_FILE} there", _suggest_scenario(place))
-    if file.resolve() in heirs:
-        raise InputError(f"{file}: extends", "leads back to itself", "a scenario that does not extend this one")
+        where = file.parent if file.name == SCENARIO_FILE else file
+        raise InputError(where, f"expected a {SCENARIO_FILE}, got no such file", _suggest_scenario(where))
+    if file.resolve() in extending:
+        raise InputError(f"{file}: extends", "the scenario extends itself", "Extend another scenario")
     values = reading.read_toml(file)
-    if not isinstance(base := values.get("extends", ""), str):
-        raise InputError(f"{file}: extends", f"{base!r}", "the path of a scenario's folder")
-    if not base:
+    extends = values.get("extends", "")
+    if not isinstance(extends, str):
+        raise InputError(f"{file}: extends", f"expected the path of a scenario folder, got {extends!r}")
+    if not extends:
         return values
-    below = _read_with_bases(file.parent / base / SCENARIO_FILE, (*heirs, file.resolve()))
-    return _merge(_drop_replaced_keys(below, values), values)
+    base = _read_with_bases(file.parent / extends / SCENARIO_FILE, (*extending, file.resolve()))
+    return _merge(_drop_replaced_keys(base, values), values)
 
 
-_SITE_RULE_KEYS = ("points", "only_free", "heights_m")
+_SITE_SOURCE_KEYS = ("points", "only_free", "heights_m")
+"""Keys of ``[sites]`` that go with one source of sites; a new source does not take them over."""
 _ALTERNATIVES = (("traffic", TRAFFIC_SOURCES), ("sites", SITE_SOURCES), ("sites", SITE_DIRECTIONS))
 
 
-def _drop_replaced_keys(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
-    """``below`` without the sources of traffic and sites, and the directions of sensors, that ``above`` replaces by
-    others, and what hangs on them."""
-    left = dict(below)
+def _drop_replaced_keys(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    """Drop keys of ``base`` that contradict the ``values`` above it.
+
+    These are sources of traffic and sites and directions of sensors that are replaced by others, and the keys that have
+    an effect with the replaced source only.
+    """
+    remaining = dict(base)
     for table, sources in _ALTERNATIVES:
-        old, new = left.get(table), above.get(table)
+        old = remaining.get(table)
+        new = values.get(table)
         if not isinstance(old, dict) or not isinstance(new, dict):
             continue
         source = next((key for key in sources if key in new), None)
         if source is None or all(key in new for key in sources if key in old):
             continue
-        idle = (
-            _dropped_traffic_keys(source) if table == "traffic" else _SITE_RULE_KEYS if source in SITE_SOURCES else ()
-        )
-        left[table] = {key: value for key, value in old.items() if key not in idle and key not in sources}
-    return left
+        dropped = set(sources)
+        if table == "traffic":
+            dropped |= _dropped_traffic_keys(source)
+        elif source in SITE_SOURCES:
+            dropped.update(_SITE_SOURCE_KEYS)
+        remaining[table] = {key: value for key, value in old.items() if key not in dropped}
+    return remaining
 
 
-def _merge(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
-    merged = dict(below)
-    for key, value in above.items():
-        both = isinstance(value, dict) and isinstance(below.get(key), dict)
-        merged[key] = _merge(below[key], value) if both else value
+def _dropped_traffic_keys(source: str) -> frozenset[str]:
+    """Return the keys of another source of traffic that a new source does not take over."""
+    dropped = keys_without_effect(source) | {"routes"}
+    if source == "fcd":  # a finished file is used completely
+        dropped |= {"frames", "frame_period_s", "warmup_s"}
+    return dropped
+
+
+def _merge(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    """Return ``base`` updated by ``values``, table by table."""
+    merged = dict(base)
+    for key, value in values.items():
+        if isinstance(value, dict) and isinstance(base.get(key), dict):
+            merged[key] = _merge(base[key], value)
+        else:
+            merged[key] = value
     return merged
 
 
-def _bases(folder: Path, extends: str, where: str) -> Iterator[Path]:
-    """The scenario's folder, then those of the scenarios that it extends."""
+def _scenario_folders(folder: Path, extends: str, where: str) -> Iterator[Path]:
+    """Yield the scenario's folder, then those of the scenarios that it extends."""
     yield folder
     while extends:
         folder = folder / extends
         if not (folder / SCENARIO_FILE).is_file():
-            raise InputError(f"{where}: extends", f"no {SCENARIO_FILE} in {folder}", "the path of a scenario's folder")
+            raise InputError(f"{where}: extends", f"expected the path of a scenario folder, got {folder}")
         yield folder
         extends = reading.read_toml(folder / SCENARIO_FILE).get("extends", "")
 
 
 def scenario_from_dict(values: dict[str, Any], folder: Path, where: str) -> Scenario:
-    """Check a scenario that is at hand as nested values (as ``run.json`` holds it)."""
+    """Check a scenario that is given as nested dictionaries, as in ``run.json``.
+
+    Parameters
+    ----------
+    values
+        Tables and keys.
+    folder
+        Folder that paths in the scenario are relative to.
+    where
+        The file, for messages.
+
+    Raises
+    ------
+    InputError
+        When the scenario is invalid.
+    """
     values.setdefault("name", default_name(folder) or "scenario")
     try:
-        scenario = Scenario.of(values)
+        scenario = Scenario.from_dict(values)
     except ValidationError as error:
         raise format_validation_error(error, where) from None
-    scenario._folders = tuple(_bases(folder, scenario.extends, where))
+    scenario._folders = tuple(_scenario_folders(folder, scenario.extends, where))
     Grid.over(scenario.roi.box, scenario.roi.voxel_m, f"{where}: roi")
     return scenario
 
 
 def default_name(folder: Path) -> str:
-    """The name that a folder stands for."""
+    """Return the name of a scenario that is not named otherwise: that of its folder."""
     return re.sub(r'[\s\x00-\x1f\x7f/\\:*?"<>|]+', "_", folder.resolve().name)[:80]
 
 
 def json_schema() -> str:
-    """The JSON Schema that editors use to complete and check a scenario.toml."""
+    """Return the JSON Schema with which editors complete and check a scenario.toml."""
     return json.dumps(Scenario.model_json_schema(), indent=2, ensure_ascii=False) + "\n"
 
 
 def _suggest_scenario(folder: Path) -> str:
-    """What may be meant by a folder that is no scenario's."""
+    """Return a hint at the scenario that may be meant by another folder."""
     if (folder / "city.toml").is_file():
-        return f"it is a city: egvs city run {folder}, or one of its junctions, {folder / 'junctions'}/ID"
+        return f"This is a city. Use egvs city run {folder}, or one of its junctions, {folder / 'junctions'}/ID"
     if (folder / "run.json").is_file():
-        return "it is the folder of a run; the scenario that it is of"
-    return f"a folder with a {SCENARIO_FILE}, or the file itself"
-
-
-def _dropped_traffic_keys(source: str) -> frozenset[str]:
-    """The keys of another traffic that a new source of it does not take over."""
-    simulated = {"frames", "frame_period_s", "warmup_s"} if source == "fcd" else set()  # a finished file is taken whole
-    return unused_keys(source) | {"routes"} | simulated
+        return "This is the folder of a run. Name the folder of its scenario"
+    return f"Name a folder with a {SCENARIO_FILE}, or the file"
 
 
 def _apply_override(values: dict[str, Any], override: str) -> dict[str, Any]:
-    """``values`` with one ``key.key=value`` in them."""
+    """Return ``values`` with one override ``table.key=value``."""
+    where = f"--set {override}"
     key, equals, text = override.partition("=")
     if not equals or not key.strip():
-        raise InputError(f"--set {override}", "no key=value", "for example --set traffic.frames=500")
+        raise InputError(where, "expected KEY=VALUE", "Use for example --set traffic.frames=500")
     try:
         value = reading.parse_toml_value(text)
     except (ValueError, RecursionError):
         value = text
-    *parents, last = words = key.strip().split(".")
-    if parents:
-        values = _drop_replaced_keys(values, {words[0]: {words[1]: value}})
-    top = values
-    for parent in parents:
-        values = _find_row(values, parent, override) if isinstance(values, list) else values.setdefault(parent, {})
-        if not isinstance(values, dict | list):
-            raise InputError(f"--set {override}", f"'{parent}' is not a table", "a key that the scenario knows")
-    if isinstance(values, list):
-        raise InputError(f"--set {override}", f"{last!r} is a row, not a key", f"{key.strip()}.KEY=VALUE")
-    values[last] = value
-    return top
+    parts = key.strip().split(".")
+    if len(parts) > 1:
+        values = _drop_replaced_keys(values, {parts[0]: {parts[1]: value}})
+    table: Any = values
+    for parent in parts[:-1]:
+        table = _find_row(table, parent, where) if isinstance(table, list) else table.setdefault(parent, {})
+        if not isinstance(table, dict | list):
+            raise InputError(where, f"{parent!r} is not a table")
+    if isinstance(table, list):
+        raise InputError(where, f"{parts[-1]!r} is a row, not a key", f"Use {key.strip()}.KEY=VALUE")
+    table[parts[-1]] = value
+    return values
 
 
-def _find_row(rows: list[Any], name_or_number: str, override: str) -> Any:
-    """A row of a list of tables, by its name, else by its number from 0."""
+def _find_row(rows: list[Any], name_or_number: str, where: str) -> Any:
+    """Return a row of a list of tables by its name, else by its number from 0."""
     for row in rows:
         if isinstance(row, dict) and row.get("name") == name_or_number:
             return row
     if name_or_number.isdecimal() and int(name_or_number) < len(rows):
         return rows[int(name_or_number)]
     names = [str(row["name"]) for row in rows if isinstance(row, dict) and "name" in row]
-    right = f"one of {', '.join(names)}, or a number from 0" if names else f"a number from 0 to {len(rows) - 1}"
-    raise InputError(f"--set {override}", f"no row {name_or_number!r}", right)
+    hint = f"Use {', '.join([*names, 'a number'])} from 0 to {len(rows) - 1}"
+    raise InputError(where, f"there is no row {name_or_number!r}", hint)

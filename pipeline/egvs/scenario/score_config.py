@@ -1,125 +1,136 @@
-"""``[score]``, ``[placement]``, ``[costs]``.
-
-``[score]``: how a site is scored, and by which score sites are ranked.
-
-``[placement]`` and ``[costs]``: what is asked of a plan of several sensors, and what it costs.
-"""
+"""The keys of ``[score]``, ``[placement]`` and ``[costs]``: how sites are ranked, and what a plan must meet."""
 
 from __future__ import annotations
 
 import math
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from egvs.scenario.fields import Name, NotNegative, Point2, Positive, StrictModel
+from egvs.scenario.fields import Name, NotNegative, Point2, Positive, StrictModel, find_duplicates
 
 VehicleClass = Literal[
     "pedestrian", "wheelchair", "bicycle", "scooter", "moped", "motorcycle", "passenger", "private", "hov", "taxi",
     "bus", "coach", "delivery", "truck", "trailer", "evehicle", "emergency", "authority", "army", "vip", "tram",
-    "rail_urban",
-    "subway", "rail", "rail_electric", "rail_fast", "ship", "container", "cable_car", "aircraft", "drone", "custom1",
-    "custom2",
+    "rail_urban", "subway", "rail", "rail_electric", "rail_fast", "ship", "container", "cable_car", "aircraft", "drone",
+    "custom1", "custom2",
 ]  # fmt: skip
 """SUMO's vClasses."""
 
 OtherScore = Literal[
     "expected_detections", "seen_well", "points_on_target", "entropy_seen", "coverage", "expected_visibility"
 ]  # fmt: skip
-"""Scores beside the EGVS."""
+"""Scores besides the EGVS."""
 
 DEFAULT_SCORE: OtherScore = "expected_detections"
-"""The score that the study recommends (docs/validity.md), and that new scenarios rank by."""
+"""The score that the validation study recommends (docs/validity.md), and that new scenarios rank by."""
 
-_AT_ONE_METRE, _POWER = 10.0, 1.16
-"""Through the gammas that rank best on the study's training junctions (docs/validity.md, B): 2, 5 and 10 for voxels of
-0.25, 0.5 and 1 m; 1, 2 and 5 with moving occlusion. A line through three points each, of one sensor, no law."""
+_GAMMA_AT_1_M, _GAMMA_EXPONENT = 10.0, 1.16
+"""A fit to the gammas that rank best on the study's training junctions (docs/validity.md, B): 2, 5 and 10 for voxels of
+0.25, 0.5 and 1 m; 1, 2 and 5 with moving occlusion. It interpolates three values each, measured with one sensor."""
 
 
 def default_gamma(voxel_m: float, *, moving_occlusion: bool) -> float:
-    r"""The gamma that ``"auto"`` stands for: :math:`10 (d / 1 m)^{1.16}` for voxels of d metres, half of that with
-    moving occlusion; to two significant digits."""
-    gamma = _AT_ONE_METRE * voxel_m**_POWER
-    return float(f"{gamma / 2 if moving_occlusion else gamma:.2g}")
+    r"""Return the gamma that ``"auto"`` stands for, to two significant digits.
+
+    It is :math:`10 (d / 1 m)^{1.16}` for voxels of d metres, and half of that with moving occlusion.
+
+    Parameters
+    ----------
+    voxel_m
+        Edge length of a voxel.
+    moving_occlusion
+        Whether vehicles occlude one another.
+    """
+    gamma = _GAMMA_AT_1_M * voxel_m**_GAMMA_EXPONENT
+    if moving_occlusion:
+        gamma /= 2
+    return float(f"{gamma:.2g}")
 
 
-def checked_polygon(polygon_m: tuple[Point2, ...]) -> tuple[Point2, ...]:
-    """The corners of a polygon; ValueError where they enclose no area."""
+def _check_polygon(polygon_m: tuple[Point2, ...]) -> tuple[Point2, ...]:
+    """Return the corners of a polygon; ValueError when they enclose no area."""
     import shapely
 
-    if (why := shapely.is_valid_reason(shapely.Polygon(polygon_m))) != "Valid Geometry":
-        raise ValueError(f"no polygon that encloses an area ({why})")
+    reason = shapely.is_valid_reason(shapely.Polygon(polygon_m))
+    if reason != "Valid Geometry":
+        raise ValueError(f"expected a polygon that encloses an area ({reason})")
     return polygon_m
 
 
+Corners = Annotated[tuple[Point2, ...], Field(min_length=3), AfterValidator(_check_polygon)]
+"""Corners of a polygon in the world frame, in order."""
+
+
 class ZoneConfig(StrictModel):
-    """A part of the region in which vehicles count more, or less."""
+    """A part of the region in which vehicles have another weight."""
 
-    polygon_m: tuple[Point2, ...] = Field(min_length=3, description="Its corners in the world frame, in order")
-    weight: float = Field(ge=0, description="How much a vehicle counts whose centre is in it; 1 elsewhere")
-
-    _encloses = field_validator("polygon_m")(checked_polygon)
+    polygon_m: Corners = Field(description="Corners in the world frame, in order")
+    weight: float = Field(ge=0, description="Weight of vehicles whose centre is in the zone; it is 1 elsewhere")
 
 
 class WeightsConfig(StrictModel):
-    """How much vehicles count in the scores over vehicles: a vehicle's kind times every zone that holds its centre."""
+    """Weights of vehicles in the scores over vehicles: that of the kind times those of all zones with its centre."""
 
     kinds: dict[VehicleClass, Annotated[float, Field(ge=0)]] = Field(
         default_factory=dict,
-        description="Weight of each SUMO vClass, 1 where none stands here; people on foot and on bicycles are to be "
-        "seen only where they have one, as in pedestrian = 2",
+        description="Weight of each SUMO vClass. By default 1; pedestrians and bicycles of [effects] only count if "
+        "they have a weight here, e.g. pedestrian = 2",
     )
-    zones: dict[Name, ZoneConfig] = Field(default_factory=dict, description="Parts of the region by a name of your own")
+    zones: dict[Name, ZoneConfig] = Field(default_factory=dict, description="Parts of the region with other weights")
 
     @property
     def are_given(self) -> bool:
-        """Whether there are any."""
+        """Whether any weight is set."""
         return bool(self.kinds or self.zones)
 
     @property
     def in_words(self) -> str:
         """Names and weights: "bus 3, zone crosswalk 2"."""
         kinds = [f"{kind} {weight:g}" for kind, weight in self.kinds.items()]
-        return ", ".join([*kinds, *(f"zone {name} {zone.weight:g}" for name, zone in self.zones.items())])
+        zones = [f"zone {name} {zone.weight:g}" for name, zone in self.zones.items()]
+        return ", ".join([*kinds, *zones])
 
 
 class ScoreConfig(StrictModel):
-    """How a site is scored."""
+    """How sites are scored and ranked."""
 
     gamma: Annotated[float, Field(ge=0, allow_inf_nan=True)] | Literal["auto"] = Field(
         "auto",
-        description="Beams in a voxel above this number count no more; may be inf. 'auto': by the size of the voxels, "
-        "10 (voxel_m / 1 m)^1.16 (2 for 0.25 m, 10 for 1 m), half of that with moving_occlusion",
+        description="Cap of the beams that count in one voxel; may be inf. 'auto' depends on the size of voxels: "
+        "10 (voxel_m / 1 m)^1.16 (2 for 0.25 m, 10 for 1 m), and half of that with moving_occlusion",
     )
-    rank_by: Literal["egvs", OtherScore] = Field("egvs", description="The score that sites are ranked by")
+    rank_by: Literal["egvs", OtherScore] = Field("egvs", description="Score that sites are ranked by")
     others: tuple[OtherScore, ...] = Field(
-        (DEFAULT_SCORE,),
-        description="Further scores that scores.parquet gets, beside egvs and the one that ranks",
+        (DEFAULT_SCORE,), description="Further scores in scores.parquet, besides egvs and the score of rank_by"
     )
     weights: WeightsConfig = WeightsConfig()
     keep_visibility: tuple[str, ...] | Literal["all"] = Field(
-        (), description="Sites whose hits in every voxel are written to visibility.parquet"
+        (), description="Names of sites, or 'all', whose beams in each voxel are written to visibility.parquet"
     )
     blindspots: bool = Field(True, description="Write blindspots.parquet: where each site misses vehicles")
-    standard_error: bool = Field(True, description="Say how far each score may be off because the traffic was short")
+    standard_error: bool = Field(True, description="Estimate the standard errors due to finite traffic")
 
     @field_validator("gamma", mode="before")
     @classmethod
-    def _from_json(cls, gamma: Any) -> Any:
+    def _parse_inf(cls, gamma: Any) -> Any:
+        """JSON has no infinity: it is written as text."""
         return math.inf if gamma == "inf" else gamma
 
     @field_validator("others")
     @classmethod
-    def _each_once(cls, others: tuple[OtherScore, ...]) -> tuple[OtherScore, ...]:
-        if twice := sorted({name for name in others if others.count(name) > 1}):
-            raise ValueError(f"{twice[0]} stands there twice")
+    def _check_duplicates(cls, others: tuple[OtherScore, ...]) -> tuple[OtherScore, ...]:
+        duplicates = find_duplicates(others)
+        if duplicates:
+            raise ValueError(f"{duplicates[0]} is listed twice")
         return others
 
     @property
     def additional(self) -> tuple[OtherScore, ...]:
-        """The scores beside the EGVS that are asked for, each once: the one that ranks first."""
-        first = () if self.rank_by == "egvs" else (self.rank_by,)
-        return (*first, *(name for name in self.others if name not in first))
+        """The scores to compute besides the EGVS, without duplicates; the one that sites are ranked by is the first."""
+        if self.rank_by == "egvs":
+            return self.others
+        return (self.rank_by, *(name for name in self.others if name != self.rank_by))
 
 
 Share = Annotated[float, Field(gt=0, le=1)]
@@ -128,94 +139,90 @@ Tilt = Annotated[float, Field(ge=-90, le=90)]
 
 
 class CostsConfig(StrictModel):
-    """What a candidate costs, in any currency; a column ``cost`` of the sites file says it of a row in their place."""
+    """Costs of a candidate, in any currency. A value in the column ``cost`` of the sites file replaces them."""
 
-    sensor: dict[str, NotNegative] = Field(default_factory=dict, description="Of each sensor by its name")
-    pole: NotNegative = Field(0.0, description="Of a pole, once for all sensors at it")
-    metre: NotNegative = Field(0.0, description="Of each metre of a sensor's height z_m")
+    sensor: dict[str, NotNegative] = Field(default_factory=dict, description="Cost of each sensor, by its name")
+    pole: NotNegative = Field(0.0, description="Cost of a pole, once for all sensors on it")
+    metre: NotNegative = Field(0.0, description="Cost per metre of a sensor's height z_m")
 
     @property
     def are_given(self) -> bool:
-        """Whether any is."""
+        """Whether any cost is set."""
         return bool(self.sensor or self.pole or self.metre)
 
 
 class ZoneDemand(StrictModel):
-    """A part of the region that a plan must see."""
+    """A part of the region that a plan must cover."""
 
-    polygon_m: tuple[Point2, ...] = Field(min_length=3, description="Its corners in the world frame, in order")
-    share: Share = Field(description="Of its entropy: of the voxels whose centre is in it")
-    by: int = Field(1, ge=1, description="Sensors that must see a voxel for it to count")
-
-    _encloses = field_validator("polygon_m")(checked_polygon)
+    polygon_m: Corners = Field(description="Corners in the world frame, in order")
+    share: Share = Field(description="Share of the zone's occupancy entropy that must be visible")
+    by: int = Field(1, ge=1, description="Number of sensors that must see a voxel for it to count as visible")
 
 
 class RefinementConfig(StrictModel):
-    """How far the sensors of a plan may move from their candidates' poses; those that are forced stay."""
+    """How far the sensors of a plan may be moved from the poses of their candidates. Forced sensors are not moved."""
 
     radius_m: NotNegative | None = Field(
         None,
-        description="A pole in plan; one of sites.along along its line, by half the spacing if not given. Else 0",
+        description="Distance that a pole may be moved by in plan, or along its line for sites.along. By default half "
+        "the spacing for sites.along, else 0",
     )
-    within_m: tuple[tuple[Point2, ...], ...] = Field(
-        (), description="Polygons: a pole that stands in one may be anywhere in it, whatever radius_m says"
+    within_m: tuple[Corners, ...] = Field(
+        (), description="Polygons: a pole inside one may be moved anywhere in it, regardless of radius_m"
     )
     heights_m: tuple[Positive, Positive] | None = Field(
-        None, description="Lowest and highest z_m; those of all candidates where it is not given"
+        None, description="Lowest and highest z_m. By default those of all candidates"
     )
-    yaw_deg: tuple[Turn, Turn] | None = Field(None, description="From, to; any where it is not given")
-    pitch_deg: tuple[Tilt, Tilt] = Field((-30.0, 10.0), description="Lowest and highest, nose up positive")
+    yaw_deg: tuple[Turn, Turn] | None = Field(None, description="Lowest and highest yaw. By default any")
+    pitch_deg: tuple[Tilt, Tilt] = Field((-30.0, 10.0), description="Lowest and highest pitch, positive for nose up")
     roll_deg: tuple[Turn, Turn] | None = Field(
-        None, description="From, to; as the candidate has it where it is not given"
+        None, description="Lowest and highest roll. By default that of the candidate"
     )
-    evaluations: int = Field(300, ge=20, description="Poses that are tried for a sensor in its turn")
-
-    _enclose = field_validator("within_m")(lambda polygons: tuple(map(checked_polygon, polygons)))
+    evaluations: int = Field(300, ge=20, description="Number of poses that are tried for a sensor in each round")
 
     @field_validator("heights_m", "yaw_deg", "pitch_deg", "roll_deg")
     @classmethod
-    def _ascending(cls, ends: tuple[float, float] | None) -> tuple[float, float] | None:
-        if ends is not None and ends[0] > ends[1]:
-            raise ValueError(f"{ends[0]:g} to {ends[1]:g}: the lower end comes first")
-        return ends
+    def _check_ascending(cls, limits: tuple[float, float] | None) -> tuple[float, float] | None:
+        if limits is not None and limits[0] > limits[1]:
+            raise ValueError(f"expected the lower limit first, got {limits[0]:g} and {limits[1]:g}")
+        return limits
 
 
 class PlacementConfig(StrictModel):
-    """What is asked of a plan; options of ``egvs place`` take the place of keys."""
+    """What a plan of several sensors must meet. Options of ``egvs place`` override these keys."""
 
-    count: int | None = Field(None, ge=1, description="Sensors at most, those forced among them")
-    budget: Positive | None = Field(None, description="Cost at most, see [costs]; forced candidates are free")
+    count: int | None = Field(None, ge=1, description="Maximum number of sensors, including forced ones")
+    budget: Positive | None = Field(None, description="Maximum cost, see [costs]; forced candidates are free")
     reach: Share | None = Field(
-        None, description="The fewest sensors that reach this share of what all candidates together would"
+        None, description="Find the fewest sensors that reach this share of the score of all candidates together"
     )
-    forced: tuple[str, ...] = Field((), description="Candidates that are there already: part of every plan")
-    excluded: tuple[str, ...] = Field((), description="Candidates, or poles, that are part of none")
-    most_per_pole: int | None = Field(None, ge=1, description="Sensors at one pole at most")
-    least_distance_m: NotNegative = Field(0.0, description="Between any two sensors")
-    zones: dict[Name, ZoneDemand] = Field(default_factory=dict, description="Parts of the region that must be seen")
+    forced: tuple[str, ...] = Field((), description="Candidates that exist already and are part of every plan")
+    excluded: tuple[str, ...] = Field((), description="Candidates or poles that are not used")
+    most_per_pole: int | None = Field(None, ge=1, description="Maximum number of sensors on a pole. By default any")
+    least_distance_m: NotNegative = Field(0.0, description="Minimum distance between any two sensors")
+    zones: dict[Name, ZoneDemand] = Field(default_factory=dict, description="Parts of the region to cover, by name")
     objective: Literal["mean", "worst"] = Field(
         "mean",
-        description="Of traffic with periods: their mix, or the period of which the least is seen, as a share of what "
-        "all candidates together would",
+        description="For traffic with periods: 'mean' maximises the score of their mix, 'worst' that of the period "
+        "with the smallest share of the score of all candidates together",
     )
-    periods: tuple[str, ...] = Field(
-        (), description='Those of which objective = "worst" takes the worst; all by default'
-    )
+    periods: tuple[str, ...] = Field((), description='Periods that objective = "worst" considers. By default all')
     survives: int = Field(
-        0, ge=0, le=1, description="1: what counts is what is left when the sensor that is missed most has failed"
+        0, ge=0, le=1, description="1: maximise the score that remains when the most important sensor fails"
     )
     refine: RefinementConfig | None = Field(
-        None, description="Let the sensors of the plan move, as --refine does; within what the keys of this table say"
+        None, description="Move the sensors of the plan, as with --refine, within the limits of this table"
     )
 
     @model_validator(mode="after")
-    def _no_name_in_both(self) -> PlacementConfig:
+    def _check_names(self) -> PlacementConfig:
         for key in ("forced", "excluded", "periods"):
-            names = getattr(self, key)
-            if twice := sorted({name for name in names if names.count(name) > 1}):
-                raise ValueError(f"{key} names {twice[0]} twice")
-        if both := [name for name in self.forced if name in self.excluded]:
-            raise ValueError(f"{both[0]} is forced and excluded: it can be one of them")
+            duplicates = find_duplicates(getattr(self, key))
+            if duplicates:
+                raise ValueError(f"{key} lists {duplicates[0]} twice")
+        for name in self.forced:
+            if name in self.excluded:
+                raise ValueError(f"{name} is both forced and excluded")
         if self.survives and self.count is not None and self.count < 2:
-            raise ValueError("survives = 1 with count = 1: nothing is left when the only sensor fails; a count above 1")
+            raise ValueError("survives = 1 needs a count above 1: nothing remains when the only sensor fails")
         return self

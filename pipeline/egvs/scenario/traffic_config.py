@@ -1,38 +1,38 @@
-"""The keys of ``[traffic]``: where vehicles come from, how many, how long they are watched."""
+"""The keys of ``[traffic]``: where vehicles come from, how many there are, and how long they are recorded."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from egvs.scenario.fields import Name, Positive, StrictModel
+from egvs.scenario.fields import Name, Positive, StrictModel, find_duplicates
 
 _ATTRIBUTE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*")
-"""What an attribute of a vType may be called: it is written into XML as it stands."""
+"""Names of attributes of a vType, which are written into XML unchanged."""
 
 
 class VehicleKind(StrictModel):
-    """One row of the fleet: a SUMO vType with its real size and its share of the trips."""
+    """A kind of vehicle in the fleet: a SUMO vType with its size and its share of the trips."""
 
-    name: Name = Field(description="Identifier of the SUMO vType; for a finished FCD file, the type that it names")
+    name: Name = Field(description="Id of the SUMO vType; with a finished FCD file, the type that the file names")
     vclass: str = Field("passenger", description="SUMO vClass")
     share: Positive = Field(1.0, description="Share of the trips, relative to the other kinds")
-    length_m: Positive
-    width_m: Positive
-    height_m: Positive
+    length_m: Positive = Field(description="Length of the vehicle")
+    width_m: Positive = Field(description="Width of the vehicle")
+    height_m: Positive = Field(description="Height of the vehicle")
     attributes: dict[str, str | float] = Field(
-        default_factory=dict, description="Further attributes of the SUMO vType, under SUMO's own names"
+        default_factory=dict, description="Further attributes of the SUMO vType, by SUMO's names"
     )
 
     @field_validator("attributes")
     @classmethod
-    def _named_as_in_sumo(cls, attributes: dict[str, str | float]) -> dict[str, str | float]:
+    def _check_attribute_names(cls, attributes: dict[str, str | float]) -> dict[str, str | float]:
         for name in attributes:
             if _ATTRIBUTE_NAME.fullmatch(name) is None:
-                raise ValueError(f"{name[:80]!r} is no attribute's name: letters and digits, as in SUMO's sigma")
+                raise ValueError(f"expected a name of letters and digits, such as sigma, got {name[:80]!r}")
         return attributes
 
 
@@ -40,72 +40,87 @@ EdgeId = Annotated[str, Field(min_length=1)]
 
 
 class CountConfig(StrictModel):
-    """Vehicles an hour that were counted on an edge, or on their way from one edge to another."""
+    """A traffic count: vehicles per hour on an edge, or from one edge to another."""
 
-    edge: EdgeId | None = Field(None, description="Id of an edge of the network; or from_edge and to_edge")
-    from_edge: EdgeId | None = Field(None, description="Id of the edge from which vehicles were counted")
+    edge: EdgeId | None = Field(None, description="Id of an edge of the network; or set from_edge and to_edge")
+    from_edge: EdgeId | None = Field(None, description="Id of the edge that the counted vehicles came from")
     to_edge: EdgeId | None = Field(
-        None, description="Id of the edge to which they drove, at the next junction or beyond"
+        None, description="Id of the edge that they drove to, at the next junction or beyond"
     )
-    per_hour: float = Field(ge=0, le=1e5, description="Vehicles an hour")
-    kind: str = Field("", description="The kind counted; not given: the whole fleet, its kinds by their shares")
+    per_hour: float = Field(ge=0, le=1e5, description="Vehicles per hour")
+    kind: str = Field("", description="Kind of vehicle that was counted. By default the whole fleet")
 
     @model_validator(mode="after")
     def _check_location(self) -> CountConfig:
-        given = tuple(key is not None for key in (self.edge, self.from_edge, self.to_edge))
-        if given not in ((True, False, False), (False, True, True)):
-            raise ValueError("either edge, or both from_edge and to_edge are needed")
+        is_set = tuple(edge is not None for edge in (self.edge, self.from_edge, self.to_edge))
+        if is_set not in ((True, False, False), (False, True, True)):
+            raise ValueError("expected either edge, or both from_edge and to_edge")
         if self.edge is None and self.from_edge == self.to_edge:
             raise ValueError(f"from_edge and to_edge are both {self.from_edge!r}")
         return self
 
     @property
     def title(self) -> str:
-        """The counted place in words."""
+        """The counted location: "edge" or "edge to edge"."""
         return self.edge or f"{self.from_edge} to {self.to_edge}"
 
 
 class PeriodConfig(StrictModel):
-    """A part of the day with traffic of its own; a key that is not given is that of ``[traffic]``."""
+    """A part of the day with traffic of its own. Keys that are not set are those of ``[traffic]``."""
 
-    name: Name = Field(description="Shown in results: morning, midday, evening, night")
-    weight: Positive = Field(1.0, description="Share of the mix, relative to the other periods: its hours, for example")
-    sumocfg: str | None = Field(None, description="Its own .sumocfg")
-    fcd: str | None = Field(None, description="Its own finished FCD file")
-    routes: tuple[str, ...] = Field((), description="Its own route files for the network")
-    counts: tuple[CountConfig, ...] = Field((), description="Its own counted vehicles")
-    vehicles: int | None = Field(None, ge=1, description="Its own number of vehicles at all times")
+    name: Name = Field(description="Name in results, e.g. morning, midday, evening or night")
+    weight: Positive = Field(1.0, description="Share of the mix, relative to the other periods, e.g. hours")
+    sumocfg: str | None = Field(None, description="SUMO configuration of this period")
+    fcd: str | None = Field(None, description="Finished FCD file of this period")
+    routes: tuple[str, ...] = Field((), description="Route files of this period")
+    counts: tuple[CountConfig, ...] = Field((), description="Traffic counts of this period")
+    vehicles: int | None = Field(None, ge=1, description="Number of vehicles in the network in this period")
     begin_s: float | None = Field(None, ge=0, description="As traffic.begin_s")
-    length_s: Positive | None = Field(None, description="Time recorded, instead of traffic.frames")
+    length_s: Positive | None = Field(None, description="Duration of the recording, instead of traffic.frames")
 
     @model_validator(mode="after")
-    def _one_source(self) -> PeriodConfig:
+    def _check_source(self) -> PeriodConfig:
         if self.sumocfg is not None and self.fcd is not None:
-            raise ValueError("sumocfg and fcd: a period has one source")
+            raise ValueError("expected sumocfg or fcd, got both")
         return self
 
-    def over(self, traffic: TrafficConfig) -> TrafficConfig:
-        """The traffic of this period alone; ValueError where the keys do not go together."""
+    def apply_to(self, traffic: TrafficConfig) -> TrafficConfig:
+        """Return the traffic of this period.
+
+        Parameters
+        ----------
+        traffic
+            The complete traffic.
+
+        Raises
+        ------
+        ValueError
+            When the keys contradict each other.
+        """
         values = {key: getattr(traffic, key) for key in traffic.model_fields_set - {"periods"}}
-        if source := next((key for key in ("sumocfg", "fcd") if getattr(self, key) is not None), None):
-            for key in (*TRAFFIC_SOURCES, "routes", "counts"):
-                values.pop(key, None)
-            values[source] = getattr(self, source)
+        for source in ("sumocfg", "fcd"):
+            if getattr(self, source) is not None:
+                for key in (*TRAFFIC_SOURCES, "routes", "counts"):
+                    values.pop(key, None)
+                values[source] = getattr(self, source)
         own = {key: getattr(self, key) for key in ("routes", "counts", "vehicles", "begin_s")}
-        values |= {key: value for key, value in own.items() if value is not None and value != ()}
-        for given, other in (("routes", "counts"), ("counts", "routes")):
-            if own[given] and not own[other]:
-                values.pop(other, None)
+        values |= {key: value for key, value in own.items() if value not in (None, ())}
+        if self.routes and not self.counts:
+            values.pop("counts", None)
+        if self.counts and not self.routes:
+            values.pop("routes", None)
         if self.length_s is not None:
-            exact = self.length_s / traffic.frame_period_s
-            if abs(exact - round(exact)) > 1e-9 * exact:
-                period = f"{traffic.frame_period_s:g} s"
-                raise ValueError(f"period {self.name!r}: length_s = {self.length_s:g} is no whole number of {period}")
-            values["frames"] = round(exact)
+            frames = self.length_s / traffic.frame_period_s
+            if abs(frames - round(frames)) > 1e-9 * frames:
+                multiple = f"a multiple of {traffic.frame_period_s:g} s"
+                raise ValueError(f"period {self.name!r}: length_s = {self.length_s:g} is not {multiple}")
+            values["frames"] = round(frames)
         try:
             return TrafficConfig(**values)
         except ValidationError as error:
-            raise ValueError(f"period {self.name!r}: {error.errors()[0]['msg']}") from None
+            raise ValueError(
+                f"period {self.name!r}: {error.errors()[0]['msg'].removeprefix('Value error, ')}"
+            ) from None
 
 
 _DEFAULT_FLEET = (
@@ -116,193 +131,227 @@ _DEFAULT_FLEET = (
 )
 
 DEFAULT_FRAMES, DEFAULT_WARMUP_S = 5000, 300.0
-"""What is recorded where a scenario does not say it, and the time before; a finished file is taken whole."""
+"""Defaults of simulated traffic; a finished file is used completely."""
 
 
-def _is_finished(given: dict[str, Any]) -> bool:
-    """Whether the traffic of these keys comes from a finished file."""
-    return given.get("fcd") is not None
+def _is_finished(values: dict[str, Any]) -> bool:
+    """Return whether the traffic comes from a finished FCD file; ``values`` are the keys before ``frames``."""
+    return values.get("fcd") is not None
 
 
-def _of_first_period(given: dict[str, Any], key: str) -> str | None:
-    """Where each period has its own source and ``[traffic]`` none, the first one's stands for what all share."""
-    periods = given.get("periods")
-    if not periods or any(given.get(source) is not None for source in ("network", "sumocfg")):
+def _first_source(values: dict[str, Any], key: str) -> str | None:
+    """Return the source of the first period, where ``[traffic]`` has none: it serves for what all periods share."""
+    periods = values.get("periods")
+    if not periods or any(values.get(source) is not None for source in ("network", "sumocfg")):
         return None
     source: str | None = getattr(periods[0], key)
     return source
 
 
 TRAFFIC_SOURCES = ("network", "sumocfg", "fcd")
-"""Keys that say where vehicles come from; a scenario has one of them."""
+"""Keys that set where vehicles come from; exactly one must be set."""
 
 _RATE_KEYS = frozenset({"vehicles_per_lane_km", "trips_per_s", "min_trip_m"})
-"""Keys that say how many trips are drawn where none were counted."""
+"""Keys for random trips, which have no effect with counts."""
 
 
-def unused_keys(source: str) -> frozenset[str]:
-    """The keys that act on nothing with this source: one of :data:`TRAFFIC_SOURCES`, or "routes" for a network with
-    routes."""
-    drawn = _RATE_KEYS | {"counts", "edge_weights", "kinds"}
-    simulated = frozenset({"vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s"})
+class UnusedKeys(NamedTuple):
+    """Keys that are set although they have no effect.
+
+    Attributes
+    ----------
+    table
+        The table with the keys.
+    source
+        Key that makes them unused, e.g. "fcd".
+    keys
+        The keys.
+    """
+
+    table: str
+    source: str
+    keys: set[str]
+
+
+def keys_without_effect(source: str) -> frozenset[str]:
+    """Return the keys that have no effect with a source of traffic.
+
+    Parameters
+    ----------
+    source
+        One of :data:`TRAFFIC_SOURCES`, or "routes" for a network with routes.
+    """
+    demand = _RATE_KEYS | {"counts", "edge_weights", "kinds"}
+    simulation = frozenset({"vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s"})
     if source == "fcd":
-        return simulated | drawn - {"kinds"} | {"routes"}
-    return {"sumocfg": drawn | {"routes"}, "routes": drawn}.get(source, frozenset()) | {"vtypes", "roads"}
+        return simulation | demand - {"kinds"} | {"routes"}
+    unused = frozenset({"vtypes", "roads", "fcd_geo"})
+    if source == "network":
+        return unused
+    return unused | demand | ({"routes"} if source == "sumocfg" else set())
 
 
 class TrafficConfig(StrictModel):
-    """Where vehicles come from: a network (with drawn or given demand), a SUMO configuration, or a finished FCD
+    """Where vehicles come from: a network (with random or given demand), a SUMO configuration, or a finished FCD
     file.
     """
 
     network: str | None = Field(
-        None, description="A .net.xml(.gz) or an OpenStreetMap file; may start with $SUMO_HOME/"
+        None, description="SUMO network (.net.xml, .net.xml.gz) or OpenStreetMap file; may start with $SUMO_HOME/"
     )
     periods: tuple[PeriodConfig, ...] = Field(
-        (), description="Parts of the day with traffic of their own, mixed by weight; scores are told for each, too"
+        (), description="Parts of the day with traffic of their own, mixed by their weights and scored one by one"
     )
     routes: tuple[str, ...] = Field(
-        (), description="Route files for the network; none: trips are drawn between its fringe edges"
+        (), description="Route files for the network. By default, random trips are drawn between its fringe edges"
     )
     sumocfg: str | None = Field(
-        default_factory=lambda given: _of_first_period(given, "sumocfg"),
-        description="A .sumocfg that names network and demand",
+        default_factory=lambda values: _first_source(values, "sumocfg"),
+        description="SUMO configuration (.sumocfg) that names network and demand",
     )
     fcd: str | None = Field(
-        default_factory=lambda given: _of_first_period(given, "fcd"),
-        description="A finished FCD file (XML, CSV or Parquet, may be gzipped); nothing is simulated",
+        default_factory=lambda values: _first_source(values, "fcd"),
+        description="Finished FCD file (XML, CSV or Parquet, may be gzipped); nothing is simulated",
+    )
+    fcd_geo: bool = Field(
+        False, description="x and y of the finished FCD file are longitude and latitude (SUMO's --fcd-output.geo)"
     )
     roads: str | None = Field(
         None,
-        description="The network on which the vehicles of a finished FCD file drove (as `network`): maps show it, blind"
-        " spots name its lanes, checks hold sites against it",
+        description="Network (as in `network`) on which the vehicles of a finished FCD file drove. It is shown on maps,"
+        " names lanes with blind spots, and is used to check sites",
     )
     vtypes: tuple[str, ...] = Field(
-        (), description="SUMO files with <vType>s: the sizes in a finished FCD file; kinds come before them"
+        (), description="SUMO files with <vType>s: sizes of vehicles in a finished FCD file; `kinds` override them"
     )
     vehicles: int | None = Field(
         None,
         ge=1,
-        description="Vehicles in the whole network at all times; not given, routes and a sumocfg are taken as they are"
-        " and drawn trips follow vehicles_per_lane_km",
+        description="Number of vehicles in the network at all times. By default, demand is used unchanged and random "
+        "trips follow vehicles_per_lane_km",
     )
     vehicles_per_lane_km: Positive = Field(
-        4.0, description="Drawn trips where vehicles is not given: vehicles for each km of lanes that the fleet may use"
+        4.0, description="Vehicles per km of lanes that the fleet may use, for random trips when vehicles is not set"
     )
     hold: Literal["exactly", "at_most"] = Field(
-        "exactly", description="Whether a frame with fewer vehicles than are to be held is an error"
+        "exactly", description="'exactly': a frame with fewer than `vehicles` is an error; 'at_most': it is allowed"
     )
     frames: int | None = Field(
-        default_factory=lambda given: None if _is_finished(given) else DEFAULT_FRAMES,
+        default_factory=lambda values: None if _is_finished(values) else DEFAULT_FRAMES,
         ge=1,
         le=2**32 - 1,
-        description=f"Frames to record; {DEFAULT_FRAMES} if not given, of a finished file all",
+        description=f"Number of recorded frames. By default {DEFAULT_FRAMES}, or all of a finished file",
     )
-    frame_period_s: Positive = Field(1.0, description="Time between two frames; a whole number of steps")
+    frame_period_s: Positive = Field(1.0, description="Time between two frames; a multiple of step_s")
     begin_s: float | None = Field(
         None,
         ge=0,
-        description="The simulation's clock when it begins, warmup_s before the first frame; not given, that of the"
-        " sumocfg, or 0. Of a finished file: seconds of it that are left out before the warm-up",
+        description="Simulation time at the beginning, warmup_s before the first frame. By default that of the sumocfg,"
+        " or 0. For a finished file: seconds of it that are skipped before the warm-up",
     )
     step_s: Positive = Field(0.25, description="SUMO's step length")
     warmup_s: float = Field(
-        default_factory=lambda given: 0.0 if _is_finished(given) else DEFAULT_WARMUP_S,
+        default_factory=lambda values: 0.0 if _is_finished(values) else DEFAULT_WARMUP_S,
         ge=0,
-        description=f"Time before the first frame; {DEFAULT_WARMUP_S:g} if not given, of a finished file 0",
+        description=f"Time before the first frame. By default {DEFAULT_WARMUP_S:g}, or 0 for a finished file",
     )
     lateral_resolution_m: float = Field(
-        0.8, ge=0, description="SUMO's sublane width; 0 makes lane changes instant jumps"
+        0.8, ge=0, description="Width of SUMO's sublanes; 0 makes lane changes instantaneous"
     )
     trips_per_s: Positive = Field(
-        2.0, description="Rate of drawn trips; more than the network takes, so that N is held"
+        2.0, description="Rate of random trips; higher than the network can take, so that `vehicles` is maintained"
     )
     max_depart_delay_s: Positive | None = Field(
         None,
-        description="A trip that could not start for so long is given up; not given, drawn trips are after 120 s and a"
-        " demand of your own never",
+        description="Time after which a trip that cannot depart is discarded. By default 120 s for random trips, and"
+        " never for your own demand",
     )
-    min_trip_m: float = Field(0.0, ge=0, description="Drawn trips are at least so long as the crow flies")
+    min_trip_m: float = Field(0.0, ge=0, description="Minimum straight-line distance of random trips")
     edge_weights: dict[str, Annotated[float, Field(ge=0)]] = Field(
-        default_factory=dict,
-        description="Drawn trips that start or end at an edge, relative to others; its number of lanes if not named",
+        default_factory=dict, description="Weight of an edge (id) as end of random trips. By default its lanes"
     )
     counts: tuple[CountConfig, ...] = Field(
-        (), description="Counted vehicles; not given: trips are drawn between the network's fringe edges"
+        (), description="Traffic counts. By default, random trips are drawn between the network's fringe edges"
     )
     kinds: tuple[VehicleKind, ...] = Field(
-        _DEFAULT_FLEET, min_length=1, description="The fleet of drawn trips; the sizes in a finished FCD file"
+        _DEFAULT_FLEET, min_length=1, description="The fleet of random trips; sizes of vehicles in a finished FCD file"
     )
 
     @model_validator(mode="after")
-    def _periods(self) -> TrafficConfig:
-        names = [period.name.casefold() for period in self.periods]  # folders that some systems do not tell apart
-        if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise ValueError(f"two periods have the same name: {', '.join(twice)}")
+    def _check_periods(self) -> TrafficConfig:
+        # names become folders, and some file systems ignore case
+        duplicates = find_duplicates([period.name.casefold() for period in self.periods])
+        if duplicates:
+            raise ValueError(f"two periods have the same name: {', '.join(duplicates)}")
         for period in self.periods:
-            period.over(self)
+            period.apply_to(self)
         return self
 
     @model_validator(mode="after")
-    def _one_source(self) -> TrafficConfig:
-        given = [key for key in TRAFFIC_SOURCES if getattr(self, key) is not None]
-        if len(given) != 1:
-            raise ValueError(
-                f"exactly one of network, sumocfg and fcd is needed, found {' and '.join(given) or 'none'}"
-            )
-        names = [kind.name for kind in self.kinds]
-        if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise ValueError(f"two kinds have the same name: {', '.join(twice)}")
+    def _check_source(self) -> TrafficConfig:
+        sources = [key for key in TRAFFIC_SOURCES if getattr(self, key) is not None]
+        if len(sources) != 1:
+            actual = " and ".join(sources) or "none"
+            raise ValueError(f"expected exactly one of network, sumocfg and fcd, got {actual}")
+        duplicates = find_duplicates([kind.name for kind in self.kinds])
+        if duplicates:
+            raise ValueError(f"two kinds have the same name: {', '.join(duplicates)}")
         return self
 
     @model_validator(mode="after")
-    def _counted_once(self) -> TrafficConfig:
-        places = [(count.title, count.kind) for count in self.counts]
-        if twice := sorted({place for place in places if places.count(place) > 1}):
-            told = ", ".join(f"{place} ({kind})" if kind else place for place, kind in twice)
-            raise ValueError(f"counts: given twice for {told}; one for each place and kind")
+    def _check_counts(self) -> TrafficConfig:
+        duplicates = find_duplicates([(count.title, count.kind) for count in self.counts])
+        if duplicates:
+            names = ", ".join(f"{title} ({kind})" if kind else title for title, kind in duplicates)
+            raise ValueError(f"counts: expected one count for each location and kind, got two for {names}")
         if self.counts and not any(count.per_hour for count in self.counts):
-            raise ValueError("counts: no vehicle was counted anywhere; at least one per_hour above 0")
+            raise ValueError("counts: expected at least one per_hour above 0")
         return self
 
     @model_validator(mode="after")
-    def _not_endless(self) -> TrafficConfig:
+    def _check_amounts(self) -> TrafficConfig:
         frames = self.frames or 0
-        lasts_s = self.warmup_s + frames * self.frame_period_s
+        duration_s = self.warmup_s + frames * self.frame_period_s
         counted_per_s = sum(count.per_hour for count in self.counts) / 3600.0
-        for what, amount, most in (
+        for what, amount, maximum in (
             ("frames", frames, 10_000_000),
-            ("seconds of traffic", lasts_s, 1e7),
-            ("drawn trips (trips_per_s times these seconds)", lasts_s * self.trips_per_s, 1e7),
-            ("counted vehicles (per_hour for all this time)", lasts_s * counted_per_s, 1e7),
+            ("seconds of traffic", duration_s, 1e7),
+            ("random trips (trips_per_s times these seconds)", duration_s * self.trips_per_s, 1e7),
+            ("counted vehicles (per_hour for all this time)", duration_s * counted_per_s, 1e7),
         ):
-            if amount > most:
-                raise ValueError(f"{amount:,.0f} {what}: at most {most:,.0f} can be handled")
+            if amount > maximum:
+                raise ValueError(f"expected at most {maximum:,.0f} {what}, got {amount:,.0f}")
         return self
 
     @property
     def named_kinds(self) -> tuple[VehicleKind, ...]:
-        """The kinds that the scenario itself names."""
-        return self.kinds if self.kinds != _DEFAULT_FLEET else ()
+        """The kinds that the scenario sets; none for the default fleet."""
+        return () if self.kinds == _DEFAULT_FLEET else self.kinds
 
-    def unused_keys(self) -> Iterator[tuple[str, str, set[str]]]:
-        """Tables with keys that the user set although they act on nothing: the table, the source of its traffic, the
-        keys. A key of ``[traffic]`` acts if it does in any period."""
-        alone = [period.over(self) for period in self.periods] or [self]
-        found = [traffic._unused() for traffic in alone]
-        if everywhere := set.intersection(*(idle for _, idle in found)) & self.model_fields_set:
-            yield "traffic", found[0][0], everywhere
-        for period, (source, idle) in zip(self.periods, found, strict=False):
-            if own := idle & period.model_fields_set:
-                yield f"traffic.periods ({period.name})", source, own
+    def unused_keys(self) -> Iterator[UnusedKeys]:
+        """Yield keys that the user set although they have no effect.
 
-    def _unused(self) -> tuple[str, set[str]]:
-        """The source of the traffic, and the keys that act on nothing with this source."""
+        A key of ``[traffic]`` has an effect if it has one in any period.
+        """
+        unused = [traffic._unused_keys() for traffic in [period.apply_to(self) for period in self.periods] or [self]]
+        everywhere = set.intersection(*(item.keys for item in unused)) & self.model_fields_set
+        if everywhere:
+            yield UnusedKeys("traffic", unused[0].source, everywhere)
+        for period, in_period in zip(self.periods, unused, strict=False):
+            keys = in_period.keys & period.model_fields_set
+            if keys:
+                yield UnusedKeys(f"traffic.periods ({period.name})", in_period.source, keys)
+
+    def _unused_keys(self) -> UnusedKeys:
+        """Return the keys that have no effect in this traffic, without regard to periods."""
         source = next(key for key in TRAFFIC_SOURCES if getattr(self, key) is not None)
         if self.routes and source == "network":
             source = "routes"
-        if idle := self.model_fields_set & unused_keys(source):
-            return source, set(idle)
-        if self.counts and (idle := self.model_fields_set & _RATE_KEYS):
-            return "counts", idle
-        return "vehicles", self.model_fields_set & ({"vehicles_per_lane_km"} if self.vehicles is not None else set())
+        keys = self.model_fields_set & keys_without_effect(source)
+        if not keys and self.counts:
+            source = "counts"
+            keys = self.model_fields_set & _RATE_KEYS
+        if not keys and self.vehicles is not None:
+            source = "vehicles"
+            keys = self.model_fields_set & {"vehicles_per_lane_km"}
+        return UnusedKeys("traffic", source, keys)

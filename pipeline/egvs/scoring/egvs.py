@@ -23,11 +23,11 @@ from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.kernels import traversal
 
 Hits = NDArray[np.uint32] | NDArray[np.int64]
-"""Hits of each voxel, flat, (nx * ny * nz,): whole beams, or multiples of a fraction of a beam."""
+"""Hits of each voxel, flat, (nx * ny * nz,): numbers of beams, or multiples of a fraction of a beam."""
 
 _DIGITS = 40
 _SCALE = 128
-"""Entropies are whole multiples of 2**-128: the smallest above 0, for T = 2**32 - 1, is 8e-9 with 53 bits."""
+"""Entropies are integer multiples of 2**-128: the smallest above 0, for T = 2**32 - 1, is 8e-9 with 53 bits."""
 
 
 def binary_entropy(count: int, frames: int) -> float:
@@ -37,6 +37,11 @@ def binary_entropy(count: int, frames: int) -> float:
     ------
     ValueError
         Unless 0 <= count <= frames and frames >= 1.
+
+    Examples
+    --------
+    >>> binary_entropy(5, 10)
+    1.0
     """
     if not 0 <= count <= frames or frames < 1:
         raise ValueError(f"expected 0 <= count <= frames and frames >= 1, got count = {count} and frames = {frames}")
@@ -44,7 +49,7 @@ def binary_entropy(count: int, frames: int) -> float:
 
 
 def _entropies(counts: list[int], frames: int) -> FloatArray:
-    """H of each count, correctly rounded: T log T - c log c - (T - c) log(T - c), over T log 2, in 40 digits."""
+    """Return H of each count, correctly rounded: (T ln T - c ln c - (T - c) ln(T - c)) / (T ln 2) in 40 digits."""
     entropies = np.empty(len(counts))
     with localcontext() as context:
         context.prec = _DIGITS
@@ -111,7 +116,7 @@ class EntropyField:
     cells
         Flat index of each voxel with entropy, (n,) int64, ascending.
     classes
-        Which of ``entropies_bit`` each voxel has, (n,) int64.
+        Index into ``entropies_bit`` of each voxel, (n,) int64.
     entropies_bit
         Entropy of each class, float64, above 0.
     sizes
@@ -133,7 +138,7 @@ class EntropyField:
             raise InputError(
                 "tpog",
                 f"a voxel is occupied in {largest} of {frames} frames",
-                "Make the TPOG again from the trajectories.",
+                "Compute the TPOG again from the trajectories.",
             )
 
         cells = np.flatnonzero((flat > 0) & (flat < frames))
@@ -149,7 +154,7 @@ class EntropyField:
 
     @cached_property
     def total_bit(self) -> float:
-        """The TPOG's entropy: the sum of H over all voxels."""
+        """Entropy of the TPOG: the sum of H over all voxels."""
         return self.limit(1.0)
 
     def score(self, hits: Hits, gamma: float, unit: int = 1) -> Score:
@@ -162,7 +167,16 @@ class EntropyField:
         gamma
             Cap, 0 or above, may be fractional or infinite.
         unit
-            Hits that a whole beam adds to a voxel.
+            Hits that one beam adds to a voxel.
+
+        Examples
+        --------
+        Two voxels: the first is occupied in 5 of 10 frames and crossed by 3 beams, the second is never occupied.
+
+        >>> grid = Grid(origin_m=(0.0, 0.0, 0.0), voxel_m=0.5, shape=(2, 1, 1))
+        >>> field = EntropyField.of(np.array([[[5]], [[0]]]), frames=10, grid=grid)
+        >>> field.score(np.array([3, 7], dtype=np.uint32), gamma=2.0)
+        Score(egvs=2.0, entropy_seen=1.0)
         """
         sums = sum_hits_by_class(hits, self.cells, self.classes, len(self.sizes), gamma * unit)
         egvs = self._sum(gamma, sums.capped, sums.below, unit)
@@ -181,7 +195,7 @@ class EntropyField:
 
     @cached_property
     def _scaled(self) -> list[int]:
-        """Entropy of each class times 2**_SCALE, a whole number."""
+        """Entropy of each class times 2**_SCALE, an integer."""
         scaled = []
         for entropy in self.entropies_bit.tolist():
             numerator, denominator = entropy.as_integer_ratio()

@@ -1,9 +1,10 @@
-r"""Occupied voxels of a record, the autocorrelation time of its traffic, and warnings about both.
+r"""Occupied voxels of recorded traffic, its autocorrelation time, and warnings about both.
 
-A voxel is occupied at a frame when a vehicle's box, made 0.1 mm smaller on each side, shares positive volume with it.
+A voxel is occupied in a frame if a vehicle's box, made 0.1 mm smaller on each side, shares positive volume with it.
 The Traffic Probabilistic Occupancy Grid (arXiv 2504.06772, section III) is :math:`p(v) = c(v) / T`, with :math:`c(v)`
 the sum of counts over blocks and :math:`T` the number of frames. A voxel that static geometry fills has p = 1 and so no
-entropy; it is left out. Memory holds one block's counters and one batch of frames, however many frames there are.
+entropy; it is left out. The memory that is needed, for the counters of one block and one batch of frames, does not
+depend on the number of frames.
 
 With :math:`\rho(t)` the autocorrelation at lag t of the number of boxes near the region, frame by frame, the integrated
 autocorrelation time is
@@ -21,7 +22,7 @@ there).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -29,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
-from egvs.artefacts.traffic_frames import FrameBoxes
+from egvs.artefacts.frame_boxes import FrameBoxes
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.kernels import occupancy
@@ -38,8 +39,7 @@ from egvs.world import clearances
 from egvs.world.mesh import World
 
 if TYPE_CHECKING:
-    from egvs.artefacts.tpog import Tpog
-    from egvs.sensors.sites import Site
+    pass
 
 MEMORY_WINDOW = 5.0
 """Sokal's c: the window in autocorrelation times."""
@@ -201,7 +201,7 @@ def warn_empty_region(boxes: float, trajectories: Path) -> Iterator[Diagnostic]:
 
 
 def _traffic_extent(trajectories: Path) -> str:
-    """Where recorded vehicles are, in words; empty where there is none."""
+    """Return the extent of recorded vehicles as text; empty without vehicles."""
     table, _ = parquet.read_artefact(trajectories, "trajectories", ["x_m", "y_m"])
     if not table.num_rows:
         return ""
@@ -226,12 +226,12 @@ def warn_empty_periods(boxes: Mapping[str, float]) -> Iterator[Diagnostic]:
 def warn_traffic_through_solids(
     hidden: IntArray, visible: int, voxels: IntArray, grid: Grid, world: World
 ) -> Iterator[Diagnostic]:
-    """Warn where vehicles occupy what static geometry fills.
+    """Warn where vehicles occupy voxels that static geometry fills.
 
     Parameters
     ----------
     hidden
-        In how many frames each voxel that static geometry fills is occupied, (k,).
+        Number of frames in which each voxel that static geometry fills is occupied, (k,).
     visible
         The same, summed over all other voxels.
     voxels
@@ -253,7 +253,7 @@ def warn_traffic_through_solids(
 
 
 def _solid_at(world: World, at_m: FloatArray, within_m: float) -> str:
-    """The first solid whose triangles come so near to a point along each axis that they may fill its voxel."""
+    """Return the first solid with a triangle within a distance of a point along each axis; empty without one."""
     corners = world.triangles_m
     near = (corners.min(axis=1) <= at_m + within_m).all(axis=1) & (corners.max(axis=1) >= at_m - within_m).all(axis=1)
     for solid in np.unique(world.solid_of_face[near]):
@@ -261,26 +261,3 @@ def _solid_at(world: World, at_m: FloatArray, within_m: float) -> str:
         if kind != "ground":
             return f"{name} ({kind})"
     return ""
-
-
-def warn_sites_in_traffic(sites: Iterable[Site], tpog: Tpog) -> Iterator[Diagnostic]:
-    """Warn about each site that is, no higher than the clearance, where vehicles drive in some frame."""
-    grid = tpog.grid
-    for site in sites:
-        at_m = np.array(site.pose.position_m)
-        ix, iy, _ = np.floor((at_m - grid.origin_m) / grid.voxel_m).astype(np.int64)
-        if not (0 <= ix < grid.shape[0] and 0 <= iy < grid.shape[1]):
-            continue
-        column = tpog.counts[ix, iy]
-        layers = np.flatnonzero(column)
-        if not len(layers):
-            continue
-        height_m = at_m[2] - (grid.origin_m[2] + layers[0] * grid.voxel_m)
-        if height_m <= clearances.CLEARANCE_M:
-            share = column.max() / tpog.frames
-            yield Diagnostic(
-                "sites on the road",
-                f"site {site.name}",
-                f"vehicles drive through its position ({at_m[0]:g}, {at_m[1]:g}) in {share:.1%} of the frames",
-                f"Move it beside the road, or more than {clearances.CLEARANCE_M:g} m above it.",
-            )

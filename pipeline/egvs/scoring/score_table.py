@@ -1,209 +1,321 @@
-"""ScoreTable: scores[site, period, replicate, score].
+"""All scores in one labelled table: ``scores[site, period, replicate, score, value]``.
 
-What all sites are worth by one score: values, how far they may be off, and the same in each period.
+The table is long because it is ragged: in the mix, every score has one replicate for each group of blocks that is left
+out; in a period, only EGVS has replicates, with groups of that period. Arrays come from its views: a score of all sites
+(:meth:`ScoreTable.column`), the sites from best to worst (:meth:`ScoreTable.ranking`), a score in each period
+(:meth:`ScoreTable.by_period`).
 
-Scores of each period beside those of the mix: ``scores_by_period.parquet``, and what rankings disagree on.
+``scores_by_period.parquet`` and the warnings about scores are made from the table as well.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
 from egvs.core.errors import Diagnostic
+from egvs.core.grid import FloatArray
 from egvs.scenario.model import SCENARIO_FILE
-from egvs.scoring.scorer import PeriodTpog, SiteScore, ranks
-from egvs.scoring.standard_errors import BlockGroups, ScoreUncertainty, beats_next
+from egvs.scoring.scorer import SiteScore, ranks
+from egvs.scoring.standard_errors import BlockGroups, ScoreUncertainty, beats_next, rank_order
 from egvs.scoring.target_scores import SiteTargetScores
-from egvs.scoring.targets import Floats
+
+MIX = ""
+"""Period of the scores over all traffic: the mix of the periods where there are some."""
+
+ALL_TRAFFIC = 0
+"""Replicate with all traffic; replicates 1, 2, ... leave out one group of blocks each."""
+
+JACKKNIFE_TOTAL = -1
+"""Replicate with all traffic, summed in the order of the other replicates: the last bits of an EGVS can differ from
+those of :data:`ALL_TRAFFIC`. Standard errors are computed from this one."""
+
+
+class ScoreEntry(NamedTuple):
+    """One score of one site in one period.
+
+    ``left_out`` is the score of all traffic, then with each group left out, (1 + k,) float64; None without replicates.
+    """
+
+    period: str
+    score: str
+    value: float
+    left_out: FloatArray | None
+
+
+class SiteScores(NamedTuple):
+    """The scores of one site, as the scorers of voxels and of vehicles return them."""
+
+    site: str
+    voxels: SiteScore
+    targets: SiteTargetScores | None
+
+    def entries(self, periods: Sequence[str]) -> Iterator[ScoreEntry]:
+        """Yield all scores, first those of the mix, then those of the ``periods``; of the mix only without periods."""
+        yield from _voxel_entries(MIX, self.voxels)
+        if self.targets is not None:
+            for name, replicates in self.targets.scores.items():
+                yield ScoreEntry(MIX, name, float(replicates[0]), _left_out(replicates))
+        for period, scores in zip(periods, self.voxels.by_period, strict=bool(periods)):
+            for entry in _voxel_entries(period, scores):
+                yield entry if entry.score == "egvs" else entry._replace(left_out=None)
+        if self.targets is not None:
+            for period, values in zip(periods, self.targets.by_period, strict=bool(periods)):
+                for name, value in values.items():
+                    yield ScoreEntry(period, name, value, None)
+
+
+def _voxel_entries(period: str, scores: SiteScore) -> Iterator[ScoreEntry]:
+    yield ScoreEntry(period, "egvs", scores.egvs, scores.left_out)
+    shares = {"entropy_seen": np.array([scores.entropy_seen]), **scores.shares}
+    for name, replicates in shares.items():
+        yield ScoreEntry(period, name, float(replicates[0]), _left_out(replicates))
+
+
+def _left_out(replicates: FloatArray) -> FloatArray | None:
+    return replicates if len(replicates) > 1 else None
 
 
 @dataclass(frozen=True, eq=False)
 class ScoreColumn:
-    """The sites by one score, n of them.
+    """One score of n sites.
 
     Attributes
     ----------
     name
-        Of the score.
+        Name of the score.
     values
-        (n,) float64; not numbers where the score is not defined.
+        (n,) float64; NaN where the score is not defined.
     left_out
-        Of all traffic, then with each group of it left out, (n, 1 + k) float64; None where there are no standard
-        errors.
+        The score of all traffic, then with each group of blocks left out, (n, 1 + k) float64; None without replicates.
     groups
-        That were left out.
-    by_period
-        Values in each period alone, (n,) float64 each.
+        The groups that are left out, k in all.
     """
 
     name: str
-    values: Floats
-    left_out: Floats | None
-    groups: tuple[BlockGroups, ...]
-    by_period: tuple[Floats, ...]
-
-    @classmethod
-    def of(
-        cls,
-        name: str,
-        sites: Sequence[tuple[SiteScore, SiteTargetScores | None]],
-        groups: tuple[BlockGroups, ...] | None,
-    ) -> ScoreColumn:
-        """From the scores of all sites; ``groups`` are None where there are no standard errors."""
-        values = np.array([_score_value(name, *site) for site in sites])
-        left_out = None
-        if groups is not None:
-            columns = 1 + sum(len(its.frames) for its in groups)
-            left_out = np.array([_jackknife_values(name, *site) for site in sites]).reshape(len(sites), columns)
-        apart = zip(*(_period_values(name, *site) for site in sites), strict=True)
-        return cls(name, values, left_out, groups or (), tuple(np.array(period) for period in apart))
-
-    def standard_error_warnings(self) -> list[Diagnostic]:
-        """A warning where it has values whose errors should be known and are not."""
-        if self.left_out is None or self.estimate is not None or np.isnan(self.values).any():
-            return []
-        groups = sum(len(its.frames) for its in self.groups)
-        found = f"all vehicles in the region are in one of the {groups} groups of frames"
-        cure = "traffic that lasts longer"
-        return [
-            Diagnostic(
-                "no standard error", f"{SCENARIO_FILE}: traffic", f"{found}: {self.name} has no standard error", cure
-            )
-        ]
-
-    def all_zero_warnings(self, gamma: float, limit: float) -> list[Diagnostic]:
-        """A warning where the score is 0 at every site, which is no ranking; why, by gamma and the EGVS's limit."""
-        if np.any(self.values > 0):
-            return []
-        if gamma == 0:
-            place, why, cure = f"{SCENARIO_FILE}: score.gamma", "gamma is 0", "a gamma above 0"
-        elif limit == 0:
-            place, why, cure = (
-                f"{SCENARIO_FILE}: roi",
-                "no traffic comes and goes in the region",
-                "a region with traffic in it",
-            )
-        else:
-            place, why = f"{SCENARIO_FILE}: sites", "no beam crosses a place with traffic"
-            cure = "sites and sensors that look at the traffic in the region"
-        return [Diagnostic("no ranking", place, f"{self.name} is 0 at every site, so none is best: {why}", cure)]
-
-    def unranked_zero_warnings(self) -> list[Diagnostic]:
-        """A warning where the score, which does not rank, is 0 at every site."""
-        if not len(self.values) or np.any(self.values != 0):
-            return []
-        found = f"{self.name} is 0 at every site, so it tells none from another"
-        cure = "sites, sensors and settings by which it is above 0 somewhere"
-        return [Diagnostic("no other score", f"{SCENARIO_FILE}: score", found, cure)]
+    values: FloatArray
+    left_out: FloatArray | None = None
+    groups: tuple[BlockGroups, ...] = ()
 
     @property
-    def rank(self) -> np.ndarray[Any, np.dtype[np.uint32]]:
-        """1 for the best, (n,)."""
+    def rank(self) -> NDArray[np.uint32]:
+        """Rank of each site, 1 for the best, (n,)."""
         return ranks(self.values)
 
     @cached_property
     def estimate(self) -> ScoreUncertainty | None:
-        """How far the values may be off; None where that is not known."""
+        """Standard errors and comparisons; None where they are unknown."""
         if self.left_out is None or np.isnan(self.left_out).any():
             return None
         return ScoreUncertainty.of(self.left_out, self.groups)
 
     @property
-    def se(self) -> Floats:
-        """Standard errors, (n,) float64; not numbers where they are not known."""
-        return np.full(len(self.values), math.nan) if self.estimate is None else self.estimate.se
+    def se(self) -> FloatArray:
+        """Standard errors, (n,) float64; NaN where they are unknown."""
+        if self.estimate is None:
+            return np.full(len(self.values), math.nan)
+        return self.estimate.se
 
     @property
-    def beats_next(self) -> Floats:
-        """As :func:`egvs.scoring.standard_errors.beats_next`; not numbers where it is not known."""
-        return np.full(len(self.values), math.nan) if self.estimate is None else beats_next(self.estimate)
+    def beats_next(self) -> FloatArray:
+        """Probability that each site is better than the next in rank, (n,) float64; NaN where it is unknown."""
+        if self.estimate is None:
+            return np.full(len(self.values), math.nan)
+        return beats_next(self.estimate)
+
+    @property
+    def best(self) -> frozenset[int]:
+        """Indices of the sites with the highest score; empty where scores are NaN."""
+        if not len(self.values):
+            return frozenset()
+        return frozenset(np.flatnonzero(self.values == self.values.max()).tolist())
 
 
-def _score_value(name: str, score: SiteScore, targets: SiteTargetScores | None) -> float:
-    if name == "egvs":
-        return score.egvs
-    return float((targets.scores if targets is not None and name in targets.scores else score.shares)[name][0])
+class RankedSite(NamedTuple):
+    """A site with its rank by some score."""
+
+    rank: int
+    site: str
+    value: float
 
 
-def _jackknife_values(name: str, score: SiteScore, targets: SiteTargetScores | None) -> Floats | None:
-    if name == "egvs":
-        return score.left_out
-    return (targets.scores if targets is not None and name in targets.scores else score.shares)[name]
+@dataclass(frozen=True, eq=False)
+class ScoreTable:
+    """The scores of all sites.
 
+    Attributes
+    ----------
+    table
+        Columns ``site``, ``period``, ``replicate``, ``score``, ``value``, in the order of the sites.
+    sites
+        Names of the sites, n.
+    periods
+        Names of the periods; empty where the traffic has none.
+    groups
+        Period -> groups of blocks that are left out there in turn; nothing where there are no standard errors.
+    limits
+        Period -> highest EGVS that any site could reach.
+    """
 
-def _period_values(name: str, score: SiteScore, targets: SiteTargetScores | None) -> list[float]:
-    if targets is not None and name in targets.scores:
-        return [period[name] for period in targets.by_period]
-    return [_score_value(name, period, None) for period in score.by_period]
+    table: pa.Table
+    sites: tuple[str, ...]
+    periods: tuple[str, ...] = ()
+    groups: Mapping[str, tuple[BlockGroups, ...]] = field(default_factory=dict)
+    limits: Mapping[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        scores: Iterable[SiteScores],
+        groups: Mapping[str, tuple[BlockGroups, ...]],
+        limits: Mapping[str, float] | None = None,
+        periods: Sequence[str] = (),
+    ) -> ScoreTable:
+        """Make the table from the scores of each site; other parameters are the attributes of the same name."""
+        sites = []
+        columns: dict[str, list[Any]] = {"site": [], "period": [], "replicate": [], "score": [], "value": []}
+        for site_scores in scores:
+            sites.append(site_scores.site)
+            for entry in site_scores.entries(periods):
+                replicates, values = [ALL_TRAFFIC], [entry.value]
+                if entry.left_out is not None:
+                    replicates += [JACKKNIFE_TOTAL, *range(1, len(entry.left_out))]
+                    values += entry.left_out.tolist()
+                columns["site"] += [site_scores.site] * len(values)
+                columns["period"] += [entry.period] * len(values)
+                columns["replicate"] += replicates
+                columns["score"] += [entry.score] * len(values)
+                columns["value"] += values
+        types = {"replicate": pa.int32(), "value": pa.float64()}
+        table = pa.table({name: pa.array(rows, types.get(name, pa.string())) for name, rows in columns.items()})
+        return cls(table, tuple(sites), tuple(periods), groups, limits or {})
+
+    def column(self, score: str, period: str = MIX) -> ScoreColumn:
+        """Return one score of all sites in the mix, or in a period."""
+        is_score = pc.equal(self.table.column("score"), score)
+        rows = self.table.filter(pc.and_(is_score, pc.equal(self.table.column("period"), period)))
+        replicate = rows.column("replicate").to_numpy()
+        values = rows.column("value").to_numpy()
+        groups = self.groups.get(period, ())
+        left_out = None
+        if groups and (len(values) > len(self.sites) or not self.sites):
+            replicates = 1 + sum(len(record.frames) for record in groups)
+            left_out = values[replicate != ALL_TRAFFIC].reshape(len(self.sites), replicates)
+        return ScoreColumn(score, values[replicate == ALL_TRAFFIC], left_out, groups)
+
+    def by_period(self, score: str) -> dict[str, ScoreColumn]:
+        """Return one score of all sites in each period."""
+        return {period: self.column(score, period) for period in self.periods}
+
+    def ranking(self, score: str, period: str = MIX) -> list[RankedSite]:
+        """Return the sites from best to worst by one score; equal ones in the order of the table."""
+        column = self.column(score, period)
+        rank = column.rank
+        order = rank_order(column.values).tolist()
+        return [RankedSite(int(rank[i]), self.sites[i], float(column.values[i])) for i in order]
 
 
 def write_scores_by_period(
-    path: Path,
-    sites: Sequence[str],
-    scores: Sequence[SiteScore],
-    ranking: ScoreColumn,
-    others: Sequence[ScoreColumn],
-    periods: Sequence[PeriodTpog],
-    limits: Sequence[float],
-    metadata: dict[str, Any],
+    path: Path, scores: ScoreTable, rank_by: str, additional: Sequence[str], metadata: Mapping[str, Any]
 ) -> None:
-    """Write one row group a period; remove the file of an earlier run where there are no periods.
+    """Write ``scores_by_period.parquet``, one row group per period; remove an old file where there are no periods.
 
-    ``ranking`` is the score that ranks, ``others`` are those that get a column of their own beside what always stands
-    there.
+    Parameters
+    ----------
+    path
+        The file.
+    scores
+        Scores of all sites.
+    rank_by
+        Score that the sites are ranked by.
+    additional
+        Scores that have a column, beside EGVS and the share of entropy.
+    metadata
+        Metadata of the file.
     """
-    if not periods:
+    if not scores.periods:
         path.unlink(missing_ok=True)
         return
-    has_errors = all(period.leave_out is not None for period in periods)
-    more = (*(("egvs_se", "egvs_bias") if has_errors else ()), *(other.name for other in others))
-    with parquet.artefact_writer(path, "scores_by_period", more) as file:
-        for number, (period, limit) in enumerate(zip(periods, limits, strict=True)):
-            worths = [score.by_period[number] for score in scores]
-            egvs = np.array([worth.egvs for worth in worths])
+    more = [name for name in additional if name != "entropy_seen"]
+    has_errors = all(period in scores.groups for period in scores.periods)
+    optional = (*("egvs_se", "egvs_bias"), *more) if has_errors else tuple(more)
+    with parquet.artefact_writer(path, "scores_by_period", optional) as file:
+        for period in scores.periods:
+            egvs = scores.column("egvs", period)
             columns: dict[str, Any] = {
-                "period": [period.name] * len(sites),
-                "site": list(sites),
-                "egvs": egvs,
-                "egvs_limit": np.full(len(sites), limit),
-                "rank": ranks(ranking.by_period[number]),
-                "entropy_seen": np.array([worth.entropy_seen for worth in worths]),
+                "period": [period] * len(scores.sites),
+                "site": scores.sites,
+                "egvs": egvs.values,
+                "egvs_limit": np.full(len(scores.sites), scores.limits[period]),
+                "rank": scores.column(rank_by, period).rank,
+                "entropy_seen": scores.column("entropy_seen", period).values,
             }
-            if has_errors and period.leave_out is not None:
-                left_out = np.array([worth.left_out for worth in worths]).reshape(len(sites), -1)
-                estimate = ScoreUncertainty.of(left_out, period.leave_out.groups)
-                columns |= {"egvs_se": estimate.se, "egvs_bias": estimate.bias}
-            columns |= {other.name: other.by_period[number] for other in others}
+            if has_errors and egvs.estimate is not None:
+                columns |= {"egvs_se": egvs.estimate.se, "egvs_bias": egvs.estimate.bias}
+            columns |= {name: scores.column(name, period).values for name in more}
             file.write(columns)
         file.describe(metadata)
 
 
-def period_disagreements(sites: Sequence[str], ranking: ScoreColumn, periods: Sequence[PeriodTpog]) -> list[Diagnostic]:
-    """A warning for each period whose best site, by the score that ranks, is another than the mix's."""
-    if not sites:
-        return []
-    best = _best_sites(ranking.values)
-    found = []
-    for period, values in zip(periods, ranking.by_period, strict=True):
-        its = _best_sites(values)
-        if best & its or not values.max() > 0:
+def warn_all_zero(column: ScoreColumn, gamma: float, limit: float) -> Iterator[Diagnostic]:
+    """Warn that the score that ranks is 0 at every site; ``limit`` is the highest EGVS of any site."""
+    if np.any(column.values > 0):
+        return
+    key = "sites"
+    reason = "no beam crosses a voxel with traffic"
+    hint = "Check poses, sensors and the region of interest."
+    if gamma == 0:
+        key = "score.gamma"
+        reason = "gamma is 0"
+        hint = "Set gamma above 0."
+    elif limit == 0:
+        key = "roi"
+        reason = "the traffic in the region never changes"
+        hint = "Move or enlarge the region of interest."
+    problem = f"{column.name} is 0 at every site, so there is no ranking: {reason}"
+    yield Diagnostic("no ranking", f"{SCENARIO_FILE}: {key}", problem, hint)
+
+
+def warn_additional_all_zero(column: ScoreColumn) -> Iterator[Diagnostic]:
+    """Warn that a score that does not rank is 0 at every site."""
+    if len(column.values) and not np.any(column.values != 0):
+        problem = f"{column.name} is 0 at every site, so it does not distinguish them"
+        yield Diagnostic("no other score", f"{SCENARIO_FILE}: score", problem, "Check sites, sensors and effects.")
+
+
+def warn_no_standard_error(column: ScoreColumn) -> Iterator[Diagnostic]:
+    """Warn that the standard error of a score is unknown, although the scenario requests standard errors."""
+    if column.left_out is None or column.estimate is not None or np.isnan(column.values).any():
+        return
+    groups = sum(len(record.frames) for record in column.groups)
+    problem = f"{column.name} has no standard error: all vehicles in the region are in one of {groups} groups of frames"
+    yield Diagnostic("no standard error", f"{SCENARIO_FILE}: traffic", problem, "Record more traffic.")
+
+
+def warn_period_disagreements(scores: ScoreTable, rank_by: str) -> Iterator[Diagnostic]:
+    """Warn about each period whose best site, by the score that ranks, is not that of the mix."""
+    best = scores.column(rank_by).best
+    for period, column in scores.by_period(rank_by).items():
+        if not best or not column.best or best & column.best:
             continue
-        first, there = min(best), min(its)
-        lost, rank = 1.0 - values[first] / values.max(), int(ranks(values)[first])
-        what = f"{sites[there]} is the best site, not {sites[first]} of the mix, which is rank {rank} there"
-        cure = "weigh which period counts: the best of the mix need not be the best at any hour"
-        place = f"{SCENARIO_FILE}: traffic.periods ({period.name})"
-        found.append(Diagnostic("periods disagree", place, f"{what} and scores {lost:.1%} less", cure))
-    return found
-
-
-def _best_sites(values: np.ndarray[Any, np.dtype[np.float64]]) -> set[int]:
-    return set(np.flatnonzero(values == values.max()).tolist())
+        highest = column.values.max()
+        if not highest > 0:
+            continue
+        mix_best = min(best)
+        loss = 1.0 - column.values[mix_best] / highest
+        problem = (
+            f"the best site is {scores.sites[min(column.best)]}; {scores.sites[mix_best]}, the best of the mix, "
+            f"has rank {column.rank[mix_best]} and scores {loss:.1%} less"
+        )
+        hint = "Decide which period matters most; the best site of the mix need not be the best in any period."
+        yield Diagnostic("periods disagree", f"{SCENARIO_FILE}: traffic.periods ({period})", problem, hint)

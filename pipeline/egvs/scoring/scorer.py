@@ -9,8 +9,8 @@ Other scores are shares of the voxels that a site's beams cross: of their number
 
 .. math:: \sum_v w(v) [hits(v) > 0] \Big/ \sum_v w(v)
 
-with w = 1 where traffic ever is (``coverage``: the rest are blind spots; Kim et al. 2023), w = p
-(``expected_visibility``), w = H(p) (``entropy_seen``). Every share of a TPOG without traffic is 0.
+with w = 1 in voxels that traffic ever occupies (``coverage``: the rest are blind spots; Kim et al. 2023), w = p
+(``expected_visibility``), w = H(p) (``entropy_seen``). All shares are 0 for a TPOG without traffic.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ class SiteScore:
         The EGVS of all frames, then with each group of blocks left out, (1 + k,) float64, see
         :class:`egvs.scoring.standard_errors.BlockJackknife`; None without standard errors.
     shares
-        Those of :data:`VOXEL_SHARES` that the scenario requests, by name, like ``left_out``; (1,) without standard
-        errors.
+        The scores of :data:`VOXEL_SHARES` that the scenario requests, by name, in the form of ``left_out``; (1,)
+        without standard errors.
     by_period
         Scores in each period alone, where the TPOG is a mix and they are requested.
     """
@@ -71,12 +71,12 @@ class PeriodTpog:
 
 
 class Scorer:
-    """Scores one scan after another. Threads may share one; it pickles to its arguments.
+    """Scores one scan after another. Threads may share one; it is pickled as its arguments.
 
     Parameters
     ----------
     scene
-        The scene of the scans; its scenario has gamma.
+        The scene of the scans; its scenario sets gamma.
     tpog
         Occupancy by traffic.
     trajectories
@@ -84,7 +84,7 @@ class Scorer:
     leave_out
         Groups of blocks that are left out in turn, for standard errors.
     periods
-        TPOGs of periods that each scan is also scored against, with the same hits.
+        TPOGs of single periods; each scan is scored against these as well, with the same hits.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class Scorer:
 
     @property
     def limit(self) -> float:
-        """The highest EGVS that any scan could reach: gamma beams in every voxel."""
+        """The highest possible EGVS: gamma beams in every voxel."""
         return self.field.limit(self._gamma)
 
     @property
@@ -125,12 +125,12 @@ class Scorer:
         return self._score_hits(self._visibility.borrowed_hits(_as_beams(scan), self._cells))
 
     def score_and_hits(self, scan: Scan | Beams) -> tuple[SiteScore, FloatArray]:
-        """Score one scan; return also the beams that cross each voxel, (nx, ny, nz) float64."""
+        """Score one scan; return also the number of beams that cross each voxel, (nx, ny, nz) float64."""
         hits = self._visibility.borrowed_hits(_as_beams(scan))
         return self._score_hits(hits), self._in_beams(hits)
 
     def hits(self, scan: Scan | Beams) -> FloatArray:
-        """Return the beams that cross each voxel, (nx, ny, nz) float64; whole unless an effect weights beams."""
+        """Return the number of beams that cross each voxel, (nx, ny, nz) float64; an integer without weighted beams."""
         return self._in_beams(self._visibility.borrowed_hits(_as_beams(scan)))
 
     def _in_beams(self, hits: Hits) -> FloatArray:
@@ -196,7 +196,7 @@ class _ScoredTpog:
         return cls(entropy, OccupiedVoxels.of(tpog.counts), leave_out)
 
     def share(self, name: str, hits: Hits, entropy_seen: float) -> FloatArray:
-        """One of :data:`VOXEL_SHARES`, and the same with each group left out where there are groups."""
+        """Return one of :data:`VOXEL_SHARES` and, if there are groups, its values with each group left out."""
         value = entropy_seen
         if name == "coverage":
             value = self.occupied.coverage(hits)
@@ -217,5 +217,5 @@ def ever_occupied(tpogs: Sequence[Tpog]) -> IntArray:
 
 
 def ranks(scores: FloatArray) -> NDArray[np.uint32]:
-    """Return 1 for the highest score; equal scores share a rank, and as many ranks are skipped after them."""
+    """Return the rank of each score, 1 for the highest; equal scores share a rank, and the next ranks are skipped."""
     return np.array([1 + np.sum(scores > score) for score in scores], dtype=np.uint32)

@@ -21,13 +21,13 @@ are joined further where groups would be shorter than :data:`GROUP_LENGTH_MEMORI
 :data:`MIN_GROUPS` groups: the t quantile accounts for the uncertainty of few groups. The correlation that remains
 between the groups of a short record inflates the error
 (:func:`egvs.scoring.occupancy.standard_error_inflation`). Where neighbouring groups are correlated all the same, they
-are joined in pairs. Groups shorter than the window of the memory's own estimate, and groups that stay correlated, give
-a warning.
+are joined in pairs. Groups shorter than the window in which the memory was estimated, and groups that stay correlated,
+give a warning.
 
 Voxels that have equal counts in every group share one class (0.5 million occupied voxels of a real junction make 50,000
 classes), so a site costs one pass over the voxels and one over the classes. Nothing is random; the result does not
-depend on threads or on other sites. Hits are taken as they are: where an effect lets traffic hide voxels, its part of
-the error is left out.
+depend on threads or on other sites. Hits are not resampled: where an effect lets traffic hide voxels, its part of the
+error is not included.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ _CLASS_KEY_SEED = 0x9E3779B97F4A7C15
 
 @dataclass(frozen=True)
 class BlockGroups:
-    """Consecutive groups of one record: the ``frames`` in each, (k,) int64, and the traffic's ``memory`` in frames."""
+    """Consecutive groups of one record: the ``frames`` of each, (k,) int64, and the traffic's ``memory`` in frames."""
 
     frames: IntArray
     memory: float
@@ -85,7 +85,7 @@ class BlockGroups:
 
 
 def group_sizes(blocks: int, block_frames: int = 1, memory: float = 0.0) -> list[int]:
-    """Return how many consecutive blocks each group has."""
+    """Return the number of consecutive blocks of each group."""
     groups = blocks
     if blocks >= 2 * TARGET_GROUPS:
         groups = TARGET_GROUPS
@@ -112,9 +112,9 @@ class BlockJackknife:
     entropies_bit
         Entropy of each class, (classes, 1 + k) float64: of all frames, then with group 0, 1, ... left out.
     p
-        Share of the frames in which voxels of each class are occupied, likewise.
+        Share of the frames in which voxels of each class are occupied, in the same form.
     groups
-        Groups of each record that the TPOG was counted in, in the order of the columns.
+        Groups of each record of the TPOG, in the order of the columns.
     """
 
     cells: IntArray
@@ -127,7 +127,7 @@ class BlockJackknife:
     def of(cls, path: Path, tpog: tpog_file.Tpog, period: str | None = None) -> BlockJackknife | None:
         """Count the groups of ``tpog.parquet``, which was read as ``tpog``: the mix, or one period.
 
-        None where a record has one block only, since its scatter is unknown.
+        None if a record has one block only, because its scatter is unknown.
         """
         periods = [record for record in tpog_file.read_periods(path) if period in (None, record.name)]
         groups = tuple(block_groups(record) for record in periods)
@@ -143,7 +143,7 @@ class BlockJackknife:
     def from_counts(
         cls, counts: NDArray[np.uint32], cells: IntArray, groups: BlockGroups, grid: Grid
     ) -> BlockJackknife:
-        """Make the jackknife of one record from the counts of its groups, (k, n), in the voxels ``cells``, (n,)."""
+        """Return the jackknife of one record from the counts of its groups, (k, n), in the voxels ``cells``, (n,)."""
         first, classes = _classify_voxels(counts)
         by_group = counts[:, first].astype(np.int64)
         total = by_group.sum(axis=0)
@@ -166,10 +166,10 @@ class BlockJackknife:
         times: Sequence[int],
         grid: Grid,
     ) -> BlockJackknife:
-        """Make the jackknife of a mix of records, each of whose frames counts ``times`` in the mix.
+        """Return the jackknife of a mix of records, each of whose frames counts ``times`` in the mix.
 
-        The rest of a record without a group keeps the record's weight. These entropies are taken in float64, since the
-        number of frames that would represent them exactly is unbounded; that of all frames is exact.
+        The rest of a record without a group keeps the record's weight. These entropies are computed in float64, because
+        the number of frames that would represent them exactly is unbounded; that of all frames is exact.
         """
         first, classes = _classify_voxels(counts)
         ends = np.cumsum([len(record.frames) for record in groups])
@@ -239,7 +239,7 @@ class BlockJackknife:
 def _count_by_group(
     path: Path, cells: IntArray, grid: Grid, groups: Sequence[BlockGroups], only_period: str | None
 ) -> NDArray[np.uint32]:
-    """Counts of each group of blocks in the voxels ``cells``, (k, n)."""
+    """Return the counts of each group of blocks in the voxels ``cells``, (k, n)."""
     group_of_block = []
     n_groups = 0
     next_groups = iter(groups)
@@ -266,7 +266,7 @@ def _count_by_group(
 
 
 def _classify_voxels(counts: NDArray[np.uint32]) -> tuple[IntArray, IntArray]:
-    """One voxel of each class of equal counts, and the class of each voxel, (n,)."""
+    """Return one voxel of each class of equal counts, and the class of each voxel, (n,)."""
     keys = np.random.default_rng(_CLASS_KEY_SEED).integers(1, 2**63, size=len(counts), dtype=np.uint64)
     # The chance that two classes share a sum of keys is (classes**2 / 2) / 2**64: 1e-10 for 50,000.
     sums = np.zeros(counts.shape[1], dtype=np.uint64)
@@ -277,7 +277,7 @@ def _classify_voxels(counts: NDArray[np.uint32]) -> tuple[IntArray, IntArray]:
 
 
 def _binary_entropies(p: FloatArray) -> FloatArray:
-    """H(p) in bits, float64."""
+    """Return H(p) in bits, float64."""
     inside = (p > 0.0) & (p < 1.0)
     q = np.where(inside, p, 0.5)
     entropies: FloatArray = np.where(inside, -(q * np.log(q) + (1.0 - q) * np.log1p(-q)) / math.log(2.0), 0.0)
@@ -285,7 +285,7 @@ def _binary_entropies(p: FloatArray) -> FloatArray:
 
 
 def _exact_entropies(counts: IntArray, frames: int, grid: Grid) -> FloatArray:
-    """Entropies of counts of ``frames``, in the counts' shape."""
+    """Return the entropies of counts of ``frames`` frames, in the shape of the counts."""
     field = EntropyField.of(counts, frames, grid)
     entropies = np.zeros(counts.size)
     entropies[field.cells] = field.per_cell_bit
@@ -299,7 +299,7 @@ class Stratum:
     Attributes
     ----------
     pseudo
-        Pseudo-values, (k, n) float64: the score that each group alone suggests.
+        Pseudo-values, (k, n) float64: estimates of the score from each group.
     spread
         h_g - 1 of each group, (k,) float64.
     centre
@@ -308,12 +308,12 @@ class Stratum:
         Factor for the standard error that the scatter of the groups gives.
     groups
         Groups of the record before any were joined.
-    alike
+    correlation
         Lag-one autocorrelation of these groups.
     joined
-        How many of them were joined to one because neighbours were correlated.
-    still_alike
-        Whether neighbours are correlated all the same, so that the errors are too small.
+        How many of them were joined into one because neighbours were correlated.
+    still_correlated
+        Whether neighbours are correlated even so, which makes the errors too small.
     """
 
     pseudo: FloatArray
@@ -321,9 +321,9 @@ class Stratum:
     centre: FloatArray
     widening: float
     groups: BlockGroups
-    alike: float
+    correlation: float
     joined: int
-    still_alike: bool
+    still_correlated: bool
 
     @classmethod
     def of(cls, scores: FloatArray, left_out: FloatArray, groups: BlockGroups) -> Stratum:
@@ -343,9 +343,9 @@ class Stratum:
         widening = 1.0
         if groups.memory:
             widening = occupancy.standard_error_inflation(groups.memory, groups.total, len(frames))
-        still_alike = correlation > _autocorrelation_limit(len(pseudo))
+        still_correlated = correlation > _autocorrelation_limit(len(pseudo))
         spread = groups.total / frames - 1.0
-        return cls(pseudo, spread, centre, widening, groups, first_correlation, joined, still_alike)
+        return cls(pseudo, spread, centre, widening, groups, first_correlation, joined, still_correlated)
 
     def variance(self, a: IntArray, b: IntArray | None = None) -> FloatArray:
         """Return the squared standard error of the scores of sites a (m,), or of their lead over sites b (m,)."""
@@ -373,7 +373,7 @@ def autocorrelation(series: FloatArray) -> float:
 
 
 def _autocorrelation_limit(groups: int) -> float:
-    """The autocorrelation that independent groups exceed once in 20 (Kendall and Ord, Time Series, 1990)."""
+    """Return the autocorrelation that independent groups exceed once in 20 (Kendall and Ord, Time Series, 1990)."""
     if groups <= 2:
         return 1.0
     return -1.0 / groups + _CORRELATION_QUANTILE * math.sqrt((groups - 2) / (groups**2 - 1.0))
@@ -402,7 +402,7 @@ class ScoreUncertainty:
     scores
         Scores of all frames, (n,) float64.
     strata
-        The jackknife over each record that the TPOG was counted in; one unless it is a mix.
+        The jackknife over each record of the TPOG; one unless it is a mix.
     """
 
     scores: FloatArray
@@ -410,7 +410,7 @@ class ScoreUncertainty:
 
     @classmethod
     def of(cls, left_out: FloatArray, groups: Sequence[BlockGroups]) -> ScoreUncertainty:
-        """Make it from the scores with each group left out, (n, 1 + k), and the groups, k in all."""
+        """Compare the scores of all frames and with each group left out, (n, 1 + k), for k groups in all."""
         scores = left_out[:, 0]
         ends = np.cumsum([len(record.frames) for record in groups])
         by_record = np.split(left_out[:, 1:].T, ends[:-1])
@@ -419,7 +419,7 @@ class ScoreUncertainty:
 
     @cached_property
     def bias(self) -> FloatArray:
-        """Expected error of ``scores`` because frames are few, (n,) float64."""
+        """Expected error of ``scores`` due to the limited number of frames, (n,) float64."""
         bias: FloatArray = sum((self.scores - stratum.centre for stratum in self.strata), np.zeros(len(self.scores)))
         return bias
 
@@ -453,13 +453,13 @@ class ScoreUncertainty:
         return float(stdtrit(self.freedom, 0.5 + 0.5 * level))
 
     def intervals(self, level: float = CONFIDENCE_LEVEL) -> FloatArray:
-        """Return lower and upper bound of the score that endless traffic would give, (n, 2) float64."""
+        """Return the bounds of intervals of the scores from endless traffic, (n, 2) float64."""
         half_width = self.quantile(level) * self.se
         centre = self.scores - self.bias
         return np.column_stack([centre - half_width, centre + half_width])
 
     def differences(self, a: IntArray, b: IntArray) -> ScoreDifferences:
-        """Return scores of sites a (m,) minus those of sites b (m,); their shared scatter cancels in the errors."""
+        """Return the scores of sites a (m,) minus those of sites b (m,); their common scatter cancels in the errors."""
         return ScoreDifferences(self.scores[a] - self.scores[b], self._error(a, b))
 
     def beats(self, a: IntArray, b: IntArray) -> FloatArray:
@@ -470,7 +470,7 @@ class ScoreUncertainty:
         gap, error = self.differences(a, b)
         with np.errstate(divide="ignore", invalid="ignore"):
             chance = stdtr(self.freedom, gap / error)
-        # Rounded to 1e-6, since the last bits of a t distribution depend on the machine.
+        # Rounded to 1e-6, because the last bits of a t distribution depend on the machine.
         rounded: FloatArray = np.round(np.where(gap == 0.0, 0.5, chance), 6).astype(np.float64)
         return rounded
 
@@ -517,7 +517,7 @@ def _describe_stratum(stratum: Stratum) -> str:
     blocks = len(stratum.pseudo)
     text = f"{blocks} blocks of {stratum.groups.total // blocks:,} frames"
     if stratum.joined > 1:
-        text += f", joined because neighbours were correlated ({stratum.alike:.2f})"
+        text += f", joined because neighbours were correlated ({stratum.correlation:.2f})"
     return text + _describe_widening(stratum)
 
 
@@ -551,7 +551,7 @@ def uncertainty_warnings(
     """
     warnings = []
     for stratum, name in zip(estimate.strata, names, strict=True):
-        if not (stratum.is_short or stratum.still_alike):
+        if not (stratum.is_short or stratum.still_correlated):
             continue
         length_key = (period_lengths or {}).get(name)
         if length_key is not None:
@@ -580,7 +580,7 @@ def _describe_short_record(stratum: Stratum, frame_period_s: float) -> str:
 
 def _longer_record_hint(stratum: Stratum, frame_period_s: float, *, in_seconds: bool) -> str:
     enough = math.ceil(MIN_GROUPS * occupancy.MEMORY_WINDOW * stratum.groups.memory)
-    if stratum.still_alike:
+    if stratum.still_correlated:
         enough = max(2 * stratum.groups.total, enough)
     better = round(GROUP_LENGTH_MEMORIES / occupancy.MEMORY_WINDOW) * enough
     if in_seconds:

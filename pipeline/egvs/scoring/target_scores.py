@@ -1,27 +1,27 @@
-r"""Scores over vehicles: points on target, share seen well, expected detections.
+r"""Scores over vehicles: points on target, share of well visible vehicles, expected detections.
 
 Each score is the weighted mean of a function of what a site sees of each of the N vehicle-frames of a record
 (:func:`egvs.scoring.targets.weighted_mean`).
 
-*Points*: a concave gain g of the points :math:`n_i` on a vehicle, with everything else in the way.
+*Points*: a concave gain g of the points :math:`n_i` on a vehicle, with occlusion by all others.
 
 .. math:: \frac{1}{N} \sum_{i=1}^{N} g(n_i)
 
-A first point on a vehicle is worth more than a hundredth, so that one vehicle seen very well does not make up for one
-that is missed. g(0) = 0: a vehicle without a point is in a blind spot of the site.
+The first point on a vehicle counts more than the hundredth, so that one vehicle with many points does not make up for
+one without. g(0) = 0: a vehicle without a point is in a blind spot of the site.
 
 *Expected detections*: the probability that a detector finds the vehicle, from what the site sees of it.
 
 .. math:: \frac{1}{N} \sum_{i=1}^{N} p(x_i), \qquad p(x) = \frac{1}{1 + e^{-b - \sum_t f_t(x)}}
 
 x are :data:`FEATURES`, f_t the trees of a boosted model. The model rises with points, points on sides, spans and the
-gap to the neighbour, and falls with the hole between points and with steepness (:data:`MONOTONICITY`); it is free in
-range, length and the angle of view. A vehicle without any point is never detected.
+gap to the neighbour, and falls with the hole between points and with the depression angle (:data:`MONOTONICITY`);
+range, length and angle of view may have either effect. A vehicle without any point is never detected.
 
-The parameters of the model are data, ``target_scores.json`` beside this module. They were learnt from what each
-detector found, and missed, on junctions that no result is quoted for (``benchmarks/detectability`` fits them again;
-docs/validity.md shows how well they hold elsewhere). A detection is a box that overlaps the vehicle by more than 0.7,
-in the mean of the overlaps in plan and in space.
+The parameters of the model are in ``target_scores.json`` beside this module. They were trained on the detections of
+each detector at junctions that no result is quoted for (``benchmarks/detectability`` fits them again; docs/validity.md
+shows their accuracy elsewhere). A detection is a box that overlaps the vehicle by more than 0.7, in the mean of the
+overlaps from above and in 3D.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ MONOTONICITY = {
     "range_m": 0,
     "side": 0,
 }
-"""For each feature, whether the probability rises with it (1), falls (-1), or may do either (0)."""
+"""For each feature: 1 if the probability may only rise with it, -1 if it may only fall, 0 for either."""
 
 FEATURES = tuple(MONOTONICITY)
 """Features of the model, see :class:`egvs.scoring.targets.VisibleTargets`: logarithms of 1 + points, gaps of at most
@@ -87,7 +87,7 @@ class SiteTargetScores:
     by_period
         Scores in each period alone, in their order; empty without periods.
     missed
-        Where the site misses vehicles; None unless requested.
+        Visibility of vehicles by place; None unless requested.
     """
 
     scores: Mapping[str, FloatArray]
@@ -123,7 +123,7 @@ def points_on_target(visible: VisibleTargets, gain: Gain = log_points, weight: F
 
 
 def seen_well(visible: VisibleTargets, weight: FloatArray | None = None) -> float:
-    """Return the share of vehicles that a site sees well, 0 to 1; parameters as in :func:`points_on_target`."""
+    """Return the share of well visible vehicles, 0 to 1; parameters as in :func:`points_on_target`."""
     return points_on_target(visible, saturating_gain, weight)
 
 
@@ -177,7 +177,7 @@ def detectability_features(visible: VisibleTargets) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class DetectabilityModel:
-    """Boosted trees over :data:`FEATURES`, as :func:`egvs.kernels.vehicle_visibility.add_trees` takes them.
+    """Boosted trees over :data:`FEATURES`, in the form that :func:`egvs.kernels.vehicle_visibility.add_trees` takes.
 
     Attributes
     ----------
@@ -233,7 +233,7 @@ def detectability_model(detector: str) -> DetectabilityModel:
 
 
 def _score_detection(visible: VisibleTargets) -> FloatArray:
-    """Probability of detection; for people, for whom no model is calibrated, the gain that saturates."""
+    """Return the probability of detection; for people, for whom there is no model, the saturating gain."""
     if not len(visible):
         return np.empty(0)
     return np.where(visible.record.are_people, saturating_gain(visible.points), detection_chances(visible))

@@ -1,16 +1,16 @@
 r"""Vehicles of recorded frames, and what a site sees of each of them.
 
 Steps: read some frames of ``trajectories.parquet``, evenly spread over the record; arrange their boxes for the kernels;
-compute once for all sites what depends on traffic alone (:class:`TargetRecord`); count for each site the beams that
-meet each vehicle first (:func:`visible_targets`); average over vehicles (:func:`weighted_mean`), over all of them and
+compute once for all sites what depends on traffic only (:class:`TargetRecord`); count for each site the beams that
+hit each vehicle first (:func:`visible_targets`); average over vehicles (:func:`weighted_mean`), over all of them and
 with each group of frames left out (:class:`FrameGroups`).
 
-Targets are the boxes of :meth:`egvs.artefacts.traffic_frames.TrafficFrame.target_rows`: centre in the region of
-interest, one box for each part of an articulated vehicle, pedestrians and bicycles only on request. Each such box in a
-frame is one *vehicle-frame*, a row here. All other boxes of a frame only occlude.
+Targets are the boxes of :meth:`egvs.artefacts.traffic_frames.TrafficFrame.target_rows`: boxes with their centre in the
+region of interest, one for each part of an articulated vehicle; pedestrians and bicycles only on request. Each such box
+in a frame is one *vehicle-frame*, a row here. All other boxes of a frame only occlude.
 
-Visibility follows from the empty scan alone: the boxes of a frame are put into it, and a beam ends on the first box
-that it enters (made 0.1 mm smaller on each side, as everywhere). Boxes are plain boxes here, as for the TPOG.
+Visibility is computed from the empty scan: the boxes of a frame are inserted, and a beam ends on the first box that it
+enters (made 0.1 mm smaller on each side, as for the TPOG).
 
 Limits: beams that cannot meet the region of interest were not cast, so the part of a vehicle outside the region gets no
 or few points, and vehicles entirely beyond the region occlude nothing. (At ingolstadt it would change 6 of 24,888
@@ -63,24 +63,24 @@ REPLAYED_FRAMES = 250
 """Number of frames that are replayed, evenly spread over the record."""
 
 SEEN_WELL_POINTS = 20.0
-"""n0: a vehicle with this many points is seen well by 63 %, with three times as many by 95 %."""
+"""n0: the gain of a vehicle with this many points is 63 %, with three times as many 95 %."""
 
 _KERNEL_ORDER = [0, 1, 2, 6, 7, 3, 4, 5]
-"""Columns of ``traffic_frames.BOX_COLUMNS`` and pitch, as kernels take a box: centre, yaw, pitch, sizes."""
+"""Columns of ``traffic_frames.BOX_COLUMNS`` and pitch, in the order of kernels: centre, yaw, pitch, sizes."""
 
 _BANDS = 16
 """Number of bands of slopes that beams are sorted into."""
 
 _SAME_SLOPE = 1e-9
-"""Slopes of one ring of a sensor differ by rounding alone, and belong to one band."""
+"""Slopes that differ by less are those of one ring of a sensor, and belong to one band."""
 
 _MAX_HITS = 2**17
-"""Hits that are listed at once: bounds the memory."""
+"""Hits that are listed at once, which bounds the memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class AllBoxes:
-    """Every box of the replayed frames, as kernels take them, in the grid's frame.
+    """Every box of the replayed frames, in the form that kernels take and in the grid's frame.
 
     Attributes
     ----------
@@ -223,14 +223,14 @@ class TargetRecord:
 
 
 def _index_names(names: Sequence[str]) -> tuple[tuple[str, ...], IntArray]:
-    """The distinct names, sorted, and the index of each name among them."""
+    """Return the distinct names, sorted, and the index of each name among them."""
     distinct = sorted(set(names))
     index = {name: i for i, name in enumerate(distinct)}
     return tuple(distinct), np.array([index[name] for name in names], dtype=np.int64)
 
 
 def _neighbour_gaps(boxes: AllBoxes, row: IntArray, is_vehicle: NDArray[np.bool_]) -> FloatArray:
-    """Gap in plan from the boxes in ``row`` to their nearest neighbours, metres."""
+    """Return the gap in plan from the boxes in ``row`` to their nearest neighbours, metres."""
     footprints, gap_m = np.empty((len(boxes.values), 6)), np.empty(len(boxes.values))
     vehicle_visibility.footprints(boxes.values, footprints)
     is_target = np.zeros(len(boxes.values), dtype=np.bool_)
@@ -248,10 +248,10 @@ class VisibleTargets:
     record
         The vehicle-frames.
     points
-        Beams that meet the vehicle first, with the static world and all other boxes in the way, (n,) float64: a whole
-        number; an expectation where effects weight beams or lose returns.
+        Number of beams that hit the vehicle first, with occlusion by the static world and all other boxes, (n,)
+        float64; an expectation where effects weight beams or lose returns.
     points_alone
-        The same with no other box in the way, (n,) float64.
+        The same without occlusion by other boxes, (n,) float64.
     points_on_sides
         Those of ``points`` that are not on its roof (or, from below, its underside), (n,) float64.
     length_share, width_share
@@ -287,7 +287,7 @@ class VisibleTargets:
 
 
 def visible_targets(
-    record: TargetRecord, beams: Beams, noticed: Callable[[FloatArray], FloatArray] | None = None
+    record: TargetRecord, beams: Beams, return_probability: Callable[[FloatArray], FloatArray] | None = None
 ) -> VisibleTargets:
     """Return what a site sees of the vehicle-frames of a record.
 
@@ -297,7 +297,7 @@ def visible_targets(
         Recorded traffic; the same for all sites.
     beams
         The site's empty scan.
-    noticed
+    return_probability
         Probability that a return from each range (n,) is detected; 1 where it is None.
     """
     row, boxes = record.row, record.all_boxes.values[record.row]
@@ -308,10 +308,10 @@ def visible_targets(
     run_m = np.hypot(away_m[:, 0], away_m[:, 1])
     across_m = np.abs(away_m[:, 1] * np.cos(yaw_rad) - away_m[:, 0] * np.sin(yaw_rad))
 
-    hits = _count_points(record, sensor_m, beams, noticed)
+    hits = _count_points(record, sensor_m, beams, return_probability)
     points_alone = hits.alone[row]
-    if noticed is not None:
-        points_alone = points_alone * noticed(range_m)
+    if return_probability is not None:
+        points_alone = points_alone * return_probability(range_m)
     low, high = hits.low[row], hits.high[row]
     has_points = high >= low
     spans = np.zeros((len(row), 2))
@@ -354,7 +354,7 @@ class _BoxHits(NamedTuple):
     """Points on every box of a record, (b,); ``low`` and ``high`` bound them along the box's axes, (b, 2), metres."""
 
     alone: FloatArray
-    """With no other box in the way and every return detected."""
+    """Without occlusion by other boxes, and with every return detected."""
     points: FloatArray
     on_sides: FloatArray
     slices: NDArray[np.uint64]
@@ -364,11 +364,14 @@ class _BoxHits(NamedTuple):
 
 
 def _count_points(
-    record: TargetRecord, sensor_m: FloatArray, site: Beams, noticed: Callable[[FloatArray], FloatArray] | None
+    record: TargetRecord,
+    sensor_m: FloatArray,
+    site: Beams,
+    return_probability: Callable[[FloatArray], FloatArray] | None,
 ) -> _BoxHits:
     boxes, count = record.all_boxes, len(record.all_boxes.values)
     bands = 1  # then shares are added in the order of azimuths alone
-    if site.weight is None and noticed is None:
+    if site.weight is None and return_probability is None:
         bands = _BANDS
     beams = _sort_into_bands(site, bands)
     is_target = np.zeros(count, dtype=np.bool_)
@@ -380,7 +383,7 @@ def _count_points(
     owner = np.full(len(beams.weight), -1, dtype=np.int32)
     range_m = beams.length_m.copy()
     capacity = 0
-    if noticed is not None:
+    if return_probability is not None:
         capacity = max(_MAX_HITS, len(beams.weight))
     hits = (np.empty(capacity, dtype=np.int64), np.empty(capacity, dtype=np.int64), *np.empty((3, capacity)))
 
@@ -390,15 +393,15 @@ def _count_points(
         frame, filled = vehicle_visibility.first_hits(
             frame, sensor_m, size_m, all_boxes, tuple(beams), owner, range_m, tuple(result), hits
         )
-        if noticed is not None:
+        if return_probability is not None:
             box, row, hit_range_m, along_m, across_m = (column[:filled] for column in hits)
-            weight = beams.weight[row] * noticed(hit_range_m)
+            weight = beams.weight[row] * return_probability(hit_range_m)
             vehicle_visibility.accumulate_hits(box, weight, along_m, across_m, boxes.values, tuple(result[1:]))
     return result
 
 
 class _SortedBeams(NamedTuple):
-    """Beams as :func:`egvs.kernels.vehicle_visibility.first_hits` takes them."""
+    """Beams in the form that :func:`egvs.kernels.vehicle_visibility.first_hits` takes."""
 
     starts: IntArray
     slopes: FloatArray
@@ -409,12 +412,12 @@ class _SortedBeams(NamedTuple):
 
 
 def _sort_into_bands(beams: Beams, bands: int) -> _SortedBeams:
-    """Sort beams into bands of slopes with as many beams in each, and by azimuth in a band."""
+    """Sort beams into bands of slopes with equal numbers of beams, and by azimuth within each band."""
     ends = beams.ends_m
     azimuth = np.arctan2(ends[:, 1], ends[:, 0])
     run_m = np.sqrt(ends[:, 0] ** 2 + ends[:, 1] ** 2)
     length_m = np.sqrt((ends[:, 0] ** 2 + ends[:, 1] ** 2) + ends[:, 2] ** 2)
-    with np.errstate(invalid="ignore", divide="ignore"):  # a beam without length meets nothing; one may be vertical
+    with np.errstate(invalid="ignore", divide="ignore"):  # beams without length, which hit nothing, and vertical beams
         slope = np.nan_to_num(ends[:, 2] / run_m)
         directions = ends.T / length_m
 
@@ -486,7 +489,7 @@ class FrameGroups:
     def read(cls, tpog: Path, trajectories: Path, record: TargetRecord) -> FrameGroups | None:
         """Read the groups from ``tpog.parquet`` and the ``trajectories.parquet`` that it was counted from.
 
-        None where a record has one block only, since its scatter is unknown.
+        None if a record has one block only, because its scatter is unknown.
         """
         periods = read_periods(tpog)
         if any(period.blocks < 2 for period in periods):
@@ -495,7 +498,7 @@ class FrameGroups:
 
     @classmethod
     def of(cls, periods: Sequence[PeriodBlocks], recorded: Sequence[int], record: TargetRecord) -> FrameGroups:
-        """Make the groups from the blocks of each record, two or more, and its number of recorded frames.
+        """Return the groups from the blocks of each record, two or more, and its number of recorded frames.
 
         Frames at the end of a record that fill no block belong to its last group. A record of which no frame is
         replayed has no weight.
@@ -519,7 +522,7 @@ class FrameGroups:
         values
             Of vehicle-frames, (n,) float64.
         weight
-            Weight of each beside that in the mix, (n,) float64; equal weights where it is None.
+            Weight of each, in addition to that in the mix, (n,) float64; equal weights where it is None.
         """
         weights = self.weight
         if weight is not None:
@@ -550,7 +553,7 @@ def weighted_people(config: WeightsConfig) -> frozenset[str]:
 
 
 def target_weights(config: WeightsConfig, record: TargetRecord) -> FloatArray:
-    """Return the weight of each vehicle-frame, (n,) float64, 1 by default. A centre on a zone's edge is in it."""
+    """Return the weight of each vehicle-frame, (n,) float64, 1 by default. The edge of a zone is part of it."""
     weight: FloatArray = np.ones(len(record))
     if record.kinds:
         by_kind = np.array([config.kinds.get(kind, 1.0) for kind in record.kinds])  # type: ignore[call-overload]
@@ -575,7 +578,7 @@ def warn_unused_weights(config: WeightsConfig, record: TargetRecord) -> Iterator
 
 
 def _in_polygon(polygon_m: Any, record: TargetRecord) -> NDArray[np.bool_]:
-    """Which vehicle-frames have their centre in a polygon or on its edge."""
+    """Return which vehicle-frames have their centre in a polygon or on its edge."""
     import shapely
 
     inside: NDArray[np.bool_] = shapely.intersects_xy(

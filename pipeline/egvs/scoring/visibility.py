@@ -1,17 +1,18 @@
 r"""Hits of a scan: how many of its beams cross each voxel, with effects on beams and detection.
 
-Steps: move the scan into the grid's frame in float64, march every beam, count. Effects change only what they need to:
+Steps: convert the scan to the grid's frame in float64, traverse the voxels of every beam, count. Effects change only
+what they need to:
 
-- where the rows of a scan are shares of beams, each beam adds its share, in whole multiples of 2**-32;
-- where an effect says which share of a beam reaches a voxel, crossings are listed, and each adds that share; where it
-  says at which ranges a beam's share falls, each beam adds what is left of it;
-- the probability that a return from a voxel is detected depends on its range alone, so hits are added up first and then
-  thinned:
+- where the rows of a scan are shares of beams, each row adds its share, in integer multiples of 2**-32;
+- where an effect defines which share of a beam reaches a voxel, crossings are listed, and each adds that share; where
+  it defines at which ranges the share of a beam falls, each beam adds the share that remains;
+- the probability that a return from a voxel is detected depends on its range only, so hits are added up first and then
+  multiplied by it:
 
 .. math:: hits(v) \cdot detect(range(v))
 
-The range of a voxel is that of its centre from the sensor, whichever beam crosses it. The function is not evaluated for
-a million voxels but at some thousand ranges, and interpolated by a table of cubics. Each piece is compared with the
+The range of a voxel is that of its centre from the sensor, for all beams. The function is not evaluated for a million
+voxels but at a few thousand ranges, and interpolated by a table of cubics. Each piece is compared with the
 function between its nodes and used only where it is within ``TOLERANCE``; in any other piece (the step of a hard limit)
 the function itself is evaluated for each voxel.
 """
@@ -45,23 +46,23 @@ from egvs.sensors.sites import Pose
 ByRange = Callable[[FloatArray], FloatArray]
 
 UNIT = 2**32
-"""What a whole beam adds to a voxel where beams are weighted: weights are rounded to whole multiples of 2**-32."""
+"""What one beam adds to a voxel where beams are weighted: weights are rounded to integer multiples of 2**-32."""
 
 MAX_CROSSINGS = 2**31
-"""More whole beams times voxels might overflow 64 bits in units of 2**-32."""
+"""Above this number of beams times voxels, sums in units of 2**-32 might overflow 64 bits."""
 
 FARTHEST_M = 2e7
-"""From further away, float64 cannot tell whether a chord is longer than 1 micrometre."""
+"""From farther away, float64 cannot decide whether a chord is longer than 1 micrometre."""
 
 TOLERANCE = 2.0**-34
 """Largest accepted difference between a cubic and the function at the three points where both are compared."""
 
 _INITIAL_PIECES = 1024
 _MAX_PIECES = 16384
-_MAX_ROUGH_SHARE = 1 / 64  # where more pieces than this share need the function, shorter pieces are tried
+_MAX_ROUGH_SHARE = 1 / 64  # if a larger share of pieces needs the function itself, shorter pieces are tried
 
 _CUBIC_COEFFICIENTS = np.array([[2, 0, 0, 0], [-11, 18, -9, 2], [18, -45, 36, -9], [-9, 27, -27, 9]]).T / 2
-"""Values at 0, 1/3, 2/3 and 1, to the coefficients of the cubic through them."""
+"""Converts values at 0, 1/3, 2/3 and 1 to the coefficients of the cubic through them."""
 
 
 @dataclass(frozen=True)
@@ -73,11 +74,11 @@ class Beams:
     pose, sensor
         Pose and sensor of the scan.
     ends_m
-        End of each piece of a beam, seen from the sensor along the world's axes, (n, 3) float64.
+        End of each beam or part of a beam, relative to the sensor along the world's axes, (n, 3) float64.
     weight
-        The share of its beam that each row is, (n,) float64; None where every row is a whole beam.
+        Share of its beam of each row, (n,) float64; None where every row is one beam.
     where
-        What messages name as their source.
+        The source of the beams, for messages.
     """
 
     pose: Pose
@@ -93,7 +94,7 @@ class Beams:
 
 
 class VoxelSegments(NamedTuple):
-    """Beams in voxel units, as :mod:`egvs.kernels.traversal` takes them.
+    """Beams in voxel units, in the form that :mod:`egvs.kernels.traversal` takes.
 
     ``origin``: the sensor, (3,) float64; ``ends``: beams from there, (n, 3) float64; ``shape``: the grid's, (3,) int64.
     """
@@ -135,14 +136,14 @@ class HitCounter:
     Parameters
     ----------
     scene, tpog
-        The scene with its effects, and the TPOG whose grid is marched.
+        The scene with its effects, and the TPOG with the grid.
     trajectories
         ``trajectories.parquet``, for effects that replay traffic.
 
     Attributes
     ----------
     unit
-        What a whole beam adds to a voxel: 1 (counters are uint32), or ``UNIT`` where effects weight beams (int64).
+        What one beam adds to a voxel: 1 (counters are uint32), or ``UNIT`` where effects weight beams (int64).
     """
 
     def __init__(self, scene: Scene, tpog: Tpog, trajectories: Path | None = None) -> None:
@@ -165,8 +166,8 @@ class HitCounter:
         beams
             The scan.
         cells
-            Flat index of the voxels that are needed, (n,) int64: scores read only those that traffic ever occupies, and
-            where effects detect, only these are thinned. Values in other voxels are undefined. None for all voxels.
+            Flat index of the voxels that are needed, (n,) int64; values in other voxels are undefined. Scores need only
+            those that traffic ever occupies. None for all voxels.
         """
         segments = to_voxel_units(beams, self._grid)
         self._refuse_too_many(beams)
@@ -190,13 +191,13 @@ class HitCounter:
         return weighted
 
     def _refuse_too_many(self, beams: Beams) -> None:
-        """Raise InputError where a sum of weighted hits might overflow 64 bits."""
-        whole_beams = float(len(beams.ends_m))
+        """Raise an InputError where a sum of weighted hits might overflow 64 bits."""
+        total_weight = float(len(beams.ends_m))
         if beams.weight is not None:
-            whole_beams = float(beams.weight.sum())
+            total_weight = float(beams.weight.sum())
         limit = MAX_CROSSINGS / (sum(self._grid.shape) + 3)
-        if self.unit > 1 and whole_beams >= limit:
-            problem = f"expected fewer than {limit:g} beams with effects, got {whole_beams:g}"
+        if self.unit > 1 and total_weight >= limit:
+            problem = f"expected fewer than {limit:g} beams with effects, got {total_weight:g}"
             raise InputError(beams.where, problem, "Use a sensor with fewer beams, or larger voxels.")
 
     def _counters(self) -> tuple[NDArray[np.uint32], IntArray]:
@@ -221,12 +222,12 @@ class HitCounter:
             return
 
         effects = [effect.for_sensor(segments.origin * voxel_m, self._grid) for effect in self._transmit]
-        falls = None
+        steps = None
         if len(effects) == 1:
-            falls = effects[0].falls(beams.ends_m)
-        if falls is not None:
-            for part in falls:
-                share = _checked_shares(effects[0], part.share, len(part.range_m), "falls")
+            steps = effects[0].transmittance_steps(beams.ends_m)
+        if steps is not None:
+            for part in steps:
+                share = _checked_shares(effects[0], part.share, len(part.range_m), "transmittance_steps")
                 hit_kernels.add_stepwise_shares(
                     *segments, voxel_m, part.rows, part.first, part.range_m, share, weights, UNIT, hits
                 )
@@ -254,7 +255,7 @@ class HitCounter:
 
 
 def _checked_shares(effect: Effect[Any], shares: object, count: int, unit: str) -> FloatArray:
-    """Return the ``count`` shares of an effect; RunError for anything else, since a wrong share is a wrong score."""
+    """Return the ``count`` shares of an effect; raise a RunError for anything else, which would give a wrong score."""
     if not isinstance(shares, np.ndarray):
         actual = f"{type(shares).__name__}"
     elif shares.dtype.kind not in "fiub":
@@ -277,7 +278,7 @@ class RangeTable:
     function
         The function itself, (n,) metres to (n,) shares.
     near_m, piece_m
-        Begin of the first piece, and length of each.
+        Start of the first piece, and length of each.
     cubics
         Coefficients of each piece, see :func:`egvs.kernels.hits.thin_by_range`; NaN where a cubic is too inaccurate.
     """
@@ -325,7 +326,7 @@ class RangeTable:
 
 
 def _fit_cubics(function: ByRange, near_m: float, far_m: float, pieces: int) -> FloatArray:
-    """Cubics through four points of each piece; NaN where one is too inaccurate at the three points between them."""
+    """Fit a cubic through four points of each piece; NaN if it is too inaccurate at the three points between them."""
     nodes = np.arange(pieces)[:, None] + np.arange(7) / 6
     values = function((near_m + nodes * ((far_m - near_m) / pieces)).ravel()).reshape(pieces, 7)
     cubics: FloatArray = (values[:, ::2, None] * _CUBIC_COEFFICIENTS).sum(axis=1)

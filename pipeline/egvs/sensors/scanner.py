@@ -240,10 +240,11 @@ class Scanner:
             problem = f"expected points within {MAX_COORDINATE_M:g} m of the world's origin, got {farthest_m:g} m"
             raise InputError(where, problem)
         if crs is None:
-            world.metres(points[:, :2], where, "metres of the world frame, or a LAS file that declares its CRS")
+            hint = "Save the points in the world frame, or as a LAS file that declares its system."
+            world.check_metres(points[:, :2], where, hint)
             return points
-        expected = "points in the coordinate reference system that the file's header declares"
-        reading = world.read_coordinates(points[:, :2], where, crs, expected)
+        hint = "Check the coordinate reference system in the file's header."
+        reading = world.read_coordinates(points[:, :2], where, crs, hint)
         z_m = points[:, 2] * height_unit_m(crs, where) - self.scene.scenario.crs.zero_height_m
         return np.column_stack([reading.to_world(points[:, :2]), z_m])
 

@@ -360,7 +360,7 @@ def catalogue_entries() -> dict[str, CatalogueEntry]:
     """Return all entries by name, in the order of the file."""
     with CATALOGUE_FILE.open("rb") as file:
         document = tomllib.load(file)
-    return {name: CatalogueEntry.of(values) for name, values in document.items()}
+    return {name: CatalogueEntry.from_dict(values) for name, values in document.items()}
 
 
 def catalogue_digest(name: str) -> str:

@@ -2,7 +2,7 @@
 
 The column names of a CSV say what its coordinates are: ``x_m, y_m``, or longitude and latitude (WGS 84, degrees) under
 one of the names of :data:`LONGITUDE` and :data:`LATITUDE`. Where a row has both, they must agree. The coordinates of a
-GeoJSON file are metres, degrees, or what the file declares.
+GeoJSON file are in the system that its member ``crs`` declares.
 
 Further columns belong to the user (``fid``, ``owner``, ``note``) and are carried through to the scores. A column whose
 name is nearly one of the program's, which the file lacks, is rejected as misspelt.
@@ -11,6 +11,7 @@ name is nearly one of the program's, which the file lacks, is rejected as misspe
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
 import re
@@ -22,6 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from egvs.core import files
 from egvs.core.errors import InputError, find_misspelling
 from egvs.core.grid import FloatArray
 from egvs.core.reading import read_json
@@ -38,7 +40,7 @@ LATITUDE = ("lat", "latitude", "lat_deg", "latitude_deg")
 
 _TOLERANCE_M = 0.1
 _MAX_M = 1e8  # larger values are not on Earth; they are rejected when the row is parsed
-_EXPECTED_COLUMNS = "columns x_m, y_m in metres of the world frame, or longitude, latitude in degrees"
+_COLUMNS_HINT = "Use the columns x_m, y_m for metres of the world frame, or longitude, latitude for degrees."
 
 _COLUMN_NAME = re.compile(r"[^\x00-\x1f]{1,80}")
 _PLAIN_NUMBER = re.compile(r"-?(0|[1-9][0-9]{0,17})(\.[0-9]+)?")  # "007" is a name
@@ -69,7 +71,10 @@ def read_csv(path: Path, world: Georeference) -> Iterator[SiteRow]:
     """Yield the rows of a CSV; InputError with file and row for a malformed one."""
     located = []
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with (
+            files.open_input(path) as content,
+            io.TextIOWrapper(content, encoding="utf-8-sig", newline="") as file,
+        ):
             reader = csv.DictReader(file, skipinitialspace=True)
             _check_header(path, list(reader.fieldnames or ()))
             for values in reader:
@@ -177,7 +182,7 @@ def locate_rows(rows: Iterable[SiteRow], path: object, world: Georeference) -> l
     names = [_lon_lat_columns(row.columns) for row in rows]
     metres = [(_number_or_nan(row.columns.get("x_m")), _number_or_nan(row.columns.get("y_m"))) for row in rows]
     plausible = [(x, y) for x, y in metres if abs(x) <= _MAX_M and abs(y) <= _MAX_M]
-    world.metres(_as_points(plausible), str(path), _EXPECTED_COLUMNS)
+    world.check_metres(_as_points(plausible), str(path), _COLUMNS_HINT)
     if not any(names):
         return [row.columns for row in rows]
     degrees = [_row_degrees(row, columns) for row, columns in zip(rows, names, strict=True)]
@@ -189,7 +194,7 @@ def locate_rows(rows: Iterable[SiteRow], path: object, world: Georeference) -> l
     if world.frame is None and not needs_degrees:
         return without_degrees
     known = _as_points([lon_lat for lon_lat in degrees if lon_lat is not None])
-    reading = world.read_coordinates(known, str(path), WGS84, _EXPECTED_COLUMNS)
+    reading = world.read_coordinates(known, str(path), WGS84, _COLUMNS_HINT)
     located = []
     for row, columns, lon_lat in zip(rows, without_degrees, degrees, strict=True):
         located.append(columns | _row_to_world(row, lon_lat, reading))

@@ -78,6 +78,8 @@ class Stage:
     code
         Further modules that determine the artefacts although the stage does not import them: they make the
         :class:`egvs.stages.inputs.Inputs` that it is given.
+    neutral_options
+        Keyword arguments of ``run`` that change no artefact, for example where the work is done.
     """
 
     name: str
@@ -87,6 +89,7 @@ class Stage:
     reads: tuple[RunFile, ...] = ()
     effect_stages: tuple[str, ...] = ()
     code: tuple[str, ...] = ()
+    neutral_options: tuple[str, ...] = ()
 
     @property
     def artefacts(self) -> tuple[str, ...]:
@@ -160,7 +163,7 @@ class StageContext:
         if artefact in self._digests:
             return self._digests[artefact]
 
-        digest = self.folder.digest(artefact)
+        digest = files.hash_file(self.path(artefact))
         recorded = self._recorded.get(artefact, digest)
         hint = "Call egvs run to make it again."
         if recorded == "":
@@ -204,8 +207,3 @@ class StageContext:
             "seed": self.scenario.seed if seeded else None,
             **more,
         }
-
-
-def static_world(context: StageContext) -> World:
-    """Return :attr:`StageContext.world`."""
-    return context.world

@@ -1,15 +1,7 @@
-"""The check stage and its list of rules.
+"""The check stage: everything that can be rejected is rejected before any costly work; it writes no file.
 
-Holds a scenario's sites, solids, region of interest, lanes, traffic and sensors against one another.
-
-:func:`check_scenario` reads what the scenario names once, asks every rule, and gives all findings at once, errors
-first. Nothing
-is simulated, cast or written.
-
-The check stage: what can be refused is refused before anything costly, and doubts are told; it writes no file.
-
-Steps: read what the scenario names; ask every rule (:mod:`egvs.stages.check`). All errors stop the run at once;
-warnings stay in the stage's summary.
+Steps: read what the scenario names, once (:func:`egvs.stages.inputs.resolve_check_inputs`); apply every rule of
+:data:`RULES`. All errors stop the run at once; warnings stay in the summary of the stage. Nothing is simulated or cast.
 """
 
 from __future__ import annotations
@@ -29,27 +21,38 @@ from egvs.stages.scene_inputs import sensor_digests
 from egvs.world import geolocation
 
 RULES: tuple[Callable[[CheckInputs], Iterator[Diagnostic]], ...] = (
-    scene_checks.check_lanes_in_region, scene_checks.check_period_networks, traffic_checks.check_times,
-    traffic_checks.check_sumo_files, traffic_checks.check_period_weights, traffic_checks.check_demand,
-    traffic_checks.check_recorded_positions, traffic_checks.check_finished_files,
-    traffic_checks.check_vehicle_kinds, traffic_checks.check_counts, scene_checks.check_sensors_known,
+    scene_checks.check_lanes_in_region,
+    scene_checks.check_period_networks,
+    traffic_checks.check_times,
+    traffic_checks.check_sumo_files,
+    traffic_checks.check_period_weights,
+    traffic_checks.check_demand,
+    traffic_checks.check_recorded_positions,
+    traffic_checks.check_finished_files,
+    traffic_checks.check_vehicle_kinds,
+    traffic_checks.check_counts,
+    scene_checks.check_sensors_known,
     scene_checks.warn_repeated_beams,
-    scene_checks.check_effects, scene_checks.check_poses, scene_checks.warn_sites_on_lanes,
-    scene_checks.warn_dropped_sites, scene_checks.warn_solids_over_lanes, scene_checks.warn_solids_far_away,
-)  # fmt: skip
-"""In the order in which findings are told. A further rule is a function here."""
+    scene_checks.check_effects,
+    scene_checks.check_poses,
+    scene_checks.warn_sites_on_lanes,
+    scene_checks.warn_dropped_sites,
+    scene_checks.warn_solids_over_lanes,
+    scene_checks.warn_solids_far_away,
+)
+"""In the order in which findings are reported. A new rule is a function in this list."""
 
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What a check found, and how much was held against one another.
+    """Findings of a check.
 
     Attributes
     ----------
     findings
-        Errors first.
+        Errors and warnings, errors first.
     sites, solids, lanes
-        How many there are.
+        How many were checked.
     """
 
     findings: tuple[Diagnostic, ...]
@@ -59,12 +62,12 @@ class CheckReport:
 
     @property
     def errors(self) -> tuple[Diagnostic, ...]:
-        """What must stop a run."""
+        """The findings that stop a run."""
         return tuple(finding for finding in self.findings if finding.is_error)
 
     @property
     def warnings(self) -> tuple[Diagnostic, ...]:
-        """What a planner has to know."""
+        """The findings that do not stop a run."""
         return tuple(finding for finding in self.findings if not finding.is_error)
 
 
@@ -74,12 +77,12 @@ def check_scenario(scenario: Scenario) -> CheckReport:
 
 
 def check_inputs(inputs: Inputs) -> CheckReport:
-    """Apply every rule to what a scenario names.
+    """Apply every rule to the inputs of a scenario.
 
     Raises
     ------
     RunError
-        When a program that reads a file is not there or fails; what is wrong with the input is among the findings.
+        When a program that reads a file is missing or fails; errors of the input are among the findings.
     """
     readable, findings = stage_inputs.resolve_check_inputs(inputs)
     for rule in RULES:
@@ -94,39 +97,42 @@ def check_inputs(inputs: Inputs) -> CheckReport:
 
 
 def _drop_repeated_missing_files(findings: Sequence[Diagnostic]) -> Iterator[Diagnostic]:
-    """Without what rules say of files that are not there: that is told already, where the scenario names them."""
-    absent = {finding.problem for finding in findings if finding.rule == stage_inputs.MISSING_FILE_RULE}
-    return (
-        finding
-        for finding in findings
-        if finding.rule == stage_inputs.MISSING_FILE_RULE or finding.problem not in absent
-    )
+    """Drop what other rules report about missing files, which are reported where the scenario names them."""
+    missing = {finding.problem for finding in findings if finding.rule == stage_inputs.MISSING_FILE_RULE}
+    for finding in findings:
+        if finding.rule == stage_inputs.MISSING_FILE_RULE or finding.problem not in missing:
+            yield finding
 
 
 def _merge_findings(findings: Iterable[Diagnostic]) -> Iterator[Diagnostic]:
-    """Each finding once; those that say the same of several places as one, which names the first."""
-    places: dict[tuple[str, str, bool], dict[str, Diagnostic]] = {}
+    """Join findings that differ only in the file or key; the first of these is named."""
+    by_text: dict[tuple[str, str, bool], dict[str, Diagnostic]] = {}
     for finding in findings:
-        places.setdefault((finding.problem, finding.hint, finding.is_error), {}).setdefault(finding.where, finding)
-    for first, *others in (list(alike.values()) for alike in places.values()):
+        by_text.setdefault((finding.problem, finding.hint, finding.is_error), {}).setdefault(finding.where, finding)
+    for equal in by_text.values():
+        first, *others = equal.values()
         yield replace(first, where=f"{first.where} and {len(others)} more") if others else first
 
 
-def dependencies(work: StageContext) -> StageDependencies:
-    """Every file by hash, and all settings but voxels and those of what comes of a run (:data:`IGNORED_SETTINGS`)."""
-    scenario = work.scenario
-    candidates = stage_inputs.readable_candidates(work.inputs)
-    hashes = stage_inputs.file_digests(work.inputs) | _sensor_digests(scenario, candidates)
+IGNORED_SETTINGS = ("description", "extends", "seed", "tpog", "scan", "score", "validation", "placement", "costs")
+"""Settings that no rule reads."""
+
+
+def dependencies(context: StageContext) -> StageDependencies:
+    """Return what the check depends on: every file by hash, and all settings except :data:`IGNORED_SETTINGS`."""
+    scenario = context.scenario
+    candidates = stage_inputs.readable_candidates(context.inputs)
+    digests = stage_inputs.file_digests(context.inputs) | _sensor_digests(scenario, candidates)
     settings = scenario.model_dump(mode="json", exclude={**dict.fromkeys(IGNORED_SETTINGS, True), "roi": {"voxel_m"}})
     settings["keep_visibility"] = scenario.score.keep_visibility
-    if scenario.traffic.periods:  # whose frames that fill no block have no weight
+    if scenario.traffic.periods:  # frames of a period that fill no block have no weight
         settings["blocks"] = scenario.tpog.blocks
     settings |= _georeference_settings(scenario)
-    return StageDependencies(settings, hashes)
+    return StageDependencies(settings, digests)
 
 
 def _sensor_digests(scenario: Scenario, candidates: tuple[Site, ...]) -> dict[str, str]:
-    """Beam tables and entries of the catalogue, by hash; none where one is not there, which is known already."""
+    """The sha256 of beam tables and catalogue entries; nothing where one is missing, which a rule reports."""
     try:
         return sensor_digests(scenario, candidates)
     except InputError:
@@ -134,35 +140,40 @@ def _sensor_digests(scenario: Scenario, candidates: tuple[Site, ...]) -> dict[st
 
 
 def _georeference_settings(scenario: Scenario) -> dict[str, Any]:
-    """Where the world frame lies, and the SUMO that converts a map; nothing where that is wrong, which is told."""
+    """Settings of the world frame and of the conversion of a map; nothing where a rule reports them as wrong."""
     try:
         return geolocation.world_frame_settings(scenario)
     except InputError:
         return {}
 
 
-IGNORED_SETTINGS = ("description", "extends", "seed", "tpog", "scan", "score", "validation", "placement", "costs")
+def run(context: StageContext, _inputs: StageDependencies) -> Summary:
+    """Apply every rule.
 
-
-def run(work: StageContext, inputs: StageDependencies) -> Summary:
-    """Ask every rule.
+    Parameters
+    ----------
+    context
+        The inputs.
 
     Returns
     -------
     dict
-        ``sites`` (those that are scanned), ``solids`` and ``lanes`` that were held against one another; warnings.
+        Number of ``sites`` (those that are scanned), ``solids`` and ``lanes`` that were checked; warnings.
 
     Raises
     ------
-    FindingsError
-        With all errors, and the warnings beside them.
+    DiagnosticsError
+        With all errors and warnings.
     """
-    del inputs
-    checked = check_inputs(work.inputs)
-    if checked.errors:
-        raise DiagnosticsError(checked.errors, checked.warnings)
-    counts = {"sites": checked.sites, "solids": checked.solids, "lanes": checked.lanes}
-    return {**counts, WARNINGS_KEY: [finding.to_json() for finding in checked.warnings]}
+    report = check_inputs(context.inputs)
+    if report.errors:
+        raise DiagnosticsError(report.errors, report.warnings)
+    return {
+        "sites": report.sites,
+        "solids": report.solids,
+        "lanes": report.lanes,
+        WARNINGS_KEY: [finding.to_json() for finding in report.warnings],
+    }
 
 
 STAGE = Stage("check", __name__, dependencies, run, effect_stages=("traffic", "scan", "score"))

@@ -1,16 +1,14 @@
 """The scan stage: what each candidate site sees of the static world alone, as ``scans.parquet``.
 
-Steps: cast the beams of every site (or read its measured scan), :mod:`egvs.sensors.scanner`; write one row a beam
-that can meet the region of interest. The scan knows nothing of traffic, voxels or gamma, so none of these needs it made
-again.
+Steps: cast the beams of every site (or read its measured scan), :mod:`egvs.sensors.scanner`; write one row per beam
+that can meet the region of interest. Scans do not depend on traffic, voxels or gamma.
 
-With ``scan.keep = false`` nothing is written here, and score casts as it goes.
+With ``scan.keep = false`` nothing is written, and the score stage casts the beams.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,23 +20,26 @@ from egvs.core.errors import InputError
 from egvs.core.runtime import map_ordered
 from egvs.formats import point_clouds
 from egvs.sensors.scanner import Scan, Scanner
-from egvs.sensors.scene import Scene
-from egvs.sensors.sites import ScannedSite, Site
+from egvs.sensors.sites import ScannedSite
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.scene_inputs import scan_dependencies
 
 
-def dependencies(work: StageContext) -> StageDependencies:
-    """What empty scans depend on, and whether they are kept."""
-    read = scan_dependencies(work)
-    return replace(read, settings={"keep": work.scenario.scan.keep, **read.settings})
+def dependencies(context: StageContext) -> StageDependencies:
+    """Return what empty scans depend on, and whether they are kept."""
+    scans = scan_dependencies(context)
+    return replace(scans, settings={"keep": context.scenario.scan.keep, **scans.settings})
 
 
-def run(work: StageContext, inputs: StageDependencies, points: tuple[str, ...] = (), cloud: str = "ply") -> Summary:
+def run(context: StageContext, inputs: StageDependencies, points: tuple[str, ...] = (), cloud: str = "ply") -> Summary:
     """Scan all sites and write ``scans.parquet``.
 
     Parameters
     ----------
+    context
+        The run folder, with the static world.
+    inputs
+        What the scans depend on.
     points
         Sites whose empty scan is also written as a point cloud, ``scan_<site>.<cloud>``.
     cloud
@@ -47,59 +48,58 @@ def run(work: StageContext, inputs: StageDependencies, points: tuple[str, ...] =
     Returns
     -------
     dict
-        ``sites``, ``beams`` (cast), ``returns``, ``settled_in_float64`` (beams that float32 alone left in doubt),
-        ``clouds`` (files with points).
+        ``sites``, ``kept``, ``beams`` (cast), ``returns``, ``settled_in_float64`` (beams for which float32 was not
+        exact enough), ``clouds`` (files with points).
     """
-    scene = work.scene
-    known = [site.name for site in scene.sites]
+    scene = context.scene
+    names = [site.name for site in scene.sites]
     for name in points:
-        if name not in known:
-            raise InputError(f"--points {name}", "no such site", f"one of {', '.join(known)}")
+        if name not in names:
+            raise InputError(f"--points {name}", "there is no such site", f"The sites are {', '.join(names)}.")
     scanner = Scanner(scene)
     scanner.check(scene.sites)
-    if not work.scenario.scan.keep:
-        work.folder.scans.unlink(missing_ok=True)
-        written = [
-            _write_cloud(work.folder.path, s.name, scanner.scan_site(s), cloud) for s in scene.sites if s.name in points
-        ]
-        return {"sites": len(known), "kept": False, "clouds": written, **_skipped_effects(scene)}
-    return _write_all(work, inputs, scanner, points, cloud)
-
-
-def _write_all(
-    work: StageContext, inputs: StageDependencies, scanner: Scanner, points: tuple[str, ...], cloud: str
-) -> Summary:
-    scene, clouds, doubtful = work.scene, [], 0
-    about: list[ScannedSite] = []
-
-    def scan(site: Site) -> tuple[Site, Scan, ScannedSite]:
-        done = scanner.scan_site(site)
-        return site, done, done.as_site(site.name, site.pole)
-
-    with parquet.artefact_writer(work.folder.scans, "scans", scanner.columns) as file:
-        for site, done, scanned in map_ordered(scan, scene.sites, work.threads):
-            file.write(_scan_columns(site.name, done))
-            about.append(scanned)
-            doubtful += done.rows.doubtful
+    summary: Summary
+    if context.scenario.scan.keep:
+        summary = _write_scans(context, inputs, scanner, points, cloud)
+    else:
+        context.folder.scans.unlink(missing_ok=True)
+        clouds = []
+        for site in scene.sites:
             if site.name in points:
-                clouds.append(_write_cloud(work.folder.path, site.name, done, cloud))
-            work.progress("sites", len(about), len(scene.sites))
-        file.describe(work.metadata(inputs, seeded=False, sites=[site.to_json() for site in about]))
+                clouds.append(_write_cloud(context.folder, site.name, scanner.scan_site(site), cloud))
+        summary = {"sites": len(names), "kept": False, "clouds": clouds}
+    skipped = scene.skipped("scan")
+    if skipped:
+        summary["skipped"] = skipped
+    return summary
+
+
+def _write_scans(
+    context: StageContext, inputs: StageDependencies, scanner: Scanner, points: tuple[str, ...], cloud: str
+) -> Summary:
+    """Scan the sites on the threads of the context; write one row group for each."""
+    sites = context.scene.sites
+    scanned: list[ScannedSite] = []
+    clouds = []
+    doubtful = 0
+    with parquet.artefact_writer(context.folder.scans, "scans", scanner.columns) as file:
+        scans = map_ordered(scanner.scan_site, sites, context.threads)
+        for site, scan in zip(sites, scans, strict=True):
+            file.write(_scan_columns(site.name, scan))
+            scanned.append(scan.as_site(site.name, site.pole))
+            doubtful += scan.rows.doubtful
+            if site.name in points:
+                clouds.append(_write_cloud(context.folder, site.name, scan, cloud))
+            context.progress("sites", len(scanned), len(sites))
+        file.describe(context.metadata(inputs, seeded=False, sites=[site.to_json() for site in scanned]))
     return {
-        "sites": len(about),
+        "sites": len(scanned),
         "kept": True,
-        "beams": sum(site.beams_in_roi for site in about),
-        "returns": sum(site.returns for site in about),
+        "beams": sum(site.beams_in_roi for site in scanned),
+        "returns": sum(site.returns for site in scanned),
         "settled_in_float64": doubtful,
         "clouds": clouds,
-        **_skipped_effects(scene),
     }
-
-
-def _skipped_effects(scene: Scene) -> Summary:
-    """What to say of effects that are named but provably change nothing; nothing when there is none."""
-    skipped = scene.skipped("scan")
-    return {"skipped": skipped} if skipped else {}
 
 
 def _scan_columns(site: str, scan: Scan) -> dict[str, Any]:
@@ -116,10 +116,11 @@ def _scan_columns(site: str, scan: Scan) -> dict[str, Any]:
     }
 
 
-def _write_cloud(folder: Path, site: str, scan: Scan, suffix: str) -> str:
-    """Write a site's points; the file's name."""
-    name, ends = f"scan_{site}.{suffix}", scan.rows.ends_m[scan.rows.returned]
-    point_clouds.write_points(folder / name, ends + np.asarray(scan.pose.position_m))
+def _write_cloud(folder: RunFolder, site: str, scan: Scan, suffix: str) -> str:
+    """Write the points of a site; return the name of the file."""
+    name = f"scan_{site}.{suffix}"
+    points_m = scan.rows.ends_m[scan.rows.returned] + np.asarray(scan.pose.position_m)
+    point_clouds.write_points(folder / name, points_m)
     return name
 
 

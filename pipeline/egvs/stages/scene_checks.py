@@ -1,17 +1,9 @@
-"""Rules for sites, solids, region, sensors and effects.
+"""Rules for the region of interest, sites, sensors, effects and solids.
 
-Rules for the region of interest: lanes lead through it.
-
-Rules for sensors and effects: they are known, and nothing that an effect needs is missing.
-
-Rules for sites: where they stand, and whether their beams meet the region of interest.
-
-Rules for solids: none covers the lanes, and they stand where the region of interest is.
-
-Which part of a solid is in the way: for a closed one, the triangles whose underside is lower than
-:data:`egvs.world.clearances.CLEARANCE_M` above the road; of an open surface only those that reach above
-:data:`egvs.world.clearances.KERB_M` as well, so that a terrain or the road itself is none. Seen from above, they are
-held against the lanes' areas.
+A solid is in the way of a lane where it is lower than :data:`egvs.world.clearances.CLEARANCE_M` above the road. Of a
+closed solid, all triangles with such a lower edge count; of an open surface, only those that also reach above
+:data:`egvs.world.clearances.KERB_M`, so that terrain, or the road itself, does not count. They are compared with the
+areas of the lanes in plan.
 """
 
 from __future__ import annotations
@@ -40,184 +32,205 @@ from egvs.world.carriageway import Carriageway
 from egvs.world.mesh import World
 
 
-def check_lanes_in_region(subject: CheckInputs) -> Iterator[Diagnostic]:
-    """An error where no lane leads through the region, or all lie above or below it."""
-    if subject.network is None:
+def check_lanes_in_region(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Report a region of interest without lanes, or with all lanes above or below it."""
+    if inputs.network is None:
         return
-    box = subject.scenario.roi.box
-    low_m, high_m = np.asarray(box.origin_m), np.add(box.origin_m, box.size_m)
-    place, cure = f"{subject.scenario.file}: roi", "a region over the network's roads, in the network's coordinates"
-    if subject.carriageway is None:
-        yield Diagnostic("region", place, "the network has no lane for vehicles of the road", cure, is_error=True)
+    box = inputs.scenario.roi.box
+    low_m = np.asarray(box.origin_m)
+    high_m = np.add(box.origin_m, box.size_m)
+    key = f"{inputs.scenario.file}: roi"
+    hint = "Set center_m to a point on the road, in the coordinates of the network."
+    if inputs.carriageway is None:
+        yield Diagnostic("region", key, "the network has no lane for road vehicles", hint, is_error=True)
         return
-    if (far_m := subject.carriageway.distance_m(low_m.tolist(), high_m.tolist())) > 0:
-        (x0, y0), (x1, y1) = subject.carriageway.bounds_m
-        extent = f"lanes reach from ({x0:.0f}, {y0:.0f}) to ({x1:.0f}, {y1:.0f})"
-        what = f"no lane leads through it: the nearest is {far_m:,.1f} m away, {extent}"
-        yield Diagnostic("region", place, what, cure, is_error=True)
+    distance_m = inputs.carriageway.distance_m(low_m.tolist(), high_m.tolist())
+    if distance_m > 0:
+        (x0, y0), (x1, y1) = inputs.carriageway.bounds_m
+        extent = f"lanes extend from ({x0:.0f}, {y0:.0f}) to ({x1:.0f}, {y1:.0f})"
+        problem = f"no lane passes through the region: the nearest is {distance_m:,.1f} m away, {extent}"
+        yield Diagnostic("region", key, problem, hint, is_error=True)
         return
-    at_m = (low_m + high_m)[:2] / 2.0
-    lane = subject.carriageway.nearest(at_m)
-    road_m = subject.carriageway.height_m(lane, at_m)
+    centre_m = (low_m + high_m)[:2] / 2.0
+    lane = inputs.carriageway.nearest(centre_m)
+    road_m = inputs.carriageway.height_m(lane, centre_m)
     if road_m > high_m[2] or road_m + clearances.CLEARANCE_M < low_m[2]:
-        what = f"reaches from z = {low_m[2]:g} to {high_m[2]:g} m, but the road there lies at z = {road_m:.1f} m"
-        yield Diagnostic("region", place, what, "a center_m that holds the traffic", is_error=True)
+        problem = f"the region extends from z = {low_m[2]:g} to {high_m[2]:g} m, but the road is at z = {road_m:.1f} m"
+        yield Diagnostic("region", key, problem, hint, is_error=True)
 
 
-def check_period_networks(subject: CheckInputs) -> Iterator[Diagnostic]:
-    """An error for each period with a network of its own that has no lane in the region, or another zero than the
-    first period's: its vehicles would drive elsewhere.
-    """
-    scenario, refusals = subject.scenario, ErrorCollector()
-    for period, alone in scenario.by_period().items():
-        roads = refusals.attempt("network", partial(sumo_folder.read_network, alone)) if period else None
-        if roads is None or roads is subject.network:
+def check_period_networks(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Report periods whose own network has no lane in the region, or another origin than that of the first period."""
+    scenario = inputs.scenario
+    errors = ErrorCollector()
+    for period, period_scenario in scenario.by_period().items():
+        if not period:
             continue
-        place, box = f"{scenario.file}: traffic.periods ({period})", scenario.roi.box
-        first, own = (
-            geolocation.network_world_frame(None if n is None else n.location) for n in (subject.network, roads)
-        )
-        if first is not None and own is not None and first != own:
-            offsets = f"netOffset {list(own.offset_m)}, not {list(first.offset_m)}"
-            what = f"its network has another zero or projection than that of the first period ({offsets})"
-            cure = "networks of one extract and one projection, so that all periods share a world frame"
-            yield Diagnostic("region", place, what, cure, is_error=True)
-        elif (far_m := Carriageway.of(roads).distance_m(box.origin_m, np.add(box.origin_m, box.size_m))) > 0:
-            what = f"no lane of its network leads through the region: the nearest is {far_m:,.1f} m away"
-            yield Diagnostic("region", place, what, "a network in the coordinates of the others", is_error=True)
-    yield from refusals.findings
+        network = errors.attempt("network", partial(sumo_folder.read_network, period_scenario))
+        if network is None or network is inputs.network:
+            continue
+        key = f"{scenario.file}: traffic.periods ({period})"
+        first_frame = None
+        if inputs.network is not None:
+            first_frame = geolocation.network_world_frame(inputs.network.location)
+        frame = geolocation.network_world_frame(network.location)
+        if first_frame is not None and frame is not None and first_frame != frame:
+            offsets = f"netOffset {list(frame.offset_m)} instead of {list(first_frame.offset_m)}"
+            problem = f"its network has another origin or projection than that of the first period ({offsets})"
+            hint = "Use networks of one extract and one projection, so that all periods share a world frame."
+            yield Diagnostic("region", key, problem, hint, is_error=True)
+            continue
+        box = scenario.roi.box
+        distance_m = Carriageway.of(network).distance_m(box.origin_m, np.add(box.origin_m, box.size_m))
+        if distance_m > 0:
+            problem = f"no lane of its network passes through the region: the nearest is {distance_m:,.1f} m away"
+            hint = "Use a network in the coordinates of the others."
+            yield Diagnostic("region", key, problem, hint, is_error=True)
+    yield from errors.findings
 
 
 MAX_LISTED_BEAMS = 5
-"""So many repeated beams of a table are named."""
+"""Number of repeated beams of a table that are listed."""
 
 
-def check_sensors_known(subject: CheckInputs) -> Iterator[Diagnostic]:
-    """An error for each sensor that nobody knows, or whose table is wrong, and which sites name it."""
-    names: dict[str, list[str]] = {}
-    for site in subject.sites:
-        names.setdefault(site.sensor, []).append(site.name)
-    for sensor_name, of in names.items():
-        more = f" and {len(of) - 1} more" if len(of) > 1 else ""
+def check_sensors_known(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Report each sensor that is unknown, or whose beam table is wrong, and the sites that name it."""
+    sites: dict[str, list[str]] = {}
+    for site in inputs.sites:
+        sites.setdefault(site.sensor, []).append(site.name)
+    for sensor_name, site_names in sites.items():
+        where = f"site {site_names[0]}"
+        if len(site_names) > 1:
+            where += f" and {len(site_names) - 1} more"
         try:
-            scenario_sensor(sensor_name, subject.scenario, f"site {of[0]}{more}")
+            scenario_sensor(sensor_name, inputs.scenario, where)
         except InputError as error:
             yield Diagnostic.of("sensors", error)
 
 
-def warn_repeated_beams(subject: CheckInputs) -> Iterator[Diagnostic]:
-    """A warning for each table of beams that names a direction twice."""
-    scenario = subject.scenario
-    for name in dict.fromkeys(site.sensor for site in subject.sites):
-        model = scenario.sensors.get(name)
-        if model is None or model.beams is None:
+def warn_repeated_beams(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Warn about beam tables that contain a direction twice."""
+    scenario = inputs.scenario
+    for name in dict.fromkeys(site.sensor for site in inputs.sites):
+        config = scenario.sensors.get(name)
+        if config is None or config.beams is None:
             continue
         try:
-            table = sensor.scenario_sensor(name, scenario, name).table
+            table = scenario_sensor(name, scenario, name).table
         except InputError:
-            continue  # told elsewhere
-        if table is not None and (twice := sensor.repeated_beams(table)):
-            listed = ", ".join(f"beam {beam} as beam {first}" for beam, first in twice[:MAX_LISTED_BEAMS])
-            more = ", ..." if twice[MAX_LISTED_BEAMS:] else ""
-            what = (
-                f"{len(twice)} of {len(table)} beams point where an earlier one does ({listed}{more}) and count again"
-            )
-            cure = "each direction once (azimuths of 0 and 360 degrees are the same)"
-            yield Diagnostic("repeated beams", model.beams, what, cure)
+            continue  # check_sensors_known reports it
+        repeated = sensor.repeated_beams(table) if table is not None else ()
+        if table is None or not repeated:
+            continue
+        listed = ", ".join(f"beam {beam} as beam {first}" for beam, first in repeated[:MAX_LISTED_BEAMS])
+        if len(repeated) > MAX_LISTED_BEAMS:
+            listed += ", ..."
+        problem = f"{len(repeated)} of {len(table)} beams repeat an earlier direction ({listed}) and count twice"
+        hint = "Name each direction once; azimuths of 0 and 360 degrees are equal."
+        yield Diagnostic("repeated beams", config.beams, problem, hint)
 
 
-def check_effects(subject: CheckInputs) -> Iterator[Diagnostic]:
-    """An error for each effect that this scenario cannot have, or that lacks something."""
-    if subject.scene is None or any(True for _ in check_sensors_known(subject)):
+def check_effects(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Report each effect that cannot act in this scenario, or lacks something that it needs."""
+    if inputs.scene is None or any(check_sensors_known(inputs)):
         return
-    for effect in registry.scenario_effects(subject.scenario, "traffic", "scan", "score"):
-        yield from _effect_errors(effect, subject.scene)
+    for effect in registry.scenario_effects(inputs.scenario, "traffic", "scan", "score"):
+        yield from _effect_errors(effect, inputs.scene)
 
 
 def _effect_errors(effect: Effect[Any], scene: Scene) -> Iterator[Diagnostic]:
-    refusals = ErrorCollector()
-    idle = refusals.attempt("effects", lambda: effect.why_idle(scene))
-    yield from refusals.findings
-    if not refusals.findings and idle is None and (error := effect.refusal(scene)) is not None:
+    errors = ErrorCollector()
+    inactive_reason = errors.attempt("effects", lambda: effect.why_idle(scene))
+    yield from errors.findings
+    if errors.findings or inactive_reason is not None:
+        return
+    error = effect.refusal(scene)
+    if error is not None:
         yield Diagnostic.of("effects", error)
 
 
 MAX_LISTED_SITES = 8
-"""So many sites get a line of their own; the others share one."""
+"""Number of sites that are listed one by one; the others share a line."""
 
-_CACHED_MOUNTS = 4  # whose beams are kept, 1.4 MB each of 57,600: sites that share a mount come one after another
+_CACHED_MOUNTS = 4  # 57,600 beams take 1.4 MB; sites with the same mount follow one another
 
 
-def check_poses(subject: CheckInputs) -> Iterator[Diagnostic]:
-    """An error for each site that is in a solid, below the ground, or out of its sensor's reach of the region.
+def check_poses(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Report sites in a solid, below the ground, or too far away from the region for their sensor.
 
-    A warning where no beam of a sensor as mounted meets the region.
+    Warn about sites none of whose beams, as mounted, meets the region.
     """
     blind = []
-    if subject.scene is None:
+    if inputs.scene is None:
         return
-    for site in subject.sites:
+    for site in inputs.sites:
         try:
-            sensor = subject.scene.sensor(site.sensor)
+            sensor = inputs.scene.sensor(site.sensor)
         except InputError:
-            continue  # told elsewhere
+            continue  # check_sensors_known reports it
         try:
-            site_feasibility.check_pose(subject.scene, site.pose, sensor, f"site {site.name}")
+            site_feasibility.check_pose(inputs.scene, site.pose, sensor, f"site {site.name}")
         except InputError as error:
             yield Diagnostic.of("sites", error)
             continue
-        if site.points is None and not _reaches_region(subject, site, sensor):
+        if site.points is None and not _reaches_region(inputs, site, sensor):
             blind.append(site.name)
     if blind:
-        names = ", ".join(blind[:MAX_LISTED_SITES]) + (", ..." if blind[MAX_LISTED_SITES:] else "")
-        what = f"no beam of {len(blind)} of {len(subject.sites)} sites meets the region of interest: {names}"
-        yield Diagnostic(
-            "beams beside the region", "sites", what, "another yaw, pitch or place, or a sensor that sees it"
-        )
+        names = ", ".join(blind[:MAX_LISTED_SITES])
+        if len(blind) > MAX_LISTED_SITES:
+            names += ", ..."
+        problem = f"no beam of {len(blind)} of {len(inputs.sites)} sites meets the region of interest: {names}"
+        yield Diagnostic("beams beside the region", "sites", problem, "Change yaw, pitch, position or sensor.")
 
 
-def warn_sites_on_lanes(subject: CheckInputs) -> Iterator[Diagnostic]:
-    """A warning for each named site that stands in a lane, or amid a junction, unless it hangs over the road."""
-    model = subject.scenario.sites
-    if subject.carriageway is None or not subject.sites or (model.file is None and model.only_free):
+def warn_sites_on_lanes(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Warn about each named site in a lane or within a junction, unless it is above the traffic."""
+    config = inputs.scenario.sites
+    if inputs.carriageway is None or not inputs.sites or (config.file is None and config.only_free):
         return
-    found = list(_sites_on_road(subject.sites, subject.carriageway))
-    cure = f"a place beside the road, or more than {clearances.CLEARANCE_M:g} m above it"
-    for site, where in found[:MAX_LISTED_SITES]:
-        what = f"({site.pose.x_m:g}, {site.pose.y_m:g}, {site.pose.z_m:g}) stands {where}"
-        yield Diagnostic("sites on lanes", subject.site_location(site), what, cure)
-    if rest := found[MAX_LISTED_SITES:]:
-        names = ", ".join(site.name for site, _ in rest)
-        what = f"{len(rest)} more of {len(subject.sites)} stand in lanes or junctions: {names}"
-        yield Diagnostic("sites on lanes", subject.site_location(rest[0][0]).partition(":")[0], what, cure)
+    on_road = list(_sites_on_road(inputs.sites, inputs.carriageway))
+    hint = f"Move it beside the road, or more than {clearances.CLEARANCE_M:g} m above it."
+    for site, where in on_road[:MAX_LISTED_SITES]:
+        problem = f"({site.pose.x_m:g}, {site.pose.y_m:g}, {site.pose.z_m:g}) is {where}"
+        yield Diagnostic("sites on lanes", inputs.site_location(site), problem, hint)
+    others = on_road[MAX_LISTED_SITES:]
+    if others:
+        names = ", ".join(site.name for site, _ in others)
+        problem = f"{len(others)} more of {len(inputs.sites)} are in lanes or junctions: {names}"
+        file = inputs.site_location(others[0][0]).partition(":")[0]
+        yield Diagnostic("sites on lanes", file, problem, hint)
 
 
 def _sites_on_road(sites: tuple[Site, ...], carriageway: Carriageway) -> Iterator[tuple[Site, str]]:
-    """The sites that stand in a lane or amid a junction, no higher than the clearance above the road, and where."""
+    """The sites in a lane or within a junction, no higher than the clearance above the road, and where they are."""
     at_m = np.array([[site.pose.x_m, site.pose.y_m] for site in sites])
-    lanes, amid = carriageway.lanes_at(at_m), carriageway.in_junctions(at_m)
-    for site, spot_m, lane, inside in zip(sites, at_m, lanes, amid, strict=True):
-        if lane is None and not inside:
+    lanes = carriageway.lanes_at(at_m)
+    in_junction = carriageway.in_junctions(at_m)
+    for number, site in enumerate(sites):
+        lane = lanes[number]
+        if lane is None and not in_junction[number]:
             continue
-        road_m = carriageway.height_m(carriageway.nearest(spot_m) if lane is None else lane, spot_m)
-        if site.pose.z_m - road_m <= clearances.CLEARANCE_M:
-            yield site, "amid a junction" if lane is None else f"in lane {carriageway.names[lane]}"
+        nearest = carriageway.nearest(at_m[number]) if lane is None else lane
+        if site.pose.z_m - carriageway.height_m(nearest, at_m[number]) > clearances.CLEARANCE_M:
+            continue
+        yield site, "within a junction" if lane is None else f"in lane {carriageway.names[lane]}"
 
 
-def warn_dropped_sites(subject: CheckInputs) -> Iterator[Diagnostic]:
-    """How many candidates of a rule are dropped, and why."""
-    if subject.scene is not None and (gone := subject.scene.dropped):
-        reasons = Counter(why for _, why in gone)
-        why = ", ".join(f"{count} {reason}" for reason, count in reasons.items())
-        what = f"{len(gone)} of {len(gone) + len(subject.sites)} candidates are dropped, since no pole can stand there"
-        place = "sites.grid" if subject.scenario.sites.grid is not None else "sites.along"
-        yield Diagnostic(
-            "dropped candidates", place, f"{what} ({why})", "name a sensor on a gantry or an island in a file of sites"
-        )
+def warn_dropped_sites(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Warn how many candidates of a rule are dropped, and why."""
+    if inputs.scene is None or not inputs.scene.dropped:
+        return
+    dropped = inputs.scene.dropped
+    counts = Counter(reason for _, reason in dropped)
+    reasons = ", ".join(f"{count} {reason}" for reason, count in counts.items())
+    candidates = len(dropped) + len(inputs.sites)
+    problem = f"{len(dropped)} of {candidates} candidates are dropped, since no pole can stand there ({reasons})"
+    key = "sites.grid" if inputs.scenario.sites.grid is not None else "sites.along"
+    yield Diagnostic("dropped candidates", key, problem, "Name a sensor on a gantry or an island in a file of sites.")
 
 
-def _reaches_region(subject: CheckInputs, site: Site, sensor: Sensor) -> bool:
-    box = subject.scenario.roi.box
+def _reaches_region(inputs: CheckInputs, site: Site, sensor: Sensor) -> bool:
+    box = inputs.scenario.roi.box
     ends = _cached_directions(sensor, site.pose.angles_deg) * sensor.range_m
     reaches = np.empty(len(ends), dtype=np.bool_)
     ray_triangle.can_meet_box(np.subtract(site.pose.position_m, box.origin_m), ends, np.asarray(box.size_m), reaches)
@@ -234,19 +247,19 @@ MAX_NAMED_SOLIDS = 5
 _FLAT_M2 = 1e-6  # twice the area that a triangle needs to be seen from above
 
 
-def warn_solids_over_lanes(subject: CheckInputs) -> Iterator[Diagnostic]:
-    """A warning where solids cover lanes in and round the region of interest: the share, the largest, and where."""
-    if subject.world is None or subject.carriageway is None:
+def warn_solids_over_lanes(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Warn about solids that cover lanes in and around the region of interest."""
+    if inputs.world is None or inputs.carriageway is None:
         return
     import shapely
 
-    low_m, high_m = _surroundings(subject.scenario.roi.box)
-    lanes = subject.carriageway.within(low_m, high_m)
+    low_m, high_m = _surroundings(inputs.scenario.roi.box)
+    lanes = inputs.carriageway.within(low_m, high_m)
     if not lanes.area:
         return
     shapely.prepare(lanes)
     covered = []
-    for solid, parts in _solids_in_the_way(subject.world, subject.carriageway, low_m, high_m).items():
+    for solid, parts in _solids_in_the_way(inputs.world, inputs.carriageway, low_m, high_m).items():
         shape = shapely.union_all(parts)
         common = shapely.intersection(shape, lanes)
         if common.area >= clearances.MIN_COVERED_M2 or (common.area > 0 and shapely.intersects(lanes, shape.centroid)):
@@ -255,39 +268,40 @@ def warn_solids_over_lanes(subject: CheckInputs) -> Iterator[Diagnostic]:
         return
     covered.sort(key=lambda item: (-item[0].area, item[1]))
     share = shapely.union_all([common for common, _ in covered]).area / lanes.area
-    named = ", ".join(_describe_solid(subject.world, common, solid) for common, solid in covered[:MAX_NAMED_SOLIDS])
-    more = f", and {len(covered) - MAX_NAMED_SOLIDS} more" if len(covered) > MAX_NAMED_SOLIDS else ""
+    named = ", ".join(_describe_solid(inputs.world, common, solid) for common, solid in covered[:MAX_NAMED_SOLIDS])
+    if len(covered) > MAX_NAMED_SOLIDS:
+        named += f", and {len(covered) - MAX_NAMED_SOLIDS} more"
     count = f"{len(covered)} solids cover" if len(covered) > 1 else "a solid covers"
-    what = f"{count} {share:.1%} of the lanes in and round the region: {named}{more}"
-    cure = "move or lift them, or look at their coordinates: traffic would drive through them"
-    yield Diagnostic("solids over lanes", "statics", what, cure)
+    problem = f"{count} {share:.1%} of the lanes in and around the region: {named}"
+    hint = "Move or lift them, or check their coordinates: traffic would drive through them."
+    yield Diagnostic("solids over lanes", "statics", problem, hint)
 
 
-def warn_solids_far_away(subject: CheckInputs) -> Iterator[Diagnostic]:
-    """A warning where all that stands is far from the region of interest."""
-    if subject.world is None:
+def warn_solids_far_away(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Warn that all solids except the ground are far from the region of interest."""
+    if inputs.world is None:
         return
-    world, box = subject.world, subject.scenario.roi.box
-    low, high = world.bounds_xy_m
-    standing = np.array([kind != "ground" for _, kind in world.solids], dtype=np.bool_)[world.solid_of_face]
-    if not standing.any():
+    box = inputs.scenario.roi.box
+    low, high = inputs.world.bounds_xy_m
+    is_solid = np.array([kind != "ground" for _, kind in inputs.world.solids], dtype=np.bool_)
+    faces = is_solid[inputs.world.solid_of_face]
+    if not faces.any():
         return
-    first, last = np.asarray(box.origin_m[:2]), np.add(box.origin_m, box.size_m)[:2]
-    gaps = np.maximum(np.maximum(first - high[standing], low[standing] - last), 0.0)
+    box_low = np.asarray(box.origin_m[:2])
+    box_high = np.add(box.origin_m, box.size_m)[:2]
+    gaps = np.maximum(np.maximum(box_low - high[faces], low[faces] - box_high), 0.0)
     nearest_m = float(np.hypot(gaps[:, 0], gaps[:, 1]).min())
     if nearest_m > clearances.MAX_STATICS_DISTANCE_M:
-        middle = (low[standing].min(axis=0) + high[standing].max(axis=0)) / 2.0
-        what = (
-            f"the nearest solid is {nearest_m:,.0f} m from the region of interest; all lie round "
-            f"{_format_position(middle)}"
-        )
-        yield Diagnostic("statics far away", "statics", what, "the network's coordinates, in metres")
+        middle = (low[faces].min(axis=0) + high[faces].max(axis=0)) / 2.0
+        distance = f"the nearest solid is {nearest_m:,.0f} m from the region of interest"
+        problem = f"{distance}; all solids are around {_format_position(middle)}"
+        yield Diagnostic("statics far away", "statics", problem, "Use the coordinates of the network, in metres.")
 
 
 def _solids_in_the_way(
     world: World, carriageway: Carriageway, low_m: NDArray[np.float64], high_m: NDArray[np.float64]
 ) -> dict[int, list[object]]:
-    """Solid -> its parts, seen from above, that are in the way on some lane of a rectangle."""
+    """Solid -> its parts, in plan, that are in the way on some lane of a rectangle."""
     import shapely
 
     low, high = world.bounds_xy_m

@@ -1,21 +1,21 @@
-"""The score stage: which site sees most of what is uncertain, as ``scores.parquet``.
+"""The score stage: how much of the occupancy uncertainty each site covers, as ``scores.parquet``.
 
-Steps: read ``tpog.parquet``, and the vehicles of some frames where a score asks for them; take the scans site by site
-(:mod:`egvs.stages.site_scoring`); score each (:mod:`egvs.scoring.scorer`,
-:mod:`egvs.stages.site_scoring`); rank by the score that the scenario names; say how far each score may be
-off because the traffic was short. Another gamma, voxel size, score or TPOG needs this stage alone.
+Steps: read ``tpog.parquet``, and the vehicles of some frames where a score needs them; take the scans site by site and
+score them (:mod:`egvs.stages.site_scoring`); rank by the score that the scenario names; estimate how far each score may
+be off because the traffic was short. Another gamma, voxel size, score or TPOG needs this stage alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from egvs.artefacts import parquet, readers
-from egvs.artefacts.parquet import extra_columns
+from egvs.artefacts.extra_columns import extra_columns
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import Tpog
 from egvs.core.errors import WARNINGS_KEY, Diagnostic
@@ -23,191 +23,262 @@ from egvs.effects import registry
 from egvs.effects.base import Effect
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import SCENARIO_FILE, Scenario
-from egvs.scoring import occupancy, score_table, standard_errors
-from egvs.scoring.score_table import ScoreColumn
-from egvs.scoring.standard_errors import BlockJackknife
+from egvs.scoring import score_table, standard_errors
+from egvs.scoring.score_table import ScoreTable
+from egvs.sensors.sites import Site
 from egvs.stages import site_scoring
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.scene_inputs import scan_dependencies, sensor_digests, sensor_settings
 from egvs.stages.site_scoring import BeamAudit, ScoredSite, SiteScoring, needs_targets
-from egvs.world import geolocation
+from egvs.world import clearances, geolocation
 
 
-def dependencies(work: StageContext) -> StageDependencies:
-    """Gamma and what to keep; TPOG and scans by hash (without kept scans: what a scan depends on)."""
-    scenario, live = work.scenario, work.scene.acting(Effect, "score")
-    as_number = scenario.score.model_copy(update={"gamma": scenario.gamma})
-    settings: dict[str, Any] = {"name": scenario.name, "score": as_number.model_dump(mode="json")}
-    if own := _user_columns(work):
-        settings["own_columns"] = {name: column.to_pylist() for name, column in own.items()}
+def dependencies(context: StageContext) -> StageDependencies:
+    """Return what the scores depend on: the [score] table, the TPOG and the scans.
+
+    Scans count by their hash; where they are not kept, by what a scan depends on.
+    """
+    scenario = context.scenario
+    effects = context.scene.acting(Effect, "score")
+    score_config = scenario.score.model_copy(update={"gamma": scenario.gamma})
+    settings: dict[str, Any] = {"name": scenario.name, "score": score_config.model_dump(mode="json")}
+    user_columns = _user_columns(context)
+    if user_columns:
+        settings["own_columns"] = {name: column.to_pylist() for name, column in user_columns.items()}
     settings |= geolocation.world_frame_settings(scenario)
-    if live:
-        settings["effects"] = registry.effect_settings(live)
+
+    artefacts = [RunFolder.tpog.name]
+    if needs_targets(scenario):
+        artefacts.append(RunFolder.trajectories.name)
+    for effect in effects:
+        artefacts += effect.reads
+    digests = context.digests(*artefacts)
+    network = context.inputs.common_network_path
+    if scenario.score.blindspots and network is not None:
+        digests["network"] = context.inputs.digest(network)
+    if effects:
+        settings["effects"] = registry.effect_settings(effects)
         settings["sensors"] = sensor_settings(scenario)
-    hashes = work.digests(RunFolder.tpog.name, *(name for effect in live for name in effect.reads))
-    if needs_targets(work.scenario):
-        hashes |= work.digests(RunFolder.trajectories.name)
-    if scenario.score.blindspots and (path := work.inputs.common_network_path) is not None:
-        hashes["network"] = work.inputs.digest(path)
-    if live:
-        hashes |= sensor_digests(scenario, work.scene.sites)
-    modules = registry.effect_modules(live)
+        digests |= sensor_digests(scenario, context.scene.sites)
+
+    modules = registry.effect_modules(effects)
     if scenario.scan.keep:
-        return StageDependencies(settings, hashes | work.digests(RunFolder.scans.name), modules=modules)
-    cast = scan_dependencies(work)
-    read = {**hashes, **cast.files}
-    return StageDependencies({**settings, "scan": cast.settings}, read, modules=modules + cast.modules)
+        return StageDependencies(settings, digests | context.digests(RunFolder.scans.name), modules=modules)
+    scans = scan_dependencies(context)
+    settings["scan"] = scans.settings
+    return StageDependencies(settings, {**digests, **scans.files}, modules=modules + scans.modules)
 
 
 def run(
-    work: StageContext,
+    context: StageContext,
     inputs: StageDependencies,
     audit: bool = False,
     observe: Callable[[ScoredSite], None] | None = None,
     scored_elsewhere: Callable[[SiteScoring], Iterable[ScoredSite]] | None = None,
 ) -> Summary:
-    """Score and rank all sites; write ``scores.parquet``, ``visibility.parquet`` where sites are to be kept,
-    ``scores_by_period.parquet`` where the traffic has periods, and ``blindspots.parquet`` unless it is not wanted.
+    """Score and rank all sites, and write the files of :class:`egvs.artefacts.run_folder.RunFolder` of this stage.
 
     Parameters
     ----------
+    context
+        The run folder, with the artefacts of the stages before.
+    inputs
+        What the scores depend on.
     audit
         Check for every beam that the chords of its voxels add up to the clipped segment and that no voxel comes twice.
     observe
         Called with each site as it is scored, in order.
     scored_elsewhere
-        Gives all sites in order, as :meth:`SiteScoring.score` scores them: other processes may share that work.
+        Yields all sites in order, as :meth:`SiteScoring.score` scores them, so that other processes can share the work.
 
     Returns
     -------
     dict
-        ``sites``, ``best`` (names), ``egvs_limit``; with ``audit`` the worst case found.
+        ``sites``, ``best`` (names), ``rank_by``, ``egvs_limit``; with ``audit`` the worst values found; warnings.
     """
-    wanted, scoring = work.scenario.score, SiteScoring(work, audit=audit)
-    tpog, scorer, targets, leave_out, periods = (
-        scoring.tpog, scoring.scorer, scoring.targets, scoring.leave_out, scoring.periods,
-    )  # fmt: skip
-    scored = scored_elsewhere(scoring) if scored_elsewhere is not None else scoring.all_sites()
-    done: list[ScoredSite] = []
-    with site_scoring.write_site_outputs(work, targets, len(scoring.names)) as details:
-        for its in scored:
+    scoring = SiteScoring(context, audit=audit)  # TPOG by period, vehicles of recorded frames, scorers
+    sites = scoring.all_sites() if scored_elsewhere is None else scored_elsewhere(scoring)
+    sites = _write_sites(context, inputs, scoring, sites, observe)
+    scores = scoring.score_table(sites)
+    metadata = _metadata(context, inputs, scoring, sites)
+    _write_scores(context, sites, scores, metadata)
+    config = context.scenario.score
+    by_period = context.folder.scores_by_period
+    score_table.write_scores_by_period(by_period, scores, config.rank_by, config.additional, metadata)
+    return _summary(context, scoring, sites, scores, audit)
+
+
+def _write_sites(
+    context: StageContext,
+    inputs: StageDependencies,
+    scoring: SiteScoring,
+    sites: Iterable[ScoredSite],
+    observe: Callable[[ScoredSite], None] | None,
+) -> list[ScoredSite]:
+    """Score the sites; write their hits in voxels and their blind spots, if requested, and drop these from memory."""
+    scored: list[ScoredSite] = []
+    with site_scoring.write_site_outputs(scoring) as outputs:
+        for site in sites:
             if observe is not None:
-                observe(its)
-            done.append(details.take(its))
-            work.progress("sites", len(done), 0)
-        about = _metadata(work, inputs, tpog, done)
-        details.describe(about)
-    judged = {name: _score_column(name, done, leave_out) for name in ("egvs", *wanted.additional)}
-    ranking, others = judged[wanted.rank_by], [judged[name] for name in wanted.additional]
-    _write_scores(work, done, judged, scorer.limit, about)
-    names, worths = [d.site.name for d in done], [d.score for d in done]
-    apart = [other for other in others if other.name != "entropy_seen"]
-    limits = scorer.limits_by_period
-    score_table.write_scores_by_period(
-        work.folder.scores_by_period, names, worths, ranking, apart, periods, limits, about
-    )
-    nothing = ranking.all_zero_warnings(work.scenario.gamma, scorer.limit)
-    best = [] if nothing else [name for name, rank in zip(names, ranking.rank, strict=True) if rank == 1]
-    summary: Summary = {"sites": len(done), "best": best, "rank_by": wanted.rank_by, "egvs_limit": scorer.limit}
-    if wanted.weights.are_given:
-        summary["weights"] = wanted.weights.in_words
-    if wanted.gamma == "auto":
-        summary["gamma_auto"] = work.scenario.gamma
-    if wanted.blindspots and (found := next(readers.read_blindspots(work.folder.blindspots, best[:1]), None)):
-        summary["missed"] = found.in_words()
-    if skipped := work.scene.skipped("score"):
-        summary["skipped"] = skipped
-    doubts = score_table.period_disagreements(names, ranking, periods)
-    doubts += targets.undefined_score_warnings(tpog, [period.tpog for period in periods]) if targets is not None else []
-    doubts += [doubt for its in judged.values() for doubt in its.standard_error_warnings()]
-    if not nothing:
-        doubts += [doubt for its in judged.values() if its is not ranking for doubt in its.unranked_zero_warnings()]
-    if ranking.estimate is not None:
-        records = [period.name for period in periods] or [""]
-        summary |= standard_errors.summarise_uncertainty(ranking.estimate, records)
-        doubts = _standard_error_warnings(work.scenario, ranking.estimate, records) + doubts
-    if audit:
-        summary["audit"] = _worst_audit([d.audit for d in done if d.audit is not None])
-    if work.scenario.is_recorded:  # without a network, the record alone knows the road
-        doubts += occupancy.warn_sites_in_traffic(work.scene.sites, tpog)
-    if doubts := nothing + doubts:
-        summary[WARNINGS_KEY] = [doubt.to_json() for doubt in doubts]
-    return summary
+                observe(site)
+            scored.append(outputs.write(site))
+            context.progress("sites", len(scored), 0)
+        outputs.describe(_metadata(context, inputs, scoring, scored))
+    return scored
 
 
-def _metadata(work: StageContext, inputs: StageDependencies, tpog: Tpog, done: list[ScoredSite]) -> dict[str, Any]:
+def _metadata(
+    context: StageContext, inputs: StageDependencies, scoring: SiteScoring, sites: Sequence[ScoredSite]
+) -> dict[str, Any]:
     """The metadata that all files of the stage have."""
-    wanted, sites = work.scenario.score, [d.site.to_json() for d in done]
-    grid, gamma = tpog.grid.to_json(), work.scenario.gamma
-    about = work.metadata(inputs, gamma=gamma, rank_by=wanted.rank_by, grid=grid, frames=tpog.frames, sites=sites)
-    return about | ({"weights": wanted.weights.model_dump(mode="json")} if wanted.weights.are_given else {})
-
-
-def _score_column(name: str, done: list[ScoredSite], leave_out: BlockJackknife | None) -> ScoreColumn:
-    return ScoreColumn.of(name, [(d.score, d.targets) for d in done], None if leave_out is None else leave_out.groups)
-
-
-def _standard_error_warnings(
-    scenario: Scenario, estimate: standard_errors.ScoreUncertainty, records: list[str]
-) -> list[Diagnostic]:
-    traffic = scenario.traffic
-    own = {
-        p.name: f"{SCENARIO_FILE}: traffic.periods ({p.name}).length_s"
-        for p in traffic.periods
-        if p.length_s is not None
-    }
-    return standard_errors.uncertainty_warnings(
-        estimate, f"{SCENARIO_FILE}: traffic.frames", traffic.frame_period_s, records, own
+    config = context.scenario.score
+    metadata = context.metadata(
+        inputs,
+        gamma=context.scenario.gamma,
+        rank_by=config.rank_by,
+        grid=scoring.tpog.grid.to_json(),
+        frames=scoring.tpog.frames,
+        sites=[site.site.to_json() for site in sites],
     )
+    if config.weights.are_given:
+        metadata["weights"] = config.weights.model_dump(mode="json")
+    return metadata
 
 
 def _write_scores(
-    work: StageContext,
-    done: list[ScoredSite],
-    score_columns: dict[str, ScoreColumn],
-    limit: float,
-    metadata: dict[str, Any],
+    context: StageContext, sites: Sequence[ScoredSite], scores: ScoreTable, metadata: dict[str, Any]
 ) -> None:
     """Write ``scores.parquet``."""
-    ranking, sites = score_columns[work.scenario.score.rank_by], [d.site.to_json() for d in done]
-    columns: dict[str, Any] = {name: [site[name] for site in sites] for name in sites[0]} if sites else {}
+    config = context.scenario.score
+    egvs = scores.column("egvs")
+    ranking = scores.column(config.rank_by)
+    columns: dict[str, Any] = {}
+    if sites:
+        rows = [site.site.to_json() for site in sites]
+        columns = {name: [row[name] for row in rows] for name in rows[0]}
     columns |= {
-        "egvs": score_columns["egvs"].values,
-        "egvs_limit": np.full(len(done), limit),
+        "egvs": egvs.values,
+        "egvs_limit": np.full(len(sites), scores.limits[score_table.MIX]),
         "rank": ranking.rank,
-        "entropy_seen": np.array([d.score.entropy_seen for d in done]),
+        "entropy_seen": scores.column("entropy_seen").values,
     }
-    more = _geographic_columns(done, work.inputs.georeference)
-    more |= {name: its.values for name, its in score_columns.items() if name not in columns}
-    if score_columns["egvs"].estimate is not None:
-        more |= {f"{name}_se": its.se for name, its in score_columns.items()}
-        more |= {"egvs_bias": score_columns["egvs"].estimate.bias, "beats_next": ranking.beats_next}
-    own = _user_columns(work)
-    with parquet.artefact_writer(work.folder.scores, "scores", tuple(more), extra=own) as file:
-        file.write(columns | more | own)
+    optional = _geographic_columns(sites, context.inputs.georeference)
+    for name in ("egvs", *config.additional):
+        column = scores.column(name)
+        if name not in columns:
+            optional[name] = column.values
+        if egvs.estimate is not None:
+            optional[f"{name}_se"] = column.se
+    if egvs.estimate is not None:
+        optional["egvs_bias"] = egvs.estimate.bias
+        optional["beats_next"] = ranking.beats_next
+    user_columns = _user_columns(context)
+    with parquet.artefact_writer(context.folder.scores, "scores", tuple(optional), extra=user_columns) as file:
+        file.write(columns | optional | user_columns)
         file.describe(metadata)
 
 
-def _user_columns(work: StageContext) -> dict[str, pa.Array]:
-    """The columns of the user's own that the sites have, in the order of the sites."""
-    return extra_columns([site.user_columns for site in work.scene.sites], parquet.column_names("scores"))
+def _user_columns(context: StageContext) -> dict[str, pa.Array]:
+    """The user's columns of the sites file, in the order of the sites."""
+    rows = [site.user_columns for site in context.scene.sites]
+    return extra_columns(rows, parquet.column_names("scores"))
 
 
-def _geographic_columns(done: list[ScoredSite], world: Georeference) -> dict[str, Any]:
-    """Where the sites are on the Earth; nothing where that is not known."""
-    places = [[d.site.pose.x_m, d.site.pose.y_m] for d in done]
-    lon_lat_deg = world.lon_lat_deg(np.array(places).reshape(-1, 2))
-    return {} if lon_lat_deg is None else {"longitude_deg": lon_lat_deg[:, 0], "latitude_deg": lon_lat_deg[:, 1]}
+def _geographic_columns(sites: Sequence[ScoredSite], georeference: Georeference) -> dict[str, Any]:
+    """Longitude and latitude of the sites; nothing where they are unknown."""
+    positions_m = np.array([[site.site.pose.x_m, site.site.pose.y_m] for site in sites]).reshape(-1, 2)
+    lon_lat_deg = georeference.lon_lat_deg(positions_m)
+    if lon_lat_deg is None:
+        return {}
+    return {"longitude_deg": lon_lat_deg[:, 0], "latitude_deg": lon_lat_deg[:, 1]}
 
 
-def _worst_audit(audits: list[BeamAudit]) -> dict[str, float]:
-    """The worst case over all sites."""
-    return {
-        "worst_sum": max(audit.worst_sum for audit in audits),
-        "longest_gap_m": max(audit.longest_gap_m for audit in audits),
-        "misplaced_chords": sum(audit.misplaced_chords for audit in audits),
-        "voxels_visited_twice": sum(audit.voxels_visited_twice for audit in audits),
-    }
+def _summary(
+    context: StageContext, scoring: SiteScoring, sites: Sequence[ScoredSite], scores: ScoreTable, audit: bool
+) -> Summary:
+    """The outcome of the stage."""
+    config = context.scenario.score
+    limit = scores.limits[score_table.MIX]
+    ranking = scores.column(config.rank_by)
+    best = []
+    if np.any(ranking.values > 0):
+        best = [site.site for site in scores.ranking(config.rank_by) if site.rank == 1]
+    summary: Summary = {"sites": len(sites), "best": best, "rank_by": config.rank_by, "egvs_limit": limit}
+    if config.weights.are_given:
+        summary["weights"] = config.weights.in_words
+    if config.gamma == "auto":
+        summary["gamma_auto"] = context.scenario.gamma
+    if config.blindspots:
+        for blindspots in readers.read_blindspots(context.folder.blindspots, best[:1]):
+            summary["missed"] = blindspots.in_words()
+    skipped = context.scene.skipped("score")
+    if skipped:
+        summary["skipped"] = skipped
+    if ranking.estimate is not None:
+        summary |= standard_errors.summarise_uncertainty(ranking.estimate, scores.periods or (score_table.MIX,))
+    if audit:
+        summary["audit"] = asdict(BeamAudit.worst([site.audit for site in sites if site.audit is not None]))
+    warnings = list(_warnings(context, scoring, scores))
+    if warnings:
+        summary[WARNINGS_KEY] = [warning.to_json() for warning in warnings]
+    return summary
+
+
+def _warnings(context: StageContext, scoring: SiteScoring, scores: ScoreTable) -> Iterator[Diagnostic]:
+    """Warnings about the scores, those about the ranking first."""
+    scenario = context.scenario
+    rank_by = scenario.score.rank_by
+    ranking = scores.column(rank_by)
+    others = [scores.column(name) for name in ("egvs", *scenario.score.additional) if name != rank_by]
+    yield from score_table.warn_all_zero(ranking, scenario.gamma, scores.limits[score_table.MIX])
+    if ranking.estimate is not None:
+        yield from _warn_short_traffic(scenario, ranking.estimate, scores.periods or (score_table.MIX,))
+    yield from score_table.warn_period_disagreements(scores, rank_by)
+    if scoring.targets is not None:
+        yield from scoring.targets.warn_undefined_scores(scoring.tpog, scoring.periods)
+    for column in (ranking, *others):
+        yield from score_table.warn_no_standard_error(column)
+    if np.any(ranking.values > 0):
+        for column in others:
+            yield from score_table.warn_additional_all_zero(column)
+    if scenario.is_recorded:  # without a network, only the recorded vehicles show where the road is
+        yield from _warn_sites_in_traffic(context.scene.sites, scoring.tpog)
+
+
+def _warn_short_traffic(
+    scenario: Scenario, estimate: standard_errors.ScoreUncertainty, records: Sequence[str]
+) -> list[Diagnostic]:
+    """Warn about each record that is too short for reliable standard errors."""
+    traffic = scenario.traffic
+    length_keys = {}
+    for period in traffic.periods:
+        if period.length_s is not None:
+            length_keys[period.name] = f"{SCENARIO_FILE}: traffic.periods ({period.name}).length_s"
+    key = f"{SCENARIO_FILE}: traffic.frames"
+    return standard_errors.uncertainty_warnings(estimate, key, traffic.frame_period_s, records, length_keys)
+
+
+def _warn_sites_in_traffic(sites: Iterable[Site], tpog: Tpog) -> Iterator[Diagnostic]:
+    """Warn about each site that is, no higher than the clearance, where vehicles drive in some frame."""
+    grid = tpog.grid
+    for site in sites:
+        at_m = np.array(site.pose.position_m)
+        ix, iy, _ = np.floor((at_m - grid.origin_m) / grid.voxel_m).astype(np.int64)
+        if not (0 <= ix < grid.shape[0] and 0 <= iy < grid.shape[1]):
+            continue
+        column = tpog.counts[ix, iy]
+        layers = np.flatnonzero(column)
+        if not len(layers):
+            continue
+        height_m = at_m[2] - (grid.origin_m[2] + layers[0] * grid.voxel_m)
+        if height_m <= clearances.CLEARANCE_M:
+            share = column.max() / tpog.frames
+            yield Diagnostic(
+                "sites on the road",
+                f"site {site.name}",
+                f"vehicles drive through its position ({at_m[0]:g}, {at_m[1]:g}) in {share:.1%} of the frames",
+                f"Move it beside the road, or more than {clearances.CLEARANCE_M:g} m above it.",
+            )
 
 
 STAGE = Stage(
@@ -217,4 +288,5 @@ STAGE = Stage(
     run,
     reads=(RunFolder.tpog, RunFolder.trajectories, RunFolder.scans, RunFolder.statics),
     effect_stages=("scan", "score"),
+    neutral_options=("scored_elsewhere",),
 )

@@ -1,6 +1,6 @@
-"""The statics stage: everything that stands at the junction, as triangles in ``statics.ply``.
+"""The statics stage: buildings, poles, trees and ground at the junction, as triangles in ``statics.ply``.
 
-Steps: find what lays the ground where the network has relief; read, mend and build footprints and meshes
+Steps: find the source of the ground where the network has relief; read, repair and build footprints and meshes
 (:mod:`egvs.world.static_world`); write one mesh in the world frame, in metres.
 """
 
@@ -14,35 +14,51 @@ from egvs.world import geolocation
 from egvs.world.mesh import write_ply
 
 
-def dependencies(work: StageContext) -> StageDependencies:
-    """The statics settings, the region of interest (for the ground's extent), and the files' hashes."""
-    scenario, model, box = work.scenario, work.scenario.statics, work.scenario.roi.box
-    named = [*(("footprints", f) for f in model.footprints), *(("polygons", f) for f in model.polygons)]
-    hashes = {name: work.inputs.digest(scenario.find(name, f"statics.{key}")) for key, name in named}
-    for mesh in model.meshes:
-        hashes |= mesh_digests(scenario.find(mesh.file, "statics.meshes"), mesh.file)
+def dependencies(context: StageContext) -> StageDependencies:
+    """Return what the static world depends on: [statics], the region (for the extent of the ground), files by hash."""
+    scenario = context.scenario
+    config = scenario.statics
+    digests = {}
+    for key in ("footprints", "polygons"):
+        for name in getattr(config, key):
+            digests[name] = context.inputs.digest(scenario.find(name, f"statics.{key}"))
+    for mesh in config.meshes:
+        digests |= mesh_digests(scenario.find(mesh.file, "statics.meshes"), mesh.file)
+    modules: tuple[str, ...] = ()
     ground = registry.ground_effect(scenario)
-    if ground is not None and (path := sumo_folder.network_path(scenario)) is not None:
-        hashes["surface"] = work.inputs.digest(path)
-    settings = {"name": scenario.name, "statics": model.model_dump(mode="json"), "roi": [box.origin_m, box.size_m]}
+    if ground is not None:
+        modules = (type(ground).__module__,)
+        network = sumo_folder.network_path(scenario)
+        if network is not None:
+            digests["surface"] = context.inputs.digest(network)
+    box = scenario.roi.box
+    settings = {"name": scenario.name, "statics": config.model_dump(mode="json"), "roi": [box.origin_m, box.size_m]}
     settings |= geolocation.world_frame_settings(scenario)
-    return StageDependencies(settings, hashes, modules=() if ground is None else (type(ground).__module__,))
+    return StageDependencies(settings, digests, modules=modules)
 
 
-def run(work: StageContext, inputs: StageDependencies) -> Summary:
+def run(context: StageContext, inputs: StageDependencies) -> Summary:
     """Build the static world and write ``statics.ply``.
+
+    Parameters
+    ----------
+    context
+        The run folder and the inputs.
+    inputs
+        What the static world depends on.
 
     Returns
     -------
     dict
-        ``triangles``; ``built`` (solids a kind), ``mended`` and ``left_out`` (how often each mend or omission was
-        needed).
+        ``triangles``, ``solids``; counts of what was built, repaired and left out; ``notes``.
     """
-    ground = registry.ground_effect(work.scenario)
-    world, counts = work.inputs.built_world
-    write_ply(work.folder.statics, world, work.metadata(inputs, seeded=False))
-    notes = {} if ground is None else {"notes": [f"{ground.NAME}: on, the ground follows the network's roads"]}
-    return {"triangles": len(world.faces), "solids": len(world.solids), **counts.to_json(), **notes}
+    world, counts = context.inputs.built_world
+    write_ply(context.folder.statics, world, context.metadata(inputs, seeded=False))
+    summary: Summary = {"triangles": len(world.faces), "solids": len(world.solids), **counts.to_json()}
+    ground = registry.ground_effect(context.scenario)
+    if ground is not None:
+        summary["notes"] = [f"{ground.NAME}: on, the ground follows the network's roads"]
+    return summary
 
 
 STAGE = Stage("statics", __name__, dependencies, run, code=("egvs.world.static_world",))

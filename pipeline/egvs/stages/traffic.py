@@ -29,69 +29,77 @@ from egvs.traffic.fcd import FrameWindow
 from egvs.world import geolocation
 
 
-def dependencies(work: StageContext) -> StageDependencies:
-    """Everything that the trajectories depend on; which weights periods have, is no part of it."""
-    scenario, traffic = work.scenario, work.scenario.traffic
-    sources = dict.fromkeys(path for alone in scenario.by_period().values() for path in _sources(alone))
+def dependencies(context: StageContext) -> StageDependencies:
+    """Return what the trajectories depend on; the weights of periods do not matter."""
+    scenario = context.scenario
+    periods = scenario.by_period().values()
     effects, _ = registry.active_traffic_effects(scenario)
-    shown = traffic.model_dump(mode="json")
-    for period in shown["periods"]:
+    traffic = scenario.traffic.model_dump(mode="json")
+    for period in traffic["periods"]:
         del period["weight"]
-    settings = {"seed": scenario.seed, "name": scenario.name, "traffic": shown}
+    settings = {"seed": scenario.seed, "name": scenario.name, "traffic": traffic}
     if scenario.is_recorded:
         settings |= geolocation.world_frame_settings(scenario)
-    # one that acts by itself depends on the network alone
-    if named := registry.effect_settings(effect for effect in effects if not effect.SELF_ACTING):
-        settings["effects"] = named
-    hashes = {_relative_name(path, scenario): work.inputs.digest(path) for path in sources}
-    asks_sumo = any(alone.traffic.fcd is None or alone.traffic.vtypes for alone in scenario.by_period().values())
-    version = sumo.sumo_version() if asks_sumo else None
-    sizes_by = {"sizes_by": _installed_sumo_version()} if scenario.is_recorded else {}
-    return StageDependencies(settings, hashes, {"sumo": version, **sizes_by}, registry.effect_modules(effects))
+    # an effect that activates itself depends on the network only
+    named_effects = registry.effect_settings(effect for effect in effects if not effect.SELF_ACTING)
+    if named_effects:
+        settings["effects"] = named_effects
+
+    digests = {}
+    for period_scenario in periods:
+        for path in _source_files(period_scenario):
+            digests[_relative_name(path, scenario)] = context.inputs.digest(path)
+    needs_sumo = any(period.traffic.fcd is None or period.traffic.vtypes for period in periods)
+    versions = {"sumo": sumo.sumo_version() if needs_sumo else None}
+    if scenario.is_recorded:
+        versions["sizes_by"] = _installed_sumo_version()
+    return StageDependencies(settings, digests, versions, registry.effect_modules(effects))
 
 
 def _installed_sumo_version() -> str | None:
-    """The version of the SUMO that says how large its own types in a finished file are; without one, such a file is
-    refused."""
+    """Version of the SUMO that knows the sizes of its own vehicle types, which a finished file may use."""
     try:
         return sumo.sumo_version()
     except MissingBackendError:
         return None
 
 
-def _sources(scenario: Scenario) -> list[Path]:
-    """The files that one period's traffic comes from."""
+def _source_files(scenario: Scenario) -> list[Path]:
+    """The files that the traffic of one period comes from."""
     traffic = scenario.traffic
     if traffic.fcd is not None:
-        roads = sumo_folder.network_path(scenario)
-        return [
-            scenario.find(traffic.fcd, "traffic.fcd"),
-            *finished_fcd.size_files(scenario),
-            *([] if roads is None else [roads]),
-        ]
-    own = [scenario.find(traffic.sumocfg, "traffic.sumocfg")] if traffic.sumocfg is not None else []
-    return [*own, *sumo_folder.demand_files(scenario).all()]
+        sources = [scenario.find(traffic.fcd, "traffic.fcd"), *finished_fcd.size_files(scenario)]
+        network = sumo_folder.network_path(scenario)
+        return sources if network is None else [*sources, network]
+    sources = []
+    if traffic.sumocfg is not None:
+        sources.append(scenario.find(traffic.sumocfg, "traffic.sumocfg"))
+    return [*sources, *sumo_folder.demand_files(scenario).all()]
 
 
 def _relative_name(path: Path, scenario: Scenario) -> str:
-    """A file's name seen from the scenario's folder, so that it does not depend on where that is."""
+    """Name of a file that does not depend on where the scenario and SUMO are installed."""
     if path.is_relative_to(sumo_home()):
         return f"$SUMO_HOME/{path.relative_to(sumo_home()).as_posix()}"
     return Path(os.path.relpath(path, scenario.folder)).as_posix()
 
 
-def run(work: StageContext, inputs: StageDependencies, traci: tuple[str, int] | None = None) -> Summary:
-    """Make the trajectories. SUMO runs on one thread, so that its bytes do not depend on how many there are.
+def run(context: StageContext, inputs: StageDependencies, traci: tuple[str, int] | None = None) -> Summary:
+    """Make the trajectories. SUMO runs on one thread, so that its output does not depend on their number.
 
     Parameters
     ----------
+    context
+        The run folder and the inputs.
+    inputs
+        What the trajectories depend on.
     traci
-        Host and port of a SUMO that is already running; nothing is started then.
+        Host and port of a SUMO that is already running; none is started then.
 
     Returns
     -------
     dict
-        What came out, as JSON: frames, vehicles, speeds, standing, collisions, overlaps, SUMO's flags and seconds.
+        Outcome as JSON: frames, vehicles, speeds, standing, collisions, overlaps, SUMO's flags and seconds.
 
     Raises
     ------
@@ -100,24 +108,26 @@ def run(work: StageContext, inputs: StageDependencies, traci: tuple[str, int] | 
     RunError
         When SUMO fails, N vehicles are not held, or a vehicle stands without end.
     """
-    periods = work.scenario.by_period()
-    if traci is not None and work.scenario.traffic.periods:
-        raise InputError("--traci", "the scenario has periods", "a scenario without [[traffic.periods]]")
-    summaries, first_frame, described = {}, 0, []
-    with parquet.artefact_writer(work.folder.trajectories, "trajectories") as file:
-        for name, scenario in periods.items():
-            window, summaries[name] = _record(work, scenario, name, file, first_frame, traci)
-            first_frame += window.count
-            described.append({"name": name, "frames": window.count})
-        about: dict[str, Any] = {"frames": first_frame, "frame_period_s": window.period_ms / 1000.0}
-        if work.scenario.traffic.periods:
-            about["periods"] = described
-        file.describe(work.metadata(inputs, **about, sumo=inputs.more["sumo"]))
-    return merge_summaries(summaries) if work.scenario.traffic.periods else summaries[""]
+    has_periods = bool(context.scenario.traffic.periods)
+    if traci is not None and has_periods:
+        raise InputError("--traci", "the scenario has periods", "Use a scenario without [[traffic.periods]].")
+    summaries = {}
+    periods = []
+    frames = 0
+    with parquet.artefact_writer(context.folder.trajectories, "trajectories") as file:
+        for name, scenario in context.scenario.by_period().items():
+            window, summaries[name] = _record_period(context, scenario, name, file, frames, traci)
+            frames += window.count
+            periods.append({"name": name, "frames": window.count})
+        metadata: dict[str, Any] = {"frames": frames, "frame_period_s": window.period_ms / 1000.0}
+        if has_periods:
+            metadata["periods"] = periods
+        file.describe(context.metadata(inputs, **metadata, sumo=inputs.more["sumo"]))
+    return merge_summaries(summaries) if has_periods else summaries[""]
 
 
-def _record(
-    work: StageContext,
+def _record_period(
+    context: StageContext,
     scenario: Scenario,
     period: str,
     file: parquet.ArtefactWriter,
@@ -126,43 +136,42 @@ def _record(
 ) -> tuple[FrameWindow, Summary]:
     """Write the frames of one period."""
     effects, notes = registry.active_traffic_effects(scenario)
-    folder = work.folder.sumo / period
-    with recording.record_traffic(
-        scenario, folder, effects, work.progress, traci, work.inputs.georeference
-    ) as recorded:
-        tally, reports = trajectories.write_trajectories(scenario, recorded, effects, file, work.progress, first_frame)
-        summary = recorded.summary()
-        doubts = trajectories.traffic_warnings(tally, recorded, scenario.roi.box)
-    result = tally.to_json(recorded.window.period_ms / 1000.0) | ({} if summary is None else asdict(summary))
-    result[WARNINGS_KEY] = [*result.get(WARNINGS_KEY, []), *(finding.to_json() for finding in doubts)]
+    folder = context.folder.sumo / period
+    georeference = context.inputs.georeference
+    with recording.record_traffic(scenario, folder, effects, context.progress, traci, georeference) as recorded:
+        tally, reports = trajectories.write_trajectories(
+            scenario, recorded, effects, file, context.progress, first_frame
+        )
+        sumo_summary = recorded.summary()
+        warnings = trajectories.traffic_warnings(tally, recorded, scenario.roi.box)
+    summary = tally.to_json(recorded.window.period_ms / 1000.0)
+    if sumo_summary is not None:
+        summary |= asdict(sumo_summary)
+    summary[WARNINGS_KEY] = [*summary.get(WARNINGS_KEY, []), *(warning.to_json() for warning in warnings)]
     if notes:
-        result["notes"] = [*result.get("notes", []), *notes]
-    return recorded.window, result | reports
+        summary["notes"] = [*summary.get("notes", []), *notes]
+    return recorded.window, summary | reports
 
 
 def merge_summaries(summaries: dict[str, Summary]) -> Summary:
-    """The summaries of periods as one; what is of SUMO stands where it does without periods."""
-    together: Summary = {"frames": sum(its["frames"] for its in summaries.values()), "periods": summaries}
-    if flags := {name: summary.pop("flags", None) for name, summary in summaries.items()}:
-        together["flags"] = flags
-    if seconds := [summary.pop("sumo_seconds", None) or 0.0 for summary in summaries.values()]:
-        together["sumo_seconds"] = round(sum(seconds), 3)
-    versions = {summary.pop("sumo", None) for summary in summaries.values()} - {None}
-    if versions:
-        together["sumo"] = versions.pop()
-    counts = [
-        {**count, "place": f"{count['place']} ({name})"}
-        for name, summary in summaries.items()
-        for count in summary.pop("counts", None) or ()
-    ]
+    """Join the summaries of periods; what SUMO reports is at the same keys as without periods."""
+    merged: Summary = {"frames": sum(summary["frames"] for summary in summaries.values()), "periods": summaries}
+    merged["flags"] = {name: summary.pop("flags", None) for name, summary in summaries.items()}
+    merged["sumo_seconds"] = round(sum(summary.pop("sumo_seconds", None) or 0.0 for summary in summaries.values()), 3)
+    counts = []
+    warnings = []
+    for name, summary in summaries.items():
+        version = summary.pop("sumo", None)
+        if version is not None:
+            merged["sumo"] = version
+        counts += [{**count, "place": f"{count['place']} ({name})"} for count in summary.pop("counts", None) or ()]
+        for warning in summary.pop(WARNINGS_KEY, ()):
+            warnings.append({**warning, "where": f"{warning['where']} ({name})"})
     if counts:
-        together["counts"] = counts
-    warnings = [
-        {**warning, "where": f"{warning['where']} ({name})"}
-        for name, summary in summaries.items()
-        for warning in summary.pop(WARNINGS_KEY, ())
-    ]
-    return together | ({WARNINGS_KEY: warnings} if warnings else {})
+        merged["counts"] = counts
+    if warnings:
+        merged[WARNINGS_KEY] = warnings
+    return merged
 
 
 STAGE = Stage("traffic", __name__, dependencies, run)

@@ -1,9 +1,10 @@
-"""A study of what accuracy costs in time, and the cheapest setting within a tolerance.
+"""Study how the accuracy of scores depends on run time, and recommend the cheapest setting within a tolerance.
 
-Steps: run the scenario, then a reference whose traffic is watched many times as long, then one setting after another
-(:mod:`egvs.studies.study_settings`), within a budget of seconds; repeat every stage of every setting, all settings in
-turn, so that a drift of the machine hits all alike; compare (:mod:`egvs.studies.score_errors`); recommend; write
-``accuracy.parquet`` and ``accuracy.png``. Errors are deterministic; seconds are measured.
+Steps: run the scenario, then a reference with much more traffic, then one setting after another
+(:mod:`egvs.studies.study_settings`) until a budget of seconds is used up; repeat every stage of every setting, in
+rounds over all settings, so that slow drifts of the machine affect all alike; compare
+(:mod:`egvs.studies.score_errors`); recommend; write ``accuracy.parquet`` and ``accuracy.png``. Errors are
+deterministic; seconds are measured.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from egvs.artefacts import parquet, run_folder
+from egvs.artefacts import checksums, parquet
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
 from egvs.core.errors import EgvsError, InputError
@@ -28,38 +29,80 @@ from egvs.runs.stages import RANKING_STAGES
 from egvs.scenario.loading import load
 from egvs.scenario.model import Scenario
 from egvs.studies import measurement, pareto_figure, score_errors, study_settings
-from egvs.studies.measurement import SettingListener, SettingRunner, SettingScores, scenario_dependencies
+from egvs.studies.measurement import Neighbours, SettingListener, SettingRunner, SettingScores, scenario_dependencies
 from egvs.studies.score_errors import SeedComparison, SettingResult, compare_seeds
-from egvs.studies.study_settings import MEASURES, REFERENCE, SCENARIO, SCENARIO_AS_IS, Setting
+from egvs.studies.study_settings import (
+    DEFAULT_VALUES,
+    MEASURES,
+    REFERENCE,
+    SCENARIO,
+    SCENARIO_AS_IS,
+    Setting,
+    SettingValues,
+)  # fmt: skip
 
-REPEATS = 3
-MAX_REFERENCE_FACTOR = 32
-"""The reference watches traffic at most so many times as long as the scenario."""
 BEYOND_BUDGET = "beyond the budget"
 """Why a setting was not run."""
 REFERENCE_BUDGET_SHARE = 1 / 3
-"""Of the budget: the most that the reference may take."""
+"""Largest share of the budget that the reference may take."""
+
+
+@dataclass(frozen=True)
+class StudyOptions:
+    """Options of a study.
+
+    Attributes
+    ----------
+    tolerance
+        Largest error of the recommended setting, relative.
+    budget_s
+        Settings that would not end within this time are not started. The scenario and the reference always run.
+    seeds
+        Number of independent runs of the scenario, to check the standard errors.
+    jobs
+        Number of threads; None for all cores.
+    repeats
+        How often each stage is measured.
+    max_reference_factor
+        The reference's traffic is at most this many times as long as the scenario's.
+    values
+        Values that settings try.
+    """
+
+    tolerance: float
+    budget_s: float
+    seeds: int = 0
+    jobs: int | None = None
+    repeats: int = 3
+    max_reference_factor: int = 32
+    values: SettingValues = DEFAULT_VALUES
 
 
 @dataclass(frozen=True)
 class AccuracyStudy:
-    """What the study found.
+    """Results of a study.
 
     Attributes
     ----------
     rows
         Compared settings: the scenario, the reference, then the others by kind and seconds.
     skipped
-        Setting -> why it was not run.
+        Why settings were not run, by name.
+    tolerance
+        Largest error of the recommended setting, relative.
     best
-        The recommended setting; None when none is within the tolerance.
-    times
-        How many times as long as the scenario the reference watches traffic.
+        The recommended setting; None if none is within the tolerance.
+    reference_factor
+        How many times as long as the scenario's traffic that of the reference is.
     neighbours
-        See :class:`egvs.studies.measurement.SettingScores`, of the longest traffic.
+        See :class:`egvs.studies.measurement.SettingScores`, with the longest traffic.
     files
-        What was written.
-    empty
+        Written files.
+    seeds
+        Comparison of independent runs, if requested.
+    repeated
+        Number of stages that were run again.
+    all_zero
         Whether every score is 0.
     """
 
@@ -67,83 +110,85 @@ class AccuracyStudy:
     skipped: dict[str, str]
     tolerance: float
     best: SettingResult | None
-    times: int
-    neighbours: list[tuple[str, str, float, float]]
+    reference_factor: int
+    neighbours: list[Neighbours]
     files: tuple[Path, ...]
     seeds: SeedComparison | None = None
     repeated: int = 0
-    empty: bool = False
+    all_zero: bool = False
 
 
-def _ignore_setting(_setting: str, _state: str, _details: dict[str, Any]) -> None:
-    """A :data:`SettingListener` that says nothing."""
+def ignore_setting(_setting: str, _state: str, _details: dict[str, Any]) -> None:
+    """Do nothing; a :data:`SettingListener`."""
 
 
 def run_accuracy_study(
     path: Path,
-    sets: Sequence[str],
+    overrides: Sequence[str],
     out: Path,
+    options: StudyOptions,
     *,
-    tolerance: float,
-    budget_s: float,
-    seeds: int = 0,
-    jobs: int | None = None,
     progress: ProgressCallback = no_progress,
-    listener: SettingListener = _ignore_setting,
+    listener: SettingListener = ignore_setting,
 ) -> AccuracyStudy:
-    """Run the study, or go on with it.
+    """Run a study, or continue one that was interrupted.
 
     Parameters
     ----------
-    path, sets
-        The scenario, and what ``--set`` lays over it.
+    path, overrides
+        The scenario, and arguments of ``--set``.
     out
-        ``accuracy.parquet`` and ``accuracy.png`` are written there; results of settings are kept in ``out /
-        "accuracy"``.
-    tolerance
-        The largest error that the recommended setting may have.
-    budget_s
-        No setting is begun that would not end within it. The scenario and the reference are always run.
-    seeds
-        So many independent runs of the scenario's own setting, to check the standard errors.
+        Run folder for ``accuracy.parquet`` and ``accuracy.png``; intermediate results go to ``out / "accuracy"``.
+    options
+        Options of the study.
+    progress
+        Called as stages proceed.
+    listener
+        Called after each setting.
+
+    Raises
+    ------
+    InputError
+        If the options do not fit the scenario, or intermediate results were altered.
     """
-    if not 1e-6 <= tolerance <= 1:
-        raise InputError("--tolerance", f"{tolerance:g}", "a share from 1e-6 to 1, for example 0.02")
-    check_no_overwrite(load(path, sets), out, (measurement.STUDY_FOLDER,))
+    if not 1e-6 <= options.tolerance <= 1:
+        raise InputError("--tolerance", f"expected a share from 1e-6 to 1, got {options.tolerance:g}", "Try 0.02")
+    check_no_overwrite(load(path, overrides), out, (measurement.STUDY_FOLDER,))
     with lock_run_folder(out):
-        runner = SettingRunner(path, sets, out, jobs, progress)
+        runner = SettingRunner(path, overrides, out, options.jobs, progress)
         scenario = runner.scenario(SCENARIO_AS_IS)
-        _check(scenario, seeds)
-        result = _StudyRun(runner, scenario, budget_s, progress, listener).study(out, float(tolerance))
+        _check_traffic(scenario, options.seeds)
+        study = _StudyRun(runner, scenario, options, progress, listener).run(out)
         report = refresh_report(out)
-        written = result.files if report is None else (*result.files, report)
-        checked_seeds = compare_seeds(runner, scenario, seeds, listener) if seeds else None
-        return replace(result, files=written, seeds=checked_seeds)
+        if report is not None:
+            study = replace(study, files=(*study.files, report))
+        if options.seeds:
+            study = replace(study, seeds=compare_seeds(runner, scenario, options.seeds, listener))
+        return study
 
 
-def _check(scenario: Scenario, seeds: int) -> None:
-    if seeds and study_settings.is_finished(scenario):
-        found = "the traffic is a finished file, the same for each seed"
-        raise InputError("--seeds", found, "network or sumocfg in [traffic]")
+def _check_traffic(scenario: Scenario, seeds: int) -> None:
+    """Reject scenarios and numbers of seeds that tell nothing about standard errors."""
+    if seeds and scenario.is_recorded:
+        problem = "the traffic is a finished file, the same for each seed"
+        raise InputError("--seeds", problem, "Use network or sumocfg in [traffic].")
     if seeds and scenario.score.rank_by != "egvs":
-        found = (
-            f"score.rank_by = {scenario.score.rank_by!r}: what all runs together say is worked out for the EGVS alone"
-        )
-        raise InputError("--seeds", found, "--set score.rank_by=egvs")
+        problem = f"seeds are compared by EGVS only, but score.rank_by is {scenario.score.rank_by!r}"
+        raise InputError("--seeds", problem, "Use --set score.rank_by=egvs.")
     if seeds == 1:
-        raise InputError("--seeds", "1", "at least 2")
-    if not study_settings.is_finished(scenario) and scenario.tpog.blocks == 1:
-        found = "1, so that nothing tells how far a score may be off"
-        raise InputError(f"{scenario.file}: tpog.blocks", found, "10, or another divisor of traffic.frames")
+        raise InputError("--seeds", "expected at least 2, got 1", "Use 2 or more.")
+    if not scenario.is_recorded and scenario.tpog.blocks == 1:
+        problem = "standard errors need at least 2 blocks, got 1"
+        raise InputError(f"{scenario.file}: tpog.blocks", problem, "Use 10, or another divisor of traffic.frames.")
 
 
 @dataclass
 class _StudyRun:
-    """A study at work: ``scores`` are those of the settings that were run, ``skipped`` says why others were not."""
+    """A study in progress: scores of the settings that ran, and why others were skipped."""
 
     runner: SettingRunner
     scenario: Scenario
-    budget_s: float
+    options: StudyOptions
     progress: ProgressCallback
     listener: SettingListener
     scores: dict[str, SettingScores] = field(default_factory=dict)
@@ -152,107 +197,158 @@ class _StudyRun:
 
     @property
     def left_s(self) -> float:
-        """What is left of the budget."""
-        return self.budget_s - (perf_counter() - self.start)
+        """Rest of the budget."""
+        return self.options.budget_s - (perf_counter() - self.start)
 
-    def study(self, out: Path, tolerance: float) -> AccuracyStudy:
-        """All of it but the seeds, written into ``out``."""
-        runner, scenario, scores = self.runner, self.scenario, self.scores
+    def run(self, out: Path) -> AccuracyStudy:
+        """Run all settings, compare them, and write the files of the study."""
+        settings = self._valid_settings()
+        self._warm_up(settings)
+        base_scores = self.runner.run(SCENARIO_AS_IS)
+        self.scores[SCENARIO] = base_scores
+        factor = reference_factor(self.runner, base_scores, self.options)
+        if factor > 1:
+            reference = study_settings.reference_setting(self.scenario, factor)
+            settings = [reference, *(setting for setting in settings if is_shorter(self.runner, setting, reference))]
+        compared = self._run_all(settings)
+        repeated = self._repeat(compared)
+        if REFERENCE not in self.scores:
+            factor = 1
+
+        rows = [
+            score_errors.compare_setting(
+                self.runner, setting, self.scores, could_last_longer=not self.scenario.is_recorded
+            )
+            for setting in compared
+        ]
+        rows = score_errors.mark_pareto_front(rows, self.options.tolerance)
+        written = self._write(RunFolder(out), rows, factor)
+        return AccuracyStudy(
+            rows=rows,
+            skipped=self.skipped,
+            tolerance=self.options.tolerance,
+            best=next((row for row in rows if row.recommended), None),
+            reference_factor=factor,
+            neighbours=self.scores.get(REFERENCE, base_scores).neighbours,
+            files=written,
+            repeated=repeated,
+            all_zero=not any(base_scores.shares),
+        )
+
+    def _valid_settings(self) -> list[Setting]:
+        """Return the settings whose overrides give a valid scenario; skip the others."""
         settings = []
-        for setting in study_settings.list_settings(scenario):
-            if (fault := _setting_error(runner, setting)) is None:
+        for setting in study_settings.list_settings(self.scenario, self.options.values):
+            error = _setting_error(self.runner, setting)
+            if error is None:
                 settings.append(setting)
             else:
-                self._skip(setting, fault)
-        self._warm_up(settings)
-        own = scores[SCENARIO] = runner.run(SCENARIO_AS_IS)
-        times = _reference_factor(runner, scenario, own, self.budget_s)
-        longest = [study_settings.reference_setting(scenario, times)] if times > 1 else []
-        settings = [s for s in settings if not longest or _is_shorter(runner, s, longest[0])]
-        compared = self._run_all([*longest, *settings])
-        repeated = self._repeat(compared)
-        could_last_longer = not study_settings.is_finished(scenario)
-        rows = [score_errors.compare_setting(runner, s, scores, could_last_longer=could_last_longer) for s in compared]
-        rows = score_errors.mark_pareto_front(rows, tolerance)
-        best = next((row for row in rows if row.recommended), None)
-        written = (RunFolder(out).accuracy, RunFolder(out).accuracy_figure)
-        RunFolder(out).accuracy_checksums.unlink(missing_ok=True)
-        times = times if REFERENCE in scores else 1
-        _write_study(written[0], scenario, rows, own, times, tolerance)
-        pareto_figure.draw_figure(rows, tolerance, scenario.name, written[1])
-        run_folder.write_checksums(RunFolder(out).accuracy_checksums, written)
-        neighbours = scores.get(REFERENCE, own).neighbours
-        empty = not any(own.shares)
-        return AccuracyStudy(rows, self.skipped, tolerance, best, times, neighbours, written, None, repeated, empty)
+                self._skip(setting, error)
+        return settings
 
-    def _skip(self, setting: Setting, why: str) -> None:
-        self.skipped[setting.name] = why
-        self.listener(setting.name, "skipped", {"why": why})
+    def _skip(self, setting: Setting, reason: str) -> None:
+        self.skipped[setting.name] = reason
+        self.listener(setting.name, "skipped", {"why": reason})
 
     def _warm_up(self, settings: list[Setting]) -> None:
-        """Compile what the settings still to be run need: on the shortest traffic, and with each effect switched on."""
-        wanted = [setting for setting in settings if self.runner.known(setting) is None]
-        if (own := self.runner.known(SCENARIO_AS_IS)) is not None:
-            expected = _TimeEstimate(self.runner, own)
-            wanted = [setting for setting in wanted if expected.seconds(setting) <= self.left_s]
-        if not wanted:
+        """Compile everything that the settings need, with the shortest traffic and with each added effect."""
+        pending = [setting for setting in settings if self.runner.saved_scores(setting) is None]
+        base_scores = self.runner.saved_scores(SCENARIO_AS_IS)
+        if base_scores is not None:
+            estimate = _TimeEstimate(self.runner, base_scores)
+            pending = [setting for setting in pending if estimate.seconds(setting) <= self.left_s]
+        if not pending:
             return
-        shortest = min(
-            (s for s in settings if s.kind != MEASURES), key=lambda s: _simulation_steps(self.runner.scenario(s))
-        )
-        switched_on = (s for s in wanted if s.name.startswith(study_settings.WITH_PREFIX))
-        for setting in (shortest, *(replace(s, overrides=(*shortest.overrides, *s.overrides)) for s in switched_on)):
-            with suppress(EgvsError):  # named when it is run
-                self.runner.warm_up(setting)
+        same_scores = (setting for setting in settings if setting.kind != MEASURES)
+        shortest = min(same_scores, key=lambda setting: _simulation_steps(self.runner.scenario(setting)))
+        trials = [shortest]
+        for setting in pending:
+            if setting.name.startswith(study_settings.WITH_PREFIX):
+                trials.append(replace(setting, overrides=(*shortest.overrides, *setting.overrides)))
+        for trial in trials:
+            with suppress(EgvsError):  # reported when the setting itself runs
+                self.runner.warm_up(trial)
 
     def _run_all(self, settings: list[Setting]) -> list[Setting]:
-        """Run one setting after another as long as the budget lasts, and return those; what is known costs nothing.
+        """Run settings until the budget is used up, and return those that ran; saved results cost nothing.
 
-        Cheap ones go first; of those that cost about the same (within a factor of two), approximations.
+        Cheap ones run first; among those of similar cost (within a factor of two), approximations run first.
         """
-        runner, compared, expected = self.runner, [], _TimeEstimate(self.runner, self.scores[SCENARIO])
-        known = {s.name: runner.known(s) for s in settings}
-        free = {SCENARIO, REFERENCE, *(name for name, scores in known.items() if scores)}
-        needs_s = {s.name: 0.0 if s.name in free else expected.seconds(s) for s in settings}
-        in_turn = sorted(settings, key=lambda s: (math.frexp(needs_s[s.name])[1], s.kind == MEASURES, needs_s[s.name]))
-        for setting in in_turn:
+        estimate = _TimeEstimate(self.runner, self.scores[SCENARIO])
+        saved = {setting.name: self.runner.saved_scores(setting) for setting in settings}
+        needed_s = {}
+        for setting in settings:
+            is_free = setting.name in (SCENARIO, REFERENCE) or saved[setting.name] is not None
+            needed_s[setting.name] = 0.0 if is_free else estimate.seconds(setting)
+
+        def cost_order(setting: Setting) -> tuple[int, bool, float]:
+            seconds = needed_s[setting.name]
+            return math.frexp(seconds)[1], setting.kind == MEASURES, seconds
+
+        finished = []
+        for setting in sorted(settings, key=cost_order):
             name = setting.name
-            if needs_s[name] > max(self.left_s, 0.0):
+            if needed_s[name] > max(self.left_s, 0.0):
                 self.skipped[name] = BEYOND_BUDGET
-                self.listener(name, "skipped", {"why": f"about {needs_s[name]:.0f} s, {BEYOND_BUDGET}", "beyond": True})
+                details = {"why": f"about {needed_s[name]:.0f} s, {BEYOND_BUDGET}", "beyond": True}
+                self.listener(name, "skipped", details)
                 continue
+            scores = saved[name]
             try:
-                self.scores[name] = known[name] or runner.run(setting)
+                self.scores[name] = scores or self.runner.run(setting)
             except EgvsError as error:
                 self._skip(setting, str(error))
                 continue
-            compared.append(setting)
-            seconds = sum(runner.medians(self.scores[name]).values())
-            self.listener(name, "kept" if known[name] else "done", {"seconds": seconds})
-        return compared
+            finished.append(setting)
+            seconds = sum(self.runner.median_seconds(self.scores[name]).values())
+            self.listener(name, "kept" if scores else "done", {"seconds": seconds})
+        return finished
 
     def _repeat(self, settings: list[Setting]) -> int:
-        """Time every stage again, all in turn, cheap ones first, while the budget lasts; returns how many were.
+        """Measure every stage again while the budget lasts, and return how many were run.
 
-        One that was fetched has not been timed yet.
+        Each round measures all stages once, cheap ones first. A stage from the cache has not been measured yet.
         """
         stages: dict[tuple[str, str], Setting] = {}
         for setting in settings:
             for name in RANKING_STAGES:
                 stages.setdefault((name, self.scores[setting.name].stages[name]), setting)
-        took = {task: min(self.runner.times(*task).seconds) for task in stages}
-        done = 0
-        for turn in range(1, REPEATS + 1):
-            for (name, key), setting in sorted(stages.items(), key=lambda item: took[item[0]]):
-                if self.runner.times(name, key).repeats < turn and 1.2 * took[name, key] + 0.2 < self.left_s:
-                    self.runner.time_again(name, setting, self.scores[setting.name])
-                    done += 1
-                    self.progress("repeats", done, 0)
-        return done
+        expected_s = {stage: min(self.runner.stage_times(*stage).seconds) for stage in stages}
+        repeated = 0
+        for round_number in range(1, self.options.repeats + 1):
+            for stage in sorted(stages, key=lambda stage: expected_s[stage]):
+                is_measured = self.runner.stage_times(*stage).repeats >= round_number
+                if is_measured or 1.2 * expected_s[stage] + 0.2 >= self.left_s:
+                    continue
+                setting = stages[stage]
+                self.runner.time_again(stage[0], setting, self.scores[setting.name])
+                repeated += 1
+                self.progress("repeats", repeated, 0)
+        return repeated
+
+    def _write(self, folder: RunFolder, rows: list[SettingResult], factor: int) -> tuple[Path, ...]:
+        """Write the table and the figure, and return their paths."""
+        scenario, tolerance = self.scenario, self.options.tolerance
+        written = (folder.accuracy, folder.accuracy_figure)
+        folder.accuracy_checksums.unlink(missing_ok=True)
+        columns = {column.name: [getattr(row, column.name) for row in rows] for column in fields(SettingResult)}
+        metadata = {
+            "schema": parquet.SCHEMA_VERSION,
+            "scenario": {"name": scenario.name, "hash": files.hash_json(scenario.model_dump(mode="json"))},
+            "inputs": files.hash_json(scenario_dependencies(scenario)),
+            "seed": scenario.seed,
+            "reference_times": factor,
+            "tolerance": tolerance,
+            "stages": self.scores[SCENARIO].stages,
+        }
+        parquet.write_artefact(folder.accuracy, "accuracy", columns, metadata)
+        pareto_figure.draw_figure(rows, tolerance, scenario.name, folder.accuracy_figure)
+        checksums.write_checksums(folder.accuracy_checksums, written)
+        return written
 
 
 def _setting_error(runner: SettingRunner, setting: Setting) -> str | None:
-    """Why a setting is no scenario; None where it is one."""
+    """Return why a setting gives no valid scenario; None if it does."""
     try:
         runner.scenario(setting)
     except InputError as error:
@@ -260,82 +356,96 @@ def _setting_error(runner: SettingRunner, setting: Setting) -> str | None:
     return None
 
 
-def _is_shorter(runner: SettingRunner, setting: Setting, longest: Setting) -> bool:
-    """Whether a setting is worth comparing with the reference: not the same, and not watched for longer."""
-    ours_s, its_s = (_traffic_duration_s(runner.scenario(s)) for s in (setting, longest))
-    return setting.overrides != longest.overrides and ours_s <= its_s * (1 + 1e-9)
+def is_shorter(runner: SettingRunner, setting: Setting, reference: Setting) -> bool:
+    """Whether a setting differs from the reference, and its traffic is not longer; others cannot be compared with it.
+
+    Parameters
+    ----------
+    runner
+        Loads scenarios.
+    setting, reference
+        Settings of the study.
+    """
+    duration_s = _traffic_duration_s(runner.scenario(setting))
+    reference_s = _traffic_duration_s(runner.scenario(reference))
+    return setting.overrides != reference.overrides and duration_s <= reference_s * (1 + 1e-9)
 
 
 def _traffic_duration_s(scenario: Scenario) -> float:
     return study_settings.counted_frames(scenario) * scenario.traffic.frame_period_s
 
 
-def _reference_factor(runner: SettingRunner, scenario: Scenario, base_scores: SettingScores, budget_s: float) -> int:
-    """How long the reference watches: a power of two that fits a share of the budget; as before in a repeated study."""
-    if study_settings.is_finished(scenario):
+def reference_factor(runner: SettingRunner, base_scores: SettingScores, options: StudyOptions) -> int:
+    """Choose the length of the reference's traffic; a repeated study keeps it.
+
+    Parameters
+    ----------
+    runner
+        Knows times of stages.
+    base_scores
+        Scores of the scenario as it is.
+    options
+        The budget, and the largest factor.
+
+    Returns
+    -------
+    int
+        A multiple of the scenario's traffic: the largest power of two that is a valid scenario and fits a share of the
+        budget.
+    """
+    scenario = runner.scenario(SCENARIO_AS_IS)
+    if scenario.is_recorded:
         return 1
-    kept = runner.note("study")
-    if (kept.get("scenario"), kept.get("budget_s")) == (base_scores.stages, budget_s):
-        return int(kept["times"])
-    once_s = sum(min(runner.times(name, base_scores.stages[name]).seconds) for name in ("traffic", "tpog"))
-    times = MAX_REFERENCE_FACTOR
-    while times > 1 and (
-        times * once_s > REFERENCE_BUDGET_SHARE * budget_s
-        or _setting_error(runner, study_settings.reference_setting(scenario, times))
-    ):
-        times //= 2
-    runner.save_note("study", {"scenario": base_scores.stages, "budget_s": budget_s, "times": times})
-    return times
+    note = runner.read_note("study")
+    if note.get("scenario") == base_scores.stages and note.get("budget_s") == options.budget_s:
+        return int(note["times"])
+
+    seconds = sum(min(runner.stage_times(name, base_scores.stages[name]).seconds) for name in ("traffic", "tpog"))
+    factor = options.max_reference_factor
+    while factor > 1:
+        is_affordable = factor * seconds <= REFERENCE_BUDGET_SHARE * options.budget_s
+        if is_affordable and not _setting_error(runner, study_settings.reference_setting(scenario, factor)):
+            break
+        factor //= 2
+    runner.save_note("study", {"scenario": base_scores.stages, "budget_s": options.budget_s, "times": factor})
+    return factor
 
 
 class _TimeEstimate:
-    """About how long a setting will take, from what the scenario took."""
+    """Estimates the time of settings from that of the scenario."""
 
-    def __init__(self, runner: SettingRunner, base: SettingScores) -> None:
+    def __init__(self, runner: SettingRunner, base_scores: SettingScores) -> None:
         self._runner = runner
-        self._scenario = runner.scenario(SCENARIO_AS_IS)
-        self._took = runner.medians(base)
+        self._base = runner.scenario(SCENARIO_AS_IS)
+        self._base_s = runner.median_seconds(base_scores)
 
     def seconds(self, setting: Setting) -> float:
-        other, own, took = self._runner.scenario(setting), self._scenario, self._took
-        finer = own.roi.voxel_m / other.roi.voxel_m
-        stepped = _simulation_steps(other) / _simulation_steps(own) if _traffic_key(other) != _traffic_key(own) else 0.0
-        frames, own_frames = (study_settings.counted_frames(scenario) for scenario in (other, own))
-        watched = frames / own_frames * max(1.0, finer**3)
-        counted = watched if stepped or finer != 1.0 else 0.0
-        cast = 1.0 if other.sensors != own.sensors or other.effects != own.effects else 0.0
-        beams = _sub_beams_per_beam(other) / _sub_beams_per_beam(own)
-        score = took["score"] * beams * max(1.0, finer**2)
-        return took["traffic"] * stepped + took["tpog"] * counted + took["scan"] * beams * cast + score
+        """Estimate the time of the stages that a setting runs again."""
+        scenario, base = self._runner.scenario(setting), self._base
+        finer = base.roi.voxel_m / scenario.roi.voxel_m
+        simulation, counting, casting = 0.0, 0.0, 0.0
+        if _traffic_key(scenario) != _traffic_key(base):
+            simulation = _simulation_steps(scenario) / _simulation_steps(base)
+        if simulation or finer != 1.0:
+            frames = study_settings.counted_frames(scenario) / study_settings.counted_frames(base)
+            counting = frames * max(1.0, finer**3)
+        if scenario.sensors != base.sensors or scenario.effects != base.effects:
+            casting = 1.0
+        beams = _sub_beams_per_beam(scenario) / _sub_beams_per_beam(base)
+        score_s = self._base_s["score"] * beams * max(1.0, finer**2)
+        traffic_s = self._base_s["traffic"] * simulation + self._base_s["tpog"] * counting
+        return traffic_s + self._base_s["scan"] * beams * casting + score_s
 
 
 def _sub_beams_per_beam(scenario: Scenario) -> int:
-    """Sub-beams of a beam."""
-    return math.prod(
-        effect.copies for effect in registry.scenario_effects(scenario, "scan") if isinstance(effect, Expand)
-    )
+    effects = registry.scenario_effects(scenario, "scan")
+    return math.prod(effect.copies for effect in effects if isinstance(effect, Expand))
 
 
 def _traffic_key(scenario: Scenario) -> tuple[object, ...]:
-    """What traffic depends on, as far as settings change it."""
+    """Return what traffic depends on, among the values that settings change."""
     return scenario.traffic, *(effect.parameters for effect in registry.scenario_effects(scenario, "traffic"))
 
 
 def _simulation_steps(scenario: Scenario) -> float:
     return (scenario.traffic.warmup_s + _traffic_duration_s(scenario)) / scenario.traffic.step_s
-
-
-def _write_study(
-    path: Path, scenario: Scenario, rows: list[SettingResult], base_scores: SettingScores, times: int, tolerance: float
-) -> None:
-    columns = {f.name: [getattr(row, f.name) for row in rows] for f in fields(SettingResult)}
-    about = {
-        "schema": parquet.SCHEMA_VERSION,
-        "scenario": {"name": scenario.name, "hash": files.hash_json(scenario.model_dump(mode="json"))},
-        "inputs": files.hash_json(scenario_dependencies(scenario)),
-        "seed": scenario.seed,
-        "reference_times": times,
-        "tolerance": tolerance,
-        "stages": base_scores.stages,
-    }
-    parquet.write_artefact(path, "accuracy", columns, about)

@@ -1,21 +1,10 @@
-"""Egvs effects: which a scenario calls for, what each changes.
+"""Study effects: which ones a scenario calls for, and what each changes.
 
-The plain scene, the scene with one named effect at a time, and with all of them: what each changes, and costs.
-
-Each is a run like any other, in a folder of its own; stages that an effect does not touch come from the store.
-
-Tries effects that a scenario does not name: by how much each would change the scores of some sites.
-
-Steps: take the traffic that the scenario's last run has recorded and counted, where it is still the scenario's; scan
-and score a few sites, spread over the list, with the scenario's own effects; then again with one more effect. Nothing
-is written, and no traffic is simulated, so effects on traffic cannot be tried.
-
-Which effects exist, which of them a scenario calls for, and what an accuracy study says that each costs.
-
-Steps of :func:`effect_statuses`: build the static world in memory; ask every named effect whether it can change the
-result; ask
-every other one whether it could, what in the scene it is about, and try it on the traffic of the last run
-(:mod:`egvs.studies.effect_study`); say for each effect whether it is on or called for, and why.
+- :func:`effect_statuses`: whether each effect is on or called for in a scene, and why. Effects that the scenario does
+  not name are tried on a few sites with the traffic of the last run (:class:`EffectTrials`).
+- :func:`run_ablation`: runs without effects, with each effect alone, and with all; each run has its own folder, and
+  stages that an effect does not change come from the cache.
+- :func:`effect_costs`: costs and changes as measured by an accuracy study.
 """
 
 from __future__ import annotations
@@ -31,7 +20,8 @@ import numpy as np
 
 from egvs.artefacts import parquet
 from egvs.artefacts.readers import read_accuracy, read_scores
-from egvs.artefacts.run_folder import RunFolder, RunRecord
+from egvs.artefacts.run_folder import RunFolder
+from egvs.artefacts.run_record import RunRecord
 from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files, plugins
 from egvs.core.errors import InputError, MissingBackendError, format_problem
@@ -52,19 +42,29 @@ from egvs.studies.measurement import scenario_dependencies
 from egvs.studies.study_settings import SCENARIO, WITH_PREFIX, WITHOUT_PREFIX
 from egvs.traffic.vehicle_boxes import VehicleSize
 
+MAX_TRIAL_SITES = 6
+
+UNTRIED = "not known before a run"
+SMALL_CHANGE, MIN_DISPLAYED_CHANGE = 0.01, 0.001
+"""An effect that changes all scores by less than the first share, and keeps their order, has little effect. Before a
+run, the same holds for an effect whose formula loses less than the first share of returns. Changes below the second
+share are displayed as "less than"."""
+
+_TRAJECTORIES, _TPOG = RunFolder.trajectories.name, RunFolder.tpog.name
+
 
 @dataclass(frozen=True)
 class EffectChange:
-    """What one effect (or all) does to the scores.
+    """Scores with one effect.
 
     Attributes
     ----------
     effect
-        Its name; "all" for all that the scenario names together; "none" for the plain scene.
+        Its name; "all" for all effects of the scenario, "none" for no effect.
     seconds
-        Time of all stages but the report; a stage that came from the store counts with what it took to make it.
+        Time of all stages except the report; stages from the cache count with their original time.
     sites, scores, ranks
-        Of each site, in the order of the sites.
+        Names, EGVS and ranks, in the order of the sites.
     """
 
     effect: str
@@ -77,26 +77,34 @@ class EffectChange:
 def run_ablation(
     scenario: Scenario, out: Path, *, jobs: int | None = None, progress: ProgressCallback = no_progress
 ) -> list[EffectChange]:
-    """Run the plain scene, each effect alone, and all together, under ``out / "ablation"``; resumed as any run."""
-    every = scenario.effects
-    variants = {"none": every.only(), **{name: every.only(name) for name in every.named}}
-    if len(every.named) > 1:
-        variants["all"] = every
+    """Run a scenario without effects, with each effect alone, and with all of them, under ``out / "ablation"``.
+
+    Parameters
+    ----------
+    scenario
+        Names the effects.
+    out
+        The run folder.
+    jobs
+        Number of threads; None for all cores.
+    progress
+        Called as stages proceed.
+    """
+    effects = scenario.effects
+    variants = {"none": effects.only()}
+    for name in effects.named:
+        variants[name] = effects.only(name)
+    if len(effects.named) > 1:
+        variants["all"] = effects
     changes = []
-    for name, effects in variants.items():
+    for name, variant in variants.items():
         folder = out / "ablation" / name
-        record = run.run(scenario.with_effects(effects), folder, jobs=jobs, progress=progress)
+        record = run.run(scenario.with_effects(variant), folder, jobs=jobs, progress=progress)
         seconds = sum(record.stages[stage].cost.seconds for stage in RANKING_STAGES)
         scores = read_scores(RunFolder(folder).scores)
         sites, egvs, ranks = (tuple(scores[column].to_pylist()) for column in ("site", "egvs", "rank"))
         changes.append(EffectChange(name, seconds, sites, egvs, ranks))
     return changes
-
-
-MAX_TRIAL_SITES = 6
-"""Sites that are scored at most."""
-
-_TRAJECTORIES, _TPOG = RunFolder.trajectories.name, RunFolder.tpog.name
 
 
 @dataclass(frozen=True)
@@ -106,11 +114,11 @@ class EffectTrial:
     Attributes
     ----------
     least, most
-        Relative changes of the scores, the one that is nearest to 0 and the one farthest from it.
+        Relative changes of scores: the one nearest to 0, and the one farthest from it.
     sites, of_sites
-        How many were scored, of how many there are.
+        Number of sites that were scored, and of all sites.
     same_order
-        Whether they rank as before.
+        Whether the ranking stays the same.
     """
 
     least: float
@@ -121,57 +129,63 @@ class EffectTrial:
 
 
 class EffectTrials:
-    """Tries one effect after another before a scene, on the traffic of the run in a folder; see :meth:`of`."""
+    """Scores a few sites of a scene with one effect after another, with the traffic of a run.
+
+    Parameters
+    ----------
+    scene
+        The scene without the effects.
+    folder
+        A run folder with trajectories and a TPOG.
+    """
 
     def __init__(self, scene: Scene, folder: Path) -> None:
         self._scene, self._folder = scene, folder
-        every = len(scene.sites)
-        picked = np.unique(np.linspace(0, every - 1, min(MAX_TRIAL_SITES, every)).round().astype(int))
-        self._sites = tuple(scene.sites[i] for i in picked)
+        count = len(scene.sites)
+        indices = np.unique(np.linspace(0, count - 1, min(MAX_TRIAL_SITES, count)).round().astype(int))
+        self._sites = tuple(scene.sites[index] for index in indices)
 
     @classmethod
-    def of(cls, scene: Scene, folder: Path) -> EffectTrials | None:
-        """None where the folder holds no traffic of this scenario as it is now."""
+    def from_run(cls, scene: Scene, folder: Path) -> EffectTrials | None:
+        """Use the traffic in a run folder; None if it contains no traffic of the scenario as it is now."""
         if not RunFolder(folder).run_record.is_file():
             return None
         record = RunRecord.read(folder)
         work = open_folder(scene.scenario, folder, recorded=stages.recorded_digests(record))
         try:
-            current = all(
-                name in record.stages and record.stages[name].inputs == stages.stage_key(name, work).key
-                for name in ("traffic", "statics", "tpog")
-            )
+            for name in ("traffic", "statics", "tpog"):
+                if name not in record.stages or record.stages[name].inputs != stages.stage_key(name, work).key:
+                    return None
             work.digests(_TRAJECTORIES, _TPOG)
-        except InputError:  # an artefact is gone, or another one
+        except InputError:  # an artefact is missing or was altered
             return None
-        return cls(scene, folder) if current else None
+        return cls(scene, folder)
 
     def trial(self, effect: Effect[EffectParameters]) -> EffectTrial | None:
-        """What the effect changes; None where that takes other traffic, or every score is 0."""
+        """Score the sites with an effect; None if it needs other traffic, or every score is 0."""
         if isinstance(effect, Traffic) or not self._plain.any():
             return None
-        own = self._scene.scenario.effects
-        named = own.model_validate({**own.named, effect.NAME: effect.parameters})
-        changed = self._scores(inputs.resolve_scene(self._scene.scenario.with_effects(named), self._scene.world))
-        seen = self._plain > 0
-        changes = changed[seen] / self._plain[seen] - 1
-        least, most = (float(changes[pick(np.abs(changes))]) for pick in (np.argmin, np.argmax))
-        order = np.array_equal(np.argsort(-changed, kind="stable"), np.argsort(-self._plain, kind="stable"))
-        return EffectTrial(least, most, len(self._sites), len(self._scene.sites), bool(order))
+        effects = self._scene.scenario.effects
+        with_effect = effects.model_validate({**effects.named, effect.NAME: effect.parameters})
+        scene = inputs.resolve_scene(self._scene.scenario.with_effects(with_effect), self._scene.world)
+        scores = self._scores(scene)
+        is_scored = self._plain > 0
+        changes = scores[is_scored] / self._plain[is_scored] - 1
+        least = float(changes[np.argmin(np.abs(changes))])
+        most = float(changes[np.argmax(np.abs(changes))])
+        order = np.argsort(-scores, kind="stable")
+        same_order = np.array_equal(order, np.argsort(-self._plain, kind="stable"))
+        return EffectTrial(least, most, len(self._sites), len(self._scene.sites), same_order)
 
     @cached_property
-    def sizes(self) -> dict[str, tuple[VehicleSize, float]]:
-        """Sizes of the recorded vehicles by a name of their own, each with its share of all boxes."""
+    def vehicle_shares(self) -> dict[str, tuple[VehicleSize, float]]:
+        """Kinds and lengths of recorded vehicles: size, and share of all boxes, by a unique name."""
         table = parquet.read_artefact(self._folder / _TRAJECTORIES, "trajectories", ["kind", "length_m"])[0]
-        counted = table.group_by(["kind", "length_m"]).aggregate([("length_m", "count")]).to_pylist()
-        rows = max(len(table), 1)
-        return {
-            f"{row['kind']} of {row['length_m']:g} m": (
-                VehicleSize(row["length_m"], 1.0, 1.0, row["kind"]),
-                row["length_m_count"] / rows,
-            )
-            for row in counted
-        }
+        shares = {}
+        for row in table.group_by(["kind", "length_m"]).aggregate([("length_m", "count")]).to_pylist():
+            size = VehicleSize(row["length_m"], 1.0, 1.0, row["kind"])
+            shares[f"{row['kind']} of {row['length_m']:g} m"] = (size, row["length_m_count"] / len(table))
+        return shares
 
     @cached_property
     def _tpog(self) -> Tpog:
@@ -179,6 +193,7 @@ class EffectTrials:
 
     @cached_property
     def _plain(self) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+        """EGVS without the effect."""
         return self._scores(self._scene)
 
     def _scores(self, scene: Scene) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
@@ -186,17 +201,24 @@ class EffectTrials:
         return np.array([scorer.score(scanner.scan_site(site)).egvs for site in self._sites])
 
 
-UNTRIED = "not known before a run"
-SMALL_CHANGE, MIN_DISPLAYED_CHANGE = 0.01, 0.001
-"""An effect that changes no score by more than the first share, and no order, is of little effect; before a run, one by
-whose formula less than the first share of returns is missed. What is below the second is not told apart."""
-
-
 @dataclass(frozen=True)
 class EffectStatus:
-    """One effect, before one scene, and why: named, it is "on", "skipped", or "refused" because something is missing;
-    not named, it is "called for", of "little" effect, "your choice" where the scene cannot tell, or "off"; it is
-    "broken" where it cannot be loaded.
+    """An effect in a scene.
+
+    Attributes
+    ----------
+    name, stage, kind
+        The effect.
+    state
+        If the scenario names the effect: "on", "skipped" (it changes nothing), or "refused" (something is missing).
+        Otherwise: "called for", "little" (it changes little), "your choice" (the scene cannot tell), or "off".
+        "broken" if it cannot be loaded.
+    why
+        The reason.
+    source
+        Where the model is published.
+    change
+        What it would change, and where the number comes from; for effects that the scenario does not name.
     """
 
     name: str
@@ -206,23 +228,22 @@ class EffectStatus:
     why: str
     source: str
     change: str = ""
-    """What it would change, and where the number comes from; of an effect that is not named."""
 
 
 @dataclass(frozen=True)
 class EffectCost:
-    """What one effect costs and changes, as an accuracy study found.
+    """What one effect costs and changes, according to an accuracy study.
 
     Attributes
     ----------
     seconds
-        Of all stages: with the effect less without it.
+        Additional time of all stages.
     change
-        Largest relative change of a site's share of the limit, against the scenario as it is.
+        Largest relative change of a site's share of the limit.
     tau
         Kendall's tau of the rankings with and without it.
     regret
-        Share of the best score that is lost by trusting the other ranking's best site.
+        Share of the best score that is lost by using the best site of the other ranking.
     """
 
     seconds: float
@@ -232,47 +253,78 @@ class EffectCost:
 
 
 def effect_catalogue() -> list[EffectStatus]:
-    """Every effect that exists."""
+    """Return all installed effects, without a state."""
     return [_status_or_error(name, _describe_effect) for name in registry.effect_names()]
 
 
 def effect_statuses(
     scenario: Scenario, out: Path | None = None, progress: ProgressCallback = no_progress
 ) -> list[EffectStatus]:
-    """Every effect before ``scenario``, see :class:`EffectStatus`; tried on the traffic of the run in ``out``, where
-    that is
-    there."""
+    """Return the status of each effect in a scenario.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    out
+        Effects are tried with the traffic in this run folder, if there is any.
+    progress
+        Called after each effect.
+    """
     scene = build_scene(scenario)
-    return effect_statuses_in_scene(scene, None if out is None else EffectTrials.of(scene, out), progress)
+    trials = None if out is None else EffectTrials.from_run(scene, out)
+    return effect_statuses_in_scene(scene, trials, progress)
 
 
 def effect_statuses_in_scene(
     scene: Scene, trials: EffectTrials | None = None, progress: ProgressCallback = no_progress
 ) -> list[EffectStatus]:
-    """The same before a scene that is at hand."""
-    calls, names = [], registry.effect_names()
-    for done, name in enumerate(names, start=1):
-        calls.append(_status_or_error(name, lambda name: _effect_status(name, scene, trials)))
-        progress("effects", done, len(names))
-    return calls
+    """Return the status of each effect in a scene.
+
+    Parameters
+    ----------
+    scene
+        The scene.
+    trials
+        Tries effects; without it, changes are unknown.
+    progress
+        Called after each effect.
+    """
+    statuses: list[EffectStatus] = []
+    names = registry.effect_names()
+    for name in names:
+        statuses.append(_status_or_error(name, lambda name: _effect_status(name, scene, trials)))
+        progress("effects", len(statuses), len(names))
+    return statuses
 
 
 def effect_costs(scenario: Scenario, out: Path) -> dict[str, EffectCost] | None:
-    """What ``egvs accuracy`` left in ``out`` of each effect; None where it was not run on this scenario."""
+    """Return costs of effects from an accuracy study, by name; None if there is no study of this scenario in ``out``.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    out
+        The run folder.
+    """
     study = read_accuracy(RunFolder(out).accuracy)
     if study is None or study[1]["inputs"] != files.hash_json(scenario_dependencies(scenario)):
         return None
     rows = {row["setting"]: row for row in study[0]}
-    priced, own = {}, rows[SCENARIO]["seconds"]
+    scenario_s = rows[SCENARIO]["seconds"]
+    costs = {}
     for name in registry.effect_names():
-        for beginning, sign in ((WITH_PREFIX, 1.0), (WITHOUT_PREFIX, -1.0)):
-            if (row := rows.get(f"{beginning}{name}")) is not None:
-                priced[name] = EffectCost(sign * (row["seconds"] - own), row["error"], row["tau"], row["regret"])
-    return priced
+        for prefix, sign in ((WITH_PREFIX, 1.0), (WITHOUT_PREFIX, -1.0)):
+            row = rows.get(f"{prefix}{name}")
+            if row is not None:
+                seconds = sign * (row["seconds"] - scenario_s)
+                costs[name] = EffectCost(seconds, row["error"], row["tau"], row["regret"])
+    return costs
 
 
 def _status_or_error(name: str, describe: Callable[[str], EffectStatus]) -> EffectStatus:
-    """What is told of an effect; of one that cannot be loaded, why: nobody may have named it."""
+    """Describe an effect; for one that cannot be loaded, say why."""
     try:
         return describe(name)
     except MissingBackendError as error:
@@ -281,78 +333,86 @@ def _status_or_error(name: str, describe: Callable[[str], EffectStatus]) -> Effe
 
 def _describe_effect(name: str) -> EffectStatus:
     kind = registry.find_effect_class(name)
-    return EffectStatus(name, kind.STAGE, kind.KIND, "", _effect_summary(kind), _model_source(kind))
+    summary = str(sys.modules[kind.__module__].__doc__).strip().splitlines()[0]
+    return _status(kind, "", summary)
+
+
+def _status(kind: type[Effect[Any]], state: str, why: str, change: str = "") -> EffectStatus:
+    source = kind.SOURCE
+    package = plugins.plugin_package(GROUP, kind.NAME)
+    if package != plugins.PACKAGE_NAME:
+        source += f" (package {package})"
+    return EffectStatus(kind.NAME, kind.STAGE, kind.KIND, state, why, source, change)
 
 
 def _effect_status(name: str, scene: Scene, trials: EffectTrials | None) -> EffectStatus:
-    kind, named = registry.find_effect_class(name), scene.scenario.effects.named
-
-    def call(state: str, why: str) -> EffectStatus:
-        return EffectStatus(name, kind.STAGE, kind.KIND, state, why, _model_source(kind))
-
+    kind = registry.find_effect_class(name)
+    named = scene.scenario.effects.named
     if issubclass(kind, Traffic) and kind.SELF_ACTING:
-        on, why = kind(kind.Model()).acts(scene.scenario)
-        return call("on" if on else "off", why)
+        is_on, why = kind(kind.Model()).acts(scene.scenario)
+        return _status(kind, "on" if is_on else "off", why)
     if name not in named:
         return _unnamed_effect_status(kind, scene, trials)
     effect = kind(named[name])
-    if (idle := effect.why_idle(scene)) is not None:
-        return call("skipped", f"named, but {idle}: the result is the same without it")
-    if (refusal := effect.refusal(scene)) is not None:
-        return call("refused", str(refusal))
-    values = ", ".join(f"{key} = {value}" for key, value in effect.parameters.model_dump(mode="json").items())
-    return call("on", f"named, with {values}" if values else "named")
+    idle = effect.why_idle(scene)
+    if idle is not None:
+        return _status(kind, "skipped", f"named, but {idle}: the result is the same without it")
+    refusal = effect.refusal(scene)
+    if refusal is not None:
+        return _status(kind, "refused", str(refusal))
+    parameters = effect.parameters.model_dump(mode="json")
+    if not parameters:
+        return _status(kind, "on", "named")
+    return _status(kind, "on", "named, with " + ", ".join(f"{key} = {value}" for key, value in parameters.items()))
 
 
 def _unnamed_effect_status(kind: type[Effect[Any]], scene: Scene, trials: EffectTrials | None) -> EffectStatus:
-    """Whether the scene calls for an effect that it does not name, and what that would change."""
+    """Say whether the scene calls for an effect that the scenario does not name, and what it would change."""
+    missing = [key for key in registry.required_parameters(kind.NAME) if key not in kind.TRIAL]
+    if missing:
+        return _status(kind, "off", f"not named; it needs {', '.join(missing)}, which the scene does not contain")
+    effect = kind(kind.Model.from_dict(kind.TRIAL))
+    idle = effect.why_idle(scene)
+    if idle is not None:
+        return _status(kind, "off", f"not called for: {idle}")
+    refusal = effect.refusal(scene)
+    if refusal is not None:
+        return _status(kind, "off", format_problem("cannot act here", refusal.problem, refusal.hint))
 
-    def call(state: str, why: str, change: str = "") -> EffectStatus:
-        return EffectStatus(kind.NAME, kind.STAGE, kind.KIND, state, why, _model_source(kind), change)
-
-    if untold := [key for key in registry.required_parameters(kind.NAME) if key not in kind.TRIAL]:
-        return call("off", f"not named; it needs {', '.join(untold)}, which the scene does not tell")
-    effect = kind(kind.Model.of(kind.TRIAL))
-    if (idle := effect.why_idle(scene)) is not None:
-        return call("off", f"not called for: {idle}")
-    if (refusal := effect.refusal(scene)) is not None:
-        return call("off", format_problem("cannot act here", refusal.problem, refusal.hint))
-    seen, small, change = effect.summary(scene), False, UNTRIED
+    summary = effect.summary(scene)
+    is_small, change = False, UNTRIED
     if trials is not None:
-        small, change = _try_effect(effect, trials)
+        is_small, change = _try_effect(effect, trials)
     elif isinstance(effect, Detect):
-        small = 1.0 - min(effect.noticed_shares(scene)) < SMALL_CHANGE
+        is_small = 1.0 - min(effect.detection_shares(scene)) < SMALL_CHANGE
+
     if kind.DECIDED_BY:
-        values = ", ".join(f"{key} = {value:g}" for key, value in kind.TRIAL.items())
-        tried = f"; tried with {values}" if trials is not None and not isinstance(effect, Traffic) else ""
-        return call("your choice", "; ".join(filter(None, (f"{kind.DECIDED_BY} decides", seen))) + tried, change)
-    unknown = trials is None and isinstance(effect, Articulated)  # which vehicles come
-    state = "little" if small else "your choice" if unknown else "called for"
-    return call(state, seen or "it can act here", change)
+        why = "; ".join(filter(None, (f"{kind.DECIDED_BY} decides", summary)))
+        if trials is not None and not isinstance(effect, Traffic):
+            why += "; tried with " + ", ".join(f"{key} = {value:g}" for key, value in kind.TRIAL.items())
+        return _status(kind, "your choice", why, change)
+    state = "called for"
+    if is_small:
+        state = "little"
+    elif trials is None and isinstance(effect, Articulated):  # depends on the vehicles that will come
+        state = "your choice"
+    return _status(kind, state, summary or "it can act here", change)
 
 
 def _try_effect(effect: Effect[Any], trials: EffectTrials) -> tuple[bool, str]:
-    """Whether an effect changes next to nothing, and by how much it changes the scores, in words."""
+    """Return whether an effect changes little, and a description of how much it changes the scores."""
     if isinstance(effect, Articulated):
-        parts = effect.geometries({name: size for name, (size, _) in trials.sizes.items()}, effect.NAME)
-        share = sum(share for name, (_, share) in trials.sizes.items() if name in parts)
-        return share == 0, f"{share:.1%} of the boxes in the last run get parts; what that changes takes a run with it"
-    found = trials.trial(effect)
-    if found is None:
-        return False, "takes a run with it: its traffic is another"
-    few = abs(found.most) < MIN_DISPLAYED_CHANGE
-    spread = f"less than {MIN_DISPLAYED_CHANGE:.1%}" if few else f"{found.least:+.1%} to {found.most:+.1%}"
-    order = "" if found.same_order else ", and their order"
-    where = f"measured on {found.sites} of {found.of_sites} sites, with the last run's traffic"
-    return abs(found.most) < SMALL_CHANGE and found.same_order, f"scores by {spread}{order} ({where})"
-
-
-def _model_source(kind: type[Effect[Any]]) -> str:
-    """Where an effect's model is published; and which package brings it, where that is not this program."""
-    package = plugins.plugin_package(GROUP, kind.NAME)
-    return kind.SOURCE if package == plugins.PACKAGE_NAME else f"{kind.SOURCE} (package {package})"
-
-
-def _effect_summary(kind: type) -> str:
-    """What an effect's module says of it."""
-    return str(sys.modules[kind.__module__].__doc__).strip().splitlines()[0]
+        sizes = {name: size for name, (size, _) in trials.vehicle_shares.items()}
+        parts = effect.geometries(sizes, effect.NAME)
+        share = sum(share for name, (_, share) in trials.vehicle_shares.items() if name in parts)
+        return share == 0, f"{share:.1%} of the boxes in the last run get parts; only a run with it shows the change"
+    trial = trials.trial(effect)
+    if trial is None:
+        return False, "only a run with it shows the change, because it changes the traffic"
+    change = f"{trial.least:+.1%} to {trial.most:+.1%}"
+    if abs(trial.most) < MIN_DISPLAYED_CHANGE:
+        change = f"less than {MIN_DISPLAYED_CHANGE:.1%}"
+    if not trial.same_order:
+        change += ", and their order"
+    where = f"measured on {trial.sites} of {trial.of_sites} sites, with the last run's traffic"
+    return abs(trial.most) < SMALL_CHANGE and trial.same_order, f"scores by {change} ({where})"

@@ -1,14 +1,14 @@
-"""Runs side by side: scores, ranks, how well rankings agree, and what differs in settings and files.
+"""Compare finished runs: scores, ranks, agreement of the rankings, and differences of settings and files.
 
-Sites are matched by name. Scores in bits compare only where region, voxels and gamma are the same; shares of
-``egvs_limit`` compare further, ranks furthest. Rankings are held against each other pair by pair, over the sites that
-both runs have: Kendall's tau-b, Spearman's rho, and the regret of trusting the one run's best site in the other.
+Sites are matched by name. EGVS in bits can be compared if region, voxels and gamma are equal; shares of ``egvs_limit``
+and ranks can also be compared otherwise. Rankings are compared in pairs, over the sites that both runs have: Kendall's
+tau-b, Spearman's rho, and the regret of using the best site of one run in the other.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from egvs.artefacts import parquet
-from egvs.artefacts.run_folder import RunFolder, RunRecord
+from egvs.artefacts.run_folder import RunFolder
+from egvs.artefacts.run_record import RunRecord
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.studies.score_errors import best_sites, rank_agreement, regret
@@ -29,7 +30,25 @@ _POSE_COLUMNS = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg", "senso
 
 @dataclass(frozen=True)
 class SiteResult:
-    """A site's row of a run's ``scores.parquet``; what a run does not know is None."""
+    """A row of ``scores.parquet``; values that a run does not have are None.
+
+    Attributes
+    ----------
+    site
+        Name.
+    pose
+        x, y, z, yaw, pitch, roll (m and degrees), and name of the sensor.
+    longitude_deg, latitude_deg
+        Location on the Earth.
+    egvs, egvs_se
+        EGVS and its standard error, in bits.
+    rank
+        1 is best.
+    share
+        EGVS as a share of ``egvs_limit``.
+    other, other_se
+        The score that ranks and its standard error, if it is not EGVS.
+    """
 
     site: str
     pose: tuple[float | str, ...]
@@ -39,9 +58,7 @@ class SiteResult:
     egvs_se: float | None
     rank: int
     share: float | None
-    """Of ``egvs_limit``."""
     other: float | None = None
-    """The score that ranks, and its standard error, where it is not the EGVS."""
     other_se: float | None = None
 
     @property
@@ -52,7 +69,21 @@ class SiteResult:
 
 @dataclass(frozen=True)
 class ComparedRun:
-    """A finished run: ``label`` is short, ``settings`` and ``files`` (sha256) are those that its scores depend on."""
+    """A finished run.
+
+    Attributes
+    ----------
+    label
+        A, B, ...
+    folder
+        The run folder.
+    sites
+        Results by name.
+    settings, files
+        Settings by full key, and sha256 of the files that its scores depend on.
+    rank_by
+        The score that ranks.
+    """
 
     label: str
     folder: Path
@@ -64,10 +95,20 @@ class ComparedRun:
 
 @dataclass(frozen=True)
 class RankAgreement:
-    """How well two runs agree, over the sites that both have; no numbers where they share none.
+    """Agreement of two rankings, over the sites that both runs have.
 
-    ``best_a`` and ``best_b`` are each run's best of the shared sites, ``regret_a`` the share of run b's best score that
-    trusting ``best_a`` would lose.
+    Attributes
+    ----------
+    a, b
+        Labels of the runs.
+    shared
+        Number of common sites; without any, the other values are empty.
+    tau, rho
+        Kendall's tau-b and Spearman's rho.
+    best_a, best_b
+        Best common sites of each run.
+    regret_a
+        Share of run b's best score that is lost at ``best_a``.
     """
 
     a: str
@@ -82,7 +123,7 @@ class RankAgreement:
 
 @dataclass(frozen=True)
 class Difference:
-    """A setting, or a file's content, that is not the same in all runs; None where a run has none."""
+    """A setting, or the content of a file, that differs between runs; None for runs without it."""
 
     what: str
     values: tuple[Any, ...]
@@ -90,7 +131,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Runs side by side; ``sites`` in the order of the first run's ranking, then those of the others."""
+    """Compared runs; ``sites`` are in the order of the first run's ranking, followed by those of the other runs."""
 
     runs: tuple[ComparedRun, ...]
     sites: tuple[str, ...]
@@ -100,57 +141,70 @@ class Comparison:
 
 
 def compare_runs(folders: Sequence[Path]) -> Comparison:
-    """Compare two or more finished runs.
+    """Compare finished runs.
 
-    InputError when there are fewer, or a folder holds no finished and unaltered run.
+    Parameters
+    ----------
+    folders
+        Two or more run folders.
+
+    Raises
+    ------
+    InputError
+        If there are fewer folders, or one contains no finished run, or its scores were altered.
     """
     if len(folders) < 2:
-        raise InputError("compare", f"{len(folders)} run", "two or more folders of finished runs")
-    runs = tuple(_read_run(folder, _letter(number)) for number, folder in enumerate(folders))
-    pairs = list(combinations(runs, 2))
-    agreements = tuple(_agreement(a, b) for a, b in pairs)
-    notes = [note for pair in pairs for note in _notes(*pair)]
-    return Comparison(runs, _sites_in_order(runs), agreements, tuple(_differences(runs)), tuple(notes))
+        raise InputError("compare", f"expected at least two runs, got {len(folders)}", "Name folders of finished runs.")
+    runs = tuple(_read_run(folder, run_label(number)) for number, folder in enumerate(folders))
+    sites: dict[str, None] = {}
+    for run in runs:
+        ranked = sorted(run.sites.values(), key=lambda site: site.rank)
+        sites |= dict.fromkeys(site.site for site in ranked)
+    agreements = []
+    notes: list[str] = []
+    for a, b in combinations(runs, 2):
+        agreements.append(compare_rankings(a, b))
+        notes += _notes(a, b)
+    return Comparison(runs, tuple(sites), tuple(agreements), tuple(find_differences(runs)), tuple(notes))
 
 
-def _letter(number: int) -> str:
-    """A, B, ... Z, AA, AB, ... as columns of a table are called."""
-    above, last = divmod(number, 26)
-    return (_letter(above - 1) if above else "") + chr(ord("A") + last)
+def run_label(number: int) -> str:
+    """Return A, B, ... Z, AA, AB, ... for the numbers from 0, as the columns of a spreadsheet."""
+    prefix, last = divmod(number, 26)
+    label = chr(ord("A") + last)
+    return run_label(prefix - 1) + label if prefix else label
 
 
 def _read_run(folder: Path, label: str) -> ComparedRun:
-    record, path = RunRecord.read(folder), folder / SCORES
-    done = record.stages.get("score")
-    if done is None:
-        raise InputError(
-            RunFolder(folder).run_record, "the stage score is not done", "a finished run; call egvs run first"
-        )
-    if files.hash_file(path) != done.artefacts.get(SCORES):
-        raise InputError(path, "is not what the run in its folder made", "the run's own file; call egvs run again")
-    scores, about = parquet.read_artefact(path, "scores")
-    rows, rank_by = scores.to_pylist(), about.get("rank_by", "egvs")
-    made = {name for stage in record.stages.values() for name in stage.artefacts}
-    read = {
-        name: digest
-        for key, stage in record.stages.items()
-        if key not in ("check", "report")
-        for name, digest in stage.files.items()
-        if name not in made
-    }
+    record = RunRecord.read(folder)
+    path = folder / SCORES
+    score_stage = record.stages.get("score")
+    if score_stage is None:
+        problem = "expected a finished run, but the stage score was not run"
+        raise InputError(RunFolder(folder).run_record, problem, "Call egvs run first.")
+    if files.hash_file(path) != score_stage.artefacts.get(SCORES):
+        raise InputError(path, "is not the file that the run wrote", "Call egvs run again.")
+    scores, metadata = parquet.read_artefact(path, "scores")
+    rank_by = metadata.get("rank_by", "egvs")
+
     settings = {**dict(_flatten(record.scenario)), "egvs (version)": record.egvs}
-    if settings.get("score.gamma") == "auto":  # the number that it stood for
-        settings["score.gamma"] = about["gamma"]
-    if (version := record.stages["traffic"].summary.get("sumo") if "traffic" in record.stages else None) is not None:
-        settings["sumo (version)"] = version
-    return ComparedRun(
-        label, folder, {row["site"]: _site_result(row, rank_by) for row in rows}, settings, read, rank_by
-    )
+    if settings.get("score.gamma") == "auto":
+        settings["score.gamma"] = metadata["gamma"]
+    if "traffic" in record.stages and record.stages["traffic"].summary.get("sumo") is not None:
+        settings["sumo (version)"] = record.stages["traffic"].summary["sumo"]
+
+    artefacts = {name for stage in record.stages.values() for name in stage.artefacts}
+    input_files: dict[str, str] = {}
+    for name, stage in record.stages.items():
+        if name not in ("check", "report"):
+            input_files |= {file: digest for file, digest in stage.files.items() if file not in artefacts}
+    sites = {row["site"]: _site_result(row, rank_by) for row in scores.to_pylist()}
+    return ComparedRun(label, folder, sites, settings, input_files, rank_by)
 
 
 def _site_result(row: dict[str, Any], rank_by: str) -> SiteResult:
-    limit, is_other = row["egvs_limit"], rank_by != "egvs"
-    return SiteResult(
+    limit = row["egvs_limit"]
+    result = SiteResult(
         site=row["site"],
         pose=tuple(row[name] for name in _POSE_COLUMNS),
         longitude_deg=row.get("longitude_deg"),
@@ -159,17 +213,20 @@ def _site_result(row: dict[str, Any], rank_by: str) -> SiteResult:
         egvs_se=row.get("egvs_se"),
         rank=row["rank"],
         share=row["egvs"] / limit if 0 < limit < float("inf") else None,
-        other=row[rank_by] if is_other else None,
-        other_se=row.get(f"{rank_by}_se") if is_other else None,
     )
+    if rank_by == "egvs":
+        return result
+    return replace(result, other=row[rank_by], other_se=row.get(f"{rank_by}_se"))
 
 
 def _flatten(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Each setting under its whole key; rows of tables under their names, or their numbers."""
+    """Yield each setting with its full key; rows of tables are called by their name or number."""
     if isinstance(value, dict) and value:
         for name, inner in value.items():
-            if key or name not in _IGNORED_SETTINGS:
-                yield from _flatten(inner, f"{key}.{name}" if key else name)
+            if key:
+                yield from _flatten(inner, f"{key}.{name}")
+            elif name not in _IGNORED_SETTINGS:
+                yield from _flatten(inner, name)
     elif isinstance(value, list) and value and all(isinstance(row, dict) for row in value):
         for number, row in enumerate(value):
             yield from _flatten(row, f"{key}[{row.get('name', number)}]")
@@ -177,57 +234,81 @@ def _flatten(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
         yield key, value
 
 
-def _sites_in_order(runs: Sequence[ComparedRun]) -> tuple[str, ...]:
-    ranked = (site for run in runs for site in sorted(run.sites, key=lambda name: run.sites[name].rank))
-    return tuple(dict.fromkeys(ranked))
+def compare_rankings(a: ComparedRun, b: ComparedRun) -> RankAgreement:
+    """Compare the rankings of two runs.
 
-
-def _agreement(a: ComparedRun, b: ComparedRun) -> RankAgreement:
+    Parameters
+    ----------
+    a, b
+        The runs; the regret is that of using the best site of ``a``.
+    """
     shared = [site for site in a.sites if site in b.sites]
     if not shared:
         return RankAgreement(a.label, b.label, 0)
-    its, others = (np.array([run.sites[site].score for site in shared]) for run in (a, b))
-    first_a, first_b = (tuple(shared[i] for i in sorted(best_sites(scores, 1))) for scores in (its, others))
-    tau, rho = (rank_agreement(its, others, kind) if len(shared) > 1 else None for kind in ("tau", "rho"))
-    return RankAgreement(a.label, b.label, len(shared), tau, rho, first_a, first_b, regret(its, others))
+    scores_a = np.array([a.sites[site].score for site in shared])
+    scores_b = np.array([b.sites[site].score for site in shared])
+    tau, rho = None, None
+    if len(shared) > 1:
+        tau = rank_agreement(scores_a, scores_b, "tau")
+        rho = rank_agreement(scores_a, scores_b, "rho")
+    best_a = tuple(shared[index] for index in sorted(best_sites(scores_a, 1)))
+    best_b = tuple(shared[index] for index in sorted(best_sites(scores_b, 1)))
+    return RankAgreement(a.label, b.label, len(shared), tau, rho, best_a, best_b, regret(scores_a, scores_b))
 
 
-def _differences(runs: Sequence[ComparedRun]) -> Iterator[Difference]:
-    whole_rows: dict[str, None] = {}
+def find_differences(runs: Sequence[ComparedRun]) -> Iterator[Difference]:
+    """Yield the settings and files that differ.
+
+    A row of a table that some runs lack is one difference, instead of one for each of its keys.
+
+    Parameters
+    ----------
+    runs
+        The runs.
+    """
+    missing_rows = set()
     for key in dict.fromkeys(key for run in runs for key in run.settings):
-        row = key[: key.rindex("]") + 1] if "]" in key else ""
-        have = [any(other.startswith(row) for other in run.settings) for run in runs] if row else []
-        if row in whole_rows:
+        row = key[: key.rfind("]") + 1]  # "traffic.kinds[car]" of "traffic.kinds[car].length_m"
+        if row in missing_rows:
             continue
-        if not all(have):  # a row of a table that some runs lack: once, not key by key
-            whole_rows[row] = None
-            yield Difference(row, tuple("there" if has else None for has in have))
+        have_row = [_has_key_starting(run, row) for run in runs]
+        if row and not all(have_row):
+            missing_rows.add(row)
+            yield Difference(row, tuple("present" if has_row else None for has_row in have_row))
             continue
-        if any(other.startswith((f"{key}.", f"{key}[")) for run in runs for other in run.settings):
-            continue  # an empty table here, which is told by what another run has in it
+        if any(_has_key_starting(run, (f"{key}.", f"{key}[")) for run in runs):
+            continue  # an empty table here; its rows in other runs are reported
         values = tuple(run.settings.get(key) for run in runs)
         if any(value != values[0] for value in values):
             yield Difference(key, values)
     for name in dict.fromkeys(name for run in runs for name in run.files):
-        digests = tuple(run.files.get(name) for run in runs)
-        if len({digest for digest in digests if digest is not None}) > 1:
+        digests = [run.files.get(name) for run in runs]
+        if len(set(digests) - {None}) > 1:
             yield Difference(f"content of {name}", tuple(digest and digest[:8] for digest in digests))
 
 
+def _has_key_starting(run: ComparedRun, prefix: str | tuple[str, ...]) -> bool:
+    return any(key.startswith(prefix) for key in run.settings)
+
+
 def _notes(a: ComparedRun, b: ComparedRun) -> Iterator[str]:
-    """What a reader has to know before comparing the numbers of two runs."""
+    """Yield what a reader must know before comparing the numbers of two runs."""
+    pair = f"{a.label} and {b.label}"
     shared = [site for site in a.sites if site in b.sites]
     if not shared:
-        yield f"{a.label} and {b.label} share no site: their rankings cannot be held against each other"
+        yield f"{pair} have no site in common, so their rankings cannot be compared"
         return
     moved = [site for site in shared if a.sites[site].pose != b.sites[site].pose]
     if moved:
-        names = ", ".join(moved[:4]) + (f" and {len(moved) - 4} more" if len(moved) > 4 else "")
+        names = ", ".join(moved[:4])
+        if len(moved) > 4:
+            names += f" and {len(moved) - 4} more"
         count = "1 site has" if len(moved) == 1 else f"{len(moved)} sites have"
-        yield f"{count} the same name in {a.label} and {b.label} but another place, angle or sensor: {names}"
-    keys = ["roi.center_m", "roi.size_m", "roi.voxel_m", "score.gamma"]
-    other = [key for key in keys if a.settings.get(key) != b.settings.get(key)]
+        yield f"{count} the same name in {pair} but another position, angle or sensor: {names}"
     if a.rank_by != b.rank_by:
-        yield f"{a.label} ranks by {a.rank_by}, {b.label} by {b.rank_by}: compare ranks alone"
-    elif other and a.rank_by == "egvs":
-        yield f"{a.label} and {b.label} differ in {' and '.join(other)}: compare ranks and shares, not bits"
+        yield f"{a.label} ranks by {a.rank_by}, {b.label} by {b.rank_by}: compare ranks only"
+        return
+    keys = ("roi.center_m", "roi.size_m", "roi.voxel_m", "score.gamma")
+    differing = [key for key in keys if a.settings.get(key) != b.settings.get(key)]
+    if differing and a.rank_by == "egvs":
+        yield f"{pair} differ in {' and '.join(differing)}: compare ranks and shares, not bits"

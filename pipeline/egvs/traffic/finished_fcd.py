@@ -1,27 +1,18 @@
-r"""Finished FCD files: vehicle sizes, metadata, frames.
+r"""Finished FCD files: their metadata, the sizes of their vehicles, and their frames.
 
-What a file of floating car data may say of itself, so that it need not be guessed from its rows.
+**Metadata.** Rows alone do not tell whether a time without any was recorded. A Parquet file may declare this under the
+metadata key ``egvs``, as one JSON object: frame k is at k times ``period_ms``, ``frames`` is their number, with or
+without vehicles, and ``types`` are the sizes of vehicles. Its positions are in the world frame. Its columns are SUMO's.
 
-Rows alone do not tell whether a time without any was watched. A Parquet file may say it, as one JSON object under the
-metadata key ``egvs``: that frame k is at k times ``period_ms`` on its clock, and how many there are, with vehicles or
-without; how large the vehicles of each type are. Its positions are metres of the world frame then. The file's columns
-stay those of SUMO, so that whatever reads SUMO's Parquet reads it.
+**Sizes.** FCD files name vehicle types, but not their sizes. In order of precedence: kinds that the scenario names;
+``<vType>``\ s of the user's SUMO files (``traffic.vtypes``), where SUMO adds what they leave to its defaults; SUMO's
+default types; the metadata of the file; the scenario's default kinds. Metres.
 
-Finds how large the vehicles of a finished FCD file are, which itself names their types alone.
-
-Steps: read the ``<vType>``\ s of the user's SUMO files (``traffic.vtypes``); ask SUMO for what they leave to its
-defaults, which follow from the vClass; lay the scenario's own kinds over them; name every type that is still missing.
-What the file itself states (:mod:`egvs.traffic.finished_fcd`) counts where neither says otherwise. Metres.
-
-Looks a finished file of floating car data through before its rows are taken. Times are whole milliseconds.
-
-A file that states its frames (:mod:`egvs.traffic.finished_fcd`) need not be looked through: time steps without
-rows are frames without vehicles then.
+**Frames.** A file without metadata is read once to find its time steps and types. Times are whole milliseconds.
 """
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -34,7 +25,7 @@ import numpy as np
 import pyarrow.compute as pc
 from pydantic import Field, ValidationError
 
-from egvs.artefacts.traffic_frames import MAX_BOX_M, MIN_BOX_M
+from egvs.artefacts.frame_boxes import MAX_BOX_M, MIN_BOX_M
 from egvs.core import reading
 from egvs.core.errors import InputError
 from egvs.core.files import temporary_folder
@@ -43,15 +34,14 @@ from egvs.scenario.fields import Name, Positive, StrictModel
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import VehicleKind
 from egvs.traffic import fcd, sumo, sumo_folder
-from egvs.traffic.fcd import FrameWindow, check_span
 from egvs.traffic.vehicle_boxes import VehicleSize
 
 _MARKER_KEY = "period_ms"
-"""A key that no other file of this program has there."""
+"""Only FCD files have this key in their metadata."""
 
 
 class DeclaredSize(StrictModel):
-    """A type of vehicles."""
+    """Size and vClass of a vehicle type."""
 
     length_m: Positive
     width_m: Positive
@@ -60,7 +50,7 @@ class DeclaredSize(StrictModel):
 
 
 class FcdMetadata(StrictModel):
-    """What a file says of itself."""
+    """Metadata of an FCD file: period and number of its frames, and sizes of its vehicle types."""
 
     period_ms: int = Field(ge=1)
     frames: int = Field(ge=1, le=2**32 - 1)
@@ -68,47 +58,42 @@ class FcdMetadata(StrictModel):
 
     @property
     def sizes(self) -> dict[str, VehicleSize]:
-        """The types' sizes."""
+        """Size of each vehicle type."""
         return {name: VehicleSize(t.length_m, t.width_m, t.height_m, t.vclass) for name, t in self.types.items()}
 
     @classmethod
     def for_recording(cls, period_ms: int, frames: int, sizes: dict[str, VehicleSize]) -> FcdMetadata:
-        """For a file that is to be written."""
-        return cls(
-            period_ms=period_ms,
-            frames=frames,
-            types={name: DeclaredSize(**vars(size)) for name, size in sorted(sizes.items())},
-        )
+        """Return the metadata of a file to be written."""
+        types = {name: DeclaredSize(**vars(size)) for name, size in sorted(sizes.items())}
+        return cls(period_ms=period_ms, frames=frames, types=types)
 
 
 def read_fcd_metadata(path: Path) -> FcdMetadata | None:
-    """What a finished file says of itself; None where it says nothing.
-
-    InputError where what it says makes no sense.
-    """
-    if not path.is_file() or (raw := fcd.fcd_metadata(path)) is None:
+    """Read the metadata of a finished file, if any; InputError if it is invalid."""
+    raw = fcd.fcd_metadata(path) if path.is_file() else None
+    if raw is None:
         return None
-    right = "an unaltered file; make it again"
+    hint = "Use an unaltered file; create it again."
     try:
         values: Any = reading.parse_json(raw)
     except (ValueError, RecursionError) as error:
-        raise InputError(path, f"its metadata is no JSON ({error})", right) from None
+        raise InputError(path, f"its metadata is not valid JSON ({error})", hint) from None
     if not isinstance(values, dict) or _MARKER_KEY not in values:
         return None
     try:
-        return FcdMetadata.of({key: value for key, value in values.items() if key != "schema"})
+        return FcdMetadata.from_dict({key: value for key, value in values.items() if key != "schema"})
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(map(str, first["loc"]))
-        raise InputError(path, f"its metadata says {key} = {str(first['input'])[:80]}", right) from None
+        raise InputError(path, f"invalid metadata: {key} = {str(first['input'])[:80]}", hint) from None
 
 
-_SIZES = ("length", "width", "height")
+_SIZE_ATTRIBUTES = ("length", "width", "height")
 _NUMBER = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
-"""As SUMO reads it, which knows no digits but these, and no underscores."""
+"""A number as SUMO reads it: ASCII digits, without underscores."""
 
-_SUMO_DEFAULT_TYPES = frozenset(f"DEFAULT_{what}TYPE" for what in ("VEH", "TAXI", "BIKE", "RAIL", "PED", "CONTAINER"))
-"""Types that SUMO has without being told."""
+_DEFAULT_TYPES = frozenset(f"DEFAULT_{name}TYPE" for name in ("VEH", "TAXI", "BIKE", "RAIL", "PED", "CONTAINER"))
+"""Types that SUMO always has."""
 
 _NETWORK = """\
 <net version="1.20">
@@ -118,114 +103,163 @@ _NETWORK = """\
     <junction id="b" type="dead_end" x="9" y="0" incLanes="e_0" intLanes="" shape="9,0"/>
 </net>
 """
-"""The least that SUMO starts with."""
+"""A minimal network to start SUMO with."""
 
 
 def size_files(scenario: Scenario) -> list[Path]:
-    """The files that the scenario names for sizes."""
+    """Return the files of ``traffic.vtypes``."""
     return [scenario.find(name, "traffic.vtypes") for name in scenario.traffic.vtypes]
 
 
 def kind_sizes(kinds: Collection[VehicleKind]) -> dict[str, VehicleSize]:
-    """Sizes of the fleet's kinds."""
+    """Return the sizes of kinds of the fleet."""
     return {k.name: VehicleSize(k.length_m, k.width_m, k.height_m, k.vclass) for k in kinds}
 
 
 def known_sizes(scenario: Scenario) -> dict[str, VehicleSize]:
-    """The sizes that need no asking of SUMO: of the scenario's kinds, and those that its finished file states."""
+    """Return the sizes that are known without starting SUMO: from the scenario, and the metadata of a finished file."""
     traffic = scenario.traffic
-    itself = None if traffic.fcd is None else read_fcd_metadata(scenario.find(traffic.fcd, "traffic.fcd"))
-    return kind_sizes(traffic.kinds) if itself is None else itself.sizes | kind_sizes(traffic.named_kinds)
+    metadata = None if traffic.fcd is None else read_fcd_metadata(scenario.find(traffic.fcd, "traffic.fcd"))
+    return kind_sizes(traffic.kinds) if metadata is None else metadata.sizes | kind_sizes(traffic.named_kinds)
 
 
 def sizes_of_types(
     scenario: Scenario, types: Collection[str], declared: Mapping[str, VehicleSize]
 ) -> dict[str, VehicleSize]:
-    """The sizes of the vehicles of a finished file, which are of these ``types``; ``declared`` are those that it
-    states.
+    """Find the sizes of the vehicles of a finished file.
 
-    InputError naming all types without a known size, or what is wrong with a file of vTypes.
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    types
+        Vehicle types of the file.
+    declared
+        Sizes in its metadata.
+
+    Returns
+    -------
+    dict
+        Size of each type; may have further types.
+
+    Raises
+    ------
+    InputError
+        When a type has no known size, or a file of vTypes is invalid.
     """
-    traffic, vtypes = scenario.traffic, check_types(scenario, types, declared)
-    sizes = kind_sizes(traffic.kinds) | dict(declared) | kind_sizes(traffic.named_kinds)
+    vtypes = check_types(scenario, types, declared)
+    named = kind_sizes(scenario.traffic.named_kinds)
+    sizes = kind_sizes(scenario.traffic.kinds) | dict(declared) | named
     if vtypes or any(name not in sizes for name in types):
         try:
-            sizes |= _query_sizes(vtypes) | kind_sizes(traffic.named_kinds)
+            sizes |= _query_sizes(vtypes) | named
         except sumo.SumoInputError as error:
-            place = ", ".join(map(str, size_files(scenario))) or sumo_folder.traffic_key(scenario)
-            raise InputError(place, f"SUMO does not take its types: {error}", "types that SUMO reads") from None
+            where = ", ".join(map(str, size_files(scenario))) or sumo_folder.traffic_key(scenario)
+            hint = "Use types that SUMO can read."
+            raise InputError(where, f"SUMO rejects the vehicle types: {error}", hint) from None
     return sizes
 
 
 def check_types(scenario: Scenario, types: Collection[str], declared: Mapping[str, VehicleSize]) -> list[Element]:
-    r"""The ``<vType>``\ s of the scenario's files.
+    r"""Check that all types of a finished file have a size.
 
-    InputError naming all ``types`` that neither these nor the scenario's kinds give a size, and that are not the
-    file's ``declared``; or what is wrong with a file.
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    types
+        Vehicle types of the file.
+    declared
+        Sizes in its metadata.
+
+    Returns
+    -------
+    list of Element
+        The ``<vType>``\ s of the scenario's files.
+
+    Raises
+    ------
+    InputError
+        Names all types without a size, or an invalid file of vTypes.
     """
-    vtypes = list(_vtypes(size_files(scenario)))
+    vtypes = list(_read_vtypes(size_files(scenario)))
     known = {kind.name for kind in scenario.traffic.kinds} | {vtype.attrib["id"] for vtype in vtypes} | set(declared)
-    if missing := sorted(name for name in set(types) - known if name not in _SUMO_DEFAULT_TYPES):
-        each, have = ("each", "have") if len(missing) > 1 else ("that", "has")
-        raise InputError(
-            f"{sumo_folder.traffic_key(scenario)}.kinds",
-            f"vehicle type{'s' * (len(missing) > 1)} {', '.join(map(repr, missing))} of {scenario.traffic.fcd} {have}"
-            " no known size",
-            f"a kind of {each} name with length_m, width_m and height_m, or the SUMO file with their <vType> in vtypes"
-            f" (known: {', '.join(sorted(known))})",
+    missing = sorted(set(types) - known - _DEFAULT_TYPES)
+    if missing:
+        names = ", ".join(map(repr, missing))
+        problem = f"the size of vehicle types of {scenario.traffic.fcd} is unknown: {names}"
+        hint = (
+            "Add a kind of each name with length_m, width_m and height_m, or the SUMO file with their <vType> to vtypes"
+            f" (known: {', '.join(sorted(known))})."
         )
+        raise InputError(f"{sumo_folder.traffic_key(scenario)}.kinds", problem, hint)
     return vtypes
 
 
-def _vtypes(paths: Collection[Path]) -> Iterator[Element]:
-    """Identifier, vClass and sizes of every ``<vType>``, wherever it stands in a file; InputError for a wrong one."""
-    seen: dict[str, Path] = {}
+def _read_vtypes(paths: Collection[Path]) -> Iterator[Element]:
+    """Yield id, vClass and sizes of each ``<vType>``, at any depth of a file."""
+    names: set[str] = set()
     for path in paths:
-        before = len(seen)
+        has_type = False
         for child in xml.iter_elements(path, ""):
             for vtype in child.iter("vType"):
+                has_type = True
                 name = vtype.get("id", "")
-                if not name or name in seen:
-                    found = f"a second <vType> {name!r}" if name else "a <vType> without id"
-                    raise InputError(path, found, "each <vType> once, with an id")
-                seen[name] = path
-                yield _checked_type(vtype, f"{path}: vType {name}")
-        if len(seen) == before:
-            raise InputError(path, "has no <vType>", "a SUMO file with <vType id=... vClass=... length=.../>")
+                if not name:
+                    raise InputError(path, "a <vType> has no id", "Add one.")
+                if name in names:
+                    raise InputError(path, f"a second <vType> {name!r}", "Remove one of them.")
+                names.add(name)
+                yield _checked_vtype(vtype, f"{path}: vType {name}")
+        if not has_type:
+            hint = "Use a SUMO file with <vType id=... vClass=... length=.../>."
+            raise InputError(path, "the file has no <vType>", hint)
 
 
-def _checked_type(vtype: Element, where: str) -> Element:
-    kept = Element("vType", {key: vtype.attrib[key] for key in ("id", "vClass", *_SIZES) if key in vtype.attrib})
-    if (vclass := kept.get("vClass", "passenger")) not in sumo.vehicle_classes():
-        raise InputError(f"{where}: vClass", repr(vclass), "a vClass of SUMO, e.g. passenger, truck, bus or bicycle")
-    for key in _SIZES:
-        text = kept.get(key, "1")
-        size_m = float(text) if _NUMBER.fullmatch(text) else math.nan
-        if not MIN_BOX_M <= size_m <= MAX_BOX_M:
-            right = f"a length of at least {MIN_BOX_M} m and at most {MAX_BOX_M:g} m"
-            raise InputError(f"{where}: {key}", repr(text[:80]), right)
-    return kept
+def _checked_vtype(vtype: Element, where: str) -> Element:
+    """Return a ``<vType>`` with id, vClass and sizes only; InputError if one is invalid."""
+    keys = [key for key in ("id", "vClass", *_SIZE_ATTRIBUTES) if key in vtype.attrib]
+    checked = Element("vType", {key: vtype.attrib[key] for key in keys})
+    vclass = checked.get("vClass", "passenger")
+    if vclass not in sumo.vehicle_classes():
+        hint = "Use a vClass of SUMO, e.g. passenger, truck, bus or bicycle."
+        raise InputError(f"{where}: vClass", f"unknown vClass {vclass!r}", hint)
+    for key in _SIZE_ATTRIBUTES:
+        text = checked.get(key, "1")
+        if not _NUMBER.fullmatch(text) or not MIN_BOX_M <= float(text) <= MAX_BOX_M:
+            hint = f"Use at least {MIN_BOX_M} m and at most {MAX_BOX_M:g} m."
+            raise InputError(f"{where}: {key}", f"expected a length, got {text[:80]!r}", hint)
+    return checked
 
 
 def _query_sizes(vtypes: Collection[Element]) -> dict[str, VehicleSize]:
-    """The sizes that SUMO gives these types, and its own ones."""
+    """Query the sizes of some types, and of SUMO's default types, from SUMO."""
     document = Element("additional")
     for vtype in vtypes:
         SubElement(document, vtype.tag, vtype.attrib)
     with temporary_folder() as folder:
-        (folder / "least.net.xml").write_text(_NETWORK, encoding="utf-8")
+        (folder / "minimal.net.xml").write_text(_NETWORK, encoding="utf-8")
         (folder / "types.add.xml").write_bytes(tostring(document, encoding="utf-8"))
-        named = ["-n", "least.net.xml", "-a", "types.add.xml", "--route-steps", "0"]
-        with sumo.serve_traci(named, folder) as connection:
-            return {name: sumo.query_size(connection, name) for name in connection.vehicletype.getIDList()}
+        return sumo.query_sizes(["-n", "minimal.net.xml", "-a", "types.add.xml"], folder)
 
 
 @dataclass(frozen=True)
 class FcdSurvey:
-    """What a finished file holds: the time from its first row to its last, its time steps, and their greatest common
-    divisor; the types of its vehicles; what it states itself, if it does."""
+    """Content of a finished file.
 
-    lasts_ms: int
+    Attributes
+    ----------
+    duration_ms
+        Time from the first row to the last.
+    time_steps, step_ms
+        Number of distinct times, and greatest common divisor of the steps between them.
+    types
+        Vehicle types.
+    metadata
+        Metadata, if the file has any.
+    """
+
+    duration_ms: int
     time_steps: int
     step_ms: int
     types: frozenset[str]
@@ -233,20 +267,33 @@ class FcdSurvey:
 
     @property
     def sizes(self) -> dict[str, VehicleSize]:
-        """The sizes that the file itself states."""
+        """Sizes in the metadata."""
         return {} if self.metadata is None else self.metadata.sizes
 
 
 def survey_fcd(path: Path, until_ms: int | None = None) -> FcdSurvey:
-    """Look a finished file through, to ``until_ms`` after its first row or to its end.
+    """Read a finished file to find its time steps and vehicle types; with metadata, only these are read.
 
-    InputError as :func:`egvs.traffic.fcd.read_fcd`, and when it holds no vehicle.
+    Parameters
+    ----------
+    path
+        The file.
+    until_ms
+        Stop this long after the first row; None for the complete file.
+
+    Raises
+    ------
+    InputError
+        When the file has no vehicle, or :func:`egvs.traffic.fcd.read_fcd` rejects it.
     """
-    if (itself := read_fcd_metadata(path)) is not None:
-        lasts_ms = (itself.frames - 1) * itself.period_ms
-        return FcdSurvey(lasts_ms, itself.frames, itself.period_ms, frozenset(itself.types), itself)
-    first_ms, last_ms, types = None, 0, set[str]()
-    time_steps, step_ms = 1, 0
+    metadata = read_fcd_metadata(path)
+    if metadata is not None:
+        duration_ms = (metadata.frames - 1) * metadata.period_ms
+        return FcdSurvey(duration_ms, metadata.frames, metadata.period_ms, frozenset(metadata.types), metadata)
+    first_ms = None
+    last_ms = step_ms = 0
+    time_steps = 1
+    types: set[str] = set()
     for table in fcd.read_fcd(path):
         time_ms = table["time_ms"].to_numpy()
         if first_ms is None:
@@ -254,39 +301,43 @@ def survey_fcd(path: Path, until_ms: int | None = None) -> FcdSurvey:
         steps = np.diff(time_ms, prepend=last_ms)
         time_steps += int(np.count_nonzero(steps))
         step_ms = int(np.gcd.reduce(steps, initial=step_ms))
+        last_ms = int(time_ms[-1])
         if until_ms is not None:
             table = table.slice(0, int(np.searchsorted(time_ms, first_ms + until_ms, side="right")))
         types.update(pc.unique(table["type"]).to_pylist())
-        last_ms = int(time_ms[-1])
         if until_ms is not None and last_ms > first_ms + until_ms:
             break
     if first_ms is None:
-        raise InputError(path, "holds no vehicle", fcd.EXPECTED_FCD)
+        raise InputError(path, "the file has no vehicle", fcd.EXPECTED_FCD)
     return FcdSurvey(last_ms - first_ms, time_steps, step_ms, frozenset(types))
 
 
-def fcd_window(scenario: Scenario) -> tuple[FrameWindow, FcdSurvey]:
-    """Which rows of a scenario's finished file are frames, and what the file holds as far as they reach.
+def fcd_window(scenario: Scenario) -> tuple[fcd.FrameWindow, FcdSurvey]:
+    """Find the frames in the finished file of a scenario, and its content up to the last one.
 
-    InputError when the file does not hold these frames, or is no sound file.
+    Raises
+    ------
+    InputError
+        When the file has too few frames, or is invalid.
     """
-    traffic, place = scenario.traffic, sumo_folder.traffic_key(scenario)
+    traffic = scenario.traffic
+    where = sumo_folder.traffic_key(scenario)
     assert traffic.fcd is not None
     path = scenario.find(traffic.fcd, "traffic.fcd")
-    period_ms = max(1, sumo_folder.to_milliseconds(traffic.frame_period_s, f"{place}.frame_period_s"))
-    skip_ms = sumo_folder.to_milliseconds(traffic.warmup_s + (traffic.begin_s or 0.0), f"{place}.warmup_s")
+    period_ms = max(1, sumo_folder.to_milliseconds(traffic.frame_period_s, f"{where}.frame_period_s"))
+    skip_ms = sumo_folder.to_milliseconds(traffic.warmup_s + (traffic.begin_s or 0.0), f"{where}.warmup_s")
     until_ms = None if traffic.frames is None else skip_ms + (traffic.frames - 1) * period_ms
-    found = _cached_survey(path, path.stat().st_mtime_ns, until_ms)
-    frames = traffic.frames or (found.lasts_ms - skip_ms) // period_ms + 1
+    survey = _cached_survey(path, path.stat().st_mtime_ns, until_ms)
+    frames = traffic.frames or (survey.duration_ms - skip_ms) // period_ms + 1
     if frames < 1:
-        lasts = f"{path.name} lasts {found.lasts_ms / 1000:g} s"
-        raise InputError(f"{place}.warmup_s = {traffic.warmup_s:g}", lasts, "a shorter warm-up")
-    if found.metadata is None:
-        wanted = FrameWindow(frames, period_ms, skip_ms=skip_ms)
-    else:
-        wanted = FrameWindow(frames, period_ms, first_ms=skip_ms, skip_ms=skip_ms, complete=True)
-    check_span(wanted, found.lasts_ms - skip_ms, found.step_ms, found.time_steps, place, str(traffic.fcd))
-    return wanted, found
+        problem = f"the duration of {path.name} is {survey.duration_ms / 1000:g} s"
+        raise InputError(f"{where}.warmup_s = {traffic.warmup_s:g}", problem, "Use a shorter warm-up.")
+    is_complete = survey.metadata is not None
+    window = fcd.FrameWindow(frames, period_ms, skip_ms if is_complete else None, skip_ms, is_complete)
+    fcd.check_span(
+        window, survey.duration_ms - skip_ms, survey.step_ms, survey.time_steps, where, file=str(traffic.fcd)
+    )
+    return window, survey
 
 
 @lru_cache(maxsize=4)
@@ -295,5 +346,5 @@ def _cached_survey(path: Path, _modified_ns: int, until_ms: int | None) -> FcdSu
 
 
 def recorded_frames(scenario: Scenario) -> int:
-    """Frames that a scenario records: as it says, or all of a finished file."""
+    """Return the number of frames that a scenario records: ``traffic.frames``, or all of a finished file."""
     return fcd_window(scenario)[0].count if scenario.traffic.frames is None else scenario.traffic.frames

@@ -1,13 +1,12 @@
-"""Reads SUMO networks: roads, lanes, connections, junctions, signals, sidewalks.
+"""Read SUMO networks: roads, lanes, connections, junctions, signals, sidewalks.
 
-Steps of :func:`read_net_xml`: go through a ``.net.xml`` (gzipped or not) once, child by child; check what every
-reader needs;
-keep the text of shapes, which become arrays only when somebody asks for them. World frame, metres, seconds.
+:func:`read_net_xml` parses a ``.net.xml`` (gzipped or not) once, element by element, and checks it. Shapes are kept as
+text and parsed when they are used. World frame, metres, seconds.
 
-The graph of a vClass has an edge's successors as SUMO's own router sees them: a connection counts when the class may
-use the lane that it leaves, the lane that it reaches, and the connection itself.
+:meth:`Network.links` follows SUMO's router: a vClass may use a connection if it may use the lane that the connection
+leaves, the lane that it reaches, and the connection itself.
 
-sumolib's own reader is not used: it takes any XML, entities included, and a damaged file ends in a traceback.
+sumolib's reader is not used: it accepts any XML, entities included, and a damaged file ends in a traceback.
 """
 
 from __future__ import annotations
@@ -28,32 +27,33 @@ from egvs.formats import xml
 from egvs.scenario.fields import parse_coordinate_m
 
 LANE_WIDTH_M, DEFAULT_SPEED_M_S = 3.2, 13.89
-"""A lane's width and speed limit where the network names none: SUMO's defaults."""
+"""SUMO's defaults for lanes without a width or a speed limit."""
 
 _TURNAROUNDS = ("t", "T")
 _SHAPE_WITH_HEIGHT = re.compile(rb"(?:^|\s)[^,\s]+,[^,\s]+,[^,\s]+(?:\s|$)")
-"""A point with a third coordinate. (SUMO writes none where a height is 0.)"""
+"""A point with a third coordinate, which SUMO omits where it is 0."""
 
 _PEDESTRIAN = "pedestrian"
 _OSM_SUFFIXES = (".osm", ".osm.xml", ".osm.pbf")
-_EXPECTED = "a file that netconvert wrote"
+_HINT = "Use a network that netconvert wrote."
 
 
 @dataclass(frozen=True)
 class Permission:
-    """Which vClasses a lane or connection admits, as its attributes ``allow`` and ``disallow`` say."""
+    """The vClasses that may use a lane or connection; ``allow`` is None if it does not restrict them."""
 
     allow: frozenset[str] | None
     disallow: frozenset[str]
 
     @classmethod
-    def of(cls, attributes: Mapping[str, str]) -> Permission:
-        """From those of a ``<lane>`` or a ``<connection>``."""
-        allow, disallow = attributes.get("allow", ""), attributes.get("disallow", "")
-        return cls(None if allow in ("", "all") else frozenset(allow.split()), frozenset(disallow.split()))
+    def from_attributes(cls, attributes: Mapping[str, str]) -> Permission:
+        """Parse ``allow`` and ``disallow`` of a ``<lane>`` or a ``<connection>``."""
+        allow = attributes.get("allow", "")
+        disallow = frozenset(attributes.get("disallow", "").split())
+        return cls(None if allow in ("", "all") else frozenset(allow.split()), disallow)
 
     def admits(self, vclass: str) -> bool:
-        """Whether a vehicle of ``vclass`` may go there."""
+        """Whether vehicles of a vClass may use it."""
         if self.allow is not None:
             return vclass in self.allow
         return vclass not in self.disallow and "all" not in self.disallow
@@ -61,19 +61,19 @@ class Permission:
 
 @dataclass(frozen=True)
 class Shape:
-    """A line or outline as the file writes it ("x,y x,y,z ..."); ``where`` is what messages point to."""
+    """A line or an outline, as text of the file ("x,y x,y,z ..."); ``where`` names it in messages."""
 
     text: str
     where: str
 
     @cached_property
     def shape_m(self) -> NDArray[np.float64]:
-        """(n, 3) float64, metres; z is 0 where the file names none. InputError when the text holds no coordinates."""
+        """Points in metres, shape (n, 3), float64; z is 0 where the file has none."""
         try:
-            points = [[parse_coordinate_m(v) for v in point.split(",")] for point in self.text.split()]
-            return np.array([[*point, 0.0][:3] for point in points], dtype=np.float64).reshape(-1, 3)
+            points = [[*map(parse_coordinate_m, point.split(",")), 0.0][:3] for point in self.text.split()]
+            return np.array(points, dtype=np.float64).reshape(-1, 3)
         except ValueError as error:
-            raise InputError(self.where, f"a shape holds no coordinates ({error})", _EXPECTED) from None
+            raise InputError(self.where, f"invalid coordinates in a shape ({error})", _HINT) from None
 
     @property
     def has_heights(self) -> bool:
@@ -83,10 +83,7 @@ class Shape:
 
 @dataclass(frozen=True)
 class Lane(Shape):
-    """A lane: its middle line, or a walking area's outline.
-
-    ``width_m`` is None where the file names none; ``length_m`` is as SUMO counts.
-    """
+    """A lane, with its centre line, or a walking area, with its outline; ``width_m`` is None for the default."""
 
     width_m: float | None
     length_m: float
@@ -95,18 +92,18 @@ class Lane(Shape):
 
     @property
     def is_pavement(self) -> bool:
-        """Whether it is for people on foot alone."""
+        """Whether only pedestrians may use it."""
         return self.permission.allow == frozenset({_PEDESTRIAN})
 
     @property
     def is_sidewalk(self) -> bool:
-        """Whether people, but no cars, may use it."""
+        """Whether pedestrians may use it, and cars may not."""
         return self.permission.admits(_PEDESTRIAN) and not self.permission.admits("passenger")
 
 
 @dataclass(frozen=True)
 class Edge:
-    """A road in one direction; or, where ``function`` says so, a piece of a junction, a crossing, a walking area."""
+    """A road in one direction, or the part of a junction that ``function`` names (e.g. ``"crossing"``)."""
 
     id: str
     function: str
@@ -115,32 +112,43 @@ class Edge:
     name: str
     lanes: tuple[Lane, ...]
     type: str = ""
-    """As the map has it ("highway.primary"); empty where the network names none."""
+    """Type of the road, e.g. ``"highway.primary"``; may be empty."""
 
     @cached_property
     def start_m(self) -> tuple[float, float]:
-        """Where its first lane starts."""
+        """Start of the first lane."""
         return _point(self.lanes[0].text.split()[0])
 
     @cached_property
     def end_m(self) -> tuple[float, float]:
-        """Where its first lane ends."""
+        """End of the first lane."""
         return _point(self.lanes[0].text.split()[-1])
 
     @property
     def seconds(self) -> float:
-        """How long its fastest lane takes at the speed limit."""
+        """Travel time on the fastest lane, at the speed limit."""
         return self.lanes[0].length_m / max(lane.speed_m_s for lane in self.lanes)
 
     def lanes_for(self, vclass: str) -> int:
-        """How many of its lanes ``vclass`` may use."""
+        """Return the number of lanes that a vClass may use."""
         return sum(lane.permission.admits(vclass) for lane in self.lanes)
 
 
 @dataclass(frozen=True)
 class Connection:
-    """A way from one lane to another; ``source`` and ``target`` are positions in ``Network.edges``, ``direction`` is
-    SUMO's ("s", "l", "R" ...), and ``via`` the first lane inside the junction; both empty where none is named."""
+    """A connection from one lane to another.
+
+    Attributes
+    ----------
+    source, target
+        Positions of the edges in ``Network.edges``.
+    source_lane, target_lane
+        Index of the lane on its edge.
+    direction
+        SUMO's code ("s", "l", "R" ...); may be empty.
+    via
+        First lane inside the junction; may be empty.
+    """
 
     source: int
     source_lane: int
@@ -153,7 +161,7 @@ class Connection:
 
 @dataclass(frozen=True)
 class Junction(Shape):
-    """Where edges meet, with its outline; ``type`` is SUMO's ("traffic_light", "dead_end", "internal", ...)."""
+    """A junction, with its outline; ``type`` is SUMO's ("traffic_light", "dead_end", "internal", ...)."""
 
     id: str
     type: str
@@ -163,7 +171,7 @@ class Junction(Shape):
 
 @dataclass(frozen=True)
 class Location:
-    """How longitude and latitude became x, y: (x, y) = projection(lon, lat) + ``offset_m``."""
+    """Georeference of a network: (x, y) = projection(lon, lat) + ``offset_m``."""
 
     projection: str
     offset_m: tuple[float, float]
@@ -171,7 +179,7 @@ class Location:
 
 @dataclass(frozen=True)
 class Sidewalk:
-    """A road's lane that people walk on. Sidewalks of one ``part`` are joined by walking areas and crossings."""
+    """A sidewalk; walking areas and crossings connect the sidewalks of one ``part``."""
 
     edge: str
     from_node: str
@@ -182,7 +190,7 @@ class Sidewalk:
 
 @dataclass(frozen=True)
 class Walkways:
-    """Where people may walk."""
+    """The sidewalks of a network; numbers of walking areas and crossings."""
 
     sidewalks: tuple[Sidewalk, ...]
     areas: int
@@ -191,16 +199,22 @@ class Walkways:
 
 @dataclass(frozen=True)
 class Network:
-    """A network as its file has it.
+    """A road network.
 
     Attributes
     ----------
     all_edges
-        Those inside junctions and people's too, in the order of the file.
+        All edges, in file order, including those inside junctions, crossings and walking areas.
     connections
-        From road to road.
+        Connections between roads.
+    junctions
+        All junctions, in file order.
     cycle_s
-        The longest time that a signal program takes at most to come round; 0 without signals.
+        Longest cycle of a signal; 0 without signals.
+    location
+        Georeference, if the network has one.
+    lane_links
+        Pairs of lanes that walking areas and crossings connect, in both directions.
     """
 
     all_edges: tuple[Edge, ...]
@@ -209,11 +223,10 @@ class Network:
     cycle_s: float = 0.0
     location: Location | None = None
     lane_links: tuple[tuple[str, str], ...] = ()
-    """Lanes between which a walking area's or a crossing's connection leads, either way."""
 
     @cached_property
     def edges(self) -> tuple[Edge, ...]:
-        """The roads."""
+        """Roads: edges without a function."""
         return tuple(edge for edge in self.all_edges if not edge.function)
 
     @cached_property
@@ -223,153 +236,178 @@ class Network:
 
     @cached_property
     def diagonal_m(self) -> float:
-        """From the south-west to the north-east corner of all roads' ends."""
-        ends = np.array([p for e in self.edges for p in (e.start_m, e.end_m)])
+        """Diagonal of the bounding box of the ends of all roads."""
+        ends = np.array([edge.start_m for edge in self.edges] + [edge.end_m for edge in self.edges])
         return float(np.hypot(*(ends.max(axis=0) - ends.min(axis=0))))
 
     def links(self, vclass: str) -> NDArray[np.int64]:
-        """(n, 3) of source edge, target edge, and 1 for a turnaround, for ``vclass``."""
-        edges = self.edges
-        usable = [
-            (c.source, c.target, int(c.direction in _TURNAROUNDS))
-            for c in self.connections
-            if edges[c.source].lanes[c.source_lane].permission.admits(vclass)
-            and edges[c.target].lanes[c.target_lane].permission.admits(vclass)
-            and c.permission.admits(vclass)
-        ]
+        """Return the connections that a vClass may use, shape (n, 3): source, target, and 1 for a turnaround."""
+        usable = []
+        for connection in self.connections:
+            source_lane = self.edges[connection.source].lanes[connection.source_lane]
+            target_lane = self.edges[connection.target].lanes[connection.target_lane]
+            permissions = (source_lane.permission, target_lane.permission, connection.permission)
+            if all(permission.admits(vclass) for permission in permissions):
+                is_turnaround = connection.direction in _TURNAROUNDS
+                usable.append((connection.source, connection.target, int(is_turnaround)))
         return np.array(usable, dtype=np.int64).reshape(-1, 3)
 
     @cached_property
     def walkways(self) -> Walkways:
-        """The sidewalks, and how they hang together (people walk both ways)."""
-        walked = [
-            (edge, index)
-            for edge in self.edges
-            if (index := next((i for i, lane in enumerate(edge.lanes) if lane.is_sidewalk), None)) is not None
-        ]
-        parts = _connected_parts([f"{edge.id}_{index}" for edge, index in walked], self.lane_links)
-        sidewalks = [
-            Sidewalk(edge.id, edge.from_node, edge.to_node, edge.lanes[index].length_m, part)
-            for (edge, index), part in zip(walked, parts, strict=True)
-        ]
+        """First sidewalk of each edge, grouped into connected parts."""
+        lanes: dict[str, tuple[Edge, Lane]] = {}
+        for edge in self.edges:
+            for index, lane in enumerate(edge.lanes):
+                if lane.is_sidewalk:
+                    lanes[f"{edge.id}_{index}"] = edge, lane
+                    break
+        parts = _connected_parts(list(lanes), self.lane_links)
+        sidewalks = []
+        for (edge, lane), part in zip(lanes.values(), parts, strict=True):
+            sidewalks.append(Sidewalk(edge.id, edge.from_node, edge.to_node, lane.length_m, part))
         functions = [edge.function for edge in self.all_edges]
         return Walkways(tuple(sidewalks), functions.count("walkingarea"), functions.count("crossing"))
 
 
 def read_net_xml(path: Path, name: Path | None = None) -> Network:
-    """Read a network, once for all who ask; messages call it ``name`` where it is a copy of what the user named.
+    """Read a network. The two last read are cached by content.
 
-    InputError when the file is no SUMO network, is damaged, or has no road.
+    Parameters
+    ----------
+    path
+        The file.
+    name
+        Its name in messages, where ``path`` is a copy.
+
+    Raises
+    ------
+    InputError
+        When the file is not a SUMO network, is damaged, or has no road.
     """
     return _read_network_file(_NamedFile(name or path, path), files.hash_file(path))
 
 
 @dataclass(frozen=True)
 class _NamedFile:
-    """A file as messages call it, and where to read it, which does not count when two are compared."""
+    """A file to read and its name in messages; only the name counts in comparisons."""
 
     name: Path
-    copy: Path = field(compare=False)
+    path: Path = field(compare=False)
 
 
 @lru_cache(maxsize=2)
 def _read_network_file(file: _NamedFile, _content: str) -> Network:
-    copy, path = file.copy, file.name
     edges: list[Edge] = []
     connections: list[dict[str, str]] = []
     lane_links: list[tuple[str, str]] = []
     junctions: list[Junction] = []
-    cycle_s, location = 0.0, None
-    for element in xml.iter_elements(copy, "net", path):
+    cycle_s = 0.0
+    location = None
+    for element in xml.iter_elements(file.path, "net", file.name):
         try:
             match element.tag:
                 case "edge":
-                    edges.append(_edge(element, path))
+                    edges.append(_parse_edge(element, file.name))
                 case "connection":
-                    start, end = element.attrib["from"], element.get("to", "")
+                    start = element.attrib["from"]
+                    end = element.get("to", "")
                     if not start.startswith(":"):
                         connections.append(element.attrib)
                     if start.startswith(":") or end.startswith(":"):
-                        start_lane, end_lane = f"{start}_{element.get('fromLane')}", f"{end}_{element.get('toLane')}"
-                        lane_links.append((start_lane, end_lane))
+                        lane_links.append((f"{start}_{element.get('fromLane')}", f"{end}_{element.get('toLane')}"))
                 case "junction":
-                    junctions.append(_junction(element.attrib, path))
+                    junctions.append(_parse_junction(element.attrib, file.name))
                 case "tlLogic":
-                    phases = element.iter("phase")
-                    cycle_s = max(cycle_s, sum(float(p.get("maxDur", p.attrib["duration"])) for p in phases))
+                    durations_s = [float(p.get("maxDur", p.attrib["duration"])) for p in element.iter("phase")]
+                    cycle_s = max(cycle_s, sum(durations_s))
                 case "location":
-                    location = _location(element)
+                    location = _parse_location(element)
         except (KeyError, ValueError, IndexError) as error:
-            what = f"<{element.tag} id={element.get('id', element.get('from', ''))!r}>"
-            raise InputError(path, f"{what} is not as in a SUMO network ({error!r})", _EXPECTED) from None
+            title = f"<{element.tag} id={element.get('id', element.get('from', ''))!r}>"
+            raise InputError(file.name, f"invalid {title} for a SUMO network ({error!r})", _HINT) from None
     roads = [edge for edge in edges if not edge.function]
     if not roads:
-        raise InputError(path, "the network has no road", "a network with at least one edge")
-    ways = tuple(_road_connections(connections, roads, path))
-    return Network(tuple(edges), ways, tuple(junctions), cycle_s, location, tuple(lane_links))
+        raise InputError(file.name, "the network has no road", "Use a network with at least one edge.")
+    road_connections = tuple(_parse_connections(connections, roads, file.name))
+    return Network(tuple(edges), road_connections, tuple(junctions), cycle_s, location, tuple(lane_links))
 
 
 def read_location(path: Path, root: str = "net") -> Location | None:
-    """Where a network (or, by its ``root``, a file that polyconvert wrote) says that it lies on the Earth.
+    """Read the georeference at the head of a file.
 
-    None where it does not. Only the head of the file is read.
+    Parameters
+    ----------
+    path
+        A network, or a file that polyconvert wrote.
+    root
+        Tag of its root element.
+
+    Returns
+    -------
+    Location or None
+        None for a file without georeference.
     """
     for element in xml.iter_elements(path, root):
         if element.tag == "location":
             try:
-                return _location(element)
+                return _parse_location(element)
             except (KeyError, ValueError) as error:
-                raise InputError(path, f"<location> is not as SUMO writes it ({error!r})", _EXPECTED) from None
+                raise InputError(path, f"invalid <location> ({error!r})", _HINT) from None
         if element.tag in ("edge", "poly"):
             return None
     return None
 
 
-def _location(element: Element) -> Location:
-    x, y = map(float, element.attrib["netOffset"].split(",")[:2])  # -1e10 in a network of no road
+def _parse_location(element: Element) -> Location:
+    x, y = map(float, element.attrib["netOffset"].split(",")[:2])  # -1e10 in a network without roads
     return Location(element.get("projParameter", ""), (x, y))
 
 
-def _edge(element: Element, path: Path) -> Edge:
+def _parse_edge(element: Element, path: Path) -> Edge:
     function, start, end, name, kind = (element.get(key, "") for key in ("function", "from", "to", "name", "type"))
-    lanes = tuple(_lane(lane, path) for lane in element.iter("lane"))
+    lanes = tuple(_parse_lane(lane, path) for lane in element.iter("lane"))
     edge = Edge(element.attrib["id"], function, start, end, name, lanes, kind)
     if not function:
         if not start or not end:
             raise KeyError("to" if start else "from")
-        _ = edge.start_m, edge.end_m  # a road has a lane with coordinates
+        _ = edge.start_m, edge.end_m  # raises where a road has no lane, or no coordinates
     return edge
 
 
-def _lane(lane: Element, path: Path) -> Lane:
+def _parse_lane(lane: Element, path: Path) -> Lane:
     width_m = float(lane.attrib["width"]) if "width" in lane.attrib else None
-    length_m, place = float(lane.get("length", 0)), f"{path}: lane {lane.get('id', '')}"
+    length_m = float(lane.get("length", 0))
     speed_m_s = float(lane.get("speed", DEFAULT_SPEED_M_S))
-    return Lane(lane.attrib["shape"], place, width_m, length_m, Permission.of(lane.attrib), speed_m_s)
+    where = f"{path}: lane {lane.get('id', '')}"
+    return Lane(lane.attrib["shape"], where, width_m, length_m, Permission.from_attributes(lane.attrib), speed_m_s)
 
 
-def _junction(junction: dict[str, str], path: Path) -> Junction:
-    name, at_m = junction["id"], (parse_coordinate_m(junction["x"]), parse_coordinate_m(junction["y"]))
+def _parse_junction(junction: dict[str, str], path: Path) -> Junction:
+    name = junction["id"]
+    location_m = parse_coordinate_m(junction["x"]), parse_coordinate_m(junction["y"])
     incoming = tuple(junction.get("incLanes", "").split())
-    shape, place = junction.get("shape", ""), f"{path}: junction {name}"
-    return Junction(shape, place, name, junction.get("type", ""), at_m, incoming)
+    where = f"{path}: junction {name}"
+    return Junction(junction.get("shape", ""), where, name, junction.get("type", ""), location_m, incoming)
 
 
-def _road_connections(connections: Iterable[dict[str, str]], roads: Sequence[Edge], path: Path) -> Iterator[Connection]:
+def _parse_connections(
+    connections: Iterable[dict[str, str]], roads: Sequence[Edge], path: Path
+) -> Iterator[Connection]:
     index = {road.id: i for i, road in enumerate(roads)}
     for connection in connections:
         start = connection["from"]
         try:
-            source, target = (index.get(connection[key]) for key in ("from", "to"))
-            lanes = int(connection["fromLane"]), int(connection["toLane"])
+            source, target = index.get(start), index.get(connection["to"])
+            source_lane, target_lane = int(connection["fromLane"]), int(connection["toLane"])
         except (KeyError, ValueError) as error:
-            raise InputError(path, f"a <connection> from {start!r} is damaged ({error!r})", _EXPECTED) from None
+            raise InputError(path, f"invalid <connection> from {start!r} ({error!r})", _HINT) from None
         if source is None or target is None:
-            continue  # to or from a walking area or a crossing
-        if lanes[0] >= len(roads[source].lanes) or lanes[1] >= len(roads[target].lanes):
-            raise InputError(path, f"a <connection> from {start!r} names a lane that is not there", _EXPECTED)
-        direction, via = connection.get("dir", ""), connection.get("via", "")
-        yield Connection(source, lanes[0], target, lanes[1], direction, Permission.of(connection), via)
+            continue  # from or to a walking area or a crossing
+        if source_lane >= len(roads[source].lanes) or target_lane >= len(roads[target].lanes):
+            raise InputError(path, f"a <connection> from {start!r} names a lane that does not exist", _HINT)
+        permission = Permission.from_attributes(connection)
+        direction = connection.get("dir", "")
+        yield Connection(source, source_lane, target, target_lane, direction, permission, connection.get("via", ""))
 
 
 def _point(text: str) -> tuple[float, float]:
@@ -378,23 +416,28 @@ def _point(text: str) -> tuple[float, float]:
 
 
 def is_osm(path: Path) -> bool:
-    """Whether a network is still a map of OpenStreetMap."""
+    """Whether a network file is an OpenStreetMap map, by its name."""
     return path.name.removesuffix(".gz").endswith(_OSM_SUFFIXES)
 
 
 def may_have_heights(path: Path) -> bool:
-    """Whether any shape has a third coordinate: a quick look, so that a flat network need not be read."""
+    """Whether a SUMO network has a shape with heights, without parsing it; False for OpenStreetMap maps."""
     if is_osm(path) or not path.is_file():
         return False
     return any(_SHAPE_WITH_HEIGHT.search(shape) is not None for shape in xml.scan_attribute_values(path, "shape"))
 
 
 def _connected_parts(lanes: Sequence[str], links: Sequence[tuple[str, str]]) -> list[int]:
-    """For each lane, the number of the part that it belongs to: the same for lanes that hang together."""
+    """Return the number of the connected part of each lane."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    index = {lane: i for i, lane in enumerate(dict.fromkeys([*lanes, *(lane for pair in links for lane in pair)]))}
-    rows, columns = ([index[pair[i]] for pair in links] for i in (0, 1))
+    if not lanes:
+        return []
+    names = [*lanes, *(lane for link in links for lane in link)]
+    index = {name: i for i, name in enumerate(dict.fromkeys(names))}
+    rows = [index[start] for start, _ in links]
+    columns = [index[end] for _, end in links]
     graph = coo_array((np.ones(len(links)), (rows, columns)), shape=(len(index), len(index)))
-    return [int(part) for part in connected_components(graph, directed=False)[1][: len(lanes)]] if lanes else []
+    _, parts = connected_components(graph, directed=False)
+    return [int(part) for part in parts[: len(lanes)]]

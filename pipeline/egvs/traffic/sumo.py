@@ -1,20 +1,10 @@
-"""Find, start and query SUMO (the only module that imports traci and sumolib).
+"""Find, start and query SUMO.
 
-Looks at the ends of files that a program of SUMO wrote: on a full disk it ends without a word or an error.
+The only module that locates SUMO's programs and imports its Python tools (sumolib, traci), each inside the function
+that needs it. Programs run as subprocesses in the folder of their files, so that their outputs contain no paths.
 
-Finds, starts and asks SUMO.
-
-The only module that locates SUMO's programs or imports its Python tools (sumolib, traci), each inside the function that
-needs it. Programs run as subprocesses in the folder that holds their files, so that no path gets into what they write.
-
-What fails here is told with SUMO's own words and its exit code; a missing system library is named together with the
-package that has it.
-
-Records the rows of floating car data from a SUMO that is already running, over TraCI.
-
-Steps: check that its clock fits the scenario's; subscribe to everybody on the road; step it through the recording, and
-give the rows of each frame as SUMO's own FCD file would have them. World frame and units as in SUMO; times are whole
-milliseconds.
+Errors quote SUMO's own message and exit code. For a missing system library, they name the package that has it. Outputs
+are checked for completeness, because SUMO ends without an error on a full disk.
 """
 
 from __future__ import annotations
@@ -42,75 +32,45 @@ from egvs.core.runtime import sumo_home
 from egvs.traffic import sandbox
 from egvs.traffic.vehicle_boxes import VehicleSize
 
+APT_COMMAND = "apt-get install libatomic1 libx11-6 libxext6 libxrender1 libgl1"
+"""Installs what SUMO's binaries need on a minimal Debian."""
+
+_WATCH_PERIOD_S = 0.1
+_CONNECT_PERIOD_S = 0.02
+_START_TIMEOUT_S = 60.0
+_EXIT_TIMEOUT_S = 10.0
+
+_ANSWER_TIMEOUT_S, _STEP_TIMEOUT_S = 30.0, 600.0
+"""Timeouts for the first answer of a SUMO that was already running, and for each step: a user may pause it."""
+
+_MAX_ERRORS, _MAX_ERROR_LENGTH = 12, 300
 _TAIL_BYTES = 512
 
-
-def check_table_complete(path: Path) -> None:
-    """RunError where a table does not end with a line."""
-    if not last_bytes(path).endswith(b"\n"):
-        raise truncated_file_error(path)
-
-
-def check_xml_complete(path: Path, root: str) -> None:
-    """RunError where the root element of an XML file is not closed."""
-    if re.search(rf"(</{root}>|<{root}[^<>]*/>)\s*\n\Z".encode(), last_bytes(path)) is None:
-        raise truncated_file_error(path)
-
-
-def truncated_file_error(path: Path) -> RunError:
-    """The error for a file that SUMO did not write to its end."""
-    free_mb = shutil.disk_usage(path.parent).free / 1e6
-    return RunError(f"{path}: SUMO did not write it to its end; is the disk full? ({free_mb:,.0f} MB are free there)")
-
-
-def last_bytes(path: Path) -> bytes:
-    """The file's last bytes; none where there is no such file."""
-    if not path.is_file():
-        return b""
-    with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
-        return file.read()
-
-
-APT_COMMAND = "apt-get install libatomic1 libx11-6 libxext6 libxrender1 libgl1"
-"""What SUMO's binaries need on a minimal Debian."""
-
-_POLL_S = 0.1
-_LISTENS_S = 0.02
-_OPENS_WITHIN_S = 60.0
-_ENDS_WITHIN_S = 10.0
-_MAX_ERRORS, _MAX_ERROR_LENGTH = 12, 300
-
 _CRASHES = frozenset({signal.SIGSEGV, signal.SIGABRT, signal.SIGFPE, signal.SIGILL, getattr(signal, "SIGBUS", 0)})
-"""Signals by which a program ends itself."""
+"""Signals of a program that crashed, in contrast to one that was killed."""
 
-_ANSWERS_WITHIN_S, _STEPS_WITHIN_S = 30.0, 600.0
-"""How long somebody else's SUMO may take to answer first, and then each time: it may be paused by hand."""
-
-_NO_TRACI = (struct.error, UnicodeDecodeError)
-"""What reading an answer raises that is none of SUMO's."""
+_PROTOCOL_ERRORS = (struct.error, UnicodeDecodeError)
+"""What traci raises when an answer does not follow its protocol."""
 
 
 class SumoInputError(RunError):
-    """A program of SUMO refused what it was given: it ended by itself, with an error, or crashed."""
+    """A program of SUMO rejected its input: it ended with an error, or crashed."""
 
 
 def sumo_binary(name: str) -> Path:
-    """A program of SUMO in the environment, SUMO_HOME, wheel or PATH; MissingBackendError when it is in none."""
-    import shutil
-
+    """Find a program of SUMO in the environment, SUMO_HOME, the wheel or PATH."""
     import sumolib
 
     with _preserve_proj_data():
         program = shutil.which(sumolib.checkBinary(name))
     if program is None:
-        raise MissingBackendError(f"SUMO's program '{name}' was not found: set SUMO_HOME, or pip install eclipse-sumo")
+        raise MissingBackendError(f"SUMO's program {name!r} was not found. Set SUMO_HOME, or pip install eclipse-sumo")
     return Path(program)
 
 
 @contextmanager
 def _preserve_proj_data() -> Iterator[None]:
-    """Importing SUMO's wheel points this process at its data of projections, which not every library can read."""
+    """Restore the variables that SUMO's wheel sets on import; other libraries may not read its PROJ data."""
     before = {name: os.environ.get(name) for name in ("PROJ_DATA", "PROJ_LIB")}
     try:
         yield
@@ -121,16 +81,18 @@ def _preserve_proj_data() -> Iterator[None]:
 
 
 def sumo_environment() -> dict[str, str]:
-    """What SUMO's programs need: this process' own variables, SUMO_HOME, and where the wheel keeps PROJ's data."""
+    """Return the environment for SUMO's programs: SUMO_HOME, the wheel's PROJ data, and this process's variables."""
     home = sumo_home()
+    defaults = {"SUMO_HOME": str(home)}
     proj = home / "data" / "proj"
-    more = {"PROJ_DATA": str(proj), "PROJ_LIB": str(proj)} if proj.is_dir() else {}
-    return {"SUMO_HOME": str(home), **more, **os.environ}
+    if proj.is_dir():
+        defaults |= {"PROJ_DATA": str(proj), "PROJ_LIB": str(proj)}
+    return {**defaults, **os.environ}
 
 
 @cache
 def sumo_version() -> str:
-    """SUMO's version, e.g. ``"1.28.0"``: the wheel's where its binary is used, else what ``sumo --version`` prints."""
+    """Return SUMO's version, e.g. ``"1.28.0"``: that of the wheel, or what ``sumo --version`` prints."""
     program = sumo_binary("sumo")
     try:
         wheel = metadata.distribution("eclipse-sumo")
@@ -142,22 +104,22 @@ def sumo_version() -> str:
 
 
 def parse_version(text: str) -> str:
-    """The version number in what SUMO says about itself ("Eclipse SUMO sumo 1.28.0", or traci's "SUMO 1.28.0")."""
+    """Find the version in the output of SUMO ("Eclipse SUMO sumo 1.28.0") or of traci ("SUMO 1.28.0")."""
     number = re.search(r"\b[vV]?(\d+[._]\d+[._]\d+\S*)", text)
     if number is None:
-        raise RunError(f"SUMO does not tell its version: {text.strip().splitlines()[:1]}")
+        raise RunError(f"expected a version of SUMO, got {text.strip().splitlines()[:1]}")
     return number.group(1).replace("_", ".")
 
 
 def vehicle_classes() -> frozenset[str]:
-    """The names of all SUMO vClasses."""
+    """Return SUMO's vClasses."""
     from sumolib.net.lane import SUMO_VEHICLE_CLASSES
 
     return frozenset(SUMO_VEHICLE_CLASSES)
 
 
 def traci_constants() -> Any:
-    """The numbers that TraCI calls its variables by."""
+    """Return the module of TraCI's constants."""
     from traci import constants
 
     return constants
@@ -166,21 +128,30 @@ def traci_constants() -> Any:
 def run_program(
     name: str, arguments: Sequence[str], folder: Path, log: Path | None = None, watch: Callable[[], None] | None = None
 ) -> str:
-    """Run a program of SUMO to its end and return what it printed.
+    """Run a program of SUMO to its end. It may write to its folder only.
 
     Parameters
     ----------
     name, arguments
-        The program, e.g. ``"sumo"``, and its flags; file names are relative to ``folder``, where it runs.
+        The program, e.g. ``"sumo"``, and its arguments; file names are relative to ``folder``.
+    folder
+        Its working directory.
     log
-        Where to keep its warnings and errors.
+        File for its warnings and errors.
     watch
-        Called a few times a second while it runs.
+        Called every 0.1 s while it runs.
+
+    Returns
+    -------
+    str
+        Its standard output.
 
     Raises
     ------
-    RefusedError
-        When it ends with an error, or crashes: its own error text and exit code. RunError when it is killed.
+    SumoInputError
+        When it ends with an error, or crashes.
+    RunError
+        When it is killed.
     MissingBackendError
         When it, or a system library that it needs, is not installed.
     """
@@ -188,143 +159,191 @@ def run_program(
 
 
 def run_netconvert(arguments: Sequence[str], folder: Path, name: str) -> None:
-    """Have netconvert make the network ``name`` in a folder; raises what :func:`run_program` does, and RunError where
-    it did
-    not write the network to its end."""
+    """Run netconvert, as :func:`run_program` does, and check that the network is complete.
+
+    Parameters
+    ----------
+    arguments
+        All arguments but the output file.
+    folder
+        Its working directory.
+    name
+        The network to write.
+    """
     run_program("netconvert", [*arguments, "-o", name], folder)
     check_xml_complete(folder / name, "net")
 
 
 def run_tool(name: str, arguments: Sequence[str], folder: Path) -> str:
-    """Run one of SUMO's Python tools, e.g. ``"routeSampler.py"``, to its end and return what it printed; as
-    :func:`run_program`
-    does, it may write in its folder only.
+    """Run one of SUMO's Python tools, as :func:`run_program` does.
 
-    RunError when it ends with an error; MissingBackendError when it is not installed.
+    Parameters
+    ----------
+    name, arguments
+        The tool, e.g. ``"routeSampler.py"``, and its arguments.
+    folder
+        Its working directory.
     """
     tool = sumo_home() / "tools" / name
     if not tool.is_file():
-        raise MissingBackendError(f"SUMO's tool {name} is not in {tool.parent}: pip install eclipse-sumo")
+        raise MissingBackendError(f"SUMO's tool {name} is not in {tool.parent}. Run pip install eclipse-sumo")
     return _run_command(name, [sys.executable, "-B", str(tool), *arguments], folder, Path(os.devnull), None)
 
 
 def _run_command(name: str, command: Sequence[str], folder: Path, log: Path, watch: Callable[[], None] | None) -> str:
-    with log.open("wb") as errors:
-        capture = subprocess.PIPE if str(log) == os.devnull else errors
-        with _start_program(command, folder, subprocess.PIPE, capture) as process:
-            printed, complaint = _wait(process, watch)
+    with log.open("wb") as log_file:
+        has_log = str(log) != os.devnull
+        stderr = log_file if has_log else subprocess.PIPE
+        with _start_program(command, folder, subprocess.PIPE, stderr) as process:
+            output, errors = _wait(process, watch)
     if process.returncode:
-        text = complaint if capture == subprocess.PIPE else log.read_bytes()
-        raise program_error(name, process.returncode, (text or b"").decode("utf-8", "replace"))
-    return printed.decode("utf-8", "replace")
+        text = log.read_bytes() if has_log else errors
+        raise program_error(name, process.returncode, text.decode("utf-8", "replace"))
+    return output.decode("utf-8", "replace")
 
 
 @contextmanager
-def _start_program(
-    command: Sequence[str], folder: Path, printed: Any, complaints: Any
-) -> Iterator[subprocess.Popen[bytes]]:
-    """A program that ends with the block, and with this process. It may write in its folder only."""
+def _start_program(command: Sequence[str], folder: Path, stdout: Any, stderr: Any) -> Iterator[subprocess.Popen[bytes]]:
+    """Start a program that may write to its folder only, and that ends with the block or with this process."""
     launcher = [sys.executable, "-I", "-S", sandbox.__file__, os.curdir, str(os.getpid())]
-    reading, holding = os.pipe()
+    read_end, write_end = os.pipe()
     try:
         process = subprocess.Popen(
-            [*launcher, *command], cwd=folder, env=sumo_environment(), stdin=reading, stdout=printed,
-            stderr=complaints,
-        )  # fmt: skip
+            [*launcher, *command], cwd=folder, env=sumo_environment(), stdin=read_end, stdout=stdout, stderr=stderr
+        )
     except BaseException:
-        os.close(holding)
+        os.close(write_end)
         raise
     finally:
-        os.close(reading)
+        os.close(read_end)
     with process:
         try:
             yield process
         finally:
-            os.close(holding)
-            if sandbox.REPLACES_PROCESS:  # else the launcher kills it now
+            os.close(write_end)
+            if sandbox.REPLACES_PROCESS:  # else the launcher kills the program when the pipe is closed
                 process.kill()
 
 
 def _wait(process: subprocess.Popen[bytes], watch: Callable[[], None] | None) -> tuple[bytes, bytes]:
+    """Return standard output and standard error of a process, at its end."""
+    if watch is None:
+        return process.communicate()
     while True:
         try:
-            return process.communicate(timeout=None if watch is None else _POLL_S)
+            return process.communicate(timeout=_WATCH_PERIOD_S)
         except subprocess.TimeoutExpired:
-            assert watch is not None
             watch()
 
 
 def program_error(name: str, code: int, text: str) -> RunError:
-    """The error for a program of SUMO that ended with exit code ``code`` and said ``text``."""
+    """Return the error for a program of SUMO that failed.
+
+    Parameters
+    ----------
+    name
+        The program.
+    code
+        Exit code; negative for a signal.
+    text
+        Its standard error.
+    """
     missing = re.search(r"error while loading shared libraries: ([^:\s]+)", text)
     if missing:
-        library = missing.group(1)
-        return MissingBackendError(
-            f"{name} cannot start, the system library {library} is missing; on Debian: {APT_COMMAND}"
-        )
+        problem = f"{name} cannot start: the system library {missing.group(1)} is missing"
+        return MissingBackendError(f"{problem}. On Debian, run {APT_COMMAND}")
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     if code == sandbox.CANNOT_START:
-        return MissingBackendError(f"{name} cannot be started: {(lines or ['this process has ended'])[-1]}")
+        reason = lines[-1] if lines else "the process that started it has ended"
+        return MissingBackendError(f"{name} cannot be started: {reason}")
+
     errors = [line for line in lines if not line.startswith(("Warning", "Quitting", "pj_obj_create"))] or lines[-1:]
-    how = f"ended with exit code {code}"
-    if code < 0:
-        how = f"{'crashed with' if -code in _CRASHES else 'was killed by'} signal {-code}"
-    kind = SumoInputError if code > 0 or -code in _CRASHES else RunError
-    return kind("\n".join([f"{name} {how}:", *(f"  {line[:_MAX_ERROR_LENGTH]}" for line in errors[:_MAX_ERRORS])]))
+    is_crash = -code in _CRASHES
+    verb = "crashed with" if is_crash else "was killed by"
+    problem = f"{verb} signal {-code}" if code < 0 else f"ended with exit code {code}"
+    kind = SumoInputError if code > 0 or is_crash else RunError
+    return kind("\n".join([f"{name} {problem}:", *(f"  {line[:_MAX_ERROR_LENGTH]}" for line in errors[:_MAX_ERRORS])]))
 
 
 @contextmanager
 def connect_traci(host: str, port: int) -> Iterator[Any]:
-    """A TraCI connection to a SUMO that is already running.
+    """Connect to a SUMO that is already running.
 
-    InputError when nothing answers there, or not as SUMO does; RunError when SUMO ends the connection early, or falls
-    silent.
+    Parameters
+    ----------
+    host, port
+        Address of its TraCI server.
+
+    Yields
+    ------
+    traci.connection.Connection
+        The connection.
+
+    Raises
+    ------
+    InputError
+        When nothing answers there, or not as SUMO does.
+    RunError
+        When SUMO closes the connection, or stops answering.
     """
     import traci
 
-    place = f"--traci {host}:{port}"
+    where = f"--traci {host}:{port}"
     connection = _connect(host, port)
     if connection is None:
-        raise InputError(place, "no SUMO answers there", "start one with --remote-port first")
+        raise InputError(where, "no SUMO answers there", "Start one with --remote-port first.")
     try:
         try:
             connection.getVersion()
-        except (*_NO_TRACI, traci.exceptions.TraCIException, traci.exceptions.FatalTraCIError):
-            found = f"who listens there does not answer as SUMO does within {_ANSWERS_WITHIN_S:g} s"
-            raise InputError(place, found, "the port that SUMO was given with --remote-port") from None
-        connection._socket.settimeout(_STEPS_WITHIN_S)
+        except (*_PROTOCOL_ERRORS, traci.exceptions.TraCIException, traci.exceptions.FatalTraCIError):
+            problem = f"the server there does not answer as SUMO does within {_ANSWER_TIMEOUT_S:g} s"
+            raise InputError(where, problem, "Use the port that SUMO was given with --remote-port.") from None
+        connection._socket.settimeout(_STEP_TIMEOUT_S)
         yield connection
     except traci.exceptions.FatalTraCIError as error:
-        what = f"ended the connection, or did not answer for {_STEPS_WITHIN_S:g} s"
-        raise RunError(f"SUMO at {host}:{port} {what}: {error}") from None
-    except (*_NO_TRACI, traci.exceptions.TraCIException) as error:
-        raise RunError(f"SUMO at {host}:{port} gave an answer that cannot be understood: {error}") from None
+        problem = f"closed the connection, or did not answer for {_STEP_TIMEOUT_S:g} s"
+        raise RunError(f"SUMO at {host}:{port} {problem}: {error}") from None
+    except (*_PROTOCOL_ERRORS, traci.exceptions.TraCIException) as error:
+        raise RunError(f"SUMO at {host}:{port} gave an invalid answer: {error}") from None
     finally:
         _close(connection)
 
 
 def _close(connection: Any) -> None:
-    """Close without a word when SUMO has hung up first."""
+    """Close a connection, even if SUMO closed it first."""
     import traci
 
-    its = connection._socket
-    with suppress(*_NO_TRACI, traci.exceptions.TraCIException, traci.exceptions.FatalTraCIError, OSError):
+    server = connection._socket
+    with suppress(*_PROTOCOL_ERRORS, traci.exceptions.TraCIException, traci.exceptions.FatalTraCIError, OSError):
         connection.close(False)
-    if its is not None:
-        its.close()
+    if server is not None:
+        server.close()
 
 
 @contextmanager
 def serve_traci(arguments: Sequence[str], folder: Path) -> Iterator[Any]:
-    """Start SUMO with a TraCI server, yield the connection, and end SUMO."""
+    """Start SUMO with a TraCI server, connect to it, and end it with the block.
+
+    Parameters
+    ----------
+    arguments
+        Arguments of ``sumo``.
+    folder
+        Its working directory.
+
+    Yields
+    ------
+    traci.connection.Connection
+        The connection.
+    """
     import traci
     from sumolib.miscutils import getFreeSocketPort
 
     port = getFreeSocketPort()
-    # a file, because SUMO would wait for ever on a full pipe that nobody reads
-    with tempfile.TemporaryFile() as complaints:
+    # a file, because SUMO would wait forever on a full pipe that nobody reads
+    with tempfile.TemporaryFile() as stderr:
         command = [str(sumo_binary("sumo")), *arguments, "--remote-port", str(port)]
-        with _start_program(command, folder, subprocess.DEVNULL, complaints) as process:
+        with _start_program(command, folder, subprocess.DEVNULL, stderr) as process:
             try:
                 connection = _attach(process, port)
                 try:
@@ -332,56 +351,89 @@ def serve_traci(arguments: Sequence[str], folder: Path) -> Iterator[Any]:
                 finally:
                     _close(connection)
             except traci.exceptions.FatalTraCIError:
-                raise _closed_by_sumo(process, complaints) from None
+                raise _closed_error(process, stderr) from None
 
 
-def _closed_by_sumo(process: subprocess.Popen[bytes], complaints: IO[bytes]) -> RunError:
-    """Why SUMO closed its end: it says so on its way out."""
+def _closed_error(process: subprocess.Popen[bytes], stderr: IO[bytes]) -> RunError:
+    """Return the error for a SUMO that closed its TraCI server; it writes the reason before it ends."""
     try:
-        process.wait(_ENDS_WITHIN_S)
+        process.wait(_EXIT_TIMEOUT_S)
     except subprocess.TimeoutExpired:
-        return RunError("sumo closed its TraCI port, and did not say why")
-    complaints.seek(0)
-    return program_error("sumo", process.returncode, complaints.read().decode("utf-8", "replace"))
+        return RunError("sumo closed its TraCI port without an error message")
+    stderr.seek(0)
+    return program_error("sumo", process.returncode, stderr.read().decode("utf-8", "replace"))
 
 
 def _attach(process: subprocess.Popen[bytes], port: int) -> Any:
-    """Connect as soon as SUMO listens; traci's own retries wait a whole second and print."""
+    """Connect as soon as SUMO listens. (traci's own retries wait a second each, and print.)"""
     import traci
 
-    deadline = time.monotonic() + _OPENS_WITHIN_S
+    deadline = time.monotonic() + _START_TIMEOUT_S
     while (connection := _connect("localhost", port)) is None:
         if process.poll() is not None:
             raise traci.exceptions.FatalTraCIError("sumo ended")
         if time.monotonic() > deadline:
-            raise RunError(f"sumo did not open its TraCI port within {_OPENS_WITHIN_S:g} s")
-        time.sleep(_LISTENS_S)
-    connection._socket.settimeout(None)  # one of our own, which may think as long as it likes
+            raise RunError(f"sumo did not open its TraCI port within {_START_TIMEOUT_S:g} s")
+        time.sleep(_CONNECT_PERIOD_S)
+    connection._socket.settimeout(None)  # this SUMO cannot be paused by a user
     return connection
 
 
 def _connect(host: str, port: int) -> Any:
-    """A connection, or None where nobody listens (traci forgets to close the socket then: Python would warn of it)."""
+    """Return a connection, or None where no server listens."""
     import traci
 
-    patience_s = socket.getdefaulttimeout()
+    default_s = socket.getdefaulttimeout()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ResourceWarning)
+        warnings.simplefilter("ignore", ResourceWarning)  # traci does not close the socket of a failed connection
         try:
-            socket.setdefaulttimeout(_ANSWERS_WITHIN_S)
+            socket.setdefaulttimeout(_ANSWER_TIMEOUT_S)
             connection = traci.connect(port=port, host=host, numRetries=0)
         except (traci.exceptions.FatalTraCIError, OSError):
             return None
         finally:
-            socket.setdefaulttimeout(patience_s)
-    ends = connection._socket.getsockname(), connection._socket.getpeername()
-    if ends[0] == ends[1]:  # TCP may connect a free local port to itself, and wait for ever
+            socket.setdefaulttimeout(default_s)
+    if connection._socket.getsockname() == connection._socket.getpeername():
+        # TCP may connect a free local port to itself, which would wait forever
         connection._socket.close()
         return None
     return connection
 
 
 def query_size(connection: Any, name: str) -> VehicleSize:
-    """One vehicle type's size over TraCI."""
+    """Query the size of a vehicle type over TraCI."""
     types = connection.vehicletype
     return VehicleSize(types.getLength(name), types.getWidth(name), types.getHeight(name), types.getVehicleClass(name))
+
+
+def query_sizes(arguments: Sequence[str], folder: Path) -> dict[str, VehicleSize]:
+    """Start SUMO with some arguments, and query the sizes of all vehicle types: defaults depend on the vClass."""
+    with serve_traci([*arguments, "--route-steps", "0"], folder) as connection:
+        return {name: query_size(connection, name) for name in connection.vehicletype.getIDList()}
+
+
+def check_table_complete(path: Path) -> None:
+    """Raise a RunError when the last line of a table is not complete."""
+    if not read_tail(path).endswith(b"\n"):
+        raise incomplete_file_error(path)
+
+
+def check_xml_complete(path: Path, root: str) -> None:
+    """Raise a RunError when the root element of an XML file is not closed."""
+    if re.search(rf"(</{root}>|<{root}[^<>]*/>)\s*\n\Z".encode(), read_tail(path)) is None:
+        raise incomplete_file_error(path)
+
+
+def incomplete_file_error(path: Path) -> RunError:
+    """Return the error for a file that SUMO did not write completely."""
+    free_mb = shutil.disk_usage(path.parent).free / 1e6
+    return RunError(f"{path}: SUMO wrote an incomplete file. Is the disk full? ({free_mb:,.0f} MB are free)")
+
+
+def read_tail(path: Path) -> bytes:
+    """Return the last 512 bytes of a file; empty where there is no file."""
+    if not path.is_file():
+        return b""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - _TAIL_BYTES))
+        return file.read()

@@ -1,10 +1,10 @@
-"""Lays out the folder that SUMO runs in.
+"""Prepare the folder that SUMO runs in.
 
-Steps: find the files that a scenario, or the SUMO configuration that it names, takes its traffic from; check its times;
-copy the files, draw trips where none are given, add the route files of extensions, and write ``run.sumocfg``. The
-folder opens in sumo-gui.
+Steps of :func:`prepare_simulation`: find the files that a scenario, or the SUMO configuration that it names, takes its
+traffic from; check the times; copy the files; draw trips or sample routes if the scenario names none; add the route
+files of extensions; write ``run.sumocfg``. The folder can be opened in sumo-gui.
 
-World frame and units as in SUMO; times are whole milliseconds, SUMO's own unit, so that step, period and warm-up are
+World frame and units as in SUMO. Times are whole milliseconds, as SUMO counts, so that step, period and warm-up can be
 compared exactly.
 """
 
@@ -26,38 +26,39 @@ from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import TrafficConfig
 from egvs.traffic import demand, network, sumo, user_files
 from egvs.traffic.fcd import FrameWindow
-from egvs.traffic.user_files import DemandFiles
 from egvs.traffic.vehicle_boxes import TrafficHook
 
 CONFIG_FILE, NETWORK_FILE, TRIPS_FILE, VTYPES_FILE = "run.sumocfg", "network.net.xml", "trips.rou.xml", "vtypes.add.xml"
 FCD_FILE, COLLISIONS_FILE, STOPS_FILE, LOG_FILE = "fcd.csv", "collisions.xml", "stops.xml", "sumo.log"
 STATISTICS_FILE, DRIVEN_ROUTES_FILE = "statistics.xml", "driven.rou.xml"
-"""What SUMO adds up itself where nothing is held; who left which edge when, where vehicles were counted."""
 EXTRA_ROUTES_FILE, PERSONS_FILE, MAP_FILE = "others.rou.xml", "persons.csv", "map.osm.xml"
-"""Route file of an extension (those of further ones count up), and what SUMO records of persons."""
+_RESERVED_NAMES = frozenset({
+    CONFIG_FILE, TRIPS_FILE, VTYPES_FILE, FCD_FILE, COLLISIONS_FILE, STOPS_FILE, LOG_FILE, EXTRA_ROUTES_FILE,
+    PERSONS_FILE, MAP_FILE, STATISTICS_FILE, DRIVEN_ROUTES_FILE,
+})  # fmt: skip
 
 OSM_SIGNALS = (
     "--tls.guess-signals", "--tls.join", "--tls.default-type", "actuated", "--default.connection.cont-pos", "0",
 )  # fmt: skip
 """Signals and right of way on a network made from OpenStreetMap.
 
-Signals stay green while vehicles come; who has to give way waits at the stop line, not on the junction. Measured on a
-town with 50 drawn vehicles, 1000 s: with netconvert's fixed programs gridlock in two seeds of two, with these none.
+Signals stay green while vehicles arrive, and vehicles give way at the stop line, not on the junction. Measured on a
+town with 50 random vehicles for 1000 s: gridlock in two seeds of two with netconvert's defaults, in none with these.
 """
 
 _OSM_FLAGS = ("--geometry.remove", "--junctions.join", *OSM_SIGNALS, "--sidewalks.guess", "--crossings.guess")
 FCD_DIGITS = 8
-"""Decimals that SUMO writes."""
+"""Decimals of SUMO's outputs."""
 
 _DRAWN_DEPART_DELAY_S = 120.0
-"""More trips are drawn than start, so that those of long ago make room."""
+"""More trips are drawn than fit; those that wait longer are dropped."""
 
-_ATTRIBUTES = "id,x,y,angle,type,speed"
+_FCD_ATTRIBUTES = "id,x,y,angle,type,speed"
 
 
 @dataclass(frozen=True)
 class Timing:
-    """When frames are recorded, in whole milliseconds from the simulation's zero."""
+    """Begin of the simulation, first frame, frame period and step (milliseconds), and number of frames."""
 
     begin_ms: int
     first_ms: int
@@ -67,50 +68,67 @@ class Timing:
 
     @property
     def end_ms(self) -> int:
-        """The simulation ends when the last frame is recorded."""
+        """End of the simulation: the step after the last frame."""
         return self.first_ms + (self.frames - 1) * self.period_ms + self.step_ms
 
     def window(self) -> FrameWindow:
-        """Every step of this time is recorded."""
+        """Return the recorded frames; SUMO records every one."""
         return FrameWindow(self.frames, self.period_ms, self.first_ms, complete=True)
 
 
 def traffic_key(scenario: Scenario) -> str:
-    """Where messages about the traffic point to."""
+    """Return what messages about ``[traffic]`` refer to."""
     return f"{scenario.file}: traffic"
 
 
 def to_milliseconds(value_s: float, where: str) -> int:
-    """Seconds as whole milliseconds."""
+    """Convert seconds to milliseconds; InputError if they are not a whole number."""
     exact = value_s * 1000.0
     if abs(exact - round(exact)) > 1e-6 * max(1.0, exact):
-        raise InputError(f"{where} = {value_s:g}", "is no whole number of milliseconds", "SUMO counts in milliseconds")
+        problem = "expected a whole number of milliseconds"
+        raise InputError(f"{where} = {value_s:g}", problem, "Round it; SUMO counts in milliseconds.")
     return round(exact)
 
 
 def make_timing(traffic: TrafficConfig, begin_s: float, where: str) -> Timing:
-    """The times; period and warm-up are whole numbers of steps (SUMO itself only warns, and records wrong times).
+    """Return the times of a simulation.
 
-    ``begin_s`` is the configuration's, for a scenario without its own.
+    Parameters
+    ----------
+    traffic
+        The traffic.
+    begin_s
+        Begin of the SUMO configuration, used where the scenario has none.
+    where
+        The traffic table, for messages.
+
+    Raises
+    ------
+    InputError
+        When frame period or warm-up are not whole numbers of steps. (SUMO warns only, and records wrong times.)
     """
-    step = to_milliseconds(traffic.step_s, f"{where}.step_s")
-    if step < 1:
-        raise InputError(f"{where}.step_s = {traffic.step_s:g}", "is below a millisecond", "at least 0.001")
-    values = []
-    for key in ("frame_period_s", "warmup_s"):
-        value = to_milliseconds(getattr(traffic, key), f"{where}.{key}")
-        if value % step:
-            near = " or ".join(f"{n * step / 1000:g}" for n in (value // step, value // step + 1) if n)
-            what, right = f"is no whole number of steps of {step / 1000:g} s", f"for example {near}, or another step_s"
-            raise InputError(f"{where}.{key} = {value / 1000:g}", what, right)
-        values.append(value)
-    begin = to_milliseconds(begin_s if traffic.begin_s is None else traffic.begin_s, f"{where}: begin")
-    assert traffic.frames is not None, "what is simulated has an end"
-    return Timing(begin, begin + values[1], values[0], step, traffic.frames)
+    step_ms = to_milliseconds(traffic.step_s, f"{where}.step_s")
+    if step_ms < 1:
+        raise InputError(f"{where}.step_s = {traffic.step_s:g}", "expected at least 0.001 s", "Use a longer step.")
+    period_ms = _whole_steps_ms(traffic.frame_period_s, step_ms, f"{where}.frame_period_s")
+    warmup_ms = _whole_steps_ms(traffic.warmup_s, step_ms, f"{where}.warmup_s")
+    begin_ms = to_milliseconds(begin_s if traffic.begin_s is None else traffic.begin_s, f"{where}: begin")
+    assert traffic.frames is not None, "a simulation has an end"
+    return Timing(begin_ms, begin_ms + warmup_ms, period_ms, step_ms, traffic.frames)
 
 
-def demand_files(scenario: Scenario) -> DemandFiles:
-    """The files that a simulation reads; InputError when the scenario, or its configuration, names a missing one."""
+def _whole_steps_ms(value_s: float, step_ms: int, where: str) -> int:
+    value_ms = to_milliseconds(value_s, where)
+    if value_ms % step_ms:
+        steps = value_ms // step_ms
+        near = " or ".join(f"{n * step_ms / 1000:g}" for n in (steps, steps + 1) if n)
+        problem = f"expected a multiple of the step of {step_ms / 1000:g} s"
+        raise InputError(f"{where} = {value_ms / 1000:g}", problem, f"Use {near}, for example, or another step_s.")
+    return value_ms
+
+
+def demand_files(scenario: Scenario) -> user_files.DemandFiles:
+    """Return the inputs of a scenario's simulation; InputError if a file is missing."""
     traffic = scenario.traffic
     if traffic.sumocfg is not None:
         return user_files.read_sumocfg(scenario.find(traffic.sumocfg, "traffic.sumocfg"))
@@ -118,12 +136,11 @@ def demand_files(scenario: Scenario) -> DemandFiles:
     files: dict[str, tuple[Path, ...]] = {"net-file": (scenario.find(traffic.network, "traffic.network"),)}
     if traffic.routes:
         files["route-files"] = tuple(scenario.find(name, "traffic.routes") for name in traffic.routes)
-    return DemandFiles(files)
+    return user_files.DemandFiles(files)
 
 
 def network_path(scenario: Scenario) -> Path | None:
-    """The network that a scenario or its configuration simulates, or the roads that it names beside a finished file;
-    None where it names none."""
+    """Return the network of a scenario, if any: that of the simulation, or ``traffic.roads`` with a finished file."""
     traffic = scenario.traffic
     if traffic.fcd is not None:
         return None if traffic.roads is None else scenario.find(traffic.roads, "traffic.roads")
@@ -135,25 +152,26 @@ def network_path(scenario: Scenario) -> Path | None:
 
 
 def read_network(scenario: Scenario) -> network.Network | None:
-    """The network of :func:`network_path`, a map of OpenStreetMap converted first.
-
-    InputError when the scenario, its configuration or its network is wrong.
-    """
+    """Read the network of a scenario, if any; an OpenStreetMap map is converted first."""
     path = network_path(scenario)
-    if path is None or not network.is_osm(path):
-        return None if path is None else network.read_net_xml(path)
+    if path is None:
+        return None
+    if not network.is_osm(path):
+        return network.read_net_xml(path)
     with files.temporary_folder() as folder:
         convert_osm(path, folder / NETWORK_FILE)
         return network.read_net_xml(folder / NETWORK_FILE, path)
 
 
 def copy_network(scenario: Scenario, folder: Path) -> None:
-    """A fresh folder with a copy of the roads that a scenario names beside a finished file, if it does."""
-    if (path := network_path(scenario)) is None:
+    """Empty a folder, and copy the network of a scenario with a finished file to it, if there is one."""
+    path = network_path(scenario)
+    if path is None:
         return
-    assert scenario.traffic.fcd is not None, "what is simulated is laid out otherwise"
-    own = [scenario.find(scenario.traffic.fcd, "traffic.fcd"), path]
-    _make_empty(folder, [*own, *(scenario.find(name, "traffic.vtypes") for name in scenario.traffic.vtypes)])
+    traffic = scenario.traffic
+    assert traffic.fcd is not None, "a simulation needs prepare_simulation"
+    vtypes = [scenario.find(name, "traffic.vtypes") for name in traffic.vtypes]
+    _make_empty(folder, [scenario.find(traffic.fcd, "traffic.fcd"), path, *vtypes])
     if network.is_osm(path):
         convert_osm(path, folder / NETWORK_FILE)
     else:
@@ -161,103 +179,154 @@ def copy_network(scenario: Scenario, folder: Path) -> None:
 
 
 def may_have_heights(scenario: Scenario) -> bool:
-    """Whether the network may go up and down: a quick look, so that for a flat one nothing more is read or imported."""
+    """Whether the network of a scenario may have slopes, without parsing it."""
     path = network_path(scenario)
     return path is not None and network.may_have_heights(path)
 
 
 @dataclass(frozen=True)
 class SimulationFolder:
-    """A folder that SUMO can run in."""
+    """A folder that SUMO can run in.
+
+    Attributes
+    ----------
+    folder
+        Its path.
+    sources
+        The user's files that were copied to it.
+    options
+        Options of SUMO.
+    timing
+        Times of the simulation.
+    roads
+        The network.
+    vehicles
+        Number of vehicles to maintain; None for a demand that is simulated as it is.
+    is_generated
+        Whether trips or routes were generated, rather than read from a user's files.
+    has_counts
+        Whether the traffic meets counts.
+    has_fixed_count
+        Whether each frame must have exactly ``vehicles``, so that a missing frame is noticed.
+    has_extra_traffic
+        Whether extensions added traffic.
+    notes
+        Remarks for the user.
+    """
 
     folder: Path
-    given: tuple[Path, ...]
-    """The user's files of which it holds copies."""
+    sources: tuple[Path, ...]
     options: dict[str, str]
     timing: Timing
     roads: network.Network
     vehicles: int | None
-    """How many are to be held in the network; None where the demand is taken as it is."""
-    drawn: bool
-    """Whether the traffic is made here, of drawn trips or counts, and is not a user's."""
-    counted: bool
-    """Whether it follows counts."""
-    exactly: bool
-    """Whether each recorded frame must have that many, so that one that is missing is noticed."""
-    adds_traffic: bool
-    """Whether extensions added traffic to it."""
+    is_generated: bool
+    has_counts: bool
+    has_fixed_count: bool
+    has_extra_traffic: bool
     notes: list[str]
 
     @property
     def outputs(self) -> dict[str, str]:
-        """What this program has SUMO write."""
-        wanted = {
+        """Options for the outputs of SUMO that are needed."""
+        options = {
             "fcd-output": FCD_FILE,
-            "fcd-output.attributes": _ATTRIBUTES + (",z,slope" if self.roads.has_heights else ""),
+            "fcd-output.attributes": _FCD_ATTRIBUTES + (",z,slope" if self.roads.has_heights else ""),
             "fcd-output.skip-empty": "true",
             "device.fcd.begin": _format_seconds(self.timing.first_ms),
             "device.fcd.period": _format_seconds(self.timing.period_ms),
             "precision": str(FCD_DIGITS),
             "collision-output": COLLISIONS_FILE,
         }
-        if self.adds_traffic or not self.drawn:  # else SUMO writes a user's persons among the vehicles
-            wanted |= {"person-fcd-output": PERSONS_FILE}
-        if not self.exactly:  # else nothing would tell a file that ends too early from roads that got empty
-            wanted |= {"statistic-output": STATISTICS_FILE}
-        if self.counted:
-            wanted |= {"vehroute-output": DRIVEN_ROUTES_FILE, "vehroute-output.exit-times": "true",
-                       "vehroute-output.write-unfinished": "true"}  # fmt: skip
-        return wanted if self.drawn else wanted | {"stop-output": STOPS_FILE, "stop-output.write-unfinished": "true"}
+        if self.has_extra_traffic or not self.is_generated:  # without it, SUMO writes persons among the vehicles
+            options["person-fcd-output"] = PERSONS_FILE
+        if not self.has_fixed_count:  # distinguishes an incomplete file from roads without vehicles
+            options["statistic-output"] = STATISTICS_FILE
+        if self.has_counts:
+            options["vehroute-output"] = DRIVEN_ROUTES_FILE
+            options |= {"vehroute-output.exit-times": "true", "vehroute-output.write-unfinished": "true"}
+        if not self.is_generated:
+            options |= {"stop-output": STOPS_FILE, "stop-output.write-unfinished": "true"}
+        return options
 
 
 def prepare_simulation(scenario: Scenario, folder: Path, extensions: Iterable[TrafficHook] = ()) -> SimulationFolder:
-    """Lay out the folder, with the traffic that ``extensions`` add."""
-    traffic, place = scenario.traffic, traffic_key(scenario)
-    given = demand_files(scenario)
-    when = make_timing(traffic, given.begin_s, place)
+    """Prepare the folder of a simulation.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    folder
+        The folder; it is emptied first.
+    extensions
+        Add traffic.
+
+    Returns
+    -------
+    SimulationFolder
+        The folder, and what is needed to run SUMO in it.
+
+    Raises
+    ------
+    InputError
+        When an input is wrong.
+    """
+    traffic = scenario.traffic
+    where = traffic_key(scenario)
+    inputs = demand_files(scenario)
+    timing = make_timing(traffic, inputs.begin_s, where)
+    times_s = timing.begin_ms / 1000.0, timing.end_ms / 1000.0
     adding = [extension for extension in extensions if extension.ADDS_TRAFFIC]
-    others = [EXTRA_ROUTES_FILE.replace("others", f"others{number or ''}") for number in range(len(adding))]
-    _make_empty(folder, given.all())
-    named, left_out = _copy_files(given, folder, others)
-    roads = network.read_net_xml(folder / named["net-file"], given.files["net-file"][0])
-    demand_seed, sumo_seed, *other_seeds = np.random.SeedSequence(scenario.seed).spawn(2 + len(adding))
-    drawn, notes = traffic.sumocfg is None and not traffic.routes, []
-    vehicles, times = traffic.vehicles, (when.begin_ms / 1000.0, when.end_ms / 1000.0)
-    if drawn:
-        demand.check_kinds(traffic.kinds, sumo.vehicle_classes(), place)
+    extra_files = [EXTRA_ROUTES_FILE.replace("others", f"others{number or ''}") for number in range(len(adding))]
+
+    _make_empty(folder, inputs.all())
+    copies, notes = _copy_files(inputs, folder, extra_files)
+    roads = network.read_net_xml(folder / copies["net-file"], inputs.files["net-file"][0])
+    demand_seed, sumo_seed, *extra_seeds = np.random.SeedSequence(scenario.seed).spawn(2 + len(adding))
+
+    is_generated = traffic.sumocfg is None and not traffic.routes
+    vehicles = traffic.vehicles
+    depart_delay_s = traffic.max_depart_delay_s
+    if is_generated:
+        demand.check_kinds(traffic.kinds, sumo.vehicle_classes(), where)
         files.write_text(folder / VTYPES_FILE, demand.vtypes_xml(traffic.kinds))
-        named |= {"additional-files": VTYPES_FILE, "route-files": TRIPS_FILE}
+        copies |= {"additional-files": VTYPES_FILE, "route-files": TRIPS_FILE}
         if traffic.counts:
-            demand.write_routes(traffic, roads, times, demand_seed, folder / TRIPS_FILE, place)
+            demand.write_routes(traffic, roads, times_s, demand_seed, folder / TRIPS_FILE, where)
         else:
-            notes = _write_trips(scenario, roads, when, np.random.default_rng(demand_seed), folder)
+            notes += _write_trips(scenario, roads, timing, np.random.default_rng(demand_seed), folder)
             vehicles = demand.target_vehicle_count(traffic, roads)
-    others_at_most = 0
-    for extension, name, seed in zip(adding, others, other_seeds, strict=True):
-        plan = extension.plan(scenario, roads, *times, np.random.default_rng(seed))
-        files.write_text(folder / name, plan.xml)
-        named["route-files"] = ",".join(filter(None, (named.get("route-files"), name)))
-        others_at_most, notes = others_at_most + plan.vehicles, [*notes, *plan.notes]
-    number = int(sumo_seed.generate_state(1)[0]) & 0x7FFFFFFF
-    options = given.options | named | _scenario_options(traffic, when, number)
+            depart_delay_s = depart_delay_s or _DRAWN_DEPART_DELAY_S
+
+    extra_vehicles = 0
+    for extension, name, seed in zip(adding, extra_files, extra_seeds, strict=True):
+        extra = extension.plan(scenario, roads, *times_s, np.random.default_rng(seed))
+        files.write_text(folder / name, extra.xml)
+        copies["route-files"] = ",".join(filter(None, (copies.get("route-files"), name)))
+        extra_vehicles += extra.vehicles
+        notes += extra.notes
+
+    seed_number = int(sumo_seed.generate_state(1)[0]) & 0x7FFFFFFF
+    options = inputs.options | copies | _scenario_options(traffic, timing, seed_number)
     if vehicles is not None:
-        options["max-num-vehicles"] = str(vehicles + others_at_most)
-    if delay_s := traffic.max_depart_delay_s or (_DRAWN_DEPART_DELAY_S if drawn and not traffic.counts else None):
-        options["max-depart-delay"] = f"{delay_s:g}"
+        options["max-num-vehicles"] = str(vehicles + extra_vehicles)
+    if depart_delay_s:
+        options["max-depart-delay"] = f"{depart_delay_s:g}"
     files.write_text(folder / CONFIG_FILE, _config_xml(options))
-    exactly, notes = vehicles is not None and traffic.hold == "exactly", left_out + notes
+    has_fixed_count = vehicles is not None and traffic.hold == "exactly"
     return SimulationFolder(
-        folder, tuple(given.all()), options, when, roads, vehicles, drawn, bool(traffic.counts), exactly, bool(adding),
-        notes,
+        folder, tuple(inputs.all()), options, timing, roads, vehicles, is_generated, bool(traffic.counts),
+        has_fixed_count, bool(adding), notes,
     )  # fmt: skip
 
 
-def _make_empty(folder: Path, given: Iterable[Path]) -> None:
-    """An empty folder, so that nothing of an earlier run, nor a SUMO that still writes, gets into this one."""
-    for path in given:
+def _make_empty(folder: Path, inputs: Iterable[Path]) -> None:
+    """Make a new, empty folder, so that an earlier run, or a SUMO that still runs, cannot affect this one."""
+    for path in inputs:
         if path.resolve().is_relative_to(folder.resolve()):
-            what = "lies in the folder that is made anew for SUMO"
-            raise InputError(path, what, "another --out, or the file elsewhere")
+            hint = "Use another --out, or move the file."
+            raise InputError(path, "an input file is in the folder that is emptied for SUMO", hint)
     if folder.is_symlink():
         folder.unlink()
     elif folder.exists():
@@ -265,13 +334,13 @@ def _make_empty(folder: Path, given: Iterable[Path]) -> None:
     folder.mkdir(parents=True)
 
 
-def _scenario_options(traffic: TrafficConfig, when: Timing, seed: int) -> dict[str, str]:
-    """What the scenario decides, whatever a user's configuration says; see the traps of SUMO behind each."""
+def _scenario_options(traffic: TrafficConfig, timing: Timing, seed: int) -> dict[str, str]:
+    """Return the options that the scenario sets, whatever a user's configuration says."""
     return {
         "seed": str(seed),
-        "begin": _format_seconds(when.begin_ms),
-        "end": _format_seconds(when.end_ms),
-        "step-length": _format_seconds(when.step_ms),
+        "begin": _format_seconds(timing.begin_ms),
+        "end": _format_seconds(timing.end_ms),
+        "step-length": _format_seconds(timing.step_ms),
         "threads": "1",
         "lateral-resolution": f"{traffic.lateral_resolution_m:g}",
         "time-to-teleport": "-1",
@@ -287,18 +356,19 @@ def _format_seconds(time_ms: int) -> str:
 
 
 def as_flags(options: Mapping[str, str]) -> list[str]:
-    """Options as one would type them."""
+    """Return options as arguments of a command line."""
     return [word for key, value in options.items() for word in (f"--{key}", value)]
 
 
 def _write_trips(
-    scenario: Scenario, roads: network.Network, when: Timing, rng: np.random.Generator, folder: Path
+    scenario: Scenario, roads: network.Network, timing: Timing, rng: np.random.Generator, folder: Path
 ) -> list[str]:
-    """Write drawn trips; what the user should know of them."""
-    traffic, place = scenario.traffic, traffic_key(scenario)
-    pairs = [demand.origin_destination_pairs(roads, kind, traffic, rng, place) for kind in traffic.kinds]
-    count = int(np.ceil((when.end_ms - when.begin_ms) / 1000.0 * traffic.trips_per_s))
-    departs_s = when.begin_ms / 1000.0 + np.arange(count) / traffic.trips_per_s
+    """Write random trips; return notes for the user."""
+    traffic = scenario.traffic
+    where = traffic_key(scenario)
+    pairs = [demand.origin_destination_pairs(roads, kind, traffic, rng, where) for kind in traffic.kinds]
+    count = int(np.ceil((timing.end_ms - timing.begin_ms) / 1000.0 * traffic.trips_per_s))
+    departs_s = timing.begin_ms / 1000.0 + np.arange(count) / traffic.trips_per_s
     trips = demand.draw_trips(roads, traffic.kinds, pairs, departs_s, rng)
     files.write_text(folder / TRIPS_FILE, demand.trips_xml(trips, departs_s))
     return [
@@ -308,45 +378,30 @@ def _write_trips(
     ]
 
 
-def _copy_files(given: DemandFiles, folder: Path, others: Iterable[str]) -> tuple[dict[str, str], list[str]]:
-    """Copy every file into the folder, so that it can be moved and opened elsewhere; ``others`` are taken names.
-
-    The copies' names by option, and what was left out of them.
-    """
-    taken = {
-        CONFIG_FILE,
-        TRIPS_FILE,
-        VTYPES_FILE,
-        FCD_FILE,
-        COLLISIONS_FILE,
-        STOPS_FILE,
-        LOG_FILE,
-        EXTRA_ROUTES_FILE,
-        PERSONS_FILE,
-        MAP_FILE,
-        STATISTICS_FILE,
-        DRIVEN_ROUTES_FILE,
-        *others,
-    }
-    values, notes = {}, []
-    for option, paths in given.files.items():
+def _copy_files(
+    inputs: user_files.DemandFiles, folder: Path, extra_files: Iterable[str]
+) -> tuple[dict[str, str], list[str]]:
+    """Copy the input files; return the names of the copies by option, and notes for the user."""
+    used = {*_RESERVED_NAMES, *extra_files}
+    copies, notes = {}, []
+    for option, paths in inputs.files.items():
         names = []
         for path in paths:
             name = NETWORK_FILE if option == "net-file" else user_files.safe_name(path.name)
-            while name in taken:
+            while name in used:
                 name = f"_{name}"
-            taken.add(name)
+            used.add(name)
+            names.append(name)
             if option == "net-file" and network.is_osm(path):
                 convert_osm(path, folder / name)
             else:
                 notes += user_files.copy_checked(path, folder / name)
-            names.append(name)
-        values[option] = ",".join(names)
-    return values, notes
+        copies[option] = ",".join(names)
+    return copies, notes
 
 
 def convert_osm(path: Path, network_path: Path) -> None:
-    """Turn a map of OpenStreetMap into a network; its world frame starts at the network's south-west corner."""
+    """Convert an OpenStreetMap map to a network, whose origin is at its south-west corner."""
     content = _convert_osm_once(path, files.hash_file(path))
     with files.attach_filename(network_path):
         network_path.write_bytes(content)
@@ -354,7 +409,7 @@ def convert_osm(path: Path, network_path: Path) -> None:
 
 @lru_cache(maxsize=1)
 def _convert_osm_once(path: Path, _content: str) -> bytes:
-    """The network of a map, converted once for the check and the traffic."""
+    """Return the network of a map; cached, for the check and the traffic."""
     with files.temporary_folder() as folder:
         if osm.is_pbf(path):  # netconvert reads XML only
             osm.write_xml(path, folder / MAP_FILE)
@@ -363,9 +418,8 @@ def _convert_osm_once(path: Path, _content: str) -> bytes:
         try:
             sumo.run_netconvert(["--osm-files", MAP_FILE, *_OSM_FLAGS], folder, NETWORK_FILE)
         except sumo.SumoInputError as error:
-            raise InputError(
-                path, f"is no map that streets can be made of: {error}", "a whole map; fetch it again"
-            ) from None
+            problem = f"no network can be made of this map: {error}"
+            raise InputError(path, problem, "Download the map again, in full.") from None
         return (folder / NETWORK_FILE).read_bytes()
 
 

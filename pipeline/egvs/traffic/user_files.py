@@ -1,26 +1,14 @@
-"""A user's SUMO configuration and demand: what is taken over, copied safely.
+"""Copy a user's SUMO configuration and demand safely.
 
-Tells whether the files of a user's demand bring any vehicle, before they are simulated.
+**Configuration.** SUMO writes files wherever its options say, so an option is copied only if it is known to change
+nothing but the traffic: :data:`FILE_OPTIONS` name files that SUMO reads, :data:`ACCEPTED_OPTIONS` are numbers, names
+and switches. Options that affect outputs only, or that the scenario sets itself, are ignored. Any other option is an
+error, because ignoring it might change the traffic.
 
-Files are read only as far as the first vehicle, so it costs next to nothing where there is one.
-
-Reads of a user's SUMO configuration what may be taken over.
-
-SUMO writes wherever an option tells it to, so an option is taken over only where it is known to change nothing but the
-traffic: :data:`FILE_OPTIONS` are files that it reads, :data:`ACCEPTED_OPTIONS` are numbers, names and switches. What
-only writes, shows
-or tells, and what the scenario decides itself, is left out. Any other option is an error: unheard, it might change the
-traffic.
-
-Copies the XML that SUMO is to read, so that SUMO reads nothing that was not read here first.
-
-Steps: read every element with the safe parser, which refuses entities and document types; refuse what makes SUMO read a
-further file; where something makes SUMO write one, or the file is in another encoding than UTF-8, write it anew, with
-the outputs going nowhere. SUMO reads the copy alone, so that it cannot understand a file in another way than it was
-understood here.
-
-By detectors, mean data, probes, calibrators, signal programs and, in any file, ``<param>``, SUMO can be told to write.
-None of that is the traffic's, so it is not written; the detectors and devices themselves stay, because signals and
+**XML files.** SUMO reads copies only. Each file is first read with the safe parser, which rejects entities and document
+types; an element that makes SUMO read a further file is an error. If the file makes SUMO write outputs, or is in an
+encoding other than UTF-8, the copy is written anew, with the outputs disabled. Detectors, mean data, probes,
+calibrators, signal programs and, in any file, ``<param>`` can have outputs. They stay in the copy, because signals and
 routes may depend on them.
 """
 
@@ -28,6 +16,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -43,26 +32,9 @@ from egvs.core.errors import InputError
 from egvs.formats import xml
 
 DEMAND_OPTIONS = ("route-files", "additional-files")
-"""SUMO's options that name files with vehicles."""
+"""SUMO's options for files with vehicles."""
 
-_VEHICLE_ELEMENTS = frozenset({"vehicle", "trip", "flow"})
-_INCLUDE_ELEMENTS = frozenset({"include"})
-
-
-def has_vehicles(paths: Iterable[Path]) -> bool:
-    """Whether any of these files has a ``<vehicle>``, ``<trip>`` or ``<flow>``, or includes files that may.
-
-    What cannot be read is left to SUMO, which says what is wrong with it.
-    """
-    try:
-        return any(
-            element.tag in _VEHICLE_ELEMENTS | _INCLUDE_ELEMENTS
-            for path in paths
-            for child in xml.iter_elements(path, "")
-            for element in child.iter()
-        )
-    except InputError:
-        return True
+_DEMAND_ELEMENTS = frozenset({"vehicle", "trip", "flow", "include"})
 
 
 _SYNONYMS = {
@@ -72,7 +44,7 @@ _SYNONYMS = {
 }  # fmt: skip
 
 FILE_OPTIONS = ("net-file", "route-files", "additional-files", "weight-files")
-"""Options that name files which SUMO reads; each is read here first."""
+"""Options for files that SUMO reads."""
 
 _ACCEPTED_TEXT = """
     weight-attribute junction-taz
@@ -170,68 +142,95 @@ _IGNORED_PREFIXES = (
     "device.ssm.", "device.emissions.", "device.tripinfo.", "device.vehroute.", "device.btreceiver.",
     "device.btsender.", "person-device.btsender.", "person-device.btreceiver.", "device.example.",
 )  # fmt: skip
-"""What only writes, shows or tells, or is the scenario's to decide: nothing is lost without it."""
+"""Options for outputs, logs and the display, and options that the scenario sets itself."""
 
 _TRUE = {"true", "1", "yes", "on", "t", "x"}
+
+_MAX_BEGIN_S = 1e9
+"""SUMO counts milliseconds in 64 bits; this is thirty years."""
+
+NULL_FILE = "NUL"
+"""SUMO's name, on any system, of an output that is not written."""
+
+_OUTPUT_ATTRIBUTES = frozenset({"file", "output", "dest"})
+_OUTPUT_PARAMETERS = ("file", "files", "output")
+"""Ends of the keys of a ``<param>`` with an output: ``file`` of a signal, ``device.ssm.file`` of a vehicle or type."""
+
+_INPUT_ATTRIBUTES = frozenset({"href", "edgesFile"})
+_INPUT_ELEMENTS = frozenset({"rerouter", "variableSpeedSign"})
+"""Elements whose ``file`` is an input."""
 
 
 @dataclass(frozen=True)
 class DemandFiles:
-    """The files that the traffic comes from: SUMO option -> files, and the other options of a user's configuration."""
+    """Inputs of a simulation: files by SUMO option, other options, and the begin of the configuration."""
 
     files: dict[str, tuple[Path, ...]]
     options: dict[str, str] = field(default_factory=dict)
     begin_s: float = 0.0
 
     def all(self) -> list[Path]:
-        """Every file, once."""
+        """Return all files, without duplicates."""
         return list(dict.fromkeys(path for paths in self.files.values() for path in paths))
 
 
+def has_vehicles(paths: Iterable[Path]) -> bool:
+    """Whether a file has a vehicle, trip or flow, or includes a further file. Reads up to the first one.
+
+    An invalid file counts as True: SUMO's error describes it better.
+    """
+    try:
+        for path in paths:
+            for child in xml.iter_elements(path, ""):
+                if any(element.tag in _DEMAND_ELEMENTS for element in child.iter()):
+                    return True
+    except InputError:
+        return True
+    return False
+
+
 def sumocfg_network_path(path: Path) -> Path | None:
-    """The network that the configuration ``path`` names; None where it names none."""
-    return next((path.parent / value for key, value in _read_options(path) if key == "net-file" and value), None)
+    """Return the network that a configuration names, if any."""
+    return next((path.parent / value for key, value in _iter_options(path) if key == "net-file" and value), None)
 
 
 def read_sumocfg(path: Path) -> DemandFiles:
-    """What is taken over of the configuration ``path``.
+    """Read the options of a configuration that are copied.
 
-    InputError when it names no network, a file that is missing, or an option that is not known to be harmless.
+    Raises
+    ------
+    InputError
+        When it names no network, a missing file, or an option that is not known to be harmless.
     """
     files: dict[str, tuple[Path, ...]] = {}
-    options, begin_s = {}, 0.0
-    for key, value in _read_options(path):
-        if key == "begin":
-            begin_s = _parse_seconds(value, path)
-        elif key == "no-internal-links" and value.lower() in _TRUE:
-            what = "lets vehicles jump over junctions (up to 42 m)"
-            raise InputError(f"{path}: {key} = {value!r}", what, "remove it")
-        elif key in FILE_OPTIONS:
-            files[key] = _option_files(path, key, value)
-        elif key in ACCEPTED_OPTIONS:
-            options[key] = value
-        elif value and not _is_ignored(key):
-            what = "is no option of SUMO that is taken over"
-            raise InputError(f"{path}: {key} = {value!r}", what, "remove it; docs/security.md says which are")
+    options: dict[str, str] = {}
+    begin_s = 0.0
+    for option, value in _iter_options(path):
+        where = f"{path}: {option} = {value!r}"
+        if option == "begin":
+            begin_s = _parse_begin_s(value, path)
+        elif option == "no-internal-links" and value.lower() in _TRUE:
+            raise InputError(where, "makes vehicles jump over junctions (up to 42 m)", "Remove it.")
+        elif option in FILE_OPTIONS:
+            files[option] = tuple(path.parent / name.strip() for name in value.split(",") if name.strip())
+            for file in files[option]:
+                if not file.is_file():
+                    raise InputError(where, f"no such file ({file})", "Use a path relative to the configuration.")
+        elif option in ACCEPTED_OPTIONS:
+            options[option] = value
+        elif value and not _is_ignored(option):
+            raise InputError(where, "option of SUMO not supported", "Remove it; docs/security.md lists those that are.")
     if "net-file" not in files:
-        raise InputError(path, "names no net-file", "<net-file value=.../> in its <input>")
+        raise InputError(path, "has no net-file", "Add <net-file value=.../> to its <input>.")
     return DemandFiles(files, options, begin_s)
 
 
-def _is_ignored(key: str) -> bool:
-    return key in _IGNORED_OPTIONS or key.startswith(_IGNORED_PREFIXES) or "output" in key
+def _is_ignored(option: str) -> bool:
+    return option in _IGNORED_OPTIONS or option.startswith(_IGNORED_PREFIXES) or "output" in option
 
 
-def _option_files(path: Path, key: str, value: str) -> tuple[Path, ...]:
-    pieces = tuple(path.parent / piece.strip() for piece in value.split(",") if piece.strip())
-    for missing in (piece for piece in pieces if not piece.is_file()):
-        what = f"no such file ({missing})"
-        raise InputError(f"{path}: {key} = {value!r}", what, "a path relative to the configuration")
-    return pieces
-
-
-def _read_options(path: Path) -> Iterator[tuple[str, str]]:
-    """Every option with its value; sections are only for readers."""
+def _iter_options(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield the full name and the value of each option, whatever section it is in."""
     for child in xml.iter_elements(path, ""):
         for element in child.iter():
             value = element.get("value", element.get("v"))
@@ -239,78 +238,77 @@ def _read_options(path: Path) -> Iterator[tuple[str, str]]:
                 yield _SYNONYMS.get(element.tag, element.tag), os.path.expandvars(value)
 
 
-def _parse_seconds(value: str, path: Path) -> float:
+def _parse_begin_s(value: str, path: Path) -> float:
     try:
         seconds = float(value)
     except ValueError:
         seconds = math.nan
     if not 0.0 <= seconds <= _MAX_BEGIN_S:
-        right = f"0 to {_MAX_BEGIN_S:g}, for example 25200 for seven o'clock"
-        raise InputError(f"{path}: begin = {value[:80]!r}", "is no number of seconds", right)
+        problem = f"expected 0 to {_MAX_BEGIN_S:g} seconds"
+        raise InputError(f"{path}: begin = {value[:80]!r}", problem, "Use 25200, for example, for seven o'clock.")
     return seconds
 
 
-_MAX_BEGIN_S = 1e9
-"""SUMO counts milliseconds in 64 bits; this is thirty years."""
-
-NULL_FILE = "NUL"
-"""SUMO's own name, on any system, of an output that is not written."""
-
-_OUTPUT_ATTRIBUTES = frozenset({"file", "output", "dest"})
-_OUTPUT_PARAMETERS = ("file", "files", "output")
-"""How the keys of such a ``<param>`` end: ``file`` of a signal, ``device.ssm.file`` of a vehicle or its type."""
-
-_INPUT_ATTRIBUTES = frozenset({"href", "edgesFile"})
-_INPUT_ELEMENTS = frozenset({"rerouter", "variableSpeedSign"})
-"""Elements whose ``file`` is read."""
-
-
 def safe_name(name: str) -> str:
-    """A file's name without what SUMO reads as more than a name: lists, variables of the environment."""
-    return "".join("_" if sign in ",;$%" else sign for sign in name)
+    """Replace the characters of a file name that SUMO reads as separators or variables."""
+    return re.sub(r"[,;$%]", "_", name)
 
 
 def copy_checked(path: Path, to: Path) -> list[str]:
-    """Write a copy of the XML file ``path`` that SUMO may read; what the user should know of it.
+    """Write a copy of an XML file that SUMO may read.
 
-    InputError when it is not well-formed, declares entities, or names a further file that SUMO would read.
+    Parameters
+    ----------
+    path
+        The file.
+    to
+        The copy.
+
+    Returns
+    -------
+    list of str
+        Notes for the user about disabled outputs.
+
+    Raises
+    ------
+    InputError
+        When the file is not well-formed, declares entities, or names a further file that SUMO would read.
     """
-    unwritten = _count_outputs(path, files.hash_file(path))
+    outputs = _count_outputs(path, files.hash_file(path))
     with files.atomic_write(to) as partial, partial.open("wb") as file:
-        if unwritten or xml.file_encoding(path) not in ("utf-8", "ascii"):
+        if outputs or xml.file_encoding(path) not in ("utf-8", "ascii"):
             _rewrite(path, file)
         else:
             with xml.open_bounded(path) as source:
                 shutil.copyfileobj(source, file)
-    if not unwritten:
+    if not outputs:
         return []
-    told = ", ".join(f"{count} of <{tag}>" for tag, count in unwritten)
-    return [f"{path.name}: SUMO's outputs that it asks for are not written: {told}"]
+    counts = ", ".join(f"{count} of <{tag}>" for tag, count in outputs)
+    return [f"{path.name}: outputs of SUMO are disabled: {counts}"]
 
 
 def check_copyable(path: Path) -> None:
-    """InputError where :func:`copy_checked` would refuse a file."""
+    """Raise the InputError of :func:`copy_checked`, if any."""
     _count_outputs(path, files.hash_file(path))
 
 
 @lru_cache(maxsize=32)
 def _count_outputs(path: Path, _content: str) -> tuple[tuple[str, int], ...]:
-    """The elements of a file that ask for an output, and how many; read once for the check and the copy."""
-    found: Counter[str] = Counter()
+    """Return the tags of elements with outputs and their numbers; cached, for the check and the copy."""
+    counts: Counter[str] = Counter()
     for child in _checked_elements(path):
-        found.update(element.tag for element in child.iter() if _output_keys(element))
-    return tuple(sorted(found.items()))
+        counts.update(element.tag for element in child.iter() if _output_keys(element))
+    return tuple(sorted(counts.items()))
 
 
 def _checked_elements(path: Path, on_root: Callable[[Element], None] = lambda root: None) -> Iterator[Element]:
-    """The children of the root, when nothing in the file has SUMO read a further one."""
+    """Yield the children of the root element, checked; pass the root to ``on_root`` first."""
 
     def check_root(root: Element) -> None:
         _check_element(root, path)
-        if keys := _output_keys(root):  # SUMO takes any element for the root
-            raise InputError(
-                path, f"its root <{root.tag} {keys[0]}=...> asks for an output", "a root like <additional>"
-            )
+        if keys := _output_keys(root):  # SUMO accepts any element as the root
+            problem = f"its root <{root.tag} {keys[0]}=...> has an output"
+            raise InputError(path, problem, "Use a root like <additional>.")
         on_root(root)
 
     for child in xml.iter_elements(path, "", on_root=check_root):
@@ -320,34 +318,36 @@ def _checked_elements(path: Path, on_root: Callable[[Element], None] = lambda ro
 
 
 def _rewrite(path: Path, file: IO[bytes]) -> None:
-    """Write a file anew, as UTF-8, with outputs that go nowhere."""
-    roots: list[Element] = []
+    """Write an XML file anew, as UTF-8, with its outputs disabled."""
+    root_tag = ""
 
     def open_root(root: Element) -> None:
-        roots.append(root)
-        named = "".join(f" {key}={quoteattr(value)}" for key, value in root.attrib.items() if "}" not in key)
-        file.write(f"<{root.tag}{named}>\n".encode())
+        nonlocal root_tag
+        root_tag = root.tag
+        attributes = "".join(f" {key}={quoteattr(value)}" for key, value in root.attrib.items() if "}" not in key)
+        file.write(f"<{root_tag}{attributes}>\n".encode())
 
     for child in _checked_elements(path, open_root):
         for element in child.iter():
             for key in _output_keys(element):
                 element.set(key, NULL_FILE)
         file.write(tostring(child, encoding="utf-8"))
-    file.write(f"</{roots[0].tag}>\n".encode())
+    file.write(f"</{root_tag}>\n".encode())
 
 
 def _check_element(element: Element, path: Path) -> None:
+    """Raise an InputError for an element in a namespace, or one that makes SUMO read a further file."""
     if "}" in element.tag:
-        raise InputError(path, f"<{element.tag}> is in a namespace", "SUMO's elements, which have none")
-    read = _INPUT_ATTRIBUTES | ({"file"} if element.tag in _INPUT_ELEMENTS else set())
-    for key in sorted(read & element.attrib.keys()):
+        raise InputError(path, f"<{element.tag}> is in a namespace", "Use SUMO's elements, which have none.")
+    inputs = _INPUT_ATTRIBUTES | ({"file"} if element.tag in _INPUT_ELEMENTS else set())
+    for key in sorted(inputs & element.attrib.keys()):
         if element.attrib[key] not in ("", NULL_FILE):
-            what = f"<{element.tag} {key}={element.attrib[key]!r}> has SUMO read a further file"
-            raise InputError(path, what, "its content in this file itself")
+            problem = f"<{element.tag} {key}={element.attrib[key]!r}> makes SUMO read a further file"
+            raise InputError(path, problem, "Put its content into this file.")
 
 
 def _output_keys(element: Element) -> list[str]:
-    """The attributes by which an element asks for an output."""
+    """Return the attributes of an element that name an output."""
     keys = sorted(_OUTPUT_ATTRIBUTES & element.attrib.keys())
     if element.tag == "param" and element.get("key", "").lower().endswith(_OUTPUT_PARAMETERS):
         keys.append("value")

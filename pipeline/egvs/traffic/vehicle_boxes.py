@@ -1,24 +1,17 @@
-"""Front-bumper points to boxes; the hooks for traffic effects.
+"""Vehicle boxes from SUMO's front-bumper points, and the hooks of effects on traffic.
 
-Turns SUMO's points on front bumpers into boxes.
-
-SUMO gives x, y (and z on networks with heights) of the middle of the front bumper, an angle a in degrees clockwise from
-north, and a slope p in degrees, uphill positive. The box of length L and height H has its centre at
+SUMO gives x, y (and z on networks with heights) of the centre of the front bumper, an angle a in degrees clockwise from
+north, and a slope p in degrees, positive uphill. The box of length L and height H has its centre at
 
     front - L/2 (sin a cos p, cos a cos p, sin p) + (0, 0, H/2),      yaw = 90 deg - a,      pitch = p
 
-in the world frame (x east, y north, z up; yaw counter-clockwise from +x, in (-pi, pi]). Sines and cosines are taken of
-degrees, exact at multiples of 90. Positions are rounded to 1 micrometre, angles to 1 nanoradian.
+in the world frame (x east, y north, z up; yaw counter-clockwise from +x, in (-pi, pi]). Sines and cosines of degrees
+are exact at multiples of 90. Positions are rounded to 1 micrometre, angles to 1 nanoradian.
 
-Says what may go beyond plain vehicles on flat ground, and in which order it is asked.
-
-An extension may bring traffic of its own (a further route file of the same simulation), have types of vehicles that do
-not count as the scenario's vehicles, and change boxes before they are written. Those that act are passed into the
-recording and the writing of trajectories, which know none of them by name.
-
-Order: :meth:`~TrafficHook.refuses` before anything is laid out; :meth:`~TrafficHook.plan` while SUMO's folder
-is; :meth:`~TrafficHook.box_change` once the types' sizes are known; then each group of frames passes through the
-changes, in the order of the extensions.
+An extension (:class:`TrafficHook`) may add traffic to the simulation, have vehicle types that do not count as vehicles
+of the scenario, and change boxes. Order: :meth:`~TrafficHook.scenario_error` before the simulation is prepared;
+:meth:`~TrafficHook.plan` while it is prepared; :meth:`~TrafficHook.box_change` when the sizes are known; then each
+group of frames passes through the changes, in the order of the extensions.
 """
 
 from __future__ import annotations
@@ -31,7 +24,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from egvs.artefacts.traffic_frames import MAX_BOX_M, MIN_BOX_M
+from egvs.artefacts.frame_boxes import MAX_BOX_M, MIN_BOX_M
 from egvs.core.errors import InputError
 from egvs.traffic.fcd import FrameGroup
 
@@ -44,6 +37,7 @@ _POSITION_DIGITS, _ANGLE_DIGITS = 6, 9
 _NUMBERS = ("x_m", "y_m", "z_m", "yaw_rad", "pitch_rad", "length_m", "width_m", "height_m")
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+_SIZE_KEYS = ("length_m", "width_m", "height_m")
 
 
 @dataclass(frozen=True)
@@ -58,14 +52,39 @@ class VehicleSize:
 
 @dataclass(frozen=True)
 class VehicleBoxes:
-    """Vehicle boxes of consecutive frames, sorted by frame, then vehicle. Arrays have one element a row."""
+    """Boxes of vehicles in consecutive frames, sorted by frame, then vehicle.
+
+    Attributes
+    ----------
+    first_frame, frames
+        The frames.
+    frame
+        Frame of each box, shape (n,), as all arrays.
+    names, code
+        Names of vehicles, sorted, and position of each box's name among them.
+    kinds, kind
+        vClasses, sorted, and position of each box's vClass among them.
+    x_m, y_m, z_m
+        Centre.
+    yaw_rad, pitch_rad
+        Orientation.
+    length_m, width_m, height_m
+        Size.
+    speed_m_s
+        Speed; NaN if unknown.
+    types, type_code
+        SUMO's vehicle types, sorted, and position of each box's type among them.
+    part
+        0, or 1, 2, ... for the rear parts of an articulated vehicle; None if every vehicle is one box.
+    uncounted
+        Whether a box does not count as a vehicle of the scenario (pedestrians, bicycles); None if all count.
+    """
 
     first_frame: int
     frames: int
     frame: Ints
     names: list[str]
     code: Ints
-    """Position in ``names``, which is sorted."""
     kinds: list[str]
     kind: Ints
     x_m: Floats
@@ -77,30 +96,26 @@ class VehicleBoxes:
     width_m: Floats
     height_m: Floats
     speed_m_s: Floats
-    """NaN where unknown."""
     types: list[str] = field(default_factory=list)
     type_code: Ints = field(default_factory=lambda: np.empty(0, np.int64))
-    """Position in ``types``, SUMO's vehicle types."""
     part: Ints | None = None
-    """0, or 1.. for the rear parts of an articulated vehicle; None where every vehicle is one box."""
     uncounted: NDArray[np.bool_] | None = None
-    """Who does not count as the scenario's vehicle (an extension's pedestrians, bicycles); None where all count."""
 
     def rows(self, index: Ints) -> dict[str, Any]:
-        """The arrays that have one element a row, at ``index``."""
+        """Return all arrays at some positions, by name."""
         arrays = {name: value for name, value in self.__dict__.items() if isinstance(value, np.ndarray)}
         return {name: value[index] for name, value in arrays.items()}
 
     def select(self, mask: NDArray[np.bool_]) -> VehicleBoxes:
-        """Some of the rows."""
+        """Return some of the boxes."""
         return replace(self, **self.rows(np.flatnonzero(mask)))
 
     def columns(self, first_frame: int = 0) -> dict[str, Any]:
-        """As the artefact ``trajectories`` has them, counted from ``first_frame`` on."""
-        n = self.frame.size
+        """Return the columns of the artefact ``trajectories``; ``first_frame`` is added to the frame numbers."""
+        part = np.zeros(self.frame.size, np.int64) if self.part is None else self.part
         return {
             "frame": (self.frame + first_frame).astype(np.uint32),
-            "part": np.zeros(n, np.uint8) if self.part is None else self.part.astype(np.uint8),
+            "part": part.astype(np.uint8),
             "vehicle": _decode_strings(self.names, self.code),
             "kind": _decode_strings(self.kinds, self.kind),
             **{name: getattr(self, name) for name in _NUMBERS},
@@ -114,47 +129,88 @@ def boxes_from_bumpers(
     where: str,
     uncounted_types: frozenset[str] = frozenset(),
 ) -> VehicleBoxes:
-    """The boxes of a group of whole frames. Those of ``uncounted_types`` do not count as vehicles of the scenario.
+    """Compute the boxes of a group of frames.
 
-    InputError when a vehicle is of a type without a size that a vehicle has, or is twice in a frame.
+    Parameters
+    ----------
+    group
+        FCD rows.
+    sizes
+        Size of each vehicle type.
+    period_s
+        Time between frames, from which missing speeds are computed.
+    where
+        Source of the rows, for messages.
+    uncounted_types
+        Types that do not count as vehicles of the scenario.
+
+    Raises
+    ------
+    InputError
+        When a type has no size, or an implausible one, or a vehicle is twice in a frame.
     """
     names, code = _sorted_codes(group.rows["id"])
     types, type_code = _sorted_codes(group.rows["type"])
-    for name in (name for name in types if name not in sizes):
-        right = f"a kind of that name with length_m, width_m and height_m (known: {', '.join(sorted(sizes))})"
-        raise InputError(where, f"vehicle type {name!r} has no known size", right)
-    for name in types:
-        for key in ("length_m", "width_m", "height_m"):
-            if not MIN_BOX_M <= (size_m := getattr(sizes[name], key)) <= MAX_BOX_M:
-                what = f"vehicle type {name!r} has {key} = {size_m:g}"
-                raise InputError(where, what, f"at least {MIN_BOX_M} m, at most {MAX_BOX_M:g} m")
+    _check_sizes(types, sizes, where)
+
     order = np.lexsort((code, group.frame))
     frame, code, type_code = group.frame[order], code[order], type_code[order]
-    twice = np.flatnonzero((np.diff(frame) == 0) & (np.diff(code) == 0))
-    if twice.size:
-        what = f"vehicle {names[code[twice[0]]]!r} is twice in frame {frame[twice[0]]}"
-        raise InputError(where, what, "one row a vehicle a frame")
+    duplicates = np.flatnonzero((np.diff(frame) == 0) & (np.diff(code) == 0))
+    if duplicates.size:
+        row = duplicates[0]
+        problem = f"vehicle {names[code[row]]!r} is twice in frame {frame[row]}"
+        raise InputError(where, problem, "Write one row per vehicle and frame.")
+
     kinds = sorted({sizes[name].vclass for name in types})
     kind = np.array([kinds.index(sizes[name].vclass) for name in types], dtype=np.int64)[type_code]
     length, width, height = (
-        np.array([getattr(sizes[name], key) for name in types], dtype=np.float64)[type_code]
-        for key in ("length_m", "width_m", "height_m")
+        np.array([getattr(sizes[name], key) for name in types], dtype=np.float64)[type_code] for key in _SIZE_KEYS
     )
     keys = ("x", "y", "z", "angle", "slope", "speed")
     x, y, z, angle, slope, speed = (group.rows[key].to_numpy()[order] for key in keys)
-    uncounted = np.array([name in uncounted_types for name in types], dtype=np.bool_)
-    poses = *box_centres(x, y, z, angle, slope, length, height), yaw_from_angle(angle), round_rad(np.deg2rad(slope))
+    centre = box_centres(x, y, z, angle, slope, length, height)
+    yaw, pitch = yaw_from_angle(angle), round_rad(np.deg2rad(slope))
+    uncounted = np.array([name in uncounted_types for name in types], dtype=np.bool_)[type_code]
     boxes = VehicleBoxes(
-        group.first_frame, group.frames, frame, names, code, kinds, kind, *poses, length, width, height, speed,
-        types, type_code, uncounted=uncounted[type_code] if uncounted_types else None,
+        group.first_frame, group.frames, frame, names, code, kinds, kind, *centre, yaw, pitch, length, width, height,
+        speed, types, type_code, uncounted=uncounted if uncounted_types else None,
     )  # fmt: skip
-    return boxes if not np.isnan(speed).any() else _fill_speeds(boxes, period_s)
+    return _fill_speeds(boxes, period_s) if np.isnan(speed).any() else boxes
+
+
+def _check_sizes(types: list[str], sizes: Mapping[str, VehicleSize], where: str) -> None:
+    """Raise an InputError if a type has no size, or one that no vehicle has."""
+    for name in types:
+        if name not in sizes:
+            known = ", ".join(sorted(sizes))
+            hint = f"Add a kind of that name with length_m, width_m and height_m (known: {known})."
+            raise InputError(where, f"the size of vehicle type {name!r} is unknown", hint)
+        for key in _SIZE_KEYS:
+            value_m = getattr(sizes[name], key)
+            if not MIN_BOX_M <= value_m <= MAX_BOX_M:
+                problem = f"vehicle type {name!r} has {key} = {value_m:g}"
+                raise InputError(where, problem, f"Use at least {MIN_BOX_M} m and at most {MAX_BOX_M:g} m.")
 
 
 def box_centres(
     x: Floats, y: Floats, z: Floats, angle_deg: Floats, slope_deg: Floats, length_m: Floats, height_m: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Front bumpers (n,) -> box centres (n,), metres, rounded to 1 micrometre."""
+    """Compute box centres from front bumpers.
+
+    Parameters
+    ----------
+    x, y, z
+        Front bumper, shape (n,), metres.
+    angle_deg, slope_deg
+        Clockwise from north; positive uphill.
+    length_m, height_m
+        Size.
+
+    Returns
+    -------
+    tuple of ndarray
+        x, y and z, metres, rounded to 1 micrometre.
+    """
     from scipy.special import cosdg, sindg
 
     half, flat = length_m / 2, cosdg(slope_deg)
@@ -166,38 +222,38 @@ def box_centres(
 
 
 def yaw_from_angle(angle_deg: Floats) -> Floats:
-    """Degrees clockwise from north -> radians counter-clockwise from +x, in (-pi, pi], rounded to 1 nanoradian."""
+    """Convert degrees clockwise from north to radians counter-clockwise from +x, in (-pi, pi], rounded."""
     degrees = 90.0 - np.asarray(angle_deg, dtype=np.float64)
     degrees = degrees - 360.0 * np.ceil((degrees - 180.0) / 360.0)
     rounded = round_rad(np.deg2rad(degrees))
-    # pi itself lies between two nanoradians, and the upper one is outside the interval
+    # pi rounded up to nanoradians is outside the interval
     return np.where(np.abs(rounded) > np.pi, np.pi, rounded)
 
 
 def round_m(values: Floats) -> Floats:
-    """Metres as trajectories have them: rounded to 1 micrometre, without negative zeros."""
+    """Round metres to 1 micrometre, without negative zeros."""
     return np.round(values, _POSITION_DIGITS) + 0.0
 
 
 def round_rad(values: Floats) -> Floats:
-    """Radians as trajectories have them: rounded to 1 nanoradian, without negative zeros."""
+    """Round radians to 1 nanoradian, without negative zeros."""
     return np.round(values, _ANGLE_DIGITS) + 0.0
 
 
 def _fill_speeds(boxes: VehicleBoxes, period_s: float) -> VehicleBoxes:
-    """Fill speeds that the file does not give from the way to the next frame, or else from the last one."""
+    """Fill in missing speeds from the distance to the next frame, or else from the previous one."""
     order = np.lexsort((boxes.frame, boxes.code))
     follows = (np.diff(boxes.code[order]) == 0) & (np.diff(boxes.frame[order]) == 1)
-    way = np.hypot(np.diff(boxes.x_m[order]), np.diff(boxes.y_m[order])) / period_s
-    way = np.where(follows, way, np.nan)
-    onward, back = np.append(way, np.nan), np.insert(way, 0, np.nan)
+    step = np.hypot(np.diff(boxes.x_m[order]), np.diff(boxes.y_m[order])) / period_s
+    step = np.where(follows, step, np.nan)
+    to_next, from_previous = np.append(step, np.nan), np.insert(step, 0, np.nan)
     speed = np.empty(order.size)
-    speed[order] = np.where(np.isnan(onward), back, onward)
+    speed[order] = np.where(np.isnan(to_next), from_previous, to_next)
     return replace(boxes, speed_m_s=np.where(np.isnan(boxes.speed_m_s), speed, boxes.speed_m_s))
 
 
 def _sorted_codes(column: pa.ChunkedArray) -> tuple[list[str], Ints]:
-    """Different values, sorted by code point, and each row's position among them."""
+    """Return the distinct values, sorted by code point, and the position of each row's value among them."""
     encoded = column.combine_chunks().dictionary_encode()
     if isinstance(encoded, pa.ChunkedArray):
         encoded = encoded.combine_chunks()
@@ -214,16 +270,16 @@ def _decode_strings(values: list[str], code: Ints) -> pa.Array:
 
 @dataclass(frozen=True)
 class ExtraTraffic:
-    """Traffic beside the scenario's own.
+    """Traffic that an extension adds.
 
     Attributes
     ----------
     xml
         A route file.
     vehicles
-        How many of SUMO's vehicles it takes at most at a time: ``--max-num-vehicles`` holds that many more.
+        How many vehicles of SUMO it needs at most at a time; ``--max-num-vehicles`` is raised by it.
     notes
-        What the user should know.
+        Remarks for the user.
     """
 
     xml: str
@@ -235,42 +291,42 @@ class BoxChange(Protocol):
     """Changes the boxes of one recording, group by group; may remember the last group."""
 
     def change(self, boxes: VehicleBoxes) -> VehicleBoxes:
-        """The boxes of the next group, changed."""
+        """Return the boxes of the next group, changed."""
         ...
 
     def summary(self) -> dict[str, Any]:
-        """What the stage reports beside the counts, as JSON."""
+        """Return what the stage reports about the changes, as JSON."""
         ...
 
 
 class TrafficHook(Protocol):
-    """Something that goes beyond plain vehicles on flat ground. As it stands here, it changes nothing."""
+    """An extension of the traffic. The defaults change nothing."""
 
     ADDS_TRAFFIC: ClassVar[bool] = False
-    """Whether it has a :meth:`plan`; people on foot are recorded then."""
+    """Whether :meth:`plan` adds traffic; then persons are recorded, too."""
 
-    def refuses(self, scenario: Scenario) -> InputError | None:
-        """Why this scenario cannot have it; None when it can."""
+    def scenario_error(self, scenario: Scenario) -> InputError | None:
+        """Return an error if the extension does not support a scenario."""
         return None
 
     def sizes(self) -> dict[str, VehicleSize]:
-        """Sizes of the types of vehicles and persons that it adds."""
+        """Return the sizes of the types of vehicles and persons that it adds."""
         return {}
 
     def uncounted_types(self, sizes: Mapping[str, VehicleSize]) -> frozenset[str]:
-        """Which of SUMO's types are no vehicles of the scenario."""
+        """Return the types that do not count as vehicles of the scenario."""
         return frozenset()
 
     def followed_types(self, scenario: Scenario, sizes: Mapping[str, VehicleSize]) -> frozenset[str]:
-        """Types whose vehicles must be recorded all along their way, since a box depends on those before it."""
+        """Return the types whose vehicles must be recorded without gaps, because a box depends on earlier ones."""
         return frozenset()
 
     def plan(
         self, scenario: Scenario, roads: Network, begin_s: float, end_s: float, rng: np.random.Generator
     ) -> ExtraTraffic:
-        """The traffic that it adds between two times."""
+        """Return the traffic that it adds between two times."""
         return ExtraTraffic("<routes/>", 0)
 
     def box_change(self, scenario: Scenario, sizes: Mapping[str, VehicleSize]) -> BoxChange | None:
-        """What changes the boxes of a recording whose vehicles have these sizes; None for nothing."""
+        """Return the change of boxes for vehicles of these sizes, if any."""
         return None

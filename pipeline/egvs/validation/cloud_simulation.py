@@ -1,47 +1,46 @@
-r"""Point clouds with traffic in them: vehicle meshes, noise, intensity.
+r"""Point clouds of a static world with traffic: vehicle meshes, first hits, intensity, noise, lost returns.
 
-How bright a return is: what a diffuse surface sends back.
+The empty scan of *all* beams of a sensor is cast once; a frame then costs only the beams near its vehicles.
 
-.. math:: I = \rho \cos\theta, \quad 0 \le I \le 1
-
-with the surface's reflectivity :math:`\rho` and the angle of incidence :math:`\theta` (Lambert). A return's power also
-falls as :math:`1/r^2` (Höfle and Pfeifer 2007, ISPRS J. Photogramm. Remote Sens. 62(6), 415-433); sensors that report
-a calibrated reflectivity take that out again, as here. Gloss, retroreflectors and the wear of paint are left out.
-
-Reflectivities at 900 nm. From Wehr and Lohr (1999, ISPRS J. Photogramm. Remote Sens. 54, 68-82, table of typical
-reflectivities): asphalt with pebbles 17 %, smooth concrete 24 %, deciduous trees 60 %, black rubber of a tyre's wall 2
-%. Assumed: paint 45 %, between a dark vehicle (10 %) and a white one (80 %), one value for all; a window 10 %: glass
-mirrors most of what does not go through, and what returns comes from frames, dirt and seats; cloth 30 %.
-
-Vehicles and people as bodies: closed meshes that are stretched to the boxes of traffic.
-
-A body touches all six faces of its box and never leaves it. Those of the program are prisms across the vehicle, as
-``bodies.toml`` beside this module has them; a scenario may name a mesh of the user's for a kind (``[validation]
-bodies``). Which body a box gets goes by its SUMO vClass, as ``bodies.toml`` lists them; a box of several parts is a
-tractor with trailers, but for buses. Cars, and whatever is of no listed class, go by size:
-
-======================================================= ==========
-box                                                     body
-======================================================= ==========
-no longer than 3.4 m and no wider than 1.48 m (kei car) ``kei``
-no longer than 5.3 m, lower than 1.9 m                  ``sedan``
-no longer than 6.5 m                                    ``van``
-any other                                               ``truck``
-======================================================= ==========
-
-Makes the point cloud that a sensor takes of the static world with traffic in it.
-
-The empty scan of *all* beams of a sensor is cast once; a frame then costs the beams near its bodies alone.
-
-Steps for a frame: where effects weight beams, draw one row of each; hold beams against the bodies of all boxes, the
-nearest surface wins (:mod:`egvs.kernels.mesh_casting`); throw the dice of effects that lose returns; add noise to the
-ranges. A point lies where the sensor takes it to be: along the beam's nominal direction, at the measured range.
+Steps for a frame: where effects weight the sub-beams of a beam, draw one of them; intersect beams with the bodies of
+all boxes, of which the nearest surface wins (:mod:`egvs.kernels.mesh_casting`); drop returns that effects lose; add
+noise to the ranges. A point is where the sensor measures it: along the nominal direction of the beam, at the measured
+range.
 
 .. math:: p = (r + \sigma n)\, d_{sensor}, \quad n \sim N(0, 1)
 
-Frames: bodies and beams meet in the world's axes round the sensor, in float64; points come out in the sensor's frame.
+Frames: bodies and beams are intersected along the world's axes around the sensor, in float64; points are returned in
+the sensor's frame. Not modelled: the rotation of the sensor while vehicles move (a frame is one instant), mixed returns
+at edges, second returns.
 
-Not modelled: the sensor turns while vehicles move (a frame is one instant); mixed returns at edges; a second return.
+**Intensity** of a return from a diffuse surface (Lambert), with reflectivity :math:`\rho` and angle of incidence
+:math:`\theta`:
+
+.. math:: I = \rho \cos\theta, \quad 0 \le I \le 1
+
+The power of a return also falls as :math:`1/r^2` (Höfle and Pfeifer 2007, ISPRS J. Photogramm. Remote Sens. 62(6),
+415-433); sensors that report a calibrated reflectivity correct for that, as here. Gloss, retroreflectors and worn paint
+are not modelled.
+
+Reflectivities at 900 nm are from Wehr and Lohr (1999, ISPRS J. Photogramm. Remote Sens. 54, 68-82, table of typical
+reflectivities): asphalt with pebbles 17 %, smooth concrete 24 %, deciduous trees 60 %, black rubber of a tyre's wall
+2 %. Assumed: paint 45 %, one value between a dark vehicle (10 %) and a white one (80 %); windows 10 %, because glass
+reflects specularly most of what it does not transmit, so that returns come from frames, dirt and seats; cloth 30 %.
+
+**Bodies** of vehicles and people are closed meshes that are scaled to the boxes of traffic. A body touches all six
+faces of its box and never leaves it. The built-in bodies are prisms across the vehicle, defined in ``bodies.toml``
+beside this module; a scenario may name a mesh file for a kind of body (``[validation] bodies``). ``bodies.toml`` also
+maps SUMO's vClasses to kinds. Articulated vehicles, except buses, are a tractor with trailers. Cars, and all vClasses
+that are not listed, get a kind by size:
+
+======================================================= ==========
+box                                                     kind
+======================================================= ==========
+up to 3.4 m long and 1.48 m wide (kei car)              ``kei``
+up to 5.3 m long, lower than 1.9 m                      ``sedan``
+up to 6.5 m long                                        ``van``
+any other                                               ``truck``
+======================================================= ==========
 """
 
 from __future__ import annotations
@@ -60,6 +59,7 @@ from numpy.typing import NDArray
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core import files
 from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray, IntArray
 from egvs.effects.base import Detect
 from egvs.formats import meshes
 from egvs.kernels import mesh_casting
@@ -74,95 +74,122 @@ from egvs.world.ray_casting import EmptyScan
 REFLECTIVITY = {"paint": 0.45, "glass": 0.10, "tyre": 0.02, "cloth": 0.30, "ground": 0.17, "leaves": 0.60, "wall": 0.24}
 
 _SOLID_SURFACES = {"ground": "ground", "tree_crown": "leaves"}
-"""Kinds of solids that are no walls."""
-
-
-def solid_reflectivity(kinds: Iterable[str]) -> NDArray[np.float64]:
-    """The reflectivity of each solid of the static world, (solids,)."""
-    return np.array([REFLECTIVITY[_SOLID_SURFACES.get(kind, "wall")] for kind in kinds], dtype=np.float64)
-
+"""Kinds of solids that do not reflect like walls."""
 
 BODIES_FILE = Path(__file__).with_name("bodies.toml")
+
 MAX_TRIANGLES = 5000
-"""Of a user's mesh; each beam near a body is held against it."""
+"""Largest number of triangles of a user's mesh; each beam near a body is tested against all of them."""
 
-Floats = NDArray[np.float64]
+_OCTAGON = np.array([(1, 0), (0.5**0.5, 0.5**0.5), (0, 1), (-(0.5**0.5), 0.5**0.5)])
+_OCTAGON = np.concatenate([_OCTAGON, -_OCTAGON])
+"""Outline of a wheel of radius 1."""
 
-_WHEEL = np.array([(1, 0), (0.5**0.5, 0.5**0.5), (0, 1), (-(0.5**0.5), 0.5**0.5)])
-_WHEEL = np.concatenate([_WHEEL, -_WHEEL])
-_GROUP = 16  # triangles of a user's mesh that share a box
+_TRIANGLES_PER_PART = 16
+"""Triangles of a user's mesh that share a bounding box."""
+
 _BY_SIZE = "by size"
-_KEI_M = 3.4, 1.48  # the largest length and width of Japan's class of light vehicles
+_KEI_LENGTH_M, _KEI_WIDTH_M = 3.4, 1.48  # limits of Japan's class of light vehicles
 _ROUNDING = 1e-9
+
+_NOT_DRAWN_M = -1.0
+"""Range of a row that was not drawn: the kernel never replaces a negative range."""
+
+_WEIGHT_TOLERANCE = 1e-9
+"""Weights of a beam that sum to 1 up to this sum to 1."""
+
+
+def solid_reflectivity(kinds: Iterable[str]) -> FloatArray:
+    """Return the reflectivity of each solid of the static world, (solids,)."""
+    return np.array([REFLECTIVITY[_SOLID_SURFACES.get(kind, "wall")] for kind in kinds], dtype=np.float64)
 
 
 @dataclass(frozen=True)
 class MeshPart:
-    """A piece of a body that is closed and faces outwards, or some triangles of a user's mesh: corners (m, 3, 3) in the
-    unit box round zero."""
+    """A part of a body.
 
-    triangles: Floats
+    Attributes
+    ----------
+    triangles
+        Corners of its triangles in the unit box around 0, (m, 3, 3) float64.
+    surface
+        Key of :data:`REFLECTIVITY`.
+    closed
+        Whether the triangles enclose a volume and face outwards.
+    """
+
+    triangles: FloatArray
     surface: str
     closed: bool = True
 
 
 @dataclass(frozen=True)
 class VehicleMeshes:
-    """The bodies of all kinds, as :func:`egvs.kernels.mesh_casting.cast_meshes` takes them (``shapes``)."""
+    """The bodies of all kinds, in the form that :func:`egvs.kernels.mesh_casting.cast_meshes` takes (``shapes``)."""
 
     kinds: tuple[str, ...]
-    shapes: tuple[NDArray[np.int64], Floats, NDArray[np.bool_], NDArray[np.int64], Floats, Floats, Floats]
+    shapes: tuple[IntArray, FloatArray, NDArray[np.bool_], IntArray, FloatArray, FloatArray, FloatArray]
 
     @classmethod
-    def of(cls, parts: Mapping[str, tuple[MeshPart, ...]]) -> VehicleMeshes:
-        """From the parts of each kind."""
-        every = [part for several in parts.values() for part in several]
-        triangles = np.concatenate([part.triangles for part in every])
-        cornered = triangles.copy()
-        cornered[:, 1:] -= triangles[:, :1]
-        crosses = np.sqrt((np.cross(cornered[:, 1], cornered[:, 2]) ** 2).sum(axis=1))
-        lengths = [len(part.triangles) for part in every]
-        boxes = [np.append(part.triangles.min(axis=(0, 1)), part.triangles.max(axis=(0, 1))) for part in every]
-        closed = np.array([part.closed for part in every])
-        pad = np.repeat([-_ROUNDING, _ROUNDING], 3)
-        reflectivity = np.repeat([REFLECTIVITY[part.surface] for part in every], lengths)
-        starts, ends = (np.cumsum([0, *counts]) for counts in ([len(several) for several in parts.values()], lengths))
-        return cls(tuple(parts), (starts, np.array(boxes) + pad, closed, ends, cornered, crosses, reflectivity))
+    def from_parts(cls, parts_by_kind: Mapping[str, tuple[MeshPart, ...]]) -> VehicleMeshes:
+        """Prepare the parts of each kind of body."""
+        parts = [part for kind_parts in parts_by_kind.values() for part in kind_parts]
+        sides = np.concatenate([part.triangles for part in parts])
+        corners = sides[:, :1].copy()
+        sides[:, 1:] -= corners
+        normal_lengths = np.sqrt((np.cross(sides[:, 1], sides[:, 2]) ** 2).sum(axis=1))
+        boxes = [np.append(part.triangles.min(axis=(0, 1)), part.triangles.max(axis=(0, 1))) for part in parts]
+        padding = np.repeat([-_ROUNDING, _ROUNDING], 3)
+        closed = np.array([part.closed for part in parts])
 
-    def of_frame(self, frame: TrafficFrame) -> NDArray[np.int64]:
-        """The kind of each box of a frame, (n,)."""
-        several = frame.several_parts()
-        names = (
-            body_kind(vclass, size, part, jointed)
-            for vclass, size, part, jointed in zip(
-                frame.kinds, frame.boxes[:, 3:6].tolist(), frame.part.tolist(), several.tolist(), strict=True
-            )
-        )
-        return np.array([self.kinds.index(name) for name in names], dtype=np.int64)
+        triangle_counts = [len(part.triangles) for part in parts]
+        reflectivity = np.repeat([REFLECTIVITY[part.surface] for part in parts], triangle_counts)
+        part_starts = np.cumsum([0, *(len(kind_parts) for kind_parts in parts_by_kind.values())])
+        triangle_starts = np.cumsum([0, *triangle_counts])
+        shapes = (part_starts, np.array(boxes) + padding, closed, triangle_starts, sides, normal_lengths, reflectivity)
+        return cls(tuple(parts_by_kind), shapes)
+
+    def kinds_of_boxes(self, frame: TrafficFrame) -> IntArray:
+        """Return the index in :attr:`kinds` of each box of a frame, (n,)."""
+        articulated = frame.several_parts().tolist()
+        sizes_m = frame.boxes[:, 3:6].tolist()
+        indices = []
+        for row, vclass in enumerate(frame.kinds):
+            kind = body_kind(vclass, sizes_m[row], int(frame.part[row]), articulated[row])
+            indices.append(self.kinds.index(kind))
+        return np.array(indices, dtype=np.int64)
 
 
-def body_kind(vclass: str, size_m: list[float], part: int = 0, jointed: bool = False) -> str:
-    """The kind of body that a box gets.
+def body_kind(vclass: str, size_m: list[float], part: int = 0, articulated: bool = False) -> str:
+    """Return the kind of body of a box.
 
     Parameters
     ----------
-    vclass, size_m
-        SUMO's vClass; length, width, height.
-    part, jointed
-        0, or the number of a rear part; whether its vehicle has several parts.
+    vclass
+        SUMO's vClass.
+    size_m
+        Length, width, height.
+    part
+        0 for the front part of a vehicle, 1.. for rear parts.
+    articulated
+        Whether the vehicle has several parts.
     """
-    named = str(_read_bodies_file()["classes"].get(vclass, _BY_SIZE))
-    if jointed and named != "bus":
+    kind = str(_read_bodies_file()["classes"].get(vclass, _BY_SIZE))
+    if articulated and kind != "bus":
         return "trailer" if part else "tractor"
-    return _kind_by_size(*size_m) if named == _BY_SIZE else named
+    if kind == _BY_SIZE:
+        return _kind_by_size(*size_m)
+    return kind
 
 
 def _kind_by_size(length_m: float, width_m: float, height_m: float) -> str:
-    if length_m <= _KEI_M[0] + _ROUNDING and width_m <= _KEI_M[1] + _ROUNDING:
+    if length_m <= _KEI_LENGTH_M + _ROUNDING and width_m <= _KEI_WIDTH_M + _ROUNDING:
         return "kei"
     if length_m <= 5.3 and height_m < 1.9:
         return "sedan"
-    return "van" if length_m <= 6.5 else "truck"
+    if length_m <= 6.5:
+        return "van"
+    return "truck"
 
 
 @cache
@@ -173,150 +200,165 @@ def _read_bodies_file() -> dict[str, Any]:
 
 @cache
 def builtin_bodies() -> Mapping[str, tuple[MeshPart, ...]]:
-    """The program's own bodies by kind: closed parts in the unit box."""
-    return {
-        kind: tuple(_prism_parts(entry["parts"])) for kind, entry in _read_bodies_file().items() if kind != "classes"
-    }
-
-
-def drawn_size_m(kind: str) -> tuple[float, float, float]:
-    """The box that a body of the program was drawn for."""
-    length, width, height = _read_bodies_file()[kind]["size_m"]
-    return length, width, height
+    """Return the closed parts of each built-in body, by kind."""
+    kinds = {kind: entry for kind, entry in _read_bodies_file().items() if kind != "classes"}
+    return {kind: tuple(_prism_parts(entry["parts"])) for kind, entry in kinds.items()}
 
 
 def vehicle_meshes(scenario: Scenario) -> VehicleMeshes:
-    """The bodies that a scenario's clouds are made with; InputError as :func:`body_parts`."""
-    return VehicleMeshes.of(body_parts(scenario))
+    """Return the bodies of a scenario; raises an InputError as :func:`body_parts`."""
+    return VehicleMeshes.from_parts(body_parts(scenario))
 
 
 def body_parts(scenario: Scenario) -> Mapping[str, tuple[MeshPart, ...]]:
-    """The parts of each kind of body that a scenario's clouds are made with.
+    """Return the parts of each kind of body of a scenario.
 
     Raises
     ------
     InputError
-        Where a mesh that it names is missing, or no body.
+        If a mesh file that it names is missing or not usable.
     """
     parts = dict(builtin_bodies())
     for kind, name in scenario.validation.bodies.items():
-        place = f"validation.bodies.{kind}"
-        parts[kind] = read_body(scenario.find(name, place), place)
+        key = f"validation.bodies.{kind}"
+        parts[kind] = read_body(scenario.find(name, key), key)
     return parts
 
 
 def hash_body_files(scenario: Scenario) -> dict[str, str]:
-    """The files that bodies come from, by sha256: what clouds depend on beside the program's source."""
+    """Return the sha256 of each file that defines bodies, for cache keys."""
     hashes = {BODIES_FILE.name: files.hash_file(BODIES_FILE)}
     for kind, name in scenario.validation.bodies.items():
         hashes |= meshes.mesh_digests(scenario.find(name, f"validation.bodies.{kind}"), name)
     return hashes
 
 
-def read_body(path: Path, location: str) -> tuple[MeshPart, ...]:
-    """A user's mesh as a body, all of it paint, in the unit box; ``location`` names it in messages.
+def read_body(path: Path, where: str) -> tuple[MeshPart, ...]:
+    """Read a user's mesh as a painted body in the unit box.
+
+    Parameters
+    ----------
+    path
+        The mesh file.
+    where
+        The key that names it, for messages.
 
     Raises
     ------
     InputError
-        When it cannot be read, holds no triangles or too many, is flat, or has corners that are no numbers.
+        If the file cannot be read, or contains no triangles, too many, a flat mesh, or corners that are not finite.
     """
-    location = f"{location}: {path}"
-    mesh = meshes.load_mesh(path, location)
+    where = f"{where}: {path}"
+    mesh = meshes.load_mesh(path, where)
     if len(mesh.faces) > MAX_TRIANGLES:
-        raise InputError(location, f"has {len(mesh.faces):,} triangles", f"at most {MAX_TRIANGLES:,}; simplify it")
+        problem = f"expected at most {MAX_TRIANGLES:,} triangles, got {len(mesh.faces):,}"
+        raise InputError(where, problem, "Simplify the mesh")
     triangles = np.asarray(mesh.vertices, dtype=np.float64)[mesh.faces]
     if not np.isfinite(triangles).all():
-        raise InputError(location, "a triangle has a corner that is no number", "finite coordinates")
-    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
-    if flat := ["xyz"[axis] for axis in range(3) if not high[axis] > low[axis]]:
-        raise InputError(location, f"has no extent along {', '.join(flat)}", "a body with length, width and height")
+        raise InputError(where, "a corner of a triangle is not finite", "Use finite coordinates")
+    low = triangles.min(axis=(0, 1))
+    high = triangles.max(axis=(0, 1))
+    flat_axes = ["xyz"[axis] for axis in range(3) if not high[axis] > low[axis]]
+    if flat_axes:
+        problem = f"the mesh has no extent along {', '.join(flat_axes)}"
+        raise InputError(where, problem, "Use a mesh with a length, a width and a height")
+
     unit = np.clip((triangles - low) / (high - low), 0.0, 1.0) - 0.5
-    order = np.lexsort(np.floor(unit.mean(axis=1) * 4).T)
-    return tuple(MeshPart(unit[order[i : i + _GROUP]], "paint", closed=False) for i in range(0, len(order), _GROUP))
+    unit = unit[np.lexsort(np.floor(unit.mean(axis=1) * 4).T)]  # neighbours share a part, so that its box is small
+    starts = range(0, len(unit), _TRIANGLES_PER_PART)
+    return tuple(MeshPart(unit[start : start + _TRIANGLES_PER_PART], "paint", closed=False) for start in starts)
 
 
 def _prism_parts(entries: list[dict[str, Any]]) -> Iterator[MeshPart]:
-    """The prisms of a body."""
+    """Yield the prisms of a built-in body."""
     for entry in entries:
         if "wheel" in entry:
-            x, along, up = entry["wheel"]
-            profile = _WHEEL * (along, up) + (x, up)
+            x, length, height = entry["wheel"]
+            outline = _OCTAGON * (length, height) + (x, height)
         else:
-            profile = np.array(entry["profile"], dtype=np.float64)
-        corners = profile - 0.5
-        right, left = entry["y"] if "y" in entry else (-np.asarray(entry["half"]), np.asarray(entry["half"]))
-        yield MeshPart(_prism(corners, right, left), entry["surface"])
+            outline = np.array(entry["profile"], dtype=np.float64)
+        outline = outline - 0.5
+        if "y" in entry:
+            right, left = entry["y"]
+        else:
+            left = np.asarray(entry["half"])
+            right = -left
+        yield MeshPart(_prism(outline, right, left), entry["surface"])
         if entry.get("mirrored"):
-            yield MeshPart(_prism(corners, -left, -right), entry["surface"])
+            yield MeshPart(_prism(outline, -left, -right), entry["surface"])
 
 
-def _prism(profile: Floats, right: Floats | float, left: Floats | float) -> Floats:
-    """A closed prism across a vehicle, its triangles facing outwards, (4 n - 4, 3, 3)."""
-    n = len(profile)
-    near, far = (np.column_stack([profile[:, 0], np.broadcast_to(y, n), profile[:, 1]]) for y in (right, left))
-    fan, after = np.arange(1, n - 1), np.roll(np.arange(n), -1)
-    # Seen from the right (-y), x to the right and z up, the profile runs counter-clockwise.
-    faces = [(near[0], near[i], near[i + 1]) for i in fan] + [(far[0], far[i + 1], far[i]) for i in fan]
-    faces += [(near[i], far[i], far[after[i]]) for i in range(n)] + [
-        (near[i], far[after[i]], near[after[i]]) for i in range(n)
-    ]
+def _prism(outline: FloatArray, right: FloatArray | float, left: FloatArray | float) -> FloatArray:
+    """Return the triangles of a closed prism across a vehicle, facing outwards, (4 n - 4, 3, 3).
+
+    The outline (n, 2) has x and z; from the right side (-y), with x to the right and z up, it is counter-clockwise.
+    ``right`` and ``left`` are the y of each corner, or of all.
+    """
+    n = len(outline)
+    near = np.column_stack([outline[:, 0], np.broadcast_to(right, n), outline[:, 1]])
+    far = np.column_stack([outline[:, 0], np.broadcast_to(left, n), outline[:, 1]])
+    following = np.roll(np.arange(n), -1)
+    faces = [(near[0], near[i], near[i + 1]) for i in range(1, n - 1)]
+    faces += [(far[0], far[i + 1], far[i]) for i in range(1, n - 1)]
+    faces += [(near[i], far[i], far[following[i]]) for i in range(n)]
+    faces += [(near[i], far[following[i]], near[following[i]]) for i in range(n)]
     return np.array(faces)
 
 
-Ints = NDArray[np.int64]
-
-_NOT_DRAWN_M = -1.0
-"""The range of a row that was not drawn: nothing is nearer."""
-
-_WEIGHT_TOLERANCE = 1e-9
-"""Weights of a beam that leave no more than this over are all of it."""
-
-
 def sweep_rng(seed: int, site: str, frame: int) -> np.random.Generator:
-    """The random numbers of one sweep: of a site, by its name, in a frame; whatever other sweeps are made, and when."""
+    """Return the random generator of one sweep; it depends on no other sweep.
+
+    Parameters
+    ----------
+    seed
+        Seed of the scenario.
+    site
+        Name of the site.
+    frame
+        Number of the frame.
+    """
     return np.random.default_rng(np.random.SeedSequence((seed, zlib.crc32(site.encode()), frame)))
 
 
 def check_no_measured_scan(site: Site) -> None:
-    """InputError for a site with a measured scan, which does not tell what met nothing."""
+    """Raise an InputError for a site with a measured scan, which does not contain the beams without a return."""
     if site.points is not None:
-        found = f"an empty scan that was measured ({site.points}), which does not tell beams that met nothing"
-        raise InputError(f"site {site.name}", found, "a site without points, whose empty scan is simulated")
+        problem = f"its empty scan was measured ({site.points}), and does not contain the beams without a return"
+        raise InputError(f"site {site.name}", problem, "Use a site without points, so that its empty scan is simulated")
 
 
 @dataclass(frozen=True)
 class FirstHits:
-    """What beams meet first, one element a row of the empty scan (a beam, where no effect weights beams).
+    """What the beams hit first, one element per row of the empty scan (a beam, or a sub-beam where effects add some).
 
     Attributes
     ----------
     range_m
-        Without noise; infinite where nothing was met, negative for a row that was not drawn, (n,) float64.
+        Range without noise, (n,) float64; infinite without a hit, negative for a row that was not drawn.
     owner
         Row of the frame's boxes, -1 for the static world, (n,) int32.
     intensity
-        (n,) float64.
+        From 0 to 1, (n,) float64.
     """
 
-    range_m: Floats
+    range_m: FloatArray
     owner: NDArray[np.int32]
-    intensity: Floats
+    intensity: FloatArray
 
 
 class CloudSimulator:
-    """Point clouds of one sensor in one pose. Threads may share one.
+    """Simulates point clouds of one sensor at one pose. Threads may share one.
 
     Parameters
     ----------
     scene
-        The static world, and the effects that act.
+        The static world and its effects.
     pose, sensor, site
-        Where it stands, what it is, and its name.
+        Pose and sensor, and the name of the site.
     scanner
-        A ``Scanner(scene, whole=True)`` that several makers share; its own when None.
-    shapes
-        The bodies of traffic; the scenario's when None.
+        A ``Scanner(scene, full_sweep=True)`` that several simulators share; by default, a new one.
+    bodies
+        The bodies of traffic; by default, those of the scenario.
 
     Raises
     ------
@@ -331,18 +373,23 @@ class CloudSimulator:
         sensor: Sensor,
         site: str,
         scanner: Scanner | None = None,
-        shapes: VehicleMeshes | None = None,
+        bodies: VehicleMeshes | None = None,
     ) -> None:
         self._scanner = scanner or Scanner(scene, full_sweep=True)
         assert self._scanner.full_sweep
-        self._bodies = shapes or vehicle_meshes(scene.scenario)
+        self._bodies = bodies or vehicle_meshes(scene.scenario)
         self._detects = scene.acting(Detect)
+
         scan = self._scanner.scan(pose, sensor).rows
-        far = np.sqrt((scan.ends_m**2).sum(axis=1))
-        directions = scan.ends_m / far[:, None]
-        self._beam, self._returned, self._range_m = scan.beam.astype(np.int64), scan.returned, far
-        self._cumulated = None if scan.weight is None else _cumulate_weights(self._beam, scan.weight)
+        self._range_m = np.sqrt((scan.ends_m**2).sum(axis=1))
+        directions = scan.ends_m / self._range_m[:, None]
+        self._beam = scan.beam.astype(np.int64)
+        self._returned = scan.returned
+        self._cumulated_weight: FloatArray | None = None
+        if scan.weight is not None:
+            self._cumulated_weight = _cumulate_weights(self._beam, scan.weight)
         self._intensity = _static_intensity(self._scanner, scan, directions)
+
         cell = np.empty(len(directions), dtype=np.int64)
         mesh_casting.direction_cells(directions, cell)
         self._row = np.argsort(cell, kind="stable")
@@ -353,98 +400,105 @@ class CloudSimulator:
 
     @classmethod
     def of_site(
-        cls, scene: Scene, site: Site, scanner: Scanner | None = None, shapes: VehicleMeshes | None = None
+        cls, scene: Scene, site: Site, scanner: Scanner | None = None, bodies: VehicleMeshes | None = None
     ) -> CloudSimulator:
-        """Of a candidate site.
+        """Return the simulator of a candidate site.
 
         Raises
         ------
         InputError
-            Where no sensor can stand; or for a site with a measured scan, which does not tell what met nothing.
+            Where no sensor can stand, and for a site with a measured scan.
         """
         check_no_measured_scan(site)
-        return cls(scene, site.pose, scene.sensor(site.sensor, f"site {site.name}"), site.name, scanner, shapes)
+        return cls(scene, site.pose, scene.sensor(site.sensor, f"site {site.name}"), site.name, scanner, bodies)
 
-    def sweep(self, frame: TrafficFrame, random: np.random.Generator) -> LabelledSweep:
-        """The point cloud of one frame.
+    def sweep(self, frame: TrafficFrame, rng: np.random.Generator) -> LabelledSweep:
+        """Return the point cloud of one frame.
 
         Parameters
         ----------
         frame
-            Whose boxes stand as bodies. One that holds the sensor is left out, as in the effect moving_occlusion.
-        random
-            Of this sweep alone, see :func:`sweep_rng`.
+            The traffic. A box that contains the sensor is left out, as in the effect moving_occlusion.
+        rng
+            Generator of this sweep only, see :func:`sweep_rng`.
         """
-        rows = None if self._cumulated is None else self._drawn(self._cumulated, random)
-        hits = self.first_hits(frame, rows)
+        drawn = None
+        if self._cumulated_weight is not None:
+            drawn = self._draw_rows(self._cumulated_weight, rng)
+        hits = self.first_hits(frame, drawn)
         returned = (hits.owner >= 0) | self._returned
-        kept = np.flatnonzero(returned) if rows is None else rows[returned[rows]]
-        kept = self._noticed(kept, hits.range_m, random)
-        noise = self.view.sensor.range_sigma_m * random.standard_normal(len(kept), dtype=np.float32)
-        points = np.empty((len(kept), 4), dtype=np.float32)
-        mesh_casting.fill_returns(self._beam, kept, hits.range_m, noise, hits.intensity, self._nominal, points)
-        return LabelledSweep(Sweep(points, self._beam[kept].astype(np.uint32)), hits.owner[kept])
+        rows = np.flatnonzero(returned) if drawn is None else drawn[returned[drawn]]
+        rows = self._drop_lost_returns(rows, hits.range_m, rng)
+        noise = self.view.sensor.range_sigma_m * rng.standard_normal(len(rows), dtype=np.float32)
+        points = np.empty((len(rows), 4), dtype=np.float32)
+        mesh_casting.fill_returns(self._beam, rows, hits.range_m, noise, hits.intensity, self._nominal, points)
+        return LabelledSweep(Sweep(points, self._beam[rows].astype(np.uint32)), hits.owner[rows])
 
-    def first_hits(self, frame: TrafficFrame, rows: Ints | None = None) -> FirstHits:
-        """What the beams meet first, before dice and noise; of some rows of the empty scan, or of all."""
-        ranges = self._range_m.copy() if rows is None else np.full(len(self._range_m), _NOT_DRAWN_M)
-        if rows is not None:
-            ranges[rows] = self._range_m[rows]
-        owner, intensity = np.full(len(ranges), -1, dtype=np.int32), self._intensity.copy()
+    def first_hits(self, frame: TrafficFrame, rows: IntArray | None = None) -> FirstHits:
+        """Return the first hits of all rows of the empty scan, or of some, before losses and noise."""
+        if rows is None:
+            range_m = self._range_m.copy()
+        else:
+            range_m = np.full(len(self._range_m), _NOT_DRAWN_M)
+            range_m[rows] = self._range_m[rows]
+        owner = np.full(len(range_m), -1, dtype=np.int32)
+        intensity = self._intensity.copy()
         boxes = np.column_stack([frame.boxes, frame.pitch_rad])
         boxes[:, :3] -= self.view.pose.position_m
-        kinds = self._bodies.of_frame(frame)
-        shapes = self._bodies.shapes
+        kinds = self._bodies.kinds_of_boxes(frame)
         mesh_casting.cast_meshes(
-            self._directions, self._row, self._starts, boxes, kinds, shapes, ranges, intensity, owner
+            self._directions, self._row, self._starts, boxes, kinds, self._bodies.shapes, range_m, intensity, owner
         )
-        ranges[(owner < 0) & ~self._returned & (ranges >= 0.0)] = np.inf
-        return FirstHits(ranges, owner, intensity)
+        range_m[(owner < 0) & ~self._returned & (range_m >= 0.0)] = np.inf
+        return FirstHits(range_m, owner, intensity)
 
-    def _drawn(self, cumulated: Floats, random: np.random.Generator) -> Ints:
-        """One row of each beam, by weight; of a beam whose weights leave something over, perhaps none."""
+    def _draw_rows(self, cumulated_weight: FloatArray, rng: np.random.Generator) -> IntArray:
+        """Draw one row of each beam by weight; where the weights of a beam sum to less than 1, possibly none."""
         beams = np.arange(self.view.sensor.beams)
-        rows = np.searchsorted(cumulated, beams + random.random(len(beams)), side="right")
-        inside = rows < len(cumulated)
-        rows, beams = rows[inside], beams[inside]
-        drawn: Ints = rows[self._beam[rows] == beams]
+        rows = np.searchsorted(cumulated_weight, beams + rng.random(len(beams)), side="right")
+        inside = rows < len(cumulated_weight)
+        rows = rows[inside]
+        drawn: IntArray = rows[self._beam[rows] == beams[inside]]
         return drawn
 
-    def _noticed(self, rows: Ints, range_m: Floats, random: np.random.Generator) -> Ints:
-        """The rows whose return is noticed: a die each, where effects lose returns."""
+    def _drop_lost_returns(self, rows: IntArray, range_m: FloatArray, rng: np.random.Generator) -> IntArray:
+        """Return the rows whose return is detected, drawn by the probability that effects give it."""
         if not self._detects:
             return rows
-        chance = np.ones(len(rows))
+        probability = np.ones(len(rows))
         for effect in self._detects:
-            chance *= effect.detect(range_m[rows], self.view.sensor)
-        return rows[random.random(len(rows)) < chance]
+            probability *= effect.detect(range_m[rows], self.view.sensor)
+        return rows[rng.random(len(rows)) < probability]
 
-    def _empty_range_m(self, scan: EmptyScan, beams: int) -> Floats:
-        """Range of each beam of the sensor; of a beam with several rows, of that of the largest weight."""
-        found, ranges = np.full(beams, np.inf), np.where(self._returned, self._range_m, np.inf)
-        rows = np.arange(len(ranges)) if scan.weight is None else np.lexsort((-scan.weight, self._beam))
+    def _empty_range_m(self, scan: EmptyScan, beams: int) -> FloatArray:
+        """Return the range of each beam in the empty scan, of its sub-beam with the largest weight; (beams,)."""
+        row_ranges = np.where(self._returned, self._range_m, np.inf)
+        rows = np.arange(len(row_ranges)) if scan.weight is None else np.lexsort((-scan.weight, self._beam))
         _, first = np.unique(self._beam[rows], return_index=True)
-        found[self._beam[rows[first]]] = ranges[rows[first]]
-        return found
+        ranges = np.full(beams, np.inf)
+        ranges[self._beam[rows[first]]] = row_ranges[rows[first]]
+        return ranges
 
 
-def _cumulate_weights(beam: Ints, weight: Floats) -> Floats:
-    """Number of its beam plus the weights of its beam up to each row; ascending."""
+def _cumulate_weights(beam: IntArray, weight: FloatArray) -> FloatArray:
+    """Return, for each row, the number of its beam plus the weights of this beam up to the row; ascending."""
     total = np.cumsum(weight)
     first = np.flatnonzero(np.diff(beam, prepend=-1))
     before = np.repeat(total[first] - weight[first], np.diff(first, append=len(beam)))
-    within = total - before
-    within[np.abs(within - 1.0) < _WEIGHT_TOLERANCE] = 1.0
-    return beam.astype(np.float64) + np.minimum(within, 1.0)
+    within_beam = total - before
+    within_beam[np.abs(within_beam - 1.0) < _WEIGHT_TOLERANCE] = 1.0
+    return beam.astype(np.float64) + np.minimum(within_beam, 1.0)
 
 
-def _static_intensity(scanner: Scanner, scan: EmptyScan, directions: Floats) -> Floats:
-    """What the static world sends back along each row; of leaves, which look everywhere, at a cosine of 1/2."""
+def _static_intensity(scanner: Scanner, scan: EmptyScan, directions: FloatArray) -> FloatArray:
+    """Return the intensity of the static world along each row; leaves, of any orientation, have a cosine of 1/2."""
     assert scan.face is not None
-    world, on = scanner.opaque_world, scan.face >= 0
-    corners = world.triangles_m[scan.face[on]]
+    world = scanner.opaque_world
+    on_face = scan.face >= 0
+    corners = world.triangles_m[scan.face[on_face]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    cosine = np.abs((normals * directions[on]).sum(axis=1)) / np.sqrt((normals**2).sum(axis=1))
-    found = np.full(len(directions), 0.5 * REFLECTIVITY["leaves"])
-    found[on] = solid_reflectivity(kind for _, kind in world.solids)[world.solid_of_face[scan.face[on]]] * cosine
-    return found
+    cosine = np.abs((normals * directions[on_face]).sum(axis=1)) / np.sqrt((normals**2).sum(axis=1))
+    reflectivity = solid_reflectivity(kind for _, kind in world.solids)
+    intensity = np.full(len(directions), 0.5 * REFLECTIVITY["leaves"])
+    intensity[on_face] = reflectivity[world.solid_of_face[scan.face[on_face]]] * cosine
+    return intensity

@@ -1,57 +1,48 @@
-r"""Pearson, Spearman, Kendall with bootstrap intervals over sites.
+r"""Correlation of scores with measures of detection over sites: Pearson, Spearman, Kendall, with intervals.
 
-How well two lists of values go together: Pearson's r, Spearman's rho, Kendall's tau-b, for many resamples at once.
-
-Each is a cosine of two vectors that are made from one list each,
+**Coefficients.** Each is the cosine of two vectors, one per list of values,
 
 .. math:: c = \frac{\sum_k a_k b_k}{\sqrt{\sum_k a_k^2} \sqrt{\sum_k b_k^2}}
 
-- Pearson: a are the values less their mean.
-- Spearman: a are the ranks less their mean; equal values share the mean of their ranks.
+- Pearson: a are the values minus their mean.
+- Spearman: a are the ranks minus their mean; equal values share the mean of their ranks.
 - Kendall: a are the signs of the differences of all pairs; a pair of equal values has 0 (tau-b: Kendall, Biometrika 33,
   1945).
 
-So each list is prepared once, whatever it is compared with. A list whose values are all the same has no coefficient
-(NaN), and neither has one of fewer than three.
+So each list is standardised once, whatever it is compared with. The coefficient is undefined (NaN) for fewer than three
+values, and where all values of a list are equal.
 
-Makes intervals of 95 % from resamples, corrected for bias.
+**Resampling.** A correlation is uncertain in two ways: other sites could have been chosen, and other frames recorded. A
+resample draws n of the n sites with replacement (all sites of a pole together), and k of the k blocks of frames; the
+blocks are the same for all sites, because all sites see the same traffic. Scores are not resampled over frames: the
+uncertainty from their own traffic is not included.
 
-BC (Efron, Canadian Journal of Statistics 9, 1981; Efron and Tibshirani, "An Introduction to the Bootstrap", 1993,
-section 14.3, with the acceleration left at 0). With G the distribution of the resampled values, :math:`\hat\theta` the
-value itself and :math:`\Phi` the normal distribution,
-
-.. math:: z_0 = \Phi^{-1}(G(\hat\theta)), \qquad
-          [\,G^{-1}(\Phi(2 z_0 - 1.96)),\; G^{-1}(\Phi(2 z_0 + 1.96))\,]
-
-Values that equal :math:`\hat\theta` count half in G.
-
-What was found at the sites of a junction, and the same with sites and blocks of frames resampled.
-
-Two things make a correlation uncertain: which sites were looked at, and which frames. A resample draws n of the n sites
-with replacement (whole places, where several sites stand at one), and k of the k blocks of frames; the blocks are the
-same for all sites, for all see the same traffic.
-
-Average precision is not computed anew for each draw of blocks. It is linear enough in the blocks: with
+Average precision is not computed anew for each draw of blocks. It is close enough to linear in the blocks: with
 :math:`\theta_{(g)}` the measure without block g, :math:`\bar\theta` their mean, and block g drawn :math:`w_g` times,
 
 .. math:: \theta^* = \theta + \sqrt{\frac{k-1}{k}} \sum_g w_g (\bar\theta - \theta_{(g)})
 
-The root makes the variance over draws the jackknife's; without it the bootstrap's would be short by (k - 1) / k of k
-independent blocks (Efron and Tibshirani 1993, sections 11.5 and 20.3: the bootstrap of the jackknife's linear form).
+The root makes the variance over draws equal to the jackknife's; without it the variance would be (k - 1) / k of that of
+k independent blocks (Efron and Tibshirani 1993, sections 11.5 and 20.3: bootstrap of the jackknife's linear form).
 
-The scores are taken as they are. What their own traffic leaves open is no part of this.
+**Intervals** of 95 % are corrected for bias (BC: Efron, Canadian Journal of Statistics 9, 1981; Efron and Tibshirani,
+"An Introduction to the Bootstrap", 1993, section 14.3, with the acceleration left at 0). With G the distribution of the
+resampled values, :math:`\hat\theta` the value itself and :math:`\Phi` the normal distribution,
 
-Correlates scores with detection over sites, with intervals, at one junction or over several.
+.. math:: z_0 = \Phi^{-1}(G(\hat\theta)), \qquad
+          [\,G^{-1}(\Phi(2 z_0 - 1.96)),\; G^{-1}(\Phi(2 z_0 + 1.96))\,]
 
-Over several junctions sites are compared within each (a score in bits means little across junctions): the coefficient
-is the mean of the junctions' own, weighted by their numbers of places (sites of one pole are one place),
+Values equal to :math:`\hat\theta` count half in G.
+
+**Several junctions.** Sites are compared within each junction, because a score in bits means little across junctions.
+The coefficient is the mean of the junctions' coefficients, weighted by their numbers of poles,
 
 .. math:: c = \sum_j n_j c_j / \sum_j n_j
 
-Resamples keep the junctions and draw places and blocks of frames within each, so an interval speaks of other places and
-other traffic at these junctions, not of other junctions.
+Resamples keep the junctions and draw poles and blocks of frames within each. An interval therefore speaks of other
+poles and other traffic at these junctions, not of other junctions.
 
-Two scores are compared on the same resamples: what they share is taken out.
+Two scores are compared on the same resamples, so that what they have in common cancels.
 """
 
 from __future__ import annotations
@@ -68,78 +59,85 @@ from scipy.special import ndtr, ndtri
 from scipy.stats import rankdata
 
 from egvs.core.errors import Diagnostic
+from egvs.core.grid import FloatArray, IntArray
 from egvs.validation.detection_metrics import JackknifeEstimate
+from egvs.validation.sweeps import BoolArray
 
 CoefficientKind = Literal["pearson", "spearman", "kendall"]
 
 COEFFICIENT_KINDS: tuple[CoefficientKind, ...] = ("pearson", "spearman", "kendall")
 
 MIN_VALUES = 3
-"""Values that a coefficient needs: two always go together perfectly."""
+"""Values that a coefficient needs: the correlation of two is always perfect."""
 
 EQUALITY_TOLERANCE = 1e-12
-"""Values that scatter by less than this share of the largest are all the same."""
+"""Values are equal if they differ by less than this share of the largest."""
+
+CONFIDENCE_LEVEL = 0.95
+
+MAX_UNDEFINED_SHARE = 0.05
+"""Largest share of resamples without a coefficient, because all their values are equal."""
+
+RESAMPLES = 2000
+"""Resamples of an interval: its ends then scatter by a twentieth of its width."""
+
+MIN_POLES = 5
+"""Poles of a junction that an interval needs."""
+
+_TIE_TOLERANCE = 1e-12
 
 
 @dataclass(frozen=True)
 class StandardisedValues:
-    """A list of values prepared for one kind of coefficient, many resamples of it.
+    """Lists of values, prepared for one kind of coefficient; one list per resample.
 
     Attributes
     ----------
     vector
-        (resamples, d): float64, or int8 for Kendall's signs.
+        (resamples, d): float64, or int8 for the signs of Kendall.
     norm
-        Their lengths, (resamples,) float64; NaN where all values are the same.
+        Length of each vector, (resamples,) float64; NaN where all values are equal.
     """
 
     vector: NDArray[Any]
-    norm: NDArray[np.float64]
+    norm: FloatArray
 
     @classmethod
-    def of(cls, values: NDArray[np.float64], kind: CoefficientKind) -> StandardisedValues:
-        """From (resamples, n) float64."""
+    def from_values(cls, values: FloatArray, kind: CoefficientKind) -> StandardisedValues:
+        """Standardise values, shape (resamples, n), float64."""
         if kind == "kendall":
             first, second = np.triu_indices(values.shape[1], 1)
-            a, b = values[:, first], values[:, second]
+            a = values[:, first]
+            b = values[:, second]
             vector: NDArray[Any] = (a > b).astype(np.int8) - (a < b).astype(np.int8)
             norm = np.sqrt(np.count_nonzero(vector, axis=1))
         else:
             vector = rankdata(values, axis=1) if kind == "spearman" else values
             vector = vector - vector.mean(axis=1, keepdims=True)
             norm = np.sqrt((vector**2).sum(axis=1))
-        spread = np.ptp(values, axis=1) > EQUALITY_TOLERANCE * np.abs(values).max(axis=1, initial=0.0)
-        return cls(vector, np.where(spread & (values.shape[1] >= MIN_VALUES), norm, np.nan))
+        differ = np.ptp(values, axis=1) > EQUALITY_TOLERANCE * np.abs(values).max(axis=1, initial=0.0)
+        return cls(vector, np.where(differ & (values.shape[1] >= MIN_VALUES), norm, np.nan))
 
-    def correlate(self, other: StandardisedValues) -> NDArray[np.float64]:
-        """The coefficient with another list, (resamples,) float64, -1 to 1."""
+    def correlate(self, other: StandardisedValues) -> FloatArray:
+        """Return the coefficient with other values of the same kind, (resamples,) float64, from -1 to 1."""
         if self.vector.dtype == np.int8:
             product = (self.vector * other.vector).sum(axis=1, dtype=np.int32).astype(np.float64)
         else:
             product = np.einsum("ij,ij->i", self.vector, other.vector)
-        found: NDArray[np.float64] = np.clip(product / self.norm / other.norm, -1.0, 1.0)
-        return found
-
-
-CONFIDENCE_LEVEL = 0.95
-"""Confidence of intervals."""
-
-MAX_UNDEFINED_SHARE = 0.05
-"""Share of resamples that may be undefined: those that hold one value alone."""
-
-_TIE_TOLERANCE = 1e-12
+        coefficient: FloatArray = np.clip(product / self.norm / other.norm, -1.0, 1.0)
+        return coefficient
 
 
 @dataclass(frozen=True)
 class ConfidenceInterval:
-    """Where a value may lie.
+    """A 95 % interval.
 
     Attributes
     ----------
     low, high
-        NaN where resampling cannot tell.
+        NaN where there is no interval.
     why
-        Why it cannot; empty where it can.
+        Why there is no interval; empty where there is one.
     """
 
     low: float
@@ -147,35 +145,44 @@ class ConfidenceInterval:
     why: str = ""
 
     @classmethod
-    def unknown(cls, why: str) -> ConfidenceInterval:
-        """It cannot be told."""
+    def undefined(cls, why: str) -> ConfidenceInterval:
+        """Return no interval, with the reason."""
         return cls(math.nan, math.nan, why)
 
     @classmethod
-    def of(cls, value: float, draws: NDArray[np.float64]) -> ConfidenceInterval:
-        """From the value and what it was in each resample, NaN where it was undefined."""
-        known = draws[~np.isnan(draws)]
-        if len(known) < (1.0 - MAX_UNDEFINED_SHARE) * len(draws):
-            share = 1.0 - len(known) / len(draws)
-            return cls.unknown(f"{share:.0%} of the resamples have equal values only")
-        if np.ptp(known) <= _TIE_TOLERANCE:
-            return cls.unknown("all resamples agree to the last digit, which says nothing of other sites")
-        below = np.count_nonzero(known < value - _TIE_TOLERANCE) + 0.5 * np.count_nonzero(
-            np.abs(known - value) <= _TIE_TOLERANCE
-        )
-        half = 0.5 / len(known)
-        z0, reach = ndtri(np.clip(below / len(known), half, 1.0 - half)), ndtri(0.5 + 0.5 * CONFIDENCE_LEVEL)
-        low, high = np.quantile(known, [ndtr(2.0 * z0 - reach), ndtr(2.0 * z0 + reach)])
+    def from_resamples(cls, value: float, resampled: FloatArray) -> ConfidenceInterval:
+        """Return the bias-corrected interval of a value.
+
+        Parameters
+        ----------
+        value
+            The value of the sample itself.
+        resampled
+            The value of each resample, (resamples,); NaN where it is undefined.
+        """
+        defined = resampled[~np.isnan(resampled)]
+        if len(defined) < (1.0 - MAX_UNDEFINED_SHARE) * len(resampled):
+            share = 1.0 - len(defined) / len(resampled)
+            return cls.undefined(f"{share:.0%} of the resamples have equal values only")
+        if np.ptp(defined) <= _TIE_TOLERANCE:
+            return cls.undefined("all resamples have the same value, which says nothing about other sites")
+
+        ties = np.count_nonzero(np.abs(defined - value) <= _TIE_TOLERANCE)
+        below = np.count_nonzero(defined < value - _TIE_TOLERANCE) + 0.5 * ties
+        half = 0.5 / len(defined)
+        z0 = ndtri(np.clip(below / len(defined), half, 1.0 - half))
+        half_width = ndtri(0.5 + 0.5 * CONFIDENCE_LEVEL)
+        low, high = np.quantile(defined, [ndtr(2.0 * z0 - half_width), ndtr(2.0 * z0 + half_width)])
         return cls(float(low), float(high))
 
 
-def share_above_zero(draws: NDArray[np.float64]) -> float:
-    """Share of resamples in which a difference is above 0; ties count half, undefined ones are left out."""
-    known = draws[~np.isnan(draws)]
-    if not len(known):
+def share_above_zero(differences: FloatArray) -> float:
+    """Return the share of resamples with a difference above 0; ties count half, undefined ones are left out."""
+    defined = differences[~np.isnan(differences)]
+    if not len(defined):
         return math.nan
-    ties = np.count_nonzero(np.abs(known) <= _TIE_TOLERANCE)
-    return float((np.count_nonzero(known > _TIE_TOLERANCE) + 0.5 * ties) / len(known))
+    ties = np.count_nonzero(np.abs(defined) <= _TIE_TOLERANCE)
+    return float((np.count_nonzero(defined > _TIE_TOLERANCE) + 0.5 * ties) / len(defined))
 
 
 @dataclass(frozen=True)
@@ -185,67 +192,74 @@ class MeasureValues:
     Attributes
     ----------
     values
-        (n,) float64, NaN where it is not defined.
+        (n,) float64, NaN where the measure is undefined.
     left_out
         With each block of frames left out, (n, blocks) float64.
     """
 
-    values: NDArray[np.float64]
-    left_out: NDArray[np.float64]
+    values: FloatArray
+    left_out: FloatArray
 
     @classmethod
-    def of(cls, estimates: Sequence[JackknifeEstimate]) -> MeasureValues:
-        """From the estimate at each site."""
-        return cls(np.array([its.value for its in estimates]), np.stack([its.left_out for its in estimates]))
+    def from_estimates(cls, estimates: Sequence[JackknifeEstimate]) -> MeasureValues:
+        """Return the values of one estimate per site."""
+        values = np.array([estimate.value for estimate in estimates])
+        return cls(values, np.stack([estimate.left_out for estimate in estimates]))
 
     @property
-    def known(self) -> NDArray[np.bool_]:
-        """The sites at which it is defined, with and without each block, (n,)."""
+    def defined(self) -> BoolArray:
+        """Whether the measure is defined at each site, with all frames and without each block, (n,)."""
         return np.isfinite(self.values) & np.isfinite(self.left_out).all(axis=1)
 
 
 @dataclass(frozen=True)
 class JunctionScores:
-    """What was found at the sites of a junction.
+    """Scores and measures of detection at the sites of a junction.
 
     Attributes
     ----------
     name
-        Of the junction.
+        Name of the junction.
     sites
-        Their names, n.
+        Names of the n sites.
     scores
-        By name, (n,) float64 each, turned so that more is better; NaN where a score is not defined.
+        Values by score, (n,) float64 each, with the sign changed where less is better; NaN where undefined.
     measures
-        By name, of all the same blocks.
-    places
-        Where each site stands, for sites that stand at one place (at several heights) are much alike: they are drawn
-        together. Empty where each has a place of its own.
+        Values by measure, all with the same blocks of frames.
+    poles
+        Pole of each site. Sites of one pole (at several heights) are much alike, so they are drawn together. Empty
+        where each site has a pole of its own.
     """
 
     name: str
     sites: tuple[str, ...]
-    scores: Mapping[str, NDArray[np.float64]]
+    scores: Mapping[str, FloatArray]
     measures: Mapping[str, MeasureValues]
-    places: tuple[str, ...] = ()
+    poles: tuple[str, ...] = ()
 
     @property
     def blocks(self) -> int:
-        """How many blocks of frames there are."""
+        """Number of blocks of frames."""
         return int(next(iter(self.measures.values())).left_out.shape[1])
 
-    def known(self, scores: Sequence[str], measure: str) -> NDArray[np.bool_]:
-        """The sites at which all of these are defined, (n,) bool."""
-        known = self.measures[measure].known.copy()
+    def defined_sites(self, scores: Sequence[str], measure: str) -> BoolArray:
+        """Return at which sites these scores and the measure are all defined, (n,) bool."""
+        defined = self.measures[measure].defined.copy()
         for score in scores:
-            known &= np.isfinite(self.scores[score])
-        return known
+            defined &= np.isfinite(self.scores[score])
+        return defined
 
-    def places_of(self, known: NDArray[np.bool_]) -> int:
-        """At how many places some of the sites stand, (n,) bool."""
-        if not self.places:
-            return int(known.sum())
-        return len({place for place, has in zip(self.places, known, strict=True) if has})
+    def selected_poles(self, selected: BoolArray) -> tuple[str, ...]:
+        """Return the poles of the selected sites, (n,) bool; empty where each site has a pole of its own."""
+        if not self.poles:
+            return ()
+        return tuple(pole for pole, is_selected in zip(self.poles, selected, strict=True) if is_selected)
+
+    def count_poles(self, selected: BoolArray) -> int:
+        """Return the number of poles of the selected sites, (n,) bool."""
+        if not self.poles:
+            return int(selected.sum())
+        return len(set(self.selected_poles(selected)))
 
 
 @dataclass(frozen=True)
@@ -255,69 +269,63 @@ class Resamples:
     Attributes
     ----------
     sites
-        Rows of the sites drawn, (resamples, m) int64.
+        Rows of the drawn sites, (resamples, m) int64.
     blocks
         How often each block is drawn, (resamples, k) int64.
     """
 
-    sites: NDArray[np.int64]
-    blocks: NDArray[np.int64]
+    sites: IntArray
+    blocks: IntArray
 
     @classmethod
-    def of(
-        cls, junction: str, sites: int, blocks: int, resamples: int, seed: int, places: Sequence[str] = ()
+    def draw(
+        cls, junction: str, sites: int, blocks: int, resamples: int, seed: int, poles: Sequence[str] = ()
     ) -> Resamples:
-        """The same for the same junction, numbers, places and seed, whatever else is drawn.
+        """Draw resamples; equal arguments give equal resamples, whatever else is drawn.
 
-        Sites of one place are drawn together: places with as many sites among each other, so that all resamples are of
-        as many sites.
+        Poles are drawn from those with the same number of sites, so that all resamples have the same number of sites.
         """
         rng = np.random.default_rng(np.random.SeedSequence((seed, crc32(junction.encode()))))
-        drawn = rng.multinomial(blocks, np.full(blocks, 1.0 / blocks), resamples)
-        at: dict[str | int, list[int]] = {}
+        block_counts = rng.multinomial(blocks, np.full(blocks, 1.0 / blocks), resamples)
+        sites_by_pole: dict[str | int, list[int]] = {}
         for site in range(sites):
-            at.setdefault(places[site] if places else site, []).append(site)
-        rows = []
-        for size in sorted({len(its) for its in at.values()}):
-            alike = np.array([its for its in at.values() if len(its) == size])
-            rows.append(alike[rng.integers(0, len(alike), (resamples, len(alike)))].reshape(resamples, -1))
-        return cls(np.concatenate(rows, axis=1), drawn)
+            sites_by_pole.setdefault(poles[site] if poles else site, []).append(site)
 
-    def of_score(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """A score, (m,), at the sites drawn, (resamples, m)."""
+        rows = []
+        for size in sorted({len(pole_sites) for pole_sites in sites_by_pole.values()}):
+            same_size = np.array([pole_sites for pole_sites in sites_by_pole.values() if len(pole_sites) == size])
+            drawn = rng.integers(0, len(same_size), (resamples, len(same_size)))
+            rows.append(same_size[drawn].reshape(resamples, -1))
+        return cls(np.concatenate(rows, axis=1), block_counts)
+
+    def resample_score(self, values: FloatArray) -> FloatArray:
+        """Return a score, (m,), at the drawn sites, (resamples, m)."""
         return values[self.sites]
 
-    def of_measure(self, measured: MeasureValues, known: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """A measure at the sites drawn from those that are known, in the blocks drawn, (resamples, m)."""
-        left_out = measured.left_out[known]
+    def resample_measure(self, measure: MeasureValues, selected: BoolArray) -> FloatArray:
+        """Return a measure of the selected sites at the drawn sites and in the drawn blocks, (resamples, m)."""
+        left_out = measure.left_out[selected]
         k = left_out.shape[1]
-        moved = self.blocks @ (left_out.mean(axis=1, keepdims=True) - left_out).T
-        return np.take_along_axis(measured.values[known] + np.sqrt((k - 1) / k) * moved, self.sites, axis=1)
-
-
-RESAMPLES = 2000
-"""Resamples of an interval: its ends scatter by a twentieth of its width."""
-
-MIN_PLACES = 5
-"""Places of a junction that an interval needs; where each site is a place of its own, sites."""
+        change = self.blocks @ (left_out.mean(axis=1, keepdims=True) - left_out).T
+        return np.take_along_axis(measure.values[selected] + np.sqrt((k - 1) / k) * change, self.sites, axis=1)
 
 
 @dataclass(frozen=True)
 class Correlation:
-    """How well a score goes with a measure, or by how much better than another score does.
+    """Correlation of a score with a measure, or the difference between those of two scores.
 
     Attributes
     ----------
     value
-        The coefficient, or of two scores that of the first less that of the second; NaN where it is not defined.
+        The coefficient, or that of the first score minus that of the second; NaN where it is undefined.
     interval
-        Of 95 %.
+        Its 95 % interval.
     better
-        Of two scores: in which share of resamples the first goes better with the measure; else NaN.
+        Share of resamples in which the first of two scores has the larger coefficient; NaN for one score.
     sites
-        How many it is from.
+        Number of sites.
     dropped
-        Sites at which the score or the measure is not defined.
+        Sites at which a score or the measure is undefined.
     why
         Why there is no value, or no interval; empty where there are both.
     """
@@ -330,134 +338,142 @@ class Correlation:
     why: str
 
     def warnings(self, location: str) -> list[Diagnostic]:
-        """What is missing, as warnings."""
-        found = []
+        """Return a warning for sites left out, and for a missing value or interval."""
+        warnings = []
         if self.dropped:
-            names = ", ".join(self.dropped)
-            found.append(
-                Diagnostic("correlation", location, f"left out, for a value is not defined there: {names}", "")
-            )
+            problem = f"without {', '.join(self.dropped)}, where a value is undefined"
+            warnings.append(Diagnostic("correlation", location, problem, ""))
         if self.why:
-            what = "no interval" if math.isfinite(self.value) else "no correlation"
-            found.append(
-                Diagnostic("correlation", location, f"{what}: {self.why}", "more sites, or sites that differ more")
-            )
-        return found
+            missing = "no interval" if math.isfinite(self.value) else "no correlation"
+            hint = "Use more sites, or sites that differ more"
+            warnings.append(Diagnostic("correlation", location, f"{missing}: {self.why}", hint))
+        return warnings
 
 
 class CorrelationStudy:
-    """Scores and measures of detection at the sites of some junctions.
+    """Correlates scores with measures of detection at the sites of some junctions.
 
     Parameters
     ----------
     junctions
-        At least one; all have the scores and measures that are asked for.
+        At least one; all have the same scores and measures.
     seed
-        Of the resamples.
+        Seed of the resamples.
     resamples
-        How many.
+        Number of resamples.
     """
 
     def __init__(self, junctions: Sequence[JunctionScores], seed: int, resamples: int = RESAMPLES) -> None:
-        self.junctions, self.seed, self.resamples = tuple(junctions), seed, resamples
+        self.junctions = tuple(junctions)
+        self.seed = seed
+        self.resamples = resamples
         self._kind: CoefficientKind | None = None
-        self._draws: dict[tuple[str, bytes], Resamples] = {}
-        self._scores: dict[tuple[str, bytes, CoefficientKind, str], StandardisedValues] = {}
-        self._measure: dict[
-            tuple[str, bytes, CoefficientKind], tuple[str, StandardisedValues]
-        ] = {}  # the last one alone: forms are large
+        self._resamples: dict[tuple[str, bytes], Resamples] = {}
+        self._scores: dict[tuple[str, bytes, str], StandardisedValues] = {}
+        self._measures: dict[tuple[str, bytes], tuple[str, StandardisedValues]] = {}  # the last measure only: large
 
     def correlation(self, score: str, measure: str, kind: CoefficientKind) -> Correlation:
-        """How well a score goes with a measure.
+        """Return the correlation of a score with a measure.
 
-        Quickest when all scores are asked for one measure, then the next, and one kind after the other."""
+        Quickest when all scores are correlated with one measure, then with the next, and kinds one after the other.
+        """
         return self._compare([score], measure, kind)
 
     def difference(self, first: str, second: str, measure: str, kind: CoefficientKind) -> Correlation:
-        """By how much better one score goes with a measure than another one does, over sites that have both."""
+        """Return how much better one score correlates with a measure than another, over sites that have both."""
         return self._compare([first, second], measure, kind)
 
     def _compare(self, scores: Sequence[str], measure: str, kind: CoefficientKind) -> Correlation:
-        masks = [junction.known(scores, measure) for junction in self.junctions]
-        pairs = list(zip(self.junctions, masks, strict=True))
+        masks = [junction.defined_sites(scores, measure) for junction in self.junctions]
         sites = sum(int(mask.sum()) for mask in masks)
-        dropped = tuple(
-            f"{junction.name} {site}"
-            for junction, mask in pairs
-            for site, known in zip(junction.sites, mask, strict=True)
-            if not known
-        )
-        why = next(filter(None, (_undefined_reason(*pair, scores, measure) for pair in pairs)), "")
-        if why:
-            return Correlation(math.nan, ConfidenceInterval.unknown(why), math.nan, sites, dropped, why)
-        places = [junction.places_of(mask) for junction, mask in pairs]
-        each = [
-            pooled_coefficient([_sample_coefficient(*pair, score, measure, kind) for pair in pairs], places)[0]
-            for score in scores
-        ]
-        value = float(each[0] - each[1] if len(each) == 2 else each[0])
-        few = [f"{j.name} has sites at {count} places" for j, count in zip(self.junctions, places, strict=True)
-               if count < MIN_PLACES]  # fmt: skip
-        if few:
-            interval = ConfidenceInterval.unknown(f"{few[0]}; an interval needs {MIN_PLACES}")
-            return Correlation(value, interval, math.nan, sites, dropped, interval.why)
-        drawn = [
-            pooled_coefficient([self._drawn(*pair, score, measure, kind) for pair in pairs], places) for score in scores
-        ]
-        draws = drawn[0] - drawn[1] if len(drawn) == 2 else drawn[0]
-        interval = ConfidenceInterval.of(value, draws)
-        better = share_above_zero(draws) if len(drawn) == 2 else math.nan
-        return Correlation(value, interval, better, sites, dropped, interval.why)
+        dropped = self._dropped_sites(masks)
+        for junction, mask in zip(self.junctions, masks, strict=True):
+            why = _undefined_reason(junction, mask, scores, measure)
+            if why:
+                return Correlation(math.nan, ConfidenceInterval.undefined(why), math.nan, sites, dropped, why)
 
-    def _drawn(
-        self, junction: JunctionScores, known: NDArray[np.bool_], score: str, measure: str, kind: CoefficientKind
-    ) -> NDArray[np.float64]:
-        """The coefficient of one junction in every resample, (resamples,)."""
-        place = junction.name, known.tobytes(), kind
-        if kind != self._kind:  # forms of one kind are enough to hold
+        values = []
+        for score in scores:
+            sample = [
+                _sample_coefficient(junction, mask, score, measure, kind)
+                for junction, mask in zip(self.junctions, masks, strict=True)
+            ]
+            values.append(self._pooled(sample, masks)[0])
+        value = float(values[0] - values[1] if len(values) == 2 else values[0])
+        for junction, mask in zip(self.junctions, masks, strict=True):
+            poles = junction.count_poles(mask)
+            if poles < MIN_POLES:
+                why = f"{junction.name} has sites on {poles} poles, and an interval needs {MIN_POLES}"
+                return Correlation(value, ConfidenceInterval.undefined(why), math.nan, sites, dropped, why)
+
+        resampled = []
+        for score in scores:
+            coefficients = [
+                self._resampled_coefficient(junction, mask, score, measure, kind)
+                for junction, mask in zip(self.junctions, masks, strict=True)
+            ]
+            resampled.append(self._pooled(coefficients, masks))
+        if len(scores) == 1:
+            interval = ConfidenceInterval.from_resamples(value, resampled[0])
+            return Correlation(value, interval, math.nan, sites, dropped, interval.why)
+        differences = resampled[0] - resampled[1]
+        interval = ConfidenceInterval.from_resamples(value, differences)
+        return Correlation(value, interval, share_above_zero(differences), sites, dropped, interval.why)
+
+    def _dropped_sites(self, masks: Sequence[BoolArray]) -> tuple[str, ...]:
+        dropped = []
+        for junction, mask in zip(self.junctions, masks, strict=True):
+            dropped += [f"{junction.name} {junction.sites[row]}" for row in np.flatnonzero(~mask)]
+        return tuple(dropped)
+
+    def _pooled(self, coefficients: Sequence[FloatArray], masks: Sequence[BoolArray]) -> FloatArray:
+        """Return the mean of the junctions' coefficients, (resamples,) each, weighted by their numbers of poles."""
+        poles = [junction.count_poles(mask) for junction, mask in zip(self.junctions, masks, strict=True)]
+        weights = np.array(poles, dtype=np.float64)
+        mean: FloatArray = (np.stack(coefficients) * weights[:, None]).sum(axis=0) / weights.sum()
+        return mean
+
+    def _resampled_coefficient(
+        self, junction: JunctionScores, mask: BoolArray, score: str, measure: str, kind: CoefficientKind
+    ) -> FloatArray:
+        """Return the coefficient of one junction in every resample, (resamples,)."""
+        if kind != self._kind:  # cache the values of one kind only, which bounds the memory
             self._kind = kind
             self._scores.clear()
-            self._measure.clear()
-        if (key := (*place, score)) not in self._scores:
-            values = self._draws_of(junction, known).of_score(junction.scores[score][known])
-            self._scores[key] = StandardisedValues.of(values, kind)
-        if self._measure.get(place, ("",))[0] != measure:
-            values = self._draws_of(junction, known).of_measure(junction.measures[measure], known)
-            self._measure[place] = measure, StandardisedValues.of(values, kind)
-        return self._scores[key].correlate(self._measure[place][1])
-
-    def _draws_of(self, junction: JunctionScores, known: NDArray[np.bool_]) -> Resamples:
-        """The same for all scores and measures that are defined at the same sites."""
-        if (key := (junction.name, known.tobytes())) not in self._draws:
-            places = (
-                [place for place, has in zip(junction.places, known, strict=True) if has] if junction.places else ()
+            self._measures.clear()
+        sites_key = (junction.name, mask.tobytes())
+        if sites_key not in self._resamples:
+            poles = junction.selected_poles(mask)
+            self._resamples[sites_key] = Resamples.draw(
+                junction.name, int(mask.sum()), junction.blocks, self.resamples, self.seed, poles
             )
-            sites = int(known.sum())
-            self._draws[key] = Resamples.of(junction.name, sites, junction.blocks, self.resamples, self.seed, places)
-        return self._draws[key]
+        resamples = self._resamples[sites_key]
 
-
-def pooled_coefficient(each: Sequence[NDArray[np.float64]], places: Sequence[int]) -> NDArray[np.float64]:
-    """The mean of the junctions' coefficients, each (resamples,), weighted by how many places each has."""
-    weights = np.array(places, dtype=np.float64)
-    mean: NDArray[np.float64] = (np.stack(each) * weights[:, None]).sum(axis=0) / weights.sum()
-    return mean
+        score_key = (*sites_key, score)
+        if score_key not in self._scores:
+            values = resamples.resample_score(junction.scores[score][mask])
+            self._scores[score_key] = StandardisedValues.from_values(values, kind)
+        cached_measure = self._measures.get(sites_key)
+        if cached_measure is None or cached_measure[0] != measure:
+            values = resamples.resample_measure(junction.measures[measure], mask)
+            self._measures[sites_key] = measure, StandardisedValues.from_values(values, kind)
+        return self._scores[score_key].correlate(self._measures[sites_key][1])
 
 
 def _sample_coefficient(
-    junction: JunctionScores, known: NDArray[np.bool_], score: str, measure: str, kind: CoefficientKind
-) -> NDArray[np.float64]:
-    """The coefficient of one junction's sites themselves, (1,)."""
-    a, b = junction.scores[score][known], junction.measures[measure].values[known]
-    return StandardisedValues.of(a[None], kind).correlate(StandardisedValues.of(b[None], kind))
+    junction: JunctionScores, mask: BoolArray, score: str, measure: str, kind: CoefficientKind
+) -> FloatArray:
+    """Return the coefficient of one junction's sites themselves, (1,)."""
+    score_values = StandardisedValues.from_values(junction.scores[score][mask][None], kind)
+    return score_values.correlate(StandardisedValues.from_values(junction.measures[measure].values[mask][None], kind))
 
 
-def _undefined_reason(junction: JunctionScores, known: NDArray[np.bool_], scores: Sequence[str], measure: str) -> str:
-    """Why a junction has no coefficient, or nothing."""
-    if known.sum() < MIN_VALUES:
-        return f"{junction.name} has {known.sum()} sites with values; {MIN_VALUES} are needed"
+def _undefined_reason(junction: JunctionScores, mask: BoolArray, scores: Sequence[str], measure: str) -> str:
+    """Return why a junction has no coefficient; empty if it has one."""
+    if mask.sum() < MIN_VALUES:
+        return f"{junction.name} has {mask.sum()} sites with values, and a correlation needs {MIN_VALUES}"
     values = {score: junction.scores[score] for score in scores} | {measure: junction.measures[measure].values}
-    for name, its in values.items():
-        if np.isnan(StandardisedValues.of(its[known][None], "pearson").norm[0]):
+    for name, site_values in values.items():
+        if np.isnan(StandardisedValues.from_values(site_values[mask][None], "pearson").norm[0]):
             return f"{name} is the same at all sites of {junction.name}"
     return ""

@@ -200,7 +200,7 @@ class SiteDetectionTask(DetectionTaskBase[Detector]):
 
 def _first_sweep_detector(detector: Detector, simulator: CloudSimulator, record: HeldOutTraffic) -> SweepDetector:
     """Return a detector of single sweeps in the form that :meth:`DetectionTaskBase.detect` expects."""
-    site_detector = detector.at(simulator.view, record.scene.roi)
+    site_detector = detector.at_site(simulator.view, record.scene.roi)
     return lambda frame_sweeps: site_detector.detect(frame_sweeps[0])
 
 

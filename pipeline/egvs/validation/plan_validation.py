@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from egvs.artefacts import parquet, run_folder
+from egvs.artefacts import checksums, parquet
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
 from egvs.core.errors import Diagnostic, InputError
@@ -149,7 +149,7 @@ class FusedDetectionTask(DetectionTaskBase[JointDetector]):
         detectors = {}
         for name in names:
             if name != POINT_COUNTS_NAME:
-                detectors[name] = self.detectors[name].together(views, self.record.scene.roi).detect
+                detectors[name] = self.detectors[name].at_sites(views, self.record.scene.roi).detect
         return self.detect(simulators, detectors, with_points=POINT_COUNTS_NAME in names)
 
     def key(self, group: SensorGroup, name: str) -> str:
@@ -247,7 +247,7 @@ def read_fused_plan(folder: Path, scenario: Scenario) -> FusedPlan:
             "no such file: the folder contains no plan",
             f"Run egvs place {scenario.name} --count 3, or name the folder of another run with --plan-from.",
         )
-    run_folder.verify_checksums(path.with_name(RunFolder.placement_checksums.name), "Run egvs place again.")
+    checksums.verify_checksums(path.with_name(RunFolder.placement_checksums.name), "Run egvs place again.")
     table, metadata = parquet.read_artefact(path, "placement")
     _check_plan_scenario(path, metadata.get("scenario"), scenario)
 
@@ -316,7 +316,7 @@ def with_gains(groups: Sequence[SensorGroup], rows: Sequence[SiteDetection]) -> 
 def estimate_difference(first: JackknifeEstimate, second: JackknifeEstimate, frames: int) -> JackknifeEstimate:
     """Return the first measure minus the second, both of the same frames."""
     values = np.concatenate([[first.value - second.value], first.left_out - second.left_out])
-    return JackknifeEstimate.of(values, np.bincount(detection_metrics.frame_blocks(frames)))
+    return JackknifeEstimate.from_values(values, np.bincount(detection_metrics.frame_blocks(frames)))
 
 
 def write_fused(path: Path, rows: Sequence[FusedDetection], metadata: Mapping[str, Any]) -> None:

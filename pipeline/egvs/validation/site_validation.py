@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from egvs.artefacts import parquet, run_folder
+from egvs.artefacts import checksums, parquet
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
 from egvs.core.errors import InputError
@@ -33,6 +33,7 @@ from egvs.validation.detection_metrics import ALL_OBJECTS, SiteDetection
 from egvs.validation.detector_runs import DetectionListener, SiteDetectionTask, run_detectors
 from egvs.validation.detectors import base
 from egvs.validation.held_out_traffic import HeldOutTraffic
+from egvs.validation.kitti_results import NO_KITTI_FILES, KittiFiles
 from egvs.validation.results import ScoreAgreement, ScoreName, Validation
 from egvs.validation.surrogates import Surrogates
 from egvs.validation.sweeps import POINT_COUNTS_NAME, DetectedBoxes, detections_in_roi
@@ -50,8 +51,7 @@ def validate_sites(
     *,
     frames: int,
     detectors: Sequence[str] = (POINT_COUNTS_NAME,),
-    detections: Path | None = None,
-    keep: bool = False,
+    kitti: KittiFiles = NO_KITTI_FILES,
     jobs: int | None = None,
     progress: ProgressCallback = no_progress,
     listener: DetectionListener | None = None,
@@ -66,10 +66,8 @@ def validate_sites(
         Number of frames of held-out traffic.
     detectors
         Names of detectors; points on vehicles are always counted.
-    detections
-        Folder with KITTI results of further detectors, see :mod:`egvs.validation.kitti_results`.
-    keep
-        Whether to write ground truth and detections as KITTI files too.
+    kitti
+        KITTI results of further detectors, and whether to write ground truth and detections as KITTI files.
     jobs
         Number of processes; one per core when None.
     listener
@@ -79,14 +77,14 @@ def validate_sites(
     ------
     InputError
         If the check finds an error, a detector is unknown, the traffic has too few frames or no vehicle in the region
-        of interest, or ``detections`` do not belong to these sites and frames.
+        of interest, or the KITTI results do not belong to these sites and frames.
     """
     chosen = {name: base.make_detector(name) for name in dict.fromkeys(detectors) if name != POINT_COUNTS_NAME}
-    _check_no_input_overwritten(scenario, out, detections, keep=keep)
+    _check_no_input_overwritten(scenario, out, kitti)
 
     with validation_run(scenario, out, frames, jobs=jobs, progress=progress) as run:
         record = run.record
-        external = _read_external_boxes(detections, record, chosen)
+        external = _read_external_boxes(kitti.detections, record, chosen)
         task = SiteDetectionTask(record, chosen)
         detected = run_detectors(record.scene.sites, task, jobs=jobs, progress=progress, listener=listener)
         by_site = {site: {**by_detector, **external.get(site, {})} for site, by_detector in detected.items()}
@@ -98,21 +96,21 @@ def validate_sites(
         validation = Validation(tuple(rows), scores, tuple(agreements), warnings)
 
         _write_artefacts(out, run, scenario, validation, external)
-        if keep:
+        if kitti.keep:
             kitti_results.write_kitti_results(out / kitti_results.KITTI_FOLDER, record, run.frames, by_site)
         return replace(validation, report=runs.refresh_report(out))
 
 
-def _check_no_input_overwritten(scenario: Scenario, out: Path, detections: Path | None, *, keep: bool) -> None:
+def _check_no_input_overwritten(scenario: Scenario, out: Path, kitti: KittiFiles) -> None:
     """Raise an InputError if an output would overwrite an input."""
-    if not keep:
+    if not kitti.keep:
         runs.check_no_overwrite(scenario, out)
         return
     runs.check_no_overwrite(scenario, out, (kitti_results.KITTI_FOLDER, kitti_results.PARTIAL_FOLDER))
     kitti_folder = (out / kitti_results.KITTI_FOLDER).resolve()
-    if detections is not None and detections.resolve().is_relative_to(kitti_folder):
+    if kitti.detections is not None and kitti.detections.resolve().is_relative_to(kitti_folder):
         raise InputError(
-            f"--detections {detections}",
+            f"--detections {kitti.detections}",
             "the folder would be overwritten by --keep",
             "Copy the folder elsewhere, or omit --keep.",
         )
@@ -168,7 +166,9 @@ def correlate_scores(
     for detector in dict.fromkeys(row.detector for row in rows):
         detector_rows = [row for row in rows if row.detector == detector and row.objects_of == ALL_OBJECTS]
         measure_names = results.correlated_measures(detector)
-        measures = {name: MeasureValues.of([row.measures[name] for row in detector_rows]) for name in measure_names}
+        measures = {}
+        for measure in measure_names:
+            measures[measure] = MeasureValues.from_estimates([row.measures[measure] for row in detector_rows])
         junction = JunctionScores(scenario.name, site_names, values_by_text, measures, poles)
         study = CorrelationStudy([junction], scenario.seed)
         by_kind = {}
@@ -206,7 +206,7 @@ def _write_artefacts(
     validation.surrogates.write(folder / surrogates.SURROGATES_TABLE, scenario)
     _write_correlation(folder / CORRELATION_TABLE, validation, metadata)
     results.write_figure(folder / results.FIGURE_FILE, scenario, validation)
-    run_folder.write_checksums(RunFolder(folder).validation_checksums, sorted(folder.iterdir()))
+    checksums.write_checksums(RunFolder(folder).validation_checksums, sorted(folder.iterdir()))
     for path in sorted(folder.iterdir()):
         path.replace(out / path.name)
 

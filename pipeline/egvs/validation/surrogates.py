@@ -50,7 +50,7 @@ from egvs.sensors import voxel_crossings
 from egvs.sensors.scene import Scene
 from egvs.stages.base import StageContext
 from egvs.stages.inputs import get_scene, open_folder
-from egvs.stages.site_scoring import SiteScan, empty_scans
+from egvs.stages.site_scans import SiteScan, empty_scans
 from egvs.studies.measurement import scenario_dependencies
 
 ParameterValue = float | int | bool | str

@@ -42,6 +42,9 @@ from egvs.core.grid import FloatArray, IntArray, Roi
 from egvs.sensors.sensor import Sensor
 from egvs.sensors.sites import Pose
 
+BoolArray = NDArray[np.bool_]
+"""Array of bool, of the shape that each docstring states."""
+
 CLASSES = ("Car", "Van", "Truck", "Trailer", "Bus", "Tram", "Motorcycle", "Cyclist", "Pedestrian", "Misc")
 """All classes, in the order of listings."""
 

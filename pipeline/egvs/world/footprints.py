@@ -1,11 +1,11 @@
-"""Reads footprints, and mends or refuses what is not sound.
+"""Footprints: polygons that are extruded to solids, read from GeoJSON.
 
-Steps: read GeoJSON polygons, lines and points (:mod:`egvs.world.sumo_polygons` reads SUMO's); bring what is in degrees
-or in a map projection into the world frame (:mod:`egvs.formats.georeference`); widen lines and points; mend what
-has one meaning only, and count it; refuse the rest. World frame, metres.
+Steps: read polygons, lines and points (:mod:`egvs.world.sumo_polygons` reads those of SUMO); convert degrees or a map
+projection to the world frame (:mod:`egvs.formats.georeference`); widen lines and points; repair what is unambiguous,
+with a count; reject the rest. World frame, metres.
 
-``height_m`` is the z of the top, ``base_m`` (default 0) the z of the underside. Points are discs of ``radius_m``, lines
-are strips of that half width.
+``height_m`` is the z of the top, ``base_m`` (default 0) the z of the underside. Points become discs of ``radius_m``,
+lines strips of that half width.
 """
 
 from __future__ import annotations
@@ -29,15 +29,17 @@ if TYPE_CHECKING:
 
 
 CROSSING_RINGS = "rings that cross themselves, each part that they enclose kept"
-_MAX_SLIVER_SHARE = 0.01  # of an area
-_QUARTER_SIDES = 4  # a disc is a regular polygon of four times as many sides
+# rings whose crossing changes no more than this share of an area cross because coordinates were rounded
+_MAX_SLIVER_SHARE = 0.01
+# sides of a quarter of a disc
+_QUARTER_SIDES = 4
 
+# properties that must not be misspelt
 _HEIGHT_KEYS = ("height_m", "base_m")
-"""Properties that count: what is nearly one of them must not be taken for a stranger."""
+# properties that ``egvs new`` adds as notes
 _NOTE_KEYS = ("height_from",)
-"""What ``egvs new`` notes beside them."""
+# invalid features of a file that are reported one by one
 _MAX_REPORTED = 20
-"""So many wrong features of a file are told; of more, how many they are."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,17 @@ class Footprint:
 
 @dataclass(frozen=True)
 class FootprintFile:
-    """What a file holds; what was mended in it and left out, each with how often; what to know before trusting it."""
+    """Footprints of a file.
+
+    Attributes
+    ----------
+    footprints
+        The footprints.
+    repaired, ignored
+        What was repaired and what was left out, with counts.
+    warnings
+        What the user should check.
+    """
 
     footprints: list[Footprint] = field(default_factory=list)
     repaired: Counter[str] = field(default_factory=Counter)
@@ -62,123 +74,172 @@ class FootprintFile:
 
 
 def read_geojson(path: Path, world: Georeference) -> FootprintFile:
-    """Footprints of a GeoJSON FeatureCollection in world-frame metres, degrees, or the system that it declares.
+    """Read the footprints of a GeoJSON FeatureCollection.
 
-    InputError names the features that cannot be understood, have no height, or are no sound polygons, all at once.
+    Parameters
+    ----------
+    path
+        The file; it declares its coordinate reference system.
+    world
+        Where the world frame is.
+
+    Raises
+    ------
+    InputError
+        When features are no geometries, have no height, or are invalid polygons; all are named.
     """
     file = FootprintFile()
-    document = read_json(path, "a GeoJSON FeatureCollection")
+    document = read_json(path, "Give a GeoJSON FeatureCollection")
     if not isinstance(document, dict) or not isinstance(document.get("features"), list):
-        raise InputError(path, "has no list of features", "a GeoJSON FeatureCollection in world-frame metres")
-    declared = declared_crs(document, str(path))
-    reading = world.read_coordinates(geojson_coordinates(document["features"]), str(path), declared)
+        raise InputError(path, "expected a GeoJSON FeatureCollection, got no list of features")
+    features = document["features"]
+    reading = world.read_coordinates(geojson_coordinates(features), str(path), declared_crs(document, str(path)))
     if reading.convert is not None:
-        file.repaired[f"features in {reading.description}, brought into the world frame"] += len(document["features"])
-    refused: list[InputError] = []
-    for number, feature in enumerate(document["features"]):
+        file.repaired[f"features in {reading.description}, brought into the world frame"] += len(features)
+    errors: list[InputError] = []
+    for number, feature in enumerate(features):
         try:
             file.footprints.extend(_feature_footprints(feature, number, path, file.repaired, reading))
         except InputError as error:
-            refused.append(error)
-    if refused:
-        raise DiagnosticsError(_report_refused(refused, path))
+            errors.append(error)
+    if errors:
+        raise DiagnosticsError(_report_errors(errors, path))
     return file
 
 
 def _feature_footprints(
     feature: Any, number: int, path: Path, repaired: Counter[str], reading: CoordinateReading
 ) -> list[Footprint]:
-    """The footprints of one feature, counting in ``repaired``."""
-    place = f"{path}: feature {number}"
+    """Return the footprints of one feature; repairs are counted in ``repaired``."""
+    where = f"{path}: feature {number}"
     if not isinstance(feature, dict) or not isinstance(feature.get("properties") or {}, dict):
-        raise InputError(place, "is not a GeoJSON feature", "an object with geometry and properties")
+        raise InputError(where, "expected a GeoJSON feature with geometry and properties")
     properties = feature.get("properties") or {}
-    name = str(_named_value(properties, "name", f"{path.stem}_{number}"))
-    place = f"{place} ({name})"
-    if (odd := find_misspelling((key for key in properties if key not in _NOTE_KEYS), _HEIGHT_KEYS)) is not None:
-        raise InputError(place, f"unknown property {odd[0]!r}", f"did you mean {odd[1]}?")
-    height, base = _metres(properties, "height_m", place), _metres(properties, "base_m", place, 0.0)
-    if not height > base:
-        raise InputError(place, f"height_m = {height:g} with base_m = {base:g}", "a top above the underside")
-    kind = str(_named_value(properties, "kind", "footprint"))
-    parts = to_polygons(feature.get("geometry"), properties, place, repaired, reading)
-    return [Footprint(name, kind, part, base, height) for part in parts]
+    name = str(_property(properties, "name", f"{path.stem}_{number}"))
+    where = f"{where} ({name})"
+    misspelling = find_misspelling((key for key in properties if key not in _NOTE_KEYS), _HEIGHT_KEYS)
+    if misspelling is not None:
+        raise InputError(where, f"unknown property {misspelling[0]!r}", f"Did you mean {misspelling[1]}?")
+    height_m = _metres(properties, "height_m", where)
+    base_m = _metres(properties, "base_m", where, 0.0)
+    if not height_m > base_m:
+        raise InputError(where, f"expected height_m above base_m = {base_m:g}, got {height_m:g}")
+    kind = str(_property(properties, "kind", "footprint"))
+    polygons = to_polygons(feature.get("geometry"), properties, where, repaired, reading)
+    return [Footprint(name, kind, polygon, base_m, height_m) for polygon in polygons]
 
 
-def _report_refused(refused: list[InputError], path: Path) -> Iterator[Diagnostic]:
-    """The first of a file's wrong features, and how many more there are."""
-    for error in refused[:_MAX_REPORTED]:
+def _report_errors(errors: list[InputError], path: Path) -> Iterator[Diagnostic]:
+    """Yield the first errors of a file, and the number of the others."""
+    for error in errors[:_MAX_REPORTED]:
         yield Diagnostic.of("statics", error)
-    if (more := len(refused) - _MAX_REPORTED) > 0:
-        yield Diagnostic("statics", str(path), f"{more} more features are wrong", "those above first", is_error=True)
+    more = len(errors) - _MAX_REPORTED
+    if more > 0:
+        yield Diagnostic("statics", str(path), f"{more} more features are wrong", "Correct those above", is_error=True)
 
 
-def _named_value(properties: dict[str, Any], key: str, default: str) -> Any:
+def _property(properties: dict[str, Any], key: str, default: Any) -> Any:
+    """Return a property; a GIS writes null where only other features of a table have it."""
     value = properties.get(key)
     return default if value is None else value
 
 
 def _metres(properties: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
-    value = properties.get(key)
-    if value is None:  # a GIS writes null where another feature of the table has the property
-        value = default
+    value = _property(properties, key, default)
     if value is None:
-        raise InputError(where, f"{key} is missing", "a number of metres")
+        raise InputError(where, f"{key} is missing", "Give a number of metres")
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= MAX_COORDINATE_M:
-        raise InputError(f"{where}: {key}", f"{value!r}", f"a finite number of metres, at most {MAX_COORDINATE_M:g}")
+        raise InputError(f"{where}: {key}", f"expected metres, at most {MAX_COORDINATE_M:g}, got {value!r}")
     return float(value)
 
 
 def to_polygons(
-    geometry: Any,
-    properties: dict[str, Any],
-    where: str,
-    repaired: Counter[str],
-    reading: CoordinateReading = WORLD_READING,
-    *,
-    mends_crossings: bool = False,
-) -> list[Polygon]:
-    """The polygons of one feature, in the world frame: lines and points buffered, dirt mended, multi-part geometries
-    taken apart. Rings that cross themselves are refused, unless what comes from a map is to be taken as it is."""
+    geometry: Any, properties: dict[str, Any], where: str, repaired: Counter[str],
+    reading: CoordinateReading = WORLD_READING, *, keep_crossing_parts: bool = False,
+) -> list[Polygon]:  # fmt: skip
+    """Convert a GeoJSON geometry to polygons in the world frame.
+
+    Parameters
+    ----------
+    geometry
+        The geometry; several parts become several polygons.
+    properties
+        ``radius_m`` is the radius of points and the half width of lines.
+    where
+        The feature, for messages.
+    repaired
+        Counts repairs.
+    reading
+        Conversion of coordinates to the world frame.
+    keep_crossing_parts
+        For rings that cross themselves: keep each enclosed part, instead of an error.
+
+    Raises
+    ------
+    InputError
+        When the geometry or ``radius_m`` is invalid.
+    """
     import shapely
 
-    shape_place = f"{where}: geometry"
-    damage = (shapely.errors.ShapelyError, TypeError, ValueError, LookupError, AttributeError, RecursionError)
-    try:
-        with np.errstate(invalid="ignore"):  # what is no number is refused below
-            shape: BaseGeometry = shapely.geometry.shape(geometry)
-        coordinates = shapely.get_coordinates(shape)
-    except damage as error:
-        raise InputError(shape_place, f"cannot be understood ({error})", "a GeoJSON geometry") from None
-    if shape.is_empty or not np.isfinite(coordinates).all():
-        raise InputError(shape_place, "is empty or has a coordinate that is no number", "finite metres")
-    if (far_m := np.abs(coordinates).max()) > MAX_COORDINATE_M:
-        raise InputError(shape_place, f"lies {far_m:g} m from the world's zero", f"within {MAX_COORDINATE_M:g} m")
-    if shapely.has_z(shape) and np.any(shapely.get_coordinates(shape, include_z=True)[:, 2] != 0):
-        raise InputError(shape_place, "has z coordinates", "two coordinates a point; heights go into base_m, height_m")
+    shape = _parse_shape(geometry, f"{where}: geometry")
     if reading.convert is not None:
         shape = shapely.transform(shape, reading.to_world)
     if shape.geom_type == "GeometryCollection":
-        shape = _only_areas(shape, repaired)
+        shape = _keep_polygons(shape, repaired)
     if shape.geom_type.endswith(("Point", "LineString")):
-        radius = _metres(properties, "radius_m", where)
-        if radius <= 0:
-            raise InputError(f"{where}: radius_m", f"{radius:g}", "above 0")
+        radius_m = _metres(properties, "radius_m", where)
+        if radius_m <= 0:
+            raise InputError(f"{where}: radius_m", f"expected a radius above 0 m, got {radius_m:g}")
         cap = "flat" if "Line" in shape.geom_type else "round"
-        shape = shape.buffer(radius, quad_segs=_QUARTER_SIDES, cap_style=cap)
-    elif "Polygon" not in shape.geom_type:
-        raise InputError(shape_place, f"is a {shape.geom_type}", "a Polygon, LineString or Point, or their Multi forms")
-    sound = _repair(shape, shape_place, repaired, reading.convert is not None, mends_crossings)
-    areas = [part for part in shapely.get_parts(sound) if "Polygon" in part.geom_type]
-    parts = [polygon for area in areas for polygon in shapely.get_parts(area)]  # mended ones lie deeper
-    if not parts:
-        raise InputError(shape_place, "encloses no area", "a polygon with three corners that are not in line")
-    return parts
+        shape = shape.buffer(radius_m, quad_segs=_QUARTER_SIDES, cap_style=cap)
+
+    where = f"{where}: geometry"
+    if "Polygon" not in shape.geom_type:
+        problem = f"expected a Polygon, LineString or Point, or their Multi forms, got a {shape.geom_type}"
+        raise InputError(where, problem)
+    valid = _repair(shape, where, repaired, reading.convert is not None, keep_crossing_parts)
+    polygons = _polygons_of(valid)
+    if not polygons:
+        raise InputError(where, "encloses no area", "Give three corners that are not in line")
+    return polygons
 
 
-def _only_areas(collection: BaseGeometry, repaired: Counter[str]) -> BaseGeometry:
-    """The polygons of a collection. A GIS that rounds degrees turns the thinnest corners of a polygon into lines beside
-    it; a collection without a polygon stays what it is."""
+def _parse_shape(geometry: Any, where: str) -> BaseGeometry:
+    """Return a shape with finite coordinates in two dimensions."""
+    import shapely
+
+    invalid = (shapely.errors.ShapelyError, TypeError, ValueError, LookupError, AttributeError, RecursionError)
+    try:
+        with np.errstate(invalid="ignore"):  # nan is rejected below
+            shape: BaseGeometry = shapely.geometry.shape(geometry)
+        coordinates = shapely.get_coordinates(shape)
+    except invalid as error:
+        raise InputError(where, f"expected a GeoJSON geometry ({error})") from None
+    if shape.is_empty:
+        raise InputError(where, "the geometry is empty")
+    if not np.isfinite(coordinates).all():
+        raise InputError(where, "expected finite coordinates, got nan or inf")
+    farthest_m = np.abs(coordinates).max()
+    if farthest_m > MAX_COORDINATE_M:
+        raise InputError(where, f"expected coordinates within {MAX_COORDINATE_M:g} m, got {farthest_m:g} m")
+    if shapely.has_z(shape) and np.any(shapely.get_coordinates(shape, include_z=True)[:, 2] != 0):
+        raise InputError(where, "has z coordinates", "Set the properties base_m and height_m instead")
+    return shape
+
+
+def _polygons_of(shape: BaseGeometry) -> list[Polygon]:
+    """Return the polygons of a shape; repaired ones may be two levels deep."""
+    import shapely
+
+    areas = [part for part in shapely.get_parts(shape) if "Polygon" in part.geom_type]
+    return list(shapely.get_parts(areas))
+
+
+def _keep_polygons(collection: BaseGeometry, repaired: Counter[str]) -> BaseGeometry:
+    """Drop the lines and points of a collection with polygons.
+
+    A GIS that rounds degrees turns the thinnest corners of a polygon into such lines.
+    """
     import shapely
 
     parts = shapely.get_parts(collection)
@@ -186,37 +247,41 @@ def _only_areas(collection: BaseGeometry, repaired: Counter[str]) -> BaseGeometr
     if not areas:
         return collection
     repaired["lines and points beside polygons, left out"] += len(parts) - len(areas)
-    return shapely.MultiPolygon([area for part in areas for area in shapely.get_parts(part)])
+    return shapely.MultiPolygon(_polygons_of(collection))
 
 
-def _barely_crosses(shape: BaseGeometry) -> bool:
-    """Whether what the crossing rings of an area turn over is next to nothing: slivers as wide as a last digit."""
-    import shapely
+def _repair(
+    shape: BaseGeometry, where: str, repaired: Counter[str], may_be_rounded: bool, keep_crossing_parts: bool
+) -> BaseGeometry:
+    """Repair repeated points, rings that touch themselves, and rings that cross because degrees were rounded.
 
-    whole_m2 = shapely.make_valid(shape).area
-    return bool(abs(whole_m2 - shape.area) <= _MAX_SLIVER_SHARE * whole_m2)
-
-
-def _repair(shape: BaseGeometry, where: str, repaired: Counter[str], may_be_rounded: bool, mends: bool) -> BaseGeometry:
-    """Mend what has one meaning only (doubled points, rings that touch themselves, or that cross where degrees were
-    rounded); what has two is refused, or ``mends`` keeps each part that is enclosed."""
+    Other rings that cross themselves are ambiguous: they are rejected, unless ``keep_crossing_parts``.
+    """
     import shapely
 
     if not shapely.is_valid(shape):
         reason = shapely.is_valid_reason(shape)
-        touches = reason.startswith("Ring Self-intersection")
-        rounded = may_be_rounded and _barely_crosses(shape)
-        if not (touches or rounded or mends):
-            raise InputError(where, f"is not a sound polygon ({reason})", "rings that do not cross, holes inside")
+        repair = CROSSING_RINGS
+        if reason.startswith("Ring Self-intersection"):
+            repair = "rings that touched themselves"
+        elif may_be_rounded and _barely_crosses(shape):
+            repair = "rings that rounded degrees made cross"
+        elif not keep_crossing_parts:
+            raise InputError(
+                where, f"is not a valid polygon ({reason})", "Give rings that do not cross, and holes inside"
+            )
         shape = shapely.make_valid(shape)
-        repaired[
-            "rings that touched themselves"
-            if touches
-            else "rings that rounded degrees made cross"
-            if rounded
-            else CROSSING_RINGS
-        ] += 1
+        repaired[repair] += 1
     clean = shapely.remove_repeated_points(shape)
-    if doubled := len(shapely.get_coordinates(shape)) - len(shapely.get_coordinates(clean)):
-        repaired["doubled points"] += doubled
+    repeated = len(shapely.get_coordinates(shape)) - len(shapely.get_coordinates(clean))
+    if repeated:
+        repaired["doubled points"] += repeated
     return shapely.orient_polygons(clean)
+
+
+def _barely_crosses(shape: BaseGeometry) -> bool:
+    """Return whether the parts that crossing rings turn over are negligible slivers."""
+    import shapely
+
+    valid_m2 = shapely.make_valid(shape).area
+    return bool(abs(valid_m2 - shape.area) <= _MAX_SLIVER_SHARE * valid_m2)

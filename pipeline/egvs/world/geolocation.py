@@ -1,7 +1,7 @@
-"""Tells where a scenario's world frame lies on the Earth.
+"""Where a scenario's world frame is on the Earth.
 
-Steps: take the projection and offset of ``[crs]``, or those of the SUMO network's ``<location>`` (netconvert wrote
-there what it did to longitude and latitude); where both are given, hold them against one another.
+It is the projection and offset of ``[crs]``, or those of the SUMO network's ``<location>``, in which netconvert writes
+how it converted longitude and latitude. If both are given, they are compared.
 """
 
 from __future__ import annotations
@@ -20,54 +20,80 @@ from egvs.traffic import network, sumo, sumo_folder
 from egvs.traffic.network import Location
 
 _TOLERANCE_M = 10.0
-"""Datums of one place differ by less, once transformed; a forgotten offset or another zone by far more."""
+"""Different datums differ by less once transformed; a forgotten offset or a wrong zone by far more."""
 
 _NO_PROJECTION = ("", "!")
-"""What SUMO writes where a network was not made from a map."""
+"""SUMO's entries for a network that was not made from a map."""
 
 
 def scenario_georeference(scenario: Scenario) -> Georeference:
-    """Where the world frame lies, if the scenario or its network says it; a network of OpenStreetMap is converted.
+    """Return where the world frame of a scenario is, if the scenario or its network tells.
 
-    InputError where ``[crs]`` names nothing that fits: no projection in metres, one that stretches lengths, or another
-    place than the network says; or where the network's own projection stretches lengths.
+    Parameters
+    ----------
+    scenario
+        The scenario. If its network is an OpenStreetMap file, netconvert runs once.
+
+    Raises
+    ------
+    InputError
+        When a projection is not in metres or distorts lengths, or when ``[crs]`` contradicts the network.
     """
-    stated, own = _declared_frame(scenario), _network_frame(scenario)
-    box, place = scenario.roi.box, str(scenario.file)
-    if own is not None:
-        _check_network(own, scenario)
-    if stated is not None:
-        _check_stretch(stated, scenario)
-        if own is not None:
-            _check_agreement(stated, own, scenario)
-    return Georeference(stated or own, box, place)
+    declared = _declared_frame(scenario)
+    from_network = _network_frame(scenario)
+    if from_network is not None:
+        _check_network_scale(from_network, scenario)
+    if declared is not None:
+        _check_declared_scale(declared, scenario)
+        if from_network is not None:
+            _check_agreement(declared, from_network, scenario)
+    return Georeference(declared or from_network, scenario.roi.box, str(scenario.file))
 
 
 def world_frame_settings(scenario: Scenario) -> dict[str, Any]:
-    """What :func:`scenario_georeference` depends on, as a stage's settings hold it: ``world_frame``, or nothing where
-    it is not known.
+    """Return what :func:`scenario_georeference` depends on, for the cache key of a stage.
 
-    No map is converted for it.
+    Parameters
+    ----------
+    scenario
+        The scenario; its network is not converted.
+
+    Returns
+    -------
+    dict
+        The key ``world_frame``; empty if the position is unknown.
     """
-    found: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
     if scenario.crs.epsg is not None:
-        found["crs"] = [scenario.crs.epsg, *scenario.crs.offset_m]
-    if (path := _network_path(scenario)) is not None:
-        if network.is_osm(path):
-            found |= {"map": files.hash_file(path), "sumo": sumo.sumo_version()}
-        elif (location := network.read_location(path)) is not None and location.projection not in _NO_PROJECTION:
-            found["location"] = [location.projection, *location.offset_m]
-    return {"world_frame": found} if found else {}
+        settings["crs"] = [scenario.crs.epsg, *scenario.crs.offset_m]
+    path = _network_path(scenario)
+    if path is not None and network.is_osm(path):
+        settings |= {"map": files.hash_file(path), "sumo": sumo.sumo_version()}
+    elif path is not None:
+        location = network.read_location(path)
+        if location is not None and location.projection not in _NO_PROJECTION:
+            settings["location"] = [location.projection, *location.offset_m]
+    return {"world_frame": settings} if settings else {}
 
 
 def network_world_frame(location: Location | None) -> WorldFrame | None:
-    """The frame of a network, or of a ``.poly.xml``, that says where it lies; None where it does not, or in SUMO's own
-    words that PROJ does not know."""
+    """Return the frame that a network or a ``.poly.xml`` declares in its ``<location>``.
+
+    Parameters
+    ----------
+    location
+        The location.
+
+    Returns
+    -------
+    WorldFrame, or None
+        None if there is no location, or in a notation of SUMO's own that PROJ does not know.
+    """
     if location is None or location.projection in _NO_PROJECTION:
         return None
     try:
-        return WorldFrame.of(location.projection, location.offset_m, "<location>")
-    except InputError:  # "-", ".": SUMO's own rough projections
+        return WorldFrame.from_projection(location.projection, location.offset_m, "<location>")
+    except InputError:  # "-" and ".": approximate projections of SUMO
         return None
 
 
@@ -75,11 +101,11 @@ def _declared_frame(scenario: Scenario) -> WorldFrame | None:
     crs = scenario.crs
     if crs.epsg is None:
         return None
-    return WorldFrame.of(f"EPSG:{crs.epsg}", crs.offset_m, f"{scenario.file}: crs.epsg")
+    return WorldFrame.from_projection(f"EPSG:{crs.epsg}", crs.offset_m, f"{scenario.file}: crs.epsg")
 
 
 def _network_path(scenario: Scenario) -> Path | None:
-    """The network's file, where it is there: a scan needs none, and who reads traffic tells that it is missing."""
+    """The network, if the file exists: scans do not need it, and reading traffic reports that it is missing."""
     try:
         path = sumo_folder.network_path(scenario)
     except InputError:
@@ -88,7 +114,8 @@ def _network_path(scenario: Scenario) -> Path | None:
 
 
 def _network_frame(scenario: Scenario) -> WorldFrame | None:
-    if (path := _network_path(scenario)) is None:
+    path = _network_path(scenario)
+    if path is None:
         return None
     if network.is_osm(path):
         status = path.stat()
@@ -98,54 +125,52 @@ def _network_frame(scenario: Scenario) -> WorldFrame | None:
 
 @lru_cache(maxsize=4)
 def _converted_location(path: Path, changed_ns: int, size: int) -> Location | None:
-    """Where netconvert puts a map; the file's time and size tell one map from another under the same name."""
+    """The location that netconvert writes for a map; time and size of the file are part of the cache key."""
     del changed_ns, size
     with files.temporary_folder() as folder:
-        made = folder / sumo_folder.NETWORK_FILE
-        sumo_folder.convert_osm(path, made)
-        return network.read_location(made)
+        converted = folder / sumo_folder.NETWORK_FILE
+        sumo_folder.convert_osm(path, converted)
+        return network.read_location(converted)
 
 
-def _check_stretch(frame: WorldFrame, scenario: Scenario) -> None:
+def _check_declared_scale(frame: WorldFrame, scenario: Scenario) -> None:
+    """Raise an InputError when the projection of ``[crs]`` distorts lengths at the region of interest."""
     x, y, _ = scenario.roi.center_m
-    place, stretch = f"{scenario.file}: crs", frame.stretch((x, y))
-    if abs(stretch - 1.0) <= MAX_SCALE_ERROR:
+    where = f"{scenario.file}: crs"
+    scale = frame.scale_factor((x, y))
+    if abs(scale - 1.0) <= MAX_SCALE_ERROR:
         return
     lon_deg, lat_deg = frame.to_degrees(np.array([[x, y]]))[0]
     if not np.isfinite(lon_deg + lat_deg):
-        found = f"epsg = {scenario.crs.epsg} has no place ({x:g}, {y:g}) less offset_m, the centre of roi"
-        raise InputError(place, found, "the network's netOffset as offset_m, or roi.center_m in this system")
-    found = (
-        f"epsg = {scenario.crs.epsg} draws lengths {stretch:.3g} times as long at the region of interest"
+        problem = f"the centre of roi, ({x:g}, {y:g}) minus offset_m, is outside of epsg = {scenario.crs.epsg}"
+        raise InputError(where, problem, "Set offset_m to the network's netOffset, and roi.center_m in this system")
+    position = f"longitude {lon_deg:.5f}, latitude {lat_deg:.5f}"
+    problem = f"epsg = {scenario.crs.epsg} scales lengths by {scale:.3g} at the region of interest ({position})"
+    hint = f"Use a system without distortion there, e.g. epsg = {utm_epsg(lon_deg, lat_deg)}, with its offset_m"
+    raise InputError(where, problem, hint)
+
+
+def _check_network_scale(frame: WorldFrame, scenario: Scenario) -> None:
+    """Raise an InputError when the projection of the network distorts lengths at the region of interest."""
+    x, y, _ = scenario.roi.center_m
+    scale = frame.scale_factor((x, y))
+    if abs(scale - 1.0) > MAX_SCALE_ERROR:
+        problem = f"its <location> ({frame.projection}) scales lengths by {scale:.3g} at the region of interest"
+        hint = "Use a projection without distortion there: netconvert has UTM for maps (--proj.utm)"
+        raise InputError(f"{scenario.file}: the network", problem, hint)
+
+
+def _check_agreement(declared: WorldFrame, from_network: WorldFrame, scenario: Scenario) -> None:
+    """Raise an InputError when ``[crs]`` and the network locate the region of interest differently."""
+    centre = np.array([scenario.roi.center_m[:2]])
+    lon_deg, lat_deg = from_network.to_degrees(centre)[0]
+    distance_m = float(np.hypot(*(declared.from_degrees(from_network.to_degrees(centre)) - centre)[0]))
+    if distance_m <= _TOLERANCE_M:
+        return
+    problem = (
+        f"epsg = {declared.projection.removeprefix('EPSG:')} with offset_m = {list(declared.offset_m)} puts the"
+        f" region of interest {distance_m:,.0f} m from where the network's <location> puts it"
         f" (longitude {lon_deg:.5f}, latitude {lat_deg:.5f})"
     )
-    right = f"a system that keeps lengths there, for example epsg = {utm_epsg(lon_deg, lat_deg)}, with its offset_m"
-    raise InputError(place, found, right)
-
-
-def _check_network(network_frame: WorldFrame, scenario: Scenario) -> None:
-    x, y, _ = scenario.roi.center_m
-    if abs((stretch := network_frame.stretch((x, y))) - 1.0) > MAX_SCALE_ERROR:
-        found = (
-            f"its <location> ({network_frame.projection}) draws lengths {stretch:.3g} times as long at the "
-            f"region of interest"
-        )
-        right = "a projection that keeps lengths there: netconvert takes UTM for a map (--proj.utm)"
-        raise InputError(f"{scenario.file}: the network", found, right)
-
-
-def _check_agreement(declared: WorldFrame, network_frame: WorldFrame, scenario: Scenario) -> None:
-    centre = np.array([scenario.roi.center_m[:2]])
-    lon_deg, lat_deg = network_frame.to_degrees(centre)[0]
-    apart_m = float(np.hypot(*(declared.from_degrees(network_frame.to_degrees(centre)) - centre)[0]))
-    if not apart_m <= _TOLERANCE_M:
-        found = (
-            f"epsg = {declared.projection.removeprefix('EPSG:')} with offset_m = {list(declared.offset_m)} puts the"
-            f" region of interest {apart_m:,.0f} m from where the network's <location> puts it"
-            f" (longitude {lon_deg:.5f}, latitude {lat_deg:.5f})"
-        )
-        right = (
-            f"no [crs], or one that agrees: netOffset {list(network_frame.offset_m)}, projParameter "
-            f"{network_frame.projection!r}"
-        )
-        raise InputError(f"{scenario.file}: crs", found, right)
+    location = f"netOffset {list(from_network.offset_m)}, projParameter {from_network.projection!r}"
+    raise InputError(f"{scenario.file}: crs", problem, f"Remove [crs], or make it agree: {location}")

@@ -1,26 +1,24 @@
-"""What of a map is solid, and how high.
+"""Which objects of a map are solid, and from which height to which; for OpenStreetMap and SUMO's polygons.
 
-What of a map is solid, and how high where the map does not say: one table for OpenStreetMap and SUMO's polygons.
+A type is a key of OpenStreetMap and its value: ``building.garage``. An entry for ``building`` applies to all types
+below it that have no entry. The tables also list the short names that SUMO's polyconvert uses by default (``parking``,
+``water``; see its ``osmPolyconvert.typ.xml``).
 
-A type is a key of OpenStreetMap and its value, with a dot between: ``building.garage``. What is said of ``building``
-goes for everything below it that has no entry of its own. The short names that SUMO's polyconvert gives by default
-(``parking``, ``water``; its ``osmPolyconvert.typ.xml``) stand here too.
+Sizes in the tables are round figures for ordinary towns, not measurements.
 
-All sizes are round figures for towns of no special kind, not measurements. Metres, above the ground.
-
-How high a thing of a map stands, from its tags (Simple 3D Buildings,
-https://wiki.openstreetmap.org/wiki/Simple_3D_Buildings) and its type.
+Heights follow from the tags of an object (Simple 3D Buildings,
+https://wiki.openstreetmap.org/wiki/Simple_3D_Buildings) and its type, in metres above the ground::
 
     top  = height         or (building:levels + roof:levels) * 3 m    or the default of the type
     base = min_height     or building:min_level * 3 m                 or 0, or the underside of a roof or crown
 
-``roof:height`` stands for the storeys of the roof where it is given. Metres above the ground.
+``roof:height``, if present, replaces the levels of the roof.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from egvs.formats.osm import parse_length_m, parse_number
@@ -30,18 +28,18 @@ IGNORE: Literal["ignore"] = "ignore"
 
 @dataclass(frozen=True)
 class SolidType:
-    """How a type of things stands.
+    """Default dimensions of a type of objects.
 
     Attributes
     ----------
     height_m
-        Its top where the map names none; None: that of buildings of no special type.
+        Top of objects without a height; None for the default height of buildings.
     thickness_m
-        For an open roof: from its underside, below which one sees through, to its top.
+        Thickness of an open roof; below it, the object is open.
     half_width_m
-        How far a line of it reaches to each side, or a point all round; None: only areas are solid.
+        Half width of lines and radius of points; None if only areas are solid.
     is_tree
-        Whether it is a crown that starts at :data:`CROWN_BASE_SHARE` of its height.
+        Whether it is a crown that begins at :data:`CROWN_BASE_SHARE` of its height.
     """
 
     height_m: float | None = None
@@ -102,7 +100,7 @@ SOLID_TYPES: Mapping[str, SolidType] = {
     "natural.tree_row": SolidType(8.0, half_width_m=2.0, is_tree=True),
     "tree": SolidType(8.0, half_width_m=2.0, is_tree=True),
 }
-"""What is solid where it is an area or, with a half width, a line."""
+"""Types whose areas are solid and, if they have a half width, also their lines."""
 
 POLE_TYPES: Mapping[str, SolidType] = {
     "advertising.column": SolidType(3.5, half_width_m=0.65),
@@ -115,12 +113,12 @@ POLE_TYPES: Mapping[str, SolidType] = {
     "man_made.utility_pole": SolidType(8.0, half_width_m=0.15),
     "power.pole": SolidType(8.0, half_width_m=0.15),
 }
-"""What is solid where it is a point, an upright cylinder; trees stand above."""
+"""Types whose points are solid: upright cylinders. Trees are in :data:`SOLID_TYPES`."""
 
-_NO_BUILDING = (
+_NOT_SOLID_BUILDINGS = (
     "demolished", "destroyed", "entrance", "no", "planned", "proposed", "razed", "removed", "underground",
 )  # fmt: skip
-_NO_WALL = (
+_NOT_SOLID_BARRIERS = (
     "block", "bollard", "border_control", "bump_gate", "bus_trap", "cattle_grid", "chain", "cycle_barrier",
     "debris", "ditch", "entrance", "full-height_turnstile", "gate", "hampshire_gate", "height_restrictor",
     "kerb", "kissing_gate", "lift_gate", "log", "motorcycle_barrier", "no", "rope", "sally_port",
@@ -137,74 +135,93 @@ _SHORT_NAMES = (
     "traffic_sign", "university", "water",
 )  # fmt: skip
 NOT_SOLID = frozenset(
-    (*(f"building.{v}" for v in _NO_BUILDING), *(f"barrier.{v}" for v in _NO_WALL), *_TAG_KEYS, *_SHORT_NAMES)
+    (
+        *(f"building.{v}" for v in _NOT_SOLID_BUILDINGS),
+        *(f"barrier.{v}" for v in _NOT_SOLID_BARRIERS),
+        *_TAG_KEYS,
+        *_SHORT_NAMES,
+    )
 )
-"""What is none. Of barriers that is what one sees or drives through: gates, kerbs, ditches, rows of bollards."""
+"""Types that are not solid. Barriers that one can see or drive through are among them: gates, kerbs, bollards."""
 
 
 class SolidTypes:
-    """The table, with what a user says of some types in place of it.
+    """The tables of solid types with the user's overrides.
 
     Parameters
     ----------
-    changes
-        Type to a height in metres, "solid" or "ignore"; "" stands for all types that the table does not name.
-        "ignore" goes for everything below the type, too.
+    overrides
+        For some types, a height in metres, "solid" or "ignore"; "" stands for all types that the tables do not list.
+        "ignore" also applies to all types below.
     """
 
-    def __init__(self, changes: Mapping[str, float | Literal["solid", "ignore"]] | None = None) -> None:
-        changes = changes or {}
-        ignored = tuple(f"{name}." for name, value in changes.items() if value == IGNORE and name)
-        self._solid = {name: kind for name, kind in SOLID_TYPES.items() if not name.startswith(ignored)}
-        self._poles = {name: kind for name, kind in POLE_TYPES.items() if not name.startswith(ignored)}
-        self._none = set(NOT_SOLID)
-        for name, value in sorted(changes.items()):
+    def __init__(self, overrides: Mapping[str, float | Literal["solid", "ignore"]] | None = None) -> None:
+        overrides = overrides or {}
+        ignored = tuple(f"{name}." for name, value in overrides.items() if value == IGNORE and name)
+        self._solid = {name: solid for name, solid in SOLID_TYPES.items() if not name.startswith(ignored)}
+        self._poles = {name: solid for name, solid in POLE_TYPES.items() if not name.startswith(ignored)}
+        self._not_solid = set(NOT_SOLID)
+        for name, value in sorted(overrides.items()):
             if value == IGNORE:
-                self._none.add(name)
+                self._not_solid.add(name)
                 self._solid.pop(name, None)
                 self._poles.pop(name, None)
             elif name in POLE_TYPES:
-                self._poles[name] = (
-                    POLE_TYPES[name] if value == "solid" else replace(POLE_TYPES[name], height_m=float(value))
-                )
+                self._poles[name] = _with_height(POLE_TYPES[name], value)
             else:
-                self._none.discard(name)
-                kind = self._solid.get(name) or SOLID_TYPES.get(name) or self.named(name) or _CLOSED
-                self._solid[name] = kind if value == "solid" else replace(kind, height_m=float(value))
+                self._not_solid.discard(name)
+                solid = self._solid.get(name) or SOLID_TYPES.get(name) or self.area_type(name) or _CLOSED
+                self._solid[name] = _with_height(solid, value)
 
-    def knows(self, name: str) -> bool:
-        """Whether the table says anything of a type."""
-        return any(prefix in self._solid or prefix in self._none for prefix in _prefixes(name))
+    def is_known(self, name: str) -> bool:
+        """Return whether the tables list a type, or one above it."""
+        return self._listed_type(name) is not None
 
-    def pole(self, name: str) -> SolidType | None:
-        """How a point of a type stands; None when it is neither a pole nor a tree."""
-        solid = self._poles.get(name) or self.named(name)
-        return solid if name in self._poles or (solid is not None and solid.is_tree) else None
+    def point_type(self, name: str) -> SolidType | None:
+        """Return the dimensions of points of a type; None if they are neither poles nor trees."""
+        pole = self._poles.get(name)
+        if pole is not None:
+            return pole
+        solid = self.area_type(name)
+        return solid if solid is not None and solid.is_tree else None
 
-    def named(self, name: str) -> SolidType | None:
-        """How a type stands; None when it is not solid, or unknown."""
-        known = (prefix for prefix in _prefixes(name) if prefix in self._solid or prefix in self._none)
-        return self._solid.get(next(known, ""))
+    def area_type(self, name: str) -> SolidType | None:
+        """Return the dimensions of areas and lines of a type; None if it is not solid, or unknown."""
+        return self._solid.get(self._listed_type(name) or "")
+
+    def _listed_type(self, name: str) -> str | None:
+        """Return the type itself, or the nearest one above it that the tables list; "" is above all types."""
+        parts = name.split(".")
+        prefixes = [".".join(parts[:count]) for count in range(len(parts), 0, -1)]
+        for prefix in [*prefixes, ""]:
+            if prefix in self._solid or prefix in self._not_solid:
+                return prefix
+        return None
 
 
-def _prefixes(name: str) -> list[str]:
-    """The type itself, what it lies below, and last "", below which everything lies."""
-    parts = name.split(".")
-    return [".".join(parts[:count]) for count in range(len(parts), 0, -1)] + [""] * bool(name)
+def _with_height(solid: SolidType, value: float | Literal["solid", "ignore"]) -> SolidType:
+    """Apply an override that is not "ignore"."""
+    return solid if value == "solid" else replace(solid, height_m=float(value))
 
 
 LEVEL_M = 3.0
-"""A storey of a building."""
+"""Height of a storey."""
 
 _MAX_LEVELS = 300
 
 
 @dataclass(frozen=True)
 class VerticalExtent:
-    """From where to where a thing stands up.
+    """From which height to which an object is solid.
 
-    ``source`` says where the top is from: height, levels (tags of the map) or default. ``unreadable`` names the tags
-    that say nothing, and were not heeded.
+    Attributes
+    ----------
+    base_m, top_m
+        Heights above the ground.
+    source
+        Where the top is from: height or levels (tags of the map), or default.
+    unreadable
+        Tags that were ignored because their values are invalid.
     """
 
     base_m: float
@@ -213,77 +230,95 @@ class VerticalExtent:
     unreadable: tuple[str, ...] = ()
 
 
+@dataclass
 class _HeightTags:
-    """Values of tags; those that say nothing count as absent, and are remembered."""
+    """Values of tags. Invalid ones count as absent and are collected."""
 
-    def __init__(self, tags: Mapping[str, str]) -> None:
-        self._tags = tags
-        self.unreadable: list[str] = []
+    tags: Mapping[str, str]
+    unreadable: list[str] = field(default_factory=list)
 
     def read(self, key: str, parse: Callable[[str], float | None]) -> float | None:
-        if key not in self._tags:
+        if key not in self.tags:
             return None
-        value = parse(self._tags[key])
+        value = parse(self.tags[key])
         if value is None:
             self.unreadable.append(key)
         return value
 
 
 def vertical_extent(tags: Mapping[str, str], solid: SolidType, default_m: float) -> VerticalExtent:
-    """Where a thing starts and ends; ``default_m`` is the top of what has no height of its own, nor one by its type."""
-    read = _HeightTags(tags)
-    low_m = _low_m(read)
-    top_m, source = read.read("height", parse_positive_length_m), "height"
+    """Return from which height to which an object is solid.
+
+    Parameters
+    ----------
+    tags
+        Tags of the object.
+    solid
+        Dimensions of its type.
+    default_m
+        Top if neither the tags nor the type have a height.
+    """
+    height_tags = _HeightTags(tags)
+    base_m = _base_m(height_tags)
+    source = "height"
+    top_m = height_tags.read("height", parse_positive_length_m)
     if top_m is None:
-        top_m, source = _levels_m(read), "levels"
+        source = "levels"
+        top_m = _levels_m(height_tags)
     if top_m is None:
-        top_m, source = solid.height_m or default_m, "default"
-        if low_m is not None and low_m >= top_m:
-            top_m = low_m + (solid.thickness_m or LEVEL_M)
-    if low_m is not None and low_m >= top_m:
-        read.unreadable.append("base above top")
-        low_m = None
-    return VerticalExtent(_underside_m(solid, top_m) if low_m is None else low_m, top_m, source, tuple(read.unreadable))
+        source = "default"
+        top_m = solid.height_m or default_m
+        if base_m is not None and base_m >= top_m:
+            top_m = base_m + (solid.thickness_m or LEVEL_M)
+    if base_m is not None and base_m >= top_m:
+        height_tags.unreadable.append("base above top")
+        base_m = None
+    if base_m is None:
+        base_m = _default_base_m(solid, top_m)
+    return VerticalExtent(base_m, top_m, source, tuple(height_tags.unreadable))
 
 
 def is_underground(tags: Mapping[str, str]) -> bool:
-    """Whether a thing lies wholly below the ground."""
+    """Return whether an object is completely below the ground."""
     if "underground" in (tags.get("location"), tags.get("building"), tags.get("parking")):
         return True
-    below = parse_number(tags.get("building:levels:underground", "0")) or 0.0
-    return (
-        below > 0 and parse_number(tags.get("building:levels", "")) == 0 and not {"height", "roof:levels"} & tags.keys()
-    )
+    levels_below = parse_number(tags.get("building:levels:underground", "0")) or 0.0
+    levels_above = parse_number(tags.get("building:levels", ""))
+    return levels_below > 0 and levels_above == 0 and not {"height", "roof:levels"} & tags.keys()
 
 
-def _low_m(read: _HeightTags) -> float | None:
-    low_m = read.read("min_height", parse_length_m)
-    if low_m is None and (levels := read.read("building:min_level", parse_number)) is not None:
-        low_m = max(0.0, LEVEL_M * levels)
-    return low_m
+def _base_m(height_tags: _HeightTags) -> float | None:
+    """Return the underside according to the tags; None if they do not tell."""
+    base_m = height_tags.read("min_height", parse_length_m)
+    if base_m is not None:
+        return base_m
+    levels = height_tags.read("building:min_level", parse_number)
+    return None if levels is None else max(0.0, LEVEL_M * levels)
 
 
-def _levels_m(read: _HeightTags) -> float | None:
-    """The height of the storeys and the roof above them; None where there are none, or nobody says how many."""
-    levels = read.read("building:levels", _parse_levels)
+def _levels_m(height_tags: _HeightTags) -> float | None:
+    """Return the height of all levels and of the roof; None if the tags do not tell."""
+    levels = height_tags.read("building:levels", _parse_levels)
     if levels is None:
         return None
-    roof_m = read.read("roof:height", parse_length_m)
+    roof_m = height_tags.read("roof:height", parse_length_m)
     if roof_m is None:
-        roof_m = LEVEL_M * (read.read("roof:levels", _parse_levels) or 0.0)
+        roof_m = LEVEL_M * (height_tags.read("roof:levels", _parse_levels) or 0.0)
     if not levels and not roof_m:
-        read.unreadable.append("building:levels")
+        height_tags.unreadable.append("building:levels")
     return LEVEL_M * levels + roof_m or None
 
 
-def _underside_m(solid: SolidType, top_m: float) -> float:
+def _default_base_m(solid: SolidType, top_m: float) -> float:
     if solid.is_tree:
         return CROWN_BASE_SHARE * top_m
-    return max(0.0, top_m - solid.thickness_m) if solid.thickness_m else 0.0
+    if solid.thickness_m:
+        return max(0.0, top_m - solid.thickness_m)
+    return 0.0
 
 
 def parse_positive_length_m(text: str) -> float | None:
-    """A length as OpenStreetMap writes it, in metres; None when it is none, or 0."""
+    """Return a length in OpenStreetMap's notation in metres; None if it is invalid or 0."""
     return parse_length_m(text) or None
 
 

@@ -1,10 +1,10 @@
-"""Builds the static world of a scenario as one triangle mesh.
+"""Build the static world of a scenario as one triangle mesh.
 
-Steps: read footprints (:mod:`egvs.world.footprints`) and extrude them between ``base_m`` and ``height_m``; take
-meshes apart into closed solids and open surfaces; lay a ground plane at z = 0. World frame, metres.
+Steps: read footprints (:mod:`egvs.world.footprints`) and extrude them from ``base_m`` to ``height_m``; divide meshes
+into closed solids and open surfaces; add a ground plane at z = 0. World frame, metres.
 
-Where a ground that goes up and down is given, it is laid instead, and both heights of a footprint count from the ground
-below its centre; what stands on the ground reaches down to the lowest of it.
+A ground with relief replaces the plane. Then both heights of a footprint are relative to the ground below its centre,
+and objects that stand on the ground reach down to its lowest point along their outline.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ from egvs.world.terrain import GroundSource, TerrainSurface
 Floats = NDArray[np.float64]
 
 GROUND_MARGIN_M = 500.0
-"""How far the ground plane goes on beyond everything; no sensor in the catalogue reaches farther."""
+"""Margin of the ground plane around everything; no sensor of the catalogue has a longer range."""
 
 
 @dataclass(frozen=True)
 class BuildCounts:
-    """What was built (solids a kind), mended, left out, and is doubtful; shown to the user, kept in ``run.json``."""
+    """What was built (solids by kind), repaired and left out, with counts, and warnings."""
 
     built: Counter[str] = field(default_factory=Counter)
     repaired: Counter[str] = field(default_factory=Counter)
@@ -49,141 +49,172 @@ class BuildCounts:
     warnings: list[Diagnostic] = field(default_factory=list)
 
     def to_json(self) -> dict[str, Any]:
-        """As the stage reports it."""
+        """Return the form in the summary of a stage."""
         counts = {"built": self.built, "mended": self.repaired, "left_out": self.ignored}
-        told = {WARNINGS_KEY: [warning.to_json() for warning in self.warnings]} if self.warnings else {}
-        return {key: dict(sorted(counter.items())) for key, counter in counts.items()} | told
+        summary: dict[str, Any] = {key: dict(sorted(counter.items())) for key, counter in counts.items()}
+        if self.warnings:
+            summary[WARNINGS_KEY] = [warning.to_json() for warning in self.warnings]
+        return summary
 
 
 def build_world(
     scenario: Scenario, ground: GroundSource | None = None, progress: ProgressCallback = no_progress
 ) -> tuple[World, BuildCounts]:
-    """The static world of a scenario, on a flat ground where no other is given; and what went into it.
+    """Build the static world of a scenario.
 
-    InputError when a file that the scenario names is not sound.
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    ground
+        Provides a ground with relief. By default, the ground is flat.
+    progress
+        Called for each footprint.
+
+    Returns
+    -------
+    world, counts
+        The mesh, and what it was made from.
+
+    Raises
+    ------
+    InputError
+        When a file of the scenario is invalid.
     """
-    model, builder, world = scenario.statics, _Builder(), geolocation.scenario_georeference(scenario)
-    read = [read_geojson(scenario.find(name, "statics.footprints"), world) for name in model.footprints]
-    types = SolidTypes(model.polygon_types)
-    polygons = [scenario.find(name, "statics.polygons") for name in model.polygons]
-    read += [read_poly_xml(path, types, model.polygon_height_m, world) for path in polygons]
-    for file in read:
+    config = scenario.statics
+    builder = _Builder()
+    world = geolocation.scenario_georeference(scenario)
+    types = SolidTypes(config.polygon_types)
+    files = [read_geojson(scenario.find(name, "statics.footprints"), world) for name in config.footprints]
+    polygons = [scenario.find(name, "statics.polygons") for name in config.polygons]
+    files += [read_poly_xml(path, types, config.polygon_height_m, world) for path in polygons]
+    footprints = []
+    for file in files:
+        footprints += file.footprints
         builder.counts.repaired.update(file.repaired)
         builder.counts.ignored.update(file.ignored)
         builder.counts.warnings.extend(file.warnings)
-    footprints = [footprint for file in read for footprint in file.footprints]
-    surface = None if ground is None else ground.ground(scenario, *_extent_m(scenario, footprints))
+
+    surface = None
+    if ground is not None:
+        surface = ground.ground(scenario, *_ground_extent_m(scenario, footprints))
     for done, footprint in enumerate(footprints):
-        standing = footprint if surface is None else _lift_to_surface(surface, footprint)
-        builder.add(*_extrude(standing), footprint.name, footprint.kind)
+        lifted = footprint if surface is None else _lift_to_surface(surface, footprint)
+        builder.add(*_extrude(lifted), footprint.name, footprint.kind)
         progress("footprints", done + 1, len(footprints))
-    for mesh in model.meshes:
+    for mesh in config.meshes:
         _add_mesh(builder, scenario.find(mesh.file, "statics.meshes"), mesh, world)
-    if model.ground:
-        laid = _add_plane(builder, scenario) if surface is None else (surface.vertices_m, surface.faces)
-        builder.add(*laid, "ground", "ground")
+    if config.ground and surface is not None:
+        builder.add(surface.vertices_m, surface.faces, "ground", "ground")
+    elif config.ground:
+        builder.add(*_ground_plane(builder, scenario), "ground", "ground")
     return builder.world(), builder.counts
 
 
 @dataclass
 class _Builder:
-    """Collects solids into one mesh, and counts."""
+    """Collects solids in one mesh, and counts them."""
 
     vertices: list[Floats] = field(default_factory=list)
     faces: list[NDArray[np.int64]] = field(default_factory=list)
     solids: list[tuple[str, str]] = field(default_factory=list)
     counts: BuildCounts = field(default_factory=BuildCounts)
-    _count: int = 0
+    _vertex_count: int = 0
 
-    def add(self, vertices_m: Floats, faces: NDArray[np.int64], name: str, kind: str, form: str = "") -> None:
-        """Add one solid; counted under its kind, and its ``form`` where that is no closed one."""
+    def add(self, vertices_m: Floats, faces: NDArray[np.int64], name: str, kind: str, suffix: str = "") -> None:
+        """Add a solid; it is counted as its kind with ``suffix``."""
         self.vertices.append(np.asarray(vertices_m, dtype=np.float64))
-        self.faces.append(np.asarray(faces, dtype=np.int64) + self._count)
+        self.faces.append(np.asarray(faces, dtype=np.int64) + self._vertex_count)
         self.solids.append((name, kind))
-        self._count += len(vertices_m)
-        self.counts.built[kind + form] += 1
+        self._vertex_count += len(vertices_m)
+        self.counts.built[kind + suffix] += 1
 
     def world(self) -> World:
-        owner = [np.full(len(f), i, dtype=np.int32) for i, f in enumerate(self.faces)]
+        solid_of_face = [np.full(len(faces), number, dtype=np.int32) for number, faces in enumerate(self.faces)]
         return World(
             np.concatenate([np.empty((0, 3)), *self.vertices]),
             np.concatenate([np.empty((0, 3), dtype=np.int64), *self.faces]).astype(np.int32),
-            np.concatenate([np.empty(0, dtype=np.int32), *owner]),
+            np.concatenate([np.empty(0, dtype=np.int32), *solid_of_face]),
             tuple(self.solids),
         )
 
 
 def _extrude(footprint: Footprint) -> tuple[Floats, NDArray[np.int64]]:
-    """Vertices and faces (outwards) of a closed prism over the footprint."""
+    """Return vertices and faces (outwards) of a closed prism over a footprint."""
     import trimesh
 
     mesh = trimesh.creation.extrude_polygon(footprint.polygon, footprint.height_m - footprint.base_m, engine="earcut")
     return np.asarray(mesh.vertices) + np.array([0.0, 0.0, footprint.base_m]), np.asarray(mesh.faces)
 
 
-def _add_mesh(builder: _Builder, path: Path, model: MeshConfig, world: Georeference) -> None:
-    """Each closed piece of a mesh becomes a solid, so that sites inside can be told; the rest stays one surface."""
+def _add_mesh(builder: _Builder, path: Path, config: MeshConfig, world: Georeference) -> None:
+    """Add each closed piece of a mesh as a solid, so that sites inside are detected; the rest is one open surface."""
     mesh = meshes.load_mesh(path, str(path))
-    near = (np.abs(mesh.vertices) <= MAX_COORDINATE_M).all(axis=1)
-    if not near.all():
-        bad, right = int(np.flatnonzero(~near)[0]), f"finite coordinates, at most {MAX_COORDINATE_M:g} m"
-        raise InputError(f"{path}: vertex {bad}", f"{mesh.vertices[bad].tolist()}", right)
+    far = np.flatnonzero(~(np.abs(mesh.vertices) <= MAX_COORDINATE_M).all(axis=1))
+    if len(far):
+        expected = f"expected finite coordinates, at most {MAX_COORDINATE_M:g} m"
+        raise InputError(f"{path}: vertex {far[0]}", f"{expected}, got {mesh.vertices[far[0]].tolist()}")
     faces = len(mesh.faces)
-    with translate_errors(path, meshes.EXPECTED_MESH, "cannot be taken apart"):
+    with translate_errors(path, meshes.MESH_HINT, "cannot be divided into pieces"):
         mesh.merge_vertices(merge_tex=True, merge_norm=True)
         mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
     if len(mesh.faces) == 0:
-        raise InputError(path, f"none of its {faces} triangles has an area", "a triangle mesh")
-    if dropped := faces - len(mesh.faces):
-        builder.counts.repaired["degenerate or doubled triangles dropped"] += dropped
-    triangles, vertices_m = np.asarray(mesh.faces, dtype=np.int64), _to_world(mesh.vertices, model, path, world)
+        raise InputError(path, f"expected a triangle mesh, got {faces} triangles without area")
+    if faces > len(mesh.faces):
+        builder.counts.repaired["degenerate or doubled triangles dropped"] += faces - len(mesh.faces)
+
+    triangles = np.asarray(mesh.faces, dtype=np.int64)
+    vertices_m = _to_world(mesh.vertices, config, path, world)
     piece = mesh_components(mesh.face_adjacency, len(triangles))
-    closed = are_closed(triangles, piece)
+    is_closed = are_closed(triangles, piece)
     order = np.argsort(piece, kind="stable")
-    ends = np.cumsum(np.bincount(piece))
-    for number in np.flatnonzero(closed).tolist():
-        its = order[ends[number - 1] if number else 0 : ends[number]]
-        used, corners = np.unique(triangles[its], return_inverse=True)
-        builder.add(vertices_m[used], corners.reshape(-1, 3), f"{path.stem}_{number}", model.kind)
-    if len(rest := order[~closed[piece[order]]]):
-        name, form = f"{path.stem}_surface", " (open surface)"
-        builder.add(vertices_m, triangles[rest], name, model.kind, form)
+    by_piece = np.split(order, np.cumsum(np.bincount(piece))[:-1])
+    for number in np.flatnonzero(is_closed).tolist():
+        used, corners = np.unique(triangles[by_piece[number]], return_inverse=True)
+        builder.add(vertices_m[used], corners.reshape(-1, 3), f"{path.stem}_{number}", config.kind)
+    rest = order[~is_closed[piece[order]]]
+    if len(rest):
+        builder.add(vertices_m, triangles[rest], f"{path.stem}_surface", config.kind, " (open surface)")
 
 
-def _to_world(vertices_m: Floats, model: MeshConfig, path: Path, world: Georeference) -> Floats:
-    """A mesh's vertices (n, 3) in the world frame: moved by its offset, then brought from its own system, if any."""
-    placed: Floats = np.add(vertices_m, model.offset_m, dtype=np.float64)
-    if model.system is None:
-        world.metres(placed[:, :2], str(path), "offset_m, epsg or origin_deg beside the mesh's file")
-        return placed
-    right = "the epsg or the origin_deg that the mesh was made with"
-    reading = world.read_coordinates(placed[:, :2], str(path), model.system, right)
-    return np.column_stack([reading.to_world(placed[:, :2]), placed[:, 2]])
+def _to_world(vertices_m: Floats, config: MeshConfig, path: Path, world: Georeference) -> Floats:
+    """Return the vertices of a mesh (n, 3) in the world frame."""
+    moved: Floats = np.add(vertices_m, config.offset_m, dtype=np.float64)
+    if config.crs is None:
+        world.check_metres(moved[:, :2], str(path), "Set offset_m, epsg or origin_deg beside the mesh's file.")
+        return moved
+    hint = "Set the epsg or the origin_deg that the mesh was made with."
+    reading = world.read_coordinates(moved[:, :2], str(path), config.crs, hint)
+    return np.column_stack([reading.to_world(moved[:, :2]), moved[:, 2]])
 
 
-def _add_plane(builder: _Builder, scenario: Scenario) -> tuple[Floats, NDArray[np.int64]]:
-    """Two triangles at z = 0, facing up, well beyond the region of interest and everything that stands."""
+def _roi_corners_m(scenario: Scenario) -> Floats:
+    """Return the lowest and the highest corner of the region of interest, (2, 3)."""
     box = scenario.roi.box
-    corners = np.array([box.origin_m, np.add(box.origin_m, box.size_m)])
-    points = np.concatenate([corners, *builder.vertices])
-    (x0, y0), (x1, y1) = points.min(axis=0)[:2] - GROUND_MARGIN_M, points.max(axis=0)[:2] + GROUND_MARGIN_M
+    return np.array([box.origin_m, np.add(box.origin_m, box.size_m)])
+
+
+def _ground_plane(builder: _Builder, scenario: Scenario) -> tuple[Floats, NDArray[np.int64]]:
+    """Return two triangles at z = 0, facing up, with a margin around the region of interest and all solids."""
+    points = np.concatenate([_roi_corners_m(scenario), *builder.vertices])
+    x0, y0 = points.min(axis=0)[:2] - GROUND_MARGIN_M
+    x1, y1 = points.max(axis=0)[:2] + GROUND_MARGIN_M
     vertices = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
     return vertices, np.array([[0, 1, 2], [0, 2, 3]])
 
 
-def _extent_m(scenario: Scenario, footprints: Sequence[Footprint]) -> tuple[Floats, Floats]:
-    """South-west and north-east corner (2,) of the ground: well beyond the region of interest and all footprints."""
-    box = scenario.roi.box
-    corners = np.array([box.origin_m, np.add(box.origin_m, box.size_m)])[:, :2]
-    points = np.concatenate([corners, *(np.reshape(f.polygon.bounds, (2, 2)) for f in footprints)])
+def _ground_extent_m(scenario: Scenario, footprints: Sequence[Footprint]) -> tuple[Floats, Floats]:
+    """Return the corners (2,) of the ground: with a margin around the region of interest and all footprints."""
+    bounds = [np.reshape(footprint.polygon.bounds, (2, 2)) for footprint in footprints]
+    points = np.concatenate([_roi_corners_m(scenario)[:, :2], *bounds])
     return points.min(axis=0) - GROUND_MARGIN_M, points.max(axis=0) + GROUND_MARGIN_M
 
 
 def _lift_to_surface(surface: TerrainSurface, footprint: Footprint) -> Footprint:
-    """A footprint whose heights count from the ground."""
-    centre = np.array([[footprint.polygon.centroid.x, footprint.polygon.centroid.y]])
-    ground = float(surface.height_m(centre[:, 0], centre[:, 1])[0])
-    base = ground + footprint.base_m
+    """Return a footprint with heights above the ground converted to z."""
+    centre = footprint.polygon.centroid
+    ground_m = float(surface.height_m(np.array([centre.x]), np.array([centre.y]))[0])
+    base_m = ground_m + footprint.base_m
     if footprint.base_m <= 0:
-        base = min(base, surface.lowest_m(np.asarray(footprint.polygon.exterior.coords)))
-    return replace(footprint, base_m=base, height_m=ground + footprint.height_m)
+        base_m = min(base_m, surface.lowest_m(np.asarray(footprint.polygon.exterior.coords)))
+    return replace(footprint, base_m=base_m, height_m=ground_m + footprint.height_m)

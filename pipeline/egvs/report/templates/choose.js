@@ -1,29 +1,29 @@
-// Draws the views of the site that a reader chooses: joins each image's data to the palette of the page's colours.
+// Draws the views of the site that a reader chooses: joins the data of each image with the palettes of the page.
 (() => {
   const data = JSON.parse(document.getElementById("site-data").textContent);
   const bytes = text => Uint8Array.from(atob(text), c => c.charCodeAt(0));
-  const address = (image, palette) => {
+  const imageUrl = (image, palette) => {
     const [head, pixels] = image;
     return URL.createObjectURL(new Blob([head, palette, pixels, data.end].map(bytes), { type: "image/png" }));
   };
   const set = (element, image, palette) => {
     if (element.dataset.made) URL.revokeObjectURL(element.getAttribute("href"));
-    element.setAttribute("href", address(image, palette));
+    element.setAttribute("href", imageUrl(image, palette));
     element.dataset.made = 1;
   };
-  const tell = (view, its) => {
-    view.querySelector(".share-vehicles").textContent = its.missed;
-    view.querySelector(".worst-note").textContent = its.note;
-    view.querySelector(".worst-places").replaceChildren(...its.worst.map(([words, rests]) => {
+  const showVehicles = (view, vehicles) => {
+    view.querySelector(".share-vehicles").textContent = vehicles.missed;
+    view.querySelector(".worst-note").textContent = vehicles.note;
+    view.querySelector(".worst-places").replaceChildren(...vehicles.worst.map(([text, sample]) => {
       const item = document.createElement("li"), small = document.createElement("small");
-      small.textContent = rests;
-      item.append(words, small);
+      small.textContent = sample;
+      item.append(text, small);
       return item;
     }));
     view.querySelectorAll("g.worst").forEach((mark, number) => {
-      const at = its.numbers[number];
-      if (at) mark.setAttribute("transform", `translate(${at.join(" ")})`);
-      mark.setAttribute("display", at ? "inline" : "none");
+      const position = vehicles.numbers[number];
+      if (position) mark.setAttribute("transform", `translate(${position.join(" ")})`);
+      mark.setAttribute("display", position ? "inline" : "none");
     });
   };
   const choose = (panel, name) => {
@@ -33,14 +33,14 @@
     panel.querySelector(".share-seen").textContent = site.share[0];
     panel.querySelector(".share-missed").textContent = site.share[1];
     panel.querySelector("figcaption").textContent = site.caption;
-    if (site.vehicles) tell(panel.querySelector("[data-view=vehicles]"), site.vehicles);
+    if (site.vehicles) showVehicles(panel.querySelector("[data-view=vehicles]"), site.vehicles);
     for (const kind of Object.keys(site.images).filter(kind => kind !== "shade")) {
       const svg = panel.querySelector(`[data-view=${kind}] svg`);
       svg.setAttribute("aria-label", `From above, ${kind}: ${site.caption}`);
       svg.querySelector(".sensor").setAttribute("transform", `translate(${site.at.join(" ")})`);
-      for (const look of ["day", "night"]) {
-        const palette = data.palettes[look][kind in data.palettes[look] ? kind : "field"];
-        set(svg.querySelector(`.field.${look}`), site.images[kind], palette);
+      for (const theme of ["day", "night"]) {
+        const palette = data.palettes[theme][kind in data.palettes[theme] ? kind : "field"];
+        set(svg.querySelector(`.field.${theme}`), site.images[kind], palette);
       }
       const shade = svg.querySelector(".shade");
       if (shade) set(shade, site.images.shade, data.palettes.shade);

@@ -1,1 +1,39 @@
 """Detectors that validation runs on point clouds."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from egvs.core.lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from egvs.validation.detectors.base import (
+        Detector,
+        JointDetector,
+        JointSiteDetector,
+        SiteDetector,
+        detector_names,
+        make_detector,
+    )
+    from egvs.validation.detectors.cluster import Cluster
+    from egvs.validation.detectors.pointpillars import PointPillars
+
+__all__ = [
+    "Cluster",
+    "Detector",
+    "JointDetector",
+    "JointSiteDetector",
+    "PointPillars",
+    "SiteDetector",
+    "detector_names",
+    "make_detector",
+]
+
+__getattr__, __dir__ = lazy_exports(
+    __name__,
+    {
+        "base": ["Detector", "JointDetector", "JointSiteDetector", "SiteDetector", "detector_names", "make_detector"],
+        "cluster": ["Cluster"],
+        "pointpillars": ["PointPillars"],
+    },
+)

@@ -1,16 +1,12 @@
-"""PillarNet, its loss, ONNX export.
+"""The network of the PointPillars detector, its loss, and its export to ONNX (needs PyTorch).
 
-How far the network is from what it should say.
+**Network:** PointPillars' encoder and backbone (Lang et al. 2019), with a head that finds centres (Yin et al. 2021).
+Anchors fit one length of vehicles; from kei cars of 3.4 m to buses of 12 m there is more than one, so the head returns
+where centres are instead. About 0.9 million parameters.
 
-For the middles, the focal loss of Law and Deng (2018, ECCV, Eq. 1): -(1 - p)^2 log p in a vehicle's cell, elsewhere
--(1 - heat)^4 p^2 log(1 - p), over the number of vehicles. For the boxes, the mean distance of their values.
-
-The network: PointPillars' encoder and backbone (Lang et al. 2019), with a head that finds centres (Yin et al. 2021).
-
-Anchors suit one length of vehicle; kei cars of 3.4 m and buses of 12 m share this junction, so the head says where
-middles are instead. Some 0.9 million parameters.
-
-Writes a network as an ONNX model that says how it was made.
+**Loss:** for the centres, the focal loss of Law and Deng (2018, ECCV, Eq. 1): -(1 - p)^2 log p in the cell of a
+vehicle, elsewhere -(1 - heat)^4 p^2 log(1 - p), divided by the number of vehicles. For the boxes, the mean absolute
+difference of their values.
 """
 
 from __future__ import annotations
@@ -29,79 +25,106 @@ from torch.nn.functional import logsigmoid
 from egvs.validation.detectors.pointpillars import CELLS, METADATA_KEY, N_FEATURES, N_VALUES, POINTS_PER_PILLAR
 from egvs.validation.training.samples import CROP_CELLS, Sample
 
-_BOX_WEIGHT = 0.5  # weight of the boxes beside the middles
+_BOX_WEIGHT = 0.5  # weight of the loss of the boxes, relative to that of the centres
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Some samples as tensors."""
+    """Samples as tensors.
+
+    Attributes
+    ----------
+    features, present, cell
+        Pillars of all samples; cells are counted on from sample to sample.
+    heat, loss_weight
+        Maps of each sample, (samples, c, c).
+    centres
+        Sample, row and column of the cell of each vehicle.
+    values
+        Values of the box of each vehicle, (vehicles, N_VALUES).
+    samples
+        Number of samples.
+    """
 
     features: Tensor
     present: Tensor
     cell: Tensor
     heat: Tensor
-    counts: Tensor
-    at: tuple[Tensor, Tensor, Tensor]
+    loss_weight: Tensor
+    centres: tuple[Tensor, Tensor, Tensor]
     values: Tensor
-    sweeps: int
+    samples: int
 
     @classmethod
-    def of(cls, samples: list[Sample]) -> Batch:
-        """Put samples together."""
-        pillars, targets = [s.pillars for s in samples], [s.target for s in samples]
-        cell = np.concatenate([p.cell + i * CROP_CELLS**2 for i, p in enumerate(pillars)])
-        which = np.repeat(np.arange(len(samples)), [len(t.cell) for t in targets])
-        at = np.concatenate([t.cell for t in targets])
+    def collate(cls, samples: list[Sample]) -> Batch:
+        """Combine samples."""
+        pillars = [sample.pillars for sample in samples]
+        targets = [sample.target for sample in samples]
+        cell = np.concatenate([each.cell + number * CROP_CELLS**2 for number, each in enumerate(pillars)])
+        sample = np.repeat(np.arange(len(samples)), [len(target.cell) for target in targets])
+        centres = np.concatenate([target.cell for target in targets])
         return cls(
-            torch.from_numpy(np.concatenate([p.features for p in pillars])),
-            torch.from_numpy(np.concatenate([p.present for p in pillars])),
+            torch.from_numpy(np.concatenate([each.features for each in pillars])),
+            torch.from_numpy(np.concatenate([each.present for each in pillars])),
             torch.from_numpy(cell),
-            torch.from_numpy(np.stack([t.heat for t in targets])),
-            torch.from_numpy(np.stack([t.counts for t in targets])),
-            (torch.from_numpy(which), torch.from_numpy(at[:, 0].copy()), torch.from_numpy(at[:, 1].copy())),
-            torch.from_numpy(np.concatenate([t.values for t in targets])),
+            torch.from_numpy(np.stack([target.heat for target in targets])),
+            torch.from_numpy(np.stack([target.loss_weight for target in targets])),
+            (torch.from_numpy(sample), torch.from_numpy(centres[:, 0].copy()), torch.from_numpy(centres[:, 1].copy())),
+            torch.from_numpy(np.concatenate([target.values for target in targets])),
             len(samples),
         )
 
 
-def compute_loss(odds: Tensor, values: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
-    """Of the middles, and of the boxes (weighted); their sum is what is made small.
+def compute_loss(log_odds: Tensor, values: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
+    """Return the loss of the centres, and that of the boxes with its weight; training minimises their sum.
 
-    ``odds`` (sweeps, 1, c, c) and ``values`` (sweeps, VALUES, c, c) are the network's.
+    Parameters
+    ----------
+    log_odds, values
+        Maps of the network, (samples, 1, c, c) and (samples, N_VALUES, c, c).
+    batch
+        The samples with their targets.
     """
-    odds = odds[:, 0]
-    chance = torch.sigmoid(odds)
-    middle = batch.heat == 1.0
-    found = -((1 - chance) ** 2 * logsigmoid(odds))[middle].sum()
-    false = -((1 - batch.heat) ** 4 * chance**2 * logsigmoid(-odds) * batch.counts)[~middle].sum()
+    log_odds = log_odds[:, 0]
+    probability = torch.sigmoid(log_odds)
+    is_centre = batch.heat == 1.0
+    centre_loss = -((1 - probability) ** 2 * logsigmoid(log_odds))[is_centre].sum()
+    elsewhere = (1 - batch.heat) ** 4 * probability**2 * logsigmoid(-log_odds) * batch.loss_weight
+    elsewhere_loss = -elsewhere[~is_centre].sum()
     vehicles = max(1, len(batch.values))
-    which, x, y = batch.at
-    off = (values[which, :, x, y] - batch.values).abs().sum() / vehicles
-    return (found + false) / vehicles, _BOX_WEIGHT * off
+    sample, row, column = batch.centres
+    box_loss = (values[sample, :, row, column] - batch.values).abs().sum() / vehicles
+    return (centre_loss + elsewhere_loss) / vehicles, _BOX_WEIGHT * box_loss
 
 
 _PILLAR_CHANNELS = 32
-_WIDTHS, _DEPTHS = (32, 64, 128), (3, 4, 4)
-_UPSAMPLED_CHANNELS, _HEAD_CHANNELS = 32, 48
-_INITIAL_LOG_ODDS = -3.0  # log odds of a middle before anything was learned
+_BLOCK_WIDTHS = (32, 64, 128)
+_BLOCK_DEPTHS = (3, 4, 4)
+_UPSAMPLED_CHANNELS = 32
+_HEAD_CHANNELS = 48
+_INITIAL_LOG_ODDS = -3.0  # of a centre, before training
+_EXAMPLE_PILLARS = 8  # of the example that the export traces; any number works
 
 
 class PillarNet(nn.Module):
-    """Pillars to maps, see :mod:`egvs.validation.detectors.pointpillars`."""
+    """Computes maps from pillars, see :mod:`egvs.validation.detectors.pointpillars`."""
 
     def __init__(self) -> None:
         super().__init__()
         self.point = nn.Linear(N_FEATURES, _PILLAR_CHANNELS, bias=False)
         self.point_norm = nn.BatchNorm1d(_PILLAR_CHANNELS, eps=1e-3, momentum=0.01)
-        blocks, ups, before = [], [], _PILLAR_CHANNELS
-        for level, (width, depth) in enumerate(zip(_WIDTHS, _DEPTHS, strict=True)):
-            layers = [_convolution(before, width, 2), *(_convolution(width, width, 1) for _ in range(depth))]
+        blocks: list[nn.Module] = []
+        ups: list[nn.Module] = []
+        channels = _PILLAR_CHANNELS
+        for level, (width, depth) in enumerate(zip(_BLOCK_WIDTHS, _BLOCK_DEPTHS, strict=True)):
+            layers = [_convolution(channels, width, 2), *(_convolution(width, width, 1) for _ in range(depth))]
             blocks.append(nn.Sequential(*layers))
             up = nn.ConvTranspose2d(width, _UPSAMPLED_CHANNELS, 2**level, stride=2**level, bias=False)
             ups.append(nn.Sequential(up, _batch_norm(_UPSAMPLED_CHANNELS), nn.ReLU()))
-            before = width
-        self.blocks, self.ups = nn.ModuleList(blocks), nn.ModuleList(ups)
-        self.head = _convolution(_UPSAMPLED_CHANNELS * len(_WIDTHS), _HEAD_CHANNELS, 1)
+            channels = width
+        self.blocks = nn.ModuleList(blocks)
+        self.ups = nn.ModuleList(ups)
+        self.head = _convolution(_UPSAMPLED_CHANNELS * len(_BLOCK_WIDTHS), _HEAD_CHANNELS, 1)
         self.heat = nn.Conv2d(_HEAD_CHANNELS, 1, 1)
         self.values = nn.Conv2d(_HEAD_CHANNELS, N_VALUES, 1)
         assert self.heat.bias is not None
@@ -110,14 +133,18 @@ class PillarNet(nn.Module):
     def forward(
         self, features: Tensor, present: Tensor, cell: Tensor, sweeps: int = 1, cells: int = CELLS
     ) -> tuple[Tensor, Tensor]:
-        """Log odds of a middle (sweeps, 1, c, c), and values (sweeps, VALUES, c, c), with c = cells / 2.
+        """Return log odds of centres (sweeps, 1, c, c), and values (sweeps, N_VALUES, c, c), with c = cells / 2.
 
         Parameters
         ----------
         features, present
-            Of all pillars of all sweeps, (p, POINTS, FEATURES) and (p, POINTS).
+            Pillars of all sweeps, (p, POINTS_PER_PILLAR, N_FEATURES) and (p, POINTS_PER_PILLAR).
         cell
-            Of each pillar, counted on from sweep to sweep, (p,).
+            Cell of each pillar, counted on from sweep to sweep, (p,).
+        sweeps
+            Number of sweeps.
+        cells
+            Pillars along each side of a window.
         """
         points = self.point(features)
         points = self.point_norm(points.transpose(1, 2)).transpose(1, 2)
@@ -137,17 +164,16 @@ def _batch_norm(channels: int) -> nn.Module:
     return nn.BatchNorm2d(channels, eps=1e-3, momentum=0.01)
 
 
-def _convolution(before: int, after: int, stride: int) -> nn.Module:
-    return nn.Sequential(
-        nn.Conv2d(before, after, 3, stride=stride, padding=1, bias=False), _batch_norm(after), nn.ReLU()
-    )
-
-
-_EXAMPLE_PILLARS = 8  # of the example that the export traces; any number will do
+def _convolution(inputs: int, outputs: int, stride: int) -> nn.Module:
+    convolution = nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1, bias=False)
+    return nn.Sequential(convolution, _batch_norm(outputs), nn.ReLU())
 
 
 def export_onnx(net: PillarNet, metadata: dict[str, Any]) -> bytes:
-    """The model, its description under :data:`METADATA_KEY`. The network is left in training mode as it was."""
+    """Return the model as ONNX, with metadata under :data:`METADATA_KEY`.
+
+    The network keeps its mode (training or evaluation).
+    """
     was_training = net.training
     net.eval()
     example = (
@@ -157,7 +183,7 @@ def export_onnx(net: PillarNet, metadata: dict[str, Any]) -> bytes:
     )
     pillars = torch.export.Dim("pillars", min=1)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the exporter, about itself
+        warnings.simplefilter("ignore")  # deprecations within the exporter
         program = torch.onnx.export(
             net,
             example,

@@ -1,12 +1,9 @@
-"""Training crops and targets from random poses.
+"""Training samples: crops of simulated sweeps from random poses, and what the network should return for them.
 
-Draws where a roadside sensor could hang: beside the lanes of a junction, at any height that poles have.
-
-Makes what the network learns from: crops of simulated sweeps, and what it should say of each.
-
-Sample number i is a function of the seed and i alone, so that training goes on where it was stopped. A pose serves some
-samples in turn, because its empty scan costs more than a sweep; each sample of a batch is from another pose. Crops are
-turned at random and mirrored, so that the network knows no compass.
+Poses are drawn beside the lanes of a junction, at any height of poles. Sample number i depends on the seed and i only,
+so an interrupted training can be resumed. A pose is used for several samples, because its empty scan costs more than a
+sweep; the samples of a batch have different poses. Crops are rotated at random and mirrored, so that the network does
+not learn compass directions.
 """
 
 from __future__ import annotations
@@ -16,16 +13,16 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS, TrafficFrame
 from egvs.core.errors import InputError
-from egvs.scenario.model import Scenario
+from egvs.core.grid import FloatArray, IntArray
 from egvs.sensors import site_feasibility
 from egvs.sensors.scanner import Scanner
-from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import Sensor
 from egvs.sensors.sites import Pose, Site
 from egvs.traffic import sumo_folder
@@ -35,233 +32,272 @@ from egvs.validation.detectors.pointpillars import (
     OUTPUT_CELL_M,
     STRIDE,
     Convention,
-    HeightZero,
+    HeightOrigin,
     PillarPoints,
     Pillars,
     PillarWindow,
     encode_boxes,
 )
 from egvs.validation.held_out_traffic import HeldOutTraffic
+from egvs.validation.sweeps import BoolArray
 from egvs.world.carriageway import Carriageway
 
-_MAX_ROAD_DISTANCE_M = 12.0  # beyond the region of interest
-_PITCH_DEG, _ROLL_DEG = (-15.0, 3.0), 2.0
+CROP_CELLS = 128
+BATCH = 8
+
+_MAX_ROAD_DISTANCE_M = 12.0  # of a pose from the region of interest
+_PITCH_DEG = (-15.0, 3.0)
+_ROLL_DEG = 2.0
 _MAX_ATTEMPTS = 1000
+_SAMPLES_PER_POSE = 20
+_MIN_POINTS = 3  # of a vehicle that should be detected
+_IGNORED_POINTS = 1  # with so many, up to the minimum, a vehicle may be detected or not
+_JITTER_M = 20.0  # of the centre of a crop from a vehicle
+_ANYWHERE_SHARE = 0.1  # of crops that are not near a vehicle
+_MARGIN_M = 15.0  # of crops around the region of interest
+_PEAK_SHARE = 1 / 8  # standard deviation of a peak of the heat map, relative to the size of the vehicle
+_MIN_PEAK_M = 0.6
 
 
-@dataclass(frozen=True)
-class PoseRule:
-    """Where poses of a junction are drawn from.
+class TrainingJunction:
+    """A training junction: its scene, its frames, and random poses.
 
-    Attributes
+    Parameters
     ----------
+    record
+        Scene and traffic.
     heights_m
-        Lowest and highest height above the ground.
+        Lowest and highest mounting height above the ground.
     """
 
-    scene: Scene
-    carriageway: Carriageway | None
-    heights_m: tuple[float, float]
+    def __init__(self, record: HeldOutTraffic, heights_m: tuple[float, float]) -> None:
+        self.record = record
+        self.frames = list(record.read())
+        self._heights_m = heights_m
+        network = sumo_folder.read_network(record.scenario)
+        self._carriageway = None if network is None else Carriageway.of(network)
 
-    @classmethod
-    def of(cls, scenario: Scenario, scene: Scene, heights_m: tuple[float, float]) -> PoseRule:
-        """For a scenario's scene."""
-        network = sumo_folder.read_network(scenario)
-        return cls(scene, None if network is None else Carriageway.of(network), heights_m)
+    @cached_property
+    def scanner(self) -> Scanner:
+        """Scanner for all poses."""
+        return Scanner(self.record.scene, full_sweep=True)
 
-    def draw(self, sensor: Sensor, random: np.random.Generator) -> Pose:
-        """One pose. A sensor with a limited field of view looks at the region of interest.
+    def draw_pose(self, sensor: Sensor, rng: np.random.Generator) -> Pose:
+        """Draw a pose. A sensor with a limited field of view points at the region of interest.
 
         Raises
         ------
         InputError
-            Where no place round the region of interest is free.
+            If there is no free position around the region of interest.
         """
-        low = np.asarray(self.scene.roi.origin_m)[:2] - _MAX_ROAD_DISTANCE_M
-        size = np.asarray(self.scene.roi.size_m)[:2] + 2 * _MAX_ROAD_DISTANCE_M
+        scene = self.record.scene
+        low = np.asarray(scene.roi.origin_m)[:2] - _MAX_ROAD_DISTANCE_M
+        size = np.asarray(scene.roi.size_m)[:2] + 2 * _MAX_ROAD_DISTANCE_M
         for _ in range(_MAX_ATTEMPTS):
-            x_m, y_m = (low + size * random.random(2)).tolist()
-            above_m, pitch_deg, roll_deg, turn = (
-                random.uniform(*self.heights_m),
-                random.uniform(*_PITCH_DEG),
-                random.uniform(-_ROLL_DEG, _ROLL_DEG),
-                random.uniform(-180.0, 180.0),
-            )
-            yaw_deg = turn if sensor.azimuth_span_deg is None else self._towards_roi_deg(x_m, y_m) + turn / 12
+            x_m, y_m = (low + size * rng.random(2)).tolist()
+            height_m = rng.uniform(*self._heights_m)
+            pitch_deg = rng.uniform(*_PITCH_DEG)
+            roll_deg = rng.uniform(-_ROLL_DEG, _ROLL_DEG)
+            turn_deg = rng.uniform(-180.0, 180.0)
+            yaw_deg = turn_deg
+            if sensor.azimuth_span_deg is not None:
+                yaw_deg = self._direction_to_roi_deg(x_m, y_m) + turn_deg / 12
             pose = Pose(x_m, y_m, 0.0, round(yaw_deg, 3), round(pitch_deg, 3), round(roll_deg, 3))
-            pose = Pose(x_m, y_m, site_feasibility.ground_height_m(self.scene.world, pose) + above_m, *pose.angles_deg)
+            z_m = site_feasibility.ground_height_m(scene.world, pose) + height_m
+            pose = Pose(x_m, y_m, z_m, *pose.angles_deg)
             if self._is_free(pose, sensor):
                 return pose
-        raise InputError(f"{self.scene.scenario.file}: roi", "no free place for a pole round it", "places beside roads")
+        problem = "there is no free position for a pole around the region"
+        raise InputError(f"{scene.scenario.file}: roi", problem, "Use a region with space beside its roads")
 
     def _is_free(self, pose: Pose, sensor: Sensor) -> bool:
+        scene = self.record.scene
         site = Site("drawn", pose, sensor.name)
-        if not site_feasibility.drop_infeasible([site], self.scene.world, self.carriageway).free:
+        if not site_feasibility.drop_infeasible([site], scene.world, self._carriageway).free:
             return False
         try:
-            site_feasibility.check_pose(self.scene, pose, sensor, "drawn")
+            site_feasibility.check_pose(scene, pose, sensor, "drawn")
         except InputError:
             return False
         return True
 
-    def _towards_roi_deg(self, x_m: float, y_m: float) -> float:
-        roi = self.scene.roi
-        to_x, to_y = (roi.origin_m[i] + roi.size_m[i] / 2 - at for i, at in enumerate((x_m, y_m)))
+    def _direction_to_roi_deg(self, x_m: float, y_m: float) -> float:
+        roi = self.record.scene.roi
+        to_x = roi.origin_m[0] + roi.size_m[0] / 2 - x_m
+        to_y = roi.origin_m[1] + roi.size_m[1] / 2 - y_m
         return math.degrees(math.atan2(to_y, to_x))
-
-
-CROP_CELLS = 128
-BATCH = 8
-_SAMPLES_PER_POSE = 20
-_FEWEST, _UNSURE = 3, 1  # points of a vehicle that should be found; that may be found or not
-_JITTER_M, _ELSEWHERE = 20.0, 0.1
-_BEYOND_M = 15.0
-_SPREAD, _LEAST_SPREAD_M = 8.0, 0.6
 
 
 @dataclass(frozen=True)
 class Target:
-    """What the network should say of a crop.
+    """What the network should return for a crop.
 
     Attributes
     ----------
     heat
-        1 in the cell of a vehicle's middle, less round it, (c, c) float32.
-    counts
-        0 where it does not matter what the network says, (c, c) float32.
+        1 in the cell of a vehicle's centre, less around it, (c, c) float32.
+    loss_weight
+        0 where the output does not matter, else 1, (c, c) float32.
     cell, values
         Of each vehicle, see :func:`egvs.validation.detectors.pointpillars.encode_boxes`.
     """
 
     heat: NDArray[np.float32]
-    counts: NDArray[np.float32]
-    cell: NDArray[np.int64]
+    loss_weight: NDArray[np.float32]
+    cell: IntArray
     values: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One crop."""
+    """The pillars of one crop, and its target."""
 
     pillars: Pillars
     target: Target
 
 
-class TrainingJunction:
-    """A training junction: its scene, its frames, and where sensors may hang."""
-
-    def __init__(self, record: HeldOutTraffic, heights_m: tuple[float, float]) -> None:
-        self.record = record
-        self.frames = list(record.read())
-        self.rule = PoseRule.of(record.scenario, record.scene, heights_m)
-
-    @cached_property
-    def scanner(self) -> Scanner:
-        """Scans for all poses."""
-        return Scanner(self.record.scene, full_sweep=True)
+class _DrawnPose(NamedTuple):
+    junction: TrainingJunction
+    simulator: CloudSimulator
+    origin: HeightOrigin
 
 
 class Samples:
-    """Samples by number."""
+    """Training samples by number.
+
+    Parameters
+    ----------
+    junctions
+        The training junctions, which take turns.
+    sensors
+        Names of sensors to draw from.
+    convention
+        Where heights are measured from.
+    seed
+        Seed of poses, crops and sweeps.
+    """
 
     def __init__(
         self, junctions: Sequence[TrainingJunction], sensors: Sequence[str], convention: Convention, seed: int
     ) -> None:
-        self._junctions, self._sensors, self._convention, self._seed = junctions, sensors, convention, seed
-        self._open: OrderedDict[int, tuple[TrainingJunction, CloudSimulator, HeightZero]] = OrderedDict()
+        self._junctions = junctions
+        self._sensors = sensors
+        self._convention = convention
+        self._seed = seed
+        self._poses: OrderedDict[int, _DrawnPose] = OrderedDict()
 
     def sample(self, number: int) -> Sample:
-        """Sample ``number``, from 0."""
+        """Return a sample; numbers start at 0."""
         group = number // (BATCH * _SAMPLES_PER_POSE) * BATCH + number % BATCH
-        junction, maker, zero = self._posed(group)
-        random = self._random(1, number)
-        frame = junction.frames[int(random.integers(len(junction.frames)))]
-        sweep = maker.sweep(frame, random)
-        motor = np.array([kind not in NON_VEHICLE_KINDS for kind in frame.kinds], dtype=np.bool_)
-        points = sweep.points_on(len(frame.boxes))
-        window = self._window(junction, frame.boxes[motor & (points >= _FEWEST)], random)
-        seen = PillarPoints.of(sweep.sweep, maker.view, zero)
-        pillars = pointpillars.make_pillars(seen, window, self._convention)
-        return randomly_mirrored(Sample(pillars, make_target(frame, motor, points, window, zero)), random)
+        junction, simulator, origin = self._draw_pose(group)
+        rng = self._rng(1, number)
+        frame = junction.frames[int(rng.integers(len(junction.frames)))]
+        cloud = simulator.sweep(frame, rng)
+        is_vehicle = np.array([kind not in NON_VEHICLE_KINDS for kind in frame.kinds], dtype=np.bool_)
+        points_on_box = cloud.points_on(len(frame.boxes))
+        window = self._draw_window(junction, frame.boxes[is_vehicle & (points_on_box >= _MIN_POINTS)], rng)
+        points = PillarPoints.from_sweeps([cloud.sweep], [simulator.view], origin)
+        pillars = pointpillars.make_pillars(points, window, self._convention)
+        return randomly_mirrored(Sample(pillars, make_target(frame, is_vehicle, points_on_box, window, origin)), rng)
 
-    def _posed(self, group: int) -> tuple[TrainingJunction, CloudSimulator, HeightZero]:
-        """The pose of a group of samples; the last ones are kept."""
-        if group not in self._open:
-            random = self._random(0, group)
+    def _draw_pose(self, group: int) -> _DrawnPose:
+        """Return the pose of a group of samples; the last ones are cached."""
+        if group not in self._poses:
+            rng = self._rng(0, group)
             junction = self._junctions[group % len(self._junctions)]
-            sensor = junction.record.scene.sensor(self._sensors[int(random.integers(len(self._sensors)))])
-            pose = junction.rule.draw(sensor, random)
-            maker = CloudSimulator(junction.record.scene, pose, sensor, f"drawn {group}", junction.scanner)
-            zero = HeightZero(self._convention, maker.view, junction.record.scene.roi)
-            self._open[group] = junction, maker, zero
-            while len(self._open) > BATCH:
-                self._open.popitem(last=False)
-        return self._open[group]
+            scene = junction.record.scene
+            sensor = scene.sensor(self._sensors[int(rng.integers(len(self._sensors)))])
+            pose = junction.draw_pose(sensor, rng)
+            simulator = CloudSimulator(scene, pose, sensor, f"drawn {group}", junction.scanner)
+            origin = HeightOrigin(self._convention, [simulator.view], scene.roi)
+            self._poses[group] = _DrawnPose(junction, simulator, origin)
+            while len(self._poses) > BATCH:
+                self._poses.popitem(last=False)
+        return self._poses[group]
 
-    def _random(self, what: int, number: int) -> np.random.Generator:
-        return np.random.default_rng(np.random.SeedSequence((self._seed, what, number)))
+    def _rng(self, stream: int, number: int) -> np.random.Generator:
+        return np.random.default_rng(np.random.SeedSequence((self._seed, stream, number)))
 
-    def _window(
-        self, junction: TrainingJunction, boxes: NDArray[np.float64], random: np.random.Generator
-    ) -> PillarWindow:
-        """A crop near a vehicle that can be seen; now and then anywhere."""
-        low = np.asarray(junction.record.scene.roi.origin_m)[:2] - _BEYOND_M
-        high = low + np.asarray(junction.record.scene.roi.size_m)[:2] + 2 * _BEYOND_M
+    def _draw_window(self, junction: TrainingJunction, boxes: FloatArray, rng: np.random.Generator) -> PillarWindow:
+        """Draw a crop near a visible vehicle; sometimes anywhere."""
+        roi = junction.record.scene.roi
+        low = np.asarray(roi.origin_m)[:2] - _MARGIN_M
+        high = low + np.asarray(roi.size_m)[:2] + 2 * _MARGIN_M
         near = boxes[((boxes[:, :2] >= low) & (boxes[:, :2] < high)).all(axis=1), :2]
-        if len(near) and random.random() >= _ELSEWHERE:
-            centre = near[int(random.integers(len(near)))] + random.uniform(-_JITTER_M, _JITTER_M, 2)
+        if len(near) and rng.random() >= _ANYWHERE_SHARE:
+            centre = near[int(rng.integers(len(near)))] + rng.uniform(-_JITTER_M, _JITTER_M, 2)
         else:
-            centre = random.uniform(low, high)
-        return PillarWindow((float(centre[0]), float(centre[1])), random.uniform(-math.pi, math.pi), CROP_CELLS)
+            centre = rng.uniform(low, high)
+        return PillarWindow((float(centre[0]), float(centre[1])), rng.uniform(-math.pi, math.pi), CROP_CELLS)
 
 
 def make_target(
-    frame: TrafficFrame, motor: NDArray[np.bool_], points: NDArray[np.int64], window: PillarWindow, zero: HeightZero
+    frame: TrafficFrame, is_vehicle: BoolArray, points_on_box: IntArray, window: PillarWindow, origin: HeightOrigin
 ) -> Target:
-    """What the network should say of a frame in a window; ``points`` lie on each of the frame's boxes."""
-    boxes = frame.boxes[motor].copy()
-    boxes[:, 2] -= zero.below_m(boxes[:, :2])
+    """Return what the network should return for a frame in a window.
+
+    Parameters
+    ----------
+    frame
+        The traffic.
+    is_vehicle
+        Which of the frame's boxes are vehicles, (n,).
+    points_on_box
+        Number of points on each of the frame's boxes, (n,).
+    window
+        The crop.
+    origin
+        Where heights are measured from.
+    """
+    boxes = frame.boxes[is_vehicle].copy()
+    boxes[:, 2] -= origin.z_m(boxes[:, :2])
     boxes[:, :2] = window.to_window(boxes[:, :2])
     boxes[:, 6] -= window.turn_rad
     inside = ((boxes[:, :2] >= 0.0) & (boxes[:, :2] < window.size_m)).all(axis=1)
-    on = points[motor]
+    points = points_on_box[is_vehicle]
     size = window.cells // STRIDE
-    heat, counts = np.zeros((size, size), dtype=np.float32), np.ones((size, size), dtype=np.float32)
-    for box in boxes[(on >= _UNSURE) & (on < _FEWEST)]:
-        counts[_heat_bump(box, size) > 0.1] = 0.0
-    sought = boxes[inside & (on >= _FEWEST)]
-    for box in sought:
-        bump = _heat_bump(box, size)
-        np.maximum(heat, bump, out=heat)
-        counts[bump > 0.1] = 1.0
-    cell, values = encode_boxes(sought)
+    heat = np.zeros((size, size), dtype=np.float32)
+    loss_weight = np.ones((size, size), dtype=np.float32)
+    for box in boxes[(points >= _IGNORED_POINTS) & (points < _MIN_POINTS)]:
+        loss_weight[_heat_peak(box, size) > 0.1] = 0.0
+    targets = boxes[inside & (points >= _MIN_POINTS)]
+    for box in targets:
+        peak = _heat_peak(box, size)
+        np.maximum(heat, peak, out=heat)
+        loss_weight[peak > 0.1] = 1.0
+    cell, values = encode_boxes(targets)
     heat[tuple(cell.T)] = 1.0
-    counts[tuple(cell.T)] = 1.0
-    return Target(heat, counts, cell, values)
+    loss_weight[tuple(cell.T)] = 1.0
+    return Target(heat, loss_weight, cell, values)
 
 
-def _heat_bump(box: NDArray[np.float64], size: int) -> NDArray[np.float32]:
-    """How near each cell is to a box's middle, 1 to 0, along its length and its width."""
+def _heat_peak(box: FloatArray, size: int) -> NDArray[np.float32]:
+    """Return a Gaussian peak at the centre of a box, as long and wide as the box in proportion, (size, size)."""
     middle = (np.arange(size) + 0.5) * OUTPUT_CELL_M
     x, y = np.meshgrid(middle - box[0], middle - box[1], indexing="ij")
-    c, s = math.cos(box[6]), math.sin(box[6])
-    long, wide = (max(_LEAST_SPREAD_M, extent / _SPREAD) for extent in box[3:5])
-    near = np.exp(-0.5 * (((c * x + s * y) / long) ** 2 + ((c * y - s * x) / wide) ** 2))
-    found: NDArray[np.float32] = near.astype(np.float32)
-    return found
+    cos = math.cos(box[6])
+    sin = math.sin(box[6])
+    sigma_along = max(_MIN_PEAK_M, box[3] * _PEAK_SHARE)
+    sigma_across = max(_MIN_PEAK_M, box[4] * _PEAK_SHARE)
+    along = (cos * x + sin * y) / sigma_along
+    across = (cos * y - sin * x) / sigma_across
+    peak: NDArray[np.float32] = np.exp(-0.5 * (along**2 + across**2)).astype(np.float32)
+    return peak
 
 
-def randomly_mirrored(sample: Sample, random: np.random.Generator) -> Sample:
-    """The sample, or its mirror image across y, by the throw of a coin."""
-    if random.random() < 0.5:
+def randomly_mirrored(sample: Sample, rng: np.random.Generator) -> Sample:
+    """Return the sample or, in half of all cases, its mirror image across y."""
+    if rng.random() < 0.5:
         return sample
-    pillars, its = sample.pillars, sample.target
+    pillars = sample.pillars
+    target = sample.target
     features = pillars.features.copy()
-    features[:, :, [1, 5]] *= -1.0  # y from the pillar's middle, and from the mean of its points
-    size = CROP_CELLS
-    cell = pillars.cell + size - 1 - 2 * (pillars.cell % size)
+    features[:, :, [1, 5]] *= -1.0  # y from the centre of the pillar, and from the mean of its points
+    cell = pillars.cell + CROP_CELLS - 1 - 2 * (pillars.cell % CROP_CELLS)
     order = np.argsort(cell)
-    values = its.values * np.array([1, -1, 1, 1, 1, 1, -1, 1], dtype=np.float32)
-    to = np.column_stack([its.cell[:, 0], len(its.heat) - 1 - its.cell[:, 1]])
-    turned = Target(its.heat[:, ::-1].copy(), its.counts[:, ::-1].copy(), to, values)
-    return Sample(Pillars(features[order], pillars.present[order], cell[order]), turned)
+    values = target.values * np.array([1, -1, 1, 1, 1, 1, -1, 1], dtype=np.float32)
+    target_cell = np.column_stack([target.cell[:, 0], len(target.heat) - 1 - target.cell[:, 1]])
+    heat = target.heat[:, ::-1].copy()
+    loss_weight = target.loss_weight[:, ::-1].copy()
+    mirrored_pillars = Pillars(features[order], pillars.present[order], cell[order])
+    return Sample(mirrored_pillars, Target(heat, loss_weight, target_cell, values))

@@ -1,0 +1,68 @@
+"""One sensor of a plan: a row of ``placement.parquet``, or of a city's ``plan.parquet``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+
+@dataclass(frozen=True)
+class PlannedSensor:
+    """One sensor of a plan.
+
+    Attributes
+    ----------
+    order
+        1 for the first sensor: forced ones come first, then each time the one with the largest gain.
+    site, pole
+        Names of the candidate and of its pole.
+    x_m, y_m, z_m
+        Position in the world frame.
+    yaw_deg, pitch_deg, roll_deg
+        Orientation, as in :class:`egvs.sensors.sites.Pose`.
+    sensor
+        Name of the sensor model.
+    forced
+        Whether it is already installed.
+    gain, score
+        What it adds to the joint score of those before it, and the joint score with it.
+    cost
+        What it adds to the cost of those before it.
+    loss
+        What the joint score of the complete plan loses if this sensor fails; NaN in plans of a city.
+    bound
+        Upper bound of all plans with as many sensors as up to this one; NaN in plans of a city.
+    moved_m
+        Distance from the candidate's position; 0 without refinement.
+    gain_by_refining
+        What the joint score loses if this sensor alone returns to its candidate's pose; 0 without refinement.
+    junction
+        Name of the junction, in plans of a city.
+    """
+
+    order: int
+    site: str
+    pole: str
+    x_m: float
+    y_m: float
+    z_m: float
+    yaw_deg: float
+    pitch_deg: float
+    roll_deg: float
+    sensor: str
+    forced: bool
+    gain: float
+    score: float
+    cost: float
+    loss: float = math.nan
+    bound: float = math.nan
+    moved_m: float = 0.0
+    gain_by_refining: float = 0.0
+    junction: str = ""
+
+
+def plan_columns(sensors: Sequence[PlannedSensor]) -> dict[str, list[Any]]:
+    """Return the columns of the table of these sensors, by name."""
+    return {field.name: [getattr(sensor, field.name) for sensor in sensors] for field in fields(PlannedSensor)}

@@ -1,0 +1,154 @@
+"""The record of a run, ``run.json``: what each stage read, wrote and reported.
+
+It is written again after each stage, so that an interrupted run continues from there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
+from egvs.core import files, reading
+from egvs.core.errors import InputError
+from egvs.core.files import CHECKSUM_KEY, add_checksum, has_valid_checksum
+from egvs.core.runtime import ResourceUsage
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """The last run of one stage.
+
+    Attributes
+    ----------
+    inputs
+        Hash of everything that its artefacts depend on.
+    files, artefacts
+        File name -> sha256 of the files that it read and of those that it wrote.
+    summary
+        Outcome in numbers, a JSON value.
+    cost
+        Resources used when the artefacts were made, possibly in another run whose results were cached.
+    companions
+        Path in the run folder -> sha256 of files written beside the artefacts, for example ``sumo/run.sumocfg``.
+    """
+
+    inputs: str
+    files: dict[str, str]
+    artefacts: dict[str, str]
+    summary: dict[str, Any]
+    cost: ResourceUsage
+    companions: dict[str, str] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the JSON object that ``run.json`` contains."""
+        return {**self.__dict__, "cost": self.cost.to_json()}
+
+    @classmethod
+    def from_json(cls, value: Any) -> StageRecord | None:
+        """Read the JSON object of ``run.json``; None if another version of this program wrote it."""
+        match value:
+            case {
+                "inputs": str(inputs),
+                "files": dict(files_read),
+                "artefacts": dict(artefacts),
+                "summary": dict(summary),
+                "cost": {"seconds": int() | float() as seconds, "peak_mb": int() | float() as peak_mb},
+            }:
+                companions = value.get("companions", {})
+            case _:
+                return None
+        if not all(_is_digest_table(table) for table in (files_read, artefacts, companions)):
+            return None
+        cost = ResourceUsage(seconds=seconds, peak_mb=peak_mb)
+        return cls(inputs, files_read, artefacts, summary, cost, companions)
+
+
+def _is_digest_table(value: Any) -> bool:
+    return isinstance(value, dict) and all(isinstance(digest, str) for digest in value.values())
+
+
+_RECORD_TYPES = {"egvs": str, "seed": int, "scenario": dict, "scenario_folder": str, "stages": dict}
+_RERUN_HINT = "Remove it and run again."
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """Contents of ``run.json``.
+
+    Attributes
+    ----------
+    egvs
+        Version of this program.
+    seed
+        Seed of the scenario.
+    scenario, scenario_folder
+        The resolved scenario, and the folder of its files relative to the run folder.
+    stages
+        The completed stages, in the order of execution.
+    """
+
+    egvs: str
+    seed: int
+    scenario: dict[str, Any]
+    scenario_folder: str
+    stages: dict[str, StageRecord]
+
+    @classmethod
+    def read(cls, folder: Path) -> RunRecord:
+        """Read ``run.json`` of a folder.
+
+        Raises
+        ------
+        InputError
+            When there is no such file, or it is damaged or was changed.
+        """
+        path = RunFolder(folder).run_record
+        if not path.is_file():
+            raise InputError(path, "no such file", "Name a folder that egvs run has written.")
+        value = reading.read_json(path, _RERUN_HINT)
+        has_checksum = isinstance(value, dict) and CHECKSUM_KEY in value
+        if has_checksum and not has_valid_checksum(value):
+            raise InputError(path, f"was changed after the run: {CHECKSUM_KEY} does not match the content", _RERUN_HINT)
+
+        for key, expected_type in _RECORD_TYPES.items():
+            actual = value.get(key) if isinstance(value, dict) else value
+            if not isinstance(actual, expected_type):
+                raise InputError(path, f"is not the record of a run ({key!r} is {actual!r})", _RERUN_HINT)
+
+        stages = {}
+        if has_checksum:  # a file without a checksum comes from another version of this program
+            for name in STAGE_NAMES:
+                stage = StageRecord.from_json(value["stages"].get(name))
+                if stage is not None:
+                    stages[name] = stage
+        return cls(value["egvs"], value["seed"], value["scenario"], value["scenario_folder"], stages)
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """File name -> sha256 of the files that stages wrote, and of those that they read.
+
+        A file that was read counts where the stage that wrote it is no longer recorded, because settings changed.
+        """
+        digests: dict[str, str] = {}
+        for stage in self.stages.values():
+            digests |= stage.files
+        for stage in self.stages.values():
+            digests |= stage.artefacts | stage.companions
+        return digests
+
+    def having(self, name: str, stage: StageRecord | None) -> RunRecord:
+        """Return the record with another entry for a stage; without the stage if ``stage`` is None."""
+        changed = {**self.stages, name: stage}
+        stages = {}
+        for stage_name in STAGE_NAMES:
+            entry = changed.get(stage_name)
+            if entry is not None:
+                stages[stage_name] = entry
+        return replace(self, stages=stages)
+
+    def write(self, folder: Path) -> None:
+        """Write ``run.json`` into a folder."""
+        value = {**self.__dict__, "stages": {name: stage.to_json() for name, stage in self.stages.items()}}
+        files.write_text(RunFolder(folder).run_record, files.to_json_text(add_checksum(value), indent=2) + "\n")

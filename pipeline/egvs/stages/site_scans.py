@@ -1,0 +1,67 @@
+"""The empty scans of a run folder, one by one: read from ``scans.parquet``, or cast where ``scan.keep`` is false."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from egvs.artefacts import parquet
+from egvs.artefacts.run_folder import RunFolder
+from egvs.core.errors import InputError
+from egvs.scoring.visibility import Beams
+from egvs.sensors.scanner import Scanner
+from egvs.sensors.scene import Scene
+from egvs.sensors.sites import ScannedSite
+from egvs.stages.base import StageContext
+
+
+@dataclass(frozen=True)
+class SiteScan:
+    """The empty scan of one site, and what artefacts say about the site."""
+
+    site: ScannedSite
+    beams: Beams
+
+
+def empty_scans(context: StageContext, only: Collection[str] | None = None) -> Iterator[SiteScan]:
+    """Yield the scans in the order of the sites; of the sites named in ``only``, or of all."""
+    if context.scenario.scan.keep:
+        return _stored_scans(context, only)
+    return _cast_scans(context, only)
+
+
+def _stored_scans(context: StageContext, only: Collection[str] | None) -> Iterator[SiteScan]:
+    path = context.folder.scans
+    with parquet.open_artefact(path, "scans") as (file, metadata):
+        sites = metadata["sites"]
+        if file.num_row_groups != len(sites):
+            problem = f"expected a row group for each of {len(sites)} sites, got {file.num_row_groups}"
+            raise InputError(path, problem, "Run the scan stage again.")
+        names = [name for name in ("dx_m", "dy_m", "dz_m", "weight") if name in file.schema_arrow.names]
+        for group, entry in enumerate(sites):
+            site = ScannedSite.from_json(entry, path)
+            if only is not None and site.name not in only:
+                continue
+            table = parquet.read_row_group(file, group, path, names)
+            columns = {name: table.column(name).to_numpy() for name in names}
+            ends_m = np.column_stack([columns[name] for name in ("dx_m", "dy_m", "dz_m")])
+            sensor = context.scene.sensor(site.sensor, f"site {site.name}")
+            source = f"{RunFolder.scans.name}: site {site.name}"
+            yield SiteScan(site, Beams(site.pose, sensor, ends_m, columns.get("weight"), source))
+
+
+def _cast_scans(context: StageContext, only: Collection[str] | None) -> Iterator[SiteScan]:
+    scanner = context.remember("scanner", (RunFolder.statics.name,), lambda: _make_scanner(context.scene))
+    for site in context.scene.sites:
+        if only is None or site.name in only:
+            scan = scanner.scan_site(site)
+            yield SiteScan(scan.as_site(site.name, site.pole), Beams.of(scan))
+
+
+def _make_scanner(scene: Scene) -> Scanner:
+    """Make the scanner of a scene, and check the pose of each site."""
+    scanner = Scanner(scene)
+    scanner.check(scene.sites)
+    return scanner

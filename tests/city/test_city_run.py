@@ -1,0 +1,203 @@
+"""City runs and city plans: equal to separate runs of the junctions, and the best of all choices of sites."""
+
+from __future__ import annotations
+
+import re
+from itertools import combinations
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+
+import egvs
+from egvs.artefacts import parquet
+from egvs.city import city_run, model, results, traffic_split
+from egvs.city.city_run import CityRunOptions, overlap_warnings
+from egvs.city.model import City
+from egvs.city.tasks import Job
+from egvs.core.errors import InputError
+from egvs.placement.plan import JointScore
+from egvs.runs import run
+
+pytestmark = pytest.mark.system
+HAS_COSTS = ("report.html", "run.json", ".lock")
+
+
+def read_files(out: Path) -> dict[str, bytes]:
+    """Return all files of a city run without costs in them."""
+    paths = [path for path in out.rglob("*") if path.is_file() and path.name not in HAS_COSTS]
+    return {str(path.relative_to(out)): path.read_bytes() for path in paths}
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_process_cluster")
+def test_city_run_equals_separate_runs(city: City, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ran = city_run.run_city(city, tmp_path / "out")
+    assert [result.junction.id for result in ran.results] == ["west", "east"]
+    for junction in city.junctions:
+        with monkeypatch.context() as patch:
+            patch.setenv("EGVS_STORE", str(tmp_path / "separate store"))
+            run.run(egvs.load(junction.scenario_folder(city)), tmp_path / "separate" / junction.id)
+        for path in (tmp_path / "separate" / junction.id).glob("*.p*"):
+            assert path.read_bytes() == (results.junction_run_folder(ran.out, junction.id) / path.name).read_bytes()
+    first = read_files(ran.out)
+    monkeypatch.setenv("EGVS_STORE", str(tmp_path / "another store"))
+    again = city_run.run_city(city, tmp_path / "again")
+    assert read_files(again.out) == first
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_process_cluster")
+def test_joins_scores_and_ranks_junctions(city: City, tmp_path: Path) -> None:
+    sites = city.folder / "junctions" / "east" / "sites.csv"
+    head, *rows = sites.read_text().splitlines()
+    sites.write_text("\n".join([f"{head},owner", *(f"{row},city" for row in rows), ""]))  # a column of one junction
+    ran = city_run.run_city(model.load_city(city.folder), tmp_path / "out")
+    scores = results.read_city_scores(ran.out)
+    assert scores.column("junction").to_pylist() == ["east", "east", "west", "west"]
+    assert scores.column("owner").to_pylist() == ["city", "city", None, None]
+    assert pq.read_table(ran.out / "scores" / "junction=west").num_rows == 2
+    table, metadata = parquet.read_artefact(ran.out / "junctions.parquet", "city")
+    assert metadata["rank_by"] == "egvs"
+    best = {name: max(s["egvs"] for s in scores.to_pylist() if s["junction"] == name) for name in ("east", "west")}
+    for row in table.to_pylist():
+        assert row["egvs"] == row["score"] == best[row["junction"]]
+    assert table.column("rank").to_pylist() == [1, 2]
+    html = (ran.out / "city.html").read_text()
+    assert re.findall(r'href="(junctions/\w+/report\.html)"', html)[-2:] == [
+        "junctions/west/report.html", "junctions/east/report.html",
+    ]  # fmt: skip
+    assert all((ran.out / link).is_file() for link in re.findall(r'href="(junctions/[^"]+)"', html))
+    assert "http" not in re.sub(r"arXiv|http://www.w3.org/2000/svg", "", html)
+
+
+def test_rejects_overrides_of_traffic(city: City, tmp_path: Path) -> None:
+    for override in ("traffic.frames=5", "traffic.periods.rush.weight=2", "traffic = {}"):
+        with pytest.raises(InputError) as caught:
+            city_run.run_city(city, tmp_path / "out", CityRunOptions(overrides=["score.gamma=2", override]))
+        assert str(caught.value).startswith(f"--set {override}: the traffic of a city is simulated once")
+        assert f" in {city.file} instead" in str(caught.value)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_process_cluster")
+def test_runs_one_junction_with_overrides(city: City, tmp_path: Path) -> None:
+    city_run.run_city(city, tmp_path / "out")
+    options = CityRunOptions(junctions=["east"], overrides=["score.gamma=2"])
+    ran = city_run.run_city(city, tmp_path / "out", options)
+    assert [result.junction.id for result in ran.results] == ["east"]
+    assert [path.name for path in (ran.out / "scores").iterdir()] == ["junction=east"]
+    assert egvs.load(city.folder / "junctions" / "east").score.gamma == 4  # overridden, not written
+    assert '"gamma": 2' in (results.junction_run_folder(ran.out, "east") / "run.json").read_text()
+    with pytest.raises(InputError, match=r"--junction north: no such junction in .* Use one of west, east"):
+        city_run.run_city(city, tmp_path / "out", CityRunOptions(junctions=["north"]))
+
+
+def test_checks_cluster_before_simulating(city: City, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"--cluster: .* got 'nowhere'"):
+        city_run.run_city(city, tmp_path / "out", CityRunOptions(cluster="nowhere"))
+    assert not (city.folder / "traffic" / traffic_split.RECORD_FILE).exists()
+
+
+def score_every_set(city: City, folder: Path) -> dict[tuple[str, str], float]:
+    """Return the joint score of every set of sites of each junction, by junction and names."""
+    scores = {}
+    for junction in city.junctions:
+        scenario = egvs.load(junction.scenario_folder(city))
+        joint = JointScore.of(scenario, folder / junction.id)
+        for count in range(len(joint.candidates) + 1):
+            for names in combinations(joint.candidates, count):
+                joint.remove(*joint.chosen)
+                joint.add(*names)
+                scores[junction.id, " ".join(sorted(names))] = joint.value
+    return scores
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_process_cluster")
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_plan_is_best_of_all_choices(city: City, tmp_path: Path, count: int) -> None:
+    placed = city_run.place_city(city, tmp_path / "out", count=count)
+    scores = score_every_set(city, tmp_path / "separate")
+    best = max(
+        a + b
+        for (one, names), a in scores.items() if one == "west"
+        for (other, others), b in scores.items() if other == "east"
+        if len(names.split()) + len(others.split()) <= count
+    )  # fmt: skip
+    assert placed.plan.joint == pytest.approx(best, rel=1e-12)
+    assert placed.plan.bound >= best
+    assert len(placed.plan.sensors) <= count
+    rows = pq.read_table(tmp_path / "out" / "plan.parquet").to_pylist()
+    assert [row["order"] for row in rows] == list(range(1, len(rows) + 1))
+    assert rows[-1]["score"] == pytest.approx(best, rel=1e-12)
+    gains = [row["gain"] for row in rows]
+    assert gains == sorted(gains, reverse=True)
+    html = (tmp_path / "out" / "city.html").read_text()
+    assert f"The plan: {len(rows)} sensors" in html
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_process_cluster")
+def test_page_keeps_plan_until_junctions_change(city: City, tmp_path: Path) -> None:
+    city_run.place_city(city, tmp_path / "out", count=2)
+    page = tmp_path / "out" / "city.html"
+    with_plan = page.read_bytes()
+    city_run.run_city(city, tmp_path / "out")
+    assert page.read_bytes() == with_plan
+    city_run.run_city(city, tmp_path / "out", CityRunOptions(overrides=["roi.voxel_m=1"]))
+    assert "The plan:" not in page.read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_process_cluster")
+def test_plans_within_budget(city: City, tmp_path: Path) -> None:
+    with pytest.raises(Exception, match="the cost of site pole_a is unknown"):
+        city_run.place_city(city, tmp_path / "out", budget=20.0)
+    with_costs = CityRunOptions(overrides=['costs.sensor={"small"=8}', "costs.pole=4"])
+    placed = city_run.place_city(city, tmp_path / "out", with_costs, budget=25.0)
+    assert [sensor.cost for sensor in placed.plan.sensors] == [12.0, 12.0]
+    assert placed.plan.cost == 24.0
+    assert not city_run.place_city(city, tmp_path / "out", with_costs, budget=11.0).plan.sensors
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_process_cluster")
+@pytest.mark.parametrize("score", ["expected_detections", "coverage"])
+def test_gain_is_score_times_vehicles(city: City, tmp_path: Path, score: str) -> None:
+    options = CityRunOptions(overrides=[f'score.rank_by="{score}"'])
+    placed = city_run.place_city(city, tmp_path / "out", options, count=1)
+    first, (sensor,) = placed.city_run.results[0], placed.plan.sensors
+    assert first.gain == first.score * first.vehicles > 0
+    assert (sensor.junction, sensor.site) == (first.junction.id, first.best.site)
+    assert sensor.gain == pytest.approx(first.gain, rel=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_process_cluster")
+@pytest.mark.parametrize(
+    ("request_", "overrides", "message"),
+    [
+        ({}, [], "--count, --budget: expected one of them, got neither"),
+        ({"count": 1, "budget": 5.0}, [], "--count, --budget: expected one of them, got count and budget"),
+        ({"budget": -1.0}, [], "--budget: expected a cost above 0, got -1"),
+        ({"count": 1}, ["placement.survives=1"], "placement.survives: has no effect in a city"),
+        ({"count": 1}, ['placement.forced=["pole_a", "pole_b"]'], "--count 1: 4 sensors are already installed"),
+    ],
+)
+def test_rejects_impossible_request(
+    city: City, tmp_path: Path, request_: dict[str, object], overrides: list[str], message: str
+) -> None:
+    with pytest.raises(InputError) as caught:
+        city_run.place_city(city, tmp_path / "out", CityRunOptions(overrides=overrides), **request_)  # type: ignore[arg-type]
+    assert message in str(caught.value)
+
+
+def test_warns_about_overlapping_regions(city: City) -> None:
+    jobs = [Job(j.id, j.scenario_folder(city), Path("out")) for j in city.junctions]
+    assert not list(overlap_warnings(jobs))
+    path = city.folder / "junctions" / "east" / "scenario.toml"
+    path.write_text(path.read_text().replace("center_m = [520,", "center_m = [50,"))
+    (warning,) = overlap_warnings(jobs)
+    assert "the regions of west and east overlap" in str(warning)
+    assert model.load_city(city.folder).name == "town"

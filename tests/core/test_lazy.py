@@ -1,0 +1,43 @@
+"""Packages that import their public names on first use: every name exists, and importing the package loads nothing."""
+
+from __future__ import annotations
+
+import importlib
+import subprocess
+import sys
+
+import pytest
+
+PACKAGES = [
+    "egvs",
+    "egvs.artefacts",
+    "egvs.effects",
+    "egvs.placement",
+    "egvs.scenario",
+    "egvs.scoring",
+    "egvs.sensors",
+    "egvs.validation.detectors",
+]
+HEAVY = ["numpy", "numba", "pyarrow", "pydantic", "shapely", "trimesh", "matplotlib", "embreex", "scipy", "onnxruntime"]
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_every_public_name_exists(name: str) -> None:
+    package = importlib.import_module(name)
+    assert dir(package) == sorted(set(package.__all__))
+    assert len(set(package.__all__)) == len(package.__all__)
+    for public in package.__all__:
+        assert getattr(package, public) is not None
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_rejects_unknown_name(name: str) -> None:
+    with pytest.raises(AttributeError, match=f"module '{name}' has no attribute 'nothing'"):
+        _ = importlib.import_module(name).nothing
+
+
+@pytest.mark.system
+def test_importing_packages_loads_nothing_heavy() -> None:
+    code = f"import sys, {', '.join(PACKAGES)}; print([name for name in {HEAVY} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,119 @@
+"""`egvs explore` on the command line: output, end, and invalid options."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import urllib.error
+import urllib.request
+import webbrowser
+from pathlib import Path
+
+import pytest
+
+from egvs.explore import page
+from tests.processes import EGVS
+
+
+@pytest.mark.system
+@pytest.mark.slow
+def test_serves_until_interrupt_and_cleans_up(mini: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    command = [sys.executable, "-c", EGVS, "explore", mini, "--no-browser", "--out", out]
+    (tmp_path / "tmp").mkdir()
+    started = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        env=os.environ | {"TMPDIR": str(tmp_path / "tmp")},
+    )  # fmt: skip
+    assert started.stdout is not None
+    address = next(line.split()[0] for line in started.stdout if line.startswith("http"))
+    before = {path: path.read_bytes() for path in out.iterdir()}
+    opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+    assert opener.open(address).status == 200
+    os.kill(started.pid, signal.SIGINT)
+    printed, errors = started.communicate()
+    assert (started.returncode, printed.strip()) == (0, "")
+    assert errors.splitlines()[-1].startswith("score")  # no message about the interrupt
+    with pytest.raises(ProcessLookupError):
+        os.killpg(started.pid, 0)  # no process is left
+    with pytest.raises(urllib.error.URLError, match="refused"):
+        opener.open(address)
+    assert not any(tmp_path.glob("tmp/egvs-work-*"))  # temporary runs with other settings
+    assert {path: path.read_bytes() for path in out.iterdir()} == before
+
+
+def test_address_is_printed_and_opened(run_egvs, mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    monkeypatch.setattr(page.Page, "run", lambda page: opened.append(page.address))
+    code, out, err = run_egvs("explore", mini, "--out", tmp_path / "run")
+    assert (code, err.splitlines()[-1].partition(" ")[0]) == (0, "score")
+    assert opened[0] == opened[1]
+    assert out.splitlines()[-1] == f"{opened[0]}  (press Ctrl-C to stop)"
+    run_egvs("explore", tmp_path / "run", "--no-browser")
+    assert len(opened) == 3
+
+
+def test_starts_with_the_view_of_a_link(run_egvs, mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[tuple] = []
+
+    real_run = page.Page.run
+
+    def run(page: page.Page) -> None:
+        loop = threading.Thread(target=real_run, args=(page,))
+        loop.start()
+        assert page.wait_until_idle(60)
+        shown.append((page.view.site.name, page.view.site.pose.z_m, page.view.layer))
+        page.end()
+        loop.join()
+
+    monkeypatch.setattr(page.Page, "run", run)
+    explore = ("explore", mini, "--no-browser", "--out", tmp_path / "run", "--view")
+    assert run_egvs(*explore, "site=pole_a&pose=10,12,4.5,0,0,0&layer=seen")[0] == 0
+    assert shown == [("pole_a", 4.5, "seen")]
+    code, _, err = run_egvs(*explore, "site=nobody")
+    assert (code, err.splitlines()[-1]) == (2, "egvs: --view: site: expected one of pole_a, pole_b, got 'nobody'")
+
+
+def test_says_how_to_install_viser(run_egvs, mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(mini.parent)
+    monkeypatch.setitem(sys.modules, "viser", None)
+    code, out, err = run_egvs("explore", mini)
+    assert (code, out) == (2, "")
+    assert err == "egvs: egvs explore needs viser, which is not installed: pip install 'egvs[explore]'\n"
+    assert not Path("runs").exists()
+
+
+def test_port_in_use_is_reported_before_any_work(run_egvs, mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(mini.parent)
+    with socket.socket() as other:
+        other.bind((page.HOST, 0))
+        other.listen()
+        port = other.getsockname()[1]
+        code, out, err = run_egvs("explore", mini, "--port", port)
+    assert (code, out) == (2, "")
+    assert err == f"egvs: --port: port {port} is in use. Use another port, or 0 for any free one.\n"
+    assert not Path("runs").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("nowhere", "--no-browser"), "nowhere"),
+        (("mini", "--port", "70000"), "less than or equal to 65535"),
+        (("mini", "--set", "score.gamma=-1"), "score.gamma"),
+    ],
+)
+def test_invalid_options_give_one_message(
+    run_egvs, mini: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], message: str
+) -> None:
+    monkeypatch.chdir(mini.parent)
+    code, out, err = run_egvs("explore", *options)
+    assert (code, out) == (2, "")
+    assert message in err
+    assert "Traceback" not in err
+    assert not Path("runs").exists()

@@ -1,0 +1,18 @@
+"""Texts of the panel."""
+
+from __future__ import annotations
+
+from egvs.explore import controls
+from egvs.explore.session import PoseScore
+from egvs.sensors.sites import Pose, Site
+
+
+def test_describes_score_and_change() -> None:
+    site = Site("a_b", Pose(0, 0, 3), "small")
+    candidate = PoseScore(site, {"egvs": 200.0, "entropy_seen": 0.5}, 2)
+    moved = PoseScore(Site("a_b", Pose(0, 0, 4), "small"), {"egvs": 250.0, "entropy_seen": 0.6}, 1)
+    text = controls.describe_score(moved, "egvs", candidate, 7)
+    assert text.startswith("## 250.0 (+25.0%)\n\nrank 1 of 7 by egvs\n")
+    assert "| entropy\\_seen | 60.00% |" in text
+    assert "a\\_b" in controls.ranking_table([candidate], "egvs")
+    assert controls.describe_score(candidate, "egvs", candidate, 7).startswith("## 200.0\n")

@@ -1,0 +1,79 @@
+"""Sentences about rankings made by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from egvs.report import ranking as report_ranking
+from egvs.report.formatting import SCORE_LABELS
+from egvs.report.ranking import RankedSite, Ranking, ScoreValue
+
+
+def ranking(*rows: tuple[str, float, int, float, float]) -> Ranking:
+    """From (site, score, rank, entropy seen, chance to beat the next), best first."""
+    sites = tuple(
+        RankedSite(site, 0.0, 0.0, 3.0, egvs, rank, site, 0.0, 0.0, 0.0, "s", 200.0, 1, 1, entropy_seen, 1.0, beats)
+        for site, egvs, rank, entropy_seen, beats in rows
+    )
+    return Ranking(sites, tuple(site for site in sites if site.rank == 1), ())
+
+
+def by_vehicles(*rows: tuple[str, float, float], rank_by: str = "expected_detections") -> Ranking:
+    """From (site, EGVS, share of vehicles found), ranked by the latter, best first."""
+    sites = tuple(
+        replace(site, rank_by=rank_by, others=(ScoreValue("expected_detections", detected, 0.01),))
+        for site, (_, _, detected) in zip(
+            ranking(*((name, egvs, i + 1, 0.5, 0.99) for i, (name, egvs, _) in enumerate(rows))).sites,
+            rows,
+            strict=True,
+        )
+    )
+    return Ranking(sites, sites[:1], ())
+
+
+def test_sentences_for_a_score_over_vehicles() -> None:
+    detected = by_vehicles(("a", 50.0, 0.871), ("b", 90.0, 0.8), ("c", 20.0, 0.4))
+    assert (
+        report_ranking.headline(detected, has_traffic=True)
+        == "a is the best of 3 sites: it should find 87% of vehicles"
+    )
+    assert report_ranking.lead(detected) == "It leads the next site, b, by 8.2% of its score."
+    assert report_ranking.entropy_seen_note(detected) == ""
+    assert report_ranking.site_caption(detected.sites[0], 1, 2).startswith(
+        "a: rank 1, the share of vehicles found 87.1%, at x"
+    )
+    assert detected.sites[0].score_se == 0.01 and detected.companion_score is SCORE_LABELS["egvs"]
+    assert (
+        report_ranking.headline(by_vehicles(("a", 50.0, 0.871)), has_traffic=True)
+        == "a, the only site, should find 87% of vehicles"
+    )
+    assert by_vehicles(("a", 50.0, 0.9), rank_by="egvs").companion_score is SCORE_LABELS["expected_detections"]
+    assert ranking(("a", 50.0, 1, 0.5, 1.0)).companion_score is None
+
+
+def test_lead_says_whether_the_best_is_certain() -> None:
+    """Two that share the first place cannot beat each other; whether they lead is another matter."""
+    ahead = ranking(("a", 100.0, 1, 0.5, 0.5), ("b", 100.0, 1, 0.6, 0.99), ("c", 80.0, 3, 0.4, 1.0))
+    assert report_ranking.lead(ahead) == "They lead the next site, c, by 20.0% of their score."
+    near = ranking(("a", 100.0, 1, 0.5, 0.5), ("b", 100.0, 1, 0.6, 0.7), ("c", 98.0, 3, 0.4, 1.0))
+    assert report_ranking.lead(near).endswith(
+        "by 2.0% of their score. This much traffic is not enough to tell which of them is better."
+    )
+    alone = ranking(("a", 100.0, 1, 0.5, 0.7), ("c", 98.0, 2, 0.4, 1.0))
+    assert report_ranking.lead(alone).endswith("This much traffic is not enough to tell which of them is better.")
+
+
+def test_note_on_the_site_that_sees_most_entropy() -> None:
+    """Of two with the same score, one that sees more contradicts nothing."""
+    tied = ranking(("a", 100.0, 1, 0.5, 0.5), ("b", 100.0, 1, 0.6, 0.99), ("c", 80.0, 3, 0.4, 1.0))
+    assert (
+        report_ranking.entropy_seen_note(tied) == "b also sees the largest share of the traffic’s uncertainty, 60.0%."
+    )
+    other = ranking(("a", 100.0, 1, 0.5, 0.99), ("c", 80.0, 2, 0.7, 1.0))
+    assert report_ranking.entropy_seen_note(other).startswith(
+        "c, rank 2, sees more of the traffic’s uncertainty (70.0% against 50.0%), but with fewer beams. One beam"
+    )
+    agree = ranking(("a", 100.0, 1, 0.7, 0.99), ("c", 80.0, 2, 0.5, 1.0))
+    assert (
+        report_ranking.entropy_seen_note(agree) == "It also sees the largest share of the traffic’s uncertainty, 70.0%."
+    )

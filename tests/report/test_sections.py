@@ -1,0 +1,252 @@
+"""Sections on other commands: their sentences, and that they are shown only beside the same run."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import html
+import math
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from egvs.artefacts import parquet
+from egvs.report.sections import RHO, DetectorSummary, SiteDetection, Tau, egvs_setting, ranking_disagreement
+from egvs.studies import score_errors, study_settings
+from tests.report.test_ranking import by_vehicles, ranking
+
+NAN = float("nan")
+
+
+SCORED = [
+    SimpleNamespace(site=name, egvs=run_egvs) for name, run_egvs in zip("abcd", (9.0, 7.0, 5.0, 2.0), strict=True)
+]
+
+
+def _summary(values, tau):
+    known = [value for value in values if value is not None]
+    ranks = [None if value is None else 1 + sum(other > value for other in known) for value in values]
+    sites = {s.site: SiteDetection(v, 0.01, r) for s, v, r in zip(SCORED, values, ranks, strict=True)}
+    return DetectorSummary("d", "what", Tau(*tau), sites)
+
+
+@pytest.mark.parametrize(
+    ("values", "tau", "agreement", "judgement"),
+    [
+        (  # five of six pairs agree
+            (0.9, 0.5, 0.6, 0.1), (0.67, 0.2, 1.0),
+            "EGVS and detection agree on which of two sites is better in 83% of the pairs of 4 sites "
+            "(Kendall's tau 0.67, 95 % confidence interval 0.20 to 1.00).",
+            "This is more than chance: sites with a higher score tend to detect more. The best site by score, a, has "
+            "rank 1 by detection.",
+        ),
+        (  # pairs of equal values do not count
+            (0.5, 0.5, 0.6, 0.1), (0.18, -0.5, 0.8),
+            "EGVS and detection agree on which of two sites is better in 60% of the pairs of 4 sites "
+            "(Kendall's tau 0.18, 95 % confidence interval -0.50 to 0.80).",
+            "4 sites are too few to tell: the interval includes 0, so the agreement may be chance. The best site by "
+            "score, a, has rank 2 by detection.",
+        ),
+        (
+            (0.1, 0.2, 0.3, 0.4), (-1.0, -1.0, -0.4),
+            "EGVS and detection agree on which of two sites is better in 0% of the pairs of 4 sites "
+            "(Kendall's tau -1.00, 95 % confidence interval -1.00 to -0.40).",
+            "The score orders these sites the wrong way round: sites with a higher score tend to detect less. The "
+            "best site by score, a, has rank 4 by detection.",
+        ),
+        (
+            (None, 0.3, 0.2, 0.1), (1.0, NAN, NAN),
+            "EGVS and detection agree on which of two sites is better in 100% of the pairs of 3 sites "
+            "(Kendall's tau 1.00).",
+            "From 3 sites it cannot be said how certain this is.",
+        ),
+        (
+            (None, None, None, 0.1), (NAN, NAN, NAN),
+            "1 site with values: too few, or too similar, to compare the two orders.", "",
+        ),
+    ],
+)  # fmt: skip
+def test_describes_agreement_of_the_orders(values, tau, agreement, judgement):
+    summary = _summary(values, tau)
+    assert summary.agreement(SCORED) == agreement
+    assert summary.judgement(SCORED) == judgement
+
+
+@pytest.mark.slow
+def test_shows_the_validation_of_the_same_run(mini, tmp_path, run_egvs):
+    out = tmp_path / "out"
+    validate = ("validate", mini, "--out", out, "--frames", "10", "--detector", "points", "--jobs", "1")
+
+    def section():
+        text = (out / "report.html").read_text()
+        return text[text.index('<section id="detected">') :].split("</section>")[0] if 'id="detected"' in text else ""
+
+    assert run_egvs("run", mini, "--out", out)[0] == 0
+    assert not section()
+    code, printed, error = run_egvs(*validate)
+    assert code == 0, error
+    text = html.unescape(section())
+    assert f"data:image/png;base64,{base64.b64encode((out / 'validation.png').read_bytes()).decode()}" in text
+    assert "in 10 frames of traffic, at least 2 s apart, with 18 vehicles in the region" in text
+    assert "to compare the two orders" in text  # of two sites
+    assert "evaluated with the frames that the TPOG was computed from" in text and str(mini) not in text
+    for row in parquet.read_artefact(out / "detection.parquet", "detection")[0].to_pylist():
+        if row["objects_of"] == "vehicles":
+            assert f"{100 * row['seen_20']:.1f} ± {100 * row['seen_20_se']:.1f}" in text
+    assert str(out / "report.html") in printed
+    assert run_egvs("verify", out)[0] == 0
+
+    assert run_egvs("run", mini, "--out", out, "--set", "score.gamma=3.0")[0] == 0
+    assert not section()  # the scores that were validated are others
+    assert run_egvs(*validate, "--set", "score.gamma=3.0")[0] == 0
+    assert section()
+    (out / "detection.parquet").unlink()
+    assert run_egvs("run", mini, "--out", out, "--set", "score.gamma=3.0")[0] == 0
+    assert not section()
+
+
+@pytest.mark.slow
+def test_rejects_a_damaged_validation(mini, tmp_path, run_egvs):
+    out = tmp_path / "out"
+    assert run_egvs("validate", mini, "--out", out, "--frames", "10", "--detector", "points", "--jobs", "1")[0] == 0
+    (out / "correlation.parquet").write_bytes(b"PAR1")
+    code, _, error = run_egvs("run", mini, "--out", out)
+    assert code == 2
+    assert "correlation.parquet: does not match its checksum in validation.sha256. Remove it, or" in error
+    (out / "validation.sha256").unlink()  # as an earlier version left none
+    code, _, error = run_egvs("run", mini, "--out", out)
+    assert code == 2
+    assert "correlation.parquet: is not a validation (" in error
+    assert "Remove it, or run egvs validate again." in error
+
+
+EGVS = egvs_setting(2.0, 0.25)
+
+
+def test_reports_scores_with_different_best_sites() -> None:
+    rows = (("a", 50.0, 0.9), ("b", 90.0, 0.8), ("c", 20.0, 0.7), ("d", 80.0, 0.6))
+    text = ranking_disagreement(by_vehicles(*rows).sites, EGVS, {})
+    assert text == (
+        "The best sites by EGVS are b, d and a; by the share of vehicles found they are a, b and c. "
+        "How well this setting of the EGVS predicts detection was not measured."
+    )
+    assert ranking_disagreement(by_vehicles(*rows, rank_by="egvs").sites, EGVS, {}) == text  # whichever ranks
+    rho = {"expected_detections": {"cluster": 0.9, "pointpillars": 0.8}, EGVS: {"cluster": 0.7, "pointpillars": 0.6}}
+    assert ranking_disagreement(by_vehicles(*rows).sites, EGVS, rho).endswith(
+        " At the held-out junctions of the validation study, the share of vehicles found predicted detection better: "
+        "rank correlation 0.90 against 0.70 (cluster) and 0.80 against 0.60 (pointpillars); see docs/validity.md."
+    )
+    for worse, who in ((0.5, "the EGVS"), (0.65, "neither of the two")):
+        rho["expected_detections"] = {"cluster": worse, "pointpillars": worse if worse < 0.6 else 0.55}
+        rho["expected_detections"]["pointpillars"] = 0.5 if worse == 0.5 else 0.7
+        assert f", {who} predicted detection better: rank" in ranking_disagreement(by_vehicles(*rows).sites, EGVS, rho)
+    for other in (egvs_setting(10.0, 0.25), egvs_setting(2.0, 0.25, moving_occlusion=True)):
+        assert ranking_disagreement(by_vehicles(*rows).sites, other, rho).endswith(
+            "was not measured. The rank correlation of the share of vehicles found with detection is 0.65 (cluster) "
+            "and 0.70 (pointpillars); see docs/validity.md."
+        )
+
+
+def test_evidence_equals_the_tables_of_the_study() -> None:
+    path = Path(__file__).parents[2] / "docs" / "data" / "validity" / "f-all-scores.csv"
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    rho = {row["score"]: {name: round(float(row[name]), 2) for name in ("cluster", "pointpillars")} for row in rows}
+    expected = {name: row for name, row in rho.items() if name.startswith("egvs ")}
+    expected["expected_detections"] = rho["expected_detections (detectors cluster+pointpillars)"]
+    assert expected == RHO and {egvs_setting(10.0, 0.25), egvs_setting(2.0, 0.5, moving_occlusion=True)} < set(RHO)
+
+
+def test_is_silent_if_scores_agree() -> None:
+    same = (("a", 90.0, 0.9), ("b", 60.0, 0.8), ("c", 70.0, 0.7), ("d", 50.0, 0.6))  # the second and the third change
+    assert ranking_disagreement(by_vehicles(*same).sites, EGVS, {}) == ""
+    other_first = (("a", 60.0, 0.9), ("b", 90.0, 0.8), ("c", 70.0, 0.7), ("d", 50.0, 0.6))
+    assert ranking_disagreement(by_vehicles(*other_first).sites, EGVS, {}).startswith(
+        "The best sites by EGVS are b, c and a; by"
+    )
+    assert ranking_disagreement(ranking(("a", 9.0, 1, 0.5, 1.0)).sites, EGVS, {}) == ""  # not asked for
+    unknown = by_vehicles(("a", 60.0, math.nan), ("b", 90.0, 0.8)).sites
+    assert ranking_disagreement(unknown, EGVS, {}) == ""
+
+
+@pytest.mark.slow
+def test_shows_the_accuracy_study_of_the_same_run(mini, tmp_path, run_egvs, monkeypatch):
+    """Its recommendation, the front, the figure; not of another scenario or other files; the run is verified in each
+    case."""
+    few = study_settings.SettingValues(voxels_m=(1.0,), gammas=(2.0,), unnamed_effects=False)
+    list_settings = study_settings.list_settings
+    monkeypatch.setattr(study_settings, "list_settings", lambda scenario, _: list_settings(scenario, few))
+    expected = score_errors.mark_pareto_front
+
+    def thinned(rows, tolerance):
+        """The clock decides which of two fast settings is the cheapest: here it is always the same."""
+        return expected(
+            [replace(r, seconds=0.5 if r.setting == "every 2nd azimuth" else 1.0, judged=0.0) for r in rows], tolerance
+        )
+
+    monkeypatch.setattr(score_errors, "mark_pareto_front", thinned)
+    out = tmp_path / "out"
+
+    def is_shown():
+        return "What accuracy costs" in (out / "report.html").read_text()
+
+    assert run_egvs("run", mini, "--out", out)[0] == 0
+    assert not is_shown()
+    code, printed, error = run_egvs("accuracy", mini, "--out", out)
+    assert code == 0, error
+    assert printed.splitlines()[-1] == str(out / "report.html")
+    text = (out / "report.html").read_text()
+    assert f"data:image/png;base64,{base64.b64encode((out / 'accuracy.png').read_bytes()).decode()}" in text
+    rows = parquet.read_artefact(out / "accuracy.parquet", "accuracy")[0].to_pylist()
+    best = next(row for row in rows if row["recommended"])
+    assert best["setting"] == "every 2nd azimuth"
+    section = text[text.index("What accuracy costs") :]
+    section = section[: section.index("</section>")]
+    assert f"<code>{best['overrides']}</code>" in html.unescape(section)
+    assert section.count("<tr") == 1 + sum(
+        row["front"] or row["recommended"] or row["kind"] == "scenario" for row in rows
+    )
+    assert run_egvs("verify", out)[0] == 0
+
+    assert run_egvs("accuracy", mini, "--out", out, "--set", "score.gamma=3.0")[0] == 0
+    assert not is_shown()  # that study is of another scenario than the run
+    assert run_egvs("verify", out)[0] == 0
+    assert run_egvs("run", mini, "--out", out, "--set", "score.gamma=3.0")[0] == 0
+    assert is_shown()
+    assert run_egvs("verify", out)[0] == 0
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,10,12,3\n")
+    assert run_egvs("run", mini, "--out", out, "--set", "score.gamma=3.0")[0] == 0
+    assert not is_shown()  # nor is it of other sites
+
+
+@pytest.mark.slow
+def test_verify_reports_a_replaced_study(mini, tmp_path, run_egvs):
+    out = tmp_path / "out"
+    assert run_egvs("run", mini, "--out", out)[0] == 0
+    assert run_egvs("accuracy", mini, "--out", out, "--budget", "0.001s")[0] == 0
+    (out / "accuracy.png").write_bytes((out / "accuracy.png").read_bytes() + b"x")
+    code, printed, _ = run_egvs("verify", out)
+    assert code == 1
+    assert "report.html shows accuracy.png, which was replaced since" in printed
+
+
+@pytest.mark.slow
+def test_rejects_a_damaged_study(mini, tmp_path, run_egvs):
+    out = tmp_path / "out"
+    assert run_egvs("accuracy", mini, "--out", out, "--budget", "0.001s")[0] == 0
+    parquet.write_artefact(
+        out / "accuracy.parquet",
+        "scores",
+        {name: [] for name in parquet.arrow_schema("scores").names},
+        {"schema": 1},
+    )
+    code, _, error = run_egvs("run", mini, "--out", out)
+    assert code == 2
+    assert "accuracy.parquet: does not match its checksum in accuracy.sha256. Remove it, or run" in error
+    (out / "accuracy.sha256").unlink()  # as an earlier version left none
+    code, _, error = run_egvs("run", mini, "--out", out)
+    assert code == 2
+    assert "accuracy.parquet: is not an accuracy study (" in error
+    assert "Remove it, or run egvs accuracy again." in error

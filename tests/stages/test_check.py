@@ -1,0 +1,472 @@
+"""What a check says of sites, solids, region, lanes, traffic and sensors: each case by hand, with its message."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import egvs
+from egvs.core.errors import DiagnosticsError, InputError
+from egvs.sensors.sites import Pose, Site
+from egvs.stages import check, scene_checks
+from egvs.stages.inputs import CheckInputs
+from egvs.traffic import network, sumo, sumo_folder
+from egvs.world.carriageway import Carriageway
+from tests.conftest import collection, feature
+from tests.stage_runner import inputs_of
+from tests.stages.conftest import LANES, net_xml
+
+SCENARIOS = Path(__file__).resolve().parents[2] / "scenarios"
+
+
+def found(folder: Path, *settings: str) -> dict[str, list[str]]:
+    """What is found, by rule; errors as they are, warnings in brackets."""
+    told: dict[str, list[str]] = {}
+    for finding in check.check_scenario(egvs.load(folder, settings)).findings:
+        line = f"{finding.where}: {finding.problem}".replace(f"{folder}/", "")
+        told.setdefault(finding.rule, []).append(line if finding.is_error else f"[{line}]")
+    return told
+
+
+def box(low: tuple[float, float], high: tuple[float, float], name: str = "kiosk", **more: object) -> dict:
+    (x0, y0), (x1, y1) = low, high
+    ring = [[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]]
+    return feature({"type": "Polygon", "coordinates": [ring]}, **{"name": name, "kind": "kiosk", "height_m": 3, **more})
+
+
+def sites(folder: Path, *rows: str) -> None:
+    (folder / "sites.csv").write_text("\n".join(["site,x_m,y_m,z_m", *rows]) + "\n")
+
+
+def statics(folder: Path, *features: dict) -> None:
+    (folder / "statics.geojson").write_text(collection(*features))
+
+
+def test_valid_scenario_has_no_finding(street: Path, mini: Path) -> None:
+    checked = check.check_scenario(egvs.load(street))
+    assert (checked.findings, checked.sites, checked.solids, checked.lanes) == ((), 2, 3, 2)
+
+
+def test_no_lane_rule_applies_without_network(mini: Path) -> None:
+    checked = check.check_scenario(egvs.load(mini))
+    assert (checked.findings, checked.lanes) == ((), 0)
+
+
+# ---- sites
+
+
+def test_site_is_in_lane_from_a_quarter_metre_inside(street: Path) -> None:
+    """Lanes of 3.2 m round y = +-1.6: from 0 to 3.2 m, so 2.94 is in one and 2.96 is not; 0 is the line between."""
+    sites(street, "in,10,2.94,3", "kerb,10,2.96,3", "middle,12,0,3", "walk,10,-4.2,3", "bicycles,10,4.2,3", "e,9,-1,3")
+    assert found(street) == {
+        "sites on lanes": [
+            "[sites.csv: site in: (10, 2.94, 3) is in lane west_1]",
+            "[sites.csv: site e: (9, -1, 3) is in lane east_1]",
+        ]
+    }
+
+
+def test_sensor_on_gantry_is_not_in_lane(street: Path) -> None:
+    sites(street, "low,10,1.6,4.5", "high,10,1.6,4.51")
+    assert [line for lines in found(street).values() for line in lines] == [
+        "[sites.csv: site low: (10, 1.6, 4.5) is in lane west_1]"
+    ]
+
+
+def test_warns_of_site_within_junction_unless_above_road() -> None:
+    """Of the hill's junction (0, -2) is in no lane, and (60, 12) is beside the road."""
+    roads = Carriageway.of(network.read_net_xml(SCENARIOS / "hill" / "network.net.xml"))
+    at_m = np.array([0.0, -2.0])
+    assert roads.lanes_at(at_m[None]) == [None]
+    road_m = roads.height_m(roads.nearest(at_m), at_m)
+    places = {"low": (0.0, -2.0, road_m + 2), "high": (0.0, -2.0, road_m + 4.6), "beside": (60.0, 12.0, road_m + 2)}
+    candidates = tuple(Site(name, Pose(*place), "VLP-32C") for name, place in places.items())
+    subject = CheckInputs(egvs.load(SCENARIOS / "hill"), carriageway=roads, sites=candidates)
+    assert [str(finding) for finding in scene_checks.warn_sites_on_lanes(subject)] == [
+        f"sites.csv: site low: (0, -2, {road_m + 2:g}) is within a junction. "
+        "Move it beside the road, or more than 4.5 m above it."
+    ]
+
+
+def test_height_above_road_decides(street: Path) -> None:
+    lifted = LANES.replace("80,1.60 -40,1.60", "80,1.60,4.00 -40,1.60,4.00").replace(
+        "-40,-1.60 80,-1.60", "-40,-1.60,4.00 80,-1.60,4.00"
+    )
+    (street / "net.net.xml").write_text(net_xml(lifted))
+    sites(street, "low,10,1.6,8.4", "high,10,1.6,8.6")
+    told = found(street, "roi.center_m=[20,0,6.5]")
+    assert [line.partition(" is in lane")[0] for line in told["sites on lanes"]] == [
+        "[sites.csv: site low: (10, 1.6, 8.4)"
+    ]
+
+
+def test_many_sites_in_lanes_share_one_warning(street: Path) -> None:
+    sites(street, *(f"s{i:02d},{i},1.6,3" for i in range(1, 13)))
+    lines = found(street)["sites on lanes"]
+    assert len(lines) == 9
+    assert lines[-1] == "[sites.csv: 4 more of 12 are in lanes or junctions: s09, s10, s11, s12]"
+
+
+def rule(folder: Path, grid: str) -> None:
+    text = (folder / "scenario.toml").read_text()
+    (folder / "scenario.toml").write_text(text.replace('file = "sites.csv"', f"grid = {grid}"))
+
+
+def test_rule_drops_candidates_in_lanes_and_solids(street: Path) -> None:
+    """Rows at y = -6, -1, 4 and 9: the second is in a lane, whatever the height; of the last, one is in the house (from
+    x = 14 to 18, y = 5 to 8, made wider here), but not above it."""
+    statics(street, box((14, 5), (18, 10), "house", height_m=6))
+    rule(street, "{ low_m=[6,-6], high_m=[26,9], spacing_m=5, heights_m=[3.0, 7.0] }")
+    checked = check.check_scenario(egvs.load(street))
+    assert [str(finding) for finding in checked.findings] == [
+        "sites.grid: 11 of 40 candidates are dropped, since no pole can stand there (10 in a lane, 1 in a solid). "
+        "Name a sensor on a gantry or an island in a file of sites."
+    ]
+    scene = egvs.build_scene(egvs.load(street))
+    assert (len(scene.sites), checked.sites) == (29, 29)
+    assert {site.pose.y_m for site in scene.sites} == {-6.0, 4.0, 9.0}
+    assert [(site.pose.position_m, why) for site, why in scene.dropped if site.pose.y_m > 4] == [
+        ((16.0, 9.0, 3.0), "in a solid")
+    ]
+
+
+def test_rule_drops_candidates_within_junction_but_not_on_walkways(street: Path) -> None:
+    """A junction of 8 x 8 m beside the lanes, its corner in the north-east a walking area of 2 x 2 m."""
+    area = '<edge id=":j_w0" function="walkingarea"><lane id=":j_w0_0" index="0" allow="pedestrian" length="2"'
+    corner = f'{area} width="2" shape="18,-6 20,-6 20,-8 18,-8"/></edge>'
+    shape = 'shape="12,-6 20,-6 20,-14 12,-14"'
+    junction = f'<junction id="j" type="priority" x="16" y="-10" incLanes="east_1" {shape}/>'
+    (street / "net.net.xml").write_text(net_xml(f"{LANES}{corner}{junction}"))
+    rule(street, "{ low_m=[11,-15], high_m=[19,-7], spacing_m=2, heights_m=[3.0] }")
+    scene = egvs.build_scene(egvs.load(street))
+    dropped = {site.pose.position_m[:2] for site, why in scene.dropped if why == "in a junction"}
+    assert dropped == {(x, y) for x in (13, 15, 17, 19) for y in (-13, -11, -9, -7)} - {(19, -7)}
+
+
+def test_rule_that_drops_nothing_is_checked_like_a_file(street: Path) -> None:
+    rule(street, "{ low_m=[6,-6], high_m=[16,9], spacing_m=5, heights_m=[3.0] }")
+    told = found(street, "sites.only_free=false")
+    assert {key: len(lines) for key, lines in told.items()} == {"sites on lanes": 3}
+
+
+def test_rejects_rule_without_feasible_candidate(street: Path) -> None:
+    rule(street, "{ low_m=[6,1], high_m=[16,1], spacing_m=5, heights_m=[3.0] }")
+    assert found(street) == {"sites": ["scenario.toml: sites: no place can hold a pole (3 in a lane)"]}
+
+
+def test_rejects_visibility_of_dropped_site(street: Path) -> None:
+    rule(street, "{ low_m=[6,-6], high_m=[6,-1], spacing_m=5, heights_m=[3.0] }")
+    told = found(street, 'score.keep_visibility=["g02"]')
+    assert told == {"sites": ["scenario.toml: score.keep_visibility: the site 'g02' is dropped: it stands in a lane"]}
+
+
+def test_warns_of_beams_that_miss_region(street: Path) -> None:
+    sensor = "{elevations_deg=[5,15],channels=4,azimuth_step_deg=1.0,range_m=100}"
+    told = found(street, f"sensors.small={sensor}", "roi.center_m=[20,0,1.0]", "roi.size_m=[40,20,2]")
+    assert told == {
+        "beams beside the region": ["[sites: no beam of 2 of 2 sites meets the region of interest: pole_a, pole_b]"]
+    }
+
+
+def test_reports_all_wrong_poses_at_once(street: Path) -> None:
+    sites(street, "inside,16,6,3", "deep,10,12,-1", "far,300,12,3", "fine,10,12,3")
+    assert found(street) == {
+        "sites": [
+            "site inside: (16, 6, 3) is inside house (building)",
+            "site deep: z_m = -1 is not above the ground (z = 0)",
+            "site far: the site is 260.0 m from the region of interest",
+        ]
+    }
+
+
+# ---- solids
+
+
+def test_warns_of_solid_on_lane_with_position(street: Path) -> None:
+    """2 x 2 m of two lanes that are 2.7 m wide without their edges and 120 m long: 4 of 2 * 2.7 * 120 m2."""
+    statics(street, box((20, 0.5), (22, 2.5), "shelter", base_m=2.4, height_m=2.6))
+    share, lanes = 4 / (2 * 2.7 * 120), "of the lanes in and around the region"
+    assert found(street) == {
+        "solids over lanes": [f"[statics: a solid covers {share:.1%} {lanes}: shelter (kiosk) 4 m2 at (21, 2)]"]
+    }
+
+
+@pytest.mark.parametrize(
+    ("solid", "is_found"),
+    [
+        (box((20, 0.5), (22, 2.5), base_m=4.5, height_m=6), False),  # a bridge
+        (box((20, 0.5), (22, 2.5), height_m=0.3), False),  # an island
+        (box((20, 0.5), (22, 2.5), height_m=0.31), True),
+        (box((20, 2.9), (30, 6)), False),  # touches: 0.05 m of the inset lane
+        (box((20, 2.7), (30, 6)), True),  # 0.25 m of it, 2.5 m2
+        (box((20, 1.5), (20.2, 1.7)), True),  # a post, small, but in the middle of a lane
+        (box((20, 2.9), (20.2, 3.1)), False),  # one at the kerb
+        (box((200, 0.5), (222, 2.5)), False),  # too far away to matter
+    ],
+)
+def test_solid_in_the_way_on_lane(street: Path, solid: dict, is_found: bool) -> None:
+    statics(street, solid)
+    assert set(found(street)) == ({"solids over lanes"} if is_found else set())
+
+
+def test_open_surface_above_kerb_is_in_the_way(street: Path) -> None:
+    """A sheet over the whole street is the road at 0.1 m, and in everybody's way at 1 m."""
+    for height_m, is_found in ((0.1, False), (1.0, True)):
+        corners = "".join(f"v {x} {y} {height_m}\n" for x, y in ((-40, -6), (80, -6), (80, 6), (-40, 6)))
+        (street / "sheet.obj").write_text(corners + "f 1 2 3\nf 1 3 4\n")
+        told = found(street, "statics.footprints=[]", 'statics.meshes=[{file="sheet.obj"}]')
+        assert set(told) == ({"solids over lanes"} if is_found else set())
+        if is_found:
+            assert "a solid covers 100.0% of the lanes" in told["solids over lanes"][0]
+
+
+def test_warns_of_distant_buildings(street: Path) -> None:
+    statics(street, box((1000, 2000), (1010, 2010)), box((1100, 2000), (1110, 2010)))
+    assert found(street) == {
+        "statics far away": [
+            "[statics: the nearest solid is 2,209 m from the region of interest; all solids are around (1055, 2005)]"
+        ]
+    }
+
+
+# ---- the region
+
+
+def test_rejects_region_without_lanes(street: Path) -> None:
+    sites(street, "a,20,210,3")
+    statics(street)
+    told = found(street, "roi.center_m=[20,200,2.5]")
+    assert told == {
+        "region": [
+            "scenario.toml: roi: no lane passes through the region: the nearest is 187.1 m away, "
+            "lanes extend from (-40, -3) to (80, 3)"
+        ]
+    }
+
+
+def test_rejects_region_above_road(street: Path) -> None:
+    told = found(street, "roi.center_m=[20,0,22.5]")
+    assert told["region"] == [
+        "scenario.toml: roi: the region extends from z = 20 to 25 m, but the road is at z = 0.0 m"
+    ]
+
+
+# ---- all at once
+
+
+def test_reports_all_errors_at_once(street: Path, run_egvs) -> None:
+    sites(street, "in,10,1.6,3", "house,16,6,3")
+    (street / "broken.geojson").write_text("{")
+    settings = (
+        'sites.sensor="smal"', "traffic.frame_period_s=0.3", "traffic.edge_weights={north=2}",
+        'statics.footprints=["statics.geojson","gone.geojson","broken.geojson"]',
+    )  # fmt: skip
+    told = found(street, *settings)
+    assert {key: len(lines) for key, lines in told.items()} == {
+        "files": 1, "statics": 1, "traffic": 2, "sensors": 1, "sites on lanes": 1,
+    }  # fmt: skip
+    assert told["sensors"] == ["site in and 1 more: unknown sensor 'smal'"]
+    flags = [word for setting in settings for word in ("--set", setting)]
+    code, printed, _ = run_egvs("check", street, *flags)
+    assert code == 2
+    assert printed.splitlines()[0] == "5 errors"
+    assert "1 warning" in printed.splitlines()
+    code, _, said = run_egvs("run", street, "--out", street / "out", *flags)
+    said = said.replace(f"{street}/", "")
+    assert code == 2
+    assert all(line.partition(": ")[2] in said for lines in told.values() for line in lines if line[0] != "[")
+    assert not list((street / "out").glob("[!.]*"))
+
+
+def test_rejects_truncated_network_before_building(street: Path) -> None:
+    (street / "net.net.xml").write_text(net_xml()[:300])
+    told = found(street)
+    assert list(told) == ["network"]
+    with pytest.raises(DiagnosticsError, match="is not well-formed XML"):
+        egvs.run(egvs.load(street), street / "out")
+
+
+@pytest.mark.parametrize("softness", [0, 0.3])
+def test_rejects_range_limit_without_rated_range(street: Path, softness: float) -> None:
+    told = found(street, f"effects.range_limit={{reflectivity=0.1, softness={softness}}}")
+    assert told == {"effects": ["effects.range_limit: sensor small: rated_range_m is missing"]}
+
+
+# ---- the command, and the run
+
+
+def test_check_command_without_findings_writes_nothing(street: Path, run_egvs) -> None:
+    before = sorted(street.rglob("*"))
+    code, printed, _ = run_egvs("check", street)
+    assert (code, printed.splitlines()) == (
+        0,
+        ["no errors and no warnings", "checked 2 sites, 3 solids and 2 lanes"],
+    )
+    assert sorted(street.rglob("*")) == before
+
+
+@pytest.mark.slow
+def test_run_records_and_shows_warnings(mini: Path, run_egvs) -> None:
+    statics(mini, box((1000, 2000), (1010, 2010)))
+    for state in ("nearest solid", "unchanged"):
+        code, _, said = run_egvs("run", mini, "--out", mini / "out")
+        assert (code, state in said, "warning: statics: the nearest solid is 2,209 m" in said) == (0, True, True)
+    record = json.loads((mini / "out" / "run.json").read_text())
+    assert [warning["rule"] for warning in record["stages"]["check"]["summary"]["warnings"]] == ["statics far away"]
+    assert "the nearest solid is 2,209 m" in (mini / "out" / "report.html").read_text()
+    assert run_egvs("verify", mini / "out")[0] == 0
+
+
+def test_diagnostics_error_is_input_error(street: Path) -> None:
+    with pytest.raises(InputError) as caught:
+        egvs.run(egvs.load(street, ['sites.sensor="smal"', "traffic.edge_weights={north=2}"]), street / "out")
+    assert len(str(caught.value).splitlines()) == 2
+
+
+def test_warns_of_repeated_beams(street: Path) -> None:
+    """They count twice, since a table is taken as it is."""
+    (street / "beams.csv").write_text("elevation_deg,azimuth_deg\n-5,0\n-5,90\n-5,360\n-9,0\n")
+    told = found(street, 'sensors.own={beams="beams.csv",range_m=90}', 'sites.sensor="own"', 'sites.aim="roi"')
+    assert told == {
+        "repeated beams": ["[beams.csv: 1 of 4 beams repeat an earlier direction (beam 2 as beam 0) and count twice]"]
+    }
+
+
+# ---- files, and the keys of the stage
+
+
+def test_reports_all_wrong_rows_of_sites_file(street: Path) -> None:
+    sites(street, "a,10,12,x", "b,10,12,3", "b,11,12,3", "c,,12,3", "d,10,12,3")
+    assert found(street) == {
+        "sites": [
+            "sites.csv: row a: z_m: expected a finite number of at most 1e+08, got 'x'",
+            "sites.csv: row b: there are two sites 'b'",
+            "sites.csv: row c: x_m is missing",
+        ]
+    }
+
+
+def test_equal_findings_of_many_sites_are_joined(street: Path) -> None:
+    """An aim needs the sensor, so each row is refused for it."""
+    told = found(street, 'sites.sensor="smal"', 'sites.aim="roi"')
+    assert told == {"sites": ["sites.csv: row pole_a: sensor and 1 more: unknown sensor 'smal'"]}
+
+
+def test_reports_missing_files_and_unknown_formats(street: Path) -> None:
+    (street / "sites.csv").write_text("site,x_m,y_m,z_m,points\na,10,12,3,gone.pcd\nb,12,12,3,scan.xyz\nc,14,12,3,\n")
+    (street / "scan.xyz").write_text("")
+    told = found(street, 'statics.polygons=["gone.poly.xml"]', 'sensors.own={beams="beams.csv",range_m=50}')
+    assert {line.partition(": no such")[0] for line in told["files"][:3]} == {
+        "scenario.toml: statics.polygons = 'gone.poly.xml'",
+        "scenario.toml: sensors.own.beams = 'beams.csv'",
+        "scenario.toml: site a: points = 'gone.pcd'",
+    }
+    assert "scan.xyz" in told["files"][3]
+    assert len(told["files"]) == 4
+
+
+def test_missing_file_of_period_is_reported_once(street: Path) -> None:
+    """The rules that would read it find it missing too."""
+    told = found(street, 'traffic.periods=[{name="a",sumocfg="gone.sumocfg"},{name="b",vehicles=3}]')
+    (line,) = (line for lines in told.values() for line in lines)
+    assert line.startswith("scenario.toml: traffic.periods (a).sumocfg = 'gone.sumocfg': no such file")
+
+
+def test_reports_warnings_beside_errors(street: Path, run_egvs) -> None:
+    sites(street, "amid,10,1.6,3")
+    code, _, err = run_egvs("run", street, "--set", "traffic.edge_weights={north=2}")
+    assert code == 2
+    warning, error = err.splitlines()
+    assert warning.startswith("warning: sites.csv: site amid: (10, 1.6, 3) is in lane west_1")
+    assert error.startswith("egvs: ") and "the network has no edge 'north'" in error
+
+
+@pytest.mark.slow
+@pytest.mark.system
+def test_rejects_map_that_netconvert_rejects(street: Path, monkeypatch: pytest.MonkeyPatch, run_egvs) -> None:
+    (street / "map.osm").write_text('<osm version="0.6"></osm>')
+    monkeypatch.chdir(street.parent)
+    code, _, err = run_egvs("check", street.name, "--set", 'traffic.network="map.osm"')
+    assert (code, err) == (2, "")
+    code, _, err = run_egvs("run", street.name, "--set", 'traffic.network="map.osm"', "--out", "out")
+    assert code == 2
+    assert err.startswith(f"egvs: {street.name}/map.osm: no network can be made of this map: netconvert ended with")
+    assert not list((street.parent / "out").glob("*.p*"))
+    (street / "map.osm").write_text("<osm><node")
+    code, _, err = run_egvs("run", street.name, "--set", 'traffic.network="map.osm"', "--out", "out")
+    assert code == 2
+    assert err.startswith(f"egvs: {street.name}/map.osm: is not well-formed XML: unclosed token")
+
+
+def test_reports_counts_at_unknown_edges_and_kinds(street: Path) -> None:
+    counts = (
+        '[{edge="east",per_hour=100},{edge="north",per_hour=9},{from_edge="east",to_edge="up",per_hour=9,kind="ox"}]'
+    )
+    told = found(street, f"traffic.counts={counts}")
+    assert [line.partition("): ")[2] for line in told["traffic"]] == [
+        "the network has no edge 'north'", "the fleet has no kind 'ox'", "the network has no edge 'up'",
+    ]  # fmt: skip
+
+
+def test_rejects_count_on_impossible_route(street: Path) -> None:
+    (told,) = found(street, 'traffic.counts=[{from_edge="east",to_edge="west",per_hour=9}]')["traffic"]
+    assert told == "scenario.toml: traffic.counts (east to west): there is no way from 'east' to 'west'"
+
+
+def test_junction_with_invalid_walking_areas_drops_candidates() -> None:
+    """Those of the hill, made valid, are areas with lines beside them, which GEOS subtracts from nothing."""
+    roads = Carriageway.of(network.read_net_xml(SCENARIOS / "hill" / "network.net.xml"))
+    at_m = np.array([[0.0, 0.0], [2.0, -2.0], [15.0, 14.0], [60.0, 12.0]])
+    assert roads.in_junctions(at_m).tolist() == [True, True, False, False]
+
+
+def test_file_keeps_all_sites(street: Path) -> None:
+    with pytest.raises(InputError, match="only_free has no effect with file"):
+        egvs.load(street, ["sites.only_free=false"])
+
+
+def test_changed_input_repeats_check(street: Path) -> None:
+    """Each file that it reads, and no setting of what comes of a run."""
+    (street / "scan.csv").write_text("x_m,y_m,z_m\n30.5,0,0\n")
+    (street / "sites.csv").write_text("site,x_m,y_m,z_m,points\na,10,12,3,\nb,12,12,3,scan.csv\n")
+
+    def key(*settings: str) -> object:
+        return inputs_of(check, egvs.load(street, settings), street / "out").to_json()
+
+    before = key()
+    for setting in ("roi.voxel_m=0.25", "score.gamma=9", "tpog.blocks=2", "seed=3", "scan.keep=false"):
+        assert key(setting) == before
+    for setting in ("roi.center_m=[21,0,2.5]", "sites.roll_deg=1", "traffic.step_s=0.5", "effects.rain.rate_mm_h=9"):
+        assert key(setting) != before
+    for name in ("net.net.xml", "sites.csv", "statics.geojson"):
+        (street / name).write_text((street / name).read_text() + "\n")
+        now = key()
+        assert now != before, name
+        before = now
+    (street / "scan.csv").unlink()
+    assert key() != before
+
+
+def test_map_is_converted_once(street: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The check, the rule of sites and the traffic all need the network of a map."""
+    calls = []
+
+    def netconvert(name: str, arguments: list[str], folder: Path) -> str:
+        calls.append(name)
+        (folder / arguments[-1]).write_text((street / "net.net.xml").read_text())
+        return ""
+
+    monkeypatch.setattr(sumo, "run_program", netconvert)
+    (street / "map.osm").write_text("<osm/>")
+    rule(street, "{ low_m=[6,-6], high_m=[26,9], spacing_m=5, heights_m=[3.0] }")
+    scenario = egvs.load(street, ['traffic.network="map.osm"'])
+    assert check.check_scenario(scenario).lanes == 2
+    egvs.build_scene(scenario)
+    sumo_folder.convert_osm(street / "map.osm", street / "again.net.xml")
+    assert (street / "again.net.xml").read_text() == (street / "net.net.xml").read_text()
+    (street / "map.osm").write_text("<osm> </osm>")
+    sumo_folder.read_network(scenario)
+    assert calls == ["netconvert", "netconvert"]

@@ -1,0 +1,138 @@
+"""Scores of a setting are those of a run; each stage runs once, and its time and memory are measured."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import egvs
+from egvs.core import files, runtime
+from egvs.core.errors import RunError
+from egvs.runs import stages
+from egvs.runs.store import Store
+from egvs.scoring.scorer import Scorer
+from egvs.stages.inputs import get_scene, open_folder
+from egvs.stages.site_scoring import empty_scans
+from egvs.studies import measurement, study_settings
+from egvs.studies.study_settings import SCENARIO_AS_IS
+from tests.studies.short_studies import (
+    make_runner,
+    shares,
+)
+
+
+def test_repeat_with_other_bytes_is_an_error(mini: Path, tmp_path: Path) -> None:
+    runner = make_runner(mini, tmp_path)
+    original = SCENARIO_AS_IS
+    trial = runner.run(original)
+    cost = tmp_path / "accuracy" / "times" / f"tpog-{trial.stages['tpog'][:16]}.json"
+    times = json.loads(cost.read_text().replace('"tpog.parquet": "', '"tpog.parquet": "0'))
+    cost.write_text(files.to_json_text(files.add_checksum(times)))
+    with pytest.raises(RunError, match="other bytes"):
+        runner.time_again("tpog", original, trial)
+
+
+def test_thinned_beams_score_as_if_each_hit_counted_twice(mini: Path, tmp_path: Path) -> None:
+    thin = next(s for s in study_settings.list_settings(egvs.load(mini)) if s.name == "every 2nd azimuth")
+    scenario = egvs.load(mini, thin.overrides)
+    thinned_shares = shares(mini, list(thin.overrides), tmp_path / "out")
+    tpog = egvs.read_tpog(tmp_path / "out" / "tpog.parquet")
+    p = tpog.p.ravel()
+    with np.errstate(divide="ignore", invalid="ignore"):
+        entropy = np.nan_to_num(-(p * np.log2(p) + (1 - p) * np.log2(1 - p)))
+    work = open_folder(scenario, tmp_path / "out")
+    scorer = Scorer(get_scene(work), tpog)
+    for share, scan in zip(thinned_shares, empty_scans(work), strict=True):
+        twice = np.minimum(4.0, 2.0 * scorer.hits(scan.beams).ravel())
+        assert share == pytest.approx((entropy * twice).sum() / (4.0 * entropy.sum()), rel=1e-12)
+
+
+def test_thinned_beams_are_weighted_with_infinite_gamma(mini: Path, tmp_path: Path) -> None:
+    runner = make_runner(mini, tmp_path / "out", "score.gamma=inf")
+    thinned_shares = {s.name: s for s in study_settings.list_settings(runner.scenario(SCENARIO_AS_IS))}
+    complete, thin = (np.array(runner.run(thinned_shares[name]).shares) for name in ("scenario", "every 2nd azimuth"))
+    assert np.abs(thin / complete - 1).max() < 0.1
+
+
+def test_cached_stages_count_with_their_original_time_until_they_are_measured(mini: Path, tmp_path: Path) -> None:
+    record = egvs.run(egvs.load(mini), tmp_path / "run")
+    runner = make_runner(mini, tmp_path / "out")
+    scores = runner.run(SCENARIO_AS_IS)
+    assert scores.stages == {name: record.stages[name].inputs for name in stages.RANKING_STAGES}
+    for name, key in scores.stages.items():
+        cached = runner.stage_times(name, key)
+        assert (cached.repeats, cached.seconds) == (0, (record.stages[name].cost.seconds,))  # the stage did not run
+    plain = make_runner(mini, tmp_path / "other")
+    Store.default().prune(-1)
+    assert plain.run(SCENARIO_AS_IS) == scores  # standard errors too, which a cached stage does not contain
+    cached = runner.stage_times("tpog", scores.stages["tpog"])
+    runner.time_again("tpog", SCENARIO_AS_IS, scores)
+    timed = runner.stage_times("tpog", scores.stages["tpog"])
+    assert (timed.repeats, len(timed.seconds)) == (1, 1)
+    assert timed.seconds != cached.seconds
+
+
+def test_result_of_another_program_version_is_ignored(
+    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from egvs.runs import stages
+
+    runner = make_runner(mini, tmp_path / "out")
+    runner.run(SCENARIO_AS_IS)
+    assert runner.saved_scores(SCENARIO_AS_IS) is not None
+    original = stages.source_digest
+    monkeypatch.setattr(stages, "source_digest", lambda *names: replace(original(*names), digest="another"))
+    changed = make_runner(mini, tmp_path / "out")
+    assert changed.saved_scores(SCENARIO_AS_IS) is None
+
+
+def test_results_with_different_weights_are_saved_separately(mini: Path, tmp_path: Path) -> None:
+    """With infinite gamma, unweighted scores of every second beam are half as large."""
+    runner = make_runner(mini, tmp_path, "score.gamma=inf")
+    thin = next(
+        s for s in study_settings.list_settings(runner.scenario(SCENARIO_AS_IS)) if s.name == "every 2nd azimuth"
+    )
+    plain = replace(thin, weight=1.0)
+    assert np.array(runner.run(thin).shares) == pytest.approx(2 * np.array(runner.run(plain).shares))
+
+
+def test_memory_is_freed_before_a_stage_is_measured(
+    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[str] = []
+    monkeypatch.setattr(measurement, "release_memory", lambda: done.append("freed"))
+    original = runtime.measure_usage
+
+    def noted() -> object:
+        done.append("measured")
+        return original()
+
+    monkeypatch.setattr(stages, "measure_usage", noted)
+    make_runner(mini, tmp_path).run(SCENARIO_AS_IS)
+    assert done == ["freed", "measured"] * len(stages.RANKING_STAGES)
+
+
+@pytest.mark.slow
+def test_memory_is_measured_above_what_the_program_holds(
+    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from egvs.stages import tpog
+
+    def greedy(*args: Any, **options: Any) -> dict[str, Any]:
+        assert np.ones(50_000_000).sum() > 0  # 400 MB
+        return tpog.run(*args, **options)
+
+    runner, setting = make_runner(mini, tmp_path), SCENARIO_AS_IS
+    held = np.ones(50_000_000)
+    trial = runner.run(setting)
+    plain = runner.stage_times("tpog", trial.stages["tpog"]).peak_mb
+    monkeypatch.setattr(tpog, "STAGE", replace(tpog.STAGE, run=greedy))
+    runner.time_again("tpog", setting, trial)
+    assert plain < 200
+    assert runner.stage_times("tpog", trial.stages["tpog"]).peak_mb == pytest.approx(plain + 381, abs=60)
+    assert held[0] == 1.0

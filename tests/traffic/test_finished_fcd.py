@@ -1,0 +1,264 @@
+"""Scenarios with a finished FCD file: frames, sizes of vehicles, roads."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+import egvs
+from egvs.artefacts import parquet
+from egvs.core.errors import InputError, MissingBackendError
+from egvs.runs import stages
+from egvs.scenario.traffic_config import TrafficConfig
+from egvs.stages import traffic
+from egvs.stages.inputs import open_folder
+from egvs.studies.study_settings import counted_frames
+from tests.conftest import fcd
+from tests.stage_runner import inputs_of
+from tests.stages.conftest import net_xml
+
+LORRY = '<vType id="lorry" vClass="truck"/>'
+
+
+CAR = '<vType id="car" length="4" width="1.7" height="1.4"/>'
+
+
+def without_frames(mini: Path, *also: tuple[str, str]) -> Path:
+    """The scenario without frames and warm-up; its file lasts 19.5 s in steps of 0.5 s."""
+    text = (mini / "scenario.toml").read_text()
+    for old, new in (("frames = 40\n", ""), ("warmup_s = 0\n", ""), *also):
+        assert old in text
+        text = text.replace(old, new)
+    (mini / "scenario.toml").write_text(text)
+    return mini
+
+
+def set_types(mini: Path, *types: str) -> None:
+    """Name the file's vehicles, which are cars, as these types, in turn."""
+    head, *rows = (mini / "fcd.csv").read_text().splitlines()
+    rows = [row.replace(";car;", f";{types[i % len(types)]};") for i, row in enumerate(rows)]
+    (mini / "fcd.csv").write_text("\n".join([head, *rows]) + "\n")
+
+
+def vtypes(mini: Path, *files: str) -> list[str]:
+    """Write files of vTypes; the override that names them."""
+    for number, text in enumerate(files):
+        (mini / f"types{number}.xml").write_text(text)
+    return [f"traffic.vtypes={[f'types{number}.xml' for number in range(len(files))]}"]
+
+
+@pytest.mark.slow
+def test_without_frames_the_complete_file_is_used(mini: Path, tmp_path: Path, run_egvs) -> None:
+    assert run_egvs("run", mini, "--out", tmp_path / "said")[0] == 0
+    code, printed, output = run_egvs("run", without_frames(mini), "--out", tmp_path / "without_frames")
+    assert code == 0, output
+    assert "left over" not in output + printed
+    for name, read in (("trajectories", egvs.read_trajectories), ("scores", egvs.read_scores)):
+        ours, theirs = (read(tmp_path / way / f"{name}.parquet") for way in ("said", "without_frames"))
+        assert ours.equals(theirs)
+    assert run_egvs("verify", tmp_path / "without_frames")[0] == 0
+
+
+@pytest.mark.slow
+def test_frames_after_the_last_full_block_are_skipped_with_a_note(mini: Path, tmp_path: Path, run_egvs) -> None:
+    code, printed, output = run_egvs(
+        "run", without_frames(mini, ("blocks = 4", "blocks = 3")), "--out", tmp_path / "three"
+    )
+    assert code == 0, output
+    assert "left over the last 1 of 40 frames, so that 3 blocks are alike" in output + printed
+    metadata = parquet.read_metadata(tmp_path / "three" / "tpog.parquet", "tpog")
+    assert (metadata["frames"], metadata["block_frames"]) == (39, 13)
+    assert run_egvs("run", mini, "--set", "traffic.frames=39", "--out", tmp_path / "given")[0] == 0
+    ours, theirs = (egvs.read_tpog(tmp_path / way / "tpog.parquet") for way in ("three", "given"))
+    assert (ours.counts == theirs.counts).all()
+
+
+def test_frames_after_the_last_full_block_of_a_period_are_skipped(mini: Path, tmp_path: Path) -> None:
+    """``[traffic]`` simulates, and one of its periods is a finished file."""
+    (mini / "net.net.xml").write_text(net_xml())
+    period = '[[traffic.periods]]\nname = "day"\nfcd = "fcd.csv"\n\n[[traffic.kinds]]'
+    network = ('fcd = "fcd.csv"', 'network = "net.net.xml"')
+    without_frames(mini, network, ("[[traffic.kinds]]", period), ("blocks = 4", "blocks = 3"))
+    record = egvs.run(egvs.load(mini), tmp_path)
+    assert record.stages["tpog"].summary["left_over"] == "the last 1 of 40 frames, so that 3 blocks are alike"
+
+
+def test_sumo_version_is_an_input_if_any_period_is_simulated(mini: Path, tmp_path: Path) -> None:
+    """Another SUMO is other traffic, whatever the first period comes from."""
+    (mini / "net.net.xml").write_text(net_xml())
+    (mini / "c.sumocfg").write_text('<configuration><net-file value="net.net.xml"/></configuration>')
+    day, night = 'name = "day"\nfcd = "fcd.csv"\n', 'name = "night"\nsumocfg = "c.sumocfg"\nlength_s = 20\n'
+    periods = f"[[traffic.periods]]\n{day}\n[[traffic.periods]]\n{night}\n"
+
+    def version(text: str) -> object:
+        (mini / "scenario.toml").write_text(text)
+        return inputs_of(traffic, egvs.load(mini), tmp_path).to_json()["sumo"]
+
+    text = (mini / "scenario.toml").read_text()
+    assert version(text) is None
+    assert version(text.replace('fcd = "fcd.csv"\n', "").replace("[[traffic.kinds]]", f"{periods}[[traffic.kinds]]"))
+
+
+def test_warm_up_and_frame_period_apply_to_finished_file(mini: Path, tmp_path: Path) -> None:
+    scenario = egvs.load(without_frames(mini), ["traffic.warmup_s=4", "traffic.frame_period_s=1", "tpog.blocks=2"])
+    assert counted_frames(scenario) == 16  # 4, 5, ... 19 s
+    assert counted_frames(egvs.load(mini, ["tpog.blocks=7"])) == 35
+    record = egvs.run(scenario, tmp_path)
+    assert record.stages["traffic"].summary["frames"] == 16
+
+
+def test_rejects_fewer_frames_than_blocks(mini: Path, tmp_path: Path, run_egvs) -> None:
+    code, _, output = run_egvs("run", without_frames(mini, ("blocks = 4", "blocks = 50")), "--out", tmp_path)
+    assert code == 2
+    assert "tpog.blocks: 50 does not divide the 40 frames recorded; a divisor, or at most 40" in output
+
+
+def test_rejects_warm_up_longer_than_the_file(mini: Path, tmp_path: Path, run_egvs) -> None:
+    code, _, output = run_egvs("run", without_frames(mini), "--set", "traffic.warmup_s=20", "--out", tmp_path)
+    assert code == 2
+    assert "traffic.warmup_s = 20: the duration of fcd.csv is 19.5 s" in output
+
+
+def test_default_length_of_a_simulation() -> None:
+    traffic = TrafficConfig.from_dict({"network": "n.net.xml"})
+    assert (traffic.frames, traffic.warmup_s) == (5000, 300.0)
+
+
+def test_sizes_from_vtypes_and_sumo_defaults(mini: Path, tmp_path: Path) -> None:
+    set_types(mini, "lorry", "DEFAULT_VEHTYPE", "car", "coach")
+    expected = vtypes(mini, f"<additional>{LORRY}</additional>",
+                    f"<routes><vTypeDistribution id='d'>{CAR}</vTypeDistribution>"
+                    "<route id='r' edges='no'/><vType id='coach' vClass='bus' length='12.5'/></routes>")  # fmt: skip
+    egvs.run(egvs.load(mini, expected), tmp_path / "out")
+    rows = egvs.read_trajectories(tmp_path / "out" / "trajectories.parquet").to_pylist()
+    result = {(row["kind"], row["length_m"], row["width_m"], row["height_m"]) for row in rows}
+    truck, passenger = ("truck", 7.1, 2.4, 2.4), ("passenger", 5.0, 1.8, 1.5)  # SUMO's defaults, its documentation
+    car = ("passenger", 4.5, 1.8, 1.5)  # the scenario's kind comes before the file's
+    assert result == {truck, passenger, car, ("bus", 12.5, 2.5, 3.4)}
+
+
+def test_sumo_version_is_in_the_cache_key(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The trajectories' key holds SUMO's version though no SUMO drove; without a SUMO there is a key all the same."""
+
+    def missing() -> str:
+        raise MissingBackendError("no sumo")
+
+    keys = set()
+    for version in (lambda: "1.20.0", lambda: "1.28.0", missing):
+        monkeypatch.setattr("egvs.traffic.sumo.sumo_version", version)
+        keys.add(stages.stage_key("traffic", open_folder(egvs.load(mini), tmp_path)).key)
+    assert len(keys) == 3
+
+
+def test_vtypes_override_the_default_fleet(mini: Path, tmp_path: Path) -> None:
+    text = (mini / "scenario.toml").read_text()
+    kind = text[text.index("[[traffic.kinds]]") : text.index("[statics]")]
+    (mini / "scenario.toml").write_text(text.replace(kind, ""))
+    egvs.run(egvs.load(mini, vtypes(mini, f"<additional>{CAR}</additional>")), tmp_path / "out")
+    rows = egvs.read_trajectories(tmp_path / "out" / "trajectories.parquet").to_pylist()
+    assert {row["length_m"] for row in rows} == {4.0}
+
+
+def test_names_all_types_without_size(mini: Path, tmp_path: Path, run_egvs) -> None:
+    set_types(mini, "tram", "car", "lorry", "car")
+    code, _, output = run_egvs("run", mini, "--out", tmp_path)
+    assert code == 2
+    assert (
+        "traffic.kinds: the size of vehicle types of fcd.csv is unknown: 'lorry', 'tram'. Add a kind of each name"
+        in output
+    )
+    assert "vtypes (known: car)" in output
+    head, _, _ = fcd().rpartition(";car;")
+    (mini / "fcd.csv").write_text(f"{head};tram;1.7\n")  # at 19.5 s, beyond the frames that are asked for below
+    assert run_egvs("run", mini, "--out", tmp_path)[0] == 2
+    assert run_egvs("run", mini, "--set", "traffic.frames=36", "--out", tmp_path)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        (["<additional/>"], r"types0\.xml: the file has no <vType>"),
+        (["<additional><vType/></additional>"], "a <vType> has no id"),
+        ([f"<a>{LORRY}{LORRY}</a>"], "a second <vType> 'lorry'"),
+        ([f"<a>{LORRY}</a>"] * 2, r"types1\.xml: a second <vType> 'lorry'"),
+        (["<a><vType id='x' vClass='lorry'/></a>"], "vType x: vClass: unknown vClass 'lorry'"),
+        *(([f"<a><vType id='x' height='{height}'/></a>"], f"vType x: height: expected a length, got '{height}'")
+          for height in ("tall", "0", "-1", "nan", "inf", "1e-300", "2001", "1_0", "٣")),
+        (["<a><vType id='x'></a>"], "is not well-formed XML"),
+        (["<a><vType id='x y&gt;'/></a>"], r"types0\.xml: SUMO rejects the vehicle types: sumo ended with"),
+    ],
+)  # fmt: skip
+def test_rejects_invalid_vtypes_file(mini: Path, tmp_path: Path, files: list[str], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        egvs.run(egvs.load(mini, vtypes(mini, *files)), tmp_path / "out")
+
+
+def test_rejects_vtypes_without_finished_file(mini: Path) -> None:
+    with pytest.raises(InputError, match=r"vtypes.* have no effect with network"):
+        egvs.load(mini, ["traffic.network=n.net.xml", 'traffic.vtypes=["x.xml"]'])
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("traffic.frames=400", r"frames = 400: fcd\.csv has 40 frames 0\.5 s apart"),
+        ("traffic.frame_period_s=0.75", r"frame_period_s = 0\.75: the time steps of fcd\.csv are 0\.5 s apart"),
+        ("traffic.warmup_s=20", r"warmup_s = 20: the duration of fcd\.csv is 19\.5 s"),
+    ],
+)
+def test_check_reports_missing_frames(mini: Path, run_egvs, override: str, message: str) -> None:
+    code, output, _ = run_egvs("check", without_frames(mini), "--set", override)
+    assert code == 2
+    assert re.search(message, output)
+
+
+def test_check_reports_missing_sizes(mini: Path, run_egvs) -> None:
+    set_types(mini, "tram", "car", "lorry", "DEFAULT_VEHTYPE")
+    code, output, _ = run_egvs("check", mini)
+    assert code == 2
+    assert "the size of vehicle types of fcd.csv is unknown: 'lorry', 'tram'" in output
+
+
+@pytest.mark.slow
+def test_roads_with_a_finished_file(mini: Path, tmp_path: Path, run_egvs) -> None:
+    (mini / "net.net.xml").write_text(net_xml())
+    roads = ["--set", "traffic.roads='net.net.xml'"]
+    assert run_egvs("run", mini, "--out", tmp_path / "plain")[0] == 0
+    code, _, output = run_egvs("run", mini, "--out", tmp_path / "roads", *roads)
+    assert code == 0, output
+    ours, theirs = (egvs.read_trajectories(tmp_path / way / "trajectories.parquet") for way in ("roads", "plain"))
+    assert ours.equals(theirs)
+    assert (tmp_path / "roads" / "sumo" / "network.net.xml").read_text() == net_xml()
+    named = {way: set(parquet.read_artefact(tmp_path / way / "blindspots.parquet", "blindspots")[0]["by"].to_pylist())
+             for way in ("roads", "plain")}  # fmt: skip
+    assert "lane" in named["roads"] - named["plain"]
+    assert run_egvs("verify", tmp_path / "roads")[0] == 0
+    (mini / "net.net.xml").write_text(net_xml().replace("</net>", "<!-- another --></net>"))
+    assert "traffic" in run_egvs("run", mini, "--out", tmp_path / "roads", *roads)[1]
+    assert "another" in (tmp_path / "roads" / "sumo" / "network.net.xml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (["traffic.roads='no.net.xml'"], "traffic.roads = 'no.net.xml': no such file"),
+        (["traffic.roads='fcd.csv'"], "fcd.csv: is not well-formed XML"),
+        (["traffic.network='net.net.xml'", "traffic.roads='net.net.xml'"], "roads has no effect with network"),
+    ],
+)
+def test_rejects_wrong_roads(mini: Path, tmp_path: Path, run_egvs, settings: list[str], message: str) -> None:
+    (mini / "net.net.xml").write_text(net_xml())
+    code, _, output = run_egvs(
+        "run", mini, "--out", tmp_path / "run", *(word for s in settings for word in ("--set", s))
+    )
+    assert code == 2 and message in output, output
+
+
+def test_rejects_roads_in_the_folder_for_sumo(mini: Path, run_egvs) -> None:
+    (mini / "sumo").mkdir()
+    (mini / "sumo" / "mine.net.xml").write_text(net_xml())
+    code, _, output = run_egvs("run", mini, "--out", mini, "--set", "traffic.roads='sumo/mine.net.xml'")
+    assert code == 2 and "write over sumo/mine.net.xml, which the scenario names (traffic.roads)" in output, output
+    assert (mini / "sumo" / "mine.net.xml").is_file()
