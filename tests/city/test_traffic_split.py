@@ -183,7 +183,7 @@ def test_files_are_fcd_as_sumo_writes_it(city: City) -> None:
         ("junctions/east/scenario.toml", "gamma = 4", "gamma = -4", "score.gamma"),
         ("city.toml", "frames = 60", "frames = 61", "city.toml: traffic: frames = 61: fcd.csv has 60 frames"),
         ("city.toml", "[[traffic.kinds]]", '[[traffic.periods]]\nname = "a/b"\n\n[[traffic.kinds]]',
-         "city.toml: traffic.periods.0.name: 'a/b'"),
+         "city.toml: traffic.periods.0.name: expected a name, got 'a/b'"),
         ("city.toml", "seed = 7", "seed = 7\n[effects.rain]\nrate_mm_h = 20.0\n",
          "city.toml: effects.rain: adds no traffic. Move it to junctions/scenario.toml"),
         ("city.toml", 'name = "bus"', 'name = "coach"', "the size of vehicle types of fcd.csv is unknown: 'bus'"),

@@ -233,7 +233,7 @@ BAD: dict[str, tuple[Change, str]] = {
     "a column twice": (sites("a,1,12,3,2", head="site,x_m,y_m,z_m,x_m"), r"the column 'x_m' occurs twice"),
     "too many beams": (
         edit("azimuth_step_deg = 1.0", "azimuth_step_deg = 1e-7"),
-        r"8 rings every 1e-07 degrees has more than",
+        r"8 rings every 1e-07 degrees are more than",
     ),
     "ROI beyond the Earth": (
         edit("center_m = [20, 0, 2.5]", "center_m = [1e300, 0, 2.5]"),

@@ -452,20 +452,20 @@ def test_foliage_combines_with_rain(mini: Path, tmp_path: Path) -> None:
 
 
 BAD_SCAN = {
-    f"{DIVERGENCE}5": "effects.divergence.sub_beams: 5",
-    "effects.divergence.divergence_mrad=[-1, 2]": "effects.divergence.divergence_mrad.0: -1",
-    "effects.divergence.divergence_mrad=[1]": "effects.divergence.divergence_mrad",
-    "effects.divergence.subbeams=7": "Did you mean sub_beams",
-    f"{SWAY}-1": "effects.mount_sway.tilt_deg: -1",
-    f"{SWAY}nan": "effects.mount_sway.tilt_deg",
-    "effects.mount_sway.samples=9": "effects.mount_sway.tilt_deg: this key is required",
-    "effects.mount_sway={tilt_deg = 1, samples = 5}": "effects.mount_sway.samples: 5",
-    f"{FOLIAGE}-0.1": "effects.foliage.leaf_area_density: -0.1",
-    f"{FOLIAGE}inf": "effects.foliage.leaf_area_density",
-    "effects.foliage.season='spring'": "effects.foliage.season",
-    "effects.foliage.season=1.5": "effects.foliage.season",
-    "effects.foliage.projection=0": "effects.foliage.projection: 0",
-    "effects.foliage.step_m=0": "effects.foliage.step_m: 0",
+    f"{DIVERGENCE}5": ("effects.divergence.sub_beams", "got 5"),
+    "effects.divergence.divergence_mrad=[-1, 2]": ("effects.divergence.divergence_mrad.0", "got -1"),
+    "effects.divergence.divergence_mrad=[1]": ("effects.divergence.divergence_mrad",),
+    "effects.divergence.subbeams=7": ("Did you mean sub_beams",),
+    f"{SWAY}-1": ("effects.mount_sway.tilt_deg", "got -1"),
+    f"{SWAY}nan": ("effects.mount_sway.tilt_deg",),
+    "effects.mount_sway.samples=9": ("effects.mount_sway.tilt_deg: this key is required",),
+    "effects.mount_sway={tilt_deg = 1, samples = 5}": ("effects.mount_sway.samples", "got 5"),
+    f"{FOLIAGE}-0.1": ("effects.foliage.leaf_area_density", "got -0.1"),
+    f"{FOLIAGE}inf": ("effects.foliage.leaf_area_density",),
+    "effects.foliage.season='spring'": ("effects.foliage.season",),
+    "effects.foliage.season=1.5": ("effects.foliage.season",),
+    "effects.foliage.projection=0": ("effects.foliage.projection", "got 0"),
+    "effects.foliage.step_m=0": ("effects.foliage.step_m", "got 0"),
 }
 
 
@@ -475,7 +475,8 @@ def test_rejects_bad_parameters_of_scan_effects(
 ) -> None:
     code, _, err = run_egvs("scan", mini, "--out", tmp_path / "out", "--set", change)
     assert code == 2 and "Traceback" not in err
-    assert BAD_SCAN[change] in " ".join(err.split()).replace(" ", " ")
+    message = " ".join(err.split()).replace(" ", " ")
+    assert all(part in message for part in BAD_SCAN[change]), message
 
 
 def test_scan_effects_are_active_with_simulated_sites(mini: Path) -> None:
@@ -565,12 +566,12 @@ def test_rejects_traffic_effects_that_do_not_fit_network_or_fleet(tmp_path, lane
 
 BAD_TRAFFIC = {
     "slope takes nothing": ("effects.slope.grade=1", r"effects\.slope\.grade: unknown key"),
-    "a negative rate": ("effects.pedestrians_bicycles.pedestrians_per_h=-1", r"pedestrians_per_h: -1"),
+    "a negative rate": ("effects.pedestrians_bicycles.pedestrians_per_h=-1", r"pedestrians_per_h: expected .* got -1"),
     "a flat person": ("effects.pedestrians_bicycles.pedestrian_m=[0.8,0.6,0]", r"pedestrian_m"),
     "no parts": ("effects.articulated.kinds.car.parts_m=[]", r"articulated\.kinds\.car\.parts_m"),
     "too many hinges": (
         "effects.articulated.kinds.car={parts_m=[2,2],hinges_m=[2,3]}",
-        r"hinges_m has 2 values for 2 parts, 1",
+        r"expected 1 hinges_m for 2 parts, or none, got 2",
     ),
     "a wrong word": ("effects.articulated.kind=1", r"articulated\.kind: unknown key. Did you mean kinds\?"),
     "people beside a finished file": (

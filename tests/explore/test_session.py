@@ -295,7 +295,9 @@ def test_refined_plan_has_its_refined_poses(mini: Path, tmp_path: Path) -> None:
     placed = egvs.place(scenario, tmp_path / "run", refine=True)
     plan = open_session(mini, (), tmp_path / "run").plan
     assert plan is not None
-    assert [site.pose for site in plan.sites.values()] == [pick.site.pose for pick in placed.sensors]
+    assert [site.pose for site in plan.sites.values()] == [
+        Pose(s.x_m, s.y_m, s.z_m, s.yaw_deg, s.pitch_deg, s.roll_deg) for s in placed.sensors
+    ]
     assert plan.joint == placed.joint
 
 

@@ -96,7 +96,7 @@ def test_plan_with_other_gamma_has_its_joint_score(mini: Path, tmp_path: Path) -
 
 def test_rejects_invalid_settings(session: Session, tmp_path: Path) -> None:
     variants = SessionFactory(session, tmp_path / "scratch")
-    with pytest.raises(InputError, match=r"score\.gamma: -1\.0; input should be greater than or equal to 0"):
+    with pytest.raises(InputError, match=r"score\.gamma: expected a value greater than or equal to 0 or .*, got -1\.0"):
         variants.session(Settings(-1.0, "egvs", frozenset()))
     with pytest.raises(InputError, match="rated_range_m"):
         variants.session(Settings(None, "egvs", frozenset({"range_limit"})))

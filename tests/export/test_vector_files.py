@@ -23,6 +23,7 @@ import pytest
 
 from egvs.artefacts import parquet
 from egvs.artefacts.readers import read_scores
+from egvs.core.errors import InputError
 from egvs.core.grid import Roi
 from egvs.export.export import FORMATS, export_run
 from egvs.formats.georeference import Georeference, WorldFrame
@@ -132,7 +133,13 @@ def test_exported_footprints_can_be_imported(located: Path, tmp_path: Path) -> N
     world = Georeference(frame, Roi.around((20, 0, 2.5), (40, 20, 5)), "scenario.toml")
     for crs in ("scenario", "wgs84"):
         export_run(located, "geojson", crs=crs, out=tmp_path / crs)
-        file = read_geojson(tmp_path / crs / "footprints.geojson", world)
+        path = tmp_path / crs / "footprints.geojson"
+        if crs == "wgs84":  # RFC 7946 forbids the member "crs", so it has to be declared
+            with pytest.raises(InputError, match='"crs"'):
+                read_geojson(path, world)
+            declared = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}
+            path.write_text(json.dumps(json.loads(path.read_text()) | {"crs": declared}))
+        file = read_geojson(path, world)
         house = next(one for one in file.footprints if one.name == "house")
         assert (house.kind, house.base_m, house.height_m) == ("building", 0.0, 6.0)
         assert house.polygon.area == pytest.approx(12.0, abs=0.01)

@@ -19,7 +19,7 @@ from egvs.report.maps import Backdrop
 from egvs.scenario.loading import scenario_from_dict
 from egvs.stages import scan, score
 from egvs.world.mesh import World, write_ply
-from tests.stages import run_stage
+from tests.stage_runner import run_stage
 
 UNSAFE_NAME = '<b>&"x'
 

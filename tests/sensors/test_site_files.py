@@ -120,7 +120,7 @@ def test_rejects_misspelt_height_of_a_footprint(mini: Path, tmp_path: Path, run_
         (mini / "statics.geojson").write_text(collection(feature(house, **user_file)))
         code, _, output = run_egvs("run", mini, "--out", tmp_path)
         assert code == (2 if spelt else 0), output
-    assert f"unknown property '{name}'; did you mean {meant}?" in output
+    assert f"unknown property '{name}'. Did you mean {meant}?" in output
 
 
 def test_geojson_rows_may_have_their_own_aim(mini: Path) -> None:

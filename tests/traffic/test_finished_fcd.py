@@ -112,7 +112,7 @@ def test_warm_up_and_frame_period_apply_to_finished_file(mini: Path, tmp_path: P
 def test_rejects_fewer_frames_than_blocks(mini: Path, tmp_path: Path, run_egvs) -> None:
     code, _, output = run_egvs("run", without_frames(mini, ("blocks = 4", "blocks = 50")), "--out", tmp_path)
     assert code == 2
-    assert "tpog.blocks: 50 does not divide the 40 frames recorded; a divisor, or at most 40" in output
+    assert "tpog.blocks: 50 does not divide the 40 recorded frames" in output
 
 
 def test_rejects_warm_up_longer_than_the_file(mini: Path, tmp_path: Path, run_egvs) -> None:
@@ -196,7 +196,7 @@ def test_rejects_invalid_vtypes_file(mini: Path, tmp_path: Path, files: list[str
 
 
 def test_rejects_vtypes_without_finished_file(mini: Path) -> None:
-    with pytest.raises(InputError, match=r"vtypes.* have no effect with network"):
+    with pytest.raises(InputError, match=r"vtypes has no effect with network"):
         egvs.load(mini, ["traffic.network=n.net.xml", 'traffic.vtypes=["x.xml"]'])
 
 

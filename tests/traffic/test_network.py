@@ -88,7 +88,7 @@ def test_rejects_ground_with_too_many_points(tmp_path: Path) -> None:
     text = '<net><edge id="e" from="a" to="b"><lane id="e_0" shape="0,0,1 9e7,9,200"/></edge></net>'
     (tmp_path / "n.net.xml").write_text(text)
     message = (
-        r"n.net.xml: reaches so far that its ground takes [0-9,]+ points\. The limit is 2,000,000 points; set "
+        r"n.net.xml: is so large that its ground needs [0-9,]+ points\. The limit is 2,000,000 points; set "
         r"EGVS_MAX_GROUND"
     )
     with pytest.raises(InputError, match=message):

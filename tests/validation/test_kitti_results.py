@@ -75,7 +75,7 @@ def test_reads_results_beside_export_and_in_data_folder(folder):
         (CAR.replace("0.9", "sure"), ["'sure'", "a finite number"]),
         (CAR.replace("0.9", "inf"), ["'inf'", "a finite number"]),
         (CAR.replace("Car", "Horse"), ["unknown class 'Horse'", "Car, Van, Truck"]),
-        (CAR.rsplit(" ", 1)[0], ["has no score", "16 values"]),
+        (CAR.rsplit(" ", 1)[0], ["no score", "16 values"]),
         (CAR + " 1", ["got 17", "16 (a result"]),
         (CAR.rsplit(" ", 2)[0], ["got 14"]),
         (CAR.replace(" 1.8 ", " -1 "), ["got 1.5 x -1 x 4.5 m", "above 0"]),

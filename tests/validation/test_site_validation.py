@@ -72,7 +72,7 @@ def test_detects_flipped_bit(validated, tmp_path):
     assert read_validation(*paths) is not None
     data = paths[0].read_bytes()
     paths[0].write_bytes(data[:99] + bytes([data[99] ^ 1]) + data[100:])
-    message = r"detection\.parquet: does not match its checksum in validation\.sha256; remove it, or run egvs val"
+    message = r"detection\.parquet: does not match its checksum in validation\.sha256\. Remove it, or run egvs val"
     with pytest.raises(InputError, match=message):
         read_validation(*paths)
 

@@ -96,7 +96,7 @@ def test_rejects_model_file_that_cannot_be_written(run_egvs, mini, tmp_path, mon
 
 
 @pytest.mark.parametrize(
-    ("frames", "problem"), [(10_000_001, "10,000,001 frames"), (5_000_000, "10,000,300 seconds of traffic")]
+    ("frames", "problem"), [(10_000_001, "10,000,001"), (5_000_000, "10,000,300")]
 )
 def test_rejects_too_many_frames(mini, frames, problem):
     text = (mini / "scenario.toml").read_text().replace('fcd = "fcd.csv"', 'network = "net.net.xml"')
@@ -105,6 +105,6 @@ def test_rejects_too_many_frames(mini, frames, problem):
     scenario = load(mini)
     with pytest.raises(
         InputError,
-        match=rf"^--frames: {frames} frames at least 2 s apart are too many: {problem}: at most .*Use fewer fr",
+        match=rf"^--frames: {frames} frames at least 2 s apart are too many: expected at most .*, got {problem}",
     ):
         held_out_traffic.held_out_scenario(scenario, frames)

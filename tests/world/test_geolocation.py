@@ -156,7 +156,7 @@ def test_rejects_offset_without_epsg(tmp_path: Path) -> None:
 
 def test_rejects_damaged_location(tmp_path: Path) -> None:
     scene = load(tmp_path, with_location(tmp_path, UTM, "here"))
-    with pytest.raises(InputError, match=r"n.net.xml: <location> is not as SUMO writes it"):
+    with pytest.raises(InputError, match=r"n.net.xml: invalid <location>"):
         geolocation.scenario_georeference(scene)
 
 
