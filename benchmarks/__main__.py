@@ -26,7 +26,7 @@ import egvs
 from benchmarks import alternatives, casting, clouds, culling, detection, effects, file_checks, site_costs, stability
 from benchmarks.scenes import run_stage
 from egvs.artefacts.tpog import read_tpog
-from egvs.core.runtime import map_ordered
+from egvs.core.threads import map_ordered
 from egvs.kernels import traversal
 from egvs.scoring.scorer import Scorer
 from egvs.scoring.visibility import Beams, HitCounter, to_voxel_units

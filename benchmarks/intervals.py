@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from egvs.core.runtime import no_progress
+from egvs.core.progress import no_progress
 from egvs.scenario.loading import load
 from egvs.studies.measurement import SettingRunner
 from egvs.studies.score_errors import compare_seeds

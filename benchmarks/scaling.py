@@ -32,7 +32,7 @@ from pyarrow import csv
 
 import egvs
 from egvs.artefacts.run_record import StageRecord
-from egvs.core.runtime import release_memory
+from egvs.core.resource_usage import release_memory
 from egvs.runs import run
 
 ROOT = Path(__file__).resolve().parent.parent

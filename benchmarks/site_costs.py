@@ -20,7 +20,7 @@ from typing import Any
 import egvs
 from egvs.artefacts.tpog import read_tpog
 from egvs.artefacts.traffic_frames import TrafficFrame
-from egvs.core.runtime import measure_usage
+from egvs.core.resource_usage import measure_usage
 from egvs.runs.run import ensure_stages
 from egvs.scoring import target_scores
 from egvs.scoring.scorer import Scorer

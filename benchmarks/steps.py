@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from egvs.core.runtime import no_progress, thread_count
+from egvs.core.progress import no_progress
+from egvs.core.threads import thread_count
 from egvs.studies.measurement import SettingRunner
 from egvs.studies.study_settings import Setting
 

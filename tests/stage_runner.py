@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.scenario.model import Scenario
 from egvs.stages.base import StageDependencies
 from egvs.stages.inputs import open_folder

@@ -23,7 +23,7 @@ from benchmarks.validity.study import Extent
 from egvs.cli import options
 from egvs.core import files
 from egvs.core.errors import EgvsError, InputError
-from egvs.core.runtime import ProgressCallback
+from egvs.core.progress import ProgressCallback
 from egvs.scoring.target_scores import DETECTORS, MODEL_FILE
 from egvs.validation.detectors import base
 from egvs.validation.detectors.base import Detector

@@ -19,9 +19,9 @@ import numpy as np
 from benchmarks.detectability.fitting import Examples, Floats
 from benchmarks.validity.measurement import Part
 from benchmarks.validity.record import BOXED
-from egvs.core import runtime
 from egvs.core.errors import InputError
-from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.core.progress import ProgressCallback, no_progress
+from egvs.core.threads import map_ordered, thread_count
 from egvs.kernels.detection import OVERLAP_TOLERANCE
 from egvs.scoring.target_scores import detectability_features
 from egvs.scoring.targets import TargetRecord, detection_probability, visible_targets
@@ -121,7 +121,7 @@ def _features(
         )
 
     results: dict[str, Floats] = {}
-    for site, result in zip(sites, runtime.map_ordered(of, sites, runtime.thread_count(jobs)), strict=True):
+    for site, result in zip(sites, map_ordered(of, sites, thread_count(jobs)), strict=True):
         results[site.name] = result
         progress("visibility of sites", len(results), len(sites))
     return results

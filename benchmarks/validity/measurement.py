@@ -18,7 +18,7 @@ from benchmarks.validity import low_models
 from benchmarks.validity.record import Estimates, Record, StudySite, further_measures, measures_of
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core import files
-from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.runs import stages
 from egvs.scenario.model import Scenario
 from egvs.sensors import site_feasibility

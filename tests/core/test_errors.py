@@ -8,7 +8,7 @@ from dataclasses import replace
 from egvs.artefacts.run_record import StageRecord
 from egvs.cli.console import ProgressDisplay
 from egvs.core.errors import WARNINGS_KEY, Diagnostic, DiagnosticsError, collect_warnings, with_relative_paths
-from egvs.core.runtime import ResourceUsage
+from egvs.core.resource_usage import ResourceUsage
 
 ONE = Diagnostic("sites on lanes", "sites.csv: row 3 (k2)", "stands on lane e1_0", "move it by 2 m")
 

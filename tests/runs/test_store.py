@@ -23,7 +23,7 @@ from egvs.artefacts import parquet
 from egvs.artefacts.run_folder import STAGE_NAMES
 from egvs.core import files
 from egvs.core.errors import InputError
-from egvs.core.runtime import ResourceUsage
+from egvs.core.resource_usage import ResourceUsage
 from egvs.runs import run, stages, verification
 from egvs.runs.stages import StageResult
 from egvs.runs.store import Store, StoreEntry

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 import egvs
-from egvs.core.runtime import no_progress
+from egvs.core.progress import no_progress
 from egvs.studies import accuracy, study_settings
 from egvs.studies.accuracy import AccuracyStudy, StudyOptions
 from egvs.studies.measurement import SettingRunner

@@ -22,7 +22,7 @@ from egvs.artefacts import parquet
 from egvs.artefacts.readers import read_accuracy
 from egvs.cli import study_tables
 from egvs.core.errors import InputError, RunError
-from egvs.core.runtime import no_progress
+from egvs.core.progress import no_progress
 from egvs.runs.run import lock_run_folder
 from egvs.studies import accuracy, measurement, study_settings
 from egvs.studies.accuracy import StudyOptions

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 import egvs
-from egvs.core import files, runtime
+from egvs.core import files
 from egvs.core.errors import RunError
+from egvs.core.resource_usage import measure_usage
 from egvs.runs import stages
 from egvs.runs.store import Store
 from egvs.scoring.scorer import Scorer
@@ -106,7 +107,7 @@ def test_memory_is_freed_before_a_stage_is_measured(
 ) -> None:
     done: list[str] = []
     monkeypatch.setattr(measurement, "release_memory", lambda: done.append("freed"))
-    original = runtime.measure_usage
+    original = measure_usage
 
     def noted() -> object:
         done.append("measured")

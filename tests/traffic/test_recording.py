@@ -11,7 +11,7 @@ import pytest
 
 from egvs.artefacts import parquet
 from egvs.core.errors import InputError, RunError
-from egvs.core.runtime import no_progress
+from egvs.core.progress import no_progress
 from egvs.effects.base import Traffic
 from egvs.scenario.effects_config import EffectParameters
 from egvs.scenario.loading import load

@@ -95,9 +95,7 @@ def test_rejects_model_file_that_cannot_be_written(run_egvs, mini, tmp_path, mon
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize(
-    ("frames", "problem"), [(10_000_001, "10,000,001"), (5_000_000, "10,000,300")]
-)
+@pytest.mark.parametrize(("frames", "problem"), [(10_000_001, "10,000,001"), (5_000_000, "10,000,300")])
 def test_rejects_too_many_frames(mini, frames, problem):
     text = (mini / "scenario.toml").read_text().replace('fcd = "fcd.csv"', 'network = "net.net.xml"')
     (mini / "net.net.xml").write_text("<net/>")

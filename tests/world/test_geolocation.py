@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from egvs.core.errors import InputError
-from egvs.core.runtime import sumo_home
+from egvs.core.sumo_home import sumo_home
 from egvs.formats import osm
 from egvs.scenario.loading import scenario_from_dict
 from egvs.scenario.model import Scenario

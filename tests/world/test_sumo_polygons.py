@@ -16,7 +16,7 @@ import shapely
 
 from egvs.core.errors import InputError
 from egvs.core.grid import Roi
-from egvs.core.runtime import sumo_home
+from egvs.core.sumo_home import sumo_home
 from egvs.formats import osm
 from egvs.formats.georeference import Georeference, WorldFrame
 from egvs.scenario.loading import scenario_from_dict

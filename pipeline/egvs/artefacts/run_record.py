@@ -13,7 +13,7 @@ from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.core import files, reading
 from egvs.core.errors import InputError
 from egvs.core.files import CHECKSUM_KEY, add_checksum, has_valid_checksum
-from egvs.core.runtime import ResourceUsage
+from egvs.core.resource_usage import ResourceUsage
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from egvs.city.results import CityPlan, JunctionResult, read_junction_results, w
 from egvs.city.tasks import Job, JobFailure, JobResult, RunSettings
 from egvs.core.errors import Diagnostic, InputError, collect_warnings
 from egvs.core.grid import Roi
-from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.runs.run import lock_run_folder
 
 if TYPE_CHECKING:

@@ -29,7 +29,7 @@ from egvs.city import model
 from egvs.city.model import CITY_FILE, JUNCTIONS_FILE, JUNCTIONS_FOLDER, TRAFFIC_FOLDER, CityJunction
 from egvs.core import files
 from egvs.core.errors import InputError
-from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.formats.osm import read_osm as read_extract
 from egvs.importers import junctions, openstreetmap, osm_network, osm_solids
 from egvs.importers.junctions import HEIGHTS_M, JunctionRegion, KerbsidePole, StreetJunction, Streets

@@ -19,9 +19,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from egvs.city import tasks
 from egvs.city.tasks import Job, JobFailure, JobResult, Part, RunSettings, program_id
-from egvs.core import plugins, runtime
+from egvs.core import plugins
 from egvs.core.errors import EgvsError, InputError, RunError
-from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.core.progress import ProgressCallback, no_progress
+from egvs.core.threads import thread_count
 from egvs.runs import store
 from egvs.runs.store import RemoteStore
 
@@ -125,7 +126,7 @@ def check_cluster(cluster: str) -> None:
 def _process_count(cluster: str) -> int | None:
     """Return the number of local processes; None for the address of a scheduler."""
     if cluster == LOCAL_CLUSTER:
-        return runtime.thread_count(None)
+        return thread_count(None)
     if cluster.startswith(ADDRESS_PREFIXES) and len(cluster) > len(ADDRESS_PREFIXES[0]):
         return None
     match = re.fullmatch(r"processes=([0-9]{1,4})", cluster)

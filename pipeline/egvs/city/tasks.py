@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from egvs._version import __version__
 from egvs.core import files
 from egvs.core.errors import EgvsError, InputError, RunError
-from egvs.core.runtime import measure_usage, release_memory
+from egvs.core.resource_usage import measure_usage, release_memory
 from egvs.runs import run, stages, store
 from egvs.runs.stages import StageResult
 from egvs.runs.store import Store

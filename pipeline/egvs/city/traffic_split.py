@@ -44,7 +44,7 @@ from egvs.city.model import CITY_FILE, JUNCTIONS_FILE, JUNCTIONS_FOLDER, TRAFFIC
 from egvs.core import files, platform, reading
 from egvs.core.errors import WARNINGS_KEY, Diagnostic, InputError
 from egvs.core.grid import FloatArray
-from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.effects import registry
 from egvs.runs import stages
 from egvs.runs.run import lock_run_folder

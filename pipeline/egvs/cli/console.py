@@ -161,7 +161,7 @@ class ProgressDisplay:
             self._bar.stop()
 
     def progress(self, what: str, done: int, total: int) -> None:
-        """Move the bar; a :data:`egvs.core.runtime.ProgressCallback`."""
+        """Move the bar; a :data:`egvs.core.progress.ProgressCallback`."""
         if not self._has_bar:
             return
         count = f"{done}/{total}" if total else str(done)

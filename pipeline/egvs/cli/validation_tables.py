@@ -17,7 +17,7 @@ from egvs.validation.results import main_measure
 from egvs.validation.sweeps import POINT_COUNTS_NAME
 
 if TYPE_CHECKING:
-    from egvs.core.runtime import ResourceUsage
+    from egvs.core.resource_usage import ResourceUsage
     from egvs.scenario.model import Scenario
     from egvs.validation.correlation import Correlation
     from egvs.validation.dataset import WrittenDataset

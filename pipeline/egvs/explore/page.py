@@ -25,7 +25,7 @@ from matplotlib import image
 
 from egvs.core.errors import EgvsError, InputError, RunError
 from egvs.core.grid import Vec3
-from egvs.core.runtime import release_memory
+from egvs.core.resource_usage import release_memory
 from egvs.explore import controls, drawing, settings
 from egvs.explore.access import KEY_PARAMETER, AccessGuard
 from egvs.explore.controls import Controls, PanelContent, show_modal

@@ -17,7 +17,7 @@ from typing import Any
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.core.errors import InputError
-from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.effects import registry
 from egvs.explore.session import Session
 from egvs.runs import run, stages

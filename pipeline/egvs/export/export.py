@@ -17,7 +17,7 @@ from egvs.artefacts import parquet
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files, plugins
 from egvs.core.errors import InputError
-from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.export.finished_run import CRS_CHOICES, SCENARIO_CRS, WGS84_CRS, ExportCrs, FinishedRun
 from egvs.export.layers import NAMES, Layer, best_site, city_layers, city_name, is_city, open_junction_run, run_layers
 

@@ -17,7 +17,7 @@ from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files, plugins
 from egvs.core.errors import InputError, MissingBackendError
-from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.export.export import EXPORT_FOLDER, safe_file_name, unknown_site
 from egvs.export.finished_run import FinishedRun
 from egvs.report import figures, maps

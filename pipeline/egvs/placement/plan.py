@@ -22,7 +22,7 @@ from egvs.artefacts.planned_sensor import PlannedSensor, plan_columns
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
 from egvs.core.errors import InputError
-from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.placement import problem_builder, refinement, solver
 from egvs.placement.problem import Problem
 from egvs.placement.problem_builder import PlacementProblem

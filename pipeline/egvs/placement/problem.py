@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 
 from egvs.artefacts.tpog import Tpog
 from egvs.core.grid import FloatArray, IntArray
-from egvs.core.runtime import map_ordered
+from egvs.core.threads import map_ordered
 from egvs.kernels import submodular
 from egvs.scoring.egvs import EntropyField
 from egvs.scoring.scorer import OccupiedVoxels

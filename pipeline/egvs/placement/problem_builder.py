@@ -17,7 +17,7 @@ import numpy as np
 from egvs.artefacts.tpog import Tpog, read_periods, read_tpog
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, Grid, IntArray
-from egvs.core.runtime import map_ordered
+from egvs.core.threads import map_ordered
 from egvs.effects.base import Detect
 from egvs.placement import problem
 from egvs.placement.problem import CoverageTerm, Demand, PlanRules, Problem, VisibilityMatrix, VisibilityRow

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.core.runtime import map_ordered
+from egvs.core.threads import map_ordered
 from egvs.placement.problem import Plan, PlanRules, PlanValue, Problem, VisibilityMatrix, VisibilityRow
 from egvs.placement.problem_builder import PlacementProblem, candidate_costs
 from egvs.scenario.model import Scenario, SiteLine

@@ -24,7 +24,7 @@ from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.artefacts.run_record import RunRecord, StageRecord
 from egvs.core import files
 from egvs.core.errors import InputError, RunError
-from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.formats.meshes import referenced_files
 from egvs.runs import locks, stages, store
 from egvs.runs.stages import StageKey, StageResult

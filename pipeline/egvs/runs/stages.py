@@ -26,7 +26,7 @@ from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.artefacts.run_record import RunRecord, StageRecord
 from egvs.core import files
 from egvs.core.errors import with_relative_paths
-from egvs.core.runtime import ResourceUsage, measure_usage
+from egvs.core.resource_usage import ResourceUsage, measure_usage
 from egvs.effects import registry
 from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary

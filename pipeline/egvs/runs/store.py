@@ -36,8 +36,9 @@ from typing import Any
 from egvs.artefacts.run_folder import STAGE_NAMES
 from egvs.core import files, plugins
 from egvs.core.errors import InputError
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.reading import translate_errors
-from egvs.core.runtime import ProgressCallback, ResourceUsage, no_progress
+from egvs.core.resource_usage import ResourceUsage
 from egvs.runs import locks
 from egvs.runs.locks import locked
 from egvs.runs.stages import StageResult

@@ -13,7 +13,7 @@ from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.artefacts.run_record import RunRecord, StageRecord
 from egvs.core import files
 from egvs.core.errors import InputError
-from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.runs import stages
 from egvs.runs.run import StageListener, ignore_stage, start_record
 from egvs.scenario.loading import scenario_from_dict

@@ -20,7 +20,7 @@ from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from egvs.core.errors import InputError
 from egvs.core.grid import Grid, Roi
-from egvs.core.runtime import sumo_home
+from egvs.core.sumo_home import sumo_home
 from egvs.scenario.effects_config import EffectsConfig
 from egvs.scenario.fields import Latitude, Longitude, Name, Point2, Point3, Positive, StrictModel
 from egvs.scenario.score_config import CostsConfig, PlacementConfig, ScoreConfig, default_gamma

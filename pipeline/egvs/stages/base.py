@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any, Concatenate, TypeVar
 
 from egvs.artefacts import parquet
 from egvs.artefacts.run_folder import RunFile, RunFolder
-from egvs.core import files, runtime
+from egvs.core import files
 from egvs.core.errors import InputError
-from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.core.progress import ProgressCallback, no_progress
+from egvs.core.threads import thread_count
 from egvs.scenario.model import Scenario
 
 if TYPE_CHECKING:
@@ -131,7 +132,7 @@ class StageContext:
         self.scenario: Scenario = inputs.scenario
         self.folder = folder
         self.progress = progress
-        self.threads = runtime.thread_count(jobs)
+        self.threads = thread_count(jobs)
         self._recorded = dict(recorded or {})
         self._digests: dict[str, str] = {}
         self._remembered: dict[str, tuple[tuple[str, ...], Any]] = {}

@@ -16,7 +16,7 @@ from typing import TypeVar
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
 from egvs.core.errors import Diagnostic, DiagnosticsError, InputError
-from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.effects import registry
 from egvs.formats import point_clouds
 from egvs.formats.georeference import Georeference

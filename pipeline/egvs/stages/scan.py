@@ -17,7 +17,7 @@ import pyarrow as pa
 from egvs.artefacts import parquet
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core.errors import InputError
-from egvs.core.runtime import map_ordered
+from egvs.core.threads import map_ordered
 from egvs.formats import point_clouds
 from egvs.sensors.scanner import Scan, Scanner
 from egvs.sensors.sites import ScannedSite

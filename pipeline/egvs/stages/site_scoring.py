@@ -22,7 +22,7 @@ from egvs.artefacts.parquet import ArtefactWriter
 from egvs.artefacts.tpog import PeriodBlocks, Tpog, read_periods, read_tpog
 from egvs.core.errors import Diagnostic, InputError
 from egvs.core.grid import FloatArray, Grid
-from egvs.core.runtime import map_ordered
+from egvs.core.threads import map_ordered
 from egvs.kernels import traversal
 from egvs.scenario.model import SCENARIO_FILE, Scenario
 from egvs.scoring.blindspots import SpotWriter, VehicleSpots, open_spot_writer

@@ -22,7 +22,7 @@ from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import PeriodBlocks, frame_multiplicities
 from egvs.core.errors import WARNINGS_KEY, InputError
 from egvs.core.grid import Grid, IntArray
-from egvs.core.runtime import ProgressCallback
+from egvs.core.progress import ProgressCallback
 from egvs.scenario.model import Scenario
 from egvs.scoring import occupancy
 from egvs.scoring.occupancy import BlockCounts, autocorrelation_time, count_blocks, static_voxels

@@ -20,7 +20,7 @@ from typing import Any
 
 from egvs.artefacts import parquet
 from egvs.core.errors import WARNINGS_KEY, InputError, MissingBackendError
-from egvs.core.runtime import sumo_home
+from egvs.core.sumo_home import sumo_home
 from egvs.effects import registry
 from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary

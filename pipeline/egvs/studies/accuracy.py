@@ -21,7 +21,7 @@ from egvs.artefacts import checksums, parquet
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
 from egvs.core.errors import EgvsError, InputError
-from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.effects import registry
 from egvs.effects.base import Expand
 from egvs.runs.run import check_no_overwrite, lock_run_folder, refresh_report

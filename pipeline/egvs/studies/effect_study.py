@@ -25,7 +25,7 @@ from egvs.artefacts.run_record import RunRecord
 from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files, plugins
 from egvs.core.errors import InputError, MissingBackendError, format_problem
-from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.effects import registry
 from egvs.effects.articulated import Articulated
 from egvs.effects.base import Detect, Effect, Traffic

@@ -30,7 +30,8 @@ from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files, reading
 from egvs.core.errors import InputError, RunError
 from egvs.core.files import CHECKSUM_KEY, add_checksum, has_valid_checksum
-from egvs.core.runtime import ProgressCallback, ResourceUsage, release_memory
+from egvs.core.progress import ProgressCallback
+from egvs.core.resource_usage import ResourceUsage, release_memory
 from egvs.runs import stages
 from egvs.runs.run import fetch_or_run
 from egvs.runs.stages import RANKING_STAGES, StageKey, StageResult

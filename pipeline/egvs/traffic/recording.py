@@ -21,7 +21,7 @@ import pyarrow as pa
 
 from egvs.core.errors import Diagnostic, InputError, RunError
 from egvs.core.grid import Roi
-from egvs.core.runtime import ProgressCallback
+from egvs.core.progress import ProgressCallback
 from egvs.formats import xml
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import Scenario

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from egvs.core.errors import InputError, MissingBackendError, RunError
-from egvs.core.runtime import sumo_home
+from egvs.core.sumo_home import sumo_home
 from egvs.traffic import sandbox
 from egvs.traffic.vehicle_boxes import VehicleSize
 

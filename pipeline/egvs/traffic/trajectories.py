@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from egvs.artefacts.parquet import ArtefactWriter
 from egvs.core.errors import Diagnostic, RunError
 from egvs.core.grid import Roi
-from egvs.core.runtime import ProgressCallback
+from egvs.core.progress import ProgressCallback
 from egvs.scenario.model import Scenario
 from egvs.traffic import fcd, vehicle_boxes
 from egvs.traffic.recording import Recording, describe_distance

@@ -27,7 +27,8 @@ from egvs._version import __version__
 from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS
 from egvs.core import files
 from egvs.core.errors import InputError, RunError
-from egvs.core.runtime import ProgressCallback, no_progress, thread_count
+from egvs.core.progress import ProgressCallback, no_progress
+from egvs.core.threads import thread_count
 from egvs.effects import registry
 from egvs.runs import locks
 from egvs.scenario.model import Scenario

@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core import files
 from egvs.core.grid import FloatArray, IntArray
-from egvs.core.runtime import ProgressCallback, map_ordered
+from egvs.core.progress import ProgressCallback
+from egvs.core.threads import map_ordered
 from egvs.formats import kitti, pcd, ply
 from egvs.formats.kitti import wrap_angle
 from egvs.sensors.sensor import rotation_world_sensor

@@ -22,9 +22,11 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from egvs.artefacts import parquet
-from egvs.core import files, runtime
+from egvs.core import files
 from egvs.core.errors import RunError
-from egvs.core.runtime import ProgressCallback, ResourceUsage, measure_usage, no_progress
+from egvs.core.progress import ProgressCallback, no_progress
+from egvs.core.resource_usage import ResourceUsage, measure_usage
+from egvs.core.threads import thread_count
 from egvs.effects import registry
 from egvs.effects.base import Effect
 from egvs.runs import stages
@@ -239,7 +241,7 @@ def run_detectors(
     results = {site.name: _read_cached_results(task, site) for site in sites}
     missing = {site.name: [name for name in task.names if name not in results[site.name]] for site in sites}
     work = [_SiteWork(site, missing[site.name]) for site in sites if missing[site.name]]
-    processes = min(runtime.thread_count(jobs), len(work))
+    processes = min(thread_count(jobs), len(work))
     done = len(sites) - len(work)
 
     listener.begins(missing, task.record.frames, processes)

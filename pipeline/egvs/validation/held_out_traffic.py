@@ -22,7 +22,7 @@ from egvs.artefacts import parquet
 from egvs.artefacts.traffic_frames import TrafficFrame, read_frames
 from egvs.core.errors import InputError
 from egvs.core.grid import IntArray
-from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.runs.run import ensure_stages
 from egvs.scenario.model import Scenario
 from egvs.sensors.scene import Scene

@@ -32,7 +32,7 @@ from egvs.artefacts import checksums, parquet
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
 from egvs.core.errors import Diagnostic, InputError
-from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.runs import run as runs
 from egvs.runs import stages
 from egvs.scenario.model import Scenario

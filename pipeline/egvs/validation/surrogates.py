@@ -35,7 +35,8 @@ from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files, plugins
 from egvs.core.errors import Diagnostic, InputError, MissingBackendError, RunError
 from egvs.core.grid import FloatArray, IntArray
-from egvs.core.runtime import ProgressCallback, map_ordered, no_progress
+from egvs.core.progress import ProgressCallback, no_progress
+from egvs.core.threads import map_ordered
 from egvs.effects import registry
 from egvs.kernels.hits import max_free_probability
 from egvs.runs import stages

@@ -18,7 +18,7 @@ from egvs.artefacts import parquet
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core import files
 from egvs.core.errors import WARNINGS_KEY, Diagnostic, InputError, collect_warnings, with_relative_paths
-from egvs.core.runtime import ProgressCallback
+from egvs.core.progress import ProgressCallback
 from egvs.runs import stages
 from egvs.runs.run import lock_run_folder
 from egvs.scenario.model import Scenario

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.errors import WARNINGS_KEY, Diagnostic, InputError
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.reading import translate_errors
-from egvs.core.runtime import ProgressCallback, no_progress
 from egvs.formats import meshes
 from egvs.formats.georeference import Georeference
 from egvs.formats.meshes import are_closed, mesh_components

@@ -20,7 +20,7 @@ import torch
 from egvs._version import __version__
 from egvs.core import files
 from egvs.core.errors import InputError
-from egvs.core.runtime import ProgressCallback, no_progress
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.runs import stages
 from egvs.scenario.model import Scenario
 from egvs.validation.cloud_simulation import CloudSimulator

@@ -1,0 +1,77 @@
+"""Time and memory of a block of code: wall seconds, processor seconds, and peak memory.
+
+Linux can reset the peak; elsewhere it is the highest so far.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from egvs.core import platform
+
+_PROC_STATUS, _PROC_CLEAR_REFS = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+
+
+@dataclass
+class ResourceUsage:
+    """Time and memory of a block; filled when it ends."""
+
+    seconds: float = 0.0
+    busy_s: float = 0.0
+    """Processor seconds of this process and of the child processes that it waited for (SUMO)."""
+    peak_mb: float = 0.0
+    held_mb: float = 0.0
+    """Memory of the process when the block began; on other systems than Linux, the highest until then."""
+
+    def to_json(self) -> dict[str, Any]:
+        """The form in a run's record, rounded to the precision of such a measurement."""
+        return {"seconds": round(self.seconds, 3), "peak_mb": round(self.peak_mb, 1)}
+
+
+@contextmanager
+def measure_usage() -> Iterator[ResourceUsage]:
+    """Measure a block; the yielded object is filled at its end."""
+    usage, resettable = ResourceUsage(), _reset_peak()
+    usage.held_mb = _status_mb("VmRSS:") if resettable else platform.peak_memory_mb()
+    start, busy = time.perf_counter(), _cpu_seconds()
+    try:
+        yield usage
+    finally:
+        usage.seconds = time.perf_counter() - start
+        usage.busy_s = _cpu_seconds() - busy
+        usage.peak_mb = _status_mb("VmHWM:") if resettable else platform.peak_memory_mb()
+
+
+def release_memory() -> None:
+    """Return unused memory to the system, so that the next measured peak is that of its own block."""
+    gc.collect(1)  # a full collection would take 50 ms
+    if (arrow := sys.modules.get("pyarrow")) is not None:
+        arrow.default_memory_pool().release_unused()
+    if sys.platform.startswith("linux") and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
+        trim(0)  # glibc's
+
+
+def _cpu_seconds() -> float:
+    return sum(os.times()[:4])
+
+
+def _reset_peak() -> bool:
+    try:
+        _PROC_CLEAR_REFS.write_text("5")
+    except OSError:
+        return False
+    return True
+
+
+def _status_mb(name: str) -> float:
+    line = next(line for line in _PROC_STATUS.read_text().splitlines() if line.startswith(name))
+    return int(line.split()[1]) / 1024
