@@ -59,11 +59,6 @@ def is_own_file(status: os.stat_result) -> bool:
     return not hasattr(os, "geteuid") or status.st_uid == os.geteuid()
 
 
-def user_name() -> str:
-    """Return a name of this user for file names: the user number, or the login name on Windows."""
-    return str(os.geteuid()) if hasattr(os, "geteuid") else os.environ.get("USERNAME", "user")
-
-
 def peak_memory_mb() -> float:
     """Return the highest memory of this process so far, in MB of 2**20 bytes."""
     if HAS_POSIX:
