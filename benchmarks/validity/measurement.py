@@ -19,7 +19,7 @@ from benchmarks.validity.record import Estimates, Record, StudySite, further_mea
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core import files
 from egvs.core.progress import ProgressCallback, no_progress
-from egvs.runs import stages
+from egvs.runs import stage_keys
 from egvs.scenario.model import Scenario
 from egvs.sensors import site_feasibility
 from egvs.sensors.sites import Site
@@ -115,7 +115,7 @@ def _key(part: Part, tasks: Mapping[str, SiteDetectionTask]) -> str:
         ]
         for name, task in tasks.items()
     }
-    source = stages.source_digest(detection_metrics.__name__, surrogates.__name__)
+    source = stage_keys.source_digest(detection_metrics.__name__, surrogates.__name__)
     dependencies = {
         "part": [part.name, part.junction, part.role, part.sensor, sorted(part.given), part.frames, part.apart_s],
         "looked": detector_keys,
@@ -125,7 +125,7 @@ def _key(part: Part, tasks: Mapping[str, SiteDetectionTask]) -> str:
             files.hash_file(Path(__file__)),
             files.hash_file(Path(__file__).with_name("record.py")),
         ],
-        "libraries": stages.library_versions(source.libraries),
+        "libraries": stage_keys.library_versions(source.libraries),
     }
     return files.hash_json(dependencies)
 

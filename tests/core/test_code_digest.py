@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 import egvs
-from egvs.runs import stages
+from egvs.runs import stage_keys
 
 PACKAGE = Path(egvs.__file__).parent
 STAGES = ("check", "statics", "scan", "traffic", "tpog", "score", "report")
@@ -48,8 +48,8 @@ def imports_by_syntax_tree(text: str, package: str) -> set[str]:
 @pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: str(path.relative_to(PACKAGE)))
 def test_import_pattern_matches_syntax_tree(path: Path) -> None:
     text, package = path.read_text(encoding="utf-8"), "egvs.x"
-    assert imports_by_syntax_tree(text, package) <= set(stages.imported_names(text, package))
-    assert set(stages.imported_names(text, package)) - imports_by_syntax_tree(text, package) <= {
+    assert imports_by_syntax_tree(text, package) <= set(stage_keys.imported_names(text, package))
+    assert set(stage_keys.imported_names(text, package)) - imports_by_syntax_tree(text, package) <= {
         "egvs"
     }  # in docstrings
 
@@ -72,16 +72,16 @@ def n():
 
 def test_finds_every_kind_of_import() -> None:
     expected = ["a", "b.c", "x.y", "x.y.e", "x.f", "x.f.g", "x.f.i", "o.p", "o.p.q", "o.p.r"]
-    assert list(stages.imported_names(KINDS_OF_IMPORT, "x.y")) == expected
+    assert list(stage_keys.imported_names(KINDS_OF_IMPORT, "x.y")) == expected
     assert imports_by_syntax_tree(KINDS_OF_IMPORT, "x.y") == set(expected)
 
 
-ROOTS = [(stage.module, *stage.code) for stage in map(stages.stage, STAGES)]
+ROOTS = [(stage.module, *stage.code) for stage in map(stage_keys.stage, STAGES)]
 
 DIGESTS = f"""
 import json
-from egvs.runs import stages
-print(json.dumps([stages.source_digest(*modules).digest for modules in {ROOTS}]))
+from egvs.runs import stage_keys
+print(json.dumps([stage_keys.source_digest(*modules).digest for modules in {ROOTS}]))
 """
 
 
@@ -128,7 +128,7 @@ def test_changed_line_changes_digest_of_importers(file: str, tmp_path: Path) -> 
     shutil.copytree(PACKAGE, tmp_path / "egvs", ignore=shutil.ignore_patterns("__pycache__"))
     before = digests(tmp_path)
     assert before == [
-        stages.source_digest(*modules).digest for modules in ROOTS
+        stage_keys.source_digest(*modules).digest for modules in ROOTS
     ]  # the same source elsewhere is the same
     path = tmp_path / "egvs" / file
     path.write_text(path.read_text(encoding="utf-8") + "\n# changed\n", encoding="utf-8")
@@ -144,10 +144,10 @@ def test_module_of_other_package_counts_with_its_imports(tmp_path: Path, monkeyp
     (package / "effect.py").write_text("from somebody import model\nfrom egvs.kernels import foliage\n")
     monkeypatch.syspath_prepend(str(tmp_path))
 
-    def digest() -> stages.SourceDigest:
-        for remembered in (stages.source_digest, stages._digest_module, stages._module_path):
+    def digest() -> stage_keys.SourceDigest:
+        for remembered in (stage_keys.source_digest, stage_keys._digest_module, stage_keys._module_path):
             remembered.cache_clear()
-        return stages.source_digest("somebody.effect")
+        return stage_keys.source_digest("somebody.effect")
 
     before = digest()
     assert "numba" in before.libraries
@@ -159,9 +159,9 @@ def test_module_of_other_package_counts_with_its_imports(tmp_path: Path, monkeyp
 def test_library_versions_are_those_installed() -> None:
     import numpy
 
-    assert stages.library_versions(frozenset({"numpy"})) == {"numpy": numpy.__version__}
-    assert stages.source_digest("egvs.stages.scan").libraries >= {"numpy", "numba", "embreex", "pyarrow"}
-    assert "numba" not in stages.source_digest("egvs.stages.statics").libraries
+    assert stage_keys.library_versions(frozenset({"numpy"})) == {"numpy": numpy.__version__}
+    assert stage_keys.source_digest("egvs.stages.scan").libraries >= {"numpy", "numba", "embreex", "pyarrow"}
+    assert "numba" not in stage_keys.source_digest("egvs.stages.statics").libraries
 
 
 SOURCE_BEFORE = {
@@ -196,9 +196,9 @@ def code_lines(path: Path) -> int:
 
 @pytest.mark.parametrize("name", SOURCE_BEFORE)
 def test_source_behind_stage_key_stays_small(name: str) -> None:
-    stage = stages.stage(name)
-    modules = [module for module in stages.source_modules(stage.module, *stage.code) if module.startswith("egvs")]
-    paths = [stages._module_path(module) for module in modules]
+    stage = stage_keys.stage(name)
+    modules = [module for module in stage_keys.source_modules(stage.module, *stage.code) if module.startswith("egvs")]
+    paths = [stage_keys._module_path(module) for module in modules]
     # An __init__.py lists public names and computes nothing.
     total = sum(code_lines(path) for path in paths if path is not None and path.name != "__init__.py")
     assert total <= GROWTH.get(name, 1.1) * SOURCE_BEFORE[name]

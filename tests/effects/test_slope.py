@@ -57,7 +57,7 @@ def test_acts_on_one_uphill_lane_from_zero(tmp_path):
     (tmp_path / "e.edg.xml").write_text('<edges><edge id="ab" from="a" to="b"/></edges>')
     sumo.run_program("netconvert", ["-n", "n.nod.xml", "-e", "e.edg.xml", "-o", "road.net.xml"], tmp_path)
     assert (
-        network.may_have_heights(tmp_path / "road.net.xml")
+        network.may_have_slopes(tmp_path / "road.net.xml")
         and network.read_net_xml(tmp_path / "road.net.xml").has_heights
     )
     assert slope_acts(road_scenario(tmp_path, **SMALL))[0]

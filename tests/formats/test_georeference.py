@@ -41,7 +41,7 @@ def utm_by_krueger_series(lon_deg: float, lat_deg: float, central_deg: float) ->
 
 
 def project(frame: WorldFrame, lon_deg: float, lat_deg: float) -> list[float]:
-    return frame.from_degrees(np.array([[lon_deg, lat_deg]]))[0].tolist()
+    return frame.from_lon_lat(np.array([[lon_deg, lat_deg]]))[0].tolist()
 
 
 def test_central_meridian_has_easting_500_km_and_its_arc_as_northing() -> None:
@@ -71,7 +71,7 @@ def test_x_is_east_and_y_is_north_for_systems_that_name_northing_first() -> None
 @pytest.mark.parametrize("declared", ["EPSG:4326", "urn:ogc:def:crs:EPSG::4326", "urn:ogc:def:crs:OGC:1.3:CRS84"])
 def test_longitude_comes_first_in_degrees_for_every_name_of_wgs84(declared: str) -> None:
     spot = np.array([[9.7203, 50.8651]])
-    assert UTM32.from_crs(spot, declared).tolist() == UTM32.from_degrees(spot).tolist()
+    assert UTM32.from_crs(spot, declared).tolist() == UTM32.from_lon_lat(spot).tolist()
 
 
 def test_offset_is_added_to_easting_and_northing() -> None:
@@ -89,8 +89,8 @@ def test_conversion_to_degrees_and_back_is_exact_to_10_micrometres(projection: s
     near = {"EPSG:2056": (2_600_000.0, 1_200_000.0), "EPSG:31467": (3_500_000.0, 5_650_000.0), "EPSG:6677": (0.0, 0.0)}
     middle = frame.to_degrees(np.array([near.get(projection, (500_000.0, 5_600_000.0))]) + frame.offset_m)
     lon_lat_deg = middle + np.random.default_rng(1).uniform(-0.2, 0.2, (500, 2))
-    xy_m = frame.from_degrees(lon_lat_deg)
-    again = frame.from_degrees(frame.to_degrees(xy_m))
+    xy_m = frame.from_lon_lat(lon_lat_deg)
+    again = frame.from_lon_lat(frame.to_degrees(xy_m))
     assert np.abs(again - xy_m).max() < 1e-5
     metres = (frame.to_degrees(xy_m) - lon_lat_deg) * 111_000
     assert np.abs(metres).max() < 1e-5
@@ -173,7 +173,7 @@ def test_degrees_are_converted_when_declared() -> None:
 
 def test_small_numbers_are_read_as_declared_where_degrees_and_metres_have_one_size() -> None:
     """Near the origin of the world: 9.7 m east and 50.9 m north of it is in the region of interest."""
-    x, y = WorldFrame("EPSG:32632").from_degrees(np.array([[9.72, 50.865]]))[0]
+    x, y = WorldFrame("EPSG:32632").from_lon_lat(np.array([[9.72, 50.865]]))[0]
     frame = WorldFrame("EPSG:32632", (-round(x) + 20.0, -round(y) + 60.0))
     world = Georeference(frame, Roi((0.0, 0.0, 0.0), (60.0, 100.0, 5.0)), "s")
     metres = np.array([[9.0, 51.0], [9.4, 51.0], [9.4, 51.4]])
@@ -187,7 +187,7 @@ def test_small_numbers_are_read_as_declared_where_degrees_and_metres_have_one_si
 
 
 def test_declared_projection_is_converted() -> None:
-    gauss_kruger = WorldFrame("EPSG:31467").from_degrees(DEGREES)
+    gauss_kruger = WorldFrame("EPSG:31467").from_lon_lat(DEGREES)
     assert convert(LOCATED, gauss_kruger, "urn:ogc:def:crs:EPSG::31467") == pytest.approx(CORNERS, abs=2e-3)
     eastings = CORNERS - np.array(FRAME.offset_m)
     assert convert(LOCATED, eastings, "EPSG:25832") == pytest.approx(CORNERS, abs=5e-4)  # ETRS89 equals WGS 84 here

@@ -215,7 +215,7 @@ def test_sites_are_beside_kerb(made: Made) -> None:
 def test_each_pole_has_three_heights_and_tilts_aimed_at_region(made: Made) -> None:
     scenario = loading.load(made[0])
     result = sites.candidate_sites(scenario)
-    assert len(result) == made[1].sites == 9 * made[1].poles == 9 * 12
+    assert len(result) == made[1].n_candidates == 9 * made[1].poles == 9 * 12
     assert [site.name for site in result[:4]] == ["k01@3m+0deg", "k01@3m-10deg", "k01@3m+aim", "k01@4.5m+0deg"]
     x_m, y_m, z_m = scenario.roi.center_m
     for site in result:

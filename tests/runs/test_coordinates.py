@@ -38,7 +38,7 @@ def to_utm(x: float, y: float) -> list[float]:
 
 def to_gauss_kruger(x: float, y: float) -> list[float]:
     """DHDN, another datum: metres of Gauss-Krueger zone 3."""
-    point = WorldFrame("EPSG:31467").from_degrees(np.array([to_degrees(x, y)]))[0].tolist()
+    point = WorldFrame("EPSG:31467").from_lon_lat(np.array([to_degrees(x, y)]))[0].tolist()
     return [point[0], point[1]]
 
 
@@ -180,7 +180,7 @@ def test_scores_have_longitude_and_latitude(tmp_path: Path, in_metres: pa.Table)
     places = zip(in_metres["longitude_deg"].to_pylist(), in_metres["latitude_deg"].to_pylist(), strict=True)
     for place, metres in zip(places, [(10.0, 12.0), (30.5, -12.0)], strict=True):
         assert place == pytest.approx(to_degrees(*metres), abs=1e-9)
-        assert FRAME.from_degrees(np.array([place]))[0] == pytest.approx(metres, abs=1e-3)
+        assert FRAME.from_lon_lat(np.array([place]))[0] == pytest.approx(metres, abs=1e-3)
     unknown = scores(write_mini(tmp_path / "mini"), tmp_path / "run")
     assert unknown.equals(in_metres.drop_columns(["longitude_deg", "latitude_deg"]))
     assert Ranking.read(tmp_path / "run" / "scores.parquet").sites[0].longitude_deg is None

@@ -24,8 +24,8 @@ from egvs.artefacts.run_folder import STAGE_NAMES
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.resource_usage import ResourceUsage
-from egvs.runs import run, stages, verification
-from egvs.runs.stages import StageResult
+from egvs.runs import run, stage_keys, verification
+from egvs.runs.stage_keys import StageResult
 from egvs.runs.store import Store, StoreEntry
 from tests.runs import children
 from tests.runs.children import Child, Job
@@ -99,7 +99,7 @@ def test_a_second_folder_makes_nothing(
         raise AssertionError("a stage was made")
 
     with monkeypatch.context() as patched:
-        patched.setattr(stages, "run_stage", refuse)
+        patched.setattr(stage_keys, "run_stage", refuse)
         assert set(states(scenario, other).values()) == {"fetched"}
         assert set(states(scenario, other).values()) == {"skipped"}
     names = {p.relative_to(one).as_posix() for p in one.rglob("*") if p.is_file()}
@@ -478,11 +478,11 @@ def test_one_changed_line_makes_what_depends_on_it_again(
     copy = tmp_path / "egvs"
     shutil.copytree(ROOT / "pipeline" / "egvs", copy, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copytree(ROOT / "data_schemas", copy / "data_schemas")
-    monkeypatch.setattr(stages, "_ROOT", copy)
+    monkeypatch.setattr(stage_keys, "_ROOT", copy)
     monkeypatch.setattr(parquet, "schema_folder", lambda: copy / "data_schemas")
 
     def forget() -> None:
-        for remembered in (stages.source_digest, stages._digest_module, stages._module_path):
+        for remembered in (stage_keys.source_digest, stage_keys._digest_module, stage_keys._module_path):
             remembered.cache_clear()
 
     def made() -> set[str]:

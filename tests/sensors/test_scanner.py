@@ -241,7 +241,7 @@ def test_las_in_a_projection_gives_the_same_scan_as_metres(mini: Path, crs: str,
     point_clouds.write_points(mini / "m.ply", POINTS)
     by_metres = scan_file(mini, "m.ply")
     lon_lat_deg = WORLD_FRAME.to_degrees(POINTS[:, :2])
-    xy = WorldFrame(crs.partition("+")[0]).from_degrees(lon_lat_deg)
+    xy = WorldFrame(crs.partition("+")[0]).from_lon_lat(lon_lat_deg)
     write_las(mini / "m.las", np.column_stack([xy, POINTS[:, 2] + 210.0]), crs, point_format)
     by_las = scan_file(mini, "m.las")
     assert len(by_las.rows.ends_m) == 3
@@ -254,7 +254,7 @@ def test_las_in_feet_gives_the_same_scan_as_metres(mini: Path, vertical: str, un
     """New York's plane counts in US survey feet; its heights too, where no vertical system says otherwise."""
     frame = WorldFrame("EPSG:32618", (-585_000.0, -4_510_000.0))
     known = "\n[crs]\nepsg = 32618\noffset_m = [-585000, -4510000]\nzero_height_m = 5.0\n"
-    feet = WorldFrame("EPSG:2263").from_degrees(frame.to_degrees(POINTS[:, :2]))
+    feet = WorldFrame("EPSG:2263").from_lon_lat(frame.to_degrees(POINTS[:, :2]))
     write_las(mini / "m.las", np.column_stack([feet, (POINTS[:, 2] + 5.0) / unit_m]), f"EPSG:2263{vertical}")
     assert scan_file(mini, "m.las", known).rows.ends_m == pytest.approx(POINTS - [10, 12, 3], abs=2e-3)
 

@@ -10,7 +10,7 @@ import pytest
 import egvs
 from egvs.artefacts import parquet
 from egvs.core.errors import InputError, MissingBackendError
-from egvs.runs import stages
+from egvs.runs import stage_keys
 from egvs.scenario.traffic_config import TrafficConfig
 from egvs.stages import traffic
 from egvs.stages.inputs import open_folder
@@ -148,7 +148,7 @@ def test_sumo_version_is_in_the_cache_key(mini: Path, tmp_path: Path, monkeypatc
     keys = set()
     for version in (lambda: "1.20.0", lambda: "1.28.0", missing):
         monkeypatch.setattr("egvs.traffic.sumo.sumo_version", version)
-        keys.add(stages.stage_key("traffic", open_folder(egvs.load(mini), tmp_path)).key)
+        keys.add(stage_keys.stage_key("traffic", open_folder(egvs.load(mini), tmp_path)).key)
     assert len(keys) == 3
 
 

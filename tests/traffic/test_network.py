@@ -47,7 +47,7 @@ def test_reads_lanes_junctions_sidewalks_and_location(tmp_path):
     assert (first.name, first.start_m, first.end_m) == ("High Street", (-100, 0), (0, 0))
     assert first.lanes[0].shape_m.tolist() == [[-100, 0, 0], [-50, 0, 1.5], [0, 0, 0]]
     assert (first.lanes[0].width_m, first.lanes[1].width_m, first.lanes[0].length_m) == (2, None, 99.5)
-    assert roads.has_heights and network.may_have_heights(path)
+    assert roads.has_heights and network.may_have_slopes(path)
     signal, end = roads.junctions
     assert (signal.id, signal.type, signal.at_m) == ("j", "traffic_light", (0.5, -2))
     assert signal.incoming_lanes == ("in_0", "in_1") and signal.shape_m.shape == (3, 3)

@@ -57,7 +57,7 @@ def test_junctions_are_at_their_map_nodes(tmp_path: Path, map_file: Path) -> Non
     assert len(known) > 5
     junctions = np.array([j.at_m for j in known])
     lon_lat_deg = np.array([nodes[int(j.id)] for j in known])[:, ::-1]
-    distances_m = np.hypot(*(world.frame.from_degrees(lon_lat_deg) - junctions).T)
+    distances_m = np.hypot(*(world.frame.from_lon_lat(lon_lat_deg) - junctions).T)
     assert np.median(distances_m) < 0.01  # netconvert writes centimetres
     assert np.ptp(junctions, axis=0).min() > 100
     back = world.lon_lat_deg(junctions)

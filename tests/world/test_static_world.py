@@ -234,7 +234,7 @@ def test_converts_mesh_from_its_crs(tmp_path, way):
     if way == "origin":  # metres to the east and north of a place on the Earth: north is half a degree off the grid's
         bearings_deg = np.degrees(np.arctan2(corners[:, 0], corners[:, 1]))
         ends = pyproj.Geod(ellps="WGS84").fwd([lon] * 4, [lat] * 4, bearings_deg, np.hypot(*corners.T))
-        expected = FRAME.from_degrees(np.column_stack(ends[:2]))
+        expected = FRAME.from_lon_lat(np.column_stack(ends[:2]))
         assert np.abs(expected - corners - [20.0, 30.0]).max() > 0.01
     corners_found = np.unique(np.round(world.vertices_m[:, :2], 1 if way == "epsg" else 6), axis=0)
     assert sorted(corners_found.tolist()) == [pytest.approx(spot, abs=near) for spot in sorted(expected.tolist())]

@@ -99,7 +99,7 @@ class NewJunction:
     poles: list[KerbsidePole]
 
     @property
-    def sites(self) -> int:
+    def n_candidates(self) -> int:
         """Number of candidates: each pole with each height and each tilt."""
         return len(self.poles) * len(HEIGHTS_M) * len(PITCHES_DEG)
 
@@ -134,7 +134,7 @@ class NewCity:
             },
             "traffic": traffic_amount(streets),
             "poles": sum(len(j.poles) for j in made),
-            "sites": sum(j.sites for j in made),
+            "sites": sum(j.n_candidates for j in made),
             "statics": self.statics.to_json(),
             "notes": list(self.notes),
         }  # fmt: skip

@@ -35,8 +35,8 @@ from egvs._version import __version__
 from egvs.core import files
 from egvs.core.errors import EgvsError, InputError, RunError
 from egvs.core.resource_usage import measure_usage, release_memory
-from egvs.runs import run, stages, store
-from egvs.runs.stages import StageResult
+from egvs.runs import run, stage_keys, store
+from egvs.runs.stage_keys import StageResult
 from egvs.runs.store import Store
 from egvs.scenario.loading import load
 from egvs.scenario.model import Scenario
@@ -150,8 +150,8 @@ class Part(NamedTuple):
 
 def program_id() -> str:
     """Return a text that is equal for programs that give the same bytes: version, source and libraries."""
-    source = stages.source_digest("egvs.runs.run", "egvs.report.page", *_STAGE_MODULES)
-    libraries = sorted(stages.library_versions(source.libraries).items())
+    source = stage_keys.source_digest("egvs.runs.run", "egvs.report.page", *_STAGE_MODULES)
+    libraries = sorted(stage_keys.library_versions(source.libraries).items())
     return f"{__version__}, source {source.digest[:12]}, {', '.join(' '.join(pair) for pair in libraries)}"
 
 
@@ -199,7 +199,7 @@ class CachedScene:
     @cached_property
     def score_key(self) -> str:
         """Key of the score stage."""
-        return stages.stage_key("score", self.context).key
+        return stage_keys.stage_key("score", self.context).key
 
 
 class SceneCache:
@@ -334,7 +334,7 @@ def read_stored_scores(parts: int) -> Callable[[SiteScoring], Iterator[ScoredSit
     """
 
     def scored_sites(scoring: SiteScoring) -> Iterator[ScoredSite]:
-        score_key = stages.stage_key("score", scoring.context).key
+        score_key = stage_keys.stage_key("score", scoring.context).key
         for part in split_sites(len(scoring.names), parts):
             names = scoring.names[part]
             if names:
@@ -347,7 +347,7 @@ def read_stored_scores(parts: int) -> Callable[[SiteScoring], Iterator[ScoredSit
 def _fetch_or_score(scoring: SiteScoring, score_key: str, names: tuple[str, ...], folder: Path) -> Path:
     """Fetch the scores of some sites from the store into a folder, or compute and store them; return the file."""
     part_store, path = Store.default(), folder / PART_FILE
-    program = stages.source_digest(__name__).digest
+    program = stage_keys.source_digest(__name__).digest
     key = files.hash_json({"score": score_key, "sites": names, "program": program})
     if part_store.take(PART_KIND, key, folder) is not None:
         return path

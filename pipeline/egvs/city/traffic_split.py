@@ -46,7 +46,7 @@ from egvs.core.errors import WARNINGS_KEY, Diagnostic, InputError
 from egvs.core.grid import FloatArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.effects import registry
-from egvs.runs import stages
+from egvs.runs import stage_keys
 from egvs.runs.run import lock_run_folder
 from egvs.scenario.loading import load, scenario_from_dict
 from egvs.scenario.model import SCENARIO_FILE, Scenario
@@ -236,8 +236,8 @@ def _traffic_key(scenario: Scenario, folder: Path, regions: Mapping[str, Traffic
             "inputs": dependencies.to_json(),
             "regions": {name: region.to_json() for name, region in regions.items()},
             "effects": effects,
-            "program": stages.program_inputs(traffic.STAGE.name, scenario, dependencies.modules),
-            "splitting": stages.source_digest(__name__).digest,
+            "program": stage_keys.program_inputs(traffic.STAGE.name, scenario, dependencies.modules),
+            "splitting": stage_keys.source_digest(__name__).digest,
         }
     )
 
@@ -440,7 +440,7 @@ def _slope_warnings(scenario: Scenario, regions: Mapping[str, TrafficRegion]) ->
     if flat:
         problem = f"the network has slopes, but the ground of {', '.join(flat)} is level, because they name no roads"
         hint = "Set traffic.roads in their scenarios."
-        yield Diagnostic("relief", sumo_folder.traffic_key(scenario), problem, hint)
+        yield Diagnostic("relief", sumo_folder.traffic_location(scenario), problem, hint)
 
 
 def _no_traffic_warnings(scenario: Scenario, rows: Mapping[str, int]) -> Iterator[Diagnostic]:
@@ -448,7 +448,7 @@ def _no_traffic_warnings(scenario: Scenario, rows: Mapping[str, int]) -> Iterato
     if empty:
         problem = f"no vehicle comes near {', '.join(empty)}"
         hint = f"Use more traffic, or remove their rows from {JUNCTIONS_FILE}."
-        yield Diagnostic("junctions without traffic", sumo_folder.traffic_key(scenario), problem, hint)
+        yield Diagnostic("junctions without traffic", sumo_folder.traffic_location(scenario), problem, hint)
 
 
 @dataclass

@@ -204,15 +204,15 @@ def _run_columns(run: ComparedRun, width: int) -> list[Column[str]]:
     """Return the columns of one run, whose rows are names of sites."""
     label = SCORE_LABELS[run.rank_by]
 
-    def format_of(text: Any, site_name: str) -> str:
+    def cell_text(text: Any, site_name: str) -> str:
         site = run.sites.get(site_name)
         return "-" if site is None else str(text(site))
 
-    score = Column(f"{run.label} {label.head}", partial(format_of, lambda site: label.value(site.score)))
-    error = Column(f"{run.label} error", partial(format_of, partial(_format_error, run)))
-    egvs = Column(f"{run.label} bit", partial(format_of, lambda site: f"{site.egvs:.1f}"))
-    share = Column(f"{run.label} of limit", partial(format_of, _format_limit_share))
-    rank = Column(f"{run.label} rank", partial(format_of, lambda site: site.rank))
+    score = Column(f"{run.label} {label.head}", partial(cell_text, lambda site: label.value(site.score)))
+    error = Column(f"{run.label} error", partial(cell_text, partial(_format_error, run)))
+    egvs = Column(f"{run.label} bit", partial(cell_text, lambda site: f"{site.egvs:.1f}"))
+    share = Column(f"{run.label} of limit", partial(cell_text, _format_limit_share))
+    rank = Column(f"{run.label} rank", partial(cell_text, lambda site: site.rank))
 
     columns = [score, error, egvs, rank]
     if run.rank_by == "egvs":

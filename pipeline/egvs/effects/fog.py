@@ -50,7 +50,7 @@ class Fog(Detect[FogParameters]):
     DECIDED_BY: ClassVar[str] = "the weather"
 
     def extinction_per_m(self, wavelength_nm: float) -> float:
-        """Return the extinction coefficient in nepers per metre."""
+        """Return the extinction coefficient of the Beer-Lambert law, in 1/m."""
         green_per_m = -math.log(self.parameters.contrast) / self.parameters.visibility_m
         visibility_km = -math.log(_MODELS_CONTRAST) / green_per_m / 1000
         exponent = _kim if self.parameters.model == "kim" else _kruse

@@ -62,7 +62,7 @@ class Foliage(TransmitScan[FoliageParameters]):
     QUALITY: ClassVar[dict[str, tuple[Any, ...]]] = {"step_m": (2.0, 0.5, 0.1)}
 
     def extinction_per_m(self) -> float:
-        """Return the extinction within a crown in nepers per metre."""
+        """Return the extinction coefficient within a crown (Beer-Lambert law), in 1/m."""
         season = self.parameters.season
         share = SEASONS[season] if isinstance(season, str) else season
         return float(self.parameters.projection * share * self.parameters.leaf_area_density)

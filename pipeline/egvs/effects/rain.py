@@ -39,12 +39,12 @@ from egvs.scenario.effects_config import EffectParameters, RainParameters
 from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import Sensor
 
-_NEPERS_PER_DB = math.log(10) / 10
+_NATURAL_LOGS_PER_DB = math.log(10) / 10
 _POWER_LAWS = {
     "japan": (1.58, 0.63),
     "france": (1.076, 0.67),
     "itu2025": (1.2924, 0.6436),
-    "goodin": (0.01 * 1000 / _NEPERS_PER_DB, 0.6),
+    "goodin": (0.01 * 1000 / _NATURAL_LOGS_PER_DB, 0.6),
 }
 """k in dB/km and beta, for a rain rate in mm/h."""
 
@@ -67,9 +67,9 @@ class Rain(Detect[RainParameters]):
         return None
 
     def extinction_per_m(self) -> float:
-        """Return the specific attenuation in nepers per metre."""
+        """Return the extinction coefficient of the Beer-Lambert law, in 1/m."""
         k, beta = _POWER_LAWS[self.parameters.law]
-        return float(k * self.parameters.rate_mm_h**beta * _NEPERS_PER_DB / 1000)
+        return float(k * self.parameters.rate_mm_h**beta * _NATURAL_LOGS_PER_DB / 1000)
 
     def detect(self, range_m: FloatArray, sensor: Sensor) -> FloatArray:
         """Return exp(-2 alpha r)."""

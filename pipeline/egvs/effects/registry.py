@@ -2,7 +2,7 @@
 
 Effects are entry points of the group ``egvs.effects`` (``name = "module:Class"``), of this program or of any other
 package. A module is imported only when its effect is named. ``docs/extending.md`` lists what a new effect needs (base
-class, parameters, docs).
+class, parameters, docs); an effect of this program also needs a field of ``EffectsConfig`` (``CONTRIBUTING.md``).
 
 Effects on traffic and ground may also activate themselves where leaving them out would be wrong.
 """
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 _BASE_CLASSES = (base.Expand, base.TransmitScan, base.TransmitScore, base.Detect, base.Traffic)
 
-SELF_ACTIVATING: dict[str, Callable[[Scenario], bool]] = {"slope": sumo_folder.may_have_heights}
+SELF_ACTIVATING: dict[str, Callable[[Scenario], bool]] = {"slope": sumo_folder.may_have_slopes}
 """Effects that activate themselves, each with a quick test of whether it may act."""
 
 

@@ -62,7 +62,7 @@ class Slope(Traffic[SlopeParameters]):
         path = sumo_folder.network_path(scenario)
         if path is None:
             return False, "there is no network (traffic.roads), so the z and slope of the FCD file are used"
-        if not network.may_have_heights(path):
+        if not network.may_have_slopes(path):
             return False, "the network is flat"
         span_m, off_m = terrain.relief_m(network.read_net_xml(path))
         if span_m > MIN_RELIEF_M:

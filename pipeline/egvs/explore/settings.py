@@ -20,7 +20,7 @@ from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.effects import registry
 from egvs.explore.session import Session
-from egvs.runs import run, stages
+from egvs.runs import run, stage_keys
 from egvs.runs.run import StageListener, ignore_stage, lock_run_folder
 from egvs.scenario.loading import load, scenario_from_dict
 from egvs.scenario.model import Scenario
@@ -133,7 +133,7 @@ def make_session(
     """
     record = run.run(scenario, folder, only=REQUIRED_STAGES, jobs=jobs, progress=progress, listener=listener)
     with lock_run_folder(folder):
-        work = open_folder(scenario, folder, jobs=jobs, recorded=stages.recorded_digests(record))
+        work = open_folder(scenario, folder, jobs=jobs, recorded=stage_keys.recorded_digests(record))
         return Session(work, {name: stage.inputs for name, stage in record.stages.items()})
 
 
@@ -181,7 +181,7 @@ def _copy_run(source: Path, folder: Path) -> None:
     The record is copied last, so that it never names missing files.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    names = [name for stage in REQUIRED_STAGES for name in stages.written_by(stage)]
+    names = [name for stage in REQUIRED_STAGES for name in stage_keys.written_by(stage)]
     names += [RunFolder.placement.name, RunFolder.curve.name, RunFolder.placement_checksums.name]
     names.append(RunFolder.run_record.name)
     with lock_run_folder(source):

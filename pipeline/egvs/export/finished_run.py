@@ -20,7 +20,7 @@ from egvs.artefacts.tpog import Tpog
 from egvs.core.errors import InputError
 from egvs.formats import georeference
 from egvs.formats.georeference import WorldFrame
-from egvs.runs import stages
+from egvs.runs import stage_keys
 from egvs.scenario.loading import scenario_from_dict
 from egvs.scenario.model import Scenario
 from egvs.scoring.scorer import Scorer
@@ -72,7 +72,7 @@ class FinishedRun:
             problem = f"the scenario folder {source} does not exist"
             raise InputError(record_path, problem, "Move it back to where it was when the run was made")
         scenario = scenario_from_dict(record.scenario, source, str(record_path))
-        work = open_folder(scenario, folder, recorded=stages.recorded_digests(record))
+        work = open_folder(scenario, folder, recorded=stage_keys.recorded_digests(record))
         run = cls(record, scenario, work, geolocation.scenario_georeference(scenario).frame)
         run._check_georeference()
         return run
@@ -195,7 +195,7 @@ class ExportCrs:
         if self.frame is None:
             return xy
         if self.is_degrees:
-            return self.frame.from_degrees(xy)
+            return self.frame.from_lon_lat(xy)
         return np.add(xy, self.frame.offset_m)
 
     def geometries(self, shapes: Any) -> Any:

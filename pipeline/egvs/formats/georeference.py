@@ -74,7 +74,7 @@ class WorldFrame:
         hint = "Use a projection in metres to the east and north, for example epsg = 32632 (UTM zone 32 north)."
         raise InputError(where, f"{projection} ({crs.name}) {problem}", hint)
 
-    def from_degrees(self, lon_lat_deg: FloatArray) -> FloatArray:
+    def from_lon_lat(self, lon_lat_deg: FloatArray) -> FloatArray:
         """Convert longitude and latitude (n, 2) in degrees to world-frame x, y in metres, (n, 2) float64.
 
         Not finite where the projection is not defined.
@@ -84,7 +84,7 @@ class WorldFrame:
     def to_degrees(self, xy_m: FloatArray) -> FloatArray:
         """Convert world-frame x, y (n, 2) in metres to longitude and latitude in degrees (WGS 84), (n, 2) float64.
 
-        The inverse of :meth:`from_degrees` to a micrometre. A change of datum alone is inverted to some millimetres
+        The inverse of :meth:`from_lon_lat` to a micrometre. A change of datum alone is inverted to some millimetres
         only, so its error is measured and subtracted.
         """
         eastings = np.subtract(xy_m, self.offset_m, dtype=np.float64)
@@ -269,7 +269,7 @@ class Georeference:
         world_frame, reading = self.frame, WORLD_READING
         if frame is not None and world_frame is not None and frame != world_frame:
             reading = CoordinateReading(
-                "metres of its own <location>", lambda xy: world_frame.from_degrees(frame.to_degrees(xy)), where
+                "metres of its own <location>", lambda xy: world_frame.from_lon_lat(frame.to_degrees(xy)), where
             )
         self._check_near(reading, xy_m, where, hint)
         return reading
@@ -279,7 +279,7 @@ class Georeference:
         if not len(xy_m):
             return
         if self.frame is not None and look_like_degrees(xy_m):
-            distance_m = self.distance_m(self.frame.from_degrees(xy_m))
+            distance_m = self.distance_m(self.frame.from_lon_lat(xy_m))
             if distance_m <= COUNTRY_M:
                 problem = (
                     f"expected metres of the world frame, got longitude and latitude: coordinates"
@@ -343,9 +343,9 @@ class Georeference:
         if self.frame is None:
             return
         if (np.abs(xy) <= (180.0, 90.0)).all():
-            yield "degrees", self.frame.from_degrees(xy)
+            yield "degrees", self.frame.from_lon_lat(xy)
         if (np.abs(xy) <= (90.0, 180.0)).all():
-            yield "latitude and longitude, in the wrong order", self.frame.from_degrees(xy[:, ::-1])
+            yield "latitude and longitude, in the wrong order", self.frame.from_lon_lat(xy[:, ::-1])
         name = self.frame.projection if self.frame.projection.startswith("EPSG") else "the network's projection"
         yield f"eastings and northings of {name}", xy + np.asarray(self.frame.offset_m)
 

@@ -150,7 +150,7 @@ class Streets:
 
     def to_xy(self, lons_deg: Sequence[float], lats_deg: Sequence[float]) -> list[XY]:
         """World-frame x, y in metres of positions in degrees."""
-        xy_m = self._frame.from_degrees(np.column_stack([lons_deg, lats_deg]))
+        xy_m = self._frame.from_lon_lat(np.column_stack([lons_deg, lats_deg]))
         return [(x, y) for x, y in xy_m.tolist()]
 
     def to_degrees(self, points_m: Sequence[XY]) -> list[tuple[float, float]]:

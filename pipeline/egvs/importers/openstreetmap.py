@@ -97,7 +97,7 @@ class NewScenario:
     notes: tuple[str, ...]
 
     @property
-    def sites(self) -> int:
+    def n_candidates(self) -> int:
         """Number of candidates: each pole with each height and each tilt."""
         return self.poles * len(junctions.HEIGHTS_M) * len(PITCHES_DEG)
 
@@ -126,7 +126,7 @@ class NewScenario:
                 "flows": len(self.flows), "vehicles_per_hour": round(math.fsum(f.per_hour for f in self.flows)),
             },
             "poles": self.poles,
-            "sites": self.sites,
+            "sites": self.n_candidates,
             "statics": self.statics.to_json(),
             "notes": list(self.notes),
         }  # fmt: skip

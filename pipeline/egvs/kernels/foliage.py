@@ -1,7 +1,7 @@
-"""Where the share of a beam that leaves intercept ends.
+"""Foliage: which share of a beam is intercepted by leaves, and at what range.
 
 Frame: any with the world's axes, in metres, float64. A tree crown is a closed surface of triangles with one leaf
-density throughout. The share of a beam that passes an optical path of length s in leaves is :math:`e^{-k s}`; where
+density throughout. The share of a beam that is transmitted through s metres of foliage is :math:`e^{-k s}`; where
 crowns overlap, their extinctions add up.
 
 Steps for each beam:
@@ -57,7 +57,7 @@ def split_at_leaves(o, d, far, weight, size, starts, balls, triangles, planes, e
     triangles, planes
         Of all crowns, (m, 3, 3) and (m, 4, 4), float64; see :func:`egvs.kernels.ray_triangle.triangle_planes`.
     extinction, step_m
-        Extinction in nepers per metre in one crown, above 0; the longest step.
+        Extinction coefficient in one crown, in 1/m, above 0; the longest step.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-r"""Which beams of a sensor meet a vehicle body first: a closed mesh that is scaled to a box.
+r"""Which vehicle body each beam of a sensor hits first: a closed mesh that is scaled to a box.
 
 Frame: the sensor's position, the world's axes, metres, float64. A body is stored once, in a box of size 1 around zero;
 a beam is transformed into that box by the affine map of the vehicle's box. An affine map preserves t in :math:`o +
@@ -11,7 +11,8 @@ t\,d`, so t is the range in metres.
    Minimum Storage Ray/Triangle Intersection"); terms that do not depend on the beam are computed once a body.
 
 A point up to ``SLACK`` (1e-9 of the triangle's sides) outside a triangle is on it, so that no beam slips between two of
-them; a triangle at an angle whose sine is below ``GRAZE`` in the unit box is not met, the one next to it is.
+them. A triangle at grazing incidence (sine of the angle in the unit box below ``GRAZE``) is skipped; its neighbour
+takes the hit.
 """
 
 from __future__ import annotations

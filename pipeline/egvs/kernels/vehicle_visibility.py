@@ -1,7 +1,7 @@
-"""Which beams meet which vehicle boxes first; distances between boxes; boosted trees over these features.
+"""Which vehicle box each beam hits first; distances between boxes; boosted trees over these features.
 
-Frame: the grid's own, in metres. A beam meets a box as in :mod:`egvs.kernels.occlusion`: made 0.1 mm smaller on each of
-its six sides, where the beam enters it.
+Frame: that of the grid, in metres. Boxes are shrunk by 0.1 mm on each of their six sides, as in
+:mod:`egvs.kernels.occlusion`; a hit is the point where a beam enters the shrunk box.
 
 Beams are sorted into bands of similar slope, and in each band by azimuth. So a box needs only the bands that are
 neither too steep nor too flat for it, and of these only the beams between the azimuths that it spans. Both bounds are

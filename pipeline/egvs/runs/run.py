@@ -26,8 +26,8 @@ from egvs.core import files
 from egvs.core.errors import InputError, RunError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.formats.meshes import referenced_files
-from egvs.runs import locks, stages, store
-from egvs.runs.stages import StageKey, StageResult
+from egvs.runs import locks, stage_keys, store
+from egvs.runs.stage_keys import StageKey, StageResult
 from egvs.runs.store import Store
 from egvs.scenario.loading import scenario_from_dict
 from egvs.scenario.model import Scenario
@@ -116,7 +116,7 @@ def run_one(
     check_no_overwrite(scenario, out)
     with lock_run_folder(out), files.hold_inputs(except_in=out):
         record = start_record(scenario, out)
-        recorded = stages.recorded_digests(record)
+        recorded = stage_keys.recorded_digests(record)
         context = open_folder(scenario, out, jobs=jobs, progress=progress, recorded=recorded)
         current = _Run(context, record, listener)
         current.ensure_stage(stage, options, again=True)
@@ -197,7 +197,7 @@ def fetch_or_run(
         The result, and whether it was restored.
     """
     out = context.folder.path
-    context.forget(*stages.written_by(name))
+    context.forget(*stage_keys.written_by(name))
     entry = store.take(name, key, out, link=link)
     if entry is None:
         with store.maker(name, key, progress=context.progress):
@@ -207,7 +207,7 @@ def fetch_or_run(
                 result = make()
                 store.put(name, key, out, result, link=link)
                 return result, False
-    for other in set(stages.stage(name).artefacts) - set(entry.made.artefacts):
+    for other in set(stage_keys.stage(name).artefacts) - set(entry.made.artefacts):
         (out / other).unlink(missing_ok=True)  # as the stage does
     return entry.made, True
 
@@ -217,10 +217,10 @@ def ensure_stages(context: StageContext, *names: str) -> dict[str, str]:
     keys = {}
     store = Store.default()
     for name in names:
-        key = stages.stage_key(name, context)
+        key = stage_keys.stage_key(name, context)
 
         def make(name: str = name, key: StageKey = key) -> StageResult:
-            return stages.run_stage(name, context, key.dependencies)
+            return stage_keys.run_stage(name, context, key.dependencies)
 
         fetch_or_run(name, context, key.key, store, make, link=True)
         keys[name] = key.key
@@ -254,8 +254,8 @@ class _Run:
 
     def ensure_stage(self, name: str, options: Mapping[str, Any], *, again: bool = False) -> None:
         """Bring one stage up to date; with ``again``, or with options that change artefacts, it always runs."""
-        key = stages.stage_key(name, self.context)
-        has_options = any(option not in stages.stage(name).neutral_options for option in options)
+        key = stage_keys.stage_key(name, self.context)
+        has_options = any(option not in stage_keys.stage(name).neutral_options for option in options)
         last = self.record.stages.get(name)
         if last and not (again or has_options) and last.inputs == key.key and _is_intact(self.context, last):
             self._record_stage(name, last)
@@ -264,7 +264,7 @@ class _Run:
 
         def make() -> StageResult:
             self.listener(name, "runs", None)
-            return stages.run_stage(name, self.context, key.dependencies, **options)
+            return stage_keys.run_stage(name, self.context, key.dependencies, **options)
 
         fetched = False
         if has_options:
@@ -307,7 +307,7 @@ class _Run:
 def _is_up_to_date(name: str, context: StageContext, record: RunRecord) -> bool:
     """Whether a recorded stage has the key that follows from this scenario and the present artefacts."""
     try:
-        return record.stages[name].inputs == stages.stage_key(name, context).key
+        return record.stages[name].inputs == stage_keys.stage_key(name, context).key
     except InputError:
         return False
 

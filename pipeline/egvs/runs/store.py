@@ -1,14 +1,16 @@
-"""Results cached by a hash of their inputs: a folder on this machine, and optionally a store shared by machines.
+"""Results cached by a hash of their inputs (:mod:`egvs.runs.stage_keys`).
+
+The cache is a folder on this machine, and optionally a store shared by machines::
 
     <store>/<stage>-<key>/          artefacts, companions, and entry.json: hashes (also its own), summary, cost
     <store>/.locks/<stage>-<key>    held by the process that makes this entry; others wait for it, then use the entry
     <store>/.work/                  entries that are incomplete, or being removed
     <store>/.lock                   shared by those who read or add an entry, exclusive for those who remove one
 
-An entry is written in ``.work``, then renamed: it is complete or not there, whenever a process is killed. The hash of
-every file is checked when an entry is used; a damaged entry is removed, and made again. The least recently used entries
-are removed when all together exceed a limit. Other files in the folder are ignored. A store that cannot be written is
-reported once, and not used further.
+An entry is written in ``.work``, then renamed: it is either complete or absent, even if a process is killed. The hash
+of every file is checked when an entry is used; a damaged entry is removed and computed again. The least recently used
+entries are removed when all together exceed a limit. Other files in the folder are ignored. A store that cannot be
+written is reported once, and not used further.
 
 A shared store is any file system that fsspec knows (``s3://``, ``gs://``, ``file://``, ...), with the same folders of
 entries; ``entry.json`` is written last. What the folder lacks is fetched from there, and new entries are put there.
@@ -41,7 +43,7 @@ from egvs.core.reading import translate_errors
 from egvs.core.resource_usage import ResourceUsage
 from egvs.runs import locks
 from egvs.runs.locks import locked
-from egvs.runs.stages import StageResult
+from egvs.runs.stage_keys import StageResult
 
 ENTRY_FILE = "entry.json"
 """Record of an entry; written last."""

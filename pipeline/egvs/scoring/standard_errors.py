@@ -449,11 +449,11 @@ class ScoreUncertainty:
         return self._error(self._all_sites)
 
     def quantile(self, level: float = CONFIDENCE_LEVEL) -> float:
-        """Return the half-width of an interval of this confidence, in standard errors."""
+        """Return the critical value of Student's t for a two-sided interval of this confidence level."""
         return float(stdtrit(self.freedom, 0.5 + 0.5 * level))
 
     def intervals(self, level: float = CONFIDENCE_LEVEL) -> FloatArray:
-        """Return the bounds of intervals of the scores from endless traffic, (n, 2) float64."""
+        """Return the bounds of intervals of the scores in the limit of infinitely long traffic, (n, 2) float64."""
         half_width = self.quantile(level) * self.se
         centre = self.scores - self.bias
         return np.column_stack([centre - half_width, centre + half_width])
@@ -463,7 +463,7 @@ class ScoreUncertainty:
         return ScoreDifferences(self.scores[a] - self.scores[b], self._error(a, b))
 
     def beats(self, a: IntArray, b: IntArray) -> FloatArray:
-        """Return the probability (m,) that endless traffic would give sites a (m,) the higher score.
+        """Return the probability (m,) that sites a (m,) score higher in infinitely long traffic.
 
         One half where the scores are equal.
         """

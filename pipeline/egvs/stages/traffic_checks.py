@@ -40,7 +40,7 @@ def check_times(inputs: CheckInputs) -> Iterator[Diagnostic]:
     errors = ErrorCollector()
     demand_files = errors.attempt("traffic", lambda: sumo_folder.demand_files(scenario))
     begin_s = 0.0 if demand_files is None else demand_files.begin_s
-    key = sumo_folder.traffic_key(scenario)
+    key = sumo_folder.traffic_location(scenario)
     errors.attempt("traffic", lambda: sumo_folder.make_timing(scenario.traffic, begin_s, key))
     yield from errors.findings
 
@@ -72,7 +72,9 @@ def check_period_weights(inputs: CheckInputs) -> Iterator[Diagnostic]:
     if not weights or not all(frames):
         return
     errors = ErrorCollector()
-    errors.attempt("traffic", partial(tpog.frame_multiplicities, weights, frames, sumo_folder.traffic_key(scenario)))
+    errors.attempt(
+        "traffic", partial(tpog.frame_multiplicities, weights, frames, sumo_folder.traffic_location(scenario))
+    )
     yield from errors.findings
 
 
@@ -89,7 +91,7 @@ def check_demand(inputs: CheckInputs) -> Iterator[Diagnostic]:
         if errors.attempt("traffic", partial(_has_demand, scenario)) is not False:
             continue  # there are vehicles, or check_times reports the error
         traffic = scenario.traffic
-        key = sumo_folder.traffic_key(scenario)
+        key = sumo_folder.traffic_location(scenario)
         if period:
             key += f".periods ({period})"
         if traffic.sumocfg:
@@ -151,7 +153,7 @@ def check_finished_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
 def check_vehicle_kinds(inputs: CheckInputs) -> Iterator[Diagnostic]:
     """Report kinds of vehicles that SUMO does not know or the network does not admit, and unknown edges."""
     traffic = inputs.scenario.traffic
-    key = sumo_folder.traffic_key(inputs.scenario)
+    key = sumo_folder.traffic_location(inputs.scenario)
     if traffic.network is None or traffic.routes:
         return
     for kind in traffic.kinds:
@@ -175,7 +177,7 @@ def check_vehicle_kinds(inputs: CheckInputs) -> Iterator[Diagnostic]:
 def check_counts(inputs: CheckInputs) -> Iterator[Diagnostic]:
     """Report counts at unknown edges or of unknown kinds, and counts on routes that no vehicle can drive."""
     traffic = inputs.scenario.traffic
-    key = sumo_folder.traffic_key(inputs.scenario)
+    key = sumo_folder.traffic_location(inputs.scenario)
     if inputs.network is None or not traffic.counts:
         return
     edges = {edge.id for edge in inputs.network.edges}

@@ -29,8 +29,8 @@ from egvs.core.progress import ProgressCallback, no_progress
 from egvs.effects import registry
 from egvs.effects.articulated import Articulated
 from egvs.effects.base import Detect, Effect, Traffic
-from egvs.runs import run, stages
-from egvs.runs.stages import RANKING_STAGES
+from egvs.runs import run, stage_keys
+from egvs.runs.stage_keys import RANKING_STAGES
 from egvs.scenario.effects_config import GROUP, EffectParameters
 from egvs.scenario.model import Scenario
 from egvs.scoring.scorer import Scorer
@@ -151,10 +151,10 @@ class EffectTrials:
         if not RunFolder(folder).run_record.is_file():
             return None
         record = RunRecord.read(folder)
-        work = open_folder(scene.scenario, folder, recorded=stages.recorded_digests(record))
+        work = open_folder(scene.scenario, folder, recorded=stage_keys.recorded_digests(record))
         try:
             for name in ("traffic", "statics", "tpog"):
-                if name not in record.stages or record.stages[name].inputs != stages.stage_key(name, work).key:
+                if name not in record.stages or record.stages[name].inputs != stage_keys.stage_key(name, work).key:
                     return None
             work.digests(_TRAJECTORIES, _TPOG)
         except InputError:  # an artefact is missing or was altered

@@ -32,9 +32,9 @@ from egvs.core.errors import InputError, RunError
 from egvs.core.files import CHECKSUM_KEY, add_checksum, has_valid_checksum
 from egvs.core.progress import ProgressCallback
 from egvs.core.resource_usage import ResourceUsage, release_memory
-from egvs.runs import stages
+from egvs.runs import stage_keys
 from egvs.runs.run import fetch_or_run
-from egvs.runs.stages import RANKING_STAGES, StageKey, StageResult
+from egvs.runs.stage_keys import RANKING_STAGES, StageKey, StageResult
 from egvs.runs.store import Store
 from egvs.scenario.loading import load
 from egvs.scenario.model import Scenario, SiteGrid
@@ -218,14 +218,14 @@ class SettingRunner:
             If the stage writes other bytes than before.
         """
         with self._temporary_run(self.scenario(setting), RANKING_STAGES[: RANKING_STAGES.index(name)]) as work:
-            result = self._run_stage(name, work, stages.stage_key(name, work))
+            result = self._run_stage(name, work, stage_keys.stage_key(name, work))
             self._save_times(name, scores.stages[name], work, result, is_measured=True)
 
     def warm_up(self, setting: Setting) -> None:
         """Run all stages with a single site and discard the result, so that everything is compiled and loaded."""
         with self._temporary_run(with_one_site(self.scenario(setting))) as work:
             for name in RANKING_STAGES:
-                stages.run_stage(name, work, stages.stage_key(name, work).dependencies)
+                stage_keys.run_stage(name, work, stage_keys.stage_key(name, work).dependencies)
 
     def stage_times(self, name: str, key: str) -> StageTimes:
         """Return what a stage has cost so far."""
@@ -270,7 +270,7 @@ class SettingRunner:
 
         ``observe`` is called with each site if the score stage runs.
         """
-        inputs = stages.stage_key(name, work)
+        inputs = stage_keys.stage_key(name, work)
         result, is_cached = fetch_or_run(
             name, work, inputs.key, self._store, lambda: self._run_stage(name, work, inputs, observe), link=True
         )
@@ -283,8 +283,8 @@ class SettingRunner:
     ) -> StageResult:
         release_memory()
         if name == "score" and observe is not None:
-            return stages.run_stage(name, work, inputs.dependencies, observe=observe)
-        return stages.run_stage(name, work, inputs.dependencies)
+            return stage_keys.run_stage(name, work, inputs.dependencies, observe=observe)
+        return stage_keys.run_stage(name, work, inputs.dependencies)
 
     def _save_times(self, name: str, key: str, work: StageContext, result: StageResult, *, is_measured: bool) -> None:
         """Add the cost of a stage, measured now or by the run that wrote the artefacts."""
@@ -348,9 +348,9 @@ def scenario_dependencies(scenario: Scenario) -> dict[str, Any]:
     work = open_folder(scenario, scenario.folder)
     return {
         "scenario": scenario.model_dump(mode="json"),
-        "stages": {name: stages.stage_key(name, work).key for name in ("statics", "traffic")},
+        "stages": {name: stage_keys.stage_key(name, work).key for name in ("statics", "traffic")},
         "sites": site_digests(scenario, sites.candidate_sites(scenario)),
-        "program": {name: stages.program_inputs(name, scenario) for name in RANKING_STAGES},
+        "program": {name: stage_keys.program_inputs(name, scenario) for name in RANKING_STAGES},
     }
 
 

@@ -154,7 +154,7 @@ def sizes_of_types(
         try:
             sizes |= _query_sizes(vtypes) | named
         except sumo.SumoInputError as error:
-            where = ", ".join(map(str, size_files(scenario))) or sumo_folder.traffic_key(scenario)
+            where = ", ".join(map(str, size_files(scenario))) or sumo_folder.traffic_location(scenario)
             hint = "Use types that SUMO can read."
             raise InputError(where, f"SUMO rejects the vehicle types: {error}", hint) from None
     return sizes
@@ -192,7 +192,7 @@ def check_types(scenario: Scenario, types: Collection[str], declared: Mapping[st
             "Add a kind of each name with length_m, width_m and height_m, or the SUMO file with their <vType> to vtypes"
             f" (known: {', '.join(sorted(known))})."
         )
-        raise InputError(f"{sumo_folder.traffic_key(scenario)}.kinds", problem, hint)
+        raise InputError(f"{sumo_folder.traffic_location(scenario)}.kinds", problem, hint)
     return vtypes
 
 
@@ -321,7 +321,7 @@ def fcd_window(scenario: Scenario) -> tuple[fcd.FrameWindow, FcdSurvey]:
         When the file has too few frames, or is invalid.
     """
     traffic = scenario.traffic
-    where = sumo_folder.traffic_key(scenario)
+    where = sumo_folder.traffic_location(scenario)
     assert traffic.fcd is not None
     path = scenario.find(traffic.fcd, "traffic.fcd")
     period_ms = max(1, sumo_folder.to_milliseconds(traffic.frame_period_s, f"{where}.frame_period_s"))

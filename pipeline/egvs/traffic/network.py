@@ -420,7 +420,7 @@ def is_osm(path: Path) -> bool:
     return path.name.removesuffix(".gz").endswith(_OSM_SUFFIXES)
 
 
-def may_have_heights(path: Path) -> bool:
+def may_have_slopes(path: Path) -> bool:
     """Whether a SUMO network has a shape with heights, without parsing it; False for OpenStreetMap maps."""
     if is_osm(path) or not path.is_file():
         return False

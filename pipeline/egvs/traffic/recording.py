@@ -146,7 +146,7 @@ def record_traffic(
 def _record_finished(scenario: Scenario, folder: Path, world: Georeference) -> Iterator[Recording]:
     name = scenario.traffic.fcd
     assert name is not None
-    where = sumo_folder.traffic_key(scenario)
+    where = sumo_folder.traffic_location(scenario)
     sumo_folder.copy_network(scenario, folder)
     window, survey = finished_fcd.fcd_window(scenario)
     path = scenario.find(name, "traffic.fcd")
@@ -161,7 +161,7 @@ def _record_finished(scenario: Scenario, folder: Path, world: Georeference) -> I
 def _record_simulated(
     scenario: Scenario, folder: Path, progress: ProgressCallback, extensions: Sequence[TrafficHook]
 ) -> Iterator[Recording]:
-    where = sumo_folder.traffic_key(scenario)
+    where = sumo_folder.traffic_location(scenario)
     prepared = sumo_folder.prepare_simulation(scenario, folder, extensions)
     sources = ", ".join(path.name for path in prepared.sources)
     try:
@@ -207,7 +207,7 @@ def _read_rows(path: Path, element: str) -> Iterable[pa.Table]:
 
 @contextmanager
 def _record_running(scenario: Scenario, host: str, port: int, extensions: Sequence[TrafficHook]) -> Iterator[Recording]:
-    where = sumo_folder.traffic_key(scenario)
+    where = sumo_folder.traffic_location(scenario)
     inputs = sumo_folder.demand_files(scenario)
     timing = sumo_folder.make_timing(scenario.traffic, inputs.begin_s, where)
     net_file = inputs.files["net-file"][0]
@@ -475,7 +475,7 @@ def _collision_warning(collisions: dict[tuple[str, str], Collision], scenario: S
     pairs = "a pair" if len(collisions) == 1 else f"{len(collisions)} pairs"
     problem = f"{pairs} of vehicles collided and drove through each other: {', '.join(locations)}"
     hint = "Check right of way, signals, and the space for waiting on the junctions there, in sumo-gui."
-    return [Diagnostic("collisions", sumo_folder.traffic_key(scenario), problem, hint)]
+    return [Diagnostic("collisions", sumo_folder.traffic_location(scenario), problem, hint)]
 
 
 def describe_distance(at_m: tuple[float, float], roi: Roi) -> str:
@@ -494,7 +494,9 @@ def _insertion_warning(prepared: SimulationFolder, scenario: Scenario) -> list[D
     if waiting <= _MAX_WAITING_SHARE * loaded:
         return []
     problem = f"{waiting} of {loaded} vehicles could not start, because the streets where they start are full"
-    return [Diagnostic("waiting", sumo_folder.traffic_key(scenario), problem, "Reduce the demand there, or add lanes.")]
+    return [
+        Diagnostic("waiting", sumo_folder.traffic_location(scenario), problem, "Reduce the demand there, or add lanes.")
+    ]
 
 
 def _vehicle_counts(prepared: SimulationFolder) -> dict[str, int]:
@@ -510,7 +512,7 @@ def _compare_counts(scenario: Scenario, prepared: SimulationFolder) -> tuple[lis
         return [], []
     first_s, end_s = prepared.timing.first_ms / 1000.0, prepared.timing.end_ms / 1000.0
     fits = demand.count_fits(scenario.traffic, prepared.folder / sumo_folder.DRIVEN_ROUTES_FILE, first_s, end_s)
-    return fits, demand.count_warnings(fits, (end_s - first_s) / 3600.0, sumo_folder.traffic_key(scenario))
+    return fits, demand.count_warnings(fits, (end_s - first_s) / 3600.0, sumo_folder.traffic_location(scenario))
 
 
 def _planned_stops(prepared: SimulationFolder) -> set[str]:

@@ -76,7 +76,7 @@ class Timing:
         return FrameWindow(self.frames, self.period_ms, self.first_ms, complete=True)
 
 
-def traffic_key(scenario: Scenario) -> str:
+def traffic_location(scenario: Scenario) -> str:
     """Return what messages about ``[traffic]`` refer to."""
     return f"{scenario.file}: traffic"
 
@@ -178,10 +178,10 @@ def copy_network(scenario: Scenario, folder: Path) -> None:
         user_files.copy_checked(path, folder / NETWORK_FILE)
 
 
-def may_have_heights(scenario: Scenario) -> bool:
+def may_have_slopes(scenario: Scenario) -> bool:
     """Whether the network of a scenario may have slopes, without parsing it."""
     path = network_path(scenario)
-    return path is not None and network.may_have_heights(path)
+    return path is not None and network.may_have_slopes(path)
 
 
 @dataclass(frozen=True)
@@ -273,7 +273,7 @@ def prepare_simulation(scenario: Scenario, folder: Path, extensions: Iterable[Tr
         When an input is wrong.
     """
     traffic = scenario.traffic
-    where = traffic_key(scenario)
+    where = traffic_location(scenario)
     inputs = demand_files(scenario)
     timing = make_timing(traffic, inputs.begin_s, where)
     times_s = timing.begin_ms / 1000.0, timing.end_ms / 1000.0
@@ -365,7 +365,7 @@ def _write_trips(
 ) -> list[str]:
     """Write random trips; return notes for the user."""
     traffic = scenario.traffic
-    where = traffic_key(scenario)
+    where = traffic_location(scenario)
     pairs = [demand.origin_destination_pairs(roads, kind, traffic, rng, where) for kind in traffic.kinds]
     count = int(np.ceil((timing.end_ms - timing.begin_ms) / 1000.0 * traffic.trips_per_s))
     departs_s = timing.begin_ms / 1000.0 + np.arange(count) / traffic.trips_per_s

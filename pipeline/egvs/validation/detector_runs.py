@@ -29,7 +29,7 @@ from egvs.core.resource_usage import ResourceUsage, measure_usage
 from egvs.core.threads import thread_count
 from egvs.effects import registry
 from egvs.effects.base import Effect
-from egvs.runs import stages
+from egvs.runs import stage_keys
 from egvs.runs.store import Store
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.sites import Site
@@ -181,7 +181,7 @@ class SiteDetectionTask(DetectionTaskBase[Detector]):
         modules = [__name__, *registry.effect_modules(effects)]
         if detector:
             modules.append(type(detector).__module__)
-        sources = [stages.source_digest(module) for module in modules]
+        sources = [stage_keys.source_digest(module) for module in modules]
         libraries: frozenset[str] = frozenset()
         libraries = libraries.union(*(source.libraries for source in sources))
 
@@ -194,7 +194,7 @@ class SiteDetectionTask(DetectionTaskBase[Detector]):
             "effects": registry.effect_settings(effects),
             "roi": [scene.roi.origin_m, scene.roi.size_m],
             "program": [source.digest for source in sources],
-            "libraries": stages.library_versions(libraries),
+            "libraries": stage_keys.library_versions(libraries),
             "schema": parquet.SCHEMA_VERSION,
         }
         return files.hash_json(dependencies)
@@ -292,7 +292,7 @@ def _cache_result(result: DetectorResult, key: str, cost: ResourceUsage) -> None
         with store.maker(stem, key, wait=False) as is_maker:
             if is_maker:  # otherwise another process is storing the same result
                 artefacts = {path.name: files.hash_file(path)}
-                store.put(stem, key, folder, stages.StageResult(artefacts, {}, {}, cost))
+                store.put(stem, key, folder, stage_keys.StageResult(artefacts, {}, {}, cost))
 
 
 # ---- worker processes

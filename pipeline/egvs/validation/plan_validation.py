@@ -34,7 +34,7 @@ from egvs.core import files
 from egvs.core.errors import Diagnostic, InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.runs import run as runs
-from egvs.runs import stages
+from egvs.runs import stage_keys
 from egvs.scenario.model import Scenario
 from egvs.sensors import sensor, sites
 from egvs.sensors.sites import Pose, Site
@@ -156,7 +156,7 @@ class FusedDetectionTask(DetectionTaskBase[JointDetector]):
         """Return a hash of everything that a detector's result for a group depends on."""
         site_task = SiteDetectionTask(self.record, self.detectors)
         site_keys = [site_task.key(site, name) for site in group.sites]
-        return files.hash_json({"fused": site_keys, "program": stages.source_digest(__name__).digest})
+        return files.hash_json({"fused": site_keys, "program": stage_keys.source_digest(__name__).digest})
 
 
 def validate_plan(

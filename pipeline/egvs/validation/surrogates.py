@@ -39,7 +39,7 @@ from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.threads import map_ordered
 from egvs.effects import registry
 from egvs.kernels.hits import max_free_probability
-from egvs.runs import stages
+from egvs.runs import stage_keys
 from egvs.runs.run import ensure_stages
 from egvs.scenario.effects_config import MovingOcclusionParameters
 from egvs.scenario.model import Scenario
@@ -458,8 +458,8 @@ def surrogates_key(scenario: Scenario, names: Sequence[str] | None = None) -> st
     for score in scores:
         sweeps[score.name] = {key: [repr(value) for value in values] for key, values in score.sweep.items()}
     modules = sorted({plugins.plugin_module(SCORES_GROUP, score.name) for score in scores})
-    source = stages.source_digest(__name__, *modules)
-    program = {"source": source.digest, "libraries": stages.library_versions(source.libraries)}
+    source = stage_keys.source_digest(__name__, *modules)
+    program = {"source": source.digest, "libraries": stage_keys.library_versions(source.libraries)}
     return files.hash_json({"scenario": scenario_dependencies(scenario), "scores": sweeps, "program": program})
 
 

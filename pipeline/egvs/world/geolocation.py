@@ -164,7 +164,7 @@ def _check_agreement(declared: WorldFrame, from_network: WorldFrame, scenario: S
     """Raise an InputError when ``[crs]`` and the network locate the region of interest differently."""
     centre = np.array([scenario.roi.center_m[:2]])
     lon_deg, lat_deg = from_network.to_degrees(centre)[0]
-    distance_m = float(np.hypot(*(declared.from_degrees(from_network.to_degrees(centre)) - centre)[0]))
+    distance_m = float(np.hypot(*(declared.from_lon_lat(from_network.to_degrees(centre)) - centre)[0]))
     if distance_m <= _TOLERANCE_M:
         return
     problem = (

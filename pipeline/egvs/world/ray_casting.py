@@ -35,7 +35,7 @@ Floats = NDArray[np.float64]
 _RIM_M = 1e-4
 # rim per largest coordinate of a triangle: eight times the rounding of float32
 _RIM_SHARE = 2.0**-21
-# a needle whose tip would move farther when it is enlarged is replaced by a rectangle
+# a sliver triangle whose tip would move farther than this when it is enlarged is replaced by a rectangle
 _MAX_SHIFT_M = 1.0
 # shapes are left out of the tree only if they are farther away than any triangle is enlarged by
 _CLEARANCE_M = 2.0

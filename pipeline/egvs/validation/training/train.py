@@ -21,7 +21,7 @@ from egvs._version import __version__
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
-from egvs.runs import stages
+from egvs.runs import stage_keys
 from egvs.scenario.model import Scenario
 from egvs.validation.cloud_simulation import CloudSimulator
 from egvs.validation.detection_metrics import EvaluationFrames, GroundTruth, evaluate
@@ -214,7 +214,7 @@ class _TrainingRun:
         self._schedule = torch.optim.lr_scheduler.LambdaLR(
             self._optimizer, lambda step: _learning_rate_share(step / recipe.steps)
         )
-        self._metadata = metadata | {"code": stages.source_digest(__name__).digest}
+        self._metadata = metadata | {"code": stage_keys.source_digest(__name__).digest}
         self._checkpoint = out.with_name(out.name + ".partial")
         self._step = 0
         self._curve: list[dict[str, Any]] = []

@@ -1,11 +1,11 @@
-"""The registered stages, running one, and the key of a stage.
+"""The key of a stage, which decides whether it runs again; the registered stages, and running one.
 
 The key is a hash of everything that the artefacts of a stage depend on: settings by value, input files by hash, the
 source of the program, versions of libraries. A stage runs again when its key changes.
 
 The source is followed from the module of the stage through every import (also those inside functions, but not those for
 type checking only). Modules that are loaded by name (effects, plug-ins) are not visible in the text, so they are named.
-Imports are matched by a pattern instead of a parser, which takes a tenth of the time: a line of a docstring that looks
+Imports are found with a regular expression, ten times as fast as a parser: a line of a docstring that looks
 like an import may add a module, but none is missed. A file is read once per process.
 """
 
