@@ -69,7 +69,7 @@ def _run(arguments: argparse.Namespace) -> None:
             partial.write_text(text, encoding="utf-8")
         print(models)
     elif not models.is_file():
-        raise InputError("--only-draw", f"no such file ({models})", "Name a folder that this command wrote.")
+        raise InputError("--only-draw", f"no such file ({models})", "Give a folder written by this command.")
     figures.draw(picture, models)
     print(picture)
 
@@ -117,10 +117,10 @@ def _junction_folders(arguments: argparse.Namespace) -> list[tuple[str, Role, Pa
     if arguments.osm_training is not None:
         folders.append(junctions.from_osm("training", arguments.osm_training, at, arguments.data / "junctions"))
     elif at is not None:
-        raise InputError("--osm-training-at", "used without --osm-training", "Name the extract that contains it.")
+        raise InputError("--osm-training-at", "used without --osm-training", "Give the extract that contains it.")
     if len(folders) < MIN_JUNCTIONS:
         there = ", ".join(name for name, _, _ in folders) or "none"
-        raise InputError("--junction", f"expected at least {MIN_JUNCTIONS} junctions, got {there}", "Name another one.")
+        raise InputError("--junction", f"expected at least {MIN_JUNCTIONS} junctions, got {there}", "Add another one.")
     return folders
 
 

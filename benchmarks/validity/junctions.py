@@ -75,7 +75,7 @@ def from_osm(role: Role, extract: Path, at: tuple[float, float] | None, folder: 
     name = OSM[role]
     scenario_folder, note = folder / name, folder / f"{name}.json"
     if not extract.is_file():
-        raise InputError(_option(role), f"no such file ({extract})", "Name an OpenStreetMap extract.")
+        raise InputError(_option(role), f"no such file ({extract})", "Give an OpenStreetMap extract.")
     key = files.canonical_json({"extract": files.hash_file(extract), "at": at})
     if not (scenario_folder.is_dir() and note.is_file() and note.read_bytes() == key):
         if scenario_folder.is_dir():

@@ -19,24 +19,24 @@ def sums(tmp_path: Path) -> Path:
 
 
 def test_unchanged_and_missing_files_pass(sums: Path) -> None:
-    checksums.verify_checksums(sums, "again")
+    checksums.verify_checksums(sums, "Run again.")
     sums.with_name("b.png").unlink()
-    checksums.verify_checksums(sums, "again")
-    checksums.verify_checksums(sums.with_name("none.sha256"), "again")
+    checksums.verify_checksums(sums, "Run again.")
+    checksums.verify_checksums(sums.with_name("none.sha256"), "Run again.")
 
 
 def test_a_flipped_bit_is_told(sums: Path) -> None:
     sums.with_name("b.png").write_bytes(b"b.pnf")
-    with pytest.raises(InputError, match=r"b\.png: does not match its checksum in study\.sha256; again"):
-        checksums.verify_checksums(sums, "again")
-    assert checksums.changed_files(sums, "again") == ["b.png"]
+    with pytest.raises(InputError, match=r"b\.png: does not match its checksum in study\.sha256. Run again."):
+        checksums.verify_checksums(sums, "Run again.")
+    assert checksums.changed_files(sums, "Run again.") == ["b.png"]
 
 
 @pytest.mark.parametrize("text", [b"x", b"\xff\n", b"0" * 64 + b"  ../a\n", b"0" * 64 + b" a\n", b"\n"])
 def test_a_damaged_list_is_told(sums: Path, text: bytes) -> None:
     sums.write_bytes(text)
-    with pytest.raises(InputError, match=r"study\.sha256: is not a list of checksums; again"):
-        checksums.verify_checksums(sums, "again")
+    with pytest.raises(InputError, match=r"study\.sha256: is not a list of checksums. Run again."):
+        checksums.verify_checksums(sums, "Run again.")
 
 
 @pytest.mark.system

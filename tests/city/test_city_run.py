@@ -178,8 +178,8 @@ def test_gain_is_score_times_vehicles(city: City, tmp_path: Path, score: str) ->
 @pytest.mark.parametrize(
     ("request_", "overrides", "message"),
     [
-        ({}, [], "--count, --budget: expected one of them, got neither"),
-        ({"count": 1, "budget": 5.0}, [], "--count, --budget: expected one of them, got count and budget"),
+        ({}, [], "--count, --budget: expected exactly one of the two, got neither"),
+        ({"count": 1, "budget": 5.0}, [], "--count, --budget: expected exactly one of the two, got count and budget"),
         ({"budget": -1.0}, [], "--budget: expected a cost above 0, got -1"),
         ({"count": 1}, ["placement.survives=1"], "placement.survives: has no effect in a city"),
         ({"count": 1}, ['placement.forced=["pole_a", "pole_b"]'], "--count 1: 4 sensors are already installed"),

@@ -226,13 +226,13 @@ def test_rejects_wrong_row_of_table(extract: Path, tmp_path: Path, rows: str, me
 def test_wrong_input_gives_one_message_and_creates_nothing(extract: Path, tmp_path: Path, run_egvs) -> None:
     out = tmp_path / "town"
     for options, message in (
-        (["--radius", "2km"], "--radius: 2000 m around no point. Add --around LAT,LON"),
+        (["--radius", "2km"], "--radius: given without --around. Add --around LAT,LON"),
         (["--around", "50.0,10.0", "--radius", "2 miles"], "--radius: expected a length above 0, got '2 miles'"),
         (["--around", "51.0,10.0"], "--around: 51,10 is outside the extract"),
         (["--around", "here"], "--around: expected LAT,LON in degrees, got 'here'"),
         (
             ["--junctions", "signalized"],
-            "signalized: no such file. Name a CSV table of junctions",
+            "signalized: no such file. Give a CSV table of junctions",
         ),
         (["--around", "50.0,10.0", "--radius", "90"], "too near to the rim"),
     ):

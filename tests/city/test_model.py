@@ -101,7 +101,7 @@ def test_rejects_missing_or_damaged_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"junctions\.csv: cannot be read as CSV"):
         model.load_city(folder)
     (folder / "junctions.csv").unlink()
-    with pytest.raises(InputError, match=r"junctions\.csv: no such file. Name a CSV table .* Use the columns"):
+    with pytest.raises(InputError, match=r"junctions\.csv: no such file. Give a CSV table .* Use the columns"):
         model.load_city(folder)
 
 

@@ -34,7 +34,7 @@ def test_shows_best_junction_warnings_and_attribution() -> None:
     html = page.render_page(make_city(*results), results, [Diagnostic("rule", "where", "problem", "hint")])
     assert "Of 2 junctions, a first sensor has the largest gain at a, Main Street" in html
     assert "33.3%" in html
-    assert "<b>where</b>: problem <small>hint</small>" in html
+    assert "<b>where</b>: problem. <small>hint</small>" in html
     assert "© the mappers" in html
     assert html.count('class="plan"') == 2  # by gain, and by the share that is seen
 
@@ -55,5 +55,5 @@ def test_shows_junction_without_score() -> None:
 def test_headline_for_no_gain_ties_and_single_junction() -> None:
     assert page.format_headline([make_result("a", 1, 0.0)]) == "No site sees any traffic"
     tie = [make_result("a", 1, 5.0), make_result("b", 1, 5.0)]
-    assert page.format_headline(tie) == "2 of 2 junctions share the first place"
+    assert page.format_headline(tie) == "2 of 2 junctions share first place"
     assert page.format_headline([make_result("a", 1, 5.0)]) == "a, the only junction: scores 5 bit"

@@ -204,7 +204,7 @@ def test_reports_workers_that_never_start(jobs: list[Job], monkeypatch: pytest.M
         killer = threading.Thread(target=kill)
         killer.start()
         try:
-            with pytest.raises(RunError, match="ended as soon as they were started"):
+            with pytest.raises(RunError, match="died at start-up"):
                 scheduler.run_jobs(client, jobs)
         finally:
             ended.set()

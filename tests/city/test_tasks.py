@@ -69,7 +69,7 @@ def test_same_sites_give_same_bytes(tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", [b"", b"PK no archive", b"\x93NUMPY"])
 def test_rejects_damaged_part(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "part.npz").write_bytes(content)
-    with pytest.raises(InputError, match="cannot be read as a part of scores"):
+    with pytest.raises(InputError, match="cannot be read as partial scores"):
         list(tasks.read_part(tmp_path / "part.npz"))
 
 
@@ -110,7 +110,7 @@ def test_rejects_other_version_of_program(jobs: list[Job], monkeypatch: pytest.M
     monkeypatch.setattr("egvs.city.tasks.__version__", "9.9.9")
     result = tasks.estimate_beams(jobs[0], settings)
     assert isinstance(result, JobFailure)
-    assert "this worker runs another version of egvs (9.9.9," in result.message
+    assert "this worker runs a different version of egvs (9.9.9," in result.message
 
 
 def test_cache_keeps_few_scenes(jobs: list[Job]) -> None:

@@ -186,7 +186,7 @@ def test_files_are_fcd_as_sumo_writes_it(city: City) -> None:
          "city.toml: traffic.periods.0.name: expected a name, got 'a/b'"),
         ("city.toml", "seed = 7", "seed = 7\n[effects.rain]\nrate_mm_h = 20.0\n",
          "city.toml: effects.rain: adds no traffic. Move it to junctions/scenario.toml"),
-        ("city.toml", 'name = "bus"', 'name = "coach"', "the size of vehicle types of fcd.csv is unknown: 'bus'"),
+        ("city.toml", 'name = "bus"', 'name = "coach"', "unknown sizes of vehicle types of fcd.csv: 'bus'"),
     ],
 )  # fmt: skip
 def test_rejects_wrong_input(city: City, file: str, old: str, new: str, message: str) -> None:
@@ -281,7 +281,7 @@ def test_warns_about_flat_junction_in_hilly_network(city: City) -> None:
 
 def test_rejects_second_process(city: City) -> None:
     def start_another(_what: str, _done: int, _total: int) -> None:
-        with pytest.raises(RunError, match="another run is at work there"):
+        with pytest.raises(RunError, match="another run is using this folder"):
             traffic_split.make_city_traffic(city)
 
     assert traffic_split.make_city_traffic(city, start_another).is_new

@@ -10,7 +10,7 @@ from egvs.cli.console import ProgressDisplay
 from egvs.core.errors import WARNINGS_KEY, Diagnostic, DiagnosticsError, collect_warnings, with_relative_paths
 from egvs.core.resource_usage import ResourceUsage
 
-ONE = Diagnostic("sites on lanes", "sites.csv: row 3 (k2)", "stands on lane e1_0", "move it by 2 m")
+ONE = Diagnostic("sites on lanes", "sites.csv: row 3 (k2)", "stands on lane e1_0", "Move it by 2 m.")
 
 
 def test_collect_warnings_inverts_to_json() -> None:
@@ -20,8 +20,13 @@ def test_collect_warnings_inverts_to_json() -> None:
 
 def test_diagnostics_error_lists_all_errors() -> None:
     error = DiagnosticsError([ONE, Diagnostic("roi", "roi", "no lane inside", "")])
-    assert str(error) == "sites.csv: row 3 (k2): stands on lane e1_0; move it by 2 m\nroi: no lane inside"
+    assert str(error) == "sites.csv: row 3 (k2): stands on lane e1_0. Move it by 2 m.\nroi: no lane inside"
     assert error.exit_code == 2
+
+
+def test_error_without_hint_ends_with_its_problem() -> None:
+    errors = [Diagnostic("roi", "roi", "no lane inside", ""), ONE]
+    assert str(DiagnosticsError(errors)) == f"roi: no lane inside\n{ONE}"
 
 
 def test_warning_is_printed_on_one_line(capsys) -> None:

@@ -30,7 +30,7 @@ def test_limit_is_checked_reported_and_raised_by_variable(monkeypatch: pytest.Mo
 @pytest.mark.parametrize("text", ["", "0", "-1", "1e9", "many", "٣", "9" * 19])
 def test_rejects_invalid_value_of_variable(monkeypatch: pytest.MonkeyPatch, text: str) -> None:
     monkeypatch.setenv("EGVS_MAX_FILE_MB", text)
-    with pytest.raises(InputError, match=r"^EGVS_MAX_FILE_MB: expected how many MB .*for example 1000\.$"):
+    with pytest.raises(InputError, match=r"^EGVS_MAX_FILE_MB: expected the maximum number of MB .*for example 1000\.$"):
         _ = limits.FILE.maximum
 
 
@@ -43,14 +43,14 @@ def test_names_of_limits_are_unique() -> None:
 @pytest.mark.parametrize(
     ("error", "message"),
     [
-        (MemoryError(), "it asks for more memory than there is"),
+        (MemoryError(), "it needs more memory than is available"),
         (RecursionError("maximum"), "it is nested too deeply"),
         (ValueError("first\nsecond"), "first"),
         (KeyError("x"), "KeyError 'x'"),
         (AssertionError(), "AssertionError"),
         (OverflowError("too large"), "too large"),
         (PermissionError(errno.EACCES, "Permission denied"), "Permission denied"),
-        (UnicodeDecodeError("utf-8", b"\xff", 0, 1, ""), "it is no utf-8 text: byte 0 is 0xff"),
+        (UnicodeDecodeError("utf-8", b"\xff", 0, 1, ""), "it is not utf-8 text: byte 0 is 0xff"),
     ],
 )
 def test_translate_errors_names_the_file(error: Exception, message: str) -> None:

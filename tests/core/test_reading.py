@@ -22,7 +22,7 @@ DIGITS = "9" * 5000
         (f"a = {DIGITS}", "a number has too many digits"),
         (f"a = 0x{'f' * 5000}", "a number has too many digits"),
         (f"a = [0x{'f' * 300}]", "a number has too many digits"),
-        ("a = '\udcff'", "it is no utf-8 text: byte 5 is 0xff"),
+        ("a = '\udcff'", "it is not utf-8 text: byte 5 is 0xff"),
         ("a = 1\na = 2", "Cannot overwrite a value"),
     ],
 )
@@ -44,7 +44,7 @@ def test_rejects_invalid_toml(tmp_path: Path, text: str, message: str) -> None:
         (b"[" + b"9" * 301 + b"]", "a number has too many digits"),
         (b'{"a": {"b": 1, "c": 2, "b": 3}}', "the key 'b' occurs twice in one object"),
         (b'["\\ud800"]', "it is not valid text"),
-        ('["駅"]'.encode("cp932"), "it is no utf-8 text: byte 2 is 0x89"),
+        ('["駅"]'.encode("cp932"), "it is not utf-8 text: byte 2 is 0x89"),
         (b"{", "Expecting property name"),
     ],
 )

@@ -113,7 +113,7 @@ def test_a_format_of_another_package_is_read(mini: Path, tmp_path: Path) -> None
     (mini / "scan.xyz").write_text("1 2\n")
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m,points\npole_a,10,12,3,scan.xyz\n")
     code, text = run_egvs("run", mini, "--out", tmp_path / "wrong", beside=beside)
-    assert code == 2 and "has 2 numbers a line; three: x, y and z" in text, text
+    assert code == 2 and "expected 3 numbers per line, got 2" in text, text
 
 
 @pytest.mark.system

@@ -511,7 +511,7 @@ def test_idle_traffic_effects_do_not_change_the_traffic(flat_road, plain_traffic
     result, actual = run_and_read(scene, tmp_path)
     assert actual == plain_traffic[0]
     name = next(iter(effects))
-    assert re.fullmatch(rf"{name}: named, but .*: skipped, the result is the same", result["notes"][-1])
+    assert re.fullmatch(rf"{name}: set, but .*: skipped, the result is the same", result["notes"][-1])
     reason = find_effect_class(name)(scene.effects.named[name]).why_idle(Scene(scene, None, ()))
     assert reason and reason in result["notes"][-1]
     assert inputs_of(traffic, scene, tmp_path) == inputs_of(traffic, road_scenario(flat_road, **SMALL), tmp_path)

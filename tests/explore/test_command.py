@@ -84,7 +84,7 @@ def test_says_how_to_install_viser(run_egvs, mini: Path, monkeypatch: pytest.Mon
     monkeypatch.setitem(sys.modules, "viser", None)
     code, out, err = run_egvs("explore", mini)
     assert (code, out) == (2, "")
-    assert err == "egvs: egvs explore needs viser, which is not installed: pip install 'egvs[explore]'\n"
+    assert err == "egvs: egvs explore needs viser, which is not installed. Run pip install 'egvs[explore]'\n"
     assert not Path("runs").exists()
 
 

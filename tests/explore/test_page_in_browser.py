@@ -198,7 +198,7 @@ def test_link_and_picture_show_the_current_view(browser: Any, tab: Any, page: Pa
     (client,) = page.server.get_clients().values()
     before = client.camera.position, page.view
     with tab.expect_download(timeout=READY_MS) as download:
-        tab.get_by_role("button", name="Picture (PNG)").click()
+        tab.get_by_role("button", name="Download picture (PNG)").click()
     assert download.value.suggested_filename == "mini.png"
     assert Path(download.value.path()).read_bytes().startswith(b"\x89PNG")
     page.request(site=page.session.candidates["pole_b"].site, layer="traffic")

@@ -75,17 +75,17 @@ def test_link_to_initial_view_is_short(session: Session) -> None:
         ("pose=1,2,3,4,5,nan", r"link: pose: expected numbers x,y,z,yaw,tilt,roll, got '1,2,3,4,5,nan'"),
         ("pose=1,2,3,4,5,up", r"link: pose: expected numbers x,y,z,yaw,tilt,roll, got 'up'"),
         ("sensor=nothing", r"link: sensor: .*nothing"),
-        ("gamma=many", r"link: gamma: expected a number from 0, got 'many'"),
-        ("gamma=-1", r"link: score\.gamma: expected a value greater than or equal to 0 or .*, got -1\.0"),
+        ("gamma=many", r"link: gamma: expected a number of at least 0, got 'many'"),
+        ("gamma=-1", r"link: score\.gamma: expected a value greater than or equal to 0 or 'auto', got -1\.0"),
         ("score=best", r"link: score\.rank_by: expected .*, got 'best'"),
         ("effects=hail", r"link: effects: expected some of range_limit, rain, .*, got 'hail'"),
         ("period=noon", r"link: period: expected one of day, night, got 'noon'"),
         ("layer=sky", r"link: layer: expected one of none, traffic, seen, .*, got 'sky'"),
-        ("ring=-1", r"link: ring: expected a whole number from 0, got -1"),
-        ("frame=1.5", r"link: frame: expected a whole number from 0, got '1.5'"),
+        ("ring=-1", r"link: ring: expected a whole number of at least 0, got -1"),
+        ("frame=1.5", r"link: frame: expected a whole number of at least 0, got '1.5'"),
         ("beside=nobody", r"link: beside: expected one of pole_a, pole_b, got 'nobody'"),
         ("camera=1,2", r"link: camera: expected numbers x,y,z,x,y,z, got '1,2'"),
-        ("sity=pole_a", r"link: unknown 'sity'. Use some of beside, camera, dark"),
+        ("sity=pole_a", r"link: unknown key 'sity'. Use only beside, camera, dark"),
     ],
 )
 def test_invalid_links_are_rejected(session: Session, text: str, message: str) -> None:
@@ -110,7 +110,7 @@ def test_saved_poses_are_a_file_of_sites(mini: Path) -> None:
 @pytest.mark.parametrize("content", ["site,x_m,y_m,z_m\nmine,1,2,3\n", "", "\x00\xff", '"site'])
 def test_users_file_is_not_changed(mini: Path, content: str) -> None:
     (mini / SAVED_SITES).write_text(content)
-    with pytest.raises(InputError, match="was not written by egvs explore, and is not changed"):
+    with pytest.raises(InputError, match="was not written by egvs explore, so it is not overwritten"):
         save_pose(mini / SAVED_SITES, SITE, CANDIDATES)
     assert (mini / SAVED_SITES).read_text() == content
     assert unused_file_name(mini) == "kept_sites-2.csv"

@@ -54,7 +54,7 @@ def test_names_the_missing_extra(
 ) -> None:
     monkeypatch.setattr(plugins, "find_spec", lambda name: None)
     code, _, err = run_egvs("export", local, "--to", to)
-    output = f"egvs: export to {to} needs {library}, which is not installed: pip install 'egvs[gis]'\n"
+    output = f"egvs: export to {to} needs {library}, which is not installed. Run pip install 'egvs[gis]'\n"
     assert (code, err) == (2, output)
 
 
@@ -72,7 +72,7 @@ def test_rejects_a_file_where_a_folder_is_needed(located: Path, tmp_path: Path, 
     (tmp_path / "file").write_text("mine")
     code, _, err = run_egvs("export", located, "--to", "csv", "--out", tmp_path / "file")
     assert (code, (tmp_path / "file").read_text()) == (2, "mine")
-    assert "is a file. Name a folder: --to csv writes several files" in err
+    assert "is a file. Give a folder: --to csv writes several files" in err
 
 
 def test_replaces_no_file_in_a_user_s_folder(local: Path, run_egvs: Call) -> None:
@@ -82,7 +82,7 @@ def test_replaces_no_file_in_a_user_s_folder(local: Path, run_egvs: Call) -> Non
         code, _, err = run_egvs("export", local, "--to", to, "--out", folder)
         assert (code, err) == (
             2,
-            f"egvs: --out: {folder / name} exists already. Choose a new folder, or one without such files\n",
+            f"egvs: --out: {folder / name} already exists. Choose a new folder, or one without these files.\n",
         )
         assert ((folder / name).read_bytes(), sorted(folder.rglob("*"))) == (content, before)
 
@@ -91,7 +91,7 @@ def test_replaces_no_file_in_a_user_s_folder(local: Path, run_egvs: Call) -> Non
 def test_replaces_no_file_of_a_user(located: Path, tmp_path: Path, run_egvs: Call, to: str) -> None:
     (path := tmp_path / f"mine.{to}").write_text("mine")
     code, _, err = run_egvs("export", located, "--to", to, "--out", path)
-    assert (code, err) == (2, f"egvs: --out: {path} exists already. Choose another name\n")
+    assert (code, err) == (2, f"egvs: --out: {path} already exists. Choose another name.\n")
     assert path.read_text() == "mine"
 
 

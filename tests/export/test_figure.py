@@ -113,7 +113,7 @@ def test_svg_needs_no_extra_but_pdf_does(
 ) -> None:
     monkeypatch.setattr(plugins, "find_spec", lambda name: None)
     code, _, err = run_egvs("figure", local, "--what", "ranking", "--out", tmp_path / "a.pdf")
-    needs = "egvs: a figure as pdf needs cairosvg, which is not installed: pip install 'egvs[figure]'\n"
+    needs = "egvs: a pdf figure needs cairosvg, which is not installed. Run pip install 'egvs[figure]'\n"
     assert (code, err) == (2, needs)
     assert run_egvs("figure", local, "--what", "ranking", "--format", "svg", "--out", tmp_path / "a.svg")[0] == 0
 
@@ -127,7 +127,7 @@ def test_svg_needs_no_extra_but_pdf_does(
         (("--what", "map", "--size", "wide"), "--size: expected a width of 50 to 1000 mm, got 'wide'"),
         (("--what", "map", "--site", "pole_a"), "--site: cannot be combined with --what map"),
         (("--what", "seen", "--site", "x"), "--site: this run has no site 'x'. Choose one of pole_"),
-        (("--what", "map", "--out", "a.png"), "--out: expected a file name ending in .pdf, got 'a.png'"),
+        (("--what", "map", "--out", "a.png"), "--out: expected a name ending in .pdf, got 'a.png'"),
     ],
 )
 def test_rejects_impossible_requests_with_one_message(

@@ -21,11 +21,11 @@ Call = Callable[..., tuple[int, str, str]]
 
 def test_rejects_a_missing_folder_and_a_folder_without_a_run(tmp_path: Path, run_egvs: Call) -> None:
     code, _, err = run_egvs("export", tmp_path / "none", "--to", "csv")
-    assert (code, err) == (2, f"egvs: {tmp_path / 'none'}: no such folder. Name a folder that egvs run has written\n")
+    assert (code, err) == (2, f"egvs: {tmp_path / 'none'}: no such folder. Give a folder written by egvs run.\n")
     code, _, err = run_egvs("export", tmp_path, "--to", "csv")
     assert (code, err) == (
         2,
-        f"egvs: {tmp_path / 'run.json'}: no such file. Name a folder that egvs run has written.\n",
+        f"egvs: {tmp_path / 'run.json'}: no such file. Give a folder written by egvs run.\n",
     )
 
 
@@ -39,8 +39,8 @@ def test_rejects_an_unfinished_run_and_one_of_another_version(local: Path, tmp_p
         value = {name: its for name, its in record.items() if name != "own_sha256"} | {"stages": stages}
         path.write_text(files.to_json_text(value if content is None else add_checksum(value)))
         code, _, err = run_egvs("export", path.parent, "--to", "csv", "--out", tmp_path / "out")
-        problem = f"the stage {first} is not finished, or was run by another version of this program"
-        assert (code, err) == (2, f"egvs: {path}: {problem}. Run egvs run again\n")
+        problem = f"the stage {first} is not finished, or was run by another version of egvs"
+        assert (code, err) == (2, f"egvs: {path}: {problem}. Run egvs run again.\n")
         assert not (tmp_path / "out").exists()
 
 
@@ -50,8 +50,8 @@ def test_rejects_a_run_from_before_the_scenario_had_a_reference_system(
     placed = Georeference(WorldFrame(f"EPSG:{EPSG}", OFFSET_M), Roi.around((0, 0, 0), (1, 1, 1)), "")
     monkeypatch.setattr(geolocation, "scenario_georeference", lambda scenario: placed)
     code, _, err = run_egvs("export", local, "--to", "csv", "--out", tmp_path / "out")
-    problem = "its sites have no longitude and latitude, but the scenario or its network has a position"
-    assert (code, err) == (2, f"egvs: {local / 'scores.parquet'}: {problem}. Run egvs run again\n")
+    problem = "its sites have no geographic position, but the scenario or its network has one"
+    assert (code, err) == (2, f"egvs: {local / 'scores.parquet'}: {problem}. Run egvs run again.\n")
 
 
 def test_rejects_a_run_whose_scenario_has_moved(
@@ -62,7 +62,7 @@ def test_rejects_a_run_whose_scenario_has_moved(
         monkeypatch.setattr(geolocation, "scenario_georeference", lambda scenario, now=now: now)
         code, _, err = run_egvs("export", located, "--to", "csv", "--out", tmp_path / "out")
         assert code == 2
-        assert "scores.parquet: the position of its sites on the Earth differs from that in the scenario" in err
+        assert "scores.parquet: the geographic position of its sites differs from that in the scenario" in err
 
 
 @pytest.mark.parametrize("artefact", ["scores.parquet", "blindspots.parquet", "statics.ply"])

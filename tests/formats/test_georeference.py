@@ -98,7 +98,7 @@ def test_conversion_to_degrees_and_back_is_exact_to_10_micrometres(projection: s
 
 def test_rejects_frames_that_are_no_map_projection_in_metres() -> None:
     assert WorldFrame.from_projection("EPSG:25832", (1.0, 2.0), "here") == WorldFrame("EPSG:25832", (1.0, 2.0))
-    for wrong, message in (("EPSG:4326", "is not a map projection"), ("EPSG:2263", "counts in US survey foot"),
+    for wrong, message in (("EPSG:4326", "is not a map projection"), ("EPSG:2263", "has axes in US survey foot"),
                          ("EPSG:1", "unknown coordinate reference system"),
                          ("!", "unknown coordinate reference system")):  # fmt: skip
         with pytest.raises(InputError, match=f"^here: .*{message}"):
@@ -129,7 +129,7 @@ def test_utm_epsg_of_a_location(lon: float, lat: float, code: int) -> None:
 @pytest.mark.parametrize("projection", ["EPSG:2053", "+proj=tmerc +lon_0=9 +axis=wsu +ellps=WGS84 +units=m +no_defs"])
 def test_rejects_projection_whose_axes_point_west_and_south(projection: str) -> None:
     with pytest.raises(
-        InputError, match=r"s: crs: .* counts in metre to the west and south.* metres to the east and north"
+        InputError, match=r"s: crs: .* has axes in metre to the west and south.* metres to the east and north"
     ):
         WorldFrame.from_projection(projection, (0.0, 0.0), "s: crs")
 
@@ -181,7 +181,7 @@ def test_small_numbers_are_read_as_declared_where_degrees_and_metres_have_one_si
     assert convert(world, metres, WORLD) is metres
     assert np.array_equal(convert(world, degrees, WGS84), metres)
     assert np.array_equal(convert(world, degrees[:1], WGS84), metres[:1])
-    with pytest.raises(InputError, match=r"53 km .* as WGS 84.*They would be near it as metres .*null for metres"):
+    with pytest.raises(InputError, match=r"53 km .* as WGS 84.*Read as metres .*null for metres"):
         convert(world, metres[:1], WGS84)
     assert convert(world, metres[:1], WORLD).tolist() == metres[:1].tolist()
 
@@ -205,13 +205,13 @@ def test_declared_projection_is_the_world_frame_where_its_position_is_unknown() 
         (UNLOCATED, DEGREES, "EPSG:4326", r"^a.geojson: the file is in WGS 84, but the position.*32632"),
         (UNLOCATED, np.add(CORNERS / 1e6, 1e6), WORLD, r"are 1,413 km from the region .* as metres .*Set \"crs\""),
         (UNLOCATED, CORNERS, "EPSG:2263", "the file is in NAD83 / New York Long Island .*, but the position"),
-        (LOCATED, np.add(DEGREES, (1.8, 0.0)), WGS84, r"are 127 km from the region of interest as WGS 84"),
-        (LOCATED, np.add(DEGREES, (0.5, 0.0)), WGS84, r"are 35 km from the region of interest as WGS 84"),
-        (LOCATED, DEGREES[:, ::-1], "EPSG:4326", "They would be near it as latitude and longitude, in the wrong order"),
+        (LOCATED, np.add(DEGREES, (1.8, 0.0)), WGS84, r"are 127 km from the region of interest, read as WGS 84"),
+        (LOCATED, np.add(DEGREES, (0.5, 0.0)), WGS84, r"are 35 km from the region of interest, read as WGS 84"),
+        (LOCATED, DEGREES[:, ::-1], "EPSG:4326", "Read as latitude and longitude, in the wrong order, they"),
         (LOCATED, CORNERS - np.array(FRAME.offset_m), WORLD,
-         r"are 5,661 km from the region of interest as metres of the world frame. "
-         r'They would be near it as eastings and northings of EPSG:32632. Set "crs" in the file'),
-        (LOCATED, CORNERS, "EPSG:25832", "They would be near it as metres of the world frame"),
+         r"are 5,661 km from the region of interest, read as metres of the world frame. "
+         r'Read as eastings and northings of EPSG:32632, they would be near it. Set "crs" in the file'),
+        (LOCATED, CORNERS, "EPSG:25832", "Read as metres of the world frame, they would be near it"),
         (LOCATED, CORNERS + 1e5, WORLD, "are 141 km .* as metres of the world frame"),
         (UNLOCATED, CORNERS + 1e5, WORLD, "are 141 km .* as metres of the world frame"),
         (LOCATED, DEGREES, WORLD, "expected metres .*, got longitude and latitude: .* 0 m from the region of interest"),

@@ -109,7 +109,7 @@ def test_ignores_deleted_objects(tmp_path: Path, mark: str) -> None:
         ),
         (osm_xml(NODE).replace("<osm", '<!DOCTYPE osm [<!ENTITY a SYSTEM "file:///etc/passwd">]><osm'), "XML entities"),
         (osm_xml(NODE).replace("</osm>", ""), "is not well-formed XML: no element found"),
-        ("<gpx/>", "expected the root <osm>, got <gpx>"),
+        ("<gpx/>", "expected the root element <osm>, got <gpx>"),
         (osm_xml(""), "has no nodes"),
         (osm_xml('<node id="1" lat="1" lon="2" action="delete"/>'), "has no nodes"),
         (osm_xml(NODE).replace(' version="0.6"', ""), "cannot be read as OpenStreetMap data .*version"),
@@ -198,7 +198,7 @@ def test_rejects_more_objects_than_the_limit(tmp_path: Path, monkeypatch: pytest
     pbf = pbf_of(SMALL, tmp_path / "a.osm.pbf")
     for path in (SMALL, pbf):
         message = (
-            rf"{path.name}: has more than 10 objects\. Use a part of the map\. The limit is 10 objects; set "
+            rf"{path.name}: has more than 10 objects\. Use a smaller extract\. The limit is 10 objects; set "
             rf"EGVS_MAX_MAP_OBJECTS"
         )
         with pytest.raises(InputError, match=message):

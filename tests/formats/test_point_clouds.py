@@ -334,7 +334,7 @@ def test_rejects_laz_that_asks_for_more_memory_than_the_limit(tmp_path: Path) ->
     points_at = struct.unpack_from("<I", path.read_bytes(), 96)[0]
     overwrite(path, points_at + 8 + 30 + 4 + 7 * 4, b"\xff\xff\xff\xf0")
     message = (
-        r"the decompressor was ended by signal 6: .*too much memory\)\. The limit is 2,000 MB; set EGVS_MAX_READER_MB"
+        r"the decompressor was killed by signal 6: .*too much memory\)\. The limit is 2,000 MB; set EGVS_MAX_READER_MB"
     )
     with pytest.raises(InputError, match=message):
         read_points(path, "")
@@ -359,7 +359,7 @@ def test_message_without_laspy_tells_how_to_install_it(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "laspy", None)
-    with pytest.raises(InputError, match=r"needs laspy, which is not installed\. Install it: pip install egvs\[las\]"):
+    with pytest.raises(InputError, match=r"needs laspy, which is not installed\. Run pip install 'egvs\[las\]'"):
         read_points(put(tmp_path, name, b"LASF"), "")
 
 
@@ -369,7 +369,7 @@ def test_message_without_lazrs_tells_how_to_install_it(tmp_path: Path, monkeypat
 
     path, _ = las(tmp_path, "a.laz")
     monkeypatch.setattr(laspy.LazBackend, "detect_available", lambda: ())
-    with pytest.raises(InputError, match=r"needs lazrs, which is not installed\. Install it: pip install egvs\[las\]"):
+    with pytest.raises(InputError, match=r"needs lazrs, which is not installed\. Run pip install 'egvs\[las\]'"):
         read_points(path, "")
 
 
@@ -423,15 +423,15 @@ CSV = "x_m,y_m,z_m\n1,2,3\n"
         ("a.xyz", "1 2 3", r"a\.xyz: unknown file format '\.xyz'. Use one of \.csv, \.las, \.laz, \.pcd, \.ply"),
         ("a", "1 2 3", r"/a: the file name has no suffix. Use one of \.csv"),
         # PCD, header
-        ("a.pcd", "", r"a\.pcd: the PCD header has no line DATA"),
-        ("a.pcd", ASCII_PCD[:40], "the PCD header has no line DATA"),
+        ("a.pcd", "", r"a\.pcd: the PCD header has no DATA line"),
+        ("a.pcd", ASCII_PCD[:40], "the PCD header has no DATA line"),
         ("a.pcd", "VERSION\x00\x80 7\n" + ASCII_PCD, r"a\.pcd: line 1: expected text, got .VERSION.x00.x80 7."),
-        ("a.pcd", ASCII_PCD.replace("FIELDS x y z\n", ""), "the PCD header has no line FIELDS"),
+        ("a.pcd", ASCII_PCD.replace("FIELDS x y z\n", ""), "the PCD header has no FIELDS line"),
         ("a.pcd", ASCII_PCD.replace("x y z", "x y zz"),
-         "expected one field 'z', got the fields x y zz. Write one field each for x, y and z"),
+         "expected one field 'z', got the fields x y zz. Write one field for each of x, y and z"),
         ("a.pcd", ASCII_PCD.replace("x y z", "x x z"), "expected one field 'x', got the fields x x z"),
         ("a.pcd", ASCII_PCD.replace("TYPE", "COUNT 1 2 1\nTYPE"), "expected one field 'y'"),
-        ("a.pcd", ASCII_PCD.replace("8 8 8", "8 8"), "SIZE: expected 3 values, one for each of FIELDS, got 2"),
+        ("a.pcd", ASCII_PCD.replace("8 8 8", "8 8"), "SIZE: expected 3 values, one per field, got 2"),
         ("a.pcd", ASCII_PCD.replace("8 8 8", "8 2 8"), "field 'y' has TYPE F and SIZE 2. Use TYPE F with SIZE 4 or 8"),
         ("a.pcd", ASCII_PCD.replace("8 8 8", "8 eight 8"), "SIZE of y: expected a whole number, got 'eight'"),
         ("a.pcd", ASCII_PCD.replace("F F F", "F Q F"), "field 'y' has TYPE Q and SIZE 8"),
@@ -439,7 +439,7 @@ CSV = "x_m,y_m,z_m\n1,2,3\n"
         ("a.pcd", ASCII_PCD.replace("POINTS 2", "POINTS -2"), "POINTS: expected a whole number, got '-2'"),
         ("a.pcd", ASCII_PCD.replace("POINTS 2", "POINTS " + "9" * 5000),
          r"POINTS: expected a whole number, got '9+ .* 9+'"),
-        ("a.pcd", ASCII_PCD.replace("POINTS 2\n", "").replace("WIDTH 2\n", ""), "no line POINTS"),
+        ("a.pcd", ASCII_PCD.replace("POINTS 2\n", "").replace("WIDTH 2\n", ""), "no POINTS line"),
         ("a.pcd", ASCII_PCD.replace(" 2\n", " 0\n"),
          "the header declares 0 points. Use a file with at least one return"),
         ("a.pcd", ASCII_PCD.replace("ascii", "zip"), "DATA: expected ascii, binary or binary_compressed, got 'zip'"),
@@ -460,13 +460,13 @@ CSV = "x_m,y_m,z_m\n1,2,3\n"
         ("a.pcd", BINARY + bytes(23), r"the header declares 2 points of 12 bytes \(24 bytes\), got 23 bytes"),
         ("a.pcd", BINARY + bytes(25), r"\(24 bytes\), got 25 bytes"),
         ("a.pcd", ASCII_PCD.replace("DATA ascii", "DATA " + "x" * 900), "DATA: .* got 'x{60}'"),
-        ("a.pcd", PACKED + bytes(7), r"the file ends before its points \(7 bytes of them\)"),
+        ("a.pcd", PACKED + bytes(7), r"the file ends before its points \(only 7 bytes of data\)"),
         ("a.pcd", PACKED + struct.pack("<II", 1, 12) + b"\0",
-         "the header declares 24 bytes of points, got 12 bytes, unpacked"),
+         "the header declares 24 bytes of points, got 12 bytes after decompression"),
         ("a.pcd", PACKED + packed(bytes(24))[:-1], "expected 5 bytes of packed points, got 4 bytes"),
-        ("a.pcd", PACKED + struct.pack("<II", 2, 24) + b"\x20\x05", "the packed points are no valid LZF data"),
-        ("a.pcd", PACKED + struct.pack("<II", 1, 24) + b"\xe0", "the packed points are no valid LZF data"),
-        ("a.pcd", PACKED + struct.pack("<II", 2, 24) + b"\x05\x05", "the packed points are no valid LZF data"),
+        ("a.pcd", PACKED + struct.pack("<II", 2, 24) + b"\x20\x05", "the packed points are not valid LZF data"),
+        ("a.pcd", PACKED + struct.pack("<II", 1, 24) + b"\xe0", "the packed points are not valid LZF data"),
+        ("a.pcd", PACKED + struct.pack("<II", 2, 24) + b"\x05\x05", "the packed points are not valid LZF data"),
         # PLY
         ("a.ply", "plyx", r"a\.ply: not a PLY file with a header from 'ply' to 'end_header'"),
         ("a.ply", "solid\nend_header\n", "not a PLY file"),
@@ -474,7 +474,7 @@ CSV = "x_m,y_m,z_m\n1,2,3\n"
          "expected an element 'vertex', got corner. Write the points as vertices"),
         ("a.ply", ASCII_PLY.replace("double z", "double q"), "expected one field 'z', got the fields x y q"),
         ("a.ply", ASCII_PLY.replace("format ascii 1.0\n", ""),
-         "the PLY header has no line 'format'. Add a line 'format' with one of ascii"),
+         "the PLY header has no 'format' line. Add a 'format' line with one of ascii"),
         ("a.ply", ASCII_PLY.replace("ascii", "utf8"),
          r"line 2: expected a format, an element, .* got 'format utf8 1\.0'"),
         ("a.ply", ASCII_PLY.replace("double z", "real z"), r"line 6: .* got 'property real z'"),
@@ -483,25 +483,25 @@ CSV = "x_m,y_m,z_m\n1,2,3\n"
          "count of element 'vertex': expected a whole number, got 'two'"),
         ("a.ply", ASCII_PLY.replace("vertex 2", "vertex 0"), "the header declares 0 points"),
         ("a.ply", ASCII_PLY.replace("double z", "list uchar int z"),
-         "the element 'vertex' has a list. Write no list among"),
+         "the element 'vertex' has a list property. Use no list properties in"),
         ("a.ply", BINARY_PLY.replace("element", "element path 1\nproperty list uchar int way\nelement") + "\0" * 49,
-         "the element 'path' has a list"),
+         "the element 'path' has a list property"),
         ("a.ply", ASCII_PLY.replace("4 5 6\n", ""), "the header declares 2 points, got 1 lines"),
         ("a.ply", ASCII_PLY.replace("4 5 6\n", "4 5\n"), "line 9: expected 3 values, got 2"),
         ("a.ply", ASCII_PLY.replace("4 5 6\n", "4 5 z\n"), "line 9: expected a number, got 'z'"),
         ("a.ply", BINARY_PLY + "\0" * 47, r"the header declares 2 points of 24 bytes \(48 bytes\), got 47 bytes"),
         ("a.ply", BINARY_PLY + "\0" * 49, r"\(48 bytes\), got 49 bytes"),
         # CSV
-        ("a.csv", "", r"a\.csv: expected one column 'x_m', got none"),
-        ("a.csv", CSV.replace("x_m", "x"), "expected one column 'x_m', got x, y_m, z_m. Write a header row"),
-        ("a.csv", CSV.replace("z_m", "x_m"), "expected one column 'x_m', got x_m, y_m, x_m"),
+        ("a.csv", "", r"a\.csv: expected exactly one column 'x_m', got none"),
+        ("a.csv", CSV.replace("x_m", "x"), "expected exactly one column 'x_m', got x, y_m, z_m. Write a header row"),
+        ("a.csv", CSV.replace("z_m", "x_m"), "expected exactly one column 'x_m', got x_m, y_m, x_m"),
         ("a.csv", "x_m,y_m,z_m\n", "got none of 0"),
         ("a.csv", CSV + "4,five,6\n",
          r"a\.csv: line 3: y_m: expected a number, got 'five'. Use a number, or nan for a missing return"),
         ("a.csv", CSV + "\n4,,6\n", "line 4: y_m: expected a number, got ''"),
         ("a.csv", CSV + "4,5\n", "line 3: expected 3 values, one per column, got 2"),
         ("a.csv", CSV + "1,5,2,5,3,5\n", "line 3: expected 3 values, one per column, got 6"),
-        ("a.csv", CSV.replace(",", ";"), "expected one column 'x_m', got x_m;y_m;z_m"),
+        ("a.csv", CSV.replace(",", ";"), "expected exactly one column 'x_m', got x_m;y_m;z_m"),
         ("a.csv", CSV + "4,5,6_0\n", r"cannot be read as CSV \(.*6_0"),
         ("a.csv", CSV + "4,5,\0\n", "line 3: z_m: expected a number, got '\\\\x00'"),
         ("a.csv", "x" * 200_000, r"cannot be read as CSV \(field larger than"),
@@ -634,13 +634,13 @@ def read(path, where):
 @pytest.mark.parametrize(
     ("body", "problem"),
     [
-        ("raise RuntimeError('boom')", r"ended with RuntimeError\('boom'\)"),
-        ("raise SystemExit(0)", r"ended with SystemExit\(0\)"),
+        ("raise RuntimeError('boom')", r"raised RuntimeError\('boom'\)"),
+        ("raise SystemExit(0)", r"raised SystemExit\(0\)"),
         ("return None", "returns NoneType"),
         ("return [[1.0, 2.0, 3.0]]", "returns list"),
-        ("return np.array([['a', 'b', 'c']])", "returns an array of <U1"),
-        ("return np.ones((5, 2))", r"returns an array of float64 of the shape \(5, 2\)"),
-        ("return np.ones(3)", r"returns an array of float64 of the shape \(3,\)"),
+        ("return np.array([['a', 'b', 'c']])", "returns a <U1 array"),
+        ("return np.ones((5, 2))", r"returns a float64 array of shape \(5, 2\)"),
+        ("return np.ones(3)", r"returns a float64 array of shape \(3,\)"),
     ],
 )
 def test_message_names_failing_reader_and_file(site: Path, body: str, problem: str) -> None:  # noqa: F811

@@ -58,13 +58,13 @@ def test_rejects_unsupported_encoding(tmp_path: Path, declared: str) -> None:
 
 def test_rejects_bytes_that_are_no_text(tmp_path: Path) -> None:
     data = b'<?xml version="1.0" encoding="Shift_JIS"?><net><e name="\x81"/></net>'
-    with pytest.raises(InputError, match=r"a.xml: cannot be read \(it is no cp932 text: byte \d+ is 0x81\)"):
+    with pytest.raises(InputError, match=r"a.xml: cannot be read \(it is not cp932 text: byte \d+ is 0x81\)"):
         names(tmp_path, data)
 
 
 def hostile() -> Iterator[tuple[str, bytes, str]]:
     """Yield name, content and message of files that would take much memory."""
-    element = "has an element, or a text, of more than 1 MB. The limit is 1 MB; set EGVS_MAX_ELEMENT_MB to raise it"
+    element = "has an element or text of more than 1 MB. The limit is 1 MB; set EGVS_MAX_ELEMENT_MB to raise it"
     yield "text of the root", b"<net>" + ONE_MB * 3 + b"</net>", element
     yield "text between children", b"<net><e/>" + ONE_MB * 3 + b"<e/></net>", element
     yield "rows in one step", b"<net><e>" + b"<v a='1'/>" * 150_000 + b"</e></net>", element
@@ -73,7 +73,7 @@ def hostile() -> Iterator[tuple[str, bytes, str]]:
     yield "before the root", ONE_MB * 3 + b"<net/>", element
     yield "deep", b"<net>" + b"<e>" * 5000 + b"</e>" * 5000 + b"</net>", "nested more than 100 deep"
     many = b"<net>" + (b"<e/>" + b" " * 900_000) * 6 + b"</net>"
-    packed = "holds more than 5 MB, unpacked. The limit is 5 MB; set EGVS_MAX_UNPACKED_MB to raise it"
+    packed = "holds more than 5 MB after decompression. The limit is 5 MB; set EGVS_MAX_UNPACKED_MB to raise it"
     yield "a bomb", gzip.compress(many, mtime=0), packed
     yield "a bomb without an end", gzip.compress(b"<net>" + ONE_MB * 3, mtime=0), element
 
@@ -95,7 +95,7 @@ def test_reads_long_file_of_small_children(tmp_path: Path) -> None:
 
 def test_read_line_rejects_line_without_end(tmp_path: Path) -> None:
     (tmp_path / "fcd.csv.gz").write_bytes(gzip.compress(b"1;2" * 700_000, mtime=0))
-    with xml.open_bounded(tmp_path / "fcd.csv.gz") as file, pytest.raises(InputError, match="has a line without end"):
+    with xml.open_bounded(tmp_path / "fcd.csv.gz") as file, pytest.raises(InputError, match="has an unterminated line"):
         xml.read_line(file, "fcd.csv.gz")
 
 
@@ -113,5 +113,5 @@ def test_scan_attribute_values_finds_values_across_chunks(tmp_path: Path) -> Non
 def test_scan_attribute_values_rejects_value_without_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("EGVS_MAX_ELEMENT_MB", "1")
     (tmp_path / "n.net.xml").write_bytes(b"<net><e shape='" + b"1,2 " * 1_000_000)
-    with pytest.raises(InputError, match=r"n.net.xml: has a value without end. The limit is 1 MB"):
+    with pytest.raises(InputError, match=r"n.net.xml: has an unterminated value. The limit is 1 MB"):
         list(xml.scan_attribute_values(tmp_path / "n.net.xml", "shape"))

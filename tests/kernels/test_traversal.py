@@ -140,7 +140,7 @@ def test_reversed_hard_segments_cross_same_voxels():
 
 @pytest.mark.parametrize("entry", REFUSED, ids=[entry["name"] for entry in REFUSED])
 def test_rejects_nan_and_inf(entry):
-    with pytest.raises(InputError, match=r"scans.parquet: site s: a beam has an end that is not finite"):
+    with pytest.raises(InputError, match=r"scans.parquet: site s: a beam has a non-finite end point"):
         converted(*of_entry(entry))
 
 

@@ -251,7 +251,7 @@ REJECTED = {
     ),
     "a zone in the way of a reach": (
         ["--count", "1", "--reach", "0.01", "--set", ZONE % (0.5, 2)],
-        "placement.zones: no plan of 1 sensors that meets them was found",
+        "placement.zones: no plan of 1 sensors that meets the demands was found",
     ),
     "no costs": (["--budget", "50"], "placement.budget: the cost of site a is unknown"),
     "a sensor without a price": (
@@ -293,7 +293,7 @@ REJECTED = {
     ),
     "a zone beyond the count": (
         ["--count", "1", "--set", ZONE % (0.5, 2)],
-        "placement.zones: no plan of 1 sensors that meets them was found",
+        "placement.zones: no plan of 1 sensors that meets the demands was found",
     ),
 }
 
@@ -322,13 +322,13 @@ def test_report_shows_plan_until_inputs_change(five_candidates: Path, out: Path,
     assert code == 0
     assert str(out / "report.html") in text
     page = (out / "report.html").read_text()
-    assert "Which poles together?" in page
-    assert "Which poles together?" not in before
+    assert "Which sites together?" in page
+    assert "Which sites together?" not in before
     rows, _, _ = read_tables(out)
     assert all(f'<th scope="row">{row["site"]}</th>' in page for row in rows)
     run_egvs("run", five_candidates, "--out", out, "--set", "score.gamma=2")
     run_egvs("run", five_candidates, "--out", out, "--set", "seed=8", "--set", "roi.voxel_m=1")
-    assert "Which poles together?" not in (out / "report.html").read_text()
+    assert "Which sites together?" not in (out / "report.html").read_text()
 
 
 @pytest.mark.slow
@@ -403,7 +403,7 @@ def test_next_run_keeps_plan_in_report(three_candidates: Path, tmp_path: Path, r
     run_egvs("run", three_candidates, "--out", out)
     run_egvs("place", three_candidates, "--out", out, "--count", 2, "--set", "costs.pole=5")
     page = (out / "report.html").read_bytes()
-    assert b"Which poles together?" in page
+    assert b"Which sites together?" in page
     run_egvs("run", three_candidates, "--out", out)
     assert (out / "report.html").read_bytes() == page
 

@@ -182,7 +182,7 @@ def test_shows_user_columns_by_pole(tmp_path):
     rows = [("a", 6, 9, 2, "City & Co", 7), ("b", 6, 9, 3, "City & Co", 8), ("c", 6, -1, 3, "", 9)]
     table = (
         render_report(*run_to_scores(tmp_path, rows, columns=("owner", "fid")))
-        .split("<h2>Your columns of the sites file")[1]
+        .split("<h2>Your columns from the sites file")[1]
         .split("</table>")[0]
     )
     assert '>Pole</th><th scope="col">owner</th><th scope="col">fid</th>' in table
@@ -192,7 +192,7 @@ def test_shows_user_columns_by_pole(tmp_path):
 
 
 def test_has_no_table_of_user_columns_without_them(plain_run):
-    assert "Your columns of the sites file" not in plain_run[2]
+    assert "Your columns from the sites file" not in plain_run[2]
 
 
 def test_page_of_one_site(tmp_path):

@@ -57,10 +57,10 @@ def test_lead_says_whether_the_best_is_certain() -> None:
     assert report_ranking.lead(ahead) == "They lead the next site, c, by 20.0% of their score."
     near = ranking(("a", 100.0, 1, 0.5, 0.5), ("b", 100.0, 1, 0.6, 0.7), ("c", 98.0, 3, 0.4, 1.0))
     assert report_ranking.lead(near).endswith(
-        "by 2.0% of their score. This much traffic is not enough to tell which of them is better."
+        "by 2.0% of their score. There is too little traffic to tell which of them is better."
     )
     alone = ranking(("a", 100.0, 1, 0.5, 0.7), ("c", 98.0, 2, 0.4, 1.0))
-    assert report_ranking.lead(alone).endswith("This much traffic is not enough to tell which of them is better.")
+    assert report_ranking.lead(alone).endswith("There is too little traffic to tell which of them is better.")
 
 
 def test_note_on_the_site_that_sees_most_entropy() -> None:

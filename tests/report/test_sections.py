@@ -60,11 +60,11 @@ def _summary(values, tau):
             (None, 0.3, 0.2, 0.1), (1.0, NAN, NAN),
             "EGVS and detection agree on which of two sites is better in 100% of the pairs of 3 sites "
             "(Kendall's tau 1.00).",
-            "From 3 sites it cannot be said how certain this is.",
+            "3 sites are too few to say how certain this is.",
         ),
         (
             (None, None, None, 0.1), (NAN, NAN, NAN),
-            "1 site with values: too few, or too similar, to compare the two orders.", "",
+            "1 site with values: too few, or too similar, to compare the two rankings.", "",
         ),
     ],
 )  # fmt: skip
@@ -90,7 +90,7 @@ def test_shows_the_validation_of_the_same_run(mini, tmp_path, run_egvs):
     text = html.unescape(section())
     assert f"data:image/png;base64,{base64.b64encode((out / 'validation.png').read_bytes()).decode()}" in text
     assert "in 10 frames of traffic, at least 2 s apart, with 18 vehicles in the region" in text
-    assert "to compare the two orders" in text  # of two sites
+    assert "to compare the two rankings" in text  # of two sites
     assert "evaluated with the frames that the TPOG was computed from" in text and str(mini) not in text
     for row in parquet.read_artefact(out / "detection.parquet", "detection")[0].to_pylist():
         if row["objects_of"] == "vehicles":
@@ -138,7 +138,7 @@ def test_reports_scores_with_different_best_sites() -> None:
         " At the held-out junctions of the validation study, the share of vehicles found predicted detection better: "
         "rank correlation 0.90 against 0.70 (cluster) and 0.80 against 0.60 (pointpillars); see docs/validity.md."
     )
-    for worse, who in ((0.5, "the EGVS"), (0.65, "neither of the two")):
+    for worse, who in ((0.5, "the EGVS"), (0.65, "neither of the two consistently")):
         rho["expected_detections"] = {"cluster": worse, "pointpillars": worse if worse < 0.6 else 0.55}
         rho["expected_detections"]["pointpillars"] = 0.5 if worse == 0.5 else 0.7
         assert f", {who} predicted detection better: rank" in ranking_disagreement(by_vehicles(*rows).sites, EGVS, rho)

@@ -57,12 +57,12 @@ def a_body(mini: Path) -> None:
 
 
 INPUTS = {
-    "a mesh": (a_mesh, "statics.ply, which the scenario names (statics.meshes)"),
-    "an FCD file": (an_fcd_file, "trajectories.parquet, which the scenario names (traffic.fcd)"),
-    "in the folder of SUMO": (a_file_for_sumo, "sumo/f.geojson, which the scenario names (statics.footprints)"),
-    "a buffer of a mesh": (a_buffer_of_a_mesh, "tpog.parquet, which the scenario names (statics.meshes)"),
-    "a body": (a_body, "statics.ply, which the scenario names (validation.bodies.sedan)"),
-    "a measured scan": (a_measured_scan, "scan_pole_a.ply, which the scenario names (site pole_a: points)"),
+    "a mesh": (a_mesh, "statics.ply, which the scenario uses (statics.meshes)"),
+    "an FCD file": (an_fcd_file, "trajectories.parquet, which the scenario uses (traffic.fcd)"),
+    "in the folder of SUMO": (a_file_for_sumo, "sumo/f.geojson, which the scenario uses (statics.footprints)"),
+    "a buffer of a mesh": (a_buffer_of_a_mesh, "tpog.parquet, which the scenario uses (statics.meshes)"),
+    "a body": (a_body, "statics.ply, which the scenario uses (validation.bodies.sedan)"),
+    "a measured scan": (a_measured_scan, "scan_pole_a.ply, which the scenario uses (site pole_a: points)"),
 }
 
 
@@ -72,7 +72,7 @@ def test_run_does_not_overwrite_input(mini: Path, run_egvs, put, message: str, v
     put(mini)
     before = tree(mini)
     code, _, error = run_egvs(verb, mini, "--out", mini)
-    told = f"egvs: --out {mini}: a run would write over {message}. Name a folder of its own, for example runs/mine.\n"
+    told = f"egvs: --out {mini}: a run would overwrite {message}. Use a separate folder, for example runs/mine.\n"
     assert (code, error) == (2, told)
     assert tree(mini) == before
 
@@ -92,7 +92,7 @@ def test_study_does_not_overwrite_input(mini: Path, run_egvs, words: tuple[str, 
     named(mini, "fcd.csv", name)
     before = tree(mini)
     code, _, error = run_egvs(words[0], mini, "--out", mini, *words[1:])
-    assert (code, f"write over {name}, which the scenario names (traffic.fcd)" in error) == (2, True)
+    assert (code, f"overwrite {name}, which the scenario uses (traffic.fcd)" in error) == (2, True)
     assert tree(mini) == before
 
 
@@ -108,12 +108,12 @@ def test_input_is_recognised_through_link(mini: Path, tmp_path: Path, run_egvs) 
     a_mesh(mini)
     (tmp_path / "link").symlink_to(mini)
     code, _, error = run_egvs("run", mini, "--out", tmp_path / "link")
-    assert (code, "write over statics.ply" in error) == (2, True)
+    assert (code, "overwrite statics.ply" in error) == (2, True)
     (mini / "deep").mkdir()
     (mini / "deep" / "tpog.parquet").write_text("fcd")
     named(mini, "fcd.csv", "deep/tpog.parquet")
     code, _, error = run_egvs("run", mini, "--out", mini / "deep")
-    assert (code, "write over tpog.parquet, which the scenario names (traffic.fcd)" in error) == (2, True)
+    assert (code, "overwrite tpog.parquet, which the scenario uses (traffic.fcd)" in error) == (2, True)
 
 
 def test_run_inside_scenario_folder_is_allowed(mini: Path, run_egvs) -> None:

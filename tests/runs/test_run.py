@@ -145,7 +145,7 @@ def test_interrupted_run_records_one_scenario(done: tuple[Path, Path], monkeypat
             run.run(other, out)
     record = json.loads((out / "run.json").read_text())
     assert (record["scenario"]["statics"]["ground"], list(record["stages"])) == (False, ["check", "statics", "scan"])
-    with pytest.raises(InputError, match="the stage traffic is not done"):
+    with pytest.raises(InputError, match="the stage traffic has not been run"):
         verification.verify(out)
     again = states(egvs.load(mini, ["statics.ground=false"]), out)
     assert (again["statics"], again["scan"], again["traffic"]) == ("skipped", "skipped", "fetched")
@@ -207,20 +207,20 @@ def test_verify_rejects_unfinished_run(done: tuple[Path, Path]) -> None:
     record = json.loads((out / "run.json").read_text())
     del record["stages"]["score"]
     (out / "run.json").write_text(json.dumps(add_checksum(record)))
-    with pytest.raises(InputError, match="the stage score is not done"):
+    with pytest.raises(InputError, match="the stage score has not been run"):
         verification.verify(out)
 
 
 def test_rejects_second_run_in_same_folder(done: tuple[Path, Path]) -> None:
     mini, out = done
-    with lock_run_folder(out), pytest.raises(RunError, match="another run is at work"):
+    with lock_run_folder(out), pytest.raises(RunError, match="another run is using this folder"):
         egvs.run(egvs.load(mini), out)
 
 
 def test_rejects_file_that_is_no_record(done: tuple[Path, Path]) -> None:
     mini, out = done
     (out / "run.json").write_text("[]")
-    with pytest.raises(InputError, match="is not the record of a run"):
+    with pytest.raises(InputError, match="is not a run record"):
         egvs.run(egvs.load(mini), out)
 
 
@@ -251,7 +251,7 @@ def test_single_stage_drops_stages_of_other_settings(done: tuple[Path, Path], ru
     mini, out = done
     assert run_egvs("score", mini, "--out", out, "--set", "score.gamma=7", "--set", "sites.yaw_deg=5")[0] == 0
     code, _, said = run_egvs("verify", out)
-    assert (code, "the stage check is not done" in said) == (2, True), said
+    assert (code, "the stage check has not been run" in said) == (2, True), said
     assert run_egvs("run", mini, "--out", out)[0] == 0
     assert run_egvs("verify", out)[0] == 0
 
@@ -311,7 +311,7 @@ def test_ranking_fits_terminal_width(mini: Path, tmp_path: Path, width: int, by:
     assert "…" not in text
     assert all(len(line) <= width for line in text.splitlines())
     if by == "egvs" or width > 130:
-        assert all(f"{egvs:.1f}" in text for run_egvs in table["egvs"].to_pylist())
+        assert all(f"{value:.1f}" in text for value in table["egvs"].to_pylist())
     told = (lambda value: f"{value:.2f}") if by == "points_on_target" else (lambda value: f"{value:.1%}")
     assert by == "egvs" or all(told(value) in text for value in table[by].to_pylist())
 
@@ -341,7 +341,7 @@ def test_record_of_earlier_version_has_no_stages(done: tuple[Path, Path]) -> Non
         del stage["files"]
     del record["own_sha256"]
     (out / "run.json").write_text(json.dumps(record | {"effects": []}))
-    with pytest.raises(InputError, match="the stage check is not done"):
+    with pytest.raises(InputError, match="the stage check has not been run"):
         verification.verify(out)
     assert set(states(egvs.load(mini), out).values()) == {"fetched"}
     assert verification.verify(out) == []
@@ -353,13 +353,13 @@ def test_prints_best_sites_and_counts_others(mini: Path, tmp_path: Path, run_egv
     rows = [f"p{i:02d},{2 + i},12,{3 + i / 8}" for i in range(9)]
     (mini / "sites.csv").write_text("\n".join(["site,x_m,y_m,z_m", *rows]) + "\n")
     code, whole, _ = run_egvs("run", mini, "--out", tmp_path / "out")
-    assert (code, "more: without --top" in whole) == (0, False)
+    assert (code, "without --top" in whole) == (0, False)
     ranked = [line.split()[1] for line in whole.splitlines() if re.match(r"\s*\d+\s+p\d\d", line)]
     assert len(ranked) == 9
     for verb in ("run", "score"):
         code, printed, _ = run_egvs(verb, mini, "--out", tmp_path / "out", "--top", 4)
         assert code == 0
         assert [line.split()[1] for line in printed.splitlines() if re.match(r"\s*\d+\s+p\d\d", line)] == ranked[:4]
-        assert "... and 5 more: without --top, in " in printed
-    assert "more: without" not in run_egvs("score", mini, "--out", tmp_path / "out", "--top", 9)[1]
+        assert "... and 5 more, listed in " in printed
+    assert "without --top" not in run_egvs("score", mini, "--out", tmp_path / "out", "--top", 9)[1]
     assert run_egvs("run", mini, "--top", 0)[0] == 2

@@ -45,7 +45,7 @@ def test_poly_xml_gives_ranking_of_footprints(mini: Path, tmp_path: Path, run_eg
         assert code == 0, err
         found[name] = scores(tmp_path / name)
         if name == "odd":
-            assert "unknown types of polygons were left out: sculpture (1)" in out + err
+            assert "polygons of unknown types were left out: sculpture (1)" in out + err
     assert found["map"] == found["hand"] == found["odd"]
     assert found["bare"] != found["hand"], "the building is not in the way of any site"
     record = json.loads((tmp_path / "odd" / "run.json").read_text(encoding="utf-8"))

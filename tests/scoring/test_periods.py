@@ -114,7 +114,7 @@ def test_run_with_periods_is_reproducible_and_reported(split: Path, tmp_path: Pa
     code, printed, told = run_egvs("run", split, "--out", tmp_path / "out")
     assert code == 0
     (night,) = (line for line in told.splitlines() if line.split()[0] == "night")
-    assert night.split("   ")[-1].startswith("frames 16; vehicles 2 fewest, 2 most, 2 different; rows 32;")
+    assert night.split("   ")[-1].startswith("16 frames; 2 vehicles at a time, 2 in all;")
     assert "standard errors from day: 4 blocks of 6 frames" in told
     assert "rank and share of the best in each period; in the mix: day 71.4%, night 28.6%" in printed
     assert "scores_by_period.parquet" in printed
@@ -123,7 +123,7 @@ def test_run_with_periods_is_reproducible_and_reported(split: Path, tmp_path: Pa
     assert "night<br>(28.6%)" in page
     assert ">40 frames<small>one every 0.5 s, 20 s in total, in 2 periods" in page
     assert "<dt>day</dt><dd>24 frames; 2 vehicles at a time, 2 in total;" in page
-    assert page.index("<h2>By period") < page.index("<h2>Where the sites stand")
+    assert page.index("<h2>By period") < page.index("<h2>Where the sites are")
     ranking = PeriodRanking.read(tmp_path / "out")
     assert ranking is not None
     assert (ranking.periods, ranking.frames) == (("day", "night"), 40)
@@ -276,7 +276,7 @@ def test_effect_that_periods_forbid_is_not_recommended(split: Path) -> None:
     (found,) = (call for call in effect_statuses(egvs.load(split)) if call.name == "moving_occlusion")
     assert (found.state, found.why) == (
         "off",
-        'cannot act here: method = "frames" replays all periods alike, whatever their weights.'
+        'cannot act here: method = "frames" ignores the weights of the periods.'
         ' Use method = "independent", which weights the periods.',
     )
 
@@ -307,14 +307,14 @@ def test_the_world_frame_counts_where_a_period_alone_is_a_finished_file(
             'name = ".."',
             r"traffic\.periods\.1\.name: expected a name, got '\.\.'. Use a name .*not only dots",
         ),
-        ('name = "night"', f'name = "{"n" * 81}"', r"traffic\.periods\.1\.name: 'n+'; string should have at most 80"),
+        ('name = "night"', f'name = "{"n" * 81}"', r"traffic\.periods\.1\.name: .*at most 80 characters, got 'n+'"),
         ('name = "night"', 'name = "a\\u0000b"', r"traffic\.periods\.1\.name: expected a name, got 'a.*b'"),
         ("length_s = 8", "length_s = 8.1", "period 'night': length_s = 8.1 is not a multiple of 0.5 s"),
         ("length_s = 8", "length_s = 9", "tpog.blocks = 4 does not divide traffic.frames = 18 of the period 'night'"),
         ("weight = 2.5", "weight = 0", r"traffic\.periods\.0\.weight: expected a value greater than 0, got 0\n$"),
         ("weight = 2.5", "weight = 2.123456789", "make a mix of .* frames\\. Use weights with fewer digits"),
         ("begin_s = 12", "begin = 12", "begin"),
-        ("blocks = 4", "blocks = 40000", "blocks = 40000 gives 80000 blocks in all periods, at most 65535"),
+        ("blocks = 4", "blocks = 40000", "blocks = 40000 gives 80000 blocks in all periods, more than 65535"),
         ("length_s = 8", "length_s = 80", "frames"),
         ("length_s = 8", 'fcd = "a"\nsumocfg = "b"', "expected sumocfg or fcd, got both"),
         (

@@ -174,7 +174,7 @@ def test_warns_of_unknown_standard_errors(mini: Path, tmp_path: Path) -> None:
     sets = ["score.rank_by=seen_well", "score.others=[]"]
     record = egvs.run(loading.load(mini, sets), tmp_path / "run", jobs=1)
     (doubt,) = (it for it in collect_warnings([record.stages["score"].summary]) if it.rule == "no standard error")
-    assert "all vehicles in the region are in one of 4 groups of frames" in doubt.problem
+    assert "all vehicles in the region are in one of 4 blocks of frames" in doubt.problem
 
 
 def test_only_scores_over_vehicles_read_trajectories(mini: Path, tmp_path: Path) -> None:
@@ -218,7 +218,7 @@ def test_warns_of_undefined_target_scores(mini: Path, tmp_path: Path) -> None:
     values = read_scores(tmp_path / "run" / "scores.parquet")["expected_detections"].to_pylist()
     assert read_tpog(tmp_path / "run" / "tpog.parquet").counts.any()
     nobody = "no vehicle has its centre in the region of interest in the 40 frames examined"
-    assert [it.problem for it in told] == [f"{nobody}: expected_detections is NaN"]
+    assert [it.problem for it in told] == [f"{nobody}: no value for expected_detections"]
     assert math.isnan(values[0])
 
 

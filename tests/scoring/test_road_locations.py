@@ -40,7 +40,7 @@ def test_roads_that_leave_the_region_are_exits_and_others_pass(tmp_path: Path) -
 
 def test_in_the_junction_the_approach_and_the_turn_are_named_to_its_end(tmp_path: Path) -> None:
     said = words_of_lanes(RoadLocations.of(read(tmp_path), GRID.roi))
-    assert said[30.0, -4.8] == ["eastbound way straight through the junction, High Street"]
+    assert said[30.0, -4.8] == ["eastbound straight movement through the junction, High Street"]
     assert said[30.0, -1.6] == said[33.0, -1.0] == ["eastbound left turn in the junction, High Street"]
 
 
@@ -90,9 +90,9 @@ def test_lanes_in_words(turns: tuple[str, ...], words: str) -> None:
 def test_turns_in_words() -> None:
     assert [describe_turn(turn) for turn in ("left", "straight", "back", "")] == [
         "left turn in the junction",
-        "way straight through the junction",
+        "straight movement through the junction",
         "U-turn in the junction",
-        "way through the junction",
+        "movement through the junction",
     ]
 
 

@@ -150,13 +150,13 @@ def test_groups_too_short_for_the_traffic_are_joined_or_warned_of() -> None:
     assert warned
     doubts = [standard_errors.uncertainty_warnings(e, "scenario.toml: traffic.frames", 0.5) for e in warned]
     assert all("neighbouring blocks of 10 frames are correlated" in doubt.problem for (doubt,) in doubts)
-    assert {doubt.hint for (doubt,) in doubts} == {"Record at least 140 frames, better 560."}
+    assert {doubt.hint for (doubt,) in doubts} == {"Record at least 140 frames, preferably 560."}
     own = {"night": "scenario.toml: traffic.periods (night).length_s"}
     (doubt,) = standard_errors.uncertainty_warnings(warned[0], "scenario.toml: traffic.frames", 0.5, ["night"], own)
-    assert (doubt.where, doubt.hint) == (own["night"], "Set length_s to at least 70, better 280.")
+    assert (doubt.where, doubt.hint) == (own["night"], "Set length_s to at least 70, preferably 280.")
     (doubt,) = standard_errors.uncertainty_warnings(warned[0], "scenario.toml: traffic.frames", 0.5, ["day"], own)
     assert doubt.where == "scenario.toml: traffic.frames (day)"
-    assert doubt.hint == "Record at least 140 frames, better 560."
+    assert doubt.hint == "Record at least 140 frames, preferably 560."
     honest = [ScoreUncertainty.of(wandering(16, 0.0, seed), record(np.full(16, 10))) for seed in range(200)]
     assert np.mean([e.strata[0].joined > 1 for e in honest]) < 0.1
 

@@ -269,14 +269,14 @@ def test_las_without_crs_is_in_metres(mini: Path) -> None:
 def test_rejects_scan_far_from_the_region(mini: Path) -> None:
     utm = np.add(POINTS, (550_700, 5_635_200, 210))
     write_las(mini / "m.las", utm, None)
-    message = "They would be near it as eastings and northings of EPSG:32632. Save the points"
+    message = "Read as eastings and northings of EPSG:32632, they would be near it. Save the points"
     with pytest.raises(InputError, match=rf"site pole_a: points: .*m.las: coordinates .*{message}"):
         scan_file(mini, "m.las")
     write_las(mini / "m.las", utm, "EPSG:25833")
-    with pytest.raises(InputError, match=r"are [\d,]+ km from the region of interest as ETRS89 / UTM zone 33N"):
+    with pytest.raises(InputError, match=r"are [\d,]+ km from the region of interest, read as ETRS89 / UTM zone 33N"):
         scan_file(mini, "m.las")
     write_las(mini / "m.las", utm, "EPSG:25832")
-    with pytest.raises(InputError, match=r"from the region of interest as ETRS89 / UTM zone 32N, which must"):
+    with pytest.raises(InputError, match=r"from the region of interest, read as ETRS89 / UTM zone 32N, which must"):
         scan_file(mini, "m.las", crs="")
 
 
@@ -285,6 +285,6 @@ def test_rejects_points_in_degrees(mini: Path) -> None:
     point_clouds.write_points(mini / "m.ply", degrees)
     with pytest.raises(
         InputError,
-        match=r"m.ply: expected metres .*, got longitude and latitude: .*, 0 m from the region",
+        match=r"m.ply: expected metres .*, got longitude and latitude: .*, as degrees 0 m from the region",
     ):
         scan_file(mini, "m.ply")

@@ -209,13 +209,13 @@ def test_run_from_geojson_has_the_scores_of_csv(mini: Path, tmp_path: Path) -> N
                         feature({"type": "Point", "coordinates": None}, name="b"), point(0, name="b"),
                         feature({"type": "Point", "coordinates": "195"}, name="b"), point(0, 0, 3, 4, name="b"),
                         {**point(0, 0, 3), "properties": None})),
-        (collection(point(0, "195", 3, name="a")), "feature 0: y_m: expected a number.*text '195'"),
+        (collection(point(0, "195", 3, name="a")), "feature 0: y_m: expected a numeric coordinate.*text '195'"),
         (collection(point(0, True, 3, name="a")), "feature 0: y_m: .*finite number.*True"),
         (collection(point(0, None, 3, name="a")), "feature 0: y_m is missing"),
         (collection(point(0, 0, 10**400, name="a")), "is not valid JSON: a number has too many digits"),
         (collection(point(0, 0, 3, name="a", z_m=4)), "feature 0: z_m: there are two values, 4 and 3"),
         (collection(point(0, 0, 3, name="a", site="b")), "feature 0: site: there are two values, 'b' and 'a'"),
-        *((collection(point(0, 0, 3, **{"name": "a", key: value})), f"feature 0: {result}: expected a text")
+        *((collection(point(0, 0, 3, **{"name": "a", key: value})), f"feature 0: {result}: expected text")
           for key, result in (("name", "site"), ("sensor", "sensor"), ("points", "points"))
           for value in ([], ["b"], {}, True)),
         (collection(point(0, 0, 3, name="\ud800")), r"is not valid JSON: it is not valid text"),

@@ -161,7 +161,7 @@ def test_run_ranks_candidates_and_groups_them_by_pole(mini: Path, tmp_path: Path
     scores = egvs.read_scores(tmp_path / "run" / "scores.parquet").to_pylist()
     assert [row["pole"] for row in scores] == ["c01"] * 4 + ["c02"] * 4
     best = {pole: max((r for r in scores if r["pole"] == pole), key=lambda r: r["egvs"]) for pole in ("c01", "c02")}
-    table = out[out.index("best candidate of each pole") :]
+    table = out[out.index("best candidate on each pole") :]
     html = (tmp_path / "run" / "report.html").read_text()
     section = html[html.index("The best site on each pole") :]
     for pole, row in best.items():
@@ -172,7 +172,7 @@ def test_run_ranks_candidates_and_groups_them_by_pole(mini: Path, tmp_path: Path
 
 def test_no_table_of_poles_with_one_candidate_each(mini: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
     _, out, _ = run_egvs("run", mini, "--out", tmp_path / "run")
-    assert "best candidate of each pole" not in out
+    assert "best candidate on each pole" not in out
     assert "The best site on each pole" not in (tmp_path / "run" / "report.html").read_text()
 
 
@@ -204,7 +204,7 @@ PLACE = "site,x_m,y_m\np,0,0\n"
             {"aim": "roi", "pitch_deg": '"aim"'},
             r"row p: pitch_deg: .*'aim', but .*yaw_deg, 30",
         ),
-        (ROW, {"aim_m": "[0, 0, 1]"}, r"row p: aim: \(0, 0, 1\) is straight above or below the sensor"),
+        (ROW, {"aim_m": "[0, 0, 1]"}, r"row p: aim: \(0, 0, 1\) is directly above or below the sensor"),
         (ROW, {"aim": "roi", "sensor": "VLP-33"}, r"row p: sensor: unknown sensor 'VLP-33'. Did you mean VLP-32C"),
         ("site,x_m,y_m,z_m,aim_x_m\np,0,0,6,5\n", {}, r"row p: aim: one of aim_x_m and aim_y_m is missing"),
         ("site,x_m,y_m,z_m,aim\np,0,0,6,ROI\n", {}, r"row p: aim: .*'roi', got 'ROI'.*aim_x_m and aim_y_m"),
@@ -214,7 +214,7 @@ PLACE = "site,x_m,y_m\np,0,0\n"
         (
             "site,x_m,y_m,z_m,points\np,0,0,6,a.ply\n",
             {"pitch_deg": "[0, -10]"},
-            r"row p: points: .*one measured scan for 2 mounts",
+            r"row p: points: .*one measured scan is given for 2 mounts",
         ),
         (
             "site,x_m,y_m,z_m,pitch_deg\np,0,0,6,\np@0deg,1,1,5,3\n",
@@ -234,9 +234,9 @@ def test_rejects_invalid_aim(mini: Path, rows: str, keys: dict[str, str], messag
         ({"aim": "junction"}, r"sites\.aim: expected 'roi', got 'junction'"),
         ({"aim_m": "[1]"}, r"sites\.aim_m"),
         ({"pitch_deg": "[]"}, r"pitch_deg = \[\] leaves no candidate"),
-        ({"pitch_deg": "[0, 0]"}, "has a value twice"),
+        ({"pitch_deg": "[0, 0]"}, "contains a value twice"),
         ({"pitch_deg": "[-91]"}, r"sites\.pitch_deg"),
-        ({"heights_m": "[3, 3]"}, "has a value twice"),
+        ({"heights_m": "[3, 3]"}, "contains a value twice"),
         ({"heights_m": "[-3]"}, r"sites\.heights_m"),
     ],
 )
@@ -278,7 +278,7 @@ def test_rejects_heights_with_a_rule(mini: Path) -> None:
 
 def test_rejects_target_out_of_reach_of_the_middle_ray() -> None:
     up = Sensor("up", (30.0,), (0.0,), 1, 100.0, "")
-    with pytest.raises(InputError, match=r"up cannot be tilted so that its middle ray meets \(0.1, 0, 0\)"):
+    with pytest.raises(InputError, match=r"up cannot be pitched so that its central ray meets \(0.1, 0, 0\)"):
         sites.aiming_angles("here", (0, 0, 6), (0.1, 0, 0), 0.0, up)
     assert sensor.CATALOGUE["OS1-128"].middle_deg == (0.0, 0.0)
 

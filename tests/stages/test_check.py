@@ -122,8 +122,8 @@ def test_rule_drops_candidates_in_lanes_and_solids(street: Path) -> None:
     rule(street, "{ low_m=[6,-6], high_m=[26,9], spacing_m=5, heights_m=[3.0, 7.0] }")
     checked = check.check_scenario(egvs.load(street))
     assert [str(finding) for finding in checked.findings] == [
-        "sites.grid: 11 of 40 candidates are dropped, since no pole can stand there (10 in a lane, 1 in a solid). "
-        "Name a sensor on a gantry or an island in a file of sites."
+        "sites.grid: 11 of 40 candidates are dropped, because no pole can stand there (10 in a lane, 1 in a solid). "
+        "List sensors on gantries or islands in a sites file."
     ]
     scene = egvs.build_scene(egvs.load(street))
     assert (len(scene.sites), checked.sites) == (29, 29)
@@ -154,7 +154,7 @@ def test_rule_that_drops_nothing_is_checked_like_a_file(street: Path) -> None:
 
 def test_rejects_rule_without_feasible_candidate(street: Path) -> None:
     rule(street, "{ low_m=[6,1], high_m=[16,1], spacing_m=5, heights_m=[3.0] }")
-    assert found(street) == {"sites": ["scenario.toml: sites: no place can hold a pole (3 in a lane)"]}
+    assert found(street) == {"sites": ["scenario.toml: sites: no location can hold a pole (3 in a lane)"]}
 
 
 def test_rejects_visibility_of_dropped_site(street: Path) -> None:
@@ -167,7 +167,9 @@ def test_warns_of_beams_that_miss_region(street: Path) -> None:
     sensor = "{elevations_deg=[5,15],channels=4,azimuth_step_deg=1.0,range_m=100}"
     told = found(street, f"sensors.small={sensor}", "roi.center_m=[20,0,1.0]", "roi.size_m=[40,20,2]")
     assert told == {
-        "beams beside the region": ["[sites: no beam of 2 of 2 sites meets the region of interest: pole_a, pole_b]"]
+        "beams beside the region": [
+            "[sites: 2 of 2 sites have no beam that meets the region of interest: pole_a, pole_b]"
+        ]
     }
 
 
@@ -303,7 +305,7 @@ def test_check_command_without_findings_writes_nothing(street: Path, run_egvs) -
     code, printed, _ = run_egvs("check", street)
     assert (code, printed.splitlines()) == (
         0,
-        ["no errors and no warnings", "checked 2 sites, 3 solids and 2 lanes"],
+        ["no errors or warnings", "checked 2 sites, 3 solids and 2 lanes"],
     )
     assert sorted(street.rglob("*")) == before
 
@@ -393,7 +395,7 @@ def test_rejects_map_that_netconvert_rejects(street: Path, monkeypatch: pytest.M
     assert (code, err) == (2, "")
     code, _, err = run_egvs("run", street.name, "--set", 'traffic.network="map.osm"', "--out", "out")
     assert code == 2
-    assert err.startswith(f"egvs: {street.name}/map.osm: no network can be made of this map: netconvert ended with")
+    assert err.startswith(f"egvs: {street.name}/map.osm: no network can be built from this map: netconvert ended with")
     assert not list((street.parent / "out").glob("*.p*"))
     (street / "map.osm").write_text("<osm><node")
     code, _, err = run_egvs("run", street.name, "--set", 'traffic.network="map.osm"', "--out", "out")
@@ -413,7 +415,7 @@ def test_reports_counts_at_unknown_edges_and_kinds(street: Path) -> None:
 
 def test_rejects_count_on_impossible_route(street: Path) -> None:
     (told,) = found(street, 'traffic.counts=[{from_edge="east",to_edge="west",per_hour=9}]')["traffic"]
-    assert told == "scenario.toml: traffic.counts (east to west): there is no way from 'east' to 'west'"
+    assert told == "scenario.toml: traffic.counts (east to west): there is no route from 'east' to 'west'"
 
 
 def test_junction_with_invalid_walking_areas_drops_candidates() -> None:

@@ -30,7 +30,7 @@ def test_two_vehicles_per_frame_are_enough(mini: Path, tmp_path: Path) -> None:
     few = warnings(mini, tmp_path / "few", "roi.center_m=[30,0,2.5]", "roi.size_m=[20,20,5]")
     assert len(few["tpog"]) == 1
     assert few["tpog"][0].endswith(
-        " vehicles are in the region on average: the ranking is based on very little traffic"
+        " vehicles are in the region on average, so the ranking is based on very little traffic"
     )
 
 

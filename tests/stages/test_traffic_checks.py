@@ -58,13 +58,13 @@ def test_rejects_configuration_without_vehicles(street: Path, routes: str, addit
         (
             "<routes/>",
             '<additional><include href="more.xml"/></additional>',
-            "more.add.xml: <include href='more.xml'> makes SUMO read a further file",
+            "more.add.xml: <include href='more.xml'> makes SUMO read another file",
         ),
         ("<routes", "", "own.rou.xml: is not well-formed XML: unclosed token: line 1, column 0"),
         (
             '<!DOCTYPE routes [<!ENTITY a "b">]><routes><vehicle id="&a;" depart="0"/></routes>',
             "",
-            "own.rou.xml: declares XML entities or a document type, which are refused",
+            "own.rou.xml: declares XML entities or a document type, which are not allowed",
         ),
     ],
 )
@@ -107,7 +107,7 @@ def test_rejects_weights_of_too_large_mix(mini: Path, lasts: str) -> None:
         scenario.write_text(scenario.read_text().replace("frames = 40\n", ""))
     (told,) = found(mini, f"traffic.periods=[{','.join(of)}]", "tpog.blocks=2")["traffic"]
     assert told.startswith("scenario.toml: traffic.periods: weights 1e-300, 1e+300 of ")
-    assert told.endswith(" frames make a mix of more than 4,294,967,295 frames")
+    assert told.endswith(" frames need a mix of more than 4,294,967,295 frames")
     assert len(told) < 150
     assert (
         found(mini, f"traffic.periods=[{','.join(of).replace('1e-300', '3').replace('1e+300', '1')}]", "tpog.blocks=2")

@@ -49,7 +49,7 @@ def test_statuses_of_effects_in_plain_scene(mini: Path) -> None:
     assert statuses["rain"][1].startswith("the weather decides; by its formula, ")
     assert statuses["foliage"][1] == "not called for: there is no closed tree crown"
     assert "cannot act here: rated_range_m is missing" in statuses["range_limit"][1]
-    assert "people cannot be added to a finished FCD file" in statuses["pedestrians_bicycles"][1]
+    assert "pedestrians and bicycles cannot be added to a finished FCD file" in statuses["pedestrians_bicycles"][1]
     assert "no vehicle type has more than one part" in statuses["articulated"][1]
     assert "flat" in statuses["slope"][1] or "no network" in statuses["slope"][1] or "relief" in statuses["slope"][1]
 
@@ -99,7 +99,7 @@ def test_trees_and_long_trucks_call_for_their_effects(mini: Path, tmp_path: Path
         "1 of 2 tree crowns may stand between a site and the region",
     )
     assert statuses["articulated"].state == "called for"
-    assert statuses["articulated"].change.startswith("100.0% of the boxes in the last run get parts")
+    assert statuses["articulated"].change.startswith("100.0% of the boxes in the last run would be split into parts")
 
 
 @pytest.mark.slow
@@ -155,7 +155,7 @@ def test_ablation_runs_each_effect_alone_and_all_together(mini: Path, tmp_path: 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [(["--ablation"], "without a scenario"), (["{mini}", "--ablation"], "names no effect")],
+    [(["--ablation"], "without a scenario"), (["{mini}", "--ablation"], "has no effects")],
 )
 def test_rejects_ablation_without_effects(mini: Path, run_egvs, arguments: list[str], message: str) -> None:
     code, _, errors = run_egvs("effects", *(a.format(mini=mini) for a in arguments))

@@ -192,11 +192,11 @@ def test_labels_continue_after_z() -> None:
 def test_rejects_folders_without_finished_run(two: tuple[Path, Path], tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected at least two runs, got 1"):
         compare_runs(two[:1])
-    with pytest.raises(InputError, match=r"run\.json: no such file. Name a folder that egvs run has written."):
+    with pytest.raises(InputError, match=r"run\.json: no such file. Give a folder written by egvs run."):
         compare_runs([two[0], tmp_path / "nowhere"])
     record = json.loads((two[1] / "run.json").read_text())
     (two[1] / "scores.parquet").write_bytes((two[0] / "scores.parquet").read_bytes())
-    with pytest.raises(InputError, match="is not the file that the run wrote"):
+    with pytest.raises(InputError, match="was changed after the run"):
         compare_runs(two)
     del record["stages"]["score"]
     (two[1] / "run.json").write_text(json.dumps(add_checksum(record)))

@@ -168,7 +168,7 @@ def test_isolated_location_is_a_route_by_itself(tmp_path):
         ([turn("left", "right", 10, "tram")], r"counts \(left0A0 to .*\): the fleet has no kind 'tram'.*car, truck"),
         (
             [{"from_edge": "A0top0", "to_edge": "left0A0", "per_hour": 5}],
-            r"\(A0top0 to left0A0\): there is no way from 'A0top0' to 'left0A0'",
+            r"\(A0top0 to left0A0\): there is no route from 'A0top0' to 'left0A0'",
         ),
         ([{"edge": "a", "to_edge": "b", "per_hour": 1}], r"expected either edge, or both from_edge and to_edge"),
         ([{"to_edge": "b", "per_hour": 1}], r"expected either edge, or both from_edge and to_edge"),
@@ -212,10 +212,10 @@ def test_rejects_kind_without_trips(tmp_path):
     path = tmp_path / "n.net.xml"
     path.write_text(SMALL_NET)
     roads, rng = network.read_net_xml(path), np.random.default_rng(0)
-    with pytest.raises(InputError, match=r"kind 'boat' \(vClass ship\) can make no trip of at least 300 m"):
+    with pytest.raises(InputError, match=r"kind 'boat' \(vClass ship\) cannot make any trip of at least 300 m"):
         demand.origin_destination_pairs(roads, car(name="boat", vclass="ship"), drawn(min_trip_m=300), rng, "place")
     roads = network.Network(tuple(e for e in roads.edges if e.id == "in"), ())
-    with pytest.raises(InputError, match=r"kind 'bus' \(vClass bus\) may use no lane"):
+    with pytest.raises(InputError, match=r"no lane of the network allows kind 'bus' \(vClass bus\)"):
         demand.origin_destination_pairs(roads, car(name="bus", vclass="bus"), drawn(), rng, "place")
 
 

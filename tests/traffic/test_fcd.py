@@ -130,7 +130,7 @@ BAD = {
     "truncated gzip, XML": (gzip.compress(XML.encode())[:-30], r"damaged gzip"),
     "truncated gzip, Parquet": (gzip.compress(parquet_bytes())[:-30], r"damaged gzip"),
     "truncated XML": (XML[:-40].encode(), r"not well-formed XML"),
-    "XML of another kind": (b"<net/>", r"expected the root <fcd-export>, got <net>"),
+    "XML of another kind": (b"<net/>", r"expected the root element <fcd-export>, got <net>"),
     "XML without angle": (XML.replace('angle="90.00"', "").encode(), r"vehicle 'b' at time '0\.50' has no angle"),
     "XML with a bad number": (XML.replace('"-1.25"', '"west"').encode(), r"x: .*west"),
     "XML with NaN": (XML.replace('"360.00"', '"nan"').encode(), r"vehicle element 2: angle of vehicle 'a' is nan"),
@@ -138,7 +138,7 @@ BAD = {
     "truncated Parquet": (parquet_bytes()[:-30], r"cannot be read as Parquet"),
     "Parquet with a name that is no text": (
         parquet_bytes().replace(b"vehicle_angle", b"vehicle\xffangle"),
-        r"cannot be read as Parquet \(it is no utf-8 text: byte 7 is 0xff\)",
+        r"cannot be read as Parquet \(it is not utf-8 text: byte 7 is 0xff\)",
     ),
     "Parquet with an id that is no text": (parquet_bytes(b"\xff"), r"cannot be read as Parquet \(.*UTF8"),
     "infinite speed": (
@@ -212,7 +212,7 @@ def test_rejects_period_between_time_steps():
 
 
 def test_rejects_file_without_vehicles():
-    with pytest.raises(InputError, match="the file has no vehicle"):
+    with pytest.raises(InputError, match="the file contains no vehicles"):
         list(group_frames([], FrameWindow(2, 250), 10, "place"))
 
 
@@ -267,7 +267,8 @@ def test_rejects_row_group_above_limit(tmp_path, monkeypatch):
     columns |= {"timestep_time": np.zeros(n), "vehicle_id": ["v"] * n, "vehicle_type": ["car"] * n}
     pq.write_table(pa.table(columns), tmp_path / "f.parquet")
     with pytest.raises(
-        InputError, match=r"f.parquet: has a row group of 1 MB, unpacked\. The limit is 1 MB; set EGVS_MAX_UNPACKED"
+        InputError,
+        match=r"f.parquet: has a row group of 1 MB after decompression\. The limit is 1 MB; set EGVS_MAX_UNPACKED",
     ):
         read_all(tmp_path / "f.parquet")
 

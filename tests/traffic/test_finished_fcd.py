@@ -112,7 +112,7 @@ def test_warm_up_and_frame_period_apply_to_finished_file(mini: Path, tmp_path: P
 def test_rejects_fewer_frames_than_blocks(mini: Path, tmp_path: Path, run_egvs) -> None:
     code, _, output = run_egvs("run", without_frames(mini, ("blocks = 4", "blocks = 50")), "--out", tmp_path)
     assert code == 2
-    assert "tpog.blocks: 50 does not divide the 40 recorded frames" in output
+    assert "tpog.blocks: 50 does not divide the 40 recorded frames. Use a divisor of 40." in output
 
 
 def test_rejects_warm_up_longer_than_the_file(mini: Path, tmp_path: Path, run_egvs) -> None:
@@ -166,8 +166,7 @@ def test_names_all_types_without_size(mini: Path, tmp_path: Path, run_egvs) -> N
     code, _, output = run_egvs("run", mini, "--out", tmp_path)
     assert code == 2
     assert (
-        "traffic.kinds: the size of vehicle types of fcd.csv is unknown: 'lorry', 'tram'. Add a kind of each name"
-        in output
+        "traffic.kinds: unknown sizes of vehicle types of fcd.csv: 'lorry', 'tram'. Add a kind of each name" in output
     )
     assert "vtypes (known: car)" in output
     head, _, _ = fcd().rpartition(";car;")
@@ -218,7 +217,7 @@ def test_check_reports_missing_sizes(mini: Path, run_egvs) -> None:
     set_types(mini, "tram", "car", "lorry", "DEFAULT_VEHTYPE")
     code, output, _ = run_egvs("check", mini)
     assert code == 2
-    assert "the size of vehicle types of fcd.csv is unknown: 'lorry', 'tram'" in output
+    assert "unknown sizes of vehicle types of fcd.csv: 'lorry', 'tram'" in output
 
 
 @pytest.mark.slow
@@ -260,5 +259,5 @@ def test_rejects_roads_in_the_folder_for_sumo(mini: Path, run_egvs) -> None:
     (mini / "sumo").mkdir()
     (mini / "sumo" / "mine.net.xml").write_text(net_xml())
     code, _, output = run_egvs("run", mini, "--out", mini, "--set", "traffic.roads='sumo/mine.net.xml'")
-    assert code == 2 and "write over sumo/mine.net.xml, which the scenario names (traffic.roads)" in output, output
+    assert code == 2 and "overwrite sumo/mine.net.xml, which the scenario uses (traffic.roads)" in output, output
     assert (mini / "sumo" / "mine.net.xml").is_file()

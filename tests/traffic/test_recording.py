@@ -77,7 +77,7 @@ def test_rejects_running_sumo_with_wrong_step_or_late_clock(town, recorded, tmp_
     folder = recorded[3] / "sumo"
     with pytest.raises(InputError, match=r"expected steps of 0\.125 s, got 0\.25 s"):
         over_traci(scenario(town, network="net.xml", **SMALL, step_s=0.125), tmp_path, folder)
-    with pytest.raises(RunError, match=r"SUMO is at 70 s already, after the first frame at 60 s"):
+    with pytest.raises(RunError, match=r"SUMO is already at 70 s, after the first frame at 60 s"):
         over_traci(scenario(town, network="net.xml", **SMALL), tmp_path, folder, "--begin", "70")
     assert not (tmp_path / "trajectories.parquet").exists()
 

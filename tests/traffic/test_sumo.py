@@ -79,7 +79,7 @@ def test_rejects_incomplete_network_from_netconvert(tmp_path, monkeypatch):
 def test_rejects_traci_address_without_server(town, tmp_path):
     from sumolib.miscutils import getFreeSocketPort
 
-    with pytest.raises(InputError, match="no SUMO answers there"):
+    with pytest.raises(InputError, match="no SUMO simulation answers there"):
         run_stage(
             traffic, scenario(town, network="net.xml", **SMALL), tmp_path, traci=("localhost", getFreeSocketPort())
         )

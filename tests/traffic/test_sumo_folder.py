@@ -68,12 +68,12 @@ BAD = {
         InputError,
         r"traffic\.routes = 'r\.xml': no such file",
     ),
-    "empty network": (write("e.xml", "<net/>"), {"network": "e.xml"}, InputError, r"e\.xml: the network has no road"),
+    "empty network": (write("e.xml", "<net/>"), {"network": "e.xml"}, InputError, r"e\.xml: the network has no roads"),
     "no network inside": (
         write("e.xml", "<routes/>"),
         {"network": "e.xml"},
         InputError,
-        r"e\.xml: expected the root <net>, got <routes>",
+        r"e\.xml: expected the root element <net>, got <routes>",
     ),
     "malformed network": (
         write("e.xml", "<net><edge"),
@@ -94,7 +94,12 @@ BAD = {
         InputError,
         r"kind 'car' has the unknown vClass 'saucer'",
     ),
-    "trips too long": (nothing, {"network": "net.xml", "min_trip_m": 5000}, InputError, r"no trip of at least 5000 m"),
+    "trips too long": (
+        nothing,
+        {"network": "net.xml", "min_trip_m": 5000},
+        InputError,
+        r"cannot make any trip of at least 5000 m",
+    ),
     "routes off the network": (
         write("r.xml", CAR_ROUTE),
         {"network": "net.xml", "routes": ["r.xml"]},
@@ -125,7 +130,7 @@ BAD = {
         write("f.csv", f"{FCD}\n0;v;1;2;3;tram\n1;v;1;2;3;tram\n"),
         {"fcd": "f.csv", "frames": 1, "warmup_s": 0, "frame_period_s": 1},
         InputError,
-        r"the size of vehicle types of f.csv is unknown: 'tram'",
+        r"unknown sizes of vehicle types of f.csv: 'tram'",
     ),
     "too few frames in a finished file": (
         write("f.csv", f"{FCD}\n0;v;1;2;3;car\n1;v;1;2;3;car\n"),
@@ -147,7 +152,7 @@ def test_rejects_wrong_input(town, tmp_path, prepare, keys, error, message):
 
 def test_rejects_traci_with_finished_file(tmp_path):
     (tmp_path / "f.csv").write_text("x")
-    with pytest.raises(InputError, match="--traci: the scenario names a finished FCD file"):
+    with pytest.raises(InputError, match="--traci: the scenario uses a finished FCD file"):
         run_stage(traffic, scenario(tmp_path, fcd="f.csv"), tmp_path, traci=("localhost", 1))
 
 
@@ -155,7 +160,7 @@ def test_rejects_input_file_in_the_folder_for_sumo(town, tmp_path):
     user_file = tmp_path / "sumo" / "net.xml"
     user_file.parent.mkdir()
     shutil.copy(town / "net.xml", user_file)
-    with pytest.raises(InputError, match=r"sumo/net\.xml: an input file is in the folder that is emptied for SUMO"):
+    with pytest.raises(InputError, match=r"sumo/net\.xml: an input file is in a folder that egvs empties for SUMO"):
         run_stage(traffic, scenario(tmp_path, network="sumo/net.xml"), tmp_path)
     assert user_file.is_file()
 

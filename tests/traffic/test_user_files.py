@@ -63,7 +63,7 @@ def test_each_option_is_accepted_ignored_or_an_error(options, tmp_path):
 
 
 def test_rejects_unknown_option(tmp_path):
-    with pytest.raises(InputError, match=r"c\.sumocfg: colour = 'red': option of SUMO not supported"):
+    with pytest.raises(InputError, match=r"c\.sumocfg: colour = 'red': this SUMO option is not supported"):
         read_config(tmp_path, '<colour value="red"/>')
 
 
@@ -137,7 +137,7 @@ FURTHER = {
 @pytest.mark.parametrize("text", FURTHER.values(), ids=FURTHER.keys())
 def test_rejects_elements_that_read_further_files(tmp_path, text):
     (tmp_path / "a.xml").write_text(f"<additional>{text}</additional>")
-    with pytest.raises(InputError, match=r"makes SUMO read a further file"):
+    with pytest.raises(InputError, match=r"makes SUMO read another file"):
         user_files.copy_checked(tmp_path / "a.xml", tmp_path / "copy.xml")
     assert not (tmp_path / "copy.xml").exists()
     (tmp_path / "a.xml").write_text(
@@ -154,7 +154,7 @@ def test_checked_file_is_parsed_again_only_if_it_changed(tmp_path, monkeypatch):
         patch.setattr(user_files, "_checked_elements", None)
         assert user_files.copy_checked(path, tmp_path / "copy.xml") == []
     path.write_text('<routes><include href="f"/></routes>')
-    with pytest.raises(InputError, match="makes SUMO read a further file"):
+    with pytest.raises(InputError, match="makes SUMO read another file"):
         user_files.check_copyable(path)
 
 
@@ -258,7 +258,7 @@ def test_rejects_markup_in_attribute_name_of_a_kind(demand_folder, tmp_path):
 def test_rejects_entities_in_demand_files(demand_folder, tmp_path, which):
     scene = scenario_with_options(demand_folder)
     (demand_folder / which).write_text(BOMB)
-    message = rf"{which}: declares XML entities or a document type, which are refused"
+    message = rf"{which}: declares XML entities or a document type, which are not allowed"
     with pytest.raises(InputError, match=message):
         run_stage(traffic, scene, tmp_path / "out")
     assert not (tmp_path / "out" / "trajectories.parquet").exists()
@@ -286,7 +286,7 @@ def test_rejects_entities_in_a_map(demand_folder, tmp_path):
             '<additional><edgeData id="d" edgesFile="x"/></additional>',
             "<edgeData edgesFile='x'> makes SUMO read",
         ),
-        ('<edgeData id="d" file="/x"/>', r"its root <edgeData file=\.\.\.> has an output"),
+        ('<edgeData id="d" file="/x"/>', r"its root <edgeData file=\.\.\.> has an output attribute"),
         ('<a:additional xmlns:a="b"><a:edgeData file="/x"/></a:additional>', "<{b}additional> is in a namespace"),
         ("<additional><edgeData", "is not well-formed XML"),
     ],

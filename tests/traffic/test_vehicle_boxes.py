@@ -80,7 +80,7 @@ def test_rejects_implausible_size(width_m):
 
 
 def test_rejects_vehicle_twice_in_a_frame():
-    with pytest.raises(InputError, match="vehicle 'v' is twice in frame 3"):
+    with pytest.raises(InputError, match="vehicle 'v' occurs twice in frame 3"):
         vehicle_boxes.boxes_from_bumpers(group_of([(3, "v", "car", 0, 0, 0, 1)] * 2), SIZES, 1.0, "place")
 
 

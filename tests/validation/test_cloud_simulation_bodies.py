@@ -121,7 +121,7 @@ def test_scales_user_mesh_to_unit_box(mini):
         (
             "nan.ply",
             lambda p: trimesh.Trimesh([[0, 0, 0], [1, 0, np.nan], [0, 1, 1]], [[0, 1, 2]], process=False).export(p),
-            r"nan\.ply: a corner of a triangle is not finite",
+            r"nan\.ply: a triangle has a non-finite vertex",
         ),
     ],
 )

@@ -258,7 +258,7 @@ def test_rejects_full_disk_before_writing(four_sites, tmp_path, monkeypatch):
 
 def test_rejects_sites_that_cannot_be_exported(four_sites, tmp_path):
     (four_sites / "sites.csv").write_text("site,x_m,y_m,z_m,points\n..,10,8,3,\nmeasured,12,8,3,scan.ply\n")
-    with pytest.raises(InputError, match=r"site \.\.: its name cannot be the name of a folder here"):
+    with pytest.raises(InputError, match=r"site \.\.: its name is reserved in the exported folder"):
         write_dataset(load(four_sites), tmp_path / "out", sites=[".."], frames=2)
     with pytest.raises(InputError, match="site measured: its empty scan was measured"):
         write_dataset(load(four_sites), tmp_path / "out", sites=["measured"], frames=2)

@@ -158,7 +158,7 @@ def test_rejects_plan_of_other_scenario_and_warns_of_other_world(run_egvs, plann
         "validate", same, "--plan-from", out, "--out", tmp_path / "x", *OPTIONS, "--set", "statics.footprints=[]"
     )
     assert code == 0, error
-    assert "warning: placement.parquet: the plan was computed in another static world" in output
+    assert "warning: placement.parquet: the plan was computed with a different static world" in output
 
 
 def test_rejects_site_with_measured_scan(run_egvs, planned, tmp_path):

@@ -176,4 +176,4 @@ def test_reports_all_wrong_features_at_once(tmp_path: Path) -> None:
     assert len(messages) == 21
     assert "feature 1 (t): height_m: expected metres, at most 1e+08, got 'tall'" in messages[0]
     assert "feature 2 (w0): height_m is missing" in messages[1]
-    assert "4 more features are wrong" in messages[-1]
+    assert "4 more invalid features" in messages[-1]

@@ -122,8 +122,8 @@ def test_warns_about_unknown_types(tmp_path: Path) -> None:
     }
     assert [(w.rule, w.is_error) for w in file.warnings] == [("polygon types", False)]
     assert str(file.warnings[0]) == (
-        f"{tmp_path / 's.poly.xml'}: unknown types of polygons were left out: sculpture (2), (none) (1), mine.own (1). "
-        'Set each in [statics.polygon_types] to "solid", "ignore" or a height in metres'
+        f"{tmp_path / 's.poly.xml'}: polygons of unknown types were left out: sculpture (2), (none) (1), mine.own (1). "
+        'Set each in [statics.polygon_types] to "solid", "ignore" or a height in metres.'
     )
 
 
@@ -144,7 +144,7 @@ def test_keeps_all_parts_of_crossing_outline(tmp_path: Path) -> None:
     assert file.repaired["rings that cross themselves, each part that they enclose kept"] == 1
     assert file.ignored["outlines that enclose nothing of type building"] == 1
     (warning,) = file.warnings
-    assert warning.problem == "outlines that cross themselves: 1 (x). All parts that they enclose were kept"
+    assert warning.problem == "outlines that cross themselves: 1 (x). All areas that they enclose are kept"
 
 
 # ---- the user's own table
@@ -364,8 +364,8 @@ def test_drops_duplicate_solids(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("shape", "message"),
     [
-        ("", "poly x: shape: expected three points for an area, two for a line, got ''"),
-        ("1,2", "poly x: shape: expected three points for an area, two for a line, got '1,2'"),
+        ("", "poly x: shape: expected at least three points for an area, two for a line, got ''"),
+        ("1,2", "poly x: shape: expected at least three points for an area, two for a line, got '1,2'"),
         ("0,0 a,0 4,4", "poly x: expected shape='x,y x,y ...' in metres"),
         ("0,0 4 4,4", "poly x: expected shape='x,y x,y ...' in metres"),
         ("0,0 nan,0 4,4 0,4", "poly x: geometry: expected finite coordinates"),

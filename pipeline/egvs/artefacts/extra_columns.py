@@ -38,7 +38,7 @@ def extra_columns(rows: Sequence[ExtraValues], taken: Collection[str]) -> dict[s
 
 
 def _extra_column(values: list[ExtraValue]) -> pa.Array:
-    kinds = {type(value) for value in values if value is not None}
+    kinds = set(map(type, values)) - {type(None)}
     if kinds == {bool}:
         return pa.array(values, type=pa.bool_())
     if kinds == {int}:

@@ -94,4 +94,4 @@ def _check_box_values(path: Path, frame: IntArray, values: FloatArray) -> None:
     bad = int(np.flatnonzero(~is_valid)[0])
     shown = ", ".join(f"{name} = {value:g}" for name, value in zip(PITCHED_BOX_COLUMNS, values[bad], strict=True))
     problem = f"expected finite values and sizes from {MIN_BOX_M} m to {MAX_BOX_M:g} m, got {shown}"
-    raise InputError(f"{path}: frame {frame[bad]}", problem, "Correct the recording, and make the trajectories again.")
+    raise InputError(f"{path}: frame {frame[bad]}", problem, "Correct the recording, then run the traffic stage again.")

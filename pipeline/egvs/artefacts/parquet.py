@@ -28,7 +28,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import Grid
 from egvs.core.package_data import data_folder
 
-_REMAKE_HINT = "Make the file again."
+_REMAKE_HINT = "Create the file again."
 
 
 SCHEMA_VERSION = 1
@@ -49,11 +49,6 @@ def _table_schema(artefact: str) -> dict[str, Any]:
 def column_names(artefact: str) -> tuple[str, ...]:
     """Return all columns that the schema of an artefact declares."""
     return tuple(column["name"] for column in _table_schema(artefact)["fields"])
-
-
-def allows_extra_columns(artefact: str) -> bool:
-    """Whether an artefact may have columns that its schema does not name (``"partial"`` in Table Schema)."""
-    return "partial" in _table_schema(artefact).get("fieldsMatch", ())
 
 
 @cache
@@ -226,7 +221,7 @@ def _check_columns(path: Path, artefact: str, schema: pa.Schema) -> None:
         if index < 0 and column.name in required:
             raise InputError(path, f"the column {column.name!r} is missing", hint)
     unknown = sorted(set(schema.names) - set(known.names))
-    if unknown and not allows_extra_columns(artefact):
+    if unknown and "partial" not in _table_schema(artefact).get("fieldsMatch", ()):
         raise InputError(path, f"unknown columns {', '.join(unknown)}", hint)
 
 

@@ -62,6 +62,13 @@ class PlannedSensor:
     gain_by_refining: float = 0.0
     junction: str = ""
 
+    @property
+    def marked_order(self) -> str:
+        """The order, with a star if the sensor is already installed."""
+        if self.forced:
+            return f"{self.order}*"
+        return str(self.order)
+
 
 def plan_columns(sensors: Sequence[PlannedSensor]) -> dict[str, list[Any]]:
     """Return the columns of the table of these sensors, by name."""

@@ -32,7 +32,7 @@ _MAX_ROW_GROUPS = 1000
 
 _LISTED_KINDS = ("lane", "turn", "crossing")
 
-_REMAKE_HINT = "Make the file again."
+_REMAKE_HINT = "Create the file again."
 
 Rows = list[dict[str, Any]]
 
@@ -249,7 +249,7 @@ def read_visibility(path: str | Path, site: str) -> FloatArray:
     table, metadata = parquet.read_artefact(path, "visibility")
     rows = table.filter(pc.equal(table.column("site"), site))
     if len(rows) == 0 and site not in {entry["site"] for entry in metadata["sites"]}:
-        raise InputError(path, f"there is no site {site!r}", "Use a site that score.keep_visibility names.")
+        raise InputError(path, f"there is no site {site!r}", "Use a site listed in score.keep_visibility.")
     hits = np.zeros(Grid.from_json(metadata["grid"]).shape)
     hits[tuple(rows.column(name).to_numpy() for name in ("ix", "iy", "iz"))] = rows.column("hits").to_numpy()
     return hits
@@ -314,10 +314,7 @@ class PeriodRanking:
         sites = []
         for row in sorted(read_scores(run_folder.scores).to_pylist(), key=lambda row: int(row["rank"])):
             sites.append(SitePeriodRanks(row["site"], row["rank"], tuple(ranks[row["site"]])))
-        total_weight = sum(period.weight for period in periods)
-        return cls(
-            tuple(period.name for period in periods),
-            tuple(period.weight / total_weight for period in periods),
-            sum(period.frames for period in periods),
-            tuple(sites),
-        )
+        names = tuple(period.name for period in periods)
+        weights = [period.weight for period in periods]
+        shares = tuple(weight / sum(weights) for weight in weights)
+        return cls(names, shares, sum(period.frames for period in periods), tuple(sites))

@@ -106,7 +106,7 @@ class RunRecord:
         """
         path = RunFolder(folder).run_record
         if not path.is_file():
-            raise InputError(path, "no such file", "Name a folder that egvs run has written.")
+            raise InputError(path, "no such file", "Give a folder written by egvs run.")
         value = reading.read_json(path, _RERUN_HINT)
         has_checksum = isinstance(value, dict) and CHECKSUM_KEY in value
         if has_checksum and not has_valid_checksum(value):
@@ -115,7 +115,7 @@ class RunRecord:
         for key, expected_type in _RECORD_TYPES.items():
             actual = value.get(key) if isinstance(value, dict) else value
             if not isinstance(actual, expected_type):
-                raise InputError(path, f"is not the record of a run ({key!r} is {actual!r})", _RERUN_HINT)
+                raise InputError(path, f"is not a run record ({key!r} is {actual!r})", _RERUN_HINT)
 
         stages = {}
         if has_checksum:  # a file without a checksum comes from another version of this program

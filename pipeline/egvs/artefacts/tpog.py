@@ -87,8 +87,8 @@ def frame_multiplicities(weights: Sequence[float], frames: Sequence[int], where:
     total = sum(count * number for count, number in zip(smallest, frames, strict=True))
     if total > MAX_FRAMES:
         listed = f"weights {', '.join(f'{w:g}' for w in weights)} of {', '.join(map(str, frames))} frames"
-        problem = f"{listed} make a mix of more than {MAX_FRAMES:,} frames"
-        raise InputError(f"{where}.periods", problem, "Use weights with fewer digits that differ less.")
+        problem = f"{listed} need a mix of more than {MAX_FRAMES:,} frames"
+        raise InputError(f"{where}.periods", problem, "Use weights with fewer digits or closer to each other.")
     return smallest
 
 
@@ -101,7 +101,7 @@ def periods_from_metadata(metadata: dict[str, Any], path: Path) -> tuple[PeriodB
     for period in periods:
         if period.frames % period.block_frames:
             problem = f"{period.frames} frames do not fill blocks of {period.block_frames} frames"
-            raise InputError(path, problem, "Make the file again.")
+            raise InputError(path, problem, "Create the file again.")
     return periods
 
 
@@ -169,7 +169,7 @@ def read_tpog(path: str | Path, period: str | None = None) -> Tpog:
         for group in range(file.num_row_groups):  # one block each: memory does not grow with their number
             _add_block(parquet.read_row_group(file, group, path), path, grid, times, counts)
     if counts.max(initial=0) > frames:
-        raise InputError(path, f"a voxel is occupied in {counts.max()} of {frames} frames", "Make the file again.")
+        raise InputError(path, f"a voxel is occupied in {counts.max()} of {frames} frames", "Create the file again.")
     return Tpog(grid, frames, counts.reshape(grid.shape))
 
 
@@ -178,7 +178,7 @@ def _add_block(table: pa.Table, path: Path, grid: Grid, times: IntArray, counts:
     index = [table.column(name).to_numpy() for name in ("ix", "iy", "iz")]
     for axis, values, size in zip("xyz", index, grid.shape, strict=True):
         if len(values) and not (values.min() >= 0 and values.max() < size):
-            raise InputError(path, f"expected i{axis} from 0 to {size - 1}", "Make the file again.")
+            raise InputError(path, f"expected i{axis} from 0 to {size - 1}", "Create the file again.")
     if not len(table):
         return
     cells = np.ravel_multi_index(index, grid.shape)
@@ -190,7 +190,7 @@ def block_numbers(table: pa.Table, path: Path, blocks: int) -> NDArray[np.uint16
     """Return the block of each row of a TPOG; InputError where there is no such block."""
     block: NDArray[np.uint16] = table.column("block").to_numpy()
     if block.max(initial=0) >= blocks:
-        raise InputError(path, f"expected blocks 0 to {blocks - 1}, got {block.max()}", "Make the file again.")
+        raise InputError(path, f"expected blocks 0 to {blocks - 1}, got {block.max()}", "Create the file again.")
     return block
 
 

@@ -63,12 +63,12 @@ class TrafficFrame:
 
     def several_parts(self) -> NDArray[np.bool_]:
         """Return which boxes belong to vehicles with more than one part, (n,) bool."""
-        articulated = {name for name, part in zip(self.vehicles, self.part.tolist(), strict=True) if part}
-        return np.array([name in articulated for name in self.vehicles], dtype=np.bool_)
+        vehicles = np.array(self.vehicles, dtype=np.str_)
+        return np.isin(vehicles, vehicles[self.part > 0])
 
     def are_vehicles(self) -> NDArray[np.bool_]:
         """Return which boxes are vehicles or parts of them, (n,) bool."""
-        return np.array([kind not in NON_VEHICLE_KINDS for kind in self.kinds], dtype=np.bool_)
+        return np.isin(self.kinds, list(NON_VEHICLE_KINDS), invert=True)
 
     def target_rows(self, roi: Roi, people: Collection[str] = ()) -> NDArray[np.int64]:
         """Return the rows of the targets: vehicles whose centre is in the region of interest (half-open, as voxels).
@@ -77,8 +77,7 @@ class TrafficFrame:
         """
         centre = self.boxes[:, :3] - np.asarray(roi.origin_m)
         inside = ((centre >= 0.0) & (centre < np.asarray(roi.size_m))).all(axis=1)
-        named = np.array([kind in people for kind in self.kinds], dtype=np.bool_)
-        return np.flatnonzero(inside & (self.are_vehicles() | named))
+        return np.flatnonzero(inside & (self.are_vehicles() | np.isin(self.kinds, list(people))))
 
 
 def spaced_frames(recorded: int, count: int) -> NDArray[np.int64]:

@@ -209,10 +209,10 @@ def _check_request(count: int | None, budget: float | None) -> dict[str, float]:
     """Return the request by the name of its option; raise an InputError if it is invalid."""
     requested = {key: float(value) for key, value in (("count", count), ("budget", budget)) if value is not None}
     if len(requested) != 1:
-        problem = f"expected one of them, got {' and '.join(requested) or 'neither'}"
-        raise InputError("--count, --budget", problem, "Give for example --count 20 or --budget 800000.")
+        problem = f"expected exactly one of the two, got {' and '.join(requested) or 'neither'}"
+        raise InputError("--count, --budget", problem, "Use, for example, --count 20 or --budget 800000.")
     if budget is not None and not 0 < budget < float("inf"):
-        raise InputError("--budget", f"expected a cost above 0, got {budget:g}", "Give for example --budget 800000.")
+        raise InputError("--budget", f"expected a cost above 0, got {budget:g}", "Use, for example, --budget 800000.")
     return requested
 
 
@@ -315,8 +315,8 @@ def overlap_warnings(jobs: Sequence[Job]) -> Iterator[Diagnostic]:
     names = ", ".join(pairs[:_MAX_PAIRS])
     if len(pairs) > _MAX_PAIRS:
         names += f" and {len(pairs) - _MAX_PAIRS} more pairs"
-    problem = f"the regions of {names} overlap, so the common part counts twice in the city's score"
-    yield Diagnostic("regions overlap", "junctions", problem, "Use smaller regions, or one of the two junctions.")
+    problem = f"the regions of {names} overlap, so the overlap counts twice in the city's score"
+    yield Diagnostic("regions overlap", "junctions", problem, "Use smaller regions, or drop one of the two junctions.")
 
 
 def _overlap(box: Roi, other: Roi) -> bool:
@@ -333,5 +333,5 @@ def _overlap(box: Roi, other: Roi) -> bool:
 
 def _no_gain_warnings(city: City, names: Sequence[str]) -> Iterator[Diagnostic]:
     if names:
-        problem = f"no site of {', '.join(names)} sees any traffic, so no sensor is planned there"
+        problem = f"no site at {', '.join(names)} sees any traffic, so no sensor is planned there"
         yield Diagnostic("junctions unseen", str(city.file), problem, "Use more traffic, or other candidates.")

@@ -170,7 +170,7 @@ def create_city(
     """
     name = openstreetmap.check_new_folder(folder)
     if radius_m is not None and around is None:
-        raise InputError("--radius", f"{radius_m:g} m around no point", "Add --around LAT,LON.")
+        raise InputError("--radius", "given without --around", "Add --around LAT,LON.")
     extract = read_extract(osm)
     check_inside_extract(extract, around, "--around")
 
@@ -264,7 +264,7 @@ def _junctions_from_table(streets: Streets, path: Path) -> Iterator[tuple[str, S
         junction = _nearest_junction(streets, Point(streets.to_xy([lon_deg], [lat_deg])[0]), where)
         if junction.id in names_by_id:
             problem = f"these coordinates select the same junction as {names_by_id[junction.id]}"
-            raise InputError(where, problem, "Give each junction one row.")
+            raise InputError(where, problem, "Use one row per junction.")
         names_by_id[junction.id] = row["junction"]
         yield row["junction"], junction
 

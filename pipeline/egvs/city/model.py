@@ -46,10 +46,10 @@ class CityModel(StrictModel):
 
     name: Name = Field("", min_length=0, validate_default=False, description="Defaults to the folder's name")
     description: str = ""
-    attribution: str = Field("", description="Whose map this is; shown with results")
+    attribution: str = Field("", description="Attribution of the map, shown with results")
     seed: int = Field(0, ge=0, le=2**63 - 1, description="Seed of the traffic simulation")
     traffic: TrafficConfig = Field(description="The traffic of all junctions, as in a scenario")
-    effects: EffectsConfig = Field(EffectsConfig(), description="Effects that add traffic: people on foot, on bicycles")
+    effects: EffectsConfig = Field(EffectsConfig(), description="Effects that add traffic: pedestrians and bicycles")
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def load_city(folder: str | Path) -> City:
     path = Path(folder)
     file = path if path.is_file() else path / CITY_FILE
     if not file.is_file():
-        raise InputError(path, f"there is no {CITY_FILE} in this folder", "Name a folder created by egvs city new.")
+        raise InputError(path, f"there is no {CITY_FILE} in this folder", "Give a folder created by egvs city new.")
     values = reading.read_toml(file)
     values.setdefault("name", default_name(file.parent) or "city")
     try:
@@ -171,7 +171,7 @@ def read_junction_rows(path: Path, required: Sequence[str]) -> Iterator[tuple[st
     """
     hint = f"Use the columns {', '.join(required)}, separated by commas."
     if not path.is_file():
-        raise InputError(path, "no such file", f"Name a CSV table of junctions. {hint}")
+        raise InputError(path, "no such file", f"Give a CSV table of junctions. {hint}")
     data = limits.read_bytes(path, limits.DOCUMENT)
     names = set[str]()
     try:
@@ -200,7 +200,7 @@ def _check_name(where: str, name: str, other_names: Collection[str]) -> None:
     except ValidationError:
         raise InputError(f"{where}: junction", f"invalid name {repr(name)[:80]}", NAME_DESCRIPTION) from None
     if name.casefold() in other_names:
-        raise InputError(where, "this name occurs twice", "Give each junction a name of its own.")
+        raise InputError(where, "this name occurs twice", "Give each junction a unique name.")
 
 
 def _parse_junction(where: str, row: dict[str, str]) -> CityJunction:

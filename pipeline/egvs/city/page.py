@@ -95,7 +95,8 @@ def junction_map(
         Title of the colour bar, and text for screen readers.
     """
     frame = map_frame(box, prefix)
-    low, high = min(junction.value for junction in junctions), max(junction.value for junction in junctions)
+    values = [junction.value for junction in junctions]
+    low, high = min(values), max(values)
     has_numbers = len(junctions) <= _MAX_NUMBERS
     radius = 9.0 if has_numbers else 6.0
 
@@ -118,7 +119,7 @@ def map_frame(box: Box, prefix: str = "") -> MapFrame:
 
 def map_box(positions_m: Sequence[tuple[float, float]]) -> Box:
     """Return the box around positions (x, y), with a margin."""
-    xs, ys = [x for x, _ in positions_m], [y for _, y in positions_m]
+    xs, ys = zip(*positions_m, strict=True)
     extent_m = max(max(xs) - min(xs), max(ys) - min(ys))
     margin_m = max(_MARGIN_SHARE * extent_m, _MIN_EXTENT_M / 2)
     return min(xs) - margin_m, min(ys) - margin_m, max(xs) + margin_m, max(ys) + margin_m
@@ -221,7 +222,7 @@ def format_headline(results: Sequence[JunctionResult]) -> str:
         return f"{name}, the only junction: {first.best.by.sentence(first.score)}"
     n_best = sum(result.rank == 1 for result in results)
     if n_best > 1:
-        return f"{n_best} of {len(results)} junctions share the first place"
+        return f"{n_best} of {len(results)} junctions share first place"
     return f"Of {len(results)} junctions, a first sensor has the largest gain at {name}"
 
 

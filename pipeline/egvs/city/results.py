@@ -296,7 +296,7 @@ def read_city_scores(out: str | Path) -> pa.Table:
     """
     folders = sorted((Path(out) / SCORES_DATASET).glob(f"{_PARTITION_PREFIX}*"))
     if not folders:
-        hint = "Name the folder of a finished egvs city run."
+        hint = "Give the folder of a finished egvs city run."
         raise InputError(Path(out) / SCORES_DATASET, "there are no scores in this folder", hint)
     tables = []
     for folder in folders:

@@ -133,7 +133,7 @@ def _process_count(cluster: str) -> int | None:
     if match is None or not 1 <= int(match[1]) <= _MAX_PROCESSES:
         expected = f"local, processes=N (1 to {_MAX_PROCESSES}), or the address of a scheduler"
         problem = f"expected {expected}, got {repr(cluster)[:80]}"
-        raise InputError("--cluster", problem, "An address is for example tcp://host:8786.")
+        raise InputError("--cluster", problem, "Use an address such as tcp://host:8786.")
     return int(match[1])
 
 
@@ -176,7 +176,7 @@ class LocalWorkers:
             return
         if self._replacements == _MAX_REPLACEMENTS:
             raise RunError(
-                f"{len(missing)} worker processes ended as soon as they were started, usually for lack of memory. "
+                f"{len(missing)} worker processes died at start-up, usually for lack of memory. "
                 "Use fewer processes; finished results are kept."
             )
         self._last_complete = now
@@ -356,7 +356,7 @@ def make_run_settings() -> RunSettings:
     """Return settings for a new city run; raise an InputError if there is no store, or it cannot be reached."""
     folder, max_bytes = store.read_store_settings()
     if folder is None:
-        problem = "is empty, so there is no store, which a city run needs to pass results between workers"
+        problem = "is empty, so there is no store; a city run needs one to pass results between workers"
         raise InputError(store.STORE_VARIABLE, problem, "Set it to a folder that all workers can access.")
     url = store.remote_url()
     if url is not None:

@@ -101,7 +101,7 @@ class RunSettings:
         """Use the store within the block; raise a RunError if this worker runs another version of the program."""
         if self.program != program_id():
             raise RunError(
-                f"this worker runs another version of egvs ({program_id()}, expected {self.program}). "
+                f"this worker runs a different version of egvs ({program_id()}, expected {self.program}). "
                 "Install the same version on every machine."
             )
         with store.use_store(self.store, self.store_bytes):
@@ -271,7 +271,7 @@ def read_part(path: Path) -> Iterator[ScoredSite]:
         for value in metadata:
             yield _decode(value, arrays)
     except (OSError, EOFError, ValueError, LookupError, TypeError, zipfile.BadZipFile) as error:
-        raise InputError(path, f"cannot be read as a part of scores ({error})", "Remove it, and run again.") from None
+        raise InputError(path, f"cannot be read as partial scores ({error})", "Remove it, and run again.") from None
 
 
 class _PartEncoder:

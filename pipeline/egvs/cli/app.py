@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="egvs",
-    help="Rank candidate sites of roadside LiDARs by the Entropy-Guided Visibility Score.",
+    help="Rank candidate sites for roadside LiDARs by the Entropy-Guided Visibility Score.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -131,10 +131,10 @@ def traffic(
     set_: Set = None,
     traci: Annotated[
         str | None,
-        typer.Option(metavar="HOST:PORT", help="Record from a SUMO that is already running with --remote-port."),
+        typer.Option(metavar="HOST:PORT", help="Record from a running SUMO, started with --remote-port."),
     ] = None,
 ) -> None:
-    """Simulate the traffic with SUMO: trajectories.parquet."""
+    """Simulate the traffic with SUMO; writes trajectories.parquet."""
     stage_options: dict[str, Any] = {}
     if traci is not None:
         stage_options["traci"] = cli_options.host_and_port(traci)
@@ -143,13 +143,13 @@ def traffic(
 
 @app.command()
 def statics(scenario: ScenarioPath, out: Out = None, set_: Set = None) -> None:
-    """Build the static world: statics.ply."""
+    """Build the static world; writes statics.ply."""
     _run_stage("statics", scenario, out, set_)
 
 
 @app.command()
 def tpog(scenario: ScenarioPath, out: Out = None, set_: Set = None) -> None:
-    """Count how often each voxel is occupied by traffic: tpog.parquet."""
+    """Count how often each voxel is occupied by traffic; writes tpog.parquet."""
     _run_stage("tpog", scenario, out, set_)
 
 
@@ -165,7 +165,7 @@ def scan(
     ] = None,
     cloud: Annotated[str, typer.Option(metavar="FORMAT", help="Format of --points: ply or pcd.")] = "ply",
 ) -> None:
-    """Cast an empty scan (without traffic) from every site: scans.parquet."""
+    """Cast an empty scan (without traffic) from every site; writes scans.parquet."""
     if cloud not in ("ply", "pcd"):
         raise InputError("--cloud", f"expected ply or pcd, got {cloud!r}", "Use --cloud ply.")
     stage_options: dict[str, Any] = {}
@@ -183,14 +183,14 @@ def score(
     audit: Audit = False,
     top: Top = None,
 ) -> None:
-    """Score and rank the sites: scores.parquet."""
+    """Score and rank the sites; writes scores.parquet."""
     stage_options = {"audit": True} if audit else {}
     _run_stage("score", scenario, out, set_, jobs, top, **stage_options)
 
 
 @app.command()
 def report(scenario: ScenarioPath, out: Out = None, set_: Set = None) -> None:
-    """Write the report of a run: report.html."""
+    """Write the report of a run, report.html."""
     _run_stage("report", scenario, out, set_)
 
 
@@ -220,7 +220,7 @@ def _run_stage(
 def verify(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a finished run.")],
     scenario: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="The scenario's folder, if it was moved since the run.")
+        Path | None, typer.Option(metavar="FOLDER", help="The scenario's folder, if it has moved since the run.")
     ] = None,
     jobs: Jobs = None,
 ) -> None:
@@ -259,10 +259,8 @@ def accuracy(
     out: Out = None,
     set_: Set = None,
     jobs: Jobs = None,
-    tolerance: Annotated[
-        float, typer.Option(help="Largest relative error of the recommended setting, e.g. 0.02 for 2 %.")
-    ] = 0.02,
-    budget: Annotated[str, typer.Option(metavar="TIME", help="Time for the study, e.g. 60s or 10m.")] = "10m",
+    tolerance: Annotated[float, typer.Option(help="Largest relative error to accept, e.g. 0.02 for 2 %.")] = 0.02,
+    budget: Annotated[str, typer.Option(metavar="TIME", help="Time limit of the study, e.g. 60s or 10m.")] = "10m",
     seeds: Annotated[
         int,
         typer.Option(
@@ -291,12 +289,12 @@ def effects(
     ] = None,
     set_: Set = None,
     ablation: Annotated[
-        bool, typer.Option("--ablation", help="Run each effect of the scenario alone, and print what it changes.")
+        bool, typer.Option("--ablation", help="Run each effect of the scenario on its own, and print what it changes.")
     ] = False,
     out: Out = None,
     jobs: Jobs = None,
 ) -> None:
-    """List the effects; for a scenario, which ones it calls for, why, and what they change."""
+    """List the effects; with a scenario, show which ones it calls for, why, and what they change."""
     from egvs.cli import run_tables
     from egvs.cli.console import ProgressDisplay
     from egvs.studies import effect_study
@@ -314,20 +312,18 @@ def effects(
     run_tables.print_effects(statuses, costs)
 
     if any(status.change == effect_study.UNTRIED for status in statuses):
-        print(f"to measure the expected changes, first: {cli_options.command('run', scenario, set_, out)}")
+        print(f"to measure the expected changes, first run: {cli_options.command('run', scenario, set_, out)}")
     if recommended := [f"effects.{status.name}={{}}" for status in statuses if status.state == "called for"]:
         overrides = [*(set_ or ()), *recommended]
-        print(f"with all effects that are called for: {cli_options.command('run', scenario, overrides, out)}")
+        print(f"to run with all effects that are called for: {cli_options.command('run', scenario, overrides, out)}")
     if unmeasured := _unmeasured_effects(statuses, costs, loaded):
         study = cli_options.command("accuracy", scenario, set_, out)
-        print(f"to measure what {unmeasured} cost and change: {study}, or use --ablation")
+        print(f"to measure the cost and effect of {unmeasured}: {study}, or use --ablation")
 
     if not ablation:
         return
     if not loaded.effects.named:
-        raise InputError(
-            "--ablation", "the scenario names no effect", "Name one, e.g. --set effects.rain.rate_mm_h=20."
-        )
+        raise InputError("--ablation", "the scenario has no effects", "Add one, e.g. --set effects.rain.rate_mm_h=20.")
     with ProgressDisplay() as screen:
         changes = effect_study.run_ablation(loaded, folder, jobs=jobs, progress=screen.progress)
     run_tables.print_ablation(changes)
@@ -352,7 +348,7 @@ def explore(
     folder: Annotated[
         Path, typer.Argument(metavar="RUN|SCENARIO", help="Folder of a run, or a scenario, which is run first.")
     ],
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page on this machine; 0 for any free.")] = 0,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page on this machine; 0 for any.")] = 0,
     browser: Annotated[bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")] = True,
     out: Out = None,
     set_: Set = None,
@@ -367,7 +363,7 @@ def explore(
     from egvs.cli.console import ProgressDisplay
     from egvs.core import files, plugins
 
-    plugins.require_libraries("egvs explore", "explore", "viser")
+    plugins.require_libraries("egvs explore", "explore", "viser", "PIL")
     from egvs.explore.page import Page, check_port_free
     from egvs.explore.settings import open_session
 
@@ -413,7 +409,9 @@ def export(
     ] = None,
     site: Annotated[
         list[str] | None,
-        typer.Option(metavar="SITE", help="For geotiff: a site whose view is exported (repeatable); the best default."),
+        typer.Option(
+            metavar="SITE", help="For geotiff: a site whose view is exported (repeatable); default: the best."
+        ),
     ] = None,
 ) -> None:
     """Export sites, plan, blind spots and footprints of a run for GIS and spreadsheets, or rasters."""
@@ -471,12 +469,12 @@ def sensors() -> None:
 
 @app.command()
 def new(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="The scenario's folder, which is created.")],
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the new scenario.")],
     osm: Annotated[
         Path, typer.Option(metavar="FILE", help="An OpenStreetMap extract (.osm, .osm.xml, .osm.pbf, also gzipped).")
     ],
     at: Annotated[
-        str | None, typer.Option(metavar="LAT,LON", help="Use the junction nearest to this point; default: largest.")
+        str | None, typer.Option(metavar="LAT,LON", help="Use the junction nearest to this point, not the largest.")
     ] = None,
     lefthand: Annotated[bool, typer.Option("--lefthand", help="Traffic drives on the left.")] = False,
     walk: Annotated[bool, typer.Option("--walk", help="Include sidewalks and crossings, for pedestrians.")] = False,
@@ -491,7 +489,9 @@ def new(
     from egvs.cli import run_tables
     from egvs.importers import openstreetmap
 
-    location = cli_options.latitude_and_longitude(at) if at is not None else None
+    location = None
+    if at is not None:
+        location = cli_options.latitude_and_longitude(at)
     surroundings_m: float | None = openstreetmap.SURROUNDINGS_M
     if surroundings is not None:
         surroundings_m = cli_options.radius_m(surroundings)
@@ -507,7 +507,8 @@ def store(
         bool, typer.Option("--prune", help="Remove the least recently used entries beyond --max.")
     ] = False,
     max_size: Annotated[
-        str | None, typer.Option("--max", metavar="SIZE", help="Size for --prune, e.g. 2G; default: EGVS_STORE_MAX_GB.")
+        str | None,
+        typer.Option("--max", metavar="SIZE", help="Limit for --prune, e.g. 2G; default: EGVS_STORE_MAX_GB."),
     ] = None,
     clear: Annotated[bool, typer.Option("--clear", help="Remove all entries.")] = False,
 ) -> None:
@@ -516,7 +517,7 @@ def store(
     from egvs.runs.store import Store
 
     if clear and prune:
-        raise InputError("--clear", "given together with --prune", "Use --clear to remove all entries.")
+        raise InputError("--clear", "cannot be combined with --prune", "Use --clear alone to remove all entries.")
     if max_size is not None and not prune:
         raise InputError("--max", "used without --prune", "Run egvs store --prune --max 2G.")
     cache = Store.default()

@@ -39,13 +39,13 @@ CitySet = Annotated[
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Override one key of every junction, e.g. score.gamma=2 (not of the traffic).",
+        help="Override a key of every junction, e.g. score.gamma=2; not for traffic (repeatable).",
     ),
 ]
 
 
 def new(
-    folder: Annotated[Path, typer.Argument(metavar="CITY", help="The city's folder, which is created.")],
+    folder: Annotated[Path, typer.Argument(metavar="CITY", help="Folder of the new city.")],
     osm: Annotated[
         Path, typer.Option(metavar="FILE", help="An OpenStreetMap extract (.osm, .osm.xml, .osm.pbf, also gzipped).")
     ],
@@ -68,8 +68,11 @@ def new(
     from egvs.city import creation
     from egvs.cli.console import ProgressDisplay
 
-    centre = options.latitude_and_longitude(around, "--around") if around is not None else None
-    radius_m = options.length_m(radius, "--radius") if radius is not None else None
+    centre = radius_m = None
+    if around is not None:
+        centre = options.latitude_and_longitude(around, "--around")
+    if radius is not None:
+        radius_m = options.length_m(radius, "--radius")
     with ProgressDisplay("city") as screen:
         created = creation.create_city(
             folder, osm, around=centre, radius_m=radius_m, which=junctions, lefthand=lefthand, walk=walk,
@@ -143,7 +146,7 @@ def _run_options(
 
 
 def _print_new(city: NewCity) -> None:
-    from egvs.cli.console import WIDE, Column, console, make_table
+    from egvs.cli.console import WIDE, Column, console, make_table, print_mapping
 
     columns: list[Column[Any]] = [
         Column("junction", lambda row: row.id, "left"),
@@ -154,19 +157,19 @@ def _print_new(city: NewCity) -> None:
     ]
     out = console(WIDE)
     out.print(make_table(columns, city.junctions))
-    _print_mapping({"folder": str(city.folder)} | city.to_json())
+    print_mapping({"folder": str(city.folder)} | city.to_json(), _WIDTH)
     out.print(f"next: egvs city traffic {city.folder}")
 
 
 def _print_traffic(folder: Path, result: CityTraffic) -> None:
     from egvs.city import model
-    from egvs.cli.console import console
+    from egvs.cli.console import console, print_mapping
     from egvs.core.errors import WARNINGS_KEY, collect_warnings
 
     out = console(_WIDTH)
-    _print_mapping(_shown_statistics(result.summary))
+    print_mapping(_shown_statistics(result.summary), _WIDTH)
     for name, summary in result.summary.get("periods", {}).items():
-        _print_mapping({name: _shown_statistics(summary)})
+        print_mapping({name: _shown_statistics(summary)}, _WIDTH)
     if result.linked:
         junctions = ", ".join(result.linked)
         out.print(f"{model.JUNCTIONS_FOLDER}/*/scenario.toml: added the city's files and periods to {junctions}")
@@ -177,7 +180,7 @@ def _print_traffic(folder: Path, result: CityTraffic) -> None:
     most = max(result.rows, key=lambda name: result.rows[name])
     out.print(f"rows: {result.rows[most]:,} at {most} (the most), {result.rows[fewest]:,} at {fewest} (the fewest)")
     if not result.is_new:
-        out.print("nothing to do: neither the traffic nor a region changed")
+        out.print("nothing to do: neither the traffic nor any region has changed")
     out.print(str(folder / "traffic"))
 
 
@@ -188,16 +191,6 @@ _STATISTICS = (
 
 def _shown_statistics(summary: Mapping[str, Any]) -> dict[str, Any]:
     return {key: summary[key] for key in _STATISTICS if summary.get(key) not in (None, [])}
-
-
-def _print_mapping(values: Mapping[str, Any]) -> None:
-    """Print one line per key."""
-    from egvs.cli.console import console, format_value, format_values
-
-    out = console(_WIDTH)
-    for key, value in values.items():
-        text = format_values(value) if isinstance(value, dict) else format_value(value)
-        out.print(f"{key}: {text}")
 
 
 def describe_done(done: JobResult) -> str:
@@ -241,7 +234,7 @@ def print_plan(placed: CityPlacement) -> None:
     plan = placed.plan
     label = gain_label(plan.rank_by)
     columns: list[Column[Any]] = [
-        Column("", lambda sensor: f"{sensor.order}*" if sensor.forced else str(sensor.order)),
+        Column("", lambda sensor: sensor.marked_order),
         Column("junction", lambda sensor: sensor.junction, "left"),
         Column("site", lambda sensor: sensor.site, "left"),
         Column("z m", lambda sensor: f"{sensor.z_m:g}"),
@@ -258,12 +251,14 @@ def print_plan(placed: CityPlacement) -> None:
         out.print("* already installed")
 
     cost = f" for {plan.cost:g}" if plan.cost else ""
-    share = plan.joint / plan.joint_of_all if plan.joint_of_all > 0 else 0.0
+    share = 0.0
+    if plan.joint_of_all > 0:
+        share = plan.joint / plan.joint_of_all
     proved = math.floor(plan.certificate * 1e4) / 1e2  # never rounded up
     out.print(
         f"{len(plan.sensors)} sensors at {len(plan.by_junction)} of {plan.junctions} junctions{cost}: "
         f"{label.label} {label.value(plan.joint)}, {share:.1%} of the score of all {plan.candidates:,} candidates "
-        f"together; proved: at least {proved:.2f} % of the best possible"
+        f"together; proved: at least {proved:.2f} % of the best possible score"
     )
     for path in placed.files:
         out.print(str(path))

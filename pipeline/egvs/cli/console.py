@@ -111,6 +111,23 @@ def format_values(values: Mapping[str, Any]) -> str:
     return "; ".join(shown)
 
 
+def format_or_dash(value: float | None, spec: str) -> str:
+    """Return a number as text, with a format such as ".2%"; "-" if it is unknown."""
+    if value is None:
+        return "-"
+    return f"{value:{spec}}"
+
+
+def print_mapping(values: Mapping[str, Any], file_width: int) -> None:
+    """Print one line per key; ``file_width`` is that of :func:`console`."""
+    out = console(file_width)
+    for key, value in values.items():
+        text = format_value(value)
+        if isinstance(value, dict):
+            text = format_values(value)
+        out.print(f"{key}: {text}")
+
+
 def format_value(value: Any) -> str:
     """Return a value as text; a mapping of counts as "3 pole, 2 sign"."""
     if isinstance(value, dict):
@@ -196,7 +213,9 @@ class ProgressDisplay:
         """
         if details.get("beyond"):
             return
-        duration = f"{details['seconds']:.2f} s" if "seconds" in details else state
+        duration = state
+        if "seconds" in details:
+            duration = f"{details['seconds']:.2f} s"
         note = " (cached)" if state == "kept" else ""
         self.say(f"{duration:>10}   {name}{note} {details.get('why', '')}".rstrip())
 

@@ -28,8 +28,8 @@ _FAILED = EgvsError.exit_code
 _INTERRUPTED = 130
 """Exit code after Ctrl-C."""
 
-_OPEN_FLAGS = (os.O_RDONLY, os.O_WRONLY, os.O_WRONLY)
-"""For standard input, output and error."""
+_STANDARD_STREAMS = (("stdin", os.O_RDONLY, "r"), ("stdout", os.O_WRONLY, "w"), ("stderr", os.O_WRONLY, "w"))
+"""Name, flags and mode of each stream, in the order of their descriptors."""
 
 _USER_ERRORS = (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError)
 """Errors about files that the user can correct."""
@@ -68,10 +68,14 @@ def report_errors() -> Iterator[None]:
 def describe_os_error(error: OSError) -> tuple[str, int]:
     """Return the message and the exit code for an error of the operating system."""
     reason = error.strerror or str(error)
-    name = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else None
+    name = None
+    if isinstance(error.filename, str | bytes):
+        name = os.fsdecode(error.filename)
     if error.errno in DISK_FULL_ERRNOS:
         reason = os.strerror(error.errno)  # shorter and clearer than Arrow's text
-        paths = [Path(name)] if name else [Path.cwd(), Path(tempfile.gettempdir())]
+        paths = [Path.cwd(), Path(tempfile.gettempdir())]
+        if name:
+            paths = [Path(name)]
         free = ", ".join(map(_describe_free_space, paths))
         return f"{name or 'standard output, or a file'}: {reason} ({free})", _FAILED
     if name is None:
@@ -91,13 +95,13 @@ def _open_streams() -> None:
 
     Otherwise the next file that is opened would get the number of a closed stream.
     """
-    for number, name in enumerate(("stdin", "stdout", "stderr")):
+    for number, (name, flags, mode) in enumerate(_STANDARD_STREAMS):
         if getattr(sys, name) is None:
-            descriptor = os.open(os.devnull, _OPEN_FLAGS[number])
+            descriptor = os.open(os.devnull, flags)
             if descriptor != number:
                 os.dup2(descriptor, number)
                 os.close(descriptor)
-            setattr(sys, name, open(number, "r" if number == 0 else "w", encoding="utf-8", closefd=False))  # noqa: SIM115
+            setattr(sys, name, open(number, mode, encoding="utf-8", closefd=False))  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")

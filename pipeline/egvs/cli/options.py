@@ -13,7 +13,7 @@ import typer
 
 from egvs.core.errors import InputError
 
-ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="A folder with a scenario.toml, or the file.")]
+ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="Scenario folder, or its scenario.toml.")]
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")]
 Out = Annotated[
     Path | None, typer.Option("--out", metavar="DIR", help="Folder of the run; runs/<scenario name> by default.")
@@ -22,9 +22,7 @@ Set = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Override a scenario key, e.g. traffic.frames=500 (repeatable)."),
 ]
-Jobs = Annotated[
-    int | None, typer.Option("--jobs", min=1, help="Number of threads; one per core by default. Same results.")
-]
+Jobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Number of threads; one per core by default.")]
 Top = Annotated[
     int | None, typer.Option("--top", metavar="N", min=1, help="Print only the best N sites; all by default.")
 ]
@@ -44,10 +42,11 @@ def duration_s(text: str, option: str = "--budget") -> float:
 def heights_m(text: str) -> tuple[float, float]:
     """Return the two heights of ``--heights LOW,HIGH`` in metres."""
     match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?),([0-9]+(?:\.[0-9]+)?)", text)
-    low, high = (float(match[1]), float(match[2])) if match else (0.0, 0.0)
-    if not 0 < low <= high <= 100:
-        raise InputError("--heights", f"expected LOW,HIGH in metres, got {text!r}", "Use heights such as 2,7.")
-    return low, high
+    if match:
+        low, high = float(match[1]), float(match[2])
+        if 0 < low <= high <= 100:
+            return low, high
+    raise InputError("--heights", f"expected LOW,HIGH in metres, got {text!r}", "Use heights such as 2,7.")
 
 
 def model_file(path: Path) -> Path:

@@ -31,21 +31,19 @@ def place(
         ),
     ] = None,
     exact: Annotated[
-        bool, typer.Option("--exact", help="Search until the plan is proved to be the best, or the time limit ends.")
+        bool, typer.Option("--exact", help="Search until the plan is proved optimal or time runs out.")
     ] = False,
     time_limit: Annotated[
         str, typer.Option(metavar="TIME", help="Time limit of --exact, and of the proof for --reach, e.g. 60s or 5m.")
     ] = "60s",
     refine: Annotated[
         bool,
-        typer.Option(
-            "--refine", help="Then optimise the pose of each sensor within the limits of \\[placement.refine]."
-        ),
+        typer.Option("--refine", help="Afterwards, optimise each pose within the limits of \\[placement.refine]."),
     ] = False,
     set_: Set = None,
     jobs: Jobs = None,
 ) -> None:
-    """Plan several sensors: which sites together, how many, and a bound on the best possible."""
+    """Plan several sensors: which sites, how many, and a bound on the best possible score."""
     from egvs.cli.console import WIDE, ProgressDisplay, console
     from egvs.placement import plan
     from egvs.runs.run import default_folder
@@ -65,7 +63,7 @@ def place(
         )  # fmt: skip
     print_placement(placed)
     if exact and not (placed.solution.is_best or placed.solution.fewest_is_proved):
-        console(WIDE).print(f"--exact reached its --time-limit of {time_limit} before the best plan was proved")
+        console(WIDE).print(f"--exact reached its --time-limit of {time_limit} before any plan was proved optimal")
 
 
 def print_placement(placed: Placement) -> None:
@@ -91,7 +89,7 @@ def _sensor_table(placed: Placement) -> Table:
     from egvs.cli.console import Column, make_table
 
     columns: list[Column[PlannedSensor]] = [
-        Column("", lambda row: f"{row.order}*" if row.forced else str(row.order)),
+        Column("", lambda row: row.marked_order),
         Column("site", lambda row: row.site, "left"),
         Column("z m", lambda row: f"{row.z_m:g}"),
         Column("yaw deg", lambda row: f"{row.yaw_deg:.1f}"),
@@ -123,7 +121,7 @@ def _curve_table(placed: Placement) -> Table:
         Column[int]("sensors", lambda i: str(curve[i].count)),
         Column[int]("joint score", lambda i: f"{curve[i].plan_value.joint:.6g}"),
         Column[int]("of all candidates", lambda i: f"{_score_share(placed, curve[i].plan_value.joint):.1%}"),
-        Column[int]("proved, of the best possible", lambda i: _format_rounded_down(curve[i].certificate)),
+        Column[int]("proved, of the best possible score", lambda i: _format_rounded_down(curve[i].certificate)),
     ]
     if any(placed.curve_costs):
         columns.append(Column("cost", lambda i: f"{placed.curve_costs[i]:g}"))
@@ -156,24 +154,27 @@ def _describe_proof(placed: Placement) -> str:
         fewer = len(placed.sensors) - 1
         if fewer == 0:
             return "one sensor is enough"
+        noun = "sensor is" if fewer == 1 else "sensors are"
         if solution.fewest_is_proved:
-            return f"proved: {fewer} sensors are not enough"
-        return f"not proved that {fewer} sensors are not enough"
+            return f"proved: {fewer} {noun} not enough"
+        return f"not proved that {fewer} {noun} not enough"
     if solution.is_best:
         return "proved: no plan within the rules is better"
-    return f"proved: at least {_format_rounded_down(placed.certificate)} of the best possible"
+    return f"proved: at least {_format_rounded_down(placed.certificate)} of the best possible score"
 
 
 def describe_refinement(placed: Placement, summary: RefinementSummary) -> str:
     """Return what the refinement of poses changed."""
-    change = f" ({placed.joint / summary.joint_before - 1.0:+.1%})" if summary.joint_before > 0 else ""
-    cost = f", for {placed.cost:g}" if placed.cost else ""
-    objective = ""
+    change = cost = objective = ""
+    if summary.joint_before > 0:
+        change = f" ({placed.joint / summary.joint_before - 1.0:+.1%})"
+    if placed.cost:
+        cost = f", for {placed.cost:g}"
     if (summary.value_before, summary.value_after) != (summary.joint_before, placed.joint):
         objective = f"; objective {summary.value_before:.6g} before, {summary.value_after:.6g} after"
     return (
         f"refined: {placed.score} {summary.joint_before:.6g} before, {placed.joint:.6g} after{change}"
-        f"{objective}{cost}; {summary.poses_tried} poses tried in {summary.turns} turns and {summary.seconds:.1f} s, "
+        f"{objective}{cost}; {summary.poses_tried} poses tried in {summary.turns} rounds and {summary.seconds:.1f} s, "
         f"{summary.poses_infeasible} of them infeasible; the proof applies to the candidates at their original poses"
     )
 

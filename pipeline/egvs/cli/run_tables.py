@@ -19,7 +19,7 @@ from rich.table import Table
 from egvs.artefacts import parquet
 from egvs.artefacts.readers import DISTINCT_PROBABILITY, PeriodRank, PeriodRanking
 from egvs.artefacts.run_record import RunRecord
-from egvs.cli.console import NARROW, WIDE, Column, console, format_value, format_values, make_table, print_table
+from egvs.cli.console import NARROW, WIDE, Column, console, format_or_dash, make_table, print_mapping, print_table
 from egvs.core.errors import collect_warnings
 from egvs.report import sections
 from egvs.report.formatting import SCORE_LABELS, ScoreLabel
@@ -50,7 +50,7 @@ def print_run(folder: Path, record: RunRecord, *, anything_ran: bool, top: int |
     ]
     out.print(make_table(columns, record.stages))
     if not anything_ran:
-        out.print("nothing to do: no input of any stage changed since the last run")
+        out.print("nothing to do: no stage input has changed since the last run")
 
 
 def _artefact_paths(folder: Path, record: RunRecord, stage: str) -> list[str]:
@@ -80,7 +80,7 @@ def _print_scores(out: Console, folder: Path, record: RunRecord, top: int | None
     for line in _outcome_sentences(folder, record, sites):
         out.print(line)
     if top is not None and len(sites) > top:
-        out.print(f"... and {len(sites) - top} more, listed in {folder / 'scores.parquet'} and without --top")
+        out.print(f"... and {len(sites) - top} more; omit --top, or see {folder / 'scores.parquet'}")
     if len({site.pole for site in sites}) < len(sites):
         out.print(poles_table(sites, top))
     by_period = PeriodRanking.read(folder)
@@ -146,7 +146,7 @@ def ranking_table(sites: Sequence[RankedSite], width: int = WIDE, top: int | Non
     if any(site.egvs_se is not None for site in sites):
         columns.append(Column("std error", lambda site: by.error(site.score, site.score_se)))
         columns.append(Column("beats next", lambda site: _format_beats_next(site, by_rank[-1])))
-    columns.append(Column("of best", lambda site: f"{site.score / best_score:.1%}" if best_score > 0 else "-"))
+    columns.append(Column("of best", partial(_format_share_of_best, best_score)))
     if companion is not None:
         columns.append(_score_column(companion))
     if "entropy seen" not in [column.title for column in columns]:
@@ -157,13 +157,21 @@ def ranking_table(sites: Sequence[RankedSite], width: int = WIDE, top: int | Non
     shown = by_rank[:top]
     caption = None
     if not all(site.is_separable for site in shown):
-        chance = f"the chance that it truly scores higher is below {DISTINCT_PROBABILITY:.0%}"
+        chance = f"the probability that it truly scores higher is below {DISTINCT_PROBABILITY:.0%}"
         caption = f"~ not separable from the next site: {chance}"
     return make_table(columns, shown, width=width, caption=caption)
 
 
 def _ranking_score(sites: Sequence[RankedSite]) -> ScoreLabel:
-    return SCORE_LABELS[sites[0].rank_by if sites else "egvs"]
+    if not sites:
+        return SCORE_LABELS["egvs"]
+    return SCORE_LABELS[sites[0].rank_by]
+
+
+def _format_share_of_best(best_score: float, site: RankedSite) -> str:
+    if not best_score > 0:
+        return "-"
+    return f"{site.score / best_score:.1%}"
 
 
 def _score_column(label: ScoreLabel) -> Column[RankedSite]:
@@ -199,10 +207,10 @@ def poles_table(sites: Sequence[RankedSite], top: int | None = None) -> Table:
         Column("pitch deg", lambda pole: f"{pole.best.pitch_deg:.1f}"),
         Column(by.head, lambda pole: _format_score(by, pole.best)),
         Column("candidates", lambda pole: str(len(pole.sites))),
-        Column("beats worst by", lambda pole: "-" if pole.gain is None else f"{pole.gain:.1%}"),
+        Column("beats worst by", lambda pole: format_or_dash(pole.gain, ".1%")),
     ]
     poles = group_by_pole(sorted(sites, key=lambda site: site.rank))
-    return make_table(columns, poles[:top], title="best candidate of each pole")
+    return make_table(columns, poles[:top], title="best candidate on each pole")
 
 
 def period_table(by_period: PeriodRanking, top: int | None = None) -> Table:
@@ -234,7 +242,7 @@ def print_verification(folder: Path, differences: list[str]) -> None:
     for line in differences:
         out.print(f"{folder}: {line}")
     if not differences:
-        out.print(f"{folder}: every artefact is unaltered, and a second run produces the same bytes")
+        out.print(f"{folder}: all artefacts are unaltered, and a second run reproduces them byte for byte")
 
 
 def print_check(checked: CheckReport) -> None:
@@ -251,7 +259,7 @@ def print_check(checked: CheckReport) -> None:
                 if finding.rule == rule:
                     out.print(f"    {finding}")
     if not checked.findings:
-        out.print("no errors and no warnings")
+        out.print("no errors or warnings")
     out.print(f"checked {checked.sites} sites, {checked.solids} solids and {checked.lanes} lanes")
 
 
@@ -259,13 +267,11 @@ def print_new_scenario(scenario: NewScenario) -> None:
     """Print what ``egvs new`` created."""
     out = console(_RESULT_FILE_WIDTH)
     description = scenario.to_json()
-    for key, value in description.items():
-        text = format_values(value) if isinstance(value, dict) else format_value(value)
-        out.print(f"{key}: {text}")
+    print_mapping(description, _RESULT_FILE_WIDTH)
     hourly = description["assumed_traffic"]["vehicles_per_hour"]
     out.print(
         f"warning: the traffic is assumed ({hourly:,} vehicles an hour) and affects the ranking. "
-        f"Enter counted traffic under [traffic] of {scenario.folder / 'scenario.toml'} before you rely on it."
+        f"Enter counted traffic under [traffic] in {scenario.folder / 'scenario.toml'} before you rely on the ranking."
     )
     out.print(f"next: egvs run {scenario.folder}")
 
@@ -286,7 +292,7 @@ def print_sensors(sensors: Iterable[Sensor]) -> None:
         Column("rings", lambda sensor: str(sensor.channels or "-")),
         Column("elevation deg", lambda sensor: _format_span(sensor.elevation_span_deg)),
         Column("azimuth deg", lambda sensor: _format_span(sensor.azimuth_span_deg)),
-        Column("step deg", lambda sensor: "-" if sensor.azimuth_step_deg is None else f"{sensor.azimuth_step_deg:.6g}"),
+        Column("step deg", lambda sensor: format_or_dash(sensor.azimuth_step_deg, ".6g")),
         Column("beams", lambda sensor: str(sensor.beams)),
         Column("range m", lambda sensor: f"{sensor.range_m:g}"),
         Column("rated m", _format_rating),
@@ -340,22 +346,24 @@ def _format_cost(cost: EffectCost | None) -> str:
 def _format_cost_change(cost: EffectCost | None) -> str:
     if cost is None:
         return ""
-    best = "same best site" if cost.regret == 0 else f"another best site, regret {cost.regret:.2%}"
+    best = "same best site"
+    if cost.regret != 0:
+        best = f"different best site, regret {cost.regret:.2%}"
     return f"scores by up to {cost.change:.1%}; {best}; tau {cost.tau:.2f}"
 
 
 def print_ablation(changes: Sequence[EffectChange]) -> None:
     """Print by how much each effect changes the scores of the plain scene, which is the first of ``changes``."""
     plain = changes[0]
+    titles = {**dict(enumerate(plain.sites)), _SECONDS_ROW: "seconds"}
     columns = [
-        Column[int]("site", lambda row: "seconds" if row < 0 else plain.sites[row], "left"),
+        Column[int]("site", lambda row: titles[row], "left"),
         Column[int]("plain, bit", lambda row: _format_plain(plain, row)),
     ]
     columns += [Column(change.effect, partial(_format_change, plain, change)) for change in changes[1:]]
-    title = "change of each site's score against the plain scene (rank, where it changes)"
-    rows = [*range(len(plain.sites)), _SECONDS_ROW]
+    title = "change in each site's score compared with the plain scene (and rank, where it changes)"
     out = console(_LIST_FILE_WIDTH, soft_wrap=False)
-    out.print(make_table(columns, rows, title=title, truncate=True))
+    out.print(make_table(columns, titles, title=title, truncate=True))
 
 
 _SECONDS_ROW = -1
@@ -401,7 +409,7 @@ def print_store(store: Store) -> None:
 
 def print_removed(store: Store, removed: list[StoreEntry]) -> None:
     """Print what was removed from the store, and what is left."""
-    print(f"{store.folder}: removed {_format_total(removed)}; {_format_total(store.entries())} are left")
+    print(f"{store.folder}: removed {_format_total(removed)}; {_format_total(store.entries())} remain")
 
 
 def _format_total(entries: list[StoreEntry]) -> str:

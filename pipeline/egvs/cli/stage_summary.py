@@ -19,7 +19,7 @@ _OMITTED_KEYS = frozenset(
 """Entries of a summary that are printed elsewhere, or that only ``run.json`` holds."""
 
 _STAGE_NAMES = {"tpog": "occupancy"}
-"""Stages that are called otherwise than their command."""
+"""Stages whose name differs from their command."""
 
 
 def stage_lines(stage: str, state: str, record: StageRecord) -> Iterator[str]:
@@ -58,7 +58,10 @@ def _check_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[
 
 
 def _statics_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[str]:
-    yield f"{rest.pop('triangles'):,} triangles in {_count(summary['solids'], 'solid')}"
+    solids = _count(summary["solids"], "solid")
+    if built := rest.pop("built", None):
+        solids += ": " + ", ".join(f"{kind.replace('_', ' ')} ({count:,})" for kind, count in built.items())
+    yield f"{rest.pop('triangles'):,} triangles in {solids}"
     if repaired := rest.pop("mended", None):
         yield "repaired: " + _describe_counts(repaired)
     if ignored := rest.pop("left_out", None):
@@ -68,7 +71,7 @@ def _statics_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterato
 def _scan_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[str]:
     yield f"{_count(rest.pop('sites'), 'site')} scanned"
     if not rest.pop("kept", True):
-        yield "scans not kept"
+        yield "scans not saved"
     elif "beams" in rest:
         yield f"{rest.pop('returns'):,} returns from {rest.pop('beams'):,} beams towards the region"
 
@@ -78,7 +81,7 @@ def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterato
     if "vehicles" in rest:
         yield describe_vehicles(rest.pop("vehicles"))
         yield f"mean speed {3.6 * rest.pop('mean_speed_m_s'):.0f} km/h"
-        yield f"{rest.pop('share_standing'):.0%} of the time standing, {rest.pop('longest_standing_s'):g} s at most"
+        yield f"standing {rest.pop('share_standing'):.0%} of the time, for at most {rest.pop('longest_standing_s'):g} s"
         yield f"vehicles overlap in {_count(rest.pop('frames_with_overlap'), 'frame')}"
     if rest.get("collisions") is not None:
         yield _count(rest.pop("collisions"), "collision")
@@ -90,7 +93,7 @@ def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterato
 
 
 def _tpog_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[str]:
-    yield f"{_count(rest.pop('occupied_voxels'), 'voxel')} occupied at some time"
+    yield f"{_count(rest.pop('occupied_voxels'), 'voxel')} occupied at least once"
     yield f"{rest.pop('static_voxels'):,} filled by static solids"
     yield f"{rest.pop('boxes_in_roi'):.1f} vehicles in the region on average"
     memory = rest.pop("memory_frames")
@@ -108,6 +111,8 @@ def _score_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[
         yield f"best: {', '.join(best)}"
     if by.name == "egvs":
         yield f"upper limit {float(limit):,.0f} bit"
+    if gamma := rest.pop("gamma_auto", None):
+        yield f"gamma {gamma:g} (auto)"
     if errors := rest.pop("standard_errors_from", None):
         yield f"standard errors from {errors}"
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
-from egvs.cli.console import NARROW, WIDE, Column, console, make_table
+from egvs.cli.console import NARROW, WIDE, Column, console, format_or_dash, make_table
 from egvs.report.formatting import SCORE_LABELS
 
 if TYPE_CHECKING:
@@ -34,15 +34,15 @@ def print_study(study: AccuracyStudy, command: str) -> None:
     approximations = [row for row in study.rows if row.kind != "measures"]
     measures = [row for row in study.rows if row.kind == "measures"]
 
-    title = "settings that approximate the same number, against the reference"
+    title = "settings that approximate the same number, compared with the reference"
     out.print(_settings_table(title, approximations, has_errors=True, is_wide=is_wide))
-    out.print(f"reference: {_describe_reference(study)}. * on the front of time and error, = recommended")
+    out.print(f"reference: {_describe_reference(study)}. * on the Pareto front of time and error, = recommended")
     out.print(f"seconds are medians; stages were repeated {study.repeated} times to measure them\n")
     if measures:
-        title = "settings that measure something else, against the scenario on the same traffic"
+        title = "settings that measure something else, compared with the scenario on the same traffic"
         out.print(_settings_table(title, measures, has_errors=False, is_wide=is_wide))
     if not is_wide:
-        out.print("seconds by stage, memory and disk: in a wider window, or in accuracy.parquet")
+        out.print("for seconds by stage, memory and disk, widen the window or see accuracy.parquet")
 
     for reason in dict.fromkeys(study.skipped.values()):
         names = [name for name, skip_reason in study.skipped.items() if skip_reason == reason]
@@ -52,7 +52,7 @@ def print_study(study: AccuracyStudy, command: str) -> None:
     for better, worse, probability, frames in study.neighbours[:3]:
         needed = "no feasible amount of traffic would tell them apart"
         if frames < _MAX_FRAMES:
-            needed = f"about {frames:,.0f} frames tell them apart"
+            needed = f"about {frames:,.0f} frames would tell them apart"
         out.print(f"{better} above {worse}: probability {probability:.0%}; {needed}")
     out.print(_describe_recommendation(study, command))
     for path in study.files:
@@ -123,7 +123,7 @@ def _print_seeds(out: Console, seeds: SeedComparison) -> None:
     ]
     title = f"{seeds.seeds} independent runs of {seeds.frames} frames, bit"
     out.print(make_table(columns, range(len(seeds.sites)), title=title, truncate=True))
-    out.print(f"90 % intervals contain the score of all runs together in {seeds.covered:.1%} of cases")
+    out.print(f"90 % intervals contain the pooled score of all runs in {seeds.covered:.1%} of cases")
 
 
 def _describe_recommendation(study: AccuracyStudy, command: str) -> str:
@@ -135,11 +135,11 @@ def _describe_recommendation(study: AccuracyStudy, command: str) -> str:
     best = study.best
     if best is None and len(candidates) == 1:
         error = f"{candidates[0].judged:.2%}"
-        return f"the budget was enough for the scenario's own setting only, with an error of {error}: increase --budget"
+        return f"the budget only covered the scenario's own setting, with an error of {error}: increase --budget"
     if best is None:
         nearest = min(candidates, key=lambda row: row.judged)
         error = f"{nearest.judged:.2%}"
-        return f"no setting is within {study.tolerance:.2%}; the nearest is {nearest.setting!r}, with {error}"
+        return f"no setting is within {study.tolerance:.2%}; the closest is {nearest.setting!r}, with {error}"
 
     standard_error = "unknown" if math.isnan(best.error_se) else f"{best.error_se:.2%}"
     note = ""
@@ -180,7 +180,10 @@ def print_comparison(comparison: Comparison, top: int | None = None) -> None:
 
 def _fit_to_width(runs: Sequence[ComparedRun], width: int) -> list[Sequence[ComparedRun]]:
     """Divide runs into tables that fit the width; the first run is in each table, to compare others with it."""
-    widest_run = max(sum(_column_width(column) for column in _run_columns(run, width)) for run in runs)
+    widest_run = 0
+    for run in runs:
+        widths = [max(len(column.title), 8) + _COLUMN_GAP for column in _run_columns(run, width)]
+        widest_run = max(widest_run, sum(widths))
     sites = [site for run in runs for site in run.sites.values()]
     used = 0
     if sites:
@@ -196,22 +199,20 @@ def _fit_to_width(runs: Sequence[ComparedRun], width: int) -> list[Sequence[Comp
     return [(*first, *others[start : start + step]) for start in range(0, len(others), step)]
 
 
-def _column_width(column: Column[Any]) -> int:
-    return max(len(column.title), 8) + _COLUMN_GAP
-
-
 def _run_columns(run: ComparedRun, width: int) -> list[Column[str]]:
     """Return the columns of one run, whose rows are names of sites."""
     label = SCORE_LABELS[run.rank_by]
 
     def cell_text(text: Any, site_name: str) -> str:
         site = run.sites.get(site_name)
-        return "-" if site is None else str(text(site))
+        if site is None:
+            return "-"
+        return str(text(site))
 
     score = Column(f"{run.label} {label.head}", partial(cell_text, lambda site: label.value(site.score)))
     error = Column(f"{run.label} error", partial(cell_text, partial(_format_error, run)))
     egvs = Column(f"{run.label} bit", partial(cell_text, lambda site: f"{site.egvs:.1f}"))
-    share = Column(f"{run.label} of limit", partial(cell_text, _format_limit_share))
+    share = Column(f"{run.label} of limit", partial(cell_text, lambda site: format_or_dash(site.share, ".1%")))
     rank = Column(f"{run.label} rank", partial(cell_text, lambda site: site.rank))
 
     columns = [score, error, egvs, rank]
@@ -229,10 +230,6 @@ def _format_error(run: ComparedRun, site: SiteResult) -> str:
     return SCORE_LABELS[run.rank_by].error(site.score, standard_error)
 
 
-def _format_limit_share(site: SiteResult) -> str:
-    return "-" if site.share is None else f"{site.share:.1%}"
-
-
 def _site_table(comparison: Comparison, runs: Sequence[ComparedRun], names: Sequence[str], width: int) -> Table:
     """Return the scores of sites in several runs."""
     sites = {name: next(run.sites[name] for run in comparison.runs if name in run.sites) for name in names}
@@ -240,9 +237,8 @@ def _site_table(comparison: Comparison, runs: Sequence[ComparedRun], names: Sequ
     for number, title in enumerate(("x m", "y m", "z m")):
         columns.append(Column(title, partial(_format_position, sites, number), min_width=NARROW))
     if any(site.longitude_deg is not None for site in sites.values()):
-        longitude = Column[str]("longitude", lambda name: _format_degrees(sites[name].longitude_deg), min_width=NARROW)
-        latitude = Column[str]("latitude", lambda name: _format_degrees(sites[name].latitude_deg), min_width=NARROW)
-        columns += [longitude, latitude]
+        for title, key in (("longitude", "longitude_deg"), ("latitude", "latitude_deg")):
+            columns.append(Column(title, partial(_format_degrees, sites, key), min_width=NARROW))
     for run in runs:
         columns += _run_columns(run, width)
     return make_table(columns, names, width=width)
@@ -252,28 +248,20 @@ def _format_position(sites: dict[str, SiteResult], axis: int, name: str) -> str:
     return f"{sites[name].pose[axis]:.2f}"
 
 
-def _format_degrees(degrees: float | None) -> str:
-    return "-" if degrees is None else f"{degrees:.6f}"
+def _format_degrees(sites: dict[str, SiteResult], key: str, name: str) -> str:
+    return format_or_dash(getattr(sites[name], key), ".6f")
 
 
 def _agreement_table(comparison: Comparison) -> Table:
     columns: list[Column[RankAgreement]] = [
         Column("runs", lambda pair: f"{pair.a}, {pair.b}", "left"),
         Column("common sites", lambda pair: str(pair.shared), wrap=True),
-        Column("tau", lambda pair: _format_correlation(pair.tau)),
-        Column("rho", lambda pair: _format_correlation(pair.rho)),
+        Column("tau", lambda pair: format_or_dash(pair.tau, ".2f")),
+        Column("rho", lambda pair: format_or_dash(pair.rho, ".2f")),
         Column("best", _format_best_sites, "left", wrap=True),
-        Column("regret of the first run's best", lambda pair: _format_regret(pair.regret_a), wrap=True),
+        Column("regret of the first run's best", lambda pair: format_or_dash(pair.regret_a, ".2%"), wrap=True),
     ]
     return make_table(columns, comparison.agreements)
-
-
-def _format_correlation(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
-
-
-def _format_regret(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2%}"
 
 
 def _format_best_sites(pair: RankAgreement) -> str:
@@ -302,4 +290,6 @@ def _format_setting(run: int, difference: Difference) -> str:
     value = difference.values[run]
     if value is None:
         return "-"
-    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+    if isinstance(value, str):
+        return value
+    return json.dumps(value, ensure_ascii=False)

@@ -14,7 +14,7 @@ from egvs.core.errors import InputError, MissingBackendError
 DEFAULT_FRAMES = 1000
 """Frames of a validation: with as many, AP (BEV + 3D, on a scale from 0 to 200) had a standard error of 2.4 to 6.5."""
 
-_FRAMES_HELP = "Frames of held-out traffic, at least 2 s apart."
+_FRAMES_HELP = "Number of frames of held-out traffic, at least 2 s apart."
 
 
 def validate(
@@ -62,7 +62,7 @@ def validate(
 
     if detections is not None or keep:
         option = "--keep" if keep else "--detections"
-        raise InputError(option, "not available with a plan", f"Leave out {option}, or --plan and --plan-from.")
+        raise InputError(option, "not available with a plan", f"Omit {option}, or omit --plan and --plan-from.")
     with ProgressDisplay("validate") as screen:
         plan_result = plan_validation.validate_plan(
             loaded, folder, plan_from or folder, frames=frames, detectors=detectors, jobs=jobs,
@@ -109,14 +109,14 @@ def train(
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The model file to write, .onnx.")],
     set_: Set = None,
     steps: Annotated[int, typer.Option(min=10, help="Training steps, each on 8 crops of sweeps.")] = 3000,
-    frames: Annotated[int, typer.Option(min=10, help="Training frames of each junction.")] = 400,
+    frames: Annotated[int, typer.Option(min=10, help="Training frames per junction.")] = 400,
     heights: Annotated[
         str, typer.Option(metavar="LOW,HIGH", help="Range of mounting heights, in metres above the ground.")
     ] = "2,7",
     convention: Annotated[
         str, typer.Option(help="Origin of point heights: ground, or sensor (as for detectors on cars).")
     ] = "ground",
-    seed: Annotated[int, typer.Option(min=0, help="Seed of traffic, poses, samples and initial weights.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Seed for traffic, poses, samples and initial weights.")] = 1,
     jobs: Jobs = None,
 ) -> None:
     """Train the PointPillars detector on simulated sweeps of junctions (needs the extra `train`)."""
@@ -130,7 +130,7 @@ def train(
     try:
         from egvs.validation.training import train
     except ImportError as error:
-        raise MissingBackendError(f"training cannot start: {error}; pip install 'egvs[train]'") from None
+        raise MissingBackendError(f"training cannot start: {error}. Run pip install 'egvs[train]'") from None
 
     if convention not in ("ground", "sensor"):
         raise InputError("--convention", f"expected ground or sensor, got {convention!r}", "Use --convention ground.")

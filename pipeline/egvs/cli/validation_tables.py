@@ -74,9 +74,10 @@ def _format_source(entry: ScoreEntry) -> str:
 
 def _format_sweep(entry: ScoreEntry) -> str:
     """Return the values of each parameter that the validation tries."""
+    if entry.score is None:
+        return ""
     parts = []
-    sweep = {} if entry.score is None else entry.score.sweep
-    for name, values in sweep.items():
+    for name, values in entry.score.sweep.items():
         parts.append(f"{name} {', '.join(map(_format_parameter, values))}")
     return "; ".join(parts)
 
@@ -120,7 +121,7 @@ def print_validation(scenario: Scenario, out: Path, validation: Validation) -> N
 
 def _print_sample(detection: Any) -> None:
     """Print the size of the held-out traffic."""
-    print(f"{detection.objects} vehicles in {detection.frames} frames of held-out traffic; ± is a standard error")
+    print(f"{detection.objects} vehicles in {detection.frames} frames of held-out traffic; ± gives the standard error")
 
 
 def _print_agreement(validation: Validation, scenario_score: ScoreName, detectors: Sequence[str]) -> None:
@@ -163,7 +164,7 @@ def print_plan_validation(validation: PlanValidation) -> None:
             measures, gain_measure = _POINT_COLUMNS, "seen_20"
         columns: list[Column[Any]] = [
             Column(detector, lambda row: str(len(row.sites))),
-            Column("with", lambda row: f"+ {row.sites[-1]}" if len(row.sites) > 1 else row.sites[0], "left"),
+            Column("with", _format_last_site, "left"),
         ]
         for title, measure in measures.items():
             columns.append(Column(title, partial(_format_measure, measure)))
@@ -171,10 +172,16 @@ def print_plan_validation(validation: PlanValidation) -> None:
         detector_rows = [row for row in rows if row.detection.detector == detector]
         print_table(columns, detector_rows, file_width=_FILE_WIDTH)
     _print_sample(rows[0].detection)
-    print(f"fused clouds of the plan by {validation.plan.score} in {validation.plan.path}; gain: over one sensor less")
+    print(f"fused clouds of the plan by {validation.plan.score} in {validation.plan.path}; gain: over one sensor fewer")
     for warning in validation.warnings:
         print(f"warning: {warning}")
     print(validation.path)
+
+
+def _format_last_site(row: Any) -> str:
+    if len(row.sites) == 1:
+        return str(row.sites[0])
+    return f"+ {row.sites[-1]}"
 
 
 def _format_measure(measure: str, row: Any) -> str:

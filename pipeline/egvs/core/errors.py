@@ -73,11 +73,9 @@ class MissingExtraError(MissingBackendError):
 
 def format_problem(where: str, problem: str, hint: str = "") -> str:
     """Return ``WHERE: PROBLEM. HINT``."""
-    if not hint:
-        return f"{where}: {problem}"
-    if hint[0].isupper():
-        return f"{where}: {problem}. {hint}"
-    return f"{where}: {problem}; {hint}"
+    if not hint or hint.startswith("\n"):  # further errors, but no hint
+        return f"{where}: {problem}{hint}"
+    return f"{where}: {problem}. {hint}"
 
 
 def truncate_text(text: str) -> str:

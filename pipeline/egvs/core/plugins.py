@@ -37,7 +37,7 @@ _REQUIREMENTS = {
 }
 """Required attributes of the objects of each group, and a description for messages."""
 
-_PACKAGES = {"sklearn": "scikit-learn", "torch": "PyTorch"}
+_PACKAGES = {"PIL": "Pillow", "sklearn": "scikit-learn", "torch": "PyTorch"}
 """Names of packages that differ from the name that is imported."""
 
 
@@ -63,7 +63,7 @@ def require_libraries(what: str, extra: str, *libraries: str) -> None:
         return
     verb = "is" if len(missing) == 1 else "are"
     names = f"{', '.join(missing)}, which {verb} not installed"
-    raise MissingExtraError(f"{what} needs {names}: pip install '{PACKAGE_NAME}[{extra}]'")
+    raise MissingExtraError(f"{what} needs {names}. Run pip install '{PACKAGE_NAME}[{extra}]'")
 
 
 def plugin_names(group: str) -> list[str]:
@@ -75,7 +75,7 @@ def plugin_module(group: str, name: str) -> str:
     """Return the module of an entry point without importing it; KeyError when the group declares no such name."""
     entry = _entry_points_by_name(group)[name]
     if EntryPoint.pattern.match(entry.value) is None:
-        raise plugin_error(group, name, "it names no module")
+        raise plugin_error(group, name, "it does not name a module")
     return entry.module
 
 
@@ -106,13 +106,13 @@ def load_plugin(group: str, name: str) -> Any:
     entry = _entry_points_by_name(group).get(name)
     if entry is None:
         known = ", ".join(plugin_names(group)) or "none"
-        raise InputError(group, f"knows no {name!r}", f"Choose one of {known}.")
+        raise InputError(group, f"unknown name {name!r}", f"Choose one of {known}.")
     try:
         plugin = entry.load()
     except (ImportError, AttributeError, SyntaxError) as error:
         raise plugin_error(group, name, str(error)) from error
     except (Exception, SystemExit) as error:  # a foreign module may do anything when it is imported
-        raise plugin_error(group, name, f"its module ended with {error!r}") from error
+        raise plugin_error(group, name, f"its import raised {error!r}") from error
     required, description = _REQUIREMENTS.get(group, ((), ""))
     missing = [attribute for attribute in required if not _has_attribute(plugin, attribute)]
     if missing:

@@ -57,11 +57,11 @@ def describe_exception(error: BaseException) -> str:
     """Describe an exception in words for a user."""
     match error:
         case MemoryError():
-            return "it asks for more memory than there is"
+            return "it needs more memory than is available"
         case RecursionError():
             return "it is nested too deeply"
         case UnicodeDecodeError():
-            return f"it is no {error.encoding} text: byte {error.start} is {error.object[error.start]:#x}"
+            return f"it is not {error.encoding} text: byte {error.start} is {error.object[error.start]:#x}"
         case OSError() if error.strerror:
             return error.strerror
         case UnicodeError():

@@ -15,5 +15,5 @@ def sumo_home() -> Path:
         return Path(home)
     spec = importlib.util.find_spec("sumo")
     if spec is None or not spec.submodule_search_locations:
-        raise MissingBackendError("SUMO is not installed: set SUMO_HOME, or pip install eclipse-sumo")
+        raise MissingBackendError("SUMO is not installed. Set SUMO_HOME, or run pip install eclipse-sumo")
     return Path(spec.submodule_search_locations[0])

@@ -74,7 +74,7 @@ class MovingOcclusion(TransmitScore[MovingOcclusionParameters]):
         """Frames of several periods cannot be replayed by the periods' weights."""
         if self.parameters.method != "frames" or not scene.scenario.traffic.periods:
             return None
-        problem = 'method = "frames" replays all periods alike, whatever their weights'
+        problem = 'method = "frames" ignores the weights of the periods'
         return InputError("effects.moving_occlusion", problem, 'Use method = "independent", which weights the periods.')
 
     def summary(self, scene: Scene) -> str:

@@ -90,7 +90,7 @@ class PedestriansBicycles(Traffic[PedestriansBicyclesParameters]):
         """Return the error for a finished FCD file, to which nobody can be added."""
         if scenario.traffic.fcd is None or not self.acts(scenario)[0]:
             return None
-        problem = "people cannot be added to a finished FCD file"
+        problem = "pedestrians and bicycles cannot be added to a finished FCD file"
         return InputError(self.config_key(scenario), problem, "Use network or sumocfg in [traffic].")
 
     def acts(self, scenario: Scenario) -> tuple[bool, str]:
@@ -169,7 +169,7 @@ def _walks(roads: Network, times_s: FloatArray, rng: np.random.Generator, where:
         raise InputError(key, "the network has no connected sidewalks", _SIDEWALKS_HINT)
     trips = _fringe_trips(walkways.sidewalks) or _trips_anywhere(walkways.sidewalks)
     if not trips:
-        raise InputError(key, "no sidewalk leads to another", _SIDEWALKS_HINT)
+        raise InputError(key, "no two sidewalks are connected", _SIDEWALKS_HINT)
     drawn = rng.integers(len(trips), size=times_s.size)
     persons = []
     for number, (depart_s, trip) in enumerate(zip(times_s, drawn, strict=True)):

@@ -99,7 +99,7 @@ def active_traffic_effects(scenario: Scenario) -> tuple[tuple[base.Traffic[Any],
             if effect.SELF_ACTING:
                 notes.append(f"{effect.NAME}: on, {reason}")
         elif effect.NAME in scenario.effects.named:
-            notes.append(f"{effect.NAME}: named, but {reason}: skipped, the result is the same")
+            notes.append(f"{effect.NAME}: set, but {reason}: skipped, the result is the same")
         else:
             notes.append(f"{effect.NAME}: off, {reason}")
     return tuple(effects), tuple(notes)

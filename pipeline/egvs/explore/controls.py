@@ -34,7 +34,7 @@ _POSE_LABELS = {
     "y_m": "y m",
     "z_m": "z m",
     "yaw_deg": "yaw deg",
-    "pitch_deg": "tilt deg",
+    "pitch_deg": "pitch deg",
     "roll_deg": "roll deg",
 }
 _LENGTH_STEP, _ANGLE_STEP = 0.001, 0.01
@@ -59,7 +59,7 @@ def describe_score(rating: PoseScore, rank_by: str, candidate: PoseScore, candid
     """
     findings = []
     for finding in rating.findings:
-        title = "**not possible:**" if finding.is_error else "**warning:**"
+        title = "**error:**" if finding.is_error else "**warning:**"
         findings.append(f"- {title} {escape_markdown(str(finding))}")
     findings_text = "\n".join(findings)
     if not rating.is_feasible:
@@ -198,7 +198,7 @@ class Controls:
                 gui.add_markdown(content.note)
         with gui.add_folder("pose"):
             self._add_pose()
-        with gui.add_folder("scored by", expand_by_default=False):
+        with gui.add_folder("scoring", expand_by_default=False):
             self._add_settings(content.effects)
         for name, action in content.buttons.items():
             gui.add_button(name).on_click(_client_callback(action))
@@ -215,7 +215,7 @@ class Controls:
         sensors = dict.fromkeys((*session.scene.used_sensors, *session.scenario.sensors, *CATALOGUE))
         self.sensor = gui.add_dropdown("sensor", tuple(sensors))
         self.sensor.on_update(self._on_pose)
-        gui.add_button("Back to the candidate").on_click(self._on_back)
+        gui.add_button("Reset to the candidate").on_click(self._on_back)
 
     def _add_layer(self, frames: int) -> None:
         gui = self._gui
@@ -239,7 +239,7 @@ class Controls:
         gui, session = self._gui, self._session
         scores = dict.fromkeys((*_FIRST_SCORES, *session.scenario.score.additional, *get_args(OtherScore)))
         self.score = gui.add_dropdown("score", tuple(scores), hint="Candidates are ranked by this score.")
-        self.gamma = gui.add_number("gamma", 0.0, min=0.0, step=0.1, hint="More beams in a voxel do not count.")
+        self.gamma = gui.add_number("gamma", 0.0, min=0.0, step=0.1, hint="Further beams in a voxel do not count.")
         self.effects = {name: gui.add_checkbox(name, False, hint=why) for name, why in effects.items()}
         self.period = gui.add_dropdown("period", (_ALL_PERIODS, *session.periods), visible=bool(session.periods))
         for control in (self.score, self.gamma, *self.effects.values()):

@@ -522,7 +522,7 @@ def _draw_traffic(context: LayerContext) -> str:
     points, point_colours = column_points(tpog, tpog.p, context.zero_m)
     context.draw_points(points, point_colours, tpog.grid.voxel_m)
     peak = float(tpog.p.sum(axis=2).max(initial=0.0))
-    return _scale_legend("vehicles: share of time that voxels are occupied, summed over height", 0.0, peak)
+    return _scale_legend("vehicles: share of the time that voxels are occupied, summed over height", 0.0, peak)
 
 
 def _draw_entropy(context: LayerContext) -> str:
@@ -544,7 +544,7 @@ def _draw_blindspots(context: LayerContext) -> str:
     points = middles + np.array([*spots.origin_m, LAYER_HEIGHT_M]) - context.zero_m
     point_colours = colour_scale(spots.share_missed[ix, iy], 0.0, 1.0)
     context.draw_points(points.astype(np.float32), point_colours, spots.cell_m)
-    overall = "no vehicle was recorded"
+    overall = "no vehicles were recorded"
     if spots.overall is not None:
         overall = f"all vehicles: {spots.overall.share:.1%} seen"
     rows = [f"<b>{_escape_html(overall)}</b>"]

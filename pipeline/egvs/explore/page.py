@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import viser
-from matplotlib import image
+from PIL import Image
 
 from egvs.core.errors import EgvsError, InputError, RunError
 from egvs.core.grid import Vec3
@@ -123,7 +123,7 @@ class Page:
             self.server = _Server(host=HOST, port=port, label="egvs explore", verbose=False)
         if not self.guard.is_active:
             self.stop()
-            raise RunError("this version of viser starts its server in another way, so the page cannot be protected")
+            raise RunError("this version of viser starts its server differently, so the page cannot be protected")
         if port and self.server.get_port() != port:  # viser uses another port instead
             self.stop()
             raise _port_taken(port)
@@ -257,7 +257,7 @@ class Page:
             buttons={
                 "Save this pose": self._save_pose,
                 "Link to this view": self._show_link,
-                "Picture (PNG)": self._send_picture,
+                "Download picture (PNG)": self._send_picture,
             },
             note=controls.describe_drawn_triangles(self.world.drawn, self.world.triangles),
         )
@@ -299,7 +299,7 @@ class Page:
         path = self.session.scenario.folder / file
         site = self.rating.site
         if not self.rating.is_feasible:
-            error = InputError(f"site {site.name}", "no sensor can be mounted there", "Move it to a free place.")
+            error = InputError(f"site {site.name}", "no sensor can be mounted there", "Move it to a free location.")
             show_modal(client, "Not saved", [controls.escape_markdown(str(error))], {"Close": _do_nothing})
             return
         try:
@@ -329,7 +329,7 @@ class Page:
     def _send_picture(self, client: viser.ClientHandle) -> None:
         file = io.BytesIO()
         picture = client.get_render(client.camera.image_height, client.camera.image_width, transport_format="png")
-        image.imsave(file, picture, format="png")
+        Image.fromarray(picture).save(file, format="png")
         client.send_file_download(f"{self.session.scenario.name}.png", file.getvalue(), save_immediately=True)
 
     # ---- showing a view
@@ -357,7 +357,7 @@ class Page:
                 drawing.draw_plan(scene, self.plan, site.name, self.zero_m, self._select)
             if view.is_dark != view_before.is_dark:
                 self.world.set_dark(view.is_dark)
-            self.label.text = f"{site.name}: not possible here"
+            self.label.text = f"{site.name}: cannot be mounted here"
             if self.rating.is_feasible:
                 self.label.text = f"{site.name}  rank {self.rating.rank}"
             legend = None

@@ -226,7 +226,7 @@ def open_session(
         return make_session(scenario, folder, jobs=jobs, progress=progress, listener=listener)
     for option, is_given in (("--set", bool(overrides)), ("--out", out is not None)):
         if is_given:
-            raise InputError(option, f"cannot be used with a run folder ({path})", "Name the scenario instead.")
+            raise InputError(option, f"cannot be used with a run folder ({path})", "Give the scenario instead.")
     return make_session(_recorded_scenario(path), path, jobs=jobs, progress=progress, listener=listener)
 
 
@@ -235,5 +235,5 @@ def _recorded_scenario(folder: Path) -> Scenario:
     source = Path(os.path.normpath(folder / record.scenario_folder))
     if not source.is_dir():
         problem = f"the scenario's folder {source} does not exist"
-        raise InputError(RunFolder(folder).run_record, problem, "Name the scenario instead of the run.")
+        raise InputError(RunFolder(folder).run_record, problem, "Give the scenario instead of the run.")
     return scenario_from_dict(record.scenario, source, str(RunFolder(folder).run_record))

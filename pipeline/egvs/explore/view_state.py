@@ -48,7 +48,7 @@ LAYERS = {
 T = TypeVar("T")
 D = TypeVar("D")
 _POSE_PARTS = ("x", "y", "z", "yaw", "tilt", "roll")
-_WHOLE_NUMBER = "a whole number from 0"
+_WHOLE_NUMBER = "a whole number of at least 0"
 
 
 def save_pose(path: Path, site: Site, candidates: Collection[str]) -> str:
@@ -93,7 +93,7 @@ def _read_saved_rows(path: Path) -> list[list[str]]:
     with path.open(newline="", encoding="utf-8", errors="replace") as file:
         rows = [row for row in csv.reader(file) if row]
     if not rows or tuple(rows[0]) != _COLUMNS or any(len(row) != len(_COLUMNS) for row in rows):
-        raise InputError(path, "was not written by egvs explore, and is not changed", "Save to another file.")
+        raise InputError(path, "was not written by egvs explore, so it is not overwritten", "Save to another file.")
     return rows[1:]
 
 
@@ -207,7 +207,7 @@ def decode_view(
     if sensor != site.sensor:
         session.scene.sensor(sensor, f"{where}: sensor")
         site = replace(site, sensor=sensor)
-    gamma = reader.number("gamma", None, float, "a number from 0")
+    gamma = reader.number("gamma", None, float, "a number of at least 0")
     rank_by = reader.text("score", initial.settings.rank_by)
     settings = Settings(gamma, rank_by, reader.effects(initial.settings.effects))
     view = View(
@@ -288,7 +288,7 @@ class _LinkReader:
     def reject_unknown_keys(self) -> None:
         """Raise an InputError if the link has parts that nothing has read."""
         for key in sorted(self._parts.keys() - self._known):
-            raise InputError(self._where, f"unknown {key!r}", f"Use some of {', '.join(sorted(self._known))}.")
+            raise InputError(self._where, f"unknown key {key!r}", f"Use only {', '.join(sorted(self._known))}.")
 
     def _convert(self, key: str, text: str, kind: Callable[[str], T], expected: str) -> T:
         try:

@@ -110,11 +110,15 @@ def export_run(
     """
     file_format = _check_request(to, crs, sites)
     of_city = is_city(folder)
-    if of_city and to == "geotiff":
-        hint = f"Export a junction: {folder / 'junctions' / 'NAME'}"
-        raise InputError("--to geotiff", f"{folder} is the folder of a city", hint)
-    run = open_junction_run(folder) if of_city else FinishedRun.open(folder)
-    title = city_name(folder) if of_city else run.scenario.name
+    if of_city:
+        if to == "geotiff":
+            hint = f"Export a junction: {folder / 'junctions' / 'NAME'}."
+            raise InputError("--to geotiff", f"{folder} is the folder of a city", hint)
+        run = open_junction_run(folder)
+        title = city_name(folder)
+    else:
+        run = FinishedRun.open(folder)
+        title = run.scenario.name
     reference = _export_crs(run, file_format, crs)
     selected = _selected_sites(run, sites)
     target = out or _default_target(folder, file_format, title)
@@ -131,7 +135,9 @@ def export_run(
             progress("layers made", 1, 2)
             written = list(_write_vectors(file_format, layers, reference, temp_folder, target.name, title))
             progress("files written", 2, 2)
-        paths = [target] if file_format.is_one_file else [target / path.name for path in written]
+        paths = [target]
+        if not file_format.is_one_file:
+            paths = [target / path.name for path in written]
         _check_not_existing(paths, out)
         _move_all(written, paths)
     if out is None and not file_format.is_one_file:
@@ -143,12 +149,12 @@ def _check_request(to: str, crs: str | None, sites: Collection[str]) -> Format:
     if to not in FORMATS:
         raise InputError("--to", f"expected one of {', '.join(FORMATS)}, got {to!r}")
     if crs is not None and crs not in CRS_CHOICES:
-        hint = f"{SCENARIO_CRS.capitalize()} is the scenario's reference system, {WGS84_CRS} are degrees"
+        hint = f"Use {SCENARIO_CRS} for the scenario's reference system, {WGS84_CRS} for degrees."
         raise InputError("--crs", f"expected {' or '.join(CRS_CHOICES)}, got {crs!r}", hint)
     if to == "kml" and crs == SCENARIO_CRS:
-        raise InputError("--crs", "KML files are always in degrees", f"Use --crs {WGS84_CRS}, or leave --crs out")
+        raise InputError("--crs", "KML files are always in degrees", f"Use --crs {WGS84_CRS}, or omit --crs.")
     if sites and to != "geotiff":
-        hint = "Leave --site out: the other formats have all sites"
+        hint = "Omit --site: the other formats contain all sites."
         raise InputError("--site", f"works only with --to geotiff, got --to {to}", hint)
     plugins.require_libraries(f"export to {to}", "gis", *FORMATS[to].libraries)
     return FORMATS[to]
@@ -173,8 +179,10 @@ def _selected_sites(run: FinishedRun, sites: Collection[str]) -> Collection[str]
 
 def unknown_site(name: str, known: Sequence[str]) -> InputError:
     """Return an error for a site that a run does not have."""
-    listed = ", ".join(known[:10]) + (", ..." if len(known) > 10 else "")
-    return InputError("--site", f"this run has no site {name!r}", f"Choose one of {listed}")
+    listed = ", ".join(known[:10])
+    if len(known) > 10:
+        listed += " and others"
+    return InputError("--site", f"this run has no site {name!r}", f"Choose one of {listed}.")
 
 
 def _default_target(folder: Path, file_format: Format, title: str) -> Path:
@@ -189,11 +197,11 @@ def _check_target(target: Path, file_format: Format) -> None:
     if file_format.is_one_file:
         if target.suffix != file_format.suffix:
             problem = f"expected a file name ending in {file_format.suffix} for {option}, got {str(target)!r}"
-            raise InputError("--out", problem, "Change its ending, or --to")
+            raise InputError("--out", problem, "Change the file name, or --to.")
         files.check_writable(target)
         return
     if target.exists() and not target.is_dir():
-        raise InputError("--out", f"{target} is a file", f"Name a folder: {option} writes several files")
+        raise InputError("--out", f"{target} is a file", f"Give a folder: {option} writes several files.")
     files.check_writable(target / f"any{file_format.suffix}")
 
 
@@ -203,8 +211,10 @@ def _check_not_existing(paths: Sequence[Path], out: Path | None) -> None:
         return
     for path in paths:
         if path.exists():
-            hint = "Choose another name" if path == out else "Choose a new folder, or one without such files"
-            raise InputError("--out", f"{path} exists already", hint)
+            hint = "Choose a new folder, or one without these files."
+            if path == out:
+                hint = "Choose another name."
+            raise InputError("--out", f"{path} already exists", hint)
 
 
 def _move_all(sources: Sequence[Path], targets: Sequence[Path]) -> None:

@@ -82,7 +82,9 @@ def draw_figure(
     run = FinishedRun.open(folder)
     ranking = Ranking.read(run.artefact(RunFolder.scores.name))
     selected = _find_site(ranking, site)
-    name = f"{what}_{safe_file_name(selected.site)}" if what in SITE_FIGURES else what
+    name = what
+    if what in SITE_FIGURES:
+        name += f"_{safe_file_name(selected.site)}"
     path = out or folder / EXPORT_FOLDER / f"{name}.{kind}"
     files.check_writable(path)
 
@@ -99,12 +101,12 @@ def _check_arguments(what: str, site: str | None, kind: str, out: Path | None) -
         if value not in known:
             raise InputError(option, f"expected one of {', '.join(known)}, got {value!r}")
     if site is not None and what not in SITE_FIGURES:
-        hint = f"Use --what {' or '.join(SITE_FIGURES)}, or leave --site out"
+        hint = f"Use --what {' or '.join(SITE_FIGURES)}, or omit --site."
         raise InputError("--site", f"cannot be combined with --what {what}", hint)
     if out is not None and out.suffix != f".{kind}":
-        raise InputError("--out", f"expected a file name ending in .{kind}, got {str(out)!r}", "Or change --format")
+        raise InputError("--out", f"expected a name ending in .{kind}, got {str(out)!r}", "Change it, or --format.")
     if kind != "svg":
-        plugins.require_libraries(f"a figure as {kind}", "figure", "cairosvg")
+        plugins.require_libraries(f"a {kind} figure", "figure", "cairosvg")
 
 
 def _find_site(ranking: Ranking, name: str | None) -> RankedSite:
@@ -136,7 +138,7 @@ def _site_view_svg(
     scorer = run.scorer(tpog)
     field, scan = scorer.field, next(empty_scans(run.work, (site.site,)))
     if not len(field.cells):
-        raise InputError(f"--what {what}", "nothing is uncertain in this run", "Use a run with traffic in its region")
+        raise InputError(f"--what {what}", "no voxel has uncertainty", "Use a run with traffic in the region.")
     crossed = scorer.hits(scan.beams) > 0
     which = crossed.ravel()[field.cells]
     share, verb = site.entropy_seen, "sees"
@@ -169,7 +171,7 @@ def _convert_svg(svg: str, kind: str) -> bytes:
     try:
         import cairosvg
     except OSError:  # the package is installed, but not the library that it calls
-        message = f"a figure as {kind} needs the system library cairo (libcairo2); --format svg does not"
+        message = f"a {kind} figure needs the system library cairo (libcairo2); --format svg does not"
         raise MissingBackendError(message) from None
     if kind == "png":
         return _with_resolution(

@@ -61,16 +61,16 @@ class FinishedRun:
     def open(cls, folder: Path) -> FinishedRun:
         """Open a run folder; InputError if it has no finished run, or the scenario folder does not exist."""
         if not folder.is_dir():
-            raise InputError(folder, "no such folder", "Name a folder that egvs run has written")
+            raise InputError(folder, "no such folder", "Give a folder written by egvs run.")
         record, record_path = RunRecord.read(folder), RunFolder(folder).run_record
         for name in _READ_STAGES:
             if name not in record.stages:
-                problem = f"the stage {name} is not finished, or was run by another version of this program"
-                raise InputError(record_path, problem, "Run egvs run again")
+                problem = f"the stage {name} is not finished, or was run by another version of egvs"
+                raise InputError(record_path, problem, "Run egvs run again.")
         source = Path(os.path.normpath(folder / record.scenario_folder))
         if not source.is_dir():
             problem = f"the scenario folder {source} does not exist"
-            raise InputError(record_path, problem, "Move it back to where it was when the run was made")
+            raise InputError(record_path, problem, "Move it back to where it was when the run was made.")
         scenario = scenario_from_dict(record.scenario, source, str(record_path))
         work = open_folder(scenario, folder, recorded=stage_keys.recorded_digests(record))
         run = cls(record, scenario, work, geolocation.scenario_georeference(scenario).frame)
@@ -89,12 +89,12 @@ class FinishedRun:
                 xy_m = np.column_stack([scores.column(name).to_numpy() for name in ("x_m", "y_m")])
                 if np.allclose(recorded, self.frame.to_degrees(xy_m), rtol=0.0, atol=_TOLERANCE_DEG):
                     return
-            problem = "the position of its sites on the Earth differs from that in the scenario or its network"
+            problem = "the geographic position of its sites differs from that in the scenario or its network"
         elif self.frame is None:
             return
         else:  # a run of an older version, or from before the scenario had a reference system
-            problem = "its sites have no longitude and latitude, but the scenario or its network has a position"
-        raise InputError(path, problem, "Run egvs run again")
+            problem = "its sites have no geographic position, but the scenario or its network has one"
+        raise InputError(path, problem, "Run egvs run again.")
 
     def scorer(self, tpog: Tpog) -> Scorer:
         """Return a scorer with the settings of the run.
@@ -106,7 +106,7 @@ class FinishedRun:
         for name, digest in score.dependencies(self.work).files.items():
             if recorded.get(name) != digest:
                 problem = f"{name} has changed since the sites were scored"
-                raise InputError(self.work.folder.run_record, problem, "Run egvs run again")
+                raise InputError(self.work.folder.run_record, problem, "Run egvs run again.")
         return Scorer(get_scene(self.work), tpog, trajectories)
 
     def artefact(self, name: str) -> Path:
@@ -167,7 +167,7 @@ class ExportCrs:
         if choice == WGS84_CRS:
             if frame is None:
                 problem = "cannot write degrees, because the scenario has no reference system"
-                hint = "Add [crs] with epsg to the scenario, use a network with a <location>, or --crs scenario"
+                hint = "Add [crs] with epsg to the scenario, use a network with a <location>, or use --crs scenario."
                 raise InputError(where, problem, hint)
             return cls("EPSG:4326", "longitude and latitude (WGS 84)", frame, is_degrees=True)
         if frame is None:

@@ -281,7 +281,7 @@ def city_layers(folder: Path) -> tuple[list[Layer], list[str]]:
     rows, metadata = parquet.read_artefact(folder / results.JUNCTIONS_TABLE, "city")
     if metadata["inputs"] != results.hash_scores(folder, _junction_names(folder)):
         problem = "the scores of a junction have changed since the city run"
-        raise InputError(folder / results.JUNCTIONS_TABLE, problem, "Run egvs city run again")
+        raise InputError(folder / results.JUNCTIONS_TABLE, problem, "Run egvs city run again.")
     layers, notes = [Layer(JUNCTIONS, point_geometries(rows), to_plain_table(rows), "gain")], list[str]()
     scores = results.read_city_scores(folder)
     planned = results.read_plan(folder, _junction_names(folder))
@@ -404,7 +404,11 @@ def raster_qml(low: float, high: float, stops: list[tuple[float, str]]) -> str:
 
 
 def _site_filter(layer: Layer) -> str:
-    return f'"site" = {_quote_text(layer.initial_site)}' if layer.initial_site else ""
+    """Expression of QGIS that selects the initial site; empty if all sites are shown."""
+    if not layer.initial_site:
+        return ""
+    text = layer.initial_site.replace("\\", "\\\\").replace("'", "''")
+    return f"\"site\" = '{text}'"
 
 
 def _class_filter(layer: Layer, colour_class: ColourClass) -> str:
@@ -414,11 +418,6 @@ def _class_filter(layer: Layer, colour_class: ColourClass) -> str:
     if not layer.initial_site:
         return limits
     return f"{_site_filter(layer)} AND {limits}"
-
-
-def _quote_text(value: str) -> str:
-    """A text literal of QGIS expressions."""
-    return "'" + value.replace("\\", "\\\\").replace("'", "''") + "'"
 
 
 def _symbol(symbols: ET.Element, name: str, layer: Layer, colour: str) -> None:

@@ -66,15 +66,17 @@ def write_geopackage(path: Path, layers: Sequence[Layer], reference: ExportCrs) 
     import shapely
 
     with _fixed_time():
+        dataset_options: dict[str, str] | None = {"VERSION": _VERSION}
         for number, layer in enumerate(layers):
             shapes = shapely.to_wkb(reference.geometries(layer.geometries))
             table = layer.rows.append_column(_GEOMETRY, pa.array(shapes, pa.binary()))
             pyogrio.write_arrow(
                 table, path, layer=layer.name, driver="GPKG", geometry_name=_GEOMETRY,
                 geometry_type=_KINDS.get(layer.name, "Point"), crs=reference.crs, append=number > 0,
-                dataset_options=None if number else {"VERSION": _VERSION},
+                dataset_options=dataset_options,
                 layer_options={"FID": _NUMBER, "GEOMETRY_NAME": _GEOMETRY, "IDENTIFIER": layer.name},
             )  # fmt: skip
+            dataset_options = None  # the file exists
     with closing(sqlite3.connect(path)) as database, database:
         database.executescript(_STYLES)
         rows = [(layer.name, _GEOMETRY, layer.name, layer_qml(layer), _EPOCH) for layer in layers]
@@ -170,7 +172,8 @@ def _placemark(
             text = repr(value) if isinstance(value, float) else str(value)
             data = ET.SubElement(extended, "Data", name=_remove_invalid_xml(key))
             ET.SubElement(data, "value").text = _remove_invalid_xml(text)
-    _geometry(mark, shape, row.get("z_m") if layer.has_points else None)
+    z_m = row.get("z_m") if layer.has_points else None
+    _geometry(mark, shape, z_m)
 
 
 def _geometry(parent: ET.Element, shape: Any, z_m: float | None) -> None:
@@ -269,7 +272,9 @@ def write_csv(path: Path, layer: Layer, reference: ExportCrs) -> None:
     shapes = reference.geometries(layer.geometries)
     positions: list[list[str]]
     if layer.has_points:
-        position_names = ["longitude_deg", "latitude_deg"] if reference.is_degrees else ["easting_m", "northing_m"]
+        position_names = ["easting_m", "northing_m"]
+        if reference.is_degrees:
+            position_names = ["longitude_deg", "latitude_deg"]
         positions = [[repr(x), repr(y)] for x, y in shapely.get_coordinates(shapes).tolist()]
     else:
         position_names = ["wkt"]

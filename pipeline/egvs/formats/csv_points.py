@@ -53,7 +53,7 @@ def _column_names(where: str, head: bytes) -> list[str]:
         raise InputError(where, f"expected at most {_MAX_COLUMNS:,} columns, got {len(names):,}", _HINT)
     for name in _COLUMNS:
         if names.count(name) != 1:
-            raise InputError(where, f"expected one column {name!r}, got {', '.join(names) or 'none'}", _HINT)
+            raise InputError(where, f"expected exactly one column {name!r}, got {', '.join(names) or 'none'}", _HINT)
     return names
 
 

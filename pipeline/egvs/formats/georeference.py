@@ -70,7 +70,7 @@ class WorldFrame:
             return cls(projection, offset_m)
         problem = "is not a map projection"
         if crs.is_projected:
-            problem = f"counts in {units[0]} to the {' and '.join(directions)}"
+            problem = f"has axes in {units[0]} to the {' and '.join(directions)}"
         hint = "Use a projection in metres to the east and north, for example epsg = 32632 (UTM zone 32 north)."
         raise InputError(where, f"{projection} ({crs.name}) {problem}", hint)
 
@@ -134,8 +134,10 @@ def height_unit_m(crs: Any, where: str) -> float:
     parse_crs(crs, where)
     parsed = CRS.from_user_input(crs)
     for axis in parsed.axis_info:
-        if axis.direction in ("up", "down"):
-            return float(axis.unit_conversion_factor) * (1.0 if axis.direction == "up" else -1.0)
+        if axis.direction == "up":
+            return float(axis.unit_conversion_factor)
+        if axis.direction == "down":
+            return -float(axis.unit_conversion_factor)
     return float(parsed.axis_info[0].unit_conversion_factor) if parsed.is_projected else 1.0
 
 
@@ -204,7 +206,7 @@ class CoordinateReading:
         xy_m = np.round(self.convert(xy), _DIGITS_M) + 0.0  # no -0
         for i in np.flatnonzero(~np.isfinite(xy_m).all(axis=1)):
             problem = f"({xy[i, 0]:.10g}, {xy[i, 1]:.10g}) cannot be converted from {self.description}"
-            raise InputError(self.where, problem, "Check the coordinates, and the projection of the scenario.")
+            raise InputError(self.where, problem, "Check the coordinates and the scenario's projection.")
         return xy_m
 
 
@@ -283,7 +285,7 @@ class Georeference:
             if distance_m <= COUNTRY_M:
                 problem = (
                     f"expected metres of the world frame, got longitude and latitude: coordinates"
-                    f" {_format_span(xy_m)}, {_format_distance(distance_m)} from the region of interest as degrees"
+                    f" {_format_span(xy_m)}, as degrees {_format_distance(distance_m)} from the region of interest"
                 )
                 raise InputError(where, problem, hint)
         self._check_near(WORLD_READING, xy_m, where, hint)
@@ -327,13 +329,13 @@ class Georeference:
         if distance_m <= FAR_M:
             return
         problem = (
-            f"coordinates {_format_span(xy)} are {_format_distance(distance_m)} from the region of interest"
-            f" as {reading.description}"
+            f"coordinates {_format_span(xy)} are {_format_distance(distance_m)} from the region of interest,"
+            f" read as {reading.description}"
         )
         distances_m = {words: self.distance_m(points) for words, points in self._alternatives(xy)}
         nearest = min(distances_m, key=lambda words: distances_m[words], default="")
         if distances_m.get(nearest, np.inf) <= FAR_M:
-            hint = f"They would be near it as {nearest}. {hint}"
+            hint = f"Read as {nearest}, they would be near it. {hint}"
         raise InputError(where, problem, hint)
 
     def _alternatives(self, xy: FloatArray) -> Iterator[tuple[str, FloatArray]]:

@@ -29,7 +29,7 @@ from egvs.core.grid import FloatArray, IntArray
 _NOT_TRUNCATED_NOT_OCCLUDED = "0.00 0"
 _RECTANGLE = "0.00 0.00 50.00 50.00"
 _LABEL_VALUES, _RESULT_VALUES = 15, 16
-_LABELS_HINT = "Write one object per line, as KITTI does; the file is empty where there is none."
+_LABELS_HINT = "Write one object per line, as in KITTI; leave the file empty if there are no objects."
 
 _CAMERA = "1 0 0 0 0 1 0 0 0 0 1 0"
 CALIBRATION = (
@@ -39,7 +39,7 @@ CALIBRATION = (
 """The text of a file ``calib/*.txt``; the same for every frame."""
 
 _CAMERA_KEYS = ("R0_rect", "Tr_velo_to_cam")
-_CALIBRATION_HINT = "Use the calibration that egvs clouds writes."
+_CALIBRATION_HINT = "Use the calibration file written by egvs clouds."
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,8 @@ def read_labels(path: Path) -> KittiObjects:
         lines.append(number)
         names.append(words[0])
         boxes.append(values[7:14])
-        scores.append(values[14] if len(words) == _RESULT_VALUES else math.nan)
+        score = values[14] if len(words) == _RESULT_VALUES else math.nan
+        scores.append(score)
     camera = np.array(boxes, dtype=np.float64).reshape(-1, 7)
     return KittiObjects(
         tuple(names), from_camera(camera), np.array(scores, dtype=np.float64), np.array(lines, dtype=np.int64)

@@ -27,7 +27,7 @@ from egvs.formats.point_clouds import stack_xyz
 
 _CHUNK = 1_000_000
 _CANNOT_READ = "cannot be read as LAS"
-_INSTALL_HINT = "Install it: pip install egvs[las]."
+_INSTALL_HINT = "Run pip install 'egvs[las]'."
 _ROOT = Path(__file__).resolve().parents[2]
 """Folder of the package ``egvs``, which the other process must find."""
 
@@ -101,10 +101,12 @@ def _read_in_other_process(path: Path, where: str, declared: int) -> FloatArray:
         errors.seek(0)
         lines = errors.read(100_000).decode("utf-8", "replace").strip().splitlines()
     if code < 0:
-        problem = f"{_CANNOT_READ} (the decompressor was ended by signal {-code}: it asked for too much memory)"
+        problem = f"{_CANNOT_READ} (the decompressor was killed by signal {-code}: it needed too much memory)"
         raise InputError(where, problem, limits.READER_MEMORY.hint)
     if code or has_more:
-        reason = lines[-1] if lines else "more points than its header declares"
+        reason = "more points than its header declares"
+        if lines:
+            reason = lines[-1]
         raise InputError(where, f"{_CANNOT_READ} ({reason})", COMPLETE_FILE)
     return points[: filled // points.itemsize // 3]
 
@@ -129,7 +131,9 @@ def crs_of(path: Path, where: str) -> str | None:
         laspy.open(file, closefd=False, read_evlrs=False) as las,
     ):
         crs = las.header.parse_crs()
-        return None if crs is None else str(crs.to_wkt())
+        if crs is None:
+            return None
+        return str(crs.to_wkt())
 
 
 def _check_header(where: str, head: bytes, size: int) -> bool:

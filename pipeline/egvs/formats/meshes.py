@@ -75,7 +75,7 @@ def _check_gltf_size(path: Path, where: str, data: bytes) -> None:
 
     external = [path.parent / uri for uri in _external_uris(document)]
     total = sum(file.stat().st_size for file in external if file.is_file())
-    limits.FILE.check_bytes(where, total, "names larger files")
+    limits.FILE.check_bytes(where, total, "refers to larger files")
 
 
 def _accessor_count(accessor: dict[str, Any]) -> int:
@@ -168,10 +168,10 @@ MESH_HINT = "Use a complete triangle mesh that trimesh can read: PLY, OBJ, STL, 
 
 _PLY_ELEMENT = re.compile(rb"(?m)^element[ \t]+(\S+)[ \t]+(\d+)[ \t\r]*$")
 _OBJ_FAULTS = (
-    (re.compile(rb"(?m)^[ \t]*[-+.0-9][^\n]*"), "starts with no keyword"),
+    (re.compile(rb"(?m)^[ \t]*[-+.0-9][^\n]*"), "does not start with a keyword"),
     (re.compile(rb"(?m)^v(?:[ \t]+[^ \t\r\n]+){0,2}[ \t\r]*$"), "has fewer than three coordinates"),
     (re.compile(rb"(?m)^f(?:[ \t]+[^ \t\r\n]+){0,2}[ \t\r]*$"), "is a face with fewer than three corners"),
-    (re.compile(rb"(?m)^f[ \t](?:[^\n]*[ \t])?0+(?=[ \t\r\n/]|\Z)"), "names vertex 0, but the first is 1"),
+    (re.compile(rb"(?m)^f[ \t](?:[^\n]*[ \t])?0+(?=[ \t\r\n/]|\Z)"), "refers to vertex 0, but the first is 1"),
 )
 """Lines that a reader could only guess at."""
 
@@ -207,7 +207,7 @@ def load_mesh(path: Path, where: str) -> trimesh.Trimesh:
             raise InputError(where, f"the vertices have the shape {mesh.vertices.shape}, not (n, 3)", MESH_HINT)
         for vertex in (mesh.faces.min(), mesh.faces.max()):
             if not 0 <= vertex < len(mesh.vertices):
-                raise InputError(where, f"a triangle names vertex {vertex} of {len(mesh.vertices)}", MESH_HINT)
+                raise InputError(where, f"a triangle refers to vertex {vertex} of {len(mesh.vertices)}", MESH_HINT)
     return mesh
 
 

@@ -141,7 +141,7 @@ def read_osm(path: Path) -> OsmExtract:
         box = objects.header.box()
         for number, o in enumerate(objects):
             if number == limit:
-                hint = f"Use a part of the map. {limits.MAP_OBJECTS.hint}"
+                hint = f"Use a smaller extract. {limits.MAP_OBJECTS.hint}"
                 raise InputError(path, f"has more than {limit:,} objects", hint)
             if isinstance(o, osmium.osm.Changeset) or not o.visible or (o.type_str(), o.id) in deleted:
                 continue

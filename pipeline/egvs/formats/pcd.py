@@ -73,8 +73,10 @@ def read(path: Path, where: str) -> FloatArray:
             points = layout.from_blocks(_unpack(where, data[header.data_start :], layout.n * layout.size))
         case other:
             problem = f"DATA: expected ascii, binary or binary_compressed, got {' '.join(other)[:60]!r}"
-            raise InputError(where, problem, "Convert the file.")
-    return points if viewpoint == _IDENTITY else _to_world(points, viewpoint)
+            raise InputError(where, problem, "Convert the file to one of these.")
+    if viewpoint == _IDENTITY:
+        return points
+    return _to_world(points, viewpoint)
 
 
 def write(path: Path, points_m: FloatArray) -> None:
@@ -103,7 +105,7 @@ def _read_header(where: str, data: bytes) -> _Header:
     start = lines = 0
     while "DATA" not in words:
         if start >= len(data):
-            raise InputError(where, "the PCD header has no line DATA", COMPLETE_FILE)
+            raise InputError(where, "the PCD header has no DATA line", COMPLETE_FILE)
         end = data.find(b"\n", start)
         if end < 0:
             end = len(data)
@@ -121,12 +123,12 @@ def _read_header(where: str, data: bytes) -> _Header:
 def _layout(where: str, header: dict[str, list[str]]) -> RecordLayout:
     for key in ("FIELDS", "SIZE", "TYPE"):
         if key not in header:
-            raise InputError(where, f"the PCD header has no line {key}", _HEADER_HINT)
+            raise InputError(where, f"the PCD header has no {key} line", _HEADER_HINT)
     names = header["FIELDS"]
     words = {"COUNT": ["1"] * len(names)} | header
     for key in ("SIZE", "TYPE", "COUNT"):
         if len(words[key]) != len(names):
-            problem = f"{key}: expected {len(names)} values, one for each of FIELDS, got {len(words[key])}"
+            problem = f"{key}: expected {len(names)} values, one per field, got {len(words[key])}"
             raise InputError(where, problem, "Correct the PCD header.")
     formats = []
     for name, kind, size in zip(names, words["TYPE"], words["SIZE"], strict=True):
@@ -151,7 +153,7 @@ def _point_count(where: str, header: dict[str, list[str]]) -> int:
             raise InputError(where, f"POINTS is {points}, but WIDTH x HEIGHT is {product}", hint)
         return product
     if points is None:
-        raise InputError(where, "the PCD header has no line POINTS", _HEADER_HINT)
+        raise InputError(where, "the PCD header has no POINTS line", _HEADER_HINT)
     return points
 
 
@@ -188,10 +190,10 @@ def _to_world(points: FloatArray, viewpoint: tuple[float, ...]) -> FloatArray:
 def _unpack(where: str, body: bytes, expected: int) -> bytearray:
     """Return the ``expected`` bytes of points of a file with DATA binary_compressed."""
     if len(body) < 8:
-        raise InputError(where, f"the file ends before its points ({len(body)} bytes of them)", COMPLETE_FILE)
+        raise InputError(where, f"the file ends before its points (only {len(body)} bytes of data)", COMPLETE_FILE)
     packed, size = struct.unpack_from("<II", body)
     if size != expected:
-        problem = f"the header declares {expected} bytes of points, got {size} bytes, unpacked"
+        problem = f"the header declares {expected} bytes of points, got {size} bytes after decompression"
         raise InputError(where, problem, COMPLETE_FILE)
     if len(body) < 8 + packed:
         problem = f"expected {packed} bytes of packed points, got {len(body) - 8} bytes"
@@ -199,7 +201,7 @@ def _unpack(where: str, body: bytes, expected: int) -> bytearray:
     limits.UNPACKED.check_bytes(where, size)
     unpacked = _decompress_lzf(body[8 : 8 + packed], size)
     if unpacked is None:
-        raise InputError(where, "the packed points are no valid LZF data", COMPLETE_FILE)
+        raise InputError(where, "the packed points are not valid LZF data", COMPLETE_FILE)
     return unpacked
 
 
@@ -235,4 +237,6 @@ def _decompress_lzf(packed: bytes, size: int) -> bytearray | None:
             out += piece
     except IndexError:
         return None
-    return out if at == end and len(out) == size else None
+    if at != end or len(out) != size:
+        return None
+    return out

@@ -90,8 +90,8 @@ def write_columns(path: Path, columns: Mapping[str, NDArray[np.generic]]) -> Non
 def _formats(where: str, element: _Element, order: str) -> list[str]:
     formats = [order + kind for kind in element.properties.values() if kind is not None]
     if len(formats) < len(element.properties):
-        hint = "Write no list among the vertices' properties, and in a binary file none before the vertices."
-        raise InputError(where, f"the element {element.name!r} has a list", hint)
+        hint = "Use no list properties in the vertices or, in a binary file, in any element before them."
+        raise InputError(where, f"the element {element.name!r} has a list property", hint)
     return formats
 
 
@@ -116,8 +116,10 @@ def _read_header(where: str, data: bytes) -> _Header:
                 pass
             case _:
                 problem = f"expected a format, an element, or a property of a known type, got {line.strip()[:60]!r}"
-                raise InputError(f"{where}: line {number}", problem, "Correct the PLY header; each name occurs once.")
+                raise InputError(
+                    f"{where}: line {number}", problem, "Correct the PLY header; each name is allowed once."
+                )
     if not order:
-        hint = f"Add a line 'format' with one of {', '.join(_ORDERS)}."
-        raise InputError(where, "the PLY header has no line 'format'", hint)
+        hint = f"Add a 'format' line with one of {', '.join(_ORDERS)}."
+        raise InputError(where, "the PLY header has no 'format' line", hint)
     return _Header(order, elements, start, len(lines))

@@ -110,7 +110,7 @@ def read_points(path: Path, where: str) -> PointCloud:
 
 def _read_with(point_format: PointFormat, path: Path, where: str, reader: str) -> FloatArray:
     """Return what a format reads, as (n, 3) float64; InputError when it fails or returns something else."""
-    hint = f"Check the file, or repair {reader}."
+    hint = f"Check the file, or fix {reader}."
     try:
         points = point_format.read(path, where)
     except EgvsError:
@@ -119,11 +119,11 @@ def _read_with(point_format: PointFormat, path: Path, where: str, reader: str) -
         problem = f"cannot be read ({describe_exception(error)})"
         raise InputError(where, problem, "Check the path, the permissions, and that the file is complete.") from None
     except (Exception, SystemExit) as error:  # a reader of another package may raise anything
-        raise InputError(where, f"{reader} ended with {error!r}", hint) from error
+        raise InputError(where, f"{reader} raised {error!r}", hint) from error
     if not isinstance(points, np.ndarray):
         raise InputError(where, f"{reader} returns {type(points).__name__}, not an array", hint)
     if points.dtype.kind not in "fiu" or points.ndim != 2 or points.shape[1] != 3:
-        problem = f"{reader} returns an array of {points.dtype} of the shape {points.shape}, not numbers (n, 3)"
+        problem = f"{reader} returns a {points.dtype} array of shape {points.shape}, not numbers of shape (n, 3)"
         raise InputError(where, problem, hint)
     limits.POINTS.check(where, len(points))
     return points.astype(np.float64, copy=False)
@@ -235,7 +235,7 @@ class RecordLayout:
         for axis in AXES:
             if names.count(axis) != 1 or counts[names.index(axis)] != 1:
                 problem = f"expected one field {axis!r}, got the fields {' '.join(names) or 'none'}"
-                raise InputError(where, problem, "Write one field each for x, y and z.")
+                raise InputError(where, problem, "Write one field for each of x, y and z.")
         sizes = [np.dtype(kind).itemsize * count for kind, count in zip(formats, counts, strict=True)]
         columns = (0, *accumulate(counts))
         offsets = (0, *accumulate(sizes))
@@ -296,7 +296,7 @@ class RecordLayout:
             for word in words:
                 if parse_float(word) is None:
                     return InputError(where, f"expected a number, got {word!r}", NUMBER_HINT)
-        return InputError(self.where, f"cannot be read as text ({error})", "Separate the numbers by spaces.")
+        return InputError(self.where, f"cannot be read as text ({error})", "Separate the numbers with spaces.")
 
 
 def stack_xyz(columns: Sequence[NDArray[np.generic]]) -> FloatArray:

@@ -38,7 +38,7 @@ DECODED_ENCODINGS = frozenset(
 """Python's names of the encodings that are decoded here."""
 
 _ENCODING_HINT = (
-    "Save it in UTF-8, UTF-16, Shift_JIS, EUC-JP, ISO-8859-x, windows-125x, GB18030, Big5 or EUC-KR, and declare that."
+    "Save it in UTF-8, UTF-16, Shift_JIS, EUC-JP, ISO-8859-x, windows-125x, GB18030, Big5 or EUC-KR, and declare it."
 )
 _WHATWG_SUPERSETS = {"shift_jis": "cp932", "gb2312": "gb18030", "gbk": "gb18030"}
 """Declared encodings that in practice, and in the WHATWG's Encoding Standard, mean a superset."""
@@ -114,7 +114,7 @@ def read_line(file: IO[bytes], where: object) -> bytes:
     """Return the next line of a file; InputError when it is too long."""
     limit = limits.ELEMENT.maximum * limits.MB
     line = file.readline(limit + 1)
-    limits.ELEMENT.check_bytes(where, len(line), "has a line without end")
+    limits.ELEMENT.check_bytes(where, len(line), "has an unterminated line")
     return line
 
 
@@ -153,7 +153,7 @@ def iter_elements(
         try:
             _, top = next(events)
             if root and top.tag != root:
-                raise InputError(where, f"expected the root <{root}>, got <{top.tag}>", "Check which file is named.")
+                raise InputError(where, f"expected the root element <{root}>, got <{top.tag}>", "Check the file name.")
             if on_root is not None:
                 on_root(top)
             depth = 0
@@ -168,7 +168,7 @@ def iter_elements(
         except ParseError as error:
             raise InputError(where, f"is not well-formed XML: {error}", COMPLETE_FILE) from None
         except DefusedXmlException:
-            problem = "declares XML entities or a document type, which are refused"
+            problem = "declares XML entities or a document type, which are not allowed"
             raise InputError(where, problem, "Remove <!DOCTYPE ...> from the file.") from None
 
 
@@ -190,7 +190,7 @@ def scan_attribute_values(path: Path, attribute: str) -> Iterator[bytes]:
             # A value, or the attribute's name, may continue in the next chunk.
             begin = data.rfind(start, end)
             rest = data[-len(start) :] if begin < 0 else data[max(begin - 1, 0) :]
-            limits.ELEMENT.check_bytes(path, len(rest), "has a value without end")
+            limits.ELEMENT.check_bytes(path, len(rest), "has an unterminated value")
 
 
 def file_encoding(path: Path, name: Path | None = None) -> str:
@@ -211,7 +211,7 @@ def copy_as_utf8(path: Path, to: Path) -> None:
         start = text.read(_HEAD_BYTES)
         while b"?>" not in start and (more := text.read(_HEAD_BYTES)):
             start += more
-            limits.ELEMENT.check_bytes(path, len(start), "has an XML declaration without end")
+            limits.ELEMENT.check_bytes(path, len(start), "has an unterminated XML declaration")
         copy.write(start.partition(b"?>")[2])
         while chunk := text.read(1 << 20):
             copy.write(chunk)
@@ -229,7 +229,7 @@ class _BoundedReader(io.RawIOBase):
     def readinto(self, buffer: Any) -> int:
         chunk = self._file.read(len(buffer))
         self._bytes += len(chunk)
-        problem = f"holds more than {limits.UNPACKED.maximum:,} MB, unpacked"
+        problem = f"holds more than {limits.UNPACKED.maximum:,} MB after decompression"
         limits.UNPACKED.check_bytes(self._where, self._bytes, problem)
         buffer[: len(chunk)] = chunk
         return len(chunk)
@@ -246,6 +246,6 @@ class _ElementMeter:
         chunk = self._file.read(size)
         self.bytes_since_child += len(chunk)
         if self.bytes_since_child > self._max_mb * limits.MB + size:
-            problem = f"has an element, or a text, of more than {self._max_mb:,} MB"
+            problem = f"has an element or text of more than {self._max_mb:,} MB"
             raise InputError(self._where, problem, limits.ELEMENT.hint)
         return chunk

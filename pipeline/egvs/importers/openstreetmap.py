@@ -55,7 +55,7 @@ SURROUNDINGS_M = 300.0
 """How far from the junction streets are simulated: enough for the queues and platoons that reach it."""
 
 PEOPLE_HINT = (
-    "pedestrians are added with --set effects.pedestrians_bicycles.pedestrians_per_h=300 (bicycles: bicycles_per_h)"
+    "pedestrians are added with --set effects.pedestrians_bicycles.pedestrians_per_h=300 (bicycles: bicycles_per_h)."
 )
 
 TomlTable = tuple[str, dict[str, Any]]
@@ -221,7 +221,7 @@ def check_new_folder(folder: Path) -> str:
     InputError
         When there is a file or a folder with content.
     """
-    hint = "Name a folder that does not exist yet, so that nothing is overwritten."
+    hint = "Choose a folder that does not exist yet; no file is ever overwritten."
     if folder.exists() and not folder.is_dir():
         raise InputError(folder, "expected a new folder, got an existing file", hint)
     if folder.is_dir() and any(folder.iterdir()):

@@ -187,10 +187,10 @@ def _clear_of_carriageway(solid: MappedSolid, lanes: shapely.STRtree, counts: Im
     counts.keep(solid)
     if len(pieces) == 1:
         return [dataclasses.replace(solid, geometry=pieces[0])]
-    return [
-        dataclasses.replace(solid, geometry=piece, name=f"{solid.name}#{number}")
-        for number, piece in enumerate(pieces, 1)
-    ]
+    solids = []
+    for number, piece in enumerate(pieces, 1):
+        solids.append(dataclasses.replace(solid, geometry=piece, name=f"{solid.name}#{number}"))
+    return solids
 
 
 def _cut_away(solid: MappedSolid, lanes: list[BaseGeometry], counts: ImportCounts) -> list[BaseGeometry]:

@@ -554,7 +554,7 @@ def candidate_costs(scenario: Scenario, sites: Sequence[Site]) -> tuple[FloatArr
 def _check_cost(where: str, cost: float) -> None:
     """Raise InputError for a cost so large that sums of costs lose the small ones, or overflow."""
     if not cost <= _MAX_COST:
-        raise InputError(where, f"expected at most {_MAX_COST:g}, got {cost:g}", "Use a larger unit of money.")
+        raise InputError(where, f"expected at most {_MAX_COST:g}, got {cost:g}", "Use a larger currency unit.")
 
 
 def share_demand(problem: Problem, share: float, joint_of_all: float) -> Demand:

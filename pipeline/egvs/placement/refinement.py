@@ -202,7 +202,7 @@ def check_refine_config(scenario: Scenario, config: RefinementConfig) -> None:
     for number, corners in enumerate(config.within_m):
         if not shapely.intersects_xy(shapely.Polygon(corners), x_m, y_m).any():
             where = f"{scenario.file}: placement.refine.within_m: polygon {number}"
-            hint = "Draw it round a candidate, in the world frame."
+            hint = "Draw it around a candidate, in the world frame."
             raise InputError(where, "no candidate is inside this polygon", hint)
 
 
@@ -251,7 +251,7 @@ def sensor_freedoms(
         raise InputError(
             f"{scenario.file}: placement.refine",
             "no sensor of the plan can move",
-            "Give a range of heights or angles, or sensors that are neither forced nor measured.",
+            "Set a range of heights or angles, or use sensors that are neither forced nor measured.",
         )
     return tuple(freedoms)
 

@@ -61,9 +61,7 @@ def world_outlines(world: World, box: Box) -> tuple[Outlines, ...]:
     kinds = np.empty(0, dtype=str)
     if len(world.faces):
         kinds = np.array([kind for _, kind in world.solids])[world.solid_of_face]
-    by_class: dict[str, tuple[list[str], list[Any]]] = {
-        css_class: ([], []) for css_class in ("large", "small", "green")
-    }
+    by_class: dict[str, tuple[list[str], list[Any]]] = {"large": ([], []), "small": ([], []), "green": ([], [])}
     for kind in sorted(set(kinds[is_visible].tolist()) - {"ground"}):
         of_kind = is_visible & (kinds == kind)
         shape = union_of_triangles(corners[of_kind], box)

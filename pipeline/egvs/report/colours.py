@@ -69,7 +69,9 @@ def opacity(share: float) -> float:
 
 def colour_class(value: float, low: float, high: float) -> int:
     """Return the number of the class of a value on a linear scale."""
-    return round(STEPS * (value - low) / (high - low)) if high > low else STEPS
+    if not high > low:
+        return STEPS
+    return round(STEPS * (value - low) / (high - low))
 
 
 @dataclass(frozen=True)

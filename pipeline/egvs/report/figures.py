@@ -132,8 +132,9 @@ def draw_figures(work: StageContext, ranking: Ranking, choosable: Sequence[Ranke
     """Draw the figures of a run; views are made of the ``choosable`` sites."""
     backdrop = make_backdrop(work, ranking, tpog)
     scorer = Scorer(work.scene, tpog, work.folder.trajectories)
-    occupancy = occupancy_map(tpog, ranking, backdrop) if tpog.counts.any() else ""
-    views = None
+    occupancy, views = "", None
+    if tpog.counts.any():
+        occupancy = occupancy_map(tpog, ranking, backdrop)
     if len(scorer.field.cells):
         views = site_views(work, ranking, choosable, scorer, backdrop)
     return Figures(occupancy, sites_map(tpog, ranking, backdrop), views, backdrop)
@@ -159,7 +160,7 @@ def occupancy_map(tpog: Tpog, ranking: Ranking, backdrop: Backdrop, style: Figur
     alt = (
         f"Occupancy of the region of interest by traffic, seen from above: "
         f"vehicles use {np.count_nonzero(mean) / mean.size:.0%} of its area; "
-        f"the busiest place is near x = {x:.0f} m, y = {y:.0f} m."
+        f"the busiest location is near x = {x:.0f} m, y = {y:.0f} m."
     )
     label = "Occupied voxels in the column"
     if style.width >= _WIDE_FIGURE:
@@ -223,10 +224,11 @@ def site_views(
         "palettes": palettes,
         "end": _to_base64(colours.PNG_END),
     }
+    points = blindspots.points if blindspots else 0.0
     return SiteViews(
         panels=tuple(panels[site.site] for site in ranking.extremes),
         scale=shared_scale(peak, "Entropy in the column (bit)"),
-        points=blindspots.points if blindspots else 0.0,
+        points=points,
         data=json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),  # a name must not end the script
         is_coarse=is_coarse,
     )
@@ -391,10 +393,10 @@ def format_missed_share(site_blindspots: SiteBlindspots) -> str:
 
 def describe_worst_locations(site_blindspots: SiteBlindspots) -> tuple[tuple[str, str], ...]:
     """Return the worst locations, and the sample that each is based on."""
-    return tuple(
-        (f"{location.words}: {_format_share(location)} seen", _describe_sample(location))
-        for location in site_blindspots.worst
-    )
+    described = []
+    for location in site_blindspots.worst:
+        described.append((f"{location.words}: {_format_share(location)} seen", _describe_sample(location)))
+    return tuple(described)
 
 
 def blindspot_note(site_blindspots: SiteBlindspots) -> str:

@@ -47,7 +47,9 @@ class ScoreLabel:
     def title(self) -> str:
         """Head of a column of the report: two lines of HTML."""
         first, _, rest = self.head.partition(" ")
-        second = f"({self.unit})" if self.unit else rest or "of all"
+        second = rest or "of all"
+        if self.unit:
+            second = f"({self.unit})"
         return f"{first[0].upper()}{first[1:]}<br>{second}"
 
     @property
@@ -73,7 +75,9 @@ class ScoreLabel:
 
     def sentence(self, value: float) -> str:
         """Return what a site with this score does, e.g. "should find 87% of vehicles"."""
-        text = f"{value:.0%}" if self.is_share else f"{self.value(value)} {self.unit}".strip()
+        text = f"{self.value(value)} {self.unit}".strip()
+        if self.is_share:
+            text = f"{value:.0%}"
         return self.says.format(text)
 
 
@@ -92,18 +96,18 @@ _LABELS = (
         "Sites are ranked by the share of the traffic’s uncertainty in voxels that at least one beam crosses.",
     ),
     ScoreLabel(
-        "coverage", "the coverage", "coverage", "crosses {} of the voxels where traffic ever is",
+        "coverage", "the coverage", "coverage", "crosses {} of the voxels that traffic ever occupies",
         "Sites are ranked by coverage: of the voxels that traffic ever occupies, the share that at least one beam "
         "crosses.",
     ),
     ScoreLabel(
-        "expected_visibility", "the occupancy seen", "visibility", "sees {} of what traffic occupies",
+        "expected_visibility", "the occupancy seen", "visibility", "sees {} of the traffic’s occupancy",
         "Sites are ranked by the occupancy seen: of the summed occupancy probabilities, the share in voxels that at "
         "least one beam crosses.",
     ),
     ScoreLabel(
         "points_on_target", "the points on vehicles", "log points", "has a mean log(1 + points) of {} on vehicles",
-        f"Sites are ranked by the points that they get from vehicles: the mean of log(1 + points). "
+        f"Sites are ranked by their points on vehicles: the mean of log(1 + points). "
         f"{_VEHICLES_NOTE}",
         is_share=False, digits=2,
     ),
@@ -115,7 +119,7 @@ _LABELS = (
     ScoreLabel(
         "expected_detections", "the share of vehicles found", "found", "should find {} of vehicles",
         "Sites are ranked by the share of vehicles that detectors are expected to find, given the points on each "
-        "vehicle, how far they spread over it, its distance, and the distance to the next vehicle. "
+        "vehicle, how widely they are spread over it, its distance, and the distance to the next vehicle. "
         f"{_VEHICLES_NOTE}",
     ),
 )  # fmt: skip

@@ -121,7 +121,8 @@ def site_map(
     plan = _sites_frame(extent(grid, sites), "sites", style)
     stacks = _stack_sites(sites)
     crowded = is_crowded(sites)
-    low, high = min(site.score for site in sites), max(site.score for site in sites)
+    scores = [site.score for site in sites]
+    low, high = min(scores), max(scores)
     street_names, street_boxes = _street_names(plan, backdrop.roads.names, sites)
     radius = 8.5
     labelled = stacks
@@ -131,7 +132,9 @@ def site_map(
     parts = [*base_layers(plan, grid, values, backdrop), *street_names]
     parts += [_site_rings(plan, stack, low, high, radius, crowded) for stack in reversed(stacks)]
     parts += _stack_labels(plan, stacks, labelled, radius, street_boxes)
-    bar = ColourBar(low, high, sites[0].by.label, even=True) if high > low else None
+    bar = None
+    if high > low:
+        bar = ColourBar(low, high, sites[0].by.label, even=True)
     return plan.svg(parts, alt, bar=bar)
 
 
@@ -182,7 +185,10 @@ def site_view(
     label
         Title of a colour bar below the map; no bar by default.
     """
-    plan = site_view_frame(view.box, prefix) if style is None else _sites_frame(view.box, prefix, style)
+    if style is None:
+        plan = site_view_frame(view.box, prefix)
+    else:
+        plan = _sites_frame(view.box, prefix, style)
     shade = colours.shade_image(np.logical_not(view.crossed.any(axis=2)))
     parts = [
         _road_paths(plan, view.backdrop.roads),
@@ -192,16 +198,17 @@ def site_view(
         plan.roi(grid),
         _sensor_mark(plan, view.site),
     ]
-    return plan.svg(parts, alt, ColourBar(0.0, peak, label) if label else None)
+    if not label:
+        return plan.svg(parts, alt)
+    return plan.svg(parts, alt, ColourBar(0.0, peak, label))
 
 
 def scan_view(grid: Grid, image: IndexedImage, view: SiteViewFigure, prefix: str, alt: str) -> str:
     """Return where the beams of an empty scan end, from above; ``image`` covers the box of the view."""
     plan = site_view_frame(view.box, prefix)
-    images = [
-        plan.image(plan.full_extent, image.uri(colours.DOT_PALETTES[theme]), f"field {theme}")
-        for theme in colours.THEMES
-    ]
+    images = []
+    for theme in colours.THEMES:
+        images.append(plan.image(plan.full_extent, image.uri(colours.DOT_PALETTES[theme]), f"field {theme}"))
     outlines = _outline_paths(plan, view.backdrop.outlines)
     return plan.svg([outlines, *images, plan.roi(grid), _sensor_mark(plan, view.site)], alt)
 
@@ -222,13 +229,15 @@ def missed_view(
         parts.append(plan.image(rectangle, image.uri(colours.SHARE_PALETTES[theme]), f"field share {theme}"))
     parts += [_outline_paths(plan, backdrop.outlines), plan.roi(grid), _sensor_mark(plan, site)]
     for number, position in enumerate(label_positions(plan, blindspots), start=1):
-        transform = f'transform="translate({position[0]} {position[1]})"' if position else 'display="none"'
+        transform = 'display="none"'
+        if position:
+            transform = f'transform="translate({position[0]} {position[1]})"'
         parts.append(f'<g class="worst" {transform}><circle r="8.5"/><text y="4">{number}</text></g>')
 
     alt = f"From above: no vehicles for {site.site} to see."
     if blindspots.overall:
         alt = f"From above: {site.site} misses {1.0 - blindspots.overall.share:.1%} of the vehicles; share by cell."
-    bar = ColourBar(0.0, 100.0, "Share of the vehicles that is missed (%)", even=True)
+    bar = ColourBar(0.0, 100.0, "Share of vehicles missed (%)", even=True)
     return plan.svg(parts, alt, bar)
 
 
@@ -252,10 +261,9 @@ def _field_image(plan: MapFrame, grid: Grid, values: ColumnValues, peak: float) 
     if not peak > 0:
         return ""
     image, rectangle = colours.field_image(values, peak), plan.region(grid)
-    images = [
-        plan.image(rectangle, image.uri(colours.FIELD_PALETTES[theme]), f"field {theme}")
-        for theme in plan.style.image_themes
-    ]
+    images = []
+    for theme in plan.style.image_themes:
+        images.append(plan.image(rectangle, image.uri(colours.FIELD_PALETTES[theme]), f"field {theme}"))
     return "".join(images)
 
 
@@ -273,7 +281,9 @@ def _road_paths(plan: MapFrame, roads: Roads) -> str:
         edges.append(f'<path {plan.style.shape("edge")} style="stroke-width:{width:.2f}px" d="{d}"/>')
         lanes.append(f'<path {plan.style.shape("lane", css_class)} style="stroke-width:{narrow:.2f}px" d="{d}"/>')
     outlines = "".join(_closed_path(plan, outline) for outline in roads.junctions)
-    junctions = f'<path {plan.style.shape("junction")} d="{outlines}"/>' if outlines else ""
+    junctions = ""
+    if outlines:
+        junctions = f'<path {plan.style.shape("junction")} d="{outlines}"/>'
     return f"<g {plan.style.shape('roads')}>{''.join(edges)}{junctions}{''.join(lanes)}</g>"
 
 
@@ -291,10 +301,9 @@ def _street_names(plan: MapFrame, names: Sequence[StreetName], sites: Sequence[M
         angle, half = math.atan2(y1 - y0, x1 - x0), 3.3 * len(name.text) + 4.0
         for along in _STREET_NAME_POSITIONS:
             x, y = x0 + along * (x1 - x0), y0 + along * (y1 - y0)
-            boxes = [
-                _square(x + offset * math.cos(angle), y + offset * math.sin(angle), 7.0)
-                for offset in np.arange(-half, half, 7)
-            ]
+            boxes = []
+            for offset in np.arange(-half, half, 7):
+                boxes.append(_square(x + offset * math.cos(angle), y + offset * math.sin(angle), 7.0))
             if all(_is_free(box, plan, [*site_boxes, *covered]) for box in boxes):
                 covered += boxes
                 position = f'transform="translate({x:.1f} {y:.1f}) rotate({math.degrees(angle):.1f})" dy="4"'
@@ -329,18 +338,23 @@ def _site_rings(plan: MapFrame, stack: StackedSites, low: float, high: float, ra
     """Concentric rings, the best site innermost, with its rank unless the map is crowded."""
     best = stack[0]
     x, y = plan.x(best.x_m), plan.y(best.y_m)
-    displayed = [*stack[:3], stack[-1]] if len(stack) > 4 else stack
+    displayed = stack
+    if len(stack) > 4:
+        displayed = [*stack[:3], stack[-1]]
     shapes = []
     for i, site in reversed(list(enumerate(displayed))):
         colour = plan.style.shape(f"q{colours.colour_class(site.score, low, high)}")
         shapes.append(f'<circle {colour} cx="{x:.1f}" cy="{y:.1f}" r="{radius + 3.5 * i:.1f}"/>')
     if not crowded:
         is_dark = 2 * colours.colour_class(best.score, low, high) > colours.STEPS
-        tone = plan.style.shape("rank", "high" if is_dark else "low")
-        shapes.append(f'<text {tone} x="{x:.1f}" y="{y + 3.4:.1f}">{best.rank}</text>')
+        tone = "high" if is_dark else "low"
+        text_style = plan.style.shape("rank", tone)
+        shapes.append(f'<text {text_style} x="{x:.1f}" y="{y + 3.4:.1f}">{best.rank}</text>')
 
     sites = [f"{site.site}: rank {site.rank}, {site.by.with_noun(site.score)}, height {site.z_m:g} m" for site in stack]
-    group = plan.style.shape("site", "first") if best.rank == 1 else plan.style.shape("site")
+    group = plan.style.shape("site")
+    if best.rank == 1:
+        group = plan.style.shape("site", "first")
     title = f"<title>{escape('; '.join(sites))}</title>"
     return f'<g {group} data-site="{escape(best.site)}">{title}{"".join(shapes)}</g>'
 
@@ -386,7 +400,9 @@ def _stack_labels(
 
 def _stack_spot(plan: MapFrame, stack: StackedSites, radius: float) -> LabelSpot:
     names = [shorten_name(site.site) for site in stack]
-    text = ", ".join(names) if len(names) <= 2 else f"{names[0]} +{len(names) - 1}"
+    text = ", ".join(names)
+    if len(names) > 2:
+        text = f"{names[0]} +{len(names) - 1}"
     outer_radius = radius + 3.5 * min(3, len(stack) - 1)
     return LabelSpot(plan.x(stack[0].x_m), plan.y(stack[0].y_m), text, outer_radius)
 
@@ -405,11 +421,9 @@ def _label_spots(plan: MapFrame, spots: Sequence[LabelSpot], circles: Sequence[B
     covered, drawn = list(circles), []
     for spot in spots:
         near = spot.radius + _LABEL_GAP
-        options = [
-            (distance, _label_box(spot, distance, side))
-            for distance in (near, near + 12, near + 26, near + 42)
-            for side in _LABEL_SIDES
-        ]
+        options = []
+        for distance in (near, near + 12, near + 26, near + 42):
+            options += [(distance, _label_box(spot, distance, side)) for side in _LABEL_SIDES]
         inside = [option for option in options if _within(option[1], plan)] or options
         distance, box = min(inside, key=lambda option: sum(_overlap(option[1], other) for other in covered))
         covered.append(box)
@@ -443,9 +457,11 @@ def _label_box(spot: LabelSpot, distance: float, side: tuple[float, float]) -> B
 
 def _share_before(direction: float) -> float:
     """Share of a label that lies left of, or above, its anchor."""
-    if direction == 0:
-        return 0.5
-    return 0.0 if direction > 0 else 1.0
+    if direction > 0:
+        return 0.0
+    if direction < 0:
+        return 1.0
+    return 0.5
 
 
 def _within(box: Box, plan: MapFrame) -> bool:

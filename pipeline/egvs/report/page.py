@@ -55,11 +55,11 @@ _OPTIONAL_FILES = (
 )
 
 _UNMODELLED = (
-    ("the occlusion of vehicles by each other in the EGVS", "moving_occlusion"),
+    ("occlusion between vehicles (in the EGVS)", "moving_occlusion"),
     ("rain", "rain"),
     ("fog", "fog"),
-    ("the attenuation of beams with distance", "range_limit"),
-    ("foliage that lets some light through", "foliage"),
+    ("attenuation of beams with distance", "range_limit"),
+    ("partly transparent foliage", "foliage"),
     ("pedestrians and cyclists", "pedestrians_bicycles"),
     ("dirt and glare", ""),
 )
@@ -241,20 +241,25 @@ def _template_environment() -> Environment:
 
 
 def _ranking_values(ranking: Ranking) -> dict[str, Any]:
+    limit_share = None
+    if ranking.by.name == "egvs":
+        limit_share = share_of_limit(ranking.sites[0])
     return {
         "listing": SiteListing.from_ranking(ranking),
         "by": ranking.by,
         "companion": ranking.companion_score,
         "crowded": maps.is_crowded(ranking.sites),
         "rings": maps.has_stacked_sites(ranking.sites),
-        "limit_share": share_of_limit(ranking.sites[0]) if ranking.by.name == "egvs" else None,
+        "limit_share": limit_share,
     }
 
 
 def _setting_values(contents: PageContents) -> dict[str, Any]:
     scenario = contents.scenario
     effects, gamma = list(scenario.effects.named), scenario.gamma
-    frames = contents.tpog.frames if contents.by_period is None else contents.by_period.frames
+    frames = contents.tpog.frames
+    if contents.by_period is not None:
+        frames = contents.by_period.frames
     return {
         "weights": scenario.score.weights.in_words,
         "gamma": "∞" if math.isinf(gamma) else f"{gamma:g}",

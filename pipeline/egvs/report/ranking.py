@@ -181,7 +181,9 @@ def companion_score(sites: Sequence[RankedSite]) -> ScoreLabel | None:
     """
     if not sites:
         return None
-    names = (DEFAULT_SCORE, "seen_well") if sites[0].rank_by == "egvs" else ("egvs",)
+    names = ["egvs"]
+    if sites[0].rank_by == "egvs":
+        names = [DEFAULT_SCORE, "seen_well"]
     for name in names:
         if all(site.value_of(name) is not None for site in sites):
             return SCORE_LABELS[name]
@@ -219,7 +221,7 @@ class Ranking:
         """Read ``scores.parquet``; InputError if it has no site."""
         sites = tuple(sorted(RankedSite.read(path), key=lambda site: site.rank))
         if not sites:
-            raise InputError(path, "expected at least one site, got none", "Run the score stage again")
+            raise InputError(path, "expected at least one site, got none", "Run the score stage again.")
         best = tuple(site for site in sites if site.rank == 1)
         near = (1 - CLOSE_SHARE) * best[0].score
         return cls(sites, best, tuple(site for site in sites if site.rank > 1 and site.score >= near > 0))
@@ -247,7 +249,9 @@ class Ranking:
     @property
     def extremes(self) -> tuple[RankedSite, ...]:
         """The best and the worst site; only one where all have the same score."""
-        return self.sites[:1] if self.is_tie else (self.sites[0], self.last)
+        if self.is_tie:
+            return self.sites[:1]
+        return self.sites[0], self.last
 
     @property
     def has_errors(self) -> bool:
@@ -277,7 +281,9 @@ class Ranking:
     def share_of_best(self, site: RankedSite) -> float:
         """Return the score of a site as a share of the best score; 0 if that is 0."""
         best_score = self.best[0].score
-        return site.score / best_score if best_score > 0 else 0.0
+        if not best_score > 0:
+            return 0.0
+        return site.score / best_score
 
 
 def headline(ranking: Ranking, has_traffic: bool) -> str:
@@ -301,10 +307,10 @@ def headline(ranking: Ranking, has_traffic: bool) -> str:
             return text
         return f"{text}: each {result}"
     if len(best) > 4:
-        return f"{top.site} and {len(best) - 1} others share the first place of {count}: {top.site} {result}"
+        return f"{top.site} and {len(best) - 1} others share first place among {count} sites: {top.site} {result}"
     if len(best) > 1:
         names = join_names([site.site for site in best])
-        return f"{names} share the first place of {count}: {top.site} {result}"
+        return f"{names} share first place among {count} sites: {top.site} {result}"
     text = f"{top.site} is the best of {count} sites"
     return text if by_egvs else f"{text}: it {result}"
 
@@ -321,7 +327,7 @@ def lead(ranking: Ranking) -> str:
     else:
         text = f"They lead the next site, {second.site}, by {gap_text} of their score."
     if not ranking.best[-1].is_separable:  # ``beats_next`` of the last of the best refers to the second
-        text += " This much traffic is not enough to tell which of them is better."
+        text += " There is too little traffic to tell which of them is better."
     if len(ranking.close) > 1:
         names = ", ".join(site.site for site in ranking.close[:4])
         if len(ranking.close) > 4:
@@ -362,4 +368,6 @@ def site_caption(site: RankedSite, visible_voxels: int, voxels: int) -> str:
 def share_of_limit(site: RankedSite) -> float | None:
     """Return the EGVS as a share of its upper limit; None if there is no finite limit above 0."""
     limit = site.egvs_limit
-    return site.egvs / limit if limit > 0 and math.isfinite(limit) else None
+    if not (limit > 0 and math.isfinite(limit)):
+        return None
+    return site.egvs / limit

@@ -121,7 +121,7 @@ class DetectorSummary:
                 compared += 1
                 agreeing += (egvs > other_egvs) == (detected > other_detected)
         if math.isnan(self.tau.value) or not compared:
-            return f"{_count_sites(len(values))} with values: too few, or too similar, to compare the two orders."
+            return f"{_count_sites(len(values))} with values: too few, or too similar, to compare the two rankings."
         interval = ""
         if not math.isnan(self.tau.low):
             interval = f", 95 % confidence interval {self.tau.low:.2f} to {self.tau.high:.2f}"
@@ -136,7 +136,7 @@ class DetectorSummary:
             return ""
         count = _count_sites(sum(site.value is not None for site in self.sites.values()))
         if math.isnan(self.tau.low):
-            verdict = f"From {count} it cannot be said how certain this is."
+            verdict = f"{count} are too few to say how certain this is."
         elif self.tau.low <= 0.0 <= self.tau.high:
             verdict = f"{count} are too few to tell: the interval includes 0, so the agreement may be chance."
         elif self.tau.low > 0.0:
@@ -178,7 +178,9 @@ class ValidationSummary:
     def read(cls, out: Path, stages: Mapping[str, StageRecord]) -> ValidationSummary | None:
         """Read the validation in a run folder; None if there is none of this run."""
         detection, correlation, figure = (out / name for name in VALIDATION_FILES)
-        result = read_validation(detection, correlation) if figure.is_file() else None
+        if not figure.is_file():
+            return None
+        result = read_validation(detection, correlation)
         if result is None:
             return None
         detection_rows, correlation_rows, metadata = result
@@ -214,7 +216,8 @@ def _detector_summary(
 def _site_detection(value: float, se: float, values: Sequence[float]) -> SiteDetection:
     if math.isnan(value):
         return SiteDetection(None, None, None)
-    return SiteDetection(value, None if math.isnan(se) else se, 1 + sum(other > value for other in values))
+    known_se = None if math.isnan(se) else se
+    return SiteDetection(value, known_se, 1 + sum(other > value for other in values))
 
 
 # ---- evidence of the validation study
@@ -226,9 +229,7 @@ def egvs_setting(gamma: float, voxel_m: float, *, moving_occlusion: bool = False
     return f"egvs (gamma {gamma:g}, {occlusion}voxel {voxel_m:g})"
 
 
-def ranking_disagreement(
-    sites: Sequence[RankedSite], egvs: str, rho: Mapping[str, Mapping[str, float]] | None = None
-) -> str:
+def ranking_disagreement(sites: Sequence[RankedSite], egvs: str, rho: Mapping[str, Mapping[str, float]] = RHO) -> str:
     """Return sentences if the EGVS and the recommended score have different best sites; empty otherwise.
 
     Parameters
@@ -246,7 +247,7 @@ def ranking_disagreement(
     noun = SCORE_LABELS[DEFAULT_SCORE].noun
     return (
         f"The best sites by EGVS are {join_names(by_egvs)}; by {noun} they are {join_names(by_other)}. "
-        f"{_describe_evidence(noun, egvs, RHO if rho is None else rho)}"
+        f"{_describe_evidence(noun, egvs, rho)}"
     )
 
 
@@ -274,7 +275,7 @@ def _describe_evidence(noun: str, egvs: str, rho: Mapping[str, Mapping[str, floa
     if all(is_better):
         better = noun
     elif any(is_better):
-        better = "neither of the two"
+        better = "neither of the two consistently"
     else:
         better = "the EGVS"
     values = join_names([f"{recommended[name]:.2f} against {this_egvs[name]:.2f} ({name})" for name in detectors])
@@ -392,6 +393,9 @@ class PlacementSummary:
         by, joint = SCORE_LABELS[plan["score"]], plan["joint"]
         picks = tuple(PlanRow(**{field.name: row[field.name] for field in fields(PlanRow)}) for row in rows)
         names = ", ".join(pick.site for pick in picks)
+        before = None
+        if "moves" in plan:
+            before = plan["moves"]["before"]
         occupied = tpog.counts.sum(axis=2) / tpog.frames
         poles = _planned_poles(picks, joint, by)
         return cls(
@@ -405,7 +409,7 @@ class PlacementSummary:
             proof=_describe_proof(plan, len(picks)),
             objective=_describe_objective(plan["asked"]),
             zones=tuple(plan["zones"]),
-            before=plan["moves"]["before"] if "moves" in plan else None,
+            before=before,
             map=maps.plan_map(tpog.grid, occupied, backdrop, candidates, poles, f"Map of the plan: {names}."),
             chart=_curve_chart(curve_rows, plan),
         )
@@ -413,11 +417,15 @@ class PlacementSummary:
     @property
     def share(self) -> float:
         """Joint score as a share of that of all candidates together."""
-        return self.joint / self.together if self.together else 0.0
+        if not self.together:
+            return 0.0
+        return self.joint / self.together
 
     def lost(self, pick: PlanRow) -> float:
         """Return the share of the joint score that is lost if a sensor fails."""
-        return pick.loss / self.joint if self.joint else 0.0
+        if not self.joint:
+            return 0.0
+        return pick.loss / self.joint
 
 
 def _curve(rows: Sequence[Mapping[str, Any]], together: float) -> tuple[CurveRow, ...]:
@@ -440,7 +448,9 @@ def _curve_chart(rows: Sequence[Mapping[str, Any]], plan: Mapping[str, Any]) -> 
 
 def _certificate(value: float, bound: float) -> float:
     """Share of the best possible value that is proved to be reached; 1 up to the rounding of bounds."""
-    return 1.0 if bound <= value * (1.0 + 2e-9) else value / bound
+    if bound <= value * (1.0 + 2e-9):
+        return 1.0
+    return value / bound
 
 
 def _describe_proof(plan: Mapping[str, Any], sensors: int) -> str:
@@ -474,14 +484,18 @@ def _planned_poles(picks: Sequence[PlanRow], joint: float, by: ScoreLabel) -> li
         picks_of.setdefault((pick.x_m, pick.y_m), []).append(pick)
     poles = []
     for (x_m, y_m), members in picks_of.items():
-        name = members[0].site if len(members) == 1 else f"{members[0].site} +{len(members) - 1}"
-        gain = sum(pick.gain for pick in members) / joint if joint else 0.0
-        sensors = [
-            f"{pick.order}. {pick.site}, {pick.z_m:g} m high, adds {by.value(pick.gain)} {by.unit}".strip()
-            for pick in members
-        ]
-        numbers = ", ".join(str(pick.order) for pick in members)
-        poles.append(PlannedPole(x_m, y_m, numbers, f"{name}: {gain:.0%}", "; ".join(sensors)))
+        name = members[0].site
+        if len(members) > 1:
+            name += f" +{len(members) - 1}"
+        gain = 0.0
+        if joint:
+            gain = sum(pick.gain for pick in members) / joint
+        numbers, sensors = [], []
+        for pick in members:
+            numbers.append(str(pick.order))
+            sensor = f"{pick.order}. {pick.site}, {pick.z_m:g} m high, adds {by.value(pick.gain)} {by.unit}"
+            sensors.append(sensor.strip())
+        poles.append(PlannedPole(x_m, y_m, ", ".join(numbers), f"{name}: {gain:.0%}", "; ".join(sensors)))
     return poles
 
 
@@ -523,7 +537,9 @@ class StudySummary:
     def read(cls, out: Path, stages: Mapping[str, StageRecord]) -> StudySummary | None:
         """Read the study in a run folder; None if there is none of this run."""
         table, figure = (out / name for name in ACCURACY_FILES)
-        study = read_accuracy(table) if figure.is_file() else None
+        if not figure.is_file():
+            return None
+        study = read_accuracy(table)
         if study is None:
             return None
         rows, metadata = study

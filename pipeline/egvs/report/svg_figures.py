@@ -164,7 +164,8 @@ class MapFrame:
         style: FigureStyle = PAGE_STYLE,
     ) -> None:
         self.box, self.prefix, self.width, self.north, self.style = box, prefix, width, north, style
-        self._x_ticks = round_values(box[0], box[2], 9 if width > 600 else 6)
+        max_x_ticks = 9 if width > 600 else 6
+        self._x_ticks = round_values(box[0], box[2], max_x_ticks)
         self._y_ticks = round_values(box[1], box[3], 6)
         self._y_tick_width = 7.0 * max(len(tick.text) for tick in self._y_ticks)
         self.left = 34.0 + self._y_tick_width
@@ -218,7 +219,13 @@ class MapFrame:
             A colour bar below the map.
         """
         base = self.top + self.frame_height
-        height = base + 40.0 + (56.0 if bar else 0.0)
+        height = base + 40.0
+        colour_bar = north_arrow = ""
+        if bar:
+            height += 56.0
+            colour_bar = bar.svg(self.prefix, self.left, base + 46.0, self.frame_width, self.style)
+        if self.north:
+            north_arrow = self._north_arrow()
         position = f'x="{self.left:.1f}" y="{self.top:.1f}"'
         frame = f'<rect {position} width="{self.frame_width:.1f}" height="{self.frame_height:.1f}"/>'
         clip = f'<clipPath id="{self.prefix}-clip">{frame}</clipPath>'
@@ -226,8 +233,8 @@ class MapFrame:
         lines = [
             svg_start(self.width, height, alt, self.style),
             f'<defs>{clip}</defs>{self._axes(base)}\n<g clip-path="url(#{self.prefix}-clip)">{drawing}</g>',
-            self._north_arrow() if self.north else "",
-            bar.svg(self.prefix, self.left, base + 46.0, self.frame_width, self.style) if bar else "",
+            north_arrow,
+            colour_bar,
             "</svg>",
         ]
         return "\n".join(lines)
@@ -289,10 +296,9 @@ class ColourBar:
         axis = style.shape("axis")
         position = f'x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="12"'
         bar = f'<rect {axis} style="fill:url(#{prefix}-scale)" {position}/>'
-        ticks = [
-            f'<path {axis} d="M{tick_x:.1f} {y + 12:.1f}v4"/>{_text(tick_x, y + 28, text)}'
-            for tick_x, text in self._ticks(x, width)
-        ]
+        ticks = []
+        for tick_x, text in self._ticks(x, width):
+            ticks.append(f'<path {axis} d="M{tick_x:.1f} {y + 12:.1f}v4"/>{_text(tick_x, y + 28, text)}')
         note = "" if self.even else " · square-root scale"
         position = f'x="{x + width / 2:.1f}" y="{y + 44:.1f}"'
         title = f'<text class="title" {position} text-anchor="middle">{escape(self.label)}{note}</text>'
@@ -308,7 +314,9 @@ class ColourBar:
         for value in sorted({tick.value for tick in ticks}, reverse=True):
             text = f"{value:,.6g}"
             share = (value - self.low) / span
-            tick_x = x + width * (share if self.even else math.sqrt(share))
+            if not self.even:
+                share = math.sqrt(share)
+            tick_x = x + width * share
             if all(abs(tick_x - other.value) > 5.0 * (len(text) + len(other.text)) for other in placed):
                 placed.append(Tick(tick_x, text))
         return placed
@@ -365,7 +373,9 @@ def sensor_count_chart(steps: Sequence[CurveStep], alt: str) -> str:
         y = base - height * value / 100.0 / top
         parts.append(f'<path class="grid" d="M{_CURVE_LEFT:.1f} {y:.1f}h{width:.1f}"/>')
         parts.append(_text(_CURVE_LEFT - 8, y + 4, f"{value:g} %", "end"))
-    label_step = 1 if len(steps) <= _MAX_LABELS else 1 + len(steps) // _MAX_LABELS
+    label_step = 1
+    if len(steps) > _MAX_LABELS:
+        label_step += len(steps) // _MAX_LABELS
     for i, step in enumerate(steps):
         x, bar = _CURVE_LEFT + i * spacing, height * step.share / top
         bound = base - height * step.bound / top
@@ -415,7 +425,8 @@ def bar_chart(bars: Sequence[Bar], label: str, alt: str, factor: float = 1.0, st
     left = 16.0 + 7.0 * max(len(name) for name in names)
     width, height = style.width - left - _BARS_MARGIN, _BAR_SPACING * len(bars)
     most = max(bar.value + (bar.se or 0.0) for bar in bars) or 1.0
-    low, high = min(bar.value for bar in bars), max(bar.value for bar in bars)
+    values = [bar.value for bar in bars]
+    low, high = min(values), max(values)
     base = _BARS_TOP + height
     parts = [svg_start(style.width, base + _BARS_BOTTOM, alt, style)]
     for value, text in round_values(0.0, most * factor, max(2, int(width // 70))):

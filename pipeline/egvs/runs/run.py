@@ -87,6 +87,16 @@ def run(
     -------
     RunRecord
         Contents of ``run.json``.
+
+    Examples
+    --------
+    >>> import egvs
+    >>> scenario = egvs.load("scenarios/roundabout", ["traffic.frames=100"])
+    >>> record = egvs.run(scenario, "runs/example")
+    >>> list(record.stages)
+    ['check', 'statics', 'scan', 'traffic', 'tpog', 'score', 'report']
+    >>> egvs.read_scores("runs/example/scores.parquet").num_rows == len(egvs.build_scene(scenario).sites)
+    True
     """
     folder = Path(out) if out is not None else default_folder(scenario)
     check_no_overwrite(scenario, folder)
@@ -346,7 +356,7 @@ def lock_run_folder(folder: Path, wait_s: float = 0.0) -> Iterator[None]:
         raise InputError(folder, problem, "Choose a folder that you may write to.") from None
     try:
         if not locks.wait_for_lock(descriptor, wait_s):
-            raise RunError(f"{folder}: another run is at work there")
+            raise RunError(f"{folder}: another run is using this folder")
         yield
     finally:
         os.close(descriptor)
@@ -381,8 +391,8 @@ def check_no_overwrite(scenario: Scenario, folder: Path, folders: Collection[str
             continue
         relative = real_path.relative_to(home)
         if _may_be_written(relative, folders):
-            problem = f"a run would write over {relative.as_posix()}, which the scenario names ({key})"
-            raise InputError(f"--out {folder}", problem, "Name a folder of its own, for example runs/mine.")
+            problem = f"a run would overwrite {relative.as_posix()}, which the scenario uses ({key})"
+            raise InputError(f"--out {folder}", problem, "Use a separate folder, for example runs/mine.")
 
 
 def _may_be_written(path: Path, folders: Collection[str]) -> bool:

@@ -72,7 +72,7 @@ class RemoteStore:
             self._fs.pipe_file(probe, b"egvs")
             self._fs.invalidate_cache()
             if self._fs.cat_file(probe) != b"egvs":
-                raise InputError(self.url, "returns other bytes than were written", _LOCATION_HINT)
+                raise InputError(self.url, "does not return the bytes that were written", _LOCATION_HINT)
             self._fs.rm_file(probe)
 
     def fetch(self, name: str, folder: Path) -> bool:
@@ -197,7 +197,7 @@ def check_outside_store(folder: Path) -> None:
     """
     store, _ = read_store_settings()
     if store is not None and Path(os.path.realpath(folder)).is_relative_to(os.path.realpath(store)):
-        raise InputError(folder, f"is the store ({store}), or lies in it", "Name a folder outside of the store.")
+        raise InputError(folder, f"is the store ({store}) or inside it", "Use a folder outside the store.")
 
 
 _HASH_FIELD = "sha256"
@@ -288,7 +288,7 @@ class Store:
     def check(self, *, changed: bool) -> None:
         """Raise InputError where the folder is a file, or there is no store although it is to be ``changed``."""
         if self.folder is None and changed:
-            raise InputError(STORE_VARIABLE, "empty, so that there is no store", "Set it to the folder of the store.")
+            raise InputError(STORE_VARIABLE, "is empty, so there is no store", "Set it to the folder of the store.")
         if self.folder is not None and _exists_as(Path.is_file, self.folder):
             raise InputError(self.folder, "is a file", f"Set {STORE_VARIABLE} to the folder of the store.")
 

@@ -49,11 +49,11 @@ def verify(
     record_file = RunFolder(folder).run_record
     for stage in STAGE_NAMES:
         if stage not in record.stages:
-            raise InputError(record_file, f"the stage {stage} is not done", "Call egvs run to finish the run first.")
+            raise InputError(record_file, f"the stage {stage} has not been run", "Finish the run with egvs run first.")
     source = Path(scenario_folder or os.path.normpath(folder / record.scenario_folder))
     if not source.is_dir():
-        problem = f"the folder of the scenario, {source}, does not exist"
-        raise InputError(record_file, problem, "Name it with --scenario.")
+        problem = f"the scenario's folder {source} does not exist"
+        raise InputError(record_file, problem, "Give its new location with --scenario.")
     scenario = scenario_from_dict(record.scenario, source, str(record_file))
 
     differences = [*_changed_artefacts(folder, record), *_changed_companions(folder, record)]

@@ -40,7 +40,7 @@ class RangeLimitParameters(EffectParameters):
     incidence_deg: float = Field(0.0, ge=0, lt=90, description="Angle between the beam and the normal of the target")
     softness: float = Field(0.3, ge=0, description="Standard deviation of the logarithm of the received power")
     rated_range_m: float | None = Field(None, gt=0, description="Rated range, instead of each sensor's")
-    rated_reflectivity: float | None = Field(None, gt=0, description="Reflectivity there, instead of each sensor's")
+    rated_reflectivity: float | None = Field(None, gt=0, description="Rated reflectivity, instead of each sensor's")
 
 
 class RainParameters(EffectParameters):
@@ -136,7 +136,9 @@ class VehicleParts(EffectParameters):
         (), description="Distance of each joint from the front bumper. By default halfway between its parts"
     )
     axles_m: tuple[Positive, ...] = Field(
-        (), description="Distance from each joint back to the axle of its rear part. By default 0.75 of it"
+        (),
+        description="Distance from each joint back to the axle of its rear part. By default 0.75 of the length of the "
+        "part",
     )
 
     @model_validator(mode="after")
@@ -229,7 +231,7 @@ def _check_plugin_parameters(name: str, values: object) -> EffectParameters:
     known = list(dict.fromkeys([*EffectsConfig.BUILT_IN, *plugins.plugin_names(GROUP)]))
     if name not in known:
         similar = difflib.get_close_matches(name, known, 1, 0.4)
-        hint = f"Did you mean {similar[0]}?" if similar else f"Known effects: {', '.join(known)}"
+        hint = f"Did you mean {similar[0]}?" if similar else f"Known effects are {', '.join(known)}."
         raise PydanticCustomError("unknown_effect", "unknown effect", {"name": name, "hint": hint})
     if isinstance(values, EffectParameters):
         return values

@@ -49,7 +49,7 @@ Longitude = Annotated[float, Field(ge=-180, le=180)]
 Latitude = Annotated[float, Field(ge=-90, le=90)]
 Point2 = tuple[Coordinate, Coordinate]
 Point3 = tuple[Coordinate, Coordinate, Coordinate]
-NAME_DESCRIPTION = 'Use a name that can name a folder: no spaces, none of / \\ : * ? " < > |, and not only dots'
+NAME_DESCRIPTION = 'Use a name that is valid for a folder: no spaces, none of / \\ : * ? " < > |, and not only dots.'
 """Hint for a text that is not a :data:`Name`; no other text in a scenario has a pattern."""
 _NAME_CHARACTER = r"[^\s\x00-\x1f\x7f/\\:*?\"<>|"
 Name = Annotated[

@@ -134,7 +134,7 @@ def _suggest_key(location: Sequence[str | int], top: type[BaseModel]) -> str:
         if part in fields:
             fields = _table_fields(fields[str(part)].annotation)
     similar = difflib.get_close_matches(key, sorted(fields), 1, 0.5)
-    return f"Did you mean {similar[0]}?" if similar else f"Known keys: {', '.join(sorted(fields))}"
+    return f"Did you mean {similar[0]}?" if similar else f"Known keys are {', '.join(sorted(fields))}."
 
 
 def _table_fields(annotation: Any) -> dict[str, FieldInfo]:
@@ -173,7 +173,7 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
     values = _read_with_bases(file, ())
     for override in overrides:
         if override.partition("=")[0].strip() == "extends":
-            hint = f"Write extends = ... into a {SCENARIO_FILE}"
+            hint = f"Set it in a {SCENARIO_FILE}."
             raise InputError(f"--set {override}", "the key extends cannot be set here", hint)
         values = _apply_override(values, override)
     try:
@@ -213,16 +213,16 @@ def check_unused_keys(traffic: TrafficConfig, file: Path) -> None:
     for unused in traffic.unused_keys():
         names = ", ".join(sorted(unused.keys))
         problem = f"{names} {'have' if len(unused.keys) > 1 else 'has'} no effect with {unused.source}"
-        raise InputError(f"{file}: {unused.table}", problem, f"Remove {names}")
+        raise InputError(f"{file}: {unused.table}", problem, f"Remove {names}.")
 
 
 def _read_with_bases(file: Path, extending: tuple[Path, ...]) -> dict[str, Any]:
     """Return the values of a scenario file and of those that it extends; ``extending`` are the files that extend it."""
     if not file.is_file():
         where = file.parent if file.name == SCENARIO_FILE else file
-        raise InputError(where, f"expected a {SCENARIO_FILE}, got no such file", _suggest_scenario(where))
+        raise InputError(where, f"expected a {SCENARIO_FILE}, got none", _suggest_scenario(where))
     if file.resolve() in extending:
-        raise InputError(f"{file}: extends", "the scenario extends itself", "Extend another scenario")
+        raise InputError(f"{file}: extends", "the scenario extends itself", "Extend a different scenario.")
     values = reading.read_toml(file)
     extends = values.get("extends", "")
     if not isinstance(extends, str):
@@ -332,10 +332,10 @@ def json_schema() -> str:
 def _suggest_scenario(folder: Path) -> str:
     """Return a hint at the scenario that may be meant by another folder."""
     if (folder / "city.toml").is_file():
-        return f"This is a city. Use egvs city run {folder}, or one of its junctions, {folder / 'junctions'}/ID"
+        return f"This is a city. Use egvs city run {folder}, or one of its junctions, {folder / 'junctions'}/ID."
     if (folder / "run.json").is_file():
-        return "This is the folder of a run. Name the folder of its scenario"
-    return f"Name a folder with a {SCENARIO_FILE}, or the file"
+        return "This is a run folder. Give the scenario's folder."
+    return f"Give a folder with a {SCENARIO_FILE}, or the file."
 
 
 def _apply_override(values: dict[str, Any], override: str) -> dict[str, Any]:
@@ -343,7 +343,7 @@ def _apply_override(values: dict[str, Any], override: str) -> dict[str, Any]:
     where = f"--set {override}"
     key, equals, text = override.partition("=")
     if not equals or not key.strip():
-        raise InputError(where, "expected KEY=VALUE", "Use for example --set traffic.frames=500")
+        raise InputError(where, "expected KEY=VALUE", "Use, for example, --set traffic.frames=500.")
     try:
         value = reading.parse_toml_value(text)
     except (ValueError, RecursionError):
@@ -357,7 +357,7 @@ def _apply_override(values: dict[str, Any], override: str) -> dict[str, Any]:
         if not isinstance(table, dict | list):
             raise InputError(where, f"{parent!r} is not a table")
     if isinstance(table, list):
-        raise InputError(where, f"{parts[-1]!r} is a row, not a key", f"Use {key.strip()}.KEY=VALUE")
+        raise InputError(where, f"{parts[-1]!r} is a row, not a key", f"Use {key.strip()}.KEY=VALUE.")
     table[parts[-1]] = value
     return values
 
@@ -370,5 +370,6 @@ def _find_row(rows: list[Any], name_or_number: str, where: str) -> Any:
     if name_or_number.isdecimal() and int(name_or_number) < len(rows):
         return rows[int(name_or_number)]
     names = [str(row["name"]) for row in rows if isinstance(row, dict) and "name" in row]
-    hint = f"Use {', '.join([*names, 'a number'])} from 0 to {len(rows) - 1}"
+    choices = f"one of {', '.join(names)}, or " if names else ""
+    hint = f"Use {choices}a number from 0 to {len(rows) - 1}."
     raise InputError(where, f"there is no row {name_or_number!r}", hint)

@@ -29,7 +29,7 @@ from egvs.scenario.traffic_config import TrafficConfig
 
 
 class CrsConfig(StrictModel):
-    """Where the world frame is on the Earth. By default, the ``<location>`` of the SUMO network says so."""
+    """Position of the world frame on the Earth. By default, that of the ``<location>`` in the SUMO network."""
 
     epsg: int | None = Field(
         None, ge=1, description="EPSG code of a projected coordinate reference system in metres, e.g. 25832"
@@ -42,7 +42,7 @@ class CrsConfig(StrictModel):
     @model_validator(mode="after")
     def _check_offset(self) -> CrsConfig:
         if self.epsg is None and self.offset_m != (0.0, 0.0):
-            raise ValueError("offset_m needs epsg: the <location> of a network has an offset of its own")
+            raise ValueError("offset_m needs epsg: the <location> of a network has its own offset")
         return self
 
 
@@ -241,7 +241,7 @@ class SitesConfig(StrictModel):
         for key in ("heights_m", "pitch_deg"):
             values = getattr(self, key)
             if isinstance(values, tuple) and len(set(values)) < len(values):
-                raise ValueError(f"{key} = {list(values)} has a value twice")
+                raise ValueError(f"{key} = {list(values)} contains a value twice")
         if self.pitch_deg == ():
             raise ValueError("pitch_deg = [] leaves no candidate")
         return self
@@ -251,7 +251,7 @@ class ScanConfig(StrictModel):
     """Empty scans: scans of the static world without traffic."""
 
     keep: bool = Field(
-        True, description="Write scans.parquet; with false, scans are not stored (for thousands of sites)"
+        True, description="Write scans.parquet; with false, scans are not saved (for thousands of sites)"
     )
 
 
@@ -287,7 +287,7 @@ class Scenario(StrictModel):
         blocks = self.tpog.blocks
         all_blocks = blocks * max(1, len(self.traffic.periods))
         if all_blocks > MAX_BLOCKS:
-            raise ValueError(f"tpog.blocks = {blocks} gives {all_blocks} blocks in all periods, at most {MAX_BLOCKS}")
+            raise ValueError(f"tpog.blocks = {blocks} gives {all_blocks} blocks in all periods, more than {MAX_BLOCKS}")
         for period, traffic in self._traffic_by_period():
             if traffic.frames is not None and traffic.frames % blocks:
                 suffix = f" of the period {period!r}" if period else ""
@@ -385,6 +385,6 @@ class Scenario(StrictModel):
             if not path.is_file():
                 continue
             if not os.access(path, os.R_OK):
-                raise InputError(where, f"cannot be read ({path}: Permission denied)", "Check its permissions")
+                raise InputError(where, f"cannot be read ({path}: Permission denied)", "Check its permissions.")
             return path
-        raise InputError(where, f"no such file ({paths[0]})", "Give a path relative to the scenario's folder")
+        raise InputError(where, f"no such file ({paths[0]})", "Give a path relative to the scenario's folder.")

@@ -70,7 +70,7 @@ class ZoneConfig(StrictModel):
 
 
 class WeightsConfig(StrictModel):
-    """Weights of vehicles in the scores over vehicles: that of the kind times those of all zones with its centre."""
+    """Weights of vehicles in scores over vehicles: the weight of the kind times those of all zones with its centre."""
 
     kinds: dict[VehicleClass, Annotated[float, Field(ge=0)]] = Field(
         default_factory=dict,
@@ -164,7 +164,7 @@ class RefinementConfig(StrictModel):
 
     radius_m: NotNegative | None = Field(
         None,
-        description="Distance that a pole may be moved by in plan, or along its line for sites.along. By default half "
+        description="Horizontal distance by which a pole may be moved, for sites.along along its line. By default half "
         "the spacing for sites.along, else 0",
     )
     within_m: tuple[Corners, ...] = Field(
@@ -197,7 +197,7 @@ class PlacementConfig(StrictModel):
         None, description="Find the fewest sensors that reach this share of the score of all candidates together"
     )
     forced: tuple[str, ...] = Field((), description="Candidates that exist already and are part of every plan")
-    excluded: tuple[str, ...] = Field((), description="Candidates or poles that are not used")
+    excluded: tuple[str, ...] = Field((), description="Candidates or poles that must not be used")
     most_per_pole: int | None = Field(None, ge=1, description="Maximum number of sensors on a pole. By default any")
     least_distance_m: NotNegative = Field(0.0, description="Minimum distance between any two sensors")
     zones: dict[Name, ZoneDemand] = Field(default_factory=dict, description="Parts of the region to cover, by name")

@@ -24,7 +24,7 @@ Turns = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 def _check_beams(beams: float, what: str) -> None:
     if not beams <= limits.BEAMS.maximum:
-        raise ValueError(f"{what} are more than {limits.BEAMS.maximum:,} beams. {limits.BEAMS.hint}")
+        raise ValueError(f"{what} make more than {limits.BEAMS.maximum:,} beams. {limits.BEAMS.hint}")
 
 
 class BeamPatternConfig(StrictModel):

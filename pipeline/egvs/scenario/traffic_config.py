@@ -268,7 +268,8 @@ class TrafficConfig(StrictModel):
     )
     min_trip_m: float = Field(0.0, ge=0, description="Minimum straight-line distance of random trips")
     edge_weights: dict[str, Annotated[float, Field(ge=0)]] = Field(
-        default_factory=dict, description="Weight of an edge (id) as end of random trips. By default its lanes"
+        default_factory=dict,
+        description="Weight of an edge (id) as start or end of random trips. By default its number of lanes",
     )
     counts: tuple[CountConfig, ...] = Field(
         (), description="Traffic counts. By default, random trips are drawn between the network's fringe edges"

@@ -186,7 +186,7 @@ def describe_lane(turns: Iterable[str]) -> str:
 def describe_turn(turn: str) -> str:
     """Return the description of a turn in a junction."""
     if turn in ("", "straight"):
-        return f"way {turn} through the junction".replace("  ", " ")
+        return f"{turn} movement through the junction".lstrip()
     return f"{'U-turn' if turn == 'back' else f'{turn} turn'} in the junction"
 
 

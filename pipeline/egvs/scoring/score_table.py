@@ -298,7 +298,7 @@ def warn_no_standard_error(column: ScoreColumn) -> Iterator[Diagnostic]:
     if column.left_out is None or column.estimate is not None or np.isnan(column.values).any():
         return
     groups = sum(len(record.frames) for record in column.groups)
-    problem = f"{column.name} has no standard error: all vehicles in the region are in one of {groups} groups of frames"
+    problem = f"{column.name} has no standard error: all vehicles in the region are in one of {groups} blocks of frames"
     yield Diagnostic("no standard error", f"{SCENARIO_FILE}: traffic", problem, "Record more traffic.")
 
 

@@ -584,5 +584,5 @@ def _longer_record_hint(stratum: Stratum, frame_period_s: float, *, in_seconds: 
         enough = max(2 * stratum.groups.total, enough)
     better = round(GROUP_LENGTH_MEMORIES / occupancy.MEMORY_WINDOW) * enough
     if in_seconds:
-        return f"Set length_s to at least {enough * frame_period_s:g}, better {better * frame_period_s:g}."
-    return f"Record at least {enough} frames, better {better}."
+        return f"Set length_s to at least {enough * frame_period_s:g}, preferably {better * frame_period_s:g}."
+    return f"Record at least {enough} frames, preferably {better}."

@@ -120,7 +120,7 @@ def to_voxel_units(beams: Beams, grid: Grid) -> VoxelSegments:
         origin, ends = grid.segments(beams.pose.position_m, beams.ends_m)
 
     if not (is_finite and np.isfinite(ends).all()):
-        raise InputError(beams.where, "a beam has an end that is not finite", "Use finite coordinates in metres.")
+        raise InputError(beams.where, "a beam has a non-finite end point", "Use finite coordinates in metres.")
     distance_m = np.abs(origin_m).max()
     if distance_m > FARTHEST_M:
         problem = f"expected a sensor within {FARTHEST_M:g} m of the grid, got {distance_m:g} m"

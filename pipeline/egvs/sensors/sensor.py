@@ -285,10 +285,12 @@ class Sensor:
     @property
     def azimuth_step_deg(self) -> float | None:
         """Angle between two beams of a ring; None for a table, or a single beam."""
-        if self.azimuth_deg is not None:
-            first, last = self.azimuth_deg
-            return (last - first) / (self.azimuths - 1) if self.azimuths > 1 else None
-        return 360.0 / self.azimuths if self.azimuths else None
+        if self.azimuth_deg is None:
+            return 360.0 / self.azimuths if self.azimuths else None
+        if self.azimuths <= 1:
+            return None
+        first, last = self.azimuth_deg
+        return (last - first) / (self.azimuths - 1)
 
     @property
     def middle_deg(self) -> tuple[float, float]:

@@ -63,14 +63,6 @@ def ground_height_m(world: World, pose: Pose) -> float:
     return _ground_height_m(world, pose, _faces_around(world, pose))
 
 
-def enclosing_solid(world: World, pose: Pose) -> int | None:
-    """Return the first solid that contains a sensor, as an index into ``world.solids``.
-
-    A solid whose surface the sensor touches does not count.
-    """
-    return _enclosing_solid(world, pose, _faces_around(world, pose))
-
-
 def _faces_around(world: World, pose: Pose) -> IntArray:
     """The faces that a vertical line through the sensor may meet."""
     low, high = world.bounds_xy_m
@@ -95,6 +87,7 @@ def _ground_height_m(world: World, pose: Pose, faces: IntArray) -> float:
 
 
 def _enclosing_solid(world: World, pose: Pose, faces: IntArray) -> int | None:
+    """Return the first solid that contains a sensor; a solid whose surface the sensor touches does not count."""
     position = np.asarray(pose.position_m)
     triangles = world.triangles_m[faces]
     solids = world.solid_of_face[faces]
@@ -133,7 +126,7 @@ def drop_infeasible(sites: Sequence[Site], world: World, carriageway: Carriagewa
     dropped = []
     for site, conflict in zip(sites, _road_conflicts(sites, carriageway), strict=True):
         reason = conflict
-        if reason is None and enclosing_solid(world, site.pose) is not None:
+        if reason is None and _enclosing_solid(world, site.pose, _faces_around(world, site.pose)) is not None:
             reason = IN_A_SOLID
         if reason is None:
             free.append(site)

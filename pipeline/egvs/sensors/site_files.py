@@ -98,13 +98,13 @@ def _check_header(path: Path, names: list[str]) -> None:
                 raise InputError(path, f"the columns are separated by {separator!r}", hint)
     duplicates = sorted({name for name in names if names.count(name) > 1})
     if duplicates:
-        raise InputError(path, f"the column {duplicates[0]!r} occurs twice", "Name each column once.")
+        raise InputError(path, f"the column {duplicates[0]!r} occurs twice", "Use each column name once.")
 
 
 def read_geojson(path: Path, world: Georeference) -> Iterator[SiteRow]:
     """Yield the features of a GeoJSON file as rows; InputError with file and feature for a malformed one."""
     expected = "a FeatureCollection of Points"
-    document = read_json(path, expected)
+    document = read_json(path, f"Use {expected}.")
     if not isinstance(document, dict) or not isinstance(document.get("features"), list):
         raise InputError(path, f"expected {expected}, got {reprlib.repr(document)[:120]}")
     coordinates = geojson_coordinates(document["features"])
@@ -129,8 +129,9 @@ def _feature_columns(where: str, feature: Any, reading: CoordinateReading) -> di
         if value is None:
             continue
         if isinstance(value, str) and key != "site":
-            raise InputError(f"{where}: {key}", f"expected a number as coordinate, got the text {value!r}")
-        if reading.convert is not None and _coordinates_match(row.get(key), value):
+            raise InputError(f"{where}: {key}", f"expected a numeric coordinate, got the text {value!r}")
+        difference_m = abs(_number_or_nan(row.get(key)) - _number_or_nan(value))
+        if reading.convert is not None and difference_m <= _TOLERANCE_M:
             continue  # a GIS carried the unrounded value along as a property: keep it
         if row.get(key, value) not in (None, value):
             raise InputError(f"{where}: {key}", f"there are two values, {row[key]!r} and {value!r}", "Use one of them.")
@@ -147,10 +148,6 @@ def _point_to_world(point: list[Any], reading: CoordinateReading) -> list[Any]:
     if not math.isfinite(x + y):
         return point
     return [*reading.to_world(np.array([[x, y]]))[0].tolist(), *point[2:]]
-
-
-def _coordinates_match(property_value: Any, geometry_value: Any) -> bool:
-    return abs(_number_or_nan(property_value) - _number_or_nan(geometry_value)) <= _TOLERANCE_M
 
 
 class _LonLatColumns(NamedTuple):
@@ -185,19 +182,20 @@ def locate_rows(rows: Iterable[SiteRow], path: object, world: Georeference) -> l
     world.check_metres(_as_points(plausible), str(path), _COLUMNS_HINT)
     if not any(names):
         return [row.columns for row in rows]
-    degrees = [_row_degrees(row, columns) for row, columns in zip(rows, names, strict=True)]
-    needs_degrees = False
-    for lon_lat, xy_m in zip(degrees, metres, strict=True):
+    degrees, without_degrees, needs_degrees = [], [], False
+    for row, columns, xy_m in zip(rows, names, metres, strict=True):
+        lon_lat = _row_degrees(row, columns)
+        degrees.append(lon_lat)
+        without_degrees.append({name: value for name, value in row.columns.items() if name not in (columns or ())})
         if lon_lat is not None and not math.isfinite(sum(xy_m)):
             needs_degrees = True
-    without_degrees = [_without_columns(row.columns, columns) for row, columns in zip(rows, names, strict=True)]
     if world.frame is None and not needs_degrees:
         return without_degrees
     known = _as_points([lon_lat for lon_lat in degrees if lon_lat is not None])
     reading = world.read_coordinates(known, str(path), WGS84, _COLUMNS_HINT)
     located = []
-    for row, columns, lon_lat in zip(rows, without_degrees, degrees, strict=True):
-        located.append(columns | _row_to_world(row, lon_lat, reading))
+    for row, other_columns, lon_lat in zip(rows, without_degrees, degrees, strict=True):
+        located.append(other_columns | _row_to_world(row, lon_lat, reading))
     return located
 
 
@@ -245,10 +243,6 @@ def _row_to_world(row: SiteRow, lon_lat: _LonLat | None, reading: CoordinateRead
     return {}
 
 
-def _without_columns(row: dict[str, Any], columns: _LonLatColumns | None) -> dict[str, Any]:
-    return {name: value for name, value in row.items() if name not in (columns or ())}
-
-
 def _number_or_nan(value: Any) -> float:
     try:
         return float(value)
@@ -264,7 +258,7 @@ def user_columns(where: str, row: Mapping[str, Any], known: Collection[str]) -> 
     misspelling = find_misspelling(row, known)
     if misspelling is not None:
         name, meant = misspelling
-        hint = f"Did you mean {meant}? A column of your own may have any name that is less similar."
+        hint = f"Did you mean {meant}? A custom column needs a less similar name."
         raise InputError(where, f"unknown column {name!r}", hint)
     columns: dict[str, ColumnValue] = {}
     for name, value in row.items():

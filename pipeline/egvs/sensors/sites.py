@@ -139,7 +139,7 @@ class ScannedSite:
             return cls(str(value["site"]), str(value["pole"]), pose, str(value["sensor"]), *counts)
         except (KeyError, TypeError, ValueError) as error:
             problem = f"its metadata has an invalid site {value!r} ({error!r})"
-            raise InputError(where, problem, "Use an unaltered file.") from None
+            raise InputError(where, problem, "Use the original file.") from None
 
 
 def candidate_sites(scenario: Scenario) -> tuple[Site, ...]:
@@ -223,7 +223,7 @@ def _check_keep_visibility(scenario: Scenario, sites: Mapping[str, Site]) -> Non
         return
     for name in kept:
         if name not in sites:
-            hint = f"Name one of {', '.join(sites)}, or use 'all'."
+            hint = f"Use one of {', '.join(sites)}, or 'all'."
             raise InputError(f"{scenario.file}: score.keep_visibility", f"there is no site {name!r}", hint)
 
 
@@ -233,7 +233,7 @@ def _with_measured_scan(sites: tuple[Site, ...], scenario: Scenario) -> tuple[Si
         return sites
     if len(sites) != 1:
         hint = "Add a column 'points' to the sites file, or use a single site."
-        raise InputError(f"{scenario.file}: sites.points", f"there is one measured scan for {len(sites)} sites", hint)
+        raise InputError(f"{scenario.file}: sites.points", f"one measured scan is given for {len(sites)} sites", hint)
     return (replace(sites[0], points=points),)
 
 
@@ -297,7 +297,7 @@ class _SiteBuilder:
         pole = self._poles.setdefault((request.x_m, request.y_m), name)
         mounts = self._mounts(row.where, request, sensor_name)
         if points is not None and len(mounts) > 1:
-            problem = f"there is one measured scan for {len(mounts)} mounts"
+            problem = f"one measured scan is given for {len(mounts)} mounts"
             raise InputError(f"{row.where}: points", problem, "Use one height and one pitch.")
         for mount in mounts:
             site_name = name + mount.name_suffix
@@ -322,7 +322,7 @@ class _SiteBuilder:
                 sensor = self._sensor(sensor_name, f"{where}: sensor")
                 aimed = aiming_angles(where, position_m, aim_m, request.roll_deg, sensor)
             for pitch in pitches:
-                suffix = _name_suffix(z_m if len(heights_m) > 1 else None, pitch if len(pitches) > 1 else None)
+                suffix = _name_suffix(z_m, pitch, with_height=len(heights_m) > 1, with_pitch=len(pitches) > 1)
                 yaw_deg, pitch_deg = self._angles(where, request, pitch, aimed)
                 mounts.append(Mount(suffix, z_m, yaw_deg, pitch_deg))
         return mounts
@@ -341,8 +341,8 @@ class _SiteBuilder:
             return None
         self.used_keys.add("aim" if config.aim is not None else "aim_m")
         center_m = self.scenario.roi.center_m
-        x_m, y_m, *z_m = config.aim_m or center_m
-        return x_m, y_m, z_m[0] if z_m else center_m[2]
+        x_m, y_m, z_m = (*(config.aim_m or center_m), center_m[2])[:3]
+        return x_m, y_m, z_m
 
     def _pitches(self, request: MountRequest, has_aim: bool) -> tuple[Pitch, ...]:
         """The pitch of the row, else the pitches of ``[sites]``, else the aim's pitch, else 0."""
@@ -358,8 +358,10 @@ class _SiteBuilder:
         self, where: str, request: MountRequest, pitch: Pitch, aimed: AimingAngles | None
     ) -> tuple[float, float]:
         """Yaw and pitch of a mount, degrees."""
+        if aimed is not None and pitch == "aim":
+            return aimed.yaw_deg, aimed.pitch_deg
         if aimed is not None:
-            return aimed.yaw_deg, aimed.pitch_deg if pitch == "aim" else float(pitch)
+            return aimed.yaw_deg, float(pitch)
         if pitch == "aim":
             reason = "there is no aim"
             if request.yaw_deg is not None:
@@ -375,17 +377,14 @@ class _SiteBuilder:
         return self._sensors[name]
 
 
-def _name_suffix(z_m: float | None, pitch: Pitch | None) -> str:
-    """Return ``@4.5m-10deg``, ``@aim``; without the height or pitch that is None because all candidates share it."""
-    height = "" if z_m is None else f"{z_m:.10g}m"
-    tilt = ""
-    if pitch == "aim":
-        tilt = "+aim" if height else "aim"
-    elif pitch is not None:
-        tilt = f"{pitch + 0.0:+.10g}deg"
-        if not height:
-            tilt = tilt.removeprefix("+")
-    return f"@{height}{tilt}" if height or tilt else ""
+def _name_suffix(z_m: float, pitch: Pitch, *, with_height: bool, with_pitch: bool) -> str:
+    """Return ``@4.5m-10deg``, ``@4.5m+aim``; without the height or pitch that all candidates share."""
+    suffix = ""
+    if with_height:
+        suffix = f"{z_m:.10g}m"
+    if with_pitch:
+        suffix += "+aim" if pitch == "aim" else f"{pitch + 0.0:+.10g}deg"
+    return "@" + suffix.removeprefix("+") if suffix else ""
 
 
 def aiming_angles(where: str, from_m: Vec3, to_m: Vec3, roll_deg: float, sensor: Sensor) -> AimingAngles:
@@ -405,14 +404,14 @@ def aiming_angles(where: str, from_m: Vec3, to_m: Vec3, roll_deg: float, sensor:
     Raises
     ------
     InputError
-        When the point is straight above or below the sensor, or when no pitch between -90 and 90 degrees lets the ray
+        When the point is directly above or below the sensor, or when no pitch between -90 and 90 degrees lets the ray
         meet it.
     """
     target = f"({', '.join(f'{v:g}' for v in to_m)})"
     x, y, z = (to - start for to, start in zip(to_m, from_m, strict=True))
     level_m = math.hypot(x, y)
     if level_m < _MIN_OFFSET_M:
-        problem = f"{target} is straight above or below the sensor"
+        problem = f"{target} is directly above or below the sensor"
         raise InputError(f"{where}: aim", problem, "Aim at a point to the side of it.")
     range_m = math.hypot(level_m, z)
     middle_x, middle_y, middle_z = _rotate_around_x(sensor.middle_deg, roll_deg)
@@ -421,8 +420,8 @@ def aiming_angles(where: str, from_m: Vec3, to_m: Vec3, roll_deg: float, sensor:
     pitch_rad = math.atan2(z / range_m, forward) - math.atan2(middle_z, middle_x)
     pitch_deg = math.remainder(math.degrees(pitch_rad), 360.0)
     if level < abs(middle_y) or abs(pitch_deg) > 90:
-        problem = f"{sensor.name} cannot be tilted so that its middle ray meets {target}"
-        hint = "Aim at a point that the middle ray meets with a pitch between -90 and 90."
+        problem = f"{sensor.name} cannot be pitched so that its central ray meets {target}"
+        hint = "Aim at a point that the central ray meets at a pitch between -90 and 90."
         raise InputError(f"{where}: aim", problem, hint)
     yaw_deg = math.degrees(math.atan2(y, x) - math.atan2(middle_y, forward))
     yaw_deg = round(math.remainder(yaw_deg, 360.0), _ANGLE_DIGITS) + 0.0
@@ -452,7 +451,7 @@ def _check_columns(row: SiteRow, scenario: Scenario) -> None:
     for key in ("site", *site_files.TEXT_COLUMNS):
         value = row.columns.get(key)
         if isinstance(value, bool | list | dict):
-            raise InputError(f"{row.where}: {key}", f"expected a text, got {repr(value)[:80]}")
+            raise InputError(f"{row.where}: {key}", f"expected text, got {repr(value)[:80]}")
 
 
 def _mount_request(row: SiteRow, scenario: Scenario) -> MountRequest:

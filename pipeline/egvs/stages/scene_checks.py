@@ -126,7 +126,7 @@ def warn_repeated_beams(inputs: CheckInputs) -> Iterator[Diagnostic]:
         if len(repeated) > MAX_LISTED_BEAMS:
             listed += ", ..."
         problem = f"{len(repeated)} of {len(table)} beams repeat an earlier direction ({listed}) and count twice"
-        hint = "Name each direction once; azimuths of 0 and 360 degrees are equal."
+        hint = "List each direction once; azimuths of 0 and 360 degrees are the same."
         yield Diagnostic("repeated beams", config.beams, problem, hint)
 
 
@@ -179,7 +179,7 @@ def check_poses(inputs: CheckInputs) -> Iterator[Diagnostic]:
         names = ", ".join(blind[:MAX_LISTED_SITES])
         if len(blind) > MAX_LISTED_SITES:
             names += ", ..."
-        problem = f"no beam of {len(blind)} of {len(inputs.sites)} sites meets the region of interest: {names}"
+        problem = f"{len(blind)} of {len(inputs.sites)} sites have no beam that meets the region of interest: {names}"
         yield Diagnostic("beams beside the region", "sites", problem, "Change yaw, pitch, position or sensor.")
 
 
@@ -224,9 +224,9 @@ def warn_dropped_sites(inputs: CheckInputs) -> Iterator[Diagnostic]:
     counts = Counter(reason for _, reason in dropped)
     reasons = ", ".join(f"{count} {reason}" for reason, count in counts.items())
     candidates = len(dropped) + len(inputs.sites)
-    problem = f"{len(dropped)} of {candidates} candidates are dropped, since no pole can stand there ({reasons})"
+    problem = f"{len(dropped)} of {candidates} candidates are dropped, because no pole can stand there ({reasons})"
     key = "sites.grid" if inputs.scenario.sites.grid is not None else "sites.along"
-    yield Diagnostic("dropped candidates", key, problem, "Name a sensor on a gantry or an island in a file of sites.")
+    yield Diagnostic("dropped candidates", key, problem, "List sensors on gantries or islands in a sites file.")
 
 
 def _reaches_region(inputs: CheckInputs, site: Site, sensor: Sensor) -> bool:

@@ -54,7 +54,7 @@ def resolve_plain_scene(scenario: Scenario, world: World, candidates: tuple[Site
     if not selection.free:
         reasons = ", ".join(f"{count} {reason}" for reason, count in selection.reasons.items())
         raise InputError(
-            f"{scenario.file}: sites", f"no place can hold a pole ({reasons})", "Name places beside the road."
+            f"{scenario.file}: sites", f"no location can hold a pole ({reasons})", "Use locations beside the road."
         )
     _check_kept_sites(scenario, selection)
     return Scene(scenario, world, selection.free, dropped=selection.dropped)
@@ -79,7 +79,7 @@ def _check_kept_sites(scenario: Scenario, selection: SiteSelection) -> None:
     for name in requested:
         if name in reasons:
             problem = f"the site {name!r} is dropped: it stands {reasons[name]}"
-            raise InputError(f"{scenario.file}: score.keep_visibility", problem, "Name a site that is scored.")
+            raise InputError(f"{scenario.file}: score.keep_visibility", problem, "Use a site that is scored.")
 
 
 def with_effects(plain: Scene) -> Scene:

@@ -53,9 +53,10 @@ def dependencies(context: StageContext) -> StageDependencies:
     for effect in effects:
         artefacts += effect.reads
     digests = context.digests(*artefacts)
-    network = context.inputs.common_network_path
-    if scenario.score.blindspots and network is not None:
-        digests["network"] = context.inputs.digest(network)
+    if scenario.score.blindspots:
+        network = context.inputs.common_network_path
+        if network is not None:
+            digests["network"] = context.inputs.digest(network)
     if effects:
         settings["effects"] = registry.effect_settings(effects)
         settings["sensors"] = sensor_settings(scenario)

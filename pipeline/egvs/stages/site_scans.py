@@ -37,7 +37,7 @@ def _stored_scans(context: StageContext, only: Collection[str] | None) -> Iterat
     with parquet.open_artefact(path, "scans") as (file, metadata):
         sites = metadata["sites"]
         if file.num_row_groups != len(sites):
-            problem = f"expected a row group for each of {len(sites)} sites, got {file.num_row_groups}"
+            problem = f"expected {len(sites)} row groups, one per site, got {file.num_row_groups}"
             raise InputError(path, problem, "Run the scan stage again.")
         names = [name for name in ("dx_m", "dy_m", "dz_m", "weight") if name in file.schema_arrow.names]
         for group, entry in enumerate(sites):

@@ -173,7 +173,7 @@ class TargetScorer:
         """
         if not self._names or not tpog.counts.any():
             return
-        problem = f"{self._no_vehicles_text}: {' and '.join(self._names)} is NaN"
+        problem = f"{self._no_vehicles_text}: no value for {' and '.join(self._names)}"
         if self.is_empty:
             yield Diagnostic("no vehicles", f"{SCENARIO_FILE}: roi", problem, _ROI_HINT)
         yield from warn_unused_weights(self._config, self.record)

@@ -100,7 +100,7 @@ def check_demand(inputs: CheckInputs) -> Iterator[Diagnostic]:
             key += f".routes = {list(traffic.routes)}"
         files = ", ".join(path.name for path in _demand_files(scenario)) or "no route file is named"
         problem = f"no vehicle, trip or flow in its files ({files})"
-        hint = "Name route files with vehicles, or a network only: then trips are drawn at random."
+        hint = "Use route files with vehicles, or only a network, for random trips."
         yield Diagnostic("traffic", key, problem, hint, is_error=True)
 
 
@@ -169,8 +169,8 @@ def check_vehicle_kinds(inputs: CheckInputs) -> Iterator[Diagnostic]:
         yield Diagnostic("traffic", f"{key}.edge_weights", problem, "Use the id of an edge.", is_error=True)
     for kind in traffic.kinds:
         if not any(edge.lanes_for(kind.vclass) for edge in inputs.network.edges):
-            problem = f"no lane of the network admits kind {kind.name!r} (vClass {kind.vclass})"
-            yield Diagnostic("traffic", f"{key}.kinds", problem, "Use a kind that the network admits.", is_error=True)
+            problem = f"no lane of the network allows kind {kind.name!r} (vClass {kind.vclass})"
+            yield Diagnostic("traffic", f"{key}.kinds", problem, "Use a kind that the network allows.", is_error=True)
 
 
 @_for_each_period

@@ -19,7 +19,7 @@ from typing import Any
 
 from egvs.artefacts import checksums, parquet
 from egvs.artefacts.run_folder import RunFolder
-from egvs.core import files
+from egvs.core import files, plugins
 from egvs.core.errors import EgvsError, InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.effects import registry
@@ -151,8 +151,9 @@ def run_accuracy_study(
     InputError
         If the options do not fit the scenario, or intermediate results were altered.
     """
+    plugins.require_libraries("egvs accuracy", "figure", "matplotlib")
     if not 1e-6 <= options.tolerance <= 1:
-        raise InputError("--tolerance", f"expected a share from 1e-6 to 1, got {options.tolerance:g}", "Try 0.02")
+        raise InputError("--tolerance", f"expected 1e-6 to 1, got {options.tolerance:g}", "Use 0.02, for example.")
     check_no_overwrite(load(path, overrides), out, (measurement.STUDY_FOLDER,))
     with lock_run_folder(out):
         runner = SettingRunner(path, overrides, out, options.jobs, progress)
@@ -170,7 +171,7 @@ def run_accuracy_study(
 def _check_traffic(scenario: Scenario, seeds: int) -> None:
     """Reject scenarios and numbers of seeds that tell nothing about standard errors."""
     if seeds and scenario.is_recorded:
-        problem = "the traffic is a finished file, the same for each seed"
+        problem = "the traffic is a finished file, so it is the same for every seed"
         raise InputError("--seeds", problem, "Use network or sumocfg in [traffic].")
     if seeds and scenario.score.rank_by != "egvs":
         problem = f"seeds are compared by EGVS only, but score.rank_by is {scenario.score.rank_by!r}"
@@ -215,12 +216,9 @@ class _StudyRun:
         if REFERENCE not in self.scores:
             factor = 1
 
-        rows = [
-            score_errors.compare_setting(
-                self.runner, setting, self.scores, could_last_longer=not self.scenario.is_recorded
-            )
-            for setting in compared
-        ]
+        rows, can_lengthen = [], not self.scenario.is_recorded
+        for setting in compared:
+            rows.append(score_errors.compare_setting(self.runner, setting, self.scores, could_last_longer=can_lengthen))
         rows = score_errors.mark_pareto_front(rows, self.options.tolerance)
         written = self._write(RunFolder(out), rows, factor)
         return AccuracyStudy(

@@ -356,21 +356,23 @@ def _effect_status(name: str, scene: Scene, trials: EffectTrials | None) -> Effe
     effect = kind(named[name])
     idle = effect.why_idle(scene)
     if idle is not None:
-        return _status(kind, "skipped", f"named, but {idle}: the result is the same without it")
+        return _status(kind, "skipped", f"set in the scenario, but {idle}: the result is the same without it")
     refusal = effect.refusal(scene)
     if refusal is not None:
         return _status(kind, "refused", str(refusal))
     parameters = effect.parameters.model_dump(mode="json")
     if not parameters:
         return _status(kind, "on", "named")
-    return _status(kind, "on", "named, with " + ", ".join(f"{key} = {value}" for key, value in parameters.items()))
+    return _status(
+        kind, "on", "set in the scenario, with " + ", ".join(f"{key} = {value}" for key, value in parameters.items())
+    )
 
 
 def _unnamed_effect_status(kind: type[Effect[Any]], scene: Scene, trials: EffectTrials | None) -> EffectStatus:
     """Say whether the scene calls for an effect that the scenario does not name, and what it would change."""
     missing = [key for key in registry.required_parameters(kind.NAME) if key not in kind.TRIAL]
     if missing:
-        return _status(kind, "off", f"not named; it needs {', '.join(missing)}, which the scene does not contain")
+        return _status(kind, "off", f"not set; it needs {', '.join(missing)}, which the scene does not provide")
     effect = kind(kind.Model.from_dict(kind.TRIAL))
     idle = effect.why_idle(scene)
     if idle is not None:
@@ -396,7 +398,7 @@ def _unnamed_effect_status(kind: type[Effect[Any]], scene: Scene, trials: Effect
         state = "little"
     elif trials is None and isinstance(effect, Articulated):  # depends on the vehicles that will come
         state = "your choice"
-    return _status(kind, state, summary or "it can act here", change)
+    return _status(kind, state, summary or "applicable here", change)
 
 
 def _try_effect(effect: Effect[Any], trials: EffectTrials) -> tuple[bool, str]:
@@ -405,7 +407,10 @@ def _try_effect(effect: Effect[Any], trials: EffectTrials) -> tuple[bool, str]:
         sizes = {name: size for name, (size, _) in trials.vehicle_shares.items()}
         parts = effect.geometries(sizes, effect.NAME)
         share = sum(share for name, (_, share) in trials.vehicle_shares.items() if name in parts)
-        return share == 0, f"{share:.1%} of the boxes in the last run get parts; only a run with it shows the change"
+        return (
+            share == 0,
+            f"{share:.1%} of the boxes in the last run would be split into parts; only a run with it shows the change",
+        )
     trial = trials.trial(effect)
     if trial is None:
         return False, "only a run with it shows the change, because it changes the traffic"

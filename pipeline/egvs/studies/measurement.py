@@ -160,7 +160,7 @@ class SettingRunner:
             for leftover in self._folder.glob(".work-*"):  # of a study that was killed
                 shutil.rmtree(leftover)
         except OSError as error:
-            problem = f"expected a folder for intermediate results, got an error ({error.strerror})"
+            problem = f"cannot be used as a folder for intermediate results ({error.strerror})"
             raise InputError(self._folder, problem, "Remove it.") from None
         self._results: dict[Setting, Path] = {}
         self._gamma: float | None = None
@@ -296,7 +296,7 @@ class SettingRunner:
             if path.is_file():
                 times = _read_json(path)
             if times["sha256"] != result.artefacts:
-                raise RunError(f"{name}: a repeat wrote other bytes than the first run; see {path}")
+                raise RunError(f"{name}: a repeat wrote different bytes from the first run. See {path}")
             if is_measured:
                 times["measured"].append(cost)
         _write_json(path, times)
@@ -327,7 +327,7 @@ def _reject_altered(path: Path) -> Iterator[None]:
     try:
         yield
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        problem = f"is not as the study wrote it ({error})"
+        problem = f"was changed after the study wrote it ({error})"
         raise InputError(path, problem, "Remove it, and run the study again.") from None
 
 

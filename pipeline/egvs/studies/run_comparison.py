@@ -154,7 +154,7 @@ def compare_runs(folders: Sequence[Path]) -> Comparison:
         If there are fewer folders, or one contains no finished run, or its scores were altered.
     """
     if len(folders) < 2:
-        raise InputError("compare", f"expected at least two runs, got {len(folders)}", "Name folders of finished runs.")
+        raise InputError("compare", f"expected at least two runs, got {len(folders)}", "Give folders of finished runs.")
     runs = tuple(_read_run(folder, run_label(number)) for number, folder in enumerate(folders))
     sites: dict[str, None] = {}
     for run in runs:
@@ -181,9 +181,9 @@ def _read_run(folder: Path, label: str) -> ComparedRun:
     score_stage = record.stages.get("score")
     if score_stage is None:
         problem = "expected a finished run, but the stage score was not run"
-        raise InputError(RunFolder(folder).run_record, problem, "Call egvs run first.")
+        raise InputError(RunFolder(folder).run_record, problem, "Run egvs run first.")
     if files.hash_file(path) != score_stage.artefacts.get(SCORES):
-        raise InputError(path, "is not the file that the run wrote", "Call egvs run again.")
+        raise InputError(path, "was changed after the run", "Run egvs run again.")
     scores, metadata = parquet.read_artefact(path, "scores")
     rank_by = metadata.get("rank_by", "egvs")
 

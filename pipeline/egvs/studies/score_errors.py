@@ -101,6 +101,9 @@ def compare_setting(
     error_rms = error
     if 0 < error < math.inf:
         error_rms = error * float(np.sqrt(np.mean((changes / error) ** 2)))
+    judged = error
+    if could_last_longer:
+        judged = max(error, error_se)
     return SettingResult(
         setting=setting.name,
         kind=setting.kind,
@@ -121,7 +124,7 @@ def compare_setting(
         error_se=error_se,
         error_rms=error_rms,
         own_change=float(relative_errors(shares, np.array(baseline.shares)).max(initial=0.0)),
-        judged=max(error, error_se) if could_last_longer else error,
+        judged=judged,
         tau=rank_agreement(shares, reference_shares, "tau"),
         rho=rank_agreement(shares, reference_shares, "rho"),
         best_kept=best_sites(shares, 1) == best_sites(reference_shares, 1),
@@ -202,9 +205,8 @@ def mark_pareto_front(rows: list[SettingResult], tolerance: float) -> list[Setti
         Largest error of the recommended setting.
     """
     candidates = [row for row in rows if row.kind in (APPROXIMATES, SCENARIO)]
-    accurate = sorted(
-        (row for row in candidates if row.judged <= tolerance), key=lambda row: (row.seconds, row.setting)
-    )
+    accurate = [row for row in candidates if row.judged <= tolerance]
+    accurate.sort(key=lambda row: (row.seconds, row.setting))
     recommended = None
     if accurate:
         recommended = _recommended(accurate).setting

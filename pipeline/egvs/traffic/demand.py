@@ -199,8 +199,8 @@ def origin_destination_pairs(
     title = f"kind {kind.name!r} (vClass {kind.vclass})"
     lanes = _lanes_per_edge(network, kind.vclass)
     if not lanes.any():
-        problem = f"{title} may use no lane of the network"
-        raise InputError(f"{where}.kinds", problem, "Use a vClass that the network admits.")
+        problem = f"no lane of the network allows {title}"
+        raise InputError(f"{where}.kinds", problem, "Use a vClass that the network allows.")
 
     weights = edge_weights(network, lanes, traffic, where)
     links = network.links(kind.vclass)
@@ -216,7 +216,7 @@ def origin_destination_pairs(
     origin, target = pairs[:, 0], pairs[:, 1]
     weight = weights[origin] * weights[target]
     if not weight.any():
-        problem = f"{title} can make no trip of at least {traffic.min_trip_m:g} m"
+        problem = f"{title} cannot make any trip of at least {traffic.min_trip_m:g} m"
         raise InputError(f"{where}.kinds", problem, "Use a connected network, or a smaller min_trip_m.")
     return OriginDestinations(origin, target, weight, at_fringe)
 
@@ -469,7 +469,7 @@ class RouteFinder:
             ways = self._fastest(indices)
             indices = _follow(ways.towards[0], end, indices[0])[::-1]
         if not indices:
-            problem = f"there is no way from {first!r} to {last!r}"
+            problem = f"there is no route from {first!r} to {last!r}"
             raise InputError(where, problem, "Use an edge that can be reached from the first.")
         return CountLocation(tuple(self._edges[i].id for i in indices), tuple(indices))
 
@@ -680,7 +680,7 @@ def count_location(
         names = ", ".join(kind.name for kind in traffic.kinds)
         raise InputError(where, f"the fleet has no kind {count.kind!r}", f"Use one of {names}.")
     if count.kind == FLEET:
-        problem = f"a kind is called {FLEET!r}, which is reserved for vehicles counted without their kind"
+        problem = f"a kind is called {FLEET!r}, which is reserved for vehicles counted without a kind"
         raise InputError(where, problem, "Give this kind another name.")
     finder = routes[_main_kind(kinds).vclass]
     return finder.locate(count.edge or count.from_edge or "", count.to_edge, where)
@@ -813,21 +813,19 @@ def count_warnings(counts: Sequence[CountFit], hours: float, where: str) -> list
     where
         The traffic table, for messages.
     """
-    missed = [fit for fit in counts if fit.geh > GOOD_GEH and _exceeds_noise(fit, hours)]
-    if not missed:
-        return []
     descriptions = []
-    for fit in missed:
+    for fit in counts:
+        difference = abs(fit.simulated_per_h - fit.counted_per_h) * hours
+        noise = _NOISE_SIGMAS * math.sqrt(max(fit.counted_per_h * hours, 1.0))
+        if not (fit.geh > GOOD_GEH and difference > noise):
+            continue
         kind = f" ({fit.kind})" if fit.kind else ""
         descriptions.append(f"{fit.place}{kind}: {fit.simulated_per_h:g} instead of {fit.counted_per_h:g}")
+    if not descriptions:
+        return []
     problem = (
-        f"the simulation misses {len(missed)} of {len(counts)} counts (vehicles per hour, simulated instead of counted:"
+        f"the simulation misses {len(descriptions)} of {len(counts)} counts (vehicles per hour, simulated vs counted:"
         f" {'; '.join(descriptions)})"
     )
     hint = "Check that the counts are consistent with each other and with the network's lanes and signals."
     return [Diagnostic("counts", f"{where}.counts", problem, hint)]
-
-
-def _exceeds_noise(fit: CountFit, hours: float) -> bool:
-    difference = abs(fit.simulated_per_h - fit.counted_per_h) * hours
-    return difference > _NOISE_SIGMAS * math.sqrt(max(fit.counted_per_h * hours, 1.0))

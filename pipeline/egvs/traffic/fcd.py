@@ -54,7 +54,7 @@ _MAX_ROWS_PER_BYTE = 10
 """Positions and angles that change take at least a bit per row."""
 
 EXPECTED_FCD = (
-    "Use FCD with the attributes id, x, y, angle and type (--fcd-output.attributes id,x,y,z,angle,slope,type,speed)."
+    "Use FCD data with the attributes id, x, y, angle, type (--fcd-output.attributes id,x,y,z,angle,slope,type,speed)."
 )
 
 _GEO_HINT = "Set traffic.fcd_geo = true for longitude and latitude (--fcd-output.geo); without it, x and y are metres."
@@ -150,7 +150,8 @@ def _read_csv(path: Path, element: str) -> Iterator[pa.RecordBatch]:
         header = xml.read_line(file, path).decode("utf-8").lstrip("\ufeff").strip()
     delimiter = ";" if ";" in header else ","
     columns = _source_columns([name.strip('"') for name in header.split(delimiter)], path, element)
-    types = {source: pa.string() if name in _STRINGS else pa.float64() for name, source in columns.items()}
+    types = dict.fromkeys(columns.values(), pa.float64())
+    types.update((columns[name], pa.string()) for name in _STRINGS)
     convert = csv.ConvertOptions(
         column_types=types,
         include_columns=list(columns.values()),
@@ -214,7 +215,7 @@ def _check_rows(metadata: Any, path: Path) -> None:
     """Raise an InputError if a Parquet file declares more rows than it can contain."""
     groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
     largest = max((group.total_byte_size for group in groups), default=0)
-    limits.UNPACKED.check_bytes(path, largest, f"has a row group of {largest / limits.MB:,.0f} MB, unpacked")
+    limits.UNPACKED.check_bytes(path, largest, f"has a row group of {largest / limits.MB:,.0f} MB after decompression")
     packed = sum(group.column(i).total_compressed_size for group in groups for i in range(group.num_columns))
     if metadata.num_rows > _MAX_ROWS_PER_BYTE * packed:
         raise InputError(path, f"declares {metadata.num_rows:,} rows in {packed:,} bytes", _COMPLETE_FILE)
@@ -265,7 +266,7 @@ def _source_columns(names: list[str], path: Path, element: str) -> dict[str, str
 
 def _checked_tables(batches: Iterable[pa.RecordBatch], path: Path, unit: str) -> Iterator[pa.Table]:
     """Convert batches to :data:`FCD_SCHEMA`; check that numbers are finite and times are in order."""
-    rows_read, last_ms = 0, None
+    rows_read, last_ms = 0, np.iinfo(np.int64).min
     for batch in batches:
         rows = _RowBatch(batch, rows_read, path, unit)
         rows_read += batch.num_rows
@@ -322,8 +323,8 @@ class _RowBatch:
             raise self._error(i, problem, "Round the times; SUMO counts in milliseconds.")
         return rounded.astype(np.int64)
 
-    def check_order(self, time_ms: NDArray[np.int64], last_ms: int | None) -> None:
-        before = np.concatenate([[time_ms[0] if last_ms is None else last_ms], time_ms[:-1]])
+    def check_order(self, time_ms: NDArray[np.int64], last_ms: int) -> None:
+        before = np.concatenate([[last_ms], time_ms[:-1]])
         for i in np.flatnonzero(time_ms < before):
             problem = f"time {time_ms[i] / 1000:g} s comes after {before[i] / 1000:g} s"
             raise self._error(i, problem, "Sort the rows by time.")
@@ -460,7 +461,7 @@ class _FrameBuffer:
         if self.window.complete:
             return
         if self.first_ms is None:
-            raise InputError(self.where, "the file has no vehicle", EXPECTED_FCD)
+            raise InputError(self.where, "the file contains no vehicles", EXPECTED_FCD)
         check_span(self.window, self.last_ms - self.first_ms, self.step_ms, self.time_steps, self.where)
 
 
@@ -492,7 +493,7 @@ def check_span(
     period_s = window.period_ms / 1000
     if step_ms and window.period_ms % step_ms:
         problem = f"the time steps of {file} are {step_ms / 1000:g} s apart"
-        raise InputError(f"{where}: frame_period_s = {period_s:g}", problem, "Use a multiple of them.")
+        raise InputError(f"{where}: frame_period_s = {period_s:g}", problem, "Use a multiple of that.")
     available = max(0, duration_ms // window.period_ms + 1)
     if available < window.count:
         problem = (

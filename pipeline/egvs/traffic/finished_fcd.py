@@ -73,7 +73,7 @@ def read_fcd_metadata(path: Path) -> FcdMetadata | None:
     raw = fcd.fcd_metadata(path) if path.is_file() else None
     if raw is None:
         return None
-    hint = "Use an unaltered file; create it again."
+    hint = "Use the original file, or create it again."
     try:
         values: Any = reading.parse_json(raw)
     except (ValueError, RecursionError) as error:
@@ -119,8 +119,11 @@ def kind_sizes(kinds: Collection[VehicleKind]) -> dict[str, VehicleSize]:
 def known_sizes(scenario: Scenario) -> dict[str, VehicleSize]:
     """Return the sizes that are known without starting SUMO: from the scenario, and the metadata of a finished file."""
     traffic = scenario.traffic
-    metadata = None if traffic.fcd is None else read_fcd_metadata(scenario.find(traffic.fcd, "traffic.fcd"))
-    return kind_sizes(traffic.kinds) if metadata is None else metadata.sizes | kind_sizes(traffic.named_kinds)
+    if traffic.fcd is not None:
+        metadata = read_fcd_metadata(scenario.find(traffic.fcd, "traffic.fcd"))
+        if metadata is not None:
+            return metadata.sizes | kind_sizes(traffic.named_kinds)
+    return kind_sizes(traffic.kinds)
 
 
 def sizes_of_types(
@@ -187,7 +190,7 @@ def check_types(scenario: Scenario, types: Collection[str], declared: Mapping[st
     missing = sorted(set(types) - known - _DEFAULT_TYPES)
     if missing:
         names = ", ".join(map(repr, missing))
-        problem = f"the size of vehicle types of {scenario.traffic.fcd} is unknown: {names}"
+        problem = f"unknown sizes of vehicle types of {scenario.traffic.fcd}: {names}"
         hint = (
             "Add a kind of each name with length_m, width_m and height_m, or the SUMO file with their <vType> to vtypes"
             f" (known: {', '.join(sorted(known))})."
@@ -308,7 +311,7 @@ def survey_fcd(path: Path, until_ms: int | None = None) -> FcdSurvey:
         if until_ms is not None and last_ms > first_ms + until_ms:
             break
     if first_ms is None:
-        raise InputError(path, "the file has no vehicle", fcd.EXPECTED_FCD)
+        raise InputError(path, "the file contains no vehicles", fcd.EXPECTED_FCD)
     return FcdSurvey(last_ms - first_ms, time_steps, step_ms, frozenset(types))
 
 
@@ -333,7 +336,8 @@ def fcd_window(scenario: Scenario) -> tuple[fcd.FrameWindow, FcdSurvey]:
         problem = f"the duration of {path.name} is {survey.duration_ms / 1000:g} s"
         raise InputError(f"{where}.warmup_s = {traffic.warmup_s:g}", problem, "Use a shorter warm-up.")
     is_complete = survey.metadata is not None
-    window = fcd.FrameWindow(frames, period_ms, skip_ms if is_complete else None, skip_ms, is_complete)
+    first_ms = skip_ms if is_complete else None
+    window = fcd.FrameWindow(frames, period_ms, first_ms, skip_ms, is_complete)
     fcd.check_span(
         window, survey.duration_ms - skip_ms, survey.step_ms, survey.time_steps, where, file=str(traffic.fcd)
     )
@@ -347,4 +351,6 @@ def _cached_survey(path: Path, _modified_ns: int, until_ms: int | None) -> FcdSu
 
 def recorded_frames(scenario: Scenario) -> int:
     """Return the number of frames that a scenario records: ``traffic.frames``, or all of a finished file."""
-    return fcd_window(scenario)[0].count if scenario.traffic.frames is None else scenario.traffic.frames
+    if scenario.traffic.frames is not None:
+        return scenario.traffic.frames
+    return fcd_window(scenario)[0].count

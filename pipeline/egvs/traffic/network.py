@@ -327,7 +327,7 @@ def _read_network_file(file: _NamedFile, _content: str) -> Network:
             raise InputError(file.name, f"invalid {title} for a SUMO network ({error!r})", _HINT) from None
     roads = [edge for edge in edges if not edge.function]
     if not roads:
-        raise InputError(file.name, "the network has no road", "Use a network with at least one edge.")
+        raise InputError(file.name, "the network has no roads", "Use a network with at least one edge.")
     road_connections = tuple(_parse_connections(connections, roads, file.name))
     return Network(tuple(edges), road_connections, tuple(junctions), cycle_s, location, tuple(lane_links))
 
@@ -404,7 +404,7 @@ def _parse_connections(
         if source is None or target is None:
             continue  # from or to a walking area or a crossing
         if source_lane >= len(roads[source].lanes) or target_lane >= len(roads[target].lanes):
-            raise InputError(path, f"a <connection> from {start!r} names a lane that does not exist", _HINT)
+            raise InputError(path, f"a <connection> from {start!r} refers to a lane that does not exist", _HINT)
         permission = Permission.from_attributes(connection)
         direction = connection.get("dir", "")
         yield Connection(source, source_lane, target, target_lane, direction, permission, connection.get("via", ""))

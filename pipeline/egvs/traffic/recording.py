@@ -129,8 +129,8 @@ def record_traffic(
         When ``traci`` is given for a finished file, or an extension does not support the scenario.
     """
     if scenario.traffic.fcd is not None and traci is not None:
-        hint = "Name a network or a sumocfg in [traffic] instead."
-        raise InputError("--traci", "the scenario names a finished FCD file", hint)
+        hint = "Set network or sumocfg in [traffic] instead."
+        raise InputError("--traci", "the scenario uses a finished FCD file", hint)
     for extension in extensions:
         error = extension.scenario_error(scenario)
         if error is not None:
@@ -172,7 +172,7 @@ def _record_simulated(
             sizes |= extension.sizes()
         duration_s = round(simulate(prepared, progress), 3)
     except sumo.SumoInputError as error:
-        hint = "Correct these files, of which SUMO read copies."
+        hint = "Correct these files; SUMO read copies of them."
         raise InputError(where, f"SUMO cannot run {sources}: {error}", hint) from None
     else:
         collisions = _read_collisions(prepared)
@@ -285,7 +285,9 @@ def record_live(
             if time_ms + timing.step_ms >= timing.end_ms:
                 stopped = {name for name in subscriptions.vehicles() if connection.vehicle.isStopped(name)}
                 observations.stopped_on_purpose |= stopped
-            yield _rows_to_table(time_ms, rows)
+            ids, types, numbers = zip(*rows, strict=True)
+            arrays = [np.full(len(rows), time_ms), pa.array(ids), pa.array(types), *np.array(numbers).T]
+            yield pa.table(arrays, schema=fcd.FCD_SCHEMA)
 
 
 def _check_clock(connection: Any, timing: Timing, address: str) -> None:
@@ -298,10 +300,10 @@ def _check_clock(connection: Any, timing: Timing, address: str) -> None:
     now_ms = round(connection.simulation.getTime() * 1000)
     first_frame = f"the first frame at {timing.first_ms / 1000:g} s"
     if now_ms > timing.first_ms:
-        hint = "Restart it, or set a longer traffic.warmup_s"
-        raise RunError(f"{where}: SUMO is at {now_ms / 1000:g} s already, after {first_frame}. {hint}")
+        hint = "Restart it, or set a longer traffic.warmup_s."
+        raise RunError(f"{where}: SUMO is already at {now_ms / 1000:g} s, after {first_frame}. {hint}")
     if (timing.first_ms - now_ms) % timing.step_ms:
-        raise RunError(f"{where}: steps of {step_s:g} s from {now_ms / 1000:g} s on do not reach {first_frame}")
+        raise RunError(f"{where}: steps of {step_s:g} s from {now_ms / 1000:g} s on do not hit {first_frame}")
 
 
 class _FcdRow(NamedTuple):
@@ -365,12 +367,6 @@ class _Subscriptions:
             self._sizes[vtype] = sumo.query_size(self._connection, vtype)
         numbers = (*values[self._position], values[self._angle], values[self._slope], values[self._speed])
         return _FcdRow(name, vtype, [float(f"{number:.{sumo_folder.FCD_DIGITS}f}") for number in numbers])
-
-
-def _rows_to_table(time_ms: int, rows: list[_FcdRow]) -> pa.Table:
-    ids, types, numbers = zip(*rows, strict=True)
-    columns = np.array(numbers).T
-    return pa.table([np.full(len(rows), time_ms), pa.array(ids), pa.array(types), *columns], schema=fcd.FCD_SCHEMA)
 
 
 def standing_limit_s(cycle_s: float) -> float:
@@ -445,8 +441,9 @@ class Collision:
     @property
     def location(self) -> str:
         """The junction or the edge, e.g. ``"junction J1"``."""
-        lane = self.lane
-        return f"junction {lane[1:].rsplit('_', 2)[0]}" if lane.startswith(":") else f"edge {lane.rpartition('_')[0]}"
+        if self.lane.startswith(":"):
+            return f"junction {self.lane[1:].rsplit('_', 2)[0]}"
+        return f"edge {self.lane.rpartition('_')[0]}"
 
 
 def _read_collisions(prepared: SimulationFolder) -> dict[tuple[str, str], Collision]:
@@ -474,7 +471,7 @@ def _collision_warning(collisions: dict[tuple[str, str], Collision], scenario: S
         locations.append(f"{number} at {location}{distance}")
     pairs = "a pair" if len(collisions) == 1 else f"{len(collisions)} pairs"
     problem = f"{pairs} of vehicles collided and drove through each other: {', '.join(locations)}"
-    hint = "Check right of way, signals, and the space for waiting on the junctions there, in sumo-gui."
+    hint = "In sumo-gui, check right of way, signals and the waiting space on the junctions there."
     return [Diagnostic("collisions", sumo_folder.traffic_location(scenario), problem, hint)]
 
 
@@ -482,7 +479,9 @@ def describe_distance(at_m: tuple[float, float], roi: Roi) -> str:
     """Describe the horizontal distance of a point in the world frame from the region of interest."""
     axes = zip(at_m, roi.origin_m[:2], roi.size_m[:2], strict=True)
     distance_m = math.hypot(*(max(low - x, x - low - size, 0.0) for x, low, size in axes))
-    return f"{distance_m:.0f} m from the region of interest" if distance_m else "in the region of interest"
+    if not distance_m:
+        return "in the region of interest"
+    return f"{distance_m:.0f} m from the region of interest"
 
 
 def _insertion_warning(prepared: SimulationFolder, scenario: Scenario) -> list[Diagnostic]:

@@ -64,7 +64,7 @@ def sumo_binary(name: str) -> Path:
     with _preserve_proj_data():
         program = shutil.which(sumolib.checkBinary(name))
     if program is None:
-        raise MissingBackendError(f"SUMO's program {name!r} was not found. Set SUMO_HOME, or pip install eclipse-sumo")
+        raise MissingBackendError(f"SUMO's {name!r} was not found. Set SUMO_HOME, or run pip install eclipse-sumo")
     return Path(program)
 
 
@@ -258,10 +258,13 @@ def program_error(name: str, code: int, text: str) -> RunError:
         return MissingBackendError(f"{name} cannot be started: {reason}")
 
     errors = [line for line in lines if not line.startswith(("Warning", "Quitting", "pj_obj_create"))] or lines[-1:]
-    is_crash = -code in _CRASHES
-    verb = "crashed with" if is_crash else "was killed by"
-    problem = f"{verb} signal {-code}" if code < 0 else f"ended with exit code {code}"
-    kind = SumoInputError if code > 0 or is_crash else RunError
+    kind: type[RunError] = SumoInputError
+    if code > 0:
+        problem = f"ended with exit code {code}"
+    elif -code in _CRASHES:
+        problem = f"crashed with signal {-code}"
+    else:
+        kind, problem = RunError, f"was killed by signal {-code}"
     return kind("\n".join([f"{name} {problem}:", *(f"  {line[:_MAX_ERROR_LENGTH]}" for line in errors[:_MAX_ERRORS])]))
 
 
@@ -291,7 +294,7 @@ def connect_traci(host: str, port: int) -> Iterator[Any]:
     where = f"--traci {host}:{port}"
     connection = _connect(host, port)
     if connection is None:
-        raise InputError(where, "no SUMO answers there", "Start one with --remote-port first.")
+        raise InputError(where, "no SUMO simulation answers there", "Start SUMO with --remote-port first.")
     try:
         try:
             connection.getVersion()

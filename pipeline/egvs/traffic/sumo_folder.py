@@ -231,13 +231,15 @@ class SimulationFolder:
         """Options for the outputs of SUMO that are needed."""
         options = {
             "fcd-output": FCD_FILE,
-            "fcd-output.attributes": _FCD_ATTRIBUTES + (",z,slope" if self.roads.has_heights else ""),
+            "fcd-output.attributes": _FCD_ATTRIBUTES,
             "fcd-output.skip-empty": "true",
             "device.fcd.begin": _format_seconds(self.timing.first_ms),
             "device.fcd.period": _format_seconds(self.timing.period_ms),
             "precision": str(FCD_DIGITS),
             "collision-output": COLLISIONS_FILE,
         }
+        if self.roads.has_heights:
+            options["fcd-output.attributes"] += ",z,slope"
         if self.has_extra_traffic or not self.is_generated:  # without it, SUMO writes persons among the vehicles
             options["person-fcd-output"] = PERSONS_FILE
         if not self.has_fixed_count:  # distinguishes an incomplete file from roads without vehicles
@@ -313,7 +315,8 @@ def prepare_simulation(scenario: Scenario, folder: Path, extensions: Iterable[Tr
         options["max-num-vehicles"] = str(vehicles + extra_vehicles)
     if depart_delay_s:
         options["max-depart-delay"] = f"{depart_delay_s:g}"
-    files.write_text(folder / CONFIG_FILE, _config_xml(options))
+    lines = [f"    <{key} value={quoteattr(value)}/>" for key, value in options.items()]
+    files.write_text(folder / CONFIG_FILE, "\n".join(["<configuration>", *lines, "</configuration>", ""]))
     has_fixed_count = vehicles is not None and traffic.hold == "exactly"
     return SimulationFolder(
         folder, tuple(inputs.all()), options, timing, roads, vehicles, is_generated, bool(traffic.counts),
@@ -326,7 +329,7 @@ def _make_empty(folder: Path, inputs: Iterable[Path]) -> None:
     for path in inputs:
         if path.resolve().is_relative_to(folder.resolve()):
             hint = "Use another --out, or move the file."
-            raise InputError(path, "an input file is in the folder that is emptied for SUMO", hint)
+            raise InputError(path, "an input file is in a folder that egvs empties for SUMO", hint)
     if folder.is_symlink():
         folder.unlink()
     elif folder.exists():
@@ -418,11 +421,6 @@ def _convert_osm_once(path: Path, _content: str) -> bytes:
         try:
             sumo.run_netconvert(["--osm-files", MAP_FILE, *_OSM_FLAGS], folder, NETWORK_FILE)
         except sumo.SumoInputError as error:
-            problem = f"no network can be made of this map: {error}"
+            problem = f"no network can be built from this map: {error}"
             raise InputError(path, problem, "Download the map again, in full.") from None
         return (folder / NETWORK_FILE).read_bytes()
-
-
-def _config_xml(options: Mapping[str, str]) -> str:
-    lines = [f"    <{key} value={quoteattr(value)}/>" for key, value in options.items()]
-    return "\n".join(["<configuration>", *lines, "</configuration>", ""])

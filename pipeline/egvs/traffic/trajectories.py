@@ -413,7 +413,7 @@ def traffic_warnings(statistics: TrafficStatistics, recording: Recording, roi: R
         duration_s = jam.frames * (recording.window.period_ms / 1000.0)
         if duration_s > LONG_STOP_S:
             where = f"{recording.where}: {describe_location(jam.at_m, roi)}"
-            problem = f"vehicle {jam.vehicle!r} was standing for {duration_s:g} s, longer than at any usual signal"
+            problem = f"vehicle {jam.vehicle!r} was standing for {duration_s:g} s, longer than any usual red phase"
             hint = "Check the signals and connections of the network there, or reduce the traffic."
             warnings.append(Diagnostic("standing", where, problem, hint))
     share = statistics.frames_with_overlap / statistics.frames

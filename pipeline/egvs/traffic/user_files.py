@@ -6,7 +6,7 @@ and switches. Options that affect outputs only, or that the scenario sets itself
 error, because ignoring it might change the traffic.
 
 **XML files.** SUMO reads copies only. Each file is first read with the safe parser, which rejects entities and document
-types; an element that makes SUMO read a further file is an error. If the file makes SUMO write outputs, or is in an
+types; an element that makes SUMO read another file is an error. If the file makes SUMO write outputs, or is in an
 encoding other than UTF-8, the copy is written anew, with the outputs disabled. Detectors, mean data, probes,
 calibrators, signal programs and, in any file, ``<param>`` can have outputs. They stay in the copy, because signals and
 routes may depend on them.
@@ -210,7 +210,7 @@ def read_sumocfg(path: Path) -> DemandFiles:
         if option == "begin":
             begin_s = _parse_begin_s(value, path)
         elif option == "no-internal-links" and value.lower() in _TRUE:
-            raise InputError(where, "makes vehicles jump over junctions (up to 42 m)", "Remove it.")
+            raise InputError(where, "makes vehicles jump across junctions (up to 42 m)", "Remove it.")
         elif option in FILE_OPTIONS:
             files[option] = tuple(path.parent / name.strip() for name in value.split(",") if name.strip())
             for file in files[option]:
@@ -218,15 +218,13 @@ def read_sumocfg(path: Path) -> DemandFiles:
                     raise InputError(where, f"no such file ({file})", "Use a path relative to the configuration.")
         elif option in ACCEPTED_OPTIONS:
             options[option] = value
-        elif value and not _is_ignored(option):
-            raise InputError(where, "option of SUMO not supported", "Remove it; docs/security.md lists those that are.")
+        elif option in _IGNORED_OPTIONS or option.startswith(_IGNORED_PREFIXES) or "output" in option:
+            continue  # has no effect on the traffic
+        elif value:
+            raise InputError(where, "this SUMO option is not supported", "Remove it; see docs/security.md.")
     if "net-file" not in files:
         raise InputError(path, "has no net-file", "Add <net-file value=.../> to its <input>.")
     return DemandFiles(files, options, begin_s)
-
-
-def _is_ignored(option: str) -> bool:
-    return option in _IGNORED_OPTIONS or option.startswith(_IGNORED_PREFIXES) or "output" in option
 
 
 def _iter_options(path: Path) -> Iterator[tuple[str, str]]:
@@ -307,8 +305,8 @@ def _checked_elements(path: Path, on_root: Callable[[Element], None] = lambda ro
     def check_root(root: Element) -> None:
         _check_element(root, path)
         if keys := _output_keys(root):  # SUMO accepts any element as the root
-            problem = f"its root <{root.tag} {keys[0]}=...> has an output"
-            raise InputError(path, problem, "Use a root like <additional>.")
+            problem = f"its root <{root.tag} {keys[0]}=...> has an output attribute"
+            raise InputError(path, problem, "Use a plain root such as <additional>.")
         on_root(root)
 
     for child in xml.iter_elements(path, "", on_root=check_root):
@@ -336,14 +334,14 @@ def _rewrite(path: Path, file: IO[bytes]) -> None:
 
 
 def _check_element(element: Element, path: Path) -> None:
-    """Raise an InputError for an element in a namespace, or one that makes SUMO read a further file."""
+    """Raise an InputError for an element in a namespace, or one that makes SUMO read another file."""
     if "}" in element.tag:
-        raise InputError(path, f"<{element.tag}> is in a namespace", "Use SUMO's elements, which have none.")
+        raise InputError(path, f"<{element.tag}> is in a namespace", "Use SUMO's elements without a namespace.")
     inputs = _INPUT_ATTRIBUTES | ({"file"} if element.tag in _INPUT_ELEMENTS else set())
     for key in sorted(inputs & element.attrib.keys()):
         if element.attrib[key] not in ("", NULL_FILE):
-            problem = f"<{element.tag} {key}={element.attrib[key]!r}> makes SUMO read a further file"
-            raise InputError(path, problem, "Put its content into this file.")
+            problem = f"<{element.tag} {key}={element.attrib[key]!r}> makes SUMO read another file"
+            raise InputError(path, problem, "Move its content into this file.")
 
 
 def _output_keys(element: Element) -> list[str]:

@@ -158,7 +158,7 @@ def boxes_from_bumpers(
     duplicates = np.flatnonzero((np.diff(frame) == 0) & (np.diff(code) == 0))
     if duplicates.size:
         row = duplicates[0]
-        problem = f"vehicle {names[code[row]]!r} is twice in frame {frame[row]}"
+        problem = f"vehicle {names[code[row]]!r} occurs twice in frame {frame[row]}"
         raise InputError(where, problem, "Write one row per vehicle and frame.")
 
     kinds = sorted({sizes[name].vclass for name in types})
@@ -170,10 +170,10 @@ def boxes_from_bumpers(
     x, y, z, angle, slope, speed = (group.rows[key].to_numpy()[order] for key in keys)
     centre = box_centres(x, y, z, angle, slope, length, height)
     yaw, pitch = yaw_from_angle(angle), round_rad(np.deg2rad(slope))
-    uncounted = np.array([name in uncounted_types for name in types], dtype=np.bool_)[type_code]
+    uncounted = np.isin(types, list(uncounted_types))[type_code] if uncounted_types else None
     boxes = VehicleBoxes(
         group.first_frame, group.frames, frame, names, code, kinds, kind, *centre, yaw, pitch, length, width, height,
-        speed, types, type_code, uncounted=uncounted if uncounted_types else None,
+        speed, types, type_code, uncounted=uncounted,
     )  # fmt: skip
     return _fill_speeds(boxes, period_s) if np.isnan(speed).any() else boxes
 

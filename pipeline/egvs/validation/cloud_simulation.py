@@ -50,6 +50,7 @@ import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -133,7 +134,7 @@ class VehicleMeshes:
     @classmethod
     def from_parts(cls, parts_by_kind: Mapping[str, tuple[MeshPart, ...]]) -> VehicleMeshes:
         """Prepare the parts of each kind of body."""
-        parts = [part for kind_parts in parts_by_kind.values() for part in kind_parts]
+        parts = list(chain.from_iterable(parts_by_kind.values()))
         sides = np.concatenate([part.triangles for part in parts])
         corners = sides[:, :1].copy()
         sides[:, 1:] -= corners
@@ -144,7 +145,7 @@ class VehicleMeshes:
 
         triangle_counts = [len(part.triangles) for part in parts]
         reflectivity = np.repeat([REFLECTIVITY[part.surface] for part in parts], triangle_counts)
-        part_starts = np.cumsum([0, *(len(kind_parts) for kind_parts in parts_by_kind.values())])
+        part_starts = np.cumsum([0, *map(len, parts_by_kind.values())])
         triangle_starts = np.cumsum([0, *triangle_counts])
         shapes = (part_starts, np.array(boxes) + padding, closed, triangle_starts, sides, normal_lengths, reflectivity)
         return cls(tuple(parts_by_kind), shapes)
@@ -252,16 +253,16 @@ def read_body(path: Path, where: str) -> tuple[MeshPart, ...]:
     mesh = meshes.load_mesh(path, where)
     if len(mesh.faces) > MAX_TRIANGLES:
         problem = f"expected at most {MAX_TRIANGLES:,} triangles, got {len(mesh.faces):,}"
-        raise InputError(where, problem, "Simplify the mesh")
+        raise InputError(where, problem, "Simplify the mesh.")
     triangles = np.asarray(mesh.vertices, dtype=np.float64)[mesh.faces]
     if not np.isfinite(triangles).all():
-        raise InputError(where, "a corner of a triangle is not finite", "Use finite coordinates")
+        raise InputError(where, "a triangle has a non-finite vertex", "Use finite coordinates.")
     low = triangles.min(axis=(0, 1))
     high = triangles.max(axis=(0, 1))
     flat_axes = ["xyz"[axis] for axis in range(3) if not high[axis] > low[axis]]
     if flat_axes:
         problem = f"the mesh has no extent along {', '.join(flat_axes)}"
-        raise InputError(where, problem, "Use a mesh with a length, a width and a height")
+        raise InputError(where, problem, "Use a mesh with a length, a width and a height.")
 
     unit = np.clip((triangles - low) / (high - low), 0.0, 1.0) - 0.5
     unit = unit[np.lexsort(np.floor(unit.mean(axis=1) * 4).T)]  # neighbours share a part, so that its box is small
@@ -297,12 +298,12 @@ def _prism(outline: FloatArray, right: FloatArray | float, left: FloatArray | fl
     n = len(outline)
     near = np.column_stack([outline[:, 0], np.broadcast_to(right, n), outline[:, 1]])
     far = np.column_stack([outline[:, 0], np.broadcast_to(left, n), outline[:, 1]])
-    following = np.roll(np.arange(n), -1)
-    faces = [(near[0], near[i], near[i + 1]) for i in range(1, n - 1)]
-    faces += [(far[0], far[i + 1], far[i]) for i in range(1, n - 1)]
-    faces += [(near[i], far[i], far[following[i]]) for i in range(n)]
-    faces += [(near[i], far[following[i]], near[following[i]]) for i in range(n)]
-    return np.array(faces)
+    next_near, next_far = np.roll(near, -1, axis=0), np.roll(far, -1, axis=0)
+    near_cap = np.stack([np.broadcast_to(near[0], (n - 2, 3)), near[1:-1], near[2:]], axis=1)
+    far_cap = np.stack([np.broadcast_to(far[0], (n - 2, 3)), far[2:], far[1:-1]], axis=1)
+    first_half = np.stack([near, far, next_far], axis=1)
+    second_half = np.stack([near, next_far, next_near], axis=1)
+    return np.concatenate([near_cap, far_cap, first_half, second_half])
 
 
 def sweep_rng(seed: int, site: str, frame: int) -> np.random.Generator:
@@ -324,7 +325,7 @@ def check_no_measured_scan(site: Site) -> None:
     """Raise an InputError for a site with a measured scan, which does not contain the beams without a return."""
     if site.points is not None:
         problem = f"its empty scan was measured ({site.points}), and does not contain the beams without a return"
-        raise InputError(f"site {site.name}", problem, "Use a site without points, so that its empty scan is simulated")
+        raise InputError(f"site {site.name}", problem, "Use a site without points; its empty scan is simulated.")
 
 
 @dataclass(frozen=True)

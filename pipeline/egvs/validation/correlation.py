@@ -345,7 +345,7 @@ class Correlation:
             warnings.append(Diagnostic("correlation", location, problem, ""))
         if self.why:
             missing = "no interval" if math.isfinite(self.value) else "no correlation"
-            hint = "Use more sites, or sites that differ more"
+            hint = "Use more sites, or sites that differ more."
             warnings.append(Diagnostic("correlation", location, f"{missing}: {self.why}", hint))
         return warnings
 
@@ -394,10 +394,9 @@ class CorrelationStudy:
 
         values = []
         for score in scores:
-            sample = [
-                _sample_coefficient(junction, mask, score, measure, kind)
-                for junction, mask in zip(self.junctions, masks, strict=True)
-            ]
+            sample = []
+            for junction, mask in zip(self.junctions, masks, strict=True):
+                sample.append(_sample_coefficient(junction, mask, score, measure, kind))
             values.append(self._pooled(sample, masks)[0])
         value = float(values[0] - values[1] if len(values) == 2 else values[0])
         for junction, mask in zip(self.junctions, masks, strict=True):
@@ -408,10 +407,9 @@ class CorrelationStudy:
 
         resampled = []
         for score in scores:
-            coefficients = [
-                self._resampled_coefficient(junction, mask, score, measure, kind)
-                for junction, mask in zip(self.junctions, masks, strict=True)
-            ]
+            coefficients = []
+            for junction, mask in zip(self.junctions, masks, strict=True):
+                coefficients.append(self._resampled_coefficient(junction, mask, score, measure, kind))
             resampled.append(self._pooled(coefficients, masks))
         if len(scores) == 1:
             interval = ConfidenceInterval.from_resamples(value, resampled[0])

@@ -403,7 +403,7 @@ def write_dataset(
         frames of traffic, or a scenario that a stage refuses.
     """
     if kind not in LAYOUTS:
-        raise InputError("--format", f"unknown format {kind!r}", f"Use one of {', '.join(LAYOUTS)}")
+        raise InputError("--format", f"unknown format {kind!r}", f"Use one of {', '.join(LAYOUTS)}.")
     _check_empty(folder)
     selected = _selected_sites(candidate_sites(scenario), sites)
     with _partial_folder(folder) as partial:
@@ -461,7 +461,7 @@ def _selected_sites(candidates: Sequence[Site], names: Sequence[str]) -> list[Si
     for site in selected:
         cloud_simulation.check_no_measured_scan(site)
         if site.name.startswith(".") or site.name.casefold() == README_FILE.casefold():
-            raise InputError(f"site {site.name}", "its name cannot be the name of a folder here", "Rename the site")
+            raise InputError(f"site {site.name}", "its name is reserved in the exported folder", "Rename the site.")
     return selected
 
 
@@ -469,8 +469,8 @@ def _site_hint(name: str, known: Sequence[str]) -> str:
     similar = difflib.get_close_matches(name, known, 1, 0.4)
     if similar:
         return f"Did you mean {similar[0]}?"
-    hint = f"Use one of {', '.join(known[:20])}"
-    return f"{hint} and {len(known) - 20} more" if len(known) > 20 else hint
+    others = f" and {len(known) - 20} more" if len(known) > 20 else ""
+    return f"Use one of {', '.join(known[:20])}{others}."
 
 
 def _check_feasible(scene: Scene, sites: Sequence[Site]) -> None:
@@ -479,12 +479,12 @@ def _check_feasible(scene: Scene, sites: Sequence[Site]) -> None:
     for site in sites:
         if site.name in reasons:
             problem = f"the site {site.name!r} is dropped, because it is {reasons[site.name]}"
-            raise InputError("--site", problem, "Use a site that is scanned")
+            raise InputError("--site", problem, "Use a site that is scanned.")
 
 
 def _check_empty(folder: Path) -> None:
     """Raise an InputError for a folder that is not empty."""
-    hint = "Use a new or empty folder"
+    hint = "Use a new or empty folder."
     if folder.exists() and not folder.is_dir():
         raise InputError(f"--out {folder}", "expected a folder, got a file", hint)
     if folder.is_dir() and any(folder.iterdir()):
@@ -502,7 +502,7 @@ def _partial_folder(folder: Path) -> Iterator[Path]:
         locks.create_lock(lock)
     except OSError as error:
         problem = f"the folder cannot be written ({error.strerror})"
-        raise InputError(f"--out {folder}", problem, "Use a folder that you may write to") from None
+        raise InputError(f"--out {folder}", problem, "Use a folder that you may write to.") from None
     with locks.locked(lock, wait=False, remove=True) as is_locked:
         if not is_locked:
             raise RunError(f"{folder}: another export is writing to this folder")
@@ -532,4 +532,4 @@ def _check_disk_space(
     free = shutil.disk_usage(partial).free
     if need > free:
         problem = f"the points need about {need / 1e9:,.1f} GB, but {free / 1e9:,.1f} GB are free"
-        raise InputError(f"--out {folder}", problem, "Use fewer --frames, fewer sites (--site), or another disk")
+        raise InputError(f"--out {folder}", problem, "Use fewer --frames, fewer sites (--site), or another disk.")

@@ -20,6 +20,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -218,7 +219,7 @@ class LevelFrame:
 
 def box_corners(boxes: FloatArray) -> FloatArray:
     """Return the eight corners of each upright box (n, 7), (n, 8, 3)."""
-    signs = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    signs = np.array(list(product((-0.5, 0.5), repeat=3)))
     local = boxes[:, None, 3:6] * signs
     cos = np.cos(boxes[:, 6:7])
     sin = np.sin(boxes[:, 6:7])

@@ -152,7 +152,7 @@ def frame_blocks(frames: int, blocks: int = BLOCKS) -> IntArray:
     """
     if frames < blocks:
         problem = f"expected at least {blocks} frames, got {frames}"
-        raise InputError("--frames", problem, f"Standard errors are computed from {blocks} blocks of frames")
+        raise InputError("--frames", problem, f"Standard errors are computed from {blocks} blocks of frames.")
     return np.arange(frames, dtype=np.int64) * blocks // frames
 
 
@@ -198,8 +198,8 @@ class GroundTruth:
     def from_frame(cls, frame: TrafficFrame, points: IntArray, roi: Roi) -> GroundTruth:
         """Return the vehicles in the region of interest; ``points`` is the number of points on each of them."""
         rows = frame.target_rows(roi)
-        is_car = np.array([frame.kinds[row] in CAR_VCLASSES for row in rows], dtype=np.bool_)
-        return cls(frame.boxes[rows], is_car, points)
+        is_car = np.isin(frame.kinds, list(CAR_VCLASSES))
+        return cls(frame.boxes[rows], is_car[rows], points)
 
 
 @dataclass(frozen=True)
@@ -326,7 +326,7 @@ def _check_detections(frame: IntArray, boxes: FloatArray, scores: FloatArray) ->
         name = (*BOX_COLUMNS, "score")[column]
         expected = "a length of at least 0" if 3 <= column < 6 else "a finite number"
         problem = f"{name}: expected {expected}, got {values[row, column]:g}"
-        raise InputError(where, problem, "Correct the output of the detector")
+        raise InputError(where, problem, "Correct the output of the detector.")
 
 
 @dataclass(frozen=True)
@@ -403,7 +403,7 @@ class Evaluation:
                 problem = f"all {subset.label} are in one of {len(counts)} blocks of frames: no standard error"
             else:
                 continue
-            warnings.append(Diagnostic("average precision", location, problem, "Use more frames"))
+            warnings.append(Diagnostic("average precision", location, problem, "Use more frames."))
         return warnings
 
 
@@ -580,10 +580,9 @@ def measure_detection(
     for site, by_detector in results.items():
         points = by_detector[POINT_COUNTS_NAME]
         assert isinstance(points, PointCounts)
-        objects = [
-            GroundTruth.from_frame(frame, on_vehicles, roi)
-            for frame, on_vehicles in zip(frames, points.points, strict=True)
-        ]
+        objects = []
+        for frame, on_vehicles in zip(frames, points.points, strict=True):
+            objects.append(GroundTruth.from_frame(frame, on_vehicles, roi))
         without_boxes = EvaluationFrames.from_frames(objects, [Detections.empty()] * len(objects))
         point_measures = {subset.name: _point_measures(without_boxes, subset) for subset in SUBSETS}
         for name, result in by_detector.items():
@@ -625,12 +624,9 @@ def write_detection(path: Path, rows: Sequence[SiteDetection], metadata: Mapping
 
 def detection_columns(rows: Sequence[SiteDetection]) -> dict[str, list[Any]]:
     """Return all columns of the artefact by name, except that of the site."""
-    columns: dict[str, list[Any]] = {
-        "detector": [row.detector for row in rows],
-        "objects_of": [row.objects_of for row in rows],
-        "frames": [row.frames for row in rows],
-        "objects": [row.objects for row in rows],
-    }
+    columns: dict[str, list[Any]] = {}
+    for name in ("detector", "objects_of", "frames", "objects"):
+        columns[name] = [getattr(row, name) for row in rows]
     for minimum in _COUNTED_POINTS:
         columns[f"objects_{minimum}"] = [row.objects_with[minimum] for row in rows]
     for name in MEASURES:

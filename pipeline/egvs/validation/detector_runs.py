@@ -141,12 +141,12 @@ class DetectionTaskBase(Generic[DetectorT]):
         detections: dict[str, list[Detections]] = {name: [] for name in detectors}
 
         for frame in self.record.read():
-            labelled = [
-                simulator.sweep(frame, sweep_rng(seed, simulator.view.site, frame.number)) for simulator in simulators
-            ]
-            points_on_box = np.array([sweep.points_on(len(frame.boxes)) for sweep in labelled])
-            points.append(points_on_box[:, frame.target_rows(roi)].sum(axis=0))
-            frame_sweeps = [sweep.sweep for sweep in labelled]
+            frame_sweeps, points_on_box = [], []
+            for simulator in simulators:
+                labelled = simulator.sweep(frame, sweep_rng(seed, simulator.view.site, frame.number))
+                frame_sweeps.append(labelled.sweep)
+                points_on_box.append(labelled.points_on(len(frame.boxes)))
+            points.append(np.array(points_on_box)[:, frame.target_rows(roi)].sum(axis=0))
             for name, detect in detectors.items():
                 detections[name].append(sweeps.detections_in_roi(detect(frame_sweeps), roi))
 
@@ -238,8 +238,11 @@ def run_detectors(
         If a worker process was killed.
     """
     listener = listener or DetectionListener()
-    results = {site.name: _read_cached_results(task, site) for site in sites}
-    missing = {site.name: [name for name in task.names if name not in results[site.name]] for site in sites}
+    results: dict[str, dict[str, DetectorResult]] = {}
+    missing: dict[str, list[str]] = {}
+    for site in sites:
+        results[site.name] = _read_cached_results(task, site)
+        missing[site.name] = [name for name in task.names if name not in results[site.name]]
     work = [_SiteWork(site, missing[site.name]) for site in sites if missing[site.name]]
     processes = min(thread_count(jobs), len(work))
     done = len(sites) - len(work)

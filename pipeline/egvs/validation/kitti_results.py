@@ -49,7 +49,7 @@ PARTIAL_FOLDER = f".{KITTI_FOLDER}.partial"
 """Where the folder is written before it is renamed."""
 
 _EXPORTED_FOLDERS = frozenset(name for layout in LAYOUTS.values() for name in layout.folders)
-_LAYOUT_HINT = "Use folders SITE/DETECTOR/000000.txt, with one file per frame"
+_LAYOUT_HINT = "Use folders SITE/DETECTOR/000000.txt, with one file per frame."
 
 DetectorResults = dict[str, dict[str, tuple[Detections, ...]]]
 """Detections of each frame, by detector and site."""
@@ -102,14 +102,14 @@ def read_kitti_results(folder: Path, poses: Mapping[str, Pose], numbers: IntArra
         raise InputError(folder, "no such folder", _LAYOUT_HINT)
     for path in sorted(folder.iterdir()):
         if path.is_dir() and not path.name.startswith(".") and path.name not in poses:
-            raise InputError(path, "the folder is not named after a validated site", f"Use {', '.join(poses)}")
+            raise InputError(path, "the folder is not named after a validated site", f"Use {', '.join(poses)}.")
     folders = {site: _detector_folders(folder, site) for site in poses}
     detectors = sorted(set[str]().union(*folders.values()))
     for site, site_folders in folders.items():
         for name in detectors:
             if name not in site_folders:
                 raise InputError(
-                    folder / site, f"no results of {name}", "Add the results of each detector at each site"
+                    folder / site, f"no results of {name}", "Add the results of each detector at each site."
                 )
 
     results: DetectorResults = {name: {} for name in detectors}
@@ -150,12 +150,12 @@ def _read_site(folder: Path, level: LevelFrame, numbers: IntArray) -> tuple[Dete
     missing = [name for name in expected if name not in actual]
     if missing:
         others = f", and {len(missing) - 1} others are missing" if len(missing) > 1 else ""
-        hint = f"Add one file for each of the {len(expected)} frames, empty where nothing was detected"
+        hint = f"Add one file for each of the {len(expected)} frames, empty where nothing was detected."
         raise InputError(folder / missing[0], f"no such file{others}", hint)
     unknown = sorted(actual.difference(expected))
     if unknown:
         problem = f"expected results of {len(expected)} frames from {expected[0]} to {expected[-1]}"
-        raise InputError(folder / unknown[0], problem, "Use the same --frames as for the export of the clouds")
+        raise InputError(folder / unknown[0], problem, "Use the same --frames as for the export of the clouds.")
     return tuple(_read_frame(folder / name, level) for name in expected)
 
 
@@ -164,9 +164,9 @@ def _read_frame(path: Path, level: LevelFrame) -> Detections:
     labels = kitti.read_labels(path)
     for line, name, score in zip(labels.lines.tolist(), labels.names, labels.scores.tolist(), strict=True):
         if name not in CLASSES:
-            raise InputError(f"{path}: line {line}", f"unknown class {name!r}", f"Use one of {', '.join(CLASSES)}")
+            raise InputError(f"{path}: line {line}", f"unknown class {name!r}", f"Use one of {', '.join(CLASSES)}.")
         if np.isnan(score):
-            raise InputError(f"{path}: line {line}", "no score", "Write 16 values, the last of which is the score")
+            raise InputError(f"{path}: line {line}", "no score", "Write 16 values, the last of which is the score.")
     is_vehicle = np.array([name not in IGNORED_CLASSES for name in labels.names], dtype=np.bool_)
     return Detections(level.world_boxes(labels.boxes[is_vehicle]), labels.scores[is_vehicle])
 

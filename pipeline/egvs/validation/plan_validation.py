@@ -273,7 +273,7 @@ def _check_plan_scenario(path: Path, plan_scenario: object, scenario: Scenario) 
         raise InputError(
             path,
             f"expected a plan for {scenario.name}, got a plan for {name!r}",
-            "Name the folder of another run with --plan-from.",
+            "Give the folder of another run with --plan-from.",
         )
 
 
@@ -290,7 +290,7 @@ def _other_world_warnings(plan: FusedPlan, record: HeldOutTraffic) -> list[Diagn
     """Return a warning if the plan was computed in another static world than the present one."""
     if plan.statics == record.keys["statics"]:
         return []
-    problem = "the plan was computed in another static world than this validation"
+    problem = "the plan was computed with a different static world"
     return [Diagnostic("plan", plan.path.name, problem, "Run egvs place again.")]
 
 

@@ -197,15 +197,17 @@ def _draw_scatter(axes: Any, egvs: ScoreName, validation: Validation, detector: 
     """Draw EGVS against the detector's main measure."""
     measure = main_measure(detector)
     scores = validation.values_of(egvs)
-    rows = []
+    x, y, half_width, site_names = [], [], [], []
     for row in validation.detections:
-        is_shown = row.detector == detector and row.objects_of == ALL_OBJECTS
-        if is_shown and math.isfinite(row.measures[measure].value):
-            rows.append(row)
+        if row.detector != detector or row.objects_of != ALL_OBJECTS:
+            continue
+        estimate = row.measures[measure]
+        if math.isfinite(estimate.value):
+            x.append(scores[row.site] / 1e3)
+            y.append(_PERCENT * estimate.value)
+            half_width.append(_SIGMAS_95 * _PERCENT * estimate.se)
+            site_names.append(row.site)
 
-    x = [scores[row.site] / 1e3 for row in rows]
-    y = [_PERCENT * row.measures[measure].value for row in rows]
-    half_width = [_SIGMAS_95 * _PERCENT * row.measures[measure].se for row in rows]
     axes.errorbar(x, y, yerr=np.nan_to_num(half_width), fmt="none", ecolor="0.7", elinewidth=1.0, zorder=1)
     axes.scatter(x, y, s=34, facecolors=_DOT_COLOUR, edgecolors="black", linewidths=0.6, zorder=3)
     axes.set(xlabel="EGVS, thousand bits", ylabel=_MEASURE_LABELS[measure])
@@ -214,7 +216,7 @@ def _draw_scatter(axes: Any, egvs: ScoreName, validation: Validation, detector: 
     axes.grid(True, color="0.88", linewidth=0.7)
     axes.tick_params(labelsize=8)
     axes.margins(0.12)
-    return _Scatter(x, y, [row.site for row in rows])
+    return _Scatter(x, y, site_names)
 
 
 def _format_correlation(agreement: ScoreAgreement) -> str:
@@ -230,11 +232,10 @@ def _format_correlation(agreement: ScoreAgreement) -> str:
 def _draw_ranking(axes: Any, egvs: ScoreName, validation: Validation, detector: str, *, with_names: bool) -> None:
     """Draw Spearman's rho of every score, in the order of the scores."""
     measure = main_measure(detector)
-    agreements = [
-        agreement
-        for agreement in validation.agreements
-        if (agreement.detector, agreement.measure) == (detector, measure)
-    ]
+    agreements = []
+    for agreement in validation.agreements:
+        if agreement.detector == detector and agreement.measure == measure:
+            agreements.append(agreement)
     for line, agreement in enumerate(agreements):
         spearman = agreement.by_kind["spearman"]
         interval = spearman.interval

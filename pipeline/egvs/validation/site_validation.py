@@ -9,6 +9,7 @@ the run. Their bytes depend on the scenario and the program only.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +19,7 @@ import numpy as np
 
 from egvs.artefacts import checksums, parquet
 from egvs.artefacts.run_folder import RunFolder
-from egvs.core import files
+from egvs.core import files, plugins
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.progress import ProgressCallback, no_progress
@@ -79,6 +80,7 @@ def validate_sites(
         If the check finds an error, a detector is unknown, the traffic has too few frames or no vehicle in the region
         of interest, or the KITTI results do not belong to these sites and frames.
     """
+    plugins.require_libraries("egvs validate", "validate", "matplotlib")
     chosen = {name: base.make_detector(name) for name in dict.fromkeys(detectors) if name != POINT_COUNTS_NAME}
     _check_no_input_overwritten(scenario, out, kitti)
 
@@ -224,9 +226,9 @@ def _site_metadata(
     metadata["stages"] = _stage_keys(scenario, run.folder / "scores")
     metadata["own_score"] = {"score": egvs.score, "parameters": egvs.parameters}
     if external:
-        metadata["given"] = {
-            site: {name: boxes.digest for name, boxes in by_detector.items()} for site, by_detector in external.items()
-        }
+        metadata["given"] = {}
+    for site, by_detector in external.items():
+        metadata["given"][site] = {name: boxes.digest for name, boxes in by_detector.items()}
     return metadata
 
 
@@ -238,17 +240,16 @@ def _stage_keys(scenario: Scenario, folder: Path) -> dict[str, str]:
 
 
 def _write_correlation(path: Path, validation: Validation, metadata: dict[str, Any]) -> None:
-    agreements = validation.agreements
-    columns: dict[str, list[Any]] = {
-        "score": [agreement.score.score for agreement in agreements],
-        "parameters": [agreement.score.parameters for agreement in agreements],
-        "detector": [agreement.detector for agreement in agreements],
-        "measure": [agreement.measure for agreement in agreements],
-        "n": [agreement.by_kind[COEFFICIENT_KINDS[0]].sites for agreement in agreements],
-    }
-    for kind in COEFFICIENT_KINDS:
-        correlations = [agreement.by_kind[kind] for agreement in agreements]
-        columns[kind] = [correlation.value for correlation in correlations]
-        columns[f"{kind}_low"] = [correlation.interval.low for correlation in correlations]
-        columns[f"{kind}_high"] = [correlation.interval.high for correlation in correlations]
+    columns: dict[str, list[Any]] = defaultdict(list)
+    for agreement in validation.agreements:
+        columns["score"].append(agreement.score.score)
+        columns["parameters"].append(agreement.score.parameters)
+        columns["detector"].append(agreement.detector)
+        columns["measure"].append(agreement.measure)
+        columns["n"].append(agreement.by_kind[COEFFICIENT_KINDS[0]].sites)
+        for kind in COEFFICIENT_KINDS:
+            correlation = agreement.by_kind[kind]
+            columns[kind].append(correlation.value)
+            columns[f"{kind}_low"].append(correlation.interval.low)
+            columns[f"{kind}_high"].append(correlation.interval.high)
     parquet.write_artefact(path, "correlation", columns, metadata)

@@ -89,9 +89,9 @@ def read_geojson(path: Path, world: Georeference) -> FootprintFile:
         When features are no geometries, have no height, or are invalid polygons; all are named.
     """
     file = FootprintFile()
-    document = read_json(path, "Give a GeoJSON FeatureCollection")
+    document = read_json(path, "Use a GeoJSON FeatureCollection.")
     if not isinstance(document, dict) or not isinstance(document.get("features"), list):
-        raise InputError(path, "expected a GeoJSON FeatureCollection, got no list of features")
+        raise InputError(path, "expected a GeoJSON FeatureCollection, got no features list")
     features = document["features"]
     reading = world.read_coordinates(geojson_coordinates(features), str(path), declared_crs(document, str(path)))
     if reading.convert is not None:
@@ -135,7 +135,9 @@ def _report_errors(errors: list[InputError], path: Path) -> Iterator[Diagnostic]
         yield Diagnostic.of("statics", error)
     more = len(errors) - _MAX_REPORTED
     if more > 0:
-        yield Diagnostic("statics", str(path), f"{more} more features are wrong", "Correct those above", is_error=True)
+        yield Diagnostic(
+            "statics", str(path), f"{more} more invalid features", "Correct those above first.", is_error=True
+        )
 
 
 def _property(properties: dict[str, Any], key: str, default: Any) -> Any:
@@ -147,7 +149,7 @@ def _property(properties: dict[str, Any], key: str, default: Any) -> Any:
 def _metres(properties: dict[str, Any], key: str, where: str, default: float | None = None) -> float:
     value = _property(properties, key, default)
     if value is None:
-        raise InputError(where, f"{key} is missing", "Give a number of metres")
+        raise InputError(where, f"{key} is missing", "Give a number of metres.")
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= MAX_COORDINATE_M:
         raise InputError(f"{where}: {key}", f"expected metres, at most {MAX_COORDINATE_M:g}, got {value!r}")
     return float(value)
@@ -195,12 +197,12 @@ def to_polygons(
 
     where = f"{where}: geometry"
     if "Polygon" not in shape.geom_type:
-        problem = f"expected a Polygon, LineString or Point, or their Multi forms, got a {shape.geom_type}"
+        problem = f"expected a Polygon, LineString or Point, or a Multi form of these, got {shape.geom_type}"
         raise InputError(where, problem)
     valid = _repair(shape, where, repaired, reading.convert is not None, keep_crossing_parts)
     polygons = _polygons_of(valid)
     if not polygons:
-        raise InputError(where, "encloses no area", "Give three corners that are not in line")
+        raise InputError(where, "encloses no area", "Use at least three corners that are not collinear.")
     return polygons
 
 
@@ -223,7 +225,7 @@ def _parse_shape(geometry: Any, where: str) -> BaseGeometry:
     if farthest_m > MAX_COORDINATE_M:
         raise InputError(where, f"expected coordinates within {MAX_COORDINATE_M:g} m, got {farthest_m:g} m")
     if shapely.has_z(shape) and np.any(shapely.get_coordinates(shape, include_z=True)[:, 2] != 0):
-        raise InputError(where, "has z coordinates", "Set the properties base_m and height_m instead")
+        raise InputError(where, "has z coordinates", "Set the properties base_m and height_m instead.")
     return shape
 
 
@@ -268,7 +270,7 @@ def _repair(
             repair = "rings that rounded degrees made cross"
         elif not keep_crossing_parts:
             raise InputError(
-                where, f"is not a valid polygon ({reason})", "Give rings that do not cross, and holes inside"
+                where, f"is not a valid polygon ({reason})", "Use rings that do not cross, with holes inside."
             )
         shape = shapely.make_valid(shape)
         repaired[repair] += 1

@@ -142,11 +142,11 @@ def _check_declared_scale(frame: WorldFrame, scenario: Scenario) -> None:
         return
     lon_deg, lat_deg = frame.to_degrees(np.array([[x, y]]))[0]
     if not np.isfinite(lon_deg + lat_deg):
-        problem = f"the centre of roi, ({x:g}, {y:g}) minus offset_m, is outside of epsg = {scenario.crs.epsg}"
-        raise InputError(where, problem, "Set offset_m to the network's netOffset, and roi.center_m in this system")
+        problem = f"the centre of roi, ({x:g}, {y:g}) minus offset_m, is outside the area of epsg = {scenario.crs.epsg}"
+        raise InputError(where, problem, "Set offset_m to the network's netOffset, and roi.center_m in this system.")
     position = f"longitude {lon_deg:.5f}, latitude {lat_deg:.5f}"
     problem = f"epsg = {scenario.crs.epsg} scales lengths by {scale:.3g} at the region of interest ({position})"
-    hint = f"Use a system without distortion there, e.g. epsg = {utm_epsg(lon_deg, lat_deg)}, with its offset_m"
+    hint = f"Use a system with little distortion there, e.g. epsg = {utm_epsg(lon_deg, lat_deg)}, with its offset_m."
     raise InputError(where, problem, hint)
 
 
@@ -156,7 +156,7 @@ def _check_network_scale(frame: WorldFrame, scenario: Scenario) -> None:
     scale = frame.scale_factor((x, y))
     if abs(scale - 1.0) > MAX_SCALE_ERROR:
         problem = f"its <location> ({frame.projection}) scales lengths by {scale:.3g} at the region of interest"
-        hint = "Use a projection without distortion there: netconvert has UTM for maps (--proj.utm)"
+        hint = "Use a projection with little distortion there, such as UTM (netconvert --proj.utm)."
         raise InputError(f"{scenario.file}: the network", problem, hint)
 
 
@@ -173,4 +173,4 @@ def _check_agreement(declared: WorldFrame, from_network: WorldFrame, scenario: S
         f" (longitude {lon_deg:.5f}, latitude {lat_deg:.5f})"
     )
     location = f"netOffset {list(from_network.offset_m)}, projParameter {from_network.projection!r}"
-    raise InputError(f"{scenario.file}: crs", problem, f"Remove [crs], or make it agree: {location}")
+    raise InputError(f"{scenario.file}: crs", problem, f"Remove [crs], or make it agree: {location}.")

@@ -24,7 +24,7 @@ from egvs.core.errors import InputError
 
 _VERTEX = np.dtype([("xyz", "<f8", 3)])
 _FACE = np.dtype([("n", "u1"), ("corners", "<i4", 3), ("solid", "<i4")])
-_RUN_STATICS = "Run the statics stage again"
+_RUN_STATICS = "Run the statics stage again."
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ def write_ply(path: Path, world: World, metadata: dict[str, Any]) -> None:
 def read_ply(path: Path) -> tuple[World, dict[str, Any]]:
     """Read a world and its metadata from a file that :func:`write_ply` wrote; InputError for any other file."""
     if not path.is_file():
-        raise InputError(path, "no such file", f"Run the stage that writes {path.name} first")
+        raise InputError(path, "no such file", f"Run the stage that writes {path.name} first.")
     head, end, body = path.read_bytes().partition(b"end_header\n")
     try:
         header = _parse_header(head.decode("ascii"))
@@ -136,7 +136,7 @@ def read_ply(path: Path) -> tuple[World, dict[str, Any]]:
         if not end or header.vertices < 0 or len(body) != size + header.faces * _FACE.itemsize:
             raise ValueError
     except (ValueError, LookupError, TypeError, RecursionError):
-        raise InputError(path, "expected a complete statics.ply, got another file or a part", _RUN_STATICS) from None
+        raise InputError(path, "expected a complete statics.ply, got another or a partial file", _RUN_STATICS) from None
     vertices = np.frombuffer(body, dtype=_VERTEX, count=header.vertices)
     faces = np.frombuffer(body, dtype=_FACE, offset=size)
     wrong = np.flatnonzero(faces["n"] != 3)

@@ -106,7 +106,7 @@ class _Shape:
         """Return the points of a polygon or line; InputError for fewer than two."""
         points = _parse_points(self.element.get("shape", ""), self.where)
         if len(points) < 2:
-            expected = "expected three points for an area, two for a line"
+            expected = "expected at least three points for an area, two for a line"
             raise InputError(f"{self.where}: shape", f"{expected}, got {self.element.get('shape')!r}")
         return points
 
@@ -242,29 +242,29 @@ class _PolygonReader:
         """Cut out courtyards; return the footprints with warnings."""
         self._cut_courtyards()
         if self._unknown_types:
-            problem = f"unknown types of polygons were left out: {_list_types(self._unknown_types)}"
-            hint = 'Set each in [statics.polygon_types] to "solid", "ignore" or a height in metres'
+            problem = f"polygons of unknown types were left out: {_list_types(self._unknown_types)}"
+            hint = 'Set each in [statics.polygon_types] to "solid", "ignore" or a height in metres.'
             self._warn("polygon types", problem, hint)
         if self._open_types:
             problem = f"open outlines of solid types were left out: {_list_types(self._open_types)}"
-            hint = "Close them. Those that polyconvert divides into several are joined by --osm.merge-relations 1"
+            hint = "Close them. polyconvert --osm.merge-relations 1 joins outlines that are split into several ways."
             self._warn("open outlines", problem, hint)
         if self._crossing_names:
             shown = ", ".join(self._crossing_names[:_MAX_LISTED])
             if len(self._crossing_names) > _MAX_LISTED:
                 shown += ", ..."
             count = len(self._crossing_names)
-            problem = f"outlines that cross themselves: {count} ({shown}). All parts that they enclose were kept"
-            self._warn("crossing outlines", problem, "Check them on the map, and correct them there")
+            problem = f"outlines that cross themselves: {count} ({shown}). All areas that they enclose are kept"
+            self._warn("crossing outlines", problem, "Check and correct them in the map.")
         if self._polygon_count and not self._file.footprints:
             problem = f"none of the {self._polygon_count} polygons is solid"
-            hint = "Name solid types in [statics.polygon_types], or remove the file from statics.polygons"
+            hint = "List solid types in [statics.polygon_types], or remove the file from statics.polygons."
             self._warn("polygon types", problem, hint)
         inside = _count_inside(self._file.footprints)
         if inside:
             problem = f"solids inside another of the same kind and height: {inside}. They may be filled courtyards"
             self._warn(
-                "filled courtyards", problem, "If so, use polyconvert --osm.merge-relations 1, which cuts them out"
+                "filled courtyards", problem, "If so, use polyconvert --osm.merge-relations 1, which cuts them out."
             )
         return self._file
 

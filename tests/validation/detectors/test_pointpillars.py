@@ -106,7 +106,7 @@ def test_windows_cover_region_and_overlap(size_m):
 def test_rejects_file_that_is_not_a_model(tmp_path):
     path = tmp_path / "m.onnx"
     path.write_bytes(b"no model")
-    with pytest.raises(InputError, match=r"m\.onnx: not an ONNX model .*\. Use a model that egvs train wrote"):
+    with pytest.raises(InputError, match=r"m\.onnx: not an ONNX model .*\. Use a model written by egvs train"):
         pointpillars.OnnxModel.load(path)
     with pytest.raises(InputError, match="No such file"):
         pointpillars.OnnxModel.load(tmp_path / "absent.onnx")

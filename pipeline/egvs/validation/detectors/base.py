@@ -129,7 +129,7 @@ def make_detector(name: str, where: str = "--detector") -> Detector:
         If it cannot be imported, or is not a detector.
     """
     if name not in detector_names():
-        raise InputError(where, f"unknown detector {name!r}", f"Use one of {', '.join(['points', *detector_names()])}")
+        raise InputError(where, f"unknown detector {name!r}", f"Use one of {', '.join(['points', *detector_names()])}.")
     if name in _REQUIRED_LIBRARIES:
         plugins.require_libraries(f"the detector {name}", "validate", _REQUIRED_LIBRARIES[name])
     detector_class = plugins.load_plugin(DETECTORS_GROUP, name)

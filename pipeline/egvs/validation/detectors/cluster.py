@@ -577,9 +577,9 @@ class ClusterAtSites:
         points_on = np.zeros((len(self.views), len(clusters)), dtype=np.int64)
         np.add.at(points_on, (clusters.sensor, clusters.cluster_of_point), 1)
         best_sensor = points_on.argmax(axis=0)
-        by_sensor = [
-            self._boxes_from_sensor(k, clusters, best_sensor == k, points_m) for k in np.unique(best_sensor).tolist()
-        ]
+        by_sensor = []
+        for sensor in np.unique(best_sensor).tolist():
+            by_sensor.append(self._boxes_from_sensor(sensor, clusters, best_sensor == sensor, points_m))
         boxes, cost, points = (np.concatenate(arrays) for arrays in zip(*by_sensor, strict=True))
         return suppress_overlaps(Detections(boxes, box_scores(points, cost)), points)
 

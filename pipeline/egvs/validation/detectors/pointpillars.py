@@ -77,7 +77,7 @@ _MIN_SCORE = 0.05
 _MAX_BOXES = 100
 _INPUTS = {"features": [POINTS_PER_PILLAR, N_FEATURES], "present": [POINTS_PER_PILLAR], "cell": []}
 _ONNX_ERRORS = ("Fail", "InvalidArgument", "InvalidGraph", "InvalidProtobuf", "NotImplemented", "RuntimeException")
-_MODEL_HINT = "Use a model that egvs train wrote"
+_MODEL_HINT = "Use a model written by egvs train."
 _WINDOW_OVERLAP_M = 20.0  # so that each vehicle is complete in at least one window
 
 
@@ -318,7 +318,7 @@ def _start_session(path: Path) -> InferenceSession:
         import onnxruntime
         from onnxruntime.capi import onnxruntime_pybind11_state as onnx_errors
     except ImportError:
-        raise MissingBackendError("PointPillars needs onnxruntime: pip install 'egvs[validate]'") from None
+        raise MissingBackendError("PointPillars needs onnxruntime. Run pip install 'egvs[validate]'") from None
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1

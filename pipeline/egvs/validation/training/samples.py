@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS, TrafficFrame
+from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.sensors import site_feasibility
@@ -108,7 +108,7 @@ class TrainingJunction:
             if self._is_free(pose, sensor):
                 return pose
         problem = "there is no free position for a pole around the region"
-        raise InputError(f"{scene.scenario.file}: roi", problem, "Use a region with space beside its roads")
+        raise InputError(f"{scene.scenario.file}: roi", problem, "Use a region with space beside its roads.")
 
     def _is_free(self, pose: Pose, sensor: Sensor) -> bool:
         scene = self.record.scene
@@ -193,7 +193,7 @@ class Samples:
         rng = self._rng(1, number)
         frame = junction.frames[int(rng.integers(len(junction.frames)))]
         cloud = simulator.sweep(frame, rng)
-        is_vehicle = np.array([kind not in NON_VEHICLE_KINDS for kind in frame.kinds], dtype=np.bool_)
+        is_vehicle = frame.are_vehicles()
         points_on_box = cloud.points_on(len(frame.boxes))
         window = self._draw_window(junction, frame.boxes[is_vehicle & (points_on_box >= _MIN_POINTS)], rng)
         points = PillarPoints.from_sweeps([cloud.sweep], [simulator.view], origin)

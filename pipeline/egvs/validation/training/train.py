@@ -163,7 +163,7 @@ def train(
     names = [scenario.name for scenario in scenarios]
     for name in sorted(set(names)):
         if names.count(name) > 1:
-            raise InputError("SCENARIO", f"two junctions have the name {name!r}", "Use junctions with different names")
+            raise InputError("SCENARIO", f"two junctions have the name {name!r}", "Use junctions with different names.")
     with files.temporary_folder() as folder:
 
         def record_junction(scenario: Scenario, stream: int, frames: int) -> TrainingJunction:
@@ -194,7 +194,7 @@ def _record_traffic(
     record = prepare_held_out_traffic(reseeded, record_folder, frames, jobs=jobs, progress=progress)
     if not any(len(frame.target_rows(record.scene.roi)) for frame in record.read()):
         problem = f"no vehicle in any of {frames} frames"
-        raise InputError(f"{scenario.file}: roi", problem, "Use a junction with traffic in its region")
+        raise InputError(f"{scenario.file}: roi", problem, "Use a junction with traffic in its region.")
     return record
 
 
@@ -284,14 +284,14 @@ class _TrainingRun:
         """Load the checkpoint if there is one."""
         if not self._checkpoint.is_file():
             return
-        hint = "Remove the file to start the training again"
+        hint = "Remove the file to restart the training."
         try:
             state = torch.load(self._checkpoint, weights_only=True)
             is_same_training = state["about"] == json.dumps(self._metadata)
         except (RuntimeError, OSError, ValueError, KeyError, EOFError) as error:
             raise InputError(self._checkpoint, f"cannot be read ({error})", hint) from None
         if not is_same_training:
-            problem = "the checkpoint belongs to another training or another version of the program"
+            problem = "the checkpoint belongs to another training run or another version of egvs"
             raise InputError(self._checkpoint, problem, hint)
         self._net.load_state_dict(state["net"])
         self._optimizer.load_state_dict(state["optimizer"])
