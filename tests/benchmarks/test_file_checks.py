@@ -16,7 +16,7 @@ def test_checks_work_while_they_are_timed(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(file_checks, "launcher_s", lambda: 2.0)
     (tmp_path / "a.xml").write_text("<additional><include href='b'/></additional>")
     with file_checks.measure_checks() as spent_s:
-        with pytest.raises(InputError, match="a further file"):
+        with pytest.raises(InputError, match="read another file"):
             user_files.copy_checked(tmp_path / "a.xml", tmp_path / "b.xml")
         for _ in range(3):
             with sumo._start_program(["/bin/sh", "-c", "exit 0"], tmp_path, None, None) as process:

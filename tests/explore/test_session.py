@@ -225,7 +225,7 @@ def test_run_folder_is_opened_with_its_settings(mini: Path, tmp_path: Path) -> N
     with pytest.raises(InputError, match="--out: cannot be used with a run folder"):
         open_session(out, out=tmp_path / "other")
     mini.rename(tmp_path / "gone")
-    with pytest.raises(InputError, match=r"the scenario's folder .* does not exist. Name the scenario"):
+    with pytest.raises(InputError, match=r"the scenario's folder .* does not exist. Give the scenario"):
         open_session(out)
 
 

@@ -186,8 +186,8 @@ def put(name, row, value):
         ("tpog", put("count", 0, 2**32 - 1), "of 40 frames"),
         ("tpog", lambda t, a: (t, a | {"schema": 999}), "expected schema version 1, got 999"),
         ("tpog", lambda t, a: (t.drop_columns("count"), a), "the column 'count' is missing"),
-        ("scans", put("dx_m", 5, np.nan), "not finite"),
-        ("scans", put("dz_m", 5, np.inf), "not finite"),
+        ("scans", put("dx_m", 5, np.nan), "non-finite"),
+        ("scans", put("dz_m", 5, np.inf), "non-finite"),
     ],
 )
 def test_rejects_altered_artefacts(mini, tmp_path, artefact, change, message):

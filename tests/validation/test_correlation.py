@@ -154,7 +154,7 @@ def test_constant_score_has_no_correlation_but_warning(thirteen):
     assert math.isnan(correlation.value) and math.isnan(correlation.interval.low)
     (warning,) = correlation.warnings("flat, ap")
     assert str(warning) == (
-        "flat, ap: no correlation: flat is the same at all sites of made up. Use more sites, or sites that differ more"
+        "flat, ap: no correlation: flat is the same at all sites of made up. Use more sites, or sites that differ more."
     )
 
 

@@ -98,7 +98,7 @@ def test_measures_without_objects_are_nan_with_warnings():
     assert all(math.isnan(entry.value) and math.isnan(entry.se) for entry in evaluation.measures.values())
     warnings = [str(warning) for warning in evaluation.warnings("site c03, cluster")]
     assert warnings[0] == (
-        "site c03, cluster: no vehicles in 10 frames, so average precision is undefined. Use more frames"
+        "site c03, cluster: no vehicles in 10 frames, so average precision is undefined. Use more frames."
     )
     assert len(warnings) == 5  # of each subset
     evaluation = one_frame(objects([A]), (A, 0.9))

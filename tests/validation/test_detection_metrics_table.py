@@ -92,7 +92,7 @@ def test_warns_about_site_without_visible_vehicle():
     assert _row(rows, "d", "points_1").objects == 0
     assert math.isnan(_row(rows, "d", "points_1").measures["ap_bev_r40_iou70"].value)
     assert math.isnan(_row(rows, POINT_COUNTS_NAME, "points_1").measures["log_points"].value)
-    first = "no vehicles with 1 points or more in 10 frames, so average precision is undefined. Use more frames"
+    first = "no vehicles with 1 points or more in 10 frames, so average precision is undefined. Use more frames."
     assert str(warnings[0]) == f"detector d, site a: {first}"
     more = {name: {POINT_COUNTS_NAME: _points(0, 0), "d": boxes} for name in "abc"}
     texts = list(map(str, detection_metrics.measure_detection(FRAMES, ROI, more)[1]))

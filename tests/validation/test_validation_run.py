@@ -37,7 +37,7 @@ def test_reports_missing_library_of_detector(
     arguments = ("--frames", "10", "--detector", f"points,{detector}", "--out", tmp_path / "out")
     code, out, error = run_egvs("validate", mini, *arguments)
     hint = "pip install 'egvs[validate]'"
-    assert error == f"egvs: the detector {detector} needs {library_name}, which is not installed: {hint}\n"
+    assert error == f"egvs: the detector {detector} needs {library_name}, which is not installed. Run {hint}\n"
     assert code == 2 and out == "" and not (tmp_path / "out").exists()
 
 
@@ -60,7 +60,7 @@ def test_reports_missing_libraries_of_training(run_egvs, mini, tmp_path, monkeyp
     monkeypatch.setattr(plugins, "find_spec", lambda name: sys.modules.get(name, "there"))
     code, _, error = run_egvs("train", mini, "--out", tmp_path / "new" / "model.onnx")
     hint = "pip install 'egvs[train]'"
-    assert error == f"egvs: training needs PyTorch, onnxscript, which are not installed: {hint}\n"
+    assert error == f"egvs: training needs PyTorch, onnxscript, which are not installed. Run {hint}\n"
     assert code == 2 and not (tmp_path / "new").exists()
 
 

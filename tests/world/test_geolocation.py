@@ -121,7 +121,7 @@ def test_crs_of_scenario_gives_frame(tmp_path: Path) -> None:
     ("crs", "message"),
     [
         ({"epsg": 4326}, r"crs.epsg: EPSG:4326 \(WGS 84\) is not a map projection. Use a projection in metres"),
-        ({"epsg": 2263}, r"crs.epsg: EPSG:2263 .* counts in US survey foot"),
+        ({"epsg": 2263}, r"crs.epsg: EPSG:2263 .* has axes in US survey foot"),
         ({"epsg": 1}, "crs.epsg: unknown coordinate reference system 'EPSG:1'"),
         ({"epsg": 3857, "offset_m": [-1081000, -6594000]},
          r"crs: epsg = 3857 scales lengths by 1.58 at the region of interest \(longitude 9.71\d*, latitude "

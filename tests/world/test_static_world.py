@@ -246,7 +246,7 @@ def test_rejects_mesh_of_another_location(tmp_path):
     box.apply_translation([550_720, 5_635_230, 4])
     box.export(tmp_path / "m.ply")
     with pytest.raises(
-        InputError, match=r"m.ply: .*would be near it as eastings and northings of EPSG:32632. Set offset_m"
+        InputError, match=r"m.ply: .*Read as eastings and northings of EPSG:32632, they would be near it. Set offset_m"
     ):
         build_located(tmp_path, meshes=[{"file": "m.ply"}])
     with pytest.raises(InputError, match="expected epsg or origin_deg, got both"):

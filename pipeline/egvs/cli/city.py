@@ -153,7 +153,7 @@ def _print_new(city: NewCity) -> None:
         Column("title", lambda row: row.junction.title, "left", wrap=True),
         Column("lanes in", lambda row: str(row.junction.lanes_in)),
         Column("poles", lambda row: str(len(row.poles))),
-        Column("sites", lambda row: str(row.sites)),
+        Column("sites", lambda row: str(row.n_candidates)),
     ]
     out = console(WIDE)
     out.print(make_table(columns, city.junctions))
@@ -218,7 +218,7 @@ def print_junctions(city_run: CityRun) -> None:
     if "entropy seen" not in (gain.head, by.head):
         columns.append(Column("entropy seen", lambda row: f"{row.best.entropy_seen:.1%}"))
     columns.append(Column("vehicles", lambda row: f"{row.vehicles:.1f}"))
-    columns.append(Column("sites", lambda row: str(row.sites)))
+    columns.append(Column("sites", lambda row: str(row.n_candidates)))
 
     out = console(WIDE)
     out.print(make_table(columns, city_run.results, width=out.width))

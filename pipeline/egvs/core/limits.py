@@ -77,15 +77,15 @@ class Limit:
 
 DOCUMENT = Limit("EGVS_MAX_DOCUMENT_MB", 64, "MB", "a TOML, JSON, GeoJSON or CSV file that is read as a whole")
 FILE = Limit("EGVS_MAX_FILE_MB", 1000, "MB", "a mesh or a point cloud")
-UNPACKED = Limit("EGVS_MAX_UNPACKED_MB", 1000, "MB", "the content of a packed file (gzip, 3MF, Parquet)")
-ELEMENT = Limit("EGVS_MAX_ELEMENT_MB", 16, "MB", "one element below the root of an XML file, or a line of a text")
+UNPACKED = Limit("EGVS_MAX_UNPACKED_MB", 1000, "MB", "the unpacked content of a file (gzip, Parquet, PCD, glTF)")
+ELEMENT = Limit("EGVS_MAX_ELEMENT_MB", 16, "MB", "one element below the root of an XML file, or a line of a text file")
 POINTS = Limit("EGVS_MAX_POINTS", 30_000_000, "points", "a point cloud")
 TRIANGLES = Limit("EGVS_MAX_TRIANGLES", 5_000_000, "triangles", "a mesh")
 SITES = Limit("EGVS_MAX_SITES", 100_000, "candidates", "a scenario's sites")
 BEAMS = Limit("EGVS_MAX_BEAMS", 3_000_000, "beams", "one turn of a sensor")
 VOXELS = Limit("EGVS_MAX_VOXELS", 2**30, "voxels", "a region of interest")
 ROWS = Limit("EGVS_MAX_ROWS", 3_000_000, "rows", "the frames of an FCD file held in memory at a time")
-MAP_OBJECTS = Limit("EGVS_MAX_MAP_OBJECTS", 5_000_000, "objects", "an OpenStreetMap map")
+MAP_OBJECTS = Limit("EGVS_MAX_MAP_OBJECTS", 5_000_000, "objects", "an OpenStreetMap extract")
 GROUND_POINTS = Limit("EGVS_MAX_GROUND_POINTS", 2_000_000, "points", "the ground surface built from a network")
 READER_MEMORY = Limit("EGVS_MAX_READER_MB", 2000, "MB", "the program that unpacks a LAZ file")
 
