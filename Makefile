@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: run test test-slow test-train unit lint bench scaling numerics validity detectability pictures schema reference docs fuzz clean
+.PHONY: run test test-slow test-train test-lowest unit lint bench scaling numerics validity detectability pictures schema reference docs fuzz clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
@@ -19,6 +19,15 @@ test-slow: $(VENV)/.installed-dev
 # PyTorch is large, and only those who train a detector need it.
 test-train: $(VENV)/.installed-train
 	$(BIN)/python -m pytest -n 0 tests/validation/training
+
+# The lowest versions that pyproject.toml allows, in an environment of its own.
+test-lowest: $(VENV)/.installed
+	mkdir -p build
+	$(BIN)/python .ci/lowest.py > build/lowest.txt
+	$(PYTHON) -m venv --clear build/lowest
+	build/lowest/bin/python -m pip install --quiet --disable-pip-version-check --constraint build/lowest.txt \
+		'.[place]' hypothesis pytest pytest-xdist
+	build/lowest/bin/python -m pytest -m unit -p no:cacheprovider tests/core tests/scenario tests/scoring tests/sensors tests/world
 
 # The quick loop: no other program is started, nothing takes long.
 unit: $(VENV)/.installed-dev

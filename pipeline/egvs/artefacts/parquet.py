@@ -24,8 +24,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from egvs.core import files, limits, reading
-from egvs.core.errors import InputError, MissingBackendError
+from egvs.core.errors import InputError
 from egvs.core.grid import Grid
+from egvs.core.package_data import data_folder
 
 _REMAKE_HINT = "Create the file again."
 
@@ -35,12 +36,8 @@ SCHEMA_VERSION = 1
 
 
 def schema_folder() -> Path:
-    """Return the folder ``data_schemas``: beside the package in a checkout, inside it when installed from a wheel."""
-    package = Path(__file__).resolve().parent.parent
-    for candidate in (package / "data_schemas", package.parent.parent / "data_schemas"):
-        if candidate.is_dir():
-            return candidate
-    raise MissingBackendError(f"{package.parent}: the folder data_schemas is missing. Reinstall egvs")
+    """The folder of the Table Schemas, one for each artefact."""
+    return data_folder("data_schemas")
 
 
 @cache

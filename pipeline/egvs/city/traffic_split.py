@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import math
 import os
-import resource
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -42,7 +41,7 @@ from tomlkit.exceptions import TOMLKitError
 
 from egvs.artefacts import parquet
 from egvs.city.model import CITY_FILE, JUNCTIONS_FILE, JUNCTIONS_FOLDER, TRAFFIC_FOLDER, City, CityJunction
-from egvs.core import files, reading
+from egvs.core import files, platform, reading
 from egvs.core.errors import WARNINGS_KEY, Diagnostic, InputError
 from egvs.core.grid import FloatArray
 from egvs.core.progress import ProgressCallback, no_progress
@@ -511,7 +510,7 @@ def split_recording(
     period_ms, where = recording.window.period_ms, recording.source or recording.where
     statistics = TrafficStatistics(recording.window.count, stopped_on_purpose=recording.stopped_on_purpose)
     uncounted = frozenset[str]().union(*(extension.uncounted_types(recording.sizes) for extension in extensions))
-    _raise_file_limit(len(regions))
+    platform.raise_open_file_limit(len(regions) + _OTHER_OPEN_FILES)
     with ExitStack() as stack:
         writers = {}
         for name, region in regions.items():
@@ -528,16 +527,6 @@ def split_recording(
             writer.flush()
             writer.file.describe({"schema": parquet.SCHEMA_VERSION, **fcd_metadata.model_dump(mode="json")})
     return statistics, {name: writer.rows for name, writer in writers.items()}
-
-
-def _raise_file_limit(n_files: int) -> None:
-    """Allow as many open files as there are junctions; the default limit is too low for a large city."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    required = n_files + _OTHER_OPEN_FILES
-    if soft == resource.RLIM_INFINITY or soft >= required:
-        return
-    if hard == resource.RLIM_INFINITY or hard >= required:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (required, hard))
 
 
 def _write_rows(rows: pa.Table, writers: Iterable[_JunctionWriter], sizes: Mapping[str, VehicleSize]) -> None:

@@ -139,6 +139,9 @@ def after_imports() -> Iterator[None]:
     if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:  # ignored, for example: leave it so
         yield
         return
+    if not hasattr(signal, "SIGALRM"):  # Windows has no timer that could raise the interrupt later
+        yield
+        return
     before = {number: signal.signal(number, _interrupt) for number in (signal.SIGINT, signal.SIGALRM)}
     try:
         yield

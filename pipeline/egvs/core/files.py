@@ -10,7 +10,6 @@ write the file can compute it anew.
 from __future__ import annotations
 
 import errno
-import fcntl
 import hashlib
 import io
 import json
@@ -27,6 +26,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from egvs.core import platform
 from egvs.core.errors import InputError
 
 DISK_FULL_ERRNOS = (errno.ENOSPC, errno.EDQUOT)
@@ -96,13 +96,13 @@ def _remove_stale_folders(parent: Path) -> None:
 
 def _try_lock(folder: Path) -> int | None:
     """Lock a folder of this user until the descriptor is closed; None where it is not this user's, locked, or gone."""
-    with suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    with suppress(OSError):  # Windows opens no folders: there, folders of killed programs stay
+        descriptor = os.open(folder, os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | platform.OPEN_NO_LINK)
         with suppress(OSError):
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            status = os.fstat(descriptor)
-            if status.st_uid == os.geteuid() and os.path.samestat(status, folder.stat()):
-                return descriptor
+            if platform.try_lock(descriptor):
+                status = os.fstat(descriptor)
+                if platform.is_own_file(status) and os.path.samestat(status, folder.stat()):
+                    return descriptor
         os.close(descriptor)
     return None
 

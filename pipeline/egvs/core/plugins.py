@@ -37,7 +37,7 @@ _REQUIREMENTS = {
 }
 """Required attributes of the objects of each group, and a description for messages."""
 
-_PACKAGES = {"sklearn": "scikit-learn", "torch": "PyTorch"}
+_PACKAGES = {"PIL": "Pillow", "sklearn": "scikit-learn", "torch": "PyTorch"}
 """Names of packages that differ from the name that is imported."""
 
 

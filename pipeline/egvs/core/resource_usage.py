@@ -8,7 +8,6 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
-import resource
 import sys
 import time
 from collections.abc import Iterator
@@ -16,6 +15,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from egvs.core import platform
 
 _PROC_STATUS, _PROC_CLEAR_REFS = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 
@@ -40,14 +41,14 @@ class ResourceUsage:
 def measure_usage() -> Iterator[ResourceUsage]:
     """Measure a block; the yielded object is filled at its end."""
     usage, resettable = ResourceUsage(), _reset_peak()
-    usage.held_mb = _status_mb("VmRSS:") if resettable else _peak_mb()
+    usage.held_mb = _status_mb("VmRSS:") if resettable else platform.peak_memory_mb()
     start, busy = time.perf_counter(), _cpu_seconds()
     try:
         yield usage
     finally:
         usage.seconds = time.perf_counter() - start
         usage.busy_s = _cpu_seconds() - busy
-        usage.peak_mb = _status_mb("VmHWM:") if resettable else _peak_mb()
+        usage.peak_mb = _status_mb("VmHWM:") if resettable else platform.peak_memory_mb()
 
 
 def release_memory() -> None:
@@ -55,8 +56,8 @@ def release_memory() -> None:
     gc.collect(1)  # a full collection would take 50 ms
     if (arrow := sys.modules.get("pyarrow")) is not None:
         arrow.default_memory_pool().release_unused()
-    if (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:  # glibc's
-        trim(0)
+    if sys.platform.startswith("linux") and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)) is not None:
+        trim(0)  # glibc's
 
 
 def _cpu_seconds() -> float:
@@ -74,8 +75,3 @@ def _reset_peak() -> bool:
 def _status_mb(name: str) -> float:
     line = next(line for line in _PROC_STATUS.read_text().splitlines() if line.startswith(name))
     return int(line.split()[1]) / 1024
-
-
-def _peak_mb() -> float:
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1024 * 1024 if sys.platform == "darwin" else 1024)

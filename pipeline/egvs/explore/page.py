@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import viser
-from matplotlib import image
+from PIL import Image
 
 from egvs.core.errors import EgvsError, InputError, RunError
 from egvs.core.grid import Vec3
@@ -329,7 +329,7 @@ class Page:
     def _send_picture(self, client: viser.ClientHandle) -> None:
         file = io.BytesIO()
         picture = client.get_render(client.camera.image_height, client.camera.image_width, transport_format="png")
-        image.imsave(file, picture, format="png")
+        Image.fromarray(picture).save(file, format="png")
         client.send_file_download(f"{self.session.scenario.name}.png", file.getvalue(), save_immediately=True)
 
     # ---- showing a view

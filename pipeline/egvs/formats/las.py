@@ -14,13 +14,12 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 
-from egvs.core import limits
+from egvs.core import limits, platform
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.reading import COMPLETE_FILE, translate_errors
@@ -114,14 +113,7 @@ def _read_in_other_process(path: Path, where: str, declared: int) -> FloatArray:
 
 def stream_points(path: Path, memory_mb: int) -> None:
     """Write the points of a file to standard output as float64, within a limit of memory."""
-    with suppress(ImportError):  # on systems without such limits
-        import resource
-
-        hard = resource.getrlimit(resource.RLIMIT_AS)[1]
-        limit = memory_mb * limits.MB
-        if hard != resource.RLIM_INFINITY:
-            limit = min(hard, limit)
-        resource.setrlimit(resource.RLIMIT_AS, (limit, hard))
+    platform.limit_memory(memory_mb * limits.MB)
     for points in _chunks(path):
         sys.stdout.buffer.write(points.data)
 

@@ -125,6 +125,8 @@ def _candidate_folders(kernels: Path) -> Iterator[Path]:
         yield kernels / "__pycache__"
         with suppress(RuntimeError):  # a user without a home
             yield Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "egvs"
+    if not hasattr(os, "geteuid"):  # Windows, where the temporary folder is the user's
+        return
     with suppress(OSError):
         temporary = Path(tempfile.gettempdir()) / f"egvs-{os.geteuid()}"
         temporary.mkdir(mode=0o700, exist_ok=True)

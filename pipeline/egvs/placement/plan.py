@@ -20,7 +20,7 @@ import numpy as np
 from egvs.artefacts import checksums, parquet
 from egvs.artefacts.planned_sensor import PlannedSensor, plan_columns
 from egvs.artefacts.run_folder import RunFolder
-from egvs.core import files
+from egvs.core import files, plugins
 from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.placement import problem_builder, refinement, solver
@@ -289,6 +289,8 @@ def place(
     InputError
         When no plan meets ``[placement]``; the message names the nearest request that can be met.
     """
+    if refine:
+        plugins.require_libraries("egvs place --refine", "place", "cma")
     folder = Path(out) if out is not None else run.default_folder(scenario)
     if refine and scenario.placement.refine is None:
         placement = scenario.placement.model_copy(update={"refine": RefinementConfig()})

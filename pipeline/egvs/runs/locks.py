@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import errno
-import fcntl
+import math
 import os
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from egvs.core import platform
 from egvs.core.errors import InputError
 
-_OPEN_FLAGS = os.O_CLOEXEC | os.O_NOFOLLOW
 _PAUSE_S = 0.05
 
 
@@ -31,13 +31,10 @@ def locked(path: Path, *, shared: bool = False, wait: bool = True, remove: bool 
     remove
         Remove the file at the end. A process that waited for it then locks the new file of that name.
     """
-    operation = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
-    if not wait:
-        operation |= fcntl.LOCK_NB
     while True:
         descriptor = open_lock(path, shared=shared)
         try:
-            if not _try_lock(descriptor, operation):
+            if not wait_for_lock(descriptor, math.inf if wait else 0.0, shared=shared):
                 yield False
                 return
             if not _is_current_lock(descriptor, path):
@@ -46,7 +43,8 @@ def locked(path: Path, *, shared: bool = False, wait: bool = True, remove: bool 
                 yield True
             finally:
                 if remove:
-                    path.unlink(missing_ok=True)
+                    with suppress(PermissionError):  # Windows removes no open file
+                        path.unlink(missing_ok=True)
             return
         finally:
             os.close(descriptor)
@@ -60,12 +58,14 @@ def create_lock(path: Path) -> None:
 def open_lock(path: Path, *, shared: bool = False) -> int:
     """Return the descriptor of a lock file, created if it does not exist; InputError where it is a symbolic link."""
     try:
+        if not platform.OPEN_NO_LINK and path.is_symlink():
+            raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
         try:
-            return os.open(path, os.O_RDWR | os.O_CREAT | _OPEN_FLAGS, 0o666)
+            return os.open(path, os.O_RDWR | os.O_CREAT | platform.OPEN_NO_LINK, 0o666)
         except PermissionError:
             if not shared:
                 raise
-        return os.open(path, os.O_RDONLY | _OPEN_FLAGS)
+        return os.open(path, os.O_RDONLY | platform.OPEN_NO_LINK)
     except OSError as error:
         if error.errno == errno.ELOOP:
             problem = "is a symbolic link, and nothing is written through links"
@@ -73,21 +73,13 @@ def open_lock(path: Path, *, shared: bool = False) -> int:
         raise
 
 
-def wait_for_lock(descriptor: int, timeout_s: float) -> bool:
-    """Lock an open file exclusively; return False where it is not free in time."""
+def wait_for_lock(descriptor: int, timeout_s: float, *, shared: bool = False) -> bool:
+    """Lock an open file; return False where it is not free in time."""
     deadline = time.monotonic() + timeout_s
-    while not _try_lock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB):
+    while not platform.try_lock(descriptor, shared=shared):
         if time.monotonic() >= deadline:
             return False
         time.sleep(_PAUSE_S)
-    return True
-
-
-def _try_lock(descriptor: int, operation: int) -> bool:
-    try:
-        fcntl.flock(descriptor, operation)
-    except BlockingIOError:
-        return False
     return True
 
 

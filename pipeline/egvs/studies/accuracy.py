@@ -19,7 +19,7 @@ from typing import Any
 
 from egvs.artefacts import checksums, parquet
 from egvs.artefacts.run_folder import RunFolder
-from egvs.core import files
+from egvs.core import files, plugins
 from egvs.core.errors import EgvsError, InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.effects import registry
@@ -151,6 +151,7 @@ def run_accuracy_study(
     InputError
         If the options do not fit the scenario, or intermediate results were altered.
     """
+    plugins.require_libraries("egvs accuracy", "figure", "matplotlib")
     if not 1e-6 <= options.tolerance <= 1:
         raise InputError("--tolerance", f"expected 1e-6 to 1, got {options.tolerance:g}", "Use 0.02, for example.")
     check_no_overwrite(load(path, overrides), out, (measurement.STUDY_FOLDER,))

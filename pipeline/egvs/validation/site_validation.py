@@ -19,7 +19,7 @@ import numpy as np
 
 from egvs.artefacts import checksums, parquet
 from egvs.artefacts.run_folder import RunFolder
-from egvs.core import files
+from egvs.core import files, plugins
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.progress import ProgressCallback, no_progress
@@ -80,6 +80,7 @@ def validate_sites(
         If the check finds an error, a detector is unknown, the traffic has too few frames or no vehicle in the region
         of interest, or the KITTI results do not belong to these sites and frames.
     """
+    plugins.require_libraries("egvs validate", "validate", "matplotlib")
     chosen = {name: base.make_detector(name) for name in dict.fromkeys(detectors) if name != POINT_COUNTS_NAME}
     _check_no_input_overwritten(scenario, out, kitti)
 

@@ -1,0 +1,66 @@
+"""Locks between open files, and the program without the modules that only POSIX systems have."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from egvs.core import platform
+
+ROOT = Path(__file__).parents[2]
+
+
+def open_file(path: Path) -> int:
+    return os.open(path, os.O_RDWR | os.O_CREAT)
+
+
+def test_lock_keeps_others_out_until_it_is_closed(tmp_path: Path) -> None:
+    first, second = open_file(tmp_path / "lock"), open_file(tmp_path / "lock")
+    assert platform.try_lock(first)
+    assert not platform.try_lock(second)
+    assert not platform.try_lock(second, shared=True)
+    os.close(first)
+    assert platform.try_lock(second)
+    os.close(second)
+
+
+def test_shared_locks_exclude_only_exclusive_ones(tmp_path: Path) -> None:
+    first, second, third = (open_file(tmp_path / "lock") for _ in range(3))
+    assert platform.try_lock(first, shared=True)
+    assert platform.try_lock(second, shared=True)
+    assert not platform.try_lock(third)
+    for descriptor in (first, second, third):
+        os.close(descriptor)
+
+
+def test_peak_memory_grows_with_an_array() -> None:
+    before_mb = platform.peak_memory_mb()
+    size_mb = int(before_mb) + 100
+    data = bytearray(b"x") * (size_mb * 2**20)
+    assert platform.peak_memory_mb() > size_mb
+    assert len(data) == size_mb * 2**20
+
+
+WITHOUT_POSIX = """
+import sys
+import tests.without_posix
+from egvs.cli.app import main
+from egvs.core import platform
+
+assert not platform.HAS_POSIX
+sys.argv = ["egvs", "demo", sys.argv[1]]
+main()
+"""
+
+
+@pytest.mark.slow
+def test_demo_runs_without_posix_modules(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", WITHOUT_POSIX, tmp_path / "demo"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "kerb_NE" in done.stdout
+    assert (tmp_path / "demo" / "results" / "report.html").is_file()

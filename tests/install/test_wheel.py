@@ -1,0 +1,119 @@
+"""The wheel, installed into a new environment, works in an empty folder without a checkout."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import time
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from subprocess import CompletedProcess
+
+import pyarrow.parquet as pq
+import pytest
+
+ROOT = Path(__file__).parents[2]
+MAP = ROOT / "tests" / "importers" / "data" / "small.osm"
+MAX_WHEEL_MB = 15
+
+pytestmark = pytest.mark.slow
+
+
+def build_wheel(folder: Path) -> Path:
+    """Build a wheel from the checkout."""
+    environment = os.environ | {"SOURCE_DATE_EPOCH": "1700000000"}
+    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", folder, ROOT]
+    subprocess.run(command, check=True, capture_output=True, env=environment)
+    (wheel,) = folder.glob("egvs-*.whl")
+    return wheel
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build_wheel(tmp_path_factory.mktemp("wheel"))
+
+
+class Installed:
+    """An environment with the wheel in it, and an empty folder to work in."""
+
+    def __init__(self, wheel: Path, folder: Path, extras: str) -> None:
+        self.bin = folder / "environment" / "bin"
+        self.work = folder / "work"
+        self.work.mkdir()
+        self.environment = {
+            "PATH": f"{self.bin}:{os.environ['PATH']}",
+            "HOME": "/dev/null",  # nothing can be written there, not even by root
+            "LANG": "C.UTF-8",
+            "TMPDIR": str(folder),
+        }
+        subprocess.run([sys.executable, "-m", "venv", folder / "environment"], check=True)
+        pip = [self.bin / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+        subprocess.run([*pip, "--constraint", ROOT / "constraints.txt", f"{wheel}{extras}"], check=True)
+
+    def egvs(self, *arguments: object) -> CompletedProcess[str]:
+        """Run a command, which must succeed."""
+        done = self.start(*arguments)
+        out, error = done.communicate(timeout=600)
+        assert done.returncode == 0, f"{arguments}: {error}"
+        return CompletedProcess([], 0, out, error)
+
+    def start(self, *arguments: object) -> subprocess.Popen[str]:
+        """Start a command."""
+        return subprocess.Popen(
+            [self.bin / "egvs", *map(str, arguments)], cwd=self.work, env=self.environment, text=True,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Installed]:
+    """The wheel with the extras of ``place --refine``, ``explore`` and ``export --to gpkg``."""
+    yield Installed(wheel, tmp_path_factory.mktemp("installed"), "[place,explore,gis]")
+
+
+def test_wheel_is_small_and_reproducible(wheel: Path, tmp_path: Path) -> None:
+    assert wheel.stat().st_size < MAX_WHEEL_MB * 1_000_000
+    assert build_wheel(tmp_path).read_bytes() == wheel.read_bytes()
+
+
+def test_metadata_is_valid(wheel: Path) -> None:
+    done = subprocess.run([sys.executable, "-m", "twine", "check", "--strict", wheel], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+
+
+def test_demo_ranks_sites_and_equals_checkout(installed: Installed, tmp_path: Path, run_egvs) -> None:
+    done = installed.egvs("demo")
+    assert re.search(r"^\s+1\s+kerb_", done.stdout, re.MULTILINE), done.stdout
+    results = installed.work / "egvs-demo" / "results"
+    assert (results / "report.html").stat().st_size > 100_000
+
+    code, _, error = run_egvs("demo", tmp_path / "demo")
+    assert code == 0, error
+    for name in ("scores.parquet", "tpog.parquet", "scans.parquet", "trajectories.parquet", "blindspots.parquet"):
+        assert pq.read_table(results / name).equals(pq.read_table(tmp_path / "demo" / "results" / name)), name
+
+
+def test_first_commands_run_without_checkout(installed: Installed) -> None:
+    if not (installed.work / "egvs-demo").exists():
+        installed.egvs("demo")
+    installed.egvs("new", "town", "--osm", MAP)
+    few = ("--set", "traffic.frames=60", "--set", "traffic.warmup_s=20", "--set", 'traffic.hold="at_most"')
+    installed.egvs("run", "town", *few)
+    installed.egvs("place", "town", "--count", "2", "--refine", *few)
+    installed.egvs("export", "runs/town", "--to", "gpkg")
+    explorer = installed.start("explore", "runs/town", "--no-browser")
+    try:
+        assert explorer.stdout is not None
+        url = None
+        deadline = time.monotonic() + 120
+        while url is None and time.monotonic() < deadline:
+            url = re.search(r"http://\S+", explorer.stdout.readline())
+        assert url is not None
+        with urllib.request.urlopen(url[0], timeout=60) as page:
+            assert page.status == 200
+    finally:
+        explorer.terminate()
+        explorer.communicate(timeout=60)
