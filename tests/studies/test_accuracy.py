@@ -284,7 +284,8 @@ def test_damaged_intermediate_file_is_named(mini: Path, junction: Path, tmp_path
         path.write_text(content)
     code, printed, errors = run_egvs(*words)
     assert code == 2
-    assert re.search(pattern.replace("*", ".*") + ": (was changed after the study wrote it|is not valid JSON)", errors), errors
+    message = ": (was changed after the study wrote it|is not valid JSON)"
+    assert re.search(pattern.replace("*", ".*") + message, errors), errors
     assert "Traceback" not in errors + printed
 
 
