@@ -85,10 +85,10 @@ with files.temporary_folder() as folder:
 
 
 def test_temporary_folders_work_without_file_locks(monkeypatch: pytest.MonkeyPatch) -> None:
-    def raise_not_supported(*_: object) -> None:
+    def raise_not_supported(*_: object, **_options: object) -> None:
         raise OSError(errno.ENOLCK, "No locks available")
 
-    monkeypatch.setattr(files.fcntl, "flock", raise_not_supported)
+    monkeypatch.setattr(files.platform, "try_lock", raise_not_supported)
     with files.temporary_folder() as folder:
         assert folder.is_dir()
     assert not folder.exists()

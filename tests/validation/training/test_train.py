@@ -161,7 +161,7 @@ def test_training_resumes_and_writes_metadata(mini, tmp_path, monkeypatch):
 
     monkeypatch.setattr(HeldOutSet, "FRAMES", 10)
     monkeypatch.setattr(train, "_CHECKPOINT_STEPS", 2)
-    complete = train([scenario], tmp_path / "whole.onnx", recipe)
+    complete = train.train([scenario], tmp_path / "whole.onnx", recipe)
     assert [entry["step"] for entry in complete["curve"]] == [4]
     assert complete["junctions"] == [scenario.name] and complete["recipe"]["steps"] == 4
 
@@ -173,11 +173,11 @@ def test_training_resumes_and_writes_metadata(mini, tmp_path, monkeypatch):
             raise Stop
 
     with pytest.raises(Stop):
-        train([scenario], tmp_path / "part.onnx", recipe, progress=stop)
+        train.train([scenario], tmp_path / "part.onnx", recipe, progress=stop)
     assert not (tmp_path / "part.onnx").exists() and (tmp_path / "part.onnx.partial").exists()
     with pytest.raises(InputError, match="the checkpoint belongs to another training"):
-        train([scenario], tmp_path / "part.onnx", Recipe(steps=5, frames=10, sensors=("small",)))
-    train([scenario], tmp_path / "part.onnx", recipe)
+        train.train([scenario], tmp_path / "part.onnx", Recipe(steps=5, frames=10, sensors=("small",)))
+    train.train([scenario], tmp_path / "part.onnx", recipe)
     assert not (tmp_path / "part.onnx.partial").exists()
     assert (tmp_path / "part.onnx").read_bytes() == (tmp_path / "whole.onnx").read_bytes()
     metadata = json.loads({p.key: p.value for p in onnx.load(tmp_path / "whole.onnx").metadata_props}[METADATA_KEY])
