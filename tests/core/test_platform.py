@@ -58,6 +58,7 @@ main()
 
 
 @pytest.mark.slow
+@pytest.mark.system
 def test_demo_runs_without_posix_modules(tmp_path: Path) -> None:
     command = [sys.executable, "-c", WITHOUT_POSIX, tmp_path / "demo"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)

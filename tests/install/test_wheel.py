@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[2]
 MAP = ROOT / "tests" / "importers" / "data" / "small.osm"
 MAX_WHEEL_MB = 15
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.system]
 
 
 def build_wheel(folder: Path) -> Path:
