@@ -93,12 +93,11 @@ def test_demo_ranks_sites_and_equals_checkout(installed: Installed, tmp_path: Pa
     code, _, error = run_egvs("demo", tmp_path / "demo")
     assert code == 0, error
     for name in ("scores.parquet", "tpog.parquet", "scans.parquet", "trajectories.parquet", "blindspots.parquet"):
-        assert pq.read_table(results / name).equals(pq.read_table(tmp_path / "demo" / "results" / name)), name
+        first, second = (pq.read_table(folder / name) for folder in (results, tmp_path / "demo" / "results"))
+        assert first.equals(second) or repr(first.to_pylist()) == repr(second.to_pylist()), name  # NaN equals NaN
 
 
 def test_first_commands_run_without_checkout(installed: Installed) -> None:
-    if not (installed.work / "egvs-demo").exists():
-        installed.egvs("demo")
     installed.egvs("new", "town", "--osm", MAP)
     few = ("--set", "traffic.frames=60", "--set", "traffic.warmup_s=20", "--set", 'traffic.hold="at_most"')
     installed.egvs("run", "town", *few)
