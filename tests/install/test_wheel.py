@@ -6,8 +6,6 @@ import os
 import re
 import subprocess
 import sys
-import time
-import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from subprocess import CompletedProcess
@@ -16,7 +14,6 @@ import pyarrow.parquet as pq
 import pytest
 
 ROOT = Path(__file__).parents[2]
-MAP = ROOT / "tests" / "importers" / "data" / "small.osm"
 MAX_WHEEL_MB = 15
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
@@ -70,8 +67,8 @@ class Installed:
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Installed]:
-    """The wheel with the extras of ``place --refine``, ``explore`` and ``export --to gpkg``."""
-    yield Installed(wheel, tmp_path_factory.mktemp("installed"), "[place,explore,gis]")
+    """The wheel without extras."""
+    yield Installed(wheel, tmp_path_factory.mktemp("installed"), "")
 
 
 def test_wheel_is_small_and_reproducible(wheel: Path, tmp_path: Path) -> None:
@@ -95,24 +92,3 @@ def test_demo_ranks_sites_and_equals_checkout(installed: Installed, tmp_path: Pa
     for name in ("scores.parquet", "tpog.parquet", "scans.parquet", "trajectories.parquet", "blindspots.parquet"):
         first, second = (pq.read_table(folder / name) for folder in (results, tmp_path / "demo" / "results"))
         assert first.equals(second) or repr(first.to_pylist()) == repr(second.to_pylist()), name  # NaN equals NaN
-
-
-def test_first_commands_run_without_checkout(installed: Installed) -> None:
-    installed.egvs("new", "town", "--osm", MAP)
-    few = ("--set", "traffic.frames=60", "--set", "traffic.warmup_s=20", "--set", 'traffic.hold="at_most"')
-    installed.egvs("run", "town", *few)
-    installed.egvs("place", "town", "--count", "2", "--refine", *few)
-    installed.egvs("export", "runs/town", "--to", "gpkg")
-    explorer = installed.start("explore", "runs/town", "--no-browser")
-    try:
-        assert explorer.stdout is not None
-        url = None
-        deadline = time.monotonic() + 120
-        while url is None and time.monotonic() < deadline:
-            url = re.search(r"http://\S+", explorer.stdout.readline())
-        assert url is not None
-        with urllib.request.urlopen(url[0], timeout=60) as page:
-            assert page.status == 200
-    finally:
-        explorer.terminate()
-        explorer.communicate(timeout=60)
