@@ -25,7 +25,7 @@ def test_unchanged_and_missing_files_pass(sums: Path) -> None:
     checksums.verify_checksums(sums.with_name("none.sha256"), "Run again.")
 
 
-def test_a_flipped_bit_is_told(sums: Path) -> None:
+def test_a_flipped_bit_is_reported(sums: Path) -> None:
     sums.with_name("b.png").write_bytes(b"b.pnf")
     with pytest.raises(InputError, match=r"b\.png: does not match its checksum in study\.sha256. Run again."):
         checksums.verify_checksums(sums, "Run again.")
@@ -33,7 +33,7 @@ def test_a_flipped_bit_is_told(sums: Path) -> None:
 
 
 @pytest.mark.parametrize("text", [b"x", b"\xff\n", b"0" * 64 + b"  ../a\n", b"0" * 64 + b" a\n", b"\n"])
-def test_a_damaged_list_is_told(sums: Path, text: bytes) -> None:
+def test_a_damaged_list_is_reported(sums: Path, text: bytes) -> None:
     sums.write_bytes(text)
     with pytest.raises(InputError, match=r"study\.sha256: is not a list of checksums. Run again."):
         checksums.verify_checksums(sums, "Run again.")
@@ -41,5 +41,5 @@ def test_a_damaged_list_is_told(sums: Path, text: bytes) -> None:
 
 @pytest.mark.system
 @pytest.mark.skipif(shutil.which("sha256sum") is None, reason="sha256sum is not installed")
-def test_it_is_what_sha256sum_reads(sums: Path) -> None:
+def test_sha256sum_reads_the_list(sums: Path) -> None:
     assert subprocess.run(["sha256sum", "--check", "--status", sums.name], cwd=sums.parent).returncode == 0

@@ -20,7 +20,7 @@ def _record(path, rows):
     return path
 
 
-def test_frames_are_read_in_order_and_empty_ones_are_told(tmp_path):
+def test_frames_are_read_in_order_and_empty_ones_are_reported(tmp_path):
     path = _record(tmp_path / "t.parquet", [(0, "a", "passenger", 1.0), (3, "a", "bus", 2.0), (3, "b", "truck", 3.0)])
     read = list(traffic_frames.read_frames(path, np.array([0, 1, 3, 8])))
     assert [frame.number for frame in read] == [0, 1, 3, 8]
@@ -30,7 +30,7 @@ def test_frames_are_read_in_order_and_empty_ones_are_told(tmp_path):
     np.testing.assert_array_equal(read[0].pitch_rad, [0.1])
 
 
-def test_rear_parts_are_told_from_whole_vehicles():
+def test_rear_parts_are_distinguished_from_whole_vehicles():
     boxes = np.zeros((4, 7))
     whole = traffic_frames.TrafficFrame(0, ("a", "b", "b", "c"), ("bus",) * 4, boxes, np.zeros(4))
     np.testing.assert_array_equal(whole.part, [0, 0, 0, 0])

@@ -87,7 +87,7 @@ def test_the_slope_is_that_of_the_larger_half() -> None:
     assert scaling.slope(sizes[::-1], [5.0] * 5) == pytest.approx(0.0)
 
 
-def test_a_synthetic_junction_is_as_large_as_asked(tmp_path) -> None:
+def test_a_synthetic_junction_has_the_requested_size(tmp_path) -> None:
     import egvs
     from egvs.sensors import sensor, sites
     from egvs.world import static_world
@@ -101,7 +101,7 @@ def test_a_synthetic_junction_is_as_large_as_asked(tmp_path) -> None:
     assert len((scenario.folder / "fcd.csv").read_text().splitlines()) == 1 + 10 * 3
 
 
-def test_a_bias_is_told_from_scatter() -> None:
+def test_a_bias_is_distinguished_from_scatter() -> None:
     """One site that is 10 % lower, one that only scatters; t is that of two independent means."""
     rng = np.random.default_rng(2)
     against, shares = (rng.normal([0.4, 0.2], [0.004, 0.02], size=(16, 2)) for _ in range(2))

@@ -69,7 +69,7 @@ def test_no_place_is_in_the_building_or_outside_the_surroundings(mini: Path) -> 
     assert x.min() == -12.0 and x.max() == 52.0 and y.min() == -22.0 and y.max() == 22.0
 
 
-def test_places_are_beside_lanes_and_their_heights_count_from_the_slope() -> None:
+def test_sites_are_next_to_lanes_and_heights_are_above_the_slope() -> None:
     scenario = egvs.load(ROOT / "scenarios" / "hill")
     scene = egvs.build_scene(scenario)
     lanes = junctions.Carriageway.of(junctions.sumo_folder.read_network(scenario))
@@ -110,7 +110,7 @@ def part_of(mini: Path, folder: Path) -> measurement.Part:
     return measurement.Part(**{**vars(part), "scores": ("entropy_seen",)})
 
 
-def test_a_part_that_was_measured_is_kept_and_an_interrupted_one_goes_on(mini, tmp_path, monkeypatch, short) -> None:
+def test_a_measured_part_is_reused_and_an_interrupted_one_continues(mini, tmp_path, monkeypatch, short) -> None:
     said: list[str] = []
     part = part_of(mini, tmp_path)
     made = measurement.measure(part, tmp_path, jobs=1, report=said.append)
@@ -138,7 +138,7 @@ def test_a_posed_scenario_has_these_sites_and_no_keys_of_the_old_ones(mini: Path
         assert {s.sensor for s in sites} == {sensor or "small"}
 
 
-def test_wrong_arguments_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_arguments_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = ["--data", str(tmp_path)]
     assert command.main([*data, "--junction", "tokyo"]) == 2
     assert "--junction: expected some of ingolstadt" in capsys.readouterr().err
@@ -194,9 +194,7 @@ def test_some_of_the_given_sites_are_of_many_poles_and_all_heights() -> None:
     assert [site.name for site in detector_sites.evenly_chosen(pair, 2)] == ["k0", "k2"]
 
 
-def test_the_whole_study_is_the_same_bytes_twice_and_says_what_it_went_without(
-    tmp_path, monkeypatch, capsys, short
-) -> None:
+def test_the_study_is_repeatable_and_names_what_was_left_out(tmp_path, monkeypatch, capsys, short) -> None:
     (tmp_path / "scenarios").mkdir()
     for name in ("ingolstadt", "nishishinjuku"):
         write_mini(tmp_path / "scenarios" / name)
@@ -367,7 +365,7 @@ def test_heights_of_two_detectors_are_compared_at_the_same_sites(records: list[R
     assert [cell[0] for cell in gap[8:]] == pytest.approx([-2.0, -4.0, -6.0])
 
 
-def test_what_is_not_defined_is_listed(records: list[Record]) -> None:
+def test_undefined_values_are_listed(records: list[Record]) -> None:
     its = records[0].detections["points"]
     values = [math.nan, *its["seen_20"].values[1:]]
     holed = replace(
@@ -478,7 +476,7 @@ def recommended(name: str, role: str) -> Record:
     return replace(record, scores=record.scores | {recommended_score.RECOMMENDED: values, "seen_well": values})
 
 
-def test_the_recommended_score_is_quoted_where_nothing_was_learnt_and_has_no_part_in_what_came_before() -> None:
+def test_the_recommended_score_is_quoted_only_for_untrained_junctions_and_changes_no_earlier_table() -> None:
     its = [recommended("left", "training"), recommended("right", "held out"), recommended("north", "unseen")]
     made = list(recommended_score.tables(its, ["cluster", low_models.SENSOR]))
     found = table(made, f"F cluster {BOXED[0]}")
@@ -502,5 +500,5 @@ def test_the_recommended_score_is_quoted_where_nothing_was_learnt_and_has_no_par
     ]
 
 
-def test_records_without_the_recommended_score_have_no_such_table(all_tables: list[tables.Table]) -> None:
+def test_records_without_the_recommended_score_have_no_table_of_it(all_tables: list[tables.Table]) -> None:
     assert not [its for its in all_tables if its.name.startswith("F")]

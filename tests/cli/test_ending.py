@@ -56,7 +56,7 @@ def test_names_that_an_encoding_does_not_know_are_printed_as_escapes(mini: Path,
 
 @pytest.mark.slow
 @pytest.mark.system
-def test_full_streams_are_told_and_unread_ones_are_not() -> None:
+def test_full_streams_are_reported_and_closed_ones_are_not() -> None:
     full = shell("egvs sensors > /dev/full")
     told = "egvs: standard output, or a file: No space left on device"
     assert (full.returncode, full.stderr.split(" (")[0]) == (1, told)
@@ -66,7 +66,7 @@ def test_full_streams_are_told_and_unread_ones_are_not() -> None:
     assert (unread.returncode in (0, 1), unread.stderr) == (True, "")
 
 
-def test_a_full_disk_is_told_with_the_file_and_the_room(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_with_the_file_and_the_free_space(tmp_path: Path) -> None:
     free_mb = shutil.disk_usage(tmp_path).free / 1e6
     error = OSError(errno.ENOSPC, "Error writing bytes to file", str(tmp_path / "new" / "tpog.parquet"))
     message, code = exit.describe_os_error(error)
@@ -90,7 +90,9 @@ def test_a_full_disk_is_told_with_the_file_and_the_room(tmp_path: Path) -> None:
         (errno.ENOENT, None, 1, "system: No such file or directory"),
     ],
 )
-def test_what_a_user_can_put_right_is_wrong_input(number: int, name: str | int | None, code: int, message: str) -> None:
+def test_errors_that_a_user_can_correct_are_input_errors(
+    number: int, name: str | int | None, code: int, message: str
+) -> None:
     error = OSError(number, os.strerror(number)) if name is None else OSError(number, os.strerror(number), name)
     assert exit.describe_os_error(error) == (message, code)
 

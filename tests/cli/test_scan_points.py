@@ -28,7 +28,7 @@ def clouds(out: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("format_", ["ply", "pcd"])
-def test_the_cloud_is_what_the_scan_returned(mini: Path, run_egvs: Call, out: Path, format_: str) -> None:
+def test_the_cloud_has_the_points_of_the_scan(mini: Path, run_egvs: Call, out: Path, format_: str) -> None:
     assert run_egvs("scan", mini, "--out", out, "--points", "pole_b", "--cloud", format_)[0] == 0
     assert list(clouds(out)) == [f"scan_pole_b.{format_}"]
     points_m, dropped = read_points(out / f"scan_pole_b.{format_}", "here")
@@ -48,7 +48,7 @@ def test_ply_is_the_default_and_sites_may_be_several(mini: Path, run_egvs: Call,
 
 
 @pytest.mark.parametrize("format_", ["ply", "pcd"])
-def test_scans_that_are_not_kept_have_the_same_clouds(mini: Path, run_egvs: Call, out: Path, format_: str) -> None:
+def test_scans_that_are_not_stored_have_the_same_clouds(mini: Path, run_egvs: Call, out: Path, format_: str) -> None:
     arguments = ("scan", mini, "--out", out, "--points", "pole_a", "--cloud", format_)
     assert run_egvs(*arguments)[0] == 0
     kept = clouds(out)

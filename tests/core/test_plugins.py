@@ -133,7 +133,7 @@ def test_sorts_packages_without_name(site: Path) -> None:
         ),
     ],
 )
-def test_message_of_missing_extra_tells_what_to_install(
+def test_message_of_missing_extra_says_what_to_install(
     there: dict[str, None], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in there:

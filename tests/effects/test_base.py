@@ -326,7 +326,7 @@ def test_scan_effects_change_scores_and_write_weights(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SCAN_EFFECTS)
-def test_scans_with_effects_do_not_depend_on_threads_or_on_being_kept(
+def test_scans_with_effects_do_not_depend_on_threads_or_on_storage(
     mini: Path, tmp_path: Path, plain_scan_run: Path, name: str
 ) -> None:
     out = [plain_scan_run.rename(tmp_path / str(jobs)) if jobs == 1 else tmp_path / str(jobs) for jobs in (1, 2, 3)]

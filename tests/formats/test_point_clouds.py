@@ -328,7 +328,7 @@ def test_rejects_laz_that_would_end_the_process(tmp_path: Path) -> None:
 @needs_laspy
 @pytest.mark.system
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="memory cannot be limited on this system")
-def test_rejects_laz_that_asks_for_more_memory_than_the_limit(tmp_path: Path) -> None:
+def test_rejects_laz_that_needs_more_memory_than_the_limit(tmp_path: Path) -> None:
     """A layer of its first chunk says that it has 4 GB, after the first point (30 bytes), a count and eight layers."""
     path, _ = las(tmp_path, "a.laz")
     points_at = struct.unpack_from("<I", path.read_bytes(), 96)[0]
@@ -355,7 +355,7 @@ def overwrite(path: Path, at: int, value: bytes) -> None:
 
 
 @pytest.mark.parametrize("name", ["a.las", "a.laz"])
-def test_message_without_laspy_tells_how_to_install_it(
+def test_message_without_laspy_says_how_to_install_it(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "laspy", None)
@@ -364,7 +364,7 @@ def test_message_without_laspy_tells_how_to_install_it(
 
 
 @needs_laspy
-def test_message_without_lazrs_tells_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_message_without_lazrs_says_how_to_install_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import laspy
 
     path, _ = las(tmp_path, "a.laz")

@@ -208,7 +208,7 @@ def check_sites(folder: Path, poles: int) -> None:
     assert min(Point(a).distance(Point(b)) for a in places for b in places if a != b) >= 5.0
 
 
-def test_sites_are_beside_kerb(made: Made) -> None:
+def test_sites_are_next_to_kerb(made: Made) -> None:
     check_sites(made[0], 12)
 
 

@@ -161,7 +161,7 @@ def test_scoring_again_casts_nothing(done: tuple[Path, Path], monkeypatch: pytes
     assert casts == []
 
 
-def test_scores_are_the_same_without_kept_scans(done: tuple[Path, Path], tmp_path: Path) -> None:
+def test_scores_are_the_same_without_stored_scans(done: tuple[Path, Path], tmp_path: Path) -> None:
     mini, out = done
     lean = tmp_path / "lean"
     egvs.run(egvs.load(mini, ["scan.keep=false"]), lean)

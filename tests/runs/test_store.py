@@ -115,7 +115,7 @@ def test_a_second_folder_makes_nothing(
 
 
 @pytest.mark.slow
-def test_what_sumo_read_and_the_report_draws_is_held_against_its_digest(
+def test_files_read_by_sumo_and_the_report_are_checked_against_their_digests(
     junction: Path, tmp_path: Path, run_egvs
 ) -> None:
     out, scenario = tmp_path / "out", egvs.load(junction)
@@ -150,7 +150,7 @@ def test_a_changed_and_a_former_setting(done: tuple[egvs.Scenario, Path]) -> Non
 
 
 @pytest.mark.slow
-def test_a_file_that_the_kept_stage_does_not_have_goes(mini: Path, tmp_path: Path) -> None:
+def test_a_file_that_the_stored_stage_does_not_have_is_removed(mini: Path, tmp_path: Path) -> None:
     """Hits of sites are kept by one setting, and not by the other."""
     plain, seen = egvs.load(mini), egvs.load(mini, ['score.keep_visibility="all"'])
     egvs.run(plain, tmp_path / "plain")
@@ -161,7 +161,7 @@ def test_a_file_that_the_kept_stage_does_not_have_goes(mini: Path, tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_a_stage_with_options_is_made_and_not_kept(done: tuple[egvs.Scenario, Path], tmp_path: Path, store) -> None:
+def test_a_stage_with_options_runs_and_is_not_stored(done: tuple[egvs.Scenario, Path], tmp_path: Path, store) -> None:
     scenario, _ = done
     options = {"score": {"audit": True}}
     assert states(scenario, tmp_path / "other", options=options)["score"] == "done"
@@ -170,7 +170,7 @@ def test_a_stage_with_options_is_made_and_not_kept(done: tuple[egvs.Scenario, Pa
     assert {e.stage for e in assert_whole(store) if e.folder not in {b.folder for b in before}} == {"report"}
 
 
-def test_a_stage_called_by_itself_is_made_and_kept(done: tuple[egvs.Scenario, Path], tmp_path: Path) -> None:
+def test_a_stage_called_by_itself_runs_and_is_stored(done: tuple[egvs.Scenario, Path], tmp_path: Path) -> None:
     scenario, out = done
     seen: list[str] = []
     run.run_one("statics", scenario, out, listener=lambda _, state, __: seen.append(state))
@@ -278,7 +278,9 @@ def test_several_at_once_make_every_stage_once(mini: Path, tmp_path: Path, store
 
 
 @pytest.mark.slow
-def test_who_comes_second_waits_and_takes_it(done: tuple[egvs.Scenario, Path], tmp_path: Path, store: Path) -> None:
+def test_the_second_run_waits_and_fetches_the_entry(
+    done: tuple[egvs.Scenario, Path], tmp_path: Path, store: Path
+) -> None:
     scenario, out = done
     kept = Store(store)
     entry = next(entry for entry in kept.entries() if entry.stage == "statics")
@@ -315,7 +317,9 @@ def test_killed_at_ten_steps_the_store_is_whole_and_the_next_run_ends_in_the_sam
         assert len(assert_whole(store)) >= len(STAGE_NAMES)
 
 
-def test_what_was_used_longest_ago_goes_first(done: tuple[egvs.Scenario, Path], store: Path, tmp_path: Path) -> None:
+def test_the_least_recently_used_entry_is_removed_first(
+    done: tuple[egvs.Scenario, Path], store: Path, tmp_path: Path
+) -> None:
     kept = Store(store)
     for age, entry in enumerate(sorted(kept.entries(), key=lambda e: e.stage)):
         os.utime(entry.folder / "entry.json", (1e9 - age, 1e9 - age))
@@ -356,7 +360,7 @@ def test_a_store_that_cannot_be_written_is_named_once(
     assert run_egvs("store")[0] == (2 if place == "file" else 0)
 
 
-def test_what_cannot_be_asked_of_the_store_is_named(
+def test_invalid_store_settings_are_named(
     tmp_path: Path, store: Path, monkeypatch: pytest.MonkeyPatch, run_egvs
 ) -> None:
     for words in (("--clear", "--prune"), ("--clear", "--prune", "--max", "2G")):
@@ -384,7 +388,7 @@ def test_an_empty_name_is_no_store(
     assert run_egvs("store")[1].strip() == "EGVS_STORE is empty: results are not cached"
 
 
-def test_by_default_it_lies_beside_the_runs(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_default_store_is_next_to_the_runs(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("EGVS_STORE")
     monkeypatch.chdir(tmp_path)
     egvs.run(egvs.load(mini))
@@ -407,7 +411,7 @@ def test_the_command_line_lists_prunes_and_clears(done: tuple[egvs.Scenario, Pat
         assert (code, message in said) == (2, True), said
 
 
-def test_what_is_not_the_stores_own_is_left_alone(
+def test_foreign_files_in_the_store_are_not_touched(
     mini: Path, tmp_path: Path, store: Path, run_egvs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A folder that somebody else uses, and names as the store where its own lie is not lost."""
@@ -444,7 +448,7 @@ def test_a_run_does_not_go_into_the_store(
     assert not list(store.iterdir())
 
 
-def test_a_run_says_what_it_fetched(done: tuple[egvs.Scenario, Path], tmp_path: Path, run_egvs) -> None:
+def test_a_run_prints_which_stages_it_fetched(done: tuple[egvs.Scenario, Path], tmp_path: Path, run_egvs) -> None:
     scenario, _ = done
     code, printed, said = run_egvs("run", scenario.folder, "--out", tmp_path / "other")
     assert (code, said.count("from store")) == (0, len(STAGE_NAMES)), said
@@ -468,7 +472,7 @@ CHANGED_LINES = {
 
 
 @pytest.mark.slow
-def test_one_changed_line_makes_what_depends_on_it_again(
+def test_one_changed_line_repeats_the_stages_that_depend_on_it(
     mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And nothing else: a stage whose source is another one, and that writes what it wrote before, changes no later
@@ -514,7 +518,7 @@ def test_locks_and_folders_for_work_are_no_links(mini: Path, tmp_path: Path, sto
     assert (tmp_path / "mine").read_text() == "kept"
 
 
-def test_what_an_entry_says_is_json(tmp_path: Path, store: Path) -> None:
+def test_the_record_of_an_entry_is_json(tmp_path: Path, store: Path) -> None:
     kept, out = Store(store), tmp_path / "out"
     out.mkdir()
     (out / "a").write_text("a")

@@ -106,7 +106,7 @@ def test_counts_are_those_of_the_points(on_roads: tuple[model.Scenario, Path]) -
         assert (rows["near_2"]["vehicle_frames"], rows["near_2"]["vehicles"]) == (40, 12)
 
 
-def test_what_it_is_made_from_and_what_it_says_of_itself(on_roads: tuple[model.Scenario, Path]) -> None:
+def test_inputs_and_metadata_of_blind_spots(on_roads: tuple[model.Scenario, Path]) -> None:
     scenario, out = on_roads
     assert {"network", "trajectories.parquet"} <= inputs_of(score, scenario, out).files.keys()
     about = parquet.read_metadata(out / "blindspots.parquet", "blindspots")

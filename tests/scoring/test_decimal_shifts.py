@@ -114,7 +114,7 @@ def test_a_beam_in_a_plane_belongs_to_the_voxel_that_begins_there(tenths: int, p
             assert set(np.nonzero(hits.reshape(grid.shape))[0]) == {plane}
 
 
-def test_what_is_further_from_a_plane_than_a_nanometre_stays_off_it() -> None:
+def test_points_more_than_a_nanometre_from_a_plane_stay_off_it() -> None:
     grid = Grid((0.0, 0.0, 0.0), 0.1, (10, 10, 10))
     o, d = grid.segments((0.3 - 1.1e-9, 0.05, 0.2), np.array([[1e-9, 1.0, 1.1e-9], [0.0, 1.0, -1e-9]]))
     assert o[0] < 3 and o[2] == 2

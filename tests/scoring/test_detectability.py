@@ -45,7 +45,7 @@ def test_as_trees_walked_one_by_one(detector):
 
 @pytest.mark.parametrize("detector", DETECTORS)
 @pytest.mark.parametrize("feature", [name for name, way in MONOTONICITY.items() if way])
-def test_rises_with_what_helps_and_falls_with_what_hinders(detector, feature):
+def test_probability_is_monotonic_in_each_feature(detector, feature):
     x = rows(400)
     column = FEATURES.index(feature)
     low, high = x.copy(), x.copy()

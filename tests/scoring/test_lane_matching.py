@@ -37,7 +37,7 @@ def test_it_leads_the_same_way():
     assert match_lanes(at, yaw, [EAST, EAST_TOO, WEST]).tolist() == [2, 2, 2, -1]
 
 
-def test_where_ways_cross_the_heading_tells():
+def test_heading_decides_where_roads_cross():
     lanes = [line((0, 0), (10, 0)), line((5, -5), (5, 5))]
     assert match_lanes(np.full((2, 2), (5.0, 0.0)), np.array([0.1, math.pi / 2]), lanes).tolist() == [0, 1]
 

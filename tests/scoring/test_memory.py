@@ -52,7 +52,7 @@ def test_the_sums_by_hand() -> None:
     assert occupancy.autocorrelation_time(series) == pytest.approx(largest, abs=1e-3)
 
 
-def test_a_signal_does_not_hide_what_lies_below_it() -> None:
+def test_a_signal_does_not_hide_the_ground_below_it() -> None:
     """The plain sum of a swing of 80 frames cancels within half a cycle; the largest one does not."""
     slow = remembering(20, 4000, 0.9, 2)
     swinging = slow + 1.5 * np.sign(np.sin(2 * np.pi * np.arange(4000) / 80))
@@ -60,7 +60,7 @@ def test_a_signal_does_not_hide_what_lies_below_it() -> None:
 
 
 @pytest.mark.parametrize("series", [np.zeros(9), np.full(9, 3), np.array([5]), np.array([1, -1] * 20)])
-def test_what_does_not_vary_or_alternates_has_no_memory(series: np.ndarray) -> None:
+def test_constant_and_alternating_series_have_no_autocorrelation(series: np.ndarray) -> None:
     assert occupancy.autocorrelation_time(series) == 1.0
 
 
@@ -71,7 +71,7 @@ def test_errors_are_never_narrowed_and_long_records_are_left_alone(lasts: float,
 
 
 @pytest.mark.parametrize(("lasts", "frames", "groups"), [(50, 1000, 10), (50, 2000, 4), (200, 1000, 4), (5, 1000, 10)])
-def test_widening_is_what_the_covariance_itself_says(
+def test_inflation_equals_that_of_the_covariance(
     lasts: float, frames: int, groups: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a series that keeps a share of itself from frame to frame: the variance of its mean, and the scatter of the
@@ -85,7 +85,7 @@ def test_widening_is_what_the_covariance_itself_says(
     assert occupancy.standard_error_inflation(lasts, frames, groups) == pytest.approx(needed, rel=1e-3)
 
 
-def test_groups_are_long_beside_the_memory_where_the_record_allows() -> None:
+def test_groups_are_longer_than_the_correlation_time_if_the_record_allows() -> None:
     assert group_sizes(10, 100, 5.0) == [1] * 10
     assert group_sizes(10, 100, 5.1) == [2] * 5
     assert group_sizes(10, 100, 1000.0) == [3, 3, 2, 2]

@@ -44,7 +44,7 @@ def test_in_the_junction_the_approach_and_the_turn_are_named_to_its_end(tmp_path
     assert said[30.0, -1.6] == said[33.0, -1.0] == ["eastbound left turn in the junction, High Street"]
 
 
-def test_crossings_and_who_walks_are_no_lanes(tmp_path: Path) -> None:
+def test_crossings_and_sidewalks_are_not_lanes(tmp_path: Path) -> None:
     found = RoadLocations.of(read(tmp_path), GRID.roi)
     ((strip, place),) = found.crossings
     assert found.locations[place].words == "pedestrian crossing on the east side of the junction"
@@ -104,7 +104,7 @@ def test_the_compass_has_eight_points() -> None:
     ]  # fmt: skip
 
 
-def test_the_same_words_are_told_apart_by_a_point_or_else_by_name() -> None:
+def test_equal_descriptions_are_made_distinct_by_compass_point_or_name() -> None:
     places = [
         RoadLocation("lane", name, "lane", at) for name, at in (("a", (1.2, 2.0)), ("b", (1.3, 2.0)), ("c", (9.0, 2.0)))
     ]

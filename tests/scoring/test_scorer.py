@@ -30,7 +30,7 @@ def scorer_of(scene, folder) -> Scorer:
     return Scorer(scene, egvs.read_tpog(folder / "tpog.parquet"), folder / "trajectories.parquet")
 
 
-def test_it_gives_what_the_stage_wrote(run):
+def test_scorer_returns_the_scores_of_the_score_stage(run):
     scene, folder = run
     rows = {row["site"]: row for row in egvs.read_scores(folder / "scores.parquet").to_pylist()}
     scanner, scorer = Scanner(scene), scorer_of(scene, folder)

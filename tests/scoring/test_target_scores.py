@@ -47,7 +47,7 @@ def test_a_gain_begins_at_0_rises_and_is_concave(gain):
     assert (np.diff(worth) > 0).all() and (np.diff(worth, 2) < 0).all()
 
 
-def test_the_share_seen_well_stays_below_1_and_tells_small_numbers_apart():
+def test_the_share_seen_well_stays_below_1_and_distinguishes_small_numbers():
     assert saturating_gain(np.array([1e9])) == 1.0 and 0.0 < saturating_gain(np.array([1e-12]))[0] < 1e-12
 
 

@@ -107,7 +107,7 @@ def test_weights_are_reported(mini: Path, tmp_path: Path, run_egvs) -> None:  # 
     assert about["weights"]["kinds"] == {"passenger": 2.0}
 
 
-def test_periods_are_weighted_each_by_itself(mini: Path, tmp_path: Path) -> None:
+def test_each_period_is_weighted_separately(mini: Path, tmp_path: Path) -> None:
     halves = 'traffic.periods=[{name="a", length_s=12}, {name="b", begin_s=12, length_s=8}]'
     run(mini, tmp_path / "run", WEST, halves)
     apart = {

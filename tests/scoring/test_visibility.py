@@ -62,7 +62,7 @@ def test_every_voxel_is_thinned_by_its_range(name: str, sensor: str) -> None:
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_only_voxels_that_are_asked_for_are_touched(name: str) -> None:
+def test_only_requested_voxels_are_changed(name: str) -> None:
     o_m, hits = np.array(SENSORS["inside"]), np.random.default_rng(2).integers(0, 9, len(ALL)).astype(np.uint32)
     table, whole, some = RangeTable.over(FUNCTIONS[name], o_m, GRID), np.empty(len(ALL), np.int64), ALL[5::7]
     table.thin(hits, WHOLE, o_m / GRID.voxel_m, GRID, ALL, whole)
@@ -82,7 +82,7 @@ def test_a_limit_is_met_to_the_last_bit() -> None:
         assert thinned.reshape(GRID.shape)[:, 0, 0].tolist() == [WHOLE] * seen + [0] * (30 - seen)
 
 
-def test_a_smooth_function_is_asked_seldom_and_a_rough_one_for_each_voxel() -> None:
+def test_a_smooth_function_is_evaluated_seldom_and_a_rough_one_for_each_voxel() -> None:
     calls: list[int] = []
 
     def counted(function: ByRange) -> ByRange:

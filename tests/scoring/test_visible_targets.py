@@ -96,7 +96,7 @@ def test_only_vehicles_in_the_region_count_and_all_are_in_the_way():
     assert seen([frame([walker, behind])], beams_to(AT, [])).points.tolist() == [0.0, 0.0]  # a scan without beams
 
 
-def test_what_stands_before_the_car_ends_the_beam_and_a_box_round_the_sensor_is_ignored():
+def test_an_obstacle_before_the_car_ends_the_beam_and_a_box_around_the_sensor_is_ignored():
     beams = beams_to(AT, [[8.0, 0.0, 0.0], [30.0, 0.0, 0.0], [0.0, 0.0, 0.0]])  # the first ends at a wall
     round_it, behind = (101.0, 210.0, 1.0, 4.0, 2.0, 3.0, 0.0), (115.0, 210.0, 1.0, 4.0, 2.0, 1.5, 0.0)
     found = seen([frame([round_it, behind])], beams)
@@ -184,7 +184,7 @@ def test_a_chance_of_one_is_no_effect():
             np.testing.assert_array_equal(getattr(plain, name), getattr(certain, name))
 
 
-def test_what_effects_of_a_scene_notice(tmp_path):
+def test_detection_probability_with_and_without_dropout(tmp_path):
     folder = write_mini(tmp_path / "mini")
     plain = egvs.build_scene(egvs.load(folder))
     assert targets.detection_probability(plain, sensor.CATALOGUE["VLP-16"]) is None

@@ -377,7 +377,7 @@ def test_missing_file_of_period_is_reported_once(street: Path) -> None:
     assert line.startswith("scenario.toml: traffic.periods (a).sumocfg = 'gone.sumocfg': no such file")
 
 
-def test_reports_warnings_beside_errors(street: Path, run_egvs) -> None:
+def test_reports_warnings_as_well_as_errors(street: Path, run_egvs) -> None:
     sites(street, "amid,10,1.6,3")
     code, _, err = run_egvs("run", street, "--set", "traffic.edge_weights={north=2}")
     assert code == 2

@@ -151,7 +151,7 @@ def test_candidate_routes_over_a_location_are_no_detours(town):
     assert not ways.may_drive([where.edges[0], where.edges[0]])
 
 
-def test_isolated_location_is_a_route_by_itself(tmp_path):
+def test_isolated_location_is_a_route_of_its_own(tmp_path):
     """A network without fringe, where an edge weight of 0 excludes no counted vehicle."""
     netgenerate(tmp_path, "--spider", "--spider.arm-number", "3", "--spider.circle-number", "1")
     roads = network.read_net_xml(tmp_path / "net.xml")

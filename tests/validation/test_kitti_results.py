@@ -58,7 +58,7 @@ def test_drops_people_cyclists_and_dont_care(folder):
     assert len(kitti_results.read_kitti_results(folder, POSES, NUMBERS)["mine"]["a"][0].scores) == 1
 
 
-def test_reads_results_beside_export_and_in_data_folder(folder):
+def test_reads_results_next_to_export_and_in_data_folder(folder):
     for site in POSES:
         (folder / site / "velodyne").mkdir()
         (folder / site / "calib").mkdir()

@@ -141,7 +141,7 @@ def test_converts_and_counts_features_in_degrees(tmp_path):
     assert world.solids[0] == ("s_0", "footprint")
 
 
-def test_drops_and_counts_lines_beside_polygon(tmp_path):
+def test_drops_and_counts_lines_next_to_polygon(tmp_path):
     """GDAL makes a collection of a polygon whose thin corner fell together."""
     thin = {"type": "LineString", "coordinates": [[4, 4], [6, 4]]}
     both = {"type": "GeometryCollection", "geometries": [{"type": "Polygon", "coordinates": [SQUARE]}, thin]}

@@ -190,7 +190,7 @@ def read_scans(path: str | Path) -> pa.Table:
 
 
 def read_accuracy(path: str | Path) -> tuple[Rows, dict[str, Any]] | None:
-    """Return the rows and the metadata of ``accuracy.parquet``; None where there is none."""
+    """Return the rows and the metadata of ``accuracy.parquet``; None if the file does not exist."""
     path = Path(path)
     if not path.is_file():
         return None

@@ -131,7 +131,7 @@ class TransmitScore(Effect[P]):
         tpog
             The occupancy grid of the traffic.
         trajectories
-            ``trajectories.parquet``; None where there is none, which is an error for an effect that :attr:`reads` it.
+            ``trajectories.parquet``; None if the run has none, which is an error for an effect that :attr:`reads` it.
         """
         raise NotImplementedError
 

@@ -140,7 +140,7 @@ def point_cloud_crs(path: Path, where: str) -> str | None:
 
 
 def format_of_file(path: Path, where: str) -> str:
-    """Return the module that reads files with this suffix; InputError at ``where`` when there is none."""
+    """Return the module that reads files with this suffix; InputError at ``where`` if no reader knows the suffix."""
     return plugins.plugin_module(GROUP, _readable_suffix(path, _with_path(where, path)))
 
 
@@ -318,7 +318,7 @@ def pack_records(columns: Mapping[str, NDArray[np.generic]]) -> NDArray[np.void]
 
 
 def parse_float(text: str) -> float | None:
-    """Parse a number as Python does, including nan and inf; None if it is none."""
+    """Parse a number as Python does, including nan and inf; None if the text is not a number."""
     try:
         return float(text)
     except ValueError:

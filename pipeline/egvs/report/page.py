@@ -75,7 +75,7 @@ class PageContents:
     stages
         Records of the stages, as far as ``run.json`` has them, in the order of :data:`STAGES`.
     study, by_period, detected, plan
-        Results of other commands and of periods; None if there are none.
+        Results of other commands and of periods; None if those commands have not run.
     """
 
     scenario: Scenario

@@ -134,7 +134,7 @@ class TargetRecord:
         Nose up, (n,) float64.
     gap_m
         Smallest distance in plan from the box's rectangle to that of any other vehicle of the frame, in the region or
-        not, (n,) float64; 0 where they overlap, infinity where there is none. The parts of an articulated vehicle are
+        not, (n,) float64; 0 where they overlap, infinity if there is no other. The parts of an articulated vehicle are
         neighbours of each other, as they are separate boxes; people are not neighbours.
     all_boxes, row
         Every box of the frames, and the index of each row's box, (n,) int64.

@@ -87,7 +87,7 @@ class Scene:
         return self._sensors[name]
 
     def site(self, name: str) -> Site:
-        """Return the site called ``name``; KeyError when there is none."""
+        """Return the site called ``name``; KeyError if no site has this name."""
         return {site.name: site for site in self.sites}[name]
 
     def acting(self, kind: type[Kind], stage: str | None = None) -> tuple[Kind, ...]:

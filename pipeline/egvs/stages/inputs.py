@@ -86,7 +86,7 @@ class Inputs:
 
     @cached_property
     def common_network(self) -> Network | None:
-        """The network that the traffic of all periods drives on; None where there is none, or several."""
+        """The network that the traffic of all periods drives on; None if there is no network or more than one."""
         if self.common_network_path is None:
             return None
         if not self.scenario.traffic.periods:
@@ -243,7 +243,7 @@ def missing_files(inputs: Inputs) -> Iterator[Diagnostic]:
 
 
 def file_digests(inputs: Inputs) -> dict[str, str]:
-    """Return the sha256 of every file that the check stage reads, ``MISSING`` where there is none.
+    """Return the sha256 of every file that the check stage reads, ``MISSING`` if it does not exist.
 
     Measured scans are not opened; only whether they exist counts.
     """

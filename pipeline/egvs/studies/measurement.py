@@ -175,7 +175,7 @@ class SettingRunner:
         return scenario.with_effects(scenario.effects.without(setting.without))
 
     def saved_scores(self, setting: Setting) -> SettingScores | None:
-        """Read the scores of an earlier run; None if there are none, or if times of a stage were removed."""
+        """Read the scores of an earlier run; None if that run has none, or if times of a stage were removed."""
         path = self._result(setting)
         if not path.is_file():
             return None

@@ -561,7 +561,7 @@ def _draw_ends(ends: Sequence[int], weights: FloatArray, rng: np.random.Generato
 
 
 def _follow(towards: IntArray, start: int, end: int) -> list[int]:
-    """Return the way from ``start`` to ``end``; empty where there is none."""
+    """Return the way from ``start`` to ``end``; empty if there is no way."""
     way = [start]
     while way[-1] != end:
         following = int(towards[way[-1]])

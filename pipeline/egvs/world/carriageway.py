@@ -128,7 +128,7 @@ class Carriageway:
         return int(self._tree.nearest(shapely.points(at_m)))
 
     def within(self, low_m: Corner, high_m: Corner) -> BaseGeometry:
-        """Return all lanes in a rectangle as one shape, empty where there is none."""
+        """Return all lanes in a rectangle as one shape; empty if there are no lanes."""
         import shapely
 
         box = shapely.box(*low_m[:2], *high_m[:2])

@@ -93,7 +93,7 @@ def empty_scan_points(view: SiteView) -> FloatArray:
 
 
 def _fit_surface(lowest_m: FloatArray, fallback_m: float) -> FloatArray:
-    """Return the ground of every square from the lowest return of each, infinite where there is none."""
+    """Return the ground of every square from the lowest return of each, infinite where no beam returned."""
     has_return = np.isfinite(lowest_m)
     if not has_return.any():
         return np.full(lowest_m.shape, fallback_m)
