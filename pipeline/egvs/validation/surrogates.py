@@ -150,7 +150,7 @@ class Occupancy:
 
     @cached_property
     def lowest(self) -> IntArray:
-        """Return the lowest layer that is ever occupied in each column of voxels, (nx, ny) int64; -1 if there is none."""
+        """Return the lowest layer that is ever occupied in each column of voxels, (nx, ny) int64; -1 if none."""
         occupied = self.tpog.counts > 0
         return np.where(occupied.any(axis=2), occupied.argmax(axis=2), -1)
 
