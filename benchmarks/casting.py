@@ -54,10 +54,10 @@ def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:
         mesh = ray_triangle.TriangleMesh(caster._triangles, caster._planes)
         rays = ray_triangle.Rays(o, beam, directions, sensor.range_m)
         filled = np.empty(count), np.empty(count, dtype=np.int64)
-        ends, doubtful = (np.empty((count, 3)), np.empty(count, dtype=np.bool_)), np.empty(count, dtype=np.int64)
+        ends, ambiguous = (np.empty((count, 3)), np.empty(count, dtype=np.bool_)), np.empty(count, dtype=np.int64)
         hits = ray_triangle.Hits(*filled, *ends)
-        settled = (tree.nearest(o, beam, directions), caster._owner, mesh, rays, hits, doubtful)
-        some = doubtful[: ray_triangle.resolve_hits(*settled)]
+        settled = (tree.nearest(o, beam, directions), caster._owner, mesh, rays, hits, ambiguous)
+        some = ambiguous[: ray_triangle.resolve_hits(*settled)]
         searched = (some, mesh, ray_triangle.BoxTree(caster._boxes, caster._level_starts), rays, hits)
         jobs.append(
             (
@@ -88,7 +88,7 @@ def rows() -> list[tuple[Any, ...]]:
     """Return a row for each part: what, ratio to Embree alone, and share of the complete cast."""
     table: list[tuple[Any, ...]] = []
     for name in ("nishishinjuku", "ingolstadt", "hill", "roundabout"):
-        work, beams, doubtful = _work(name)
+        work, beams, ambiguous = _work(name)
         times: dict[str, list[float]] = {part: [] for part in work}
         for _ in range(_ROUNDS):
             for part, do in work.items():
@@ -101,7 +101,7 @@ def rows() -> list[tuple[Any, ...]]:
                 for base in (next(iter(work)), "complete cast")
             ]
             table.append((f"{name}: {part}", f"{against[0]:.2f} x Embree alone", f"{against[1]:.1%} of the cast"))
-        table.append((f"{name}: {doubtful} of {beams} beams were uncertain", f"{doubtful / beams:.2%}"))
+        table.append((f"{name}: {ambiguous} of {beams} beams were uncertain", f"{ambiguous / beams:.2%}"))
     return table
 
 

@@ -22,7 +22,7 @@ from egvs.artefacts.readers import read_scores
 from egvs.artefacts.tpog import read_tpog
 from egvs.artefacts.traffic_frames import read_trajectories
 from egvs.effects import registry
-from egvs.effects.registry import SELF_ACTIVATING
+from egvs.effects.registry import AUTO_ENABLED
 from egvs.report.basemap import network_file, roads_within, world_outlines
 from egvs.report.maps import Backdrop, SiteViewFigure, site_view
 from egvs.report.ranking import RankedSite
@@ -127,7 +127,7 @@ def side_view(out: Path, pitched: bool) -> str:
 
 def main() -> None:
     """Draw all pictures."""
-    assert set(EXAMPLES) == set(registry.effect_names()) - set(SELF_ACTIVATING)  # slopes cannot be switched off
+    assert set(EXAMPLES) == set(registry.effect_names()) - set(AUTO_ENABLED)  # slopes cannot be switched off
     (IMAGES / "effects").mkdir(parents=True, exist_ok=True)
     bodies_picture.draw(IMAGES / "bodies.png")
     with tempfile.TemporaryDirectory() as temporary:

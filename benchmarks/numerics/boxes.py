@@ -74,10 +74,10 @@ def depth_in(box, low, voxel_m):
 
 
 @_kernel
-def compare(values, shape, voxel_m, doubtful, nearest):
+def compare(values, shape, voxel_m, ambiguous, nearest):
     """Count each box by itself and compare.
 
-    Returns how many voxels differ, how many pairs there were, and how many entries of ``doubtful`` (box, ix, iy, iz,
+    Returns how many voxels differ, how many pairs there were, and how many entries of ``ambiguous`` (box, ix, iy, iz,
     what the kernel says) are filled: pairs within UNSURE_M of the bound. ``nearest`` gets each box's least distance of
     a depth to the bound."""
     nx, ny, nz = shape[0], shape[1], shape[2]
@@ -110,8 +110,8 @@ def compare(values, shape, voxel_m, doubtful, nearest):
                     pairs += 1
                     nearest[b] = min(nearest[b], abs(deep - 1e-4))
                     if abs(deep - 1e-4) <= UNSURE_M:
-                        if n < doubtful.shape[0]:
-                            doubtful[n, 0], doubtful[n, 1], doubtful[n, 2], doubtful[n, 3], doubtful[n, 4] = (
+                        if n < ambiguous.shape[0]:
+                            ambiguous[n, 0], ambiguous[n, 1], ambiguous[n, 2], ambiguous[n, 3], ambiguous[n, 4] = (
                                 b,
                                 ix,
                                 iy,
@@ -127,13 +127,13 @@ def compare(values, shape, voxel_m, doubtful, nearest):
 
 def check(values, shape, voxel_m):
     """Return numbers of pairs: all, decided in 50 digits, within 1e-10 m of the bound, and wrong."""
-    doubtful, nearest = np.empty((40 * len(values) + 100, 5), np.int64), np.empty(len(values))
-    wrong, pairs, n = compare(values, np.asarray(shape, np.int64), voxel_m, doubtful, nearest)
-    assert n <= len(doubtful)
+    ambiguous, nearest = np.empty((40 * len(values) + 100, 5), np.int64), np.empty(len(values))
+    wrong, pairs, n = compare(values, np.asarray(shape, np.int64), voxel_m, ambiguous, nearest)
+    assert n <= len(ambiguous)
     excluded = 0
     with mpmath.workdps(oracle.DIGITS):
         bound, margin, voxel = mpmath.mpf(100001) / 10**9, mpmath.mpf(1) / 10**10, mpmath.mpf(voxel_m)
-        for b, ix, iy, iz, counted in doubtful[:n].tolist():
+        for b, ix, iy, iz, counted in ambiguous[:n].tolist():
             exact = oracle.depth(*oracle.exact_box(values[b]), [ix * voxel, iy * voxel, iz * voxel], voxel) - bound
             if abs(exact) <= margin:
                 excluded += 1
@@ -203,9 +203,9 @@ def real(scale):
     scenario = egvs.load(ROOT / "scenarios" / "nishishinjuku", [f"traffic.frames={frames}"])
     grid, recorded = scenario.roi.grid, recorded_boxes(scenario)
     frame, values = recorded.frame, recorded.values
-    doubtful, nearest = np.empty((len(values), 5), np.int64), np.empty(len(values))
+    ambiguous, nearest = np.empty((len(values), 5), np.int64), np.empty(len(values))
     selected = np.ascontiguousarray(values[:: max(1, round(1 / max(scale, 1e-9) / 2))])
-    wrong, pairs, _ = compare(selected, np.asarray(grid.shape, np.int64), grid.voxel_m, doubtful, nearest)
+    wrong, pairs, _ = compare(selected, np.asarray(grid.shape, np.int64), grid.voxel_m, ambiguous, nearest)
     close = int((nearest[: len(selected)] <= 1e-9).sum())
     before = count_occupancy(recorded, grid, frames)
     turned = 0

@@ -138,9 +138,9 @@ def check(o, d, shape, voxel_m):
     excluded = mismatches = 0
     for i in np.flatnonzero(verdict):
         wrong = walk(o[i], d[i], shape, voxel_m) ^ oracle.crossed(o[i], d[i], shape, voxel_m)
-        doubtful = oracle.doubtful(o[i], d[i], shape, voxel_m)
-        excluded += bool(doubtful)
-        mismatches += not wrong <= doubtful
+        ambiguous = oracle.ambiguous(o[i], d[i], shape, voxel_m)
+        excluded += bool(ambiguous)
+        mismatches += not wrong <= ambiguous
     return excluded, mismatches, int((verdict > 0).sum())
 
 
@@ -381,10 +381,10 @@ def in_decimals(scale):
             result.append(walk(o, d[0], shape, grid.voxel_m))
         exact_o, exact_d = oracle.in_world(site, np.add(beam_m, noise).tolist(), origin, grid.voxel_m)
         in_plane += any(c.denominator == 1 and not x for c, x in zip(exact_o, exact_d, strict=True))
-        doubtful = oracle.doubtful(exact_o, exact_d, shape, Fraction(tenths, 10))
-        excluded += bool(doubtful)
+        ambiguous = oracle.ambiguous(exact_o, exact_d, shape, Fraction(tenths, 10))
+        excluded += bool(ambiguous)
         wrong = result[1] ^ oracle.crossed(exact_o, exact_d, shape, Fraction(tenths, 10))
-        mismatches += result[0] != result[1] or not wrong <= doubtful
+        mismatches += result[0] != result[1] or not wrong <= ambiguous
     tested = f"rational arithmetic on the decimals, and the same moved by up to 4000 km; {in_plane} beams in a plane"
     return Row("beams on tenths of a metre, voxels of 0.1 to 0.3 m", RULE, tested, 2 * n, excluded, mismatches, "-")
 

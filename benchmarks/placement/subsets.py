@@ -19,7 +19,7 @@ import egvs
 from egvs.artefacts.run_record import RunRecord
 from egvs.placement import plan, problem_builder, solver
 from egvs.placement.plan import REQUIRED_STAGES
-from egvs.runs import run, stage_keys
+from egvs.runs import run, stage_registry
 from egvs.stages.inputs import open_folder
 
 SCENARIOS = Path(__file__).parent.parent.parent / "scenarios"
@@ -37,7 +37,7 @@ def _subsets(out: Path) -> None:
     scenario = egvs.load(SCENARIOS / "nishishinjuku", ["placement.count=4"])
     record: RunRecord = run.run(scenario, out)
     built = problem_builder.build_problem(
-        open_folder(scenario, out, recorded=stage_keys.recorded_digests(record)), lambda _: None
+        open_folder(scenario, out, recorded=stage_registry.recorded_digests(record)), lambda _: None
     )
     for count in (1, 2, 3, 4):
         problem = built.problem.with_count(count)

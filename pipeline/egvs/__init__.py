@@ -22,7 +22,7 @@ Any pose, not only the scenario's sites, in milliseconds::
     pose = egvs.Pose(x_m=12.0, y_m=30.0, z_m=4.5, yaw_deg=180.0)
     scorer.score(scanner.scan(pose, scene.sensor("VLP-32C"))).egvs
 
-Several poses together, and plans with what is proved of them::
+Several poses together, and plans with proven bounds on their quality::
 
     joint = egvs.JointScore.of(scenario, "runs/trial")
     joint.add("c03")

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 import egvs
-from egvs.runs import stage_keys
+from egvs.runs import stage_keys, stage_registry
 
 PACKAGE = Path(egvs.__file__).parent
 STAGES = ("check", "statics", "scan", "traffic", "tpog", "score", "report")
@@ -76,11 +76,11 @@ def test_finds_every_kind_of_import() -> None:
     assert imports_by_syntax_tree(KINDS_OF_IMPORT, "x.y") == set(expected)
 
 
-ROOTS = [(stage.module, *stage.code) for stage in map(stage_keys.stage, STAGES)]
+ROOTS = [(stage.module, *stage.code) for stage in map(stage_registry.stage, STAGES)]
 
 DIGESTS = f"""
 import json
-from egvs.runs import stage_keys
+from egvs.runs import stage_keys, stage_registry
 print(json.dumps([stage_keys.source_digest(*modules).digest for modules in {ROOTS}]))
 """
 
@@ -196,7 +196,7 @@ def code_lines(path: Path) -> int:
 
 @pytest.mark.parametrize("name", SOURCE_BEFORE)
 def test_source_behind_stage_key_stays_small(name: str) -> None:
-    stage = stage_keys.stage(name)
+    stage = stage_registry.stage(name)
     modules = [module for module in stage_keys.source_modules(stage.module, *stage.code) if module.startswith("egvs")]
     paths = [stage_keys._module_path(module) for module in modules]
     # An __init__.py lists public names and computes nothing.

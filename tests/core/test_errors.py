@@ -1,4 +1,4 @@
-"""What was found wrong or doubtful, and how it travels."""
+"""What was found wrong or ambiguous, and how it travels."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ def hits_along_beam(one_beam_run: tuple[Path, Path], *settings: str) -> np.ndarr
 
 
 def make_effect(name: str, **parameters: object) -> Effect:
-    return registry.make_effect(name, registry.find_effect_class(name).Model.from_dict(parameters))
+    return registry.make_effect(name, registry.load_effect_class(name).Model.from_dict(parameters))
 
 
 def make_scene(score_run: tuple[Path, Path], *settings: str) -> Scene:

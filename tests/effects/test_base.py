@@ -24,7 +24,7 @@ from egvs.effects.foliage import Foliage
 from egvs.effects.mount_sway import MountSway
 from egvs.effects.mount_sway import tilt_nodes as sway_nodes
 from egvs.effects.rain import Rain
-from egvs.effects.registry import find_effect_class
+from egvs.effects.registry import load_effect_class
 from egvs.runs import run
 from egvs.scenario.effects_config import (
     DivergenceParameters,
@@ -171,7 +171,7 @@ def test_why_idle_of_detect_effects(score_run: tuple[Path, Path]) -> None:
 
 @pytest.mark.parametrize("name", ACTIVE)
 def test_detect_effects_name_their_source(name: str) -> None:
-    kind = registry.find_effect_class(name)
+    kind = registry.load_effect_class(name)
     assert (kind.NAME, issubclass(kind, Detect)) == (name, True)
     assert len(kind.SOURCE) > 20
     assert all(field.description for field in kind.Model.model_fields.values())
@@ -512,7 +512,7 @@ def test_idle_traffic_effects_do_not_change_the_traffic(flat_road, plain_traffic
     assert actual == plain_traffic[0]
     name = next(iter(effects))
     assert re.fullmatch(rf"{name}: set, but .*: skipped, the result is the same", result["notes"][-1])
-    reason = find_effect_class(name)(scene.effects.named[name]).why_idle(Scene(scene, None, ()))
+    reason = load_effect_class(name)(scene.effects.named[name]).why_idle(Scene(scene, None, ()))
     assert reason and reason in result["notes"][-1]
     assert inputs_of(traffic, scene, tmp_path) == inputs_of(traffic, road_scenario(flat_road, **SMALL), tmp_path)
 

@@ -138,7 +138,7 @@ def test_rejects_plugin_that_is_not_an_effect_of_that_name(site: Path, source: s
     install(site, "somebody-elses", "zz = plug_z:Half", {"plug_z": source}, "egvs.effects")
     where = r"\(entry point 'plug_z:Half' of the package somebody-elses\)"
     with pytest.raises(MissingBackendError, match=f"^'zz' of egvs.effects cannot be loaded: {problem}.*{where}"):
-        registry.find_effect_class("zz")
+        registry.load_effect_class("zz")
 
 
 @pytest.mark.system

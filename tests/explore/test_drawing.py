@@ -138,7 +138,7 @@ def test_quaternion_rotates_like_beams(angles: tuple[float, float, float]) -> No
 
 @given(ANGLES)
 def test_angles_of_quaternion_are_restored(angles: tuple[float, float, float]) -> None:
-    again = drawing.quaternion_angles_deg(drawing.pose_quaternion(Pose(0, 0, 0, *angles)))
+    again = drawing.quaternion_to_yaw_pitch_roll_deg(drawing.pose_quaternion(Pose(0, 0, 0, *angles)))
     away = [math.remainder(a - b, 360.0) for a, b in zip(again, angles, strict=True)]
     assert np.allclose(away, 0.0, atol=1e-6)
 
@@ -146,7 +146,7 @@ def test_angles_of_quaternion_are_restored(angles: tuple[float, float, float]) -
 @pytest.mark.parametrize("pitch", [90.0, -90.0])
 @pytest.mark.parametrize(("yaw", "roll"), [(0.0, 0.0), (30.0, 0.0), (-120.0, 50.0)])
 def test_vertical_sensor_has_equivalent_angles(yaw: float, pitch: float, roll: float) -> None:
-    result = drawing.quaternion_angles_deg(drawing.pose_quaternion(Pose(0, 0, 0, yaw, pitch, roll)))
+    result = drawing.quaternion_to_yaw_pitch_roll_deg(drawing.pose_quaternion(Pose(0, 0, 0, yaw, pitch, roll)))
     assert result[1:] == (pitch, 0.0)
     assert np.allclose(rotation_world_sensor(*result), rotation_world_sensor(yaw, pitch, roll), atol=1e-6)
 

@@ -10,7 +10,7 @@ import egvs
 from egvs.core.errors import InputError
 from egvs.explore.session import Session
 from egvs.explore.settings import SessionFactory, Settings, offered_effects, open_session, trial_parameters
-from egvs.runs import stage_keys
+from egvs.runs import stage_registry
 from tests.explore.test_session import MOVED, scored, write_site
 from tests.explore.test_session import SITES as FOUR_SITES
 
@@ -72,9 +72,9 @@ def test_only_stages_that_depend_on_a_setting_run(
     session: Session, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("EGVS_STORE", "")  # else it would come from there
-    made, make = [], stage_keys.run_stage
+    made, make = [], stage_registry.run_stage
     monkeypatch.setattr(
-        stage_keys, "run_stage", lambda name, *args, **more: (made.append(name), make(name, *args, **more))[1]
+        stage_registry, "run_stage", lambda name, *args, **more: (made.append(name), make(name, *args, **more))[1]
     )
     SessionFactory(session, tmp_path / "scratch").session(Settings(2.5, "egvs", frozenset()))
     assert made == ["score"]

@@ -326,8 +326,8 @@ def test_small_traffic_agrees_with_brute_force():
     rng = np.random.default_rng(5)
     shape, frames = (6, 6, 5), 12
     frame, values = traffic_of(rng, frames, crowd=9)
-    expected, doubtful = oracle.tpog(frame, values, shape, VOXEL_M, frames)
-    assert doubtful == 0
+    expected, ambiguous = oracle.tpog(frame, values, shape, VOXEL_M, frames)
+    assert ambiguous == 0
     expected = np.array(expected)
     assert expected.max() >= 3
     assert np.array_equal(count(frame, values, grid_of(shape), frames), expected)
@@ -523,8 +523,8 @@ def hard_boxes():
         [0.9, 0.8, 0.63, 2.1, -0.5, 1.1, 0.4, 0.1],
         *stack((0, 1), (3, 4), (3, 5), (0, 2)),
     ])  # fmt: skip
-    expected, doubtful = oracle.tpog(frame, values, SHAPE, VOXEL_M, 7)
-    assert doubtful == 0
+    expected, ambiguous = oracle.tpog(frame, values, SHAPE, VOXEL_M, 7)
+    assert ambiguous == 0
     return frame, values, np.array(expected)
 
 

@@ -108,8 +108,10 @@ def test_hard_segment(entry, backwards):
     o, d = converted(start, beam, origin, voxel_m, shape)
     found = march_voxels(o, d, shape, voxel_m)
     wrong = found ^ oracle.crossed(o, d, shape, voxel_m)
-    assert wrong <= oracle.doubtful(o, d, shape, voxel_m)
-    assert bool(oracle.doubtful(o, d, shape, voxel_m)) == entry.get("excluded", False), "excluded are those built to be"
+    assert wrong <= oracle.ambiguous(o, d, shape, voxel_m)
+    assert bool(oracle.ambiguous(o, d, shape, voxel_m)) == entry.get("excluded", False), (
+        "excluded are those built to be"
+    )
     exact_o, exact_d = oracle.in_world(start, beam, origin, voxel_m)
     if exact_o == [Fraction(x) for x in o] and exact_d == [Fraction(x) for x in d]:
         return
@@ -132,7 +134,7 @@ def test_reversed_hard_segments_cross_same_voxels():
         ]:
             continue  # turned round it would be another segment
         turned += 1
-        assert march_voxels(end, -d, shape, voxel_m) ^ march_voxels(o, d, shape, voxel_m) <= oracle.doubtful(
+        assert march_voxels(end, -d, shape, voxel_m) ^ march_voxels(o, d, shape, voxel_m) <= oracle.ambiguous(
             o, d, shape, voxel_m
         ), entry["name"]
     assert turned > 60
@@ -221,7 +223,7 @@ def test_random_segment_agrees_with_rational_arithmetic(segment):
     wrong = march_voxels(o, d, SHAPE, voxel_m) ^ oracle.crossed(o, d, SHAPE, voxel_m)
     if wrong:
         event("a chord within 1e-8 m of the bound")
-    assert wrong <= oracle.doubtful(o, d, SHAPE, voxel_m)
+    assert wrong <= oracle.ambiguous(o, d, SHAPE, voxel_m)
 
 
 @pytest.mark.slow
@@ -237,7 +239,7 @@ def test_random_segment_agrees_with_rational_arithmetic(segment):
 def test_any_finite_segment_terminates(o, d, near):
     """From anywhere: bounded, within the grid, nothing twice. From nearby, to anywhere: also correct."""
     march_voxels(o, d, SHAPE, 0.25)
-    assert march_voxels(near, d, SHAPE, 0.25) ^ oracle.crossed(near, d, SHAPE, 0.25) <= oracle.doubtful(
+    assert march_voxels(near, d, SHAPE, 0.25) ^ oracle.crossed(near, d, SHAPE, 0.25) <= oracle.ambiguous(
         near, d, SHAPE, 0.25
     )
 
@@ -252,7 +254,7 @@ def test_reversed_segment_crosses_same_voxels(segment):
     exact = all(Fraction(e) == Fraction(a) + Fraction(b) for e, a, b in zip(end, o, d, strict=True))
     event("exact" if exact else "the end is rounded")
     if exact:
-        assert march_voxels(o, d, SHAPE, voxel_m) ^ march_voxels(end, back, SHAPE, voxel_m) <= oracle.doubtful(
+        assert march_voxels(o, d, SHAPE, voxel_m) ^ march_voxels(end, back, SHAPE, voxel_m) <= oracle.ambiguous(
             o, d, SHAPE, voxel_m
         )
 
@@ -283,7 +285,7 @@ def test_moving_ends_by_a_nanometre_changes_fragile_voxels_only(segment, by_star
         by_chord, along_face = oracle.fragile(o, d, SHAPE, voxel_m, 1.01e-9)
         event(f"changed; along a face plane: {bool(along_face)}")
         # A voxel that float64 is not held to (a chord within 1e-8 m of the bound) may have been decided either way.
-        assert before ^ after <= by_chord | along_face | oracle.doubtful(o, d, SHAPE, voxel_m)
+        assert before ^ after <= by_chord | along_face | oracle.ambiguous(o, d, SHAPE, voxel_m)
 
 
 def test_fragile_segments_are_those_constructed():
@@ -366,9 +368,9 @@ def test_corners_of_long_grid_from_1e7_m():
         o = corner + aside + [0.0, 0.0, 0.5] - far * u
         d = 2 * far * u
         wrong = march_voxels(o, d, shape, voxel_m) ^ oracle.crossed(o, d, shape, voxel_m)
-        doubtful = oracle.doubtful(o, d, shape, voxel_m)
-        excluded += bool(doubtful)
-        assert wrong <= doubtful
+        ambiguous = oracle.ambiguous(o, d, shape, voxel_m)
+        excluded += bool(ambiguous)
+        assert wrong <= ambiguous
     assert excluded < 15
 
 
@@ -382,8 +384,8 @@ def test_error_beyond_documented_range():
         o = target - u / math.hypot(*u) * 1e9 / 0.25
         d = 2 * (target - o)
         differing = march_voxels(o, d, SHAPE, 0.25) ^ oracle.crossed(o, d, SHAPE, 0.25)
-        assert differing <= oracle.doubtful(o, d, SHAPE, 0.25, Fraction(45, 10**8))
-        wrong += bool(differing - oracle.doubtful(o, d, SHAPE, 0.25))
+        assert differing <= oracle.ambiguous(o, d, SHAPE, 0.25, Fraction(45, 10**8))
+        wrong += bool(differing - oracle.ambiguous(o, d, SHAPE, 0.25))
     assert wrong < 5
 
 
@@ -496,7 +498,7 @@ def test_detects_fault_in_march(fault):
         except (IndexError, AssertionError, ValueError, OverflowError):
             shown.append(entry["name"])
             continue
-        if not wrong <= oracle.doubtful(o, d, shape, voxel_m):
+        if not wrong <= oracle.ambiguous(o, d, shape, voxel_m):
             shown.append(entry["name"])
     assert bool(shown) == (fault != "none"), shown
 

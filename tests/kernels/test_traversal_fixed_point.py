@@ -41,8 +41,8 @@ def list_voxels(kernels, o, d, shape, voxel_m):
 
 @cache
 def exact(o, d, shape, voxel_m):
-    """The voxels by rational arithmetic; None where one is doubtful."""
-    return None if oracle.doubtful(o, d, shape, voxel_m) else oracle.crossed(o, d, shape, voxel_m)
+    """The voxels by rational arithmetic; None where one is ambiguous."""
+    return None if oracle.ambiguous(o, d, shape, voxel_m) else oracle.crossed(o, d, shape, voxel_m)
 
 
 def agrees_with_exact_march(kernels, o, d, shape, voxel_m):

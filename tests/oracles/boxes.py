@@ -122,17 +122,17 @@ def occupied(box: Any, shape: Any, voxel_m: float) -> tuple[set[tuple[int, int, 
 
 
 def tpog(frames: Any, values: Any, shape: Any, voxel_m: float, total: int) -> tuple[Any, int]:
-    """Frames in which each voxel is occupied (nested lists by ix, iy, iz), box by box and frame by frame; and doubtful
+    """Frames in which each voxel is occupied (nested lists by ix, iy, iz), box by box and frame by frame; and ambiguous
     pairs."""
     counts = [[[0] * shape[2] for _ in range(shape[1])] for _ in range(shape[0])]
-    doubtful = 0
+    ambiguous = 0
     for frame in range(total):
         here: set[tuple[int, int, int]] = set()
         for f, box in zip(frames, values, strict=True):
             if f == frame:
                 inside, unsure = occupied(box, shape, voxel_m)
                 here |= inside
-                doubtful += len(unsure)
+                ambiguous += len(unsure)
         for i, j, k in here:
             counts[i][j][k] += 1
-    return counts, doubtful
+    return counts, ambiguous

@@ -93,7 +93,7 @@ def crossed(o: Sequence[Number], d: Sequence[Number], shape: Sequence[int], voxe
     return {voxel for voxel, share in shares(o, d, shape).items() if longer(share, length2, CHORD_M)}
 
 
-def doubtful(
+def ambiguous(
     o: Sequence[Number], d: Sequence[Number], shape: Sequence[int], voxel_m: Number, margin_m: Fraction = MARGIN_M
 ) -> set[Voxel]:
     """The voxels whose chord lies within the margin of 1 micrometre: no program in float64 is held to those."""
@@ -130,5 +130,5 @@ def fragile(
         if longer(share, length2, CHORD_M - 2 * moved)
         and not longer(inner.get(voxel, ZERO), length2, CHORD_M + 2 * moved)
     }
-    by_chord = found & doubtful(o, d, shape, voxel_m)
+    by_chord = found & ambiguous(o, d, shape, voxel_m)
     return by_chord, found - by_chord

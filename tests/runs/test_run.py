@@ -20,7 +20,7 @@ from egvs.core import files
 from egvs.core.errors import InputError, RunError
 from egvs.core.files import add_checksum
 from egvs.report.ranking import RankedSite
-from egvs.runs import run, stage_keys, verification
+from egvs.runs import run, stage_registry, verification
 from egvs.runs.run import lock_run_folder
 from egvs.world import ray_casting
 from tests import processes
@@ -132,7 +132,7 @@ def test_rejected_run_leaves_folder_unchanged(done: tuple[Path, Path], settings:
 def test_interrupted_run_records_one_scenario(done: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     """Of what was made by then, and of no score of the scenario before; what did not change is not made again."""
     mini, out = done
-    other, make = egvs.load(mini, ["statics.ground=false", "traffic.frames=20"]), stage_keys.run_stage
+    other, make = egvs.load(mini, ["statics.ground=false", "traffic.frames=20"]), stage_registry.run_stage
 
     def fails(name: str, *rest: object, **options: object) -> object:
         if name == "traffic":
@@ -140,7 +140,7 @@ def test_interrupted_run_records_one_scenario(done: tuple[Path, Path], monkeypat
         return make(name, *rest, **options)  # type: ignore[arg-type]
 
     with monkeypatch.context() as patch:
-        patch.setattr(stage_keys, "run_stage", fails)
+        patch.setattr(stage_registry, "run_stage", fails)
         with pytest.raises(RunError):
             run.run(other, out)
     record = json.loads((out / "run.json").read_text())

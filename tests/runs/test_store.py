@@ -24,8 +24,8 @@ from egvs.artefacts.run_folder import STAGE_NAMES
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.resource_usage import ResourceUsage
-from egvs.runs import run, stage_keys, verification
-from egvs.runs.stage_keys import StageResult
+from egvs.runs import run, stage_keys, stage_registry, verification
+from egvs.runs.stage_registry import StageResult
 from egvs.runs.store import Store, StoreEntry
 from tests.runs import children
 from tests.runs.children import Child, Job
@@ -99,7 +99,7 @@ def test_a_second_folder_makes_nothing(
         raise AssertionError("a stage was made")
 
     with monkeypatch.context() as patched:
-        patched.setattr(stage_keys, "run_stage", refuse)
+        patched.setattr(stage_registry, "run_stage", refuse)
         assert set(states(scenario, other).values()) == {"fetched"}
         assert set(states(scenario, other).values()) == {"skipped"}
     names = {p.relative_to(one).as_posix() for p in one.rglob("*") if p.is_file()}

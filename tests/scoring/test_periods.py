@@ -199,7 +199,7 @@ def test_standard_errors_of_mix_and_periods_are_reported(split: Path, tmp_path: 
     day, night = summary["standard_errors_from"].split("; ")
     assert day.startswith("day: 4 blocks of 6 frames")
     assert night.startswith("night: 4 blocks of 4 frames")
-    doubts = [finding for finding in collect_warnings([summary]) if finding.rule == "traffic's memory"]
+    doubts = [finding for finding in collect_warnings([summary]) if finding.rule == "traffic autocorrelation"]
     assert doubts
     assert {finding.where for finding in doubts} <= {
         f"scenario.toml: traffic.periods ({name}).length_s" for name in ("day", "night")

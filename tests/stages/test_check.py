@@ -467,7 +467,7 @@ def test_map_is_converted_once(street: Path, monkeypatch: pytest.MonkeyPatch) ->
     scenario = egvs.load(street, ['traffic.network="map.osm"'])
     assert check.check_scenario(scenario).lanes == 2
     egvs.build_scene(scenario)
-    sumo_folder.convert_osm(street / "map.osm", street / "again.net.xml")
+    sumo_folder.convert_osm_to_network(street / "map.osm", street / "again.net.xml")
     assert (street / "again.net.xml").read_text() == (street / "net.net.xml").read_text()
     (street / "map.osm").write_text("<osm> </osm>")
     sumo_folder.read_network(scenario)

@@ -14,7 +14,7 @@ import egvs
 from egvs.core import files
 from egvs.core.errors import RunError
 from egvs.core.resource_usage import measure_usage
-from egvs.runs import stage_keys
+from egvs.runs import stage_keys, stage_registry
 from egvs.runs.store import Store
 from egvs.scoring.scorer import Scorer
 from egvs.stages.inputs import get_scene, open_folder
@@ -64,7 +64,7 @@ def test_cached_stages_count_with_their_original_time_until_they_are_measured(mi
     record = egvs.run(egvs.load(mini), tmp_path / "run")
     runner = make_runner(mini, tmp_path / "out")
     scores = runner.run(SCENARIO_AS_IS)
-    assert scores.stages == {name: record.stages[name].inputs for name in stage_keys.RANKING_STAGES}
+    assert scores.stages == {name: record.stages[name].inputs for name in stage_registry.RANKING_STAGES}
     for name, key in scores.stages.items():
         cached = runner.stage_times(name, key)
         assert (cached.repeats, cached.seconds) == (0, (record.stages[name].cost.seconds,))  # the stage did not run
@@ -81,7 +81,6 @@ def test_cached_stages_count_with_their_original_time_until_they_are_measured(mi
 def test_result_of_another_program_version_is_ignored(
     mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from egvs.runs import stage_keys
 
     runner = make_runner(mini, tmp_path / "out")
     runner.run(SCENARIO_AS_IS)
@@ -113,9 +112,9 @@ def test_memory_is_freed_before_a_stage_is_measured(
         done.append("measured")
         return original()
 
-    monkeypatch.setattr(stage_keys, "measure_usage", noted)
+    monkeypatch.setattr(stage_registry, "measure_usage", noted)
     make_runner(mini, tmp_path).run(SCENARIO_AS_IS)
-    assert done == ["freed", "measured"] * len(stage_keys.RANKING_STAGES)
+    assert done == ["freed", "measured"] * len(stage_registry.RANKING_STAGES)
 
 
 @pytest.mark.slow

@@ -52,7 +52,7 @@ def frames_of(scenario: Scenario) -> list[int | None]:
 def test_scaling_lengthens_each_period(
     split: Path, times: float, period_s: float, overrides: tuple[str, ...], frames: list[int]
 ) -> None:
-    assert study_settings.scale_traffic(egvs.load(split), times, period_s) == (sum(frames), overrides)
+    assert study_settings.traffic_length_overrides(egvs.load(split), times, period_s) == (sum(frames), overrides)
     period = [f"traffic.frame_period_s={period_s}"]
     assert frames_of(egvs.load(split, [*overrides, *period])) == frames
 
@@ -73,8 +73,8 @@ def test_periods_of_finished_files_are_not_scaled(mini: Path) -> None:
     scenario = egvs.load(mini)
     assert scenario.is_recorded
     assert study_settings.counted_frames(scenario) == 24 + 16
-    assert study_settings.scale_traffic(scenario, 2, 0.5) == (0, ())
-    assert study_settings.scale_traffic(scenario, 1, 0.5) == (40, ())
+    assert study_settings.traffic_length_overrides(scenario, 2, 0.5) == (0, ())
+    assert study_settings.traffic_length_overrides(scenario, 1, 0.5) == (40, ())
     assert list(study_settings.traffic_settings(scenario)) == []
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from egvs.core.errors import InputError
-from egvs.scenario.traffic_config import CountConfig
 from egvs.stages import traffic
 from egvs.traffic import demand, network, sumo
+from egvs.traffic.count_fit import geh
 from egvs.traffic.demand import RouteFinder
 from tests.stage_runner import run_stage
 from tests.traffic.helpers import SMALL, SMALL_NET, car, drawn, netgenerate, scenario
@@ -55,7 +55,7 @@ def test_routes_meet_counts_of_turns_edge_and_kind(cross, tmp_path):
     assert [c["counted_per_h"] for c in met] == [300, 80, 120, 200, 60] and met[-1]["kind"] == "truck"
     assert all(c["geh"] < 5 for c in met), met
     assert [c["geh"] for c in met] == pytest.approx(
-        [demand.geh(c["counted_per_h"], c["simulated_per_h"]) for c in met], abs=0.011
+        [geh(c["counted_per_h"], c["simulated_per_h"]) for c in met], abs=0.011
     )
     assert result["warnings"] == [] and "--max-num-vehicles" not in result["flags"]
     routes = (tmp_path / "sumo" / "trips.rou.xml").read_text()
@@ -104,36 +104,6 @@ def test_rejects_kind_called_fleet(cross, tmp_path):
     model = scenario(cross, network="net.xml", kinds=kinds, counts=rows, **LASTING)
     with pytest.raises(InputError, match=r"counts \(left0A0 to A0right0\): a kind is called 'fleet'"):
         run_stage(traffic, model, tmp_path)
-
-
-def test_count_fits_by_edge_and_by_turn(tmp_path):
-    def vehicle(name, edges, times):
-        return f'<vehicle id="{name}" depart="0"><route edges="{edges}" exitTimes="{times}"/></vehicle>'
-
-    (tmp_path / "driven.xml").write_text(
-        "<routes>"
-        + vehicle("fleet.0", "a b c", "90 110 120")  # leaves a before the first frame
-        + vehicle("fleet.1", "a b c", "100 120 130")
-        + vehicle("fleet.2", "a c", "150 -1")  # still on its way; c comes after a, with nothing between
-        + vehicle("fleet.3", "c a", "150 199.5")
-        + vehicle("truck.0", "a b", "150 160")
-        + vehicle("fleet.4", "a b", "200 210")  # too late
-        + '<person id="fleet.5" depart="0"><walk edges="a b" exitTimes="150 160"/></person>'
-        + "</routes>"
-    )
-    expected = [
-        {"edge": "a", "per_hour": 144}, {"edge": "b", "per_hour": 36}, {"edge": "b", "per_hour": 36, "kind": "truck"},
-        {"from_edge": "a", "to_edge": "c", "per_hour": 0}, {"from_edge": "c", "to_edge": "a", "per_hour": 36},
-    ]  # fmt: skip
-    model = drawn(counts=tuple(CountConfig(**row) for row in expected))
-    met = demand.count_fits(model, tmp_path / "driven.xml", 100.0, 200.0)
-    assert [c.simulated_per_h for c in met] == [36 * n for n in (3, 2, 1, 2, 1)]
-
-
-def test_geh_of_known_flows():
-    assert demand.geh(100, 100) == demand.geh(0, 0) == 0
-    assert demand.geh(400, 500) == pytest.approx((2 * 100**2 / 900) ** 0.5)
-    assert demand.geh(500, 400) == demand.geh(400, 500)
 
 
 def test_candidate_routes_over_a_location_are_no_detours(town):

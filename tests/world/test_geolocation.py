@@ -49,7 +49,7 @@ UTM = "+proj=utm +zone=32 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"
 @pytest.mark.parametrize("map_file", [SMALL, pytest.param(REAL, marks=pytest.mark.skipif(
     not REAL.is_file(), reason="bad_hersfeld.osm is not beside the checkout (shared/real)"))])  # fmt: skip
 def test_junctions_are_at_their_map_nodes(tmp_path: Path, map_file: Path) -> None:
-    sumo_folder.convert_osm(map_file, tmp_path / "n.net.xml")
+    sumo_folder.convert_osm_to_network(map_file, tmp_path / "n.net.xml")
     world = geolocation.scenario_georeference(load(tmp_path, {"network": "n.net.xml"}))
     assert world.frame is not None
     nodes = osm.read_osm(map_file).nodes
@@ -67,7 +67,7 @@ def test_junctions_are_at_their_map_nodes(tmp_path: Path, map_file: Path) -> Non
 
 @pytest.mark.system
 def test_map_has_frame_of_its_converted_network(tmp_path: Path) -> None:
-    sumo_folder.convert_osm(SMALL, tmp_path / "n.net.xml")
+    sumo_folder.convert_osm_to_network(SMALL, tmp_path / "n.net.xml")
     (tmp_path / "m.osm.xml").write_bytes(SMALL.read_bytes())
     by_net, by_map = (load(tmp_path, {"network": name}) for name in ("n.net.xml", "m.osm.xml"))
     assert (

@@ -60,7 +60,7 @@ def box_ranges(o, d, low, high):
 
 
 @pytest.mark.parametrize(
-    ("end", "range_m", "doubtful"),
+    ("end", "range_m", "ambiguous"),
     [
         ((40.0, 0.0), 100.0, False),  # sine 0.0125
         ((49.0, 0.0), 100.0, False),  # sine 0.011
@@ -70,7 +70,7 @@ def box_ranges(o, d, low, high):
         ((1.0, 39.9999), 100.0, False),
     ],
 )
-def test_hits_near_edges_and_at_shallow_angles_are_doubtful(end, range_m, doubtful):
+def test_hits_near_edges_and_at_shallow_angles_are_doubtful(end, range_m, ambiguous):
     """A large triangle on the ground, a sensor 0.5 m above it at x = 0; what a float32 caster proposed is always
     triangle 0."""
     triangles, planes, _ = with_planes(np.array([[[-500.0, 40.0, 0.0], [0.0, -900.0, 0.0], [500.0, 40.0, 0.0]]]))
@@ -83,7 +83,7 @@ def test_hits_near_edges_and_at_shallow_angles_are_doubtful(end, range_m, doubtf
     hits = ray_triangle.Hits(ranges, hit, ends, returned)
     count = ray_triangle.resolve_hits(nearest, owner, mesh, rays, hits, result)
     assert ranges[0] == pytest.approx(np.linalg.norm([*end, 0.5]), abs=1e-9)
-    assert bool(count) == doubtful
+    assert bool(count) == ambiguous
 
 
 @pytest.mark.parametrize("degrees", [0.0, 37.0, 45.0, 90.0, 123.456])
@@ -220,9 +220,9 @@ def test_no_leak_at_vertices_and_edges_of_sphere(centre):
     o = np.array([3.0, 2.0, 1.0]) + centre
     targets = np.concatenate([ball.vertices, ball.vertices[ball.edges_unique].mean(axis=1)]) + centre
     assert len(targets) == 10_242 + 30_720
-    ranges, doubtful = caster(ball.triangles + centre).first_hits(o, towards(o, targets))
+    ranges, ambiguous = caster(ball.triangles + centre).first_hits(o, towards(o, targets))
     assert np.abs(ranges - np.linalg.norm(targets - o, axis=1)).max() < 1e-5
-    assert doubtful == len(targets)
+    assert ambiguous == len(targets)
 
 
 @pytest.mark.parametrize("graze_deg", [0.1, 0.5, 2.0, 30.0])
@@ -344,7 +344,7 @@ def test_moved_scene_gives_identical_scan():
     assert (here.beam == there.beam).all()
     assert (here.ends_m == there.ends_m).all()
     assert (here.returned == there.returned).all()
-    assert here.doubtful == there.doubtful
+    assert here.ambiguous == there.ambiguous
 
 
 # UTM 54N of Nishi-Shinjuku, Japan Plane Rectangular IX, an MGRS square with heights above the ellipsoid
@@ -420,7 +420,7 @@ def test_shipped_scene_agrees_with_brute_force(name, site):
     reach = CATALOGUE[site.sensor].range_m
     assert (scan.returned[chosen] == (true <= reach)).all()
     assert np.abs(scan.ends_m[chosen] - d * np.minimum(true, reach)[:, None]).max() < 1e-9
-    assert scan.doubtful < 0.01 * len(scan.beam)
+    assert scan.ambiguous < 0.01 * len(scan.beam)
 
 
 @pytest.mark.parametrize("dtype", [np.int64, np.float32])

@@ -199,7 +199,7 @@ def place_city(
 
         plan = _make_city_plan(plans, shares, ran.results[0].best.rank_by, requested)
         without_gain = [job.junction for job in jobs if job.junction not in with_gain]
-        warnings = (*ran.warnings, *overlap_warnings(jobs), *_no_gain_warnings(city, without_gain))
+        warnings = (*ran.warnings, *overlap_warnings(jobs), *_unseen_junction_warnings(city, without_gain))
         plan_file = results.write_plan(folder, city, plan, [job.junction for job in jobs])
         page_file = page.write_page(folder, city, ran.results, warnings, plan)
     return CityPlacement(replace(ran, warnings=warnings), plan, (plan_file, page_file))
@@ -331,7 +331,7 @@ def _overlap(box: Roi, other: Roi) -> bool:
     return True
 
 
-def _no_gain_warnings(city: City, names: Sequence[str]) -> Iterator[Diagnostic]:
+def _unseen_junction_warnings(city: City, names: Sequence[str]) -> Iterator[Diagnostic]:
     if names:
         problem = f"no site at {', '.join(names)} sees any traffic, so no sensor is planned there"
         yield Diagnostic("junctions unseen", str(city.file), problem, "Use more traffic, or other candidates.")

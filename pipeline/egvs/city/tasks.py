@@ -36,7 +36,7 @@ from egvs.core import files
 from egvs.core.errors import EgvsError, InputError, RunError
 from egvs.core.resource_usage import measure_usage, release_memory
 from egvs.runs import run, stage_keys, store
-from egvs.runs.stage_keys import StageResult
+from egvs.runs.stage_registry import StageResult
 from egvs.runs.store import Store
 from egvs.scenario.loading import load
 from egvs.scenario.model import Scenario

@@ -248,7 +248,7 @@ def city_traffic_scenario(city: City, regions: Mapping[str, TrafficRegion]) -> S
     InputError for an effect that adds no traffic.
     """
     for name in city.effects.named:
-        if not getattr(registry.find_effect_class(name), "ADDS_TRAFFIC", False):
+        if not getattr(registry.load_effect_class(name), "ADDS_TRAFFIC", False):
             hint = f"Move it to {JUNCTIONS_FOLDER}/{SCENARIO_FILE}, or to the scenarios of some junctions."
             raise InputError(f"{city.file}: effects.{name}", "adds no traffic", hint)
     low_x_m = min(region.low_x_m for region in regions.values())

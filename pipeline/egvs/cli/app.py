@@ -45,7 +45,7 @@ def _print_version(requested: bool) -> None:
 
 
 @app.callback()
-def options(
+def global_options(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
@@ -279,7 +279,7 @@ def accuracy(
         study = run_accuracy_study(
             scenario, set_ or (), folder, options, progress=screen.progress, listener=screen.setting_event
         )
-    study_tables.print_study(study, cli_options.command("run", scenario, set_))
+    study_tables.print_study(study, cli_options.shell_command("run", scenario, set_))
 
 
 @app.command()
@@ -312,12 +312,12 @@ def effects(
     run_tables.print_effects(statuses, costs)
 
     if any(status.change == effect_study.UNTRIED for status in statuses):
-        print(f"to measure the expected changes, first run: {cli_options.command('run', scenario, set_, out)}")
+        print(f"to measure the expected changes, first run: {cli_options.shell_command('run', scenario, set_, out)}")
     if recommended := [f"effects.{status.name}={{}}" for status in statuses if status.state == "called for"]:
         overrides = [*(set_ or ()), *recommended]
-        print(f"to run with all effects that are called for: {cli_options.command('run', scenario, overrides, out)}")
+        print(f"to run with all recommended effects: {cli_options.shell_command('run', scenario, overrides, out)}")
     if unmeasured := _unmeasured_effects(statuses, costs, loaded):
-        study = cli_options.command("accuracy", scenario, set_, out)
+        study = cli_options.shell_command("accuracy", scenario, set_, out)
         print(f"to measure the cost and effect of {unmeasured}: {study}, or use --ablation")
 
     if not ablation:

@@ -133,6 +133,6 @@ def command_words(verb: str, path: Path, overrides: Sequence[str] | None, out: P
     return words
 
 
-def command(verb: str, path: Path, overrides: Sequence[str] | None, out: Path | None = None) -> str:
+def shell_command(verb: str, path: Path, overrides: Sequence[str] | None, out: Path | None = None) -> str:
     """Return a command that can be typed into a shell."""
     return shlex.join(command_words(verb, path, overrides, out))

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 _RESULT_FILE_WIDTH = 150
 _LIST_FILE_WIDTH = 160
-_ROOMY_WIDTH = 130
-"""Terminals of this width show the entropy seen as well as the score beside the one that ranks."""
+_EXTRA_COLUMNS_WIDTH = 130
+"""Terminals at least this wide show the entropy seen and the companion score next to the ranking score."""
 
 
 def print_run(folder: Path, record: RunRecord, *, anything_ran: bool, top: int | None = None) -> None:
@@ -150,7 +150,7 @@ def ranking_table(sites: Sequence[RankedSite], width: int = WIDE, top: int | Non
     if companion is not None:
         columns.append(_score_column(companion))
     if "entropy seen" not in [column.title for column in columns]:
-        min_width = 0 if companion is None else _ROOMY_WIDTH
+        min_width = 0 if companion is None else _EXTRA_COLUMNS_WIDTH
         columns.append(Column("entropy seen", lambda site: f"{site.entropy_seen:.1%}", min_width=min_width))
     columns.append(Column("beams in ROI", lambda site: str(site.beams_in_roi), min_width=NARROW))
 

@@ -1,10 +1,12 @@
-"""Atomic writing, temporary folders, hashes, and JSON records with a checksum.
+"""Input files held in memory, atomic writing, temporary folders, hashes, and JSON records with a checksum.
+
+During a run (:func:`hold_inputs`), :func:`open_input` reads each input file from the disk once.
 
 A file is first written to ``.<name>.partial``, then renamed, so that a killed run leaves no half-written artefact.
 Temporary folders are locked while they are in use, so that the next program removes those of a killed one.
 
-Records of this program contain their own hash, so that any damage is noticed. The checksum is no signature: whoever may
-write the file can compute it anew.
+Records of this program contain their own hash, so that any damage is noticed. The checksum is not a signature:
+anyone who can write the file can recompute it.
 """
 
 from __future__ import annotations

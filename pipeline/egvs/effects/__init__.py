@@ -8,7 +8,7 @@ from egvs.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from egvs.effects.base import Detect, Effect, Expand, Traffic, TransmitScan, TransmitScore
-    from egvs.effects.registry import effect_names, find_effect_class
+    from egvs.effects.registry import effect_names, load_effect_class
 
 __all__ = [
     "Detect",
@@ -18,13 +18,13 @@ __all__ = [
     "TransmitScan",
     "TransmitScore",
     "effect_names",
-    "find_effect_class",
+    "load_effect_class",
 ]
 
 __getattr__, __dir__ = lazy_exports(
     __name__,
     {
         "base": ["Detect", "Effect", "Expand", "Traffic", "TransmitScan", "TransmitScore"],
-        "registry": ["effect_names", "find_effect_class"],
+        "registry": ["effect_names", "load_effect_class"],
     },
 )

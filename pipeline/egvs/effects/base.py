@@ -68,9 +68,9 @@ class Effect(Generic[P]):
     TRIAL
         Values for parameters without a default, for ``egvs effects`` to try the effect on a scene that does not name
         it.
-    DECIDED_BY
-        What decides whether the effect is needed but is not in the scene, e.g. "the weather"; empty where the scene
-        tells.
+    USER_KNOWLEDGE
+        What only the user can know and what decides whether the effect is needed, e.g. "the weather"; empty if the
+        scene decides.
     """
 
     parameters: P
@@ -81,7 +81,7 @@ class Effect(Generic[P]):
     Model: ClassVar[type[EffectParameters]]
     QUALITY: ClassVar[dict[str, tuple[Any, ...]]] = {}
     TRIAL: ClassVar[dict[str, Any]] = {}
-    DECIDED_BY: ClassVar[str] = ""
+    USER_KNOWLEDGE: ClassVar[str] = ""
 
     def why_idle(self, scene: Scene) -> str | None:
         """Return why the effect provably cannot change the result in this scene; None when it can."""
@@ -208,7 +208,7 @@ class Traffic(Effect[P], TrafficHook):
 
     STAGE: ClassVar[str] = "traffic"
     KIND: ClassVar[str] = "traffic"
-    SELF_ACTING: ClassVar[bool] = False
+    AUTO_ENABLED: ClassVar[bool] = False
     """Whether it also acts where the scenario does not name it; then :meth:`acts` alone decides."""
 
     def acts(self, scenario: Scenario) -> tuple[bool, str]:

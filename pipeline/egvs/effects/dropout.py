@@ -29,7 +29,7 @@ class Dropout(Detect[DropoutParameters]):
     SOURCE: ClassVar[str] = "Dosovitskiy et al. 2017 (CARLA), dropoff_general_rate, as an expectation"
     Model: ClassVar[type[EffectParameters]] = DropoutParameters
     TRIAL: ClassVar[dict[str, Any]] = {"share": 0.1}
-    DECIDED_BY: ClassVar[str] = "how dirty the sensor gets"
+    USER_KNOWLEDGE: ClassVar[str] = "how dirty the sensor gets"
 
     def why_idle(self, scene: Scene) -> str | None:
         """A share of 0 changes nothing."""

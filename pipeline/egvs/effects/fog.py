@@ -20,8 +20,8 @@ airports report the meteorological optical range, which is at 5 % (-ln 0.05 = 3.
 0.05``; V is converted to 2 % before q is computed.
 
 Use it for a site that must work in fog, mist or haze. Limits: the returned share of the pulse stands for the detection
-probability; a sensor with power in reserve loses less, and one that the fog's own return blinds loses more. Homogeneous
-fog; single scattering; wavelengths from 400 to 1550 nm.
+probability; a sensor with signal margin loses less; one that is blinded by backscatter from the fog loses more.
+Homogeneous fog; single scattering; wavelengths from 400 to 1550 nm.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ class Fog(Detect[FogParameters]):
     SOURCE: ClassVar[str] = "Kim, McArthur and Korevaar 2001, Proc. SPIE 4214; Kruse et al. 1962"
     Model: ClassVar[type[EffectParameters]] = FogParameters
     TRIAL: ClassVar[dict[str, Any]] = {"visibility_m": 200.0}
-    DECIDED_BY: ClassVar[str] = "the weather"
+    USER_KNOWLEDGE: ClassVar[str] = "the weather"
 
     def extinction_per_m(self, wavelength_nm: float) -> float:
         """Return the extinction coefficient of the Beer-Lambert law, in 1/m."""
         green_per_m = -math.log(self.parameters.contrast) / self.parameters.visibility_m
         visibility_km = -math.log(_MODELS_CONTRAST) / green_per_m / 1000
-        exponent = _kim if self.parameters.model == "kim" else _kruse
+        exponent = _kim_exponent if self.parameters.model == "kim" else _kruse_exponent
         return float(green_per_m * (wavelength_nm / _GREEN_NM) ** -exponent(visibility_km))
 
     def detect(self, range_m: FloatArray, sensor: Sensor) -> FloatArray:
@@ -62,17 +62,17 @@ class Fog(Detect[FogParameters]):
         return share
 
 
-def _kruse(visibility_km: float) -> float:
+def _kruse_exponent(visibility_km: float) -> float:
     """Exponent q of Kruse et al."""
     if visibility_km > 6:
         return 1.6 if visibility_km > 50 else 1.3
     return float(0.585 * visibility_km ** (1 / 3))
 
 
-def _kim(visibility_km: float) -> float:
+def _kim_exponent(visibility_km: float) -> float:
     """Exponent q of Kim et al.; Kruse's from 6 km on."""
     if visibility_km > 6:
-        return _kruse(visibility_km)
+        return _kruse_exponent(visibility_km)
     if visibility_km > 1:
         return 0.16 * visibility_km + 0.34
     return max(visibility_km - 0.5, 0.0)

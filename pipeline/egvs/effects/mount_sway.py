@@ -51,7 +51,7 @@ class MountSway(Expand[MountSwayParameters]):
     SOURCE: ClassVar[str] = "Gaussian tilt (assumed); Gauss-Hermite rule (Abramowitz and Stegun 1964, 25.4.46)"
     Model: ClassVar[type[EffectParameters]] = MountSwayParameters
     TRIAL: ClassVar[dict[str, Any]] = {"tilt_deg": 0.5}
-    DECIDED_BY: ClassVar[str] = "how the mount moves"
+    USER_KNOWLEDGE: ClassVar[str] = "how the mount moves"
     QUALITY: ClassVar[dict[str, tuple[Any, ...]]] = {"samples": (4, 9, 16)}
 
     @property

@@ -83,7 +83,7 @@ class PedestriansBicycles(Traffic[PedestriansBicyclesParameters]):
     )
     Model: ClassVar[type[EffectParameters]] = PedestriansBicyclesParameters
     TRIAL: ClassVar[dict[str, Any]] = {"pedestrians_per_h": 100.0}
-    DECIDED_BY: ClassVar[str] = "whether people must be seen"
+    USER_KNOWLEDGE: ClassVar[str] = "whether people must be seen"
     ADDS_TRAFFIC: ClassVar[bool] = True
 
     def scenario_error(self, scenario: Scenario) -> InputError | None:

@@ -23,7 +23,7 @@ P.1814-1 has four more drop-size distributions; shape -2 is stronger below 5 mm/
 simulators that use it.
 
 Use it for a site that must work in rain. Limits: the returned share of the pulse stands for the detection probability;
-a sensor with power in reserve loses less. No returns from drops, no spray behind vehicles, no wet surfaces or windows.
+a sensor with signal margin loses less. No returns from drops, no spray behind vehicles, no wet surfaces or windows.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Rain(Detect[RainParameters]):
     )
     Model: ClassVar[type[EffectParameters]] = RainParameters
     TRIAL: ClassVar[dict[str, Any]] = {"rate_mm_h": 10.0}
-    DECIDED_BY: ClassVar[str] = "the weather"
+    USER_KNOWLEDGE: ClassVar[str] = "the weather"
 
     def why_idle(self, scene: Scene) -> str | None:
         """A rain rate of 0 changes nothing."""

@@ -1,10 +1,11 @@
-"""Effects by name, and those that a scenario activates.
+"""Effects by name, and those that a scenario enables.
 
 Effects are entry points of the group ``egvs.effects`` (``name = "module:Class"``), of this program or of any other
 package. A module is imported only when its effect is named. ``docs/extending.md`` lists what a new effect needs (base
 class, parameters, docs); an effect of this program also needs a field of ``EffectsConfig`` (``CONTRIBUTING.md``).
 
-Effects on traffic and ground may also activate themselves where leaving them out would be wrong.
+Effects on traffic and ground may also be enabled automatically, where leaving them out would be wrong. Built-in effects
+are declared in ``pyproject.toml``, under ``egvs.effects``.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
 
 _BASE_CLASSES = (base.Expand, base.TransmitScan, base.TransmitScore, base.Detect, base.Traffic)
 
-SELF_ACTIVATING: dict[str, Callable[[Scenario], bool]] = {"slope": sumo_folder.may_have_slopes}
-"""Effects that activate themselves, each with a quick test of whether it may act."""
+AUTO_ENABLED: dict[str, Callable[[Scenario], bool]] = {"slope": sumo_folder.may_have_slopes}
+"""Effects that are enabled automatically, each with a quick test of whether it may act."""
 
 
 def effect_names() -> list[str]:
@@ -35,7 +36,7 @@ def effect_names() -> list[str]:
     return names
 
 
-def find_effect_class(name: str) -> type[base.Effect[Any]]:
+def load_effect_class(name: str) -> type[base.Effect[Any]]:
     """Import an effect.
 
     Raises
@@ -43,7 +44,7 @@ def find_effect_class(name: str) -> type[base.Effect[Any]]:
     InputError
         When there is no such effect.
     MissingBackendError
-        When it cannot be imported, is no effect, or has another name than its entry point: two effects of one name
+        When it cannot be imported, is not an effect, or has another name than its entry point: two effects of one name
         would overwrite each other's parameters in :func:`effect_settings`.
     """
     effect_class = plugins.load_plugin(GROUP, name)
@@ -63,12 +64,12 @@ def find_effect_class(name: str) -> type[base.Effect[Any]]:
 
 def make_effect(name: str, parameters: EffectParameters) -> base.Effect[Any]:
     """Return an effect with its parameters."""
-    return find_effect_class(name)(parameters)
+    return load_effect_class(name)(parameters)
 
 
 def required_parameters(name: str) -> list[str]:
     """Return the parameters of an effect that have no default."""
-    fields = find_effect_class(name).Model.model_fields
+    fields = load_effect_class(name).Model.model_fields
     return [key for key, field in fields.items() if field.is_required()]
 
 
@@ -89,14 +90,14 @@ def effect_settings(effects: Iterable[base.Effect[Any]]) -> dict[str, Any]:
 
 
 def active_traffic_effects(scenario: Scenario) -> tuple[tuple[base.Traffic[Any], ...], tuple[str, ...]]:
-    """Return the active effects in order, and notes on those that activate themselves or are skipped."""
+    """Return the active effects in order, and notes on those that are enabled automatically or skipped."""
     effects = []
     notes = []
     for effect in _candidate_effects(scenario):
         on, reason = effect.acts(scenario)
         if on:
             effects.append(effect)
-            if effect.SELF_ACTING:
+            if effect.AUTO_ENABLED:
                 notes.append(f"{effect.NAME}: on, {reason}")
         elif effect.NAME in scenario.effects.named:
             notes.append(f"{effect.NAME}: set, but {reason}: skipped, the result is the same")
@@ -122,12 +123,12 @@ def ground_effect(scenario: Scenario) -> GroundSource | None:
 
 
 def _candidate_effects(scenario: Scenario) -> Iterator[base.Traffic[Any]]:
-    """The effects on traffic that are named or may activate themselves, in the order in which they are applied."""
+    """The effects on traffic that are named or may be enabled automatically, in the order in which they are applied."""
     named = scenario.effects.named
     for name in effect_names():
-        may_activate_itself = name in SELF_ACTIVATING and name not in named and SELF_ACTIVATING[name](scenario)
-        if name not in named and not may_activate_itself:
+        may_be_enabled = name in AUTO_ENABLED and name not in named and AUTO_ENABLED[name](scenario)
+        if name not in named and not may_be_enabled:
             continue
-        effect_class = find_effect_class(name)
+        effect_class = load_effect_class(name)
         if issubclass(effect_class, base.Traffic):
             yield effect_class(named[name] if name in named else effect_class.Model())

@@ -15,8 +15,8 @@ A triangulated surface is laid through the lanes (:mod:`egvs.world.terrain`). Th
 - *footprints* count ``base_m`` and ``height_m`` from the ground below their centre, and those that stand on the ground
   reach down to its lowest point below them. Meshes, sites and the region of interest stay in the world's z.
 
-The effect activates itself when the network's lanes differ in height by more than 0.1 m, or lie off z = 0, because
-leaving it out would be wrong then; it never acts on a flat network. It has no parameters.
+The effect is enabled automatically when the network's lanes differ in height by more than 0.1 m, or lie off z = 0,
+because leaving it out would be wrong then; it never acts on a flat network. It has no parameters.
 
 Source: SUMO's networks with elevation (https://sumo.dlr.de/docs/Networks/Elevation.html); linear interpolation over a
 Delaunay triangulation: Barber, Dobkin, Huhdanpaa 1996, ACM TOMS 22(4), 469-483 (Qhull).
@@ -55,7 +55,7 @@ class Slope(Traffic[SlopeParameters]):
     NAME: ClassVar[str] = "slope"
     SOURCE: ClassVar[str] = "SUMO networks with elevation; Delaunay surface (Barber et al. 1996, Qhull)"
     Model: ClassVar[type[EffectParameters]] = SlopeParameters
-    SELF_ACTING: ClassVar[bool] = True
+    AUTO_ENABLED: ClassVar[bool] = True
 
     def acts(self, scenario: Scenario) -> tuple[bool, str]:
         """Return whether the network has relief, and how much."""

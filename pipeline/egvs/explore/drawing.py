@@ -1,7 +1,7 @@
 """Draw the explorer's page: the scene, candidates and plans, layers over the scene, and the pose of the gizmo.
 
 Arrays for the browser are float32 relative to ``zero_m``, a point near the region, so that scenes far from the origin
-of the world frame do not tremble. Lengths are in metres.
+of the world frame do not jitter. Lengths are in metres.
 
 Mount angles and quaternions: R_world_sensor = Rz(yaw) Ry(-pitch) Rx(roll), as
 :func:`egvs.sensors.sensor.rotation_world_sensor` builds it; a quaternion is (w, x, y, z) of length 1. Dragged positions
@@ -389,7 +389,7 @@ def pose_quaternion(pose: Pose) -> Quaternion:
     )
 
 
-def quaternion_angles_deg(wxyz: Sequence[float]) -> Vec3:
+def quaternion_to_yaw_pitch_roll_deg(wxyz: Sequence[float]) -> Vec3:
     """Return yaw, pitch and roll of a quaternion of any length above 0."""
     length = math.hypot(*wxyz)
     w, x, y, z = (value / length for value in wxyz)
@@ -412,7 +412,7 @@ def dragged_pose(pose: Pose, position_m: Sequence[float], wxyz: Sequence[float])
     position_m, wxyz
         Position and orientation of the gizmo.
     """
-    after = (*position_m, *quaternion_angles_deg(wxyz))
+    after = (*position_m, *quaternion_to_yaw_pitch_roll_deg(wxyz))
     values = {}
     for (name, before), value in zip(asdict(pose).items(), after, strict=True):
         change, digits = value - before, _LENGTH_DIGITS

@@ -437,7 +437,7 @@ def site_blindspots(site: str, spots: VehicleSpots, visibility: SpotVisibility, 
             visibility.se[index].item(),
         )
         locations.append(location_visibility)
-    share_missed = np.full(blindspots.map_shape(grid), np.nan)
+    share_missed = np.full(blindspots.blindspot_map_shape(grid), np.nan)
     share_missed[tuple(spots.cells.T)] = 1.0 - visibility.share[len(locations) :]
     x, y, _ = grid.origin_m
     return SiteBlindspots(site, SEEN_WELL_POINTS, tuple(locations), share_missed, (x, y), CELL_M)

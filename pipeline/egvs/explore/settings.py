@@ -20,7 +20,7 @@ from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.effects import registry
 from egvs.explore.session import Session
-from egvs.runs import run, stage_keys
+from egvs.runs import run, stage_registry
 from egvs.runs.run import StageListener, ignore_stage, lock_run_folder
 from egvs.scenario.loading import load, scenario_from_dict
 from egvs.scenario.model import Scenario
@@ -99,7 +99,7 @@ class Settings:
 
 def trial_parameters(effect: str) -> dict[str, Any]:
     """Return the parameters with which an effect is tried if the scenario does not name it."""
-    return dict(registry.find_effect_class(effect).TRIAL)
+    return dict(registry.load_effect_class(effect).TRIAL)
 
 
 def offered_effects(session: Session) -> dict[str, str]:
@@ -109,7 +109,7 @@ def offered_effects(session: Session) -> dict[str, str]:
     for status in effect_study.effect_statuses_in_scene(session.scene):
         if status.state not in _OFFERED_STATES:
             continue
-        if status.name in named or not registry.find_effect_class(status.name).DECIDED_BY:
+        if status.name in named or not registry.load_effect_class(status.name).USER_KNOWLEDGE:
             offered[status.name] = status.why
     return offered
 
@@ -133,7 +133,7 @@ def make_session(
     """
     record = run.run(scenario, folder, only=REQUIRED_STAGES, jobs=jobs, progress=progress, listener=listener)
     with lock_run_folder(folder):
-        work = open_folder(scenario, folder, jobs=jobs, recorded=stage_keys.recorded_digests(record))
+        work = open_folder(scenario, folder, jobs=jobs, recorded=stage_registry.recorded_digests(record))
         return Session(work, {name: stage.inputs for name, stage in record.stages.items()})
 
 
@@ -181,7 +181,7 @@ def _copy_run(source: Path, folder: Path) -> None:
     The record is copied last, so that it never names missing files.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    names = [name for stage in REQUIRED_STAGES for name in stage_keys.written_by(stage)]
+    names = [name for stage in REQUIRED_STAGES for name in stage_registry.written_by(stage)]
     names += [RunFolder.placement.name, RunFolder.curve.name, RunFolder.placement_checksums.name]
     names.append(RunFolder.run_record.name)
     with lock_run_folder(source):

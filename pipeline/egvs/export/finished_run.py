@@ -20,7 +20,7 @@ from egvs.artefacts.tpog import Tpog
 from egvs.core.errors import InputError
 from egvs.formats import georeference
 from egvs.formats.georeference import WorldFrame
-from egvs.runs import stage_keys
+from egvs.runs import stage_registry
 from egvs.scenario.loading import scenario_from_dict
 from egvs.scenario.model import Scenario
 from egvs.scoring.scorer import Scorer
@@ -72,7 +72,7 @@ class FinishedRun:
             problem = f"the scenario folder {source} does not exist"
             raise InputError(record_path, problem, "Move it back to where it was when the run was made.")
         scenario = scenario_from_dict(record.scenario, source, str(record_path))
-        work = open_folder(scenario, folder, recorded=stage_keys.recorded_digests(record))
+        work = open_folder(scenario, folder, recorded=stage_registry.recorded_digests(record))
         run = cls(record, scenario, work, geolocation.scenario_georeference(scenario).frame)
         run._check_georeference()
         return run

@@ -131,7 +131,7 @@ def read_osm(path: Path) -> OsmExtract:
         raise InputError(path, "no such file", _HINT)
     import osmium
 
-    deleted = frozenset() if is_pbf(path) else _check_xml(path)
+    deleted = frozenset() if is_pbf(path) else _check_values_and_find_deleted(path)
     nodes: dict[int, tuple[float, float]] = {}
     node_tags: dict[int, Tags] = {}
     ways: dict[int, Way] = {}
@@ -251,7 +251,7 @@ def _bounds(box: osmium.osm.Box, nodes: dict[int, tuple[float, float]]) -> Bound
     return Bounds(min(lats), min(lons), max(lats), max(lons))
 
 
-def _check_xml(path: Path) -> frozenset[tuple[str, int]]:
+def _check_values_and_find_deleted(path: Path) -> frozenset[tuple[str, int]]:
     """Reject values that osmium reads as 0, or whose object its messages do not name.
 
     Returns the objects that an editor has marked as deleted, which osmium ignores: (first letter of type, identifier).

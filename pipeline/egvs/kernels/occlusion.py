@@ -331,7 +331,7 @@ def beam_stops(begin, rows, azimuth, beams, boxes, frames, levels, met, first, r
         stopped = 0
         for k in range(entries):
             before = stopped
-            stopped = _stop_in_frames(row, entered[k], frames, met, stopped)
+            stopped = _mark_blocked_frames(row, entered[k], frames, met, stopped)
             if stopped > before:
                 range_m[total], share[total] = ranges[k], levels[stopped]
                 total += 1
@@ -349,7 +349,7 @@ def _end_of_bundle(azimuth, begin, cell, cells):  # type: ignore[no-untyped-def]
 
 
 @_inlined
-def _stop_in_frames(row, box, frames, met, stopped):  # type: ignore[no-untyped-def]
+def _mark_blocked_frames(row, box, frames, met, stopped):  # type: ignore[no-untyped-def]
     """Mark the frames of a box in which a beam is stopped; returns ``stopped`` plus those that were not marked."""
     first_frame, frame = frames
     for i in range(first_frame[box], first_frame[box + 1]):

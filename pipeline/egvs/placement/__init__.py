@@ -1,4 +1,4 @@
-"""Which sensors together: plans of several LiDARs and proofs of how good they are."""
+"""Joint placement: plans of several LiDARs, with proven bounds on their quality."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ from egvs.placement import problem_builder, refinement, solver
 from egvs.placement.problem import Problem
 from egvs.placement.problem_builder import PlacementProblem
 from egvs.placement.solver import Solution
-from egvs.runs import run, stage_keys
+from egvs.runs import run, stage_registry
 from egvs.runs.run import StageListener, ignore_stage, lock_run_folder
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import RefinementConfig
@@ -90,7 +90,7 @@ class JointScore:
         folder = Path(out) if out is not None else run.default_folder(scenario)
         record = run.run(scenario, folder, only=REQUIRED_STAGES, jobs=jobs, progress=progress)
         context = open_folder(
-            scenario, folder, jobs=jobs, progress=progress, recorded=stage_keys.recorded_digests(record)
+            scenario, folder, jobs=jobs, progress=progress, recorded=stage_registry.recorded_digests(record)
         )
         return cls(problem_builder.build_problem(context, lambda done: progress("candidates", done, 0)))
 
@@ -305,7 +305,7 @@ def place(
     record = run.run(scenario, folder, only=REQUIRED_STAGES, jobs=jobs, progress=progress, listener=listener)
     with lock_run_folder(folder):
         context = open_folder(
-            scenario, folder, jobs=jobs, progress=progress, recorded=stage_keys.recorded_digests(record)
+            scenario, folder, jobs=jobs, progress=progress, recorded=stage_registry.recorded_digests(record)
         )
         placed = solve_placement(context, exact=exact, time_limit_s=time_limit_s)
         inputs_by_stage = {name: record.stages[name].inputs for name in REQUIRED_STAGES}

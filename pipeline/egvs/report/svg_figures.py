@@ -120,7 +120,7 @@ def extent(grid: Grid, sites: Sequence[MapSite]) -> Box:
 def shared_scale(peak: float, label: str) -> str:
     """Return the colour scale of several figures as a figure of its own."""
     bar = ColourBar(0.0, peak, label)
-    start = svg_start(460.0, 52.0, f"Colour scale: {label}, 0 to {peak:.3g}")
+    start = svg_start_tag(460.0, 52.0, f"Colour scale: {label}, 0 to {peak:.3g}")
     return f"{start}{bar.svg('scale', 16.0, 4.0, 428.0)}</svg>"
 
 
@@ -231,7 +231,7 @@ class MapFrame:
         clip = f'<clipPath id="{self.prefix}-clip">{frame}</clipPath>'
         drawing = "\n".join(parts)
         lines = [
-            svg_start(self.width, height, alt, self.style),
+            svg_start_tag(self.width, height, alt, self.style),
             f'<defs>{clip}</defs>{self._axes(base)}\n<g clip-path="url(#{self.prefix}-clip)">{drawing}</g>',
             north_arrow,
             colour_bar,
@@ -322,7 +322,7 @@ class ColourBar:
         return placed
 
 
-def svg_start(width: float, height: float, alt: str, style: FigureStyle = PAGE_STYLE) -> str:
+def svg_start_tag(width: float, height: float, alt: str, style: FigureStyle = PAGE_STYLE) -> str:
     """Return the first tag of a figure."""
     attributes = f'class="plan" viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{escape(alt)}"'
     if style.theme is not None:
@@ -368,7 +368,7 @@ def sensor_count_chart(steps: Sequence[CurveStep], alt: str) -> str:
     width, height = _CURVE_WIDTH - _CURVE_LEFT - 12.0, _CURVE_HEIGHT - _CURVE_TOP - _CURVE_BOTTOM
     top = max(1.0, *(step.bound for step in steps))
     base, spacing = _CURVE_TOP + height, width / len(steps)
-    parts = [svg_start(_CURVE_WIDTH, _CURVE_HEIGHT, alt)]
+    parts = [svg_start_tag(_CURVE_WIDTH, _CURVE_HEIGHT, alt)]
     for value, _ in round_values(0.0, 100.0 * top, 5):
         y = base - height * value / 100.0 / top
         parts.append(f'<path class="grid" d="M{_CURVE_LEFT:.1f} {y:.1f}h{width:.1f}"/>')
@@ -428,7 +428,7 @@ def bar_chart(bars: Sequence[Bar], label: str, alt: str, factor: float = 1.0, st
     values = [bar.value for bar in bars]
     low, high = min(values), max(values)
     base = _BARS_TOP + height
-    parts = [svg_start(style.width, base + _BARS_BOTTOM, alt, style)]
+    parts = [svg_start_tag(style.width, base + _BARS_BOTTOM, alt, style)]
     for value, text in round_values(0.0, most * factor, max(2, int(width // 70))):
         x = left + width * value / factor / most
         parts.append(f'<path {style.shape("grid")} d="M{x:.1f} {_BARS_TOP:.1f}V{base:.1f}"/>')

@@ -26,8 +26,9 @@ from egvs.core import files
 from egvs.core.errors import InputError, RunError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.formats.meshes import referenced_files
-from egvs.runs import locks, stage_keys, store
-from egvs.runs.stage_keys import StageKey, StageResult
+from egvs.runs import locks, stage_keys, stage_registry, store
+from egvs.runs.stage_keys import StageKey
+from egvs.runs.stage_registry import StageResult
 from egvs.runs.store import Store
 from egvs.scenario.loading import scenario_from_dict
 from egvs.scenario.model import Scenario
@@ -126,7 +127,7 @@ def run_one(
     check_no_overwrite(scenario, out)
     with lock_run_folder(out), files.hold_inputs(except_in=out):
         record = start_record(scenario, out)
-        recorded = stage_keys.recorded_digests(record)
+        recorded = stage_registry.recorded_digests(record)
         context = open_folder(scenario, out, jobs=jobs, progress=progress, recorded=recorded)
         current = _Run(context, record, listener)
         current.ensure_stage(stage, options, again=True)
@@ -207,7 +208,7 @@ def fetch_or_run(
         The result, and whether it was restored.
     """
     out = context.folder.path
-    context.forget(*stage_keys.written_by(name))
+    context.forget(*stage_registry.written_by(name))
     entry = store.take(name, key, out, link=link)
     if entry is None:
         with store.maker(name, key, progress=context.progress):
@@ -217,7 +218,7 @@ def fetch_or_run(
                 result = make()
                 store.put(name, key, out, result, link=link)
                 return result, False
-    for other in set(stage_keys.stage(name).artefacts) - set(entry.made.artefacts):
+    for other in set(stage_registry.stage(name).artefacts) - set(entry.made.artefacts):
         (out / other).unlink(missing_ok=True)  # as the stage does
     return entry.made, True
 
@@ -230,7 +231,7 @@ def ensure_stages(context: StageContext, *names: str) -> dict[str, str]:
         key = stage_keys.stage_key(name, context)
 
         def make(name: str = name, key: StageKey = key) -> StageResult:
-            return stage_keys.run_stage(name, context, key.dependencies)
+            return stage_registry.run_stage(name, context, key.dependencies)
 
         fetch_or_run(name, context, key.key, store, make, link=True)
         keys[name] = key.key
@@ -265,7 +266,7 @@ class _Run:
     def ensure_stage(self, name: str, options: Mapping[str, Any], *, again: bool = False) -> None:
         """Bring one stage up to date; with ``again``, or with options that change artefacts, it always runs."""
         key = stage_keys.stage_key(name, self.context)
-        has_options = any(option not in stage_keys.stage(name).neutral_options for option in options)
+        has_options = any(option not in stage_registry.stage(name).neutral_options for option in options)
         last = self.record.stages.get(name)
         if last and not (again or has_options) and last.inputs == key.key and _is_intact(self.context, last):
             self._record_stage(name, last)
@@ -274,7 +275,7 @@ class _Run:
 
         def make() -> StageResult:
             self.listener(name, "runs", None)
-            return stage_keys.run_stage(name, self.context, key.dependencies, **options)
+            return stage_registry.run_stage(name, self.context, key.dependencies, **options)
 
         fetched = False
         if has_options:

@@ -1,4 +1,4 @@
-"""The key of a stage, which decides whether it runs again; the registered stages, and running one.
+"""The key of a stage, which decides whether it runs again.
 
 The key is a hash of everything that the artefacts of a stage depend on: settings by value, input files by hash, the
 source of the program, versions of libraries. A stage runs again when its key changes.
@@ -22,14 +22,12 @@ from pathlib import Path
 from typing import Any
 
 from egvs.artefacts import parquet
-from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
-from egvs.artefacts.run_record import RunRecord, StageRecord
+from egvs.artefacts.run_record import StageRecord
 from egvs.core import files
-from egvs.core.errors import with_relative_paths
-from egvs.core.resource_usage import ResourceUsage, measure_usage
 from egvs.effects import registry
+from egvs.runs.stage_registry import StageResult, stage
 from egvs.scenario.model import Scenario
-from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
+from egvs.stages.base import Stage, StageContext, StageDependencies
 
 PACKAGE = "egvs"
 _ROOT = Path(__file__).resolve().parent.parent
@@ -169,116 +167,6 @@ def _module_path(module: str) -> Path | None:
     if spec is None or spec.origin is None or not spec.origin.endswith(".py"):
         return None
     return Path(spec.origin)
-
-
-RANKING_STAGES = STAGE_NAMES[1:-1]
-"""The stages that a ranking needs: all but the check and the report."""
-
-
-@dataclass(frozen=True)
-class StageResult:
-    """Result of a stage.
-
-    Attributes
-    ----------
-    artefacts
-        Name -> sha256 of each file that the stage wrote.
-    companions
-        Path in the run folder -> sha256 of further files, such as those that open in sumo-gui.
-    summary
-        Outcome in numbers, a JSON value.
-    cost
-        Resources that the stage used.
-    """
-
-    artefacts: dict[str, str]
-    companions: dict[str, str]
-    summary: Summary
-    cost: ResourceUsage
-
-    @property
-    def files(self) -> dict[str, str]:
-        """Name -> sha256 of artefacts and companions."""
-        return self.artefacts | self.companions
-
-
-def stage(name: str) -> Stage:
-    """Return a stage; its module is imported only now, so that ``--help`` stays quick."""
-    match name:
-        case "check":
-            from egvs.stages.check import STAGE as check
-
-            return check
-        case "statics":
-            from egvs.stages.statics import STAGE as statics
-
-            return statics
-        case "scan":
-            from egvs.stages.scan import STAGE as scan
-
-            return scan
-        case "traffic":
-            from egvs.stages.traffic import STAGE as traffic
-
-            return traffic
-        case "tpog":
-            from egvs.stages.tpog import STAGE as tpog
-
-            return tpog
-        case "score":
-            from egvs.stages.score import STAGE as score
-
-            return score
-        case "report":
-            from egvs.report.page import STAGE as report
-
-            return report
-        case _:
-            raise ValueError(f"expected a stage ({', '.join(STAGE_NAMES)}), got {name!r}")
-
-
-def written_by(name: str) -> tuple[str, ...]:
-    """Return the files that a stage can write, and the folders that it writes beside them."""
-    return tuple(file.name for file in RunFolder.written_by(name))
-
-
-def recorded_digests(record: RunRecord) -> dict[str, str]:
-    """Return the sha256 of every artefact and companion file as a run recorded it, "" for an unknown artefact."""
-    digests: dict[str, str] = {}
-    for stage_record in record.stages.values():
-        digests |= stage_record.companions
-    known = record.digests
-    for name in STAGE_NAMES:
-        for artefact in stage(name).artefacts:
-            digests[artefact] = known.get(artefact, "")
-    return digests
-
-
-def run_stage(name: str, context: StageContext, dependencies: StageDependencies, **options: Any) -> StageResult:
-    """Run a stage in a folder that contains the artefacts of the stages before it."""
-    running = stage(name)
-    stamps_before = _companion_stamps(running, context.folder.path)
-    context.forget(*written_by(name))
-    with measure_usage() as cost, parquet.share_open_files():
-        summary = with_relative_paths(context.scenario.folder, running.run(context, dependencies, **options))
-
-    written = [artefact for artefact in running.artefacts if context.path(artefact).exists()]
-    companions = {}
-    for companion, stamp in sorted(_companion_stamps(running, context.folder.path).items()):
-        if stamps_before.get(companion) != stamp:
-            companions[companion] = files.hash_file(context.path(companion))
-    return StageResult(context.digests(*written), companions, summary, cost)
-
-
-def _companion_stamps(stage: Stage, folder: Path) -> dict[str, tuple[int, int, int]]:
-    """Files beside the artefacts of a stage, each with a stamp that changes when the file is written."""
-    stamps = {}
-    for name in stage.companions:
-        for path in (folder / name).rglob("*"):
-            if path.is_file() and not path.is_symlink():
-                status = path.stat()
-                stamps[path.relative_to(folder).as_posix()] = (status.st_mtime_ns, status.st_ino, status.st_size)
-    return stamps
 
 
 @dataclass(frozen=True)

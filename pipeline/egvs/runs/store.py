@@ -43,7 +43,7 @@ from egvs.core.reading import translate_errors
 from egvs.core.resource_usage import ResourceUsage
 from egvs.runs import locks
 from egvs.runs.locks import locked
-from egvs.runs.stage_keys import StageResult
+from egvs.runs.stage_registry import StageResult
 
 ENTRY_FILE = "entry.json"
 """Record of an entry; written last."""
@@ -244,7 +244,7 @@ class _DamagedEntry(Exception):
     """An entry is not as it was written."""
 
 
-def _to_stderr(message: str) -> None:
+def _print_to_stderr(message: str) -> None:
     print(f"egvs: {message}", file=sys.stderr)
 
 
@@ -267,7 +267,7 @@ class Store:
         self,
         folder: Path | None,
         bound_bytes: float = DEFAULT_MAX_GB * 1e9,
-        note: Callable[[str], None] = _to_stderr,
+        note: Callable[[str], None] = _print_to_stderr,
         remote: RemoteStore | None = None,
     ) -> None:
         self.folder = folder

@@ -14,7 +14,7 @@ from egvs.artefacts.run_record import RunRecord, StageRecord
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
-from egvs.runs import stage_keys
+from egvs.runs import stage_keys, stage_registry
 from egvs.runs.run import StageListener, ignore_stage, start_record
 from egvs.scenario.loading import scenario_from_dict
 from egvs.stages.inputs import open_folder
@@ -70,7 +70,7 @@ def verify(
                     shown_in = " and ".join(before.artefacts) or f"the stage {name}"
                     differences.append(f"{shown_in} shows {study}, which was replaced since: run egvs {name} again")
             listener(name, "runs", None)
-            after = key.record(stage_keys.run_stage(name, context, key.dependencies))
+            after = key.record(stage_registry.run_stage(name, context, key.dependencies))
             listener(name, "done", after)
             new_record = new_record.having(name, replace(after, cost=before.cost))  # the report shows the cost
             new_record.write(temporary)

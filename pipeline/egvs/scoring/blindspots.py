@@ -277,7 +277,7 @@ class SpotWriter:
         if self._pending:
             self._write()
         grid = Grid.from_json(metadata["grid"])
-        cells = {"origin_m": list(grid.origin_m[:2]), "cell_m": CELL_M, "shape": list(map_shape(grid))}
+        cells = {"origin_m": list(grid.origin_m[:2]), "cell_m": CELL_M, "shape": list(blindspot_map_shape(grid))}
         self._file.describe({**metadata, "cells": cells, "points": SEEN_WELL_POINTS})
 
     def _write(self) -> None:
@@ -310,7 +310,7 @@ def open_spot_writer(path: Path, spots: VehicleSpots, sites: int, *, mixed: bool
         yield SpotWriter(file, spots, sites)
 
 
-def map_shape(grid: Grid) -> tuple[int, int]:
+def blindspot_map_shape(grid: Grid) -> tuple[int, int]:
     """Return how many cells the region has to the east and to the north."""
     nx, ny = np.ceil(np.asarray(grid.roi.size_m[:2]) / CELL_M).astype(int).tolist()
     return nx, ny

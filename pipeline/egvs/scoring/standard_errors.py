@@ -7,22 +7,22 @@ frames and S_(g) of all but group g (Busing, Meijer, van der Leeden, Statistics 
 .. math:: \tilde S = k S - \sum_g (1 - T_g / T) S_{(g)}, \qquad P_g = h_g S - (h_g - 1) S_{(g)}, \qquad
           se^2 = \frac{1}{k} \sum_g \frac{(P_g - \tilde S)^2}{h_g - 1}, \qquad bias = S - \tilde S
 
-and an interval is :math:`S - bias \pm t_{k-1} \, se`. The entropy is concave, so few frames score too low: the bias is
-below 0 and shrinks like 1 / T. Of a TPOG that was mixed from several records, the variances and the biases add up, and
-t has the degrees of freedom of Satterthwaite (Biometrics Bulletin 2, 1946).
+and an interval is :math:`S - bias \pm t_{k-1} \, se`. The entropy is concave, so scores from few frames are biased low:
+the bias is below 0 and shrinks like 1 / T. Of a TPOG that was mixed from several records, the variances and the biases
+add up, and t has the degrees of freedom of Satterthwaite (Biometrics Bulletin 2, 1946).
 
 Why not the bootstrap, resampling blocks with replacement? Measured over independent runs of SUMO (docs/accuracy.md),
 with 10 blocks its standard errors are too small, its 90 % intervals cover 81 %, it takes hundreds of scores per site
 instead of ten, and it needs random numbers. The jackknife's intervals cover 89 %.
 
-Groups must be longer than the traffic's autocorrelation time (its *memory*, :mod:`egvs.scoring.occupancy`). Up to 19
+Groups must be longer than the traffic's autocorrelation time (:mod:`egvs.scoring.autocorrelation`). Up to 19
 blocks are taken as they are, more are joined to ten groups - with fifty the same intervals cover 83 % - and neighbours
-are joined further where groups would be shorter than :data:`GROUP_LENGTH_MEMORIES` memories, down to
+are joined further where groups would be shorter than :data:`GROUP_LENGTH_TIMES` of it, down to
 :data:`MIN_GROUPS` groups: the t quantile accounts for the uncertainty of few groups. The correlation that remains
 between the groups of a short record inflates the error
-(:func:`egvs.scoring.occupancy.standard_error_inflation`). Where neighbouring groups are correlated all the same, they
-are joined in pairs. Groups shorter than the window in which the memory was estimated, and groups that stay correlated,
-give a warning.
+(:func:`egvs.scoring.autocorrelation.standard_error_inflation`). Where neighbouring groups are correlated all the same,
+they are joined in pairs. Groups shorter than the window in which that time was estimated, and groups that stay
+correlated, give a warning.
 
 Voxels that have equal counts in every group share one class (0.5 million occupied voxels of a real junction make 50,000
 classes), so a site costs one pass over the voxels and one over the classes. Nothing is random; the result does not
@@ -49,7 +49,7 @@ from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.kernels.occupancy import accumulate
-from egvs.scoring import occupancy
+from egvs.scoring.autocorrelation import WINDOW_TIMES, standard_error_inflation
 from egvs.scoring.egvs import EntropyField, Hits, sum_hits_by_class
 
 TARGET_GROUPS = 10
@@ -58,8 +58,8 @@ TARGET_GROUPS = 10
 MIN_GROUPS = 4
 """Groups are not joined to fewer than this."""
 
-GROUP_LENGTH_MEMORIES = 20.0
-"""Desired length of a group, in memories of the traffic."""
+GROUP_LENGTH_TIMES = 20.0
+"""Desired length of a group, in autocorrelation times of the traffic."""
 
 CONFIDENCE_LEVEL = 0.9
 """Confidence of intervals."""
@@ -73,10 +73,10 @@ _CLASS_KEY_SEED = 0x9E3779B97F4A7C15
 
 @dataclass(frozen=True)
 class BlockGroups:
-    """Consecutive groups of one record: the ``frames`` of each, (k,) int64, and the traffic's ``memory`` in frames."""
+    """Consecutive groups of one record: the ``frames`` of each, (k,) int64, and the traffic's autocorrelation time."""
 
     frames: IntArray
-    memory: float
+    autocorrelation_frames: float
 
     @property
     def total(self) -> int:
@@ -84,12 +84,12 @@ class BlockGroups:
         return int(self.frames.sum())
 
 
-def group_sizes(blocks: int, block_frames: int = 1, memory: float = 0.0) -> list[int]:
+def group_sizes(blocks: int, block_frames: int = 1, autocorrelation_frames: float = 0.0) -> list[int]:
     """Return the number of consecutive blocks of each group."""
     groups = blocks
     if blocks >= 2 * TARGET_GROUPS:
         groups = TARGET_GROUPS
-    needed_blocks = math.ceil(GROUP_LENGTH_MEMORIES * memory / block_frames)
+    needed_blocks = math.ceil(GROUP_LENGTH_TIMES * autocorrelation_frames / block_frames)
     if needed_blocks > blocks // groups:
         groups = min(groups, max(MIN_GROUPS, blocks // needed_blocks))
     return [len(part) for part in np.array_split(np.arange(blocks), groups)]
@@ -333,17 +333,17 @@ class Stratum:
         centre = len(h) * scores - ((1.0 - 1.0 / h)[:, None] * left_out).sum(axis=0)
         pseudo = h[:, None] * scores - (h - 1.0)[:, None] * left_out
 
-        first_correlation = correlation = autocorrelation(pseudo)
+        first_correlation = correlation = lag_one_autocorrelation(pseudo)
         joined = 1
-        while correlation > _autocorrelation_limit(len(pseudo)) and len(pseudo) // 2 >= MIN_GROUPS:
+        while correlation > _critical_autocorrelation(len(pseudo)) and len(pseudo) // 2 >= MIN_GROUPS:
             pseudo, frames = _join_pairs(pseudo, frames)
             joined *= 2
-            correlation = autocorrelation(pseudo)
+            correlation = lag_one_autocorrelation(pseudo)
 
         widening = 1.0
-        if groups.memory:
-            widening = occupancy.standard_error_inflation(groups.memory, groups.total, len(frames))
-        still_correlated = correlation > _autocorrelation_limit(len(pseudo))
+        if groups.autocorrelation_frames:
+            widening = standard_error_inflation(groups.autocorrelation_frames, groups.total, len(frames))
+        still_correlated = correlation > _critical_autocorrelation(len(pseudo))
         spread = groups.total / frames - 1.0
         return cls(pseudo, spread, centre, widening, groups, first_correlation, joined, still_correlated)
 
@@ -358,11 +358,11 @@ class Stratum:
 
     @property
     def is_short(self) -> bool:
-        """Whether groups are shorter than the window in which the memory was estimated."""
-        return self.groups.total < len(self.pseudo) * occupancy.MEMORY_WINDOW * self.groups.memory
+        """Whether groups are shorter than the window in which the autocorrelation time was estimated."""
+        return self.groups.total < len(self.pseudo) * WINDOW_TIMES * self.groups.autocorrelation_frames
 
 
-def autocorrelation(series: FloatArray) -> float:
+def lag_one_autocorrelation(series: FloatArray) -> float:
     """Return the lag-one autocorrelation of groups, (k, n), pooled over all sites; 0 where nothing varies."""
     centred = series - series.mean(axis=0)
     scale = np.sqrt((centred**2).sum(axis=0))
@@ -372,7 +372,7 @@ def autocorrelation(series: FloatArray) -> float:
     return float((centred[1:] * centred[:-1]).sum(axis=0).mean())
 
 
-def _autocorrelation_limit(groups: int) -> float:
+def _critical_autocorrelation(groups: int) -> float:
     """Return the autocorrelation that independent groups exceed once in 20 (Kendall and Ord, Time Series, 1990)."""
     if groups <= 2:
         return 1.0
@@ -534,7 +534,7 @@ def uncertainty_warnings(
     names: Sequence[str] = ("",),
     period_lengths: Mapping[str, str] | None = None,
 ) -> list[Diagnostic]:
-    """Warn about each record that is too short, compared with its memory, for reliable standard errors.
+    """Warn about each record that is too short, compared with its autocorrelation time, for reliable standard errors.
 
     Parameters
     ----------
@@ -561,28 +561,30 @@ def uncertainty_warnings(
         else:
             key = where
         hint = _longer_record_hint(stratum, frame_period_s, in_seconds=length_key is not None)
-        warnings.append(Diagnostic("traffic's memory", key, _describe_short_record(stratum, frame_period_s), hint))
+        warnings.append(
+            Diagnostic("traffic autocorrelation", key, _describe_unreliable_error(stratum, frame_period_s), hint)
+        )
     return warnings
 
 
-def _describe_short_record(stratum: Stratum, frame_period_s: float) -> str:
+def _describe_unreliable_error(stratum: Stratum, frame_period_s: float) -> str:
     frames = stratum.groups.total
     if not stratum.is_short:
         blocks = len(stratum.pseudo)
         return f"neighbouring blocks of {frames // blocks} frames are correlated: standard errors may be too small"
-    memory_s = stratum.groups.memory * frame_period_s
+    correlation_time_s = stratum.groups.autocorrelation_frames * frame_period_s
     widening = _describe_widening(stratum)
     return (
         f"{frames} frames ({frames * frame_period_s:g} s) are few for traffic with an autocorrelation time of"
-        f" {memory_s:.3g} s: standard errors{widening} may be too small"
+        f" {correlation_time_s:.3g} s: standard errors{widening} may be too small"
     )
 
 
 def _longer_record_hint(stratum: Stratum, frame_period_s: float, *, in_seconds: bool) -> str:
-    enough = math.ceil(MIN_GROUPS * occupancy.MEMORY_WINDOW * stratum.groups.memory)
+    enough = math.ceil(MIN_GROUPS * WINDOW_TIMES * stratum.groups.autocorrelation_frames)
     if stratum.still_correlated:
         enough = max(2 * stratum.groups.total, enough)
-    better = round(GROUP_LENGTH_MEMORIES / occupancy.MEMORY_WINDOW) * enough
+    better = round(GROUP_LENGTH_TIMES / WINDOW_TIMES) * enough
     if in_seconds:
         return f"Set length_s to at least {enough * frame_period_s:g}, preferably {better * frame_period_s:g}."
     return f"Record at least {enough} frames, preferably {better}."

@@ -38,7 +38,7 @@ import numpy as np
 from scipy.special import expit
 
 from egvs.core.grid import FloatArray, IntArray
-from egvs.kernels.vehicle_visibility import add_trees
+from egvs.kernels.boosted_trees import add_tree_values
 from egvs.scoring.blindspots import SpotVisibility
 from egvs.scoring.targets import SEEN_WELL_POINTS, VisibleTargets, weighted_mean
 
@@ -177,7 +177,7 @@ def detectability_features(visible: VisibleTargets) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class DetectabilityModel:
-    """Boosted trees over :data:`FEATURES`, in the form that :func:`egvs.kernels.vehicle_visibility.add_trees` takes.
+    """Boosted trees over :data:`FEATURES`, in the form that :func:`egvs.kernels.boosted_trees.add_tree_values` takes.
 
     Attributes
     ----------
@@ -221,7 +221,7 @@ class DetectabilityModel:
         columns = np.ascontiguousarray(features.T)
         logit = np.full(len(features), self.base)
         nodes = self.feature, self.threshold, self.left, self.right, self.value
-        add_trees(columns, self.starts, *nodes, logit)
+        add_tree_values(columns, self.starts, *nodes, logit)
         chance: FloatArray = expit(logit)
         return chance
 

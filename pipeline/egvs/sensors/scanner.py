@@ -280,4 +280,4 @@ def _concatenate_scans(scans: list[EmptyScan]) -> EmptyScan:
     if scans[0].face is not None:
         names.append("face")
     columns = {name: np.concatenate([getattr(scan, name) for scan in scans]) for name in names}
-    return EmptyScan(**columns, doubtful=sum(scan.doubtful for scan in scans))
+    return EmptyScan(**columns, ambiguous=sum(scan.ambiguous for scan in scans))

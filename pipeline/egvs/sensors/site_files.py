@@ -184,7 +184,7 @@ def locate_rows(rows: Iterable[SiteRow], path: object, world: Georeference) -> l
         return [row.columns for row in rows]
     degrees, without_degrees, needs_degrees = [], [], False
     for row, columns, xy_m in zip(rows, names, metres, strict=True):
-        lon_lat = _row_degrees(row, columns)
+        lon_lat = _parse_lon_lat(row, columns)
         degrees.append(lon_lat)
         without_degrees.append({name: value for name, value in row.columns.items() if name not in (columns or ())})
         if lon_lat is not None and not math.isfinite(sum(xy_m)):
@@ -213,7 +213,7 @@ def _lon_lat_columns(row: Mapping[str, Any]) -> _LonLatColumns | None:
     return _LonLatColumns(lon, lat)
 
 
-def _row_degrees(row: SiteRow, columns: _LonLatColumns | None) -> _LonLat | None:
+def _parse_lon_lat(row: SiteRow, columns: _LonLatColumns | None) -> _LonLat | None:
     """Longitude and latitude of a row, checked; None where both are empty."""
     if columns is None or all(row.columns[name] in (None, "") for name in columns):
         return None

@@ -81,13 +81,13 @@ def _write_scans(
     sites = context.scene.sites
     scanned: list[ScannedSite] = []
     clouds = []
-    doubtful = 0
+    ambiguous = 0
     with parquet.artefact_writer(context.folder.scans, "scans", scanner.columns) as file:
         scans = map_ordered(scanner.scan_site, sites, context.threads)
         for site, scan in zip(sites, scans, strict=True):
             file.write(_scan_columns(site.name, scan))
             scanned.append(scan.as_site(site.name, site.pole))
-            doubtful += scan.rows.doubtful
+            ambiguous += scan.rows.ambiguous
             if site.name in points:
                 clouds.append(_write_cloud(context.folder, site.name, scan, cloud))
             context.progress("sites", len(scanned), len(sites))
@@ -97,7 +97,7 @@ def _write_scans(
         "kept": True,
         "beams": sum(site.beams_in_roi for site in scanned),
         "returns": sum(site.returns for site in scanned),
-        "settled_in_float64": doubtful,
+        "settled_in_float64": ambiguous,
         "clouds": clouds,
     }
 

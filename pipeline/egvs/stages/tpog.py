@@ -25,7 +25,8 @@ from egvs.core.grid import Grid, IntArray
 from egvs.core.progress import ProgressCallback
 from egvs.scenario.model import Scenario
 from egvs.scoring import occupancy
-from egvs.scoring.occupancy import BlockCounts, autocorrelation_time, count_blocks, static_voxels
+from egvs.scoring.autocorrelation import autocorrelation_time
+from egvs.scoring.occupancy import BlockCounts, count_blocks, static_voxels
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 
 

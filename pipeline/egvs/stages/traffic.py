@@ -40,8 +40,8 @@ def dependencies(context: StageContext) -> StageDependencies:
     settings = {"seed": scenario.seed, "name": scenario.name, "traffic": traffic}
     if scenario.is_recorded:
         settings |= geolocation.world_frame_settings(scenario)
-    # an effect that activates itself depends on the network only
-    named_effects = registry.effect_settings(effect for effect in effects if not effect.SELF_ACTING)
+    # an effect that is enabled automatically depends on the network only
+    named_effects = registry.effect_settings(effect for effect in effects if not effect.AUTO_ENABLED)
     if named_effects:
         settings["effects"] = named_effects
 

@@ -25,7 +25,7 @@ from egvs.core.progress import ProgressCallback, no_progress
 from egvs.effects import registry
 from egvs.effects.base import Expand
 from egvs.runs.run import check_no_overwrite, lock_run_folder, refresh_report
-from egvs.runs.stage_keys import RANKING_STAGES
+from egvs.runs.stage_registry import RANKING_STAGES
 from egvs.scenario.loading import load
 from egvs.scenario.model import Scenario
 from egvs.studies import measurement, pareto_figure, score_errors, study_settings

@@ -29,8 +29,8 @@ from egvs.core.progress import ProgressCallback, no_progress
 from egvs.effects import registry
 from egvs.effects.articulated import Articulated
 from egvs.effects.base import Detect, Effect, Traffic
-from egvs.runs import run, stage_keys
-from egvs.runs.stage_keys import RANKING_STAGES
+from egvs.runs import run, stage_keys, stage_registry
+from egvs.runs.stage_registry import RANKING_STAGES
 from egvs.scenario.effects_config import GROUP, EffectParameters
 from egvs.scenario.model import Scenario
 from egvs.scoring.scorer import Scorer
@@ -151,7 +151,7 @@ class EffectTrials:
         if not RunFolder(folder).run_record.is_file():
             return None
         record = RunRecord.read(folder)
-        work = open_folder(scene.scenario, folder, recorded=stage_keys.recorded_digests(record))
+        work = open_folder(scene.scenario, folder, recorded=stage_registry.recorded_digests(record))
         try:
             for name in ("traffic", "statics", "tpog"):
                 if name not in record.stages or record.stages[name].inputs != stage_keys.stage_key(name, work).key:
@@ -332,7 +332,7 @@ def _status_or_error(name: str, describe: Callable[[str], EffectStatus]) -> Effe
 
 
 def _describe_effect(name: str) -> EffectStatus:
-    kind = registry.find_effect_class(name)
+    kind = registry.load_effect_class(name)
     summary = str(sys.modules[kind.__module__].__doc__).strip().splitlines()[0]
     return _status(kind, "", summary)
 
@@ -346,9 +346,9 @@ def _status(kind: type[Effect[Any]], state: str, why: str, change: str = "") -> 
 
 
 def _effect_status(name: str, scene: Scene, trials: EffectTrials | None) -> EffectStatus:
-    kind = registry.find_effect_class(name)
+    kind = registry.load_effect_class(name)
     named = scene.scenario.effects.named
-    if issubclass(kind, Traffic) and kind.SELF_ACTING:
+    if issubclass(kind, Traffic) and kind.AUTO_ENABLED:
         is_on, why = kind(kind.Model()).acts(scene.scenario)
         return _status(kind, "on" if is_on else "off", why)
     if name not in named:
@@ -388,8 +388,8 @@ def _unnamed_effect_status(kind: type[Effect[Any]], scene: Scene, trials: Effect
     elif isinstance(effect, Detect):
         is_small = 1.0 - min(effect.detection_shares(scene)) < SMALL_CHANGE
 
-    if kind.DECIDED_BY:
-        why = "; ".join(filter(None, (f"{kind.DECIDED_BY} decides", summary)))
+    if kind.USER_KNOWLEDGE:
+        why = "; ".join(filter(None, (f"{kind.USER_KNOWLEDGE} decides", summary)))
         if trials is not None and not isinstance(effect, Traffic):
             why += "; tried with " + ", ".join(f"{key} = {value:g}" for key, value in kind.TRIAL.items())
         return _status(kind, "your choice", why, change)

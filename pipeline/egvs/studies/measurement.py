@@ -32,9 +32,10 @@ from egvs.core.errors import InputError, RunError
 from egvs.core.files import CHECKSUM_KEY, add_checksum, has_valid_checksum
 from egvs.core.progress import ProgressCallback
 from egvs.core.resource_usage import ResourceUsage, release_memory
-from egvs.runs import stage_keys
+from egvs.runs import stage_keys, stage_registry
 from egvs.runs.run import fetch_or_run
-from egvs.runs.stage_keys import RANKING_STAGES, StageKey, StageResult
+from egvs.runs.stage_keys import StageKey
+from egvs.runs.stage_registry import RANKING_STAGES, StageResult
 from egvs.runs.store import Store
 from egvs.scenario.loading import load
 from egvs.scenario.model import Scenario, SiteGrid
@@ -225,7 +226,7 @@ class SettingRunner:
         """Run all stages with a single site and discard the result, so that everything is compiled and loaded."""
         with self._temporary_run(with_one_site(self.scenario(setting))) as work:
             for name in RANKING_STAGES:
-                stage_keys.run_stage(name, work, stage_keys.stage_key(name, work).dependencies)
+                stage_registry.run_stage(name, work, stage_keys.stage_key(name, work).dependencies)
 
     def stage_times(self, name: str, key: str) -> StageTimes:
         """Return what a stage has cost so far."""
@@ -283,8 +284,8 @@ class SettingRunner:
     ) -> StageResult:
         release_memory()
         if name == "score" and observe is not None:
-            return stage_keys.run_stage(name, work, inputs.dependencies, observe=observe)
-        return stage_keys.run_stage(name, work, inputs.dependencies)
+            return stage_registry.run_stage(name, work, inputs.dependencies, observe=observe)
+        return stage_registry.run_stage(name, work, inputs.dependencies)
 
     def _save_times(self, name: str, key: str, work: StageContext, result: StageResult, *, is_measured: bool) -> None:
         """Add the cost of a stage, measured now or by the run that wrote the artefacts."""

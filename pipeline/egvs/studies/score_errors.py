@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from egvs.artefacts.tpog import Tpog
 from egvs.core.errors import EgvsError
-from egvs.runs.stage_keys import RANKING_STAGES
+from egvs.runs.stage_registry import RANKING_STAGES
 from egvs.scenario.model import Scenario
 from egvs.studies.measurement import SettingListener, SettingRunner, SettingScores
 from egvs.studies.study_settings import APPROXIMATES, MEASURES, REFERENCE, SCENARIO, SCENARIO_AS_IS, Setting, is_default

@@ -27,7 +27,7 @@ from pydantic import ValidationError
 from egvs.core.errors import InputError
 from egvs.core.grid import Grid
 from egvs.effects import registry
-from egvs.effects.registry import SELF_ACTIVATING
+from egvs.effects.registry import AUTO_ENABLED
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import DEFAULT_FRAMES, TrafficConfig
 from egvs.sensors import sites
@@ -118,7 +118,7 @@ def counted_frames(scenario: Scenario) -> int:
     return sum(map(_frames_in_blocks, scenario.by_period().values()))
 
 
-def scale_traffic(scenario: Scenario, factor: float, period_s: float) -> tuple[int, tuple[str, ...]]:
+def traffic_length_overrides(scenario: Scenario, factor: float, period_s: float) -> tuple[int, tuple[str, ...]]:
     """Find the overrides that lengthen or shorten all traffic of a scenario.
 
     Parameters
@@ -170,7 +170,7 @@ def reference_setting(scenario: Scenario, factor: int) -> Setting:
     """Return the scenario with traffic that is ``factor`` times as long."""
     overrides: tuple[str, ...] = ()
     if factor > 1:
-        _, overrides = scale_traffic(scenario, factor, scenario.traffic.frame_period_s)
+        _, overrides = traffic_length_overrides(scenario, factor, scenario.traffic.frame_period_s)
     return Setting(REFERENCE, REFERENCE, "frames", overrides)
 
 
@@ -214,7 +214,7 @@ def traffic_settings(scenario: Scenario, values: SettingValues = DEFAULT_VALUES)
     traffic = scenario.traffic
     scenario_frames = counted_frames(scenario)
     for requested in values.frames:
-        frames, overrides = scale_traffic(scenario, requested / scenario_frames, traffic.frame_period_s)
+        frames, overrides = traffic_length_overrides(scenario, requested / scenario_frames, traffic.frame_period_s)
         if 0 < frames < scenario_frames and (frames == requested or traffic.periods):
             yield Setting(f"{frames} frames", APPROXIMATES, "frames", overrides)
     for period_s in values.frame_periods_s:
@@ -244,7 +244,7 @@ def _scaled_traffic_setting(
     traffic = scenario.traffic
     step_s = step_s or traffic.step_s
     period_s = period_s or traffic.frame_period_s
-    frames, length_overrides = scale_traffic(scenario, factor, period_s)
+    frames, length_overrides = traffic_length_overrides(scenario, factor, period_s)
     is_possible = _divides(step_s, period_s) and _divides(step_s, traffic.warmup_s)
     if frames == 0 or not (is_possible or scenario.is_recorded):
         return
@@ -359,10 +359,10 @@ def _acting_effects(scenario: Scenario) -> Iterator[str]:
     """Yield effects that the scenario does not name, that need no parameter, and that act in its scene."""
     scene = None
     for name in registry.effect_names():
-        if name in scenario.effects.named or name in SELF_ACTIVATING or registry.required_parameters(name):
+        if name in scenario.effects.named or name in AUTO_ENABLED or registry.required_parameters(name):
             continue
         scene = scene or build_scene(scenario)
-        kind = registry.find_effect_class(name)
+        kind = registry.load_effect_class(name)
         effect = kind(kind.Model())
         if effect.why_idle(scene) is None and effect.refusal(scene) is None:
             yield name
@@ -384,7 +384,7 @@ def _effect_quality_settings(scenario: Scenario) -> Iterator[Setting]:
         parameters = named.model_dump(mode="json", exclude_unset=True)
         for key, values in effect.QUALITY.items():
             try:
-                registry.find_effect_class(name).Model.from_dict({**parameters, key: values[0]})
+                registry.load_effect_class(name).Model.from_dict({**parameters, key: values[0]})
             except ValidationError:  # the effect uses another method, without this parameter
                 continue
             current = getattr(effect.parameters, key)

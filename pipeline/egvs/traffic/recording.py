@@ -25,7 +25,8 @@ from egvs.core.progress import ProgressCallback
 from egvs.formats import xml
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import Scenario
-from egvs.traffic import demand, fcd, finished_fcd, network, sumo, sumo_folder
+from egvs.traffic import fcd, finished_fcd, network, sumo, sumo_folder
+from egvs.traffic.count_fit import CountFit, count_fits, missed_count_warnings
 from egvs.traffic.sumo_folder import SimulationFolder, Timing
 from egvs.traffic.vehicle_boxes import TrafficHook, VehicleSize
 
@@ -49,7 +50,7 @@ class RecordingSummary:
     flags: list[str] | None
     collisions: int
     notes: list[str] = field(default_factory=list)
-    counts: list[demand.CountFit] = field(default_factory=list)
+    counts: list[CountFit] = field(default_factory=list)
     warnings: list[Diagnostic] = field(default_factory=list)
 
 
@@ -505,13 +506,13 @@ def _vehicle_counts(prepared: SimulationFolder) -> dict[str, int]:
     return {key: int(vehicles.get(key, "0")) for key in ("loaded", "running", "waiting")}
 
 
-def _compare_counts(scenario: Scenario, prepared: SimulationFolder) -> tuple[list[demand.CountFit], list[Diagnostic]]:
+def _compare_counts(scenario: Scenario, prepared: SimulationFolder) -> tuple[list[CountFit], list[Diagnostic]]:
     """Compare simulated flows with the counts of a scenario, if it has any."""
     if not prepared.has_counts:
         return [], []
     first_s, end_s = prepared.timing.first_ms / 1000.0, prepared.timing.end_ms / 1000.0
-    fits = demand.count_fits(scenario.traffic, prepared.folder / sumo_folder.DRIVEN_ROUTES_FILE, first_s, end_s)
-    return fits, demand.count_warnings(fits, (end_s - first_s) / 3600.0, sumo_folder.traffic_location(scenario))
+    fits = count_fits(scenario.traffic, prepared.folder / sumo_folder.DRIVEN_ROUTES_FILE, first_s, end_s)
+    return fits, missed_count_warnings(fits, (end_s - first_s) / 3600.0, sumo_folder.traffic_location(scenario))
 
 
 def _planned_stops(prepared: SimulationFolder) -> set[str]:

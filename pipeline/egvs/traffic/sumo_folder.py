@@ -159,7 +159,7 @@ def read_network(scenario: Scenario) -> network.Network | None:
     if not network.is_osm(path):
         return network.read_net_xml(path)
     with files.temporary_folder() as folder:
-        convert_osm(path, folder / NETWORK_FILE)
+        convert_osm_to_network(path, folder / NETWORK_FILE)
         return network.read_net_xml(folder / NETWORK_FILE, path)
 
 
@@ -173,7 +173,7 @@ def copy_network(scenario: Scenario, folder: Path) -> None:
     vtypes = [scenario.find(name, "traffic.vtypes") for name in traffic.vtypes]
     _make_empty(folder, [scenario.find(traffic.fcd, "traffic.fcd"), path, *vtypes])
     if network.is_osm(path):
-        convert_osm(path, folder / NETWORK_FILE)
+        convert_osm_to_network(path, folder / NETWORK_FILE)
     else:
         user_files.copy_checked(path, folder / NETWORK_FILE)
 
@@ -396,14 +396,14 @@ def _copy_files(
             used.add(name)
             names.append(name)
             if option == "net-file" and network.is_osm(path):
-                convert_osm(path, folder / name)
+                convert_osm_to_network(path, folder / name)
             else:
                 notes += user_files.copy_checked(path, folder / name)
         copies[option] = ",".join(names)
     return copies, notes
 
 
-def convert_osm(path: Path, network_path: Path) -> None:
+def convert_osm_to_network(path: Path, network_path: Path) -> None:
     """Convert an OpenStreetMap map to a network, whose origin is at its south-west corner."""
     content = _convert_osm_once(path, files.hash_file(path))
     with files.attach_filename(network_path):

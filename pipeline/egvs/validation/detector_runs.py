@@ -29,7 +29,7 @@ from egvs.core.resource_usage import ResourceUsage, measure_usage
 from egvs.core.threads import thread_count
 from egvs.effects import registry
 from egvs.effects.base import Effect
-from egvs.runs import stage_keys
+from egvs.runs import stage_keys, stage_registry
 from egvs.runs.store import Store
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.sites import Site
@@ -249,7 +249,7 @@ def run_detectors(
 
     listener.begins(missing, task.record.frames, processes)
     progress("sites", done, len(sites))
-    with closing(_run_all(task, work, processes)) as finished:
+    with closing(_iter_site_results(task, work, processes)) as finished:
         for site, site_results, cost in finished:
             for name, result in site_results.items():
                 _cache_result(result, task.key(site, name), cost)
@@ -295,7 +295,7 @@ def _cache_result(result: DetectorResult, key: str, cost: ResourceUsage) -> None
         with store.maker(stem, key, wait=False) as is_maker:
             if is_maker:  # otherwise another process is storing the same result
                 artefacts = {path.name: files.hash_file(path)}
-                store.put(stem, key, folder, stage_keys.StageResult(artefacts, {}, {}, cost))
+                store.put(stem, key, folder, stage_registry.StageResult(artefacts, {}, {}, cost))
 
 
 # ---- worker processes
@@ -316,7 +316,7 @@ class _SiteResults(NamedTuple):
     cost: ResourceUsage
 
 
-def _run_all(
+def _iter_site_results(
     task: DetectionTask[Any], work: Sequence[_SiteWork], processes: int
 ) -> Generator[_SiteResults, None, None]:
     """Yield the results of each viewpoint as they are finished."""

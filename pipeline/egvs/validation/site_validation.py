@@ -24,7 +24,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.runs import run as runs
-from egvs.runs import stage_keys
+from egvs.runs import stage_keys, stage_registry
 from egvs.scenario.model import Scenario
 from egvs.sensors.sites import Site
 from egvs.stages.inputs import open_folder
@@ -236,7 +236,7 @@ def _stage_keys(scenario: Scenario, folder: Path) -> dict[str, str]:
     """Return the keys of the stages of a run whose artefacts the scores were computed from."""
     context = open_folder(scenario, folder)
     runs.ensure_stages(context, "tpog")  # the last TPOG in the folder may have voxels of another size
-    return {name: stage_keys.stage_key(name, context).key for name in stage_keys.RANKING_STAGES}
+    return {name: stage_keys.stage_key(name, context).key for name in stage_registry.RANKING_STAGES}
 
 
 def _write_correlation(path: Path, validation: Validation, metadata: dict[str, Any]) -> None:

@@ -19,7 +19,7 @@ from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core import files
 from egvs.core.errors import WARNINGS_KEY, Diagnostic, InputError, collect_warnings, with_relative_paths
 from egvs.core.progress import ProgressCallback
-from egvs.runs import stage_keys
+from egvs.runs import stage_keys, stage_registry
 from egvs.runs.run import lock_run_folder
 from egvs.scenario.model import Scenario
 from egvs.stages.inputs import open_folder
@@ -93,7 +93,7 @@ def _check_scenario(scenario: Scenario, folder: Path, progress: ProgressCallback
     """Run the check stage and return its warnings; its errors are raised."""
     folder.mkdir()
     context = open_folder(scenario, folder, progress=progress)
-    result = stage_keys.run_stage("check", context, stage_keys.stage_key("check", context).dependencies)
+    result = stage_registry.run_stage("check", context, stage_keys.stage_key("check", context).dependencies)
     return collect_warnings([result.summary])
 
 

@@ -1,6 +1,6 @@
 """The carriageway: the lanes that vehicles drive on, as areas.
 
-The middle line of each lane, including those inside junctions, is widened to its width less a margin on either side
+The centre line of each lane, including those inside junctions, is widened to its width less a margin on either side
 (:data:`egvs.world.clearances.LANE_INSET_M`). Sidewalks, bicycle lanes and separate rails are not carriageway. World
 frame, metres.
 """
@@ -45,7 +45,7 @@ class Carriageway:
     names
         SUMO's id of each lane.
     lanes
-        Their middle lines and widths.
+        Their centre lines and widths.
     junctions, corners
         Outlines of junctions, and of the walking areas in them.
     """
@@ -150,7 +150,7 @@ class Carriageway:
         return np.reshape(shapely.total_bounds(self.areas), (2, 2))
 
     def height_m(self, lane: int, at_m: FloatArray) -> float:
-        """Return the road's z beside a point (2,), on the middle line of a lane."""
+        """Return the road's z beside a point (2,), on the centre line of a lane."""
         line = self.lanes[lane].shape_m
         starts = line[:-1, :2]
         along = np.diff(line[:, :2], axis=0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 LANE_INSET_M = 0.25
-"""A site is in a lane when it is closer to the lane's middle line than half the width less this. Networks are accurate
+"""A site is in a lane when it is closer to the lane's centre line than half the width less this. Networks are accurate
 to a few decimetres, and a pole at the kerb is fine."""
 
 CLEARANCE_M = 4.5

@@ -129,7 +129,7 @@ def _converted_location(path: Path, changed_ns: int, size: int) -> Location | No
     del changed_ns, size
     with files.temporary_folder() as folder:
         converted = folder / sumo_folder.NETWORK_FILE
-        sumo_folder.convert_osm(path, converted)
+        sumo_folder.convert_osm_to_network(path, converted)
         return network.read_location(converted)
 
 

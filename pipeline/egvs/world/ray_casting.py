@@ -6,7 +6,7 @@ Embree (float32) finds *which triangle*, float64 arithmetic *where*:
 2. Embree (:class:`egvs.kernels.embree.TriangleTree`) gets every triangle enlarged by a rim that is wider than the error
    of float32, and a low upright fin on each side that is not shared with a steep neighbour. A beam that hits a triangle
    also hits it there: no beam leaks through a shared edge or vertex, or along a surface at a fraction of a degree.
-3. Each proposed hit is computed in float64 on the exact triangle. Beams are doubtful (one in a thousand) if they hit
+3. Each proposed hit is computed in float64 on the exact triangle. Beams are ambiguous (one in a thousand) if they hit
    only a rim or fin, pass within 0.02 mm of an edge, or hit a surface at less than 0.6 degrees. Their first hit is
    searched among all exact triangles in float64.
 
@@ -66,7 +66,7 @@ class EmptyScan:
         End of each beam relative to the sensor, along the world axes, (n, 3) float64.
     returned
         Whether the beam hit something within range, (n,) bool.
-    doubtful
+    ambiguous
         Number of beams whose hit float32 alone could not determine.
     weight
         Share of the beam that each row is, (n,) float64; None unless effects weight beams.
@@ -77,7 +77,7 @@ class EmptyScan:
     beam: NDArray[np.uint32]
     ends_m: Floats
     returned: NDArray[np.bool_]
-    doubtful: int = 0
+    ambiguous: int = 0
     weight: Floats | None = None
     face: NDArray[np.int64] | None = None
 
@@ -104,7 +104,8 @@ class Caster:
         triangles = world.triangles_m - self._origin_m
         if not np.isfinite(triangles).all():
             raise InputError("statics", "expected finite coordinates, got a triangle with nan or inf")
-        faces = np.flatnonzero(_cross(triangles).any(axis=1))  # beams hit the neighbours of triangles without area
+        # A beam through a degenerate triangle (zero area) hits its neighbours.
+        faces = np.flatnonzero(_cross(triangles).any(axis=1))
         if starts_m is not None:
             is_reachable = reachable_shapes(world.triangles_m[faces], roi, starts_m, range_m)
             if 2 * np.count_nonzero(is_reachable) < len(faces):  # removing a few does not make the tree faster
@@ -164,12 +165,12 @@ class Caster:
 
         Returns
         -------
-        ranges, doubtful
+        ranges, ambiguous
             Range of each ray's first hit, infinite for none, (n,); number of rays that were searched in float64.
         """
         ranges = np.empty(len(d))
         scan, _ = self._cast(o_roi_m, np.arange(len(d), dtype=np.uint32), d, range_m, ranges)
-        return ranges, scan.doubtful
+        return ranges, scan.ambiguous
 
     def _cast(
         self, o: Floats, beam: NDArray[np.uint32], d: Floats, range_m: float, ranges: Floats | None = None
@@ -190,11 +191,11 @@ class Caster:
             nearest = self._tree.nearest(o, beam, d)
         mesh = ray_triangle.TriangleMesh(self._triangles, self._planes)
         rays = ray_triangle.Rays(o, beam, d, float(range_m))
-        doubtful = np.empty(count, dtype=np.int64)
-        doubtful = doubtful[: ray_triangle.resolve_hits(nearest, self._owner, mesh, rays, hits, doubtful)]
+        ambiguous = np.empty(count, dtype=np.int64)
+        ambiguous = ambiguous[: ray_triangle.resolve_hits(nearest, self._owner, mesh, rays, hits, ambiguous)]
         boxes = ray_triangle.BoxTree(self._boxes, self._level_starts)
-        ray_triangle.search_triangles(doubtful, mesh, boxes, rays, hits)
-        return EmptyScan(beam, hits.ends, hits.returned, len(doubtful)), hits.triangle
+        ray_triangle.search_triangles(ambiguous, mesh, boxes, rays, hits)
+        return EmptyScan(beam, hits.ends, hits.returned, len(ambiguous)), hits.triangle
 
 
 def reachable_shapes(shapes: Floats, roi: Roi, sites_m: Floats, range_m: float = float("inf")) -> NDArray[np.bool_]:

@@ -1,6 +1,6 @@
 """A triangulated ground through the lanes of a network.
 
-Steps: sample the middle line and both sides of each lane every few metres; thin the points to one per cell of half a
+Steps: sample the centre line and both sides of each lane every few metres; thin the points to one per cell of half a
 metre (the mean, so that points of a plane stay on it; where lanes cross at different levels, only the lowest level);
 triangulate the points (Delaunay). Beyond the roads, the ground continues at the height of the nearest lane. World frame
 (x east, y north, z up), metres.
@@ -147,7 +147,7 @@ def triangulate_ground(
     InputError
         When the ground would have too many points.
     """
-    _check_size(roads, low_m, high_m, where)
+    _check_point_count(roads, low_m, high_m, where)
     lanes = [_sample_lane(lane, _width_m(edge, lane)) for edge in roads.all_edges for lane in edge.lanes]
     points = _thin_points(np.concatenate(lanes))
     low = points[:, :2].min(axis=0) - _MARGIN_M if low_m is None else low_m
@@ -158,7 +158,7 @@ def triangulate_ground(
     return _triangulate(np.concatenate([points[is_inside], rim]), low, high)
 
 
-def _check_size(roads: Network, low_m: Floats | None, high_m: Floats | None, where: object) -> None:
+def _check_point_count(roads: Network, low_m: Floats | None, high_m: Floats | None, where: object) -> None:
     """Raise an InputError when lanes are so long, or the rectangle so wide, that there are too many points."""
     shapes = [lane.shape_m for edge in roads.all_edges for lane in edge.lanes]
     length = sum(float(np.hypot(*np.diff(shape[:, :2], axis=0).T).sum()) for shape in shapes)

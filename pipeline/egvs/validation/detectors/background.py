@@ -75,7 +75,7 @@ class GroundMap:
         np.minimum.at(lowest_return_m, tuple(square[inside].T), points[inside, 2])
         lowest_sensor_m = min(view.pose.z_m for view in views)
         fallback_m = float(points[:, 2].min(initial=lowest_sensor_m))
-        return cls(low + SQUARE_M / 2, _fit_surface(lowest_return_m, fallback_m))
+        return cls(low + SQUARE_M / 2, _fit_ground(lowest_return_m, fallback_m))
 
     def height_m(self, xy_m: FloatArray) -> FloatArray:
         """Return the world z of the ground at positions (n, 2) in the world frame, (n,)."""
@@ -92,7 +92,7 @@ def empty_scan_points(view: SiteView) -> FloatArray:
     return points_m
 
 
-def _fit_surface(lowest_m: FloatArray, fallback_m: float) -> FloatArray:
+def _fit_ground(lowest_m: FloatArray, fallback_m: float) -> FloatArray:
     """Return the ground of every square from the lowest return of each, infinite where no beam returned."""
     has_return = np.isfinite(lowest_m)
     if not has_return.any():

@@ -1,4 +1,4 @@
-"""Clusters the foreground points of a sweep, ideally one cluster per road user.
+"""Clustering of the foreground points of a sweep, ideally one cluster per road user.
 
 Steps: average the points in small squares of the ground, so that a wall of points counts as its outline; cluster the
 squares by DBSCAN (Ester, Kriegel, Sander, Xu, KDD 1996), with a neighbourhood that grows with the range, as the

@@ -212,7 +212,7 @@ class _TrainingRun:
         self._net = PillarNet()
         self._optimizer = torch.optim.AdamW(self._net.parameters(), lr=_LEARNING_RATE, weight_decay=_WEIGHT_DECAY)
         self._schedule = torch.optim.lr_scheduler.LambdaLR(
-            self._optimizer, lambda step: _learning_rate_share(step / recipe.steps)
+            self._optimizer, lambda step: _learning_rate_factor(step / recipe.steps)
         )
         self._metadata = metadata | {"code": stage_keys.source_digest(__name__).digest}
         self._checkpoint = out.with_name(out.name + ".partial")
@@ -301,7 +301,7 @@ class _TrainingRun:
         self._mean_losses = dict(state["mean"])
 
 
-def _learning_rate_share(progress: float) -> float:
+def _learning_rate_factor(progress: float) -> float:
     """Return the share of the learning rate: linear for the first fifth of the steps, then a cosine to 0."""
     if progress < _WARM_UP_SHARE:
         return 0.05 + 0.95 * progress / _WARM_UP_SHARE

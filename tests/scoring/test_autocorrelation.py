@@ -1,6 +1,6 @@
-"""Is the traffic's memory estimated and paid for?
+"""Is the autocorrelation time estimated, and are standard errors inflated accordingly?
 
-Evidence: processes whose memory is known, a plain twin of the sums, and the scatter of many records."""
+Evidence: processes whose autocorrelation time is known, a plain twin of the sums, and the scatter of many records."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from egvs.scoring import occupancy
+from egvs.scoring import autocorrelation
 from egvs.scoring.standard_errors import (
-    GROUP_LENGTH_MEMORIES,
+    GROUP_LENGTH_TIMES,
     MIN_GROUPS,
     BlockGroups,
     ScoreUncertainty,
@@ -23,7 +23,7 @@ from egvs.scoring.standard_errors import (
 )
 
 
-def remembering(records: int, frames: int, keeps: float, seed: int) -> np.ndarray:
+def autoregressive_series(records: int, frames: int, keeps: float, seed: int) -> np.ndarray:
     """First-order autoregressive series (records, frames), started in their stationary state;
     tau = (1 + a) / (1 - a)."""
     rng = np.random.default_rng(seed)
@@ -35,8 +35,8 @@ def remembering(records: int, frames: int, keeps: float, seed: int) -> np.ndarra
 
 
 @pytest.mark.parametrize("keeps", [0.0, 0.5, 0.9])
-def test_a_known_memory_is_found(keeps: float) -> None:
-    found = [occupancy.autocorrelation_time(series) for series in remembering(40, 4000, keeps, 1)]
+def test_a_known_autocorrelation_time_is_found(keeps: float) -> None:
+    found = [autocorrelation.autocorrelation_time(series) for series in autoregressive_series(40, 4000, keeps, 1)]
     assert np.mean(found) == pytest.approx((1 + keeps) / (1 - keeps), rel=0.15)
 
 
@@ -49,25 +49,25 @@ def test_the_sums_by_hand() -> None:
         largest = max(largest, total)
         if lag >= 5 * largest:
             break
-    assert occupancy.autocorrelation_time(series) == pytest.approx(largest, abs=1e-3)
+    assert autocorrelation.autocorrelation_time(series) == pytest.approx(largest, abs=1e-3)
 
 
-def test_a_signal_does_not_hide_the_ground_below_it() -> None:
+def test_a_periodic_signal_does_not_hide_the_correlation_over_full_cycles() -> None:
     """The plain sum of a swing of 80 frames cancels within half a cycle; the largest one does not."""
-    slow = remembering(20, 4000, 0.9, 2)
+    slow = autoregressive_series(20, 4000, 0.9, 2)
     swinging = slow + 1.5 * np.sign(np.sin(2 * np.pi * np.arange(4000) / 80))
-    assert np.mean([occupancy.autocorrelation_time(series) for series in swinging]) >= 15
+    assert np.mean([autocorrelation.autocorrelation_time(series) for series in swinging]) >= 15
 
 
 @pytest.mark.parametrize("series", [np.zeros(9), np.full(9, 3), np.array([5]), np.array([1, -1] * 20)])
 def test_constant_and_alternating_series_have_no_autocorrelation(series: np.ndarray) -> None:
-    assert occupancy.autocorrelation_time(series) == 1.0
+    assert autocorrelation.autocorrelation_time(series) == 1.0
 
 
 @given(st.floats(1, 500), st.integers(10, 100_000), st.integers(2, 10))
 def test_errors_are_never_narrowed_and_long_records_are_left_alone(lasts: float, frames: int, groups: int) -> None:
-    assert occupancy.standard_error_inflation(lasts, frames, groups) >= 1.0
-    assert occupancy.standard_error_inflation(lasts, int(1000 * lasts * groups), groups) < 1.01
+    assert autocorrelation.standard_error_inflation(lasts, frames, groups) >= 1.0
+    assert autocorrelation.standard_error_inflation(lasts, int(1000 * lasts * groups), groups) < 1.01
 
 
 @pytest.mark.parametrize(("lasts", "frames", "groups"), [(50, 1000, 10), (50, 2000, 4), (200, 1000, 4), (5, 1000, 10)])
@@ -76,13 +76,13 @@ def test_inflation_equals_that_of_the_covariance(
 ) -> None:
     """Of a series that keeps a share of itself from frame to frame: the variance of its mean, and the scatter of the
     means of groups that is to be expected, entry by entry of the covariance matrix."""
-    monkeypatch.setattr(occupancy, "memory_upper_bound", lambda memory, frames: memory)
+    monkeypatch.setattr(autocorrelation, "time_upper_bound", lambda time_frames, frames: time_frames)
     at = np.arange(frames)
     covariance = ((lasts - 1.0) / (lasts + 1.0)) ** np.abs(at[:, None] - at[None, :])
     of_groups = covariance.reshape(groups, frames // groups, groups, frames // groups).mean(axis=(1, 3))
     scatter = (np.trace(of_groups) - of_groups.sum() / groups) / (groups - 1) / groups
     needed = math.sqrt(covariance.mean() / scatter)
-    assert occupancy.standard_error_inflation(lasts, frames, groups) == pytest.approx(needed, rel=1e-3)
+    assert autocorrelation.standard_error_inflation(lasts, frames, groups) == pytest.approx(needed, rel=1e-3)
 
 
 def test_groups_are_longer_than_the_correlation_time_if_the_record_allows() -> None:
@@ -91,16 +91,16 @@ def test_groups_are_longer_than_the_correlation_time_if_the_record_allows() -> N
     assert group_sizes(10, 100, 1000.0) == [3, 3, 2, 2]
     assert group_sizes(50, 20, 5.0) == [5] * 10
     assert group_sizes(3, 20, 1000.0) == [1, 1, 1]
-    for memory_frames in (1.0, 12.0, 40.0):
-        sizes = group_sizes(100, 25, memory_frames)
-        assert len(sizes) == MIN_GROUPS or min(sizes) * 25 >= GROUP_LENGTH_MEMORIES * memory_frames
+    for correlation_frames in (1.0, 12.0, 40.0):
+        sizes = group_sizes(100, 25, correlation_frames)
+        assert len(sizes) == MIN_GROUPS or min(sizes) * 25 >= GROUP_LENGTH_TIMES * correlation_frames
 
 
 def estimates(series: np.ndarray, blocks: int) -> list[ScoreUncertainty]:
     """Of the means of records (records, frames), as the blocks of a TPOG would give them."""
     found = []
     for one in series:
-        lasts = occupancy.autocorrelation_time(one)
+        lasts = autocorrelation.autocorrelation_time(one)
         frames = np.array(group_sizes(blocks, len(one) // blocks, lasts)) * (len(one) // blocks)
         sums = np.array([part.sum() for part in np.split(one, np.cumsum(frames)[:-1])])
         left_out = [(one.sum() - part) / (len(one) - n) for part, n in zip(sums, frames, strict=True)]
@@ -111,20 +111,20 @@ def estimates(series: np.ndarray, blocks: int) -> list[ScoreUncertainty]:
 @pytest.mark.parametrize("frames", [600, 1500])
 def test_intervals_hold_where_groups_of_ten_would_not(frames: int) -> None:
     """A memory of 39 frames in a record of 15 or of 38 of them: ten groups would hold less than 0.85."""
-    found = estimates(remembering(400, frames, 0.95, 3), 10)
+    found = estimates(autoregressive_series(400, frames, 0.95, 3), 10)
     held = [one.intervals()[0, 0] <= 0 <= one.intervals()[0, 1] for one in found]
     assert 0.86 <= np.mean(held) <= 0.96
     assert all(one.strata[0].widening > 1 for one in found)
 
 
 def test_a_short_record_is_warned_of_and_a_long_one_is_not() -> None:
-    (short,) = estimates(remembering(1, 200, 0.95, 4), 10)
+    (short,) = estimates(autoregressive_series(1, 200, 0.95, 4), 10)
     (doubt,) = uncertainty_warnings(short, "scenario.toml: traffic.frames", 0.5)
     assert doubt.problem.startswith("200 frames (100 s) are few")
     assert "for autocorrelation" in doubt.problem
     assert doubt.hint.startswith("Record at least ")
     assert "for autocorrelation" in str(summarise_uncertainty(short)["standard_errors_from"])
-    (long,) = estimates(remembering(1, 20_000, 0.95, 4), 10)
+    (long,) = estimates(autoregressive_series(1, 20_000, 0.95, 4), 10)
     assert uncertainty_warnings(long, "scenario.toml: traffic.frames", 0.5) == []
 
 
