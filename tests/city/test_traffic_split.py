@@ -186,7 +186,7 @@ def test_files_are_fcd_as_sumo_writes_it(city: City) -> None:
          "city.toml: traffic.periods.0.name: expected a name, got 'a/b'"),
         ("city.toml", "seed = 7", "seed = 7\n[effects.rain]\nrate_mm_h = 20.0\n",
          "city.toml: effects.rain: adds no traffic. Move it to junctions/scenario.toml"),
-        ("city.toml", 'name = "bus"', 'name = "coach"', "unknown sizes of vehicle types of fcd.csv: 'bus'"),
+        ("city.toml", 'name = "bus"', 'name = "coach"', "types in fcd.csv are unknown: 'bus'"),
     ],
 )  # fmt: skip
 def test_rejects_wrong_input(city: City, file: str, old: str, new: str, message: str) -> None:

@@ -129,7 +129,7 @@ def test_impossible_pose_has_no_score(page: Page) -> None:
     move_and_wait(page, "pole_a", Pose(16, 6, 3))
     assert page.controls.status.content.startswith("## no score")
     assert "is inside house" in page.controls.status.content
-    assert page.label.text == "pole_a: cannot be mounted here"
+    assert page.label.text == "pole_a: no sensor can be mounted here"
 
 
 @pytest.mark.slow

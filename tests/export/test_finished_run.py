@@ -40,7 +40,7 @@ def test_rejects_an_unfinished_run_and_one_of_another_version(local: Path, tmp_p
         path.write_text(files.to_json_text(value if content is None else add_checksum(value)))
         code, _, err = run_egvs("export", path.parent, "--to", "csv", "--out", tmp_path / "out")
         problem = f"the stage {first} is not finished, or was run by another version of egvs"
-        assert (code, err) == (2, f"egvs: {path}: {problem}. Run egvs run again.\n")
+        assert (code, err) == (2, f'egvs: {path}: {problem}. Repeat "egvs run".\n')
         assert not (tmp_path / "out").exists()
 
 
@@ -51,7 +51,7 @@ def test_rejects_a_run_from_before_the_scenario_had_a_reference_system(
     monkeypatch.setattr(geolocation, "scenario_georeference", lambda scenario: placed)
     code, _, err = run_egvs("export", local, "--to", "csv", "--out", tmp_path / "out")
     problem = "its sites have no geographic position, but the scenario or its network has one"
-    assert (code, err) == (2, f"egvs: {local / 'scores.parquet'}: {problem}. Run egvs run again.\n")
+    assert (code, err) == (2, f'egvs: {local / "scores.parquet"}: {problem}. Repeat "egvs run".\n')
 
 
 def test_rejects_a_run_whose_scenario_has_moved(
@@ -62,7 +62,7 @@ def test_rejects_a_run_whose_scenario_has_moved(
         monkeypatch.setattr(geolocation, "scenario_georeference", lambda scenario, now=now: now)
         code, _, err = run_egvs("export", located, "--to", "csv", "--out", tmp_path / "out")
         assert code == 2
-        assert "scores.parquet: the geographic position of its sites differs from that in the scenario" in err
+        assert "scores.parquet: the geographic positions of its sites differ from those in the scenario" in err
 
 
 @pytest.mark.parametrize("artefact", ["scores.parquet", "blindspots.parquet", "statics.ply"])

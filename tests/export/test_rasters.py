@@ -135,7 +135,7 @@ def test_scans_that_were_not_saved_need_unchanged_inputs(mini: Path, tmp_path: P
     code, output, _ = run_egvs("export", run, "--to", "geotiff", "--out", tmp_path / "a")
     assert code == 0
     (mini / "sites.csv").write_text((mini / "sites.csv").read_text().replace("pole_a,10,", "pole_a,11,"))
-    output = f"egvs: {run / 'run.json'}: sites.csv has changed since the sites were scored. Run egvs run again.\n"
+    output = f'egvs: {run / "run.json"}: sites.csv has changed since the sites were scored. Repeat "egvs run".\n'
     assert run_egvs("export", run, "--to", "geotiff", "--out", tmp_path / "b") == (2, "", output)
     assert not (tmp_path / "b").exists()
     assert run_egvs("figure", run, "--what", "seen", "--format", "svg", "--out", tmp_path / "b.svg") == (2, "", output)

@@ -47,8 +47,12 @@ PLACED = [{"mesh": 0} for _ in range(1000)]
 
 def hostile() -> Iterator[tuple[str, bytes, str]]:
     """Yield file name, content, and part of the message."""
-    yield "m.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 9999999999\nend_header\n", "got 1 bytes"
-    yield "m.ply", ASCII_PLY[:-20], r"the header declares 8 of 'vertex' and 12 of 'face', got 1\d lines"
+    yield "m.ply", b"ply\nformat binary_little_endian 1.0\nelement vertex 9999999999\nend_header\n", "contains 1 bytes"
+    yield (
+        "m.ply",
+        ASCII_PLY[:-20],
+        r"the header declares 8 of 'vertex' and 12 of 'face', but the file contains 1\d lines",
+    )
     yield "m.ply", COMPLETE_FILES["m.ply"][:-20], "cannot be loaded"
     yield "m.ply", ASCII_PLY.replace(b"-0.5", b"-0.5x", 1), "cannot be loaded"
     yield "m.ply", b"ply\n", "m.ply"

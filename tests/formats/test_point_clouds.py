@@ -290,8 +290,12 @@ def test_rejects_truncated_las(tmp_path: Path, name: str) -> None:
         (100, b"\xff\xff\xff\xff", "points beyond the file or into itself"),  # number of variable-length records
         (96, b"\xff\xff\xff\x7f", "points beyond the file or into itself"),  # where the points start
         (104, b"\x3f", "cannot be read as LAS"),  # point format 63
-        (247, b"\x2d\x01", "the header declares 9030 bytes of points, got 9000"),  # 301 points
-        (105, b"\xff\xff", "the header declares 19660500 bytes of points, got 9000"),  # length of a point
+        (247, b"\x2d\x01", "the header declares 9030 bytes of points, but the file contains 9000"),  # 301 points
+        (
+            105,
+            b"\xff\xff",
+            "the header declares 19660500 bytes of points, but the file contains 9000",
+        ),  # length of a point
         (131, struct.pack("<d", 1e308), "expected at least one return with finite x, y and z"),  # the scale of x
     ],
 )
@@ -448,21 +452,21 @@ CSV = "x_m,y_m,z_m\n1,2,3\n"
         ("a.pcd", pcd_with_viewpoint("0 0 nan 1 0 0 0"), "VIEWPOINT: .* got '0 0 nan 1 0 0 0'"),
         ("a.pcd", pcd_with_viewpoint("0 0 0"), "VIEWPOINT: .* got '0 0 0'"),
         # PCD, points
-        ("a.pcd", ASCII_PCD.replace("4 5 6\n", ""), "the header declares 2 points, got 1 lines"),
-        ("a.pcd", ASCII_PCD + "7 8 9\n", "the header declares 2 points, got 3 lines"),
+        ("a.pcd", ASCII_PCD.replace("4 5 6\n", ""), "the header declares 2 points, but the file contains 1 lines"),
+        ("a.pcd", ASCII_PCD + "7 8 9\n", "the header declares 2 points, but the file contains 3 lines"),
         ("a.pcd", ASCII_PCD.replace("4 5 6", "4 5"), r"a\.pcd: line 9: expected 3 values, got 2"),
         ("a.pcd", ASCII_PCD.replace("1 2 3\n4 5 6", "1 2 3 0\n4 5 6 0"), r"line 8: expected 3 values, got 4"),
         ("a.pcd", ASCII_PCD.replace("4 5 6", "\n4 5 six"),
          "line 10: expected a number, got 'six'. Use a number, or nan for a missing return"),
-        ("a.pcd", ASCII_PCD.replace("4 5 6", "4 5 6_0"), "cannot be read as text .*6_0"),
+        ("a.pcd", ASCII_PCD.replace("4 5 6", "4 5 6_0"), "expected 3 numbers in each line .*6_0"),
         ("a.pcd", ASCII_PCD.replace("1 2 3\n4 5 6", "nan 2 3\n4 5 inf"),
          "expected at least one return with finite x, y and z, got none of 2"),
-        ("a.pcd", BINARY + bytes(23), r"the header declares 2 points of 12 bytes \(24 bytes\), got 23 bytes"),
-        ("a.pcd", BINARY + bytes(25), r"\(24 bytes\), got 25 bytes"),
+        ("a.pcd", BINARY + bytes(23), r"declares 2 points of 12 bytes \(24 bytes\), but the file contains 23 bytes"),
+        ("a.pcd", BINARY + bytes(25), r"\(24 bytes\), but the file contains 25 bytes"),
         ("a.pcd", ASCII_PCD.replace("DATA ascii", "DATA " + "x" * 900), "DATA: .* got 'x{60}'"),
         ("a.pcd", PACKED + bytes(7), r"the file ends before its points \(only 7 bytes of data\)"),
         ("a.pcd", PACKED + struct.pack("<II", 1, 12) + b"\0",
-         "the header declares 24 bytes of points, got 12 bytes after decompression"),
+         "the header declares 24 bytes of points, but there are 12 after decompression"),
         ("a.pcd", PACKED + packed(bytes(24))[:-1], "expected 5 bytes of packed points, got 4 bytes"),
         ("a.pcd", PACKED + struct.pack("<II", 2, 24) + b"\x20\x05", "the packed points are not valid LZF data"),
         ("a.pcd", PACKED + struct.pack("<II", 1, 24) + b"\xe0", "the packed points are not valid LZF data"),
@@ -486,11 +490,11 @@ CSV = "x_m,y_m,z_m\n1,2,3\n"
          "the element 'vertex' has a list property. Use no list properties in"),
         ("a.ply", BINARY_PLY.replace("element", "element path 1\nproperty list uchar int way\nelement") + "\0" * 49,
          "the element 'path' has a list property"),
-        ("a.ply", ASCII_PLY.replace("4 5 6\n", ""), "the header declares 2 points, got 1 lines"),
+        ("a.ply", ASCII_PLY.replace("4 5 6\n", ""), "the header declares 2 points, but the file contains 1 lines"),
         ("a.ply", ASCII_PLY.replace("4 5 6\n", "4 5\n"), "line 9: expected 3 values, got 2"),
         ("a.ply", ASCII_PLY.replace("4 5 6\n", "4 5 z\n"), "line 9: expected a number, got 'z'"),
-        ("a.ply", BINARY_PLY + "\0" * 47, r"the header declares 2 points of 24 bytes \(48 bytes\), got 47 bytes"),
-        ("a.ply", BINARY_PLY + "\0" * 49, r"\(48 bytes\), got 49 bytes"),
+        ("a.ply", BINARY_PLY + "\0" * 47, r"2 points of 24 bytes \(48 bytes\), but the file contains 47 bytes"),
+        ("a.ply", BINARY_PLY + "\0" * 49, r"\(48 bytes\), but the file contains 49 bytes"),
         # CSV
         ("a.csv", "", r"a\.csv: expected exactly one column 'x_m', got none"),
         ("a.csv", CSV.replace("x_m", "x"), "expected exactly one column 'x_m', got x, y_m, z_m. Write a header row"),

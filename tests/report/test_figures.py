@@ -61,7 +61,7 @@ def test_lists_the_worst_locations_first_and_none_with_few_vehicles() -> None:
         "± 8 %, from 12 vehicles in 120 observations",
     )
     assert figures.format_missed_share(blindspots) == "12.5%"
-    assert figures.blindspot_note(blindspots) == "Share seen by approach: eastbound approach: 63 %."
+    assert figures.blindspot_note(blindspots) == "Share of vehicles seen on each approach: eastbound 63 %."
     assert blindspots.in_words() == (
         "p1 misses 12.5% of the vehicles (fewer than 20 points); worst: eastbound left-turn lane, 41% seen; "
         "eastbound left turn in the junction, 50% seen"
@@ -102,7 +102,7 @@ def test_page_has_the_blind_spots_of_each_site(tmp_path: Path) -> None:
     scenario, out = run_to_scores(tmp_path)
     text = render_report(scenario, out)
     read = PageReader(text)
-    assert read.text.count("Where vehicles are missed:") == 2
+    assert read.text.count("Vehicles missed:") == 2
     assert read.text.count("The traffic does not come from one road network") == 2 + 4  # panels, and data
     data = json.loads(re.search(r'id="site-data">(.*?)</script>', text, re.DOTALL)[1])  # type: ignore[index]
     for name, blindspots in data["sites"].items():

@@ -73,8 +73,8 @@ def test_rejects_artefact_with_flipped_bit(runs, out: Path, name: str, verb: str
         said = answer(verb, runs[0], out)
         now, known = (files.hash_file(path / name)[:12] for path in (out, runs[1]))
         altered = (
-            f"{out / name}: was altered or replaced (sha256 {now}, in run.json {known}). Run egvs run "
-            f"again to create it."
+            f'{out / name}: was altered or replaced (sha256 {now}, in run.json {known}). Repeat "egvs run" '
+            "to create it."
         )
         assert said == altered
         assert contents(out) == before, "a refused verb wrote something"
@@ -94,7 +94,7 @@ def test_rejects_artefact_that_no_stage_wrote(runs, tmp_path: Path, run_egvs) ->
     for name in ("trajectories.parquet", "statics.ply"):
         shutil.copyfile(made / name, fresh / name)
     code, _, error = run_egvs("tpog", scenario.folder, "--out", fresh)
-    what = "was not created by any stage in run.json. Run egvs run again to create it."
+    what = 'was not created by any stage recorded in run.json. Repeat "egvs run" to create it.'
     assert (code, error) == (2, f"egvs: {fresh / 'trajectories.parquet'}: {what}\n")
     assert not (fresh / "tpog.parquet").exists()
 

@@ -333,7 +333,9 @@ def test_warns_of_repeated_beams(street: Path) -> None:
     (street / "beams.csv").write_text("elevation_deg,azimuth_deg\n-5,0\n-5,90\n-5,360\n-9,0\n")
     told = found(street, 'sensors.own={beams="beams.csv",range_m=90}', 'sites.sensor="own"', 'sites.aim="roi"')
     assert told == {
-        "repeated beams": ["[beams.csv: 1 of 4 beams repeat an earlier direction (beam 2 as beam 0) and count twice]"]
+        "repeated beams": [
+            "[beams.csv: 1 of 4 beams have the same direction as an earlier one (beam 2 = beam 0) and count twice]"
+        ]
     }
 
 
@@ -409,7 +411,7 @@ def test_reports_counts_at_unknown_edges_and_kinds(street: Path) -> None:
     )
     told = found(street, f"traffic.counts={counts}")
     assert [line.partition("): ")[2] for line in told["traffic"]] == [
-        "the network has no edge 'north'", "the fleet has no kind 'ox'", "the network has no edge 'up'",
+        "the network has no edge 'north'", "the fleet has no vehicle kind 'ox'", "the network has no edge 'up'",
     ]  # fmt: skip
 
 

@@ -34,7 +34,7 @@ def test_repeat_with_other_bytes_is_an_error(mini: Path, tmp_path: Path) -> None
     cost = tmp_path / "accuracy" / "times" / f"tpog-{trial.stages['tpog'][:16]}.json"
     times = json.loads(cost.read_text().replace('"tpog.parquet": "', '"tpog.parquet": "0'))
     cost.write_text(files.to_json_text(files.add_checksum(times)))
-    with pytest.raises(RunError, match="different bytes"):
+    with pytest.raises(RunError, match="wrote bytes that differ"):
         runner.time_again("tpog", original, trial)
 
 

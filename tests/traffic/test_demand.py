@@ -135,7 +135,10 @@ def test_isolated_location_is_a_route_of_its_own(tmp_path):
     ("rows", "message"),
     [
         ([{"edge": "nowhere", "per_hour": 1}], r"traffic\.counts \(nowhere\): the network has no edge 'nowhere'"),
-        ([turn("left", "right", 10, "tram")], r"counts \(left0A0 to .*\): the fleet has no kind 'tram'.*car, truck"),
+        (
+            [turn("left", "right", 10, "tram")],
+            r"counts \(left0A0 to .*\): the fleet has no vehicle kind 'tram'.*car, truck",
+        ),
         (
             [{"from_edge": "A0top0", "to_edge": "left0A0", "per_hour": 5}],
             r"\(A0top0 to left0A0\): there is no route from 'A0top0' to 'left0A0'",
@@ -149,7 +152,7 @@ def test_isolated_location_is_a_route_of_its_own(tmp_path):
             [{"edge": "a", "per_hour": 1}, {"edge": "a", "per_hour": 9}],
             r"counts: expected one count for each location and kind, got two for a",
         ),
-        ([{"edge": "a", "per_hour": 0}], r"counts: expected at least one per_hour above 0"),
+        ([{"edge": "a", "per_hour": 0}], r"counts: expected at least one count with per_hour above 0"),
     ],
 )
 def test_rejects_wrong_count(cross, tmp_path, rows, message):

@@ -166,9 +166,10 @@ def test_names_all_types_without_size(mini: Path, tmp_path: Path, run_egvs) -> N
     code, _, output = run_egvs("run", mini, "--out", tmp_path)
     assert code == 2
     assert (
-        "traffic.kinds: unknown sizes of vehicle types of fcd.csv: 'lorry', 'tram'. Add a kind of each name" in output
+        "traffic.kinds: the sizes of these vehicle types in fcd.csv are unknown: 'lorry', 'tram'. For each, add a kind"
+        in output
     )
-    assert "vtypes (known: car)" in output
+    assert "Types with known sizes: car." in output
     head, _, _ = fcd().rpartition(";car;")
     (mini / "fcd.csv").write_text(f"{head};tram;1.7\n")  # at 19.5 s, beyond the frames that are asked for below
     assert run_egvs("run", mini, "--out", tmp_path)[0] == 2
@@ -217,7 +218,7 @@ def test_check_reports_missing_sizes(mini: Path, run_egvs) -> None:
     set_types(mini, "tram", "car", "lorry", "DEFAULT_VEHTYPE")
     code, output, _ = run_egvs("check", mini)
     assert code == 2
-    assert "unknown sizes of vehicle types of fcd.csv: 'lorry', 'tram'" in output
+    assert "the sizes of these vehicle types in fcd.csv are unknown: 'lorry', 'tram'" in output
 
 
 @pytest.mark.slow

@@ -130,7 +130,7 @@ BAD = {
         write("f.csv", f"{FCD}\n0;v;1;2;3;tram\n1;v;1;2;3;tram\n"),
         {"fcd": "f.csv", "frames": 1, "warmup_s": 0, "frame_period_s": 1},
         InputError,
-        r"unknown sizes of vehicle types of f.csv: 'tram'",
+        r"the sizes of these vehicle types in f.csv are unknown: 'tram'",
     ),
     "too few frames in a finished file": (
         write("f.csv", f"{FCD}\n0;v;1;2;3;car\n1;v;1;2;3;car\n"),

@@ -208,7 +208,7 @@ def read_junction_results(out: Path, junctions: Sequence[CityJunction]) -> tuple
     first = unranked[0]
     for result in unranked:
         if result.best.rank_by != first.best.rank_by:
-            problem = f"is {result.best.rank_by}, but {first.best.rank_by} at {first.junction.id}"
+            problem = f"expected {first.best.rank_by}, as for junction {first.junction.id}, got {result.best.rank_by}"
             hint = "Rank all junctions of a city by the same score."
             raise InputError(f"{_scores_path(out, result.junction.id)}: score.rank_by", problem, hint)
 

@@ -96,7 +96,7 @@ def demo(
     ] = Path("egvs-demo"),
     jobs: Jobs = None,
 ) -> None:
-    """Try it: rank eight sites at a roundabout with recorded traffic, in about a minute."""
+    """Try it: rank eight sites at a roundabout in about a minute, with traffic simulated in advance."""
     from egvs.cli import run_tables
     from egvs.cli.console import ProgressDisplay
     from egvs.runs.run import run
@@ -113,7 +113,7 @@ def demo(
 
 @app.command()
 def check(scenario: ScenarioPath, set_: Set = None) -> None:
-    """Check a scenario before a run, and print all errors and warnings; writes nothing."""
+    """Check a scenario before a run, and print all errors and warnings. No files are written."""
     from egvs.cli import run_tables
     from egvs.scenario.loading import load
     from egvs.stages import check
@@ -134,7 +134,7 @@ def traffic(
         typer.Option(metavar="HOST:PORT", help="Record from a running SUMO, started with --remote-port."),
     ] = None,
 ) -> None:
-    """Simulate the traffic with SUMO; writes trajectories.parquet."""
+    """Simulate the traffic with SUMO and write trajectories.parquet."""
     stage_options: dict[str, Any] = {}
     if traci is not None:
         stage_options["traci"] = cli_options.host_and_port(traci)
@@ -143,13 +143,13 @@ def traffic(
 
 @app.command()
 def statics(scenario: ScenarioPath, out: Out = None, set_: Set = None) -> None:
-    """Build the static world; writes statics.ply."""
+    """Build the static world and write statics.ply."""
     _run_stage("statics", scenario, out, set_)
 
 
 @app.command()
 def tpog(scenario: ScenarioPath, out: Out = None, set_: Set = None) -> None:
-    """Count how often each voxel is occupied by traffic; writes tpog.parquet."""
+    """Count how often each voxel is occupied by traffic, and write tpog.parquet."""
     _run_stage("tpog", scenario, out, set_)
 
 
@@ -165,7 +165,7 @@ def scan(
     ] = None,
     cloud: Annotated[str, typer.Option(metavar="FORMAT", help="Format of --points: ply or pcd.")] = "ply",
 ) -> None:
-    """Cast an empty scan (without traffic) from every site; writes scans.parquet."""
+    """Simulate an empty scan (without traffic) from every site, and write scans.parquet."""
     if cloud not in ("ply", "pcd"):
         raise InputError("--cloud", f"expected ply or pcd, got {cloud!r}", "Use --cloud ply.")
     stage_options: dict[str, Any] = {}
@@ -183,7 +183,7 @@ def score(
     audit: Audit = False,
     top: Top = None,
 ) -> None:
-    """Score and rank the sites; writes scores.parquet."""
+    """Score and rank the sites, and write scores.parquet."""
     stage_options = {"audit": True} if audit else {}
     _run_stage("score", scenario, out, set_, jobs, top, **stage_options)
 
@@ -246,7 +246,7 @@ def compare(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN RUN...", help="Two or more folders of finished runs.")],
     top: Top = None,
 ) -> None:
-    """Compare runs: scores, ranks, rank correlations, and differences of settings and files."""
+    """Compare runs: scores, ranks, rank correlations, and differences in settings and files."""
     from egvs.cli import study_tables
     from egvs.studies import run_comparison
 
@@ -264,7 +264,8 @@ def accuracy(
     seeds: Annotated[
         int,
         typer.Option(
-            min=0, help="Also check the standard errors with this many independent runs (2 or more, beyond --budget)."
+            min=0,
+            help="Check the standard errors with this many further runs (at least 2), whatever the budget.",
         ),
     ] = 0,
 ) -> None:
@@ -289,12 +290,13 @@ def effects(
     ] = None,
     set_: Set = None,
     ablation: Annotated[
-        bool, typer.Option("--ablation", help="Run each effect of the scenario on its own, and print what it changes.")
+        bool,
+        typer.Option("--ablation", help="Run the scenario with each of its effects alone, and print what it changes."),
     ] = False,
     out: Out = None,
     jobs: Jobs = None,
 ) -> None:
-    """List the effects; with a scenario, show which ones it calls for, why, and what they change."""
+    """List the effects; with a scenario, show which are enabled or recommended, why, and what they change."""
     from egvs.cli import run_tables
     from egvs.cli.console import ProgressDisplay
     from egvs.studies import effect_study
@@ -357,7 +359,7 @@ def explore(
         str, typer.Option(metavar="LINK", help='View to open, copied from "Link to this view" in the page.')
     ] = "",
 ) -> None:
-    """Move sensors in the browser and see their scores at once."""
+    """Move sensors in the browser and see their new scores immediately."""
     import webbrowser
 
     from egvs.cli.console import ProgressDisplay
@@ -414,7 +416,7 @@ def export(
         ),
     ] = None,
 ) -> None:
-    """Export sites, plan, blind spots and footprints of a run for GIS and spreadsheets, or rasters."""
+    """Export a run for GIS and spreadsheets: sites, plan, blind spots and footprints, or rasters."""
     from egvs.cli.console import ProgressDisplay
     from egvs.export import export
 
@@ -474,14 +476,16 @@ def new(
         Path, typer.Option(metavar="FILE", help="An OpenStreetMap extract (.osm, .osm.xml, .osm.pbf, also gzipped).")
     ],
     at: Annotated[
-        str | None, typer.Option(metavar="LAT,LON", help="Use the junction nearest to this point, not the largest.")
+        str | None,
+        typer.Option(metavar="LAT,LON", help="Use the junction nearest to this point instead of the largest one."),
     ] = None,
     lefthand: Annotated[bool, typer.Option("--lefthand", help="Traffic drives on the left.")] = False,
     walk: Annotated[bool, typer.Option("--walk", help="Include sidewalks and crossings, for pedestrians.")] = False,
     surroundings: Annotated[
         str | None,
         typer.Option(
-            metavar="METRES", help="Radius around the junction in which streets are simulated, or all; 300 by default."
+            metavar="METRES",
+            help="Simulate the streets within this radius of the junction, or 'all'; 300 by default.",
         ),
     ] = None,
 ) -> None:

@@ -82,7 +82,7 @@ def new(
 
 
 def traffic(city: CityPath) -> None:
-    """Simulate a city's traffic once and divide it among its junctions, if anything changed."""
+    """Simulate a city's traffic once and divide it among its junctions; skipped if nothing has changed."""
     from egvs.city import model, traffic_split
     from egvs.cli.console import ProgressDisplay
 
@@ -99,7 +99,7 @@ def run(
     junction: Junctions = None,
     set_: CitySet = None,
 ) -> None:
-    """Run every junction: the traffic once, then all junctions in parallel."""
+    """Simulate the city's traffic once, then run the scenarios of all junctions in parallel."""
     from egvs.city import city_run, model
     from egvs.cli.console import ProgressDisplay
 
@@ -122,7 +122,7 @@ def place(
     junction: Junctions = None,
     set_: CitySet = None,
 ) -> None:
-    """Plan sensors over all junctions together: the best plan of the whole city."""
+    """Plan sensors for all junctions together: find the best plan for the whole city."""
     from egvs.city import city_run, model
     from egvs.cli.console import ProgressDisplay
 

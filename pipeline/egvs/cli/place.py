@@ -43,7 +43,7 @@ def place(
     set_: Set = None,
     jobs: Jobs = None,
 ) -> None:
-    """Plan several sensors: which sites, how many, and a bound on the best possible score."""
+    """Plan several sensors: how many, at which sites, and how close the plan is to the best possible score."""
     from egvs.cli.console import WIDE, ProgressDisplay, console
     from egvs.placement import plan
     from egvs.runs.run import default_folder

@@ -33,7 +33,11 @@ def validate(
         bool, typer.Option("--keep", help="Also write ground truth and detections as KITTI labels and results.")
     ] = False,
     plan: Annotated[
-        bool, typer.Option("--plan", help="Validate this run's plan (egvs place): fused clouds of 1, 2, ... sensors.")
+        bool,
+        typer.Option(
+            "--plan",
+            help="Validate this run's plan (egvs place), in the fused clouds of its first 1, 2, ... sensors.",
+        ),
     ] = False,
     plan_from: Annotated[
         Path | None, typer.Option("--plan-from", metavar="DIR", help="Validate the plan in another run's folder.")
@@ -97,7 +101,7 @@ def clouds(
 
 
 def scores() -> None:
-    """Print the scores that a validation compares: formula, direction, source."""
+    """Print the scores that a validation compares: formula, whether higher or lower is better, and source."""
     from egvs.cli import validation_tables
     from egvs.validation import surrogates
 

@@ -25,7 +25,7 @@ KEY_PARAMETER = "key"
 
 _HOSTS = ("127.0.0.1", "localhost")
 _MAX_PATH_LENGTH = 4096
-_REFUSAL = "egvs explore: open the address that it printed; it contains the key to this page.\n"
+_REFUSAL = 'Open the address that "egvs explore" printed in the terminal; it contains the key to this page.\n'
 
 RequestHandler = Callable[[ServerConnection, Request], Response | None]
 

@@ -30,12 +30,12 @@ _SHARE_SCORES = ("entropy_seen", "coverage", "expected_visibility", "expected_de
 _MARKDOWN_ESCAPES = str.maketrans({sign: f"\\{sign}" for sign in "\\`*_{}[]()<>#+-.!|"})
 
 _POSE_LABELS = {
-    "x_m": "x m",
-    "y_m": "y m",
-    "z_m": "z m",
-    "yaw_deg": "yaw deg",
-    "pitch_deg": "pitch deg",
-    "roll_deg": "roll deg",
+    "x_m": "x (m)",
+    "y_m": "y (m)",
+    "z_m": "z (m)",
+    "yaw_deg": "yaw (°)",
+    "pitch_deg": "pitch (°)",
+    "roll_deg": "roll (°)",
 }
 _LENGTH_STEP, _ANGLE_STEP = 0.001, 0.01
 _ALL_PERIODS, _BEST_OTHER = "all periods", "best other site"
@@ -215,7 +215,7 @@ class Controls:
         sensors = dict.fromkeys((*session.scene.used_sensors, *session.scenario.sensors, *CATALOGUE))
         self.sensor = gui.add_dropdown("sensor", tuple(sensors))
         self.sensor.on_update(self._on_pose)
-        gui.add_button("Reset to the candidate").on_click(self._on_back)
+        gui.add_button("Reset to the candidate's pose").on_click(self._on_back)
 
     def _add_layer(self, frames: int) -> None:
         gui = self._gui
@@ -239,7 +239,9 @@ class Controls:
         gui, session = self._gui, self._session
         scores = dict.fromkeys((*_FIRST_SCORES, *session.scenario.score.additional, *get_args(OtherScore)))
         self.score = gui.add_dropdown("score", tuple(scores), hint="Candidates are ranked by this score.")
-        self.gamma = gui.add_number("gamma", 0.0, min=0.0, step=0.1, hint="Further beams in a voxel do not count.")
+        self.gamma = gui.add_number(
+            "gamma", 0.0, min=0.0, step=0.1, hint="Beams beyond this number in a voxel do not count."
+        )
         self.effects = {name: gui.add_checkbox(name, False, hint=why) for name, why in effects.items()}
         self.period = gui.add_dropdown("period", (_ALL_PERIODS, *session.periods), visible=bool(session.periods))
         for control in (self.score, self.gamma, *self.effects.values()):

@@ -522,7 +522,7 @@ def _draw_traffic(context: LayerContext) -> str:
     points, point_colours = column_points(tpog, tpog.p, context.zero_m)
     context.draw_points(points, point_colours, tpog.grid.voxel_m)
     peak = float(tpog.p.sum(axis=2).max(initial=0.0))
-    return _scale_legend("vehicles: share of the time that voxels are occupied, summed over height", 0.0, peak)
+    return _scale_legend("share of time for which voxels are occupied by vehicles, summed over height", 0.0, peak)
 
 
 def _draw_entropy(context: LayerContext) -> str:
@@ -533,8 +533,8 @@ def _draw_entropy(context: LayerContext) -> str:
     peak = float(session.entropy_bit.sum(axis=2).max(initial=0.0))
     points, point_colours = column_points(session.tpog, entropy, context.zero_m, peak)
     context.draw_points(points, point_colours, session.tpog.grid.voxel_m)
-    where = "with beams" if draws_seen else "without beams"
-    return _scale_legend(f"entropy of voxels {where}, bit, summed over height", 0.0, peak)
+    where = "that beams cross" if draws_seen else "that no beam crosses"
+    return _scale_legend(f"entropy (bits) of voxels {where}, summed over height", 0.0, peak)
 
 
 def _draw_blindspots(context: LayerContext) -> str:
@@ -565,8 +565,8 @@ def _draw_difference(context: LayerContext) -> str:
     context.draw_points(points, point_colours, session.tpog.grid.voxel_m)
     return _swatch_legend(
         [
-            (_THIS_COLOUR, f"only {context.rating.site.name} sees {float(only_this.sum()):,.1f} bit"),
-            (_OTHER_COLOUR, f"only {context.other.site.name} sees {float(only_other.sum()):,.1f} bit"),
+            (_THIS_COLOUR, f"seen only by {context.rating.site.name}: {float(only_this.sum()):,.1f} bits"),
+            (_OTHER_COLOUR, f"seen only by {context.other.site.name}: {float(only_other.sum()):,.1f} bits"),
         ]
     )
 
@@ -574,7 +574,7 @@ def _draw_difference(context: LayerContext) -> str:
 def _draw_scan(context: LayerContext) -> str:
     points = (context.session.returns_m(context.rating.site) - context.zero_m).astype(np.float32)
     context.draw_points(points, np.full(points.shape, _SCAN_COLOUR, dtype=np.uint8), _RETURN_M)
-    return _swatch_legend([(_SCAN_COLOUR, f"{len(points):,} returns of beams towards the region")])
+    return _swatch_legend([(_SCAN_COLOUR, f"{len(points):,} returns from beams directed at the region")])
 
 
 def _draw_ring(context: LayerContext) -> str:

@@ -299,7 +299,11 @@ class Page:
         path = self.session.scenario.folder / file
         site = self.rating.site
         if not self.rating.is_feasible:
-            error = InputError(f"site {site.name}", "no sensor can be mounted there", "Move it to a free location.")
+            error = InputError(
+                f"site {site.name}",
+                "the sensor cannot be mounted at its current position",
+                "Move it to a free location.",
+            )
             show_modal(client, "Not saved", [controls.escape_markdown(str(error))], {"Close": _do_nothing})
             return
         try:
@@ -319,9 +323,9 @@ class Page:
         link = encode_view(self.view, self._initial_view, camera)
         command = shlex.join((*(self._command or ("egvs", "explore", "RUN")), "--view", link))
         texts = [
-            "While this page is open, on this machine:",
+            "This link works on this machine while the page is open:",
             f"```\n{self.address}&{link}\n```",
-            "At any time:",
+            "To open the view later, run:",
             f"```\n{command}\n```",
         ]
         show_modal(client, "Link to this view", texts, {"Close": _do_nothing})
@@ -357,7 +361,7 @@ class Page:
                 drawing.draw_plan(scene, self.plan, site.name, self.zero_m, self._select)
             if view.is_dark != view_before.is_dark:
                 self.world.set_dark(view.is_dark)
-            self.label.text = f"{site.name}: cannot be mounted here"
+            self.label.text = f"{site.name}: no sensor can be mounted here"
             if self.rating.is_feasible:
                 self.label.text = f"{site.name}  rank {self.rating.rank}"
             legend = None

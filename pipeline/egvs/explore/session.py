@@ -266,7 +266,7 @@ class Session:
         self.scene.sensor(site.sensor)
         if site.points is not None and site != candidate:
             problem = "its empty scan was measured, so scans from other poses are unknown"
-            hint = "Reset it to the candidate."
+            hint = "Reset the sensor to the candidate's pose."
             finding = Diagnostic("measured scan", f"site {name}", problem, hint, is_error=True)
             return PoseScore(site, {}, 0, (finding,))
         findings = self._check(site)
@@ -345,7 +345,7 @@ class Session:
         read = read_scores_by_period if self.period else read_scores
         rows = {row["site"]: row for row in read(path).to_pylist() if row.get("period", "") == self.period}
         if rows.keys() != {site.name for site in self.scene.sites}:
-            raise InputError(path, "contains different sites from those of the scenario", "Run egvs run again.")
+            raise InputError(path, "its sites are not those of the scenario", 'Repeat "egvs run".')
         names = dict.fromkeys(("egvs", "entropy_seen", *self.scenario.score.additional))
         candidates = {}
         for site in self.scene.sites:

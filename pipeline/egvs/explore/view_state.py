@@ -47,7 +47,7 @@ LAYERS = {
 
 T = TypeVar("T")
 D = TypeVar("D")
-_POSE_PARTS = ("x", "y", "z", "yaw", "tilt", "roll")
+_POSE_PARTS = ("x", "y", "z", "yaw", "pitch", "roll")
 _WHOLE_NUMBER = "a whole number of at least 0"
 
 
@@ -255,7 +255,7 @@ class _LinkReader:
         self._known.add(key)
         if key not in self._parts:
             return []
-        expected = f"numbers {','.join(names)}"
+        expected = f"{len(names)} numbers {','.join(names)}"
         values = [self._convert(key, part, float, expected) for part in self._parts[key].split(",")]
         if len(values) != len(names) or not all(map(math.isfinite, values)):
             raise self._error(key, expected, self._parts[key])
@@ -282,7 +282,7 @@ class _LinkReader:
             return default
         names = frozenset(filter(None, self.text("effects", "").split(",")))
         for name in sorted(names.difference(registry.effect_names())):
-            raise self._error("effects", f"some of {', '.join(registry.effect_names())}", name)
+            raise self._error("effects", f"effects out of {', '.join(registry.effect_names())}", name)
         return names
 
     def reject_unknown_keys(self) -> None:

@@ -66,7 +66,7 @@ class FinishedRun:
         for name in _READ_STAGES:
             if name not in record.stages:
                 problem = f"the stage {name} is not finished, or was run by another version of egvs"
-                raise InputError(record_path, problem, "Run egvs run again.")
+                raise InputError(record_path, problem, 'Repeat "egvs run".')
         source = Path(os.path.normpath(folder / record.scenario_folder))
         if not source.is_dir():
             problem = f"the scenario folder {source} does not exist"
@@ -89,12 +89,12 @@ class FinishedRun:
                 xy_m = np.column_stack([scores.column(name).to_numpy() for name in ("x_m", "y_m")])
                 if np.allclose(recorded, self.frame.to_degrees(xy_m), rtol=0.0, atol=_TOLERANCE_DEG):
                     return
-            problem = "the geographic position of its sites differs from that in the scenario or its network"
+            problem = "the geographic positions of its sites differ from those in the scenario or its network"
         elif self.frame is None:
             return
         else:  # a run of an older version, or from before the scenario had a reference system
             problem = "its sites have no geographic position, but the scenario or its network has one"
-        raise InputError(path, problem, "Run egvs run again.")
+        raise InputError(path, problem, 'Repeat "egvs run".')
 
     def scorer(self, tpog: Tpog) -> Scorer:
         """Return a scorer with the settings of the run.
@@ -106,7 +106,7 @@ class FinishedRun:
         for name, digest in score.dependencies(self.work).files.items():
             if recorded.get(name) != digest:
                 problem = f"{name} has changed since the sites were scored"
-                raise InputError(self.work.folder.run_record, problem, "Run egvs run again.")
+                raise InputError(self.work.folder.run_record, problem, 'Repeat "egvs run".')
         return Scorer(get_scene(self.work), tpog, trajectories)
 
     def artefact(self, name: str) -> Path:

@@ -51,7 +51,7 @@ def read(path: Path, where: str) -> FloatArray:
             expected = declared * las.header.point_format.size
             actual = size - las.header.offset_to_point_data
         if actual < expected and not is_packed:
-            problem = f"the header declares {expected} bytes of points, got {actual}"
+            problem = f"the header declares {expected} bytes of points, but the file contains {actual}"
             raise InputError(where, problem, COMPLETE_FILE)
         limits.POINTS.check(where, declared)
         if is_packed:
@@ -59,7 +59,9 @@ def read(path: Path, where: str) -> FloatArray:
         else:
             points = np.concatenate([np.empty((0, 3)), *_chunks(path)])
     if len(points) != declared:
-        raise InputError(where, f"the header declares {declared} points, got {len(points)}", COMPLETE_FILE)
+        raise InputError(
+            where, f"the header declares {declared} points, but the file contains {len(points)}", COMPLETE_FILE
+        )
     return points
 
 

@@ -233,7 +233,7 @@ def _check_ply(data: bytes, where: str) -> None:
     declared = sum(count for _, count in counts)
     if declared > actual:
         elements = " and ".join(f"{count} of {name!r}" for name, count in counts)
-        raise InputError(where, f"the header declares {elements}, got {actual} {unit}", MESH_HINT)
+        raise InputError(where, f"the header declares {elements}, but the file contains {actual} {unit}", MESH_HINT)
     limits.TRIANGLES.check(where, declared / 4)
 
 

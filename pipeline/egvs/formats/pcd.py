@@ -193,7 +193,7 @@ def _unpack(where: str, body: bytes, expected: int) -> bytearray:
         raise InputError(where, f"the file ends before its points (only {len(body)} bytes of data)", COMPLETE_FILE)
     packed, size = struct.unpack_from("<II", body)
     if size != expected:
-        problem = f"the header declares {expected} bytes of points, got {size} bytes after decompression"
+        problem = f"the header declares {expected} bytes of points, but there are {size} after decompression"
         raise InputError(where, problem, COMPLETE_FILE)
     if len(body) < 8 + packed:
         problem = f"expected {packed} bytes of packed points, got {len(body) - 8} bytes"

@@ -259,7 +259,11 @@ class RecordLayout:
         """
         rows = [(number, row) for number, row in enumerate(text.splitlines(), line) if row.strip()][skip:]
         if len(rows) < self.n or (last and len(rows) > self.n):
-            raise InputError(self.where, f"the header declares {self.n} points, got {len(rows)} lines", COMPLETE_FILE)
+            raise InputError(
+                self.where,
+                f"the header declares {self.n} points, but the file contains {len(rows)} lines",
+                COMPLETE_FILE,
+            )
         rows = rows[: self.n]
         try:
             table = np.loadtxt([row for _, row in rows], comments=None, encoding="latin-1", ndmin=2)
@@ -274,7 +278,8 @@ class RecordLayout:
         expected = self.n * self.size
         if len(body) < expected or (last and bytes(body[expected:]).strip()):
             problem = (
-                f"the header declares {self.n} points of {self.size} bytes ({expected} bytes), got {len(body)} bytes"
+                f"the header declares {self.n} points of {self.size} bytes ({expected} bytes), but the file contains"
+                f" {len(body)} bytes"
             )
             raise InputError(self.where, problem, COMPLETE_FILE)
         kind = np.dtype({"names": AXES, "formats": self.formats, "offsets": self.offsets, "itemsize": self.size})
@@ -296,7 +301,9 @@ class RecordLayout:
             for word in words:
                 if parse_float(word) is None:
                     return InputError(where, f"expected a number, got {word!r}", NUMBER_HINT)
-        return InputError(self.where, f"cannot be read as text ({error})", "Separate the numbers with spaces.")
+        return InputError(
+            self.where, f"expected {self.values} numbers in each line ({error})", "Separate the numbers with spaces."
+        )
 
 
 def stack_xyz(columns: Sequence[NDArray[np.generic]]) -> FloatArray:

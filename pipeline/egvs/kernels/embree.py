@@ -148,7 +148,7 @@ def _device() -> int:
     """Embree's device, one for the process."""
     device: int | None = _library.rtcNewDevice(None)
     if device is None:
-        raise RuntimeError(f"Embree does not start: its error {_library.rtcGetDeviceError(None)}")
+        raise RuntimeError(f"Embree cannot start (error code {_library.rtcGetDeviceError(None)})")
     if (version := _library.rtcGetDeviceProperty(device, _MAJOR_VERSION)) != 4:
         raise RuntimeError(f"embreex brings Embree {version}, whose layouts may be others than those of Embree 4")
     return device
@@ -169,7 +169,7 @@ def _last_error(problem: str) -> Exception | None:
     if not code:
         return None
     kind = MemoryError if code == _OUT_OF_MEMORY else RuntimeError
-    return kind(f"{problem}: its error {code}")
+    return kind(f"{problem} (error code {code})")
 
 
 def _aligned_rows(rows: int) -> NDArray[np.float32]:

@@ -500,8 +500,8 @@ def _unmet_zone_error(
         hint = f"Set placement.count to {len(larger.order)}: {names} see enough."
     return InputError(
         f"{scenario.file}: placement.zones",
-        f"no plan of {problem.rules.count} sensors that meets the demands was found; the closest, {nearest}, sees "
-        + " and ".join(shares),
+        f"found no plan of {problem.rules.count} sensors that meets the requirements of all zones;"
+        f" the closest ({nearest}) sees {' and '.join(shares)}",
         hint,
     )
 

@@ -446,8 +446,12 @@ def rules_from_config(scenario: Scenario, sites: Sequence[Site]) -> PlanRules:
             excluded[_candidate_index(name, names, f"{table}.excluded")] = True
     for candidate in forced:
         if excluded[candidate]:
-            problem_text = f"the pole of {names[candidate]} is excluded"
-            raise InputError(f"{table}.forced", problem_text, "Remove it from placement.forced or placement.excluded.")
+            problem_text = f"{names[candidate]} is forced, but it or its pole is excluded"
+            raise InputError(
+                f"{table}.forced",
+                problem_text,
+                "Remove it from placement.forced, or remove it or its pole from placement.excluded.",
+            )
 
     n_allowed = int(np.count_nonzero(~excluded))
     if not n_allowed:

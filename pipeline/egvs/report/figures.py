@@ -409,8 +409,10 @@ def blindspot_note(site_blindspots: SiteBlindspots) -> str:
     if not site_blindspots.worst:
         sentences.append(f"No lane, turn or crossing with {MIN_VEHICLES} vehicles or more is seen worse than average.")
     if approaches := site_blindspots.of_kind("approach"):
-        shares = "; ".join(f"{approach.words}: {_format_share(approach)}" for approach in approaches)
-        sentences.append(f"Share seen by approach: {shares}.")
+        shares = ", ".join(
+            f"{approach.words.removesuffix(' approach')} {_format_share(approach)}" for approach in approaches
+        )
+        sentences.append(f"Share of vehicles seen on each approach: {shares}.")
     if site_blindspots.off_lanes:
         verb = "was" if site_blindspots.off_lanes == 1 else "were"
         sentences.append(

@@ -251,6 +251,7 @@ def _ranking_values(ranking: Ranking) -> dict[str, Any]:
         "crowded": maps.is_crowded(ranking.sites),
         "rings": maps.has_stacked_sites(ranking.sites),
         "limit_share": limit_share,
+        "best_name": ranking.sites[0].site,
     }
 
 

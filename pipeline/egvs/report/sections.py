@@ -273,16 +273,14 @@ def _describe_evidence(noun: str, egvs: str, rho: Mapping[str, Mapping[str, floa
 
     is_better = [recommended[detector] > this_egvs[detector] for detector in detectors]
     if all(is_better):
-        better = noun
+        verdict = f"{noun} was the better predictor of detection"
     elif any(is_better):
-        better = "neither of the two consistently"
+        verdict = "neither score was consistently the better predictor of detection"
     else:
-        better = "the EGVS"
+        verdict = "the EGVS was the better predictor of detection"
     values = join_names([f"{recommended[name]:.2f} against {this_egvs[name]:.2f} ({name})" for name in detectors])
-    return (
-        f"At the held-out junctions of the validation study, {better} predicted detection better: rank correlation "
-        f"{values}; see docs/validity.md."
-    )
+    where = "At the held-out junctions of the validation study"
+    return f"{where}, {verdict}: rank correlation {values}; see docs/validity.md."
 
 
 # ---- egvs place

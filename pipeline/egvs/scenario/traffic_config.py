@@ -306,7 +306,7 @@ class TrafficConfig(StrictModel):
             names = ", ".join(f"{title} ({kind})" if kind else title for title, kind in duplicates)
             raise ValueError(f"counts: expected one count for each location and kind, got two for {names}")
         if self.counts and not any(count.per_hour for count in self.counts):
-            raise ValueError("counts: expected at least one per_hour above 0")
+            raise ValueError("counts: expected at least one count with per_hour above 0")
         return self
 
     @model_validator(mode="after")

@@ -137,7 +137,7 @@ def _read_cached(path: Path, _content_hash: str) -> BeamTable:
                 if None in row:  # e.g. a decimal comma, which shifts all following values by one column
                     n_values = len(names) + len(row[None])
                     problem = f"expected {len(names)} values, one per column, got {n_values}"
-                    raise InputError(f"{path}: beam {number}", problem, "Write numbers with decimal points.")
+                    raise InputError(f"{path}: beam {number}", problem, "Use decimal points, not decimal commas.")
                 elevation_deg = _parse_angle(path, number, "elevation_deg", row["elevation_deg"])
                 azimuth_deg = _parse_angle(path, number, "azimuth_deg", row["azimuth_deg"])
                 angles.append((elevation_deg, azimuth_deg))

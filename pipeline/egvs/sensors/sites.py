@@ -421,7 +421,7 @@ def aiming_angles(where: str, from_m: Vec3, to_m: Vec3, roll_deg: float, sensor:
     pitch_deg = math.remainder(math.degrees(pitch_rad), 360.0)
     if level < abs(middle_y) or abs(pitch_deg) > 90:
         problem = f"{sensor.name} cannot be pitched so that its central ray meets {target}"
-        hint = "Aim at a point that the central ray meets at a pitch between -90 and 90."
+        hint = "Aim at a point that the central ray can reach with a pitch between -90 and 90 degrees."
         raise InputError(f"{where}: aim", problem, hint)
     yaw_deg = math.degrees(math.atan2(y, x) - math.atan2(middle_y, forward))
     yaw_deg = round(math.remainder(yaw_deg, 360.0), _ANGLE_DIGITS) + 0.0

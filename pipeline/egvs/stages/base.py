@@ -166,9 +166,9 @@ class StageContext:
 
         digest = files.hash_file(self.path(artefact))
         recorded = self._recorded.get(artefact, digest)
-        hint = "Run egvs run again to create it."
+        hint = 'Repeat "egvs run" to create it.'
         if recorded == "":
-            raise InputError(self.path(artefact), "was not created by any stage in run.json", hint)
+            raise InputError(self.path(artefact), "was not created by any stage recorded in run.json", hint)
         if recorded != digest:
             problem = f"was altered or replaced (sha256 {digest[:12]}, in run.json {recorded[:12]})"
             raise InputError(self.path(artefact), problem, hint)

@@ -122,10 +122,13 @@ def warn_repeated_beams(inputs: CheckInputs) -> Iterator[Diagnostic]:
         repeated = sensor.repeated_beams(table) if table is not None else ()
         if table is None or not repeated:
             continue
-        listed = ", ".join(f"beam {beam} as beam {first}" for beam, first in repeated[:MAX_LISTED_BEAMS])
+        listed = ", ".join(f"beam {beam} = beam {first}" for beam, first in repeated[:MAX_LISTED_BEAMS])
         if len(repeated) > MAX_LISTED_BEAMS:
             listed += ", ..."
-        problem = f"{len(repeated)} of {len(table)} beams repeat an earlier direction ({listed}) and count twice"
+        problem = (
+            f"{len(repeated)} of {len(table)} beams have the same direction as an earlier one ({listed})"
+            " and count twice"
+        )
         hint = "List each direction once; azimuths of 0 and 360 degrees are the same."
         yield Diagnostic("repeated beams", config.beams, problem, hint)
 

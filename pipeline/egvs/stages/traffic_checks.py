@@ -100,7 +100,7 @@ def check_demand(inputs: CheckInputs) -> Iterator[Diagnostic]:
             key += f".routes = {list(traffic.routes)}"
         files = ", ".join(path.name for path in _demand_files(scenario)) or "no route file is named"
         problem = f"no vehicle, trip or flow in its files ({files})"
-        hint = "Use route files with vehicles, or only a network, for random trips."
+        hint = "Use route files that contain vehicles. For random trips, give only a network."
         yield Diagnostic("traffic", key, problem, hint, is_error=True)
 
 

@@ -297,7 +297,9 @@ class SettingRunner:
             if path.is_file():
                 times = _read_json(path)
             if times["sha256"] != result.artefacts:
-                raise RunError(f"{name}: a repeat wrote different bytes from the first run. See {path}")
+                raise RunError(
+                    f"{name}: the repeated run wrote bytes that differ from those of the first run. See {path}"
+                )
             if is_measured:
                 times["measured"].append(cost)
         _write_json(path, times)

@@ -183,7 +183,7 @@ def _read_run(folder: Path, label: str) -> ComparedRun:
         problem = "expected a finished run, but the stage score was not run"
         raise InputError(RunFolder(folder).run_record, problem, "Run egvs run first.")
     if files.hash_file(path) != score_stage.artefacts.get(SCORES):
-        raise InputError(path, "was changed after the run", "Run egvs run again.")
+        raise InputError(path, "was changed after the run", 'Repeat "egvs run".')
     scores, metadata = parquet.read_artefact(path, "scores")
     rank_by = metadata.get("rank_by", "egvs")
 

@@ -663,7 +663,7 @@ def count_location(
     kinds = _counted_kinds(traffic, count.kind)
     if not kinds:
         names = ", ".join(kind.name for kind in traffic.kinds)
-        raise InputError(where, f"the fleet has no kind {count.kind!r}", f"Use one of {names}.")
+        raise InputError(where, f"the fleet has no vehicle kind {count.kind!r}", f"Use one of {names}.")
     if count.kind == FLEET:
         problem = f"a kind is called {FLEET!r}, which is reserved for vehicles counted without a kind"
         raise InputError(where, problem, "Give this kind another name.")

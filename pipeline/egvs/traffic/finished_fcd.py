@@ -190,10 +190,10 @@ def check_types(scenario: Scenario, types: Collection[str], declared: Mapping[st
     missing = sorted(set(types) - known - _DEFAULT_TYPES)
     if missing:
         names = ", ".join(map(repr, missing))
-        problem = f"unknown sizes of vehicle types of {scenario.traffic.fcd}: {names}"
+        problem = f"the sizes of these vehicle types in {scenario.traffic.fcd} are unknown: {names}"
         hint = (
-            "Add a kind of each name with length_m, width_m and height_m, or the SUMO file with their <vType> to vtypes"
-            f" (known: {', '.join(sorted(known))})."
+            "For each, add a kind of the same name with length_m, width_m and height_m, or add to vtypes the SUMO file"
+            f" that defines its <vType>. Types with known sizes: {', '.join(sorted(known))}."
         )
         raise InputError(f"{sumo_folder.traffic_location(scenario)}.kinds", problem, hint)
     return vtypes

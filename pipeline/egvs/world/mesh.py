@@ -136,7 +136,9 @@ def read_ply(path: Path) -> tuple[World, dict[str, Any]]:
         if not end or header.vertices < 0 or len(body) != size + header.faces * _FACE.itemsize:
             raise ValueError
     except (ValueError, LookupError, TypeError, RecursionError):
-        raise InputError(path, "expected a complete statics.ply, got another or a partial file", _RUN_STATICS) from None
+        raise InputError(
+            path, "expected a complete statics.ply, got a different or incomplete file", _RUN_STATICS
+        ) from None
     vertices = np.frombuffer(body, dtype=_VERTEX, count=header.vertices)
     faces = np.frombuffer(body, dtype=_FACE, offset=size)
     wrong = np.flatnonzero(faces["n"] != 3)

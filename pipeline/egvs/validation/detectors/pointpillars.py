@@ -301,8 +301,9 @@ class OnnxModel:
             raise InputError(path, f"expected a model with inputs {_INPUTS}, got {inputs}", _MODEL_HINT)
         size = CELLS // STRIDE
         outputs = {value.name: list(value.shape) for value in session.get_outputs()}
-        if outputs != {"heat": [1, 1, size, size], "values": [1, N_VALUES, size, size]}:
-            raise InputError(path, f"expected a model with outputs heat and values, got {outputs}", _MODEL_HINT)
+        expected = {"heat": [1, 1, size, size], "values": [1, N_VALUES, size, size]}
+        if outputs != expected:
+            raise InputError(path, f"expected a model with outputs {expected}, got {outputs}", _MODEL_HINT)
         try:
             metadata = json.loads(session.get_modelmeta().custom_metadata_map[METADATA_KEY])
             if metadata["convention"] not in HEIGHT_LIMITS_M:
