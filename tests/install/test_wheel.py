@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
+import signal
 import subprocess
 import sys
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from subprocess import CompletedProcess
@@ -15,6 +18,19 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 MAX_WHEEL_MB = 15
+EXTRACT = ROOT / "tests" / "importers" / "data" / "small.osm"
+FEW = ("--set", "traffic.frames=60", "--set", "traffic.warmup_s=20", "--set", "roi.voxel_m=0.5")
+
+COMMANDS_WITH_EXTRAS = {
+    ("explore", "runs/myplace"): "explore",
+    ("place", "myplace", *FEW, "--count", "2", "--refine"): "place",
+    ("export", "runs/myplace", "--to", "gpkg"): "gis",
+    ("figure", "runs/myplace", "--what", "ranking"): "figure",
+    ("accuracy", "myplace", *FEW): "figure",
+    ("validate", "myplace", *FEW): "validate",
+    ("city", "run", "."): "cluster",
+}
+"""Commands of the README, and the extra that each needs."""
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
 
@@ -36,7 +52,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Installed:
     """An environment with the wheel in it, and an empty folder to work in."""
 
-    def __init__(self, wheel: Path, folder: Path, extras: str) -> None:
+    def __init__(self, wheel: Path, folder: Path) -> None:
         self.bin = folder / "environment" / "bin"
         self.work = folder / "work"
         self.work.mkdir()
@@ -47,15 +63,19 @@ class Installed:
             "TMPDIR": str(folder),
         }
         subprocess.run([sys.executable, "-m", "venv", folder / "environment"], check=True)
-        pip = [self.bin / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
-        subprocess.run([*pip, "--constraint", ROOT / "constraints.txt", f"{wheel}{extras}"], check=True)
+        self.install(str(wheel))
 
-    def egvs(self, *arguments: object) -> CompletedProcess[str]:
-        """Run a command, which must succeed."""
+    def install(self, requirement: str) -> None:
+        """Install a wheel, with the versions of the constraints file."""
+        pip = [self.bin / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+        subprocess.run([*pip, "--constraint", ROOT / "constraints.txt", requirement], check=True)
+
+    def egvs(self, *arguments: object, code: int = 0) -> CompletedProcess[str]:
+        """Run a command, which must end with an exit code."""
         done = self.start(*arguments)
         out, error = done.communicate(timeout=600)
-        assert done.returncode == 0, f"{arguments}: {error}"
-        return CompletedProcess([], 0, out, error)
+        assert done.returncode == code, f"{arguments}: {error}"
+        return CompletedProcess([], code, out, error)
 
     def start(self, *arguments: object) -> subprocess.Popen[str]:
         """Start a command."""
@@ -68,7 +88,7 @@ class Installed:
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Installed]:
     """The wheel without extras."""
-    yield Installed(wheel, tmp_path_factory.mktemp("installed"), "")
+    yield Installed(wheel, tmp_path_factory.mktemp("installed"))
 
 
 def test_wheel_is_small_and_reproducible(wheel: Path, tmp_path: Path) -> None:
@@ -92,3 +112,30 @@ def test_demo_ranks_sites_and_equals_checkout(installed: Installed, tmp_path: Pa
     for name in ("scores.parquet", "tpog.parquet", "scans.parquet", "trajectories.parquet", "blindspots.parquet"):
         first, second = (pq.read_table(folder / name) for folder in (results, tmp_path / "demo" / "results"))
         assert first.equals(second) or repr(first.to_pylist()) == repr(second.to_pylist()), name  # NaN equals NaN
+
+
+def test_commands_of_the_readme_work_or_name_their_extra(installed: Installed, wheel: Path) -> None:
+    shutil.copyfile(EXTRACT, installed.work / "extract.osm")
+    runs = installed.work / "runs" / "myplace"
+    installed.egvs("new", "myplace", "--osm", "extract.osm")
+    installed.egvs("run", "myplace", *FEW)
+    installed.egvs("place", "myplace", *FEW, "--count", "2")
+    installed.egvs("compare", "runs/myplace", "runs/myplace")
+    installed.egvs("export", "runs/myplace", "--to", "csv")
+    installed.egvs("verify", "runs/myplace")
+    assert (runs / "report.html").exists() and (runs / "placement.parquet").exists()
+
+    for command, extra in COMMANDS_WITH_EXTRAS.items():
+        (message,) = installed.egvs(*command, code=2).stderr.splitlines()
+        assert f"pip install 'egvs[{extra}]'" in message, message
+
+    installed.install(f"{wheel}[explore,gis,place]")
+    installed.egvs("place", "myplace", *FEW, "--count", "2", "--refine")
+    installed.egvs("export", "runs/myplace", "--to", "gpkg")
+    page = installed.start("explore", "runs/myplace", "--no-browser")
+    try:
+        address = page.stdout.readline().split()[0]
+        assert urllib.request.urlopen(address, timeout=60).status == 200
+    finally:
+        page.send_signal(signal.SIGINT)
+        page.communicate(timeout=60)
