@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: run test test-slow test-train test-lowest unit lint bench scaling numerics validity detectability pictures schema reference docs fuzz clean
+.PHONY: run test test-slow test-train test-lowest test-portable unit lint bench scaling numerics validity detectability pictures schema reference docs fuzz clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
@@ -28,6 +28,10 @@ test-lowest: $(VENV)/.installed
 	build/lowest/bin/python -m pip install --quiet --disable-pip-version-check --constraint build/lowest.txt \
 		'.[place]' hypothesis pytest pytest-xdist
 	build/lowest/bin/python -m pytest -m unit -p no:cacheprovider tests/core tests/scenario tests/scoring tests/sensors tests/world
+
+# The unit tests without the modules and flags that only POSIX systems have.
+test-portable: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -m unit -p tests.without_posix --ignore=tests/validation/training
 
 # The quick loop: no other program is started, nothing takes long.
 unit: $(VENV)/.installed-dev

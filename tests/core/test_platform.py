@@ -18,6 +18,10 @@ def open_file(path: Path) -> int:
     return os.open(path, os.O_RDWR | os.O_CREAT)
 
 
+needs_posix = pytest.mark.skipif(not platform.HAS_POSIX, reason="needs the locks of a POSIX system, or msvcrt")
+
+
+@needs_posix
 def test_lock_keeps_others_out_until_it_is_closed(tmp_path: Path) -> None:
     first, second = open_file(tmp_path / "lock"), open_file(tmp_path / "lock")
     assert platform.try_lock(first)
@@ -28,6 +32,7 @@ def test_lock_keeps_others_out_until_it_is_closed(tmp_path: Path) -> None:
     os.close(second)
 
 
+@needs_posix
 def test_shared_locks_exclude_only_exclusive_ones(tmp_path: Path) -> None:
     first, second, third = (open_file(tmp_path / "lock") for _ in range(3))
     assert platform.try_lock(first, shared=True)
