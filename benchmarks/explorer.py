@@ -31,7 +31,7 @@ _PAGE = resource.getpagesize()
 
 def memory_mb() -> float:
     """Return the resident memory of this process."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * _PAGE / 1e6
+    return int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1]) * _PAGE / 1e6
 
 
 def random_move(site: Site, rng: random.Random) -> Site:

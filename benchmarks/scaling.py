@@ -179,7 +179,7 @@ def _traffic(size: Size, long: float, wide: float, path: Path) -> None:
 
 def _held_mb() -> float:
     release_memory()
-    lines = Path("/proc/self/status").read_text().splitlines()
+    lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
     return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS:"))
 
 

@@ -65,7 +65,7 @@ def _work(
     os.chdir(folder)
     for number, path in enumerate(printed, 1):
         os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT), number)
-    sys.stdout, sys.stderr = (open(number, "w", closefd=False) for number in (1, 2))  # noqa: SIM115
+    sys.stdout, sys.stderr = (open(number, "w", encoding="utf-8", closefd=False) for number in (1, 2))  # noqa: SIM115
     if beside:
         sys.path.insert(0, str(beside))
     sys.argv = ["-c", *arguments]

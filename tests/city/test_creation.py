@@ -59,7 +59,7 @@ class Map:
         self.way([*corners, corners[0]], building="yes", **tags)
 
     def write(self, path: Path) -> Path:
-        path.write_text("\n".join(['<osm version="0.6">', *self._lines, *self._ways, "</osm>"]))
+        path.write_text("\n".join(['<osm version="0.6">', *self._lines, *self._ways, "</osm>"]), encoding="utf-8")
         return path
 
 

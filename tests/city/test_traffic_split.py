@@ -26,9 +26,9 @@ ARTICULATED = "\n[effects.articulated]\nkinds = { bus = { parts_m = [9.0, 8.0] }
 
 def edit(path: Path, text: str, old: str = "") -> None:
     """Replace ``old`` in a file by ``text``, or append ``text``."""
-    before = path.read_text()
+    before = path.read_text(encoding="utf-8")
     assert old in before
-    path.write_text(before.replace(old, text) if old else before + text)
+    path.write_text(before.replace(old, text) if old else before + text, encoding="utf-8")
 
 
 def contents(city: City) -> dict[str, bytes]:

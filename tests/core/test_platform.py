@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import ntpath
 import os
 import subprocess
 import sys
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 import pytest
 
@@ -40,6 +41,13 @@ def test_shared_locks_exclude_only_exclusive_ones(tmp_path: Path) -> None:
     assert not platform.try_lock(third)
     for descriptor in (first, second, third):
         os.close(descriptor)
+
+
+def test_relative_paths_have_slashes_and_may_be_on_another_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert platform.relative_path(Path("/a/b/c"), Path("/a/d")) == "../b/c"
+    monkeypatch.setattr(os, "path", ntpath)
+    assert platform.relative_path(PureWindowsPath(r"C:\towns\a\map"), PureWindowsPath(r"C:\towns\runs")) == "../a/map"
+    assert platform.relative_path(PureWindowsPath(r"D:\towns\a"), PureWindowsPath(r"C:\runs")) == "D:/towns/a"
 
 
 def test_peak_memory_grows_with_an_array() -> None:

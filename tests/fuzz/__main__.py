@@ -52,7 +52,7 @@ def _done(path: Path, seed: int) -> dict[tuple[str, int], str]:
     """The verdicts of an earlier call."""
     if not path.is_file():
         return {}
-    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
     return {(line["kind"], line["case"]): line["verdict"] for line in lines if line["seed"] == seed}
 
 

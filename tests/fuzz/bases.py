@@ -291,7 +291,7 @@ def _write_points(path: Path) -> None:
         return
     rows = "".join(f"{x:g},{y:g},{z:g}\n" for x, y, z in points)
     if form == "csv":
-        path.write_text("x_m,y_m,z_m\n" + rows)
+        path.write_text("x_m,y_m,z_m\n" + rows, encoding="utf-8")
     elif path.stem == "binary":
         from egvs.formats.point_clouds import write_points
 
@@ -299,11 +299,11 @@ def _write_points(path: Path) -> None:
     elif form == "pcd":
         fields = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nCOUNT 1 1 1\n"
         head = f"{fields}WIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA ascii\n"
-        path.write_text(head + rows.replace(",", " "))
+        path.write_text(head + rows.replace(",", " "), encoding="utf-8")
     else:
         properties = "".join(f"property double {axis}\n" for axis in "xyz")
         head = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n{properties}end_header\n"
-        path.write_text(head + rows.replace(",", " "))
+        path.write_text(head + rows.replace(",", " "), encoding="utf-8")
 
 
 # ---- maps

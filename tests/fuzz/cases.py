@@ -91,7 +91,7 @@ def become(folder: Path, arguments: Sequence[str], printed: Sequence[Path], stor
         os.chdir(folder)
         for number, path in enumerate(printed, 1):
             os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
-        sys.stdout, sys.stderr = (open(number, "w", closefd=False) for number in (1, 2))  # noqa: SIM115
+        sys.stdout, sys.stderr = (open(number, "w", encoding="utf-8", closefd=False) for number in (1, 2))  # noqa: SIM115
         os.environ |= {
             "EGVS_STORE": str(folder / "store") if store else "",
             "TMPDIR": str(folder / ".tmp"),
@@ -117,7 +117,7 @@ def become(folder: Path, arguments: Sequence[str], printed: Sequence[Path], stor
 
 def _limit() -> None:
     """Of address space, files and dumps."""
-    mine = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    mine = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[0]) * resource.getpagesize()
     most = mine + _ADDRESSES
     for what, limit in ((resource.RLIMIT_AS, most), (resource.RLIMIT_FSIZE, _MOST_WRITTEN), (resource.RLIMIT_CORE, 0)):
         resource.setrlimit(what, (limit, limit))
@@ -143,7 +143,7 @@ def _wait(child: int) -> tuple[int | None, int]:
 
 def _busy_s(process: int) -> float:
     """Processor time of a process and of those that it has waited for."""
-    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    fields = Path(f"/proc/{process}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
     return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
 
 

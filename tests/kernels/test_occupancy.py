@@ -459,7 +459,7 @@ def test_moving_recorded_boxes_by_a_nanometre_keeps_counts(recorded):
 
 def with_fault(*replacements):
     """The kernel's source with some text replaced, as plain Python: not compiled, so a fault costs no compilation."""
-    source = Path(kernels_occupancy.__file__).read_text()
+    source = Path(kernels_occupancy.__file__).read_text(encoding="utf-8")
     for old, new in replacements:
         assert old in source, f"the fault does not fit the source any more: {old}"
         source = source.replace(old, new)

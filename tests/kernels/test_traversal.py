@@ -430,7 +430,7 @@ def test_audit_accepts_hard_beams(found):
 
 def with_fault(*replacements):
     """The kernel's source with some text replaced, as plain Python: not compiled, so a fault costs no compilation."""
-    source = Path(traversal.__file__).read_text()
+    source = Path(traversal.__file__).read_text(encoding="utf-8")
     for old, new in replacements:
         assert old in source, f"the fault does not fit the source any more: {old}"
         source = source.replace(old, new)

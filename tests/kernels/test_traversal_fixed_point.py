@@ -168,7 +168,7 @@ def test_zero_or_overflowing_extents_need_the_exact_march(x):
 
 def with_fault(*replacements):
     """The source with some text replaced, as plain Python: not compiled, so a fault costs no compilation."""
-    source = Path(traversal.__file__).read_text()
+    source = Path(traversal.__file__).read_text(encoding="utf-8")
     for old, new in (("_BLOCK_SIZE = 16", "_BLOCK_SIZE = 1"), *replacements):
         assert old in source, f"the fault does not fit the source any more: {old}"
         source = source.replace(old, new)

@@ -60,7 +60,7 @@ def write_geojson(path: Path, features: list[dict[str, Any]], move: Move, crs: s
     head: dict[str, Any] = {"type": "FeatureCollection", "name": path.stem} | (
         {} if crs is None else {"crs": named(crs)}
     )
-    path.write_text(json.dumps({**head, "features": features}))
+    path.write_text(json.dumps({**head, "features": features}), encoding="utf-8")
 
 
 def moved_mini(folder: Path, move: Move, crs: str | None) -> Path:

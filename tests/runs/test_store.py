@@ -194,11 +194,11 @@ def edited(how: Callable[[dict], object], rehash: bool = False) -> Callable[[Pat
     """A note of which a value was changed by hand."""
 
     def edit(path: Path) -> None:
-        how(value := json.loads(path.read_text()))
+        how(value := json.loads(path.read_text(encoding="utf-8")))
         if rehash:
             del value["sha256"]
             value["sha256"] = files.hash_json(value)
-        path.write_text(json.dumps(value))
+        path.write_text(json.dumps(value), encoding="utf-8")
 
     return edit
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from egvs.scoring import autocorrelation
+from egvs.scoring import autocorrelation, standard_errors
 from egvs.scoring.standard_errors import (
     GROUP_LENGTH_TIMES,
     MIN_GROUPS,
@@ -66,8 +66,8 @@ def test_constant_and_alternating_series_have_no_autocorrelation(series: np.ndar
 
 @given(st.floats(1, 500), st.integers(10, 100_000), st.integers(2, 10))
 def test_errors_are_never_narrowed_and_long_records_are_left_alone(lasts: float, frames: int, groups: int) -> None:
-    assert autocorrelation.standard_error_inflation(lasts, frames, groups) >= 1.0
-    assert autocorrelation.standard_error_inflation(lasts, int(1000 * lasts * groups), groups) < 1.01
+    assert standard_errors.standard_error_inflation(lasts, frames, groups) >= 1.0
+    assert standard_errors.standard_error_inflation(lasts, int(1000 * lasts * groups), groups) < 1.01
 
 
 @pytest.mark.parametrize(("lasts", "frames", "groups"), [(50, 1000, 10), (50, 2000, 4), (200, 1000, 4), (5, 1000, 10)])
@@ -76,13 +76,13 @@ def test_inflation_equals_that_of_the_covariance(
 ) -> None:
     """Of a series that keeps a share of itself from frame to frame: the variance of its mean, and the scatter of the
     means of groups that is to be expected, entry by entry of the covariance matrix."""
-    monkeypatch.setattr(autocorrelation, "time_upper_bound", lambda time_frames, frames: time_frames)
+    monkeypatch.setattr(standard_errors, "_time_upper_bound", lambda time_frames, frames: time_frames)
     at = np.arange(frames)
     covariance = ((lasts - 1.0) / (lasts + 1.0)) ** np.abs(at[:, None] - at[None, :])
     of_groups = covariance.reshape(groups, frames // groups, groups, frames // groups).mean(axis=(1, 3))
     scatter = (np.trace(of_groups) - of_groups.sum() / groups) / (groups - 1) / groups
     needed = math.sqrt(covariance.mean() / scatter)
-    assert autocorrelation.standard_error_inflation(lasts, frames, groups) == pytest.approx(needed, rel=1e-3)
+    assert standard_errors.standard_error_inflation(lasts, frames, groups) == pytest.approx(needed, rel=1e-3)
 
 
 def test_groups_are_longer_than_the_correlation_time_if_the_record_allows() -> None:

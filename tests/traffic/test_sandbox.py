@@ -90,4 +90,4 @@ def test_watched_program_returns_its_exit_code():
 
 
 def test_sandbox_imports_no_module_of_the_package():
-    assert "egvs" not in Path(sandbox.__file__).read_text().split('"""', 2)[2]
+    assert "egvs" not in Path(sandbox.__file__).read_text(encoding="utf-8").split('"""', 2)[2]

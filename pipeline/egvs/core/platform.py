@@ -1,4 +1,4 @@
-"""What differs between operating systems: file locks, links, memory, and the limits of a process.
+"""What differs between operating systems: file locks, links, paths, memory, and the limits of a process.
 
 Linux and macOS have the modules ``fcntl`` and ``resource``; Windows has ``msvcrt``, whose locks are always exclusive.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import sys
+from pathlib import PurePath
 
 try:
     import fcntl
@@ -57,6 +58,15 @@ def try_lock(descriptor: int, *, shared: bool = False) -> bool:
 def is_own_file(status: os.stat_result) -> bool:
     """Return whether a file belongs to this user; always True on Windows, which has no user numbers."""
     return not hasattr(os, "geteuid") or status.st_uid == os.geteuid()
+
+
+def relative_path(path: PurePath, folder: PurePath) -> str:
+    """Return a path relative to a folder, with slashes; the path itself if it is on another drive of Windows."""
+    try:
+        relative = os.path.relpath(path, folder)
+    except ValueError:
+        return path.as_posix()
+    return type(path)(relative).as_posix()
 
 
 def peak_memory_mb() -> float:

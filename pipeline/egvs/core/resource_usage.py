@@ -66,12 +66,12 @@ def _cpu_seconds() -> float:
 
 def _reset_peak() -> bool:
     try:
-        _PROC_CLEAR_REFS.write_text("5")
+        _PROC_CLEAR_REFS.write_text("5", encoding="utf-8")
     except OSError:
         return False
     return True
 
 
 def _status_mb(name: str) -> float:
-    line = next(line for line in _PROC_STATUS.read_text().splitlines() if line.startswith(name))
+    line = next(line for line in _PROC_STATUS.read_text(encoding="utf-8").splitlines() if line.startswith(name))
     return int(line.split()[1]) / 1024

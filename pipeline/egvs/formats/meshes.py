@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import re
 import warnings
 from collections.abc import Iterable, Iterator
@@ -31,6 +30,7 @@ from numpy.typing import NDArray
 from egvs.core import files, limits, reading
 from egvs.core.errors import InputError
 from egvs.core.grid import IntArray
+from egvs.core.platform import relative_path
 from egvs.core.reading import translate_errors
 
 if TYPE_CHECKING:
@@ -140,7 +140,7 @@ def mesh_digests(path: Path, name: str) -> dict[str, str]:
     """Return the SHA-256 of a mesh's file under its ``name``, and of each file that it references."""
     digests = {name: files.hash_file(path)}
     for file in referenced_files(path):
-        digests[f"{name}: {os.path.relpath(file, path.parent)}"] = files.hash_file(file)
+        digests[f"{name}: {relative_path(file, path.parent)}"] = files.hash_file(file)
     return digests
 
 

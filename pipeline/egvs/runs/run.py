@@ -24,6 +24,7 @@ from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.artefacts.run_record import RunRecord, StageRecord
 from egvs.core import files
 from egvs.core.errors import InputError, RunError
+from egvs.core.platform import relative_path
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.formats.meshes import referenced_files
 from egvs.runs import locks, stage_keys, stage_registry, store
@@ -171,7 +172,7 @@ def default_folder(scenario: Scenario) -> Path:
 
 def start_record(scenario: Scenario, folder: Path) -> RunRecord:
     """Return the record of earlier runs in a folder, with the scenario as it is now."""
-    scenario_folder = Path(os.path.relpath(scenario.folder, folder)).as_posix()
+    scenario_folder = relative_path(scenario.folder, folder)
     recorded = RunRecord.read(folder).stages if RunFolder(folder).has_record else {}
     return RunRecord(__version__, scenario.seed, scenario.model_dump(mode="json"), scenario_folder, recorded)
 

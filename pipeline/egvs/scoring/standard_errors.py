@@ -20,7 +20,7 @@ blocks are taken as they are, more are joined to ten groups - with fifty the sam
 are joined further where groups would be shorter than :data:`GROUP_LENGTH_TIMES` of it, down to
 :data:`MIN_GROUPS` groups: the t quantile accounts for the uncertainty of few groups. The correlation that remains
 between the groups of a short record inflates the error
-(:func:`egvs.scoring.autocorrelation.standard_error_inflation`). Where neighbouring groups are correlated all the same,
+(:func:`standard_error_inflation`). Where neighbouring groups are correlated all the same,
 they are joined in pairs. Groups shorter than the window in which that time was estimated, and groups that stay
 correlated, give a warning.
 
@@ -49,7 +49,7 @@ from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.kernels.occupancy import accumulate
-from egvs.scoring.autocorrelation import WINDOW_TIMES, standard_error_inflation
+from egvs.scoring.autocorrelation import WINDOW_TIMES
 from egvs.scoring.egvs import EntropyField, Hits, sum_hits_by_class
 
 TARGET_GROUPS = 10
@@ -360,6 +360,46 @@ class Stratum:
     def is_short(self) -> bool:
         """Whether groups are shorter than the window in which the autocorrelation time was estimated."""
         return self.groups.total < len(self.pseudo) * WINDOW_TIMES * self.groups.autocorrelation_frames
+
+
+def _time_upper_bound(time_frames: float, frames: int) -> float:
+    """Return an autocorrelation time one standard deviation above the estimate from a record of so many frames."""
+    return time_frames * (1.0 + math.sqrt(2.0 * (2.0 * WINDOW_TIMES * time_frames + 1.0) / frames))
+
+
+def standard_error_inflation(time_frames: float, frames: int, groups: int) -> float:
+    r"""Return the factor by which the scatter of consecutive groups of frames underestimates a standard error.
+
+    For an autocorrelation that decays as :math:`e^{-2 t / \tau}`, a mean over n frames has the variance
+
+    .. math:: \sigma^2 \tau f(n) / n, \qquad f(n) = 1 - (1 - e^{-x}) / x, \qquad x = 2 n / \tau
+
+    (Priestley, Spectral Analysis and Time Series, 1981, section 5.3). Groups are then correlated, and their scatter
+    underestimates the variance of the mean: of k groups with variance V each and V_T of all frames, it gives
+    (V - V_T) / (k - 1) instead of V_T.
+
+    Parameters
+    ----------
+    time_frames
+        Autocorrelation time of the traffic, in frames.
+    frames
+        Frames of the record.
+    groups
+        Number of groups that the record was cut into, at least 2.
+
+    Returns
+    -------
+    float
+        Factor for the standard error, at least 1; for the longest autocorrelation time that the record does not exclude
+        (:func:`_time_upper_bound`).
+    """
+    longest = _time_upper_bound(time_frames, frames)
+    ratio = groups * _variance_share(2.0 * frames / groups / longest) / _variance_share(2.0 * frames / longest)
+    return max(1.0, math.sqrt((groups - 1.0) / (ratio - 1.0)))
+
+
+def _variance_share(x: float) -> float:
+    return 1.0 + math.expm1(-x) / x
 
 
 def lag_one_autocorrelation(series: FloatArray) -> float:

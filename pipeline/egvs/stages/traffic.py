@@ -13,13 +13,13 @@ SUMO (https://eclipse.dev/sumo) stands in for the paper's game-engine simulator.
 
 from __future__ import annotations
 
-import os
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from egvs.artefacts import parquet
 from egvs.core.errors import WARNINGS_KEY, InputError, MissingBackendError
+from egvs.core.platform import relative_path
 from egvs.core.sumo_home import sumo_home
 from egvs.effects import registry
 from egvs.scenario.model import Scenario
@@ -81,7 +81,7 @@ def _relative_name(path: Path, scenario: Scenario) -> str:
     """Name of a file that does not depend on where the scenario and SUMO are installed."""
     if path.is_relative_to(sumo_home()):
         return f"$SUMO_HOME/{path.relative_to(sumo_home()).as_posix()}"
-    return Path(os.path.relpath(path, scenario.folder)).as_posix()
+    return relative_path(path, scenario.folder)
 
 
 def run(context: StageContext, inputs: StageDependencies, traci: tuple[str, int] | None = None) -> Summary:
