@@ -48,7 +48,7 @@ def all_choices(junctions: list[JunctionPlans]) -> list[tuple[float, int, float]
 @pytest.mark.slow
 @given(junctions(), st.integers(1, 12))
 def test_allocates_count_optimally(junctions: list[JunctionPlans], count: int) -> None:
-    allocated = allocation.allocate_count(junctions, count)
+    allocated = allocation.allocate_sensors(junctions, count)
     assert allocated.value == max(value for value, sensors, _ in all_choices(junctions) if sensors <= count)
     plans = [junction.plans[i] for junction, i in zip(junctions, allocated.chosen, strict=True)]
     assert sum(p.count for p in plans) <= count
@@ -83,8 +83,8 @@ def test_every_choice_has_forced_sensors() -> None:
         "a", (make_plan(2, 9.0, 0.0), make_plan(3, 10.0, 5.0)), (9.0, 9.0, 9.0, 10.0), (0.0, 0.0, 0.0, 5.0), 10.0, True
     )
     other = JunctionPlans("b", (make_plan(0, 0.0, 0.0), make_plan(1, 4.0, 5.0)), (0.0, 4.0), (0.0, 5.0), 4.0, True)
-    assert allocation.allocate_count([forced, other], 3).chosen == (0, 1)
-    assert allocation.allocate_count([forced, other], 2).chosen == (0, 0)
+    assert allocation.allocate_sensors([forced, other], 3).chosen == (0, 1)
+    assert allocation.allocate_sensors([forced, other], 2).chosen == (0, 0)
     assert allocation.allocate_budget([forced, other], 4.9).chosen == (0, 0)
     assert allocation.allocate_budget([forced, other], 5.0).value == 13.0
 

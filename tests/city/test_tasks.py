@@ -33,7 +33,7 @@ def make_site(name: str, rng: np.random.Generator, *, full: bool) -> ScoredSite:
     )
     if not full:
         return ScoredSite(site, score, None, None, None)
-    score = SiteScore(score.egvs, score.entropy_seen, score.left_out, score.shares, (score, score))
+    score = SiteScore(score.egvs, score.entropy_seen, score.replicates, score.shares, (score, score))
     missed = SpotVisibility(rng.integers(0, 9, 5), rng.random(5), np.array([np.nan, np.inf, 0.0, 0.1, -0.0]))
     targets = SiteTargetScores({"seen_well": np.array([np.nan, 0.1])}, ({"seen_well": float("nan")},), missed)
     index = {key: rng.integers(0, 9, 3).astype(np.int32) for key in ("ix", "iy", "iz")}

@@ -166,7 +166,7 @@ def test_layers_draw_their_data(page: Page, session: Session, layer: str) -> Non
     if layer == "difference":
         alone = (entropy * ((hits > 0) & (other == 0))).sum(), (entropy * ((hits == 0) & (other > 0))).sum()
         for name, bit in zip(("pole_a", "pole_b"), alone, strict=True):
-            assert f"only {name} sees {bit:,.1f} bit" in page.controls.legend.content
+            assert f"seen only by {name}: {bit:,.1f} bits" in page.controls.legend.content
     if layer == "blindspots":
         assert f"{session.blindspots(site).overall.share:.1%} seen" in page.controls.legend.content
 

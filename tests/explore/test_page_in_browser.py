@@ -150,7 +150,7 @@ def test_drag_ends_with_score_of_final_pose(tab: Any, page: Page, errors: list[s
 
 
 def test_other_browsers_and_reload_show_the_same(browser: Any, tab: Any, page: Page, errors: list[str]) -> None:
-    field = tab.get_by_label("z m")
+    field = tab.get_by_label("z (m)")
     field.fill("4.5")
     field.press("Enter")
     best = page.session.ranked[0].site

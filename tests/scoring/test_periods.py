@@ -241,10 +241,10 @@ def test_score_table_keeps_replicates_of_each_period() -> None:
     table = ScoreTable.of([SiteScores("a", scores, None)], groups)
     egvs = table.column("egvs")
     assert egvs.values.tolist() == [9.0]
-    assert egvs.left_out is not None and egvs.left_out.tolist() == [[9.1, 8.0, 10.0]]
+    assert egvs.replicates is not None and egvs.replicates.tolist() == [[9.1, 8.0, 10.0]]
     coverage = table.column("coverage")
-    assert coverage.left_out is not None and coverage.left_out.tolist() == [[0.5, 0.4, 0.6]]
-    assert table.column("entropy_seen").left_out is None
+    assert coverage.replicates is not None and coverage.replicates.tolist() == [[0.5, 0.4, 0.6]]
+    assert table.column("entropy_seen").replicates is None
     assert math.isnan(table.column("entropy_seen").se[0])
 
 

@@ -219,7 +219,7 @@ def test_scores_say_how_sure_they_are(mini: Path, tmp_path: Path) -> None:
     work, tpog = open_folder(scenario, tmp_path / "out"), egvs.read_tpog(tmp_path / "out" / "tpog.parquet")
     scorer = Scorer(get_scene(work), tpog, leave_out=leave_out)
     for scan, row in zip(empty_scans(work), rows, strict=True):
-        assert scorer.score(scan.beams).left_out[0] == pytest.approx(row["egvs"], rel=1e-12)
+        assert scorer.score(scan.beams).replicates[0] == pytest.approx(row["egvs"], rel=1e-12)
 
 
 def test_many_blocks_are_joined_as_they_are_read(mini: Path, tmp_path: Path) -> None:

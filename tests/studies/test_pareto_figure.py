@@ -6,7 +6,7 @@ from dataclasses import fields
 
 import pytest
 
-from egvs.studies.pareto_figure import make_figure
+from egvs.studies.pareto_figure import draw_figure
 from egvs.studies.score_errors import SettingResult
 from egvs.studies.study_settings import APPROXIMATES, MEASURES, SCENARIO
 
@@ -29,7 +29,7 @@ def settings(seconds: float, judged: float) -> list[SettingResult]:
 @pytest.mark.slow
 @pytest.mark.parametrize(("seconds", "judged"), [(0.8, 0.3), (40.0, 0.3), (40.0, 0.0), (5.0, 0.01)])
 def test_legend_and_labels_cover_no_marker(seconds: float, judged: float) -> None:
-    figure = make_figure(settings(seconds, judged), 0.02, "trial")
+    figure = draw_figure(settings(seconds, judged), 0.02, "trial")
     panel = figure.axes[0]
     legend = panel.get_legend().get_window_extent(figure.canvas.get_renderer())
     assert not legend.overlaps(panel.bbox)  # where all the markers are

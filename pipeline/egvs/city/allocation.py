@@ -255,7 +255,7 @@ def min_costs_by_count(rules: PlanRules) -> tuple[float, ...]:
     return (*[0.0] * len(rules.forced), *costs.tolist())
 
 
-def allocate_count(junctions: Sequence[JunctionPlans], count: int) -> Allocation:
+def allocate_sensors(junctions: Sequence[JunctionPlans], count: int) -> Allocation:
     """Return the best allocation of at most ``count`` sensors, forced ones included."""
     best = np.zeros(count + 1)
     choices: list[IntArray] = []

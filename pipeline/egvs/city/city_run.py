@@ -269,7 +269,7 @@ def _solve_allocation(plans: Sequence[JunctionPlans], count: int | None, budget:
     if n_forced > count:
         problem = f"{n_forced} sensors are already installed (placement.forced)"
         raise InputError(f"--count {count}", problem, f"Use a count of at least {n_forced}.")
-    return allocation.allocate_count(plans, count)
+    return allocation.allocate_sensors(plans, count)
 
 
 def _make_city_plan(

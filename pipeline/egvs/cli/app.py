@@ -137,7 +137,7 @@ def traffic(
     """Simulate the traffic with SUMO and write trajectories.parquet."""
     stage_options: dict[str, Any] = {}
     if traci is not None:
-        stage_options["traci"] = cli_options.host_and_port(traci)
+        stage_options["traci"] = cli_options.parse_host_and_port(traci)
     _run_stage("traffic", scenario, out, set_, **stage_options)
 
 

@@ -64,7 +64,7 @@ def size_bytes(text: str) -> float:
     return size
 
 
-def host_and_port(text: str) -> tuple[str, int]:
+def parse_host_and_port(text: str) -> tuple[str, int]:
     """Return host and port of ``--traci HOST:PORT``."""
     host, _, port = text.rpartition(":")
     if not host or not port.isdigit() or not 0 < int(port) < 65536:

@@ -1,4 +1,4 @@
-"""The errors that reach a user, and diagnostics: errors and warnings about a scenario or a run.
+"""The errors that reach a user, suggestions for misspelt names, and diagnostics about a scenario or a run.
 
 Every error that reaches a user is an :class:`EgvsError`. Its text names the file, the key or row, what is wrong, and
 what to do. ``exit_code`` is the exit code of the command line.
@@ -202,10 +202,10 @@ def find_misspelling(names: Iterable[str], known: Collection[str]) -> tuple[str,
         near = difflib.get_close_matches(low, missing, 1, _MIN_SIMILARITY)
         if meant := stems.get(_UNIT_SUFFIX.sub("", low)):
             return name, meant
-        if near and _similarity(low, near[0]) > _MIN_SIMILARITY:
+        if near and _name_similarity(low, near[0]) > _MIN_SIMILARITY:
             return name, missing[near[0]]
     return None
 
 
-def _similarity(a: str, b: str) -> float:
+def _name_similarity(a: str, b: str) -> float:
     return difflib.SequenceMatcher(None, b, a).ratio()

@@ -44,7 +44,7 @@ _COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 _EXTERNAL_KEYS = ("buffers", "images")
 
 
-def _parse_gltf(data: bytes) -> Any:
+def _parse_gltf_json(data: bytes) -> Any:
     """Return the JSON of a glTF or GLB; ValueError or RecursionError when it is damaged."""
     if data.startswith(_GLB):
         data = data[_HEADER_BYTES : _HEADER_BYTES + int.from_bytes(data[12:16], "little")]
@@ -53,7 +53,7 @@ def _parse_gltf(data: bytes) -> Any:
 
 def _check_gltf_size(path: Path, where: str, data: bytes) -> None:
     """Raise an InputError when a glTF file asks for more memory than the limits allow."""
-    document = _parse_gltf(data)
+    document = _parse_gltf_json(data)
     reading.check_depth(document)
     accessors = _objects_under(document, "accessors")
     meshes = _objects_under(document, "meshes")
@@ -119,7 +119,7 @@ def referenced_files(path: Path) -> list[Path]:
     match path.suffix.lower():
         case ".gltf" | ".glb":
             try:
-                uris = _external_uris(_parse_gltf(limits.read_bytes(path, limits.FILE)))
+                uris = _external_uris(_parse_gltf_json(limits.read_bytes(path, limits.FILE)))
             except (ValueError, RecursionError):
                 return []
             return _existing_files(path, [name for uri in uris for name in (uri, unquote(uri))])

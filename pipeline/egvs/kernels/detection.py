@@ -174,7 +174,7 @@ def overlap_each(a, b, bev, solid):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def overlap_frames(objects, object_start, detections, detection_start, pair_start, overlap):  # type: ignore[no-untyped-def]
+def fill_overlaps(objects, object_start, detections, detection_start, pair_start, overlap):  # type: ignore[no-untyped-def]
     """Fill the overlaps of every object with every detection of its frame.
 
     Parameters
@@ -241,7 +241,7 @@ def match_frames(  # type: ignore[no-untyped-def]
     Parameters
     ----------
     object_start, detection_start, pair_start, overlap
-        As for :func:`overlap_frames`; one row of the overlaps, (pairs,).
+        As for :func:`fill_overlaps`; one row of the overlaps, (pairs,).
     counted
         Whether each object counts, (n,) bool; a detection of another object is not counted at all.
     min_overlap

@@ -175,7 +175,7 @@ def smallest_plan(problem: Problem, *, time_limit_s: float, on_progress: SolverC
     """
     end_time = perf_counter() + time_limit_s
     curve: list[BoundedPoint] = []
-    for count in range(_min_sensors(problem), problem.rules.max_sensors + 1):
+    for count in range(_first_count(problem), problem.rules.max_sensors + 1):
         previous: Plan = curve[-1].point.plan if curve else ()
         curve.append(_curve_point(problem.with_count(count), previous))
         on_progress(count)
@@ -204,7 +204,7 @@ def smallest_plan(problem: Problem, *, time_limit_s: float, on_progress: SolverC
     return Solution(order, tuple(points), nodes, fewest_is_proved=is_proved)
 
 
-def _min_sensors(problem: Problem) -> int:
+def _first_count(problem: Problem) -> int:
     """Number of sensors at which the curve starts."""
     return max(1, len(problem.rules.forced))
 
@@ -215,7 +215,7 @@ def _plan_curve(problem: Problem, max_count: int, on_progress: SolverCallback) -
     greedy: Plan = ()
     if problem.is_plain and np.isinf(problem.rules.budget):
         greedy = greedy_plan(problem)
-    for count in range(_min_sensors(problem), max_count + 1):
+    for count in range(_first_count(problem), max_count + 1):
         smaller: Plan = curve[-1].point.plan if curve else ()
         curve.append(_curve_point(problem.with_count(count), smaller, greedy[:count]))
         on_progress(count)
@@ -234,7 +234,7 @@ def _smaller_plans(
         best = max(better, key=lambda point: point.plan_value)
         bound = max(last.bound, best.plan_value.value)
         last = replace(last, plan=best.plan, plan_value=best.plan_value, bound=bound)
-    count = max(_min_sensors(problem), len(last.plan))
+    count = max(_first_count(problem), len(last.plan))
     return [point for point in curve if point.count < count], replace(last, count=count)
 
 

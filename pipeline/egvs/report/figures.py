@@ -246,11 +246,11 @@ def _site_coverages(work: StageContext, choosable: Sequence[RankedSite], scorer:
             visible_bit=column_entropy(field, visible),
             missed_bit=column_entropy(field, ~visible),
             caption=ranking.site_caption(site, int(visible.sum()), len(visible)),
-            ends_m=_beam_ends_m(scan.beams),
+            ends_m=_hit_positions_m(scan.beams),
         )
 
 
-def _beam_ends_m(beams: Beams) -> NDArray[np.float64]:
+def _hit_positions_m(beams: Beams) -> NDArray[np.float64]:
     """Positions where beams hit something, x and y in the world frame, shape (n, 2)."""
     is_hit = np.linalg.norm(beams.ends_m, axis=1) < beams.sensor.range_m * (1 - 1e-9)
     ends: NDArray[np.float64] = beams.ends_m[is_hit, :2] + np.asarray(beams.pose.position_m[:2])

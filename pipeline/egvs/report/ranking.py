@@ -88,7 +88,7 @@ class RankedSite(MapSite):
         sites = []
         for row in scores.to_pylist():
             values = {name: _none_if_nan(row[name]) for name in names}
-            user_columns = tuple((name, _format_user_value(row[name])) for name in user_names)
+            user_columns = tuple((name, _format_extra_column(row[name])) for name in user_names)
             others = tuple(ScoreValue(name, row[name], _none_if_nan(row.get(f"{name}_se"))) for name in other_names)
             sites.append(cls(**values, user_columns=user_columns, rank_by=rank_by, others=others))
         return tuple(sites)
@@ -135,7 +135,7 @@ def _none_if_nan(value: Any) -> Any:
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
-def _format_user_value(value: object) -> str:
+def _format_extra_column(value: object) -> str:
     if value is None:
         return ""
     if isinstance(value, float):

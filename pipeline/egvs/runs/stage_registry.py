@@ -1,4 +1,4 @@
-"""The registered stages, and running one of them."""
+"""The registered stages, running one of them, and the digests of their artefacts."""
 
 from __future__ import annotations
 

@@ -179,7 +179,7 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
     try:
         return _build_scenario(values, file)
     except InputError as error:
-        if not overrides or not _is_valid_alone(file):
+        if not overrides or not _is_valid_without_overrides(file):
             raise
         texts = [text.replace(str(file), "--set") for text in (error.where, error.problem, error.hint)]
         raise InputError(*texts) from None
@@ -191,7 +191,7 @@ def _build_scenario(values: dict[str, Any], file: Path) -> Scenario:
     return scenario
 
 
-def _is_valid_alone(file: Path) -> bool:
+def _is_valid_without_overrides(file: Path) -> bool:
     """Return whether a scenario is valid without overrides."""
     try:
         _build_scenario(_read_with_bases(file, ()), file)

@@ -44,13 +44,13 @@ those of :data:`ALL_TRAFFIC`. Standard errors are computed from this one."""
 class ScoreEntry(NamedTuple):
     """One score of one site in one period.
 
-    ``left_out`` is the score of all traffic, then with each group left out, (1 + k,) float64; None without replicates.
+    ``replicates``: the score of all traffic, then with each group left out, (1 + k,) float64; None without any.
     """
 
     period: str
     score: str
     value: float
-    left_out: FloatArray | None
+    replicates: FloatArray | None
 
 
 class SiteScores(NamedTuple):
@@ -65,10 +65,10 @@ class SiteScores(NamedTuple):
         yield from _voxel_entries(MIX, self.voxels)
         if self.targets is not None:
             for name, replicates in self.targets.scores.items():
-                yield ScoreEntry(MIX, name, float(replicates[0]), _left_out(replicates))
+                yield ScoreEntry(MIX, name, float(replicates[0]), _if_several(replicates))
         for period, scores in zip(periods, self.voxels.by_period, strict=bool(periods)):
             for entry in _voxel_entries(period, scores):
-                yield entry if entry.score == "egvs" else entry._replace(left_out=None)
+                yield entry if entry.score == "egvs" else entry._replace(replicates=None)
         if self.targets is not None:
             for period, values in zip(periods, self.targets.by_period, strict=bool(periods)):
                 for name, value in values.items():
@@ -76,13 +76,13 @@ class SiteScores(NamedTuple):
 
 
 def _voxel_entries(period: str, scores: SiteScore) -> Iterator[ScoreEntry]:
-    yield ScoreEntry(period, "egvs", scores.egvs, scores.left_out)
+    yield ScoreEntry(period, "egvs", scores.egvs, scores.replicates)
     shares = {"entropy_seen": np.array([scores.entropy_seen]), **scores.shares}
     for name, replicates in shares.items():
-        yield ScoreEntry(period, name, float(replicates[0]), _left_out(replicates))
+        yield ScoreEntry(period, name, float(replicates[0]), _if_several(replicates))
 
 
-def _left_out(replicates: FloatArray) -> FloatArray | None:
+def _if_several(replicates: FloatArray) -> FloatArray | None:
     return replicates if len(replicates) > 1 else None
 
 
@@ -96,7 +96,7 @@ class ScoreColumn:
         Name of the score.
     values
         (n,) float64; NaN where the score is not defined.
-    left_out
+    replicates
         The score of all traffic, then with each group of blocks left out, (n, 1 + k) float64; None without replicates.
     groups
         The groups that are left out, k in all.
@@ -104,7 +104,7 @@ class ScoreColumn:
 
     name: str
     values: FloatArray
-    left_out: FloatArray | None = None
+    replicates: FloatArray | None = None
     groups: tuple[BlockGroups, ...] = ()
 
     @property
@@ -115,9 +115,9 @@ class ScoreColumn:
     @cached_property
     def estimate(self) -> ScoreUncertainty | None:
         """Standard errors and comparisons; None where they are unknown."""
-        if self.left_out is None or np.isnan(self.left_out).any():
+        if self.replicates is None or np.isnan(self.replicates).any():
             return None
-        return ScoreUncertainty.of(self.left_out, self.groups)
+        return ScoreUncertainty.of(self.replicates, self.groups)
 
     @property
     def se(self) -> FloatArray:
@@ -141,7 +141,7 @@ class ScoreColumn:
         return frozenset(np.flatnonzero(self.values == self.values.max()).tolist())
 
 
-class RankedSite(NamedTuple):
+class RankingRow(NamedTuple):
     """A site with its rank by some score."""
 
     rank: int
@@ -187,13 +187,14 @@ class ScoreTable:
         for site_scores in scores:
             sites.append(site_scores.site)
             for entry in site_scores.entries(periods):
-                replicates, values = [ALL_TRAFFIC], [entry.value]
-                if entry.left_out is not None:
-                    replicates += [JACKKNIFE_TOTAL, *range(1, len(entry.left_out))]
-                    values += entry.left_out.tolist()
+                numbers = [ALL_TRAFFIC]
+                values = [entry.value]
+                if entry.replicates is not None:
+                    numbers += [JACKKNIFE_TOTAL, *range(1, len(entry.replicates))]
+                    values += entry.replicates.tolist()
                 columns["site"] += [site_scores.site] * len(values)
                 columns["period"] += [entry.period] * len(values)
-                columns["replicate"] += replicates
+                columns["replicate"] += numbers
                 columns["score"] += [entry.score] * len(values)
                 columns["value"] += values
         types = {"replicate": pa.int32(), "value": pa.float64()}
@@ -207,22 +208,22 @@ class ScoreTable:
         replicate = rows.column("replicate").to_numpy()
         values = rows.column("value").to_numpy()
         groups = self.groups.get(period, ())
-        left_out = None
+        replicates = None
         if groups and (len(values) > len(self.sites) or not self.sites):
-            replicates = 1 + sum(len(record.frames) for record in groups)
-            left_out = values[replicate != ALL_TRAFFIC].reshape(len(self.sites), replicates)
-        return ScoreColumn(score, values[replicate == ALL_TRAFFIC], left_out, groups)
+            n_replicates = 1 + sum(len(record.frames) for record in groups)
+            replicates = values[replicate != ALL_TRAFFIC].reshape(len(self.sites), n_replicates)
+        return ScoreColumn(score, values[replicate == ALL_TRAFFIC], replicates, groups)
 
     def by_period(self, score: str) -> dict[str, ScoreColumn]:
         """Return one score of all sites in each period."""
         return {period: self.column(score, period) for period in self.periods}
 
-    def ranking(self, score: str, period: str = MIX) -> list[RankedSite]:
+    def ranking(self, score: str, period: str = MIX) -> list[RankingRow]:
         """Return the sites from best to worst by one score; equal ones in the order of the table."""
         column = self.column(score, period)
         rank = column.rank
         order = rank_order(column.values).tolist()
-        return [RankedSite(int(rank[i]), self.sites[i], float(column.values[i])) for i in order]
+        return [RankingRow(int(rank[i]), self.sites[i], float(column.values[i])) for i in order]
 
 
 def write_scores_by_period(
@@ -295,7 +296,7 @@ def warn_additional_all_zero(column: ScoreColumn) -> Iterator[Diagnostic]:
 
 def warn_no_standard_error(column: ScoreColumn) -> Iterator[Diagnostic]:
     """Warn that the standard error of a score is unknown, although the scenario requests standard errors."""
-    if column.left_out is None or column.estimate is not None or np.isnan(column.values).any():
+    if column.replicates is None or column.estimate is not None or np.isnan(column.values).any():
         return
     groups = sum(len(record.frames) for record in column.groups)
     problem = f"{column.name} has no standard error: all vehicles in the region are in one of {groups} blocks of frames"

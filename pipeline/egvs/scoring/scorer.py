@@ -44,11 +44,11 @@ class SiteScore:
         The score in bits.
     entropy_seen
         Share of the TPOG's entropy in voxels crossed at least once.
-    left_out
+    replicates
         The EGVS of all frames, then with each group of blocks left out, (1 + k,) float64, see
         :class:`egvs.scoring.standard_errors.BlockJackknife`; None without standard errors.
     shares
-        The scores of :data:`VOXEL_SHARES` that the scenario requests, by name, in the form of ``left_out``; (1,)
+        The scores of :data:`VOXEL_SHARES` that the scenario requests, by name, in the form of ``replicates``; (1,)
         without standard errors.
     by_period
         Scores in each period alone, where the TPOG is a mix and they are requested.
@@ -56,7 +56,7 @@ class SiteScore:
 
     egvs: float
     entropy_seen: float
-    left_out: FloatArray | None = None
+    replicates: FloatArray | None = None
     shares: Mapping[str, FloatArray] = field(default_factory=dict)
     by_period: tuple[SiteScore, ...] = ()
 
@@ -143,11 +143,11 @@ class Scorer:
     def _score_hits_against(self, hits: Hits, tpog: _ScoredTpog) -> SiteScore:
         unit = self._visibility.unit
         score = tpog.entropy.score(hits, self._gamma, unit)
-        left_out = None
+        replicates = None
         if tpog.leave_out is not None:
-            left_out = tpog.leave_out.scores(hits, self._gamma, unit)
+            replicates = tpog.leave_out.scores(hits, self._gamma, unit)
         shares = {name: tpog.share(name, hits, score.entropy_seen) for name in self._requested_shares}
-        return SiteScore(score.egvs, score.entropy_seen, left_out, shares)
+        return SiteScore(score.egvs, score.entropy_seen, replicates, shares)
 
 
 def _as_beams(scan: Scan | Beams) -> Beams:

@@ -85,7 +85,7 @@ def read_csv(path: Path, world: Georeference) -> Iterator[SiteRow]:
     except (UnicodeDecodeError, csv.Error) as error:
         hint = "Save it as UTF-8 text with a header row."
         raise InputError(path, f"the file cannot be read as CSV ({error})", hint) from None
-    rows = parse_numeric_columns(locate_rows(located, path, world), KNOWN_COLUMNS)
+    rows = parse_numeric_columns(rows_in_world_frame(located, path, world), KNOWN_COLUMNS)
     for row, columns in zip(located, rows, strict=True):
         yield SiteRow(row.where, columns)
 
@@ -164,7 +164,7 @@ class _LonLat(NamedTuple):
     lat_deg: float
 
 
-def locate_rows(rows: Iterable[SiteRow], path: object, world: Georeference) -> list[dict[str, Any]]:
+def rows_in_world_frame(rows: Iterable[SiteRow], path: object, world: Georeference) -> list[dict[str, Any]]:
     """Return the columns of CSV rows with ``x_m, y_m`` in the world frame, and without longitude and latitude.
 
     Missing values and values that are no numbers are left as they are; they are rejected when the row is parsed.

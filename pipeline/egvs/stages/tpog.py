@@ -73,7 +73,7 @@ def run(context: StageContext, inputs: StageDependencies) -> Summary:
     boxes_in_roi = []
     left_over = 0
     with parquet.artefact_writer(context.folder.tpog, "tpog") as file:
-        for name, recorded, boxes in _recorded_boxes(source, grid):
+        for name, recorded, boxes in _recorded_periods(source, grid):
             unused = _leftover_frames(by_period.get(name, scenario), recorded)
             frames = recorded - unused
             blocks = count_blocks(boxes, grid, frames // n_blocks, n_blocks)
@@ -143,7 +143,7 @@ class _RecordedPeriod(NamedTuple):
     boxes: Iterator[FrameBoxes]
 
 
-def _recorded_boxes(source: Path, grid: Grid) -> Iterator[_RecordedPeriod]:
+def _recorded_periods(source: Path, grid: Grid) -> Iterator[_RecordedPeriod]:
     metadata = parquet.read_metadata(source, "trajectories")
     if "periods" not in metadata:
         yield _RecordedPeriod("", int(metadata["frames"]), read_boxes(source, grid))

@@ -340,7 +340,7 @@ class _StudyRun:
             "stages": self.scores[SCENARIO].stages,
         }
         parquet.write_artefact(folder.accuracy, "accuracy", columns, metadata)
-        pareto_figure.draw_figure(rows, tolerance, scenario.name, folder.accuracy_figure)
+        pareto_figure.write_figure(rows, tolerance, scenario.name, folder.accuracy_figure)
         checksums.write_checksums(folder.accuracy_checksums, written)
         return written
 

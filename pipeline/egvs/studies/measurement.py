@@ -393,11 +393,11 @@ def _collect_scores(work: StageContext, keys: dict[str, str], weight: float, sco
     column = None
     if jackknife is not None:
         column = _score_column(work, tpog, jackknife, scored)
-    if column is None or column.left_out is None or column.estimate is None:
+    if column is None or column.replicates is None or column.estimate is None:
         unknown = [math.nan] * len(names)
         return SettingScores(names, shares.tolist(), unknown, scores.tolist(), unknown, unknown, math.nan, [], keys)
     estimate = column.estimate
-    share_estimate = ScoreUncertainty.of(column.left_out / np.where(limits > 0, limits, 1.0), column.groups)
+    share_estimate = ScoreUncertainty.of(column.replicates / np.where(limits > 0, limits, 1.0), column.groups)
     return SettingScores(
         names, shares.tolist(), share_estimate.se.tolist(), scores.tolist(), estimate.se.tolist(),
         estimate.bias.tolist(), estimate.quantile(), _neighbours(estimate, names, counted_frames(work.scenario)), keys,

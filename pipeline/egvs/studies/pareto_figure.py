@@ -84,13 +84,13 @@ _MIN_ERROR = 1e-4
 """Smaller errors are drawn here, because the axis is logarithmic."""
 
 
-def draw_figure(settings: Sequence[SettingResult], tolerance: float, title: str, path: Path) -> None:
-    """Write the figure as a PNG; see :func:`make_figure`."""
+def write_figure(settings: Sequence[SettingResult], tolerance: float, title: str, path: Path) -> None:
+    """Write the figure as a PNG; see :func:`draw_figure`."""
     with files.atomic_write(path) as partial:
-        make_figure(settings, tolerance, title).savefig(partial, dpi=150, format="png", metadata={"Software": None})
+        draw_figure(settings, tolerance, title).savefig(partial, dpi=150, format="png", metadata={"Software": None})
 
 
-def make_figure(settings: Sequence[SettingResult], tolerance: float, title: str) -> Figure:
+def draw_figure(settings: Sequence[SettingResult], tolerance: float, title: str) -> Figure:
     """Draw the figure.
 
     Parameters

@@ -111,7 +111,7 @@ def size_files(scenario: Scenario) -> list[Path]:
     return [scenario.find(name, "traffic.vtypes") for name in scenario.traffic.vtypes]
 
 
-def kind_sizes(kinds: Collection[VehicleKind]) -> dict[str, VehicleSize]:
+def sizes_of_kinds(kinds: Collection[VehicleKind]) -> dict[str, VehicleSize]:
     """Return the sizes of kinds of the fleet."""
     return {k.name: VehicleSize(k.length_m, k.width_m, k.height_m, k.vclass) for k in kinds}
 
@@ -122,8 +122,8 @@ def known_sizes(scenario: Scenario) -> dict[str, VehicleSize]:
     if traffic.fcd is not None:
         metadata = read_fcd_metadata(scenario.find(traffic.fcd, "traffic.fcd"))
         if metadata is not None:
-            return metadata.sizes | kind_sizes(traffic.named_kinds)
-    return kind_sizes(traffic.kinds)
+            return metadata.sizes | sizes_of_kinds(traffic.named_kinds)
+    return sizes_of_kinds(traffic.kinds)
 
 
 def sizes_of_types(
@@ -151,11 +151,11 @@ def sizes_of_types(
         When a type has no known size, or a file of vTypes is invalid.
     """
     vtypes = check_types(scenario, types, declared)
-    named = kind_sizes(scenario.traffic.named_kinds)
-    sizes = kind_sizes(scenario.traffic.kinds) | dict(declared) | named
+    named = sizes_of_kinds(scenario.traffic.named_kinds)
+    sizes = sizes_of_kinds(scenario.traffic.kinds) | dict(declared) | named
     if vtypes or any(name not in sizes for name in types):
         try:
-            sizes |= _query_sizes(vtypes) | named
+            sizes |= _query_type_sizes(vtypes) | named
         except sumo.SumoInputError as error:
             where = ", ".join(map(str, size_files(scenario))) or sumo_folder.traffic_location(scenario)
             hint = "Use types that SUMO can read."
@@ -235,7 +235,7 @@ def _checked_vtype(vtype: Element, where: str) -> Element:
     return checked
 
 
-def _query_sizes(vtypes: Collection[Element]) -> dict[str, VehicleSize]:
+def _query_type_sizes(vtypes: Collection[Element]) -> dict[str, VehicleSize]:
     """Query the sizes of some types, and of SUMO's default types, from SUMO."""
     document = Element("additional")
     for vtype in vtypes:

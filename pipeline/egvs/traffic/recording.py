@@ -166,7 +166,7 @@ def _record_simulated(
     prepared = sumo_folder.prepare_simulation(scenario, folder, extensions)
     sources = ", ".join(path.name for path in prepared.sources)
     try:
-        sizes = finished_fcd.kind_sizes(scenario.traffic.kinds)
+        sizes = finished_fcd.sizes_of_kinds(scenario.traffic.kinds)
         if not prepared.is_generated:
             sizes = sumo.query_sizes(["-c", sumo_folder.CONFIG_FILE], folder)
         for extension in extensions:

@@ -1,4 +1,4 @@
-"""Prepare the folder that SUMO runs in.
+"""Prepare the folder that SUMO runs in; convert an OpenStreetMap map that a scenario names to a network.
 
 Steps of :func:`prepare_simulation`: find the files that a scenario, or the SUMO configuration that it names, takes its
 traffic from; check the times; copy the files; draw trips or sample routes if the scenario names none; add the route

@@ -276,7 +276,7 @@ class EvaluationFrames:
 
         starts = _frame_starts(object_frame, detection_frame, len(objects))
         overlap = np.empty((len(VIEWS), starts.pairs[-1]))
-        detection.overlap_frames(
+        detection.fill_overlaps(
             boxes[order], starts.objects, detected_boxes[by_score], starts.detections, starts.pairs, overlap
         )
         return cls(
