@@ -142,7 +142,7 @@ def _run_options(
     def on_done(done: JobResult) -> None:
         screen.say(describe_done(done))
 
-    return CityRunOptions(cluster, junctions or (), overrides or (), screen.progress, on_done)
+    return CityRunOptions(cluster, junctions or (), overrides or (), screen.progress, on_done, screen.say)
 
 
 def _print_new(city: NewCity) -> None:
