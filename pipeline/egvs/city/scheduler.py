@@ -459,8 +459,8 @@ def store_size_messages(folder: Path, max_bytes: float) -> Iterator[str]:
     if used_bytes > max_bytes:
         used_gb, max_gb = used_bytes / 1e9, max_bytes / 1e9
         yield (
-            f"{store.MAX_GB_VARIABLE}: the results in {folder} take {used_gb:.3g} GB, and those of this city are kept while "
-            f"it runs; expected at most {max_gb:.3g} GB. A later run will remove some. Try {1.2 * used_gb:.2g}."
+            f"{store.MAX_GB_VARIABLE}: expected results of at most {max_gb:.3g} GB in {folder}, got {used_gb:.3g} GB. "
+            f"All were kept for this city; a later run removes some. Try {1.2 * used_gb:.2g}."
         )
 
 

@@ -29,7 +29,7 @@ from egvs.runs.store import RemoteStore
 
 STAGE_MODULES = tuple(f"egvs.stages.{name}" for name in ("check", "statics", "scan", "traffic", "tpog", "score"))
 
-TOKEN_PREFIX = ".egvs-worker-check-"  # noqa: S105 - no password
+TOKEN_PREFIX = ".egvs-worker-check-"
 """Beginning of the names of token files. The program that starts a run writes one into each folder that workers must
 see, and removes it at the end."""
 

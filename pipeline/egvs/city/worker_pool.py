@@ -75,6 +75,8 @@ class _WorkerState:
         What is wrong with it; None before it has answered.
     answered_s
         Time of the last answer.
+    reported
+        The problems that the user knows.
     """
 
     threads: int
@@ -165,7 +167,7 @@ class WorkerPool:
         try:
             self._client.run_on_scheduler(worker_check.program_versions)
         except (ImportError, AttributeError) as error:
-            where = f"the scheduler at {self._client.scheduler.address}"  # type: ignore[union-attr]
+            where = f"the scheduler at {self._client.scheduler.address}"
             raise InputError(where, f"cannot import egvs ({error})", "Install egvs there, and restart it.") from None
 
     def _wait_for_first(self, on_wait: Callable[[], None]) -> None:
@@ -191,14 +193,13 @@ class WorkerPool:
             time.sleep(0.05)
         with self._lock:
             self._is_started = True
-            messages = self._unreported_problems()
+            messages = self._unreported_changes()
         for message in messages:
             self._on_message(message)
 
     def _no_worker_error(self, rejected: dict[str, _WorkerState]) -> InputError:
         lines = _describe_rejected(rejected)
-        where = f"{len(rejected)} of {len(rejected)} workers" if len(rejected) > 1 else "the only worker"
-        return InputError("--cluster", f"{where} cannot run this city\n" + "\n".join(lines), "")
+        return InputError("--cluster", "no connected worker can run this city\n" + "\n".join(lines))
 
     # ---- the thread that watches
 
@@ -219,7 +220,7 @@ class WorkerPool:
                 self._collect_answer(worker)
                 if self._is_due(worker):
                     worker.answer = asyncio.run_coroutine_threadsafe(self._ask(address), self._client.loop.asyncio_loop)
-            messages = self._unreported_problems() if self._is_started else []
+            messages = self._unreported_changes() if self._is_started else []
         for message in messages:
             self._on_message(message)
 
@@ -272,11 +273,12 @@ class WorkerPool:
     def _rejected(self) -> dict[str, _WorkerState]:
         return {address: worker for address, worker in self._workers.items() if worker.problems}
 
-    def _unreported_problems(self) -> list[str]:
+    def _unreported_changes(self) -> list[str]:
         new = {address: worker for address, worker in self._rejected().items() if worker.problems != worker.reported}
-        for worker in new.values():
-            worker.reported = list(worker.problems or ())
-        return _describe_rejected(new)
+        repaired = [address for address, worker in self._workers.items() if worker.is_accepted and worker.reported]
+        for address in (*new, *repaired):
+            self._workers[address].reported = list(self._workers[address].problems or ())
+        return [*_describe_rejected(new), *(f"worker {address} gets tasks from now on" for address in repaired)]
 
 
 def _describe_rejected(workers: dict[str, _WorkerState]) -> list[str]:

@@ -245,11 +245,10 @@ def entries_in_use(folder: Path, token: str) -> Iterator[None]:
     token
         Name of the run, unique.
     """
-    if (folder / _IN_USE_FOLDER).is_symlink():
-        raise InputError(
-            folder / _IN_USE_FOLDER, "is a symbolic link, and nothing is written through links", "Remove it."
-        )
-    path, stop = folder / _IN_USE_FOLDER / token, threading.Event()
+    runs_folder, stop = folder / _IN_USE_FOLDER, threading.Event()
+    if runs_folder.is_symlink():
+        raise InputError(runs_folder, "is a symbolic link, and nothing is written through links", "Remove it.")
+    path = runs_folder / token
 
     def touch() -> None:
         while not stop.wait(_TOUCH_INTERVAL_S):
@@ -257,9 +256,9 @@ def entries_in_use(folder: Path, token: str) -> Iterator[None]:
                 path.touch()
 
     with suppress(OSError):  # reported when an entry cannot be written
-        path.parent.mkdir(parents=True, exist_ok=True)
+        runs_folder.mkdir(parents=True, exist_ok=True)
         path.write_text(repr(time.time()), encoding="utf-8")
-        _remove_ended_runs(path.parent)
+        _remove_ended_runs(runs_folder)
     thread = threading.Thread(target=touch, name="store", daemon=True)
     thread.start()
     try:
@@ -553,7 +552,7 @@ class Store:
     def prune(self, most_bytes: float) -> list[StoreEntry]:
         """Remove the least recently used entries until the others fit into ``most_bytes`` (below 0: all).
 
-        Entries that a city run in progress has used are kept, unless all are to be removed. Returns the removed entries.
+        Entries that a city run in progress has used are kept, unless all are to be removed. Returns the removed ones.
         """
         if self.folder is None or not self._folders() or sum(entry.bytes for entry in self.entries()) <= most_bytes:
             return []
