@@ -44,8 +44,8 @@ DoneCallback = Callable[[JobResult], None]
 LOCAL_CLUSTER = "local"
 ADDRESS_PREFIXES = ("tcp://", "tls://")
 
-MIN_TASK_BEAMS, MAX_TASK_BEAMS = 2**24, 2**25
-"""Limits of the work of a task. 2**24 beams take about ten seconds, so the overhead of a task is negligible."""
+MIN_TASK_BEAMS, MAX_TASK_BEAMS = 2**20, 2**25
+"""Limits of the work of a task. 2**20 beams take one to two seconds, about three times as long as loading the scene."""
 
 TASKS_PER_WORKER = 4
 """Number of tasks per worker, if they are large enough."""
@@ -208,7 +208,8 @@ def beams_per_task(beams: Mapping[str, int], workers: int) -> int:
     workers
         Number of workers.
     """
-    target = sum(beams.values()) // max(1, TASKS_PER_WORKER * workers)
+    total = sum(beams.values()) + JUNCTION_BEAMS * len(beams)
+    target = total // max(1, TASKS_PER_WORKER * workers)
     power_of_two = 1 << max(0, target.bit_length() - 1)
     return int(min(MAX_TASK_BEAMS, max(MIN_TASK_BEAMS, power_of_two)))
 

@@ -376,7 +376,8 @@ class _StoreUsage:
     def is_old(self) -> bool:
         """Return whether all entries should be listed again."""
         age_s = time.time() - self.counted_at
-        return self.puts > min(max(_MIN_PUTS, self.entries), _MAX_PUTS) or not 0 <= age_s <= _MAX_COUNT_AGE_S
+        max_puts = min(max(_MIN_PUTS, self.entries - self.puts), _MAX_PUTS)
+        return self.puts > max_puts or not 0 <= age_s <= _MAX_COUNT_AGE_S
 
     def is_above(self, most_bytes: float) -> bool:
         """Return whether the store exceeds its limit, and trying to reduce it is not in vain."""
