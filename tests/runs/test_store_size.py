@@ -66,7 +66,7 @@ def lists(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_adding_entries_rarely_lists_them(tmp_path: Path, store: Path, lists: list[int]) -> None:
     for number in range(250):
         put(Store(store), number, tmp_path / "out")
-    assert len(lists) == 3  # the first time, and after 100 and 200 new entries
+    assert len(lists) == 3  # at the entries 1, 102 and 205
     assert recorded_bytes(store) == 250 * SIZE == Store(store).usage_bytes()
 
 

@@ -478,9 +478,9 @@ class Store:
             shutil.rmtree(work, ignore_errors=True)
             work.mkdir(parents=True)
             if self._call_remote(lambda remote: remote.fetch(final.name, work)):
-                _read_entry(work)
-                with self._shared():
-                    work.rename(final)
+                usage = self._add(work, final, _read_entry(work).bytes)
+                if usage.is_above(self.bound_bytes):
+                    self._prune_unused()
         except _DamagedEntry as damage:
             self._note(f"{self._remote.url}: the cached {stage} is damaged ({damage}) and will be made again")
         except OSError as error:
@@ -529,11 +529,9 @@ class Store:
             for name in result.files:
                 _copy_or_link(out / name, work / name, link)
             (work / ENTRY_FILE).write_text(_entry_to_json(stage, key, work, result), encoding="utf-8")
-            with self._shared():
-                work.rename(final)
+            usage = self._add(work, final, sum((work / name).stat().st_size for name in result.files))
             self._call_remote(lambda remote: remote.put(final.name, final, result.files))
-            size = sum((final / name).stat().st_size for name in result.files)
-            if self._count_new_entry(size).is_above(self.bound_bytes):
+            if usage.is_above(self.bound_bytes):
                 self._prune_unused()
         except OSError as error:
             self._stop_writing(error)
@@ -571,9 +569,10 @@ class Store:
             usage = None
         return (usage or self._list_usage()).bytes
 
-    def _count_new_entry(self, n_bytes: int) -> _StoreUsage:
-        """Add an entry to the recorded size; list all entries if this size is unknown or old."""
-        with self._usage_file() as descriptor:
+    def _add(self, work: Path, final: Path, n_bytes: int) -> _StoreUsage:
+        """Move a complete entry to its place, and count it; list all entries if their size is unknown or old."""
+        with self._shared(), self._usage_file() as descriptor:
+            work.rename(final)
             usage = _StoreUsage.read(descriptor)
             if usage is not None:
                 usage = replace(usage, bytes=usage.bytes + n_bytes, entries=usage.entries + 1, puts=usage.puts + 1)
