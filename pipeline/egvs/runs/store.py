@@ -358,8 +358,10 @@ class _StoreUsage:
     pruned_at: float = 0.0
 
     @classmethod
-    def read(cls, descriptor: int) -> _StoreUsage | None:
-        """Return the content of the file; None where it is empty or damaged."""
+    def read(cls, descriptor: int | None) -> _StoreUsage | None:
+        """Return the content of the file; None where it is empty or damaged, or there is none."""
+        if descriptor is None:
+            return None
         os.lseek(descriptor, 0, os.SEEK_SET)
         try:
             usage = cls(**json.loads(os.read(descriptor, _USAGE_BYTES)))
@@ -368,8 +370,10 @@ class _StoreUsage:
             return None
         return usage if is_valid else None
 
-    def write(self, descriptor: int) -> None:
+    def write(self, descriptor: int | None) -> None:
         """Write the file, which always has the same size, in one piece."""
+        if descriptor is None:
+            return
         os.lseek(descriptor, 0, os.SEEK_SET)
         os.write(descriptor, json.dumps(asdict(self)).ljust(_USAGE_BYTES - 1).encode() + b"\n")
 
@@ -630,10 +634,14 @@ class Store:
         return start
 
     @contextmanager
-    def _usage_file(self) -> Iterator[int]:
-        """Lock the record of the size; yield its descriptor."""
+    def _usage_file(self) -> Iterator[int | None]:
+        """Lock the record of the size; yield its descriptor, None where another user owns it."""
         assert self.folder is not None
-        descriptor = locks.open_lock(self.folder / ".usage")
+        try:
+            descriptor = locks.open_lock(self.folder / ".usage")
+        except PermissionError:
+            yield None
+            return
         try:
             locks.wait_for_lock(descriptor, math.inf)
             yield descriptor
