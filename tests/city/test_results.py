@@ -18,7 +18,7 @@ pytestmark = pytest.mark.system
 def test_rejects_different_scores(city: City, tmp_path: Path) -> None:
     path = city.folder / "junctions" / "east" / "scenario.toml"
     path.write_text(path.read_text().replace("[score]", '[score]\nrank_by = "coverage"'))
-    with pytest.raises(InputError, match=r"score.rank_by: is coverage, but egvs at west"):
+    with pytest.raises(InputError, match=r"score.rank_by: expected egvs, as for junction west, got coverage"):
         city_run.run_city(city, tmp_path / "out")
 
 

@@ -6,6 +6,7 @@ Junctions are compared byte by byte with runs of their own, with another store.
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import threading
@@ -22,6 +23,7 @@ from egvs.city import scheduler, tasks
 from egvs.city.scheduler import check_cluster
 from egvs.city.tasks import Job, JobResult, RunSettings
 from egvs.core.errors import EgvsError, InputError, RunError
+from egvs.runs.store import Store
 from tests.city.conftest import OVERRIDES, assert_same_run, run_separately
 
 pytestmark = pytest.mark.system
@@ -257,3 +259,25 @@ def test_reports_workers_that_never_start(jobs: list[Job], monkeypatch: pytest.M
         finally:
             ended.set()
             killer.join()
+
+
+def test_store_grows_with_city_unless_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("EGVS_STORE_MAX_GB", raising=False)
+    assert scheduler.make_run_settings(23).store_bytes == 10e9
+    assert scheduler.make_run_settings(10_000).store_bytes == 1e12
+    monkeypatch.setenv("EGVS_STORE_MAX_GB", "2")
+    assert scheduler.make_run_settings(10_000).store_bytes == 2e9
+
+
+def test_warns_about_small_store_and_disk(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert list(scheduler.expected_size_messages(store, 10e9, 23)) == []
+    (message,) = scheduler.expected_size_messages(store, 0.5e9, 23)
+    expected = "the results of 23 junctions take about 0.92 GB, more than the limit of 0.5 GB. Try 1.8."
+    assert message == f"EGVS_STORE_MAX_GB: {expected}"
+    (message,) = scheduler.expected_size_messages(store, math.inf, 10**9)
+    assert message.startswith(f"{store}: the results of 1,000,000,000 junctions take about 4e+07 GB, and ")
+    monkeypatch.setattr(Store, "usage_bytes", lambda _: 3e9)
+    (message,) = scheduler.store_size_messages(store, 2e9)
+    assert message.startswith(f"EGVS_STORE_MAX_GB: expected results of at most 2 GB in {store}, got 3 GB.")
+    assert message.endswith("Try 3.6.")
+    assert list(scheduler.store_size_messages(store, 4e9)) == []

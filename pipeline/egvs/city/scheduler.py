@@ -13,10 +13,11 @@ from __future__ import annotations
 import logging
 import os
 import re
+import shutil
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -53,8 +54,8 @@ TASKS_PER_WORKER = 4
 JUNCTION_BEAMS = 2**21
 """Work of the other stages of a junction, in beams."""
 
-STORE_BYTES_PER_JUNCTION = 100e6
-"""Space in the store for each junction, by default: twice that of a junction with 108 candidates."""
+TYPICAL_JUNCTION_BYTES, STORE_BYTES_PER_JUNCTION = 40e6, 100e6
+"""Results of a junction with 108 candidates and 5,000 frames, and space in the store for each junction by default."""
 
 CHECK_INTERVAL_S = 5.0
 """How often a run that waits for results checks the processes of this machine."""
@@ -323,6 +324,8 @@ def checked_workers(
     settings = make_run_settings(n_junctions)
     url = store.remote_url()
     store_folder = store.DEFAULT_FOLDER if url is not None else Path(settings.store)
+    for message in expected_size_messages(store_folder, settings.store_bytes, n_junctions):
+        on_message(message)
     shared_folders = writable_folders([*folders, store_folder] if url is None else folders)
     requirements = Requirements(settings.token, tuple(shared_folders), str(folders[-1].absolute()), url)
     pool = WorkerPool(client, requirements, on_message)
@@ -444,6 +447,29 @@ def make_run_settings(n_junctions: int = 1) -> RunSettings:
     if store.MAX_GB_VARIABLE not in os.environ:
         max_bytes = max(max_bytes, n_junctions * STORE_BYTES_PER_JUNCTION)
     return RunSettings(uuid.uuid4().hex[:8], program_id(), url or str(folder.absolute()), max_bytes)
+
+
+def expected_size_messages(folder: Path, max_bytes: float, n_junctions: int) -> Iterator[str]:
+    """Yield a message if the results of a city will probably exceed the store or the disk.
+
+    Parameters
+    ----------
+    folder
+        Folder of the store.
+    max_bytes
+        Largest size of the store.
+    n_junctions
+        Number of junctions.
+    """
+    expected_bytes = n_junctions * TYPICAL_JUNCTION_BYTES
+    expected = f"the results of {n_junctions:,} junctions take about {expected_bytes / 1e9:.3g} GB"
+    if expected_bytes > max_bytes:
+        limit = f"more than the limit of {max_bytes / 1e9:.3g} GB"
+        yield f"{store.MAX_GB_VARIABLE}: {expected}, {limit}. Try {2 * expected_bytes / 1e9:.2g}."
+    with suppress(OSError):
+        free_bytes = shutil.disk_usage(folder).free + Store(folder).usage_bytes()
+        if expected_bytes > free_bytes:
+            yield f"{folder}: {expected}, and {free_bytes / 1e9:.3g} GB are available. Use a larger disk."
 
 
 def store_size_messages(folder: Path, max_bytes: float) -> Iterator[str]:

@@ -42,8 +42,8 @@ FIRST_ANSWER_S = 3.0
 NO_WORKER_S = 5.0
 """If no worker is connected for this time, a message says that the run waits."""
 
-MAX_WAIT_S = 60.0
-"""A run whose only workers are rejected ones ends after this time."""
+FIRST_WORKER_S, MAX_WAIT_S = 8.0, 60.0
+"""A run whose only workers are rejected ones ends after this time: before its first task, and later."""
 
 _STALE_TOKEN_S = 86_400.0
 """Token files of killed programs are removed after this time."""
@@ -110,7 +110,6 @@ class WorkerPool:
         self._client, self._requirements, self._on_message = client, requirements, on_message
         self._workers: dict[str, _WorkerState] = {}
         self._lock, self._stop = threading.Lock(), threading.Event()
-        self._is_started = False
         self._last_accepted_s = time.monotonic()
         self._thread = threading.Thread(target=self._watch, name="workers", daemon=True)
 
@@ -173,29 +172,26 @@ class WorkerPool:
     def _wait_for_first(self, on_wait: Callable[[], None]) -> None:
         from distributed.comm import CommClosedError
 
-        start_s = time.monotonic()
+        start_s = only_rejected_s = time.monotonic()
         is_reported = False
         while True:
-            waited_s = time.monotonic() - start_s
+            now_s = time.monotonic()
             with self._lock:
-                has_accepted, rejected = self._has_accepted(), self._rejected()
-                is_complete = bool(self._workers) and all(w.problems is not None for w in self._workers.values())
-            if has_accepted and (is_complete or waited_s > FIRST_ANSWER_S):
-                break
-            if rejected and is_complete and waited_s > FIRST_ANSWER_S:
+                has_accepted, rejected, n_workers = self._has_accepted(), self._rejected(), len(self._workers)
+                has_all_answers = all(worker.problems is not None for worker in self._workers.values())
+            if has_accepted and (has_all_answers or now_s - start_s > FIRST_ANSWER_S):
+                return
+            if not rejected or not has_all_answers:
+                only_rejected_s = now_s
+            if now_s - only_rejected_s > FIRST_WORKER_S:
                 raise self._no_worker_error(rejected)
-            if not self._workers and waited_s > NO_WORKER_S and not is_reported:
+            if not n_workers and now_s - start_s > NO_WORKER_S and not is_reported:
                 self._on_message("no worker is connected to the scheduler; the run waits for one")
                 is_reported = True
             if self._client.status in ("closing", "closed"):
                 raise CommClosedError("the scheduler was lost")
             on_wait()
             time.sleep(0.05)
-        with self._lock:
-            self._is_started = True
-            messages = self._unreported_changes()
-        for message in messages:
-            self._on_message(message)
 
     def _no_worker_error(self, rejected: dict[str, _WorkerState]) -> InputError:
         lines = _describe_rejected(rejected)
@@ -220,7 +216,7 @@ class WorkerPool:
                 self._collect_answer(worker)
                 if self._is_due(worker):
                     worker.answer = asyncio.run_coroutine_threadsafe(self._ask(address), self._client.loop.asyncio_loop)
-            messages = self._unreported_changes() if self._is_started else []
+            messages = self._unreported_changes()
         for message in messages:
             self._on_message(message)
 
