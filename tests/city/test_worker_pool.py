@@ -119,14 +119,20 @@ def requirements(tmp_path: Path) -> Iterator[Requirements]:
     """What workers of a run in a temporary folder must have."""
     for name in ("city", "out"):
         (tmp_path / name).mkdir()
-    required = Requirements("12ab", (str(tmp_path / "city"), str(tmp_path / "out")), str(tmp_path / "out"))
+    folders = (str(tmp_path / "city"), str(tmp_path / "out"))
+    required = Requirements("12ab", folders, folders[1], worker_check.library_names())
     with worker_pool._token_files(required):
         yield required
 
 
 def describe_this_process(required: Requirements) -> worker_check.WorkerAnswer:
     return worker_check.describe_worker(
-        required.token_name, required.token, required.folders, required.writable, required.store_url
+        required.token_name,
+        required.token,
+        required.folders,
+        required.writable,
+        required.libraries,
+        required.store_url,
     )
 
 
@@ -161,7 +167,7 @@ def test_token_files_are_removed(tmp_path: Path, requirements: Requirements) -> 
 def test_names_differences_of_program(requirements: Requirements, name: str, text: str) -> None:
     answer = describe_this_process(requirements)
     answer["program"] = answer["program"] | {name: "other"}
-    expected = text.format(worker_check.program_versions().get(name))
+    expected = text.format(worker_check.program_versions(requirements.libraries).get(name))
     assert problem_texts(answer, requirements) == [f"another version of the program ({expected})"]
 
 
@@ -183,15 +189,23 @@ def test_source_digest_sees_every_file(other_version: Path, monkeypatch: pytest.
     """Also effects and schemas, which are found by name; a wheel and a checkout of the same source are equal."""
     package = other_version / "egvs"
     shutil.copyfile(Path(egvs.__file__).parent / "_version.py", package / "_version.py")
-    expected = worker_check._source_digest()
+    digest = worker_check._source_digest.__wrapped__
+    expected = digest()
     monkeypatch.setattr(worker_check, "_PACKAGE_FOLDER", package)
-    monkeypatch.setattr(parquet, "schema_folder", lambda: package / "data_schemas")
-    assert worker_check._source_digest() == expected
+    monkeypatch.setattr(worker_check, "data_folder", lambda name: package / name)
+    assert digest() == expected
     for name in ("effects/rain.py", "data_schemas/scores.schema.json", "sensors/catalogue.toml"):
-        before = worker_check._source_digest()
+        before = digest()
         with (package / name).open("a") as file:
             file.write("\n")
-        assert worker_check._source_digest() != before
+        assert digest() != before
+
+
+@pytest.mark.slow
+def test_worker_answers_before_it_imports_libraries() -> None:
+    code = "import sys; from egvs.city import worker_check as w; w.program_versions(()); print('numpy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout.strip() == "False"
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from egvs.city import tasks
 from egvs.city.tasks import Job, JobFailure, JobResult, Part, RunSettings, program_id
-from egvs.city.worker_check import Requirements
+from egvs.city.worker_check import Requirements, library_names
 from egvs.city.worker_pool import WorkerPool, print_to_stderr, writable_folders
 from egvs.core import plugins
 from egvs.core.errors import EgvsError, InputError, RunError
@@ -327,7 +327,8 @@ def checked_workers(
     for message in expected_size_messages(store_folder, settings.store_bytes, n_junctions):
         on_message(message)
     shared_folders = writable_folders([*folders, store_folder] if url is None else folders)
-    requirements = Requirements(settings.token, tuple(shared_folders), str(folders[-1].absolute()), url)
+    out = str(folders[-1].absolute())
+    requirements = Requirements(settings.token, tuple(shared_folders), out, library_names(), url)
     pool = WorkerPool(client, requirements, on_message)
     with store.entries_in_use(store_folder, settings.token), ExitStack() as stack:
         with _watch_scheduler(client):

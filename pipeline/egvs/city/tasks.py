@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs._version import __version__
-from egvs.city.worker_check import program_versions
+from egvs.city.worker_check import library_names, program_versions
 from egvs.core import files
 from egvs.core.errors import EgvsError, InputError, RunError
 from egvs.core.resource_usage import measure_usage, release_memory
@@ -149,7 +149,7 @@ class Part(NamedTuple):
 
 def program_id() -> str:
     """Return a text that is equal for programs that give the same bytes: version, source and libraries."""
-    versions = program_versions() | {"egvs": __version__}
+    versions = program_versions(library_names()) | {"egvs": __version__}
     return f"{versions.pop('egvs')}, {', '.join(' '.join(pair) for pair in versions.items())}"
 
 

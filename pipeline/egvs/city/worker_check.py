@@ -18,14 +18,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
+from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple, TypedDict
 
 from egvs._version import __version__
-from egvs.artefacts import parquet
 from egvs.core.errors import EgvsError
-from egvs.runs import stage_keys
-from egvs.runs.store import RemoteStore
+from egvs.core.package_data import data_folder
 
 STAGE_MODULES = tuple(f"egvs.stages.{name}" for name in ("check", "statics", "scan", "traffic", "tpog", "score"))
 
@@ -60,6 +59,8 @@ class Requirements:
         Folders with a token file.
     writable
         The folder in which tasks write, one of ``folders``.
+    libraries
+        Libraries of which every worker must have the same version as this program.
     store_url
         URL of the shared store with a token file; None for a store that is a folder.
     """
@@ -67,6 +68,7 @@ class Requirements:
     token: str
     folders: tuple[str, ...]
     writable: str
+    libraries: tuple[str, ...] = ()
     store_url: str | None = None
 
     @property
@@ -90,18 +92,29 @@ class WorkerAnswer(TypedDict):
 
 
 @cache
-def program_versions() -> dict[str, str]:
-    """Return what must be equal for equal results: version and source of the program, Python, libraries."""
+def library_names() -> tuple[str, ...]:
+    """Return the names of the installed libraries that results depend on."""
+    from egvs.runs import stage_keys  # not on workers, where it would delay the answer
+
     libraries = stage_keys.source_digest("egvs.runs.run", "egvs.report.page", *STAGE_MODULES).libraries
+    return tuple(stage_keys.library_versions(libraries))
+
+
+def program_versions(libraries: Sequence[str]) -> dict[str, str]:
+    """Return what must be equal for equal results: versions of program, Python and libraries, digest of the source."""
     python = ".".join(platform.python_version_tuple()[:2])
-    own = {"egvs": __version__, "source": _source_digest(), "python": python}
-    return own | stage_keys.library_versions(libraries)
+    versions = {"egvs": __version__, "source": _source_digest(), "python": python}
+    for name in libraries:
+        with suppress(metadata.PackageNotFoundError):
+            versions[name] = metadata.version(name)
+    return versions
 
 
+@cache
 def _source_digest() -> str:
     """Return a digest of all files of the package and of its schemas: two checkouts of one version may differ."""
     digest = hashlib.sha256()
-    for root in (_PACKAGE_FOLDER, parquet.schema_folder()):
+    for root in (_PACKAGE_FOLDER, data_folder("data_schemas")):
         for path in sorted(_source_files(root), key=lambda path: path.relative_to(root).as_posix()):
             digest.update(f"{path.relative_to(root).as_posix()}\n{path.stat().st_size}\n".encode())
             digest.update(path.read_bytes())
@@ -117,7 +130,7 @@ def _source_files(root: Path) -> Iterator[Path]:
 
 
 def describe_worker(
-    token_name: str, token: str, folders: Sequence[str], writable: str, url: str | None
+    token_name: str, token: str, folders: Sequence[str], writable: str, libraries: Sequence[str], url: str | None
 ) -> WorkerAnswer:
     """Describe this worker; the parameters are the fields of :class:`Requirements`."""
     invisible = [folder for folder in folders if not _has_token(Path(folder, token_name), token)]
@@ -134,7 +147,7 @@ def describe_worker(
             free_bytes[folder] = shutil.disk_usage(folder).free
     return {
         "host": socket.gethostname(),
-        "program": program_versions(),
+        "program": program_versions(libraries),
         "invisible": invisible,
         "unwritable": unwritable,
         "free_bytes": free_bytes,
@@ -149,6 +162,8 @@ def _has_token(path: Path, token: str) -> bool:
 
 
 def _has_remote_token(url: str, name: str, token: str) -> bool:
+    from egvs.runs.store import RemoteStore  # it imports much
+
     try:
         return RemoteStore(url).read_file(name) == token.encode()
     except (EgvsError, OSError):
@@ -174,7 +189,7 @@ def find_problems(answer: WorkerAnswer, requirements: Requirements) -> list[Prob
     requirements
         What the worker must have.
     """
-    problems = list(_program_problems(answer["program"]))
+    problems = list(_program_problems(answer["program"], program_versions(requirements.libraries)))
     for location in answer["invisible"]:
         if location == requirements.store_url:
             problems.append(Problem(f"{location} is not readable", "Give every machine access to this store."))
@@ -192,8 +207,7 @@ def find_problems(answer: WorkerAnswer, requirements: Requirements) -> list[Prob
     return problems
 
 
-def _program_problems(actual: dict[str, str]) -> Iterator[Problem]:
-    expected = program_versions()
+def _program_problems(actual: dict[str, str], expected: dict[str, str]) -> Iterator[Problem]:
     differences = []
     for name in {**expected, **actual}:
         if expected.get(name) != actual.get(name):

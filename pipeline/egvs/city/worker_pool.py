@@ -164,7 +164,7 @@ class WorkerPool:
     def _check_scheduler(self) -> None:
         """Raise an InputError if the scheduler cannot import the program: it has to read the tasks."""
         try:
-            self._client.run_on_scheduler(worker_check.program_versions)
+            self._client.run_on_scheduler(worker_check.program_versions, ())
         except (ImportError, AttributeError) as error:
             where = f"the scheduler at {self._client.scheduler.address}"
             raise InputError(where, f"cannot import egvs ({error})", "Install egvs there, and restart it.") from None
@@ -246,7 +246,7 @@ class WorkerPool:
         required = self._requirements
         call: Any = self._client.run(  # a coroutine: this runs in the event loop of the client
             worker_check.describe_worker, required.token_name, required.token, required.folders, required.writable,
-            required.store_url, workers=[address], on_error="return",
+            required.libraries, required.store_url, workers=[address], on_error="return",
         )  # fmt: skip
         answer = (await asyncio.wait_for(call, ANSWER_TIMEOUT_S))[address]
         if isinstance(answer, Exception):
