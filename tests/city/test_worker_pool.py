@@ -79,8 +79,7 @@ class RealCluster:
 
     def names(self) -> dict[str, str]:
         """Return the names of the connected workers by address."""
-        workers = self.client.scheduler_info(n_workers=-1)["workers"]
-        return {address: worker["name"] for address, worker in workers.items()}
+        return {address: worker["name"] for address, worker in worker_pool.connected_workers(self.client).items()}
 
     def close(self) -> None:
         self.client.close()

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from egvs.city import tasks
 from egvs.city.tasks import Job, JobFailure, JobResult, Part, RunSettings, program_id
 from egvs.city.worker_check import Requirements, library_names
-from egvs.city.worker_pool import WorkerPool, print_to_stderr, writable_folders
+from egvs.city.worker_pool import WorkerPool, connected_workers, print_to_stderr, writable_folders
 from egvs.core import plugins
 from egvs.core.errors import EgvsError, InputError, RunError
 from egvs.core.progress import ProgressCallback, no_progress
@@ -176,8 +176,7 @@ class LocalWorkers:
         if cluster is None or now - self._last_check < CHECK_INTERVAL_S:
             return
         self._last_check = now
-        workers = self._client.scheduler_info(n_workers=-1)["workers"].values()
-        running = {worker["name"] for worker in workers}
+        running = {worker["name"] for worker in connected_workers(self._client).values()}
         missing = [name for name in cluster.worker_spec if name not in running]
         if not missing:
             self._last_complete = now

@@ -59,6 +59,16 @@ def print_to_stderr(message: str) -> None:
     print(f"egvs: {message}", file=sys.stderr)
 
 
+def connected_workers(client: Client) -> dict[str, dict[str, Any]]:
+    """Return what the scheduler knows of each connected worker, by address.
+
+    ``Client.scheduler_info`` sometimes returns no workers, because a periodic callback of the client asks for none.
+    """
+    assert client.scheduler is not None
+    workers: dict[str, dict[str, Any]] = client.sync(client.scheduler.identity, n_workers=-1)["workers"]
+    return workers
+
+
 @dataclass
 class _WorkerState:
     """A connected worker.
@@ -207,7 +217,7 @@ class WorkerPool:
 
     def _update(self) -> None:
         """Ask new workers, and report those that were rejected."""
-        connected = self._client.scheduler_info(n_workers=-1)["workers"]
+        connected = connected_workers(self._client)
         with self._lock:
             for address in [address for address in self._workers if address not in connected]:
                 del self._workers[address]
