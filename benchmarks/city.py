@@ -7,6 +7,8 @@ Each command runs a synthetic city (junctions of :mod:`benchmarks.scaling`) with
 - ``python -m benchmarks.city flat``: milliseconds per site, from 10 to 10,000 sites per junction and from 1 to 50
   junctions, and the workers' memory.
 
+``python -m benchmarks.city store`` measures the time of adding an entry to a cache of 100 and of 7,000 entries.
+
 ``python -m benchmarks.city kills`` ends random workers with SIGKILL at random moments, ten times, and compares every
 artefact with those of an undisturbed run.
 """
@@ -38,7 +40,10 @@ from benchmarks.scaling import Size, prepare, sides
 from egvs.artefacts.run_record import RunRecord
 from egvs.city import scheduler, tasks
 from egvs.city.tasks import Job, JobResult
+from egvs.core import files
+from egvs.core.resource_usage import ResourceUsage
 from egvs.runs import run
+from egvs.runs.stage_registry import StageResult
 from egvs.runs.store import Store
 
 KILLS = 10
@@ -175,6 +180,36 @@ def spread(folder: Path, junctions: int, size: Size) -> list[Job]:
     return jobs
 
 
+def store(sizes: tuple[int, ...] = (100, 7000), repeats: int = 200) -> None:
+    """Print the time of adding an entry to caches of several sizes, and of listing their entries."""
+    mean_ms = []
+    for size in sizes:
+        with tempfile.TemporaryDirectory() as temporary:
+            cache, out = Store(Path(temporary, "store")), Path(temporary, "out")
+            out.mkdir()
+            for number in range(size):
+                _put(cache, out, number)
+            start = time.perf_counter()
+            cache.entries()
+            list_ms = 1e3 * (time.perf_counter() - start)
+            start = time.perf_counter()
+            for number in range(size, size + repeats):
+                _put(cache, out, number)
+            mean_ms.append(1e3 * (time.perf_counter() - start) / repeats)
+            print(
+                f"{size} entries: {mean_ms[-1]:.2f} ms per new entry; a list of all takes {list_ms:.0f} ms", flush=True
+            )
+    print(f"ratio {mean_ms[-1] / mean_ms[0]:.2f}")
+
+
+def _put(cache: Store, out: Path, number: int) -> None:
+    (out / tasks.PART_FILE).write_bytes(number.to_bytes(8, "little"))
+    key = files.hash_json(number)
+    digests = {tasks.PART_FILE: files.hash_file(out / tasks.PART_FILE)}
+    with cache.maker(tasks.PART_KIND, key):
+        cache.put(tasks.PART_KIND, key, out, StageResult(digests, {}, {}, ResourceUsage()))
+
+
 # ---- lost workers
 
 
@@ -238,7 +273,7 @@ def digests(jobs: list[Job]) -> dict[str, str]:
 def main() -> None:
     """Run the requested benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("speed", "flat", "overhead", "kills"))
+    parser.add_argument("what", choices=("speed", "flat", "overhead", "store", "kills"))
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--most-beams", type=int, help="beams per task, so that small cities are divided too")
@@ -254,6 +289,8 @@ def main() -> None:
                 flat(folder)
             case "overhead":
                 overhead(folder)
+            case "store":
+                store()
             case "kills":
                 kills(folder, options.seed)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
@@ -69,6 +70,18 @@ def test_joins_scores_and_ranks_junctions(city: City, tmp_path: Path) -> None:
     ]  # fmt: skip
     assert all((ran.out / link).is_file() for link in re.findall(r'href="(junctions/[^"]+)"', html))
     assert "http" not in re.sub(r"arXiv|http://www.w3.org/2000/svg", "", html)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_process_cluster")
+def test_command_prints_junctions_and_files(city: City, tmp_path: Path, run_egvs: Any) -> None:
+    code, printed, _ = run_egvs("city", "run", city.folder, "--out", tmp_path / "out")
+    assert code == 0
+    rows = [line.split() for line in printed.splitlines()]
+    assert [row[1] for row in rows if row[0] in ("1", "2")] == ["west", "east"]
+    assert rows[-1] == [str(tmp_path / "out" / "city.html")]
+    assert not list((tmp_path / "town").glob(".egvs*"))
+    assert not list((tmp_path / "out").glob(".egvs*"))
 
 
 def test_rejects_overrides_of_traffic(city: City, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ Junctions are compared byte by byte with runs of their own, with another store.
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import threading
@@ -18,10 +19,11 @@ from benchmarks.city import workers
 from hypothesis import given
 from hypothesis import strategies as st
 
-from egvs.city import scheduler
+from egvs.city import scheduler, tasks
 from egvs.city.scheduler import check_cluster
 from egvs.city.tasks import Job, JobResult, RunSettings
 from egvs.core.errors import EgvsError, InputError, RunError
+from egvs.runs.store import Store
 from tests.city.conftest import OVERRIDES, assert_same_run, run_separately
 
 pytestmark = pytest.mark.system
@@ -44,7 +46,7 @@ def test_graph_has_every_junction_once(beams: list[int], workers: int) -> None:
 def test_splits_large_junctions_and_groups_small_ones() -> None:
     all_jobs, m = make_jobs(5), 2**21
     beams = dict(zip((job.junction for job in all_jobs), (m, 100 * m, m, m, 9 * m), strict=True))
-    assert scheduler.beams_per_task(beams, 2) == 8 * m  # an eighth of 112 m, as a power of two
+    assert scheduler.beams_per_task(beams, 2) == 8 * m  # an eighth of 117 m, as a power of two
     assert scheduler.part_count(beams["j1"], 8 * m) == 13
     small = [all_jobs[i] for i in (0, 2, 3)]  # 2 m each, with the work that does not depend on beams
     groups = scheduler.group_jobs(small, beams, 5 * m)
@@ -53,10 +55,58 @@ def test_splits_large_junctions_and_groups_small_ones() -> None:
     assert {task.key.split("-")[0] for task in graph} == {"finish", "run"}
 
 
-@pytest.mark.parametrize(("workers", "beams"), [(1, 2**25), (2, 2**25), (8, 2**25), (100, 2**24)])
+@pytest.mark.parametrize(("workers", "beams"), [(1, 2**25), (2, 2**25), (8, 2**25), (100, 2**22), (1000, 2**20)])
 def test_limits_size_of_tasks(workers: int, beams: int) -> None:
     assert scheduler.beams_per_task({"a": 2**31}, workers) == beams
     assert scheduler.beams_per_task({"a": 1}, workers) == scheduler.MIN_TASK_BEAMS
+
+
+def busy_share(beams: dict[str, int], workers: int) -> float:
+    """Return the share of the time in which workers are busy, if tasks take as long as they have beams.
+
+    A quarter of the work of a junction that does not depend on its sites is before its sites are scored, the rest after
+    that. A free worker takes the first task that can start, those of split junctions before the others.
+    """
+    prepare, finish = scheduler.JUNCTION_BEAMS // 4, 3 * scheduler.JUNCTION_BEAMS // 4
+    max_beams = scheduler.beams_per_task(beams, workers)
+    parts = {name: scheduler.part_count(work, max_beams) for name, work in beams.items()}
+    small_jobs = [job for job in make_jobs(len(beams)) if parts[job.junction] == 1]
+    groups = list(scheduler.group_jobs(small_jobs, beams, max_beams))
+    whole = [sum(beams[job.junction] + scheduler.JUNCTION_BEAMS for job in group) for group in groups]
+
+    ready = [(0, prepare, name, "prepare") for name in beams if parts[name] > 1]
+    ready += [(0, work, "", "whole") for work in whole]
+    free, scored = [0] * workers, dict.fromkeys(beams, 0)
+    while ready:
+        ready.sort(key=lambda task: max(task[0], min(free)))
+        start, work, name, kind = ready.pop(0)
+        worker = free.index(min(free))
+        end = free[worker] = max(start, free[worker]) + work
+        if kind == "prepare":
+            ready += [(end, beams[name] // parts[name], name, "score")] * parts[name]
+        if kind == "score":
+            scored[name] += 1
+            if scored[name] == parts[name]:
+                ready.append((end, finish, name, "finish"))
+    return (sum(beams.values()) + scheduler.JUNCTION_BEAMS * len(beams)) / (workers * max(free))
+
+
+VLP_32C_SITES = 108 * (57_600 + tasks.SITE_BEAMS)
+"""Work of a junction with 108 candidates."""
+
+
+@pytest.mark.parametrize(
+    ("junctions", "workers", "share"), [(1, 2, 0.8), (11, 2, 0.9), (23, 8, 0.95), (23, 64, 0.7), (300, 64, 0.9)]
+)
+def test_tasks_keep_workers_busy(junctions: int, workers: int, share: float) -> None:
+    beams = {f"j{i}": VLP_32C_SITES for i in range(junctions)}
+    assert busy_share(beams, workers) > share
+
+
+def test_64_workers_score_one_town_in_three_rounds() -> None:
+    beams = {f"j{i}": VLP_32C_SITES for i in range(23)}
+    n_parts = 23 * scheduler.part_count(VLP_32C_SITES, scheduler.beams_per_task(beams, 64))
+    assert n_parts == 184  # 2.9 times 64
 
 
 @pytest.mark.parametrize(
@@ -209,3 +259,25 @@ def test_reports_workers_that_never_start(jobs: list[Job], monkeypatch: pytest.M
         finally:
             ended.set()
             killer.join()
+
+
+def test_store_grows_with_city_unless_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("EGVS_STORE_MAX_GB", raising=False)
+    assert scheduler.make_run_settings(23).store_bytes == 10e9
+    assert scheduler.make_run_settings(10_000).store_bytes == 1e12
+    monkeypatch.setenv("EGVS_STORE_MAX_GB", "2")
+    assert scheduler.make_run_settings(10_000).store_bytes == 2e9
+
+
+def test_warns_about_small_store_and_disk(store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert list(scheduler.expected_size_messages(store, 10e9, 23)) == []
+    (message,) = scheduler.expected_size_messages(store, 0.5e9, 23)
+    expected = "the results of 23 junctions take about 0.92 GB, more than the limit of 0.5 GB. Try 1.8."
+    assert message == f"EGVS_STORE_MAX_GB: {expected}"
+    (message,) = scheduler.expected_size_messages(store, math.inf, 10**9)
+    assert message.startswith(f"{store}: the results of 1,000,000,000 junctions take about 4e+07 GB, and ")
+    monkeypatch.setattr(Store, "usage_bytes", lambda _: 3e9)
+    (message,) = scheduler.store_size_messages(store, 2e9)
+    assert message.startswith(f"EGVS_STORE_MAX_GB: expected results of at most 2 GB in {store}, got 3 GB.")
+    assert message.endswith("Try 3.6.")
+    assert list(scheduler.store_size_messages(store, 4e9)) == []

@@ -12,24 +12,23 @@ plan has, its plans are computed for twice as many, and the allocation is repeat
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from egvs.artefacts.planned_sensor import PlannedSensor
 from egvs.city import allocation, page, results, scheduler, traffic_split
 from egvs.city.allocation import Allocation, JunctionPlans
 from egvs.city.model import City
 from egvs.city.results import CityPlan, JunctionResult, read_junction_results, write_results
-from egvs.city.tasks import Job, JobFailure, JobResult, RunSettings
+from egvs.city.scheduler import Cluster
+from egvs.city.tasks import Job, JobFailure, JobResult
+from egvs.city.worker_pool import print_to_stderr
 from egvs.core.errors import Diagnostic, InputError, collect_warnings
 from egvs.core.grid import Roi
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.runs.run import lock_run_folder
-
-if TYPE_CHECKING:
-    from distributed import Client
 
 _MIN_FIRST_COUNT = 4
 """Plans of each junction are computed for at least this number of sensors."""
@@ -57,6 +56,8 @@ class CityRunOptions:
         ``KEY=VALUE`` for the scenarios of all junctions, as in ``egvs run --set``; no keys of the traffic.
     progress, on_done
         Called with the number of finished junctions, and with each of them.
+    on_message
+        Called with messages about the cluster, e.g. about workers that get no tasks; also from another thread.
     """
 
     cluster: str = scheduler.LOCAL_CLUSTER
@@ -64,6 +65,7 @@ class CityRunOptions:
     overrides: Sequence[str] = ()
     progress: ProgressCallback = no_progress
     on_done: Callable[[JobResult], None] = lambda _: None
+    on_message: Callable[[str], None] = print_to_stderr
 
 
 @dataclass(frozen=True)
@@ -109,18 +111,27 @@ def run_city(city: City, out: str | Path | None = None, options: CityRunOptions 
     jobs = make_jobs(city, folder, options)
     with lock_run_folder(folder):
         scheduler.check_cluster(options.cluster)
-        with scheduler.connect(options.cluster) as client:
-            ran = _run_jobs(client, city, folder, jobs, options)
+        with _connect(city, folder, jobs, options) as cluster:
+            ran = _run_jobs(cluster, city, folder, jobs, options)
         plan = results.read_plan(folder, [job.junction for job in jobs])
         page_file = page.write_page(folder, city, ran.results, ran.warnings, plan)
         return replace(ran, files=(*ran.files, page_file))
 
 
-def _run_jobs(client: Client, city: City, folder: Path, jobs: Sequence[Job], options: CityRunOptions) -> CityRun:
+@contextmanager
+def _connect(city: City, folder: Path, jobs: Sequence[Job], options: CityRunOptions) -> Iterator[Cluster]:
+    """Connect to the cluster, and ask its workers; the folder is locked."""
+    with (
+        scheduler.connect(options.cluster) as client,
+        scheduler.checked_workers(client, [city.folder, folder], len(jobs), options.on_message) as cluster,
+    ):
+        yield cluster
+
+
+def _run_jobs(cluster: Cluster, city: City, folder: Path, jobs: Sequence[Job], options: CityRunOptions) -> CityRun:
     """Run junctions, and write the tables of their results; the folder is locked."""
-    settings = scheduler.make_run_settings()
     traffic = traffic_split.make_city_traffic(city, options.progress, options.overrides)
-    scheduler.run_jobs(client, jobs, settings, on_done=options.on_done, progress=options.progress)
+    scheduler.run_jobs(cluster.client, jobs, on_done=options.on_done, progress=options.progress, cluster=cluster)
     junction_results = read_junction_results(folder, [city.junction(job.junction) for job in jobs])
     written = write_results(folder, city, junction_results)
     return CityRun(folder, junction_results, written, tuple(collect_warnings([traffic.summary])))
@@ -189,13 +200,13 @@ def place_city(
 
     with lock_run_folder(folder):
         scheduler.check_cluster(options.cluster)
-        with scheduler.connect(options.cluster) as client:
-            ran = _run_jobs(client, city, folder, jobs, options)
+        with _connect(city, folder, jobs, options) as cluster:
+            ran = _run_jobs(cluster, city, folder, jobs, options)
             with_gain = {result.junction.id for result in ran.results if result.gain > 0}
             useful_jobs = [job for job in jobs if job.junction in with_gain]
             if not useful_jobs:
                 raise InputError(city.file, "no site sees any traffic", "Use a city with traffic.")
-            plans, shares = _allocate_sensors(client, useful_jobs, count, budget, options.progress)
+            plans, shares = _allocate_sensors(cluster, useful_jobs, count, budget, options.progress)
 
         plan = _make_city_plan(plans, shares, ran.results[0].best.rank_by, requested)
         without_gain = [job.junction for job in jobs if job.junction not in with_gain]
@@ -217,10 +228,9 @@ def _check_request(count: int | None, budget: float | None) -> dict[str, float]:
 
 
 def _allocate_sensors(
-    client: Client, jobs: Sequence[Job], count: int | None, budget: float | None, progress: ProgressCallback
+    cluster: Cluster, jobs: Sequence[Job], count: int | None, budget: float | None, progress: ProgressCallback
 ) -> tuple[list[JunctionPlans], Allocation]:
     """Return the plans of each junction, and the allocation of the count or budget to them."""
-    settings = scheduler.make_run_settings()
     limit, first_count = _MAX_SENSORS, _MIN_FIRST_COUNT
     if count is not None:
         twice_the_average = 2 * -(-count // len(jobs))
@@ -229,7 +239,7 @@ def _allocate_sensors(
     max_counts = {job.junction: first_count for job in jobs}
     plans: dict[str, JunctionPlans] = {}
     while True:
-        for result in _compute_plans(client, jobs, max_counts, settings, with_costs=budget is not None):
+        for result in _compute_plans(cluster, jobs, max_counts, with_costs=budget is not None):
             plans[result.junction] = result
             progress("junctions planned", len(plans), len(jobs))
 
@@ -245,14 +255,14 @@ def _allocate_sensors(
 
 
 def _compute_plans(
-    client: Client, jobs: Sequence[Job], max_counts: Mapping[str, int], settings: RunSettings, *, with_costs: bool
+    cluster: Cluster, jobs: Sequence[Job], max_counts: Mapping[str, int], *, with_costs: bool
 ) -> Iterator[JunctionPlans]:
     """Yield the plans of the junctions in ``max_counts``; finally raise an EgvsError if any of them failed."""
     failures = []
     for count in sorted(set(max_counts.values())):
         count_jobs = [job for job in jobs if max_counts.get(job.junction) == count]
         task = allocation.junction_plans
-        for _, result in scheduler.map_junctions(client, task, count_jobs, settings, count, with_costs):
+        for _, result in scheduler.map_junctions(cluster, task, count_jobs, count, with_costs):
             if isinstance(result, JobFailure):
                 failures.append(result)
             else:

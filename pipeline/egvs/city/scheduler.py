@@ -1,7 +1,8 @@
 """Run the junctions of a city on a Dask cluster: processes of this machine, or the workers of a running scheduler.
 
-Steps of :func:`run_jobs`: estimate the work of each junction; build one graph of tasks, in which large junctions are
-split and small ones are grouped; wait for the results, and replace local processes that are lost.
+Steps of :func:`run_jobs`: ask the workers (:mod:`egvs.city.worker_pool`); estimate the work of each junction; build one
+graph of tasks, in which large junctions are split and small ones are grouped; wait for the results, and replace local
+processes that are lost.
 
 Dask decides only where and when a task runs. Tasks bring stages up to date as ``egvs run`` does and use the store, so
 an interrupted run continues where it stopped.
@@ -10,21 +11,27 @@ an interrupted run continues where it stopped.
 from __future__ import annotations
 
 import logging
+import os
 import re
+import shutil
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from egvs.city import tasks
 from egvs.city.tasks import Job, JobFailure, JobResult, Part, RunSettings, program_id
+from egvs.city.worker_check import Requirements, library_names
+from egvs.city.worker_pool import WorkerPool, connected_workers, print_to_stderr, writable_folders
 from egvs.core import plugins
 from egvs.core.errors import EgvsError, InputError, RunError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.threads import thread_count
 from egvs.runs import store
-from egvs.runs.store import RemoteStore
+from egvs.runs.store import RemoteStore, Store
 
 if TYPE_CHECKING:
     from dask.delayed import Delayed
@@ -38,14 +45,17 @@ DoneCallback = Callable[[JobResult], None]
 LOCAL_CLUSTER = "local"
 ADDRESS_PREFIXES = ("tcp://", "tls://")
 
-MIN_TASK_BEAMS, MAX_TASK_BEAMS = 2**24, 2**25
-"""Limits of the work of a task. 2**24 beams take about ten seconds, so the overhead of a task is negligible."""
+MIN_TASK_BEAMS, MAX_TASK_BEAMS = 2**20, 2**25
+"""Limits of the work of a task. 2**20 beams take one to two seconds, about three times as long as loading the scene."""
 
 TASKS_PER_WORKER = 4
 """Number of tasks per worker, if they are large enough."""
 
 JUNCTION_BEAMS = 2**21
 """Work of the other stages of a junction, in beams."""
+
+TYPICAL_JUNCTION_BYTES, STORE_BYTES_PER_JUNCTION = 40e6, 100e6
+"""Results of a junction with 108 candidates and 5,000 frames, and space in the store for each junction by default."""
 
 CHECK_INTERVAL_S = 5.0
 """How often a run that waits for results checks the processes of this machine."""
@@ -166,8 +176,7 @@ class LocalWorkers:
         if cluster is None or now - self._last_check < CHECK_INTERVAL_S:
             return
         self._last_check = now
-        workers = self._client.scheduler_info(n_workers=-1)["workers"].values()
-        running = {worker["name"] for worker in workers}
+        running = {worker["name"] for worker in connected_workers(self._client).values()}
         missing = [name for name in cluster.worker_spec if name not in running]
         if not missing:
             self._last_complete = now
@@ -199,7 +208,8 @@ def beams_per_task(beams: Mapping[str, int], workers: int) -> int:
     workers
         Number of workers.
     """
-    target = sum(beams.values()) // max(1, TASKS_PER_WORKER * workers)
+    total = sum(beams.values()) + JUNCTION_BEAMS * len(beams)
+    target = total // max(1, TASKS_PER_WORKER * workers)
     power_of_two = 1 << max(0, target.bit_length() - 1)
     return int(min(MAX_TASK_BEAMS, max(MIN_TASK_BEAMS, power_of_two)))
 
@@ -276,13 +286,71 @@ def _delay(task: Callable[..., Any], name: str, *args: Any) -> Delayed:
     return delayed(task, pure=False)(*args, dask_key_name=name)
 
 
+@dataclass(frozen=True)
+class Cluster:
+    """A cluster whose workers were asked, and the settings of the tasks that they run; see :func:`checked_workers`."""
+
+    client: Client
+    settings: RunSettings
+    workers: WorkerPool
+
+
+@contextmanager
+def checked_workers(
+    client: Client,
+    folders: Sequence[Path],
+    n_junctions: int,
+    on_message: Callable[[str], None] = print_to_stderr,
+) -> Iterator[Cluster]:
+    """Ask all workers whether they can run a city; ask those that join within the block before they get tasks.
+
+    Parameters
+    ----------
+    client
+        Client of the cluster.
+    folders
+        Folders that workers must see: those that tasks read, and last the one in which they write.
+    n_junctions
+        Number of junctions, for the size of the store.
+    on_message
+        Called with messages for the user, e.g. about workers that get no tasks; also from another thread.
+
+    Raises
+    ------
+    InputError
+        When no connected worker is acceptable.
+    """
+    settings = make_run_settings(n_junctions)
+    url = store.remote_url()
+    store_folder = store.DEFAULT_FOLDER if url is not None else Path(settings.store)
+    for message in expected_size_messages(store_folder, settings.store_bytes, n_junctions):
+        on_message(message)
+    shared_folders = writable_folders([*folders, store_folder] if url is None else folders)
+    out = str(folders[-1].absolute())
+    requirements = Requirements(settings.token, tuple(shared_folders), out, library_names(), url)
+    pool = WorkerPool(client, requirements, on_message)
+    with store.entries_in_use(store_folder, settings.token), ExitStack() as stack:
+        with _watch_scheduler(client):
+            stack.enter_context(pool.watched(LocalWorkers(client).replace_lost))
+        yield Cluster(client, settings, pool)
+        for message in store_size_messages(store_folder, settings.store_bytes):
+            on_message(message)
+
+
+def job_folders(jobs: Sequence[Job]) -> list[Path]:
+    """Return the folder that contains the scenarios of all jobs, and the one that contains their runs."""
+    inputs = os.path.commonpath([job.folder.parent for job in jobs])
+    outputs = os.path.commonpath([job.out.parent for job in jobs])
+    return [Path(inputs), Path(outputs)]
+
+
 def run_jobs(
     client: Client,
     jobs: Sequence[Job],
-    settings: RunSettings | None = None,
     *,
     on_done: DoneCallback = lambda _: None,
     progress: ProgressCallback = no_progress,
+    cluster: Cluster | None = None,
 ) -> None:
     """Run junctions, each into its own folder.
 
@@ -292,10 +360,10 @@ def run_jobs(
         Client of the cluster.
     jobs
         The junctions.
-    settings
-        From :func:`make_run_settings`, which is called when None.
     on_done, progress
         Called with each junction when its run is complete, and with the number of finished junctions.
+    cluster
+        From :func:`checked_workers`, which is called when None.
 
     Raises
     ------
@@ -304,10 +372,15 @@ def run_jobs(
     RunError
         When the scheduler is lost, or workers are killed again and again.
     """
-    settings = settings or make_run_settings()
+    if cluster is None:
+        with checked_workers(client, job_folders(jobs), len(jobs)) as checked:
+            run_jobs(client, jobs, on_done=on_done, progress=progress, cluster=checked)
+        return
+
+    settings = cluster.settings
     beams: dict[str, int] = {}
     failures: list[JobFailure] = []
-    for job, result in map_junctions(client, tasks.estimate_beams, jobs, settings):
+    for job, result in map_junctions(cluster, tasks.estimate_beams, jobs):
         if isinstance(result, JobFailure):
             failures.append(result)
         else:
@@ -316,11 +389,11 @@ def run_jobs(
     n_done = 0
     progress("junctions", n_done, len(jobs))
     with _watch_scheduler(client):
-        n_workers = max(1, sum(client.nthreads().values()))
+        n_workers = cluster.workers.thread_count()
         graph = build_graph([job for job in jobs if job.junction in beams], beams, settings, n_workers)
-        futures = client.compute(list(graph))
+        futures = client.compute(list(graph), resources=cluster.workers.resources)
         group_of_key = {future.key: group for future, group in zip(futures, graph.values(), strict=True)}
-        for future in _as_finished(client, futures):
+        for future in _as_finished(cluster, futures):
             for result in _task_result(future, [job.junction for job in group_of_key[future.key]]):
                 n_done += 1
                 progress("junctions", n_done, len(jobs))
@@ -331,29 +404,39 @@ def run_jobs(
     raise_failures(failures, len(jobs))
 
 
-def map_junctions(
-    client: Client, task: Callable[..., T], jobs: Iterable[Job], settings: RunSettings, *args: Any
-) -> Iterator[tuple[Job, T]]:
+def map_junctions(cluster: Cluster, task: Callable[..., T], jobs: Iterable[Job], *args: Any) -> Iterator[tuple[Job, T]]:
     """Run one task per junction; yield the results in the order in which they finish.
 
     Parameters
     ----------
-    client
-        Client of the cluster.
+    cluster
+        From :func:`checked_workers`.
     task
-        Called with a job, the settings and ``args``.
-    jobs, settings
-        The junctions, and the settings of the city run.
+        Called with a job, the settings of the city run, and ``args``.
+    jobs
+        The junctions.
     """
+    client, resources = cluster.client, cluster.workers.resources
     with _watch_scheduler(client):
-        jobs_by_future = {client.submit(task, job, settings, *args, pure=False): job for job in jobs}
-        for future in _as_finished(client, list(jobs_by_future)):
+        jobs_by_future = {}
+        for job in jobs:
+            future = client.submit(task, job, cluster.settings, *args, pure=False, resources=resources)
+            jobs_by_future[future] = job
+        for future in _as_finished(cluster, list(jobs_by_future)):
             job = jobs_by_future[future]
             yield job, _task_result(future, [job.junction])
 
 
-def make_run_settings() -> RunSettings:
-    """Return settings for a new city run; raise an InputError if there is no store, or it cannot be reached."""
+def make_run_settings(n_junctions: int = 1) -> RunSettings:
+    """Return settings for a new city run.
+
+    The largest size of the store grows with the city, unless ``EGVS_STORE_MAX_GB`` is set.
+
+    Raises
+    ------
+    InputError
+        When there is no store, or it cannot be reached.
+    """
     folder, max_bytes = store.read_store_settings()
     if folder is None:
         problem = "is empty, so there is no store; a city run needs one to pass results between workers"
@@ -361,7 +444,51 @@ def make_run_settings() -> RunSettings:
     url = store.remote_url()
     if url is not None:
         RemoteStore(url).check()
+    if store.MAX_GB_VARIABLE not in os.environ:
+        max_bytes = max(max_bytes, n_junctions * STORE_BYTES_PER_JUNCTION)
     return RunSettings(uuid.uuid4().hex[:8], program_id(), url or str(folder.absolute()), max_bytes)
+
+
+def expected_size_messages(folder: Path, max_bytes: float, n_junctions: int) -> Iterator[str]:
+    """Yield a message if the results of a city will probably exceed the store or the disk.
+
+    Parameters
+    ----------
+    folder
+        Folder of the store.
+    max_bytes
+        Largest size of the store.
+    n_junctions
+        Number of junctions.
+    """
+    expected_bytes = n_junctions * TYPICAL_JUNCTION_BYTES
+    expected = f"the results of {n_junctions:,} junctions take about {expected_bytes / 1e9:.3g} GB"
+    if expected_bytes > max_bytes:
+        limit = f"more than the limit of {max_bytes / 1e9:.3g} GB"
+        yield f"{store.MAX_GB_VARIABLE}: {expected}, {limit}. Try {2 * expected_bytes / 1e9:.2g}."
+    with suppress(OSError):
+        free_bytes = shutil.disk_usage(folder).free + Store(folder).usage_bytes()
+        if expected_bytes > free_bytes:
+            yield f"{folder}: {expected}, and {free_bytes / 1e9:.3g} GB are available. Use a larger disk."
+
+
+def store_size_messages(folder: Path, max_bytes: float) -> Iterator[str]:
+    """Yield a message if the entries that a city run uses exceed the largest size of the store.
+
+    Parameters
+    ----------
+    folder
+        Folder of the store.
+    max_bytes
+        Largest size of the store.
+    """
+    used_bytes = Store(folder).usage_bytes()
+    if used_bytes > max_bytes:
+        used_gb, max_gb = used_bytes / 1e9, max_bytes / 1e9
+        yield (
+            f"{store.MAX_GB_VARIABLE}: expected results of at most {max_gb:.3g} GB in {folder}, got {used_gb:.3g} GB. "
+            f"All were kept for this city; a later run removes some. Try {1.2 * used_gb:.2g}."
+        )
 
 
 def raise_failures(failures: Sequence[JobFailure], n_junctions: int) -> None:
@@ -382,15 +509,16 @@ def raise_failures(failures: Sequence[JobFailure], n_junctions: int) -> None:
     raise error
 
 
-def _as_finished(client: Client, futures: list[Future]) -> Iterator[Future]:
+def _as_finished(cluster: Cluster, futures: list[Future]) -> Iterator[Future]:
     """Yield futures in the order in which they finish; replace local workers that are lost meanwhile."""
     from distributed import wait
 
-    remaining, workers = list(futures), LocalWorkers(client)
+    remaining, workers = list(futures), LocalWorkers(cluster.client)
     while remaining:
         workers.replace_lost()
+        cluster.workers.check()
         try:
-            with client.as_current():
+            with cluster.client.as_current():
                 done = wait(remaining, timeout=CHECK_INTERVAL_S, return_when="FIRST_COMPLETED").done
         except TimeoutError:
             continue

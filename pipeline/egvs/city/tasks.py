@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs._version import __version__
+from egvs.city.worker_check import library_names, program_versions
 from egvs.core import files
 from egvs.core.errors import EgvsError, InputError, RunError
 from egvs.core.resource_usage import measure_usage, release_memory
@@ -62,8 +63,6 @@ STAGES_BEFORE_SCORE = ("statics", "scan", "traffic", "tpog")
 
 SITE_BEAMS = 2**14
 """Work per site that does not depend on its beams, in beams: mainly the sum over all voxels."""
-
-_STAGE_MODULES = tuple(f"egvs.stages.{name}" for name in ("check", "statics", "scan", "traffic", "tpog", "score"))
 
 _PART_CLASSES = (ScoredSite, ScannedSite, Pose, SiteScore, SiteTargetScores, SpotVisibility, BeamAudit)
 """Classes that occur in a part."""
@@ -150,9 +149,8 @@ class Part(NamedTuple):
 
 def program_id() -> str:
     """Return a text that is equal for programs that give the same bytes: version, source and libraries."""
-    source = stage_keys.source_digest("egvs.runs.run", "egvs.report.page", *_STAGE_MODULES)
-    libraries = sorted(stage_keys.library_versions(source.libraries).items())
-    return f"{__version__}, source {source.digest[:12]}, {', '.join(' '.join(pair) for pair in libraries)}"
+    versions = program_versions(library_names()) | {"egvs": __version__}
+    return f"{versions.pop('egvs')}, {', '.join(' '.join(pair) for pair in versions.items())}"
 
 
 def catch_input_errors(task: Callable[P, T]) -> Callable[P, T | JobFailure]:

@@ -142,7 +142,7 @@ def _run_options(
     def on_done(done: JobResult) -> None:
         screen.say(describe_done(done))
 
-    return CityRunOptions(cluster, junctions or (), overrides or (), screen.progress, on_done)
+    return CityRunOptions(cluster, junctions or (), overrides or (), screen.progress, on_done, screen.say)
 
 
 def _print_new(city: NewCity) -> None:
@@ -218,7 +218,7 @@ def print_junctions(city_run: CityRun) -> None:
     if "entropy seen" not in (gain.head, by.head):
         columns.append(Column("entropy seen", lambda row: f"{row.best.entropy_seen:.1%}"))
     columns.append(Column("vehicles", lambda row: f"{row.vehicles:.1f}"))
-    columns.append(Column("sites", lambda row: str(row.n_candidates)))
+    columns.append(Column("sites", lambda row: str(row.sites)))
 
     out = console(WIDE)
     out.print(make_table(columns, city_run.results, width=out.width))

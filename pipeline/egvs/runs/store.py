@@ -6,11 +6,17 @@ The cache is a folder on this machine, and optionally a store shared by machines
     <store>/.locks/<stage>-<key>    held by the process that makes this entry; others wait for it, then use the entry
     <store>/.work/                  entries that are incomplete, or being removed
     <store>/.lock                   shared by those who read or add an entry, exclusive for those who remove one
+    <store>/.usage                  size and number of all entries, as counted by those who add one
+    <store>/.in_use/<token>         a city run in progress: entries that it has used stay
 
 An entry is written in ``.work``, then renamed: it is either complete or absent, even if a process is killed. The hash
 of every file is checked when an entry is used; a damaged entry is removed and computed again. The least recently used
 entries are removed when all together exceed a limit. Other files in the folder are ignored. A store that cannot be
 written is reported once, and not used further.
+
+Adding an entry does not list the others: it adds to the size in ``.usage``. This size may be wrong, for example after a
+kill between adding an entry and counting it. So it only decides when to list all entries, which corrects it: after as
+many new entries as there are, once a day, when the file is missing or damaged, and before entries are removed.
 
 A shared store is any file system that fsspec knows (``s3://``, ``gs://``, ``file://``, ...), with the same folders of
 entries; ``entry.json`` is written last. What the folder lacks is fetched from there, and new entries are put there.
@@ -27,11 +33,12 @@ import posixpath
 import re
 import shutil
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -47,6 +54,9 @@ from egvs.runs.stage_registry import StageResult
 
 ENTRY_FILE = "entry.json"
 """Record of an entry; written last."""
+
+_EXTRA_FOLDER = ".egvs"
+"""Folder in a shared store of files that belong to no entry."""
 
 _LOCATION_HINT = "Check that this machine may read and write there, and install its library (s3fs for s3://)."
 
@@ -66,14 +76,29 @@ class RemoteStore:
 
     def check(self) -> None:
         """Check that files can be written, read and removed there."""
-        probe = self._path(".egvs", "probe")
+        self.write_file("probe", b"egvs")
+        if self.read_file("probe") != b"egvs":
+            raise InputError(self.url, "does not return the bytes that were written", _LOCATION_HINT)
+        self.remove_file("probe")
+
+    def write_file(self, name: str, content: bytes) -> None:
+        """Write a file that belongs to no entry."""
+        path = self._path(_EXTRA_FOLDER, name)
         with translate_errors(self.url, _LOCATION_HINT, "cannot be written"):
-            self._fs.makedirs(posixpath.dirname(probe), exist_ok=True)
-            self._fs.pipe_file(probe, b"egvs")
+            self._fs.makedirs(posixpath.dirname(path), exist_ok=True)
+            self._fs.pipe_file(path, content)
+
+    def read_file(self, name: str) -> bytes:
+        """Return the content of a file that belongs to no entry."""
+        with translate_errors(self.url, _LOCATION_HINT, "cannot be read"):
             self._fs.invalidate_cache()
-            if self._fs.cat_file(probe) != b"egvs":
-                raise InputError(self.url, "does not return the bytes that were written", _LOCATION_HINT)
-            self._fs.rm_file(probe)
+            content: bytes = self._fs.cat_file(self._path(_EXTRA_FOLDER, name))
+        return content
+
+    def remove_file(self, name: str) -> None:
+        """Remove a file that belongs to no entry."""
+        with translate_errors(self.url, _LOCATION_HINT, "cannot be written"):
+            self._fs.rm_file(self._path(_EXTRA_FOLDER, name))
 
     def fetch(self, name: str, folder: Path) -> bool:
         """Copy the files of an entry into a folder; return False where there is no such entry, or it is damaged."""
@@ -136,6 +161,25 @@ largest size of its folder."""
 DEFAULT_FOLDER = Path("runs", ".store")
 DEFAULT_MAX_GB = 10.0
 
+_PRUNED_SHARE = 0.9
+"""A store that exceeds its limit is reduced to this share of it, so that entries are removed rarely."""
+
+_MIN_PUTS, _MAX_PUTS = 100, 10_000
+"""All entries are listed after as many new ones as there are, within these limits."""
+
+_MAX_COUNT_AGE_S = 86_400.0
+"""All entries are listed when the last list is older."""
+
+_PRUNE_AGAIN_S, _PRUNE_AGAIN_SHARE = 600.0, 0.1
+"""A store that could not be reduced, because its entries are in use, is listed again after this time, or after growing
+by this share of its limit."""
+
+_IN_USE_S, _TOUCH_INTERVAL_S = 3600.0, 60.0
+"""A run whose file in ``.in_use`` was not touched for this time has been killed; how often it is touched."""
+
+_CLOCK_TOLERANCE_S = 600.0
+"""Clocks of machines may differ by this time."""
+
 _OVERRIDE: ContextVar[tuple[str, float] | None] = ContextVar("_OVERRIDE", default=None)
 
 
@@ -190,6 +234,50 @@ def _is_url(location: str) -> bool:
     return "://" in location
 
 
+@contextmanager
+def entries_in_use(folder: Path, token: str) -> Iterator[None]:
+    """Keep all entries of a store that are used during the block, by any process.
+
+    Parameters
+    ----------
+    folder
+        Folder of the store.
+    token
+        Name of the run, unique.
+    """
+    runs_folder, stop = folder / _IN_USE_FOLDER, threading.Event()
+    if runs_folder.is_symlink():
+        raise InputError(runs_folder, "is a symbolic link, and nothing is written through links", "Remove it.")
+    path = runs_folder / token
+
+    def touch() -> None:
+        while not stop.wait(_TOUCH_INTERVAL_S):
+            with suppress(OSError):
+                path.touch()
+
+    with suppress(OSError):  # reported when an entry cannot be written
+        runs_folder.mkdir(parents=True, exist_ok=True)
+        path.write_text(repr(time.time()), encoding="utf-8")
+        _remove_ended_runs(runs_folder)
+    thread = threading.Thread(target=touch, name="store", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+
+
+def _remove_ended_runs(folder: Path) -> None:
+    """Remove what killed runs left in ``.in_use``."""
+    for path in folder.iterdir():
+        with suppress(OSError):
+            if re.fullmatch("[0-9a-f]{8}", path.name) and time.time() - path.stat().st_mtime > _MAX_COUNT_AGE_S:
+                path.unlink()
+
+
 def check_outside_store(folder: Path) -> None:
     """Raise InputError where a run folder is the folder of the store, or lies in it.
 
@@ -211,6 +299,12 @@ _ENTRY_NAME = re.compile(rf"({'|'.join(ENTRY_KINDS)})-[0-9a-f]{{32}}")
 
 _WORK_FOLDER_NAME = re.compile(rf"{_ENTRY_NAME.pattern}|removed-{_ENTRY_NAME.pattern}-[0-9]+-[0-9]+")
 """Names of folders in ``.work`` and of files in ``.locks``."""
+
+
+_USAGE_BYTES = 256
+"""Size of the file ``.usage``."""
+
+_IN_USE_FOLDER = ".in_use"
 
 
 @dataclass(frozen=True)
@@ -238,6 +332,64 @@ class StoreEntry:
     bytes: int
     created: float
     last_used: float
+
+
+@dataclass(frozen=True)
+class _StoreUsage:
+    """Size of all entries, as counted.
+
+    Attributes
+    ----------
+    bytes, entries
+        Size and number of entries.
+    puts
+        Entries that were added since all were listed.
+    counted_at, pruned_at
+        When all entries were listed, and when entries were last removed, in seconds since the epoch.
+    pruned_to
+        Size after entries were last removed.
+    """
+
+    bytes: int
+    entries: int
+    puts: int = 0
+    counted_at: float = 0.0
+    pruned_to: int = 0
+    pruned_at: float = 0.0
+
+    @classmethod
+    def read(cls, descriptor: int | None) -> _StoreUsage | None:
+        """Return the content of the file; None where it is empty or damaged, or there is none."""
+        if descriptor is None:
+            return None
+        os.lseek(descriptor, 0, os.SEEK_SET)
+        try:
+            usage = cls(**json.loads(os.read(descriptor, _USAGE_BYTES)))
+            is_valid = all(isinstance(value, int | float) and value >= 0 for value in asdict(usage).values())
+        except (ValueError, TypeError, RecursionError):
+            return None
+        return usage if is_valid else None
+
+    def write(self, descriptor: int | None) -> None:
+        """Write the file, which always has the same size, in one piece."""
+        if descriptor is None:
+            return
+        os.lseek(descriptor, 0, os.SEEK_SET)
+        os.write(descriptor, json.dumps(asdict(self)).ljust(_USAGE_BYTES - 1).encode() + b"\n")
+
+    def is_old(self) -> bool:
+        """Return whether all entries should be listed again."""
+        age_s = time.time() - self.counted_at
+        max_puts = min(max(_MIN_PUTS, self.entries - self.puts), _MAX_PUTS)
+        return self.puts > max_puts or not 0 <= age_s <= _MAX_COUNT_AGE_S
+
+    def is_above(self, most_bytes: float) -> bool:
+        """Return whether the store exceeds its limit, and trying to reduce it is not in vain."""
+        if self.bytes <= most_bytes:
+            return False
+        has_grown = self.bytes > self.pruned_to + _PRUNE_AGAIN_SHARE * most_bytes
+        is_long_ago = abs(time.time() - self.pruned_at) > _PRUNE_AGAIN_S
+        return self.pruned_to <= most_bytes or has_grown or is_long_ago
 
 
 class _DamagedEntry(Exception):
@@ -330,9 +482,9 @@ class Store:
             shutil.rmtree(work, ignore_errors=True)
             work.mkdir(parents=True)
             if self._call_remote(lambda remote: remote.fetch(final.name, work)):
-                _read_entry(work)
-                with self._shared():
-                    work.rename(final)
+                usage = self._add(work, final, _read_entry(work).bytes)
+                if usage.is_above(self.bound_bytes):
+                    self._prune_unused()
         except _DamagedEntry as damage:
             self._note(f"{self._remote.url}: the cached {stage} is damaged ({damage}) and will be made again")
         except OSError as error:
@@ -381,10 +533,10 @@ class Store:
             for name in result.files:
                 _copy_or_link(out / name, work / name, link)
             (work / ENTRY_FILE).write_text(_entry_to_json(stage, key, work, result), encoding="utf-8")
-            with self._shared():
-                work.rename(final)
+            usage = self._add(work, final, sum((work / name).stat().st_size for name in result.files))
             self._call_remote(lambda remote: remote.put(final.name, final, result.files))
-            self.prune(self.bound_bytes)
+            if usage.is_above(self.bound_bytes):
+                self._prune_unused()
         except OSError as error:
             self._stop_writing(error)
         finally:
@@ -403,19 +555,98 @@ class Store:
     def prune(self, most_bytes: float) -> list[StoreEntry]:
         """Remove the least recently used entries until the others fit into ``most_bytes`` (below 0: all).
 
-        Returns the removed entries.
+        Entries that a city run in progress has used are kept, unless all are to be removed. Returns the removed ones.
         """
-        removed: list[StoreEntry] = []
-        if self.folder is None or sum(entry.bytes for entry in self.entries()) <= most_bytes or not self._folders():
-            return removed
+        if self.folder is None or not self._folders() or sum(entry.bytes for entry in self.entries()) <= most_bytes:
+            return []
         with locked(self.folder / ".lock"):
-            entries = self.entries()
-            for folder in set(self._folders()) - {entry.folder for entry in entries}:
-                self._remove(folder)  # damaged
-            while entries and sum(entry.bytes for entry in entries) > most_bytes:
+            return self._remove_oldest(most_bytes)
+
+    def usage_bytes(self) -> int:
+        """Return the size of all entries, as counted; 0 where there is no store."""
+        if self.folder is None or not _exists_as(Path.is_dir, self.folder):
+            return 0
+        try:
+            with self._usage_file() as descriptor:
+                usage = _StoreUsage.read(descriptor)
+        except OSError:
+            usage = None
+        return (usage or self._list_usage()).bytes
+
+    def _add(self, work: Path, final: Path, n_bytes: int) -> _StoreUsage:
+        """Move a complete entry to its place, and count it; list all entries if their size is unknown or old."""
+        with self._shared(), self._usage_file() as descriptor:
+            work.rename(final)
+            usage = _StoreUsage.read(descriptor)
+            if usage is not None:
+                usage = replace(usage, bytes=usage.bytes + n_bytes, entries=usage.entries + 1, puts=usage.puts + 1)
+            if usage is None or usage.is_old():
+                usage = self._list_usage()
+            usage.write(descriptor)
+        return usage
+
+    def _list_usage(self) -> _StoreUsage:
+        entries = self.entries()
+        return _StoreUsage(sum(entry.bytes for entry in entries), len(entries), counted_at=time.time())
+
+    def _prune_unused(self) -> None:
+        """Reduce a store that exceeds its limit, unless another process has done it meanwhile."""
+        assert self.folder is not None
+        with locked(self.folder / ".lock"):
+            with self._usage_file() as descriptor:
+                usage = _StoreUsage.read(descriptor)
+            if usage is None or usage.is_above(self.bound_bytes):
+                self._remove_oldest(self.bound_bytes, _PRUNED_SHARE * self.bound_bytes)
+
+    def _remove_oldest(self, most_bytes: float, target_bytes: float | None = None) -> list[StoreEntry]:
+        """Remove entries that are not in use if all exceed ``most_bytes``, down to ``target_bytes`` if possible.
+
+        The caller has the exclusive lock of the store.
+        """
+        entries = self.entries()
+        for folder in set(self._folders()) - {entry.folder for entry in entries}:
+            self._remove(folder)  # damaged
+        total = sum(entry.bytes for entry in entries)
+        target = most_bytes if target_bytes is None else target_bytes
+        removed: list[StoreEntry] = []
+        if total > most_bytes:
+            in_use_since = math.inf if most_bytes < 0 else self._in_use_since()
+            while entries and total > target and entries[-1].last_used < in_use_since:
+                if total <= most_bytes and len(entries) == 1:
+                    break
                 removed.append(entries.pop())
+                total -= removed[-1].bytes
                 self._remove(removed[-1].folder)
+        now = time.time()
+        with suppress(OSError), self._usage_file() as descriptor:
+            _StoreUsage(total, len(entries), counted_at=now, pruned_to=total, pruned_at=now).write(descriptor)
         return removed
+
+    def _in_use_since(self) -> float:
+        """Return the start of the first city run in progress; infinity where there is none."""
+        assert self.folder is not None
+        start = math.inf
+        with suppress(OSError):
+            for path in (self.folder / _IN_USE_FOLDER).iterdir():
+                with suppress(OSError, ValueError):
+                    if time.time() - path.stat().st_mtime < _IN_USE_S + _CLOCK_TOLERANCE_S:
+                        start = min(start, float(path.read_text(encoding="utf-8")) - _CLOCK_TOLERANCE_S)
+        return start
+
+    @contextmanager
+    def _usage_file(self) -> Iterator[int | None]:
+        """Lock the record of the size; yield its descriptor, None where another user owns it."""
+        assert self.folder is not None
+        try:
+            descriptor = locks.open_lock(self.folder / ".usage")
+        except PermissionError:
+            yield None
+            return
+        try:
+            locks.wait_for_lock(descriptor, math.inf)
+            yield descriptor
+        finally:
+            os.close(descriptor)
 
     def _folders(self) -> list[Path]:
         """Folders of all entries, also of damaged ones."""
