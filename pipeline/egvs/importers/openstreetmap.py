@@ -54,6 +54,9 @@ SURROUNDINGS_MIN_M = 100.0
 SURROUNDINGS_M = 300.0
 """How far from the junction streets are simulated: enough for the queues and platoons that reach it."""
 
+JUNCTION_BLOCKER_S, TELEPORT_S = 10.0, 180.0
+"""What ends locks in new scenarios; the second is longer than any red phase and most waits to give way."""
+
 PEOPLE_HINT = (
     "pedestrians are added with --set effects.pedestrians_bicycles.pedestrians_per_h=300 (bicycles: bicycles_per_h)."
 )
@@ -62,6 +65,11 @@ TomlTable = tuple[str, dict[str, Any]]
 """A comment, and the keys of a table."""
 
 _KEY_COMMENTS = {
+    (
+        "traffic",
+        "junction_blocker_s",
+    ): "vehicles drive through one that blocks them on a junction; overlaps are counted",
+    ("traffic", "teleport_s"): "the last resort against locks; vehicles that are moved on are counted",
     ("score", "rank_by"): "the expected share of vehicles that detectors find; docs/validity.md",
     ("sites", "aim"): "sensors face the centre of the region",
     ("sites", "pitch_deg"): "each height with each tilt is a candidate; 'aim': the central ray points at the centre",
@@ -380,6 +388,8 @@ def _scenario_toml(name: str, scenario: NewScenario) -> str:
         "frames": DEFAULT_FRAMES,
         "frame_period_s": TrafficConfig.model_fields["frame_period_s"].default,
         "warmup_s": DEFAULT_WARMUP_S,
+        "junction_blocker_s": JUNCTION_BLOCKER_S,
+        "teleport_s": TELEPORT_S,
     }
     tables = {
         "roi": (roi_comment, roi | voxel_keys()),

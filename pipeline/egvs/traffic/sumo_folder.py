@@ -339,19 +339,22 @@ def _make_empty(folder: Path, inputs: Iterable[Path]) -> None:
 
 def _scenario_options(traffic: TrafficConfig, timing: Timing, seed: int) -> dict[str, str]:
     """Return the options that the scenario sets, whatever a user's configuration says."""
-    return {
+    options = {
         "seed": str(seed),
         "begin": _format_seconds(timing.begin_ms),
         "end": _format_seconds(timing.end_ms),
         "step-length": _format_seconds(timing.step_ms),
         "threads": "1",
         "lateral-resolution": f"{traffic.lateral_resolution_m:g}",
-        "time-to-teleport": "-1",
+        "time-to-teleport": "-1" if traffic.teleport_s is None else f"{traffic.teleport_s:g}",
         "collision.action": "warn",
         "collision.check-junctions": "true",
         "no-step-log": "true",
         "duration-log.disable": "true",
     }
+    if traffic.junction_blocker_s is not None:
+        options["ignore-junction-blocker"] = f"{traffic.junction_blocker_s:g}"
+    return options
 
 
 def _format_seconds(time_ms: int) -> str:
