@@ -580,7 +580,7 @@ class RouteFinder:
                 before[start] = {self._edges[i].from_node for i in indices}
         after: dict[int, set[str]] = {}
         for end in ways.sinks:
-            indices = (inner[-1], *ways.after(end))
+            indices = [inner[-1], *ways.after(end)]
             if not self._has_loop(indices):
                 after[end] = {self._edges[i].to_node for i in indices[1:]}
 
