@@ -175,6 +175,11 @@ class NewScenario:
         """Number of candidates: each pole with each height and each tilt."""
         return self.poles * len(junctions.HEIGHTS_M) * len(PITCHES_DEG)
 
+    @property
+    def flows(self) -> tuple[CountConfig, ...]:
+        """The flows of the scenario; empty where no street leads through the region of interest."""
+        return () if self.traffic is None else self.traffic.flows
+
     def to_json(self) -> dict[str, Any]:
         """Return a summary as plain JSON, the most interesting keys first."""
         junction, streets = self.junction, self.streets

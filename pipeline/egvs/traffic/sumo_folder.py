@@ -242,7 +242,8 @@ class SimulationFolder:
             options["fcd-output.attributes"] += ",z,slope"
         if self.has_extra_traffic or not self.is_generated:  # without it, SUMO writes persons among the vehicles
             options["person-fcd-output"] = PERSONS_FILE
-        if not self.has_fixed_count:  # distinguishes an incomplete file from roads without vehicles
+        # distinguishes an incomplete file from roads without vehicles
+        if not self.has_fixed_count or self.options["time-to-teleport"] != "-1":
             options["statistic-output"] = STATISTICS_FILE
         if self.has_counts:
             options["vehroute-output"] = DRIVEN_ROUTES_FILE

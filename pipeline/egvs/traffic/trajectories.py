@@ -21,7 +21,8 @@ from egvs.core.grid import Roi
 from egvs.core.progress import ProgressCallback
 from egvs.scenario.model import Scenario
 from egvs.traffic import fcd, vehicle_boxes
-from egvs.traffic.recording import Recording, describe_distance
+from egvs.traffic.locks import describe_distance, is_inside
+from egvs.traffic.recording import Recording, demand_key
 from egvs.traffic.vehicle_boxes import BoxChange, Ints, TrafficHook, VehicleBoxes
 
 STANDING_M_S = 0.1
@@ -166,6 +167,12 @@ class TrafficStatistics:
         Overlaps in squares of :data:`SQUARE_M`, by number of the square to the east and to the north.
     standing_since
         Vehicles that are standing in the last frame, and the frame since when.
+    standing_at_m
+        Where they are standing.
+    region
+        Overlaps in this region are counted, too; None for no region.
+    rows_in_region, overlaps_in_region
+        Vehicles in it, summed over the frames, and overlaps.
     uncounted
         Statistics of kinds that do not count as vehicles.
     mixed_overlaps
@@ -185,6 +192,10 @@ class TrafficStatistics:
     longest_jam: StandingVehicle | None = None
     overlaps_by_square: Counter[tuple[int, int]] = field(default_factory=Counter)
     standing_since: dict[str, int] = field(default_factory=dict)
+    standing_at_m: dict[str, tuple[float, float]] = field(default_factory=dict)
+    region: Roi | None = None
+    rows_in_region: int = 0
+    overlaps_in_region: int = 0
     uncounted: dict[str, UncountedKind] = field(default_factory=dict)
     mixed_overlaps: Counter[str] = field(default_factory=Counter)
 
@@ -215,6 +226,10 @@ class TrafficStatistics:
         east = np.floor(boxes.x_m[first] / SQUARE_M).astype(int)
         north = np.floor(boxes.y_m[first] / SQUARE_M).astype(int)
         self.overlaps_by_square.update(zip(east.tolist(), north.tolist(), strict=True))
+        if self.region is not None:
+            in_region = _in_region(boxes, self.region)
+            self.rows_in_region += int(np.count_nonzero(in_region))
+            self.overlaps_in_region += int(np.count_nonzero(in_region[pairs].any(axis=1)))
 
     def _add_uncounted(self, boxes: VehicleBoxes, uncounted: NDArray[np.bool_], pairs: Ints) -> None:
         """Add the boxes that do not count as vehicles, and the overlaps of such boxes."""
@@ -236,6 +251,7 @@ class TrafficStatistics:
         begins = np.flatnonzero((np.diff(code, prepend=-1) != 0) | (np.diff(frame, prepend=-2) != 1))
         ends = np.append(begins, rows.size)[1:] - 1
         still_standing: dict[str, int] = {}
+        self.standing_at_m = {}
         for first, last in zip(begins.tolist(), ends.tolist(), strict=True):
             name = boxes.names[code[first]]
             since = int(frame[first])
@@ -249,6 +265,7 @@ class TrafficStatistics:
                 self.longest_jam = StandingVehicle(duration, name, (float(boxes.x_m[row]), float(boxes.y_m[row])))
             if frame[last] == end - 1:
                 still_standing[name] = since
+                self.standing_at_m[name] = float(boxes.x_m[rows[last]]), float(boxes.y_m[rows[last]])
         self.standing_since = still_standing
 
     def to_json(self, period_s: float) -> dict[str, Any]:
@@ -276,10 +293,19 @@ class TrafficStatistics:
             "overlapping_pairs": self.overlapping_pairs,
             "frames_with_overlap": self.frames_with_overlap,
         }
+        if self.region is not None:
+            values["overlapping_pairs_in_roi"] = self.overlaps_in_region
         if self.uncounted:
             kinds = {kind: statistics.to_json() for kind, statistics in sorted(self.uncounted.items())}
             values["beside_vehicles"] = kinds | {"overlapping_pairs": dict(sorted(self.mixed_overlaps.items()))}
         return values
+
+
+def _in_region(boxes: VehicleBoxes, region: Roi) -> NDArray[np.bool_]:
+    """Return whether the centre of each box is in a region, seen from above."""
+    (x_m, y_m), (width_m, depth_m) = region.origin_m[:2], region.size_m[:2]
+    inside: NDArray[np.bool_] = (boxes.x_m >= x_m) & (boxes.x_m <= x_m + width_m)
+    return inside & (boxes.y_m >= y_m) & (boxes.y_m <= y_m + depth_m)
 
 
 def _vehicle_pairs(boxes: VehicleBoxes, part: Ints, pairs: Ints) -> Ints:
@@ -331,7 +357,10 @@ def write_trajectories(
     RunError
         When the number of vehicles is not maintained, or a vehicle stands for good.
     """
-    statistics = TrafficStatistics(recording.window.count, stopped_on_purpose=recording.stopped_on_purpose)
+    region = None if scenario.traffic.junction_blocker_s is None else scenario.roi.box
+    statistics = TrafficStatistics(
+        recording.window.count, stopped_on_purpose=recording.stopped_on_purpose, region=region
+    )
     period_s = recording.window.period_ms / 1000.0
     changes: list[BoxChange] | None = None
     for group in frame_groups(recording, GROUP_FRAMES):
@@ -392,7 +421,7 @@ def check_recording(scenario: Scenario, statistics: TrafficStatistics, recording
     if recording.vehicles is not None and traffic.hold == "exactly":
         _check_vehicle_count(recording.vehicles, statistics, recording.where)
     if recording.standing_limit_s is not None:
-        _check_moving(statistics, recording, recording.standing_limit_s)
+        _check_moving(scenario, statistics, recording, recording.standing_limit_s)
 
 
 def traffic_warnings(statistics: TrafficStatistics, recording: Recording, roi: Roi) -> list[Diagnostic]:
@@ -416,6 +445,14 @@ def traffic_warnings(statistics: TrafficStatistics, recording: Recording, roi: R
             problem = f"vehicle {jam.vehicle!r} was standing for {duration_s:g} s, longer than any usual red phase"
             hint = "Check the signals and connections of the network there, or reduce the traffic."
             warnings.append(Diagnostic("standing", where, problem, hint))
+    if statistics.overlaps_in_region:
+        per_thousand = 1000 * statistics.overlaps_in_region / statistics.rows_in_region
+        problem = (
+            f"vehicles overlap {statistics.overlaps_in_region} times in the region of interest ({per_thousand:.2g} per"
+            " 1,000 vehicles and frames); some drive through a vehicle that blocks them"
+        )
+        hint = "Reduce the traffic, or remove junction_blocker_s, which may lock the traffic."
+        warnings.append(Diagnostic("overlaps in roi", f"{recording.where}.junction_blocker_s", problem, hint))
     share = statistics.frames_with_overlap / statistics.frames
     if share > MAX_OVERLAP_SHARE:
         ((east, north), pairs), *_ = statistics.overlaps_by_square.most_common(1)
@@ -443,17 +480,24 @@ def _check_vehicle_count(vehicles: int, statistics: TrafficStatistics, where: st
         )
 
 
-def _check_moving(statistics: TrafficStatistics, recording: Recording, limit_s: float) -> None:
+def _check_moving(scenario: Scenario, statistics: TrafficStatistics, recording: Recording, limit_s: float) -> None:
+    """Raise a RunError if vehicles stand for good.
+
+    Where the number of vehicles is maintained, a jam anywhere collects the vehicles of all streets. Otherwise a jam
+    matters in the region of interest only.
+    """
     period_s = recording.window.period_ms / 1000.0
     jammed_s = {}
     for name, frame in statistics.standing_since.items():
         duration_s = (statistics.frames - 1 - frame) * period_s
-        if name not in recording.stopped_on_purpose and duration_s > limit_s:
+        matters = recording.vehicles is not None or is_inside(statistics.standing_at_m[name], scenario.roi.box)
+        if matters and name not in recording.stopped_on_purpose and duration_s > limit_s:
             jammed_s[name] = duration_s
     if jammed_s:
         longest = max(jammed_s, key=lambda name: jammed_s[name])
+        location = describe_location(statistics.standing_at_m[longest], scenario.roi.box)
+        where, hint = demand_key(scenario)
         raise RunError(
-            f"{recording.where}: the traffic is jammed: {len(jammed_s)} vehicles stand for more than {limit_s:g} s up"
-            f" to the last frame, {longest!r} for {jammed_s[longest]:g} s. Lower traffic.vehicles, or correct the"
-            " signals and connections of the network"
+            f"{where}: the traffic is jammed: {len(jammed_s)} vehicles stand for more than {limit_s:g} s up"
+            f" to the last frame, {longest!r} for {jammed_s[longest]:g} s at {location}. {hint}"
         )
