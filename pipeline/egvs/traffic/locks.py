@@ -50,7 +50,7 @@ MOVED_M = 2.0
 FREE_AHEAD_M, LANE_HALF_WIDTH_M = 10.0, 1.5
 """The road ahead of a vehicle is free if no other vehicle is in this rectangle."""
 
-_TELEPORT = re.compile(r"Teleporting vehicle '(.*?)'; waited too long \((.*?)\), lane='(.*?)', time=([\d.]+)")
+_TELEPORT = re.compile(r"Teleporting vehicle '(.*?)'; waited too long \((.*?)\), lane='(.*?)', time=(\d+(?:\.\d+)?)")
 _DEFAULT_LENGTH_M = 5.0
 
 
