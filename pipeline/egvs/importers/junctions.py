@@ -67,7 +67,7 @@ LANE_FLOW_PER_H = {
     "motorway": 600.0, "trunk": 400.0, "primary": 250.0, "secondary": 200.0, "tertiary": 150.0, "unclassified": 60.0,
     "residential": 40.0, "living_street": 20.0, "service": 10.0,
 }  # fmt: skip
-"""Vehicles per hour and lane by OpenStreetMap road class, on an ordinary day outside the peak hours.
+"""Vehicles per hour and lane by OpenStreetMap road class, in a busy hour; new scenarios use a share of it.
 
 Round figures of the usual order of magnitude in traffic planning; they are assumptions without a source.
 """
