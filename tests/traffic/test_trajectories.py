@@ -247,16 +247,19 @@ def test_warns_about_overlaps_in_many_frames_with_location():
     assert result.problem == "vehicles overlap in 7% of the frames; 20 of 25 overlaps are here"
 
 
-def test_overlaps_in_region_are_counted_where_vehicles_may_drive_through_blockers():
-    rows = [(f, name, "car", 10.0, 31.0 + i, 0, 5.0) for f in range(3) for i, name in enumerate("ab")]
-    rows += [(f, name, "car", 90.0, 31.0 + i, 0, 5.0) for f in range(5) for i, name in enumerate("cd")]
-    tally = TrafficStatistics(300, region=ROI)
+def test_overlaps_with_blockers_in_region_are_counted():
+    """Both a and d stand from the beginning, and are blockers from frame 4 on; b and e drive through them."""
+    rows = [(f, name, "car", 10.0, 31.0 + i, 0, 5.0 * i) for f in range(7) for i, name in enumerate("ab")]
+    rows += [(f, name, "car", 90.0, 31.0 + i, 0, 5.0 * i) for f in range(9) for i, name in enumerate("de")]
+    tally = TrafficStatistics(300, region=ROI, blocker_frames=4)
     tally.add(vehicle_boxes.boxes_from_bumpers(group_of(sorted(rows)), SIZES, 1.0, "place"))
-    assert (tally.rows_in_region, tally.overlaps_in_region, tally.overlapping_pairs) == (6, 3, 8)
+    assert (tally.rows_in_region, tally.overlaps_in_region, tally.overlapping_pairs) == (14, 3, 16)
     assert tally.to_json(1.0)["overlapping_pairs_in_roi"] == 3
     (result,) = trajectories.traffic_warnings(tally, recording_with(), ROI)
     assert (result.rule, result.where) == ("overlaps in roi", "s.toml: traffic.junction_blocker_s")
-    assert result.problem.startswith("vehicles overlap 3 times in the region of interest (5e+02 per 1,000")
+    assert result.problem.startswith(
+        "vehicles overlap 3 times in the region of interest (214.3 per 1,000 vehicles and frames)"
+    )
     assert "overlapping_pairs_in_roi" not in statistics_of(sorted(rows)).to_json(1.0)
 
 

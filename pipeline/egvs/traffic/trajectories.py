@@ -170,9 +170,11 @@ class TrafficStatistics:
     standing_at_m
         Where they are standing.
     region
-        Overlaps in this region are counted, too; None for no region.
+        Where overlaps with blockers are counted; None for nowhere.
+    blocker_frames
+        A vehicle that has stood for so many frames is a blocker.
     rows_in_region, overlaps_in_region
-        Vehicles in it, summed over the frames, and overlaps.
+        Vehicles in the region, summed over the frames, and overlaps with blockers.
     uncounted
         Statistics of kinds that do not count as vehicles.
     mixed_overlaps
@@ -194,6 +196,7 @@ class TrafficStatistics:
     standing_since: dict[str, int] = field(default_factory=dict)
     standing_at_m: dict[str, tuple[float, float]] = field(default_factory=dict)
     region: Roi | None = None
+    blocker_frames: int = 0
     rows_in_region: int = 0
     overlaps_in_region: int = 0
     uncounted: dict[str, UncountedKind] = field(default_factory=dict)
@@ -209,11 +212,12 @@ class TrafficStatistics:
             pairs = _vehicle_pairs(boxes, boxes.part, pairs)
             boxes = boxes.select(boxes.part == 0)
         end = boxes.first_frame + boxes.frames
-        self._add_standing(boxes, end)
+        standing_frames = self._add_standing(boxes, end)
         if boxes.uncounted is not None:
             self._add_uncounted(boxes, boxes.uncounted, pairs)
             mixed = boxes.uncounted[pairs].any(axis=1)
             pairs = (np.cumsum(~boxes.uncounted) - 1)[pairs[~mixed]]
+            standing_frames = standing_frames[~boxes.uncounted]
             boxes = boxes.select(~boxes.uncounted)
         self.vehicles[boxes.first_frame : end] = _boxes_per_frame(boxes, boxes.frame)
         self.names.update(boxes.names[i] for i in np.unique(boxes.code))
@@ -229,7 +233,8 @@ class TrafficStatistics:
         if self.region is not None:
             in_region = _in_region(boxes, self.region)
             self.rows_in_region += int(np.count_nonzero(in_region))
-            self.overlaps_in_region += int(np.count_nonzero(in_region[pairs].any(axis=1)))
+            is_blocker = standing_frames >= self.blocker_frames
+            self.overlaps_in_region += int(np.count_nonzero((in_region & is_blocker)[pairs].any(axis=1)))
 
     def _add_uncounted(self, boxes: VehicleBoxes, uncounted: NDArray[np.bool_], pairs: Ints) -> None:
         """Add the boxes that do not count as vehicles, and the overlaps of such boxes."""
@@ -243,8 +248,12 @@ class TrafficStatistics:
             kinds = sorted(boxes.kinds[boxes.kind[i]] for i in pair)
             self.mixed_overlaps[" and ".join(kinds)] += 1
 
-    def _add_standing(self, boxes: VehicleBoxes, end: int) -> None:
-        """Follow the runs of frames in which each vehicle is standing, across groups."""
+    def _add_standing(self, boxes: VehicleBoxes, end: int) -> Ints:
+        """Follow the runs of frames in which each vehicle is standing, across groups.
+
+        Return for how many frames each vehicle has stood; -1 for those that move.
+        """
+        standing_frames = np.full(boxes.frame.size, -1)
         order = np.lexsort((boxes.frame, boxes.code))
         rows = order[boxes.speed_m_s[order] < STANDING_M_S]
         frame, code = boxes.frame[rows], boxes.code[rows]
@@ -258,6 +267,7 @@ class TrafficStatistics:
             if since == boxes.first_frame:
                 since = self.standing_since.get(name, since)
             duration = int(frame[last]) - since
+            standing_frames[rows[first : last + 1]] = frame[first : last + 1] - since
             self.longest_standing_frames = max(self.longest_standing_frames, duration)
             is_longest = self.longest_jam is None or duration > self.longest_jam.frames
             if is_longest and name not in self.stopped_on_purpose:
@@ -267,6 +277,7 @@ class TrafficStatistics:
                 still_standing[name] = since
                 self.standing_at_m[name] = float(boxes.x_m[rows[last]]), float(boxes.y_m[rows[last]])
         self.standing_since = still_standing
+        return standing_frames
 
     def to_json(self, period_s: float) -> dict[str, Any]:
         """Return the statistics as JSON.
@@ -357,11 +368,12 @@ def write_trajectories(
     RunError
         When the number of vehicles is not maintained, or a vehicle stands for good.
     """
-    region = None if scenario.traffic.junction_blocker_s is None else scenario.roi.box
-    statistics = TrafficStatistics(
-        recording.window.count, stopped_on_purpose=recording.stopped_on_purpose, region=region
-    )
     period_s = recording.window.period_ms / 1000.0
+    statistics = TrafficStatistics(recording.window.count, stopped_on_purpose=recording.stopped_on_purpose)
+    blocker_s = scenario.traffic.junction_blocker_s
+    if blocker_s is not None:
+        statistics.region = scenario.roi.box
+        statistics.blocker_frames = max(0, int(blocker_s / period_s) - 1)  # it stopped between two frames
     changes: list[BoxChange] | None = None
     for group in frame_groups(recording, GROUP_FRAMES):
         uncounted = frozenset[str]().union(*(extension.uncounted_types(recording.sizes) for extension in extensions))
@@ -448,10 +460,10 @@ def traffic_warnings(statistics: TrafficStatistics, recording: Recording, roi: R
     if statistics.overlaps_in_region:
         per_thousand = 1000 * statistics.overlaps_in_region / statistics.rows_in_region
         problem = (
-            f"vehicles overlap {statistics.overlaps_in_region} times in the region of interest ({per_thousand:.2g} per"
-            " 1,000 vehicles and frames); some drive through a vehicle that blocks them"
+            f"vehicles overlap {statistics.overlaps_in_region} times in the region of interest ({per_thousand:.1f} per 1,000 vehicles"
+            " and frames) with one that blocked them on a junction"
         )
-        hint = "Reduce the traffic, or remove junction_blocker_s, which may lock the traffic."
+        hint = "Reduce the traffic, or remove junction_blocker_s, without which the traffic may lock."
         warnings.append(Diagnostic("overlaps in roi", f"{recording.where}.junction_blocker_s", problem, hint))
     share = statistics.frames_with_overlap / statistics.frames
     if share > MAX_OVERLAP_SHARE:
