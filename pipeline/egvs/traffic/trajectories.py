@@ -460,8 +460,8 @@ def traffic_warnings(statistics: TrafficStatistics, recording: Recording, roi: R
     if statistics.overlaps_in_region:
         per_thousand = 1000 * statistics.overlaps_in_region / statistics.rows_in_region
         problem = (
-            f"vehicles overlap {statistics.overlaps_in_region} times in the region of interest ({per_thousand:.1f} per 1,000 vehicles"
-            " and frames) with one that blocked them on a junction"
+            f"vehicles overlap {statistics.overlaps_in_region} times in the region of interest ({per_thousand:.1f} per"
+            " 1,000 vehicles and frames) with one that blocked them on a junction"
         )
         hint = "Reduce the traffic, or remove junction_blocker_s, without which the traffic may lock."
         warnings.append(Diagnostic("overlaps in roi", f"{recording.where}.junction_blocker_s", problem, hint))
