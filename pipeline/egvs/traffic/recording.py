@@ -82,6 +82,8 @@ class Recording:
         Returns the summary after all rows have been read; None for a finished file.
     source
         Source of the rows, for messages; empty for a running SUMO.
+    roads
+        The simulated network, for messages; None if it is not known.
     """
 
     rows: Iterable[pa.Table]
@@ -94,6 +96,7 @@ class Recording:
     persons: Iterable[pa.Table] | None = None
     summary: Callable[[], RecordingSummary | None] = lambda: None
     source: str = ""
+    roads: network.Network | None = None
 
 
 def record_traffic(
@@ -212,6 +215,7 @@ def _record_simulated(
             persons,
             lambda: summary,
             f"{where} ({sources})",
+            prepared.roads,
         )
     finally:
         for name in (*_TABLES, sumo_folder.DRIVEN_ROUTES_FILE, sumo_folder.STATISTICS_FILE):

@@ -7,6 +7,7 @@ east, y north, z up), metres, radians, metres per second.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass, field
@@ -21,7 +22,7 @@ from egvs.core.grid import Roi
 from egvs.core.progress import ProgressCallback
 from egvs.scenario.model import Scenario
 from egvs.traffic import fcd, vehicle_boxes
-from egvs.traffic.locks import describe_distance, is_inside
+from egvs.traffic.locks import StreetNames, describe_distance, is_inside
 from egvs.traffic.recording import Recording, demand_key
 from egvs.traffic.vehicle_boxes import BoxChange, Ints, TrafficHook, VehicleBoxes
 
@@ -130,8 +131,9 @@ class UncountedKind:
 
 @dataclass(frozen=True)
 class StandingVehicle:
-    """A vehicle that was standing: for how many frames, and its position."""
+    """A vehicle that was standing: since which frame, for how many frames, and its position."""
 
+    since: int
     frames: int
     vehicle: str
     at_m: tuple[float, float]
@@ -163,6 +165,10 @@ class TrafficStatistics:
         Vehicles that are ignored in ``longest_jam``.
     longest_jam
         Vehicle that was standing for longest.
+    long_stop_frames
+        A vehicle that was standing for more frames made a long stop.
+    stood_long
+        Names of the vehicles with a long stop.
     overlaps_by_square
         Overlaps in squares of :data:`SQUARE_M`, by number of the square to the east and to the north.
     standing_since
@@ -192,6 +198,8 @@ class TrafficStatistics:
     longest_standing_frames: int = 0
     stopped_on_purpose: Set[str] = frozenset()
     longest_jam: StandingVehicle | None = None
+    long_stop_frames: float = math.inf
+    stood_long: set[str] = field(default_factory=set)
     overlaps_by_square: Counter[tuple[int, int]] = field(default_factory=Counter)
     standing_since: dict[str, int] = field(default_factory=dict)
     standing_at_m: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -270,9 +278,13 @@ class TrafficStatistics:
             standing_frames[rows[first : last + 1]] = frame[first : last + 1] - since
             self.longest_standing_frames = max(self.longest_standing_frames, duration)
             is_longest = self.longest_jam is None or duration > self.longest_jam.frames
+            if duration > self.long_stop_frames and name not in self.stopped_on_purpose:
+                self.stood_long.add(name)
             if is_longest and name not in self.stopped_on_purpose:
                 row = rows[last]
-                self.longest_jam = StandingVehicle(duration, name, (float(boxes.x_m[row]), float(boxes.y_m[row])))
+                self.longest_jam = StandingVehicle(
+                    since, duration, name, (float(boxes.x_m[row]), float(boxes.y_m[row]))
+                )
             if frame[last] == end - 1:
                 still_standing[name] = since
                 self.standing_at_m[name] = float(boxes.x_m[rows[last]]), float(boxes.y_m[rows[last]])
@@ -370,6 +382,7 @@ def write_trajectories(
     """
     period_s = recording.window.period_ms / 1000.0
     statistics = TrafficStatistics(recording.window.count, stopped_on_purpose=recording.stopped_on_purpose)
+    statistics.long_stop_frames = LONG_STOP_S / period_s
     blocker_s = scenario.traffic.junction_blocker_s
     if blocker_s is not None:
         statistics.region = scenario.roi.box
@@ -455,6 +468,15 @@ def traffic_warnings(statistics: TrafficStatistics, recording: Recording, roi: R
         if duration_s > LONG_STOP_S:
             where = f"{recording.where}: {describe_location(jam.at_m, roi)}"
             problem = f"vehicle {jam.vehicle!r} was standing for {duration_s:g} s, longer than any usual red phase"
+            if recording.roads is not None:
+                begin_s = ((recording.window.first_ms or 0) + jam.since * recording.window.period_ms) / 1000.0
+                problem += f", at {StreetNames(recording.roads).at(jam.at_m)}, from {begin_s:g} s on"
+            if statistics.stood_long:
+                number, total = len(statistics.stood_long), len(statistics.names)
+                percent = f"{100 * number / total:.1f} %"
+                problem += (
+                    f"; {number} of {total:,} vehicles ({percent}) stood for more than {LONG_STOP_S:g} s somewhere"
+                )
             hint = "Check the signals and connections of the network there, or reduce the traffic."
             warnings.append(Diagnostic("standing", where, problem, hint))
     if statistics.overlaps_in_region:
