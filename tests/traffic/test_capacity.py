@@ -67,15 +67,16 @@ def test_longest_standing_time_allows_small_moves(tmp_path):
     assert capacity._longest_standing_s(path) == 0.0
 
 
-def test_vehicles_should_arrive_one_trip_after_departure(tmp_path):
-    """Trips last 50 s: who departs from 250 s on should arrive after the warm-up, and until 850 s before the end."""
-    departs = [100, 249, 250, 600, 849, 850]
+def test_vehicles_should_arrive_one_mean_trip_after_departure(tmp_path):
+    """Trips last 40 to 60 s: who departs in the last 50 s of the trial has not arrived yet."""
+    departs = [0, 249, 600, 849, 850, 899]
     routes, trips = tmp_path / "routes.xml", tmp_path / "trips.xml"
     routes.write_text("<routes>" + "".join(f'<vehicle id="{d}" depart="{d}"/>' for d in departs) + "</routes>")
-    arrivals = [150, 299, 300, 700]
-    text = "".join(f'<tripinfo id="{a}" arrival="{a}" duration="50"/>' for a in arrivals)
+    text = "".join(f'<tripinfo id="{d}" arrival="1" duration="{d}"/>' for d in (40, 50, 60))
     trips.write_text(f"<tripinfos>{text}</tripinfos>")
-    assert capacity._arrivals(routes, trips) == (3, 2)
+    assert capacity._arrivals(routes, trips) == (4, 3)
+    trips.write_text("<tripinfos/>")
+    assert capacity._arrivals(routes, trips) == (6, 0)
 
 
 @pytest.mark.slow
