@@ -1,10 +1,14 @@
 """Assumed flows of a junction."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from egvs.importers import junctions
+from egvs.importers.junctions import JunctionRegion
 from egvs.traffic.network import Edge, Lane, Permission
+from tests.traffic.test_demand import LOOP_NET
 
 
 # --- assumed traffic -----------------------------------------------------------------------------------------------
@@ -35,3 +39,12 @@ def test_road_class_sets_flow_per_lane(kind: str, per_lane_h: float) -> None:
 def test_inflow_is_met_where_outflow_cannot_be() -> None:
     rates = junctions.balance_flows(np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 0.0]]), [100, 50, 30], [10, 200])
     assert rates.tolist() == [[100, 0], [50, 0], [0, 0]]
+
+
+def test_turn_that_is_only_possible_with_a_loop_gets_no_flow(tmp_path: Path) -> None:
+    """All that comes in, 40 an hour from each of two streets, goes on; nobody turns round through the signal."""
+    path = tmp_path / "loop.net.xml"
+    path.write_text(LOOP_NET)
+    streets = junctions.read_streets(path)
+    flows = junctions.assumed_flows(streets, JunctionRegion((15.0, 0.0), (90.0, 90.0)))
+    assert {(flow.title, flow.per_hour) for flow in flows} == {("in to on", 40.0), ("side to on", 40.0)}

@@ -22,6 +22,7 @@ from egvs.formats import osm
 from egvs.importers import openstreetmap
 from egvs.scenario import loading
 from egvs.sensors import sites
+from egvs.traffic.capacity import Capacity, TrialRun
 from tests.formats.test_osm import pbf_of
 from tests.stage_runner import run_stage
 
@@ -331,7 +332,7 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Made:
 def test_real_town(town: Made) -> None:
     folder, summary = town
     assert "Meisebacher Straße" in summary.junction.title and summary.junction.signalised
-    assert summary.to_json()["assumed_traffic"]["vehicles_per_hour"] > 1000
+    assert summary.to_json()["assumed_traffic"]["assumed_per_hour"] > 1000
     assert summary.statics.heights["building"] == {"height": 1, "levels": 5, "default": 636}
     assert summary.statics.objects["tree_trunk"] == 15
     assert loading.load(folder).roi.grid.shape == (360, 320, 20)
@@ -471,6 +472,41 @@ def test_rejects_folder_with_content(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("level", "share"), [("light", 0.4), ("medium", 0.75), ("heavy", 1.0)])
+def test_traffic_is_a_share_of_what_the_junction_carries(tmp_path: Path, level: str, share: float) -> None:
+    summary = openstreetmap.create_scenario(tmp_path / "out", SMALL, traffic=level)
+    traffic = summary.traffic
+    assert traffic is not None and traffic.capacity.is_everything
+    assert traffic.carried_per_h == traffic.assumed_per_h > 500
+    assert [flow.per_hour for flow in summary.flows] == [round(flow.per_hour * share) for flow in traffic.assumed]
+    assert traffic.summary == (
+        f"carries at least {traffic.assumed_per_h:,} vehicles an hour; {level} {100 * share:.0f} % is used"
+    )
+    text = (tmp_path / "out" / "scenario.toml").read_text(encoding="utf-8")
+    assert f"the network {traffic.summary}. Replace them by real counts" in text
+    loaded = loading.load(tmp_path / "out")
+    assert (loaded.traffic.junction_blocker_s, loaded.traffic.teleport_s) == (10.0, 180.0)
+
+
+def test_flow_above_capacity_is_reduced_and_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    runs = (TrialRun(1.0, 100, 50, 300.0, 20), TrialRun(0.7, 70, 70, 50.0, 0))
+    monkeypatch.setattr(openstreetmap, "find_capacity", lambda *_: Capacity(0.644, runs))
+    traffic = openstreetmap.create_scenario(tmp_path / "out", SMALL).traffic
+    assert traffic is not None
+    assert traffic.carried_per_h == 10 * round(0.0644 * traffic.assumed_per_h)
+    assert traffic.summary == f"carries {traffic.carried_per_h:,} vehicles an hour; medium 75 % is used"
+    assert traffic.per_h == pytest.approx(0.75 * traffic.carried_per_h, abs=12)
+    monkeypatch.setattr(openstreetmap, "find_capacity", lambda *_: Capacity(0.155, runs[:1]))
+    notes = openstreetmap.create_scenario(tmp_path / "jammed", SMALL).notes
+    assert "traffic jams in all 1 trials; check the signals and connections of the network" in notes
+
+
+def test_rejects_unknown_level_of_traffic(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"--traffic: expected light, medium or heavy, got 'rush'"):
+        openstreetmap.create_scenario(tmp_path / "out", SMALL, traffic="rush")
+    assert not (tmp_path / "out").exists()
+
+
 def test_smaller_surroundings_keep_sites_and_flows(tmp_path: Path) -> None:
     made = {r: openstreetmap.create_scenario(tmp_path / str(r), SMALL, surroundings_m=r) for r in (120.0, 150.0, None)}
     lengths = [summary.streets.lane_length_m for summary in made.values()]

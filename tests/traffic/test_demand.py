@@ -83,6 +83,7 @@ def test_warns_about_counts_above_lane_capacity(cross, tmp_path):
     warning, waiting = result["warnings"]
     assert (warning["rule"], waiting["rule"]) == ("counts", "waiting")
     assert not warning["is_error"]
+    assert re.search(r"the movement left0A0 to A0top0 exceeds .*: \d+(\.\d)? of 9000 vehicles an", waiting["problem"])
     assert re.search(r"misses 1 of 1 counts .*left0A0 to A0top0: \d+(\.\d)? instead of 9000", warning["problem"])
 
 
@@ -119,6 +120,53 @@ def test_candidate_routes_over_a_location_are_no_detours(town):
         assert ends[way[0]][0] != ends[way[-1]][1]
         assert len(way) <= 4  # in, along, and out at once or one street on; never round the block
     assert not ways.may_drive([where.edges[0], where.edges[0]])
+
+
+LOOP_NET = """<net version="1.20">
+  <edge id="in" from="w" to="j"><lane id="in_0" index="0" speed="10" length="90" shape="-100,0 -10,0"/></edge>
+  <edge id="side" from="s" to="j"><lane id="side_0" index="0" speed="10" length="90" shape="0,-100 0,-10"/></edge>
+  <edge id="mid" from="j" to="k"><lane id="mid_0" index="0" speed="10" length="30" shape="10,0 40,0"/></edge>
+  <edge id="back" from="k" to="j"><lane id="back_0" index="0" speed="10" length="30" shape="40,8 10,8"/></edge>
+  <edge id="out" from="j" to="w2"><lane id="out_0" index="0" speed="10" length="90" shape="-10,8 -100,8"/></edge>
+  <edge id="on" from="k" to="e"><lane id="on_0" index="0" speed="10" length="90" shape="50,0 140,0"/></edge>
+  <connection from="in" to="mid" fromLane="0" toLane="0" dir="s" state="o"/>
+  <connection from="side" to="mid" fromLane="0" toLane="0" dir="r" state="o"/>
+  <connection from="mid" to="on" fromLane="0" toLane="0" dir="s" state="o"/>
+  <connection from="mid" to="back" fromLane="0" toLane="0" dir="l" state="o"/>
+  <connection from="back" to="out" fromLane="0" toLane="0" dir="s" state="o"/>
+</net>
+"""
+"""A dual carriageway (in, out) at a signal j: whoever leaves by out has turned at k, and passes j twice."""
+
+
+@pytest.fixture
+def loop_routes(tmp_path):
+    path = tmp_path / "loop.net.xml"
+    path.write_text(LOOP_NET)
+    return RouteFinder(network.read_net_xml(path), "passenger")
+
+
+def test_routes_pass_no_node_twice(loop_routes):
+    where = loop_routes.locate("mid", None, "place")
+    result = loop_routes.candidates([where], drawn(), np.random.default_rng(1), "place")
+    assert sorted(result) == [("in", "mid", "on"), ("side", "mid", "on")]
+    assert loop_routes.has_route_without_loop(where)
+
+
+def test_rare_ends_are_used_where_all_others_make_loops(loop_routes):
+    """Sixty draws miss the exit with the small weight."""
+    where = loop_routes.locate("mid", None, "place")
+    weights = {"on": 1e-12, "side": 1e-12}
+    result = loop_routes.candidates([where], drawn(edge_weights=weights), np.random.default_rng(1), "place")
+    assert sorted(result) == [("in", "mid", "on"), ("side", "mid", "on")]
+
+
+def test_count_that_is_only_possible_with_a_loop_is_a_last_resort(loop_routes):
+    where = loop_routes.locate("in", "out", "place")
+    assert not loop_routes.has_route_without_loop(where)
+    result = loop_routes.candidates([where], drawn(), np.random.default_rng(1), "place")
+    assert result == [("in", "mid", "back", "out")]
+    assert loop_routes.has_route_without_loop(loop_routes.locate("in", "on", "place"))
 
 
 def test_isolated_location_is_a_route_of_its_own(tmp_path):

@@ -247,6 +247,35 @@ def test_warns_about_overlaps_in_many_frames_with_location():
     assert result.problem == "vehicles overlap in 7% of the frames; 20 of 25 overlaps are here"
 
 
+def test_overlaps_with_blockers_in_region_are_counted():
+    """Both a and d stand from the beginning, and are blockers from frame 4 on; b and e drive through them."""
+    rows = [(f, name, "car", 10.0, 31.0 + i, 0, 5.0 * i) for f in range(7) for i, name in enumerate("ab")]
+    rows += [(f, name, "car", 90.0, 31.0 + i, 0, 5.0 * i) for f in range(9) for i, name in enumerate("de")]
+    tally = TrafficStatistics(300, region=ROI, blocker_frames=4)
+    tally.add(vehicle_boxes.boxes_from_bumpers(group_of(sorted(rows)), SIZES, 1.0, "place"))
+    assert (tally.rows_in_region, tally.overlaps_in_region, tally.overlapping_pairs) == (14, 3, 16)
+    assert tally.to_json(1.0)["overlapping_pairs_in_roi"] == 3
+    (result,) = trajectories.traffic_warnings(tally, recording_with(), ROI)
+    assert (result.rule, result.where) == ("overlaps in roi", "s.toml: traffic.junction_blocker_s")
+    assert result.problem.startswith(
+        "vehicles overlap 3 times in the region of interest (214.3 per 1,000 vehicles and frames)"
+    )
+    assert "overlapping_pairs_in_roi" not in statistics_of(sorted(rows)).to_json(1.0)
+
+
+@pytest.mark.parametrize(("x_m", "vehicles", "jammed"), [(0.0, None, True), (100.0, None, False), (100.0, 1, True)])
+def test_jam_at_the_end_matters_in_region_or_where_a_number_is_maintained(tmp_path, x_m, vehicles, jammed):
+    tally = statistics_of([(f, "stuck", "car", x_m, 0, 0, 0.0) for f in range(300)])
+    counts = [{"edge": "e", "per_hour": 10}]
+    model = scenario(tmp_path, network="net.xml", counts=counts, vehicles=vehicles, hold="at_most")
+    recorded = recording_with(standing_limit_s=180.0, vehicles=vehicles)
+    if not jammed:
+        trajectories.check_recording(model, tally, recorded)
+        return
+    with pytest.raises(RunError, match=r"traffic\.counts: the traffic is jammed: 1 vehicles stand .*Lower per_hour of"):
+        trajectories.check_recording(model, tally, recorded)
+
+
 @pytest.mark.parametrize(
     ("at_m", "words"),
     [

@@ -488,6 +488,14 @@ def new(
             help="Simulate the streets within this radius of the junction, or 'all'; 300 by default.",
         ),
     ] = None,
+    traffic: Annotated[
+        str,
+        typer.Option(
+            metavar="LEVEL",
+            help="light, medium or heavy: 40, 75 or 100 % of what the junction carries of the flow that is usual for"
+            " its road classes.",
+        ),
+    ] = "medium",
 ) -> None:
     """Create a scenario from an OpenStreetMap extract."""
     from egvs.cli import run_tables
@@ -500,7 +508,7 @@ def new(
     if surroundings is not None:
         surroundings_m = cli_options.radius_m(surroundings)
     scenario = openstreetmap.create_scenario(
-        folder, osm, location, lefthand=lefthand, walk=walk, surroundings_m=surroundings_m
+        folder, osm, location, lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=traffic
     )
     run_tables.print_new_scenario(scenario)
 

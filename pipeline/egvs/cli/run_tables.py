@@ -268,7 +268,10 @@ def print_new_scenario(scenario: NewScenario) -> None:
     out = console(_RESULT_FILE_WIDTH)
     description = scenario.to_json()
     print_mapping(description, _RESULT_FILE_WIDTH)
-    hourly = description["assumed_traffic"]["vehicles_per_hour"]
+    hourly = 0
+    if scenario.traffic is not None:
+        hourly = scenario.traffic.per_h
+        out.print(f"traffic: {scenario.traffic.summary} ({hourly:,} vehicles an hour)")
     out.print(
         f"warning: the traffic is assumed ({hourly:,} vehicles an hour) and affects the ranking. "
         f"Enter counted traffic under [traffic] in {scenario.folder / 'scenario.toml'} before you rely on the ranking."

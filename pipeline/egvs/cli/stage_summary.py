@@ -85,6 +85,10 @@ def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterato
         yield f"vehicles overlap in {_count(rest.pop('frames_with_overlap'), 'frame')}"
     if rest.get("collisions") is not None:
         yield _count(rest.pop("collisions"), "collision")
+    if (overlaps := rest.pop("overlapping_pairs_in_roi", None)) is not None:
+        yield f"{_count(overlaps, 'overlap')} in the region"
+    if teleports := rest.pop("teleports", 0):
+        yield f"{_count(teleports, 'vehicle')} moved on"
     if counts := rest.pop("counts", None):
         worst = max(count["geh"] for count in counts)
         yield f"largest GEH against the counts {worst:.1f}"

@@ -20,8 +20,9 @@ https://archive.nptel.ac.in/content/storage2/courses/105101087/08-Ltexhtml/p6/p.
 .. math:: q_{ij} = a_i \, b_j \, w_{ij}, \qquad \sum_j q_{ij} = q_i, \qquad
           \sum_i q_{ij} \approx q_j \sum_i q_i / \sum_j q_j,
 
-where w is 1 if one can drive from gate i to gate j without turning back, and 0 otherwise. The inflows are met exactly,
-the outflows as well as possible.
+where w is 1 if a route over gates i and j exists, from the fringe of the network to its fringe, that passes no node
+twice, and 0 otherwise. (Without this rule, a U-turn from one carriageway of a street to the other would be a turn like
+any other.) The inflows are met exactly, the outflows as well as possible.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ from egvs.core.grid import FloatArray
 from egvs.formats.georeference import WorldFrame
 from egvs.scenario.traffic_config import CountConfig
 from egvs.traffic import network as road_network
+from egvs.traffic.demand import RouteFinder
 from egvs.traffic.network import Edge, Network
 from egvs.world.geolocation import network_world_frame
 
@@ -65,7 +67,7 @@ LANE_FLOW_PER_H = {
     "motorway": 600.0, "trunk": 400.0, "primary": 250.0, "secondary": 200.0, "tertiary": 150.0, "unclassified": 60.0,
     "residential": 40.0, "living_street": 20.0, "service": 10.0,
 }  # fmt: skip
-"""Vehicles per hour and lane by OpenStreetMap road class, on an ordinary day outside the peak hours.
+"""Vehicles per hour and lane by OpenStreetMap road class, in a busy hour; new scenarios use a share of it.
 
 Round figures of the usual order of magnitude in traffic planning; they are assumptions without a source.
 """
@@ -435,7 +437,7 @@ def _nearest_poles(points: Sequence[XY], center: XY) -> list[XY]:
 class _Gates:
     """The edges by which vehicles enter and leave a region.
 
-    ``connected`` has shape (n_entries, n_exits): 1 where one can drive from the entry to the exit, otherwise 0.
+    ``connected`` has shape (n_entries, n_exits): 1 where a route without loop leads over entry and exit, otherwise 0.
     """
 
     entries: list[Edge]
@@ -530,12 +532,16 @@ def _find_gates(streets: Streets, roi: JunctionRegion) -> _Gates:
 
     entries = [index for index in successors if index not in entered]
     exits = [index for index, following in successors.items() if not following]
+    routes = RouteFinder(streets.network, _CAR)
     connected = np.zeros((len(entries), len(exits)))
     for row, entry in enumerate(entries):
         reachable = _reachable(entry, successors)
         for column, exit_index in enumerate(exits):
-            turns_back = edges[exit_index].to_node == edges[entry].from_node
-            connected[row, column] = exit_index in reachable and not turns_back
+            if exit_index not in reachable or edges[exit_index].to_node == edges[entry].from_node:
+                continue
+            to_edge = None if exit_index == entry else edges[exit_index].id
+            location = routes.locate(edges[entry].id, to_edge, "assumed flows")
+            connected[row, column] = routes.has_route_without_loop(location)
     return _Gates([edges[i] for i in entries], [edges[i] for i in exits], connected)
 
 

@@ -1,7 +1,8 @@
 """Make a scenario from a town on OpenStreetMap.
 
 Steps of :func:`create_scenario`: read the extract; run netconvert on its streets; choose a junction and put the region
-of interest around it; take buildings, trees, barriers and poles as solids; find candidate sites along the kerbs; write
+of interest around it; take buildings, trees, barriers and poles as solids; find candidate sites along the kerbs; assume
+flows, and find how much of them the network carries; write
 
     network.net.xml    the streets                                       (traffic)
     statics.geojson    footprints with heights, and import counts        (statics)
@@ -43,6 +44,7 @@ from egvs.scenario.loading import load
 from egvs.scenario.model import SCENARIO_FILE, RoiConfig
 from egvs.scenario.score_config import DEFAULT_SCORE, ScoreConfig
 from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, CountConfig, TrafficConfig
+from egvs.traffic.capacity import Capacity, find_capacity, scale_flows
 
 STATICS_FILE, SITES_FILE = "statics.geojson", "sites.csv"
 SENSOR = "VLP-32C"
@@ -54,6 +56,14 @@ SURROUNDINGS_MIN_M = 100.0
 SURROUNDINGS_M = 300.0
 """How far from the junction streets are simulated: enough for the queues and platoons that reach it."""
 
+JUNCTION_BLOCKER_S, TELEPORT_S = 10.0, 180.0
+"""What ends locks in new scenarios; the second is longer than any red phase and most waits to give way."""
+
+TRAFFIC_LEVELS = {"light": 0.4, "medium": 0.75, "heavy": 1.0}
+"""Shares of the carried flow. The queues of a junction get long, and rare locks possible, near its capacity."""
+
+DEFAULT_TRAFFIC = "medium"
+
 PEOPLE_HINT = (
     "pedestrians are added with --set effects.pedestrians_bicycles.pedestrians_per_h=300 (bicycles: bicycles_per_h)."
 )
@@ -62,10 +72,71 @@ TomlTable = tuple[str, dict[str, Any]]
 """A comment, and the keys of a table."""
 
 _KEY_COMMENTS = {
+    (
+        "traffic",
+        "junction_blocker_s",
+    ): "vehicles drive through one that blocks them on a junction; overlaps are counted",
+    ("traffic", "teleport_s"): "the last resort against locks; vehicles that are moved on are counted",
     ("score", "rank_by"): "the expected share of vehicles that detectors find; docs/validity.md",
     ("sites", "aim"): "sensors face the centre of the region",
     ("sites", "pitch_deg"): "each height with each tilt is a candidate; 'aim': the central ray points at the centre",
 }
+
+
+@dataclass(frozen=True)
+class AssumedTraffic:
+    """The traffic of a new scenario.
+
+    Attributes
+    ----------
+    assumed
+        Flows from the classes of the streets.
+    capacity
+        What the network carries of them.
+    level
+        A key of :data:`TRAFFIC_LEVELS`.
+    """
+
+    assumed: tuple[CountConfig, ...]
+    capacity: Capacity
+    level: str
+
+    @cached_property
+    def flows(self) -> tuple[CountConfig, ...]:
+        """The flows of the scenario."""
+        return tuple(scale_flows(self.assumed, self.capacity.share * TRAFFIC_LEVELS[self.level]))
+
+    @property
+    def assumed_per_h(self) -> int:
+        """Sum of the assumed flows."""
+        return round(math.fsum(flow.per_hour for flow in self.assumed))
+
+    @property
+    def carried_per_h(self) -> int:
+        """Sum of the flows that the network carries, in steps of 10."""
+        if self.capacity.is_everything:
+            return self.assumed_per_h
+        return round(self.capacity.share * self.assumed_per_h / 10) * 10
+
+    @property
+    def per_h(self) -> int:
+        """Sum of the flows of the scenario."""
+        return round(math.fsum(flow.per_hour for flow in self.flows))
+
+    @property
+    def summary(self) -> str:
+        """What is carried and used, as a sentence."""
+        at_least = "at least " if self.capacity.is_everything else ""
+        share = f"{TRAFFIC_LEVELS[self.level]:.0%}".replace("%", " %")
+        return f"carries {at_least}{self.carried_per_h:,} vehicles an hour; {self.level} {share} is used"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return a summary as plain JSON."""
+        return {
+            "flows": len(self.flows), "vehicles_per_hour": self.per_h, "level": self.level,
+            "assumed_per_hour": self.assumed_per_h, "carried_per_hour": self.carried_per_h,
+            "trial_runs": len(self.capacity.runs),
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -84,6 +155,8 @@ class NewScenario:
         Number of locations for poles.
     statics
         What happened to the objects of the map.
+    traffic
+        The traffic through the region of interest; None where no street leads through it.
     notes
         What to know before trusting the scenario.
     """
@@ -94,6 +167,7 @@ class NewScenario:
     streets: Streets
     poles: int
     statics: ImportCounts
+    traffic: AssumedTraffic | None
     notes: tuple[str, ...]
 
     @property
@@ -101,10 +175,10 @@ class NewScenario:
         """Number of candidates: each pole with each height and each tilt."""
         return self.poles * len(junctions.HEIGHTS_M) * len(PITCHES_DEG)
 
-    @cached_property
+    @property
     def flows(self) -> tuple[CountConfig, ...]:
-        """The assumed traffic through the region of interest; empty where no street leads through it."""
-        return tuple(junctions.assumed_flows(self.streets, self.roi))
+        """The flows of the scenario; empty where no street leads through the region of interest."""
+        return () if self.traffic is None else self.traffic.flows
 
     def to_json(self) -> dict[str, Any]:
         """Return a summary as plain JSON, the most interesting keys first."""
@@ -122,9 +196,7 @@ class NewScenario:
                 "edges": len(streets.network.edges), "lane_length_m": round(streets.lane_length_m),
                 "signalised_junctions": sum(j.signalised for j in streets.junctions),
             },
-            "assumed_traffic": {
-                "flows": len(self.flows), "vehicles_per_hour": round(math.fsum(f.per_hour for f in self.flows)),
-            },
+            "assumed_traffic": {"flows": 0} if self.traffic is None else self.traffic.to_json(),
             "poles": self.poles,
             "sites": self.n_candidates,
             "statics": self.statics.to_json(),
@@ -134,7 +206,7 @@ class NewScenario:
 
 def create_scenario(
     folder: Path, osm: Path, at: tuple[float, float] | None = None, lefthand: bool = False, walk: bool = False,
-    surroundings_m: float | None = SURROUNDINGS_M,
+    surroundings_m: float | None = SURROUNDINGS_M, traffic: str = DEFAULT_TRAFFIC,
 ) -> NewScenario:  # fmt: skip
     """Make a scenario folder from an OpenStreetMap extract.
 
@@ -152,6 +224,8 @@ def create_scenario(
         Whether the network gets sidewalks and crossings, which pedestrians need.
     surroundings_m
         Distance from the junction at which streets end; None for the complete extract.
+    traffic
+        A key of :data:`TRAFFIC_LEVELS`: the share of the flow that the junction carries.
 
     Returns
     -------
@@ -164,6 +238,8 @@ def create_scenario(
         When the folder is not empty, the file is damaged or has no drivable streets, ``at`` is outside the extract, or
         no site is possible. Nothing is written then.
     """
+    if traffic not in TRAFFIC_LEVELS:
+        raise InputError("--traffic", f"expected light, medium or heavy, got {traffic!r}", "Use --traffic medium.")
     name = check_new_folder(folder)
     if surroundings_m is not None and surroundings_m < SURROUNDINGS_MIN_M:
         raise InputError(
@@ -192,7 +268,10 @@ def create_scenario(
     notes = _junction_notes(junction, roi, counts)
     if walk:
         notes.append(PEOPLE_HINT)
-    scenario = NewScenario(folder, junction, roi, streets, len(poles), counts, tuple(notes))
+    assumed = _assumed_traffic(network, streets, roi, traffic)
+    if assumed is not None:
+        notes += _traffic_notes(assumed)
+    scenario = NewScenario(folder, junction, roi, streets, len(poles), counts, assumed, tuple(notes))
     texts = {
         NETWORK_FILE: network,
         STATICS_FILE: solids_geojson(solids, counts),
@@ -257,6 +336,23 @@ def _junction_notes(junction: StreetJunction, roi: JunctionRegion, counts: Impor
     if not junction.signalised:
         notes.append("no junction in the extract has signals; the one with the most incoming lanes was chosen")
     return notes + scenario_notes(roi.area.covers(junction.area), counts)
+
+
+def _assumed_traffic(network: str, streets: Streets, roi: JunctionRegion, level: str) -> AssumedTraffic | None:
+    """Assume flows through a region, and find how much of them the network carries."""
+    flows = junctions.assumed_flows(streets, roi)
+    if not flows:
+        return None
+    return AssumedTraffic(tuple(flows), find_capacity(network, flows, JUNCTION_BLOCKER_S), level)
+
+
+def _traffic_notes(traffic: AssumedTraffic) -> list[str]:
+    capacity = traffic.capacity
+    if not capacity.is_certain:
+        return [f"traffic jams in all {len(capacity.runs)} trials; check the signals and connections of the network"]
+    if not capacity.is_everything:
+        return [f"the junction does not carry the {traffic.assumed_per_h:,} vehicles an hour of its road classes"]
+    return []
 
 
 def scenario_notes(junction_fits: bool, counts: ImportCounts) -> list[str]:
@@ -380,6 +476,8 @@ def _scenario_toml(name: str, scenario: NewScenario) -> str:
         "frames": DEFAULT_FRAMES,
         "frame_period_s": TrafficConfig.model_fields["frame_period_s"].default,
         "warmup_s": DEFAULT_WARMUP_S,
+        "junction_blocker_s": JUNCTION_BLOCKER_S,
+        "teleport_s": TELEPORT_S,
     }
     tables = {
         "roi": (roi_comment, roi | voxel_keys()),
@@ -393,9 +491,11 @@ def _scenario_toml(name: str, scenario: NewScenario) -> str:
         f"World frame: x east, y north in metres as in {NETWORK_FILE}, z up from the flat ground.",
     ]
     document = toml_document(comments, values, tables)
-    if scenario.flows:
-        document["traffic"].update({"counts": _counts_array(scenario.flows)})
-        document["traffic"]["counts"].comment("assumed from the road classes: replace them by real counts")
+    if scenario.traffic is not None:
+        document["traffic"].update({"counts": _counts_array(scenario.traffic.flows)})
+        origin = f"assumed from the road classes ({scenario.traffic.assumed_per_h:,} vehicles an hour)"
+        comment = f"{origin}; the network {scenario.traffic.summary}. Replace them by real counts"
+        document["traffic"]["counts"].comment(comment)
     return tomlkit.dumps(document)
 
 

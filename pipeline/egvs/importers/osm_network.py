@@ -22,6 +22,7 @@ from pathlib import Path
 
 from egvs.core import files
 from egvs.core.errors import InputError, RunError
+from egvs.formats import xml
 from egvs.formats.osm import OsmExtract, Way, write_streets
 from egvs.importers import junctions
 from egvs.importers.junctions import XY, StreetJunction, Streets
@@ -34,8 +35,19 @@ NETCONVERT_FLAGS = (
     "--geometry.remove", "--junctions.join", *sumo_folder.OSM_SIGNALS,
     "--keep-edges.by-vclass", "passenger,bus,truck", "--remove-edges.isolated",
     "--output.street-names", "--precision", "3",
+    "--no-turnarounds.tls", "--no-turnarounds.geometry", "--junctions.right-before-left.speed-threshold", "0",
 )  # fmt: skip
-"""How netconvert makes a network of streets."""
+"""How netconvert makes a network of streets.
+
+The last three prevent locks: vehicles do not turn back at signals or in the middle of a street, and a minor street
+gives way by a sign; four vehicles that give way to each other from the right wait forever.
+"""
+
+JOINED_SIGNALS_FLAG = "--tls.join"
+LONGEST_PROGRAM_S = 120.0
+"""A signal program for several nodes may not be longer: one of 16 phases and 272 s, one approach after another, let
+less than half of the usual traffic pass.
+"""
 
 SIDEWALK_FLAGS = ("--sidewalks.guess", "--sidewalks.guess.max-speed", "28", "--crossings.guess")
 """Sidewalks, walking areas at their corners, and crossings between these.
@@ -89,7 +101,8 @@ def build_network(extract: OsmExtract, osm: Path, flags: Sequence[str]) -> tuple
     osm
         Its file, for messages.
     flags
-        Flags of netconvert.
+        Flags of netconvert. :data:`JOINED_SIGNALS_FLAG` is dropped if a signal program gets longer than
+        :data:`LONGEST_PROGRAM_S`.
 
     Returns
     -------
@@ -114,7 +127,11 @@ def build_network(extract: OsmExtract, osm: Path, flags: Sequence[str]) -> tuple
     with files.temporary_folder() as folder:
         write_streets(extract, folder / "streets.osm.xml")
         try:
-            sumo.run_netconvert(["--osm-files", "streets.osm.xml", *flags], folder, NETWORK_FILE)
+            arguments = ["--osm-files", "streets.osm.xml", *flags]
+            sumo.run_netconvert(arguments, folder, NETWORK_FILE)
+            if JOINED_SIGNALS_FLAG in arguments and longest_program_s(folder / NETWORK_FILE) > LONGEST_PROGRAM_S:
+                arguments.remove(JOINED_SIGNALS_FLAG)
+                sumo.run_netconvert(arguments, folder, NETWORK_FILE)
             streets = junctions.read_streets(folder / NETWORK_FILE)
         except (RunError, InputError) as error:
             if _NOTHING_LOADED.search(str(error)):
@@ -128,6 +145,18 @@ def build_network(extract: OsmExtract, osm: Path, flags: Sequence[str]) -> tuple
     # the first comment of netconvert contains the date and paths
     text = re.sub(r"<!-- generated on .*?-->", f"<!-- {ATTRIBUTION} -->", text, count=1, flags=re.DOTALL)
     return text, streets
+
+
+def longest_program_s(path: Path) -> float:
+    """Return the duration of the longest signal program of a network, in seconds; 0 without signals.
+
+    An actuated phase counts with the duration that it has in the fixed-time program.
+    """
+    longest_s = 0.0
+    for element in xml.iter_elements(path, "net"):
+        if element.tag == "tlLogic":
+            longest_s = max(longest_s, math.fsum(float(phase.get("duration", "0")) for phase in element.iter("phase")))
+    return longest_s
 
 
 def crop_network(

@@ -182,7 +182,9 @@ def keys_without_effect(source: str) -> frozenset[str]:
         One of :data:`TRAFFIC_SOURCES`, or "routes" for a network with routes.
     """
     demand = _RATE_KEYS | {"counts", "edge_weights", "kinds"}
-    simulation = frozenset({"vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s"})
+    simulation = frozenset({
+        "vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s", "junction_blocker_s", "teleport_s",
+    })  # fmt: skip
     if source == "fcd":
         return simulation | demand - {"kinds"} | {"routes"}
     unused = frozenset({"vtypes", "roads", "fcd_geo"})
@@ -257,6 +259,16 @@ class TrafficConfig(StrictModel):
     )
     lateral_resolution_m: float = Field(
         0.8, ge=0, description="Width of SUMO's sublanes; 0 makes lane changes instantaneous"
+    )
+    junction_blocker_s: Positive | None = Field(
+        None,
+        description="Time after which a vehicle drives on through another one that blocks it on a junction (SUMO's"
+        " --ignore-junction-blocker). It ends locks, and overlaps are counted. By default never",
+    )
+    teleport_s: Positive | None = Field(
+        None,
+        description="Time after which a vehicle that stands first on its lane is moved to the next free place on its"
+        " route (SUMO's --time-to-teleport). It is the last resort against locks, and is counted. By default never",
     )
     trips_per_s: Positive = Field(
         2.0, description="Rate of random trips; higher than the network can take, so that `vehicles` is maintained"

@@ -138,7 +138,8 @@ def _record_period(
     effects, notes = registry.active_traffic_effects(scenario)
     folder = context.folder.sumo / period
     georeference = context.inputs.georeference
-    with recording.record_traffic(scenario, folder, effects, context.progress, traci, georeference) as recorded:
+    region = scenario.roi.box
+    with recording.record_traffic(scenario, folder, effects, context.progress, traci, georeference, region) as recorded:
         tally, reports = trajectories.write_trajectories(
             scenario, recorded, effects, file, context.progress, first_frame
         )

@@ -15,8 +15,13 @@ routes that meet the counts, with departures uniformly distributed over the simu
 kind, by share, among those that may drive its route. Counts of a kind are added to those of the fleet.
 
 A route over a location is the fastest way from the fringe to the location and on to the fringe. It is plausible if it
-takes at most :data:`MAX_DETOUR` times as long as the fastest way between its ends and visits no edge twice; without
-plausible routes, the shortest detours are used. Travel times are seconds at the speed limit.
+takes at most :data:`MAX_DETOUR` times as long as the fastest way between its ends and passes no node twice. Without
+plausible routes, the shortest detours without a loop are used; where every route has a loop, those with the shortest
+detours. Travel times are seconds at the speed limit.
+
+A loop is a node that a route passes twice. In a network that was cut around a junction, the ends of a turn are often
+the two sides of a dual carriageway, so the fastest way between them turns back through the signals. Such vehicles
+overload left-turn lanes, and one of them meets two counts.
 
 After the run, :func:`count_fits` compares simulated flows m with counts c by the GEH statistic of traffic engineering
 (sumolib.statistics.geh; below 5 is a good match, also in routeSampler's --geh-ok):
@@ -369,14 +374,13 @@ def _xml_document(root: str, lines: Sequence[str]) -> str:
 class _Route(NamedTuple):
     """A route over a location; routes sort by how plausible they are."""
 
-    repeats_edge: bool
-    goes_back: bool
+    has_loop: bool
     detour: float
     indices: tuple[int, ...]
 
     @property
     def is_plausible(self) -> bool:
-        return not self.repeats_edge and not self.goes_back and self.detour <= MAX_DETOUR
+        return not self.has_loop and self.detour <= MAX_DETOUR
 
 
 class _FastestWays(NamedTuple):
@@ -384,6 +388,25 @@ class _FastestWays(NamedTuple):
 
     seconds: FloatArray
     towards: IntArray
+
+
+@dataclass(frozen=True)
+class _WaysOver:
+    """The fastest ways from the ends of trips to a location, and from it to the ends of trips; positions of edges."""
+
+    location: CountLocation
+    to_first: _FastestWays
+    from_last: _FastestWays
+    sources: list[int]
+    sinks: list[int]
+
+    def before(self, start: int) -> list[int]:
+        """The way from a start to the first edge of the location, both included."""
+        return _follow(self.to_first.towards[0], start, self.location.indices[0])
+
+    def after(self, end: int) -> list[int]:
+        """The way from the last edge of the location, which is not included, to an end."""
+        return _follow(self.from_last.towards[0], end, self.location.indices[-1])[::-1][1:]
 
 
 class RouteFinder:
@@ -496,32 +519,78 @@ class RouteFinder:
     def _routes_over(
         self, location: CountLocation, weights: FloatArray, rng: np.random.Generator
     ) -> list[tuple[int, ...]]:
+        ways = self._ways_over(location, weights)
+        starts = _draw_ends(ways.sources, weights, rng)
+        ends = _draw_ends(ways.sinks, weights, rng)
+        ends_of_routes = list(dict.fromkeys(zip(starts.tolist(), ends.tolist(), strict=True)))
+
+        routes = self._rate(ways, ends_of_routes)
+        plausible = [route.indices for route in routes if route.is_plausible]
+        if plausible:
+            return plausible[:_MAX_ROUTES]
+
+        # too few draws may miss the only ends between which there is no loop
+        if all(route.has_loop for route in routes):
+            routes = self._rate(ways, self._ends_without_loop(ways)) or routes
+        return [route.indices for route in sorted(routes)[:_MIN_ROUTES] if route.has_loop == min(routes).has_loop]
+
+    def has_route_without_loop(self, location: CountLocation) -> bool:
+        """Return whether a route over a location exists, between any two ends, that passes no node twice."""
+        weights = self._lanes
+        return bool(self._ends_without_loop(self._ways_over(location, weights)))
+
+    def _ways_over(self, location: CountLocation, weights: FloatArray) -> _WaysOver:
         first, last = location.indices[0], location.indices[-1]
         to_first = self._fastest([first], backward=True)
         from_last = self._fastest([last])
         sources = _likely_ends(self._sources, to_first.seconds[0], weights, first)
         sinks = _likely_ends(self._sinks, from_last.seconds[0], weights, last)
-        starts = _draw_ends(sources, weights, rng)
-        ends = _draw_ends(sinks, weights, rng)
-        ends_of_routes = list(dict.fromkeys(zip(starts.tolist(), ends.tolist(), strict=True)))
+        return _WaysOver(location, to_first, from_last, sources, sinks)
 
-        inner_s = sum(self._edges[i].seconds for i in location.indices[1:])
+    def _rate(self, ways: _WaysOver, ends_of_routes: Sequence[tuple[int, int]]) -> list[_Route]:
+        """Return the fastest routes over a location between pairs of ends."""
+        if not ends_of_routes:
+            return []
+        inner_s = sum(self._edges[i].seconds for i in ways.location.indices[1:])
         routes = []
         for (start, end), fastest_s in zip(ends_of_routes, self._direct_s(ends_of_routes), strict=True):
-            before = _follow(to_first.towards[0], start, first)
-            after = _follow(from_last.towards[0], end, last)[::-1][1:]
-            indices = (*before, *location.indices[1:], *after)
-            seconds = to_first.seconds[0][start] + inner_s + from_last.seconds[0][end]
+            indices = (*ways.before(start), *ways.location.indices[1:], *ways.after(end))
+            seconds = ways.to_first.seconds[0][start] + inner_s + ways.from_last.seconds[0][end]
             detour = 1.0
             if seconds > fastest_s:
                 detour = seconds / max(fastest_s, _MIN_SECONDS)
-            goes_back = self._edges[start].from_node == self._edges[end].to_node
-            routes.append(_Route(len(set(indices)) < len(indices), goes_back, detour, indices))
+            routes.append(_Route(self._has_loop(indices), detour, indices))
+        return routes
 
-        plausible = [route.indices for route in routes if route.is_plausible]
-        if plausible:
-            return plausible[:_MAX_ROUTES]
-        return [route.indices for route in sorted(routes)[:_MIN_ROUTES]]
+    def _has_loop(self, indices: Sequence[int]) -> bool:
+        nodes = [self._edges[i].from_node for i in indices]
+        nodes.append(self._edges[indices[-1]].to_node)
+        return len(set(nodes)) < len(nodes)
+
+    def _ends_without_loop(self, ways: _WaysOver) -> list[tuple[int, int]]:
+        """Return all pairs of ends whose fastest way over a location passes no node twice."""
+        inner = ways.location.indices
+        if self._has_loop(inner):
+            return []
+        inner_nodes = {self._edges[i].to_node for i in inner}
+        before: dict[int, set[str]] = {}
+        for start in ways.sources:
+            indices = ways.before(start)
+            if not self._has_loop(indices):
+                before[start] = {self._edges[i].from_node for i in indices}
+        after: dict[int, set[str]] = {}
+        for end in ways.sinks:
+            indices = [inner[-1], *ways.after(end)]
+            if not self._has_loop(indices):
+                after[end] = {self._edges[i].to_node for i in indices[1:]}
+
+        pairs = []
+        for start, nodes_before in before.items():
+            for end, nodes_after in after.items():
+                parts = nodes_before, inner_nodes, nodes_after
+                if len(set().union(*parts)) == sum(map(len, parts)):
+                    pairs.append((start, end))
+        return pairs
 
     def _direct_s(self, pairs: Sequence[tuple[int, int]]) -> list[float]:
         """Return the seconds of the fastest way between each pair of ends."""

@@ -25,8 +25,9 @@ from egvs.core.progress import ProgressCallback
 from egvs.formats import xml
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import Scenario
-from egvs.traffic import fcd, finished_fcd, network, sumo, sumo_folder
+from egvs.traffic import fcd, finished_fcd, locks, network, sumo, sumo_folder
 from egvs.traffic.count_fit import CountFit, count_fits, missed_count_warnings
+from egvs.traffic.locks import DemandKey, RegionWatch, describe_distance
 from egvs.traffic.sumo_folder import SimulationFolder, Timing
 from egvs.traffic.vehicle_boxes import TrafficHook, VehicleSize
 
@@ -49,6 +50,7 @@ class RecordingSummary:
     sumo_seconds: float | None
     flags: list[str] | None
     collisions: int
+    teleports: int = 0
     notes: list[str] = field(default_factory=list)
     counts: list[CountFit] = field(default_factory=list)
     warnings: list[Diagnostic] = field(default_factory=list)
@@ -80,6 +82,8 @@ class Recording:
         Returns the summary after all rows have been read; None for a finished file.
     source
         Source of the rows, for messages; empty for a running SUMO.
+    roads
+        The simulated network, for messages; None if it is not known.
     """
 
     rows: Iterable[pa.Table]
@@ -92,6 +96,7 @@ class Recording:
     persons: Iterable[pa.Table] | None = None
     summary: Callable[[], RecordingSummary | None] = lambda: None
     source: str = ""
+    roads: network.Network | None = None
 
 
 def record_traffic(
@@ -101,6 +106,7 @@ def record_traffic(
     progress: ProgressCallback,
     traci: tuple[str, int] | None,
     world: Georeference,
+    region: Roi | None = None,
 ) -> AbstractContextManager[Recording]:
     """Record the traffic of a scenario.
 
@@ -118,6 +124,8 @@ def record_traffic(
         Host and port of a running SUMO.
     world
         Converts a finished file in degrees to the world frame.
+    region
+        SUMO is stopped, with an error, as soon as the traffic in this region is locked; None for no such region.
 
     Returns
     -------
@@ -140,7 +148,7 @@ def record_traffic(
         return _record_finished(scenario, folder, world)
     if traci is not None:
         return _record_running(scenario, *traci, extensions)
-    return _record_simulated(scenario, folder, progress, extensions)
+    return _record_simulated(scenario, folder, progress, extensions, region)
 
 
 @contextmanager
@@ -160,7 +168,11 @@ def _record_finished(scenario: Scenario, folder: Path, world: Georeference) -> I
 
 @contextmanager
 def _record_simulated(
-    scenario: Scenario, folder: Path, progress: ProgressCallback, extensions: Sequence[TrafficHook]
+    scenario: Scenario,
+    folder: Path,
+    progress: ProgressCallback,
+    extensions: Sequence[TrafficHook],
+    region: Roi | None,
 ) -> Iterator[Recording]:
     where = sumo_folder.traffic_location(scenario)
     prepared = sumo_folder.prepare_simulation(scenario, folder, extensions)
@@ -171,17 +183,25 @@ def _record_simulated(
             sizes = sumo.query_sizes(["-c", sumo_folder.CONFIG_FILE], folder)
         for extension in extensions:
             sizes |= extension.sizes()
-        duration_s = round(simulate(prepared, progress), 3)
+        watch = None
+        if region is not None and prepared.is_generated:  # vehicles of a user's demand may stop on purpose
+            watch = _region_watch(scenario, prepared, region, sizes)
+        duration_s = round(simulate(prepared, progress, watch), 3)
     except sumo.SumoInputError as error:
         hint = "Correct these files; SUMO read copies of them."
         raise InputError(where, f"SUMO cannot run {sources}: {error}", hint) from None
     else:
         collisions = _read_collisions(prepared)
         fits, warnings = _compare_counts(scenario, prepared)
-        warnings += [*_collision_warning(collisions, scenario), *_insertion_warning(prepared, scenario)]
+        teleports = _read_teleports(prepared, scenario)
+        warnings += [
+            *_collision_warning(collisions, scenario),
+            *_insertion_warning(prepared, scenario, fits),
+            *_teleport_warning(teleports, prepared, scenario),
+        ]
         flags = sumo_folder.as_flags(prepared.options | prepared.outputs)
         summary = RecordingSummary(
-            sumo.sumo_version(), duration_s, flags, len(collisions), prepared.notes, fits, warnings
+            sumo.sumo_version(), duration_s, flags, len(collisions), len(teleports), prepared.notes, fits, warnings
         )
         persons = _read_rows(folder / sumo_folder.PERSONS_FILE, "person") if prepared.has_extra_traffic else None
         yield Recording(
@@ -195,6 +215,7 @@ def _record_simulated(
             persons,
             lambda: summary,
             f"{where} ({sources})",
+            prepared.roads,
         )
     finally:
         for name in (*_TABLES, sumo_folder.DRIVEN_ROUTES_FILE, sumo_folder.STATISTICS_FILE):
@@ -375,7 +396,35 @@ def standing_limit_s(cycle_s: float) -> float:
     return max(_MIN_STANDING_LIMIT_S, 2.0 * cycle_s)
 
 
-def simulate(prepared: SimulationFolder, progress: ProgressCallback) -> float:
+def _region_watch(
+    scenario: Scenario, prepared: SimulationFolder, region: Roi, sizes: Mapping[str, VehicleSize]
+) -> RegionWatch:
+    fcd_file, log = (prepared.folder / name for name in (sumo_folder.FCD_FILE, sumo_folder.LOG_FILE))
+    return RegionWatch(fcd_file, log, prepared.timing, region, prepared.roads, sizes, demand_key(scenario))
+
+
+def demand_key(scenario: Scenario) -> DemandKey:
+    """Return the key that sets how much traffic there is, and how to reduce the traffic, for messages."""
+    traffic = scenario.traffic
+    where = sumo_folder.traffic_location(scenario)
+    if traffic.sumocfg is not None:
+        return DemandKey(
+            f"{where}.sumocfg", "Reduce its demand, or correct the signals and connections of its network."
+        )
+    if traffic.routes:
+        return DemandKey(f"{where}.routes", "Reduce the demand, or correct the signals and connections of the network.")
+    if traffic.counts:
+        hint = "Lower per_hour of the counts there, or correct the signals and connections of the network."
+        return DemandKey(f"{where}.counts", hint)
+    for key in ("vehicles", "vehicles_per_lane_km"):
+        if key in traffic.model_fields_set and getattr(traffic, key) is not None:
+            return DemandKey(f"{where}.{key}", "Lower it, or correct the signals and connections of the network.")
+    return DemandKey(
+        f"{where}.network", "Set traffic.vehicles to fewer vehicles, or correct its signals and connections."
+    )
+
+
+def simulate(prepared: SimulationFolder, progress: ProgressCallback, region_watch: RegionWatch | None = None) -> float:
     """Run SUMO.
 
     Parameters
@@ -384,11 +433,18 @@ def simulate(prepared: SimulationFolder, progress: ProgressCallback) -> float:
         Its folder.
     progress
         Reports simulated frames.
+    region_watch
+        Stops SUMO as soon as a region is locked.
 
     Returns
     -------
     float
         The duration in seconds.
+
+    Raises
+    ------
+    RunError
+        When the region is locked, or an output is not complete.
     """
     timing = prepared.timing
 
@@ -397,11 +453,15 @@ def simulate(prepared: SimulationFolder, progress: ProgressCallback) -> float:
         if now_ms is not None:
             frames = (now_ms - timing.first_ms) // timing.period_ms
             progress("frames simulated", min(timing.frames, max(0, frames)), timing.frames)
+        if region_watch is not None:
+            region_watch.update()
 
     start = perf_counter()
     flags = ["-c", sumo_folder.CONFIG_FILE, *sumo_folder.as_flags(prepared.outputs)]
     sumo.run_program("sumo", flags, prepared.folder, prepared.folder / sumo_folder.LOG_FILE, watch)
     check_complete(prepared)
+    if region_watch is not None:
+        region_watch.finish()
     return perf_counter() - start
 
 
@@ -476,17 +536,28 @@ def _collision_warning(collisions: dict[tuple[str, str], Collision], scenario: S
     return [Diagnostic("collisions", sumo_folder.traffic_location(scenario), problem, hint)]
 
 
-def describe_distance(at_m: tuple[float, float], roi: Roi) -> str:
-    """Describe the horizontal distance of a point in the world frame from the region of interest."""
-    axes = zip(at_m, roi.origin_m[:2], roi.size_m[:2], strict=True)
-    distance_m = math.hypot(*(max(low - x, x - low - size, 0.0) for x, low, size in axes))
-    if not distance_m:
-        return "in the region of interest"
-    return f"{distance_m:.0f} m from the region of interest"
+def _read_teleports(prepared: SimulationFolder, scenario: Scenario) -> list[locks.Teleport]:
+    """Return the vehicles that SUMO moved on in the recorded time."""
+    if scenario.traffic.teleport_s is None:
+        return []
+    log = (prepared.folder / sumo_folder.LOG_FILE).read_text(encoding="utf-8", errors="replace")
+    return locks.read_teleports(log, prepared.timing.first_ms / 1000.0)
 
 
-def _insertion_warning(prepared: SimulationFolder, scenario: Scenario) -> list[Diagnostic]:
-    """Warn if many vehicles of a demand had no space to start."""
+def _teleport_warning(
+    teleports: Sequence[locks.Teleport], prepared: SimulationFolder, scenario: Scenario
+) -> list[Diagnostic]:
+    limit_s = scenario.traffic.teleport_s
+    if not teleports or limit_s is None:
+        return []
+    counts = _vehicle_counts(prepared)
+    vehicles = counts["loaded"] - counts["waiting"]
+    names = locks.StreetNames(prepared.roads)
+    return locks.teleport_warning(teleports, vehicles, limit_s, names, scenario.roi.box, demand_key(scenario))
+
+
+def _insertion_warning(prepared: SimulationFolder, scenario: Scenario, fits: Sequence[CountFit]) -> list[Diagnostic]:
+    """Warn if many vehicles of a demand had no space to start, and name the movement that exceeds the network most."""
     if prepared.vehicles is not None:
         return []
     counts = _vehicle_counts(prepared)
@@ -494,6 +565,12 @@ def _insertion_warning(prepared: SimulationFolder, scenario: Scenario) -> list[D
     if waiting <= _MAX_WAITING_SHARE * loaded:
         return []
     problem = f"{waiting} of {loaded} vehicles could not start, because the streets where they start are full"
+    if fits:
+        worst = max(fits, key=lambda fit: fit.counted_per_h - fit.simulated_per_h)
+        problem += (
+            f"; the movement {worst.place} exceeds what the network carries: {worst.simulated_per_h:g} of"
+            f" {worst.counted_per_h:g} vehicles an hour passed"
+        )
     return [
         Diagnostic("waiting", sumo_folder.traffic_location(scenario), problem, "Reduce the demand there, or add lanes.")
     ]

@@ -242,7 +242,8 @@ class SimulationFolder:
             options["fcd-output.attributes"] += ",z,slope"
         if self.has_extra_traffic or not self.is_generated:  # without it, SUMO writes persons among the vehicles
             options["person-fcd-output"] = PERSONS_FILE
-        if not self.has_fixed_count:  # distinguishes an incomplete file from roads without vehicles
+        # distinguishes an incomplete file from roads without vehicles
+        if not self.has_fixed_count or self.options["time-to-teleport"] != "-1":
             options["statistic-output"] = STATISTICS_FILE
         if self.has_counts:
             options["vehroute-output"] = DRIVEN_ROUTES_FILE
@@ -339,19 +340,22 @@ def _make_empty(folder: Path, inputs: Iterable[Path]) -> None:
 
 def _scenario_options(traffic: TrafficConfig, timing: Timing, seed: int) -> dict[str, str]:
     """Return the options that the scenario sets, whatever a user's configuration says."""
-    return {
+    options = {
         "seed": str(seed),
         "begin": _format_seconds(timing.begin_ms),
         "end": _format_seconds(timing.end_ms),
         "step-length": _format_seconds(timing.step_ms),
         "threads": "1",
         "lateral-resolution": f"{traffic.lateral_resolution_m:g}",
-        "time-to-teleport": "-1",
+        "time-to-teleport": "-1" if traffic.teleport_s is None else f"{traffic.teleport_s:g}",
         "collision.action": "warn",
         "collision.check-junctions": "true",
         "no-step-log": "true",
         "duration-log.disable": "true",
     }
+    if traffic.junction_blocker_s is not None:
+        options["ignore-junction-blocker"] = f"{traffic.junction_blocker_s:g}"
+    return options
 
 
 def _format_seconds(time_ms: int) -> str:

@@ -7,6 +7,7 @@ east, y north, z up), metres, radians, metres per second.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass, field
@@ -21,7 +22,8 @@ from egvs.core.grid import Roi
 from egvs.core.progress import ProgressCallback
 from egvs.scenario.model import Scenario
 from egvs.traffic import fcd, vehicle_boxes
-from egvs.traffic.recording import Recording, describe_distance
+from egvs.traffic.locks import StreetNames, describe_distance, is_inside
+from egvs.traffic.recording import Recording, demand_key
 from egvs.traffic.vehicle_boxes import BoxChange, Ints, TrafficHook, VehicleBoxes
 
 STANDING_M_S = 0.1
@@ -129,8 +131,9 @@ class UncountedKind:
 
 @dataclass(frozen=True)
 class StandingVehicle:
-    """A vehicle that was standing: for how many frames, and its position."""
+    """A vehicle that was standing: since which frame, for how many frames, and its position."""
 
+    since: int
     frames: int
     vehicle: str
     at_m: tuple[float, float]
@@ -162,10 +165,22 @@ class TrafficStatistics:
         Vehicles that are ignored in ``longest_jam``.
     longest_jam
         Vehicle that was standing for longest.
+    long_stop_frames
+        A vehicle that was standing for more frames made a long stop.
+    stood_long
+        Names of the vehicles with a long stop.
     overlaps_by_square
         Overlaps in squares of :data:`SQUARE_M`, by number of the square to the east and to the north.
     standing_since
         Vehicles that are standing in the last frame, and the frame since when.
+    standing_at_m
+        Where they are standing.
+    region
+        Where overlaps with blockers are counted; None for nowhere.
+    blocker_frames
+        A vehicle that has stood for so many frames is a blocker.
+    rows_in_region, overlaps_in_region
+        Vehicles in the region, summed over the frames, and overlaps with blockers.
     uncounted
         Statistics of kinds that do not count as vehicles.
     mixed_overlaps
@@ -183,8 +198,15 @@ class TrafficStatistics:
     longest_standing_frames: int = 0
     stopped_on_purpose: Set[str] = frozenset()
     longest_jam: StandingVehicle | None = None
+    long_stop_frames: float = math.inf
+    stood_long: set[str] = field(default_factory=set)
     overlaps_by_square: Counter[tuple[int, int]] = field(default_factory=Counter)
     standing_since: dict[str, int] = field(default_factory=dict)
+    standing_at_m: dict[str, tuple[float, float]] = field(default_factory=dict)
+    region: Roi | None = None
+    blocker_frames: int = 0
+    rows_in_region: int = 0
+    overlaps_in_region: int = 0
     uncounted: dict[str, UncountedKind] = field(default_factory=dict)
     mixed_overlaps: Counter[str] = field(default_factory=Counter)
 
@@ -198,11 +220,12 @@ class TrafficStatistics:
             pairs = _vehicle_pairs(boxes, boxes.part, pairs)
             boxes = boxes.select(boxes.part == 0)
         end = boxes.first_frame + boxes.frames
-        self._add_standing(boxes, end)
+        standing_frames = self._add_standing(boxes, end)
         if boxes.uncounted is not None:
             self._add_uncounted(boxes, boxes.uncounted, pairs)
             mixed = boxes.uncounted[pairs].any(axis=1)
             pairs = (np.cumsum(~boxes.uncounted) - 1)[pairs[~mixed]]
+            standing_frames = standing_frames[~boxes.uncounted]
             boxes = boxes.select(~boxes.uncounted)
         self.vehicles[boxes.first_frame : end] = _boxes_per_frame(boxes, boxes.frame)
         self.names.update(boxes.names[i] for i in np.unique(boxes.code))
@@ -215,6 +238,11 @@ class TrafficStatistics:
         east = np.floor(boxes.x_m[first] / SQUARE_M).astype(int)
         north = np.floor(boxes.y_m[first] / SQUARE_M).astype(int)
         self.overlaps_by_square.update(zip(east.tolist(), north.tolist(), strict=True))
+        if self.region is not None:
+            in_region = _in_region(boxes, self.region)
+            self.rows_in_region += int(np.count_nonzero(in_region))
+            is_blocker = standing_frames >= self.blocker_frames
+            self.overlaps_in_region += int(np.count_nonzero((in_region & is_blocker)[pairs].any(axis=1)))
 
     def _add_uncounted(self, boxes: VehicleBoxes, uncounted: NDArray[np.bool_], pairs: Ints) -> None:
         """Add the boxes that do not count as vehicles, and the overlaps of such boxes."""
@@ -228,28 +256,40 @@ class TrafficStatistics:
             kinds = sorted(boxes.kinds[boxes.kind[i]] for i in pair)
             self.mixed_overlaps[" and ".join(kinds)] += 1
 
-    def _add_standing(self, boxes: VehicleBoxes, end: int) -> None:
-        """Follow the runs of frames in which each vehicle is standing, across groups."""
+    def _add_standing(self, boxes: VehicleBoxes, end: int) -> Ints:
+        """Follow the runs of frames in which each vehicle is standing, across groups.
+
+        Return for how many frames each vehicle has stood; -1 for those that move.
+        """
+        standing_frames = np.full(boxes.frame.size, -1)
         order = np.lexsort((boxes.frame, boxes.code))
         rows = order[boxes.speed_m_s[order] < STANDING_M_S]
         frame, code = boxes.frame[rows], boxes.code[rows]
         begins = np.flatnonzero((np.diff(code, prepend=-1) != 0) | (np.diff(frame, prepend=-2) != 1))
         ends = np.append(begins, rows.size)[1:] - 1
         still_standing: dict[str, int] = {}
+        self.standing_at_m = {}
         for first, last in zip(begins.tolist(), ends.tolist(), strict=True):
             name = boxes.names[code[first]]
             since = int(frame[first])
             if since == boxes.first_frame:
                 since = self.standing_since.get(name, since)
             duration = int(frame[last]) - since
+            standing_frames[rows[first : last + 1]] = frame[first : last + 1] - since
             self.longest_standing_frames = max(self.longest_standing_frames, duration)
             is_longest = self.longest_jam is None or duration > self.longest_jam.frames
+            if duration > self.long_stop_frames and name not in self.stopped_on_purpose:
+                self.stood_long.add(name)
             if is_longest and name not in self.stopped_on_purpose:
                 row = rows[last]
-                self.longest_jam = StandingVehicle(duration, name, (float(boxes.x_m[row]), float(boxes.y_m[row])))
+                self.longest_jam = StandingVehicle(
+                    since, duration, name, (float(boxes.x_m[row]), float(boxes.y_m[row]))
+                )
             if frame[last] == end - 1:
                 still_standing[name] = since
+                self.standing_at_m[name] = float(boxes.x_m[rows[last]]), float(boxes.y_m[rows[last]])
         self.standing_since = still_standing
+        return standing_frames
 
     def to_json(self, period_s: float) -> dict[str, Any]:
         """Return the statistics as JSON.
@@ -276,10 +316,19 @@ class TrafficStatistics:
             "overlapping_pairs": self.overlapping_pairs,
             "frames_with_overlap": self.frames_with_overlap,
         }
+        if self.region is not None:
+            values["overlapping_pairs_in_roi"] = self.overlaps_in_region
         if self.uncounted:
             kinds = {kind: statistics.to_json() for kind, statistics in sorted(self.uncounted.items())}
             values["beside_vehicles"] = kinds | {"overlapping_pairs": dict(sorted(self.mixed_overlaps.items()))}
         return values
+
+
+def _in_region(boxes: VehicleBoxes, region: Roi) -> NDArray[np.bool_]:
+    """Return whether the centre of each box is in a region, seen from above."""
+    (x_m, y_m), (width_m, depth_m) = region.origin_m[:2], region.size_m[:2]
+    inside: NDArray[np.bool_] = (boxes.x_m >= x_m) & (boxes.x_m <= x_m + width_m)
+    return inside & (boxes.y_m >= y_m) & (boxes.y_m <= y_m + depth_m)
 
 
 def _vehicle_pairs(boxes: VehicleBoxes, part: Ints, pairs: Ints) -> Ints:
@@ -331,8 +380,13 @@ def write_trajectories(
     RunError
         When the number of vehicles is not maintained, or a vehicle stands for good.
     """
-    statistics = TrafficStatistics(recording.window.count, stopped_on_purpose=recording.stopped_on_purpose)
     period_s = recording.window.period_ms / 1000.0
+    statistics = TrafficStatistics(recording.window.count, stopped_on_purpose=recording.stopped_on_purpose)
+    statistics.long_stop_frames = LONG_STOP_S / period_s
+    blocker_s = scenario.traffic.junction_blocker_s
+    if blocker_s is not None:
+        statistics.region = scenario.roi.box
+        statistics.blocker_frames = max(0, int(blocker_s / period_s) - 1)  # it stopped between two frames
     changes: list[BoxChange] | None = None
     for group in frame_groups(recording, GROUP_FRAMES):
         uncounted = frozenset[str]().union(*(extension.uncounted_types(recording.sizes) for extension in extensions))
@@ -392,7 +446,7 @@ def check_recording(scenario: Scenario, statistics: TrafficStatistics, recording
     if recording.vehicles is not None and traffic.hold == "exactly":
         _check_vehicle_count(recording.vehicles, statistics, recording.where)
     if recording.standing_limit_s is not None:
-        _check_moving(statistics, recording, recording.standing_limit_s)
+        _check_moving(scenario, statistics, recording, recording.standing_limit_s)
 
 
 def traffic_warnings(statistics: TrafficStatistics, recording: Recording, roi: Roi) -> list[Diagnostic]:
@@ -414,8 +468,25 @@ def traffic_warnings(statistics: TrafficStatistics, recording: Recording, roi: R
         if duration_s > LONG_STOP_S:
             where = f"{recording.where}: {describe_location(jam.at_m, roi)}"
             problem = f"vehicle {jam.vehicle!r} was standing for {duration_s:g} s, longer than any usual red phase"
+            if recording.roads is not None:
+                begin_s = ((recording.window.first_ms or 0) + jam.since * recording.window.period_ms) / 1000.0
+                problem += f", at {StreetNames(recording.roads).at(jam.at_m)}, from {begin_s:g} s on"
+            if statistics.stood_long:
+                number, total = len(statistics.stood_long), len(statistics.names)
+                percent = f"{100 * number / total:.1f} %"
+                problem += (
+                    f"; {number} of {total:,} vehicles ({percent}) stood for more than {LONG_STOP_S:g} s somewhere"
+                )
             hint = "Check the signals and connections of the network there, or reduce the traffic."
             warnings.append(Diagnostic("standing", where, problem, hint))
+    if statistics.overlaps_in_region:
+        per_thousand = 1000 * statistics.overlaps_in_region / statistics.rows_in_region
+        problem = (
+            f"vehicles overlap {statistics.overlaps_in_region} times in the region of interest ({per_thousand:.1f} per"
+            " 1,000 vehicles and frames) with one that blocked them on a junction"
+        )
+        hint = "Reduce the traffic, or remove junction_blocker_s, without which the traffic may lock."
+        warnings.append(Diagnostic("overlaps in roi", f"{recording.where}.junction_blocker_s", problem, hint))
     share = statistics.frames_with_overlap / statistics.frames
     if share > MAX_OVERLAP_SHARE:
         ((east, north), pairs), *_ = statistics.overlaps_by_square.most_common(1)
@@ -443,17 +514,24 @@ def _check_vehicle_count(vehicles: int, statistics: TrafficStatistics, where: st
         )
 
 
-def _check_moving(statistics: TrafficStatistics, recording: Recording, limit_s: float) -> None:
+def _check_moving(scenario: Scenario, statistics: TrafficStatistics, recording: Recording, limit_s: float) -> None:
+    """Raise a RunError if vehicles stand for good.
+
+    Where the number of vehicles is maintained, a jam anywhere collects the vehicles of all streets. Otherwise a jam
+    matters in the region of interest only.
+    """
     period_s = recording.window.period_ms / 1000.0
     jammed_s = {}
     for name, frame in statistics.standing_since.items():
         duration_s = (statistics.frames - 1 - frame) * period_s
-        if name not in recording.stopped_on_purpose and duration_s > limit_s:
+        matters = recording.vehicles is not None or is_inside(statistics.standing_at_m[name], scenario.roi.box)
+        if matters and name not in recording.stopped_on_purpose and duration_s > limit_s:
             jammed_s[name] = duration_s
     if jammed_s:
         longest = max(jammed_s, key=lambda name: jammed_s[name])
+        location = describe_location(statistics.standing_at_m[longest], scenario.roi.box)
+        where, hint = demand_key(scenario)
         raise RunError(
-            f"{recording.where}: the traffic is jammed: {len(jammed_s)} vehicles stand for more than {limit_s:g} s up"
-            f" to the last frame, {longest!r} for {jammed_s[longest]:g} s. Lower traffic.vehicles, or correct the"
-            " signals and connections of the network"
+            f"{where}: the traffic is jammed: {len(jammed_s)} vehicles stand for more than {limit_s:g} s up"
+            f" to the last frame, {longest!r} for {jammed_s[longest]:g} s at {location}. {hint}"
         )

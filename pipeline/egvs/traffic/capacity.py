@@ -1,0 +1,215 @@
+"""Find how much traffic a network carries, by a trial of short simulations.
+
+Assumed flows come from the classes of streets, so they may be more than a junction can take. The trial simulates a
+share of all flows at a time: all of them, then 0.7 of that until a share is carried, then shares between the largest
+that was carried and the smallest that was not. A share is carried if, in a simulation of :data:`DURATION_S`,
+
+- no vehicle stands for more than :data:`MAX_STANDING_S` after the first :data:`WARMUP_S`;
+- fewer than :data:`MAX_WAITING` vehicles wait for space to start;
+- at least :data:`MIN_ARRIVED` of the vehicles that should have arrived have done so.
+
+The simulation is coarse (steps of 0.5 s, no sublanes) and short, so queues that grow slowly do not show. Of a share
+below 1, :data:`RESERVE` is therefore used. Rare locks do not show either.
+
+The same network and flows give the same result.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from egvs.core import files
+from egvs.formats import xml
+from egvs.scenario.traffic_config import CountConfig, TrafficConfig
+from egvs.traffic import demand, sumo, sumo_folder
+from egvs.traffic.network import Network, read_net_xml
+
+DURATION_S, WARMUP_S = 900.0, 300.0
+STEP_S = 0.5
+
+MAX_STANDING_S = 200.0
+MAX_WAITING = 5
+MIN_ARRIVED = 0.9
+
+MAX_RUNS = 6
+RESERVE = 0.92
+
+_FACTOR = 0.7
+_CLOSE_ENOUGH = 1.06
+"""The trial ends when the shares that are and are not carried differ by less than this factor."""
+
+_SAMPLE_S = 10.0
+_MOVED_M = 2.0
+"""A vehicle stands if it moves less than this between two samples."""
+
+_FCD_FILE, _TRIPS_FILE, _STATISTICS_FILE = "trial.csv", "arrivals.xml", "statistics.xml"
+
+
+@dataclass(frozen=True)
+class TrialRun:
+    """A simulation of a share of all flows.
+
+    Attributes
+    ----------
+    share
+        The share.
+    scheduled, arrived
+        Vehicles that should have arrived, and that did.
+    longest_standing_s
+        Longest time that a vehicle stood.
+    waiting
+        Vehicles without space to start, at the end.
+    """
+
+    share: float
+    scheduled: int
+    arrived: int
+    longest_standing_s: float
+    waiting: int
+
+    @property
+    def is_carried(self) -> bool:
+        """Whether the network carries this share."""
+        stands = self.longest_standing_s > MAX_STANDING_S
+        return not stands and self.waiting < MAX_WAITING and self.arrived >= MIN_ARRIVED * self.scheduled
+
+
+@dataclass(frozen=True)
+class Capacity:
+    """What a network carries of its flows.
+
+    Attributes
+    ----------
+    share
+        Share of all flows that it carries, at most 1.
+    runs
+        The simulations of the trial, in order.
+    """
+
+    share: float
+    runs: tuple[TrialRun, ...]
+
+    @property
+    def is_everything(self) -> bool:
+        """Whether all flows are carried in full."""
+        return self.share == 1.0
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether any simulation showed that the share is carried."""
+        return any(run.is_carried for run in self.runs)
+
+
+def scale_flows(flows: Sequence[CountConfig], share: float) -> list[CountConfig]:
+    """Return a share of all flows, rounded to whole vehicles per hour, and at least 1 each."""
+    return [flow.model_copy(update={"per_hour": max(1.0, float(round(flow.per_hour * share)))}) for flow in flows]
+
+
+def find_capacity(network: str, flows: Sequence[CountConfig], junction_blocker_s: float) -> Capacity:
+    """Find the share of all flows that a network carries.
+
+    Parameters
+    ----------
+    network
+        The SUMO network, as text.
+    flows
+        Vehicles per hour at locations of the network.
+    junction_blocker_s
+        As in ``[traffic]``.
+    """
+    runs: list[TrialRun] = []
+    carried, too_much = 0.0, math.inf
+    share = 1.0
+    with files.temporary_folder() as folder:
+        files.write_text(folder / sumo_folder.NETWORK_FILE, network)
+        roads = read_net_xml(folder / sumo_folder.NETWORK_FILE)
+        while len(runs) < MAX_RUNS and too_much > _CLOSE_ENOUGH * carried:
+            run = _simulate(folder, roads, flows, share, junction_blocker_s)
+            runs.append(run)
+            if run.is_carried:
+                carried = share
+            else:
+                too_much = share
+            if carried == 1.0:
+                return Capacity(1.0, tuple(runs))
+            share = round((carried + too_much) / 2 if carried else _FACTOR * too_much, 3)
+    return Capacity(round(RESERVE * (carried or too_much), 3), tuple(runs))
+
+
+def _simulate(
+    folder: Path, roads: Network, flows: Sequence[CountConfig], share: float, junction_blocker_s: float
+) -> TrialRun:
+    scaled = [flow.model_copy(update={"per_hour": flow.per_hour * share}) for flow in flows]
+    traffic = TrafficConfig(network=sumo_folder.NETWORK_FILE, counts=tuple(scaled))
+    seed = np.random.SeedSequence(0)
+    routes = folder / sumo_folder.TRIPS_FILE
+    demand.write_routes(traffic, roads, (0.0, DURATION_S), seed, routes, "assumed flows")
+    files.write_text(folder / sumo_folder.VTYPES_FILE, demand.vtypes_xml(traffic.kinds))
+    options = {
+        "net-file": sumo_folder.NETWORK_FILE,
+        "additional-files": sumo_folder.VTYPES_FILE,
+        "route-files": sumo_folder.TRIPS_FILE,
+        "seed": "1",
+        "end": f"{DURATION_S:g}",
+        "step-length": f"{STEP_S:g}",
+        "threads": "1",
+        "time-to-teleport": "-1",
+        "collision.action": "none",
+        "ignore-junction-blocker": f"{junction_blocker_s:g}",
+        "fcd-output": _FCD_FILE,
+        "fcd-output.attributes": "id,x,y",
+        "device.fcd.begin": f"{WARMUP_S:g}",
+        "device.fcd.period": f"{_SAMPLE_S:g}",
+        "tripinfo-output": _TRIPS_FILE,
+        "statistic-output": _STATISTICS_FILE,
+        "no-step-log": "true",
+        "no-warnings": "true",
+        "duration-log.disable": "true",
+    }
+    sumo.run_program("sumo", sumo_folder.as_flags(options), folder)
+    scheduled, arrived = _arrivals(routes, folder / _TRIPS_FILE)
+    (vehicles,) = (e for e in xml.iter_elements(folder / _STATISTICS_FILE, "statistics") if e.tag == "vehicles")
+    return TrialRun(share, scheduled, arrived, _longest_standing_s(folder / _FCD_FILE), int(vehicles.get("waiting", 0)))
+
+
+def _arrivals(routes: Path, trips: Path) -> tuple[int, int]:
+    """Return how many vehicles should have arrived, and how many did.
+
+    Vehicles arrive, on average, one mean trip after they depart. The whole time counts, also the warm-up: with small
+    flows, the number that departs in a part of the time varies by more than the tenth that may be missing.
+    """
+    durations_s = [float(trip.get("duration", "0")) for trip in xml.iter_elements(trips, "tripinfos")]
+    mean_trip_s = min(WARMUP_S, statistics.fmean(durations_s)) if durations_s else 0.0
+    departs_s = [float(vehicle.get("depart", "0")) for vehicle in xml.iter_elements(routes, "routes")]
+    scheduled = sum(depart_s + mean_trip_s < DURATION_S for depart_s in departs_s)
+    return scheduled, len(durations_s)
+
+
+def _longest_standing_s(fcd: Path) -> float:
+    """Return for how long a vehicle stood at most."""
+    lines = fcd.read_text(encoding="utf-8").splitlines()
+    header = lines[0].split(";") if lines else []
+    if len(lines) < 2:
+        return 0.0
+    column = {name: header.index(name) for name in ("timestep_time", "vehicle_id", "vehicle_x", "vehicle_y")}
+    last: dict[str, tuple[float, float, float]] = {}
+    """Time since when each vehicle stands, and where."""
+    longest_s = 0.0
+    for line in lines[1:]:
+        values = line.split(";")
+        name = values[column["vehicle_id"]]
+        if not name:
+            continue
+        time_s, x_m, y_m = (float(values[column[key]]) for key in ("timestep_time", "vehicle_x", "vehicle_y"))
+        since_s, old_x_m, old_y_m = last.get(name, (time_s, math.inf, math.inf))
+        if math.hypot(x_m - old_x_m, y_m - old_y_m) >= _MOVED_M:
+            since_s, old_x_m, old_y_m = time_s, x_m, y_m
+        last[name] = since_s, old_x_m, old_y_m
+        longest_s = max(longest_s, time_s - since_s)
+    return longest_s

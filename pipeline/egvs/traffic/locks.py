@@ -1,0 +1,353 @@
+"""See locks of the traffic while SUMO runs, and name where and when they happen.
+
+A lock is a group of vehicles that wait for each other. With ``traffic.teleport_s``, SUMO moves a vehicle on that stands
+first on its lane for so long, and reports it in its log: :func:`read_teleports`, :func:`teleport_warning`. This changes
+the record, so the region of interest is refused if it needs this too often.
+
+:class:`RegionWatch` reads the log and the FCD file while SUMO writes them. The region is locked if
+
+- more than :data:`MAX_TELEPORT_SHARE` of the vehicles so far had to be moved on in it, at least
+  :data:`MIN_TELEPORTS`; or
+- a vehicle in it has not moved for two signal cycles, at least :data:`STANDING_LIMIT_S`, and the road ahead of it is
+  free; or for twice as long, whatever is ahead.
+
+The decision depends on the content of these files only, not on when they are read: a record that is refused is refused
+at the same time again.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+
+from egvs.core.errors import Diagnostic, RunError
+from egvs.core.grid import FloatArray, Roi
+from egvs.traffic.network import Network
+from egvs.traffic.sumo_folder import Timing
+from egvs.traffic.vehicle_boxes import VehicleSize
+
+XY = tuple[float, float]
+
+MAX_TELEPORT_SHARE = 0.05
+MIN_TELEPORTS = 10
+
+STANDING_LIMIT_S = 300.0
+"""Longer than most waits to give way in dense traffic."""
+
+SAMPLE_S = 10.0
+MOVED_M = 2.0
+"""A vehicle stands if it moves less than this between two samples."""
+
+FREE_AHEAD_M, LANE_HALF_WIDTH_M = 10.0, 1.5
+"""The road ahead of a vehicle is free if no other vehicle is in this rectangle."""
+
+_TELEPORT = re.compile(r"Teleporting vehicle '(.*?)'; waited too long \((.*?)\), lane='(.*?)', time=(\d+(?:\.\d+)?)")
+_DEFAULT_LENGTH_M = 5.0
+
+
+class Teleport(NamedTuple):
+    """A vehicle that SUMO moved on: its name, SUMO's reason, its lane and the time."""
+
+    vehicle: str
+    reason: str
+    lane: str
+    time_s: float
+
+
+def read_teleports(log: str, first_s: float) -> list[Teleport]:
+    """Return the vehicles that SUMO moved on in the recorded time.
+
+    Parameters
+    ----------
+    log
+        SUMO's log.
+    first_s
+        Time of the first frame.
+    """
+    teleports = []
+    for vehicle, reason, lane, time in _TELEPORT.findall(log):
+        if float(time) >= first_s:
+            teleports.append(Teleport(vehicle, reason, lane, float(time)))
+    return teleports
+
+
+class DemandKey(NamedTuple):
+    """The key of a scenario that sets how much traffic there is, and how to reduce the traffic."""
+
+    where: str
+    hint: str
+
+
+class StreetNames:
+    """Names locations on a network as a user knows them: by junction and street.
+
+    Parameters
+    ----------
+    roads
+        The network.
+    """
+
+    def __init__(self, roads: Network) -> None:
+        self._edges = [edge for edge in roads.all_edges if edge.function in ("", "internal")]
+        self._by_lane = {f"{edge.id}_{i}": edge for edge in self._edges for i in range(len(edge.lanes))}
+        self._nodes = {node.id: node for node in roads.junctions}
+
+    def of_lane(self, lane: str) -> str:
+        """Return the junction that a lane leads to, and the street, e.g. ``"junction J1, Main Street"``."""
+        edge = self._by_lane.get(lane)
+        if edge is None:
+            return f"lane {lane}"
+        node = edge.to_node or _node_of_internal_edge(edge.id)
+        return f"junction {node}, {edge.name}" if edge.name else f"junction {node}, edge {edge.id}"
+
+    def end_of_lane(self, lane: str) -> XY | None:
+        """Return where a lane ends; None for an unknown lane."""
+        edge = self._by_lane.get(lane)
+        return None if edge is None else edge.end_m
+
+    def at(self, at_m: XY) -> str:
+        """Return the junction and the street at a position."""
+        lanes = list(self._by_lane)
+        lines = [self._by_lane[lane].lanes[int(lane.rpartition("_")[2])].shape_m[:, :2] for lane in lanes]
+        distances = [shapely.Point(at_m).distance(_line(points)) for points in lines]
+        return self.of_lane(lanes[int(np.argmin(distances))])
+
+
+def _line(points: FloatArray) -> shapely.Geometry:
+    return shapely.LineString(points) if len(points) > 1 else shapely.Point(points[0])
+
+
+def _node_of_internal_edge(edge_id: str) -> str:
+    return edge_id[1:].rpartition("_")[0]
+
+
+def teleport_warning(
+    teleports: Sequence[Teleport], vehicles: int, limit_s: float, names: StreetNames, roi: Roi, demand: DemandKey
+) -> list[Diagnostic]:
+    """Warn about vehicles that SUMO moved on, with the junctions, streets and times.
+
+    Parameters
+    ----------
+    teleports
+        From :func:`read_teleports`.
+    vehicles
+        Number of all vehicles.
+    limit_s
+        ``traffic.teleport_s``.
+    names
+        Names junctions and streets.
+    roi
+        The region of interest.
+    demand
+        For messages.
+    """
+    if not teleports:
+        return []
+    numbers = Counter(names.of_lane(teleport.lane) for teleport in teleports)
+    locations = []
+    for location, number in numbers.most_common(3):
+        there = [teleport for teleport in teleports if names.of_lane(teleport.lane) == location]
+        end_m = names.end_of_lane(there[0].lane)
+        distance = "" if end_m is None else f", {describe_distance(end_m, roi)}"
+        period = f"{there[0].time_s:.0f} to {there[-1].time_s:.0f} s" if number > 1 else f"{there[0].time_s:.0f} s"
+        locations.append(f"{number} at {location} ({period}{distance})")
+    count = len({teleport.vehicle for teleport in teleports})
+    share = f"{count / max(vehicles, 1):.1%}".replace("%", " %")
+    problem = (
+        f"{count} of {vehicles:,} vehicles ({share}) stood first on their lane for {limit_s:g} s and were moved on:"
+        f" {'; '.join(locations)}"
+    )
+    return [Diagnostic("teleports", demand.where, problem, demand.hint)]
+
+
+def is_inside(at_m: XY, roi: Roi) -> bool:
+    """Return whether a position is in the region of interest, seen from above."""
+    return all(
+        low <= value <= low + size for value, low, size in zip(at_m, roi.origin_m[:2], roi.size_m[:2], strict=True)
+    )
+
+
+def describe_distance(at_m: XY, roi: Roi) -> str:
+    """Describe the horizontal distance of a point in the world frame from the region of interest."""
+    axes = zip(at_m, roi.origin_m[:2], roi.size_m[:2], strict=True)
+    distance_m = math.hypot(*(max(low - x, x - low - size, 0.0) for x, low, size in axes))
+    if not distance_m:
+        return "in the region of interest"
+    return f"{distance_m:.0f} m from the region of interest"
+
+
+class _Vehicle(NamedTuple):
+    """A row of the FCD file: position of the front bumper, angle in degrees clockwise from north, and type."""
+
+    at_m: XY
+    angle_deg: float
+    vtype: str
+
+
+@dataclass
+class _Standing:
+    """Since when, and where, a vehicle stands."""
+
+    since_ms: int
+    at_m: XY
+
+
+class RegionWatch:
+    """Watches a region while SUMO writes its files, and raises an error as soon as the region is locked.
+
+    Parameters
+    ----------
+    fcd, log
+        Files that SUMO writes: FCD as CSV, and its log.
+    timing
+        Times of the simulation.
+    roi
+        The region.
+    roads
+        The network, for names in messages.
+    sizes
+        Sizes of the vehicle types.
+    demand
+        For messages.
+    """
+
+    def __init__(
+        self, fcd: Path, log: Path, timing: Timing, roi: Roi, roads: Network, sizes: Mapping[str, VehicleSize],
+        demand: DemandKey,
+    ) -> None:  # fmt: skip
+        self._fcd, self._log = fcd, log
+        self._first_ms = timing.first_ms
+        self._sample_ms = timing.period_ms * max(1, round(SAMPLE_S * 1000 / timing.period_ms))
+        self._roi, self._roads, self._sizes = roi, roads, sizes
+        self._limit_ms = round(1000 * max(STANDING_LIMIT_S, 2.0 * roads.cycle_s))
+        self._demand = demand
+        self._offset = 0
+        self._rest = b""
+        self._columns: dict[str, int] = {}
+        self._time, self._now_ms = b"", -1
+        self._log_bytes = 0
+        self._teleports: list[Teleport] = []
+        self._vehicles: dict[str, _Vehicle] = {}
+        self._standing: dict[str, _Standing] = {}
+        self._names: set[str] = set()
+
+    def update(self) -> None:
+        """Read what SUMO wrote since the last call.
+
+        Raises
+        ------
+        RunError
+            When the region is locked.
+        """
+        if not self._fcd.is_file():
+            return
+        with self._fcd.open("rb") as file:
+            file.seek(self._offset)
+            content = self._rest + file.read()
+            self._offset = file.tell()
+        *lines, self._rest = content.split(b"\n")
+        for line in lines:
+            self._add(line)
+
+    def finish(self) -> None:
+        """Read the rest, after SUMO has ended."""
+        self.update()
+        self._check_sample()
+
+    def _add(self, line: bytes) -> None:
+        if not self._columns:  # the time is the first column
+            header = line.decode("utf-8", "replace").split(";")
+            self._columns = {name.rpartition("vehicle_")[2]: i for i, name in enumerate(header)}
+            return
+        time = line.partition(b";")[0]
+        if time != self._time:
+            self._check_sample()
+            self._time, self._now_ms, self._vehicles = time, round(float(time or b"-1") * 1000), {}
+        if (self._now_ms - self._first_ms) % self._sample_ms:
+            return
+        values = line.decode("utf-8", "replace").split(";")
+        if len(values) < len(self._columns) or not values[self._columns["id"]]:
+            return
+        x_m, y_m, angle_deg = (float(values[self._columns[key]]) for key in ("x", "y", "angle"))
+        vehicle = _Vehicle((x_m, y_m), angle_deg, values[self._columns["type"]])
+        self._vehicles[values[self._columns["id"]]] = vehicle
+
+    def _check_sample(self) -> None:
+        """Check the vehicles of a sample that is complete."""
+        if not self._vehicles:
+            return
+        self._names.update(self._vehicles)
+        standing = {}
+        for name, vehicle in self._vehicles.items():
+            before = self._standing.get(name)
+            if before is None or math.dist(before.at_m, vehicle.at_m) >= MOVED_M:
+                before = _Standing(self._now_ms, vehicle.at_m)
+            standing[name] = before
+        self._standing = standing
+        self._check_teleports()
+        for name, vehicle in self._vehicles.items():
+            duration_ms = self._now_ms - standing[name].since_ms
+            if duration_ms < self._limit_ms or not is_inside(vehicle.at_m, self._roi):
+                continue
+            if duration_ms >= 2 * self._limit_ms or self._is_free_ahead(name):
+                location = self._street_names.at(vehicle.at_m)
+                raise self._error(
+                    f"vehicle {name!r} stands at {location} (x {vehicle.at_m[0]:.0f} m, y {vehicle.at_m[1]:.0f} m) from"
+                    f" {standing[name].since_ms / 1000:.0f} s to {self._now_ms / 1000:.0f} s"
+                )
+
+    def _check_teleports(self) -> None:
+        log_bytes = self._log.stat().st_size if self._log.is_file() else 0
+        if log_bytes != self._log_bytes:
+            self._log_bytes = log_bytes
+            text = self._log.read_text(encoding="utf-8", errors="replace")
+            self._teleports = [t for t in read_teleports(text, self._first_ms / 1000) if self._is_at_region(t)]
+        inside = [teleport for teleport in self._teleports if teleport.time_s * 1000 <= self._now_ms]
+        if len(inside) < MIN_TELEPORTS or len(inside) <= MAX_TELEPORT_SHARE * len(self._names):
+            return
+        locations = Counter(self._street_names.of_lane(teleport.lane) for teleport in inside)
+        ((location, number),) = locations.most_common(1)
+        raise self._error(
+            f"{len(inside)} of {len(self._names)} vehicles had to be moved on up to {self._now_ms / 1000:.0f} s,"
+            f" {number} of them at {location}"
+        )
+
+    def _error(self, problem: str) -> RunError:
+        where, hint = self._demand
+        return RunError(f"{where}: the traffic in the region of interest is locked: {problem}. {hint}")
+
+    @cached_property
+    def _street_names(self) -> StreetNames:
+        return StreetNames(self._roads)
+
+    def _is_at_region(self, teleport: Teleport) -> bool:
+        end_m = self._street_names.end_of_lane(teleport.lane)
+        return end_m is not None and is_inside(end_m, self._roi)
+
+    def _is_free_ahead(self, name: str) -> bool:
+        """Return whether no other vehicle is just ahead of a vehicle."""
+        mine = self._vehicles[name]
+        ahead = math.radians(mine.angle_deg)
+        for other_name, other in self._vehicles.items():
+            if other_name == name or math.dist(mine.at_m, other.at_m) > 50.0:
+                continue
+            size = self._sizes.get(other.vtype)
+            length_m = _DEFAULT_LENGTH_M if size is None else size.length_m
+            heading = math.radians(other.angle_deg)
+            for back_m in (0.0, length_m / 2, length_m):
+                dx = other.at_m[0] - back_m * math.sin(heading) - mine.at_m[0]
+                dy = other.at_m[1] - back_m * math.cos(heading) - mine.at_m[1]
+                along_m = dx * math.sin(ahead) + dy * math.cos(ahead)
+                across_m = dx * math.cos(ahead) - dy * math.sin(ahead)
+                if 0.0 < along_m <= FREE_AHEAD_M and abs(across_m) <= LANE_HALF_WIDTH_M:
+                    return False
+        return True
