@@ -49,6 +49,6 @@ def write_town(path: Path, kind: str, seed: int) -> list[tuple[float, float]]:
         text = "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags.items())
         refs = "".join(f'<nd ref="{numbers[node]}"/>' for node in (start, end))
         lines.append(f'<way id="{number}">{refs}{text}</way>')
-    path.write_text("\n".join([*lines, "</osm>", ""]))
+    path.write_text("\n".join([*lines, "</osm>", ""]), encoding="utf-8")
     signals.sort(key=lambda node: math.dist(node.at_m, middle))
     return [degrees(node.at_m) for node in signals]
