@@ -9,7 +9,7 @@ from egvs.core.errors import InputError
 from egvs.core.package_data import data_folder
 
 DEMO = "demo"
-"""The scenario of ``egvs demo``; its traffic is recorded, so that SUMO need not run."""
+"""The scenario of ``egvs demo``; its traffic was simulated in advance, so that SUMO need not run."""
 
 
 def copy_scenario(name: str, folder: Path) -> None:
