@@ -167,7 +167,9 @@ def test_names_differences_of_program(requirements: Requirements, name: str, tex
     answer = describe_this_process(requirements)
     answer["program"] = answer["program"] | {name: "other"}
     expected = text.format(worker_check.program_versions(requirements.libraries).get(name))
-    assert problem_texts(answer, requirements) == [f"another version of the program ({expected})"]
+    assert problem_texts(answer, requirements) == [
+        f"the program differs from the one that started the run ({expected})"
+    ]
 
 
 def test_names_folders_that_worker_lacks(tmp_path: Path, requirements: Requirements) -> None:
@@ -234,7 +236,7 @@ def test_ends_if_no_worker_is_acceptable(cluster: RealCluster, jobs: list[Job], 
         scheduler.run_jobs(cluster.client, jobs)
     assert caught.value.exit_code == 2
     assert "no connected worker can run this city" in str(caught.value)
-    assert "get no tasks: another version of the program" in str(caught.value)
+    assert "get no tasks: the program differs from the one that started the run" in str(caught.value)
     assert all(address in str(caught.value) for address in cluster.names())
 
 

@@ -280,7 +280,7 @@ REJECTED = {
     ),
     "a period of the mix": (
         ["--count", "2", "--set", "placement.periods=['a']", "--set", HALVES],
-        'placement.periods: a has no effect with objective = "mean"',
+        'placement.periods: the key has no effect with objective = "mean"',
     ),
     "too much of a zone": (
         ["--count", "2", "--set", ZONE % (1.0, 5)],

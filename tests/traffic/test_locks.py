@@ -75,7 +75,7 @@ def test_warning_names_junction_street_times_and_share(roads):
     (result,) = locks.teleport_warning(teleports, 300, 180.0, StreetNames(roads), ROI, DEMAND)
     assert result.rule == "teleports" and not result.is_error and result.where == "s.toml: traffic.counts"
     assert result.problem == (
-        "3 of 300 vehicles (1.0 %) stood first on their lane for 180 s and were moved on:"
+        "3 of 300 vehicles (1.0 %) stood at the head of their lane for 180 s and were moved on:"
         " 2 at junction j, Main Street (100 to 500 s, in the region of interest);"
         " 1 at junction b, edge out (400 s, 275 m from the region of interest)"
     )
@@ -87,7 +87,7 @@ def test_region_is_locked_when_a_vehicle_stands_with_free_road_ahead(tmp_path, r
     with pytest.raises(RunError) as caught:
         watch(tmp_path, roads).finish()
     assert str(caught.value) == (
-        "s.toml: traffic.counts: the traffic in the region of interest is locked: vehicle 'stuck' stands at junction j,"
+        "s.toml: traffic.counts: the traffic in the region of interest is locked: vehicle 'stuck' stood at junction j,"
         " Main Street (x -10 m, y 0 m) from 0 s to 300 s. Lower per_hour."
     )
 
@@ -136,9 +136,7 @@ def test_region_is_locked_when_too_many_vehicles_are_moved_on(tmp_path, roads):
     ]
     (tmp_path / "sumo.log").write_text("\n".join(lines) + "\n")
     (tmp_path / "fcd.csv").write_text(rows(range(300), *((f"v{i}", -100, 3 * i, 90, 5) for i in range(50))))
-    with pytest.raises(
-        RunError, match=r"10 of 50 vehicles had to be moved on up to 100 s, 10 of them at junction j, M"
-    ):
+    with pytest.raises(RunError, match=r"10 of 50 vehicles had to be moved on by 100 s, 10 of them at junction j, M"):
         watch(tmp_path, roads).finish()
     (tmp_path / "fcd.csv").write_text(rows(range(300), *((f"v{i}", -100, 3 * i, 90, 5) for i in range(1000))))
     watch(tmp_path, roads).finish()  # 2.9 % of the vehicles
@@ -174,7 +172,7 @@ def test_locked_region_is_refused_while_sumo_runs(locked, tmp_path):
     reported = []
     with pytest.raises(
         RunError,
-        match=r"traffic\.counts: the traffic in the region of interest is locked: vehicle .* stands at junction A0",
+        match=r"traffic\.counts: the traffic in the region of interest is locked: vehicle .* stood at junction A0",
     ):
         run_stage(
             traffic,
@@ -200,7 +198,7 @@ def test_vehicles_are_moved_on_and_counted(locked, tmp_path):
     result = run_stage(traffic, scene, tmp_path / "a")
     (warning,) = [warning for warning in result["warnings"] if warning["rule"] == "teleports"]
     assert result["teleports"] > 3
-    assert "stood first on their lane for 120 s and were moved on" in warning["problem"]
+    assert "stood at the head of their lane for 120 s and were moved on" in warning["problem"]
     assert "at junction A0, edge left0A0" in warning["problem"]
     run_stage(traffic, scene, tmp_path / "b")
     files = [(tmp_path / run / "trajectories.parquet").read_bytes() for run in "ab"]

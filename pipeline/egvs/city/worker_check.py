@@ -203,7 +203,9 @@ def find_problems(answer: WorkerAnswer, requirements: Requirements) -> list[Prob
             problem = (
                 f"{folder}: expected at least {MIN_FREE_BYTES / 1e6:.0f} MB of free disk space, got {free / 1e6:.1f} MB"
             )
-            problems.append(Problem(problem, "Remove files, or set TMPDIR to a larger disk."))
+            problems.append(
+                Problem(problem, "Remove files, or use a folder on a larger disk (for temporary files, set TMPDIR).")
+            )
     return problems
 
 
@@ -217,4 +219,4 @@ def _program_problems(actual: dict[str, str], expected: dict[str, str]) -> Itera
     if [name for name in {**expected, **actual} if expected.get(name) != actual.get(name)] == ["source"]:
         differences.append("the version is the same, but the source code is not")
     hint = "Install the same version on every machine, and restart the worker."
-    yield Problem(f"another version of the program ({'; '.join(differences)})", hint)
+    yield Problem(f"the program differs from the one that started the run ({'; '.join(differences)})", hint)

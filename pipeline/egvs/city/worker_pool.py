@@ -177,7 +177,9 @@ class WorkerPool:
             self._client.run_on_scheduler(worker_check.program_versions, ())
         except (ImportError, AttributeError) as error:
             where = f"the scheduler at {self._client.scheduler.address}"
-            raise InputError(where, f"cannot import egvs ({error})", "Install egvs there, and restart it.") from None
+            raise InputError(
+                where, f"cannot import egvs ({error})", "Install egvs there, and restart the scheduler."
+            ) from None
 
     def _wait_for_first(self, on_wait: Callable[[], None]) -> None:
         from distributed.comm import CommClosedError
@@ -244,11 +246,11 @@ class WorkerPool:
         if error is None:
             worker.host, worker.problems = worker.answer.result()
         elif isinstance(error, TimeoutError):
-            worker.problems = [Problem(f"it does not answer within {ANSWER_TIMEOUT_S:.0f} s", _CALL_HINT)]
+            worker.problems = [Problem(f"no answer within {ANSWER_TIMEOUT_S:.0f} s", _CALL_HINT)]
         elif isinstance(error, OSError):  # it is about to be removed from the list, or will be asked again
             worker.problems = None
         else:
-            worker.problems = [Problem(f"it cannot answer ({type(error).__name__}: {error})", _CALL_HINT)]
+            worker.problems = [Problem(f"the check failed ({type(error).__name__}: {error})", _CALL_HINT)]
         worker.answer, worker.answered_s = None, time.monotonic()
 
     async def _ask(self, address: str) -> tuple[str, list[Problem]]:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="egvs",
-    help="Rank candidate sites for roadside LiDARs by the Entropy-Guided Visibility Score.",
+    help="Rank candidate sites for roadside LiDARs by how well they see the traffic.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -334,7 +334,7 @@ def effects(
 def _unmeasured_effects(statuses: Sequence[EffectStatus], costs: Collection[str] | None, scenario: Scenario) -> str:
     """Return the named effects without a measured cost, as text; empty if there is none."""
     if costs is None:
-        return "they"
+        return "them"
     active = [status.name for status in statuses if status.state == "on" and status.name in scenario.effects.named]
     return ", ".join(name for name in active if name not in costs)
 
@@ -492,8 +492,8 @@ def new(
         str,
         typer.Option(
             metavar="LEVEL",
-            help="light, medium or heavy: 40, 75 or 100 % of what the junction carries of the flow that is usual for"
-            " its road classes.",
+            help="light, medium or heavy: 40, 75 or 100 % of the flow that the junction can carry, up to the usual flow"
+            " for its road classes.",
         ),
     ] = "medium",
 ) -> None:

@@ -255,8 +255,9 @@ def print_plan(placed: CityPlacement) -> None:
     if plan.joint_of_all > 0:
         share = plan.joint / plan.joint_of_all
     proved = math.floor(plan.certificate * 1e4) / 1e2  # never rounded up
+    sensors = "1 sensor" if len(plan.sensors) == 1 else f"{len(plan.sensors)} sensors"
     out.print(
-        f"{len(plan.sensors)} sensors at {len(plan.by_junction)} of {plan.junctions} junctions{cost}: "
+        f"{sensors} at {len(plan.by_junction)} of {plan.junctions} junctions{cost}: "
         f"{label.label} {label.value(plan.joint)}, {share:.1%} of the score of all {plan.candidates:,} candidates "
         f"together; proved: at least {proved:.2f} % of the best possible score"
     )

@@ -363,8 +363,8 @@ def _check_zone_reachable(scenario: Scenario, demand: Demand, reachable: float) 
     sensors = f" by {zone.by} sensors" if zone.by > 1 else ""
     raise InputError(
         f"{scenario.file}: placement.zones.{demand.term.name}.share",
-        f"expected a share that the candidates can reach, got {zone.share:g}: together they see {reachable:.3g} of the "
-        f"zone's entropy{sensors}",
+        f"expected a share that the candidates can reach, got {zone.share:g}: with all of them,"
+        f" {reachable:.3g} of the zone's entropy is seen{sensors}",
         f"Set it to at most {np.floor(reachable * 1000) / 1000:g}, or add candidates.",
     )
 
@@ -400,7 +400,7 @@ def _check_periods(scenario: Scenario) -> None:
             raise InputError(where, f"no period {name!r}", hint)
     if placement.periods and placement.objective == "mean":
         periods = ", ".join(placement.periods)
-        problem_text = f'{periods} has no effect with objective = "mean", which mixes all periods'
+        problem_text = f'the key has no effect with objective = "mean", which mixes all periods (got {periods})'
         raise InputError(where, problem_text, 'Set placement.objective to "worst", or remove the key.')
 
 

@@ -122,7 +122,7 @@ def _feature_columns(where: str, feature: Any, reading: CoordinateReading) -> di
         ):
             values = (properties.get("name"), *_point_to_world(point, reading))
         case _:
-            expected = "expected a Feature with properties whose geometry is a Point of two or three coordinates"
+            expected = "expected a Feature that has properties and a Point geometry with two or three coordinates"
             raise InputError(where, f"{expected}, got {reprlib.repr(feature)[:120]}")
     row = {key: value for key, value in properties.items() if key != "name"}
     for key, value in zip(REQUIRED_COLUMNS, values, strict=False):

@@ -163,8 +163,8 @@ def teleport_warning(
     count = len({teleport.vehicle for teleport in teleports})
     share = f"{count / max(vehicles, 1):.1%}".replace("%", " %")
     problem = (
-        f"{count} of {vehicles:,} vehicles ({share}) stood first on their lane for {limit_s:g} s and were moved on:"
-        f" {'; '.join(locations)}"
+        f"{count} of {vehicles:,} vehicles ({share}) stood at the head of their lane for {limit_s:g} s and were moved"
+        f" on: {'; '.join(locations)}"
     )
     return [Diagnostic("teleports", demand.where, problem, demand.hint)]
 
@@ -301,7 +301,7 @@ class RegionWatch:
             if duration_ms >= 2 * self._limit_ms or self._is_free_ahead(name):
                 location = self._street_names.at(vehicle.at_m)
                 raise self._error(
-                    f"vehicle {name!r} stands at {location} (x {vehicle.at_m[0]:.0f} m, y {vehicle.at_m[1]:.0f} m) from"
+                    f"vehicle {name!r} stood at {location} (x {vehicle.at_m[0]:.0f} m, y {vehicle.at_m[1]:.0f} m) from"
                     f" {standing[name].since_ms / 1000:.0f} s to {self._now_ms / 1000:.0f} s"
                 )
 
@@ -317,7 +317,7 @@ class RegionWatch:
         locations = Counter(self._street_names.of_lane(teleport.lane) for teleport in inside)
         ((location, number),) = locations.most_common(1)
         raise self._error(
-            f"{len(inside)} of {len(self._names)} vehicles had to be moved on up to {self._now_ms / 1000:.0f} s,"
+            f"{len(inside)} of {len(self._names)} vehicles had to be moved on by {self._now_ms / 1000:.0f} s,"
             f" {number} of them at {location}"
         )
 

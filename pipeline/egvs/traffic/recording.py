@@ -420,7 +420,7 @@ def demand_key(scenario: Scenario) -> DemandKey:
         if key in traffic.model_fields_set and getattr(traffic, key) is not None:
             return DemandKey(f"{where}.{key}", "Lower it, or correct the signals and connections of the network.")
     return DemandKey(
-        f"{where}.network", "Set traffic.vehicles to fewer vehicles, or correct its signals and connections."
+        f"{where}.network", "Set traffic.vehicles to a lower number, or correct the network's signals and connections."
     )
 
 
@@ -568,7 +568,7 @@ def _insertion_warning(prepared: SimulationFolder, scenario: Scenario, fits: Seq
     if fits:
         worst = max(fits, key=lambda fit: fit.counted_per_h - fit.simulated_per_h)
         problem += (
-            f"; the movement {worst.place} exceeds what the network carries: {worst.simulated_per_h:g} of"
+            f"; the count of {worst.place} exceeds what the network can carry: {worst.simulated_per_h:g} of"
             f" {worst.counted_per_h:g} vehicles an hour passed"
         )
     return [
