@@ -110,7 +110,7 @@ def test_region_is_not_locked(tmp_path, roads, vehicles, seconds):
 def test_vehicle_behind_another_is_locked_after_twice_the_time(tmp_path, roads):
     """The first of both is outside the region."""
     (tmp_path / "fcd.csv").write_text(rows(range(700), ("second", 20, 0, 90), ("first", 27, 0, 90)))
-    with pytest.raises(RunError, match=r"'second' stands at .* from 0 s to 600 s"):
+    with pytest.raises(RunError, match=r"'second' stood at .* from 0 s to 600 s"):
         watch(tmp_path, roads).finish()
 
 
