@@ -78,7 +78,7 @@ def test_parquet_and_schemas_are_read_in_one_place() -> None:
         for node in ast.walk(tree(name))
         if isinstance(node, ast.Constant) and node.value == "data_schemas"
     }
-    assert named == {"artefacts/parquet.py"}
+    assert named == {"core/package_data.py"}
 
 
 @pytest.mark.system

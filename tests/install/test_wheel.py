@@ -28,7 +28,7 @@ COMMANDS_WITH_EXTRAS = {
     ("figure", "runs/myplace", "--what", "ranking"): "figure",
     ("accuracy", "myplace", *FEW): "figure",
     ("validate", "myplace", *FEW): "validate",
-    ("city", "run", "."): "cluster",
+    ("city", "run", "town"): "cluster",
 }
 """Commands of the README, and the extra that each needs."""
 
@@ -125,6 +125,7 @@ def test_commands_of_the_readme_work_or_name_their_extra(installed: Installed, w
     installed.egvs("verify", "runs/myplace")
     assert (runs / "report.html").exists() and (runs / "placement.parquet").exists()
 
+    installed.egvs("city", "new", "town", "--osm", "extract.osm")
     for command, extra in COMMANDS_WITH_EXTRAS.items():
         (message,) = installed.egvs(*command, code=2).stderr.splitlines()
         assert f"pip install 'egvs[{extra}]'" in message, message

@@ -26,7 +26,7 @@ import pyarrow.parquet as pq
 from egvs.core import files, limits, reading
 from egvs.core.errors import InputError
 from egvs.core.grid import Grid
-from egvs.core.package_data import data_folder
+from egvs.core.package_data import SCHEMAS, data_folder
 
 _REMAKE_HINT = "Create the file again."
 
@@ -37,7 +37,7 @@ SCHEMA_VERSION = 1
 
 def schema_folder() -> Path:
     """The folder of the Table Schemas, one for each artefact."""
-    return data_folder("data_schemas")
+    return data_folder(SCHEMAS)
 
 
 @cache

@@ -24,7 +24,7 @@ from typing import NamedTuple, TypedDict
 
 from egvs._version import __version__
 from egvs.core.errors import EgvsError
-from egvs.core.package_data import data_folder
+from egvs.core.package_data import SCHEMAS, data_folder
 
 STAGE_MODULES = tuple(f"egvs.stages.{name}" for name in ("check", "statics", "scan", "traffic", "tpog", "score"))
 
@@ -36,7 +36,7 @@ MIN_FREE_BYTES = 32_000_000
 """A worker with less free disk space gets no tasks: the artefacts of one junction would fill the disk."""
 
 _PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
-_NO_SOURCE = frozenset({"__pycache__", "data_schemas", "scenarios"})
+_NO_SOURCE = frozenset({"__pycache__", SCHEMAS, "scenarios"})
 """Folders in the package that are no source; an installed package contains the schemas, a checkout does not."""
 
 
@@ -114,7 +114,7 @@ def program_versions(libraries: Sequence[str]) -> dict[str, str]:
 def _source_digest() -> str:
     """Return a digest of all files of the package and of its schemas: two checkouts of one version may differ."""
     digest = hashlib.sha256()
-    for root in (_PACKAGE_FOLDER, data_folder("data_schemas")):
+    for root in (_PACKAGE_FOLDER, data_folder(SCHEMAS)):
         for path in sorted(_source_files(root), key=lambda path: path.relative_to(root).as_posix()):
             digest.update(f"{path.relative_to(root).as_posix()}\n{path.stat().st_size}\n".encode())
             digest.update(path.read_bytes())

@@ -10,6 +10,9 @@ from pathlib import Path
 
 from egvs.core.errors import MissingBackendError
 
+SCHEMAS = "data_schemas"
+"""Folder of the schemas of artefacts."""
+
 
 def data_folder(name: str) -> Path:
     """Return the folder ``name`` of the files that come with this program.
