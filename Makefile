@@ -20,14 +20,14 @@ test-slow: $(VENV)/.installed-dev
 test-train: $(VENV)/.installed-train
 	$(BIN)/python -m pytest -n 0 tests/validation/training
 
-# The lowest versions that pyproject.toml allows, in an environment of its own.
+# The lowest versions that pyproject.toml allows, in an environment of its own. Old libraries warn about newer ones.
 test-lowest: $(VENV)/.installed
 	mkdir -p build
 	$(BIN)/python .ci/lowest.py > build/lowest.txt
 	$(PYTHON) -m venv --clear build/lowest
 	build/lowest/bin/python -m pip install --quiet --disable-pip-version-check --constraint build/lowest.txt \
-		'.[place]' hypothesis pytest pytest-xdist
-	build/lowest/bin/python -m pytest -m unit -p no:cacheprovider tests/core tests/scenario tests/scoring tests/sensors tests/world
+		'.[place]' hypothesis mpmath pytest pytest-xdist
+	build/lowest/bin/python -m pytest -m unit -p no:cacheprovider -W ignore::DeprecationWarning tests/core tests/scenario tests/scoring tests/sensors tests/world
 
 # The unit tests without the modules and flags that only POSIX systems have.
 test-portable: $(VENV)/.installed-dev
