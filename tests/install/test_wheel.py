@@ -136,7 +136,8 @@ def test_commands_of_the_readme_work_or_name_their_extra(installed: Installed, w
     page = installed.start("explore", "runs/myplace", "--no-browser")
     try:
         address = page.stdout.readline().split()[0]
-        assert urllib.request.urlopen(address, timeout=60).status == 200
+        opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())  # the link sets a cookie
+        assert opener.open(address, timeout=60).status == 200
     finally:
         page.send_signal(signal.SIGINT)
         page.communicate(timeout=60)
