@@ -204,7 +204,7 @@ def test_run_from_geojson_has_the_scores_of_csv(mini: Path, tmp_path: Path) -> N
           for text in ("[1, 2]", '{"type": "Point"}', "[]", "null", "5", '{"features": null}', '{"features": {}}')),
         pytest.param("[" * 100_000, "is not valid JSON", id="deep"),
         (collection(), "expected at least one site"),
-        *((collection(point(0, 0, 3, name="a"), wrong), "feature 1: expected a Feature with properties")
+        *((collection(point(0, 0, 3, name="a"), wrong), "feature 1: expected a Feature that has properties")
           for wrong in (None, 5, [], {"type": "Feature", "geometry": None}, feature({"type": "Point"}, name="b"),
                         feature({"type": "Point", "coordinates": None}, name="b"), point(0, name="b"),
                         feature({"type": "Point", "coordinates": "195"}, name="b"), point(0, 0, 3, 4, name="b"),
