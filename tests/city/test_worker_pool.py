@@ -24,7 +24,7 @@ from egvs.artefacts import parquet
 from egvs.city import scheduler, worker_check, worker_pool
 from egvs.city.tasks import Job, JobResult
 from egvs.city.worker_check import Requirements
-from egvs.core.errors import InputError
+from egvs.core.errors import InputError, RunError
 
 pytestmark = pytest.mark.system
 
@@ -260,7 +260,7 @@ def test_worker_without_folder_gets_no_task(cluster: RealCluster, jobs: list[Job
 
 
 @pytest.mark.slow
-def test_late_workers_are_asked(cluster: RealCluster, jobs: list[Job], other_version: Path) -> None:
+def test_late_workers_are_checked(cluster: RealCluster, jobs: list[Job], other_version: Path) -> None:
     from distributed import get_task_stream
 
     first = cluster.start_worker("first")
@@ -285,3 +285,14 @@ def test_late_workers_are_asked(cluster: RealCluster, jobs: list[Job], other_ver
     assert {cluster.names()[task["worker"]] for task in stream.data} == {"second"}
     assert len(messages) == 1
     assert "got 9.9.9" in messages[0]
+
+
+@pytest.mark.slow
+def test_failed_check_ends_the_run(cluster: RealCluster, jobs: list[Job], monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_: object) -> None:
+        raise KeyError("nthreads")
+
+    cluster.start_worker("first")
+    monkeypatch.setattr(worker_pool.WorkerPool, "_update", fail)
+    with pytest.raises(RunError, match=r"the check of workers failed .KeyError: 'nthreads'"):
+        scheduler.run_jobs(cluster.client, jobs)

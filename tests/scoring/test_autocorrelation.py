@@ -35,7 +35,7 @@ def autoregressive_series(records: int, frames: int, keeps: float, seed: int) ->
 
 
 @pytest.mark.parametrize("keeps", [0.0, 0.5, 0.9])
-def test_a_known_autocorrelation_time_is_found(keeps: float) -> None:
+def test_autocorrelation_time_of_autoregressive_series(keeps: float) -> None:
     found = [autocorrelation.autocorrelation_time(series) for series in autoregressive_series(40, 4000, keeps, 1)]
     assert np.mean(found) == pytest.approx((1 + keeps) / (1 - keeps), rel=0.15)
 

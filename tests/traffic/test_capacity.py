@@ -52,7 +52,7 @@ def test_shares_are_bisected(monkeypatch, tmp_path, limit, shares, result):
     assert [run.share for run in found.runs] == shares
     assert found.share == result
     assert found.is_everything is (result == 1.0)
-    assert found.is_certain is (limit > 0.1)
+    assert found.is_confirmed is (limit > 0.1)
 
 
 def test_longest_standing_time_allows_small_moves(tmp_path):
@@ -97,6 +97,6 @@ def test_crossing_carries_little_traffic_and_not_too_much(tmp_path):
     little = capacity.find_capacity(network, flows(20), 10.0)
     assert little.is_everything and len(little.runs) == 1
     much = capacity.find_capacity(network, flows(400), 10.0)  # 1,200 vehicles an hour on each of four lanes
-    assert 0.1 < much.share < 0.8 and much.is_certain
+    assert 0.1 < much.share < 0.8 and much.is_confirmed
     assert much == capacity.find_capacity(network, flows(400), 10.0)
     assert sumo_folder.NETWORK_FILE not in [p.name for p in tmp_path.iterdir()]

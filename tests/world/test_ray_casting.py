@@ -70,7 +70,7 @@ def box_ranges(o, d, low, high):
         ((1.0, 39.9999), 100.0, False),
     ],
 )
-def test_hits_near_edges_and_at_shallow_angles_are_doubtful(end, range_m, ambiguous):
+def test_hits_near_edges_and_at_shallow_angles_are_ambiguous(end, range_m, ambiguous):
     """A large triangle on the ground, a sensor 0.5 m above it at x = 0; what a float32 caster proposed is always
     triangle 0."""
     triangles, planes, _ = with_planes(np.array([[[-500.0, 40.0, 0.0], [0.0, -900.0, 0.0], [500.0, 40.0, 0.0]]]))

@@ -31,7 +31,6 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from egvs._version import __version__
 from egvs.city.worker_check import library_names, program_versions
 from egvs.core import files
 from egvs.core.errors import EgvsError, InputError, RunError
@@ -149,7 +148,7 @@ class Part(NamedTuple):
 
 def program_id() -> str:
     """Return a text that is equal for programs that give the same bytes: version, source and libraries."""
-    versions = program_versions(library_names()) | {"egvs": __version__}
+    versions = program_versions(library_names())
     return f"{versions.pop('egvs')}, {', '.join(' '.join(pair) for pair in versions.items())}"
 
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from egvs.city import worker_check
 from egvs.city.worker_check import Problem, Requirements
-from egvs.core.errors import EgvsError, InputError
+from egvs.core.errors import EgvsError, InputError, RunError
 from egvs.runs.store import RemoteStore
 
 if TYPE_CHECKING:
@@ -120,6 +120,7 @@ class WorkerPool:
         self._client, self._requirements, self._on_message = client, requirements, on_message
         self._workers: dict[str, _WorkerState] = {}
         self._lock, self._stop = threading.Lock(), threading.Event()
+        self._error: Exception | None = None
         self._last_accepted_s = time.monotonic()
         self._thread = threading.Thread(target=self._watch, name="workers", daemon=True)
 
@@ -161,6 +162,7 @@ class WorkerPool:
 
     def check(self) -> None:
         """Raise an InputError if for long only rejected workers have been connected."""
+        self._check_watching()
         with self._lock:
             rejected = self._rejected()
             if self._has_accepted() or not rejected:
@@ -202,6 +204,7 @@ class WorkerPool:
                 is_reported = True
             if self._client.status in ("closing", "closed"):
                 raise CommClosedError("the scheduler was lost")
+            self._check_watching()
             on_wait()
             time.sleep(0.05)
 
@@ -209,13 +212,24 @@ class WorkerPool:
         lines = _describe_rejected(rejected)
         return InputError("--cluster", "no connected worker can run this city\n" + "\n".join(lines))
 
+    def _check_watching(self) -> None:
+        """Raise a RunError if the thread that asks workers has failed: no further worker would get tasks."""
+        if self._error is not None:
+            raise RunError(
+                f"the check of workers failed ({type(self._error).__name__}: {self._error}). Start the run again"
+            ) from self._error
+
     # ---- the thread that watches
 
     def _watch(self) -> None:
-        while not self._stop.is_set():
-            with suppress(Exception):  # a lost scheduler is reported where results are awaited
-                self._update()
-            self._stop.wait(POLL_INTERVAL_S)
+        try:
+            while not self._stop.is_set():
+                with suppress(OSError):  # a lost scheduler is reported where results are awaited
+                    self._update()
+                self._stop.wait(POLL_INTERVAL_S)
+        except Exception as error:  # noqa: BLE001 - the thread of the run raises it
+            if self._client.status not in ("closing", "closed"):
+                self._error = error
 
     def _update(self) -> None:
         """Ask new workers, and report those that were rejected."""

@@ -348,7 +348,7 @@ def _assumed_traffic(network: str, streets: Streets, roi: JunctionRegion, level:
 
 def _traffic_notes(traffic: AssumedTraffic) -> list[str]:
     capacity = traffic.capacity
-    if not capacity.is_certain:
+    if not capacity.is_confirmed:
         return [f"traffic jams in all {len(capacity.runs)} trials; check the signals and connections of the network"]
     if not capacity.is_everything:
         return [f"the junction does not carry the {traffic.assumed_per_h:,} vehicles an hour of its road classes"]

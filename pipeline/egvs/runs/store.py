@@ -359,7 +359,7 @@ class _StoreUsage:
 
     @classmethod
     def read(cls, descriptor: int | None) -> _StoreUsage | None:
-        """Return the content of the file; None where it is empty or damaged, or there is none."""
+        """Return the content of the file; None if it is missing, empty or damaged."""
         if descriptor is None:
             return None
         os.lseek(descriptor, 0, os.SEEK_SET)
@@ -623,7 +623,7 @@ class Store:
         return removed
 
     def _in_use_since(self) -> float:
-        """Return the start of the first city run in progress; infinity where there is none."""
+        """Return the start of the first city run in progress, in seconds since the epoch; infinity if there is none."""
         assert self.folder is not None
         start = math.inf
         with suppress(OSError):

@@ -28,6 +28,7 @@ from egvs.core import files
 from egvs.formats import xml
 from egvs.scenario.traffic_config import CountConfig, TrafficConfig
 from egvs.traffic import demand, sumo, sumo_folder
+from egvs.traffic.locks import MOVED_M, SAMPLE_S
 from egvs.traffic.network import Network, read_net_xml
 
 DURATION_S, WARMUP_S = 900.0, 300.0
@@ -43,10 +44,6 @@ RESERVE = 0.92
 _FACTOR = 0.7
 _CLOSE_ENOUGH = 1.06
 """The trial ends when the shares that are and are not carried differ by less than this factor."""
-
-_SAMPLE_S = 10.0
-_MOVED_M = 2.0
-"""A vehicle stands if it moves less than this between two samples."""
 
 _FCD_FILE, _TRIPS_FILE, _STATISTICS_FILE = "trial.csv", "arrivals.xml", "statistics.xml"
 
@@ -101,7 +98,7 @@ class Capacity:
         return self.share == 1.0
 
     @property
-    def is_certain(self) -> bool:
+    def is_confirmed(self) -> bool:
         """Whether any simulation showed that the share is carried."""
         return any(run.is_carried for run in self.runs)
 
@@ -165,7 +162,7 @@ def _simulate(
         "fcd-output": _FCD_FILE,
         "fcd-output.attributes": "id,x,y",
         "device.fcd.begin": f"{WARMUP_S:g}",
-        "device.fcd.period": f"{_SAMPLE_S:g}",
+        "device.fcd.period": f"{SAMPLE_S:g}",
         "tripinfo-output": _TRIPS_FILE,
         "statistic-output": _STATISTICS_FILE,
         "no-step-log": "true",
@@ -208,7 +205,7 @@ def _longest_standing_s(fcd: Path) -> float:
             continue
         time_s, x_m, y_m = (float(values[column[key]]) for key in ("timestep_time", "vehicle_x", "vehicle_y"))
         since_s, old_x_m, old_y_m = last.get(name, (time_s, math.inf, math.inf))
-        if math.hypot(x_m - old_x_m, y_m - old_y_m) >= _MOVED_M:
+        if math.hypot(x_m - old_x_m, y_m - old_y_m) >= MOVED_M:
             since_s, old_x_m, old_y_m = time_s, x_m, y_m
         last[name] = since_s, old_x_m, old_y_m
         longest_s = max(longest_s, time_s - since_s)
