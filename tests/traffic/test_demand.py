@@ -292,7 +292,7 @@ def test_number_of_vehicles_is_proportional_to_lane_length(town, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("reroute", [False, True])
 def test_flow_departs_at_regular_intervals(town, tmp_path, reroute):
-    keys = {"network": "net.xml", "frames": 100, "warmup_s": 200.0, "vehicles_per_h": 600.0}
+    keys = {"network": "net.xml", "frames": 100, "frame_period_s": 1.0, "warmup_s": 200.0, "vehicles_per_h": 600.0}
     result = run_stage(traffic, scenario(town, **keys, reroute_at_departure=reroute), tmp_path / "first")
     routes = (tmp_path / "first" / "sumo" / "trips.rou.xml").read_text()
     departs_s = [float(text) for text in re.findall(r'<vehicle [^>]*depart="([^"]*)"', routes)]

@@ -63,6 +63,8 @@ MAX_DETOUR = 1.25
 
 CANDIDATE_ROUTES_FILE, COUNTS_FILE, SAMPLED_ROUTES_FILE = "candidates.rou.xml", "counts.xml", "sampled.rou.xml"
 DRAWN_TRIPS_FILE, ROUTED_TRIPS_FILE = "drawn.rou.xml", "routed.rou.xml"
+_ALTERNATIVES_FILE = "routed.rou.alt.xml"
+"""duarouter writes it beside the routes."""
 
 REROUTE_OPTIONS = {
     "device.rerouting.probability": "1",
@@ -401,7 +403,7 @@ def route_trips(trips: Sequence[Trip], folder: Path, network: str, vtypes: str) 
         for route in vehicle.iter("route"):
             edges = route.get("edges", "")
             routed.append(RoutedTrip(int(vehicle.get("id", "0")), vehicle.get("type", ""), edges))
-    for name in (DRAWN_TRIPS_FILE, ROUTED_TRIPS_FILE):
+    for name in (DRAWN_TRIPS_FILE, ROUTED_TRIPS_FILE, _ALTERNATIVES_FILE):
         (folder / name).unlink()
     return routed
 
