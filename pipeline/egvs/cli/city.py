@@ -118,6 +118,10 @@ def place(
     budget: Annotated[
         float | None, typer.Option(metavar="COST", help="Find the best sensors within this total cost (see \\[costs]).")
     ] = None,
+    phases: Annotated[
+        str | None,
+        typer.Option(metavar="K,K,...", help="Sensors after each phase of the installation, e.g. 5,10 for --count 10."),
+    ] = None,
     cluster: Cluster = "local",
     junction: Junctions = None,
     set_: CitySet = None,
@@ -128,10 +132,25 @@ def place(
 
     with ProgressDisplay("city") as screen:
         run_options = _run_options(cluster, junction, set_, screen)
-        placed = city_run.place_city(model.load_city(city), out, run_options, count=count, budget=budget)
+        numbers = _parse_phases(phases)
+        placed = city_run.place_city(
+            model.load_city(city), out, run_options, count=count, budget=budget, phases=numbers
+        )
         for warning in placed.city_run.warnings:
             screen.say(f"warning: {warning}")
     print_plan(placed)
+
+
+def _parse_phases(text: str | None) -> tuple[int, ...]:
+    from egvs.core.errors import InputError
+
+    if text is None:
+        return ()
+    try:
+        return tuple(int(number) for number in text.split(","))
+    except ValueError:
+        problem = f"expected whole numbers separated by commas, got {text[:80]!r}"
+        raise InputError("--phases", problem, "Use, for example, --count 10 --phases 5,10.") from None
 
 
 def _run_options(
@@ -261,6 +280,18 @@ def print_plan(placed: CityPlacement) -> None:
         f"{label.label} {label.value(plan.joint)}, {share:.1%} of the score of all {plan.candidates:,} candidates "
         f"together; proved: at least {proved:.2f} % of the best possible score"
     )
+    if plan.has_errors:
+        last = plan.curve[-1]
+        out.print(f"standard error: {label.value(last.score_se)}, from {plan.errors_from}")
+    else:
+        out.print(f"no standard errors: {plan.errors_from}")
+    for phase in plan.by_phase:
+        names = ", ".join(f"{sensor.junction} {sensor.site}" for sensor in phase.sensors) or "no sensor"
+        error = f" ± {label.value(phase.point.installed_se)}" if plan.has_errors else ""
+        out.print(
+            f"phase {phase.number}: {names}; then {label.label} {label.value(phase.point.installed)}{error}, "
+            f"{phase.loss:.2%} below the best plan of {phase.point.limit:g} alone"
+        )
     for path in placed.files:
         out.print(str(path))
 

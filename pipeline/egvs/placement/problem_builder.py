@@ -88,7 +88,7 @@ class TargetView:
     """Turn empty scans into amounts on vehicle-frames, as a score counts them; may be shared by threads."""
 
     def __init__(self, context: StageContext, targets: TargetScorer, score: str) -> None:
-        self._targets = targets
+        self.targets = targets
         self._score = score
         scene = get_scene(context)
         if score == "expected_detections":
@@ -101,11 +101,11 @@ class TargetView:
     @property
     def n_cells(self) -> int:
         """Number of cells."""
-        return len(self._targets.record)
+        return len(self.targets.record)
 
     def row(self, beams: Beams) -> VisibilityRow:
         """Return the amounts of a scan on all vehicle-frames."""
-        amounts = self._amounts(self._targets.visible(beams))
+        amounts = self._amounts(self.targets.visible(beams))
         return VisibilityRow.of(np.rint(amounts * self.unit).astype(np.int64), _MAX_WEIGHTED_HITS)
 
     def _amounts(self, visible: VisibleTargets) -> FloatArray:
