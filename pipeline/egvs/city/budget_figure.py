@@ -84,7 +84,7 @@ class _BudgetChart:
             yield _text(self._x(limit), base + 18, text)
         yield f'<path class="axis" d="M{_LEFT:.1f} {_TOP:.1f}V{base:.1f}H{right:.1f}"/>'
         yield _text((_LEFT + right) / 2, _HEIGHT - 8, "sensors in the whole city" if self._is_count else "cost")
-        yield _text(10.0, 14.0, self._label.label if self._label.label != "EGVS" else self._label.head, "start")
+        yield _text(10.0, 14.0, self._label.label, "start")
 
     def _limit_ticks(self) -> list[tuple[float, str]]:
         span = _WIDTH - _LEFT - _RIGHT
