@@ -190,7 +190,7 @@ def create_city(
 
     solids, counts = osm_solids.map_solids(extract, streets)
     areas = shapely.STRtree([solid.area for solid in solids])
-    made = []
+    made: list[NewJunction] = []
     left_out = dict(choice.left_out)
     for number, (junction_id, street_junction) in enumerate(choice.junctions.items(), 1):
         junction = _make_junction(junction_id, street_junction, streets, areas)
