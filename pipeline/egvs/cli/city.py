@@ -14,6 +14,7 @@ from egvs.cli import options
 if TYPE_CHECKING:
     from egvs.city.city_run import CityPlacement, CityRun, CityRunOptions
     from egvs.city.creation import NewCity
+    from egvs.city.plan_comparison import PlanComparison
     from egvs.city.tasks import JobResult
     from egvs.city.traffic_split import CityTraffic
     from egvs.cli.console import ProgressDisplay
@@ -139,6 +140,21 @@ def place(
         for warning in placed.city_run.warnings:
             screen.say(f"warning: {warning}")
     print_plan(placed)
+
+
+def compare(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(metavar="RUN RUN...", help="Folders of egvs city place, e.g. one for each traffic demand."),
+    ],
+) -> None:
+    """Compare the plans of several city runs: which sensors stay, and what each plan scores in the others' traffic."""
+    from egvs.city import plan_comparison
+    from egvs.cli.console import ProgressDisplay
+
+    with ProgressDisplay("compare") as screen:
+        comparison = plan_comparison.compare_plans(runs, screen.progress)
+    print_comparison(comparison)
 
 
 def _parse_phases(text: str | None) -> tuple[int, ...]:
@@ -296,7 +312,43 @@ def print_plan(placed: CityPlacement) -> None:
         out.print(str(path))
 
 
+def print_comparison(comparison: PlanComparison) -> None:
+    """Print one row per plan: the sensors that it shares with all others, and its value in the traffic of each run."""
+    from egvs.city.results import gain_label
+    from egvs.cli.console import WIDE, Column, console, make_table
+
+    plans, folders = comparison.plans, comparison.folders
+    label = gain_label(plans[0].rank_by)
+    relative = comparison.relative_values
+
+    def value_column(j: int) -> Column[int]:
+        def text(i: int) -> str:
+            return f"{label.value(comparison.values[i, j])} ({relative[i, j]:.1%})"
+
+        return Column(f"in the traffic of {folders[j].name}", text, wrap=True)
+
+    columns: list[Column[int]] = [
+        Column("plan", lambda i: folders[i].name, "left"),
+        Column("sensors", lambda i: str(len(plans[i].sensors))),
+        Column("in all plans", lambda i: f"{comparison.common_to_all(i).sensors:.0%}"),
+        Column("same pole", lambda i: f"{comparison.common_to_all(i).poles:.0%}"),
+        Column("same junction", lambda i: f"{comparison.common_to_all(i).junctions:.0%}"),
+        *(value_column(j) for j in range(len(plans))),
+    ]
+    out = console(WIDE)
+    out.print(make_table(columns, range(len(plans)), width=out.width))
+    out.print(f"values: {label.label}; in brackets, relative to the plan that was made for this traffic")
+    for i, folder in enumerate(folders):
+        for j, other in enumerate(folders):
+            if i < j:
+                shares = comparison.common(i, [j])
+                out.print(
+                    f"{folder.name}, {other.name}: {shares.sensors:.0%} of the sensors, {shares.poles:.0%} of the "
+                    f"poles and {shares.junctions:.0%} of the junctions in common"
+                )
+
+
 app = typer.Typer(no_args_is_help=True, help="Run every junction of a city, on one machine or a cluster.")
 
-for verb in (new, traffic, run, place):
+for verb in (new, traffic, run, place, compare):
     app.command()(verb)
