@@ -54,6 +54,7 @@ scaling: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.city speed
 	$(BIN)/python -m benchmarks.city overhead
 	$(BIN)/python -m benchmarks.city flat
+	$(BIN)/python -m benchmarks.town_traffic
 
 numerics: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.numerics --markdown docs/numerics-table.md

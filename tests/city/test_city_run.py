@@ -15,10 +15,12 @@ from egvs.artefacts import parquet
 from egvs.city import city_run, model, results, traffic_split
 from egvs.city.city_run import CityRunOptions, overlap_warnings
 from egvs.city.model import City
+from egvs.city.region_locks import RegionLocks
 from egvs.city.tasks import Job
-from egvs.core.errors import InputError
+from egvs.core.errors import InputError, RunError
 from egvs.placement.plan import JointScore
 from egvs.runs import run
+from egvs.traffic import recording
 
 pytestmark = pytest.mark.system
 HAS_COSTS = ("report.html", "run.json", ".lock")
@@ -249,3 +251,30 @@ def test_warns_about_overlapping_regions(city: City) -> None:
     (warning,) = overlap_warnings(jobs)
     assert "the regions of west and east overlap" in str(warning)
     assert model.load_city(city.folder).name == "town"
+
+
+@pytest.mark.usefixtures("in_process_cluster")
+def test_junction_with_locked_traffic_is_left_out(city: City, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All others are ranked, and nothing is simulated again."""
+    monkeypatch.setattr(RegionLocks, "add_teleports", lambda locks, _: locks.found.update(east="a car stood there"))
+    first = city_run.run_city(city, tmp_path / "out")
+    assert [result.junction.id for result in first.results] == ["west"]
+    (warning,) = [warning for warning in first.warnings if warning.rule == "junctions locked"]
+    assert warning.problem == "east is left out, because its traffic is locked: a car stood there"
+    assert not city.junction("east").traffic_file(city).exists()
+    assert "east is left out" in (tmp_path / "out" / "city.html").read_text()
+
+    monkeypatch.setattr(recording, "record_traffic", None)
+    again = city_run.place_city(city, tmp_path / "out", count=1)
+    assert {sensor.junction for sensor in again.plan.sensors} == {"west"}
+    assert again.plan.junctions == 1
+    with pytest.raises(InputError, match="the traffic of all junctions that were selected is locked"):
+        city_run.run_city(city, tmp_path / "out", CityRunOptions(junctions=["east"]))
+
+
+def test_city_with_locked_traffic_everywhere_is_rejected(city: City, monkeypatch: pytest.MonkeyPatch) -> None:
+    reasons = {"west": "a car stood there", "east": "a bus stood there"}
+    monkeypatch.setattr(RegionLocks, "add_teleports", lambda locks, _: locks.found.update(reasons))
+    with pytest.raises(RunError, match="locked at every junction: west: a car stood there; east: a bus stood there"):
+        traffic_split.make_city_traffic(city)
+    assert not (city.folder / "traffic" / traffic_split.RECORD_FILE).exists()

@@ -15,6 +15,7 @@ from shapely.geometry import box, shape
 import egvs
 from egvs.artefacts import parquet
 from egvs.city import creation, model, traffic_split
+from egvs.city.creation import NewCityOptions
 from egvs.core.errors import InputError
 from egvs.formats import osm
 from egvs.importers import junctions, openstreetmap, osm_network
@@ -176,7 +177,7 @@ def test_same_map_gives_same_bytes(made: creation.NewCity, extract: Path, tmp_pa
 
 
 def test_leaves_out_junction_without_pole_locations(extract: Path, tmp_path: Path) -> None:
-    city = creation.create_city(tmp_path / "town", extract, which="all")
+    city = creation.create_city(tmp_path / "town", extract, NewCityOptions(which="all"))
     assert [new.junction.names[0] for new in city.junctions] == ["A Road", "B Road"]
     assert len(city.left_out[creation.NO_FREE_KERB]) == 1
 
@@ -186,17 +187,17 @@ def test_selects_junctions_of_table(extract: Path, tmp_path: Path) -> None:
     table = tmp_path / "junctions.csv"
     (lat, lon), (b_lat, b_lon) = degrees(-195, 5), degrees(0, 0)
     table.write_text(f"junction,lat_deg,lon_deg\nbridge,{b_lat},{b_lon}\ntower,{lat},{lon}\n")
-    city = creation.create_city(tmp_path / "town", extract, which=str(table))
+    city = creation.create_city(tmp_path / "town", extract, NewCityOptions(which=str(table)))
     read = model.load_city(city.folder)
     assert [(j.id, j.title) for j in read.junctions] == [
         ("bridge", "signalised junction of B Road and Main"), ("tower", "signalised junction of A Road and Main"),
     ]  # fmt: skip
-    again = creation.create_city(tmp_path / "again", extract, which=str(city.folder / "junctions.csv"))
+    again = creation.create_city(tmp_path / "again", extract, NewCityOptions(which=str(city.folder / "junctions.csv")))
     assert model.load_city(again.folder).junctions == read.junctions
 
 
 def test_radius_limits_streets_and_junctions(extract: Path, tmp_path: Path) -> None:
-    city = creation.create_city(tmp_path / "town", extract, around=degrees(-200, 0), radius_m=250.0)
+    city = creation.create_city(tmp_path / "town", extract, NewCityOptions(around=degrees(-200, 0), radius_m=250.0))
     assert [new.junction.names[0] for new in city.junctions] == ["A Road"]
     assert len(city.left_out["too near to the rim"]) == 1
     assert city.streets.lane_length_m < 2 * (500 + 300 + 300) + 50
@@ -217,7 +218,7 @@ def test_rejects_wrong_row_of_table(extract: Path, tmp_path: Path, rows: str, me
     table = tmp_path / "junctions.csv"
     table.write_text(f"junction,lat_deg,lon_deg\n{rows}\n")
     with pytest.raises(InputError) as caught:
-        creation.create_city(tmp_path / "town", extract, which=str(table))
+        creation.create_city(tmp_path / "town", extract, NewCityOptions(which=str(table)))
     assert message in str(caught.value)
     assert not (tmp_path / "town").exists()
 
@@ -248,7 +249,7 @@ def test_wrong_input_gives_one_message_and_creates_nothing(extract: Path, tmp_pa
 def test_from_map_to_scores(extract: Path, tmp_path: Path, run_egvs) -> None:
     code, printed, error = run_egvs("city", "new", tmp_path / "town", "--osm", extract, "--walk")
     assert code == 0, error
-    assert "j02" in printed and "next: egvs city traffic" in printed
+    assert "j02" in printed and "next: egvs city run" in printed
     file = tmp_path / "town" / "city.toml"
     text = file.read_text()
     for old, now in (
@@ -317,7 +318,7 @@ def test_rejects_rows_with_overlapping_regions(close_junctions: Path, tmp_path: 
     rows = [",".join([name, *map(str, degrees(x, 0))]) for name, x in (("small", 45.0), ("large", 0.0))]
     table.write_text("\n".join(["junction,lat_deg,lon_deg", *rows, ""]))
     with pytest.raises(InputError) as caught:
-        creation.create_city(tmp_path / "town", close_junctions, which=str(table))
+        creation.create_city(tmp_path / "town", close_junctions, NewCityOptions(which=str(table)))
     message = str(caught.value)
     assert message.startswith(f"{table}: junctions small and large: their regions of interest overlap")
     assert "Remove one of the two rows." in message

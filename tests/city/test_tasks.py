@@ -107,7 +107,7 @@ def test_failure_is_passed_on(jobs: list[Job]) -> None:
 
 def test_rejects_other_version_of_program(jobs: list[Job], monkeypatch: pytest.MonkeyPatch) -> None:
     settings = scheduler.make_run_settings()
-    monkeypatch.setattr("egvs.city.tasks.__version__", "9.9.9")
+    monkeypatch.setattr("egvs.city.worker_check.__version__", "9.9.9")
     result = tasks.estimate_beams(jobs[0], settings)
     assert isinstance(result, JobFailure)
     assert "this worker runs a different version of egvs (9.9.9," in result.message

@@ -3,6 +3,7 @@
 import math
 import re
 from collections import Counter
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -286,6 +287,50 @@ def test_number_of_vehicles_is_proportional_to_lane_length(town, tmp_path):
     for density, more in ((4.0, {}), (7.0, {"vehicles_per_lane_km": 7.0})):
         result = run_stage(traffic, scenario(town, **keys, **more), tmp_path)
         assert result["vehicles"]["fewest"] == result["vehicles"]["most"] == round(density * lane_km(town))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reroute", [False, True])
+def test_flow_departs_at_regular_intervals(town, tmp_path, reroute):
+    keys = {"network": "net.xml", "frames": 100, "warmup_s": 200.0, "vehicles_per_h": 600.0}
+    result = run_stage(traffic, scenario(town, **keys, reroute_at_departure=reroute), tmp_path / "first")
+    routes = (tmp_path / "first" / "sumo" / "trips.rou.xml").read_text()
+    departs_s = [float(text) for text in re.findall(r'<vehicle [^>]*depart="([^"]*)"', routes)]
+    assert departs_s == [6.0 * i for i in range(50)]  # 299.25 s
+    assert routes.count("<route ") == 50 and "<trip" not in routes
+    flags = result["flags"]
+    assert "--max-num-vehicles" not in flags and "--max-depart-delay" not in flags
+    assert ("--device.rerouting.probability" in flags) is reroute
+    assert 0 < result["vehicles"]["fewest"] < result["vehicles"]["most"] < 50
+
+    again = scenario(town, **keys, reroute_at_departure=reroute)
+    run_stage(traffic, again, tmp_path / "second")
+    first, second = (tmp_path / name / "trajectories.parquet" for name in ("first", "second"))
+    assert first.read_bytes() == second.read_bytes()
+
+
+@pytest.mark.slow
+def test_routes_equal_those_of_dijkstra(town, tmp_path):
+    """Contraction hierarchies find ways that are as fast as those of an independent search."""
+    from scipy.sparse.csgraph import dijkstra
+
+    roads = network.read_net_xml(town / "net.xml")
+    files = {"net.xml": (town / "net.xml").read_text(), "vtypes.xml": demand.vtypes_xml([car()])}
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    pairs = demand.origin_destination_pairs(roads, car(), drawn(), np.random.default_rng(0), "place")
+    trips = demand.draw_trips(roads, [car()], [pairs], np.arange(40.0), np.random.default_rng(1))
+    routed = demand.route_trips(trips, tmp_path, "net.xml", "vtypes.xml")
+    assert [trip.number for trip in routed] == list(range(40))
+    finder = RouteFinder(roads, "passenger")
+    index = {edge.id: i for i, edge in enumerate(roads.edges)}
+    seconds = dijkstra(finder._graph)
+    for trip, route in zip(trips, routed, strict=True):
+        edges = route.edges.split()
+        assert (edges[0], edges[-1]) == (trip.origin, trip.target)
+        ways_s = sum(finder._graph[index[a], index[b]] for a, b in pairwise(edges))
+        assert ways_s == pytest.approx(seconds[index[edges[0]], index[edges[-1]]], rel=0.02)
+    assert {path.name for path in tmp_path.iterdir()} == {"net.xml", "vtypes.xml"}
 
 
 def test_vehicle_density_ignores_lanes_closed_to_the_fleet(tmp_path):

@@ -114,7 +114,7 @@ def run_city(city: City, out: str | Path | None = None, options: CityRunOptions 
         scheduler.check_cluster(options.cluster)
         with _connect(city, folder, jobs, options) as cluster:
             ran = _run_jobs(cluster, city, folder, jobs, options)
-        plan = results.read_plan(folder, [job.junction for job in jobs])
+        plan = results.read_plan(folder, [result.junction.id for result in ran.results])
         page_file = page.write_page(folder, city, ran.results, ran.warnings, plan)
         return replace(ran, files=(*ran.files, page_file))
 
@@ -130,8 +130,15 @@ def _connect(city: City, folder: Path, jobs: Sequence[Job], options: CityRunOpti
 
 
 def _run_jobs(cluster: Cluster, city: City, folder: Path, jobs: Sequence[Job], options: CityRunOptions) -> CityRun:
-    """Run junctions, and write the tables of their results; the folder is locked."""
+    """Run junctions, and write the tables of their results; the folder is locked.
+
+    Junctions whose traffic is locked are left out.
+    """
     traffic = traffic_split.make_city_traffic(city, options.progress, options.overrides)
+    jobs = [job for job in jobs if job.junction not in traffic.locked]
+    if not jobs:
+        problem = "the traffic of all junctions that were selected is locked"
+        raise InputError("--junction", problem, f"Select others, or use less traffic in {city.file}.")
     scheduler.run_jobs(cluster.client, jobs, on_done=options.on_done, progress=options.progress, cluster=cluster)
     junction_results = read_junction_results(folder, [city.junction(job.junction) for job in jobs])
     written = write_results(folder, city, junction_results)
@@ -208,6 +215,8 @@ def place_city(
         scheduler.check_cluster(options.cluster)
         with _connect(city, folder, jobs, options) as cluster:
             ran = _run_jobs(cluster, city, folder, jobs, options)
+            ranked = {result.junction.id for result in ran.results}
+            jobs = [job for job in jobs if job.junction in ranked]
             with_gain = {result.junction.id for result in ran.results if result.gain > 0}
             useful_jobs = [job for job in jobs if job.junction in with_gain]
             if not useful_jobs:

@@ -5,8 +5,9 @@ streets; choose junctions (:func:`choose_junctions`); map buildings, trees, barr
 junction set the region of interest, find pole locations along its kerbs, and select the solids that a sensor there can
 reach; write the folder that :mod:`egvs.city.model` describes.
 
-Traffic demand is drawn for the complete network, in proportion to the length of its lanes: flows assumed for each
-junction alone would count a vehicle several times that passes several junctions.
+Traffic is drawn for the complete network, as much as a trial shows that it carries (:func:`find_flow` of
+:mod:`egvs.traffic.capacity`): flows assumed for each junction alone would count a vehicle several times that passes
+several junctions. It is simulated in steps of 0.5 s and without sublanes; with them, vehicles of a whole town lock.
 
 World frame: x (east), y (north) of the network in metres; the ground is z = 0. Tables have degrees (WGS 84). The same
 extract gives the same bytes.
@@ -33,14 +34,25 @@ from egvs.core.progress import ProgressCallback, no_progress
 from egvs.formats.osm import read_osm as read_extract
 from egvs.importers import junctions, openstreetmap, osm_network, osm_solids
 from egvs.importers.junctions import HEIGHTS_M, JunctionRegion, KerbsidePole, StreetJunction, Streets
-from egvs.importers.openstreetmap import PITCHES_DEG, SENSOR, SITES_FILE, STATICS_FILE, TomlTable, check_inside_extract
+from egvs.importers.openstreetmap import (
+    DEFAULT_TRAFFIC,
+    JUNCTION_BLOCKER_S,
+    PITCHES_DEG,
+    SENSOR,
+    SITES_FILE,
+    STATICS_FILE,
+    TELEPORT_S,
+    TRAFFIC_LEVELS,
+    TomlTable,
+    check_inside_extract,
+)  # fmt: skip
 from egvs.importers.osm_network import ATTRIBUTION, NETWORK_FILE, NetworkExcerpts
 from egvs.importers.osm_solids import ImportCounts, MappedSolid
 from egvs.scenario.loading import load
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, TrafficConfig
 from egvs.sensors.sensor import CATALOGUE
-from egvs.traffic import demand
+from egvs.traffic.capacity import FlowCapacity, find_flow
 
 SIGNALISED, ALL = "signalised", "all"
 REQUIRED_COLUMNS = ("junction", "lat_deg", "lon_deg")
@@ -72,8 +84,7 @@ _MIN_ARMS = 3
 _CROSSING_SPEED_M_S, _WARMUP_STEP_S = 8.0, 60.0
 """The warm-up lasts until a vehicle could have crossed the network at this speed, in whole steps."""
 
-_MIN_TRIP_S = 100.0
-"""Trips last longer than this, so one N-th of it between departures is enough for N vehicles."""
+CITY_STEP_S, CITY_LATERAL_RESOLUTION_M = 0.5, 0.0
 
 _KERB_MARGIN_M, _ROADS_MARGIN_M = 60.0, 100.0
 """Distances from the region of interest within which solids can block kerbs, and streets are written."""
@@ -115,6 +126,32 @@ class NewJunction:
 
 
 @dataclass(frozen=True)
+class CityFlow:
+    """The traffic of a new city: what the network carries, and a key of :data:`openstreetmap.TRAFFIC_LEVELS`."""
+
+    capacity: FlowCapacity
+    level: str
+
+    @property
+    def vehicles_per_h(self) -> int:
+        """Vehicles that start per hour, in steps of 10."""
+        return max(10, 10 * round(self.capacity.vehicles_per_h * TRAFFIC_LEVELS[self.level] / 10))
+
+    @property
+    def summary(self) -> str:
+        """What is carried and used, as a sentence."""
+        share = f"{TRAFFIC_LEVELS[self.level]:.0%}".replace("%", " %")
+        return f"carries {self.capacity.vehicles_per_h:,} vehicles an hour; {self.level} {share} is used"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return a summary as plain JSON."""
+        return {
+            "vehicles_per_hour": self.vehicles_per_h, "level": self.level,
+            "carried_per_hour": self.capacity.vehicles_per_h, "trial_runs": len(self.capacity.runs),
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
 class NewCity:
     """What :func:`create_city` made; ``left_out`` are ids of junctions without scenario, by reason."""
 
@@ -123,6 +160,7 @@ class NewCity:
     left_out: dict[str, list[str]]
     streets: Streets
     statics: ImportCounts
+    traffic: CityFlow
     notes: tuple[str, ...]
 
     def to_json(self) -> dict[str, Any]:
@@ -136,7 +174,7 @@ class NewCity:
                 "edges": len(streets.network.edges), "lane_length_m": round(streets.lane_length_m),
                 "signalised_junctions": sum(j.signalised for j in streets.junctions),
             },
-            "traffic": traffic_amount(streets),
+            "traffic": self.traffic.to_json() | {"warmup_s": warmup_s(streets)},
             "poles": sum(len(j.poles) for j in made),
             "sites": sum(j.n_candidates for j in made),
             "statics": self.statics.to_json(),
@@ -144,10 +182,35 @@ class NewCity:
         }  # fmt: skip
 
 
-def create_city(
-    folder: Path, osm: Path, *, around: tuple[float, float] | None = None, radius_m: float | None = None,
-    which: str = SIGNALISED, lefthand: bool = False, walk: bool = False, progress: ProgressCallback = no_progress,
-) -> NewCity:  # fmt: skip
+@dataclass(frozen=True)
+class NewCityOptions:
+    """Options of :func:`create_city`.
+
+    Attributes
+    ----------
+    around, radius_m
+        Latitude, longitude in degrees, and the distance within which streets are used; the complete extract if
+        ``around`` is None.
+    which
+        ``"signalised"``, ``"all"``, or the path of a table, see :func:`choose_junctions`.
+    lefthand, walk
+        As in :func:`egvs.importers.openstreetmap.create_scenario`.
+    traffic
+        A key of :data:`egvs.importers.openstreetmap.TRAFFIC_LEVELS`: the share of the flow that the network carries.
+    progress
+        Called with the number of finished junctions.
+    """
+
+    around: tuple[float, float] | None = None
+    radius_m: float | None = None
+    which: str = SIGNALISED
+    lefthand: bool = False
+    walk: bool = False
+    traffic: str = DEFAULT_TRAFFIC
+    progress: ProgressCallback = no_progress
+
+
+def create_city(folder: Path, osm: Path, options: NewCityOptions | None = None) -> NewCity:
     """Make the folder of a city from an OpenStreetMap extract.
 
     Parameters
@@ -156,15 +219,8 @@ def create_city(
         Created by this function; may exist if it is empty.
     osm
         An OpenStreetMap file: XML (plain or gzipped) or PBF.
-    around, radius_m
-        Latitude, longitude in degrees, and the distance within which streets are used; the complete extract if
-        ``around`` is None.
-    which
-        ``"signalised"``, ``"all"``, or the path of a table, see :func:`choose_junctions`.
-    lefthand, walk
-        As in :func:`egvs.importers.openstreetmap.create_scenario`.
-    progress
-        Called with the number of finished junctions.
+    options
+        Options; the defaults when None.
 
     Raises
     ------
@@ -172,6 +228,9 @@ def create_city(
         When the folder is not empty, the file is damaged or has no drivable streets, ``around`` is outside the extract,
         a table is wrong or selects junctions with overlapping regions, or no junction is left. Nothing is written then.
     """
+    options = options or NewCityOptions()
+    around, radius_m, which = options.around, options.radius_m, options.which
+    openstreetmap.check_traffic_level(options.traffic)
     name = openstreetmap.check_new_folder(folder)
     if radius_m is not None and around is None:
         raise InputError("--radius", "given without --around", "Add --around LAT,LON.")
@@ -181,7 +240,7 @@ def create_city(
     street_extract, rim_m = extract, radius_m or DEFAULT_RADIUS_M
     if around is not None:
         street_extract = osm_network.cut_surroundings(extract, around, rim_m)
-    flags = osm_network.netconvert_flags(extract, lefthand=lefthand, walk=walk)
+    flags = osm_network.netconvert_flags(extract, lefthand=options.lefthand, walk=options.walk)
     network, streets = osm_network.build_network(street_extract, osm, flags)
     within = None
     if around is not None:
@@ -203,7 +262,7 @@ def create_city(
             left_out.setdefault(OVERLAPPING_REGION, []).append(street_junction.id)
         else:
             raise _overlap_error(which, larger, junction)
-        progress("junctions", number, len(choice.junctions))
+        options.progress("junctions", number, len(choice.junctions))
     if not made:
         reasons = ", ".join(f"{len(ids)} {reason}" for reason, ids in left_out.items()) or "no streets meet"
         hint = "Choose another extract, or a larger --radius."
@@ -211,15 +270,19 @@ def create_city(
             hint = "Try --junctions all."
         raise InputError(osm, f"no junction is left ({reasons})", hint)
 
-    notes = _import_notes(made, counts, walk)
-    city = NewCity(folder, tuple(made), left_out, streets, counts, notes)
+    flow = CityFlow(find_flow(network, JUNCTION_BLOCKER_S), options.traffic)
+    notes = _import_notes(made, counts, flow, options.walk)
+    city = NewCity(folder, tuple(made), left_out, streets, counts, flow, notes)
     openstreetmap.publish_folder(folder, _city_files(city, name, network, solids, areas), _check_city)
     return city
 
 
-def _import_notes(made: Sequence[NewJunction], counts: ImportCounts, walk: bool) -> tuple[str, ...]:
+def _import_notes(made: Sequence[NewJunction], counts: ImportCounts, flow: CityFlow, walk: bool) -> tuple[str, ...]:
     """Return what to know before trusting the city."""
     notes = openstreetmap.scenario_notes(True, counts)
+    if not flow.capacity.is_confirmed:
+        runs = len(flow.capacity.runs)
+        notes.append(f"traffic jams in all {runs} trials; check the signals and connections of the network")
     n_larger = sum(not junction.roi.area.covers(junction.junction.area) for junction in made)
     if n_larger:
         limit = f"at most {junctions.ROI_MAX_M:g} m"
@@ -324,7 +387,7 @@ def _city_files(
     city: NewCity, name: str, network: str, solids: list[MappedSolid], areas: shapely.STRtree
 ) -> Iterator[tuple[str, str]]:
     """Yield path and text of every file of the folder."""
-    yield CITY_FILE, city_toml(name, city.streets, len(city.junctions))
+    yield CITY_FILE, city_toml(name, city.streets, city.traffic, len(city.junctions))
     yield NETWORK_FILE, network
     yield JUNCTIONS_FILE, model.junctions_csv(_table_junctions(city))
     yield IMPORT_FILE, files.to_json_text(city.to_json() | {"left_out": city.left_out}, indent=1) + "\n"
@@ -361,19 +424,13 @@ def _count_solids(solids: Sequence[MappedSolid]) -> ImportCounts:
     return counts
 
 
-def traffic_amount(streets: Streets) -> dict[str, Any]:
-    """Return the keys of ``[traffic]`` that depend on the size of the network."""
-    vehicles = demand.target_vehicle_count(TrafficConfig(network=NETWORK_FILE), streets.network)
+def warmup_s(streets: Streets) -> float:
+    """Return a warm-up in which a vehicle can cross the network, in seconds."""
     crossing_steps = math.ceil(streets.network.diagonal_m / _CROSSING_SPEED_M_S / _WARMUP_STEP_S)
-    min_trips_per_s = float(TrafficConfig.model_fields["trips_per_s"].default)
-    return {
-        "vehicles": vehicles,
-        "warmup_s": max(DEFAULT_WARMUP_S, _WARMUP_STEP_S * crossing_steps),
-        "trips_per_s": max(min_trips_per_s, vehicles / _MIN_TRIP_S),
-    }
+    return max(DEFAULT_WARMUP_S, _WARMUP_STEP_S * crossing_steps)
 
 
-def city_toml(name: str, streets: Streets, n_junctions: int) -> str:
+def city_toml(name: str, streets: Streets, flow: CityFlow, n_junctions: int) -> str:
     """Return the text of ``city.toml``.
 
     Parameters
@@ -382,23 +439,27 @@ def city_toml(name: str, streets: Streets, n_junctions: int) -> str:
         The name of the city; "" if it is that of the folder.
     streets
         The network.
+    flow
+        The traffic.
     n_junctions
         Number of junctions.
     """
-    amount, fields = traffic_amount(streets), TrafficConfig.model_fields
     values: dict[str, Any] = {"description": f"{n_junctions} junctions", "attribution": ATTRIBUTION, "seed": 1}
     if name:
         values = {"name": name, **values}
-    traffic = {
-        "network": NETWORK_FILE, "vehicles_per_lane_km": fields["vehicles_per_lane_km"].default,
+    traffic: dict[str, Any] = {"network": NETWORK_FILE, "vehicles_per_h": flow.vehicles_per_h}
+    if flow.capacity.reroute:
+        traffic["reroute_at_departure"] = True
+    traffic |= {
         "frames": DEFAULT_FRAMES,
-        "frame_period_s": fields["frame_period_s"].default, "warmup_s": amount["warmup_s"],
-        "trips_per_s": amount["trips_per_s"],
+        "frame_period_s": TrafficConfig.model_fields["frame_period_s"].default, "warmup_s": warmup_s(streets),
+        "step_s": CITY_STEP_S, "lateral_resolution_m": CITY_LATERAL_RESOLUTION_M,
+        "junction_blocker_s": JUNCTION_BLOCKER_S, "teleport_s": TELEPORT_S,
     }  # fmt: skip
     comment = "one simulation for all junctions, trips drawn in the whole network; or your own sumocfg, counts, fcd"
     comments = [f"A city. {_SOURCE_COMMENT}", _FRAME_COMMENT]
     document = openstreetmap.toml_document(comments, values, {"traffic": (comment, traffic)})
-    document["traffic"]["vehicles_per_lane_km"].comment(f"{amount['vehicles']} vehicles in this network")
+    document["traffic"]["vehicles_per_h"].comment(f"the network {flow.summary}")
     return tomlkit.dumps(document)
 
 

@@ -26,11 +26,11 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -41,8 +41,9 @@ from tomlkit.exceptions import TOMLKitError
 
 from egvs.artefacts import parquet
 from egvs.city.model import CITY_FILE, JUNCTIONS_FILE, JUNCTIONS_FOLDER, TRAFFIC_FOLDER, City, CityJunction
+from egvs.city.region_locks import RegionLocks
 from egvs.core import files, platform, reading
-from egvs.core.errors import WARNINGS_KEY, Diagnostic, InputError
+from egvs.core.errors import WARNINGS_KEY, Diagnostic, InputError, RunError
 from egvs.core.grid import FloatArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.effects import registry
@@ -84,6 +85,7 @@ _FLUSH_ROWS = 8192
 """Number of rows of a junction that are written together."""
 
 _OTHER_OPEN_FILES = 64
+_MAX_REASONS = 5
 _CITY_HEIGHT_M = 5.0
 
 
@@ -99,6 +101,8 @@ class CityTraffic:
         Summary of the complete traffic, as in the ``run.json`` of a scenario.
     rows
         Number of rows of each junction, over all periods.
+    locked
+        Why a junction has no file, by name: its traffic locks.
     linked
         Names of the junctions whose scenarios were changed.
     """
@@ -106,6 +110,7 @@ class CityTraffic:
     is_new: bool
     summary: Mapping[str, Any]
     rows: Mapping[str, int]
+    locked: Mapping[str, str] = field(default_factory=dict)
     linked: tuple[str, ...] = ()
 
     @property
@@ -166,7 +171,8 @@ def make_city_traffic(
     InputError
         When the city, a junction's scenario, or a file that they name is wrong.
     RunError
-        When SUMO fails, the number of vehicles is not held, vehicles are stuck, or another process uses the folder.
+        When SUMO fails, the number of vehicles is not held, the traffic locks at every junction, or another process
+        uses the folder.
     """
     folder = city.folder / TRAFFIC_FOLDER
     with lock_run_folder(folder):
@@ -178,27 +184,40 @@ def make_city_traffic(
         if existing is not None:
             return replace(existing, linked=linked)
 
-        summaries, rows = dict[str, Summary](), Counter[str]()
+        summaries, rows, locked = dict[str, Summary](), Counter[str](), dict[str, str]()
         for period, period_scenario in scenario.by_period().items():
             paths = {junction.id: junction.traffic_file(city, period) for junction in city.junctions}
             sumo_path = folder / SUMO_FOLDER / period
-            summaries[period], period_rows = _record_period(period_scenario, sumo_path, regions, paths, progress)
-            rows.update(period_rows)
+            recorded = _record_period(period_scenario, sumo_path, regions, paths, progress)
+            summaries[period] = recorded.summary
+            rows.update(recorded.rows)
+            for name, reason in recorded.locked.items():
+                locked.setdefault(name, f"{reason} (period {period})" if period else reason)
         summary = traffic.merge_summaries(summaries) if city.traffic.periods else summaries[""]
+        if len(locked) == len(regions):
+            where, hint = recording.demand_key(scenario)
+            reasons = "; ".join(f"{name}: {reason}" for name, reason in list(locked.items())[:_MAX_REASONS])
+            raise RunError(f"{where}: the traffic is locked at every junction: {reasons}. {hint}")
+        for path in _traffic_paths(city, locked):
+            path.unlink(missing_ok=True)
         warnings = [warning.to_json() for warning in _no_traffic_warnings(scenario, rows)]
+        warnings += [warning.to_json() for warning in _locked_warnings(scenario, locked)]
         summary[WARNINGS_KEY] = [*summary.get(WARNINGS_KEY, []), *warnings]
 
-        digests = {_traffic_label(city, path): files.hash_file(path) for path in _traffic_paths(city)}
-        record = {"key": key, "files": digests, "rows": dict(rows), "summary": summary}
+        digests = {
+            _traffic_label(city, path): files.hash_file(path) for path in _traffic_paths(city, rows.keys() - locked)
+        }
+        record = {"key": key, "files": digests, "rows": dict(rows), "locked": locked, "summary": summary}
         files.write_text(folder / RECORD_FILE, files.to_json_text(record, indent=1) + "\n")
-    return CityTraffic(True, summary, dict(rows), linked)
+    return CityTraffic(True, summary, dict(rows), locked, linked)
 
 
-def _traffic_paths(city: City) -> Iterator[Path]:
-    """Yield the files of all periods and junctions."""
+def _traffic_paths(city: City, names: Collection[str]) -> Iterator[Path]:
+    """Yield the files of all periods of some junctions."""
     for period in [period.name for period in city.traffic.periods] or [""]:
         for junction in city.junctions:
-            yield junction.traffic_file(city, period)
+            if junction.id in names:
+                yield junction.traffic_file(city, period)
 
 
 def _traffic_label(city: City, path: Path) -> str:
@@ -211,18 +230,21 @@ def _read_existing_traffic(city: City, key: str) -> CityTraffic | None:
     if not path.is_file():
         return None
     match reading.read_json(path):
-        case {"key": str(old_key), "files": dict(digests), "rows": dict(rows), "summary": dict(summary)}:
+        case {
+            "key": str(old_key), "files": dict(digests), "rows": dict(rows), "locked": dict(locked),
+            "summary": dict(summary),
+        }:  # fmt: skip
             pass
         case _:
             return None
     if old_key != key:
         return None
-    for traffic_path in _traffic_paths(city):
+    for traffic_path in _traffic_paths(city, rows.keys() - locked):
         if not traffic_path.is_file() or files.hash_file(traffic_path) != digests.get(
             _traffic_label(city, traffic_path)
         ):
             return None
-    return CityTraffic(False, summary, rows)
+    return CityTraffic(False, summary, rows, locked)
 
 
 def _traffic_key(scenario: Scenario, folder: Path, regions: Mapping[str, TrafficRegion]) -> str:
@@ -396,18 +418,27 @@ def _format_periods(names: Iterable[str]) -> str:
     return f"the periods {', '.join(sorted(names))}"
 
 
+class _RecordedPeriod(NamedTuple):
+    """Summary of a period, rows of each junction, and why junctions are locked."""
+
+    summary: Summary
+    rows: dict[str, int]
+    locked: dict[str, str]
+
+
 def _record_period(
     scenario: Scenario,
     folder: Path,
     regions: Mapping[str, TrafficRegion],
     paths: Mapping[str, Path],
     progress: ProgressCallback,
-) -> tuple[Summary, dict[str, int]]:
-    """Record the traffic of one period and write all files; return its summary, and the rows of each junction."""
+) -> _RecordedPeriod:
+    """Record the traffic of one period and write all files."""
     effects, notes = registry.active_traffic_effects(scenario)
     world = geolocation.scenario_georeference(scenario)
     with recording.record_traffic(scenario, folder, effects, progress, None, world) as recorded:
-        statistics, rows = split_recording(scenario, recorded, regions, paths, effects, progress)
+        locks = RegionLocks({name: region.scenario.roi.box for name, region in regions.items()}, recorded)
+        statistics, rows = split_recording(scenario, recorded, regions, paths, effects, progress, locks)
         recording_summary = recorded.summary()
         warnings = trajectories.traffic_warnings(statistics, recorded, scenario.roi.box)
     summary = statistics.to_json(recorded.window.period_ms / 1000.0)
@@ -422,7 +453,7 @@ def _record_period(
     summary[WARNINGS_KEY] = [_reword_for_city(warning) for warning in all_warnings]
     if notes:
         summary["notes"] = [*summary.get("notes", []), *notes]
-    return summary, rows
+    return _RecordedPeriod(summary, rows, locks.found)
 
 
 def _reword_for_city(warning: Mapping[str, Any]) -> dict[str, Any]:
@@ -451,6 +482,14 @@ def _no_traffic_warnings(scenario: Scenario, rows: Mapping[str, int]) -> Iterato
         yield Diagnostic("junctions without traffic", sumo_folder.traffic_location(scenario), problem, hint)
 
 
+def _locked_warnings(scenario: Scenario, locked: Mapping[str, str]) -> Iterator[Diagnostic]:
+    where, hint = recording.demand_key(scenario)
+    for name, reason in locked.items():
+        yield Diagnostic(
+            "junctions locked", where, f"{name} is left out, because its traffic is locked: {reason}", hint
+        )
+
+
 @dataclass
 class _JunctionWriter:
     """Writes the rows of a junction into its file, many at a time."""
@@ -459,10 +498,12 @@ class _JunctionWriter:
     followed_types: frozenset[str]
     file: parquet.ArtefactWriter
     rows: int = 0
+    vehicles: set[str] = field(default_factory=set)
     _pending: list[pa.Table] = field(default_factory=list)
 
     def add(self, rows: pa.Table) -> None:
         self._pending.append(rows)
+        self.vehicles.update(pc.unique(rows["id"]).to_pylist())
         self.rows += rows.num_rows
         if sum(table.num_rows for table in self._pending) >= _FLUSH_ROWS:
             self.flush()
@@ -483,6 +524,7 @@ def split_recording(
     paths: Mapping[str, Path],
     extensions: Sequence[TrafficHook],
     progress: ProgressCallback,
+    locks: RegionLocks,
 ) -> tuple[TrafficStatistics, dict[str, int]]:
     """Write the files of all junctions. No file appears before the recording is complete and checked.
 
@@ -496,6 +538,8 @@ def split_recording(
         Effects that change the traffic.
     progress
         Called with the number of frames that were written.
+    locks
+        Collects the junctions whose traffic locks.
 
     Returns
     -------
@@ -519,9 +563,12 @@ def split_recording(
         for group in trajectories.frame_groups(recording, GROUP_FRAMES):
             boxes = vehicle_boxes.boxes_from_bumpers(group, recording.sizes, period_ms / 1000.0, where, uncounted)
             statistics.add(boxes)
+            locks.add(statistics, group.first_frame + group.frames)
             _write_rows(_with_frame_times(group, period_ms), writers.values(), recording.sizes)
             progress("frames written", group.first_frame + group.frames, statistics.frames)
-        trajectories.check_recording(scenario, statistics, recording)
+        # vehicles that stand outside the regions of interest do not matter
+        trajectories.check_recording(scenario, statistics, replace(recording, standing_limit_s=None))
+        locks.add_teleports({name: len(writer.vehicles) for name, writer in writers.items()})
         fcd_metadata = FcdMetadata.for_recording(period_ms, statistics.frames, dict(recording.sizes))
         for writer in writers.values():
             writer.flush()

@@ -64,6 +64,12 @@ def new(
     ] = "signalised",
     lefthand: Annotated[bool, typer.Option("--lefthand", help="Traffic drives on the left.")] = False,
     walk: Annotated[bool, typer.Option("--walk", help="Include sidewalks and crossings, for pedestrians.")] = False,
+    traffic: Annotated[
+        str,
+        typer.Option(
+            metavar="LEVEL", help="light, medium or heavy: 40, 75 or 100 % of the flow that the network carries."
+        ),
+    ] = "medium",
 ) -> None:
     """Create a city from an OpenStreetMap extract: one network, and a scenario for each junction."""
     from egvs.city import creation
@@ -75,10 +81,8 @@ def new(
     if radius is not None:
         radius_m = options.length_m(radius, "--radius")
     with ProgressDisplay("city") as screen:
-        created = creation.create_city(
-            folder, osm, around=centre, radius_m=radius_m, which=junctions, lefthand=lefthand, walk=walk,
-            progress=screen.progress,
-        )  # fmt: skip
+        new_options = creation.NewCityOptions(centre, radius_m, junctions, lefthand, walk, traffic, screen.progress)
+        created = creation.create_city(folder, osm, new_options)
     _print_new(created)
 
 
@@ -193,7 +197,8 @@ def _print_new(city: NewCity) -> None:
     out = console(WIDE)
     out.print(make_table(columns, city.junctions))
     print_mapping({"folder": str(city.folder)} | city.to_json(), _WIDTH)
-    out.print(f"next: egvs city traffic {city.folder}")
+    out.print(f"traffic: the network {city.traffic.summary}")
+    out.print(f"next: egvs city run {city.folder}")
 
 
 def _print_traffic(folder: Path, result: CityTraffic) -> None:

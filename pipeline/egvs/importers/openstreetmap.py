@@ -238,8 +238,7 @@ def create_scenario(
         When the folder is not empty, the file is damaged or has no drivable streets, ``at`` is outside the extract, or
         no site is possible. Nothing is written then.
     """
-    if traffic not in TRAFFIC_LEVELS:
-        raise InputError("--traffic", f"expected light, medium or heavy, got {traffic!r}", "Use --traffic medium.")
+    check_traffic_level(traffic)
     name = check_new_folder(folder)
     if surroundings_m is not None and surroundings_m < SURROUNDINGS_MIN_M:
         raise InputError(
@@ -280,6 +279,12 @@ def create_scenario(
     }
     publish_folder(folder, texts.items(), load)
     return scenario
+
+
+def check_traffic_level(level: str) -> None:
+    """Raise an InputError unless a text is a key of :data:`TRAFFIC_LEVELS`."""
+    if level not in TRAFFIC_LEVELS:
+        raise InputError("--traffic", f"expected light, medium or heavy, got {level!r}", "Use --traffic medium.")
 
 
 def check_new_folder(folder: Path) -> str:

@@ -151,8 +151,13 @@ def _first_source(values: dict[str, Any], key: str) -> str | None:
 TRAFFIC_SOURCES = ("network", "sumocfg", "fcd")
 """Keys that set where vehicles come from; exactly one must be set."""
 
-_RATE_KEYS = frozenset({"vehicles_per_lane_km", "trips_per_s", "min_trip_m"})
+_RANDOM_TRIP_KEYS = frozenset({
+    "vehicles_per_lane_km", "vehicles_per_h", "trips_per_s", "min_trip_m", "reroute_at_departure",
+})  # fmt: skip
 """Keys for random trips, which have no effect with counts."""
+
+_HELD_NUMBER_KEYS = frozenset({"vehicles_per_lane_km", "trips_per_s", "hold"})
+"""Keys that maintain a number of vehicles, which have no effect with ``vehicles_per_h``."""
 
 
 class UnusedKeys(NamedTuple):
@@ -181,7 +186,7 @@ def keys_without_effect(source: str) -> frozenset[str]:
     source
         One of :data:`TRAFFIC_SOURCES`, or "routes" for a network with routes.
     """
-    demand = _RATE_KEYS | {"counts", "edge_weights", "kinds"}
+    demand = _RANDOM_TRIP_KEYS | {"counts", "edge_weights", "kinds"}
     simulation = frozenset({
         "vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s", "junction_blocker_s", "teleport_s",
     })  # fmt: skip
@@ -235,6 +240,11 @@ class TrafficConfig(StrictModel):
     vehicles_per_lane_km: Positive = Field(
         4.0, description="Vehicles per km of lanes that the fleet may use, for random trips when vehicles is not set"
     )
+    vehicles_per_h: Positive | None = Field(
+        None,
+        description="Vehicles that start per hour, as random trips at regular intervals, instead of a number of"
+        " vehicles in the network. Use it for whole towns: it does not fill them",
+    )
     hold: Literal["exactly", "at_most"] = Field(
         "exactly", description="'exactly': a frame with fewer than `vehicles` is an error; 'at_most': it is allowed"
     )
@@ -277,6 +287,11 @@ class TrafficConfig(StrictModel):
         None,
         description="Time after which a trip that cannot depart is discarded. By default 120 s for random trips, and"
         " never for your own demand",
+    )
+    reroute_at_departure: bool = Field(
+        False,
+        description="Random trips take the route that is fastest in the traffic at their departure, rather than on"
+        " empty streets (SUMO's device.rerouting)",
     )
     min_trip_m: float = Field(0.0, ge=0, description="Minimum straight-line distance of random trips")
     edge_weights: dict[str, Annotated[float, Field(ge=0)]] = Field(
@@ -326,10 +341,13 @@ class TrafficConfig(StrictModel):
         frames = self.frames or 0
         duration_s = self.warmup_s + frames * self.frame_period_s
         counted_per_s = sum(count.per_hour for count in self.counts) / 3600.0
+        trips_per_s = self.trips_per_s
+        if self.vehicles_per_h is not None:
+            trips_per_s = self.vehicles_per_h / 3600.0
         for what, amount, maximum in (
             ("frames", frames, 10_000_000),
             ("seconds of traffic", duration_s, 1e7),
-            ("random trips (trips_per_s times these seconds)", duration_s * self.trips_per_s, 1e7),
+            ("random trips (their rate times these seconds)", duration_s * trips_per_s, 1e7),
             ("counted vehicles (per_hour for all this time)", duration_s * counted_per_s, 1e7),
         ):
             if amount > maximum:
@@ -363,8 +381,11 @@ class TrafficConfig(StrictModel):
         keys = self.model_fields_set & keys_without_effect(source)
         if not keys and self.counts:
             source = "counts"
-            keys = self.model_fields_set & _RATE_KEYS
+            keys = self.model_fields_set & _RANDOM_TRIP_KEYS
         if not keys and self.vehicles is not None:
             source = "vehicles"
-            keys = self.model_fields_set & {"vehicles_per_lane_km"}
+            keys = self.model_fields_set & {"vehicles_per_lane_km", "vehicles_per_h"}
+        if not keys and self.vehicles_per_h is not None:
+            source = "vehicles_per_h"
+            keys = self.model_fields_set & _HELD_NUMBER_KEYS
         return UnusedKeys("traffic", source, keys)

@@ -11,6 +11,11 @@ that was carried and the smallest that was not. A share is carried if, in a simu
 The simulation is coarse (steps of 0.5 s, no sublanes) and short, so queues that grow slowly do not show. Of a share
 below 1, :data:`RESERVE` is therefore used. Rare locks do not show either.
 
+For a whole town, :func:`find_flow` finds how many random trips per hour it carries: no vehicle stands for long, all
+find space to start, and less than :data:`MAX_QUEUING` of them stand beyond those that also stand in light traffic.
+Vehicles per kilometre of lane would be the wrong measure: most streets are residential, and all trips use a few main
+roads.
+
 The same network and flows give the same result.
 """
 
@@ -18,9 +23,11 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,7 +36,7 @@ from egvs.formats import xml
 from egvs.scenario.traffic_config import CountConfig, TrafficConfig
 from egvs.traffic import demand, sumo, sumo_folder
 from egvs.traffic.locks import MOVED_M, SAMPLE_S
-from egvs.traffic.network import Network, read_net_xml
+from egvs.traffic.network import Edge, Network, read_net_xml
 
 DURATION_S, WARMUP_S = 900.0, 300.0
 STEP_S = 0.5
@@ -40,6 +47,20 @@ MIN_ARRIVED = 0.9
 
 MAX_RUNS = 6
 RESERVE = 0.92
+
+FLOW_DURATION_S, FLOW_WARMUP_S, FLOW_STEP_S = 1500.0, 600.0, 1.0
+"""Simulations of whole towns."""
+
+LANE_PER_H, FIRST_LOAD = 1800, 0.6
+"""Vehicles that a lane passes per hour, and the load of the busiest junction in the first simulation of a town."""
+
+FLOW_FACTOR = 1.25
+MAX_FLOW_RUNS = 6
+MAX_QUEUING = 0.15
+LIGHT_SHARE = 0.1
+"""Light traffic is this share of the first flow."""
+
+_LOAD_TRIPS, _MIN_LIGHT_PER_H = 3000, 100
 
 _FACTOR = 0.7
 _CLOSE_ENOUGH = 1.06
@@ -148,31 +169,46 @@ def _simulate(
     routes = folder / sumo_folder.TRIPS_FILE
     demand.write_routes(traffic, roads, (0.0, DURATION_S), seed, routes, "assumed flows")
     files.write_text(folder / sumo_folder.VTYPES_FILE, demand.vtypes_xml(traffic.kinds))
-    options = {
+    state = _run_sumo(folder, DURATION_S, WARMUP_S, {"ignore-junction-blocker": f"{junction_blocker_s:g}"})
+    scheduled, arrived = _arrivals(routes, folder / _TRIPS_FILE)
+    return TrialRun(share, scheduled, arrived, state.longest_standing_s, state.waiting)
+
+
+class _FinalState(NamedTuple):
+    """What a simulation led to: the longest stand, vehicles without space to start, and the share at rest."""
+
+    longest_standing_s: float
+    waiting: int
+    share_at_rest: float
+
+
+def _run_sumo(folder: Path, duration_s: float, warmup_s: float, options: Mapping[str, str]) -> _FinalState:
+    """Simulate the routes in a folder."""
+    all_options = {
         "net-file": sumo_folder.NETWORK_FILE,
         "additional-files": sumo_folder.VTYPES_FILE,
         "route-files": sumo_folder.TRIPS_FILE,
         "seed": "1",
-        "end": f"{DURATION_S:g}",
+        "end": f"{duration_s:g}",
         "step-length": f"{STEP_S:g}",
         "threads": "1",
         "time-to-teleport": "-1",
         "collision.action": "none",
-        "ignore-junction-blocker": f"{junction_blocker_s:g}",
         "fcd-output": _FCD_FILE,
         "fcd-output.attributes": "id,x,y",
-        "device.fcd.begin": f"{WARMUP_S:g}",
+        "device.fcd.begin": f"{warmup_s:g}",
         "device.fcd.period": f"{SAMPLE_S:g}",
         "tripinfo-output": _TRIPS_FILE,
         "statistic-output": _STATISTICS_FILE,
         "no-step-log": "true",
         "no-warnings": "true",
         "duration-log.disable": "true",
+        **options,
     }
-    sumo.run_program("sumo", sumo_folder.as_flags(options), folder)
-    scheduled, arrived = _arrivals(routes, folder / _TRIPS_FILE)
+    sumo.run_program("sumo", sumo_folder.as_flags(all_options), folder)
     (vehicles,) = (e for e in xml.iter_elements(folder / _STATISTICS_FILE, "statistics") if e.tag == "vehicles")
-    return TrialRun(share, scheduled, arrived, _longest_standing_s(folder / _FCD_FILE), int(vehicles.get("waiting", 0)))
+    longest_s, share_at_rest = _standing(folder / _FCD_FILE)
+    return _FinalState(longest_s, int(vehicles.get("waiting", 0)), share_at_rest)
 
 
 def _arrivals(routes: Path, trips: Path) -> tuple[int, int]:
@@ -188,16 +224,16 @@ def _arrivals(routes: Path, trips: Path) -> tuple[int, int]:
     return scheduled, len(durations_s)
 
 
-def _longest_standing_s(fcd: Path) -> float:
-    """Return for how long a vehicle stood at most."""
+def _standing(fcd: Path) -> tuple[float, float]:
+    """Return for how long a vehicle stood at most, and the share of vehicles that stand in a sample."""
     lines = fcd.read_text(encoding="utf-8").splitlines()
     header = lines[0].split(";") if lines else []
     if len(lines) < 2:
-        return 0.0
+        return 0.0, 0.0
     column = {name: header.index(name) for name in ("timestep_time", "vehicle_id", "vehicle_x", "vehicle_y")}
     last: dict[str, tuple[float, float, float]] = {}
     """Time since when each vehicle stands, and where."""
-    longest_s = 0.0
+    longest_s, rows, standing = 0.0, 0, 0
     for line in lines[1:]:
         values = line.split(";")
         name = values[column["vehicle_id"]]
@@ -209,4 +245,162 @@ def _longest_standing_s(fcd: Path) -> float:
             since_s, old_x_m, old_y_m = time_s, x_m, y_m
         last[name] = since_s, old_x_m, old_y_m
         longest_s = max(longest_s, time_s - since_s)
-    return longest_s
+        rows += 1
+        standing += time_s > since_s
+    return longest_s, standing / max(rows, 1)
+
+
+@dataclass(frozen=True)
+class FlowTrial:
+    """A simulation of a whole town.
+
+    Attributes
+    ----------
+    vehicles_per_h
+        Vehicles that start per hour.
+    reroute
+        As ``traffic.reroute_at_departure``.
+    longest_standing_s
+        Longest time that a vehicle stood.
+    waiting
+        Vehicles without space to start, at the end.
+    share_queuing
+        Share of the vehicles that stand, in the mean over time, beyond the share in light traffic, which stands at
+        red signals.
+    """
+
+    vehicles_per_h: int
+    reroute: bool
+    longest_standing_s: float
+    waiting: int
+    share_queuing: float
+
+    @property
+    def is_carried(self) -> bool:
+        """Whether the town carries this flow."""
+        stands = self.longest_standing_s > MAX_STANDING_S
+        return not stands and self.waiting < MAX_WAITING and self.share_queuing < MAX_QUEUING
+
+
+@dataclass(frozen=True)
+class FlowCapacity:
+    """The flow that a town carries, whether it needs ``traffic.reroute_at_departure``, and the trial's simulations."""
+
+    vehicles_per_h: int
+    reroute: bool
+    runs: tuple[FlowTrial, ...]
+
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether any simulation showed that the flow is carried."""
+        return any(run.is_carried for run in self.runs)
+
+
+def find_flow(network: str, junction_blocker_s: float) -> FlowCapacity:
+    """Find how many random trips per hour a town carries.
+
+    Routes on empty streets give a first flow, at which the busiest junction has :data:`FIRST_LOAD` of
+    :data:`LANE_PER_H` on each lane that leads to it. Flows are raised by :data:`FLOW_FACTOR` as long as they are
+    carried, or lowered until one is, with vehicles that choose their routes at departure. If the first flow that is not
+    carried is carried with routes on empty streets, these are used from there on.
+
+    Parameters
+    ----------
+    network
+        The SUMO network, as text.
+    junction_blocker_s
+        As in ``[traffic]``.
+
+    Raises
+    ------
+    InputError
+        When no trip is possible.
+    """
+    with files.temporary_folder() as folder:
+        files.write_text(folder / sumo_folder.NETWORK_FILE, network)
+        trial = _TownTrial(folder, junction_blocker_s)
+        per_h, reroute = trial.first_flow(), True
+        trial.run_light_traffic(per_h)
+        carried = 0
+        while len(trial.runs) < MAX_FLOW_RUNS:
+            if trial.run(per_h, reroute).is_carried:
+                carried = per_h
+                per_h = round(per_h * FLOW_FACTOR)
+            elif carried and reroute:
+                reroute = False
+            elif carried:
+                break
+            else:
+                per_h = max(1, round(per_h / FLOW_FACTOR))
+        best = [run for run in trial.runs if run.is_carried and run.vehicles_per_h == carried]
+        return FlowCapacity(carried or per_h, best[0].reroute if best else True, tuple(trial.runs))
+
+
+class _TownTrial:
+    """Simulates flows through a town; the same trips depart at different rates."""
+
+    def __init__(self, folder: Path, junction_blocker_s: float) -> None:
+        self.runs: list[FlowTrial] = []
+        self._folder = folder
+        self._options = {
+            "ignore-junction-blocker": f"{junction_blocker_s:g}",
+            "step-length": f"{FLOW_STEP_S:g}",
+        }
+        traffic = TrafficConfig(network=sumo_folder.NETWORK_FILE)
+        self._roads = read_net_xml(folder / sumo_folder.NETWORK_FILE)
+        self._rng = np.random.default_rng(0)
+        files.write_text(folder / sumo_folder.VTYPES_FILE, demand.vtypes_xml(traffic.kinds))
+        self._kinds = traffic.kinds
+        self._pairs = [
+            demand.origin_destination_pairs(self._roads, kind, traffic, self._rng, "random trips")
+            for kind in traffic.kinds
+        ]
+        self._routed: list[demand.RoutedTrip] = []
+        self._n_trips = 0
+        self._share_in_light_traffic = 0.0
+
+    def first_flow(self) -> int:
+        """Return the flow, in vehicles per hour, at which the busiest junction has the load :data:`FIRST_LOAD`."""
+        self._draw(_LOAD_TRIPS)
+        incoming: dict[str, list[Edge]] = {}
+        for edge in self._roads.edges:
+            incoming.setdefault(edge.to_node, []).append(edge)
+        passes = Counter(edge for trip in self._routed for edge in trip.edges.split())
+        loads = []
+        for edges in incoming.values():
+            if len(edges) > 1:
+                loads.append(math.fsum(passes[edge.id] / (LANE_PER_H * len(edge.lanes)) for edge in edges))
+        per_trip = max(loads, default=0.0) / self._n_trips
+        if not per_trip:  # no junction
+            return LANE_PER_H
+        return max(1, round(FIRST_LOAD / per_trip))
+
+    def run_light_traffic(self, first_per_h: int) -> None:
+        """Measure which share of the vehicles stands in light traffic."""
+        per_h = max(_MIN_LIGHT_PER_H, round(LIGHT_SHARE * first_per_h))
+        self._share_in_light_traffic = self._simulate(per_h, True).share_at_rest
+
+    def run(self, per_h: int, reroute: bool) -> FlowTrial:
+        """Simulate a flow."""
+        state = self._simulate(per_h, reroute)
+        share_queuing = round(max(0.0, state.share_at_rest - self._share_in_light_traffic), 4)
+        run = FlowTrial(per_h, reroute, state.longest_standing_s, state.waiting, share_queuing)
+        self.runs.append(run)
+        return run
+
+    def _simulate(self, per_h: int, reroute: bool) -> _FinalState:
+        count = math.ceil(FLOW_DURATION_S * per_h / 3600.0)
+        if count > self._n_trips:
+            self._draw(count)
+        departs_s = np.arange(self._n_trips, dtype=np.float64) * (3600.0 / per_h)
+        departing = [trip for trip in self._routed if trip.number < count]
+        files.write_text(self._folder / sumo_folder.TRIPS_FILE, demand.routes_xml(departing, departs_s))
+        options = self._options | (demand.REROUTE_OPTIONS if reroute else {})
+        return _run_sumo(self._folder, FLOW_DURATION_S, FLOW_WARMUP_S, options)
+
+    def _draw(self, count: int) -> None:
+        """Draw and route trips, at least as many as a number."""
+        departs_s = np.arange(count, dtype=np.float64)
+        trips = demand.draw_trips(self._roads, self._kinds, self._pairs, departs_s, self._rng)
+        self._n_trips = count
+        self._routed = demand.route_trips(trips, self._folder, sumo_folder.NETWORK_FILE, sumo_folder.VTYPES_FILE)

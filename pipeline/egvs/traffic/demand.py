@@ -9,6 +9,9 @@ cannot be left; turnarounds do not count. A network without such edges (a loop, 
 trips between any two edges at least a quarter of the network's diagonal apart, with a note. More trips are drawn than
 fit, so that ``--max-num-vehicles`` maintains N vehicles, as SUMO's randomTrips.py does.
 
+With ``traffic.vehicles_per_h``, trips depart at regular intervals, and duarouter finds all routes at once. A number of
+vehicles that is maintained is a closed queue: the slowest junction of a town collects all of them.
+
 **Traffic counts.** Steps, for the counts of the complete fleet and then for those of each kind: find plausible routes
 over each counted location; SUMO's routeSampler (https://sumo.dlr.de/docs/Tools/Turns.html#routesamplerpy) selects
 routes that meet the counts, with departures uniformly distributed over the simulation; each vehicle of the fleet gets a
@@ -59,6 +62,19 @@ STRAIGHT_STOP_ATTRIBUTES = {"maxSpeedLat": "1.0", "lcMaxSpeedLatStanding": "0", 
 MAX_DETOUR = 1.25
 
 CANDIDATE_ROUTES_FILE, COUNTS_FILE, SAMPLED_ROUTES_FILE = "candidates.rou.xml", "counts.xml", "sampled.rou.xml"
+DRAWN_TRIPS_FILE, ROUTED_TRIPS_FILE = "drawn.rou.xml", "routed.rou.xml"
+
+REROUTE_OPTIONS = {
+    "device.rerouting.probability": "1",
+    "device.rerouting.period": "0",
+    "device.rerouting.pre-period": "30",
+    "device.rerouting.adaptation-interval": "10",
+    "device.rerouting.adaptation-steps": "18",
+    "routing-algorithm": "astar",
+}
+"""SUMO's options for ``traffic.reroute_at_departure``: speeds are means of three minutes. Threads would make the routes
+depend on chance.
+"""
 
 FLEET = "fleet"
 """Prefix of the ids of vehicles that were counted without their kind."""
@@ -339,6 +355,68 @@ def trips_xml(trips: Sequence[Trip], departs_s: FloatArray) -> str:
         for index, (trip, depart_s) in enumerate(zip(trips, departs_s, strict=True))
     ]
     return _xml_document("routes", lines)
+
+
+class RoutedTrip(NamedTuple):
+    """A trip: its number among all that were routed, name of the kind, and ids of the edges of its route."""
+
+    number: int
+    kind: str
+    edges: str
+
+    def xml(self, depart_s: float) -> str:
+        """Return the vehicle as a line of a SUMO route file."""
+        return (
+            f'    <vehicle id="{self.number}" type={quoteattr(self.kind)} depart="{depart_s:.3f}" departLane="best"'
+            f' departSpeed="max"><route edges={quoteattr(self.edges)}/></vehicle>'
+        )
+
+
+def route_trips(trips: Sequence[Trip], folder: Path, network: str, vtypes: str) -> list[RoutedTrip]:
+    """Find the fastest routes on empty streets, all in one run of duarouter.
+
+    Parameters
+    ----------
+    trips
+        The trips.
+    folder
+        Contains the files; also used for temporary files.
+    network, vtypes
+        Names of the network, and of the file with the kinds of vehicles.
+
+    Returns
+    -------
+    list of RoutedTrip
+        In the order of ``trips``, without those that have no route.
+    """
+    files.write_text(folder / DRAWN_TRIPS_FILE, trips_xml(trips, np.arange(len(trips), dtype=np.float64)))
+    options = [
+        "-n", network, "-r", DRAWN_TRIPS_FILE, "-a", vtypes, "-o", ROUTED_TRIPS_FILE,
+        "--routing-algorithm", "CHWrapper", "--ignore-errors", "--no-warnings", "--no-step-log",
+    ]  # fmt: skip
+    sumo.run_program("duarouter", options, folder)
+    sumo.check_xml_complete(folder / ROUTED_TRIPS_FILE, "routes")
+    routed = []
+    for vehicle in xml.iter_elements(folder / ROUTED_TRIPS_FILE, "routes"):
+        for route in vehicle.iter("route"):
+            edges = route.get("edges", "")
+            routed.append(RoutedTrip(int(vehicle.get("id", "0")), vehicle.get("type", ""), edges))
+    for name in (DRAWN_TRIPS_FILE, ROUTED_TRIPS_FILE):
+        (folder / name).unlink()
+    return routed
+
+
+def routes_xml(trips: Sequence[RoutedTrip], departs_s: FloatArray) -> str:
+    """Return a SUMO route file.
+
+    Parameters
+    ----------
+    trips
+        The trips.
+    departs_s
+        Departure of each trip, by ``RoutedTrip.number``, in seconds; ascending.
+    """
+    return _xml_document("routes", [trip.xml(departs_s[trip.number]) for trip in trips])
 
 
 def vtypes_xml(kinds: Sequence[VehicleKind]) -> str:

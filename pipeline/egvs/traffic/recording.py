@@ -84,6 +84,8 @@ class Recording:
         Source of the rows, for messages; empty for a running SUMO.
     roads
         The simulated network, for messages; None if it is not known.
+    teleports
+        Vehicles that SUMO moved on.
     """
 
     rows: Iterable[pa.Table]
@@ -97,6 +99,7 @@ class Recording:
     summary: Callable[[], RecordingSummary | None] = lambda: None
     source: str = ""
     roads: network.Network | None = None
+    teleports: Sequence[locks.Teleport] = ()
 
 
 def record_traffic(
@@ -216,6 +219,7 @@ def _record_simulated(
             lambda: summary,
             f"{where} ({sources})",
             prepared.roads,
+            teleports,
         )
     finally:
         for name in (*_TABLES, sumo_folder.DRIVEN_ROUTES_FILE, sumo_folder.STATISTICS_FILE):
@@ -416,7 +420,7 @@ def demand_key(scenario: Scenario) -> DemandKey:
     if traffic.counts:
         hint = "Lower per_hour of the counts there, or correct the signals and connections of the network."
         return DemandKey(f"{where}.counts", hint)
-    for key in ("vehicles", "vehicles_per_lane_km"):
+    for key in ("vehicles", "vehicles_per_h", "vehicles_per_lane_km"):
         if key in traffic.model_fields_set and getattr(traffic, key) is not None:
             return DemandKey(f"{where}.{key}", "Lower it, or correct the signals and connections of the network.")
     return DemandKey(

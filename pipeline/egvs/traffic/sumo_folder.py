@@ -299,8 +299,9 @@ def prepare_simulation(scenario: Scenario, folder: Path, extensions: Iterable[Tr
             demand.write_routes(traffic, roads, times_s, demand_seed, folder / TRIPS_FILE, where)
         else:
             notes += _write_trips(scenario, roads, timing, np.random.default_rng(demand_seed), folder)
-            vehicles = demand.target_vehicle_count(traffic, roads)
-            depart_delay_s = depart_delay_s or _DRAWN_DEPART_DELAY_S
+            if traffic.vehicles_per_h is None:
+                vehicles = demand.target_vehicle_count(traffic, roads)
+                depart_delay_s = depart_delay_s or _DRAWN_DEPART_DELAY_S
 
     extra_vehicles = 0
     for extension, name, seed in zip(adding, extra_files, extra_seeds, strict=True):
@@ -355,6 +356,8 @@ def _scenario_options(traffic: TrafficConfig, timing: Timing, seed: int) -> dict
     }
     if traffic.junction_blocker_s is not None:
         options["ignore-junction-blocker"] = f"{traffic.junction_blocker_s:g}"
+    if traffic.reroute_at_departure:
+        options |= demand.REROUTE_OPTIONS
     return options
 
 
@@ -374,15 +377,25 @@ def _write_trips(
     traffic = scenario.traffic
     where = traffic_location(scenario)
     pairs = [demand.origin_destination_pairs(roads, kind, traffic, rng, where) for kind in traffic.kinds]
-    count = int(np.ceil((timing.end_ms - timing.begin_ms) / 1000.0 * traffic.trips_per_s))
-    departs_s = timing.begin_ms / 1000.0 + np.arange(count) / traffic.trips_per_s
+    trips_per_s = traffic.trips_per_s
+    if traffic.vehicles_per_h is not None:
+        trips_per_s = traffic.vehicles_per_h / 3600.0
+    count = int(np.ceil((timing.end_ms - timing.begin_ms) / 1000.0 * trips_per_s))
+    departs_s = timing.begin_ms / 1000.0 + np.arange(count) / trips_per_s
     trips = demand.draw_trips(roads, traffic.kinds, pairs, departs_s, rng)
-    files.write_text(folder / TRIPS_FILE, demand.trips_xml(trips, departs_s))
-    return [
+    notes = [
         f"{kind.name}: no trip between fringe edges; trips join any two edges that are far apart"
         for kind, kind_pairs in zip(traffic.kinds, pairs, strict=True)
         if not kind_pairs.fringe
     ]
+    if traffic.vehicles_per_h is None:
+        files.write_text(folder / TRIPS_FILE, demand.trips_xml(trips, departs_s))
+        return notes
+    routed = demand.route_trips(trips, folder, NETWORK_FILE, VTYPES_FILE)
+    if len(routed) < len(trips):
+        notes.append(f"{len(trips) - len(routed)} of {len(trips)} trips have no route and were left out")
+    files.write_text(folder / TRIPS_FILE, demand.routes_xml(routed, departs_s))
+    return notes
 
 
 def _copy_files(
