@@ -56,6 +56,7 @@ TABLES: dict[str, str] = {
     "detections": "detections.parquet",
     "city": "junctions.parquet",
     "city_plan": "plan.parquet",
+    "city_curve": "curve.parquet of a city run",
     "fcd": "traffic/<junction>.parquet",
 }
 """Schema -> the file that it describes, in the order of the page."""

@@ -59,7 +59,10 @@ def test_allocates_count_optimally(junctions: list[JunctionPlans], count: int) -
         if sum(numbers) <= count
     )
     assert allocated.bound == max(best, allocated.value)
-    for k, (value, bound) in enumerate(allocated.curve):
+    for k, (limit, chosen, value, bound) in enumerate(allocated.curve):
+        assert limit == k
+        assert sum(junction.plans[i].value for junction, i in zip(junctions, chosen, strict=True)) == value
+        assert sum(junction.plans[i].count for junction, i in zip(junctions, chosen, strict=True)) <= k
         assert value == max(v for v, sensors, _ in all_choices(junctions) if sensors <= k)
         assert bound >= value
 

@@ -166,6 +166,41 @@ def test_page_keeps_plan_until_junctions_change(city: City, tmp_path: Path) -> N
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("in_process_cluster")
+def test_command_prints_phases_and_page_shows_curve(city: City, tmp_path: Path, run_egvs: Any) -> None:
+    arguments = ("--set", 'score.rank_by="expected_detections"', "--out", tmp_path / "out")
+    code, printed, _ = run_egvs("city", "place", city.folder, "--count", "3", "--phases", "1", *arguments)
+    assert code == 0
+    assert "standard error: " in printed
+    assert "phase 1: " in printed and "phase 2: " in printed
+    curve, metadata = parquet.read_artefact(tmp_path / "out" / "curve.parquet", "city_curve")
+    rows, sensors = curve.to_pylist(), pq.read_table(tmp_path / "out" / "plan.parquet").to_pylist()
+    assert [row["limit"] for row in rows] == [0.0, 1.0, 2.0, 3.0]
+    assert [row["installed"] for row in rows[1:]] == pytest.approx([sensor["score"] for sensor in sensors])
+    assert all(row["score"] >= row["installed"] * (1 - 1e-12) for row in rows)
+    assert all(row["score_se"] > 0 for row in rows[1:])
+    assert [sensor["phase"] for sensor in sensors] == [1, 2, 2]
+    assert metadata["plan"]["phases"] == [1, 3]
+    page_file = tmp_path / "out" / "city.html"
+    html = page_file.read_text()
+    assert "How many sensors are enough?" in html and "<h3>Phases</h3>" in html and "curve-band" in html
+
+    read = results.read_plan(tmp_path / "out", [junction.id for junction in city.junctions])
+    assert read is not None and read.has_errors and len(read.by_phase) == 2
+    (tmp_path / "out" / "curve.parquet").unlink()
+    assert results.read_plan(tmp_path / "out", [junction.id for junction in city.junctions]) is None
+
+
+@pytest.mark.parametrize("phases", ["2,1", "0,3", "4", "1,1"])
+def test_rejects_phases_that_do_not_ascend_to_the_count(city: City, tmp_path: Path, phases: str) -> None:
+    numbers = [int(number) for number in phases.split(",")]
+    with pytest.raises(InputError, match=rf"--phases {phases}: expected ascending numbers .* to the count of 3"):
+        city_run.place_city(city, tmp_path / "out", count=3, phases=numbers)
+    with pytest.raises(InputError, match="phases are numbers of sensors, so they need --count"):
+        city_run.place_city(city, tmp_path / "out", budget=3.0, phases=numbers)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_process_cluster")
 def test_plans_within_budget(city: City, tmp_path: Path) -> None:
     with pytest.raises(Exception, match="the cost of site pole_a is unknown"):
         city_run.place_city(city, tmp_path / "out", budget=20.0)

@@ -285,3 +285,41 @@ def test_from_map_to_scores(extract: Path, tmp_path: Path, run_egvs) -> None:
     assert traffic_split.make_city_traffic(city).is_new  # SUMO runs again: the same bytes
     again = contents(tmp_path / "town" / "traffic")
     assert all(again[name] == before[name] for name in before if name.endswith(".parquet"))
+
+
+@pytest.fixture(scope="module")
+def close_junctions(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map with three signalised junctions: the middle one has more lanes, and the next one is 45 m to the east."""
+    drawn = Map()
+    positions = (-200.0, 0.0, 45.0)
+    middles = [drawn.node(x, 0, highway="traffic_signals") for x in positions]
+    for x, middle, lanes in zip(positions, middles, ("2", "4", "2"), strict=True):
+        ends = drawn.node(x, -150), middle, drawn.node(x, 150)
+        drawn.way(list(ends), highway="residential", name=f"Road {x:g}", lanes=lanes)
+    drawn.way([drawn.node(-400, 0), *middles, drawn.node(400, 0)], highway="secondary", lanes="2", name="Main")
+    return drawn.write(tmp_path_factory.mktemp("map") / "town.osm")
+
+
+@pytest.mark.slow
+def test_leaves_out_smaller_junction_of_overlapping_regions(close_junctions: Path, tmp_path: Path) -> None:
+    made = creation.create_city(tmp_path / "town", close_junctions)
+    kept = [junction.junction.title for junction in made.junctions]
+    assert [title.split(" of ")[1] for title in kept] == ["Main and Road 0", "Main and Road -200"]
+    assert len(made.left_out[creation.OVERLAPPING_REGION]) == 1
+    summary = json.loads((made.folder / "import.json").read_text())
+    assert summary["left_out"][creation.OVERLAPPING_REGION] == made.left_out[creation.OVERLAPPING_REGION]
+    regions = [junction.roi.area for junction in made.junctions]
+    assert regions[0].intersection(regions[1]).area == 0.0
+
+
+@pytest.mark.slow
+def test_rejects_rows_with_overlapping_regions(close_junctions: Path, tmp_path: Path) -> None:
+    table = tmp_path / "mine.csv"
+    rows = [",".join([name, *map(str, degrees(x, 0))]) for name, x in (("small", 45.0), ("large", 0.0))]
+    table.write_text("\n".join(["junction,lat_deg,lon_deg", *rows, ""]))
+    with pytest.raises(InputError) as caught:
+        creation.create_city(tmp_path / "town", close_junctions, NewCityOptions(which=str(table)))
+    message = str(caught.value)
+    assert message.startswith(f"{table}: junctions small and large: their regions of interest overlap")
+    assert "Remove one of the two rows." in message
+    assert not (tmp_path / "town").exists()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from egvs.city import page
 from egvs.city.model import City, CityJunction
-from egvs.city.results import JunctionResult
+from egvs.city.results import BudgetPoint, CityPlan, JunctionResult
 from egvs.core.errors import Diagnostic
 from egvs.report.ranking import RankedSite
 from egvs.scenario.traffic_config import TrafficConfig
@@ -37,6 +37,32 @@ def test_shows_best_junction_warnings_and_attribution() -> None:
     assert "<b>where</b>: problem. <small>hint</small>" in html
     assert "© the mappers" in html
     assert html.count('class="plan"') == 2  # by gain, and by the share that is seen
+
+
+def make_plan(requested: str, phases: tuple[int, ...] = (), se: float = 2.0) -> CityPlan:
+    """Return a plan without sensors and with a curve of three points."""
+    curve = tuple(BudgetPoint(n, n, 5.0 * n, 30.0 * n, se * n, 31.0 * n, 29.0 * n, se * n) for n in range(3))
+    has_errors = not math.isnan(se)
+    return CityPlan((), "egvs", {requested: 2.0}, 60.0, 62.0, 90.0, 9, 2, curve, phases, "the <blocks>", has_errors)
+
+
+def test_shows_curve_with_errors_and_phases() -> None:
+    results = (make_result("a", 1, 90.0), make_result("b", 2, 30.0))
+    html = page.render_page(make_city(*results), results, (), make_plan("count", (1, 2)))
+    assert "Standard errors come from the &lt;blocks&gt;." in html
+    assert 'class="curve-band"' in html and 'class="curve-installed"' in html
+    assert "2 sensors: 60 ± 4, at most 62" in html
+    assert html.count('class="curve-phase"') == 2
+    assert ">3.33 %<" in html  # 29 instead of 30
+
+
+def test_curve_without_errors_says_why() -> None:
+    results = (make_result("a", 1, 90.0), make_result("b", 2, 30.0))
+    html = page.render_page(make_city(*results), results, (), make_plan("budget", (), math.nan))
+    assert "There are no standard errors: the &lt;blocks&gt;." in html
+    assert 'class="curve-band"' not in html and 'class="curve-installed"' not in html
+    assert "cost 10, 2 sensors: 60, at most 62" in html
+    assert not re.search(r"\bnan\b", html)
 
 
 def test_escapes_names() -> None:

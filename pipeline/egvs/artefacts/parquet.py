@@ -235,6 +235,7 @@ _REQUIRED_METADATA: dict[str, tuple[str, ...]] = {
     "placement": ("inputs", "stages", "plan"),
     "curve": ("inputs", "stages", "plan"),
     "city_plan": ("inputs", "plan"),
+    "city_curve": ("inputs", "plan"),
     "detection": ("inputs", "frames", "stages"),
     "fused": ("inputs", "frames", "shown"),
     "correlation": ("inputs", "frames", "stages", "own_score", "shown"),

@@ -15,13 +15,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from egvs.artefacts.planned_sensor import PlannedSensor
+from egvs.city.replicates import CityBlocks, JointReplicates
 from egvs.city.results import mean_vehicles, score_factor
 from egvs.city.tasks import SCENE_CACHE, Job, RunSettings, catch_input_errors
 from egvs.core.errors import InputError
@@ -41,17 +42,32 @@ _MAX_STATES = 100_000
 """Maximum number of costs that the dynamic programming for a budget distinguishes. With more, costs within a
 1 / _MAX_STATES of the budget are merged, and the best of them is kept."""
 
+CURVE_STEPS = 40
+"""Number of costs of a curve for a budget."""
+
 _COST_TOLERANCE = 1e-9
 """Costs are sums of decimal numbers: a budget is exceeded if the cost is higher by more than this share."""
 
 
 @dataclass(frozen=True)
 class JunctionPlan:
-    """Sensors at one junction, in the order of installation; their joint score and cost."""
+    """Sensors at one junction, in the order of installation.
+
+    Attributes
+    ----------
+    sensors
+        The sensors.
+    value, cost
+        Their joint score, and their cost.
+    replicates
+        The joint score of the first 0, 1, ... n of them, of all traffic and with each group of blocks left out,
+        (n + 1, 1 + k) float64; None where there are no standard errors.
+    """
 
     sensors: tuple[PlannedSensor, ...]
     value: float
     cost: float
+    replicates: FloatArray | None = field(default=None, compare=False)
 
     @property
     def count(self) -> int:
@@ -106,15 +122,43 @@ class JunctionPlans:
         return min(self.joint_of_all, self.bounds[-1] * count / self.max_count)
 
     def scaled(self, factor: float) -> JunctionPlans:
-        """Return the same plans with all joint scores multiplied by a factor."""
+        """Return the same plans with all joint scores multiplied by a factor; without replicates."""
         if factor == 1.0:
             return self
         plans = []
         for plan in self.plans:
             sensors = tuple(replace(sensor, gain=sensor.gain * factor) for sensor in plan.sensors)
-            plans.append(replace(plan, value=plan.value * factor, sensors=sensors))
+            plans.append(replace(plan, value=plan.value * factor, sensors=sensors, replicates=None))
         bounds = tuple(bound * factor for bound in self.bounds)
         return replace(self, plans=tuple(plans), bounds=bounds, joint_of_all=self.joint_of_all * factor)
+
+    def with_replicates(self, replicates: JointReplicates) -> JunctionPlans:
+        """Return the same plans with replicates."""
+        plans = []
+        for plan in self.plans:
+            plans.append(replace(plan, replicates=replicates.of_order([sensor.site for sensor in plan.sensors])))
+        return replace(self, plans=tuple(plans))
+
+
+class CurvePoint(NamedTuple):
+    """The best allocation within a limit.
+
+    Attributes
+    ----------
+    limit
+        Maximum number of sensors, or maximum cost.
+    chosen
+        Index into :attr:`JunctionPlans.plans` for each junction.
+    value
+        Sum of the joint scores.
+    bound
+        Upper bound of all plans of the city within the limit.
+    """
+
+    limit: float
+    chosen: tuple[int, ...]
+    value: float
+    bound: float
 
 
 @dataclass(frozen=True)
@@ -123,20 +167,27 @@ class Allocation:
 
     Attributes
     ----------
-    chosen
-        Index into :attr:`JunctionPlans.plans` for each junction.
-    value
-        Sum of the joint scores.
-    bound
-        Upper bound of all plans of the city.
     curve
-        For a count: the best sum and the upper bound for 0, 1, ... sensors, (count + 1, 2) float64; empty for a budget.
+        The best allocations within ascending limits. For a count: of as many sensors as are forced, one more, and so
+        on. For a budget: of at most :data:`CURVE_STEPS` costs, evenly spread. The last one is within the full limit.
     """
 
-    chosen: tuple[int, ...]
-    value: float
-    bound: float
-    curve: FloatArray
+    curve: tuple[CurvePoint, ...]
+
+    @property
+    def chosen(self) -> tuple[int, ...]:
+        """Index into :attr:`JunctionPlans.plans` for each junction, within the full limit."""
+        return self.curve[-1].chosen
+
+    @property
+    def value(self) -> float:
+        """Sum of the joint scores, within the full limit."""
+        return self.curve[-1].value
+
+    @property
+    def bound(self) -> float:
+        """Upper bound of all plans of the city within the full limit."""
+        return self.curve[-1].bound
 
 
 class CostPoint(NamedTuple):
@@ -159,7 +210,9 @@ def check_additive_config(scenario: Scenario) -> None:
 
 
 @catch_input_errors
-def junction_plans(job: Job, settings: RunSettings, max_count: int, with_costs: bool) -> JunctionPlans:
+def junction_plans(
+    job: Job, settings: RunSettings, max_count: int, with_costs: bool, blocks: CityBlocks | None = None
+) -> JunctionPlans:
     """Compute the plans of a junction; a task of a worker.
 
     Parameters
@@ -170,6 +223,8 @@ def junction_plans(job: Job, settings: RunSettings, max_count: int, with_costs: 
         Maximum number of sensors.
     with_costs
         Whether costs are needed, and single sensors that are cheaper than the best one.
+    blocks
+        Blocks of frames for replicates; without replicates when None.
     """
     with settings.applied(), SCENE_CACHE.borrow(settings.token, job) as scene:
         scene.ensure_artefacts()
@@ -180,8 +235,12 @@ def junction_plans(job: Job, settings: RunSettings, max_count: int, with_costs: 
             scenario = scenario.model_copy(update={"placement": placement})
         context = open_folder(scenario, scene.context.folder.path, jobs=1)
         problem = problem_builder.build_problem(context, lambda _: None)
+        vehicles = mean_vehicles(job.out)
         plans = plan_junction(problem, job.junction, max_count, with_single_sensors=with_costs)
-        return plans.scaled(score_factor(scenario.score.rank_by, mean_vehicles(job.out)))
+        plans = plans.scaled(score_factor(scenario.score.rank_by, vehicles))
+        if blocks is None:
+            return plans
+        return plans.with_replicates(JointReplicates(context, problem, blocks, vehicles))
 
 
 def plan_junction(
@@ -267,13 +326,21 @@ def allocate_sensors(junctions: Sequence[JunctionPlans], count: int) -> Allocati
         choices.append(values.argmax(axis=0))
         best = values.max(axis=0)
 
-    chosen: list[int] = []
-    remaining = count
-    for junction, choice in zip(reversed(junctions), reversed(choices), strict=True):
-        chosen.append(int(choice[remaining]))
-        remaining -= junction.plans[chosen[-1]].count
     bounds = np.maximum(_bounds_by_count(junctions, count), best)
-    return Allocation(tuple(reversed(chosen)), float(best[-1]), float(bounds[-1]), np.column_stack([best, bounds]))
+    curve = []
+    for limit in np.flatnonzero(best > -math.inf).tolist():
+        chosen = _chosen_plans(junctions, choices, limit)
+        curve.append(CurvePoint(limit, chosen, float(best[limit]), float(bounds[limit])))
+    return Allocation(tuple(curve))
+
+
+def _chosen_plans(junctions: Sequence[JunctionPlans], choices: Sequence[IntArray], count: int) -> tuple[int, ...]:
+    """Return the plan of each junction, from the choices of the dynamic programming for each remaining count."""
+    chosen: list[int] = []
+    for junction, choice in zip(reversed(junctions), reversed(choices), strict=True):
+        chosen.append(int(choice[count]))
+        count -= junction.plans[chosen[-1]].count
+    return tuple(reversed(chosen))
 
 
 def _bounds_by_count(junctions: Sequence[JunctionPlans], count: int) -> FloatArray:
@@ -301,14 +368,22 @@ def allocate_budget(junctions: Sequence[JunctionPlans], budget: float) -> Alloca
         steps.append((states // len(costs), states % len(costs)))
         costs, values = new_costs[states], new_values[states]
 
+    curve = []
+    for step_limit in np.linspace(0.0, limit, CURVE_STEPS + 1).tolist():
+        state = int(np.searchsorted(costs, step_limit, side="right")) - 1  # forced sensors cost nothing, so >= 0
+        value = float(values[state])
+        bound = max(value, relaxed_bound(junctions, step_limit))
+        curve.append(CurvePoint(step_limit, _plans_of_state(steps, state), value, bound))
+    return Allocation(tuple(curve))
+
+
+def _plans_of_state(steps: Sequence[tuple[IntArray, IntArray]], state: int) -> tuple[int, ...]:
+    """Return the plan of each junction that leads to a state of the dynamic programming."""
     chosen: list[int] = []
-    state = len(values) - 1
     for plan_of_state, state_before in reversed(steps):
         chosen.append(int(plan_of_state[state]))
         state = int(state_before[state])
-    value = float(values[-1])
-    bound = max(value, relaxed_bound(junctions, limit))
-    return Allocation(tuple(reversed(chosen)), value, bound, np.empty((0, 2)))
+    return tuple(reversed(chosen))
 
 
 def _pareto_front(costs: FloatArray, values: FloatArray, limit: float) -> IntArray:

@@ -6,7 +6,8 @@ The folder of each junction is byte for byte what ``egvs run`` of its scenario a
 
 Steps of :func:`place_city`: run all junctions; compute the best plans of 1, 2, ... sensors for each, on the cluster;
 allocate sensors to the junctions (:mod:`egvs.city.allocation`). Where a junction gets as many sensors as its largest
-plan has, its plans are computed for twice as many, and the allocation is repeated.
+plan has, its plans are computed for twice as many, and the allocation is repeated. Then put the sensors into the order
+of installation, and estimate the standard errors of the curve (:mod:`egvs.city.city_plan`).
 """
 
 from __future__ import annotations
@@ -14,13 +15,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, pairwise
 from pathlib import Path
 
-from egvs.artefacts.planned_sensor import PlannedSensor
-from egvs.city import allocation, page, results, scheduler, traffic_split
+from egvs.city import allocation, city_plan, page, results, scheduler, traffic_split
 from egvs.city.allocation import Allocation, JunctionPlans
 from egvs.city.model import City
+from egvs.city.replicates import CityBlocks, common_blocks
 from egvs.city.results import CityPlan, JunctionResult, read_junction_results, write_results
 from egvs.city.scheduler import Cluster
 from egvs.city.tasks import Job, JobFailure, JobResult
@@ -183,6 +184,7 @@ def place_city(
     *,
     count: int | None = None,
     budget: float | None = None,
+    phases: Sequence[int] = (),
 ) -> CityPlacement:
     """Find the sensors of a city that are best together.
 
@@ -192,6 +194,9 @@ def place_city(
         As in :func:`run_city`.
     count, budget
         Maximum number of sensors, or maximum cost: exactly one of them.
+    phases
+        For a count: number of sensors after each phase of the installation, ascending. The count itself is added where
+        it is missing.
 
     Raises
     ------
@@ -200,6 +205,7 @@ def place_city(
     """
     options = options or CityRunOptions()
     requested = _check_request(count, budget)
+    phases = _check_phases(phases, count)
     folder = _run_folder(city, out)
     jobs = make_jobs(city, folder, options)
     for job in jobs:
@@ -215,14 +221,19 @@ def place_city(
             useful_jobs = [job for job in jobs if job.junction in with_gain]
             if not useful_jobs:
                 raise InputError(city.file, "no site sees any traffic", "Use a city with traffic.")
-            plans, shares = _allocate_sensors(cluster, useful_jobs, count, budget, options.progress)
+            blocks = common_blocks(useful_jobs)
+            plans, shares = _allocate_sensors(cluster, useful_jobs, count, budget, blocks, options.progress)
+        n_forced = sum(junction.plans[0].count for junction in plans)
+        if phases and phases[0] < n_forced:
+            problem = f"{n_forced} sensors are already installed (placement.forced)"
+            raise InputError(f"--phases {phases[0]}", problem, f"Let the first phase end at {n_forced} or more.")
 
-        plan = _make_city_plan(plans, shares, ran.results[0].best.rank_by, requested)
+        plan = city_plan.make_city_plan(plans, shares, ran.results[0].best.rank_by, requested, phases, blocks)
         without_gain = [job.junction for job in jobs if job.junction not in with_gain]
         warnings = (*ran.warnings, *overlap_warnings(jobs), *_unseen_junction_warnings(city, without_gain))
-        plan_file = results.write_plan(folder, city, plan, [job.junction for job in jobs])
+        plan_files = results.write_plan(folder, city, plan, [job.junction for job in jobs])
         page_file = page.write_page(folder, city, ran.results, warnings, plan)
-    return CityPlacement(replace(ran, warnings=warnings), plan, (plan_file, page_file))
+    return CityPlacement(replace(ran, warnings=warnings), plan, (*plan_files, page_file))
 
 
 def _check_request(count: int | None, budget: float | None) -> dict[str, float]:
@@ -236,8 +247,30 @@ def _check_request(count: int | None, budget: float | None) -> dict[str, float]:
     return requested
 
 
+def _check_phases(phases: Sequence[int], count: int | None) -> tuple[int, ...]:
+    """Return the number of sensors after each phase; raise an InputError if they are invalid."""
+    if not phases:
+        return ()
+    given = ",".join(map(str, phases))
+    if count is None:
+        hint = "Use, for example, --count 10 --phases 5,10."
+        raise InputError(f"--phases {given}", "phases are numbers of sensors, so they need --count", hint)
+    ascending = all(a < b for a, b in pairwise(phases))
+    if not ascending or not phases[0] >= 1 or not phases[-1] <= count:
+        problem = f"expected ascending numbers of sensors from 1 to the count of {count}"
+        raise InputError(f"--phases {given}", problem, "Use, for example, --count 10 --phases 5,10.")
+    if phases[-1] < count:
+        return (*phases, count)
+    return tuple(phases)
+
+
 def _allocate_sensors(
-    cluster: Cluster, jobs: Sequence[Job], count: int | None, budget: float | None, progress: ProgressCallback
+    cluster: Cluster,
+    jobs: Sequence[Job],
+    count: int | None,
+    budget: float | None,
+    blocks: CityBlocks | str,
+    progress: ProgressCallback,
 ) -> tuple[list[JunctionPlans], Allocation]:
     """Return the plans of each junction, and the allocation of the count or budget to them."""
     limit, first_count = _MAX_SENSORS, _MIN_FIRST_COUNT
@@ -247,8 +280,9 @@ def _allocate_sensors(
 
     max_counts = {job.junction: first_count for job in jobs}
     plans: dict[str, JunctionPlans] = {}
+    common = blocks if isinstance(blocks, CityBlocks) else None
     while True:
-        for result in _compute_plans(cluster, jobs, max_counts, with_costs=budget is not None):
+        for result in _compute_plans(cluster, jobs, max_counts, common, with_costs=budget is not None):
             plans[result.junction] = result
             progress("junctions planned", len(plans), len(jobs))
 
@@ -264,14 +298,19 @@ def _allocate_sensors(
 
 
 def _compute_plans(
-    cluster: Cluster, jobs: Sequence[Job], max_counts: Mapping[str, int], *, with_costs: bool
+    cluster: Cluster,
+    jobs: Sequence[Job],
+    max_counts: Mapping[str, int],
+    blocks: CityBlocks | None,
+    *,
+    with_costs: bool,
 ) -> Iterator[JunctionPlans]:
     """Yield the plans of the junctions in ``max_counts``; finally raise an EgvsError if any of them failed."""
     failures = []
     for count in sorted(set(max_counts.values())):
         count_jobs = [job for job in jobs if max_counts.get(job.junction) == count]
         task = allocation.junction_plans
-        for _, result in scheduler.map_junctions(cluster, task, count_jobs, count, with_costs):
+        for _, result in scheduler.map_junctions(cluster, task, count_jobs, count, with_costs, blocks):
             if isinstance(result, JobFailure):
                 failures.append(result)
             else:
@@ -289,40 +328,6 @@ def _solve_allocation(plans: Sequence[JunctionPlans], count: int | None, budget:
         problem = f"{n_forced} sensors are already installed (placement.forced)"
         raise InputError(f"--count {count}", problem, f"Use a count of at least {n_forced}.")
     return allocation.allocate_sensors(plans, count)
-
-
-def _make_city_plan(
-    plans: Sequence[JunctionPlans], shares: Allocation, rank_by: str, requested: Mapping[str, float]
-) -> CityPlan:
-    """Return the plan of the city, its sensors in the order of installation."""
-    sensors_by_junction = {}
-    for junction, chosen in zip(plans, shares.chosen, strict=True):
-        sensors_by_junction[junction.junction] = junction.plans[chosen].sensors
-    sensors, score = [], 0.0
-    for number, sensor in enumerate(_merge_by_gain(sensors_by_junction), start=1):
-        score += sensor.gain
-        sensors.append(replace(sensor, order=number, score=score))
-    return CityPlan(
-        sensors=tuple(sensors),
-        rank_by=rank_by,
-        requested=requested,
-        joint=shares.value,
-        bound=shares.bound,
-        joint_of_all=sum(junction.joint_of_all for junction in plans),
-        candidates=sum(len(junction.min_costs) - 1 for junction in plans),
-        junctions=len(plans),
-        curve=tuple((float(best), float(bound)) for best, bound in shares.curve),
-    )
-
-
-def _merge_by_gain(sensors_by_junction: Mapping[str, Sequence[PlannedSensor]]) -> Iterator[PlannedSensor]:
-    """Yield forced sensors first, then each time the next sensor of the junction where it adds most."""
-    remaining = {name: list(sensors) for name, sensors in sensors_by_junction.items() if sensors}
-    while remaining:
-        name = max(remaining, key=lambda name: (remaining[name][0].forced, remaining[name][0].gain))
-        yield replace(remaining[name].pop(0), junction=name)
-        if not remaining[name]:
-            del remaining[name]
 
 
 def overlap_warnings(jobs: Sequence[Job]) -> Iterator[Diagnostic]:

@@ -67,6 +67,7 @@ RIM_WIDTH_M = 100.0
 
 NEAR_RIM, NO_SIGNALS, TOO_FEW_ARMS = "too near to the rim", "without signals", "fewer than three streets meet"
 NO_FREE_KERB = "no place for a pole is free along the kerbs"
+OVERLAPPING_REGION = "the region of interest overlaps that of a larger junction"
 """Reasons to leave a junction out."""
 
 PEDESTRIANS_NOTE = (
@@ -87,6 +88,9 @@ CITY_STEP_S, CITY_LATERAL_RESOLUTION_M = 0.5, 0.0
 
 _KERB_MARGIN_M, _ROADS_MARGIN_M = 60.0, 100.0
 """Distances from the region of interest within which solids can block kerbs, and streets are written."""
+
+_OVERLAP_TOLERANCE_M2 = 1e-6
+"""Regions that share no more than this only touch."""
 
 _SOURCE_COMMENT = f"Made from OpenStreetMap. Map data {ATTRIBUTION} (openstreetmap.org/copyright)."
 _FRAME_COMMENT = f"World frame: x east, y north in metres as in {NETWORK_FILE}, z up from the flat ground."
@@ -222,7 +226,7 @@ def create_city(folder: Path, osm: Path, options: NewCityOptions | None = None) 
     ------
     InputError
         When the folder is not empty, the file is damaged or has no drivable streets, ``around`` is outside the extract,
-        a table is wrong, or no junction is left. Nothing is written then.
+        a table is wrong or selects junctions with overlapping regions, or no junction is left. Nothing is written then.
     """
     options = options or NewCityOptions()
     around, radius_m, which = options.around, options.radius_m, options.which
@@ -245,14 +249,19 @@ def create_city(folder: Path, osm: Path, options: NewCityOptions | None = None) 
 
     solids, counts = osm_solids.map_solids(extract, streets)
     areas = shapely.STRtree([solid.area for solid in solids])
-    made = []
+    made: list[NewJunction] = []
     left_out = dict(choice.left_out)
     for number, (junction_id, street_junction) in enumerate(choice.junctions.items(), 1):
         junction = _make_junction(junction_id, street_junction, streets, areas)
-        if junction.poles:
-            made.append(junction)
-        else:
+        larger = _overlapping_junction(junction, made)
+        if not junction.poles:
             left_out.setdefault(NO_FREE_KERB, []).append(street_junction.id)
+        elif larger is None:
+            made.append(junction)
+        elif which in (SIGNALISED, ALL):
+            left_out.setdefault(OVERLAPPING_REGION, []).append(street_junction.id)
+        else:
+            raise _overlap_error(which, larger, junction)
         options.progress("junctions", number, len(choice.junctions))
     if not made:
         reasons = ", ".join(f"{len(ids)} {reason}" for reason, ids in left_out.items()) or "no streets meet"
@@ -353,6 +362,21 @@ def _make_junction(junction_id: str, junction: StreetJunction, streets: Streets,
     obstacles = list(areas.geometries[sorted(areas.query(surroundings))])
     poles = junctions.kerbside_poles(streets.near(surroundings), junction, roi, obstacles)
     return NewJunction(junction_id, junction, roi, poles)
+
+
+def _overlapping_junction(junction: NewJunction, others: Sequence[NewJunction]) -> NewJunction | None:
+    """Return the first of other junctions whose region of interest has an area in common; None if there is none."""
+    for other in others:
+        if junction.roi.area.intersection(other.roi.area).area > _OVERLAP_TOLERANCE_M2:
+            return other
+    return None
+
+
+def _overlap_error(table: str, first: NewJunction, second: NewJunction) -> InputError:
+    """Return the error for two rows of a table; in a city, vehicles in both regions would count twice."""
+    problem = "their regions of interest overlap, so vehicles in both would count twice"
+    hint = "Remove one of the two rows. egvs new makes a scenario of a single junction."
+    return InputError(f"{table}: junctions {first.id} and {second.id}", problem, hint)
 
 
 def _surroundings(roi: JunctionRegion, margin_m: float) -> shapely.Geometry:

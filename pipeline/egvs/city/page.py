@@ -17,13 +17,14 @@ from urllib.parse import quote
 import numpy as np
 
 from egvs._version import __version__
+from egvs.city.budget_figure import budget_chart, curve_rows
 from egvs.city.model import NETWORK_FILE, City
-from egvs.city.results import RUNS_FOLDER, CityPlan, JunctionResult, gain_label
+from egvs.city.results import RUNS_FOLDER, CityPlan, JunctionResult, counts_vehicles, gain_label
 from egvs.core import files
 from egvs.core.errors import Diagnostic
 from egvs.report import colours, formatting, maps, page
 from egvs.report.colours import STYLE_SHEET
-from egvs.report.svg_figures import Box, ColourBar, CurveStep, MapFrame, sensor_count_chart
+from egvs.report.svg_figures import Box, ColourBar, MapFrame
 from egvs.traffic import network
 
 PAGE_FILE = "city.html"
@@ -200,7 +201,10 @@ def render_page(
         links={result.junction.id: report_link(result) for result in results},
         maps=page_maps(city, results, plan),
         plan=plan,
-        curve=_curve_chart(plan),
+        curve="" if plan is None else budget_chart(plan),
+        curve_rows=() if plan is None else curve_rows(plan),
+        counts_vehicles=counts_vehicles(score.name),
+        vehicles=sum(result.vehicles for result in results),
         max_gain=max(result.gain for result in results),
         sites=sum(result.sites for result in results),
         warnings=warnings,
@@ -267,16 +271,6 @@ def _map_junction(result: JunctionResult, value: float, number: str) -> MapJunct
         f"sees {formatting.format_percent(best.entropy_seen)}"
     )
     return MapJunction(junction.id, junction.x_m, junction.y_m, value, number, title, report_link(result))
-
-
-def _curve_chart(plan: CityPlan | None) -> str:
-    """Draw the joint score for 1, 2, ... sensors of the city; "" for a budget."""
-    if plan is None or len(plan.curve) < 2:
-        return ""
-    steps = []
-    for number, (best, bound) in enumerate(plan.curve[1:], start=1):
-        steps.append(CurveStep(number, best / plan.joint_of_all, bound / plan.joint_of_all))
-    return sensor_count_chart(steps, "Joint score by number of sensors, as a share of all candidates together")
 
 
 def _network_path(city: City) -> Path | None:

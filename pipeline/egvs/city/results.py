@@ -4,6 +4,7 @@ OUT/junctions/<ID>/                     the run of a junction, as ``egvs run`` w
 OUT/scores/junction=<ID>/scores.parquet a copy of its scores: a dataset partitioned by junction
 OUT/junctions.parquet                   one row per junction, the largest gain first
 OUT/plan.parquet                        one row per sensor of the city's plan
+OUT/curve.parquet                       the best plans for fewer sensors, or lower costs
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import math
 import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +32,12 @@ from egvs.report.formatting import SCORE_LABELS
 from egvs.report.ranking import RankedSite
 from egvs.scoring.scorer import ranks
 
-RUNS_FOLDER, SCORES_DATASET, JUNCTIONS_TABLE, PLAN_TABLE = "junctions", "scores", "junctions.parquet", "plan.parquet"
+RUNS_FOLDER, SCORES_DATASET, JUNCTIONS_TABLE = "junctions", "scores", "junctions.parquet"
+PLAN_TABLE, CURVE_TABLE = "plan.parquet", "curve.parquet"
 """In the folder of a city run."""
 
 _SCORES_FILE, _PARTITION_PREFIX = RunFolder.scores.name, "junction="
-_PLAN_SCHEMA = "city_plan"
+_PLAN_SCHEMA, _CURVE_SCHEMA = "city_plan", "city_curve"
 _INPUT_STAGES = ("statics", "scan", "traffic", "tpog")
 """The stages that a plan is made from."""
 
@@ -83,6 +85,61 @@ class JunctionResult:
 
 
 @dataclass(frozen=True)
+class BudgetPoint:
+    """The best plan of a city within a number of sensors, or a cost: a row of ``curve.parquet``.
+
+    Attributes
+    ----------
+    limit
+        Maximum number of sensors, or maximum cost.
+    sensors, cost
+        Number and cost of the sensors of the best plan.
+    score, score_se
+        Its joint score, and the standard error of the score; NaN where it is unknown.
+    bound
+        Upper bound of all plans within the limit.
+    installed, installed_se
+        For a number of sensors: the joint score of the first ones of the complete plan in the order of installation,
+        and its standard error; NaN for a cost.
+    """
+
+    limit: float
+    sensors: int
+    cost: float
+    score: float
+    score_se: float
+    bound: float
+    installed: float = math.nan
+    installed_se: float = math.nan
+
+
+@dataclass(frozen=True)
+class Phase:
+    """Sensors that are installed together.
+
+    Attributes
+    ----------
+    number
+        1 for the first phase.
+    sensors
+        Its sensors.
+    point
+        The plan after this phase, and the best plan of as many sensors.
+    """
+
+    number: int
+    sensors: tuple[PlannedSensor, ...]
+    point: BudgetPoint
+
+    @property
+    def loss(self) -> float:
+        """Share of the best score of as many sensors that the order of installation costs."""
+        if not self.point.score > 0.0:
+            return 0.0
+        return max(0.0, 1.0 - self.point.installed / self.point.score)
+
+
+@dataclass(frozen=True)
 class CityPlan:
     """Sensors for a city, and the certificate of the plan.
 
@@ -101,7 +158,13 @@ class CityPlan:
     candidates, junctions
         Number of candidates and of junctions to choose from.
     curve
-        For a count: the best sum and the upper bound for 0, 1, ... sensors.
+        The best plans within smaller limits, and within the full one.
+    phases
+        Number of sensors after each phase, ascending; empty without phases.
+    errors_from
+        How standard errors were computed; or, if ``has_errors`` is false, why there are none.
+    has_errors
+        Whether the curve has standard errors.
     """
 
     sensors: tuple[PlannedSensor, ...]
@@ -112,7 +175,24 @@ class CityPlan:
     joint_of_all: float
     candidates: int
     junctions: int
-    curve: tuple[tuple[float, float], ...] = ()
+    curve: tuple[BudgetPoint, ...] = ()
+    phases: tuple[int, ...] = ()
+    errors_from: str = ""
+    has_errors: bool = False
+
+    @property
+    def by_phase(self) -> tuple[Phase, ...]:
+        """The phases; empty without any."""
+        points = {point.limit: point for point in self.curve}
+        phases, start = [], 0
+        for number, end in enumerate(self.phases, start=1):
+            phases.append(Phase(number, self.sensors[start:end], points[end]))
+            start = end
+        return tuple(phases)
+
+    def phase_of(self, sensor: PlannedSensor) -> int:
+        """Return the number of the phase in which a sensor is installed; 1 without phases."""
+        return 1 + sum(end < sensor.order for end in self.phases)
 
     @property
     def certificate(self) -> float:
@@ -153,6 +233,11 @@ def gain_label(rank_by: str) -> GainLabel:
     if rank_by in _VEHICLE_LABELS:
         return GainLabel(_VEHICLE_LABELS[rank_by], f"{_VEHICLE_LABELS[rank_by]}, on average", 2)
     return GainLabel(f"{score.head} × vehicles", f"{score.noun} times the average number of vehicles", 2)
+
+
+def counts_vehicles(rank_by: str) -> bool:
+    """Return whether the gains by a score are numbers of vehicles."""
+    return rank_by in _VEHICLE_LABELS
 
 
 def score_factor(rank_by: str, vehicles: float) -> float:
@@ -315,8 +400,8 @@ def hash_plan_inputs(out: Path, junctions: Sequence[str]) -> str:
     return files.hash_json(keys)
 
 
-def write_plan(out: Path, city: City, plan: CityPlan, junctions: Sequence[str]) -> Path:
-    """Write ``plan.parquet`` and return its path; ``junctions`` are those of the city run."""
+def write_plan(out: Path, city: City, plan: CityPlan, junctions: Sequence[str]) -> tuple[Path, Path]:
+    """Write ``plan.parquet`` and ``curve.parquet``; return their paths. ``junctions`` are those of the city run."""
     summary = {
         "rank_by": plan.rank_by,
         "asked": dict(plan.requested),
@@ -325,33 +410,42 @@ def write_plan(out: Path, city: City, plan: CityPlan, junctions: Sequence[str]) 
         "together": plan.joint_of_all,
         "candidates": plan.candidates,
         "junctions": plan.junctions,
-        "curve": plan.curve,
         "value": plan.joint,
         "certificate": plan.certificate,
         "cost": plan.cost,
+        "phases": list(plan.phases),
+        "standard_errors": {"known": plan.has_errors, "from": plan.errors_from},
     }
     metadata = {**_common_metadata(city, hash_plan_inputs(out, junctions)), "plan": summary}
-    parquet.write_artefact(out / PLAN_TABLE, _PLAN_SCHEMA, plan_columns(plan.sensors), metadata)
-    return out / PLAN_TABLE
+    rows = [asdict(point) for point in plan.curve]
+    curve = {field.name: [row[field.name] for row in rows] for field in fields(BudgetPoint)}
+    columns = {**plan_columns(plan.sensors), "phase": [plan.phase_of(sensor) for sensor in plan.sensors]}
+    parquet.write_artefact(out / CURVE_TABLE, _CURVE_SCHEMA, curve, metadata)
+    parquet.write_artefact(out / PLAN_TABLE, _PLAN_SCHEMA, columns, metadata)
+    return out / PLAN_TABLE, out / CURVE_TABLE
 
 
 def read_plan(out: Path, junctions: Sequence[str]) -> CityPlan | None:
     """Return the plan in a folder; None if there is none, or it was made from other runs or junctions."""
-    path = out / PLAN_TABLE
-    if not path.is_file():
+    if not (out / PLAN_TABLE).is_file() or not (out / CURVE_TABLE).is_file():
         return None
-    table, metadata = parquet.read_artefact(path, _PLAN_SCHEMA)
-    if metadata["inputs"] != hash_plan_inputs(out, junctions):
+    table, metadata = parquet.read_artefact(out / PLAN_TABLE, _PLAN_SCHEMA)
+    curve, curve_metadata = parquet.read_artefact(out / CURVE_TABLE, _CURVE_SCHEMA)
+    if metadata["inputs"] != hash_plan_inputs(out, junctions) or metadata["plan"] != curve_metadata["plan"]:
         return None
     plan = metadata["plan"]
+    errors = plan["standard_errors"]
     return CityPlan(
-        tuple(PlannedSensor(**row) for row in table.to_pylist()),
-        plan["rank_by"],
-        plan["asked"],
-        plan["joint"],
-        plan["bound"],
-        plan["together"],
-        plan["candidates"],
-        plan["junctions"],
-        tuple((float(best), float(bound)) for best, bound in plan["curve"]),
+        sensors=tuple(PlannedSensor(**row) for row in table.drop_columns(["phase"]).to_pylist()),
+        rank_by=plan["rank_by"],
+        requested=plan["asked"],
+        joint=plan["joint"],
+        bound=plan["bound"],
+        joint_of_all=plan["together"],
+        candidates=plan["candidates"],
+        junctions=plan["junctions"],
+        curve=tuple(BudgetPoint(**row) for row in curve.to_pylist()),
+        phases=tuple(plan["phases"]),
+        errors_from=errors["from"],
+        has_errors=errors["known"],
     )

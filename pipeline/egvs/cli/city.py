@@ -14,6 +14,7 @@ from egvs.cli import options
 if TYPE_CHECKING:
     from egvs.city.city_run import CityPlacement, CityRun, CityRunOptions
     from egvs.city.creation import NewCity
+    from egvs.city.plan_comparison import PlanComparison
     from egvs.city.tasks import JobResult
     from egvs.city.traffic_split import CityTraffic
     from egvs.cli.console import ProgressDisplay
@@ -122,6 +123,10 @@ def place(
     budget: Annotated[
         float | None, typer.Option(metavar="COST", help="Find the best sensors within this total cost (see \\[costs]).")
     ] = None,
+    phases: Annotated[
+        str | None,
+        typer.Option(metavar="K,K,...", help="Sensors after each phase of the installation, e.g. 5,10 for --count 10."),
+    ] = None,
     cluster: Cluster = "local",
     junction: Junctions = None,
     set_: CitySet = None,
@@ -132,10 +137,40 @@ def place(
 
     with ProgressDisplay("city") as screen:
         run_options = _run_options(cluster, junction, set_, screen)
-        placed = city_run.place_city(model.load_city(city), out, run_options, count=count, budget=budget)
+        numbers = _parse_phases(phases)
+        placed = city_run.place_city(
+            model.load_city(city), out, run_options, count=count, budget=budget, phases=numbers
+        )
         for warning in placed.city_run.warnings:
             screen.say(f"warning: {warning}")
     print_plan(placed)
+
+
+def compare(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(metavar="RUN RUN...", help="Folders of egvs city place, e.g. one for each traffic demand."),
+    ],
+) -> None:
+    """Compare the plans of several city runs: which sensors stay, and what each plan scores in the others' traffic."""
+    from egvs.city import plan_comparison
+    from egvs.cli.console import ProgressDisplay
+
+    with ProgressDisplay("compare") as screen:
+        comparison = plan_comparison.compare_plans(runs, screen.progress)
+    print_comparison(comparison)
+
+
+def _parse_phases(text: str | None) -> tuple[int, ...]:
+    from egvs.core.errors import InputError
+
+    if text is None:
+        return ()
+    try:
+        return tuple(int(number) for number in text.split(","))
+    except ValueError:
+        problem = f"expected whole numbers separated by commas, got {text[:80]!r}"
+        raise InputError("--phases", problem, "Use, for example, --count 10 --phases 5,10.") from None
 
 
 def _run_options(
@@ -266,11 +301,59 @@ def print_plan(placed: CityPlacement) -> None:
         f"{label.label} {label.value(plan.joint)}, {share:.1%} of the score of all {plan.candidates:,} candidates "
         f"together; proved: at least {proved:.2f} % of the best possible score"
     )
+    if plan.has_errors:
+        last = plan.curve[-1]
+        out.print(f"standard error: {label.value(last.score_se)}, from {plan.errors_from}")
+    else:
+        out.print(f"no standard errors: {plan.errors_from}")
+    for phase in plan.by_phase:
+        names = ", ".join(f"{sensor.junction} {sensor.site}" for sensor in phase.sensors) or "no sensor"
+        error = f" ± {label.value(phase.point.installed_se)}" if plan.has_errors else ""
+        out.print(
+            f"phase {phase.number}: {names}; then {label.label} {label.value(phase.point.installed)}{error}, "
+            f"{phase.loss:.2%} below the best plan of {phase.point.limit:g} alone"
+        )
     for path in placed.files:
         out.print(str(path))
 
 
+def print_comparison(comparison: PlanComparison) -> None:
+    """Print one row per plan: the sensors that it shares with all others, and its value in the traffic of each run."""
+    from egvs.city.results import gain_label
+    from egvs.cli.console import WIDE, Column, console, make_table
+
+    plans, folders = comparison.plans, comparison.folders
+    label = gain_label(plans[0].rank_by)
+    relative = comparison.relative_values
+
+    def value_column(j: int) -> Column[int]:
+        def text(i: int) -> str:
+            return f"{label.value(comparison.values[i, j])} ({relative[i, j]:.1%})"
+
+        return Column(f"in the traffic of {folders[j].name}", text, wrap=True)
+
+    columns: list[Column[int]] = [
+        Column("plan", lambda i: folders[i].name, "left"),
+        Column("sensors", lambda i: str(len(plans[i].sensors))),
+        Column("in all plans", lambda i: f"{comparison.common_to_all(i).sensors:.0%}"),
+        Column("same pole", lambda i: f"{comparison.common_to_all(i).poles:.0%}"),
+        Column("same junction", lambda i: f"{comparison.common_to_all(i).junctions:.0%}"),
+        *(value_column(j) for j in range(len(plans))),
+    ]
+    out = console(WIDE)
+    out.print(make_table(columns, range(len(plans)), width=out.width))
+    out.print(f"values: {label.label}; in brackets, relative to the plan that was made for this traffic")
+    for i, folder in enumerate(folders):
+        for j, other in enumerate(folders):
+            if i < j:
+                shares = comparison.common(i, [j])
+                out.print(
+                    f"{folder.name}, {other.name}: {shares.sensors:.0%} of the sensors, {shares.poles:.0%} of the "
+                    f"poles and {shares.junctions:.0%} of the junctions in common"
+                )
+
+
 app = typer.Typer(no_args_is_help=True, help="Run every junction of a city, on one machine or a cluster.")
 
-for verb in (new, traffic, run, place):
+for verb in (new, traffic, run, place, compare):
     app.command()(verb)

@@ -1,8 +1,8 @@
 """Vector layers of a run or a city, their colours, and their QGIS styles.
 
 Layers of a run: candidate sites, the plan, blind spots, footprints, the region. Layers of a city: junctions, the plan,
-the candidate sites of all junctions. Geometries are shapely's, in the world frame, metres, seen from above. Column
-names end in their unit, as in the artefacts.
+the candidate sites and the regions of all junctions. Geometries are shapely's, in the world frame, metres, seen from
+above. Column names end in their unit, as in the artefacts.
 
 The colours are those of the report, in a few classes. Styles are QML files as QGIS writes them
 (https://docs.qgis.org/latest/en/docs/user_manual/appendices/qgis_file_formats.html). They are made for each run,
@@ -13,7 +13,7 @@ shown; a static style could have neither.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -215,15 +215,24 @@ _MIN_AREA_M2 = 2e-6
 
 
 def _region_layer(run: FinishedRun) -> Layer:
+    return Layer(REGION, _region_geometries([run]), pa.Table.from_pylist([_region_row(run)]))
+
+
+def _region_row(run: FinishedRun) -> dict[str, Any]:
+    box = run.scenario.roi.box
+    return {
+        "name": run.scenario.name, "low_m": box.origin_m[2], "high_m": box.origin_m[2] + box.size_m[2],
+        "voxel_m": run.scenario.roi.voxel_m, "gamma": f"{run.scenario.gamma:g}", "rank_by": run.scenario.score.rank_by,
+    }  # fmt: skip
+
+
+def _region_geometries(runs: Sequence[FinishedRun]) -> NDArray[np.object_]:
+    """Return the rectangle of the region of interest of each run."""
     import shapely
 
-    roi = run.scenario.roi
-    (x, y, z), (w, h, tall) = roi.box.origin_m, roi.box.size_m
-    row = {
-        "name": run.scenario.name, "low_m": z, "high_m": z + tall, "voxel_m": roi.voxel_m,
-        "gamma": f"{run.scenario.gamma:g}", "rank_by": run.scenario.score.rank_by,
-    }  # fmt: skip
-    return Layer(REGION, np.array([shapely.box(x, y, x + w, y + h)], dtype=object), pa.Table.from_pylist([row]))
+    boxes = [run.scenario.roi.box for run in runs]
+    corners = [(*box.origin_m[:2], box.origin_m[0] + box.size_m[0], box.origin_m[1] + box.size_m[1]) for box in boxes]
+    return np.array([shapely.box(*corner) for corner in corners], dtype=object)
 
 
 def point_geometries(table: pa.Table) -> NDArray[np.object_]:
@@ -292,7 +301,16 @@ def city_layers(folder: Path) -> tuple[list[Layer], list[str]]:
         notes.append("the plan is left out: it is for other junctions or settings. Run egvs city place again")
     first = ["rank", *(name for name in scores.column_names if name != "rank")]
     layers.append(Layer(SITES, point_geometries(scores), to_plain_table(scores.select(first)), metadata["rank_by"]))
+    layers.append(_city_region_layer(folder))
     return layers, notes
+
+
+def _city_region_layer(folder: Path) -> Layer:
+    """The regions of interest of all junctions."""
+    names = _junction_names(folder)
+    runs = [FinishedRun.open(results.junction_run_folder(folder, name)) for name in names]
+    rows = [{_JUNCTION_COLUMN: name, **_region_row(run)} for name, run in zip(names, runs, strict=True)]
+    return Layer(REGION, _region_geometries(runs), pa.Table.from_pylist(rows))
 
 
 def _junction_names(folder: Path) -> list[str]:

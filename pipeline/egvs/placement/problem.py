@@ -506,20 +506,35 @@ def target_term(name: str, score: str, visibility: VisibilityMatrix, counts: Flo
         Amount that one point adds (for ``expected_detections``: a detection probability of 1 - 1/e).
     """
     weight = counts / max(float(np.sum(counts)), np.finfo(np.float64).tiny)
+    curve, scale = submodular.SATURATING, unit
     if score == "points_on_target":
-        return CoverageTerm(
-            name, visibility, weight, submodular.LOGARITHM, unit, False,
-            lambda totals: weighted_mean(log_points(totals / unit), counts),
-        )  # fmt: skip
-    if score == "seen_well":
-        return CoverageTerm(
-            name, visibility, weight, submodular.SATURATING, SEEN_WELL_POINTS * unit, False,
-            lambda totals: weighted_mean(saturating_gain(totals / unit), counts),
-        )  # fmt: skip
+        curve = submodular.LOGARITHM
+    elif score == "seen_well":
+        scale = SEEN_WELL_POINTS * unit
     return CoverageTerm(
-        name, visibility, weight, submodular.SATURATING, unit, False,
-        lambda totals: weighted_mean(-np.expm1(-(totals / unit)), counts),
+        name, visibility, weight, curve, scale, False,
+        lambda totals: weighted_mean(target_values(score, totals, unit), counts),
     )  # fmt: skip
+
+
+def target_values(score: str, totals: IntArray, unit: float) -> FloatArray:
+    """Return the value of each vehicle-frame, f of its total amount, (n_cells,) float64.
+
+    Parameters
+    ----------
+    score
+        A score over vehicle-frames.
+    totals
+        Total amount in each vehicle-frame, (n_cells,) int64.
+    unit
+        As in :func:`target_term`.
+    """
+    if score == "points_on_target":
+        return log_points(totals / unit)
+    if score == "seen_well":
+        return saturating_gain(totals / unit)
+    values: FloatArray = -np.expm1(-(totals / unit))
+    return values
 
 
 class CoverageState:

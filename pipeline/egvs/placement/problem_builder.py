@@ -9,7 +9,7 @@ Requests that no plan can meet raise an :class:`InputError` that names the neare
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -88,7 +88,7 @@ class TargetView:
     """Turn empty scans into amounts on vehicle-frames, as a score counts them; may be shared by threads."""
 
     def __init__(self, context: StageContext, targets: TargetScorer, score: str) -> None:
-        self._targets = targets
+        self.targets = targets
         self._score = score
         scene = get_scene(context)
         if score == "expected_detections":
@@ -101,11 +101,11 @@ class TargetView:
     @property
     def n_cells(self) -> int:
         """Number of cells."""
-        return len(self._targets.record)
+        return len(self.targets.record)
 
     def row(self, beams: Beams) -> VisibilityRow:
         """Return the amounts of a scan on all vehicle-frames."""
-        amounts = self._amounts(self._targets.visible(beams))
+        amounts = self._amounts(self.targets.visible(beams))
         return VisibilityRow.of(np.rint(amounts * self.unit).astype(np.int64), _MAX_WEIGHTED_HITS)
 
     def _amounts(self, visible: VisibleTargets) -> FloatArray:
@@ -281,10 +281,33 @@ def _read_tpogs(context: StageContext) -> dict[str, Tpog]:
     return tpogs
 
 
+def joint_scores(context: StageContext, plans: Sequence[Sequence[str]]) -> list[float]:
+    """Return the joint score of each of some sets of candidates; other candidates are not scanned.
+
+    Parameters
+    ----------
+    context
+        The run; the stages up to the TPOG and the scans are up to date.
+    plans
+        Names of the candidates of each set.
+    """
+    names = set().union(*plans)
+    used = [site.name for site in get_scene(context).sites if site.name in names]
+    if not used:
+        return [0.0] * len(plans)
+    objective = make_objective(context, _read_tpogs(context))
+    (visibility,) = visibility_matrices(context, (objective.view,), lambda _: None, only=used)
+    term = objective.terms(visibility)[""]
+    return [problem.CoverageState([term], [used.index(name) for name in plan]).value(term) for plan in plans]
+
+
 def visibility_matrices(
-    context: StageContext, views: Sequence[View], on_progress: Callable[[int], None]
+    context: StageContext,
+    views: Sequence[View],
+    on_progress: Callable[[int], None],
+    only: Collection[str] | None = None,
 ) -> tuple[VisibilityMatrix, ...]:
-    """Return one visibility matrix per view, over all candidates of a scenario. Each scan is read once.
+    """Return one visibility matrix per view, over the candidates of a scenario. Each scan is read once.
 
     Parameters
     ----------
@@ -294,13 +317,15 @@ def visibility_matrices(
         What turns a scan into rows.
     on_progress
         Called with the number of processed candidates.
+    only
+        Names of the candidates; all when None.
     """
     builders = [problem.VisibilityMatrixBuilder(view.n_cells) for view in views]
 
     def rows_of(scan: SiteScan) -> list[VisibilityRow]:
         return [view.row(scan.beams) for view in views]
 
-    all_rows = map_ordered(rows_of, empty_scans(context), context.threads)
+    all_rows = map_ordered(rows_of, empty_scans(context, only), context.threads)
     for number, rows in enumerate(all_rows, start=1):
         for builder, row in zip(builders, rows, strict=True):
             builder.add(row)

@@ -124,13 +124,29 @@ class BlockJackknife:
     groups: tuple[BlockGroups, ...]
 
     @classmethod
-    def of(cls, path: Path, tpog: tpog_file.Tpog, period: str | None = None) -> BlockJackknife | None:
+    def of(
+        cls,
+        path: Path,
+        tpog: tpog_file.Tpog,
+        period: str | None = None,
+        groups: tuple[BlockGroups, ...] | None = None,
+    ) -> BlockJackknife | None:
         """Count the groups of ``tpog.parquet``, which was read as ``tpog``: the mix, or one period.
 
         None if a record has one block only, because its scatter is unknown.
+
+        Parameters
+        ----------
+        path, tpog
+            The file, and its contents.
+        period
+            Name of the period; the mix when None.
+        groups
+            Groups of complete blocks, for each record; those of :func:`block_groups` when None.
         """
         periods = [record for record in tpog_file.read_periods(path) if period in (None, record.name)]
-        groups = tuple(block_groups(record) for record in periods)
+        if groups is None:
+            groups = tuple(block_groups(record) for record in periods)
         if any(len(record_groups.frames) < 2 for record_groups in groups):
             return None
         cells = np.flatnonzero(tpog.counts)

@@ -1,0 +1,212 @@
+r"""Replicates of joint scores: with one group of blocks of the city's traffic left out in turn.
+
+The junctions of a city share one traffic simulation, so their scores are not independent: a busy quarter of an hour is
+busy at many junctions. Their frames have the same times. So the same groups of blocks are left out at all junctions,
+and the replicates of the junctions are added up: the replicate of the city without group g is
+
+.. math:: F_{(g)} = \sum_j n_{j,(g)} \, S_{j,(g)}
+
+with the joint score S of junction j and, for scores that are means, its average number of vehicles n, both without the
+frames of group g. The block jackknife (:mod:`egvs.scoring.standard_errors`) of these sums needs no assumption about the
+correlation between junctions. Groups are at least 20 autocorrelation times long: those of the junction whose
+traffic has the longest one.
+
+Limits: the plan was chosen with the same traffic, and the allocation is not repeated for each replicate. So the error
+is that of the score of these sensors, without the error of the choice. Another demand or another network is another
+question, which standard errors do not answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from egvs.artefacts.frame_boxes import read_boxes
+from egvs.artefacts.run_folder import RunFolder
+from egvs.artefacts.tpog import PeriodBlocks, read_periods, read_tpog
+from egvs.city.tasks import Job
+from egvs.core.grid import FloatArray, Grid, IntArray
+from egvs.placement import problem
+from egvs.placement.problem_builder import PlacementProblem, TargetView, VoxelView
+from egvs.scoring.occupancy import near_grid
+from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, ScoreUncertainty, block_groups
+from egvs.scoring.targets import FrameGroups, recorded_frames
+from egvs.stages.base import StageContext
+
+
+@dataclass(frozen=True)
+class CityBlocks:
+    """The blocks of frames that all junctions of a city have in common.
+
+    Attributes
+    ----------
+    periods
+        The blocks of each record, with the longest autocorrelation time of any junction.
+    """
+
+    periods: tuple[PeriodBlocks, ...]
+
+    @property
+    def groups(self) -> tuple[BlockGroups, ...]:
+        """Groups of blocks that are left out in turn, of each record."""
+        return tuple(block_groups(period) for period in self.periods)
+
+    def uncertainty(self, replicates: FloatArray) -> ScoreUncertainty:
+        """Return standard errors of n scores from their replicates, (n, 1 + k)."""
+        return ScoreUncertainty.of(replicates, self.groups)
+
+
+class _FrameTimes(NamedTuple):
+    """What must be equal at two junctions, so that their blocks have the same times."""
+
+    frame_period_s: float
+    blocks: tuple[tuple[str, int, int, int], ...]
+
+
+def common_blocks(jobs: Sequence[Job]) -> CityBlocks | str:
+    """Return the blocks that all junctions have in common, or the reason why there are no standard errors.
+
+    The runs of the junctions are complete.
+    """
+    times: dict[str, _FrameTimes] = {}
+    memory: list[list[float]] = []
+    periods: tuple[PeriodBlocks, ...] = ()
+    for job in jobs:
+        scenario = job.scenario()
+        if not scenario.score.standard_error:
+            return f"score.standard_error is false at junction {job.junction}"
+        periods = read_periods(job.out / RunFolder.tpog.name)
+        blocks = tuple((period.name, period.frames, period.block_frames, period.times) for period in periods)
+        times[job.junction] = _FrameTimes(scenario.traffic.frame_period_s, blocks)
+        memory.append([period.memory_frames for period in periods])
+        if any(period.blocks < 2 for period in periods):
+            return f"junction {job.junction} has a single block of frames (tpog.blocks)"
+    first = next(iter(times))
+    for name, junction_times in times.items():
+        if junction_times != times[first]:
+            return f"junctions {first} and {name} have different frames or blocks"
+    longest = np.max(memory, axis=0).tolist()
+    return CityBlocks(
+        tuple(replace(period, memory_frames=frames) for period, frames in zip(periods, longest, strict=True))
+    )
+
+
+class JointReplicates:
+    """Computes the replicates of plans of one junction.
+
+    Parameters
+    ----------
+    context
+        The run of the junction, up to the TPOG.
+    placement_problem
+        Its candidates.
+    blocks
+        The blocks of the city.
+    mean_vehicles
+        Average number of vehicles in the region of interest.
+    """
+
+    def __init__(
+        self, context: StageContext, placement_problem: PlacementProblem, blocks: CityBlocks, mean_vehicles: float
+    ) -> None:
+        self._problem = placement_problem
+        self._index = {name: i for i, name in enumerate(placement_problem.names)}
+        self._values = _score_replicates(context, placement_problem, blocks)
+        self._factor: FloatArray | float = 1.0
+        if placement_problem.score != "egvs":
+            trajectories = context.folder.trajectories
+            without = vehicles_without_groups(trajectories, context.scenario.roi.grid, blocks)
+            self._factor = np.append(mean_vehicles, without)
+
+    def of_order(self, sites: Sequence[str]) -> FloatArray:
+        """Return the replicates of the first 0, 1, ... n of the sites of a plan, (n + 1, 1 + k) float64.
+
+        The first column is the score with all frames.
+        """
+        term = self._problem.problem.joint
+        state = problem.CoverageState([term])
+        rows = [self._values(state.totals(term))]
+        for name in sites:
+            state.add(self._index[name])
+            rows.append(self._values(state.totals(term)))
+        return np.array(rows) * self._factor
+
+
+def _score_replicates(
+    context: StageContext, placement_problem: PlacementProblem, blocks: CityBlocks
+) -> Callable[[IntArray], FloatArray]:
+    """Return the joint score, of all frames and without each group, as a function of the totals of all cells."""
+    view, score = placement_problem.views[-1], placement_problem.score
+    if isinstance(view, TargetView):
+        return _target_replicates(context, view, score, blocks)
+    return _voxel_replicates(context, view, score, blocks)
+
+
+def _target_replicates(
+    context: StageContext, view: TargetView, score: str, blocks: CityBlocks
+) -> Callable[[IntArray], FloatArray]:
+    recorded = recorded_frames(context.folder.trajectories)
+    groups = FrameGroups.of(blocks.periods, recorded, view.targets.record)
+    groups = replace(groups, weight=view.targets.weight)
+
+    def replicates(totals: IntArray) -> FloatArray:
+        means = groups.means(problem.target_values(score, totals, view.unit))
+        return np.nan_to_num(means, nan=0.0)  # without vehicles, none is found
+
+    return replicates
+
+
+def _voxel_replicates(
+    context: StageContext, view: VoxelView, score: str, blocks: CityBlocks
+) -> Callable[[IntArray], FloatArray]:
+    tpog = read_tpog(context.folder.tpog)
+    jackknife = BlockJackknife.of(context.folder.tpog, tpog, groups=blocks.groups)
+    assert jackknife is not None  # common_blocks checks that every record has two blocks
+    gamma = context.scenario.gamma
+
+    def replicates(totals: IntArray) -> FloatArray:
+        hits = np.zeros(int(np.prod(tpog.grid.shape)), dtype=np.int64)
+        hits[view.voxels] = totals
+        if score == "egvs":
+            return jackknife.scores(hits, gamma, view.unit)
+        return jackknife.voxel_shares(hits, score)
+
+    return replicates
+
+
+def vehicles_without_groups(trajectories: Path, grid: Grid, blocks: CityBlocks) -> FloatArray:
+    """Return the average number of vehicles near a region of interest without each group of frames, (k,) float64.
+
+    Counted as ``boxes_in_roi`` of the tpog stage; of a mix, the weighted mean over its records.
+
+    Parameters
+    ----------
+    trajectories
+        ``trajectories.parquet`` of a junction.
+    grid
+        The grid of its region.
+    blocks
+        The blocks of the city.
+    """
+    recorded = recorded_frames(trajectories)
+    counts = np.zeros(sum(recorded), dtype=np.int64)
+    for boxes in read_boxes(trajectories, grid):
+        near = near_grid(boxes.values, grid)
+        counts += np.bincount(boxes.frame[near], minlength=len(counts))
+
+    starts = (np.cumsum(recorded) - recorded).tolist()
+    used = [counts[start : start + period.frames] for start, period in zip(starts, blocks.periods, strict=True)]
+    means = np.array([record.mean() for record in used])
+    weights = np.array([period.weight for period in blocks.periods])
+    without = []
+    for i, (record, groups) in enumerate(zip(used, blocks.groups, strict=True)):
+        ends = np.cumsum(groups.frames).tolist()
+        for end, frames in zip(ends, groups.frames.tolist(), strict=True):
+            means_left = means.copy()
+            means_left[i] = (record.sum() - record[end - frames : end].sum()) / (len(record) - frames)
+            without.append(np.average(means_left, weights=weights))
+    return np.array(without)
