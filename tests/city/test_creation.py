@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
+from itertools import combinations
 from pathlib import Path
 
 import pytest
+import shapely
 from shapely.geometry import box, shape
 
 import egvs
@@ -19,6 +22,7 @@ from egvs.city.creation import NewCityOptions
 from egvs.core.errors import InputError
 from egvs.formats import osm
 from egvs.importers import junctions, openstreetmap, osm_network
+from egvs.importers.junctions import JunctionRegion, StreetJunction
 from egvs.stages import traffic
 from egvs.traffic import network
 from egvs.world import geolocation
@@ -301,25 +305,68 @@ def close_junctions(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_leaves_out_smaller_junction_of_overlapping_regions(close_junctions: Path, tmp_path: Path) -> None:
+def test_overlapping_regions_are_divided(close_junctions: Path, tmp_path: Path) -> None:
     made = creation.create_city(tmp_path / "town", close_junctions)
-    kept = [junction.junction.title for junction in made.junctions]
-    assert [title.split(" of ")[1] for title in kept] == ["Main and Road 0", "Main and Road -200"]
-    assert len(made.left_out[creation.OVERLAPPING_REGION]) == 1
-    summary = json.loads((made.folder / "import.json").read_text())
-    assert summary["left_out"][creation.OVERLAPPING_REGION] == made.left_out[creation.OVERLAPPING_REGION]
+    kept = [junction.junction.title.split(" of ")[1] for junction in made.junctions]
+    assert kept == ["Main and Road 0", "Main and Road -200", "Main and Road 45"]
+    assert creation.OVERLAPPING_REGION not in made.left_out
     regions = [junction.roi.area for junction in made.junctions]
-    assert regions[0].intersection(regions[1]).area == 0.0
+    assert all(a.intersection(b).area == 0.0 for a, b in combinations(regions, 2))
+    uncut = [junctions.region_around(junction.junction).area for junction in made.junctions]
+    assert shapely.union_all(regions).equals(shapely.union_all(uncut))
+    assert sum(region.area for region in regions) < sum(region.area for region in uncut)
+
+
+def square_junction(name: str, x_m: float, y_m: float, side_m: float = 16.0) -> StreetJunction:
+    area = shapely.box(x_m - side_m / 2, y_m - side_m / 2, x_m + side_m / 2, y_m + side_m / 2)
+    return StreetJunction(name, (x_m, y_m), area, 4, 4, True, ())
+
+
+def test_regions_are_cut_in_the_middle_of_their_overlap() -> None:
+    """Regions of 60 m: from -30 to 30 and from 15 to 75. A third overlaps only the second, from above."""
+    chosen = {"a": square_junction("a", 0, 0), "b": square_junction("b", 45, 0), "c": square_junction("c", 62, 50)}
+    regions = {name: region.area.bounds for name, region in creation.divided_regions(chosen).items()}
+    assert regions == {"a": (-30, -30, 22, 30), "b": (22, -30, 75, 25), "c": (32, 25, 92, 80)}
+
+
+def test_junctions_that_no_line_divides_are_named() -> None:
+    chosen = {"a": square_junction("a", 0, 0), "b": square_junction("b", 10, 10), "c": square_junction("c", 90, 0)}
+    regions = creation.divided_regions(chosen)
+    assert regions["b"] == "a"
+    assert regions["a"] == junctions.region_around(chosen["a"])
+    assert regions["c"] == junctions.region_around(chosen["c"])
+
+
+@pytest.fixture
+def undivided(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only the first junction gets a region."""
+
+    def regions(chosen: Mapping[str, StreetJunction]) -> dict[str, JunctionRegion | str]:
+        first, *others = chosen
+        return {first: junctions.region_around(chosen[first]), **dict.fromkeys(others, first)}
+
+    monkeypatch.setattr(creation, "divided_regions", regions)
 
 
 @pytest.mark.slow
-def test_rejects_rows_with_overlapping_regions(close_junctions: Path, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("undivided")
+def test_leaves_out_junction_too_near_to_larger_one(close_junctions: Path, tmp_path: Path) -> None:
+    made = creation.create_city(tmp_path / "town", close_junctions)
+    assert [junction.id for junction in made.junctions] == ["j01"]
+    assert len(made.left_out[creation.OVERLAPPING_REGION]) == 2
+    summary = json.loads((made.folder / "import.json").read_text())
+    assert summary["left_out"][creation.OVERLAPPING_REGION] == made.left_out[creation.OVERLAPPING_REGION]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("undivided")
+def test_rejects_rows_of_junctions_that_no_line_divides(close_junctions: Path, tmp_path: Path) -> None:
     table = tmp_path / "mine.csv"
     rows = [",".join([name, *map(str, degrees(x, 0))]) for name, x in (("small", 45.0), ("large", 0.0))]
     table.write_text("\n".join(["junction,lat_deg,lon_deg", *rows, ""]))
     with pytest.raises(InputError) as caught:
         creation.create_city(tmp_path / "town", close_junctions, NewCityOptions(which=str(table)))
     message = str(caught.value)
-    assert message.startswith(f"{table}: junctions small and large: their regions of interest overlap")
+    assert message.startswith(f"{table}: junctions small and large: no line divides their regions of interest")
     assert "Remove one of the two rows." in message
     assert not (tmp_path / "town").exists()

@@ -16,7 +16,7 @@ extract gives the same bytes.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -67,7 +67,7 @@ RIM_WIDTH_M = 100.0
 
 NEAR_RIM, NO_SIGNALS, TOO_FEW_ARMS = "too near to the rim", "without signals", "fewer than three streets meet"
 NO_FREE_KERB = "no place for a pole is free along the kerbs"
-OVERLAPPING_REGION = "the region of interest overlaps that of a larger junction"
+OVERLAPPING_REGION = "too near to a larger junction"
 """Reasons to leave a junction out."""
 
 PEDESTRIANS_NOTE = (
@@ -91,6 +91,9 @@ _KERB_MARGIN_M, _ROADS_MARGIN_M = 60.0, 100.0
 
 _OVERLAP_TOLERANCE_M2 = 1e-6
 """Regions that share no more than this only touch."""
+
+_MIN_REGION_SIDE_M = 20.0
+"""A region of interest is not cut to less."""
 
 _SOURCE_COMMENT = f"Made from OpenStreetMap. Map data {ATTRIBUTION} (openstreetmap.org/copyright)."
 _FRAME_COMMENT = f"World frame: x east, y north in metres as in {NETWORK_FILE}, z up from the flat ground."
@@ -251,17 +254,19 @@ def create_city(folder: Path, osm: Path, options: NewCityOptions | None = None) 
     areas = shapely.STRtree([solid.area for solid in solids])
     made: list[NewJunction] = []
     left_out = dict(choice.left_out)
+    regions = divided_regions(choice.junctions)
     for number, (junction_id, street_junction) in enumerate(choice.junctions.items(), 1):
-        junction = _make_junction(junction_id, street_junction, streets, areas)
-        larger = _overlapping_junction(junction, made)
-        if not junction.poles:
-            left_out.setdefault(NO_FREE_KERB, []).append(street_junction.id)
-        elif larger is None:
-            made.append(junction)
+        roi = regions[junction_id]
+        if isinstance(roi, JunctionRegion):
+            junction = _make_junction(junction_id, street_junction, roi, streets, areas)
+            if junction.poles:
+                made.append(junction)
+            else:
+                left_out.setdefault(NO_FREE_KERB, []).append(street_junction.id)
         elif which in (SIGNALISED, ALL):
             left_out.setdefault(OVERLAPPING_REGION, []).append(street_junction.id)
         else:
-            raise _overlap_error(which, larger, junction)
+            raise _overlap_error(which, roi, junction_id)
         options.progress("junctions", number, len(choice.junctions))
     if not made:
         reasons = ", ".join(f"{len(ids)} {reason}" for reason, ids in left_out.items()) or "no streets meet"
@@ -355,28 +360,87 @@ def _nearest_junction(streets: Streets, point: Point, where: str) -> StreetJunct
     return nearest
 
 
-def _make_junction(junction_id: str, junction: StreetJunction, streets: Streets, areas: shapely.STRtree) -> NewJunction:
-    """Set the region of a junction, and find pole locations that are free of solids (``areas``)."""
-    roi = junctions.region_around(junction)
+def divided_regions(chosen: Mapping[str, StreetJunction]) -> dict[str, JunctionRegion | str]:
+    """Return the region of interest of each junction; regions do not overlap.
+
+    In a city, vehicles in two regions would count twice. Two regions that overlap are therefore cut along a line
+    between them, in whole metres, so that each junction keeps its side.
+
+    Parameters
+    ----------
+    chosen
+        The junctions by name, the most important first.
+
+    Returns
+    -------
+    dict
+        Region of each junction; or, where no line divides its area from that of a junction before it, the name of that
+        junction.
+    """
+    regions: dict[str, JunctionRegion | str] = {}
+    for name, junction in chosen.items():
+        region = junctions.region_around(junction)
+        changed: dict[str, JunctionRegion] = {}
+        for other_name, other in regions.items():
+            if not isinstance(other, JunctionRegion) or not _overlap(region, other):
+                continue
+            halves = _divide(region, other, junction, chosen[other_name])
+            if halves is None:
+                regions[name] = other_name
+                break
+            region, changed[other_name] = halves
+        else:
+            regions |= changed
+            regions[name] = region
+    return regions
+
+
+def _overlap(region: JunctionRegion, other: JunctionRegion) -> bool:
+    return bool(region.area.intersection(other.area).area > _OVERLAP_TOLERANCE_M2)
+
+
+def _divide(
+    region: JunctionRegion, other: JunctionRegion, junction: StreetJunction, other_junction: StreetJunction
+) -> tuple[JunctionRegion, JunctionRegion] | None:
+    """Cut two overlapping regions along a line; None if every line would cut a junction, or leave too little."""
+    overlap_m = region.area.intersection(other.area).bounds
+    axes = sorted((0, 1), key=lambda axis: overlap_m[axis + 2] - overlap_m[axis])  # the thinner overlap first
+    for axis in axes:
+        line_m = round((overlap_m[axis] + overlap_m[axis + 2]) / 2)
+        halves = _side_of(region, junction, axis, line_m), _side_of(other, other_junction, axis, line_m)
+        if halves[0] is None or halves[1] is None or _overlap(halves[0], halves[1]):
+            continue
+        return halves[0], halves[1]
+    return None
+
+
+def _side_of(region: JunctionRegion, junction: StreetJunction, axis: int, line_m: float) -> JunctionRegion | None:
+    """Return the part of a region on the junction's side of a line; None if it does not contain the junction."""
+    bounds = list(region.area.bounds)
+    bounds[axis if junction.at_m[axis] > line_m else axis + 2] = line_m
+    part = box(*bounds)
+    sides_m = bounds[2] - bounds[0], bounds[3] - bounds[1]
+    fits = region.area.intersection(junction.area).within(part.buffer(_OVERLAP_TOLERANCE_M2))
+    if not fits or min(sides_m) < _MIN_REGION_SIDE_M:
+        return None
+    return JunctionRegion(((bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2), sides_m)
+
+
+def _make_junction(
+    junction_id: str, junction: StreetJunction, roi: JunctionRegion, streets: Streets, areas: shapely.STRtree
+) -> NewJunction:
+    """Find pole locations of a junction that are free of solids (``areas``)."""
     surroundings = _surroundings(roi, _KERB_MARGIN_M)
     obstacles = list(areas.geometries[sorted(areas.query(surroundings))])
     poles = junctions.kerbside_poles(streets.near(surroundings), junction, roi, obstacles)
     return NewJunction(junction_id, junction, roi, poles)
 
 
-def _overlapping_junction(junction: NewJunction, others: Sequence[NewJunction]) -> NewJunction | None:
-    """Return the first of other junctions whose region of interest has an area in common; None if there is none."""
-    for other in others:
-        if junction.roi.area.intersection(other.roi.area).area > _OVERLAP_TOLERANCE_M2:
-            return other
-    return None
-
-
-def _overlap_error(table: str, first: NewJunction, second: NewJunction) -> InputError:
-    """Return the error for two rows of a table; in a city, vehicles in both regions would count twice."""
-    problem = "their regions of interest overlap, so vehicles in both would count twice"
+def _overlap_error(table: str, first: str, second: str) -> InputError:
+    """Return the error for two rows of a table."""
+    problem = "no line divides their regions of interest, so vehicles in both would count twice"
     hint = "Remove one of the two rows. egvs new makes a scenario of a single junction."
-    return InputError(f"{table}: junctions {first.id} and {second.id}", problem, hint)
+    return InputError(f"{table}: junctions {first} and {second}", problem, hint)
 
 
 def _surroundings(roi: JunctionRegion, margin_m: float) -> shapely.Geometry:
