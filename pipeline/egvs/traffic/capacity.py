@@ -321,17 +321,18 @@ def find_flow(network: str, junction_blocker_s: float) -> FlowCapacity:
         trial = _TownTrial(folder, junction_blocker_s)
         per_h, reroute = trial.first_flow(), True
         trial.run_light_traffic(per_h)
-        carried = 0
+        carried, too_much = 0, math.inf
         while len(trial.runs) < MAX_FLOW_RUNS:
             if trial.run(per_h, reroute).is_carried:
-                carried = per_h
-                per_h = round(per_h * FLOW_FACTOR)
-            elif carried and reroute:
+                carried, per_h = per_h, round(per_h * FLOW_FACTOR)
+                if per_h > 0.99 * too_much:
+                    reroute = False
+            elif not carried:
+                too_much, per_h = per_h, max(1, round(per_h / FLOW_FACTOR))
+            elif reroute:
                 reroute = False
-            elif carried:
-                break
             else:
-                per_h = max(1, round(per_h / FLOW_FACTOR))
+                break
         best = [run for run in trial.runs if run.is_carried and run.vehicles_per_h == carried]
         return FlowCapacity(carried or per_h, best[0].reroute if best else True, tuple(trial.runs))
 
