@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 import egvs
+from egvs.core.errors import InputError
 from egvs.formats.point_clouds import read_points
+from egvs.stages import scan
 
 Call = Callable[..., tuple[int, str, str]]
 POSITION_M = {"pole_a": (10, 12, 3), "pole_b": (30.5, -12, 3)}
@@ -78,3 +80,9 @@ def test_other_formats_and_other_sites_are_refused_by_name(mini: Path, run_egvs:
     assert code == 2
     assert "--points pole_c" in err and "pole_a, pole_b" in err
     assert clouds(out) == {}
+
+
+def test_rejects_clouds_whose_names_differ_in_case_only() -> None:
+    scan._check_cloud_names(["pole_a", "pole_b", "pole_a"])
+    with pytest.raises(InputError, match="POLE_a and pole_a give the same file on Windows and macOS"):
+        scan._check_cloud_names(["pole_a", "POLE_a"])

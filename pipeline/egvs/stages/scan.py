@@ -8,6 +8,7 @@ With ``scan.keep = false`` nothing is written, and the score stage casts the bea
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -56,6 +57,7 @@ def run(context: StageContext, inputs: StageDependencies, points: tuple[str, ...
     for name in points:
         if name not in names:
             raise InputError(f"--points {name}", "there is no such site", f"The sites are {', '.join(names)}.")
+    _check_cloud_names(points)
     scanner = Scanner(scene)
     scanner.check(scene.sites)
     summary: Summary
@@ -72,6 +74,16 @@ def run(context: StageContext, inputs: StageDependencies, points: tuple[str, ...
     if skipped:
         summary["skipped"] = skipped
     return summary
+
+
+def _check_cloud_names(sites: Sequence[str]) -> None:
+    """Raise an InputError if the clouds of two sites have the same file name where case does not matter."""
+    names: dict[str, str] = {}
+    for site in sites:
+        other = names.setdefault(site.casefold(), site)
+        if other != site:
+            problem = f"{site} and {other} give the same file on Windows and macOS"
+            raise InputError("--points", problem, "Rename one of the two sites.")
 
 
 def _write_scans(
