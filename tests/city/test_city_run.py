@@ -259,8 +259,8 @@ def test_junction_with_locked_traffic_is_left_out(city: City, tmp_path: Path, mo
     monkeypatch.setattr(RegionLocks, "add_teleports", lambda locks, _: locks.found.update(east="a car stood there"))
     first = city_run.run_city(city, tmp_path / "out")
     assert [result.junction.id for result in first.results] == ["west"]
-    (warning,) = [warning for warning in first.warnings if warning.rule == "junctions locked"]
-    assert warning.problem == "east is left out, because its traffic is locked: a car stood there"
+    (warning,) = [warning for warning in first.warnings if warning.rule == "junctions left out"]
+    assert warning.problem == "east is left out, because a car stood there"
     assert not city.junction("east").traffic_file(city).exists()
     assert "east is left out" in (tmp_path / "out" / "city.html").read_text()
 
@@ -268,13 +268,13 @@ def test_junction_with_locked_traffic_is_left_out(city: City, tmp_path: Path, mo
     again = city_run.place_city(city, tmp_path / "out", count=1)
     assert {sensor.junction for sensor in again.plan.sensors} == {"west"}
     assert again.plan.junctions == 1
-    with pytest.raises(InputError, match="the traffic of all junctions that were selected is locked"):
+    with pytest.raises(InputError, match="all junctions that were selected are left out"):
         city_run.run_city(city, tmp_path / "out", CityRunOptions(junctions=["east"]))
 
 
 def test_city_with_locked_traffic_everywhere_is_rejected(city: City, monkeypatch: pytest.MonkeyPatch) -> None:
     reasons = {"west": "a car stood there", "east": "a bus stood there"}
     monkeypatch.setattr(RegionLocks, "add_teleports", lambda locks, _: locks.found.update(reasons))
-    with pytest.raises(RunError, match="locked at every junction: west: a car stood there; east: a bus stood there"):
+    with pytest.raises(RunError, match="no junction can be ranked: west: a car stood there; east: a bus stood there"):
         traffic_split.make_city_traffic(city)
     assert not (city.folder / "traffic" / traffic_split.RECORD_FILE).exists()

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from egvs.city.region_locks import RegionLocks
@@ -43,7 +44,9 @@ def test_vehicle_that_stands_for_300_s_locks_its_region(since: int, locked: list
     locks.add(standing(a=(since, 5.0), b=(0, 50.0)), 200)  # b stands between the regions
     assert list(locks.found) == locked
     if locked:
-        assert locks.found["west"] == "vehicle 'a' stood at x 5 m, y 5 m for 300 s, from 198 s on"
+        assert (
+            locks.found["west"] == "its traffic is locked: vehicle 'a' stood at x 5 m, y 5 m for 300 s, from 198 s on"
+        )
 
 
 def test_long_signal_cycles_need_longer_stands(tmp_path: Path) -> None:
@@ -71,4 +74,14 @@ def test_region_with_many_teleports_is_locked(tmp_path: Path, teleports: int, ve
     locks.add_teleports({"west": vehicles, "east": vehicles})
     assert list(locks.found) == (["west"] if locked else [])
     if locked:
-        assert locks.found["west"] == "10 of 199 vehicles had to be moved on, 10 of them at junction W, Main Street"
+        assert locks.found["west"] == (
+            "its traffic is locked: 10 of 199 vehicles had to be moved on, 10 of them at junction W, Main Street"
+        )
+
+
+def test_region_without_vehicles_is_left_out() -> None:
+    """In 100 frames, two vehicles are in the west and one is in the east."""
+    locks = RegionLocks(REGIONS, recording())
+    locks.add_boxes(np.array([0.0, 10.0, 105.0, 50.0]), np.array([0.0, 10.0, 5.0, 5.0]))
+    locks.add_empty(["west", "east"], 100)
+    assert locks.found == {"east": "only 0.01 vehicles are in its region of interest at a time (at least 0.02)"}

@@ -175,7 +175,7 @@ SOURCE_BEFORE = {
 }
 """Code lines behind the key of each stage before the layout with one module per subject."""
 
-GROWTH = {"traffic": 1.13, "tpog": 1.145, "report": 1.2}
+GROWTH = {"scan": 1.11, "traffic": 1.15, "tpog": 1.155, "score": 1.105, "report": 1.2}
 """Allowed growth, 1.1 for the others: a stage runs again whenever a line behind its key changes."""
 
 

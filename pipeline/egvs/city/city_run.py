@@ -132,12 +132,12 @@ def _connect(city: City, folder: Path, jobs: Sequence[Job], options: CityRunOpti
 def _run_jobs(cluster: Cluster, city: City, folder: Path, jobs: Sequence[Job], options: CityRunOptions) -> CityRun:
     """Run junctions, and write the tables of their results; the folder is locked.
 
-    Junctions whose traffic is locked are left out.
+    Junctions whose traffic is locked, or that have none, are left out.
     """
     traffic = traffic_split.make_city_traffic(city, options.progress, options.overrides)
-    jobs = [job for job in jobs if job.junction not in traffic.locked]
+    jobs = [job for job in jobs if job.junction not in traffic.left_out]
     if not jobs:
-        problem = "the traffic of all junctions that were selected is locked"
+        problem = "all junctions that were selected are left out: their traffic is locked, or they have none"
         raise InputError("--junction", problem, f"Select others, or use less traffic in {city.file}.")
     scheduler.run_jobs(cluster.client, jobs, on_done=options.on_done, progress=options.progress, cluster=cluster)
     junction_results = read_junction_results(folder, [city.junction(job.junction) for job in jobs])

@@ -1,4 +1,4 @@
-"""Find the junctions of a city whose traffic locks, so that they are left out and all others are ranked.
+"""Find the junctions of a city that must be left out, so that all others are ranked.
 
 The traffic in the region of interest of a junction is locked if
 
@@ -6,16 +6,19 @@ The traffic in the region of interest of a junction is locked if
 - more than :data:`egvs.traffic.locks.MAX_TELEPORT_SHARE` of the vehicles near it had to be moved on in it, at least
   :data:`egvs.traffic.locks.MIN_TELEPORTS`.
 
-A vehicle that stands elsewhere in the city changes nothing. World frame, metres.
+A region with less than :data:`MIN_VEHICLES` at a time is too empty for a ranking by detected vehicles, which examines
+250 frames by default. A vehicle that stands elsewhere in the city changes nothing. World frame, metres.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from egvs.core.grid import Roi
+import numpy as np
+
+from egvs.core.grid import FloatArray, Roi
 from egvs.traffic.locks import (
     MAX_TELEPORT_SHARE,
     MIN_TELEPORTS,
@@ -27,10 +30,13 @@ from egvs.traffic.locks import (
 from egvs.traffic.recording import Recording
 from egvs.traffic.trajectories import TrafficStatistics
 
+MIN_VEHICLES = 0.02
+"""Of 250 frames, five contain a vehicle then, on average."""
+
 
 @dataclass
 class RegionLocks:
-    """Collects locked regions while a recording is read.
+    """Collects regions that are locked or empty while a recording is read.
 
     Attributes
     ----------
@@ -39,12 +45,15 @@ class RegionLocks:
     recording
         The recording.
     found
-        Why a junction is locked, by name.
+        Why a junction is left out, by name.
+    rows
+        Vehicles in each region, summed over the frames, by name.
     """
 
     regions: Mapping[str, Roi]
     recording: Recording
     found: dict[str, str] = field(default_factory=dict)
+    rows: Counter[str] = field(default_factory=Counter)
 
     def add(self, statistics: TrafficStatistics, end_frame: int) -> None:
         """Check the vehicles that stand at the end of a group of frames.
@@ -68,8 +77,24 @@ class RegionLocks:
                     if self.recording.roads is not None:
                         place = f"{StreetNames(self.recording.roads).at(at_m)} ({place})"
                     self.found[name] = (
-                        f"vehicle {vehicle!r} stood at {place} for {duration_s:g} s, from {begin_s:g} s on"
+                        f"its traffic is locked: vehicle {vehicle!r} stood at {place} for {duration_s:g} s, from"
+                        f" {begin_s:g} s on"
                     )
+
+    def add_boxes(self, x_m: FloatArray, y_m: FloatArray) -> None:
+        """Count the vehicles whose centres (n,) are in each region."""
+        for name, region in self.regions.items():
+            (low_x_m, low_y_m), (width_m, depth_m) = region.origin_m[:2], region.size_m[:2]
+            inside = (x_m >= low_x_m) & (x_m <= low_x_m + width_m) & (y_m >= low_y_m) & (y_m <= low_y_m + depth_m)
+            self.rows[name] += int(np.count_nonzero(inside))
+
+    def add_empty(self, names: Iterable[str], frames: int) -> None:
+        """Check whether enough vehicles were in some regions, of which these are the names."""
+        for name in names:
+            mean = self.rows[name] / frames
+            if mean < MIN_VEHICLES:
+                reason = f"only {mean:.3g} vehicles are in its region of interest at a time (at least {MIN_VEHICLES:g})"
+                self.found.setdefault(name, reason)
 
     def add_teleports(self, vehicles: Mapping[str, int]) -> None:
         """Check the vehicles that SUMO moved on.
@@ -89,7 +114,8 @@ class RegionLocks:
             ((place, number),) = Counter(names.of_lane(teleport.lane) for teleport in inside).most_common(1)
             self.found.setdefault(
                 name,
-                f"{len(inside)} of {vehicles[name]} vehicles had to be moved on, {number} of them at {place}",
+                f"its traffic is locked: {len(inside)} of {vehicles[name]} vehicles had to be moved on, {number} of"
+                f" them at {place}",
             )
 
     @property

@@ -51,7 +51,7 @@ from egvs.runs import stage_keys
 from egvs.runs.run import lock_run_folder
 from egvs.scenario.loading import load, scenario_from_dict
 from egvs.scenario.model import SCENARIO_FILE, Scenario
-from egvs.scoring.target_scores import ISOLATED_GAP_M
+from egvs.scoring.target_scores import ISOLATED_GAP_M, TARGET_SCORES
 from egvs.sensors import sites
 from egvs.stages import traffic
 from egvs.stages.base import Summary
@@ -101,8 +101,8 @@ class CityTraffic:
         Summary of the complete traffic, as in the ``run.json`` of a scenario.
     rows
         Number of rows of each junction, over all periods.
-    locked
-        Why a junction has no file, by name: its traffic locks.
+    left_out
+        Why a junction has no file, by name: its traffic is locked, or there is none.
     linked
         Names of the junctions whose scenarios were changed.
     """
@@ -110,7 +110,7 @@ class CityTraffic:
     is_new: bool
     summary: Mapping[str, Any]
     rows: Mapping[str, int]
-    locked: Mapping[str, str] = field(default_factory=dict)
+    left_out: Mapping[str, str] = field(default_factory=dict)
     linked: tuple[str, ...] = ()
 
     @property
@@ -184,32 +184,32 @@ def make_city_traffic(
         if existing is not None:
             return replace(existing, linked=linked)
 
-        summaries, rows, locked = dict[str, Summary](), Counter[str](), dict[str, str]()
+        summaries, rows, left_out = dict[str, Summary](), Counter[str](), dict[str, str]()
         for period, period_scenario in scenario.by_period().items():
             paths = {junction.id: junction.traffic_file(city, period) for junction in city.junctions}
             sumo_path = folder / SUMO_FOLDER / period
             recorded = _record_period(period_scenario, sumo_path, regions, paths, progress)
             summaries[period] = recorded.summary
             rows.update(recorded.rows)
-            for name, reason in recorded.locked.items():
-                locked.setdefault(name, f"{reason} (period {period})" if period else reason)
+            for name, reason in recorded.left_out.items():
+                left_out.setdefault(name, f"{reason} (period {period})" if period else reason)
         summary = traffic.merge_summaries(summaries) if city.traffic.periods else summaries[""]
-        if len(locked) == len(regions):
+        if len(left_out) == len(regions):
             where, hint = recording.demand_key(scenario)
-            reasons = "; ".join(f"{name}: {reason}" for name, reason in list(locked.items())[:_MAX_REASONS])
-            raise RunError(f"{where}: the traffic is locked at every junction: {reasons}. {hint}")
-        for path in _traffic_paths(city, locked):
+            reasons = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:_MAX_REASONS])
+            raise RunError(f"{where}: no junction can be ranked: {reasons}. {hint}")
+        for path in _traffic_paths(city, left_out):
             path.unlink(missing_ok=True)
         warnings = [warning.to_json() for warning in _no_traffic_warnings(scenario, rows)]
-        warnings += [warning.to_json() for warning in _locked_warnings(scenario, locked)]
+        warnings += [warning.to_json() for warning in _left_out_warnings(scenario, left_out)]
         summary[WARNINGS_KEY] = [*summary.get(WARNINGS_KEY, []), *warnings]
 
         digests = {
-            _traffic_label(city, path): files.hash_file(path) for path in _traffic_paths(city, rows.keys() - locked)
+            _traffic_label(city, path): files.hash_file(path) for path in _traffic_paths(city, rows.keys() - left_out)
         }
-        record = {"key": key, "files": digests, "rows": dict(rows), "locked": locked, "summary": summary}
+        record = {"key": key, "files": digests, "rows": dict(rows), "left_out": left_out, "summary": summary}
         files.write_text(folder / RECORD_FILE, files.to_json_text(record, indent=1) + "\n")
-    return CityTraffic(True, summary, dict(rows), locked, linked)
+    return CityTraffic(True, summary, dict(rows), left_out, linked)
 
 
 def _traffic_paths(city: City, names: Collection[str]) -> Iterator[Path]:
@@ -231,7 +231,7 @@ def _read_existing_traffic(city: City, key: str) -> CityTraffic | None:
         return None
     match reading.read_json(path):
         case {
-            "key": str(old_key), "files": dict(digests), "rows": dict(rows), "locked": dict(locked),
+            "key": str(old_key), "files": dict(digests), "rows": dict(rows), "left_out": dict(left_out),
             "summary": dict(summary),
         }:  # fmt: skip
             pass
@@ -239,12 +239,12 @@ def _read_existing_traffic(city: City, key: str) -> CityTraffic | None:
             return None
     if old_key != key:
         return None
-    for traffic_path in _traffic_paths(city, rows.keys() - locked):
+    for traffic_path in _traffic_paths(city, rows.keys() - left_out):
         if not traffic_path.is_file() or files.hash_file(traffic_path) != digests.get(
             _traffic_label(city, traffic_path)
         ):
             return None
-    return CityTraffic(False, summary, rows, locked)
+    return CityTraffic(False, summary, rows, left_out)
 
 
 def _traffic_key(scenario: Scenario, folder: Path, regions: Mapping[str, TrafficRegion]) -> str:
@@ -419,11 +419,11 @@ def _format_periods(names: Iterable[str]) -> str:
 
 
 class _RecordedPeriod(NamedTuple):
-    """Summary of a period, rows of each junction, and why junctions are locked."""
+    """Summary of a period, rows of each junction, and why junctions are left out."""
 
     summary: Summary
     rows: dict[str, int]
-    locked: dict[str, str]
+    left_out: dict[str, str]
 
 
 def _record_period(
@@ -482,12 +482,10 @@ def _no_traffic_warnings(scenario: Scenario, rows: Mapping[str, int]) -> Iterato
         yield Diagnostic("junctions without traffic", sumo_folder.traffic_location(scenario), problem, hint)
 
 
-def _locked_warnings(scenario: Scenario, locked: Mapping[str, str]) -> Iterator[Diagnostic]:
+def _left_out_warnings(scenario: Scenario, left_out: Mapping[str, str]) -> Iterator[Diagnostic]:
     where, hint = recording.demand_key(scenario)
-    for name, reason in locked.items():
-        yield Diagnostic(
-            "junctions locked", where, f"{name} is left out, because its traffic is locked: {reason}", hint
-        )
+    for name, reason in left_out.items():
+        yield Diagnostic("junctions left out", where, f"{name} is left out, because {reason}", hint)
 
 
 @dataclass
@@ -539,7 +537,7 @@ def split_recording(
     progress
         Called with the number of frames that were written.
     locks
-        Collects the junctions whose traffic locks.
+        Collects the junctions that are left out.
 
     Returns
     -------
@@ -564,10 +562,15 @@ def split_recording(
             boxes = vehicle_boxes.boxes_from_bumpers(group, recording.sizes, period_ms / 1000.0, where, uncounted)
             statistics.add(boxes)
             locks.add(statistics, group.first_frame + group.frames)
+            locks.add_boxes(boxes.x_m, boxes.y_m)
             _write_rows(_with_frame_times(group, period_ms), writers.values(), recording.sizes)
             progress("frames written", group.first_frame + group.frames, statistics.frames)
         # vehicles that stand outside the regions of interest do not matter
         trajectories.check_recording(scenario, statistics, replace(recording, standing_limit_s=None))
+        ranked_by_vehicles = [
+            name for name, region in regions.items() if region.scenario.score.rank_by in TARGET_SCORES
+        ]
+        locks.add_empty(ranked_by_vehicles, statistics.frames)
         locks.add_teleports({name: len(writer.vehicles) for name, writer in writers.items()})
         fcd_metadata = FcdMetadata.for_recording(period_ms, statistics.frames, dict(recording.sizes))
         for writer in writers.values():
