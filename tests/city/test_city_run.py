@@ -15,7 +15,7 @@ from egvs.artefacts import parquet
 from egvs.city import city_run, model, results, traffic_split
 from egvs.city.city_run import CityRunOptions, overlap_warnings
 from egvs.city.model import City
-from egvs.city.region_locks import RegionLocks
+from egvs.city.region_checks import RegionChecks
 from egvs.city.tasks import Job
 from egvs.core.errors import InputError, RunError
 from egvs.placement.plan import JointScore
@@ -256,7 +256,8 @@ def test_warns_about_overlapping_regions(city: City) -> None:
 @pytest.mark.usefixtures("in_process_cluster")
 def test_junction_with_locked_traffic_is_left_out(city: City, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All others are ranked, and nothing is simulated again."""
-    monkeypatch.setattr(RegionLocks, "add_teleports", lambda locks, _: locks.found.update(east="a car stood there"))
+    reasons = {"east": "a car stood there"}
+    monkeypatch.setattr(RegionChecks, "check_teleports", lambda checks, _: checks.locked.update(reasons))
     first = city_run.run_city(city, tmp_path / "out")
     assert [result.junction.id for result in first.results] == ["west"]
     (warning,) = [warning for warning in first.warnings if warning.rule == "junctions left out"]
@@ -274,7 +275,40 @@ def test_junction_with_locked_traffic_is_left_out(city: City, tmp_path: Path, mo
 
 def test_city_with_locked_traffic_everywhere_is_rejected(city: City, monkeypatch: pytest.MonkeyPatch) -> None:
     reasons = {"west": "a car stood there", "east": "a bus stood there"}
-    monkeypatch.setattr(RegionLocks, "add_teleports", lambda locks, _: locks.found.update(reasons))
+    monkeypatch.setattr(RegionChecks, "check_teleports", lambda checks, _: checks.locked.update(reasons))
     with pytest.raises(RunError, match="no junction can be ranked: west: a car stood there; east: a bus stood there"):
         traffic_split.make_city_traffic(city)
     assert not (city.folder / "traffic" / traffic_split.RECORD_FILE).exists()
+
+
+def test_quiet_period_leaves_no_junction_out(city: City) -> None:
+    """No vehicle is near the eastern junction at night, but there are some in the day."""
+    without_far = [line for line in (city.folder / "fcd.csv").read_text().splitlines() if ";far;" not in line]
+    (city.folder / "night.csv").write_text("\n".join([*without_far, ""]))
+    periods = "".join(
+        f'\n[[traffic.periods]]\nname = "{name}"\nfcd = "{file}.csv"\nlength_s = 30.0\n'
+        for name, file in (("day", "fcd"), ("night", "night"))
+    )
+    toml = city.folder / "city.toml"
+    without_record = toml.read_text().replace('fcd = "fcd.csv"\n', "").replace("frames = 60\n", "")
+    toml.write_text(without_record.replace("\n[[traffic.kinds]]", periods + "\n[[traffic.kinds]]", 1))
+    assert not traffic_split.make_city_traffic(model.load_city(city.folder)).left_out
+
+
+def test_score_decides_whether_empty_junction_is_left_out(city: City) -> None:
+    """The traffic is the same, so nothing is simulated again, and the files are kept."""
+    fcd = city.folder / "fcd.csv"
+    without_far = [line for line in fcd.read_text().splitlines() if ";far;" not in line]
+    fcd.write_text("\n".join([*without_far, ""]))
+    by_detections = traffic_split.make_city_traffic(city, overrides=["score.rank_by=expected_detections"])
+    assert by_detections.is_new
+    assert by_detections.left_out == {"east": "only 0 vehicles are in its region of interest at a time (at least 0.02)"}
+    (warning,) = [warning for warning in by_detections.summary["warnings"] if warning["rule"].startswith("junctions")]
+    assert warning["problem"].startswith("east is left out, because only 0 vehicles")
+
+    by_entropy = traffic_split.make_city_traffic(city, overrides=["score.rank_by=egvs"])
+    assert not by_entropy.is_new
+    assert not by_entropy.left_out
+    rules = [warning["rule"] for warning in by_entropy.summary["warnings"]]
+    assert "junctions without traffic" in rules
+    assert "junctions left out" not in rules

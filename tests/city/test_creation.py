@@ -22,9 +22,10 @@ from egvs.city.creation import NewCityOptions
 from egvs.core.errors import InputError
 from egvs.formats import osm
 from egvs.importers import junctions, openstreetmap, osm_network
-from egvs.importers.junctions import JunctionRegion, StreetJunction
+from egvs.importers.junctions import StreetJunction
 from egvs.stages import traffic
 from egvs.traffic import network
+from egvs.traffic.capacity import FlowCapacity, FlowTrial
 from egvs.world import geolocation
 from tests.stage_runner import run_stage
 
@@ -240,6 +241,7 @@ def test_wrong_input_gives_one_message_and_creates_nothing(extract: Path, tmp_pa
             "signalized: no such file. Give a CSV table of junctions",
         ),
         (["--around", "50.0,10.0", "--radius", "90"], "too near to the rim"),
+        (["--traffic", "dense"], "--traffic: expected light, medium or heavy, got 'dense'"),
     ):
         code, _, error = run_egvs("city", "new", out, "--osm", extract, *options)
         assert code == 2 and message in error, (options, error)
@@ -248,6 +250,20 @@ def test_wrong_input_gives_one_message_and_creates_nothing(extract: Path, tmp_pa
     (out / "mine").touch()
     code, _, error = run_egvs("city", "new", out, "--osm", extract)
     assert code == 2 and "not empty" in error
+
+
+@pytest.mark.slow
+def test_traffic_level_is_a_share_of_what_the_network_carries(
+    extract: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_egvs
+) -> None:
+    capacity = FlowCapacity(2000, True, (FlowTrial(2000, True, 100.0, 0, 0.0),))
+    monkeypatch.setattr(creation, "find_flow", lambda *_: capacity)
+    for level, expected in (("light", 800), ("medium", 1500), ("heavy", 2000)):
+        folder = tmp_path / level
+        code, printed, error = run_egvs("city", "new", folder, "--osm", extract, "--traffic", level)
+        assert code == 0, error
+        assert f"carries 2,000 vehicles an hour; {level} {expected // 20} % is used" in printed + error
+        assert model.load_city(folder).traffic.vehicles_per_h == expected
 
 
 def test_from_map_to_scores(extract: Path, tmp_path: Path, run_egvs) -> None:
@@ -325,25 +341,24 @@ def square_junction(name: str, x_m: float, y_m: float, side_m: float = 16.0) -> 
 def test_regions_are_cut_in_the_middle_of_their_overlap() -> None:
     """Regions of 60 m: from -30 to 30 and from 15 to 75. A third overlaps only the second, from above."""
     chosen = {"a": square_junction("a", 0, 0), "b": square_junction("b", 45, 0), "c": square_junction("c", 62, 50)}
-    regions = {name: region.area.bounds for name, region in creation.divided_regions(chosen).items()}
+    regions = {name: region.area.bounds for name, region in creation.divided_regions(chosen).regions.items()}
     assert regions == {"a": (-30, -30, 22, 30), "b": (22, -30, 75, 25), "c": (32, 25, 92, 80)}
 
 
 def test_junctions_that_no_line_divides_are_named() -> None:
     chosen = {"a": square_junction("a", 0, 0), "b": square_junction("b", 10, 10), "c": square_junction("c", 90, 0)}
-    regions = creation.divided_regions(chosen)
-    assert regions["b"] == "a"
-    assert regions["a"] == junctions.region_around(chosen["a"])
-    assert regions["c"] == junctions.region_around(chosen["c"])
+    divided = creation.divided_regions(chosen)
+    assert divided.too_near == {"b": "a"}
+    assert divided.regions == {name: junctions.region_around(chosen[name]) for name in ("a", "c")}
 
 
 @pytest.fixture
 def undivided(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only the first junction gets a region."""
 
-    def regions(chosen: Mapping[str, StreetJunction]) -> dict[str, JunctionRegion | str]:
+    def regions(chosen: Mapping[str, StreetJunction]) -> creation.DividedRegions:
         first, *others = chosen
-        return {first: junctions.region_around(chosen[first]), **dict.fromkeys(others, first)}
+        return creation.DividedRegions({first: junctions.region_around(chosen[first])}, dict.fromkeys(others, first))
 
     monkeypatch.setattr(creation, "divided_regions", regions)
 

@@ -38,7 +38,9 @@ def without_each_block(frames: int, period: PeriodBlocks) -> list[set[int]]:
     return [set(range(frames)) - set(range(b * size, (b + 1) * size)) for b in range(period.blocks)]
 
 
-def slow_found(context: StageContext, problem: PlacementProblem, sites: list[str], mean: float) -> FloatArray:
+def vehicles_found_by_plan(
+    context: StageContext, problem: PlacementProblem, sites: list[str], mean: float
+) -> FloatArray:
     """Return the vehicles found by all sites: with all frames, and without each block, from loops over vehicles."""
     view: Any = problem.views[-1]
     totals = [0.0] * view.n_cells
@@ -115,7 +117,7 @@ def test_replicates_equal_scores_without_each_block(tmp_path: Path, score: str) 
         if score == "egvs":
             expected = slow_egvs(context, problem, sites[:n])
         else:
-            expected = slow_found(context, problem, sites[:n], mean)
+            expected = vehicles_found_by_plan(context, problem, sites[:n], mean)
         assert actual[n] == pytest.approx(expected, rel=1e-9)
     assert len(set(actual[2].tolist())) > 2
 

@@ -248,13 +248,13 @@ def test_trips_follow_shares_lanes_and_minimum_length(town):
     pairs = [demand.origin_destination_pairs(roads, kind, drawn(min_trip_m=200), rng, "place") for kind in kinds]
     departs_s = np.arange(4000) / 4
     trips = demand.draw_trips(roads, kinds, pairs, departs_s, rng)
-    assert Counter(kind for kind, _, _ in trips)["car"] == pytest.approx(3000, abs=150)
+    assert Counter(trip.kind for trip in trips)["car"] == pytest.approx(3000, abs=150)
     edges = {e.id: e for e in roads.edges}
     assert {len(edges) for _ in trips} == {24}
-    for _, origin, target in trips:
-        assert math.dist(edges[origin].start_m, edges[target].end_m) >= 200
-        assert edges[origin].from_node != edges[target].to_node
-    assert len({(a, b) for _, a, b in trips}) == 8 * 7 - 2 * (
+    for trip in trips:
+        assert math.dist(edges[trip.origin].start_m, edges[trip.target].end_m) >= 200
+        assert edges[trip.origin].from_node != edges[trip.target].to_node
+    assert len({(trip.origin, trip.target) for trip in trips}) == 8 * 7 - 2 * (
         4 + 4
     )  # neighbours at a corner and along a side lie closer
 

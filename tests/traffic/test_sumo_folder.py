@@ -216,14 +216,23 @@ def test_user_demand_is_limited_on_request(crowded_folder):
     assert result["flags"][result["flags"].index("--max-depart-delay") + 1] == "7"
 
 
+COUNT = '[[traffic.counts]]\nedge = "a"\nper_hour = 100'
+
+
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
         ('routes = ["r.xml"]\nvehicles_per_lane_km = 3', r"vehicles_per_lane_km has no effect with routes"),
         ("vehicles = 5\nvehicles_per_lane_km = 3", r"vehicles_per_lane_km has no effect with vehicles"),
+        ("vehicles = 5\nvehicles_per_h = 300", r"vehicles_per_h has no effect with vehicles"),
+        ("vehicles_per_h = 300\nvehicles_per_lane_km = 3", r"vehicles_per_lane_km has no effect with vehicles_per_h"),
+        ("vehicles_per_h = 300\ntrips_per_s = 3", r"trips_per_s has no effect with vehicles_per_h"),
+        ('vehicles_per_h = 300\nhold = "at_most"', r"hold has no effect with vehicles_per_h"),
+        (f"vehicles_per_h = 300\n{COUNT}", r"vehicles_per_h has no effect with counts"),
+        (f"reroute_at_departure = true\n{COUNT}", r"reroute_at_departure has no effect with counts"),
     ],
 )
-def test_rejects_density_without_effect(tmp_path, keys, message):
+def test_rejects_amounts_of_traffic_without_effect(tmp_path, keys, message):
     (tmp_path / "scenario.toml").write_text(
         '[roi]\ncenter_m = [0, 0, 2.5]\nsize_m = [50, 100, 5]\n[sites]\nfile = "s.csv"\n'
         f'[traffic]\nnetwork = "net.xml"\n{keys}\n'

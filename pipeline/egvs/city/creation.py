@@ -19,7 +19,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import shapely
 import tomlkit
@@ -45,7 +45,7 @@ from egvs.importers.openstreetmap import (
     TRAFFIC_LEVELS,
     TomlTable,
     check_inside_extract,
-)  # fmt: skip
+)
 from egvs.importers.osm_network import ATTRIBUTION, NETWORK_FILE, NetworkExcerpts
 from egvs.importers.osm_solids import ImportCounts, MappedSolid
 from egvs.scenario.loading import load
@@ -91,6 +91,9 @@ _KERB_MARGIN_M, _ROADS_MARGIN_M = 60.0, 100.0
 
 _OVERLAP_TOLERANCE_M2 = 1e-6
 """Regions that share no more than this only touch."""
+
+_SIDE_TOLERANCE_M = 1e-6
+"""A junction may extend beyond its side of a line by this."""
 
 _MIN_REGION_SIDE_M = 20.0
 """A region of interest is not cut to less."""
@@ -254,11 +257,10 @@ def create_city(folder: Path, osm: Path, options: NewCityOptions | None = None) 
     areas = shapely.STRtree([solid.area for solid in solids])
     made: list[NewJunction] = []
     left_out = dict(choice.left_out)
-    regions = divided_regions(choice.junctions)
+    divided = divided_regions(choice.junctions)
     for number, (junction_id, street_junction) in enumerate(choice.junctions.items(), 1):
-        roi = regions[junction_id]
-        if isinstance(roi, JunctionRegion):
-            junction = _make_junction(junction_id, street_junction, roi, streets, areas)
+        if junction_id in divided.regions:
+            junction = _make_junction(junction_id, street_junction, divided.regions[junction_id], streets, areas)
             if junction.poles:
                 made.append(junction)
             else:
@@ -266,7 +268,7 @@ def create_city(folder: Path, osm: Path, options: NewCityOptions | None = None) 
         elif which in (SIGNALISED, ALL):
             left_out.setdefault(OVERLAPPING_REGION, []).append(street_junction.id)
         else:
-            raise _overlap_error(which, roi, junction_id)
+            raise _overlap_error(which, divided.too_near[junction_id], junction_id)
         options.progress("junctions", number, len(choice.junctions))
     if not made:
         reasons = ", ".join(f"{len(ids)} {reason}" for reason, ids in left_out.items()) or "no streets meet"
@@ -360,8 +362,23 @@ def _nearest_junction(streets: Streets, point: Point, where: str) -> StreetJunct
     return nearest
 
 
-def divided_regions(chosen: Mapping[str, StreetJunction]) -> dict[str, JunctionRegion | str]:
-    """Return the region of interest of each junction; regions do not overlap.
+class DividedRegions(NamedTuple):
+    """Regions of interest that do not overlap.
+
+    Attributes
+    ----------
+    regions
+        Region of each junction that has one, by name.
+    too_near
+        The others by name: the junction from which no line divides them.
+    """
+
+    regions: dict[str, JunctionRegion]
+    too_near: dict[str, str]
+
+
+def divided_regions(chosen: Mapping[str, StreetJunction]) -> DividedRegions:
+    """Return regions of interest of junctions that do not overlap.
 
     In a city, vehicles in two regions would count twice. Two regions that overlap are therefore cut along a line
     between them, in whole metres, so that each junction keeps its side.
@@ -370,29 +387,25 @@ def divided_regions(chosen: Mapping[str, StreetJunction]) -> dict[str, JunctionR
     ----------
     chosen
         The junctions by name, the most important first.
-
-    Returns
-    -------
-    dict
-        Region of each junction; or, where no line divides its area from that of a junction before it, the name of that
-        junction.
     """
-    regions: dict[str, JunctionRegion | str] = {}
+    regions: dict[str, JunctionRegion] = {}
+    too_near: dict[str, str] = {}
     for name, junction in chosen.items():
         region = junctions.region_around(junction)
         changed: dict[str, JunctionRegion] = {}
         for other_name, other in regions.items():
-            if not isinstance(other, JunctionRegion) or not _overlap(region, other):
+            if not _overlap(region, other):
                 continue
             halves = _divide(region, other, junction, chosen[other_name])
             if halves is None:
-                regions[name] = other_name
+                too_near[name] = other_name
                 break
-            region, changed[other_name] = halves
-        else:
+            region = halves[0]
+            changed[other_name] = halves[1]
+        if name not in too_near:
             regions |= changed
             regions[name] = region
-    return regions
+    return DividedRegions(regions, too_near)
 
 
 def _overlap(region: JunctionRegion, other: JunctionRegion) -> bool:
@@ -420,7 +433,7 @@ def _side_of(region: JunctionRegion, junction: StreetJunction, axis: int, line_m
     bounds[axis if junction.at_m[axis] > line_m else axis + 2] = line_m
     part = box(*bounds)
     sides_m = bounds[2] - bounds[0], bounds[3] - bounds[1]
-    fits = region.area.intersection(junction.area).within(part.buffer(_OVERLAP_TOLERANCE_M2))
+    fits = region.area.intersection(junction.area).within(part.buffer(_SIDE_TOLERANCE_M))
     if not fits or min(sides_m) < _MIN_REGION_SIDE_M:
         return None
     return JunctionRegion(((bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2), sides_m)

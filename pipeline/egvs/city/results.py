@@ -162,7 +162,7 @@ class CityPlan:
     phases
         Number of sensors after each phase, ascending; empty without phases.
     errors_from
-        How standard errors were computed; or, if ``has_errors`` is false, why there are none.
+        How standard errors were computed; without standard errors, the reason.
     has_errors
         Whether the curve has standard errors.
     """

@@ -41,17 +41,17 @@ from tomlkit.exceptions import TOMLKitError
 
 from egvs.artefacts import parquet
 from egvs.city.model import CITY_FILE, JUNCTIONS_FILE, JUNCTIONS_FOLDER, TRAFFIC_FOLDER, City, CityJunction
-from egvs.city.region_locks import RegionLocks
+from egvs.city.region_checks import RegionChecks, empty_regions
 from egvs.core import files, platform, reading
 from egvs.core.errors import WARNINGS_KEY, Diagnostic, InputError, RunError
-from egvs.core.grid import FloatArray
+from egvs.core.grid import FloatArray, Roi
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.effects import registry
 from egvs.runs import stage_keys
 from egvs.runs.run import lock_run_folder
 from egvs.scenario.loading import load, scenario_from_dict
 from egvs.scenario.model import SCENARIO_FILE, Scenario
-from egvs.scoring.target_scores import ISOLATED_GAP_M, TARGET_SCORES
+from egvs.scoring.target_scores import ISOLATED_GAP_M
 from egvs.sensors import sites
 from egvs.stages import traffic
 from egvs.stages.base import Summary
@@ -102,7 +102,7 @@ class CityTraffic:
     rows
         Number of rows of each junction, over all periods.
     left_out
-        Why a junction has no file, by name: its traffic is locked, or there is none.
+        Why a junction cannot be ranked, by name: its traffic is locked, or there is hardly any.
     linked
         Names of the junctions whose scenarios were changed.
     """
@@ -180,36 +180,77 @@ def make_city_traffic(
         regions = find_traffic_regions(city, overrides)
         scenario = city_traffic_scenario(city, regions)
         key = _traffic_key(scenario, folder, regions)
-        existing = _read_existing_traffic(city, key)
+        existing = _read_record(city, key)
         if existing is not None:
-            return replace(existing, linked=linked)
+            return _city_traffic(False, existing, scenario, regions, linked)
 
-        summaries, rows, left_out = dict[str, Summary](), Counter[str](), dict[str, str]()
+        summaries, periods = dict[str, Summary](), list[_RecordedPeriod]()
+        locked: dict[str, str] = {}
         for period, period_scenario in scenario.by_period().items():
             paths = {junction.id: junction.traffic_file(city, period) for junction in city.junctions}
             sumo_path = folder / SUMO_FOLDER / period
             recorded = _record_period(period_scenario, sumo_path, regions, paths, progress)
             summaries[period] = recorded.summary
-            rows.update(recorded.rows)
-            for name, reason in recorded.left_out.items():
-                left_out.setdefault(name, f"{reason} (period {period})" if period else reason)
+            periods.append(recorded)
+            for name, reason in recorded.locked.items():
+                locked.setdefault(name, f"{reason} (period {period})" if period else reason)
         summary = traffic.merge_summaries(summaries) if city.traffic.periods else summaries[""]
-        if len(left_out) == len(regions):
-            where, hint = recording.demand_key(scenario)
-            reasons = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:_MAX_REASONS])
-            raise RunError(f"{where}: no junction can be ranked: {reasons}. {hint}")
-        for path in _traffic_paths(city, left_out):
+        if len(locked) == len(regions):
+            raise RunError(_no_ranking_problem(scenario, locked))
+        for path in _traffic_paths(city, locked):
             path.unlink(missing_ok=True)
-        warnings = [warning.to_json() for warning in _no_traffic_warnings(scenario, rows)]
-        warnings += [warning.to_json() for warning in _left_out_warnings(scenario, left_out)]
-        summary[WARNINGS_KEY] = [*summary.get(WARNINGS_KEY, []), *warnings]
 
         digests = {
-            _traffic_label(city, path): files.hash_file(path) for path in _traffic_paths(city, rows.keys() - left_out)
+            _traffic_label(city, path): files.hash_file(path) for path in _traffic_paths(city, regions.keys() - locked)
         }
-        record = {"key": key, "files": digests, "rows": dict(rows), "left_out": left_out, "summary": summary}
+        record = {
+            "key": key, "files": digests, "rows": _sum_by_junction([recorded.rows for recorded in periods]),
+            "mean_vehicles": _mean_vehicles(periods, int(summary["frames"])), "locked": locked, "summary": summary,
+        }  # fmt: skip
         files.write_text(folder / RECORD_FILE, files.to_json_text(record, indent=1) + "\n")
-    return CityTraffic(True, summary, dict(rows), left_out, linked)
+        return _city_traffic(True, record, scenario, regions, linked)
+
+
+def _sum_by_junction(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
+    total = Counter[str]()
+    for by_junction in counts:
+        total.update(by_junction)
+    return dict(total)
+
+
+def _mean_vehicles(periods: Sequence[_RecordedPeriod], frames: int) -> dict[str, float]:
+    """Return the mean number of vehicles in each region of interest, over all frames of all periods."""
+    total = _sum_by_junction([recorded.vehicles for recorded in periods])
+    return {name: count / frames for name, count in total.items()}
+
+
+def _city_traffic(
+    is_new: bool,
+    record: Mapping[str, Any],
+    scenario: Scenario,
+    regions: Mapping[str, TrafficRegion],
+    linked: tuple[str, ...],
+) -> CityTraffic:
+    """Return the traffic of ``traffic.json``, with a warning about each junction that cannot be ranked.
+
+    Whether a junction has enough vehicles depends on its score, so another score needs no new traffic.
+    """
+    empty = empty_regions(record["mean_vehicles"], {name: region.scenario for name, region in regions.items()})
+    left_out = empty | record["locked"]
+    if len(left_out) == len(regions):
+        raise RunError(_no_ranking_problem(scenario, left_out))
+    warnings = list(_left_out_warnings(scenario, left_out))
+    unused = {name: count for name, count in record["rows"].items() if name not in left_out}
+    warnings += _no_traffic_warnings(scenario, unused)
+    summary = dict(record["summary"])
+    summary[WARNINGS_KEY] = [*summary.get(WARNINGS_KEY, []), *(warning.to_json() for warning in warnings)]
+    return CityTraffic(is_new, summary, record["rows"], left_out, linked)
+
+
+def _no_ranking_problem(scenario: Scenario, left_out: Mapping[str, str]) -> str:
+    where, hint = recording.demand_key(scenario)
+    reasons = "; ".join(f"{name}: {reason}" for name, reason in list(left_out.items())[:_MAX_REASONS])
+    return f"{where}: no junction can be ranked: {reasons}. {hint}"
 
 
 def _traffic_paths(city: City, names: Collection[str]) -> Iterator[Path]:
@@ -224,31 +265,35 @@ def _traffic_label(city: City, path: Path) -> str:
     return path.relative_to(city.folder / TRAFFIC_FOLDER).as_posix()
 
 
-def _read_existing_traffic(city: City, key: str) -> CityTraffic | None:
-    """Return the traffic in the folder; None if it has another key, or a file is missing or was changed."""
+def _read_record(city: City, key: str) -> dict[str, Any] | None:
+    """Return ``traffic.json``; None if it has another key, or a file is missing or was changed."""
     path = city.folder / TRAFFIC_FOLDER / RECORD_FILE
     if not path.is_file():
         return None
-    match reading.read_json(path):
+    record = reading.read_json(path)
+    match record:
         case {
-            "key": str(old_key), "files": dict(digests), "rows": dict(rows), "left_out": dict(left_out),
-            "summary": dict(summary),
+            "key": str(old_key), "files": dict(digests), "rows": dict(rows), "mean_vehicles": dict(),
+            "locked": dict(locked), "summary": dict(),
         }:  # fmt: skip
             pass
         case _:
             return None
     if old_key != key:
         return None
-    for traffic_path in _traffic_paths(city, rows.keys() - left_out):
+    for traffic_path in _traffic_paths(city, rows.keys() - locked):
         if not traffic_path.is_file() or files.hash_file(traffic_path) != digests.get(
             _traffic_label(city, traffic_path)
         ):
             return None
-    return CityTraffic(False, summary, rows, left_out)
+    return dict(record)
 
 
 def _traffic_key(scenario: Scenario, folder: Path, regions: Mapping[str, TrafficRegion]) -> str:
-    """Return a hash of all inputs: the traffic, the regions, the effects of the junctions, the program."""
+    """Return a hash of all inputs: the traffic, the regions, the effects of the junctions, the program.
+
+    A region of interest decides whether a junction is locked, the rectangle around it which vehicles it gets.
+    """
     dependencies = traffic.dependencies(open_folder(scenario, folder))
     effects = {}
     for name, region in regions.items():
@@ -257,11 +302,17 @@ def _traffic_key(scenario: Scenario, folder: Path, regions: Mapping[str, Traffic
         {
             "inputs": dependencies.to_json(),
             "regions": {name: region.to_json() for name, region in regions.items()},
+            "regions_of_interest": {name: _horizontal(region.scenario.roi.box) for name, region in regions.items()},
             "effects": effects,
             "program": stage_keys.program_inputs(traffic.STAGE.name, scenario, dependencies.modules),
             "splitting": stage_keys.source_digest(__name__).digest,
         }
     )
+
+
+def _horizontal(roi: Roi) -> list[float]:
+    """Return the corner and the size of a region, seen from above."""
+    return [*roi.origin_m[:2], *roi.size_m[:2]]
 
 
 def city_traffic_scenario(city: City, regions: Mapping[str, TrafficRegion]) -> Scenario:
@@ -419,11 +470,12 @@ def _format_periods(names: Iterable[str]) -> str:
 
 
 class _RecordedPeriod(NamedTuple):
-    """Summary of a period, rows of each junction, and why junctions are left out."""
+    """Summary of a period, and by junction: rows, vehicles in the region (sum over frames), why it is locked."""
 
     summary: Summary
     rows: dict[str, int]
-    left_out: dict[str, str]
+    vehicles: dict[str, int]
+    locked: dict[str, str]
 
 
 def _record_period(
@@ -437,8 +489,8 @@ def _record_period(
     effects, notes = registry.active_traffic_effects(scenario)
     world = geolocation.scenario_georeference(scenario)
     with recording.record_traffic(scenario, folder, effects, progress, None, world) as recorded:
-        locks = RegionLocks({name: region.scenario.roi.box for name, region in regions.items()}, recorded)
-        statistics, rows = split_recording(scenario, recorded, regions, paths, effects, progress, locks)
+        checks = RegionChecks({name: region.scenario.roi.box for name, region in regions.items()}, recorded)
+        statistics, rows = split_recording(scenario, recorded, regions, paths, effects, progress, checks)
         recording_summary = recorded.summary()
         warnings = trajectories.traffic_warnings(statistics, recorded, scenario.roi.box)
     summary = statistics.to_json(recorded.window.period_ms / 1000.0)
@@ -453,7 +505,7 @@ def _record_period(
     summary[WARNINGS_KEY] = [_reword_for_city(warning) for warning in all_warnings]
     if notes:
         summary["notes"] = [*summary.get("notes", []), *notes]
-    return _RecordedPeriod(summary, rows, locks.found)
+    return _RecordedPeriod(summary, rows, dict(checks.vehicles), checks.locked)
 
 
 def _reword_for_city(warning: Mapping[str, Any]) -> dict[str, Any]:
@@ -522,7 +574,7 @@ def split_recording(
     paths: Mapping[str, Path],
     extensions: Sequence[TrafficHook],
     progress: ProgressCallback,
-    locks: RegionLocks,
+    checks: RegionChecks,
 ) -> tuple[TrafficStatistics, dict[str, int]]:
     """Write the files of all junctions. No file appears before the recording is complete and checked.
 
@@ -536,8 +588,8 @@ def split_recording(
         Effects that change the traffic.
     progress
         Called with the number of frames that were written.
-    locks
-        Collects the junctions that are left out.
+    checks
+        Collects the junctions that are locked.
 
     Returns
     -------
@@ -561,17 +613,12 @@ def split_recording(
         for group in trajectories.frame_groups(recording, GROUP_FRAMES):
             boxes = vehicle_boxes.boxes_from_bumpers(group, recording.sizes, period_ms / 1000.0, where, uncounted)
             statistics.add(boxes)
-            locks.add(statistics, group.first_frame + group.frames)
-            locks.add_boxes(boxes.x_m, boxes.y_m)
+            checks.add_frames(boxes, statistics)
             _write_rows(_with_frame_times(group, period_ms), writers.values(), recording.sizes)
             progress("frames written", group.first_frame + group.frames, statistics.frames)
         # vehicles that stand outside the regions of interest do not matter
         trajectories.check_recording(scenario, statistics, replace(recording, standing_limit_s=None))
-        ranked_by_vehicles = [
-            name for name, region in regions.items() if region.scenario.score.rank_by in TARGET_SCORES
-        ]
-        locks.add_empty(ranked_by_vehicles, statistics.frames)
-        locks.add_teleports({name: len(writer.vehicles) for name, writer in writers.items()})
+        checks.check_teleports({name: len(writer.vehicles) for name, writer in writers.items()})
         fcd_metadata = FcdMetadata.for_recording(period_ms, statistics.frames, dict(recording.sizes))
         for writer in writers.values():
             writer.flush()

@@ -623,7 +623,7 @@ class Store:
         return removed
 
     def _in_use_since(self) -> float:
-        """Return the start of the first city run in progress, in seconds since the epoch; infinity if there is none."""
+        """Return the start of the first city run in progress, in seconds since the epoch; infinity without one."""
         assert self.folder is not None
         start = math.inf
         with suppress(OSError):

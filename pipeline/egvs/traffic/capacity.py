@@ -34,7 +34,7 @@ import numpy as np
 from egvs.core import files
 from egvs.formats import xml
 from egvs.scenario.traffic_config import CountConfig, TrafficConfig
-from egvs.traffic import demand, sumo, sumo_folder
+from egvs.traffic import demand, sumo, sumo_folder, town_trips
 from egvs.traffic.locks import MOVED_M, SAMPLE_S
 from egvs.traffic.network import Edge, Network, read_net_xml
 
@@ -55,8 +55,14 @@ LANE_PER_H, FIRST_LOAD = 1800, 0.6
 """Vehicles that a lane passes per hour, and the load of the busiest junction in the first simulation of a town."""
 
 FLOW_FACTOR = 1.25
+"""From one simulation of a town to the next, its flow is raised or lowered by this factor."""
+
 MAX_FLOW_RUNS = 6
+"""Maximum number of simulations of a town, without that of light traffic."""
+
 MAX_QUEUING = 0.15
+"""Maximum share of the vehicles that stand, beyond the share that stands in light traffic."""
+
 LIGHT_SHARE = 0.1
 """Light traffic is this share of the first flow."""
 
@@ -65,6 +71,9 @@ _LOAD_TRIPS, _MIN_LIGHT_PER_H = 3000, 100
 _FACTOR = 0.7
 _CLOSE_ENOUGH = 1.06
 """The trial ends when the shares that are and are not carried differ by less than this factor."""
+
+_TRIAL_WHERE = "random trips"
+"""In messages, instead of the traffic table of a scenario."""
 
 _FCD_FILE, _TRIPS_FILE, _STATISTICS_FILE = "trial.csv", "arrivals.xml", "statistics.xml"
 
@@ -174,15 +183,15 @@ def _simulate(
     return TrialRun(share, scheduled, arrived, state.longest_standing_s, state.waiting)
 
 
-class _FinalState(NamedTuple):
-    """What a simulation led to: the longest stand, vehicles without space to start, and the share at rest."""
+class _SimulationResult(NamedTuple):
+    """The longest stand of a vehicle in a simulation, vehicles without space to start, and the share at rest."""
 
     longest_standing_s: float
     waiting: int
     share_at_rest: float
 
 
-def _run_sumo(folder: Path, duration_s: float, warmup_s: float, options: Mapping[str, str]) -> _FinalState:
+def _run_sumo(folder: Path, duration_s: float, warmup_s: float, options: Mapping[str, str]) -> _SimulationResult:
     """Simulate the routes in a folder."""
     all_options = {
         "net-file": sumo_folder.NETWORK_FILE,
@@ -208,7 +217,7 @@ def _run_sumo(folder: Path, duration_s: float, warmup_s: float, options: Mapping
     sumo.run_program("sumo", sumo_folder.as_flags(all_options), folder)
     (vehicles,) = (e for e in xml.iter_elements(folder / _STATISTICS_FILE, "statistics") if e.tag == "vehicles")
     longest_s, share_at_rest = _standing(folder / _FCD_FILE)
-    return _FinalState(longest_s, int(vehicles.get("waiting", 0)), share_at_rest)
+    return _SimulationResult(longest_s, int(vehicles.get("waiting", 0)), share_at_rest)
 
 
 def _arrivals(routes: Path, trips: Path) -> tuple[int, int]:
@@ -321,20 +330,25 @@ def find_flow(network: str, junction_blocker_s: float) -> FlowCapacity:
         trial = _TownTrial(folder, junction_blocker_s)
         per_h, reroute = trial.first_flow(), True
         trial.run_light_traffic(per_h)
-        carried, too_much = 0, math.inf
+        carried: FlowTrial | None = None
+        too_much = math.inf
         while len(trial.runs) < MAX_FLOW_RUNS:
-            if trial.run(per_h, reroute).is_carried:
-                carried, per_h = per_h, round(per_h * FLOW_FACTOR)
+            run = trial.run(per_h, reroute)
+            if run.is_carried:
+                carried = run
+                per_h = round(per_h * FLOW_FACTOR)
                 if per_h > 0.99 * too_much:
                     reroute = False
-            elif not carried:
-                too_much, per_h = per_h, max(1, round(per_h / FLOW_FACTOR))
+            elif carried is None:
+                too_much = per_h
+                per_h = max(1, round(per_h / FLOW_FACTOR))
             elif reroute:
                 reroute = False
             else:
                 break
-        best = [run for run in trial.runs if run.is_carried and run.vehicles_per_h == carried]
-        return FlowCapacity(carried or per_h, best[0].reroute if best else True, tuple(trial.runs))
+        if carried is None:
+            return FlowCapacity(per_h, True, tuple(trial.runs))
+        return FlowCapacity(carried.vehicles_per_h, carried.reroute, tuple(trial.runs))
 
 
 class _TownTrial:
@@ -347,14 +361,12 @@ class _TownTrial:
             "ignore-junction-blocker": f"{junction_blocker_s:g}",
             "step-length": f"{FLOW_STEP_S:g}",
         }
-        traffic = TrafficConfig(network=sumo_folder.NETWORK_FILE)
+        self._traffic = TrafficConfig(network=sumo_folder.NETWORK_FILE)
         self._roads = read_net_xml(folder / sumo_folder.NETWORK_FILE)
         self._rng = np.random.default_rng(0)
-        files.write_text(folder / sumo_folder.VTYPES_FILE, demand.vtypes_xml(traffic.kinds))
-        self._kinds = traffic.kinds
-        self._pairs = [
-            demand.origin_destination_pairs(self._roads, kind, traffic, self._rng, "random trips")
-            for kind in traffic.kinds
+        files.write_text(folder / sumo_folder.VTYPES_FILE, demand.vtypes_xml(self._traffic.kinds))
+        self._ends = [
+            town_trips.trip_ends(self._roads, kind, self._traffic, _TRIAL_WHERE) for kind in self._traffic.kinds
         ]
         self._routed: list[demand.RoutedTrip] = []
         self._n_trips = 0
@@ -389,7 +401,7 @@ class _TownTrial:
         self.runs.append(run)
         return run
 
-    def _simulate(self, per_h: int, reroute: bool) -> _FinalState:
+    def _simulate(self, per_h: int, reroute: bool) -> _SimulationResult:
         count = math.ceil(FLOW_DURATION_S * per_h / 3600.0)
         if count > self._n_trips:
             self._draw(count)
@@ -401,7 +413,6 @@ class _TownTrial:
 
     def _draw(self, count: int) -> None:
         """Draw and route trips, at least as many as a number."""
-        departs_s = np.arange(count, dtype=np.float64)
-        trips = demand.draw_trips(self._roads, self._kinds, self._pairs, departs_s, self._rng)
+        trips = town_trips.draw_town_trips(self._roads, self._traffic, self._ends, count, self._rng, _TRIAL_WHERE)
         self._n_trips = count
         self._routed = demand.route_trips(trips, self._folder, sumo_folder.NETWORK_FILE, sumo_folder.VTYPES_FILE)

@@ -118,11 +118,23 @@ class OriginDestinations:
 
 
 class Trip(NamedTuple):
-    """Name of the kind, and ids of the first and the last edge."""
+    """Name of the kind, and ids of the first and the last edge.
+
+    A trip starts at the begin of its first edge and ends at the end of the last one, unless positions along these edges
+    are given, in metres.
+    """
 
     kind: str
     origin: str
     target: str
+    depart_m: float | None = None
+    arrival_m: float | None = None
+
+    @property
+    def positions_xml(self) -> str:
+        """The given positions as attributes, each after a space."""
+        depart = "" if self.depart_m is None else f' departPos="{self.depart_m:.1f}"'
+        return depart if self.arrival_m is None else f'{depart} arrivalPos="{self.arrival_m:.1f}"'
 
 
 @dataclass(frozen=True)
@@ -204,12 +216,7 @@ def origin_destination_pairs(
     InputError
         When the kind may use no lane, or no trip is as long as ``min_trip_m``.
     """
-    title = f"kind {kind.name!r} (vClass {kind.vclass})"
-    lanes = _lanes_per_edge(network, kind.vclass)
-    if not lanes.any():
-        problem = f"no lane of the network allows {title}"
-        raise InputError(f"{where}.kinds", problem, "Use a vClass that the network allows.")
-
+    lanes = usable_lanes(network, kind, where)
     weights = edge_weights(network, lanes, traffic, where)
     links = network.links(kind.vclass)
     sources, sinks = fringe_edges(lanes, links)
@@ -224,9 +231,27 @@ def origin_destination_pairs(
     origin, target = pairs[:, 0], pairs[:, 1]
     weight = weights[origin] * weights[target]
     if not weight.any():
-        problem = f"{title} cannot make any trip of at least {traffic.min_trip_m:g} m"
-        raise InputError(f"{where}.kinds", problem, "Use a connected network, or a smaller min_trip_m.")
+        raise no_trip_error(where, kind, traffic.min_trip_m)
     return OriginDestinations(origin, target, weight, at_fringe)
+
+
+def usable_lanes(network: Network, kind: VehicleKind, where: str) -> FloatArray:
+    """Return how many lanes of each edge a kind of vehicle may use, shape (n_edges,); InputError if there is none."""
+    lanes = _lanes_per_edge(network, kind.vclass)
+    if not lanes.any():
+        problem = f"no lane of the network allows {_kind_title(kind)}"
+        raise InputError(f"{where}.kinds", problem, "Use a vClass that the network allows.")
+    return lanes
+
+
+def no_trip_error(where: str, kind: VehicleKind, min_trip_m: float) -> InputError:
+    """Return the error for a kind of vehicle without possible trips."""
+    problem = f"{_kind_title(kind)} cannot make any trip of at least {min_trip_m:g} m"
+    return InputError(f"{where}.kinds", problem, "Use a connected network, or a smaller min_trip_m.")
+
+
+def _kind_title(kind: VehicleKind) -> str:
+    return f"kind {kind.name!r} (vClass {kind.vclass})"
 
 
 def _lanes_per_edge(network: Network, vclass: str) -> FloatArray:
@@ -353,24 +378,35 @@ def trips_xml(trips: Sequence[Trip], departs_s: FloatArray) -> str:
     """Return a SUMO route file with one ``<trip>`` per departure."""
     lines = [
         f'    <trip id="{index}" depart="{depart_s:.3f}" from={quoteattr(trip.origin)} to={quoteattr(trip.target)}'
-        f' type={quoteattr(trip.kind)} departLane="best" departSpeed="max"/>'
+        f' type={quoteattr(trip.kind)} departLane="best" departSpeed="max"{trip.positions_xml}/>'
         for index, (trip, depart_s) in enumerate(zip(trips, departs_s, strict=True))
     ]
     return _xml_document("routes", lines)
 
 
 class RoutedTrip(NamedTuple):
-    """A trip: its number among all that were routed, name of the kind, and ids of the edges of its route."""
+    """A trip with its route.
+
+    Attributes
+    ----------
+    number
+        Its number among all that were routed.
+    edges
+        Ids of the edges of its route, with spaces between them.
+    trip
+        The trip.
+    """
 
     number: int
-    kind: str
     edges: str
+    trip: Trip
 
     def xml(self, depart_s: float) -> str:
         """Return the vehicle as a line of a SUMO route file."""
+        attributes = f'depart="{depart_s:.3f}" departLane="best" departSpeed="max"{self.trip.positions_xml}'
         return (
-            f'    <vehicle id="{self.number}" type={quoteattr(self.kind)} depart="{depart_s:.3f}" departLane="best"'
-            f' departSpeed="max"><route edges={quoteattr(self.edges)}/></vehicle>'
+            f'    <vehicle id="{self.number}" type={quoteattr(self.trip.kind)} {attributes}>'
+            f"<route edges={quoteattr(self.edges)}/></vehicle>"
         )
 
 
@@ -401,8 +437,8 @@ def route_trips(trips: Sequence[Trip], folder: Path, network: str, vtypes: str) 
     routed = []
     for vehicle in xml.iter_elements(folder / ROUTED_TRIPS_FILE, "routes"):
         for route in vehicle.iter("route"):
-            edges = route.get("edges", "")
-            routed.append(RoutedTrip(int(vehicle.get("id", "0")), vehicle.get("type", ""), edges))
+            number = int(vehicle.get("id", "0"))
+            routed.append(RoutedTrip(number, route.get("edges", ""), trips[number]))
     for name in (DRAWN_TRIPS_FILE, ROUTED_TRIPS_FILE, _ALTERNATIVES_FILE):
         (folder / name).unlink()
     return routed

@@ -169,6 +169,16 @@ def teleport_warning(
     return [Diagnostic("teleports", demand.where, problem, demand.hint)]
 
 
+def standing_limit_s(roads: Network | None) -> float:
+    """Return how long a vehicle may stand: two signal cycles, at least :data:`STANDING_LIMIT_S`."""
+    return max(STANDING_LIMIT_S, 0.0 if roads is None else 2.0 * roads.cycle_s)
+
+
+def are_too_many_teleports(teleports: int, vehicles: int) -> bool:
+    """Return whether so many teleports of so many vehicles mean that a region is locked."""
+    return teleports >= MIN_TELEPORTS and teleports > MAX_TELEPORT_SHARE * vehicles
+
+
 def is_inside(at_m: XY, roi: Roi) -> bool:
     """Return whether a position is in the region of interest, seen from above."""
     return all(
@@ -228,7 +238,7 @@ class RegionWatch:
         self._first_ms = timing.first_ms
         self._sample_ms = timing.period_ms * max(1, round(SAMPLE_S * 1000 / timing.period_ms))
         self._roi, self._roads, self._sizes = roi, roads, sizes
-        self._limit_ms = round(1000 * max(STANDING_LIMIT_S, 2.0 * roads.cycle_s))
+        self._limit_ms = round(1000 * standing_limit_s(roads))
         self._demand = demand
         self._offset = 0
         self._rest = b""
@@ -312,7 +322,7 @@ class RegionWatch:
             text = self._log.read_text(encoding="utf-8", errors="replace")
             self._teleports = [t for t in read_teleports(text, self._first_ms / 1000) if self._is_at_region(t)]
         inside = [teleport for teleport in self._teleports if teleport.time_s * 1000 <= self._now_ms]
-        if len(inside) < MIN_TELEPORTS or len(inside) <= MAX_TELEPORT_SHARE * len(self._names):
+        if not are_too_many_teleports(len(inside), len(self._names)):
             return
         locations = Counter(self._street_names.of_lane(teleport.lane) for teleport in inside)
         ((location, number),) = locations.most_common(1)

@@ -21,10 +21,11 @@ import numpy as np
 
 from egvs.core import files
 from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray
 from egvs.formats import osm
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import TrafficConfig
-from egvs.traffic import demand, network, sumo, user_files
+from egvs.traffic import demand, network, sumo, town_trips, user_files
 from egvs.traffic.fcd import FrameWindow
 from egvs.traffic.vehicle_boxes import TrafficHook
 
@@ -376,26 +377,39 @@ def _write_trips(
     """Write random trips; return notes for the user."""
     traffic = scenario.traffic
     where = traffic_location(scenario)
-    pairs = [demand.origin_destination_pairs(roads, kind, traffic, rng, where) for kind in traffic.kinds]
-    trips_per_s = traffic.trips_per_s
     if traffic.vehicles_per_h is not None:
-        trips_per_s = traffic.vehicles_per_h / 3600.0
-    count = int(np.ceil((timing.end_ms - timing.begin_ms) / 1000.0 * trips_per_s))
-    departs_s = timing.begin_ms / 1000.0 + np.arange(count) / trips_per_s
+        return _write_flow(traffic, roads, timing, rng, folder, where)
+    pairs = [demand.origin_destination_pairs(roads, kind, traffic, rng, where) for kind in traffic.kinds]
+    departs_s = _departures(timing, traffic.trips_per_s)
     trips = demand.draw_trips(roads, traffic.kinds, pairs, departs_s, rng)
-    notes = [
+    files.write_text(folder / TRIPS_FILE, demand.trips_xml(trips, departs_s))
+    return [
         f"{kind.name}: no trip between fringe edges; trips join any two edges that are far apart"
         for kind, kind_pairs in zip(traffic.kinds, pairs, strict=True)
         if not kind_pairs.fringe
     ]
-    if traffic.vehicles_per_h is None:
-        files.write_text(folder / TRIPS_FILE, demand.trips_xml(trips, departs_s))
-        return notes
+
+
+def _departures(timing: Timing, trips_per_s: float) -> FloatArray:
+    """Return departures at regular intervals, in seconds."""
+    count = int(np.ceil((timing.end_ms - timing.begin_ms) / 1000.0 * trips_per_s))
+    departs_s: FloatArray = timing.begin_ms / 1000.0 + np.arange(count) / trips_per_s
+    return departs_s
+
+
+def _write_flow(
+    traffic: TrafficConfig, roads: network.Network, timing: Timing, rng: np.random.Generator, folder: Path, where: str
+) -> list[str]:
+    """Write the routes of random trips through a town; return notes for the user."""
+    assert traffic.vehicles_per_h is not None
+    departs_s = _departures(timing, traffic.vehicles_per_h / 3600.0)
+    ends = [town_trips.trip_ends(roads, kind, traffic, where) for kind in traffic.kinds]
+    trips = town_trips.draw_town_trips(roads, traffic, ends, departs_s.size, rng, where)
     routed = demand.route_trips(trips, folder, NETWORK_FILE, VTYPES_FILE)
-    if len(routed) < len(trips):
-        notes.append(f"{len(trips) - len(routed)} of {len(trips)} trips have no route and were left out")
     files.write_text(folder / TRIPS_FILE, demand.routes_xml(routed, departs_s))
-    return notes
+    if len(routed) == len(trips):
+        return []
+    return [f"{len(trips) - len(routed)} of {len(trips)} trips have no route and were left out"]
 
 
 def _copy_files(

@@ -239,7 +239,7 @@ class TrafficStatistics:
         north = np.floor(boxes.y_m[first] / SQUARE_M).astype(int)
         self.overlaps_by_square.update(zip(east.tolist(), north.tolist(), strict=True))
         if self.region is not None:
-            in_region = _in_region(boxes, self.region)
+            in_region = centres_in_region(boxes, self.region)
             self.rows_in_region += int(np.count_nonzero(in_region))
             is_blocker = standing_frames >= self.blocker_frames
             self.overlaps_in_region += int(np.count_nonzero((in_region & is_blocker)[pairs].any(axis=1)))
@@ -324,7 +324,7 @@ class TrafficStatistics:
         return values
 
 
-def _in_region(boxes: VehicleBoxes, region: Roi) -> NDArray[np.bool_]:
+def centres_in_region(boxes: VehicleBoxes, region: Roi) -> NDArray[np.bool_]:
     """Return whether the centre of each box is in a region, seen from above."""
     (x_m, y_m), (width_m, depth_m) = region.origin_m[:2], region.size_m[:2]
     inside: NDArray[np.bool_] = (boxes.x_m >= x_m) & (boxes.x_m <= x_m + width_m)
