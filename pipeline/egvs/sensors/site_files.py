@@ -5,7 +5,8 @@ one of the names of :data:`LONGITUDE` and :data:`LATITUDE`. Where a row has both
 GeoJSON file are in the system that its member ``crs`` declares.
 
 Further columns belong to the user (``fid``, ``owner``, ``note``) and are carried through to the scores. A column whose
-name is nearly one of the program's, which the file lacks, is rejected as misspelt.
+name is nearly one of the program's, which the file lacks, is rejected as misspelt. So is a column that other programs
+use for what this program reads from a column of another name (:data:`FOREIGN_COLUMNS`): ``height``, ``heading``.
 """
 
 from __future__ import annotations
@@ -37,6 +38,23 @@ KNOWN_COLUMNS = ("site", *NUMBER_COLUMNS, *TEXT_COLUMNS)
 
 LONGITUDE = ("lon", "lng", "longitude", "lon_deg", "longitude_deg")
 LATITUDE = ("lat", "latitude", "lat_deg", "latitude_deg")
+
+_Z_HINT = (
+    "Use z_m, the sensor's z in the world frame in metres: its height above the ground plus the ground's z, 0 if flat."
+)
+_YAW_HINT = "Use yaw_deg, counter-clockwise from east: 90 minus the degrees clockwise from north."
+_PITCH_HINT = "Use pitch_deg, positive for nose up: minus the degrees by which the sensor is tilted down."
+_SENSOR_HINT = "Use sensor, with a name from `egvs sensors` or from [sensors]."
+
+FOREIGN_COLUMNS = {
+    **dict.fromkeys(("height", "heights", "altitude", "sensor_height", "mount_height", "mounting_height"), _Z_HINT),
+    **dict.fromkeys(("heading", "bearing", "azimuth", "compass", "facing", "orientation"), _YAW_HINT),
+    **dict.fromkeys(("tilt", "tilt_angle", "downtilt", "inclination"), _PITCH_HINT),
+    **dict.fromkeys(("lidar", "sensor_name", "sensor_model", "sensor_type"), _SENSOR_HINT),
+}
+"""Columns of other programs, without their unit, and the column to use instead, with the conversion."""
+
+_COLUMN_UNIT = re.compile(r"[ _]*[ _(\[](m|cm|ft|metres?|meters?|feet|deg|degrees?|rad|°)[)\]]?$")
 
 _TOLERANCE_M = 0.1
 _MAX_M = 1e8  # larger values are not on Earth; they are rejected when the row is parsed
@@ -253,8 +271,10 @@ def _number_or_nan(value: Any) -> float:
 def user_columns(where: str, row: Mapping[str, Any], known: Collection[str]) -> dict[str, ColumnValue]:
     """Return the columns of a row beyond the ``known`` ones; lists and tables as JSON text.
 
-    InputError when a column looks like a known one that the row lacks, or has an invalid name.
+    InputError when a column looks like a known one that the row lacks, has a name that other programs use for a known
+    one, or has an invalid name.
     """
+    _check_foreign_columns(where, row)
     misspelling = find_misspelling(row, known)
     if misspelling is not None:
         name, meant = misspelling
@@ -268,6 +288,14 @@ def user_columns(where: str, row: Mapping[str, Any], known: Collection[str]) -> 
             raise InputError(where, f"expected a column name of 1 to 80 characters, got {name[:80]!r}")
         columns[name] = _to_column_value(value)
     return columns
+
+
+def _check_foreign_columns(where: str, row: Mapping[str, Any]) -> None:
+    for name, value in row.items():
+        key = re.sub(r"[\s-]+", "_", _COLUMN_UNIT.sub("", name.strip().lower()))
+        if key in FOREIGN_COLUMNS and value not in (None, ""):
+            hint = f"{FOREIGN_COLUMNS[key]} A custom column needs another name."
+            raise InputError(where, f"the column {name!r} has no effect", hint)
 
 
 def parse_numeric_columns(rows: Iterable[dict[str, Any]], known: Collection[str]) -> list[dict[str, Any]]:
