@@ -35,7 +35,7 @@ from egvs.core import limits
 from egvs.core.errors import Diagnostic, DiagnosticsError, InputError
 from egvs.core.grid import Vec3
 from egvs.scenario.fields import MAX_COORDINATE_M
-from egvs.scenario.model import Scenario, SiteGrid, SiteLine, SitesConfig
+from egvs.scenario.model import Scenario, SiteGrid, SiteLine
 from egvs.sensors import site_files
 from egvs.sensors.sensor import Sensor, scenario_sensor
 from egvs.sensors.site_files import SiteRow
@@ -170,7 +170,7 @@ def candidate_sites(scenario: Scenario) -> tuple[Site, ...]:
         raise DiagnosticsError(_group_errors(errors))
     if not sites:
         raise InputError(path, "expected at least one site, got none")
-    _check_unused_keys(scenario.sites, builder.used_keys, scenario.file, path)
+    _check_unused_keys(scenario, builder.used_keys, path)
     _check_keep_visibility(scenario, sites)
     return _with_measured_scan(tuple(sites.values()), scenario)
 
@@ -203,18 +203,33 @@ def _group_errors(errors: list[InputError]) -> Iterator[Diagnostic]:
         yield Diagnostic.of("sites", InputError(where, problem, hint))
 
 
-def _check_unused_keys(config: SitesConfig, used_keys: set[str], scenario_file: Path, path: Path) -> None:
-    """InputError for a key of ``[sites]`` that every row overrides."""
-    for key in ("aim", "aim_m", "heights_m", "pitch_deg"):
-        if getattr(config, key) in (None, ()) or key in used_keys:
+_OVERRIDING_COLUMNS = {
+    "sensor": "sensor",
+    "heights_m": "z_m",
+    "aim": "yaw_deg or aim",
+    "aim_m": "yaw_deg or aim",
+    "yaw_deg": "yaw_deg or aim",
+    "pitch_deg": "pitch_deg",
+    "roll_deg": "roll_deg",
+}
+"""Keys of ``[sites]`` that are defaults for rows, and the columns that override them."""
+
+
+def _check_unused_keys(scenario: Scenario, used_keys: set[str], path: Path) -> None:
+    """InputError for a key of ``[sites]`` that the user wrote and that every row overrides."""
+    config = scenario.sites
+    for key, column in _OVERRIDING_COLUMNS.items():
+        is_set = key in scenario.written_site_keys and getattr(config, key) not in (None, ())
+        if not is_set or key in used_keys:
             continue
-        column = "pitch_deg"
-        if key == "heights_m":
-            column = "z_m"
-        elif key.startswith("aim"):
-            column = "yaw_deg or aim"
+        problem = f"the key has no effect on any site: each row of {path.name} has {column}"
         hint = f"Remove it, or remove {column} from the rows of {path.name}."
-        raise InputError(f"{scenario_file}: sites.{key}", "the key has no effect on any site", hint)
+        if key == "sensor" and config.replace_sensor is not None:
+            problem = "the key has no effect on any site: replace_sensor sets the sensor of all"
+            hint = "Remove one of them."
+        elif key == "sensor":
+            hint = f"Use sites.replace_sensor={config.sensor} to replace them, or remove the key."
+        raise InputError(f"{scenario.file}: sites.{key}", problem, hint)
 
 
 def _check_keep_visibility(scenario: Scenario, sites: Mapping[str, Site]) -> None:
@@ -291,9 +306,11 @@ class _SiteBuilder:
         user_columns = site_files.user_columns(row.where, columns, site_files.KNOWN_COLUMNS)
         _check_columns(row, self.scenario)
         name = str(columns["site"]).strip()
-        sensor_name = str(columns.get("sensor") or self.scenario.sites.sensor).strip()
+        sensor_name = self._sensor_name(columns)
         points = str(columns["points"]).strip() if columns.get("points") else None
         request = _mount_request(row, self.scenario)
+        if columns.get("roll_deg") in (None, ""):
+            self.used_keys.add("roll_deg")
         pole = self._poles.setdefault((request.x_m, request.y_m), name)
         mounts = self._mounts(row.where, request, sensor_name)
         if points is not None and len(mounts) > 1:
@@ -306,6 +323,15 @@ class _SiteBuilder:
                 raise InputError(f"{row.where}: site", problem)
             pose = Pose(request.x_m, request.y_m, mount.z_m, mount.yaw_deg, mount.pitch_deg, request.roll_deg)
             yield Site(site_name, pose, sensor_name, points, pole, user_columns)
+
+    def _sensor_name(self, columns: Mapping[str, Any]) -> str:
+        config = self.scenario.sites
+        if config.replace_sensor is not None:
+            return config.replace_sensor
+        if columns.get("sensor"):
+            return str(columns["sensor"]).strip()
+        self.used_keys.add("sensor")
+        return config.sensor
 
     def _mounts(self, where: str, request: MountRequest, sensor_name: str) -> list[Mount]:
         """Every combination of height and pitch of a row; InputError for an aim that no mount meets."""
@@ -369,6 +395,7 @@ class _SiteBuilder:
             raise InputError(f"{where}: pitch_deg", f"pitch_deg is 'aim', but {reason}", 'Set aim = "roi", or aim_m.')
         if request.yaw_deg is not None:
             return request.yaw_deg, float(pitch)
+        self.used_keys.add("yaw_deg")
         return self.scenario.sites.yaw_deg or 0.0, float(pitch)
 
     def _sensor(self, name: str, where: str) -> Sensor:
