@@ -292,3 +292,21 @@ def test_rejects_geojson_that_is_not_utf8(mini: Path) -> None:
     (mini / "sites.geojson").write_bytes(b'{"features": "\xff"}')
     with pytest.raises(InputError, match="is not valid JSON"):
         sites.candidate_sites(egvs.load(mini, ['sites.file="sites.geojson"']))
+
+
+def test_stops_reading_a_table_with_too_many_rows(mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The malformed row after the limit is not read."""
+    monkeypatch.setenv("EGVS_MAX_SITES", "3")
+    rows = "".join(f"s{i},{i},12,3\n" for i in range(1, 5))
+    (mini / "sites.csv").write_text(f"site,x_m,y_m,z_m\n{rows}s5,5,12\n")
+    with pytest.raises(InputError, match=r"sites\.csv: there are more than 3 candidates .*EGVS_MAX_SITES"):
+        sites.candidate_sites(egvs.load(mini))
+
+
+def test_rejects_too_many_features_before_their_coordinates_are_read(
+    mini: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("EGVS_MAX_SITES", "3")
+    (mini / "sites.geojson").write_text(collection(*(point("east", i, 3, name=f"s{i}") for i in range(5))))
+    with pytest.raises(InputError, match=r"sites\.geojson: there are more than 3 candidates"):
+        sites_from(mini, file='"sites.geojson"')

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from egvs.core import files
+from egvs.core import files, limits
 from egvs.core.errors import InputError, find_misspelling
 from egvs.core.grid import FloatArray
 from egvs.core.reading import read_json
@@ -100,12 +100,23 @@ def read_csv(path: Path, world: Georeference) -> Iterator[SiteRow]:
                 if None in values or None in values.values():
                     raise InputError(where, "the row has more or fewer values than the header has columns")
                 located.append(SiteRow(where, dict(values)))
+                check_site_count(len(located), path, "each row is one", "Use fewer rows.")
     except (UnicodeDecodeError, csv.Error) as error:
         hint = "Save it as UTF-8 text with a header row."
         raise InputError(path, f"the file cannot be read as CSV ({error})", hint) from None
     rows = parse_numeric_columns(rows_in_world_frame(located, path, world), KNOWN_COLUMNS)
     for row, columns in zip(located, rows, strict=True):
         yield SiteRow(row.where, columns)
+
+
+_FEWER_CANDIDATES = "Use a wider spacing, or fewer heights and pitches."
+
+
+def check_site_count(count: float, where: object, reason: str, hint: str = _FEWER_CANDIDATES) -> None:
+    """Raise an InputError when a scenario has more candidates than :data:`egvs.core.limits.SITES`."""
+    if not count <= limits.SITES.maximum:
+        problem = f"there are more than {limits.SITES.maximum:,} candidates ({reason})"
+        raise InputError(where, problem, f"{hint} {limits.SITES.hint}")
 
 
 def _check_header(path: Path, names: list[str]) -> None:
@@ -125,6 +136,7 @@ def read_geojson(path: Path, world: Georeference) -> Iterator[SiteRow]:
     document = read_json(path, f"Use {expected}.")
     if not isinstance(document, dict) or not isinstance(document.get("features"), list):
         raise InputError(path, f"expected {expected}, got {reprlib.repr(document)[:120]}")
+    check_site_count(len(document["features"]), path, "each feature is one", "Use fewer features.")
     coordinates = geojson_coordinates(document["features"])
     reading = world.read_coordinates(coordinates, str(path), declared_crs(document, str(path)))
     for number, feature in enumerate(document["features"]):

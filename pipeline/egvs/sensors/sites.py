@@ -31,7 +31,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from scipy.special import cosdg, sindg
 
-from egvs.core import limits
 from egvs.core.errors import Diagnostic, DiagnosticsError, InputError
 from egvs.core.grid import Vec3
 from egvs.scenario.fields import MAX_COORDINATE_M
@@ -165,7 +164,7 @@ def candidate_sites(scenario: Scenario) -> tuple[Site, ...]:
                 sites[site.name] = site
         except InputError as error:
             errors.append(error)
-        _check_site_count(len(sites), path, "each combination of location, height and pitch is one")
+        site_files.check_site_count(len(sites), path, "each combination of location, height and pitch is one")
     if errors:
         raise DiagnosticsError(_group_errors(errors))
     if not sites:
@@ -185,12 +184,6 @@ def _site_rows(scenario: Scenario, path: Path) -> Iterator[SiteRow]:
     if config.grid is not None:
         return _grid_rows(config.grid)
     return _line_rows(config.along)
-
-
-def _check_site_count(count: float, where: object, reason: str) -> None:
-    if not count <= limits.SITES.maximum:
-        problem = f"there are more than {limits.SITES.maximum:,} candidates ({reason})"
-        raise InputError(where, problem, f"Use a wider spacing, or fewer heights and pitches. {limits.SITES.hint}")
 
 
 def _group_errors(errors: list[InputError]) -> Iterator[Diagnostic]:
@@ -545,11 +538,11 @@ def _grid_rows(rule: SiteGrid) -> Iterator[SiteRow]:
     axes = []
     for low, high in zip(rule.low_m, rule.high_m, strict=True):
         steps = (high - low) / rule.spacing_m + 1e-9
-        _check_site_count(steps, "sites.grid", reason)
+        site_files.check_site_count(steps, "sites.grid", reason)
         count = math.floor(steps) + 1
         axes.append([low + i * rule.spacing_m for i in range(count)])
     xs, ys = axes
-    _check_site_count(len(xs) * len(ys), "sites.grid", reason)
+    site_files.check_site_count(len(xs) * len(ys), "sites.grid", reason)
     points = [_RulePoint(x, y, rule.heights_m) for y in ys for x in xs]
     yield from _numbered_rows("g", points, "sites.grid")
 
@@ -560,9 +553,9 @@ def _line_rows(rules: tuple[SiteLine, ...]) -> Iterator[SiteRow]:
         reason = f"spacing_m = {rule.spacing_m:g}"
         line = np.asarray(rule.line_m)
         distance_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
-        _check_site_count(float(distance_m[-1]) / rule.spacing_m, "sites.along", reason)
+        site_files.check_site_count(float(distance_m[-1]) / rule.spacing_m, "sites.along", reason)
         count = math.floor(distance_m[-1] / rule.spacing_m + 1e-9) + 1
-        _check_site_count(len(points) + count, "sites.along", reason)
+        site_files.check_site_count(len(points) + count, "sites.along", reason)
         at_m = np.arange(count) * rule.spacing_m
         xs = np.interp(at_m, distance_m, line[:, 0])
         ys = np.interp(at_m, distance_m, line[:, 1])
