@@ -23,8 +23,8 @@ from egvs.formats import point_clouds
 from egvs.sensors.scanner import Scan, Scanner
 from egvs.sensors.sites import ScannedSite
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
+from egvs.stages.blocked_sites import near_share, warn_blocked_sites
 from egvs.stages.scene_inputs import scan_dependencies
-from egvs.stages.site_scans import near_share, warn_blocked_sites
 
 
 def dependencies(context: StageContext) -> StageDependencies:

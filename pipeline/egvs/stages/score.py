@@ -28,8 +28,8 @@ from egvs.scoring.score_table import ScoreTable
 from egvs.sensors.sites import Site
 from egvs.stages import site_scoring
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
+from egvs.stages.blocked_sites import warn_blocked_sites
 from egvs.stages.scene_inputs import scan_dependencies, sensor_digests, sensor_settings
-from egvs.stages.site_scans import warn_blocked_sites
 from egvs.stages.site_scoring import BeamAudit, ScoredSite, SiteScoring, needs_targets
 from egvs.world import clearances, geolocation
 

@@ -1,28 +1,20 @@
-"""The empty scans of a run folder, one by one: read from ``scans.parquet``, or cast where ``scan.keep`` is false.
-
-:func:`warn_blocked_sites` names sites whose sensor sees little but what is around it, such as its own mast.
-"""
+"""The empty scans of a run folder, one by one: read from ``scans.parquet``, or cast where ``scan.keep`` is false."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from egvs.artefacts import parquet
 from egvs.artefacts.run_folder import RunFolder
-from egvs.core.errors import Diagnostic, InputError
-from egvs.core.grid import FloatArray
+from egvs.core.errors import InputError
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.scene import Scene
 from egvs.sensors.sites import ScannedSite
 from egvs.stages.base import StageContext
-from egvs.world import supports
-
-NEAR_M = 0.5
-"""Beams that end closer to the sensor have met what it is mounted on, or mounted in."""
 
 
 @dataclass(frozen=True)
@@ -73,33 +65,3 @@ def _make_scanner(scene: Scene) -> Scanner:
     scanner = Scanner(scene)
     scanner.check(scene.sites)
     return scanner
-
-
-def near_share(ends_m: FloatArray, weight: FloatArray | None) -> float:
-    """Return the share of beams that end within :data:`NEAR_M` of the sensor; 0 without beams.
-
-    Parameters
-    ----------
-    ends_m
-        Ends of the beams relative to the sensor, (n, 3).
-    weight
-        Share of its beam of each row, (n,); None where every row is one beam.
-    """
-    is_near = (ends_m**2).sum(axis=1) < NEAR_M**2
-    if not is_near.any():
-        return 0.0
-    return float(np.average(is_near, weights=weight))
-
-
-def warn_blocked_sites(near_shares: Mapping[str, float]) -> Iterator[Diagnostic]:
-    """Warn about the sites of which most beams end near the sensor; ``near_shares`` by site."""
-    blocked = [f"{site} ({share:.0%})" for site, share in near_shares.items() if share > 0.5]
-    if blocked:
-        count = f"{len(blocked)} of {len(near_shares)} sites"
-        problem = f"most beams of {count} end within {NEAR_M:g} m of the sensor: {', '.join(blocked)}"
-        kinds = ", ".join(supports.KINDS)
-        hint = (
-            f"Move the sensor away from the solid, or set the kind of its mast (one of {kinds}; at most"
-            f" {supports.MAX_WIDTH_M:g} m across), which is then left out of the scan."
-        )
-        yield Diagnostic("blocked sites", "sites", problem, hint)

@@ -47,7 +47,8 @@ from egvs.scoring.targets import (
 from egvs.scoring.visibility import Beams, to_voxel_units
 from egvs.sensors.sites import ScannedSite
 from egvs.stages.base import StageContext
-from egvs.stages.site_scans import SiteScan, empty_scans, near_share
+from egvs.stages.blocked_sites import near_share
+from egvs.stages.site_scans import SiteScan, empty_scans
 
 _ROI_HINT = "Check that the region of interest contains the road."
 
