@@ -201,13 +201,13 @@ PLACE = "site,x_m,y_m\np,0,0\n"
         (
             "site,x_m,y_m,z_m,yaw_deg\np,0,0,6,0\n",
             {"yaw_deg": "0"},
-            r"sites\.yaw_deg: .*no effect on any site: each row of sites\.csv has yaw_deg or aim",
+            r"sites\.yaw_deg: .*no effect on any site: each row of sites\.csv has its own yaw_deg or aim",
         ),
         ("site,x_m,y_m,z_m,roll_deg\np,0,0,6,0\n", {"roll_deg": "0"}, r"sites\.roll_deg: .*no effect on any site"),
         (
             "site,x_m,y_m,z_m,sensor\np,0,0,6,VLP-16\n",
             {"sensor": "OS1-128"},
-            r"sites\.sensor: .*no effect on any site: each row of sites\.csv has sensor\. "
+            r"sites\.sensor: .*no effect on any site: each row of sites\.csv has its own sensor\. "
             r"Use sites\.replace_sensor=OS1-128 to replace them",
         ),
         ("site,x_m,y_m,z_m,sensor\np,0,0,6,VLP-16\n", {"sensor": "OS1-129"}, r"sites\.sensor: .*no effect on any site"),
@@ -259,6 +259,11 @@ def test_rejects_invalid_mount_keys(mini: Path, keys: dict[str, str], message: s
 
 
 MIXED_SENSORS = "site,x_m,y_m,z_m,sensor\na,0,0,6,VLP-16\nb,9,0,6,\n"
+
+
+def test_accepts_sensor_that_the_rows_name_too(mini: Path) -> None:
+    rows = "site,x_m,y_m,z_m,sensor\na,0,0,6,VLP-16\n"
+    assert [site.sensor for site in sites_from(mini, rows, sensor="VLP-16")] == ["VLP-16"]
 
 
 def test_replace_sensor_applies_to_rows_that_name_another_sensor(mini: Path) -> None:

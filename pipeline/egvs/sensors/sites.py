@@ -215,7 +215,7 @@ def _check_unused_keys(scenario: Scenario, used_keys: set[str], path: Path) -> N
         is_set = key in scenario.written_site_keys and getattr(config, key) not in (None, ())
         if not is_set or key in used_keys:
             continue
-        problem = f"the key has no effect on any site: each row of {path.name} has {column}"
+        problem = f"the key has no effect on any site: each row of {path.name} has its own {column}"
         hint = f"Remove it, or remove {column} from the rows of {path.name}."
         if key == "sensor" and config.replace_sensor is not None:
             problem = "the key has no effect on any site: replace_sensor sets the sensor of all"
@@ -284,7 +284,7 @@ class AimingAngles(NamedTuple):
 class _SiteBuilder:
     """Makes the candidates of one row after another.
 
-    ``used_keys`` collects the keys of ``[sites]`` that had an effect.
+    ``used_keys`` collects the keys of ``[sites]`` that had an effect, or that a row repeats.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -322,7 +322,10 @@ class _SiteBuilder:
         if config.replace_sensor is not None:
             return config.replace_sensor
         if columns.get("sensor"):
-            return str(columns["sensor"]).strip()
+            name = str(columns["sensor"]).strip()
+            if name == config.sensor:  # the row says the same
+                self.used_keys.add("sensor")
+            return name
         self.used_keys.add("sensor")
         return config.sensor
 
