@@ -104,8 +104,8 @@ def test_rejects_input_in_results_folder(mini: Path, tmp_path: Path, run_egvs) -
     assert error.startswith(f"egvs: --detections {theirs}: ") and "--keep" in error
 
 
-FOREIGN = ("statics.ply", "scores.parquet", "tpog.parquet", "report.html", "accuracy.png", "placement.parquet",
-           "sumo/mine.net.xml")  # fmt: skip
+FOREIGN = ("statics.ply", "scores.parquet", "tpog.parquet", "report.html", "accuracy.png", "accuracy.sha256",
+           "placement.parquet", "sumo/mine.net.xml")  # fmt: skip
 
 
 @pytest.mark.parametrize("verb", ["run", "statics", "score", "accuracy", "validate", "place"])

@@ -2,11 +2,13 @@
 
 Parquet files and ``statics.ply`` carry metadata of this program; so a file of a killed run is recognised. A file that
 was damaged since is recognised by its name in ``run.json``, or in the checksums of a study. Reports, pictures and lists
-of checksums carry no metadata: they belong to a run where one has left its lock or its record in the folder.
+of checksums carry no metadata, nor do SUMO's files: they belong to a run where one has left its lock, its record or a
+file with metadata in the folder.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,6 +18,7 @@ import pyarrow.parquet as pq
 from egvs.artefacts.run_folder import RunFile, RunFolder
 from egvs.artefacts.run_record import RunRecord
 
+_CHECKSUM_LINE = re.compile(r"[0-9a-f]{64}  (.+)")
 _PARQUET_KEY = b"egvs"
 _PLY_START = b"ply\nformat binary_little_endian 1.0\ncomment egvs "
 
@@ -32,42 +35,49 @@ def foreign_files(folder: Path) -> Iterator[str]:
     """
     run_folder = RunFolder(folder)
     written = _recorded_names(run_folder)
-    is_run_folder = run_folder.has_record or run_folder.lock.exists()
+    unmarked = []
     for file in RunFolder.all_files():
         path = folder / file.name
-        if path.is_symlink() or not path.exists() or file.name in written:
+        if path.is_symlink() or not path.exists():
             continue
-        if not _is_written_by_run(path, file, is_run_folder):
+        if path.is_dir():  # in place of a file, it is rejected where the file is written
+            if file.is_folder and any(path.iterdir()):
+                unmarked.append(file)
+        elif file.name in written or _has_metadata(path):
+            written.add(file.name)
+        else:
+            unmarked.append(file)
+
+    for file in unmarked:
+        if _can_have_metadata(file) or not written:
             yield file.name
 
 
 def _recorded_names(folder: RunFolder) -> set[str]:
-    names = {RunFolder.run_record.name, RunFolder.lock.name}
+    """The names in ``run.json`` and in the checksums of studies; also those of the record and the lock themselves."""
+    names = {file.name for file in (RunFolder.run_record, RunFolder.lock) if (folder / file.name).exists()}
     if folder.has_record:
         for stage in RunRecord.read(folder.path).stages.values():
             names |= stage.artefacts.keys()
     for path in (folder.accuracy_checksums, folder.validation_checksums, folder.placement_checksums):
         if path.is_file():
             lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-            names.update(line.partition("  ")[2] for line in lines)
+            names.update(match[1] for match in map(_CHECKSUM_LINE.fullmatch, lines) if match)
     return names
 
 
-def _is_written_by_run(path: Path, file: RunFile, is_run_folder: bool) -> bool:
-    if file.is_folder:
-        return is_run_folder or not path.is_dir() or not any(path.iterdir())
-    if not path.is_file():
-        return True  # a folder of this name is rejected where the file is written
+def _can_have_metadata(file: RunFile) -> bool:
+    return file.name.endswith((".parquet", ".ply"))
+
+
+def _has_metadata(path: Path) -> bool:
+    """Whether a file carries metadata of this program."""
     if path.suffix == ".parquet":
-        return _has_parquet_metadata(path)
+        try:
+            return _PARQUET_KEY in (pq.read_metadata(path).metadata or {})
+        except pa.ArrowInvalid:  # no Parquet file
+            return False
     if path.suffix == ".ply":
         with path.open("rb") as content:
             return content.read(len(_PLY_START)) == _PLY_START
-    return is_run_folder
-
-
-def _has_parquet_metadata(path: Path) -> bool:
-    try:
-        return _PARQUET_KEY in (pq.read_metadata(path).metadata or {})
-    except pa.ArrowInvalid:  # no Parquet file
-        return False
+    return False
