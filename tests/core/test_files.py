@@ -51,6 +51,9 @@ def test_error_of_full_disk_names_the_file(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="left on device") as caught, files.atomic_write(tmp_path / "a"):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert caught.value.filename == str(tmp_path / "a")
+    with pytest.raises(OSError, match="left on device") as caught, files.atomic_write(tmp_path / "a") as partial:
+        raise OSError(errno.ENOSPC, "No space left on device", "/elsewhere/source", None, str(partial))  # as of a copy
+    assert (caught.value.filename, caught.value.filename2) == (str(tmp_path / "a"), None)
     with pytest.raises(OSError, match="other") as caught, files.atomic_write(tmp_path / "a"):
         raise OSError(errno.EIO, "another error")  # may be of what is read
     assert caught.value.filename is None

@@ -100,7 +100,7 @@ def test_all_files_appear_or_none(located: Path, tmp_path: Path, monkeypatch: py
 
     def full(source: Path, target: Path) -> None:
         if len(copied) == 2:
-            raise OSError(errno.ENOSPC, "No space left on device")
+            raise OSError(errno.ENOSPC, "No space left on device", str(source), None, str(target))
         copied.append(copy(source, target))
 
     monkeypatch.setattr(shutil, "copyfile", full)

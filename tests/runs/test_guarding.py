@@ -104,6 +104,54 @@ def test_rejects_input_in_results_folder(mini: Path, tmp_path: Path, run_egvs) -
     assert error.startswith(f"egvs: --detections {theirs}: ") and "--keep" in error
 
 
+FOREIGN = ("statics.ply", "scores.parquet", "tpog.parquet", "report.html", "accuracy.png", "accuracy.sha256",
+           "placement.parquet", "sumo/mine.net.xml")  # fmt: skip
+
+
+@pytest.mark.parametrize("verb", ["run", "statics", "score", "accuracy", "validate", "place"])
+@pytest.mark.parametrize("name", FOREIGN)
+def test_run_does_not_overwrite_file_that_no_run_wrote(
+    mini: Path, tmp_path: Path, run_egvs, verb: str, name: str
+) -> None:
+    out = tmp_path / "mine"
+    (out / name).parent.mkdir(parents=True)
+    (out / name).write_text("my work of years")
+    code, _, error = run_egvs(verb, mini, "--out", out, "--set", "placement.count=1")
+    top = name.partition("/")[0]
+    hint = f"Use a separate folder, for example runs/mine, or move {top}."
+    assert (code, error) == (2, f"egvs: --out {out}: a run would overwrite {top}, which no run wrote. {hint}\n")
+    assert tree(out) == {name: b"my work of years"}
+
+
+def test_run_does_not_overwrite_parquet_file_of_another_program(mini: Path, tmp_path: Path, run_egvs) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    pq.write_table(pa.table({"mine": [1]}), tmp_path / "scores.parquet")
+    code, _, error = run_egvs("run", mini, "--out", tmp_path)
+    assert (code, "overwrite scores.parquet, which no run wrote" in error) == (2, True)
+    assert pq.read_table(tmp_path / "scores.parquet").column_names == ["mine"]
+
+
+def test_run_does_not_overwrite_foreign_run_record(mini: Path, tmp_path: Path, run_egvs) -> None:
+    (tmp_path / "run.json").write_text('{"speed_km_h": 12}')
+    code, _, error = run_egvs("run", mini, "--out", tmp_path)
+    assert (code, "run.json: is not a run record" in error) == (2, True)
+    assert json.loads((tmp_path / "run.json").read_text()) == {"speed_km_h": 12}
+
+
+def test_run_goes_on_in_the_folder_of_a_killed_or_damaged_run(mini: Path, tmp_path: Path) -> None:
+    """Artefacts that no record names, and recorded ones that were damaged, are made again."""
+    scenario = egvs.load(mini)
+    egvs.run(scenario, tmp_path)
+    before = {name: data for name, data in tree(tmp_path).items() if name.endswith((".parquet", ".ply"))}
+    (tmp_path / "scores.parquet").write_text("damaged")
+    egvs.run(scenario, tmp_path)
+    (tmp_path / "run.json").unlink()
+    egvs.run(scenario, tmp_path)
+    assert {name: tree(tmp_path)[name] for name in before} == before
+
+
 def test_input_is_recognised_through_link(mini: Path, tmp_path: Path, run_egvs) -> None:
     a_mesh(mini)
     (tmp_path / "link").symlink_to(mini)

@@ -27,6 +27,7 @@ from egvs.stages.inputs import build_scene
 from egvs.world import ray_casting
 from egvs.world.mesh import read_ply
 from egvs.world.ray_casting import Caster
+from tests.conftest import feature
 from tests.effects.scan_helpers import CROWNS, ROI, _world, prism, run_scan, write_scene
 
 EFFECTS = ["effects.mount_sway.tilt_deg=0.5", "effects.divergence.sub_beams=7"]
@@ -104,6 +105,54 @@ def test_scanner_is_pickled_as_its_scene(mini: Path) -> None:
     again = pickle.loads(pickle.dumps(scanner))
     assert len(pickle.dumps(scanner)) < 100_000  # the scene alone, no tree
     assert same(scanner.scan(pose, sensor), again.scan(pose, sensor))
+
+
+ON_MAST = "on_top,10,7,5\nbeside,10.4,7,3\nelsewhere,30.5,-12,3\n"
+MAST = feature({"type": "Point", "coordinates": [10, 7]}, name="m1", kind="mast", height_m=5, radius_m=0.2)
+HOUSE = prism(14, 5, 18, 8, 0, 6, "building")
+
+
+@pytest.mark.parametrize("settings", [[], EFFECTS], ids=["plain", "weighted"])
+def test_scan_leaves_out_the_mast_of_its_own_sensor_only(mini: Path, settings: list[str]) -> None:
+    with_mast = egvs.build_scene(egvs.load(write_scene(mini, MAST, HOUSE, sites=ON_MAST), settings))
+    without = egvs.build_scene(egvs.load(write_scene(mini, HOUSE), settings))
+    scanner, reference = Scanner(with_mast), Scanner(without)
+    for name in ("on_top", "beside"):
+        assert same(scanner.scan_site(with_mast.site(name)), reference.scan_site(without.site(name)))
+    elsewhere = with_mast.site("elsewhere")
+    assert not same(scanner.scan_site(elsewhere), reference.scan_site(elsewhere))
+
+
+def test_sweep_leaves_out_the_mast_and_names_the_faces_of_the_complete_world(mini: Path) -> None:
+    scene = egvs.build_scene(egvs.load(write_scene(mini, MAST, HOUSE, sites=ON_MAST)))
+    rows = Scanner(scene, full_sweep=True).scan_site(scene.site("on_top")).rows
+    assert rows.face is not None
+    solids = scene.world.solid_of_face[rows.face[rows.returned]]
+    assert {scene.world.solids[solid][1] for solid in solids} == {"building", "ground"}
+
+
+def test_rejects_sensor_inside_any_other_solid(mini: Path) -> None:
+    wide = feature({"type": "Point", "coordinates": [10, 12]}, name="m1", kind="mast", height_m=5, radius_m=0.6)
+    kiosk = feature({"type": "Point", "coordinates": [10, 12]}, name="m1", kind="kiosk", height_m=5, radius_m=0.2)
+    for solid in (wide, kiosk):
+        scene = egvs.build_scene(egvs.load(write_scene(mini, solid, sites="inside,10,12,3\n")))
+        with pytest.raises(InputError, match=r"site inside: \(10, 12, 3\) is inside m1"):
+            Scanner(scene).scan_site(scene.site("inside"))
+
+
+def test_number_of_cached_worlds_is_limited(mini: Path) -> None:
+    masts, rows = [], ""
+    for i in range(7):
+        point = {"type": "Point", "coordinates": [2 + 5 * i, 12]}
+        masts.append(feature(point, name=f"m{i}", kind="mast", height_m=5, radius_m=0.2))
+        rows += f"s{i},{2 + 5 * i},12,5\n"
+    scene = egvs.build_scene(egvs.load(write_scene(mini, *masts, sites=rows)))
+    scanner = Scanner(scene)
+    first = scanner.scan_site(scene.sites[0])
+    for site in scene.sites:
+        scanner.scan_site(site)
+    assert len(scanner._casters_without) == 4
+    assert same(scanner.scan_site(scene.sites[0]), first)
 
 
 def test_error_of_one_site_does_not_affect_others(mini: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +110,40 @@ def test_reports_misspelt_column_once_for_all_rows(mini: Path, tmp_path: Path, r
     assert code == 2
     assert output.count("unknown column 'yaw'. Did you mean yaw_deg?") == 1
     assert "row a and 2 more: " in output
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [
+        *((name, "Use z_m, the sensor's z in the world frame in metres") for name in
+          ("height", "height_m", "Height (m)", "heights_m", "height_ft", "mounting-height", "altitude_m")),
+        *((name, "Use yaw_deg, counter-clockwise from east: 90 minus the degrees clockwise from north") for name in
+          ("heading", "heading_deg", "azimuth", "bearing", "Bearing [deg]", "orientation_deg")),
+        *((name, "Use pitch_deg, positive for nose up: minus the degrees by which the sensor is tilted") for name in
+          ("tilt", "tilt_deg", "downtilt_deg")),
+        *((name, "Use sensor, with a name from `egvs sensors`") for name in ("lidar", "sensor_model")),
+    ],
+)  # fmt: skip
+def test_rejects_column_that_other_programs_use_for_a_known_one(mini: Path, name: str, hint: str) -> None:
+    (mini / "sites.csv").write_text(f"site,x_m,y_m,{name}\na,10,12,4\nb,30.5,-12,4\n")
+    with pytest.raises(InputError, match=re.escape(hint)) as error:
+        sites_from(mini, file='"sites.csv"', heights_m="[3, 4.5, 6]")
+    assert f"row a and 1 more: the column {name!r} has no effect" in str(error.value)
+    assert str(error.value).count(hint) == 1
+
+
+def test_rejects_property_that_other_programs_use_for_yaw(mini: Path) -> None:
+    (mini / "sites.geojson").write_text(collection(point(0, 0, 6, name="a", heading_deg=10)))
+    with pytest.raises(InputError, match=r"feature 0: the column 'heading_deg' has no effect. Use yaw_deg"):
+        sites_from(mini, file='"sites.geojson"')
+
+
+@pytest.mark.parametrize("name", ["height", "lamp_height_m", "street_heading"])
+def test_accepts_custom_columns_of_similar_names_and_empty_ones(mini: Path, name: str) -> None:
+    value = "" if name == "height" else "4"
+    (mini / "sites.csv").write_text(f"site,x_m,y_m,z_m,{name}\na,10,12,3,{value}\n")
+    (site,) = sites_from(mini, file='"sites.csv"')
+    assert site.user_columns == {name: int(value) if value else None}
 
 
 @pytest.mark.parametrize(("name", "meant"), [("heigth_m", "height_m"), ("height", "height_m"), ("bse_m", "base_m")])
@@ -257,3 +292,21 @@ def test_rejects_geojson_that_is_not_utf8(mini: Path) -> None:
     (mini / "sites.geojson").write_bytes(b'{"features": "\xff"}')
     with pytest.raises(InputError, match="is not valid JSON"):
         sites.candidate_sites(egvs.load(mini, ['sites.file="sites.geojson"']))
+
+
+def test_stops_reading_a_table_with_too_many_rows(mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The malformed row after the limit is not read."""
+    monkeypatch.setenv("EGVS_MAX_SITES", "3")
+    rows = "".join(f"s{i},{i},12,3\n" for i in range(1, 5))
+    (mini / "sites.csv").write_text(f"site,x_m,y_m,z_m\n{rows}s5,5,12\n")
+    with pytest.raises(InputError, match=r"sites\.csv: there are more than 3 candidates .*EGVS_MAX_SITES"):
+        sites.candidate_sites(egvs.load(mini))
+
+
+def test_rejects_too_many_features_before_their_coordinates_are_read(
+    mini: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("EGVS_MAX_SITES", "3")
+    (mini / "sites.geojson").write_text(collection(*(point("east", i, 3, name=f"s{i}") for i in range(5))))
+    with pytest.raises(InputError, match=r"sites\.geojson: there are more than 3 candidates"):
+        sites_from(mini, file='"sites.geojson"')

@@ -198,6 +198,19 @@ PLACE = "site,x_m,y_m\np,0,0\n"
             r"sites\.aim: .*no effect on any site.*yaw_deg or aim from",
         ),
         ("site,x_m,y_m,z_m,pitch_deg\np,0,0,6,0\n", {"pitch_deg": "-10"}, r"sites\.pitch_deg: .*no effect on any site"),
+        (
+            "site,x_m,y_m,z_m,yaw_deg\np,0,0,6,0\n",
+            {"yaw_deg": "0"},
+            r"sites\.yaw_deg: .*no effect on any site: each row of sites\.csv has its own yaw_deg or aim",
+        ),
+        ("site,x_m,y_m,z_m,roll_deg\np,0,0,6,0\n", {"roll_deg": "0"}, r"sites\.roll_deg: .*no effect on any site"),
+        (
+            "site,x_m,y_m,z_m,sensor\np,0,0,6,VLP-16\n",
+            {"sensor": "OS1-128"},
+            r"sites\.sensor: .*no effect on any site: each row of sites\.csv has its own sensor\. "
+            r"Use sites\.replace_sensor=OS1-128 to replace them",
+        ),
+        ("site,x_m,y_m,z_m,sensor\np,0,0,6,VLP-16\n", {"sensor": "OS1-129"}, r"sites\.sensor: .*no effect on any site"),
         (ROW, {"pitch_deg": '"aim"'}, r"row p: pitch_deg: .*'aim', but there is no aim.*aim = \"roi\", or aim_m"),
         (
             "site,x_m,y_m,z_m,yaw_deg\np,0,0,6,30\n",
@@ -243,6 +256,45 @@ def test_rejects_invalid_aim(mini: Path, rows: str, keys: dict[str, str], messag
 def test_rejects_invalid_mount_keys(mini: Path, keys: dict[str, str], message: str) -> None:
     with pytest.raises(InputError, match=message):
         sites_from(mini, **keys)
+
+
+MIXED_SENSORS = "site,x_m,y_m,z_m,sensor\na,0,0,6,VLP-16\nb,9,0,6,\n"
+
+
+def test_accepts_sensor_that_the_rows_name_too(mini: Path) -> None:
+    rows = "site,x_m,y_m,z_m,sensor\na,0,0,6,VLP-16\n"
+    assert [site.sensor for site in sites_from(mini, rows, sensor="VLP-16")] == ["VLP-16"]
+
+
+def test_replace_sensor_applies_to_rows_that_name_another_sensor(mini: Path) -> None:
+    assert [site.sensor for site in sites_from(mini, MIXED_SENSORS)] == ["VLP-16", "small"]
+    assert [site.sensor for site in sites_from(mini, MIXED_SENSORS, sensor="AT128")] == ["VLP-16", "AT128"]
+    assert [site.sensor for site in sites_from(mini, MIXED_SENSORS, replace_sensor="AT128")] == ["AT128", "AT128"]
+
+
+def test_rejects_replace_sensor_beside_sensor_in_one_file(mini: Path) -> None:
+    path = mini / "scenario.toml"
+    path.write_text(path.read_text().replace('sensor = "small"', 'sensor = "small"\nreplace_sensor = "AT128"'))
+    with pytest.raises(InputError, match=r"sites\.sensor: the key has no effect .*: replace_sensor sets"):
+        sites_from(mini)
+    assert {site.sensor for site in sites_from(mini, sensor="VLP-16")} == {"VLP-16"}  # the override replaces both
+
+
+def test_scenario_without_replace_sensor_is_recorded_without_it(mini: Path) -> None:
+    """So that cache keys and the metadata of artefacts stay what they were."""
+    assert "replace_sensor" not in egvs.load(mini).model_dump(mode="json")["sites"]
+    replaced = egvs.load(mini, ["sites.replace_sensor=AT128"]).model_dump(mode="json")
+    assert replaced["sites"]["replace_sensor"] == "AT128"
+
+
+def test_recorded_scenario_may_have_sensor_and_roll_that_rows_override(mini: Path) -> None:
+    """``run.json`` has all keys, including defaults without effect."""
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m,roll_deg,sensor\na,0,0,6,1,VLP-16\n")
+    path = mini / "scenario.toml"
+    path.write_text(path.read_text().replace('sensor = "small"\n', ""))
+    scenario = egvs.load(mini)
+    recorded = json.loads(json.dumps(scenario.model_dump(mode="json")))
+    assert sites.candidate_sites(scenario_from_dict(recorded, mini, "run.json")) == sites.candidate_sites(scenario)
 
 
 @pytest.mark.parametrize(("other", "result"), [("aim_m = [1, 2]", "aim and aim_m"), ("yaw_deg = 0", "aim and yaw_deg")])

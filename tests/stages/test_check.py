@@ -110,6 +110,44 @@ def test_many_sites_in_lanes_share_one_warning(street: Path) -> None:
     assert lines[-1] == "[sites.csv: 4 more of 12 are in lanes or junctions: s09, s10, s11, s12]"
 
 
+def mast(at_m: tuple[float, float], name: str, kind: str = "mast") -> dict:
+    return feature({"type": "Point", "coordinates": at_m}, name=name, kind=kind, height_m=4, radius_m=0.1)
+
+
+def test_lists_masts_that_carry_sensors(street: Path) -> None:
+    statics(street, mast((10, 6), "m1"), mast((20.3, 6), "m2", "pole"), mast((30, 8), "m3"))
+    (street / "sites.csv").write_text("site,x_m,y_m\na,10,6\nb,20,6\nc,30,6\n")
+    assert found(street, "sites.heights_m=[3, 4, 5]") == {
+        "own supports": [
+            "[statics: 2 solids carry sensors and are left out of their scans: m1 (mast) at a, m2 (pole) at b]"
+        ]
+    }
+
+
+def test_candidate_of_a_rule_may_be_on_a_pole_but_not_in_a_house(street: Path) -> None:
+    statics(street, mast((6, 6), "m1"), box((10, 5), (12, 7)))
+    rule(street, "{ low_m=[6,6], high_m=[16,6], spacing_m=5, heights_m=[2.0] }")
+    told = found(street)
+    listed = "m1 (mast) at g01"
+    assert told["own supports"] == [f"[statics: a solid carries sensors and is left out of their scans: {listed}]"]
+    assert (
+        "1 of 3 candidates are dropped, because no pole can stand there (1 in a solid)" in told["dropped candidates"][0]
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("keep", ["true", "false"])
+def test_run_warns_of_site_whose_beams_mostly_end_near_it(mini: Path, keep: str) -> None:
+    cage = feature({"type": "Point", "coordinates": [10, 12]}, name="cage", kind="kiosk", height_m=2.99, radius_m=0.6)
+    statics(mini, cage)
+    record = egvs.run(egvs.load(mini, [f"scan.keep={keep}"]), mini / "out")
+    stage = "scan" if keep == "true" else "score"
+    (warning,) = [w for w in record.stages[stage].summary["warnings"] if w["rule"] == "blocked sites"]
+    assert warning["problem"].startswith("most beams of 1 of 2 sites end within 0.5 m of the sensor: pole_a (")
+    assert not [w for s, r in record.stages.items() if s != stage for w in r.summary.get("warnings", ())
+                if w["rule"] == "blocked sites"]  # fmt: skip
+
+
 def rule(folder: Path, grid: str) -> None:
     text = (folder / "scenario.toml").read_text()
     (folder / "scenario.toml").write_text(text.replace('file = "sites.csv"', f"grid = {grid}"))

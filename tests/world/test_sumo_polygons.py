@@ -337,7 +337,7 @@ def test_reads_trees_and_poles(tmp_path: Path) -> None:
     assert [(f.name, f.kind, f.base_m, f.height_m) for f in file.footprints] == [
         ("t", "tree_crown", 3.0, 10.0),
         ("t/trunk", "tree_trunk", 0.0, 3.0),
-        ("l", "highway", 0.0, 6.0),
+        ("l", "pole", 0.0, 6.0),
     ]
     assert file.footprints[0].polygon.centroid.coords[0] == pytest.approx((5, 6))
     assert file.ignored == {"points of type shop": 1, "points of type building": 1, "points of type natural": 1}

@@ -39,12 +39,15 @@ _TEMP_PREFIX, _MAX_ATTEMPTS = "egvs-work-", 10
 
 @contextmanager
 def attach_filename(path: Path) -> Iterator[None]:
-    """Name the file in the error of a full disk, which Python and Arrow leave out."""
+    """Name the file in the error of a full disk, which Python and Arrow leave out.
+
+    The error of a copy names two files, the source first; the disk of the other one is full.
+    """
     try:
         yield
     except OSError as error:
-        if error.errno in DISK_FULL_ERRNOS and error.filename is None:
-            error.filename = str(path)
+        if error.errno in DISK_FULL_ERRNOS and (error.filename is None or error.filename2 is not None):
+            error.filename, error.filename2 = str(path), None
         raise
 
 

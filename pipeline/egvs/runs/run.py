@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from egvs._version import __version__
+from egvs.artefacts.origin import foreign_files
 from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.artefacts.run_record import RunRecord, StageRecord
 from egvs.core import files
@@ -376,7 +377,8 @@ def check_no_overwrite(scenario: Scenario, folder: Path, folders: Collection[str
     Raises
     ------
     InputError
-        When a file that the scenario names would be overwritten, or a folder contains a symbolic link.
+        When a file that the scenario names, or one that no run wrote, would be overwritten, or a folder contains a
+        symbolic link.
     """
     if not folder.is_dir():
         return
@@ -395,6 +397,9 @@ def check_no_overwrite(scenario: Scenario, folder: Path, folders: Collection[str
         if _may_be_written(relative, folders):
             problem = f"a run would overwrite {relative.as_posix()}, which the scenario uses ({key})"
             raise InputError(f"--out {folder}", problem, "Use a separate folder, for example runs/mine.")
+    for name in foreign_files(folder):
+        problem = f"a run would overwrite {name}, which no run wrote"
+        raise InputError(f"--out {folder}", problem, f"Use a separate folder, for example runs/mine, or move {name}.")
 
 
 def _may_be_written(path: Path, folders: Collection[str]) -> bool:

@@ -22,7 +22,7 @@ from egvs.core import reading
 from egvs.core.errors import InputError, format_problem
 from egvs.core.grid import Grid
 from egvs.scenario.fields import NAME_DESCRIPTION
-from egvs.scenario.model import SCENARIO_FILE, SITE_DIRECTIONS, SITE_SOURCES, Scenario
+from egvs.scenario.model import SCENARIO_FILE, SITE_DIRECTIONS, SITE_SENSORS, SITE_SOURCES, Scenario
 from egvs.scenario.traffic_config import TRAFFIC_SOURCES, TrafficConfig, keys_without_effect
 
 _ALTERNATIVE = re.compile(r"\.(?:(?:constrained-)?(?:float|int|str)|(?:literal|tuple)\[.*\])$")
@@ -188,6 +188,7 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
 def _build_scenario(values: dict[str, Any], file: Path) -> Scenario:
     scenario = scenario_from_dict(values, file.parent, str(file))
     check_unused_keys(scenario.traffic, file)
+    scenario._written_site_keys = frozenset(scenario.sites.model_fields_set)
     return scenario
 
 
@@ -235,7 +236,12 @@ def _read_with_bases(file: Path, extending: tuple[Path, ...]) -> dict[str, Any]:
 
 _SITE_SOURCE_KEYS = ("points", "only_free", "heights_m")
 """Keys of ``[sites]`` that go with one source of sites; a new source does not take them over."""
-_ALTERNATIVES = (("traffic", TRAFFIC_SOURCES), ("sites", SITE_SOURCES), ("sites", SITE_DIRECTIONS))
+_ALTERNATIVES = (
+    ("traffic", TRAFFIC_SOURCES),
+    ("sites", SITE_SOURCES),
+    ("sites", SITE_DIRECTIONS),
+    ("sites", SITE_SENSORS),
+)
 
 
 def _drop_replaced_keys(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:

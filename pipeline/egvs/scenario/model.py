@@ -16,7 +16,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, PrivateAttr, field_validator, model_validator
+from pydantic import (
+    Field,
+    PrivateAttr,
+    SerializerFunctionWrapHandler,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from egvs.core.errors import InputError
 from egvs.core.grid import Grid, Roi
@@ -186,6 +193,9 @@ class SiteLine(StrictModel):
 SITE_DIRECTIONS = ("aim", "aim_m", "yaw_deg")
 """Keys that set the direction of sensors; at most one may be set."""
 
+SITE_SENSORS = ("sensor", "replace_sensor")
+"""Keys that set the sensor of sites; the second one leaves no site to the first."""
+
 SITE_SOURCES = ("file", "grid", "along")
 """Keys that set where candidate sites come from; exactly one must be set."""
 
@@ -203,6 +213,9 @@ class SitesConfig(StrictModel):
         None, description="Measured empty scan of the only site (PCD, PLY, LAS, LAZ, CSV; world frame)"
     )
     sensor: str = Field("VLP-32C", description="A sensor from `egvs sensors` or from [sensors]")
+    replace_sensor: str | None = Field(
+        None, description="A sensor for all sites, also for those whose row names another one"
+    )
     heights_m: tuple[Positive, ...] = Field(
         (), description="Heights z of locations in `file` that have no z_m; each is a candidate"
     )
@@ -221,6 +234,11 @@ class SitesConfig(StrictModel):
         "sites that are aimed, else 0",
     )
     roll_deg: float = Field(0.0, description="Roll about the sensor's x axis")
+
+    @model_serializer(mode="wrap")
+    def _serialize(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out replace_sensor where it is not set, so that it does not change cache keys."""
+        return {name: value for name, value in serialize(self).items() if name != "replace_sensor" or value is not None}
 
     @model_validator(mode="after")
     def _check_source(self) -> SitesConfig:
@@ -281,6 +299,7 @@ class Scenario(StrictModel):
     _folders: tuple[Path, ...] = PrivateAttr(default=(Path(),))
     _period: str = PrivateAttr(default="")
     _file_name: str = PrivateAttr(default=SCENARIO_FILE)
+    _written_site_keys: frozenset[str] = PrivateAttr(default=frozenset())
 
     @model_validator(mode="after")
     def _check_tables_together(self) -> Scenario:
@@ -342,6 +361,11 @@ class Scenario(StrictModel):
     def period(self) -> str:
         """The period of a scenario from :meth:`by_period`, else empty."""
         return self._period
+
+    @property
+    def written_site_keys(self) -> frozenset[str]:
+        """The keys of ``[sites]`` that the user wrote; none for a scenario from ``run.json``, which has all keys."""
+        return self._written_site_keys
 
     @property
     def folder(self) -> Path:

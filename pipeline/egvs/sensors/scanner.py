@@ -2,7 +2,8 @@
 
 Steps for a pose: reject it where no sensor can stand (in a solid, below the ground, out of range of the region of
 interest); compute the directions of the sensor's beams; expand them into weighted sub-beams, where effects do so; cast
-them; cut them at porous surfaces. A site with a measured scan uses that scan instead.
+them; cut them at porous surfaces. A site with a measured scan uses that scan instead. A scan leaves out the pole, mast
+or sign that carries its sensor (:mod:`egvs.world.supports`), and no other scan does.
 
 A measured scan holds returns only. Beams that met nothing are missing from it.
 """
@@ -33,9 +34,13 @@ from egvs.sensors.sites import Pose, ScannedSite, Site
 from egvs.world import geolocation
 from egvs.world.mesh import World
 from egvs.world.ray_casting import Caster, EmptyScan
+from egvs.world.supports import without_solids
 
 _BEAMS_PER_CHUNK = 4096
 """Beams that are expanded at once, which bounds the memory."""
+
+_CACHED_WORLDS = 4
+"""Worlds without the supports of a sensor that are cached: the heights at one pole follow one another."""
 
 _CACHED_MOUNTS = 32
 """Mounts whose beam directions are cached (1.4 MB each for 57,600 beams)."""
@@ -103,6 +108,7 @@ class Scanner:
         self._cuts = [effect.cutter(scene.world, roi) for effect in cutters]
         self._site_positions = frozenset(_sensor_positions(scene))
         self._casters: dict[bool, Caster] = {}
+        self._casters_without: dict[tuple[bool, tuple[int, ...]], Caster] = {}
         self._directions: dict[tuple[Sensor, Vec3], FloatArray] = {}
         self._lock = threading.Lock()
 
@@ -156,7 +162,7 @@ class Scanner:
     def _cast(self, pose: Pose, sensor: Sensor, where: str) -> Scan:
         site_feasibility.check_pose(self.scene, pose, sensor, where)
         is_site_position = (pose.position_m, sensor) in self._site_positions
-        caster = self._caster(is_site_position and not self.full_sweep)
+        caster = self._caster(is_site_position and not self.full_sweep, self.scene.own_supports(pose))
         cast = caster.sweep if self.full_sweep else caster.scan
         directions = self._beam_directions(sensor, pose)
         if self._expanders:
@@ -171,20 +177,30 @@ class Scanner:
             rows = cut(rows, pose)
         return Scan(pose, sensor, sensor.beams, rows)
 
-    def _caster(self, at_sites: bool) -> Caster:
+    def _caster(self, at_sites: bool, supports: tuple[int, ...]) -> Caster:
         """The caster for beams from the scene's sites, or from anywhere, made at its first use.
 
-        Both give the same hits. The first holds fewer triangles.
+        Both give the same hits. The first holds fewer triangles. It leaves out the ``supports`` of a sensor.
         """
         with self._lock:
-            if at_sites not in self._casters:
-                starts_m = None
-                range_m = float("inf")
-                if at_sites:
-                    starts_m = np.array([position_m for position_m, _ in self._site_positions])
-                    range_m = max(sensor.range_m for _, sensor in self._site_positions)
-                self._casters[at_sites] = Caster(self._opaque, self.scene.roi, starts_m, range_m)
-            return self._casters[at_sites]
+            if not supports:
+                if at_sites not in self._casters:
+                    self._casters[at_sites] = self._make_caster(at_sites, self._opaque)
+                return self._casters[at_sites]
+            key = at_sites, supports
+            if key not in self._casters_without:
+                while len(self._casters_without) >= _CACHED_WORLDS:
+                    del self._casters_without[next(iter(self._casters_without))]
+                self._casters_without[key] = self._make_caster(at_sites, without_solids(self._opaque, supports))
+            return self._casters_without[key]
+
+    def _make_caster(self, at_sites: bool, world: World) -> Caster:
+        starts_m = None
+        range_m = float("inf")
+        if at_sites:
+            starts_m = np.array([position_m for position_m, _ in self._site_positions])
+            range_m = max(sensor.range_m for _, sensor in self._site_positions)
+        return Caster(world, self.scene.roi, starts_m, range_m)
 
     def _cast_expanded(
         self, cast: Callable[..., EmptyScan], pose: Pose, sensor: Sensor, start: int, directions: FloatArray

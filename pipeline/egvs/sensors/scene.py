@@ -7,12 +7,14 @@ again. A scene can be sent to another process.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, Protocol, TypeVar
 
 from egvs.core.grid import Roi
 from egvs.scenario.model import Scenario
 from egvs.sensors.sensor import Sensor, scenario_sensor
-from egvs.sensors.sites import Site
+from egvs.sensors.sites import Pose, Site
+from egvs.world.supports import Supports
 
 if TYPE_CHECKING:
     from egvs.world.mesh import World
@@ -85,6 +87,15 @@ class Scene:
         if name not in self._sensors:
             self._sensors[name] = scenario_sensor(name, self.scenario, where)
         return self._sensors[name]
+
+    @cached_property
+    def supports(self) -> Supports:
+        """The solids that can carry a sensor."""
+        return Supports.of(self.world)
+
+    def own_supports(self, pose: Pose) -> tuple[int, ...]:
+        """Return the solids that carry a sensor at a pose, which its scan leaves out."""
+        return self.supports.at(pose.x_m, pose.y_m)
 
     def site(self, name: str) -> Site:
         """Return the site called ``name``; KeyError if no site has this name."""

@@ -6,6 +6,8 @@
 in a lane, in the middle of a junction, or in a solid. The height of the sensor does not matter, since the pole reaches
 the ground; sensors on gantries are listed in a sites file instead. Candidates between the lanes of a junction are
 dropped too, because networks do not tell an island from the middle of a crossing. World frame, metres.
+
+The sensor's own pole, mast or sign (:mod:`egvs.world.supports`) is in nobody's way.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from egvs.sensors.sites import Pose, Site
 from egvs.world.carriageway import Carriageway
 from egvs.world.mesh import World
 from egvs.world.ray_casting import touches_sensor
+from egvs.world.supports import Supports
 
 IN_A_LANE = "in a lane"
 IN_A_JUNCTION = "in a junction"
@@ -51,7 +54,7 @@ def check_pose(scene: Scene, pose: Pose, sensor: Sensor, where: str) -> None:
         if may_be_degrees:
             hint += " Longitude and latitude belong in columns lon_deg and lat_deg."
         raise InputError(where, problem, hint)
-    enclosing = _enclosing_solid(scene.world, pose, faces)
+    enclosing = _enclosing_solid(scene.world, pose, faces, scene.own_supports(pose))
     if enclosing is not None:
         name, kind = scene.world.solids[enclosing]
         problem = f"({pose.x_m:g}, {pose.y_m:g}, {pose.z_m:g}) is inside {name} ({kind})"
@@ -86,8 +89,8 @@ def _ground_height_m(world: World, pose: Pose, faces: IntArray) -> float:
     return 0.0
 
 
-def _enclosing_solid(world: World, pose: Pose, faces: IntArray) -> int | None:
-    """Return the first solid that contains a sensor; a solid whose surface the sensor touches does not count."""
+def _enclosing_solid(world: World, pose: Pose, faces: IntArray, supports: tuple[int, ...]) -> int | None:
+    """Return the first solid that contains a sensor; its supports, and a solid that it touches, do not count."""
     position = np.asarray(pose.position_m)
     triangles = world.triangles_m[faces]
     solids = world.solid_of_face[faces]
@@ -95,6 +98,7 @@ def _enclosing_solid(world: World, pose: Pose, faces: IntArray) -> int | None:
     occupancy.point_winding_numbers(position, triangles, solids.astype(np.int64), world.signs[solids], winding)
     if winding.any():
         winding[solids[touches_sensor(triangles - position)]] = 0
+    winding[list(supports)] = 0
     enclosing = np.flatnonzero((winding != 0) & world.closed)
     return int(enclosing[0]) if len(enclosing) else None
 
@@ -124,9 +128,11 @@ def drop_infeasible(sites: Sequence[Site], world: World, carriageway: Carriagewa
     """Select the candidates where a pole can stand; without a carriageway, only solids are checked."""
     free = []
     dropped = []
+    supports = Supports.of(world)
     for site, conflict in zip(sites, _road_conflicts(sites, carriageway), strict=True):
         reason = conflict
-        if reason is None and _enclosing_solid(world, site.pose, _faces_around(world, site.pose)) is not None:
+        own = supports.at(site.pose.x_m, site.pose.y_m)
+        if reason is None and _enclosing_solid(world, site.pose, _faces_around(world, site.pose), own) is not None:
             reason = IN_A_SOLID
         if reason is None:
             free.append(site)

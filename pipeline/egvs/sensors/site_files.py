@@ -5,7 +5,8 @@ one of the names of :data:`LONGITUDE` and :data:`LATITUDE`. Where a row has both
 GeoJSON file are in the system that its member ``crs`` declares.
 
 Further columns belong to the user (``fid``, ``owner``, ``note``) and are carried through to the scores. A column whose
-name is nearly one of the program's, which the file lacks, is rejected as misspelt.
+name is nearly one of the program's, which the file lacks, is rejected as misspelt. So is a column that other programs
+use for what this program reads from a column of another name (:data:`FOREIGN_COLUMNS`): ``height``, ``heading``.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from egvs.core import files
+from egvs.core import files, limits
 from egvs.core.errors import InputError, find_misspelling
 from egvs.core.grid import FloatArray
 from egvs.core.reading import read_json
@@ -37,6 +38,23 @@ KNOWN_COLUMNS = ("site", *NUMBER_COLUMNS, *TEXT_COLUMNS)
 
 LONGITUDE = ("lon", "lng", "longitude", "lon_deg", "longitude_deg")
 LATITUDE = ("lat", "latitude", "lat_deg", "latitude_deg")
+
+_Z_HINT = (
+    "Use z_m, the sensor's z in the world frame in metres: its height above the ground plus the ground's z, 0 if flat."
+)
+_YAW_HINT = "Use yaw_deg, counter-clockwise from east: 90 minus the degrees clockwise from north."
+_PITCH_HINT = "Use pitch_deg, positive for nose up: minus the degrees by which the sensor is tilted down."
+_SENSOR_HINT = "Use sensor, with a name from `egvs sensors` or from [sensors]."
+
+FOREIGN_COLUMNS = {
+    **dict.fromkeys(("height", "heights", "altitude", "sensor_height", "mount_height", "mounting_height"), _Z_HINT),
+    **dict.fromkeys(("heading", "bearing", "azimuth", "compass", "facing", "orientation"), _YAW_HINT),
+    **dict.fromkeys(("tilt", "tilt_angle", "downtilt", "inclination"), _PITCH_HINT),
+    **dict.fromkeys(("lidar", "sensor_name", "sensor_model", "sensor_type"), _SENSOR_HINT),
+}
+"""Columns of other programs, without their unit, and the column to use instead, with the conversion."""
+
+_COLUMN_UNIT = re.compile(r"[ _]*[ _(\[](m|cm|ft|metres?|meters?|feet|deg|degrees?|rad|°)[)\]]?$")
 
 _TOLERANCE_M = 0.1
 _MAX_M = 1e8  # larger values are not on Earth; they are rejected when the row is parsed
@@ -82,12 +100,23 @@ def read_csv(path: Path, world: Georeference) -> Iterator[SiteRow]:
                 if None in values or None in values.values():
                     raise InputError(where, "the row has more or fewer values than the header has columns")
                 located.append(SiteRow(where, dict(values)))
+                check_site_count(len(located), path, "each row is one", "Use fewer rows.")
     except (UnicodeDecodeError, csv.Error) as error:
         hint = "Save it as UTF-8 text with a header row."
         raise InputError(path, f"the file cannot be read as CSV ({error})", hint) from None
     rows = parse_numeric_columns(rows_in_world_frame(located, path, world), KNOWN_COLUMNS)
     for row, columns in zip(located, rows, strict=True):
         yield SiteRow(row.where, columns)
+
+
+_FEWER_CANDIDATES = "Use a wider spacing, or fewer heights and pitches."
+
+
+def check_site_count(count: float, where: object, reason: str, hint: str = _FEWER_CANDIDATES) -> None:
+    """Raise an InputError when a scenario has more candidates than :data:`egvs.core.limits.SITES`."""
+    if not count <= limits.SITES.maximum:
+        problem = f"there are more than {limits.SITES.maximum:,} candidates ({reason})"
+        raise InputError(where, problem, f"{hint} {limits.SITES.hint}")
 
 
 def _check_header(path: Path, names: list[str]) -> None:
@@ -107,6 +136,7 @@ def read_geojson(path: Path, world: Georeference) -> Iterator[SiteRow]:
     document = read_json(path, f"Use {expected}.")
     if not isinstance(document, dict) or not isinstance(document.get("features"), list):
         raise InputError(path, f"expected {expected}, got {reprlib.repr(document)[:120]}")
+    check_site_count(len(document["features"]), path, "each feature is one", "Use fewer features.")
     coordinates = geojson_coordinates(document["features"])
     reading = world.read_coordinates(coordinates, str(path), declared_crs(document, str(path)))
     for number, feature in enumerate(document["features"]):
@@ -253,8 +283,10 @@ def _number_or_nan(value: Any) -> float:
 def user_columns(where: str, row: Mapping[str, Any], known: Collection[str]) -> dict[str, ColumnValue]:
     """Return the columns of a row beyond the ``known`` ones; lists and tables as JSON text.
 
-    InputError when a column looks like a known one that the row lacks, or has an invalid name.
+    InputError when a column looks like a known one that the row lacks, has a name that other programs use for a known
+    one, or has an invalid name.
     """
+    _check_foreign_columns(where, row)
     misspelling = find_misspelling(row, known)
     if misspelling is not None:
         name, meant = misspelling
@@ -268,6 +300,14 @@ def user_columns(where: str, row: Mapping[str, Any], known: Collection[str]) -> 
             raise InputError(where, f"expected a column name of 1 to 80 characters, got {name[:80]!r}")
         columns[name] = _to_column_value(value)
     return columns
+
+
+def _check_foreign_columns(where: str, row: Mapping[str, Any]) -> None:
+    for name, value in row.items():
+        key = re.sub(r"[\s-]+", "_", _COLUMN_UNIT.sub("", name.strip().lower()))
+        if key in FOREIGN_COLUMNS and value not in (None, ""):
+            hint = f"{FOREIGN_COLUMNS[key]} A custom column needs another name."
+            raise InputError(where, f"the column {name!r} has no effect", hint)
 
 
 def parse_numeric_columns(rows: Iterable[dict[str, Any]], known: Collection[str]) -> list[dict[str, Any]]:

@@ -31,11 +31,10 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from scipy.special import cosdg, sindg
 
-from egvs.core import limits
 from egvs.core.errors import Diagnostic, DiagnosticsError, InputError
 from egvs.core.grid import Vec3
 from egvs.scenario.fields import MAX_COORDINATE_M
-from egvs.scenario.model import Scenario, SiteGrid, SiteLine, SitesConfig
+from egvs.scenario.model import Scenario, SiteGrid, SiteLine
 from egvs.sensors import site_files
 from egvs.sensors.sensor import Sensor, scenario_sensor
 from egvs.sensors.site_files import SiteRow
@@ -165,12 +164,12 @@ def candidate_sites(scenario: Scenario) -> tuple[Site, ...]:
                 sites[site.name] = site
         except InputError as error:
             errors.append(error)
-        _check_site_count(len(sites), path, "each combination of location, height and pitch is one")
+        site_files.check_site_count(len(sites), path, "each combination of location, height and pitch is one")
     if errors:
         raise DiagnosticsError(_group_errors(errors))
     if not sites:
         raise InputError(path, "expected at least one site, got none")
-    _check_unused_keys(scenario.sites, builder.used_keys, scenario.file, path)
+    _check_unused_keys(scenario, builder.used_keys, path)
     _check_keep_visibility(scenario, sites)
     return _with_measured_scan(tuple(sites.values()), scenario)
 
@@ -187,12 +186,6 @@ def _site_rows(scenario: Scenario, path: Path) -> Iterator[SiteRow]:
     return _line_rows(config.along)
 
 
-def _check_site_count(count: float, where: object, reason: str) -> None:
-    if not count <= limits.SITES.maximum:
-        problem = f"there are more than {limits.SITES.maximum:,} candidates ({reason})"
-        raise InputError(where, problem, f"Use a wider spacing, or fewer heights and pitches. {limits.SITES.hint}")
-
-
 def _group_errors(errors: list[InputError]) -> Iterator[Diagnostic]:
     """Report each problem once; a misspelt column, for example, is an error in every row."""
     rows: dict[tuple[str, str], dict[str, None]] = {}
@@ -203,18 +196,33 @@ def _group_errors(errors: list[InputError]) -> Iterator[Diagnostic]:
         yield Diagnostic.of("sites", InputError(where, problem, hint))
 
 
-def _check_unused_keys(config: SitesConfig, used_keys: set[str], scenario_file: Path, path: Path) -> None:
-    """InputError for a key of ``[sites]`` that every row overrides."""
-    for key in ("aim", "aim_m", "heights_m", "pitch_deg"):
-        if getattr(config, key) in (None, ()) or key in used_keys:
+_OVERRIDING_COLUMNS = {
+    "sensor": "sensor",
+    "heights_m": "z_m",
+    "aim": "yaw_deg or aim",
+    "aim_m": "yaw_deg or aim",
+    "yaw_deg": "yaw_deg or aim",
+    "pitch_deg": "pitch_deg",
+    "roll_deg": "roll_deg",
+}
+"""Keys of ``[sites]`` that are defaults for rows, and the columns that override them."""
+
+
+def _check_unused_keys(scenario: Scenario, used_keys: set[str], path: Path) -> None:
+    """InputError for a key of ``[sites]`` that the user wrote and that every row overrides."""
+    config = scenario.sites
+    for key, column in _OVERRIDING_COLUMNS.items():
+        is_set = key in scenario.written_site_keys and getattr(config, key) not in (None, ())
+        if not is_set or key in used_keys:
             continue
-        column = "pitch_deg"
-        if key == "heights_m":
-            column = "z_m"
-        elif key.startswith("aim"):
-            column = "yaw_deg or aim"
+        problem = f"the key has no effect on any site: each row of {path.name} has its own {column}"
         hint = f"Remove it, or remove {column} from the rows of {path.name}."
-        raise InputError(f"{scenario_file}: sites.{key}", "the key has no effect on any site", hint)
+        if key == "sensor" and config.replace_sensor is not None:
+            problem = "the key has no effect on any site: replace_sensor sets the sensor of all"
+            hint = "Remove one of them."
+        elif key == "sensor":
+            hint = f"Use sites.replace_sensor={config.sensor} to replace them, or remove the key."
+        raise InputError(f"{scenario.file}: sites.{key}", problem, hint)
 
 
 def _check_keep_visibility(scenario: Scenario, sites: Mapping[str, Site]) -> None:
@@ -276,7 +284,7 @@ class AimingAngles(NamedTuple):
 class _SiteBuilder:
     """Makes the candidates of one row after another.
 
-    ``used_keys`` collects the keys of ``[sites]`` that had an effect.
+    ``used_keys`` collects the keys of ``[sites]`` that had an effect, or that a row repeats.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -291,9 +299,11 @@ class _SiteBuilder:
         user_columns = site_files.user_columns(row.where, columns, site_files.KNOWN_COLUMNS)
         _check_columns(row, self.scenario)
         name = str(columns["site"]).strip()
-        sensor_name = str(columns.get("sensor") or self.scenario.sites.sensor).strip()
+        sensor_name = self._sensor_name(columns)
         points = str(columns["points"]).strip() if columns.get("points") else None
         request = _mount_request(row, self.scenario)
+        if columns.get("roll_deg") in (None, ""):
+            self.used_keys.add("roll_deg")
         pole = self._poles.setdefault((request.x_m, request.y_m), name)
         mounts = self._mounts(row.where, request, sensor_name)
         if points is not None and len(mounts) > 1:
@@ -306,6 +316,18 @@ class _SiteBuilder:
                 raise InputError(f"{row.where}: site", problem)
             pose = Pose(request.x_m, request.y_m, mount.z_m, mount.yaw_deg, mount.pitch_deg, request.roll_deg)
             yield Site(site_name, pose, sensor_name, points, pole, user_columns)
+
+    def _sensor_name(self, columns: Mapping[str, Any]) -> str:
+        config = self.scenario.sites
+        if config.replace_sensor is not None:
+            return config.replace_sensor
+        if columns.get("sensor"):
+            name = str(columns["sensor"]).strip()
+            if name == config.sensor:  # the row says the same
+                self.used_keys.add("sensor")
+            return name
+        self.used_keys.add("sensor")
+        return config.sensor
 
     def _mounts(self, where: str, request: MountRequest, sensor_name: str) -> list[Mount]:
         """Every combination of height and pitch of a row; InputError for an aim that no mount meets."""
@@ -369,6 +391,7 @@ class _SiteBuilder:
             raise InputError(f"{where}: pitch_deg", f"pitch_deg is 'aim', but {reason}", 'Set aim = "roi", or aim_m.')
         if request.yaw_deg is not None:
             return request.yaw_deg, float(pitch)
+        self.used_keys.add("yaw_deg")
         return self.scenario.sites.yaw_deg or 0.0, float(pitch)
 
     def _sensor(self, name: str, where: str) -> Sensor:
@@ -518,11 +541,11 @@ def _grid_rows(rule: SiteGrid) -> Iterator[SiteRow]:
     axes = []
     for low, high in zip(rule.low_m, rule.high_m, strict=True):
         steps = (high - low) / rule.spacing_m + 1e-9
-        _check_site_count(steps, "sites.grid", reason)
+        site_files.check_site_count(steps, "sites.grid", reason)
         count = math.floor(steps) + 1
         axes.append([low + i * rule.spacing_m for i in range(count)])
     xs, ys = axes
-    _check_site_count(len(xs) * len(ys), "sites.grid", reason)
+    site_files.check_site_count(len(xs) * len(ys), "sites.grid", reason)
     points = [_RulePoint(x, y, rule.heights_m) for y in ys for x in xs]
     yield from _numbered_rows("g", points, "sites.grid")
 
@@ -533,9 +556,9 @@ def _line_rows(rules: tuple[SiteLine, ...]) -> Iterator[SiteRow]:
         reason = f"spacing_m = {rule.spacing_m:g}"
         line = np.asarray(rule.line_m)
         distance_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
-        _check_site_count(float(distance_m[-1]) / rule.spacing_m, "sites.along", reason)
+        site_files.check_site_count(float(distance_m[-1]) / rule.spacing_m, "sites.along", reason)
         count = math.floor(distance_m[-1] / rule.spacing_m + 1e-9) + 1
-        _check_site_count(len(points) + count, "sites.along", reason)
+        site_files.check_site_count(len(points) + count, "sites.along", reason)
         at_m = np.arange(count) * rule.spacing_m
         xs = np.interp(at_m, distance_m, line[:, 0])
         ys = np.interp(at_m, distance_m, line[:, 1])

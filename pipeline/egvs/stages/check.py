@@ -36,6 +36,7 @@ RULES: tuple[Callable[[CheckInputs], Iterator[Diagnostic]], ...] = (
     scene_checks.check_effects,
     scene_checks.check_poses,
     scene_checks.warn_sites_on_lanes,
+    scene_checks.warn_own_supports,
     scene_checks.warn_dropped_sites,
     scene_checks.warn_solids_over_lanes,
     scene_checks.warn_solids_far_away,

@@ -17,12 +17,13 @@ import pyarrow as pa
 
 from egvs.artefacts import parquet
 from egvs.artefacts.run_folder import RunFolder
-from egvs.core.errors import InputError
+from egvs.core.errors import WARNINGS_KEY, InputError
 from egvs.core.threads import map_ordered
 from egvs.formats import point_clouds
 from egvs.sensors.scanner import Scan, Scanner
 from egvs.sensors.sites import ScannedSite
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
+from egvs.stages.blocked_sites import near_share, warn_blocked_sites
 from egvs.stages.scene_inputs import scan_dependencies
 
 
@@ -50,7 +51,7 @@ def run(context: StageContext, inputs: StageDependencies, points: tuple[str, ...
     -------
     dict
         ``sites``, ``kept``, ``beams`` (cast), ``returns``, ``settled_in_float64`` (beams for which float32 was not
-        exact enough), ``clouds`` (files with points).
+        exact enough), ``clouds`` (files with points); warnings.
     """
     scene = context.scene
     names = [site.name for site in scene.sites]
@@ -92,6 +93,7 @@ def _write_scans(
     """Scan the sites on the threads of the context; write one row group for each."""
     sites = context.scene.sites
     scanned: list[ScannedSite] = []
+    near_shares: dict[str, float] = {}
     clouds = []
     ambiguous = 0
     with parquet.artefact_writer(context.folder.scans, "scans", scanner.columns) as file:
@@ -99,12 +101,13 @@ def _write_scans(
         for site, scan in zip(sites, scans, strict=True):
             file.write(_scan_columns(site.name, scan))
             scanned.append(scan.as_site(site.name, site.pole))
+            near_shares[site.name] = near_share(scan.rows.ends_m, scan.rows.weight)
             ambiguous += scan.rows.ambiguous
             if site.name in points:
                 clouds.append(_write_cloud(context.folder, site.name, scan, cloud))
             context.progress("sites", len(scanned), len(sites))
         file.describe(context.metadata(inputs, seeded=False, sites=[site.to_json() for site in scanned]))
-    return {
+    summary: Summary = {
         "sites": len(scanned),
         "kept": True,
         "beams": sum(site.beams_in_roi for site in scanned),
@@ -112,6 +115,10 @@ def _write_scans(
         "settled_in_float64": ambiguous,
         "clouds": clouds,
     }
+    warnings = [warning.to_json() for warning in warn_blocked_sites(near_shares)]
+    if warnings:
+        summary[WARNINGS_KEY] = warnings
+    return summary
 
 
 def _scan_columns(site: str, scan: Scan) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from egvs.sensors.sensor import Sensor, scenario_sensor
 from egvs.sensors.sites import Site
 from egvs.stages.inputs import CheckInputs, ErrorCollector
 from egvs.traffic import sumo_folder
-from egvs.world import clearances, geolocation
+from egvs.world import clearances, geolocation, supports
 from egvs.world.carriageway import Carriageway
 from egvs.world.mesh import World
 
@@ -217,6 +217,26 @@ def _sites_on_road(sites: tuple[Site, ...], carriageway: Carriageway) -> Iterato
         if site.pose.z_m - carriageway.height_m(nearest, at_m[number]) > clearances.CLEARANCE_M:
             continue
         yield site, "within a junction" if lane is None else f"in lane {carriageway.names[lane]}"
+
+
+def warn_own_supports(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """List the poles, masts and signs that carry a sensor, which its scan leaves out."""
+    if inputs.scene is None:
+        return
+    carried: dict[int, dict[str, None]] = {}
+    for site in inputs.scene.cast_sites:
+        for solid in inputs.scene.own_supports(site.pose):
+            carried.setdefault(solid, {})[site.pole] = None
+    if not carried:
+        return
+    listed = []
+    for solid, poles in carried.items():
+        name, kind = inputs.scene.world.solids[solid]
+        listed.append(f"{name} ({kind}) at {' and '.join(poles)}")
+    count = f"{len(carried)} solids carry sensors and are" if len(carried) > 1 else "a solid carries sensors and is"
+    problem = f"{count} left out of their scans: {', '.join(listed)}"
+    hint = f"Move sensors that they do not carry more than {supports.MAX_DISTANCE_M:g} m away."
+    yield Diagnostic("own supports", "statics", problem, hint)
 
 
 def warn_dropped_sites(inputs: CheckInputs) -> Iterator[Diagnostic]:

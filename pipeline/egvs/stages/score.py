@@ -28,6 +28,7 @@ from egvs.scoring.score_table import ScoreTable
 from egvs.sensors.sites import Site
 from egvs.stages import site_scoring
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
+from egvs.stages.blocked_sites import warn_blocked_sites
 from egvs.stages.scene_inputs import scan_dependencies, sensor_digests, sensor_settings
 from egvs.stages.site_scoring import BeamAudit, ScoredSite, SiteScoring, needs_targets
 from egvs.world import clearances, geolocation
@@ -220,6 +221,8 @@ def _summary(
     if audit:
         summary["audit"] = asdict(BeamAudit.worst([site.audit for site in sites if site.audit is not None]))
     warnings = list(_warnings(context, scoring, scores))
+    if not context.scenario.scan.keep:  # the scan stage has not seen these beams
+        warnings += warn_blocked_sites({site.site.name: site.near_share for site in sites})
     if warnings:
         summary[WARNINGS_KEY] = [warning.to_json() for warning in warnings]
     return summary

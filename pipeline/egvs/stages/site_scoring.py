@@ -47,6 +47,7 @@ from egvs.scoring.targets import (
 from egvs.scoring.visibility import Beams, to_voxel_units
 from egvs.sensors.sites import ScannedSite
 from egvs.stages.base import StageContext
+from egvs.stages.blocked_sites import near_share
 from egvs.stages.site_scans import SiteScan, empty_scans
 
 _ROI_HINT = "Check that the region of interest contains the road."
@@ -235,13 +236,17 @@ class BeamAudit:
 
 @dataclass(frozen=True)
 class ScoredSite:
-    """A site and its scores; if requested, an audit of its beams, and its hits in the voxels that it sees."""
+    """A site and its scores; if requested, an audit of its beams, and its hits in the voxels that it sees.
+
+    ``near_share`` is the share of beams that end near the sensor.
+    """
 
     site: ScannedSite
     score: SiteScore
     targets: SiteTargetScores | None
     audit: BeamAudit | None
     visible: dict[str, NDArray[Any]] | None
+    near_share: float = 0.0
 
 
 class SiteScoring:
@@ -283,10 +288,11 @@ class SiteScoring:
         targets = None
         if self.targets is not None:
             targets = self.targets.scores(self.targets.visible(scan.beams))
+        near = near_share(scan.beams.ends_m, scan.beams.weight)
         if self._keep_visibility != "all" and scan.site.name not in self._keep_visibility:
-            return ScoredSite(scan.site, self.scorer.score(scan.beams), targets, audit, None)
+            return ScoredSite(scan.site, self.scorer.score(scan.beams), targets, audit, None, near)
         score, hits = self.scorer.score_and_hits(scan.beams)
-        return ScoredSite(scan.site, score, targets, audit, _sparse_hits(hits))
+        return ScoredSite(scan.site, score, targets, audit, _sparse_hits(hits), near)
 
     def score_table(self, sites: Iterable[ScoredSite]) -> ScoreTable:
         """Return the scores of sites as one table."""

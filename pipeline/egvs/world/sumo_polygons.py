@@ -29,7 +29,7 @@ from egvs.formats.georeference import WGS84, CoordinateReading, Georeference
 from egvs.traffic.network import read_location
 from egvs.world.footprints import CROSSING_RINGS, Footprint, FootprintFile, to_polygons
 from egvs.world.geolocation import network_world_frame
-from egvs.world.map_features import TRUNK_RADIUS_M, SolidType, SolidTypes, is_underground, vertical_extent
+from egvs.world.map_features import POLE_TYPES, TRUNK_RADIUS_M, SolidType, SolidTypes, is_underground, vertical_extent
 
 _INNER = "inner"
 # polyconvert's colour of courtyards, which have another type with --osm.keep-full-type
@@ -222,6 +222,8 @@ class _PolygonReader:
             kind = "tree_crown"
         elif solid.thickness_m:
             kind = "roof"
+        elif shape.kind in POLE_TYPES:
+            kind = "pole"
         is_white = shape.element.get("color") in _WHITE
         footprints = self._white if is_white else self._file.footprints
         for area in areas:
