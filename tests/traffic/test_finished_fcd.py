@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Collection
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 
 import egvs
 from egvs.artefacts import parquet
+from egvs.cli import stage_summary
 from egvs.core.errors import InputError, MissingBackendError
 from egvs.runs import stage_keys
 from egvs.scenario.traffic_config import TrafficConfig
@@ -18,6 +20,7 @@ from egvs.stages import traffic
 from egvs.stages.inputs import open_folder
 from egvs.studies.study_settings import counted_frames
 from egvs.traffic import finished_fcd
+from egvs.traffic.vehicle_boxes import VehicleSize
 from tests.conftest import fcd
 from tests.stage_runner import inputs_of
 from tests.stages.conftest import net_xml
@@ -338,3 +341,41 @@ def write_xml(mini: Path, skip: Collection[int] = (), empty: Collection[int] = (
             content = "" if number in empty else "".join(vehicles)
             texts.append(f'<timestep time="{time}">{content}</timestep>')
     (mini / "fcd.xml").write_text(f"<fcd-export>{''.join(texts)}</fcd-export>")
+
+
+# --- sizes and their sources ---------------------------------------------------------------------------------------
+def test_prints_sizes_and_where_they_come_from(mini: Path, tmp_path: Path, run_egvs) -> None:
+    set_types(mini, "car", "lorry", "bus", "DEFAULT_VEHTYPE")
+    text = (mini / "scenario.toml").read_text()
+    kind = text[text.index("[[traffic.kinds]]") : text.index("[statics]")]
+    (mini / "scenario.toml").write_text(text.replace(kind, ""))
+    (overrides,) = vtypes(mini, f"<additional>{LORRY}</additional>")
+    code, _, output = run_egvs("traffic", mini, "--out", tmp_path / "out", "--set", overrides)
+    assert code == 0, output
+    text = " ".join(output.split())
+    expected = (
+        "sizes: DEFAULT_VEHTYPE 5 x 1.8 x 1.5 m (from SUMO's default type), bus 10.9 x 2.5 x 3.1 m (from a default kind),"
+        " car 4.5 x 1.75 x 1.5 m (from a default kind), lorry 7.1 x 2.4 x 2.4 m (from traffic.vtypes)"
+    )
+    assert expected in text, text
+
+
+def test_size_of_a_kind_of_the_scenario_is_named_as_such(mini: Path, tmp_path: Path, run_egvs) -> None:
+    code, _, output = run_egvs("traffic", mini, "--out", tmp_path / "out")
+    assert code == 0, output
+    assert "sizes: car 4.5 x 1.8 x 1.5 m (from traffic.kinds)" in " ".join(output.split())
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    size = {"length_m": 4.5, "width_m": 1.8, "height_m": 1.5, "vclass": "passenger", "source": "traffic.kinds"}
+    assert record["stages"]["traffic"]["summary"]["sizes"] == {"car": size}
+
+
+def test_size_in_the_metadata_of_the_file_is_named_as_such(mini: Path) -> None:
+    declared = {"car": VehicleSize(5.0, 2.0, 1.5, "passenger"), "bus": VehicleSize(11.0, 2.5, 3.2, "bus")}
+    sized = finished_fcd.sizes_of_types(egvs.load(mini), declared, declared)
+    assert {name: sized[name].source for name in declared} == {"car": "traffic.kinds", "bus": "the FCD file"}
+
+
+def test_many_sizes_are_shortened() -> None:
+    size = {"length_m": 4.0, "width_m": 2.0, "height_m": 1.5, "vclass": "passenger", "source": "traffic.vtypes"}
+    text = stage_summary.describe_sizes({f"t{number}": size for number in range(10)})
+    assert text.endswith("t5 4 x 2 x 1.5 m (from traffic.vtypes), 4 more in run.json")

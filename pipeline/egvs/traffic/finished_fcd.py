@@ -133,9 +133,26 @@ def known_sizes(scenario: Scenario) -> dict[str, VehicleSize]:
     return sizes_of_kinds(traffic.kinds)
 
 
+@dataclass(frozen=True)
+class SizedType:
+    """The size of a vehicle type, and where it comes from."""
+
+    size: VehicleSize
+    source: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON."""
+        return {**vars(self.size), "source": self.source}
+
+
+_DEFAULT_KIND, _FILE, _SUMO_DEFAULT = "a default kind", "the FCD file", "SUMO's default type"
+_VTYPES, _KINDS = "traffic.vtypes", "traffic.kinds"
+"""Sources of sizes."""
+
+
 def sizes_of_types(
     scenario: Scenario, types: Collection[str], declared: Mapping[str, VehicleSize]
-) -> dict[str, VehicleSize]:
+) -> dict[str, SizedType]:
     """Find the sizes of the vehicles of a finished file.
 
     Parameters
@@ -158,16 +175,27 @@ def sizes_of_types(
         When a type has no known size, or a file of vTypes is invalid.
     """
     vtypes = check_types(scenario, types, declared)
+    sized: dict[str, SizedType] = {}
+
+    def add(sizes: Mapping[str, VehicleSize], source: str) -> None:
+        sized.update({name: SizedType(size, source) for name, size in sizes.items()})
+
+    add(sizes_of_kinds(scenario.traffic.kinds), _DEFAULT_KIND)
+    add(declared, _FILE)
     named = sizes_of_kinds(scenario.traffic.named_kinds)
-    sizes = sizes_of_kinds(scenario.traffic.kinds) | dict(declared) | named
-    if vtypes or any(name not in sizes for name in types):
+    add(named, _KINDS)
+    if vtypes or any(name not in sized for name in types):
         try:
-            sizes |= _query_type_sizes(vtypes) | named
+            queried = _query_type_sizes(vtypes)
         except sumo.SumoInputError as error:
             where = ", ".join(map(str, size_files(scenario))) or sumo_folder.traffic_location(scenario)
             hint = "Use types that SUMO can read."
             raise InputError(where, f"SUMO rejects the vehicle types: {error}", hint) from None
-    return sizes
+        add(queried, _SUMO_DEFAULT)
+        vtype_names = {vtype.attrib["id"] for vtype in vtypes}
+        add({name: size for name, size in queried.items() if name in vtype_names}, _VTYPES)
+        add(named, _KINDS)
+    return sized
 
 
 def check_types(scenario: Scenario, types: Collection[str], declared: Mapping[str, VehicleSize]) -> list[Element]:
