@@ -354,7 +354,8 @@ def test_prints_sizes_and_where_they_come_from(mini: Path, tmp_path: Path, run_e
     assert code == 0, output
     text = " ".join(output.split())
     expected = (
-        "sizes: DEFAULT_VEHTYPE 5 x 1.8 x 1.5 m (from SUMO's default type), bus 10.9 x 2.5 x 3.1 m (from a default kind),"
+        "sizes: DEFAULT_VEHTYPE 5 x 1.8 x 1.5 m (from SUMO's default type),"
+        " bus 10.9 x 2.5 x 3.1 m (from a default kind),"
         " car 4.5 x 1.75 x 1.5 m (from a default kind), lorry 7.1 x 2.4 x 2.4 m (from traffic.vtypes)"
     )
     assert expected in text, text

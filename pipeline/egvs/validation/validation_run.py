@@ -24,7 +24,7 @@ from egvs.runs.run import lock_run_folder
 from egvs.scenario.model import Scenario
 from egvs.stages.inputs import open_folder
 from egvs.validation import held_out_traffic
-from egvs.validation.held_out_traffic import HeldOutTraffic
+from egvs.validation.held_out_traffic import FrameSampling, HeldOutTraffic, TrafficSample
 from egvs.validation.results import main_measure
 
 _WORK_PREFIX = ".validate-"
@@ -44,17 +44,20 @@ class ValidationRun:
         Its frames.
     warnings
         Warnings of the check and about the traffic.
+    sample
+        The size of the traffic.
     """
 
     folder: Path
     record: HeldOutTraffic
     frames: list[TrafficFrame]
     warnings: tuple[Diagnostic, ...]
+    sample: TrafficSample
 
 
 @contextmanager
 def validation_run(
-    scenario: Scenario, out: Path, frames: int, *, jobs: int | None, progress: ProgressCallback
+    scenario: Scenario, out: Path, sampling: FrameSampling, *, jobs: int | None, progress: ProgressCallback
 ) -> Iterator[ValidationRun]:
     """Lock the folder of a run, check its scenario, and prepare held-out traffic.
 
@@ -62,8 +65,8 @@ def validation_run(
     ----------
     out
         The run's folder.
-    frames
-        Number of frames of held-out traffic.
+    sampling
+        Frames of held-out traffic.
 
     Raises
     ------
@@ -73,11 +76,11 @@ def validation_run(
     with lock_run_folder(out), _temporary_work_folder(out) as folder:
         warnings = [*_check_scenario(scenario, folder / "check", progress), *_same_traffic_warnings(scenario)]
         record = held_out_traffic.prepare_held_out_traffic(
-            scenario, folder / "unseen", frames, jobs=jobs, progress=progress
+            scenario, folder / "unseen", sampling.frames, apart_s=sampling.spacing_s, jobs=jobs, progress=progress
         )
         traffic_frames = list(record.read())
         _check_any_vehicle(scenario, record, traffic_frames)
-        yield ValidationRun(folder, record, traffic_frames, tuple(warnings))
+        yield ValidationRun(folder, record, traffic_frames, tuple(warnings), record.sample(traffic_frames))
 
 
 @contextmanager
@@ -123,7 +126,11 @@ def _check_any_vehicle(scenario: Scenario, record: HeldOutTraffic, frames: Seque
 
 
 def validation_metadata(
-    scenario: Scenario, record: HeldOutTraffic, detectors: Sequence[str], warnings: Sequence[Diagnostic]
+    scenario: Scenario,
+    record: HeldOutTraffic,
+    sample: TrafficSample,
+    detectors: Sequence[str],
+    warnings: Sequence[Diagnostic],
 ) -> dict[str, Any]:
     """Return the metadata that all artefacts of a validation contain."""
     warnings_json = {WARNINGS_KEY: [warning.to_json() for warning in warnings]}
@@ -132,8 +139,9 @@ def validation_metadata(
         "scenario": {"name": scenario.name, "hash": files.hash_json(scenario.model_dump(mode="json"))},
         "seed": scenario.seed,
         "unseen_seed": record.scenario.seed,
-        "frames": record.frames,
-        "apart_s": held_out_traffic.FRAME_SPACING_S,
+        "frames": sample.frames,
+        "apart_s": sample.apart_s,
+        "vehicles": sample.vehicles,
         "shown": {detector: main_measure(detector) for detector in detectors},
         **with_relative_paths(scenario.folder, warnings_json),
     }
