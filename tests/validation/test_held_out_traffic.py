@@ -6,7 +6,7 @@ import pytest
 from egvs import load
 from egvs.artefacts import parquet
 from egvs.core.errors import InputError
-from egvs.validation import held_out_traffic
+from egvs.validation import held_out_traffic, validation_run
 
 
 def test_held_out_traffic_has_other_seed_and_frame_spacing():
@@ -58,11 +58,7 @@ def test_frames_are_as_far_apart_as_a_finished_file_allows(mini, frames, spacing
 def test_frames_of_a_user_demand_stay_in_the_time_of_the_recording(mini):
     (mini / "net.net.xml").write_text("<net/>")
     (mini / "r.rou.xml").write_text("<routes/>")
-    text = (mini / "scenario.toml").read_text()
-    text = text.replace('fcd = "fcd.csv"', 'network = "net.net.xml"\nroutes = ["r.rou.xml"]')
-    kind = text[text.index("[[traffic.kinds]]") : text.index("[statics]")]
-    (mini / "scenario.toml").write_text(text.replace(kind, ""))
-    scenario = load(mini)
+    scenario = load(simulated(mini, 'routes = ["r.rou.xml"]'))
     assert held_out_traffic.default_spacing_s(scenario, 5) == 4.5
     assert held_out_traffic.default_spacing_s(scenario, 2) == 7.0
 
@@ -88,3 +84,36 @@ def test_same_id_in_two_periods_is_two_vehicles(mini, tmp_path):
     single = held_out_traffic.prepare_held_out_traffic(load(mini), tmp_path / "one", 10)
     vehicles = single.vehicles_in_region(single.read())
     assert vehicles and len(record.vehicles_in_region(record.read())) == 2 * len(vehicles)
+
+
+# --- vehicles that the held-out traffic and that of the TPOG have in common ------------------------------------------
+def test_warns_of_the_share_of_vehicles_that_both_have(run_egvs, mini, tmp_path):
+    options = ("--frames", "10", "--detector", "points", "--jobs", "1", "--out", tmp_path / "out")
+    code, printed, error = run_egvs("validate", mini, *options)
+    assert code == 0, error
+    assert "frames that the TPOG was computed from: 2 of 2 vehicles (100%) are in both" in " ".join(printed.split())
+
+
+def test_departures_that_cannot_be_redrawn_are_a_warning(mini):
+    (mini / "net.net.xml").write_text("<net/>")
+    (mini / "r.rou.xml").write_text("<routes><vehicle id='a' depart='1'/><vehicle id='b' depart='triggered'/></routes>")
+    scenario = load(simulated(mini, 'routes = ["r.rou.xml"]'))
+    (warning,) = validation_run._fixed_departure_warnings(scenario)
+    assert "1 of 2 vehicles and flows (50%) have departures that cannot be redrawn" in warning.problem
+    assert held_out_traffic.held_out_scenario(scenario, 10, 2.0).traffic.redraw_departures
+
+
+def test_random_trips_need_no_redrawn_departures(mini):
+    (mini / "net.net.xml").write_text("<net/>")
+    scenario = load(simulated(mini))
+    assert not list(validation_run._fixed_departure_warnings(scenario))
+    assert not held_out_traffic.held_out_scenario(scenario, 10, 2.0).traffic.redraw_departures
+
+
+def simulated(mini, keys=""):
+    """Replace the finished file by a network, and the fleet of the scenario by the default."""
+    text = (mini / "scenario.toml").read_text()
+    text = text.replace('fcd = "fcd.csv"', f'network = "net.net.xml"\n{keys}')
+    kind = text[text.index("[[traffic.kinds]]") : text.index("[statics]")]
+    (mini / "scenario.toml").write_text(text.replace(kind, ""))
+    return mini

@@ -1,8 +1,8 @@
 """Held-out traffic: recorded traffic that the TPOG was not computed from.
 
-It is the scenario's own demand under another seed, in frames that lie further apart than those of the TPOG. All sites
-are evaluated with the same frames. A finished traffic file has no seed: its frames are also those of the TPOG, and
-validation warns about that.
+It is the scenario's own demand under another seed, in frames that lie further apart than those of the TPOG. Departures
+of a user's demand are redrawn. All sites are evaluated with the same frames. A finished traffic file has no seed: its
+frames are also those of the TPOG, and validation warns about that.
 
 The static world and the record are stages of a run and come from its store, so what another command has computed is
 not computed again.
@@ -180,7 +180,7 @@ def default_spacing_s(scenario: Scenario, frames: int) -> float:
     user's demand have an end: where their frames do not allow as much, it is shorter, but at least ``MIN_SPACING_S``.
     """
     traffic = scenario.traffic
-    if not traffic.periods and traffic.fcd is None and traffic.sumocfg is None and not traffic.routes:
+    if not traffic.periods and traffic.fcd is None and not traffic.has_user_demand:
         return DEFAULT_SPACING_S
     recorded = sum(finished_fcd.recorded_frames(period) for period in scenario.by_period().values())
     widest = (recorded - 1) // max(frames - 1, 1)
@@ -209,6 +209,8 @@ def held_out_scenario(scenario: Scenario, frames: int, apart_s: float) -> Scenar
     state = np.random.SeedSequence((scenario.seed, _SEED_STREAM)).generate_state(1, np.uint64)
     seed = int(state[0]) >> 33  # SUMO takes seeds of 31 bits
     values = {key: getattr(traffic, key) for key in traffic.model_fields_set}
+    if any(period.traffic.has_user_demand for period in scenario.by_period().values()):
+        values["redraw_departures"] = True
     if not traffic.periods:
         stride = math.ceil(apart_s / traffic.frame_period_s - 1e-9)
         values |= {"frames": frames, "frame_period_s": stride * traffic.frame_period_s}

@@ -23,6 +23,7 @@ from egvs.runs import stage_keys, stage_registry
 from egvs.runs.run import lock_run_folder
 from egvs.scenario.model import Scenario
 from egvs.stages.inputs import open_folder
+from egvs.traffic import departures, sumo_folder, user_files
 from egvs.validation import held_out_traffic
 from egvs.validation.held_out_traffic import FrameSampling, HeldOutTraffic, TrafficSample
 from egvs.validation.results import main_measure
@@ -74,12 +75,13 @@ def validation_run(
         If the check finds an error, the traffic has too few frames, or no vehicle enters the region of interest.
     """
     with lock_run_folder(out), _temporary_work_folder(out) as folder:
-        warnings = [*_check_scenario(scenario, folder / "check", progress), *_same_traffic_warnings(scenario)]
+        warnings = _check_scenario(scenario, folder / "check", progress)
         record = held_out_traffic.prepare_held_out_traffic(
             scenario, folder / "unseen", sampling.frames, apart_s=sampling.spacing_s, jobs=jobs, progress=progress
         )
         traffic_frames = list(record.read())
         _check_any_vehicle(scenario, record, traffic_frames)
+        warnings += [*_same_traffic_warnings(scenario, record, traffic_frames), *_fixed_departure_warnings(scenario)]
         yield ValidationRun(folder, record, traffic_frames, tuple(warnings), record.sample(traffic_frames))
 
 
@@ -100,18 +102,40 @@ def _check_scenario(scenario: Scenario, folder: Path, progress: ProgressCallback
     return collect_warnings([result.summary])
 
 
-def _same_traffic_warnings(scenario: Scenario) -> list[Diagnostic]:
-    """Return a warning if the held-out frames are those of the TPOG."""
-    if not scenario.is_recorded:
-        return []
-    return [
-        Diagnostic(
+def _same_traffic_warnings(
+    scenario: Scenario, record: HeldOutTraffic, frames: Sequence[TrafficFrame]
+) -> Iterator[Diagnostic]:
+    """Warn if vehicles of the held-out frames are also in the traffic of the TPOG: those of a finished file."""
+    periods = list(scenario.by_period().values())
+    vehicles = record.vehicles_in_region(frames)
+    n_shared = sum(periods[period].traffic.fcd is not None for period, _ in vehicles)
+    if n_shared:
+        yield Diagnostic(
             "traffic not held out",
             f"{scenario.file}: traffic.fcd",
-            "the traffic is a finished file, so sites are evaluated with the frames that the TPOG was computed from",
+            "the traffic is a finished file, so sites are evaluated with the frames that the TPOG was computed from: "
+            f"{n_shared:,} of {len(vehicles):,} vehicles ({n_shared / len(vehicles):.0%}) are in both",
             "Use a network or a sumocfg to simulate held-out traffic.",
         )
-    ]
+
+
+def _fixed_departure_warnings(scenario: Scenario) -> Iterator[Diagnostic]:
+    """Warn about vehicles of a user's demand that depart at the same time with any seed."""
+    for period in scenario.by_period().values():
+        if not period.traffic.has_user_demand:
+            continue
+        demand = sumo_folder.demand_files(period).files
+        paths = [path for option in user_files.DEMAND_OPTIONS for path in demand.get(option, ())]
+        counts = departures.count_departures(paths)
+        total = counts.redrawn + counts.fixed
+        if counts.fixed:
+            yield Diagnostic(
+                "departures not redrawn",
+                sumo_folder.traffic_location(period),
+                f"{counts.fixed:,} of {total:,} vehicles and flows ({counts.fixed / total:.0%}) have departures that"
+                " cannot be redrawn, so the held-out traffic and that of the TPOG have them in common",
+                "Use departure times in seconds, or flows.",
+            )
 
 
 def _check_any_vehicle(scenario: Scenario, record: HeldOutTraffic, frames: Sequence[TrafficFrame]) -> None:
