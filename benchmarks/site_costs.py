@@ -7,6 +7,7 @@ first two. Traffic is simulated once for all sites, and is listed separately. Ti
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import statistics
 import tempfile
@@ -33,7 +34,7 @@ from egvs.stages.inputs import open_folder
 from egvs.validation import detection_metrics
 from egvs.validation.detector_runs import SiteDetectionTask
 from egvs.validation.detectors import base
-from egvs.validation.held_out_traffic import HeldOutTraffic, prepare_held_out_traffic
+from egvs.validation.held_out_traffic import MIN_SPACING_S, HeldOutTraffic, prepare_held_out_traffic
 from egvs.validation.sweeps import POINT_COUNTS_NAME
 from egvs.world.mesh import read_ply
 
@@ -118,7 +119,7 @@ def _score_costs(folder: Path) -> tuple[dict[str, float], int]:
 def _detection_costs(folder: Path) -> tuple[dict[str, float], float]:
     """Return milliseconds per site of measuring AP, by detector, and the seconds to simulate traffic."""
     with measure_usage() as cost:  # SUMO's too
-        held_out = prepare_held_out_traffic(egvs.load(SCENARIO), folder, REPLAYED_FRAMES)
+        held_out = prepare_held_out_traffic(egvs.load(SCENARIO), folder, REPLAYED_FRAMES, apart_s=MIN_SPACING_S)
     frames, sites = list(held_out.read()), held_out.scene.sites[:AP_SITES]
     return {
         f"AP by {name}": 1e3 * _ap_s(held_out, frames, sites, name) for name in target_scores.DETECTORS
@@ -133,9 +134,7 @@ def _ap_s(held_out: HeldOutTraffic, frames: Sequence[TrafficFrame], sites: Seque
         result = {site.name: task.at(site, [POINT_COUNTS_NAME, name])}
         detection_metrics.measure_detection(frames, held_out.scene.roi, result)
 
-    short = HeldOutTraffic(
-        held_out.scenario, held_out.scene, held_out.trajectories, held_out.numbers[:5], held_out.keys
-    )
+    short = dataclasses.replace(held_out, numbers=held_out.numbers[:5])
     SiteDetectionTask(short, task.detectors).at(
         sites[0], [POINT_COUNTS_NAME, name]
     )  # compiles, and loads what it needs

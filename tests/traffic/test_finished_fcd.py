@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import json
 import re
+from collections.abc import Collection
 from pathlib import Path
 
+import pyarrow as pa
 import pytest
 
 import egvs
 from egvs.artefacts import parquet
+from egvs.cli import stage_summary
 from egvs.core.errors import InputError, MissingBackendError
 from egvs.runs import stage_keys
 from egvs.scenario.traffic_config import TrafficConfig
 from egvs.stages import traffic
 from egvs.stages.inputs import open_folder
 from egvs.studies.study_settings import counted_frames
+from egvs.traffic import finished_fcd
+from egvs.traffic.vehicle_boxes import VehicleSize
 from tests.conftest import fcd
 from tests.stage_runner import inputs_of
 from tests.stages.conftest import net_xml
@@ -262,3 +268,115 @@ def test_rejects_roads_in_the_folder_for_sumo(mini: Path, run_egvs) -> None:
     code, _, output = run_egvs("run", mini, "--out", mini, "--set", "traffic.roads='sumo/mine.net.xml'")
     assert code == 2 and "overwrite sumo/mine.net.xml, which the scenario uses (traffic.roads)" in output, output
     assert (mini / "sumo" / "mine.net.xml").is_file()
+
+
+# --- missing time steps --------------------------------------------------------------------------------------------
+def test_rejects_xml_with_missing_time_steps(mini: Path, run_egvs) -> None:
+    write_xml(mini, skip=range(10, 14))
+    code, printed, output = run_egvs("check", mini, "--set", "traffic.fcd='fcd.xml'")
+    assert code == 2
+    problem = "fcd.xml: time 7.00: expected equal time steps, got 0.5 s and 2.5 s: steps are missing"
+    assert problem in " ".join(printed.split()), printed + output
+
+
+def test_rejects_xml_whose_first_step_is_missing(mini: Path, run_egvs) -> None:
+    write_xml(mini, skip=[1])
+    code, printed, output = run_egvs("check", mini, "--set", "traffic.fcd='fcd.xml'")
+    assert code == 2 and "time 1.50: expected equal time steps" in " ".join(printed.split()), printed + output
+
+
+def test_xml_with_steps_without_vehicles_is_accepted(mini: Path, run_egvs) -> None:
+    write_xml(mini, empty=range(10, 14))
+    code, printed, output = run_egvs("check", mini, "--set", "traffic.fcd='fcd.xml'")
+    assert code == 0, printed + output
+
+
+def test_xml_with_times_rounded_to_milliseconds_is_accepted(tmp_path: Path) -> None:
+    steps = "".join(
+        f'<timestep time="{round(k / 30, 3)}"><vehicle id="a" x="{k}" y="0" angle="90" type="car"/></timestep>'
+        for k in range(60)
+    )
+    path = tmp_path / "camera.xml"
+    path.write_text(f"<fcd-export>{steps}</fcd-export>")
+    assert finished_fcd.survey_fcd(path).time_steps == 60
+
+
+def test_warns_of_vehicles_that_disappear_and_return(mini: Path, run_egvs) -> None:
+    head, *rows = (mini / "fcd.csv").read_text().splitlines()
+    rest = [row for row in rows if not 5.0 <= float(row.split(";")[0]) < 7.0]
+    (mini / "fcd.csv").write_text("\n".join([head, *rest]) + "\n")
+    code, printed, output = run_egvs("check", mini)
+    text = " ".join((printed + output).split())
+    assert code == 0, text
+    assert re.search(r"fcd = 'fcd.csv': vehicles disappear and return (once|\d+ times), e.g. '\w+'", text), text
+    assert "between 4.5 s and 7 s" in text
+
+
+def test_vehicle_that_returns_in_a_later_part_of_a_long_file_is_found() -> None:
+    presence = finished_fcd._VehiclePresence()
+    for times_ms in ([0, 500, 1000], [1500, 4000, 4500]):
+        presence.add(pa.table({"id": ["a"] * 3, "time_ms": pa.array(times_ms, pa.int64())}))
+        presence.add(pa.table({"id": pa.array([], pa.string()), "time_ms": pa.array([], pa.int64())}))
+    assert presence.find_returns() == (1, "'a' between 1.5 s and 4 s")
+
+
+def test_file_with_complete_trips_gets_no_warning(mini: Path, run_egvs) -> None:
+    code, printed, output = run_egvs("check", mini)
+    assert code == 0 and "disappear" not in printed + output
+
+
+def write_xml(mini: Path, skip: Collection[int] = (), empty: Collection[int] = ()) -> None:
+    """Write the finished file as XML, without some time steps, or without the vehicles of some."""
+    head, *lines = (mini / "fcd.csv").read_text().splitlines()
+    names = [name.partition("_")[2] for name in head.split(";")]
+    steps: dict[str, list[str]] = {}
+    for line in lines:
+        row = dict(zip(names, line.split(";"), strict=True))
+        time = f"{float(row.pop('time')):.2f}"
+        vehicle = " ".join(f'{key}="{value}"' for key, value in row.items())
+        steps.setdefault(time, []).append(f"<vehicle {vehicle}/>")
+    texts = []
+    for number, (time, vehicles) in enumerate(steps.items()):
+        if number not in skip:
+            content = "" if number in empty else "".join(vehicles)
+            texts.append(f'<timestep time="{time}">{content}</timestep>')
+    (mini / "fcd.xml").write_text(f"<fcd-export>{''.join(texts)}</fcd-export>")
+
+
+# --- sizes and their sources ---------------------------------------------------------------------------------------
+def test_prints_sizes_and_where_they_come_from(mini: Path, tmp_path: Path, run_egvs) -> None:
+    set_types(mini, "car", "lorry", "bus", "DEFAULT_VEHTYPE")
+    text = (mini / "scenario.toml").read_text()
+    kind = text[text.index("[[traffic.kinds]]") : text.index("[statics]")]
+    (mini / "scenario.toml").write_text(text.replace(kind, ""))
+    (overrides,) = vtypes(mini, f"<additional>{LORRY}</additional>")
+    code, _, output = run_egvs("traffic", mini, "--out", tmp_path / "out", "--set", overrides)
+    assert code == 0, output
+    text = " ".join(output.split())
+    expected = (
+        "sizes: DEFAULT_VEHTYPE 5 x 1.8 x 1.5 m (from SUMO's default type),"
+        " bus 10.9 x 2.5 x 3.1 m (from a default kind),"
+        " car 4.5 x 1.75 x 1.5 m (from a default kind), lorry 7.1 x 2.4 x 2.4 m (from traffic.vtypes)"
+    )
+    assert expected in text, text
+
+
+def test_size_of_a_kind_of_the_scenario_is_named_as_such(mini: Path, tmp_path: Path, run_egvs) -> None:
+    code, _, output = run_egvs("traffic", mini, "--out", tmp_path / "out")
+    assert code == 0, output
+    assert "sizes: car 4.5 x 1.8 x 1.5 m (from traffic.kinds)" in " ".join(output.split())
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    size = {"length_m": 4.5, "width_m": 1.8, "height_m": 1.5, "vclass": "passenger", "source": "traffic.kinds"}
+    assert record["stages"]["traffic"]["summary"]["sizes"] == {"car": size}
+
+
+def test_size_in_the_metadata_of_the_file_is_named_as_such(mini: Path) -> None:
+    declared = {"car": VehicleSize(5.0, 2.0, 1.5, "passenger"), "bus": VehicleSize(11.0, 2.5, 3.2, "bus")}
+    sized = finished_fcd.sizes_of_types(egvs.load(mini), declared, declared)
+    assert {name: sized[name].source for name in declared} == {"car": "traffic.kinds", "bus": "the FCD file"}
+
+
+def test_many_sizes_are_shortened() -> None:
+    size = {"length_m": 4.0, "width_m": 2.0, "height_m": 1.5, "vclass": "passenger", "source": "traffic.vtypes"}
+    text = stage_summary.describe_sizes({f"t{number}": size for number in range(10)})
+    assert text.endswith("t5 4 x 2 x 1.5 m (from traffic.vtypes), 4 more in run.json")

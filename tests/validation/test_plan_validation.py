@@ -36,7 +36,8 @@ def test_validates_plan_of_run(run_egvs, planned, tmp_path, monkeypatch):
     code, output, error = run_egvs("validate", mini, "--plan", "--out", out, *OPTIONS)
     assert code == 0, error
     assert f"{FRAMES} frames from 2 groups, points, cluster, 1 process: about" in error
-    assert "18 vehicles in 10 frames of held-out traffic" in output and "fused clouds of the plan by egvs in " in output
+    assert output.startswith("2 different vehicles in held-out traffic: 18 vehicles in 10 frames, at least 2 s apart;")
+    assert "fused clouds of the plan by egvs in " in output
     table, metadata = parquet.read_artefact(out / "fused.parquet", "fused")
     order = [row["site"] for row in parquet.read_artefact(out / "placement.parquet", "placement")[0].to_pylist()]
     rows = [row for row in table.to_pylist() if row["objects_of"] == ALL_OBJECTS]

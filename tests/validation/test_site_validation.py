@@ -15,6 +15,7 @@ from egvs.sensors.sites import Pose, Site
 from egvs.validation.correlation import CorrelationStudy, JunctionScores, MeasureValues
 from egvs.validation.detection_metrics import ALL_OBJECTS, BLOCKS, MEASURES, JackknifeEstimate, SiteDetection
 from egvs.validation.detectors import base
+from egvs.validation.held_out_traffic import FrameSampling
 from egvs.validation.kitti_results import KittiFiles
 from egvs.validation.results import CORRELATED_BOX_MEASURES, CORRELATED_POINT_MEASURES, ScoreName
 from egvs.validation.site_validation import correlate_scores, validate_sites
@@ -44,7 +45,7 @@ def validated(tmp_path_factory):
     (mini / "sites.csv").write_text("\n".join(["site,x_m,y_m,z_m", *lines]) + "\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(base, "make_detector", lambda name: {"middle": MiddleDetector()}[name])
-        done = validate_sites(load(mini), folder / "out", frames=10, detectors=["middle"], jobs=1)
+        done = validate_sites(load(mini), folder / "out", sampling=FrameSampling(10), detectors=["middle"], jobs=1)
     return mini, folder / "out", done
 
 
@@ -88,7 +89,7 @@ def test_warns_if_traffic_is_not_held_out(validated):
 def test_bytes_are_reproducible(validated, middle, tmp_path):
     mini, out, _ = validated
     elsewhere = shutil.copytree(mini, tmp_path / "moved" / mini.name)  # the store of this test is empty
-    validate_sites(load(elsewhere), tmp_path / "again", frames=10, detectors=["middle"], jobs=1)
+    validate_sites(load(elsewhere), tmp_path / "again", sampling=FrameSampling(10), detectors=["middle"], jobs=1)
     for name in ARTEFACTS:
         assert (tmp_path / "again" / name).read_bytes() == (out / name).read_bytes(), name
 
@@ -97,19 +98,26 @@ def test_bytes_are_reproducible(validated, middle, tmp_path):
 def test_written_kitti_files_can_be_read_as_results(mini, middle, tmp_path):
     scenario = load(mini)
     first = validate_sites(
-        scenario, tmp_path / "a", frames=10, detectors=["middle"], kitti=KittiFiles(keep=True), jobs=1
+        scenario, tmp_path / "a", sampling=FrameSampling(10), detectors=["middle"], kitti=KittiFiles(keep=True), jobs=1
     )
     kitti_folder = tmp_path / "a" / "validation_kitti"
     with pytest.raises(InputError, match="--detections: the folder has results of 'middle', which also runs here"):
         validate_sites(
-            scenario, tmp_path / "b", frames=10, detectors=["middle"], kitti=KittiFiles(kitti_folder), jobs=1
+            scenario,
+            tmp_path / "b",
+            sampling=FrameSampling(10),
+            detectors=["middle"],
+            kitti=KittiFiles(kitti_folder),
+            jobs=1,
         )
     for site in ("pole_a", "pole_b"):
         frames = sorted(path.name for path in (kitti_folder / site / "middle").iterdir())
         assert frames == sorted(path.name for path in (kitti_folder / site / "label_2").iterdir())
         assert len(frames) == 10
         (kitti_folder / site / "middle").rename(kitti_folder / site / "theirs")
-    again = validate_sites(scenario, tmp_path / "b", frames=10, kitti=KittiFiles(kitti_folder, keep=True), jobs=1)
+    again = validate_sites(
+        scenario, tmp_path / "b", sampling=FrameSampling(10), kitti=KittiFiles(kitti_folder, keep=True), jobs=1
+    )
     measures_by_row = {
         (row.site, row.detector, row.objects_of): row.measures for row in [*first.detections, *again.detections]
     }
@@ -122,7 +130,7 @@ def test_written_kitti_files_can_be_read_as_results(mini, middle, tmp_path):
     assert len(labels) == objects and all(line.startswith("Car ") for line in labels)
     (kitti_folder / "pole_b" / "theirs" / "000000.txt").unlink()
     with pytest.raises(InputError, match=r"pole_b/theirs/000000\.txt: no such file"):
-        validate_sites(scenario, tmp_path / "b", frames=10, kitti=KittiFiles(kitti_folder), jobs=1)
+        validate_sites(scenario, tmp_path / "b", sampling=FrameSampling(10), kitti=KittiFiles(kitti_folder), jobs=1)
 
 
 @pytest.mark.slow
@@ -135,7 +143,7 @@ def test_written_kitti_files_can_be_read_as_results(mini, middle, tmp_path):
 )
 def test_egvs_score_has_parameters_of_scenario(mini, tmp_path, sets, parameters):
     scenario = load(mini, sets)
-    done = validate_sites(scenario, tmp_path / "out", frames=10, jobs=1)
+    done = validate_sites(scenario, tmp_path / "out", sampling=FrameSampling(10), jobs=1)
     egvs_row = done.egvs_score(scenario)
     assert egvs_row.score == "egvs" and json.loads(egvs_row.parameters) == parameters
     assert set(done.values_of(egvs_row)) == {"pole_a", "pole_b"} and min(done.values_of(egvs_row).values()) > 0

@@ -105,4 +105,4 @@ def test_rejects_too_many_frames(mini, frames, problem):
         InputError,
         match=rf"^--frames: {frames} frames at least 2 s apart are too many: expected at most .*, got {problem}",
     ):
-        held_out_traffic.held_out_scenario(scenario, frames)
+        held_out_traffic.held_out_scenario(scenario, frames, 2.0)

@@ -18,6 +18,9 @@ _OMITTED_KEYS = frozenset(
 )
 """Entries of a summary that are printed elsewhere, or that only ``run.json`` holds."""
 
+_MAX_SIZES = 6
+"""Vehicle types whose sizes are printed."""
+
 _STAGE_NAMES = {"tpog": "occupancy"}
 """Stages whose name differs from their command."""
 
@@ -92,6 +95,8 @@ def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterato
     if counts := rest.pop("counts", None):
         worst = max(count["geh"] for count in counts)
         yield f"largest GEH against the counts {worst:.1f}"
+    if sizes := rest.pop("sizes", None):
+        yield describe_sizes(sizes)
     if sumo := rest.pop("sumo", None):
         yield f"SUMO {sumo}"
 
@@ -157,6 +162,17 @@ def describe_vehicles(vehicles: dict[str, int]) -> str:
     if fewest != most:
         range_text = f"{fewest:,} to {most:,}"
     return f"{range_text} vehicles at a time, {vehicles['different']:,} in all"
+
+
+def describe_sizes(sizes: dict[str, dict[str, Any]]) -> str:
+    """Return length, width and height of the vehicle types of a finished file, and where each size comes from."""
+    texts = []
+    for name, size in list(sizes.items())[:_MAX_SIZES]:
+        metres = " x ".join(f"{size[key]:g}" for key in ("length_m", "width_m", "height_m"))
+        texts.append(f"{name} {metres} m (from {size['source']})")
+    if len(sizes) > _MAX_SIZES:
+        texts.append(f"{len(sizes) - _MAX_SIZES} more in run.json")
+    return "sizes: " + ", ".join(texts)
 
 
 def _describe_counts(counts: dict[str, int]) -> str:

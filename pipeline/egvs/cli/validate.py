@@ -11,10 +11,17 @@ from egvs.cli import options
 from egvs.cli.options import Jobs, Out, ScenarioPath, Set
 from egvs.core.errors import InputError, MissingBackendError
 
-DEFAULT_FRAMES = 1000
-"""Frames of a validation: with as many, AP (BEV + 3D, on a scale from 0 to 200) had a standard error of 2.4 to 6.5."""
+DEFAULT_FRAMES = 250
+"""Frames of a validation or a dataset."""
 
-_FRAMES_HELP = "Number of frames of held-out traffic, at least 2 s apart."
+_FRAMES_HELP = "Number of frames of held-out traffic."
+
+Spacing = Annotated[
+    float | None,
+    typer.Option(
+        metavar="SECONDS", help="Minimum time between two frames. [default: 7, or what the traffic allows, at least 2]"
+    ),
+]
 
 
 def validate(
@@ -22,6 +29,7 @@ def validate(
     out: Out = None,
     set_: Set = None,
     frames: Annotated[int, typer.Option(min=10, help=_FRAMES_HELP)] = DEFAULT_FRAMES,
+    spacing: Spacing = None,
     detector: Annotated[
         str, typer.Option(metavar="NAME,NAME", help="Detectors to run: points, cluster, pointpillars, or a plug-in.")
     ] = "points,cluster",
@@ -50,15 +58,17 @@ def validate(
     from egvs.runs.run import default_folder
     from egvs.scenario.loading import load
     from egvs.validation import plan_validation, site_validation
+    from egvs.validation.held_out_traffic import FrameSampling
     from egvs.validation.kitti_results import KittiFiles
 
     loaded = load(scenario, set_ or ())
     folder = out or default_folder(loaded)
+    sampling = FrameSampling(frames, spacing)
     detectors = [name.strip() for name in detector.split(",") if name.strip()]
     if not plan and plan_from is None:
         with ProgressDisplay("validate") as screen:
             validation = site_validation.validate_sites(
-                loaded, folder, frames=frames, detectors=detectors, kitti=KittiFiles(detections, keep), jobs=jobs,
+                loaded, folder, sampling=sampling, detectors=detectors, kitti=KittiFiles(detections, keep), jobs=jobs,
                 progress=screen.progress, listener=validation_tables.DetectorRunDisplay(screen.say),
             )  # fmt: skip
         validation_tables.print_validation(loaded, folder, validation)
@@ -69,7 +79,7 @@ def validate(
         raise InputError(option, "not available with a plan", f"Omit {option}, or omit --plan and --plan-from.")
     with ProgressDisplay("validate") as screen:
         plan_result = plan_validation.validate_plan(
-            loaded, folder, plan_from or folder, frames=frames, detectors=detectors, jobs=jobs,
+            loaded, folder, plan_from or folder, sampling=sampling, detectors=detectors, jobs=jobs,
             progress=screen.progress, listener=validation_tables.PlanRunDisplay(screen.say),
         )  # fmt: skip
     validation_tables.print_plan_validation(plan_result)
@@ -82,6 +92,7 @@ def clouds(
         list[str] | None, typer.Option(metavar="SITE", help="Only this site (repeatable); all by default.")
     ] = None,
     frames: Annotated[int, typer.Option(min=1, help=_FRAMES_HELP)] = DEFAULT_FRAMES,
+    spacing: Spacing = None,
     kind: Annotated[str, typer.Option("--format", metavar="FORMAT", help="kitti, openpcdet, ply or pcd.")] = "kitti",
     set_: Set = None,
     jobs: Jobs = None,
@@ -95,7 +106,14 @@ def clouds(
     loaded = load(scenario, set_ or ())
     with ProgressDisplay("clouds") as screen:
         dataset = write_dataset(
-            loaded, out, sites=site or (), frames=frames, kind=kind, jobs=jobs, progress=screen.progress
+            loaded,
+            out,
+            sites=site or (),
+            frames=frames,
+            spacing_s=spacing,
+            kind=kind,
+            jobs=jobs,
+            progress=screen.progress,
         )
     validation_tables.print_export(dataset)
 

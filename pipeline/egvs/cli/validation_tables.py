@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from egvs.scenario.model import Scenario
     from egvs.validation.correlation import Correlation
     from egvs.validation.dataset import WrittenDataset
-    from egvs.validation.detection_metrics import JackknifeEstimate
+    from egvs.validation.detection_metrics import JackknifeEstimate, SiteDetection
+    from egvs.validation.held_out_traffic import TrafficSample
     from egvs.validation.plan_validation import PlanValidation
     from egvs.validation.results import ScoreName, Validation
     from egvs.validation.surrogates import ParameterValue, ScoreEntry
@@ -92,6 +93,7 @@ def _format_parameter(value: ParameterValue) -> str:
 
 def print_validation(scenario: Scenario, out: Path, validation: Validation) -> None:
     """Print what each detector finds from each site, and how well scores predict it."""
+    _print_sample(validation.sample, next(row for row in validation.detections if row.objects_of == ALL_OBJECTS))
     score = validation.egvs_score(scenario)
     egvs = validation.values_of(score)
     sites = sorted(egvs, key=lambda site: -egvs[site])
@@ -109,7 +111,6 @@ def print_validation(scenario: Scenario, out: Path, validation: Validation) -> N
         title = f"{detector}: {_MEASURE_TITLES[main_measure(detector)]}"
         columns.append(Column(title, partial(format_detection, detector), wrap=True))
     print_table(columns, sites, file_width=_FILE_WIDTH)
-    _print_sample(next(iter(detections.values())))
     print()
     _print_agreement(validation, score, detectors)
     for warning in validation.warnings:
@@ -119,9 +120,13 @@ def print_validation(scenario: Scenario, out: Path, validation: Validation) -> N
         print(validation.report)
 
 
-def _print_sample(detection: Any) -> None:
+def _print_sample(sample: TrafficSample, detection: SiteDetection) -> None:
     """Print the size of the held-out traffic."""
-    print(f"{detection.objects} vehicles in {detection.frames} frames of held-out traffic; ± gives the standard error")
+    frames = f"{detection.objects:,} vehicles in {sample.frames:,} frames"
+    spacing = f"at least {sample.apart_s:g} s apart"
+    print(
+        f"{sample.vehicles:,} different vehicles in held-out traffic: {frames}, {spacing}; ± gives the standard error"
+    )
 
 
 def _print_agreement(validation: Validation, scenario_score: ScoreName, detectors: Sequence[str]) -> None:
@@ -158,6 +163,7 @@ _POINT_COLUMNS = {"seen with 1 point, %": "seen_1", "5": "seen_5", "20": "seen_2
 def print_plan_validation(validation: PlanValidation) -> None:
     """Print what each detector finds with 1, 2, ... sensors, and the gain from the last one."""
     rows = [row for row in validation.rows if row.detection.objects_of == ALL_OBJECTS]
+    _print_sample(validation.sample, rows[0].detection)
     for detector in dict.fromkeys(row.detection.detector for row in rows):
         measures, gain_measure = _BOX_COLUMNS, "BEV + 3D .7"
         if detector == POINT_COUNTS_NAME:
@@ -171,7 +177,6 @@ def print_plan_validation(validation: PlanValidation) -> None:
         columns.append(Column(f"gain, {gain_measure}", _format_gain))
         detector_rows = [row for row in rows if row.detection.detector == detector]
         print_table(columns, detector_rows, file_width=_FILE_WIDTH)
-    _print_sample(rows[0].detection)
     print(f"fused clouds of the plan by {validation.plan.score} in {validation.plan.path}; gain: over one sensor fewer")
     for warning in validation.warnings:
         print(f"warning: {warning}")

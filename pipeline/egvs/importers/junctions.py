@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -159,6 +159,11 @@ class Streets:
         """Longitude and latitude in degrees of positions in the world frame."""
         degrees = self._frame.to_degrees(np.array(points_m))
         return [(lon, lat) for lon, lat in degrees.tolist()]
+
+    def node_positions(self, nodes: Mapping[int, tuple[float, float]]) -> dict[int, XY]:
+        """World-frame x, y in metres of nodes of a map, given as latitude and longitude in degrees by identifier."""
+        lats_deg, lons_deg = zip(*nodes.values(), strict=True)
+        return dict(zip(nodes, self.to_xy(lons_deg, lats_deg), strict=True))
 
     def near(self, window: BaseGeometry) -> Streets:
         """Return the part that touches a window, in the same order and without connections.

@@ -1,15 +1,17 @@
 """Make a scenario from a town on OpenStreetMap.
 
 Steps of :func:`create_scenario`: read the extract; run netconvert on its streets; choose a junction and put the region
-of interest around it; take buildings, trees, barriers and poles as solids; find candidate sites along the kerbs; assume
-flows, and find how much of them the network carries; write
+of interest around it; leave out the roads that cross the region on another level; take buildings, trees, barriers,
+bridge decks and poles as solids; find candidate sites along the kerbs; assume flows, and find how much of them the
+network carries; write
 
     network.net.xml    the streets                                       (traffic)
     statics.geojson    footprints with heights, and import counts        (statics)
     sites.csv          candidate sites                                   (scan, score)
     scenario.toml      the scenario that names them
 
-World frame: the network's x (east), y (north) in metres; the ground is z = 0 (hills, bridges and tunnels are flat).
+World frame: the network's x (east), y (north) in metres; the ground is z = 0 (hills are flat, and so are bridges and
+tunnels of the junction's own streets).
 The same extract gives the same bytes: no dates, no paths, objects sorted.
 
 The functions that make the parts of a scenario file are also used for the junctions of a city.
@@ -30,15 +32,17 @@ from typing import Any
 
 import tomlkit
 from pydantic import TypeAdapter, ValidationError
+from shapely.geometry.base import BaseGeometry
 
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.formats import osm as osm_files
 from egvs.formats.osm import OsmExtract
-from egvs.importers import junctions, osm_network, osm_solids
+from egvs.importers import junctions, osm_network, osm_solids, road_levels
 from egvs.importers.junctions import XY, JunctionRegion, KerbsidePole, StreetJunction, Streets
 from egvs.importers.osm_network import ATTRIBUTION, NETWORK_FILE
 from egvs.importers.osm_solids import ImportCounts, MappedSolid
+from egvs.importers.road_levels import OtherLevels
 from egvs.scenario.fields import Name
 from egvs.scenario.loading import load
 from egvs.scenario.model import SCENARIO_FILE, RoiConfig
@@ -253,7 +257,13 @@ def create_scenario(
     network, streets = osm_network.build_network(extract, osm, flags)
     near = streets.to_xy([at[1]], [at[0]])[0] if at else None
     junction = _choose_junction(streets, osm, near)
-    solids, counts = osm_solids.map_solids(extract, streets)
+    others = _other_levels(extract, streets, junction)
+    if others.roads:
+        location = streets.to_degrees([junction.at_m])[0]
+        extract = osm_network.cut_out_roads(extract, streets, others.roads, _level_window(junction))
+        network, streets = osm_network.build_network(extract, osm, flags)
+        junction = _choose_junction(streets, osm, streets.to_xy(*zip(location, strict=True))[0])
+    solids, counts = osm_solids.map_solids(extract, streets, others.decks)
 
     if surroundings_m is not None:
         network, streets = osm_network.crop_network(extract, osm, flags, streets, junction, surroundings_m)
@@ -264,7 +274,7 @@ def create_scenario(
         problem = f"there is no free location for a pole along the kerbs of the {junction.title}"
         raise InputError(osm, problem, "Choose another junction with --at LAT,LON.")
 
-    notes = _junction_notes(junction, roi, counts)
+    notes = _junction_notes(junction, roi, counts) + _level_notes(others, counts)
     if walk:
         notes.append(PEOPLE_HINT)
     assumed = _assumed_traffic(network, streets, roi, traffic)
@@ -334,6 +344,28 @@ def _choose_junction(streets: Streets, osm: Path, near: XY | None) -> StreetJunc
     if junction is None:
         raise InputError(osm, "the streets of the extract have no junction", "Choose an extract with a junction.")
     return junction
+
+
+def _other_levels(extract: OsmExtract, streets: Streets, junction: StreetJunction) -> OtherLevels:
+    """Find what is above or below the region of a junction."""
+    return road_levels.find_other_levels(extract, streets, junction, _level_window(junction))
+
+
+def _level_window(junction: StreetJunction) -> BaseGeometry:
+    """Return the region of a junction with a margin."""
+    return junctions.region_around(junction).area.buffer(road_levels.MARGIN_M, join_style="mitre")
+
+
+def _level_notes(others: OtherLevels, counts: ImportCounts) -> list[str]:
+    notes = []
+    if others.roads:
+        titles = ", ".join(others.road_titles)
+        notes.append(f"roads on another level are left out of the traffic in the region of interest: {titles}")
+    heights = counts.heights.get("bridge", Counter())
+    if heights["default"]:
+        shares = f"{heights['default']} of {heights.total()}"
+        notes.append(f"{shares} bridge decks have no height: {osm_solids.DECK_BASE_M:g} m assumed")
+    return notes
 
 
 def _junction_notes(junction: StreetJunction, roi: JunctionRegion, counts: ImportCounts) -> list[str]:

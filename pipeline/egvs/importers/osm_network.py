@@ -15,10 +15,13 @@ from __future__ import annotations
 import html
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+
+from shapely.geometry import LineString
+from shapely.geometry.base import BaseGeometry
 
 from egvs.core import files
 from egvs.core.errors import InputError, RunError
@@ -58,10 +61,11 @@ more on a motorway.
 
 EARTH_M = 6371008.8
 
-_FOOT_HIGHWAYS = {
+PATH_HIGHWAYS = {
     "footway", "path", "cycleway", "steps", "pedestrian", "bridleway", "corridor", "platform", "elevator", "proposed",
     "construction", "via_ferrata",
 }  # fmt: skip
+"""Values of ``highway`` that are no roads for vehicles."""
 
 _NOTHING_LOADED = re.compile(r"No (nodes|edges) loaded|has no road")
 _ELEMENT = re.compile(r"^    <(edge|junction|connection) [^\n]*?(?:/>|>\n.*?^    </\1>)\n", re.MULTILINE | re.DOTALL)
@@ -219,19 +223,60 @@ def cut_surroundings(extract: OsmExtract, middle: tuple[float, float], radius_m:
         if "highway" not in way.tags:
             ways[way.id] = way
             continue
-        pieces = [piece for piece in _pieces_inside(way, circle, extract) if len(piece) > 1]
-        pieces.sort(key=len, reverse=True)
-        for index, nodes in enumerate(pieces):
-            if index == 0:  # the longest piece keeps the id, which turn restrictions refer to
-                way_id = way.id
-            else:
-                way_id = next_id
-                next_id += 1
-            ways[way_id] = Way(way_id, nodes, way.tags)
+        pieces = _pieces_as_ways(way, _pieces_inside(way, circle, extract), next_id)
+        next_id += max(0, len(pieces) - 1)
+        ways |= pieces
 
     inside = replace(extract, nodes=extract.nodes | circle.cuts, ways=dict(sorted(ways.items())))
     connected = _connected_roads(inside, circle)
-    return replace(inside, ways={i: way for i, way in inside.ways.items() if i in connected or not _is_road(way)})
+    return replace(inside, ways={i: way for i, way in inside.ways.items() if i in connected or not is_road(way)})
+
+
+def cut_out_roads(extract: OsmExtract, streets: Streets, roads: Sequence[Way], region: BaseGeometry) -> OsmExtract:
+    """Return the extract without those segments of some roads that touch a region.
+
+    Parameters
+    ----------
+    extract
+        The map.
+    streets
+        Its network, for the frame of the region.
+    roads
+        The roads to cut.
+    region
+        World frame, metres.
+    """
+    xy = streets.node_positions(extract.nodes)
+    ways = dict(extract.ways)
+    next_id = max(ways) + 1
+    for road in roads:
+        del ways[road.id]
+        pieces = _pieces_as_ways(road, _pieces_outside(road, xy, region), next_id)
+        next_id += max(0, len(pieces) - 1)
+        ways |= pieces
+    return replace(extract, ways=dict(sorted(ways.items())))
+
+
+def _pieces_outside(way: Way, xy: Mapping[int, XY], region: BaseGeometry) -> Iterator[tuple[int, ...]]:
+    """Yield the runs of a way's nodes whose segments do not touch a region."""
+    nodes = [node for node in way.nodes if node in xy]
+    piece = nodes[:1]
+    for start, end in pairwise(nodes):
+        if LineString([xy[start], xy[end]]).intersects(region):
+            yield tuple(piece)
+            piece = []
+        piece.append(end)
+    yield tuple(piece)
+
+
+def _pieces_as_ways(way: Way, pieces: Iterable[tuple[int, ...]], next_id: int) -> dict[int, Way]:
+    """Make ways of the pieces of a way that have at least two nodes.
+
+    The longest keeps the identifier, which turn restrictions refer to; the others are numbered from ``next_id``.
+    """
+    longest_first = sorted((piece for piece in pieces if len(piece) > 1), key=len, reverse=True)
+    ids = [way.id, *range(next_id, next_id + len(longest_first))]
+    return {way_id: Way(way_id, nodes, way.tags) for way_id, nodes in zip(ids, longest_first, strict=False)}
 
 
 class _Circle:
@@ -303,13 +348,14 @@ def _pieces_inside(way: Way, circle: _Circle, extract: OsmExtract) -> Iterator[t
     yield tuple(piece)
 
 
-def _is_road(way: Way) -> bool:
-    return way.tags.get("highway", "footway") not in _FOOT_HIGHWAYS
+def is_road(way: Way) -> bool:
+    """Return whether a way is a road for vehicles."""
+    return way.tags.get("highway", "footway") not in PATH_HIGHWAYS
 
 
 def _connected_roads(extract: OsmExtract, circle: _Circle) -> set[int]:
     """Return the ids of the roads connected to the one nearest to the middle."""
-    roads = [way for way in extract.ways.values() if _is_road(way)]
+    roads = [way for way in extract.ways.values() if is_road(way)]
     roads_at_node: dict[int, list[Way]] = {}
     for way in roads:
         for node in way.nodes:

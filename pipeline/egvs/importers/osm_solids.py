@@ -1,8 +1,8 @@
 """Take the buildings, trees, barriers and poles of an OpenStreetMap extract as solids with heights.
 
 Steps of :func:`map_solids`: find buildings (ways, multipolygons, parts), barriers and poles; cut off or drop what
-covers the carriageway below :data:`egvs.world.clearances.CLEARANCE_M`, because vehicles drive there; find trees, and
-lift the crowns that overhang the carriageway, as street trees are trimmed.
+covers the carriageway below :data:`egvs.world.clearances.CLEARANCE_M`, because vehicles drive there; the same with the
+decks of bridges; find trees, and lift the crowns that overhang the carriageway, as street trees are trimmed.
 
 :class:`ImportCounts` counts every object that is used, changed or left out, and every default size. What is solid, and
 how high it is where the map gives no height, is defined in :mod:`egvs.world.map_features`. The defaults are round
@@ -21,7 +21,7 @@ import dataclasses
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -29,8 +29,9 @@ import shapely
 from shapely.geometry import LineString, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
-from egvs.formats.osm import OsmExtract, Relation, Tags, Way
+from egvs.formats.osm import OsmExtract, Relation, Tags, Way, parse_number
 from egvs.importers.junctions import XY, Streets
+from egvs.importers.osm_network import PATH_HIGHWAYS
 from egvs.scenario.model import StaticsConfig
 from egvs.world import map_features
 from egvs.world.clearances import CLEARANCE_M
@@ -42,8 +43,17 @@ DEFAULT_BUILDING_M: float = StaticsConfig.model_fields["polygon_height_m"].defau
 TREE = map_features.SOLID_TYPES["natural.tree"]
 ROW_SPACING_M = 8.0
 
+DECK_BASE_M, DECK_THICKNESS_M = 5.0, 1.0
+DECK = SolidType(DECK_BASE_M + DECK_THICKNESS_M, thickness_m=DECK_THICKNESS_M)
+"""A bridge without a height in the map: above the region of interest, and above lorries."""
+
+_DECK_LANE_M, _DECK_EDGE_M, _TRACK_M, _PATH_M = 3.5, 1.0, 5.0, 3.0
+"""Widths of bridges without a width in the map: of each lane, of each edge, of a railway track, and of a path."""
+
 _SOLID_TYPES = SolidTypes()
 _BUILDING_KEYS = ("building:part", "building", "man_made")
+
+_MAX_LANES = 12
 
 _GRID_M = 0.001
 _SLIVER_M2 = 0.25
@@ -60,7 +70,7 @@ class MappedSolid:
     name
         Unique, e.g. ``"way/12"``.
     kind
-        ``building``, ``roof``, ``barrier``, ``pole``, ``tree_trunk`` or ``tree_crown``.
+        ``building``, ``roof``, ``barrier``, ``bridge``, ``pole``, ``tree_trunk`` or ``tree_crown``.
     geometry
         World frame, metres.
     height_m, base_m
@@ -131,7 +141,9 @@ def _sort_keys(value: Any) -> Any:
     return {key: _sort_keys(value[key]) for key in sorted(value)}
 
 
-def map_solids(extract: OsmExtract, streets: Streets) -> tuple[list[MappedSolid], ImportCounts]:
+def map_solids(
+    extract: OsmExtract, streets: Streets, bridges: Sequence[Way] = ()
+) -> tuple[list[MappedSolid], ImportCounts]:
     """Collect all static objects of an extract, clear of the carriageway.
 
     Parameters
@@ -140,6 +152,8 @@ def map_solids(extract: OsmExtract, streets: Streets) -> tuple[list[MappedSolid]
         The map.
     streets
         The carriageway, and the frame of the solids.
+    bridges
+        Ways whose decks are above the ground, see :func:`make_decks`.
 
     Returns
     -------
@@ -148,8 +162,7 @@ def map_solids(extract: OsmExtract, streets: Streets) -> tuple[list[MappedSolid]
     counts : ImportCounts
         What happened to the mapped objects.
     """
-    lats_deg, lons_deg = zip(*extract.nodes.values(), strict=True)
-    xy = dict(zip(extract.nodes, streets.to_xy(lons_deg, lats_deg), strict=True))
+    xy = streets.node_positions(extract.nodes)
     counts = ImportCounts()
     lanes = shapely.STRtree(list(streets.areas.values()))
 
@@ -157,6 +170,8 @@ def map_solids(extract: OsmExtract, streets: Streets) -> tuple[list[MappedSolid]
     for find in (find_buildings, find_barriers, find_poles):
         for solid in find(extract, xy, counts):
             solids += _clear_of_carriageway(solid, lanes, counts)
+    for deck in make_decks(bridges, xy, counts):
+        solids += _clear_of_carriageway(deck, lanes, counts)
     for trunk, crown in find_trees(extract, xy, counts):
         if _lanes_under(trunk, lanes):
             counts.drop("tree", "on_carriageway")
@@ -460,6 +475,45 @@ def find_barriers(extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts) 
             continue
         name = f"way/{way.id}"
         yield MappedSolid(name, "barrier", geometry, extent.top_m, extent.source, extent.base_m, radius_m)
+
+
+def make_decks(bridges: Sequence[Way], xy: dict[int, XY], counts: ImportCounts) -> Iterator[MappedSolid]:
+    """Yield the decks of bridges: strips as wide as the way, from ``min_height`` to ``height`` of the map.
+
+    Parameters
+    ----------
+    bridges
+        Ways on bridges.
+    xy, counts
+        As for :func:`find_buildings`.
+    """
+    for way in bridges:
+        extent = extent_from_tags(way.tags, DECK, counts)
+        half_width_m = _deck_width_m(way.tags, counts) / 2
+        lines = shapely.MultiLineString(way_lines(way, xy))
+        if lines.is_empty:
+            counts.drop("bridge", "degenerate")
+            continue
+        yield MappedSolid(f"way/{way.id}", "bridge", lines, extent.top_m, extent.source, extent.base_m, half_width_m)
+
+
+def _deck_width_m(tags: Tags, counts: ImportCounts) -> float:
+    width_m = tag_value(tags, "width", map_features.parse_positive_length_m, counts)
+    if width_m:
+        return width_m
+    if "railway" in tags:
+        return _TRACK_M
+    if tags["highway"] in PATH_HIGHWAYS:
+        return _PATH_M
+    lanes = tag_value(tags, "lanes", _parse_lanes, counts)
+    if lanes is None:
+        lanes = 1.0 if tags.get("oneway") == "yes" else 2.0
+    return lanes * _DECK_LANE_M + 2 * _DECK_EDGE_M
+
+
+def _parse_lanes(text: str) -> float | None:
+    lanes = parse_number(text)
+    return lanes if lanes is not None and 1 <= lanes <= _MAX_LANES else None
 
 
 def find_poles(extract: OsmExtract, xy: dict[int, XY], counts: ImportCounts) -> Iterator[MappedSolid]:

@@ -191,10 +191,10 @@ def keys_without_effect(source: str) -> frozenset[str]:
         "vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s", "junction_blocker_s", "teleport_s",
     })  # fmt: skip
     if source == "fcd":
-        return simulation | demand - {"kinds"} | {"routes"}
+        return simulation | demand - {"kinds"} | {"routes", "redraw_departures"}
     unused = frozenset({"vtypes", "roads", "fcd_geo"})
     if source == "network":
-        return unused
+        return unused | {"redraw_departures"}
     return unused | demand | ({"routes"} if source == "sumocfg" else set())
 
 
@@ -293,6 +293,11 @@ class TrafficConfig(StrictModel):
         description="Random trips take the route that is fastest in the traffic at their departure, rather than on"
         " empty streets (SUMO's device.rerouting)",
     )
+    redraw_departures: bool = Field(
+        False,
+        description="Vehicles of your own demand depart at random times within the same five minutes, and flows at"
+        " random intervals, so that another seed gives other traffic. By default as in the files",
+    )
     min_trip_m: float = Field(0.0, ge=0, description="Minimum straight-line distance of random trips")
     edge_weights: dict[str, Annotated[float, Field(ge=0)]] = Field(
         default_factory=dict,
@@ -353,6 +358,11 @@ class TrafficConfig(StrictModel):
             if amount > maximum:
                 raise ValueError(f"expected at most {maximum:,.0f} {what}, got {amount:,.0f}")
         return self
+
+    @property
+    def has_user_demand(self) -> bool:
+        """Whether SUMO simulates demand files of the user."""
+        return self.sumocfg is not None or bool(self.routes)
 
     @property
     def named_kinds(self) -> tuple[VehicleKind, ...]:

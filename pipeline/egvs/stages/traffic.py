@@ -148,6 +148,8 @@ def _record_period(
     summary = tally.to_json(recorded.window.period_ms / 1000.0)
     if sumo_summary is not None:
         summary |= asdict(sumo_summary)
+    if recorded.types:
+        summary["sizes"] = {name: sized.to_json() for name, sized in recorded.types.items()}
     summary[WARNINGS_KEY] = [*summary.get(WARNINGS_KEY, []), *(warning.to_json() for warning in warnings)]
     if notes:
         summary["notes"] = [*summary.get("notes", []), *notes]

@@ -138,7 +138,7 @@ def _check_recorded_position(scenario: Scenario, name: str) -> None:
 
 @_for_each_period
 def check_finished_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
-    """Report finished files without the requested frames, or with vehicles of unknown size."""
+    """Report finished files without the requested frames, with vehicles of unknown size, or that disappear."""
     scenario = inputs.scenario
     if scenario.traffic.fcd is None:
         return
@@ -147,6 +147,7 @@ def check_finished_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
     if window is not None:
         content = window[1]
         errors.attempt("traffic", lambda: finished_fcd.check_types(scenario, content.types, content.sizes))
+        yield from finished_fcd.presence_warnings(scenario, content)
     yield from errors.findings
 
 

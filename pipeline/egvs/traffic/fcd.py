@@ -53,6 +53,9 @@ _BATCH_ROWS = 1 << 16
 _MAX_ROWS_PER_BYTE = 10
 """Positions and angles that change take at least a bit per row."""
 
+MIN_GAP_STEPS = 1.5
+"""A time this many times the usual step has a gap; times of cameras, in whole milliseconds, vary by less."""
+
 EXPECTED_FCD = (
     "Use FCD data with the attributes id, x, y, angle, type (--fcd-output.attributes id,x,y,z,angle,slope,type,speed)."
 )
@@ -223,7 +226,9 @@ def _check_rows(metadata: Any, path: Path) -> None:
 
 def _read_xml(path: Path, element: str) -> Iterator[pa.RecordBatch]:
     rows: list[dict[str, str]] = []
+    steps = _StepCheck(path)
     for step in xml.iter_elements(path, "fcd-export"):
+        steps.add(step.get("time", ""))
         for child in step.iter(element):
             row = {"time": step.get("time", ""), **child.attrib}
             if element == "person":
@@ -234,6 +239,34 @@ def _read_xml(path: Path, element: str) -> Iterator[pa.RecordBatch]:
             rows.clear()
     if rows:
         yield _xml_batch(rows, path)
+
+
+class _StepCheck:
+    """Checks that an XML file has all time steps: SUMO also writes those without vehicles.
+
+    Without this check, a step that is missing would count as an empty frame.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._last_s: float | None = None
+        self._shortest_s, self._longest_s = np.inf, 0.0
+
+    def add(self, time: str) -> None:
+        """Check the next time step; a time that is no number is reported with its vehicles."""
+        try:
+            time_s = float(time)
+        except ValueError:
+            return
+        if self._last_s is not None and time_s > self._last_s:
+            step_s = time_s - self._last_s
+            self._shortest_s, self._longest_s = min(self._shortest_s, step_s), max(self._longest_s, step_s)
+            if self._longest_s > MIN_GAP_STEPS * self._shortest_s:
+                steps = f"{self._shortest_s:g} s and {self._longest_s:g} s"
+                problem = f"expected equal time steps, got {steps}: steps are missing"
+                hint = "Use a file with all steps, also those without vehicles (without --fcd-output.skip-empty)."
+                raise InputError(f"{self._path}: time {time}", problem, hint)
+        self._last_s = time_s
 
 
 def _xml_batch(rows: list[dict[str, str]], path: Path) -> pa.RecordBatch:

@@ -8,12 +8,15 @@ without vehicles, and ``types`` are the sizes of vehicles. Its positions are in 
 ``<vType>``\ s of the user's SUMO files (``traffic.vtypes``), where SUMO adds what they leave to its defaults; SUMO's
 default types; the metadata of the file; the scenario's default kinds. Metres.
 
-**Frames.** A file without metadata is read once to find its time steps and types. Times are whole milliseconds.
+**Frames.** A file without metadata is read once to find its time steps and types. Times are whole milliseconds. In XML,
+all time steps must be there; in other formats, steps without vehicles may be missing, and a vehicle that disappears and
+returns gets a warning.
 """
 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -22,12 +25,13 @@ from typing import Annotated, Any
 from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 from pydantic import Field, ValidationError
 
 from egvs.artefacts.frame_boxes import MAX_BOX_M, MIN_BOX_M
 from egvs.core import reading
-from egvs.core.errors import InputError
+from egvs.core.errors import Diagnostic, InputError
 from egvs.core.files import temporary_folder
 from egvs.formats import xml
 from egvs.scenario.fields import Name, Positive, StrictModel
@@ -35,6 +39,9 @@ from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import VehicleKind
 from egvs.traffic import fcd, sumo, sumo_folder
 from egvs.traffic.vehicle_boxes import VehicleSize
+
+_NEVER = -(2**63)
+"""Time of a row that does not exist."""
 
 _MARKER_KEY = "period_ms"
 """Only FCD files have this key in their metadata."""
@@ -126,9 +133,26 @@ def known_sizes(scenario: Scenario) -> dict[str, VehicleSize]:
     return sizes_of_kinds(traffic.kinds)
 
 
+@dataclass(frozen=True)
+class SizedType:
+    """The size of a vehicle type, and where it comes from."""
+
+    size: VehicleSize
+    source: str
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON."""
+        return {**vars(self.size), "source": self.source}
+
+
+_DEFAULT_KIND, _FILE, _SUMO_DEFAULT = "a default kind", "the FCD file", "SUMO's default type"
+_VTYPES, _KINDS = "traffic.vtypes", "traffic.kinds"
+"""Sources of sizes."""
+
+
 def sizes_of_types(
     scenario: Scenario, types: Collection[str], declared: Mapping[str, VehicleSize]
-) -> dict[str, VehicleSize]:
+) -> dict[str, SizedType]:
     """Find the sizes of the vehicles of a finished file.
 
     Parameters
@@ -151,16 +175,27 @@ def sizes_of_types(
         When a type has no known size, or a file of vTypes is invalid.
     """
     vtypes = check_types(scenario, types, declared)
+    sized: dict[str, SizedType] = {}
+
+    def add(sizes: Mapping[str, VehicleSize], source: str) -> None:
+        sized.update({name: SizedType(size, source) for name, size in sizes.items()})
+
+    add(sizes_of_kinds(scenario.traffic.kinds), _DEFAULT_KIND)
+    add(declared, _FILE)
     named = sizes_of_kinds(scenario.traffic.named_kinds)
-    sizes = sizes_of_kinds(scenario.traffic.kinds) | dict(declared) | named
-    if vtypes or any(name not in sizes for name in types):
+    add(named, _KINDS)
+    if vtypes or any(name not in sized for name in types):
         try:
-            sizes |= _query_type_sizes(vtypes) | named
+            queried = _query_type_sizes(vtypes)
         except sumo.SumoInputError as error:
             where = ", ".join(map(str, size_files(scenario))) or sumo_folder.traffic_location(scenario)
             hint = "Use types that SUMO can read."
             raise InputError(where, f"SUMO rejects the vehicle types: {error}", hint) from None
-    return sizes
+        add(queried, _SUMO_DEFAULT)
+        vtype_names = {vtype.attrib["id"] for vtype in vtypes}
+        add({name: size for name, size in queried.items() if name in vtype_names}, _VTYPES)
+        add(named, _KINDS)
+    return sized
 
 
 def check_types(scenario: Scenario, types: Collection[str], declared: Mapping[str, VehicleSize]) -> list[Element]:
@@ -260,6 +295,10 @@ class FcdSurvey:
         Vehicle types.
     metadata
         Metadata, if the file has any.
+    returns
+        How often a vehicle disappears and returns.
+    first_return
+        The first of these times, as a text.
     """
 
     duration_ms: int
@@ -267,6 +306,8 @@ class FcdSurvey:
     step_ms: int
     types: frozenset[str]
     metadata: FcdMetadata | None = None
+    returns: int = 0
+    first_return: str = ""
 
     @property
     def sizes(self) -> dict[str, VehicleSize]:
@@ -297,6 +338,7 @@ def survey_fcd(path: Path, until_ms: int | None = None) -> FcdSurvey:
     last_ms = step_ms = 0
     time_steps = 1
     types: set[str] = set()
+    presence = _VehiclePresence()
     for table in fcd.read_fcd(path):
         time_ms = table["time_ms"].to_numpy()
         if first_ms is None:
@@ -307,12 +349,75 @@ def survey_fcd(path: Path, until_ms: int | None = None) -> FcdSurvey:
         last_ms = int(time_ms[-1])
         if until_ms is not None:
             table = table.slice(0, int(np.searchsorted(time_ms, first_ms + until_ms, side="right")))
+        presence.add(table)
         types.update(pc.unique(table["type"]).to_pylist())
         if until_ms is not None and last_ms > first_ms + until_ms:
             break
     if first_ms is None:
         raise InputError(path, "the file contains no vehicles", fcd.EXPECTED_FCD)
-    return FcdSurvey(last_ms - first_ms, time_steps, step_ms, frozenset(types))
+    returns, first_return = presence.find_returns()
+    return FcdSurvey(
+        last_ms - first_ms, time_steps, step_ms, frozenset(types), returns=returns, first_return=first_return
+    )
+
+
+class _VehiclePresence:
+    """Times between successive rows of the same vehicle, counted by their length."""
+
+    def __init__(self) -> None:
+        self._codes: dict[str, int] = {}
+        self._last_ms = np.empty(0, dtype=np.int64)
+        self._counts: Counter[int] = Counter()
+        self._first: dict[int, tuple[int, str]] = {}
+
+    def add(self, table: pa.Table) -> None:
+        """Add the next rows of the file."""
+        if not table.num_rows:
+            return
+        names = table["id"].combine_chunks().dictionary_encode()
+        known = len(self._codes)
+        codes = np.array([self._codes.setdefault(name, len(self._codes)) for name in names.dictionary.to_pylist()])
+        self._last_ms = np.append(self._last_ms, np.full(len(self._codes) - known, _NEVER))
+
+        code = codes[names.indices.to_numpy()]
+        time_ms = table["time_ms"].to_numpy()
+        order = np.argsort(code, kind="stable")  # rows are in order of time
+        code, time_ms = code[order], time_ms[order]
+        is_first = np.diff(code, prepend=-1) != 0
+        previous_ms = np.where(is_first, self._last_ms[code], np.roll(time_ms, 1))
+        is_last = np.append(is_first[1:], True)
+        self._last_ms[code[is_last]] = time_ms[is_last]
+
+        pause_ms = np.where(previous_ms == _NEVER, 0, time_ms - previous_ms)
+        lengths_ms, rows, numbers = np.unique(pause_ms, return_index=True, return_counts=True)
+        texts = list(self._codes)
+        for length_ms, row, number in zip(lengths_ms.tolist(), rows.tolist(), numbers.tolist(), strict=True):
+            if length_ms > 0:
+                self._counts[length_ms] += number
+                self._first.setdefault(length_ms, (int(previous_ms[row]), texts[code[row]]))
+
+    def find_returns(self) -> tuple[int, str]:
+        """Return how often a vehicle is missing for longer than the usual step, and one such time as a text."""
+        if not self._counts:
+            return 0, ""
+        usual_ms = self._counts.most_common(1)[0][0]
+        pauses_ms = [length_ms for length_ms in self._counts if length_ms >= fcd.MIN_GAP_STEPS * usual_ms]
+        if not pauses_ms:
+            return 0, ""
+        (since_ms, name), length_ms = min((self._first[length_ms], length_ms) for length_ms in pauses_ms)
+        number = sum(self._counts[length_ms] for length_ms in pauses_ms)
+        return number, f"{name!r} between {since_ms / 1000:g} s and {(since_ms + length_ms) / 1000:g} s"
+
+
+def presence_warnings(scenario: Scenario, survey: FcdSurvey) -> Iterator[Diagnostic]:
+    """Warn about vehicles of a finished file that disappear and return."""
+    if not survey.returns:
+        return
+    where = f"{sumo_folder.traffic_location(scenario)}.fcd = {scenario.traffic.fcd!r}"
+    times = "once" if survey.returns == 1 else f"{survey.returns:,} times"
+    problem = f"vehicles disappear and return {times}, e.g. {survey.first_return}; meanwhile they count as absent"
+    hint = "Use a file in which each vehicle has a row in every time step of its trip."
+    yield Diagnostic("vehicles return", where, problem, hint)
 
 
 def fcd_window(scenario: Scenario) -> tuple[fcd.FrameWindow, FcdSurvey]:

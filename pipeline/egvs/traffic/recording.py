@@ -86,6 +86,8 @@ class Recording:
         The simulated network, for messages; None if it is not known.
     teleports
         Vehicles that SUMO moved on.
+    types
+        The vehicle types of a finished file with their sizes.
     """
 
     rows: Iterable[pa.Table]
@@ -100,6 +102,7 @@ class Recording:
     source: str = ""
     roads: network.Network | None = None
     teleports: Sequence[locks.Teleport] = ()
+    types: Mapping[str, finished_fcd.SizedType] = field(default_factory=dict)
 
 
 def record_traffic(
@@ -162,11 +165,13 @@ def _record_finished(scenario: Scenario, folder: Path, world: Georeference) -> I
     sumo_folder.copy_network(scenario, folder)
     window, survey = finished_fcd.fcd_window(scenario)
     path = scenario.find(name, "traffic.fcd")
-    sizes = finished_fcd.sizes_of_types(scenario, survey.types, survey.sizes)
+    sized = finished_fcd.sizes_of_types(scenario, survey.types, survey.sizes)
+    sizes = {vehicle_type: sized_type.size for vehicle_type, sized_type in sized.items()}
+    types = {vehicle_type: sized[vehicle_type] for vehicle_type in sorted(survey.types)}
     rows = fcd.read_fcd(path)
     if survey.metadata is None:
         rows = fcd.georeference_rows(rows, world, path, scenario.traffic.fcd_geo)
-    yield Recording(rows, window, sizes, where, source=f"{where}.fcd = {name!r}")
+    yield Recording(rows, window, sizes, where, source=f"{where}.fcd = {name!r}", types=types)
 
 
 @contextmanager

@@ -25,7 +25,7 @@ from egvs.core.grid import FloatArray
 from egvs.formats import osm
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import TrafficConfig
-from egvs.traffic import demand, network, sumo, town_trips, user_files
+from egvs.traffic import demand, departures, network, sumo, town_trips, user_files
 from egvs.traffic.fcd import FrameWindow
 from egvs.traffic.vehicle_boxes import TrafficHook
 
@@ -289,7 +289,9 @@ def prepare_simulation(scenario: Scenario, folder: Path, extensions: Iterable[Tr
     roads = network.read_net_xml(folder / copies["net-file"], inputs.files["net-file"][0])
     demand_seed, sumo_seed, *extra_seeds = np.random.SeedSequence(scenario.seed).spawn(2 + len(adding))
 
-    is_generated = traffic.sumocfg is None and not traffic.routes
+    if traffic.redraw_departures:
+        notes += _redraw_departures(copies, folder, np.random.default_rng(demand_seed))
+    is_generated = not traffic.has_user_demand
     vehicles = traffic.vehicles
     depart_delay_s = traffic.max_depart_delay_s
     if is_generated:
@@ -325,6 +327,16 @@ def prepare_simulation(scenario: Scenario, folder: Path, extensions: Iterable[Tr
         folder, tuple(inputs.all()), options, timing, roads, vehicles, is_generated, bool(traffic.counts),
         has_fixed_count, bool(adding), notes,
     )  # fmt: skip
+
+
+def _redraw_departures(copies: Mapping[str, str], folder: Path, rng: np.random.Generator) -> list[str]:
+    """Redraw the departures in the copies of demand files; return notes for the user."""
+    counts = departures.DepartureCounts()
+    for option in user_files.DEMAND_OPTIONS:
+        for name in filter(None, copies.get(option, "").split(",")):
+            counts += departures.redraw_departures(folder / name, rng)
+    total = counts.redrawn + counts.fixed
+    return [f"departures of {counts.redrawn} of {total} vehicles and flows are redrawn"]
 
 
 def _make_empty(folder: Path, inputs: Iterable[Path]) -> None:

@@ -372,7 +372,8 @@ def write_dataset(
     folder: Path,
     *,
     sites: Sequence[str] = (),
-    frames: int = 1000,
+    frames: int,
+    spacing_s: float | None = None,
     kind: str = "kitti",
     jobs: int | None = None,
     progress: ProgressCallback = no_progress,
@@ -389,6 +390,8 @@ def write_dataset(
         Names of sites; all by default.
     frames
         Number of frames of each site.
+    spacing_s
+        Minimum time between two frames, in seconds; by default 7 s, or what the traffic allows.
     kind
         One of :data:`egvs.validation.dataset_files.LAYOUTS`.
     jobs
@@ -408,7 +411,7 @@ def write_dataset(
     selected = _selected_sites(candidate_sites(scenario), sites)
     with _partial_folder(folder) as partial:
         record = held_out_traffic.prepare_held_out_traffic(
-            scenario, partial / _RECORD_FOLDER, frames, jobs=jobs, progress=progress
+            scenario, partial / _RECORD_FOLDER, frames, apart_s=spacing_s, jobs=jobs, progress=progress
         )
         if sites:
             _check_feasible(record.scene, selected)

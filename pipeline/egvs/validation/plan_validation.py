@@ -43,7 +43,7 @@ from egvs.validation.detection_metrics import ALL_OBJECTS, UNDEFINED, JackknifeE
 from egvs.validation.detector_runs import DetectionListener, DetectionTaskBase, SiteDetectionTask, run_detectors
 from egvs.validation.detectors import base
 from egvs.validation.detectors.base import JointDetector
-from egvs.validation.held_out_traffic import HeldOutTraffic
+from egvs.validation.held_out_traffic import FrameSampling, HeldOutTraffic, TrafficSample
 from egvs.validation.results import main_measure
 from egvs.validation.sweeps import POINT_COUNTS_NAME, DetectorResult
 from egvs.validation.validation_run import validation_metadata, validation_run
@@ -130,12 +130,15 @@ class PlanValidation:
         What to know before trusting the rows.
     path
         The file that was written.
+    sample
+        The size of the held-out traffic.
     """
 
     plan: FusedPlan
     rows: tuple[FusedDetection, ...]
     warnings: tuple[Diagnostic, ...]
     path: Path
+    sample: TrafficSample
 
 
 @dataclass(frozen=True)
@@ -164,7 +167,7 @@ def validate_plan(
     out: Path,
     plan_folder: Path,
     *,
-    frames: int,
+    sampling: FrameSampling,
     detectors: Sequence[str] = (POINT_COUNTS_NAME,),
     jobs: int | None = None,
     progress: ProgressCallback = no_progress,
@@ -178,8 +181,8 @@ def validate_plan(
         The run's folder.
     plan_folder
         Folder of the plan's ``placement.parquet``.
-    frames
-        Number of frames of held-out traffic.
+    sampling
+        Frames of held-out traffic.
     detectors
         Names of detectors; points on vehicles are always counted.
     jobs
@@ -197,13 +200,13 @@ def validate_plan(
     plan = read_fused_plan(plan_folder, scenario)
     runs.check_no_overwrite(scenario, out)
 
-    with validation_run(scenario, out, frames, jobs=jobs, progress=progress) as run:
+    with validation_run(scenario, out, sampling, jobs=jobs, progress=progress) as run:
         record = run.record
         task = FusedDetectionTask(record, chosen)
         results = run_detectors(plan.groups, task, jobs=jobs, progress=progress, listener=listener)
         rows, undefined = detection_metrics.measure_detection(run.frames, record.scene.roi, results)
         warnings = (*run.warnings, *_other_world_warnings(plan, record), *undefined)
-        validation = PlanValidation(plan, with_gains(plan.groups, rows), warnings, out / FUSED_TABLE)
+        validation = PlanValidation(plan, with_gains(plan.groups, rows), warnings, out / FUSED_TABLE, run.sample)
         write_fused(validation.path, validation.rows, _plan_metadata(scenario, record, validation))
         return validation
 
@@ -336,7 +339,7 @@ def _plan_metadata(scenario: Scenario, record: HeldOutTraffic, validation: PlanV
     plan = validation.plan
     sensors = [{"site": site.name, "sensor": site.sensor, **asdict(site.pose)} for site in plan.sites]
     return {
-        **validation_metadata(scenario, record, detectors, validation.warnings),
+        **validation_metadata(scenario, record, validation.sample, detectors, validation.warnings),
         "inputs": files.hash_json([record.keys, record.numbers.tolist(), detectors, sensors]),
         "plan": {"score": plan.score, "inputs": plan.inputs, "sensors": sensors},
     }

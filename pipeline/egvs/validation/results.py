@@ -25,6 +25,7 @@ from egvs.scenario.model import Scenario
 from egvs.studies.pareto_figure import LabelPlacement
 from egvs.validation.correlation import CoefficientKind, Correlation
 from egvs.validation.detection_metrics import ALL_OBJECTS, SiteDetection
+from egvs.validation.held_out_traffic import TrafficSample
 from egvs.validation.surrogates import Surrogates
 from egvs.validation.sweeps import POINT_COUNTS_NAME
 
@@ -104,6 +105,8 @@ class Validation:
         Rows of ``correlation.parquet``.
     warnings
         Undefined measures, skipped scores, and traffic that is not held out.
+    sample
+        The size of the held-out traffic.
     report
         Path of the updated report; None if the folder does not contain a complete run.
     """
@@ -112,6 +115,7 @@ class Validation:
     surrogates: Surrogates
     agreements: tuple[ScoreAgreement, ...]
     warnings: tuple[Diagnostic, ...]
+    sample: TrafficSample
     report: Path | None = None
 
     @cached_property

@@ -33,7 +33,7 @@ from egvs.validation.correlation import COEFFICIENT_KINDS, CorrelationStudy, Jun
 from egvs.validation.detection_metrics import ALL_OBJECTS, SiteDetection
 from egvs.validation.detector_runs import DetectionListener, SiteDetectionTask, run_detectors
 from egvs.validation.detectors import base
-from egvs.validation.held_out_traffic import HeldOutTraffic
+from egvs.validation.held_out_traffic import FrameSampling, HeldOutTraffic
 from egvs.validation.kitti_results import NO_KITTI_FILES, KittiFiles
 from egvs.validation.results import ScoreAgreement, ScoreName, Validation
 from egvs.validation.surrogates import Surrogates
@@ -50,7 +50,7 @@ def validate_sites(
     scenario: Scenario,
     out: Path,
     *,
-    frames: int,
+    sampling: FrameSampling,
     detectors: Sequence[str] = (POINT_COUNTS_NAME,),
     kitti: KittiFiles = NO_KITTI_FILES,
     jobs: int | None = None,
@@ -63,8 +63,8 @@ def validate_sites(
     ----------
     out
         The run's folder.
-    frames
-        Number of frames of held-out traffic.
+    sampling
+        Frames of held-out traffic.
     detectors
         Names of detectors; points on vehicles are always counted.
     kitti
@@ -84,7 +84,7 @@ def validate_sites(
     chosen = {name: base.make_detector(name) for name in dict.fromkeys(detectors) if name != POINT_COUNTS_NAME}
     _check_no_input_overwritten(scenario, out, kitti)
 
-    with validation_run(scenario, out, frames, jobs=jobs, progress=progress) as run:
+    with validation_run(scenario, out, sampling, jobs=jobs, progress=progress) as run:
         record = run.record
         external = _read_external_boxes(kitti.detections, record, chosen)
         task = SiteDetectionTask(record, chosen)
@@ -95,7 +95,7 @@ def validate_sites(
         scores = surrogates.compute_surrogates(scenario, run.folder / "scores", jobs=jobs, progress=progress)
         agreements = correlate_scores(record.scene.sites, scenario, rows, scores)
         warnings = (*run.warnings, *undefined, *scores.skipped)
-        validation = Validation(tuple(rows), scores, tuple(agreements), warnings)
+        validation = Validation(tuple(rows), scores, tuple(agreements), warnings, run.sample)
 
         _write_artefacts(out, run, scenario, validation, external)
         if kitti.keep:
@@ -221,7 +221,7 @@ def _site_metadata(
     detectors = list(dict.fromkeys(row.detector for row in validation.detections))
     egvs = validation.egvs_score(scenario)
     inputs = [record.keys, record.numbers.tolist(), detectors, validation.surrogates.inputs]
-    metadata = validation_metadata(scenario, record, detectors, validation.warnings)
+    metadata = validation_metadata(scenario, record, validation.sample, detectors, validation.warnings)
     metadata["inputs"] = files.hash_json(inputs)
     metadata["stages"] = _stage_keys(scenario, run.folder / "scores")
     metadata["own_score"] = {"score": egvs.score, "parameters": egvs.parameters}

@@ -23,8 +23,9 @@ from egvs.runs import stage_keys, stage_registry
 from egvs.runs.run import lock_run_folder
 from egvs.scenario.model import Scenario
 from egvs.stages.inputs import open_folder
+from egvs.traffic import departures, sumo_folder, user_files
 from egvs.validation import held_out_traffic
-from egvs.validation.held_out_traffic import HeldOutTraffic
+from egvs.validation.held_out_traffic import FrameSampling, HeldOutTraffic, TrafficSample
 from egvs.validation.results import main_measure
 
 _WORK_PREFIX = ".validate-"
@@ -44,17 +45,20 @@ class ValidationRun:
         Its frames.
     warnings
         Warnings of the check and about the traffic.
+    sample
+        The size of the traffic.
     """
 
     folder: Path
     record: HeldOutTraffic
     frames: list[TrafficFrame]
     warnings: tuple[Diagnostic, ...]
+    sample: TrafficSample
 
 
 @contextmanager
 def validation_run(
-    scenario: Scenario, out: Path, frames: int, *, jobs: int | None, progress: ProgressCallback
+    scenario: Scenario, out: Path, sampling: FrameSampling, *, jobs: int | None, progress: ProgressCallback
 ) -> Iterator[ValidationRun]:
     """Lock the folder of a run, check its scenario, and prepare held-out traffic.
 
@@ -62,8 +66,8 @@ def validation_run(
     ----------
     out
         The run's folder.
-    frames
-        Number of frames of held-out traffic.
+    sampling
+        Frames of held-out traffic.
 
     Raises
     ------
@@ -71,13 +75,14 @@ def validation_run(
         If the check finds an error, the traffic has too few frames, or no vehicle enters the region of interest.
     """
     with lock_run_folder(out), _temporary_work_folder(out) as folder:
-        warnings = [*_check_scenario(scenario, folder / "check", progress), *_same_traffic_warnings(scenario)]
+        warnings = _check_scenario(scenario, folder / "check", progress)
         record = held_out_traffic.prepare_held_out_traffic(
-            scenario, folder / "unseen", frames, jobs=jobs, progress=progress
+            scenario, folder / "unseen", sampling.frames, apart_s=sampling.spacing_s, jobs=jobs, progress=progress
         )
         traffic_frames = list(record.read())
         _check_any_vehicle(scenario, record, traffic_frames)
-        yield ValidationRun(folder, record, traffic_frames, tuple(warnings))
+        warnings += [*_same_traffic_warnings(scenario, record, traffic_frames), *_fixed_departure_warnings(scenario)]
+        yield ValidationRun(folder, record, traffic_frames, tuple(warnings), record.sample(traffic_frames))
 
 
 @contextmanager
@@ -97,18 +102,40 @@ def _check_scenario(scenario: Scenario, folder: Path, progress: ProgressCallback
     return collect_warnings([result.summary])
 
 
-def _same_traffic_warnings(scenario: Scenario) -> list[Diagnostic]:
-    """Return a warning if the held-out frames are those of the TPOG."""
-    if not scenario.is_recorded:
-        return []
-    return [
-        Diagnostic(
+def _same_traffic_warnings(
+    scenario: Scenario, record: HeldOutTraffic, frames: Sequence[TrafficFrame]
+) -> Iterator[Diagnostic]:
+    """Warn if vehicles of the held-out frames are also in the traffic of the TPOG: those of a finished file."""
+    periods = list(scenario.by_period().values())
+    vehicles = record.vehicles_in_region(frames)
+    n_shared = sum(periods[period].traffic.fcd is not None for period, _ in vehicles)
+    if n_shared:
+        yield Diagnostic(
             "traffic not held out",
             f"{scenario.file}: traffic.fcd",
-            "the traffic is a finished file, so sites are evaluated with the frames that the TPOG was computed from",
+            "the traffic is a finished file, so sites are evaluated with the frames that the TPOG was computed from: "
+            f"{n_shared:,} of {len(vehicles):,} vehicles ({n_shared / len(vehicles):.0%}) are in both",
             "Use a network or a sumocfg to simulate held-out traffic.",
         )
-    ]
+
+
+def _fixed_departure_warnings(scenario: Scenario) -> Iterator[Diagnostic]:
+    """Warn about vehicles of a user's demand that depart at the same time with any seed."""
+    for period in scenario.by_period().values():
+        if not period.traffic.has_user_demand:
+            continue
+        demand = sumo_folder.demand_files(period).files
+        paths = [path for option in user_files.DEMAND_OPTIONS for path in demand.get(option, ())]
+        counts = departures.count_departures(paths)
+        total = counts.redrawn + counts.fixed
+        if counts.fixed:
+            yield Diagnostic(
+                "departures not redrawn",
+                sumo_folder.traffic_location(period),
+                f"{counts.fixed:,} of {total:,} vehicles and flows ({counts.fixed / total:.0%}) have departures that"
+                " cannot be redrawn, so the held-out traffic and that of the TPOG have them in common",
+                "Use departure times in seconds, or flows.",
+            )
 
 
 def _check_any_vehicle(scenario: Scenario, record: HeldOutTraffic, frames: Sequence[TrafficFrame]) -> None:
@@ -123,7 +150,11 @@ def _check_any_vehicle(scenario: Scenario, record: HeldOutTraffic, frames: Seque
 
 
 def validation_metadata(
-    scenario: Scenario, record: HeldOutTraffic, detectors: Sequence[str], warnings: Sequence[Diagnostic]
+    scenario: Scenario,
+    record: HeldOutTraffic,
+    sample: TrafficSample,
+    detectors: Sequence[str],
+    warnings: Sequence[Diagnostic],
 ) -> dict[str, Any]:
     """Return the metadata that all artefacts of a validation contain."""
     warnings_json = {WARNINGS_KEY: [warning.to_json() for warning in warnings]}
@@ -132,8 +163,9 @@ def validation_metadata(
         "scenario": {"name": scenario.name, "hash": files.hash_json(scenario.model_dump(mode="json"))},
         "seed": scenario.seed,
         "unseen_seed": record.scenario.seed,
-        "frames": record.frames,
-        "apart_s": held_out_traffic.FRAME_SPACING_S,
+        "frames": sample.frames,
+        "apart_s": sample.apart_s,
+        "vehicles": sample.vehicles,
         "shown": {detector: main_measure(detector) for detector in detectors},
         **with_relative_paths(scenario.folder, warnings_json),
     }

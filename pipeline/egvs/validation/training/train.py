@@ -26,7 +26,7 @@ from egvs.scenario.model import Scenario
 from egvs.validation.cloud_simulation import CloudSimulator
 from egvs.validation.detection_metrics import EvaluationFrames, GroundTruth, evaluate
 from egvs.validation.detectors.pointpillars import Convention, PointPillars
-from egvs.validation.held_out_traffic import HeldOutTraffic, prepare_held_out_traffic
+from egvs.validation.held_out_traffic import MIN_SPACING_S, HeldOutTraffic, prepare_held_out_traffic
 from egvs.validation.sweeps import Detections, detections_in_roi
 from egvs.validation.training import pillar_net
 from egvs.validation.training.pillar_net import Batch, PillarNet, compute_loss
@@ -191,7 +191,9 @@ def _record_traffic(
     traffic_seed = int(sequence.generate_state(1, np.uint64)[0]) >> 33
     reseeded = scenario.model_copy(update={"seed": traffic_seed})
     record_folder = folder / f"{scenario.name}-{stream}"
-    record = prepare_held_out_traffic(reseeded, record_folder, frames, jobs=jobs, progress=progress)
+    record = prepare_held_out_traffic(
+        reseeded, record_folder, frames, apart_s=MIN_SPACING_S, jobs=jobs, progress=progress
+    )
     if not any(len(frame.target_rows(record.scene.roi)) for frame in record.read()):
         problem = f"no vehicle in any of {frames} frames"
         raise InputError(f"{scenario.file}: roi", problem, "Use a junction with traffic in its region.")
