@@ -175,7 +175,7 @@ SOURCE_BEFORE = {
 }
 """Code lines behind the key of each stage before the layout with one module per subject."""
 
-GROWTH = {"scan": 1.11, "traffic": 1.15, "tpog": 1.155, "score": 1.105, "report": 1.2}
+GROWTH = {"check": 1.105, "scan": 1.11, "traffic": 1.15, "tpog": 1.155, "score": 1.105, "report": 1.2}
 """Allowed growth, 1.1 for the others: a stage runs again whenever a line behind its key changes."""
 
 
