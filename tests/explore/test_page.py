@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import gc
 import math
 import socket
@@ -261,6 +262,58 @@ def test_opened_link_shows_its_view(page: Page, session: Session) -> None:
     assert page.wait_until_idle(30)
     assert "nobody" in page.controls.status.content
     assert page.view.site.pose == Pose(10.5, 12, 4)
+
+
+BAD_VALUES = [
+    ("z_m", math.inf, "z_m: expected a number from -1e+08 to 1e+08, got inf"),
+    ("yaw_deg", math.nan, "yaw_deg: expected a number from -1e+08 to 1e+08, got nan"),
+    ("sensor", "nothing", "unknown sensor 'nothing'"),
+    ("layer", "sky", "layer: expected one of none, traffic, "),
+    ("period", "noon", "period: expected no value, got 'noon'"),
+    ("compared_site", "nobody", "beside: expected one of pole_a, pole_b, got 'nobody'"),
+    ("score", "best", "score.rank_by: expected "),
+    ("gamma", math.nan, "score.gamma: expected "),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "message"), BAD_VALUES)
+def test_bad_value_of_a_browser_is_rejected(page: Page, name: str, value: object, message: str) -> None:
+    panel = page.controls
+    control = panel.numbers.get(name) or getattr(panel, name)
+    rating, view, before = page.rating, page.view, control.value
+    control._impl.value = value  # as viser does when a browser sends it
+    for update in control._impl.update_cb:
+        update(viser.GuiEvent(object(), 0, control))
+    assert page.wait_until_idle(30)
+    assert message in panel.status.content.replace("\\", "")
+    assert (page.rating, page.view, control.value) == (rating, view, before)
+    move_and_wait(page, "pole_a", Pose(11, 12, 3))
+    assert page.rating == page.session.rate("pole_a", Pose(11, 12, 3))
+
+
+@pytest.mark.parametrize(
+    ("position", "wxyz"), [((math.inf, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)), ((0.0, 0.0, 3.0), (0.0,) * 4)]
+)
+def test_impossible_drag_is_rejected(page: Page, position: tuple[float, ...], wxyz: tuple[float, ...]) -> None:
+    where = page.gizmo.position.tolist()
+    page.gizmo._impl.position, page.gizmo._impl.wxyz = np.array(position), np.array(wxyz)
+    asyncio.run(page._on_gizmo(viser.TransformControlsEvent(None, 7, page.gizmo, "update")))
+    assert page.wait_until_idle(30)
+    assert "the page: sensor: expected a position and an angle" in page.controls.status.content.replace("\\", "")
+    assert page.gizmo.position.tolist() == where
+
+
+def test_page_goes_on_after_a_layer_that_fails(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_: object) -> str:
+        raise InputError("trajectories.parquet", "no such file")
+
+    monkeypatch.setitem(drawing._DRAW_FUNCTIONS, "replay", fail)
+    page.request(layer="replay")
+    assert page.wait_until_idle(30)
+    assert "no such file" in page.controls.status.content
+    assert (page.view.layer, page.controls.layer.value) == ("none", LAYERS["none"])
+    move_and_wait(page, "pole_a", Pose(11, 12, 3))
+    assert page.rating == page.session.rate("pole_a", Pose(11, 12, 3))
 
 
 def test_gizmo_follows_when_dragging_browser_disconnects(page: Page) -> None:

@@ -226,7 +226,7 @@ class Controls:
         self.plays = gui.add_checkbox("play", False)
         self.legend = gui.add_html("")
         self.dark = gui.add_checkbox("dark", False)
-        self._request_on_update(self.layer, lambda: {"layer": _LAYERS_BY_LABEL[self.layer.value]})
+        self._request_on_update(self.layer, lambda: {"layer": _LAYERS_BY_LABEL.get(self.layer.value, self.layer.value)})
         self._request_on_update(self.ring, lambda: {"ring": int(self.ring.value)})
         self._request_on_update(
             self.compared_site, lambda: {"beside": _name_or_empty(self.compared_site.value, _BEST_OTHER)}

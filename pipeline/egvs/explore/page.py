@@ -2,7 +2,7 @@
 
 All browsers share one state. What users do (gizmo, numbers, clicks, links) only requests a view;
 :meth:`Page.run` shows the latest requested view, in the thread that called it. So however fast somebody drags, the
-last number is that of the last pose.
+last number is that of the last pose. A request with an invalid value is rejected with a message, and the page goes on.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import gc
 import io
+import math
 import shlex
 import socket
 import threading
@@ -31,7 +32,16 @@ from egvs.explore.access import KEY_PARAMETER, AccessGuard
 from egvs.explore.controls import Controls, PanelContent, show_modal
 from egvs.explore.session import MovingPlan, Playback, Session
 from egvs.explore.settings import SessionFactory
-from egvs.explore.view_state import SAVED_SITES, Camera, View, decode_view, encode_view, save_pose, unused_file_name
+from egvs.explore.view_state import (
+    SAVED_SITES,
+    Camera,
+    View,
+    check_view,
+    decode_view,
+    encode_view,
+    save_pose,
+    unused_file_name,
+)
 from egvs.sensors.sites import Pose, Site
 
 HOST = "127.0.0.1"
@@ -45,6 +55,8 @@ FREE_MEMORY_EVERY = 32
 """Moves after which unused memory is returned to the system."""
 
 _SHUTDOWN_S = 5.0
+_WHERE = "the page"
+"""Used in messages about invalid values."""
 
 
 def check_port_free(port: int) -> None:
@@ -142,9 +154,19 @@ class Page:
         return f"http://{HOST}:{self.server.get_port()}"
 
     def request(self, **changes: Any) -> None:
-        """Request changes of the view (fields by name), in addition to those that were requested before."""
+        """Request changes of the view (fields by name), in addition to those that were requested before.
+
+        Changes to an invalid view are rejected: the page shows the reason.
+        """
         with self._changed:
-            self._requested, self._has_request = replace(self._requested, **changes), True
+            view = replace(self._requested, **changes)
+            try:
+                check_view(view, self._initial_session, _WHERE)
+            except InputError as error:
+                self._notice = str(error)
+            else:
+                self._requested = view
+            self._has_request = True
             self._changed.notify_all()
 
     def run(self) -> None:
@@ -158,7 +180,7 @@ class Page:
                     next_frame = (self._requested.frame + 1) % self._playback.frames
                     self._requested = replace(self._requested, frame=next_frame)
                 view, self._has_request, self._is_busy = self._requested, False, True
-            self._show(view)
+            self._show_or_reject(view)
             with self._changed:
                 self._is_busy = False
                 self._changed.notify_all()
@@ -267,6 +289,12 @@ class Page:
 
     async def _on_gizmo(self, event: viser.TransformControlsEvent) -> None:
         """Handle a drag; a coroutine, so that viser keeps the order of events."""
+        values = [*event.target.position, *event.target.wxyz]
+        if not all(map(math.isfinite, values)) or not any(event.target.wxyz):
+            self._notice = str(InputError(f"{_WHERE}: sensor", f"expected a position and an angle, got {values}"))
+            self._dragging_client = None
+            self.request()
+            return
         position_m = np.asarray(event.target.position, dtype=np.float64) + self.zero_m
         pose = drawing.dragged_pose(self.view.site.pose, position_m.tolist(), event.target.wxyz.tolist())
         self.drag(event.client_id, pose, is_finished=event.phase == "end")
@@ -337,6 +365,19 @@ class Page:
         client.send_file_download(f"{self.session.scenario.name}.png", file.getvalue(), save_immediately=True)
 
     # ---- showing a view
+
+    def _show_or_reject(self, view: View) -> None:
+        """Show a view; if that fails, show the one before and the reason, without a layer, which may have failed."""
+        before = self.session, self._all_periods, self.plan, self._playback, self.rating, self.view
+        try:
+            self._show(view)
+        except (EgvsError, OSError) as error:
+            self._notice = str(error)
+            self.session, self._all_periods, self.plan, self._playback, self.rating, self.view = before
+            without_layer = replace(self.view, layer="none")
+            with self._changed:
+                self._requested = without_layer
+            self._show(without_layer)
 
     def _show(self, view: View) -> None:
         """Compute the scores of a view, and update scene and panel."""
