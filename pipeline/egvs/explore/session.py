@@ -34,6 +34,7 @@ from egvs.core.errors import Diagnostic, InputError
 from egvs.core.grid import Grid
 from egvs.placement import problem_builder
 from egvs.placement.refinement import PlanPoses
+from egvs.report.formatting import SCORE_LABELS
 from egvs.scenario.model import Scenario
 from egvs.scoring import blindspots
 from egvs.scoring.blindspots import CELL_M, SpotVisibility, VehicleSpots
@@ -57,6 +58,12 @@ from egvs.validation.cloud_simulation import CloudSimulator, VehicleMeshes, swee
 from egvs.world.carriageway import Carriageway
 
 Floats = NDArray[np.float64]
+
+
+def format_score(name: str, value: float) -> str:
+    """Return a score with its name and unit, e.g. "egvs 1,234 bit" or "expected_detections 61.3%"."""
+    label = SCORE_LABELS[name]
+    return f"{name} {label.value(value)} {label.unit}".strip()
 
 
 _SCORES = RunFolder.scores.name
@@ -157,6 +164,13 @@ class PoseScore:
     scores: Mapping[str, float]
     rank: int
     findings: tuple[Diagnostic, ...] = ()
+
+    def __repr__(self) -> str:
+        if not self.is_feasible:
+            problems = "; ".join(str(finding) for finding in self.findings if finding.is_error)
+            return f"PoseScore({self.site.name}: no score, {problems})"
+        scores = ", ".join(format_score(name, value) for name, value in self.scores.items())
+        return f"PoseScore({self.site.name}: rank {self.rank}, {scores})"
 
     @property
     def is_feasible(self) -> bool:
