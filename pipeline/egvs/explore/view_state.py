@@ -47,6 +47,9 @@ LAYERS = {
 }
 """Layers over the scene: name in a link, and on the page."""
 
+FIRST_LAYER = "traffic"
+"""The layer of a page that is opened without a link."""
+
 T = TypeVar("T")
 D = TypeVar("D")
 _POSE_PARTS = ("x", "y", "z", "yaw", "pitch", "roll")
@@ -126,7 +129,7 @@ class View:
     site: Site
     settings: Settings
     period: str = ""
-    layer: str = "none"
+    layer: str = FIRST_LAYER
     ring: int = 0
     frame: int = 0
     beside: str = ""
@@ -168,7 +171,7 @@ def encode_view(view: View, initial: View, camera: Camera | None = None) -> str:
         parts["score"] = view.settings.rank_by
     if view.settings.effects != initial.settings.effects:
         parts["effects"] = ",".join(sorted(view.settings.effects))
-    for name, default in (("period", ""), ("layer", "none"), ("ring", 0), ("frame", 0), ("beside", "")):
+    for name, default in (("period", ""), ("layer", FIRST_LAYER), ("ring", 0), ("frame", 0), ("beside", "")):
         value = getattr(view, name)
         if value != default:
             parts[name] = str(value)
@@ -215,7 +218,7 @@ def decode_view(
         site=site,
         settings=settings,
         period=reader.text("period", ""),
-        layer=reader.text("layer", "none"),
+        layer=reader.text("layer", FIRST_LAYER),
         ring=reader.whole_number("ring"),
         frame=reader.whole_number("frame"),
         beside=reader.text("beside", ""),
