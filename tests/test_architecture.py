@@ -135,6 +135,7 @@ USES = {
     "World": SCENE + "isinstance(scene.world, World) and scene.world.triangles_m.shape[1:] == (3, 3)",
     "build_scene": "build_scene(__import__('egvs').load('mini')).sites",
     "load": "load('mini').name == 'mini'",
+    "open_session": "open_session('run').ranked[0].rank == 1",
     "place": "len(place(__import__('egvs').load('mini', ['placement.count=1']), 'placed').sensors) == 1",
     "read_scans": "len(read_scans('run/scans.parquet').to_pandas())",
     "read_scores": "list(read_scores('run/scores.parquet').to_pandas().site) == ['pole_a', 'pole_b']",

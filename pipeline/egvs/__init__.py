@@ -15,7 +15,13 @@ From a notebook::
     tpog = egvs.read_tpog("runs/trial/tpog.parquet")
     tpog.p  # share of frames in which each voxel is occupied
 
-Any pose, not only the scenario's sites, in milliseconds::
+Any pose, not only the scenario's sites, with all scores of the run::
+
+    session = egvs.open_session("runs/trial")
+    rated = session.rate("c03", egvs.Pose(x_m=12.0, y_m=30.0, z_m=4.5, yaw_deg=180.0))  # c03's sensor, moved
+    rated.scores["expected_detections"]
+
+Empty scans, and the scores that need no recorded vehicles, in milliseconds::
 
     scene = egvs.build_scene(scenario)
     scanner, scorer = egvs.Scanner(scene), egvs.Scorer(scene, tpog)
@@ -44,6 +50,7 @@ if TYPE_CHECKING:
     from egvs.artefacts.tpog import Tpog, read_tpog
     from egvs.artefacts.traffic_frames import read_trajectories
     from egvs.core.errors import EgvsError, InputError, RunError
+    from egvs.explore.settings import open_session
     from egvs.placement.plan import JointScore, place
     from egvs.runs.run import run
     from egvs.runs.verification import verify
@@ -74,6 +81,7 @@ __all__ = [
     "__version__",
     "build_scene",
     "load",
+    "open_session",
     "place",
     "read_scans",
     "read_scores",
@@ -92,6 +100,7 @@ __getattr__, __dir__ = lazy_exports(
         "artefacts.tpog": ["Tpog", "read_tpog"],
         "artefacts.traffic_frames": ["read_trajectories"],
         "core.errors": ["EgvsError", "InputError", "RunError"],
+        "explore.settings": ["open_session"],
         "placement.plan": ["JointScore", "place"],
         "runs.run": ["run"],
         "runs.verification": ["verify"],

@@ -59,7 +59,7 @@ def test_joins_scores_and_ranks_junctions(city: City, tmp_path: Path) -> None:
     scores = results.read_city_scores(ran.out)
     assert scores.column("junction").to_pylist() == ["east", "east", "west", "west"]
     assert scores.column("owner").to_pylist() == ["city", "city", None, None]
-    assert pq.read_table(ran.out / "scores" / "junction=west").num_rows == 2
+    assert pq.read_table(ran.out / "scores" / "junction_west.parquet").num_rows == 2
     table, metadata = parquet.read_artefact(ran.out / "junctions.parquet", "city")
     assert metadata["rank_by"] == "egvs"
     best = {name: max(s["egvs"] for s in scores.to_pylist() if s["junction"] == name) for name in ("east", "west")}
@@ -101,7 +101,7 @@ def test_runs_one_junction_with_overrides(city: City, tmp_path: Path) -> None:
     options = CityRunOptions(junctions=["east"], overrides=["score.gamma=2"])
     ran = city_run.run_city(city, tmp_path / "out", options)
     assert [result.junction.id for result in ran.results] == ["east"]
-    assert [path.name for path in (ran.out / "scores").iterdir()] == ["junction=east"]
+    assert [path.name for path in (ran.out / "scores").iterdir()] == ["junction_east.parquet"]
     assert egvs.load(city.folder / "junctions" / "east").score.gamma == 4  # overridden, not written
     assert '"gamma": 2' in (results.junction_run_folder(ran.out, "east") / "run.json").read_text()
     with pytest.raises(InputError, match=r"--junction north: no such junction in .* Use one of west, east"):

@@ -50,6 +50,10 @@ def test_reads_table_as_written(tmp_path: Path) -> None:
     [
         ([], "junctions.csv: the table has no junctions. Add at least one row"),
         ([ROW, ROW.replace("j1", "J1")], "junction J1: this name occurs twice"),
+        ([ROW.replace("j1", "caf\u00e9"), ROW.replace("j1", "cafe\u0301")], "this name occurs twice"),
+        ([ROW.replace("j1", '"a\nb"')], r"junction: invalid name 'a\nb'"),
+        ([ROW.replace("10.5", "1_0")], "junction j1: x_m: expected a number from -1e+08 to 1e+08, got '1_0'"),
+        ([ROW.replace("50.1", "\u0665\u0660")], "lat_deg: expected a number from -90 to 90, got '\u0665\u0660'"),
         ([ROW.replace("j1", "a/b")], "junction a/b: junction: invalid name 'a/b'"),
         ([ROW.replace("10.5", "nan")], "junction j1: x_m: expected a number from -1e+08 to 1e+08, got 'nan'"),
         ([ROW.replace("50.1", "91")], "junction j1: lat_deg: expected a number from -90 to 90, got '91'"),
@@ -103,6 +107,18 @@ def test_rejects_missing_or_damaged_file(tmp_path: Path) -> None:
     (folder / "junctions.csv").unlink()
     with pytest.raises(InputError, match=r"junctions\.csv: no such file. Give a CSV table .* Use the columns"):
         model.load_city(folder)
+
+
+@pytest.mark.parametrize("link", ["traffic", "traffic/periods", "traffic/periods/rush"])
+def test_rejects_traffic_folder_outside_the_city(tmp_path: Path, link: str) -> None:
+    folder = write_city(tmp_path / "town", ROW)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (folder / link).parent.mkdir(parents=True, exist_ok=True)
+    (folder / link).symlink_to(elsewhere, target_is_directory=True)
+    with pytest.raises(InputError) as caught:
+        model.load_city(folder)
+    assert f"{folder / link}: expected a folder, got a link to {elsewhere}. Remove the link" in str(caught.value)
 
 
 def test_editor_schema_is_up_to_date() -> None:

@@ -15,7 +15,7 @@ import egvs
 from egvs.artefacts.tpog import Tpog
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.grid import Grid, Roi
-from egvs.explore import drawing
+from egvs.explore import drawing, road_meshes
 from egvs.sensors.sensor import rotation_world_sensor
 from egvs.sensors.sites import Pose
 from egvs.traffic.network import Lane, Permission
@@ -75,7 +75,7 @@ def test_region_has_twelve_edges() -> None:
 
 def test_lane_is_a_strip_of_its_width_and_slope() -> None:
     lane = Lane("0,0,1 10,0,2 20,0,2", "lane", 3.0, 20.0, Permission(None, frozenset()))
-    strip = drawing.lane_mesh(Carriageway(("lane",), (lane,)), (0.0, 0.0, 0.0))
+    strip = road_meshes.lane_mesh(Carriageway(("lane",), (lane,)), (0.0, 0.0, 0.0))
     corners = strip.points[strip.faces].astype(np.float64)
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2.0
     assert np.isclose(areas.sum(), 3.0 * (np.hypot(10.0, 1.0) + 10.0))
@@ -85,7 +85,7 @@ def test_lane_is_a_strip_of_its_width_and_slope() -> None:
 
 def test_two_lanes_share_no_corner() -> None:
     lane = Lane("0,0 10,0", "lane", 3.0, 10.0, Permission(None, frozenset()))
-    both = drawing.lane_mesh(
+    both = road_meshes.lane_mesh(
         Carriageway(("a", "b"), (lane, Lane("0,9 10,9", "b", None, 10.0, lane.permission))), (0, 0, 0)
     )
     assert both.faces.max() == 7

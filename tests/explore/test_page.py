@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import gc
 import math
 import socket
@@ -109,7 +110,7 @@ def test_controls_and_gizmo_show_the_pose(page: Page) -> None:
     pose = Pose(10.5, 12.25, 4.125, 33.0, -7.5, 2.0)
     move_and_wait(page, "pole_a", pose)
     assert {name: number.value for name, number in page.controls.numbers.items()} == pose.__dict__
-    assert page.controls.site.value.endswith("pole_a: 993.0")
+    assert page.controls.site.value.endswith("pole_a: 993.0 bit")
     assert (page.gizmo.position + page.zero_m).tolist() == [10.5, 12.25, 4.125]
     assert page.label.text == f"pole_a  rank {page.rating.rank}"
 
@@ -251,6 +252,64 @@ def test_memory_for_earlier_poses_sensors_and_sessions_is_freed(page: Page, sess
     assert page.rating == session.rate("pole_a", page.view.site.pose, "small")
 
 
+def test_page_opens_with_traffic_names_of_poles_north_and_scale(page: Page) -> None:
+    page.request(site=page.session.candidates["pole_b"].site)
+    assert page.wait_until_idle(30)
+    assert page.controls.layer.value == LAYERS["traffic"]
+    assert page.server.scene.get_handle_by_name("/layer") is not None
+    scene = page.server.scene
+    assert scene.get_handle_by_name("/map/north/label").text == "N"
+    assert scene.get_handle_by_name("/map/scale/label").text == "5 m"
+    names = [scene.get_handle_by_name(f"/poles/{number}") for number in (0, 1)]
+    assert [label and label.text for label in names] == [None, "pole_a"]  # the gizmo names the selected one
+    page.request(site=page.session.candidates["pole_a"].site)
+    assert page.wait_until_idle(30)
+    names = [scene.get_handle_by_name(f"/poles/{number}") for number in (0, 1)]
+    assert [label and label.text for label in names] == ["pole_b", None]
+
+
+def test_height_slider_moves_the_sensor(page: Page) -> None:
+    page.request(site=page.session.candidates["pole_a"].site)
+    assert page.wait_until_idle(30)
+    slider = page.controls.height
+    slider._impl.value = 4.5  # as viser does when a browser sends it
+    for update in slider._impl.update_cb:
+        update(viser.GuiEvent(object(), 0, slider))
+    assert page.wait_until_idle(30)
+    assert page.rating.site.pose == Pose(10.0, 12.0, 4.5)
+    assert page.controls.numbers["z_m"].value == 4.5
+    move_and_wait(page, "pole_a", Pose(10.0, 12.0, 40.0))
+    assert slider.value == slider.max
+
+
+def test_second_sensor_is_added_by_one_click(page: Page) -> None:
+    moved = replace(page.session.candidates["pole_a"].site, pose=Pose(10.5, 12.25, 4.0))
+    page.request(site=moved)
+    page.add_sensor()
+    assert page.wait_until_idle(60)
+    assert page.plan is not None
+    assert list(page.plan.sites) == ["pole_a", "pole_b"]
+    assert page.plan.sites["pole_a"] == moved
+    assert page.plan.joint > page.rating.scores["egvs"]
+    assert "**plan** pole\\_a, pole\\_b: EGVS" in page.controls.status.content
+    assert page.server.scene.get_handle_by_name("/plan/label1").text == "pole_b: in the plan"
+    page.add_sensor()
+    assert page.wait_until_idle(60)
+    assert "All candidates are in the plan" in page.controls.status.content
+    page.reset_plan()
+    assert page.wait_until_idle(60)
+    assert page.plan is None
+    assert "**plan**" not in page.controls.status.content
+
+
+def test_impossible_sensor_starts_no_plan(page: Page) -> None:
+    move_and_wait(page, "pole_a", Pose(16, 6, 3))
+    page.add_sensor()
+    assert page.wait_until_idle(60)
+    assert page.plan is None
+    assert "cannot be mounted" in page.controls.status.content
+
+
 def test_opened_link_shows_its_view(page: Page, session: Session) -> None:
     opener = with_key(page)
     link = f"{page.address}&site=pole_a&pose=10.5,12,4,0,0,0&layer=seen&camera=20,-30,40,20,0,2.5"
@@ -261,6 +320,58 @@ def test_opened_link_shows_its_view(page: Page, session: Session) -> None:
     assert page.wait_until_idle(30)
     assert "nobody" in page.controls.status.content
     assert page.view.site.pose == Pose(10.5, 12, 4)
+
+
+BAD_VALUES = [
+    ("z_m", math.inf, "z_m: expected a number from -1e+08 to 1e+08, got inf"),
+    ("yaw_deg", math.nan, "yaw_deg: expected a number from -1e+08 to 1e+08, got nan"),
+    ("sensor", "nothing", "unknown sensor 'nothing'"),
+    ("layer", "sky", "layer: expected one of none, traffic, "),
+    ("period", "noon", "period: expected no value, got 'noon'"),
+    ("compared_site", "nobody", "beside: expected one of pole_a, pole_b, got 'nobody'"),
+    ("score", "best", "score.rank_by: expected "),
+    ("gamma", math.nan, "score.gamma: expected "),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "message"), BAD_VALUES)
+def test_bad_value_of_a_browser_is_rejected(page: Page, name: str, value: object, message: str) -> None:
+    panel = page.controls
+    control = panel.numbers.get(name) or getattr(panel, name)
+    rating, view, before = page.rating, page.view, control.value
+    control._impl.value = value  # as viser does when a browser sends it
+    for update in control._impl.update_cb:
+        update(viser.GuiEvent(object(), 0, control))
+    assert page.wait_until_idle(30)
+    assert message in panel.status.content.replace("\\", "")
+    assert (page.rating, page.view, control.value) == (rating, view, before)
+    move_and_wait(page, "pole_a", Pose(11, 12, 3))
+    assert page.rating == page.session.rate("pole_a", Pose(11, 12, 3))
+
+
+@pytest.mark.parametrize(
+    ("position", "wxyz"), [((math.inf, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)), ((0.0, 0.0, 3.0), (0.0,) * 4)]
+)
+def test_impossible_drag_is_rejected(page: Page, position: tuple[float, ...], wxyz: tuple[float, ...]) -> None:
+    where = page.gizmo.position.tolist()
+    page.gizmo._impl.position, page.gizmo._impl.wxyz = np.array(position), np.array(wxyz)
+    asyncio.run(page._on_gizmo(viser.TransformControlsEvent(None, 7, page.gizmo, "update")))
+    assert page.wait_until_idle(30)
+    assert "the page: sensor: expected a position and an angle" in page.controls.status.content.replace("\\", "")
+    assert page.gizmo.position.tolist() == where
+
+
+def test_page_goes_on_after_a_layer_that_fails(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_: object) -> str:
+        raise InputError("trajectories.parquet", "no such file")
+
+    monkeypatch.setitem(drawing._DRAW_FUNCTIONS, "replay", fail)
+    page.request(layer="replay")
+    assert page.wait_until_idle(30)
+    assert "no such file" in page.controls.status.content
+    assert (page.view.layer, page.controls.layer.value) == ("none", LAYERS["none"])
+    move_and_wait(page, "pole_a", Pose(11, 12, 3))
+    assert page.rating == page.session.rate("pole_a", Pose(11, 12, 3))
 
 
 def test_gizmo_follows_when_dragging_browser_disconnects(page: Page) -> None:
@@ -291,10 +402,10 @@ def test_plan_follows_its_sensors(mini: Path, tmp_path: Path) -> None:
     with serving(Page(open_session(mini, (), tmp_path / "run"), tmp_path / "scratch")) as served:
         scene = served.server.scene
         site = served.rating.site
-        text = f"**plan** pole\\_b: joint score {placed.joint:,.1f}; best additional sensor: pole\\_a"
+        text = f"**plan** pole\\_b: EGVS {placed.joint:,.1f} bit together; best next: pole\\_a"
         assert text in served.controls.status.content
         assert scene.get_handle_by_name("/plan/label0") is None  # the gizmo has a label
-        assert scene.get_handle_by_name("/plan/label1").text == "pole_a: best additional sensor"
+        assert scene.get_handle_by_name("/plan/label1").text == "pole_a: best next"
         moved = replace(site, pose=replace(site.pose, z_m=4.5))
         served.request(site=moved)
         assert served.wait_until_idle(60)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,10 +38,11 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
 
 
 finite = st.floats(-1e6, 1e6, allow_nan=False)
+pitch = st.floats(-90, 90)
 
 
 @given(
-    pose=st.builds(Pose, finite, finite, finite, finite, finite, finite),
+    pose=st.builds(Pose, finite, finite, finite, finite, pitch, finite),
     gamma=st.none() | st.floats(0, 1e9) | st.just(float("inf")),
     layer=st.sampled_from(sorted(LAYERS)),
     ring=st.integers(0, 200),
@@ -74,6 +76,8 @@ def test_link_to_initial_view_is_short(session: Session) -> None:
         ("pose=1,2,3", r"link: pose: expected 6 numbers x,y,z,yaw,pitch,roll, got '1,2,3'"),
         ("pose=1,2,3,4,5,nan", r"link: pose: expected 6 numbers x,y,z,yaw,pitch,roll, got '1,2,3,4,5,nan'"),
         ("pose=1,2,3,4,5,up", r"link: pose: expected 6 numbers x,y,z,yaw,pitch,roll, got 'up'"),
+        ("pose=1,2,1e9,4,5,6", r"link: z_m: expected a number from -1e\+08 to 1e\+08, got 1000000000\.0"),
+        ("pose=1,2,3,4,91,6", r"link: pitch_deg: expected a number from -90 to 90, got 91\.0"),
         ("sensor=nothing", r"link: sensor: .*nothing"),
         ("gamma=many", r"link: gamma: expected a number of at least 0, got 'many'"),
         ("gamma=-1", r"link: score\.gamma: expected a value greater than or equal to 0 or 'auto', got -1\.0"),
@@ -116,6 +120,15 @@ def test_users_file_is_not_changed(mini: Path, content: str) -> None:
     assert unused_file_name(mini) == "kept_sites-2.csv"
     (mini / "kept_sites-2.csv").write_text("mine")
     assert unused_file_name(mini) == "kept_sites-3.csv"
+
+
+def test_poses_that_are_saved_at_once_are_all_in_the_file(mini: Path) -> None:
+    with ThreadPoolExecutor(8) as pool:
+        names = list(pool.map(lambda _: save_pose(mini / SAVED_SITES, SITE, CANDIDATES), range(40)))
+    rows = (mini / SAVED_SITES).read_text().splitlines()[1:]
+    assert sorted(row.split(",")[0] for row in rows) == sorted(names)
+    assert len(set(names)) == 40
+    assert not list(mini.glob(".*.lock"))
 
 
 def test_saved_pose_gets_unused_name(mini: Path) -> None:

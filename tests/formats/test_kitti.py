@@ -52,6 +52,7 @@ def test_calibration_transforms_points_like_boxes():
         ("Car 0 0 0 0 0 50 50 1 1 4 0 0 9", "line 1: expected 15 values (a label) or 16 (a result with score), got 14"),
         ("Car 0 0 0 0 0 50 50 1 1 4 0 nan 9 0", "line 1: expected a finite number, got 'nan'"),
         ("Car 0 0 0 0 0 50 50 1 1 4 0 0 9 0 high", "line 1: expected a finite number, got 'high'"),
+        ("Car 0 0 0 0 0 50 50 1 1 4 0 0 1_0 0", "line 1: expected a finite number, got '1_0'"),
         ("Car 0 0 0 0 0 50 50 1 0 4 0 0 9 0", "line 1: expected height, width and length above 0, got 1 x 0 x 4 m"),
     ],
 )

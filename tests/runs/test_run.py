@@ -272,6 +272,7 @@ def test_notebook_lines_of_the_readme_run(mini: Path, tmp_path: Path, monkeypatc
     names: dict[str, object] = {}
     exec(code.group(1), names)  # the README's own words
     assert names["tpog"].p.max() <= 1.0  # type: ignore[attr-defined]
+    assert 0.0 < names["rated"].scores["expected_detections"] < 1.0  # type: ignore[attr-defined]
 
 
 def test_editor_schema_is_not_stale() -> None:

@@ -451,6 +451,8 @@ def test_scenes_and_sensors_can_be_pickled(mini: Path) -> None:
         ("elevation_deg,azimuth_deg\n1,\n", r"beam 0: azimuth_deg: .*a number .*got ''"),
         ("elevation_deg,azimuth_deg\n1\n", r"beam 0: azimuth_deg: .*a number .*got None"),
         ("elevation_deg,azimuth_deg\nnan,0\n", r"beam 0: elevation_deg: .*'nan'"),
+        ("elevation_deg,azimuth_deg\n1_0,0\n", r"beam 0: elevation_deg: .*'1_0'"),
+        ("elevation_deg,azimuth_deg\n\u0661,0\n", r"beam 0: elevation_deg: .*'\u0661'"),
         ("elevation_deg,azimuth_deg\nup,0\n", r"beam 0: elevation_deg: .*'up'"),
         (
             "elevation_deg,azimuth_deg\n-5,5,3,5\n",

@@ -137,6 +137,11 @@ class Tpog:
         """Share of the frames in which each voxel is occupied, (nx, ny, nz) float64."""
         return self.counts / self.frames
 
+    def __repr__(self) -> str:
+        shape = " x ".join(str(count) for count in self.grid.shape)
+        occupied = np.count_nonzero(self.counts)
+        return f"Tpog({shape} voxels of {self.grid.voxel_m:g} m, {occupied:,} ever occupied in {self.frames:,} frames)"
+
 
 def read_tpog(path: str | Path, period: str | None = None) -> Tpog:
     """Read ``tpog.parquet``.

@@ -18,6 +18,8 @@ import csv
 import io
 import json
 import math
+import os
+import unicodedata
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +28,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from egvs.core import limits, reading
 from egvs.core.errors import InputError
+from egvs.core.numbers import parse_decimal
 from egvs.scenario.effects_config import EffectsConfig
 from egvs.scenario.fields import MAX_COORDINATE_M, NAME_DESCRIPTION, Name, StrictModel
 from egvs.scenario.loading import check_unused_keys, default_name, format_validation_error
@@ -107,6 +110,8 @@ class City:
 def load_city(folder: str | Path) -> City:
     """Read and check a city.
 
+    Its folder of traffic must be inside it, because files are written there.
+
     Parameters
     ----------
     folder
@@ -115,7 +120,8 @@ def load_city(folder: str | Path) -> City:
     Raises
     ------
     InputError
-        When a file is missing or damaged, a key is unknown, or a junction occurs twice or has no scenario.
+        When a file is missing or damaged, a key is unknown, a junction occurs twice or has no scenario, or the folder
+        of traffic is a link.
     """
     path = Path(folder)
     file = path if path.is_file() else path / CITY_FILE
@@ -145,7 +151,17 @@ def load_city(folder: str | Path) -> City:
         if not scenario_file.is_file():
             hint = f"Create the scenario, or remove the row {junction.id} from {JUNCTIONS_FILE}."
             raise InputError(scenario_file, "no such file", hint)
+    _check_traffic_folder(city.folder / TRAFFIC_FOLDER)
     return city
+
+
+def _check_traffic_folder(folder: Path) -> None:
+    """Raise an InputError if the folder, or one in it, is a link: files would be written to another place."""
+    below = [Path(parent) / name for parent, names, _ in os.walk(folder) for name in names]
+    for path in (folder, *below):
+        if path.is_symlink():
+            problem = f"expected a folder, got a link to {os.path.realpath(path)}"
+            raise InputError(path, problem, "Remove the link; for another disk, move the whole city there.")
 
 
 def city_json_schema() -> str:
@@ -173,9 +189,10 @@ def read_junction_rows(path: Path, required: Sequence[str]) -> Iterator[tuple[st
     if not path.is_file():
         raise InputError(path, "no such file", f"Give a CSV table of junctions. {hint}")
     data = limits.read_bytes(path, limits.DOCUMENT)
-    names = set[str]()
+    keys = set[str]()
     try:
-        reader = csv.DictReader(data.decode("utf-8-sig").splitlines(), skipinitialspace=True, strict=True)
+        file = io.StringIO(data.decode("utf-8-sig"), newline="")
+        reader = csv.DictReader(file, skipinitialspace=True, strict=True)
         columns = list(reader.fieldnames or ())
         if not set(required) <= set(columns) <= set(JUNCTION_COLUMNS) or len(set(columns)) < len(columns):
             raise InputError(path, f"the columns are {', '.join(columns) or 'missing'}", hint)
@@ -184,23 +201,29 @@ def read_junction_rows(path: Path, required: Sequence[str]) -> Iterator[tuple[st
             if None in row or None in row.values():
                 problem = "has more or fewer values than the header has columns"
                 raise InputError(where, problem, "Give one value per column.")
-            _check_name(where, row["junction"], names)
-            names.add(row["junction"].casefold())
+            _check_name(where, row["junction"], keys)
+            keys.add(_folder_key(row["junction"]))
             yield where, row
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(path, f"cannot be read as CSV ({error})", "Use UTF-8 text with a header row.") from None
-    if not names:
+    if not keys:
         raise InputError(path, "the table has no junctions", "Add at least one row.")
 
 
-def _check_name(where: str, name: str, other_names: Collection[str]) -> None:
-    """Raise an InputError for a name that no folder can have; some file systems ignore case."""
+def _folder_key(name: str) -> str:
+    """Return a text that is the same for names of one folder: some file systems ignore case and Unicode normal form."""
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
+
+
+def _check_name(where: str, name: str, other_keys: Collection[str]) -> None:
+    """Raise an InputError for a name that no folder can have, or that belongs to the folder of another name."""
     try:
         TypeAdapter(Name).validate_python(name)
     except ValidationError:
         raise InputError(f"{where}: junction", f"invalid name {repr(name)[:80]}", NAME_DESCRIPTION) from None
-    if name.casefold() in other_names:
-        raise InputError(where, "this name occurs twice", "Give each junction a unique name.")
+    if _folder_key(name) in other_keys:
+        hint = "Give each junction a name that differs in more than case and Unicode normal form."
+        raise InputError(where, "this name occurs twice", hint)
 
 
 def _parse_junction(where: str, row: dict[str, str]) -> CityJunction:
@@ -216,7 +239,7 @@ def parse_number(where: str, row: dict[str, str], column: str) -> float:
     """Return a coordinate of a table of junctions; raise an InputError if it is no number or out of range."""
     limit = _MAX_COORDINATES[column]
     try:
-        value = float(row[column])
+        value = parse_decimal(row[column])
     except ValueError:
         value = math.nan
     if not abs(value) <= limit:

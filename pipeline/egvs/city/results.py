@@ -1,7 +1,7 @@
 """Results of a city run: the table of junctions, the scores of all sites, and the plan of the city.
 
 OUT/junctions/<ID>/                     the run of a junction, as ``egvs run`` writes it
-OUT/scores/junction=<ID>/scores.parquet a copy of its scores: a dataset partitioned by junction
+OUT/scores/junction_<ID>.parquet        its scores, with a column of the junction: the files are one dataset
 OUT/junctions.parquet                   one row per junction, the largest gain first
 OUT/plan.parquet                        one row per sensor of the city's plan
 OUT/curve.parquet                       the best plans for fewer sensors, or lower costs
@@ -36,7 +36,10 @@ RUNS_FOLDER, SCORES_DATASET, JUNCTIONS_TABLE = "junctions", "scores", "junctions
 PLAN_TABLE, CURVE_TABLE = "plan.parquet", "curve.parquet"
 """In the folder of a city run."""
 
-_SCORES_FILE, _PARTITION_PREFIX = RunFolder.scores.name, "junction="
+_JUNCTION_COLUMN = "junction"
+_SCORES_PREFIX = f"{_JUNCTION_COLUMN}_"
+"""The junction is not in the name of a folder, ``junction=007``, because readers of datasets make 7 of it."""
+
 _PLAN_SCHEMA, _CURVE_SCHEMA = "city_plan", "city_curve"
 _INPUT_STAGES = ("statics", "scan", "traffic", "tpog")
 """The stages that a plan is made from."""
@@ -260,7 +263,7 @@ def junction_run_folder(out: Path, junction: str) -> Path:
 
 
 def _scores_path(out: Path, junction: str) -> Path:
-    return junction_run_folder(out, junction) / _SCORES_FILE
+    return junction_run_folder(out, junction) / RunFolder.scores.name
 
 
 def read_junction_results(out: Path, junctions: Sequence[CityJunction]) -> tuple[JunctionResult, ...]:
@@ -351,14 +354,31 @@ def hash_scores(out: Path, junctions: Sequence[str]) -> str:
 
 
 def _write_scores(out: Path, junctions: Sequence[str]) -> None:
-    """Write the dataset of scores; remove the partitions of other junctions."""
-    partitions = {f"{_PARTITION_PREFIX}{name}": name for name in junctions}
-    for folder in (out / SCORES_DATASET).glob(f"{_PARTITION_PREFIX}*"):
-        if folder.name not in partitions:
-            shutil.rmtree(folder)
-    for partition, name in partitions.items():
-        with files.atomic_write(out / SCORES_DATASET / partition / _SCORES_FILE) as partial:
-            shutil.copyfile(_scores_path(out, name), partial)
+    """Write the dataset of scores; remove the files of other junctions, and the folders that earlier versions wrote."""
+    dataset = out / SCORES_DATASET
+    for folder in dataset.glob(f"{_JUNCTION_COLUMN}=*"):
+        shutil.rmtree(folder)
+    paths = {dataset / f"{_SCORES_PREFIX}{name}.parquet": name for name in junctions}
+    for path in dataset.glob(f"{_SCORES_PREFIX}*"):
+        if path not in paths:
+            path.unlink()
+    for path, name in paths.items():
+        _write_junction_scores(_scores_path(out, name), path, name)
+
+
+def _write_junction_scores(source: Path, path: Path, junction: str) -> None:
+    """Copy a table of scores, with the junction as another column; a user's column of this name is renamed."""
+    table, metadata = parquet.read_artefact(source, "scores")
+    columns = dict(zip(table.column_names, table.columns, strict=True))
+    users_column = columns.pop(_JUNCTION_COLUMN, None)
+    if users_column is not None:
+        columns[f"given_{_JUNCTION_COLUMN}"] = users_column
+    optional = tuple(name for name in parquet.optional_columns("scores") if name in columns)
+    extra = {name: column for name, column in columns.items() if name not in parquet.column_names("scores")}
+    extra[_JUNCTION_COLUMN] = pa.array([junction] * table.num_rows, pa.string())
+    with parquet.artefact_writer(path, "scores", optional, extra) as file:
+        file.write(columns | extra)
+        file.describe(metadata)
 
 
 def read_city_scores(out: str | Path) -> pa.Table:
@@ -379,15 +399,15 @@ def read_city_scores(out: str | Path) -> pa.Table:
     InputError
         When the folder has no city run, or a file is damaged.
     """
-    folders = sorted((Path(out) / SCORES_DATASET).glob(f"{_PARTITION_PREFIX}*"))
-    if not folders:
+    paths = sorted((Path(out) / SCORES_DATASET).glob(f"{_SCORES_PREFIX}*"))
+    if not paths:
         hint = "Give the folder of a finished egvs city run."
         raise InputError(Path(out) / SCORES_DATASET, "there are no scores in this folder", hint)
     tables = []
-    for folder in folders:
-        table, _ = parquet.read_artefact(folder / _SCORES_FILE, "scores")
-        junction = pa.array([folder.name.removeprefix(_PARTITION_PREFIX)] * table.num_rows, pa.string())
-        tables.append(table.replace_schema_metadata(None).add_column(0, "junction", junction))
+    for path in paths:
+        table, _ = parquet.read_artefact(path, "scores")
+        others = [name for name in table.column_names if name != _JUNCTION_COLUMN]
+        tables.append(table.select([_JUNCTION_COLUMN, *others]).replace_schema_metadata(None))
     return pa.concat_tables(tables, promote_options="default")
 
 

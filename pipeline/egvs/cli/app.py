@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.models import CommandInfo
 
 from egvs._version import __version__
 from egvs.cli import city, exit, place, validate
@@ -543,3 +544,35 @@ def store(
     elif max_size is not None:
         bound_bytes = cli_options.size_bytes(max_size)
     run_tables.print_removed(cache, cache.prune(bound_bytes))
+
+
+# ---- egvs --help
+
+COMMAND_GROUPS = {
+    "Start here": ("new", "demo", "check", "run"),
+    "Decide": ("place", "explore", "compare", "city"),
+    "Study": ("validate", "accuracy", "effects", "scores", "clouds", "train"),
+    "Stages of egvs run": ("traffic", "statics", "tpog", "scan", "score", "report"),
+    "Files": ("export", "figure", "sensors", "verify", "store"),
+}
+"""Groups of ``egvs --help``, and their commands."""
+
+
+def _group_commands() -> None:
+    """Show the commands in their groups, in the order of :data:`COMMAND_GROUPS`."""
+    order = [name for names in COMMAND_GROUPS.values() for name in names]
+    group_of = {name: group for group, names in COMMAND_GROUPS.items() for name in names}
+
+    def command_name(info: CommandInfo) -> str:
+        assert info.callback is not None
+        return info.name or info.callback.__name__
+
+    app.registered_commands.sort(key=lambda info: order.index(command_name(info)))
+    for command in app.registered_commands:
+        command.rich_help_panel = group_of[command_name(command)]
+    for group in app.registered_groups:
+        assert group.name is not None
+        group.rich_help_panel = group_of[group.name]
+
+
+_group_commands()

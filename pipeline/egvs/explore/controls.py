@@ -6,6 +6,7 @@ Controls only request changes (:meth:`PageActions.request`); the page then shows
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -16,6 +17,7 @@ import viser
 from egvs.explore.session import MovingPlan, PoseScore, Session
 from egvs.explore.settings import Settings
 from egvs.explore.view_state import LAYERS, View
+from egvs.report.formatting import SCORE_LABELS
 from egvs.scenario.score_config import OtherScore
 from egvs.sensors.sensor import CATALOGUE
 from egvs.sensors.sites import Pose, Site
@@ -26,7 +28,6 @@ MAX_LISTED = 20
 WORKING_TITLE = "## computing ..."
 """Shown while stages run with other settings."""
 
-_SHARE_SCORES = ("entropy_seen", "coverage", "expected_visibility", "expected_detections", "seen_well")
 _MARKDOWN_ESCAPES = str.maketrans({sign: f"\\{sign}" for sign in "\\`*_{}[]()<>#+-.!|"})
 
 _POSE_LABELS = {
@@ -40,7 +41,20 @@ _POSE_LABELS = {
 _LENGTH_STEP, _ANGLE_STEP = 0.001, 0.01
 _ALL_PERIODS, _BEST_OTHER = "all periods", "best other site"
 _LAYERS_BY_LABEL = {label: name for name, label in LAYERS.items()}
-_FIRST_SCORES = ("egvs", "points_on_target", "expected_detections")
+_FIRST_SCORES = ("expected_detections", "egvs", "points_on_target")
+_SLIDER_MARGIN_M = 6.0
+"""The slider reaches this far above the highest candidate."""
+
+HELP = (
+    "**Move the sensor**: drag the coloured arrows and squares; drag the rings to turn it. Or use the height slider and"
+    " the numbers under *pose*.",
+    "**Other sites**: click a ball, or choose from the list *site*, the best first. Darker balls have higher scores.",
+    "**Look around**: left button turns, right button moves, wheel zooms. The orange box is the region of interest.",
+    "**Layers** colour the road: where traffic is, what the sensor sees, which vehicles it misses.",
+    "**A second sensor**: *Add the best next sensor* shows which candidate adds most to the selected one.",
+    "**Keep a result**: *Save this pose* adds it to a sites file; *Link to this view* restores everything later.",
+)
+"""How to use the page, in markdown."""
 
 
 def describe_score(rating: PoseScore, rank_by: str, candidate: PoseScore, candidates: int) -> str:
@@ -65,12 +79,13 @@ def describe_score(rating: PoseScore, rank_by: str, candidate: PoseScore, candid
     if not rating.is_feasible:
         return f"## no score\n\n{findings_text}"
 
-    title = format_score(rank_by, rating.scores[rank_by])
+    label = SCORE_LABELS[rank_by]
+    title = f"{format_score(rank_by, rating.scores[rank_by])} {label.head if label.is_share else ''}".strip()
     before = candidate.scores[rank_by]
     if before > 0.0 and rating.site.pose != candidate.site.pose:
         title += f" ({rating.scores[rank_by] / before - 1.0:+.1%})"
-    rows = [f"| {escape_markdown(name)} | {format_score(name, value)} |" for name, value in rating.scores.items()]
-    rank = f"rank {rating.rank} of {candidates} by {escape_markdown(rank_by)}"
+    rows = [f"| {plain_name(name)} | {format_score(name, value)} |" for name, value in rating.scores.items()]
+    rank = f"rank {rating.rank} of {candidates} by {plain_name(rank_by)}"
     return "\n".join([f"## {title}\n\n{rank}\n\n| score | value |\n|---|---|", *rows, "", findings_text])
 
 
@@ -84,11 +99,11 @@ def describe_drawn_triangles(drawn: int, triangles: int) -> str:
 def describe_plan(plan: MovingPlan) -> str:
     """Describe the joint score of a plan with its current poses, and the best additional sensor."""
     names = ", ".join(map(escape_markdown, plan.sites))
-    joint = format_score(plan.poses.placement_problem.score, plan.joint)
-    text = f"\n\n**plan** {names}: joint score {joint}"
+    score = plan.poses.placement_problem.score
+    text = f"\n\n**plan** {names}: {plain_name(score)} {format_score(score, plan.joint)} together"
     if plan.best_next is not None:
         name, gain = plan.best_next
-        text += f"; best additional sensor: {escape_markdown(name)} (+{gain:,.4g})"
+        text += f"; best next: {escape_markdown(name)} (+{format_score(score, gain)})"
     return text
 
 
@@ -102,7 +117,7 @@ def ranking_table(ranked: Sequence[PoseScore], rank_by: str) -> str:
     rank_by
         The score that ranks.
     """
-    lines = [f"| rank | site | {escape_markdown(rank_by)} |", "|---|---|---|"]
+    lines = [f"| rank | site | {plain_name(rank_by)} |", "|---|---|---|"]
     for candidate in ranked[:MAX_LISTED]:
         score = format_score(rank_by, candidate.scores[rank_by])
         lines.append(f"| {candidate.rank} | {escape_markdown(candidate.site.name)} | {score} |")
@@ -116,11 +131,18 @@ def candidate_label(candidate: PoseScore, rank_by: str) -> str:
     return f"{candidate.rank}. {candidate.site.name}: {format_score(rank_by, candidate.scores[rank_by])}"
 
 
+def plain_name(score: str) -> str:
+    """Return the name of a score in words."""
+    return SCORE_LABELS[score].noun.removeprefix("the ")
+
+
 def format_score(name: str, value: float) -> str:
-    """Return a score with as many digits as a planner needs."""
-    if name in _SHARE_SCORES:
-        return f"{value:.2%}"
-    return f"{value:,.1f}" if abs(value) >= 100.0 else f"{value:.4g}"
+    """Return a score with its unit and as many digits as a planner needs."""
+    label = SCORE_LABELS[name]
+    if label.is_share:
+        return f"{value:.1%}"
+    number = f"{value:,.1f}" if abs(value) >= 100.0 else f"{value:.4g}"
+    return f"{number} {label.unit}".strip()
 
 
 def escape_markdown(text: str) -> str:
@@ -136,6 +158,12 @@ class PageActions(Protocol):
 
     def current_site(self, candidate: Site) -> Site:
         """Return where a candidate's sensor is now."""
+
+    def add_sensor(self) -> None:
+        """Request the best additional sensor."""
+
+    def reset_plan(self) -> None:
+        """Request the plan of the run folder."""
 
 
 @dataclass(frozen=True)
@@ -176,7 +204,7 @@ class Controls:
 
     Attributes
     ----------
-    site, sensor, numbers, layer, ring, compared_site, frame, plays, dark, score, gamma, effects, period
+    site, sensor, height, numbers, layer, ring, compared_site, frame, plays, dark, score, gamma, effects, period
         The controls.
     status, legend, ranking
         Texts.
@@ -192,6 +220,7 @@ class Controls:
         self.site = gui.add_dropdown("site", ("",), hint="Candidates, best first.")
         self.site.on_update(self._on_site)
         self.status = gui.add_markdown("")
+        gui.add_button("Help", color="gray").on_click(_client_callback(_show_help))
         with gui.add_folder("layer"):
             self._add_layer(content.frames)
             if content.note:
@@ -202,11 +231,18 @@ class Controls:
             self._add_settings(content.effects)
         for name, action in content.buttons.items():
             gui.add_button(name).on_click(_client_callback(action))
+        with gui.add_folder("plan"):
+            gui.add_button("Add the best next sensor").on_click(lambda _: page.add_sensor())
+            gui.add_button("Reset the plan", color="gray").on_click(lambda _: page.reset_plan())
         with gui.add_folder("ranking", expand_by_default=False):
             self.ranking = gui.add_markdown("")
 
     def _add_pose(self) -> None:
         gui, session = self._gui, self._session
+        heights_m = [candidate.site.pose.z_m for candidate in session.candidates.values()]
+        low_m, high_m = math.floor(session.scene.roi.origin_m[2]), math.ceil(max(heights_m) + _SLIDER_MARGIN_M)
+        self.height = gui.add_slider("height (m)", float(low_m), float(high_m), 0.1, float(low_m))
+        self._request_on_update(self.height, self._changed_height)
         self.numbers = {}
         for name, label in _POSE_LABELS.items():
             step = _ANGLE_STEP if name.endswith("_deg") else _LENGTH_STEP
@@ -226,7 +262,7 @@ class Controls:
         self.plays = gui.add_checkbox("play", False)
         self.legend = gui.add_html("")
         self.dark = gui.add_checkbox("dark", False)
-        self._request_on_update(self.layer, lambda: {"layer": _LAYERS_BY_LABEL[self.layer.value]})
+        self._request_on_update(self.layer, lambda: {"layer": _LAYERS_BY_LABEL.get(self.layer.value, self.layer.value)})
         self._request_on_update(self.ring, lambda: {"ring": int(self.ring.value)})
         self._request_on_update(
             self.compared_site, lambda: {"beside": _name_or_empty(self.compared_site.value, _BEST_OTHER)}
@@ -275,6 +311,7 @@ class Controls:
         _set_if_changed(self.sensor, "value", view.site.sensor)
         for name, value in asdict(view.site.pose).items():
             _set_if_changed(self.numbers[name], "value", value)
+        _set_if_changed(self.height, "value", min(max(view.site.pose.z_m, self.height.min), self.height.max))
         self._show_layer(view)
         _set_if_changed(self.score, "value", session.rank_by)
         _set_if_changed(self.gamma, "value", session.scenario.gamma)
@@ -312,6 +349,10 @@ class Controls:
             pose = Pose(**{name: float(number.value) for name, number in self.numbers.items()})
             self._page.request(site=replace(self._view.site, pose=pose, sensor=self.sensor.value))
 
+    def _changed_height(self) -> dict[str, Site]:
+        pose = replace(self._view.site.pose, z_m=float(self.height.value))
+        return {"site": replace(self._view.site, pose=pose)}
+
     def _on_back(self, _: viser.GuiEvent[Any]) -> None:
         self._page.request(site=self._session.candidates[self._view.site.name].site)
 
@@ -346,6 +387,11 @@ def _set_if_changed(control: Any, attribute: str, value: object) -> None:
     """Set an attribute of a control; each assignment sends a message to all browsers."""
     if getattr(control, attribute) != value:
         setattr(control, attribute, value)
+
+
+def _show_help(client: viser.ClientHandle) -> None:
+    """Open a window that says how to use the page."""
+    show_modal(client, "Help", HELP, {"Close": lambda: None})
 
 
 def show_modal(

@@ -24,14 +24,13 @@ from numpy.typing import NDArray
 from egvs.artefacts.tpog import Tpog
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.grid import Grid, Roi, Vec3
+from egvs.explore.road_meshes import LANE_HEIGHT_M, Mesh, junction_mesh, lane_mesh, marking_mesh
 from egvs.explore.session import MovingPlan, Playback, PoseScore, Session
 from egvs.explore.view_state import View
 from egvs.report import colours
 from egvs.scoring.targets import SEEN_WELL_POINTS
 from egvs.sensors.sites import Pose, Site
-from egvs.traffic.network import LANE_WIDTH_M
 from egvs.validation.cloud_simulation import MeshPart
-from egvs.world.carriageway import Carriageway
 from egvs.world.mesh import World
 
 Points = NDArray[np.float32]
@@ -45,36 +44,27 @@ Colour = tuple[int, int, int]
 
 _LIGHT_COLOURS: dict[str, Colour] = {
     "building": (205, 208, 216), "ground": (225, 222, 214), "tree_crown": (150, 190, 165), "lanes": (112, 118, 130),
-    "other": (150, 154, 166),
+    "junctions": (112, 118, 130), "markings": (250, 250, 250), "other": (150, 154, 166),
 }  # fmt: skip
 _DARK_COLOURS: dict[str, Colour] = {
     "building": (66, 70, 82), "ground": (34, 36, 42), "tree_crown": (52, 88, 66), "lanes": (52, 56, 66),
-    "other": (92, 96, 108),
+    "junctions": (52, 56, 66), "markings": (150, 154, 164), "other": (92, 96, 108),
 }  # fmt: skip
 _ROI_COLOUR = (232, 89, 12)
 _SITE_RADIUS_M, _PLAN_RADIUS_M = 0.9, 1.3
 _PLAN_COLOUR, _NEXT_SITE_COLOUR = (214, 40, 120), (120, 60, 200)
 
-_LANE_HEIGHT_M = 0.03
-"""Height of a drawn lane above its middle line."""
-
-LAYER_HEIGHT_M = 2.0 * _LANE_HEIGHT_M
-"""Height of a drawn layer above the road."""
+LAYER_HEIGHT_M = 3.0 * LANE_HEIGHT_M
+"""Height of a drawn layer above the road and its markings."""
 
 _SCALE_STEPS, _MIN_OPACITY = 255, 0.4
+
+_FLAT_KINDS = ("lanes", "junctions", "markings")
 
 MAX_TRIANGLES = 150_000
 """Larger worlds are simplified for drawing, so that browsers without a graphics card can rotate them."""
 
 _FINEST_M = 0.25
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """Triangles: ``points`` (n, 3) float32, ``faces`` (m, 3) int32."""
-
-    points: Points
-    faces: NDArray[np.int32]
 
 
 def drawing_origin(roi: Roi) -> Vec3:
@@ -121,36 +111,6 @@ def _simplify(mesh: Mesh, cell_m: float) -> Mesh:
     faces = faces[(a != b) & (b != c) & (c != a)]
     _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
     return Mesh(means.astype(np.float32), faces[np.sort(first)].astype(np.int32))
-
-
-def lane_mesh(carriageway: Carriageway, zero_m: Vec3) -> Mesh:
-    """Return the lanes as strips along their middle lines.
-
-    Parameters
-    ----------
-    carriageway
-        The lanes.
-    zero_m
-        Origin of the drawing.
-    """
-    points, faces, count = [np.empty((0, 3))], [np.empty((0, 3), dtype=np.int32)], 0
-    for lane in carriageway.lanes:
-        strip = _lane_strip(lane.shape_m, LANE_WIDTH_M if lane.width_m is None else lane.width_m)
-        left = np.arange(len(strip) // 2 - 1) * 2
-        quads = np.column_stack([left, left + 1, left + 2, left + 2, left + 1, left + 3]).reshape(-1, 3)
-        points.append(strip)
-        faces.append((quads + count).astype(np.int32))
-        count += len(strip)
-    lifted = np.concatenate(points) - zero_m + (0.0, 0.0, _LANE_HEIGHT_M)
-    return Mesh(lifted.astype(np.float32), np.concatenate(faces))
-
-
-def _lane_strip(line: Floats, width_m: float) -> Floats:
-    """Return points left and right of each point of a line (n, 3) in turn, (2 n, 3)."""
-    along = np.gradient(line[:, :2], axis=0)
-    along /= np.maximum(np.hypot(*along.T), np.finfo(np.float64).tiny)[:, None]
-    across = np.column_stack([-along[:, 1], along[:, 0], np.zeros(len(line))]) * (width_m / 2.0)
-    return np.stack([line + across, line - across], axis=1).reshape(-1, 3)
 
 
 def region_edges(roi: Roi, zero_m: Vec3) -> Points:
@@ -277,13 +237,18 @@ class SceneMeshes:
         meshes = solid_meshes(session.scene.world, zero_m)
         drawn = sum(len(mesh.faces) for mesh in meshes.values())
         if session.carriageway is not None:
+            meshes["junctions"] = junction_mesh(session.carriageway, zero_m)
             meshes["lanes"] = lane_mesh(session.carriageway, zero_m)
+        if session.network is not None:
+            meshes["markings"] = marking_mesh(session.network, zero_m)
         scene.add_line_segments("/roi", region_edges(session.scene.roi, zero_m), _ROI_COLOUR, thickness=0.15)
         handles = {}
         for kind, mesh in meshes.items():
+            if not len(mesh.faces):
+                continue
             handles[kind] = scene.add_mesh_simple(
                 f"/world/{kind}", mesh.points, mesh.faces, color=_solid_colour(kind, _LIGHT_COLOURS),
-                flat_shading=kind != "lanes", side="double", cast_shadow=False,
+                flat_shading=kind not in _FLAT_KINDS, side="double", cast_shadow=False,
             )  # fmt: skip
         return cls(handles, drawn, len(session.scene.world.faces))
 
@@ -331,7 +296,7 @@ def draw_plan(
     if plan.best_next is not None:
         problem = plan.poses.placement_problem
         sites.append(problem.sites[problem.names.index(plan.best_next[0])])
-        labels.append("best additional sensor")
+        labels.append("best next")
         ball_colours.append(_NEXT_SITE_COLOUR)
     scene.add_frame("/plan", show_axes=False)
     balls = _Balls(sites, np.array(ball_colours, dtype=np.uint8), _PLAN_RADIUS_M)

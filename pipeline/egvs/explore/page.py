@@ -2,7 +2,7 @@
 
 All browsers share one state. What users do (gizmo, numbers, clicks, links) only requests a view;
 :meth:`Page.run` shows the latest requested view, in the thread that called it. So however fast somebody drags, the
-last number is that of the last pose.
+last number is that of the last pose. A request with an invalid value is rejected with a message, and the page goes on.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import gc
 import io
+import math
 import shlex
 import socket
 import threading
@@ -26,12 +27,21 @@ from PIL import Image
 from egvs.core.errors import EgvsError, InputError, RunError
 from egvs.core.grid import Vec3
 from egvs.core.resource_usage import release_memory
-from egvs.explore import controls, drawing, settings
+from egvs.explore import controls, drawing, map_symbols, settings
 from egvs.explore.access import KEY_PARAMETER, AccessGuard
 from egvs.explore.controls import Controls, PanelContent, show_modal
 from egvs.explore.session import MovingPlan, Playback, Session
 from egvs.explore.settings import SessionFactory
-from egvs.explore.view_state import SAVED_SITES, Camera, View, decode_view, encode_view, save_pose, unused_file_name
+from egvs.explore.view_state import (
+    SAVED_SITES,
+    Camera,
+    View,
+    check_view,
+    decode_view,
+    encode_view,
+    save_pose,
+    unused_file_name,
+)
 from egvs.sensors.sites import Pose, Site
 
 HOST = "127.0.0.1"
@@ -45,6 +55,9 @@ FREE_MEMORY_EVERY = 32
 """Moves after which unused memory is returned to the system."""
 
 _SHUTDOWN_S = 5.0
+_ADD_SENSOR, _RESET_PLAN = "add", "reset"
+_WHERE = "the page"
+"""Used in messages about invalid values."""
 
 
 def check_port_free(port: int) -> None:
@@ -118,6 +131,7 @@ class Page:
         self._is_stopped = self._is_busy = False
         self._dragging_client: int | None = None
         self._notice, self._draw_count = "", 0
+        self._plan_request: str | None = None
         self.guard = AccessGuard(self._open_query)
         with redirect_stdout(io.StringIO()), self.guard.protect_new_servers():  # viser prints a banner
             self.server = _Server(host=HOST, port=port, label="egvs explore", verbose=False)
@@ -142,9 +156,33 @@ class Page:
         return f"http://{HOST}:{self.server.get_port()}"
 
     def request(self, **changes: Any) -> None:
-        """Request changes of the view (fields by name), in addition to those that were requested before."""
+        """Request changes of the view (fields by name), in addition to those that were requested before.
+
+        Changes to an invalid view are rejected: the page shows the reason.
+        """
         with self._changed:
-            self._requested, self._has_request = replace(self._requested, **changes), True
+            view = replace(self._requested, **changes)
+            try:
+                check_view(view, self._initial_session, _WHERE)
+            except InputError as error:
+                self._notice = str(error)
+            else:
+                self._requested = view
+            self._has_request = True
+            self._changed.notify_all()
+
+    def add_sensor(self) -> None:
+        """Request the best additional sensor; without a plan, it starts with the selected sensor."""
+        self._request_plan(_ADD_SENSOR)
+
+    def reset_plan(self) -> None:
+        """Request the plan of the run folder; no plan if there is none."""
+        self._request_plan(_RESET_PLAN)
+
+    def _request_plan(self, action: str) -> None:
+        with self._changed:
+            self._plan_request = action
+            self._has_request = True
             self._changed.notify_all()
 
     def run(self) -> None:
@@ -158,7 +196,7 @@ class Page:
                     next_frame = (self._requested.frame + 1) % self._playback.frames
                     self._requested = replace(self._requested, frame=next_frame)
                 view, self._has_request, self._is_busy = self._requested, False, True
-            self._show(view)
+            self._show_or_reject(view)
             with self._changed:
                 self._is_busy = False
                 self._changed.notify_all()
@@ -244,6 +282,8 @@ class Page:
         self.world = drawing.SceneMeshes.draw(scene, session, self.zero_m)
         drawing.draw_sites(scene, session, self.zero_m, self._select)
         drawing.draw_plan(scene, self.plan, self.view.site.name, self.zero_m, self._select)
+        self._draw_pole_names(self.view.site)
+        map_symbols.draw_north_and_scale(scene, session.scene.roi, session.scene.world, self.zero_m)
         self.gizmo = scene.add_transform_controls("/sensor", scale=GIZMO_M, depth_test=False)
         self.label = scene.add_label("/sensor/label", "", anchor="top-center")
         self.gizmo.on_update(self._on_gizmo)
@@ -267,6 +307,12 @@ class Page:
 
     async def _on_gizmo(self, event: viser.TransformControlsEvent) -> None:
         """Handle a drag; a coroutine, so that viser keeps the order of events."""
+        values = [*event.target.position, *event.target.wxyz]
+        if not all(map(math.isfinite, values)) or not any(event.target.wxyz):
+            self._notice = str(InputError(f"{_WHERE}: sensor", f"expected a position and an angle, got {values}"))
+            self._dragging_client = None
+            self.request()
+            return
         position_m = np.asarray(event.target.position, dtype=np.float64) + self.zero_m
         pose = drawing.dragged_pose(self.view.site.pose, position_m.tolist(), event.target.wxyz.tolist())
         self.drag(event.client_id, pose, is_finished=event.phase == "end")
@@ -338,6 +384,19 @@ class Page:
 
     # ---- showing a view
 
+    def _show_or_reject(self, view: View) -> None:
+        """Show a view; if that fails, show the one before and the reason, without a layer, which may have failed."""
+        before = self.session, self._all_periods, self.plan, self._playback, self.rating, self.view
+        try:
+            self._show(view)
+        except (EgvsError, OSError) as error:
+            self._notice = str(error)
+            self.session, self._all_periods, self.plan, self._playback, self.rating, self.view = before
+            without_layer = replace(self.view, layer="none")
+            with self._changed:
+                self._requested = without_layer
+            self._show(without_layer)
+
     def _show(self, view: View) -> None:
         """Compute the scores of a view, and update scene and panel."""
         session_before, plan_before, view_before = self.session, self.plan, self.view
@@ -353,12 +412,15 @@ class Page:
         if self.plan is not None and is_plan_changed and self.rating.is_feasible and not is_dragging:
             self.plan = self.plan.with_moved(site, self.session.beams(site))
 
+        self._change_plan(site)
+
         scene = self.server.scene
         with self.server.atomic():
             if is_new_session:
                 drawing.draw_sites(scene, self.session, self.zero_m, self._select)
             if self.plan is not plan_before or site.name != view_before.site.name:
                 drawing.draw_plan(scene, self.plan, site.name, self.zero_m, self._select)
+                self._draw_pole_names(site)
             if view.is_dark != view_before.is_dark:
                 self.world.set_dark(view.is_dark)
             self.label.text = f"{site.name}: no sensor can be mounted here"
@@ -376,6 +438,41 @@ class Page:
             gc.collect()  # frees the previous session or sensor
         if is_new_sensor or self._draw_count % FREE_MEMORY_EVERY == 0:
             release_memory()
+
+    def _change_plan(self, site: Site) -> None:
+        """Add a sensor to the plan, or reset it, if that was requested."""
+        with self._changed:
+            action, self._plan_request = self._plan_request, None
+        if action == _RESET_PLAN:
+            self.plan = self.session.plan
+        if action != _ADD_SENSOR:
+            return
+        if not self.rating.is_feasible:
+            self._notice = "The sensor cannot be mounted at its current position. Move it to a free location first."
+            return
+        self.controls.status.content = controls.WORKING_TITLE
+        plan = self.plan
+        if plan is None:
+            plan = MovingPlan.of_candidates(self.session.work, [site.name])
+            if plan.sites[site.name] != site:
+                plan = plan.with_moved(site, self.session.beams(site))
+        if plan.best_next is None:
+            self._notice = "All candidates are in the plan."
+        else:
+            plan = plan.with_added(plan.best_next[0])
+        self.plan = plan
+
+    def _draw_pole_names(self, site: Site) -> None:
+        """Write the names of poles that have no other label: the selected sensor and those of the plan have one."""
+        labelled = [site]
+        if self.plan is not None:
+            labelled += self.plan.sites.values()
+            if self.plan.best_next is not None:
+                labelled.append(self.session.candidates[self.plan.best_next[0]].site)
+        ranked = [candidate.site for candidate in self.session.ranked]
+        map_symbols.draw_pole_names(
+            self.server.scene, ranked, {one.pole or one.name for one in labelled}, self.zero_m
+        )  # fmt: skip
 
     def _apply_settings(self, view: View) -> View:
         """Change session and period to those of a view; return the view, without settings that are not valid."""
@@ -434,9 +531,11 @@ def _do_nothing() -> None:
 
 def _with_moved_sensors(before: MovingPlan | None, session: Session) -> MovingPlan | None:
     """Return the plan of a session with its sensors where users have moved them."""
+    if before is None:
+        return session.plan
     plan = session.plan
-    if plan is None or before is None:
-        return plan
+    if plan is None or list(plan.sites) != list(before.sites):
+        plan = MovingPlan.of_candidates(session.work, list(before.sites))
     for name, site in before.sites.items():
         if plan.sites.get(name, site) != site:
             plan = plan.with_moved(site, session.beams(site))

@@ -11,7 +11,7 @@ Nothing here depends on a page or a browser. World frame, metres.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -34,6 +34,7 @@ from egvs.core.errors import Diagnostic, InputError
 from egvs.core.grid import Grid
 from egvs.placement import problem_builder
 from egvs.placement.refinement import PlanPoses
+from egvs.report.formatting import SCORE_LABELS
 from egvs.scenario.model import Scenario
 from egvs.scoring import blindspots
 from egvs.scoring.blindspots import CELL_M, SpotVisibility, VehicleSpots
@@ -57,6 +58,12 @@ from egvs.validation.cloud_simulation import CloudSimulator, VehicleMeshes, swee
 from egvs.world.carriageway import Carriageway
 
 Floats = NDArray[np.float64]
+
+
+def _score_text(name: str, value: float) -> str:
+    """Return a score with its name and unit, e.g. "egvs 1,234 bit" or "expected_detections 61.3%"."""
+    label = SCORE_LABELS[name]
+    return f"{name} {label.value(value)} {label.unit}".strip()
 
 
 _SCORES = RunFolder.scores.name
@@ -88,11 +95,7 @@ class MovingPlan:
         rows, _, metadata = placement
         if any(metadata["stages"].get(name) != stages.get(name) for name in _PLAN_STAGES):
             return None
-        unconstrained = copy(work)  # sensors may be moved anywhere, whatever [placement] requires
-        unconstrained.scenario = work.scenario.model_copy(update={"placement": type(work.scenario.placement)()})
-        problem = problem_builder.build_problem(unconstrained, lambda _: None)
-        indices = [problem.names.index(row["site"]) for row in rows]
-        plan = cls(PlanPoses.of(unconstrained.scenario, problem, indices))
+        plan = cls.of_candidates(work, [row["site"] for row in rows])
         scanner = Scanner(replace(get_scene(work), sites=()))
         for row, site in zip(rows, plan.poses.sites, strict=True):
             pose = Pose(**{field.name: row[field.name] for field in fields(Pose)})
@@ -100,6 +103,23 @@ class MovingPlan:
                 moved = replace(site, pose=pose)
                 plan = plan.with_moved(moved, Beams.of(scanner.scan_site(moved)))
         return plan
+
+    @classmethod
+    def of_candidates(cls, work: StageContext, names: Sequence[str]) -> MovingPlan:
+        """Return a plan of some candidates; this scans all candidates.
+
+        Parameters
+        ----------
+        work
+            The run.
+        names
+            Names of the candidates.
+        """
+        unconstrained = copy(work)  # sensors may be moved anywhere, whatever [placement] requires
+        unconstrained.scenario = work.scenario.model_copy(update={"placement": type(work.scenario.placement)()})
+        problem = problem_builder.build_problem(unconstrained, lambda _: None)
+        indices = [problem.names.index(name) for name in names]
+        return cls(PlanPoses.of(unconstrained.scenario, problem, indices))
 
     @property
     def sites(self) -> dict[str, Site]:
@@ -116,8 +136,8 @@ class MovingPlan:
         rows = tuple(view.row(beams) for view in self.poses.placement_problem.views)
         return MovingPlan(self.poses.with_sensor(list(self.sites).index(site.name), site, rows))
 
-    def gain(self, candidate: str) -> float:
-        """Return the increase of the joint score if a candidate is added."""
+    def with_added(self, candidate: str) -> MovingPlan:
+        """Return the plan with one more candidate."""
         problem = self.poses.placement_problem
         index = problem.names.index(candidate)
         rows = tuple(visibility.row(index) for visibility in problem.visibilities)
@@ -127,7 +147,11 @@ class MovingPlan:
             sites=(*self.poses.sites, problem.sites[index]),
             rows=(*self.poses.rows, rows),
         )
-        return float(extended.plan_value.joint) - self.joint
+        return MovingPlan(extended)
+
+    def gain(self, candidate: str) -> float:
+        """Return the increase of the joint score if a candidate is added."""
+        return self.with_added(candidate).joint - self.joint
 
     @cached_property
     def best_next(self) -> tuple[str, float] | None:
@@ -157,6 +181,13 @@ class PoseScore:
     scores: Mapping[str, float]
     rank: int
     findings: tuple[Diagnostic, ...] = ()
+
+    def __repr__(self) -> str:
+        if not self.is_feasible:
+            problems = "; ".join(str(finding) for finding in self.findings if finding.is_error)
+            return f"PoseScore({self.site.name}: no score, {problems})"
+        scores = ", ".join(_score_text(name, value) for name, value in self.scores.items())
+        return f"PoseScore({self.site.name}: rank {self.rank}, {scores})"
 
     @property
     def is_feasible(self) -> bool:

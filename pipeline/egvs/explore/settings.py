@@ -194,9 +194,9 @@ def _copy_run(source: Path, folder: Path) -> None:
 
 
 def open_session(
-    path: Path,
+    path: str | Path,
     overrides: Sequence[str] = (),
-    out: Path | None = None,
+    out: str | Path | None = None,
     *,
     jobs: int | None = None,
     progress: ProgressCallback = no_progress,
@@ -220,9 +220,10 @@ def open_session(
     InputError
         If it is neither, or the scenario is not valid.
     """
+    path = Path(path)
     if not RunFolder(path).run_record.is_file():
         scenario = load(path, overrides)
-        folder = out or run.default_folder(scenario)
+        folder = run.default_folder(scenario) if out is None else Path(out)
         return make_session(scenario, folder, jobs=jobs, progress=progress, listener=listener)
     for option, is_given in (("--set", bool(overrides)), ("--out", out is not None)):
         if is_given:

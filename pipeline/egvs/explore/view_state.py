@@ -4,7 +4,7 @@ A link has the form of the query of a web address, ``site=c03&pose=190,255,4.5,0
 Values that are the same as when the page was opened are left out.
 
 Saved poses are rows of a file in the scenario's folder that ``sites.file`` can name. A file of that name that the
-explorer did not write is never changed.
+explorer did not write is never changed. Explorers that save at the same time wait for each other.
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ from egvs.core.grid import Vec3
 from egvs.effects import registry
 from egvs.explore.session import Session
 from egvs.explore.settings import Settings
+from egvs.runs import locks
+from egvs.scenario.fields import MAX_COORDINATE_M
 from egvs.sensors.sites import Pose, Site
 
 SAVED_SITES = "kept_sites.csv"
@@ -45,10 +47,14 @@ LAYERS = {
 }
 """Layers over the scene: name in a link, and on the page."""
 
+FIRST_LAYER = "traffic"
+"""The layer of a page that is opened without a link."""
+
 T = TypeVar("T")
 D = TypeVar("D")
 _POSE_PARTS = ("x", "y", "z", "yaw", "pitch", "roll")
 _WHOLE_NUMBER = "a whole number of at least 0"
+_MAX_PITCH_DEG = 90.0
 
 
 def save_pose(path: Path, site: Site, candidates: Collection[str]) -> str:
@@ -68,15 +74,16 @@ def save_pose(path: Path, site: Site, candidates: Collection[str]) -> str:
     InputError
         If the file was not written by the explorer; it is not changed.
     """
-    rows = _read_saved_rows(path)
-    taken = {row[0] for row in rows} | set(candidates)
-    numbered = (f"{site.name[:72]}-{number}" for number in count(1))
-    name = next(name for name in numbered if name not in taken)
-    pose = site.pose
-    rows.append([name, *(repr(float(value)) for value in (*pose.position_m, *pose.angles_deg)), site.sensor])
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows([_COLUMNS, *rows])
-    files.write_text(path, text.getvalue())
+    with locks.locked(path.with_name(f".{path.name}.lock"), remove=True):
+        rows = _read_saved_rows(path)
+        taken = {row[0] for row in rows} | set(candidates)
+        numbered = (f"{site.name[:72]}-{number}" for number in count(1))
+        name = next(name for name in numbered if name not in taken)
+        pose = site.pose
+        rows.append([name, *(repr(float(value)) for value in (*pose.position_m, *pose.angles_deg)), site.sensor])
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([_COLUMNS, *rows])
+        files.write_text(path, text.getvalue())
     return name
 
 
@@ -122,7 +129,7 @@ class View:
     site: Site
     settings: Settings
     period: str = ""
-    layer: str = "none"
+    layer: str = FIRST_LAYER
     ring: int = 0
     frame: int = 0
     beside: str = ""
@@ -164,7 +171,7 @@ def encode_view(view: View, initial: View, camera: Camera | None = None) -> str:
         parts["score"] = view.settings.rank_by
     if view.settings.effects != initial.settings.effects:
         parts["effects"] = ",".join(sorted(view.settings.effects))
-    for name, default in (("period", ""), ("layer", "none"), ("ring", 0), ("frame", 0), ("beside", "")):
+    for name, default in (("period", ""), ("layer", FIRST_LAYER), ("ring", 0), ("frame", 0), ("beside", "")):
         value = getattr(view, name)
         if value != default:
             parts[name] = str(value)
@@ -203,24 +210,22 @@ def decode_view(
     pose = reader.numbers("pose", _POSE_PARTS)
     if pose:
         site = replace(site, pose=Pose(*pose))
-    sensor = reader.text("sensor", site.sensor)
-    if sensor != site.sensor:
-        session.scene.sensor(sensor, f"{where}: sensor")
-        site = replace(site, sensor=sensor)
+    site = replace(site, sensor=reader.text("sensor", site.sensor))
     gamma = reader.number("gamma", None, float, "a number of at least 0")
     rank_by = reader.text("score", initial.settings.rank_by)
     settings = Settings(gamma, rank_by, reader.effects(initial.settings.effects))
     view = View(
         site=site,
         settings=settings,
-        period=reader.choice("period", ("", *session.periods), ""),
-        layer=reader.choice("layer", LAYERS, "none"),
+        period=reader.text("period", ""),
+        layer=reader.text("layer", FIRST_LAYER),
         ring=reader.whole_number("ring"),
         frame=reader.whole_number("frame"),
-        beside=reader.choice("beside", ("", *session.candidates), ""),
+        beside=reader.text("beside", ""),
         is_dark=reader.text("dark", "") == "1",
     )
     settings.apply(session.scenario, where)
+    check_view(view, session, where)
     camera = None
     coordinates = reader.numbers("camera", ("x", "y", "z", "x", "y", "z"))
     if coordinates:
@@ -228,6 +233,42 @@ def decode_view(
         camera = Camera((from_x, from_y, from_z), (at_x, at_y, at_z))
     reader.reject_unknown_keys()
     return view, camera
+
+
+def check_view(view: View, session: Session, where: str) -> None:
+    """Check that a page can show a view; what depends on settings is checked when they are applied.
+
+    Parameters
+    ----------
+    view
+        The view.
+    session
+        The session without changes.
+    where
+        Used in messages.
+
+    Raises
+    ------
+    InputError
+        If a value is out of range, or there is no such candidate, sensor, period or layer.
+    """
+    _check_choice(f"{where}: site", view.site.name, session.candidates)
+    for name, value in vars(view.site.pose).items():
+        limit = _MAX_PITCH_DEG if name == "pitch_deg" else MAX_COORDINATE_M
+        if not abs(value) <= limit:
+            raise InputError(f"{where}: {name}", f"expected a number from {-limit:g} to {limit:g}, got {value!r}")
+    session.scene.sensor(view.site.sensor, f"{where}: sensor")
+    _check_choice(f"{where}: period", view.period, ("", *session.periods))
+    _check_choice(f"{where}: layer", view.layer, LAYERS)
+    _check_choice(f"{where}: beside", view.beside, ("", *session.candidates))
+
+
+def _check_choice(where: str, text: str, choices: Collection[str]) -> None:
+    """Raise an InputError if a text is not one of several names."""
+    if text not in choices:
+        names = ", ".join(name for name in choices if name)
+        expected = f"one of {names}" if names else "no value"
+        raise InputError(where, f"expected {expected}, got {text!r}")
 
 
 class _LinkReader:
@@ -245,9 +286,7 @@ class _LinkReader:
     def choice(self, key: str, choices: Collection[str], default: str) -> str:
         """Return one of several names."""
         text = self.text(key, default)
-        if text not in choices:
-            names = ", ".join(name for name in choices if name)
-            raise self._error(key, f"one of {names}" if names else "no value", text)
+        _check_choice(f"{self._where}: {key}", text, choices)
         return text
 
     def numbers(self, key: str, names: Sequence[str]) -> list[float]:

@@ -25,6 +25,7 @@ import numpy as np
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
+from egvs.core.numbers import parse_decimal
 
 _NOT_TRUNCATED_NOT_OCCLUDED = "0.00 0"
 _RECTANGLE = "0.00 0.00 50.00 50.00"
@@ -165,7 +166,7 @@ def _parse_values(where: str, words: list[str]) -> list[float]:
     values = []
     for word in words[1:]:
         try:
-            value = float(word)
+            value = parse_decimal(word)
         except ValueError:
             value = math.nan
         if not math.isfinite(value):

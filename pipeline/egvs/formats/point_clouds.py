@@ -30,6 +30,7 @@ from egvs.core import limits, plugins
 from egvs.core.errors import EgvsError, InputError, MissingBackendError
 from egvs.core.files import atomic_write
 from egvs.core.grid import FloatArray
+from egvs.core.numbers import parse_decimal
 from egvs.core.reading import COMPLETE_FILE, describe_exception
 
 GROUP = "egvs.point_clouds"
@@ -325,9 +326,9 @@ def pack_records(columns: Mapping[str, NDArray[np.generic]]) -> NDArray[np.void]
 
 
 def parse_float(text: str) -> float | None:
-    """Parse a number as Python does, including nan and inf; None if the text is not a number."""
+    """Parse a number, including nan and inf; None if the text is not a number."""
     try:
-        return float(text)
+        return parse_decimal(text)
     except ValueError:
         return None
 

@@ -60,6 +60,11 @@ class SiteScore:
     shares: Mapping[str, FloatArray] = field(default_factory=dict)
     by_period: tuple[SiteScore, ...] = ()
 
+    def __repr__(self) -> str:
+        shares = {"entropy_seen": self.entropy_seen} | {name: values[0] for name, values in self.shares.items()}
+        listed = ", ".join(f"{name} {value:.1%}" for name, value in shares.items())
+        return f"SiteScore(egvs {self.egvs:,.1f} bit, {listed})"
+
 
 @dataclass(frozen=True)
 class PeriodTpog:

@@ -75,6 +75,14 @@ class Scan:
         """Number of distinct beams that met something."""
         return _count_distinct(self.rows.beam[self.rows.returned])
 
+    def __repr__(self) -> str:
+        position = ", ".join(f"{value:g}" for value in self.pose.position_m)
+        angles = ", ".join(f"{value:g}" for value in self.pose.angles_deg)
+        return (
+            f"Scan({self.sensor.name} at x, y, z = {position} m; yaw, pitch, roll = {angles} deg; "
+            f"{self.beams_in_roi:,} of {self.beams:,} beams towards the region, {self.returns:,} returns)"
+        )
+
     def as_site(self, name: str, pole: str = "") -> ScannedSite:
         """Return the record of the scan for artefacts; ``pole`` defaults to the name of the site."""
         counts = self.beams, self.beams_in_roi, self.returns

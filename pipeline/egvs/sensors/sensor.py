@@ -39,6 +39,7 @@ from scipy.special import cosdg, sindg
 from egvs.core import files, limits
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.core.numbers import parse_decimal
 from egvs.scenario.model import Scenario
 from egvs.scenario.sensor_config import BeamPatternConfig, SensorConfig
 
@@ -164,7 +165,7 @@ def _check_beam_columns(path: Path, names: list[str]) -> None:
 def _parse_angle(path: Path, number: int, column: str, text: str | None) -> float:
     limit_deg = _MAX_ANGLE_DEG[column]
     try:
-        angle = float(text or "")
+        angle = parse_decimal(text or "")
     except ValueError:
         angle = math.nan
     if not abs(angle) <= limit_deg:

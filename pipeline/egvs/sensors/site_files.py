@@ -27,6 +27,7 @@ import numpy as np
 from egvs.core import files, limits
 from egvs.core.errors import InputError, find_misspelling
 from egvs.core.grid import FloatArray
+from egvs.core.numbers import parse_decimal
 from egvs.core.reading import read_json
 from egvs.formats.georeference import WGS84, CoordinateReading, Georeference, declared_crs, geojson_coordinates
 
@@ -275,7 +276,7 @@ def _row_to_world(row: SiteRow, lon_lat: _LonLat | None, reading: CoordinateRead
 
 def _number_or_nan(value: Any) -> float:
     try:
-        return float(value)
+        return parse_decimal(value) if isinstance(value, str) else float(value)
     except (TypeError, ValueError, OverflowError):
         return math.nan
 

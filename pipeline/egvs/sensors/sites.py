@@ -33,6 +33,7 @@ from scipy.special import cosdg, sindg
 
 from egvs.core.errors import Diagnostic, DiagnosticsError, InputError
 from egvs.core.grid import Vec3
+from egvs.core.numbers import parse_decimal
 from egvs.scenario.fields import MAX_COORDINATE_M
 from egvs.scenario.model import Scenario, SiteGrid, SiteLine
 from egvs.sensors import site_files
@@ -519,7 +520,7 @@ def _row_aim_m(row: SiteRow, numbers: Mapping[str, float], scenario: Scenario) -
 
 def _parse_number(where: str, key: str, value: Any) -> float:
     try:
-        number = float(value)
+        number = parse_decimal(value) if isinstance(value, str) else float(value)
     except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not abs(number) <= MAX_COORDINATE_M or isinstance(value, bool):

@@ -1,0 +1,29 @@
+"""Numbers in text files."""
+
+from __future__ import annotations
+
+
+def parse_decimal(text: str) -> float:
+    """Parse a decimal number in ASCII, such as ``-1.5e3``.
+
+    Unlike :class:`float`, it accepts neither ``1_0``, which Python alone reads as 10, nor digits of other scripts.
+
+    Parameters
+    ----------
+    text
+        The number, with any white space around it.
+
+    Raises
+    ------
+    ValueError
+        If it is not a number.
+
+    Examples
+    --------
+    >>> parse_decimal(" 8e3 ")
+    8000.0
+    """
+    number = text.strip()
+    if not number.isascii() or "_" in number:
+        raise ValueError(f"not a decimal number: {text!r}")
+    return float(number)

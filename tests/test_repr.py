@@ -1,0 +1,37 @@
+"""In a notebook, results show themselves in one informative line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import egvs
+from egvs.sensors.sites import Pose
+
+
+def test_results_are_one_informative_line(mini: Path, tmp_path: Path) -> None:
+    scenario = egvs.load(mini)
+    egvs.run(scenario, tmp_path / "run")
+    tpog = egvs.read_tpog(tmp_path / "run" / "tpog.parquet")
+    occupied = int((tpog.p > 0).sum())
+    assert repr(tpog) == f"Tpog(80 x 40 x 10 voxels of 0.5 m, {occupied:,} ever occupied in 40 frames)"
+
+    scene = egvs.build_scene(scenario)
+    scan = egvs.Scanner(scene).scan(Pose(10.0, 12.0, 3.5, 33.0), scene.sensor("small"))
+    assert repr(scan) == (
+        "Scan(small at x, y, z = 10, 12, 3.5 m; yaw, pitch, roll = 33, 0, 0 deg; "
+        f"{scan.beams_in_roi:,} of 2,880 beams towards the region, {scan.returns:,} returns)"
+    )
+    score = egvs.Scorer(scene, tpog).score(scan)
+    assert repr(score) == f"SiteScore(egvs {score.egvs:,.1f} bit, entropy_seen {score.entropy_seen:.1%})"
+
+
+def test_rated_pose_shows_the_recommended_score_or_the_reason(mini: Path, tmp_path: Path) -> None:
+    scenario = egvs.load(mini, ["score.rank_by='expected_detections'"])
+    egvs.run(scenario, tmp_path / "run")
+    session = egvs.open_session(str(tmp_path / "run"))
+    rated = session.rate("pole_a", Pose(10.0, 12.0, 4.0))
+    found = rated.scores["expected_detections"]
+    assert repr(rated).startswith(f"PoseScore(pole_a: rank {rated.rank}, egvs {rated.scores['egvs']:,.0f} bit, ")
+    assert f"expected_detections {found:.1%}" in repr(rated)
+    inside = session.rate("pole_a", Pose(16.0, 6.0, 3.0))
+    assert repr(inside).startswith("PoseScore(pole_a: no score, site pole_a: (16, 6, 3) is inside house")
