@@ -118,6 +118,7 @@ KEYS: dict[str, Change] = {
     "traffic.trips_per_s": Change("1", NETWORK),
     "traffic.max_depart_delay_s": Change("60", NETWORK),
     "traffic.reroute_at_departure": Change("true", NETWORK),
+    "traffic.redraw_departures": Change("true", ("traffic.routes=['trips.rou.xml']",), file="without_kinds.toml"),
     "traffic.min_trip_m": Change("10", NETWORK),
     "traffic.edge_weights": Change("{a=2}", NETWORK),
     "traffic.counts.*.edge": Change("'b'", COUNTED),
