@@ -37,7 +37,7 @@ def test_sentences_for_a_score_over_vehicles() -> None:
         report_ranking.headline(detected, has_traffic=True)
         == "a is the best of 3 sites: it should find 87% of vehicles"
     )
-    assert report_ranking.lead(detected) == "It leads the next site, b, by 8.2% of its score."
+    assert report_ranking.lead(detected) == "It leads the next site, b, by 7.1 percentage points."
     assert report_ranking.entropy_seen_note(detected) == ""
     assert report_ranking.site_caption(detected.sites[0], 1, 2).startswith(
         "a: rank 1, the share of vehicles found 87.1%, at x"

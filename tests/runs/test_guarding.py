@@ -263,7 +263,7 @@ def test_warns_that_scores_are_zero_at_every_site(mini: Path, tmp_path: Path, ru
     changes = [word for setting in settings for word in ("--set", setting)]
     code, printed, error = run_egvs("run", mini, "--out", tmp_path / "out", *changes)
     assert code == 0, error
-    assert printed.splitlines()[0] == f"scenario.toml: {message}"
+    assert printed.splitlines()[1] == f"scenario.toml: {message}"
     assert f"warning: scenario.toml: {message}" in error
     assert not re.search(r"rank +site|best pole", printed + error)
     assert json.loads((tmp_path / "out" / "run.json").read_text())["stages"]["score"]["summary"]["best"] == []
@@ -285,5 +285,5 @@ def test_warns_of_additional_score_that_is_zero_everywhere(mini: Path, tmp_path:
         "warning: scenario.toml: score: egvs is 0 at every site, so it does not distinguish them. "
         "Check sites, sensors and effects."
     ]
-    assert "   1  pole_" in printed, "the other score ranks all the same"
+    assert "\n1  pole_" in printed, "the other score ranks all the same"
     assert "is 0 at every site" not in run_egvs("run", mini, "--out", tmp_path / "two")[2]

@@ -353,14 +353,19 @@ def test_record_of_earlier_version_has_no_stages(done: tuple[Path, Path]) -> Non
 def test_prints_best_sites_and_counts_others(mini: Path, tmp_path: Path, run_egvs) -> None:
     rows = [f"p{i:02d},{2 + i},12,{3 + i / 8}" for i in range(9)]
     (mini / "sites.csv").write_text("\n".join(["site,x_m,y_m,z_m", *rows]) + "\n")
-    code, whole, _ = run_egvs("run", mini, "--out", tmp_path / "out")
-    assert (code, "omit --top" in whole) == (0, False)
-    ranked = [line.split()[1] for line in whole.splitlines() if re.match(r"\s*\d+\s+p\d\d", line)]
-    assert len(ranked) == 9
-    for verb in ("run", "score"):
-        code, printed, _ = run_egvs(verb, mini, "--out", tmp_path / "out", "--top", 4)
-        assert code == 0
-        assert [line.split()[1] for line in printed.splitlines() if re.match(r"\s*\d+\s+p\d\d", line)] == ranked[:4]
-        assert "... and 5 more; omit --top" in printed
+
+    def listed(*words: object) -> list[str]:
+        code, printed, error = run_egvs(*words, "--out", tmp_path / "out")
+        assert code == 0, error
+        return [line.split()[1] for line in printed.splitlines() if re.match(r"\s*\d+\s+p\d\d", line)]
+
+    best = listed("run", mini)
+    ranked = listed("score", mini)
+    assert (len(ranked), best) == (9, ranked[:5])
+    assert listed("run", mini, "--top", 4) == ranked[:4]
+    assert listed("score", mini, "--top", 4) == ranked[:4]
+    assert listed("run", mini, "--all") == ranked + ranked, "the complete ranking, and the poles"
+    assert "... and 5 more; omit --top" in run_egvs("score", mini, "--out", tmp_path / "out", "--top", 4)[1]
+    assert "4 more poles: --all lists all" in run_egvs("run", mini, "--out", tmp_path / "out")[1]
     assert "omit --top" not in run_egvs("score", mini, "--out", tmp_path / "out", "--top", 9)[1]
     assert run_egvs("run", mini, "--top", 0)[0] == 2

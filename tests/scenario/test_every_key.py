@@ -89,6 +89,7 @@ REFINED = (*ONE, "placement.refine={radius_m=1, evaluations=100}")
 KEYS: dict[str, Change] = {
     "name": Change("'renamed'"),
     "description": Change("'changed'"),
+    "assumed": Change("['the poles']"),
     "seed": Change("8"),
     "crs.epsg": Change("25833", ("crs.epsg=25832",)),
     "crs.offset_m": Change("[-500000, -5000000]", ("crs.epsg=25832",)),

@@ -16,7 +16,7 @@ from typer.models import CommandInfo
 from egvs._version import __version__
 from egvs.cli import city, exit, place, validate
 from egvs.cli import options as cli_options
-from egvs.cli.options import Audit, Jobs, Out, Run, ScenarioPath, Set, Top
+from egvs.cli.options import DEFAULT_POLES, Audit, Jobs, Out, Run, ScenarioPath, Set, Top, Verbose
 from egvs.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -74,20 +74,29 @@ def run(
     set_: Set = None,
     jobs: Jobs = None,
     audit: Audit = False,
-    top: Top = None,
+    top: Annotated[int, typer.Option("--top", metavar="N", min=1, help="Number of poles to print.")] = DEFAULT_POLES,
+    all_: Annotated[bool, typer.Option("--all", help="Print the complete ranking of all sites and poles.")] = False,
+    verbose: Verbose = False,
 ) -> None:
-    """Run all stages in order and print the ranking; stages with unchanged inputs are skipped."""
-    from egvs.cli import run_tables
+    """Run all stages in order and print the best poles; stages with unchanged inputs are skipped."""
+    from egvs.cli import answer, run_tables
     from egvs.cli.console import ProgressDisplay
     from egvs.runs import run
 
     loaded, folder = _load(scenario, set_, out)
     stage_options = {"score": {"audit": True}} if audit else None
-    with ProgressDisplay() as screen:
+    with ProgressDisplay(with_details=verbose) as screen:
         record = run.run(
             loaded, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, options=stage_options
         )
-    run_tables.print_run(folder, record, anything_ran=screen.any_stage_ran, top=top)
+    if not screen.any_stage_ran:
+        screen.say("no stage ran: no input has changed since the last run")
+    if all_:
+        run_tables.print_scores(folder, record)
+    if verbose:
+        run_tables.print_costs(folder, record)
+    run_tables.print_audit(record)
+    answer.print_answer(folder, loaded, record, poles=None if all_ else top)
 
 
 @app.command()
@@ -98,17 +107,17 @@ def demo(
     jobs: Jobs = None,
 ) -> None:
     """Try it: rank eight sites at a roundabout in about a minute, with traffic simulated in advance."""
-    from egvs.cli import run_tables
+    from egvs.cli import answer, run_tables
     from egvs.cli.console import ProgressDisplay
     from egvs.runs.run import run
     from egvs.scenario import shipped
     from egvs.scenario.loading import load
 
     shipped.copy_scenario(shipped.DEMO, folder)
-    results = folder / "results"
+    results, loaded = folder / "results", load(folder)
     with ProgressDisplay() as screen:
-        record = run(load(folder), results, jobs=jobs, progress=screen.progress, listener=screen.stage_event)
-    run_tables.print_run(results, record, anything_ran=screen.any_stage_ran)
+        record = run(loaded, results, jobs=jobs, progress=screen.progress, listener=screen.stage_event)
+    answer.print_answer(results, loaded, record)
     run_tables.print_demo_hints(folder, results)
 
 
@@ -210,7 +219,7 @@ def _run_stage(
     from egvs.runs import run
 
     loaded, folder = _load(scenario, set_, out)
-    with ProgressDisplay() as screen:
+    with ProgressDisplay(with_details=True) as screen:
         record = run.run_one(
             stage, loaded, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, **stage_options
         )

@@ -21,6 +21,9 @@ from egvs.core.errors import collect_warnings
 NARROW, WIDE = 110, 190
 """Terminals below ``NARROW`` columns get fewer columns of tables; those of about ``WIDE`` get all."""
 
+MAX_WARNINGS = 3
+"""Warnings that a command prints without details."""
+
 Row = TypeVar("Row")
 
 
@@ -148,14 +151,27 @@ def _format_entry(key: str, value: Any) -> str:
 class ProgressDisplay:
     """Shows the progress of a run: a bar on a terminal, and one line per finished stage.
 
+    Parameters
+    ----------
+    verb
+        Name of the command, until a stage begins.
+    with_details
+        Whether all that a stage reports is printed, and every warning; otherwise one short line for each stage, and the
+        first :data:`MAX_WARNINGS` warnings.
+
     Attributes
     ----------
     any_stage_ran
         Whether at least one stage was run or restored from the cache.
+    hidden_warnings
+        Number of warnings that were not printed.
     """
 
-    def __init__(self, verb: str = "") -> None:
+    def __init__(self, verb: str = "", *, with_details: bool = False) -> None:
         self.any_stage_ran = False
+        self.hidden_warnings = 0
+        self._with_details = with_details
+        self._warnings = 0
         self._stage = verb
         self._console = Console(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=True)
         self._bar = Progress(
@@ -176,6 +192,8 @@ class ProgressDisplay:
     def __exit__(self, *_: object) -> None:
         if self._has_bar:
             self._bar.stop()
+        if self.hidden_warnings:
+            self.say(f"more warnings: {self.hidden_warnings}; the report and egvs run --verbose list them")
 
     def progress(self, what: str, done: int, total: int) -> None:
         """Move the bar; a :data:`egvs.core.progress.ProgressCallback`."""
@@ -196,10 +214,14 @@ class ProgressDisplay:
         if self._has_bar:
             self._bar.update(self._task, visible=False)
 
-        for line in stage_summary.stage_lines(stage, state, record):
+        for line in stage_summary.stage_lines(stage, state, record, with_details=self._with_details):
             self.say(line)
         for warning in collect_warnings([record.summary]):
-            self.say(f"warning: {warning}")
+            self._warnings += 1
+            if self._warnings > MAX_WARNINGS and not self._with_details:
+                self.hidden_warnings += 1
+            else:
+                self.say(f"warning: {warning}")
 
     def _show_stage(self, stage: str) -> None:
         if self._has_bar:

@@ -26,6 +26,12 @@ Jobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Number of threa
 Top = Annotated[
     int | None, typer.Option("--top", metavar="N", min=1, help="Print only the best N sites; all by default.")
 ]
+Verbose = Annotated[
+    bool, typer.Option("--verbose", help="Print all details of each stage, all warnings, the files and their cost.")
+]
+DEFAULT_POLES = 5
+"""Poles that ``egvs run`` and ``egvs demo`` print unless options ask for others."""
+
 Audit = Annotated[
     bool, typer.Option("--audit", help="Check the voxel traversal of every beam, and print the worst deviation.")
 ]

@@ -13,7 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
 from rich.table import Table
 
 from egvs.artefacts import parquet
@@ -38,19 +37,15 @@ _EXTRA_COLUMNS_WIDTH = 130
 """Terminals at least this wide show the entropy seen and the companion score next to the ranking score."""
 
 
-def print_run(folder: Path, record: RunRecord, *, anything_ran: bool, top: int | None = None) -> None:
-    """Print the ranking, the artefacts, and what each stage cost."""
-    out = console(_RESULT_FILE_WIDTH)
-    _print_scores(out, folder, record, top)
+def print_costs(folder: Path, record: RunRecord) -> None:
+    """Print the artefacts of each stage, and what they cost."""
     columns = [
         Column[str]("stage", str, "left"),
         Column[str]("artefact", lambda stage: "\n".join(_artefact_paths(folder, record, stage)), "left", wrap=True),
         Column[str]("seconds", lambda stage: f"{record.stages[stage].cost.seconds:.2f}"),
         Column[str]("peak MB", lambda stage: f"{record.stages[stage].cost.peak_mb:.0f}"),
     ]
-    out.print(make_table(columns, record.stages))
-    if not anything_ran:
-        out.print("nothing to do: no stage input has changed since the last run")
+    console(_RESULT_FILE_WIDTH).print(make_table(columns, record.stages))
 
 
 def _artefact_paths(folder: Path, record: RunRecord, stage: str) -> list[str]:
@@ -61,14 +56,16 @@ def print_stage(folder: Path, stage: str, record: RunRecord, *, top: int | None 
     """Print the files that one stage wrote; after the score stage, the ranking too."""
     out = console(_RESULT_FILE_WIDTH)
     if stage == "score":
-        _print_scores(out, folder, record, top)
+        print_scores(folder, record, top)
+        print_audit(record)
     clouds = record.stages[stage].summary.get("clouds", ())
     for path in (*_artefact_paths(folder, record, stage), *(str(folder / name) for name in clouds)):
         out.print(path)
 
 
-def _print_scores(out: Console, folder: Path, record: RunRecord, top: int | None) -> None:
-    """Print the ranking, the best candidate of each pole, the ranking by period, and the result of an audit."""
+def print_scores(folder: Path, record: RunRecord, top: int | None = None) -> None:
+    """Print the ranking, the best candidate of each pole, and the ranking by period; ``top`` of each, or all."""
+    out = console(_RESULT_FILE_WIDTH)
     sites = RankedSite.read(folder / "scores.parquet")
     summary = record.stages["score"].summary
     if not any(site.score > 0 for site in sites):
@@ -88,8 +85,12 @@ def _print_scores(out: Console, folder: Path, record: RunRecord, top: int | None
         out.print(period_table(by_period, top))
     if missed := summary.get("missed"):
         out.print(missed)
-    if audit := summary.get("audit"):
-        out.print(
+
+
+def print_audit(record: RunRecord) -> None:
+    """Print the result of an audit of the scores, if there was one."""
+    if audit := record.stages["score"].summary.get("audit"):
+        console(_RESULT_FILE_WIDTH).print(
             f"audit: chord lengths differ from the beam length by at most {audit['worst_sum']:.1e} of it, the longest "
             f"gap between voxels is {audit['longest_gap_m'] * 1e6:.2f} micrometres, {audit['misplaced_chords']} chords "
             f"are misplaced, {audit['voxels_visited_twice']} voxels are visited twice"

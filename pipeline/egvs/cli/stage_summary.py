@@ -7,6 +7,7 @@ so that a new key is never lost.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 from egvs.artefacts.run_record import StageRecord
@@ -25,8 +26,16 @@ _STAGE_NAMES = {"tpog": "occupancy"}
 """Stages whose name differs from their command."""
 
 
-def stage_lines(stage: str, state: str, record: StageRecord) -> Iterator[str]:
-    """Yield the line of a stage, then one line for each period of its traffic."""
+@dataclass(frozen=True)
+class Sentence:
+    """A sentence about a stage; details are printed on request only."""
+
+    text: str
+    is_detail: bool = False
+
+
+def stage_lines(stage: str, state: str, record: StageRecord, *, with_details: bool) -> Iterator[str]:
+    """Yield the line of a stage; with details, also one line for each period of its traffic."""
     duration = f"{record.cost.seconds:.1f} s"
     if state == "skipped":
         duration = "unchanged"
@@ -37,102 +46,111 @@ def stage_lines(stage: str, state: str, record: StageRecord) -> Iterator[str]:
     periods = {}
     if stage == "traffic":
         periods = summary.pop("periods", {})
-    yield f"{_STAGE_NAMES.get(stage, stage):<10} {duration:>10}   {describe_summary(stage, summary)}"
+    text = describe_summary(stage, summary, with_details=with_details)
+    if periods and not with_details:
+        text = f"{_count(len(periods), 'period')}, {text}"
+    yield f"{_STAGE_NAMES.get(stage, stage):<10} {duration:>10}   {text}"
+    if not with_details:
+        return
     for name, period in periods.items():
-        yield f"{name:>21}   {describe_summary(stage, period)}"
+        yield f"{name:>21}   {describe_summary(stage, period, with_details=True)}"
 
 
-def describe_summary(stage: str, summary: dict[str, Any]) -> str:
+def describe_summary(stage: str, summary: dict[str, Any], *, with_details: bool) -> str:
     """Return the summary of a stage in one line."""
     from egvs.cli.console import format_values
 
     rest = {key: value for key, value in summary.items() if key not in _OMITTED_KEYS}
-    sentences: list[str] = []
+    sentences: list[Sentence] = []
     if stage in _SENTENCES and _REQUIRED_KEYS[stage] <= summary.keys():
         sentences += _SENTENCES[stage](rest, summary)
     if rest_text := format_values(rest):
-        sentences.append(rest_text)
-    return "; ".join(sentences)
+        sentences.append(Sentence(rest_text, is_detail=True))
+    return "; ".join(sentence.text for sentence in sentences if with_details or not sentence.is_detail)
 
 
-def _check_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[str]:
+def _detail(text: str) -> Sentence:
+    return Sentence(text, is_detail=True)
+
+
+def _check_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[Sentence]:
     sites, solids, lanes = rest.pop("sites"), summary["solids"], rest.pop("lanes")
-    yield f"{_count(sites, 'site')}, {_count(solids, 'solid')} and {_count(lanes, 'lane')} checked"
+    yield Sentence(f"{_count(sites, 'site')}, {_count(solids, 'solid')} and {_count(lanes, 'lane')} checked")
 
 
-def _statics_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[str]:
-    solids = _count(summary["solids"], "solid")
+def _statics_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[Sentence]:
+    yield Sentence(f"{rest.pop('triangles'):,} triangles in {_count(summary['solids'], 'solid')}")
     if built := rest.pop("built", None):
-        solids += ": " + ", ".join(f"{kind.replace('_', ' ')} ({count:,})" for kind, count in built.items())
-    yield f"{rest.pop('triangles'):,} triangles in {solids}"
+        yield _detail("built: " + ", ".join(f"{kind.replace('_', ' ')} ({count:,})" for kind, count in built.items()))
     if repaired := rest.pop("mended", None):
-        yield "repaired: " + _describe_counts(repaired)
+        yield _detail("repaired: " + _describe_counts(repaired))
     if ignored := rest.pop("left_out", None):
-        yield "left out: " + _describe_counts(ignored)
+        yield _detail("left out: " + _describe_counts(ignored))
 
 
-def _scan_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[str]:
-    yield f"{_count(rest.pop('sites'), 'site')} scanned"
+def _scan_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[Sentence]:
+    yield Sentence(f"{_count(rest.pop('sites'), 'site')} scanned")
     if not rest.pop("kept", True):
-        yield "scans not saved"
+        yield _detail("scans not saved")
     elif "beams" in rest:
-        yield f"{rest.pop('returns'):,} returns from {rest.pop('beams'):,} beams towards the region"
+        yield _detail(f"{rest.pop('returns'):,} returns from {rest.pop('beams'):,} beams towards the region")
 
 
-def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[str]:
-    yield _count(rest.pop("frames"), "frame")
+def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[Sentence]:
+    yield Sentence(_count(rest.pop("frames"), "frame"))
     if "vehicles" in rest:
-        yield describe_vehicles(rest.pop("vehicles"))
-        yield f"mean speed {3.6 * rest.pop('mean_speed_m_s'):.0f} km/h"
-        yield f"standing {rest.pop('share_standing'):.0%} of the time, for at most {rest.pop('longest_standing_s'):g} s"
-        yield f"vehicles overlap in {_count(rest.pop('frames_with_overlap'), 'frame')}"
+        yield Sentence(describe_vehicles(rest.pop("vehicles")))
+        standing, longest_s = rest.pop("share_standing"), rest.pop("longest_standing_s")
+        yield _detail(f"mean speed {3.6 * rest.pop('mean_speed_m_s'):.0f} km/h")
+        yield _detail(f"standing {standing:.0%} of the time, for at most {longest_s:g} s")
+        yield _detail(f"vehicles overlap in {_count(rest.pop('frames_with_overlap'), 'frame')}")
     if rest.get("collisions") is not None:
-        yield _count(rest.pop("collisions"), "collision")
+        yield _detail(_count(rest.pop("collisions"), "collision"))
     if (overlaps := rest.pop("overlapping_pairs_in_roi", None)) is not None:
-        yield f"{_count(overlaps, 'overlap')} in the region"
+        yield _detail(f"{_count(overlaps, 'overlap')} in the region")
     if teleports := rest.pop("teleports", 0):
-        yield f"{_count(teleports, 'vehicle')} moved on"
+        yield Sentence(f"{_count(teleports, 'vehicle')} moved on")
     if counts := rest.pop("counts", None):
         worst = max(count["geh"] for count in counts)
-        yield f"largest GEH against the counts {worst:.1f}"
+        yield Sentence(f"largest GEH against the counts {worst:.1f}")
     if sizes := rest.pop("sizes", None):
-        yield describe_sizes(sizes)
+        yield Sentence(describe_sizes(sizes))
     if sumo := rest.pop("sumo", None):
-        yield f"SUMO {sumo}"
+        yield _detail(f"SUMO {sumo}")
 
 
-def _tpog_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[str]:
-    yield f"{_count(rest.pop('occupied_voxels'), 'voxel')} occupied at least once"
-    yield f"{rest.pop('static_voxels'):,} filled by static solids"
-    yield f"{rest.pop('boxes_in_roi'):.1f} vehicles in the region on average"
+def _tpog_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[Sentence]:
+    yield Sentence(f"{rest.pop('boxes_in_roi'):.1f} vehicles in the region on average")
+    yield _detail(f"{_count(rest.pop('occupied_voxels'), 'voxel')} occupied at least once")
+    yield _detail(f"{rest.pop('static_voxels'):,} filled by static solids")
     memory = rest.pop("memory_frames")
     if isinstance(memory, float):
         memory = f"{memory:.4g}"
-    yield f"autocorrelation time {memory} frames"
+    yield _detail(f"autocorrelation time {memory} frames")
 
 
-def _score_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[str]:
+def _score_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[Sentence]:
     best = rest.pop("best")
     by = SCORE_LABELS[rest.pop("rank_by")]
     limit = rest.pop("egvs_limit")
-    yield f"{_count(rest.pop('sites'), 'site')} ranked by {by.noun}"
+    yield Sentence(f"{_count(rest.pop('sites'), 'site')} ranked by {by.noun}")
     if best:
-        yield f"best: {', '.join(best)}"
+        yield _detail(f"best: {', '.join(best)}")
     if by.name == "egvs":
-        yield f"upper limit {float(limit):,.0f} bit"
+        yield _detail(f"upper limit {float(limit):,.0f} bit")
     if gamma := rest.pop("gamma_auto", None):
-        yield f"gamma {gamma:g} (auto)"
+        yield _detail(f"gamma {gamma:g} (auto)")
     if errors := rest.pop("standard_errors_from", None):
-        yield f"standard errors from {errors}"
+        yield _detail(f"standard errors from {errors}")
 
 
-def _report_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[str]:
+def _report_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[Sentence]:
     rest.pop("best", None)
     rest.pop("worst", None)
-    yield f"{rest.pop('kilobytes'):,} kB"
+    yield Sentence(f"{rest.pop('kilobytes'):,} kB")
 
 
-_SENTENCES: dict[str, Callable[[dict[str, Any], dict[str, Any]], Iterator[str]]] = {
+_SENTENCES: dict[str, Callable[[dict[str, Any], dict[str, Any]], Iterator[Sentence]]] = {
     "check": _check_sentences,
     "statics": _statics_sentences,
     "scan": _scan_sentences,

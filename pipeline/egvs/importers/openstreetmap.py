@@ -502,7 +502,11 @@ def toml_document(comments: Sequence[str], values: Mapping[str, Any], tables: Ma
 
 def _scenario_toml(name: str, scenario: NewScenario) -> str:
     title = scenario.junction.title
-    values: dict[str, Any] = {"description": title[0].upper() + title[1:], "seed": 1}
+    values: dict[str, Any] = {
+        "description": title[0].upper() + title[1:],
+        "assumed": _assumptions(scenario),
+        "seed": 1,
+    }
     if name:
         values = {"name": name} | values
 
@@ -534,6 +538,19 @@ def _scenario_toml(name: str, scenario: NewScenario) -> str:
         comment = f"{origin}; the network {scenario.traffic.summary}. Replace them by real counts"
         document["traffic"]["counts"].comment(comment)
     return tomlkit.dumps(document)
+
+
+def _assumptions(scenario: NewScenario) -> list[str]:
+    """Return what the map does not tell, for the key ``assumed``."""
+    assumed = []
+    if scenario.traffic is not None:
+        assumed.append(f"traffic ({scenario.traffic.per_h:,} vehicles an hour, from the road classes)")
+    if scenario.junction.signalised:
+        assumed.append("signal plans")
+    heights = scenario.statics.heights.get("building", Counter())
+    if heights["default"]:
+        assumed.append(f"heights of {heights['default']} of {heights.total()} buildings")
+    return [*assumed, "positions of the poles"]
 
 
 def _counts_array(flows: Sequence[CountConfig]) -> Any:

@@ -27,7 +27,14 @@ from egvs.report.basemap import network_file
 from egvs.report.colours import STYLE_SHEET
 from egvs.report.figures import Figures
 from egvs.report.ranking import RankedSite, Ranking, entropy_seen_note, headline, lead, share_of_limit
-from egvs.report.sections import PlacementSummary, StudySummary, ValidationSummary, egvs_setting, ranking_disagreement
+from egvs.report.sections import (
+    PlacementSummary,
+    StudySummary,
+    ValidationSummary,
+    assumptions,
+    egvs_setting,
+    ranking_disagreement,
+)
 from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.scene_inputs import scan_dependencies
@@ -148,6 +155,7 @@ def _displayed_settings(scenario: Scenario) -> dict[str, Any]:
         "gamma": repr(scenario.gamma),
         "gamma_auto": scenario.score.gamma == "auto",
         "weights": scenario.score.weights.in_words,
+        "assumed": assumptions(scenario),
         "blindspots": scenario.score.blindspots,
         "effects": scenario.effects.model_dump(mode="json"),
     }
@@ -263,6 +271,7 @@ def _setting_values(contents: PageContents) -> dict[str, Any]:
         frames = contents.by_period.frames
     return {
         "weights": scenario.score.weights.in_words,
+        "assumed": assumptions(scenario),
         "gamma": "∞" if math.isinf(gamma) else f"{gamma:g}",
         "uncapped": math.isinf(gamma),
         "gamma_auto": scenario.score.gamma == "auto",

@@ -320,12 +320,8 @@ def lead(ranking: Ranking) -> str:
     if ranking.is_tie or not ranking.best[0].score > 0:
         return ""
     second = ranking.sites[len(ranking.best)]
-    gap = 1 - ranking.share_of_best(second)
-    gap_text = f"{gap:.1%}" if gap >= _MIN_LEAD else "less than 0.1%"
-    if len(ranking.best) == 1:
-        text = f"It leads the next site, {second.site}, by {gap_text} of its score."
-    else:
-        text = f"They lead the next site, {second.site}, by {gap_text} of their score."
+    subject = "It leads" if len(ranking.best) == 1 else "They lead"
+    text = f"{subject} the next site, {second.site}, by {_format_gap(ranking, second)}."
     if not ranking.best[-1].is_separable:  # ``beats_next`` of the last of the best refers to the second
         text += " There is too little traffic to tell which of them is better."
     if len(ranking.close) > 1:
@@ -334,6 +330,20 @@ def lead(ranking: Ranking) -> str:
             names += f" and {len(ranking.close) - 4} more"
         text += f" {len(ranking.close)} other sites score within {CLOSE_SHARE:.0%} of the best: {names}."
     return text
+
+
+def _format_gap(ranking: Ranking, second: RankedSite) -> str:
+    """Return the lead of the best site: in percentage points for shares, relative to its score otherwise."""
+    best_score = ranking.best[0].score
+    is_share = ranking.by.is_share
+    gap = best_score - second.score
+    if not is_share:
+        gap /= best_score
+    gap_text = f"{100.0 * gap:.1f}" if gap >= _MIN_LEAD else "less than 0.1"
+    if is_share:
+        return f"{gap_text} percentage points"
+    owner = "its" if len(ranking.best) == 1 else "their"
+    return f"{gap_text}% of {owner} score"
 
 
 def entropy_seen_note(ranking: Ranking) -> str:

@@ -27,6 +27,7 @@ from egvs.report.formatting import SCORE_LABELS, ScoreLabel, join_names
 from egvs.report.maps import Backdrop, PlannedPole
 from egvs.report.ranking import RankedSite
 from egvs.report.svg_figures import CurveStep, MapSite
+from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
 
 COMPARED_SITES = 3
@@ -220,6 +221,18 @@ def _site_detection(value: float, se: float, values: Sequence[float]) -> SiteDet
     return SiteDetection(value, known_se, 1 + sum(other > value for other in values))
 
 
+# ---- what the ranking rests on
+
+
+def assumptions(scenario: Scenario) -> tuple[str, ...]:
+    """Return what a scenario assumes rather than measures: its key ``assumed``, and traffic without any count."""
+    traffic = scenario.traffic
+    has_demand = traffic.network is None or bool(traffic.counts or traffic.routes)
+    if has_demand or any(period.counts or period.routes for period in traffic.periods):
+        return scenario.assumed
+    return (*scenario.assumed, "traffic (random trips)")
+
+
 # ---- evidence of the validation study
 
 
@@ -241,7 +254,7 @@ def ranking_disagreement(sites: Sequence[RankedSite], egvs: str, rho: Mapping[st
     rho
         The evidence; :data:`RHO` by default.
     """
-    by_egvs, by_other = _best_sites(sites, "egvs"), _best_sites(sites, DEFAULT_SCORE)
+    by_egvs, by_other = best_sites(sites, "egvs"), best_sites(sites, DEFAULT_SCORE)
     if not by_egvs or not by_other or (by_egvs[0] == by_other[0] and set(by_egvs) == set(by_other)):
         return ""
     noun = SCORE_LABELS[DEFAULT_SCORE].noun
@@ -251,8 +264,8 @@ def ranking_disagreement(sites: Sequence[RankedSite], egvs: str, rho: Mapping[st
     )
 
 
-def _best_sites(sites: Sequence[RankedSite], name: str) -> tuple[str, ...]:
-    """The best sites by one score, those of equal scores in the order of the sites; empty if a value is missing."""
+def best_sites(sites: Sequence[RankedSite], name: str) -> tuple[str, ...]:
+    """Return the best sites by one score, equal ones in the order of the sites; empty if a value is missing."""
     values = [site.value_of(name) for site in sites]
     if any(value is None for value in values):
         return ()

@@ -278,6 +278,10 @@ class Scenario(StrictModel):
 
     name: Name = Field("", min_length=0, validate_default=False, description="By default the name of the folder")
     description: str = Field("", description="Shown in the report")
+    assumed: tuple[str, ...] = Field(
+        (),
+        description="What is assumed rather than measured; shown with the ranking. Remove what you have replaced",
+    )
     extends: str = Field(
         "", description="Folder of a scenario that supplies keys not set here; tables are merged, lists replaced"
     )

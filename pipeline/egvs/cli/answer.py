@@ -1,0 +1,140 @@
+"""What ``egvs run`` prints at its end: the answer to "which pole?" in a few lines.
+
+First the verdict, then the best poles, each with its best mount, the lanes where the best site finds fewest vehicles,
+what was assumed, and the path of the report.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from egvs.artefacts import parquet
+from egvs.artefacts.readers import PeriodRanking
+from egvs.artefacts.run_folder import RunFolder
+from egvs.artefacts.run_record import RunRecord
+from egvs.cli.console import Column, console, make_table
+from egvs.cli.options import DEFAULT_POLES
+from egvs.core.errors import collect_warnings
+from egvs.report import ranking, sections
+from egvs.report.formatting import ScoreLabel, join_names
+from egvs.report.ranking import Pole, RankedSite, Ranking
+from egvs.scenario.model import Scenario
+
+_FILE_WIDTH = 150
+_MAX_PERIODS = 4
+"""With more periods, their ranks are left to ``--all`` and the report."""
+
+
+def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: int | None = DEFAULT_POLES) -> None:
+    """Print the answer of a finished run.
+
+    Parameters
+    ----------
+    folder
+        The run folder.
+    scenario, record
+        Its scenario and its record.
+    poles
+        How many of the best poles are listed; None for all.
+    """
+    out = console(_FILE_WIDTH)
+    run_folder = RunFolder(folder)
+    ranked = Ranking.read(run_folder.scores)
+    summary = record.stages["score"].summary
+    out.print()
+    if ranked.best[0].score > 0:
+        _print_ranking(out, folder, ranked, record, poles)
+    else:
+        for warning in collect_warnings([summary]):
+            out.print(str(warning))
+    if assumptions := sections.assumptions(scenario):
+        out.print(f"Before you trust this ranking: assumed, not measured: {'; '.join(assumptions)}.")
+    out.print(f"report: {run_folder.report}")
+
+
+def _print_ranking(out: Console, folder: Path, ranked: Ranking, record: RunRecord, poles: int | None) -> None:
+    """Print the verdict, the best poles, the lanes seen worst, and how the order by EGVS differs."""
+    out.print(verdict(ranked))
+    out.print()
+    out.print(poles_table(ranked, PeriodRanking.read(folder), poles))
+    if poles is not None and len(ranked.poles) > poles:
+        others = len(ranked.poles) - poles
+        out.print(f"{others} more {'pole' if others == 1 else 'poles'}: --all lists all")
+    out.print()
+    if missed := record.stages["score"].summary.get("missed"):
+        out.print(missed)
+    if other_order := order_by_egvs(ranked, parquet.read_metadata(RunFolder(folder).scores, "scores")):
+        out.print(other_order)
+
+
+def verdict(ranked: Ranking) -> str:
+    """Return one or two sentences: the best site, and how clearly it leads."""
+    sentences = [f"{ranking.headline(ranked, has_traffic=True)}."]
+    if lead := ranking.lead(ranked):
+        sentences.append(lead)
+    return " ".join(sentences)
+
+
+def order_by_egvs(ranked: Ranking, metadata: Mapping[str, Any]) -> str:
+    """Return how the order by EGVS differs, in one sentence; empty where the EGVS ranks or has the same best site."""
+    by_egvs = sections.best_sites(ranked.sites, "egvs")
+    if ranked.by.name == "egvs" or not by_egvs or by_egvs[0] == ranked.sites[0].site:
+        return ""
+    names = join_names(by_egvs)
+    return f"By the EGVS with gamma {metadata['gamma']:g}, the best sites are {names}."
+
+
+def poles_table(ranked: Ranking, by_period: PeriodRanking | None, count: int | None) -> Table:
+    """Return the best poles, how their best candidates are mounted, and what they achieve."""
+    poles = ranked.poles[:count]
+    columns = [
+        Column[Pole]("", lambda pole: str(1 + poles.index(pole))),
+        Column[Pole]("pole", lambda pole: pole.name, "left", wrap=True),
+        *_mount_columns(ranked.sites, poles),
+        Column[Pole](ranked.by.head, lambda pole: ranked.by.value(pole.best.score)),
+    ]
+    if ranked.has_errors:
+        columns.append(Column("std error", lambda pole: ranked.by.error(pole.best.score, pole.best.score_se)))
+    if ranked.companion_score is not None:
+        columns.append(_companion_column(ranked.companion_score))
+    if by_period is not None and len(by_period.periods) <= _MAX_PERIODS:
+        columns += _period_columns(by_period)
+    return make_table(columns, poles)
+
+
+def _mount_columns(sites: Sequence[RankedSite], poles: Sequence[Pole]) -> list[Column[Pole]]:
+    """Return columns for what differs: site, sensor, yaw and pitch only where there are several."""
+    columns: list[Column[Pole]] = []
+    if any(pole.best.site != pole.name for pole in poles):
+        columns.append(Column("best site", lambda pole: pole.best.site, "left", wrap=True))
+    if len({site.sensor for site in sites}) > 1:
+        columns.append(Column("sensor", lambda pole: pole.best.sensor, "left"))
+    columns.append(Column("z m", lambda pole: f"{pole.best.z_m:.4g}"))
+    if any(site.yaw_deg or site.pitch_deg for site in sites):
+        columns.append(Column("yaw deg", lambda pole: f"{pole.best.yaw_deg:.0f}"))
+        columns.append(Column("pitch deg", lambda pole: f"{pole.best.pitch_deg:.0f}"))
+    return columns
+
+
+def _companion_column(label: ScoreLabel) -> Column[Pole]:
+    def text(pole: Pole) -> str:
+        value = pole.best.value_of(label.name)
+        return "-" if value is None else label.value(value)
+
+    return Column(label.head, text)
+
+
+def _period_columns(by_period: PeriodRanking) -> list[Column[Pole]]:
+    """Return the rank of the best site of a pole in each period."""
+    ranks = {row.site: row.by_period for row in by_period.sites}
+
+    def text(number: int, pole: Pole) -> str:
+        return str(ranks[pole.best.site][number].rank)
+
+    return [Column(f"in {name}", partial(text, number)) for number, name in enumerate(by_period.periods)]

@@ -1,0 +1,60 @@
+"""The answer at the end of ``egvs run``."""
+
+from pathlib import Path
+
+import pytest
+
+from egvs.cli import answer
+from tests.report.test_ranking import by_vehicles
+
+MOUNTS = "site,x_m,y_m,z_m,pitch_deg\n" + "".join(
+    f"{pole}_{z_m},{x_m},{y_m},{z_m},-10\n"
+    for pole, x_m, y_m in (("a", 10, 12), ("b", 30.5, -12), ("c", 2, -12), ("d", 38, 12), ("e", 20, 12), ("f", 25, -12))
+    for z_m in (5, 3)
+)
+
+
+@pytest.fixture
+def six_poles(mini: Path) -> Path:
+    (mini / "sites.csv").write_text(MOUNTS)
+    return mini
+
+
+def test_ends_with_the_best_poles_and_the_report(six_poles: Path, tmp_path: Path, run_egvs) -> None:
+    code, printed, error = run_egvs("run", six_poles, "--out", tmp_path / "out", "--set", "score.rank_by='coverage'")
+    assert code == 0, error
+    lines = printed.splitlines()
+    assert lines[1].split()[1:7] == ["is", "the", "best", "of", "12", "sites:"]
+    table = [line.split() for line in lines if line[:1].isdigit() and line[1:3] == "  "]
+    assert [row[0] for row in table] == ["1", "2", "3", "4", "5"]
+    assert len({row[1] for row in table}) == 5, "each pole once"
+    shares = [float(row[-3].rstrip("%")) for row in table]
+    assert shares == sorted(shares, reverse=True)
+    assert "1 more pole: --all lists all" in printed
+    assert lines[-1] == f"report: {tmp_path / 'out' / 'report.html'}"
+    assert len(lines) + len(error.splitlines()) <= 25
+
+
+def test_says_what_was_assumed(mini: Path, tmp_path: Path, run_egvs) -> None:
+    settings = ("--set", "assumed=['traffic (guessed)', 'positions of the poles']")
+    code, printed, error = run_egvs("run", mini, "--out", tmp_path / "out", *settings)
+    assert code == 0, error
+    assert "assumed, not measured: traffic (guessed); positions of the poles." in printed
+    assert "traffic (guessed); positions of the poles" in (tmp_path / "out" / "report.html").read_text()
+    assert "not measured" not in run_egvs("run", mini, "--out", tmp_path / "two")[1]
+
+
+def test_names_the_best_sites_by_egvs_where_another_score_prefers_others() -> None:
+    ranked = by_vehicles(("a", 50.0, 0.9), ("b", 90.0, 0.8), ("c", 20.0, 0.7), ("d", 80.0, 0.6))
+    assert answer.order_by_egvs(ranked, {"gamma": 10.0}) == (
+        "By the EGVS with gamma 10, the best sites are b, d and a."
+    )
+    agreed = by_vehicles(("b", 90.0, 0.9), ("d", 80.0, 0.8))
+    assert answer.order_by_egvs(agreed, {"gamma": 10.0}) == ""
+
+
+def test_details_only_on_request(mini: Path, tmp_path: Path, run_egvs) -> None:
+    brief, error = run_egvs("run", mini, "--out", tmp_path / "out")[1:]
+    verbose, verbose_error = run_egvs("run", mini, "--out", tmp_path / "out", "--verbose")[1:]
+    assert "voxels occupied at least once" not in error and "voxels occupied at least once" in verbose_error
+    assert "peak MB" not in brief and "peak MB" in verbose
