@@ -34,7 +34,7 @@ def main() -> None:
 
 
 def _subsets(out: Path) -> None:
-    scenario = egvs.load(SCENARIOS / "nishishinjuku", ["placement.count=4"])
+    scenario = egvs.load(SCENARIOS / "nishishinjuku", ["placement.count=4", "score.rank_by='egvs'"])
     record: RunRecord = run.run(scenario, out)
     built = problem_builder.build_problem(
         open_folder(scenario, out, recorded=stage_registry.recorded_digests(record)), lambda _: None

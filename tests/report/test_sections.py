@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from egvs.artefacts import parquet
-from egvs.report.sections import RHO, DetectorSummary, SiteDetection, Tau, egvs_setting, ranking_disagreement
+from egvs.report.sections import RHO, RHO_RANGE, DetectorSummary, SiteDetection, Tau, egvs_setting, ranking_disagreement
 from egvs.studies import score_errors, study_settings
 from tests.report.test_ranking import by_vehicles, ranking
 
@@ -135,18 +135,18 @@ def test_reports_scores_with_different_best_sites() -> None:
     rho = {"expected_detections": {"cluster": 0.9, "pointpillars": 0.8}, EGVS: {"cluster": 0.7, "pointpillars": 0.6}}
     assert ranking_disagreement(by_vehicles(*rows).sites, EGVS, rho).endswith(
         " At the held-out junctions of the validation study, the share of vehicles found was the better "
-        "predictor of detection: rank correlation 0.90 against 0.70 (cluster) and 0.80 against 0.60 (pointpillars); "
-        "see docs/validity.md."
+        "predictor of detection: mean rank correlation 0.90 against 0.70 (cluster) and 0.80 against 0.60 "
+        f"(pointpillars). That of the share of vehicles found is {RHO_RANGE}; see docs/validity.md."
     )
     for worse, who in ((0.5, "the EGVS"), (0.65, "neither score")):
         rho["expected_detections"] = {"cluster": worse, "pointpillars": worse if worse < 0.6 else 0.55}
         rho["expected_detections"]["pointpillars"] = 0.5 if worse == 0.5 else 0.7
         text = ranking_disagreement(by_vehicles(*rows).sites, EGVS, rho)
-        assert f", {who} was " in text and "the better predictor of detection: rank" in text
+        assert f", {who} was " in text and "the better predictor of detection: mean rank" in text
     for other in (egvs_setting(10.0, 0.25), egvs_setting(2.0, 0.25, moving_occlusion=True)):
         assert ranking_disagreement(by_vehicles(*rows).sites, other, rho).endswith(
-            "was not measured. The rank correlation of the share of vehicles found with detection is 0.65 (cluster) "
-            "and 0.70 (pointpillars); see docs/validity.md."
+            "was not measured. The rank correlation of the share of vehicles found with detection is "
+            f"{RHO_RANGE}; see docs/validity.md."
         )
 
 
