@@ -273,7 +273,8 @@ def expected(run: Path) -> Layers:
     ]
     on_lanes = [row for row in missed if row["by"] == "lane"]
     at = [Thing(row, [(row["x_m"], row["y_m"])]) for row in missed]
-    region = {"name": "junction", "low_m": 0.0, "high_m": 5.0, "voxel_m": 1.0, "gamma": "1000", "rank_by": "egvs"}
+    region = {"name": "junction", "low_m": 0.0, "high_m": 5.0, "voxel_m": 1.0, "gamma": "1000"}
+    region["rank_by"] = "expected_detections"
     return {
         "sites": [Thing(row, [(row["x_m"], row["y_m"])]) for row in rows_of(run, "scores")],
         "plan": [Thing(row, [(row["x_m"], row["y_m"])]) for row in rows_of(run, "placement")],

@@ -50,21 +50,20 @@ GOOD = place("lane", "westbound lane", 90, 40, 0.875)
 
 
 def site(places: Sequence[LocationVisibility], share: object = ((0.0, NAN), (0.25, 1.0))) -> SiteBlindspots:
-    return SiteBlindspots("p1", 20.0, tuple(places), np.array(share), (0.0, 0.0), 1.0)
+    return SiteBlindspots("p1", tuple(places), np.array(share), (0.0, 0.0), 1.0)
 
 
 def test_lists_the_worst_locations_first_and_none_with_few_vehicles() -> None:
     blindspots = site([ALL, APPROACH, GOOD, FEW, CROSSING, TURN, LEFT])
     assert blindspots.worst == [LEFT, TURN, CROSSING]
     assert figures.describe_worst_locations(blindspots)[0] == (
-        "eastbound left-turn lane: 41 % seen",
+        "eastbound left-turn lane: 41 % found",
         "± 8 %, from 12 vehicles in 120 observations",
     )
     assert figures.format_missed_share(blindspots) == "12.5%"
-    assert figures.blindspot_note(blindspots) == "Share of vehicles seen on each approach: eastbound 63 %."
+    assert figures.blindspot_note(blindspots) == "Share of vehicles found on each approach: eastbound 63 %."
     assert blindspots.in_words() == (
-        "p1 misses 12.5% of the vehicles (fewer than 20 points); worst: eastbound left-turn lane, 41% seen; "
-        "eastbound left turn in the junction, 50% seen"
+        "p1: fewest vehicles are found here: eastbound left-turn lane (41%); eastbound left turn in the junction (50%)"
     )
 
 
@@ -78,7 +77,7 @@ def test_lists_at_most_five_locations() -> None:
     [
         ([], "No vehicle in the region."),
         ([ALL], "The traffic does not come from one road network, so there are no lanes to list; see the map."),
-        ([ALL, GOOD], "No lane, turn or crossing with 10 vehicles or more is seen worse than average."),
+        ([ALL, GOOD], "No lane, turn or crossing with 10 vehicles or more is below the average."),
         ([ALL, LEFT, place("no lane", "on no lane", 1, 1, 1.0)], "1 of 1,000 observed vehicles was not on a lane."),
         ([ALL, LEFT, place("no lane", "on no lane", 7, 2, 1.0)], "7 of 1,000 observed vehicles were not on a lane."),
     ],
@@ -102,7 +101,7 @@ def test_page_has_the_blind_spots_of_each_site(tmp_path: Path) -> None:
     scenario, out = run_to_scores(tmp_path)
     text = render_report(scenario, out)
     read = PageReader(text)
-    assert read.text.count("Vehicles missed:") == 2
+    assert read.text.count("Vehicles not found:") == 2
     assert read.text.count("The traffic does not come from one road network") == 2 + 4  # panels, and data
     data = json.loads(re.search(r'id="site-data">(.*?)</script>', text, re.DOTALL)[1])  # type: ignore[index]
     for name, blindspots in data["sites"].items():
@@ -110,9 +109,8 @@ def test_page_has_the_blind_spots_of_each_site(tmp_path: Path) -> None:
         assert actual.overall is not None and actual.overall.vehicle_frames == 40 + 33  # the second drives out
         assert blindspots["vehicles"]["missed"] == f"{1 - actual.overall.share:.1%}"
         assert blindspots["vehicles"]["numbers"] == [None] * MAX_LOCATIONS
-    assert any(
-        f"misses {blindspots['vehicles']['missed']} of the vehicles" in text for blindspots in data["sites"].values()
-    )
+    missed = [blindspots["vehicles"]["missed"] for blindspots in data["sites"].values()]
+    assert any(f"{share} of the vehicles are not found from" in text for share in missed)
 
 
 def test_views_agree_with_the_scores(plain_run):

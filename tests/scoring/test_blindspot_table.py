@@ -13,6 +13,7 @@ import egvs
 from egvs.artefacts import parquet, readers
 from egvs.core.errors import InputError
 from egvs.scenario import loading, model
+from egvs.scoring.target_scores import detection_chances
 from egvs.scoring.targets import TargetRecord, visible_targets
 from egvs.stages import scan, score, statics
 from egvs.stages.inputs import open_folder
@@ -83,10 +84,11 @@ def test_vehicle_frames_add_up(on_roads: tuple[model.Scenario, Path]) -> None:
         count = {by: sum(r["vehicle_frames"] for r in rows if r["by"] == by) for by in {r["by"] for r in rows}}
         assert count["all"] == 90 == count["lane"] + count.get("turn", 0) + count["no lane"]
         assert count["no lane"] == 10 and count["approach"] == 80
-        seen = {by: sum(r["seen"] for r in rows if r["by"] == by) for by in count}
+        seen = {by: sum(r["with_points"] for r in rows if r["by"] == by) for by in count}
         assert 0 < seen["all"] == seen["lane"] + seen.get("turn", 0) + seen["no lane"]
+        found = {by: sum(r["share_found"] * r["vehicle_frames"] for r in rows if r["by"] == by) for by in count}
+        assert found["all"] == pytest.approx(found["lane"] + found.get("turn", 0) + found["no lane"])
         for row in rows:
-            assert row["share_seen"] == row["seen"] / row["vehicle_frames"]
             assert (row["ix"] >= 0) == (row["iy"] >= 0) == (row["by"] == "cell") == (row["words"] == "")
     keys = [(r["by"], r["place"], r["ix"], r["iy"]) for r in rows_of(out, "pole_a")]
     assert (
@@ -94,14 +96,26 @@ def test_vehicle_frames_add_up(on_roads: tuple[model.Scenario, Path]) -> None:
     )
 
 
+def test_the_share_found_of_all_vehicles_is_the_score(on_roads: tuple[model.Scenario, Path]) -> None:
+    _, out = on_roads
+    scores = {
+        row["site"]: row["expected_detections"] for row in readers.read_scores(out / "scores.parquet").to_pylist()
+    }
+    assert len(scores) == 2
+    for site, score_of_site in scores.items():
+        (whole,) = (row for row in rows_of(out, site) if row["by"] == "all")
+        assert whole["share_found"] == pytest.approx(score_of_site)
+
+
 def test_counts_are_those_of_the_points(on_roads: tuple[model.Scenario, Path]) -> None:
     scenario, out = on_roads
     record = TargetRecord.read(out / "trajectories.parquet", scenario.roi.grid)
     for its in empty_scans(open_folder(scenario, out)):
-        points = visible_targets(record, its.beams).points
+        visible = visible_targets(record, its.beams)
         left = record.boxes[:, 1] == -1.6
         rows = {row["place"]: row for row in rows_of(out, its.site.name) if row["by"] == "lane"}
-        assert rows["near_2"]["seen"] == int((points[left] >= 20).sum())
+        assert rows["near_2"]["with_points"] == int((visible.points[left] >= 20).sum())
+        assert rows["near_2"]["share_found"] == pytest.approx(detection_chances(visible)[left].mean())
         assert rows["near_2"]["words"] == "eastbound left-turn lane, High Street"
         assert (rows["near_2"]["vehicle_frames"], rows["near_2"]["vehicles"]) == (40, 12)
 
@@ -112,7 +126,7 @@ def test_inputs_and_metadata_of_blind_spots(on_roads: tuple[model.Scenario, Path
     about = parquet.read_metadata(out / "blindspots.parquet", "blindspots")
     assert about["cells"] == {"origin_m": [0.0, -20.0], "cell_m": 1.0, "shape": [60, 40]} and about["points"] == 20.0
     (site,) = readers.read_blindspots(out / "blindspots.parquet", {"pole_b"})
-    assert (site.site, site.points, site.off_lanes, site.share_missed.shape) == ("pole_b", 20.0, 10, (60, 40))
+    assert (site.site, site.off_lanes, site.share_missed.shape) == ("pole_b", 10, (60, 40))
 
 
 def test_another_number_of_threads_writes_the_same_bytes(
@@ -156,12 +170,13 @@ def test_a_mix_of_periods_weighs_its_vehicles(tmp_path: Path) -> None:
     record = TargetRecord.read(tmp_path / "run" / "trajectories.parquet", scenario.roi.grid)
     of_a = record.numbers[record.frame] < 24
     its = {it.site.name: it for it in empty_scans(open_folder(scenario, tmp_path / "run"))}
-    well = visible_targets(record, its["pole_b"].beams).points >= 20
-    parts, weights = [well[of_a].sum(), well[~of_a].sum()], np.array([3 / 24, 1 / 16])
+    visible = visible_targets(record, its["pole_b"].beams)
+    chances, weights = detection_chances(visible), np.array([3 / 24, 1 / 16])
+    parts = np.array([chances[of_a].sum(), chances[~of_a].sum()])
     assert whole["vehicles"] == len({*record.vehicle[of_a]}) + len({*record.vehicle[~of_a]})
-    assert whole["seen"] == sum(parts) and whole["vehicle_frames"] == len(record)
+    assert whole["with_points"] == int((visible.points >= 20).sum()) and whole["vehicle_frames"] == len(record)
     expected = parts @ weights / ([of_a.sum(), (~of_a).sum()] @ weights)
-    assert whole["share_seen"] == pytest.approx(expected)
+    assert whole["share_found"] == pytest.approx(expected)
     rows = rows_of(tmp_path / "run", "pole_b")
     assert all(row["weight"] > 0 for row in rows)
 

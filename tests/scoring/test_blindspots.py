@@ -39,13 +39,18 @@ def by_place(spots: VehicleSpots, counts) -> dict[tuple[str, str], int]:
     return dict(zip(names, np.asarray(counts)[: len(names)].tolist(), strict=True))
 
 
+def well_visible(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points, and a certain detection with at least 20 of them."""
+    return points, (points >= 20).astype(np.float64)
+
+
 def test_a_hidden_lane_by_hand(tmp_path: Path) -> None:
     """Two frames of a two-lane approach: of three cars in the left-turn lane one is seen, of three others all."""
     first = frame([car(25, -1.6), car(20, -1.6), car(25, -4.8), car(32, -4.8)], vehicles=("a", "b", "c", "d"))
     later = frame([car(29, -1.6), car(20, 10), car(41, -4.8)], number=9, vehicles=("b", "e", "c"))
     record = TargetRecord.of([first, later], GRID)
     spots = spots_of(record, RoadLocations.of(read(tmp_path), GRID.roi))
-    found = spots.visibility(np.array([19.0, 20.0, 25.0, 1000.0, 0.0, 21.0, 20.0]))
+    found = spots.visibility(*well_visible(np.array([19.0, 20.0, 25.0, 1000.0, 0.0, 21.0, 20.0])))
     assert by_place(spots, spots.vehicle_frames) == {
         ("all", ""): 7,
         ("no lane", ""): 1,
@@ -68,7 +73,7 @@ def test_a_hidden_lane_by_hand(tmp_path: Path) -> None:
         ("turn", "near:straight"): 1,
         ("crossing", ":j_c0_0"): 1,
     }
-    assert by_place(spots, found.visible) == {
+    assert by_place(spots, found.with_points) == {
         ("all", ""): 5,
         ("no lane", ""): 1,
         ("approach", "near"): 2,
@@ -79,7 +84,7 @@ def test_a_hidden_lane_by_hand(tmp_path: Path) -> None:
         ("turn", "near:straight"): 1,
         ("crossing", ":j_c0_0"): 1,
     }
-    assert found.share.tolist() == (found.visible / spots.vehicle_frames).tolist()
+    assert found.share == pytest.approx(found.with_points / spots.vehicle_frames)
     left = [place.name for place in spots.locations].index("near_2")
     assert spots.at_m[left].tolist() == pytest.approx([(23 + 18 + 27) / 3, -1.6])
 
@@ -141,29 +146,30 @@ def test_counts_against_plain_python(seed):
     points, weight = rng.integers(0, 40, len(record)).astype(np.float64), rng.uniform(0.5, 3, len(record))
     period = (record.frame > 0).astype(np.int64)
     spots = spots_of(record, weight=weight, period=period)
-    found = spots.visibility(points)
+    chances = rng.uniform(0, 1, len(record))
+    found = spots.visibility(points, chances)
     who, counted, well, weighed = defaultdict(set), defaultdict(int), defaultdict(int), defaultdict(list)
     for i in range(len(record)):
         for cell in slow_cells(record.boxes[i], small.roi):
             who[cell].add((record.vehicle[i], record.frame[i] > 0))
             counted[cell] += 1
             well[cell] += int(points[i] >= 20)
-            weighed[cell] += [(record.vehicle[i], record.frame[i] > 0, weight[i], points[i] >= 20)]
+            weighed[cell] += [(record.vehicle[i], record.frame[i] > 0, weight[i], chances[i])]
     first = len(spots.locations)
     assert first == (1 if len(record) else 0)
     cells = list(map(tuple, spots.cells.tolist()))
     assert cells == sorted(counted)
     assert spots.vehicle_frames[first:].tolist() == [counted[cell] for cell in cells]
     assert spots.vehicles[first:].tolist() == [len(who[cell]) for cell in cells]
-    assert found.visible[first:].tolist() == [well[cell] for cell in cells]
-    assert found.visible[:first].tolist() == [int((points >= 20).sum())] * first
+    assert found.with_points[first:].tolist() == [well[cell] for cell in cells]
+    assert found.with_points[:first].tolist() == [int((points >= 20).sum())] * first
     slow = [share_slowly(weighed[cell]) for cell in cells]
     assert found.share[first:] == pytest.approx([share for share, _ in slow])
     assert found.se[first:] == pytest.approx([se for _, se in slow], nan_ok=True)
 
 
 def share_slowly(rows):
-    """A ratio of sums over vehicles, and its textbook error, of (vehicle, period, weight, seen)."""
+    """A ratio of sums over vehicles, and its textbook error, of (vehicle, period, weight, chance)."""
     total = math.fsum(weight for *_, weight, _ in rows)
     share = math.fsum(weight * seen for *_, weight, seen in rows) / total
     vehicles = {row[:2] for row in rows}
@@ -179,9 +185,9 @@ def test_the_standard_error_is_that_of_vehicles_looked_at_once_or_always_alike()
     often = TargetRecord.of([frame(cars, number=number) for number in range(7)], GRID)
     points = np.where(np.arange(10) < 4, 0.0, 50.0)
     for record, its in ((once, points), (often, np.tile(points, 7))):
-        found = spots_of(record).visibility(its)
+        found = spots_of(record).visibility(*well_visible(its))
         assert (found.share[0], found.se[0]) == pytest.approx((0.6, math.sqrt(0.6 * 0.4 / 9)))
-    assert np.isnan(spots_of(once).visibility(points).se[1:]).all()  # one car over each square
+    assert np.isnan(spots_of(once).visibility(*well_visible(points)).se[1:]).all()  # one car over each square
 
 
 def test_cars_of_one_name_in_two_periods_are_two() -> None:
@@ -194,8 +200,8 @@ def test_cars_of_one_name_in_two_periods_are_two() -> None:
 def test_weights_count_in_shares() -> None:
     record = TargetRecord.of([frame([car(20, 10), car(40, 10)])], GRID)
     spots = spots_of(record, weight=[3.0, 1.0])
-    found = spots.visibility(np.array([20.0, 0.0]))
-    assert (found.visible[0], found.share[0], spots.weights[0]) == (1, 0.75, 4.0)
+    found = spots.visibility(*well_visible(np.array([20.0, 0.0])))
+    assert (found.with_points[0], found.share[0], spots.weights[0]) == (1, 0.75, 4.0)
 
 
 def test_a_rear_part_is_where_its_own_front_is(tmp_path: Path) -> None:
@@ -215,9 +221,9 @@ def test_people_whom_a_score_counts_are_no_vehicles(tmp_path: Path) -> None:
     assert by_place(both, both.vehicle_frames) == by_place(alone, alone.vehicle_frames)
     assert both.cells.tolist() == alone.cells.tolist()
     assert (
-        both.visibility(np.array([50.0, 0.0, 50.0])).visible.sum()
+        both.visibility(*well_visible(np.array([50.0, 0.0, 50.0]))).with_points.sum()
         == 0
-        < both.visibility(np.array([0.0, 20.0, 0.0])).visible.sum()
+        < both.visibility(*well_visible(np.array([0.0, 20.0, 0.0]))).with_points.sum()
     )
 
 
@@ -247,4 +253,4 @@ def test_crossings_against_shapely(tmp_path: Path) -> None:
 def test_no_vehicles(tmp_path: Path) -> None:
     record = TargetRecord.of([frame([])], GRID)
     spots = spots_of(record, RoadLocations.of(read(tmp_path), GRID.roi))
-    assert len(spots) == 0 and spots.visibility(np.empty(0)).share.shape == (0,)
+    assert len(spots) == 0 and spots.visibility(np.empty(0), np.empty(0)).share.shape == (0,)

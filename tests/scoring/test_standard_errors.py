@@ -268,7 +268,7 @@ def test_without_errors_the_scores_are_the_same(mini: Path, tmp_path: Path, chan
 
 def test_the_ranking_marks_neighbours_that_are_not_separable(mini: Path, tmp_path: Path, run_egvs) -> None:
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,10,12,3\npole_b,30.5,-12,3\npole_c,10,12,3.001\n")
-    code, printed, _ = run_egvs("run", mini, "--out", tmp_path / "out")
+    code, printed, _ = run_egvs("run", mini, "--out", tmp_path / "out", "--all")
     assert code == 0
     assert "~ " in printed
     assert "not separable" in printed

@@ -39,7 +39,7 @@ Rows = list[dict[str, Any]]
 
 @dataclass(frozen=True)
 class LocationVisibility:
-    """A location, and the vehicles there that a site sees.
+    """A location, and the vehicles there that are found from a site.
 
     Attributes
     ----------
@@ -50,7 +50,8 @@ class LocationVisibility:
     vehicle_frames, vehicles
         Number of vehicles counted in each frame, and of different vehicles.
     share, se
-        Share of the vehicles that the site sees, 0 to 1, and its standard error; NaN with one vehicle.
+        Share of the vehicles that detectors should find from the site, 0 to 1, and its standard error; NaN with one
+        vehicle.
     """
 
     by: str
@@ -71,8 +72,6 @@ class SiteBlindspots:
     ----------
     site
         Name of the site.
-    points
-        A vehicle with this many points is seen.
     locations
         All locations except the cells of the map, in the order of the artefact.
     share_missed
@@ -82,7 +81,6 @@ class SiteBlindspots:
     """
 
     site: str
-    points: float
     locations: tuple[LocationVisibility, ...]
     share_missed: FloatArray
     origin_m: tuple[float, float]
@@ -108,18 +106,19 @@ class SiteBlindspots:
 
     @property
     def worst(self) -> list[LocationVisibility]:
-        """The lanes, turns and crossings that are seen worse than the whole region, the worst first."""
+        """The lanes, turns and crossings where a smaller share is found than in the whole region, the worst first."""
         mean = self.overall.share if self.overall else 0.0
         worse = [location for location in self.of_kind(*_LISTED_KINDS) if location.share < mean]
         return worse[:MAX_LOCATIONS]
 
     def in_words(self) -> str:
-        """Return in one line what share of the vehicles the site misses, and the two worst locations."""
+        """Return in one line where the smallest share of the vehicles is found: the two worst locations."""
         if self.overall is None:
             return f"no vehicle in the region of interest, so none that {self.site} misses"
-        share = f"{self.site} misses {1.0 - self.overall.share:.1%} of the vehicles (fewer than {self.points:g} points)"
-        worst = "; ".join(f"{location.words}, {location.share:.0%} seen" for location in self.worst[:2])
-        return f"{share}; worst: {worst}" if worst else share
+        if not self.worst:
+            return f"{self.site}: {self.overall.share:.0%} of the vehicles are found, on no listed lane fewer"
+        worst = "; ".join(f"{location.words} ({location.share:.0%})" for location in self.worst[:2])
+        return f"{self.site}: fewest vehicles are found here: {worst}"
 
 
 def read_blindspots(path: Path, only: Collection[str] | None = None) -> Iterator[SiteBlindspots]:
@@ -161,13 +160,13 @@ def _site_blindspots(
     if index.size and not ((index >= 0) & (index < np.array([cells["shape"]]).T)).all():
         raise InputError(path, f"a cell of site {site} lies outside the region", _REMAKE_HINT)
     share_missed = np.full(cells["shape"], np.nan)
-    share_missed[tuple(index)] = 1.0 - np.array(columns["share_seen"], dtype=np.float64)[is_cell]
+    share_missed[tuple(index)] = 1.0 - np.array(columns["share_found"], dtype=np.float64)[is_cell]
 
-    names = ("by", "words", "x_m", "y_m", "vehicle_frames", "vehicles", "share_seen", "share_se")
+    names = ("by", "words", "x_m", "y_m", "vehicle_frames", "vehicles", "share_found", "share_found_se")
     rows = zip(*(columns[name] for name in names), strict=True)
     locations = tuple(LocationVisibility(*row) for row in rows if row[0] != "cell")
     x_m, y_m = cells["origin_m"]
-    return SiteBlindspots(site, metadata["points"], locations, share_missed, (x_m, y_m), cells["cell_m"])
+    return SiteBlindspots(site, locations, share_missed, (x_m, y_m), cells["cell_m"])
 
 
 DISTINCT_PROBABILITY = 0.9

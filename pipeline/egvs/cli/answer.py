@@ -61,13 +61,16 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
 def _print_ranking(out: Console, folder: Path, ranked: Ranking, record: RunRecord, poles: int | None) -> None:
     """Print the verdict, the best poles, the lanes seen worst, and how the order by EGVS differs."""
     out.print(verdict(ranked))
+    summary = record.stages["score"].summary
+    if ranked.by.counts_vehicles and "weights" in summary:
+        out.print(f"Vehicles are weighted: {summary['weights']}.")
     out.print()
     out.print(poles_table(ranked, PeriodRanking.read(folder), poles))
     if poles is not None and len(ranked.poles) > poles:
         others = len(ranked.poles) - poles
         out.print(f"{others} more {'pole' if others == 1 else 'poles'}: --all lists all")
     out.print()
-    if missed := record.stages["score"].summary.get("missed"):
+    if missed := summary.get("missed"):
         out.print(missed)
     if other_order := order_by_egvs(ranked, parquet.read_metadata(RunFolder(folder).scores, "scores")):
         out.print(other_order)

@@ -511,11 +511,10 @@ def _draw_blindspots(context: LayerContext) -> str:
     context.draw_points(points.astype(np.float32), point_colours, spots.cell_m)
     overall = "no vehicles were recorded"
     if spots.overall is not None:
-        overall = f"all vehicles: {spots.overall.share:.1%} seen"
+        overall = f"all vehicles: {spots.overall.share:.1%} found"
     rows = [f"<b>{_escape_html(overall)}</b>"]
-    rows += [_escape_html(f"{location.words}: {location.share:.0%} seen") for location in spots.worst]
-    title = f"share of vehicles with fewer than {spots.points:g} points"
-    return _scale_legend(title, 0.0, 1.0, "{:.0%}") + _text_legend(rows)
+    rows += [_escape_html(f"{location.words}: {location.share:.0%} found") for location in spots.worst]
+    return _scale_legend("share of vehicles not found", 0.0, 1.0, "{:.0%}") + _text_legend(rows)
 
 
 def _draw_difference(context: LayerContext) -> str:

@@ -36,6 +36,7 @@ from egvs.placement import problem_builder
 from egvs.placement.refinement import PlanPoses
 from egvs.report.formatting import SCORE_LABELS
 from egvs.scenario.model import Scenario
+from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.scoring import blindspots
 from egvs.scoring.blindspots import CELL_M, SpotVisibility, VehicleSpots
 from egvs.scoring.egvs import EntropyField
@@ -354,8 +355,9 @@ class Session:
         assert targets.spots is not None
         beams = self.beams(site)
         probability = detection_probability(self.scene_with(site), beams.sensor)
-        points = visible_targets(targets.record, beams, probability).points
-        return site_blindspots(site.name, targets.spots, targets.spots.visibility(points), self.tpog.grid)
+        visible = visible_targets(targets.record, beams, probability)
+        visibility = targets.spots.visibility(visible.points, TARGET_SCORES[DEFAULT_SCORE](visible))
+        return site_blindspots(site.name, targets.spots, visibility, self.tpog.grid)
 
     def scene_with(self, site: Site) -> Scene:
         """Return the scene with the effects that act when the candidate of a site is moved there."""
@@ -451,7 +453,7 @@ def site_blindspots(site: str, spots: VehicleSpots, visibility: SpotVisibility, 
     spots
         Locations, and cells of the map.
     visibility
-        Share of vehicles that are visible at each spot.
+        Share of vehicles found at each spot.
     grid
         The region of interest.
     """
@@ -471,7 +473,7 @@ def site_blindspots(site: str, spots: VehicleSpots, visibility: SpotVisibility, 
     share_missed = np.full(blindspots.blindspot_map_shape(grid), np.nan)
     share_missed[tuple(spots.cells.T)] = 1.0 - visibility.share[len(locations) :]
     x, y, _ = grid.origin_m
-    return SiteBlindspots(site, SEEN_WELL_POINTS, tuple(locations), share_missed, (x, y), CELL_M)
+    return SiteBlindspots(site, tuple(locations), share_missed, (x, y), CELL_M)
 
 
 @dataclass(frozen=True, eq=False)

@@ -149,7 +149,7 @@ def _blindspot_layers(run: FinishedRun, notes: list[str]) -> Iterator[Layer]:
     table, _ = parquet.read_artefact(run.artefact(RunFolder.blindspots.name), "blindspots")
     locations = table.filter(pc.not_equal(table.column("by"), _CELL)).drop_columns(["ix", "iy"])
     best = best_site(run)
-    yield Layer(MISSED, point_geometries(locations), to_plain_table(locations), "share_seen", True, best)
+    yield Layer(MISSED, point_geometries(locations), to_plain_table(locations), "share_found", True, best)
 
     lines = _lane_lines(run)
     is_lane = pc.equal(locations.column("by"), _LANE)
@@ -157,7 +157,7 @@ def _blindspot_layers(run: FinishedRun, notes: list[str]) -> Iterator[Layer]:
     lanes = locations.filter(pc.and_(is_lane, has_line))
     if len(lanes):
         geometries = np.array([lines[name] for name in lanes.column("place").to_pylist()], dtype=object)
-        yield Layer(MISSED_LANES, geometries, to_plain_table(lanes), "share_seen", True, best)
+        yield Layer(MISSED_LANES, geometries, to_plain_table(lanes), "share_found", True, best)
 
 
 def _lane_lines(run: FinishedRun) -> dict[str, Any]:

@@ -79,8 +79,6 @@ class SiteViews:
         Those of the best and of the last site.
     scale
         Their colour scale, SVG text.
-    points
-        A vehicle with at least this number of points is seen; 0 if blind spots are not shown.
     data
         JSON from which the page draws any other site.
     is_coarse
@@ -89,7 +87,6 @@ class SiteViews:
 
     panels: tuple[SitePanel, ...]
     scale: str
-    points: float
     data: str
     is_coarse: bool
 
@@ -224,11 +221,9 @@ def site_views(
         "palettes": palettes,
         "end": _to_base64(colours.PNG_END),
     }
-    points = blindspots.points if blindspots else 0.0
     return SiteViews(
         panels=tuple(panels[site.site] for site in ranking.extremes),
         scale=shared_scale(peak, "Entropy in the column (bit)"),
-        points=points,
         data=json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),  # a name must not end the script
         is_coarse=is_coarse,
     )
@@ -344,10 +339,9 @@ def _draw_panel(
 
 @dataclass(frozen=True)
 class Blindspots:
-    """Blind spots of all choosable sites; a vehicle with at least ``points`` points is seen."""
+    """Blind spots of all choosable sites."""
 
     sites: dict[str, SiteBlindspots]
-    points: float
 
     def view(self, site: MapSite, grid: Grid, backdrop: Backdrop, box: Box, prefix: str) -> BlindspotView:
         """Return the figure and the texts of one site."""
@@ -380,8 +374,7 @@ def read_blindspots(work: StageContext, choosable: Sequence[MapSite]) -> Blindsp
         return None
     names = {site.site for site in choosable}
     sites = {site.site: site for site in readers.read_blindspots(work.folder.blindspots, names)}
-    points = next((site.points for site in sites.values()), 0.0)
-    return Blindspots(sites, points)
+    return Blindspots(sites)
 
 
 def format_missed_share(site_blindspots: SiteBlindspots) -> str:
@@ -395,7 +388,7 @@ def describe_worst_locations(site_blindspots: SiteBlindspots) -> tuple[tuple[str
     """Return the worst locations, and the sample that each is based on."""
     described = []
     for location in site_blindspots.worst:
-        described.append((f"{location.words}: {_format_share(location)} seen", _describe_sample(location)))
+        described.append((f"{location.words}: {_format_share(location)} found", _describe_sample(location)))
     return tuple(described)
 
 
@@ -407,12 +400,12 @@ def blindspot_note(site_blindspots: SiteBlindspots) -> str:
         return "The traffic does not come from one road network, so there are no lanes to list; see the map."
     sentences = []
     if not site_blindspots.worst:
-        sentences.append(f"No lane, turn or crossing with {MIN_VEHICLES} vehicles or more is seen worse than average.")
+        sentences.append(f"No lane, turn or crossing with {MIN_VEHICLES} vehicles or more is below the average.")
     if approaches := site_blindspots.of_kind("approach"):
         shares = ", ".join(
             f"{approach.words.removesuffix(' approach')} {_format_share(approach)}" for approach in approaches
         )
-        sentences.append(f"Share of vehicles seen on each approach: {shares}.")
+        sentences.append(f"Share of vehicles found on each approach: {shares}.")
     if site_blindspots.off_lanes:
         verb = "was" if site_blindspots.off_lanes == 1 else "were"
         sentences.append(

@@ -236,8 +236,9 @@ def missed_view(
 
     alt = f"From above: no vehicles for {site.site} to see."
     if blindspots.overall:
-        alt = f"From above: {site.site} misses {1.0 - blindspots.overall.share:.1%} of the vehicles; share by cell."
-    bar = ColourBar(0.0, 100.0, "Share of vehicles missed (%)", even=True)
+        missed = 1.0 - blindspots.overall.share
+        alt = f"From above: {missed:.1%} of the vehicles are not found from {site.site}; share by cell."
+    bar = ColourBar(0.0, 100.0, "Share of vehicles not found (%)", even=True)
     return plan.svg(parts, alt, bar)
 
 

@@ -1,9 +1,10 @@
-"""How many vehicles a site sees at each spot: ``blindspots.parquet``.
+"""What share of the vehicles is found from a site at each spot: ``blindspots.parquet``.
 
 A *spot* is a cell of the map, a lane, a whole approach or exit, a turn in a junction, or a crossing. A vehicle-frame
 belongs to every cell that its box covers in plan, to the lane or turn where its front is and to the road of that lane,
 and to each crossing that its box reaches; to "no lane" where its front is on none. The spots depend on traffic only and
-are computed once for all sites. A vehicle is seen with :data:`egvs.scoring.targets.SEEN_WELL_POINTS` points.
+are computed once for all sites. The share found is the mean probability that detectors find a vehicle, as in the score
+``expected_detections``.
 
 World frame, in plan, metres.
 """
@@ -51,16 +52,16 @@ class SpotVisibility:
 
     Attributes
     ----------
-    visible
-        Number of vehicle-frames that the site sees, (k,) int64.
     share, se
-        Their share of the weight at the spot, (k,) float64, and its standard error: that of a ratio of sums over
-        independent vehicles; NaN with one vehicle.
+        Weighted share of the vehicle-frames that detectors are expected to find, 0 to 1, (k,) float64, and its standard
+        error: that of a ratio of sums over independent vehicles; NaN with one vehicle.
+    with_points
+        Number of vehicle-frames with at least :data:`egvs.scoring.targets.SEEN_WELL_POINTS` points, (k,) int64.
     """
 
-    visible: Ints
     share: Floats
     se: Floats
+    with_points: Ints
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,24 +145,24 @@ class VehicleSpots:
         """Weight of all vehicle-frames at each spot, (k,) float64."""
         return self._sum_by_spot(self._visit_weights)
 
-    def visibility(self, points: Floats) -> SpotVisibility:
+    def visibility(self, points: Floats, chances: Floats) -> SpotVisibility:
         """Return what a site sees at each spot.
 
         Parameters
         ----------
         points
             Points of the site on each vehicle-frame of the record, (n,) float64.
+        chances
+            Probability that each vehicle-frame is found, 0 to 1, (n,) float64.
         """
-        is_visible = (points >= SEEN_WELL_POINTS)[self.row]
-        visit = self.visit[is_visible]
-        weights = self._visit_weights
-        visible_weights = self._sum_by_visit(visit, self.weight[self.row[is_visible]])
-        share = self._sum_by_spot(visible_weights) / self.weights
-        squares = self._sum_by_spot((visible_weights - share[self.spot] * weights) ** 2)
+        found = self._sum_by_visit(self.visit, (self.weight * chances)[self.row])
+        share = self._sum_by_spot(found) / self.weights
+        squares = self._sum_by_spot((found - share[self.spot] * self._visit_weights) ** 2)
         vehicles = self.vehicles
         correction = np.divide(vehicles, vehicles - 1, out=np.full(len(self), np.nan), where=vehicles > 1)
-        visible = np.bincount(self.spot[visit], minlength=len(self))
-        return SpotVisibility(visible, share, np.sqrt(squares * correction) / self.weights)
+        with_points = self.visit[(points >= SEEN_WELL_POINTS)[self.row]]
+        counts = np.bincount(self.spot[with_points], minlength=len(self))
+        return SpotVisibility(share, np.sqrt(squares * correction) / self.weights, counts)
 
     def _sum_by_visit(self, visit: Ints, weight: Floats) -> Floats:
         return np.bincount(visit, weight, minlength=len(self.spot)).astype(np.float64)
@@ -284,9 +285,9 @@ class SpotWriter:
         sites = len(self._pending)
         columns: dict[str, Any] = {name: values * sites for name, values in self._spot_columns.items()}
         columns["site"] = [site for site, _ in self._pending for _ in self._weights]
-        columns["seen"] = np.concatenate([visibility.visible for _, visibility in self._pending])
-        columns["share_seen"] = np.concatenate([visibility.share for _, visibility in self._pending])
-        columns["share_se"] = np.concatenate([visibility.se for _, visibility in self._pending])
+        columns["share_found"] = np.concatenate([visibility.share for _, visibility in self._pending])
+        columns["share_found_se"] = np.concatenate([visibility.se for _, visibility in self._pending])
+        columns["with_points"] = np.concatenate([visibility.with_points for _, visibility in self._pending])
         self._file.write({**columns, "weight": np.tile(self._weights, sites)})
         self._pending.clear()
 

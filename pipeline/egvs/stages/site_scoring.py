@@ -25,6 +25,7 @@ from egvs.core.grid import FloatArray, Grid
 from egvs.core.threads import map_ordered
 from egvs.kernels import traversal
 from egvs.scenario.model import SCENARIO_FILE, Scenario
+from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.scoring.blindspots import SpotWriter, VehicleSpots, open_spot_writer
 from egvs.scoring.road_locations import RoadLocations
 from egvs.scoring.score_table import MIX, ScoreTable, SiteScores
@@ -154,7 +155,12 @@ class TargetScorer:
         by_period = []
         for _, rows in self._periods:
             by_period.append({name: self._period_mean(values[name], rows) for name in self._names})
-        missed = None if self.spots is None else self.spots.visibility(visible.points)
+        missed = None
+        if self.spots is not None:
+            chances = values.get(DEFAULT_SCORE)
+            if chances is None:
+                chances = TARGET_SCORES[DEFAULT_SCORE](visible)
+            missed = self.spots.visibility(visible.points, chances)
         return SiteTargetScores(scores, tuple(by_period), missed)
 
     def _means(self, values: FloatArray) -> FloatArray:
