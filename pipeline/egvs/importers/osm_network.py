@@ -38,12 +38,13 @@ NETCONVERT_FLAGS = (
     "--geometry.remove", "--junctions.join", *sumo_folder.OSM_SIGNALS,
     "--keep-edges.by-vclass", "passenger,bus,truck", "--remove-edges.isolated",
     "--output.street-names", "--precision", "3",
-    "--no-turnarounds.tls", "--no-turnarounds.geometry", "--junctions.right-before-left.speed-threshold", "0",
+    "--no-turnarounds.except-deadend", "--junctions.right-before-left.speed-threshold", "0",
 )  # fmt: skip
 """How netconvert makes a network of streets.
 
-The last three prevent locks: vehicles do not turn back at signals or in the middle of a street, and a minor street
-gives way by a sign; four vehicles that give way to each other from the right wait forever.
+The last two prevent locks: vehicles turn back at dead ends only, since one that waits for a gap to turn back on a busy
+street blocks all behind it; and a minor street gives way by a sign, since four vehicles that give way to each other
+from the right wait forever.
 """
 
 JOINED_SIGNALS_FLAG = "--tls.join"
