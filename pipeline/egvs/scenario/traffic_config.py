@@ -243,7 +243,8 @@ class TrafficConfig(StrictModel):
     vehicles_per_h: Positive | None = Field(
         None,
         description="Vehicles that start per hour, as random trips at regular intervals, instead of a number of"
-        " vehicles in the network. Use it for whole towns: it does not fill them",
+        " vehicles in the network. Half of the trip ends are at the fringe, the others along streets. Use it for whole"
+        " towns: it does not fill them",
     )
     hold: Literal["exactly", "at_most"] = Field(
         "exactly", description="'exactly': a frame with fewer than `vehicles` is an error; 'at_most': it is allowed"
