@@ -333,8 +333,9 @@ def test_real_town(town: Made) -> None:
     folder, summary = town
     assert "Meisebacher Straße" in summary.junction.title and summary.junction.signalised
     assert summary.to_json()["assumed_traffic"]["assumed_per_hour"] > 1000
-    assert summary.statics.heights["building"] == {"height": 1, "levels": 5, "default": 636}
-    assert summary.statics.objects["tree_trunk"] == 15
+    assert summary.statics.heights["building"] == {"levels": 1, "default": 262}
+    assert summary.statics.objects["tree_trunk"] == 10
+    assert summary.statics.dropped["out_of_range"] == {"barrier": 2, "building": 379, "pole": 18, "tree": 5}
     assert loading.load(folder).roi.grid.shape == (360, 320, 20)
     check_sites(folder, 12)
 

@@ -138,6 +138,29 @@ def scale_flows(flows: Sequence[CountConfig], share: float) -> list[CountConfig]
     return [flow.model_copy(update={"per_hour": max(1.0, float(round(flow.per_hour * share)))}) for flow in flows]
 
 
+def distribute_total(flows: Sequence[CountConfig], total_per_h: int) -> list[CountConfig]:
+    """Return flows in the same proportions that add up to a total, in whole vehicles per hour; none is 0.
+
+    Parameters
+    ----------
+    flows
+        At least one flow above 0.
+    total_per_h
+        Vehicles per hour in all; the largest remainders are rounded up.
+    """
+    share = total_per_h / math.fsum(flow.per_hour for flow in flows)
+    whole = [math.floor(flow.per_hour * share) for flow in flows]
+    by_remainder = sorted(range(len(flows)), key=lambda i: whole[i] - flows[i].per_hour * share)
+    for i in by_remainder[: total_per_h - sum(whole)]:
+        whole[i] += 1
+
+    scaled = []
+    for flow, per_hour in zip(flows, whole, strict=True):
+        if per_hour > 0:
+            scaled.append(flow.model_copy(update={"per_hour": float(per_hour)}))
+    return scaled
+
+
 def find_capacity(network: str, flows: Sequence[CountConfig], junction_blocker_s: float) -> Capacity:
     """Find the share of all flows that a network carries.
 
