@@ -27,7 +27,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import Roi
 from egvs.export.export import FORMATS, export_run
 from egvs.formats.georeference import Georeference, WorldFrame
-from egvs.world.footprints import read_geojson
+from egvs.world.footprints import read_footprints
 from tests.conftest import BUILDING
 from tests.export.conftest import EPSG, HOUSE, LAMP, OFFSET_M
 from tests.export.readers import points_of_gpkg, points_of_wkb, utm32
@@ -136,10 +136,10 @@ def test_exported_footprints_can_be_imported(located: Path, tmp_path: Path) -> N
         path = tmp_path / crs / "footprints.geojson"
         if crs == "wgs84":  # RFC 7946 forbids the member "crs", so it has to be declared
             with pytest.raises(InputError, match='"crs"'):
-                read_geojson(path, world)
+                read_footprints(path, world)
             declared = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}
             path.write_text(json.dumps(json.loads(path.read_text()) | {"crs": declared}))
-        file = read_geojson(path, world)
+        file = read_footprints(path, world)
         house = next(one for one in file.footprints if one.name == "house")
         assert (house.kind, house.base_m, house.height_m) == ("building", 0.0, 6.0)
         assert house.polygon.area == pytest.approx(12.0, abs=0.01)
@@ -224,7 +224,9 @@ def test_without_a_reference_system_positions_are_local_metres(
 def test_local_footprints_can_be_imported_by_the_same_scenario(local: Path, tmp_path: Path) -> None:
     export_run(local, "geojson", out=tmp_path)
     world = Georeference(None, Roi.around((20, 0, 2.5), (40, 20, 5)), "scenario.toml")
-    house = next(one for one in read_geojson(tmp_path / "footprints.geojson", world).footprints if one.name == "house")
+    house = next(
+        one for one in read_footprints(tmp_path / "footprints.geojson", world).footprints if one.name == "house"
+    )
     assert set(house.polygon.exterior.coords) == {tuple(map(float, corner)) for corner in BUILDING[0]}
 
 

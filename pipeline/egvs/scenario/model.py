@@ -127,8 +127,8 @@ class StaticsConfig(StrictModel):
 
     footprints: tuple[str, ...] = Field(
         (),
-        description="GeoJSON files that declare their crs (null: world-frame metres); features have height_m and may"
-        " have base_m, radius_m",
+        description="GeoJSON files that declare their crs (null: world-frame metres), or GeoPackage, Shapefile,"
+        " GeoParquet, KML; features have height_m and may have base_m, radius_m",
     )
     polygons: tuple[str, ...] = Field((), description="SUMO .poly.xml files; polygons are solid or not by their type")
     polygon_height_m: Positive = Field(
@@ -205,7 +205,11 @@ Pitch = Annotated[float, Field(ge=-90, le=90)] | Literal["aim"]
 class SitesConfig(StrictModel):
     """Candidate sites: a file, or a rule. Sensor and angles are defaults for sites that do not set their own."""
 
-    file: str | None = Field(None, description="CSV file (site, x_m, y_m, z_m, ...) or GeoJSON points")
+    file: str | None = Field(
+        None,
+        description="CSV file (site, x_m, y_m, z_m, ...), or points in GeoJSON, GeoPackage, Shapefile, GeoParquet or"
+        " KML",
+    )
     grid: SiteGrid | None = None
     along: tuple[SiteLine, ...] = ()
     only_free: bool = Field(True, description="Drop sites of grid and along in lanes, junctions and solids")
