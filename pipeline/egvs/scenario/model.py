@@ -302,6 +302,7 @@ class Scenario(StrictModel):
 
     _folders: tuple[Path, ...] = PrivateAttr(default=(Path(),))
     _period: str = PrivateAttr(default="")
+    _period_keys: frozenset[str] = PrivateAttr(default=frozenset())
     _file_name: str = PrivateAttr(default=SCENARIO_FILE)
     _written_site_keys: frozenset[str] = PrivateAttr(default=frozenset())
 
@@ -342,10 +343,12 @@ class Scenario(StrictModel):
             return {"": self}
         scenarios = {}
         for number, (name, traffic) in enumerate(self._traffic_by_period()):
+            period = self.traffic.periods[number]
             drawn = int(np.random.SeedSequence((self.seed, number)).generate_state(1, np.uint64)[0])
             scenario = self.model_copy(update={"traffic": traffic, "seed": drawn >> 1})
             scenario._folders = self._folders
             scenario._period = name
+            scenario._period_keys = frozenset(period.model_fields_set)
             scenarios[name] = scenario
         return scenarios
 
@@ -365,6 +368,11 @@ class Scenario(StrictModel):
     def period(self) -> str:
         """The period of a scenario from :meth:`by_period`, else empty."""
         return self._period
+
+    @property
+    def period_keys(self) -> frozenset[str]:
+        """The keys that the period of a scenario from :meth:`by_period` sets itself, else none."""
+        return self._period_keys
 
     @property
     def written_site_keys(self) -> frozenset[str]:
@@ -387,6 +395,7 @@ class Scenario(StrictModel):
         scenario = self.model_copy(update={"effects": effects, "score": score})
         scenario._folders = self._folders
         scenario._period = self._period
+        scenario._period_keys = self._period_keys
         return scenario
 
     def find(self, name: str, key: str) -> Path:
