@@ -21,14 +21,16 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from egvs import load
 from egvs.artefacts import parquet
 from egvs.artefacts.readers import read_scores
 from egvs.core.errors import InputError
 from egvs.core.grid import Roi
 from egvs.export.export import FORMATS, export_run
 from egvs.formats.georeference import Georeference, WorldFrame
+from egvs.runs import run
 from egvs.world.footprints import read_footprints
-from tests.conftest import BUILDING
+from tests.conftest import BUILDING, feature, write_mini
 from tests.export.conftest import EPSG, HOUSE, LAMP, OFFSET_M
 from tests.export.readers import points_of_gpkg, points_of_wkb, utm32
 
@@ -436,3 +438,31 @@ def test_geojson_names_the_reference_system(on_roads: Path, tmp_path: Path) -> N
     export_run(on_roads, "geojson", crs="scenario", out=tmp_path)
     assert pyogrio.read_info(tmp_path / "plan.geojson")["crs"] == "EPSG:25832"
     assert json.loads((tmp_path / "plan.geojson").read_text())["name"] == "plan"
+
+
+# --- a small KML ---------------------------------------------------------------------------------------------------
+def test_kml_has_footprints_in_range_and_blindspots_of_the_best_on_each_pole(tmp_path: Path) -> None:
+    """A barn 150 m away is beyond the 100 m of a VLP-16; each pole has two heights."""
+    scenario = write_mini(tmp_path / "mini")
+    statics = json.loads((scenario / "statics.geojson").read_text())
+    barn = [[x + 150.0, y] for x, y in BUILDING[0]]
+    statics["features"].append(feature({"type": "Polygon", "coordinates": [barn]}, name="barn", height_m=6))
+    (scenario / "statics.geojson").write_text(json.dumps(statics))
+    with (scenario / "scenario.toml").open("a") as file:
+        file.write(f"\n[crs]\nepsg = {EPSG}\noffset_m = [{OFFSET_M[0]}, {OFFSET_M[1]}]\n")
+    (scenario / "sites.csv").write_text("site,x_m,y_m\npole_a,10,12\npole_b,30.5,-12\n")
+    overrides = ["sites.heights_m=[3,4]", "sites.replace_sensor='VLP-16'"]
+    run.run(load(scenario, overrides), tmp_path / "run")
+
+    kml = export_run(tmp_path / "run", "kml", out=tmp_path / "run.kml")
+    text = (tmp_path / "run.kml").read_text(encoding="utf-8")
+    assert "<name>house</name>" in text and "barn" not in text
+    rows = read_scores(tmp_path / "run" / "scores.parquet").to_pylist()
+    best = {pole: min((r for r in rows if r["pole"] == pole), key=lambda r: r["rank"]) for pole in ("pole_a", "pole_b")}
+    folders = {folder.find(f"{KML}name").text for folder in ET.fromstring(text).iter(f"{KML}Folder")}
+    assert {name for name in folders if "@" in name} == {row["site"] for row in best.values()}
+    assert "footprints: 2 of 3, those within the range of a sensor; the other formats have all" in kml.notes
+    assert any(note.startswith("blindspots: ") and "best candidate on each of" in note for note in kml.notes)
+
+    everything = export_run(tmp_path / "run", "geojson", out=tmp_path / "all")
+    assert "barn" in (tmp_path / "all" / "footprints.geojson").read_text(encoding="utf-8") and not everything.notes
