@@ -490,7 +490,8 @@ def test_traffic_is_a_share_of_what_the_junction_carries(tmp_path: Path, level: 
 
 
 def test_flow_above_capacity_is_reduced_and_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    runs = (TrialRun(1.0, 100, 50, 300.0, 20), TrialRun(0.7, 70, 70, 50.0, 0))
+    jam = TrialRun(1.0, 100, 50, 300.0, 20, "junction 1, Main Street from 20 s on")
+    runs = (jam, TrialRun(0.7, 70, 70, 50.0, 0))
     monkeypatch.setattr(openstreetmap, "find_capacity", lambda *_: Capacity(0.644, runs))
     traffic = openstreetmap.create_scenario(tmp_path / "out", SMALL).traffic
     assert traffic is not None
@@ -499,7 +500,10 @@ def test_flow_above_capacity_is_reduced_and_said(monkeypatch: pytest.MonkeyPatch
     assert traffic.per_h == pytest.approx(0.75 * traffic.carried_per_h, abs=12)
     monkeypatch.setattr(openstreetmap, "find_capacity", lambda *_: Capacity(0.155, runs[:1]))
     notes = openstreetmap.create_scenario(tmp_path / "jammed", SMALL).notes
-    assert "traffic jams in all 1 trials; check the signals and connections of the network" in notes
+    assert notes[-1] == (
+        "traffic jams in all 1 trials; a vehicle stood for 300 s at junction 1, Main Street from 20 s on."
+        " Lower per_hour of traffic.counts, or check the signals and connections there"
+    )
 
 
 def test_rejects_unknown_level_of_traffic(tmp_path: Path) -> None:
