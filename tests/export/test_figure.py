@@ -68,8 +68,8 @@ def test_ring_of_the_best_site_is_thicker(local: Path, tmp_path: Path) -> None:
 
 def test_error_bar_is_one_standard_error_to_either_side() -> None:
     text = bar_chart([Bar("a", 0.5, 0.1, ""), Bar("b", 0.4, None, "")], "share", "", 100.0, FigureStyle(316.0))
-    # 23 left, 16 right: 277 units for 0.6
-    assert 'd="M207.7 17.0H300.0' in text
+    # 22.8 left, 16 right: 277.2 units for 0.6
+    assert 'd="M207.6 17.0H300.0' in text
     assert text.count('class="lead"') == 1
 
 

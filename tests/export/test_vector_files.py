@@ -21,14 +21,16 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from egvs import load
 from egvs.artefacts import parquet
 from egvs.artefacts.readers import read_scores
 from egvs.core.errors import InputError
 from egvs.core.grid import Roi
 from egvs.export.export import FORMATS, export_run
 from egvs.formats.georeference import Georeference, WorldFrame
-from egvs.world.footprints import read_geojson
-from tests.conftest import BUILDING
+from egvs.runs import run
+from egvs.world.footprints import read_footprints
+from tests.conftest import BUILDING, feature, write_mini
 from tests.export.conftest import EPSG, HOUSE, LAMP, OFFSET_M
 from tests.export.readers import points_of_gpkg, points_of_wkb, utm32
 
@@ -136,10 +138,10 @@ def test_exported_footprints_can_be_imported(located: Path, tmp_path: Path) -> N
         path = tmp_path / crs / "footprints.geojson"
         if crs == "wgs84":  # RFC 7946 forbids the member "crs", so it has to be declared
             with pytest.raises(InputError, match='"crs"'):
-                read_geojson(path, world)
+                read_footprints(path, world)
             declared = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}
             path.write_text(json.dumps(json.loads(path.read_text()) | {"crs": declared}))
-        file = read_geojson(path, world)
+        file = read_footprints(path, world)
         house = next(one for one in file.footprints if one.name == "house")
         assert (house.kind, house.base_m, house.height_m) == ("building", 0.0, 6.0)
         assert house.polygon.area == pytest.approx(12.0, abs=0.01)
@@ -224,7 +226,9 @@ def test_without_a_reference_system_positions_are_local_metres(
 def test_local_footprints_can_be_imported_by_the_same_scenario(local: Path, tmp_path: Path) -> None:
     export_run(local, "geojson", out=tmp_path)
     world = Georeference(None, Roi.around((20, 0, 2.5), (40, 20, 5)), "scenario.toml")
-    house = next(one for one in read_geojson(tmp_path / "footprints.geojson", world).footprints if one.name == "house")
+    house = next(
+        one for one in read_footprints(tmp_path / "footprints.geojson", world).footprints if one.name == "house"
+    )
     assert set(house.polygon.exterior.coords) == {tuple(map(float, corner)) for corner in BUILDING[0]}
 
 
@@ -435,3 +439,31 @@ def test_geojson_names_the_reference_system(on_roads: Path, tmp_path: Path) -> N
     export_run(on_roads, "geojson", crs="scenario", out=tmp_path)
     assert pyogrio.read_info(tmp_path / "plan.geojson")["crs"] == "EPSG:25832"
     assert json.loads((tmp_path / "plan.geojson").read_text())["name"] == "plan"
+
+
+# --- a small KML ---------------------------------------------------------------------------------------------------
+def test_kml_has_footprints_in_range_and_blindspots_of_the_best_on_each_pole(tmp_path: Path) -> None:
+    """A barn 150 m away is beyond the 100 m of a VLP-16; each pole has two heights."""
+    scenario = write_mini(tmp_path / "mini")
+    statics = json.loads((scenario / "statics.geojson").read_text())
+    barn = [[x + 150.0, y] for x, y in BUILDING[0]]
+    statics["features"].append(feature({"type": "Polygon", "coordinates": [barn]}, name="barn", height_m=6))
+    (scenario / "statics.geojson").write_text(json.dumps(statics))
+    with (scenario / "scenario.toml").open("a") as file:
+        file.write(f"\n[crs]\nepsg = {EPSG}\noffset_m = [{OFFSET_M[0]}, {OFFSET_M[1]}]\n")
+    (scenario / "sites.csv").write_text("site,x_m,y_m\npole_a,10,12\npole_b,30.5,-12\n")
+    overrides = ["sites.heights_m=[3,4]", "sites.replace_sensor='VLP-16'"]
+    run.run(load(scenario, overrides), tmp_path / "run")
+
+    kml = export_run(tmp_path / "run", "kml", out=tmp_path / "run.kml")
+    text = (tmp_path / "run.kml").read_text(encoding="utf-8")
+    assert "<name>house</name>" in text and "barn" not in text
+    rows = read_scores(tmp_path / "run" / "scores.parquet").to_pylist()
+    best = {pole: min((r for r in rows if r["pole"] == pole), key=lambda r: r["rank"]) for pole in ("pole_a", "pole_b")}
+    folders = {folder.find(f"{KML}name").text for folder in ET.fromstring(text).iter(f"{KML}Folder")}
+    assert {name for name in folders if "@" in name} == {row["site"] for row in best.values()}
+    assert "footprints: 2 of 3, those within the range of a sensor; the other formats have all" in kml.notes
+    assert any(note.startswith("blindspots: ") and "best candidate on each of" in note for note in kml.notes)
+
+    everything = export_run(tmp_path / "run", "geojson", out=tmp_path / "all")
+    assert "barn" in (tmp_path / "all" / "footprints.geojson").read_text(encoding="utf-8") and not everything.notes

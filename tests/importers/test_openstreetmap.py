@@ -333,8 +333,9 @@ def test_real_town(town: Made) -> None:
     folder, summary = town
     assert "Meisebacher Straße" in summary.junction.title and summary.junction.signalised
     assert summary.to_json()["assumed_traffic"]["assumed_per_hour"] > 1000
-    assert summary.statics.heights["building"] == {"height": 1, "levels": 5, "default": 636}
-    assert summary.statics.objects["tree_trunk"] == 15
+    assert summary.statics.heights["building"] == {"levels": 1, "default": 262}
+    assert summary.statics.objects["tree_trunk"] == 10
+    assert summary.statics.dropped["out_of_range"] == {"barrier": 2, "building": 379, "pole": 18, "tree": 5}
     assert loading.load(folder).roi.grid.shape == (360, 320, 20)
     check_sites(folder, 12)
 
@@ -489,7 +490,8 @@ def test_traffic_is_a_share_of_what_the_junction_carries(tmp_path: Path, level: 
 
 
 def test_flow_above_capacity_is_reduced_and_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    runs = (TrialRun(1.0, 100, 50, 300.0, 20), TrialRun(0.7, 70, 70, 50.0, 0))
+    jam = TrialRun(1.0, 100, 50, 300.0, 20, "junction 1, Main Street from 20 s on")
+    runs = (jam, TrialRun(0.7, 70, 70, 50.0, 0))
     monkeypatch.setattr(openstreetmap, "find_capacity", lambda *_: Capacity(0.644, runs))
     traffic = openstreetmap.create_scenario(tmp_path / "out", SMALL).traffic
     assert traffic is not None
@@ -498,7 +500,10 @@ def test_flow_above_capacity_is_reduced_and_said(monkeypatch: pytest.MonkeyPatch
     assert traffic.per_h == pytest.approx(0.75 * traffic.carried_per_h, abs=12)
     monkeypatch.setattr(openstreetmap, "find_capacity", lambda *_: Capacity(0.155, runs[:1]))
     notes = openstreetmap.create_scenario(tmp_path / "jammed", SMALL).notes
-    assert "traffic jams in all 1 trials; check the signals and connections of the network" in notes
+    assert notes[-1] == (
+        "traffic jams in all 1 trials; a vehicle stood for 300 s at junction 1, Main Street from 20 s on."
+        " Lower per_hour of traffic.counts, or check the signals and connections there"
+    )
 
 
 def test_rejects_unknown_level_of_traffic(tmp_path: Path) -> None:

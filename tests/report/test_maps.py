@@ -11,7 +11,7 @@ import numpy as np
 from egvs.core.grid import Grid
 from egvs.report import maps
 from egvs.report.maps import Backdrop
-from egvs.report.svg_figures import MapFrame, MapSite
+from egvs.report.svg_figures import FigureStyle, MapFrame, MapSite
 from tests.report.small_runs import EMPTY_BACKDROP, decode_png
 from tests.report.test_basemap import roads
 
@@ -90,3 +90,15 @@ def test_street_name_avoids_sites(tmp_path: Path) -> None:
 
     (free,), (moved,) = places(tmp_path / "beside", 49.0), places(tmp_path / "on", 23.0)
     assert free != moved
+
+
+def test_narrow_map_names_poles_instead_of_candidates() -> None:
+    names = ["k1@3m+0deg", "k1@3m-10deg", "k1@6m+aim"]
+    candidates = [MapSite(name, 5.0, 5.0, 3.0, 9.0 - i, i + 1) for i, name in enumerate(names)]
+    grid = Grid((0.0, 0.0, 0.0), 0.5, (20, 20, 4))
+    labels = {}
+    for width_mm in (85.0, 170.0):
+        style = FigureStyle.for_print(width_mm)
+        drawn = maps.site_map(grid, np.zeros((20, 20)), EMPTY_BACKDROP, candidates, "", style)
+        labels[width_mm] = set(re.findall(r'class="label"[^>]*>([^<]+)<', drawn))
+    assert labels == {85.0: {"k1"}, 170.0: {"k1@3m+0deg +2"}}

@@ -8,7 +8,7 @@ import xml.etree.ElementTree as ET
 import pytest
 
 from egvs.report import svg_figures
-from egvs.report.svg_figures import MapSite
+from egvs.report.svg_figures import Bar, FigureStyle, MapSite
 from tests.report.small_runs import SITES, PageReader, render_report, run_to_scores
 
 
@@ -37,3 +37,53 @@ def test_map_includes_a_distant_site(tmp_path):
     x0, y0, x1, y1 = svg_figures.extent(scenario.roi.grid, [MapSite("far", 40, 30, 5, 1.0, 1)])
     assert x0 < 0 and y0 < 0 and x1 > 40 and y1 > 30
     assert "far" in PageReader(render_report(scenario, out)).text
+
+
+# --- lettering at the width of a column ----------------------------------------------------------------------------
+NAMES = ["k07@4.5m-10deg", "k12@6m+aim", "MMMMMMMMMMMMMMMMMM", "@@@@", "pole 1, north", "Entropy (bit) · scale"]
+
+
+def true_width(text: str) -> float:
+    """Width of a text in DejaVu Sans of 12 units."""
+    text_path = pytest.importorskip("matplotlib.textpath", reason="matplotlib is not installed")
+    font = pytest.importorskip("matplotlib.font_manager").FontProperties(family="DejaVu Sans", size=12)
+    return float(text_path.TextToPath().get_text_width_height_descent(text, font, ismath=False)[0])
+
+
+@pytest.mark.parametrize("text", NAMES)
+def test_estimated_width_is_not_less_than_that_of_the_widest_font(text: str) -> None:
+    assert true_width(text) <= svg_figures.text_width(text) <= 1.5 * true_width(text)
+
+
+def spans(svg: str) -> list[tuple[str, float, float]]:
+    """Each upright text of a figure with its left and right end."""
+    found = []
+    for text in ET.fromstring(svg).iter("{http://www.w3.org/2000/svg}text"):
+        if text.get("transform") is None:
+            share = {"middle": 0.5, "end": 1.0}.get(text.get("text-anchor", ""), 0.0)
+            left = float(text.get("x")) - share * true_width(text.text)
+            found.append((text.text, left, left + true_width(text.text)))
+    return found
+
+
+def test_no_label_is_clipped_at_85_mm() -> None:
+    style = FigureStyle.for_print(85.0)
+    bars = [Bar(name, 0.9, 0.01, "") for name in NAMES[:3]]
+    chart = svg_figures.bar_chart(bars, "the share of vehicles found (%)", "", 100.0, style)
+
+    frame = svg_figures.MapFrame((5810.0, 4000.0, 5880.0, 4070.0), "m", style.width, 560.0, north=True, style=style)
+    bar = svg_figures.ColourBar(0.0, 2.5, "Entropy in the column that k02@3m-10deg misses (bit)")
+    view = frame.svg([], "", bar)
+    for figure in (chart, view):
+        for text, left, right in spans(figure):
+            assert left >= 0.0 and right <= style.width, text
+    titles = [text for text, _, _ in spans(view)]
+    assert titles[-2:] == ["Entropy in the column that k02@3m-10deg misses (bit)", "square-root scale"]
+    height = float(ET.fromstring(view).get("viewBox").split()[3])
+    assert height > frame.top + frame.frame_height + 40.0 + 56.0, "a second line of the title needs its room"
+
+
+def test_title_of_a_wide_colour_bar_is_one_line() -> None:
+    bar = svg_figures.ColourBar(0.0, 2.5, "Entropy (bit)")
+    assert bar.title_lines(700.0) == ["Entropy (bit) · square-root scale"]
+    assert svg_figures.ColourBar(0.0, 1.0, "Share", even=True).title_lines(700.0) == ["Share"]

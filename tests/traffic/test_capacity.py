@@ -62,11 +62,22 @@ def test_longest_standing_time_allows_small_moves(tmp_path):
         lines += [f"{10 * number};still;5;{0 if number < 7 else 50}", f"{10 * number};creeps;{number};0"]
     path = tmp_path / "fcd.csv"
     path.write_text("\n".join(lines) + "\n")
-    longest_s, share_at_rest = capacity._standing(path)
-    assert longest_s == 60.0
-    assert share_at_rest == (6 + 2 + 5) / 20  # the first row of each stand does not count
+    standing = capacity._standing(path)
+    assert standing.longest_s == 60.0
+    assert standing.share_at_rest == (6 + 2 + 5) / 20  # the first row of each stand does not count
+    assert (standing.at_m, standing.since_s) == ((5.0, 0.0), 0.0)
     path.write_text("\n")
-    assert capacity._standing(path) == (0.0, 0.0)
+    assert capacity._standing(path) == (0.0, 0.0, None, 0.0)
+
+
+def test_jam_is_that_of_the_last_run_that_was_not_carried():
+    runs = (
+        run_of(1.0, longest_standing_s=300.0, longest_standing_at="A"),
+        run_of(0.7, longest_standing_s=250.0, longest_standing_at="B (x 1 m, y 2 m) from 40 s on"),
+        run_of(0.5, longest_standing_at="C"),
+    )
+    assert capacity.Capacity(0.46, runs).jam == "a vehicle stood for 250 s at B (x 1 m, y 2 m) from 40 s on"
+    assert capacity.Capacity(1.0, runs[2:]).jam == ""
 
 
 def test_vehicles_should_arrive_one_mean_trip_after_departure(tmp_path):

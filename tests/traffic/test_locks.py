@@ -76,8 +76,8 @@ def test_warning_names_junction_street_times_and_share(roads):
     assert result.rule == "teleports" and not result.is_error and result.where == "s.toml: traffic.counts"
     assert result.problem == (
         "3 of 300 vehicles (1.0 %) stood at the head of their lane for 180 s and were moved on:"
-        " 2 at junction j, Main Street (100 to 500 s, in the region of interest);"
-        " 1 at junction b, edge out (400 s, 275 m from the region of interest)"
+        " 2 at junction j, Main Street (100 to 500 s, x 0 m, y 0 m, in the region of interest);"
+        " 1 at junction b, edge out (400 s, x 300 m, y 0 m, 275 m from the region of interest)"
     )
     assert locks.teleport_warning([], 300, 180.0, StreetNames(roads), ROI, DEMAND) == []
 
@@ -136,7 +136,11 @@ def test_region_is_locked_when_too_many_vehicles_are_moved_on(tmp_path, roads):
     ]
     (tmp_path / "sumo.log").write_text("\n".join(lines) + "\n")
     (tmp_path / "fcd.csv").write_text(rows(range(300), *((f"v{i}", -100, 3 * i, 90, 5) for i in range(50))))
-    with pytest.raises(RunError, match=r"10 of 50 vehicles had to be moved on by 100 s, 10 of them at junction j, M"):
+    message = (
+        r"10 of 50 vehicles had to be moved on by 100 s, 10 of them at junction j, Main Street \(x 0 m, y 0 m\), the"
+        r" first at 10 s"
+    )
+    with pytest.raises(RunError, match=message):
         watch(tmp_path, roads).finish()
     (tmp_path / "fcd.csv").write_text(rows(range(300), *((f"v{i}", -100, 3 * i, 90, 5) for i in range(1000))))
     watch(tmp_path, roads).finish()  # 2.9 % of the vehicles

@@ -17,9 +17,10 @@ from hypothesis import strategies as st
 from egvs.core.errors import RunError
 from egvs.core.grid import Roi
 from egvs.stages import traffic
-from egvs.traffic import sumo, trajectories, vehicle_boxes
+from egvs.traffic import network, sumo, trajectories, vehicle_boxes
 from egvs.traffic.fcd import FrameGroup
-from egvs.traffic.recording import Recording
+from egvs.traffic.locks import DemandKey
+from egvs.traffic.recording import Recording, demand_key
 from egvs.traffic.trajectories import TrafficStatistics
 from tests.stage_runner import run_stage
 from tests.traffic.helpers import SIZES, SMALL, group_of, scenario, scenario_with_config
@@ -208,8 +209,11 @@ def test_standing_is_followed_across_groups():
 ROI = Roi.around((0, 0, 2.5), (50, 100, 5))
 
 
+DEMAND = DemandKey("s.toml: traffic.counts (period evening)", "Lower per_hour of the counts.")
+
+
 def recording_with(**keys):
-    window = SimpleNamespace(period_ms=1000, count=300)
+    window = SimpleNamespace(period_ms=1000, count=300, first_ms=0)
     return Recording((), window, SIZES, "s.toml: traffic", **keys)
 
 
@@ -223,25 +227,30 @@ def test_warns_about_vehicle_standing_longer_than_a_signal_cycle():
     rows = [(f, "stuck", "car", 100, 62, 0, 0.0 if 10 <= f < 210 else 5.0) for f in range(300)]
     rows += [(f, "parked", "car", 0, 20 if f < 299 else 30, 0, 0.0) for f in range(300)]
     tally = statistics_of(rows, on_purpose={"parked"})
-    (result,) = trajectories.traffic_warnings(tally, recording_with(standing_limit_s=180.0), ROI)
+    (result,) = trajectories.traffic_warnings(tally, recording_with(standing_limit_s=180.0), ROI, DEMAND)
     assert result.rule == "standing" and not result.is_error
-    assert result.where == "s.toml: traffic: x 100 m, y 60 m (76 m from the region of interest)"  # the box's centre
-    assert result.problem.startswith("vehicle 'stuck' was standing for 199 s")
+    assert (result.where, result.hint) == DEMAND
+    assert result.problem == (
+        "vehicle 'stuck' was standing for 199 s, longer than any usual red phase, at x 100 m, y 60 m (76 m from the"
+        " region of interest), from 10 s on"
+    )  # the box's centre
     assert tally.to_json(1.0)["longest_standing_s"] == 299
     short = statistics_of([row for row in rows if row[0] < 130])
-    assert [d.rule for d in trajectories.traffic_warnings(short, recording_with(standing_limit_s=180.0), ROI)] == [
-        "standing"
-    ]
+    assert [
+        d.rule for d in trajectories.traffic_warnings(short, recording_with(standing_limit_s=180.0), ROI, DEMAND)
+    ] == ["standing"]
     brief = statistics_of([row for row in rows if row[0] < 100])
-    assert trajectories.traffic_warnings(brief, recording_with(standing_limit_s=180.0), ROI) == []
-    assert trajectories.traffic_warnings(tally, recording_with(), ROI) == []  # of a finished file nothing is promised
+    assert trajectories.traffic_warnings(brief, recording_with(standing_limit_s=180.0), ROI, DEMAND) == []
+    assert (
+        trajectories.traffic_warnings(tally, recording_with(), ROI, DEMAND) == []
+    )  # of a finished file nothing is promised
 
 
 def test_warns_about_overlaps_in_many_frames_with_location():
     rows = [(f, name, "car", 10.0, 31.0 + i, 0, 5.0) for f in range(20) for i, name in enumerate("ab")]
     rows += [(f, name, "car", 90.0, 31.0 + i, 0, 5.0) for f in range(5) for i, name in enumerate("cd")]
     rows += [(299, "e", "car", 0.0, 0.0, 0, 5.0)]
-    (result,) = trajectories.traffic_warnings(statistics_of(sorted(rows)), recording_with(), ROI)
+    (result,) = trajectories.traffic_warnings(statistics_of(sorted(rows)), recording_with(), ROI, DEMAND)
     assert result.rule == "overlaps"
     assert result.where == "s.toml: traffic: x 10 m, y 30 m (in the region of interest)"
     assert result.problem == "vehicles overlap in 7% of the frames; 20 of 25 overlaps are here"
@@ -255,7 +264,7 @@ def test_overlaps_with_blockers_in_region_are_counted():
     tally.add(vehicle_boxes.boxes_from_bumpers(group_of(sorted(rows)), SIZES, 1.0, "place"))
     assert (tally.rows_in_region, tally.overlaps_in_region, tally.overlapping_pairs) == (14, 3, 16)
     assert tally.to_json(1.0)["overlapping_pairs_in_roi"] == 3
-    (result,) = trajectories.traffic_warnings(tally, recording_with(), ROI)
+    (result,) = trajectories.traffic_warnings(tally, recording_with(), ROI, DEMAND)
     assert (result.rule, result.where) == ("overlaps in roi", "s.toml: traffic.junction_blocker_s")
     assert result.problem.startswith(
         "vehicles overlap 3 times in the region of interest (214.3 per 1,000 vehicles and frames)"
@@ -272,8 +281,46 @@ def test_jam_at_the_end_matters_in_region_or_where_a_number_is_maintained(tmp_pa
     if not jammed:
         trajectories.check_recording(model, tally, recorded)
         return
-    with pytest.raises(RunError, match=r"traffic\.counts: the traffic is jammed: 1 vehicles stand .*Lower per_hour of"):
+    message = r"traffic\.counts: the traffic is jammed: 1 vehicles stand .* at x .*, from 0 s on\. Lower per_hour of"
+    with pytest.raises(RunError, match=message):
         trajectories.check_recording(model, tally, recorded)
+
+
+def test_jam_is_named_with_street_period_and_time(tmp_path):
+    tally = statistics_of([(f, "stuck", "car", 0.0, 0, 0, 0.0 if f >= 60 else 5.0) for f in range(300)])
+    (tmp_path / "n.net.xml").write_text(STREET)
+    counts = [{"edge": "in", "per_hour": 10}]
+    periods = [{"name": "noon"}, {"name": "evening", "counts": counts}]
+    by_period = scenario(tmp_path, network="n.net.xml", counts=counts, periods=periods, hold="at_most").by_period()
+    recorded = recording_with(standing_limit_s=180.0, roads=network.read_net_xml(tmp_path / "n.net.xml"))
+    stand = (
+        r"239 s at junction j, Main Street, x 0 m, y -2 m \(in the region of interest\), from 60 s on\. Lower per_hour"
+    )
+    with pytest.raises(RunError, match=r"scenario\.toml: traffic\.counts \(period noon\): the traffic is .*" + stand):
+        trajectories.check_recording(by_period["noon"], tally, recorded)
+    with pytest.raises(RunError, match=r"scenario\.toml: traffic\.periods \(evening\)\.counts: the traffic .*" + stand):
+        trajectories.check_recording(by_period["evening"], tally, recorded)
+
+
+STREET = """<net version="1.20">
+  <edge id="in" from="a" to="j" name="Main Street"><lane id="in_0" index="0" shape="-100,0 0,0"/></edge>
+</net>
+"""
+
+
+@pytest.mark.parametrize(
+    ("keys", "where", "hint"),
+    [
+        ({"counts": [{"edge": "e", "per_hour": 10}]}, "traffic.counts", "Lower per_hour of the counts"),
+        ({"vehicles": 9}, "traffic.vehicles", "Lower vehicles,"),
+        ({"vehicles_per_h": 90}, "traffic.vehicles_per_h", "Lower vehicles_per_h,"),
+        ({"vehicles_per_lane_km": 9}, "traffic.vehicles_per_lane_km", "Lower vehicles_per_lane_km,"),
+        ({}, "traffic.network", "Set traffic.vehicles_per_lane_km below 4,"),
+    ],
+)
+def test_demand_key_is_one_that_the_scenario_sets(tmp_path, keys, where, hint):
+    key = demand_key(scenario(tmp_path, network="n.net.xml", **keys))
+    assert key.where == f"{tmp_path / 'scenario.toml'}: {where}" and key.hint.startswith(hint)
 
 
 @pytest.mark.parametrize(

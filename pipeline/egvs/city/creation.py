@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import shapely
 import tomlkit
-from shapely.geometry import MultiPoint, Point, box
+from shapely.geometry import Point, box
 from shapely.geometry.base import BaseGeometry
 
 from egvs.city import model
@@ -38,7 +38,6 @@ from egvs.importers.openstreetmap import (
     DEFAULT_TRAFFIC,
     JUNCTION_BLOCKER_S,
     PITCHES_DEG,
-    SENSOR,
     SITES_FILE,
     STATICS_FILE,
     TELEPORT_S,
@@ -51,7 +50,6 @@ from egvs.importers.osm_solids import ImportCounts, MappedSolid
 from egvs.scenario.loading import load
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, TrafficConfig
-from egvs.sensors.sensor import CATALOGUE
 from egvs.traffic.capacity import FlowCapacity, find_flow
 
 SIGNALISED, ALL = "signalised", "all"
@@ -123,12 +121,6 @@ class NewJunction:
     def n_candidates(self) -> int:
         """Number of candidates: each pole with each height and each tilt."""
         return len(self.poles) * len(HEIGHTS_M) * len(PITCHES_DEG)
-
-    @property
-    def reachable_area(self) -> shapely.Geometry:
-        """Where beams from any site may end."""
-        locations = MultiPoint([(pole.x_m, pole.y_m) for pole in self.poles]).union(self.roi.area)
-        return box(*locations.bounds).buffer(CATALOGUE[SENSOR].range_m, join_style="mitre")
 
 
 @dataclass(frozen=True)
@@ -471,7 +463,8 @@ def _city_files(
     yield f"{JUNCTIONS_FOLDER}/{SCENARIO_FILE}", common_toml()
     excerpts = NetworkExcerpts(network)
     for junction in city.junctions:
-        near = [solids[i] for i in sorted(areas.query(junction.reachable_area, predicate="intersects"))]
+        reachable_area = openstreetmap.reachable_area(junction.roi)
+        near = [solids[i] for i in sorted(areas.query(reachable_area, predicate="intersects"))]
         roads = excerpts.near(city.streets.near(_surroundings(junction.roi, _ROADS_MARGIN_M)))
         folder = f"{JUNCTIONS_FOLDER}/{junction.id}"
         yield f"{folder}/{STATICS_FILE}", openstreetmap.solids_geojson(near, _count_solids(near))

@@ -492,7 +492,7 @@ def _record_period(
         checks = RegionChecks({name: region.scenario.roi.box for name, region in regions.items()}, recorded)
         statistics, rows = split_recording(scenario, recorded, regions, paths, effects, progress, checks)
         recording_summary = recorded.summary()
-        warnings = trajectories.traffic_warnings(statistics, recorded, scenario.roi.box)
+        warnings = trajectories.traffic_warnings(statistics, recorded, scenario.roi.box, recording.demand_key(scenario))
     summary = statistics.to_json(recorded.window.period_ms / 1000.0)
     if recording_summary is not None:
         summary |= asdict(recording_summary)

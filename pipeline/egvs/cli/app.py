@@ -499,13 +499,25 @@ def new(
         ),
     ] = None,
     traffic: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="LEVEL",
-            help="light, medium or heavy: 40, 75 or 100 % of the flow that the junction can carry, up to the usual flow"
-            " for its road classes.",
+            help="light, medium (default) or heavy: 40, 75 or 100 % of the flow that the junction can carry, up to the"
+            " usual flow for its road classes.",
         ),
-    ] = "medium",
+    ] = None,
+    vehicles_per_hour: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Instead of --traffic: vehicles per hour that pass the junction, in all."),
+    ] = None,
+    poles: Annotated[
+        tuple[str, str] | None,
+        typer.Option(
+            metavar="every METRES",
+            help="Candidate poles along all kerbs of the region at this spacing, e.g. every 20m, instead of at most 12"
+            " near the junction.",
+        ),
+    ] = None,
 ) -> None:
     """Create a scenario from an OpenStreetMap extract."""
     from egvs.cli import run_tables
@@ -517,9 +529,18 @@ def new(
     surroundings_m: float | None = openstreetmap.SURROUNDINGS_M
     if surroundings is not None:
         surroundings_m = cli_options.radius_m(surroundings)
+    if traffic is not None and vehicles_per_hour is not None:
+        raise InputError("--traffic", "cannot be combined with --vehicles-per-hour", "Use one of them.")
+    demand: str | int = traffic or openstreetmap.DEFAULT_TRAFFIC
+    if vehicles_per_hour is not None:
+        demand = vehicles_per_hour
+    pole_spacing_m = None
+    if poles is not None:
+        pole_spacing_m = cli_options.pole_spacing_m(*poles)
     scenario = openstreetmap.create_scenario(
-        folder, osm, location, lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=traffic
-    )
+        folder, osm, location, lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=demand,
+        pole_spacing_m=pole_spacing_m,
+    )  # fmt: skip
     run_tables.print_new_scenario(scenario)
 
 

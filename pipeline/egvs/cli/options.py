@@ -113,6 +113,15 @@ def radius_m(text: str) -> float | None:
     return radius
 
 
+def pole_spacing_m(rule: str, spacing: str) -> float:
+    """Return the spacing of ``--poles every 20m`` in metres."""
+    spacing_m = _parse_quantity(spacing, {"m": 1.0, "": 1.0})
+    if rule != "every" or math.isnan(spacing_m):
+        problem = f"expected every and a length in metres, got {f'{rule} {spacing}'[:80]!r}"
+        raise InputError("--poles", problem, "Use a spacing such as every 20m.")
+    return spacing_m
+
+
 def length_m(text: str, option: str) -> float:
     """Return metres from 1500, 1500m or 2km."""
     length = _parse_quantity(text, {"m": 1.0, "km": 1000.0, "": 1.0})

@@ -19,7 +19,17 @@ from egvs.core import files, plugins
 from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.export.finished_run import CRS_CHOICES, SCENARIO_CRS, WGS84_CRS, ExportCrs, FinishedRun
-from egvs.export.layers import NAMES, Layer, best_site, city_layers, city_name, is_city, open_junction_run, run_layers
+from egvs.export.layers import (
+    NAMES,
+    Layer,
+    best_site,
+    city_layers,
+    city_name,
+    is_city,
+    kml_layers,
+    open_junction_run,
+    run_layers,
+)
 
 EXPORT_FOLDER = "export"
 """The default folder for exports, in the run folder."""
@@ -132,6 +142,8 @@ def export_run(
             written = list(_write_rasters(run, reference, temp_folder, selected, progress))
         else:
             layers, notes = city_layers(folder) if of_city else run_layers(run)
+            if file_format.name == "kml" and not of_city:
+                layers = kml_layers(run, layers, notes)
             progress("layers made", 1, 2)
             written = list(_write_vectors(file_format, layers, reference, temp_folder, target.name, title))
             progress("files written", 2, 2)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -32,6 +32,7 @@ from egvs.core.errors import InputError
 from egvs.export.finished_run import FinishedRun
 from egvs.report import colours
 from egvs.report.basemap import network_file, union_of_triangles
+from egvs.sensors.sensor import scenario_sensor
 from egvs.traffic import network
 
 JUNCTIONS, SITES, PLAN, MISSED, MISSED_LANES, FOOTPRINTS, REGION = NAMES = (
@@ -99,6 +100,61 @@ def run_layers(run: FinishedRun) -> tuple[list[Layer], list[str]]:
         _region_layer(run),
     ]
     return layers, notes
+
+
+MAX_KML_POLES = 12
+"""KML has the blind spots of the best candidate on each of this number of poles."""
+
+
+def kml_layers(run: FinishedRun, layers: Sequence[Layer], notes: list[str]) -> list[Layer]:
+    """Return what a KML file shows of the layers of a run, so that it stays small enough for phones and maps online.
+
+    Of the footprints, those within the range of a sensor; of the blind spots, those of the best candidates on the best
+    poles. Notes say what is left out.
+    """
+    scores = parquet.read_artefact(run.artefact(RunFolder.scores.name), "scores")[0]
+    best = pa.array(_best_on_poles(scores)[:MAX_KML_POLES])
+    shown = []
+    for layer in layers:
+        if layer.name == FOOTPRINTS:
+            kept = _is_in_range(run, scores, layer)
+        elif layer.initial_site:
+            kept = pc.is_in(layer.rows.column("site"), best).to_numpy(zero_copy_only=False)
+        else:
+            kept = np.ones(len(layer.rows), dtype=np.bool_)
+        if not kept.all():
+            counts = f"{kept.sum():,} of {len(kept):,}"
+            notes.append(f"{layer.name}: {counts}, {_KML_REASONS[layer.name]}; the other formats have all")
+        if kept.any():
+            shown.append(replace(layer, geometries=layer.geometries[kept], rows=layer.rows.filter(pa.array(kept))))
+    return shown
+
+
+_BEST_ON_POLES = f"those of the best candidate on each of the best {MAX_KML_POLES} poles"
+_KML_REASONS = {
+    FOOTPRINTS: "those within the range of a sensor", MISSED: _BEST_ON_POLES, MISSED_LANES: _BEST_ON_POLES,
+}  # fmt: skip
+
+
+def _best_on_poles(scores: pa.Table) -> list[str]:
+    """Return the best site on each pole, in the order of their ranks."""
+    rows = sorted(scores.select(["rank", "site", "pole"]).to_pylist(), key=lambda row: row["rank"])
+    best: dict[str, str] = {}
+    for row in rows:
+        best.setdefault(row["pole"], row["site"])
+    return list(best.values())
+
+
+def _is_in_range(run: FinishedRun, scores: pa.Table, layer: Layer) -> NDArray[np.bool_]:
+    """Return which geometries of a layer a beam of any sensor can reach, seen from above."""
+    import shapely
+
+    in_range = np.zeros(len(layer.geometries), dtype=np.bool_)
+    for name in scores.column("sensor").unique().to_pylist():
+        range_m = scenario_sensor(name, run.scenario, f"{run.work.folder.path}: sensor").range_m
+        sites = shapely.union_all(point_geometries(scores.filter(pc.equal(scores.column("sensor"), name))))
+        in_range |= shapely.dwithin(layer.geometries, sites, range_m)
+    return in_range
 
 
 def best_site(run: FinishedRun) -> str:

@@ -149,7 +149,7 @@ def write_kml(path: Path, name: str, layers: Sequence[Layer], reference: ExportC
             _placemark(folder, layer, row, shape, style, is_visible)
     for number, element in enumerate(styles.values(), start=1):
         document.insert(number, element)
-    ET.indent(root)
+    ET.indent(root, space="")  # one element per line; spaces would be a third of the file
     path.write_bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
 
 

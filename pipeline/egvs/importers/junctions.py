@@ -56,6 +56,8 @@ APPROACH_M = 20.0
 """Minimum length of each approach inside the region of interest."""
 
 SPACING_M = 10.0
+MIN_SPACING_M, MAX_SPACING_M = 2.0, 100.0
+"""Limits of a requested spacing of poles."""
 KERB_M = 1.0
 KERB_MIN_M = 0.5
 CLEARANCE_M = 1.0
@@ -333,12 +335,13 @@ def _region_side_m(junction_side_m: float) -> float:
 
 
 def kerbside_poles(
-    streets: Streets, junction: StreetJunction, roi: JunctionRegion, objects: Sequence[BaseGeometry]
-) -> list[KerbsidePole]:
+    streets: Streets, junction: StreetJunction, roi: JunctionRegion, objects: Sequence[BaseGeometry],
+    spacing_m: float | None = None,
+) -> list[KerbsidePole]:  # fmt: skip
     """Find locations for poles along the kerbs of a junction and its approaches.
 
     Poles are ``KERB_M`` outside the carriageway (rounded to 0.1 m, never nearer than ``KERB_MIN_M``) and at least
-    ``CLEARANCE_M`` from every object. Along the kerb they are about ``SPACING_M`` apart, never less than half of it.
+    ``CLEARANCE_M`` from every object. Along the kerb they are about the spacing apart, never less than half of it.
     Traffic islands below 100 m2 count as carriageway.
 
     Parameters
@@ -349,11 +352,13 @@ def kerbside_poles(
         The region of interest; poles are inside it or up to ``BEYOND_ROI_M`` outside.
     objects
         Areas of static objects, world frame, metres.
+    spacing_m
+        Distance between neighbouring poles; None for ``SPACING_M``, and at most ``MAX_POLES`` poles.
 
     Returns
     -------
     list of KerbsidePole
-        The ``MAX_POLES`` locations nearest to the junction, counter-clockwise around it.
+        Counter-clockwise around the junction: all locations, or the ``MAX_POLES`` nearest to the junction.
     """
     window = box(*roi.area.buffer(BEYOND_ROI_M, join_style="mitre").bounds)
     surroundings = window.buffer(_SEARCH_M)
@@ -370,10 +375,12 @@ def kerbside_poles(
 
     free: list[XY] = []
     for line in _lines(kerb):
-        free += _free_points_along(line, forbidden, window)
+        free += _free_points_along(line, spacing_m or SPACING_M, forbidden, window)
 
     center = junction.area.centroid
-    poles = _nearest_poles(free, (center.x, center.y))
+    poles = _separate_poles(free, (center.x, center.y), spacing_m or SPACING_M)
+    if spacing_m is None:
+        poles = poles[:MAX_POLES]
     poles.sort(key=lambda p: (math.degrees(math.atan2(center.y - p[1], center.x - p[0])), *p))
     return [KerbsidePole(x, y) for x, y in poles]
 
@@ -414,9 +421,9 @@ def _lines(kerb: BaseGeometry) -> list[LineString]:
     return [line for line in shapely.get_parts(shapely.normalize(kerb)) if isinstance(line, LineString)]
 
 
-def _free_points_along(line: LineString, forbidden: BaseGeometry, window: BaseGeometry) -> list[XY]:
+def _free_points_along(line: LineString, spacing_m: float, forbidden: BaseGeometry, window: BaseGeometry) -> list[XY]:
     """Return evenly spaced free points on a line; a point that is not free moves a little along it."""
-    count = round(line.length / SPACING_M)
+    count = round(line.length / spacing_m)
     points = []
     for index in range(count):
         middle_m = (index + 0.5) * line.length / count
@@ -429,13 +436,13 @@ def _free_points_along(line: LineString, forbidden: BaseGeometry, window: BaseGe
     return points
 
 
-def _nearest_poles(points: Sequence[XY], center: XY) -> list[XY]:
-    """Return the points nearest to the center that keep their distance from each other."""
+def _separate_poles(points: Sequence[XY], center: XY, spacing_m: float) -> list[XY]:
+    """Return the points that keep their distance from each other, those nearest to the center first."""
     poles: list[XY] = []
     for point in sorted(points, key=lambda p: (math.dist(p, center), p)):
-        if all(math.dist(point, pole) >= SPACING_M / 2 for pole in poles):
+        if all(math.dist(point, pole) >= spacing_m / 2 for pole in poles):
             poles.append(point)
-    return poles[:MAX_POLES]
+    return poles
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 Steps of :func:`create_scenario`: read the extract; run netconvert on its streets; choose a junction and put the region
 of interest around it; leave out the roads that cross the region on another level; take buildings, trees, barriers,
-bridge decks and poles as solids; find candidate sites along the kerbs; assume flows, and find how much of them the
-network carries; write
+bridge decks and poles within sensor range as solids; find candidate sites along the kerbs; assume flows, and find how
+much of them the network carries; write
 
     network.net.xml    the streets                                       (traffic)
     statics.geojson    footprints with heights, and import counts        (statics)
@@ -32,6 +32,7 @@ from typing import Any
 
 import tomlkit
 from pydantic import TypeAdapter, ValidationError
+from shapely.geometry import Point
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core import files
@@ -48,7 +49,8 @@ from egvs.scenario.loading import load
 from egvs.scenario.model import SCENARIO_FILE, RoiConfig
 from egvs.scenario.score_config import DEFAULT_SCORE, ScoreConfig
 from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, CountConfig, TrafficConfig
-from egvs.traffic.capacity import Capacity, find_capacity, scale_flows
+from egvs.sensors.sensor import CATALOGUE
+from egvs.traffic.capacity import Capacity, distribute_total, find_capacity, scale_flows
 
 STATICS_FILE, SITES_FILE = "statics.geojson", "sites.csv"
 SENSOR = "VLP-32C"
@@ -67,6 +69,12 @@ TRAFFIC_LEVELS = {"light": 0.4, "medium": 0.75, "heavy": 1.0}
 """Shares of the carried flow. The queues of a junction get long, and rare locks possible, near its capacity."""
 
 DEFAULT_TRAFFIC = "medium"
+
+MAX_VEHICLES_PER_H = 100_000
+"""More do not pass any junction."""
+
+FAR_FROM_AT_M = 50.0
+"""A junction farther than this from the requested position may be the wrong one; cities reject it."""
 
 PEOPLE_HINT = (
     "pedestrians are added with --set effects.pedestrians_bicycles.pedestrians_per_h=300 (bicycles: bicycles_per_h)."
@@ -94,20 +102,22 @@ class AssumedTraffic:
     Attributes
     ----------
     assumed
-        Flows from the classes of the streets.
+        Flows from the classes of the streets, or in their proportions if their sum is given.
     capacity
         What the network carries of them.
     level
-        A key of :data:`TRAFFIC_LEVELS`.
+        A key of :data:`TRAFFIC_LEVELS`; None if the sum of the flows is given, and they are used in full.
     """
 
     assumed: tuple[CountConfig, ...]
     capacity: Capacity
-    level: str
+    level: str | None
 
     @cached_property
     def flows(self) -> tuple[CountConfig, ...]:
         """The flows of the scenario."""
+        if self.level is None:
+            return self.assumed
         return tuple(scale_flows(self.assumed, self.capacity.share * TRAFFIC_LEVELS[self.level]))
 
     @property
@@ -130,6 +140,9 @@ class AssumedTraffic:
     @property
     def summary(self) -> str:
         """What is carried and used, as a sentence."""
+        if self.level is None:
+            carried = "all" if self.capacity.is_everything else f"{self.carried_per_h:,}"
+            return f"carries {carried} of the {self.assumed_per_h:,} requested vehicles an hour"
         at_least = "at least " if self.capacity.is_everything else ""
         share = f"{TRAFFIC_LEVELS[self.level]:.0%}".replace("%", " %")
         return f"carries {at_least}{self.carried_per_h:,} vehicles an hour; {self.level} {share} is used"
@@ -137,7 +150,7 @@ class AssumedTraffic:
     def to_json(self) -> dict[str, Any]:
         """Return a summary as plain JSON."""
         return {
-            "flows": len(self.flows), "vehicles_per_hour": self.per_h, "level": self.level,
+            "flows": len(self.flows), "vehicles_per_hour": self.per_h, "level": self.level or "as requested",
             "assumed_per_hour": self.assumed_per_h, "carried_per_hour": self.carried_per_h,
             "trial_runs": len(self.capacity.runs),
         }  # fmt: skip
@@ -163,6 +176,8 @@ class NewScenario:
         The traffic through the region of interest; None where no street leads through it.
     notes
         What to know before trusting the scenario.
+    from_at_m
+        Distance of the junction from the requested position, 0 inside it; None without such a position.
     """
 
     folder: Path
@@ -173,6 +188,12 @@ class NewScenario:
     statics: ImportCounts
     traffic: AssumedTraffic | None
     notes: tuple[str, ...]
+    from_at_m: float | None = None
+
+    @property
+    def is_far_from_at(self) -> bool:
+        """Whether the junction may be another one than the user meant."""
+        return self.from_at_m is not None and self.from_at_m > FAR_FROM_AT_M
 
     @property
     def n_candidates(self) -> int:
@@ -210,7 +231,8 @@ class NewScenario:
 
 def create_scenario(
     folder: Path, osm: Path, at: tuple[float, float] | None = None, lefthand: bool = False, walk: bool = False,
-    surroundings_m: float | None = SURROUNDINGS_M, traffic: str = DEFAULT_TRAFFIC,
+    surroundings_m: float | None = SURROUNDINGS_M, traffic: str | int = DEFAULT_TRAFFIC,
+    pole_spacing_m: float | None = None,
 ) -> NewScenario:  # fmt: skip
     """Make a scenario folder from an OpenStreetMap extract.
 
@@ -229,7 +251,9 @@ def create_scenario(
     surroundings_m
         Distance from the junction at which streets end; None for the complete extract.
     traffic
-        A key of :data:`TRAFFIC_LEVELS`: the share of the flow that the junction carries.
+        A key of :data:`TRAFFIC_LEVELS`: the share of the flow that the junction carries. Or vehicles per hour.
+    pole_spacing_m
+        Distance between candidate poles along the kerbs; None for a few poles near the junction.
 
     Returns
     -------
@@ -242,7 +266,8 @@ def create_scenario(
         When the folder is not empty, the file is damaged or has no drivable streets, ``at`` is outside the extract, or
         no site is possible. Nothing is written then.
     """
-    check_traffic_level(traffic)
+    _check_traffic(traffic)
+    _check_pole_spacing(pole_spacing_m)
     name = check_new_folder(folder)
     if surroundings_m is not None and surroundings_m < SURROUNDINGS_MIN_M:
         raise InputError(
@@ -263,24 +288,31 @@ def create_scenario(
         extract = osm_network.cut_out_roads(extract, streets, others.roads, _level_window(junction))
         network, streets = osm_network.build_network(extract, osm, flags)
         junction = _choose_junction(streets, osm, streets.to_xy(*zip(location, strict=True))[0])
-    solids, counts = osm_solids.map_solids(extract, streets, others.decks)
+    window = reachable_area(junctions.region_around(junction))
+    solids, counts = osm_solids.map_solids(extract, streets, others.decks, window)
 
     if surroundings_m is not None:
         network, streets = osm_network.crop_network(extract, osm, flags, streets, junction, surroundings_m)
         junction = _choose_junction(streets, osm, junction.at_m)
     roi = junctions.region_around(junction)
-    poles = junctions.kerbside_poles(streets, junction, roi, [solid.area for solid in solids])
+    poles = junctions.kerbside_poles(streets, junction, roi, [solid.area for solid in solids], pole_spacing_m)
     if not poles:
         problem = f"there is no free location for a pole along the kerbs of the {junction.title}"
-        raise InputError(osm, problem, "Choose another junction with --at LAT,LON.")
+        hint = "Choose another junction with --at LAT,LON."
+        if pole_spacing_m is not None:
+            hint = "Choose a smaller spacing with --poles, or another junction with --at LAT,LON."
+        raise InputError(osm, problem, hint)
 
-    notes = _junction_notes(junction, roi, counts) + _level_notes(others, counts)
+    notes = _junction_notes(junction, roi, counts) + _level_notes(others, counts) + _range_notes(counts)
     if walk:
         notes.append(PEOPLE_HINT)
     assumed = _assumed_traffic(network, streets, roi, traffic)
     if assumed is not None:
         notes += _traffic_notes(assumed)
-    scenario = NewScenario(folder, junction, roi, streets, len(poles), counts, assumed, tuple(notes))
+    from_at_m = None
+    if at is not None:
+        from_at_m = Point(streets.to_xy([at[1]], [at[0]])[0]).distance(junction.area)
+    scenario = NewScenario(folder, junction, roi, streets, len(poles), counts, assumed, tuple(notes), from_at_m)
     texts = {
         NETWORK_FILE: network,
         STATICS_FILE: solids_geojson(solids, counts),
@@ -295,6 +327,27 @@ def check_traffic_level(level: str) -> None:
     """Raise an InputError unless a text is a key of :data:`TRAFFIC_LEVELS`."""
     if level not in TRAFFIC_LEVELS:
         raise InputError("--traffic", f"expected light, medium or heavy, got {level!r}", "Use --traffic medium.")
+
+
+def _check_traffic(traffic: str | int) -> None:
+    if isinstance(traffic, str):
+        check_traffic_level(traffic)
+    elif not 1 <= traffic <= MAX_VEHICLES_PER_H:
+        problem = f"expected 1 to {MAX_VEHICLES_PER_H:,} vehicles an hour, got {traffic:,}"
+        raise InputError("--vehicles-per-hour", problem, "Give the vehicles that pass the junction from all sides.")
+
+
+def _check_pole_spacing(spacing_m: float | None) -> None:
+    low_m, high_m = junctions.MIN_SPACING_M, junctions.MAX_SPACING_M
+    if spacing_m is not None and not low_m <= spacing_m <= high_m:
+        problem = f"expected a spacing of {low_m:g} to {high_m:g} m, got {spacing_m:g} m"
+        raise InputError("--poles", problem, "Use a spacing such as every 20m.")
+
+
+def reachable_area(roi: JunctionRegion) -> BaseGeometry:
+    """Return where beams end that start at a candidate pole, or that reach the region of interest from anywhere."""
+    margin_m = junctions.BEYOND_ROI_M + CATALOGUE[SENSOR].range_m
+    return roi.area.buffer(margin_m, join_style="mitre")
 
 
 def check_new_folder(folder: Path) -> str:
@@ -368,6 +421,16 @@ def _level_notes(others: OtherLevels, counts: ImportCounts) -> list[str]:
     return notes
 
 
+def _range_notes(counts: ImportCounts) -> list[str]:
+    left_out = counts.dropped.get(osm_solids.OUT_OF_RANGE, Counter()).total()
+    if not left_out:
+        return []
+    total = left_out + counts.objects.total() - counts.objects["tree_crown"]
+    range_m = CATALOGUE[SENSOR].range_m
+    reason = f"they are beyond the range of a {SENSOR} ({range_m:g} m) from the region of interest and change no score"
+    return [f"{left_out:,} of {total:,} static objects are left out: {reason}"]
+
+
 def _junction_notes(junction: StreetJunction, roi: JunctionRegion, counts: ImportCounts) -> list[str]:
     notes = []
     if not junction.signalised:
@@ -375,18 +438,30 @@ def _junction_notes(junction: StreetJunction, roi: JunctionRegion, counts: Impor
     return notes + scenario_notes(roi.area.covers(junction.area), counts)
 
 
-def _assumed_traffic(network: str, streets: Streets, roi: JunctionRegion, level: str) -> AssumedTraffic | None:
+def _assumed_traffic(network: str, streets: Streets, roi: JunctionRegion, traffic: str | int) -> AssumedTraffic | None:
     """Assume flows through a region, and find how much of them the network carries."""
     flows = junctions.assumed_flows(streets, roi)
+    if isinstance(traffic, int):
+        if not flows:
+            problem = "no street leads vehicles through the region of interest"
+            raise InputError("--vehicles-per-hour", problem, "Choose another junction with --at LAT,LON.")
+        flows = distribute_total(flows, traffic)
     if not flows:
         return None
+    level = traffic if isinstance(traffic, str) else None
     return AssumedTraffic(tuple(flows), find_capacity(network, flows, JUNCTION_BLOCKER_S), level)
 
 
 def _traffic_notes(traffic: AssumedTraffic) -> list[str]:
     capacity = traffic.capacity
+    jam = f"; {capacity.jam}" if capacity.jam else ""
+    hint = "Lower per_hour of traffic.counts, or check the signals and connections there"
+    if traffic.level is None:
+        if capacity.is_everything:
+            return []
+        return [f"traffic jams are likely: the network {traffic.summary}{jam}. {hint}"]
     if not capacity.is_confirmed:
-        return [f"traffic jams in all {len(capacity.runs)} trials; check the signals and connections of the network"]
+        return [f"traffic jams in all {len(capacity.runs)} trials{jam}. {hint}"]
     if not capacity.is_everything:
         return [f"the junction does not carry the {traffic.assumed_per_h:,} vehicles an hour of its road classes"]
     return []
@@ -430,7 +505,8 @@ def solids_geojson(solids: Sequence[MappedSolid], counts: ImportCounts) -> str:
 
 def sites_csv(poles: Sequence[KerbsidePole]) -> str:
     """Return the table of candidate sites."""
-    rows = [f"k{number:02d},{pole.x_m},{pole.y_m}" for number, pole in enumerate(poles, 1)]
+    digits = max(2, len(str(len(poles))))
+    rows = [f"k{number:0{digits}d},{pole.x_m},{pole.y_m}" for number, pole in enumerate(poles, 1)]
     return "\n".join(["site,x_m,y_m", *rows, ""])
 
 
@@ -535,6 +611,8 @@ def _scenario_toml(name: str, scenario: NewScenario) -> str:
     if scenario.traffic is not None:
         document["traffic"].update({"counts": _counts_array(scenario.traffic.flows)})
         origin = f"assumed from the road classes ({scenario.traffic.assumed_per_h:,} vehicles an hour)"
+        if scenario.traffic.level is None:
+            origin = "divided among the movements by the road classes"
         comment = f"{origin}; the network {scenario.traffic.summary}. Replace them by real counts"
         document["traffic"]["counts"].comment(comment)
     return tomlkit.dumps(document)

@@ -50,6 +50,9 @@ DECK = SolidType(DECK_BASE_M + DECK_THICKNESS_M, thickness_m=DECK_THICKNESS_M)
 _DECK_LANE_M, _DECK_EDGE_M, _TRACK_M, _PATH_M = 3.5, 1.0, 5.0, 3.0
 """Widths of bridges without a width in the map: of each lane, of each edge, of a railway track, and of a path."""
 
+OUT_OF_RANGE = "out_of_range"
+"""The reason to leave out objects outside the window of :func:`map_solids`."""
+
 _SOLID_TYPES = SolidTypes()
 _BUILDING_KEYS = ("building:part", "building", "man_made")
 
@@ -142,9 +145,9 @@ def _sort_keys(value: Any) -> Any:
 
 
 def map_solids(
-    extract: OsmExtract, streets: Streets, bridges: Sequence[Way] = ()
+    extract: OsmExtract, streets: Streets, bridges: Sequence[Way] = (), window: BaseGeometry | None = None
 ) -> tuple[list[MappedSolid], ImportCounts]:
-    """Collect all static objects of an extract, clear of the carriageway.
+    """Collect the static objects of an extract, clear of the carriageway.
 
     Parameters
     ----------
@@ -154,6 +157,8 @@ def map_solids(
         The carriageway, and the frame of the solids.
     bridges
         Ways whose decks are above the ground, see :func:`make_decks`.
+    window
+        Objects outside it are left out, with a count; None for all objects.
 
     Returns
     -------
@@ -166,13 +171,17 @@ def map_solids(
     counts = ImportCounts()
     lanes = shapely.STRtree(list(streets.areas.values()))
 
+    objects = [find(extract, xy, counts) for find in (find_buildings, find_barriers, find_poles)]
     solids: list[MappedSolid] = []
-    for find in (find_buildings, find_barriers, find_poles):
-        for solid in find(extract, xy, counts):
-            solids += _clear_of_carriageway(solid, lanes, counts)
-    for deck in make_decks(bridges, xy, counts):
-        solids += _clear_of_carriageway(deck, lanes, counts)
+    for solid in itertools.chain(*objects, make_decks(bridges, xy, counts)):
+        if _is_outside(solid, window):
+            counts.drop(solid.kind, OUT_OF_RANGE)
+            continue
+        solids += _clear_of_carriageway(solid, lanes, counts)
     for trunk, crown in find_trees(extract, xy, counts):
+        if _is_outside(crown, window):
+            counts.drop("tree", OUT_OF_RANGE)
+            continue
         if _lanes_under(trunk, lanes):
             counts.drop("tree", "on_carriageway")
             continue
@@ -180,6 +189,10 @@ def map_solids(
         counts.keep(crown)
         solids += [trunk, _above_traffic(crown, lanes, counts)]
     return solids, counts
+
+
+def _is_outside(solid: MappedSolid, window: BaseGeometry | None) -> bool:
+    return window is not None and not window.intersects(solid.area)
 
 
 def _lanes_under(solid: MappedSolid, lanes: shapely.STRtree) -> list[BaseGeometry]:

@@ -28,7 +28,7 @@ from egvs.report import colours
 from egvs.report.basemap import Outlines, Roads, StreetName
 from egvs.report.colours import ColumnValues, IndexedImage
 from egvs.report.formatting import shorten_name
-from egvs.report.svg_figures import PAGE_STYLE, Box, ColourBar, FigureStyle, MapFrame, MapSite, extent
+from egvs.report.svg_figures import PAGE_STYLE, Box, ColourBar, FigureStyle, MapFrame, MapSite, extent, text_width
 
 StackedSites = list[MapSite]
 """Sites at the same x, y, the best first."""
@@ -36,7 +36,11 @@ StackedSites = list[MapSite]
 _MAX_HEIGHT = 560.0
 _LABEL_GAP = 4.0
 """Gap between a spot and its label, in the figure's units."""
-_LETTER_WIDTH, _LABEL_HEIGHT = 7.2, 15.0
+_LABEL_HEIGHT = 15.0
+_BOLD = 1.1
+"""Labels are bold, which makes them wider."""
+_NARROW = 500.0
+"""Figures of less than this width have room for the names of poles, but not of candidates."""
 _CROWDED = 40
 """A map with more locations than this has no room for numbers and names."""
 _STREET_NAME_POSITIONS = (0.5, 0.3, 0.7, 0.15, 0.85)
@@ -402,7 +406,10 @@ def _stack_labels(
 def _stack_spot(plan: MapFrame, stack: StackedSites, radius: float) -> LabelSpot:
     names = [shorten_name(site.site) for site in stack]
     text = ", ".join(names)
-    if len(names) > 2:
+    poles = {site.site.partition("@")[0] for site in stack}
+    if len(names) > 1 and plan.width < _NARROW and len(poles) == 1:
+        text = shorten_name(poles.pop())
+    elif len(names) > 2:
         text = f"{names[0]} +{len(names) - 1}"
     outer_radius = radius + 3.5 * min(3, len(stack) - 1)
     return LabelSpot(plan.x(stack[0].x_m), plan.y(stack[0].y_m), text, outer_radius)
@@ -450,7 +457,7 @@ def _square(x: float, y: float, half: float) -> Box:
 def _label_box(spot: LabelSpot, distance: float, side: tuple[float, float]) -> Box:
     """Box of a label on one side of a spot."""
     dx, dy = side
-    width = _LETTER_WIDTH * len(spot.text)
+    width = _BOLD * text_width(spot.text)
     left = spot.x + distance * dx - width * _share_before(dx)
     top = spot.y + distance * dy - _LABEL_HEIGHT * _share_before(dy)
     return left, top, left + width, top + _LABEL_HEIGHT

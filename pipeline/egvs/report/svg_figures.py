@@ -33,6 +33,8 @@ FONTS = "DejaVu Sans, Arial, Helvetica, sans-serif"
 FONT_SIZE_PT = 7.0
 """Font size of printed figures, which is 12 units of a figure."""
 
+_LINE_SPACING = 15.0
+_SCALE_NOTE = "square-root scale"
 _NAMESPACE = "http://www.w3.org/2000/svg"
 
 
@@ -121,7 +123,7 @@ def shared_scale(peak: float, label: str) -> str:
     """Return the colour scale of several figures as a figure of its own."""
     bar = ColourBar(0.0, peak, label)
     start = svg_start_tag(460.0, 52.0, f"Colour scale: {label}, 0 to {peak:.3g}")
-    return f"{start}{bar.svg('scale', 16.0, 4.0, 428.0)}</svg>"
+    return f"{start}{bar.svg('scale', (16.0, 4.0), 428.0, bar.title_lines(428.0))}</svg>"
 
 
 def standalone_svg(figure: str) -> str:
@@ -222,8 +224,10 @@ class MapFrame:
         height = base + 40.0
         colour_bar = north_arrow = ""
         if bar:
-            height += 56.0
-            colour_bar = bar.svg(self.prefix, self.left, base + 46.0, self.frame_width, self.style)
+            centre = self.left + self.frame_width / 2
+            title = bar.title_lines(2.0 * min(centre, self.width - centre))
+            height += 56.0 + _LINE_SPACING * (len(title) - 1)
+            colour_bar = bar.svg(self.prefix, (self.left, base + 46.0), self.frame_width, title, self.style)
         if self.north:
             north_arrow = self._north_arrow()
         position = f'x="{self.left:.1f}" y="{self.top:.1f}"'
@@ -272,6 +276,37 @@ class MapFrame:
         return f'<g>{arrow}<text x="{x:.1f}" y="{y + 10:.1f}" text-anchor="middle" font-weight="700">N</text></g>'
 
 
+_NARROW_WIDTH, _USUAL_WIDTH, _WIDE_WIDTH = 4.5, 7.8, 12.0
+_NARROW_LETTERS, _WIDE_LETTERS = set(" .,:;'|!()[]fijlrtI-·"), set("@%mwMW+…")
+
+
+def text_width(text: str) -> float:
+    """Return about the width of a text in a figure's units, rather too large than too small.
+
+    For letters of :data:`FONTS`, of which DejaVu Sans is the widest.
+    """
+    width = 0.0
+    for letter in text:
+        if letter in _NARROW_LETTERS:
+            width += _NARROW_WIDTH
+        elif letter in _WIDE_LETTERS:
+            width += _WIDE_WIDTH
+        else:
+            width += _USUAL_WIDTH
+    return width
+
+
+def wrap_text(text: str, width: float) -> list[str]:
+    """Return the lines of a text, each at most about ``width`` wide unless it is a single word."""
+    lines: list[str] = []
+    for word in text.split():
+        if lines and text_width(f"{lines[-1]} {word}") <= width:
+            lines[-1] += f" {word}"
+        else:
+            lines.append(word)
+    return lines
+
+
 def _text(x: float, y: float, text: str, anchor: str = "middle") -> str:
     return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
 
@@ -285,8 +320,25 @@ class ColourBar:
     label: str
     even: bool = False
 
-    def svg(self, prefix: str, x: float, y: float, width: float, style: FigureStyle = PAGE_STYLE) -> str:
-        """Return the bar with its left upper corner at ``x``, ``y``; ``prefix`` makes its id unique."""
+    def title_lines(self, width: float) -> list[str]:
+        """Return the label and the kind of scale, in lines of at most a width, in the figure's units."""
+        lines = wrap_text(self.label, width)
+        if self.even:
+            return lines
+        with_scale = f"{lines[-1]} · {_SCALE_NOTE}"
+        if text_width(with_scale) <= width:
+            return [*lines[:-1], with_scale]
+        return [*lines, _SCALE_NOTE]
+
+    def svg(
+        self, prefix: str, corner: tuple[float, float], width: float, title: Sequence[str],
+        style: FigureStyle = PAGE_STYLE,
+    ) -> str:  # fmt: skip
+        """Return the bar with its left upper corner at ``corner`` and the lines of its title below.
+
+        ``prefix`` makes its id unique.
+        """
+        x, y = corner
         stops = []
         for i in range(STEPS + 1):
             share = i / STEPS
@@ -299,10 +351,11 @@ class ColourBar:
         ticks = []
         for tick_x, text in self._ticks(x, width):
             ticks.append(f'<path {axis} d="M{tick_x:.1f} {y + 12:.1f}v4"/>{_text(tick_x, y + 28, text)}')
-        note = "" if self.even else " · square-root scale"
-        position = f'x="{x + width / 2:.1f}" y="{y + 44:.1f}"'
-        title = f'<text class="title" {position} text-anchor="middle">{escape(self.label)}{note}</text>'
-        return f"<g>{gradient}{bar}{''.join(ticks)}{title}</g>"
+        texts = []
+        for number, line in enumerate(title):
+            position = f'x="{x + width / 2:.1f}" y="{y + 44 + _LINE_SPACING * number:.1f}"'
+            texts.append(f'<text class="title" {position} text-anchor="middle">{escape(line)}</text>')
+        return f"<g>{gradient}{bar}{''.join(ticks)}{''.join(texts)}</g>"
 
     def _ticks(self, x: float, width: float) -> list[Tick]:
         """Positions and texts of round values; a square-root scale has more of them near its low end."""
@@ -422,7 +475,7 @@ def bar_chart(bars: Sequence[Bar], label: str, alt: str, factor: float = 1.0, st
         Width and colours.
     """
     names = [shorten_name(bar.name) for bar in bars]
-    left = 16.0 + 7.0 * max(len(name) for name in names)
+    left = 15.0 + max(text_width(name) for name in names)
     width, height = style.width - left - _BARS_MARGIN, _BAR_SPACING * len(bars)
     most = max(bar.value + (bar.se or 0.0) for bar in bars) or 1.0
     values = [bar.value for bar in bars]

@@ -127,8 +127,8 @@ class StaticsConfig(StrictModel):
 
     footprints: tuple[str, ...] = Field(
         (),
-        description="GeoJSON files that declare their crs (null: world-frame metres); features have height_m and may"
-        " have base_m, radius_m",
+        description="GeoJSON files that declare their crs (null: world-frame metres), or GeoPackage, Shapefile,"
+        " GeoParquet, KML; features have height_m and may have base_m, radius_m",
     )
     polygons: tuple[str, ...] = Field((), description="SUMO .poly.xml files; polygons are solid or not by their type")
     polygon_height_m: Positive = Field(
@@ -205,7 +205,11 @@ Pitch = Annotated[float, Field(ge=-90, le=90)] | Literal["aim"]
 class SitesConfig(StrictModel):
     """Candidate sites: a file, or a rule. Sensor and angles are defaults for sites that do not set their own."""
 
-    file: str | None = Field(None, description="CSV file (site, x_m, y_m, z_m, ...) or GeoJSON points")
+    file: str | None = Field(
+        None,
+        description="CSV file (site, x_m, y_m, z_m, ...), or points in GeoJSON, GeoPackage, Shapefile, GeoParquet or"
+        " KML",
+    )
     grid: SiteGrid | None = None
     along: tuple[SiteLine, ...] = ()
     only_free: bool = Field(True, description="Drop sites of grid and along in lanes, junctions and solids")
@@ -302,6 +306,7 @@ class Scenario(StrictModel):
 
     _folders: tuple[Path, ...] = PrivateAttr(default=(Path(),))
     _period: str = PrivateAttr(default="")
+    _period_keys: frozenset[str] = PrivateAttr(default=frozenset())
     _file_name: str = PrivateAttr(default=SCENARIO_FILE)
     _written_site_keys: frozenset[str] = PrivateAttr(default=frozenset())
 
@@ -342,10 +347,12 @@ class Scenario(StrictModel):
             return {"": self}
         scenarios = {}
         for number, (name, traffic) in enumerate(self._traffic_by_period()):
+            period = self.traffic.periods[number]
             drawn = int(np.random.SeedSequence((self.seed, number)).generate_state(1, np.uint64)[0])
             scenario = self.model_copy(update={"traffic": traffic, "seed": drawn >> 1})
             scenario._folders = self._folders
             scenario._period = name
+            scenario._period_keys = frozenset(period.model_fields_set)
             scenarios[name] = scenario
         return scenarios
 
@@ -365,6 +372,11 @@ class Scenario(StrictModel):
     def period(self) -> str:
         """The period of a scenario from :meth:`by_period`, else empty."""
         return self._period
+
+    @property
+    def period_keys(self) -> frozenset[str]:
+        """The keys that the period of a scenario from :meth:`by_period` sets itself, else none."""
+        return self._period_keys
 
     @property
     def written_site_keys(self) -> frozenset[str]:
@@ -387,6 +399,7 @@ class Scenario(StrictModel):
         scenario = self.model_copy(update={"effects": effects, "score": score})
         scenario._folders = self._folders
         scenario._period = self._period
+        scenario._period_keys = self._period_keys
         return scenario
 
     def find(self, name: str, key: str) -> Path:

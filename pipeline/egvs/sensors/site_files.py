@@ -1,8 +1,9 @@
-"""Rows of CSV and GeoJSON files of candidate sites, with coordinates in the world frame.
+"""Rows of files of candidate sites (CSV, GeoJSON, GIS formats), with coordinates in the world frame.
 
 The column names of a CSV say what its coordinates are: ``x_m, y_m``, or longitude and latitude (WGS 84, degrees) under
 one of the names of :data:`LONGITUDE` and :data:`LATITUDE`. Where a row has both, they must agree. The coordinates of a
-GeoJSON file are in the system that its member ``crs`` declares.
+GeoJSON file are in the system that its member ``crs`` declares. GeoPackage, Shapefile, KML and GeoParquet are read as
+GeoJSON with the same content (:mod:`egvs.formats.vector_files`).
 
 Further columns belong to the user (``fid``, ``owner``, ``note``) and are carried through to the scores. A column whose
 name is nearly one of the program's, which the file lacks, is rejected as misspelt. So is a column that other programs
@@ -29,6 +30,7 @@ from egvs.core.errors import InputError, find_misspelling
 from egvs.core.grid import FloatArray
 from egvs.core.numbers import parse_decimal
 from egvs.core.reading import read_json
+from egvs.formats import vector_files
 from egvs.formats.georeference import WGS84, CoordinateReading, Georeference, declared_crs, geojson_coordinates
 
 REQUIRED_COLUMNS = ("site", "x_m", "y_m", "z_m")
@@ -131,10 +133,13 @@ def _check_header(path: Path, names: list[str]) -> None:
         raise InputError(path, f"the column {duplicates[0]!r} occurs twice", "Use each column name once.")
 
 
-def read_geojson(path: Path, world: Georeference) -> Iterator[SiteRow]:
-    """Yield the features of a GeoJSON file as rows; InputError with file and feature for a malformed one."""
+def read_features(path: Path, world: Georeference) -> Iterator[SiteRow]:
+    """Yield the features of a GeoJSON or GIS file as rows; InputError with file and feature for a malformed one."""
     expected = "a FeatureCollection of Points"
-    document = read_json(path, f"Use {expected}.")
+    if vector_files.is_gis_file(path):
+        document = vector_files.read_gis_file(path, "Point")
+    else:
+        document = read_json(path, f"Use {expected}.")
     if not isinstance(document, dict) or not isinstance(document.get("features"), list):
         raise InputError(path, f"expected {expected}, got {reprlib.repr(document)[:120]}")
     check_site_count(len(document["features"]), path, "each feature is one", "Use fewer features.")

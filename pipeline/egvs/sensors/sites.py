@@ -1,9 +1,10 @@
 r"""Candidate sites of a scenario, from a file or a rule, with each height and pitch at which a sensor is mounted.
 
-Candidate sites come from a CSV, a GeoJSON file, or a rule (a lattice, or points along lines). Each has a position in
-the world frame in metres (:mod:`egvs.sensors.site_files` converts longitude and latitude), angles in degrees, and a
-sensor; what a row leaves out is taken from the scenario's ``[sites]``. Each combination of a location with a height and
-a pitch is one candidate. Candidates with the same x, y share one *pole*, named after the first site there.
+Candidate sites come from a file (CSV, GeoJSON, GIS formats) or a rule (a lattice, or points along lines). Each has a
+position in the world frame in metres (:mod:`egvs.sensors.site_files` converts longitude and latitude), angles in
+degrees, and a sensor; what a row leaves out is taken from the scenario's ``[sites]``. Each combination of a location
+with a height and a pitch is one candidate. Candidates with the same x, y share one *pole*, named after the first site
+there.
 
 A sensor is *aimed* when its middle ray (:attr:`egvs.sensors.sensor.Sensor.middle_deg`) meets a given point. With
 :math:`m` that ray after the roll, and :math:`d` the unit vector from the sensor to the point, pitch and yaw follow from
@@ -34,6 +35,7 @@ from scipy.special import cosdg, sindg
 from egvs.core.errors import Diagnostic, DiagnosticsError, InputError
 from egvs.core.grid import Vec3
 from egvs.core.numbers import parse_decimal
+from egvs.formats import vector_files
 from egvs.scenario.fields import MAX_COORDINATE_M
 from egvs.scenario.model import Scenario, SiteGrid, SiteLine
 from egvs.sensors import site_files
@@ -179,8 +181,8 @@ def _site_rows(scenario: Scenario, path: Path) -> Iterator[SiteRow]:
     config = scenario.sites
     if config.file is not None:
         world = geolocation.scenario_georeference(scenario)
-        if path.suffix.lower() in (".geojson", ".json"):
-            return site_files.read_geojson(path, world)
+        if path.suffix.lower() in (".geojson", ".json") or vector_files.is_gis_file(path):
+            return site_files.read_features(path, world)
         return site_files.read_csv(path, world)
     if config.grid is not None:
         return _grid_rows(config.grid)

@@ -16,7 +16,7 @@ from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.effects import registry
 from egvs.effects.base import Effect
-from egvs.formats import point_clouds
+from egvs.formats import point_clouds, vector_files
 from egvs.scenario.model import Scenario
 from egvs.sensors import sensor, site_feasibility, sites
 from egvs.sensors.scene import InactiveEffect, Scene
@@ -136,7 +136,10 @@ def site_digests(scenario: Scenario, sites: Iterable[Site]) -> dict[str, str]:
     sites = tuple(sites)
     digests = {}
     if scenario.sites.file is not None:
-        digests[scenario.sites.file] = files.hash_file(scenario.find(scenario.sites.file, "sites.file"))
+        path = scenario.find(scenario.sites.file, "sites.file")
+        digests[scenario.sites.file] = files.hash_file(path)
+        for part in vector_files.companion_files(path):
+            digests[f"sites.file: {part.name}"] = files.hash_file(part)
     for site in sites:
         if site.points is not None:
             digests[site.points] = files.hash_file(scenario.find(site.points, f"site {site.name}: points"))

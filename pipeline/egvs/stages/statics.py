@@ -7,6 +7,7 @@ Steps: find the source of the ground where the network has relief; read, repair 
 from __future__ import annotations
 
 from egvs.effects import registry
+from egvs.formats import vector_files
 from egvs.formats.meshes import mesh_digests
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.traffic import sumo_folder
@@ -21,7 +22,10 @@ def dependencies(context: StageContext) -> StageDependencies:
     digests = {}
     for key in ("footprints", "polygons"):
         for name in getattr(config, key):
-            digests[name] = context.inputs.digest(scenario.find(name, f"statics.{key}"))
+            path = scenario.find(name, f"statics.{key}")
+            digests[name] = context.inputs.digest(path)
+            for part in vector_files.companion_files(path):
+                digests[f"statics.{key}: {part.name}"] = context.inputs.digest(part)
     for mesh in config.meshes:
         digests |= mesh_digests(scenario.find(mesh.file, "statics.meshes"), mesh.file)
     modules: tuple[str, ...] = ()

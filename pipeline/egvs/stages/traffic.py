@@ -144,7 +144,7 @@ def _record_period(
             scenario, recorded, effects, file, context.progress, first_frame
         )
         sumo_summary = recorded.summary()
-        warnings = trajectories.traffic_warnings(tally, recorded, scenario.roi.box)
+        warnings = trajectories.traffic_warnings(tally, recorded, scenario.roi.box, recording.demand_key(scenario))
     summary = tally.to_json(recorded.window.period_ms / 1000.0)
     if sumo_summary is not None:
         summary |= asdict(sumo_summary)

@@ -35,7 +35,7 @@ from egvs.core import files
 from egvs.formats import xml
 from egvs.scenario.traffic_config import CountConfig, TrafficConfig
 from egvs.traffic import demand, sumo, sumo_folder, town_trips
-from egvs.traffic.locks import MOVED_M, SAMPLE_S
+from egvs.traffic.locks import MOVED_M, SAMPLE_S, StreetNames
 from egvs.traffic.network import Edge, Network, read_net_xml
 
 DURATION_S, WARMUP_S = 900.0, 300.0
@@ -92,6 +92,8 @@ class TrialRun:
         Longest time that a vehicle stood.
     waiting
         Vehicles without space to start, at the end.
+    longest_standing_at
+        Where and from when on the vehicle stood that stood longest; empty if none stood.
     """
 
     share: float
@@ -99,6 +101,7 @@ class TrialRun:
     arrived: int
     longest_standing_s: float
     waiting: int
+    longest_standing_at: str = ""
 
     @property
     def is_carried(self) -> bool:
@@ -132,10 +135,41 @@ class Capacity:
         """Whether any simulation showed that the share is carried."""
         return any(run.is_carried for run in self.runs)
 
+    @property
+    def jam(self) -> str:
+        """Where a vehicle stood longest in the last run that was not carried, in words; empty if none stood."""
+        jams = [run for run in self.runs if not run.is_carried and run.longest_standing_at]
+        if not jams:
+            return ""
+        return f"a vehicle stood for {jams[-1].longest_standing_s:.0f} s at {jams[-1].longest_standing_at}"
+
 
 def scale_flows(flows: Sequence[CountConfig], share: float) -> list[CountConfig]:
     """Return a share of all flows, rounded to whole vehicles per hour, and at least 1 each."""
     return [flow.model_copy(update={"per_hour": max(1.0, float(round(flow.per_hour * share)))}) for flow in flows]
+
+
+def distribute_total(flows: Sequence[CountConfig], total_per_h: int) -> list[CountConfig]:
+    """Return flows in the same proportions that add up to a total, in whole vehicles per hour; none is 0.
+
+    Parameters
+    ----------
+    flows
+        At least one flow above 0.
+    total_per_h
+        Vehicles per hour in all; the largest remainders are rounded up.
+    """
+    share = total_per_h / math.fsum(flow.per_hour for flow in flows)
+    whole = [math.floor(flow.per_hour * share) for flow in flows]
+    by_remainder = sorted(range(len(flows)), key=lambda i: whole[i] - flows[i].per_hour * share)
+    for i in by_remainder[: total_per_h - sum(whole)]:
+        whole[i] += 1
+
+    scaled = []
+    for flow, per_hour in zip(flows, whole, strict=True):
+        if per_hour > 0:
+            scaled.append(flow.model_copy(update={"per_hour": float(per_hour)}))
+    return scaled
 
 
 def find_capacity(network: str, flows: Sequence[CountConfig], junction_blocker_s: float) -> Capacity:
@@ -180,15 +214,32 @@ def _simulate(
     files.write_text(folder / sumo_folder.VTYPES_FILE, demand.vtypes_xml(traffic.kinds))
     state = _run_sumo(folder, DURATION_S, WARMUP_S, {"ignore-junction-blocker": f"{junction_blocker_s:g}"})
     scheduled, arrived = _arrivals(routes, folder / _TRIPS_FILE)
-    return TrialRun(share, scheduled, arrived, state.longest_standing_s, state.waiting)
+    stand = state.standing
+    location = ""
+    if stand.at_m is not None:
+        x_m, y_m = stand.at_m
+        location = f"{StreetNames(roads).at(stand.at_m)} (x {x_m:.0f} m, y {y_m:.0f} m) from {stand.since_s:.0f} s on"
+    return TrialRun(share, scheduled, arrived, stand.longest_s, state.waiting, location)
+
+
+class _Standing(NamedTuple):
+    """Vehicles that stand.
+
+    The longest time that one stood, the share of vehicles that stand in a sample, where the first one stood (None if
+    none did), and since when.
+    """
+
+    longest_s: float
+    share_at_rest: float
+    at_m: tuple[float, float] | None = None
+    since_s: float = 0.0
 
 
 class _SimulationResult(NamedTuple):
-    """The longest stand of a vehicle in a simulation, vehicles without space to start, and the share at rest."""
+    """The vehicles that stand in a simulation, and the number of those without space to start."""
 
-    longest_standing_s: float
+    standing: _Standing
     waiting: int
-    share_at_rest: float
 
 
 def _run_sumo(folder: Path, duration_s: float, warmup_s: float, options: Mapping[str, str]) -> _SimulationResult:
@@ -216,8 +267,7 @@ def _run_sumo(folder: Path, duration_s: float, warmup_s: float, options: Mapping
     }
     sumo.run_program("sumo", sumo_folder.as_flags(all_options), folder)
     (vehicles,) = (e for e in xml.iter_elements(folder / _STATISTICS_FILE, "statistics") if e.tag == "vehicles")
-    longest_s, share_at_rest = _standing(folder / _FCD_FILE)
-    return _SimulationResult(longest_s, int(vehicles.get("waiting", 0)), share_at_rest)
+    return _SimulationResult(_standing(folder / _FCD_FILE), int(vehicles.get("waiting", 0)))
 
 
 def _arrivals(routes: Path, trips: Path) -> tuple[int, int]:
@@ -233,16 +283,17 @@ def _arrivals(routes: Path, trips: Path) -> tuple[int, int]:
     return scheduled, len(durations_s)
 
 
-def _standing(fcd: Path) -> tuple[float, float]:
-    """Return for how long a vehicle stood at most, and the share of vehicles that stand in a sample."""
+def _standing(fcd: Path) -> _Standing:
+    """Return for how long and where a vehicle stood at most, and the share of vehicles that stand in a sample."""
     lines = fcd.read_text(encoding="utf-8").splitlines()
     header = lines[0].split(";") if lines else []
     if len(lines) < 2:
-        return 0.0, 0.0
+        return _Standing(0.0, 0.0)
     column = {name: header.index(name) for name in ("timestep_time", "vehicle_id", "vehicle_x", "vehicle_y")}
     last: dict[str, tuple[float, float, float]] = {}
     """Time since when each vehicle stands, and where."""
-    longest_s, rows, standing = 0.0, 0, 0
+    longest = _Standing(0.0, 0.0)
+    rows, standing = 0, 0
     for line in lines[1:]:
         values = line.split(";")
         name = values[column["vehicle_id"]]
@@ -253,10 +304,11 @@ def _standing(fcd: Path) -> tuple[float, float]:
         if math.hypot(x_m - old_x_m, y_m - old_y_m) >= MOVED_M:
             since_s, old_x_m, old_y_m = time_s, x_m, y_m
         last[name] = since_s, old_x_m, old_y_m
-        longest_s = max(longest_s, time_s - since_s)
+        if time_s - since_s > longest.longest_s:
+            longest = _Standing(time_s - since_s, 0.0, (old_x_m, old_y_m), since_s)
         rows += 1
         standing += time_s > since_s
-    return longest_s, standing / max(rows, 1)
+    return longest._replace(share_at_rest=standing / max(rows, 1))
 
 
 @dataclass(frozen=True)
@@ -391,13 +443,13 @@ class _TownTrial:
     def run_light_traffic(self, first_per_h: int) -> None:
         """Measure which share of the vehicles stands in light traffic."""
         per_h = max(_MIN_LIGHT_PER_H, round(LIGHT_SHARE * first_per_h))
-        self._share_in_light_traffic = self._simulate(per_h, True).share_at_rest
+        self._share_in_light_traffic = self._simulate(per_h, True).standing.share_at_rest
 
     def run(self, per_h: int, reroute: bool) -> FlowTrial:
         """Simulate a flow."""
         state = self._simulate(per_h, reroute)
-        share_queuing = round(max(0.0, state.share_at_rest - self._share_in_light_traffic), 4)
-        run = FlowTrial(per_h, reroute, state.longest_standing_s, state.waiting, share_queuing)
+        share_queuing = round(max(0.0, state.standing.share_at_rest - self._share_in_light_traffic), 4)
+        run = FlowTrial(per_h, reroute, state.standing.longest_s, state.waiting, share_queuing)
         self.runs.append(run)
         return run
 

@@ -157,7 +157,9 @@ def teleport_warning(
     for location, number in numbers.most_common(3):
         there = [teleport for teleport in teleports if names.of_lane(teleport.lane) == location]
         end_m = names.end_of_lane(there[0].lane)
-        distance = "" if end_m is None else f", {describe_distance(end_m, roi)}"
+        distance = ""
+        if end_m is not None:
+            distance = f", x {end_m[0]:.0f} m, y {end_m[1]:.0f} m, {describe_distance(end_m, roi)}"
         period = f"{there[0].time_s:.0f} to {there[-1].time_s:.0f} s" if number > 1 else f"{there[0].time_s:.0f} s"
         locations.append(f"{number} at {location} ({period}{distance})")
     count = len({teleport.vehicle for teleport in teleports})
@@ -324,11 +326,16 @@ class RegionWatch:
         inside = [teleport for teleport in self._teleports if teleport.time_s * 1000 <= self._now_ms]
         if not are_too_many_teleports(len(inside), len(self._names)):
             return
-        locations = Counter(self._street_names.of_lane(teleport.lane) for teleport in inside)
+        names = self._street_names
+        locations = Counter(names.of_lane(teleport.lane) for teleport in inside)
         ((location, number),) = locations.most_common(1)
+        first = next(teleport for teleport in inside if names.of_lane(teleport.lane) == location)
+        end_m = names.end_of_lane(first.lane)
+        assert end_m is not None, "teleports at the region are on known lanes"
         raise self._error(
             f"{len(inside)} of {len(self._names)} vehicles had to be moved on by {self._now_ms / 1000:.0f} s,"
-            f" {number} of them at {location}"
+            f" {number} of them at {location} (x {end_m[0]:.0f} m, y {end_m[1]:.0f} m), the first at"
+            f" {first.time_s:.0f} s"
         )
 
     def _error(self, problem: str) -> RunError:

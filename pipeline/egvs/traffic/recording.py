@@ -25,6 +25,7 @@ from egvs.core.progress import ProgressCallback
 from egvs.formats import xml
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import Scenario
+from egvs.scenario.traffic_config import TrafficConfig
 from egvs.traffic import fcd, finished_fcd, locks, network, sumo, sumo_folder
 from egvs.traffic.count_fit import CountFit, count_fits, missed_count_warnings
 from egvs.traffic.locks import DemandKey, RegionWatch, describe_distance
@@ -413,24 +414,30 @@ def _region_watch(
 
 
 def demand_key(scenario: Scenario) -> DemandKey:
-    """Return the key that sets how much traffic there is, and how to reduce the traffic, for messages."""
+    """Return the key that sets how much traffic there is, with its period, and how to reduce the traffic."""
     traffic = scenario.traffic
-    where = sumo_folder.traffic_location(scenario)
     if traffic.sumocfg is not None:
-        return DemandKey(
-            f"{where}.sumocfg", "Reduce its demand, or correct the signals and connections of its network."
-        )
+        return _demand_key(scenario, "sumocfg", "Reduce its demand, or correct the signals and connections there.")
     if traffic.routes:
-        return DemandKey(f"{where}.routes", "Reduce the demand, or correct the signals and connections of the network.")
+        return _demand_key(scenario, "routes", "Reduce the demand, or correct the signals and connections there.")
     if traffic.counts:
-        hint = "Lower per_hour of the counts there, or correct the signals and connections of the network."
-        return DemandKey(f"{where}.counts", hint)
+        return _demand_key(scenario, "counts", "Lower per_hour of the counts, or correct the signals there.")
     for key in ("vehicles", "vehicles_per_h", "vehicles_per_lane_km"):
         if key in traffic.model_fields_set and getattr(traffic, key) is not None:
-            return DemandKey(f"{where}.{key}", "Lower it, or correct the signals and connections of the network.")
-    return DemandKey(
-        f"{where}.network", "Set traffic.vehicles to a lower number, or correct the network's signals and connections."
-    )
+            return _demand_key(scenario, key, f"Lower {key}, or correct the signals and connections there.")
+    density = TrafficConfig.model_fields["vehicles_per_lane_km"].default
+    hint = f"Set traffic.vehicles_per_lane_km below {density:g}, or correct the signals and connections there."
+    return _demand_key(scenario, "network", hint)
+
+
+def _demand_key(scenario: Scenario, key: str, hint: str) -> DemandKey:
+    """Return a key of ``[traffic]``, or of the period that sets it itself."""
+    if key in scenario.period_keys:
+        return DemandKey(f"{scenario.file}: traffic.periods ({scenario.period}).{key}", hint)
+    where = f"{sumo_folder.traffic_location(scenario)}.{key}"
+    if scenario.period:
+        where += f" (period {scenario.period})"
+    return DemandKey(where, hint)
 
 
 def simulate(prepared: SimulationFolder, progress: ProgressCallback, region_watch: RegionWatch | None = None) -> float:

@@ -22,7 +22,7 @@ from egvs.core.grid import Roi
 from egvs.core.progress import ProgressCallback
 from egvs.scenario.model import Scenario
 from egvs.traffic import fcd, vehicle_boxes
-from egvs.traffic.locks import StreetNames, describe_distance, is_inside
+from egvs.traffic.locks import DemandKey, StreetNames, describe_distance, is_inside
 from egvs.traffic.recording import Recording, demand_key
 from egvs.traffic.vehicle_boxes import BoxChange, Ints, TrafficHook, VehicleBoxes
 
@@ -449,7 +449,9 @@ def check_recording(scenario: Scenario, statistics: TrafficStatistics, recording
         _check_moving(scenario, statistics, recording, recording.standing_limit_s)
 
 
-def traffic_warnings(statistics: TrafficStatistics, recording: Recording, roi: Roi) -> list[Diagnostic]:
+def traffic_warnings(
+    statistics: TrafficStatistics, recording: Recording, roi: Roi, demand: DemandKey
+) -> list[Diagnostic]:
     """Warn about implausible traffic: a vehicle that was standing for too long, overlaps in too many frames.
 
     Parameters
@@ -460,25 +462,25 @@ def traffic_warnings(statistics: TrafficStatistics, recording: Recording, roi: R
         The recording.
     roi
         Region of interest; locations are described by their distance from it.
+    demand
+        How to reduce the traffic, for messages.
     """
     warnings = []
     jam = statistics.longest_jam
     if jam is not None and recording.standing_limit_s is not None:
         duration_s = jam.frames * (recording.window.period_ms / 1000.0)
         if duration_s > LONG_STOP_S:
-            where = f"{recording.where}: {describe_location(jam.at_m, roi)}"
-            problem = f"vehicle {jam.vehicle!r} was standing for {duration_s:g} s, longer than any usual red phase"
-            if recording.roads is not None:
-                begin_s = ((recording.window.first_ms or 0) + jam.since * recording.window.period_ms) / 1000.0
-                problem += f", at {StreetNames(recording.roads).at(jam.at_m)}, from {begin_s:g} s on"
+            problem = (
+                f"vehicle {jam.vehicle!r} was standing for {duration_s:g} s, longer than any usual red phase,"
+                f" {_describe_stand(jam.at_m, jam.since, recording, roi)}"
+            )
             if statistics.stood_long:
                 number, total = len(statistics.stood_long), len(statistics.names)
                 percent = f"{100 * number / total:.1f} %"
                 problem += (
                     f"; {number} of {total:,} vehicles ({percent}) stood for more than {LONG_STOP_S:g} s somewhere"
                 )
-            hint = "Check the signals and connections of the network there, or reduce the traffic."
-            warnings.append(Diagnostic("standing", where, problem, hint))
+            warnings.append(Diagnostic("standing", demand.where, problem, demand.hint))
     if statistics.overlaps_in_region:
         per_thousand = 1000 * statistics.overlaps_in_region / statistics.rows_in_region
         problem = (
@@ -529,9 +531,19 @@ def _check_moving(scenario: Scenario, statistics: TrafficStatistics, recording: 
             jammed_s[name] = duration_s
     if jammed_s:
         longest = max(jammed_s, key=lambda name: jammed_s[name])
-        location = describe_location(statistics.standing_at_m[longest], scenario.roi.box)
+        at_m, since = statistics.standing_at_m[longest], statistics.standing_since[longest]
         where, hint = demand_key(scenario)
         raise RunError(
             f"{where}: the traffic is jammed: {len(jammed_s)} vehicles stand for more than {limit_s:g} s up"
-            f" to the last frame, {longest!r} for {jammed_s[longest]:g} s at {location}. {hint}"
+            f" to the last frame, {longest!r} for {jammed_s[longest]:g} s"
+            f" {_describe_stand(at_m, since, recording, scenario.roi.box)}. {hint}"
         )
+
+
+def _describe_stand(at_m: tuple[float, float], since: int, recording: Recording, roi: Roi) -> str:
+    """Describe where a vehicle stands, by street if the network is known, and from which second on."""
+    location = describe_location(at_m, roi)
+    if recording.roads is not None:
+        location = f"{StreetNames(recording.roads).at(at_m)}, {location}"
+    begin_s = ((recording.window.first_ms or 0) + since * recording.window.period_ms) / 1000.0
+    return f"at {location}, from {begin_s:g} s on"

@@ -1,4 +1,4 @@
-"""Footprints: polygons that are extruded to solids, read from GeoJSON.
+"""Footprints: polygons that are extruded to solids, read from GeoJSON or a GIS file.
 
 Steps: read polygons, lines and points (:mod:`egvs.world.sumo_polygons` reads those of SUMO); convert degrees or a map
 projection to the world frame (:mod:`egvs.formats.georeference`); widen lines and points; repair what is unambiguous,
@@ -20,6 +20,7 @@ import numpy as np
 
 from egvs.core.errors import Diagnostic, DiagnosticsError, InputError, find_misspelling
 from egvs.core.reading import read_json
+from egvs.formats import vector_files
 from egvs.formats.georeference import WORLD_READING, CoordinateReading, Georeference, declared_crs, geojson_coordinates
 from egvs.scenario.fields import MAX_COORDINATE_M
 
@@ -73,13 +74,13 @@ class FootprintFile:
     warnings: list[Diagnostic] = field(default_factory=list)
 
 
-def read_geojson(path: Path, world: Georeference) -> FootprintFile:
-    """Read the footprints of a GeoJSON FeatureCollection.
+def read_footprints(path: Path, world: Georeference) -> FootprintFile:
+    """Read the footprints of a GeoJSON FeatureCollection, or of a GIS file.
 
     Parameters
     ----------
     path
-        The file; it declares its coordinate reference system.
+        GeoJSON, or a format of :mod:`egvs.formats.vector_files`; it declares its coordinate reference system.
     world
         Where the world frame is.
 
@@ -89,7 +90,10 @@ def read_geojson(path: Path, world: Georeference) -> FootprintFile:
         When features are no geometries, have no height, or are invalid polygons; all are named.
     """
     file = FootprintFile()
-    document = read_json(path, "Use a GeoJSON FeatureCollection.")
+    if vector_files.is_gis_file(path):
+        document = vector_files.read_gis_file(path, "Polygon")
+    else:
+        document = read_json(path, "Use a GeoJSON FeatureCollection.")
     if not isinstance(document, dict) or not isinstance(document.get("features"), list):
         raise InputError(path, "expected a GeoJSON FeatureCollection, got no features list")
     features = document["features"]

@@ -27,7 +27,7 @@ from egvs.formats.meshes import are_closed, mesh_components
 from egvs.scenario.fields import MAX_COORDINATE_M
 from egvs.scenario.model import MeshConfig, Scenario
 from egvs.world import geolocation
-from egvs.world.footprints import Footprint, read_geojson
+from egvs.world.footprints import Footprint, read_footprints
 from egvs.world.map_features import SolidTypes
 from egvs.world.mesh import World
 from egvs.world.sumo_polygons import read_poly_xml
@@ -85,7 +85,7 @@ def build_world(
     builder = _Builder()
     world = geolocation.scenario_georeference(scenario)
     types = SolidTypes(config.polygon_types)
-    files = [read_geojson(scenario.find(name, "statics.footprints"), world) for name in config.footprints]
+    files = [read_footprints(scenario.find(name, "statics.footprints"), world) for name in config.footprints]
     polygons = [scenario.find(name, "statics.polygons") for name in config.polygons]
     files += [read_poly_xml(path, types, config.polygon_height_m, world) for path in polygons]
     footprints = []

@@ -1,0 +1,191 @@
+"""Layers of GIS files as GeoJSON documents: GeoPackage, Shapefile, KML and GeoParquet.
+
+GeoPackage, Shapefile and KML are read by GDAL (pyogrio, extra ``gis``), GeoParquet (https://geoparquet.org) by pyarrow.
+The result is a FeatureCollection with the member ``crs``, as GeoJSON files of this program have it. So the same rules
+apply to all formats. Coordinates stay in the system of the file, x before y.
+
+KML: the altitude of a point counts only where it is ``relativeToGround``; Google Earth writes 0 where it is clamped to
+the ground. The fields of LIBKML that describe how a placemark is drawn are left out.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from datetime import date, datetime
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from egvs.core import plugins
+from egvs.core.errors import InputError
+from egvs.core.numbers import parse_decimal
+
+GIS_FORMATS = {
+    ".gpkg": "GeoPackage",
+    ".shp": "Shapefile",
+    ".kml": "KML",
+    ".parquet": "GeoParquet",
+    ".geoparquet": "GeoParquet",
+}
+"""Formats by the suffix of their files."""
+
+_SHAPEFILE_PARTS = (".dbf", ".prj", ".cpg", ".shx")
+_KML_FIELDS = (
+    "id", "timestamp", "begin", "end", "altitudeMode", "tessellate", "extrude", "visibility", "drawOrder", "icon",
+)  # fmt: skip
+_MAX_NAMED_LAYERS = 10
+
+
+def is_gis_file(path: Path) -> bool:
+    """Return whether :func:`read_gis_file` reads a file; its suffix decides."""
+    return path.suffix.lower() in GIS_FORMATS
+
+
+def companion_files(path: Path) -> list[Path]:
+    """Return the other files of a Shapefile; none for other formats."""
+    if path.suffix.lower() != ".shp":
+        return []
+    parts = [path.with_suffix(suffix) for suffix in _SHAPEFILE_PARTS]
+    return [part for part in parts if part.is_file()]
+
+
+def read_gis_file(path: Path, geometry: str) -> dict[str, Any]:
+    """Read the layer of a file.
+
+    Parameters
+    ----------
+    path
+        The file; :func:`is_gis_file` holds for it.
+    geometry
+        The kind of geometry that tells the layer from others: ``"Point"`` or ``"Polygon"``.
+
+    Returns
+    -------
+    dict
+        A GeoJSON FeatureCollection with the member ``crs``.
+
+    Raises
+    ------
+    InputError
+        When the file is damaged, has several such layers, or does not declare its coordinate reference system.
+    MissingExtraError
+        When pyogrio is not installed.
+    """
+    kind = GIS_FORMATS[path.suffix.lower()]
+    table, geometry_column, crs = _read_geoparquet(path) if kind == "GeoParquet" else _read_gdal(path, kind, geometry)
+    if not crs:
+        hint = "Set the coordinate reference system of the layer in a GIS, and save it again."
+        if kind == "Shapefile":
+            hint = f"Add {path.stem}.prj, which belongs to the Shapefile."
+        raise InputError(path, "the file does not declare its coordinate reference system", hint)
+    features = [_feature(row, geometry_column, path) for row in table.to_pylist()]
+    return {
+        "type": "FeatureCollection",
+        "crs": {"type": "name", "properties": {"name": crs}},
+        "features": features,
+    }
+
+
+def _read_gdal(path: Path, kind: str, geometry: str) -> tuple[pa.Table, str, str | None]:
+    """Return the table of a layer, the name of its geometry column, and its reference system."""
+    plugins.require_libraries(f"{path.name}: reading {kind}", "gis", "pyogrio")
+    import pyogrio
+    from pyogrio.errors import DataLayerError, DataSourceError
+
+    try:
+        layer = _choose_layer(path, pyogrio.list_layers(path).tolist(), geometry)
+        metadata, table = pyogrio.read_arrow(path, layer=layer)
+    except (DataSourceError, DataLayerError, pa.ArrowException) as error:
+        problem = f"the file cannot be read as {kind} ({error})"
+        raise InputError(path, problem, "Export it again, or use GeoJSON or CSV.") from None
+    return table, metadata["geometry_name"] or "wkb_geometry", metadata["crs"]
+
+
+def _choose_layer(path: Path, layers: list[list[Any]], geometry: str) -> str:
+    """Return the only layer with geometries, or the only one with geometries of a kind."""
+    names = [name for name, layer_type in layers if layer_type is not None]
+    if len(names) > 1:
+        fitting = [name for name, layer_type in layers if geometry in (layer_type or "")]
+        names = fitting or names
+    if len(names) == 1:
+        return str(names[0])
+    listed = ", ".join(map(str, names[:_MAX_NAMED_LAYERS])) or "none"
+    problem = f"expected one layer of {geometry} geometries, got {listed}"
+    raise InputError(path, problem, "Save the layer to use in a file of its own.")
+
+
+def _read_geoparquet(path: Path) -> tuple[pa.Table, str, str | None]:
+    """Return the table of a GeoParquet file, the name of its geometry column, and its reference system."""
+    try:
+        table = pq.read_table(path)
+        header = json.loads((table.schema.metadata or {})[b"geo"])
+        name = header["primary_column"]
+        column = header["columns"][name]
+        encoding = column["encoding"]
+        covering = column.get("covering", {}).get("bbox", {}).get("xmin", [None])[0]
+    except (pa.ArrowException, OSError, KeyError, TypeError, ValueError, AttributeError) as error:
+        problem = f"the file cannot be read as GeoParquet ({error!r})"[:200]
+        raise InputError(path, problem, "Export it again, or use GeoJSON or CSV.") from None
+    if encoding != "WKB" or name not in table.column_names:
+        problem = f"expected a geometry column {name!r} encoded as WKB, got {encoding!r}"
+        raise InputError(path, problem, "Export it again with the encoding WKB.")
+    if covering in table.column_names:
+        table = table.drop_columns([covering])
+    crs = column.get("crs", "OGC:CRS84")
+    return table, name, json.dumps(crs) if isinstance(crs, dict) else crs
+
+
+def _feature(row: Mapping[str, Any], geometry_column: str, path: Path) -> dict[str, Any]:
+    """Return a GeoJSON feature of a row."""
+    import shapely
+
+    shape = None
+    if row[geometry_column] is not None:
+        try:
+            shape = shapely.from_wkb(row[geometry_column])
+        except shapely.errors.ShapelyError as error:
+            raise InputError(path, f"a geometry cannot be read ({error})", "Repair it in a GIS.") from None
+    properties = {name: _plain_value(value) for name, value in row.items() if name != geometry_column}
+    if path.suffix.lower() == ".kml":
+        shape = _kml_shape(shape, properties.get("altitudeMode"), f"{path}: {properties.get('Name') or '?'}")
+        properties = dict(_kml_properties(properties))
+    if shape is None:
+        return {"type": "Feature", "geometry": None, "properties": properties}
+    if shape.geom_type.startswith("Multi") and len(shape.geoms) == 1:
+        shape = shape.geoms[0]  # a GIS saves points as MultiPoint
+    geometry = json.loads(json.dumps(shapely.geometry.mapping(shape)))  # lists, as in a file
+    return {"type": "Feature", "geometry": geometry, "properties": properties}
+
+
+def _plain_value(value: Any) -> Any:
+    """Return a value that JSON can hold: times as text; binary values are left out."""
+    if isinstance(value, date | datetime):
+        return value.isoformat()
+    return None if isinstance(value, bytes) else value
+
+
+def _kml_shape(shape: Any, altitude_mode: str | None, where: str) -> Any:
+    """Return a geometry without altitudes, unless they are heights above the ground."""
+    import shapely
+
+    if shape is None or altitude_mode == "relativeToGround":
+        return shape
+    if altitude_mode == "absolute":
+        hint = "Use the altitude mode relativeToGround, or a field z_m and the mode clampToGround."
+        raise InputError(where, "expected an altitude above the ground, got one above sea level", hint)
+    return shapely.force_2d(shape)
+
+
+def _kml_properties(fields: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield name, description and the user's fields; KML has numbers as text."""
+    for name, value in fields.items():
+        if name in _KML_FIELDS or value is None:
+            continue
+        if isinstance(value, str) and name.endswith(("_m", "_deg")):
+            with suppress(ValueError):  # the reader of the column rejects it, with the row
+                value = parse_decimal(value)
+        yield "name" if name == "Name" else name, value
