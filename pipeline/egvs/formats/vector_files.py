@@ -25,12 +25,8 @@ from egvs.core.errors import InputError
 from egvs.core.numbers import parse_decimal
 
 GIS_FORMATS = {
-    ".gpkg": "GeoPackage",
-    ".shp": "Shapefile",
-    ".kml": "KML",
-    ".parquet": "GeoParquet",
-    ".geoparquet": "GeoParquet",
-}
+    ".gpkg": "GeoPackage", ".shp": "Shapefile", ".kml": "KML", ".parquet": "GeoParquet", ".geoparquet": "GeoParquet",
+}  # fmt: skip
 """Formats by the suffix of their files."""
 
 _SHAPEFILE_PARTS = (".dbf", ".prj", ".cpg", ".shx")
@@ -83,11 +79,8 @@ def read_gis_file(path: Path, geometry: str) -> dict[str, Any]:
             hint = f"Add {path.stem}.prj, which belongs to the Shapefile."
         raise InputError(path, "the file does not declare its coordinate reference system", hint)
     features = [_feature(row, geometry_column, path) for row in table.to_pylist()]
-    return {
-        "type": "FeatureCollection",
-        "crs": {"type": "name", "properties": {"name": crs}},
-        "features": features,
-    }
+    named_crs = {"type": "name", "properties": {"name": crs}}
+    return {"type": "FeatureCollection", "crs": named_crs, "features": features}
 
 
 def _read_gdal(path: Path, kind: str, geometry: str) -> tuple[pa.Table, str, str | None]:
