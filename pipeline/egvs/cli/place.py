@@ -83,6 +83,8 @@ def print_placement(placed: Placement) -> None:
         out.print(describe_refinement(placed, placed.refinement))
     for path in placed.files:
         out.print(str(path))
+    if gain := describe_last_gain(placed):
+        out.print(gain)
 
 
 def _sensor_table(placed: Placement) -> Table:
@@ -98,8 +100,9 @@ def _sensor_table(placed: Placement) -> Table:
         Column("gain", lambda row: f"{row.gain:.6g}"),
         Column("joint score", lambda row: f"{row.score:.6g}"),
         Column("lost if it fails", lambda row: f"{_loss_share(placed, row):.1%}"),
-        Column("cost", lambda row: f"{row.cost:g}"),
     ]
+    if any(placed.curve_costs):
+        columns.append(Column("cost", lambda row: f"{row.cost:g}"))
     if placed.refinement is not None:
         columns.append(Column("moved m", lambda row: f"{row.moved_m:.2f}"))
         columns.append(Column("gained by moving", lambda row: f"{row.gain_by_refining:.6g}"))
@@ -146,6 +149,15 @@ def describe_plan(placed: Placement) -> str:
         share = _score_share(placed, joint)
         score += f", {share:.1%} of the score of all {placed.candidates} candidates together"
     return f"{sites}{cost}: {score}; {_describe_proof(placed)}"
+
+
+def describe_last_gain(placed: Placement) -> str | None:
+    """Return how much the largest plan of the curve adds to the one before it; None if there is nothing to compare."""
+    curve = placed.solution.curve
+    if len(curve) < 2 or not curve[-2].plan_value.joint > 0:
+        return None
+    gain = curve[-1].plan_value.joint / curve[-2].plan_value.joint - 1.0
+    return f"Going from {curve[-2].count} to {curve[-1].count} sensors adds {gain:.1%}."
 
 
 def _describe_proof(placed: Placement) -> str:
