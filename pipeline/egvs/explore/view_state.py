@@ -12,6 +12,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import count
@@ -55,6 +56,8 @@ D = TypeVar("D")
 _POSE_PARTS = ("x", "y", "z", "yaw", "pitch", "roll")
 _WHOLE_NUMBER = "a whole number of at least 0"
 _MAX_PITCH_DEG = 90.0
+_SAVE_LOCK = threading.Lock()
+"""Between the threads of the page; not every system's file locks separate the threads of a process."""
 
 
 def save_pose(path: Path, site: Site, candidates: Collection[str]) -> str:
@@ -74,7 +77,7 @@ def save_pose(path: Path, site: Site, candidates: Collection[str]) -> str:
     InputError
         If the file was not written by the explorer; it is not changed.
     """
-    with locks.locked(path.with_name(f".{path.name}.lock"), remove=True):
+    with _SAVE_LOCK, locks.locked(path.with_name(f".{path.name}.lock"), remove=True):
         rows = _read_saved_rows(path)
         taken = {row[0] for row in rows} | set(candidates)
         numbered = (f"{site.name[:72]}-{number}" for number in count(1))
