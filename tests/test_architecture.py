@@ -71,7 +71,8 @@ def test_no_import_by_string() -> None:
 @pytest.mark.slow
 def test_parquet_and_schemas_are_read_in_one_place() -> None:
     readers = {name for name in MODULES if "pyarrow.parquet" in imported_names(name)}
-    assert readers <= {"artefacts/parquet.py", "traffic/fcd.py"}  # the latter reads what SUMO wrote
+    foreign = {"traffic/fcd.py", "formats/vector_files.py"}  # what SUMO wrote, and GeoParquet
+    assert readers <= {"artefacts/parquet.py", "artefacts/origin.py", *foreign}
     named = {
         name
         for name in MODULES

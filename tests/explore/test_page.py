@@ -169,7 +169,7 @@ def test_layers_draw_their_data(page: Page, session: Session, layer: str) -> Non
         for name, bit in zip(("pole_a", "pole_b"), alone, strict=True):
             assert f"seen only by {name}: {bit:,.1f} bits" in page.controls.legend.content
     if layer == "blindspots":
-        assert f"{session.blindspots(site).overall.share:.1%} seen" in page.controls.legend.content
+        assert f"{session.blindspots(site).overall.share:.1%} found" in page.controls.legend.content
 
 
 @pytest.mark.slow

@@ -75,7 +75,7 @@ def test_study_settings_keep_gamma(auto: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_run_with_auto_equals_run_with_number(auto: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
-    code, _, message = run_egvs("run", auto, "--out", tmp_path / "auto")
+    code, _, message = run_egvs("run", auto, "--out", tmp_path / "auto", "--verbose")
     assert code == 0
     assert "gamma 4.5 (auto)" in message
     assert "4.5 beams<small>per voxel; further beams add nothing; chosen for the voxel size (auto)" in (

@@ -93,7 +93,7 @@ def test_recommended_setting_has_the_reported_error_with_sumo(
         grid_seconds=((None, 1.0), (0.5, 1.0)),
     )
     options = {"tolerance": 0.4, "seeds": 2, "repeats": 1, "max_reference_factor": 8, "values": values}
-    study = run_study(junction, [], tmp_path / "out", **options)
+    study = run_study(junction, ["score.rank_by=egvs"], tmp_path / "out", **options)
     study_tables.print_study(study, f"egvs run {junction}")
     printed = capsys.readouterr().out
     rows = parquet.read_artefact(tmp_path / "out" / "accuracy.parquet", "accuracy")[0].to_pylist()

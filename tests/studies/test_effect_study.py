@@ -130,7 +130,9 @@ def test_effect_without_consequence_is_skipped_and_reported(mini: Path, tmp_path
     assert "the result is the same without it" in statuses["foliage"][1]
     plain, skipped = tmp_path / "plain", tmp_path / "skipped"
     assert run_egvs("run", mini, "--out", plain)[0] == 0
-    code, _, errors = run_egvs("run", mini, "--out", skipped, *(part for name in named for part in ("--set", name)))
+    code, _, errors = run_egvs(
+        "run", mini, "--out", skipped, "--verbose", *(part for name in named for part in ("--set", name))
+    )
     assert code == 0
     assert "rain" in errors and "foliage" in errors
     for name in ("scans.parquet", "scores.parquet", "tpog.parquet", "trajectories.parquet", "statics.ply"):
