@@ -192,7 +192,8 @@ def test_lock_far_from_region_is_a_warning(locked, tmp_path):
     result = run_stage(traffic, locked_scenario(locked, (30.0, 150.0, 2.5), per_hour=60, frames=400), tmp_path)
     (warning,) = [warning for warning in result["warnings"] if warning["rule"] == "standing"]
     assert re.search(
-        r", at junction A0, edge left0A0, x \d+ m, y \d+ m \(\d+ m from the region of interest\), from \d+ s on; \d of \d vehicles \(\d+\.\d %\) stood",
+        r", at junction A0, edge left0A0, x \d+ m, y \d+ m \(\d+ m from the region of interest\), from \d+ s on; "
+        r"\d of \d vehicles \(\d+\.\d %\) stood",
         warning["problem"],
     )
 
