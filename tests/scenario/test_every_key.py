@@ -83,6 +83,8 @@ WEIGHTED = ("score.weights.zones.crossing={polygon_m=[[0, 0], [5, 0], [5, 5]], w
 WALKERS = (*NETWORK, "effects.pedestrians_bicycles={pedestrians_per_h=9, bicycles_per_h=9}")
 ONE, TWO, FIVE = (("sites.file='five.csv'", f"placement.count={count}") for count in (1, 2, 5))
 COVERED = (*TWO, "placement.zones.crossing={polygon_m=[[5, -8], [12, -8], [12, 8], [5, 8]], share=0.05}")
+WEIGHTED_BY_FILE = ("score.weights.zones.crossing={file='zones.csv', weight=2}",)
+COVERED_BY_FILE = (*TWO, "placement.zones.crossing={file='zones.csv', share=0.05}")
 BUDGET = ("sites.file='five.csv'", "costs.pole=10", "costs.sensor={small=10}", "placement.budget=45")
 REFINED = (*ONE, "placement.refine={radius_m=1, evaluations=100}")
 
@@ -198,6 +200,7 @@ KEYS: dict[str, Change] = {
     "score.others": Change("['coverage']"),
     "score.weights.kinds": Change("{bus=2}"),
     "score.weights.zones.*.polygon_m": Change("[[0, 0], [9, 0], [9, 9]]", WEIGHTED),
+    "score.weights.zones.*.file": Change("'other_zones.csv'", WEIGHTED_BY_FILE),
     "score.weights.zones.*.weight": Change("3", WEIGHTED),
     "score.keep_visibility": Change("'all'"),
     "score.blindspots": Change("false"),
@@ -243,6 +246,7 @@ KEYS: dict[str, Change] = {
     "placement.most_per_pole": Change("1", FIVE),
     "placement.least_distance_m": Change("15", FIVE),
     "placement.zones.*.polygon_m": Change("[[20, -8], [30, -8], [30, 8]]", COVERED),
+    "placement.zones.*.file": Change("'other_zones.csv'", COVERED_BY_FILE),
     "placement.zones.*.share": Change("0.02", COVERED),
     "placement.zones.*.by": Change("2", COVERED),
     "placement.objective": Change("'worst'", (*HALVES, *TWO)),
@@ -306,6 +310,8 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "one.csv": "site,x_m,y_m,z_m\na,10,12,3\n",
         "sensors.csv": "site,x_m,y_m,z_m,sensor\na,10,12,3,VLP-32C\nb,30,12,3,\n",
         "places.csv": "site,x_m,y_m\na,10,12\n",
+        "zones.csv": "zone,x_m,y_m\ncrossing,5,-8\ncrossing,12,-8\ncrossing,12,8\ncrossing,5,8\n",
+        "other_zones.csv": "zone,x_m,y_m\ncrossing,20,-8\ncrossing,30,-8\ncrossing,30,8\n",
         "beams.csv": "elevation_deg,azimuth_deg\n0,0\n-5,90\n",
         "other_beams.csv": "elevation_deg,azimuth_deg\n0,0\n-5,80\n",
     }

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 
 import egvs
 from egvs.artefacts import parquet
@@ -31,13 +32,17 @@ def record_of(people=()) -> TargetRecord:
     return TargetRecord.of([frame([(x, y, 1.0, 1.0, 1.0, 1.8, 0.0) for x, y in at], kinds)], GRID, people)
 
 
+def areas_of(config: WeightsConfig) -> dict[str, shapely.Polygon]:
+    return {name: shapely.Polygon(zone.polygon_m) for name, zone in config.zones.items()}
+
+
 def test_a_vehicle_counts_by_its_kind_and_by_every_zone_that_holds_it() -> None:
     overlap = {"polygon_m": [[114.0, 200.0], [119.0, 200.0], [119.0, 220.0], [114.0, 220.0]], "weight": 5.0}
     wanted = WeightsConfig.from_dict({"kinds": {"bus": 3.0, "pedestrian": 2.0}, "zones": {
         "crosswalk": {"polygon_m": SQUARE, "weight": 0.5}, "stop": overlap,
     }})  # fmt: skip
     record = record_of(weighted_people(wanted))
-    assert target_weights(wanted, record).tolist() == [3.0, 0.5 * 5.0, 0.5, 2.0 * 0.5 * 5.0, 2.0]
+    assert target_weights(wanted, areas_of(wanted), record).tolist() == [3.0, 0.5 * 5.0, 0.5, 2.0 * 0.5 * 5.0, 2.0]
     assert record.are_people.tolist() == [False, False, False, True, True]
 
 
@@ -46,8 +51,8 @@ def test_people_are_to_be_seen_only_where_they_have_a_weight() -> None:
     assert not record_of().are_people.any()
     assert weighted_people(WeightsConfig.from_dict({"kinds": {"bus": 3.0}})) == frozenset()
     assert len(record_of(weighted_people(WeightsConfig.from_dict({"kinds": {"pedestrian": 0.0}})))) == 5
-    assert target_weights(WeightsConfig(), record_of()).tolist() == [1.0] * 3
-    assert not len(target_weights(WeightsConfig(), TargetRecord.of([], GRID)))
+    assert target_weights(WeightsConfig(), {}, record_of()).tolist() == [1.0] * 3
+    assert not len(target_weights(WeightsConfig(), {}, TargetRecord.of([], GRID)))
 
 
 def test_people_are_found_as_well_as_they_are_seen() -> None:

@@ -31,6 +31,7 @@ from egvs.runs import run, stage_registry
 from egvs.runs.run import StageListener, ignore_stage, lock_run_folder
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import RefinementConfig
+from egvs.scoring import zones as zone_files
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scan
 from egvs.sensors.sites import Site
@@ -555,6 +556,7 @@ def _placement_metadata(scenario: Scenario, placed: Placement, stage_keys: Mappi
         "costs": scenario.costs.model_dump(mode="json"),
         "score": scenario.score.model_copy(update={"gamma": scenario.gamma}).model_dump(mode="json"),
     }
+    settings |= zone_files.file_settings(scenario.placement.zones, zone_files.placement_zones(scenario))
     solution, refined = placed.solution, placed.refinement
     plan = {
         "score": placed.score,

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,11 +28,15 @@ from egvs.scoring.scorer import ever_occupied
 from egvs.scoring.target_scores import TARGET_SCORES
 from egvs.scoring.targets import VisibleTargets
 from egvs.scoring.visibility import Beams, HitCounter
+from egvs.scoring.zones import placement_zones
 from egvs.sensors.sites import Site, candidate_sites
 from egvs.stages.base import StageContext
 from egvs.stages.inputs import get_scene
 from egvs.stages.site_scans import SiteScan, empty_scans
 from egvs.stages.site_scoring import TargetScorer
+
+if TYPE_CHECKING:
+    from shapely.geometry.base import BaseGeometry
 
 COST_COLUMN = "cost"
 """Column of a sites file with the cost of each candidate."""
@@ -246,8 +251,12 @@ def build_problem(context: StageContext, on_progress: Callable[[int], None]) -> 
 
     demands: list[Demand] = []
     if zone_view is not None:
+        areas = placement_zones(scenario)
         for name, zone in scenario.placement.zones.items():
-            demands.append(_zone_demand(scenario, name, zone, visibilities[0], tpogs[""], zone_view.voxels))
+            where = f"{scenario.file}: placement.zones.{name}"
+            inside = _voxels_in_area(areas[name], tpogs[""].grid, zone_view.voxels)
+            term = problem.zone_term(name, visibilities[0], tpogs[""], zone_view.voxels, inside, zone.by)
+            demands.append(_zone_demand(term, zone, where))
     terms = objective.terms(visibilities[-1])
     placement_problem = Problem(
         joint=terms[""],
@@ -358,25 +367,21 @@ def _as_share(scenario: Scenario, term: CoverageTerm, rules: PlanRules) -> Cover
     return replace(term, weight=term.weight / total, exact=lambda totals: term.exact(totals) / total)
 
 
-def _zone_demand(
-    scenario: Scenario, name: str, zone: ZoneDemand, visibility: VisibilityMatrix, tpog: Tpog, voxels: IntArray
-) -> Demand:
-    inside = _voxels_in_polygon(zone.polygon_m, tpog.grid, voxels)
-    term = problem.zone_term(name, visibility, tpog, voxels, inside, zone.by)
+def _zone_demand(term: CoverageTerm, zone: ZoneDemand, where: str) -> Demand:
+    """Return the demand of a zone; InputError when there is nothing to see in it."""
     if not term.weight.any():
-        where = f"{scenario.file}: placement.zones.{name}"
         raise InputError(where, "no voxel in this zone has entropy", "Move the zone to where vehicles come and go.")
     return Demand(term, zone.share)
 
 
-def _voxels_in_polygon(polygon_m: Sequence[tuple[float, float]], grid: Grid, voxels: IntArray) -> IntArray:
-    """Voxels whose centre is in a polygon or on its edge."""
+def _voxels_in_area(area: BaseGeometry, grid: Grid, voxels: IntArray) -> IntArray:
+    """Voxels whose centre is in an area or on its edge."""
     import shapely
 
     ix, iy, _ = np.unravel_index(voxels, grid.shape)
     x_m = grid.roi.origin_m[0] + (ix + 0.5) * grid.voxel_m
     y_m = grid.roi.origin_m[1] + (iy + 0.5) * grid.voxel_m
-    inside: IntArray = voxels[shapely.intersects_xy(shapely.Polygon(polygon_m), x_m, y_m)]
+    inside: IntArray = voxels[shapely.intersects_xy(area, x_m, y_m)]
     return inside
 
 
@@ -401,8 +406,8 @@ def check_placement_config(scenario: Scenario) -> None:
         hint = "Give --count 3, --budget 120000 or --reach 0.95, or one of these keys in [placement]."
         raise InputError(f"{scenario.file}: placement", "the number of sensors is not limited", hint)
     _check_periods(scenario)
-    for name, zone in placement.zones.items():
-        _check_zone_in_roi(scenario, name, zone)
+    for name, area in placement_zones(scenario).items():
+        _check_zone_in_roi(scenario, name, area)
     rules_from_config(scenario, candidate_sites(scenario))
 
 
@@ -429,7 +434,7 @@ def _check_periods(scenario: Scenario) -> None:
         raise InputError(where, problem_text, 'Set placement.objective to "worst", or remove the key.')
 
 
-def _check_zone_in_roi(scenario: Scenario, name: str, zone: ZoneDemand) -> None:
+def _check_zone_in_roi(scenario: Scenario, name: str, area: BaseGeometry) -> None:
     """Raise InputError for a zone outside the region of interest."""
     import shapely
 
@@ -437,10 +442,11 @@ def _check_zone_in_roi(scenario: Scenario, name: str, zone: ZoneDemand) -> None:
     size_x_m, size_y_m, _ = scenario.roi.size_m
     west_m, east_m = center_x_m - size_x_m / 2, center_x_m + size_x_m / 2
     south_m, north_m = center_y_m - size_y_m / 2, center_y_m + size_y_m / 2
-    if shapely.Polygon(zone.polygon_m).intersects(shapely.box(west_m, south_m, east_m, north_m)):
+    if area.intersects(shapely.box(west_m, south_m, east_m, north_m)):
         return
+    key = "polygon_m" if scenario.placement.zones[name].file is None else "file"
     raise InputError(
-        f"{scenario.file}: placement.zones.{name}.polygon_m",
+        f"{scenario.file}: placement.zones.{name}.{key}",
         f"zone {name} is outside the region of interest",
         f"Use corners within x {west_m:g} to {east_m:g} m and y {south_m:g} to {north_m:g} m.",
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
@@ -62,10 +62,26 @@ Corners = Annotated[tuple[Point2, ...], Field(min_length=3), AfterValidator(_che
 """Corners of a polygon in the world frame, in order."""
 
 
-class ZoneConfig(StrictModel):
+class ZoneArea(StrictModel):
+    """A part of the region: its corners, or a file with its area."""
+
+    polygon_m: Corners | None = Field(None, description="Corners in the world frame, in order; or give file")
+    file: str | None = Field(
+        None,
+        description="GeoJSON, GeoPackage, Shapefile, KML, GeoParquet, or CSV with a row per corner. Of a file with "
+        "several areas, the zone takes those of its own name",
+    )
+
+    @model_validator(mode="after")
+    def _check_one_source(self) -> Self:
+        if (self.polygon_m is None) == (self.file is None):
+            raise ValueError("expected either polygon_m or file")
+        return self
+
+
+class ZoneConfig(ZoneArea):
     """A part of the region in which vehicles have another weight."""
 
-    polygon_m: Corners = Field(description="Corners in the world frame, in order")
     weight: float = Field(ge=0, description="Weight of vehicles whose centre is in the zone; it is 1 elsewhere")
 
 
@@ -151,10 +167,9 @@ class CostsConfig(StrictModel):
         return bool(self.sensor or self.pole or self.metre)
 
 
-class ZoneDemand(StrictModel):
+class ZoneDemand(ZoneArea):
     """A part of the region that a plan must cover."""
 
-    polygon_m: Corners = Field(description="Corners in the world frame, in order")
     share: Share = Field(description="Share of the zone's occupancy entropy that must be visible")
     by: int = Field(1, ge=1, description="Number of sensors that must see a voxel for it to count as visible")
 

@@ -35,10 +35,10 @@ centre.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +56,9 @@ from egvs.scoring.standard_errors import BlockGroups, block_groups
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import Sensor
+
+if TYPE_CHECKING:
+    from shapely.geometry.base import BaseGeometry
 
 Floats = FloatArray
 
@@ -552,18 +555,30 @@ def weighted_people(config: WeightsConfig) -> frozenset[str]:
     return NON_VEHICLE_KINDS & set(config.kinds)
 
 
-def target_weights(config: WeightsConfig, record: TargetRecord) -> FloatArray:
-    """Return the weight of each vehicle-frame, (n,) float64, 1 by default. The edge of a zone is part of it."""
+def target_weights(config: WeightsConfig, areas: Mapping[str, BaseGeometry], record: TargetRecord) -> FloatArray:
+    """Return the weight of each vehicle-frame, (n,) float64, 1 by default. The edge of a zone is part of it.
+
+    Parameters
+    ----------
+    config
+        The weights.
+    areas
+        The areas of the zones by name, from :func:`egvs.scoring.zones.weight_zones`.
+    record
+        The vehicles.
+    """
     weight: FloatArray = np.ones(len(record))
     if record.kinds:
         by_kind = np.array([config.kinds.get(kind, 1.0) for kind in record.kinds])  # type: ignore[call-overload]
         weight = by_kind[record.kind]
-    for zone in config.zones.values():
-        weight = np.where(_in_polygon(zone.polygon_m, record), weight * zone.weight, weight)
+    for name, zone in config.zones.items():
+        weight = np.where(_in_area(areas[name], record), weight * zone.weight, weight)
     return weight
 
 
-def warn_unused_weights(config: WeightsConfig, record: TargetRecord) -> Iterator[Diagnostic]:
+def warn_unused_weights(
+    config: WeightsConfig, areas: Mapping[str, BaseGeometry], record: TargetRecord
+) -> Iterator[Diagnostic]:
     """Warn about each weight that applies to no vehicle."""
     hint = "Remove it, or check its name and the traffic."
     sample = f"in the {len(record.numbers)} frames examined"
@@ -571,17 +586,15 @@ def warn_unused_weights(config: WeightsConfig, record: TargetRecord) -> Iterator
         if kind not in record.kinds:
             problem = f"no {kind} has its centre in the region of interest {sample}"
             yield Diagnostic("weights", f"{SCENARIO_FILE}: score.weights.kinds.{kind}", problem, hint)
-    for name, zone in config.zones.items():
-        if not _in_polygon(zone.polygon_m, record).any():
+    for name in config.zones:
+        if not _in_area(areas[name], record).any():
             problem = f"no vehicle has its centre in the zone {sample}"
             yield Diagnostic("weights", f"{SCENARIO_FILE}: score.weights.zones.{name}", problem, hint)
 
 
-def _in_polygon(polygon_m: Any, record: TargetRecord) -> NDArray[np.bool_]:
-    """Return which vehicle-frames have their centre in a polygon or on its edge."""
+def _in_area(area: BaseGeometry, record: TargetRecord) -> NDArray[np.bool_]:
+    """Return which vehicle-frames have their centre in an area or on its edge."""
     import shapely
 
-    inside: NDArray[np.bool_] = shapely.intersects_xy(
-        shapely.Polygon(polygon_m), record.boxes[:, 0], record.boxes[:, 1]
-    )
+    inside: NDArray[np.bool_] = shapely.intersects_xy(area, record.boxes[:, 0], record.boxes[:, 1])
     return inside

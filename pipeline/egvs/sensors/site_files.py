@@ -279,6 +279,15 @@ def _row_to_world(row: SiteRow, lon_lat: _LonLat | None, reading: CoordinateRead
     return {}
 
 
+def row_position_m(row: SiteRow) -> tuple[float, float]:
+    """Return x_m and y_m of a row (world frame, metres); InputError where one is missing or not a number."""
+    for key in ("x_m", "y_m"):
+        if not math.isfinite(_number_or_nan(row.columns.get(key))):
+            problem = f"expected metres, got {row.columns.get(key)!r}"
+            raise InputError(f"{row.where}: {key}", problem, _COLUMNS_HINT)
+    return _number_or_nan(row.columns["x_m"]), _number_or_nan(row.columns["y_m"])
+
+
 def _number_or_nan(value: Any) -> float:
     try:
         return parse_decimal(value) if isinstance(value, str) else float(value)

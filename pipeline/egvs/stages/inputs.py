@@ -22,6 +22,7 @@ from egvs.formats import point_clouds
 from egvs.formats.georeference import Georeference
 from egvs.formats.meshes import referenced_files
 from egvs.scenario.model import Scenario
+from egvs.scoring import zones
 from egvs.sensors import sites
 from egvs.sensors.scene import ActiveEffect, InactiveEffect, Scene
 from egvs.sensors.sensor import Sensor
@@ -202,6 +203,12 @@ def named_files(scenario: Scenario) -> Iterator[tuple[str, str]]:
     ):
         if optional_name is not None:
             yield key, optional_name
+    for name, weighted in scenario.score.weights.zones.items():
+        if weighted.file is not None:
+            yield f"{zones.WEIGHTS_KEY}.{name}.file", weighted.file
+    for name, demand in scenario.placement.zones.items():
+        if demand.file is not None:
+            yield f"{zones.PLACEMENT_KEY}.{name}.file", demand.file
     for period in traffic.periods:
         prefix = f"traffic.periods ({period.name})"
         yield from ((f"{prefix}.routes", name) for name in period.routes)
@@ -347,6 +354,8 @@ def resolve_check_inputs(inputs: Inputs) -> tuple[CheckInputs, list[Diagnostic]]
     world = errors.attempt("statics", lambda: inputs.built_world[0])
     if world is None:
         errors.findings += _static_file_errors(scenario)
+    errors.attempt("zones", lambda: zones.weight_zones(scenario))
+    errors.attempt("zones", lambda: zones.placement_zones(scenario))
     carriageway = None if network is None else inputs.carriageway
     readable = CheckInputs(scenario, network, carriageway, world)
 

@@ -23,7 +23,7 @@ from egvs.effects import registry
 from egvs.effects.base import Effect
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import SCENARIO_FILE, Scenario
-from egvs.scoring import score_table, standard_errors
+from egvs.scoring import score_table, standard_errors, zones
 from egvs.scoring.score_table import ScoreTable
 from egvs.sensors.sites import Site
 from egvs.stages import site_scoring
@@ -47,6 +47,7 @@ def dependencies(context: StageContext) -> StageDependencies:
     if user_columns:
         settings["own_columns"] = {name: column.to_pylist() for name, column in user_columns.items()}
     settings |= geolocation.world_frame_settings(scenario)
+    settings |= zones.file_settings(scenario.score.weights.zones, zones.weight_zones(scenario))
 
     artefacts = [RunFolder.tpog.name]
     if needs_targets(scenario):

@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,10 +46,14 @@ from egvs.scoring.targets import (
     weights_in_mix,
 )
 from egvs.scoring.visibility import Beams, to_voxel_units
+from egvs.scoring.zones import weight_zones
 from egvs.sensors.sites import ScannedSite
 from egvs.stages.base import StageContext
 from egvs.stages.blocked_sites import near_share
 from egvs.stages.site_scans import SiteScan, empty_scans
+
+if TYPE_CHECKING:
+    from shapely.geometry.base import BaseGeometry
 
 _ROI_HINT = "Check that the region of interest contains the road."
 
@@ -113,12 +117,16 @@ class TargetScorer:
         self._scene = context.scene
         self._names: tuple[str, ...] = tuple(name for name in config.additional if name in TARGET_SCORES)
         self._config = config.weights
+        self._zones: dict[str, BaseGeometry] = {}
 
         periods = read_periods(context.folder.tpog)
         recorded = recorded_frames(trajectories)
         self._periods = _rows_of_periods(periods, recorded, self.record)
         mix_weight = weights_in_mix(periods, recorded, self.record)
-        self._configured_weight = target_weights(config.weights, self.record) if config.weights.are_given else None
+        self._configured_weight = None
+        if config.weights.are_given:
+            self._zones = weight_zones(context.scenario)
+            self._configured_weight = target_weights(config.weights, self._zones, self.record)
         self.weight = mix_weight
         if self._configured_weight is not None:
             self.weight = mix_weight * self._configured_weight
@@ -183,7 +191,7 @@ class TargetScorer:
         problem = f"{self._no_vehicles_text}: no value for {' and '.join(self._names)}"
         if self.is_empty:
             yield Diagnostic("no vehicles", f"{SCENARIO_FILE}: roi", problem, _ROI_HINT)
-        yield from warn_unused_weights(self._config, self.record)
+        yield from warn_unused_weights(self._config, self._zones, self.record)
         if self.is_empty:
             return
         for (name, rows), period in zip(self._periods, periods, strict=True):

@@ -90,14 +90,7 @@ def read_footprints(path: Path, world: Georeference) -> FootprintFile:
         When features are no geometries, have no height, or are invalid polygons; all are named.
     """
     file = FootprintFile()
-    if vector_files.is_gis_file(path):
-        document = vector_files.read_gis_file(path, "Polygon")
-    else:
-        document = read_json(path, "Use a GeoJSON FeatureCollection.")
-    if not isinstance(document, dict) or not isinstance(document.get("features"), list):
-        raise InputError(path, "expected a GeoJSON FeatureCollection, got no features list")
-    features = document["features"]
-    reading = world.read_coordinates(geojson_coordinates(features), str(path), declared_crs(document, str(path)))
+    features, reading = _read_features(path, world)
     if reading.convert is not None:
         file.repaired[f"features in {reading.description}, brought into the world frame"] += len(features)
     errors: list[InputError] = []
@@ -111,14 +104,56 @@ def read_footprints(path: Path, world: Georeference) -> FootprintFile:
     return file
 
 
+def read_named_polygons(path: Path, world: Georeference) -> Iterator[tuple[str, Polygon]]:
+    """Yield the name and the polygons (world frame, metres) of each feature of a file; heights are not needed.
+
+    Parameters
+    ----------
+    path
+        GeoJSON, or a format of :mod:`egvs.formats.vector_files`; it declares its coordinate reference system. The
+        property ``name`` names a feature; by default, its number does.
+    world
+        Where the world frame is.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, or a feature encloses no area.
+    """
+    features, reading = _read_features(path, world)
+    for number, feature in enumerate(features):
+        where = f"{path}: feature {number}"
+        properties = _feature_properties(feature, where)
+        name = str(_property(properties, "name", number))
+        for polygon in to_polygons(feature.get("geometry"), properties, f"{where} ({name})", Counter(), reading):
+            yield name, polygon
+
+
+def _read_features(path: Path, world: Georeference) -> tuple[list[Any], CoordinateReading]:
+    """Return the features of a file, and how to convert their coordinates to the world frame."""
+    if vector_files.is_gis_file(path):
+        document = vector_files.read_gis_file(path, "Polygon")
+    else:
+        document = read_json(path, "Use a GeoJSON FeatureCollection.")
+    if not isinstance(document, dict) or not isinstance(document.get("features"), list):
+        raise InputError(path, "expected a GeoJSON FeatureCollection, got no features list")
+    features = document["features"]
+    reading = world.read_coordinates(geojson_coordinates(features), str(path), declared_crs(document, str(path)))
+    return features, reading
+
+
+def _feature_properties(feature: Any, where: str) -> dict[str, Any]:
+    if not isinstance(feature, dict) or not isinstance(feature.get("properties") or {}, dict):
+        raise InputError(where, "expected a GeoJSON feature with geometry and properties")
+    return feature.get("properties") or {}
+
+
 def _feature_footprints(
     feature: Any, number: int, path: Path, repaired: Counter[str], reading: CoordinateReading
 ) -> list[Footprint]:
     """Return the footprints of one feature; repairs are counted in ``repaired``."""
     where = f"{path}: feature {number}"
-    if not isinstance(feature, dict) or not isinstance(feature.get("properties") or {}, dict):
-        raise InputError(where, "expected a GeoJSON feature with geometry and properties")
-    properties = feature.get("properties") or {}
+    properties = _feature_properties(feature, where)
     name = str(_property(properties, "name", f"{path.stem}_{number}"))
     where = f"{where} ({name})"
     misspelling = find_misspelling((key for key in properties if key not in _NOTE_KEYS), _HEIGHT_KEYS)
