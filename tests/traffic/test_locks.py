@@ -267,6 +267,21 @@ def test_locked_region_is_refused_while_sumo_runs(locked, tmp_path):
 
 
 @pytest.mark.slow
+def test_long_red_phase_is_no_lock_and_needs_no_rescue(locked, tmp_path):
+    """A signal that is red for 170 s of 200 s: rescue waits for green, and nobody is moved on."""
+    text = (locked / "net.xml").read_text()
+    head, _, rest = text.partition('<phase duration="60"')
+    state = rest.split('state="')[1].split('"')[0]
+    phases = f'<phase duration="30" state="{"G" * len(state)}"/><phase duration="170"'
+    (tmp_path / "net.xml").write_text(head + phases + rest)
+    keys = {"per_hour": 60, "frames": 1500, "teleport_s": 120}
+    result = run_stage(traffic, locked_scenario(tmp_path, (150.0, 150.0, 2.5), **keys), tmp_path / "out")
+    assert result["teleports"] == 0
+    assert 120 < result["longest_standing_s"] <= 175
+    assert "teleport_s: vehicles are moved on after 185 s, because a signal is red for 170 s" in result["notes"]
+
+
+@pytest.mark.slow
 def test_lock_far_from_region_is_a_warning(locked, tmp_path):
     result = run_stage(traffic, locked_scenario(locked, (30.0, 150.0, 2.5), per_hour=60, frames=400), tmp_path)
     (warning,) = [warning for warning in result["warnings"] if warning["rule"] == "standing"]

@@ -1,8 +1,8 @@
 """Find the junctions of a city that cannot be ranked, so that all others are.
 
-Where the program simulates its own demand, regions are watched while SUMO runs (:class:`egvs.traffic.locks.RegionWatch`),
-and locked ones are in :attr:`egvs.traffic.recording.Recording.locked`. In all other recordings, the traffic in the
-region of interest of a junction is locked if
+Where the program draws the demand itself, regions are watched while SUMO runs
+(:class:`egvs.traffic.locks.RegionWatch`), and :attr:`egvs.traffic.recording.Recording.locked` names the locked ones. In
+all other recordings, the traffic in the region of interest of a junction is locked if
 
 - a vehicle in it stands for :func:`egvs.traffic.locks.standing_limit_s`; or
 - too many of the vehicles near it had to be moved on in it (:func:`egvs.traffic.locks.are_too_many_teleports`).
