@@ -355,6 +355,7 @@ def test_junction_that_locks_is_left_out_while_sumo_runs(city: City) -> None:
         made.left_out["west"],
     )
     assert made.rows["east"] > 0
+    assert made.summary["sumo_peak_mb"] > 10
     assert not city.junction("west").traffic_file(city).exists()
 
 
