@@ -18,7 +18,7 @@ from typing import Any
 
 from egvs.core import platform
 
-_PROC_STATUS, _PROC_CLEAR_REFS = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+_PROC_CLEAR_REFS = Path("/proc/self/clear_refs")
 
 _peak_before_reset_mb = 0.0
 """Highest memory of this process before its peak was last reset."""
@@ -56,16 +56,14 @@ def measure_usage() -> Iterator[ResourceUsage]:
 
 def process_peak_mb() -> float:
     """Return the highest memory of this process since its start, in MB of 2**20 bytes."""
-    now_mb = peak_memory_of(os.getpid())
-    if now_mb is None:
-        now_mb = platform.peak_memory_mb()
+    now_mb = peak_memory_of(os.getpid()) or platform.peak_memory_mb()
     return max(_peak_before_reset_mb, now_mb)
 
 
 def peak_memory_of(process: int) -> float | None:
     """Return the highest memory of a running process so far, in MB of 2**20 bytes; None where it is not known."""
     try:
-        return _read_status_mb(Path(f"/proc/{process}/status"), "VmHWM:")
+        return _status_mb("VmHWM:", process)
     except (OSError, StopIteration):  # no Linux, or the process has just ended
         return None
 
@@ -93,10 +91,7 @@ def _reset_peak() -> bool:
     return True
 
 
-def _status_mb(name: str) -> float:
-    return _read_status_mb(_PROC_STATUS, name)
-
-
-def _read_status_mb(path: Path, name: str) -> float:
-    line = next(line for line in path.read_text(encoding="utf-8").splitlines() if line.startswith(name))
+def _status_mb(name: str, process: int | str = "self") -> float:
+    lines = Path(f"/proc/{process}/status").read_text(encoding="utf-8").splitlines()
+    line = next(line for line in lines if line.startswith(name))
     return int(line.split()[1]) / 1024

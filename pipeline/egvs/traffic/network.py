@@ -336,16 +336,19 @@ def _read_network_file(file: _NamedFile, _content: str) -> Network:
                     if not start.startswith(":"):
                         connections.append(element.attrib)
                         if "tl" in element.attrib:
-                            signals.append(_parse_signal(element.attrib))
+                            position = int(element.get("linkIndex", "-1"))
+                            signals.append(
+                                _Signal(start, int(element.attrib["fromLane"]), element.attrib["tl"], position)
+                            )
                     if start.startswith(":") or end.startswith(":"):
                         lane_links.append((f"{start}_{element.get('fromLane')}", f"{end}_{element.get('toLane')}"))
                 case "junction":
                     junctions.append(_parse_junction(element.attrib, file.name))
                 case "tlLogic":
-                    phases = [_parse_phase(phase.attrib) for phase in element.iter("phase")]
+                    phases = [_Phase.from_attributes(phase.attrib) for phase in element.iter("phase")]
                     cycle_s = max(cycle_s, sum(phase.duration_s for phase in phases))
-                    for index, red_s in _longest_reds(phases).items():
-                        key = element.attrib["id"], index
+                    for position, red_s in _longest_reds(phases).items():
+                        key = element.attrib["id"], position
                         reds_s[key] = max(red_s, reds_s.get(key, 0.0))
                 case "location":
                     location = _parse_location(element)
@@ -366,24 +369,22 @@ class _Phase(NamedTuple):
     duration_s: float
     state: str
 
-
-def _parse_phase(attributes: Mapping[str, str]) -> _Phase:
-    return _Phase(float(attributes.get("maxDur", attributes["duration"])), attributes.get("state", ""))
+    @classmethod
+    def from_attributes(cls, attributes: Mapping[str, str]) -> _Phase:
+        return cls(float(attributes.get("maxDur", attributes["duration"])), attributes.get("state", ""))
 
 
 def _longest_reds(phases: Sequence[_Phase]) -> dict[int, float]:
     """Return how long each connection of a signal program waits for green; those that never have green are left out."""
-    reds_s = {}
-    for index in range(min((len(phase.state) for phase in phases), default=0)):
-        greens = [number for number, phase in enumerate(phases) if phase.state[index] in _MAY_PASS]
-        if not greens:
+    longest_s = {}
+    for position, states in enumerate(zip(*(phase.state for phase in phases), strict=False)):
+        if _MAY_PASS.isdisjoint(states):
             continue
-        longest_s = red_s = 0.0
-        for phase in (*phases[greens[0] :], *phases[: greens[0] + 1]):  # a cycle from green to green
-            red_s = 0.0 if phase.state[index] in _MAY_PASS else red_s + phase.duration_s
-            longest_s = max(longest_s, red_s)
-        reds_s[index] = longest_s
-    return reds_s
+        red_s = longest_s[position] = 0.0
+        for state, phase in zip(states * 2, [*phases, *phases], strict=True):  # two cycles contain every red phase
+            red_s = 0.0 if state in _MAY_PASS else red_s + phase.duration_s
+            longest_s[position] = max(longest_s[position], red_s)
+    return longest_s
 
 
 class _Signal(NamedTuple):
@@ -393,11 +394,6 @@ class _Signal(NamedTuple):
     lane: int
     program: str
     position: int
-
-
-def _parse_signal(connection: Mapping[str, str]) -> _Signal:
-    position = int(connection.get("linkIndex", "-1"))
-    return _Signal(connection["from"], int(connection["fromLane"]), connection["tl"], position)
 
 
 def _stop_lines(
