@@ -21,6 +21,7 @@ from egvs.city import scheduler
 from egvs.city.model import City, load_city
 from egvs.city.tasks import Job
 from egvs.runs import run
+from tests.city.real_cluster import RealCluster
 from tests.conftest import SCENARIO, SITES, collection, write_mini
 
 FRAMES = 60
@@ -113,6 +114,14 @@ def client() -> Iterator[Any]:
         Client(cluster, set_as_default=False) as client,
     ):
         yield client
+
+
+@pytest.fixture
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RealCluster]:
+    """A scheduler without workers."""
+    started = RealCluster(tmp_path_factory.mktemp("cluster"))
+    yield started
+    started.close()
 
 
 @pytest.fixture

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import os
 import re
+import subprocess
+import sys
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -12,6 +16,7 @@ import pytest
 
 import egvs
 from egvs.artefacts import parquet
+from egvs.artefacts.run_folder import STAGE_NAMES
 from egvs.city import city_run, model, results, traffic_split
 from egvs.city.city_run import CityRunOptions, overlap_warnings
 from egvs.city.model import City
@@ -21,9 +26,10 @@ from egvs.core.errors import InputError, RunError
 from egvs.placement.plan import JointScore
 from egvs.runs import run
 from egvs.traffic import recording
+from tests.city.real_cluster import START_TIMEOUT_S, RealCluster, wait_until
 
 pytestmark = pytest.mark.system
-HAS_COSTS = ("report.html", "run.json", ".lock")
+HAS_COSTS = ("report.html", "run.json", "costs.json", ".lock")
 
 
 def read_files(out: Path) -> dict[str, bytes]:
@@ -77,13 +83,32 @@ def test_joins_scores_and_ranks_junctions(city: City, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.usefixtures("in_process_cluster")
 def test_command_prints_junctions_and_files(city: City, tmp_path: Path, run_egvs: Any) -> None:
-    code, printed, _ = run_egvs("city", "run", city.folder, "--out", tmp_path / "out")
+    out = tmp_path / "out"
+    code, printed, _ = run_egvs("city", "run", city.folder, "--out", out)
     assert code == 0
     rows = [line.split() for line in printed.splitlines()]
     assert [row[1] for row in rows if row[0] in ("1", "2")] == ["west", "east"]
-    assert rows[-1] == [str(tmp_path / "out" / "city.html")]
+    assert rows[-2:] == [[str(out / "city.html")], [str(out / "costs.json")]]
     assert not list((tmp_path / "town").glob(".egvs*"))
     assert not list((tmp_path / "out").glob(".egvs*"))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_process_cluster")
+def test_verbose_prints_times_and_memory_of_every_process(city: City, tmp_path: Path, run_egvs: Any) -> None:
+    code, printed, _ = run_egvs("city", "run", city.folder, "--out", tmp_path / "out", "--verbose")
+    assert code == 0
+    costs = json.loads((tmp_path / "out" / "costs.json").read_text())
+    assert [part["part"] for part in costs["parts"]] == [
+        "start of the workers", "traffic", "junctions", "tables", "page",
+    ]  # fmt: skip
+    assert {stage["stage"] for stage in costs["stages"]} == {*STAGE_NAMES}
+    assert all(stage["peak_mb"] > 0 for stage in costs["stages"])
+    names = [process["process"] for process in costs["processes"]]
+    assert names[0] == "egvs"
+    assert sum(name.startswith("worker inproc://") for name in names) == 2
+    assert all(process["peak_mb"] > 50 for process in costs["processes"])
+    assert all(name in printed for name in [*names, "tables", "peak MB"])
 
 
 def test_rejects_overrides_of_traffic(city: City, tmp_path: Path) -> None:
@@ -312,3 +337,46 @@ def test_score_decides_whether_empty_junction_is_left_out(city: City) -> None:
     rules = [warning["rule"] for warning in by_entropy.summary["warnings"]]
     assert "junctions without traffic" in rules
     assert "junctions left out" not in rules
+
+
+@pytest.mark.slow
+def test_killed_scheduler_leaves_a_run_that_continues_with_same_bytes(
+    city: City, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    first = RealCluster(tmp_path_factory.mktemp("first"))
+    out = tmp_path / "out"
+    try:
+        first.start_worker("one")
+        command = start_city_run(city, out, first)
+        wait_until(lambda: any(out.glob("junctions/*/statics.ply")))
+        first.kill_scheduler()
+        _, errors = command.communicate(timeout=START_TIMEOUT_S)
+    finally:
+        first.close()
+    assert command.returncode == 1
+    message = "the connection to the scheduler at tcp://.* was lost. Run the same command again to continue"
+    assert re.search(message, errors)
+    assert "Traceback" not in errors
+    assert not any((out / name).exists() for name in ("city.html", "junctions.parquet", "scores", "costs.json"))
+    assert not [path.name for path in out.rglob("*") if path.name.startswith(".") and path.name != ".lock"]
+
+    second = RealCluster(tmp_path_factory.mktemp("second"))
+    try:
+        second.start_worker("two")
+        command = start_city_run(city, out, second)
+        _, errors = command.communicate(timeout=START_TIMEOUT_S)
+        assert command.returncode == 0, errors
+        undisturbed = start_city_run(city, tmp_path / "undisturbed", second, store=tmp_path / "another store")
+        _, errors = undisturbed.communicate(timeout=START_TIMEOUT_S)
+        assert undisturbed.returncode == 0, errors
+    finally:
+        second.close()
+    assert read_files(out) == read_files(tmp_path / "undisturbed")
+
+
+def start_city_run(city: City, out: Path, cluster: RealCluster, store: Path | None = None) -> subprocess.Popen[str]:
+    """Start ``egvs city run`` on a cluster, with the store of the tests or another one."""
+    words = ["city", "run", city.folder, "--out", out, "--cluster", cluster.client.scheduler.address]
+    environment = dict(os.environ) if store is None else {**os.environ, "EGVS_STORE": str(store)}
+    command = [sys.executable, "-m", "egvs", *map(str, words)]
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

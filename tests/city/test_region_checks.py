@@ -100,6 +100,17 @@ def test_region_with_many_teleports_is_locked(tmp_path: Path, teleports: int, ve
         )
 
 
+def test_watched_regions_are_not_checked_again(tmp_path: Path) -> None:
+    (tmp_path / "net.xml").write_text(NET)
+    moved = [Teleport(f"v{i}", "yield", "a_0", 150.0) for i in range(100)]
+    roads = read_net_xml(tmp_path / "net.xml")
+    watched = recording(roads=roads, teleports=moved, locked={"east": "vehicle 'a' stood at junction W"})
+    checks = RegionChecks(REGIONS, watched)
+    checks.add_frames(frames_until(900), standing(a=(0, 5.0)))
+    checks.check_teleports({"west": 100, "east": 100})
+    assert checks.locked == {"east": "its traffic is locked: vehicle 'a' stood at junction W"}
+
+
 def test_counts_vehicles_whose_centres_are_in_region() -> None:
     checks = RegionChecks(REGIONS, recording())
     for end in (1, 2):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +18,7 @@ from egvs.artefacts import parquet
 from egvs.city import traffic_split
 from egvs.city.model import City, load_city
 from egvs.core.errors import InputError, RunError
-from egvs.traffic import fcd
+from egvs.traffic import fcd, sumo
 from tests.city.conftest import FRAMES
 from tests.stages.conftest import net_xml
 
@@ -306,3 +308,64 @@ def test_rejects_file_with_wrong_metadata(city: City, changed: dict | bytes, mes
     with pytest.raises(InputError) as caught:
         egvs.run(egvs.load(city.junctions[0].scenario_folder(city)), city.folder / "run", jobs=1)
     assert message in str(caught.value) and path.name in str(caught.value)
+
+
+NODES = """<nodes>
+  <node id="a" x="-180" y="0"/><node id="W" x="20" y="0" type="traffic_light"/>
+  <node id="E" x="520" y="0" type="traffic_light"/><node id="b" x="900" y="0"/><node id="s" x="520" y="-300"/>
+</nodes>"""
+EDGES = """<edges>
+  <edge id="in" from="a" to="W"/><edge id="middle" from="W" to="E"/><edge id="out" from="E" to="b"/>
+  <edge id="side" from="s" to="E"/>
+</edges>"""
+SIMULATED = """\
+network = "net.net.xml"
+counts = [
+    { from_edge = "in", to_edge = "middle", per_hour = 200 },
+    { from_edge = "side", to_edge = "out", per_hour = 200 },
+]
+step_s = 0.5
+warmup_s = 60
+frames = 3000"""
+
+
+def simulate_city(city: City, red: tuple[str, ...]) -> City:
+    """Give the city a network of its two junctions, at some of which the signals stay red for good."""
+    folder = city.folder
+    (folder / "n.nod.xml").write_text(NODES)
+    (folder / "e.edg.xml").write_text(EDGES)
+    sumo.run_program("netconvert", ["-n", "n.nod.xml", "-e", "e.edg.xml", "--offset.disable-normalization", "-o",
+                                    "net.net.xml"], folder)  # fmt: skip
+    network = ET.parse(folder / "net.net.xml")
+    for program in network.iter("tlLogic"):
+        for phase in program.iter("phase"):
+            letter = "r" if program.get("id") in red else "G"
+            phase.set("state", letter * len(phase.get("state", "")))
+    network.write(folder / "net.net.xml")
+    edit(folder / "city.toml", SIMULATED, 'fcd = "fcd.csv"\nframes = 60')
+    return load_city(folder)
+
+
+@pytest.mark.slow
+def test_junction_that_locks_is_left_out_while_sumo_runs(city: City) -> None:
+    made = traffic_split.make_city_traffic(simulate_city(city, ("W",)))
+    assert list(made.left_out) == ["west"]
+    assert re.match(
+        r"its traffic is locked: vehicle '.*' stood at junction W, edge in .* from \d+ s to \d+ s",
+        made.left_out["west"],
+    )
+    assert made.rows["east"] > 0
+    assert made.summary["sumo_peak_mb"] > 10
+    assert not city.junction("west").traffic_file(city).exists()
+
+
+@pytest.mark.slow
+def test_sumo_is_stopped_when_all_junctions_are_locked(city: City) -> None:
+    locked = simulate_city(city, ("W", "E"))
+    with pytest.raises(
+        RunError, match=r"traffic\.counts: the traffic in all 2 regions of interest is locked: "
+    ) as caught:
+        traffic_split.make_city_traffic(locked)
+    assert "Lower per_hour of the counts" in str(caught.value)
+    assert not list((city.folder / "traffic").glob("*.parquet"))
+    assert not (city.folder / "traffic" / traffic_split.RECORD_FILE).exists()

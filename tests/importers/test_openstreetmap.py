@@ -486,7 +486,7 @@ def test_traffic_is_a_share_of_what_the_junction_carries(tmp_path: Path, level: 
     text = (tmp_path / "out" / "scenario.toml").read_text(encoding="utf-8")
     assert f"the network {traffic.summary}. Replace them by real counts" in text
     loaded = loading.load(tmp_path / "out")
-    assert (loaded.traffic.junction_blocker_s, loaded.traffic.teleport_s) == (10.0, 180.0)
+    assert (loaded.traffic.junction_blocker_s, loaded.traffic.teleport_s) == (10.0, 120.0)
 
 
 def test_flow_above_capacity_is_reduced_and_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -7,8 +7,8 @@ import pytest
 from egvs.core.errors import RunError
 from egvs.core.grid import Roi
 from egvs.stages import traffic
-from egvs.traffic import locks, network
-from egvs.traffic.locks import DemandKey, RegionWatch, StreetNames
+from egvs.traffic import locks, network, sumo_folder
+from egvs.traffic.locks import DemandKey, RegionWatch, StreetNames, SumoFiles, WatchedRegion
 from egvs.traffic.sumo_folder import Timing
 from tests.stage_runner import run_stage
 from tests.traffic.helpers import SIZES, netgenerate, scenario
@@ -49,9 +49,10 @@ def rows(seconds, *vehicles):
     return HEADER + "".join(lines)
 
 
-def watch(tmp_path, roads, frames=2000):
-    timing = Timing(0, 0, 1000, 250, frames)
-    return RegionWatch(tmp_path / "fcd.csv", tmp_path / "sumo.log", timing, ROI, roads, SIZES, DEMAND)
+def watch(tmp_path, roads, regions=None, teleport_s=None):
+    timing = Timing(0, 0, 1000, 250, 2000)
+    files = SumoFiles(tmp_path / "fcd.csv", tmp_path / "sumo.log")
+    return RegionWatch(files, timing, regions or {"": WatchedRegion(ROI)}, roads, SIZES, DEMAND, teleport_s)
 
 
 def test_reads_teleports_of_recorded_time():
@@ -88,19 +89,19 @@ def test_region_is_locked_when_a_vehicle_stands_with_free_road_ahead(tmp_path, r
         watch(tmp_path, roads).finish()
     assert str(caught.value) == (
         "s.toml: traffic.counts: the traffic in the region of interest is locked: vehicle 'stuck' stood at junction j,"
-        " Main Street (x -10 m, y 0 m) from 0 s to 300 s. Lower per_hour."
+        " Main Street (x -10 m, y 0 m) from 0 s to 180 s. Lower per_hour."
     )
 
 
 @pytest.mark.parametrize(
     ("vehicles", "seconds"),
     [
-        ([("stuck", -10, 0, 90)], 290),
+        ([("stuck", -10, 0, 90)], 180),
         ([("far", -40, 0, 90)], 1000),
-        ([("queued", -10, 0, 90), ("first", -4, 0, 90)], 1),
+        ([("second", 20, 0, 90), ("first", 27, 0, 90)], 360),
         ([("slow", -20, 0, 90, 0.05)], 900),
     ],
-    ids=["briefly", "outside the region", "behind a vehicle", "slowly"],
+    ids=["briefly", "outside the region", "behind a vehicle outside", "slowly"],
 )
 def test_region_is_not_locked(tmp_path, roads, vehicles, seconds):
     (tmp_path / "fcd.csv").write_text(rows(range(seconds), *vehicles))
@@ -110,8 +111,86 @@ def test_region_is_not_locked(tmp_path, roads, vehicles, seconds):
 def test_vehicle_behind_another_is_locked_after_twice_the_time(tmp_path, roads):
     """The first of both is outside the region."""
     (tmp_path / "fcd.csv").write_text(rows(range(700), ("second", 20, 0, 90), ("first", 27, 0, 90)))
-    with pytest.raises(RunError, match=r"'second' stood at .* from 0 s to 600 s"):
+    with pytest.raises(RunError, match=r"'second' stood at .* from 0 s to 360 s"):
         watch(tmp_path, roads).finish()
+
+
+def test_circle_of_vehicles_is_locked(tmp_path, roads):
+    """Each of four vehicles waits for the one ahead; none has free road."""
+    circle = [("e", -2, -3, 90), ("n", 3, -2, 0), ("w", 2, 3, 270), ("s", -3, 2, 180)]
+    (tmp_path / "fcd.csv").write_text(rows(range(181), *circle))
+    with pytest.raises(RunError, match=r"stood at .* from 0 s to 180 s"):
+        watch(tmp_path, roads).finish()
+
+
+@pytest.fixture
+def signal(tmp_path):
+    """The road with a signal that is red for 170 s of 200 s."""
+    path = tmp_path / "signal.net.xml"
+    program = """<tlLogic id="j" type="actuated" programID="0" offset="0">
+    <phase duration="30" minDur="5" maxDur="30" state="G"/><phase duration="5" state="y"/>
+    <phase duration="60" minDur="5" maxDur="165" state="r"/></tlLogic>
+  <connection"""
+    path.write_text(NET.replace("<connection", program).replace('dir="s"', 'dir="s" tl="j" linkIndex="0"'))
+    return network.read_net_xml(path)
+
+
+def test_vehicle_at_red_signal_is_not_locked(tmp_path, signal):
+    """At the stop line, the red phase and a margin come first; 60 s later the vehicle is locked."""
+    assert signal.red_s == 170.0
+    (tmp_path / "fcd.csv").write_text(rows(range(240), ("stuck", -1, 0, 90)))
+    watch(tmp_path, signal).finish()
+    (tmp_path / "fcd.csv").write_text(rows(range(300), ("stuck", -1, 0, 90)))
+    with pytest.raises(RunError, match="from 0 s to 250 s"):
+        watch(tmp_path, signal).finish()
+    (tmp_path / "fcd.csv").write_text(rows(range(300), ("elsewhere", -20, 0, 90)))
+    with pytest.raises(RunError, match="from 0 s to 180 s"):
+        watch(tmp_path, signal).finish()
+
+
+def test_region_is_refused_only_after_sumo_should_have_moved_the_vehicle_on(tmp_path, roads):
+    (tmp_path / "fcd.csv").write_text(rows(range(400), ("stuck", -10, 0, 90)))
+    with pytest.raises(RunError, match="from 0 s to 300 s"):
+        watch(tmp_path, roads, teleport_s=240.0).finish()
+
+
+def test_rescue_waits_for_the_longest_red_phase(roads, signal):
+    assert sumo_folder.rescue_s(120.0, roads) == 120.0
+    assert sumo_folder.rescue_s(120.0, signal) == 185.0
+    assert sumo_folder.rescue_s(200.0, signal) == 200.0
+    assert sumo_folder.rescue_s(None, signal) is None
+
+
+REGIONS = {
+    "west": WatchedRegion(ROI, near=Roi.around((0, 0, 2.5), (100, 100, 5))),
+    "east": WatchedRegion(Roi.around((200, 0, 2.5), (50, 100, 5)), near=Roi.around((200, 0, 2.5), (100, 100, 5))),
+}
+
+
+def test_locked_region_is_listed_and_others_go_on(tmp_path, roads):
+    (tmp_path / "fcd.csv").write_text(rows(range(300), ("stuck", -10, 0, 90), ("goes", 0, 30, 90, 0.5)))
+    watched = watch(tmp_path, roads, REGIONS)
+    watched.finish()
+    assert watched.locked == {
+        "west": "vehicle 'stuck' stood at junction j, Main Street (x -10 m, y 0 m) from 0 s to 180 s"
+    }
+    (tmp_path / "fcd.csv").write_text(rows(range(300), ("stuck", -10, 0, 90), ("too", 200, 0, 90)))
+    with pytest.raises(RunError, match=r"in all 2 regions of interest is locked: west: vehicle 'stuck' .*; east: "):
+        watch(tmp_path, roads, REGIONS).finish()
+
+
+def test_share_that_is_moved_on_is_of_vehicles_near_the_region(tmp_path, roads):
+    lines = [
+        f"Warning: Teleporting vehicle 'v{i}'; waited too long (jam), lane='in_0', time={10 * i}.00."
+        for i in range(1, 12)
+    ]
+    (tmp_path / "sumo.log").write_text("\n".join(lines) + "\n")
+    far = [(f"far{i}", 1000, 3 * i, 90, 5) for i in range(1000)]
+    (tmp_path / "fcd.csv").write_text(rows(range(0, 300, 10), *((f"v{i}", -20, i, 90, 0.5) for i in range(40)), *far))
+    watched = watch(tmp_path, roads, REGIONS)
+    watched.finish()
+    assert list(watched.locked) == ["west"]
+    assert watched.locked["west"].startswith("10 of 40 vehicles had to be moved on by 100 s, 10 of them at junction j")
 
 
 def test_decision_does_not_depend_on_when_files_are_read(tmp_path, roads):
@@ -185,6 +264,21 @@ def test_locked_region_is_refused_while_sumo_runs(locked, tmp_path):
             progress=lambda *what: reported.append(what),
         )
     assert not (tmp_path / "trajectories.parquet").exists()
+
+
+@pytest.mark.slow
+def test_long_red_phase_is_no_lock_and_needs_no_rescue(locked, tmp_path):
+    """A signal that is red for 170 s of 200 s: rescue waits for green, and nobody is moved on."""
+    text = (locked / "net.xml").read_text()
+    head, _, rest = text.partition('<phase duration="60"')
+    state = rest.split('state="')[1].split('"')[0]
+    phases = f'<phase duration="30" state="{"G" * len(state)}"/><phase duration="170"'
+    (tmp_path / "net.xml").write_text(head + phases + rest)
+    keys = {"per_hour": 60, "frames": 1500, "teleport_s": 120}
+    result = run_stage(traffic, locked_scenario(tmp_path, (150.0, 150.0, 2.5), **keys), tmp_path / "out")
+    assert result["teleports"] == 0
+    assert 120 < result["longest_standing_s"] <= 175
+    assert "teleport_s: vehicles are moved on after 185 s, because a signal is red for 170 s" in result["notes"]
 
 
 @pytest.mark.slow

@@ -93,3 +93,23 @@ def test_rejects_ground_with_too_many_points(tmp_path: Path) -> None:
     )
     with pytest.raises(InputError, match=message):
         terrain.triangulate_ground(network.read_net_xml(tmp_path / "n.net.xml"), where="n.net.xml")
+
+
+def test_red_phases_of_signals(tmp_path):
+    """The longest ones, around the end of the cycle and with the longest phases of actuated signals."""
+    path = tmp_path / "n.net.xml"
+    path.write_text("""<net>
+  <edge id="in" from="a" to="j"><lane id="in_0" index="0" shape="0,0 50,0"/><lane id="in_1" index="1" shape="0,3 50,3"/>
+    <lane id="in_2" index="2" shape="0,6 50,6"/></edge>
+  <edge id="out" from="j" to="b"><lane id="out_0" index="0" shape="60,0 90,0"/></edge>
+  <tlLogic id="t" type="actuated" programID="0" offset="0">
+    <phase duration="10" state="rrr"/><phase duration="20" maxDur="50" state="Grr"/>
+    <phase duration="4" state="yrr"/><phase duration="5" state="rsr"/>
+  </tlLogic>
+  <connection from="in" to="out" fromLane="0" toLane="0" dir="s" state="o" tl="t" linkIndex="0"/>
+  <connection from="in" to="out" fromLane="1" toLane="0" dir="s" state="o" tl="t" linkIndex="1"/>
+  <connection from="in" to="out" fromLane="2" toLane="0" dir="s" state="o" tl="t" linkIndex="2"/>
+</net>""")
+    roads = network.read_net_xml(path)
+    assert [(line.at_m, line.red_s) for line in roads.stop_lines] == [((50.0, 0.0), 19.0), ((50.0, 3.0), 64.0)]
+    assert (roads.red_s, roads.cycle_s) == (64.0, 69.0)

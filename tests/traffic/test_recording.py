@@ -67,8 +67,8 @@ def test_recording_over_traci_is_identical(town, recorded, tmp_path):
     result, _, _, out = recorded
     polled = over_traci(scenario(town, network="net.xml", **SMALL), tmp_path, out / "sumo")
     assert (tmp_path / "trajectories.parquet").read_bytes() == (out / "trajectories.parquet").read_bytes()
-    assert {k: v for k, v in polled.items() if k not in ("flags", "sumo_seconds")} == {
-        k: v for k, v in result.items() if k not in ("flags", "sumo_seconds")
+    assert {k: v for k, v in polled.items() if k not in ("flags", "sumo_seconds", "sumo_peak_mb")} == {
+        k: v for k, v in result.items() if k not in ("flags", "sumo_seconds", "sumo_peak_mb")
     }
 
 

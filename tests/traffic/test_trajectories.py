@@ -272,12 +272,16 @@ def test_overlaps_with_blockers_in_region_are_counted():
     assert "overlapping_pairs_in_roi" not in statistics_of(sorted(rows)).to_json(1.0)
 
 
-@pytest.mark.parametrize(("x_m", "vehicles", "jammed"), [(0.0, None, True), (100.0, None, False), (100.0, 1, True)])
-def test_jam_at_the_end_matters_in_region_or_where_a_number_is_maintained(tmp_path, x_m, vehicles, jammed):
+@pytest.mark.parametrize(
+    ("x_m", "vehicles", "locked", "jammed"),
+    [(0.0, None, None, True), (0.0, None, {}, False), (100.0, None, None, False), (100.0, 1, {}, True)],
+    ids=["in the region", "in a watched region", "elsewhere", "where a number is maintained"],
+)
+def test_jam_at_the_end_matters_in_region_or_where_a_number_is_maintained(tmp_path, x_m, vehicles, locked, jammed):
     tally = statistics_of([(f, "stuck", "car", x_m, 0, 0, 0.0) for f in range(300)])
     counts = [{"edge": "e", "per_hour": 10}]
     model = scenario(tmp_path, network="net.xml", counts=counts, vehicles=vehicles, hold="at_most")
-    recorded = recording_with(standing_limit_s=180.0, vehicles=vehicles)
+    recorded = recording_with(standing_limit_s=180.0, vehicles=vehicles, locked=locked)
     if not jammed:
         trajectories.check_recording(model, tally, recorded)
         return

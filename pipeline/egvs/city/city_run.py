@@ -1,7 +1,8 @@
 """``egvs city run`` and ``egvs city place``: run all junctions on a cluster, and plan sensors for the whole city.
 
 Steps of :func:`run_city`: simulate the traffic once (:mod:`egvs.city.traffic_split`); run every junction
-(:mod:`egvs.city.scheduler`); collect the results (:mod:`egvs.city.results`); write the page (:mod:`egvs.city.page`).
+(:mod:`egvs.city.scheduler`); collect the results (:mod:`egvs.city.results`); write the page (:mod:`egvs.city.page`)
+and the costs (:mod:`egvs.city.costs`).
 The folder of each junction is byte for byte what ``egvs run`` of its scenario alone writes.
 
 Steps of :func:`place_city`: run all junctions; compute the best plans of 1, 2, ... sensors for each, on the cluster;
@@ -13,13 +14,14 @@ of installation, and estimate the standard errors of the curve (:mod:`egvs.city.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
 from itertools import combinations, pairwise
 from pathlib import Path
 
 from egvs.city import allocation, city_plan, page, results, scheduler, traffic_split
 from egvs.city.allocation import Allocation, JunctionPlans
+from egvs.city.costs import CityCosts, CostMeter
 from egvs.city.model import City
 from egvs.city.replicates import CityBlocks, common_blocks
 from egvs.city.results import CityPlan, JunctionResult, read_junction_results, write_results
@@ -71,12 +73,13 @@ class CityRunOptions:
 
 @dataclass(frozen=True)
 class CityRun:
-    """The result of a city run: the folder, its junctions, the best first, and the files beside their runs."""
+    """The result of a city run: the folder, its junctions, the best first, the files beside their runs, and costs."""
 
     out: Path
     results: tuple[JunctionResult, ...]
     files: tuple[Path, ...]
     warnings: tuple[Diagnostic, ...] = ()
+    costs: CityCosts = field(default_factory=CityCosts)
 
 
 @dataclass(frozen=True)
@@ -110,38 +113,52 @@ def run_city(city: City, out: str | Path | None = None, options: CityRunOptions 
     options = options or CityRunOptions()
     folder = _run_folder(city, out)
     jobs = make_jobs(city, folder, options)
+    meter = CostMeter()
     with lock_run_folder(folder):
         scheduler.check_cluster(options.cluster)
-        with _connect(city, folder, jobs, options) as cluster:
-            ran = _run_jobs(cluster, city, folder, jobs, options)
-        plan = results.read_plan(folder, [result.junction.id for result in ran.results])
-        page_file = page.write_page(folder, city, ran.results, ran.warnings, plan)
-        return replace(ran, files=(*ran.files, page_file))
+        with _connect(city, folder, jobs, options, meter) as cluster:
+            ran = _run_jobs(cluster, city, folder, jobs, options, meter)
+        with meter.part("page"):
+            plan = results.read_plan(folder, [result.junction.id for result in ran.results])
+            page_file = page.write_page(folder, city, ran.results, ran.warnings, plan)
+        costs = meter.costs()
+        return replace(ran, files=(*ran.files, page_file, costs.write(folder)), costs=costs)
 
 
 @contextmanager
-def _connect(city: City, folder: Path, jobs: Sequence[Job], options: CityRunOptions) -> Iterator[Cluster]:
+def _connect(
+    city: City, folder: Path, jobs: Sequence[Job], options: CityRunOptions, meter: CostMeter
+) -> Iterator[Cluster]:
     """Connect to the cluster, and ask its workers; the folder is locked."""
-    with (
-        scheduler.connect(options.cluster) as client,
-        scheduler.checked_workers(client, [city.folder, folder], len(jobs), options.on_message) as cluster,
-    ):
+    with ExitStack() as stack:
+        with meter.part("start of the workers"):
+            client = stack.enter_context(scheduler.connect(options.cluster))
+            folders = [city.folder, folder]
+            workers = scheduler.checked_workers(client, folders, len(jobs), options.on_message)
+            cluster = stack.enter_context(workers)
         yield cluster
 
 
-def _run_jobs(cluster: Cluster, city: City, folder: Path, jobs: Sequence[Job], options: CityRunOptions) -> CityRun:
+def _run_jobs(
+    cluster: Cluster, city: City, folder: Path, jobs: Sequence[Job], options: CityRunOptions, meter: CostMeter
+) -> CityRun:
     """Run junctions, and write the tables of their results; the folder is locked.
 
     Junctions whose traffic is locked, or that have none, are left out.
     """
-    traffic = traffic_split.make_city_traffic(city, options.progress, options.overrides)
+    with meter.part("traffic"):
+        traffic = traffic_split.make_city_traffic(city, options.progress, options.overrides)
     jobs = [job for job in jobs if job.junction not in traffic.left_out]
     if not jobs:
         problem = "all junctions that were selected are left out: their traffic is locked, or they have none"
         raise InputError("--junction", problem, f"Select others, or use less traffic in {city.file}.")
-    scheduler.run_jobs(cluster.client, jobs, on_done=options.on_done, progress=options.progress, cluster=cluster)
-    junction_results = read_junction_results(folder, [city.junction(job.junction) for job in jobs])
-    written = write_results(folder, city, junction_results)
+    with meter.part("junctions"):
+        scheduler.run_jobs(cluster.client, jobs, on_done=options.on_done, progress=options.progress, cluster=cluster)
+    with meter.part("tables"):
+        junction_results = read_junction_results(folder, [city.junction(job.junction) for job in jobs])
+        written = write_results(folder, city, junction_results)
+    meter.add_runs([job.out for job in jobs])
+    meter.add_processes(cluster, traffic.summary)
     return CityRun(folder, junction_results, written, tuple(collect_warnings([traffic.summary])))
 
 
@@ -211,10 +228,11 @@ def place_city(
     for job in jobs:
         allocation.check_additive_config(job.scenario())
 
+    meter = CostMeter()
     with lock_run_folder(folder):
         scheduler.check_cluster(options.cluster)
-        with _connect(city, folder, jobs, options) as cluster:
-            ran = _run_jobs(cluster, city, folder, jobs, options)
+        with _connect(city, folder, jobs, options, meter) as cluster:
+            ran = _run_jobs(cluster, city, folder, jobs, options, meter)
             ranked = {result.junction.id for result in ran.results}
             jobs = [job for job in jobs if job.junction in ranked]
             with_gain = {result.junction.id for result in ran.results if result.gain > 0}

@@ -1,6 +1,8 @@
 """Find the junctions of a city that cannot be ranked, so that all others are.
 
-The traffic in the region of interest of a junction is locked if
+Where the program draws the demand itself, regions are watched while SUMO runs
+(:class:`egvs.traffic.locks.RegionWatch`), and :attr:`egvs.traffic.recording.Recording.locked` names the locked ones. In
+all other recordings, the traffic in the region of interest of a junction is locked if
 
 - a vehicle in it stands for :func:`egvs.traffic.locks.standing_limit_s`; or
 - too many of the vehicles near it had to be moved on in it (:func:`egvs.traffic.locks.are_too_many_teleports`).
@@ -51,6 +53,10 @@ class RegionChecks:
     locked: dict[str, str] = field(default_factory=dict)
     vehicles: Counter[str] = field(default_factory=Counter)
 
+    def __post_init__(self) -> None:
+        for name, reason in (self.recording.locked or {}).items():
+            self.locked[name] = f"its traffic is locked: {reason}"
+
     def add_frames(self, boxes: VehicleBoxes, statistics: TrafficStatistics) -> None:
         """Check a group of frames.
 
@@ -64,7 +70,8 @@ class RegionChecks:
         counted = boxes if boxes.uncounted is None else boxes.select(~boxes.uncounted)
         for name, region in self.regions.items():
             self.vehicles[name] += int(np.count_nonzero(centres_in_region(counted, region)))
-        self._check_standing(statistics, boxes.first_frame + boxes.frames)
+        if self.recording.locked is None:
+            self._check_standing(statistics, boxes.first_frame + boxes.frames)
 
     def _check_standing(self, statistics: TrafficStatistics, end_frame: int) -> None:
         period_s = self.recording.window.period_ms / 1000.0
@@ -94,7 +101,7 @@ class RegionChecks:
         vehicles
             Number of different vehicles near each junction.
         """
-        if not self.recording.teleports or self.recording.roads is None:
+        if self.recording.locked is not None or not self.recording.teleports or self.recording.roads is None:
             return
         names = StreetNames(self.recording.roads)
         for name, region in self.regions.items():

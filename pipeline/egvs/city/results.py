@@ -5,6 +5,7 @@ OUT/scores/junction_<ID>.parquet        its scores, with a column of the junctio
 OUT/junctions.parquet                   one row per junction, the largest gain first
 OUT/plan.parquet                        one row per sensor of the city's plan
 OUT/curve.parquet                       the best plans for fewer sensors, or lower costs
+OUT/costs.json                          times of the last run, and the peak memory of its processes
 """
 
 from __future__ import annotations

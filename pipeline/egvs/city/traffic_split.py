@@ -59,6 +59,7 @@ from egvs.stages.inputs import open_folder
 from egvs.traffic import recording, sumo_folder, trajectories, vehicle_boxes
 from egvs.traffic.fcd import FrameGroup
 from egvs.traffic.finished_fcd import FcdMetadata
+from egvs.traffic.locks import WatchedRegion
 from egvs.traffic.recording import Recording
 from egvs.traffic.trajectories import TrafficStatistics
 from egvs.traffic.vehicle_boxes import TrafficHook, VehicleSize
@@ -129,6 +130,13 @@ class TrafficRegion:
     high_y_m: float
     scenario: Scenario
 
+    @property
+    def area(self) -> Roi:
+        """The rectangle, up to the height of the region of interest."""
+        box = self.scenario.roi.box
+        size_m = self.high_x_m - self.low_x_m, self.high_y_m - self.low_y_m, box.size_m[2]
+        return Roi((self.low_x_m, self.low_y_m, box.origin_m[2]), size_m)
+
     def to_json(self) -> list[float]:
         """Return the rectangle."""
         return [self.low_x_m, self.low_y_m, self.high_x_m, self.high_y_m]
@@ -171,8 +179,8 @@ def make_city_traffic(
     InputError
         When the city, a junction's scenario, or a file that they name is wrong.
     RunError
-        When SUMO fails, the number of vehicles is not held, the traffic locks at every junction, or another process
-        uses the folder.
+        When SUMO fails, the number of vehicles is not held, the traffic locks at every junction (SUMO is stopped then),
+        or another process uses the folder.
     """
     folder = city.folder / TRAFFIC_FOLDER
     with lock_run_folder(folder):
@@ -488,7 +496,8 @@ def _record_period(
     """Record the traffic of one period and write all files."""
     effects, notes = registry.active_traffic_effects(scenario)
     world = geolocation.scenario_georeference(scenario)
-    with recording.record_traffic(scenario, folder, effects, progress, None, world) as recorded:
+    watched = {name: WatchedRegion(region.scenario.roi.box, region.area) for name, region in regions.items()}
+    with recording.record_traffic(scenario, folder, effects, progress, None, world, watched) as recorded:
         checks = RegionChecks({name: region.scenario.roi.box for name, region in regions.items()}, recorded)
         statistics, rows = split_recording(scenario, recorded, regions, paths, effects, progress, checks)
         recording_summary = recorded.summary()

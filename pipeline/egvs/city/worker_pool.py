@@ -138,6 +138,11 @@ class WorkerPool:
         with self._lock:
             return max(1, sum(worker.threads for worker in self._workers.values() if worker.is_accepted))
 
+    def accepted(self) -> dict[str, str]:
+        """Return the hosts of all accepted workers, by address."""
+        with self._lock:
+            return {address: worker.host for address, worker in self._workers.items() if worker.is_accepted}
+
     @contextmanager
     def watched(self, on_wait: Callable[[], None] = lambda: None) -> Iterator[WorkerPool]:
         """Wait until a worker is accepted; ask workers that join within the block.

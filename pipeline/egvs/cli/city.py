@@ -13,6 +13,7 @@ from egvs.cli import options
 
 if TYPE_CHECKING:
     from egvs.city.city_run import CityPlacement, CityRun, CityRunOptions
+    from egvs.city.costs import CityCosts
     from egvs.city.creation import NewCity
     from egvs.city.plan_comparison import PlanComparison
     from egvs.city.tasks import JobResult
@@ -103,6 +104,12 @@ def run(
     cluster: Cluster = "local",
     junction: Junctions = None,
     set_: CitySet = None,
+    verbose: Annotated[
+        bool,
+        typer.Option(
+            "--verbose", help="Print also the time of each part and stage, and the peak memory of every process."
+        ),
+    ] = False,
 ) -> None:
     """Simulate the city's traffic once, then run the scenarios of all junctions in parallel."""
     from egvs.city import city_run, model
@@ -114,6 +121,8 @@ def run(
         for warning in result.warnings:
             screen.say(f"warning: {warning}")
     print_junctions(result)
+    if verbose:
+        print_costs(result.costs)
 
 
 def place(
@@ -264,6 +273,30 @@ def print_junctions(city_run: CityRun) -> None:
     out.print(make_table(columns, city_run.results, width=out.width))
     for path in city_run.files:
         out.print(str(path))
+
+
+def print_costs(costs: CityCosts) -> None:
+    """Print the time of each part and stage of a city run, and the peak memory of every process."""
+    from egvs.cli.console import WIDE, Column, console, make_table
+
+    parts: list[Column[Any]] = [
+        Column("part", lambda part: part.part, "left"),
+        Column("seconds", lambda part: f"{part.seconds:.2f}"),
+    ]
+    stages: list[Column[Any]] = [
+        Column("stage, at all junctions", lambda stage: stage.stage, "left"),
+        Column("seconds", lambda stage: f"{stage.seconds:.2f}"),
+        Column("peak MB", lambda stage: f"{stage.peak_mb:.0f}"),
+    ]
+    processes: list[Column[Any]] = [
+        Column("process", lambda process: process.process, "left"),
+        Column("host", lambda process: process.host, "left"),
+        Column("peak MB", lambda process: f"{process.peak_mb:.0f}"),
+    ]
+    out = console(WIDE)
+    out.print(make_table(parts, costs.parts))
+    out.print(make_table(stages, costs.stages))
+    out.print(make_table(processes, costs.processes))
 
 
 def print_plan(placed: CityPlacement) -> None:

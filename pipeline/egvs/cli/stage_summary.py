@@ -15,7 +15,17 @@ from egvs.core.errors import WARNINGS_KEY
 from egvs.report.formatting import SCORE_LABELS
 
 _OMITTED_KEYS = frozenset(
-    ("flags", "missed", "overlapping_pairs", "rows", "settled_in_float64", "solids", "sumo_seconds", WARNINGS_KEY)
+    (
+        "flags",
+        "missed",
+        "overlapping_pairs",
+        "rows",
+        "settled_in_float64",
+        "solids",
+        "sumo_seconds",
+        "sumo_peak_mb",
+        WARNINGS_KEY,
+    )
 )
 """Entries of a summary that are printed elsewhere, or that only ``run.json`` holds."""
 

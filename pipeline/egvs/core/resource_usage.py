@@ -18,7 +18,10 @@ from typing import Any
 
 from egvs.core import platform
 
-_PROC_STATUS, _PROC_CLEAR_REFS = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+_PROC_CLEAR_REFS = Path("/proc/self/clear_refs")
+
+_peak_before_reset_mb = 0.0
+"""Highest memory of this process before its peak was last reset."""
 
 
 @dataclass
@@ -51,6 +54,20 @@ def measure_usage() -> Iterator[ResourceUsage]:
         usage.peak_mb = _status_mb("VmHWM:") if resettable else platform.peak_memory_mb()
 
 
+def process_peak_mb() -> float:
+    """Return the highest memory of this process since its start, in MB of 2**20 bytes."""
+    now_mb = peak_memory_of(os.getpid()) or platform.peak_memory_mb()
+    return max(_peak_before_reset_mb, now_mb)
+
+
+def peak_memory_of(process: int) -> float | None:
+    """Return the highest memory of a running process so far, in MB of 2**20 bytes; None where it is not known."""
+    try:
+        return _status_mb("VmHWM:", process)
+    except (OSError, StopIteration):  # no Linux, or the process has just ended
+        return None
+
+
 def release_memory() -> None:
     """Return unused memory to the system, so that the next measured peak is that of its own block."""
     gc.collect(1)  # a full collection would take 50 ms
@@ -65,6 +82,8 @@ def _cpu_seconds() -> float:
 
 
 def _reset_peak() -> bool:
+    global _peak_before_reset_mb
+    _peak_before_reset_mb = process_peak_mb()
     try:
         _PROC_CLEAR_REFS.write_text("5", encoding="utf-8")
     except OSError:
@@ -72,6 +91,7 @@ def _reset_peak() -> bool:
     return True
 
 
-def _status_mb(name: str) -> float:
-    line = next(line for line in _PROC_STATUS.read_text(encoding="utf-8").splitlines() if line.startswith(name))
+def _status_mb(name: str, process: int | str = "self") -> float:
+    lines = Path(f"/proc/{process}/status").read_text(encoding="utf-8").splitlines()
+    line = next(line for line in lines if line.startswith(name))
     return int(line.split()[1]) / 1024

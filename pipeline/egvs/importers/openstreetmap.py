@@ -62,7 +62,7 @@ SURROUNDINGS_MIN_M = 100.0
 SURROUNDINGS_M = 300.0
 """How far from the junction streets are simulated: enough for the queues and platoons that reach it."""
 
-JUNCTION_BLOCKER_S, TELEPORT_S = 10.0, 180.0
+JUNCTION_BLOCKER_S, TELEPORT_S = 10.0, 120.0
 """What ends locks in new scenarios; the second is longer than any red phase and most waits to give way."""
 
 TRAFFIC_LEVELS = {"light": 0.4, "medium": 0.75, "heavy": 1.0}

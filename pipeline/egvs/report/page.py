@@ -137,7 +137,8 @@ def dependencies(work: StageContext) -> StageDependencies:
     for name in ("traffic", "statics"):
         if name in stages:
             summary = dict(stages[name].summary)
-            summary.pop("sumo_seconds", None)  # differs from run to run, and is not shown
+            for key in ("sumo_seconds", "sumo_peak_mb"):  # differ from run to run, and are not shown
+                summary.pop(key, None)
             summaries[name] = summary
     costs = {name: [stage.cost.seconds, stage.cost.peak_mb] for name, stage in stages.items()}
     warnings = [stage.summary.get(WARNINGS_KEY, []) for stage in stages.values()]

@@ -279,7 +279,8 @@ class TrafficConfig(StrictModel):
     teleport_s: Positive | None = Field(
         None,
         description="Time after which a vehicle that stands first on its lane is moved to the next free place on its"
-        " route (SUMO's --time-to-teleport). It is the last resort against locks, and is counted. By default never",
+        " route (SUMO's --time-to-teleport), or longer where a signal is red for longer. It is the last resort against"
+        " locks, and is counted. By default never",
     )
     trips_per_s: Positive = Field(
         2.0, description="Rate of random trips; higher than the network can take, so that `vehicles` is maintained"

@@ -26,6 +26,7 @@ from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.traffic import finished_fcd, recording, sumo, sumo_folder, trajectories
 from egvs.traffic.fcd import FrameWindow
+from egvs.traffic.locks import WatchedRegion
 from egvs.world import geolocation
 
 
@@ -138,8 +139,10 @@ def _record_period(
     effects, notes = registry.active_traffic_effects(scenario)
     folder = context.folder.sumo / period
     georeference = context.inputs.georeference
-    region = scenario.roi.box
-    with recording.record_traffic(scenario, folder, effects, context.progress, traci, georeference, region) as recorded:
+    regions = {"": WatchedRegion(scenario.roi.box)}
+    with recording.record_traffic(
+        scenario, folder, effects, context.progress, traci, georeference, regions
+    ) as recorded:
         tally, reports = trajectories.write_trajectories(
             scenario, recorded, effects, file, context.progress, first_frame
         )
@@ -161,6 +164,10 @@ def merge_summaries(summaries: dict[str, Summary]) -> Summary:
     merged: Summary = {"frames": sum(summary["frames"] for summary in summaries.values()), "periods": summaries}
     merged["flags"] = {name: summary.pop("flags", None) for name, summary in summaries.items()}
     merged["sumo_seconds"] = round(sum(summary.pop("sumo_seconds", None) or 0.0 for summary in summaries.values()), 3)
+    peaks_mb = [summary.pop("sumo_peak_mb", None) for summary in summaries.values()]
+    known_peaks_mb = [peak_mb for peak_mb in peaks_mb if peak_mb is not None]
+    if known_peaks_mb:
+        merged["sumo_peak_mb"] = max(known_peaks_mb)
     counts = []
     warnings = []
     for name, summary in summaries.items():

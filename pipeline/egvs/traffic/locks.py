@@ -1,15 +1,20 @@
 """See locks of the traffic while SUMO runs, and name where and when they happen.
 
-A lock is a group of vehicles that wait for each other. With ``traffic.teleport_s``, SUMO moves a vehicle on that stands
-first on its lane for so long, and reports it in its log: :func:`read_teleports`, :func:`teleport_warning`. This changes
-the record, so the region of interest is refused if it needs this too often.
+A lock is a group of vehicles that wait for each other, or for a gap that never comes. A vehicle is locked if it has
+not moved for :data:`LOCK_S`, and the road ahead of it is free or it is part of a circle of vehicles. At a signal, it
+must also have stood longer than the longest red phase there. A queue behind another vehicle is no lock by itself.
 
-:class:`RegionWatch` reads the log and the FCD file while SUMO writes them. The region is locked if
+With ``traffic.teleport_s``, SUMO moves a vehicle on that stands first on its lane for so long
+(:func:`egvs.traffic.sumo_folder.rescue_s`), and reports it in its log: :func:`read_teleports`,
+:func:`teleport_warning`. This changes the record, so a region that needs it too often is locked as well.
+
+:class:`RegionWatch` reads the log and the FCD file while SUMO writes them. A region is locked if
 
 - more than :data:`MAX_TELEPORT_SHARE` of the vehicles so far had to be moved on in it, at least
   :data:`MIN_TELEPORTS`; or
-- a vehicle in it has not moved for two signal cycles, at least :data:`STANDING_LIMIT_S`, and the road ahead of it is
-  free; or for twice as long, whatever is ahead.
+- a vehicle in it is still locked :data:`PATIENCE_S` after SUMO should have moved it on, or, without ``teleport_s``,
+  after it became locked; or
+- a vehicle in it has stood for twice that time, whatever is ahead.
 
 The decision depends on the content of these files only, not on when they are read: a record that is refused is refused
 at the same time again.
@@ -32,7 +37,7 @@ import shapely
 from egvs.core.errors import Diagnostic, RunError
 from egvs.core.grid import FloatArray, Roi
 from egvs.traffic.network import Network
-from egvs.traffic.sumo_folder import Timing
+from egvs.traffic.sumo_folder import RED_MARGIN_S, Timing
 from egvs.traffic.vehicle_boxes import VehicleSize
 
 XY = tuple[float, float]
@@ -40,8 +45,17 @@ XY = tuple[float, float]
 MAX_TELEPORT_SHARE = 0.05
 MIN_TELEPORTS = 10
 
+LOCK_S = 120.0
+"""A vehicle that stands longer than this, with free road ahead, is locked."""
+
+PATIENCE_S = 60.0
+"""A region is refused so long after a vehicle in it became locked."""
+
 STANDING_LIMIT_S = 300.0
-"""Longer than most waits to give way in dense traffic."""
+"""Of traffic that was recorded elsewhere: longer than most queues stand."""
+
+STOP_LINE_M = 10.0
+"""A vehicle waits at a signal if its front is so near to the end of a lane there."""
 
 SAMPLE_S = 10.0
 MOVED_M = 2.0
@@ -52,6 +66,7 @@ FREE_AHEAD_M, LANE_HALF_WIDTH_M = 10.0, 1.5
 
 _TELEPORT = re.compile(r"Teleporting vehicle '(.*?)'; waited too long \((.*?)\), lane='(.*?)', time=(\d+(?:\.\d+)?)")
 _DEFAULT_LENGTH_M = 5.0
+_MAX_REASONS = 5
 
 
 class Teleport(NamedTuple):
@@ -172,7 +187,7 @@ def teleport_warning(
 
 
 def standing_limit_s(roads: Network | None) -> float:
-    """Return how long a vehicle may stand: two signal cycles, at least :data:`STANDING_LIMIT_S`."""
+    """Return how long a vehicle may stand in recorded traffic: two cycles, at least :data:`STANDING_LIMIT_S`."""
     return max(STANDING_LIMIT_S, 0.0 if roads is None else 2.0 * roads.cycle_s)
 
 
@@ -213,44 +228,66 @@ class _Standing:
     at_m: XY
 
 
+class WatchedRegion(NamedTuple):
+    """A region of interest, and the area whose vehicles count for it; None for all vehicles."""
+
+    box: Roi
+    near: Roi | None = None
+
+
+class SumoFiles(NamedTuple):
+    """Files that SUMO writes: FCD as CSV, and its log."""
+
+    fcd: Path
+    log: Path
+
+
 class RegionWatch:
-    """Watches a region while SUMO writes its files, and raises an error as soon as the region is locked.
+    """Watches regions while SUMO writes its files, and raises an error as soon as all of them are locked.
 
     Parameters
     ----------
-    fcd, log
-        Files that SUMO writes: FCD as CSV, and its log.
+    files
+        Files that SUMO writes.
     timing
         Times of the simulation.
-    roi
-        The region.
+    regions
+        The regions by name; a single region may have the name "".
     roads
-        The network, for names in messages.
+        The network, for signals and for names in messages.
     sizes
         Sizes of the vehicle types.
     demand
         For messages.
+    teleport_s
+        Time after which SUMO moves a vehicle on, see :func:`egvs.traffic.sumo_folder.rescue_s`; None if it does not.
+
+    Attributes
+    ----------
+    locked
+        Why a region is locked, by name; only locked regions.
     """
 
     def __init__(
-        self, fcd: Path, log: Path, timing: Timing, roi: Roi, roads: Network, sizes: Mapping[str, VehicleSize],
-        demand: DemandKey,
+        self, files: SumoFiles, timing: Timing, regions: Mapping[str, WatchedRegion], roads: Network,
+        sizes: Mapping[str, VehicleSize], demand: DemandKey, teleport_s: float | None = None,
     ) -> None:  # fmt: skip
-        self._fcd, self._log = fcd, log
+        self.locked: dict[str, str] = {}
+        self._fcd, self._log = files
         self._first_ms = timing.first_ms
         self._sample_ms = timing.period_ms * max(1, round(SAMPLE_S * 1000 / timing.period_ms))
-        self._roi, self._roads, self._sizes = roi, roads, sizes
-        self._limit_ms = round(1000 * standing_limit_s(roads))
+        self._regions, self._roads, self._sizes = regions, roads, sizes
+        self._lock_s = max(LOCK_S, teleport_s or 0.0)
         self._demand = demand
         self._offset = 0
         self._rest = b""
         self._columns: dict[str, int] = {}
         self._time, self._now_ms = b"", -1
         self._log_bytes = 0
-        self._teleports: list[Teleport] = []
+        self._teleports: dict[str, list[Teleport]] = {}
         self._vehicles: dict[str, _Vehicle] = {}
         self._standing: dict[str, _Standing] = {}
-        self._names: set[str] = set()
+        self._names: dict[str, set[str]] = {name: set() for name in regions}
 
     def update(self) -> None:
         """Read what SUMO wrote since the last call.
@@ -258,7 +295,7 @@ class RegionWatch:
         Raises
         ------
         RunError
-            When the region is locked.
+            When all regions are locked.
         """
         if not self._fcd.is_file():
             return
@@ -297,7 +334,6 @@ class RegionWatch:
         """Check the vehicles of a sample that is complete."""
         if not self._vehicles:
             return
-        self._names.update(self._vehicles)
         standing = {}
         for name, vehicle in self._vehicles.items():
             before = self._standing.get(name)
@@ -305,55 +341,114 @@ class RegionWatch:
                 before = _Standing(self._now_ms, vehicle.at_m)
             standing[name] = before
         self._standing = standing
+        self._count_vehicles()
         self._check_teleports()
-        for name, vehicle in self._vehicles.items():
-            duration_ms = self._now_ms - standing[name].since_ms
-            if duration_ms < self._limit_ms or not is_inside(vehicle.at_m, self._roi):
+        self._check_standing()
+
+    def _count_vehicles(self) -> None:
+        names = list(self._vehicles)
+        positions_m = np.array([vehicle.at_m for vehicle in self._vehicles.values()])
+        for region, watched in self._regions.items():
+            if watched.near is None:
+                self._names[region].update(names)
                 continue
-            if duration_ms >= 2 * self._limit_ms or self._is_free_ahead(name):
-                location = self._street_names.at(vehicle.at_m)
-                raise self._error(
-                    f"vehicle {name!r} stood at {location} (x {vehicle.at_m[0]:.0f} m, y {vehicle.at_m[1]:.0f} m) from"
-                    f" {standing[name].since_ms / 1000:.0f} s to {self._now_ms / 1000:.0f} s"
-                )
+            low_m, size_m = np.array(watched.near.origin_m[:2]), np.array(watched.near.size_m[:2])
+            inside = np.all((positions_m >= low_m) & (positions_m <= low_m + size_m), axis=1)
+            self._names[region].update(names[i] for i in np.flatnonzero(inside))
+
+    def _check_standing(self) -> None:
+        for name, standing in self._standing.items():
+            duration_s = (self._now_ms - standing.since_ms) / 1000.0
+            if duration_s < LOCK_S + PATIENCE_S:
+                continue
+            at_m = self._vehicles[name].at_m
+            regions = [region for region, watched in self._regions.items() if is_inside(at_m, watched.box)]
+            if not regions or not self._is_locked_for_good(name, duration_s):
+                continue
+            problem = (
+                f"vehicle {name!r} stood at {self._street_names.at(at_m)} (x {at_m[0]:.0f} m, y {at_m[1]:.0f} m) from"
+                f" {standing.since_ms / 1000:.0f} s to {self._now_ms / 1000:.0f} s"
+            )
+            for region in regions:
+                self._add_locked(region, problem)
+
+    def _is_locked_for_good(self, name: str, duration_s: float) -> bool:
+        limit_s = max(self._lock_s, self._red_s(self._vehicles[name].at_m)) + PATIENCE_S
+        if duration_s < limit_s:
+            return False
+        return duration_s >= 2 * limit_s or self._waits_for_itself(name)
+
+    def _red_s(self, at_m: XY) -> float:
+        """Return how long a vehicle waits at a position for a signal; 0 where there is none."""
+        reds_s = [line.red_s for line in self._roads.stop_lines if math.dist(line.at_m, at_m) <= STOP_LINE_M]
+        return max(reds_s) + RED_MARGIN_S if reds_s else 0.0
+
+    def _waits_for_itself(self, name: str) -> bool:
+        """Return whether the road ahead of a vehicle is free, or the vehicles ahead are a circle that it is part of."""
+        passed = set()
+        ahead = self._vehicle_ahead(name)
+        while ahead is not None and ahead != name:
+            is_standing = self._now_ms - self._standing[ahead].since_ms >= LOCK_S * 1000
+            if ahead in passed or not is_standing:
+                return False
+            passed.add(ahead)
+            ahead = self._vehicle_ahead(ahead)
+        return ahead == name or not passed
 
     def _check_teleports(self) -> None:
         log_bytes = self._log.stat().st_size if self._log.is_file() else 0
         if log_bytes != self._log_bytes:
             self._log_bytes = log_bytes
             text = self._log.read_text(encoding="utf-8", errors="replace")
-            self._teleports = [t for t in read_teleports(text, self._first_ms / 1000) if self._is_at_region(t)]
-        inside = [teleport for teleport in self._teleports if teleport.time_s * 1000 <= self._now_ms]
-        if not are_too_many_teleports(len(inside), len(self._names)):
-            return
+            self._teleports = self._teleports_by_region(read_teleports(text, self._first_ms / 1000))
         names = self._street_names
-        locations = Counter(names.of_lane(teleport.lane) for teleport in inside)
-        ((location, number),) = locations.most_common(1)
-        first = next(teleport for teleport in inside if names.of_lane(teleport.lane) == location)
-        end_m = names.end_of_lane(first.lane)
-        assert end_m is not None, "teleports at the region are on known lanes"
-        raise self._error(
-            f"{len(inside)} of {len(self._names)} vehicles had to be moved on by {self._now_ms / 1000:.0f} s,"
-            f" {number} of them at {location} (x {end_m[0]:.0f} m, y {end_m[1]:.0f} m), the first at"
-            f" {first.time_s:.0f} s"
-        )
+        for region, teleports in self._teleports.items():
+            inside = [teleport for teleport in teleports if teleport.time_s * 1000 <= self._now_ms]
+            if not are_too_many_teleports(len(inside), len(self._names[region])):
+                continue
+            locations = Counter(names.of_lane(teleport.lane) for teleport in inside)
+            ((location, number),) = locations.most_common(1)
+            first = next(teleport for teleport in inside if names.of_lane(teleport.lane) == location)
+            end_m = names.end_of_lane(first.lane)
+            assert end_m is not None, "teleports at a region are on known lanes"
+            problem = (
+                f"{len(inside)} of {len(self._names[region])} vehicles had to be moved on by"
+                f" {self._now_ms / 1000:.0f} s, {number} of them at {location} (x {end_m[0]:.0f} m, y {end_m[1]:.0f}"
+                f" m), the first at {first.time_s:.0f} s"
+            )
+            self._add_locked(region, problem)
 
-    def _error(self, problem: str) -> RunError:
+    def _teleports_by_region(self, teleports: Sequence[Teleport]) -> dict[str, list[Teleport]]:
+        by_region: dict[str, list[Teleport]] = {}
+        for teleport in teleports:
+            end_m = self._street_names.end_of_lane(teleport.lane)
+            for region, watched in self._regions.items():
+                if end_m is not None and is_inside(end_m, watched.box):
+                    by_region.setdefault(region, []).append(teleport)
+        return by_region
+
+    def _add_locked(self, region: str, problem: str) -> None:
+        """Add a locked region; raise a RunError if no other region is left."""
+        self.locked.setdefault(region, problem)
+        if len(self.locked) < len(self._regions):
+            return
         where, hint = self._demand
-        return RunError(f"{where}: the traffic in the region of interest is locked: {problem}. {hint}")
+        if len(self._regions) == 1:
+            raise RunError(f"{where}: the traffic in the region of interest is locked: {problem}. {hint}")
+        problems = "; ".join(f"{name}: {reason}" for name, reason in list(self.locked.items())[:_MAX_REASONS])
+        raise RunError(
+            f"{where}: the traffic in all {len(self._regions)} regions of interest is locked: {problems}. {hint}"
+        )
 
     @cached_property
     def _street_names(self) -> StreetNames:
         return StreetNames(self._roads)
 
-    def _is_at_region(self, teleport: Teleport) -> bool:
-        end_m = self._street_names.end_of_lane(teleport.lane)
-        return end_m is not None and is_inside(end_m, self._roi)
-
-    def _is_free_ahead(self, name: str) -> bool:
-        """Return whether no other vehicle is just ahead of a vehicle."""
+    def _vehicle_ahead(self, name: str) -> str | None:
+        """Return a vehicle just ahead of a vehicle; None if the road there is free."""
         mine = self._vehicles[name]
         ahead = math.radians(mine.angle_deg)
+        nearest_m, nearest = math.inf, None
         for other_name, other in self._vehicles.items():
             if other_name == name or math.dist(mine.at_m, other.at_m) > 50.0:
                 continue
@@ -365,6 +460,6 @@ class RegionWatch:
                 dy = other.at_m[1] - back_m * math.cos(heading) - mine.at_m[1]
                 along_m = dx * math.sin(ahead) + dy * math.cos(ahead)
                 across_m = dx * math.cos(ahead) - dy * math.sin(ahead)
-                if 0.0 < along_m <= FREE_AHEAD_M and abs(across_m) <= LANE_HALF_WIDTH_M:
-                    return False
-        return True
+                if 0.0 < along_m <= min(FREE_AHEAD_M, nearest_m) and abs(across_m) <= LANE_HALF_WIDTH_M:
+                    nearest_m, nearest = along_m, other_name
+        return nearest

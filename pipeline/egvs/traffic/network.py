@@ -16,6 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -32,6 +33,9 @@ LANE_WIDTH_M, DEFAULT_SPEED_M_S = 3.2, 13.89
 _TURNAROUNDS = ("t", "T")
 _SHAPE_WITH_HEIGHT = re.compile(rb"(?:^|\s)[^,\s]+,[^,\s]+,[^,\s]+(?:\s|$)")
 """A point with a third coordinate, which SUMO omits where it is 0."""
+
+_MAY_PASS = frozenset("GgsoO")
+"""States of a signal in which a vehicle may drive on, at once or after giving way."""
 
 _PEDESTRIAN = "pedestrian"
 _OSM_SUFFIXES = (".osm", ".osm.xml", ".osm.pbf")
@@ -170,6 +174,14 @@ class Junction(Shape):
 
 
 @dataclass(frozen=True)
+class StopLine:
+    """The end of a lane at a signal, and the longest time that one of its connections waits for green."""
+
+    at_m: tuple[float, float]
+    red_s: float
+
+
+@dataclass(frozen=True)
 class Location:
     """Georeference of a network: (x, y) = projection(lon, lat) + ``offset_m``."""
 
@@ -215,6 +227,8 @@ class Network:
         Georeference, if the network has one.
     lane_links
         Pairs of lanes that walking areas and crossings connect, in both directions.
+    stop_lines
+        The ends of lanes at signals that become green.
     """
 
     all_edges: tuple[Edge, ...]
@@ -223,6 +237,12 @@ class Network:
     cycle_s: float = 0.0
     location: Location | None = None
     lane_links: tuple[tuple[str, str], ...] = ()
+    stop_lines: tuple[StopLine, ...] = ()
+
+    @property
+    def red_s(self) -> float:
+        """Longest time that a vehicle waits for green at a signal; 0 without signals."""
+        return max((stop_line.red_s for stop_line in self.stop_lines), default=0.0)
 
     @cached_property
     def edges(self) -> tuple[Edge, ...]:
@@ -302,6 +322,8 @@ def _read_network_file(file: _NamedFile, _content: str) -> Network:
     lane_links: list[tuple[str, str]] = []
     junctions: list[Junction] = []
     cycle_s = 0.0
+    signals: list[_Signal] = []
+    reds_s: dict[tuple[str, int], float] = {}
     location = None
     for element in xml.iter_elements(file.path, "net", file.name):
         try:
@@ -313,13 +335,21 @@ def _read_network_file(file: _NamedFile, _content: str) -> Network:
                     end = element.get("to", "")
                     if not start.startswith(":"):
                         connections.append(element.attrib)
+                        if "tl" in element.attrib:
+                            position = int(element.get("linkIndex", "-1"))
+                            signals.append(
+                                _Signal(start, int(element.attrib["fromLane"]), element.attrib["tl"], position)
+                            )
                     if start.startswith(":") or end.startswith(":"):
                         lane_links.append((f"{start}_{element.get('fromLane')}", f"{end}_{element.get('toLane')}"))
                 case "junction":
                     junctions.append(_parse_junction(element.attrib, file.name))
                 case "tlLogic":
-                    durations_s = [float(p.get("maxDur", p.attrib["duration"])) for p in element.iter("phase")]
-                    cycle_s = max(cycle_s, sum(durations_s))
+                    phases = [_Phase.from_attributes(phase.attrib) for phase in element.iter("phase")]
+                    cycle_s = max(cycle_s, sum(phase.duration_s for phase in phases))
+                    for position, red_s in _longest_reds(phases).items():
+                        key = element.attrib["id"], position
+                        reds_s[key] = max(red_s, reds_s.get(key, 0.0))
                 case "location":
                     location = _parse_location(element)
         except (KeyError, ValueError, IndexError) as error:
@@ -329,7 +359,56 @@ def _read_network_file(file: _NamedFile, _content: str) -> Network:
     if not roads:
         raise InputError(file.name, "the network has no roads", "Use a network with at least one edge.")
     road_connections = tuple(_parse_connections(connections, roads, file.name))
-    return Network(tuple(edges), road_connections, tuple(junctions), cycle_s, location, tuple(lane_links))
+    stop_lines = tuple(_stop_lines(signals, roads, reds_s))
+    return Network(tuple(edges), road_connections, tuple(junctions), cycle_s, location, tuple(lane_links), stop_lines)
+
+
+class _Phase(NamedTuple):
+    """A phase of a signal program: its longest duration, and one letter for each connection."""
+
+    duration_s: float
+    state: str
+
+    @classmethod
+    def from_attributes(cls, attributes: Mapping[str, str]) -> _Phase:
+        return cls(float(attributes.get("maxDur", attributes["duration"])), attributes.get("state", ""))
+
+
+def _longest_reds(phases: Sequence[_Phase]) -> dict[int, float]:
+    """Return how long each connection of a signal program waits for green; those that never have green are left out."""
+    longest_s = {}
+    for position, states in enumerate(zip(*(phase.state for phase in phases), strict=False)):
+        if _MAY_PASS.isdisjoint(states):
+            continue
+        red_s = longest_s[position] = 0.0
+        for state, phase in zip(states * 2, [*phases, *phases], strict=True):  # two cycles contain every red phase
+            red_s = 0.0 if state in _MAY_PASS else red_s + phase.duration_s
+            longest_s[position] = max(longest_s[position], red_s)
+    return longest_s
+
+
+class _Signal(NamedTuple):
+    """The signal of a connection: the edge and the lane before it, its program, and its position in the states."""
+
+    edge: str
+    lane: int
+    program: str
+    position: int
+
+
+def _stop_lines(
+    signals: Sequence[_Signal], roads: Sequence[Edge], reds_s: Mapping[tuple[str, int], float]
+) -> Iterator[StopLine]:
+    """Yield the ends of the lanes at signals that become green."""
+    by_id = {edge.id: edge for edge in roads}
+    by_lane: dict[tuple[str, int], float] = {}
+    for signal in signals:
+        red_s = reds_s.get((signal.program, signal.position))
+        if red_s is not None and signal.edge in by_id:
+            lane = signal.edge, signal.lane
+            by_lane[lane] = max(red_s, by_lane.get(lane, 0.0))
+    for (edge, index), red_s in by_lane.items():
+        yield StopLine(_point(by_id[edge].lanes[index].text.split()[-1]), red_s)
 
 
 def read_location(path: Path, root: str = "net") -> Location | None:

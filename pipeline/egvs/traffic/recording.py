@@ -20,15 +20,15 @@ import numpy as np
 import pyarrow as pa
 
 from egvs.core.errors import Diagnostic, InputError, RunError
-from egvs.core.grid import Roi
 from egvs.core.progress import ProgressCallback
+from egvs.core.resource_usage import peak_memory_of
 from egvs.formats import xml
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import TrafficConfig
 from egvs.traffic import fcd, finished_fcd, locks, network, sumo, sumo_folder
 from egvs.traffic.count_fit import CountFit, count_fits, missed_count_warnings
-from egvs.traffic.locks import DemandKey, RegionWatch, describe_distance
+from egvs.traffic.locks import DemandKey, RegionWatch, SumoFiles, WatchedRegion, describe_distance
 from egvs.traffic.sumo_folder import SimulationFolder, Timing
 from egvs.traffic.vehicle_boxes import TrafficHook, VehicleSize
 
@@ -45,13 +45,17 @@ _XML_ROOTS = {
 
 @dataclass(frozen=True)
 class RecordingSummary:
-    """What SUMO did; ``flags`` and ``sumo_seconds`` are None if it was already running."""
+    """What SUMO did.
+
+    ``flags`` and ``sumo_seconds`` are None if it was already running, ``sumo_peak_mb`` where it is not known.
+    """
 
     sumo: str
     sumo_seconds: float | None
     flags: list[str] | None
     collisions: int
     teleports: int = 0
+    sumo_peak_mb: float | None = None
     notes: list[str] = field(default_factory=list)
     counts: list[CountFit] = field(default_factory=list)
     warnings: list[Diagnostic] = field(default_factory=list)
@@ -87,6 +91,8 @@ class Recording:
         The simulated network, for messages; None if it is not known.
     teleports
         Vehicles that SUMO moved on.
+    locked
+        Why a watched region is locked, by name; only locked regions. None where no region was watched.
     types
         The vehicle types of a finished file with their sizes.
     """
@@ -103,6 +109,7 @@ class Recording:
     source: str = ""
     roads: network.Network | None = None
     teleports: Sequence[locks.Teleport] = ()
+    locked: Mapping[str, str] | None = None
     types: Mapping[str, finished_fcd.SizedType] = field(default_factory=dict)
 
 
@@ -113,7 +120,7 @@ def record_traffic(
     progress: ProgressCallback,
     traci: tuple[str, int] | None,
     world: Georeference,
-    region: Roi | None = None,
+    regions: Mapping[str, WatchedRegion] | None = None,
 ) -> AbstractContextManager[Recording]:
     """Record the traffic of a scenario.
 
@@ -131,8 +138,9 @@ def record_traffic(
         Host and port of a running SUMO.
     world
         Converts a finished file in degrees to the world frame.
-    region
-        SUMO is stopped, with an error, as soon as the traffic in this region is locked; None for no such region.
+    regions
+        SUMO is stopped, with an error, as soon as the traffic in all these regions is locked. They are watched if the
+        demand is generated: vehicles of a user's demand may stop on purpose.
 
     Returns
     -------
@@ -155,7 +163,7 @@ def record_traffic(
         return _record_finished(scenario, folder, world)
     if traci is not None:
         return _record_running(scenario, *traci, extensions)
-    return _record_simulated(scenario, folder, progress, extensions, region)
+    return _record_simulated(scenario, folder, progress, extensions, regions or {})
 
 
 @contextmanager
@@ -181,7 +189,7 @@ def _record_simulated(
     folder: Path,
     progress: ProgressCallback,
     extensions: Sequence[TrafficHook],
-    region: Roi | None,
+    regions: Mapping[str, WatchedRegion],
 ) -> Iterator[Recording]:
     where = sumo_folder.traffic_location(scenario)
     prepared = sumo_folder.prepare_simulation(scenario, folder, extensions)
@@ -193,9 +201,12 @@ def _record_simulated(
         for extension in extensions:
             sizes |= extension.sizes()
         watch = None
-        if region is not None and prepared.is_generated:  # vehicles of a user's demand may stop on purpose
-            watch = _region_watch(scenario, prepared, region, sizes)
-        duration_s = round(simulate(prepared, progress, watch), 3)
+        if regions and prepared.is_generated:
+            files = SumoFiles(folder / sumo_folder.FCD_FILE, folder / sumo_folder.LOG_FILE)
+            watch = RegionWatch(
+                files, prepared.timing, regions, prepared.roads, sizes, demand_key(scenario), prepared.teleport_s
+            )
+        cost = simulate(prepared, progress, watch)
     except sumo.SumoInputError as error:
         hint = "Correct these files; SUMO read copies of them."
         raise InputError(where, f"SUMO cannot run {sources}: {error}", hint) from None
@@ -210,8 +221,9 @@ def _record_simulated(
         ]
         flags = sumo_folder.as_flags(prepared.options | prepared.outputs)
         summary = RecordingSummary(
-            sumo.sumo_version(), duration_s, flags, len(collisions), len(teleports), prepared.notes, fits, warnings
-        )
+            sumo.sumo_version(), cost.seconds, flags, len(collisions), len(teleports), cost.peak_mb, prepared.notes,
+            fits, warnings,
+        )  # fmt: skip
         persons = _read_rows(folder / sumo_folder.PERSONS_FILE, "person") if prepared.has_extra_traffic else None
         yield Recording(
             _read_rows(folder / sumo_folder.FCD_FILE, "vehicle"),
@@ -226,6 +238,7 @@ def _record_simulated(
             f"{where} ({sources})",
             prepared.roads,
             teleports,
+            None if watch is None else watch.locked,
         )
     finally:
         for name in (*_TABLES, sumo_folder.DRIVEN_ROUTES_FILE, sumo_folder.STATISTICS_FILE):
@@ -406,13 +419,6 @@ def standing_limit_s(cycle_s: float) -> float:
     return max(_MIN_STANDING_LIMIT_S, 2.0 * cycle_s)
 
 
-def _region_watch(
-    scenario: Scenario, prepared: SimulationFolder, region: Roi, sizes: Mapping[str, VehicleSize]
-) -> RegionWatch:
-    fcd_file, log = (prepared.folder / name for name in (sumo_folder.FCD_FILE, sumo_folder.LOG_FILE))
-    return RegionWatch(fcd_file, log, prepared.timing, region, prepared.roads, sizes, demand_key(scenario))
-
-
 def demand_key(scenario: Scenario) -> DemandKey:
     """Return the key that sets how much traffic there is, with its period, and how to reduce the traffic."""
     traffic = scenario.traffic
@@ -440,7 +446,16 @@ def _demand_key(scenario: Scenario, key: str, hint: str) -> DemandKey:
     return DemandKey(where, hint)
 
 
-def simulate(prepared: SimulationFolder, progress: ProgressCallback, region_watch: RegionWatch | None = None) -> float:
+class SimulationCost(NamedTuple):
+    """Duration of a simulation, and the peak memory of SUMO (MB of 2**20 bytes; None where it is not known)."""
+
+    seconds: float
+    peak_mb: float | None
+
+
+def simulate(
+    prepared: SimulationFolder, progress: ProgressCallback, region_watch: RegionWatch | None = None
+) -> SimulationCost:
     """Run SUMO.
 
     Parameters
@@ -450,21 +465,20 @@ def simulate(prepared: SimulationFolder, progress: ProgressCallback, region_watc
     progress
         Reports simulated frames.
     region_watch
-        Stops SUMO as soon as a region is locked.
-
-    Returns
-    -------
-    float
-        The duration in seconds.
+        Stops SUMO as soon as all its regions are locked.
 
     Raises
     ------
     RunError
-        When the region is locked, or an output is not complete.
+        When all regions are locked, or an output is not complete.
     """
     timing = prepared.timing
+    peaks_mb: list[float] = []
 
-    def watch() -> None:
+    def watch(process: int) -> None:
+        peak_mb = peak_memory_of(process)
+        if peak_mb is not None:
+            peaks_mb.append(peak_mb)
         now_ms = _last_time_ms(prepared.folder / sumo_folder.FCD_FILE)
         if now_ms is not None:
             frames = (now_ms - timing.first_ms) // timing.period_ms
@@ -478,7 +492,8 @@ def simulate(prepared: SimulationFolder, progress: ProgressCallback, region_watc
     check_complete(prepared)
     if region_watch is not None:
         region_watch.finish()
-    return perf_counter() - start
+    peak_mb = round(max(peaks_mb), 1) if peaks_mb else None
+    return SimulationCost(round(perf_counter() - start, 3), peak_mb)
 
 
 def check_complete(prepared: SimulationFolder) -> None:
@@ -563,7 +578,7 @@ def _read_teleports(prepared: SimulationFolder, scenario: Scenario) -> list[lock
 def _teleport_warning(
     teleports: Sequence[locks.Teleport], prepared: SimulationFolder, scenario: Scenario
 ) -> list[Diagnostic]:
-    limit_s = scenario.traffic.teleport_s
+    limit_s = prepared.teleport_s
     if not teleports or limit_s is None:
         return []
     counts = _vehicle_counts(prepared)

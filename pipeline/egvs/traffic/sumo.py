@@ -126,7 +126,11 @@ def traci_constants() -> Any:
 
 
 def run_program(
-    name: str, arguments: Sequence[str], folder: Path, log: Path | None = None, watch: Callable[[], None] | None = None
+    name: str,
+    arguments: Sequence[str],
+    folder: Path,
+    log: Path | None = None,
+    watch: Callable[[int], None] | None = None,
 ) -> str:
     """Run a program of SUMO to its end. It may write to its folder only.
 
@@ -139,7 +143,7 @@ def run_program(
     log
         File for its warnings and errors.
     watch
-        Called every 0.1 s while it runs.
+        Called with the number of its process every 0.1 s while it runs.
 
     Returns
     -------
@@ -190,7 +194,9 @@ def run_tool(name: str, arguments: Sequence[str], folder: Path) -> str:
     return _run_command(name, [sys.executable, "-B", str(tool), *arguments], folder, Path(os.devnull), None)
 
 
-def _run_command(name: str, command: Sequence[str], folder: Path, log: Path, watch: Callable[[], None] | None) -> str:
+def _run_command(
+    name: str, command: Sequence[str], folder: Path, log: Path, watch: Callable[[int], None] | None
+) -> str:
     with log.open("wb") as log_file:
         has_log = str(log) != os.devnull
         stderr = log_file if has_log else subprocess.PIPE
@@ -225,7 +231,7 @@ def _start_program(command: Sequence[str], folder: Path, stdout: Any, stderr: An
                 process.kill()
 
 
-def _wait(process: subprocess.Popen[bytes], watch: Callable[[], None] | None) -> tuple[bytes, bytes]:
+def _wait(process: subprocess.Popen[bytes], watch: Callable[[int], None] | None) -> tuple[bytes, bytes]:
     """Return standard output and standard error of a process, at its end."""
     if watch is None:
         return process.communicate()
@@ -233,7 +239,7 @@ def _wait(process: subprocess.Popen[bytes], watch: Callable[[], None] | None) ->
         try:
             return process.communicate(timeout=_WATCH_PERIOD_S)
         except subprocess.TimeoutExpired:
-            watch()
+            watch(process.pid)
 
 
 def program_error(name: str, code: int, text: str) -> RunError:

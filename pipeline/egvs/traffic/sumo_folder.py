@@ -54,6 +54,9 @@ FCD_DIGITS = 8
 _DRAWN_DEPART_DELAY_S = 120.0
 """More trips are drawn than fit; those that wait longer are dropped."""
 
+RED_MARGIN_S = 15.0
+"""After the longest red phase, the first vehicle at a stop line has this time to start."""
+
 _FCD_ATTRIBUTES = "id,x,y,angle,type,speed"
 
 
@@ -179,6 +182,23 @@ def copy_network(scenario: Scenario, folder: Path) -> None:
         user_files.copy_checked(path, folder / NETWORK_FILE)
 
 
+def rescue_s(teleport_s: float | None, roads: network.Network) -> float | None:
+    """Return after which time SUMO moves a standing vehicle on; None for never.
+
+    This is ``traffic.teleport_s``, or longer if a signal is red for longer: SUMO moves vehicles at red signals as well.
+
+    Parameters
+    ----------
+    teleport_s
+        As in ``[traffic]``.
+    roads
+        The network.
+    """
+    if teleport_s is None or not roads.stop_lines:
+        return teleport_s
+    return max(teleport_s, roads.red_s + RED_MARGIN_S)
+
+
 def may_have_slopes(scenario: Scenario) -> bool:
     """Whether the network of a scenario may have slopes, without parsing it."""
     path = network_path(scenario)
@@ -226,6 +246,12 @@ class SimulationFolder:
     has_fixed_count: bool
     has_extra_traffic: bool
     notes: list[str]
+
+    @property
+    def teleport_s(self) -> float | None:
+        """Time after which SUMO moves a standing vehicle on; None for never."""
+        limit_s = float(self.options["time-to-teleport"])
+        return limit_s if limit_s > 0 else None
 
     @property
     def outputs(self) -> dict[str, str]:
@@ -315,7 +341,12 @@ def prepare_simulation(scenario: Scenario, folder: Path, extensions: Iterable[Tr
         notes += extra.notes
 
     seed_number = int(sumo_seed.generate_state(1)[0]) & 0x7FFFFFFF
-    options = inputs.options | copies | _scenario_options(traffic, timing, seed_number)
+    teleport_s = rescue_s(traffic.teleport_s, roads)
+    if teleport_s != traffic.teleport_s:
+        notes.append(
+            f"teleport_s: vehicles are moved on after {teleport_s:g} s, because a signal is red for {roads.red_s:g} s"
+        )
+    options = inputs.options | copies | _scenario_options(traffic, timing, seed_number, teleport_s)
     if vehicles is not None:
         options["max-num-vehicles"] = str(vehicles + extra_vehicles)
     if depart_delay_s:
@@ -352,7 +383,7 @@ def _make_empty(folder: Path, inputs: Iterable[Path]) -> None:
     folder.mkdir(parents=True)
 
 
-def _scenario_options(traffic: TrafficConfig, timing: Timing, seed: int) -> dict[str, str]:
+def _scenario_options(traffic: TrafficConfig, timing: Timing, seed: int, teleport_s: float | None) -> dict[str, str]:
     """Return the options that the scenario sets, whatever a user's configuration says."""
     options = {
         "seed": str(seed),
@@ -361,7 +392,7 @@ def _scenario_options(traffic: TrafficConfig, timing: Timing, seed: int) -> dict
         "step-length": _format_seconds(timing.step_ms),
         "threads": "1",
         "lateral-resolution": f"{traffic.lateral_resolution_m:g}",
-        "time-to-teleport": "-1" if traffic.teleport_s is None else f"{traffic.teleport_s:g}",
+        "time-to-teleport": "-1" if teleport_s is None else f"{teleport_s:g}",
         "collision.action": "warn",
         "collision.check-junctions": "true",
         "no-step-log": "true",

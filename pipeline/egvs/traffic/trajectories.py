@@ -520,13 +520,15 @@ def _check_moving(scenario: Scenario, statistics: TrafficStatistics, recording: 
     """Raise a RunError if vehicles stand for good.
 
     Where the number of vehicles is maintained, a jam anywhere collects the vehicles of all streets. Otherwise a jam
-    matters in the region of interest only.
+    matters in the region of interest only, if that was not watched while SUMO ran.
     """
+    is_watched = recording.locked is not None
     period_s = recording.window.period_ms / 1000.0
     jammed_s = {}
     for name, frame in statistics.standing_since.items():
         duration_s = (statistics.frames - 1 - frame) * period_s
-        matters = recording.vehicles is not None or is_inside(statistics.standing_at_m[name], scenario.roi.box)
+        is_in_region = not is_watched and is_inside(statistics.standing_at_m[name], scenario.roi.box)
+        matters = recording.vehicles is not None or is_in_region
         if matters and name not in recording.stopped_on_purpose and duration_s > limit_s:
             jammed_s[name] = duration_s
     if jammed_s:
