@@ -63,6 +63,19 @@ def test_lead_says_whether_the_best_is_certain() -> None:
     assert report_ranking.lead(alone).endswith("There is too little traffic to tell which of them is better.")
 
 
+def test_lead_names_the_best_site_on_another_pole_if_the_next_site_is_on_the_same_one() -> None:
+    sites = by_vehicles(("a", 50.0, 0.9), ("b", 50.0, 0.88), ("c", 50.0, 0.85), ("d", 50.0, 0.8)).sites
+    on_one_pole = [replace(site, pole=pole) for site, pole in zip(sites, ("p", "p", "q", "q"), strict=True)]
+    text = report_ranking.lead(report_ranking.Ranking(tuple(on_one_pole), (on_one_pole[0],), ()))
+    assert text == (
+        "It leads the next site, b, by 2.0 percentage points."
+        " The best site on another pole, c, is behind by 5.0 percentage points."
+    )
+    single_pole = tuple(replace(site, pole="p") for site in sites)
+    text = report_ranking.lead(report_ranking.Ranking(single_pole, single_pole[:1], ()))
+    assert text == "It leads the next site, b, by 2.0 percentage points."
+
+
 def test_note_on_the_site_that_sees_most_entropy() -> None:
     """Of two with the same score, one that sees more contradicts nothing."""
     tied = ranking(("a", 100.0, 1, 0.5, 0.5), ("b", 100.0, 1, 0.6, 0.99), ("c", 80.0, 3, 0.4, 1.0))

@@ -85,6 +85,8 @@ def print_placement(placed: Placement) -> None:
         out.print(str(path))
     if gain := describe_last_gain(placed):
         out.print(gain)
+    if absent := describe_absent_best(placed):
+        out.print(absent)
 
 
 def _sensor_table(placed: Placement) -> Table:
@@ -158,6 +160,19 @@ def describe_last_gain(placed: Placement) -> str | None:
         return None
     gain = curve[-1].plan_value.joint / curve[-2].plan_value.joint - 1.0
     return f"Going from {curve[-2].count} to {curve[-1].count} sensors adds {gain:.1%}."
+
+
+def describe_absent_best(placed: Placement) -> str | None:
+    """Return a sentence where the best single site is not part of the plan; None where it is, or is not known."""
+    first = placed.solution.curve[0]
+    if first.count != 1 or len(placed.sensors) < 2:
+        return None
+    (best,) = placed.curve_sites[0]
+    if best in {sensor.site for sensor in placed.sensors}:
+        return None
+    return (
+        f"The best single site, {best}, is not part of this plan: the sites of the plan complement one another better."
+    )
 
 
 def _describe_proof(placed: Placement) -> str:

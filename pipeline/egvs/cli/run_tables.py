@@ -305,7 +305,6 @@ def _print_distance(scenario: NewScenario, out: Console) -> None:
 def print_demo_hints(folder: Path, results: Path) -> None:
     """Print what to try after ``egvs demo``."""
     out = console(_RESULT_FILE_WIDTH)
-    out.print(f"report: {results / 'report.html'} (open it in a browser)")
     out.print(f"next: egvs place {folder} --out {results} --count 2   (the best two sensors together)")
     out.print(f"      egvs explore {results}   (move a sensor and see its score; needs egvs[explore])")
     out.print("      egvs new mytown --osm extract.osm.pbf   (your own junction, from OpenStreetMap)")

@@ -324,12 +324,24 @@ def lead(ranking: Ranking) -> str:
     text = f"{subject} the next site, {second.site}, by {_format_gap(ranking, second)}."
     if not ranking.best[-1].is_separable:  # ``beats_next`` of the last of the best refers to the second
         text += " There is too little traffic to tell which of them is better."
+    text += _lead_over_other_poles(ranking, second)
     if len(ranking.close) > 1:
         names = ", ".join(site.site for site in ranking.close[:4])
         if len(ranking.close) > 4:
             names += f" and {len(ranking.close) - 4} more"
         text += f" {len(ranking.close)} other sites score within {CLOSE_SHARE:.0%} of the best: {names}."
     return text
+
+
+def _lead_over_other_poles(ranking: Ranking, second: RankedSite) -> str:
+    """Return a sentence about the best site on another pole, where the second site is on the pole of a best one."""
+    best_poles = {site.pole for site in ranking.best}
+    if second.pole not in best_poles:
+        return ""
+    for site in ranking.sites:
+        if site.pole not in best_poles:
+            return f" The best site on another pole, {site.site}, is behind by {_format_gap(ranking, site)}."
+    return ""
 
 
 def _format_gap(ranking: Ranking, second: RankedSite) -> str:
