@@ -14,9 +14,9 @@ import typer
 from typer.models import CommandInfo
 
 from egvs._version import __version__
-from egvs.cli import city, exit, place, validate
+from egvs.cli import city, exit, place, sources, validate
 from egvs.cli import options as cli_options
-from egvs.cli.options import DEFAULT_POLES, Audit, Jobs, Out, Run, ScenarioPath, Set, Top, Verbose
+from egvs.cli.options import DEFAULT_POLES, Audit, Jobs, Out, Run, ScenarioPath, Set, SettingsPath, Top, Verbose
 from egvs.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -122,13 +122,13 @@ def demo(
 
 
 @app.command()
-def check(scenario: ScenarioPath, set_: Set = None) -> None:
+def check(scenario: SettingsPath, set_: Set = None) -> None:
     """Check a scenario before a run, and print all errors and warnings. No files are written."""
     from egvs.cli import run_tables
-    from egvs.scenario.loading import load
+    from egvs.runs.run_sources import SettingsSource
     from egvs.stages import check
 
-    checked = check.check_scenario(load(scenario, set_ or ()))
+    checked = check.check_scenario(SettingsSource.of(scenario, set_).load())
     run_tables.print_check(checked)
     if checked.errors:
         raise typer.Exit(InputError.exit_code)
@@ -265,7 +265,7 @@ def compare(
 
 @app.command()
 def accuracy(
-    scenario: ScenarioPath,
+    scenario: SettingsPath,
     out: Out = None,
     set_: Set = None,
     jobs: Jobs = None,
@@ -284,19 +284,21 @@ def accuracy(
     from egvs.cli.console import ProgressDisplay
     from egvs.studies.accuracy import StudyOptions, run_accuracy_study
 
-    _, folder = _load(scenario, set_, out)
+    _, folder = sources.open_source(scenario, set_, out)
     options = StudyOptions(tolerance, cli_options.duration_s(budget), seeds, jobs)
     with ProgressDisplay("accuracy") as screen:
         study = run_accuracy_study(
             scenario, set_ or (), folder, options, progress=screen.progress, listener=screen.setting_event
         )
-    study_tables.print_study(study, cli_options.shell_command("run", scenario, set_))
+    path, overrides, _ = sources.run_arguments(scenario, set_, out)
+    study_tables.print_study(study, cli_options.shell_command("run", path, overrides))
 
 
 @app.command()
 def effects(
     scenario: Annotated[
-        Path | None, typer.Argument(metavar="[SCENARIO]", help="A scenario; without it, all effects are listed.")
+        Path | None,
+        typer.Argument(metavar="[SCENARIO|RUN]", help="A scenario or a run; without it, all effects are listed."),
     ] = None,
     set_: Set = None,
     ablation: Annotated[
@@ -317,17 +319,19 @@ def effects(
         run_tables.print_effects(effect_study.effect_catalogue())
         return
 
-    loaded, folder = _load(scenario, set_, out)
+    loaded, folder = sources.open_source(scenario, set_, out)
     with ProgressDisplay() as screen:
         costs = effect_study.effect_costs(loaded, folder)
         statuses = effect_study.effect_statuses(loaded, folder, screen.progress)
     run_tables.print_effects(statuses, costs)
 
+    path, overrides, run_out = sources.run_arguments(scenario, set_, out)
     if any(status.change == effect_study.UNTRIED for status in statuses):
-        print(f"to measure the expected changes, first run: {cli_options.shell_command('run', scenario, set_, out)}")
+        command = cli_options.shell_command("run", path, overrides, run_out)
+        print(f"to measure the expected changes, first run: {command}")
     if recommended := [f"effects.{status.name}={{}}" for status in statuses if status.state == "called for"]:
-        overrides = [*(set_ or ()), *recommended]
-        print(f"to run with all recommended effects: {cli_options.shell_command('run', scenario, overrides, out)}")
+        command = cli_options.shell_command("run", path, [*overrides, *recommended], run_out)
+        print(f"to run with all recommended effects: {command}")
     if unmeasured := _unmeasured_effects(statuses, costs, loaded):
         study = cli_options.shell_command("accuracy", scenario, set_, out)
         print(f"to measure the cost and effect of {unmeasured}: {study}, or use --ablation")
@@ -380,6 +384,7 @@ def explore(
     from egvs.explore.settings import open_session
 
     check_port_free(port)
+    sources.open_source(folder, set_, out)
     with ProgressDisplay("explore") as screen:
         session = open_session(
             folder, set_ or (), out, jobs=jobs, progress=screen.progress, listener=screen.stage_event
@@ -545,6 +550,19 @@ def new(
 
 
 @app.command()
+def runs(
+    folder: Annotated[
+        Path | None, typer.Argument(metavar="[FOLDER]", help="Folder that contains run folders; runs by default.")
+    ] = None,
+) -> None:
+    """List the runs: settings that differ from the scenario, the best site, size and age; the latest run first."""
+    from egvs.cli import run_list_table
+    from egvs.runs import run_list, run_names
+
+    run_list_table.print_runs(run_list.list_runs(folder or run_names.RUNS))
+
+
+@app.command()
 def store(
     prune: Annotated[
         bool, typer.Option("--prune", help="Remove the least recently used entries beyond --max.")
@@ -583,7 +601,7 @@ COMMAND_GROUPS = {
     "Decide": ("place", "explore", "compare", "city"),
     "Study": ("validate", "accuracy", "effects", "scores", "clouds", "train"),
     "Stages of egvs run": ("traffic", "statics", "tpog", "scan", "score", "report"),
-    "Files": ("export", "figure", "sensors", "verify", "store"),
+    "Files": ("runs", "export", "figure", "sensors", "verify", "store"),
 }
 """Groups of ``egvs --help``, and their commands."""
 

@@ -23,7 +23,12 @@ _WIDTH = 150
 
 CityPath = Annotated[Path, typer.Argument(metavar="CITY", help="A folder created by egvs city new.")]
 CityOut = Annotated[
-    Path | None, typer.Option("--out", metavar="DIR", help="Folder of the city run; runs/<name> by default.")
+    Path | None,
+    typer.Option(
+        "--out",
+        metavar="DIR",
+        help="Folder of the city run; by default runs/<name>, with --set runs/<name>@<what differs>.",
+    ),
 ]
 Cluster = Annotated[
     str,
