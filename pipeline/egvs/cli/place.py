@@ -45,18 +45,19 @@ def place(
 ) -> None:
     """Plan several sensors: how many, at which sites, and how close the plan is to the best possible score."""
     from egvs.cli.console import WIDE, ProgressDisplay, console
-    from egvs.placement import plan
-    from egvs.runs.run import default_folder
-    from egvs.scenario.loading import load
 
     limit_s = options.duration_s(time_limit, "--time-limit")
     overrides = list(set_ or ())
     for key, value in (("count", count), ("budget", budget), ("reach", reach)):
         if value is not None:
             overrides.append(f"placement.{key}={value!r}")
-    loaded = load(scenario, overrides)
-    folder = out or default_folder(loaded)
     with ProgressDisplay("place") as screen:
+        from egvs.placement import plan
+        from egvs.runs.run import default_folder
+        from egvs.scenario.loading import load
+
+        loaded = load(scenario, overrides)
+        folder = out or default_folder(loaded)
         placed = plan.place(
             loaded, folder, exact=exact, time_limit_s=limit_s, refine=refine, jobs=jobs, progress=screen.progress,
             listener=screen.stage_event,
