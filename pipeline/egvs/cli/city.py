@@ -77,8 +77,6 @@ def new(
     ] = "medium",
 ) -> None:
     """Create a city from an OpenStreetMap extract: one network, and a scenario for each junction."""
-    from egvs.city import creation
-    from egvs.cli import new_summary
     from egvs.cli.console import ProgressDisplay
 
     centre = radius_m = None
@@ -87,6 +85,9 @@ def new(
     if radius is not None:
         radius_m = options.length_m(radius, "--radius")
     with ProgressDisplay("city") as screen:
+        from egvs.city import creation
+        from egvs.cli import new_summary
+
         new_options = creation.NewCityOptions(centre, radius_m, junctions, lefthand, walk, traffic, screen.progress)
         created = creation.create_city(folder, osm, new_options)
     new_summary.print_new_city(created)
@@ -94,11 +95,12 @@ def new(
 
 def traffic(city: CityPath) -> None:
     """Simulate a city's traffic once and divide it among its junctions; skipped if nothing has changed."""
-    from egvs.city import model, traffic_split
     from egvs.cli.console import ProgressDisplay
 
-    loaded = model.load_city(city)
     with ProgressDisplay("traffic") as screen:
+        from egvs.city import model, traffic_split
+
+        loaded = model.load_city(city)
         result = traffic_split.make_city_traffic(loaded, screen.progress)
     _print_traffic(loaded.folder, result)
 
@@ -117,10 +119,11 @@ def run(
     ] = False,
 ) -> None:
     """Simulate the city's traffic once, then run the scenarios of all junctions in parallel."""
-    from egvs.city import city_run, model
     from egvs.cli.console import ProgressDisplay
 
     with ProgressDisplay("city") as screen:
+        from egvs.city import city_run, model
+
         run_options = _run_options(cluster, junction, set_, screen)
         result = city_run.run_city(model.load_city(city), out, run_options)
         for warning in result.warnings:
@@ -146,10 +149,11 @@ def place(
     set_: CitySet = None,
 ) -> None:
     """Plan sensors for all junctions together: find the best plan for the whole city."""
-    from egvs.city import city_run, model
     from egvs.cli.console import ProgressDisplay
 
     with ProgressDisplay("city") as screen:
+        from egvs.city import city_run, model
+
         run_options = _run_options(cluster, junction, set_, screen)
         numbers = _parse_phases(phases)
         placed = city_run.place_city(
