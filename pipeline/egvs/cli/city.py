@@ -272,8 +272,10 @@ def print_costs(costs: CityCosts) -> None:
     from egvs.cli.console import WIDE, Column, console, make_table
 
     parts: list[Column[Any]] = [
-        Column("part", lambda part: part.part, "left"),
+        Column("part", lambda part: f"  {part.part}" if part.within else part.part, "left"),
         Column("seconds", lambda part: f"{part.seconds:.2f}"),
+        Column("start s", lambda part: f"{part.start_s:.2f}"),
+        Column("end s", lambda part: f"{part.end_s:.2f}"),
     ]
     stages: list[Column[Any]] = [
         Column("stage, at all junctions", lambda stage: stage.stage, "left"),
