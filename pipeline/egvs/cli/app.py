@@ -520,7 +520,7 @@ def new(
     ] = None,
 ) -> None:
     """Create a scenario from an OpenStreetMap extract."""
-    from egvs.cli import run_tables
+    from egvs.cli import new_summary
     from egvs.importers import openstreetmap
 
     location = None
@@ -541,7 +541,7 @@ def new(
         folder, osm, location, lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=demand,
         pole_spacing_m=pole_spacing_m,
     )  # fmt: skip
-    run_tables.print_new_scenario(scenario)
+    new_summary.print_new_scenario(scenario)
 
 
 @app.command()

@@ -14,7 +14,6 @@ from egvs.cli import options
 if TYPE_CHECKING:
     from egvs.city.city_run import CityPlacement, CityRun, CityRunOptions
     from egvs.city.costs import CityCosts
-    from egvs.city.creation import NewCity
     from egvs.city.plan_comparison import PlanComparison
     from egvs.city.tasks import JobResult
     from egvs.city.traffic_split import CityTraffic
@@ -74,6 +73,7 @@ def new(
 ) -> None:
     """Create a city from an OpenStreetMap extract: one network, and a scenario for each junction."""
     from egvs.city import creation
+    from egvs.cli import new_summary
     from egvs.cli.console import ProgressDisplay
 
     centre = radius_m = None
@@ -84,7 +84,7 @@ def new(
     with ProgressDisplay("city") as screen:
         new_options = creation.NewCityOptions(centre, radius_m, junctions, lefthand, walk, traffic, screen.progress)
         created = creation.create_city(folder, osm, new_options)
-    _print_new(created)
+    new_summary.print_new_city(created)
 
 
 def traffic(city: CityPath) -> None:
@@ -191,23 +191,6 @@ def _run_options(
         screen.say(describe_done(done))
 
     return CityRunOptions(cluster, junctions or (), overrides or (), screen.progress, on_done, screen.say)
-
-
-def _print_new(city: NewCity) -> None:
-    from egvs.cli.console import WIDE, Column, console, make_table, print_mapping
-
-    columns: list[Column[Any]] = [
-        Column("junction", lambda row: row.id, "left"),
-        Column("title", lambda row: row.junction.title, "left", wrap=True),
-        Column("lanes in", lambda row: str(row.junction.lanes_in)),
-        Column("poles", lambda row: str(len(row.poles))),
-        Column("sites", lambda row: str(row.n_candidates)),
-    ]
-    out = console(WIDE)
-    out.print(make_table(columns, city.junctions))
-    print_mapping({"folder": str(city.folder)} | city.to_json(), _WIDTH)
-    out.print(f"traffic: the network {city.traffic.summary}")
-    out.print(f"next: egvs city run {city.folder}")
 
 
 def _print_traffic(folder: Path, result: CityTraffic) -> None:
