@@ -26,10 +26,10 @@ from egvs.scenario.score_config import COST_COLUMN, CostsConfig
 
 SENSOR_EVIDENCE = (
     "How far to trust this: the order of different sensors was checked at one junction only (nishishinjuku: VLP-16, "
-    "VLP-32C, OS1-64 and OS1-128 at 5 poles). The best sensor of a pole by the score lost at most 2 points of AP "
-    "(BEV + 3D, at most 200). Of two sites with another pole and another sensor, 14 (cluster) and 22 (pointpillars) of "
-    "120 pairs were in the wrong order, by up to 32 points. The difference of two sensors in the share found was off "
-    "by up to 14 points, and the cost of one more point with it. See docs/validity.md."
+    "VLP-32C, OS1-64 and OS1-128 at 5 poles). The best sensor of a pole by the score lost at most 1 point of AP. Of "
+    "two sites with another pole and another sensor, 14 (cluster) and 22 (pointpillars) of 120 pairs were in the wrong "
+    "order, by up to 16 points. The difference of two sensors in the share found was off by up to 14 points, and the "
+    "cost of one more point with it. See docs/validity.md."
 )
 """What is known about rankings across sensors (docs/validity.md)."""
 

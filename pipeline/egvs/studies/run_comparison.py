@@ -34,6 +34,7 @@ from egvs.report.ranking import Pole, RankedSite, Ranking
 from egvs.report.sensor_results import ScoreDifference, SensorComparison, SensorMount, best_mounts
 from egvs.scenario.loading import costs_from_dict
 from egvs.scenario.score_config import CostsConfig
+from egvs.scenario.settings import flatten_settings
 from egvs.studies.paired_errors import ScoreDifferences, SiteOfRun
 from egvs.studies.score_errors import best_sites, rank_agreement, regret
 
@@ -291,7 +292,8 @@ def _read_run(folder: Path, label: str, cost_overrides: Sequence[str]) -> Compar
         raise InputError(path, "was changed after the run", 'Repeat "egvs run".')
     metadata = parquet.read_metadata(path, "scores")
 
-    settings = {**dict(_flatten(record.scenario)), "egvs (version)": record.egvs}
+    compared = {key: value for key, value in record.scenario.items() if key not in _IGNORED_SETTINGS}
+    settings = {**flatten_settings(compared), "egvs (version)": record.egvs}
     if settings.get("score.gamma") == "auto":
         settings["score.gamma"] = metadata["gamma"]
     if "traffic" in record.stages and record.stages["traffic"].summary.get("sumo") is not None:
@@ -442,21 +444,6 @@ def _differing_egvs_keys(a: ComparedRun, b: ComparedRun) -> list[str]:
     if a.rank_by != "egvs":
         return []
     return [key for key in _EGVS_KEYS if a.settings.get(key) != b.settings.get(key)]
-
-
-def _flatten(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield each setting with its full key; rows of tables are called by their name or number."""
-    if isinstance(value, dict) and value:
-        for name, inner in value.items():
-            if key:
-                yield from _flatten(inner, f"{key}.{name}")
-            elif name not in _IGNORED_SETTINGS:
-                yield from _flatten(inner, name)
-    elif isinstance(value, list) and value and all(isinstance(row, dict) for row in value):
-        for number, row in enumerate(value):
-            yield from _flatten(row, f"{key}[{row.get('name', number)}]")
-    else:
-        yield key, value
 
 
 def compare_rankings(a: ComparedRun, b: ComparedRun, by: View = "site") -> RankAgreement:
