@@ -54,11 +54,17 @@ def test_paired_error_is_that_of_the_block_differences() -> None:
     assert differences.between(there, there).se == 0.0
 
 
-def test_sensors_of_one_run_are_compared_as_neighbours_in_its_ranking(junction_with_two_sensors: Path) -> None:
+PERIODS = 'traffic.periods=[{name="a", length_s=12, weight=1}, {name="b", begin_s=12, length_s=8, weight=2}]'
+
+
+@pytest.mark.parametrize("overrides", [(), pytest.param((PERIODS,), marks=pytest.mark.slow)], ids=["whole", "periods"])
+def test_sensors_of_one_run_are_compared_as_neighbours_in_its_ranking(
+    overrides: tuple[str, ...], junction_with_two_sensors: Path
+) -> None:
     """With two sites, ``beats_next`` of the best one is the probability that it is better than the other."""
     scenario = junction_with_two_sensors
     (scenario / "sites.csv").write_text("site,x_m,y_m,z_m,sensor\none,10,12,3,small\ntwo,10,12,4,other\n")
-    egvs.run(egvs.load(scenario), scenario / "run")
+    egvs.run(egvs.load(scenario, overrides), scenario / "run")
     scores = egvs.read_scores(scenario / "run" / "scores.parquet").to_pylist()
     best, worst = sorted(scores, key=lambda row: row["rank"])
     comparison = compare_runs([scenario / "run"])
@@ -91,6 +97,7 @@ def test_runs_with_the_same_traffic_are_paired(junction_with_two_sensors: Path, 
     assert comparison.notes == ()
 
 
+@pytest.mark.slow
 def test_reason_is_noted_where_errors_are_independent(junction_with_two_sensors: Path, tmp_path: Path) -> None:
     scenario = junction_with_two_sensors
     egvs.run(egvs.load(scenario), tmp_path / "a")

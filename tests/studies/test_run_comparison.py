@@ -18,7 +18,10 @@ from egvs.cli import study_tables
 from egvs.core.errors import InputError
 from egvs.core.files import add_checksum
 from egvs.report.ranking import RankedSite, Ranking, ScoreValue, share_of_limit
+from egvs.report.sensor_results import SENSOR_EVIDENCE
+from egvs.scenario.score_config import CostsConfig
 from egvs.studies import run_comparison
+from egvs.studies.paired_errors import ScoreDifferences
 from egvs.studies.run_comparison import ComparedRun, compare_runs
 
 
@@ -222,6 +225,97 @@ def test_tables_fit_the_terminal(width: int, runs: int, monkeypatch: pytest.Monk
     header = [line for line in lines if line.startswith("site")]
     assert {f"{run.label} rank" for run in all_runs} <= {cell.strip() for line in header for cell in line.split("  ")}
     assert any("longitude" in line for line in header) == (width == 190)
+
+
+def by_pole(*runs: ComparedRun) -> run_comparison.Comparison:
+    """A comparison of made-up runs: errors of differences as if independent."""
+    independent = ScoreDifferences({})
+    locations = dict.fromkeys(location for run in runs for location in run.poles)
+    return run_comparison.Comparison(
+        runs,
+        "pole",
+        tuple(run_comparison._compare_pole(location, runs, independent) for location in locations),
+        (),
+        tuple(run_comparison.compare_rankings(runs[0], run, "pole") for run in runs[1:]),
+        run_comparison._compare_sensors(runs, run_comparison._sensor_mounts(runs), independent),
+        (),
+        (),
+    )
+
+
+def printed_text(comparison: run_comparison.Comparison, width: int, monkeypatch: pytest.MonkeyPatch) -> str:
+    console = Console(width=width, record=True, markup=False, highlight=False)
+    monkeypatch.setattr(study_tables, "console", lambda *_, **__: console)
+    study_tables.print_comparison(comparison)
+    return console.export_text()
+
+
+def mounts(sensor: str, *shares: float) -> list[RankedSite]:
+    """Sites on poles 10 m apart, 4.5 m up, tilted by 10 degrees."""
+    pose = {"z_m": 4.5, "pitch_deg": -10.0, "sensor": sensor}
+    sites = []
+    for number, share in enumerate(shares):
+        pole = f"kerb_{number}"
+        sites.append(found(f"{pole}@4.5m-10deg", share, number + 1, pole=pole, x_m=10.0 * number, **pose))
+    return sites
+
+
+@pytest.mark.parametrize("width", [80, 160])
+@pytest.mark.parametrize("runs", [2, 5])
+def test_tables_of_poles_fit_the_terminal(width: int, runs: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    compared = [
+        made_run(run_comparison.run_label(number), *mounts(f"OS{number}-128", 0.8 + 0.01 * number, 0.7))
+        for number in range(runs)
+    ]
+    text = printed_text(by_pole(*compared), width, monkeypatch)
+    tables = text.split("best mount of each sensor")[0].splitlines()
+    assert max(len(line) for line in tables if line.startswith(("pole", "kerb"))) <= width
+    first_rows = [line for line in tables if line.startswith("kerb_0")]
+    for number in range(runs):
+        assert any(f"{0.8 + 0.01 * number:.1%} ±0.3%" in line for line in first_rows)
+    assert all("80.0% ±0.3%" in line for line in first_rows)  # the first run is in each table
+    assert "+1.0 ±0.4" in text
+    if width == 80:
+        assert "4.5 m, -10°" in first_rows[0]
+    else:
+        assert "kerb_0@4.5m-10deg" in first_rows[0]
+
+
+def test_says_at_how_many_poles_a_run_is_better(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By +3, +0.2 and -2 percentage points, each with a standard error of 0.4."""
+    a, b = made_run("A", *mounts("s", 0.9, 0.8, 0.7)), made_run("B", *mounts("t", 0.93, 0.802, 0.68))
+    text = printed_text(by_pole(a, b), 160, monkeypatch)
+    assert "B against A at 3 common poles: better at 2 (clearly at 1), worse at 1 (clearly at 1)" in text
+    for difference in ("  +3.0 ±0.4", "~ +0.2 ±0.4", "  -2.0 ±0.4"):
+        assert difference in text
+
+
+def test_prints_how_to_set_costs_or_what_one_more_point_costs(monkeypatch: pytest.MonkeyPatch) -> None:
+    a, b = made_run("A", *mounts("s", 0.9)), made_run("B", *mounts("t", 0.95))
+    text = printed_text(by_pole(a, b), 160, monkeypatch)
+    assert """egvs compare a b --set 'costs.sensor={"s" = PRICE, "t" = PRICE}', or [costs] in scenario.toml""" in text
+    costs = CostsConfig(sensor={"s": 1000.0, "t": 6000.0})
+    text = printed_text(by_pole(replace(a, costs=costs), replace(b, costs=costs)), 160, monkeypatch)
+    assert "one more point costs" in text
+    assert "1,000" in text  # 5000 for 5 points
+    assert "PRICE" not in text
+    assert SENSOR_EVIDENCE.split(".")[0] in text
+
+
+def test_costs_of_the_command_line_replace_those_of_the_run(mini: Path, tmp_path: Path, run_egvs) -> None:
+    egvs.run(egvs.load(mini, ["costs.pole=5", "costs.sensor={small=7}"]), tmp_path / "run")
+    both = [tmp_path / "run", tmp_path / "run"]
+    assert compare_runs(both).runs[0].costs == CostsConfig(pole=5, sensor={"small": 7})
+    overridden = compare_runs(both, costs=["costs.sensor={small=9, other=3}", "costs.metre=2"]).runs[1].costs
+    assert overridden == CostsConfig(pole=5, metre=2, sensor={"small": 9, "other": 3})
+    for override, message in (
+        ("traffic.frames=3", "--set traffic.frames=3: expected a key of [costs]"),
+        ("costs.pole=-1", "--set: costs.pole: expected a value greater than or equal to 0, got -1"),
+        ("costs.lamp=1", "costs.lamp"),
+    ):
+        code, printed, error = run_egvs("compare", *both, "--set", override)
+        assert (code, printed) == (2, "")
+        assert message in error
 
 
 @pytest.mark.slow
