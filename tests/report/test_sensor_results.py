@@ -10,6 +10,7 @@ import pytest
 
 from egvs.report.ranking import RankedSite, ScoreValue
 from egvs.report.sensor_results import (
+    SENSOR_EVIDENCE,
     ScoreDifference,
     SensorComparison,
     best_mounts,
@@ -107,6 +108,16 @@ def test_difference_of_unknown_error_is_shown_without_one() -> None:
     difference = ScoreDifference.of_independent(site("a", "s", 0.65, se=None), site("b", "s", 0.6))
     assert format_difference(difference, site("a", "s", 0.65)) == "+5.0"
     assert difference.is_clear
+
+
+def test_evidence_is_that_of_the_score_that_ranks() -> None:
+    by_share = compare(site("a", "large", 0.85), site("b", "small", 0.60))
+    assert by_share.evidence is SENSOR_EVIDENCE
+    sites = [replace(result.mount.site, rank_by="egvs", others=()) for result in by_share.results]
+    by_egvs = compare(*sites)
+    assert "whether EGVS ranks different sensors as detectors do was not measured" in by_egvs.evidence
+    assert not by_egvs.shows_cost_per_point
+    assert [result.cost_per_point_text for result in by_egvs.results] == ["-", "-"]
 
 
 def test_difference_in_bits_has_no_percentage_points() -> None:

@@ -171,6 +171,29 @@ def test_runs_without_common_pole_are_refused(two: tuple[Path, Path], mini: Path
     assert "note: A and B have no site name in common, so their rankings cannot be compared" in printed
 
 
+def test_sensors_of_one_run_on_different_poles_are_compared(mini: Path, run_egvs) -> None:
+    file = mini / "scenario.toml"
+    other = (
+        "[sensors.other]\nelevations_deg = [-20, -3]\nchannels = 10\nazimuth_step_deg = 1.5\nrange_m = 90\n\n[score]"
+    )
+    file.write_text(file.read_text().replace("[score]", other))
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m,sensor\none,10,12,3,small\ntwo,30.5,-12,3,other\n")
+    egvs.run(egvs.load(mini), mini / "run")
+    comparison = compare_runs([mini / "run"])
+    assert [pole.differences for pole in comparison.poles] == [(None, None)] * 2
+    assert comparison.notes == ("A and B have no pole in common, so their rankings cannot be compared",)
+    assert comparison.sensors is not None
+    gain = comparison.sensors.results[1].gain
+    assert gain is not None
+    assert gain.difference.is_paired
+    code, printed, _ = run_egvs("compare", mini / "run")
+    assert code == 0
+    assert "the best mount of each sensor" in printed
+    code, _, message = run_egvs("compare", mini / "run", "--by", "site")
+    assert code == 2
+    assert "--by site: expected a second run" in message
+
+
 def test_default_view_is_by_site_where_mounts_are_the_same(two: tuple[Path, Path], mini: Path, tmp_path: Path) -> None:
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,10,12,3\npole_b,30.5,-12,3\n")
     egvs.run(egvs.load(mini, ["score.gamma=2"]), tmp_path / "gamma")

@@ -22,7 +22,6 @@ from egvs.cli.console import NARROW, WIDE, Column, console, format_or_dash, make
 from egvs.report.formatting import SCORE_LABELS, join_names
 from egvs.report.ranking import RankedSite, share_of_limit
 from egvs.report.sensor_results import (
-    SENSOR_EVIDENCE,
     ScoreDifference,
     SensorComparison,
     SensorResult,
@@ -348,7 +347,7 @@ def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparis
         out.print(
             f"What one more point costs: egvs compare {folders} {option}, or [costs] in scenario.toml", soft_wrap=True
         )
-    out.print(SENSOR_EVIDENCE, soft_wrap=True)
+    out.print(sensors.evidence, soft_wrap=True)
     out.print()
 
 

@@ -35,7 +35,7 @@ from egvs.report.sections import (
     egvs_setting,
     ranking_disagreement,
 )
-from egvs.report.sensor_results import SENSOR_EVIDENCE, SensorComparison, costs_option
+from egvs.report.sensor_results import SensorComparison, costs_option
 from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.scene_inputs import scan_dependencies
@@ -292,7 +292,6 @@ def _sensor_values(contents: PageContents) -> dict[str, Any]:
     sensors = SensorComparison.of_run(contents.ranking.sites, contents.scenario.costs)
     return {
         "sensors": sensors,
-        "sensor_evidence": SENSOR_EVIDENCE,
         "costs_option": costs_option(sensors.sensors) if sensors is not None else "",
     }
 

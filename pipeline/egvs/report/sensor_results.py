@@ -9,7 +9,7 @@ This is undefined where sensor i finds no more than b, and not stated where it i
 The same is computed for the best of all sensors that are cheaper than i: a large gain over the cheapest can hide that
 the last step costs much and adds little. Without costs, the sensor that finds least takes the place of the cheapest.
 
-:data:`SENSOR_EVIDENCE` says how well scores of different sensors predict detection.
+:attr:`SensorComparison.evidence` says how well scores of different sensors predict detection.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
-from egvs.report.formatting import format_count
+from egvs.report.formatting import SCORE_LABELS, format_count
 from egvs.report.ranking import RankedSite
-from egvs.scenario.score_config import COST_COLUMN, CostsConfig
+from egvs.scenario.score_config import COST_COLUMN, DEFAULT_SCORE, CostsConfig
 
 SENSOR_EVIDENCE = (
     "How far to trust this: the order of different sensors was checked at one junction only (nishishinjuku: VLP-16, "
@@ -31,7 +31,12 @@ SENSOR_EVIDENCE = (
     "order, by up to 16 points. The difference of two sensors in the share found was off by up to 14 points, and the "
     "cost of one more point with it. See docs/validity.md."
 )
-"""What is known about rankings across sensors (docs/validity.md)."""
+"""What is known about rankings of sensors by the recommended score (docs/validity.md)."""
+
+_NO_EVIDENCE = (
+    "How far to trust this: whether {} ranks different sensors as detectors do was not measured; docs/validity.md has "
+    "a measurement for {}."
+)
 
 _PROBABILITY_DIGITS = 6
 """The last bits of a distribution function depend on the machine."""
@@ -285,6 +290,14 @@ class SensorComparison:
             f"Differences from {mount.sensor}{run} ({kind}) are in {difference_unit(mount.site)}, ± their standard "
             "error; ~ it is not clear which is better."
         )
+
+    @property
+    def evidence(self) -> str:
+        """What is known about rankings of sensors by this score."""
+        by = self.baseline.site.by
+        if by.name == DEFAULT_SCORE:
+            return SENSOR_EVIDENCE
+        return _NO_EVIDENCE.format(by.noun, SCORE_LABELS[DEFAULT_SCORE].noun)
 
     @property
     def sensors(self) -> tuple[str, ...]:

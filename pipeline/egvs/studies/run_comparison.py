@@ -237,15 +237,16 @@ def compare_runs(
     ------
     InputError
         If there is a single run with one sensor, a folder contains no finished run, its scores were changed, or the
-        runs have no pole in common.
+        first run has no pole in common with any other.
     """
     runs = tuple(_read_run(Path(folder), run_label(number), costs) for number, folder in enumerate(folders))
     if not runs:
         raise InputError("compare", "expected at least one run, got none", "Give folders of finished runs.")
-    if len(runs) == 1:
+    is_single = len(runs) == 1
+    if is_single:
         runs = _split_by_sensor(runs[0], by)
     view = by or _choose_view(runs)
-    if view == "pole":
+    if view == "pole" and not is_single:
         _check_common_poles(runs)
 
     pairs = list(combinations(runs, 2))
