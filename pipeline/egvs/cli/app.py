@@ -118,7 +118,7 @@ def demo(
     with ProgressDisplay() as screen:
         record = run(loaded, results, jobs=jobs, progress=screen.progress, listener=screen.stage_event)
     answer.print_answer(results, loaded, record)
-    run_tables.print_demo_hints(folder, results)
+    run_tables.print_demo_hints(results)
 
 
 @app.command()
