@@ -1,6 +1,7 @@
 """``egvs city run`` and ``egvs city place``: run all junctions on a cluster, and plan sensors for the whole city.
 
-Steps of :func:`run_city`: simulate the traffic once (:mod:`egvs.city.traffic_split`); run every junction
+Steps of :func:`run_city`: simulate the traffic once (:mod:`egvs.city.traffic_split`), while workers check and scan the
+scenes of the junctions; run every junction
 (:mod:`egvs.city.scheduler`); collect the results (:mod:`egvs.city.results`); write the page (:mod:`egvs.city.page`)
 and the costs (:mod:`egvs.city.costs`).
 The folder of each junction is byte for byte what ``egvs run`` of its scenario alone writes.
@@ -150,8 +151,11 @@ def _run_jobs(
 
     Junctions whose traffic is locked, or that have none, are left out.
     """
-    with meter.part("traffic"):
-        traffic = traffic_split.make_city_traffic(city, options.progress, options.overrides)
+    with meter.part("traffic"), scheduler.SceneTasks(cluster, jobs) as scenes:
+        progress = meter.traffic_progress(options.progress)
+        traffic = traffic_split.make_city_traffic(city, progress, options.overrides, scenes.start)
+    meter.add_traffic(traffic)
+    meter.add_scenes(scenes)
     jobs = [job for job in jobs if job.junction not in traffic.left_out]
     if not jobs:
         problem = "all junctions that were selected are left out: their traffic is locked, or they have none"
@@ -161,8 +165,10 @@ def _run_jobs(
     with meter.part("tables"):
         junction_results = read_junction_results(folder, [city.junction(job.junction) for job in jobs])
         written = write_results(folder, city, junction_results)
-    meter.add_runs([job.out for job in jobs])
+    meter.add_runs(jobs)
     meter.add_processes(cluster, traffic.summary)
+    n_sites = sum(result.sites for result in junction_results)
+    meter.add_size(jobs, n_sites, traffic, traffic_split.traffic_paths(city, [job.junction for job in jobs]))
     return CityRun(folder, junction_results, written, tuple(collect_warnings([traffic.summary])))
 
 

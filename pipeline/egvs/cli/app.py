@@ -79,13 +79,14 @@ def run(
     verbose: Verbose = False,
 ) -> None:
     """Run all stages in order and print the best poles; stages with unchanged inputs are skipped."""
-    from egvs.cli import answer, run_tables
     from egvs.cli.console import ProgressDisplay
-    from egvs.runs import run
 
-    loaded, folder = _load(scenario, set_, out)
     stage_options = {"score": {"audit": True}} if audit else None
-    with ProgressDisplay(with_details=verbose) as screen:
+    with ProgressDisplay("run", with_details=verbose) as screen:
+        from egvs.cli import answer, run_tables
+        from egvs.runs import run
+
+        loaded, folder = _load(scenario, set_, out)
         record = run.run(
             loaded, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, options=stage_options
         )
@@ -107,15 +108,16 @@ def demo(
     jobs: Jobs = None,
 ) -> None:
     """Try it: rank eight sites at a roundabout in about a minute, with traffic simulated in advance."""
-    from egvs.cli import answer, run_tables
     from egvs.cli.console import ProgressDisplay
-    from egvs.runs.run import run
-    from egvs.scenario import shipped
-    from egvs.scenario.loading import load
 
-    shipped.copy_scenario(shipped.DEMO, folder)
-    results, loaded = folder / "results", load(folder)
-    with ProgressDisplay() as screen:
+    with ProgressDisplay("demo") as screen:
+        from egvs.cli import answer, run_tables
+        from egvs.runs.run import run
+        from egvs.scenario import shipped
+        from egvs.scenario.loading import load
+
+        shipped.copy_scenario(shipped.DEMO, folder)
+        results, loaded = folder / "results", load(folder)
         record = run(loaded, results, jobs=jobs, progress=screen.progress, listener=screen.stage_event)
     answer.print_answer(results, loaded, record)
     run_tables.print_demo_hints(results)
@@ -214,12 +216,13 @@ def _run_stage(
     **stage_options: Any,
 ) -> None:
     """Run one stage and print the files that it wrote."""
-    from egvs.cli import run_tables
     from egvs.cli.console import ProgressDisplay
-    from egvs.runs import run
 
-    loaded, folder = _load(scenario, set_, out)
-    with ProgressDisplay(with_details=True) as screen:
+    with ProgressDisplay(stage, with_details=True) as screen:
+        from egvs.cli import run_tables
+        from egvs.runs import run
+
+        loaded, folder = _load(scenario, set_, out)
         record = run.run_one(
             stage, loaded, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, **stage_options
         )
@@ -235,11 +238,12 @@ def verify(
     jobs: Jobs = None,
 ) -> None:
     """Repeat the run recorded in DIR/run.json, and compare every artefact byte for byte."""
-    from egvs.cli import run_tables
     from egvs.cli.console import ProgressDisplay
-    from egvs.runs import verification
 
-    with ProgressDisplay() as screen:
+    with ProgressDisplay("verify") as screen:
+        from egvs.cli import run_tables
+        from egvs.runs import verification
+
         differences = verification.verify(
             folder, scenario, jobs=jobs, progress=screen.progress, listener=screen.stage_event
         )
@@ -280,13 +284,15 @@ def accuracy(
     ] = 0,
 ) -> None:
     """Measure error against run time for many settings, and recommend the cheapest within a tolerance."""
-    from egvs.cli import study_tables
     from egvs.cli.console import ProgressDisplay
-    from egvs.studies.accuracy import StudyOptions, run_accuracy_study
 
+    budget_s = cli_options.duration_s(budget)
     _, folder = sources.open_source(scenario, set_, out)
-    options = StudyOptions(tolerance, cli_options.duration_s(budget), seeds, jobs)
     with ProgressDisplay("accuracy") as screen:
+        from egvs.cli import study_tables
+        from egvs.studies.accuracy import StudyOptions, run_accuracy_study
+
+        options = StudyOptions(tolerance, budget_s, seeds, jobs)
         study = run_accuracy_study(
             scenario, set_ or (), folder, options, progress=screen.progress, listener=screen.setting_event
         )
@@ -320,7 +326,7 @@ def effects(
         return
 
     loaded, folder = sources.open_source(scenario, set_, out)
-    with ProgressDisplay() as screen:
+    with ProgressDisplay("effects") as screen:
         costs = effect_study.effect_costs(loaded, folder)
         statuses = effect_study.effect_statuses(loaded, folder, screen.progress)
     run_tables.print_effects(statuses, costs)
@@ -340,7 +346,7 @@ def effects(
         return
     if not loaded.effects.named:
         raise InputError("--ablation", "the scenario has no effects", "Add one, e.g. --set effects.rain.rate_mm_h=20.")
-    with ProgressDisplay() as screen:
+    with ProgressDisplay("effects") as screen:
         changes = effect_study.run_ablation(loaded, folder, jobs=jobs, progress=screen.progress)
     run_tables.print_ablation(changes)
 
@@ -525,7 +531,7 @@ def new(
     ] = None,
 ) -> None:
     """Create a scenario from an OpenStreetMap extract."""
-    from egvs.cli import run_tables
+    from egvs.cli import new_summary
     from egvs.importers import openstreetmap
 
     location = None
@@ -546,7 +552,7 @@ def new(
         folder, osm, location, lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=demand,
         pole_spacing_m=pole_spacing_m,
     )  # fmt: skip
-    run_tables.print_new_scenario(scenario)
+    new_summary.print_new_scenario(scenario)
 
 
 @app.command()

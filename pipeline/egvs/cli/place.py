@@ -45,7 +45,6 @@ def place(
 ) -> None:
     """Plan several sensors: how many, at which sites, and how close the plan is to the best possible score."""
     from egvs.cli.console import WIDE, ProgressDisplay, console
-    from egvs.placement import plan
 
     limit_s = options.duration_s(time_limit, "--time-limit")
     request = []
@@ -54,6 +53,8 @@ def place(
             request.append(f"placement.{key}={value!r}")
     loaded, folder = sources.open_source(scenario, set_, out, request)
     with ProgressDisplay("place") as screen:
+        from egvs.placement import plan
+
         placed = plan.place(
             loaded, folder, exact=exact, time_limit_s=limit_s, refine=refine, jobs=jobs, progress=screen.progress,
             listener=screen.stage_event,

@@ -13,20 +13,18 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
 from rich.table import Table
 
 from egvs.artefacts import parquet
 from egvs.artefacts.readers import DISTINCT_PROBABILITY, PeriodRank, PeriodRanking
 from egvs.artefacts.run_record import RunRecord
-from egvs.cli.console import NARROW, WIDE, Column, console, format_or_dash, make_table, print_mapping, print_table
+from egvs.cli.console import NARROW, WIDE, Column, console, format_or_dash, make_table, print_table
 from egvs.core.errors import collect_warnings
 from egvs.report import sections
 from egvs.report.formatting import SCORE_LABELS, ScoreLabel
 from egvs.report.ranking import Pole, RankedSite, companion_score, group_by_pole
 
 if TYPE_CHECKING:
-    from egvs.importers.openstreetmap import NewScenario
     from egvs.runs.store import Store, StoreEntry
     from egvs.sensors.sensor import Sensor
     from egvs.stages.check import CheckReport
@@ -263,43 +261,6 @@ def print_check(checked: CheckReport) -> None:
     if not checked.findings:
         out.print("no errors or warnings")
     out.print(f"checked {checked.sites} sites, {checked.solids} solids and {checked.lanes} lanes")
-
-
-def print_new_scenario(scenario: NewScenario) -> None:
-    """Print what ``egvs new`` created."""
-    out = console(_RESULT_FILE_WIDTH)
-    description = scenario.to_json()
-    notes = description.pop("notes")
-    print_mapping(description, _RESULT_FILE_WIDTH)
-    for note in notes:
-        out.print(f"note: {note}")
-    _print_distance(scenario, out)
-    hourly = 0
-    assumed = "the traffic is assumed"
-    if scenario.traffic is not None:
-        hourly = scenario.traffic.per_h
-        out.print(f"traffic: {scenario.traffic.summary} ({hourly:,} vehicles an hour)")
-        if scenario.traffic.level is None:
-            assumed = "the shares of the movements are assumed"
-    out.print(
-        f"warning: {assumed} ({hourly:,} vehicles an hour); this affects the ranking. "
-        f"Enter counted traffic under [traffic] in {scenario.folder / 'scenario.toml'} before you rely on the ranking."
-    )
-    out.print(f"next: egvs run {scenario.folder}")
-
-
-def _print_distance(scenario: NewScenario, out: Console) -> None:
-    """Print how far the junction is from the requested position; warn if it may be another junction."""
-    if scenario.from_at_m is None:
-        return
-    distance = f"{scenario.from_at_m:,.0f} m from --at"
-    if not scenario.is_far_from_at:
-        out.print(f"position: the junction is {distance}")
-        return
-    out.print(
-        f"warning: the junction ({scenario.junction.title}) is {distance} and may not be the one that you mean."
-        " Junctions with signals are preferred. Check the position, and that the extract contains the junction."
-    )
 
 
 def print_demo_hints(results: Path) -> None:

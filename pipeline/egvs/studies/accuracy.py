@@ -288,8 +288,7 @@ class _StudyRun:
             name = setting.name
             if needed_s[name] > max(self.left_s, 0.0):
                 self.skipped[name] = BEYOND_BUDGET
-                details = {"why": f"about {needed_s[name]:.0f} s, {BEYOND_BUDGET}", "beyond": True}
-                self.listener(name, "skipped", details)
+                self.listener(name, "skipped", {"why": BEYOND_BUDGET, "beyond": True})
                 continue
             scores = saved[name]
             try:
