@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from typer.models import CommandInfo
@@ -257,14 +257,38 @@ def verify(
 
 @app.command()
 def compare(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN RUN...", help="Two or more folders of finished runs.")],
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUN...", help="Folders of finished runs; one is enough if its sites have several sensors."
+        ),
+    ],
+    by: Annotated[
+        Literal["pole", "site"] | None,
+        typer.Option(
+            help="Compare the best mounts of each pole, or sites of the same name. By default sites if no pole has "
+            "several sites and the common sites have the same mount in all runs, else poles."
+        ),
+    ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="costs.KEY=VALUE",
+            help="Override a cost, e.g. 'costs.sensor={\"VLP-32C\"=8000}' (repeatable).",
+        ),
+    ] = None,
     top: Top = None,
 ) -> None:
-    """Compare runs: scores, ranks, rank correlations, and differences in settings and files."""
-    from egvs.cli import study_tables
-    from egvs.studies import run_comparison
+    """Compare runs or sensors: the best mount of each pole, what one more percentage point costs, and settings."""
+    from egvs.cli.console import ProgressDisplay
 
-    study_tables.print_comparison(run_comparison.compare_runs(runs), top)
+    with ProgressDisplay("compare") as screen:
+        from egvs.cli import study_tables
+        from egvs.studies import run_comparison
+
+        comparison = run_comparison.compare_runs(runs, by, set_ or (), screen.progress)
+    study_tables.print_comparison(comparison, top)
 
 
 @app.command()
