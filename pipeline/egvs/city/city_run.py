@@ -32,6 +32,7 @@ from egvs.city.worker_pool import print_to_stderr
 from egvs.core.errors import Diagnostic, InputError, collect_warnings
 from egvs.core.grid import Roi
 from egvs.core.progress import ProgressCallback, no_progress
+from egvs.runs import run_names
 from egvs.runs.run import lock_run_folder
 
 _MIN_FIRST_COUNT = 4
@@ -100,7 +101,8 @@ def run_city(city: City, out: str | Path | None = None, options: CityRunOptions 
     city
         From :func:`egvs.city.model.load_city`.
     out
-        The folder of the city run; ``runs/<name of the city>`` when None.
+        The folder of the city run; ``runs/<name of the city>`` when None, or, with overrides, that and their label
+        (see :mod:`egvs.runs.run_names`).
     options
         Options of the run; the defaults when None.
 
@@ -112,8 +114,10 @@ def run_city(city: City, out: str | Path | None = None, options: CityRunOptions 
         When the traffic or a run fails, or the cluster is lost; finished results are kept.
     """
     options = options or CityRunOptions()
-    folder = _run_folder(city, out)
+    folder = _run_folder(city, out, options.overrides)
     jobs = make_jobs(city, folder, options)
+    for job in jobs[:1]:
+        job.scenario()  # rejects an invalid override before anything is written
     meter = CostMeter()
     with lock_run_folder(folder):
         scheduler.check_cluster(options.cluster)
@@ -201,8 +205,10 @@ def make_jobs(city: City, out: Path, options: CityRunOptions) -> list[Job]:
     return jobs
 
 
-def _run_folder(city: City, out: str | Path | None) -> Path:
-    return Path(out) if out is not None else Path("runs") / city.name
+def _run_folder(city: City, out: str | Path | None, overrides: Sequence[str]) -> Path:
+    if out is not None:
+        return Path(out)
+    return run_names.run_folder(city.name, run_names.parse_overrides(overrides))
 
 
 def place_city(
@@ -234,7 +240,7 @@ def place_city(
     options = options or CityRunOptions()
     requested = _check_request(count, budget)
     phases = _check_phases(phases, count)
-    folder = _run_folder(city, out)
+    folder = _run_folder(city, out, options.overrides)
     jobs = make_jobs(city, folder, options)
     for job in jobs:
         allocation.check_additive_config(job.scenario())
