@@ -384,13 +384,13 @@ def print_store(store: Store) -> None:
     columns: list[Column[StoreEntry]] = [
         Column("stage", lambda entry: entry.stage, "left"),
         Column("key", lambda entry: entry.key[:12], "left"),
-        Column("size", lambda entry: _format_size(entry.bytes)),
-        Column("age", lambda entry: _format_age(now - entry.created)),
-        Column("last used", lambda entry: f"{_format_age(now - entry.last_used)} ago"),
+        Column("size", lambda entry: format_size(entry.bytes)),
+        Column("age", lambda entry: format_age(now - entry.created)),
+        Column("last used", lambda entry: f"{format_age(now - entry.last_used)} ago"),
     ]
     out = console(120)
     out.print(make_table(columns, entries, truncate=True))
-    out.print(f"{store.folder}: {_format_total(entries)}, of at most {_format_size(store.bound_bytes)}")
+    out.print(f"{store.folder}: {_format_total(entries)}, of at most {format_size(store.bound_bytes)}")
 
 
 def print_removed(store: Store, removed: list[StoreEntry]) -> None:
@@ -400,17 +400,19 @@ def print_removed(store: Store, removed: list[StoreEntry]) -> None:
 
 def _format_total(entries: list[StoreEntry]) -> str:
     size = sum(entry.bytes for entry in entries)
-    return f"{len(entries)} entries, {_format_size(size)}"
+    return f"{len(entries)} entries, {format_size(size)}"
 
 
-def _format_size(size_bytes: float) -> str:
+def format_size(size_bytes: float) -> str:
+    """Return a size as text, e.g. "2.5 MB"."""
     for unit, unit_bytes in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("KB", 1e3)):
         if size_bytes >= unit_bytes:
             return f"{size_bytes / unit_bytes:.3g} {unit}"
     return f"{size_bytes:.3g} B"
 
 
-def _format_age(seconds: float) -> str:
+def format_age(seconds: float) -> str:
+    """Return a duration as text in its largest unit, e.g. "3 h"."""
     for unit, unit_s in (("d", 86400), ("h", 3600), ("min", 60)):
         if seconds >= unit_s:
             return f"{seconds / unit_s:.0f} {unit}"

@@ -303,6 +303,7 @@ def _sentences(contents: PageContents) -> dict[str, str]:
     setting = egvs_setting(scenario.gamma, tpog.grid.voxel_m, moving_occlusion=has_occlusion)
     return {
         "headline": headline(ranking, bool(tpog.counts.any())),
+        "contradiction": "" if contents.detected is None else contents.detected.check.contradiction,
         "lead": lead(ranking),
         "entropy_seen_note": entropy_seen_note(ranking),
         "disagreement": ranking_disagreement(ranking.sites, setting),

@@ -23,6 +23,7 @@ from egvs.core.errors import InputError, format_problem
 from egvs.core.grid import Grid
 from egvs.scenario.fields import NAME_DESCRIPTION
 from egvs.scenario.model import SCENARIO_FILE, SITE_DIRECTIONS, SITE_SENSORS, SITE_SOURCES, Scenario
+from egvs.scenario.settings import changed_settings, flatten_settings
 from egvs.scenario.traffic_config import TRAFFIC_SOURCES, TrafficConfig, keys_without_effect
 
 _ALTERNATIVE = re.compile(r"\.(?:(?:constrained-)?(?:float|int|str)|(?:literal|tuple)\[.*\])$")
@@ -170,19 +171,33 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
     path = Path(path)
     overrides = tuple(overrides)
     file = path / SCENARIO_FILE if path.is_dir() else path
-    values = _read_with_bases(file, ())
+    values = apply_overrides(_read_with_bases(file, ()), overrides)
+    try:
+        scenario = _build_scenario(values, file)
+    except InputError as error:
+        if not overrides or _scenario_without_overrides(file) is None:
+            raise
+        texts = [text.replace(str(file), "--set") for text in (error.where, error.problem, error.hint)]
+        raise InputError(*texts) from None
+    if overrides:
+        scenario._overrides = _changes_by_overrides(scenario, values, file)
+    return scenario
+
+
+def apply_overrides(values: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
+    """Return nested tables, as in a scenario file, with overrides ``"table.key=value"``; ``values`` may change too.
+
+    Raises
+    ------
+    InputError
+        When an override is not of this form, or names a row that does not exist.
+    """
     for override in overrides:
         if override.partition("=")[0].strip() == "extends":
             hint = f"Set it in a {SCENARIO_FILE}."
             raise InputError(f"--set {override}", "the key extends cannot be set here", hint)
         values = _apply_override(values, override)
-    try:
-        return _build_scenario(values, file)
-    except InputError as error:
-        if not overrides or not _is_valid_without_overrides(file):
-            raise
-        texts = [text.replace(str(file), "--set") for text in (error.where, error.problem, error.hint)]
-        raise InputError(*texts) from None
+    return values
 
 
 def _build_scenario(values: dict[str, Any], file: Path) -> Scenario:
@@ -192,13 +207,30 @@ def _build_scenario(values: dict[str, Any], file: Path) -> Scenario:
     return scenario
 
 
-def _is_valid_without_overrides(file: Path) -> bool:
-    """Return whether a scenario is valid without overrides."""
+def _scenario_without_overrides(file: Path) -> Scenario | None:
+    """Return the scenario of a file; None if it is not valid without overrides."""
     try:
-        _build_scenario(_read_with_bases(file, ()), file)
+        return _build_scenario(_read_with_bases(file, ()), file)
     except InputError:
-        return False
-    return True
+        return None
+
+
+def _changes_by_overrides(scenario: Scenario, values: dict[str, Any], file: Path) -> dict[str, Any]:
+    """Return the settings that overrides changed, by full key.
+
+    The resolved scenarios are compared, so that neither the spelling of a value counts, nor an override that repeats
+    the file or a default. A file that is not complete without the overrides is compared as it is written. The name is
+    left out: it is a name for the results.
+    """
+    resolved = scenario.model_dump(mode="json")
+    base = _scenario_without_overrides(file)
+    if base is not None:
+        changed = changed_settings(base.model_dump(mode="json"), resolved)
+    else:
+        changed = changed_settings(_read_with_bases(file, ()), values)
+        changed |= {key: value for key, value in flatten_settings(resolved).items() if key in changed}
+    changed.pop("name", None)
+    return changed
 
 
 def check_unused_keys(traffic: TrafficConfig, file: Path) -> None:
