@@ -29,7 +29,7 @@ from egvs.traffic import recording
 from tests.city.real_cluster import START_TIMEOUT_S, RealCluster, wait_until
 
 pytestmark = pytest.mark.system
-HAS_COSTS = ("report.html", "run.json", "costs.json", ".lock")
+HAS_COSTS = ("report.html", "run.json", "costs.json", ".lock", ".digests.json")
 
 
 def read_files(out: Path) -> dict[str, bytes]:
@@ -388,7 +388,8 @@ def test_killed_scheduler_leaves_a_run_that_continues_with_same_bytes(
     assert re.search(message, errors)
     assert "Traceback" not in errors
     assert not any((out / name).exists() for name in ("city.html", "junctions.parquet", "scores", "costs.json"))
-    assert not [path.name for path in out.rglob("*") if path.name.startswith(".") and path.name != ".lock"]
+    hidden = {path.name for path in out.rglob(".*")}
+    assert hidden <= {".lock", ".digests.json"}
 
     second = RealCluster(tmp_path_factory.mktemp("second"))
     try:
