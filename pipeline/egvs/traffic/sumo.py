@@ -54,7 +54,7 @@ _PROTOCOL_ERRORS = (struct.error, UnicodeDecodeError)
 
 
 _HUGE_PAGES = "glibc.malloc.hugetlb=1"
-"""Lets glibc ask the kernel for larger memory pages. A simulation reads the data of all vehicles several times per step."""
+"""Lets glibc ask for larger memory pages: SUMO reads the data of all vehicles several times in each step."""
 
 
 class SumoInputError(RunError):
