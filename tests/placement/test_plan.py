@@ -326,6 +326,10 @@ def test_report_shows_plan_until_inputs_change(five_candidates: Path, out: Path,
     assert "Which sites together?" not in before
     rows, _, _ = read_tables(out)
     assert all(f'<th scope="row">{row["site"]}</th>' in page for row in rows)
+    answer = text.splitlines()[-1]
+    assert answer.startswith(("A second sensor adds ", "One is enough: "))
+    assert answer in page
+    assert "± is one standard error, from 4 blocks of 10 frames" in page
     run_egvs("run", five_candidates, "--out", out, "--set", "score.gamma=2")
     run_egvs("run", five_candidates, "--out", out, "--set", "seed=8", "--set", "roi.voxel_m=1")
     assert "Which sites together?" not in (out / "report.html").read_text()

@@ -16,7 +16,19 @@ from typer.models import CommandInfo
 from egvs._version import __version__
 from egvs.cli import city, exit, place, sources, validate
 from egvs.cli import options as cli_options
-from egvs.cli.options import DEFAULT_POLES, Audit, Jobs, Out, Run, ScenarioPath, Set, SettingsPath, Top, Verbose
+from egvs.cli.options import (
+    DEFAULT_POLES,
+    Audit,
+    Jobs,
+    Out,
+    Rehash,
+    Run,
+    ScenarioPath,
+    Set,
+    SettingsPath,
+    Top,
+    Verbose,
+)
 from egvs.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -77,6 +89,7 @@ def run(
     top: Annotated[int, typer.Option("--top", metavar="N", min=1, help="Number of poles to print.")] = DEFAULT_POLES,
     all_: Annotated[bool, typer.Option("--all", help="Print the complete ranking of all sites and poles.")] = False,
     verbose: Verbose = False,
+    rehash: Rehash = False,
 ) -> None:
     """Run all stages in order and print the best poles; stages with unchanged inputs are skipped."""
     from egvs.cli.console import ProgressDisplay
@@ -84,9 +97,11 @@ def run(
     stage_options = {"score": {"audit": True}} if audit else None
     with ProgressDisplay("run", with_details=verbose) as screen:
         from egvs.cli import answer, run_tables
-        from egvs.runs import run
+        from egvs.runs import digest_cache, run
 
         loaded, folder = _load(scenario, set_, out)
+        if rehash:
+            digest_cache.forget_digests(folder)
         record = run.run(
             loaded, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, options=stage_options
         )
@@ -120,7 +135,7 @@ def demo(
         results, loaded = folder / "results", load(folder)
         record = run(loaded, results, jobs=jobs, progress=screen.progress, listener=screen.stage_event)
     answer.print_answer(results, loaded, record)
-    run_tables.print_demo_hints(folder, results)
+    run_tables.print_demo_hints(results)
 
 
 @app.command()

@@ -16,12 +16,13 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from egvs.artefacts.plan_step import PlanStep, plan_steps
 from egvs.artefacts.readers import read_accuracy, read_placement, read_validation
 from egvs.artefacts.run_folder import ACCURACY_FILES, PLACEMENT_FILES, VALIDATION_FILES
 from egvs.artefacts.run_record import StageRecord
 from egvs.artefacts.tpog import Tpog
 from egvs.core.errors import Diagnostic, collect_warnings
-from egvs.report import maps, svg_figures
+from egvs.report import maps, plan_answer, svg_figures
 from egvs.report.formatting import SCORE_LABELS, ScoreLabel, join_names
 from egvs.report.maps import Backdrop, PlannedPole
 from egvs.report.ranking import RankedSite
@@ -278,13 +279,20 @@ class PlanRow:
     score: float
     cost: float
     loss: float
+    score_se: float = math.nan
+    gain_se: float = math.nan
+
+    @classmethod
+    def from_row(cls, row: Mapping[str, Any]) -> PlanRow:
+        """Return a row of ``placement.parquet``; standard errors are NaN where it has none."""
+        return cls(**{field.name: row[field.name] for field in fields(cls) if field.name in row})
 
 
 @dataclass(frozen=True)
 class CurveRow:
-    """The best plan of ``count`` sensors; ``share`` is its part of the score of all candidates together."""
+    """The best plan of each number of sensors; ``share`` is its part of the score of all candidates together."""
 
-    count: int
+    step: PlanStep
     sites: tuple[str, ...]
     share: float
     certificate: float
@@ -305,6 +313,10 @@ class PlacementSummary:
         Best plans of 1, 2, ... sensors.
     joint, together
         Joint score of the plan, and of all candidates together.
+    errors_from
+        How the standard errors were computed; or the reason why there are none.
+    answer
+        How many sensors are enough, in one or two sentences; may be empty.
     cost
         Total cost; 0 without costs.
     candidates
@@ -326,6 +338,8 @@ class PlacementSummary:
     curve: tuple[CurveRow, ...]
     joint: float
     together: float
+    errors_from: str
+    answer: str
     cost: float
     candidates: int
     proof: str
@@ -363,23 +377,27 @@ class PlacementSummary:
             return None
         plan = metadata["plan"]
         by, joint = SCORE_LABELS[plan["score"]], plan["joint"]
-        picks = tuple(PlanRow(**{field.name: row[field.name] for field in fields(PlanRow)}) for row in rows)
+        picks = tuple(PlanRow.from_row(row) for row in rows)
         names = ", ".join(pick.site for pick in picks)
         before = None
         if "moves" in plan:
             before = plan["moves"]["before"]
         occupied = tpog.counts.sum(axis=2) / tpog.frames
         poles = _planned_poles(picks, joint, by)
+        steps, objective = plan_steps(curve_rows), describe_objective(plan["asked"])
+        next_count = plan_answer.next_count(steps, len(picks), plan["candidates"], plan["asked"])
         return cls(
             by=by,
             picks=picks,
-            curve=_curve(curve_rows, plan["together"] or math.inf),
+            curve=_curve(steps, curve_rows, plan["together"] or math.inf),
             joint=joint,
             together=plan["together"],
+            errors_from=plan.get("standard_errors", "the plan was made by an older version of egvs place"),
+            answer=plan_answer.describe_count(steps, by, objective=objective, next_count=next_count),
             cost=plan["cost"],
             candidates=plan["candidates"],
             proof=_describe_proof(plan, len(picks)),
-            objective=_describe_objective(plan["asked"]),
+            objective=objective,
             zones=tuple(plan["zones"]),
             before=before,
             map=maps.plan_map(tpog.grid, occupied, backdrop, candidates, poles, f"Map of the plan: {names}."),
@@ -393,19 +411,24 @@ class PlacementSummary:
             return 0.0
         return self.joint / self.together
 
-    def lost(self, pick: PlanRow) -> float:
-        """Return the share of the joint score that is lost if a sensor fails."""
-        if not self.joint:
-            return 0.0
-        return pick.loss / self.joint
+    @property
+    def has_errors(self) -> bool:
+        """Whether there are standard errors."""
+        return not any(math.isnan(row.step.score_se) for row in self.curve)
+
+    @property
+    def joint_text(self) -> str:
+        """Joint score of the plan with its standard error and its unit."""
+        se = self.picks[-1].score_se if self.picks else math.nan
+        return f"{self.by.with_error(self.joint, se)} {self.by.unit}".rstrip()
 
 
-def _curve(rows: Sequence[Mapping[str, Any]], together: float) -> tuple[CurveRow, ...]:
+def _curve(steps: Sequence[PlanStep], rows: Sequence[Mapping[str, Any]], together: float) -> tuple[CurveRow, ...]:
     curve = []
-    for row in rows:
+    for step, row in zip(steps, rows, strict=True):
         sites = tuple(json.loads(row["sites"]))
         certificate = _certificate(row["value"], row["bound"])
-        curve.append(CurveRow(row["count"], sites, row["score"] / together, certificate, row["cost"]))
+        curve.append(CurveRow(step, sites, step.score / together, certificate, row["cost"]))
     return tuple(curve)
 
 
@@ -439,7 +462,7 @@ def _describe_proof(plan: Mapping[str, Any], sensors: int) -> str:
     return f"it is not proved that {fewer} not enough"
 
 
-def _describe_objective(request: Mapping[str, Any]) -> str:
+def describe_objective(request: Mapping[str, Any]) -> str:
     """What the plan maximises, if not the joint score; empty otherwise."""
     parts = []
     if request["objective"] == "worst":
