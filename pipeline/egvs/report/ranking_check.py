@@ -26,8 +26,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from scipy.special import stdtrit
-
+from egvs.core.special import stdtrit
 from egvs.report.formatting import SCORE_LABELS, ScoreLabel
 
 ALPHA = 0.05

@@ -18,9 +18,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
 
 from egvs.artefacts.tpog import Tpog
+from egvs.core.special import stdtrit
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import TrafficConfig
 from egvs.studies.score_errors import SettingResult
