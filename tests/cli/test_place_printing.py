@@ -5,6 +5,8 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
+
 from egvs.cli import place
 
 
@@ -43,7 +45,26 @@ def test_best_single_site_in_the_plan_or_a_single_sensor_needs_no_sentence() -> 
 
 def test_sensor_table_has_costs_only_where_they_are_set() -> None:
     placed = placed_with(50.0)
-    placed.sensors = ()
+    placed.score, placed.sensors = "egvs", ()
     assert "cost" not in [column.header for column in place._sensor_table(placed).columns]
     placed.curve_costs = (3000.0,)
     assert "cost" in [column.header for column in place._sensor_table(placed).columns]
+
+
+@pytest.mark.parametrize(
+    ("score", "joint", "sentence"),
+    [
+        (
+            "expected_detections",
+            0.978704,
+            "a: share of vehicles found 97.9%; proved: no plan within the rules is better",
+        ),
+        ("egvs", 35754.4, "a: EGVS 35,754 bit; proved: no plan within the rules is better"),
+    ],
+)
+def test_plan_is_in_the_unit_of_its_score(score: str, joint: float, sentence: str) -> None:
+    placed = placed_with(joint)
+    placed.score, placed.joint_of_all, placed.sensors = score, 0.0, (SimpleNamespace(site="a"),)
+    placed.solution.point = placed.solution.curve[0]
+    placed.solution.is_best, placed.solution.fewest_is_proved = True, None
+    assert place.describe_plan(placed) == sentence

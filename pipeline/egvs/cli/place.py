@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from egvs.artefacts.planned_sensor import PlannedSensor
     from egvs.placement.plan import Placement, RefinementSummary
+    from egvs.report.formatting import ScoreLabel
 
 
 def place(
@@ -93,6 +94,7 @@ def print_placement(placed: Placement) -> None:
 def _sensor_table(placed: Placement) -> Table:
     from egvs.cli.console import Column, make_table
 
+    label = _label(placed)
     columns: list[Column[PlannedSensor]] = [
         Column("", lambda row: row.marked_order),
         Column("site", lambda row: row.site, "left"),
@@ -100,16 +102,23 @@ def _sensor_table(placed: Placement) -> Table:
         Column("yaw deg", lambda row: f"{row.yaw_deg:.1f}"),
         Column("pitch deg", lambda row: f"{row.pitch_deg:.1f}"),
         Column("sensor", lambda row: row.sensor, "left"),
-        Column("gain", lambda row: f"{row.gain:.6g}"),
-        Column("joint score", lambda row: f"{row.score:.6g}"),
+        Column(f"gain {label.unit}".strip(), lambda row: label.value(row.gain)),
+        Column(f"joint score {label.unit}".strip(), lambda row: label.value(row.score)),
         Column("lost if it fails", lambda row: f"{_loss_share(placed, row):.1%}"),
     ]
     if any(placed.curve_costs):
         columns.append(Column("cost", lambda row: f"{row.cost:g}"))
     if placed.refinement is not None:
         columns.append(Column("moved m", lambda row: f"{row.moved_m:.2f}"))
-        columns.append(Column("gained by moving", lambda row: f"{row.gain_by_refining:.6g}"))
+        columns.append(Column("gained by moving", lambda row: label.value(row.gain_by_refining)))
     return make_table(columns, placed.sensors)
+
+
+def _label(placed: Placement) -> ScoreLabel:
+    """Return the name and the unit of the joint score."""
+    from egvs.report.formatting import SCORE_LABELS
+
+    return SCORE_LABELS[placed.score]
 
 
 def _loss_share(placed: Placement, sensor: PlannedSensor) -> float:
@@ -123,9 +132,10 @@ def _curve_table(placed: Placement) -> Table:
     from egvs.cli.console import Column, make_table
 
     curve = placed.solution.curve
+    label = _label(placed)
     columns = [
         Column[int]("sensors", lambda i: str(curve[i].count)),
-        Column[int]("joint score", lambda i: f"{curve[i].plan_value.joint:.6g}"),
+        Column[int](f"joint score {label.unit}".strip(), lambda i: label.value(curve[i].plan_value.joint)),
         Column[int]("of all candidates", lambda i: f"{_score_share(placed, curve[i].plan_value.joint):.1%}"),
         Column[int]("proved, of the best possible score", lambda i: _format_rounded_down(curve[i].certificate)),
     ]
@@ -147,7 +157,7 @@ def describe_plan(placed: Placement) -> str:
     joint = placed.solution.point.plan_value.joint
     sites = ", ".join(sensor.site for sensor in placed.sensors) or "no sensor"
     cost = f" for {placed.curve_costs[-1]:g}" if placed.curve_costs[-1] else ""
-    score = f"{placed.score} {joint:.6g}"
+    score = _label(placed).with_noun(joint).removeprefix("the ")
     if placed.joint_of_all > 0:
         share = _score_share(placed, joint)
         score += f", {share:.1%} of the score of all {placed.candidates} candidates together"
@@ -200,8 +210,10 @@ def describe_refinement(placed: Placement, summary: RefinementSummary) -> str:
         cost = f", for {placed.cost:g}"
     if (summary.value_before, summary.value_after) != (summary.joint_before, placed.joint):
         objective = f"; objective {summary.value_before:.6g} before, {summary.value_after:.6g} after"
+    label = _label(placed)
+    before = label.with_noun(summary.joint_before).removeprefix("the ")
     return (
-        f"refined: {placed.score} {summary.joint_before:.6g} before, {placed.joint:.6g} after{change}"
+        f"refined: {before} before, {label.value(placed.joint)} after{change}"
         f"{objective}{cost}; {summary.poses_tried} poses tried in {summary.turns} rounds and {summary.seconds:.1f} s, "
         f"{summary.poses_infeasible} of them infeasible; the proof applies to the candidates at their original poses"
     )
