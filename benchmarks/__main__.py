@@ -23,7 +23,18 @@ from rich.console import Console
 from rich.table import Table
 
 import egvs
-from benchmarks import alternatives, casting, clouds, culling, detection, effects, file_checks, site_costs, stability
+from benchmarks import (
+    alternatives,
+    casting,
+    clouds,
+    culling,
+    detection,
+    effects,
+    file_checks,
+    site_costs,
+    stability,
+    start_up,
+)
 from benchmarks.scenes import run_stage
 from egvs.artefacts.tpog import read_tpog
 from egvs.core.threads import map_ordered
@@ -170,7 +181,7 @@ def main() -> None:
         folder = Path(temporary)
         rows, sumo = time_run(folder)
         rows += occupancy(folder, sumo) + sites(folder) + effects.rows(folder / "run") + detection.rows()
-        rows += clouds.rows(SCENARIO, folder / "run")
+        rows += clouds.rows(SCENARIO, folder / "run") + start_up.rows()
     for what, measured, bound, reached in rows:
         table.add_row(what, measured, bound, ("yes" if reached else "NO") if bound else "")
     console = Console(width=140, highlight=False)

@@ -7,7 +7,7 @@ import os
 import re
 import subprocess
 import sys
-from itertools import combinations
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from egvs.traffic import recording
 from tests.city.real_cluster import START_TIMEOUT_S, RealCluster, wait_until
 
 pytestmark = pytest.mark.system
-HAS_COSTS = ("report.html", "run.json", "costs.json", ".lock")
+HAS_COSTS = ("report.html", "run.json", "costs.json", ".lock", ".digests.json")
 
 
 def read_files(out: Path) -> dict[str, bytes]:
@@ -99,10 +99,15 @@ def test_verbose_prints_times_and_memory_of_every_process(city: City, tmp_path: 
     code, printed, _ = run_egvs("city", "run", city.folder, "--out", tmp_path / "out", "--verbose")
     assert code == 0
     costs = json.loads((tmp_path / "out" / "costs.json").read_text())
-    assert [part["part"] for part in costs["parts"]] == [
-        "start of the workers", "traffic", "junctions", "tables", "page",
-    ]  # fmt: skip
-    assert {stage["stage"] for stage in costs["stages"]} == {*STAGE_NAMES}
+    parts = [part for part in costs["parts"] if not part["within"]]
+    assert [part["part"] for part in parts] == ["start of the workers", "traffic", "junctions", "tables", "page"]
+    assert all(before["end_s"] <= after["start_s"] for before, after in pairwise(parts))
+    (split,) = (part for part in costs["parts"] if part["part"] == "split")  # SUMO does not run for a finished file
+    assert split["within"] == "traffic"
+    assert parts[1]["start_s"] <= split["start_s"] <= split["end_s"] <= parts[1]["end_s"]
+    assert {stage["stage"] for stage in costs["stages"]} >= {*STAGE_NAMES}
+    assert (costs["size"]["junctions"], costs["size"]["sites"], costs["size"]["frames"]) == (2, 4, 60)
+    assert all(size > 0 for size in costs["size"].values())
     assert all(stage["peak_mb"] > 0 for stage in costs["stages"])
     names = [process["process"] for process in costs["processes"]]
     assert names[0] == "egvs"
@@ -358,7 +363,8 @@ def test_killed_scheduler_leaves_a_run_that_continues_with_same_bytes(
     assert re.search(message, errors)
     assert "Traceback" not in errors
     assert not any((out / name).exists() for name in ("city.html", "junctions.parquet", "scores", "costs.json"))
-    assert not [path.name for path in out.rglob("*") if path.name.startswith(".") and path.name != ".lock"]
+    hidden = {path.name for path in out.rglob(".*")}
+    assert hidden <= {".lock", ".digests.json"}
 
     second = RealCluster(tmp_path_factory.mktemp("second"))
     try:

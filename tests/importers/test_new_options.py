@@ -100,10 +100,10 @@ def test_solids_out_of_range_do_not_change_scores(tmp_path: Path) -> None:
 
 # --- distance from --at --------------------------------------------------------------------------------------------
 def print_new(summary: NewScenario, capsys: pytest.CaptureFixture[str]) -> str:
-    from egvs.cli import run_tables
+    from egvs.cli import new_summary
 
     capsys.readouterr()
-    run_tables.print_new_scenario(summary)
+    new_summary.print_new_scenario(summary)
     return " ".join(capsys.readouterr().out.split())
 
 
@@ -111,7 +111,7 @@ def test_distance_from_requested_position_is_printed(tmp_path: Path, capsys: pyt
     near = openstreetmap.create_scenario(tmp_path / "near", SMALL, at=(52.0003, 10.0))
     assert near.from_at_m == pytest.approx(33.4 - junction_half_depth_m(near), abs=0.5)
     printed = print_new(near, capsys)
-    assert f"position: the junction is {near.from_at_m:.0f} m from --at" in printed
+    assert f"at 52.00000,10.00000, {near.from_at_m:.0f} m from --at" in printed
     assert printed.count("warning:") == 1
 
     without = openstreetmap.create_scenario(tmp_path / "without", SMALL)

@@ -332,7 +332,7 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Made:
 def test_real_town(town: Made) -> None:
     folder, summary = town
     assert "Meisebacher Straße" in summary.junction.title and summary.junction.signalised
-    assert summary.to_json()["assumed_traffic"]["assumed_per_hour"] > 1000
+    assert summary.traffic is not None and summary.traffic.assumed_per_h > 1000
     assert summary.statics.heights["building"] == {"levels": 1, "default": 262}
     assert summary.statics.objects["tree_trunk"] == 10
     assert summary.statics.dropped["out_of_range"] == {"barrier": 2, "building": 379, "pole": 18, "tree": 5}

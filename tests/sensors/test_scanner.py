@@ -20,6 +20,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import Roi
 from egvs.formats import point_clouds
 from egvs.formats.georeference import WorldFrame
+from egvs.kernels import embree
 from egvs.sensors.scanner import Scan, Scanner
 from egvs.sensors.scene import Scene
 from egvs.sensors.sites import Pose
@@ -233,7 +234,7 @@ def test_culling_keeps_all_shapes_that_beams_meet() -> None:
 
 
 def test_builds_no_tree_without_geometry_in_reach(mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ray_casting, "TriangleTree", lambda triangles: pytest.fail("a tree was built"))
+    monkeypatch.setattr(embree, "TriangleTree", lambda triangles: pytest.fail("a tree was built"))
     for number, solids in enumerate(((), (prism(5, 60, 9, 70, 0, 9, "building"),))):
         _, out = run_scan(
             write_scene(mini, *solids, sites="pole_a,10,12,3\n"), tmp_path / str(number), "statics.ground=false"

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from egvs.artefacts import checksums, parquet
 from egvs.artefacts.run_folder import RunFolder
@@ -244,6 +243,8 @@ def _read_study(paths: list[Path], checksum_file: str, what: str, command: str) 
 
 def read_visibility(path: str | Path, site: str) -> FloatArray:
     """Return the hits of one site in every voxel, (nx, ny, nz) float64, from ``visibility.parquet``."""
+    import pyarrow.compute as pc  # a slow import, which only this function needs
+
     path = Path(path)
     table, metadata = parquet.read_artefact(path, "visibility")
     rows = table.filter(pc.equal(table.column("site"), site))

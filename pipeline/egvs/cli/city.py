@@ -14,7 +14,6 @@ from egvs.cli import options
 if TYPE_CHECKING:
     from egvs.city.city_run import CityPlacement, CityRun, CityRunOptions
     from egvs.city.costs import CityCosts
-    from egvs.city.creation import NewCity
     from egvs.city.plan_comparison import PlanComparison
     from egvs.city.tasks import JobResult
     from egvs.city.traffic_split import CityTraffic
@@ -24,7 +23,12 @@ _WIDTH = 150
 
 CityPath = Annotated[Path, typer.Argument(metavar="CITY", help="A folder created by egvs city new.")]
 CityOut = Annotated[
-    Path | None, typer.Option("--out", metavar="DIR", help="Folder of the city run; runs/<name> by default.")
+    Path | None,
+    typer.Option(
+        "--out",
+        metavar="DIR",
+        help="Folder of the city run; by default runs/<name>, with --set runs/<name>@<what differs>.",
+    ),
 ]
 Cluster = Annotated[
     str,
@@ -82,10 +86,11 @@ def new(
         radius_m = options.length_m(radius, "--radius")
     with ProgressDisplay("city") as screen:
         from egvs.city import creation
+        from egvs.cli import new_summary
 
         new_options = creation.NewCityOptions(centre, radius_m, junctions, lefthand, walk, traffic, screen.progress)
         created = creation.create_city(folder, osm, new_options)
-    _print_new(created)
+    new_summary.print_new_city(created)
 
 
 def traffic(city: CityPath) -> None:
@@ -197,23 +202,6 @@ def _run_options(
     return CityRunOptions(cluster, junctions or (), overrides or (), screen.progress, on_done, screen.say)
 
 
-def _print_new(city: NewCity) -> None:
-    from egvs.cli.console import WIDE, Column, console, make_table, print_mapping
-
-    columns: list[Column[Any]] = [
-        Column("junction", lambda row: row.id, "left"),
-        Column("title", lambda row: row.junction.title, "left", wrap=True),
-        Column("lanes in", lambda row: str(row.junction.lanes_in)),
-        Column("poles", lambda row: str(len(row.poles))),
-        Column("sites", lambda row: str(row.n_candidates)),
-    ]
-    out = console(WIDE)
-    out.print(make_table(columns, city.junctions))
-    print_mapping({"folder": str(city.folder)} | city.to_json(), _WIDTH)
-    out.print(f"traffic: the network {city.traffic.summary}")
-    out.print(f"next: egvs city run {city.folder}")
-
-
 def _print_traffic(folder: Path, result: CityTraffic) -> None:
     from egvs.city import model
     from egvs.cli.console import console, print_mapping
@@ -284,8 +272,10 @@ def print_costs(costs: CityCosts) -> None:
     from egvs.cli.console import WIDE, Column, console, make_table
 
     parts: list[Column[Any]] = [
-        Column("part", lambda part: part.part, "left"),
+        Column("part", lambda part: f"  {part.part}" if part.within else part.part, "left"),
         Column("seconds", lambda part: f"{part.seconds:.2f}"),
+        Column("start s", lambda part: f"{part.start_s:.2f}"),
+        Column("end s", lambda part: f"{part.end_s:.2f}"),
     ]
     stages: list[Column[Any]] = [
         Column("stage, at all junctions", lambda stage: stage.stage, "left"),
@@ -296,6 +286,7 @@ def print_costs(costs: CityCosts) -> None:
         Column("process", lambda process: process.process, "left"),
         Column("host", lambda process: process.host, "left"),
         Column("peak MB", lambda process: f"{process.peak_mb:.0f}"),
+        Column("core s", lambda process: "" if process.busy_s is None else f"{process.busy_s:.1f}"),
     ]
     out = console(WIDE)
     out.print(make_table(parts, costs.parts))

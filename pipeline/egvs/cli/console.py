@@ -23,6 +23,9 @@ from egvs.core.errors import collect_warnings
 NARROW, WIDE = 110, 190
 """Terminals below ``NARROW`` columns get fewer columns of tables; those of about ``WIDE`` get all."""
 
+_UNBROKEN_WIDTH = 100_000
+"""No sentence is longer."""
+
 MAX_WARNINGS = 3
 """Warnings that a command prints without details."""
 
@@ -61,6 +64,13 @@ def console(file_width: int, *, soft_wrap: bool = True) -> Console:
     """
     width = None if sys.stdout.isatty() else file_width
     return Console(width=width, highlight=False, markup=False, emoji=False, soft_wrap=soft_wrap)
+
+
+def print_sentences(sentences: Iterable[str]) -> None:
+    """Print sentences, broken between words where a terminal is too narrow; in a file, one line each."""
+    out = console(_UNBROKEN_WIDTH, soft_wrap=False)
+    for sentence in sentences:
+        out.print(sentence)
 
 
 def make_table(

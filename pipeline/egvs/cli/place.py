@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from egvs.cli import options
-from egvs.cli.options import Jobs, Out, ScenarioPath, Set
+from egvs.cli import options, sources
+from egvs.cli.options import Jobs, Out, Set, SettingsPath
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def place(
-    scenario: ScenarioPath,
+    scenario: SettingsPath,
     out: Out = None,
     count: Annotated[int | None, typer.Option(metavar="K", help="Find the best plan of at most K sensors.")] = None,
     budget: Annotated[
@@ -48,17 +48,14 @@ def place(
     from egvs.cli.console import WIDE, ProgressDisplay, console
 
     limit_s = options.duration_s(time_limit, "--time-limit")
-    overrides = list(set_ or ())
+    request = []
     for key, value in (("count", count), ("budget", budget), ("reach", reach)):
         if value is not None:
-            overrides.append(f"placement.{key}={value!r}")
+            request.append(f"placement.{key}={value!r}")
+    loaded, folder = sources.open_source(scenario, set_, out, request)
     with ProgressDisplay("place") as screen:
         from egvs.placement import plan
-        from egvs.runs.run import default_folder
-        from egvs.scenario.loading import load
 
-        loaded = load(scenario, overrides)
-        folder = out or default_folder(loaded)
         placed = plan.place(
             loaded, folder, exact=exact, time_limit_s=limit_s, refine=refine, jobs=jobs, progress=screen.progress,
             listener=screen.stage_event,

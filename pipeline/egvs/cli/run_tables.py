@@ -13,20 +13,18 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
 from rich.table import Table
 
 from egvs.artefacts import parquet
 from egvs.artefacts.readers import DISTINCT_PROBABILITY, PeriodRank, PeriodRanking
 from egvs.artefacts.run_record import RunRecord
-from egvs.cli.console import NARROW, WIDE, Column, console, format_or_dash, make_table, print_mapping, print_table
+from egvs.cli.console import NARROW, WIDE, Column, console, format_or_dash, make_table, print_table
 from egvs.core.errors import collect_warnings
 from egvs.report import sections
 from egvs.report.formatting import SCORE_LABELS, ScoreLabel
 from egvs.report.ranking import Pole, RankedSite, companion_score, group_by_pole
 
 if TYPE_CHECKING:
-    from egvs.importers.openstreetmap import NewScenario
     from egvs.runs.store import Store, StoreEntry
     from egvs.sensors.sensor import Sensor
     from egvs.stages.check import CheckReport
@@ -265,47 +263,10 @@ def print_check(checked: CheckReport) -> None:
     out.print(f"checked {checked.sites} sites, {checked.solids} solids and {checked.lanes} lanes")
 
 
-def print_new_scenario(scenario: NewScenario) -> None:
-    """Print what ``egvs new`` created."""
-    out = console(_RESULT_FILE_WIDTH)
-    description = scenario.to_json()
-    notes = description.pop("notes")
-    print_mapping(description, _RESULT_FILE_WIDTH)
-    for note in notes:
-        out.print(f"note: {note}")
-    _print_distance(scenario, out)
-    hourly = 0
-    assumed = "the traffic is assumed"
-    if scenario.traffic is not None:
-        hourly = scenario.traffic.per_h
-        out.print(f"traffic: {scenario.traffic.summary} ({hourly:,} vehicles an hour)")
-        if scenario.traffic.level is None:
-            assumed = "the shares of the movements are assumed"
-    out.print(
-        f"warning: {assumed} ({hourly:,} vehicles an hour); this affects the ranking. "
-        f"Enter counted traffic under [traffic] in {scenario.folder / 'scenario.toml'} before you rely on the ranking."
-    )
-    out.print(f"next: egvs run {scenario.folder}")
-
-
-def _print_distance(scenario: NewScenario, out: Console) -> None:
-    """Print how far the junction is from the requested position; warn if it may be another junction."""
-    if scenario.from_at_m is None:
-        return
-    distance = f"{scenario.from_at_m:,.0f} m from --at"
-    if not scenario.is_far_from_at:
-        out.print(f"position: the junction is {distance}")
-        return
-    out.print(
-        f"warning: the junction ({scenario.junction.title}) is {distance} and may not be the one that you mean."
-        " Junctions with signals are preferred. Check the position, and that the extract contains the junction."
-    )
-
-
-def print_demo_hints(folder: Path, results: Path) -> None:
+def print_demo_hints(results: Path) -> None:
     """Print what to try after ``egvs demo``."""
     out = console(_RESULT_FILE_WIDTH)
-    out.print(f"next: egvs place {folder} --out {results} --count 2   (the best two sensors together)")
+    out.print(f"next: egvs place {results} --count 2   (the best two sensors together)")
     out.print(f"      egvs explore {results}   (move a sensor and see its score; needs egvs[explore])")
     out.print("      egvs new mytown --osm extract.osm.pbf   (your own junction, from OpenStreetMap)")
 
@@ -423,13 +384,13 @@ def print_store(store: Store) -> None:
     columns: list[Column[StoreEntry]] = [
         Column("stage", lambda entry: entry.stage, "left"),
         Column("key", lambda entry: entry.key[:12], "left"),
-        Column("size", lambda entry: _format_size(entry.bytes)),
-        Column("age", lambda entry: _format_age(now - entry.created)),
-        Column("last used", lambda entry: f"{_format_age(now - entry.last_used)} ago"),
+        Column("size", lambda entry: format_size(entry.bytes)),
+        Column("age", lambda entry: format_age(now - entry.created)),
+        Column("last used", lambda entry: f"{format_age(now - entry.last_used)} ago"),
     ]
     out = console(120)
     out.print(make_table(columns, entries, truncate=True))
-    out.print(f"{store.folder}: {_format_total(entries)}, of at most {_format_size(store.bound_bytes)}")
+    out.print(f"{store.folder}: {_format_total(entries)}, of at most {format_size(store.bound_bytes)}")
 
 
 def print_removed(store: Store, removed: list[StoreEntry]) -> None:
@@ -439,17 +400,19 @@ def print_removed(store: Store, removed: list[StoreEntry]) -> None:
 
 def _format_total(entries: list[StoreEntry]) -> str:
     size = sum(entry.bytes for entry in entries)
-    return f"{len(entries)} entries, {_format_size(size)}"
+    return f"{len(entries)} entries, {format_size(size)}"
 
 
-def _format_size(size_bytes: float) -> str:
+def format_size(size_bytes: float) -> str:
+    """Return a size as text, e.g. "2.5 MB"."""
     for unit, unit_bytes in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("KB", 1e3)):
         if size_bytes >= unit_bytes:
             return f"{size_bytes / unit_bytes:.3g} {unit}"
     return f"{size_bytes:.3g} B"
 
 
-def _format_age(seconds: float) -> str:
+def format_age(seconds: float) -> str:
+    """Return a duration as text in its largest unit, e.g. "3 h"."""
     for unit, unit_s in (("d", 86400), ("h", 3600), ("min", 60)):
         if seconds >= unit_s:
             return f"{seconds / unit_s:.0f} {unit}"

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from egvs.cli import options
-from egvs.cli.options import Jobs, Out, ScenarioPath, Set
+from egvs.cli import options, sources
+from egvs.cli.options import Jobs, Out, ScenarioPath, Set, SettingsPath
 from egvs.core.errors import InputError, MissingBackendError
 
 DEFAULT_FRAMES = 250
@@ -25,7 +25,7 @@ Spacing = Annotated[
 
 
 def validate(
-    scenario: ScenarioPath,
+    scenario: SettingsPath,
     out: Out = None,
     set_: Set = None,
     frames: Annotated[int, typer.Option(min=10, help=_FRAMES_HELP)] = DEFAULT_FRAMES,
@@ -60,16 +60,13 @@ def validate(
         option = "--keep" if keep else "--detections"
         raise InputError(option, "not available with a plan", f"Omit {option}, or omit --plan and --plan-from.")
     detectors = [name.strip() for name in detector.split(",") if name.strip()]
+    loaded, folder = sources.open_source(scenario, set_, out)
     with ProgressDisplay("validate") as screen:
         from egvs.cli import validation_tables
-        from egvs.runs.run import default_folder
-        from egvs.scenario.loading import load
         from egvs.validation import plan_validation, site_validation
         from egvs.validation.held_out_traffic import FrameSampling
         from egvs.validation.kitti_results import KittiFiles
 
-        loaded = load(scenario, set_ or ())
-        folder = out or default_folder(loaded)
         sampling = FrameSampling(frames, spacing)
         if of_plan:
             plan_result = plan_validation.validate_plan(

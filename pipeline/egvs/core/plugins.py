@@ -10,7 +10,7 @@ https://packaging.python.org/en/latest/specifications/entry-points/
 from __future__ import annotations
 
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import Distribution, EntryPoint, entry_points
 from importlib.util import find_spec
 from operator import attrgetter
 from typing import Any
@@ -81,13 +81,13 @@ def plugin_module(group: str, name: str) -> str:
 
 def plugin_package(group: str, name: str) -> str:
     """Return the package that declares an entry point; KeyError when the group declares no such name."""
-    return _distribution_name(_entry_points_by_name(group)[name])
+    return _distribution_name(_entry_points_by_name(group)[name].dist)
 
 
 def plugin_error(group: str, name: str, problem: str) -> MissingBackendError:
     """Make the error for an entry point whose object cannot be used; it names the package and the entry point."""
     entry = _entry_points_by_name(group)[name]
-    origin = f"entry point {entry.value!r} of the package {_distribution_name(entry)}"
+    origin = f"entry point {entry.value!r} of the package {_distribution_name(entry.dist)}"
     return MissingBackendError(f"{name!r} of {group} cannot be loaded: {problem} ({origin})")
 
 
@@ -123,17 +123,19 @@ def load_plugin(group: str, name: str) -> Any:
 @cache
 def _entry_points_by_name(group: str) -> dict[str, EntryPoint]:
     def priority(entry: EntryPoint) -> tuple[bool, str, str]:
-        package = _distribution_name(entry)
+        package = _distribution_name(entry.dist)
         return package != PACKAGE_NAME, package, entry.value
 
     entries = sorted(entry_points(group=group), key=priority)
     return {entry.name: entry for entry in reversed(entries)}
 
 
-def _distribution_name(entry: EntryPoint) -> str:
-    if entry.dist is None or "Name" not in entry.dist.metadata:  # the backport of importlib.metadata raises for it
+@cache
+def _distribution_name(distribution: Distribution | None) -> str:
+    """Return the name of a package, whose metadata are parsed for that; ``"?"`` where it is unknown."""
+    if distribution is None or "Name" not in distribution.metadata:  # the backport of importlib.metadata raises for it
         return "?"
-    return entry.dist.metadata["Name"] or "?"
+    return distribution.metadata["Name"] or "?"
 
 
 def _has_attribute(plugin: object, attribute: str) -> bool:

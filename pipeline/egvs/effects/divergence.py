@@ -24,9 +24,9 @@ import math
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from scipy.special import cosdg, sindg
 
 from egvs.core.grid import FloatArray
+from egvs.core.special import cosdg, sindg
 from egvs.effects.base import Expand
 from egvs.scenario.effects_config import DivergenceParameters, EffectParameters
 from egvs.sensors.beam_hooks import SubBeams

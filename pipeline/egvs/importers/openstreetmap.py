@@ -147,14 +147,6 @@ class AssumedTraffic:
         share = f"{TRAFFIC_LEVELS[self.level]:.0%}".replace("%", " %")
         return f"carries {at_least}{self.carried_per_h:,} vehicles an hour; {self.level} {share} is used"
 
-    def to_json(self) -> dict[str, Any]:
-        """Return a summary as plain JSON."""
-        return {
-            "flows": len(self.flows), "vehicles_per_hour": self.per_h, "level": self.level or "as requested",
-            "assumed_per_hour": self.assumed_per_h, "carried_per_hour": self.carried_per_h,
-            "trial_runs": len(self.capacity.runs),
-        }  # fmt: skip
-
 
 @dataclass(frozen=True)
 class NewScenario:
@@ -204,29 +196,6 @@ class NewScenario:
     def flows(self) -> tuple[CountConfig, ...]:
         """The flows of the scenario; empty where no street leads through the region of interest."""
         return () if self.traffic is None else self.traffic.flows
-
-    def to_json(self) -> dict[str, Any]:
-        """Return a summary as plain JSON, the most interesting keys first."""
-        junction, streets = self.junction, self.streets
-        _, roi = roi_table(self.roi)
-        return {
-            "folder": str(self.folder),
-            "attribution": ATTRIBUTION,
-            "junction": {
-                "title": junction.title, "id": junction.id, "signalised": junction.signalised,
-                "x_m": junction.at_m[0], "y_m": junction.at_m[1], "lanes_in": junction.lanes_in, "arms": junction.arms,
-            },
-            "roi": roi,
-            "network": {
-                "edges": len(streets.network.edges), "lane_length_m": round(streets.lane_length_m),
-                "signalised_junctions": sum(j.signalised for j in streets.junctions),
-            },
-            "assumed_traffic": {"flows": 0} if self.traffic is None else self.traffic.to_json(),
-            "poles": self.poles,
-            "sites": self.n_candidates,
-            "statics": self.statics.to_json(),
-            "notes": list(self.notes),
-        }  # fmt: skip
 
 
 def create_scenario(

@@ -1,41 +1,22 @@
-"""The ``njit`` decorator of this program, and a disk cache of compiled kernels that survives damage.
+"""The ``njit`` decorator of this program: numba is imported, and a kernel compiled, when a kernel is first called.
 
-Numba keeps compiled code beside each source file and checks that file alone: a kernel that calls a changed kernel of
-another file is not compiled again. Here, all compiled kernels lie in one folder whose name is a digest of the sources
-of all kernels, of numba's version and of Python's.
-
-Numba also trusts the content of its cache files; a truncated one crashes the program. Here, each file starts with the
-hash of its content. A file that is damaged, belongs to another kernel or cannot be written is ignored, and the kernel
-is compiled again.
+Importing numba takes longer than all else that a run without changes does, so importing a module of kernels does not
+import it. Compiled kernels are cached on disk (:mod:`egvs.kernels.kernel_cache`).
 """
 
 from __future__ import annotations
 
-import hashlib
-import os
-import pickle
-import shutil
-import stat
-import sys
-import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+import functools
+import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numba
-from numba.core.caching import FunctionCache
-from numba.core.serialize import dumps
-
-MAX_OLD_CACHES = 2
-"""Number of caches of other sources that stay, the most recently used ones: a running program may need one."""
-
-_HASH_BYTES = hashlib.sha256().digest_size
-_cache_enabled = True
-"""False where no folder can be written."""
+_DISPATCHER_LOCK = threading.RLock()
+"""Held while a dispatcher is made: threads that call a kernel for the first time share one."""
 
 
-def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+def njit(**options: Any) -> Callable[[Callable[..., Any]], Kernel]:
     """Compile a kernel with ``numba.njit``: without the GIL, with numpy's division by zero, cached on disk.
 
     Parameters
@@ -44,112 +25,66 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         Further options of ``numba.njit``, for example ``forceinline=True``.
     """
 
-    def decorate(function: Callable[..., Any]) -> Any:
-        dispatcher = numba.njit(nogil=True, error_model="numpy", **options)(function)
-        if _cache_enabled and hasattr(dispatcher, "enable_caching"):  # a plain function under NUMBA_DISABLE_JIT
-            dispatcher._cache = _CheckedCache(function)
-        return dispatcher
+    def decorate(function: Callable[..., Any]) -> Kernel:
+        return Kernel(function, options)
 
     return decorate
 
 
-class _CheckedCache(FunctionCache):
-    """The compiled versions of one function: a file for each signature and processor, each after its hash."""
-
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the compiled code of a signature, or None where there is no intact file."""
-        target_context.refresh()
-        key = self._index_key(sig, target_context.codegen())
-        try:
-            data = self._file(key).read_bytes()
-        except OSError:
-            return None
-        digest, content = data[:_HASH_BYTES], data[_HASH_BYTES:]
-        if hashlib.sha256(content).digest() != digest:
-            return None
-        stored_key, payload = pickle.loads(content)
-        if stored_key != key:
-            return None
-        return self._impl.rebuild(target_context, payload)
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        """Write the compiled code of a signature, where the folder can be written."""
-        if not self._impl.check_cachable(data):
-            return
-        key = self._index_key(sig, data.codegen)
-        content = dumps((key, self._impl.reduce(data)))
-        path = self._file(key)
-        with suppress(OSError):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".", delete=False) as file:
-                try:
-                    file.write(hashlib.sha256(content).digest() + content)
-                    file.close()
-                    Path(file.name).replace(path)
-                except OSError:
-                    Path(file.name).unlink(missing_ok=True)
-
-    def _file(self, key: Any) -> Path:
-        name = hashlib.sha256(repr(key).encode()).hexdigest()[:16]
-        return Path(self.cache_path) / f"{self._impl.filename_base}.{name}.kernel"
-
-
-def use_cache_folder(kernels: Path) -> None:
-    """Choose the folder of compiled kernels; call it before any kernel is imported.
-
-    The first of these that can be written: the package's ``__pycache__``, the user's cache, the temporary directory.
-    Where none can be written, kernels are not cached.
+class Kernel:
+    """A function that numba compiles for the types of its arguments when it is called.
 
     Parameters
     ----------
-    kernels
-        The folder of the package that holds all kernels.
+    function
+        The function in Python.
+    options
+        Further options of ``numba.njit``.
     """
-    global _cache_enabled
-    digest = hashlib.sha256(f"numba {numba.__version__} python {sys.version}".encode())
-    for path in sorted(kernels.rglob("*.py")):
-        digest.update(path.relative_to(kernels).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
-    name = f"numba-{digest.hexdigest()[:12]}"
-    for parent in _candidate_folders(kernels):
-        if _is_writable_folder(parent / name):
-            numba.config.CACHE_DIR = str(parent / name)  # type: ignore[attr-defined]
-            _remove_old_caches(parent, name)
-            return
-    _cache_enabled = False
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        functools.update_wrapper(self, function)
+        self._function = function
+        self._options = options
+        self._made: Any = None
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the compiled function."""
+        return (self._made or self._dispatcher)(*arguments)
+
+    @property
+    def _dispatcher(self) -> Any:
+        """Numba's dispatcher, which chooses among the compiled versions; a plain function under NUMBA_DISABLE_JIT."""
+        with _DISPATCHER_LOCK:
+            if self._made is None:
+                self._made = _make_dispatcher(self._function, self._options)
+        return self._made
+
+    @property
+    def _numba_type_(self) -> Any:
+        """What numba asks for where another kernel calls this one."""
+        return self._dispatcher._numba_type_
+
+    @property
+    def stats(self) -> Any:
+        """Numba's statistics of the cache: how often compiled code was found there."""
+        return self._dispatcher.stats
 
 
-def _candidate_folders(kernels: Path) -> Iterator[Path]:
-    if folder := os.environ.get("NUMBA_CACHE_DIR"):
-        yield Path(folder)
-    else:
-        yield kernels / "__pycache__"
-        with suppress(RuntimeError):  # a user without a home
-            yield Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "egvs"
-    if not hasattr(os, "geteuid"):  # Windows, where the temporary folder is the user's
-        return
-    with suppress(OSError):
-        temporary = Path(tempfile.gettempdir()) / f"egvs-{os.geteuid()}"
-        temporary.mkdir(mode=0o700, exist_ok=True)
-        status = temporary.lstat()
-        is_private = status.st_uid == os.geteuid() and not status.st_mode & 0o022
-        if stat.S_ISDIR(status.st_mode) and is_private:
-            yield temporary  # nobody else can put a kernel there
+def _make_dispatcher(function: Callable[..., Any], options: dict[str, Any]) -> Any:
+    import numba
+
+    from egvs.kernels.kernel_cache import CheckedCache
+
+    is_cached = _has_cache_folder()
+    dispatcher = numba.njit(nogil=True, error_model="numpy", **options)(function)
+    if is_cached and hasattr(dispatcher, "enable_caching"):  # a plain function under NUMBA_DISABLE_JIT
+        dispatcher._cache = CheckedCache(function)
+    return dispatcher
 
 
-def _is_writable_folder(folder: Path) -> bool:
-    """Return whether a folder exists, or can be made, and files can be written to it."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        os.utime(folder)
-        with tempfile.TemporaryFile(dir=folder):
-            return True
-    except OSError:
-        return False
+@functools.cache
+def _has_cache_folder() -> bool:
+    from egvs.kernels.kernel_cache import use_cache_folder
 
-
-def _remove_old_caches(parent: Path, name: str) -> None:
-    with suppress(OSError):  # another process may be removing them too
-        old = [path for path in parent.glob("numba-" + "?" * 12) if path.name != name]
-        old.sort(key=lambda path: path.stat().st_mtime)
-        for path in old[:-MAX_OLD_CACHES]:
-            shutil.rmtree(path, ignore_errors=True)
+    return use_cache_folder(Path(__file__).resolve().parent)

@@ -13,16 +13,18 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from egvs.report.svg_figures import Box
 from egvs.traffic import network, sumo_folder
 from egvs.traffic.network import Edge, Lane, Network
 from egvs.world.mesh import World
+
+if TYPE_CHECKING:
+    import shapely
 
 _SMALL_M2 = 4.0
 """Solids with a smaller footprint are street furniture."""
@@ -53,6 +55,8 @@ class Outlines:
 
 def world_outlines(world: World, box: Box) -> tuple[Outlines, ...]:
     """Return the outlines of the static world within a box, buildings first, trees last; without the ground."""
+    import shapely
+
     corners = world.triangles_m[:, :, :2]
     low, high = world.bounds_xy_m
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -90,6 +94,8 @@ def union_of_triangles(triangles: NDArray[np.float64], box: Box) -> Any:
     box
         Triangles that reach out of this box are never replaced.
     """
+    import shapely
+
     low, high = triangles.min(axis=1), triangles.max(axis=1)
     small = ((high - low) <= _SMALL_M).all(axis=1) & (low > box[:2]).all(axis=1) & (high < box[2:]).all(axis=1)
     if np.count_nonzero(small) <= _MAX_SMALL_TRIANGLES:
@@ -115,6 +121,8 @@ def _solid_style(kind: str, area_m2: float) -> str:
 
 
 def _shape_rings(shape: Any) -> Iterable[NDArray[np.float64]]:
+    import shapely
+
     for part in shapely.get_parts(shape):
         if part.geom_type == "Polygon":
             for ring in (part.exterior, *part.interiors):
@@ -171,6 +179,8 @@ def network_file(folder: Path) -> Path | None:
 
 def roads_within(path: Path | None, box: Box) -> Roads:
     """Return the roads of a network within a box; empty without a network."""
+    import shapely
+
     if path is None:
         return Roads()
     roads = network.read_net_xml(path)
@@ -203,6 +213,8 @@ def _lane_style(lane: Lane) -> str:
 
 
 def _pieces(points: Line, frame: shapely.Polygon) -> Iterator[Line]:
+    import shapely
+
     if len(points) < 2:
         return
     for part in shapely.get_parts(shapely.intersection(shapely.LineString(points), frame)):

@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
@@ -203,6 +202,8 @@ class ScoreTable:
 
     def column(self, score: str, period: str = MIX) -> ScoreColumn:
         """Return one score of all sites in the mix, or in a period."""
+        import pyarrow.compute as pc
+
         is_score = pc.equal(self.table.column("score"), score)
         rows = self.table.filter(pc.and_(is_score, pc.equal(self.table.column("period"), period)))
         replicate = rows.column("replicate").to_numpy()

@@ -41,13 +41,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtr, stdtrit
 
 from egvs.artefacts import parquet
 from egvs.artefacts import tpog as tpog_file
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, Grid, IntArray
+from egvs.core.special import stdtr, stdtrit
 from egvs.kernels.occupancy import accumulate
 from egvs.scoring.autocorrelation import WINDOW_TIMES
 from egvs.scoring.egvs import EntropyField, Hits, sum_hits_by_class

@@ -35,9 +35,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.special import expit
 
 from egvs.core.grid import FloatArray, IntArray
+from egvs.core.special import expit
 from egvs.kernels.boosted_trees import add_tree_values
 from egvs.scoring.blindspots import SpotVisibility
 from egvs.scoring.targets import SEEN_WELL_POINTS, VisibleTargets, weighted_mean

@@ -54,6 +54,9 @@ def zone_areas(scenario: Scenario, zones: Mapping[str, ZoneArea], key: str) -> d
     InputError
         When a file cannot be read, or has no valid area of the zone's name.
     """
+    if not zones:
+        return {}
+
     import shapely
 
     areas: dict[str, BaseGeometry] = {}
@@ -79,10 +82,13 @@ def file_settings(zones: Mapping[str, ZoneArea], areas: Mapping[str, BaseGeometr
     areas
         Their areas, from :func:`zone_areas`.
     """
+    names = [name for name, zone in zones.items() if zone.file is not None]
+    if not names:
+        return {}
+
     import shapely
 
-    corners = {name: shapely.to_wkb(areas[name], hex=True) for name, zone in zones.items() if zone.file is not None}
-    return {"zone_files": corners} if corners else {}
+    return {"zone_files": {name: shapely.to_wkb(areas[name], hex=True) for name in names}}
 
 
 def _read_areas(path: Path, world: Georeference) -> dict[str, BaseGeometry]:

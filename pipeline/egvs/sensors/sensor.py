@@ -34,12 +34,12 @@ from pathlib import Path
 
 import numpy as np
 from pydantic import Field
-from scipy.special import cosdg, sindg
 
 from egvs.core import files, limits
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.numbers import parse_decimal
+from egvs.core.special import cosdg, sindg
 from egvs.scenario.model import Scenario
 from egvs.scenario.sensor_config import BeamPatternConfig, SensorConfig
 

@@ -30,11 +30,11 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from scipy.special import cosdg, sindg
 
 from egvs.core.errors import Diagnostic, DiagnosticsError, InputError
 from egvs.core.grid import Vec3
 from egvs.core.numbers import parse_decimal
+from egvs.core.special import cosdg, sindg
 from egvs.formats import vector_files
 from egvs.scenario.fields import MAX_COORDINATE_M
 from egvs.scenario.model import Scenario, SiteGrid, SiteLine

@@ -25,8 +25,8 @@ from egvs.core.progress import ProgressCallback, no_progress
 from egvs.effects import registry
 from egvs.effects.base import Expand
 from egvs.runs.run import check_no_overwrite, lock_run_folder, refresh_report
+from egvs.runs.run_sources import SettingsSource
 from egvs.runs.stage_registry import RANKING_STAGES
-from egvs.scenario.loading import load
 from egvs.scenario.model import Scenario
 from egvs.studies import measurement, pareto_figure, score_errors, study_settings
 from egvs.studies.measurement import Neighbours, SettingListener, SettingRunner, SettingScores, scenario_dependencies
@@ -136,7 +136,7 @@ def run_accuracy_study(
     Parameters
     ----------
     path, overrides
-        The scenario, and arguments of ``--set``.
+        The scenario and arguments of ``--set``, or a run folder.
     out
         Run folder for ``accuracy.parquet`` and ``accuracy.png``; intermediate results go to ``out / "accuracy"``.
     options
@@ -154,7 +154,7 @@ def run_accuracy_study(
     plugins.require_libraries("egvs accuracy", "figure", "matplotlib")
     if not 1e-6 <= options.tolerance <= 1:
         raise InputError("--tolerance", f"expected 1e-6 to 1, got {options.tolerance:g}", "Use 0.02, for example.")
-    check_no_overwrite(load(path, overrides), out, (measurement.STUDY_FOLDER,))
+    check_no_overwrite(SettingsSource(path, tuple(overrides)).load(), out, (measurement.STUDY_FOLDER,))
     with lock_run_folder(out):
         runner = SettingRunner(path, overrides, out, options.jobs, progress)
         scenario = runner.scenario(SCENARIO_AS_IS)
@@ -288,8 +288,7 @@ class _StudyRun:
             name = setting.name
             if needed_s[name] > max(self.left_s, 0.0):
                 self.skipped[name] = BEYOND_BUDGET
-                details = {"why": f"about {needed_s[name]:.0f} s, {BEYOND_BUDGET}", "beyond": True}
-                self.listener(name, "skipped", details)
+                self.listener(name, "skipped", {"why": BEYOND_BUDGET, "beyond": True})
                 continue
             scores = saved[name]
             try:

@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from egvs.core import limits, reading
@@ -270,6 +269,8 @@ class _StepCheck:
 
 
 def _xml_batch(rows: list[dict[str, str]], path: Path) -> pa.RecordBatch:
+    import pyarrow.compute as pc
+
     for row in rows:
         for name in _REQUIRED_COLUMNS:
             if name not in row:
@@ -327,6 +328,8 @@ class _RowBatch:
     """
 
     def __init__(self, batch: pa.RecordBatch, rows_before: int, path: Path, unit: str) -> None:
+        import pyarrow.compute as pc
+
         names = batch.column("id")
         has_vehicle = pc.and_(pc.is_valid(names), pc.fill_null(pc.not_equal(names, ""), False))
         self.columns: dict[str, Any] = {n: pc.filter(batch.column(n), has_vehicle) for n in batch.schema.names}
@@ -334,6 +337,8 @@ class _RowBatch:
         self._where = f"{path}: {unit}"
 
     def check_types(self) -> None:
+        import pyarrow.compute as pc
+
         for i in _true_positions(pc.fill_null(pc.equal(self.columns["type"], ""), True)):
             hint = "Write the type of each vehicle; it determines the size."
             raise self._error(i, f"{self._vehicle(i)} has no type", hint)
@@ -370,6 +375,8 @@ class _RowBatch:
 
 
 def _to_table(columns: dict[str, Any], time_ms: NDArray[np.int64]) -> pa.Table:
+    import pyarrow.compute as pc
+
     columns = columns | {"time_ms": pa.array(time_ms)}
     for name, default in _OPTIONAL_DEFAULTS.items():
         values = _floats(columns[name]) if name in columns else np.full(time_ms.size, default)
@@ -379,6 +386,8 @@ def _to_table(columns: dict[str, Any], time_ms: NDArray[np.int64]) -> pa.Table:
 
 def _floats(column: Any) -> NDArray[np.float64]:
     """Convert to float64; nulls become NaN."""
+    import pyarrow.compute as pc
+
     array: NDArray[np.float64] = pc.cast(column, pa.float64()).to_numpy(zero_copy_only=False)
     return array
 

@@ -26,7 +26,6 @@ from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from pydantic import Field, ValidationError
 
 from egvs.artefacts.frame_boxes import MAX_BOX_M, MIN_BOX_M
@@ -330,6 +329,8 @@ def survey_fcd(path: Path, until_ms: int | None = None) -> FcdSurvey:
     InputError
         When the file has no vehicle, or :func:`egvs.traffic.fcd.read_fcd` rejects it.
     """
+    import pyarrow.compute as pc
+
     metadata = read_fcd_metadata(path)
     if metadata is not None:
         duration_ms = (metadata.frames - 1) * metadata.period_ms

@@ -29,16 +29,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import shapely
 
 from egvs.core.errors import Diagnostic, RunError
 from egvs.core.grid import FloatArray, Roi
 from egvs.traffic.network import Network
 from egvs.traffic.sumo_folder import RED_MARGIN_S, Timing
 from egvs.traffic.vehicle_boxes import VehicleSize
+
+if TYPE_CHECKING:
+    import shapely
 
 XY = tuple[float, float]
 
@@ -131,6 +133,8 @@ class StreetNames:
 
     def at(self, at_m: XY) -> str:
         """Return the junction and the street at a position."""
+        import shapely
+
         lanes = list(self._by_lane)
         lines = [self._by_lane[lane].lanes[int(lane.rpartition("_")[2])].shape_m[:, :2] for lane in lanes]
         distances = [shapely.Point(at_m).distance(_line(points)) for points in lines]
@@ -138,6 +142,8 @@ class StreetNames:
 
 
 def _line(points: FloatArray) -> shapely.Geometry:
+    import shapely
+
     return shapely.LineString(points) if len(points) > 1 else shapely.Point(points[0])
 
 

@@ -211,7 +211,7 @@ def box_centres(
     tuple of ndarray
         x, y and z, metres, rounded to 1 micrometre.
     """
-    from scipy.special import cosdg, sindg
+    from egvs.core.special import cosdg, sindg
 
     half, flat = length_m / 2, cosdg(slope_deg)
     return (

@@ -19,15 +19,15 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import cosdg, sindg
 
 from egvs.core.errors import InputError
 from egvs.core.grid import Roi
+from egvs.core.special import cosdg, sindg
 from egvs.kernels import ray_triangle
-from egvs.kernels.embree import TriangleTree
 from egvs.world.mesh import World
 
 Floats = NDArray[np.float64]
@@ -47,11 +47,6 @@ _THIN_M = 1e-3
 _STEEP_SINE = 0.25
 # more than the tolerances of the kernels and the rounding of float64 need
 _PADDING_M = 1e-5
-
-_ANGLES_DEG = np.arange(64) * (360 / 64)
-_CIRCLE = np.column_stack([cosdg(_ANGLES_DEG), sindg(_ANGLES_DEG), np.zeros(64)])
-# normals of planes that may separate shapes
-_NORMALS = np.concatenate([np.roll(_CIRCLE, axis, axis=1) for axis in range(3)])
 
 
 @dataclass(frozen=True)
@@ -120,6 +115,8 @@ class Caster:
         if len(faces):
             self._planes = _planes(self._triangles)
             enlarged, self._owner = _enlarge(self._triangles)
+            from egvs.kernels.embree import TriangleTree  # loads Embree and numba, which only a cast needs
+
             self._tree = TriangleTree(enlarged)
 
     def scan(self, position_m: tuple[float, float, float], directions: Floats, range_m: float) -> EmptyScan:
@@ -225,11 +222,12 @@ def reachable_shapes(shapes: Floats, roi: Roi, sites_m: Floats, range_m: float =
     origin = np.asarray(roi.origin_m)
     sites = sites_m - origin
     shapes = shapes - origin
-    is_rising = (_corners(roi) @ _NORMALS.T).min(axis=0) >= (sites @ _NORMALS.T).max(axis=0)
+    normals = _separating_normals()
+    is_rising = (_corners(roi) @ normals.T).min(axis=0) >= (sites @ normals.T).max(axis=0)
     gap = np.maximum(shapes.min(axis=1) - sites.max(axis=0), sites.min(axis=0) - shapes.max(axis=1))
     distance = np.sqrt((np.maximum(gap, 0.0) ** 2).sum(axis=1))
     is_reachable: NDArray[np.bool_] = distance <= range_m + _CLEARANCE_M
-    for normal in _NORMALS[is_rising]:
+    for normal in normals[is_rising]:
         is_reachable &= (shapes @ normal).max(axis=1) >= (sites @ normal).min() - _CLEARANCE_M
     return is_reachable
 
@@ -252,12 +250,21 @@ def shapes_between(shapes: Floats, roi: Roi, sites_m: Floats) -> NDArray[np.bool
         False only for shapes that are certainly not in between.
     """
     origin = np.asarray(roi.origin_m)
-    heights = np.column_stack([((shapes - origin) @ normal).max(axis=1) for normal in _NORMALS])
-    box = (_corners(roi) @ _NORMALS.T).min(axis=0)
+    normals = _separating_normals()
+    heights = np.column_stack([((shapes - origin) @ normal).max(axis=1) for normal in normals])
+    box = (_corners(roi) @ normals.T).min(axis=0)
     is_between = np.zeros(len(shapes), dtype=np.bool_)
-    for site in (sites_m - origin) @ _NORMALS.T:
+    for site in (sites_m - origin) @ normals.T:
         is_between |= (heights >= np.minimum(site, box) - _PADDING_M).all(axis=1)
     return is_between
+
+
+@cache
+def _separating_normals() -> Floats:
+    """Return normals of planes that may separate shapes, (192, 3)."""
+    angles_deg = np.arange(64) * (360 / 64)
+    circle = np.column_stack([cosdg(angles_deg), sindg(angles_deg), np.zeros(64)])
+    return np.concatenate([np.roll(circle, axis, axis=1) for axis in range(3)])
 
 
 def _corners(roi: Roi) -> Floats:

@@ -16,12 +16,11 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 from xml.etree.ElementTree import Element
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
-from shapely import Polygon
 
 from egvs.core.errors import Diagnostic, InputError
 from egvs.formats import xml
@@ -30,6 +29,9 @@ from egvs.traffic.network import read_location
 from egvs.world.footprints import CROSSING_RINGS, Footprint, FootprintFile, to_polygons
 from egvs.world.geolocation import network_world_frame
 from egvs.world.map_features import POLE_TYPES, TRUNK_RADIUS_M, SolidType, SolidTypes, is_underground, vertical_extent
+
+if TYPE_CHECKING:
+    from shapely import Polygon
 
 _INNER = "inner"
 # polyconvert's colour of courtyards, which have another type with --osm.keep-full-type
@@ -115,6 +117,7 @@ class _PolygonReader:
     """Collects the solids of one file, shape by shape."""
 
     def __init__(self, path: Path, types: SolidTypes, height_m: float, world: Georeference) -> None:
+
         self._path = path
         self._types = types
         self._height_m = height_m
@@ -193,6 +196,9 @@ class _PolygonReader:
 
     def _areas(self, shape: _Shape, points: Points) -> list[Polygon]:
         """Return what an outline encloses: each part where it crosses itself, nothing where it is flat."""
+        import shapely
+        from shapely import Polygon
+
         if np.isfinite(points).all() and shapely.make_valid(Polygon(points)).area == 0:
             self._ignore("outlines that enclose nothing", shape.element.get("type", ""))
             return []
@@ -275,6 +281,8 @@ class _PolygonReader:
 
     def _cut_courtyards(self) -> None:
         """Cut polygons of type ``inner``, and white ones inside their own kind, out of what surrounds them."""
+        import shapely
+
         footprints = self._file.footprints
         tree = shapely.STRtree([footprint.polygon for footprint in footprints])
         for polygon in self._inner:
@@ -353,6 +361,8 @@ def _check_height(text: str, where: str) -> None:
 
 def _cut_courtyard(footprint: Footprint, courtyard: Polygon) -> Footprint | None:
     """Return the footprint without the courtyard; None if the courtyard is not inside."""
+    import shapely
+
     if not footprint.polygon.covers(courtyard) or footprint.polygon.equals(courtyard):
         return None
     remaining = footprint.polygon.difference(courtyard)
@@ -363,6 +373,8 @@ def _cut_courtyard(footprint: Footprint, courtyard: Polygon) -> Footprint | None
 
 def _count_inside(footprints: list[Footprint]) -> int:
     """Count pairs of a footprint inside another of the same kind and vertical extent."""
+    import shapely
+
     shapes = np.array([footprint.polygon for footprint in footprints], dtype=object)
     pairs = zip(*shapely.STRtree(shapes).query(shapes, predicate="within").tolist(), strict=True)
     extents = [(footprint.kind, footprint.base_m, footprint.height_m) for footprint in footprints]

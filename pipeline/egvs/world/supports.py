@@ -9,13 +9,15 @@ it in plan. The width of a footprint is the longer side of the smallest rectangl
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from egvs.world.mesh import World
+
+if TYPE_CHECKING:
+    import shapely
 
 KINDS = ("pole", "mast", "sign")
 MAX_WIDTH_M = 1.0
@@ -43,6 +45,8 @@ class Supports:
     @classmethod
     def of(cls, world: World) -> Supports:
         """Find the supports of a world."""
+        import shapely
+
         is_support_kind = np.array([kind.lower() in KINDS for _, kind in world.solids], dtype=np.bool_)
         faces = np.flatnonzero(is_support_kind[world.solid_of_face])
         faces = faces[np.argsort(world.solid_of_face[faces], kind="stable")]
@@ -54,11 +58,15 @@ class Supports:
 
     def at(self, x_m: float, y_m: float) -> tuple[int, ...]:
         """Return the solids that carry a sensor at a location, in order; none where there is no support."""
+        import shapely
+
         distance_m = shapely.distance(self.footprints, shapely.Point(x_m, y_m))
         return tuple(self.solids[distance_m <= MAX_DISTANCE_M + _ROUNDING_M].tolist())
 
 
 def _width_m(footprint: shapely.Geometry) -> float:
+    import shapely
+
     rectangle = shapely.get_coordinates(shapely.oriented_envelope(footprint))
     sides_m = np.hypot(*np.diff(rectangle[:3], axis=0).T)
     return float(sides_m.max(initial=0.0))

@@ -39,10 +39,10 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from scipy.special import cosdg, sindg
 
 from egvs.core import files
 from egvs.core.grid import FloatArray, IntArray, Roi
+from egvs.core.special import cosdg, sindg
 from egvs.kernels import detection
 from egvs.validation.detectors import background
 from egvs.validation.detectors.background import GroundMap, empty_scan_points

@@ -1,0 +1,148 @@
+"""What ``egvs new`` and ``egvs city new`` print: what was found in the map, and what was assumed.
+
+One line for each part of the new scenario. Where a part needs more words (what happened to every object of the map),
+the line says which file has them.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from egvs.cli.console import WIDE, Column, console, make_table
+from egvs.importers import junctions
+from egvs.importers.openstreetmap import PITCHES_DEG, SENSOR, STATICS_FILE, NewScenario
+from egvs.importers.osm_network import ATTRIBUTION
+from egvs.importers.osm_solids import OUT_OF_RANGE, ImportCounts
+
+if TYPE_CHECKING:
+    from egvs.city.creation import NewCity, NewJunction
+    from egvs.importers.junctions import Streets
+    from egvs.importers.openstreetmap import AssumedTraffic
+
+_FILE_WIDTH = 160
+
+
+def print_new_scenario(scenario: NewScenario) -> None:
+    """Print what ``egvs new`` created."""
+    out = console(_FILE_WIDTH)
+    for name, text in _scenario_lines(scenario):
+        out.print(f"{name:<9} {text}")
+    for note in scenario.notes:
+        out.print(f"note: {note}")
+    for warning in _scenario_warnings(scenario):
+        out.print(f"warning: {warning}")
+    out.print(f"Map data {ATTRIBUTION}")
+    out.print(f"next: egvs run {scenario.folder}")
+
+
+def print_new_city(city: NewCity) -> None:
+    """Print what ``egvs city new`` created."""
+    columns: list[Column[NewJunction]] = [
+        Column("junction", lambda row: row.id, "left"),
+        Column("title", lambda row: row.junction.title, "left", wrap=True),
+        Column("lanes in", lambda row: str(row.junction.lanes_in)),
+        Column("poles", lambda row: str(len(row.poles))),
+        Column("sites", lambda row: str(row.n_candidates)),
+    ]
+    out = console(WIDE)
+    out.print(make_table(columns, city.junctions))
+    for name, text in _city_lines(city):
+        out.print(f"{name:<9} {text}")
+    for note in city.notes:
+        out.print(f"note: {note}")
+    out.print(f"Map data {ATTRIBUTION}")
+    out.print(f"next: egvs city run {city.folder}")
+
+
+def _scenario_lines(scenario: NewScenario) -> Iterator[tuple[str, str]]:
+    junction, roi = scenario.junction, scenario.roi
+    arms = f"{junction.arms} arms, {junction.lanes_in} incoming lanes"
+    yield "junction", f"{junction.title}: {arms}; {_position(scenario)}"
+    yield "region", f"{roi.size_m[0]:g} m x {roi.size_m[1]:g} m x {junctions.ROI_HEIGHT_M:g} m around the junction"
+    yield "streets", _describe_streets(scenario.streets)
+    yield "traffic", _describe_traffic(scenario.traffic)
+    mounts = f"{len(junctions.HEIGHTS_M)} heights x {len(PITCHES_DEG)} tilts"
+    yield "sites", f"{scenario.n_candidates:,} candidates: {scenario.poles} poles x {mounts}, sensor {SENSOR}"
+    yield "solids", _describe_solids(scenario.statics)
+    if left_out := _describe_dropped(scenario.statics):
+        yield "", f"left out: {left_out} (all counts: {STATICS_FILE})"
+
+
+def _city_lines(city: NewCity) -> Iterator[tuple[str, str]]:
+    from egvs.city.creation import IMPORT_FILE
+
+    poles = sum(len(row.poles) for row in city.junctions)
+    sites = sum(row.n_candidates for row in city.junctions)
+    yield "junctions", f"{len(city.junctions):,} with {poles:,} poles and {sites:,} candidate sites"
+    if city.left_out:
+        reasons = [f"{len(ids):,} ({reason})" for reason, ids in city.left_out.items()]
+        yield "", f"left out: {', '.join(reasons)}"
+    yield "streets", _describe_streets(city.streets)
+    used = f"{city.traffic.vehicles_per_h:,} vehicles start per hour (assumed)"
+    yield "traffic", f"the network {city.traffic.summary}: {used}"
+    yield "solids", _describe_solids(city.statics)
+    if left_out := _describe_dropped(city.statics):
+        yield "", f"left out: {left_out} (all counts: {IMPORT_FILE})"
+
+
+def _position(scenario: NewScenario) -> str:
+    """Return longitude and latitude of the junction, and its distance from the requested position."""
+    longitude_deg, latitude_deg = scenario.streets.to_degrees([scenario.junction.at_m])[0]
+    position = f"at {latitude_deg:.5f},{longitude_deg:.5f}"
+    if scenario.from_at_m is None:
+        return position
+    return f"{position}, {scenario.from_at_m:,.0f} m from --at"
+
+
+def _describe_streets(streets: Streets) -> str:
+    signalised = sum(junction.signalised for junction in streets.junctions)
+    length = f"{streets.lane_length_m / 1000:,.1f} km of lanes"
+    return f"{_count('edge', len(streets.network.edges))}, {length}, {_count('junction', signalised)} with signals"
+
+
+def _describe_traffic(traffic: AssumedTraffic | None) -> str:
+    if traffic is None:
+        return "none: no street leads vehicles through the region"
+    movements = _count("movement", len(traffic.flows))
+    return f"the junction {traffic.summary}: {traffic.per_h:,} vehicles an hour in {movements} (assumed)"
+
+
+def _describe_solids(counts: ImportCounts) -> str:
+    solids = Counter({kind: number for kind, number in counts.objects.items() if kind != "tree_crown"})
+    texts = [_count(kind.removesuffix("_trunk"), number) for kind, number in solids.most_common()]
+    return ", ".join(texts) or "none"
+
+
+def _describe_dropped(counts: ImportCounts) -> str:
+    """Return what is left out and why, except objects out of range, which a note names."""
+    texts = []
+    for reason, kinds in sorted(counts.dropped.items()):
+        if reason != OUT_OF_RANGE:
+            objects = ", ".join(_count(kind, number) for kind, number in kinds.most_common())
+            texts.append(f"{objects} ({reason.replace('_', ' ')})")
+    return "; ".join(texts)
+
+
+def _count(kind: str, number: int) -> str:
+    plural = "" if number == 1 else "s"
+    return f"{number:,} {kind.replace('_', ' ')}{plural}"
+
+
+def _scenario_warnings(scenario: NewScenario) -> Iterator[str]:
+    if scenario.is_far_from_at:
+        distance = f"{scenario.from_at_m:,.0f} m from --at"
+        yield (
+            f"the junction ({scenario.junction.title}) is {distance} and may not be the one that you mean."
+            " Junctions with signals are preferred. Check the position, and that the extract contains the junction."
+        )
+    assumed, per_h = "the traffic is assumed", 0
+    if scenario.traffic is not None:
+        per_h = scenario.traffic.per_h
+        if scenario.traffic.level is None:
+            assumed = "the shares of the movements are assumed"
+    yield (
+        f"{assumed} ({per_h:,} vehicles an hour); this affects the ranking."
+        f" Enter counted traffic under [traffic] in {scenario.folder / 'scenario.toml'} before you rely on the ranking."
+    )

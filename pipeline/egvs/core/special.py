@@ -1,0 +1,44 @@
+"""Special functions of scipy, which is imported when one of them is first called.
+
+Importing ``scipy.special`` takes longer than a whole run in which nothing has changed. Angles are in degrees, and
+``cosdg`` and ``sindg`` are exact at multiples of 90 degrees.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+def cosdg(angle_deg: Any) -> Any:
+    """Return the cosine of an angle, or of each angle in an array."""
+    from scipy import special
+
+    return special.cosdg(angle_deg)
+
+
+def sindg(angle_deg: Any) -> Any:
+    """Return the sine of an angle, or of each angle in an array."""
+    from scipy import special
+
+    return special.sindg(angle_deg)
+
+
+def expit(logit: Any) -> Any:
+    """Return the logistic function of each number in an array."""
+    from scipy import special
+
+    return special.expit(logit)
+
+
+def stdtr(freedom: Any, t: Any) -> Any:
+    """Return the cumulative distribution function of Student's t."""
+    from scipy import special
+
+    return special.stdtr(freedom, t)
+
+
+def stdtrit(freedom: Any, probability: Any) -> Any:
+    """Return the inverse of the cumulative distribution function of Student's t."""
+    from scipy import special
+
+    return special.stdtrit(freedom, probability)
