@@ -29,7 +29,7 @@ from egvs.traffic import recording
 from tests.city.real_cluster import START_TIMEOUT_S, RealCluster, wait_until
 
 pytestmark = pytest.mark.system
-HAS_COSTS = ("report.html", "run.json", "costs.json", ".lock")
+HAS_COSTS = ("report.html", "run.json", "costs.json", ".lock", ".digests.json")
 
 
 def read_files(out: Path) -> dict[str, bytes]:
@@ -136,6 +136,31 @@ def test_runs_one_junction_with_overrides(city: City, tmp_path: Path) -> None:
     assert '"gamma": 2' in (results.junction_run_folder(ran.out, "east") / "run.json").read_text()
     with pytest.raises(InputError, match=r"--junction north: no such junction in .* Use one of west, east"):
         city_run.run_city(city, tmp_path / "out", CityRunOptions(junctions=["north"]))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_process_cluster")
+def test_overrides_have_a_folder_of_their_own(
+    city: City, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_egvs: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for overrides in ([], ["score.gamma=2.0"], ["score.gamma = 2"]):
+        city_run.run_city(city, None, CityRunOptions(overrides=overrides))
+    names = {city.name, f"{city.name}@gamma=2"}
+    assert {path.name for path in Path("runs").iterdir()} == names
+    code, printed, _ = run_egvs("runs")
+    assert code == 0
+    assert {line.split()[0] for line in printed.splitlines() if "city run" in line} == names
+    assert "complete" in run_egvs("runs", f"runs/{city.name}@gamma=2/junctions")[1]
+
+
+def test_invalid_override_writes_nothing(city: City, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = sorted(city.folder.rglob("*"))
+    with pytest.raises(InputError, match=r"--set: score\.gama: unknown key"):
+        city_run.run_city(city, None, CityRunOptions(overrides=["score.gama=2"]))
+    assert not Path("runs").exists()
+    assert sorted(city.folder.rglob("*")) == before
 
 
 def test_checks_cluster_before_simulating(city: City, tmp_path: Path) -> None:
@@ -363,7 +388,8 @@ def test_killed_scheduler_leaves_a_run_that_continues_with_same_bytes(
     assert re.search(message, errors)
     assert "Traceback" not in errors
     assert not any((out / name).exists() for name in ("city.html", "junctions.parquet", "scores", "costs.json"))
-    assert not [path.name for path in out.rglob("*") if path.name.startswith(".") and path.name != ".lock"]
+    hidden = {path.name for path in out.rglob(".*")}
+    assert hidden <= {".lock", ".digests.json"}
 
     second = RealCluster(tmp_path_factory.mktemp("second"))
     try:

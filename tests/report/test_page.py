@@ -23,6 +23,7 @@ from egvs.scenario.effects_config import EffectsConfig
 from tests.report.small_runs import (
     EMPTY_BACKDROP,
     FRAMES,
+    SENSOR,
     SITES,
     UNSAFE_NAME,
     PageReader,
@@ -196,6 +197,48 @@ def test_shows_user_columns_by_pole(tmp_path):
 
 def test_has_no_table_of_user_columns_without_them(plain_run):
     assert "Your columns from the sites file" not in plain_run[2]
+
+
+TWO_SENSORS = {"small": SENSOR, "dense": SENSOR | {"azimuth_step_deg": 1}}
+SITES_OF_TWO_SENSORS = [("n small", 6, 9, 2, "small"), ("n dense", 6, 9, 2, "dense"), ("s", 6, -1, 2, "small")]
+
+
+def sensor_section(folder, **keys):
+    """Text of the section on sensors, ranked by the share of vehicles seen well."""
+    keys |= {"sensors": TWO_SENSORS, "score": {"rank_by": "seen_well"}}
+    html = render_report(*run_to_scores(folder, SITES_OF_TWO_SENSORS, columns=("sensor",), **keys))
+    assert PageReader(html).ids.count("sensors") == 1
+    return html.split('<section id="sensors">')[1].split("</section>")[0]
+
+
+def test_compares_sensors_where_there_are_several(tmp_path):
+    section = sensor_section(tmp_path)
+    rows = [row.split("</th>")[0] for row in section.split('<th scope="row">')[1:]]
+    assert rows == ["small", "dense"]  # the one that sees least is the baseline
+    assert "One more" not in section
+    assert "--set &#39;costs.sensor={&#34;small&#34; = PRICE, &#34;dense&#34; = PRICE}&#39;" in section
+    assert "docs/validity.md" in section
+
+
+def test_shows_what_one_more_percentage_point_costs(tmp_path):
+    costs = {"sensor": {"small": 1000, "dense": 4000}}
+    section = sensor_section(tmp_path, costs=costs)
+    scores = read_scores(tmp_path / "out" / "scores.parquet").to_pydict()
+    seen = dict(zip(scores["site"], scores["seen_well"], strict=True))
+    points = 100 * (seen["n dense"] - max(seen["n small"], seen["s"]))
+    assert points > 0
+    assert f'data-label="One more point costs">{3000 / points:,.0f}<' in section
+    assert "PRICE" not in section
+
+
+def test_has_no_section_on_sensors_with_one_sensor(plain_run):
+    assert "Which sensor?" not in plain_run[2]
+
+
+def test_costs_are_an_input_of_the_page(plain_run, tmp_path):
+    _, out, _ = plain_run
+    before = inputs_of(page, make_scenario(tmp_path, SITES), out)
+    assert inputs_of(page, make_scenario(tmp_path, SITES, costs={"pole": 5}), out) != before
 
 
 def test_page_of_one_site(tmp_path):

@@ -81,13 +81,13 @@ def test_columns_and_metadata_match_schemas(done: tuple[Path, Path]) -> None:
 
 def test_second_run_skips_every_stage(done: tuple[Path, Path], run_egvs) -> None:
     mini, out = done
-    before = {p.name: p.stat().st_mtime_ns for p in out.iterdir() if p.is_file() and p.name != ".lock"}
+    before = {p.name: p.stat().st_mtime_ns for p in out.iterdir() if p.is_file() and not p.name.startswith(".")}
     assert set(states(egvs.load(mini), out).values()) == {"skipped"}
     code, printed, said = run_egvs("run", mini, "--out", out)
     assert code == 0
     assert said.count("unchanged") == len(STAGE_NAMES)
     assert "pole_a" in printed
-    assert before == {p.name: p.stat().st_mtime_ns for p in out.iterdir() if p.is_file() and p.name != ".lock"}
+    assert before == {p.name: p.stat().st_mtime_ns for p in out.iterdir() if p.is_file() and not p.name.startswith(".")}
 
 
 CHANGES = {

@@ -70,6 +70,10 @@ def test_label_that_does_not_spell_the_overrides_ends_in_a_hash(overrides: dict[
     assert re.fullmatch(rf"{re.escape(start)},[0-9a-f]{{8}}", label), label
 
 
+def test_hash_of_a_label_is_the_same_in_every_version() -> None:
+    assert settings_label({"sites.sensor": "VLP-16"}) == "sensor=VLP-16,511b6d4c"  # as in docs/artefacts.md
+
+
 @given(SETTINGS, SETTINGS)
 def test_labels_are_equal_exactly_where_settings_are(a: dict[str, Any], b: dict[str, Any]) -> None:
     assert (settings_label(a).lower() == settings_label(b).lower()) == (a == b)
@@ -126,5 +130,7 @@ def test_scenario_that_needs_an_override_is_compared_as_written(mini: Path) -> N
 
 def test_overrides_of_a_city_have_one_label_in_every_spelling() -> None:
     spellings = (["score.gamma=5", "roi.voxel_m=0.50"], ["roi.voxel_m = 0.5", "score.gamma=2", "score.gamma=5.0"])
+    tables = (["costs.sensor={VLP-16=5}"], ["costs.sensor.VLP-16=5.0"])
+    assert len({run_folder("hersfeld", parse_overrides(overrides)) for overrides in tables}) == 1
     labels = {run_folder("hersfeld", parse_overrides(overrides)) for overrides in spellings}
     assert labels == {Path("runs/hersfeld@gamma=5,voxel_m=0.5")}

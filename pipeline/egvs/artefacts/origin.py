@@ -54,8 +54,9 @@ def foreign_files(folder: Path) -> Iterator[str]:
 
 
 def _recorded_names(folder: RunFolder) -> set[str]:
-    """The names in ``run.json`` and in the checksums of studies; also those of the record and the lock themselves."""
-    names = {file.name for file in (RunFolder.run_record, RunFolder.lock) if (folder / file.name).exists()}
+    """The names in ``run.json`` and in the checksums of studies; also those of the files that every run writes."""
+    run_files = (RunFolder.run_record, RunFolder.lock, RunFolder.digests)
+    names = {file.name for file in run_files if (folder / file.name).exists()}
     if folder.has_record:
         for stage in RunRecord.read(folder.path).stages.values():
             names |= stage.artefacts.keys()

@@ -57,6 +57,7 @@ class RunFolder:
 
     run_record = RunFile("run.json", "run")
     lock = RunFile(".lock", "run")
+    digests = RunFile(".digests.json", "run")
 
     statics = RunFile("statics.ply", "statics")
     scans = RunFile("scans.parquet", "scan")

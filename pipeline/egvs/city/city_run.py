@@ -160,8 +160,13 @@ def _run_jobs(
     if not jobs:
         problem = "all junctions that were selected are left out: their traffic is locked, or they have none"
         raise InputError("--junction", problem, f"Select others, or use less traffic in {city.file}.")
+
+    def on_done(result: JobResult) -> None:
+        meter.add_parts(result)
+        options.on_done(result)
+
     with meter.part("junctions"):
-        scheduler.run_jobs(cluster.client, jobs, on_done=options.on_done, progress=options.progress, cluster=cluster)
+        scheduler.run_jobs(cluster.client, jobs, on_done=on_done, progress=options.progress, cluster=cluster)
     with meter.part("tables"):
         junction_results = read_junction_results(folder, [city.junction(job.junction) for job in jobs])
         written = write_results(folder, city, junction_results)

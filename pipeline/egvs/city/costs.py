@@ -7,6 +7,7 @@ Times and memory differ from run to run, so they are in a file of their own, ``O
 
 from __future__ import annotations
 
+import os
 import socket
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,7 +18,7 @@ from typing import Any
 
 from egvs.artefacts.run_record import RunRecord
 from egvs.city.scheduler import Cluster, SceneTasks
-from egvs.city.tasks import Job
+from egvs.city.tasks import SCORED_PARTS, Job, JobResult
 from egvs.city.traffic_split import CityTraffic
 from egvs.core import files
 from egvs.core.progress import ProgressCallback
@@ -69,11 +70,23 @@ class StageCost:
 
 @dataclass(frozen=True)
 class ProcessCost:
-    """Peak memory of a process since its start, in MB of 2**20 bytes."""
+    """What a process has used since its start.
+
+    Attributes
+    ----------
+    process, host
+        The process, and the name of its machine.
+    peak_mb
+        Peak memory, in MB of 2**20 bytes.
+    busy_s
+        Processor seconds, which do not depend on what else the machine does; of SUMO together with the programs that
+        prepare it. None where they are not known.
+    """
 
     process: str
     host: str
     peak_mb: float
+    busy_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -124,7 +137,10 @@ class CostMeter:
         self._parts: list[PartCost] = []
         self._steps: dict[str, PartCost] = {}
         self._stages: list[StageCost] = []
+        self._part_costs: list[ResourceUsage] = []
         self._processes: tuple[ProcessCost, ...] = ()
+        self._busy_before_traffic_s = 0.0
+        self._sumo_busy_s: float | None = None
         self._size = RunSize()
 
     @contextmanager
@@ -141,6 +157,7 @@ class CostMeter:
     def traffic_progress(self, progress: ProgressCallback) -> ProgressCallback:
         """Return a callback that measures the steps of the traffic, which starts now, and calls ``progress``."""
         last_s = self._now_s()
+        self._busy_before_traffic_s = _busy_of_ended_programs_s()
 
         def measure_step(what: str, done: int, total: int) -> None:
             nonlocal last_s
@@ -157,6 +174,7 @@ class CostMeter:
         both = self._steps.pop(SUMO_STEP, None)
         if both is None or sumo_s is None:
             return
+        self._sumo_busy_s = round(_busy_of_ended_programs_s() - self._busy_before_traffic_s, 2)
         routes_s = max(0.0, both.seconds - sumo_s)
         self._add_to_step(ROUTES_STEP, both.start_s, both.start_s + routes_s)
         self._add_to_step(SUMO_STEP, both.start_s + routes_s, both.end_s)
@@ -188,6 +206,12 @@ class CostMeter:
                 by_stage.setdefault(name, []).append(stage.cost)
         for name, costs in by_stage.items():
             self._add_stage(name, costs)
+        if self._part_costs:
+            self._add_stage(SCORED_PARTS, self._part_costs)
+
+    def add_parts(self, result: JobResult) -> None:
+        """Add the scores of a large junction, which were made in several tasks."""
+        self._part_costs += result.part_costs
 
     def _add_stage(self, name: str, costs: Sequence[ResourceUsage]) -> None:
         seconds = round(sum(cost.seconds for cost in costs), 3)
@@ -214,11 +238,11 @@ class CostMeter:
 
     def add_processes(self, cluster: Cluster, traffic: Mapping[str, Any]) -> None:
         """Ask the connected workers and the scheduler for their memory; ``traffic`` is the summary of the traffic."""
-        self._processes = tuple(_process_costs(cluster, traffic))
+        self._processes = tuple(_process_costs(cluster, traffic, self._sumo_busy_s))
 
     def costs(self) -> CityCosts:
         """Return what was collected, and the memory of this process."""
-        this_process = ProcessCost("egvs", socket.gethostname(), round(process_peak_mb(), 1))
+        this_process = ProcessCost("egvs", socket.gethostname(), *_usage_of_this_process())
         processes = this_process, *self._processes
         return CityCosts(tuple(self._parts_and_steps()), tuple(self._stages), processes, self._size)
 
@@ -234,14 +258,24 @@ def _folder_bytes(folder: Path) -> int:
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
-def _process_costs(cluster: Cluster, traffic: Mapping[str, Any]) -> Iterator[ProcessCost]:
+def _process_costs(cluster: Cluster, traffic: Mapping[str, Any], sumo_busy_s: float | None) -> Iterator[ProcessCost]:
     client, hosts = cluster.client, cluster.workers.accepted()
     sumo_peak_mb = traffic.get("sumo_peak_mb")
     if sumo_peak_mb is not None:
-        yield ProcessCost("SUMO, when the traffic was made", "", sumo_peak_mb)
+        yield ProcessCost("SUMO, when the traffic was made", "", sumo_peak_mb, sumo_busy_s)
     if client.cluster is None:  # the scheduler of a local cluster is in this process
-        yield ProcessCost("scheduler", "", round(client.run_on_scheduler(process_peak_mb), 1))
-    peaks_mb = client.run(process_peak_mb, workers=list(hosts), on_error="return")
-    for address in sorted(peaks_mb):
-        if isinstance(peaks_mb[address], float):  # else the worker was lost just now
-            yield ProcessCost(f"worker {address}", hosts[address], round(peaks_mb[address], 1))
+        yield ProcessCost("scheduler", "", *client.run_on_scheduler(_usage_of_this_process))
+    usages = client.run(_usage_of_this_process, workers=list(hosts), on_error="return")
+    for address in sorted(usages):
+        if isinstance(usages[address], tuple):  # else the worker was lost just now
+            yield ProcessCost(f"worker {address}", hosts[address], *usages[address])
+
+
+def _usage_of_this_process() -> tuple[float, float]:
+    """Return its peak memory in MB, and its processor seconds."""
+    return round(process_peak_mb(), 1), round(sum(os.times()[:2]), 2)
+
+
+def _busy_of_ended_programs_s() -> float:
+    """Return the processor seconds of the programs that this process has started and that have ended."""
+    return sum(os.times()[2:4])

@@ -22,7 +22,7 @@ import zipfile
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, wraps
 from itertools import pairwise
 from pathlib import Path
@@ -63,8 +63,8 @@ PART_FILE, PART_KIND = "part.npz", "part"
 SCENE_FILE, SCENE_KIND = "scene.json", "scene"
 """Name of the file with the check of a scene, and of its kind in the store."""
 
-SCENE_CHECK, EARLY_SCANS = "check of the scene", "scans for the score"
-"""Work before the traffic is known that is in the costs of no stage."""
+SCENE_CHECK, EARLY_SCANS, SCORED_PARTS = "check of the scene", "scans for the score", "score, in parts"
+"""Work that is in the costs of no stage: before the traffic is known, and in the tasks of a large junction."""
 
 BYTES_PER_BEAM = 24
 """Largest size of a scan in the store: three numbers per beam, for the beams that can meet the region."""
@@ -140,12 +140,25 @@ class Job:
 
 @dataclass(frozen=True)
 class JobResult:
-    """A junction whose run is complete: its number of sites, the duration of the task, and the stages that it ran."""
+    """A junction whose run is complete.
+
+    Attributes
+    ----------
+    junction, sites
+        Its name, and its number of sites.
+    seconds
+        Duration of the task.
+    stages_run
+        The stages that the task ran.
+    part_costs
+        Costs of scoring its sites in other tasks, as far as this task used them.
+    """
 
     junction: str
     sites: int
     seconds: float
     stages_run: tuple[str, ...]
+    part_costs: tuple[ResourceUsage, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -350,10 +363,10 @@ def split_sites(count: int, parts: int) -> list[slice]:
     return [slice(low, high) for low, high in pairwise(ends)]
 
 
-def read_stored_scores(parts: int) -> Callable[[SiteScoring], Iterator[ScoredSite]]:
+def read_stored_scores(parts: int, costs: list[ResourceUsage]) -> Callable[[SiteScoring], Iterator[ScoredSite]]:
     """Return a function that yields all sites of a junction for the score stage, from its parts in the store.
 
-    Parts that the store has lost are scored again.
+    Parts that the store has lost are scored again. The costs of all parts are added to ``costs``.
     """
 
     def scored_sites(scoring: SiteScoring) -> Iterator[ScoredSite]:
@@ -362,7 +375,8 @@ def read_stored_scores(parts: int) -> Callable[[SiteScoring], Iterator[ScoredSit
             names = scoring.names[part]
             if names:
                 with files.temporary_folder() as folder:
-                    yield from read_part(_fetch_or_score(scoring, score_key, names, folder))
+                    costs.append(_fetch_or_score(scoring, score_key, names, folder))
+                    yield from read_part(folder / PART_FILE)
 
     return scored_sites
 
@@ -389,21 +403,24 @@ def _keeping_scans(context: StageContext) -> StageContext:
     return keeping
 
 
-def _fetch_or_score(scoring: SiteScoring, score_key: str, names: tuple[str, ...], folder: Path) -> Path:
-    """Fetch the scores of some sites from the store into a folder, or compute and store them; return the file."""
+def _fetch_or_score(scoring: SiteScoring, score_key: str, names: tuple[str, ...], folder: Path) -> ResourceUsage:
+    """Fetch the scores of some sites from the store into a folder, or compute and store them; return their cost."""
     part_store, path = Store.default(), folder / PART_FILE
     program = stage_keys.source_digest(__name__).digest
     key = files.hash_json({"score": score_key, "sites": names, "program": program})
-    if part_store.take(PART_KIND, key, folder) is not None:
-        return path
+    entry = part_store.take(PART_KIND, key, folder)
+    if entry is not None:
+        return entry.made.cost
     with part_store.maker(PART_KIND, key):
         part_store.fetch(PART_KIND, key)
-        if part_store.take(PART_KIND, key, folder) is None:  # another worker may have stored it meanwhile
-            with measure_usage() as cost:
-                write_part(path, score_stored_scans(scoring, names))
-            result = StageResult({PART_FILE: files.hash_file(path)}, {}, {}, cost)
-            part_store.put(PART_KIND, key, folder, result)
-    return path
+        entry = part_store.take(PART_KIND, key, folder)
+        if entry is not None:  # another worker has stored it meanwhile
+            return entry.made.cost
+        with measure_usage() as cost:
+            write_part(path, score_stored_scans(scoring, names))
+        result = StageResult({PART_FILE: files.hash_file(path)}, {}, {}, cost)
+        part_store.put(PART_KIND, key, folder, result)
+    return cost
 
 
 @catch_input_errors
@@ -545,8 +562,12 @@ def finish_junction(
         if isinstance(result, JobFailure):
             return [result]
     SCENE_CACHE.drop(settings.token, job)
-    score_options = {"scored_elsewhere": read_stored_scores(len(scored))}
-    return [_run_junction(job, settings, {**_STORED_RESULTS, "score": score_options})]
+    part_costs: list[ResourceUsage] = []
+    score_options = {"scored_elsewhere": read_stored_scores(len(scored), part_costs)}
+    done = _run_junction(job, settings, {**_STORED_RESULTS, "score": score_options})
+    if isinstance(done, JobResult):
+        return [replace(done, part_costs=tuple(part_costs))]
+    return [done]
 
 
 @catch_input_errors

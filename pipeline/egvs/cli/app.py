@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from typer.models import CommandInfo
@@ -16,7 +16,19 @@ from typer.models import CommandInfo
 from egvs._version import __version__
 from egvs.cli import city, exit, place, sources, validate
 from egvs.cli import options as cli_options
-from egvs.cli.options import DEFAULT_POLES, Audit, Jobs, Out, Run, ScenarioPath, Set, SettingsPath, Top, Verbose
+from egvs.cli.options import (
+    DEFAULT_POLES,
+    Audit,
+    Jobs,
+    Out,
+    Rehash,
+    Run,
+    ScenarioPath,
+    Set,
+    SettingsPath,
+    Top,
+    Verbose,
+)
 from egvs.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -77,6 +89,7 @@ def run(
     top: Annotated[int, typer.Option("--top", metavar="N", min=1, help="Number of poles to print.")] = DEFAULT_POLES,
     all_: Annotated[bool, typer.Option("--all", help="Print the complete ranking of all sites and poles.")] = False,
     verbose: Verbose = False,
+    rehash: Rehash = False,
 ) -> None:
     """Run all stages in order and print the best poles; stages with unchanged inputs are skipped."""
     from egvs.cli.console import ProgressDisplay
@@ -84,9 +97,11 @@ def run(
     stage_options = {"score": {"audit": True}} if audit else None
     with ProgressDisplay("run", with_details=verbose) as screen:
         from egvs.cli import answer, run_tables
-        from egvs.runs import run
+        from egvs.runs import digest_cache, run
 
         loaded, folder = _load(scenario, set_, out)
+        if rehash:
+            digest_cache.forget_digests(folder)
         record = run.run(
             loaded, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, options=stage_options
         )
@@ -120,7 +135,7 @@ def demo(
         results, loaded = folder / "results", load(folder)
         record = run(loaded, results, jobs=jobs, progress=screen.progress, listener=screen.stage_event)
     answer.print_answer(results, loaded, record)
-    run_tables.print_demo_hints(folder, results)
+    run_tables.print_demo_hints(results)
 
 
 @app.command()
@@ -257,14 +272,38 @@ def verify(
 
 @app.command()
 def compare(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN RUN...", help="Two or more folders of finished runs.")],
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUN...", help="Folders of finished runs; one is enough if its sites have several sensors."
+        ),
+    ],
+    by: Annotated[
+        Literal["pole", "site"] | None,
+        typer.Option(
+            help="Compare the best mounts of each pole, or sites of the same name. By default sites if no pole has "
+            "several sites and the common sites have the same mount in all runs, else poles."
+        ),
+    ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="costs.KEY=VALUE",
+            help="Override a cost, e.g. 'costs.sensor={\"VLP-32C\"=8000}' (repeatable).",
+        ),
+    ] = None,
     top: Top = None,
 ) -> None:
-    """Compare runs: scores, ranks, rank correlations, and differences in settings and files."""
-    from egvs.cli import study_tables
-    from egvs.studies import run_comparison
+    """Compare runs or sensors: the best mount of each pole, what one more percentage point costs, and settings."""
+    from egvs.cli.console import ProgressDisplay
 
-    study_tables.print_comparison(run_comparison.compare_runs(runs), top)
+    with ProgressDisplay("compare") as screen:
+        from egvs.cli import study_tables
+        from egvs.studies import run_comparison
+
+        comparison = run_comparison.compare_runs(runs, by, set_ or (), screen.progress)
+    study_tables.print_comparison(comparison, top)
 
 
 @app.command()

@@ -286,6 +286,7 @@ def print_costs(costs: CityCosts) -> None:
         Column("process", lambda process: process.process, "left"),
         Column("host", lambda process: process.host, "left"),
         Column("peak MB", lambda process: f"{process.peak_mb:.0f}"),
+        Column("core s", lambda process: "" if process.busy_s is None else f"{process.busy_s:.1f}"),
     ]
     out = console(WIDE)
     out.print(make_table(parts, costs.parts))

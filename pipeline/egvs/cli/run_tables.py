@@ -263,10 +263,10 @@ def print_check(checked: CheckReport) -> None:
     out.print(f"checked {checked.sites} sites, {checked.solids} solids and {checked.lanes} lanes")
 
 
-def print_demo_hints(folder: Path, results: Path) -> None:
+def print_demo_hints(results: Path) -> None:
     """Print what to try after ``egvs demo``."""
     out = console(_RESULT_FILE_WIDTH)
-    out.print(f"next: egvs place {folder} --out {results} --count 2   (the best two sensors together)")
+    out.print(f"next: egvs place {results} --count 2   (the best two sensors together)")
     out.print(f"      egvs explore {results}   (move a sensor and see its score; needs egvs[explore])")
     out.print("      egvs new mytown --osm extract.osm.pbf   (your own junction, from OpenStreetMap)")
 

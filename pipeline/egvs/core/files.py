@@ -20,7 +20,7 @@ import os
 import shutil
 import stat
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
@@ -162,16 +162,37 @@ def write_text(path: Path, text: str) -> None:
 def hash_file(path: Path) -> str:
     """Return the SHA-256 hex digest of a file; InputError when it does not exist.
 
-    An input that :func:`open_input` holds in memory is not opened again.
+    An input that :func:`open_input` holds in memory is not opened again, nor one whose digest is known
+    (:func:`use_digests`).
     """
     if not path.is_file():
         raise InputError(path, "no such file", f"Run the stage that writes {path.name} first.")
+    known = _KNOWN_DIGEST.get()
+    return _hash_content(path) if known is None else known(path, _hash_content)
+
+
+def _hash_content(path: Path) -> str:
     held = _HELD_FILES.get()
     content = None if held is None else held.contents.get(_file_stamp(path))
     if content is not None:
         return hashlib.sha256(content).hexdigest()
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+_KNOWN_DIGEST: ContextVar[Callable[[Path, Callable[[Path], str]], str] | None] = ContextVar(
+    "_KNOWN_DIGEST", default=None
+)
+
+
+@contextmanager
+def use_digests(digest: Callable[[Path, Callable[[Path], str]], str]) -> Iterator[None]:
+    """Let a function return the digests of :func:`hash_file` within the block: of a path, and how to hash its file."""
+    token = _KNOWN_DIGEST.set(digest)
+    try:
+        yield
+    finally:
+        _KNOWN_DIGEST.reset(token)
 
 
 _MAX_HELD_BYTES = 128_000_000

@@ -54,8 +54,25 @@ class ScoreLabel:
 
     @property
     def label(self) -> str:
-        """Title of an axis."""
+        """Name of the score with its unit."""
         return f"{self.noun} ({self.unit})" if self.unit else self.noun
+
+    @property
+    def axis_title(self) -> str:
+        """Title of an axis, e.g. "Share of vehicles found (%)"; its values are multiplied by :attr:`axis_factor`."""
+        name = self.noun.removeprefix("the ")
+        unit = "%" if self.is_share else self.unit
+        return f"{name[0].upper()}{name[1:]}" + (f" ({unit})" if unit else "")
+
+    @property
+    def axis_factor(self) -> float:
+        """Factor of values on an axis: 100 for shares, which are shown in per cent."""
+        return 100.0 if self.is_share else 1.0
+
+    @property
+    def card_head(self) -> str:
+        """Name beside a value where a narrow screen shows a row as a card."""
+        return f"{self.head[0].upper()}{self.head[1:]}"
 
     def with_noun(self, value: float) -> str:
         """Return a value with name and unit, e.g. "EGVS 247,397 bit"."""

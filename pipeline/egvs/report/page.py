@@ -35,6 +35,7 @@ from egvs.report.sections import (
     egvs_setting,
     ranking_disagreement,
 )
+from egvs.report.sensor_results import SENSOR_EVIDENCE, SensorComparison, costs_option
 from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.scene_inputs import scan_dependencies
@@ -158,6 +159,7 @@ def _displayed_settings(scenario: Scenario) -> dict[str, Any]:
         "weights": scenario.score.weights.in_words,
         "assumed": assumptions(scenario),
         "blindspots": scenario.score.blindspots,
+        "costs": scenario.costs.model_dump(mode="json"),
         "effects": scenario.effects.model_dump(mode="json"),
     }
 
@@ -213,6 +215,7 @@ def render_page(contents: PageContents) -> str:
         **vars(contents),
         **_ranking_values(contents.ranking),
         **_setting_values(contents),
+        **_sensor_values(contents),
         **_cost_values(contents.stages),
         **_sentences(contents),
     }
@@ -281,6 +284,16 @@ def _setting_values(contents: PageContents) -> dict[str, Any]:
         "duration": formatting.format_duration(frames * scenario.traffic.frame_period_s),
         "effects": effects,
         "unmodelled": [name for name, effect in _UNMODELLED if effect not in effects],
+    }
+
+
+def _sensor_values(contents: PageContents) -> dict[str, Any]:
+    """The best mount of each sensor; None where there is one sensor."""
+    sensors = SensorComparison.of_run(contents.ranking.sites, contents.scenario.costs)
+    return {
+        "sensors": sensors,
+        "sensor_evidence": SENSOR_EVIDENCE,
+        "costs_option": costs_option(sensors.sensors) if sensors is not None else "",
     }
 
 

@@ -29,6 +29,7 @@ from egvs.core.platform import relative_path
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.formats.meshes import referenced_files
 from egvs.runs import locks, run_names, stage_keys, stage_registry, store
+from egvs.runs.digest_cache import remember_digests
 from egvs.runs.stage_keys import StageKey
 from egvs.runs.stage_registry import StageResult
 from egvs.runs.store import Store
@@ -104,7 +105,7 @@ def run(
     """
     folder = Path(out) if out is not None else default_folder(scenario)
     check_no_overwrite(scenario, folder)
-    with lock_run_folder(folder, wait_s), files.hold_inputs(except_in=folder):
+    with lock_run_folder(folder, wait_s), files.hold_inputs(except_in=folder), remember_digests(RunFolder(folder)):
         context = open_folder(scenario, folder, jobs=jobs, progress=progress)
         current = _Run(context, start_record(scenario, folder), listener)
         for stage in STAGE_NAMES:

@@ -30,6 +30,7 @@ from pydantic import BaseModel
 
 from egvs.core import files, reading
 from egvs.scenario.model import Scenario
+from egvs.scenario.settings import flatten_settings
 
 RUNS = Path("runs")
 """The folder of all runs for which no other is given."""
@@ -112,7 +113,7 @@ def parse_overrides(overrides: Iterable[str]) -> dict[str, Any]:
             value = reading.parse_toml_value(text)
         except (ValueError, RecursionError):
             value = text
-        settings[key.strip()] = json.loads(json.dumps(value, default=str))
+        settings |= flatten_settings({key.strip(): json.loads(json.dumps(value, default=str))})
     return settings
 
 
