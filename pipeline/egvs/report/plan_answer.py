@@ -1,4 +1,4 @@
-"""How many sensors are enough? The answer of ``egvs place``, in the terminal and in the report.
+"""The answer of ``egvs place`` to how many sensors are enough, for the terminal and the report.
 
 A further sensor is *useful* (:func:`is_useful`) if it adds at least :data:`MIN_USEFUL_SHARE` and its gain can be
 separated from 0, or if requirements are met only with it. A number of sensors is *enough* if no further sensor of the
