@@ -11,7 +11,7 @@ from __future__ import annotations
 import difflib
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,9 +21,8 @@ from pydantic.fields import FieldInfo
 from egvs.core import reading
 from egvs.core.errors import InputError, format_problem
 from egvs.core.grid import Grid
-from egvs.scenario.fields import NAME_DESCRIPTION, StrictModel
+from egvs.scenario.fields import NAME_DESCRIPTION
 from egvs.scenario.model import SCENARIO_FILE, SITE_DIRECTIONS, SITE_SENSORS, SITE_SOURCES, Scenario
-from egvs.scenario.score_config import CostsConfig
 from egvs.scenario.settings import changed_settings, flatten_settings
 from egvs.scenario.traffic_config import TRAFFIC_SOURCES, TrafficConfig, keys_without_effect
 
@@ -197,7 +196,7 @@ def apply_overrides(values: dict[str, Any], overrides: Iterable[str]) -> dict[st
         if override.partition("=")[0].strip() == "extends":
             hint = f"Set it in a {SCENARIO_FILE}."
             raise InputError(f"--set {override}", "the key extends cannot be set here", hint)
-        values = _apply_override(values, override)
+        values = apply_override(values, override)
     return values
 
 
@@ -358,40 +357,6 @@ def scenario_from_dict(values: dict[str, Any], folder: Path, where: str) -> Scen
     return scenario
 
 
-class _CostsTable(StrictModel):
-    costs: CostsConfig
-
-
-def costs_from_dict(values: Mapping[str, Any], overrides: Iterable[str], where: str) -> CostsConfig:
-    """Check the costs of a scenario that is given as nested dictionaries, as in ``run.json``.
-
-    Parameters
-    ----------
-    values
-        Tables and keys.
-    overrides
-        ``"costs.key=value"``, as in :func:`load`.
-    where
-        The file, for messages.
-
-    Raises
-    ------
-    InputError
-        When costs are invalid, or an override is of another table.
-    """
-    tables: dict[str, Any] = {"costs": dict(values.get("costs", {}))}
-    for override in overrides:
-        if not override.strip().startswith("costs."):
-            problem = "expected a key of [costs], because the runs are finished"
-            raise InputError(f"--set {override}", problem, "Use, for example, --set costs.pole=12000.")
-        tables = _apply_override(tables, override)
-        where = "--set"
-    try:
-        return _CostsTable.model_validate(tables).costs
-    except ValidationError as error:
-        raise format_validation_error(error, where, _CostsTable) from None
-
-
 def default_name(folder: Path) -> str:
     """Return the name of a scenario that is not named otherwise: that of its folder."""
     return re.sub(r'[\s\x00-\x1f\x7f/\\:*?"<>|]+', "_", folder.resolve().name)[:80]
@@ -411,8 +376,16 @@ def _suggest_scenario(folder: Path) -> str:
     return f"Give a folder with a {SCENARIO_FILE}, or the file."
 
 
-def _apply_override(values: dict[str, Any], override: str) -> dict[str, Any]:
-    """Return ``values`` with one override ``table.key=value``."""
+def apply_override(values: dict[str, Any], override: str) -> dict[str, Any]:
+    """Return ``values`` with one override ``table.key=value``.
+
+    Parameters
+    ----------
+    values
+        Tables and keys of a scenario.
+    override
+        As of :func:`load`.
+    """
     where = f"--set {override}"
     key, equals, text = override.partition("=")
     if not equals or not key.strip():
