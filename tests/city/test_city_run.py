@@ -318,6 +318,7 @@ def test_junction_with_locked_traffic_is_left_out(city: City, tmp_path: Path, mo
     (warning,) = [warning for warning in first.warnings if warning.rule == "junctions left out"]
     assert warning.problem == "east is left out, because a car stood there"
     assert not city.junction("east").traffic_file(city).exists()
+    assert not results.junction_run_folder(tmp_path / "out", "east").exists()
     assert "east is left out" in (tmp_path / "out" / "city.html").read_text()
 
     monkeypatch.setattr(recording, "record_traffic", None)

@@ -67,7 +67,7 @@ def test_bits_have_thousands_separators(capsys: pytest.CaptureFixture[str]) -> N
     text = printed(placed_two("egvs", 100_000.0), capsys)
     assert "EGVS together, bit" in text
     assert "The plan a, b scores 99,220 ± 300 bit, 99.8% of what all 12 candidates reach together;" in text
-    assert "A second sensor adds 4,670 ± 500 bit (4.7% of the total) to EGVS: 99,220 bit" in text
+    assert "A second sensor adds 4,670 ± 500 bit (4.7% of the plan's score) to EGVS: 99,220 bit" in text
 
 
 def test_reason_is_printed_where_errors_are_unknown(capsys: pytest.CaptureFixture[str]) -> None:

@@ -135,6 +135,18 @@ def test_reason_is_named_where_errors_are_unknown(mini: Path, tmp_path: Path, ov
     assert not set(ERROR_COLUMNS) & set(curve.column_names)
 
 
+@pytest.mark.slow
+def test_report_names_reason_where_errors_are_unknown(mini: Path, tmp_path: Path) -> None:
+    scenario = egvs.load(mini, ["placement.count=2", "score.standard_error=false"])
+    egvs.run(scenario, tmp_path / "out")
+    egvs.place(scenario, tmp_path / "out")
+    page = (tmp_path / "out" / "report.html").read_text()
+    plan = page[page.index('<section id="plan">') :]
+    plan = plan[: plan.index("</section>")]
+    assert "No standard errors: score.standard_error is false." in plan
+    assert "nan" not in plan
+
+
 def test_no_errors_where_all_vehicles_are_in_one_block(mini: Path, tmp_path: Path) -> None:
     lines = (mini / "fcd.csv").read_text().splitlines()
     for number in range(13, len(lines)):  # from the 7th frame on, both are far away

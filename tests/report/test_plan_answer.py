@@ -43,11 +43,11 @@ def test_says_what_the_last_sensor_adds_where_it_is_still_useful() -> None:
 def test_bits_are_compared_with_the_score_of_the_plan() -> None:
     steps = steps_of(247397.0, 381218.0, gain_se=2100.0, beats=1.0)
     assert describe_count(steps, EGVS) == (
-        "A second sensor adds 133,821 ± 2,100 bit (35.1% of the total) to EGVS: 381,218 bit, against 247,397 bit with "
-        "one."
+        "A second sensor adds 133,821 ± 2,100 bit (35.1% of the plan's score) to EGVS: 381,218 bit, against "
+        "247,397 bit with one."
     )
     steps = steps_of(39000.0, 39300.0, gain_se=50.0, beats=1.0)
-    assert describe_count(steps, EGVS) == "One is enough: a second adds 300 ± 50 bit (0.8% of the total)."
+    assert describe_count(steps, EGVS) == "One is enough: a second adds 300 ± 50 bit (0.8% of the plan's score)."
 
 
 def test_gain_that_may_be_chance_is_not_useful() -> None:

@@ -1,5 +1,6 @@
 """Is the entropy correctly rounded, and is the score the exact sum, rounded once, in any order?"""
 
+from decimal import Decimal, localcontext
 from fractions import Fraction
 from math import inf, nan
 
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 
 from egvs.core.errors import InputError
 from egvs.core.grid import Grid
+from egvs.scoring import egvs
 from egvs.scoring.egvs import EntropyField, binary_entropy
 
 LARGEST = 2**32 - 1
@@ -48,6 +50,13 @@ def test_entropy_of_any_count(data):
     assert found == binary_entropy(frames - count, frames)
     assert 0.0 <= found <= 1.0
     assert (found == 0.0) == (count in (0, frames))
+
+
+@pytest.mark.parametrize("n", [*range(1, 400), 4999, 5000, 46_656, 49_999, 50_000, 50_001, LARGEST])
+def test_logarithm_from_table_is_that_of_decimal(n):
+    with localcontext() as context:
+        context.prec = egvs._DIGITS
+        assert egvs._ln(n) == Decimal(n).ln()
 
 
 def test_entropy_by_hand():

@@ -62,8 +62,8 @@ def _print_ranking(out: Console, folder: Path, ranked: Ranking, record: RunRecor
     """Print the verdict, the best poles, the lanes seen worst, and how the order by EGVS differs."""
     out.print(verdict(ranked))
     validation = sections.ValidationSummary.read(folder, record.stages)
-    if validation is not None and validation.check.contradiction:
-        print_sentences([f"{validation.check.contradiction} See {RunFolder(folder).report}#detected"])
+    if validation is not None and validation.check.warning:
+        print_sentences([f"{validation.check.warning} See {RunFolder(folder).report}#detected"])
     summary = record.stages["score"].summary
     if ranked.by.counts_vehicles and "weights" in summary:
         out.print(f"Vehicles are weighted: {summary['weights']}.")

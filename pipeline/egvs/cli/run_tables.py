@@ -18,7 +18,16 @@ from rich.table import Table
 from egvs.artefacts import parquet
 from egvs.artefacts.readers import DISTINCT_PROBABILITY, PeriodRank, PeriodRanking
 from egvs.artefacts.run_record import RunRecord
-from egvs.cli.console import NARROW, WIDE, Column, console, format_or_dash, make_table, print_table
+from egvs.cli.console import (
+    NARROW,
+    WIDE,
+    Column,
+    console,
+    format_or_dash,
+    make_table,
+    print_sentences,
+    print_table,
+)
 from egvs.core.errors import collect_warnings
 from egvs.report import sections
 from egvs.report.formatting import SCORE_LABELS, ScoreLabel
@@ -340,16 +349,20 @@ def _format_cost_change(cost: EffectCost | None) -> str:
 
 def print_ablation(changes: Sequence[EffectChange]) -> None:
     """Print by how much each effect changes the scores of the plain scene, which is the first of ``changes``."""
+    from egvs.cli import study_conclusions
+
     plain = changes[0]
     titles = {**dict(enumerate(plain.sites)), _SECONDS_ROW: "seconds"}
     columns = [
         Column[int]("site", lambda row: titles[row], "left"),
-        Column[int]("plain, bit", lambda row: _format_plain(plain, row)),
+        Column[int](f"plain, {SCORE_LABELS[plain.rank_by].head}", lambda row: _format_plain(plain, row)),
     ]
     columns += [Column(change.effect, partial(_format_change, plain, change)) for change in changes[1:]]
     title = "change in each site's score compared with the plain scene (and rank, where it changes)"
     out = console(_LIST_FILE_WIDTH, soft_wrap=False)
     out.print(make_table(columns, titles, title=title, truncate=True))
+    out.print()
+    print_sentences([study_conclusions.ablation_conclusion(changes)])
 
 
 _SECONDS_ROW = -1
@@ -359,7 +372,7 @@ _SECONDS_ROW = -1
 def _format_plain(plain: EffectChange, row: int) -> str:
     if row == _SECONDS_ROW:
         return f"{plain.seconds:.2f}"
-    return f"{plain.scores[row]:.1f} ({plain.ranks[row]})"
+    return f"{SCORE_LABELS[plain.rank_by].value(plain.scores[row])} ({plain.ranks[row]})"
 
 
 def _format_change(plain: EffectChange, change: EffectChange, row: int) -> str:

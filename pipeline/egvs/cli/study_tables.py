@@ -18,7 +18,8 @@ from rich.console import Console
 from rich.table import Table
 
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
-from egvs.cli.console import NARROW, WIDE, Column, console, format_or_dash, make_table
+from egvs.cli import study_conclusions
+from egvs.cli.console import NARROW, WIDE, Column, console, format_or_dash, make_table, print_sentences
 from egvs.report.formatting import SCORE_LABELS, join_names
 from egvs.report.ranking import RankedSite, share_of_limit
 from egvs.report.sensor_results import (
@@ -29,6 +30,8 @@ from egvs.report.sensor_results import (
     difference_unit,
     format_difference,
 )
+from egvs.studies.study_settings import MEASURES, SCENARIO, TRAFFIC
+from egvs.studies.traffic_options import OPTION_KNOBS, SeedSpread
 
 if TYPE_CHECKING:
     from egvs.studies.accuracy import AccuracyStudy
@@ -43,8 +46,8 @@ def print_study(study: AccuracyStudy, command: str) -> None:
     """Print an accuracy study; ``command`` runs the scenario, and is printed with the recommended options."""
     out = console(WIDE)
     is_wide = out.width >= WIDE - 10
-    approximations = [row for row in study.rows if row.kind != "measures"]
-    measures = [row for row in study.rows if row.kind == "measures"]
+    approximations = [row for row in study.rows if row.kind not in (MEASURES, TRAFFIC)]
+    measures = [row for row in study.rows if row.kind == MEASURES]
 
     title = "settings that approximate the same number, compared with the reference"
     out.print(_settings_table(title, approximations, has_errors=True, is_wide=is_wide))
@@ -53,6 +56,7 @@ def print_study(study: AccuracyStudy, command: str) -> None:
     if measures:
         title = "settings that measure something else, compared with the scenario on the same traffic"
         out.print(_settings_table(title, measures, has_errors=False, is_wide=is_wide))
+    _print_traffic_options(out, study)
     if not is_wide:
         out.print("for seconds by stage, memory and disk, widen the window or see accuracy.parquet")
 
@@ -66,9 +70,31 @@ def print_study(study: AccuracyStudy, command: str) -> None:
         if frames < _MAX_FRAMES:
             needed = f"about {frames:,.0f} frames would tell them apart"
         out.print(f"{better} above {worse}: probability {probability:.0%}; {needed}")
-    out.print(_describe_recommendation(study, command))
     for path in study.files:
         out.print(str(path))
+    out.print()
+    out.print(_describe_recommendation(study, command))
+    if not study.all_zero:
+        print_sentences(study_conclusions.accuracy_conclusion(study))
+
+
+def _print_traffic_options(out: Console, study: AccuracyStudy) -> None:
+    """Print what SUMO's step, sublanes and routing cost and change, and what other seeds change."""
+    options = [row for row in study.rows if row.kind == TRAFFIC]
+    if not options:
+        return
+    (scenario,) = (row for row in study.rows if row.kind == SCENARIO)
+    spread = SeedSpread.from_rows(options)
+    options.sort(key=lambda row: (OPTION_KNOBS.index(row.knob), row.setting))
+    title = "options of the traffic: another draw of it, compared with the scenario, beside other seeds"
+    out.print(make_table(study_conclusions.traffic_columns(scenario, spread), [scenario, *options], title=title))
+    if math.isnan(spread.tpog):
+        out.print("fewer than two other seeds ran within the budget, so the spread of seeds is unknown")
+        return
+    explained = "busy: processor seconds, and times those of the scenario; TPOG: change of the occupancy"
+    out.print(f"{explained}; scores: largest change")
+    limits = f"TPOG {spread.tpog:.1%}, scores {spread.score:.1%}"
+    out.print(f"spread of {spread.seeds} other seeds: up to {limits}")
 
 
 def _describe_reference(study: AccuracyStudy) -> str:

@@ -108,8 +108,8 @@ def print_validation(scenario: Scenario, out: Path, validation: Validation) -> N
         print(validation.report)
     print()
     print_sentences(validation.check.sentences)
-    if validation.check.contradiction:
-        print_sentences([validation.check.contradiction])
+    if validation.check.warning:
+        print_sentences([validation.check.warning])
 
 
 def _detection_columns(validation: Validation, detectors: Sequence[str]) -> list[Column[str]]:

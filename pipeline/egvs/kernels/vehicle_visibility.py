@@ -107,18 +107,22 @@ def _entry_ranges(box, d, first, last, t_m):  # type: ignore[no-untyped-def]
 @_kernel
 def _intersect_box(k, box, beams, runs, owner, range_m, t_m):  # type: ignore[no-untyped-def]
     """End the beams of ``runs`` at box k where they meet it first; returns the weight of all beams that meet it."""
-    d, length_m, weight = beams[3], beams[4], beams[5]
-    met_weight = 0.0
+    is_weighted, met_weight, met = beams[5].shape[0] > 0, 0.0, 0
     for run in range(runs.shape[0]):
         first, last = runs[run]
-        _entry_ranges(box, d, first, last, t_m)
+        _entry_ranges(box, beams[3], first, last, t_m)
+        length_m, nearest_m, owners = beams[4][first:last], range_m[first:last], owner[first:last]
         for i in range(last - first):
-            n = first + i
-            if t_m[i] < length_m[n]:
-                met_weight += weight[n]
-                if t_m[i] < range_m[n]:
-                    owner[n], range_m[n] = k, t_m[i]
-    return met_weight
+            met += t_m[i] < length_m[i]
+        if is_weighted:
+            weight = beams[5][first:last]
+            for i in range(last - first):
+                met_weight += weight[i] if t_m[i] < length_m[i] else 0.0
+        for i in range(last - first):
+            is_nearer = t_m[i] < nearest_m[i]
+            owners[i] = np.int32(k) if is_nearer else owners[i]
+            nearest_m[i] = t_m[i] if is_nearer else nearest_m[i]
+    return met_weight if is_weighted else float(met)
 
 
 @_inlined
@@ -144,20 +148,23 @@ def _add_box_hits(k, b, box, beams, runs, owner, range_m, selected, sums):  # ty
     bx, by, bz, bo, bh = box[5], box[6], box[7], box[8], box[9]
     x, y, z, weight = beams[3][0], beams[3][1], beams[3][2], beams[5]
     total, sides, slices, low, high = sums
-    count = 0
+    count, is_weighted = 0, weight.shape[0] > 0
     for run in range(runs.shape[0]):
-        for n in range(runs[run, 0], runs[run, 1]):
-            selected[count] = n
-            count += owner[n] == k
+        first, last = runs[run]
+        owners = owner[first:last]
+        for i in range(last - first):
+            selected[count] = first + i
+            count += owners[i] == k
     hit_weight, on_sides, parts = 0.0, 0.0, np.uint64(0)
     a_low, a_high, b_low, b_high = np.inf, -np.inf, np.inf, -np.inf
     for i in range(count):
         n = selected[i]
-        hit_weight += weight[n]
-        if weight[n] > 0.0:
+        share = weight[n] if is_weighted else 1.0
+        hit_weight += share
+        if share > 0.0:
             along = ao + range_m[n] * (ax * x[n] + ay * y[n] + az * z[n])
             across = bo + range_m[n] * (bx * x[n] + by * y[n] + bz * z[n])
-            on_sides += weight[n] if _is_on_side(along, across, ah, bh) else 0.0
+            on_sides += share if _is_on_side(along, across, ah, bh) else 0.0
             parts |= _slice_of(along, ah)
             a_low, a_high = min(a_low, along), max(a_high, along)
             b_low, b_high = min(b_low, across), max(b_high, across)
@@ -184,8 +191,9 @@ def _list_box_hits(k, b, box, beams, runs, owner, range_m, hits, count):  # type
 def _clear_box_hits(runs, length_m, owner, range_m):  # type: ignore[no-untyped-def]
     """Reset the first hits of the beams of ``runs``."""
     for run in range(runs.shape[0]):
-        for n in range(runs[run, 0], runs[run, 1]):
-            owner[n], range_m[n] = -1, length_m[n]
+        first, last = runs[run]
+        owner[first:last] = -1
+        range_m[first:last] = length_m[first:last]
 
 
 @_kernel
@@ -205,7 +213,7 @@ def first_hits(begin, o, size_m, boxes, beams, owner, range_m, sums, hits):  # t
     beams
         ``bands``: rows bands[i] to bands[i + 1] are those of band i, (bands + 1,) int64. ``slopes``: the lowest and the
         highest rise over run in each, (bands, 2). Of each beam: azimuth in [-pi, pi], ascending in a band; unit
-        direction (3, n); its length without boxes; its weight; float64.
+        direction (3, n); its length without boxes; its weight, or no weights (0,) where all are 1; float64.
     owner, range_m
         Scratch, (n,) int32 and float64: -1 and the length of each beam, before and after the call.
     sums

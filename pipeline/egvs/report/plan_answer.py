@@ -134,7 +134,7 @@ def _describe_gain(step: PlanStep, by: ScoreLabel) -> str:
     text = f"{by.change(step.gain, step.gain_se)} {by.change_unit}".rstrip()
     if by.is_share or not step.score > 0.0:
         return text
-    return f"{text} ({step.gain / step.score:.1%} of the total)"
+    return f"{text} ({step.gain / step.score:.1%} of the plan's score)"
 
 
 def _describe_chance(step: PlanStep, by: ScoreLabel) -> str:

@@ -26,8 +26,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from scipy.special import stdtrit
-
+from egvs.core.special import stdtrit
 from egvs.report.formatting import SCORE_LABELS, ScoreLabel
 
 ALPHA = 0.05
@@ -191,20 +190,27 @@ class RankingCheck:
 
     @property
     def contradiction(self) -> str:
-        """How the detectors contradict the ranking, in one sentence; empty if they do not (see the module)."""
+        """How the detectors contradict the ranking, as a clause; empty if they do not (see the module)."""
         for detector in self.detectors:
             if detector.returns_boxes and detector.loses_by(self.comparisons):
                 return (
-                    f"The validation contradicts the ranking: {detector.detector} detects better from {detector.best} "
-                    f"than from {detector.first}, the first site, by {detector.loss_text} ({detector.measure})."
+                    f"with {detector.detector}, detection is better from {detector.best} than from the first site, "
+                    f"{detector.first}, by {detector.loss_text} ({detector.measure})"
                 )
         for detector in self.detectors:
             if detector.returns_boxes and detector.has_wrong_order:
                 return (
-                    f"The validation contradicts the ranking: its order of the sites differs from that of "
-                    f"{detector.detector} (rank correlation {detector.rho.text})."
+                    f"with {detector.detector}, the order of the sites by detection is another one "
+                    f"(rank correlation {detector.rho.text})"
                 )
         return ""
+
+    @property
+    def warning(self) -> str:
+        """The contradiction in one sentence; empty if there is none."""
+        if not self.contradiction:
+            return ""
+        return f"The validation contradicts the ranking: {self.contradiction}."
 
     @property
     def sentences(self) -> list[str]:

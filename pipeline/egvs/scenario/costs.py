@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from egvs.core.errors import InputError
 from egvs.scenario.fields import StrictModel
-from egvs.scenario.loading import apply_override, format_validation_error
+from egvs.scenario.loading import apply_overrides, format_validation_error
 from egvs.scenario.score_config import CostsConfig
 
 
@@ -34,12 +34,13 @@ def costs_from_dict(values: Mapping[str, Any], overrides: Iterable[str], where: 
     InputError
         When costs are invalid, or an override is of another table.
     """
-    tables: dict[str, Any] = {"costs": dict(values.get("costs", {}))}
+    overrides = tuple(overrides)
     for override in overrides:
         if not override.strip().startswith("costs."):
             problem = "expected a key of [costs], because the runs are finished"
             raise InputError(f"--set {override}", problem, "Use, for example, --set costs.pole=12000.")
-        tables = apply_override(tables, override)
+    tables = apply_overrides({"costs": dict(values.get("costs", {}))}, overrides)
+    if overrides:
         where = "--set"
     try:
         return _CostsTable.model_validate(tables).costs

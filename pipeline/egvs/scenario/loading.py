@@ -22,7 +22,7 @@ from egvs.core import reading
 from egvs.core.errors import InputError, format_problem
 from egvs.core.grid import Grid
 from egvs.scenario.fields import NAME_DESCRIPTION
-from egvs.scenario.model import SCENARIO_FILE, SITE_DIRECTIONS, SITE_SENSORS, SITE_SOURCES, Scenario
+from egvs.scenario.model import SCENARIO_FILE, SITE_DIRECTIONS, SITE_SENSORS, SITE_SOURCES, Scenario, StaticsConfig
 from egvs.scenario.settings import changed_settings, flatten_settings
 from egvs.scenario.traffic_config import TRAFFIC_SOURCES, TrafficConfig, keys_without_effect
 
@@ -190,19 +190,22 @@ def apply_overrides(values: dict[str, Any], overrides: Iterable[str]) -> dict[st
     Raises
     ------
     InputError
-        When an override is not of this form, or names a row that does not exist.
+        When an override is not of this form, names a row that does not exist, or is replaced by a later one.
     """
-    for override in overrides:
+    overrides = tuple(overrides)
+    for number, override in enumerate(overrides):
         if override.partition("=")[0].strip() == "extends":
             hint = f"Set it in a {SCENARIO_FILE}."
             raise InputError(f"--set {override}", "the key extends cannot be set here", hint)
-        values = apply_override(values, override)
+        values = _apply_override(values, override)
+        _check_earlier_overrides(values, overrides[:number], override)
     return values
 
 
 def _build_scenario(values: dict[str, Any], file: Path) -> Scenario:
     scenario = scenario_from_dict(values, file.parent, str(file))
     check_unused_keys(scenario.traffic, file)
+    _check_polygon_keys(scenario.statics, file)
     scenario._written_site_keys = frozenset(scenario.sites.model_fields_set)
     return scenario
 
@@ -249,6 +252,16 @@ def check_unused_keys(traffic: TrafficConfig, file: Path) -> None:
         raise InputError(f"{file}: {unused.table}", problem, f"Remove {names}.")
 
 
+def _check_polygon_keys(statics: StaticsConfig, file: Path) -> None:
+    """Raise an InputError when a file says how SUMO's polygons become solids, but names no polygons."""
+    keys = sorted(statics.model_fields_set & set(_POLYGON_KEYS))
+    if keys and not statics.polygons:
+        names = " and ".join(keys)
+        verb = "have" if len(keys) > 1 else "has"
+        problem = f"{names} {verb} no effect without polygons"
+        raise InputError(f"{file}: statics", problem, f"Set polygons, or remove {names}.")
+
+
 def _read_with_bases(file: Path, extending: tuple[Path, ...]) -> dict[str, Any]:
     """Return the values of a scenario file and of those that it extends; ``extending`` are the files that extend it."""
     if not file.is_file():
@@ -268,6 +281,8 @@ def _read_with_bases(file: Path, extending: tuple[Path, ...]) -> dict[str, Any]:
 
 _SITE_SOURCE_KEYS = ("points", "only_free", "heights_m")
 """Keys of ``[sites]`` that go with one source of sites; a new source does not take them over."""
+_POLYGON_KEYS = ("polygon_height_m", "polygon_types")
+"""Keys of ``[statics]`` that go with ``polygons``."""
 _ALTERNATIVES = (
     ("traffic", TRAFFIC_SOURCES),
     ("sites", SITE_SOURCES),
@@ -283,6 +298,8 @@ def _drop_replaced_keys(base: dict[str, Any], values: dict[str, Any]) -> dict[st
     an effect with the replaced source only.
     """
     remaining = dict(base)
+    if values.get("statics", {}).get("polygons") == [] and isinstance(remaining.get("statics"), dict):
+        remaining["statics"] = {key: value for key, value in remaining["statics"].items() if key not in _POLYGON_KEYS}
     for table, sources in _ALTERNATIVES:
         old = remaining.get(table)
         new = values.get(table)
@@ -376,16 +393,8 @@ def _suggest_scenario(folder: Path) -> str:
     return f"Give a folder with a {SCENARIO_FILE}, or the file."
 
 
-def apply_override(values: dict[str, Any], override: str) -> dict[str, Any]:
-    """Return ``values`` with one override ``table.key=value``.
-
-    Parameters
-    ----------
-    values
-        Tables and keys of a scenario.
-    override
-        As of :func:`load`.
-    """
+def _apply_override(values: dict[str, Any], override: str) -> dict[str, Any]:
+    """Return ``values`` with one override ``table.key=value``."""
     where = f"--set {override}"
     key, equals, text = override.partition("=")
     if not equals or not key.strip():
@@ -406,6 +415,15 @@ def apply_override(values: dict[str, Any], override: str) -> dict[str, Any]:
         raise InputError(where, f"{parts[-1]!r} is a row, not a key", f"Use {key.strip()}.KEY=VALUE.")
     table[parts[-1]] = value
     return values
+
+
+def _check_earlier_overrides(values: dict[str, Any], earlier: Sequence[str], last: str) -> None:
+    """Raise an InputError when the last override replaced a key that an earlier one had set."""
+    for override in earlier:
+        table, _, key = override.partition("=")[0].strip().partition(".")
+        if isinstance(values.get(table), dict) and key and "." not in key and key not in values[table]:
+            problem = f"the key has no effect: the later --set {last} replaces it"
+            raise InputError(f"--set: {table}.{key}", problem, "Use only one of them.")
 
 
 def _find_row(rows: list[Any], name_or_number: str, where: str) -> Any:

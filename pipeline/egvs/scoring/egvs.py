@@ -10,9 +10,10 @@ and rounded once. The score is therefore the same for any order of voxels, beams
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
-from functools import cached_property
+from functools import cache, cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,12 @@ Hits = NDArray[np.uint32] | NDArray[np.int64]
 """Hits of each voxel, flat, (nx * ny * nz,): numbers of beams, or multiples of a fraction of a beam."""
 
 _DIGITS = 40
+_SPARE_DIGITS = 15
+"""Further digits of the logarithms in the table, which are sums of others."""
+
+_TABLE_SIZE = 50_000
+"""Finding a factor of a larger number would take as long as its logarithm."""
+
 _SCALE = 128
 """Entropies are integer multiples of 2**-128: the smallest above 0, for T = 2**32 - 1, is 8e-9 with 53 bits."""
 
@@ -63,7 +70,26 @@ def _entropies(counts: list[int], frames: int) -> FloatArray:
 def _n_ln_n(n: int) -> Decimal:
     if n == 0:
         return Decimal(0)
-    return n * Decimal(n).ln()
+    return n * _ln(n)
+
+
+def _ln(n: int) -> Decimal:
+    """Return ln n in 40 digits: from the table, or computed if n is larger than the table."""
+    if n > _TABLE_SIZE:
+        return Decimal(n).ln()
+    with localcontext() as context:
+        context.prec = _DIGITS + _SPARE_DIGITS
+        logarithm = _tabulated_ln(n)
+    return +logarithm  # rounded to the digits of the context
+
+
+@cache
+def _tabulated_ln(n: int) -> Decimal:
+    """Return ln n with spare digits: only the logarithms of primes, which are few, are computed as series."""
+    for factor in range(2, math.isqrt(n) + 1):
+        if n % factor == 0:
+            return _tabulated_ln(factor) + _tabulated_ln(n // factor)
+    return Decimal(n).ln()
 
 
 @dataclass(frozen=True)

@@ -373,21 +373,21 @@ def _count_points(
     return_probability: Callable[[FloatArray], FloatArray] | None,
 ) -> _BoxHits:
     boxes, count = record.all_boxes, len(record.all_boxes.values)
-    bands = 1  # then shares are added in the order of azimuths alone
     if site.weight is None and return_probability is None:
-        bands = _BANDS
-    beams = _sort_into_bands(site, bands)
+        beams = _sort_into_bands(site, _BANDS)._replace(weight=np.empty(0))  # beams are counted
+    else:
+        beams = _sort_into_bands(site, 1)  # shares are added in the order of azimuths alone
     is_target = np.zeros(count, dtype=np.bool_)
     is_target[record.row] = True
     all_boxes = boxes.starts, boxes.values, boxes.low, boxes.high, is_target
 
     bounds = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
     result = _BoxHits(np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count, dtype=np.uint64), *bounds)
-    owner = np.full(len(beams.weight), -1, dtype=np.int32)
+    owner = np.full(len(beams.length_m), -1, dtype=np.int32)
     range_m = beams.length_m.copy()
     capacity = 0
     if return_probability is not None:
-        capacity = max(_MAX_HITS, len(beams.weight))
+        capacity = max(_MAX_HITS, len(beams.length_m))
     hits = (np.empty(capacity, dtype=np.int64), np.empty(capacity, dtype=np.int64), *np.empty((3, capacity)))
 
     size_m = np.asarray(record.grid.roi.size_m)
@@ -428,7 +428,9 @@ def _sort_into_bands(beams: Beams, bands: int) -> _SortedBeams:
     if len(slope):
         limits = np.sort(slope)[len(slope) * np.arange(1, bands) // bands]
     band = np.searchsorted(np.unique(limits), slope + _SAME_SLOPE)
-    rows = np.lexsort((azimuth, band))
+    # The beams of an empty scan come in runs of ascending azimuth, which a stable sort makes use of.
+    by_azimuth = np.argsort(azimuth, kind="stable")
+    rows = by_azimuth[np.argsort(band[by_azimuth].astype(np.uint8), kind="stable")]
     starts = np.flatnonzero(np.diff(band[rows], prepend=-1))
     slopes = np.column_stack([np.minimum.reduceat(slope[rows], starts), np.maximum.reduceat(slope[rows], starts)])
     weight = np.ones(len(rows))
