@@ -11,7 +11,7 @@ from __future__ import annotations
 import difflib
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,9 +21,8 @@ from pydantic.fields import FieldInfo
 from egvs.core import reading
 from egvs.core.errors import InputError, format_problem
 from egvs.core.grid import Grid
-from egvs.scenario.fields import NAME_DESCRIPTION, StrictModel
+from egvs.scenario.fields import NAME_DESCRIPTION
 from egvs.scenario.model import SCENARIO_FILE, SITE_DIRECTIONS, SITE_SENSORS, SITE_SOURCES, Scenario, StaticsConfig
-from egvs.scenario.score_config import CostsConfig
 from egvs.scenario.settings import changed_settings, flatten_settings
 from egvs.scenario.traffic_config import TRAFFIC_SOURCES, TrafficConfig, keys_without_effect
 
@@ -373,40 +372,6 @@ def scenario_from_dict(values: dict[str, Any], folder: Path, where: str) -> Scen
     scenario._folders = tuple(_scenario_folders(folder, scenario.extends, where))
     Grid.over(scenario.roi.box, scenario.roi.voxel_m, f"{where}: roi")
     return scenario
-
-
-class _CostsTable(StrictModel):
-    costs: CostsConfig
-
-
-def costs_from_dict(values: Mapping[str, Any], overrides: Iterable[str], where: str) -> CostsConfig:
-    """Check the costs of a scenario that is given as nested dictionaries, as in ``run.json``.
-
-    Parameters
-    ----------
-    values
-        Tables and keys.
-    overrides
-        ``"costs.key=value"``, as in :func:`load`.
-    where
-        The file, for messages.
-
-    Raises
-    ------
-    InputError
-        When costs are invalid, or an override is of another table.
-    """
-    tables: dict[str, Any] = {"costs": dict(values.get("costs", {}))}
-    for override in overrides:
-        if not override.strip().startswith("costs."):
-            problem = "expected a key of [costs], because the runs are finished"
-            raise InputError(f"--set {override}", problem, "Use, for example, --set costs.pole=12000.")
-        tables = _apply_override(tables, override)
-        where = "--set"
-    try:
-        return _CostsTable.model_validate(tables).costs
-    except ValidationError as error:
-        raise format_validation_error(error, where, _CostsTable) from None
 
 
 def default_name(folder: Path) -> str:

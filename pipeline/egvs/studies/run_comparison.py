@@ -32,7 +32,7 @@ from egvs.core.progress import ProgressCallback, no_progress
 from egvs.report.formatting import join_names
 from egvs.report.ranking import Pole, RankedSite, Ranking
 from egvs.report.sensor_results import ScoreDifference, SensorComparison, SensorMount, best_mounts
-from egvs.scenario.loading import costs_from_dict
+from egvs.scenario.costs import costs_from_dict
 from egvs.scenario.score_config import CostsConfig
 from egvs.scenario.settings import flatten_settings
 from egvs.studies.paired_errors import ScoreDifferences, SiteOfRun
