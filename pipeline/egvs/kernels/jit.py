@@ -1,7 +1,7 @@
 """The ``njit`` decorator of this program: numba is imported, and a kernel compiled, when a kernel is first called.
 
-Importing numba takes longer than all else that a run without changes does, so importing a module of kernels does not
-import it. Compiled kernels are cached on disk (:mod:`egvs.kernels.kernel_cache`).
+Importing numba takes longer than all else that a run without changes does, so a module of kernels leaves that to the
+first call. Compiled kernels are cached on disk (:mod:`egvs.kernels.kernel_cache`).
 """
 
 from __future__ import annotations
