@@ -135,10 +135,11 @@ def test_sweep_leaves_out_the_mast_and_names_the_faces_of_the_complete_world(min
 def test_rejects_sensor_inside_any_other_solid(mini: Path) -> None:
     wide = feature({"type": "Point", "coordinates": [10, 12]}, name="m1", kind="mast", height_m=5, radius_m=0.6)
     kiosk = feature({"type": "Point", "coordinates": [10, 12]}, name="m1", kind="kiosk", height_m=5, radius_m=0.2)
-    for solid in (wide, kiosk):
+    for solid, is_narrow in ((wide, False), (kiosk, True)):
         scene = egvs.build_scene(egvs.load(write_scene(mini, solid, sites="inside,10,12,3\n")))
-        with pytest.raises(InputError, match=r"site inside: \(10, 12, 3\) is inside m1"):
+        with pytest.raises(InputError, match=r"site inside: \(10, 12, 3\) is inside m1") as error:
             Scanner(scene).scan_site(scene.site("inside"))
+        assert ("set its kind to pole or mast or sign" in str(error.value)) == is_narrow
 
 
 def test_number_of_cached_worlds_is_limited(mini: Path) -> None:

@@ -248,8 +248,8 @@ def page_maps(city: City, results: Sequence[JunctionResult], plan: CityPlan | No
     gain = gain_label(score.name).label
     figures = [draw("gain", f"by gain: {gain}", gain, [result.gain for result in results], ranks)]
     label = score.noun if score.is_share else "share of the traffic’s uncertainty seen"
-    shares = [_visible_share(result) for result in results]
-    figures.append(draw("seen", f"by the best site of each junction: {label}", label, shares, ranks))
+    percent = [100.0 * _visible_share(result) for result in results]
+    figures.append(draw("seen", f"by the best site of each junction: {label}", f"{label} (%)", percent, ranks))
     if plan is not None:
         counts = [float(plan.by_junction.get(result.junction.id, 0)) for result in results]
         numbers = [f"{count:g}" for count in counts]

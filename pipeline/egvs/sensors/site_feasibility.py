@@ -27,7 +27,7 @@ from egvs.sensors.sites import Pose, Site
 from egvs.world.carriageway import Carriageway
 from egvs.world.mesh import World
 from egvs.world.ray_casting import touches_sensor
-from egvs.world.supports import Supports
+from egvs.world.supports import KINDS, MAX_WIDTH_M, Supports
 
 IN_A_LANE = "in a lane"
 IN_A_JUNCTION = "in a junction"
@@ -58,7 +58,16 @@ def check_pose(scene: Scene, pose: Pose, sensor: Sensor, where: str) -> None:
     if enclosing is not None:
         name, kind = scene.world.solids[enclosing]
         problem = f"({pose.x_m:g}, {pose.y_m:g}, {pose.z_m:g}) is inside {name} ({kind})"
-        raise InputError(where, problem, "Move it outside.")
+        raise InputError(where, problem, _outside_hint(scene.world, enclosing))
+
+
+def _outside_hint(world: World, solid: int) -> str:
+    """Return what to do about a sensor inside a solid; one as narrow as a mast may be its mast."""
+    corners_m = world.triangles_m[world.solid_of_face == solid][:, :, :2].reshape(-1, 2)
+    if np.ptp(corners_m, axis=0).max() > MAX_WIDTH_M:
+        return "Move it outside."
+    kinds = " or ".join(KINDS)
+    return f"Move it outside. If this is the sensor's mast, set its kind to {kinds}; its scan then leaves it out."
 
 
 def ground_height_m(world: World, pose: Pose) -> float:
