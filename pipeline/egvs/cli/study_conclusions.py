@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from egvs.cli.console import Column
+from egvs.cli.console import NARROW, Column
 from egvs.report.formatting import join_names
 from egvs.studies.study_settings import APPROXIMATES, MEASURES, REFERENCE, SCENARIO, SEED_KNOB, TRAFFIC
 
@@ -39,7 +39,7 @@ def traffic_columns(scenario: SettingResult, spread: SeedSpread) -> list[Column[
 
     return [
         Column("setting", lambda row: row.setting, "left", wrap=True),
-        Column("seconds", lambda row: f"{row.seconds:.2f}"),
+        Column("seconds", lambda row: f"{row.seconds:.2f}", min_width=NARROW),
         Column("busy", lambda row: f"{row.busy_s:.2f}"),
         Column("times", format_factor),
         Column("TPOG", lambda row: _format_change(row.tpog_change)),

@@ -87,7 +87,8 @@ def _print_traffic_options(out: Console, study: AccuracyStudy) -> None:
     spread = SeedSpread.from_rows(options)
     options.sort(key=lambda row: (OPTION_KNOBS.index(row.knob), row.setting))
     title = "options of the traffic: another draw of it, compared with the scenario, beside other seeds"
-    out.print(make_table(study_conclusions.traffic_columns(scenario, spread), [scenario, *options], title=title))
+    columns = study_conclusions.traffic_columns(scenario, spread)
+    out.print(make_table(columns, [scenario, *options], width=out.width, title=title))
     if math.isnan(spread.tpog):
         out.print("fewer than two other seeds ran within the budget, so the spread of seeds is unknown")
         return

@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 
 _FILE_WIDTH = 160
 
+MIN_ESTIMATE_S = 10.0
+"""Shorter times that are left are not printed: one pause of a busy machine would make them wrong."""
+
 _MEASURE_TITLES = {
     "ap_mean_r40_iou70": {
         "ap_bev_r40_iou70": "BEV AP, %",
@@ -155,7 +158,7 @@ def _print_agreement(validation: Validation, scenario_score: ScoreName, detector
         agreement = validation.agreement(score, detector, main_measure(detector))
         return _format_interval(agreement.by_kind["spearman"])
 
-    columns: list[Column[ScoreName]] = [Column("Spearman's rho with detection", str, "left")]
+    columns: list[Column[ScoreName]] = [Column("Spearman's rho with detection", str, "left", wrap=True)]
     columns += [Column(detector, partial(format_rho, detector)) for detector in detectors]
     print_table(columns, names, file_width=_FILE_WIDTH)
 
@@ -301,8 +304,9 @@ class DetectorRunDisplay(DetectionListener):
         """Print one line per site, with the time that is left for the detectors where it can be estimated."""
         self._remaining.unit_done(self.kind(site, detectors), cost.seconds)
         left = ""
-        if self._remaining.seconds is not None:
-            left = f" (about {_format_duration(self._remaining.seconds)} left for detectors)"
+        left_s = self._remaining.seconds
+        if left_s is not None and left_s >= MIN_ESTIMATE_S:
+            left = f" (about {_format_duration(left_s)} left for detectors)"
         self._say(f"{cost.seconds:>8.1f} s   {site}: {', '.join(detectors)}{left}")
 
 
