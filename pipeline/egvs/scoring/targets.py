@@ -74,6 +74,9 @@ _KERNEL_ORDER = [0, 1, 2, 6, 7, 3, 4, 5]
 _BANDS = 16
 """Number of bands of slopes that beams are sorted into."""
 
+_STRIDE = 13
+"""Every so manyth beam tells where bands begin; not a divisor of any common number of channels."""
+
 _SAME_SLOPE = 1e-9
 """Slopes that differ by less are those of one ring of a sensor, and belong to one band."""
 
@@ -415,7 +418,7 @@ class _SortedBeams(NamedTuple):
 
 
 def _sort_into_bands(beams: Beams, bands: int) -> _SortedBeams:
-    """Sort beams into bands of slopes with equal numbers of beams, and by azimuth within each band."""
+    """Sort beams into bands of slopes with nearly equal numbers of beams, and by azimuth within each band."""
     ends = beams.ends_m
     azimuth = np.arctan2(ends[:, 1], ends[:, 0])
     run_m = np.sqrt(ends[:, 0] ** 2 + ends[:, 1] ** 2)
@@ -424,15 +427,17 @@ def _sort_into_bands(beams: Beams, bands: int) -> _SortedBeams:
         slope = np.nan_to_num(ends[:, 2] / run_m)
         directions = ends.T / length_m
 
-    limits = slope
-    if len(slope):
-        limits = np.sort(slope)[len(slope) * np.arange(1, bands) // bands]
-    band = np.searchsorted(np.unique(limits), slope + _SAME_SLOPE)
+    limits = np.sort(slope[::_STRIDE])
+    if len(limits):
+        limits = limits[len(limits) * np.arange(1, bands) // bands]
+    band = np.searchsorted(np.unique(limits), slope + _SAME_SLOPE).astype(np.uint8)
     # The beams of an empty scan come in runs of ascending azimuth, which a stable sort makes use of.
     by_azimuth = np.argsort(azimuth, kind="stable")
-    rows = by_azimuth[np.argsort(band[by_azimuth].astype(np.uint8), kind="stable")]
-    starts = np.flatnonzero(np.diff(band[rows], prepend=-1))
-    slopes = np.column_stack([np.minimum.reduceat(slope[rows], starts), np.maximum.reduceat(slope[rows], starts)])
+    rows = by_azimuth[np.argsort(band[by_azimuth], kind="stable")]
+    counts = np.bincount(band)
+    starts = (np.cumsum(counts) - counts)[counts > 0]
+    slope = slope[rows]
+    slopes = np.column_stack([np.minimum.reduceat(slope, starts), np.maximum.reduceat(slope, starts)])
     weight = np.ones(len(rows))
     if beams.weight is not None:
         weight = beams.weight[rows]
