@@ -280,7 +280,7 @@ def test_warns_of_files_that_have_changed_since_the_run(here: Path, run_egvs: An
     code, printed, messages = run_egvs("place", OTHER, "--count", 1)
     assert code == 0
     assert f"warning: sites.csv has changed since the run in {OTHER}: its stages run again as needed" in messages
-    assert "of all 3 candidates" in printed
+    assert "all 3 candidates" in printed
 
 
 def test_says_which_settings_the_scenario_file_has_changed_since_the_run(here: Path, run_egvs: Any) -> None:
@@ -331,7 +331,7 @@ WRITTEN = (
     ["effects.rain={rate_mm_h=20}", "effects.divergence={}"],
     ["traffic.kinds.car.length_m=5"],
     ['sites.sensor="VLP-16"', 'description="a \\"b\\"\\n"'],
-    ["sites.pitch_deg=[0, 10]", "statics.polygon_types={building.shed=2.5}"],
+    ["sites.pitch_deg=[0, 10]", 'statics.polygons=["a.poly.xml"]', "statics.polygon_types={building.shed=2.5}"],
 )
 
 
