@@ -44,11 +44,23 @@ PARTS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
 
 @dataclass(frozen=True)
 class RunCosts:
-    """Costs of a finished city run: core seconds by part, bytes on disk, and peak memory by kind of process."""
+    """Costs of a finished city run, per junction, and peak memory by kind of process.
+
+    Attributes
+    ----------
+    junctions
+        Junctions of the city. If only some of them were run, their costs stand for all.
+    seconds
+        Core seconds per junction, by part.
+    bytes
+        Bytes on disk per junction.
+    peak_mb
+        Peak memory.
+    """
 
     junctions: int
     seconds: Mapping[str, float]
-    bytes: Mapping[str, int]
+    bytes: Mapping[str, float]
     peak_mb: Mapping[str, float]
 
     @classmethod
@@ -57,17 +69,19 @@ class RunCosts:
         costs = json.loads(path.read_text(encoding="utf-8"))
         seconds_of = {step["part"]: step["seconds"] for step in costs["parts"] if step["within"]}
         seconds_of |= {stage["stage"]: stage["seconds"] for stage in costs["stages"]}
+        size = costs["size"]
         seconds: dict[str, float] = {}
         for kind, parts in PARTS.items():
             durations = {part: sum(seconds_of.get(name, 0.0) for name in names) for part, names in parts.items()}
             busy_s = sum(process["busy_s"] or 0.0 for process in costs["processes"] if _kind(process) == kind)
             total_s = sum(durations.values())
-            seconds |= {part: busy_s * duration / total_s if total_s else 0.0 for part, duration in durations.items()}
-        size = costs["size"]
+            n_junctions = size["junctions"] if kind == "worker" else size["city_junctions"]
+            for part, duration in durations.items():
+                seconds[part] = busy_s * duration / total_s / n_junctions if total_s else 0.0
         return cls(
-            size["junctions"],
+            size["city_junctions"],
             seconds,
-            {"runs": size["run_bytes"], "traffic": size["traffic_bytes"]},
+            {"runs": size["run_bytes"] / size["junctions"], "traffic": size["traffic_bytes"] / size["junctions"]},
             _peaks_by_kind(costs["processes"]),
         )
 
@@ -87,10 +101,10 @@ def _kind(process: Mapping[str, Any]) -> str:
 
 
 def growth(small: float, large: float, ratio: float) -> str:
-    """Return the exponent of a cost between two runs whose numbers of junctions have this ratio."""
+    """Return the exponent of a cost between two runs, from the costs per junction and the ratio of junctions."""
     if small <= 0 or large <= 0 or ratio <= 1:
         return "-"
-    return f"{math.log(large / small) / math.log(ratio):.2f}"
+    return f"{1 + math.log(large / small) / math.log(ratio):.2f}"
 
 
 def print_table(runs: Sequence[RunCosts], dollars_per_core_hour: float) -> None:
@@ -102,15 +116,15 @@ def print_table(runs: Sequence[RunCosts], dollars_per_core_hour: float) -> None:
     print(f"{'core hours':<20}{'s/junction':>12}{'exponent':>10}{head}")
     for part, seconds in large.seconds.items():
         exponent = growth(small.seconds[part], seconds, ratio)
-        _print_row(part, seconds / large.junctions, exponent, 1 / 3600)
-    total_s = sum(large.seconds.values()) / large.junctions
-    _print_row("all", total_s, growth(sum(small.seconds.values()), sum(large.seconds.values()), ratio), 1 / 3600)
+        _print_row(part, seconds, exponent, 1 / 3600)
+    total_s = sum(large.seconds.values())
+    _print_row("all", total_s, growth(sum(small.seconds.values()), total_s, ratio), 1 / 3600)
     dollars = [f"{total_s * count / 3600 * dollars_per_core_hour:12,.2f}" for count in JUNCTIONS]
     print(f"{f'dollars, at {dollars_per_core_hour:g} per core hour':<42}{''.join(dollars)}")
 
     print(f"{'gigabytes on disk':<20}{'MB/junction':>12}{'exponent':>10}{head}")
     for name, n_bytes in large.bytes.items():
-        _print_row(name, n_bytes / large.junctions / 1e6, growth(small.bytes[name], n_bytes, ratio), 1e-3)
+        _print_row(name, n_bytes / 1e6, growth(small.bytes[name], n_bytes, ratio), 1e-3)
 
     for kind in large.peak_mb:
         peaks = ", ".join(f"{run.peak_mb.get(kind, math.nan):.0f} ({run.junctions} junctions)" for run in runs)

@@ -11,7 +11,8 @@ from benchmarks.city_costs import RunCosts
 
 
 def write_costs(path: Path, junctions: int, sumo_s: float) -> Path:
-    """Write the costs of a run: per junction 6 s of two workers, a third of it for scores, and 2 MB."""
+    """Write the costs of half a city: per junction 6 s of two workers, a third of it for scores, and 2 MB."""
+    n_ranked = junctions // 2
     work = {"check": 2.0, "statics": 0.0, "scan": 0.0, "traffic": 1.0, "tpog": 1.0, "score": 2.0, "report": 0.0}
     costs = {
         "parts": [
@@ -19,14 +20,19 @@ def write_costs(path: Path, junctions: int, sumo_s: float) -> Path:
             {"part": "SUMO", "seconds": sumo_s, "start_s": 0.0, "end_s": sumo_s, "within": "traffic"},
             {"part": "split", "seconds": sumo_s, "start_s": sumo_s, "end_s": 2 * sumo_s, "within": "traffic"},
         ],
-        "stages": [{"stage": name, "seconds": 10 * s * junctions, "peak_mb": 1.0} for name, s in work.items()],
+        "stages": [{"stage": name, "seconds": 10 * s * n_ranked, "peak_mb": 1.0} for name, s in work.items()],
         "processes": [
             {"process": "egvs", "host": "a", "peak_mb": 300.0, "busy_s": 4.0},
             {"process": "SUMO, when the traffic was made", "host": "", "peak_mb": 60.0, "busy_s": sumo_s},
-            {"process": "worker tcp://a", "host": "a", "peak_mb": 500.0, "busy_s": 4.0 * junctions},
-            {"process": "worker tcp://b", "host": "b", "peak_mb": 700.0, "busy_s": 2.0 * junctions},
+            {"process": "worker tcp://a", "host": "a", "peak_mb": 500.0, "busy_s": 4.0 * n_ranked},
+            {"process": "worker tcp://b", "host": "b", "peak_mb": 700.0, "busy_s": 2.0 * n_ranked},
         ],
-        "size": {"junctions": junctions, "run_bytes": 1_500_000 * junctions, "traffic_bytes": 500_000 * junctions},
+        "size": {
+            "city_junctions": junctions,
+            "junctions": n_ranked,
+            "run_bytes": 1_500_000 * n_ranked,
+            "traffic_bytes": 500_000 * n_ranked,
+        },
     }
     path.write_text(json.dumps(costs), encoding="utf-8")
     return path
@@ -36,8 +42,8 @@ def test_processor_time_is_divided_in_proportion_to_the_stages(tmp_path: Path) -
     """On a busy machine, stages take ten times as long; their processor time is the same."""
     costs = RunCosts.read(write_costs(tmp_path / "costs.json", 10, 40.0))
     assert costs.seconds == {
-        "routing": 0.0, "SUMO": 40.0, "split and tables": 4.0, "checks and worlds": 20.0, "scans": 0.0,
-        "occupancy": 20.0, "score": 20.0, "reports": 0.0,
+        "routing": 0.0, "SUMO": 4.0, "split and tables": 0.4, "checks and worlds": 2.0, "scans": 0.0,
+        "occupancy": 2.0, "score": 2.0, "reports": 0.0,
     }  # fmt: skip
     assert costs.peak_mb == {"egvs": 300.0, "SUMO": 60.0, "worker": 700.0}
 

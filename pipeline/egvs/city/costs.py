@@ -95,6 +95,8 @@ class RunSize:
 
     Attributes
     ----------
+    city_junctions
+        Junctions that share the traffic.
     junctions, sites
         Junctions that were ranked, and their candidate sites.
     frames
@@ -105,6 +107,7 @@ class RunSize:
         Size of the folders of the runs of all junctions, and of the files of their traffic.
     """
 
+    city_junctions: int = 0
     junctions: int = 0
     sites: int = 0
     frames: int = 0
@@ -234,7 +237,7 @@ class CostMeter:
         rows = sum(traffic.rows[job.junction] for job in jobs)
         run_bytes = sum(_folder_bytes(job.out) for job in jobs)
         traffic_bytes = sum(path.stat().st_size for path in traffic_files)
-        self._size = RunSize(len(jobs), sites, traffic.frames, rows, run_bytes, traffic_bytes)
+        self._size = RunSize(len(traffic.rows), len(jobs), sites, traffic.frames, rows, run_bytes, traffic_bytes)
 
     def add_processes(self, cluster: Cluster, traffic: Mapping[str, Any]) -> None:
         """Ask the connected workers and the scheduler for their memory; ``traffic`` is the summary of the traffic."""
