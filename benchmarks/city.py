@@ -7,6 +7,9 @@ Each command runs a synthetic city (junctions of :mod:`benchmarks.scaling`) with
 - ``python -m benchmarks.city flat``: milliseconds per site, from 10 to 10,000 sites per junction and from 1 to 50
   junctions, and the workers' memory.
 
+``python -m benchmarks.city overlap --osm FILE`` creates a city of an OpenStreetMap extract and runs it in pairs: its
+traffic first and then the junctions, and with scenes that are prepared while SUMO runs.
+
 ``python -m benchmarks.city store`` measures the time of adding an entry to a cache of 100 and of 7,000 entries.
 
 ``python -m benchmarks.city kills`` ends random workers with SIGKILL at random moments, ten times, and compares every
@@ -20,6 +23,7 @@ import collections
 import hashlib
 import os
 import random
+import re
 import shutil
 import signal
 import statistics
@@ -38,8 +42,13 @@ from scipy.stats import qmc
 
 from benchmarks.scaling import Size, prepare, sides
 from egvs.artefacts.run_record import RunRecord
-from egvs.city import scheduler, tasks
+from egvs.city import scheduler, tasks, traffic_split
+from egvs.city.city_run import CityRunOptions, run_city
+from egvs.city.costs import CityCosts
+from egvs.city.creation import NewCityOptions, create_city
+from egvs.city.model import CITY_FILE, TRAFFIC_FOLDER, City, load_city
 from egvs.city.tasks import Job, JobResult
+from egvs.cli.city import print_costs
 from egvs.core import files
 from egvs.core.resource_usage import ResourceUsage
 from egvs.runs import run
@@ -170,6 +179,41 @@ def flat(folder: Path) -> None:
                   f"report {report:.2f} s per junction; peak of a worker {peak_mb:.0f} MB", flush=True)  # fmt: skip
 
 
+# ---- work beside the simulation
+
+
+def overlap(folder: Path, osm: Path, frames: int, junctions: int, repeats: int) -> None:
+    """Print the time of a city run in which the traffic is made first, and of one that prepares scenes beside it."""
+    create_city(folder / "city", osm, NewCityOptions())
+    settings = folder / "city" / CITY_FILE
+    text = re.sub("(?m)^frames = .*$", f"frames = {frames}", settings.read_text(encoding="utf-8"))
+    settings.write_text(text, encoding="utf-8")
+    city = load_city(folder / "city")
+    names = [junction.id for junction in city.junctions[:junctions]]
+    _run_city(city, names, first_traffic=True)  # kernels are compiled
+    ratios = []
+    for _ in range(repeats):
+        before_s, _ = _run_city(city, names, first_traffic=True)
+        after_s, costs = _run_city(city, names, first_traffic=False)
+        ratios.append(before_s / after_s)
+        print(f"traffic first {before_s:.1f} s, scenes beside it {after_s:.1f} s: {ratios[-1]:.2f} times as fast")
+        print_costs(costs)
+    print(f"median of {repeats} pairs: {statistics.median(ratios):.2f} times as fast")
+
+
+def _run_city(city: City, names: list[str], *, first_traffic: bool) -> tuple[float, CityCosts]:
+    """Run some junctions of a city without cached results; return the seconds and the costs."""
+    shutil.rmtree(city.folder / TRAFFIC_FOLDER, ignore_errors=True)
+    options = CityRunOptions(junctions=names, on_message=lambda _: None)
+    with tempfile.TemporaryDirectory() as temporary:
+        os.environ["EGVS_STORE"] = f"{temporary}/store"
+        start = time.perf_counter()
+        if first_traffic:
+            traffic_split.make_city_traffic(city)
+        costs = run_city(city, Path(temporary, "out"), options).costs
+        return time.perf_counter() - start, costs
+
+
 def spread(folder: Path, junctions: int, size: Size) -> list[Job]:
     """Return junctions whose sites are spread evenly, at other positions each."""
     jobs = build(folder, {f"j{i}": size for i in range(junctions)})
@@ -273,11 +317,16 @@ def digests(jobs: list[Job]) -> dict[str, str]:
 def main() -> None:
     """Run the requested benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("speed", "flat", "overhead", "store", "kills"))
+    parser.add_argument("what", choices=("speed", "flat", "overhead", "overlap", "store", "kills"))
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--most-beams", type=int, help="beams per task, so that small cities are divided too")
+    parser.add_argument("--osm", type=Path, help="the extract of overlap")
+    parser.add_argument("--frames", type=int, default=300, help="frames of overlap")
+    parser.add_argument("--junctions", type=int, default=4, help="junctions of overlap")
     options = parser.parse_args()
+    if options.what == "overlap" and options.osm is None:
+        parser.error("overlap needs --osm")
     if options.most_beams:
         scheduler.MIN_TASK_BEAMS = scheduler.MAX_TASK_BEAMS = options.most_beams
     with tempfile.TemporaryDirectory() as temporary:
@@ -289,6 +338,8 @@ def main() -> None:
                 flat(folder)
             case "overhead":
                 overhead(folder)
+            case "overlap":
+                overlap(folder, options.osm, options.frames, options.junctions, options.repeats)
             case "store":
                 store()
             case "kills":

@@ -135,6 +135,7 @@ USES = {
     "Tpog": "(Tpog.p.fget(__import__('egvs').read_tpog('run/tpog.parquet')) <= 1).all()",
     "World": SCENE + "isinstance(scene.world, World) and scene.world.triangles_m.shape[1:] == (3, 3)",
     "build_scene": "build_scene(__import__('egvs').load('mini')).sites",
+    "compare_runs": "compare_runs(['run', 'run']).agreements[0].tau == 1.0",
     "load": "load('mini').name == 'mini'",
     "open_session": "open_session('run').ranked[0].rank == 1",
     "place": "len(place(__import__('egvs').load('mini', ['placement.count=1']), 'placed').sensors) == 1",

@@ -25,6 +25,18 @@ def test_results_are_one_informative_line(mini: Path, tmp_path: Path) -> None:
     assert repr(score) == f"SiteScore(egvs {score.egvs:,.1f} bit, entropy_seen {score.entropy_seen:.1%})"
 
 
+def test_comparison_names_its_runs_and_their_agreement(mini: Path, tmp_path: Path) -> None:
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m\nlow,10,12,3\nhigh,10,12,4.5\nother,30.5,-12,3\n")
+    for name in ("first", "second"):
+        egvs.run(egvs.load(mini), tmp_path / name)
+    comparison = egvs.compare_runs([tmp_path / "first", tmp_path / "second"])
+    assert repr(comparison) == "Comparison(A and B by pole, 2 poles; 2 common to A and B, tau 1.00)"
+    best = comparison.runs[0].ranking.best[0]
+    assert repr(comparison.runs[0]) == (
+        f"ComparedRun(A: {tmp_path / 'first'}, 3 sites on 2 poles, small; best {best.site}, EGVS {best.egvs:,.0f} bit)"
+    )
+
+
 def test_rated_pose_shows_the_recommended_score_or_the_reason(mini: Path, tmp_path: Path) -> None:
     scenario = egvs.load(mini, ["score.rank_by='expected_detections'"])
     egvs.run(scenario, tmp_path / "run")

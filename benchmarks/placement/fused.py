@@ -21,10 +21,10 @@ from egvs.placement import plan
 from egvs.scenario.loading import load
 from egvs.sensors.sites import candidate_sites
 from egvs.validation import detection_metrics
-from egvs.validation.detection_metrics import ALL_OBJECTS, JackknifeEstimate, SiteDetection
+from egvs.validation.detection_metrics import ALL_OBJECTS, JackknifeEstimate, SiteDetection, estimate_difference
 from egvs.validation.detector_runs import run_detectors
 from egvs.validation.held_out_traffic import prepare_held_out_traffic
-from egvs.validation.plan_validation import FusedDetectionTask, SensorGroup, estimate_difference, joint_detectors
+from egvs.validation.plan_validation import FusedDetectionTask, SensorGroup, joint_detectors
 from egvs.validation.results import main_measure
 from egvs.validation.sweeps import POINT_COUNTS_NAME
 

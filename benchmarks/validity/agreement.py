@@ -18,8 +18,8 @@ TRAINING, HELD_OUT = "training", "held out"
 WORDS = {
     "seen_20": "share of vehicles with 20 points",
     "log_points": "mean log(1 + points) of vehicles",
-    "ap_combined_r40_iou70": "AP R40, BEV + 3D, IoU 0.7",
-    "ap_combined_r40_iou50": "AP R40, BEV + 3D, IoU 0.5",
+    "ap_mean_r40_iou70": "AP R40, mean of BEV and 3D, IoU 0.7",
+    "ap_mean_r40_iou50": "AP R40, mean of BEV and 3D, IoU 0.5",
     "ap_bev_r40_iou70": "AP R40, BEV, IoU 0.7",
     "ap_3d_r40_iou70": "AP R40, 3D, IoU 0.7",
 }

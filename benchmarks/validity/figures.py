@@ -125,7 +125,7 @@ def heights(table: Table) -> Figure:
                 line = "-" if roles.get(name) == "held out" else "--"
                 axes.plot(metres, values, line, color=colours[name], linewidth=1.0, marker=".", label=name)
         axes.set(xlabel="height above the ground, m", ylabel=f"{measure}, %", xticks=metres)
-        axes.set_ylim(0.0, 100.0 if detector == POINT_COUNTS_NAME else 200.0)
+        axes.set_ylim(0.0, 100.0)
         axes.set_title(detector, fontsize=9)
     panels[0, 0].legend(fontsize=6.5, loc="lower left")
     return figure

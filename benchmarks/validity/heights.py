@@ -47,7 +47,7 @@ def table(records: Sequence[Record], detectors: Sequence[str]) -> Table:
     head += [Column(f"{h:g} m", "one") for h in HEIGHTS_M] + [Column(f"{h:g} minus {low:g} m", "one") for h in above]
     caption = (
         "Mean over the grid locations at each mounting height, and differences at the same locations. Shares of"
-        " vehicles and AP in per cent (BEV + 3D: up to 200), log points times 100. For two detectors: the first minus"
+        " vehicles and AP in per cent (R40), log points times 100. For two detectors: the first minus"
         " the second, at the same sites."
     )
     return Table("C heights", "C. Mounting height", caption, head, rows)

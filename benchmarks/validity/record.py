@@ -19,7 +19,7 @@ from egvs.validation.detection_metrics import BLOCKS
 from egvs.validation.sweeps import POINT_COUNTS_NAME
 
 COUNTED = ("seen_20", "log_points")
-BOXED = ("ap_combined_r40_iou70", "ap_combined_r40_iou50")
+BOXED = ("ap_mean_r40_iou70", "ap_mean_r40_iou50")
 """Measures of detection; tables show the first one of each."""
 
 FURTHER_COUNT_MEASURES, FURTHER_BOX_MEASURES = ("seen_1", "seen_5"), ("ap_bev_r40_iou70", "ap_3d_r40_iou70")

@@ -139,7 +139,7 @@ def measured_table(records: Sequence[Record], detectors: Sequence[str]) -> Table
             Column("worst site", "one"), Column("mean", "one"), Column("best site", "one"),
             Column("mean standard error", "one")]  # fmt: skip
     caption = (
-        "Number of sites that each detector was run at, and what it detected, in per cent (AP is BEV + 3D, up to 200;"
+        "Number of sites that each detector was run at, and what it detected, in per cent (AP is R40;"
         " log points times 100)."
     )
     return Table("0 measured", "What was measured", caption, head, rows)

@@ -62,6 +62,7 @@ if TYPE_CHECKING:
     from egvs.sensors.sensor import Sensor
     from egvs.sensors.sites import Pose, Site
     from egvs.stages.inputs import build_scene
+    from egvs.studies.run_comparison import compare_runs
     from egvs.world.mesh import World
 
 __all__ = [
@@ -80,6 +81,7 @@ __all__ = [
     "World",
     "__version__",
     "build_scene",
+    "compare_runs",
     "load",
     "open_session",
     "place",
@@ -112,6 +114,7 @@ __getattr__, __dir__ = lazy_exports(
         "sensors.sensor": ["Sensor"],
         "sensors.sites": ["Pose", "Site"],
         "stages.inputs": ["build_scene"],
+        "studies.run_comparison": ["compare_runs"],
         "world.mesh": ["World"],
         "_version": ["__version__"],
     },

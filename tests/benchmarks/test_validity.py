@@ -270,7 +270,7 @@ def test_rho_of_each_setting_is_that_of_the_findings(all_tables: list[tables.Tab
     assert [c.heading for c in its.columns[3:]] == ["left", "hilly", "right", "training", "held out"]
     for row in its.rows:
         assert all(cell[0] == (1.0 if row[0] == "2" else -1.0) for cell in row[3:])
-    assert [c.heading for c in table(all_tables, "A cluster ap_combined_r40_iou70").columns[3:]] == [
+    assert [c.heading for c in table(all_tables, "A cluster ap_mean_r40_iou70").columns[3:]] == [
         "left", "right", "training", "held out",
     ]  # fmt: skip
 

@@ -7,7 +7,7 @@ import os
 import re
 import subprocess
 import sys
-from itertools import combinations
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -99,10 +99,15 @@ def test_verbose_prints_times_and_memory_of_every_process(city: City, tmp_path: 
     code, printed, _ = run_egvs("city", "run", city.folder, "--out", tmp_path / "out", "--verbose")
     assert code == 0
     costs = json.loads((tmp_path / "out" / "costs.json").read_text())
-    assert [part["part"] for part in costs["parts"]] == [
-        "start of the workers", "traffic", "junctions", "tables", "page",
-    ]  # fmt: skip
-    assert {stage["stage"] for stage in costs["stages"]} == {*STAGE_NAMES}
+    parts = [part for part in costs["parts"] if not part["within"]]
+    assert [part["part"] for part in parts] == ["start of the workers", "traffic", "junctions", "tables", "page"]
+    assert all(before["end_s"] <= after["start_s"] for before, after in pairwise(parts))
+    (split,) = (part for part in costs["parts"] if part["part"] == "split")  # SUMO does not run for a finished file
+    assert split["within"] == "traffic"
+    assert parts[1]["start_s"] <= split["start_s"] <= split["end_s"] <= parts[1]["end_s"]
+    assert {stage["stage"] for stage in costs["stages"]} >= {*STAGE_NAMES}
+    assert (costs["size"]["junctions"], costs["size"]["sites"], costs["size"]["frames"]) == (2, 4, 60)
+    assert all(size > 0 for size in costs["size"].values())
     assert all(stage["peak_mb"] > 0 for stage in costs["stages"])
     names = [process["process"] for process in costs["processes"]]
     assert names[0] == "egvs"
@@ -131,6 +136,31 @@ def test_runs_one_junction_with_overrides(city: City, tmp_path: Path) -> None:
     assert '"gamma": 2' in (results.junction_run_folder(ran.out, "east") / "run.json").read_text()
     with pytest.raises(InputError, match=r"--junction north: no such junction in .* Use one of west, east"):
         city_run.run_city(city, tmp_path / "out", CityRunOptions(junctions=["north"]))
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("in_process_cluster")
+def test_overrides_have_a_folder_of_their_own(
+    city: City, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run_egvs: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for overrides in ([], ["score.gamma=2.0"], ["score.gamma = 2"]):
+        city_run.run_city(city, None, CityRunOptions(overrides=overrides))
+    names = {city.name, f"{city.name}@gamma=2"}
+    assert {path.name for path in Path("runs").iterdir()} == names
+    code, printed, _ = run_egvs("runs")
+    assert code == 0
+    assert {line.split()[0] for line in printed.splitlines() if "city run" in line} == names
+    assert "complete" in run_egvs("runs", f"runs/{city.name}@gamma=2/junctions")[1]
+
+
+def test_invalid_override_writes_nothing(city: City, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = sorted(city.folder.rglob("*"))
+    with pytest.raises(InputError, match=r"--set: score\.gama: unknown key"):
+        city_run.run_city(city, None, CityRunOptions(overrides=["score.gama=2"]))
+    assert not Path("runs").exists()
+    assert sorted(city.folder.rglob("*")) == before
 
 
 def test_checks_cluster_before_simulating(city: City, tmp_path: Path) -> None:
@@ -288,6 +318,7 @@ def test_junction_with_locked_traffic_is_left_out(city: City, tmp_path: Path, mo
     (warning,) = [warning for warning in first.warnings if warning.rule == "junctions left out"]
     assert warning.problem == "east is left out, because a car stood there"
     assert not city.junction("east").traffic_file(city).exists()
+    assert not results.junction_run_folder(tmp_path / "out", "east").exists()
     assert "east is left out" in (tmp_path / "out" / "city.html").read_text()
 
     monkeypatch.setattr(recording, "record_traffic", None)

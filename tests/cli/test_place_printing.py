@@ -5,45 +5,99 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
+
+from egvs.artefacts.plan_step import PlanStep
+from egvs.artefacts.planned_sensor import PlannedSensor
 from egvs.cli import place
+from egvs.scenario.score_config import PlacementConfig
+
+LAST_LINES = """\
+The plan a, b should find 99.2 ± 0.3% of vehicles, 99.8% of what all 12 candidates reach together; \
+proved: no plan within the rules is better.
+A second sensor adds 4.7 ± 0.5 percentage points to the share of vehicles found: 99.2%, against 94.5% with one. \
+Try --count 3 to see what a third adds.
+"""
 
 
-def placed_with(*joint: float) -> Any:
-    """A plan whose curve has these joint scores, for one sensor, two, ..."""
-    curve = [SimpleNamespace(count=i + 1, plan_value=SimpleNamespace(joint=value)) for i, value in enumerate(joint)]
-    return SimpleNamespace(solution=SimpleNamespace(curve=curve), curve_costs=(0.0,) * len(joint), refinement=None)
+def sensor(order: int, site: str, gain: float, score: float, **values: float) -> PlannedSensor:
+    pose = {"x_m": 0.0, "y_m": 0.0, "z_m": 3.0, "yaw_deg": 0.0, "pitch_deg": 0.0, "roll_deg": 0.0}
+    return PlannedSensor(
+        order, site, site, **pose, sensor="VLP-32C", forced=False, gain=gain, score=score, cost=0.0, loss=0.04, **values
+    )
 
 
-def test_last_sentence_says_what_the_last_sensor_adds() -> None:
-    assert place.describe_last_gain(placed_with(50.0, 80.0, 80.4)) == "Going from 2 to 3 sensors adds 0.5%."
-
-
-def test_one_sensor_or_zero_score_has_no_last_sentence() -> None:
-    assert place.describe_last_gain(placed_with(50.0)) is None
-    assert place.describe_last_gain(placed_with(0.0, 1.0)) is None
-
-
-def planned(curve_sites: tuple[tuple[str, ...], ...], *sites: str) -> Any:
-    placed = placed_with(*[50.0 + i for i in range(len(curve_sites))])
-    placed.curve_sites = curve_sites
-    placed.sensors = tuple(SimpleNamespace(site=site) for site in sites)
+def placed_two(score: str = "expected_detections", scale: float = 1.0, **changes: Any) -> Any:
+    """A proved plan of two sensors; of its joint scores, errors and gains, 1 is ``scale``."""
+    steps = (
+        PlanStep(1, 0.9455 * scale, 0.9455 * scale, True, 0.009 * scale, 0.009 * scale, 1.0),
+        PlanStep(2, 0.9922 * scale, 0.0467 * scale, True, 0.003 * scale, 0.005 * scale, 0.999),
+    )
+    points = [SimpleNamespace(certificate=1.0, count=1), SimpleNamespace(certificate=1.0, count=2)]
+    points[-1].plan_value = SimpleNamespace(joint=steps[-1].score)
+    placed = SimpleNamespace(
+        score=score, steps=steps, joint_of_all=0.9942 * scale, candidates=12, refinement=None, zones=(), files=(),
+        sensors=(
+            sensor(1, "a", steps[0].gain, steps[0].score, gain_se=steps[0].gain_se, score_se=steps[0].score_se),
+            sensor(2, "b", steps[1].gain, steps[1].score, gain_se=steps[1].gain_se, score_se=steps[1].score_se),
+        ),
+        curve_sites=(("a",), ("a", "b")), curve_costs=(0.0, 0.0),
+        has_errors=True, errors_from="10 blocks of 100 frames",
+        solution=SimpleNamespace(curve=points, point=points[-1], fewest_is_proved=None, is_best=True),
+    )  # fmt: skip
+    for name, value in changes.items():
+        setattr(placed, name, value)
     return placed
 
 
+def printed(placed: Any, capsys: pytest.CaptureFixture[str]) -> str:
+    place.print_placement(placed, PlacementConfig(count=2))
+    return capsys.readouterr().out
+
+
+def test_shares_are_per_cent_with_errors_in_percentage_points(capsys: pytest.CaptureFixture[str]) -> None:
+    text = printed(placed_two(), capsys)
+    assert text.endswith(LAST_LINES)
+    assert "adds, % points  found together  lost if it fails, % points" in text
+    assert " 4.7 ± 0.5     99.2 ± 0.3%                         4.0" in text
+    assert "± is one standard error, from 10 blocks of 100 frames" in text
+
+
+def test_bits_have_thousands_separators(capsys: pytest.CaptureFixture[str]) -> None:
+    text = printed(placed_two("egvs", 100_000.0), capsys)
+    assert "EGVS together, bit" in text
+    assert "The plan a, b scores 99,220 ± 300 bit, 99.8% of what all 12 candidates reach together;" in text
+    assert "A second sensor adds 4,670 ± 500 bit (4.7% of the plan's score) to EGVS: 99,220 bit" in text
+
+
+def test_reason_is_printed_where_errors_are_unknown(capsys: pytest.CaptureFixture[str]) -> None:
+    placed = placed_two()
+    steps = tuple(PlanStep(step.count, step.score, step.gain, True) for step in placed.steps)
+    sensors = tuple(sensor(row.order, row.site, row.gain, row.score) for row in placed.sensors)
+    text = printed(
+        placed_two(steps=steps, sensors=sensors, has_errors=False, errors_from="score.standard_error is false"), capsys
+    )
+    assert "no standard errors: score.standard_error is false" in text
+    assert "±" not in text
+    assert "A second sensor adds 4.7 percentage points" in text
+
+
 def test_best_single_site_that_is_not_part_of_the_plan_is_named() -> None:
-    text = place.describe_absent_best(planned((("a",), ("b", "c")), "b", "c"))
+    text = place.describe_absent_best(placed_two(curve_sites=(("c",), ("a", "b"))))
     assert text is not None
-    assert text.startswith("The best single site, a, is not part of this plan")
+    assert text.startswith("The best single site, c, is not part of this plan")
 
 
 def test_best_single_site_in_the_plan_or_a_single_sensor_needs_no_sentence() -> None:
-    assert place.describe_absent_best(planned((("a",), ("a", "c")), "a", "c")) is None
-    assert place.describe_absent_best(planned((("a",),), "a")) is None
+    assert place.describe_absent_best(placed_two()) is None
+    one = placed_two()
+    one.sensors = one.sensors[:1]
+    one.curve_sites = (("a",),)
+    assert place.describe_absent_best(one) is None
 
 
-def test_sensor_table_has_costs_only_where_they_are_set() -> None:
-    placed = placed_with(50.0)
-    placed.sensors = ()
-    assert "cost" not in [column.header for column in place._sensor_table(placed).columns]
-    placed.curve_costs = (3000.0,)
-    assert "cost" in [column.header for column in place._sensor_table(placed).columns]
+def test_costs_are_printed_only_where_they_are_set(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "cost" not in printed(placed_two(), capsys)
+    text = printed(placed_two(curve_costs=(3000.0, 6000.0)), capsys)
+    assert sum("  cost" in line for line in text.splitlines()) == 2
+    assert "The plan a, b for 6000 should find" in text

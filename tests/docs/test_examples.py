@@ -12,7 +12,9 @@ SCENARIOS = Path(__file__).resolve().parents[2] / "scenarios"
 SLOW = [pytest.mark.slow, pytest.mark.system]
 MODULES = [
     "egvs.core.grid",
+    "egvs.runs.run_names",
     "egvs.scenario.loading",
+    "egvs.scenario.settings",
     "egvs.scoring.egvs",
     pytest.param("egvs.runs.run", marks=SLOW),
 ]

@@ -28,6 +28,7 @@ from egvs.sensors import sites
 from egvs.sensors.sites import Pose, Site
 from tests.conftest import write_mini
 from tests.explore.test_session import in_periods
+from tests.processes import Started
 
 
 @pytest.fixture(scope="module")
@@ -129,6 +130,33 @@ def test_poses_that_are_saved_at_once_are_all_in_the_file(mini: Path) -> None:
     assert sorted(row.split(",")[0] for row in rows) == sorted(names)
     assert len(set(names)) == 40
     assert not list(mini.glob(".*.lock"))
+
+
+SAVE_POSES = """
+import sys
+from egvs.explore.view_state import SAVED_SITES, save_pose
+from pathlib import Path
+from egvs.scenario.loading import load
+from egvs.sensors.sites import candidate_sites
+
+folder = Path(sys.argv[1])
+site = candidate_sites(load(folder))[0]
+for _ in range(25):
+    print(save_pose(folder / SAVED_SITES, site, (site.name,)))
+"""
+
+
+@pytest.mark.system
+@pytest.mark.slow
+def test_two_processes_that_save_poses_lose_no_row(mini: Path) -> None:
+    started = [Started(SAVE_POSES, mini) for _ in range(2)]
+    names = []
+    for ended in [process.ended() for process in started]:
+        assert ended.returncode == 0, ended.stderr
+        names += ended.stdout.split()
+    rows = (mini / SAVED_SITES).read_text().splitlines()[1:]
+    assert sorted(row.split(",")[0] for row in rows) == sorted(names)
+    assert len(set(names)) == 50
 
 
 def test_saved_pose_gets_unused_name(mini: Path) -> None:

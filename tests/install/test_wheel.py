@@ -23,7 +23,7 @@ FEW = ("--set", "traffic.frames=60", "--set", "traffic.warmup_s=20", "--set", "r
 
 COMMANDS_WITH_EXTRAS = {
     ("explore", "runs/myplace"): "explore",
-    ("place", "myplace", *FEW, "--count", "2", "--refine"): "place",
+    ("place", "runs/myplace", "--count", "2", "--refine"): "place",
     ("export", "runs/myplace", "--to", "gpkg"): "gis",
     ("figure", "runs/myplace", "--what", "ranking"): "figure",
     ("accuracy", "myplace", *FEW): "figure",
@@ -118,8 +118,9 @@ def test_commands_of_the_readme_work_or_name_their_extra(installed: Installed, w
     shutil.copyfile(EXTRACT, installed.work / "extract.osm")
     runs = installed.work / "runs" / "myplace"
     installed.egvs("new", "myplace", "--osm", "extract.osm")
-    installed.egvs("run", "myplace", *FEW)
-    installed.egvs("place", "myplace", *FEW, "--count", "2")
+    installed.egvs("run", "myplace", *FEW, "--out", "runs/myplace")
+    installed.egvs("place", "runs/myplace", "--count", "2")
+    assert "complete" in installed.egvs("runs").stdout
     installed.egvs("compare", "runs/myplace", "runs/myplace")
     installed.egvs("export", "runs/myplace", "--to", "csv")
     installed.egvs("verify", "runs/myplace")
@@ -131,7 +132,7 @@ def test_commands_of_the_readme_work_or_name_their_extra(installed: Installed, w
         assert f"pip install 'egvs[{extra}]'" in message, message
 
     installed.install(f"{wheel}[explore,gis,place]")
-    installed.egvs("place", "myplace", *FEW, "--count", "2", "--refine")
+    installed.egvs("place", "runs/myplace", "--count", "2", "--refine")
     installed.egvs("export", "runs/myplace", "--to", "gpkg")
     page = installed.start("explore", "runs/myplace", "--no-browser")
     try:

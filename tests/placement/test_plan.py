@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import itertools
 import json
 import math
@@ -170,6 +171,7 @@ def test_smallest_plan_that_reaches_share(five_candidates: Path, out: Path, run_
     rows, _, plan = read_tables(out)
     assert plan["joint"] >= 0.9 * plan["together"]
     assert f"proved: {len(rows) - 1} sensors are not enough" in text
+    assert "sensor is needed to meet the requirements; it adds " in text.splitlines()[-1]
     fewer = itertools.combinations(("a", "b", "b_high", "c", "d"), len(rows) - 1)
     assert max(joint_egvs(five_candidates, out, *names) for names in fewer) < 0.9 * plan["together"]
 
@@ -218,9 +220,11 @@ def test_worst_of_named_periods(five_candidates: Path, out: Path, run_egvs) -> N
         names = [f"'{name}'" for name in periods.split(",")]
         sets = [HALVES, "placement.objective='worst'", f"placement.periods=[{','.join(names)}]"]
         arguments = [word for one in sets for word in ("--set", one)]
-        code, _, error = run_egvs("place", five_candidates, "--out", out, "--count", 2, "--exact", *arguments)
+        code, text, error = run_egvs("place", five_candidates, "--out", out, "--count", 2, "--exact", *arguments)
         assert code == 0, error
         worst[periods] = read_tables(out)[2]["value"]
+        assert "; the plan maximises the score in the period with the lowest share." in text.splitlines()[-1]
+        assert "± is one standard error, from a: 4 blocks of 6 frames" in text
     assert 0.0 < worst["a,b"] <= min(worst["a"], worst["b"]) <= 1.0
 
 
@@ -326,6 +330,10 @@ def test_report_shows_plan_until_inputs_change(five_candidates: Path, out: Path,
     assert "Which sites together?" not in before
     rows, _, _ = read_tables(out)
     assert all(f'<th scope="row">{row["site"]}</th>' in page for row in rows)
+    answer = text.splitlines()[-1]
+    assert answer.startswith(("A second sensor adds ", "One is enough: "))
+    assert answer in html.unescape(page)
+    assert "± is one standard error, from 4 blocks of 10 frames" in page
     run_egvs("run", five_candidates, "--out", out, "--set", "score.gamma=2")
     run_egvs("run", five_candidates, "--out", out, "--set", "seed=8", "--set", "roi.voxel_m=1")
     assert "Which sites together?" not in (out / "report.html").read_text()

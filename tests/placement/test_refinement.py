@@ -213,7 +213,7 @@ def test_command_reports_refinement(mini: Path, run_egvs) -> None:
     assert code == 0
     moved = "moved from the positions of the candidates (<code>--refine</code>), where their joint score is 2,650"
     assert moved in (out / "report.html").read_text()
-    assert "refined: egvs 2650.3 before, " in printed
+    assert "Refined: EGVS 2,650 before, " in printed
     assert "the proof applies to the candidates at their original poses" in printed
     assert "gained by moving" in printed
     table = pq.read_table(out / "placement.parquet")

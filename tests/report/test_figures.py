@@ -57,11 +57,11 @@ def test_lists_the_worst_locations_first_and_none_with_few_vehicles() -> None:
     blindspots = site([ALL, APPROACH, GOOD, FEW, CROSSING, TURN, LEFT])
     assert blindspots.worst == [LEFT, TURN, CROSSING]
     assert figures.describe_worst_locations(blindspots)[0] == (
-        "eastbound left-turn lane: 41 % found",
-        "± 8 %, from 12 vehicles in 120 observations",
+        "eastbound left-turn lane: 41% found",
+        "± 8%, from 12 vehicles in 120 observations",
     )
     assert figures.format_missed_share(blindspots) == "12.5%"
-    assert figures.blindspot_note(blindspots) == "Share of vehicles found on each approach: eastbound 63 %."
+    assert figures.blindspot_note(blindspots) == "Share of vehicles found on each approach: eastbound 63%."
     assert blindspots.in_words() == (
         "p1: fewest vehicles are found here: eastbound left-turn lane (41%); eastbound left turn in the junction (50%)"
     )

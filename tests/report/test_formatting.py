@@ -20,3 +20,22 @@ def test_values_and_errors_as_text() -> None:
     assert (egvs.error(0.0, 3.0), detections.error(0.5, math.nan), detections.value(math.nan)) == ("-", "-", "-")
     assert (egvs.title, detections.title, points.title) == ("EGVS<br>(bit)", "Found<br>of all", "Log<br>points")
     assert set(SCORE_LABELS) >= {"egvs", *get_args(OtherScore)}
+
+
+def test_differences_are_in_percentage_points_or_units() -> None:
+    egvs, detections, points = (SCORE_LABELS[name] for name in ("egvs", "expected_detections", "points_on_target"))
+    assert detections.with_error(0.9457, 0.0089) == "94.6 ± 0.9%"
+    assert egvs.with_error(247397.2, 1203.4) == "247,397 ± 1,203"
+    assert (detections.with_error(0.9457, math.nan), egvs.with_error(200.0, math.nan)) == ("94.6%", "200")
+    assert (detections.change(0.0468, 0.0051), points.change(0.25, 0.02)) == ("4.7 ± 0.5", "0.25 ± 0.02")
+    assert (detections.change(-0.0468), egvs.change(12345.6, math.nan)) == ("-4.7", "12,346")
+    assert (detections.change_unit, egvs.change_unit) == ("percentage points", "bit")
+
+
+def test_small_standard_error_is_not_written_as_zero() -> None:
+    egvs, detections = SCORE_LABELS["egvs"], SCORE_LABELS["expected_detections"]
+    assert detections.with_error(0.999, 0.0004) == "99.9 ± <0.1%"
+    assert egvs.change(55.0, 0.4) == "55 ± <1"
+    assert detections.with_error(1.0, 0.0) == "100.0 ± 0.0%"
+    assert detections.is_zero(0.0004)
+    assert not detections.is_zero(0.0006)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,10 +17,13 @@ from egvs.report import page
 from egvs.report.figures import Figures
 from egvs.report.page import PageContents
 from egvs.report.ranking import Ranking
+from egvs.report.ranking_check import DetectorCheck, RankCorrelation, RankingCheck
+from egvs.report.sections import DetectorSummary, MeasureColumn, SiteDetection, ValidationSummary
 from egvs.scenario.effects_config import EffectsConfig
 from tests.report.small_runs import (
     EMPTY_BACKDROP,
     FRAMES,
+    SENSOR,
     SITES,
     UNSAFE_NAME,
     PageReader,
@@ -195,6 +199,48 @@ def test_has_no_table_of_user_columns_without_them(plain_run):
     assert "Your columns from the sites file" not in plain_run[2]
 
 
+TWO_SENSORS = {"small": SENSOR, "dense": SENSOR | {"azimuth_step_deg": 1}}
+SITES_OF_TWO_SENSORS = [("n small", 6, 9, 2, "small"), ("n dense", 6, 9, 2, "dense"), ("s", 6, -1, 2, "small")]
+
+
+def sensor_section(folder, **keys):
+    """Text of the section on sensors, ranked by the share of vehicles seen well."""
+    keys |= {"sensors": TWO_SENSORS, "score": {"rank_by": "seen_well"}}
+    html = render_report(*run_to_scores(folder, SITES_OF_TWO_SENSORS, columns=("sensor",), **keys))
+    assert PageReader(html).ids.count("sensors") == 1
+    return html.split('<section id="sensors">')[1].split("</section>")[0]
+
+
+def test_compares_sensors_where_there_are_several(tmp_path):
+    section = sensor_section(tmp_path)
+    rows = [row.split("</th>")[0] for row in section.split('<th scope="row">')[1:]]
+    assert rows == ["small", "dense"]  # the one that sees least is the baseline
+    assert "One more" not in section
+    assert "--set &#39;costs.sensor={&#34;small&#34; = PRICE, &#34;dense&#34; = PRICE}&#39;" in section
+    assert "docs/validity.md" in section
+
+
+def test_shows_what_one_more_percentage_point_costs(tmp_path):
+    costs = {"sensor": {"small": 1000, "dense": 4000}}
+    section = sensor_section(tmp_path, costs=costs)
+    scores = read_scores(tmp_path / "out" / "scores.parquet").to_pydict()
+    seen = dict(zip(scores["site"], scores["seen_well"], strict=True))
+    points = 100 * (seen["n dense"] - max(seen["n small"], seen["s"]))
+    assert points > 0
+    assert f'data-label="One more point costs">{3000 / points:,.0f}<' in section
+    assert "PRICE" not in section
+
+
+def test_has_no_section_on_sensors_with_one_sensor(plain_run):
+    assert "Which sensor?" not in plain_run[2]
+
+
+def test_costs_are_an_input_of_the_page(plain_run, tmp_path):
+    _, out, _ = plain_run
+    before = inputs_of(page, make_scenario(tmp_path, SITES), out)
+    assert inputs_of(page, make_scenario(tmp_path, SITES, costs={"pole": 5}), out) != before
+
+
 def test_page_of_one_site(tmp_path):
     text = render_report(*run_to_scores(tmp_path, sites=SITES[:1]))
     read = PageReader(text)
@@ -257,3 +303,32 @@ def test_page_of_five_hundred_sites(tmp_path):
     assert len({name for title in titles for name in re.findall(r"g\d{3}", title)}) == 500, (
         "each tells its name on the map"
     )
+
+
+def test_headline_says_that_the_validation_contradicts_the_ranking(plain_run):
+    scenario, out, text = plain_run
+    assert "contradicts" not in text
+    ranking, tpog = Ranking.read(out / "scores.parquet"), read_tpog(out / "tpog.parquet")
+    first, best = ranking.sites[0].site, ranking.sites[1].site
+    rho = RankCorrelation(0.1, -0.5, 0.6, 4)
+    losing = DetectorCheck(
+        "cluster", "mean AP of BEV and 3D", True, first, 0.5, best, 0.7, 0.01, 0.2, 0.02, 10, rho, None
+    )
+    found = {site.site: SiteDetection(0.5, 0.01, 1) for site in ranking.sites}
+    summary = DetectorSummary("cluster", (MeasureColumn("BEV AP", found), MeasureColumn("mean AP", found)))
+
+    def headline(check):
+        detected = ValidationSummary((summary,), RankingCheck("egvs", (check,)), 10, 18, 7.0, (), "")
+        contents = PageContents(scenario, ranking, tpog, Figures("", "", None, EMPTY_BACKDROP), {}, detected=detected)
+        html = page.render_page(contents)
+        read = PageReader(html)
+        assert "detected" in read.ids and "cluster BEV AP" in read.text and "cluster mean AP" in read.text
+        return read, html[html.index("<h1>") :].split("</h1>")[0]
+
+    read, title = headline(losing)
+    assert title.endswith(", but the validation contradicts this")
+    reason = f"With cluster, detection is better from {best} than from the first site, {first}, by 20.0 ± 2.0 AP points"
+    assert reason in read.text
+    assert read.fetched.count("#detected") == 1
+    read, title = headline(replace(losing, loss_se=0.2))
+    assert "contradicts" not in title and "contradicts" not in read.text

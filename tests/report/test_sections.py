@@ -8,70 +8,13 @@ import html
 import math
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from egvs.artefacts import parquet
-from egvs.report.sections import RHO, RHO_RANGE, DetectorSummary, SiteDetection, Tau, egvs_setting, ranking_disagreement
+from egvs.report.sections import RHO, RHO_RANGE, egvs_setting, ranking_disagreement
 from egvs.studies import score_errors, study_settings
 from tests.report.test_ranking import by_vehicles, ranking
-
-NAN = float("nan")
-
-
-SCORED = [
-    SimpleNamespace(site=name, egvs=run_egvs) for name, run_egvs in zip("abcd", (9.0, 7.0, 5.0, 2.0), strict=True)
-]
-
-
-def _summary(values, tau):
-    known = [value for value in values if value is not None]
-    ranks = [None if value is None else 1 + sum(other > value for other in known) for value in values]
-    sites = {s.site: SiteDetection(v, 0.01, r) for s, v, r in zip(SCORED, values, ranks, strict=True)}
-    return DetectorSummary("d", "what", Tau(*tau), sites)
-
-
-@pytest.mark.parametrize(
-    ("values", "tau", "agreement", "judgement"),
-    [
-        (  # five of six pairs agree
-            (0.9, 0.5, 0.6, 0.1), (0.67, 0.2, 1.0),
-            "EGVS and detection agree on which of two sites is better in 83% of the pairs of 4 sites "
-            "(Kendall's tau 0.67, 95 % confidence interval 0.20 to 1.00).",
-            "This is more than chance: sites with a higher score tend to detect more. The best site by score, a, has "
-            "rank 1 by detection.",
-        ),
-        (  # pairs of equal values do not count
-            (0.5, 0.5, 0.6, 0.1), (0.18, -0.5, 0.8),
-            "EGVS and detection agree on which of two sites is better in 60% of the pairs of 4 sites "
-            "(Kendall's tau 0.18, 95 % confidence interval -0.50 to 0.80).",
-            "4 sites are too few to tell: the interval includes 0, so the agreement may be chance. The best site by "
-            "score, a, has rank 2 by detection.",
-        ),
-        (
-            (0.1, 0.2, 0.3, 0.4), (-1.0, -1.0, -0.4),
-            "EGVS and detection agree on which of two sites is better in 0% of the pairs of 4 sites "
-            "(Kendall's tau -1.00, 95 % confidence interval -1.00 to -0.40).",
-            "The score orders these sites the wrong way round: sites with a higher score tend to detect less. The "
-            "best site by score, a, has rank 4 by detection.",
-        ),
-        (
-            (None, 0.3, 0.2, 0.1), (1.0, NAN, NAN),
-            "EGVS and detection agree on which of two sites is better in 100% of the pairs of 3 sites "
-            "(Kendall's tau 1.00).",
-            "3 sites are too few to say how certain this is.",
-        ),
-        (
-            (None, None, None, 0.1), (NAN, NAN, NAN),
-            "1 site with values: too few, or too similar, to compare the two rankings.", "",
-        ),
-    ],
-)  # fmt: skip
-def test_describes_agreement_of_the_orders(values, tau, agreement, judgement):
-    summary = _summary(values, tau)
-    assert summary.agreement(SCORED) == agreement
-    assert summary.judgement(SCORED) == judgement
 
 
 @pytest.mark.slow
@@ -90,7 +33,7 @@ def test_shows_the_validation_of_the_same_run(mini, tmp_path, run_egvs):
     text = html.unescape(section())
     assert f"data:image/png;base64,{base64.b64encode((out / 'validation.png').read_bytes()).decode()}" in text
     assert "in 10 frames of traffic, at least 2 s apart, with 18 vehicles in the region" in text
-    assert "to compare the two rankings" in text  # of two sites
+    assert "2 sites are too few, or too similar, to tell whether EGVS predicts detection here" in text
     assert "evaluated with the frames that the TPOG was computed from" in text and str(mini) not in text
     for row in parquet.read_artefact(out / "detection.parquet", "detection")[0].to_pylist():
         if row["objects_of"] == "vehicles":
@@ -197,7 +140,7 @@ def test_shows_the_accuracy_study_of_the_same_run(mini, tmp_path, run_egvs, monk
     assert not is_shown()
     code, printed, error = run_egvs("accuracy", mini, "--out", out)
     assert code == 0, error
-    assert printed.splitlines()[-1] == str(out / "report.html")
+    assert str(out / "report.html") in printed.splitlines()
     text = (out / "report.html").read_text()
     assert f"data:image/png;base64,{base64.b64encode((out / 'accuracy.png').read_bytes()).decode()}" in text
     rows = parquet.read_artefact(out / "accuracy.parquet", "accuracy")[0].to_pylist()

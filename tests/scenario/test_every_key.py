@@ -101,7 +101,7 @@ KEYS: dict[str, Change] = {
     "roi.voxel_m": Change("1"),
     "traffic.network": Change("'others.net.xml'", NETWORK),
     "traffic.routes": Change("['trips.rou.xml']", file="without_kinds.toml"),
-    "traffic.sumocfg": Change("'streets.sumocfg'", NETWORK),
+    "traffic.sumocfg": Change("'streets.sumocfg'", file="without_kinds.toml"),
     "traffic.fcd": Change("'others.csv'"),
     "traffic.fcd_geo": Change("true"),
     "traffic.roads": Change("'streets.net.xml'"),

@@ -86,7 +86,7 @@ def test_routes_are_dropped_with_their_source(tmp_path: Path) -> None:
 
 
 def test_override_replaces_source(tmp_path: Path) -> None:
-    scenario = extended(tmp_path, "", DRAWN, "traffic.fcd=x.csv", "sites.along=[]", "sites.file=y.csv")
+    scenario = extended(tmp_path, "", DRAWN, "traffic.fcd=x.csv", "sites.file=y.csv")
     assert (scenario.traffic.network, scenario.traffic.fcd, scenario.sites.file) == (None, "x.csv", "y.csv")
 
 
@@ -102,3 +102,49 @@ def test_override_finds_row_by_name_or_number(mini: Path, row: str) -> None:
     scenario = egvs.load(mini, [f"traffic.kinds.{row}.length_m=6.5"])
     assert scenario.traffic.kinds[0].length_m == 6.5
     assert scenario.traffic.kinds[1:] == egvs.load(mini).traffic.kinds[1:]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (
+            ["sites.yaw_deg=90", "sites.aim='roi'"],
+            "--set: sites.yaw_deg: the key has no effect: the later --set sites.aim='roi' replaces it",
+        ),
+        (
+            ["sites.sensor=OS1-128", "sites.replace_sensor=VLP-16"],
+            "--set: sites.sensor: the key has no effect: the later --set sites.replace_sensor=VLP-16 replaces it",
+        ),
+        (
+            ["traffic.frames=20", "traffic.network='net.net.xml'", "traffic.fcd='fcd.csv'"],
+            "--set: traffic.frames: the key has no effect: the later --set traffic.fcd='fcd.csv' replaces it",
+        ),
+        (
+            ["statics.polygon_height_m=4"],
+            "--set: statics: polygon_height_m has no effect without polygons. Set polygons, or remove",
+        ),
+        (
+            ["statics.polygon_types={building='ignore'}", "statics.polygon_height_m=4"],
+            "--set: statics: polygon_height_m and polygon_types have no effect without polygons",
+        ),
+    ],
+)
+def test_rejects_override_without_effect(mini: Path, overrides: list[str], message: str) -> None:
+    with pytest.raises(InputError) as error:
+        egvs.load(mini, overrides)
+    assert message in str(error.value)
+
+
+def test_last_value_of_a_key_counts(mini: Path) -> None:
+    scenario = egvs.load(mini, ["sites.yaw_deg=90", "sites.yaw_deg=45", "traffic.fcd='fcd.csv'", "traffic.frames=20"])
+    assert (scenario.sites.yaw_deg, scenario.traffic.frames) == (45.0, 20)
+
+
+def test_scenario_without_polygons_takes_over_no_keys_of_polygons(mini: Path) -> None:
+    base = mini / "scenario.toml"
+    base.write_text(base.read_text() + "\n[statics.polygon_types]\nbuilding = 3\n")
+    base.write_text(base.read_text().replace("[statics]\n", "[statics]\npolygons = ['solids.poly.xml']\n"))
+    (mini / "child").mkdir()
+    (mini / "child" / "scenario.toml").write_text('extends = ".."\n[statics]\npolygons = []\n')
+    assert egvs.load(mini).statics.polygon_types == {"building": 3.0}
+    assert egvs.load(mini / "child").statics.polygon_types == {}

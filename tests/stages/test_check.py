@@ -12,7 +12,7 @@ import egvs
 from egvs.core.errors import DiagnosticsError, InputError
 from egvs.sensors.sites import Pose, Site
 from egvs.stages import check, scene_checks
-from egvs.stages.inputs import CheckInputs
+from egvs.stages.inputs import CheckInputs, Inputs
 from egvs.traffic import network, sumo, sumo_folder
 from egvs.world.carriageway import Carriageway
 from tests.conftest import collection, feature
@@ -514,3 +514,30 @@ def test_map_is_converted_once(street: Path, monkeypatch: pytest.MonkeyPatch) ->
     (street / "map.osm").write_text("<osm> </osm>")
     sumo_folder.read_network(scenario)
     assert calls == ["netconvert", "netconvert"]
+
+
+# ---- the scene alone
+
+
+def test_check_with_scene_report_finds_the_same(street: Path) -> None:
+    statics(street, box((-3, -3), (3, 3)))  # over the lanes
+    inputs = Inputs(egvs.load(street))
+    report = check.check_scene(inputs)
+    assert report is not None
+    complete = check.check_inputs(inputs)
+    assert complete.warnings
+    assert check.check_inputs(inputs, check.SceneReport.from_json(json.loads(json.dumps(report.to_json())))) == complete
+
+
+def test_scene_is_checked_before_its_traffic_exists(mini: Path) -> None:
+    before = check.check_scene(Inputs(egvs.load(mini)))
+    (mini / "fcd.csv").unlink()
+    assert check.check_scene(Inputs(egvs.load(mini))) == before
+    (finding,) = check.check_inputs(Inputs(egvs.load(mini)), before).findings
+    assert finding.is_error and "fcd.csv" in f"{finding.where} {finding.problem}"
+
+
+def test_no_scene_report_where_the_complete_check_is_necessary(mini: Path) -> None:
+    assert check.check_scene(Inputs(egvs.load(mini, ["effects.articulated.kinds.bus.parts_m=[9.0, 9.0]"]))) is None
+    sites(mini, "below,20,12,-5")
+    assert check.check_scene(Inputs(egvs.load(mini))) is None

@@ -33,7 +33,14 @@ MEASURED = {
 RESTED = MEASURED | {"front", "recommended"}
 """Columns that depend on measured times."""
 
-FEW_VALUES = SettingValues(voxels_m=(1.0,), gammas=(2.0,), frame_periods_s=(1.0,), unnamed_effects=False)
+FEW_VALUES = SettingValues(
+    voxels_m=(1.0,),
+    gammas=(2.0,),
+    frame_periods_s=(1.0,),
+    unnamed_effects=False,
+    traffic_options=False,
+    traffic_seeds=0,
+)
 
 
 def run_study(

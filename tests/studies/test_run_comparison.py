@@ -17,8 +17,12 @@ import egvs
 from egvs.cli import study_tables
 from egvs.core.errors import InputError
 from egvs.core.files import add_checksum
+from egvs.report.ranking import RankedSite, Ranking, ScoreValue, share_of_limit
+from egvs.report.sensor_results import SENSOR_EVIDENCE
+from egvs.scenario.score_config import CostsConfig
 from egvs.studies import run_comparison
-from egvs.studies.run_comparison import SiteResult, compare_runs
+from egvs.studies.paired_errors import ScoreDifferences
+from egvs.studies.run_comparison import ComparedRun, compare_runs
 
 
 @pytest.fixture
@@ -32,14 +36,14 @@ def two(mini: Path, tmp_path: Path) -> tuple[Path, Path]:
 
 
 def test_compares_scores_shares_ranks_and_settings(two: tuple[Path, Path]) -> None:
-    comparison = compare_runs(two)
+    comparison = compare_runs(two, by="site")
     assert [run.label for run in comparison.runs] == ["A", "B"]
     assert set(comparison.sites) == {"pole_a", "pole_b", "pole_c"}
     for run, folder in zip(comparison.runs, two, strict=True):
         for row in egvs.read_scores(folder / "scores.parquet").to_pylist():
             site = run.sites[row["site"]]
             assert (site.egvs, site.rank, site.egvs_se) == (row["egvs"], row["rank"], row["egvs_se"])
-            assert site.share == pytest.approx(row["egvs"] / row["egvs_limit"])
+            assert share_of_limit(site) == pytest.approx(row["egvs"] / row["egvs_limit"])
     differing = {difference.what: difference.values for difference in comparison.differences}
     assert differing["score.gamma"] == (4.0, 2.0)
     assert differing["seed"] == (7, 8)
@@ -80,18 +84,26 @@ def test_agreement_uses_the_scores_that_rank(mini: Path, tmp_path: Path, capsys)
     assert all(f"{value:.1%}" in printed for value in scores[1]["seen_well"])
 
 
-def row(site: str, run_egvs: float, rank: int) -> SiteResult:
-    return SiteResult(site, (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, "s"), 135.5, 34.6, run_egvs, None, rank, run_egvs / 100)
+def row(site: str, score: float, rank: int = 1, **values: object) -> RankedSite:
+    """A site at (1, 2), 3 m up, upright, with the sensor s, ranked by EGVS."""
+    base = RankedSite(site, 1.0, 2.0, 3.0, score, rank, site, 0.0, 0.0, 0.0, "s", 100.0, 1, 1, 0.5)
+    return replace(replace(base, longitude_deg=135.5, latitude_deg=34.6), **values)
+
+
+def found(site: str, share: float, rank: int = 1, **values: object) -> RankedSite:
+    """The same, ranked by the share of vehicles found, with a standard error of 0.3 points."""
+    score = ScoreValue("expected_detections", share, 0.003)
+    return row(site, 1000.0 * share, rank, rank_by="expected_detections", others=(score,), **values)
+
+
+def made_run(label: str, *sites: RankedSite, **settings: object) -> ComparedRun:
+    return ComparedRun(label, Path(label.lower()), Ranking.of(sites), settings, {})
 
 
 def test_rank_agreement_computed_by_hand() -> None:
     """Three sites of four in common; two of their three pairs in the same order: tau = (2 - 1) / 3."""
-    a = run_comparison.ComparedRun(
-        "A", Path("a"), {s: row(s, v, 0) for s, v in (("p", 9.0), ("q", 8.0), ("r", 4.0), ("x", 99.0))}, {}, {}
-    )
-    b = run_comparison.ComparedRun(
-        "B", Path("b"), {s: row(s, v, 0) for s, v in zip("pqr", (6, 8, 2), strict=True)}, {}, {}
-    )
+    a = made_run("A", *(row(s, v) for s, v in (("p", 9.0), ("q", 8.0), ("r", 4.0), ("x", 99.0))))
+    b = made_run("B", *(row(s, v) for s, v in zip("pqr", (6, 8, 2), strict=True)))
     pair = run_comparison.compare_rankings(a, b)
     assert (pair.shared, pair.best_a, pair.best_b) == (3, ("p",), ("q",))
     assert pair.tau == pytest.approx(1 / 3)
@@ -99,37 +111,131 @@ def test_rank_agreement_computed_by_hand() -> None:
     assert pair.regret_a == pytest.approx(0.25)
 
 
-def test_runs_without_common_site_are_noted(two: tuple[Path, Path], mini: Path, tmp_path: Path, run_egvs) -> None:
-    (mini / "sites.csv").write_text("site,x_m,y_m,z_m\nlamp,10,12,3\n")
+def test_agreement_by_pole_uses_the_best_mount_of_each() -> None:
+    """The best mounts score 9 > 8 in A and 6 < 7 in B; the other sites would give the opposite order."""
+    here, there = {"x_m": 0.0, "pole": "p"}, {"x_m": 5.0, "pole": "q"}
+    a = made_run("A", row("p@3m", 9.0, 1, **here), row("q@3m", 8.0, 2, **there), row("p@6m", 1.0, 3, **here))
+    b = made_run("B", row("q@4m", 7.0, 1, **there), row("lamp", 6.0, 2, **here | {"pole": "lamp"}))
+    pair = run_comparison.compare_rankings(a, b, "pole")
+    assert (pair.shared, pair.tau, pair.best_a, pair.best_b) == (2, -1.0, ("p",), ("q",))
+    assert pair.regret_a == pytest.approx(1 / 7)
+
+
+def test_same_pole_with_another_name_or_height_is_matched(two: tuple[Path, Path], mini: Path, tmp_path: Path) -> None:
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m\nlamp,10,12,4.5\nlamp low,10,12,2.5\n")
     egvs.run(egvs.load(mini), tmp_path / "third")
-    code, printed, _ = run_egvs("compare", two[0], tmp_path / "third")
+    comparison = compare_runs([two[0], tmp_path / "third"])
+    assert comparison.by == "pole"
+    pole = next(pole for pole in comparison.poles if pole.name == "pole_a")
+    first, second = pole.mounts
+    assert first is not None
+    assert second is not None
+    assert (first.site, first.z_m) == ("pole_a", 3.0)
+    scores = dict(
+        zip(
+            *(egvs.read_scores(tmp_path / "third" / "scores.parquet").to_pydict()[k] for k in ("site", "egvs")),
+            strict=True,
+        )
+    )
+    assert second.egvs == max(scores.values()) == scores[second.site]
+    assert [pole.mounts[1] for pole in comparison.poles if pole.name == "pole_b"] == [None]
+    assert comparison.agreements[0].shared == 1
+
+
+def test_pole_that_was_moved_is_another_pole(two: tuple[Path, Path], mini: Path, tmp_path: Path, run_egvs) -> None:
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,10,12.5,3\npole_b,30.5,-12,3\n")
+    egvs.run(egvs.load(mini), tmp_path / "third")
+    comparison = compare_runs([two[0], tmp_path / "third"], by="pole")
+    assert len(comparison.poles) == 3
+    assert comparison.notes == (
+        "poles of the same name at different positions in A and B count as different poles: pole_a is 0.50 m away",
+    )
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,10,12.5,3\n")
+    egvs.run(egvs.load(mini), tmp_path / "fourth")
+    assert compare_runs([two[0], tmp_path / "fourth"]).by == "site"  # only the names agree
+    code, _, message = run_egvs("compare", two[0], tmp_path / "fourth", "--by", "pole")
+    assert code == 2
+    assert f"{two[0]}: no pole in common with {tmp_path / 'fourth'}" in message
+    assert "pole_a is 0.50 m away" in message
+
+
+def test_runs_without_common_pole_are_refused(two: tuple[Path, Path], mini: Path, tmp_path: Path, run_egvs) -> None:
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m\nlamp,11,12,3\n")
+    egvs.run(egvs.load(mini), tmp_path / "third")
+    code, printed, message = run_egvs("compare", two[0], tmp_path / "third")
+    assert (code, printed) == (2, "")
+    assert "no pole in common" in message
+    assert "Compare runs with the same poles" in message
+    code, printed, _ = run_egvs("compare", two[0], tmp_path / "third", "--by", "site")
     assert code == 0
-    assert "note: A and B have no site in common, so their rankings cannot be compared" in printed
+    assert "note: A and B have no site name in common, so their rankings cannot be compared" in printed
+
+
+def test_sensors_of_one_run_on_different_poles_are_compared(mini: Path, run_egvs) -> None:
+    file = mini / "scenario.toml"
+    other = (
+        "[sensors.other]\nelevations_deg = [-20, -3]\nchannels = 10\nazimuth_step_deg = 1.5\nrange_m = 90\n\n[score]"
+    )
+    file.write_text(file.read_text().replace("[score]", other))
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m,sensor\none,10,12,3,small\ntwo,30.5,-12,3,other\n")
+    egvs.run(egvs.load(mini), mini / "run")
+    comparison = compare_runs([mini / "run"])
+    assert [pole.differences for pole in comparison.poles] == [(None, None)] * 2
+    assert comparison.notes == ("A and B have no pole in common, so their rankings cannot be compared",)
+    assert comparison.sensors is not None
+    gain = comparison.sensors.results[1].gain
+    assert gain is not None
+    assert gain.difference.is_paired
+    code, printed, _ = run_egvs("compare", mini / "run")
+    assert code == 0
+    assert "the best mount of each sensor" in printed
+    code, _, message = run_egvs("compare", mini / "run", "--by", "site")
+    assert code == 2
+    assert "--by site: expected a second run" in message
+
+
+def test_default_view_is_by_site_where_mounts_are_the_same(two: tuple[Path, Path], mini: Path, tmp_path: Path) -> None:
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,10,12,3\npole_b,30.5,-12,3\n")
+    egvs.run(egvs.load(mini, ["score.gamma=2"]), tmp_path / "gamma")
+    assert compare_runs([two[0], tmp_path / "gamma"]).by == "site"
+    assert compare_runs(two).by == "pole"  # pole_a is higher in the second run
+
+
+def test_scores_that_cannot_be_subtracted_have_no_difference(two: tuple[Path, Path]) -> None:
+    comparison = compare_runs(two)
+    assert [pole.differences for pole in comparison.poles] == [(None, None)] * 3
+    assert "A and B differ in score.gamma: compare ranks and shares, not bits" in comparison.notes
 
 
 def test_compare_command_prints_tables_and_notes(two: tuple[Path, Path], run_egvs) -> None:
-    code, printed, _ = run_egvs("compare", *two)
+    code, printed, _ = run_egvs("compare", *two, "--by", "site")
     assert code == 0
     for part in ("A bit", "B rank", "score.gamma", "note: 1 site has the same name", str(two[0])):
         assert part in printed
     code, printed, _ = run_egvs("compare", two[0], two[0], "--top", 1)
-    assert "their settings and files are the same" in printed
+    assert "their settings and files are the same" not in printed  # it is one folder
     assert "pole_a" not in printed or "pole_b" not in printed.split("runs")[0]
+    code, printed, _ = run_egvs("compare", *two)
+    assert code == 0
+    for part in ("A z m", "B EGVS bit", "common poles"):
+        assert part in printed
 
 
 @pytest.mark.parametrize("width", [80, 190])
 @pytest.mark.parametrize("runs", [2, 5])
 def test_tables_fit_the_terminal(width: int, runs: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    sites = {f"site_{n:02}": row(f"site_{n:02}", 123456.7 - n, n + 1) for n in range(3)}
-    one = run_comparison.ComparedRun("A", Path("runs/base"), sites, {"seed": 1}, {})
+    one = made_run("A", *(row(f"site_{n:02}", 123456.7 - n, n + 1) for n in range(3)), seed=1)
     all_runs = tuple(
         replace(one, label=run_comparison.run_label(n), settings={"traffic.kinds[car].length_m": n})
         for n in range(runs)
     )
     comparison = run_comparison.Comparison(
         all_runs,
-        tuple(sites),
+        "site",
+        (),
+        tuple(one.sites),
         (run_comparison.compare_rankings(one, all_runs[1]),),
+        None,
         tuple(run_comparison.find_differences(all_runs)),
         (),
     )
@@ -142,6 +248,97 @@ def test_tables_fit_the_terminal(width: int, runs: int, monkeypatch: pytest.Monk
     header = [line for line in lines if line.startswith("site")]
     assert {f"{run.label} rank" for run in all_runs} <= {cell.strip() for line in header for cell in line.split("  ")}
     assert any("longitude" in line for line in header) == (width == 190)
+
+
+def by_pole(*runs: ComparedRun) -> run_comparison.Comparison:
+    """A comparison of made-up runs: errors of differences as if independent."""
+    independent = ScoreDifferences({})
+    locations = dict.fromkeys(location for run in runs for location in run.poles)
+    return run_comparison.Comparison(
+        runs,
+        "pole",
+        tuple(run_comparison._compare_pole(location, runs, independent) for location in locations),
+        (),
+        tuple(run_comparison.compare_rankings(runs[0], run, "pole") for run in runs[1:]),
+        run_comparison._compare_sensors(runs, run_comparison._sensor_mounts(runs), independent),
+        (),
+        (),
+    )
+
+
+def printed_text(comparison: run_comparison.Comparison, width: int, monkeypatch: pytest.MonkeyPatch) -> str:
+    console = Console(width=width, record=True, markup=False, highlight=False)
+    monkeypatch.setattr(study_tables, "console", lambda *_, **__: console)
+    study_tables.print_comparison(comparison)
+    return console.export_text()
+
+
+def mounts(sensor: str, *shares: float) -> list[RankedSite]:
+    """Sites on poles 10 m apart, 4.5 m up, tilted by 10 degrees."""
+    pose = {"z_m": 4.5, "pitch_deg": -10.0, "sensor": sensor}
+    sites = []
+    for number, share in enumerate(shares):
+        pole = f"kerb_{number}"
+        sites.append(found(f"{pole}@4.5m-10deg", share, number + 1, pole=pole, x_m=10.0 * number, **pose))
+    return sites
+
+
+@pytest.mark.parametrize("width", [80, 160])
+@pytest.mark.parametrize("runs", [2, 5])
+def test_tables_of_poles_fit_the_terminal(width: int, runs: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    compared = [
+        made_run(run_comparison.run_label(number), *mounts(f"OS{number}-128", 0.8 + 0.01 * number, 0.7))
+        for number in range(runs)
+    ]
+    text = printed_text(by_pole(*compared), width, monkeypatch)
+    tables = text.split("best mount of each sensor")[0].splitlines()
+    assert max(len(line) for line in tables if line.startswith(("pole", "kerb"))) <= width
+    first_rows = [line for line in tables if line.startswith("kerb_0")]
+    for number in range(runs):
+        assert any(f"{0.8 + 0.01 * number:.1%} ±0.3%" in line for line in first_rows)
+    assert all("80.0% ±0.3%" in line for line in first_rows)  # the first run is in each table
+    assert "+1.0 ±0.4" in text
+    if width == 80:
+        assert "4.5 m, -10°" in first_rows[0]
+    else:
+        assert "kerb_0@4.5m-10deg" in first_rows[0]
+
+
+def test_says_at_how_many_poles_a_run_is_better(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By +3, +0.2 and -2 percentage points, each with a standard error of 0.4."""
+    a, b = made_run("A", *mounts("s", 0.9, 0.8, 0.7)), made_run("B", *mounts("t", 0.93, 0.802, 0.68))
+    text = printed_text(by_pole(a, b), 160, monkeypatch)
+    assert "B against A at 3 common poles: better at 2 (clearly at 1), worse at 1 (clearly at 1)" in text
+    for difference in ("  +3.0 ±0.4", "~ +0.2 ±0.4", "  -2.0 ±0.4"):
+        assert difference in text
+
+
+def test_prints_how_to_set_costs_or_what_one_more_point_costs(monkeypatch: pytest.MonkeyPatch) -> None:
+    a, b = made_run("A", *mounts("s", 0.9)), made_run("B", *mounts("t", 0.95))
+    text = printed_text(by_pole(a, b), 160, monkeypatch)
+    assert """egvs compare a b --set 'costs.sensor={"s" = PRICE, "t" = PRICE}', or [costs] in scenario.toml""" in text
+    costs = CostsConfig(sensor={"s": 1000.0, "t": 6000.0})
+    text = printed_text(by_pole(replace(a, costs=costs), replace(b, costs=costs)), 160, monkeypatch)
+    assert "one more point costs" in text
+    assert "1,000" in text  # 5000 for 5 points
+    assert "PRICE" not in text
+    assert SENSOR_EVIDENCE.split(".")[0] in text
+
+
+def test_costs_of_the_command_line_replace_those_of_the_run(mini: Path, tmp_path: Path, run_egvs) -> None:
+    egvs.run(egvs.load(mini, ["costs.pole=5", "costs.sensor={small=7}"]), tmp_path / "run")
+    both = [tmp_path / "run", tmp_path / "run"]
+    assert compare_runs(both).runs[0].costs == CostsConfig(pole=5, sensor={"small": 7})
+    overridden = compare_runs(both, costs=["costs.sensor={small=9, other=3}", "costs.metre=2"]).runs[1].costs
+    assert overridden == CostsConfig(pole=5, metre=2, sensor={"small": 9, "other": 3})
+    for override, message in (
+        ("traffic.frames=3", "--set traffic.frames=3: expected a key of [costs]"),
+        ("costs.pole=-1", "--set: costs.pole: expected a value greater than or equal to 0, got -1"),
+        ("costs.lamp=1", "costs.lamp"),
+    ):
+        code, printed, error = run_egvs("compare", *both, "--set", override)
+        assert (code, printed) == (2, "")
+        assert message in error
 
 
 @pytest.mark.slow
@@ -175,7 +372,7 @@ def test_missing_effect_is_listed_by_its_parameters(mini: Path, tmp_path: Path) 
 
 def test_empty_table_is_listed_by_rows_of_other_run() -> None:
     runs = [
-        run_comparison.ComparedRun(label, Path(), {}, settings, {})
+        made_run(label, row("p", 1.0), **settings)
         for label, settings in (
             ("A", {"traffic.periods": [], "seed": 1}),
             ("B", {"traffic.periods[day].weight": 1.0, "seed": 1}),
@@ -190,8 +387,10 @@ def test_labels_continue_after_z() -> None:
 
 
 def test_rejects_folders_without_finished_run(two: tuple[Path, Path], tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="expected at least two runs, got 1"):
+    with pytest.raises(InputError, match="expected a second run, because all sites of this one have the sensor small"):
         compare_runs(two[:1])
+    with pytest.raises(InputError, match="expected at least one run, got none"):
+        compare_runs([])
     with pytest.raises(InputError, match=r"run\.json: no such file. Give a folder written by egvs run."):
         compare_runs([two[0], tmp_path / "nowhere"])
     record = json.loads((two[1] / "run.json").read_text())

@@ -364,7 +364,7 @@ def test_prints_sizes_and_where_they_come_from(mini: Path, tmp_path: Path, run_e
 def test_size_of_a_kind_of_the_scenario_is_named_as_such(mini: Path, tmp_path: Path, run_egvs) -> None:
     code, _, output = run_egvs("traffic", mini, "--out", tmp_path / "out")
     assert code == 0, output
-    assert "sizes: car 4.5 x 1.8 x 1.5 m (from traffic.kinds)" in " ".join(output.split())
+    assert "sizes from traffic.kinds: car 4.5 x 1.8 x 1.5 m" in " ".join(output.split())
     record = json.loads((tmp_path / "out" / "run.json").read_text())
     size = {"length_m": 4.5, "width_m": 1.8, "height_m": 1.5, "vclass": "passenger", "source": "traffic.kinds"}
     assert record["stages"]["traffic"]["summary"]["sizes"] == {"car": size}
@@ -379,4 +379,5 @@ def test_size_in_the_metadata_of_the_file_is_named_as_such(mini: Path) -> None:
 def test_many_sizes_are_shortened() -> None:
     size = {"length_m": 4.0, "width_m": 2.0, "height_m": 1.5, "vclass": "passenger", "source": "traffic.vtypes"}
     text = stage_summary.describe_sizes({f"t{number}": size for number in range(10)})
-    assert text.endswith("t5 4 x 2 x 1.5 m (from traffic.vtypes), 4 more in run.json")
+    assert text.startswith("sizes from traffic.vtypes: t0 4 x 2 x 1.5 m, t1 ")
+    assert text.endswith("t5 4 x 2 x 1.5 m, 4 more in run.json")

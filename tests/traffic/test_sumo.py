@@ -59,6 +59,14 @@ def test_finding_sumo_preserves_proj_variables(monkeypatch):
     assert os.environ["PROJ_DATA"] == sumo.sumo_environment()["PROJ_DATA"] == "mine"
 
 
+def test_programs_use_huge_pages_unless_the_user_sets_other_tunables(tmp_path, monkeypatch):
+    fake_sumo(tmp_path, monkeypatch, 'echo "$GLIBC_TUNABLES"')
+    monkeypatch.delenv("GLIBC_TUNABLES", raising=False)
+    assert sumo.run_program("sumo", [], tmp_path) == "glibc.malloc.hugetlb=1\n"
+    monkeypatch.setenv("GLIBC_TUNABLES", "glibc.malloc.check=0")
+    assert sumo.run_program("sumo", [], tmp_path) == "glibc.malloc.check=0\n"
+
+
 def test_version_of_another_sumo_is_parsed(tmp_path, monkeypatch):
     fake_sumo(tmp_path, monkeypatch, "echo 'Eclipse SUMO sumo v1_27_0+0045-abc'")
     sumo.sumo_version.cache_clear()

@@ -90,7 +90,7 @@ def test_by_hand(truth, scored, r11, r40, recall):
     for view in ("bev", "3d"):
         np.testing.assert_allclose(values(evaluation, view), [r11, r40, recall], atol=1e-12)
     for kind, value in (("r11", r11), ("r40", r40)):
-        assert evaluation.measures[f"ap_combined_{kind}_iou70"].value == pytest.approx(2 * value)
+        assert evaluation.measures[f"ap_mean_{kind}_iou70"].value == pytest.approx(value)
 
 
 def test_measures_without_objects_are_nan_with_warnings():
@@ -120,7 +120,7 @@ def test_height_matters_in_3d_only():
     """Half its height up: an overlap of 1 from above, of .75 / 2.25 = 1/3 in space."""
     evaluation = one_frame(objects([A]), (box(0.0, z=1.5), 0.9))
     assert values(evaluation, "bev", 50) == [1, 1, 1] and values(evaluation, "3d", 50) == [0, 0, 0]
-    assert evaluation.measures["ap_combined_r40_iou50"].value == 1
+    assert evaluation.measures["ap_mean_r40_iou50"].value == 0.5
 
 
 def test_detections_of_ignored_objects_are_not_counted():

@@ -73,7 +73,7 @@ def test_boxes_on_two_of_three_vehicles():
     value = {name: entry.value for name, entry in _row(rows, "d").measures.items()}
     assert value["recall_bev_iou70"] == value["recall_3d_iou50"] == pytest.approx(2 / 3)
     assert 26 / 40 <= value["ap_bev_r40_iou70"] <= 27 / 40  # precision 1 up to a recall of 2/3
-    assert value["ap_combined_r40_iou70"] == pytest.approx(value["ap_bev_r40_iou70"] + value["ap_3d_r40_iou70"])
+    assert value["ap_mean_r40_iou70"] == pytest.approx((value["ap_bev_r40_iou70"] + value["ap_3d_r40_iou70"]) / 2)
     assert value["seen_1"] == pytest.approx(2 / 3)  # of the vehicles, whatever the detector
     assert _row(rows, "d", "points_20").measures["recall_bev_iou70"].value == 1.0
 

@@ -5,8 +5,15 @@ import math
 import numpy as np
 
 from egvs.sensors.sites import Pose, Site
-from egvs.validation.detection_metrics import ALL_OBJECTS, BLOCKS, MEASURES, JackknifeEstimate, SiteDetection
-from egvs.validation.plan_validation import SensorGroup, estimate_difference, with_gains
+from egvs.validation.detection_metrics import (
+    ALL_OBJECTS,
+    BLOCKS,
+    MEASURES,
+    JackknifeEstimate,
+    SiteDetection,
+    estimate_difference,
+)
+from egvs.validation.plan_validation import SensorGroup, with_gains
 from egvs.validation.sweeps import POINT_COUNTS_NAME
 
 A, B = (Site(name, Pose(0.0, 0.0, 3.0), "small") for name in "ab")

@@ -238,7 +238,7 @@ _REQUIRED_METADATA: dict[str, tuple[str, ...]] = {
     "city_curve": ("inputs", "plan"),
     "detection": ("inputs", "frames", "stages"),
     "fused": ("inputs", "frames", "shown"),
-    "correlation": ("inputs", "frames", "stages", "own_score", "shown"),
+    "correlation": ("inputs", "frames", "stages", "own_score", "shown", "ranking"),
 }
 """Keys that readers of an artefact need in its metadata."""
 
@@ -285,7 +285,7 @@ def _is_valid(key: str, value: Any) -> bool:
             return _has_keys(value, _PLAN_KEYS) and all(_is_number(value[name]) for name in _PLAN_KEYS)
         case "inputs":
             return isinstance(value, str)
-        case "stages" | "own_score" | "shown":
+        case "stages" | "own_score" | "shown" | "ranking":
             return isinstance(value, dict)
         case "tolerance" | "memory_frames" | "points":
             return isinstance(value, float) and 0 < value < math.inf

@@ -40,6 +40,9 @@ class PlannedSensor:
         What the joint score loses if this sensor alone returns to its candidate's pose; 0 without refinement.
     junction
         Name of the junction, in plans of a city.
+    score_se, gain_se
+        Standard errors of ``score`` and ``gain`` due to the finite traffic record; NaN where they are unknown, and in
+        plans of a city.
     """
 
     order: int
@@ -61,6 +64,8 @@ class PlannedSensor:
     moved_m: float = 0.0
     gain_by_refining: float = 0.0
     junction: str = ""
+    score_se: float = math.nan
+    gain_se: float = math.nan
 
     @property
     def marked_order(self) -> str:

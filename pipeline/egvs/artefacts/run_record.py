@@ -69,7 +69,9 @@ def _is_digest_table(value: Any) -> bool:
     return isinstance(value, dict) and all(isinstance(digest, str) for digest in value.values())
 
 
-_RECORD_TYPES = {"egvs": str, "seed": int, "scenario": dict, "scenario_folder": str, "stages": dict}
+_RECORD_TYPES = {
+    "egvs": str, "seed": int, "scenario": dict, "scenario_folder": str, "stages": dict, "overrides": dict,
+}  # fmt: skip
 _RERUN_HINT = "Remove it and run again."
 
 
@@ -87,6 +89,9 @@ class RunRecord:
         The resolved scenario, and the folder of its files relative to the run folder.
     stages
         The completed stages, in the order of execution.
+    overrides
+        The settings in which ``scenario`` differed from the scenario file, by full key. Empty for the scenario as it
+        was written, and for a record of an older version.
     """
 
     egvs: str
@@ -94,6 +99,7 @@ class RunRecord:
     scenario: dict[str, Any]
     scenario_folder: str
     stages: dict[str, StageRecord]
+    overrides: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
     def read(cls, folder: Path) -> RunRecord:
@@ -112,6 +118,8 @@ class RunRecord:
         if has_checksum and not has_valid_checksum(value):
             raise InputError(path, f"was changed after the run: {CHECKSUM_KEY} does not match the content", _RERUN_HINT)
 
+        if isinstance(value, dict):
+            value = {"overrides": {}, **value}  # which older versions did not record
         for key, expected_type in _RECORD_TYPES.items():
             actual = value.get(key) if isinstance(value, dict) else value
             if not isinstance(actual, expected_type):
@@ -123,7 +131,8 @@ class RunRecord:
                 stage = StageRecord.from_json(value["stages"].get(name))
                 if stage is not None:
                     stages[name] = stage
-        return cls(value["egvs"], value["seed"], value["scenario"], value["scenario_folder"], stages)
+        values = {name: value[name] for name in _RECORD_TYPES if name != "stages"}
+        return cls(**values, stages=stages)
 
     @property
     def digests(self) -> dict[str, str]:

@@ -20,9 +20,8 @@ from egvs.city.allocation import Allocation, JunctionPlan, JunctionPlans
 from egvs.city.replicates import CityBlocks
 from egvs.city.results import BudgetPoint, CityPlan
 from egvs.core.grid import FloatArray
+from egvs.placement.plan_error import SHORT_RECORD
 from egvs.scoring.standard_errors import summarise_uncertainty
-
-_SHORT_RECORD = "; the recorded traffic is short for its autocorrelation, so they may be too small"
 
 
 class _Errors(NamedTuple):
@@ -131,5 +130,5 @@ def _standard_errors(
     estimate = blocks.uncertainty(np.array(sums))
     source = str(summarise_uncertainty(estimate, [period.name for period in blocks.periods])["standard_errors_from"])
     if any(stratum.is_short or stratum.still_correlated for stratum in estimate.strata):
-        source += _SHORT_RECORD
+        source += SHORT_RECORD
     return _Errors(estimate.se, source, True)

@@ -1,6 +1,7 @@
 """``egvs city run`` and ``egvs city place``: run all junctions on a cluster, and plan sensors for the whole city.
 
-Steps of :func:`run_city`: simulate the traffic once (:mod:`egvs.city.traffic_split`); run every junction
+Steps of :func:`run_city`: simulate the traffic once (:mod:`egvs.city.traffic_split`), while workers check and scan the
+scenes of the junctions; run every junction
 (:mod:`egvs.city.scheduler`); collect the results (:mod:`egvs.city.results`); write the page (:mod:`egvs.city.page`)
 and the costs (:mod:`egvs.city.costs`).
 The folder of each junction is byte for byte what ``egvs run`` of its scenario alone writes.
@@ -31,6 +32,7 @@ from egvs.city.worker_pool import print_to_stderr
 from egvs.core.errors import Diagnostic, InputError, collect_warnings
 from egvs.core.grid import Roi
 from egvs.core.progress import ProgressCallback, no_progress
+from egvs.runs import run_names
 from egvs.runs.run import lock_run_folder
 
 _MIN_FIRST_COUNT = 4
@@ -99,7 +101,8 @@ def run_city(city: City, out: str | Path | None = None, options: CityRunOptions 
     city
         From :func:`egvs.city.model.load_city`.
     out
-        The folder of the city run; ``runs/<name of the city>`` when None.
+        The folder of the city run; ``runs/<name of the city>`` when None, or, with overrides, that and their label
+        (see :mod:`egvs.runs.run_names`).
     options
         Options of the run; the defaults when None.
 
@@ -111,8 +114,10 @@ def run_city(city: City, out: str | Path | None = None, options: CityRunOptions 
         When the traffic or a run fails, or the cluster is lost; finished results are kept.
     """
     options = options or CityRunOptions()
-    folder = _run_folder(city, out)
+    folder = _run_folder(city, out, options.overrides)
     jobs = make_jobs(city, folder, options)
+    for job in jobs[:1]:
+        job.scenario()  # rejects an invalid override before anything is written
     meter = CostMeter()
     with lock_run_folder(folder):
         scheduler.check_cluster(options.cluster)
@@ -146,19 +151,29 @@ def _run_jobs(
 
     Junctions whose traffic is locked, or that have none, are left out.
     """
-    with meter.part("traffic"):
-        traffic = traffic_split.make_city_traffic(city, options.progress, options.overrides)
+    with meter.part("traffic"), scheduler.SceneTasks(cluster, jobs) as scenes:
+        progress = meter.traffic_progress(options.progress)
+        traffic = traffic_split.make_city_traffic(city, progress, options.overrides, scenes.start)
+    meter.add_traffic(traffic)
+    meter.add_scenes(scenes)
     jobs = [job for job in jobs if job.junction not in traffic.left_out]
     if not jobs:
         problem = "all junctions that were selected are left out: their traffic is locked, or they have none"
         raise InputError("--junction", problem, f"Select others, or use less traffic in {city.file}.")
+
+    def on_done(result: JobResult) -> None:
+        meter.add_parts(result)
+        options.on_done(result)
+
     with meter.part("junctions"):
-        scheduler.run_jobs(cluster.client, jobs, on_done=options.on_done, progress=options.progress, cluster=cluster)
+        scheduler.run_jobs(cluster.client, jobs, on_done=on_done, progress=options.progress, cluster=cluster)
     with meter.part("tables"):
         junction_results = read_junction_results(folder, [city.junction(job.junction) for job in jobs])
         written = write_results(folder, city, junction_results)
-    meter.add_runs([job.out for job in jobs])
+    meter.add_runs(jobs)
     meter.add_processes(cluster, traffic.summary)
+    n_sites = sum(result.sites for result in junction_results)
+    meter.add_size(jobs, n_sites, traffic, traffic_split.traffic_paths(city, [job.junction for job in jobs]))
     return CityRun(folder, junction_results, written, tuple(collect_warnings([traffic.summary])))
 
 
@@ -190,8 +205,10 @@ def make_jobs(city: City, out: Path, options: CityRunOptions) -> list[Job]:
     return jobs
 
 
-def _run_folder(city: City, out: str | Path | None) -> Path:
-    return Path(out) if out is not None else Path("runs") / city.name
+def _run_folder(city: City, out: str | Path | None, overrides: Sequence[str]) -> Path:
+    if out is not None:
+        return Path(out)
+    return run_names.run_folder(city.name, run_names.parse_overrides(overrides))
 
 
 def place_city(
@@ -223,7 +240,7 @@ def place_city(
     options = options or CityRunOptions()
     requested = _check_request(count, budget)
     phases = _check_phases(phases, count)
-    folder = _run_folder(city, out)
+    folder = _run_folder(city, out, options.overrides)
     jobs = make_jobs(city, folder, options)
     for job in jobs:
         allocation.check_additive_config(job.scenario())

@@ -18,7 +18,7 @@ question, which standard errors do not answer.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -27,14 +27,14 @@ import numpy as np
 
 from egvs.artefacts.frame_boxes import read_boxes
 from egvs.artefacts.run_folder import RunFolder
-from egvs.artefacts.tpog import PeriodBlocks, read_periods, read_tpog
+from egvs.artefacts.tpog import PeriodBlocks, read_periods
 from egvs.city.tasks import Job
-from egvs.core.grid import FloatArray, Grid, IntArray
-from egvs.placement import problem
-from egvs.placement.problem_builder import PlacementProblem, TargetView, VoxelView
+from egvs.core.grid import FloatArray, Grid
+from egvs.placement.plan_error import PlanReplicates
+from egvs.placement.problem_builder import PlacementProblem
 from egvs.scoring.occupancy import near_grid
-from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, ScoreUncertainty, block_groups
-from egvs.scoring.targets import FrameGroups, recorded_frames
+from egvs.scoring.standard_errors import BlockGroups, ScoreUncertainty, block_groups
+from egvs.scoring.targets import recorded_frames
 from egvs.stages.base import StageContext
 
 
@@ -113,9 +113,9 @@ class JointReplicates:
     def __init__(
         self, context: StageContext, placement_problem: PlacementProblem, blocks: CityBlocks, mean_vehicles: float
     ) -> None:
-        self._problem = placement_problem
+        self._joint = placement_problem.problem.joint
         self._index = {name: i for i, name in enumerate(placement_problem.names)}
-        self._values = _score_replicates(context, placement_problem, blocks)
+        self._replicates = PlanReplicates(context, placement_problem, blocks.periods)
         self._factor: FloatArray | float = 1.0
         if placement_problem.score != "egvs":
             trajectories = context.folder.trajectories
@@ -127,55 +127,9 @@ class JointReplicates:
 
         The first column is the score with all frames.
         """
-        term = self._problem.problem.joint
-        state = problem.CoverageState([term])
-        rows = [self._values(state.totals(term))]
-        for name in sites:
-            state.add(self._index[name])
-            rows.append(self._values(state.totals(term)))
-        return np.array(rows) * self._factor
-
-
-def _score_replicates(
-    context: StageContext, placement_problem: PlacementProblem, blocks: CityBlocks
-) -> Callable[[IntArray], FloatArray]:
-    """Return the joint score, of all frames and without each group, as a function of the totals of all cells."""
-    view, score = placement_problem.views[-1], placement_problem.score
-    if isinstance(view, TargetView):
-        return _target_replicates(context, view, score, blocks)
-    return _voxel_replicates(context, view, score, blocks)
-
-
-def _target_replicates(
-    context: StageContext, view: TargetView, score: str, blocks: CityBlocks
-) -> Callable[[IntArray], FloatArray]:
-    recorded = recorded_frames(context.folder.trajectories)
-    groups = FrameGroups.of(blocks.periods, recorded, view.targets.record)
-    groups = replace(groups, weight=view.targets.weight)
-
-    def replicates(totals: IntArray) -> FloatArray:
-        means = groups.means(problem.target_values(score, totals, view.unit))
-        return np.nan_to_num(means, nan=0.0)  # without vehicles, none is found
-
-    return replicates
-
-
-def _voxel_replicates(
-    context: StageContext, view: VoxelView, score: str, blocks: CityBlocks
-) -> Callable[[IntArray], FloatArray]:
-    tpog = read_tpog(context.folder.tpog)
-    jackknife = BlockJackknife.of(context.folder.tpog, tpog, groups=blocks.groups)
-    assert jackknife is not None  # common_blocks checks that every record has two blocks
-    gamma = context.scenario.gamma
-
-    def replicates(totals: IntArray) -> FloatArray:
-        hits = np.zeros(int(np.prod(tpog.grid.shape)), dtype=np.int64)
-        hits[view.voxels] = totals
-        if score == "egvs":
-            return jackknife.scores(hits, gamma, view.unit)
-        return jackknife.voxel_shares(hits, score)
-
-    return replicates
+        rows = self._replicates.of_order(self._joint, [self._index[name] for name in sites])
+        rows[np.isnan(rows)] = 0.0  # without vehicles, none is found
+        return rows * self._factor
 
 
 def vehicles_without_groups(trajectories: Path, grid: Grid, blocks: CityBlocks) -> FloatArray:

@@ -1,5 +1,7 @@
 """Run the junctions of a city on a Dask cluster: processes of this machine, or the workers of a running scheduler.
 
+:class:`SceneTasks` prepare the scenes of junctions while their traffic is simulated.
+
 Steps of :func:`run_jobs`: ask the workers (:mod:`egvs.city.worker_pool`); estimate the work of each junction; build one
 graph of tasks, in which large junctions are split and small ones are grouped; wait for the results, and replace local
 processes that are lost.
@@ -14,6 +16,7 @@ import logging
 import os
 import re
 import shutil
+import socket
 import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -23,7 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from egvs.city import tasks
-from egvs.city.tasks import Job, JobFailure, JobResult, Part, RunSettings, program_id
+from egvs.city.tasks import Job, JobFailure, JobResult, Part, RunSettings, SceneResult, program_id
 from egvs.city.worker_check import Requirements, library_names
 from egvs.city.worker_pool import WorkerPool, connected_workers, print_to_stderr, writable_folders
 from egvs.core import plugins
@@ -427,6 +430,82 @@ def map_junctions(cluster: Cluster, task: Callable[..., T], jobs: Iterable[Job],
             yield job, _task_result(future, [job.junction])
 
 
+class SceneTasks:
+    """Tasks that prepare the scenes of junctions while this program simulates their traffic, see :meth:`start`.
+
+    At the end of the block, tasks that have not ended are cancelled: the runs of their junctions do the work.
+
+    Parameters
+    ----------
+    cluster
+        From :func:`checked_workers`.
+    jobs
+        The junctions.
+
+    Attributes
+    ----------
+    start_s, end_s
+        When the tasks were submitted, and when the last one ended (:func:`time.perf_counter`).
+    """
+
+    def __init__(self, cluster: Cluster, jobs: Sequence[Job]) -> None:
+        self._cluster, self._jobs = cluster, jobs
+        self._futures: list[Future] = []
+        self.start_s = self.end_s = time.perf_counter()
+
+    def __enter__(self) -> SceneTasks:
+        return self
+
+    def start(self) -> None:
+        """Submit the tasks; some workers get none, so that a core is left for SUMO."""
+        client, pool = self._cluster.client, self._cluster.workers
+        addresses = workers_beside_sumo(pool.accepted(), socket.gethostname(), thread_count(None))
+        self.start_s = self.end_s = time.perf_counter()
+        with _watch_scheduler(client):
+            for job in self._jobs:
+                future = client.submit(
+                    tasks.prepare_scene, job, self._cluster.settings,
+                    pure=False, resources=pool.resources, workers=addresses,
+                )  # fmt: skip
+                future.add_done_callback(self._note_end)
+                self._futures.append(future)
+
+    def results(self) -> list[SceneResult]:
+        """Return the results of the tasks that have ended; a failed one is repeated in the run of its junction."""
+        with _watch_scheduler(self._cluster.client):
+            results = [future.result() for future in self._futures if future.status == "finished"]
+        return [result for result in results if isinstance(result, SceneResult)]
+
+    def _note_end(self, future: Future) -> None:
+        if future.status == "finished":
+            self.end_s = time.perf_counter()
+
+    def __exit__(self, *_error: object) -> None:
+        unfinished = [future for future in self._futures if not future.done()]
+        with suppress(OSError, TimeoutError):  # a lost scheduler is reported where results are awaited
+            self._cluster.client.cancel(unfinished)
+
+
+def workers_beside_sumo(hosts: Mapping[str, str], sumo_host: str, cores: int) -> list[str]:
+    """Return the workers that may work while SUMO runs: on its host one fewer than there are cores, and all others.
+
+    Parameters
+    ----------
+    hosts
+        Host of each worker, by address.
+    sumo_host
+        Host on which SUMO runs.
+    cores
+        Number of its cores.
+    """
+    beside = [address for address, host in hosts.items() if host == sumo_host]
+    elsewhere = [address for address in hosts if address not in beside]
+    n_beside = cores - 1
+    if not elsewhere:
+        n_beside = max(1, n_beside)
+    return [*elsewhere, *beside[:n_beside]]
+
+
 def make_run_settings(n_junctions: int = 1) -> RunSettings:
     """Return settings for a new city run.
 
@@ -446,7 +525,17 @@ def make_run_settings(n_junctions: int = 1) -> RunSettings:
         RemoteStore(url).check()
     if store.MAX_GB_VARIABLE not in os.environ:
         max_bytes = max(max_bytes, n_junctions * STORE_BYTES_PER_JUNCTION)
-    return RunSettings(uuid.uuid4().hex[:8], program_id(), url or str(folder.absolute()), max_bytes)
+    scan_bytes = 0.0
+    if url is None:  # to send scans to a shared store and back takes longer than to repeat them
+        scan_bytes = _room_for_scans(folder, max_bytes, n_junctions) / n_junctions
+    return RunSettings(uuid.uuid4().hex[:8], program_id(), url or str(folder.absolute()), max_bytes, scan_bytes)
+
+
+def _room_for_scans(folder: Path, max_bytes: float, n_junctions: int) -> float:
+    """Return the part of the store that the results of a city leave, at most half of the free disk."""
+    existing = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    free_bytes = shutil.disk_usage(existing).free
+    return max(0.0, min(max_bytes - n_junctions * TYPICAL_JUNCTION_BYTES, free_bytes / 2))
 
 
 def expected_size_messages(folder: Path, max_bytes: float, n_junctions: int) -> Iterator[str]:

@@ -3,11 +3,12 @@
 Tasks exchange paths, names and numbers, never meshes or grids. Each task may run anywhere and any number of times, and
 gives the same bytes.
 
-A small junction is run completely, several of them in one task (:func:`run_junctions`). A large junction takes three
-kinds of tasks: :func:`prepare_junction` makes the artefacts that sites are scored from, :func:`score_part` scores some
-of its sites, and :func:`finish_junction` completes its run. Results pass from one task to the next through the store;
-what is missing there is computed again. Each task first releases the memory of the previous one, so that a worker
-needs hardly more memory for many sites than for a few.
+While the traffic is simulated, the scene of each junction is checked and scanned (:func:`prepare_scene`). Then a small
+junction is run completely, several of them in one task (:func:`run_junctions`). A large junction takes three kinds of
+tasks: :func:`prepare_junction` makes the artefacts that sites are scored from, :func:`score_part` scores some of its
+sites, and :func:`finish_junction` completes its run. Results pass from one task to the next through the store; what is
+missing there is computed again. Each task first releases the memory of the previous one, so that a worker needs hardly
+more memory for many sites than for a few.
 
 ``part.npz`` has one array for each dtype, and a JSON text with the objects of all sites, which refer to these arrays.
 So a part is read back to the last bit, and no code in it is run.
@@ -19,9 +20,9 @@ import json
 import threading
 import zipfile
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, wraps
 from itertools import pairwise
 from pathlib import Path
@@ -31,11 +32,13 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from egvs.artefacts.run_folder import RunFolder
 from egvs.city.worker_check import library_names, program_versions
-from egvs.core import files
+from egvs.core import files, reading
 from egvs.core.errors import EgvsError, InputError, RunError
-from egvs.core.resource_usage import measure_usage, release_memory
-from egvs.runs import run, stage_keys, store
+from egvs.core.resource_usage import ResourceUsage, measure_usage, release_memory
+from egvs.runs import run, stage_keys, stage_registry, store
+from egvs.runs.run import StageOptions
 from egvs.runs.stage_registry import StageResult
 from egvs.runs.store import Store
 from egvs.scenario.loading import load
@@ -45,6 +48,9 @@ from egvs.scoring.scorer import SiteScore
 from egvs.scoring.target_scores import SiteTargetScores
 from egvs.sensors import sensor, sites
 from egvs.sensors.sites import Pose, ScannedSite
+from egvs.stages import check, site_scans
+from egvs.stages.base import StageContext
+from egvs.stages.check import SceneReport
 from egvs.stages.inputs import open_folder
 from egvs.stages.site_scoring import BeamAudit, ScoredSite, SiteScoring
 
@@ -53,6 +59,15 @@ T = TypeVar("T")
 
 PART_FILE, PART_KIND = "part.npz", "part"
 """Name of the file with the scores of some sites, and of its kind in the store."""
+
+SCENE_FILE, SCENE_KIND = "scene.json", "scene"
+"""Name of the file with the check of a scene, and of its kind in the store."""
+
+SCENE_CHECK, EARLY_SCANS, SCORED_PARTS = "check of the scene", "scans for the score", "score, in parts"
+"""Work that is in the costs of no stage: before the traffic is known, and in the tasks of a large junction."""
+
+BYTES_PER_BEAM = 24
+"""Largest size of a scan in the store: three numbers per beam, for the beams that can meet the region."""
 
 MAX_CACHED_SCENES = 2
 """Number of scenes that a worker keeps in memory; a large one takes some hundred MB."""
@@ -87,12 +102,15 @@ class RunSettings:
         The store as in ``EGVS_STORE``: an absolute path, or a URL.
     store_bytes
         Maximum size of the store.
+    scan_bytes
+        Maximum size of the scans of a junction that is scanned before its traffic is known, where its runs keep none.
     """
 
     token: str
     program: str
     store: str
     store_bytes: float
+    scan_bytes: float = 0.0
 
     @contextmanager
     def applied(self) -> Iterator[None]:
@@ -122,12 +140,33 @@ class Job:
 
 @dataclass(frozen=True)
 class JobResult:
-    """A junction whose run is complete: its number of sites, the duration of the task, and the stages that it ran."""
+    """A junction whose run is complete.
+
+    Attributes
+    ----------
+    junction, sites
+        Its name, and its number of sites.
+    seconds
+        Duration of the task.
+    stages_run
+        The stages that the task ran.
+    part_costs
+        Costs of scoring its sites in other tasks, as far as this task used them.
+    """
 
     junction: str
     sites: int
     seconds: float
     stages_run: tuple[str, ...]
+    part_costs: tuple[ResourceUsage, ...] = ()
+
+
+@dataclass(frozen=True)
+class SceneResult:
+    """A junction whose scene is prepared, and the costs that are in the record of no stage, by the work done."""
+
+    junction: str
+    costs: Mapping[str, ResourceUsage]
 
 
 @dataclass(frozen=True)
@@ -324,10 +363,10 @@ def split_sites(count: int, parts: int) -> list[slice]:
     return [slice(low, high) for low, high in pairwise(ends)]
 
 
-def read_stored_scores(parts: int) -> Callable[[SiteScoring], Iterator[ScoredSite]]:
+def read_stored_scores(parts: int, costs: list[ResourceUsage]) -> Callable[[SiteScoring], Iterator[ScoredSite]]:
     """Return a function that yields all sites of a junction for the score stage, from its parts in the store.
 
-    Parts that the store has lost are scored again.
+    Parts that the store has lost are scored again. The costs of all parts are added to ``costs``.
     """
 
     def scored_sites(scoring: SiteScoring) -> Iterator[ScoredSite]:
@@ -336,43 +375,146 @@ def read_stored_scores(parts: int) -> Callable[[SiteScoring], Iterator[ScoredSit
             names = scoring.names[part]
             if names:
                 with files.temporary_folder() as folder:
-                    yield from read_part(_fetch_or_score(scoring, score_key, names, folder))
+                    costs.append(_fetch_or_score(scoring, score_key, names, folder))
+                    yield from read_part(folder / PART_FILE)
 
     return scored_sites
 
 
-def _fetch_or_score(scoring: SiteScoring, score_key: str, names: tuple[str, ...], folder: Path) -> Path:
-    """Fetch the scores of some sites from the store into a folder, or compute and store them; return the file."""
+def score_stored_scans(scoring: SiteScoring, only: Collection[str] | None = None) -> Iterator[ScoredSite]:
+    """Yield the scored sites as :meth:`SiteScoring.all_sites`, from scans in the store if it has them."""
+    if scoring.context.scenario.scan.keep:
+        yield from scoring.all_sites(only)
+        return
+    with files.temporary_folder() as folder:
+        key = stage_keys.stage_key("scan", _keeping_scans(scoring.context)).key
+        if Store.default().take("scan", key, folder, link=True) is None:
+            yield from scoring.all_sites(only)
+        else:
+            scans = site_scans.read_scans(scoring.context, folder / RunFolder.scans.name, only)
+            yield from map(scoring.score, scans)
+
+
+def _keeping_scans(context: StageContext) -> StageContext:
+    """Return a context of the same scene in which scans are kept."""
+    keeping = StageContext(context.inputs, context.folder, jobs=context.threads)
+    scan_config = context.scenario.scan.model_copy(update={"keep": True})
+    keeping.scenario = context.scenario.model_copy(update={"scan": scan_config})
+    return keeping
+
+
+def _fetch_or_score(scoring: SiteScoring, score_key: str, names: tuple[str, ...], folder: Path) -> ResourceUsage:
+    """Fetch the scores of some sites from the store into a folder, or compute and store them; return their cost."""
     part_store, path = Store.default(), folder / PART_FILE
     program = stage_keys.source_digest(__name__).digest
     key = files.hash_json({"score": score_key, "sites": names, "program": program})
-    if part_store.take(PART_KIND, key, folder) is not None:
-        return path
+    entry = part_store.take(PART_KIND, key, folder)
+    if entry is not None:
+        return entry.made.cost
     with part_store.maker(PART_KIND, key):
         part_store.fetch(PART_KIND, key)
-        if part_store.take(PART_KIND, key, folder) is None:  # another worker may have stored it meanwhile
-            with measure_usage() as cost:
-                write_part(path, scoring.all_sites(only=names))
-            result = StageResult({PART_FILE: files.hash_file(path)}, {}, {}, cost)
-            part_store.put(PART_KIND, key, folder, result)
-    return path
+        entry = part_store.take(PART_KIND, key, folder)
+        if entry is not None:  # another worker has stored it meanwhile
+            return entry.made.cost
+        with measure_usage() as cost:
+            write_part(path, score_stored_scans(scoring, names))
+        result = StageResult({PART_FILE: files.hash_file(path)}, {}, {}, cost)
+        part_store.put(PART_KIND, key, folder, result)
+    return cost
 
 
 @catch_input_errors
 def estimate_beams(job: Job, settings: RunSettings) -> int:
     """Return the work of a junction's candidates: their beams, and :data:`SITE_BEAMS` for each."""
     with settings.applied():
-        scenario = job.scenario()
-        candidates = sites.candidate_sites(scenario)
-        beams = {}
-        for name in {site.sensor for site in candidates}:
-            beams[name] = sensor.scenario_sensor(name, scenario, "sites").beams
-        return sum(beams[site.sensor] + SITE_BEAMS for site in candidates)
+        return sum(n_beams + SITE_BEAMS for n_beams in _beams_of_sites(job.scenario()))
+
+
+def _beams_of_sites(scenario: Scenario) -> list[int]:
+    """Return the number of beams of each candidate site."""
+    candidates = sites.candidate_sites(scenario)
+    beams = {}
+    for name in {site.sensor for site in candidates}:
+        beams[name] = sensor.scenario_sensor(name, scenario, "sites").beams
+    return [beams[site.sensor] for site in candidates]
+
+
+@catch_input_errors
+def prepare_scene(job: Job, settings: RunSettings) -> SceneResult:
+    """Put the results that need no traffic into the store: the check of the scene, the static world, and the scans.
+
+    An error is not reported here: the run of the junction finds it again, together with those in its traffic.
+    """
+    release_memory()
+    costs: dict[str, ResourceUsage] = {}
+    with settings.applied(), files.temporary_folder() as folder:
+        context = open_folder(job.scenario(), folder, jobs=1)
+        with measure_usage() as costs[SCENE_CHECK]:
+            is_checked = _store_scene_report(context)
+        if not is_checked:
+            return SceneResult(job.junction, costs)
+        run.ensure_stages(context, *stage_registry.stages_without_traffic())
+        scan_bytes = BYTES_PER_BEAM * sum(_beams_of_sites(context.scenario))
+        if not context.scenario.scan.keep and scan_bytes <= settings.scan_bytes:
+            with measure_usage() as costs[EARLY_SCANS]:
+                run.ensure_stages(_keeping_scans(context), "scan")
+    return SceneResult(job.junction, costs)
+
+
+def _store_scene_report(context: StageContext) -> bool:
+    """Check a scene and store the report; return whether the scene has no errors."""
+    scene_store, key = Store.default(), _scene_key(context)
+    with scene_store.maker(SCENE_KIND, key):
+        scene_store.fetch(SCENE_KIND, key)
+        if _take_scene_report(scene_store, key) is not None:
+            return True
+        with measure_usage() as cost:
+            report = check.check_scene(context.inputs)
+        if report is None:
+            return False
+        path = context.folder / SCENE_FILE
+        files.write_text(path, files.to_json_text(report.to_json()))
+        result = StageResult({SCENE_FILE: files.hash_file(path)}, {}, {}, cost)
+        scene_store.put(SCENE_KIND, key, context.folder.path, result)
+    return True
+
+
+def stored_scene_report(context: StageContext) -> SceneReport | None:
+    """Return the check of a scene from the store; None if it is not there."""
+    scene_store, key = Store.default(), _scene_key(context)
+    with scene_store.maker(SCENE_KIND, key):  # another worker may be checking it
+        scene_store.fetch(SCENE_KIND, key)
+    return _take_scene_report(scene_store, key)
+
+
+def _take_scene_report(scene_store: Store, key: str) -> SceneReport | None:
+    with files.temporary_folder() as folder:
+        if scene_store.take(SCENE_KIND, key, folder) is None:
+            return None
+        return SceneReport.from_json(reading.read_json(folder / SCENE_FILE))
+
+
+def _scene_key(context: StageContext) -> str:
+    dependencies = check.scene_dependencies(context)
+    return files.hash_json(
+        {
+            "inputs": dependencies.to_json(),
+            "program": stage_keys.program_inputs("check", context.scenario, dependencies.modules),
+            "folder": str(context.scenario.folder),  # warnings contain paths
+        }
+    )
+
+
+_STORED_RESULTS: dict[str, dict[str, Any]] = {
+    "check": {"scene_report": stored_scene_report},
+    "score": {"scored_elsewhere": score_stored_scans},
+}
+"""Options of stages whose work may be in the store, see :func:`prepare_scene`."""
 
 
 def run_junctions(jobs: Sequence[Job], settings: RunSettings) -> list[JobResult | JobFailure]:
     """Run some junctions completely."""
-    return [_run_junction(job, settings, {}) for job in jobs]
+    return [_run_junction(job, settings, _STORED_RESULTS) for job in jobs]
 
 
 @catch_input_errors
@@ -420,11 +562,16 @@ def finish_junction(
         if isinstance(result, JobFailure):
             return [result]
     SCENE_CACHE.drop(settings.token, job)
-    return [_run_junction(job, settings, {"score": {"scored_elsewhere": read_stored_scores(len(scored))}})]
+    part_costs: list[ResourceUsage] = []
+    score_options = {"scored_elsewhere": read_stored_scores(len(scored), part_costs)}
+    done = _run_junction(job, settings, {**_STORED_RESULTS, "score": score_options})
+    if isinstance(done, JobResult):
+        return [replace(done, part_costs=tuple(part_costs))]
+    return [done]
 
 
 @catch_input_errors
-def _run_junction(job: Job, settings: RunSettings, help_from: dict[str, dict[str, Any]]) -> JobResult:
+def _run_junction(job: Job, settings: RunSettings, options: StageOptions) -> JobResult:
     release_memory()
     stages_run: list[str] = []
 
@@ -434,6 +581,6 @@ def _run_junction(job: Job, settings: RunSettings, help_from: dict[str, dict[str
 
     start_s = perf_counter()
     with settings.applied():
-        record = run.run(job.scenario(), job.out, jobs=1, options=help_from, wait_s=_LOCK_WAIT_S, listener=listener)
+        record = run.run(job.scenario(), job.out, jobs=1, options=options, wait_s=_LOCK_WAIT_S, listener=listener)
         n_sites = record.stages["score"].summary["sites"]
         return JobResult(job.junction, n_sites, perf_counter() - start_s, tuple(stages_run))

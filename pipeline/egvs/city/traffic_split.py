@@ -26,7 +26,7 @@ from __future__ import annotations
 import math
 import os
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -161,7 +161,10 @@ class TrafficRegion:
 
 
 def make_city_traffic(
-    city: City, progress: ProgressCallback = no_progress, overrides: Sequence[str] = ()
+    city: City,
+    progress: ProgressCallback = no_progress,
+    overrides: Sequence[str] = (),
+    on_recording: Callable[[], None] = lambda: None,
 ) -> CityTraffic:
     """Make the traffic files of a city's junctions, unless they are up to date.
 
@@ -173,6 +176,8 @@ def make_city_traffic(
         Called with the number of frames that were written.
     overrides
         ``KEY=VALUE`` for the scenarios of all junctions: they may need more of the traffic.
+    on_recording
+        Called before traffic is recorded; not if the files are up to date.
 
     Raises
     ------
@@ -191,6 +196,7 @@ def make_city_traffic(
         existing = _read_record(city, key)
         if existing is not None:
             return _city_traffic(False, existing, scenario, regions, linked)
+        on_recording()
 
         summaries, periods = dict[str, Summary](), list[_RecordedPeriod]()
         locked: dict[str, str] = {}
@@ -205,11 +211,11 @@ def make_city_traffic(
         summary = traffic.merge_summaries(summaries) if city.traffic.periods else summaries[""]
         if len(locked) == len(regions):
             raise RunError(_no_ranking_problem(scenario, locked))
-        for path in _traffic_paths(city, locked):
+        for path in traffic_paths(city, locked):
             path.unlink(missing_ok=True)
 
         digests = {
-            _traffic_label(city, path): files.hash_file(path) for path in _traffic_paths(city, regions.keys() - locked)
+            _traffic_label(city, path): files.hash_file(path) for path in traffic_paths(city, regions.keys() - locked)
         }
         record = {
             "key": key, "files": digests, "rows": _sum_by_junction([recorded.rows for recorded in periods]),
@@ -261,7 +267,7 @@ def _no_ranking_problem(scenario: Scenario, left_out: Mapping[str, str]) -> str:
     return f"{where}: no junction can be ranked: {reasons}. {hint}"
 
 
-def _traffic_paths(city: City, names: Collection[str]) -> Iterator[Path]:
+def traffic_paths(city: City, names: Collection[str]) -> Iterator[Path]:
     """Yield the files of all periods of some junctions."""
     for period in [period.name for period in city.traffic.periods] or [""]:
         for junction in city.junctions:
@@ -289,7 +295,7 @@ def _read_record(city: City, key: str) -> dict[str, Any] | None:
             return None
     if old_key != key:
         return None
-    for traffic_path in _traffic_paths(city, rows.keys() - locked):
+    for traffic_path in traffic_paths(city, rows.keys() - locked):
         if not traffic_path.is_file() or files.hash_file(traffic_path) != digests.get(
             _traffic_label(city, traffic_path)
         ):

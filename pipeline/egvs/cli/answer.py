@@ -18,7 +18,7 @@ from egvs.artefacts import parquet
 from egvs.artefacts.readers import PeriodRanking
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import RunRecord
-from egvs.cli.console import Column, console, make_table
+from egvs.cli.console import Column, console, make_table, print_sentences
 from egvs.cli.options import DEFAULT_POLES
 from egvs.core.errors import collect_warnings
 from egvs.report import ranking, sections
@@ -61,6 +61,9 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
 def _print_ranking(out: Console, folder: Path, ranked: Ranking, record: RunRecord, poles: int | None) -> None:
     """Print the verdict, the best poles, the lanes seen worst, and how the order by EGVS differs."""
     out.print(verdict(ranked))
+    validation = sections.ValidationSummary.read(folder, record.stages)
+    if validation is not None and validation.check.warning:
+        print_sentences([f"{validation.check.warning} See {RunFolder(folder).report}#detected"])
     summary = record.stages["score"].summary
     if ranked.by.counts_vehicles and "weights" in summary:
         out.print(f"Vehicles are weighted: {summary['weights']}.")

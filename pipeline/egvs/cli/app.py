@@ -8,15 +8,27 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from typer.models import CommandInfo
 
 from egvs._version import __version__
-from egvs.cli import city, exit, place, validate
+from egvs.cli import city, exit, place, sources, validate
 from egvs.cli import options as cli_options
-from egvs.cli.options import DEFAULT_POLES, Audit, Jobs, Out, Rehash, Run, ScenarioPath, Set, Top, Verbose
+from egvs.cli.options import (
+    DEFAULT_POLES,
+    Audit,
+    Jobs,
+    Out,
+    Rehash,
+    Run,
+    ScenarioPath,
+    Set,
+    SettingsPath,
+    Top,
+    Verbose,
+)
 from egvs.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -80,15 +92,16 @@ def run(
     rehash: Rehash = False,
 ) -> None:
     """Run all stages in order and print the best poles; stages with unchanged inputs are skipped."""
-    from egvs.cli import answer, run_tables
     from egvs.cli.console import ProgressDisplay
-    from egvs.runs import digest_cache, run
 
-    loaded, folder = _load(scenario, set_, out)
     stage_options = {"score": {"audit": True}} if audit else None
-    if rehash:
-        digest_cache.forget_digests(folder)
-    with ProgressDisplay(with_details=verbose) as screen:
+    with ProgressDisplay("run", with_details=verbose) as screen:
+        from egvs.cli import answer, run_tables
+        from egvs.runs import digest_cache, run
+
+        loaded, folder = _load(scenario, set_, out)
+        if rehash:
+            digest_cache.forget_digests(folder)
         record = run.run(
             loaded, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, options=stage_options
         )
@@ -110,28 +123,29 @@ def demo(
     jobs: Jobs = None,
 ) -> None:
     """Try it: rank eight sites at a roundabout in about a minute, with traffic simulated in advance."""
-    from egvs.cli import answer, run_tables
     from egvs.cli.console import ProgressDisplay
-    from egvs.runs.run import run
-    from egvs.scenario import shipped
-    from egvs.scenario.loading import load
 
-    shipped.copy_scenario(shipped.DEMO, folder)
-    results, loaded = folder / "results", load(folder)
-    with ProgressDisplay() as screen:
+    with ProgressDisplay("demo") as screen:
+        from egvs.cli import answer, run_tables
+        from egvs.runs.run import run
+        from egvs.scenario import shipped
+        from egvs.scenario.loading import load
+
+        shipped.copy_scenario(shipped.DEMO, folder)
+        results, loaded = folder / "results", load(folder)
         record = run(loaded, results, jobs=jobs, progress=screen.progress, listener=screen.stage_event)
     answer.print_answer(results, loaded, record)
-    run_tables.print_demo_hints(folder, results)
+    run_tables.print_demo_hints(results)
 
 
 @app.command()
-def check(scenario: ScenarioPath, set_: Set = None) -> None:
+def check(scenario: SettingsPath, set_: Set = None) -> None:
     """Check a scenario before a run, and print all errors and warnings. No files are written."""
     from egvs.cli import run_tables
-    from egvs.scenario.loading import load
+    from egvs.runs.run_sources import SettingsSource
     from egvs.stages import check
 
-    checked = check.check_scenario(load(scenario, set_ or ()))
+    checked = check.check_scenario(SettingsSource.of(scenario, set_).load())
     run_tables.print_check(checked)
     if checked.errors:
         raise typer.Exit(InputError.exit_code)
@@ -217,12 +231,13 @@ def _run_stage(
     **stage_options: Any,
 ) -> None:
     """Run one stage and print the files that it wrote."""
-    from egvs.cli import run_tables
     from egvs.cli.console import ProgressDisplay
-    from egvs.runs import run
 
-    loaded, folder = _load(scenario, set_, out)
-    with ProgressDisplay(with_details=True) as screen:
+    with ProgressDisplay(stage, with_details=True) as screen:
+        from egvs.cli import run_tables
+        from egvs.runs import run
+
+        loaded, folder = _load(scenario, set_, out)
         record = run.run_one(
             stage, loaded, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, **stage_options
         )
@@ -238,11 +253,12 @@ def verify(
     jobs: Jobs = None,
 ) -> None:
     """Repeat the run recorded in DIR/run.json, and compare every artefact byte for byte."""
-    from egvs.cli import run_tables
     from egvs.cli.console import ProgressDisplay
-    from egvs.runs import verification
 
-    with ProgressDisplay() as screen:
+    with ProgressDisplay("verify") as screen:
+        from egvs.cli import run_tables
+        from egvs.runs import verification
+
         differences = verification.verify(
             folder, scenario, jobs=jobs, progress=screen.progress, listener=screen.stage_event
         )
@@ -256,19 +272,43 @@ def verify(
 
 @app.command()
 def compare(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN RUN...", help="Two or more folders of finished runs.")],
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUN...", help="Folders of finished runs; one is enough if its sites have several sensors."
+        ),
+    ],
+    by: Annotated[
+        Literal["pole", "site"] | None,
+        typer.Option(
+            help="Compare the best mounts of each pole, or sites of the same name. By default sites if no pole has "
+            "several sites and the common sites have the same mount in all runs, else poles."
+        ),
+    ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="costs.KEY=VALUE",
+            help="Override a cost, e.g. 'costs.sensor={\"VLP-32C\"=8000}' (repeatable).",
+        ),
+    ] = None,
     top: Top = None,
 ) -> None:
-    """Compare runs: scores, ranks, rank correlations, and differences in settings and files."""
-    from egvs.cli import study_tables
-    from egvs.studies import run_comparison
+    """Compare runs or sensors: the best mount of each pole, what one more percentage point costs, and settings."""
+    from egvs.cli.console import ProgressDisplay
 
-    study_tables.print_comparison(run_comparison.compare_runs(runs), top)
+    with ProgressDisplay("compare") as screen:
+        from egvs.cli import study_tables
+        from egvs.studies import run_comparison
+
+        comparison = run_comparison.compare_runs(runs, by, set_ or (), screen.progress)
+    study_tables.print_comparison(comparison, top)
 
 
 @app.command()
 def accuracy(
-    scenario: ScenarioPath,
+    scenario: SettingsPath,
     out: Out = None,
     set_: Set = None,
     jobs: Jobs = None,
@@ -283,23 +323,27 @@ def accuracy(
     ] = 0,
 ) -> None:
     """Measure error against run time for many settings, and recommend the cheapest within a tolerance."""
-    from egvs.cli import study_tables
     from egvs.cli.console import ProgressDisplay
-    from egvs.studies.accuracy import StudyOptions, run_accuracy_study
 
-    _, folder = _load(scenario, set_, out)
-    options = StudyOptions(tolerance, cli_options.duration_s(budget), seeds, jobs)
+    budget_s = cli_options.duration_s(budget)
+    _, folder = sources.open_source(scenario, set_, out)
     with ProgressDisplay("accuracy") as screen:
+        from egvs.cli import study_tables
+        from egvs.studies.accuracy import StudyOptions, run_accuracy_study
+
+        options = StudyOptions(tolerance, budget_s, seeds, jobs)
         study = run_accuracy_study(
             scenario, set_ or (), folder, options, progress=screen.progress, listener=screen.setting_event
         )
-    study_tables.print_study(study, cli_options.shell_command("run", scenario, set_))
+    path, overrides, _ = sources.run_arguments(scenario, set_, out)
+    study_tables.print_study(study, cli_options.shell_command("run", path, overrides))
 
 
 @app.command()
 def effects(
     scenario: Annotated[
-        Path | None, typer.Argument(metavar="[SCENARIO]", help="A scenario; without it, all effects are listed.")
+        Path | None,
+        typer.Argument(metavar="[SCENARIO|RUN]", help="A scenario or a run; without it, all effects are listed."),
     ] = None,
     set_: Set = None,
     ablation: Annotated[
@@ -320,17 +364,19 @@ def effects(
         run_tables.print_effects(effect_study.effect_catalogue())
         return
 
-    loaded, folder = _load(scenario, set_, out)
-    with ProgressDisplay() as screen:
+    loaded, folder = sources.open_source(scenario, set_, out)
+    with ProgressDisplay("effects") as screen:
         costs = effect_study.effect_costs(loaded, folder)
         statuses = effect_study.effect_statuses(loaded, folder, screen.progress)
     run_tables.print_effects(statuses, costs)
 
+    path, overrides, run_out = sources.run_arguments(scenario, set_, out)
     if any(status.change == effect_study.UNTRIED for status in statuses):
-        print(f"to measure the expected changes, first run: {cli_options.shell_command('run', scenario, set_, out)}")
+        command = cli_options.shell_command("run", path, overrides, run_out)
+        print(f"to measure the expected changes, first run: {command}")
     if recommended := [f"effects.{status.name}={{}}" for status in statuses if status.state == "called for"]:
-        overrides = [*(set_ or ()), *recommended]
-        print(f"to run with all recommended effects: {cli_options.shell_command('run', scenario, overrides, out)}")
+        command = cli_options.shell_command("run", path, [*overrides, *recommended], run_out)
+        print(f"to run with all recommended effects: {command}")
     if unmeasured := _unmeasured_effects(statuses, costs, loaded):
         study = cli_options.shell_command("accuracy", scenario, set_, out)
         print(f"to measure the cost and effect of {unmeasured}: {study}, or use --ablation")
@@ -339,7 +385,7 @@ def effects(
         return
     if not loaded.effects.named:
         raise InputError("--ablation", "the scenario has no effects", "Add one, e.g. --set effects.rain.rate_mm_h=20.")
-    with ProgressDisplay() as screen:
+    with ProgressDisplay("effects") as screen:
         changes = effect_study.run_ablation(loaded, folder, jobs=jobs, progress=screen.progress)
     run_tables.print_ablation(changes)
 
@@ -383,6 +429,7 @@ def explore(
     from egvs.explore.settings import open_session
 
     check_port_free(port)
+    sources.open_source(folder, set_, out)
     with ProgressDisplay("explore") as screen:
         session = open_session(
             folder, set_ or (), out, jobs=jobs, progress=screen.progress, listener=screen.stage_event
@@ -548,6 +595,19 @@ def new(
 
 
 @app.command()
+def runs(
+    folder: Annotated[
+        Path | None, typer.Argument(metavar="[FOLDER]", help="Folder that contains run folders; runs by default.")
+    ] = None,
+) -> None:
+    """List the runs: settings that differ from the scenario, the best site, size and age; the latest run first."""
+    from egvs.cli import run_list_table
+    from egvs.runs import run_list, run_names
+
+    run_list_table.print_runs(run_list.list_runs(folder or run_names.RUNS))
+
+
+@app.command()
 def store(
     prune: Annotated[
         bool, typer.Option("--prune", help="Remove the least recently used entries beyond --max.")
@@ -586,7 +646,7 @@ COMMAND_GROUPS = {
     "Decide": ("place", "explore", "compare", "city"),
     "Study": ("validate", "accuracy", "effects", "scores", "clouds", "train"),
     "Stages of egvs run": ("traffic", "statics", "tpog", "scan", "score", "report"),
-    "Files": ("export", "figure", "sensors", "verify", "store"),
+    "Files": ("runs", "export", "figure", "sensors", "verify", "store"),
 }
 """Groups of ``egvs --help``, and their commands."""
 

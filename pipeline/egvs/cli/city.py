@@ -23,7 +23,12 @@ _WIDTH = 150
 
 CityPath = Annotated[Path, typer.Argument(metavar="CITY", help="A folder created by egvs city new.")]
 CityOut = Annotated[
-    Path | None, typer.Option("--out", metavar="DIR", help="Folder of the city run; runs/<name> by default.")
+    Path | None,
+    typer.Option(
+        "--out",
+        metavar="DIR",
+        help="Folder of the city run; by default runs/<name>, with --set runs/<name>@<what differs>.",
+    ),
 ]
 Cluster = Annotated[
     str,
@@ -72,8 +77,6 @@ def new(
     ] = "medium",
 ) -> None:
     """Create a city from an OpenStreetMap extract: one network, and a scenario for each junction."""
-    from egvs.city import creation
-    from egvs.cli import new_summary
     from egvs.cli.console import ProgressDisplay
 
     centre = radius_m = None
@@ -82,6 +85,9 @@ def new(
     if radius is not None:
         radius_m = options.length_m(radius, "--radius")
     with ProgressDisplay("city") as screen:
+        from egvs.city import creation
+        from egvs.cli import new_summary
+
         new_options = creation.NewCityOptions(centre, radius_m, junctions, lefthand, walk, traffic, screen.progress)
         created = creation.create_city(folder, osm, new_options)
     new_summary.print_new_city(created)
@@ -89,11 +95,12 @@ def new(
 
 def traffic(city: CityPath) -> None:
     """Simulate a city's traffic once and divide it among its junctions; skipped if nothing has changed."""
-    from egvs.city import model, traffic_split
     from egvs.cli.console import ProgressDisplay
 
-    loaded = model.load_city(city)
     with ProgressDisplay("traffic") as screen:
+        from egvs.city import model, traffic_split
+
+        loaded = model.load_city(city)
         result = traffic_split.make_city_traffic(loaded, screen.progress)
     _print_traffic(loaded.folder, result)
 
@@ -112,10 +119,11 @@ def run(
     ] = False,
 ) -> None:
     """Simulate the city's traffic once, then run the scenarios of all junctions in parallel."""
-    from egvs.city import city_run, model
     from egvs.cli.console import ProgressDisplay
 
     with ProgressDisplay("city") as screen:
+        from egvs.city import city_run, model
+
         run_options = _run_options(cluster, junction, set_, screen)
         result = city_run.run_city(model.load_city(city), out, run_options)
         for warning in result.warnings:
@@ -141,10 +149,11 @@ def place(
     set_: CitySet = None,
 ) -> None:
     """Plan sensors for all junctions together: find the best plan for the whole city."""
-    from egvs.city import city_run, model
     from egvs.cli.console import ProgressDisplay
 
     with ProgressDisplay("city") as screen:
+        from egvs.city import city_run, model
+
         run_options = _run_options(cluster, junction, set_, screen)
         numbers = _parse_phases(phases)
         placed = city_run.place_city(
@@ -263,8 +272,10 @@ def print_costs(costs: CityCosts) -> None:
     from egvs.cli.console import WIDE, Column, console, make_table
 
     parts: list[Column[Any]] = [
-        Column("part", lambda part: part.part, "left"),
+        Column("part", lambda part: f"  {part.part}" if part.within else part.part, "left"),
         Column("seconds", lambda part: f"{part.seconds:.2f}"),
+        Column("start s", lambda part: f"{part.start_s:.2f}"),
+        Column("end s", lambda part: f"{part.end_s:.2f}"),
     ]
     stages: list[Column[Any]] = [
         Column("stage, at all junctions", lambda stage: stage.stage, "left"),
@@ -275,6 +286,7 @@ def print_costs(costs: CityCosts) -> None:
         Column("process", lambda process: process.process, "left"),
         Column("host", lambda process: process.host, "left"),
         Column("peak MB", lambda process: f"{process.peak_mb:.0f}"),
+        Column("core s", lambda process: "" if process.busy_s is None else f"{process.busy_s:.1f}"),
     ]
     out = console(WIDE)
     out.print(make_table(parts, costs.parts))

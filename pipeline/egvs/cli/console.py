@@ -8,11 +8,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import timedelta
 from typing import Any, Generic, Literal, TypeVar
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.table import Table
+from rich.text import Text
 
 from egvs.artefacts.run_record import StageRecord
 from egvs.cli import stage_summary
@@ -20,6 +22,9 @@ from egvs.core.errors import collect_warnings
 
 NARROW, WIDE = 110, 190
 """Terminals below ``NARROW`` columns get fewer columns of tables; those of about ``WIDE`` get all."""
+
+_UNBROKEN_WIDTH = 100_000
+"""No sentence is longer."""
 
 MAX_WARNINGS = 3
 """Warnings that a command prints without details."""
@@ -59,6 +64,13 @@ def console(file_width: int, *, soft_wrap: bool = True) -> Console:
     """
     width = None if sys.stdout.isatty() else file_width
     return Console(width=width, highlight=False, markup=False, emoji=False, soft_wrap=soft_wrap)
+
+
+def print_sentences(sentences: Iterable[str]) -> None:
+    """Print sentences, broken between words where a terminal is too narrow; in a file, one line each."""
+    out = console(_UNBROKEN_WIDTH, soft_wrap=False)
+    for sentence in sentences:
+        out.print(sentence)
 
 
 def make_table(
@@ -148,8 +160,23 @@ def _format_entry(key: str, value: Any) -> str:
     return f"{format_value(value)} {key}"
 
 
+class _ElapsedColumn(ProgressColumn):
+    """Time since the command began.
+
+    Unlike rich's own column it does not stop at the first stage that is complete: the same bar then shows the next one.
+    """
+
+    def render(self, task: Task) -> Text:
+        """Return hours, minutes and seconds."""
+        return Text(str(timedelta(seconds=int(task.elapsed or 0.0))), style="progress.elapsed")
+
+
 class ProgressDisplay:
     """Shows the progress of a run: a bar on a terminal, and one line per finished stage.
+
+    On a terminal, the name of the stage and the elapsed time are shown from the beginning to the end, ten times per
+    second, whether or not the stage reports how far it is. Commands import what they need inside the ``with`` block:
+    importing and reading the scenario take a second or more.
 
     Parameters
     ----------
@@ -177,11 +204,11 @@ class ProgressDisplay:
         self._bar = Progress(
             TextColumn("{task.description}", markup=False),  # names may have brackets
             BarColumn(),
-            TimeElapsedColumn(),
+            _ElapsedColumn(),
             console=self._console,
             transient=True,
         )
-        self._task = self._bar.add_task("", total=None, visible=False)
+        self._task = self._bar.add_task(verb, total=None)
         self._has_bar = sys.stderr.isatty()
 
     def __enter__(self) -> ProgressDisplay:
@@ -200,7 +227,7 @@ class ProgressDisplay:
         if not self._has_bar:
             return
         count = f"{done}/{total}" if total else str(done)
-        self._bar.update(self._task, description=f"{self._stage}: {what} {count}", completed=done, visible=True)
+        self._bar.update(self._task, description=f"{self._stage}: {what} {count}", completed=done)
         self._bar.tasks[0].total = total or None  # update() takes None for "unchanged"
 
     def stage_event(self, stage: str, state: str, record: StageRecord | None) -> None:
@@ -208,11 +235,9 @@ class ProgressDisplay:
         self._stage = stage
         if state in ("runs", "fetched"):
             self.any_stage_ran = True
+        self._show_stage(stage)
         if record is None:
-            self._show_stage(stage)
             return
-        if self._has_bar:
-            self._bar.update(self._task, visible=False)
 
         for line in stage_summary.stage_lines(stage, state, record, with_details=self._with_details):
             self.say(line)
@@ -225,7 +250,7 @@ class ProgressDisplay:
 
     def _show_stage(self, stage: str) -> None:
         if self._has_bar:
-            self._bar.update(self._task, description=stage, completed=0, visible=True)
+            self._bar.update(self._task, description=stage, completed=0)
             self._bar.tasks[0].total = None
 
     def setting_event(self, name: str, state: str, details: dict[str, Any]) -> None:

@@ -14,9 +14,18 @@ import typer
 from egvs.core.errors import InputError
 
 ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="Scenario folder, or its scenario.toml.")]
+SettingsPath = Annotated[
+    Path,
+    typer.Argument(metavar="SCENARIO|RUN", help="Scenario folder or its scenario.toml, or a run, to use its settings."),
+]
 Run = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a finished run.")]
 Out = Annotated[
-    Path | None, typer.Option("--out", metavar="DIR", help="Folder of the run; runs/<scenario name> by default.")
+    Path | None,
+    typer.Option(
+        "--out",
+        metavar="DIR",
+        help="Folder of the run; by default runs/<scenario name>, with --set runs/<scenario name>@<what differs>.",
+    ),
 ]
 Set = Annotated[
     list[str] | None,

@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from egvs.cli import options
-from egvs.cli.options import Jobs, Out, ScenarioPath, Set
+from egvs.cli import options, sources
+from egvs.cli.options import Jobs, Out, Set, SettingsPath
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from egvs.artefacts.planned_sensor import PlannedSensor
     from egvs.placement.plan import Placement, RefinementSummary
+    from egvs.report.formatting import ScoreLabel
+    from egvs.scenario.score_config import PlacementConfig
 
 
 def place(
-    scenario: ScenarioPath,
+    scenario: SettingsPath,
     out: Out = None,
     count: Annotated[int | None, typer.Option(metavar="K", help="Find the best plan of at most K sensors.")] = None,
     budget: Annotated[
@@ -44,54 +47,84 @@ def place(
     jobs: Jobs = None,
 ) -> None:
     """Plan several sensors: how many, at which sites, and how close the plan is to the best possible score."""
-    from egvs.cli.console import WIDE, ProgressDisplay, console
-    from egvs.placement import plan
-    from egvs.runs.run import default_folder
-    from egvs.scenario.loading import load
+    from egvs.cli.console import ProgressDisplay
 
     limit_s = options.duration_s(time_limit, "--time-limit")
-    overrides = list(set_ or ())
+    request = []
     for key, value in (("count", count), ("budget", budget), ("reach", reach)):
         if value is not None:
-            overrides.append(f"placement.{key}={value!r}")
-    loaded = load(scenario, overrides)
-    folder = out or default_folder(loaded)
+            request.append(f"placement.{key}={value!r}")
+    loaded, folder = sources.open_source(scenario, set_, out, request)
     with ProgressDisplay("place") as screen:
+        from egvs.placement import plan
+
         placed = plan.place(
             loaded, folder, exact=exact, time_limit_s=limit_s, refine=refine, jobs=jobs, progress=screen.progress,
             listener=screen.stage_event,
         )  # fmt: skip
-    print_placement(placed)
+    notes = []
     if exact and not (placed.solution.is_best or placed.solution.fewest_is_proved):
-        console(WIDE).print(f"--exact reached its --time-limit of {time_limit} before any plan was proved optimal")
+        notes.append(f"--exact reached its --time-limit of {time_limit} before any plan was proved optimal.")
+    print_placement(placed, loaded.placement, notes)
 
 
-def print_placement(placed: Placement) -> None:
-    """Print the sensors of the plan, the score of each number of sensors, and the certificate."""
+def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequence[str] = ()) -> None:
+    """Print the plan and the curve, the files, and what a planner should know, the answer to "how many?" last.
+
+    Parameters
+    ----------
+    placed
+        The plan.
+    requested
+        The ``[placement]`` that it solves.
+    notes
+        Sentences about the search.
+    """
     from egvs.cli.console import WIDE, console
 
     out = console(WIDE)
     out.print(_sensor_table(placed))
     if any(sensor.forced for sensor in placed.sensors):
         out.print("* already installed")
+    out.print()
     out.print(_curve_table(placed))
+    out.print(describe_errors(placed))
+    out.print()
     for zone in placed.zones:
         sensors = f" by {zone.by} sensors" if zone.by > 1 else ""
         out.print(f"zone {zone.name}: {zone.seen:.1%} of its entropy seen{sensors}, {zone.share:.1%} required")
-    out.print(describe_plan(placed))
-    if placed.refinement is not None:
-        out.print(describe_refinement(placed, placed.refinement))
     for path in placed.files:
         out.print(str(path))
-    if gain := describe_last_gain(placed):
-        out.print(gain)
+    for sentence in (describe_plan(placed), *notes, *_further_sentences(placed, requested)):
+        out.print(sentence)
+
+
+def _further_sentences(placed: Placement, requested: PlacementConfig) -> Iterator[str]:
+    """Yield what is known beside the plan and its proof."""
+    from egvs.report import plan_answer
+    from egvs.report.sections import describe_objective
+
+    if placed.refinement is not None:
+        yield describe_refinement(placed, placed.refinement)
     if absent := describe_absent_best(placed):
-        out.print(absent)
+        yield absent
+    request = requested.model_dump(mode="json")
+    next_count = plan_answer.next_count(placed.steps, len(placed.sensors), placed.candidates, request)
+    objective = describe_objective(request)
+    if answer := plan_answer.describe_count(placed.steps, _label(placed), objective=objective, next_count=next_count):
+        yield answer
+
+
+def _label(placed: Placement) -> ScoreLabel:
+    from egvs.report.formatting import SCORE_LABELS
+
+    return SCORE_LABELS[placed.score]
 
 
 def _sensor_table(placed: Placement) -> Table:
     from egvs.cli.console import Column, make_table
 
+    by = _label(placed)
     columns: list[Column[PlannedSensor]] = [
         Column("", lambda row: row.marked_order),
         Column("site", lambda row: row.site, "left"),
@@ -99,39 +132,45 @@ def _sensor_table(placed: Placement) -> Table:
         Column("yaw deg", lambda row: f"{row.yaw_deg:.1f}"),
         Column("pitch deg", lambda row: f"{row.pitch_deg:.1f}"),
         Column("sensor", lambda row: row.sensor, "left"),
-        Column("gain", lambda row: f"{row.gain:.6g}"),
-        Column("joint score", lambda row: f"{row.score:.6g}"),
-        Column("lost if it fails", lambda row: f"{_loss_share(placed, row):.1%}"),
+        Column(_with_unit("adds", by.change_head), lambda row: by.change(row.gain, row.gain_se)),
+        Column(_together_head(by), lambda row: by.with_error(row.score, row.score_se)),
+        Column(_with_unit("lost if it fails", by.change_head), lambda row: by.change(row.loss)),
     ]
     if any(placed.curve_costs):
         columns.append(Column("cost", lambda row: f"{row.cost:g}"))
     if placed.refinement is not None:
         columns.append(Column("moved m", lambda row: f"{row.moved_m:.2f}"))
-        columns.append(Column("gained by moving", lambda row: f"{row.gain_by_refining:.6g}"))
+        head = _with_unit("gained by moving", by.change_head)
+        columns.append(Column(head, lambda row: by.change(row.gain_by_refining)))
     return make_table(columns, placed.sensors)
-
-
-def _loss_share(placed: Placement, sensor: PlannedSensor) -> float:
-    """Return the share of the joint score that is lost if one sensor fails."""
-    if not placed.joint > 0:
-        return 0.0
-    return sensor.loss / placed.joint
 
 
 def _curve_table(placed: Placement) -> Table:
     from egvs.cli.console import Column, make_table
 
-    curve = placed.solution.curve
+    by, curve, steps = _label(placed), placed.solution.curve, placed.steps
     columns = [
-        Column[int]("sensors", lambda i: str(curve[i].count)),
-        Column[int]("joint score", lambda i: f"{curve[i].plan_value.joint:.6g}"),
-        Column[int]("of all candidates", lambda i: f"{_score_share(placed, curve[i].plan_value.joint):.1%}"),
-        Column[int]("proved, of the best possible score", lambda i: _format_rounded_down(curve[i].certificate)),
+        Column[int]("sensors", lambda i: str(steps[i].count)),
+        Column[int](_together_head(by), lambda i: by.with_error(steps[i].score, steps[i].score_se)),
+        Column[int](_with_unit("adds", by.change_head), lambda i: by.change(steps[i].gain, steps[i].gain_se)),
+        Column[int]("of all candidates", lambda i: f"{_score_share(placed, steps[i].score):.1%}"),
+        Column[int]("proved, of the best possible", lambda i: _format_rounded_down(curve[i].certificate)),
     ]
     if any(placed.curve_costs):
         columns.append(Column("cost", lambda i: f"{placed.curve_costs[i]:g}"))
     columns.append(Column("sites", lambda i: ", ".join(placed.curve_sites[i]), "left", wrap=True))
     return make_table(columns, range(len(curve)))
+
+
+def _together_head(by: ScoreLabel) -> str:
+    """Return the head of a column of joint scores, e.g. "found together" or "EGVS together, bit"."""
+    return _with_unit(f"{by.head.removesuffix(by.unit).rstrip()} together", by.unit)
+
+
+def _with_unit(head: str, unit: str) -> str:
+    if not unit:
+        return head
+    return f"{head}, {unit}"
 
 
 def _score_share(placed: Placement, joint: float) -> float:
@@ -142,24 +181,23 @@ def _score_share(placed: Placement, joint: float) -> float:
 
 
 def describe_plan(placed: Placement) -> str:
-    """Return the plan and its certificate in one sentence."""
+    """Return the plan, its joint score with its standard error, and its certificate, in one sentence."""
+    by = _label(placed)
     joint = placed.solution.point.plan_value.joint
     sites = ", ".join(sensor.site for sensor in placed.sensors) or "no sensor"
     cost = f" for {placed.curve_costs[-1]:g}" if placed.curve_costs[-1] else ""
-    score = f"{placed.score} {joint:.6g}"
+    score = by.says.format(f"{by.with_error(joint, placed.steps[-1].score_se)} {by.unit}".rstrip())
     if placed.joint_of_all > 0:
         share = _score_share(placed, joint)
-        score += f", {share:.1%} of the score of all {placed.candidates} candidates together"
-    return f"{sites}{cost}: {score}; {_describe_proof(placed)}"
+        score += f", {share:.1%} of what all {placed.candidates} candidates reach together"
+    return f"The plan {sites}{cost} {score}; {_describe_proof(placed)}."
 
 
-def describe_last_gain(placed: Placement) -> str | None:
-    """Return how much the largest plan of the curve adds to the one before it; None if there is nothing to compare."""
-    curve = placed.solution.curve
-    if len(curve) < 2 or not curve[-2].plan_value.joint > 0:
-        return None
-    gain = curve[-1].plan_value.joint / curve[-2].plan_value.joint - 1.0
-    return f"Going from {curve[-2].count} to {curve[-1].count} sensors adds {gain:.1%}."
+def describe_errors(placed: Placement) -> str:
+    """Return what follows "±", or why there are no standard errors."""
+    if placed.has_errors:
+        return f"± is one standard error, from {placed.errors_from}"
+    return f"no standard errors: {placed.errors_from}"
 
 
 def describe_absent_best(placed: Placement) -> str | None:
@@ -192,22 +230,22 @@ def _describe_proof(placed: Placement) -> str:
 
 def describe_refinement(placed: Placement, summary: RefinementSummary) -> str:
     """Return what the refinement of poses changed."""
-    change = cost = objective = ""
-    if summary.joint_before > 0:
-        change = f" ({placed.joint / summary.joint_before - 1.0:+.1%})"
+    by = _label(placed)
+    cost = objective = ""
     if placed.cost:
         cost = f", for {placed.cost:g}"
     if (summary.value_before, summary.value_after) != (summary.joint_before, placed.joint):
         objective = f"; objective {summary.value_before:.6g} before, {summary.value_after:.6g} after"
+    after = f"{by.with_error(placed.joint, placed.joint_se)} {by.unit}".rstrip()
     return (
-        f"refined: {placed.score} {summary.joint_before:.6g} before, {placed.joint:.6g} after{change}"
-        f"{objective}{cost}; {summary.poses_tried} poses tried in {summary.turns} rounds and {summary.seconds:.1f} s, "
-        f"{summary.poses_infeasible} of them infeasible; the proof applies to the candidates at their original poses"
+        f"Refined: {by.noun} {by.value(summary.joint_before)} before, {after} after{objective}{cost}; "
+        f"{summary.poses_tried} poses tried in {summary.turns} rounds and {summary.seconds:.1f} s, "
+        f"{summary.poses_infeasible} of them infeasible; the proof applies to the candidates at their original poses."
     )
 
 
 def _format_rounded_down(share: float) -> str:
     """Return a proved share in per cent, never rounded up."""
     if share >= 1.0:
-        return "100 %"
-    return f"{math.floor(share * 1e4) / 1e2:.2f} %"
+        return "100%"
+    return f"{math.floor(share * 1e4) / 1e2:.2f}%"

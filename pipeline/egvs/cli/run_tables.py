@@ -18,7 +18,16 @@ from rich.table import Table
 from egvs.artefacts import parquet
 from egvs.artefacts.readers import DISTINCT_PROBABILITY, PeriodRank, PeriodRanking
 from egvs.artefacts.run_record import RunRecord
-from egvs.cli.console import NARROW, WIDE, Column, console, format_or_dash, make_table, print_table
+from egvs.cli.console import (
+    NARROW,
+    WIDE,
+    Column,
+    console,
+    format_or_dash,
+    make_table,
+    print_sentences,
+    print_table,
+)
 from egvs.core.errors import collect_warnings
 from egvs.report import sections
 from egvs.report.formatting import SCORE_LABELS, ScoreLabel
@@ -263,10 +272,10 @@ def print_check(checked: CheckReport) -> None:
     out.print(f"checked {checked.sites} sites, {checked.solids} solids and {checked.lanes} lanes")
 
 
-def print_demo_hints(folder: Path, results: Path) -> None:
+def print_demo_hints(results: Path) -> None:
     """Print what to try after ``egvs demo``."""
     out = console(_RESULT_FILE_WIDTH)
-    out.print(f"next: egvs place {folder} --out {results} --count 2   (the best two sensors together)")
+    out.print(f"next: egvs place {results} --count 2   (the best two sensors together)")
     out.print(f"      egvs explore {results}   (move a sensor and see its score; needs egvs[explore])")
     out.print("      egvs new mytown --osm extract.osm.pbf   (your own junction, from OpenStreetMap)")
 
@@ -340,16 +349,20 @@ def _format_cost_change(cost: EffectCost | None) -> str:
 
 def print_ablation(changes: Sequence[EffectChange]) -> None:
     """Print by how much each effect changes the scores of the plain scene, which is the first of ``changes``."""
+    from egvs.cli import study_conclusions
+
     plain = changes[0]
     titles = {**dict(enumerate(plain.sites)), _SECONDS_ROW: "seconds"}
     columns = [
         Column[int]("site", lambda row: titles[row], "left"),
-        Column[int]("plain, bit", lambda row: _format_plain(plain, row)),
+        Column[int](f"plain, {SCORE_LABELS[plain.rank_by].head}", lambda row: _format_plain(plain, row)),
     ]
     columns += [Column(change.effect, partial(_format_change, plain, change)) for change in changes[1:]]
     title = "change in each site's score compared with the plain scene (and rank, where it changes)"
     out = console(_LIST_FILE_WIDTH, soft_wrap=False)
     out.print(make_table(columns, titles, title=title, truncate=True))
+    out.print()
+    print_sentences([study_conclusions.ablation_conclusion(changes)])
 
 
 _SECONDS_ROW = -1
@@ -359,7 +372,7 @@ _SECONDS_ROW = -1
 def _format_plain(plain: EffectChange, row: int) -> str:
     if row == _SECONDS_ROW:
         return f"{plain.seconds:.2f}"
-    return f"{plain.scores[row]:.1f} ({plain.ranks[row]})"
+    return f"{SCORE_LABELS[plain.rank_by].value(plain.scores[row])} ({plain.ranks[row]})"
 
 
 def _format_change(plain: EffectChange, change: EffectChange, row: int) -> str:
@@ -384,13 +397,13 @@ def print_store(store: Store) -> None:
     columns: list[Column[StoreEntry]] = [
         Column("stage", lambda entry: entry.stage, "left"),
         Column("key", lambda entry: entry.key[:12], "left"),
-        Column("size", lambda entry: _format_size(entry.bytes)),
-        Column("age", lambda entry: _format_age(now - entry.created)),
-        Column("last used", lambda entry: f"{_format_age(now - entry.last_used)} ago"),
+        Column("size", lambda entry: format_size(entry.bytes)),
+        Column("age", lambda entry: format_age(now - entry.created)),
+        Column("last used", lambda entry: f"{format_age(now - entry.last_used)} ago"),
     ]
     out = console(120)
     out.print(make_table(columns, entries, truncate=True))
-    out.print(f"{store.folder}: {_format_total(entries)}, of at most {_format_size(store.bound_bytes)}")
+    out.print(f"{store.folder}: {_format_total(entries)}, of at most {format_size(store.bound_bytes)}")
 
 
 def print_removed(store: Store, removed: list[StoreEntry]) -> None:
@@ -400,17 +413,19 @@ def print_removed(store: Store, removed: list[StoreEntry]) -> None:
 
 def _format_total(entries: list[StoreEntry]) -> str:
     size = sum(entry.bytes for entry in entries)
-    return f"{len(entries)} entries, {_format_size(size)}"
+    return f"{len(entries)} entries, {format_size(size)}"
 
 
-def _format_size(size_bytes: float) -> str:
+def format_size(size_bytes: float) -> str:
+    """Return a size as text, e.g. "2.5 MB"."""
     for unit, unit_bytes in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("KB", 1e3)):
         if size_bytes >= unit_bytes:
             return f"{size_bytes / unit_bytes:.3g} {unit}"
     return f"{size_bytes:.3g} B"
 
 
-def _format_age(seconds: float) -> str:
+def format_age(seconds: float) -> str:
+    """Return a duration as text in its largest unit, e.g. "3 h"."""
     for unit, unit_s in (("d", 86400), ("h", 3600), ("min", 60)):
         if seconds >= unit_s:
             return f"{seconds / unit_s:.0f} {unit}"

@@ -194,13 +194,16 @@ def describe_vehicles(vehicles: dict[str, int]) -> str:
 
 def describe_sizes(sizes: dict[str, dict[str, Any]]) -> str:
     """Return length, width and height of the vehicle types of a finished file, and where each size comes from."""
+    sources = sorted({size["source"] for size in sizes.values()})
     texts = []
     for name, size in list(sizes.items())[:_MAX_SIZES]:
         metres = " x ".join(f"{size[key]:g}" for key in ("length_m", "width_m", "height_m"))
-        texts.append(f"{name} {metres} m (from {size['source']})")
+        source = f" (from {size['source']})" if len(sources) > 1 else ""
+        texts.append(f"{name} {metres} m{source}")
     if len(sizes) > _MAX_SIZES:
         texts.append(f"{len(sizes) - _MAX_SIZES} more in run.json")
-    return "sizes: " + ", ".join(texts)
+    shared_source = f" from {sources[0]}" if len(sources) == 1 else ""
+    return f"sizes{shared_source}: {', '.join(texts)}"
 
 
 def _describe_counts(counts: dict[str, int]) -> str:

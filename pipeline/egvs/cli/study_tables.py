@@ -1,26 +1,41 @@
 """What ``egvs accuracy`` and ``egvs compare`` print.
 
 An accuracy study: what each setting costs, how far its scores are off, and which setting is recommended. A comparison:
-runs in columns, the agreement of their rankings, and the differences of their settings.
+runs in columns and poles or sites in rows, the agreement of their rankings, the best mount of each sensor and what one
+more percentage point costs, and the differences of settings.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+import shlex
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Literal
 
 from rich.console import Console
 from rich.table import Table
 
-from egvs.cli.console import NARROW, WIDE, Column, console, format_or_dash, make_table
-from egvs.report.formatting import SCORE_LABELS
+from egvs.artefacts.readers import DISTINCT_PROBABILITY
+from egvs.cli import study_conclusions
+from egvs.cli.console import NARROW, WIDE, Column, console, format_or_dash, make_table, print_sentences
+from egvs.report.formatting import SCORE_LABELS, join_names
+from egvs.report.ranking import RankedSite, share_of_limit
+from egvs.report.sensor_results import (
+    ScoreDifference,
+    SensorComparison,
+    SensorResult,
+    costs_option,
+    difference_unit,
+    format_difference,
+)
+from egvs.studies.study_settings import MEASURES, SCENARIO, TRAFFIC
+from egvs.studies.traffic_options import OPTION_KNOBS, SeedSpread
 
 if TYPE_CHECKING:
     from egvs.studies.accuracy import AccuracyStudy
-    from egvs.studies.run_comparison import ComparedRun, Comparison, Difference, RankAgreement, SiteResult
+    from egvs.studies.run_comparison import ComparedPole, ComparedRun, Comparison, Difference, RankAgreement
     from egvs.studies.score_errors import SeedComparison, SettingResult
 
 _MAX_FRAMES = 1e8
@@ -31,8 +46,8 @@ def print_study(study: AccuracyStudy, command: str) -> None:
     """Print an accuracy study; ``command`` runs the scenario, and is printed with the recommended options."""
     out = console(WIDE)
     is_wide = out.width >= WIDE - 10
-    approximations = [row for row in study.rows if row.kind != "measures"]
-    measures = [row for row in study.rows if row.kind == "measures"]
+    approximations = [row for row in study.rows if row.kind not in (MEASURES, TRAFFIC)]
+    measures = [row for row in study.rows if row.kind == MEASURES]
 
     title = "settings that approximate the same number, compared with the reference"
     out.print(_settings_table(title, approximations, has_errors=True, is_wide=is_wide))
@@ -41,6 +56,7 @@ def print_study(study: AccuracyStudy, command: str) -> None:
     if measures:
         title = "settings that measure something else, compared with the scenario on the same traffic"
         out.print(_settings_table(title, measures, has_errors=False, is_wide=is_wide))
+    _print_traffic_options(out, study)
     if not is_wide:
         out.print("for seconds by stage, memory and disk, widen the window or see accuracy.parquet")
 
@@ -54,9 +70,31 @@ def print_study(study: AccuracyStudy, command: str) -> None:
         if frames < _MAX_FRAMES:
             needed = f"about {frames:,.0f} frames would tell them apart"
         out.print(f"{better} above {worse}: probability {probability:.0%}; {needed}")
-    out.print(_describe_recommendation(study, command))
     for path in study.files:
         out.print(str(path))
+    out.print()
+    out.print(_describe_recommendation(study, command))
+    if not study.all_zero:
+        print_sentences(study_conclusions.accuracy_conclusion(study))
+
+
+def _print_traffic_options(out: Console, study: AccuracyStudy) -> None:
+    """Print what SUMO's step, sublanes and routing cost and change, and what other seeds change."""
+    options = [row for row in study.rows if row.kind == TRAFFIC]
+    if not options:
+        return
+    (scenario,) = (row for row in study.rows if row.kind == SCENARIO)
+    spread = SeedSpread.from_rows(options)
+    options.sort(key=lambda row: (OPTION_KNOBS.index(row.knob), row.setting))
+    title = "options of the traffic: another draw of it, compared with the scenario, beside other seeds"
+    out.print(make_table(study_conclusions.traffic_columns(scenario, spread), [scenario, *options], title=title))
+    if math.isnan(spread.tpog):
+        out.print("fewer than two other seeds ran within the budget, so the spread of seeds is unknown")
+        return
+    explained = "busy: processor seconds, and times those of the scenario; TPOG: change of the occupancy"
+    out.print(f"{explained}; scores: largest change")
+    limits = f"TPOG {spread.tpog:.1%}, scores {spread.score:.1%}"
+    out.print(f"spread of {spread.seeds} other seeds: up to {limits}")
 
 
 def _describe_reference(study: AccuracyStudy) -> str:
@@ -155,64 +193,209 @@ def _describe_recommendation(study: AccuracyStudy, command: str) -> str:
 _FILE_WIDTH = 190
 _COLUMN_GAP = 2
 """Space that rich leaves between two columns."""
-_POSITION_WIDTH, _DEGREES_WIDTH = 28, 26
-"""Widths of the columns x, y, z together, and of longitude and latitude together."""
 
 
 def print_comparison(comparison: Comparison, top: int | None = None) -> None:
-    """Print runs side by side; only the ``top`` sites of the first run, if given."""
+    """Print runs side by side; only the ``top`` poles or sites of the first run, if given."""
     out = console(_FILE_WIDTH, soft_wrap=False)
     for run in comparison.runs:
-        out.print(f"{run.label}  {run.folder}", soft_wrap=True)
+        out.print(f"{run.label}  {run.folder}  ({join_names(run.sensors)})", soft_wrap=True)
     out.print()
-    for runs in _fit_to_width(comparison.runs, out.width):
-        out.print(_site_table(comparison, runs, comparison.sites[:top], out.width))
+    for table in _result_tables(comparison, top, out.width):
+        out.print(table)
         out.print()
+    if comparison.by == "pole":
+        _print_pole_notes(out, comparison, top)
     out.print(_agreement_table(comparison))
     out.print()
+    if comparison.sensors is not None:
+        _print_sensors(out, comparison, comparison.sensors)
     if comparison.differences:
         out.print(_difference_table(comparison))
-    else:
+    elif len({run.folder for run in comparison.runs}) > 1:
         out.print("their settings and files are the same")
     for note in comparison.notes:
         out.print(f"note: {note}", soft_wrap=True)
 
 
-def _fit_to_width(runs: Sequence[ComparedRun], width: int) -> list[Sequence[ComparedRun]]:
-    """Divide runs into tables that fit the width; the first run is in each table, to compare others with it."""
-    widest_run = 0
-    for run in runs:
-        widths = [max(len(column.title), 8) + _COLUMN_GAP for column in _run_columns(run, width)]
-        widest_run = max(widest_run, sum(widths))
-    sites = [site for run in runs for site in run.sites.values()]
-    used = 0
-    if sites:
-        used = max(len(site.site) for site in sites) + _COLUMN_GAP
-    if width >= NARROW:
-        used += _POSITION_WIDTH
-        if any(site.longitude_deg is not None for site in sites):
-            used += _DEGREES_WIDTH
+def _result_tables(comparison: Comparison, top: int | None, width: int) -> Iterator[Table]:
+    """Yield tables of the poles or sites, with as many runs side by side as fit; the first run is in each."""
+    first, *others = range(len(comparison.runs))
+    start = 0
+    while start < len(others):
+        count = len(others) - start
+        while count > 1 and _result_width(comparison, [first, *others[start : start + count]], top, width) > width:
+            count -= 1
+        yield _result_table(comparison, [first, *others[start : start + count]], top, width)
+        start += count
 
-    runs_per_table = max(2, (width - used) // widest_run)
-    first, others = runs[:1], runs[1:]
-    step = runs_per_table - 1
-    return [(*first, *others[start : start + step]) for start in range(0, len(others), step)]
+
+def _result_width(comparison: Comparison, runs: Sequence[int], top: int | None, width: int) -> int:
+    """Return the width of a table of some runs, if nothing is wrapped."""
+    table = _result_table(comparison, runs, top, width)
+    widths = []
+    for column in table.columns:
+        cells = [str(column.header), *(str(cell) for cell in column.cells)]
+        widths.append(max(len(cell) for cell in cells))
+    return sum(widths) + _COLUMN_GAP * len(widths)
+
+
+def _result_table(comparison: Comparison, runs: Sequence[int], top: int | None, width: int) -> Table:
+    if comparison.by == "pole":
+        return make_table(_pole_columns(comparison, runs, width), comparison.poles[:top], width=width)
+    return _site_table(comparison, [comparison.runs[run] for run in runs], comparison.sites[:top], width)
+
+
+# ---- by pole
+
+
+def _pole_columns(comparison: Comparison, runs: Sequence[int], width: int) -> list[Column[ComparedPole]]:
+    """Return the best mount of each pole in some runs, and the differences from the first run."""
+    columns: list[Column[ComparedPole]] = [Column("pole", lambda pole: pole.name, "left", wrap=True)]
+    for run in runs:
+        columns += _mount_columns(comparison, run, width)
+        if run > 0 and any(pole.differences[run] is not None for pole in comparison.poles):
+            title = f"{comparison.runs[run].label} - {comparison.runs[0].label}"
+            columns.append(Column(title, partial(_format_gap, run)))
+    return columns
+
+
+def _mount_columns(comparison: Comparison, run: int, width: int) -> list[Column[ComparedPole]]:
+    """Return the columns of one run, without those that are the same at all its sites."""
+    compared = comparison.runs[run]
+    sites = compared.ranking.sites
+    names = [(pole.mounts[run], pole.name) for pole in comparison.poles]
+    columns: list[Column[ComparedPole]] = []
+
+    def column(title: str, text: Callable[[RankedSite], str], align: Literal["left", "right"] = "right") -> None:
+        def cell(pole: ComparedPole) -> str:
+            mount = pole.mounts[run]
+            return "-" if mount is None else text(mount)
+
+        columns.append(Column(f"{compared.label} {title}", cell, align, wrap=align == "left"))
+
+    is_pitched = any(site.pitch_deg for site in sites)
+    if width < NARROW:
+        column("mount", partial(_describe_mount, is_pitched), "left")
+    elif any(mount is not None and mount.site != name for mount, name in names):
+        column("best site", lambda site: site.site, "left")
+    if len(compared.sensors) > 1:
+        column("sensor", lambda site: site.sensor, "left")
+    if width >= NARROW:
+        column("z m", lambda site: f"{site.z_m:.4g}")
+        if any(site.yaw_deg for site in sites):
+            column("yaw", lambda site: f"{site.yaw_deg:.0f}")
+        if is_pitched:
+            column("pitch", lambda site: f"{site.pitch_deg:.0f}")
+    column(compared.ranking.by.head, format_score)
+    return columns
+
+
+def _describe_mount(with_pitch: bool, site: RankedSite) -> str:
+    """Return height and pitch, e.g. "3 m, -10°"."""
+    return f"{site.z_m:.4g} m, {site.pitch_deg:.0f}°" if with_pitch else f"{site.z_m:.4g} m"
+
+
+def format_score(site: RankedSite) -> str:
+    """Return the score that ranks with its standard error, e.g. "87.1% ±0.5%"."""
+    error = site.by.error(site.score, site.score_se)
+    if error == "-":
+        return site.by.value(site.score)
+    return f"{site.by.value(site.score)} ±{error.removeprefix('±')}"
+
+
+def _format_gap(run: int, pole: ComparedPole) -> str:
+    difference, mount = pole.differences[run], pole.mounts[run]
+    if difference is None or mount is None:
+        return "-"
+    return format_difference(difference, mount)
+
+
+def _print_pole_notes(out: Console, comparison: Comparison, top: int | None) -> None:
+    """Explain the table of poles, and say at how many poles another run is better."""
+    if top is not None and len(comparison.poles) > top:
+        out.print(f"{len(comparison.poles) - top} more: without --top, all are listed")
+    first = comparison.runs[0]
+    compared = [run for run in range(1, len(comparison.runs)) if _gaps(comparison, run)]
+    for run in compared:
+        gaps = _gaps(comparison, run)
+        better = [gap.is_clear for gap in gaps if gap.value > 0]
+        worse = [gap.is_clear for gap in gaps if gap.value < 0]
+        out.print(
+            f"{comparison.runs[run].label} against {first.label} at {len(gaps)} common poles: better at {len(better)} "
+            f"(clearly at {sum(better)}), worse at {len(worse)} (clearly at {sum(worse)})",
+            soft_wrap=True,
+        )
+    if compared:
+        out.print(
+            f"differences of the best mounts are in {difference_unit(first.ranking.best[0])}, ± their standard error; "
+            f"~ it is not clear which is better (probability below {DISTINCT_PROBABILITY:.0%})",
+            soft_wrap=True,
+        )
+    out.print()
+
+
+def _gaps(comparison: Comparison, run: int) -> list[ScoreDifference]:
+    differences = [pole.differences[run] for pole in comparison.poles]
+    return [difference for difference in differences if difference is not None]
+
+
+# ---- sensors
+
+
+def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparison) -> None:
+    """Print the best mount of each sensor, what it costs, and how far the comparison can be trusted."""
+    by = sensors.baseline.site.by
+    columns: list[Column[SensorResult]] = []
+    if len(sensors.results) > len(sensors.sensors):
+        columns.append(Column("run", lambda result: result.mount.run, "left"))
+    columns += [
+        Column("sensor", lambda result: result.mount.sensor, "left", wrap=True),
+        Column("best site", lambda result: result.mount.site.site, "left", wrap=True),
+        Column("z m", lambda result: f"{result.mount.site.z_m:.4g}", min_width=NARROW),
+    ]
+    if sensors.has_yaw_or_pitch:
+        columns.append(Column("yaw", lambda result: f"{result.mount.site.yaw_deg:.0f}", min_width=NARROW))
+        columns.append(Column("pitch", lambda result: f"{result.mount.site.pitch_deg:.0f}", min_width=NARROW))
+    columns.append(Column(by.head, lambda result: format_score(result.mount.site)))
+    columns.append(Column("difference", lambda result: result.gain_text))
+    if any(result.mount.cost is not None for result in sensors.results):
+        columns.append(Column("cost", lambda result: result.cost_text))
+    if sensors.shows_cost_per_point:
+        columns.append(Column("one more point costs", lambda result: result.cost_per_point_text, wrap=True))
+    if sensors.shows_cost_per_point and sensors.has_steps:
+        columns.append(Column("than the best cheaper", lambda result: result.step_cost_text, wrap=True))
+    out.print(make_table(columns, sensors.results, width=out.width, title="the best mount of each sensor"))
+    out.print(sensors.explanation, soft_wrap=True)
+    if not sensors.has_costs:
+        folders = " ".join(shlex.quote(str(folder)) for folder in dict.fromkeys(run.folder for run in comparison.runs))
+        option = costs_option(sensors.sensors)
+        out.print(
+            f"What one more point costs: egvs compare {folders} {option}, or [costs] in scenario.toml", soft_wrap=True
+        )
+    out.print(sensors.evidence, soft_wrap=True)
+    out.print()
+
+
+# ---- by site
 
 
 def _run_columns(run: ComparedRun, width: int) -> list[Column[str]]:
     """Return the columns of one run, whose rows are names of sites."""
     label = SCORE_LABELS[run.rank_by]
 
-    def cell_text(text: Any, site_name: str) -> str:
+    def cell_text(text: Callable[[RankedSite], object], site_name: str) -> str:
         site = run.sites.get(site_name)
         if site is None:
             return "-"
         return str(text(site))
 
     score = Column(f"{run.label} {label.head}", partial(cell_text, lambda site: label.value(site.score)))
-    error = Column(f"{run.label} error", partial(cell_text, partial(_format_error, run)))
+    error = Column(f"{run.label} error", partial(cell_text, lambda site: label.error(site.score, site.score_se)))
     egvs = Column(f"{run.label} bit", partial(cell_text, lambda site: f"{site.egvs:.1f}"))
-    share = Column(f"{run.label} of limit", partial(cell_text, lambda site: format_or_dash(site.share, ".1%")))
+    share = Column(
+        f"{run.label} of limit", partial(cell_text, lambda site: format_or_dash(share_of_limit(site), ".1%"))
+    )
     rank = Column(f"{run.label} rank", partial(cell_text, lambda site: site.rank))
 
     columns = [score, error, egvs, rank]
@@ -225,37 +408,31 @@ def _run_columns(run: ComparedRun, width: int) -> list[Column[str]]:
     return columns[-2:]
 
 
-def _format_error(run: ComparedRun, site: SiteResult) -> str:
-    standard_error = site.egvs_se if site.other is None else site.other_se
-    return SCORE_LABELS[run.rank_by].error(site.score, standard_error)
-
-
 def _site_table(comparison: Comparison, runs: Sequence[ComparedRun], names: Sequence[str], width: int) -> Table:
     """Return the scores of sites in several runs."""
     sites = {name: next(run.sites[name] for run in comparison.runs if name in run.sites) for name in names}
     columns = [Column[str]("site", str, "left", wrap=True)]
-    for number, title in enumerate(("x m", "y m", "z m")):
-        columns.append(Column(title, partial(_format_position, sites, number), min_width=NARROW))
+    for title, key in (("x m", "x_m"), ("y m", "y_m"), ("z m", "z_m")):
+        columns.append(Column(title, partial(_format_value, sites, key, ".2f"), min_width=NARROW))
     if any(site.longitude_deg is not None for site in sites.values()):
         for title, key in (("longitude", "longitude_deg"), ("latitude", "latitude_deg")):
-            columns.append(Column(title, partial(_format_degrees, sites, key), min_width=NARROW))
+            columns.append(Column(title, partial(_format_value, sites, key, ".6f"), min_width=NARROW))
     for run in runs:
         columns += _run_columns(run, width)
     return make_table(columns, names, width=width)
 
 
-def _format_position(sites: dict[str, SiteResult], axis: int, name: str) -> str:
-    return f"{sites[name].pose[axis]:.2f}"
+def _format_value(sites: dict[str, RankedSite], key: str, spec: str, name: str) -> str:
+    return format_or_dash(getattr(sites[name], key), spec)
 
 
-def _format_degrees(sites: dict[str, SiteResult], key: str, name: str) -> str:
-    return format_or_dash(getattr(sites[name], key), ".6f")
+# ---- agreement and settings
 
 
 def _agreement_table(comparison: Comparison) -> Table:
     columns: list[Column[RankAgreement]] = [
         Column("runs", lambda pair: f"{pair.a}, {pair.b}", "left"),
-        Column("common sites", lambda pair: str(pair.shared), wrap=True),
+        Column(f"common {comparison.by}s", lambda pair: str(pair.shared), wrap=True),
         Column("tau", lambda pair: format_or_dash(pair.tau, ".2f")),
         Column("rho", lambda pair: format_or_dash(pair.rho, ".2f")),
         Column("best", _format_best_sites, "left", wrap=True),

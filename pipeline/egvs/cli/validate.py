@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from egvs.cli import options
-from egvs.cli.options import Jobs, Out, ScenarioPath, Set
+from egvs.cli import options, sources
+from egvs.cli.options import Jobs, Out, ScenarioPath, Set, SettingsPath
 from egvs.core.errors import InputError, MissingBackendError
 
 DEFAULT_FRAMES = 250
@@ -25,7 +25,7 @@ Spacing = Annotated[
 
 
 def validate(
-    scenario: ScenarioPath,
+    scenario: SettingsPath,
     out: Out = None,
     set_: Set = None,
     frames: Annotated[int, typer.Option(min=10, help=_FRAMES_HELP)] = DEFAULT_FRAMES,
@@ -53,36 +53,35 @@ def validate(
     jobs: Jobs = None,
 ) -> None:
     """Simulate detection from each site, and test which score predicts it; or validate a plan."""
-    from egvs.cli import validation_tables
     from egvs.cli.console import ProgressDisplay
-    from egvs.runs.run import default_folder
-    from egvs.scenario.loading import load
-    from egvs.validation import plan_validation, site_validation
-    from egvs.validation.held_out_traffic import FrameSampling
-    from egvs.validation.kitti_results import KittiFiles
 
-    loaded = load(scenario, set_ or ())
-    folder = out or default_folder(loaded)
-    sampling = FrameSampling(frames, spacing)
+    of_plan = plan or plan_from is not None
+    if of_plan and (detections is not None or keep):
+        option = "--keep" if keep else "--detections"
+        raise InputError(option, "not available with a plan", f"Omit {option}, or omit --plan and --plan-from.")
     detectors = [name.strip() for name in detector.split(",") if name.strip()]
-    if not plan and plan_from is None:
-        with ProgressDisplay("validate") as screen:
+    loaded, folder = sources.open_source(scenario, set_, out)
+    with ProgressDisplay("validate") as screen:
+        from egvs.cli import validation_tables
+        from egvs.validation import plan_validation, site_validation
+        from egvs.validation.held_out_traffic import FrameSampling
+        from egvs.validation.kitti_results import KittiFiles
+
+        sampling = FrameSampling(frames, spacing)
+        if of_plan:
+            plan_result = plan_validation.validate_plan(
+                loaded, folder, plan_from or folder, sampling=sampling, detectors=detectors, jobs=jobs,
+                progress=screen.progress, listener=validation_tables.PlanRunDisplay(screen.say),
+            )  # fmt: skip
+        else:
             validation = site_validation.validate_sites(
                 loaded, folder, sampling=sampling, detectors=detectors, kitti=KittiFiles(detections, keep), jobs=jobs,
                 progress=screen.progress, listener=validation_tables.DetectorRunDisplay(screen.say),
             )  # fmt: skip
+    if of_plan:
+        validation_tables.print_plan_validation(plan_result)
+    else:
         validation_tables.print_validation(loaded, folder, validation)
-        return
-
-    if detections is not None or keep:
-        option = "--keep" if keep else "--detections"
-        raise InputError(option, "not available with a plan", f"Omit {option}, or omit --plan and --plan-from.")
-    with ProgressDisplay("validate") as screen:
-        plan_result = plan_validation.validate_plan(
-            loaded, folder, plan_from or folder, sampling=sampling, detectors=detectors, jobs=jobs,
-            progress=screen.progress, listener=validation_tables.PlanRunDisplay(screen.say),
-        )  # fmt: skip
-    validation_tables.print_plan_validation(plan_result)
 
 
 def clouds(

@@ -8,7 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from egvs.cli.console import Column, console, print_table
+from egvs.cli.console import NARROW, Column, console, print_sentences, print_table
+from egvs.core.remaining_time import RemainingTime
 from egvs.report.formatting import SCORE_LABELS
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.validation.detection_metrics import ALL_OBJECTS
@@ -29,14 +30,15 @@ if TYPE_CHECKING:
 
 _FILE_WIDTH = 160
 
-FRAME_MS = {"points": 4.0, "cluster": 17.0, "pointpillars": 80.0}
-"""Time per frame of 57,600 beams and detector, measured on one core of a small cloud machine; ``points`` is the
-simulation of the cloud."""
-
-SITE_S = 0.5
-"""Time of the empty scan of a site."""
-
-_MEASURE_TITLES = {"ap_combined_r40_iou70": "AP BEV + 3D, %", "seen_20": "vehicles with 20 points, %"}
+_MEASURE_TITLES = {
+    "ap_mean_r40_iou70": {
+        "ap_bev_r40_iou70": "BEV AP, %",
+        "ap_3d_r40_iou70": "3D AP, %",
+        "ap_mean_r40_iou70": "mean, %",
+    },
+    "seen_20": {"seen_20": "vehicles with 20 points, %"},
+}
+"""Measures of a detector that the table shows, with their titles, by its main measure."""
 
 
 def print_scores(entries: Iterable[ScoreEntry]) -> None:
@@ -92,32 +94,48 @@ def _format_parameter(value: ParameterValue) -> str:
 
 
 def print_validation(scenario: Scenario, out: Path, validation: Validation) -> None:
-    """Print what each detector finds from each site, and how well scores predict it."""
+    """Print what each detector finds from each site, how well scores predict it, and what this says of the ranking."""
     _print_sample(validation.sample, next(row for row in validation.detections if row.objects_of == ALL_OBJECTS))
-    score = validation.egvs_score(scenario)
-    egvs = validation.values_of(score)
-    sites = sorted(egvs, key=lambda site: -egvs[site])
     detectors = list(dict.fromkeys(row.detector for row in validation.detections))
-    detections = {(row.site, row.detector): row for row in validation.detections if row.objects_of == ALL_OBJECTS}
-
-    def format_detection(detector: str, site: str) -> str:
-        return _format_percent(detections[site, detector].measures[main_measure(detector)])
-
-    columns = [
-        Column[str]("site", str, "left"),
-        Column[str]("EGVS, kbit", lambda site: f"{egvs[site] / 1e3:.1f}", wrap=True),
-    ]
-    for detector in detectors:
-        title = f"{detector}: {_MEASURE_TITLES[main_measure(detector)]}"
-        columns.append(Column(title, partial(format_detection, detector), wrap=True))
-    print_table(columns, sites, file_width=_FILE_WIDTH)
+    sites = sorted(validation.ranked, key=lambda site: -validation.ranked[site])
+    print_table(_detection_columns(validation, detectors), sites, file_width=_FILE_WIDTH)
     print()
-    _print_agreement(validation, score, detectors)
+    _print_agreement(validation, validation.egvs_score(scenario), detectors)
     for warning in validation.warnings:
         print(f"warning: {warning}")
     print(f"{out}: detection.parquet, surrogates.parquet, correlation.parquet, validation.png")
     if validation.report:
         print(validation.report)
+    print()
+    print_sentences(validation.check.sentences)
+    if validation.check.warning:
+        print_sentences([validation.check.warning])
+
+
+def _detection_columns(validation: Validation, detectors: Sequence[str]) -> list[Column[str]]:
+    """Return the site, the score that ranks, and the measures of each detector.
+
+    Narrow terminals show BEV and 3D of a single detector only; the mean of both is always shown.
+    """
+    label = SCORE_LABELS[validation.check.score]
+    detections = {(row.site, row.detector): row for row in validation.detections if row.objects_of == ALL_OBJECTS}
+
+    def format_detection(detector: str, measure: str, site: str) -> str:
+        return _format_percent(detections[site, detector].measures[measure])
+
+    columns = [
+        Column[str]("site", str, "left"),
+        Column[str](label.head, lambda site: label.value(validation.ranked[site]), wrap=True),
+    ]
+    with_boxes = [detector for detector in detectors if detector != POINT_COUNTS_NAME]
+    for detector in detectors:
+        main = main_measure(detector)
+        for measure, title in _MEASURE_TITLES[main].items():
+            is_detail = measure != main and len(with_boxes) > 1
+            text = partial(format_detection, detector, measure)
+            min_width = NARROW if is_detail else 0
+            columns.append(Column(f"{detector}: {title}", text, wrap=True, min_width=min_width))
+    return columns
 
 
 def _print_sample(sample: TrafficSample, detection: SiteDetection) -> None:
@@ -154,8 +172,10 @@ def _format_interval(correlation: Correlation) -> str:
 _BOX_COLUMNS = {
     "AP BEV .7, %": "ap_bev_r40_iou70",
     "3D .7": "ap_3d_r40_iou70",
+    "mean .7": "ap_mean_r40_iou70",
     "BEV .5": "ap_bev_r40_iou50",
     "3D .5": "ap_3d_r40_iou50",
+    "mean .5": "ap_mean_r40_iou50",
 }
 _POINT_COLUMNS = {"seen with 1 point, %": "seen_1", "5": "seen_5", "20": "seen_20"}
 
@@ -165,7 +185,7 @@ def print_plan_validation(validation: PlanValidation) -> None:
     rows = [row for row in validation.rows if row.detection.objects_of == ALL_OBJECTS]
     _print_sample(validation.sample, rows[0].detection)
     for detector in dict.fromkeys(row.detection.detector for row in rows):
-        measures, gain_measure = _BOX_COLUMNS, "BEV + 3D .7"
+        measures, gain_measure = _BOX_COLUMNS, "mean .7"
         if detector == POINT_COUNTS_NAME:
             measures, gain_measure = _POINT_COLUMNS, "seen_20"
         columns: list[Column[Any]] = [
@@ -244,14 +264,15 @@ class DetectorRunDisplay(DetectionListener):
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self._say = say
+        self._remaining = RemainingTime((), 1)
 
-    def clouds(self, name: str) -> int:
-        """Return how many sensors a site or group has."""
+    def kind(self, name: str, detectors: Sequence[str]) -> tuple[object, ...]:
+        """Return what the time of a site or group depends on; equal ones should take equally long."""
         del name
-        return 1
+        return tuple(detectors)
 
     def begins(self, missing: Mapping[str, Sequence[str]], frames: int, processes: int) -> None:
-        """Print how much is left to do, and an estimate of the time.
+        """Print how much is left to do.
 
         Parameters
         ----------
@@ -267,26 +288,22 @@ class DetectorRunDisplay(DetectionListener):
             self._say(f"all detections from {len(missing)} {self.NOUN}s were cached")
             return
 
+        self._remaining = RemainingTime([self.kind(site, names) for site, names in pending.items()], processes)
         detectors = list(dict.fromkeys(name for names in pending.values() for name in names))
-        clouds = sum(self.clouds(site) for site in pending)
-        runs = {name: sum(name in names for names in pending.values()) for name in detectors}
-        runs["points"] = clouds  # every detector needs the clouds
-        frame_ms = sum(FRAME_MS.get(name, 0.0) * count for name, count in runs.items())
-        seconds = SITE_S * clouds + 1e-3 * frames * frame_ms
-
-        estimate = f"about {_format_duration(seconds / processes)} with a VLP-32C"
-        if unknown := [name for name in detectors if name not in FRAME_MS]:
-            estimate += f", plus the time of {', '.join(unknown)}"
         cached = ""
         if len(pending) < len(missing):
             cached = f" ({len(missing) - len(pending)} of {len(missing)} were cached)"
         sites = _count(len(pending), self.NOUN)
         workers = f"{processes} process{'es' if processes > 1 else ''}"
-        self._say(f"{frames} frames from {sites}{cached}, {', '.join(detectors)}, {workers}: {estimate}")
+        self._say(f"{frames} frames from {sites}{cached}, {', '.join(detectors)}, {workers}")
 
     def site_done(self, site: str, detectors: Sequence[str], cost: ResourceUsage) -> None:
-        """Print one line per site."""
-        self._say(f"{cost.seconds:>8.1f} s   {site}: {', '.join(detectors)}")
+        """Print one line per site, with the time that is left for the detectors where it can be estimated."""
+        self._remaining.unit_done(self.kind(site, detectors), cost.seconds)
+        left = ""
+        if self._remaining.seconds is not None:
+            left = f" (about {_format_duration(self._remaining.seconds)} left for detectors)"
+        self._say(f"{cost.seconds:>8.1f} s   {site}: {', '.join(detectors)}{left}")
 
 
 class PlanRunDisplay(DetectorRunDisplay):
@@ -294,9 +311,9 @@ class PlanRunDisplay(DetectorRunDisplay):
 
     NOUN = "group"
 
-    def clouds(self, name: str) -> int:
-        """Return how many sensors are in a group."""
-        return name.count(" + ") + 1
+    def kind(self, name: str, detectors: Sequence[str]) -> tuple[object, ...]:
+        """Return the detectors and the number of sensors, which the time of a group depends on."""
+        return (*detectors, name.count(" + ") + 1)
 
 
 def _count(number: int, noun: str) -> str:

@@ -7,7 +7,6 @@ that exists as long as the page; stages that the settings do not change are copi
 from __future__ import annotations
 
 import math
-import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,14 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from egvs.artefacts.run_folder import RunFolder
-from egvs.artefacts.run_record import RunRecord
-from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.effects import registry
 from egvs.explore.session import Session
 from egvs.runs import run, stage_registry
 from egvs.runs.run import StageListener, ignore_stage, lock_run_folder
-from egvs.scenario.loading import load, scenario_from_dict
+from egvs.runs.run_sources import SettingsSource
+from egvs.scenario.loading import scenario_from_dict
 from egvs.scenario.model import Scenario
 from egvs.stages.inputs import open_folder
 from egvs.studies import effect_study
@@ -209,7 +207,7 @@ def open_session(
     path
         A folder with a ``run.json``, or a scenario.
     overrides, out
-        For a scenario: arguments of ``--set``, and its run folder.
+        For a scenario only: arguments of ``--set``, and its run folder.
     jobs
         Number of threads; None for all cores.
     progress, listener
@@ -218,23 +216,11 @@ def open_session(
     Raises
     ------
     InputError
-        If it is neither, or the scenario is not valid.
+        If it is neither, the scenario is not valid, or a run folder is given together with overrides or ``out``.
     """
-    path = Path(path)
-    if not RunFolder(path).run_record.is_file():
-        scenario = load(path, overrides)
-        folder = run.default_folder(scenario) if out is None else Path(out)
-        return make_session(scenario, folder, jobs=jobs, progress=progress, listener=listener)
-    for option, is_given in (("--set", bool(overrides)), ("--out", out is not None)):
-        if is_given:
-            raise InputError(option, f"cannot be used with a run folder ({path})", "Give the scenario instead.")
-    return make_session(_recorded_scenario(path), path, jobs=jobs, progress=progress, listener=listener)
-
-
-def _recorded_scenario(folder: Path) -> Scenario:
-    record = RunRecord.read(folder)
-    source = Path(os.path.normpath(folder / record.scenario_folder))
-    if not source.is_dir():
-        problem = f"the scenario's folder {source} does not exist"
-        raise InputError(RunFolder(folder).run_record, problem, "Give the scenario instead of the run.")
-    return scenario_from_dict(record.scenario, source, str(RunFolder(folder).run_record))
+    run_folder = None if out is None else Path(out)
+    source = SettingsSource.of(Path(path), overrides, run_folder)
+    scenario = source.load()
+    return make_session(
+        scenario, source.folder(scenario, run_folder), jobs=jobs, progress=progress, listener=listener
+    )  # fmt: skip

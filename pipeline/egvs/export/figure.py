@@ -159,9 +159,7 @@ def ranking_chart(ranking: Ranking, style: FigureStyle) -> str:
         for site in ranking.sites[:MAX_BARS]
     ]
     alt = f"Ranking of {len(ranking.sites)} sites by {by.noun}; best: {ranking.best[0].site}."
-    if by.is_share:
-        return bar_chart(bars, f"{by.label} (%)", alt, 100.0, style)
-    return bar_chart(bars, by.label, alt, 1.0, style)
+    return bar_chart(bars, by.axis_title, alt, by.axis_factor, style)
 
 
 def _convert_svg(svg: str, kind: str) -> bytes:

@@ -2,13 +2,15 @@
 
 Steps of :func:`place`: bring traffic, static world, TPOG and scans up to date as ``egvs run`` does; compute the
 visibility of every candidate once; solve ``[placement]`` (:mod:`egvs.placement.solver`); on request refine the poses
-(:mod:`egvs.placement.refinement`); write ``placement.parquet`` (one row per sensor) and ``curve.parquet`` (one row per
-number of sensors); refresh the report of the run, if there is one.
+(:mod:`egvs.placement.refinement`); estimate standard errors (:mod:`egvs.placement.plan_error`); write
+``placement.parquet`` (one row per sensor) and ``curve.parquet`` (one row per number of sensors); refresh the report of
+the run, if there is one.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -18,15 +20,17 @@ from typing import Any
 import numpy as np
 
 from egvs.artefacts import checksums, parquet
+from egvs.artefacts.plan_step import ERROR_COLUMNS, PlanStep
 from egvs.artefacts.planned_sensor import PlannedSensor, plan_columns
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files, plugins
 from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.placement import problem_builder, refinement, solver
+from egvs.placement.plan_error import PlanErrors
 from egvs.placement.problem import Problem
 from egvs.placement.problem_builder import PlacementProblem
-from egvs.placement.solver import Solution
+from egvs.placement.solver import CurvePoint, Solution
 from egvs.runs import run, stage_registry
 from egvs.runs.run import StageListener, ignore_stage, lock_run_folder
 from egvs.scenario.model import Scenario
@@ -43,6 +47,9 @@ REQUIRED_STAGES = ("check", "statics", "scan", "traffic", "tpog")
 
 _REFINEMENT_COLUMNS = ("moved_m", "gain_by_refining")
 """Columns of a plan whose poses were refined."""
+
+_SENSOR_ERROR_COLUMNS = ("score_se", "gain_se")
+"""Columns of a plan where standard errors are known."""
 
 _MAX_NAMES = 20
 """Number of names that a message lists."""
@@ -230,6 +237,12 @@ class Placement:
         The curve and the bounds; they apply to the candidates at their original poses.
     curve_sites, curve_costs
         Names of the sites, and the cost, of each plan of the curve.
+    steps
+        Joint score of each plan of the curve, and what it adds to the one before it, with standard errors.
+    errors_from
+        How the standard errors were computed; or the reason why there are none.
+    has_errors
+        Whether there are standard errors.
     refinement
         With refined poses, what the refinement did; ``sensors``, ``joint``, ``cost`` and ``zones`` are those after it.
     files
@@ -246,6 +259,9 @@ class Placement:
     solution: Solution
     curve_sites: tuple[tuple[str, ...], ...]
     curve_costs: tuple[float, ...]
+    steps: tuple[PlanStep, ...]
+    errors_from: str
+    has_errors: bool
     refinement: RefinementSummary | None = None
     files: tuple[Path, ...] = ()
 
@@ -253,6 +269,13 @@ class Placement:
     def certificate(self) -> float:
         """Proved share of the best possible objective."""
         return self.solution.point.certificate
+
+    @property
+    def joint_se(self) -> float:
+        """Standard error of the joint score of the plan; NaN where it is unknown, and without sensors."""
+        if not self.sensors:
+            return math.nan
+        return self.sensors[-1].score_se
 
 
 def place(
@@ -354,13 +377,35 @@ def solve_placement(context: StageContext, *, exact: bool, time_limit_s: float) 
     placement_problem = replace(placement_problem, problem=problem)
     sites = [placement_problem.sites[i] for i in solution.order]
     placed = _make_placement(scenario, placement_problem, problem, sites, solution.order, solution)
+    errors = PlanErrors(context, placement_problem)
     if config.refine is None or not placed.sensors:
-        return placed
-    return _refine_placement(context, placement_problem, config.refine, placed)
+        return _with_errors(placed, errors, placement_problem, problem, solution.order)
+    return _refine_placement(context, placement_problem, config.refine, placed, errors)
+
+
+def _with_errors(
+    placed: Placement, errors: PlanErrors, placement_problem: PlacementProblem, problem: Problem, order: Sequence[int]
+) -> Placement:
+    """Return a plan with standard errors; ``problem`` and ``order`` as in :func:`_make_placement`."""
+    curve_errors = errors.of_plans(placement_problem.problem.joint, [point.plan for point in placed.solution.curve])
+    steps = [replace(step, **error._asdict()) for step, error in zip(placed.steps, curve_errors, strict=True)]
+
+    prefixes = [tuple(order[: number + 1]) for number in range(len(order))]
+    sensor_errors = errors.of_plans(problem.joint, prefixes)
+    sensors = []
+    for sensor, error in zip(placed.sensors, sensor_errors, strict=True):
+        sensors.append(replace(sensor, score_se=error.score_se, gain_se=error.gain_se))
+    return replace(
+        placed, sensors=tuple(sensors), steps=tuple(steps), errors_from=errors.source, has_errors=errors.are_known
+    )
 
 
 def _refine_placement(
-    context: StageContext, placement_problem: PlacementProblem, config: RefinementConfig, placed: Placement
+    context: StageContext,
+    placement_problem: PlacementProblem,
+    config: RefinementConfig,
+    placed: Placement,
+    errors: PlanErrors,
 ) -> Placement:
     start_s = perf_counter()
     solution = placed.solution
@@ -368,7 +413,9 @@ def _refine_placement(
     before, after = refined.before.plan_value, refined.after.plan_value
     order = solver.greedy_order(refined.after.problem, tuple(range(len(refined.after.sites))))
     sites = [refined.after.sites[i] for i in order]
-    result = _make_placement(context.scenario, placement_problem, refined.after.problem, sites, order, solution)
+    problem = refined.after.problem
+    result = _make_placement(context.scenario, placement_problem, problem, sites, order, solution)
+    result = _with_errors(result, errors, placement_problem, problem, order)
     sensors = []
     for sensor, i in zip(result.sensors, order, strict=True):
         sensors.append(replace(sensor, moved_m=refined.moved_m(i), gain_by_refining=refined.gain(i)))
@@ -428,7 +475,21 @@ def _make_placement(
         solution=solution,
         curve_sites=tuple(_site_names(placement_problem, point.plan) for point in solution.curve),
         curve_costs=tuple(given.rules.cost_of(point.plan) for point in solution.curve),
+        steps=_plan_steps(solution.curve),
+        errors_from="",
+        has_errors=False,
     )
+
+
+def _plan_steps(curve: Sequence[CurvePoint]) -> tuple[PlanStep, ...]:
+    """Return the steps of a curve, without standard errors."""
+    steps = []
+    score_before = 0.0
+    for point in curve:
+        score = point.plan_value.joint
+        steps.append(PlanStep(point.count, score, score - score_before, met=point.plan_value.met >= 0.0))
+        score_before = score
+    return tuple(steps)
 
 
 def planned_sensors(problem: Problem, sites: Sequence[Site], order: Sequence[int]) -> Iterator[PlannedSensor]:
@@ -529,24 +590,33 @@ def write_placement(
     paths = RunFolder(folder)
     metadata = _placement_metadata(scenario, placed, stage_keys)
     paths.placement_checksums.unlink(missing_ok=True)
-    optional_columns = () if placed.refinement is None else _REFINEMENT_COLUMNS
+    optional_columns: tuple[str, ...] = () if placed.refinement is None else _REFINEMENT_COLUMNS
+    if placed.has_errors:
+        optional_columns += _SENSOR_ERROR_COLUMNS
     with parquet.artefact_writer(paths.placement, "placement", optional_columns) as out:
         out.write(plan_columns(placed.sensors))
         out.describe(metadata)
+    with parquet.artefact_writer(paths.curve, "curve", ERROR_COLUMNS if placed.has_errors else ()) as out:
+        out.write(_curve_columns(placed))
+        out.describe(metadata)
+    checksums.write_checksums(paths.placement_checksums, (paths.placement, paths.curve))
+    return paths.placement, paths.curve
 
-    points = placed.solution.curve
-    curve = {
-        "count": [point.count for point in points],
-        "score": [point.plan_value.joint for point in points],
+
+def _curve_columns(placed: Placement) -> dict[str, list[Any]]:
+    points, steps = placed.solution.curve, placed.steps
+    columns: dict[str, list[Any]] = {
+        "count": [step.count for step in steps],
+        "score": [step.score for step in steps],
         "value": [point.plan_value.value for point in points],
         "bound": [point.bound for point in points],
         "cost": list(placed.curve_costs),
-        "met": [point.plan_value.met >= 0.0 for point in points],
+        "met": [step.met for step in steps],
         "sites": [json.dumps(list(names), ensure_ascii=False) for names in placed.curve_sites],
     }
-    parquet.write_artefact(paths.curve, "curve", curve, metadata)
-    checksums.write_checksums(paths.placement_checksums, (paths.placement, paths.curve))
-    return paths.placement, paths.curve
+    for name in ERROR_COLUMNS:
+        columns[name] = [getattr(step, name) for step in steps]
+    return columns
 
 
 def _placement_metadata(scenario: Scenario, placed: Placement, stage_keys: Mapping[str, str]) -> dict[str, Any]:
@@ -571,6 +641,7 @@ def _placement_metadata(scenario: Scenario, placed: Placement, stage_keys: Mappi
         "is_best": solution.is_best,
         "fewest_is_proved": solution.fewest_is_proved,
         "zones": [asdict(zone) for zone in placed.zones],
+        "standard_errors": placed.errors_from,
     }
     if refined is not None:  # without its duration: equal plans are equal files
         plan["moves"] = {

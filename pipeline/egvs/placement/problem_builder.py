@@ -23,7 +23,7 @@ from egvs.effects.base import Detect
 from egvs.placement import problem
 from egvs.placement.problem import CoverageTerm, Demand, PlanRules, Problem, VisibilityMatrix, VisibilityRow
 from egvs.scenario.model import Scenario
-from egvs.scenario.score_config import ZoneDemand
+from egvs.scenario.score_config import COST_COLUMN, ZoneDemand
 from egvs.scoring.scorer import ever_occupied
 from egvs.scoring.target_scores import TARGET_SCORES
 from egvs.scoring.targets import VisibleTargets
@@ -37,9 +37,6 @@ from egvs.stages.site_scoring import TargetScorer
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
-
-COST_COLUMN = "cost"
-"""Column of a sites file with the cost of each candidate."""
 
 _MAX_COST = 1e12
 """Maximum cost of one candidate: sums of such costs are accurate to 0.01."""
@@ -580,7 +577,7 @@ def candidate_costs(scenario: Scenario, sites: Sequence[Site]) -> tuple[FloatArr
         if costs.sensor and site.sensor not in costs.sensor:
             problem_text = f"the cost of sensor {site.sensor} (site {site.name}) is unknown"
             raise InputError(f"{scenario.file}: costs.sensor", problem_text, f'Add "{site.sensor}" = COST.')
-        cost[i] = costs.sensor.get(site.sensor, 0.0) + costs.pole + costs.metre * site.pose.z_m
+        cost[i] = costs.of_mount(site.sensor, site.pose.z_m)
         pole_cost[i] = costs.pole
         _check_cost(f"{scenario.file}: costs ({site.name})", float(cost[i]))
     return cost, pole_cost

@@ -416,11 +416,8 @@ def blindspot_note(site_blindspots: SiteBlindspots) -> str:
 
 
 def _format_share(location: LocationVisibility) -> str:
-    return f"{100.0 * location.share:.0f} %"
+    return f"{location.share:.0%}"
 
 
 def _describe_sample(location: LocationVisibility) -> str:
-    return (
-        f"± {100.0 * location.se:.0f} %, from {location.vehicles:,} vehicles in "
-        f"{location.vehicle_frames:,} observations"
-    )
+    return f"± {location.se:.0%}, from {location.vehicles:,} vehicles in {location.vehicle_frames:,} observations"

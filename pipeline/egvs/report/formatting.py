@@ -54,8 +54,25 @@ class ScoreLabel:
 
     @property
     def label(self) -> str:
-        """Title of an axis."""
+        """Name of the score with its unit."""
         return f"{self.noun} ({self.unit})" if self.unit else self.noun
+
+    @property
+    def axis_title(self) -> str:
+        """Title of an axis, e.g. "Share of vehicles found (%)"; its values are multiplied by :attr:`axis_factor`."""
+        name = self.noun.removeprefix("the ")
+        unit = "%" if self.is_share else self.unit
+        return f"{name[0].upper()}{name[1:]}" + (f" ({unit})" if unit else "")
+
+    @property
+    def axis_factor(self) -> float:
+        """Factor of values on an axis: 100 for shares, which are shown in per cent."""
+        return 100.0 if self.is_share else 1.0
+
+    @property
+    def card_head(self) -> str:
+        """Name beside a value where a narrow screen shows a row as a card."""
+        return f"{self.head[0].upper()}{self.head[1:]}"
 
     def with_noun(self, value: float) -> str:
         """Return a value with name and unit, e.g. "EGVS 247,397 bit"."""
@@ -72,6 +89,48 @@ class ScoreLabel:
         if se is None or math.isnan(se) or not value > 0:
             return "-"
         return f"±{se:.1%}" if self.is_share else f"{se / value:.1%}"
+
+    def with_error(self, value: float, se: float) -> str:
+        """Return a value and its standard error, without unit, e.g. "94.6 ± 0.9%"; the value alone if ``se`` is NaN."""
+        if math.isnan(value) or math.isnan(se):
+            return self.value(value)
+        text = f"{self._number(value)} ± {self._error_number(se)}"
+        return f"{text}%" if self.is_share else text
+
+    def change(self, value: float, se: float = math.nan) -> str:
+        """Return a difference of two values, without unit: of shares in percentage points, e.g. "4.7 ± 0.5"."""
+        if math.isnan(se):
+            return self._number(value)
+        return f"{self._number(value)} ± {self._error_number(se)}"
+
+    @property
+    def change_unit(self) -> str:
+        """Unit of :meth:`change` in a sentence."""
+        return "percentage points" if self.is_share else self.unit
+
+    @property
+    def change_head(self) -> str:
+        """Unit of :meth:`change` at the head of a column."""
+        return "% points" if self.is_share else self.unit
+
+    def is_zero(self, value: float) -> bool:
+        """Whether a difference of two values is written as 0."""
+        return float(self._number(value).replace(",", "")) == 0.0
+
+    @property
+    def smallest_change(self) -> str:
+        """The smallest difference that is not written as 0, without unit."""
+        return f"{10.0**-self.digits:.{self.digits}f}"
+
+    def _number(self, value: float) -> str:
+        if self.is_share:
+            value = 100.0 * value
+        return f"{value:,.{self.digits}f}"
+
+    def _error_number(self, se: float) -> str:
+        if se > 0.0 and self.is_zero(se):
+            return f"<{self.smallest_change}"
+        return self._number(se)
 
     def sentence(self, value: float) -> str:
         """Return what a site with this score does, e.g. "should find 87% of vehicles"."""

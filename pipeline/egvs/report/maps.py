@@ -138,7 +138,8 @@ def site_map(
     parts += _stack_labels(plan, stacks, labelled, radius, street_boxes)
     bar = None
     if high > low:
-        bar = ColourBar(low, high, sites[0].by.label, even=True)
+        by = sites[0].by
+        bar = ColourBar(by.axis_factor * low, by.axis_factor * high, by.axis_title, even=True)
     return plan.svg(parts, alt, bar=bar)
 
 

@@ -35,6 +35,7 @@ from egvs.report.sections import (
     egvs_setting,
     ranking_disagreement,
 )
+from egvs.report.sensor_results import SensorComparison, costs_option
 from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.scene_inputs import scan_dependencies
@@ -158,6 +159,7 @@ def _displayed_settings(scenario: Scenario) -> dict[str, Any]:
         "weights": scenario.score.weights.in_words,
         "assumed": assumptions(scenario),
         "blindspots": scenario.score.blindspots,
+        "costs": scenario.costs.model_dump(mode="json"),
         "effects": scenario.effects.model_dump(mode="json"),
     }
 
@@ -213,6 +215,7 @@ def render_page(contents: PageContents) -> str:
         **vars(contents),
         **_ranking_values(contents.ranking),
         **_setting_values(contents),
+        **_sensor_values(contents),
         **_cost_values(contents.stages),
         **_sentences(contents),
     }
@@ -284,6 +287,15 @@ def _setting_values(contents: PageContents) -> dict[str, Any]:
     }
 
 
+def _sensor_values(contents: PageContents) -> dict[str, Any]:
+    """The best mount of each sensor; None where there is one sensor."""
+    sensors = SensorComparison.of_run(contents.ranking.sites, contents.scenario.costs)
+    return {
+        "sensors": sensors,
+        "costs_option": costs_option(sensors.sensors) if sensors is not None else "",
+    }
+
+
 def _cost_values(stages: Mapping[str, StageRecord]) -> dict[str, Any]:
     """Costs and artefacts of the stages; stages without a record are None."""
     seconds = [stage.cost.seconds for stage in stages.values()]
@@ -303,6 +315,7 @@ def _sentences(contents: PageContents) -> dict[str, str]:
     setting = egvs_setting(scenario.gamma, tpog.grid.voxel_m, moving_occlusion=has_occlusion)
     return {
         "headline": headline(ranking, bool(tpog.counts.any())),
+        "contradiction": "" if contents.detected is None else contents.detected.check.contradiction,
         "lead": lead(ranking),
         "entropy_seen_note": entropy_seen_note(ranking),
         "disagreement": ranking_disagreement(ranking.sites, setting),

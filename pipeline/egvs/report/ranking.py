@@ -207,7 +207,7 @@ class Ranking:
     sites
         All sites; those of equal rank are in the order of the sites file.
     best
-        The sites of rank 1.
+        The sites with the best score.
     close
         The other sites within :data:`CLOSE_SHARE` of the best score.
     """
@@ -219,12 +219,19 @@ class Ranking:
     @classmethod
     def read(cls, path: Path) -> Ranking:
         """Read ``scores.parquet``; InputError if it has no site."""
-        sites = tuple(sorted(RankedSite.read(path), key=lambda site: site.rank))
+        sites = RankedSite.read(path)
         if not sites:
             raise InputError(path, "expected at least one site, got none", "Run the score stage again.")
-        best = tuple(site for site in sites if site.rank == 1)
+        return cls.of(sites)
+
+    @classmethod
+    def of(cls, sites: Iterable[RankedSite]) -> Ranking:
+        """Return the ranking of some sites of a run, at least one; their ranks are those among all sites."""
+        ordered = tuple(sorted(sites, key=lambda site: site.rank))
+        best = tuple(site for site in ordered if site.rank == ordered[0].rank)
         near = (1 - CLOSE_SHARE) * best[0].score
-        return cls(sites, best, tuple(site for site in sites if site.rank > 1 and site.score >= near > 0))
+        close = tuple(site for site in ordered[len(best) :] if site.score >= near > 0)
+        return cls(ordered, best, close)
 
     @property
     def last(self) -> RankedSite:

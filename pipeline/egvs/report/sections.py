@@ -13,19 +13,20 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from itertools import combinations
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+from egvs.artefacts.plan_step import PlanStep, plan_steps
 from egvs.artefacts.readers import read_accuracy, read_placement, read_validation
 from egvs.artefacts.run_folder import ACCURACY_FILES, PLACEMENT_FILES, VALIDATION_FILES
 from egvs.artefacts.run_record import StageRecord
 from egvs.artefacts.tpog import Tpog
 from egvs.core.errors import Diagnostic, collect_warnings
-from egvs.report import maps, svg_figures
+from egvs.report import maps, plan_answer, svg_figures
 from egvs.report.formatting import SCORE_LABELS, ScoreLabel, join_names
 from egvs.report.maps import Backdrop, PlannedPole
 from egvs.report.ranking import RankedSite
+from egvs.report.ranking_check import RankingCheck
 from egvs.report.svg_figures import CurveStep, MapSite
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
@@ -37,8 +38,8 @@ RHO: Mapping[str, Mapping[str, float]] = json.loads(
     Path(__file__).with_name("sections.json").read_text(encoding="utf-8")
 )
 """Rank correlation (Spearman's rho) of scores with detection at the held-out junctions of the study: score -> detector
--> rho with AP (BEV + 3D, IoU 0.7), from the table of all scores under F in docs/validity-tables.md. The EGVS has one
-entry per setting, named by :func:`egvs_setting`."""
+-> rho with AP (mean of BEV and 3D, IoU 0.7), from the table of all scores under F in docs/validity-tables.md. The EGVS
+has one entry per setting, named by :func:`egvs_setting`."""
 
 RHO_RANGE = (
     "0.83 to 0.97, depending on junction and detector; among sites of equal height in dense queues, about 0.2 to 0.96"
@@ -48,10 +49,11 @@ RHO_RANGE = (
 _ALL_OBJECTS = "vehicles"
 """Name of the set of all objects in ``detection.parquet``."""
 
-_MEASURE_LABELS = {
-    "ap_combined_r40_iou70": "average precision from above plus average precision in space, at most 200 %",
-    "seen_20": "vehicles with 20 points or more",
-}
+_MEASURE_TITLES = {"ap_mean_r40_iou70": "mean AP", "seen_20": "20 points"}
+"""Titles of main measures, in ``detection.parquet``."""
+
+_FURTHER_MEASURES = {"ap_mean_r40_iou70": (("ap_bev_r40_iou70", "BEV AP"), ("ap_3d_r40_iou70", "3D AP"))}
+"""Columns and titles of measures that are shown beside a main one."""
 
 
 def _is_current(metadata: Mapping[str, Any], stages: Mapping[str, StageRecord]) -> bool:
@@ -61,10 +63,6 @@ def _is_current(metadata: Mapping[str, Any], stages: Mapping[str, StageRecord]) 
 
 def _read_base64(path: Path) -> str:
     return base64.b64encode(path.read_bytes()).decode("ascii")
-
-
-def _count_sites(count: int) -> str:
-    return "1 site" if count == 1 else f"{count} sites"
 
 
 # ---- egvs validate
@@ -87,72 +85,33 @@ class SiteDetection:
     rank: int | None
 
 
-class Tau(NamedTuple):
-    """Kendall's tau and the ends of its 95 % confidence interval; NaN if not defined."""
+@dataclass(frozen=True)
+class MeasureColumn:
+    """One measure of a detector: its title, and the values by name of the site."""
 
-    value: float
-    low: float
-    high: float
+    title: str
+    sites: Mapping[str, SiteDetection]
 
 
 @dataclass(frozen=True)
 class DetectorSummary:
-    """Agreement of the score with one detector.
+    """What one detector finds from the sites.
 
     Attributes
     ----------
-    name, measure
-        The detector, and a description of its measure.
-    tau
-        Agreement of the orders of the sites by EGVS and by detection.
-    sites
-        Detection by name of the site.
+    name
+        The detector.
+    columns
+        Its measures that the page shows; the last is the main one, whose ranks are shown.
     """
 
     name: str
-    measure: str
-    tau: Tau
-    sites: Mapping[str, SiteDetection]
+    columns: tuple[MeasureColumn, ...]
 
-    def agreement(self, scored: Sequence[RankedSite]) -> str:
-        """Return how far the orders by EGVS and by detection agree, in a sentence."""
-        values = []
-        for site in scored:
-            detected = self.sites[site.site].value
-            if detected is not None:
-                values.append((site.egvs, detected))
-        agreeing = compared = 0
-        for (egvs, detected), (other_egvs, other_detected) in combinations(values, 2):
-            if egvs != other_egvs and detected != other_detected:
-                compared += 1
-                agreeing += (egvs > other_egvs) == (detected > other_detected)
-        if math.isnan(self.tau.value) or not compared:
-            return f"{_count_sites(len(values))} with values: too few, or too similar, to compare the two rankings."
-        interval = ""
-        if not math.isnan(self.tau.low):
-            interval = f", 95 % confidence interval {self.tau.low:.2f} to {self.tau.high:.2f}"
-        return (
-            f"EGVS and detection agree on which of two sites is better in {agreeing / compared:.0%} of the pairs of "
-            f"{_count_sites(len(values))} (Kendall's tau {self.tau.value:.2f}{interval})."
-        )
-
-    def judgement(self, scored: Sequence[RankedSite]) -> str:
-        """Return what a planner can conclude from it."""
-        if math.isnan(self.tau.value):
-            return ""
-        count = _count_sites(sum(site.value is not None for site in self.sites.values()))
-        if math.isnan(self.tau.low):
-            verdict = f"{count} are too few to say how certain this is."
-        elif self.tau.low <= 0.0 <= self.tau.high:
-            verdict = f"{count} are too few to tell: the interval includes 0, so the agreement may be chance."
-        elif self.tau.low > 0.0:
-            verdict = "This is more than chance: sites with a higher score tend to detect more."
-        else:
-            verdict = "The score orders these sites the wrong way round: sites with a higher score tend to detect less."
-        best = self.sites[scored[0].site]
-        if best.rank is None:
-            return verdict
-        return f"{verdict} The best site by score, {scored[0].site}, has rank {best.rank} by detection."
+    @property
+    def main(self) -> MeasureColumn:
+        """The main measure."""
+        return self.columns[-1]
 
 
 @dataclass(frozen=True)
@@ -162,7 +121,9 @@ class ValidationSummary:
     Attributes
     ----------
     detectors
-        Agreement of the score with each detector.
+        What each detector finds.
+    check
+        What the detectors say about the ranking.
     frames, objects
         Frames of the traffic used, and vehicles in them.
     apart_s
@@ -174,6 +135,7 @@ class ValidationSummary:
     """
 
     detectors: tuple[DetectorSummary, ...]
+    check: RankingCheck
     frames: int
     objects: int
     apart_s: float
@@ -189,17 +151,14 @@ class ValidationSummary:
         result = read_validation(detection, correlation)
         if result is None:
             return None
-        detection_rows, correlation_rows, metadata = result
+        detection_rows, _, metadata = result
         if not _is_current(metadata, stages):
             return None
         rows = [row for row in detection_rows if row["objects_of"] == _ALL_OBJECTS]
-        correlations = []
-        for row in correlation_rows:
-            if metadata["own_score"] == {"score": row["score"], "parameters": row["parameters"]}:
-                correlations.append(row)
         names = dict.fromkeys(row["detector"] for row in rows)
         return cls(
-            detectors=tuple(_detector_summary(name, metadata["shown"][name], rows, correlations) for name in names),
+            detectors=tuple(_detector_summary(name, metadata["shown"][name], rows) for name in names),
+            check=RankingCheck.from_json(metadata["ranking"]),
             frames=metadata["frames"],
             objects=rows[0]["objects"],
             apart_s=metadata["apart_s"],
@@ -208,15 +167,14 @@ class ValidationSummary:
         )
 
 
-def _detector_summary(
-    name: str, measure: str, rows: Sequence[Mapping[str, Any]], correlations: Sequence[Mapping[str, Any]]
-) -> DetectorSummary:
-    (correlation,) = (row for row in correlations if (row["detector"], row["measure"]) == (name, measure))
-    tau = Tau(correlation["kendall"], correlation["kendall_low"], correlation["kendall_high"])
+def _detector_summary(name: str, measure: str, rows: Sequence[Mapping[str, Any]]) -> DetectorSummary:
     rows = [row for row in rows if row["detector"] == name]
-    values = [row[measure] for row in rows if not math.isnan(row[measure])]
-    sites = {row["site"]: _site_detection(row[measure], row[f"{measure}_se"], values) for row in rows}
-    return DetectorSummary(name, _MEASURE_LABELS.get(measure, measure.replace("_", " ")), tau, sites)
+    columns = []
+    for column, title in (*_FURTHER_MEASURES.get(measure, ()), (measure, _MEASURE_TITLES.get(measure, measure))):
+        values = [row[column] for row in rows if not math.isnan(row[column])]
+        sites = {row["site"]: _site_detection(row[column], row[f"{column}_se"], values) for row in rows}
+        columns.append(MeasureColumn(title, sites))
+    return DetectorSummary(name, tuple(columns))
 
 
 def _site_detection(value: float, se: float, values: Sequence[float]) -> SiteDetection:
@@ -321,13 +279,20 @@ class PlanRow:
     score: float
     cost: float
     loss: float
+    score_se: float = math.nan
+    gain_se: float = math.nan
+
+    @classmethod
+    def from_row(cls, row: Mapping[str, Any]) -> PlanRow:
+        """Return a row of ``placement.parquet``; standard errors are NaN where it has none."""
+        return cls(**{field.name: row[field.name] for field in fields(cls) if field.name in row})
 
 
 @dataclass(frozen=True)
 class CurveRow:
-    """The best plan of ``count`` sensors; ``share`` is its part of the score of all candidates together."""
+    """The best plan of each number of sensors; ``share`` is its part of the score of all candidates together."""
 
-    count: int
+    step: PlanStep
     sites: tuple[str, ...]
     share: float
     certificate: float
@@ -348,6 +313,10 @@ class PlacementSummary:
         Best plans of 1, 2, ... sensors.
     joint, together
         Joint score of the plan, and of all candidates together.
+    errors_from
+        How the standard errors were computed; or the reason why there are none.
+    answer
+        How many sensors are enough, in one or two sentences; may be empty.
     cost
         Total cost; 0 without costs.
     candidates
@@ -369,6 +338,8 @@ class PlacementSummary:
     curve: tuple[CurveRow, ...]
     joint: float
     together: float
+    errors_from: str
+    answer: str
     cost: float
     candidates: int
     proof: str
@@ -406,23 +377,27 @@ class PlacementSummary:
             return None
         plan = metadata["plan"]
         by, joint = SCORE_LABELS[plan["score"]], plan["joint"]
-        picks = tuple(PlanRow(**{field.name: row[field.name] for field in fields(PlanRow)}) for row in rows)
+        picks = tuple(PlanRow.from_row(row) for row in rows)
         names = ", ".join(pick.site for pick in picks)
         before = None
         if "moves" in plan:
             before = plan["moves"]["before"]
         occupied = tpog.counts.sum(axis=2) / tpog.frames
         poles = _planned_poles(picks, joint, by)
+        steps, objective = plan_steps(curve_rows), describe_objective(plan["asked"])
+        next_count = plan_answer.next_count(steps, len(picks), plan["candidates"], plan["asked"])
         return cls(
             by=by,
             picks=picks,
-            curve=_curve(curve_rows, plan["together"] or math.inf),
+            curve=_curve(steps, curve_rows, plan["together"] or math.inf),
             joint=joint,
             together=plan["together"],
+            errors_from=plan.get("standard_errors", "the plan was made by an older version of egvs place"),
+            answer=plan_answer.describe_count(steps, by, objective=objective, next_count=next_count),
             cost=plan["cost"],
             candidates=plan["candidates"],
             proof=_describe_proof(plan, len(picks)),
-            objective=_describe_objective(plan["asked"]),
+            objective=objective,
             zones=tuple(plan["zones"]),
             before=before,
             map=maps.plan_map(tpog.grid, occupied, backdrop, candidates, poles, f"Map of the plan: {names}."),
@@ -436,19 +411,24 @@ class PlacementSummary:
             return 0.0
         return self.joint / self.together
 
-    def lost(self, pick: PlanRow) -> float:
-        """Return the share of the joint score that is lost if a sensor fails."""
-        if not self.joint:
-            return 0.0
-        return pick.loss / self.joint
+    @property
+    def has_errors(self) -> bool:
+        """Whether there are standard errors."""
+        return not any(math.isnan(row.step.score_se) for row in self.curve)
+
+    @property
+    def joint_text(self) -> str:
+        """Joint score of the plan with its standard error and its unit."""
+        se = self.picks[-1].score_se if self.picks else math.nan
+        return f"{self.by.with_error(self.joint, se)} {self.by.unit}".rstrip()
 
 
-def _curve(rows: Sequence[Mapping[str, Any]], together: float) -> tuple[CurveRow, ...]:
+def _curve(steps: Sequence[PlanStep], rows: Sequence[Mapping[str, Any]], together: float) -> tuple[CurveRow, ...]:
     curve = []
-    for row in rows:
+    for step, row in zip(steps, rows, strict=True):
         sites = tuple(json.loads(row["sites"]))
         certificate = _certificate(row["value"], row["bound"])
-        curve.append(CurveRow(row["count"], sites, row["score"] / together, certificate, row["cost"]))
+        curve.append(CurveRow(step, sites, step.score / together, certificate, row["cost"]))
     return tuple(curve)
 
 
@@ -482,7 +462,7 @@ def _describe_proof(plan: Mapping[str, Any], sensors: int) -> str:
     return f"it is not proved that {fewer} not enough"
 
 
-def _describe_objective(request: Mapping[str, Any]) -> str:
+def describe_objective(request: Mapping[str, Any]) -> str:
     """What the plan maximises, if not the joint score; empty otherwise."""
     parts = []
     if request["objective"] == "worst":

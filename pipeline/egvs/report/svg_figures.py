@@ -425,7 +425,7 @@ def sensor_count_chart(steps: Sequence[CurveStep], alt: str) -> str:
     for value, _ in round_values(0.0, 100.0 * top, 5):
         y = base - height * value / 100.0 / top
         parts.append(f'<path class="grid" d="M{_CURVE_LEFT:.1f} {y:.1f}h{width:.1f}"/>')
-        parts.append(_text(_CURVE_LEFT - 8, y + 4, f"{value:g} %", "end"))
+        parts.append(_text(_CURVE_LEFT - 8, y + 4, f"{value:g}%", "end"))
     label_step = 1
     if len(steps) > _MAX_LABELS:
         label_step += len(steps) // _MAX_LABELS

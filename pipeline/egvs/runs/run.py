@@ -28,7 +28,7 @@ from egvs.core.errors import InputError, RunError
 from egvs.core.platform import relative_path
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.formats.meshes import referenced_files
-from egvs.runs import locks, stage_keys, stage_registry, store
+from egvs.runs import locks, run_names, stage_keys, stage_registry, store
 from egvs.runs.digest_cache import remember_digests
 from egvs.runs.stage_keys import StageKey
 from egvs.runs.stage_registry import StageResult
@@ -72,7 +72,8 @@ def run(
     scenario
         From :func:`egvs.load`.
     out
-        Run folder; ``runs/<scenario name>`` when None.
+        Run folder; ``runs/<scenario name>`` when None, or, with overrides, that and their label (see
+        :mod:`egvs.runs.run_names`).
     jobs
         Number of threads; one per core when None. Results do not depend on it.
     progress
@@ -125,6 +126,9 @@ def run_one(
 ) -> RunRecord:
     """Run a single stage, even if its inputs did not change, and record it in ``run.json``.
 
+    Stages before it that have not been run in the folder are restored from the store, where it has their results for
+    this scenario. So a stage can be run with another setting, which has another folder.
+
     Parameters are those of :func:`run`; ``options`` are further keyword arguments of the stage.
     """
     check_no_overwrite(scenario, out)
@@ -133,8 +137,32 @@ def run_one(
         recorded = stage_registry.recorded_digests(record)
         context = open_folder(scenario, out, jobs=jobs, progress=progress, recorded=recorded)
         current = _Run(context, record, listener)
+        for earlier in stages_before(stage):
+            current.restore_stage(earlier)
         current.ensure_stage(stage, options, again=True)
         return current.finish(keep=(stage,))
+
+
+def stages_before(stage: str) -> list[str]:
+    """Return the stages whose artefacts a stage reads, or that these stages read, in the order of execution.
+
+    Parameters
+    ----------
+    stage
+        Name of the stage.
+
+    Examples
+    --------
+    >>> stages_before("tpog")
+    ['statics', 'traffic']
+    """
+    needed: set[str] = set()
+    pending = [stage]
+    while pending:
+        read = {file.writer for file in stage_registry.stage(pending.pop()).reads} - needed
+        needed |= read
+        pending += read
+    return [name for name in STAGE_NAMES if name in needed]
 
 
 def refresh_report(out: Path) -> Path | None:
@@ -168,15 +196,16 @@ def refresh_report(out: Path) -> Path | None:
 
 
 def default_folder(scenario: Scenario) -> Path:
-    """Return the run folder where none is given."""
-    return Path("runs") / scenario.name
+    """Return the run folder where none is given: ``runs/<name>``, or ``runs/<name>@<label>`` with overrides."""
+    return run_names.run_folder(scenario.name, scenario.overrides)
 
 
 def start_record(scenario: Scenario, folder: Path) -> RunRecord:
     """Return the record of earlier runs in a folder, with the scenario as it is now."""
     scenario_folder = relative_path(scenario.folder, folder)
     recorded = RunRecord.read(folder).stages if RunFolder(folder).has_record else {}
-    return RunRecord(__version__, scenario.seed, scenario.model_dump(mode="json"), scenario_folder, recorded)
+    values, overrides = scenario.model_dump(mode="json"), dict(scenario.overrides)
+    return RunRecord(__version__, scenario.seed, values, scenario_folder, recorded, overrides)
 
 
 def fetch_or_run(
@@ -293,6 +322,22 @@ class _Run:
         self._record_stage(name, stage_record)
         self.listener(name, "fetched" if fetched else "done", stage_record)
 
+    def restore_stage(self, name: str) -> None:
+        """Restore a stage from the store if it has not been run in the folder; do nothing if the store lacks it."""
+        folder = self.context.folder.path
+        if name in self.record.stages or any((folder / file).exists() for file in stage_registry.written_by(name)):
+            return
+        key = stage_keys.stage_key(name, self.context)
+        self.context.forget(*stage_registry.written_by(name))
+        with self.store.maker(name, key.key, progress=self.context.progress):
+            self.store.fetch(name, key.key)
+            entry = self.store.take(name, key.key, folder)
+        if entry is None:
+            return
+        self.has_changed = True
+        self._record_stage(name, key.record(entry.made))
+        self.listener(name, "fetched", self.record.stages[name])
+
     def _save(self, name: str, key: StageKey, result: StageResult) -> None:
         """Save a result in the store, unless another process is making the same."""
         with self.store.maker(name, key.key, wait=False) as is_only_one:
@@ -315,6 +360,7 @@ class _Run:
         folder = self.context.folder
         if not folder.has_record or RunRecord.read(folder.path) != self.record:
             self.record.write(folder.path)
+        os.utime(folder.lock)  # "egvs runs" shows when a run was last at work
         return self.record
 
 

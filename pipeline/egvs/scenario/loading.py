@@ -11,7 +11,7 @@ from __future__ import annotations
 import difflib
 import json
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,8 +21,10 @@ from pydantic.fields import FieldInfo
 from egvs.core import reading
 from egvs.core.errors import InputError, format_problem
 from egvs.core.grid import Grid
-from egvs.scenario.fields import NAME_DESCRIPTION
-from egvs.scenario.model import SCENARIO_FILE, SITE_DIRECTIONS, SITE_SENSORS, SITE_SOURCES, Scenario
+from egvs.scenario.fields import NAME_DESCRIPTION, StrictModel
+from egvs.scenario.model import SCENARIO_FILE, SITE_DIRECTIONS, SITE_SENSORS, SITE_SOURCES, Scenario, StaticsConfig
+from egvs.scenario.score_config import CostsConfig
+from egvs.scenario.settings import changed_settings, flatten_settings
 from egvs.scenario.traffic_config import TRAFFIC_SOURCES, TrafficConfig, keys_without_effect
 
 _ALTERNATIVE = re.compile(r"\.(?:(?:constrained-)?(?:float|int|str)|(?:literal|tuple)\[.*\])$")
@@ -170,35 +172,69 @@ def load(path: str | Path, overrides: Iterable[str] = ()) -> Scenario:
     path = Path(path)
     overrides = tuple(overrides)
     file = path / SCENARIO_FILE if path.is_dir() else path
-    values = _read_with_bases(file, ())
-    for override in overrides:
+    values = apply_overrides(_read_with_bases(file, ()), overrides)
+    try:
+        scenario = _build_scenario(values, file)
+    except InputError as error:
+        if not overrides or _scenario_without_overrides(file) is None:
+            raise
+        texts = [text.replace(str(file), "--set") for text in (error.where, error.problem, error.hint)]
+        raise InputError(*texts) from None
+    if overrides:
+        scenario._overrides = _changes_by_overrides(scenario, values, file)
+    return scenario
+
+
+def apply_overrides(values: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
+    """Return nested tables, as in a scenario file, with overrides ``"table.key=value"``; ``values`` may change too.
+
+    Raises
+    ------
+    InputError
+        When an override is not of this form, names a row that does not exist, or is replaced by a later one.
+    """
+    overrides = tuple(overrides)
+    for number, override in enumerate(overrides):
         if override.partition("=")[0].strip() == "extends":
             hint = f"Set it in a {SCENARIO_FILE}."
             raise InputError(f"--set {override}", "the key extends cannot be set here", hint)
         values = _apply_override(values, override)
-    try:
-        return _build_scenario(values, file)
-    except InputError as error:
-        if not overrides or not _is_valid_without_overrides(file):
-            raise
-        texts = [text.replace(str(file), "--set") for text in (error.where, error.problem, error.hint)]
-        raise InputError(*texts) from None
+        _check_earlier_overrides(values, overrides[:number], override)
+    return values
 
 
 def _build_scenario(values: dict[str, Any], file: Path) -> Scenario:
     scenario = scenario_from_dict(values, file.parent, str(file))
     check_unused_keys(scenario.traffic, file)
+    _check_polygon_keys(scenario.statics, file)
     scenario._written_site_keys = frozenset(scenario.sites.model_fields_set)
     return scenario
 
 
-def _is_valid_without_overrides(file: Path) -> bool:
-    """Return whether a scenario is valid without overrides."""
+def _scenario_without_overrides(file: Path) -> Scenario | None:
+    """Return the scenario of a file; None if it is not valid without overrides."""
     try:
-        _build_scenario(_read_with_bases(file, ()), file)
+        return _build_scenario(_read_with_bases(file, ()), file)
     except InputError:
-        return False
-    return True
+        return None
+
+
+def _changes_by_overrides(scenario: Scenario, values: dict[str, Any], file: Path) -> dict[str, Any]:
+    """Return the settings that overrides changed, by full key.
+
+    The resolved scenarios are compared, so that neither the spelling of a value counts, nor an override that repeats
+    the file or a default. A file that is not complete without the overrides is compared as it is written. The name is
+    left out: it is a name for the results.
+    """
+    resolved = scenario.model_dump(mode="json")
+    base = _scenario_without_overrides(file)
+    if base is not None:
+        changed = changed_settings(base.model_dump(mode="json"), resolved)
+    else:
+        changed = changed_settings(_read_with_bases(file, ()), values)
+        changed |= {key: value for key, value in flatten_settings(resolved).items() if key in changed}
+    changed.pop("name", None)
+    return changed
 
 
 def check_unused_keys(traffic: TrafficConfig, file: Path) -> None:
@@ -215,6 +251,16 @@ def check_unused_keys(traffic: TrafficConfig, file: Path) -> None:
         names = ", ".join(sorted(unused.keys))
         problem = f"{names} {'have' if len(unused.keys) > 1 else 'has'} no effect with {unused.source}"
         raise InputError(f"{file}: {unused.table}", problem, f"Remove {names}.")
+
+
+def _check_polygon_keys(statics: StaticsConfig, file: Path) -> None:
+    """Raise an InputError when a file says how SUMO's polygons become solids, but names no polygons."""
+    keys = sorted(statics.model_fields_set & set(_POLYGON_KEYS))
+    if keys and not statics.polygons:
+        names = " and ".join(keys)
+        verb = "have" if len(keys) > 1 else "has"
+        problem = f"{names} {verb} no effect without polygons"
+        raise InputError(f"{file}: statics", problem, f"Set polygons, or remove {names}.")
 
 
 def _read_with_bases(file: Path, extending: tuple[Path, ...]) -> dict[str, Any]:
@@ -236,6 +282,8 @@ def _read_with_bases(file: Path, extending: tuple[Path, ...]) -> dict[str, Any]:
 
 _SITE_SOURCE_KEYS = ("points", "only_free", "heights_m")
 """Keys of ``[sites]`` that go with one source of sites; a new source does not take them over."""
+_POLYGON_KEYS = ("polygon_height_m", "polygon_types")
+"""Keys of ``[statics]`` that go with ``polygons``."""
 _ALTERNATIVES = (
     ("traffic", TRAFFIC_SOURCES),
     ("sites", SITE_SOURCES),
@@ -251,6 +299,8 @@ def _drop_replaced_keys(base: dict[str, Any], values: dict[str, Any]) -> dict[st
     an effect with the replaced source only.
     """
     remaining = dict(base)
+    if values.get("statics", {}).get("polygons") == [] and isinstance(remaining.get("statics"), dict):
+        remaining["statics"] = {key: value for key, value in remaining["statics"].items() if key not in _POLYGON_KEYS}
     for table, sources in _ALTERNATIVES:
         old = remaining.get(table)
         new = values.get(table)
@@ -325,6 +375,40 @@ def scenario_from_dict(values: dict[str, Any], folder: Path, where: str) -> Scen
     return scenario
 
 
+class _CostsTable(StrictModel):
+    costs: CostsConfig
+
+
+def costs_from_dict(values: Mapping[str, Any], overrides: Iterable[str], where: str) -> CostsConfig:
+    """Check the costs of a scenario that is given as nested dictionaries, as in ``run.json``.
+
+    Parameters
+    ----------
+    values
+        Tables and keys.
+    overrides
+        ``"costs.key=value"``, as in :func:`load`.
+    where
+        The file, for messages.
+
+    Raises
+    ------
+    InputError
+        When costs are invalid, or an override is of another table.
+    """
+    tables: dict[str, Any] = {"costs": dict(values.get("costs", {}))}
+    for override in overrides:
+        if not override.strip().startswith("costs."):
+            problem = "expected a key of [costs], because the runs are finished"
+            raise InputError(f"--set {override}", problem, "Use, for example, --set costs.pole=12000.")
+        tables = _apply_override(tables, override)
+        where = "--set"
+    try:
+        return _CostsTable.model_validate(tables).costs
+    except ValidationError as error:
+        raise format_validation_error(error, where, _CostsTable) from None
+
+
 def default_name(folder: Path) -> str:
     """Return the name of a scenario that is not named otherwise: that of its folder."""
     return re.sub(r'[\s\x00-\x1f\x7f/\\:*?"<>|]+', "_", folder.resolve().name)[:80]
@@ -366,6 +450,15 @@ def _apply_override(values: dict[str, Any], override: str) -> dict[str, Any]:
         raise InputError(where, f"{parts[-1]!r} is a row, not a key", f"Use {key.strip()}.KEY=VALUE.")
     table[parts[-1]] = value
     return values
+
+
+def _check_earlier_overrides(values: dict[str, Any], earlier: Sequence[str], last: str) -> None:
+    """Raise an InputError when the last override replaced a key that an earlier one had set."""
+    for override in earlier:
+        table, _, key = override.partition("=")[0].strip().partition(".")
+        if isinstance(values.get(table), dict) and key and "." not in key and key not in values[table]:
+            problem = f"the key has no effect: the later --set {last} replaces it"
+            raise InputError(f"--set: {table}.{key}", problem, "Use only one of them.")
 
 
 def _find_row(rows: list[Any], name_or_number: str, where: str) -> Any:

@@ -309,6 +309,7 @@ class Scenario(StrictModel):
     _period_keys: frozenset[str] = PrivateAttr(default=frozenset())
     _file_name: str = PrivateAttr(default=SCENARIO_FILE)
     _written_site_keys: frozenset[str] = PrivateAttr(default=frozenset())
+    _overrides: dict[str, Any] = PrivateAttr(default_factory=dict)
 
     @model_validator(mode="after")
     def _check_tables_together(self) -> Scenario:
@@ -382,6 +383,11 @@ class Scenario(StrictModel):
     def written_site_keys(self) -> frozenset[str]:
         """The keys of ``[sites]`` that the user wrote; none for a scenario from ``run.json``, which has all keys."""
         return self._written_site_keys
+
+    @property
+    def overrides(self) -> dict[str, Any]:
+        """The settings that ``--set`` gave other values than the file has, by full key; None for a removed one."""
+        return self._overrides
 
     @property
     def folder(self) -> Path:

@@ -154,6 +154,10 @@ Turn = Annotated[float, Field(ge=-360, le=360)]
 Tilt = Annotated[float, Field(ge=-90, le=90)]
 
 
+COST_COLUMN = "cost"
+"""Column of a sites file with the cost of each candidate."""
+
+
 class CostsConfig(StrictModel):
     """Costs of a candidate, in any currency. A value in the column ``cost`` of the sites file replaces them."""
 
@@ -165,6 +169,10 @@ class CostsConfig(StrictModel):
     def are_given(self) -> bool:
         """Whether any cost is set."""
         return bool(self.sensor or self.pole or self.metre)
+
+    def of_mount(self, sensor: str, z_m: float) -> float:
+        """Return the cost of a sensor at a height, with its pole; a sensor without a cost of its own counts 0."""
+        return self.sensor.get(sensor, 0.0) + self.pole + self.metre * z_m
 
 
 class ZoneDemand(ZoneArea):

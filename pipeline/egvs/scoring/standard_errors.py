@@ -342,19 +342,24 @@ class Stratum:
     still_correlated: bool
 
     @classmethod
-    def of(cls, scores: FloatArray, left_out: FloatArray, groups: BlockGroups) -> Stratum:
-        """Compare the scores of all frames, (n,), with those without each group, (k, n)."""
+    def of(
+        cls, scores: FloatArray, left_out: FloatArray, groups: BlockGroups, n_joined_by: int | None = None
+    ) -> Stratum:
+        """Compare the scores of all frames, (n,), with those without each group, (k, n).
+
+        Groups are joined where the first ``n_joined_by`` scores are correlated; all scores when None.
+        """
         frames = groups.frames
         h = groups.total / frames
         centre = len(h) * scores - ((1.0 - 1.0 / h)[:, None] * left_out).sum(axis=0)
         pseudo = h[:, None] * scores - (h - 1.0)[:, None] * left_out
 
-        first_correlation = correlation = lag_one_autocorrelation(pseudo)
+        first_correlation = correlation = lag_one_autocorrelation(pseudo[:, :n_joined_by])
         joined = 1
         while correlation > _critical_autocorrelation(len(pseudo)) and len(pseudo) // 2 >= MIN_GROUPS:
             pseudo, frames = _join_pairs(pseudo, frames)
             joined *= 2
-            correlation = lag_one_autocorrelation(pseudo)
+            correlation = lag_one_autocorrelation(pseudo[:, :n_joined_by])
 
         widening = 1.0
         if groups.autocorrelation_frames:
@@ -465,12 +470,19 @@ class ScoreUncertainty:
     strata: tuple[Stratum, ...]
 
     @classmethod
-    def of(cls, left_out: FloatArray, groups: Sequence[BlockGroups]) -> ScoreUncertainty:
-        """Compare the scores of all frames and with each group left out, (n, 1 + k), for k groups in all."""
+    def of(
+        cls, left_out: FloatArray, groups: Sequence[BlockGroups], n_joined_by: int | None = None
+    ) -> ScoreUncertainty:
+        """Compare the scores of all frames and with each group left out, (n, 1 + k), for k groups in all.
+
+        Neighbouring groups are joined where the first ``n_joined_by`` scores are correlated; all scores when None.
+        """
         scores = left_out[:, 0]
         ends = np.cumsum([len(record.frames) for record in groups])
         by_record = np.split(left_out[:, 1:].T, ends[:-1])
-        strata = [Stratum.of(scores, columns, record) for columns, record in zip(by_record, groups, strict=True)]
+        strata = []
+        for columns, record in zip(by_record, groups, strict=True):
+            strata.append(Stratum.of(scores, columns, record, n_joined_by))
         return cls(scores, tuple(strata))
 
     @cached_property

@@ -81,6 +81,8 @@ class Stage:
         :class:`egvs.stages.inputs.Inputs` that it is given.
     neutral_options
         Keyword arguments of ``run`` that change no artefact, for example where the work is done.
+    reads_traffic
+        Whether the stage reads files of recorded traffic that the scenario names.
     """
 
     name: str
@@ -91,6 +93,7 @@ class Stage:
     effect_stages: tuple[str, ...] = ()
     code: tuple[str, ...] = ()
     neutral_options: tuple[str, ...] = ()
+    reads_traffic: bool = False
 
     @property
     def artefacts(self) -> tuple[str, ...]:

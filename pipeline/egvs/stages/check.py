@@ -6,11 +6,12 @@ Steps: read what the scenario names, once (:func:`egvs.stages.inputs.resolve_che
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from egvs.core.errors import WARNINGS_KEY, Diagnostic, DiagnosticsError, InputError
+from egvs.effects import registry
 from egvs.scenario.model import Scenario
 from egvs.sensors.sites import Site
 from egvs.stages import inputs as stage_inputs
@@ -43,6 +44,9 @@ RULES: tuple[Callable[[CheckInputs], Iterator[Diagnostic]], ...] = (
 )
 """In the order in which findings are reported. A new rule is a function in this list."""
 
+_RECORDED_TRAFFIC_KEY = "fcd"
+"""Last part of the keys that name files of recorded traffic."""
+
 
 @dataclass(frozen=True)
 class CheckReport:
@@ -72,29 +76,104 @@ class CheckReport:
         return tuple(finding for finding in self.findings if not finding.is_error)
 
 
+@dataclass(frozen=True)
+class SceneReport:
+    """A scene without errors, checked before its traffic is known.
+
+    Attributes
+    ----------
+    warnings
+        Warnings of each rule that reads no traffic, by the name of the rule.
+    sites, solids, lanes
+        How many were checked.
+    """
+
+    warnings: Mapping[str, tuple[Diagnostic, ...]]
+    sites: int
+    solids: int
+    lanes: int
+
+    def to_json(self) -> dict[str, Any]:
+        """Return a JSON value."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> SceneReport:
+        """Invert :meth:`to_json`."""
+        warnings = {}
+        for rule, findings in values["warnings"].items():
+            warnings[rule] = tuple(Diagnostic(**finding) for finding in findings)
+        return cls(warnings, values["sites"], values["solids"], values["lanes"])
+
+
 def check_scenario(scenario: Scenario) -> CheckReport:
     """Apply every rule to a scenario; see :func:`check_inputs`."""
     return check_inputs(Inputs(scenario))
 
 
-def check_inputs(inputs: Inputs) -> CheckReport:
+def check_inputs(inputs: Inputs, scene: SceneReport | None = None) -> CheckReport:
     """Apply every rule to the inputs of a scenario.
+
+    Parameters
+    ----------
+    inputs
+        The inputs.
+    scene
+        From :func:`check_scene` of the same scene; then only the rules that read traffic are applied.
 
     Raises
     ------
     RunError
         When a program that reads a file is missing or fails; errors of the input are among the findings.
     """
-    readable, findings = stage_inputs.resolve_check_inputs(inputs)
+    if scene is None:
+        readable, findings = stage_inputs.resolve_check_inputs(inputs)
+        counts = _count_checked(readable)
+    else:
+        readable, findings = CheckInputs(inputs.scenario, inputs.network), list(stage_inputs.missing_files(inputs))
+        counts = scene.sites, scene.solids, scene.lanes
     for rule in RULES:
-        findings += rule(readable)
+        if scene is not None and rule.__name__ in scene.warnings:
+            findings += scene.warnings[rule.__name__]
+        else:
+            findings += rule(readable)
     unique = _merge_findings(_drop_repeated_missing_files(findings))
-    return CheckReport(
-        tuple(sorted(unique, key=lambda finding: not finding.is_error)),
-        len(readable.sites),
-        0 if readable.world is None else len(readable.world.solids),
-        0 if readable.carriageway is None else len(readable.carriageway.lanes),
-    )
+    return CheckReport(tuple(sorted(unique, key=lambda finding: not finding.is_error)), *counts)
+
+
+def check_scene(inputs: Inputs) -> SceneReport | None:
+    """Apply the rules that read no traffic, so that the files of recorded traffic need not exist yet.
+
+    Parameters
+    ----------
+    inputs
+        The inputs.
+
+    Returns
+    -------
+    SceneReport or None
+        None where the complete check is necessary: the scene has errors, or an effect that adds traffic.
+    """
+    if registry.scenario_effects(inputs.scenario, "traffic"):  # it may read the traffic
+        return None
+    readable, findings = stage_inputs.resolve_check_inputs(inputs)
+    if any(finding.rule != stage_inputs.MISSING_FILE_RULE for finding in findings):
+        return None
+    warnings = {}
+    for rule in RULES:
+        if rule.__module__ != scene_checks.__name__:
+            continue
+        warnings[rule.__name__] = tuple(rule(readable))
+        if any(finding.is_error for finding in warnings[rule.__name__]):
+            return None
+    return SceneReport(warnings, *_count_checked(readable))
+
+
+def _count_checked(readable: CheckInputs) -> tuple[int, int, int]:
+    """Return the numbers of sites, solids and lanes."""
+    n_solids = 0 if readable.world is None else len(readable.world.solids)
+    n_lanes = 0 if readable.carriageway is None else len(readable.carriageway.lanes)
+    return len(readable.sites), n_solids, n_lanes
 
 
 def _drop_repeated_missing_files(findings: Sequence[Diagnostic]) -> Iterator[Diagnostic]:
@@ -132,6 +211,17 @@ def dependencies(context: StageContext) -> StageDependencies:
     return StageDependencies(settings, digests)
 
 
+def scene_dependencies(context: StageContext) -> StageDependencies:
+    """Return what :func:`check_scene` depends on: as :func:`dependencies`, without the files of recorded traffic."""
+    complete = dependencies(context)
+    digests = {}
+    for label, digest in complete.files.items():
+        key = label.partition(" = ")[0]
+        if key.rpartition(".")[2] != _RECORDED_TRAFFIC_KEY:
+            digests[label] = digest
+    return replace(complete, files=digests)
+
+
 def _sensor_digests(scenario: Scenario, candidates: tuple[Site, ...]) -> dict[str, str]:
     """The sha256 of beam tables and catalogue entries; nothing where one is missing, which a rule reports."""
     try:
@@ -148,13 +238,19 @@ def _georeference_settings(scenario: Scenario) -> dict[str, Any]:
         return {}
 
 
-def run(context: StageContext, _inputs: StageDependencies) -> Summary:
+def run(
+    context: StageContext,
+    _inputs: StageDependencies,
+    scene_report: Callable[[StageContext], SceneReport | None] = lambda _: None,
+) -> Summary:
     """Apply every rule.
 
     Parameters
     ----------
     context
         The inputs.
+    scene_report
+        Returns the result of :func:`check_scene` of this scene if it is known.
 
     Returns
     -------
@@ -166,7 +262,7 @@ def run(context: StageContext, _inputs: StageDependencies) -> Summary:
     DiagnosticsError
         With all errors and warnings.
     """
-    report = check_inputs(context.inputs)
+    report = check_inputs(context.inputs, scene_report(context))
     if report.errors:
         raise DiagnosticsError(report.errors, report.warnings)
     return {
@@ -177,4 +273,12 @@ def run(context: StageContext, _inputs: StageDependencies) -> Summary:
     }
 
 
-STAGE = Stage("check", __name__, dependencies, run, effect_stages=("traffic", "scan", "score"))
+STAGE = Stage(
+    "check",
+    __name__,
+    dependencies,
+    run,
+    effect_stages=("traffic", "scan", "score"),
+    neutral_options=("scene_report",),
+    reads_traffic=True,
+)

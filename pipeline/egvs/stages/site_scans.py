@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -28,12 +29,22 @@ class SiteScan:
 def empty_scans(context: StageContext, only: Collection[str] | None = None) -> Iterator[SiteScan]:
     """Yield the scans in the order of the sites; of the sites named in ``only``, or of all."""
     if context.scenario.scan.keep:
-        return _stored_scans(context, only)
+        return read_scans(context, context.folder.scans, only)
     return _cast_scans(context, only)
 
 
-def _stored_scans(context: StageContext, only: Collection[str] | None) -> Iterator[SiteScan]:
-    path = context.folder.scans
+def read_scans(context: StageContext, path: Path, only: Collection[str] | None = None) -> Iterator[SiteScan]:
+    """Yield the scans of a ``scans.parquet`` in the order of the sites, bit by bit as they were cast.
+
+    Parameters
+    ----------
+    context
+        The scene of the scans.
+    path
+        The file.
+    only
+        Names of sites; all if None.
+    """
     with parquet.open_artefact(path, "scans") as (file, metadata):
         sites = metadata["sites"]
         if file.num_row_groups != len(sites):

@@ -184,4 +184,4 @@ def merge_summaries(summaries: dict[str, Summary]) -> Summary:
     return merged
 
 
-STAGE = Stage("traffic", __name__, dependencies, run)
+STAGE = Stage("traffic", __name__, dependencies, run, reads_traffic=True)

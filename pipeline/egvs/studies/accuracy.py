@@ -25,10 +25,10 @@ from egvs.core.progress import ProgressCallback, no_progress
 from egvs.effects import registry
 from egvs.effects.base import Expand
 from egvs.runs.run import check_no_overwrite, lock_run_folder, refresh_report
+from egvs.runs.run_sources import SettingsSource
 from egvs.runs.stage_registry import RANKING_STAGES
-from egvs.scenario.loading import load
 from egvs.scenario.model import Scenario
-from egvs.studies import measurement, pareto_figure, score_errors, study_settings
+from egvs.studies import measurement, pareto_figure, score_errors, study_settings, traffic_options
 from egvs.studies.measurement import Neighbours, SettingListener, SettingRunner, SettingScores, scenario_dependencies
 from egvs.studies.score_errors import SeedComparison, SettingResult, compare_seeds
 from egvs.studies.study_settings import (
@@ -37,6 +37,8 @@ from egvs.studies.study_settings import (
     REFERENCE,
     SCENARIO,
     SCENARIO_AS_IS,
+    SEED_KNOB,
+    TRAFFIC,
     Setting,
     SettingValues,
 )  # fmt: skip
@@ -136,7 +138,7 @@ def run_accuracy_study(
     Parameters
     ----------
     path, overrides
-        The scenario, and arguments of ``--set``.
+        The scenario and arguments of ``--set``, or a run folder.
     out
         Run folder for ``accuracy.parquet`` and ``accuracy.png``; intermediate results go to ``out / "accuracy"``.
     options
@@ -154,7 +156,7 @@ def run_accuracy_study(
     plugins.require_libraries("egvs accuracy", "figure", "matplotlib")
     if not 1e-6 <= options.tolerance <= 1:
         raise InputError("--tolerance", f"expected 1e-6 to 1, got {options.tolerance:g}", "Use 0.02, for example.")
-    check_no_overwrite(load(path, overrides), out, (measurement.STUDY_FOLDER,))
+    check_no_overwrite(SettingsSource(path, tuple(overrides)).load(), out, (measurement.STUDY_FOLDER,))
     with lock_run_folder(out):
         runner = SettingRunner(path, overrides, out, options.jobs, progress)
         scenario = runner.scenario(SCENARIO_AS_IS)
@@ -212,13 +214,22 @@ class _StudyRun:
             reference = study_settings.reference_setting(self.scenario, factor)
             settings = [reference, *(setting for setting in settings if is_shorter(self.runner, setting, reference))]
         compared = self._run_all(settings)
-        repeated = self._repeat(compared)
+        repeated = self._repeat([setting for setting in compared if setting.knob != SEED_KNOB])
         if REFERENCE not in self.scores:
             factor = 1
 
         rows, can_lengthen = [], not self.scenario.is_recorded
+        changes = self._tpog_changes(compared)
         for setting in compared:
-            rows.append(score_errors.compare_setting(self.runner, setting, self.scores, could_last_longer=can_lengthen))
+            rows.append(
+                score_errors.compare_setting(
+                    self.runner,
+                    setting,
+                    self.scores,
+                    could_last_longer=can_lengthen,
+                    tpog_change=changes.get(setting.name, math.nan),
+                )
+            )
         rows = score_errors.mark_pareto_front(rows, self.options.tolerance)
         written = self._write(RunFolder(out), rows, factor)
         return AccuracyStudy(
@@ -236,13 +247,25 @@ class _StudyRun:
     def _valid_settings(self) -> list[Setting]:
         """Return the settings whose overrides give a valid scenario; skip the others."""
         settings = []
-        for setting in study_settings.list_settings(self.scenario, self.options.values):
+        self.skipped |= traffic_options.options_without_effect(self.scenario, self.options.values)
+        for setting in (
+            *study_settings.list_settings(self.scenario, self.options.values),
+            *traffic_options.traffic_option_settings(self.scenario, self.options.values),
+        ):
             error = _setting_error(self.runner, setting)
             if error is None:
                 settings.append(setting)
             else:
                 self._skip(setting, error)
         return settings
+
+    def _tpog_changes(self, settings: list[Setting]) -> dict[str, float]:
+        """Return the change of the TPOG by each option of the traffic, by the name of the setting."""
+        options = [setting for setting in settings if setting.kind == TRAFFIC]
+        if not options:
+            return {}
+        base = self.runner.tpog(SCENARIO_AS_IS)
+        return {setting.name: traffic_options.tpog_change(self.runner.tpog(setting), base) for setting in options}
 
     def _skip(self, setting: Setting, reason: str) -> None:
         self.skipped[setting.name] = reason
@@ -257,7 +280,7 @@ class _StudyRun:
             pending = [setting for setting in pending if estimate.seconds(setting) <= self.left_s]
         if not pending:
             return
-        same_scores = (setting for setting in settings if setting.kind != MEASURES)
+        same_scores = (setting for setting in settings if setting.kind not in (MEASURES, TRAFFIC))
         shortest = min(same_scores, key=lambda setting: _simulation_steps(self.runner.scenario(setting)))
         trials = [shortest]
         for setting in pending:
@@ -281,15 +304,14 @@ class _StudyRun:
 
         def cost_order(setting: Setting) -> tuple[int, bool, float]:
             seconds = needed_s[setting.name]
-            return math.frexp(seconds)[1], setting.kind == MEASURES, seconds
+            return math.frexp(seconds)[1], setting.kind in (MEASURES, TRAFFIC), seconds
 
         finished = []
         for setting in sorted(settings, key=cost_order):
             name = setting.name
             if needed_s[name] > max(self.left_s, 0.0):
                 self.skipped[name] = BEYOND_BUDGET
-                details = {"why": f"about {needed_s[name]:.0f} s, {BEYOND_BUDGET}", "beyond": True}
-                self.listener(name, "skipped", details)
+                self.listener(name, "skipped", {"why": BEYOND_BUDGET, "beyond": True})
                 continue
             scores = saved[name]
             try:
@@ -340,7 +362,8 @@ class _StudyRun:
             "stages": self.scores[SCENARIO].stages,
         }
         parquet.write_artefact(folder.accuracy, "accuracy", columns, metadata)
-        pareto_figure.write_figure(rows, tolerance, scenario.name, folder.accuracy_figure)
+        drawn = [row for row in rows if row.kind != TRAFFIC]
+        pareto_figure.write_figure(drawn, tolerance, scenario.name, folder.accuracy_figure)
         checksums.write_checksums(folder.accuracy_checksums, written)
         return written
 
@@ -442,7 +465,11 @@ def _sub_beams_per_beam(scenario: Scenario) -> int:
 
 def _traffic_key(scenario: Scenario) -> tuple[object, ...]:
     """Return what traffic depends on, among the values that settings change."""
-    return scenario.traffic, *(effect.parameters for effect in registry.scenario_effects(scenario, "traffic"))
+    return (
+        scenario.seed,
+        scenario.traffic,
+        *(effect.parameters for effect in registry.scenario_effects(scenario, "traffic")),
+    )
 
 
 def _simulation_steps(scenario: Scenario) -> float:

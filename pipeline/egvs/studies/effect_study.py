@@ -64,7 +64,9 @@ class EffectChange:
     seconds
         Time of all stages except the report; stages from the cache count with their original time.
     sites, scores, ranks
-        Names, EGVS and ranks, in the order of the sites.
+        Names, values of the score that ranks, and ranks, in the order of the sites.
+    rank_by
+        Name of the score that ranks.
     """
 
     effect: str
@@ -72,6 +74,7 @@ class EffectChange:
     sites: tuple[str, ...]
     scores: tuple[float, ...]
     ranks: tuple[int, ...]
+    rank_by: str
 
 
 def run_ablation(
@@ -102,8 +105,9 @@ def run_ablation(
         record = run.run(scenario.with_effects(variant), folder, jobs=jobs, progress=progress)
         seconds = sum(record.stages[stage].cost.seconds for stage in RANKING_STAGES)
         scores = read_scores(RunFolder(folder).scores)
-        sites, egvs, ranks = (tuple(scores[column].to_pylist()) for column in ("site", "egvs", "rank"))
-        changes.append(EffectChange(name, seconds, sites, egvs, ranks))
+        rank_by = scenario.score.rank_by
+        sites, values, ranks = (tuple(scores[column].to_pylist()) for column in ("site", rank_by, "rank"))
+        changes.append(EffectChange(name, seconds, sites, values, ranks, rank_by))
     return changes
 
 

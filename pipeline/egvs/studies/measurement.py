@@ -34,10 +34,10 @@ from egvs.core.progress import ProgressCallback
 from egvs.core.resource_usage import ResourceUsage, release_memory
 from egvs.runs import stage_keys, stage_registry
 from egvs.runs.run import fetch_or_run
+from egvs.runs.run_sources import SettingsSource
 from egvs.runs.stage_keys import StageKey
 from egvs.runs.stage_registry import RANKING_STAGES, StageResult
 from egvs.runs.store import Store
-from egvs.scenario.loading import load
 from egvs.scenario.model import Scenario, SiteGrid
 from egvs.scoring.egvs import EntropyField
 from egvs.scoring.score_table import MIX, ScoreColumn, ScoreTable, SiteScores
@@ -141,7 +141,7 @@ class SettingRunner:
     Parameters
     ----------
     path, overrides
-        The scenario, and arguments of ``--set``.
+        The scenario and arguments of ``--set``, or a run folder.
     out
         The run folder; intermediate results are written to its subfolder ``accuracy``.
     jobs
@@ -153,7 +153,7 @@ class SettingRunner:
     def __init__(
         self, path: Path, overrides: Sequence[str], out: Path, jobs: int | None, progress: ProgressCallback
     ) -> None:
-        self._path, self._overrides = path, tuple(overrides)
+        self._source = SettingsSource(path, tuple(overrides))
         self._jobs, self._progress = jobs, progress
         self._folder, self._store = out / STUDY_FOLDER, Store.default()
         try:
@@ -169,8 +169,8 @@ class SettingRunner:
     def scenario(self, setting: Setting) -> Scenario:
         """Load the scenario with a setting; gamma is that of the study's scenario unless the setting changes it."""
         if self._gamma is None:
-            self._gamma = load(self._path, self._overrides).gamma
-        scenario = load(self._path, [*self._overrides, f"score.gamma={self._gamma}", *setting.overrides])
+            self._gamma = self._source.load().gamma
+        scenario = self._source.load([f"score.gamma={self._gamma}", *setting.overrides])
         if setting.without is None:
             return scenario
         return scenario.with_effects(scenario.effects.without(setting.without))

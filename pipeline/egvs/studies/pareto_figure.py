@@ -146,7 +146,7 @@ def _draw_approximations(axes: Any, settings: Sequence[SettingResult], tolerance
     axes.margins(x=0.08, y=0.12)
     # below the panel, because a setting may be in any corner inside
     below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.1), "ncols": 4}
-    axes.legend(fontsize=8, title="knob", title_fontsize=8, frameon=False, **below)
+    axes.legend(fontsize=8, title="setting that varies", title_fontsize=8, frameon=False, **below)
 
 
 def _format_ticks(axes: Any) -> None:

@@ -1,17 +1,25 @@
-"""Compare finished runs: scores, ranks, agreement of the rankings, and differences of settings and files.
+"""Compare finished runs: the best mount of each pole, sensors, ranks, and differences of settings and files.
 
-Sites are matched by name. EGVS in bits can be compared if region, voxels and gamma are equal; shares of ``egvs_limit``
-and ranks can also be compared otherwise. Rankings are compared in pairs, over the sites that both runs have: Kendall's
-tau-b, Spearman's rho, and the regret of using the best site of one run in the other.
+*By pole*: a pole is a location; candidates with the same x and y share it (:mod:`egvs.sensors.sites`), whatever their
+names, heights, angles and sensors. Each run has its best mount there. *By site*: sites are matched by name. Rankings
+are compared in pairs, over the poles (by their best mounts) or the sites that both runs have: Kendall's tau-b,
+Spearman's rho, and the regret of using the best pole or site of one run in the other.
+
+A single run with several sensors is compared with itself: its sites with each sensor take the place of a run.
+
+EGVS in bits can be compared if region, voxels and gamma are equal; shares of ``egvs_limit`` and ranks can also be
+compared otherwise. :mod:`egvs.studies.paired_errors` has the standard errors of differences.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -20,56 +28,39 @@ from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.core import files
 from egvs.core.errors import InputError
+from egvs.core.progress import ProgressCallback, no_progress
+from egvs.report.formatting import join_names
+from egvs.report.ranking import Pole, RankedSite, Ranking
+from egvs.report.sensor_results import ScoreDifference, SensorComparison, SensorMount, best_mounts
+from egvs.scenario.loading import costs_from_dict
+from egvs.scenario.score_config import CostsConfig
+from egvs.scenario.settings import flatten_settings
+from egvs.studies.paired_errors import ScoreDifferences, SiteOfRun
 from egvs.studies.score_errors import best_sites, rank_agreement, regret
 
 SCORES = RunFolder.scores.name
 
+View = Literal["pole", "site"]
+"""What the rows of a comparison are."""
+
 _IGNORED_SETTINGS = ("name", "description", "extends")
-_POSE_COLUMNS = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg", "sensor")
+_EGVS_KEYS = ("roi.center_m", "roi.size_m", "roi.voxel_m", "score.gamma")
+"""Settings that must be equal to compare EGVS in bits."""
+
+_NAMED = 4
+"""Number of names in a note."""
 
 
-@dataclass(frozen=True)
-class SiteResult:
-    """A row of ``scores.parquet``; values that a run does not have are None.
+class Location(NamedTuple):
+    """Where a pole stands, world frame."""
 
-    Attributes
-    ----------
-    site
-        Name.
-    pose
-        x, y, z, yaw, pitch, roll (m and degrees), and name of the sensor.
-    longitude_deg, latitude_deg
-        Location on the Earth.
-    egvs, egvs_se
-        EGVS and its standard error, in bits.
-    rank
-        1 is best.
-    share
-        EGVS as a share of ``egvs_limit``.
-    other, other_se
-        The score that ranks and its standard error, if it is not EGVS.
-    """
-
-    site: str
-    pose: tuple[float | str, ...]
-    longitude_deg: float | None
-    latitude_deg: float | None
-    egvs: float
-    egvs_se: float | None
-    rank: int
-    share: float | None
-    other: float | None = None
-    other_se: float | None = None
-
-    @property
-    def score(self) -> float:
-        """The score that ranks."""
-        return self.egvs if self.other is None else self.other
+    x_m: float
+    y_m: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ComparedRun:
-    """A finished run.
+    """A finished run, or its sites with one sensor.
 
     Attributes
     ----------
@@ -77,36 +68,86 @@ class ComparedRun:
         A, B, ...
     folder
         The run folder.
-    sites
-        Results by name.
+    ranking
+        Its sites by rank.
     settings, files
         Settings by full key, and sha256 of the files that its scores depend on.
-    rank_by
-        The score that ranks.
+    costs
+        Costs of its mounts.
     """
 
     label: str
     folder: Path
-    sites: Mapping[str, SiteResult]
+    ranking: Ranking
     settings: Mapping[str, Any]
     files: Mapping[str, str]
-    rank_by: str = "egvs"
+    costs: CostsConfig = field(default_factory=CostsConfig)
+
+    def __repr__(self) -> str:
+        best = self.ranking.best[0]
+        return (
+            f"ComparedRun({self.label}: {self.folder}, {len(self.sites)} sites on {len(self.poles)} poles, "
+            f"{', '.join(self.sensors)}; best {best.site}, {best.by.with_noun(best.score)})"
+        )
+
+    @cached_property
+    def sites(self) -> Mapping[str, RankedSite]:
+        """Sites by name, the best first."""
+        return {site.site: site for site in self.ranking.sites}
+
+    @cached_property
+    def poles(self) -> Mapping[Location, Pole]:
+        """Poles by location, the one with the best site first."""
+        return {Location(pole.best.x_m, pole.best.y_m): pole for pole in self.ranking.poles}
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of its sensors, that of the best site first."""
+        return tuple(dict.fromkeys(site.sensor for site in self.ranking.sites))
+
+    @property
+    def rank_by(self) -> str:
+        """The score that ranks."""
+        return self.ranking.by.name
+
+
+@dataclass(frozen=True)
+class ComparedPole:
+    """A pole, and the best mount of each run there.
+
+    Attributes
+    ----------
+    name
+        Its name in the first run that has it.
+    location
+        Where it stands.
+    mounts
+        The best site of each run; None for runs without this pole.
+    differences
+        For each run, its score minus that of the first run; None for the first run, where one of them lacks the pole,
+        and where scores cannot be compared.
+    """
+
+    name: str
+    location: Location
+    mounts: tuple[RankedSite | None, ...]
+    differences: tuple[ScoreDifference | None, ...]
 
 
 @dataclass(frozen=True)
 class RankAgreement:
-    """Agreement of two rankings, over the sites that both runs have.
+    """Agreement of two rankings, over the poles or sites that both runs have.
 
     Attributes
     ----------
     a, b
         Labels of the runs.
     shared
-        Number of common sites; without any, the other values are empty.
+        Number of common poles or sites; without any, the other values are empty.
     tau, rho
         Kendall's tau-b and Spearman's rho.
     best_a, best_b
-        Best common sites of each run.
+        Names of the best common poles or sites of each run.
     regret_a
         Share of run b's best score that is lost at ``best_a``.
     """
@@ -129,43 +170,109 @@ class Difference:
     values: tuple[Any, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Comparison:
-    """Compared runs; ``sites`` are in the order of the first run's ranking, followed by those of the other runs."""
+    """Compared runs.
+
+    Attributes
+    ----------
+    runs
+        The runs, or the sensors of one run.
+    by
+        What the rows are: poles, or sites of the same name.
+    poles
+        By pole, in the order of the first run's ranking, followed by those of the other runs; empty by site.
+    sites
+        Names of all sites, in the same order.
+    agreements
+        Agreement of each pair.
+    sensors
+        The best mount of each sensor; None with fewer than two sensors.
+    differences
+        Settings and files that differ.
+    notes
+        What a reader must know before comparing numbers.
+    """
 
     runs: tuple[ComparedRun, ...]
+    by: View
+    poles: tuple[ComparedPole, ...]
     sites: tuple[str, ...]
     agreements: tuple[RankAgreement, ...]
+    sensors: SensorComparison | None
     differences: tuple[Difference, ...]
     notes: tuple[str, ...]
 
+    def __repr__(self) -> str:
+        labels = join_names([run.label for run in self.runs])
+        count = len(self.poles) if self.by == "pole" else len(self.sites)
+        text = f"Comparison({labels} by {self.by}, {count} {self.by}s"
+        for pair in self.agreements[:1]:
+            if pair.tau is not None:
+                text += f"; {pair.shared} common to {pair.a} and {pair.b}, tau {pair.tau:.2f}"
+        return f"{text})"
 
-def compare_runs(folders: Sequence[Path]) -> Comparison:
-    """Compare finished runs.
+
+def compare_runs(
+    folders: Sequence[Path | str],
+    by: View | None = None,
+    costs: Sequence[str] = (),
+    progress: ProgressCallback = no_progress,
+) -> Comparison:
+    """Compare finished runs, or the sensors of one run.
 
     Parameters
     ----------
     folders
-        Two or more run folders.
+        Run folders; one is enough if it has several sensors.
+    by
+        Compare the best mounts of poles, or sites of the same name. By default sites if no pole has several sites and
+        common sites have the same mount in all runs, or if only names agree; else poles.
+    costs
+        Overrides of the scenarios' ``[costs]``, e.g. ``'costs.sensor={"VLP-32C"=8000}'``.
+    progress
+        Called while sites are scored again for the errors of differences.
 
     Raises
     ------
     InputError
-        If there are fewer folders, or one contains no finished run, or its scores were altered.
+        If there is a single run with one sensor, a folder contains no finished run, its scores were changed, or the
+        first run has no pole in common with any other.
     """
-    if len(folders) < 2:
-        raise InputError("compare", f"expected at least two runs, got {len(folders)}", "Give folders of finished runs.")
-    runs = tuple(_read_run(folder, run_label(number)) for number, folder in enumerate(folders))
+    runs = tuple(_read_run(Path(folder), run_label(number), costs) for number, folder in enumerate(folders))
+    if not runs:
+        raise InputError("compare", "expected at least one run, got none", "Give folders of finished runs.")
+    is_single = len(runs) == 1
+    if is_single:
+        runs = _split_by_sensor(runs[0], by)
+    view = by or _choose_view(runs)
+    if view == "pole" and not is_single:
+        _check_common_poles(runs)
+
+    pairs = list(combinations(runs, 2))
+    notes: list[str] = []
+    for a, b in pairs:
+        notes += _notes(a, b, view)
+    locations: dict[Location, None] = {}
     sites: dict[str, None] = {}
     for run in runs:
-        ranked = sorted(run.sites.values(), key=lambda site: site.rank)
-        sites |= dict.fromkeys(site.site for site in ranked)
-    agreements = []
-    notes: list[str] = []
-    for a, b in combinations(runs, 2):
-        agreements.append(compare_rankings(a, b))
-        notes += _notes(a, b)
-    return Comparison(runs, tuple(sites), tuple(agreements), tuple(find_differences(runs)), tuple(notes))
+        sites |= dict.fromkeys(run.sites)
+        if view == "pole":
+            locations |= dict.fromkeys(run.poles)
+
+    mounts = _sensor_mounts(runs)
+    differences = ScoreDifferences.of(_sites_to_subtract(runs, locations, mounts), progress)
+    notes += _error_notes(runs, differences)
+    return Comparison(
+        runs=runs,
+        by=view,
+        poles=tuple(_compare_pole(location, runs, differences) for location in locations),
+        sites=tuple(sites),
+        agreements=tuple(compare_rankings(a, b, view) for a, b in pairs),
+        sensors=_compare_sensors(runs, mounts, differences),
+        differences=tuple(find_differences(runs)),
+        notes=tuple(dict.fromkeys(notes)),
+    )
 
 
 def run_label(number: int) -> str:
@@ -175,7 +282,7 @@ def run_label(number: int) -> str:
     return run_label(prefix - 1) + label if prefix else label
 
 
-def _read_run(folder: Path, label: str) -> ComparedRun:
+def _read_run(folder: Path, label: str, cost_overrides: Sequence[str]) -> ComparedRun:
     record = RunRecord.read(folder)
     path = folder / SCORES
     score_stage = record.stages.get("score")
@@ -184,10 +291,10 @@ def _read_run(folder: Path, label: str) -> ComparedRun:
         raise InputError(RunFolder(folder).run_record, problem, "Run egvs run first.")
     if files.hash_file(path) != score_stage.artefacts.get(SCORES):
         raise InputError(path, "was changed after the run", 'Repeat "egvs run".')
-    scores, metadata = parquet.read_artefact(path, "scores")
-    rank_by = metadata.get("rank_by", "egvs")
+    metadata = parquet.read_metadata(path, "scores")
 
-    settings = {**dict(_flatten(record.scenario)), "egvs (version)": record.egvs}
+    compared = {key: value for key, value in record.scenario.items() if key not in _IGNORED_SETTINGS}
+    settings = {**flatten_settings(compared), "egvs (version)": record.egvs}
     if settings.get("score.gamma") == "auto":
         settings["score.gamma"] = metadata["gamma"]
     if "traffic" in record.stages and record.stages["traffic"].summary.get("sumo") is not None:
@@ -198,62 +305,185 @@ def _read_run(folder: Path, label: str) -> ComparedRun:
     for name, stage in record.stages.items():
         if name not in ("check", "report"):
             input_files |= {file: digest for file, digest in stage.files.items() if file not in artefacts}
-    sites = {row["site"]: _site_result(row, rank_by) for row in scores.to_pylist()}
-    return ComparedRun(label, folder, sites, settings, input_files, rank_by)
+    costs = costs_from_dict(record.scenario, cost_overrides, str(RunFolder(folder).run_record))
+    return ComparedRun(label, folder, Ranking.read(path), settings, input_files, costs)
 
 
-def _site_result(row: dict[str, Any], rank_by: str) -> SiteResult:
-    limit = row["egvs_limit"]
-    result = SiteResult(
-        site=row["site"],
-        pose=tuple(row[name] for name in _POSE_COLUMNS),
-        longitude_deg=row.get("longitude_deg"),
-        latitude_deg=row.get("latitude_deg"),
-        egvs=row["egvs"],
-        egvs_se=row.get("egvs_se"),
-        rank=row["rank"],
-        share=row["egvs"] / limit if 0 < limit < float("inf") else None,
-    )
-    if rank_by == "egvs":
-        return result
-    return replace(result, other=row[rank_by], other_se=row.get(f"{rank_by}_se"))
+def _split_by_sensor(run: ComparedRun, by: View | None) -> tuple[ComparedRun, ...]:
+    """Return the sites with each sensor of a run as runs; InputError if it has one sensor."""
+    if len(run.sensors) < 2:
+        problem = f"expected a second run, because all sites of this one have the sensor {run.sensors[0]}"
+        hint = "Give two or more run folders, or a run whose sites file names several sensors."
+        raise InputError(run.folder, problem, hint)
+    if by == "site":
+        problem = "expected a second run: sites of one run have different names"
+        raise InputError("--by site", problem, "Give two or more run folders, or use --by pole.")
+    parts = []
+    for number, sensor in enumerate(run.sensors):
+        ranking = Ranking.of(site for site in run.ranking.sites if site.sensor == sensor)
+        parts.append(replace(run, label=run_label(number), ranking=ranking))
+    return tuple(parts)
 
 
-def _flatten(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield each setting with its full key; rows of tables are called by their name or number."""
-    if isinstance(value, dict) and value:
-        for name, inner in value.items():
-            if key:
-                yield from _flatten(inner, f"{key}.{name}")
-            elif name not in _IGNORED_SETTINGS:
-                yield from _flatten(inner, name)
-    elif isinstance(value, list) and value and all(isinstance(row, dict) for row in value):
-        for number, row in enumerate(value):
-            yield from _flatten(row, f"{key}[{row.get('name', number)}]")
-    else:
-        yield key, value
+def _choose_view(runs: Sequence[ComparedRun]) -> View:
+    """Return the default of ``by``, see :func:`compare_runs`."""
+    first, *others = runs
+    if not any(first.poles.keys() & run.poles.keys() for run in others):
+        return "site" if any(first.sites.keys() & run.sites.keys() for run in others) else "pole"
+    if any(len(run.poles) < len(run.sites) for run in runs):
+        return "pole"
+    for run in others:
+        if any(_has_moved(first, run, name) for name in first.sites.keys() & run.sites.keys()):
+            return "pole"
+        if first.poles.keys() & run.poles.keys() and not first.sites.keys() & run.sites.keys():
+            return "pole"
+    return "site"
 
 
-def compare_rankings(a: ComparedRun, b: ComparedRun) -> RankAgreement:
+def _has_moved(a: ComparedRun, b: ComparedRun, name: str) -> bool:
+    """Whether a common site has another position, angle or sensor."""
+    return _mount(a.sites[name]) != _mount(b.sites[name])
+
+
+def _mount(site: RankedSite) -> tuple[float | str, ...]:
+    return site.x_m, site.y_m, site.z_m, site.yaw_deg, site.pitch_deg, site.roll_deg, site.sensor
+
+
+def _check_common_poles(runs: Sequence[ComparedRun]) -> None:
+    """InputError if the first run has no pole in common with any other."""
+    first, *others = runs
+    if any(first.poles.keys() & run.poles.keys() for run in others):
+        return
+    problem = f"no pole in common with {others[0].folder}: no site of one run has the x and y of a site of the other"
+    moved = _moved_poles(first, others[0])
+    if moved:
+        problem += f" ({_list_names(moved)})"
+    if len(others) > 1:
+        problem += "; nor with the other runs"
+    hint = "Compare runs with the same poles: the same scenario, or the same sites file with other sensors or heights."
+    raise InputError(first.folder, problem, hint)
+
+
+def _moved_poles(a: ComparedRun, b: ComparedRun) -> list[str]:
+    """Return poles of the same name at different positions, with the distance."""
+    locations_b = {pole.name: location for location, pole in b.poles.items()}
+    moved = []
+    for location, pole in a.poles.items():
+        other = locations_b.get(pole.name)
+        if other is not None and other != location:
+            moved.append(f"{pole.name} is {math.dist(location, other):.2f} m away")
+    return moved
+
+
+def _list_names(names: Sequence[str]) -> str:
+    text = ", ".join(names[:_NAMED])
+    if len(names) > _NAMED:
+        text += f" and {len(names) - _NAMED} more"
+    return text
+
+
+def _sites_to_subtract(
+    runs: Sequence[ComparedRun], locations: Mapping[Location, None], mounts: Sequence[SensorMount]
+) -> list[SiteOfRun]:
+    """Return the sites whose scores are subtracted from each other."""
+    by_label = {run.label: run for run in runs}
+    sites = [SiteOfRun(by_label[mount.run].folder, mount.site) for mount in mounts]
+    first, *others = runs
+    for run in others:
+        if not _are_comparable(first, run):
+            continue
+        for location in locations:
+            if location in first.poles and location in run.poles:
+                sites.append(SiteOfRun(first.folder, first.poles[location].best))
+                sites.append(SiteOfRun(run.folder, run.poles[location].best))
+    return sites
+
+
+def _compare_pole(location: Location, runs: Sequence[ComparedRun], differences: ScoreDifferences) -> ComparedPole:
+    poles = [run.poles.get(location) for run in runs]
+    name = next(pole.name for pole in poles if pole is not None)
+    mounts = [None if pole is None else pole.best for pole in poles]
+    gaps: list[ScoreDifference | None] = [None]
+    for run, mount in zip(runs[1:], mounts[1:], strict=True):
+        if mounts[0] is None or mount is None or not _are_comparable(runs[0], run):
+            gaps.append(None)
+        else:
+            gaps.append(differences.between(SiteOfRun(run.folder, mount), SiteOfRun(runs[0].folder, mounts[0])))
+    return ComparedPole(name, location, tuple(mounts), tuple(gaps))
+
+
+def _sensor_mounts(runs: Sequence[ComparedRun]) -> tuple[SensorMount, ...]:
+    """Return the best mount of each sensor of each run that can be compared with the first; none for one sensor."""
+    mounts: list[SensorMount] = []
+    for run in runs:
+        if _are_comparable(runs[0], run):
+            mounts += best_mounts(run.ranking.sites, run.costs, run.label)
+    if len({mount.sensor for mount in mounts}) < 2:
+        return ()
+    return tuple(mounts)
+
+
+def _compare_sensors(
+    runs: Sequence[ComparedRun], mounts: Sequence[SensorMount], differences: ScoreDifferences
+) -> SensorComparison | None:
+    folders = {run.label: run.folder for run in runs}
+
+    def difference(mount: SensorMount, other: SensorMount) -> ScoreDifference:
+        first, second = (SiteOfRun(folders[one.run], one.site) for one in (mount, other))
+        return differences.between(first, second)
+
+    return SensorComparison.of(mounts, difference)
+
+
+def _are_comparable(a: ComparedRun, b: ComparedRun) -> bool:
+    """Whether the scores that rank may be subtracted."""
+    return a.rank_by == b.rank_by and not _differing_egvs_keys(a, b)
+
+
+def _differing_egvs_keys(a: ComparedRun, b: ComparedRun) -> list[str]:
+    """Return the settings that make EGVS in bits incomparable; nothing where another score ranks."""
+    if a.rank_by != "egvs":
+        return []
+    return [key for key in _EGVS_KEYS if a.settings.get(key) != b.settings.get(key)]
+
+
+def compare_rankings(a: ComparedRun, b: ComparedRun, by: View = "site") -> RankAgreement:
     """Compare the rankings of two runs.
 
     Parameters
     ----------
     a, b
-        The runs; the regret is that of using the best site of ``a``.
+        The runs; the regret is that of using the best pole or site of ``a``.
+    by
+        Compare poles by their best mounts, or sites of the same name.
     """
-    shared = [site for site in a.sites if site in b.sites]
+    ranked_a, ranked_b = _ranked(a, by), _ranked(b, by)
+    shared = [key for key in ranked_a if key in ranked_b]
     if not shared:
         return RankAgreement(a.label, b.label, 0)
-    scores_a = np.array([a.sites[site].score for site in shared])
-    scores_b = np.array([b.sites[site].score for site in shared])
+    scores_a = np.array([ranked_a[key].score for key in shared])
+    scores_b = np.array([ranked_b[key].score for key in shared])
+    names = [ranked_a[key].name for key in shared]
     tau, rho = None, None
     if len(shared) > 1:
         tau = rank_agreement(scores_a, scores_b, "tau")
         rho = rank_agreement(scores_a, scores_b, "rho")
-    best_a = tuple(shared[index] for index in sorted(best_sites(scores_a, 1)))
-    best_b = tuple(shared[index] for index in sorted(best_sites(scores_b, 1)))
+    best_a = tuple(names[index] for index in sorted(best_sites(scores_a, 1)))
+    best_b = tuple(names[index] for index in sorted(best_sites(scores_b, 1)))
     return RankAgreement(a.label, b.label, len(shared), tau, rho, best_a, best_b, regret(scores_a, scores_b))
+
+
+class _RankedName(NamedTuple):
+    """Name and score of a pole, or of a site."""
+
+    name: str
+    score: float
+
+
+def _ranked(run: ComparedRun, by: View) -> dict[Location | str, _RankedName]:
+    if by == "pole":
+        return {location: _RankedName(pole.name, pole.best.score) for location, pole in run.poles.items()}
+    return {name: _RankedName(name, site.score) for name, site in run.sites.items()}
 
 
 def find_differences(runs: Sequence[ComparedRun]) -> Iterator[Difference]:
@@ -291,24 +521,47 @@ def _has_key_starting(run: ComparedRun, prefix: str | tuple[str, ...]) -> bool:
     return any(key.startswith(prefix) for key in run.settings)
 
 
-def _notes(a: ComparedRun, b: ComparedRun) -> Iterator[str]:
+def _notes(a: ComparedRun, b: ComparedRun, view: View) -> Iterator[str]:
     """Yield what a reader must know before comparing the numbers of two runs."""
     pair = f"{a.label} and {b.label}"
-    shared = [site for site in a.sites if site in b.sites]
-    if not shared:
-        yield f"{pair} have no site in common, so their rankings cannot be compared"
-        return
-    moved = [site for site in shared if a.sites[site].pose != b.sites[site].pose]
-    if moved:
-        names = ", ".join(moved[:4])
-        if len(moved) > 4:
-            names += f" and {len(moved) - 4} more"
-        count = "1 site has" if len(moved) == 1 else f"{len(moved)} sites have"
-        yield f"{count} the same name in {pair} but another position, angle or sensor: {names}"
+    if view == "pole":
+        yield from _pole_notes(a, b)
+    else:
+        yield from _site_notes(a, b)
     if a.rank_by != b.rank_by:
         yield f"{a.label} ranks by {a.rank_by}, {b.label} by {b.rank_by}: compare ranks only"
         return
-    keys = ("roi.center_m", "roi.size_m", "roi.voxel_m", "score.gamma")
-    differing = [key for key in keys if a.settings.get(key) != b.settings.get(key)]
-    if differing and a.rank_by == "egvs":
+    if differing := _differing_egvs_keys(a, b):
         yield f"{pair} differ in {' and '.join(differing)}: compare ranks and shares, not bits"
+
+
+def _pole_notes(a: ComparedRun, b: ComparedRun) -> Iterator[str]:
+    pair = f"{a.label} and {b.label}"
+    if not a.poles.keys() & b.poles.keys():
+        yield f"{pair} have no pole in common, so their rankings cannot be compared"
+    if moved := _moved_poles(a, b):
+        yield f"poles of the same name at different positions in {pair} count as different poles: {_list_names(moved)}"
+
+
+def _site_notes(a: ComparedRun, b: ComparedRun) -> Iterator[str]:
+    pair = f"{a.label} and {b.label}"
+    shared = [site for site in a.sites if site in b.sites]
+    if not shared:
+        hint = "; --by pole matches them by position" if a.poles.keys() & b.poles.keys() else ""
+        yield f"{pair} have no site name in common, so their rankings cannot be compared{hint}"
+    if moved := [site for site in shared if _has_moved(a, b, site)]:
+        count = "1 site has" if len(moved) == 1 else f"{len(moved)} sites have"
+        yield f"{count} the same name in {pair} but another position, angle or sensor: {_list_names(moved)}"
+
+
+def _error_notes(runs: Sequence[ComparedRun], differences: ScoreDifferences) -> Iterator[str]:
+    """Yield which differences have the errors of independent scores, and why."""
+    first = runs[0]
+    for run in runs[1:]:
+        if not _are_comparable(first, run):
+            continue
+        if reason := differences.why_independent(first.folder, run.folder):
+            yield (
+                f"standard errors of differences between {first.label} and {run.label} "
+                f"are those of independent scores: {reason}"
+            )

@@ -10,7 +10,8 @@ larger of its error and its standard error (:mod:`egvs.scoring.standard_errors`)
 within the tolerance is recommended. The scenario's own setting, or else the program's default, is recommended instead
 if it is within the tolerance too, and if the cheapest saves less than :data:`MIN_TIME_SAVING` of its time. Traffic that
 is a finished file cannot be longer, so only the error counts. A setting that measures something else (voxel, gamma,
-effects) has no error: its ranking and regret are compared with those of the scenario, on the same traffic.
+effects) has no error: its ranking and regret are compared with those of the scenario, on the same traffic. Options of
+the traffic are compared with the scenario too, beside other seeds (:mod:`egvs.studies.traffic_options`).
 
 :func:`compare_seeds` compares the standard errors of single runs with the scatter of independent runs.
 """
@@ -32,7 +33,16 @@ from egvs.core.errors import EgvsError
 from egvs.runs.stage_registry import RANKING_STAGES
 from egvs.scenario.model import Scenario
 from egvs.studies.measurement import SettingListener, SettingRunner, SettingScores
-from egvs.studies.study_settings import APPROXIMATES, MEASURES, REFERENCE, SCENARIO, SCENARIO_AS_IS, Setting, is_default
+from egvs.studies.study_settings import (
+    APPROXIMATES,
+    MEASURES,
+    REFERENCE,
+    SCENARIO,
+    SCENARIO_AS_IS,
+    TRAFFIC,
+    Setting,
+    is_default,
+)
 
 MIN_TIME_SAVING = 0.2
 """Share of time that a setting must save to be recommended instead of the scenario's own or the default."""
@@ -67,13 +77,20 @@ class SettingResult:
     best_kept: bool
     best_three_kept: bool
     regret: float
+    best: str
+    tpog_change: float
     default: bool
     front: bool = False
     recommended: bool = False
 
 
 def compare_setting(
-    runner: SettingRunner, setting: Setting, scores: Mapping[str, SettingScores], *, could_last_longer: bool
+    runner: SettingRunner,
+    setting: Setting,
+    scores: Mapping[str, SettingScores],
+    *,
+    could_last_longer: bool,
+    tpog_change: float = math.nan,
 ) -> SettingResult:
     """Compare one setting with the reference, or with the scenario if it measures something else.
 
@@ -87,10 +104,12 @@ def compare_setting(
         Scores of all settings by name.
     could_last_longer
         Whether longer traffic could be simulated, so that the standard error counts as an error.
+    tpog_change
+        Change of the TPOG by an option of the traffic.
     """
     result, unchanged = scores[setting.name], scores[SCENARIO]
     reference = unchanged
-    if setting.kind != MEASURES:
+    if setting.kind not in (MEASURES, TRAFFIC):
         reference = scores.get(REFERENCE, unchanged)
     baseline = scores.get(setting.baseline, unchanged)
     costs = {name: runner.stage_times(name, result.stages[name]) for name in RANKING_STAGES}
@@ -130,7 +149,9 @@ def compare_setting(
         best_kept=best_sites(shares, 1) == best_sites(reference_shares, 1),
         best_three_kept=best_sites(shares, 3) == best_sites(reference_shares, 3),
         regret=regret(shares, reference_shares),
-        default=is_default(runner.scenario(setting), runner.scenario(SCENARIO_AS_IS)),
+        best=", ".join(result.sites[site] for site in sorted(best_sites(shares, 1))),
+        tpog_change=tpog_change,
+        default=setting.kind != TRAFFIC and is_default(runner.scenario(setting), runner.scenario(SCENARIO_AS_IS)),
     )
 
 
@@ -214,7 +235,7 @@ def mark_pareto_front(rows: list[SettingResult], tolerance: float) -> list[Setti
     for row in rows:
         on_front = row in candidates and not any(_dominates(other, row) for other in candidates)
         marked.append(replace(row, front=on_front, recommended=row.setting == recommended))
-    order = (SCENARIO, REFERENCE, APPROXIMATES, MEASURES)
+    order = (SCENARIO, REFERENCE, APPROXIMATES, MEASURES, TRAFFIC)
     return sorted(marked, key=lambda row: (order.index(row.kind), row.seconds, row.setting))
 
 

@@ -1,12 +1,13 @@
 r"""The settings that an accuracy study tries.
 
-A study changes one setting at a time, and tries a small grid of the settings that cost most. There are two kinds:
+A study changes one setting at a time, and tries a small grid of the settings that cost most. There are three kinds:
 
 - Settings that *approximate* the scenario's scores: less or more traffic, longer frame periods and SUMO steps, thinned
   beams, the quality of an effect.
 - Settings that *measure* something else: another voxel size or gamma, without an effect of the scenario, or with an
   effect that it does not name. Such effects are tried if they need no parameter from the user (as a rain rate) and act
   in this scene.
+- Options of the *traffic*, whose random numbers fall differently (:mod:`egvs.studies.traffic_options`).
 
 Each setting is a list of ``--set`` overrides, so that users can type the recommended one. If only every f-th beam is
 cast, a voxel has n instead of about f n hits. Because :math:`\min(\gamma, f n) = f \min(\gamma / f, n)`, thinned
@@ -20,7 +21,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pydantic import ValidationError
 
@@ -36,6 +37,10 @@ from egvs.stages.inputs import build_scene
 from egvs.traffic.finished_fcd import recorded_frames
 
 APPROXIMATES, MEASURES, REFERENCE, SCENARIO = "approximates", "measures", "reference", "scenario"
+TRAFFIC = "traffic"
+"""Kind of settings with other traffic of the same demand."""
+SEED_KNOB = "seed"
+"""Knob of settings that only draw the traffic again."""
 WITHOUT_PREFIX, WITH_PREFIX = "without ", "with "
 """Prefixes of settings that leave out an effect, or add one."""
 
@@ -49,7 +54,7 @@ class Setting:
     name
         Description of what changes; unique in a study.
     kind, knob
-        ``APPROXIMATES`` or ``MEASURES``, and what is changed.
+        ``APPROXIMATES``, ``MEASURES`` or ``TRAFFIC``, and what is changed.
     overrides
         Arguments of ``--set``.
     without
@@ -96,6 +101,12 @@ class SettingValues:
         Edges of voxels, and values of ``score.gamma``.
     unnamed_effects
         Whether effects that the scenario does not name are tried.
+    traffic_options
+        Whether SUMO's step, sublanes and routing are compared with other seeds.
+    traffic_steps_s
+        SUMO's steps in this comparison.
+    traffic_seeds
+        Number of other seeds in this comparison.
     """
 
     frames: Sequence[int] = (250, 500, 1000, 2500)
@@ -108,6 +119,9 @@ class SettingValues:
     voxels_m: Sequence[float] = (1.0, 0.5, 0.25, 0.125)
     gammas: Sequence[float] = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
     unnamed_effects: bool = True
+    traffic_options: bool = True
+    traffic_steps_s: Sequence[float] = (0.25, 0.5, 1.0)
+    traffic_seeds: int = 3
 
 
 DEFAULT_VALUES = SettingValues()
@@ -221,13 +235,33 @@ def traffic_settings(scenario: Scenario, values: SettingValues = DEFAULT_VALUES)
         yield from _scaled_traffic_setting(scenario, "period", 1, None, period_s)
     if scenario.is_recorded:
         return
-    for step_s in values.steps_s:
-        yield from _scaled_traffic_setting(scenario, "step", 1, step_s, _nearest_period(step_s, traffic.frame_period_s))
+    yield from step_settings(scenario, values.steps_s, APPROXIMATES)
     for factor in values.traffic_factors:
         yield from _scaled_traffic_setting(scenario, "frames", factor, None, None)
     for factor in values.grid_factors:
         for grid_step_s, grid_period_s in values.grid_seconds:
             yield from _scaled_traffic_setting(scenario, "grid", factor, grid_step_s, grid_period_s)
+
+
+def step_settings(scenario: Scenario, steps_s: Sequence[float], kind: str) -> Iterator[Setting]:
+    """Yield settings with other SUMO steps, and the nearest frame period that is a multiple of the step.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    steps_s
+        Steps to try.
+    kind
+        Kind of the settings; those of the traffic have a shorter name.
+    """
+    for step_s in steps_s:
+        period_s = _nearest_period(step_s, scenario.traffic.frame_period_s)
+        for setting in _scaled_traffic_setting(scenario, "step", 1, step_s, period_s):
+            if kind == TRAFFIC:
+                frames = "" if period_s == scenario.traffic.frame_period_s else f", a frame every {period_s:g} s"
+                setting = replace(setting, name=f"step {step_s:g} s{frames}", kind=kind)
+            yield setting
 
 
 def _nearest_period(step_s: float, period_s: float) -> float:

@@ -53,6 +53,10 @@ _PROTOCOL_ERRORS = (struct.error, UnicodeDecodeError)
 """What traci raises when an answer does not follow its protocol."""
 
 
+_HUGE_PAGES = "glibc.malloc.hugetlb=1"
+"""Lets glibc ask for larger memory pages: SUMO reads the data of all vehicles several times in each step."""
+
+
 class SumoInputError(RunError):
     """A program of SUMO rejected its input: it ended with an error, or crashed."""
 
@@ -94,9 +98,12 @@ def _preserve_proj_data() -> Iterator[None]:
 
 
 def sumo_environment() -> dict[str, str]:
-    """Return the environment for SUMO's programs: SUMO_HOME, the wheel's PROJ data, and this process's variables."""
+    """Return the environment for SUMO's programs.
+
+    SUMO_HOME, the wheel's PROJ data, a setting of glibc's memory, and this process's variables, which take precedence.
+    """
     home = sumo_home()
-    defaults = {"SUMO_HOME": str(home)}
+    defaults = {"SUMO_HOME": str(home), "GLIBC_TUNABLES": _HUGE_PAGES}
     proj = home / "data" / "proj"
     if proj.is_dir():
         defaults |= {"PROJ_DATA": str(proj), "PROJ_LIB": str(proj)}

@@ -229,6 +229,9 @@ class JunctionScores:
     poles
         Pole of each site. Sites of one pole (at several heights) are much alike, so they are drawn together. Empty
         where each site has a pole of its own.
+    part
+        A part of the junction, such as one mounting height. Parts of a junction draw the same blocks of frames, and the
+        same poles where they have as many.
     """
 
     name: str
@@ -236,6 +239,7 @@ class JunctionScores:
     scores: Mapping[str, FloatArray]
     measures: Mapping[str, MeasureValues]
     poles: tuple[str, ...] = ()
+    part: str = ""
 
     @property
     def blocks(self) -> int:
@@ -368,9 +372,11 @@ class CorrelationStudy:
         self.seed = seed
         self.resamples = resamples
         self._kind: CoefficientKind | None = None
-        self._resamples: dict[tuple[str, bytes], Resamples] = {}
-        self._scores: dict[tuple[str, bytes, str], StandardisedValues] = {}
-        self._measures: dict[tuple[str, bytes], tuple[str, StandardisedValues]] = {}  # the last measure only: large
+        self._resamples: dict[tuple[str, str, bytes], Resamples] = {}
+        self._scores: dict[tuple[str, str, bytes, str], StandardisedValues] = {}
+        self._measures: dict[
+            tuple[str, str, bytes], tuple[str, StandardisedValues]
+        ] = {}  # the last measure only: large
 
     def correlation(self, score: str, measure: str, kind: CoefficientKind) -> Correlation:
         """Return the correlation of a score with a measure.
@@ -439,7 +445,7 @@ class CorrelationStudy:
             self._kind = kind
             self._scores.clear()
             self._measures.clear()
-        sites_key = (junction.name, mask.tobytes())
+        sites_key = (junction.name, junction.part, mask.tobytes())
         if sites_key not in self._resamples:
             poles = junction.selected_poles(mask)
             self._resamples[sites_key] = Resamples.draw(

@@ -32,7 +32,7 @@ step is the best one at this or any higher recall (0 where the recall is not rea
           AP_{R40} = \frac{1}{40} \sum_{r \in \{1/40, 2/40 .. 1\}} p(r)
 
 (Geiger et al. 2012; Simonelli et al., "Disentangling monocular 3D object detection", ICCV 2019, for R40), from 0 to 1.
-*Combined* is the sum of BEV and 3D, from 0 to 2. *Recall* is the share of objects found at the lowest threshold.
+*Mean* is the mean of BEV and 3D. *Recall* is the share of objects found at the lowest threshold.
 
 With fewer than 41 objects there are no 41 recalls: KITTI's rule runs out of scores, and would give 2/11 to five objects
 that are all found. Every frame is then counted as many times as are needed for 41 objects, which changes no precision
@@ -154,6 +154,12 @@ def frame_blocks(frames: int, blocks: int = BLOCKS) -> IntArray:
         problem = f"expected at least {blocks} frames, got {frames}"
         raise InputError("--frames", problem, f"Standard errors are computed from {blocks} blocks of frames.")
     return np.arange(frames, dtype=np.int64) * blocks // frames
+
+
+def estimate_difference(first: JackknifeEstimate, second: JackknifeEstimate, frames: int) -> JackknifeEstimate:
+    """Return the first measure minus the second, both of the same frames, with the error of the difference."""
+    values = np.concatenate([[first.value - second.value], first.left_out - second.left_out])
+    return JackknifeEstimate.from_values(values, np.bincount(frame_blocks(frames)))
 
 
 def paired_overlap(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -385,7 +391,7 @@ class Evaluation:
     objects
         Number of objects in each block of frames, (blocks,) int64, by subset.
     measures
-        By :func:`measure_name`, with views ``bev``, ``3d`` and ``combined`` (AP only).
+        By :func:`measure_name`, with views ``bev``, ``3d`` and ``mean`` of both (AP only).
     """
 
     frames: int
@@ -435,13 +441,13 @@ def evaluate(frames: EvaluationFrames, blocks: int = BLOCKS) -> Evaluation:
 
 
 def _named_measures(views: Sequence[FloatArray], iou: float, subset: ObjectSubset) -> Iterator[tuple[str, FloatArray]]:
-    """Yield the names and values of the measures of both views, then of the combined ones."""
+    """Yield the names and values of the measures of both views, then their means."""
     for view, values in zip(VIEWS, views, strict=True):
         for kind, column in zip(MEASURE_NAMES, values.T, strict=True):
             yield measure_name(kind, view, iou, subset), column
-    combined = views[0] + views[1]
-    for kind, column in zip(MEASURE_NAMES[:2], combined.T[:2], strict=True):
-        yield measure_name(kind, "combined", iou, subset), column
+    mean = (views[0] + views[1]) / 2.0
+    for kind, column in zip(MEASURE_NAMES[:2], mean.T[:2], strict=True):
+        yield measure_name(kind, "mean", iou, subset), column
 
 
 @dataclass(frozen=True)
@@ -509,7 +515,7 @@ def ap_and_recall(true: IntArray, false: IntArray, objects: int) -> tuple[float,
 def _ap_measures() -> Iterator[str]:
     for iou in IOUS:
         suffix = f"iou{round(100 * iou)}"
-        for view in (*VIEWS, "combined"):
+        for view in (*VIEWS, "mean"):
             yield f"ap_{view}_r11_{suffix}"
             yield f"ap_{view}_r40_{suffix}"
         for view in VIEWS:

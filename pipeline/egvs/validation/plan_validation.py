@@ -311,15 +311,9 @@ def with_gains(groups: Sequence[SensorGroup], rows: Sequence[SiteDetection]) -> 
             gain = row.measures[measure]
             if row.site in previous_group:
                 previous = row_by_key[previous_group[row.site], row.detector, row.objects_of]
-                gain = estimate_difference(gain, previous.measures[measure], row.frames)
+                gain = detection_metrics.estimate_difference(gain, previous.measures[measure], row.frames)
         fused.append(FusedDetection(site_names[row.site], row, gain))
     return tuple(fused)
-
-
-def estimate_difference(first: JackknifeEstimate, second: JackknifeEstimate, frames: int) -> JackknifeEstimate:
-    """Return the first measure minus the second, both of the same frames."""
-    values = np.concatenate([[first.value - second.value], first.left_out - second.left_out])
-    return JackknifeEstimate.from_values(values, np.bincount(detection_metrics.frame_blocks(frames)))
 
 
 def write_fused(path: Path, rows: Sequence[FusedDetection], metadata: Mapping[str, Any]) -> None:

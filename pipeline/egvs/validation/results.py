@@ -1,7 +1,7 @@
 """The result of a validation, and its figure ``validation.png``.
 
-The figure has one column per detector. Above, as in the source paper: EGVS as configured in the scenario against the
-detector's main measure, one point per site with its standard error. Below: Spearman's rho of every score with that
+The figure has one column per detector. Above: the score that ranks the sites against the detector's main measure, one
+point per site with its standard error. Below: Spearman's rho of every score with that
 measure, with 95 % intervals; a score with parameters has one row for each combination of their values. The figure is
 readable in greyscale.
 """
@@ -21,6 +21,8 @@ import numpy as np
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
 from egvs.core.errors import Diagnostic
+from egvs.report.formatting import SCORE_LABELS
+from egvs.report.ranking_check import DetectorCheck, RankingCheck
 from egvs.scenario.model import Scenario
 from egvs.studies.pareto_figure import LabelPlacement
 from egvs.validation.correlation import CoefficientKind, Correlation
@@ -34,13 +36,13 @@ if TYPE_CHECKING:
 
 
 CORRELATED_BOX_MEASURES = (
-    "ap_combined_r40_iou70",
+    "ap_mean_r40_iou70",
     "ap_bev_r40_iou70",
     "ap_3d_r40_iou70",
-    "ap_combined_r40_iou50",
-    "ap_combined_r11_iou70",
+    "ap_mean_r40_iou50",
+    "ap_mean_r11_iou70",
 )
-"""Measures of a detector that scores are correlated with; the first is that of the paper and of the figure."""
+"""Measures of a detector that scores are correlated with; the first is that of tables and figures."""
 
 CORRELATED_POINT_MEASURES = ("seen_20", "seen_1", "seen_5", "log_points")
 """The same for points on vehicles."""
@@ -51,6 +53,10 @@ def correlated_measures(detector: str) -> tuple[str, ...]:
     if detector == POINT_COUNTS_NAME:
         return CORRELATED_POINT_MEASURES
     return CORRELATED_BOX_MEASURES
+
+
+MEASURE_NOUNS = {"ap_mean_r40_iou70": "mean AP of BEV and 3D", "seen_20": "vehicles with 20 points"}
+"""The main measures in a sentence."""
 
 
 def main_measure(detector: str) -> str:
@@ -107,6 +113,10 @@ class Validation:
         Undefined measures, skipped scores, and traffic that is not held out.
     sample
         The size of the held-out traffic.
+    ranked
+        The score that ranks, by site.
+    check
+        What the detectors say about the ranking.
     report
         Path of the updated report; None if the folder does not contain a complete run.
     """
@@ -116,6 +126,8 @@ class Validation:
     agreements: tuple[ScoreAgreement, ...]
     warnings: tuple[Diagnostic, ...]
     sample: TrafficSample
+    ranked: Mapping[str, float]
+    check: RankingCheck
     report: Path | None = None
 
     @cached_property
@@ -151,7 +163,7 @@ _SIGMAS_95 = 1.96  # half width of a 95 % interval in standard errors
 _DOT_COLOUR, _EGVS_COLOUR = "#0072B2", "#D55E00"
 
 _MEASURE_LABELS = {
-    "ap_combined_r40_iou70": "AP BEV + 3D, R40, IoU 0.7, %",
+    "ap_mean_r40_iou70": "AP R40, mean of BEV and 3D, IoU 0.7, %",
     "seen_20": "vehicles with at least 20 points, %",
 }
 
@@ -178,7 +190,7 @@ def make_figure(scenario: Scenario, validation: Validation) -> Figure:
     egvs = validation.egvs_score(scenario)
     scatters = []
     for column, detector in enumerate(detectors):
-        scatters.append(_draw_scatter(panels[0, column], egvs, validation, detector))
+        scatters.append(_draw_scatter(panels[0, column], validation, detector))
         _draw_ranking(panels[1, column], egvs, validation, detector, with_names=column == 0)
 
     figure.draw_without_rendering()  # lays out the panels, so that labels can be placed in them
@@ -197,40 +209,38 @@ class _Scatter(NamedTuple):
     sites: list[str]
 
 
-def _draw_scatter(axes: Any, egvs: ScoreName, validation: Validation, detector: str) -> _Scatter:
-    """Draw EGVS against the detector's main measure."""
+def _draw_scatter(axes: Any, validation: Validation, detector: str) -> _Scatter:
+    """Draw the score that ranks against the detector's main measure."""
     measure = main_measure(detector)
-    scores = validation.values_of(egvs)
+    label = SCORE_LABELS[validation.check.score]
+    scale = _PERCENT if label.is_share else 1.0
     x, y, half_width, site_names = [], [], [], []
     for row in validation.detections:
         if row.detector != detector or row.objects_of != ALL_OBJECTS:
             continue
         estimate = row.measures[measure]
         if math.isfinite(estimate.value):
-            x.append(scores[row.site] / 1e3)
+            x.append(scale * validation.ranked[row.site])
             y.append(_PERCENT * estimate.value)
             half_width.append(_SIGMAS_95 * _PERCENT * estimate.se)
             site_names.append(row.site)
 
     axes.errorbar(x, y, yerr=np.nan_to_num(half_width), fmt="none", ecolor="0.7", elinewidth=1.0, zorder=1)
     axes.scatter(x, y, s=34, facecolors=_DOT_COLOUR, edgecolors="black", linewidths=0.6, zorder=3)
-    axes.set(xlabel="EGVS, thousand bits", ylabel=_MEASURE_LABELS[measure])
-    agreement = validation.agreement(egvs, detector, measure)
-    axes.set_title(f"{detector}: {_format_correlation(agreement)}", fontsize=10)
+    unit = "%" if label.is_share else label.unit
+    axes.set(xlabel=f"{label.noun}, {unit}".rstrip(", "), ylabel=_MEASURE_LABELS[measure])
+    check = next((check for check in validation.check.detectors if check.detector == detector), None)
+    axes.set_title(f"{detector}: {_format_correlation(check)}", fontsize=10)
     axes.grid(True, color="0.88", linewidth=0.7)
     axes.tick_params(labelsize=8)
     axes.margins(0.12)
     return _Scatter(x, y, site_names)
 
 
-def _format_correlation(agreement: ScoreAgreement) -> str:
-    spearman = agreement.by_kind["spearman"]
-    if not math.isfinite(spearman.value):
+def _format_correlation(check: DetectorCheck | None) -> str:
+    if check is None or check.rho.value is None:
         return "no rank correlation"
-    text = f"Spearman's rho {spearman.value:.2f}"
-    if math.isfinite(spearman.interval.low):
-        text += f" ({spearman.interval.low:.2f} to {spearman.interval.high:.2f})"
-    return f"{text}, {spearman.sites} sites"
+    return f"Spearman's rho {check.rho.text}, {check.rho.sites} sites"
 
 
 def _draw_ranking(axes: Any, egvs: ScoreName, validation: Validation, detector: str, *, with_names: bool) -> None:

@@ -1,7 +1,8 @@
 """Validates the scores of a run: ``egvs validate``.
 
 Steps: check the scenario; record traffic that the TPOG was not computed from; run each detector at each site; measure
-detection; compute every score; correlate scores with detection.
+detection; compute every score; correlate scores with detection; compare the ranking with detection
+(:mod:`egvs.validation.ranking_evidence`).
 
 Writes ``detection.parquet``, ``surrogates.parquet``, ``correlation.parquet`` and ``validation.png`` into the folder of
 the run. Their bytes depend on the scenario and the program only.
@@ -28,13 +29,14 @@ from egvs.runs import stage_keys, stage_registry
 from egvs.scenario.model import Scenario
 from egvs.sensors.sites import Site
 from egvs.stages.inputs import open_folder
-from egvs.validation import detection_metrics, kitti_results, results, surrogates
+from egvs.validation import detection_metrics, kitti_results, ranking_evidence, results, surrogates
 from egvs.validation.correlation import COEFFICIENT_KINDS, CorrelationStudy, JunctionScores, MeasureValues
 from egvs.validation.detection_metrics import ALL_OBJECTS, SiteDetection
 from egvs.validation.detector_runs import DetectionListener, SiteDetectionTask, run_detectors
 from egvs.validation.detectors import base
 from egvs.validation.held_out_traffic import FrameSampling, HeldOutTraffic
 from egvs.validation.kitti_results import NO_KITTI_FILES, KittiFiles
+from egvs.validation.ranking_evidence import SiteRanking
 from egvs.validation.results import ScoreAgreement, ScoreName, Validation
 from egvs.validation.surrogates import Surrogates
 from egvs.validation.sweeps import POINT_COUNTS_NAME, DetectedBoxes, detections_in_roi
@@ -94,8 +96,12 @@ def validate_sites(
         rows, undefined = detection_metrics.measure_detection(run.frames, record.scene.roi, by_site)
         scores = surrogates.compute_surrogates(scenario, run.folder / "scores", jobs=jobs, progress=progress)
         agreements = correlate_scores(record.scene.sites, scenario, rows, scores)
+        ranking = SiteRanking.compute(open_folder(scenario, run.folder / "scores", jobs=jobs, progress=progress))
+        sites = record.scene.sites
+        heights_m = ranking_evidence.mounting_heights_m(record.scene)
+        check = ranking_evidence.check_ranking(scenario, ranking, rows, [site.pole for site in sites], heights_m)
         warnings = (*run.warnings, *undefined, *scores.skipped)
-        validation = Validation(tuple(rows), scores, tuple(agreements), warnings, run.sample)
+        validation = Validation(tuple(rows), scores, tuple(agreements), warnings, run.sample, ranking.values, check)
 
         _write_artefacts(out, run, scenario, validation, external)
         if kitti.keep:
@@ -225,6 +231,7 @@ def _site_metadata(
     metadata["inputs"] = files.hash_json(inputs)
     metadata["stages"] = _stage_keys(scenario, run.folder / "scores")
     metadata["own_score"] = {"score": egvs.score, "parameters": egvs.parameters}
+    metadata["ranking"] = validation.check.to_json()
     if external:
         metadata["given"] = {}
     for site, by_detector in external.items():
@@ -235,7 +242,6 @@ def _site_metadata(
 def _stage_keys(scenario: Scenario, folder: Path) -> dict[str, str]:
     """Return the keys of the stages of a run whose artefacts the scores were computed from."""
     context = open_folder(scenario, folder)
-    runs.ensure_stages(context, "tpog")  # the last TPOG in the folder may have voxels of another size
     return {name: stage_keys.stage_key(name, context).key for name in stage_registry.RANKING_STAGES}
 
 

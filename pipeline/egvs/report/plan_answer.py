@@ -1,0 +1,175 @@
+"""How many sensors are enough? The answer of ``egvs place``, in the terminal and in the report.
+
+A further sensor is *useful* (:func:`is_useful`) if it adds at least :data:`MIN_USEFUL_SHARE` and its gain can be
+separated from 0, or if requirements are met only with it. A number of sensors is *enough* if no further sensor of the
+curve is useful.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+from egvs.artefacts.plan_step import PlanStep
+from egvs.artefacts.readers import DISTINCT_PROBABILITY
+from egvs.report.formatting import ScoreLabel
+
+MIN_USEFUL_SHARE = 0.01
+"""A useful sensor adds at least 1 percentage point; to scores that are no shares, at least 1 % of the plan's score."""
+
+_NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
+_ORDINALS = ("", "first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth")
+
+
+def is_useful(before: PlanStep, step: PlanStep, by: ScoreLabel) -> bool:
+    """Whether the last sensor of a plan is worth adding to the plan before it.
+
+    Parameters
+    ----------
+    before, step
+        The plan without and with it.
+    by
+        Label of the joint score.
+    """
+    if step.met and not before.met:
+        return True
+    return _is_large(step, by) and _is_separable(step)
+
+
+def _is_large(step: PlanStep, by: ScoreLabel) -> bool:
+    """Whether the gain reaches :data:`MIN_USEFUL_SHARE`."""
+    if by.is_share:
+        return step.gain >= MIN_USEFUL_SHARE
+    return step.gain >= MIN_USEFUL_SHARE * step.score
+
+
+def _is_separable(step: PlanStep) -> bool:
+    """Whether the gain is known to be above 0, or standard errors are unknown."""
+    return math.isnan(step.beats_previous) or step.beats_previous >= DISTINCT_PROBABILITY
+
+
+def describe_count(
+    steps: Sequence[PlanStep], by: ScoreLabel, *, objective: str = "", next_count: int | None = None
+) -> str:
+    """Return how many sensors are enough, in one or two sentences; empty if there is nothing to compare or to try.
+
+    Parameters
+    ----------
+    steps
+        The best plans of each number of sensors, at least one.
+    by
+        Label of the joint score.
+    objective
+        What the plans maximise, if not the joint score; then gains of the joint score do not tell what is enough.
+    next_count
+        The number of sensors to try next; None if there is no larger plan to try.
+    """
+    try_next = ""
+    if next_count is not None:
+        try_next = f"Try --count {next_count} to see what {_ordinal(next_count)} adds."
+    if len(steps) < 2:
+        return try_next
+
+    before, last = steps[-2], steps[-1]
+    if objective:
+        adds = _describe_gain(last, by)
+        return f"{_capitalise(_ordinal(last.count))} sensor adds {adds} to {by.noun}; the plan maximises {objective}."
+
+    enough = _last_useful_step(steps, by)
+    if enough < len(steps) - 1:
+        following = steps[enough + 1]
+        return (
+            f"{_capitalise(_count_is(steps[enough].count))} enough: {_ordinal(following.count)} adds "
+            f"{_describe_gain(following, by)}{_describe_chance(following, by)}."
+        )
+    if not before.met:
+        sensor = _capitalise(_ordinal(last.count))
+        answer = f"{sensor} sensor is needed to meet the requirements; it adds {_describe_gain(last, by)}."
+    else:
+        answer = (
+            f"{_capitalise(_ordinal(last.count))} sensor adds {_describe_gain(last, by)} to {by.noun}: "
+            f"{_value_with_unit(last.score, by)}, against {_value_with_unit(before.score, by)} with "
+            f"{_number(before.count)}."
+        )
+    return f"{answer} {try_next}".rstrip()
+
+
+def next_count(steps: Sequence[PlanStep], sensors: int, candidates: int, requested: Mapping[str, Any]) -> int | None:
+    """Return the number of sensors to try next; None if the plan is not limited by its count alone.
+
+    Parameters
+    ----------
+    steps
+        The best plans of each number of sensors.
+    sensors
+        Number of sensors of the plan.
+    candidates
+        Number of candidates.
+    requested
+        The keys of ``[placement]``.
+    """
+    is_limited_otherwise = requested["budget"] is not None or requested["reach"] is not None
+    if is_limited_otherwise or sensors < steps[-1].count or sensors >= candidates:
+        return None
+    return sensors + 1
+
+
+def _last_useful_step(steps: Sequence[PlanStep], by: ScoreLabel) -> int:
+    """Return the index of the last plan whose last sensor is useful; the first one's always is."""
+    last = 0
+    for number, (before, step) in enumerate(pairwise(steps), start=1):
+        if is_useful(before, step, by):
+            last = number
+    return last
+
+
+def _describe_gain(step: PlanStep, by: ScoreLabel) -> str:
+    """What the last sensor of a plan adds, with its standard error and its unit."""
+    if step.gain == 0.0:
+        return "nothing"
+    if by.is_zero(step.gain):
+        return f"less than {by.smallest_change} {by.change_unit}".rstrip()
+    text = f"{by.change(step.gain, step.gain_se)} {by.change_unit}".rstrip()
+    if by.is_share or not step.score > 0.0:
+        return text
+    return f"{text} ({step.gain / step.score:.1%} of the plan's score)"
+
+
+def _describe_chance(step: PlanStep, by: ScoreLabel) -> str:
+    """Say that a gain is large enough, but may be due to chance; empty otherwise."""
+    if _is_large(step, by) and not _is_separable(step):
+        return ", which may be chance"
+    return ""
+
+
+def _value_with_unit(value: float, by: ScoreLabel) -> str:
+    return f"{by.value(value)} {by.unit}".rstrip()
+
+
+def _number(count: int) -> str:
+    if count < len(_NUMBERS):
+        return _NUMBERS[count]
+    return str(count)
+
+
+def _count_is(count: int) -> str:
+    return "one is" if count == 1 else f"{_number(count)} are"
+
+
+def _ordinal(count: int) -> str:
+    """Return "a third", "an eighth", "a 12th"."""
+    if count < len(_ORDINALS):
+        word = _ORDINALS[count]
+    elif count % 100 in (11, 12, 13):
+        word = f"{count}th"
+    else:
+        suffix = {1: "st", 2: "nd", 3: "rd"}.get(count % 10, "th")
+        word = f"{count}{suffix}"
+    article = "an" if word == "eighth" or word.startswith(("8", "11th", "18th")) else "a"
+    return f"{article} {word}"
+
+
+def _capitalise(text: str) -> str:
+    return text[0].upper() + text[1:]

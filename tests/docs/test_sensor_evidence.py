@@ -1,0 +1,100 @@
+"""What the program and docs/validity.md say about rankings of different sensors follows from the published table."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from itertools import combinations
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from egvs.report.sensor_results import SENSOR_EVIDENCE
+
+DOCS = Path(__file__).parents[2] / "docs"
+DETECTORS = ("cluster", "pointpillars")
+
+
+class Measured(NamedTuple):
+    pole: str
+    sensor: str
+    expected: float
+    ap: float
+    share: float
+
+
+def measured(detector: str) -> list[Measured]:
+    """One row per site; shares and AP (mean of BEV and 3D) in per cent."""
+    with (DOCS / "data" / "sensors_at_nishishinjuku.csv").open(newline="") as file:
+        return [
+            Measured(
+                row["pole"],
+                row["sensor"],
+                100 * float(row["expected_share"]),
+                100 * float(row[f"{detector}_ap"]),
+                100 * float(row[f"{detector}_share"]),
+            )
+            for row in csv.DictReader(file)
+        ]
+
+
+def wrong_pairs(sites: list[Measured], belongs: Callable[[Measured, Measured], bool]) -> tuple[int, list[float]]:
+    """Number of pairs, and the AP lost in those that the score puts in the wrong order."""
+    pairs = [(a, b) for a, b in combinations(sites, 2) if belongs(a, b)]
+    return len(pairs), [abs(a.ap - b.ap) for a, b in pairs if (a.ap - b.ap) * (a.expected - b.expected) <= 0]
+
+
+def differ_in_both(a: Measured, b: Measured) -> bool:
+    return a.pole != b.pole and a.sensor != b.sensor
+
+
+def mean_by_sensor(sites: list[Measured], value: Callable[[Measured], float]) -> dict[str, float]:
+    return {
+        sensor: float(np.mean([value(s) for s in sites if s.sensor == sensor])) for sensor in {s.sensor for s in sites}
+    }
+
+
+def worst_gain_error(sites: list[Measured]) -> float:
+    """Largest error of the difference of two sensors in the share found, mean over the poles."""
+    errors = mean_by_sensor(sites, lambda site: site.expected - site.share)
+    return max(errors.values()) - min(errors.values())
+
+
+def test_best_sensor_of_a_pole_loses_little() -> None:
+    lost = []
+    for detector in DETECTORS:
+        sites = measured(detector)
+        for pole in {site.pole for site in sites}:
+            here = [site for site in sites if site.pole == pole]
+            lost.append(max(site.ap for site in here) - max(here, key=lambda site: site.expected).ap)
+    assert len(lost) == 10
+    assert 0.5 < max(lost) <= 1.0
+    assert "lost at most 1 point of AP" in SENSOR_EVIDENCE
+    same_pole = [wrong_pairs(measured(detector), lambda a, b: a.pole == b.pole) for detector in DETECTORS]
+    assert [(pairs, len(lost)) for pairs, lost in same_pole] == [(30, 0), (30, 2)]
+
+
+def test_pairs_with_another_pole_and_another_sensor() -> None:
+    results = [wrong_pairs(measured(detector), differ_in_both) for detector in DETECTORS]
+    assert [(pairs, len(lost)) for pairs, lost in results] == [(120, 14), (120, 22)]
+    assert [round(max(lost)) for _, lost in results] == [16, 13]
+    assert "14 (cluster) and 22 (pointpillars) of 120 pairs" in SENSOR_EVIDENCE
+    assert "by up to 16 points" in SENSOR_EVIDENCE
+
+
+def test_differences_of_shares_between_sensors() -> None:
+    assert [worst_gain_error(measured(detector)) for detector in DETECTORS] == pytest.approx([14.1, 11.4], abs=0.1)
+    assert "off by up to 14 points" in SENSOR_EVIDENCE
+
+
+def test_page_has_the_numbers_of_the_table() -> None:
+    page = (DOCS / "validity.md").read_text(encoding="utf-8")
+    for detector in DETECTORS:
+        sites = measured(detector)
+        shares = mean_by_sensor(sites, lambda site: site.share)
+        for sensor, share in mean_by_sensor(sites, lambda site: site.expected).items():
+            row = next(line for line in page.splitlines() if line.startswith(f"| {sensor} |"))
+            assert f" {share:.0f} % |" in row
+            assert f" {shares[sensor]:.0f} % " in row

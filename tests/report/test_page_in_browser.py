@@ -1,0 +1,119 @@
+"""The report with all its sections in a browser: no width scrolls the page sideways, wide tables scroll by themselves.
+
+The run has long names, periods, columns of the user, a plan, a validation and a study of the accuracy.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.conftest import write_mini
+from tests.processes import run_egvs
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.system,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium"),
+]
+
+SITES = """\
+site,x_m,y_m,z_m,yaw_deg,owner of the pole,note
+corner_of_a_street_with_a_long_name@3m-10deg,10,12,3,-130,the municipal utilities,a_word_of_33_letters_without_break
+corner_of_a_street_with_a_long_name@5m-10deg,10,12,5,-130,the municipal utilities,
+pole_b,30.5,-12,3,120,,behind the shelter
+"""
+
+PERIODS = "traffic.periods=[{name='morning_peak', length_s=12}, {name='evening_peak', begin_s=12, length_s=8}]"
+
+SECTIONS = (
+    "Where the sites are", "Ranking", "What the score means", "The best site on each pole",
+    "Your columns from the sites file", "By period", "Where the traffic is", "What a site sees and misses",
+    "Which sites together?", "Does the score predict detection?", "What accuracy costs in computing time",
+    "Input data and computing time", "What is not modelled",
+)  # fmt: skip
+
+OUTSIDE = """() => [...document.querySelectorAll("body *")]
+    .filter(e => !e.closest(".scroll, svg, select") && e.getBoundingClientRect().right > innerWidth + 1)
+    .map(e => `${e.tagName} ${e.className}: ${e.textContent.slice(0, 40)}`)"""
+
+TEXTS_THAT_OVERLAP = """selector => {
+    const boxes = [...document.querySelector(selector).querySelectorAll("text.label")]
+        .filter(e => getComputedStyle(e).display !== "none")
+        .map(e => ({text: e.textContent, box: e.getBoundingClientRect()}));
+    const apart = (a, b) => a.right <= b.left || b.right <= a.left || a.bottom <= b.top || b.bottom <= a.top;
+    return boxes.flatMap((a, i) => boxes.slice(i + 1).filter(b => !apart(a.box, b.box)).map(b => [a.text, b.text]));
+}"""
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report of a run with every section."""
+    folder = tmp_path_factory.mktemp("all_sections")
+    scenario, out = write_mini(folder / "mini"), folder / "run"
+    (scenario / "sites.csv").write_text(SITES)
+    for verb in (
+        ("run",),
+        ("place", "--count", "2"),
+        ("validate", "--frames", "10", "--spacing", "0.5", "--detector", "points", "--jobs", "1"),
+        ("accuracy", "--budget", "0.001s"),
+    ):
+        done = run_egvs(verb[0], scenario, "--out", out, "--set", PERIODS, *verb[1:])
+        assert done.returncode == 0, done.stderr
+    return out / "report.html"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield opened
+        opened.close()
+
+
+@pytest.fixture(params=[(390, "light"), (390, "dark"), (768, "light"), (1280, "light")], ids=str)
+def page(report: Path, browser: Any, request: pytest.FixtureRequest) -> Iterator[Any]:
+    """The report in a window of this width."""
+    width, scheme = request.param
+    opened = browser.new_page(color_scheme=scheme, viewport={"width": width, "height": 900})
+    opened.goto(report.as_uri())
+    yield opened
+    opened.close()
+
+
+def test_report_has_every_section_with_the_map_before_the_tables(page: Any) -> None:
+    assert page.locator("h2").all_inner_texts() == ["Before you trust this ranking", *SECTIONS]
+    tops = page.evaluate("['svg', 'table'].map(e => document.querySelector(e).getBoundingClientRect().top)")
+    assert tops[0] < tops[1]
+
+
+def test_page_does_not_scroll_sideways(page: Any) -> None:
+    assert page.evaluate("document.documentElement.scrollWidth - innerWidth") == 0
+    assert page.evaluate(OUTSIDE) == []
+
+
+def test_wide_tables_scroll_by_themselves_on_a_phone(report: Path, browser: Any) -> None:
+    page = browser.new_page(viewport={"width": 390, "height": 900})
+    page.goto(report.as_uri())
+    page.add_style_tag(content="table { min-width: 60rem; }")  # whatever the names, now they are all too wide
+    regions = page.locator(".scroll:has(table)")
+    assert regions.count() >= 6
+    for region in regions.all():
+        name = region.get_attribute("aria-label")
+        assert region.get_attribute("tabindex") == "0", name  # so that the arrow keys scroll it
+        assert region.evaluate("e => { e.scrollLeft = 9999; return e.scrollLeft; }") > 0, name
+    assert page.locator("table").count() == page.locator(".scroll table").count()
+    assert page.evaluate("document.documentElement.scrollWidth - innerWidth") == 0
+    page.close()
+
+
+def test_labels_of_the_map_do_not_overlap(page: Any) -> None:
+    assert page.evaluate(TEXTS_THAT_OVERLAP, "[aria-label='Map of the sites']") == []

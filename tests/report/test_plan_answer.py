@@ -1,0 +1,110 @@
+"""How many sensors are enough, in sentences."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from egvs.artefacts.plan_step import PlanStep
+from egvs.report.formatting import SCORE_LABELS
+from egvs.report.plan_answer import describe_count, is_useful, next_count
+
+FOUND = SCORE_LABELS["expected_detections"]
+EGVS = SCORE_LABELS["egvs"]
+NO_LIMIT = {"budget": None, "reach": None}
+
+
+def steps_of(*scores: float, gain_se: float = math.nan, beats: float = math.nan) -> list[PlanStep]:
+    """The plans of 1, 2, ... sensors with these joint scores."""
+    steps = []
+    for number, score in enumerate(scores, start=1):
+        gain = score - (scores[number - 2] if number > 1 else 0.0)
+        steps.append(PlanStep(number, score, gain, met=True, gain_se=gain_se, beats_previous=beats))
+    return steps
+
+
+def test_says_how_many_are_enough() -> None:
+    steps = steps_of(0.946, 0.992, 0.997, gain_se=0.002, beats=0.99)
+    assert describe_count(steps, FOUND) == "Two are enough: a third adds 0.5 ± 0.2 percentage points."
+    assert describe_count(steps_of(0.99, 0.9912), FOUND) == "One is enough: a second adds 0.1 percentage points."
+
+
+def test_says_what_the_last_sensor_adds_where_it_is_still_useful() -> None:
+    steps = steps_of(0.9455, 0.9922, gain_se=0.005, beats=0.999)
+    assert describe_count(steps, FOUND, next_count=3) == (
+        "A second sensor adds 4.7 ± 0.5 percentage points to the share of vehicles found: 99.2%, against 94.5% with "
+        "one. Try --count 3 to see what a third adds."
+    )
+    assert describe_count(steps, FOUND).endswith("against 94.5% with one.")
+
+
+def test_bits_are_compared_with_the_score_of_the_plan() -> None:
+    steps = steps_of(247397.0, 381218.0, gain_se=2100.0, beats=1.0)
+    assert describe_count(steps, EGVS) == (
+        "A second sensor adds 133,821 ± 2,100 bit (35.1% of the plan's score) to EGVS: 381,218 bit, against "
+        "247,397 bit with one."
+    )
+    steps = steps_of(39000.0, 39300.0, gain_se=50.0, beats=1.0)
+    assert describe_count(steps, EGVS) == "One is enough: a second adds 300 ± 50 bit (0.8% of the plan's score)."
+
+
+def test_gain_that_may_be_chance_is_not_useful() -> None:
+    steps = steps_of(0.80, 0.83, gain_se=0.03, beats=0.82)
+    assert describe_count(steps, FOUND) == (
+        "One is enough: a second adds 3.0 ± 3.0 percentage points, which may be chance."
+    )
+    assert is_useful(*steps_of(0.80, 0.83, beats=0.9), FOUND)
+    assert is_useful(*steps_of(0.80, 0.83), FOUND)  # without standard errors, the size alone counts
+
+
+def test_sensor_that_adds_nothing_or_next_to_nothing() -> None:
+    assert describe_count(steps_of(0.9, 0.9), FOUND) == "One is enough: a second adds nothing."
+    assert describe_count(steps_of(0.9, 0.9002), FOUND) == (
+        "One is enough: a second adds less than 0.1 percentage points."
+    )
+
+
+def test_useful_sensor_after_one_that_is_not_counts() -> None:
+    answer = describe_count(steps_of(0.80, 0.805, 0.90, 0.901), FOUND)
+    assert answer.startswith("Three are enough: a fourth adds 0.1 ")
+
+
+def test_sensor_that_meets_requirements_is_useful() -> None:
+    first, second = steps_of(0.99, 0.992)
+    assert describe_count([replace(first, met=False), second], FOUND) == (
+        "A second sensor is needed to meet the requirements; it adds 0.2 percentage points."
+    )
+
+
+def test_other_objective_has_no_verdict() -> None:
+    answer = describe_count(steps_of(0.848, 0.834), FOUND, objective="the score in the worst period", next_count=3)
+    assert answer == (
+        "A second sensor adds -1.4 percentage points to the share of vehicles found; the plan maximises the score in "
+        "the worst period."
+    )
+
+
+def test_single_number_of_sensors_has_only_a_hint() -> None:
+    assert describe_count(steps_of(0.9), FOUND) == ""
+    assert describe_count(steps_of(0.9), FOUND, next_count=2) == "Try --count 2 to see what a second adds."
+
+
+def test_next_count_only_where_the_count_is_the_limit() -> None:
+    steps = steps_of(0.8, 0.9)
+    assert next_count(steps, 2, 13, NO_LIMIT) == 3
+    assert next_count(steps, 2, 2, NO_LIMIT) is None
+    assert next_count(steps, 1, 13, NO_LIMIT) is None  # a second one adds nothing
+    assert next_count(steps, 2, 13, {"budget": 100.0, "reach": None}) is None
+    assert next_count(steps, 2, 13, {"budget": None, "reach": 0.9}) is None
+
+
+@pytest.mark.parametrize(
+    ("count", "words"),
+    [(8, "Seven are enough: an eighth"), (11, "Ten are enough: an 11th"), (13, "12 are enough: a 13th"),
+     (22, "21 are enough: a 22nd")],
+)  # fmt: skip
+def test_numbers_are_words_up_to_ten(count: int, words: str) -> None:
+    useful = [0.02 * number for number in range(1, count)]
+    assert describe_count(steps_of(*useful, useful[-1]), FOUND).startswith(f"{words} adds nothing")

@@ -1,0 +1,344 @@
+"""Each set of settings has a run folder; runs are listed; commands accept a run and use its settings."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import egvs
+from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
+from egvs.artefacts.run_record import RunRecord
+from egvs.core import files
+from egvs.core.errors import InputError
+from egvs.core.files import add_checksum
+from egvs.runs import run_list, run_sources
+from egvs.runs.run_sources import SettingsSource
+from egvs.scenario.settings import format_overrides
+
+OTHER = Path("runs/mini@gamma=5")
+
+
+@pytest.fixture
+def here(mini: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The scenario ``mini`` in the working folder."""
+    monkeypatch.chdir(mini.parent)
+    return Path("mini")
+
+
+def make_later(folder: Path, seconds: float) -> None:
+    """Make a run later than it was."""
+    path = RunFolder(folder).lock
+    os.utime(path, (path.stat().st_atime + seconds, path.stat().st_mtime + seconds))
+
+
+def digests(folder: Path) -> dict[str, str]:
+    return {path.name: files.hash_file(path) for path in folder.glob("*.parquet")}
+
+
+def test_run_with_overrides_leaves_the_run_as_written(here: Path, run_egvs: Any) -> None:
+    assert run_egvs("run", here)[0] == 0
+    before = digests(Path("runs/mini"))
+    code, printed, _ = run_egvs("run", here, "--set", "score.gamma=5")
+    assert (code, "report: runs/mini@gamma=5/report.html" in printed) == (0, True)
+    assert digests(Path("runs/mini")) == before
+    assert digests(OTHER)["scores.parquet"] != before["scores.parquet"]
+    assert RunRecord.read(OTHER).overrides == {"score.gamma": 5.0}
+    assert RunRecord.read(Path("runs/mini")).overrides == {}
+    assert sorted(path.name for path in Path("runs").iterdir()) == ["mini", "mini@gamma=5"]
+
+
+def test_stage_with_overrides_restores_the_stages_before_it(here: Path, run_egvs: Any) -> None:
+    egvs.run(egvs.load(here))
+    code, printed, messages = run_egvs("score", here, "--set", "score.gamma=5")
+    assert (code, str(OTHER / "scores.parquet") in printed) == (0, True)
+    restored = [line.split()[0] for line in messages.splitlines() if "from store" in line]
+    assert restored == ["statics", "scan", "traffic", "occupancy"]
+    assert list(RunRecord.read(OTHER).stages) == ["statics", "scan", "traffic", "tpog", "score"]
+    egvs.run(egvs.load(here, ["score.gamma=5"]), "fresh")
+    assert digests(OTHER) == digests(Path("fresh"))
+
+
+def test_first_stage_restores_nothing(here: Path, run_egvs: Any) -> None:
+    egvs.run(egvs.load(here))
+    assert run_egvs("traffic", here, "--set", "score.gamma=5")[0] == 0
+    assert list(RunRecord.read(OTHER).stages) == ["traffic"]
+
+
+def test_stage_without_the_stages_before_it_names_the_missing_file(
+    here: Path, run_egvs: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    egvs.run(egvs.load(here))
+    monkeypatch.setenv("EGVS_STORE", "")
+    code, _, message = run_egvs("score", here, "--set", "score.gamma=5")
+    assert code == 2
+    assert message == f"egvs: {OTHER}/statics.ply: no such file. Run the stage that writes statics.ply first.\n"
+
+
+# ---- egvs runs
+
+
+def test_lists_runs_latest_first_with_what_differs_and_the_best_site(here: Path, run_egvs: Any) -> None:
+    egvs.run(egvs.load(here))
+    egvs.run(egvs.load(here, ["score.gamma=5", "traffic.frames=20"]))
+    make_later(Path("runs/mini@frames=20,gamma=5"), 60)
+    code, printed, _ = run_egvs("runs")
+    head, latest, plain = printed.splitlines()
+    assert code == 0
+    assert head.split()[:3] == ["run", "scenario", "differs"]
+    assert latest.split()[:5] == ["mini@frames=20,gamma=5", "mini", "score.gamma=5,", "traffic.frames=20", "complete"]
+    assert plain.split()[:3] == ["mini", "mini", "complete"]
+    scores = egvs.read_scores("runs/mini/scores.parquet").to_pylist()
+    best = max(scores, key=lambda row: row["egvs"])
+    assert plain.split()[3:8] == [best["site"], f"{best['egvs']:,.0f}", "bit", "egvs", "2"]
+    make_later(Path("runs/mini"), 120)
+    assert [run.folder.name for run in run_list.list_runs()] == ["mini", "mini@frames=20,gamma=5"]
+
+
+def test_repeated_run_is_the_latest_although_no_stage_ran(here: Path) -> None:
+    egvs.run(egvs.load(here))
+    egvs.run(egvs.load(here, ["score.gamma=5"]))
+    make_later(Path("runs/mini"), -60)
+    assert run_list.list_runs()[0].folder == OTHER
+    make_later(OTHER, -60)
+    egvs.run(egvs.load(here))
+    assert run_list.list_runs()[0].folder == Path("runs/mini")
+
+
+def test_list_reads_sizes_and_missing_stages(here: Path, run_egvs: Any) -> None:
+    assert run_egvs("statics", here)[0] == 0
+    (listed,) = run_list.list_runs()
+    assert listed.missing == tuple(name for name in STAGE_NAMES if name != "statics")
+    assert listed.best is None
+    assert listed.size_bytes == sum(path.stat().st_size for path in Path("runs/mini").rglob("*"))
+    assert "without check, scan" in run_egvs("runs")[1]
+
+
+BROKEN = {
+    "damaged record": ("run.json", "{", "run.json: is not valid JSON"),
+    "changed record": ("run.json", None, "run.json: was changed after the run"),
+    "damaged scores": ("scores.parquet", "x", "scores.parquet: "),
+}
+
+
+@pytest.mark.parametrize(("name", "content", "problem"), BROKEN.values(), ids=BROKEN)
+def test_lists_broken_runs_with_their_problem(
+    here: Path, run_egvs: Any, name: str, content: str | None, problem: str
+) -> None:
+    egvs.run(egvs.load(here))
+    egvs.run(egvs.load(here, ["score.gamma=5"]))
+    path = OTHER / name
+    path.write_text(path.read_text().replace('"seed": 7', '"seed": 8', 1) if content is None else content)
+    code, printed, message = run_egvs("runs")
+    assert (code, message) == (0, "")
+    lines = {line.split()[0]: line for line in printed.splitlines()}
+    assert problem in lines[OTHER.name]
+    assert "complete" in lines["mini"]
+
+
+def test_lists_interrupted_run_and_no_other_folder(here: Path) -> None:
+    for name in ("stopped", "notes", ".store"):
+        (Path("runs") / name).mkdir(parents=True)
+    for name in ("stopped", ".store"):
+        (Path("runs") / name / ".lock").touch()
+    (listed,) = run_list.list_runs()
+    assert (listed.folder.name, listed.problem) == ("stopped", "run.json: no such file")
+
+
+def test_list_of_another_folder(here: Path, run_egvs: Any) -> None:
+    assert run_egvs("runs", "elsewhere")[::2] == (
+        2, "egvs: elsewhere: no such folder. Give a folder that contains run folders.\n"
+    )  # fmt: skip
+    Path("elsewhere").mkdir()
+    assert run_egvs("runs", "elsewhere") == (0, "no runs\n", "")
+    egvs.run(egvs.load(here), "elsewhere/one")
+    assert run_egvs("runs", "elsewhere")[1].splitlines()[1].startswith("one ")
+
+
+# ---- commands on a run folder
+
+
+def test_settings_of_a_run_are_used(here: Path) -> None:
+    egvs.run(egvs.load(here, ["score.gamma=5", "sites.yaw_deg=3"]))
+    (folder,) = Path("runs").glob("mini@*")
+    source = SettingsSource.of(folder)
+    scenario = source.load()
+    assert source.is_run
+    assert (scenario.score.gamma, scenario.sites.yaw_deg) == (5.0, 3.0)
+    assert scenario.overrides == {"score.gamma": 5.0, "sites.yaw_deg": 3.0}
+    assert source.folder(scenario) == folder
+    assert run_sources.changed_files(folder, scenario) == run_sources.edited_settings(scenario) == []
+
+
+def test_plan_of_a_run_is_written_into_it(here: Path, run_egvs: Any) -> None:
+    assert run_egvs("run", here, "--set", "score.gamma=5")[0] == 0
+    scores = digests(OTHER)["scores.parquet"]
+    code, printed, messages = run_egvs("place", OTHER, "--count", 1)
+    assert (code, str(OTHER / "placement.parquet") in printed) == (0, True)
+    assert "warning" not in messages and "differ" not in messages
+    assert digests(OTHER)["scores.parquet"] == scores
+    assert not Path("runs/mini").exists()
+    assert RunRecord.read(OTHER).overrides == {"score.gamma": 5.0}
+
+
+def test_options_of_place_replace_the_request_that_a_run_recorded(here: Path, run_egvs: Any) -> None:
+    (here / "scenario.toml").write_text((here / "scenario.toml").read_text() + "\n[costs]\npole = 10\n")
+    assert run_egvs("place", here, "--count", 1)[0] == 0
+    assert [path.name for path in Path("runs").iterdir()] == ["mini"]
+    assert RunRecord.read(Path("runs/mini")).scenario["placement"]["count"] == 1
+    code, printed, messages = run_egvs("place", "runs/mini", "--budget", 20)
+    assert (code, "differ" in messages) == (0, False)
+    assert "pole_a" in printed and "pole_b" in printed
+    placement = RunRecord.read(Path("runs/mini")).scenario["placement"]
+    assert (placement["count"], placement["budget"]) == (None, 20)
+    assert run_egvs("place", "runs/mini")[0] == 0  # the recorded request
+
+
+def test_check_accepts_a_run(here: Path, run_egvs: Any) -> None:
+    egvs.run(egvs.load(here, ["score.gamma=5"]))
+    code, printed, _ = run_egvs("check", OTHER)
+    assert (code, "checked 2 sites" in printed) == (0, True)
+
+
+def test_effects_of_a_run_name_its_scenario_and_overrides(here: Path, run_egvs: Any) -> None:
+    egvs.run(egvs.load(here, ["score.gamma=5"]))
+    code, printed, _ = run_egvs("effects", OTHER)
+    assert code == 0
+    assert "egvs run mini --set score.gamma=5.0 --set 'effects." in printed
+    assert f"egvs accuracy {OTHER}" in printed.replace("'", "")
+
+
+@pytest.mark.slow
+def test_accuracy_and_validation_of_a_run_are_written_into_it(here: Path, run_egvs: Any) -> None:
+    egvs.run(egvs.load(here, ["score.gamma=5"]))
+    code, printed, messages = run_egvs("accuracy", OTHER, "--budget", "1s")
+    assert code == 0, messages
+    assert RunFolder(OTHER).accuracy.is_file()
+    assert "egvs run mini --set score.gamma=5.0" in printed
+    code, _, messages = run_egvs("validate", OTHER, "--frames", 10, "--detector", "points")
+    assert code == 0, messages
+    assert RunFolder(OTHER).detection.is_file()
+    assert [path.name for path in Path("runs").iterdir()] == [OTHER.name]
+
+
+@pytest.mark.parametrize("verb", ["place", "validate", "accuracy", "effects", "check"])
+def test_rejects_overrides_of_a_run(here: Path, run_egvs: Any, verb: str) -> None:
+    egvs.run(egvs.load(here))
+    code, _, message = run_egvs(verb, "runs/mini", "--set", "score.gamma=5")
+    assert code == 2
+    assert message == "egvs: --set: cannot be used with a run folder (runs/mini). Give the scenario instead.\n"
+    assert [path.name for path in Path("runs").iterdir()] == ["mini"]
+
+
+def test_folder_with_scenario_and_run_is_a_scenario(here: Path) -> None:
+    egvs.run(egvs.load(here, ["score.gamma=5"]), here)
+    assert SettingsSource.of(here).load().score.gamma == 4.0
+
+
+# ---- what has changed
+
+
+def test_says_in_which_settings_a_scenario_differs_from_its_latest_run(here: Path, run_egvs: Any) -> None:
+    def note(*words: object) -> str:
+        lines = run_egvs("place", here, "--count", 1, *words)[2].splitlines()
+        return "\n".join(line for line in lines if "differ" in line)
+
+    assert note() == ""  # no run
+    egvs.run(egvs.load(here, ["score.gamma=5", "traffic.frames=20"]))
+    latest = Path("runs/mini@frames=20,gamma=5")
+    make_later(latest, 60)
+    there = f"settings differ from the latest run, {latest}: "
+    assert note() == f"{there}score.gamma (5 there, 4 here), traffic.frames (20 there, 40 here)"
+    assert note("--set", "score.gamma=5") == f"{there}traffic.frames (20 there, 40 here)"
+    assert note("--set", "score.gamma=5", "--set", "traffic.frames=20") == ""
+
+
+def test_latest_run_is_one_of_the_same_scenario(here: Path, tmp_path: Path) -> None:
+    from tests.conftest import write_mini
+
+    other = write_mini(tmp_path / "other")
+    egvs.run(egvs.load(here))
+    egvs.run(egvs.load(other, ["score.gamma=5"]))
+    make_later(Path("runs/other@gamma=5"), 60)
+    latest = run_list.latest_difference(egvs.load(here), Path("runs/mini"))
+    assert latest == (Path("runs/mini"), {})
+
+
+def test_run_given_by_out_is_compared_as_well(here: Path) -> None:
+    egvs.run(egvs.load(here, ["score.gamma=5"]), "kept")
+    latest = run_list.latest_difference(egvs.load(here), Path("kept"))
+    assert latest == (Path("kept"), {"score.gamma": (5.0, 4.0)})
+    assert run_list.latest_difference(egvs.load(here), Path("runs/mini")) is None
+
+
+def test_warns_of_files_that_have_changed_since_the_run(here: Path, run_egvs: Any) -> None:
+    egvs.run(egvs.load(here, ["score.gamma=5"]))
+    (here / "sites.csv").write_text((here / "sites.csv").read_text() + "pole_c,15,-8,3\n")
+    code, printed, messages = run_egvs("place", OTHER, "--count", 1)
+    assert code == 0
+    assert f"warning: sites.csv has changed since the run in {OTHER}: its stages run again as needed" in messages
+    assert "of all 3 candidates" in printed
+
+
+def test_says_which_settings_the_scenario_file_has_changed_since_the_run(here: Path, run_egvs: Any) -> None:
+    egvs.run(egvs.load(here, ["score.gamma=5"]))
+    file = here / "scenario.toml"
+    file.write_text(file.read_text().replace("frames = 40", "frames = 20").replace("gamma = 4", "gamma = 3"))
+    messages = run_egvs("place", OTHER, "--count", 1)[2]
+    assert f"the settings of {OTHER} are used; mini/scenario.toml now differs in traffic.frames\n" in messages
+    assert RunRecord.read(OTHER).scenario["traffic"]["frames"] == 40
+
+
+def test_run_whose_scenario_is_gone_is_rejected(here: Path, run_egvs: Any) -> None:
+    egvs.run(egvs.load(here))
+    here.rename("moved")
+    code, _, message = run_egvs("place", "runs/mini", "--count", 1)
+    assert (code, message) == (
+        2,
+        "egvs: runs/mini/run.json: the scenario's folder mini does not exist. Give the scenario instead of the run.\n",
+    )
+
+
+# ---- the record
+
+
+def test_record_of_an_older_version_has_no_overrides(here: Path) -> None:
+    egvs.run(egvs.load(here, ["score.gamma=5"]))
+    path = RunFolder(OTHER).run_record
+    values = json.loads(path.read_text())
+    del values["overrides"], values[files.CHECKSUM_KEY]
+    path.write_text(json.dumps(add_checksum(values)))
+    assert RunRecord.read(OTHER).overrides == {}
+    assert run_list.list_runs()[0].problem == ""
+
+
+def test_record_with_overrides_of_another_type_is_rejected(here: Path) -> None:
+    egvs.run(egvs.load(here))
+    path = RunFolder(Path("runs/mini")).run_record
+    values = json.loads(path.read_text()) | {"overrides": ["score.gamma"]}
+    del values[files.CHECKSUM_KEY]
+    path.write_text(json.dumps(add_checksum(values)))
+    with pytest.raises(InputError, match="'overrides' is"):
+        RunRecord.read(Path("runs/mini"))
+
+
+WRITTEN = (
+    ["score.gamma=5.0"],
+    ["score.gamma=inf"],
+    ["effects.rain={rate_mm_h=20}", "effects.divergence={}"],
+    ["traffic.kinds.car.length_m=5"],
+    ['sites.sensor="VLP-16"', 'description="a \\"b\\"\\n"'],
+    ["sites.pitch_deg=[0, 10]", "statics.polygon_types={building.shed=2.5}"],
+)
+
+
+@pytest.mark.parametrize("overrides", WRITTEN, ids=lambda overrides: overrides[0])
+def test_recorded_overrides_can_be_given_again(mini: Path, overrides: list[str]) -> None:
+    scenario = egvs.load(mini, overrides)
+    assert scenario.overrides
+    again = egvs.load(mini, format_overrides(scenario.overrides))
+    assert again == scenario
+    assert again.overrides == scenario.overrides
