@@ -26,7 +26,15 @@ from egvs.report import figures, formatting, maps
 from egvs.report.basemap import network_file
 from egvs.report.colours import STYLE_SHEET
 from egvs.report.figures import Figures
-from egvs.report.ranking import RankedSite, Ranking, entropy_seen_note, headline, lead, share_of_limit
+from egvs.report.ranking import (
+    RankedSite,
+    Ranking,
+    entropy_seen_note,
+    headline,
+    lead,
+    recorded_frames_hint,
+    share_of_limit,
+)
 from egvs.report.sections import (
     PlacementSummary,
     StudySummary,
@@ -159,6 +167,7 @@ def _displayed_settings(scenario: Scenario) -> dict[str, Any]:
         "weights": scenario.score.weights.in_words,
         "assumed": assumptions(scenario),
         "blindspots": scenario.score.blindspots,
+        "sampled_frames": scenario.score.sampled_frames,
         "costs": scenario.costs.model_dump(mode="json"),
         "effects": scenario.effects.model_dump(mode="json"),
     }
@@ -316,7 +325,7 @@ def _sentences(contents: PageContents) -> dict[str, str]:
     return {
         "headline": headline(ranking, bool(tpog.counts.any())),
         "contradiction": "" if contents.detected is None else contents.detected.check.contradiction,
-        "lead": lead(ranking),
+        "lead": lead(ranking, recorded_frames_hint(scenario, ranking, contents.stages)),
         "entropy_seen_note": entropy_seen_note(ranking),
         "disagreement": ranking_disagreement(ranking.sites, setting),
     }
