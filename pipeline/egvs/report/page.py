@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,6 +40,7 @@ from egvs.report.sections import (
     StudySummary,
     ValidationSummary,
     assumptions,
+    describe_counts,
     egvs_setting,
     ranking_disagreement,
 )
@@ -92,6 +93,8 @@ class PageContents:
         Records of the stages, as far as ``run.json`` has them, in the order of :data:`STAGES`.
     study, by_period, detected, plan
         Results of other commands and of periods; None if those commands have not run.
+    movements
+        What each counted location is in words; empty if the run folder has no network.
     """
 
     scenario: Scenario
@@ -103,6 +106,7 @@ class PageContents:
     by_period: PeriodRanking | None = None
     detected: ValidationSummary | None = None
     plan: PlacementSummary | None = None
+    movements: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -207,6 +211,7 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
         by_period=PeriodRanking.read(out),
         detected=ValidationSummary.read(out, stages),
         plan=PlacementSummary.read(out, stages, ranking.sites, tpog, drawn.backdrop),
+        movements=describe_counts(work.scenario, network_file(out)),
     )
     html = render_page(contents)
     files.write_text(work.folder.report, html)
