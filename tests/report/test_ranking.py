@@ -35,7 +35,7 @@ def test_sentences_for_a_score_over_vehicles() -> None:
     detected = by_vehicles(("a", 50.0, 0.871), ("b", 90.0, 0.8), ("c", 20.0, 0.4))
     assert (
         report_ranking.headline(detected, has_traffic=True)
-        == "a is the best of 3 sites: it should find 87% of vehicles"
+        == "a is the best of 3 sites: it should find 87.1% of vehicles"
     )
     assert report_ranking.lead(detected) == "It leads the next site, b, by 7.1 percentage points."
     assert report_ranking.entropy_seen_note(detected) == ""
@@ -45,7 +45,7 @@ def test_sentences_for_a_score_over_vehicles() -> None:
     assert detected.sites[0].score_se == 0.01 and detected.companion_score is SCORE_LABELS["egvs"]
     assert (
         report_ranking.headline(by_vehicles(("a", 50.0, 0.871)), has_traffic=True)
-        == "a, the only site, should find 87% of vehicles"
+        == "a, the only site, should find 87.1% of vehicles"
     )
     assert by_vehicles(("a", 50.0, 0.9), rank_by="egvs").companion_score is SCORE_LABELS["expected_detections"]
     assert ranking(("a", 50.0, 1, 0.5, 1.0)).companion_score is None
