@@ -51,6 +51,16 @@ def test_sentences_for_a_score_over_vehicles() -> None:
     assert ranking(("a", 50.0, 1, 0.5, 1.0)).companion_score is None
 
 
+def test_gain_of_a_pole_is_in_percentage_points_for_shares_and_relative_otherwise() -> None:
+    shares = by_vehicles(("a", 50.0, 0.6), ("b", 90.0, 0.4), ("c", 20.0, 0.0)).sites
+    assert report_ranking.Pole("p", shares[:2]).gain_text == "20.0"
+    assert report_ranking.Pole("p", shares).gain_text == "60.0"
+    assert report_ranking.Pole("p", shares[:1]).gain_text == ""
+    bits = ranking(("a", 60.0, 1, 0.5, 1.0), ("b", 40.0, 2, 0.5, 1.0), ("c", 0.0, 3, 0.0, 1.0)).sites
+    assert report_ranking.Pole("p", bits[:2]).gain_text == "50.0%"
+    assert report_ranking.Pole("p", bits).gain_text == ""
+
+
 def test_lead_says_whether_the_best_is_certain() -> None:
     """Two that share the first place cannot beat each other; whether they lead is another matter."""
     ahead = ranking(("a", 100.0, 1, 0.5, 0.5), ("b", 100.0, 1, 0.6, 0.99), ("c", 80.0, 3, 0.4, 1.0))
