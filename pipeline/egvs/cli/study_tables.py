@@ -173,22 +173,29 @@ def _describe_recommendation(study: AccuracyStudy, command: str) -> str:
     candidates = [row for row in study.rows if row.kind in ("approximates", "scenario")]
     best = study.best
     if best is None and len(candidates) == 1:
-        error = f"{candidates[0].judged:.2%}"
-        return f"the budget only covered the scenario's own setting, with an error of {error}: increase --budget"
+        return (
+            f"the budget only covered the scenario's own setting, with {_describe_error(candidates[0])}: "
+            "increase --budget"
+        )
     if best is None:
         nearest = min(candidates, key=lambda row: row.judged)
-        error = f"{nearest.judged:.2%}"
-        return f"no setting is within {study.tolerance:.2%}; the closest is {nearest.setting!r}, with {error}"
+        within = f"no setting is within {study.tolerance:.2%}"
+        return f"{within}; the closest is {nearest.setting!r}, with {_describe_error(nearest)}"
 
-    standard_error = "unknown" if math.isnan(best.error_se) else f"{best.error_se:.2%}"
     note = ""
     if any(row.judged <= study.tolerance and row.seconds < best.seconds for row in candidates):
         note = f" (cheaper settings save less than {MIN_TIME_SAVING:.0%})"
     sentence = (
         f"recommended within {study.tolerance:.2%}: {best.setting}, {best.seconds:.2f} s{note}, "
-        f"error {best.error:.2%}, standard error {standard_error}"
+        f"{_describe_error(best)}"
     )
     return f"{sentence}\n  {command} {best.overrides}".rstrip()
+
+
+def _describe_error(row: SettingResult) -> str:
+    """Name the two columns of the table of which the larger one must be within the tolerance."""
+    standard_error = "unknown" if math.isnan(row.error_se) else f"{row.error_se:.2%}"
+    return f"error {row.error:.2%} and standard error {standard_error}"
 
 
 _FILE_WIDTH = 190
