@@ -186,8 +186,7 @@ def _describe_recommendation(study: AccuracyStudy, command: str) -> str:
     if any(row.judged <= study.tolerance and row.seconds < best.seconds for row in candidates):
         note = f" (cheaper settings save less than {MIN_TIME_SAVING:.0%})"
     sentence = (
-        f"recommended within {study.tolerance:.2%}: {best.setting}, {best.seconds:.2f} s{note}, "
-        f"{_describe_error(best)}"
+        f"recommended within {study.tolerance:.2%}: {best.setting}, {best.seconds:.2f} s{note}, {_describe_error(best)}"
     )
     return f"{sentence}\n  {command} {best.overrides}".rstrip()
 
