@@ -29,6 +29,7 @@ from egvs.report.sensor_results import (
     costs_option,
     difference_unit,
     format_difference,
+    range_note,
 )
 from egvs.studies.study_settings import MEASURES, SCENARIO, TRAFFIC
 from egvs.studies.traffic_options import OPTION_KNOBS, SeedSpread
@@ -380,6 +381,9 @@ def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparis
         out.print(
             f"What one more point costs: egvs compare {folders} {option}, or [costs] in scenario.toml", soft_wrap=True
         )
+    is_modelled = all(run.has_range_limit for run in comparison.runs)
+    if note := range_note(sensors.sensors, is_modelled=is_modelled):
+        out.print(note, soft_wrap=True)
     out.print(sensors.evidence, soft_wrap=True)
     out.print()
 

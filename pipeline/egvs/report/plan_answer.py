@@ -107,8 +107,9 @@ def describe_count(
         is_smaller = bool(plans) and 0 < len(plans[enough].sites) < len(plans[-1].sites)
         if is_smaller and has_budget:
             only = "only " if steps[enough + 1].gain else ""
+            _, _, ordinal = further.partition(" ")
             return (
-                f"The budget buys {_number(len(plans[-1].sites))} sensors; the {further.partition(' ')[2]} adds {only}{gain}, so "
+                f"The budget buys {_number(len(plans[-1].sites))} sensors; the {ordinal} adds {only}{gain}, so "
                 f"{_count_is(steps[enough].count)} enough: {plans[enough].text}."
             )
         names = f" ({plans[enough].text})" if is_smaller else ""
