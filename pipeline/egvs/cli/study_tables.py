@@ -31,6 +31,7 @@ from egvs.report.sensor_results import (
     format_difference,
     range_note,
 )
+from egvs.scenario.settings import effect_state
 from egvs.studies.study_settings import MEASURES, SCENARIO, TRAFFIC
 from egvs.studies.traffic_options import OPTION_KNOBS, SeedSpread
 
@@ -476,6 +477,8 @@ def _difference_table(comparison: Comparison) -> Table:
 
 def _format_setting(run: int, difference: Difference) -> str:
     value = difference.values[run]
+    if state := effect_state(difference.what, value):
+        return state
     if value is None:
         return "-"
     if isinstance(value, str):
