@@ -107,7 +107,6 @@ SAME = {
     "a table": (["score={gamma=5, others=[]}"], ["score.others=[]", "score.gamma=5"]),
     "what the file says": (["score.gamma=4.0"], []),
     "a default": (["scan.keep=true"], []),
-    "a path with another direction": (["sites.yaw_deg=3"], ["sites.aim=roi", "sites.yaw_deg=3"]),
 }
 
 
