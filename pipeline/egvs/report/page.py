@@ -44,7 +44,7 @@ from egvs.report.sections import (
     egvs_setting,
     ranking_disagreement,
 )
-from egvs.report.sensor_results import SensorComparison, costs_option
+from egvs.report.sensor_results import SensorComparison, costs_option, range_note
 from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.scene_inputs import scan_dependencies
@@ -304,8 +304,10 @@ def _setting_values(contents: PageContents) -> dict[str, Any]:
 def _sensor_values(contents: PageContents) -> dict[str, Any]:
     """The best mount of each sensor; None where there is one sensor."""
     sensors = SensorComparison.of_run(contents.ranking.sites, contents.scenario.costs)
+    names = [site.sensor for site in contents.ranking.sites]
     return {
         "sensors": sensors,
+        "range_note": range_note(names, is_modelled=contents.scenario.effects.range_limit is not None),
         "costs_option": costs_option(sensors.sensors) if sensors is not None else "",
     }
 
