@@ -360,7 +360,7 @@ COMMANDS = {
     "--traci without port": (["traffic", "{mini}", "--traci", "here"], r"--traci: expected HOST:PORT, got 'here'"),
     "--cloud unknown": (["scan", "{mini}", "--cloud", "xyz"], r"--cloud: expected ply or pcd, got 'xyz'"),
     "stage before its inputs": (["tpog", "{mini}", "--out", "{out}"], r"trajectories.parquet|statics.ply"),
-    "verify nothing": (["verify", "{out}"], r"run.json: no such file"),
+    "verify nothing": (["verify", "{out}"], r"out: no such folder"),
     "jobs 0": (["run", "{mini}", "--jobs", "0"], r"--jobs"),
     "--at no place": (
         ["new", "{out}", "--osm", "x.osm", "--at", "here"],

@@ -391,7 +391,7 @@ def test_rejects_folders_without_finished_run(two: tuple[Path, Path], tmp_path: 
         compare_runs(two[:1])
     with pytest.raises(InputError, match="expected at least one run, got none"):
         compare_runs([])
-    with pytest.raises(InputError, match=r"run\.json: no such file. Give a folder written by egvs run."):
+    with pytest.raises(InputError, match=r"nowhere: no such folder. Give a folder written by egvs run."):
         compare_runs([two[0], tmp_path / "nowhere"])
     record = json.loads((two[1] / "run.json").read_text())
     (two[1] / "scores.parquet").write_bytes((two[0] / "scores.parquet").read_bytes())

@@ -77,8 +77,8 @@ class ListedRun:
 def list_runs(folder: Path = RUNS) -> list[ListedRun]:
     """Return the run folders in a folder, the latest one first.
 
-    Only ``run.json`` and ``scores.parquet`` are read. A folder in which a run was at work, but that has no valid
-    record, is listed with its problem; other folders are left out.
+    Only ``run.json`` and ``scores.parquet`` are read. A folder into which a run wrote files, but that has no
+    valid record, is listed with its problem; other folders are left out.
 
     Parameters
     ----------
@@ -136,8 +136,12 @@ def _run_folders(folder: Path) -> list[Path]:
 
 
 def _was_used(folder: RunFolder) -> bool:
-    """Whether a run was at work in a folder; the store, which has a lock too, has a hidden name."""
-    return folder.has_record or (folder.lock.is_file() and not folder.path.name.startswith("."))
+    """Whether a run wrote files into a folder; the store, which has a lock too, has a hidden name."""
+    if folder.has_record:
+        return True
+    if not folder.lock.is_file() or folder.path.name.startswith("."):
+        return False
+    return any(path != folder.lock for path in folder.path.iterdir())
 
 
 def _last_run_s(folder: Path) -> float:
@@ -148,6 +152,8 @@ def _last_run_s(folder: Path) -> float:
 
 def _read_run(folder: Path) -> ListedRun:
     last_run_s, size_bytes = _last_run_s(folder), sum(_file_sizes(folder))
+    if not RunFolder(folder).has_record:
+        return ListedRun(folder, last_run_s, size_bytes, problem="never finished")
     try:
         record = RunRecord.read(folder)
         best = _read_best(folder) if "score" in record.stages else None
