@@ -210,7 +210,7 @@ BAD: dict[str, tuple[Change, str]] = {
     "site too far": (sites("a,1,500,3"), r"site a: the site is 490.0 m from the region of interest"),
     "unknown sensor": (
         edit('sensor = "small"', 'sensor = "VLP32C"'),
-        r"unknown sensor 'VLP32C'\. Did you mean VLP-32C\?",
+        r"scenario\.toml: sites\.sensor: unknown sensor 'VLP32C'\. Did you mean VLP-32C\?",
     ),
     "pitch beyond 90": (
         sites("a,1,12,3,100", head="site,x_m,y_m,z_m,pitch_deg"),

@@ -398,8 +398,21 @@ CATALOGUE: Mapping[str, Sensor] = _Catalogue()
 
 
 def scenario_sensor(name: str, scenario: Scenario, where: str) -> Sensor:
-    """Return the sensor called ``name``, see :func:`resolve_sensor`; beam tables are relative to the scenario."""
+    """Return the sensor called ``name``, see :func:`resolve_sensor`; beam tables are relative to the scenario.
+
+    Messages name the key of ``[sites]`` that sets this sensor, if there is one, in place of ``where``.
+    """
+    where = _sites_key(name, scenario) or where
     return resolve_sensor(name, scenario.sensors, where, lambda file: scenario.find(file, f"sensors.{name}.beams"))
+
+
+def _sites_key(name: str, scenario: Scenario) -> str:
+    """Return file and key of ``[sites]`` that set a sensor; empty if only rows of the sites file do."""
+    for key in ("replace_sensor", "sensor"):
+        if getattr(scenario.sites, key) == name:
+            file = "--set" if f"sites.{key}" in scenario.overrides else scenario.file
+            return f"{file}: sites.{key}"
+    return ""
 
 
 def resolve_sensor(
@@ -429,7 +442,9 @@ def resolve_sensor(
         return CATALOGUE[name]
     known = [*custom, *CATALOGUE]
     similar = difflib.get_close_matches(name, known, 1, 0.4)
-    hint = f"Did you mean {similar[0]}?" if similar else f"Known sensors are {', '.join(known)}."
+    hint = f"Known sensors are {', '.join(known)}."
+    if similar:
+        hint = f"Did you mean {similar[0]}? egvs sensors lists them."
     raise InputError(where, f"unknown sensor {name!r}", hint)
 
 
