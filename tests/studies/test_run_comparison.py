@@ -322,6 +322,8 @@ def test_prints_how_to_set_costs_or_what_one_more_point_costs(monkeypatch: pytes
     assert "one more point costs" in text
     assert "1,000" in text  # 5000 for 5 points
     assert "PRICE" not in text
+    text = printed_text(by_pole(replace(a, costs=costs), made_run("B", *mounts("u", 0.95))), 160, monkeypatch)
+    assert """'costs.sensor={"s" = PRICE, "u" = PRICE}'""" in text
     assert SENSOR_EVIDENCE.split(".")[0] in text
 
 
@@ -329,12 +331,13 @@ def test_costs_of_the_command_line_replace_those_of_the_run(mini: Path, tmp_path
     egvs.run(egvs.load(mini, ["costs.pole=5", "costs.sensor={small=7}"]), tmp_path / "run")
     both = [tmp_path / "run", tmp_path / "run"]
     assert compare_runs(both).runs[0].costs == CostsConfig(pole=5, sensor={"small": 7})
-    overridden = compare_runs(both, costs=["costs.sensor={small=9, other=3}", "costs.metre=2"]).runs[1].costs
-    assert overridden == CostsConfig(pole=5, metre=2, sensor={"small": 9, "other": 3})
+    overridden = compare_runs(both, costs=["costs.sensor={small=9, VLP-16=3}", "costs.metre=2"]).runs[1].costs
+    assert overridden == CostsConfig(pole=5, metre=2, sensor={"small": 9, "VLP-16": 3})
     for override, message in (
         ("traffic.frames=3", "--set traffic.frames=3: expected a key of [costs]"),
         ("costs.pole=-1", "--set: costs.pole: expected a value greater than or equal to 0, got -1"),
         ("costs.lamp=1", "costs.lamp"),
+        ("costs.sensor={smal=9}", "--set: costs.sensor: unknown sensor 'smal'. Did you mean small?"),
     ):
         code, printed, error = run_egvs("compare", *both, "--set", override)
         assert (code, printed) == (2, "")

@@ -27,7 +27,7 @@ import difflib
 import hashlib
 import math
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from pathlib import Path
@@ -440,12 +440,40 @@ def resolve_sensor(
         return _sensor_from_config(name, custom[name], "the scenario", find)
     if name in CATALOGUE:
         return CATALOGUE[name]
+    raise _unknown_sensor(name, custom, where)
+
+
+def check_sensor_names(names: Iterable[str], custom: Iterable[str], where: str) -> None:
+    """Check that names are those of sensors.
+
+    Parameters
+    ----------
+    names
+        The names.
+    custom
+        Names of sensors that are known besides those of the catalogue.
+    where
+        File and key, for messages.
+
+    Raises
+    ------
+    InputError
+        For an unknown name, with the nearest one that exists.
+    """
+    custom = tuple(custom)
+    for name in names:
+        if name not in custom and name not in CATALOGUE:
+            raise _unknown_sensor(name, custom, where)
+
+
+def _unknown_sensor(name: str, custom: Iterable[str], where: str) -> InputError:
+    """Return the error for an unknown sensor, with the nearest name that exists."""
     known = [*custom, *CATALOGUE]
     similar = difflib.get_close_matches(name, known, 1, 0.4)
     hint = f"Known sensors are {', '.join(known)}."
     if similar:
         hint = f"Did you mean {similar[0]}? egvs sensors lists them."
-    raise InputError(where, f"unknown sensor {name!r}", hint)
+    return InputError(where, f"unknown sensor {name!r}", hint)
 
 
 def _sensor_from_config(name: str, config: SensorConfig, source: str, find: Callable[[str], Path]) -> Sensor:

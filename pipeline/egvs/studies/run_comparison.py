@@ -35,6 +35,7 @@ from egvs.report.sensor_results import ScoreDifference, SensorComparison, Sensor
 from egvs.scenario.costs import costs_from_dict
 from egvs.scenario.score_config import CostsConfig
 from egvs.scenario.settings import flatten_settings
+from egvs.sensors.sensor import check_sensor_names
 from egvs.studies.paired_errors import ScoreDifferences, SiteOfRun
 from egvs.studies.score_errors import best_sites, rank_agreement, regret
 
@@ -236,12 +237,13 @@ def compare_runs(
     Raises
     ------
     InputError
-        If there is a single run with one sensor, a folder contains no finished run, its scores were changed, or the
-        first run has no pole in common with any other.
+        If there is a single run with one sensor, a folder contains no finished run, its scores were changed, a cost is
+        that of an unknown sensor, or the first run has no pole in common with any other.
     """
     runs = tuple(_read_run(Path(folder), run_label(number), costs) for number, folder in enumerate(folders))
     if not runs:
         raise InputError("compare", "expected at least one run, got none", "Give folders of finished runs.")
+    _check_priced_sensors(runs, costs)
     is_single = len(runs) == 1
     if is_single:
         runs = _split_by_sensor(runs[0], by)
@@ -307,6 +309,13 @@ def _read_run(folder: Path, label: str, cost_overrides: Sequence[str]) -> Compar
             input_files |= {file: digest for file, digest in stage.files.items() if file not in artefacts}
     costs = costs_from_dict(record.scenario, cost_overrides, str(RunFolder(folder).run_record))
     return ComparedRun(label, folder, Ranking.read(path), settings, input_files, costs)
+
+
+def _check_priced_sensors(runs: Sequence[ComparedRun], cost_overrides: Sequence[str]) -> None:
+    """InputError if an override is the cost of an unknown sensor."""
+    compared = dict.fromkeys(sensor for run in runs for sensor in run.sensors)
+    priced = costs_from_dict({}, cost_overrides, "--set").sensor
+    check_sensor_names(priced, compared, "--set: costs.sensor")
 
 
 def _split_by_sensor(run: ComparedRun, by: View | None) -> tuple[ComparedRun, ...]:
