@@ -529,7 +529,7 @@ def sensors() -> None:
     run_tables.print_sensors(CATALOGUE.values())
 
 
-@app.command()
+@app.command(cls=cli_options.PolesCommand)
 def new(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the new scenario.")],
     osm: Annotated[
