@@ -173,6 +173,20 @@ def test_run_that_waited_for_one_that_failed_has_its_folder(here: Path, monkeypa
         pass
 
 
+def test_report_of_a_run_folder(here: Path, run_egvs: Any) -> None:
+    egvs.run(egvs.load(here, ["score.gamma=5"]))
+    before, record = (OTHER / "report.html").read_bytes(), RunRecord.read(OTHER)
+    (OTHER / "report.html").unlink()
+    code, printed, _ = run_egvs("report", OTHER)
+    assert (code, str(OTHER / "report.html") in printed) == (0, True)
+    assert (OTHER / "report.html").read_bytes() == before
+    assert RunRecord.read(OTHER).overrides == record.overrides
+    message = (
+        f"egvs: {OTHER}: expected a scenario.toml, got none. This is a run folder. Give the scenario's folder, mini.\n"
+    )
+    assert run_egvs("run", OTHER)[::2] == (2, message)
+
+
 def test_folders_without_a_run_are_explained(here: Path, run_egvs: Any) -> None:
     Path("runs/stopped").mkdir(parents=True)
     Path("runs/stopped/.lock").touch()

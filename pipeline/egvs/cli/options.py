@@ -7,10 +7,9 @@ import re
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
-from click import Context
 from typer.core import TyperCommand
 
 from egvs.core.errors import InputError
@@ -139,7 +138,7 @@ def pole_spacing_m(rule: str, spacing: str) -> float:
 class PolesCommand(TyperCommand):
     """A command that accepts ``--poles 20m`` for ``--poles every 20m``."""
 
-    def parse_args(self, ctx: Context, args: list[str]) -> list[str]:
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Insert the word that is missing."""
         words: list[str] = []
         for arg in args:
