@@ -191,7 +191,7 @@ def test_folders_without_a_run_are_explained(here: Path, run_egvs: Any) -> None:
     Path("runs/stopped").mkdir(parents=True)
     Path("runs/stopped/.lock").touch()
     message = "egvs: runs/stopped: the run in this folder never finished. Leave it out, or repeat its egvs run.\n"
-    assert run_egvs("compare", "runs/stopped", "runs/stopped")[::2] == (2, message)
+    assert run_egvs("compare", "runs/stopped")[::2] == (2, message)
     message = (
         "egvs: mini: this is a scenario; expected a run folder. First run egvs run mini, then give its run folder.\n"
     )
@@ -307,6 +307,9 @@ def test_says_in_which_settings_a_scenario_differs_from_its_latest_run(here: Pat
     assert note() == f"{there}score.gamma (5 there, 4 here), traffic.frames (20 there, 40 here)"
     assert note("--set", "score.gamma=5") == f"{there}traffic.frames (20 there, 40 here)"
     assert note("--set", "score.gamma=5", "--set", "traffic.frames=20") == ""
+    egvs.run(egvs.load(here))
+    make_later(latest, 120)
+    assert note() == ""  # an earlier run has these settings
 
 
 def test_latest_run_is_one_of_the_same_scenario(here: Path, tmp_path: Path) -> None:

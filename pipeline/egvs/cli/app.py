@@ -303,6 +303,7 @@ def compare(
         from egvs.cli import study_tables
         from egvs.studies import run_comparison
 
+        run_comparison.check_distinct(runs)
         comparison = run_comparison.compare_runs(runs, by, set_ or (), screen.progress)
     study_tables.print_comparison(comparison, top)
 

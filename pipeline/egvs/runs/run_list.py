@@ -98,6 +98,8 @@ def list_runs(folder: Path = RUNS) -> list[ListedRun]:
 def latest_difference(scenario: Scenario, out: Path) -> tuple[Path, dict[str, tuple[Any, Any]]] | None:
     """Return the latest run of a scenario, and the settings in which it differs from the present ones.
 
+    A complete run with the present settings, if there is one, takes precedence over later ones.
+
     Parameters
     ----------
     scenario
@@ -113,18 +115,23 @@ def latest_difference(scenario: Scenario, out: Path) -> tuple[Path, dict[str, tu
     folders = set(_run_folders(RUNS))
     if RunFolder(out).has_record:
         folders.add(out)
+    latest = None
     for folder in sorted(folders, key=_last_run_s, reverse=True):
         try:
-            source = folder / RunRecord.read(folder).scenario_folder
+            record = RunRecord.read(folder)
+            source = folder / record.scenario_folder
             if source.resolve() != scenario.folder.resolve():
                 continue
             recorded = run_sources.recorded_scenario(folder)
         except InputError:  # no valid record, which "egvs runs" lists
             continue
-        there, here = (flatten_settings(each.model_dump(mode="json")) for each in (recorded, scenario))
         changed = run_sources.compared_settings(recorded, scenario)
-        return folder, {key: (there.get(key), here.get(key)) for key in changed}
-    return None
+        if not changed and all(stage in record.stages for stage in STAGE_NAMES):
+            return folder, {}
+        if latest is None:
+            there, here = (flatten_settings(each.model_dump(mode="json")) for each in (recorded, scenario))
+            latest = folder, {key: (there.get(key), here.get(key)) for key in changed}
+    return latest
 
 
 def _run_folders(folder: Path) -> list[Path]:
