@@ -217,7 +217,11 @@ PLACE = "site,x_m,y_m\np,0,0\n"
             r"row p: pitch_deg: .*'aim', but .*yaw_deg, 30",
         ),
         (ROW, {"aim_m": "[0, 0, 1]"}, r"row p: aim: \(0, 0, 1\) is directly above or below the sensor"),
-        (ROW, {"aim": "roi", "sensor": "VLP-33"}, r"row p: sensor: unknown sensor 'VLP-33'. Did you mean VLP-32C"),
+        (
+            ROW,
+            {"aim": "roi", "sensor": "VLP-33"},
+            r"^--set: sites.sensor: unknown sensor 'VLP-33'. Did you mean VLP-32C",
+        ),
         ("site,x_m,y_m,z_m,aim_x_m\np,0,0,6,5\n", {}, r"row p: aim: one of aim_x_m and aim_y_m is missing"),
         ("site,x_m,y_m,z_m,aim\np,0,0,6,ROI\n", {}, r"row p: aim: .*'roi', got 'ROI'.*aim_x_m and aim_y_m"),
         ("site,x_m,y_m,z_m,aim,aim_x_m\np,0,0,6,roi,3\n", {}, r"row p: aim: .*'roi' and at a point"),

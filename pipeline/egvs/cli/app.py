@@ -6,7 +6,7 @@ the verb that needs them, so that ``egvs --help`` is quick.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -216,9 +216,9 @@ def score(
 
 
 @app.command()
-def report(scenario: ScenarioPath, out: Out = None, set_: Set = None) -> None:
+def report(scenario: SettingsPath, out: Out = None, set_: Set = None) -> None:
     """Write the report of a run, report.html."""
-    _run_stage("report", scenario, out, set_)
+    _run_stage("report", scenario, out, set_, open_source=sources.open_source)
 
 
 def _run_stage(
@@ -228,16 +228,17 @@ def _run_stage(
     set_: list[str] | None,
     jobs: int | None = None,
     top: int | None = None,
+    open_source: Callable[..., tuple[Scenario, Path]] = _load,
     **stage_options: Any,
 ) -> None:
-    """Run one stage and print the files that it wrote."""
+    """Run one stage and print the files that it wrote; ``open_source`` returns the scenario and its run folder."""
     from egvs.cli.console import ProgressDisplay
 
     with ProgressDisplay(stage, with_details=True) as screen:
         from egvs.cli import run_tables
         from egvs.runs import run
 
-        loaded, folder = _load(scenario, set_, out)
+        loaded, folder = open_source(scenario, set_, out)
         record = run.run_one(
             stage, loaded, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, **stage_options
         )
@@ -302,6 +303,7 @@ def compare(
         from egvs.cli import study_tables
         from egvs.studies import run_comparison
 
+        run_comparison.check_distinct(runs)
         comparison = run_comparison.compare_runs(runs, by, set_ or (), screen.progress)
     study_tables.print_comparison(comparison, top)
 
@@ -529,7 +531,7 @@ def sensors() -> None:
     run_tables.print_sensors(CATALOGUE.values())
 
 
-@app.command()
+@app.command(cls=cli_options.PolesCommand)
 def new(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the new scenario.")],
     osm: Annotated[
