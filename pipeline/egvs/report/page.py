@@ -276,6 +276,7 @@ def _ranking_values(ranking: Ranking) -> dict[str, Any]:
         "companion": ranking.companion_score,
         "crowded": maps.is_crowded(ranking.sites),
         "rings": maps.has_stacked_sites(ranking.sites),
+        "map_names": maps.describe_names(ranking.sites),
         "limit_share": limit_share,
         "best_name": ranking.sites[0].site,
     }
