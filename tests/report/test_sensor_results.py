@@ -16,6 +16,7 @@ from egvs.report.sensor_results import (
     best_mounts,
     costs_option,
     format_difference,
+    range_note,
     site_cost,
 )
 from egvs.scenario.score_config import CostsConfig
@@ -135,3 +136,9 @@ def test_difference_in_bits_has_no_percentage_points() -> None:
     bits = replace(site("a", "s", 0.65), rank_by="egvs", others=())
     assert format_difference(ScoreDifference(1234.4, 56.0, 1.0), bits) == "+1,234 ±56"
     assert math.isclose(bits.score, 650.0)
+
+
+def test_several_sensors_without_range_limit_have_a_note() -> None:
+    assert range_note(["a", "b", "a"], is_modelled=False).endswith("Try --set effects.range_limit={}.")
+    assert range_note(["a", "b", "a"], is_modelled=True) == ""
+    assert range_note(["a", "a"], is_modelled=False) == ""

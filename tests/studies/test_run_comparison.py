@@ -102,6 +102,16 @@ def made_run(label: str, *sites: RankedSite, **settings: object) -> ComparedRun:
     return ComparedRun(label, Path(label.lower()), Ranking.of(sites), settings, {})
 
 
+def test_range_limit_is_enabled_by_its_table_or_any_of_its_keys() -> None:
+    def has_range_limit(**settings: object) -> bool:
+        return made_run("A", row("p", 9.0), **settings).has_range_limit
+
+    assert has_range_limit(**{"effects.range_limit": {}})
+    assert has_range_limit(**{"effects.range_limit.softness": 0.2})
+    assert not has_range_limit(**{"effects.range_limit": None})
+    assert not has_range_limit(**{"effects.rain.rate_mm_h": 5.0})
+
+
 def test_rank_agreement_computed_by_hand() -> None:
     """Three sites of four in common; two of their three pairs in the same order: tau = (2 - 1) / 3."""
     a = made_run("A", *(row(s, v) for s, v in (("p", 9.0), ("q", 8.0), ("r", 4.0), ("x", 99.0))))

@@ -573,7 +573,10 @@ def new(
         ),
     ] = None,
 ) -> None:
-    """Create a scenario from an OpenStreetMap extract."""
+    """Create a scenario from an OpenStreetMap extract.
+
+    Its scenario.toml has a template for peaks and other parts of the day (traffic.periods).
+    """
     from egvs.cli import new_summary
     from egvs.importers import openstreetmap
 

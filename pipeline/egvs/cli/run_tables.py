@@ -219,6 +219,7 @@ def _format_beats_next(site: RankedSite, last: RankedSite) -> str:
 def poles_table(sites: Sequence[RankedSite], top: int | None = None) -> Table:
     """Return the best candidate of each of the ``top`` poles, how it is mounted, and its lead over the worst one."""
     by = _ranking_score(sites)
+    gain_head = f"beats worst by, {by.change_head}" if by.is_share else "beats worst by"
     columns: list[Column[Pole]] = [
         Column("rank", lambda pole: str(pole.best.rank)),
         Column("pole", lambda pole: pole.name, "left", wrap=True),
@@ -228,7 +229,7 @@ def poles_table(sites: Sequence[RankedSite], top: int | None = None) -> Table:
         Column("pitch deg", lambda pole: f"{pole.best.pitch_deg:.1f}"),
         Column(by.head, lambda pole: _format_score(by, pole.best)),
         Column("candidates", lambda pole: str(len(pole.sites))),
-        Column("beats worst by", lambda pole: format_or_dash(pole.gain, ".1%")),
+        Column(gain_head, lambda pole: pole.gain_text or "-"),
     ]
     poles = group_by_pole(sorted(sites, key=lambda site: site.rank))
     return make_table(columns, poles[:top], title="best candidate on each pole")

@@ -38,8 +38,28 @@ _NO_EVIDENCE = (
     "a measurement for {}."
 )
 
+_RANGE_NOTE = (
+    "The range of a sensor on dark vehicles is not modelled: sensors with a short rated range look better than they "
+    "are. Try --set effects.range_limit={}."
+)
+
 _PROBABILITY_DIGITS = 6
 """The last bits of a distribution function depend on the machine."""
+
+
+def range_note(sensors: Iterable[str], *, is_modelled: bool) -> str:
+    """Return a sentence where sensors are compared without their range on dark vehicles; empty otherwise.
+
+    Parameters
+    ----------
+    sensors
+        Names of the sensors.
+    is_modelled
+        Whether the effect ``range_limit`` is enabled in all runs.
+    """
+    if is_modelled or len(set(sensors)) < 2:
+        return ""
+    return _RANGE_NOTE
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,8 @@ _IGNORED_SETTINGS = ("name", "description", "extends")
 _EGVS_KEYS = ("roi.center_m", "roi.size_m", "roi.voxel_m", "score.gamma")
 """Settings that must be equal to compare EGVS in bits."""
 
+_RANGE_LIMIT = "effects.range_limit"
+
 _NAMED = 4
 """Number of names in a note."""
 
@@ -91,6 +93,12 @@ class ComparedRun:
             f"ComparedRun({self.label}: {self.folder}, {len(self.sites)} sites on {len(self.poles)} poles, "
             f"{', '.join(self.sensors)}; best {best.site}, {best.by.with_noun(best.score)})"
         )
+
+    @property
+    def has_range_limit(self) -> bool:
+        """Whether the effect ``range_limit`` was enabled."""
+        keys = [key for key, value in self.settings.items() if value is not None]
+        return any(key == _RANGE_LIMIT or key.startswith(f"{_RANGE_LIMIT}.") for key in keys)
 
     @cached_property
     def sites(self) -> Mapping[str, RankedSite]:
