@@ -108,7 +108,7 @@ def run(
     if not screen.any_stage_ran:
         screen.say("no stage ran: no input has changed since the last run")
     if all_:
-        run_tables.print_scores(folder, record)
+        run_tables.print_scores(folder, record, before_answer=True)
     if verbose:
         run_tables.print_costs(folder, record)
     run_tables.print_audit(record)
@@ -494,7 +494,7 @@ def export(
 @app.command()
 def figure(
     run: Run,
-    what: Annotated[str, typer.Option(metavar="FIGURE", help="ranking, map, tpog, seen or missed.")],
+    what: Annotated[str, typer.Option(metavar="FIGURE", help="Required: ranking, map, tpog, seen or missed.")] = "",
     site: Annotated[
         str | None, typer.Option(metavar="SITE", help="For seen and missed: the site; the best one by default.")
     ] = None,
@@ -510,6 +510,8 @@ def figure(
     from egvs.cli.console import ProgressDisplay
     from egvs.export import figure
 
+    if not what:
+        raise InputError("--what", f"expected one of {', '.join(figure.FIGURES)}", "Use --what ranking.")
     width_mm = cli_options.width_mm(size, figure.MIN_WIDTH_MM, figure.MAX_WIDTH_MM)
     with ProgressDisplay("figure") as screen:
         path = figure.draw_figure(run, what, site=site, kind=kind, width_mm=width_mm, out=out, progress=screen.progress)
