@@ -26,7 +26,15 @@ from egvs.report import figures, formatting, maps
 from egvs.report.basemap import network_file
 from egvs.report.colours import STYLE_SHEET
 from egvs.report.figures import Figures
-from egvs.report.ranking import RankedSite, Ranking, entropy_seen_note, headline, lead, share_of_limit
+from egvs.report.ranking import (
+    RankedSite,
+    Ranking,
+    entropy_seen_note,
+    headline,
+    lead,
+    recorded_frames_hint,
+    share_of_limit,
+)
 from egvs.report.sections import (
     PlacementSummary,
     StudySummary,
@@ -36,7 +44,7 @@ from egvs.report.sections import (
     egvs_setting,
     ranking_disagreement,
 )
-from egvs.report.sensor_results import SensorComparison, costs_option
+from egvs.report.sensor_results import SensorComparison, costs_option, range_note
 from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.scene_inputs import scan_dependencies
@@ -163,6 +171,7 @@ def _displayed_settings(scenario: Scenario) -> dict[str, Any]:
         "weights": scenario.score.weights.in_words,
         "assumed": assumptions(scenario),
         "blindspots": scenario.score.blindspots,
+        "sampled_frames": scenario.score.sampled_frames,
         "costs": scenario.costs.model_dump(mode="json"),
         "effects": scenario.effects.model_dump(mode="json"),
     }
@@ -267,6 +276,7 @@ def _ranking_values(ranking: Ranking) -> dict[str, Any]:
         "companion": ranking.companion_score,
         "crowded": maps.is_crowded(ranking.sites),
         "rings": maps.has_stacked_sites(ranking.sites),
+        "map_names": maps.describe_names(ranking.sites),
         "limit_share": limit_share,
         "best_name": ranking.sites[0].site,
     }
@@ -295,8 +305,10 @@ def _setting_values(contents: PageContents) -> dict[str, Any]:
 def _sensor_values(contents: PageContents) -> dict[str, Any]:
     """The best mount of each sensor; None where there is one sensor."""
     sensors = SensorComparison.of_run(contents.ranking.sites, contents.scenario.costs)
+    names = [site.sensor for site in contents.ranking.sites]
     return {
         "sensors": sensors,
+        "range_note": range_note(names, is_modelled=contents.scenario.effects.range_limit is not None),
         "costs_option": costs_option(sensors.sensors) if sensors is not None else "",
     }
 
@@ -321,7 +333,7 @@ def _sentences(contents: PageContents) -> dict[str, str]:
     return {
         "headline": headline(ranking, bool(tpog.counts.any())),
         "contradiction": "" if contents.detected is None else contents.detected.check.contradiction,
-        "lead": lead(ranking),
+        "lead": lead(ranking, recorded_frames_hint(scenario, ranking, contents.stages)),
         "entropy_seen_note": entropy_seen_note(ranking),
         "disagreement": ranking_disagreement(ranking.sites, setting),
     }

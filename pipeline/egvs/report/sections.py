@@ -409,15 +409,23 @@ class PlacementSummary:
         occupied = tpog.counts.sum(axis=2) / tpog.frames
         poles = _planned_poles(picks, joint, by)
         steps, objective = plan_steps(curve_rows), describe_objective(plan["asked"])
-        next_count = plan_answer.next_count(steps, len(picks), plan["candidates"], plan["asked"])
+        curve = _curve(steps, curve_rows, plan["together"] or math.inf)
+        answer = plan_answer.describe_count(
+            steps,
+            by,
+            plans=[plan_answer.CurvePlan(row.sites, row.cost) for row in curve],
+            has_budget=plan["asked"]["budget"] is not None,
+            objective=objective,
+            next_count=plan_answer.next_count(steps, len(picks), plan["candidates"], plan["asked"]),
+        )
         return cls(
             by=by,
             picks=picks,
-            curve=_curve(steps, curve_rows, plan["together"] or math.inf),
+            curve=curve,
             joint=joint,
             together=plan["together"],
             errors_from=plan.get("standard_errors", "the plan was made by an older version of egvs place"),
-            answer=plan_answer.describe_count(steps, by, objective=objective, next_count=next_count),
+            answer=answer,
             cost=plan["cost"],
             candidates=plan["candidates"],
             proof=_describe_proof(plan, len(picks)),
