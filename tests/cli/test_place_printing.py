@@ -101,3 +101,13 @@ def test_costs_are_printed_only_where_they_are_set(capsys: pytest.CaptureFixture
     text = printed(placed_two(curve_costs=(3000.0, 6000.0)), capsys)
     assert sum("  cost" in line for line in text.splitlines()) == 2
     assert "The plan a, b for 6000 should find" in text
+
+
+def test_replaced_plan_is_named_by_its_options() -> None:
+    two = {"count": 2, "budget": None, "reach": None, "survives": 0}
+    assert place.describe_replaced(two, {**two, "count": 3}) == "replaces the plan for --count 2"
+    bought = {**two, "count": None, "budget": 30000.0}
+    assert place.describe_replaced(bought, two) == "replaces the plan for --budget 30000"
+    assert place.describe_replaced(two, {**two, "survives": 1}) == (
+        "replaces the plan for --count 2 with other settings in [placement]"
+    )

@@ -41,7 +41,7 @@ def test_sentences_for_a_score_over_vehicles() -> None:
     detected = by_vehicles(("a", 50.0, 0.871), ("b", 90.0, 0.8), ("c", 20.0, 0.4))
     assert (
         report_ranking.headline(detected, has_traffic=True)
-        == "a is the best of 3 sites: it should find 87% of vehicles"
+        == "a is the best of 3 sites: it should find 87.1% of vehicles"
     )
     assert report_ranking.lead(detected) == "It leads the next site, b, by 7.1 percentage points."
     assert report_ranking.entropy_seen_note(detected) == ""
@@ -51,10 +51,20 @@ def test_sentences_for_a_score_over_vehicles() -> None:
     assert detected.sites[0].score_se == 0.01 and detected.companion_score is SCORE_LABELS["egvs"]
     assert (
         report_ranking.headline(by_vehicles(("a", 50.0, 0.871)), has_traffic=True)
-        == "a, the only site, should find 87% of vehicles"
+        == "a, the only site, should find 87.1% of vehicles"
     )
     assert by_vehicles(("a", 50.0, 0.9), rank_by="egvs").companion_score is SCORE_LABELS["expected_detections"]
     assert ranking(("a", 50.0, 1, 0.5, 1.0)).companion_score is None
+
+
+def test_gain_of_a_pole_is_in_percentage_points_for_shares_and_relative_otherwise() -> None:
+    shares = by_vehicles(("a", 50.0, 0.6), ("b", 90.0, 0.4), ("c", 20.0, 0.0)).sites
+    assert report_ranking.Pole("p", shares[:2]).gain_text == "20.0"
+    assert report_ranking.Pole("p", shares).gain_text == "60.0"
+    assert report_ranking.Pole("p", shares[:1]).gain_text == ""
+    bits = ranking(("a", 60.0, 1, 0.5, 1.0), ("b", 40.0, 2, 0.5, 1.0), ("c", 0.0, 3, 0.0, 1.0)).sites
+    assert report_ranking.Pole("p", bits[:2]).gain_text == "50.0%"
+    assert report_ranking.Pole("p", bits).gain_text == ""
 
 
 def test_lead_says_whether_the_best_is_certain() -> None:

@@ -24,6 +24,7 @@ from egvs.core.errors import collect_warnings
 from egvs.report import ranking, sections
 from egvs.report.formatting import ScoreLabel, join_names
 from egvs.report.ranking import Pole, RankedSite, Ranking
+from egvs.report.sensor_results import range_note
 from egvs.scenario.model import Scenario
 
 _FILE_WIDTH = 150
@@ -55,6 +56,9 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
             out.print(str(warning))
     if assumptions := sections.assumptions(scenario):
         out.print(f"Before you trust this ranking: assumed, not measured: {'; '.join(assumptions)}.")
+    sensors = [site.sensor for site in ranked.sites]
+    if note := range_note(sensors, is_modelled=scenario.effects.range_limit is not None):
+        out.print(note)
     out.print(f"report: {run_folder.report}")
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,10 +40,11 @@ from egvs.report.sections import (
     StudySummary,
     ValidationSummary,
     assumptions,
+    describe_counts,
     egvs_setting,
     ranking_disagreement,
 )
-from egvs.report.sensor_results import SensorComparison, costs_option
+from egvs.report.sensor_results import SensorComparison, costs_option, range_note
 from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.scene_inputs import scan_dependencies
@@ -92,6 +93,8 @@ class PageContents:
         Records of the stages, as far as ``run.json`` has them, in the order of :data:`STAGES`.
     study, by_period, detected, plan
         Results of other commands and of periods; None if those commands have not run.
+    movements
+        What each counted location is in words; empty if the run folder has no network.
     """
 
     scenario: Scenario
@@ -103,6 +106,7 @@ class PageContents:
     by_period: PeriodRanking | None = None
     detected: ValidationSummary | None = None
     plan: PlacementSummary | None = None
+    movements: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -207,6 +211,7 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
         by_period=PeriodRanking.read(out),
         detected=ValidationSummary.read(out, stages),
         plan=PlacementSummary.read(out, stages, ranking.sites, tpog, drawn.backdrop),
+        movements=describe_counts(work.scenario, network_file(out)),
     )
     html = render_page(contents)
     files.write_text(work.folder.report, html)
@@ -271,6 +276,7 @@ def _ranking_values(ranking: Ranking) -> dict[str, Any]:
         "companion": ranking.companion_score,
         "crowded": maps.is_crowded(ranking.sites),
         "rings": maps.has_stacked_sites(ranking.sites),
+        "map_names": maps.describe_names(ranking.sites),
         "limit_share": limit_share,
         "best_name": ranking.sites[0].site,
     }
@@ -299,8 +305,10 @@ def _setting_values(contents: PageContents) -> dict[str, Any]:
 def _sensor_values(contents: PageContents) -> dict[str, Any]:
     """The best mount of each sensor; None where there is one sensor."""
     sensors = SensorComparison.of_run(contents.ranking.sites, contents.scenario.costs)
+    names = [site.sensor for site in contents.ranking.sites]
     return {
         "sensors": sensors,
+        "range_note": range_note(names, is_modelled=contents.scenario.effects.range_limit is not None),
         "costs_option": costs_option(sensors.sensors) if sensors is not None else "",
     }
 

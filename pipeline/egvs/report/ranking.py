@@ -165,12 +165,19 @@ class Pole:
         return self.sites[0]
 
     @property
-    def gain(self) -> float | None:
-        """Lead of the best site over the worst, as a share of the worst; None for a single site, or a worst of 0."""
-        worst = self.sites[-1].score
-        if len(self.sites) == 1 or not worst > 0:
-            return None
-        return self.best.score / worst - 1
+    def gain_text(self) -> str:
+        """Lead of the best site over the worst: in percentage points for shares, else in per cent of the worst.
+
+        Empty for a single site, and for a score that is no share where the worst is 0.
+        """
+        if len(self.sites) == 1:
+            return ""
+        by, worst = self.best.by, self.sites[-1].score
+        if by.is_share:
+            return by.change(self.best.score - worst)
+        if not worst > 0:
+            return ""
+        return format_percent(self.best.score / worst - 1)
 
     @property
     def user_columns(self) -> tuple[str, ...]:

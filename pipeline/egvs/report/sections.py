@@ -30,6 +30,8 @@ from egvs.report.ranking_check import RankingCheck
 from egvs.report.svg_figures import CurveStep, MapSite
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
+from egvs.traffic.movements import MovementNames
+from egvs.traffic.network import read_net_xml
 
 COMPARED_SITES = 3
 """Number of best sites that :func:`ranking_disagreement` compares."""
@@ -194,6 +196,28 @@ def assumptions(scenario: Scenario) -> tuple[str, ...]:
     if has_demand or any(period.counts or period.routes for period in traffic.periods):
         return scenario.assumed
     return (*scenario.assumed, "traffic (random trips)")
+
+
+def describe_counts(scenario: Scenario, network: Path | None) -> dict[str, str]:
+    """Return the movement of each traffic count in words, by its location in the summary of the traffic.
+
+    Parameters
+    ----------
+    scenario
+        The counts.
+    network
+        The simulated network; None if the run folder has none.
+    """
+    periods = {name: period.traffic for name, period in scenario.by_period().items() if period.traffic.counts}
+    if network is None or not periods:
+        return {}
+    names = MovementNames(read_net_xml(network))
+    movements = {}
+    for name, traffic in periods.items():
+        period = f" ({name})" if name else ""
+        for count in traffic.counts:
+            movements[f"{count.title}{period}"] = names.describe(count.edge or count.from_edge or "", count.to_edge)
+    return movements
 
 
 # ---- evidence of the validation study
@@ -385,15 +409,23 @@ class PlacementSummary:
         occupied = tpog.counts.sum(axis=2) / tpog.frames
         poles = _planned_poles(picks, joint, by)
         steps, objective = plan_steps(curve_rows), describe_objective(plan["asked"])
-        next_count = plan_answer.next_count(steps, len(picks), plan["candidates"], plan["asked"])
+        curve = _curve(steps, curve_rows, plan["together"] or math.inf)
+        answer = plan_answer.describe_count(
+            steps,
+            by,
+            plans=[plan_answer.CurvePlan(row.sites, row.cost) for row in curve],
+            has_budget=plan["asked"]["budget"] is not None,
+            objective=objective,
+            next_count=plan_answer.next_count(steps, len(picks), plan["candidates"], plan["asked"]),
+        )
         return cls(
             by=by,
             picks=picks,
-            curve=_curve(steps, curve_rows, plan["together"] or math.inf),
+            curve=curve,
             joint=joint,
             together=plan["together"],
             errors_from=plan.get("standard_errors", "the plan was made by an older version of egvs place"),
-            answer=plan_answer.describe_count(steps, by, objective=objective, next_count=next_count),
+            answer=answer,
             cost=plan["cost"],
             candidates=plan["candidates"],
             proof=_describe_proof(plan, len(picks)),

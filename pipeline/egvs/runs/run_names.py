@@ -6,6 +6,7 @@
     score.gamma=5                                 gamma=5
     traffic.frames=300, score.gamma=0.50          frames=300,gamma=0.5
     effects.rain.rate_mm_h=20                     rain.rate_mm_h=20
+    effects.range_limit={}                        range_limit=on
     sites.sensor="VLP-16"                         sensor=VLP-16,511b6d4c
 
 A label without a hash spells all overrides. Otherwise it ends in a hash of all of them: where it would be longer than
@@ -30,7 +31,7 @@ from pydantic import BaseModel
 
 from egvs.core import files, reading
 from egvs.scenario.model import Scenario
-from egvs.scenario.settings import flatten_settings
+from egvs.scenario.settings import effect_state, flatten_settings
 
 RUNS = Path("runs")
 """The folder of all runs for which no other is given."""
@@ -132,10 +133,18 @@ def _normalise(value: Any) -> Any:
 
 def _format_pair(key: str, value: Any) -> str:
     """Return "key=value" with characters that every file system accepts."""
+    if state := effect_state(key, value):
+        return f"{_UNSAFE.sub('-', _effect_label(key))}={state}"
     text = value if isinstance(value, str) else files.to_json_text(value, separators=(",", ":"))
     if not _is_number(value):
         text = _UNSAFE.sub("-", text).strip("-")
     return f"{_UNSAFE.sub('-', short_key(key))}={text}"
+
+
+def _effect_label(key: str) -> str:
+    """Return the name of an effect, or its complete key where another setting has this name."""
+    name = key.removeprefix(_EFFECTS)
+    return key if _last_parts()[name] else name
 
 
 def _is_spelled_out(key: str, value: Any) -> bool:
@@ -144,7 +153,7 @@ def _is_spelled_out(key: str, value: Any) -> bool:
         return False
     if isinstance(value, str):
         return _PLAIN_WORD.fullmatch(value) is not None and value not in ("true", "false")
-    return isinstance(value, bool) or _is_number(value)
+    return isinstance(value, bool) or _is_number(value) or effect_state(key, value) == "on"
 
 
 def _is_number(value: Any) -> bool:
