@@ -24,7 +24,7 @@ from egvs.effects.base import Effect
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import SCENARIO_FILE, Scenario
 from egvs.scoring import score_table, standard_errors, zones
-from egvs.scoring.score_table import ScoreTable
+from egvs.scoring.score_table import ScoreColumn, ScoreTable
 from egvs.sensors.sites import Site
 from egvs.stages import site_scoring
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
@@ -32,6 +32,13 @@ from egvs.stages.blocked_sites import warn_blocked_sites
 from egvs.stages.scene_inputs import scan_dependencies, sensor_digests, sensor_settings
 from egvs.stages.site_scoring import BeamAudit, ScoredSite, SiteScoring, needs_targets
 from egvs.world import clearances, geolocation
+
+MIN_PERIOD_LOSS = 0.01
+"""The best site of a period is clearly better, where errors are unknown, by at least 1 percentage point; by scores that
+are no shares, by at least 1 %."""
+
+_NO_SHARES = ("egvs", "points_on_target")
+"""Scores that are no shares."""
 
 
 def dependencies(context: StageContext) -> StageDependencies:
@@ -229,6 +236,48 @@ def _summary(
     return summary
 
 
+def warn_period_disagreements(scores: ScoreTable, rank_by: str) -> Iterator[Diagnostic]:
+    """Warn about each period in which another site is clearly better than the best of the mix.
+
+    Parameters
+    ----------
+    scores
+        Scores of all sites.
+    rank_by
+        Name of the score that ranks.
+    """
+    best = scores.column(rank_by).best
+    is_share = rank_by not in _NO_SHARES
+    for period, column in scores.by_period(rank_by).items():
+        if not best or not column.best or best & column.best:
+            continue
+        highest = float(column.values.max())
+        if not highest > 0:
+            continue
+        mix_best, period_best = min(best), min(column.best)
+        loss = highest - float(column.values[mix_best])
+        if not is_share:
+            loss /= highest
+        if not _is_clearly_better(column, period_best, mix_best, loss):
+            continue
+
+        less = f"{100 * loss:.1f} percentage points" if is_share else f"{loss:.1%}"
+        problem = (
+            f"the best site is {scores.sites[period_best]}; {scores.sites[mix_best]}, the best of the mix, "
+            f"has rank {column.rank[mix_best]} and scores {less} less"
+        )
+        hint = "Decide which period matters most; the best site of the mix need not be the best in any period."
+        yield Diagnostic("periods disagree", f"{SCENARIO_FILE}: traffic.periods ({period})", problem, hint)
+
+
+def _is_clearly_better(column: ScoreColumn, best: int, other: int, loss: float) -> bool:
+    """Whether the best site is known to be better than another; if errors are unknown, whether it leads by enough."""
+    if column.estimate is None:
+        return loss >= MIN_PERIOD_LOSS
+    (chance,) = column.estimate.beats(np.array([best]), np.array([other]))
+    return bool(chance >= readers.DISTINCT_PROBABILITY)
+
+
 def _warnings(context: StageContext, scoring: SiteScoring, scores: ScoreTable) -> Iterator[Diagnostic]:
     """Warnings about the scores, those about the ranking first."""
     scenario = context.scenario
@@ -238,7 +287,7 @@ def _warnings(context: StageContext, scoring: SiteScoring, scores: ScoreTable) -
     yield from score_table.warn_all_zero(ranking, scenario.gamma, scores.limits[score_table.MIX])
     if ranking.estimate is not None:
         yield from _warn_short_traffic(scenario, ranking.estimate, scores.periods or (score_table.MIX,))
-    yield from score_table.warn_period_disagreements(scores, rank_by)
+    yield from warn_period_disagreements(scores, rank_by)
     if scoring.targets is not None:
         yield from scoring.targets.warn_undefined_scores(scoring.tpog, scoring.periods)
     for column in (ranking, *others):
