@@ -24,7 +24,7 @@ from egvs.effects.base import Effect
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import SCENARIO_FILE, Scenario
 from egvs.scoring import score_table, standard_errors, zones
-from egvs.scoring.score_table import ScoreColumn, ScoreTable
+from egvs.scoring.score_table import ScoreTable
 from egvs.sensors.sites import Site
 from egvs.stages import site_scoring
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
@@ -249,16 +249,15 @@ def warn_period_disagreements(scores: ScoreTable, rank_by: str) -> Iterator[Diag
     best = scores.column(rank_by).best
     is_share = rank_by not in _NO_SHARES
     for period, column in scores.by_period(rank_by).items():
-        if not best or not column.best or best & column.best:
-            continue
-        highest = float(column.values.max())
-        if not highest > 0:
+        if not best or not column.best or best & column.best or not column.values.max() > 0:
             continue
         mix_best, period_best = min(best), min(column.best)
-        loss = highest - float(column.values[mix_best])
-        if not is_share:
-            loss /= highest
-        if not _is_clearly_better(column, period_best, mix_best, loss):
+        loss = (column.values.max() - column.values[mix_best]) / (1.0 if is_share else column.values.max())
+        is_clear = loss >= MIN_PERIOD_LOSS
+        if column.estimate is not None:
+            (chance,) = column.estimate.beats(np.array([period_best]), np.array([mix_best]))
+            is_clear = chance >= readers.DISTINCT_PROBABILITY
+        if not is_clear:
             continue
 
         less = f"{100 * loss:.1f} percentage points" if is_share else f"{loss:.1%}"
@@ -268,14 +267,6 @@ def warn_period_disagreements(scores: ScoreTable, rank_by: str) -> Iterator[Diag
         )
         hint = "Decide which period matters most; the best site of the mix need not be the best in any period."
         yield Diagnostic("periods disagree", f"{SCENARIO_FILE}: traffic.periods ({period})", problem, hint)
-
-
-def _is_clearly_better(column: ScoreColumn, best: int, other: int, loss: float) -> bool:
-    """Whether the best site is known to be better than another; if errors are unknown, whether it leads by enough."""
-    if column.estimate is None:
-        return loss >= MIN_PERIOD_LOSS
-    (chance,) = column.estimate.beats(np.array([best]), np.array([other]))
-    return bool(chance >= readers.DISTINCT_PROBABILITY)
 
 
 def _warnings(context: StageContext, scoring: SiteScoring, scores: ScoreTable) -> Iterator[Diagnostic]:
