@@ -79,6 +79,17 @@ def test_without_a_cost_the_sensor_that_finds_least_is_the_baseline() -> None:
     assert costs_option(comparison.sensors) == """--set 'costs.sensor={"small" = PRICE, "large" = PRICE}'"""
 
 
+def test_sensors_with_a_cost_are_compared_without_that_of_another() -> None:
+    sites = site("a", "large", 0.85), site("b", "medium", 0.80), site("c", "small", 0.60)
+    comparison = compare(*sites, prices={"small": 4000.0, "large": 18000.0})
+    assert [result.mount.sensor for result in comparison.results] == ["small", "large", "medium"]
+    assert comparison.shows_cost_per_point
+    assert [result.cost_per_point_text for result in comparison.results] == ["-", "560", "-"]
+    assert [result.step_cost_text for result in comparison.results] == ["-", "560", "-"]
+    assert "the cheapest with a known cost" in comparison.explanation
+    assert comparison.explanation.endswith("Without a known cost: medium.")
+
+
 def test_one_sensor_is_not_compared() -> None:
     assert SensorComparison.of_run([site("a", "small", 0.6), site("b", "small", 0.5)], CostsConfig()) is None
 

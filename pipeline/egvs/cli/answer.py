@@ -50,7 +50,7 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
     summary = record.stages["score"].summary
     out.print()
     if ranked.best[0].score > 0:
-        _print_ranking(out, folder, ranked, record, poles)
+        _print_ranking(out, folder, ranked, scenario, record, poles)
     else:
         for warning in collect_warnings([summary]):
             out.print(str(warning))
@@ -62,9 +62,11 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
     out.print(f"report: {run_folder.report}")
 
 
-def _print_ranking(out: Console, folder: Path, ranked: Ranking, record: RunRecord, poles: int | None) -> None:
+def _print_ranking(
+    out: Console, folder: Path, ranked: Ranking, scenario: Scenario, record: RunRecord, poles: int | None
+) -> None:
     """Print the verdict, the best poles, the lanes seen worst, and how the order by EGVS differs."""
-    out.print(verdict(ranked))
+    out.print(verdict(ranked, ranking.recorded_frames_hint(scenario, ranked, record.stages)))
     validation = sections.ValidationSummary.read(folder, record.stages)
     if validation is not None and validation.check.warning:
         print_sentences([f"{validation.check.warning} See {RunFolder(folder).report}#detected"])
@@ -83,10 +85,10 @@ def _print_ranking(out: Console, folder: Path, ranked: Ranking, record: RunRecor
         out.print(other_order)
 
 
-def verdict(ranked: Ranking) -> str:
-    """Return one or two sentences: the best site, and how clearly it leads."""
+def verdict(ranked: Ranking, hint: str = "") -> str:
+    """Return a few sentences: the best site, how clearly it leads and, if unclear, the ``hint`` on what helps."""
     sentences = [f"{ranking.headline(ranked, has_traffic=True)}."]
-    if lead := ranking.lead(ranked):
+    if lead := ranking.lead(ranked, hint):
         sentences.append(lead)
     return " ".join(sentences)
 

@@ -10,6 +10,7 @@ import typer
 
 from egvs.cli import options, sources
 from egvs.cli.options import Jobs, Out, Set, SettingsPath
+from egvs.core.errors import InputError
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -53,6 +54,7 @@ def place(
     from egvs.cli.console import ProgressDisplay
 
     limit_s = options.duration_s(time_limit, "--time-limit")
+    _check_request(count, budget, reach)
     request = []
     for key, value in zip(_REQUEST_KEYS, (count, budget, reach), strict=True):
         if value is not None:
@@ -72,6 +74,19 @@ def place(
     if exact and not (placed.solution.is_best or placed.solution.fewest_is_proved):
         notes.append(f"--exact reached its --time-limit of {time_limit} before any plan was proved optimal.")
     print_placement(placed, loaded.placement, notes)
+
+
+def _check_request(count: int | None, budget: float | None, reach: float | None) -> None:
+    """InputError for an option whose value is out of range."""
+    if count is not None and count < 1:
+        raise InputError("--count", f"expected at least 1 sensor, got {count}", "Use a number such as 3.")
+    if budget is not None and not 0 < budget < math.inf:
+        raise InputError("--budget", f"expected a cost above 0, got {budget:g}", "Use the total cost, such as 20000.")
+    if reach is not None and not 0 < reach <= 1:
+        hint = "Use a share such as 0.95."
+        if 1 < reach <= 100:
+            hint = f"Use {reach / 100:g} for {reach:g} %."
+        raise InputError("--reach", f"expected a share above 0, at most 1, got {reach:g}", hint)
 
 
 def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequence[str] = ()) -> None:

@@ -376,9 +376,9 @@ def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparis
         columns.append(Column("than the best cheaper", lambda result: result.step_cost_text, wrap=True))
     out.print(make_table(columns, sensors.results, width=out.width, title="the best mount of each sensor"))
     out.print(sensors.explanation, soft_wrap=True)
-    if not sensors.has_costs:
+    if sensors.unpriced:
         folders = " ".join(shlex.quote(str(folder)) for folder in dict.fromkeys(run.folder for run in comparison.runs))
-        option = costs_option(sensors.sensors)
+        option = costs_option(sensors.sensors if not sensors.has_costs else sensors.unpriced)
         out.print(
             f"What one more point costs: egvs compare {folders} {option}, or [costs] in scenario.toml", soft_wrap=True
         )

@@ -31,8 +31,8 @@ _VIRIDIS = (
 )  # fmt: skip
 """17 evenly spaced colours."""
 
-SHADE = (128, 128, 136, 84)
-"""RGBA of the shade over columns that no beam crosses."""
+SHADES = {"day": (128, 128, 136, 84), "night": (218, 126, 82, 166)}
+"""RGBA of the shade over columns that no beam crosses; on dark pages brown, unlike buildings, roads and the scale."""
 
 _FADE = 0.22
 """Below this share of the scale, colours fade into the page."""
@@ -58,8 +58,8 @@ STEPS = len(_VIRIDIS) - 1
 """The classes ``q0`` .. ``q16`` are evenly spaced colours of the scale, from its low end."""
 
 ON_LIGHT = _VIRIDIS[::-1]
-ON_DARK = tuple(interpolate_colour(i, STEPS, _VIRIDIS[3:]).hex() for i in range(STEPS + 1))
-"""Without the darkest colours, which would be invisible on a dark page."""
+ON_DARK = tuple(interpolate_colour(i, STEPS, _VIRIDIS[6:]).hex() for i in range(STEPS + 1))
+"""Without the darkest colours, which have a contrast of less than 3:1 to a dark page."""
 
 
 def opacity(share: float) -> float:
@@ -102,8 +102,8 @@ LIGHT = Theme(
     street="#4a5262", low="#14181f", high="#ffffff", scale=ON_LIGHT,
 )  # fmt: skip
 DARK = Theme(
-    ink="#e6e9ef", large="#343b48", large_line="#7f889a", green="#2f5b4f", green_line="#6fa493", small="#a9b2c3",
-    halo="#12161d", road="#232a36", road_edge="#414a5a", walk="#2e2a20", cycle="#3a2827", rail="#2d2838",
+    ink="#e6e9ef", large="#46526b", large_line="#9aa5ba", green="#2f5b4f", green_line="#6fa493", small="#a9b2c3",
+    halo="#12161d", road="#232a36", road_edge="#717c90", walk="#2e2a20", cycle="#3a2827", rail="#2d2838",
     street="#b6becc", low="#ffffff", high="#14181f", scale=ON_DARK,
 )  # fmt: skip
 
@@ -141,7 +141,7 @@ SHAPE_STYLES: Mapping[str, Mapping[str, str]] = {
 _PAGE_RULES = """
 .plan { display: block; width: 100%; height: auto; font: 12px system-ui, "DejaVu Sans", sans-serif; }
 .plan text { fill: currentColor; }
-.plan .share { opacity: .88; }
+.plan .share.day { opacity: .88; }
 .plan .worst circle { fill: var(--halo); stroke: currentColor; stroke-width: 1.4; }
 .plan .worst text { font-weight: 700; font-size: 11px; text-anchor: middle; }
 .plan .planned rect { fill: #2b6cb0; stroke: var(--halo); stroke-width: 1.6; }
@@ -243,7 +243,7 @@ def share_image(share: ColumnValues) -> IndexedImage:
 
 
 def shade_image(shaded: NDArray[np.bool_], max_pixels: int = MAX_PIXELS) -> IndexedImage:
-    """Return a shade over columns of voxels, shape (nx, ny), for :data:`SHADE_PALETTE`.
+    """Return a shade over columns of voxels, shape (nx, ny), for :data:`SHADE_PALETTES`.
 
     A pixel of several columns is shaded if all of them are.
     """
@@ -319,6 +319,11 @@ def _dots_palette(ink: str) -> bytes:
     return _palette(bytes.fromhex(ink) * 256, bytes([0, *(min(255, 110 + 12 * i) for i in range(255))]))
 
 
+def _shade_palette(rgba: tuple[int, int, int, int]) -> bytes:
+    """A transparent colour, and the shade."""
+    return _palette(bytes((*rgba[:3], *rgba[:3])), bytes((0, rgba[3])))
+
+
 def _deflate(data: bytes) -> bytes:
     """Return a zlib stream by Arrow's compressor, which is the same everywhere; the system's zlib is not."""
     gzip: bytes = pa.Codec("gzip", compression_level=6).compress(data, asbytes=True)
@@ -329,4 +334,4 @@ PNG_END = _png_chunk(b"IEND", b"")
 FIELD_PALETTES = {"day": _field_palette(ON_LIGHT), "night": _field_palette(ON_DARK)}
 SHARE_PALETTES = {"day": _shares_palette(ON_LIGHT), "night": _shares_palette(ON_DARK)}
 DOT_PALETTES = {"day": _dots_palette("1d2430"), "night": _dots_palette("e6e9ef")}
-SHADE_PALETTE = _palette(bytes((*SHADE[:3], *SHADE[:3])), bytes((0, SHADE[3])))
+SHADE_PALETTES = {theme: _shade_palette(rgba) for theme, rgba in SHADES.items()}

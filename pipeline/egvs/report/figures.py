@@ -42,7 +42,12 @@ _SCAN_CELLS, _COARSE_SCAN_CELLS = 300, 150
 _COARSE_PIXELS = 30_000
 """Maximum number of pixels of the other images in coarse resolution."""
 
-_PALETTES = {"field": colours.FIELD_PALETTES, "scan": colours.DOT_PALETTES, "vehicles": colours.SHARE_PALETTES}
+_PALETTES = {
+    "field": colours.FIELD_PALETTES,
+    "scan": colours.DOT_PALETTES,
+    "vehicles": colours.SHARE_PALETTES,
+    "shade": colours.SHADE_PALETTES,
+}
 """Palettes by view; views that are not listed use that of ``field``."""
 
 _WIDE_FIGURE = 680.0
@@ -213,7 +218,7 @@ def site_views(
                 coverage, scorer.field.grid, peak, images["scan"], blindspots, backdrop, box, prefix
             )
 
-    palettes: dict[str, Any] = {"shade": _to_base64(colours.SHADE_PALETTE)}
+    palettes: dict[str, dict[str, str]] = {}
     for theme in colours.THEMES:
         palettes[theme] = {view: _to_base64(palette[theme]) for view, palette in _PALETTES.items()}
     data = {

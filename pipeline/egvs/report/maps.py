@@ -14,7 +14,7 @@ All but the empty scan have roads in the background. Labels are placed so that t
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import NamedTuple
@@ -197,7 +197,7 @@ def site_view(
     shade = colours.shade_image(np.logical_not(view.crossed.any(axis=2)))
     parts = [
         _road_paths(plan, view.backdrop.roads),
-        plan.image(plan.region(grid), shade.uri(colours.SHADE_PALETTE), "shade"),
+        *_shade_images(plan, grid, shade),
         _field_image(plan, grid, values, peak),
         _outline_paths(plan, view.backdrop.outlines),
         plan.roi(grid),
@@ -271,6 +271,11 @@ def _field_image(plan: MapFrame, grid: Grid, values: ColumnValues, peak: float) 
     for theme in plan.style.image_themes:
         images.append(plan.image(rectangle, image.uri(colours.FIELD_PALETTES[theme]), f"field {theme}"))
     return "".join(images)
+
+
+def _shade_images(plan: MapFrame, grid: Grid, shade: IndexedImage) -> Iterator[str]:
+    for theme in plan.style.image_themes:
+        yield plan.image(plan.region(grid), shade.uri(colours.SHADE_PALETTES[theme]), f"shade {theme}")
 
 
 def _road_paths(plan: MapFrame, roads: Roads) -> str:
@@ -381,6 +386,16 @@ def is_crowded(sites: Sequence[MapSite]) -> bool:
 def has_stacked_sites(sites: Sequence[MapSite]) -> bool:
     """Return whether several sites have the same location."""
     return len(_stack_sites(sites)) < len(sites)
+
+
+def describe_names(sites: Sequence[MapSite]) -> str:
+    """Return rank and name of the best site at each location, for screens where a map has no labels.
+
+    Empty for a crowded map, which has no numbers.
+    """
+    if is_crowded(sites):
+        return ""
+    return ", ".join(f"{stack[0].rank}\u00a0{stack[0].site}" for stack in _stack_sites(sites))
 
 
 class LabelSpot(NamedTuple):

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,12 +26,21 @@ from egvs.report import figures, formatting, maps
 from egvs.report.basemap import network_file
 from egvs.report.colours import STYLE_SHEET
 from egvs.report.figures import Figures
-from egvs.report.ranking import RankedSite, Ranking, entropy_seen_note, headline, lead, share_of_limit
+from egvs.report.ranking import (
+    RankedSite,
+    Ranking,
+    entropy_seen_note,
+    headline,
+    lead,
+    recorded_frames_hint,
+    share_of_limit,
+)
 from egvs.report.sections import (
     PlacementSummary,
     StudySummary,
     ValidationSummary,
     assumptions,
+    describe_counts,
     egvs_setting,
     ranking_disagreement,
 )
@@ -84,6 +93,8 @@ class PageContents:
         Records of the stages, as far as ``run.json`` has them, in the order of :data:`STAGES`.
     study, by_period, detected, plan
         Results of other commands and of periods; None if those commands have not run.
+    movements
+        What each counted location is in words; empty if the run folder has no network.
     """
 
     scenario: Scenario
@@ -95,6 +106,7 @@ class PageContents:
     by_period: PeriodRanking | None = None
     detected: ValidationSummary | None = None
     plan: PlacementSummary | None = None
+    movements: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -159,6 +171,7 @@ def _displayed_settings(scenario: Scenario) -> dict[str, Any]:
         "weights": scenario.score.weights.in_words,
         "assumed": assumptions(scenario),
         "blindspots": scenario.score.blindspots,
+        "sampled_frames": scenario.score.sampled_frames,
         "costs": scenario.costs.model_dump(mode="json"),
         "effects": scenario.effects.model_dump(mode="json"),
     }
@@ -198,6 +211,7 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
         by_period=PeriodRanking.read(out),
         detected=ValidationSummary.read(out, stages),
         plan=PlacementSummary.read(out, stages, ranking.sites, tpog, drawn.backdrop),
+        movements=describe_counts(work.scenario, network_file(out)),
     )
     html = render_page(contents)
     files.write_text(work.folder.report, html)
@@ -262,6 +276,7 @@ def _ranking_values(ranking: Ranking) -> dict[str, Any]:
         "companion": ranking.companion_score,
         "crowded": maps.is_crowded(ranking.sites),
         "rings": maps.has_stacked_sites(ranking.sites),
+        "map_names": maps.describe_names(ranking.sites),
         "limit_share": limit_share,
         "best_name": ranking.sites[0].site,
     }
@@ -318,7 +333,7 @@ def _sentences(contents: PageContents) -> dict[str, str]:
     return {
         "headline": headline(ranking, bool(tpog.counts.any())),
         "contradiction": "" if contents.detected is None else contents.detected.check.contradiction,
-        "lead": lead(ranking),
+        "lead": lead(ranking, recorded_frames_hint(scenario, ranking, contents.stages)),
         "entropy_seen_note": entropy_seen_note(ranking),
         "disagreement": ranking_disagreement(ranking.sites, setting),
     }

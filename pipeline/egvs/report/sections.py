@@ -30,6 +30,8 @@ from egvs.report.ranking_check import RankingCheck
 from egvs.report.svg_figures import CurveStep, MapSite
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
+from egvs.traffic.movements import MovementNames
+from egvs.traffic.network import read_net_xml
 
 COMPARED_SITES = 3
 """Number of best sites that :func:`ranking_disagreement` compares."""
@@ -194,6 +196,28 @@ def assumptions(scenario: Scenario) -> tuple[str, ...]:
     if has_demand or any(period.counts or period.routes for period in traffic.periods):
         return scenario.assumed
     return (*scenario.assumed, "traffic (random trips)")
+
+
+def describe_counts(scenario: Scenario, network: Path | None) -> dict[str, str]:
+    """Return the movement of each traffic count in words, by its location in the summary of the traffic.
+
+    Parameters
+    ----------
+    scenario
+        The counts.
+    network
+        The simulated network; None if the run folder has none.
+    """
+    periods = {name: period.traffic for name, period in scenario.by_period().items() if period.traffic.counts}
+    if network is None or not periods:
+        return {}
+    names = MovementNames(read_net_xml(network))
+    movements = {}
+    for name, traffic in periods.items():
+        period = f" ({name})" if name else ""
+        for count in traffic.counts:
+            movements[f"{count.title}{period}"] = names.describe(count.edge or count.from_edge or "", count.to_edge)
+    return movements
 
 
 # ---- evidence of the validation study

@@ -182,6 +182,7 @@ def _write_scores(
     if egvs.estimate is not None:
         optional["egvs_bias"] = egvs.estimate.bias
         optional["beats_next"] = ranking.beats_next
+        optional["behind_best_se"], optional["best_beats"] = ranking.behind_best
     user_columns = _user_columns(context)
     with parquet.artefact_writer(context.folder.scores, "scores", tuple(optional), extra=user_columns) as file:
         file.write(columns | optional | user_columns)

@@ -42,8 +42,10 @@
         const palette = data.palettes[theme][kind in data.palettes[theme] ? kind : "field"];
         set(svg.querySelector(`.field.${theme}`), site.images[kind], palette);
       }
-      const shade = svg.querySelector(".shade");
-      if (shade) set(shade, site.images.shade, data.palettes.shade);
+      for (const shade of svg.querySelectorAll(".shade")) {
+        const theme = shade.classList.contains("day") ? "day" : "night";
+        set(shade, site.images.shade, data.palettes[theme].shade);
+      }
     }
   };
   const panels = [...document.querySelectorAll("[data-panel]")];
