@@ -105,7 +105,7 @@ def _join(texts: Sequence[str]) -> str:
 def format_setting(key: str, value: Any) -> str:
     """Return a setting as text: an effect without other parameters as "on" or "off", an empty value as "none"."""
     from egvs.cli.console import format_value
-    from egvs.scenario.settings import effect_state
+    from egvs.runs.run_names import effect_state
 
     if state := effect_state(key, value):
         return state

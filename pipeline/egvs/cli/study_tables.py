@@ -31,7 +31,7 @@ from egvs.report.sensor_results import (
     format_difference,
     range_note,
 )
-from egvs.scenario.settings import effect_state
+from egvs.runs.run_names import effect_state
 from egvs.studies.study_settings import MEASURES, SCENARIO, TRAFFIC
 from egvs.studies.traffic_options import OPTION_KNOBS, SeedSpread
 

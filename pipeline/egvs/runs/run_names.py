@@ -31,7 +31,7 @@ from pydantic import BaseModel
 
 from egvs.core import files, reading
 from egvs.scenario.model import Scenario
-from egvs.scenario.settings import effect_state, flatten_settings
+from egvs.scenario.settings import flatten_settings
 
 RUNS = Path("runs")
 """The folder of all runs for which no other is given."""
@@ -97,6 +97,29 @@ def short_key(key: str) -> str:
         if _last_parts()[name] == 1:
             return name
     return key.replace("[", ".").replace("]", "")
+
+
+def effect_state(key: str, value: Any) -> str:
+    """Return "on" for an effect with its default parameters, "off" for one without any; empty for other settings.
+
+    Parameters
+    ----------
+    key
+        Full key.
+    value
+        Its value; None where it is not set.
+
+    Examples
+    --------
+    >>> effect_state("effects.range_limit", {}), effect_state("effects.range_limit", None), effect_state("seed", 1)
+    ('on', 'off', '')
+    """
+    prefix, _, name = key.partition(".")
+    if prefix != "effects" or not name or "." in name:
+        return ""
+    if value is None:
+        return "off"
+    return "on" if value == {} else ""
 
 
 def parse_overrides(overrides: Iterable[str]) -> dict[str, Any]:

@@ -41,29 +41,6 @@ def _flatten(value: Any, key: str) -> Iterator[tuple[str, Any]]:
         yield key, value
 
 
-def effect_state(key: str, value: Any) -> str:
-    """Return "on" for an effect with its default parameters, "off" for one without any; empty for other settings.
-
-    Parameters
-    ----------
-    key
-        Full key.
-    value
-        Its value; None where it is not set.
-
-    Examples
-    --------
-    >>> effect_state("effects.range_limit", {}), effect_state("effects.range_limit", None), effect_state("seed", 1)
-    ('on', 'off', '')
-    """
-    prefix, _, name = key.partition(".")
-    if prefix != "effects" or not name or "." in name:
-        return ""
-    if value is None:
-        return "off"
-    return "on" if value == {} else ""
-
-
 def format_overrides(settings: Mapping[str, Any]) -> list[str]:
     """Return settings as arguments of ``--set``; removed ones are left out.
 
