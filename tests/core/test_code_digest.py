@@ -175,7 +175,7 @@ SOURCE_BEFORE = {
 }
 """Code lines behind the key of each stage before the layout with one module per subject."""
 
-GROWTH = {"check": 1.22, "statics": 1.2, "scan": 1.22, "traffic": 1.273, "tpog": 1.201, "score": 1.212, "report": 1.28}
+GROWTH = {"check": 1.22, "statics": 1.2, "scan": 1.225, "traffic": 1.276, "tpog": 1.204, "score": 1.216, "report": 1.3}
 """Allowed growth, 1.1 for the others: a stage runs again whenever a line behind its key changes."""
 
 

@@ -211,7 +211,7 @@ def score(
     top: Top = None,
 ) -> None:
     """Score and rank the sites, and write scores.parquet."""
-    stage_options = {"audit": True} if audit else {}
+    stage_options: dict[str, Any] = {"audit": True} if audit else {}
     _run_stage("score", scenario, out, set_, jobs, top, **stage_options)
 
 
