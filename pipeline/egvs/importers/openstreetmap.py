@@ -508,8 +508,9 @@ def statics_table() -> TomlTable:
 
 def sites_table() -> TomlTable:
     """Return ``[sites]`` without the keys of :func:`mount_keys`."""
-    comment = f"poles {junctions.KERB_M:g} m behind the kerbs of the junction; add or remove rows as you like"
-    return comment, {"file": SITES_FILE}
+    position = "columns longitude, latitude (degrees) work as well as x_m, y_m"
+    poles = f"poles {junctions.KERB_M:g} m behind the kerbs of the junction"
+    return f"{poles}; add or remove rows as you like; {position}", {"file": SITES_FILE}
 
 
 def mount_keys() -> dict[str, Any]:
