@@ -399,21 +399,24 @@ def lock_run_folder(folder: Path, wait_s: float = 0.0) -> Iterator[None]:
     """
     store.check_outside_store(folder)
     created = _missing_folders(folder)
-    descriptor = _open_folder_lock(folder)
+    descriptor = _lock_folder(folder, wait_s)
     try:
-        if not locks.wait_for_lock(descriptor, wait_s):
-            raise RunError(f"{folder}: another run is using this folder")
-        while not locks.is_current_lock(descriptor, folder / RunFolder.lock.name):
-            os.close(descriptor)  # a run that failed has removed the folder meanwhile
-            descriptor = _open_folder_lock(folder)
-            if not locks.wait_for_lock(descriptor, wait_s):
-                raise RunError(f"{folder}: another run is using this folder")
-        try:
-            yield
-        finally:
-            _remove_unused(folder, created)
+        yield
     finally:
+        _remove_unused(folder, created)
         os.close(descriptor)
+
+
+def _lock_folder(folder: Path, wait_s: float) -> int:
+    """Return the descriptor of the lock of a run folder; RunError when another run holds it."""
+    while True:
+        descriptor = _open_folder_lock(folder)
+        if not locks.wait_for_lock(descriptor, wait_s):
+            os.close(descriptor)
+            raise RunError(f"{folder}: another run is using this folder")
+        if locks.is_current_lock(descriptor, folder / RunFolder.lock.name):
+            return descriptor
+        os.close(descriptor)  # a run that wrote nothing has removed the folder meanwhile
 
 
 def _open_folder_lock(folder: Path) -> int:
