@@ -317,22 +317,3 @@ def warn_no_standard_error(column: ScoreColumn) -> Iterator[Diagnostic]:
     groups = sum(len(record.frames) for record in column.groups)
     problem = f"{column.name} has no standard error: all vehicles in the region are in one of {groups} blocks of frames"
     yield Diagnostic("no standard error", f"{SCENARIO_FILE}: traffic", problem, "Record more traffic.")
-
-
-def warn_period_disagreements(scores: ScoreTable, rank_by: str) -> Iterator[Diagnostic]:
-    """Warn about each period whose best site, by the score that ranks, is not that of the mix."""
-    best = scores.column(rank_by).best
-    for period, column in scores.by_period(rank_by).items():
-        if not best or not column.best or best & column.best:
-            continue
-        highest = column.values.max()
-        if not highest > 0:
-            continue
-        mix_best = min(best)
-        loss = 1.0 - column.values[mix_best] / highest
-        problem = (
-            f"the best site is {scores.sites[min(column.best)]}; {scores.sites[mix_best]}, the best of the mix, "
-            f"has rank {column.rank[mix_best]} and scores {loss:.1%} less"
-        )
-        hint = "Decide which period matters most; the best site of the mix need not be the best in any period."
-        yield Diagnostic("periods disagree", f"{SCENARIO_FILE}: traffic.periods ({period})", problem, hint)
