@@ -222,3 +222,8 @@ def test_command_line_rejects_options(tmp_path: Path, run_egvs, options: tuple[o
     code, _, error = run_egvs("new", tmp_path / "made", "--osm", SMALL, *options)
     assert code == 2 and message in error
     assert not (tmp_path / "made").exists()
+
+
+def test_plans_of_a_new_scenario_have_one_sensor_per_pole(tmp_path: Path) -> None:
+    openstreetmap.create_scenario(tmp_path / "out", SMALL)
+    assert loading.load(tmp_path / "out").placement.most_per_pole == 1

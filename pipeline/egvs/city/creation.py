@@ -559,6 +559,7 @@ def common_toml() -> str:
         "sites": ("", openstreetmap.mount_keys()),
         "scan": ("sites are scanned while they are scored; true keeps the scans, 0.7 MB per site", {"keep": False}),
         "score": openstreetmap.score_table(),
+        "placement": openstreetmap.placement_table(),
     }
     comment = "Common settings of all junctions; the scenario of a junction may override them."
     return tomlkit.dumps(openstreetmap.toml_document([comment], {"seed": 1}, tables))

@@ -523,6 +523,11 @@ def score_table() -> TomlTable:
     return "", {"gamma": ScoreConfig.model_fields["gamma"].default, "rank_by": DEFAULT_SCORE}
 
 
+def placement_table() -> TomlTable:
+    """Return ``[placement]``: without a limit, a plan may put two sensors in the same place."""
+    return "rules for egvs place", {"most_per_pole": 1}
+
+
 def toml_document(comments: Sequence[str], values: Mapping[str, Any], tables: Mapping[str, TomlTable]) -> Any:
     """Make a TOML document.
 
@@ -584,6 +589,7 @@ def _scenario_toml(name: str, scenario: NewScenario) -> str:
         "statics": statics_table(),
         "sites": (sites_comment, sites | mount_keys()),
         "score": score_table(),
+        "placement": placement_table(),
     }
     comments = [
         f"A scenario made from OpenStreetMap. Map data {ATTRIBUTION} (openstreetmap.org/copyright).",
