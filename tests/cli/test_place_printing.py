@@ -101,3 +101,9 @@ def test_costs_are_printed_only_where_they_are_set(capsys: pytest.CaptureFixture
     text = printed(placed_two(curve_costs=(3000.0, 6000.0)), capsys)
     assert sum("  cost" in line for line in text.splitlines()) == 2
     assert "The plan a, b for 6000 should find" in text
+
+
+def test_ends_with_what_was_assumed(capsys: pytest.CaptureFixture[str]) -> None:
+    caveat = "Before you trust this plan: assumed, not measured: positions of the poles."
+    place.print_placement(placed_two(), PlacementConfig(count=2), caveat=caveat)
+    assert capsys.readouterr().out.splitlines()[-1] == caveat

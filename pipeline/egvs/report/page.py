@@ -26,11 +26,21 @@ from egvs.report import figures, formatting, maps
 from egvs.report.basemap import network_file
 from egvs.report.colours import STYLE_SHEET
 from egvs.report.figures import Figures
-from egvs.report.ranking import RankedSite, Ranking, entropy_seen_note, headline, lead, share_of_limit
+from egvs.report.ranking import (
+    NAMED_POLES,
+    RankedSite,
+    Ranking,
+    describe_poles_on_road,
+    entropy_seen_note,
+    headline,
+    lead,
+    share_of_limit,
+)
 from egvs.report.sections import (
     PlacementSummary,
     StudySummary,
     ValidationSummary,
+    assumes_flows,
     assumptions,
     egvs_setting,
     ranking_disagreement,
@@ -218,6 +228,7 @@ def render_page(contents: PageContents) -> str:
         **_sensor_values(contents),
         **_cost_values(contents.stages),
         **_sentences(contents),
+        **_warning_values(contents),
     }
     return _template_environment().get_template("report.html.j2").render(values)
 
@@ -277,6 +288,7 @@ def _setting_values(contents: PageContents) -> dict[str, Any]:
     return {
         "weights": scenario.score.weights.in_words,
         "assumed": assumptions(scenario),
+        "assumes_flows": assumes_flows(scenario),
         "gamma": "∞" if math.isinf(gamma) else f"{gamma:g}",
         "uncapped": math.isinf(gamma),
         "gamma_auto": scenario.score.gamma == "auto",
@@ -305,7 +317,14 @@ def _cost_values(stages: Mapping[str, StageRecord]) -> dict[str, Any]:
         "total_s": math.fsum(seconds),
         "longest_s": max(seconds, default=0.0),
         "artefacts": [artefact for stage in stages.values() for artefact in stage.artefacts.items()],
-        "warnings": collect_warnings(stage.summary for stage in stages.values()),
+    }
+
+
+def _warning_values(contents: PageContents) -> dict[str, Any]:
+    warnings = collect_warnings(stage.summary for stage in contents.stages.values())
+    return {
+        "warnings": warnings,
+        "poles_on_road": describe_poles_on_road(contents.ranking.poles[:NAMED_POLES], warnings),
     }
 
 

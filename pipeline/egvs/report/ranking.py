@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
@@ -14,13 +15,19 @@ import pyarrow as pa
 
 from egvs.artefacts import parquet
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
-from egvs.core.errors import InputError
+from egvs.core.errors import SITES_ON_LANES, Diagnostic, InputError
 from egvs.report.formatting import SCORE_LABELS, ScoreLabel, format_count, format_number, format_percent, join_names
 from egvs.report.svg_figures import MapSite
 from egvs.scenario.score_config import DEFAULT_SCORE
 
 CLOSE_SHARE = 0.01
 """The report names the sites whose score is this close to the best, as a share of the best score."""
+
+NAMED_POLES = 5
+"""Poles at the head of the ranking whose location in a lane is stated with the result."""
+
+_FURTHER_SITES = re.compile(r" and \d+ more$")
+"""End of the location of a warning that is the same for several sites."""
 
 _MIN_LEAD = 0.0005
 """Shares that differ by less than this look the same with one decimal."""
@@ -196,6 +203,35 @@ def group_by_pole(sites: Iterable[RankedSite]) -> tuple[Pole, ...]:
     for site in sites:
         sites_of_pole.setdefault(site.pole, []).append(site)
     return tuple(Pole(name, tuple(members)) for name, members in sites_of_pole.items())
+
+
+def describe_poles_on_road(poles: Iterable[Pole], warnings: Iterable[Diagnostic]) -> list[str]:
+    """Return a phrase for each pole in a lane or junction, e.g. ``"k02 stands in a lane of Main Street"``.
+
+    Parameters
+    ----------
+    poles
+        The poles.
+    warnings
+        Warnings of a run; those of the rule :data:`egvs.core.errors.SITES_ON_LANES` name sites.
+    """
+    where_of_site = {}
+    for warning in warnings:
+        if warning.rule != SITES_ON_LANES:
+            continue
+        _, _, site = warning.where.partition(": site ")
+        if site:
+            where_of_site[_FURTHER_SITES.sub("", site)] = warning.problem.partition(" is ")[2]
+        else:  # a list of all further sites
+            for name in warning.problem.partition(": ")[2].split(", "):
+                where_of_site[name] = "in a lane or junction"
+
+    phrases = []
+    for pole in poles:
+        where = next((where_of_site[site.site] for site in pole.sites if site.site in where_of_site), None)
+        if where is not None:
+            phrases.append(f"{pole.name} stands {where}")
+    return phrases
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -45,6 +46,9 @@ RHO_RANGE = (
     "0.83 to 0.97, depending on junction and detector; among sites of equal height in dense queues, about 0.2 to 0.96"
 )
 """Rank correlation of the recommended score with detection, over junctions and detectors (docs/validity.md, F)."""
+
+_TRAFFIC = re.compile(r"\btraffic\b(?! (?:light|sign))", re.IGNORECASE)
+"""Found in entries of the key ``assumed`` on traffic; traffic lights and signs are not traffic."""
 
 _ALL_OBJECTS = "vehicles"
 """Name of the set of all objects in ``detection.parquet``."""
@@ -194,6 +198,19 @@ def assumptions(scenario: Scenario) -> tuple[str, ...]:
     if has_demand or any(period.counts or period.routes for period in traffic.periods):
         return scenario.assumed
     return (*scenario.assumed, "traffic (random trips)")
+
+
+def describe_assumptions(scenario: Scenario, result: str) -> str:
+    """Return what a result ("ranking", "plan") assumes, in one sentence; empty where nothing is assumed."""
+    assumed = assumptions(scenario)
+    if not assumed:
+        return ""
+    return f"Before you trust this {result}: assumed, not measured: {'; '.join(assumed)}."
+
+
+def assumes_flows(scenario: Scenario) -> bool:
+    """Return whether the key ``assumed`` says that the traffic, hence the flows in ``counts``, is assumed."""
+    return any(_TRAFFIC.search(entry) for entry in scenario.assumed)
 
 
 # ---- evidence of the validation study

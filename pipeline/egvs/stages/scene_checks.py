@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from egvs.core.errors import Diagnostic, InputError
+from egvs.core.errors import SITES_ON_LANES, Diagnostic, InputError
 from egvs.core.grid import Roi
 from egvs.effects import registry
 from egvs.effects.base import Effect
@@ -195,13 +195,13 @@ def warn_sites_on_lanes(inputs: CheckInputs) -> Iterator[Diagnostic]:
     hint = f"Move it beside the road, or more than {clearances.CLEARANCE_M:g} m above it."
     for site, where in on_road[:MAX_LISTED_SITES]:
         problem = f"({site.pose.x_m:g}, {site.pose.y_m:g}, {site.pose.z_m:g}) is {where}"
-        yield Diagnostic("sites on lanes", inputs.site_location(site), problem, hint)
+        yield Diagnostic(SITES_ON_LANES, inputs.site_location(site), problem, hint)
     others = on_road[MAX_LISTED_SITES:]
     if others:
         names = ", ".join(site.name for site, _ in others)
         problem = f"{len(others)} more of {len(inputs.sites)} are in lanes or junctions: {names}"
         file = inputs.site_location(others[0][0]).partition(":")[0]
-        yield Diagnostic("sites on lanes", file, problem, hint)
+        yield Diagnostic(SITES_ON_LANES, file, problem, hint)
 
 
 def _sites_on_road(sites: tuple[Site, ...], carriageway: Carriageway) -> Iterator[tuple[Site, str]]:
@@ -216,7 +216,7 @@ def _sites_on_road(sites: tuple[Site, ...], carriageway: Carriageway) -> Iterato
         nearest = carriageway.nearest(at_m[number]) if lane is None else lane
         if site.pose.z_m - carriageway.height_m(nearest, at_m[number]) > clearances.CLEARANCE_M:
             continue
-        yield site, "within a junction" if lane is None else f"in lane {carriageway.names[lane]}"
+        yield site, "within a junction" if lane is None else f"in {carriageway.names[lane]}"
 
 
 def warn_own_supports(inputs: CheckInputs) -> Iterator[Diagnostic]:
