@@ -23,9 +23,10 @@ from egvs.artefacts.tpog import read_tpog
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.resource_usage import measure_usage
 from egvs.runs.run import ensure_stages
+from egvs.scenario.score_config import DEFAULT_SAMPLED_FRAMES
 from egvs.scoring import target_scores
 from egvs.scoring.scorer import Scorer
-from egvs.scoring.targets import REPLAYED_FRAMES, TargetRecord, detection_probability, visible_targets
+from egvs.scoring.targets import TargetRecord, detection_probability, visible_targets
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.sites import Site
@@ -54,7 +55,7 @@ def rows() -> list[tuple[str, str, str]]:
     each = [(name, f"{values:.1f} ms", f"{values / egvs:.2f} x EGVS") for name, values in (ms | ap_ms).items()]
     return [
         *each,
-        (f"scores: median of {count} sites; AP: mean of {AP_SITES}, {REPLAYED_FRAMES} frames", "", ""),
+        (f"scores: median of {count} sites; AP: mean of {AP_SITES}, {DEFAULT_SAMPLED_FRAMES} frames", "", ""),
         (
             "held-out traffic, once for all sites, with the static world (for AP only)",
             f"{simulated_s * 1e3:.0f} ms",
@@ -119,7 +120,7 @@ def _score_costs(folder: Path) -> tuple[dict[str, float], int]:
 def _detection_costs(folder: Path) -> tuple[dict[str, float], float]:
     """Return milliseconds per site of measuring AP, by detector, and the seconds to simulate traffic."""
     with measure_usage() as cost:  # SUMO's too
-        held_out = prepare_held_out_traffic(egvs.load(SCENARIO), folder, REPLAYED_FRAMES, apart_s=MIN_SPACING_S)
+        held_out = prepare_held_out_traffic(egvs.load(SCENARIO), folder, DEFAULT_SAMPLED_FRAMES, apart_s=MIN_SPACING_S)
     frames, sites = list(held_out.read()), held_out.scene.sites[:AP_SITES]
     return {
         f"AP by {name}": 1e3 * _ap_s(held_out, frames, sites, name) for name in target_scores.DETECTORS

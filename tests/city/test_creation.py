@@ -212,6 +212,7 @@ def test_radius_limits_streets_and_junctions(extract: Path, tmp_path: Path) -> N
     ("rows", "message"),
     [
         ("tower,50.0,10.05", "junction tower: the nearest junction of three or more streets is"),
+        ("tower,10.0,50.0", "are swapped: did you mean lat_deg 50.0, lon_deg 10.0?"),
         ("tower,50.0,10.0\nother,50.0,10.00001", "junction other: these coordinates select the same junction as tower"),
         ("tower,50.0,10.0\nTower,50.0,10.00001", "junction Tower: this name occurs twice"),
         ("a/b,50.0,10.0", "junction a/b: junction: invalid name 'a/b'"),
@@ -235,6 +236,7 @@ def test_wrong_input_gives_one_message_and_creates_nothing(extract: Path, tmp_pa
         (["--radius", "2km"], "--radius: given without --around. Add --around LAT,LON"),
         (["--around", "50.0,10.0", "--radius", "2 miles"], "--radius: expected a length above 0, got '2 miles'"),
         (["--around", "51.0,10.0"], "--around: 51,10 is outside the extract"),
+        (["--around", "10.0,50.0"], "Latitude comes first: did you mean --around 50.0,10.0?"),
         (["--around", "here"], "--around: expected LAT,LON in degrees, got 'here'"),
         (
             ["--junctions", "signalized"],

@@ -154,6 +154,11 @@ def wait_for_release(job: Job, _settings: object) -> None:
     _release.wait(60)
 
 
+def count_tasks(dask_worker: Any) -> int:
+    """Return the number of tasks that run on a worker or wait there; called by Dask on each worker."""
+    return len(dask_worker.state.tasks)
+
+
 @pytest.mark.usefixtures("in_process_cluster")
 def test_failed_simulation_cancels_tasks_and_leaves_nothing(
     city: City, client: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -170,6 +175,7 @@ def test_failed_simulation_cancels_tasks_and_leaves_nothing(
     try:
         with pytest.raises(RunError, match="SUMO has failed"):
             city_run.run_city(city, tmp_path / "out")
+        wait_until(lambda: sum(client.run(count_tasks).values()) == 1)  # workers hear of it later
     finally:
         _release.set()
     assert client.submit(len, _started, pure=False, workers=[*client.scheduler_info()["workers"]]).result() == 1

@@ -45,6 +45,24 @@ def test_says_what_was_assumed(mini: Path, tmp_path: Path, run_egvs) -> None:
     assert "not measured" not in run_egvs("run", mini, "--out", tmp_path / "two")[1]
 
 
+def test_says_that_the_range_of_several_sensors_is_not_modelled_until_it_is(
+    mini: Path, tmp_path: Path, run_egvs
+) -> None:
+    (mini / "sites.csv").write_text("site,x_m,y_m,z_m,sensor\na,10,12,5,VLP-16\nb,30.5,-12,5,VLP-32C\n")
+    scenario = mini / "scenario.toml"
+    scenario.write_text(scenario.read_text().replace('sensor = "small"\n', "", 1))
+    folders = [str(tmp_path / name) for name in ("plain", "limited")]
+    texts = []
+    for folder, settings in zip(folders, ((), ("--set", "effects.range_limit={}")), strict=True):
+        code, printed, error = run_egvs("run", mini, "--out", folder, *settings)
+        assert code == 0, error
+        page = Path(folder, "report.html").read_text(encoding="utf-8")
+        texts += [printed, page, run_egvs("compare", folder)[1]]
+    note = "sensors with a short rated range look better than they are"
+    assert [text.count(note) for text in texts] == [1, 2, 1, 0, 0, 0]
+    assert note in run_egvs("compare", *folders)[1]
+
+
 def test_names_the_best_sites_by_egvs_where_another_score_prefers_others() -> None:
     ranked = by_vehicles(("a", 50.0, 0.9), ("b", 90.0, 0.8), ("c", 20.0, 0.7), ("d", 80.0, 0.6))
     assert answer.order_by_egvs(ranked, {"gamma": 10.0}) == (

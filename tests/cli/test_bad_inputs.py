@@ -210,7 +210,7 @@ BAD: dict[str, tuple[Change, str]] = {
     "site too far": (sites("a,1,500,3"), r"site a: the site is 490.0 m from the region of interest"),
     "unknown sensor": (
         edit('sensor = "small"', 'sensor = "VLP32C"'),
-        r"unknown sensor 'VLP32C'\. Did you mean VLP-32C\?",
+        r"scenario\.toml: sites\.sensor: unknown sensor 'VLP32C'\. Did you mean VLP-32C\?",
     ),
     "pitch beyond 90": (
         sites("a,1,12,3,100", head="site,x_m,y_m,z_m,pitch_deg"),
@@ -314,7 +314,20 @@ def test_every_message_is_its_own() -> None:
 
 COMMANDS = {
     "unknown verb": (["rum", "x"], r"No such command"),
-    "no such folder": (["run", "nowhere"], r"nowhere: expected a scenario.toml"),
+    "no such folder": (["run", "nowhere"], r"nowhere: no such folder. Give a folder with a scenario.toml"),
+    "folder misspelt": (["run", "{mini}i"], r"minii: no such folder. Did you mean .*mini\?"),
+    "--osm missing": (["new", "{out}", "--osm", "x.osm"], r"x.osm: no such file. Give the path of an extract"),
+    "--poles without every": (["new", "{out}", "--osm", "x.osm", "--poles", "20m"], r"x.osm: no such file"),
+    "--poles= without every": (["new", "{out}", "--osm", "x.osm", "--poles=20", "--walk"], r"x.osm: no such file"),
+    "--poles every": (["new", "{out}", "--osm", "x.osm", "--poles", "every", "20m"], r"x.osm: no such file"),
+    "--poles=every": (["new", "{out}", "--osm", "x.osm", "--poles=every", "20m"], r"x.osm: no such file"),
+    "--poles no length": (["new", "{out}", "--osm", "x.osm", "--poles", "far"], r"--poles.*2 arguments"),
+    "figure without --what": (["figure", "{out}"], r"--what: expected one of ranking, map, tpog, seen, missed"),
+    "--count 0": (["place", "{mini}", "--count", "0"], r"^egvs: --count: expected at least 1 sensor, got 0"),
+    "--count -1": (["place", "{mini}", "--count", "-1"], r"^egvs: --count: expected at least 1 sensor, got -1"),
+    "--budget 0": (["place", "{mini}", "--budget", "0"], r"^egvs: --budget: expected a cost above 0, got 0"),
+    "--reach in per cent": (["place", "{mini}", "--reach", "95"], r"^egvs: --reach: .* got 95. Use 0.95 for 95 %"),
+    "--reach below 0": (["place", "{mini}", "--reach", "-1"], r"^egvs: --reach: .* got -1. Use a share such as 0.95"),
     "--set without value": (["run", "{mini}", "--set", "roi.voxel_m"], r"--set roi.voxel_m: expected KEY=VALUE"),
     "--set unknown": (["run", "{mini}", "--set", "roi.voxel=1"], r"roi.voxel: unknown key. Did you mean voxel_m"),
     "--set of a row that is not there": (
@@ -360,7 +373,7 @@ COMMANDS = {
     "--traci without port": (["traffic", "{mini}", "--traci", "here"], r"--traci: expected HOST:PORT, got 'here'"),
     "--cloud unknown": (["scan", "{mini}", "--cloud", "xyz"], r"--cloud: expected ply or pcd, got 'xyz'"),
     "stage before its inputs": (["tpog", "{mini}", "--out", "{out}"], r"trajectories.parquet|statics.ply"),
-    "verify nothing": (["verify", "{out}"], r"run.json: no such file"),
+    "verify nothing": (["verify", "{out}"], r"out: no such folder"),
     "jobs 0": (["run", "{mini}", "--jobs", "0"], r"--jobs"),
     "--at no place": (
         ["new", "{out}", "--osm", "x.osm", "--at", "here"],

@@ -107,3 +107,13 @@ def test_ends_with_what_was_assumed(capsys: pytest.CaptureFixture[str]) -> None:
     caveat = "Before you trust this plan: assumed, not measured: positions of the poles."
     place.print_placement(placed_two(), PlacementConfig(count=2), caveat=caveat)
     assert capsys.readouterr().out.splitlines()[-1] == caveat
+
+
+def test_replaced_plan_is_named_by_its_options() -> None:
+    two = {"count": 2, "budget": None, "reach": None, "survives": 0}
+    assert place.describe_replaced(two, {**two, "count": 3}) == "replaces the plan for --count 2"
+    bought = {**two, "count": None, "budget": 30000.0}
+    assert place.describe_replaced(bought, two) == "replaces the plan for --budget 30000"
+    assert place.describe_replaced(two, {**two, "survives": 1}) == (
+        "replaces the plan for --count 2 with other settings in [placement]"
+    )

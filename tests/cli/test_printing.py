@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from egvs.cli.console import Column, console, make_table
-from egvs.cli.run_tables import print_effects
+from egvs.cli.run_tables import print_effects, ranking_table
+from egvs.report.ranking import RankedSite
 from egvs.studies.effect_study import EffectStatus
 
 
@@ -31,3 +34,11 @@ def test_a_bar_takes_no_name_for_markup() -> None:
     screen.progress("sensor [/x] [red]S1 :car:", 1, 2)
     Console(file=shown, width=100).print(screen._bar.get_renderable())
     assert "scan: sensor [/x] [red]S1 :car: 1/2" in shown.getvalue()
+
+
+@pytest.mark.parametrize(("beats_next", "text"), [(0.896, "~ 89%"), (0.9, "90%"), (0.612, "~ 61%")])
+def test_unclear_lead_is_not_rounded_up_to_the_limit(beats_next: float, text: str) -> None:
+    site = RankedSite("a", 0.0, 0.0, 3.0, 10.0, 1, "a", 0.0, 0.0, 0.0, "s", 1e4, 1, 1, 0.5)
+    sites = [replace(site, beats_next=beats_next, egvs_se=1.0), replace(site, site="b", rank=2)]
+    (cells,) = [list(column.cells) for column in ranking_table(sites).columns if column.header == "beats next"]
+    assert cells == [text, "-"]

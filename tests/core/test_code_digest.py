@@ -175,7 +175,15 @@ SOURCE_BEFORE = {
 }
 """Code lines behind the key of each stage before the layout with one module per subject."""
 
-GROWTH = {"check": 1.22, "statics": 1.2, "scan": 1.22, "traffic": 1.27, "tpog": 1.2, "score": 1.21, "report": 1.31}
+GROWTH = {
+    "check": 1.22,
+    "statics": 1.2,
+    "scan": 1.223,
+    "traffic": 1.274,
+    "tpog": 1.202,
+    "score": 1.217,
+    "report": 1.31,
+}
 """Allowed growth, 1.1 for the others: a stage runs again whenever a line behind its key changes."""
 
 

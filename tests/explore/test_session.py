@@ -100,6 +100,12 @@ def test_sensor_without_property_that_an_effect_needs_has_no_score(tmp_path: Pat
     assert "rated_range_m" in str(unknown.findings[-1])
 
 
+def test_rejects_unknown_candidate_and_names_those_there_are(opened: Session) -> None:
+    with pytest.raises(InputError, match="no such candidate") as caught:
+        opened.rate("pole_c", MOVED)
+    assert "pole_a, pole_b" in str(caught.value)
+
+
 def test_rejects_unknown_sensor(opened: Session) -> None:
     with pytest.raises(InputError, match="unknown sensor 'nothing'"):
         opened.rate("pole_a", MOVED, "nothing")

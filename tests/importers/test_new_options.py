@@ -170,6 +170,9 @@ def test_requested_vehicles_per_hour_are_written(tmp_path: Path, total_per_h: in
     assert sum(flow.per_hour for flow in counts) == total_per_h
     assert summary.traffic is not None
     assert summary.traffic.summary == f"carries all of the {total_per_h:,} requested vehicles an hour"
+    assumed = loading.load(tmp_path / "out").assumed
+    assert assumed[0] == f"shares of the movements (of {total_per_h:,} vehicles an hour)"
+    assert not any("traffic" in entry for entry in assumed)
 
 
 def test_requested_vehicles_per_hour_above_capacity_stay_and_are_named(

@@ -8,6 +8,7 @@ import itertools
 import json
 import math
 import re
+import shutil
 from collections import Counter
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -16,12 +17,13 @@ import pytest
 import shapely
 from shapely.geometry import LineString, Point, shape
 
-from egvs.cli import app
+from egvs.cli import app, new_summary
 from egvs.core.errors import InputError
 from egvs.formats import osm
 from egvs.importers import openstreetmap
 from egvs.scenario import loading
 from egvs.sensors import sites
+from egvs.stages import check
 from egvs.traffic.capacity import Capacity, TrialRun
 from tests.formats.test_osm import pbf_of
 from tests.stage_runner import run_stage
@@ -241,6 +243,33 @@ def test_scenario_loads(made: Made) -> None:
         assert loaded.find(name, "test").is_file()
 
 
+def test_each_count_has_its_movement_as_a_comment(made: Made) -> None:
+    text = (made[0] / "scenario.toml").read_text(encoding="utf-8")
+    comments = re.findall(r"^    \{from_edge = .*\}, # (.*)$", text, re.MULTILINE)
+    assert len(comments) == len(set(comments)) == 12
+    assert "northbound on North Street, straight on" in comments
+    assert "northbound on North Street, left to East Street" in comments
+    assert "eastbound on East Street, right to North Street" in comments
+
+
+def test_template_of_periods_can_be_used(made: Made, tmp_path: Path) -> None:
+    shutil.copytree(made[0], tmp_path / "copy")
+    path = tmp_path / "copy" / "scenario.toml"
+    before, marker, after = path.read_text(encoding="utf-8").partition("# [[traffic.periods]]\n")
+    template = re.sub(r"^# ", "", marker + after, flags=re.MULTILINE)
+    path.write_text(before + template, encoding="utf-8")
+    (period,) = loading.load(tmp_path / "copy").traffic.periods
+    assert (period.name, period.counts) == ("morning", made[1].flows[:1])
+
+
+def test_printed_solids_are_those_of_the_check(made: Made, capsys: pytest.CaptureFixture[str]) -> None:
+    new_summary.print_new_scenario(made[1])
+    printed = re.search(r"^solids +(\d+) objects \((\d+) solids", capsys.readouterr().out, re.MULTILINE)
+    assert printed is not None
+    n_objects, n_solids = int(printed[1]), int(printed[2])
+    assert n_solids == check.check_scenario(loading.load(made[0])).solids > n_objects
+
+
 def test_names_junction_and_attributes_source(made: Made) -> None:
     folder, summary = made
     assert summary.junction.title == "signalised junction of East Street and North Street"
@@ -456,11 +485,17 @@ def test_rejects_missing_file(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("at", [(0.0, 0.0), (10.0, 52.0), (float("nan"), 10.0)])
+@pytest.mark.parametrize("at", [(0.0, 0.0), (52.0, 52.0), (float("nan"), 10.0)])
 def test_rejects_position_outside_extract(tmp_path: Path, at: tuple[float, float]) -> None:
     with pytest.raises(InputError, match=r"--at: .* is outside the extract.*latitude 51\.998"):
         openstreetmap.create_scenario(tmp_path / "out", SMALL, at=at)
     assert not list(tmp_path.iterdir())
+
+
+def test_suggests_position_with_latitude_first(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=re.escape("Latitude comes first: did you mean --at 52.0,10.0?")):
+        openstreetmap.create_scenario(tmp_path / "new", SMALL, (10.0, 52.0))
+    assert not (tmp_path / "new").exists()
 
 
 def test_rejects_folder_with_content(tmp_path: Path) -> None:

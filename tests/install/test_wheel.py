@@ -121,7 +121,8 @@ def test_commands_of_the_readme_work_or_name_their_extra(installed: Installed, w
     installed.egvs("run", "myplace", *FEW, "--out", "runs/myplace")
     installed.egvs("place", "runs/myplace", "--count", "2")
     assert "complete" in installed.egvs("runs").stdout
-    installed.egvs("compare", "runs/myplace", "runs/myplace")
+    shutil.copytree(runs, runs.with_name("copy"))
+    installed.egvs("compare", "runs/myplace", "runs/copy")
     installed.egvs("export", "runs/myplace", "--to", "csv")
     installed.egvs("verify", "runs/myplace")
     assert (runs / "report.html").exists() and (runs / "placement.parquet").exists()

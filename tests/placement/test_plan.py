@@ -259,7 +259,7 @@ REJECTED = {
     ),
     "no costs": (["--budget", "50"], "placement.budget: the cost of site a is unknown"),
     "a sensor without a price": (
-        ["--budget", "50", "--set", "costs.sensor.other=1"],
+        ["--budget", "50", "--set", "costs.sensor.VLP-16=1"],
         "costs.sensor: the cost of sensor small (site a) is unknown",
     ),
     "forced ones too near": (
@@ -309,6 +309,13 @@ def test_rejects_impossible_request(case: str, five_candidates: Path, out: Path,
     assert code == 2, error
     assert message in error
     assert not (out / "placement.parquet").exists()
+
+
+def test_rejects_cost_of_unknown_sensor(five_candidates: Path, out: Path, run_egvs) -> None:
+    costs = "costs.sensor={small=4, VLP16=3}"
+    code, _, error = run_egvs("place", five_candidates, "--out", out, "--count", 1, "--set", costs)
+    assert code == 2
+    assert "costs.sensor: unknown sensor 'VLP16'. Did you mean VLP-16?" in error
 
 
 def test_rejects_cost_that_is_no_number(five_candidates: Path, out: Path, run_egvs) -> None:

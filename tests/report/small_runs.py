@@ -116,6 +116,7 @@ def run_to_scores(folder, sites=SITES, counts=lane_counts, record=True, **keys):
 
 def make_record(seconds=1.25):
     traffic = {
+        "frames": FRAMES,
         "vehicles": {"fewest": 3, "most": 5, "different": 1234}, "mean_speed_m_s": 5.0, "share_standing": 0.25,
         "collisions": 7, "frames_with_overlap": 2, "longest_standing_s": 12.5, "sumo": "9.8.7",
         "sumo_seconds": 77.77, "notes": ["<i>late</i>"],

@@ -34,6 +34,7 @@ from tests.report.small_runs import (
     run_to_scores,
     site_data,
 )
+from tests.scoring.roads import NETWORK
 from tests.stage_runner import inputs_of
 
 
@@ -62,6 +63,25 @@ def test_flows_that_are_assumed_are_not_called_counted(tmp_path):
     assert "Assumed and simulated traffic" in page and "Counted" not in page
     other = scenario.model_copy(update={"assumed": ("positions of traffic lights",)})
     assert "Counted and simulated traffic" in render_report(other, out)
+
+
+def test_counts_are_described_as_movements_of_the_network(tmp_path):
+    (tmp_path / "scenario").mkdir()
+    (tmp_path / "scenario" / "made.net.xml").write_text(NETWORK)
+    (tmp_path / "out" / "sumo").mkdir(parents=True)
+    (tmp_path / "out" / "sumo" / "network.net.xml").write_text(NETWORK)
+    counts = [{"from_edge": "near", "to_edge": "up", "per_hour": 320.0}, {"edge": "back", "per_hour": 60.0}]
+    traffic = {"network": "made.net.xml", "frames": FRAMES, "counts": counts}
+    scenario, out = run_to_scores(tmp_path, traffic=traffic)
+    record = make_record()
+    record["stages"]["traffic"]["summary"]["counts"] = [
+        {"place": place, "kind": "", "counted_per_h": 60.0, "simulated_per_h": 60.0, "geh": 0.0}
+        for place in ("near to up", "back")
+    ]
+    (out / "run.json").write_text(json.dumps(add_checksum(record)), encoding="utf-8")
+    read = PageReader(render_report(scenario, out))
+    assert "near to up|eastbound on High Street, left to an unnamed street|all|60|60|0.0|" in read.rows
+    assert "back|westbound on High Street|all|60|60|0.0|" in read.rows
 
 
 def test_has_no_table_of_counts_without_counts(plain_run):

@@ -9,7 +9,7 @@ import pytest
 
 from egvs.artefacts.plan_step import PlanStep
 from egvs.report.formatting import SCORE_LABELS
-from egvs.report.plan_answer import describe_count, is_useful, next_count
+from egvs.report.plan_answer import CurvePlan, describe_count, is_useful, next_count
 
 FOUND = SCORE_LABELS["expected_detections"]
 EGVS = SCORE_LABELS["egvs"]
@@ -29,6 +29,26 @@ def test_says_how_many_are_enough() -> None:
     steps = steps_of(0.946, 0.992, 0.997, gain_se=0.002, beats=0.99)
     assert describe_count(steps, FOUND) == "Two are enough: a third adds 0.5 ± 0.2 percentage points."
     assert describe_count(steps_of(0.99, 0.9912), FOUND) == "One is enough: a second adds 0.1 percentage points."
+
+
+def test_names_the_plan_that_is_enough_where_it_is_smaller_than_the_one_shown() -> None:
+    steps = steps_of(0.946, 0.992, 0.998, gain_se=0.001, beats=0.99)
+    plans = [CurvePlan(("a",), 0.0), CurvePlan(("b", "c"), 0.0), CurvePlan(("a", "b", "c"), 0.0)]
+    assert describe_count(steps, FOUND, plans=plans) == (
+        "Two are enough (b and c): a third adds 0.6 ± 0.1 percentage points."
+    )
+    same = [*plans[:2], plans[1]]  # a third sensor is not used
+    assert describe_count(steps, FOUND, plans=same).startswith("Two are enough: a third")
+
+
+def test_plan_within_a_budget_is_not_contradicted() -> None:
+    steps = steps_of(0.946, 0.992, 0.998, gain_se=0.001, beats=0.99)
+    plans = [CurvePlan(("a",), 1e4), CurvePlan(("b", "c"), 2e4), CurvePlan(("a", "b", "c"), 3e4)]
+    assert describe_count(steps, FOUND, plans=plans, has_budget=True) == (
+        "The budget buys three sensors; the third adds only 0.6 ± 0.1 percentage points, so two are enough: "
+        "b and c for 20000."
+    )
+    assert describe_count(steps[:2], FOUND, plans=plans[:2], has_budget=True).startswith("A second sensor adds 4.6 ")
 
 
 def test_says_what_the_last_sensor_adds_where_it_is_still_useful() -> None:

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+
+import pytest
 
 from egvs.core.errors import Diagnostic
 from egvs.report import ranking as report_ranking
 from egvs.report.formatting import SCORE_LABELS
-from egvs.report.ranking import RankedSite, Ranking, ScoreValue, describe_poles_on_road
+from egvs.report.ranking import RankedSite, Ranking, ScoreValue
+from egvs.report.sections import describe_poles_on_road
+from egvs.scenario.loading import load
+
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
 
 
 def ranking(*rows: tuple[str, float, int, float, float]) -> Ranking:
@@ -36,7 +43,7 @@ def test_sentences_for_a_score_over_vehicles() -> None:
     detected = by_vehicles(("a", 50.0, 0.871), ("b", 90.0, 0.8), ("c", 20.0, 0.4))
     assert (
         report_ranking.headline(detected, has_traffic=True)
-        == "a is the best of 3 sites: it should find 87% of vehicles"
+        == "a is the best of 3 sites: it should find 87.1% of vehicles"
     )
     assert report_ranking.lead(detected) == "It leads the next site, b, by 7.1 percentage points."
     assert report_ranking.entropy_seen_note(detected) == ""
@@ -46,10 +53,20 @@ def test_sentences_for_a_score_over_vehicles() -> None:
     assert detected.sites[0].score_se == 0.01 and detected.companion_score is SCORE_LABELS["egvs"]
     assert (
         report_ranking.headline(by_vehicles(("a", 50.0, 0.871)), has_traffic=True)
-        == "a, the only site, should find 87% of vehicles"
+        == "a, the only site, should find 87.1% of vehicles"
     )
     assert by_vehicles(("a", 50.0, 0.9), rank_by="egvs").companion_score is SCORE_LABELS["expected_detections"]
     assert ranking(("a", 50.0, 1, 0.5, 1.0)).companion_score is None
+
+
+def test_gain_of_a_pole_is_in_percentage_points_for_shares_and_relative_otherwise() -> None:
+    shares = by_vehicles(("a", 50.0, 0.6), ("b", 90.0, 0.4), ("c", 20.0, 0.0)).sites
+    assert report_ranking.Pole("p", shares[:2]).gain_text == "20.0"
+    assert report_ranking.Pole("p", shares).gain_text == "60.0"
+    assert report_ranking.Pole("p", shares[:1]).gain_text == ""
+    bits = ranking(("a", 60.0, 1, 0.5, 1.0), ("b", 40.0, 2, 0.5, 1.0), ("c", 0.0, 3, 0.0, 1.0)).sites
+    assert report_ranking.Pole("p", bits[:2]).gain_text == "50.0%"
+    assert report_ranking.Pole("p", bits).gain_text == ""
 
 
 def test_lead_says_whether_the_best_is_certain() -> None:
@@ -57,11 +74,9 @@ def test_lead_says_whether_the_best_is_certain() -> None:
     ahead = ranking(("a", 100.0, 1, 0.5, 0.5), ("b", 100.0, 1, 0.6, 0.99), ("c", 80.0, 3, 0.4, 1.0))
     assert report_ranking.lead(ahead) == "They lead the next site, c, by 20.0% of their score."
     near = ranking(("a", 100.0, 1, 0.5, 0.5), ("b", 100.0, 1, 0.6, 0.7), ("c", 98.0, 3, 0.4, 1.0))
-    assert report_ranking.lead(near).endswith(
-        "by 2.0% of their score. There is too little traffic to tell which of them is better."
-    )
+    assert report_ranking.lead(near).endswith("by 2.0% of their score. These poles cannot be told apart.")
     alone = ranking(("a", 100.0, 1, 0.5, 0.7), ("c", 98.0, 2, 0.4, 1.0))
-    assert report_ranking.lead(alone).endswith("There is too little traffic to tell which of them is better.")
+    assert report_ranking.lead(alone, "More helps.").endswith("These poles cannot be told apart. More helps.")
 
 
 def test_lead_names_the_best_site_on_another_pole_if_the_next_site_is_on_the_same_one() -> None:
@@ -75,6 +90,56 @@ def test_lead_names_the_best_site_on_another_pole_if_the_next_site_is_on_the_sam
     single_pole = tuple(replace(site, pole="p") for site in sites)
     text = report_ranking.lead(report_ranking.Ranking(single_pole, single_pole[:1], ()))
     assert text == "It leads the next site, b, by 2.0 percentage points."
+
+
+def with_rivals(*rows: tuple[str, str, float, float, float]) -> Ranking:
+    """From (site, pole, share found, error of the difference to the best, chance that the best is better)."""
+    sites = by_vehicles(*((site, 50.0, share) for site, _, share, _, _ in rows)).sites
+    compared = tuple(
+        replace(site, pole=pole, behind_best_se=se, best_beats=chance)
+        for site, (_, pole, _, se, chance) in zip(sites, rows, strict=True)
+    )
+    return Ranking(compared, compared[:1], ())
+
+
+@pytest.mark.parametrize(
+    ("chance", "says"),
+    [
+        (0.903, "(it is truly worse with a probability of 90%)."),
+        (0.896, "(it is truly worse with a probability of 89.6%). These poles cannot be told apart. More helps."),
+        (0.7, "(it is truly worse with a probability of 70%). These poles cannot be told apart. More helps."),
+        (0.9999, "(it is truly worse with a probability of over 99%)."),
+    ],
+)
+def test_lead_over_another_pole_has_its_error_and_probability(chance: float, says: str) -> None:
+    sites = with_rivals(("a", "p", 0.9, 0.0, 0.5), ("b", "p", 0.89, 0.004, 0.99), ("c", "q", 0.883, 0.013, chance))
+    assert report_ranking.lead(sites, "More helps.") == (
+        "It leads the next site, b, by 1.0 ± 0.4 percentage points (it is truly better with a probability of 99%)."
+        f" The best site on another pole, c, is behind by 1.7 ± 1.3 percentage points {says}"
+    )
+
+
+def test_next_site_on_another_pole_is_compared_once() -> None:
+    text = report_ranking.lead(with_rivals(("a", "p", 0.9, 0.0, 0.5), ("c", "q", 0.8999, 0.0001, 0.84)), "More helps.")
+    assert text == (
+        "It leads the next site, c, by 0.01 ± 0.01 percentage points (it is truly better with a probability of 84%)."
+        " These poles cannot be told apart. More helps."
+    )
+
+
+def test_hint_names_the_setting_that_limits_the_error(mini: Path) -> None:
+    by, egvs = SCORE_LABELS["expected_detections"], SCORE_LABELS["egvs"]
+    recorded = load(mini)
+    more = "More frames may separate them: --set score.sampled_frames="
+    assert report_ranking.more_frames_hint(recorded, by, 5000) == f"{more}1000."
+    assert report_ranking.more_frames_hint(recorded, by, 600) == f"{more}600."
+    assert report_ranking.more_frames_hint(recorded, by, 500) == "A longer recording may separate them."
+    assert report_ranking.more_frames_hint(recorded, egvs, 5000) == "A longer recording may separate them."
+    many = load(mini, ["score.sampled_frames=1000"])
+    assert report_ranking.more_frames_hint(many, by, 5000) == f"{more}4000."
+    simulated = load(SCENARIOS / "roundabout")
+    assert report_ranking.more_frames_hint(simulated, egvs, 5000).endswith("--set traffic.frames=20000.")
+    assert "longer periods" in report_ranking.more_frames_hint(load(SCENARIOS / "nishishinjuku_peaks"), by, 400)
 
 
 def test_note_on_the_site_that_sees_most_entropy() -> None:

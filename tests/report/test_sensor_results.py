@@ -16,6 +16,7 @@ from egvs.report.sensor_results import (
     best_mounts,
     costs_option,
     format_difference,
+    range_note,
     site_cost,
 )
 from egvs.scenario.score_config import CostsConfig
@@ -78,6 +79,17 @@ def test_without_a_cost_the_sensor_that_finds_least_is_the_baseline() -> None:
     assert costs_option(comparison.sensors) == """--set 'costs.sensor={"small" = PRICE, "large" = PRICE}'"""
 
 
+def test_sensors_with_a_cost_are_compared_without_that_of_another() -> None:
+    sites = site("a", "large", 0.85), site("b", "medium", 0.80), site("c", "small", 0.60)
+    comparison = compare(*sites, prices={"small": 4000.0, "large": 18000.0})
+    assert [result.mount.sensor for result in comparison.results] == ["small", "large", "medium"]
+    assert comparison.shows_cost_per_point
+    assert [result.cost_per_point_text for result in comparison.results] == ["-", "560", "-"]
+    assert [result.step_cost_text for result in comparison.results] == ["-", "560", "-"]
+    assert "the cheapest with a known cost" in comparison.explanation
+    assert comparison.explanation.endswith("Without a known cost: medium.")
+
+
 def test_one_sensor_is_not_compared() -> None:
     assert SensorComparison.of_run([site("a", "small", 0.6), site("b", "small", 0.5)], CostsConfig()) is None
 
@@ -124,3 +136,9 @@ def test_difference_in_bits_has_no_percentage_points() -> None:
     bits = replace(site("a", "s", 0.65), rank_by="egvs", others=())
     assert format_difference(ScoreDifference(1234.4, 56.0, 1.0), bits) == "+1,234 ±56"
     assert math.isclose(bits.score, 650.0)
+
+
+def test_several_sensors_without_range_limit_have_a_note() -> None:
+    assert range_note(["a", "b", "a"], is_modelled=False).endswith("Try --set effects.range_limit={}.")
+    assert range_note(["a", "b", "a"], is_modelled=True) == ""
+    assert range_note(["a", "a"], is_modelled=False) == ""

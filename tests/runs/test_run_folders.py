@@ -13,9 +13,10 @@ import egvs
 from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.core import files
-from egvs.core.errors import InputError
+from egvs.core.errors import InputError, RunError
 from egvs.core.files import add_checksum
-from egvs.runs import run_list, run_sources
+from egvs.runs import locks, run_list, run_sources
+from egvs.runs.run import lock_run_folder
 from egvs.runs.run_sources import SettingsSource
 from egvs.scenario.settings import format_overrides
 
@@ -140,12 +141,64 @@ def test_lists_broken_runs_with_their_problem(
 
 
 def test_lists_interrupted_run_and_no_other_folder(here: Path) -> None:
-    for name in ("stopped", "notes", ".store"):
+    for name in ("stopped", "unused", "notes", ".store"):
         (Path("runs") / name).mkdir(parents=True)
-    for name in ("stopped", ".store"):
+    for name in ("stopped", "unused", ".store"):
         (Path("runs") / name / ".lock").touch()
+    (Path("runs") / "stopped" / "statics.ply").touch()
     (listed,) = run_list.list_runs()
-    assert (listed.folder.name, listed.problem) == ("stopped", "run.json: no such file")
+    assert (listed.folder.name, listed.problem) == ("stopped", "never finished")
+
+
+def test_run_that_wrote_nothing_leaves_no_folder(here: Path, run_egvs: Any) -> None:
+    assert run_egvs("run", "mini", "--set", "sites.replace_sensor=VLP32")[0] == 2
+    assert not Path("runs").exists()
+    Path("chosen").mkdir()
+    assert run_egvs("run", "mini", "--set", "sites.replace_sensor=VLP32", "--out", "chosen")[0] == 2
+    assert Path("chosen").is_dir()
+
+
+def test_run_that_waited_for_one_that_failed_has_its_folder(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    out, path = Path("runs/mini"), Path("runs/mini/.lock")
+    try_lock = locks.wait_for_lock
+
+    def other_run_fails_first(descriptor: int, timeout_s: float, *, shared: bool = False) -> bool:
+        monkeypatch.setattr(locks, "wait_for_lock", try_lock)
+        path.unlink()
+        out.rmdir()
+        return try_lock(descriptor, timeout_s, shared=shared)
+
+    monkeypatch.setattr(locks, "wait_for_lock", other_run_fails_first)
+    with lock_run_folder(out), pytest.raises(RunError, match="another run is using this folder"), lock_run_folder(out):
+        pass
+
+
+def test_report_of_a_run_folder(here: Path, run_egvs: Any) -> None:
+    egvs.run(egvs.load(here, ["score.gamma=5"]))
+    before, record = (OTHER / "report.html").read_bytes(), RunRecord.read(OTHER)
+    (OTHER / "report.html").unlink()
+    code, printed, _ = run_egvs("report", OTHER)
+    assert (code, str(OTHER / "report.html") in printed) == (0, True)
+    assert (OTHER / "report.html").read_bytes() == before
+    assert RunRecord.read(OTHER).overrides == record.overrides
+    message = (
+        f"egvs: {OTHER}: expected a scenario.toml, got none. This is a run folder. Give the scenario's folder, mini.\n"
+    )
+    assert run_egvs("run", OTHER)[::2] == (2, message)
+
+
+def test_folders_without_a_run_are_explained(here: Path, run_egvs: Any) -> None:
+    Path("runs/stopped").mkdir(parents=True)
+    Path("runs/stopped/.lock").touch()
+    message = "egvs: runs/stopped: the run in this folder never finished. Leave it out, or repeat its egvs run.\n"
+    assert run_egvs("compare", "runs/stopped")[::2] == (2, message)
+    message = (
+        "egvs: mini: this is a scenario; expected a run folder. First run egvs run mini, then give its run folder.\n"
+    )
+    assert run_egvs("verify", "mini")[::2] == (2, message)
+    egvs.run(egvs.load(here))
+    message = "egvs: mini: this is a scenario; expected a run folder. Did you mean runs/mini?\n"
+    assert run_egvs("compare", "mini")[::2] == (2, message)
 
 
 def test_list_of_another_folder(here: Path, run_egvs: Any) -> None:
@@ -254,6 +307,17 @@ def test_says_in_which_settings_a_scenario_differs_from_its_latest_run(here: Pat
     assert note() == f"{there}score.gamma (5 there, 4 here), traffic.frames (20 there, 40 here)"
     assert note("--set", "score.gamma=5") == f"{there}traffic.frames (20 there, 40 here)"
     assert note("--set", "score.gamma=5", "--set", "traffic.frames=20") == ""
+    egvs.run(egvs.load(here))
+    make_later(latest, 120)
+    assert note() == ""  # an earlier run has these settings
+
+
+def test_effect_with_default_parameters_is_on(here: Path, run_egvs: Any) -> None:
+    egvs.run(egvs.load(here, ["effects.moving_occlusion={}"]))
+    assert [path.name for path in Path("runs").iterdir()] == ["mini@moving_occlusion=on"]
+    assert "effects.moving_occlusion=on " in run_egvs("runs")[1]
+    messages = run_egvs("place", here, "--count", 1)[2]
+    assert "mini@moving_occlusion=on: effects.moving_occlusion (on there, off here)\n" in messages
 
 
 def test_latest_run_is_one_of_the_same_scenario(here: Path, tmp_path: Path) -> None:

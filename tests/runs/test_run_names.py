@@ -39,6 +39,8 @@ LABELS = {
     "gamma=inf": {"score.gamma": float("inf")},
     "frames=300,gamma=5": {"score.gamma": 5, "traffic.frames": 300},
     "rain.rate_mm_h=20": {"effects.rain.rate_mm_h": 20.0},
+    "range_limit=on": {"effects.range_limit": {}},
+    "frames=300,slope=on": {"effects.slope": {}, "traffic.frames": 300},
     "rank_by=egvs": {"score.rank_by": "egvs"},
     "keep=false": {"scan.keep": False},
     "placement.refine.heights_m=3": {"placement.refine.heights_m": 3},
@@ -105,7 +107,6 @@ SAME = {
     "a table": (["score={gamma=5, others=[]}"], ["score.others=[]", "score.gamma=5"]),
     "what the file says": (["score.gamma=4.0"], []),
     "a default": (["scan.keep=true"], []),
-    "a path with another direction": (["sites.yaw_deg=3"], ["sites.aim=roi", "sites.yaw_deg=3"]),
 }
 
 

@@ -205,6 +205,7 @@ KEYS: dict[str, Change] = {
     "score.keep_visibility": Change("'all'"),
     "score.blindspots": Change("false"),
     "score.standard_error": Change("false"),
+    "score.sampled_frames": Change("20"),
     "effects.range_limit.reflectivity": Change("0.5", effect("range_limit")),
     "effects.range_limit.incidence_deg": Change("20", effect("range_limit")),
     "effects.range_limit.softness": Change("0.1", effect("range_limit")),

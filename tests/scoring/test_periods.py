@@ -21,12 +21,11 @@ from egvs.artefacts.readers import PeriodRanking, read_scores_by_period
 from egvs.artefacts.tpog import read_periods, read_tpog
 from egvs.core.errors import Diagnostic, InputError, collect_warnings
 from egvs.core.grid import Grid
-from egvs.scoring import score_table
 from egvs.scoring.egvs import EntropyField, binary_entropy
 from egvs.scoring.score_table import ScoreTable, SiteScores
 from egvs.scoring.scorer import SiteScore
 from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, ScoreUncertainty
-from egvs.stages import traffic
+from egvs.stages import score, traffic
 from egvs.stages.inputs import open_folder
 from egvs.studies.effect_study import effect_statuses
 
@@ -218,11 +217,47 @@ def score_table_of(**sites: tuple[float, ...]) -> ScoreTable:
 
 def test_warns_of_period_with_other_best_site() -> None:
     table = score_table_of(a=(9.0, 9.0, 3.0), b=(7.0, 6.0, 4.0))
-    (warning,) = score_table.warn_period_disagreements(table, "egvs")
+    (warning,) = score.warn_period_disagreements(table, "egvs")
     assert warning.where == "scenario.toml: traffic.periods (night)"
     assert warning.problem == "the best site is b; a, the best of the mix, has rank 2 and scores 25.0% less"
-    assert not list(score_table.warn_period_disagreements(score_table_of(a=(9, 9, 4), b=(7, 6, 4)), "egvs"))
-    assert not list(score_table.warn_period_disagreements(score_table_of(a=(9, 0, math.nan)), "egvs"))
+    assert not list(score.warn_period_disagreements(score_table_of(a=(9, 9, 4), b=(7, 6, 4)), "egvs"))
+    assert not list(score.warn_period_disagreements(score_table_of(a=(9, 0, math.nan)), "egvs"))
+
+
+def test_period_with_slightly_better_site_is_no_warning_where_errors_are_unknown() -> None:
+    def count(night: float) -> int:
+        return len(list(score.warn_period_disagreements(score_table_of(a=(9, 9, night), b=(7, 6, 4)), "egvs")))
+
+    assert (count(3.95), count(3.97)) == (1, 0)
+
+
+def shares_at_night(a: float, b: float) -> ScoreTable:
+    """Two sites by their entropy seen, a share: a is the best of the mix and has these shares at night."""
+    sites = []
+    for name, mix, night in (("a", 0.9, a), ("b", 0.7, b)):
+        by_period = (SiteScore(1.0, mix), SiteScore(1.0, night))
+        sites.append(SiteScores(name, SiteScore(1.0, mix, by_period=by_period), None))
+    return ScoreTable.of(sites, {}, periods=("morning", "night"))
+
+
+def test_loss_of_shares_is_in_percentage_points() -> None:
+    (warning,) = score.warn_period_disagreements(shares_at_night(0.40, 0.412), "entropy_seen")
+    assert warning.problem.endswith("has rank 2 and scores 1.2 percentage points less")
+    assert not list(score.warn_period_disagreements(shares_at_night(0.40, 0.408), "entropy_seen"))  # 2 % less
+
+
+@pytest.mark.parametrize(("scatter", "warnings"), [(0.001, 1), (0.1, 0)])
+def test_known_errors_decide_whether_a_period_disagrees(scatter: float, warnings: int) -> None:
+    """At night b leads by 0.5 %, with left-out scores that scatter little or much against those of a."""
+    groups = {period: (BlockGroups(np.full(6, 5), 0.0),) for period in ("", "morning", "night")}
+    swing = scatter * np.array([0.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0])
+    flat = np.zeros(7)
+    sites = []
+    for name, mix, night, change in (("a", 9.0, 3.98, flat), ("b", 7.0, 4.0, swing)):
+        by_period = (SiteScore(mix, 0.0, mix + flat), SiteScore(night, 0.0, night + change))
+        sites.append(SiteScores(name, SiteScore(mix, 0.0, mix + flat, by_period=by_period), None))
+    table = ScoreTable.of(sites, groups, periods=("morning", "night"))
+    assert len(list(score.warn_period_disagreements(table, "egvs"))) == warnings
 
 
 def test_score_table_is_long_and_labelled() -> None:
@@ -253,7 +288,7 @@ def test_periods_disagree_without_standard_errors_too(
     split: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told = Diagnostic("periods disagree", "scenario.toml: traffic.periods (night)", "b is the best site, not a", "")
-    monkeypatch.setattr(score_table, "warn_period_disagreements", lambda *_: [told])
+    monkeypatch.setattr(score, "warn_period_disagreements", lambda *_: [told])
     for override in ("score.standard_error=true", "score.standard_error=false", "tpog.blocks=1"):
         record = egvs.run(egvs.load(split, [override]), tmp_path / override)
         assert told in collect_warnings([record.stages["score"].summary]), override

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import egvs
-from egvs.artefacts import parquet
+from egvs.artefacts import parquet, readers
 from egvs.artefacts.readers import PeriodRanking, read_scores, read_scores_by_period, read_visibility
 from egvs.artefacts.tpog import read_tpog
 from egvs.artefacts.traffic_frames import read_frames
@@ -29,6 +29,7 @@ from egvs.stages import score
 from tests.scoring import target_scenes as scenes
 from tests.stage_runner import inputs_of, run_stage
 
+DEMO = Path(__file__).parents[2] / "scenarios" / "demo"
 ALL = 'score.others=["expected_detections", "seen_well", "points_on_target", "entropy_seen"]'
 SITES = "site,x_m,y_m,z_m\n" + "".join(f"s{n},{5 + 6 * n},{11 - 22 * (n % 2)},{2 + n}\n" for n in range(5))
 
@@ -74,6 +75,8 @@ def test_sites_rank_by_named_score(mini: Path, tmp_path: Path, name: str) -> Non
     assert parquet.read_metadata(tmp_path / "run" / "scores.parquet", "scores")["rank_by"] == name
     ranked = sorted(rows.values(), key=lambda row: row["rank"])
     assert ranked[-1]["beats_next"] == 1.0
+    assert (ranked[0]["behind_best_se"], ranked[0]["best_beats"]) == (0.0, 0.5)
+    assert ranked[1]["best_beats"] == ranked[0]["beats_next"]
     assert all(0.5 <= row["beats_next"] <= 1.0 for row in ranked)
 
 
@@ -81,7 +84,7 @@ def test_sites_rank_by_named_score(mini: Path, tmp_path: Path, name: str) -> Non
 def test_rank_by_changes_no_score(mini: Path, tmp_path: Path) -> None:
     (mini / "sites.csv").write_text(SITES)
     plain, other = run(mini, tmp_path / "a"), run(mini, tmp_path / "b", "score.rank_by=points_on_target", ALL)
-    shared = set(plain["s0"]) - {"rank", "beats_next"}
+    shared = set(plain["s0"]) - {"rank", "beats_next", "behind_best_se", "best_beats"}
     assert {"egvs", "egvs_se", "expected_detections", "expected_detections_se"} <= shared
     assert all(other[site][key] == row[key] for site, row in plain.items() for key in shared)
 
@@ -118,7 +121,7 @@ def test_no_standard_errors_when_disabled(mini: Path, tmp_path: Path) -> None:
     for number, override in enumerate(("score.standard_error=false", "tpog.blocks=1")):
         rows = run(mini, tmp_path / str(number), ALL, override, "score.rank_by=seen_well")
         assert by_rank(rows, "seen_well")
-        assert not [name for name in rows["pole_a"] if name.endswith(("_se", "beats_next"))]
+        assert not [name for name in rows["pole_a"] if name.endswith(("_se", "beats_next", "best_beats"))]
 
 
 @pytest.mark.slow
@@ -172,6 +175,7 @@ def test_warns_of_unknown_standard_errors(mini: Path, tmp_path: Path) -> None:
     assert by_rank(rows, "seen_well")
     assert all(math.isnan(row["seen_well_se"]) and math.isnan(row["beats_next"]) for row in rows.values())
     sets = ["score.rank_by=seen_well", "score.others=[]"]
+    assert all(math.isnan(row["behind_best_se"]) and math.isnan(row["best_beats"]) for row in rows.values())
     record = egvs.run(loading.load(mini, sets), tmp_path / "run", jobs=1)
     (doubt,) = (it for it in collect_warnings([record.stages["score"].summary]) if it.rule == "no standard error")
     assert "all vehicles in the region are in one of 4 blocks of frames" in doubt.problem
@@ -187,6 +191,25 @@ def test_only_scores_over_vehicles_read_trajectories(mini: Path, tmp_path: Path)
     assert "expected_detections" not in read_scores(tmp_path / "scores.parquet").column_names
     assert not (tmp_path / "blindspots.parquet").exists()
     assert read_tpog(tmp_path / "tpog.parquet").frames == 40
+
+
+@pytest.mark.slow
+def test_more_sampled_frames_reduce_the_error_of_the_lead(tmp_path: Path) -> None:
+    """The demo has 1,000 recorded frames; 100 of them have a larger paired error than all."""
+    few, many = (run(DEMO, tmp_path / str(n), f"score.sampled_frames={n}") for n in (100, 1000))
+    assert all(row["egvs"] == many[site]["egvs"] for site, row in few.items())
+    assert any(row["expected_detections"] != many[site]["expected_detections"] for site, row in few.items())
+    errors = [[row["behind_best_se"] for row in rows.values() if row["rank"] > 1] for rows in (few, many)]
+    assert np.mean(errors[1]) < 0.8 * np.mean(errors[0])
+    blindspots = [readers.read_blindspots(tmp_path / str(n) / "blindspots.parquet", ["kerb_NE"]) for n in (100, 1000)]
+    observed = [next(iter(sites)).overall.vehicle_frames for sites in blindspots]
+    assert observed[1] > 9 * observed[0]
+
+
+def test_sampled_frames_are_recorded_only_where_set() -> None:
+    assert "sampled_frames" not in ScoreConfig().model_dump(mode="json")
+    dumped = ScoreConfig(sampled_frames=250, gamma=math.inf).model_dump(mode="json")
+    assert (dumped["sampled_frames"], dumped["gamma"]) == (250, math.inf)
 
 
 def test_additional_scores_are_unique() -> None:
@@ -227,14 +250,14 @@ def test_terminal_and_report_show_the_score_that_ranks(mini: Path, tmp_path: Pat
     code, printed, _ = run_egvs("run", mini, "--out", tmp_path, "--set", "score.rank_by=seen_well")
     assert code == 0
     best = next(row for row in read_scores(tmp_path / "scores.parquet").to_pylist() if row["rank"] == 1)
-    says = f"sees {best['seen_well']:.0%} of vehicles well"
+    says = f"sees {best['seen_well']:.1%} of vehicles well"
     assert f"{best['site']} is the best of 2 sites: it {says}" in printed
     (head,) = (line for line in printed.splitlines() if "pole  " in line)
     assert head.index("well") < head.index("EGVS")
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert f"{best['site']} is the best of 2 sites: it {says}" in page
     assert "Sites are ranked by the share of vehicles that they see well" in page
-    assert 'data-label="seen well"' in page
+    assert 'data-label="Seen well"' in page
     assert 'data-label="EGVS bit"' in page
     assert run_egvs("verify", tmp_path)[0] == 0
 

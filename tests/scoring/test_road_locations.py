@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from egvs.scoring.road_locations import RoadLocation, RoadLocations, compass, describe_lane, describe_turn, disambiguate
+from egvs.scoring.road_locations import RoadLocation, RoadLocations, describe_lane, describe_turn, disambiguate
+from egvs.traffic.directions import compass
 from tests.scoring.roads import GRID, NETWORK, read
 
 

@@ -121,6 +121,19 @@ def test_chances_add_up_and_equal_sites_are_even() -> None:
     assert found.times_needed(0, 1) > 0
 
 
+def test_lag_behind_the_best_site_has_the_error_of_the_block_differences() -> None:
+    """Differences of the blocks are 0.1, 0.1, 0.3 and -0.1: mean 0.1, standard error sqrt(0.08 / 3 / 4)."""
+    values = np.array([[0.5, 0.6, 0.5], [0.7, 0.8, 0.7], [0.5, 0.8, 0.5], [0.7, 0.6, 0.7]])
+    lag = standard_errors.lag_behind_best(
+        ScoreUncertainty.of(left_out_means(values, np.full(4, 10)), record(np.full(4, 10)))
+    )
+    se = (0.08 / 3 / 4) ** 0.5
+    assert lag.se == pytest.approx([se, 0.0, se])
+    t, root_3 = 0.1 / se, 3.0**0.5  # t has 3 degrees of freedom, whose distribution has a closed form
+    chance = 0.5 + (t / root_3 / (1 + t**2 / 3) + np.arctan(t / root_3)) / np.pi
+    assert lag.best_beats == pytest.approx([chance, 0.5, chance], abs=1e-6)
+
+
 def test_a_site_s_error_knows_nothing_of_the_others() -> None:
     values = np.random.default_rng(8).normal(0.0, 1.0, size=(10, 5))
     rows = left_out_means(values, np.full(10, 5))
@@ -260,6 +273,8 @@ def test_without_errors_the_scores_are_the_same(mini: Path, tmp_path: Path, chan
         "egvs_se",
         "egvs_bias",
         "beats_next",
+        "behind_best_se",
+        "best_beats",
         "expected_detections_se",
     }
     assert table.select(plain.column_names) == plain

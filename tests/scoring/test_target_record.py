@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from egvs.artefacts import parquet
 from egvs.core.errors import InputError
-from egvs.scoring.targets import REPLAYED_FRAMES, TargetRecord
+from egvs.scenario.score_config import DEFAULT_SAMPLED_FRAMES
+from egvs.scoring.targets import TargetRecord
 from tests.scoring.target_scenes import GRID, axes_of, frame, random_boxes
 
 CAR = (4.0, 2.0, 1.5)
@@ -111,7 +112,7 @@ def test_frames_are_spread_over_the_record(tmp_path):
     path = tmp_path / "trajectories.parquet"
     parquet.write_artefact(path, "trajectories", columns, {"schema": parquet.SCHEMA_VERSION, "frames": 600})
     record = TargetRecord.read(path, GRID)
-    assert len(record.numbers) == REPLAYED_FRAMES == 250 and record.numbers[[0, -1]].tolist() == [1, 598]
+    assert len(record.numbers) == DEFAULT_SAMPLED_FRAMES == 250 and record.numbers[[0, -1]].tolist() == [1, 598]
     assert len(record) == (record.numbers % 2 == 0).sum()
     assert TargetRecord.read(path, GRID, 3).numbers.tolist() == [100, 300, 500]
     assert len(TargetRecord.read(path, GRID, 0).numbers) == 600

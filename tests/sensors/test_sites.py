@@ -156,10 +156,15 @@ def test_rows_at_one_position_share_a_pole(mini: Path) -> None:
 def test_run_ranks_candidates_and_groups_them_by_pole(mini: Path, tmp_path: Path, run_egvs) -> None:  # type: ignore[no-untyped-def]
     (mini / "sites.csv").write_text("site,x_m,y_m\nc01,10,12\nc02,30.5,-12\n")
     expected = ["sites.heights_m=[3, 4.5]", 'sites.pitch_deg=[0, "aim"]', "sites.aim=roi", "score.standard_error=false"]
-    code, out, _ = run_egvs("run", mini, "--out", tmp_path / "run", *(part for w in expected for part in ("--set", w)))
+    words = [mini, "--out", tmp_path / "run", *(part for w in expected for part in ("--set", w))]
+    code, out, _ = run_egvs("run", *words)
     assert code == 0
     scores = egvs.read_scores(tmp_path / "run" / "scores.parquet").to_pylist()
     assert [row["pole"] for row in scores] == ["c01"] * 4 + ["c02"] * 4
+    assert "best candidate on each pole" in run_egvs("score", *words)[1]
+    _, all_printed, _ = run_egvs("run", *words, "--all")
+    assert "best candidate on each pole" not in all_printed  # the answer lists all poles
+    assert sum(line.split()[1:2] == ["c02"] for line in all_printed.splitlines()) == 1
     best = {pole: max((r for r in scores if r["pole"] == pole), key=lambda r: r["egvs"]) for pole in ("c01", "c02")}
     rows = [line.split() for line in out.splitlines()]
     html = (tmp_path / "run" / "report.html").read_text()
@@ -217,7 +222,11 @@ PLACE = "site,x_m,y_m\np,0,0\n"
             r"row p: pitch_deg: .*'aim', but .*yaw_deg, 30",
         ),
         (ROW, {"aim_m": "[0, 0, 1]"}, r"row p: aim: \(0, 0, 1\) is directly above or below the sensor"),
-        (ROW, {"aim": "roi", "sensor": "VLP-33"}, r"row p: sensor: unknown sensor 'VLP-33'. Did you mean VLP-32C"),
+        (
+            ROW,
+            {"aim": "roi", "sensor": "VLP-33"},
+            r"^--set: sites.sensor: unknown sensor 'VLP-33'. Did you mean VLP-32C",
+        ),
         ("site,x_m,y_m,z_m,aim_x_m\np,0,0,6,5\n", {}, r"row p: aim: one of aim_x_m and aim_y_m is missing"),
         ("site,x_m,y_m,z_m,aim\np,0,0,6,ROI\n", {}, r"row p: aim: .*'roi', got 'ROI'.*aim_x_m and aim_y_m"),
         ("site,x_m,y_m,z_m,aim,aim_x_m\np,0,0,6,roi,3\n", {}, r"row p: aim: .*'roi' and at a point"),

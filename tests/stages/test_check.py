@@ -321,7 +321,7 @@ def test_reports_all_errors_at_once(street: Path, run_egvs) -> None:
     assert {key: len(lines) for key, lines in told.items()} == {
         "files": 1, "statics": 1, "traffic": 2, "sensors": 1, "sites on lanes": 1,
     }  # fmt: skip
-    assert told["sensors"] == ["site in and 1 more: unknown sensor 'smal'"]
+    assert told["sensors"] == ["--set: sites.sensor: unknown sensor 'smal'"]
     flags = [word for setting in settings for word in ("--set", setting)]
     code, printed, _ = run_egvs("check", street, *flags)
     assert code == 2
@@ -407,9 +407,9 @@ def test_reports_all_wrong_rows_of_sites_file(street: Path) -> None:
 
 
 def test_equal_findings_of_many_sites_are_joined(street: Path) -> None:
-    """An aim needs the sensor, so each row is refused for it."""
+    """An aim needs the sensor, so each row is rejected for it; the message names the key that sets the sensor."""
     told = found(street, 'sites.sensor="smal"', 'sites.aim="roi"')
-    assert told == {"sites": ["sites.csv: row pole_a: sensor and 1 more: unknown sensor 'smal'"]}
+    assert told == {"sites": ["--set: sites.sensor: unknown sensor 'smal'"]}
 
 
 def test_reports_missing_files_and_unknown_formats(street: Path) -> None:

@@ -27,6 +27,8 @@ def test_two_vehicles_per_frame_are_enough(mini: Path, tmp_path: Path) -> None:
     """Two cars pass each other along the whole region, but in the first and last frames one of them is outside."""
     assert list(occupancy.warn_empty_region(2.0, tmp_path / "is not read")) == []
     assert warnings(mini, tmp_path / "out") == {}
+    (one,) = occupancy.warn_empty_region(1.0, tmp_path / "is not read")
+    assert one.problem.startswith("1 vehicle is in the region on average")
     few = warnings(mini, tmp_path / "few", "roi.center_m=[30,0,2.5]", "roi.size_m=[20,20,5]")
     assert len(few["tpog"]) == 1
     assert few["tpog"][0].endswith(

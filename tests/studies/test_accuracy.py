@@ -155,11 +155,14 @@ def test_settings_beyond_the_budget_are_skipped_and_listed(mini: Path, tmp_path:
 
 
 @pytest.mark.slow
-def test_standard_error_is_the_error_without_longer_reference(junction: Path, tmp_path: Path) -> None:
+def test_standard_error_is_the_error_without_longer_reference(junction: Path, tmp_path: Path, capsys) -> None:
     study = run_study(junction, [], tmp_path / "out", budget_s=0.001)
     assert [row.setting for row in study.rows] == ["scenario"]
     assert (study.reference_factor, study.best) == (1, None)
     assert study.rows[0].judged == study.rows[0].error_se > study.tolerance
+    study_tables.print_study(study, "egvs run junction")
+    named = f"with error 0.00% and standard error {study.rows[0].error_se:.2%}: increase --budget"
+    assert named in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ The expected numbers are read from the artefacts of small runs.
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from rich.console import Console
 from scipy.stats import kendalltau
 
 import egvs
+from egvs.artefacts.run_record import RunRecord
 from egvs.cli import study_tables
 from egvs.core.errors import InputError
 from egvs.core.files import add_checksum
@@ -98,6 +100,16 @@ def found(site: str, share: float, rank: int = 1, **values: object) -> RankedSit
 
 def made_run(label: str, *sites: RankedSite, **settings: object) -> ComparedRun:
     return ComparedRun(label, Path(label.lower()), Ranking.of(sites), settings, {})
+
+
+def test_range_limit_is_enabled_by_its_table_or_any_of_its_keys() -> None:
+    def has_range_limit(**settings: object) -> bool:
+        return made_run("A", row("p", 9.0), **settings).has_range_limit
+
+    assert has_range_limit(**{"effects.range_limit": {}})
+    assert has_range_limit(**{"effects.range_limit.softness": 0.2})
+    assert not has_range_limit(**{"effects.range_limit": None})
+    assert not has_range_limit(**{"effects.rain.rate_mm_h": 5.0})
 
 
 def test_rank_agreement_computed_by_hand() -> None:
@@ -212,8 +224,9 @@ def test_compare_command_prints_tables_and_notes(two: tuple[Path, Path], run_egv
     assert code == 0
     for part in ("A bit", "B rank", "score.gamma", "note: 1 site has the same name", str(two[0])):
         assert part in printed
-    code, printed, _ = run_egvs("compare", two[0], two[0], "--top", 1)
-    assert "their settings and files are the same" not in printed  # it is one folder
+    copy = shutil.copytree(two[0], two[0].with_name("copy"))
+    code, printed, _ = run_egvs("compare", two[0], copy, "--top", 1)
+    assert "their settings and files are the same" in printed
     assert "pole_a" not in printed or "pole_b" not in printed.split("runs")[0]
     code, printed, _ = run_egvs("compare", *two)
     assert code == 0
@@ -322,6 +335,8 @@ def test_prints_how_to_set_costs_or_what_one_more_point_costs(monkeypatch: pytes
     assert "one more point costs" in text
     assert "1,000" in text  # 5000 for 5 points
     assert "PRICE" not in text
+    text = printed_text(by_pole(replace(a, costs=costs), made_run("B", *mounts("u", 0.95))), 160, monkeypatch)
+    assert """'costs.sensor={"s" = PRICE, "u" = PRICE}'""" in text
     assert SENSOR_EVIDENCE.split(".")[0] in text
 
 
@@ -329,14 +344,15 @@ def test_costs_of_the_command_line_replace_those_of_the_run(mini: Path, tmp_path
     egvs.run(egvs.load(mini, ["costs.pole=5", "costs.sensor={small=7}"]), tmp_path / "run")
     both = [tmp_path / "run", tmp_path / "run"]
     assert compare_runs(both).runs[0].costs == CostsConfig(pole=5, sensor={"small": 7})
-    overridden = compare_runs(both, costs=["costs.sensor={small=9, other=3}", "costs.metre=2"]).runs[1].costs
-    assert overridden == CostsConfig(pole=5, metre=2, sensor={"small": 9, "other": 3})
+    overridden = compare_runs(both, costs=["costs.sensor={small=9, VLP-16=3}", "costs.metre=2"]).runs[1].costs
+    assert overridden == CostsConfig(pole=5, metre=2, sensor={"small": 9, "VLP-16": 3})
     for override, message in (
         ("traffic.frames=3", "--set traffic.frames=3: expected a key of [costs]"),
         ("costs.pole=-1", "--set: costs.pole: expected a value greater than or equal to 0, got -1"),
         ("costs.lamp=1", "costs.lamp"),
+        ("costs.sensor={smal=9}", "--set: costs.sensor: unknown sensor 'smal'. Did you mean small?"),
     ):
-        code, printed, error = run_egvs("compare", *both, "--set", override)
+        code, printed, error = run_egvs("compare", both[0], "--set", override)
         assert (code, printed) == (2, "")
         assert message in error
 
@@ -386,12 +402,29 @@ def test_labels_continue_after_z() -> None:
     assert [run_comparison.run_label(n) for n in (0, 25, 26, 27, 52)] == ["A", "Z", "AA", "AB", "BA"]
 
 
+def test_rejects_the_same_run_twice(two: tuple[Path, Path], tmp_path: Path, run_egvs) -> None:
+    (tmp_path / "link").symlink_to(two[0])
+    for again in (two[0], f"{two[0]}/", tmp_path / "link"):
+        code, _, message = run_egvs("compare", two[0], again)
+        assert code == 2
+        assert message.startswith(f"egvs: compare: the same run twice, {two[0]}")
+
+
+def test_plan_request_is_no_difference(two: tuple[Path, Path]) -> None:
+    record = RunRecord.read(two[1])
+    record.scenario["placement"] |= {"count": 2, "least_distance_m": 4.0}
+    record.write(two[1])
+    differences = [difference.what for difference in compare_runs(two).differences]
+    assert "placement.least_distance_m" in differences
+    assert "placement.count" not in differences
+
+
 def test_rejects_folders_without_finished_run(two: tuple[Path, Path], tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected a second run, because all sites of this one have the sensor small"):
         compare_runs(two[:1])
     with pytest.raises(InputError, match="expected at least one run, got none"):
         compare_runs([])
-    with pytest.raises(InputError, match=r"run\.json: no such file. Give a folder written by egvs run."):
+    with pytest.raises(InputError, match=r"nowhere: no such folder. Give a folder written by egvs run."):
         compare_runs([two[0], tmp_path / "nowhere"])
     record = json.loads((two[1] / "run.json").read_text())
     (two[1] / "scores.parquet").write_bytes((two[0] / "scores.parquet").read_bytes())

@@ -271,6 +271,12 @@ def test_overlaps_with_blockers_in_region_are_counted():
     )
     assert "overlapping_pairs_in_roi" not in statistics_of(sorted(rows)).to_json(1.0)
 
+    tally.rows_in_region = 3001
+    assert trajectories.traffic_warnings(tally, recording_with(), ROI, DEMAND) == []
+    assert tally.to_json(1.0)["overlapping_pairs_in_roi"] == 3
+    tally.rows_in_region = 3000
+    assert len(trajectories.traffic_warnings(tally, recording_with(), ROI, DEMAND)) == 1
+
 
 @pytest.mark.parametrize(
     ("x_m", "vehicles", "locked", "jammed"),

@@ -75,6 +75,25 @@ _RECORD_TYPES = {
 _RERUN_HINT = "Remove it and run again."
 
 
+def _missing_record_error(folder: Path) -> InputError:
+    """Return the error for a folder without ``run.json``: what it is, and what to do."""
+    if not folder.is_dir():
+        return InputError(folder, "no such folder", "Give a folder written by egvs run.")
+    if RunFolder(folder).lock.is_file():
+        return InputError(folder, "the run in this folder never finished", "Leave it out, or repeat its egvs run.")
+    if (folder / "scenario.toml").is_file():
+        return InputError(folder, "this is a scenario; expected a run folder", _suggest_run(folder))
+    return InputError(RunFolder(folder).run_record, "no such file", "Give a folder written by egvs run.")
+
+
+def _suggest_run(scenario_folder: Path) -> str:
+    """Return a hint at the default run folder of a scenario, or at the command that makes one."""
+    run = Path("runs") / scenario_folder.resolve().name
+    if RunFolder(run).has_record:
+        return f"Did you mean {run}?"
+    return f"First run egvs run {scenario_folder}, then give its run folder."
+
+
 @dataclass(frozen=True)
 class RunRecord:
     """Contents of ``run.json``.
@@ -112,7 +131,7 @@ class RunRecord:
         """
         path = RunFolder(folder).run_record
         if not path.is_file():
-            raise InputError(path, "no such file", "Give a folder written by egvs run.")
+            raise _missing_record_error(folder)
         value = reading.read_json(path, _RERUN_HINT)
         has_checksum = isinstance(value, dict) and CHECKSUM_KEY in value
         if has_checksum and not has_valid_checksum(value):

@@ -332,7 +332,7 @@ def _junctions_from_table(streets: Streets, path: Path) -> Iterator[tuple[str, S
     names_by_id: dict[str, str] = {}
     for where, row in model.read_junction_rows(path, REQUIRED_COLUMNS):
         lat_deg, lon_deg = model.parse_number(where, row, "lat_deg"), model.parse_number(where, row, "lon_deg")
-        junction = _nearest_junction(streets, Point(streets.to_xy([lon_deg], [lat_deg])[0]), where)
+        junction = _junction_at(streets, lat_deg, lon_deg, where)
         if junction.id in names_by_id:
             problem = f"these coordinates select the same junction as {names_by_id[junction.id]}"
             raise InputError(where, problem, "Use one row per junction.")
@@ -340,17 +340,34 @@ def _junctions_from_table(streets: Streets, path: Path) -> Iterator[tuple[str, S
         yield row["junction"], junction
 
 
-def _nearest_junction(streets: Streets, point: Point, where: str) -> StreetJunction:
-    """Return the junction whose area is nearest to a point; raise an InputError if it is too far away."""
-    nearest, distance_m = None, math.inf
+def _junction_at(streets: Streets, lat_deg: float, lon_deg: float, where: str) -> StreetJunction:
+    """Return the junction nearest to a position; raise an InputError if it is too far away."""
+    nearest = _nearest_junction(streets, lat_deg, lon_deg)
+    if nearest.junction is not None and nearest.distance_m <= MAX_DISTANCE_M:
+        return nearest.junction
+    problem = f"the nearest junction of three or more streets is {nearest.distance_m:,.0f} m away"
+    hint = f"Use coordinates within {MAX_DISTANCE_M:g} m of a junction."
+    if _nearest_junction(streets, lon_deg, lat_deg).distance_m <= MAX_DISTANCE_M:
+        hint = f"Latitude and longitude are swapped: did you mean lat_deg {lon_deg!r}, lon_deg {lat_deg!r}?"
+    raise InputError(where, problem, hint)
+
+
+class _NearestJunction(NamedTuple):
+    """A junction of three or more streets; None at an infinite distance if there is none."""
+
+    junction: StreetJunction | None
+    distance_m: float
+
+
+def _nearest_junction(streets: Streets, lat_deg: float, lon_deg: float) -> _NearestJunction:
+    """Return the junction whose area is nearest to a position."""
+    point = Point(streets.to_xy([lon_deg], [lat_deg])[0])
+    nearest = _NearestJunction(None, math.inf)
     if math.isfinite(point.x + point.y):
         for junction in sorted(streets.junctions, key=lambda j: j.id):
             junction_m = point.distance(junction.area)
-            if junction.arms >= _MIN_ARMS and junction_m < distance_m:
-                nearest, distance_m = junction, junction_m
-    if nearest is None or distance_m > MAX_DISTANCE_M:
-        problem = f"the nearest junction of three or more streets is {distance_m:,.0f} m away"
-        raise InputError(where, problem, f"Use coordinates within {MAX_DISTANCE_M:g} m of a junction.")
+            if junction.arms >= _MIN_ARMS and junction_m < nearest.distance_m:
+                nearest = _NearestJunction(junction, junction_m)
     return nearest
 
 

@@ -25,6 +25,7 @@ from egvs.core.errors import Diagnostic, collect_warnings
 from egvs.report import ranking, sections
 from egvs.report.formatting import ScoreLabel, join_names
 from egvs.report.ranking import Pole, RankedSite, Ranking
+from egvs.report.sensor_results import range_note
 from egvs.scenario.model import Scenario
 
 _FILE_WIDTH = 150
@@ -50,14 +51,17 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
     summary = record.stages["score"].summary
     out.print()
     if ranked.best[0].score > 0:
-        _print_ranking(out, folder, ranked, record, poles)
+        _print_ranking(out, folder, ranked, scenario, record, poles)
     else:
         for warning in collect_warnings([summary]):
             out.print(str(warning))
-    if on_road := ranking.describe_poles_on_road(ranked.poles[: ranking.NAMED_POLES], _check_warnings(record)):
+    if on_road := sections.describe_poles_on_road(ranked.poles[: sections.NAMED_POLES], _check_warnings(record)):
         out.print(f"Before you trust this ranking: {join_names(on_road)}.")
     if assumed := sections.describe_assumptions(scenario, "ranking"):
         out.print(assumed)
+    sensors = [site.sensor for site in ranked.sites]
+    if note := range_note(sensors, is_modelled=scenario.effects.range_limit is not None):
+        out.print(note)
     out.print(f"report: {run_folder.report}")
 
 
@@ -74,9 +78,11 @@ def flow_source(scenario: Scenario) -> str:
     return stage_summary.COUNTS
 
 
-def _print_ranking(out: Console, folder: Path, ranked: Ranking, record: RunRecord, poles: int | None) -> None:
+def _print_ranking(
+    out: Console, folder: Path, ranked: Ranking, scenario: Scenario, record: RunRecord, poles: int | None
+) -> None:
     """Print the verdict, the best poles, the lanes seen worst, and how the order by EGVS differs."""
-    out.print(verdict(ranked))
+    out.print(verdict(ranked, ranking.recorded_frames_hint(scenario, ranked, record.stages)))
     validation = sections.ValidationSummary.read(folder, record.stages)
     if validation is not None and validation.check.warning:
         print_sentences([f"{validation.check.warning} See {RunFolder(folder).report}#detected"])
@@ -95,10 +101,10 @@ def _print_ranking(out: Console, folder: Path, ranked: Ranking, record: RunRecor
         out.print(other_order)
 
 
-def verdict(ranked: Ranking) -> str:
-    """Return one or two sentences: the best site, and how clearly it leads."""
+def verdict(ranked: Ranking, hint: str = "") -> str:
+    """Return a few sentences: the best site, how clearly it leads and, if unclear, the ``hint`` on what helps."""
     sentences = [f"{ranking.headline(ranked, has_traffic=True)}."]
-    if lead := ranking.lead(ranked):
+    if lead := ranking.lead(ranked, hint):
         sentences.append(lead)
     return " ".join(sentences)
 

@@ -6,7 +6,7 @@ the verb that needs them, so that ``egvs --help`` is quick.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -109,7 +109,7 @@ def run(
     if not screen.any_stage_ran:
         screen.say("no stage ran: no input has changed since the last run")
     if all_:
-        run_tables.print_scores(folder, record)
+        run_tables.print_scores(folder, record, before_answer=True)
     if verbose:
         run_tables.print_costs(folder, record)
     run_tables.print_audit(record)
@@ -212,14 +212,14 @@ def score(
     top: Top = None,
 ) -> None:
     """Score and rank the sites, and write scores.parquet."""
-    stage_options = {"audit": True} if audit else {}
+    stage_options: dict[str, Any] = {"audit": True} if audit else {}
     _run_stage("score", scenario, out, set_, jobs, top, **stage_options)
 
 
 @app.command()
-def report(scenario: ScenarioPath, out: Out = None, set_: Set = None) -> None:
+def report(scenario: SettingsPath, out: Out = None, set_: Set = None) -> None:
     """Write the report of a run, report.html."""
-    _run_stage("report", scenario, out, set_)
+    _run_stage("report", scenario, out, set_, open_source=sources.open_source)
 
 
 def _run_stage(
@@ -229,16 +229,17 @@ def _run_stage(
     set_: list[str] | None,
     jobs: int | None = None,
     top: int | None = None,
+    open_source: Callable[..., tuple[Scenario, Path]] = _load,
     **stage_options: Any,
 ) -> None:
-    """Run one stage and print the files that it wrote."""
+    """Run one stage and print the files that it wrote; ``open_source`` returns the scenario and its run folder."""
     from egvs.cli.console import ProgressDisplay
 
     with ProgressDisplay(stage, with_details=True) as screen:
         from egvs.cli import answer, run_tables
         from egvs.runs import run
 
-        loaded, folder = _load(scenario, set_, out)
+        loaded, folder = open_source(scenario, set_, out)
         screen.flow_source = answer.flow_source(loaded)
         record = run.run_one(
             stage, loaded, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, **stage_options
@@ -304,6 +305,7 @@ def compare(
         from egvs.cli import study_tables
         from egvs.studies import run_comparison
 
+        run_comparison.check_distinct(runs)
         comparison = run_comparison.compare_runs(runs, by, set_ or (), screen.progress)
     study_tables.print_comparison(comparison, top)
 
@@ -494,7 +496,7 @@ def export(
 @app.command()
 def figure(
     run: Run,
-    what: Annotated[str, typer.Option(metavar="FIGURE", help="ranking, map, tpog, seen or missed.")],
+    what: Annotated[str, typer.Option(metavar="FIGURE", help="Required: ranking, map, tpog, seen or missed.")] = "",
     site: Annotated[
         str | None, typer.Option(metavar="SITE", help="For seen and missed: the site; the best one by default.")
     ] = None,
@@ -510,6 +512,8 @@ def figure(
     from egvs.cli.console import ProgressDisplay
     from egvs.export import figure
 
+    if not what:
+        raise InputError("--what", f"expected one of {', '.join(figure.FIGURES)}", "Use --what ranking.")
     width_mm = cli_options.width_mm(size, figure.MIN_WIDTH_MM, figure.MAX_WIDTH_MM)
     with ProgressDisplay("figure") as screen:
         path = figure.draw_figure(run, what, site=site, kind=kind, width_mm=width_mm, out=out, progress=screen.progress)
@@ -531,7 +535,7 @@ def sensors() -> None:
     run_tables.print_sensors(CATALOGUE.values())
 
 
-@app.command()
+@app.command(cls=cli_options.PolesCommand)
 def new(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the new scenario.")],
     osm: Annotated[
@@ -571,7 +575,10 @@ def new(
         ),
     ] = None,
 ) -> None:
-    """Create a scenario from an OpenStreetMap extract."""
+    """Create a scenario from an OpenStreetMap extract.
+
+    Its scenario.toml has a template for peaks and other parts of the day (traffic.periods).
+    """
     from egvs.cli import new_summary
     from egvs.importers import openstreetmap
 

@@ -65,7 +65,7 @@ def _scenario_lines(scenario: NewScenario) -> Iterator[tuple[str, str]]:
     yield "traffic", _describe_traffic(scenario.traffic)
     mounts = f"{len(junctions.HEIGHTS_M)} heights x {len(PITCHES_DEG)} tilts"
     yield "sites", f"{scenario.n_candidates:,} candidates: {scenario.poles} poles x {mounts}, sensor {SENSOR}"
-    yield "solids", _describe_solids(scenario.statics)
+    yield "solids", _describe_solids(scenario.statics, scenario.n_solids)
     if left_out := _describe_dropped(scenario.statics):
         yield "", f"left out: {left_out} (all counts: {STATICS_FILE})"
 
@@ -109,10 +109,16 @@ def _describe_traffic(traffic: AssumedTraffic | None) -> str:
     return f"the junction {traffic.summary}: {traffic.per_h:,} vehicles an hour in {movements} (assumed)"
 
 
-def _describe_solids(counts: ImportCounts) -> str:
-    solids = Counter({kind: number for kind, number in counts.objects.items() if kind != "tree_crown"})
-    texts = [_count(kind.removesuffix("_trunk"), number) for kind, number in solids.most_common()]
-    return ", ".join(texts) or "none"
+def _describe_solids(counts: ImportCounts, n_solids: int | None = None) -> str:
+    """Return the objects by kind, and the number of solids that ``egvs check`` counts, if it is known."""
+    objects = Counter({kind: number for kind, number in counts.objects.items() if kind != "tree_crown"})
+    texts = [_count(kind.removesuffix("_trunk"), number) for kind, number in objects.most_common()]
+    if not texts:
+        return "none"
+    total = _count("object", objects.total())
+    if n_solids is not None:
+        total += f" ({_count('solid', n_solids)} with tree crowns, cut pieces and the ground)"
+    return f"{total}: {', '.join(texts)}"
 
 
 def _describe_dropped(counts: ImportCounts) -> str:
@@ -144,5 +150,6 @@ def _scenario_warnings(scenario: NewScenario) -> Iterator[str]:
             assumed = "the shares of the movements are assumed"
     yield (
         f"{assumed} ({per_h:,} vehicles an hour); this affects the ranking."
-        f" Enter counted traffic under [traffic] in {scenario.folder / 'scenario.toml'} before you rely on the ranking."
+        f" Enter counted traffic under [traffic] in {scenario.folder / 'scenario.toml'} before you rely on the ranking,"
+        " and remove its entry from assumed."
     )

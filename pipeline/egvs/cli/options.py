@@ -7,9 +7,10 @@ import re
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from egvs.core.errors import InputError
 
@@ -127,11 +128,32 @@ def radius_m(text: str) -> float | None:
 
 def pole_spacing_m(rule: str, spacing: str) -> float:
     """Return the spacing of ``--poles every 20m`` in metres."""
-    spacing_m = _parse_quantity(spacing, {"m": 1.0, "": 1.0})
+    spacing_m = _parse_spacing_m(spacing)
     if rule != "every" or math.isnan(spacing_m):
         problem = f"expected every and a length in metres, got {f'{rule} {spacing}'[:80]!r}"
         raise InputError("--poles", problem, "Use a spacing such as every 20m.")
     return spacing_m
+
+
+class PolesCommand(TyperCommand):
+    """A command that accepts ``--poles 20m`` for ``--poles every 20m``."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Insert the word that is missing."""
+        words: list[str] = []
+        for arg in args:
+            option, equals, spacing = arg.partition("=")
+            if option == "--poles" and equals and not math.isnan(_parse_spacing_m(spacing)):
+                words += [option, "every", spacing]
+            elif words[-1:] == ["--poles"] and not math.isnan(_parse_spacing_m(arg)):
+                words += ["every", arg]
+            else:
+                words.append(arg)
+        return super().parse_args(ctx, words)
+
+
+def _parse_spacing_m(text: str) -> float:
+    return _parse_quantity(text, {"m": 1.0, "": 1.0})
 
 
 def length_m(text: str, option: str) -> float:

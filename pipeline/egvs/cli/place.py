@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Annotated
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from egvs.cli import options, sources
 from egvs.cli.options import Jobs, Out, Set, SettingsPath
+from egvs.core.errors import InputError
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
     from egvs.placement.plan import Placement, RefinementSummary
     from egvs.report.formatting import ScoreLabel
     from egvs.scenario.score_config import PlacementConfig
+
+_REQUEST_KEYS = ("count", "budget", "reach")
+"""Keys of ``[placement]`` that are options of ``egvs place`` too."""
 
 
 def place(
@@ -50,8 +54,9 @@ def place(
     from egvs.cli.console import ProgressDisplay
 
     limit_s = options.duration_s(time_limit, "--time-limit")
+    _check_request(count, budget, reach)
     request = []
-    for key, value in (("count", count), ("budget", budget), ("reach", reach)):
+    for key, value in zip(_REQUEST_KEYS, (count, budget, reach), strict=True):
         if value is not None:
             request.append(f"placement.{key}={value!r}")
     loaded, folder = sources.open_source(scenario, set_, out, request)
@@ -61,14 +66,30 @@ def place(
         from egvs.report import sections
 
         screen.flow_source = answer.flow_source(loaded)
+        replaced = plan.planned_request(folder)
         placed = plan.place(
             loaded, folder, exact=exact, time_limit_s=limit_s, refine=refine, jobs=jobs, progress=screen.progress,
             listener=screen.stage_event,
         )  # fmt: skip
     notes = []
+    if replaced is not None and (request_now := plan.planned_request(folder)) != replaced:
+        notes.append(describe_replaced(replaced, request_now or {}))
     if exact and not (placed.solution.is_best or placed.solution.fewest_is_proved):
         notes.append(f"--exact reached its --time-limit of {time_limit} before any plan was proved optimal.")
     print_placement(placed, loaded.placement, notes, sections.describe_assumptions(loaded, "plan"))
+
+
+def _check_request(count: int | None, budget: float | None, reach: float | None) -> None:
+    """InputError for an option whose value is out of range."""
+    if count is not None and count < 1:
+        raise InputError("--count", f"expected at least 1 sensor, got {count}", "Use a number such as 3.")
+    if budget is not None and not 0 < budget < math.inf:
+        raise InputError("--budget", f"expected a cost above 0, got {budget:g}", "Use the total cost, such as 20000.")
+    if reach is not None and not 0 < reach <= 1:
+        hint = "Use a share such as 0.95."
+        if 1 < reach <= 100:
+            hint = f"Use {reach / 100:g} for {reach:g} %."
+        raise InputError("--reach", f"expected a share above 0, at most 1, got {reach:g}", hint)
 
 
 def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequence[str] = (), caveat: str = "") -> None:
@@ -117,8 +138,15 @@ def _further_sentences(placed: Placement, requested: PlacementConfig) -> Iterato
         yield absent
     request = requested.model_dump(mode="json")
     next_count = plan_answer.next_count(placed.steps, len(placed.sensors), placed.candidates, request)
-    objective = describe_objective(request)
-    if answer := plan_answer.describe_count(placed.steps, _label(placed), objective=objective, next_count=next_count):
+    answer = plan_answer.describe_count(
+        placed.steps,
+        _label(placed),
+        plans=list(map(plan_answer.CurvePlan, placed.curve_sites, placed.curve_costs)),
+        has_budget=requested.budget is not None,
+        objective=describe_objective(request),
+        next_count=next_count,
+    )
+    if answer:
         yield answer
 
 
@@ -185,6 +213,20 @@ def _score_share(placed: Placement, joint: float) -> float:
     if not placed.joint_of_all > 0:
         return 0.0
     return joint / placed.joint_of_all
+
+
+def describe_replaced(replaced: Mapping[str, Any], requested: Mapping[str, Any]) -> str:
+    """Return which plan was replaced, by the options that request it.
+
+    Parameters
+    ----------
+    replaced, requested
+        The ``[placement]`` of the replaced plan and of the present one; they differ.
+    """
+    options = [f"--{key} {replaced[key]:.15g}" for key in _REQUEST_KEYS if replaced.get(key) is not None]
+    is_other_option = any(replaced.get(key) != requested.get(key) for key in _REQUEST_KEYS)
+    settings = "" if is_other_option else " with other settings in [placement]"
+    return f"replaces the plan for {' '.join(options)}{settings}"
 
 
 def describe_plan(placed: Placement) -> str:

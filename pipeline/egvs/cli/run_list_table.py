@@ -8,8 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from egvs.city import results
-from egvs.cli.console import Column, format_value, print_table
+from egvs.cli.console import Column, print_table
 from egvs.cli.run_tables import format_age, format_size
+from egvs.cli.sources import format_setting
 from egvs.report.formatting import SCORE_LABELS
 from egvs.runs.run_list import ListedRun
 
@@ -55,11 +56,7 @@ def _format_scenario(run: ListedRun) -> str:
 
 
 def _format_overrides(run: ListedRun) -> str:
-    pairs = []
-    for key, value in run.overrides.items():
-        text = "none" if value is None or value in ([], {}) else format_value(value)
-        pairs.append(f"{key}={text}")
-    return ", ".join(pairs)
+    return ", ".join(f"{key}={format_setting(key, value)}" for key, value in run.overrides.items())
 
 
 def _format_state(run: ListedRun) -> str:

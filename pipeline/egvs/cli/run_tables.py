@@ -71,8 +71,18 @@ def print_stage(folder: Path, stage: str, record: RunRecord, *, top: int | None 
         out.print(path)
 
 
-def print_scores(folder: Path, record: RunRecord, top: int | None = None) -> None:
-    """Print the ranking, the best candidate of each pole, and the ranking by period; ``top`` of each, or all."""
+def print_scores(folder: Path, record: RunRecord, top: int | None = None, *, before_answer: bool = False) -> None:
+    """Print the ranking, the best candidate of each pole, and the ranking by period; ``top`` of each, or all.
+
+    Parameters
+    ----------
+    folder, record
+        The run folder and its record.
+    top
+        How many of the best sites, poles and so on are printed; all for None.
+    before_answer
+        Whether the answer of the run follows, which has the poles and the lanes where fewest vehicles are found.
+    """
     out = console(_RESULT_FILE_WIDTH)
     sites = RankedSite.read(folder / "scores.parquet")
     summary = record.stages["score"].summary
@@ -86,12 +96,12 @@ def print_scores(folder: Path, record: RunRecord, top: int | None = None) -> Non
         out.print(line)
     if top is not None and len(sites) > top:
         out.print(f"... and {len(sites) - top} more; omit --top, or see {folder / 'scores.parquet'}")
-    if len({site.pole for site in sites}) < len(sites):
+    if not before_answer and len({site.pole for site in sites}) < len(sites):
         out.print(poles_table(sites, top))
     by_period = PeriodRanking.read(folder)
     if by_period is not None:
         out.print(period_table(by_period, top))
-    if missed := summary.get("missed"):
+    if not before_answer and (missed := summary.get("missed")):
         out.print(missed)
 
 
@@ -200,13 +210,16 @@ def _format_score(label: ScoreLabel, site: RankedSite) -> str:
 def _format_beats_next(site: RankedSite, last: RankedSite) -> str:
     if site.beats_next is None or site is last:
         return "-"
-    mark = "" if site.is_separable else "~ "
-    return f"{mark}{site.beats_next:.0%}"
+    if site.is_separable:
+        return f"{site.beats_next:.0%}"
+    below_limit = min(site.beats_next, DISTINCT_PROBABILITY - 0.01)  # 0.896 is not shown as 90%
+    return f"~ {below_limit:.0%}"
 
 
 def poles_table(sites: Sequence[RankedSite], top: int | None = None) -> Table:
     """Return the best candidate of each of the ``top`` poles, how it is mounted, and its lead over the worst one."""
     by = _ranking_score(sites)
+    gain_head = f"beats worst by, {by.change_head}" if by.is_share else "beats worst by"
     columns: list[Column[Pole]] = [
         Column("rank", lambda pole: str(pole.best.rank)),
         Column("pole", lambda pole: pole.name, "left", wrap=True),
@@ -216,7 +229,7 @@ def poles_table(sites: Sequence[RankedSite], top: int | None = None) -> Table:
         Column("pitch deg", lambda pole: f"{pole.best.pitch_deg:.1f}"),
         Column(by.head, lambda pole: _format_score(by, pole.best)),
         Column("candidates", lambda pole: str(len(pole.sites))),
-        Column("beats worst by", lambda pole: format_or_dash(pole.gain, ".1%")),
+        Column(gain_head, lambda pole: pole.gain_text or "-"),
     ]
     poles = group_by_pole(sorted(sites, key=lambda site: site.rank))
     return make_table(columns, poles[:top], title="best candidate on each pole")

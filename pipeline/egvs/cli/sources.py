@@ -89,7 +89,9 @@ def run_arguments(path: Path, overrides: Sequence[str] | None, out: Path | None)
 
 
 def _describe_differences(differences: dict[str, tuple[Any, Any]]) -> str:
-    texts = [f"{key} ({_format(there)} there, {_format(here)} here)" for key, (there, here) in differences.items()]
+    texts = []
+    for key, (there, here) in differences.items():
+        texts.append(f"{key} ({format_setting(key, there)} there, {format_setting(key, here)} here)")
     return _join(texts)
 
 
@@ -100,9 +102,13 @@ def _join(texts: Sequence[str]) -> str:
     return ", ".join(shown)
 
 
-def _format(value: Any) -> str:
+def format_setting(key: str, value: Any) -> str:
+    """Return a setting as text: an effect without other parameters as "on" or "off", an empty value as "none"."""
     from egvs.cli.console import format_value
+    from egvs.runs.run_names import effect_state
 
+    if state := effect_state(key, value):
+        return state
     if value is None or value in ([], {}):
         return "none"
     return format_value(value)

@@ -29,7 +29,9 @@ from egvs.report.sensor_results import (
     costs_option,
     difference_unit,
     format_difference,
+    range_note,
 )
+from egvs.runs.run_names import effect_state
 from egvs.studies.study_settings import MEASURES, SCENARIO, TRAFFIC
 from egvs.studies.traffic_options import OPTION_KNOBS, SeedSpread
 
@@ -173,22 +175,28 @@ def _describe_recommendation(study: AccuracyStudy, command: str) -> str:
     candidates = [row for row in study.rows if row.kind in ("approximates", "scenario")]
     best = study.best
     if best is None and len(candidates) == 1:
-        error = f"{candidates[0].judged:.2%}"
-        return f"the budget only covered the scenario's own setting, with an error of {error}: increase --budget"
+        return (
+            f"the budget only covered the scenario's own setting, with {_describe_error(candidates[0])}: "
+            "increase --budget"
+        )
     if best is None:
         nearest = min(candidates, key=lambda row: row.judged)
-        error = f"{nearest.judged:.2%}"
-        return f"no setting is within {study.tolerance:.2%}; the closest is {nearest.setting!r}, with {error}"
+        within = f"no setting is within {study.tolerance:.2%}"
+        return f"{within}; the closest is {nearest.setting!r}, with {_describe_error(nearest)}"
 
-    standard_error = "unknown" if math.isnan(best.error_se) else f"{best.error_se:.2%}"
     note = ""
     if any(row.judged <= study.tolerance and row.seconds < best.seconds for row in candidates):
         note = f" (cheaper settings save less than {MIN_TIME_SAVING:.0%})"
     sentence = (
-        f"recommended within {study.tolerance:.2%}: {best.setting}, {best.seconds:.2f} s{note}, "
-        f"error {best.error:.2%}, standard error {standard_error}"
+        f"recommended within {study.tolerance:.2%}: {best.setting}, {best.seconds:.2f} s{note}, {_describe_error(best)}"
     )
     return f"{sentence}\n  {command} {best.overrides}".rstrip()
+
+
+def _describe_error(row: SettingResult) -> str:
+    """Name the two columns of the table of which the larger one must be within the tolerance."""
+    standard_error = "unknown" if math.isnan(row.error_se) else f"{row.error_se:.2%}"
+    return f"error {row.error:.2%} and standard error {standard_error}"
 
 
 _FILE_WIDTH = 190
@@ -368,12 +376,15 @@ def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparis
         columns.append(Column("than the best cheaper", lambda result: result.step_cost_text, wrap=True))
     out.print(make_table(columns, sensors.results, width=out.width, title="the best mount of each sensor"))
     out.print(sensors.explanation, soft_wrap=True)
-    if not sensors.has_costs:
+    if sensors.unpriced:
         folders = " ".join(shlex.quote(str(folder)) for folder in dict.fromkeys(run.folder for run in comparison.runs))
-        option = costs_option(sensors.sensors)
+        option = costs_option(sensors.sensors if not sensors.has_costs else sensors.unpriced)
         out.print(
             f"What one more point costs: egvs compare {folders} {option}, or [costs] in scenario.toml", soft_wrap=True
         )
+    is_modelled = all(run.has_range_limit for run in comparison.runs)
+    if note := range_note(sensors.sensors, is_modelled=is_modelled):
+        out.print(note, soft_wrap=True)
     out.print(sensors.evidence, soft_wrap=True)
     out.print()
 
@@ -466,6 +477,8 @@ def _difference_table(comparison: Comparison) -> Table:
 
 def _format_setting(run: int, difference: Difference) -> str:
     value = difference.values[run]
+    if state := effect_state(difference.what, value):
+        return state
     if value is None:
         return "-"
     if isinstance(value, str):

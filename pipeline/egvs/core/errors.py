@@ -97,9 +97,6 @@ def _truncate_line(line: str) -> str:
 WARNINGS_KEY = "warnings"
 """The key of a stage's summary that holds its warnings."""
 
-SITES_ON_LANES = "sites on lanes"
-"""Rule of the warnings about sites in lanes or junctions, which the answer of a run repeats for the best poles."""
-
 
 @dataclass(frozen=True)
 class Diagnostic:

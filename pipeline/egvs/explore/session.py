@@ -69,6 +69,9 @@ def _score_text(name: str, value: float) -> str:
 
 _SCORES = RunFolder.scores.name
 _RECORDED = (RunFolder.trajectories.name, RunFolder.tpog.name)
+_MAX_NAMES = 20
+"""Number of candidates that a message lists."""
+
 _PLAN_STAGES = ("statics", "scan", "traffic", "tpog")
 """Stages that a plan depends on."""
 
@@ -288,11 +291,12 @@ class Session:
 
         Raises
         ------
-        KeyError
-            If there is no such candidate.
         InputError
-            If there is no such sensor.
+            If there is no such candidate, or no such sensor.
         """
+        if name not in self.candidates:
+            names = ", ".join([*self.candidates][:_MAX_NAMES])
+            raise InputError(f"candidate {name!r}", "no such candidate", f"Use one of {names}.")
         candidate = self.candidates[name].site
         site = replace(candidate, pose=pose, sensor=sensor or candidate.sensor)
         self.scene.sensor(site.sensor)

@@ -34,6 +34,7 @@ Tags = dict[str, str]
 _KINDS = {"n": "node", "w": "way", "r": "relation"}
 
 _HINT = "Download the extract again, or choose one with streets (.osm, .osm.pbf)."
+_MISSING_HINT = "Give the path of an extract (.osm, .osm.pbf)."
 _VALUE_HINT = "Correct the object in the file, or download the extract again."
 
 _FOOT_M = 0.3048
@@ -128,7 +129,7 @@ def read_osm(path: Path) -> OsmExtract:
         When the file is missing or incomplete, declares entities, has an invalid position, or has no nodes.
     """
     if not path.is_file():
-        raise InputError(path, "no such file", _HINT)
+        raise InputError(path, "no such file", _MISSING_HINT)
     import osmium
 
     deleted = frozenset() if is_pbf(path) else _check_values_and_find_deleted(path)

@@ -51,6 +51,7 @@ from egvs.scenario.score_config import DEFAULT_SCORE, ScoreConfig
 from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, CountConfig, TrafficConfig
 from egvs.sensors.sensor import CATALOGUE
 from egvs.traffic.capacity import Capacity, distribute_total, find_capacity, scale_flows
+from egvs.traffic.movements import MovementNames
 
 STATICS_FILE, SITES_FILE = "statics.geojson", "sites.csv"
 SENSOR = "VLP-32C"
@@ -83,7 +84,8 @@ PEOPLE_HINT = (
 TomlTable = tuple[str, dict[str, Any]]
 """A comment, and the keys of a table."""
 
-_KEY_COMMENTS = {
+_KEY_COMMENTS = {  # of tables and keys; the table of a key above all tables is ""
+    ("", "assumed"): "shown with the ranking; remove what you replace by measurements",
     (
         "traffic",
         "junction_blocker_s",
@@ -164,6 +166,8 @@ class NewScenario:
         Number of locations for poles.
     statics
         What happened to the objects of the map.
+    n_solids
+        Number of solids of the static world, the ground included. A tree is two, an object that is cut may be several.
     traffic
         The traffic through the region of interest; None where no street leads through it.
     notes
@@ -178,6 +182,7 @@ class NewScenario:
     streets: Streets
     poles: int
     statics: ImportCounts
+    n_solids: int
     traffic: AssumedTraffic | None
     notes: tuple[str, ...]
     from_at_m: float | None = None
@@ -281,7 +286,10 @@ def create_scenario(
     from_at_m = None
     if at is not None:
         from_at_m = Point(streets.to_xy([at[1]], [at[0]])[0]).distance(junction.area)
-    scenario = NewScenario(folder, junction, roi, streets, len(poles), counts, assumed, tuple(notes), from_at_m)
+    n_solids = len(solids) + 1
+    scenario = NewScenario(
+        folder, junction, roi, streets, len(poles), counts, n_solids, assumed, tuple(notes), from_at_m
+    )  # fmt: skip
     texts = {
         NETWORK_FILE: network,
         STATICS_FILE: solids_geojson(solids, counts),
@@ -356,9 +364,10 @@ def check_inside_extract(extract: OsmExtract, at: tuple[float, float] | None, op
         return
     b = extract.bounds
     bounds = f"latitude {b.south_deg:g} to {b.north_deg:g}, longitude {b.west_deg:g} to {b.east_deg:g}"
-    raise InputError(
-        option, f"{at[0]:g},{at[1]:g} is outside the extract", f"Choose a position inside the extract: {bounds}."
-    )
+    hint = f"Choose a position inside the extract: {bounds}."
+    if extract.bounds.contains(at[1], at[0]):
+        hint = f"Latitude comes first: did you mean {option} {at[1]!r},{at[0]!r}?"
+    raise InputError(option, f"{at[0]:g},{at[1]:g} is outside the extract", hint)
 
 
 def _choose_junction(streets: Streets, osm: Path, near: XY | None) -> StreetJunction:
@@ -499,8 +508,9 @@ def statics_table() -> TomlTable:
 
 def sites_table() -> TomlTable:
     """Return ``[sites]`` without the keys of :func:`mount_keys`."""
-    comment = f"poles {junctions.KERB_M:g} m behind the kerbs of the junction; add or remove rows as you like"
-    return comment, {"file": SITES_FILE}
+    position = "columns longitude, latitude (degrees) work as well as x_m, y_m"
+    poles = f"poles {junctions.KERB_M:g} m behind the kerbs of the junction"
+    return f"{poles}; add or remove rows as you like; {position}", {"file": SITES_FILE}
 
 
 def mount_keys() -> dict[str, Any]:
@@ -534,6 +544,9 @@ def toml_document(comments: Sequence[str], values: Mapping[str, Any], tables: Ma
         document.add(tomlkit.comment(comment))
     document.add(tomlkit.nl())
     document.update(values)
+    for key in values:
+        if ("", key) in _KEY_COMMENTS:
+            document[key].comment(_KEY_COMMENTS["", key])
     for table_name, (comment, keys) in tables.items():
         table = tomlkit.item(keys)
         if comment:
@@ -578,20 +591,26 @@ def _scenario_toml(name: str, scenario: NewScenario) -> str:
     ]
     document = toml_document(comments, values, tables)
     if scenario.traffic is not None:
-        document["traffic"].update({"counts": _counts_array(scenario.traffic.flows)})
+        names = MovementNames(scenario.streets.network)
+        document["traffic"].update({"counts": _counts_array(scenario.traffic.flows, names)})
         origin = f"assumed from the road classes ({scenario.traffic.assumed_per_h:,} vehicles an hour)"
         if scenario.traffic.level is None:
             origin = "divided among the movements by the road classes"
         comment = f"{origin}; the network {scenario.traffic.summary}. Replace them by real counts"
         document["traffic"]["counts"].comment(comment)
+        for line in _periods_template(scenario.traffic.flows[0]):
+            document["traffic"].add(tomlkit.comment(line))
     return tomlkit.dumps(document)
 
 
 def _assumptions(scenario: NewScenario) -> list[str]:
     """Return what the map does not tell, for the key ``assumed``."""
     assumed = []
-    if scenario.traffic is not None:
-        assumed.append(f"traffic ({scenario.traffic.per_h:,} vehicles an hour, from the road classes)")
+    traffic = scenario.traffic
+    if traffic is not None and traffic.level is None:
+        assumed.append(f"shares of the movements (of {traffic.per_h:,} vehicles an hour)")
+    elif traffic is not None:
+        assumed.append(f"traffic ({traffic.per_h:,} vehicles an hour, from the road classes)")
     if scenario.junction.signalised:
         assumed.append("signal plans")
     heights = scenario.statics.heights.get("building", Counter())
@@ -600,15 +619,31 @@ def _assumptions(scenario: NewScenario) -> list[str]:
     return [*assumed, "positions of the poles"]
 
 
-def _counts_array(flows: Sequence[CountConfig]) -> Any:
-    """Return a TOML array with one flow per line."""
+def _counts_array(flows: Sequence[CountConfig], names: MovementNames) -> Any:
+    """Return a TOML array with one flow per line, and its movement in words."""
     rows = tomlkit.array()
     for flow in flows:
-        row = tomlkit.inline_table()
-        row.update(flow.model_dump(exclude_defaults=True))
-        rows.add_line(row)
+        movement = names.describe(flow.edge or flow.from_edge or "", flow.to_edge)
+        rows.add_line(_count_row(flow), comment=movement)
     rows.add_line(indent="")
     return rows
+
+
+def _count_row(flow: CountConfig) -> Any:
+    row = tomlkit.inline_table()
+    row.update(flow.model_dump(exclude_defaults=True))
+    return row
+
+
+def _periods_template(example: CountConfig) -> list[str]:
+    """Return comment lines that show how parts of the day are written."""
+    return [
+        "Parts of the day (peaks): one such table for each, with counts in rows as above; docs/scenarios.md, Periods",
+        "[[traffic.periods]]",
+        'name = "morning"',
+        "weight = 3 # hours",
+        f"counts = [{_count_row(example).as_string()}]",
+    ]
 
 
 def publish_folder(folder: Path, texts: Iterable[tuple[str, str]], check: Callable[[Path], object]) -> None:

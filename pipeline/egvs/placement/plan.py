@@ -165,6 +165,19 @@ class JointScore:
         return [self._index_of_name[name] for name in names]
 
 
+def planned_request(folder: Path) -> dict[str, Any] | None:
+    """Return the ``[placement]`` of the plan in a run folder; None if there is no valid plan."""
+    path = RunFolder(folder).placement
+    if not path.is_file():
+        return None
+    try:
+        plan = parquet.read_metadata(path, "placement")["plan"]
+    except InputError:  # of another version, or not complete
+        return None
+    request: dict[str, Any] = plan["asked"]
+    return request
+
+
 @dataclass(frozen=True)
 class ZoneCoverage:
     """How a plan covers a required zone.

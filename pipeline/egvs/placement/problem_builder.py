@@ -29,6 +29,7 @@ from egvs.scoring.target_scores import TARGET_SCORES
 from egvs.scoring.targets import VisibleTargets
 from egvs.scoring.visibility import Beams, HitCounter
 from egvs.scoring.zones import placement_zones
+from egvs.sensors.sensor import check_sensor_names
 from egvs.sensors.sites import Site, candidate_sites
 from egvs.stages.base import StageContext
 from egvs.stages.inputs import get_scene
@@ -553,9 +554,12 @@ def candidate_costs(scenario: Scenario, sites: Sequence[Site]) -> tuple[FloatArr
     Raises
     ------
     InputError
-        For a cost that is unknown although there is a budget, that is not a number, or that is too large.
+        For a cost that is unknown although there is a budget, of an unknown sensor, that is not a number, or that is
+        too large.
     """
     costs = scenario.costs
+    known = dict.fromkeys([*(site.sensor for site in sites), *scenario.sensors])
+    check_sensor_names(costs.sensor, known, f"{scenario.file}: costs.sensor")
     has_budget = scenario.placement.budget is not None
     sites_file = scenario.sites.file or scenario.file
     cost = np.zeros(len(sites))

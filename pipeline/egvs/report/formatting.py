@@ -133,11 +133,8 @@ class ScoreLabel:
         return self._number(se)
 
     def sentence(self, value: float) -> str:
-        """Return what a site with this score does, e.g. "should find 87% of vehicles"."""
-        text = f"{self.value(value)} {self.unit}".strip()
-        if self.is_share:
-            text = f"{value:.0%}"
-        return self.says.format(text)
+        """Return what a site with this score does, e.g. "should find 87.0% of vehicles"."""
+        return self.says.format(f"{self.value(value)} {self.unit}".strip())
 
 
 _MAX_LETTERS = 18

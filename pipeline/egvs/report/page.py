@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,25 +27,27 @@ from egvs.report.basemap import network_file
 from egvs.report.colours import STYLE_SHEET
 from egvs.report.figures import Figures
 from egvs.report.ranking import (
-    NAMED_POLES,
     RankedSite,
     Ranking,
-    describe_poles_on_road,
     entropy_seen_note,
     headline,
     lead,
+    recorded_frames_hint,
     share_of_limit,
 )
 from egvs.report.sections import (
+    NAMED_POLES,
     PlacementSummary,
     StudySummary,
     ValidationSummary,
     assumes_flows,
     assumptions,
+    describe_counts,
+    describe_poles_on_road,
     egvs_setting,
     ranking_disagreement,
 )
-from egvs.report.sensor_results import SensorComparison, costs_option
+from egvs.report.sensor_results import SensorComparison, costs_option, range_note
 from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.scene_inputs import scan_dependencies
@@ -94,6 +96,8 @@ class PageContents:
         Records of the stages, as far as ``run.json`` has them, in the order of :data:`STAGES`.
     study, by_period, detected, plan
         Results of other commands and of periods; None if those commands have not run.
+    movements
+        What each counted location is in words; empty if the run folder has no network.
     """
 
     scenario: Scenario
@@ -105,6 +109,7 @@ class PageContents:
     by_period: PeriodRanking | None = None
     detected: ValidationSummary | None = None
     plan: PlacementSummary | None = None
+    movements: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -169,6 +174,7 @@ def _displayed_settings(scenario: Scenario) -> dict[str, Any]:
         "weights": scenario.score.weights.in_words,
         "assumed": assumptions(scenario),
         "blindspots": scenario.score.blindspots,
+        "sampled_frames": scenario.score.sampled_frames,
         "costs": scenario.costs.model_dump(mode="json"),
         "effects": scenario.effects.model_dump(mode="json"),
     }
@@ -208,6 +214,7 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
         by_period=PeriodRanking.read(out),
         detected=ValidationSummary.read(out, stages),
         plan=PlacementSummary.read(out, stages, ranking.sites, tpog, drawn.backdrop),
+        movements=describe_counts(work.scenario, network_file(out)),
     )
     html = render_page(contents)
     files.write_text(work.folder.report, html)
@@ -303,8 +310,10 @@ def _setting_values(contents: PageContents) -> dict[str, Any]:
 def _sensor_values(contents: PageContents) -> dict[str, Any]:
     """The best mount of each sensor; None where there is one sensor."""
     sensors = SensorComparison.of_run(contents.ranking.sites, contents.scenario.costs)
+    names = [site.sensor for site in contents.ranking.sites]
     return {
         "sensors": sensors,
+        "range_note": range_note(names, is_modelled=contents.scenario.effects.range_limit is not None),
         "costs_option": costs_option(sensors.sensors) if sensors is not None else "",
     }
 
@@ -336,7 +345,7 @@ def _sentences(contents: PageContents) -> dict[str, str]:
     return {
         "headline": headline(ranking, bool(tpog.counts.any())),
         "contradiction": "" if contents.detected is None else contents.detected.check.contradiction,
-        "lead": lead(ranking),
+        "lead": lead(ranking, recorded_frames_hint(scenario, ranking, contents.stages)),
         "entropy_seen_note": entropy_seen_note(ranking),
         "disagreement": ranking_disagreement(ranking.sites, setting),
     }

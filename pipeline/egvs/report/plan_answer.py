@@ -10,17 +10,30 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 from egvs.artefacts.plan_step import PlanStep
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
-from egvs.report.formatting import ScoreLabel
+from egvs.report.formatting import ScoreLabel, join_names
 
 MIN_USEFUL_SHARE = 0.01
 """A useful sensor adds at least 1 percentage point; to scores that are no shares, at least 1 % of the plan's score."""
 
 _NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 _ORDINALS = ("", "first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth")
+
+
+class CurvePlan(NamedTuple):
+    """Sites of the best plan with at most so many sensors, and their cost (0 without costs)."""
+
+    sites: tuple[str, ...]
+    cost: float
+
+    @property
+    def text(self) -> str:
+        """Sites and cost, e.g. "a and b for 6000"."""
+        cost = f" for {self.cost:g}" if self.cost else ""
+        return f"{join_names(self.sites)}{cost}"
 
 
 def is_useful(before: PlanStep, step: PlanStep, by: ScoreLabel) -> bool:
@@ -51,7 +64,13 @@ def _is_separable(step: PlanStep) -> bool:
 
 
 def describe_count(
-    steps: Sequence[PlanStep], by: ScoreLabel, *, objective: str = "", next_count: int | None = None
+    steps: Sequence[PlanStep],
+    by: ScoreLabel,
+    *,
+    plans: Sequence[CurvePlan] = (),
+    has_budget: bool = False,
+    objective: str = "",
+    next_count: int | None = None,
 ) -> str:
     """Return how many sensors are enough, in one or two sentences; empty if there is nothing to compare or to try.
 
@@ -61,6 +80,10 @@ def describe_count(
         The best plans of each number of sensors, at least one.
     by
         Label of the joint score.
+    plans
+        The plan of each step: if fewer sensors than those of the last plan are enough, their sites are named.
+    has_budget
+        Whether a budget limits the number of sensors of the last plan.
     objective
         What the plans maximise, if not the joint score; then gains of the joint score do not tell what is enough.
     next_count
@@ -79,11 +102,18 @@ def describe_count(
 
     enough = _last_useful_step(steps, by)
     if enough < len(steps) - 1:
-        following = steps[enough + 1]
-        return (
-            f"{_capitalise(_count_is(steps[enough].count))} enough: {_ordinal(following.count)} adds "
-            f"{_describe_gain(following, by)}{_describe_chance(following, by)}."
-        )
+        gain = f"{_describe_gain(steps[enough + 1], by)}{_describe_chance(steps[enough + 1], by)}"
+        further = _ordinal(steps[enough + 1].count)
+        is_smaller = bool(plans) and 0 < len(plans[enough].sites) < len(plans[-1].sites)
+        if is_smaller and has_budget:
+            only = "only " if steps[enough + 1].gain else ""
+            _, _, ordinal = further.partition(" ")
+            return (
+                f"The budget buys {_number(len(plans[-1].sites))} sensors; the {ordinal} adds {only}{gain}, so "
+                f"{_count_is(steps[enough].count)} enough: {plans[enough].text}."
+            )
+        names = f" ({plans[enough].text})" if is_smaller else ""
+        return f"{_capitalise(_count_is(steps[enough].count))} enough{names}: {further} adds {gain}."
     if not before.met:
         sensor = _capitalise(_ordinal(last.count))
         answer = f"{sensor} sensor is needed to meet the requirements; it adds {_describe_gain(last, by)}."

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
@@ -15,19 +14,15 @@ import pyarrow as pa
 
 from egvs.artefacts import parquet
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
-from egvs.core.errors import SITES_ON_LANES, Diagnostic, InputError
+from egvs.artefacts.run_record import StageRecord
+from egvs.core.errors import InputError
 from egvs.report.formatting import SCORE_LABELS, ScoreLabel, format_count, format_number, format_percent, join_names
 from egvs.report.svg_figures import MapSite
+from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
 
 CLOSE_SHARE = 0.01
 """The report names the sites whose score is this close to the best, as a share of the best score."""
-
-NAMED_POLES = 5
-"""Poles at the head of the ranking whose location in a lane is stated with the result."""
-
-_FURTHER_SITES = re.compile(r" and \d+ more$")
-"""End of the location of a warning that is the same for several sites."""
 
 _MIN_LEAD = 0.0005
 """Shares that differ by less than this look the same with one decimal."""
@@ -47,8 +42,8 @@ class RankedSite(MapSite):
 
     Attributes
     ----------
-    egvs_se, beats_next
-        None where no standard errors were computed.
+    egvs_se, beats_next, behind_best_se, best_beats
+        None where no standard errors were computed; the last two also in files of earlier versions.
     longitude_deg, latitude_deg
         None where the scenario has no reference system.
     user_columns
@@ -70,6 +65,8 @@ class RankedSite(MapSite):
     entropy_seen: float
     egvs_se: float | None = None
     beats_next: float | None = None
+    behind_best_se: float | None = None
+    best_beats: float | None = None
     longitude_deg: float | None = None
     latitude_deg: float | None = None
     user_columns: tuple[tuple[str, str], ...] = ()
@@ -137,6 +134,11 @@ class RankedSite(MapSite):
         """Whether the site is known to be better than the next one, or standard errors are unknown."""
         return self.beats_next is None or self.beats_next >= DISTINCT_PROBABILITY
 
+    @property
+    def is_below_best(self) -> bool:
+        """Whether the site is known to be worse than the best one, or the probability of that is unknown."""
+        return self.best_beats is None or self.best_beats >= DISTINCT_PROBABILITY
+
 
 def _none_if_nan(value: Any) -> Any:
     return None if isinstance(value, float) and math.isnan(value) else value
@@ -163,12 +165,19 @@ class Pole:
         return self.sites[0]
 
     @property
-    def gain(self) -> float | None:
-        """Lead of the best site over the worst, as a share of the worst; None for a single site, or a worst of 0."""
-        worst = self.sites[-1].score
-        if len(self.sites) == 1 or not worst > 0:
-            return None
-        return self.best.score / worst - 1
+    def gain_text(self) -> str:
+        """Lead of the best site over the worst: in percentage points for shares, else in per cent of the worst.
+
+        Empty for a single site, and for a score that is no share where the worst is 0.
+        """
+        if len(self.sites) == 1:
+            return ""
+        by, worst = self.best.by, self.sites[-1].score
+        if by.is_share:
+            return by.change(self.best.score - worst)
+        if not worst > 0:
+            return ""
+        return format_percent(self.best.score / worst - 1)
 
     @property
     def user_columns(self) -> tuple[str, ...]:
@@ -203,35 +212,6 @@ def group_by_pole(sites: Iterable[RankedSite]) -> tuple[Pole, ...]:
     for site in sites:
         sites_of_pole.setdefault(site.pole, []).append(site)
     return tuple(Pole(name, tuple(members)) for name, members in sites_of_pole.items())
-
-
-def describe_poles_on_road(poles: Iterable[Pole], warnings: Iterable[Diagnostic]) -> list[str]:
-    """Return a phrase for each pole in a lane or junction, e.g. ``"k02 stands in a lane of Main Street"``.
-
-    Parameters
-    ----------
-    poles
-        The poles.
-    warnings
-        Warnings of a run; those of the rule :data:`egvs.core.errors.SITES_ON_LANES` name sites.
-    """
-    where_of_site = {}
-    for warning in warnings:
-        if warning.rule != SITES_ON_LANES:
-            continue
-        _, _, site = warning.where.partition(": site ")
-        if site:
-            where_of_site[_FURTHER_SITES.sub("", site)] = warning.problem.partition(" is ")[2]
-        else:  # a list of all further sites
-            for name in warning.problem.partition(": ")[2].split(", "):
-                where_of_site[name] = "in a lane or junction"
-
-    phrases = []
-    for pole in poles:
-        where = next((where_of_site[site.site] for site in pole.sites if site.site in where_of_site), None)
-        if where is not None:
-            phrases.append(f"{pole.name} stands {where}")
-    return phrases
 
 
 @dataclass(frozen=True)
@@ -358,16 +338,67 @@ def headline(ranking: Ranking, has_traffic: bool) -> str:
     return text if by_egvs else f"{text}: it {result}"
 
 
-def lead(ranking: Ranking) -> str:
-    """Return sentences about the lead of the best site and the sites close to it; empty if none leads."""
+def more_frames_hint(scenario: Scenario, by: ScoreLabel, recorded: int) -> str:
+    """Return a sentence on the setting that reduces the standard errors of a score.
+
+    It is ``score.sampled_frames`` for a score over vehicles of less than half of the recorded frames, otherwise longer
+    traffic. Four times as many frames halve the errors, if they are independent.
+
+    Parameters
+    ----------
+    scenario
+        The scenario of the run.
+    by
+        The score that ranks.
+    recorded
+        Number of recorded frames.
+    """
+    sampled = scenario.score.sampled_frames
+    if by.counts_vehicles and 2 * sampled < recorded:
+        return f"More frames may separate them: --set score.sampled_frames={min(4 * sampled, recorded)}."
+    if scenario.is_recorded:
+        return "A longer recording may separate them."
+    if scenario.traffic.periods:
+        return "More traffic may separate them: longer periods, or more traffic.frames."
+    return f"More traffic may separate them: --set traffic.frames={4 * recorded}."
+
+
+def recorded_frames_hint(scenario: Scenario, ranking: Ranking, stages: Mapping[str, StageRecord]) -> str:
+    """Return :func:`more_frames_hint` for a run with these records of its stages; empty without the traffic's."""
+    if "traffic" not in stages:
+        return ""
+    return more_frames_hint(scenario, ranking.by, stages["traffic"].summary["frames"])
+
+
+def lead(ranking: Ranking, hint: str = "") -> str:
+    """Return sentences about the lead of the best site and the sites close to it; empty if none leads.
+
+    Parameters
+    ----------
+    ranking
+        The sites.
+    hint
+        Sentence on what helps where sites cannot be told apart.
+    """
     if ranking.is_tie or not ranking.best[0].score > 0:
         return ""
     second = ranking.sites[len(ranking.best)]
     subject = "It leads" if len(ranking.best) == 1 else "They lead"
-    text = f"{subject} the next site, {second.site}, by {_format_gap(ranking, second)}."
-    if not ranking.best[-1].is_separable:  # ``beats_next`` of the last of the best refers to the second
-        text += " There is too little traffic to tell which of them is better."
-    text += _lead_over_other_poles(ranking, second)
+    text = f"{subject} the next site, {second.site}, by {_format_gap(ranking, second)}"
+    text += f"{_format_probability(ranking, second, 'better')}."
+    rival = _best_on_another_pole(ranking)
+    # ``beats_next`` of the last of the best refers to the second
+    is_separable = ranking.best[-1].is_separable and second.is_below_best
+    if not is_separable:
+        text += f" These {'poles' if second is rival else 'sites'} cannot be told apart."
+    if rival is not None and rival is not second:
+        text += f" The best site on another pole, {rival.site}, is behind by {_format_gap(ranking, rival)}"
+        text += f"{_format_probability(ranking, rival, 'worse')}."
+        if not rival.is_below_best:
+            text += " These poles cannot be told apart."
+            is_separable = False
+    if hint and not is_separable:
+        text += f" {hint}"
     if len(ranking.close) > 1:
         names = ", ".join(site.site for site in ranking.close[:4])
         if len(ranking.close) > 4:
@@ -376,25 +407,38 @@ def lead(ranking: Ranking) -> str:
     return text
 
 
-def _lead_over_other_poles(ranking: Ranking, second: RankedSite) -> str:
-    """Return a sentence about the best site on another pole, where the second site is on the pole of a best one."""
+def _best_on_another_pole(ranking: Ranking) -> RankedSite | None:
+    """Return the best site that is on no pole of a best one; None without such a site."""
     best_poles = {site.pole for site in ranking.best}
-    if second.pole not in best_poles:
+    return next((site for site in ranking.sites if site.pole not in best_poles), None)
+
+
+def _format_probability(ranking: Ranking, site: RankedSite, comparison: str) -> str:
+    """Return how probable the lead of the best site is, in brackets; empty if that is unknown."""
+    if site.best_beats is None:
         return ""
-    for site in ranking.sites:
-        if site.pole not in best_poles:
-            return f" The best site on another pole, {site.site}, is behind by {_format_gap(ranking, site)}."
-    return ""
+    percent = f"{site.best_beats:.0%}"
+    if site.best_beats >= 0.995:
+        percent = "over 99%"
+    elif not site.is_below_best and round(site.best_beats, 2) >= DISTINCT_PROBABILITY:
+        percent = f"{site.best_beats:.1%}"
+    owner = "it is" if len(ranking.best) == 1 or comparison == "worse" else "they are"
+    return f" ({owner} truly {comparison} with a probability of {percent})"
 
 
 def _format_gap(ranking: Ranking, second: RankedSite) -> str:
     """Return the lead of the best site: in percentage points for shares, relative to its score otherwise."""
     best_score = ranking.best[0].score
     is_share = ranking.by.is_share
-    gap = best_score - second.score
+    gap, error = best_score - second.score, second.behind_best_se
     if not is_share:
         gap /= best_score
     gap_text = f"{100.0 * gap:.1f}" if gap >= _MIN_LEAD else "less than 0.1"
+    if error is not None:
+        if not is_share:
+            error /= best_score
+        decimals = 1 if error >= _MIN_LEAD else 2
+        gap_text = f"{100.0 * gap:.{decimals}f} ± {100.0 * error:.{decimals}f}"
     if is_share:
         return f"{gap_text} percentage points"
     owner = "its" if len(ranking.best) == 1 else "their"

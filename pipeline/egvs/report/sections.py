@@ -12,7 +12,7 @@ import base64
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -26,11 +26,13 @@ from egvs.core.errors import Diagnostic, collect_warnings
 from egvs.report import maps, plan_answer, svg_figures
 from egvs.report.formatting import SCORE_LABELS, ScoreLabel, join_names
 from egvs.report.maps import Backdrop, PlannedPole
-from egvs.report.ranking import RankedSite
+from egvs.report.ranking import Pole, RankedSite
 from egvs.report.ranking_check import RankingCheck
 from egvs.report.svg_figures import CurveStep, MapSite
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
+from egvs.traffic.movements import MovementNames
+from egvs.traffic.network import read_net_xml
 
 COMPARED_SITES = 3
 """Number of best sites that :func:`ranking_disagreement` compares."""
@@ -46,6 +48,15 @@ RHO_RANGE = (
     "0.83 to 0.97, depending on junction and detector; among sites of equal height in dense queues, about 0.2 to 0.96"
 )
 """Rank correlation of the recommended score with detection, over junctions and detectors (docs/validity.md, F)."""
+
+NAMED_POLES = 5
+"""Poles at the head of the ranking whose location in a lane is stated with the result."""
+
+_FURTHER_SITES = re.compile(r" and \d+ more$")
+"""End of the location of a warning that is the same for several sites."""
+
+_SITES_ON_LANES = "sites on lanes"
+"""Rule of the warnings of a check about sites in lanes or junctions."""
 
 _TRAFFIC = re.compile(r"\btraffic\b(?! (?:light|sign))", re.IGNORECASE)
 """Found in entries of the key ``assumed`` on traffic; traffic lights and signs are not traffic."""
@@ -200,6 +211,35 @@ def assumptions(scenario: Scenario) -> tuple[str, ...]:
     return (*scenario.assumed, "traffic (random trips)")
 
 
+def describe_poles_on_road(poles: Iterable[Pole], warnings: Iterable[Diagnostic]) -> list[str]:
+    """Return a phrase for each pole in a lane or junction, e.g. ``"k02 stands in a lane of Main Street"``.
+
+    Parameters
+    ----------
+    poles
+        The poles.
+    warnings
+        Warnings of a run; those of the rule :data:`_SITES_ON_LANES` name sites.
+    """
+    where_of_site = {}
+    for warning in warnings:
+        if warning.rule != _SITES_ON_LANES:
+            continue
+        _, _, site = warning.where.partition(": site ")
+        if site:
+            where_of_site[_FURTHER_SITES.sub("", site)] = warning.problem.partition(" is ")[2]
+        else:  # a list of all further sites
+            for name in warning.problem.partition(": ")[2].split(", "):
+                where_of_site[name] = "in a lane or junction"
+
+    phrases = []
+    for pole in poles:
+        where = next((where_of_site[site.site] for site in pole.sites if site.site in where_of_site), None)
+        if where is not None:
+            phrases.append(f"{pole.name} stands {where}")
+    return phrases
+
+
 def describe_assumptions(scenario: Scenario, result: str) -> str:
     """Return what a result ("ranking", "plan") assumes, in one sentence; empty where nothing is assumed."""
     assumed = assumptions(scenario)
@@ -211,6 +251,28 @@ def describe_assumptions(scenario: Scenario, result: str) -> str:
 def assumes_flows(scenario: Scenario) -> bool:
     """Return whether the key ``assumed`` says that the traffic, hence the flows in ``counts``, is assumed."""
     return any(_TRAFFIC.search(entry) for entry in scenario.assumed)
+
+
+def describe_counts(scenario: Scenario, network: Path | None) -> dict[str, str]:
+    """Return the movement of each traffic count in words, by its location in the summary of the traffic.
+
+    Parameters
+    ----------
+    scenario
+        The counts.
+    network
+        The simulated network; None if the run folder has none.
+    """
+    periods = {name: period.traffic for name, period in scenario.by_period().items() if period.traffic.counts}
+    if network is None or not periods:
+        return {}
+    names = MovementNames(read_net_xml(network))
+    movements = {}
+    for name, traffic in periods.items():
+        period = f" ({name})" if name else ""
+        for count in traffic.counts:
+            movements[f"{count.title}{period}"] = names.describe(count.edge or count.from_edge or "", count.to_edge)
+    return movements
 
 
 # ---- evidence of the validation study
@@ -402,15 +464,23 @@ class PlacementSummary:
         occupied = tpog.counts.sum(axis=2) / tpog.frames
         poles = _planned_poles(picks, joint, by)
         steps, objective = plan_steps(curve_rows), describe_objective(plan["asked"])
-        next_count = plan_answer.next_count(steps, len(picks), plan["candidates"], plan["asked"])
+        curve = _curve(steps, curve_rows, plan["together"] or math.inf)
+        answer = plan_answer.describe_count(
+            steps,
+            by,
+            plans=[plan_answer.CurvePlan(row.sites, row.cost) for row in curve],
+            has_budget=plan["asked"]["budget"] is not None,
+            objective=objective,
+            next_count=plan_answer.next_count(steps, len(picks), plan["candidates"], plan["asked"]),
+        )
         return cls(
             by=by,
             picks=picks,
-            curve=_curve(steps, curve_rows, plan["together"] or math.inf),
+            curve=curve,
             joint=joint,
             together=plan["together"],
             errors_from=plan.get("standard_errors", "the plan was made by an older version of egvs place"),
-            answer=plan_answer.describe_count(steps, by, objective=objective, next_count=next_count),
+            answer=answer,
             cost=plan["cost"],
             candidates=plan["candidates"],
             proof=_describe_proof(plan, len(picks)),

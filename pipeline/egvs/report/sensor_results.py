@@ -38,8 +38,28 @@ _NO_EVIDENCE = (
     "a measurement for {}."
 )
 
+_RANGE_NOTE = (
+    "The range of a sensor on dark vehicles is not modelled: sensors with a short rated range look better than they "
+    "are. Try --set effects.range_limit={}."
+)
+
 _PROBABILITY_DIGITS = 6
 """The last bits of a distribution function depend on the machine."""
+
+
+def range_note(sensors: Iterable[str], *, is_modelled: bool) -> str:
+    """Return a sentence where sensors are compared without their range on dark vehicles; empty otherwise.
+
+    Parameters
+    ----------
+    sensors
+        Names of the sensors.
+    is_modelled
+        Whether the effect ``range_limit`` is enabled in all runs.
+    """
+    if is_modelled or len(set(sensors)) < 2:
+        return ""
+    return _RANGE_NOTE
 
 
 @dataclass(frozen=True)
@@ -205,7 +225,9 @@ class SensorResult:
     @property
     def cost_per_point_text(self) -> str:
         """The cost of one more percentage point than the baseline."""
-        return "-" if self.gain is None else self.gain.cost_text
+        if self.gain is None or self.mount.cost is None:
+            return "-"
+        return self.gain.cost_text
 
     @property
     def step_cost_text(self) -> str:
@@ -215,14 +237,14 @@ class SensorResult:
 
 @dataclass(frozen=True)
 class SensorComparison:
-    """The best mount of each sensor, the baseline first: the cheapest or, where a cost is unknown, that finding least.
+    """The best mount of each sensor, the baseline first: the cheapest, or that finding least with fewer than two costs.
 
     Attributes
     ----------
     results
-        By cost; by score where a cost is unknown.
+        By cost, followed by those without a cost by score; all by score with fewer than two costs.
     has_costs
-        Whether all costs are known.
+        Whether at least two costs are known, so that they can be compared.
     """
 
     results: tuple[SensorResult, ...]
@@ -243,12 +265,14 @@ class SensorComparison:
         """
         if len({mount.sensor for mount in mounts}) < 2:
             return None
-        has_costs = all(mount.cost is not None for mount in mounts)
+        has_costs = sum(mount.cost is not None for mount in mounts) > 1
 
         def order(mount: SensorMount) -> tuple[float, float]:
-            if has_costs and mount.cost is not None:
-                return mount.cost, -mount.site.score
-            return mount.site.score, 0.0
+            if not has_costs:
+                return mount.site.score, 0.0
+            if mount.cost is None:
+                return math.inf, mount.site.score
+            return mount.cost, -mount.site.score
 
         baseline, *others = sorted(mounts, key=order)
         best_cheaper = baseline
@@ -256,7 +280,7 @@ class SensorComparison:
         for mount in others:
             gain = SensorGain.of(mount, baseline, difference(mount, baseline))
             step = None
-            if has_costs:
+            if has_costs and mount.cost is not None:
                 step = SensorGain.of(mount, best_cheaper, difference(mount, best_cheaper))
             results.append(SensorResult(mount, gain, step))
             if mount.site.score > best_cheaper.site.score:
@@ -286,9 +310,13 @@ class SensorComparison:
         mount = self.baseline
         run = f" of {mount.run}" if len(self.results) > len(self.sensors) else ""
         kind = "the cheapest" if self.has_costs else "which finds least"
+        unpriced = ""
+        if self.has_costs and self.unpriced:
+            kind = "the cheapest with a known cost"
+            unpriced = f" Without a known cost: {', '.join(self.unpriced)}."
         return (
             f"Differences from {mount.sensor}{run} ({kind}) are in {difference_unit(mount.site)}, ± their standard "
-            "error; ~ it is not clear which is better."
+            f"error; ~ it is not clear which is better.{unpriced}"
         )
 
     @property
@@ -303,6 +331,11 @@ class SensorComparison:
     def sensors(self) -> tuple[str, ...]:
         """Names of the sensors."""
         return tuple(dict.fromkeys(result.mount.sensor for result in self.results))
+
+    @property
+    def unpriced(self) -> tuple[str, ...]:
+        """Names of the sensors whose cost is unknown."""
+        return tuple(dict.fromkeys(result.mount.sensor for result in self.results if result.mount.cost is None))
 
     @property
     def shows_cost_per_point(self) -> bool:

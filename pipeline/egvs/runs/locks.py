@@ -37,7 +37,7 @@ def locked(path: Path, *, shared: bool = False, wait: bool = True, remove: bool 
             if not wait_for_lock(descriptor, math.inf if wait else 0.0, shared=shared):
                 yield False
                 return
-            if not _is_current_lock(descriptor, path):
+            if not is_current_lock(descriptor, path):
                 continue
             try:
                 yield True
@@ -83,7 +83,7 @@ def wait_for_lock(descriptor: int, timeout_s: float, *, shared: bool = False) ->
     return True
 
 
-def _is_current_lock(descriptor: int, path: Path) -> bool:
+def is_current_lock(descriptor: int, path: Path) -> bool:
     """Whether the locked file is still the one at ``path``; the process that held the lock may have removed it."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat())

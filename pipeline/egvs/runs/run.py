@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -388,7 +388,7 @@ def lock_run_folder(folder: Path, wait_s: float = 0.0) -> Iterator[None]:
     Parameters
     ----------
     folder
-        Run folder; it is created if it does not exist.
+        Run folder; it is created if it does not exist, and removed again if nothing is written into it.
     wait_s
         How long to wait for the end of another run.
 
@@ -398,18 +398,50 @@ def lock_run_folder(folder: Path, wait_s: float = 0.0) -> Iterator[None]:
         When another run is still at work there.
     """
     store.check_outside_store(folder)
+    created = _missing_folders(folder)
+    descriptor = _lock_folder(folder, wait_s)
+    try:
+        yield
+    finally:
+        _remove_unused(folder, created)
+        os.close(descriptor)
+
+
+def _lock_folder(folder: Path, wait_s: float) -> int:
+    """Return the descriptor of the lock of a run folder; RunError when another run holds it."""
+    while True:
+        descriptor = _open_folder_lock(folder)
+        if not locks.wait_for_lock(descriptor, wait_s):
+            os.close(descriptor)
+            raise RunError(f"{folder}: another run is using this folder")
+        if locks.is_current_lock(descriptor, folder / RunFolder.lock.name):
+            return descriptor
+        os.close(descriptor)  # a run that wrote nothing has removed the folder meanwhile
+
+
+def _open_folder_lock(folder: Path) -> int:
+    """Return the descriptor of the lock of a run folder; both are created if they do not exist."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        descriptor = locks.open_lock(folder / RunFolder.lock.name)
+        return locks.open_lock(folder / RunFolder.lock.name)
     except OSError as error:
         problem = f"cannot be written ({error.strerror})"
         raise InputError(folder, problem, "Choose a folder that you may write to.") from None
-    try:
-        if not locks.wait_for_lock(descriptor, wait_s):
-            raise RunError(f"{folder}: another run is using this folder")
-        yield
-    finally:
-        os.close(descriptor)
+
+
+def _missing_folders(folder: Path) -> list[Path]:
+    """Return the folder and its parents as far as they do not exist, the innermost first."""
+    return [path for path in (folder, *folder.parents) if not path.exists()]
+
+
+def _remove_unused(folder: Path, created: Sequence[Path]) -> None:
+    """Remove the folders that this run created, if nothing was written: there is only the lock in the run folder."""
+    if folder not in created or any(path.name != RunFolder.lock.name for path in folder.iterdir()):
+        return
+    with suppress(OSError):  # Windows removes no open file; a folder that another run uses is not empty
+        (folder / RunFolder.lock.name).unlink()
+        for path in created:
+            path.rmdir()
 
 
 _CLOUD_NAME = re.compile(r"scan_.*\.(ply|pcd)", re.DOTALL)

@@ -77,8 +77,8 @@ class ListedRun:
 def list_runs(folder: Path = RUNS) -> list[ListedRun]:
     """Return the run folders in a folder, the latest one first.
 
-    Only ``run.json`` and ``scores.parquet`` are read. A folder in which a run was at work, but that has no valid
-    record, is listed with its problem; other folders are left out.
+    Only ``run.json`` and ``scores.parquet`` are read. A folder into which a run wrote files, but that has no
+    valid record, is listed with its problem; other folders are left out.
 
     Parameters
     ----------
@@ -98,6 +98,8 @@ def list_runs(folder: Path = RUNS) -> list[ListedRun]:
 def latest_difference(scenario: Scenario, out: Path) -> tuple[Path, dict[str, tuple[Any, Any]]] | None:
     """Return the latest run of a scenario, and the settings in which it differs from the present ones.
 
+    A complete run with the present settings, if there is one, takes precedence over later ones.
+
     Parameters
     ----------
     scenario
@@ -113,18 +115,23 @@ def latest_difference(scenario: Scenario, out: Path) -> tuple[Path, dict[str, tu
     folders = set(_run_folders(RUNS))
     if RunFolder(out).has_record:
         folders.add(out)
+    latest = None
     for folder in sorted(folders, key=_last_run_s, reverse=True):
         try:
-            source = folder / RunRecord.read(folder).scenario_folder
+            record = RunRecord.read(folder)
+            source = folder / record.scenario_folder
             if source.resolve() != scenario.folder.resolve():
                 continue
             recorded = run_sources.recorded_scenario(folder)
         except InputError:  # no valid record, which "egvs runs" lists
             continue
-        there, here = (flatten_settings(each.model_dump(mode="json")) for each in (recorded, scenario))
         changed = run_sources.compared_settings(recorded, scenario)
-        return folder, {key: (there.get(key), here.get(key)) for key in changed}
-    return None
+        if not changed and all(stage in record.stages for stage in STAGE_NAMES):
+            return folder, {}
+        if latest is None:
+            there, here = (flatten_settings(each.model_dump(mode="json")) for each in (recorded, scenario))
+            latest = folder, {key: (there.get(key), here.get(key)) for key in changed}
+    return latest
 
 
 def _run_folders(folder: Path) -> list[Path]:
@@ -136,8 +143,12 @@ def _run_folders(folder: Path) -> list[Path]:
 
 
 def _was_used(folder: RunFolder) -> bool:
-    """Whether a run was at work in a folder; the store, which has a lock too, has a hidden name."""
-    return folder.has_record or (folder.lock.is_file() and not folder.path.name.startswith("."))
+    """Whether a run wrote files into a folder; the store, which has a lock too, has a hidden name."""
+    if folder.has_record:
+        return True
+    if not folder.lock.is_file() or folder.path.name.startswith("."):
+        return False
+    return any(path != folder.lock for path in folder.path.iterdir())
 
 
 def _last_run_s(folder: Path) -> float:
@@ -148,6 +159,8 @@ def _last_run_s(folder: Path) -> float:
 
 def _read_run(folder: Path) -> ListedRun:
     last_run_s, size_bytes = _last_run_s(folder), sum(_file_sizes(folder))
+    if not RunFolder(folder).has_record:
+        return ListedRun(folder, last_run_s, size_bytes, problem="never finished")
     try:
         record = RunRecord.read(folder)
         best = _read_best(folder) if "score" in record.stages else None

@@ -6,6 +6,7 @@
     score.gamma=5                                 gamma=5
     traffic.frames=300, score.gamma=0.50          frames=300,gamma=0.5
     effects.rain.rate_mm_h=20                     rain.rate_mm_h=20
+    effects.range_limit={}                        range_limit=on
     sites.sensor="VLP-16"                         sensor=VLP-16,511b6d4c
 
 A label without a hash spells all overrides. Otherwise it ends in a hash of all of them: where it would be longer than
@@ -98,6 +99,29 @@ def short_key(key: str) -> str:
     return key.replace("[", ".").replace("]", "")
 
 
+def effect_state(key: str, value: Any) -> str:
+    """Return "on" for an effect with its default parameters, "off" for one without any; empty for other settings.
+
+    Parameters
+    ----------
+    key
+        Full key.
+    value
+        Its value; None where it is not set.
+
+    Examples
+    --------
+    >>> effect_state("effects.range_limit", {}), effect_state("effects.range_limit", None), effect_state("seed", 1)
+    ('on', 'off', '')
+    """
+    prefix, _, name = key.partition(".")
+    if prefix != "effects" or not name or "." in name:
+        return ""
+    if value is None:
+        return "off"
+    return "on" if value == {} else ""
+
+
 def parse_overrides(overrides: Iterable[str]) -> dict[str, Any]:
     """Return the settings in arguments of ``--set`` by key, where there is no single scenario to compare them with.
 
@@ -132,10 +156,18 @@ def _normalise(value: Any) -> Any:
 
 def _format_pair(key: str, value: Any) -> str:
     """Return "key=value" with characters that every file system accepts."""
+    if state := effect_state(key, value):
+        return f"{_UNSAFE.sub('-', _effect_label(key))}={state}"
     text = value if isinstance(value, str) else files.to_json_text(value, separators=(",", ":"))
     if not _is_number(value):
         text = _UNSAFE.sub("-", text).strip("-")
     return f"{_UNSAFE.sub('-', short_key(key))}={text}"
+
+
+def _effect_label(key: str) -> str:
+    """Return the name of an effect, or its complete key where another setting has this name."""
+    name = key.removeprefix(_EFFECTS)
+    return key if _last_parts()[name] else name
 
 
 def _is_spelled_out(key: str, value: Any) -> bool:
@@ -144,7 +176,7 @@ def _is_spelled_out(key: str, value: Any) -> bool:
         return False
     if isinstance(value, str):
         return _PLAIN_WORD.fullmatch(value) is not None and value not in ("true", "false")
-    return isinstance(value, bool) or _is_number(value)
+    return isinstance(value, bool) or _is_number(value) or effect_state(key, value) == "on"
 
 
 def _is_number(value: Any) -> bool:

@@ -17,7 +17,8 @@ from pydantic import BaseModel, ConfigDict, Field
 class StrictModel(BaseModel):
     """Base of all tables of a scenario."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    # "constants": a serializer of a model would otherwise turn the infinity of its keys into None.
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, ser_json_inf_nan="constants")
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Self:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -266,6 +267,8 @@ def _read_with_bases(file: Path, extending: tuple[Path, ...]) -> dict[str, Any]:
     """Return the values of a scenario file and of those that it extends; ``extending`` are the files that extend it."""
     if not file.is_file():
         where = file.parent if file.name == SCENARIO_FILE else file
+        if not where.exists():
+            raise InputError(where, "no such folder", _suggest_similar_scenario(where))
         raise InputError(where, f"expected a {SCENARIO_FILE}, got none", _suggest_scenario(where))
     if file.resolve() in extending:
         raise InputError(f"{file}: extends", "the scenario extends itself", "Extend a different scenario.")
@@ -388,9 +391,34 @@ def _suggest_scenario(folder: Path) -> str:
     """Return a hint at the scenario that may be meant by another folder."""
     if (folder / "city.toml").is_file():
         return f"This is a city. Use egvs city run {folder}, or one of its junctions, {folder / 'junctions'}/ID."
-    if (folder / "run.json").is_file():
-        return "This is a run folder. Give the scenario's folder."
+    if (folder / _RUN_RECORD).is_file():
+        return f"This is a run folder. Give the scenario's folder{_recorded_folder(folder)}."
     return f"Give a folder with a {SCENARIO_FILE}, or the file."
+
+
+_RUN_RECORD = "run.json"
+
+
+def _recorded_folder(run: Path) -> str:
+    """Return the scenario's folder that a run recorded, as ", NAME"; empty if it cannot be read."""
+    try:
+        record = reading.read_json(run / _RUN_RECORD)
+    except InputError:  # this is a hint in another message
+        return ""
+    match record:
+        case {"scenario_folder": str(scenario)}:
+            return f", {os.path.normpath(run / scenario)}"
+    return ""
+
+
+def _suggest_similar_scenario(folder: Path) -> str:
+    """Return a hint at a scenario beside a folder that does not exist, with a similar name."""
+    hint = f"Give a folder with a {SCENARIO_FILE}, or the file."
+    if not folder.parent.is_dir():
+        return hint
+    scenarios = {path.name: path for path in sorted(folder.parent.iterdir()) if (path / SCENARIO_FILE).is_file()}
+    similar = difflib.get_close_matches(folder.name, scenarios, 1)
+    return f"Did you mean {scenarios[similar[0]]}?" if similar else hint
 
 
 def _apply_override(values: dict[str, Any], override: str) -> dict[str, Any]:

@@ -5,7 +5,14 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    SerializerFunctionWrapHandler,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from egvs.scenario.fields import Name, NotNegative, Point2, Positive, StrictModel, find_duplicates
 
@@ -24,6 +31,9 @@ OtherScore = Literal[
 
 DEFAULT_SCORE: OtherScore = "expected_detections"
 """The score that the validation study recommends (docs/validity.md), and that new scenarios rank by."""
+
+DEFAULT_SAMPLED_FRAMES = 250
+"""Recorded frames whose vehicles the scores over vehicles use."""
 
 _GAMMA_AT_1_M, _GAMMA_EXPONENT = 10.0, 1.16
 """A fit to the gammas that rank best on the study's training junctions (docs/validity.md, B): 2, 5 and 10 for voxels of
@@ -126,6 +136,18 @@ class ScoreConfig(StrictModel):
     )
     blindspots: bool = Field(True, description="Write blindspots.parquet: where each site misses vehicles")
     standard_error: bool = Field(True, description="Estimate the standard errors due to finite traffic")
+    sampled_frames: int = Field(
+        DEFAULT_SAMPLED_FRAMES,
+        ge=1,
+        description="Recorded frames, spread evenly, whose vehicles the scores over vehicles and the blind spots use;"
+        " at most all. Their cost grows in proportion",
+    )
+
+    @model_serializer(mode="wrap")
+    def _serialize(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out sampled_frames where it is not set, so that it does not change cache keys."""
+        is_set = "sampled_frames" in self.model_fields_set
+        return {name: value for name, value in serialize(self).items() if name != "sampled_frames" or is_set}
 
     @field_validator("gamma", mode="before")
     @classmethod

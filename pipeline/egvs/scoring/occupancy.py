@@ -113,7 +113,9 @@ def warn_empty_region(boxes: float, trajectories: Path) -> Iterator[Diagnostic]:
         hint = "Move the region to where vehicles drive, add traffic, or check that both use the same coordinates."
         yield Diagnostic(rule, "roi", problem, hint)
     else:
-        problem = f"{boxes:.2g} vehicles are in the region on average, so the ranking is based on very little traffic"
+        count = f"{boxes:.2g}"
+        vehicles = "1 vehicle is" if count == "1" else f"{count} vehicles are"
+        problem = f"{vehicles} in the region on average, so the ranking is based on very little traffic"
         hint = "Add vehicles in [traffic], or use a region that covers more of the road."
         yield Diagnostic(rule, "roi", problem, hint)
 

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.grid import Roi
+from egvs.traffic.directions import TURNS, compass, lane_heading
 from egvs.traffic.network import LANE_WIDTH_M, Connection, Edge, Lane, Network
 from egvs.world.carriageway import is_carriageway
 
@@ -108,12 +109,7 @@ def _distance_and_turn(at_m: Floats, yaw_rad: Floats, line_m: Floats) -> tuple[F
 APPROACH, EXIT, ROAD, LANE, TURN, CROSSING = KINDS = ("approach", "exit", "road", "lane", "turn", "crossing")
 """Kinds of locations; a road passes through the region."""
 
-_COMPASS = ("east", "north-east", "north", "north-west", "west", "south-west", "south", "south-east")
-_TURNS = {"s": "straight", "l": "left", "L": "left", "r": "right", "R": "right", "t": "back", "T": "back"}
 _ORDER = ("left", "straight", "right")
-
-_HEADING_OVER_M = 10.0
-"""The direction of a road is that of its last metres, or of its first ones where it leaves the region."""
 
 
 @dataclass(frozen=True)
@@ -163,11 +159,6 @@ class RoadLocations:
     def of(cls, network: Network, roi: Roi) -> RoadLocations:
         """Find the locations of a network; lanes without length are left out."""
         return _RoadLocationBuilder(network, roi).build()
-
-
-def compass(along_m: Floats) -> str:
-    """Return the nearest of eight compass points to a direction (2,), x east and y north."""
-    return _COMPASS[round(float(np.arctan2(along_m[1], along_m[0])) / (np.pi / 4)) % 8]
 
 
 def describe_lane(turns: Iterable[str]) -> str:
@@ -232,7 +223,7 @@ class _RoadLocationBuilder:
         before: dict[int, set[int]] = defaultdict(set)
         for source, connections in self.leaving.items():
             for connection in connections:
-                if _TURNS.get(connection.direction) != "back":
+                if TURNS.get(connection.direction) != "back":
                     after[source].add(connection.target)
                     before[connection.target].add(source)
         for source, targets in after.items():
@@ -249,7 +240,7 @@ class _RoadLocationBuilder:
         while edge != last:
             lanes = {c.target_lane for c in self.leaving[edge] if c.source_lane in lanes and c.target != c.source}
             edge = self.next_piece[edge]
-        return {_TURNS.get(c.direction, "") for c in self.leaving[edge] if c.source_lane in lanes}
+        return {TURNS.get(c.direction, "") for c in self.leaving[edge] if c.source_lane in lanes}
 
     def _of_road_lane(self, number: int, which: int) -> tuple[int, ...]:
         edge = self.edges[number]
@@ -273,10 +264,10 @@ class _RoadLocationBuilder:
         """Kind of a road (approach, exit, or passing through), its direction, and a point of it."""
         last = self.edges[self._last_piece(number)]
         if self._in_region(last.end_m):
-            return APPROACH, compass(_heading(last.lanes[0], at_end=True)), last.end_m
+            return APPROACH, compass(lane_heading(last.lanes[0], at_end=True)), last.end_m
         first = self.edges[_follow_chain(number, self.previous_piece)]
         by = EXIT if self._in_region(first.start_m) else ROAD
-        return by, compass(_heading(self.edges[number].lanes[0], at_end=False)), self.edges[number].start_m
+        return by, compass(lane_heading(self.edges[number].lanes[0], at_end=False)), self.edges[number].start_m
 
     def _in_region(self, at_m: tuple[float, float]) -> bool:
         low, size = self.roi.origin_m[:2], self.roi.size_m[:2]
@@ -291,7 +282,7 @@ class _RoadLocationBuilder:
                 if source in self.next_piece and connection.target == self.next_piece[source]:
                     locations[connection.via] = self._of_road_lane(source, connection.source_lane)
                 else:
-                    turn = _TURNS.get(connection.direction, "")
+                    turn = TURNS.get(connection.direction, "")
                     locations[connection.via] = (self._turn(edge.id, edge.name, turn, edge.lanes[0]),)
         for junction in self.network.junctions:  # an internal one has the name of the lane that continues there
             if junction.type == "internal" and junction.incoming_lanes and junction.incoming_lanes[0] in locations:
@@ -299,7 +290,7 @@ class _RoadLocationBuilder:
         return locations
 
     def _turn(self, edge: str, street: str, turn: str, approach: Lane) -> int:
-        bound, (x, y) = compass(_heading(approach, at_end=True)), approach.shape_m[-1, :2].tolist()
+        bound, (x, y) = compass(lane_heading(approach, at_end=True)), approach.shape_m[-1, :2].tolist()
         return self._location_number(TURN, f"{edge}:{turn}", f"{bound}bound {describe_turn(turn)}", street, (x, y))
 
     def _crossings(self) -> Iterator[tuple[MiddleLine, int]]:
@@ -344,15 +335,6 @@ def _vehicle_lanes(edge: Edge) -> list[tuple[int, Lane]]:
 
 def _middle_line(lane: Lane) -> MiddleLine:
     return MiddleLine(lane.shape_m[:, :2], LANE_WIDTH_M if lane.width_m is None else lane.width_m)
-
-
-def _heading(lane: Lane, *, at_end: bool) -> Floats:
-    """Direction of the last metres of a lane, or of its first ones, (2,)."""
-    points = lane.shape_m[::-1, :2] if at_end else lane.shape_m[:, :2]
-    distance_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T)))
-    there = [float(np.interp(_HEADING_OVER_M, distance_m, points[:, axis])) for axis in (0, 1)]
-    along = points[0] - there if at_end else there - points[0]
-    return np.asarray(along, dtype=np.float64)
 
 
 def disambiguate(locations: Sequence[RoadLocation]) -> list[RoadLocation]:

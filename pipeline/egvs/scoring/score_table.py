@@ -26,7 +26,14 @@ from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scoring.scorer import SiteScore, ranks
-from egvs.scoring.standard_errors import BlockGroups, ScoreUncertainty, beats_next, rank_order
+from egvs.scoring.standard_errors import (
+    BlockGroups,
+    LagBehindBest,
+    ScoreUncertainty,
+    beats_next,
+    lag_behind_best,
+    rank_order,
+)
 from egvs.scoring.target_scores import SiteTargetScores
 
 MIX = ""
@@ -131,6 +138,14 @@ class ScoreColumn:
         if self.estimate is None:
             return np.full(len(self.values), math.nan)
         return beats_next(self.estimate)
+
+    @property
+    def behind_best(self) -> LagBehindBest:
+        """How each site compares with the best one; NaN where it is unknown."""
+        if self.estimate is None:
+            unknown = np.full(len(self.values), math.nan)
+            return LagBehindBest(unknown, unknown)
+        return lag_behind_best(self.estimate)
 
     @property
     def best(self) -> frozenset[int]:

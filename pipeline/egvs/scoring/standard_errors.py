@@ -570,6 +570,28 @@ def beats_next(estimate: ScoreUncertainty) -> FloatArray:
     return chance
 
 
+class LagBehindBest(NamedTuple):
+    """How each site compares with the best one, the first of :func:`rank_order`, (n,) float64 each.
+
+    Attributes
+    ----------
+    se
+        Standard error of the difference to the best site; 0 for that site.
+    best_beats
+        Probability that the best site truly scores higher; one half where scores are equal.
+    """
+
+    se: FloatArray
+    best_beats: FloatArray
+
+
+def lag_behind_best(estimate: ScoreUncertainty) -> LagBehindBest:
+    """Compare each site with the best one; the scatter that the two have in common cancels."""
+    sites = np.arange(len(estimate.scores))
+    best = np.repeat(rank_order(estimate.scores)[:1], len(sites))
+    return LagBehindBest(estimate.differences(best, sites).se, estimate.beats(best, sites))
+
+
 def summarise_uncertainty(estimate: ScoreUncertainty, names: Sequence[str] = ("",)) -> dict[str, object]:
     """Return a stage's summary of how errors were computed; ``names`` of the periods, one per record."""
     descriptions = []

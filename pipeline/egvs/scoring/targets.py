@@ -51,7 +51,7 @@ from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.effects.base import Detect
 from egvs.kernels import occlusion, vehicle_visibility
 from egvs.scenario.model import SCENARIO_FILE
-from egvs.scenario.score_config import WeightsConfig
+from egvs.scenario.score_config import DEFAULT_SAMPLED_FRAMES, WeightsConfig
 from egvs.scoring.standard_errors import BlockGroups, block_groups
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scene import Scene
@@ -61,9 +61,6 @@ if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
 
 Floats = FloatArray
-
-REPLAYED_FRAMES = 250
-"""Number of frames that are replayed, evenly spread over the record."""
 
 SEEN_WELL_POINTS = 20.0
 """n0: the gain of a vehicle with this many points is 63 %, with three times as many 95 %."""
@@ -170,7 +167,9 @@ class TargetRecord:
         return np.array([kind in NON_VEHICLE_KINDS for kind in self.kinds], dtype=np.bool_)[self.kind]
 
     @classmethod
-    def read(cls, path: Path, grid: Grid, frames: int = REPLAYED_FRAMES, people: Collection[str] = ()) -> TargetRecord:
+    def read(
+        cls, path: Path, grid: Grid, frames: int = DEFAULT_SAMPLED_FRAMES, people: Collection[str] = ()
+    ) -> TargetRecord:
         """Read ``trajectories.parquet``.
 
         Parameters

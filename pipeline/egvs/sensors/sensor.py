@@ -27,7 +27,7 @@ import difflib
 import hashlib
 import math
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from pathlib import Path
@@ -398,8 +398,21 @@ CATALOGUE: Mapping[str, Sensor] = _Catalogue()
 
 
 def scenario_sensor(name: str, scenario: Scenario, where: str) -> Sensor:
-    """Return the sensor called ``name``, see :func:`resolve_sensor`; beam tables are relative to the scenario."""
+    """Return the sensor called ``name``, see :func:`resolve_sensor`; beam tables are relative to the scenario.
+
+    Messages name the key of ``[sites]`` that sets this sensor, if there is one, in place of ``where``.
+    """
+    where = _sites_key(name, scenario) or where
     return resolve_sensor(name, scenario.sensors, where, lambda file: scenario.find(file, f"sensors.{name}.beams"))
+
+
+def _sites_key(name: str, scenario: Scenario) -> str:
+    """Return file and key of ``[sites]`` that set a sensor; empty if only rows of the sites file do."""
+    for key in ("replace_sensor", "sensor"):
+        if getattr(scenario.sites, key) == name:
+            file = "--set" if f"sites.{key}" in scenario.overrides else scenario.file
+            return f"{file}: sites.{key}"
+    return ""
 
 
 def resolve_sensor(
@@ -427,10 +440,40 @@ def resolve_sensor(
         return _sensor_from_config(name, custom[name], "the scenario", find)
     if name in CATALOGUE:
         return CATALOGUE[name]
+    raise _unknown_sensor(name, custom, where)
+
+
+def check_sensor_names(names: Iterable[str], custom: Iterable[str], where: str) -> None:
+    """Check that names are those of sensors.
+
+    Parameters
+    ----------
+    names
+        The names.
+    custom
+        Names of sensors that are known besides those of the catalogue.
+    where
+        File and key, for messages.
+
+    Raises
+    ------
+    InputError
+        For an unknown name, with the nearest one that exists.
+    """
+    custom = tuple(custom)
+    for name in names:
+        if name not in custom and name not in CATALOGUE:
+            raise _unknown_sensor(name, custom, where)
+
+
+def _unknown_sensor(name: str, custom: Iterable[str], where: str) -> InputError:
+    """Return the error for an unknown sensor, with the nearest name that exists."""
     known = [*custom, *CATALOGUE]
     similar = difflib.get_close_matches(name, known, 1, 0.4)
-    hint = f"Did you mean {similar[0]}?" if similar else f"Known sensors are {', '.join(known)}."
-    raise InputError(where, f"unknown sensor {name!r}", hint)
+    hint = f"Known sensors are {', '.join(known)}."
+    if similar:
+        hint = f"Did you mean {similar[0]}? egvs sensors lists them."
+    return InputError(where, f"unknown sensor {name!r}", hint)
 
 
 def _sensor_from_config(name: str, config: SensorConfig, source: str, find: Callable[[str], Path]) -> Sensor:

@@ -33,6 +33,13 @@ from egvs.stages.scene_inputs import scan_dependencies, sensor_digests, sensor_s
 from egvs.stages.site_scoring import BeamAudit, ScoredSite, SiteScoring, needs_targets
 from egvs.world import clearances, geolocation
 
+MIN_PERIOD_LOSS = 0.01
+"""The best site of a period is clearly better, where errors are unknown, by at least 1 percentage point; by scores that
+are no shares, by at least 1 %."""
+
+_NO_SHARES = ("egvs", "points_on_target")
+"""Scores that are no shares."""
+
 
 def dependencies(context: StageContext) -> StageDependencies:
     """Return what the scores depend on: the [score] table, the TPOG and the scans.
@@ -175,6 +182,7 @@ def _write_scores(
     if egvs.estimate is not None:
         optional["egvs_bias"] = egvs.estimate.bias
         optional["beats_next"] = ranking.beats_next
+        optional["behind_best_se"], optional["best_beats"] = ranking.behind_best
     user_columns = _user_columns(context)
     with parquet.artefact_writer(context.folder.scores, "scores", tuple(optional), extra=user_columns) as file:
         file.write(columns | optional | user_columns)
@@ -229,6 +237,39 @@ def _summary(
     return summary
 
 
+def warn_period_disagreements(scores: ScoreTable, rank_by: str) -> Iterator[Diagnostic]:
+    """Warn about each period in which another site is clearly better than the best of the mix.
+
+    Parameters
+    ----------
+    scores
+        Scores of all sites.
+    rank_by
+        Name of the score that ranks.
+    """
+    best = scores.column(rank_by).best
+    is_share = rank_by not in _NO_SHARES
+    for period, column in scores.by_period(rank_by).items():
+        if not best or not column.best or best & column.best or not column.values.max() > 0:
+            continue
+        mix_best, period_best = min(best), min(column.best)
+        loss = (column.values.max() - column.values[mix_best]) / (1.0 if is_share else column.values.max())
+        is_clear = loss >= MIN_PERIOD_LOSS
+        if column.estimate is not None:
+            (chance,) = column.estimate.beats(np.array([period_best]), np.array([mix_best]))
+            is_clear = chance >= readers.DISTINCT_PROBABILITY
+        if not is_clear:
+            continue
+
+        less = f"{100 * loss:.1f} percentage points" if is_share else f"{loss:.1%}"
+        problem = (
+            f"the best site is {scores.sites[period_best]}; {scores.sites[mix_best]}, the best of the mix, "
+            f"has rank {column.rank[mix_best]} and scores {less} less"
+        )
+        hint = "Decide which period matters most; the best site of the mix need not be the best in any period."
+        yield Diagnostic("periods disagree", f"{SCENARIO_FILE}: traffic.periods ({period})", problem, hint)
+
+
 def _warnings(context: StageContext, scoring: SiteScoring, scores: ScoreTable) -> Iterator[Diagnostic]:
     """Warnings about the scores, those about the ranking first."""
     scenario = context.scenario
@@ -238,7 +279,7 @@ def _warnings(context: StageContext, scoring: SiteScoring, scores: ScoreTable) -
     yield from score_table.warn_all_zero(ranking, scenario.gamma, scores.limits[score_table.MIX])
     if ranking.estimate is not None:
         yield from _warn_short_traffic(scenario, ranking.estimate, scores.periods or (score_table.MIX,))
-    yield from score_table.warn_period_disagreements(scores, rank_by)
+    yield from warn_period_disagreements(scores, rank_by)
     if scoring.targets is not None:
         yield from scoring.targets.warn_undefined_scores(scoring.tpog, scoring.periods)
     for column in (ranking, *others):

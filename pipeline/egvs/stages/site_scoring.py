@@ -113,7 +113,8 @@ class TargetScorer:
     def __init__(self, context: StageContext, grid: Grid) -> None:
         config = context.scenario.score
         trajectories = context.folder.trajectories
-        self.record = TargetRecord.read(trajectories, grid, people=weighted_people(config.weights))
+        people = weighted_people(config.weights)
+        self.record = TargetRecord.read(trajectories, grid, config.sampled_frames, people)
         self._scene = context.scene
         self._names: tuple[str, ...] = tuple(name for name in config.additional if name in TARGET_SCORES)
         self._config = config.weights

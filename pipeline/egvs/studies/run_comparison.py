@@ -32,9 +32,11 @@ from egvs.core.progress import ProgressCallback, no_progress
 from egvs.report.formatting import join_names
 from egvs.report.ranking import Pole, RankedSite, Ranking
 from egvs.report.sensor_results import ScoreDifference, SensorComparison, SensorMount, best_mounts
+from egvs.runs.run_sources import PLAN_REQUEST
 from egvs.scenario.costs import costs_from_dict
 from egvs.scenario.score_config import CostsConfig
 from egvs.scenario.settings import flatten_settings
+from egvs.sensors.sensor import check_sensor_names
 from egvs.studies.paired_errors import ScoreDifferences, SiteOfRun
 from egvs.studies.score_errors import best_sites, rank_agreement, regret
 
@@ -46,6 +48,8 @@ View = Literal["pole", "site"]
 _IGNORED_SETTINGS = ("name", "description", "extends")
 _EGVS_KEYS = ("roi.center_m", "roi.size_m", "roi.voxel_m", "score.gamma")
 """Settings that must be equal to compare EGVS in bits."""
+
+_RANGE_LIMIT = "effects.range_limit"
 
 _NAMED = 4
 """Number of names in a note."""
@@ -89,6 +93,12 @@ class ComparedRun:
             f"ComparedRun({self.label}: {self.folder}, {len(self.sites)} sites on {len(self.poles)} poles, "
             f"{', '.join(self.sensors)}; best {best.site}, {best.by.with_noun(best.score)})"
         )
+
+    @property
+    def has_range_limit(self) -> bool:
+        """Whether the effect ``range_limit`` was enabled."""
+        keys = [key for key, value in self.settings.items() if value is not None]
+        return any(key == _RANGE_LIMIT or key.startswith(f"{_RANGE_LIMIT}.") for key in keys)
 
     @cached_property
     def sites(self) -> Mapping[str, RankedSite]:
@@ -236,12 +246,13 @@ def compare_runs(
     Raises
     ------
     InputError
-        If there is a single run with one sensor, a folder contains no finished run, its scores were changed, or the
-        first run has no pole in common with any other.
+        If there is a single run with one sensor, a folder contains no finished run, its scores were changed, a cost is
+        that of an unknown sensor, or the first run has no pole in common with any other.
     """
     runs = tuple(_read_run(Path(folder), run_label(number), costs) for number, folder in enumerate(folders))
     if not runs:
         raise InputError("compare", "expected at least one run, got none", "Give folders of finished runs.")
+    _check_priced_sensors(runs, costs)
     is_single = len(runs) == 1
     if is_single:
         runs = _split_by_sensor(runs[0], by)
@@ -275,6 +286,27 @@ def compare_runs(
     )
 
 
+def check_distinct(folders: Sequence[Path]) -> None:
+    """Check that no run folder is given twice, nor by a link.
+
+    Parameters
+    ----------
+    folders
+        Run folders.
+
+    Raises
+    ------
+    InputError
+        When two of them are the same folder.
+    """
+    given: dict[Path, Path] = {}
+    for folder in folders:
+        other = given.setdefault(folder.resolve(), folder)
+        if other is not folder:
+            names = str(folder) if other == folder else f"{other} and {folder}"
+            raise InputError("compare", f"the same run twice, {names}", "Give each run folder once.")
+
+
 def run_label(number: int) -> str:
     """Return A, B, ... Z, AA, AB, ... for the numbers from 0, as the columns of a spreadsheet."""
     prefix, last = divmod(number, 26)
@@ -294,6 +326,7 @@ def _read_run(folder: Path, label: str, cost_overrides: Sequence[str]) -> Compar
     metadata = parquet.read_metadata(path, "scores")
 
     compared = {key: value for key, value in record.scenario.items() if key not in _IGNORED_SETTINGS}
+    compared["placement"] = _without_request(compared.get("placement", {}))
     settings = {**flatten_settings(compared), "egvs (version)": record.egvs}
     if settings.get("score.gamma") == "auto":
         settings["score.gamma"] = metadata["gamma"]
@@ -307,6 +340,18 @@ def _read_run(folder: Path, label: str, cost_overrides: Sequence[str]) -> Compar
             input_files |= {file: digest for file, digest in stage.files.items() if file not in artefacts}
     costs = costs_from_dict(record.scenario, cost_overrides, str(RunFolder(folder).run_record))
     return ComparedRun(label, folder, Ranking.read(path), settings, input_files, costs)
+
+
+def _without_request(placement: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a plan without those that ``egvs place`` replaces by its options."""
+    return {key: value for key, value in placement.items() if f"placement.{key}" not in PLAN_REQUEST}
+
+
+def _check_priced_sensors(runs: Sequence[ComparedRun], cost_overrides: Sequence[str]) -> None:
+    """InputError if an override is the cost of an unknown sensor."""
+    compared = dict.fromkeys(sensor for run in runs for sensor in run.sensors)
+    priced = costs_from_dict({}, cost_overrides, "--set").sensor
+    check_sensor_names(priced, compared, "--set: costs.sensor")
 
 
 def _split_by_sensor(run: ComparedRun, by: View | None) -> tuple[ComparedRun, ...]:

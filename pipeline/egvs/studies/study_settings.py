@@ -193,7 +193,8 @@ def is_default(scenario: Scenario, base: Scenario) -> bool:
     defaults = {key: TrafficConfig.model_fields[key].default for key in ("frame_period_s", "step_s")}
     defaults["frames"] = DEFAULT_FRAMES
     traffic = base.traffic.model_copy(update=defaults)
-    return not base.is_recorded and scenario == base.model_copy(update={"traffic": traffic})
+    default = base.model_copy(update={"traffic": traffic})
+    return not base.is_recorded and scenario.model_dump() == default.model_dump()
 
 
 def list_settings(scenario: Scenario, values: SettingValues = DEFAULT_VALUES) -> list[Setting]:

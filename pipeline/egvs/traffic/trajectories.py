@@ -35,6 +35,9 @@ LONG_STOP_S = 120.0
 MAX_OVERLAP_SHARE = 0.05
 """SUMO's sublane model has overlaps in 0 to 5 % of the frames (measured)."""
 
+MIN_OVERLAPS_PER_THOUSAND = 1.0
+"""Overlaps with blockers per 1,000 vehicles and frames in the region: fewer are no warning."""
+
 GROUP_FRAMES = 500
 """Frames of a row group; constant, so that the file does not depend on how the rows arrive."""
 
@@ -481,8 +484,8 @@ def traffic_warnings(
                     f"; {number} of {total:,} vehicles ({percent}) stood for more than {LONG_STOP_S:g} s somewhere"
                 )
             warnings.append(Diagnostic("standing", demand.where, problem, demand.hint))
-    if statistics.overlaps_in_region:
-        per_thousand = 1000 * statistics.overlaps_in_region / statistics.rows_in_region
+    per_thousand = 1000 * statistics.overlaps_in_region / max(statistics.rows_in_region, 1)
+    if per_thousand >= MIN_OVERLAPS_PER_THOUSAND:
         problem = (
             f"vehicles overlap {statistics.overlaps_in_region} times in the region of interest ({per_thousand:.1f} per"
             " 1,000 vehicles and frames) with one that blocked them on a junction"

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.grid import FloatArray, IntArray
-from egvs.traffic.network import LANE_WIDTH_M, Edge, Lane, Network, Permission, Shape
+from egvs.traffic.network import LANE_WIDTH_M, Lane, Network, Permission, Shape
 from egvs.world import clearances
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class Carriageway:
     Attributes
     ----------
     names
-        Each lane as a user knows it, by its street or junction, e.g. ``"a lane of Main Street"``.
+        SUMO's id of each lane.
     lanes
         Their centre lines and widths.
     junctions, corners
@@ -58,9 +58,7 @@ class Carriageway:
     @classmethod
     def of(cls, network: Network) -> Carriageway:
         """Return the carriageway of a network; lanes without length are left out."""
-        names: list[str] = []
-        lanes: list[Lane] = []
-        streets = _streets_of_junctions(network)
+        lanes: dict[str, Lane] = {}
         corners: list[Shape] = []
         for edge in network.all_edges:
             if edge.function == "walkingarea":
@@ -69,10 +67,9 @@ class Carriageway:
                 continue
             for index, lane in enumerate(edge.lanes):
                 if is_carriageway(lane.permission) and len(lane.shape_m) > 1:
-                    lanes.append(lane)
-                    names.append(_describe_lane(edge, index, streets))
+                    lanes[f"{edge.id}_{index}"] = lane
         junctions = [shape for shape in network.junctions if shape.type != "internal" and len(shape.shape_m) > 2]
-        return cls(tuple(names), tuple(lanes), tuple(junctions), tuple(corners))
+        return cls(tuple(lanes), tuple(lanes.values()), tuple(junctions), tuple(corners))
 
     @cached_property
     def areas(self) -> NDArray[Any]:
@@ -177,22 +174,3 @@ def _outlines(shapes: Sequence[Shape]) -> NDArray[Any]:
 def is_carriageway(permission: Permission) -> bool:
     """Return whether a lane is for road vehicles."""
     return any(permission.admits(vclass) for vclass in ROAD_VCLASSES)
-
-
-def _streets_of_junctions(network: Network) -> dict[str, list[str]]:
-    """Names of the streets at each junction, in the order of the edges."""
-    streets: dict[str, list[str]] = {}
-    for edge in network.all_edges:
-        for node in (edge.from_node, edge.to_node):
-            names = streets.setdefault(node, [])
-            if edge.name and edge.name not in names:
-                names.append(edge.name)
-    return streets
-
-
-def _describe_lane(edge: Edge, index: int, streets: dict[str, list[str]]) -> str:
-    if edge.function == "internal":
-        node = edge.id[1:].rpartition("_")[0]
-        names = streets.get(node)
-        return f"the junction of {' and '.join(names)}" if names else f"junction {node}"
-    return f"a lane of {edge.name}" if edge.name else f"lane {edge.id}_{index}"

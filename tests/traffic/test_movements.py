@@ -1,0 +1,41 @@
+"""Movements of a network in words: a made-up junction by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from egvs.traffic.movements import MovementNames
+from tests.scoring.roads import NETWORK, read
+
+
+@pytest.mark.parametrize(
+    ("from_edge", "to_edge", "expected"),
+    [
+        ("near", "out", "eastbound on High Street, straight on"),
+        ("near", "up", "eastbound on High Street, left to an unnamed street"),
+        ("far", "up", "eastbound on High Street, left to an unnamed street"),
+        ("back", "up", "westbound on High Street, right to an unnamed street"),
+        ("near", "back", "eastbound on High Street, U-turn to High Street"),
+        ("up", "back", "northbound on an unnamed street, left to High Street"),
+        ("back", None, "westbound on High Street"),
+    ],
+)
+def test_describes_movement(tmp_path: Path, from_edge: str, to_edge: str | None, expected: str) -> None:
+    assert MovementNames(read(tmp_path)).describe(from_edge, to_edge) == expected
+
+
+def test_turn_of_a_connection_goes_before_the_directions(tmp_path: Path) -> None:
+    text = NETWORK.replace(
+        'from="near" to="up" fromLane="2" toLane="0" via=":j_1_0" dir="l"',
+        'from="near" to="up" fromLane="2" toLane="0" via=":j_1_0" dir="s"',
+    )
+    assert text != NETWORK
+    words = MovementNames(read(tmp_path, text)).describe("near", "up")
+    assert words == "eastbound on High Street, straight on to an unnamed street"
+
+
+def test_street_name_is_one_line_without_double_escapes(tmp_path: Path) -> None:
+    text = NETWORK.replace('name="High Street"', 'name="A &amp;amp; B&#10;C&#x7f;"')
+    assert MovementNames(read(tmp_path, text)).describe("back", None) == "westbound on A & B C"
