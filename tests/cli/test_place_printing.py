@@ -103,6 +103,12 @@ def test_costs_are_printed_only_where_they_are_set(capsys: pytest.CaptureFixture
     assert "The plan a, b for 6000 should find" in text
 
 
+def test_ends_with_what_was_assumed(capsys: pytest.CaptureFixture[str]) -> None:
+    caveat = "Before you trust this plan: assumed, not measured: positions of the poles."
+    place.print_placement(placed_two(), PlacementConfig(count=2), caveat=caveat)
+    assert capsys.readouterr().out.splitlines()[-1] == caveat
+
+
 def test_replaced_plan_is_named_by_its_options() -> None:
     two = {"count": 2, "budget": None, "reach": None, "survives": 0}
     assert place.describe_replaced(two, {**two, "count": 3}) == "replaces the plan for --count 2"

@@ -51,6 +51,20 @@ def test_shows_counted_and_simulated_vehicles(tmp_path):
     assert "c|truck|60|20|6.3|!|" in [row.replace("||", "|") for row in read.rows]
 
 
+def test_flows_that_are_assumed_are_not_called_counted(tmp_path):
+    scenario, out = run_to_scores(tmp_path)
+    record = make_record()
+    record["stages"]["traffic"]["summary"]["counts"] = [
+        {"place": "a to b", "kind": "", "counted_per_h": 320.0, "simulated_per_h": 311.5, "geh": 0.48},
+    ]
+    (out / "run.json").write_text(json.dumps(add_checksum(record)), encoding="utf-8")
+    assumed = scenario.model_copy(update={"assumed": ("traffic (from the road classes)",)})
+    page = render_report(assumed, out)
+    assert "Assumed and simulated traffic" in page and "Counted" not in page
+    other = scenario.model_copy(update={"assumed": ("positions of traffic lights",)})
+    assert "Counted and simulated traffic" in render_report(other, out)
+
+
 def test_counts_are_described_as_movements_of_the_network(tmp_path):
     (tmp_path / "scenario").mkdir()
     (tmp_path / "scenario" / "made.net.xml").write_text(NETWORK)

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from egvs.core.errors import Diagnostic
 from egvs.report import ranking as report_ranking
 from egvs.report.formatting import SCORE_LABELS
 from egvs.report.ranking import RankedSite, Ranking, ScoreValue
+from egvs.report.sections import describe_poles_on_road
 from egvs.scenario.loading import load
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
@@ -154,3 +156,17 @@ def test_note_on_the_site_that_sees_most_entropy() -> None:
     assert (
         report_ranking.entropy_seen_note(agree) == "It also sees the largest share of the traffic’s uncertainty, 70.0%."
     )
+
+
+def test_poles_in_lanes_are_named_once_with_their_street() -> None:
+    ranked = by_vehicles(*((name, 50.0, 0.9) for name in ("a", "b", "c", "d")))
+    warnings = [
+        Diagnostic("sites on lanes", "sites.csv: site a and 2 more", "(0, 0, 3) is in a lane of An der Warth", ""),
+        Diagnostic("sites on lanes", "sites.csv: site d", "(0, 9, 3) is within a junction", ""),
+        Diagnostic("sites on lanes", "sites.csv", "2 more of 9 are in lanes or junctions: c, z", ""),
+        Diagnostic("sites in solids", "sites.csv: site b", "(0, 9, 3) is in a house", ""),
+    ]
+    assert describe_poles_on_road(ranked.poles[:3], warnings) == [
+        "a stands in a lane of An der Warth",
+        "c stands in a lane or junction",
+    ]

@@ -8,7 +8,7 @@ import xml.etree.ElementTree as ET
 import pytest
 
 from egvs.report import svg_figures
-from egvs.report.svg_figures import Bar, FigureStyle, MapSite
+from egvs.report.svg_figures import Bar, CurveStep, FigureStyle, MapSite, sensor_count_chart
 from tests.report.small_runs import SITES, PageReader, render_report, run_to_scores
 
 
@@ -87,3 +87,25 @@ def test_title_of_a_wide_colour_bar_is_one_line() -> None:
     bar = svg_figures.ColourBar(0.0, 2.5, "Entropy (bit)")
     assert bar.title_lines(700.0) == ["Entropy (bit) · square-root scale"]
     assert svg_figures.ColourBar(0.0, 1.0, "Share", even=True).title_lines(700.0) == ["Share"]
+
+
+def bar_lengths(figure: str) -> list[float]:
+    return [float(length) for length in re.findall(r'<rect [^>]*height="([0-9.]+)"', figure)]
+
+
+def test_axis_of_long_bars_starts_above_zero_and_says_so() -> None:
+    figure = sensor_count_chart([CurveStep(1, 0.96, 0.96), CurveStep(2, 0.998, 1.0)], "alt")
+    shorter, longer = bar_lengths(figure)
+    assert shorter < 0.5 * longer
+    assert "the axis starts at 94%, not at 0" in figure
+
+
+def test_axis_of_equal_full_bars_starts_at_most_at_95_per_cent() -> None:
+    figure = sensor_count_chart([CurveStep(1, 1.0, 1.0)], "alt")
+    assert "the axis starts at 95%, not at 0" in figure and bar_lengths(figure)[0] > 100
+
+
+def test_axis_of_short_bars_starts_at_zero() -> None:
+    figure = sensor_count_chart([CurveStep(1, 0.4, 0.5), CurveStep(2, 0.8, 0.9)], "alt")
+    shorter, longer = bar_lengths(figure)
+    assert abs(longer - 2 * shorter) < 0.2 and "starts at" not in figure

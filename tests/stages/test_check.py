@@ -69,6 +69,19 @@ def test_site_is_in_lane_from_a_quarter_metre_inside(street: Path) -> None:
     }
 
 
+def test_lane_is_named_by_its_street_or_junction(street: Path) -> None:
+    named = LANES.replace('id="west"', 'id="west" name="High Street"')
+    assert named != LANES
+    lane = '<lane id=":j_0_0" index="0" length="9" speed="9" shape="90,0 99,0"/>'
+    inside = f'<edge id=":j_0" function="internal">{lane}</edge>'
+    (street / "net.net.xml").write_text(net_xml(named + inside))
+    sites(street, "a,10,1.6,3", "b,95,0,3")
+    assert [line.partition(" is in ")[2] for line in found(street)["sites on lanes"]] == [
+        "a lane of High Street]",
+        "junction j]",
+    ]
+
+
 def test_sensor_on_gantry_is_not_in_lane(street: Path) -> None:
     sites(street, "low,10,1.6,4.5", "high,10,1.6,4.51")
     assert [line for lines in found(street).values() for line in lines] == [

@@ -18,9 +18,10 @@ from egvs.artefacts import parquet
 from egvs.artefacts.readers import PeriodRanking
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import RunRecord
+from egvs.cli import stage_summary
 from egvs.cli.console import Column, console, make_table, print_sentences
 from egvs.cli.options import DEFAULT_POLES
-from egvs.core.errors import collect_warnings
+from egvs.core.errors import Diagnostic, collect_warnings
 from egvs.report import ranking, sections
 from egvs.report.formatting import ScoreLabel, join_names
 from egvs.report.ranking import Pole, RankedSite, Ranking
@@ -54,12 +55,27 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
     else:
         for warning in collect_warnings([summary]):
             out.print(str(warning))
-    if assumptions := sections.assumptions(scenario):
-        out.print(f"Before you trust this ranking: assumed, not measured: {'; '.join(assumptions)}.")
+    if on_road := sections.describe_poles_on_road(ranked.poles[: sections.NAMED_POLES], _check_warnings(record)):
+        out.print(f"Before you trust this ranking: {join_names(on_road)}.")
+    if assumed := sections.describe_assumptions(scenario, "ranking"):
+        out.print(assumed)
     sensors = [site.sensor for site in ranked.sites]
     if note := range_note(sensors, is_modelled=scenario.effects.range_limit is not None):
         out.print(note)
     out.print(f"report: {run_folder.report}")
+
+
+def _check_warnings(record: RunRecord) -> list[Diagnostic]:
+    if "check" not in record.stages:
+        return []
+    return collect_warnings([record.stages["check"].summary])
+
+
+def flow_source(scenario: Scenario) -> str:
+    """Return what the simulated flows of a scenario are compared with, in words."""
+    if sections.assumes_flows(scenario):
+        return stage_summary.ASSUMED_FLOWS
+    return stage_summary.COUNTS
 
 
 def _print_ranking(

@@ -100,6 +100,7 @@ def run(
         from egvs.runs import digest_cache, run
 
         loaded, folder = _load(scenario, set_, out)
+        screen.flow_source = answer.flow_source(loaded)
         if rehash:
             digest_cache.forget_digests(folder)
         record = run.run(
@@ -235,10 +236,11 @@ def _run_stage(
     from egvs.cli.console import ProgressDisplay
 
     with ProgressDisplay(stage, with_details=True) as screen:
-        from egvs.cli import run_tables
+        from egvs.cli import answer, run_tables
         from egvs.runs import run
 
         loaded, folder = open_source(scenario, set_, out)
+        screen.flow_source = answer.flow_source(loaded)
         record = run.run_one(
             stage, loaded, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, **stage_options
         )

@@ -192,11 +192,14 @@ class ProgressDisplay:
         Whether at least one stage was run or restored from the cache.
     hidden_warnings
         Number of warnings that were not printed.
+    flow_source
+        What the simulated flows are compared with; set by commands that know the scenario.
     """
 
     def __init__(self, verb: str = "", *, with_details: bool = False) -> None:
         self.any_stage_ran = False
         self.hidden_warnings = 0
+        self.flow_source = stage_summary.COUNTS
         self._with_details = with_details
         self._warnings = 0
         self._stage = verb
@@ -239,7 +242,10 @@ class ProgressDisplay:
         if record is None:
             return
 
-        for line in stage_summary.stage_lines(stage, state, record, with_details=self._with_details):
+        lines = stage_summary.stage_lines(
+            stage, state, record, with_details=self._with_details, flow_source=self.flow_source
+        )
+        for line in lines:
             self.say(line)
         for warning in collect_warnings([record.summary]):
             self._warnings += 1

@@ -61,8 +61,11 @@ def place(
             request.append(f"placement.{key}={value!r}")
     loaded, folder = sources.open_source(scenario, set_, out, request)
     with ProgressDisplay("place") as screen:
+        from egvs.cli import answer
         from egvs.placement import plan
+        from egvs.report import sections
 
+        screen.flow_source = answer.flow_source(loaded)
         replaced = plan.planned_request(folder)
         placed = plan.place(
             loaded, folder, exact=exact, time_limit_s=limit_s, refine=refine, jobs=jobs, progress=screen.progress,
@@ -73,7 +76,7 @@ def place(
         notes.append(describe_replaced(replaced, request_now or {}))
     if exact and not (placed.solution.is_best or placed.solution.fewest_is_proved):
         notes.append(f"--exact reached its --time-limit of {time_limit} before any plan was proved optimal.")
-    print_placement(placed, loaded.placement, notes)
+    print_placement(placed, loaded.placement, notes, sections.describe_assumptions(loaded, "plan"))
 
 
 def _check_request(count: int | None, budget: float | None, reach: float | None) -> None:
@@ -89,7 +92,7 @@ def _check_request(count: int | None, budget: float | None, reach: float | None)
         raise InputError("--reach", f"expected a share above 0, at most 1, got {reach:g}", hint)
 
 
-def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequence[str] = ()) -> None:
+def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequence[str] = (), caveat: str = "") -> None:
     """Print the plan and the curve, the files, and what a planner should know, the answer to "how many?" last.
 
     Parameters
@@ -100,6 +103,8 @@ def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequen
         The ``[placement]`` that it solves.
     notes
         Sentences about the search.
+    caveat
+        A last sentence, on what was assumed; may be empty.
     """
     from egvs.cli.console import WIDE, console
 
@@ -118,6 +123,8 @@ def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequen
         out.print(str(path))
     for sentence in (describe_plan(placed), *notes, *_further_sentences(placed, requested)):
         out.print(sentence)
+    if caveat:
+        out.print(caveat)
 
 
 def _further_sentences(placed: Placement, requested: PlacementConfig) -> Iterator[str]:

@@ -8,11 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from egvs.artefacts.run_record import StageRecord
 from egvs.core.errors import WARNINGS_KEY
 from egvs.report.formatting import SCORE_LABELS
+
+COUNTS, ASSUMED_FLOWS = "the counts", "the assumed flows"
 
 _OMITTED_KEYS = frozenset(
     (
@@ -44,8 +47,20 @@ class Sentence:
     is_detail: bool = False
 
 
-def stage_lines(stage: str, state: str, record: StageRecord, *, with_details: bool) -> Iterator[str]:
-    """Yield the line of a stage; with details, also one line for each period of its traffic."""
+def stage_lines(
+    stage: str, state: str, record: StageRecord, *, with_details: bool, flow_source: str = COUNTS
+) -> Iterator[str]:
+    """Yield the line of a stage; with details, also one line for each period of its traffic.
+
+    Parameters
+    ----------
+    stage, state, record
+        Name of the stage, how it ended, and its record.
+    with_details
+        Whether all that the stage reports is printed.
+    flow_source
+        What the simulated flows are compared with: :data:`COUNTS` or :data:`ASSUMED_FLOWS`.
+    """
     duration = f"{record.cost.seconds:.1f} s"
     if state == "skipped":
         duration = "unchanged"
@@ -56,24 +71,28 @@ def stage_lines(stage: str, state: str, record: StageRecord, *, with_details: bo
     periods = {}
     if stage == "traffic":
         periods = summary.pop("periods", {})
-    text = describe_summary(stage, summary, with_details=with_details)
+    describe = partial(describe_summary, stage, with_details=with_details, flow_source=flow_source)
+    text = describe(summary)
     if periods and not with_details:
         text = f"{_count(len(periods), 'period')}, {text}"
     yield f"{_STAGE_NAMES.get(stage, stage):<10} {duration:>10}   {text}"
     if not with_details:
         return
     for name, period in periods.items():
-        yield f"{name:>21}   {describe_summary(stage, period, with_details=True)}"
+        yield f"{name:>21}   {describe(period)}"
 
 
-def describe_summary(stage: str, summary: dict[str, Any], *, with_details: bool) -> str:
-    """Return the summary of a stage in one line."""
+def describe_summary(stage: str, summary: dict[str, Any], *, with_details: bool, flow_source: str = COUNTS) -> str:
+    """Return the summary of a stage in one line; see :func:`stage_lines`."""
     from egvs.cli.console import format_values
 
     rest = {key: value for key, value in summary.items() if key not in _OMITTED_KEYS}
     sentences: list[Sentence] = []
     if stage in _SENTENCES and _REQUIRED_KEYS[stage] <= summary.keys():
-        sentences += _SENTENCES[stage](rest, summary)
+        describe = _SENTENCES[stage]
+        if stage == "traffic":
+            describe = partial(_traffic_sentences, flow_source=flow_source)
+        sentences += describe(rest, summary)
     if rest_text := format_values(rest):
         sentences.append(Sentence(rest_text, is_detail=True))
     return "; ".join(sentence.text for sentence in sentences if with_details or not sentence.is_detail)
@@ -106,7 +125,7 @@ def _scan_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[S
         yield _detail(f"{rest.pop('returns'):,} returns from {rest.pop('beams'):,} beams towards the region")
 
 
-def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[Sentence]:
+def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any], flow_source: str = COUNTS) -> Iterator[Sentence]:
     yield Sentence(_count(rest.pop("frames"), "frame"))
     if "vehicles" in rest:
         yield Sentence(describe_vehicles(rest.pop("vehicles")))
@@ -122,7 +141,7 @@ def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterato
         yield Sentence(f"{_count(teleports, 'vehicle')} moved on")
     if counts := rest.pop("counts", None):
         worst = max(count["geh"] for count in counts)
-        yield Sentence(f"largest GEH against the counts {worst:.1f}")
+        yield Sentence(f"largest GEH against {flow_source} {worst:.1f}")
     if sizes := rest.pop("sizes", None):
         yield Sentence(describe_sizes(sizes))
     if sumo := rest.pop("sumo", None):

@@ -28,7 +28,17 @@ from egvs.report import colours
 from egvs.report.basemap import Outlines, Roads, StreetName
 from egvs.report.colours import ColumnValues, IndexedImage
 from egvs.report.formatting import shorten_name
-from egvs.report.svg_figures import PAGE_STYLE, Box, ColourBar, FigureStyle, MapFrame, MapSite, extent, text_width
+from egvs.report.svg_figures import (
+    PAGE_STYLE,
+    Box,
+    ColourBar,
+    FigureStyle,
+    MapFrame,
+    MapSite,
+    Rectangle,
+    extent,
+    text_width,
+)
 
 StackedSites = list[MapSite]
 """Sites at the same x, y, the best first."""
@@ -135,7 +145,7 @@ def site_map(
         labelled = [*stacks[:10], stacks[-1]]
     parts = [*base_layers(plan, grid, values, backdrop), *street_names]
     parts += [_site_rings(plan, stack, low, high, radius, crowded) for stack in reversed(stacks)]
-    parts += _stack_labels(plan, stacks, labelled, radius, street_boxes)
+    parts += _stack_labels(plan, stacks, labelled, radius, [*street_boxes, *_outline_boxes(plan.region(grid))])
     bar = None
     if high > low:
         by = sites[0].by
@@ -419,6 +429,14 @@ def _stack_labels(
     return _label_spots(plan, [_stack_spot(plan, stack, radius) for stack in labelled], [*circles, *covered])
 
 
+def _outline_boxes(rectangle: Rectangle) -> list[Box]:
+    """Narrow boxes along the sides of a rectangle, so that labels are placed beside its outline."""
+    x, y, width, height = rectangle
+    sides = [(x, y, x + width, y), (x, y + height, x + width, y + height)]
+    sides += [(x, y, x, y + height), (x + width, y, x + width, y + height)]
+    return [(x0 - 2.0, y0 - 2.0, x1 + 2.0, y1 + 2.0) for x0, y0, x1, y1 in sides]
+
+
 def _stack_spot(plan: MapFrame, stack: StackedSites, radius: float) -> LabelSpot:
     names = [shorten_name(site.site) for site in stack]
     text = ", ".join(names)
@@ -431,10 +449,10 @@ def _stack_spot(plan: MapFrame, stack: StackedSites, radius: float) -> LabelSpot
     return LabelSpot(plan.x(stack[0].x_m), plan.y(stack[0].y_m), text, outer_radius)
 
 
-def labels(plan: MapFrame, spots: Sequence[tuple[float, float, str, float]]) -> list[str]:
-    """Return labels beside spots (x, y, text, radius; in the figure's units), placed so that they hide little."""
+def labels(plan: MapFrame, spots: Sequence[tuple[float, float, str, float]], covered: Sequence[Box] = ()) -> list[str]:
+    """Return labels beside spots (x, y, text, radius; in the figure's units), clear of each other and ``covered``."""
     circles = [_square(x, y, radius + 1.0) for x, y, _, radius in spots]
-    return _label_spots(plan, [LabelSpot(*spot) for spot in spots], circles)
+    return _label_spots(plan, [LabelSpot(*spot) for spot in spots], [*circles, *covered])
 
 
 def _label_spots(plan: MapFrame, spots: Sequence[LabelSpot], circles: Sequence[Box]) -> list[str]:
@@ -536,4 +554,4 @@ def plan_map(
         number = f'<text x="{x:.1f}" y="{y + 4:.1f}">{escape(pole.numbers)}</text>'
         parts.append(f'<g class="planned"><title>{escape(pole.title)}</title>{shape}{number}</g>')
         spots.append(LabelSpot(x, y, pole.label, half))
-    return plan.svg([*parts, *labels(plan, spots)], alt)
+    return plan.svg([*parts, *labels(plan, spots, _outline_boxes(plan.region(grid)))], alt)

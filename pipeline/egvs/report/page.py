@@ -36,11 +36,14 @@ from egvs.report.ranking import (
     share_of_limit,
 )
 from egvs.report.sections import (
+    NAMED_POLES,
     PlacementSummary,
     StudySummary,
     ValidationSummary,
+    assumes_flows,
     assumptions,
     describe_counts,
+    describe_poles_on_road,
     egvs_setting,
     ranking_disagreement,
 )
@@ -232,6 +235,7 @@ def render_page(contents: PageContents) -> str:
         **_sensor_values(contents),
         **_cost_values(contents.stages),
         **_sentences(contents),
+        **_warning_values(contents),
     }
     return _template_environment().get_template("report.html.j2").render(values)
 
@@ -291,6 +295,7 @@ def _setting_values(contents: PageContents) -> dict[str, Any]:
     return {
         "weights": scenario.score.weights.in_words,
         "assumed": assumptions(scenario),
+        "assumes_flows": assumes_flows(scenario),
         "gamma": "∞" if math.isinf(gamma) else f"{gamma:g}",
         "uncapped": math.isinf(gamma),
         "gamma_auto": scenario.score.gamma == "auto",
@@ -321,7 +326,14 @@ def _cost_values(stages: Mapping[str, StageRecord]) -> dict[str, Any]:
         "total_s": math.fsum(seconds),
         "longest_s": max(seconds, default=0.0),
         "artefacts": [artefact for stage in stages.values() for artefact in stage.artefacts.items()],
-        "warnings": collect_warnings(stage.summary for stage in stages.values()),
+    }
+
+
+def _warning_values(contents: PageContents) -> dict[str, Any]:
+    warnings = collect_warnings(stage.summary for stage in contents.stages.values())
+    return {
+        "warnings": warnings,
+        "poles_on_road": describe_poles_on_road(contents.ranking.poles[:NAMED_POLES], warnings),
     }
 
 

@@ -11,7 +11,8 @@ from __future__ import annotations
 import base64
 import json
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from egvs.core.errors import Diagnostic, collect_warnings
 from egvs.report import maps, plan_answer, svg_figures
 from egvs.report.formatting import SCORE_LABELS, ScoreLabel, join_names
 from egvs.report.maps import Backdrop, PlannedPole
-from egvs.report.ranking import RankedSite
+from egvs.report.ranking import Pole, RankedSite
 from egvs.report.ranking_check import RankingCheck
 from egvs.report.svg_figures import CurveStep, MapSite
 from egvs.scenario.model import Scenario
@@ -47,6 +48,18 @@ RHO_RANGE = (
     "0.83 to 0.97, depending on junction and detector; among sites of equal height in dense queues, about 0.2 to 0.96"
 )
 """Rank correlation of the recommended score with detection, over junctions and detectors (docs/validity.md, F)."""
+
+NAMED_POLES = 5
+"""Poles at the head of the ranking whose location in a lane is stated with the result."""
+
+_FURTHER_SITES = re.compile(r" and \d+ more$")
+"""End of the location of a warning that is the same for several sites."""
+
+_SITES_ON_LANES = "sites on lanes"
+"""Rule of the warnings of a check about sites in lanes or junctions."""
+
+_TRAFFIC = re.compile(r"\btraffic\b(?! (?:light|sign))", re.IGNORECASE)
+"""Found in entries of the key ``assumed`` on traffic; traffic lights and signs are not traffic."""
 
 _ALL_OBJECTS = "vehicles"
 """Name of the set of all objects in ``detection.parquet``."""
@@ -196,6 +209,48 @@ def assumptions(scenario: Scenario) -> tuple[str, ...]:
     if has_demand or any(period.counts or period.routes for period in traffic.periods):
         return scenario.assumed
     return (*scenario.assumed, "traffic (random trips)")
+
+
+def describe_poles_on_road(poles: Iterable[Pole], warnings: Iterable[Diagnostic]) -> list[str]:
+    """Return a phrase for each pole in a lane or junction, e.g. ``"k02 stands in a lane of Main Street"``.
+
+    Parameters
+    ----------
+    poles
+        The poles.
+    warnings
+        Warnings of a run; those of the rule :data:`_SITES_ON_LANES` name sites.
+    """
+    where_of_site = {}
+    for warning in warnings:
+        if warning.rule != _SITES_ON_LANES:
+            continue
+        _, _, site = warning.where.partition(": site ")
+        if site:
+            where_of_site[_FURTHER_SITES.sub("", site)] = warning.problem.partition(" is ")[2]
+        else:  # a list of all further sites
+            for name in warning.problem.partition(": ")[2].split(", "):
+                where_of_site[name] = "in a lane or junction"
+
+    phrases = []
+    for pole in poles:
+        where = next((where_of_site[site.site] for site in pole.sites if site.site in where_of_site), None)
+        if where is not None:
+            phrases.append(f"{pole.name} stands {where}")
+    return phrases
+
+
+def describe_assumptions(scenario: Scenario, result: str) -> str:
+    """Return what a result ("ranking", "plan") assumes, in one sentence; empty where nothing is assumed."""
+    assumed = assumptions(scenario)
+    if not assumed:
+        return ""
+    return f"Before you trust this {result}: assumed, not measured: {'; '.join(assumed)}."
+
+
+def assumes_flows(scenario: Scenario) -> bool:
+    """Return whether the key ``assumed`` says that the traffic, hence the flows in ``counts``, is assumed."""
+    return any(_TRAFFIC.search(entry) for entry in scenario.assumed)
 
 
 def describe_counts(scenario: Scenario, network: Path | None) -> dict[str, str]:

@@ -414,24 +414,43 @@ class CurveStep:
 _CURVE_WIDTH, _CURVE_HEIGHT = 460.0, 250.0
 _CURVE_LEFT, _CURVE_TOP, _CURVE_BOTTOM = 56.0, 14.0, 44.0
 _MAX_LABELS = 12
+_MIN_CUT_SHARE = 0.8
+"""If each bar is longer than this share of the axis, the axis starts above 0, so that the bars look different."""
+_SHORTEST_BAR = 0.25
+"""Length of the shortest bar, as a share of an axis that starts above 0; at least, up to the rounding of its start."""
+_MAX_AXIS_START = 0.95
+"""Maximum start of the axis, as a share of its end."""
+
+
+def sensor_count_axis_start(steps: Sequence[CurveStep]) -> float:
+    """Return the share at which the axis of :func:`sensor_count_chart` starts: 0, unless all bars are long."""
+    top = max(1.0, *(step.bound for step in steps))
+    shortest = min(step.share for step in steps)
+    if shortest < _MIN_CUT_SHARE * top:
+        return 0.0
+    start = min((shortest - _SHORTEST_BAR * top) / (1.0 - _SHORTEST_BAR), _MAX_AXIS_START * top)
+    first, second, *_ = round_values(100.0 * start, 100.0 * top, 5)
+    step = second.value - first.value
+    return math.floor(100.0 * start / step) * step / 100.0
 
 
 def sensor_count_chart(steps: Sequence[CurveStep], alt: str) -> str:
     """Return a chart with one bar per number of sensors, and a mark above it for the upper bound."""
     width, height = _CURVE_WIDTH - _CURVE_LEFT - 12.0, _CURVE_HEIGHT - _CURVE_TOP - _CURVE_BOTTOM
     top = max(1.0, *(step.bound for step in steps))
-    base, spacing = _CURVE_TOP + height, width / len(steps)
+    start = sensor_count_axis_start(steps)
+    base, spacing, scale = _CURVE_TOP + height, width / len(steps), height / (top - start)
     parts = [svg_start_tag(_CURVE_WIDTH, _CURVE_HEIGHT, alt)]
-    for value, _ in round_values(0.0, 100.0 * top, 5):
-        y = base - height * value / 100.0 / top
+    for value, _ in round_values(100.0 * start, 100.0 * top, 5):
+        y = base - scale * (value / 100.0 - start)
         parts.append(f'<path class="grid" d="M{_CURVE_LEFT:.1f} {y:.1f}h{width:.1f}"/>')
         parts.append(_text(_CURVE_LEFT - 8, y + 4, f"{value:g}%", "end"))
     label_step = 1
     if len(steps) > _MAX_LABELS:
         label_step += len(steps) // _MAX_LABELS
     for i, step in enumerate(steps):
-        x, bar = _CURVE_LEFT + i * spacing, height * step.share / top
-        bound = base - height * step.bound / top
+        x, bar = _CURVE_LEFT + i * spacing, scale * (step.share - start)
+        bound = base - scale * (step.bound - start)
         title = f"{step.count} sensors: {step.share:.1%} of the score of all candidates; at most {step.bound:.1%}"
         parts.append(
             f'<g class="step"><title>{escape(title)}</title>'
@@ -441,7 +460,10 @@ def sensor_count_chart(steps: Sequence[CurveStep], alt: str) -> str:
         if i % label_step == 0:
             parts.append(_text(x + spacing / 2, base + 17, str(step.count)))
     parts.append(f'<path class="axis" d="M{_CURVE_LEFT:.1f} {_CURVE_TOP:.1f}v{height:.1f}h{width:.1f}"/>')
-    parts.append(_text(_CURVE_LEFT + width / 2, base + 36, "sensors"))
+    title = "sensors"
+    if start > 0:
+        title += f" (the axis starts at {100.0 * start:g}%, not at 0)"
+    parts.append(_text(_CURVE_LEFT + width / 2, base + 36, title))
     return "".join([*parts, "</svg>"])
 
 

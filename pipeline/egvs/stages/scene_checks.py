@@ -27,6 +27,7 @@ from egvs.sensors.sensor import Sensor, scenario_sensor
 from egvs.sensors.sites import Site
 from egvs.stages.inputs import CheckInputs, ErrorCollector
 from egvs.traffic import sumo_folder
+from egvs.traffic.network import Network
 from egvs.world import clearances, geolocation, supports
 from egvs.world.carriageway import Carriageway
 from egvs.world.mesh import World
@@ -191,7 +192,7 @@ def warn_sites_on_lanes(inputs: CheckInputs) -> Iterator[Diagnostic]:
     config = inputs.scenario.sites
     if inputs.carriageway is None or not inputs.sites or (config.file is None and config.only_free):
         return
-    on_road = list(_sites_on_road(inputs.sites, inputs.carriageway))
+    on_road = list(_sites_on_road(inputs.sites, inputs.carriageway, inputs.network))
     hint = f"Move it beside the road, or more than {clearances.CLEARANCE_M:g} m above it."
     for site, where in on_road[:MAX_LISTED_SITES]:
         problem = f"({site.pose.x_m:g}, {site.pose.y_m:g}, {site.pose.z_m:g}) is {where}"
@@ -204,7 +205,9 @@ def warn_sites_on_lanes(inputs: CheckInputs) -> Iterator[Diagnostic]:
         yield Diagnostic("sites on lanes", file, problem, hint)
 
 
-def _sites_on_road(sites: tuple[Site, ...], carriageway: Carriageway) -> Iterator[tuple[Site, str]]:
+def _sites_on_road(
+    sites: tuple[Site, ...], carriageway: Carriageway, network: Network | None
+) -> Iterator[tuple[Site, str]]:
     """The sites in a lane or within a junction, no higher than the clearance above the road, and where they are."""
     at_m = np.array([[site.pose.x_m, site.pose.y_m] for site in sites])
     lanes = carriageway.lanes_at(at_m)
@@ -216,7 +219,19 @@ def _sites_on_road(sites: tuple[Site, ...], carriageway: Carriageway) -> Iterato
         nearest = carriageway.nearest(at_m[number]) if lane is None else lane
         if site.pose.z_m - carriageway.height_m(nearest, at_m[number]) > clearances.CLEARANCE_M:
             continue
-        yield site, "within a junction" if lane is None else f"in lane {carriageway.names[lane]}"
+        yield site, "within a junction" if lane is None else f"in {_describe_lane(carriageway.names[lane], network)}"
+
+
+def _describe_lane(lane: str, network: Network | None) -> str:
+    """Return a lane as a user knows it, by its street or junction, e.g. ``"a lane of Main Street"``."""
+    edge_id, _, _ = lane.rpartition("_")
+    edges = [] if network is None else network.all_edges
+    if not edge_id.startswith(":"):
+        name = next((edge.name for edge in edges if edge.id == edge_id), "")
+        return f"a lane of {name}" if name else f"lane {lane}"
+    node = edge_id[1:].rpartition("_")[0]
+    names = dict.fromkeys(edge.name for edge in edges if edge.name and node in (edge.from_node, edge.to_node))
+    return f"the junction of {' and '.join(names)}" if names else f"junction {node}"
 
 
 def warn_own_supports(inputs: CheckInputs) -> Iterator[Diagnostic]:
