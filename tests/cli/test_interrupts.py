@@ -21,7 +21,8 @@ except BaseException:
 """
 
 VERB = """
-import sys
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a test run in the background ignores it
 from egvs.cli import app
 
 @app.app.command()
