@@ -38,6 +38,9 @@ MIN_LOSS = 0.01
 MIN_RHO = 0.5
 """A rank correlation whose interval lies below this contradicts a ranking."""
 
+SATURATED = 0.995
+"""Shares of detection from here on leave no room for differences between sites."""
+
 
 @dataclass(frozen=True)
 class RankCorrelation:
@@ -248,7 +251,7 @@ def _describe_same_height(rho: RankCorrelation | None) -> str:
     if rho.value is None:
         return f"; among sites of equal height there are too few to tell ({rho.why})"
     heights = "1 height" if rho.groups == 1 else f"{rho.groups} heights"
-    clause = f"{rho.text} among the {rho.sites} sites of equal height ({heights})"
+    clause = f"{rho.text} among sites of equal height ({rho.sites} sites at {heights})"
     if rho.is_undecided:
         return f", but {clause}, which are too few, or too similar, to tell"
     return f", and {clause}"
@@ -261,7 +264,10 @@ def _describe_choice(check: DetectorCheck) -> str:
     if not check.returns_boxes:
         best = f"{check.best} has most {check.measure} ({100 * check.best_value:.1f}{error} %)"
     if check.best == check.first:
-        return f"{best}, and is also first in the ranking: nothing is lost by following it."
+        text = f"{best}, and is also first in the ranking: nothing is lost by following it."
+        if check.best_value >= SATURATED:
+            text += " Values so near 100 % cannot tell the best sites apart; more frames may."
+        return text
     text = f"{best}; following the ranking, to {check.first}, loses {check.loss_text}"
     if check.loss_se is None or check.loss <= 2.0 * check.loss_se:
         return f"{text}, which may be chance."
