@@ -165,7 +165,7 @@ def _sensor_table(placed: Placement) -> Table:
         Column("site", lambda row: row.site, "left"),
         Column("z m", lambda row: f"{row.z_m:g}"),
         Column("yaw deg", lambda row: f"{row.yaw_deg:.1f}"),
-        Column("pitch deg", lambda row: f"{row.pitch_deg:.1f}"),
+        Column("pitch deg", lambda row: f"{row.pitch_deg:z.1f}"),
         Column("sensor", lambda row: row.sensor, "left"),
         Column(_with_unit("adds", by.change_head), lambda row: by.change(row.gain, row.gain_se)),
         Column(_together_head(by), lambda row: by.with_error(row.score, row.score_se)),

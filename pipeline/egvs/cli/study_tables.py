@@ -295,14 +295,14 @@ def _mount_columns(comparison: Comparison, run: int, width: int) -> list[Column[
         if any(site.yaw_deg for site in sites):
             column("yaw", lambda site: f"{site.yaw_deg:.0f}")
         if is_pitched:
-            column("pitch", lambda site: f"{site.pitch_deg:.0f}")
+            column("pitch", lambda site: f"{site.pitch_deg:z.0f}")
     column(compared.ranking.by.head, format_score)
     return columns
 
 
 def _describe_mount(with_pitch: bool, site: RankedSite) -> str:
     """Return height and pitch, e.g. "3 m, -10°"."""
-    return f"{site.z_m:.4g} m, {site.pitch_deg:.0f}°" if with_pitch else f"{site.z_m:.4g} m"
+    return f"{site.z_m:.4g} m, {site.pitch_deg:z.0f}°" if with_pitch else f"{site.z_m:.4g} m"
 
 
 def format_score(site: RankedSite) -> str:
@@ -365,7 +365,7 @@ def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparis
     ]
     if sensors.has_yaw_or_pitch:
         columns.append(Column("yaw", lambda result: f"{result.mount.site.yaw_deg:.0f}", min_width=NARROW))
-        columns.append(Column("pitch", lambda result: f"{result.mount.site.pitch_deg:.0f}", min_width=NARROW))
+        columns.append(Column("pitch", lambda result: f"{result.mount.site.pitch_deg:z.0f}", min_width=NARROW))
     columns.append(Column(by.head, lambda result: format_score(result.mount.site)))
     columns.append(Column("difference", lambda result: result.gain_text))
     if any(result.mount.cost is not None for result in sensors.results):
@@ -373,7 +373,7 @@ def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparis
     if sensors.shows_cost_per_point:
         columns.append(Column("one more point costs", lambda result: result.cost_per_point_text, wrap=True))
     if sensors.shows_cost_per_point and sensors.has_steps:
-        columns.append(Column("than the best cheaper", lambda result: result.step_cost_text, wrap=True))
+        columns.append(Column("… from the best cheaper sensor", lambda result: result.step_cost_text, wrap=True))
     out.print(make_table(columns, sensors.results, width=out.width, title="the best mount of each sensor"))
     out.print(sensors.explanation, soft_wrap=True)
     if sensors.unpriced:
