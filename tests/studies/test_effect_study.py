@@ -76,7 +76,7 @@ def test_expected_changes_equal_those_of_runs(mini: Path, tmp_path: Path) -> Non
         egvs.run(egvs.load(mini, [f"effects.{name}.{words}"]), tmp_path / name)
         rows = readers.read_scores(tmp_path / name / "scores.parquet").to_pylist()
         changes = sorted((row["egvs"] / before[row["site"]] - 1 for row in rows), key=abs)
-        assert f"scores by {changes[0]:+.1%} to {changes[-1]:+.1%}" in statuses[name].change, name
+        assert f"EGVS by {changes[0]:+.1%} to {changes[-1]:+.1%}" in statuses[name].change, name
         assert "measured on 2 of 2 sites, with the last run's traffic" in statuses[name].change
     assert statuses["dropout"].why.endswith("; tried with share = 0.1")
     assert statuses["foliage"].change == ""

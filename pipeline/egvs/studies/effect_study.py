@@ -424,4 +424,4 @@ def _try_effect(effect: Effect[Any], trials: EffectTrials) -> tuple[bool, str]:
     if not trial.same_order:
         change += ", and their order"
     where = f"measured on {trial.sites} of {trial.of_sites} sites, with the last run's traffic"
-    return abs(trial.most) < SMALL_CHANGE and trial.same_order, f"scores by {change} ({where})"
+    return abs(trial.most) < SMALL_CHANGE and trial.same_order, f"EGVS by {change} ({where})"
