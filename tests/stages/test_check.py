@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import egvs
 from egvs.core.errors import DiagnosticsError, InputError
+from egvs.report.sections import describe_poles_on_road
 from egvs.sensors.sites import Pose, Site
 from egvs.stages import check, scene_checks
 from egvs.stages.inputs import CheckInputs, Inputs
@@ -121,6 +123,16 @@ def test_many_sites_in_lanes_share_one_warning(street: Path) -> None:
     lines = found(street)["sites on lanes"]
     assert len(lines) == 9
     assert lines[-1] == "[sites.csv: 4 more of 12 are in lanes or junctions: s09, s10, s11, s12]"
+
+
+def test_result_names_the_poles_of_these_warnings(street: Path) -> None:
+    """The wording of the check and the reader of the report agree."""
+    sites(street, *(f"s{i:02d},{i},1.6,3" for i in range(1, 13)))
+    warnings = check.check_scenario(egvs.load(street)).findings
+    poles = [SimpleNamespace(name=f"pole {name}", sites=[SimpleNamespace(site=name)]) for name in ("s01", "s12", "s13")]
+    first, last = describe_poles_on_road(poles, warnings)
+    assert first.startswith("pole s01 stands in lane ")
+    assert last == "pole s12 stands in a lane or junction"
 
 
 def mast(at_m: tuple[float, float], name: str, kind: str = "mast") -> dict:
