@@ -11,7 +11,7 @@ core, the least of ``--repeats`` runs; the ratios compare each town with the sma
 from __future__ import annotations
 
 import argparse
-import resource
+import os
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -56,8 +56,8 @@ class Cost(NamedTuple):
 
 def processor_s() -> float:
     """Return the processor time of this process and the programs that it has started, in seconds."""
-    usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
 
 
 def make_town(side: int, frames: int, folder: Path, seed: int = 1) -> Scenario:
