@@ -30,7 +30,7 @@ def on_terminal(*arguments: object) -> str:
     """Run the command line in a pseudo-terminal, and return what it showed, without control sequences."""
     ours, theirs = pty.openpty()
     words = [sys.executable, "-m", "egvs", *(str(argument) for argument in arguments)]
-    environment = os.environ | {"COLUMNS": str(COLUMNS), "TERM": "xterm-256color"}
+    environment = os.environ | {"COLUMNS": str(COLUMNS), "TERM": "xterm-256color", "EGVS_MAX_BEAMS": "40000000"}
     with subprocess.Popen(words, stdin=theirs, stdout=theirs, stderr=theirs, env=environment) as process:
         os.close(theirs)
         parts = []
