@@ -8,8 +8,8 @@ with those from when it was hashed. A file is hashed again where
 - its file system is not known to be a local one of Linux (:data:`LOCAL_FILE_SYSTEMS`): the times and inodes of network
   file systems, and of those that are unknown, are not trusted. On other operating systems, every file is hashed.
 
-The cache is ``.digests.json`` in the run folder. It contains only the files of the last run in this folder, decides
-nothing but whether a file is read, and may be removed at any time. A damaged one is ignored.
+The cache is ``.digests.json`` in the run folder. It contains the files of the last run in this folder. It only decides
+whether a file is read again, and may be removed at any time; a damaged one is ignored.
 """
 
 from __future__ import annotations
