@@ -576,7 +576,11 @@ def new(
     ],
     at: Annotated[
         str | None,
-        typer.Option(metavar="LAT,LON", help="Use the junction nearest to this point instead of the largest one."),
+        typer.Option(
+            metavar="LAT,LON",
+            help="Use the junction at this point, or else the nearest one (one with signals within 40 m is preferred;"
+            " at most 100 m away), instead of the largest one with signals.",
+        ),
     ] = None,
     lefthand: Annotated[bool, typer.Option("--lefthand", help="Traffic drives on the left.")] = False,
     walk: Annotated[bool, typer.Option("--walk", help="Include sidewalks and crossings, for pedestrians.")] = False,
