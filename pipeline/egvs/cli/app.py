@@ -608,7 +608,7 @@ def new(
         typer.Option(
             metavar="every METRES",
             help="Candidate poles along all kerbs of the region at this spacing, e.g. every 20m, instead of at most 12"
-            " near the junction.",
+            " spread over the arms of the junction.",
         ),
     ] = None,
 ) -> None:
