@@ -1,7 +1,7 @@
 """What ``egvs run`` prints at its end: the answer to "which pole?" in a few lines.
 
 First the verdict, then the best poles, each with its best mount, the lanes where the best site finds fewest vehicles,
-what was assumed, and the path of the report.
+what was assumed, further reasons to be careful, and the path of the report.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from egvs.cli import stage_summary
 from egvs.cli.console import Column, console, make_table, print_sentences
 from egvs.cli.options import DEFAULT_POLES
 from egvs.core.errors import Diagnostic, collect_warnings
-from egvs.report import ranking, sections
+from egvs.report import ranking, reliability, sections
 from egvs.report.formatting import ScoreLabel, join_names
 from egvs.report.ranking import Pole, RankedSite, Ranking
 from egvs.report.sensor_results import range_note
@@ -59,6 +59,8 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
         out.print(f"Before you trust this ranking: {join_names(on_road)}.")
     if assumed := sections.describe_assumptions(scenario, "ranking"):
         out.print(assumed)
+    for sentence in reliability.describe_reliability(ranked):
+        out.print(sentence)
     sensors = [site.sensor for site in ranked.sites]
     if note := range_note(sensors, is_modelled=scenario.effects.range_limit is not None):
         out.print(note)
@@ -95,6 +97,8 @@ def _print_ranking(
         others = len(ranked.poles) - poles
         out.print(f"{others} more {'pole' if others == 1 else 'poles'}: --all lists all")
     out.print()
+    if location := _location(ranked.best[0]):
+        out.print(location)
     if missed := summary.get("missed"):
         out.print(missed)
     if other_order := order_by_egvs(ranked, parquet.read_metadata(RunFolder(folder).scores, "scores")):
@@ -107,6 +111,13 @@ def verdict(ranked: Ranking, hint: str = "") -> str:
     if lead := ranking.lead(ranked, hint):
         sentences.append(lead)
     return " ".join(sentences)
+
+
+def _location(site: RankedSite) -> str:
+    """Return the geographic position of a site, in one sentence; empty where the scenario has no reference system."""
+    if site.latitude_deg is None or site.longitude_deg is None:
+        return ""
+    return f"{site.site} is at latitude {site.latitude_deg:.6f}, longitude {site.longitude_deg:.6f}."
 
 
 def order_by_egvs(ranked: Ranking, metadata: Mapping[str, Any]) -> str:

@@ -6,6 +6,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from egvs.scenario.score_config import SCORES_IN_UNITS
+
 
 @dataclass(frozen=True)
 class ScoreLabel:
@@ -21,8 +23,6 @@ class ScoreLabel:
         What a site with a score does, with ``{}`` for the score.
     means
         How the score is defined, in one or two sentences.
-    is_share
-        Whether values are shares, written in per cent.
     digits
         Number of decimals.
     unit
@@ -34,9 +34,13 @@ class ScoreLabel:
     head: str
     says: str
     means: str
-    is_share: bool = True
     digits: int = 1
     unit: str = ""
+
+    @property
+    def is_share(self) -> bool:
+        """Whether values are shares, written in per cent."""
+        return self.name not in SCORES_IN_UNITS
 
     @property
     def counts_vehicles(self) -> bool:
@@ -146,7 +150,7 @@ _VEHICLES_NOTE = (
 
 _LABELS = (
     ScoreLabel("egvs", "EGVS", "EGVS bit", "scores {}", "",
-        is_share=False, digits=0, unit="bit"),
+        digits=0, unit="bit"),
     ScoreLabel(
         "entropy_seen", "the entropy seen", "entropy seen", "sees {} of the traffic’s uncertainty",
         "Sites are ranked by the share of the traffic’s uncertainty in voxels that at least one beam crosses.",
@@ -165,7 +169,7 @@ _LABELS = (
         "points_on_target", "the points on vehicles", "log points", "has a mean log(1 + points) of {} on vehicles",
         f"Sites are ranked by their points on vehicles: the mean of log(1 + points). "
         f"{_VEHICLES_NOTE}",
-        is_share=False, digits=2,
+        digits=2,
     ),
     ScoreLabel(
         "seen_well", "the share of vehicles seen well", "seen well", "sees {} of vehicles well",

@@ -35,6 +35,7 @@ from egvs.report.ranking import (
     recorded_frames_hint,
     share_of_limit,
 )
+from egvs.report.reliability import describe_reliability
 from egvs.report.sections import (
     NAMED_POLES,
     PlacementSummary,
@@ -333,6 +334,7 @@ def _warning_values(contents: PageContents) -> dict[str, Any]:
     warnings = collect_warnings(stage.summary for stage in contents.stages.values())
     return {
         "warnings": warnings,
+        "reliability": describe_reliability(contents.ranking),
         "poles_on_road": describe_poles_on_road(contents.ranking.poles[:NAMED_POLES], warnings),
     }
 

@@ -25,7 +25,7 @@ from egvs.core.errors import Diagnostic, InputError
 from egvs.core.grid import FloatArray, Grid
 from egvs.core.threads import map_ordered
 from egvs.kernels import occupancy, traversal
-from egvs.scenario.model import SCENARIO_FILE, Scenario
+from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.scoring.blindspots import SpotWriter, VehicleSpots, open_spot_writer
 from egvs.scoring.egvs import EntropyField
@@ -83,11 +83,6 @@ def vehicle_spots(
         roads = RoadLocations.of(network, context.scenario.roi.grid.roi)
     period = np.searchsorted(np.cumsum(recorded), record.numbers[record.frame], side="right")
     return VehicleSpots.of(record, roads, weight, period.astype(np.int64))
-
-
-def needs_targets(scenario: Scenario) -> bool:
-    """Whether a score, or the blind spots, need the vehicles of recorded frames."""
-    return scenario.score.blindspots or any(name in TARGET_SCORES for name in scenario.score.additional)
 
 
 class _PeriodRows(NamedTuple):
@@ -289,7 +284,7 @@ class SiteScoring:
         self.leave_out = BlockJackknife.of(path, self.tpog) if config.standard_error else None
         self.periods = _read_period_tpogs(path, standard_errors=config.standard_error)
         self.scorer = Scorer(context.scene, self.tpog, context.folder.trajectories, self.leave_out, self.periods)
-        self.targets = TargetScorer(context, self.tpog.grid) if needs_targets(context.scenario) else None
+        self.targets = TargetScorer(context, self.tpog.grid) if context.scenario.score.needs_vehicles else None
 
     @property
     def names(self) -> tuple[str, ...]:
