@@ -30,7 +30,7 @@ from egvs.cli.console import (
 )
 from egvs.core.errors import collect_warnings
 from egvs.report import sections
-from egvs.report.formatting import SCORE_LABELS, ScoreLabel
+from egvs.report.formatting import SCORE_LABELS, ScoreLabel, format_probability
 from egvs.report.ranking import Pole, RankedSite, companion_score, group_by_pole
 
 if TYPE_CHECKING:
@@ -210,10 +210,8 @@ def _format_score(label: ScoreLabel, site: RankedSite) -> str:
 def _format_beats_next(site: RankedSite, last: RankedSite) -> str:
     if site.beats_next is None or site is last:
         return "-"
-    if site.is_separable:
-        return f"{site.beats_next:.0%}"
-    below_limit = min(site.beats_next, DISTINCT_PROBABILITY - 0.01)  # 0.896 is not shown as 90%
-    return f"~ {below_limit:.0%}"
+    text = format_probability(site.beats_next)
+    return text if site.is_separable else f"~ {text}"
 
 
 def poles_table(sites: Sequence[RankedSite], top: int | None = None) -> Table:
