@@ -21,6 +21,7 @@ from egvs.cli import app, new_summary
 from egvs.core.errors import InputError
 from egvs.formats import osm
 from egvs.importers import openstreetmap
+from egvs.importers.osm_solids import ImportCounts
 from egvs.scenario import loading
 from egvs.sensors import sites
 from egvs.stages import check
@@ -113,6 +114,18 @@ def test_counts_changed_and_dropped_objects(made: Made) -> None:
     assert counted.raised_crowns == 1
     assert counted.not_modelled == {"barrier=ditch": 1, "power=tower": 1}
     assert json.loads((made[0] / "statics.geojson").read_text(encoding="utf-8"))["summary"] == counted.to_json()
+
+
+def test_assumed_sizes_are_listed_with_their_numbers(made: Made) -> None:
+    assumed = loading.load(made[0]).assumed
+    assert {"heights of 3 of 11 buildings", "heights of 7 of 8 trees"} < set(assumed)
+    assert "crown widths of 7 of 8 trees" in assumed
+    assert not any("bridge" in entry for entry in assumed)
+
+
+def test_sizes_from_the_map_are_not_assumed() -> None:
+    counts = ImportCounts(heights={"tree": Counter(height=4), "bridge": Counter(height=1, default=2)})
+    assert openstreetmap.assumed_sizes(counts) == ["heights of 2 of 3 bridge decks"]
 
 
 def test_every_object_is_used_or_counted(footprints: dict[str, Any], made: Made) -> None:

@@ -13,6 +13,13 @@ STAGE_NAMES = ("check", "statics", "scan", "traffic", "tpog", "score", "report")
 """In the order of execution: checks come first, and the fast stages come before SUMO runs."""
 
 
+RUNS = Path("runs")
+"""The folder of all runs for which no other is given."""
+
+UNCHANGED_PATTERN = ".unchanged-*.json"
+"""Names of what runs printed (:mod:`egvs.runs.unchanged`); a hash of the command takes the place of the star."""
+
+
 @dataclass(frozen=True)
 class RunFile:
     """A file, or a folder, that a run folder can contain.

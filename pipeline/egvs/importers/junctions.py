@@ -1,7 +1,8 @@
 r"""Choose a junction of a street network, its region of interest, poles along its kerbs, and flows through it.
 
-Steps: :func:`read_streets` turns a SUMO network into :class:`Streets`; :func:`choose_junction`; :func:`region_around`
-it; :func:`kerbside_poles` along the edge of the carriageway; :func:`assumed_flows` through the region.
+Steps: :func:`read_streets` turns a SUMO network into :class:`Streets`; :func:`largest_junction`, or
+:func:`choose_nearby` at a point; :func:`region_around` it; :func:`kerbside_poles` along the edge of the carriageway;
+:func:`assumed_flows` through the region.
 
 World frame: the network's own x (east), y (north) in metres. Longitude and latitude become x, y by the network's
 ``<location>``, as in netconvert:
@@ -49,6 +50,12 @@ from egvs.world.geolocation import network_world_frame
 
 XY = tuple[float, float]
 """x, y in metres."""
+
+MIN_ARMS = 3
+"""A junction that a user can choose connects at least this number of streets."""
+
+AT_POINT_M, SIGNALS_WITHIN_M, MAX_FROM_POINT_M = 2.0, 40.0, 100.0
+"""Distances from a point: of a junction at the point, of a signalised one that is preferred, and of any."""
 
 ROI_MIN_M, ROI_MAX_M, ROI_STEP_M, ROI_HEIGHT_M = 60.0, 120.0, 10.0, 5.0
 
@@ -116,6 +123,15 @@ class StreetJunction:
     arms: int
     signalised: bool
     names: tuple[str, ...]
+
+    @property
+    def is_crossing(self) -> bool:
+        """Whether at least three streets meet there."""
+        return self.arms >= MIN_ARMS
+
+    def distance_m(self, point_m: XY) -> float:
+        """Return the distance from a point to its area or its node, whichever is nearer."""
+        return min(float(self.area.distance(Point(point_m))), math.dist(self.at_m, point_m))
 
     @property
     def title(self) -> str:
@@ -292,34 +308,82 @@ def _ends(road: Edge) -> tuple[str, str]:
     return road.from_node, road.to_node
 
 
-def choose_junction(streets: Streets, at_m: XY | None) -> StreetJunction | None:
-    """Choose the junction nearest to a position, or the largest one.
+def largest_junction(streets: Streets) -> StreetJunction | None:
+    """Return the junction with the most incoming lanes; None where the streets have no junction.
 
     Signalised junctions where at least three streets meet come first, so that pedestrian-only signals are ignored.
     Where there are none, any signals count, then any junction of three streets, then any junction.
+    """
+    crossings = [j for j in streets.junctions if j.is_crossing]
+    signalised = [j for j in streets.junctions if j.signalised]
+    signalised_crossings = [j for j in crossings if j.signalised]
+    candidates = signalised_crossings or signalised or crossings or streets.junctions
+    return min(candidates, key=lambda j: (-j.lanes_in, -j.area.area, j.id), default=None)
+
+
+@dataclass(frozen=True)
+class NearbyJunction:
+    """A junction, and the distance of its area or its node from a point, whichever is nearer."""
+
+    junction: StreetJunction
+    distance_m: float
+
+
+def nearest_junctions(streets: Streets, point_m: XY) -> list[NearbyJunction]:
+    """Return the junctions of at least three streets, the nearest first.
 
     Parameters
     ----------
     streets
-        The streets to choose from.
-    at_m
-        World-frame x, y; None for the junction with the most incoming lanes.
+        The streets.
+    point_m
+        World-frame x, y.
+    """
+    nearby = [NearbyJunction(j, j.distance_m(point_m)) for j in streets.junctions if j.is_crossing]
+    return sorted(nearby, key=lambda near: (near.distance_m, not near.junction.signalised, near.junction.id))
+
+
+def choose_nearby(nearby: Sequence[NearbyJunction]) -> NearbyJunction | None:
+    """Choose the junction that a point stands for.
+
+    It is the junction at the point (within :data:`AT_POINT_M`). Without one, it is the nearest signalised junction
+    within :data:`SIGNALS_WITHIN_M`, otherwise the nearest junction of any kind.
+
+    Parameters
+    ----------
+    nearby
+        From :func:`nearest_junctions`.
 
     Returns
     -------
-    StreetJunction or None
-        None where the streets have no junction.
+    NearbyJunction or None
+        None where no junction is within :data:`MAX_FROM_POINT_M`.
     """
-    crossings = [j for j in streets.junctions if j.arms >= 3]
-    signalised = [j for j in streets.junctions if j.signalised]
-    signalised_crossings = [j for j in crossings if j.signalised]
-    candidates = signalised_crossings or signalised or crossings or streets.junctions
-    if not candidates:
+    if not nearby or nearby[0].distance_m > MAX_FROM_POINT_M:
         return None
-    if at_m is None:
-        return min(candidates, key=lambda j: (-j.lanes_in, -j.area.area, j.id))
-    position = Point(at_m)
-    return min(candidates, key=lambda j: (position.distance(j.area), math.dist(at_m, j.at_m), j.id))
+    if nearby[0].distance_m <= AT_POINT_M:
+        return nearby[0]
+    for near in nearby:
+        if near.junction.signalised and near.distance_m <= SIGNALS_WITHIN_M:
+            return near
+    return nearby[0]
+
+
+def find_again(streets: Streets, junction: StreetJunction, at_m: XY) -> StreetJunction | None:
+    """Return the same junction in streets that were built anew.
+
+    Parameters
+    ----------
+    streets
+        The new streets.
+    junction
+        The junction in the former streets.
+    at_m
+        Its position in the frame of the new ones. The nearest junction is returned if its identifier has changed.
+    """
+    same = [j for j in streets.junctions if j.id == junction.id]
+    candidates = same or streets.junctions
+    return min(candidates, key=lambda j: (math.dist(at_m, j.at_m), j.id), default=None)
 
 
 def region_around(junction: StreetJunction) -> JunctionRegion:
