@@ -526,12 +526,21 @@ app.add_typer(city.app, name="city")
 
 
 @app.command()
-def sensors() -> None:
-    """List the sensor catalogue."""
+def sensors(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[NAME...]", help="Print all that is known of these sensors, with the sources."),
+    ] = None,
+) -> None:
+    """List the sensor catalogue; with names, print the details and sources of these sensors."""
     from egvs.cli import run_tables
-    from egvs.sensors.sensor import CATALOGUE
+    from egvs.sensors.sensor import CATALOGUE, check_sensor_names
 
-    run_tables.print_sensors(CATALOGUE.values())
+    if not names:
+        run_tables.print_sensors(CATALOGUE.values())
+        return
+    check_sensor_names(names, (), "egvs sensors")
+    run_tables.print_sensor_details([CATALOGUE[name] for name in names])
 
 
 @app.command(cls=cli_options.PolesCommand)
