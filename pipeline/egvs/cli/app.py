@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperCommand
 from typer.models import CommandInfo
 
 from egvs._version import __version__
-from egvs.cli import city, exit, place, sources, validate
+from egvs.cli import city, compare, exit, place, sources, validate
 from egvs.cli import options as cli_options
 from egvs.cli.options import (
     DEFAULT_POLES,
@@ -306,41 +306,7 @@ def verify(
 # ---- studies
 
 
-@app.command()
-def compare(
-    runs: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="RUN...", help="Folders of finished runs; one is enough if its sites have several sensors."
-        ),
-    ],
-    by: Annotated[
-        Literal["pole", "site"] | None,
-        typer.Option(
-            help="Compare the best mounts of each pole, or sites of the same name. By default sites if no pole has "
-            "several sites and the common sites have the same mount in all runs, else poles."
-        ),
-    ] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="costs.KEY=VALUE",
-            help="Override a cost, e.g. 'costs.sensor={\"VLP-32C\"=8000}' (repeatable).",
-        ),
-    ] = None,
-    top: Top = None,
-) -> None:
-    """Compare runs or sensors: the best mount of each pole, what one more percentage point costs, and settings."""
-    from egvs.cli.console import ProgressDisplay
-
-    with ProgressDisplay("compare") as screen:
-        from egvs.cli import study_tables
-        from egvs.studies import run_comparison
-
-        run_comparison.check_distinct(runs)
-        comparison = run_comparison.compare_runs(runs, by, set_ or (), screen.progress)
-    study_tables.print_comparison(comparison, top)
+app.command()(compare.compare)
 
 
 @app.command()
@@ -560,12 +526,21 @@ app.add_typer(city.app, name="city")
 
 
 @app.command()
-def sensors() -> None:
-    """List the sensor catalogue."""
+def sensors(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[NAME...]", help="Print all that is known of these sensors, with the sources."),
+    ] = None,
+) -> None:
+    """List the sensor catalogue; with names, print the details and sources of these sensors."""
     from egvs.cli import run_tables
-    from egvs.sensors.sensor import CATALOGUE
+    from egvs.sensors.sensor import CATALOGUE, check_sensor_names
 
-    run_tables.print_sensors(CATALOGUE.values())
+    if not names:
+        run_tables.print_sensors(CATALOGUE.values())
+        return
+    check_sensor_names(names, (), "egvs sensors")
+    run_tables.print_sensor_details([CATALOGUE[name] for name in names])
 
 
 @app.command(cls=cli_options.PolesCommand)
