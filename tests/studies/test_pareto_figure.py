@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import fields
 
 import pytest
-
 from egvs.studies.pareto_figure import draw_figure
+
 from egvs.studies.score_errors import SettingResult
 from egvs.studies.study_settings import APPROXIMATES, MEASURES, SCENARIO
 

@@ -151,7 +151,7 @@ def assess_choices(draws: Sequence[Draw], reference: Reference) -> DecisionQuali
     for row, (units, choices) in enumerate(choices_of.items()):
         chosen = np.mean(choices, axis=0)
         outside = [unit for unit in range(reference.units) if unit not in units]
-        chances[row] = _by_pole(chosen, reference.poles) @ _best_pole_chances(reference, outside)
+        chances[row] = _by_pole(chosen, reference.poles) @ best_pole_chances(reference, outside)
         for judge in outside:
             losses[row, judge] = (best[judge] - chosen) @ reference.found[judge]
     by_judge = np.nanmean(losses[:, ~np.isnan(losses).all(axis=0)], axis=0)
@@ -176,7 +176,7 @@ def assess_by_model(scores: FloatArray, reference: Reference, length_units: floa
     choices = choose(_samples_of_means(scores, length_units)).mean(axis=0)
     found = reference.found.mean(axis=0)
     best = choose(found)
-    chances = _best_pole_chances(reference, range(reference.units))
+    chances = best_pole_chances(reference, range(reference.units))
     probability = float(_by_pole(choices, reference.poles) @ chances)
     loss_by_judge = np.array([(best - choices) @ judged for judged in reference.found])
     return _quality(probability, math.nan, float(loss_by_judge.mean()), _standard_error(loss_by_judge), 0)
@@ -221,8 +221,16 @@ def _standard_error(values: FloatArray) -> float:
     return float(values.std(ddof=1)) / math.sqrt(len(values))
 
 
-def _best_pole_chances(reference: Reference, units: Sequence[int]) -> FloatArray:
-    """Return the probability of each pole to have the best mount, given some units, (poles,) float64."""
+def best_pole_chances(reference: Reference, units: Sequence[int]) -> FloatArray:
+    """Return the probability of each pole to have the best mount, given some units, (poles,) float64.
+
+    Parameters
+    ----------
+    reference
+        What mounts are worth.
+    units
+        Indices of the units that are known.
+    """
     mean = reference.found[list(units)].mean(axis=0)
     noise = _unit_noise(reference.found, heavy_tails=True) / math.sqrt(len(units))
     return _by_pole(choose(mean + noise).mean(axis=0), reference.poles)
