@@ -638,8 +638,7 @@ class StudySummary:
         settings = [StudiedSetting(**{name: row[name] for name in names}) for row in rows]
         listed = tuple(setting for setting in settings if setting.is_listed)
         best = next(setting for setting in settings if setting.recommended)
-        tolerance = metadata["tolerance"]
-        return cls(listed, best, tolerance["loss_points"], tolerance["score"], _read_base64(figure))
+        return cls(listed, best, metadata["tolerance"], metadata.get("score_tolerance"), _read_base64(figure))
 
     @property
     def is_within(self) -> bool:

@@ -207,7 +207,8 @@ def _write(folder: RunFolder, runs: StudyRuns, rows: Sequence[SettingResult], to
         "inputs": files.hash_json(scenario_dependencies(scenario)),
         "seed": scenario.seed,
         "seeds": runs.seeds,
-        "tolerance": {"loss_points": tolerance.loss_points, "score": tolerance.score},
+        "tolerance": tolerance.loss_points,
+        "score_tolerance": tolerance.score,
         "stages": runs.stage_keys,
     }
     parquet.write_artefact(folder.accuracy, "accuracy", columns, metadata)

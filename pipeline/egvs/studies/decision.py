@@ -20,12 +20,15 @@ section 3.6, with a flat prior). The probability that pole q has the best mount 
 of that distribution, and the probability of a draw is that of the pole of its choice. It is one half for two equal
 poles, and it includes that the study itself may not know the best pole.
 
-Both are means over draws. The squared standard error of the loss is the variance of its mean over the judging units,
-plus that over the units that draw; that of the probability the latter. Mounts with equal scores share a choice.
+*Model.* A draw needs units that judge it, and a handful of draws that all choose the same pole do not prove that the
+next one would. So choices are also sampled: with judge e, the scores of traffic of length L (in units) are the means
+over the other units plus normal noise with their covariance divided by L. The model alone prices traffic of more than
+half of the units (:func:`assess_by_model`); otherwise it counts as one further draw, which matters among few draws. Its
+probability is of the poles given the units that it samples around, so it is too high among nearly equal poles.
 
-*Longer traffic.* A draw needs units that judge it. For more traffic than half of the units, the scores of a draw of
-length L (in units) are sampled as their means over all units plus noise of the covariance of the units divided by L,
-and the means :math:`\bar Y` judge (:func:`assess_by_model`).
+Probability and loss are means over draws. The squared standard error of the loss is the variance of its mean over the
+judging units, plus that over the units that draw; that of the probability the latter. Mounts with equal scores share a
+choice.
 """
 
 from __future__ import annotations
@@ -42,8 +45,8 @@ from egvs.core.grid import FloatArray, IntArray
 MIN_UNITS = 4
 """Number of units that a study needs: one draws, the others judge, and one of these can be left out."""
 
-SAMPLES = 4000
-"""Number of samples of the true shares, and of draws by the model."""
+SAMPLES = 2000
+"""Number of samples of the true shares, and of choices by the model."""
 
 MAX_LENGTHENING = 2.0**12
 """Longest traffic that is considered, in units."""
@@ -102,7 +105,7 @@ class DecisionQuality:
     loss_points, loss_se_points
         Expected loss in percentage points of vehicles found, 0 or above, and its standard error.
     draws
-        Number of draws; 0 where the loss is that of the model.
+        Number of draws; 0 where the model alone counts.
     """
 
     probability: float
@@ -131,33 +134,45 @@ def choose(scores: FloatArray) -> FloatArray:
     return shares
 
 
-def assess_choices(draws: Sequence[Draw], reference: Reference) -> DecisionQuality:
+def assess_choices(
+    draws: Sequence[Draw], scores: FloatArray, reference: Reference, length_units: float
+) -> DecisionQuality:
     """Return what the choices of some draws are worth, by the units outside each draw.
 
     Parameters
     ----------
     draws
         Draws of one setting, each with at least two units outside.
+    scores
+        Score that ranks of each mount, from each unit, (k, n) float64, for the model.
     reference
         What mounts are worth, from all units.
+    length_units
+        Length of the draws, in units.
     """
     choices_of: dict[tuple[int, ...], list[FloatArray]] = {}
     for draw in draws:
         choices_of.setdefault(draw.units, []).append(choose(draw.scores))
 
     best = [choose(np.delete(reference.found, judge, axis=0).mean(axis=0)) for judge in range(reference.units)]
-    chances = np.empty(len(choices_of))
-    losses = np.full((len(choices_of), reference.units), math.nan)
+    chances = np.empty(len(choices_of) + 1)
+    losses = np.full((len(choices_of) + 1, reference.units), math.nan)
+    weights = np.empty(len(choices_of) + 1)
     for row, (units, choices) in enumerate(choices_of.items()):
         chosen = np.mean(choices, axis=0)
         outside = [unit for unit in range(reference.units) if unit not in units]
         chances[row] = _by_pole(chosen, reference.poles) @ best_pole_chances(reference, outside)
         for judge in outside:
             losses[row, judge] = (best[judge] - chosen) @ reference.found[judge]
-    by_judge = np.nanmean(losses[:, ~np.isnan(losses).all(axis=0)], axis=0)
+        weights[row] = len(choices)
+    chances[-1], losses[-1] = _model(scores, reference, length_units)
+    weights[-1] = 1.0
+
     by_draw = np.nanmean(losses, axis=1)
+    by_judge = np.array([_weighted_mean(column, weights) for column in losses.T])
     loss_se = math.hypot(_standard_error(by_judge), _standard_error(by_draw))
-    return _quality(float(chances.mean()), _standard_error(chances), float(by_draw.mean()), loss_se, len(draws))
+    probability = _weighted_mean(chances, weights)
+    return _quality(probability, _standard_error(chances), _weighted_mean(by_draw, weights), loss_se, len(draws))
 
 
 def assess_by_model(scores: FloatArray, reference: Reference, length_units: float) -> DecisionQuality:
@@ -168,17 +183,11 @@ def assess_by_model(scores: FloatArray, reference: Reference, length_units: floa
     scores
         Score that ranks of each mount, from each unit, (k, n) float64.
     reference
-        What mounts are worth, from the same units.
+        What mounts are worth, from these units and perhaps more.
     length_units
         Length of the traffic, in units.
     """
-
-    choices = choose(_samples_of_means(scores, length_units)).mean(axis=0)
-    found = reference.found.mean(axis=0)
-    best = choose(found)
-    chances = best_pole_chances(reference, range(reference.units))
-    probability = float(_by_pole(choices, reference.poles) @ chances)
-    loss_by_judge = np.array([(best - choices) @ judged for judged in reference.found])
+    probability, loss_by_judge = _model(scores, reference, length_units)
     return _quality(probability, math.nan, float(loss_by_judge.mean()), _standard_error(loss_by_judge), 0)
 
 
@@ -195,13 +204,24 @@ def length_needed(scores: FloatArray, reference: Reference, tolerance_points: fl
         Percentage points of vehicles found.
     """
     length = 1.0
-    found = reference.found.mean(axis=0)
     while length <= MAX_LENGTHENING:
-        choices = choose(_samples_of_means(scores, length)).mean(axis=0)
-        if 100.0 * (found.max() - choices @ found) <= tolerance_points:
+        if assess_by_model(scores, reference, length).loss_points <= tolerance_points:
             return length
         length *= 2.0
     return math.inf
+
+
+def _model(scores: FloatArray, reference: Reference, length_units: float) -> tuple[float, FloatArray]:
+    """Return the probability of choices by the model, and their loss as each unit judges it, (units,)."""
+    chances, losses = np.empty(reference.units), np.empty(reference.units)
+    for judge in range(reference.units):
+        found = np.delete(reference.found, judge, axis=0).mean(axis=0)
+        others = np.delete(scores, judge, axis=0) if judge < len(scores) else scores
+        choices = choose(_samples_of_means(others, length_units)).mean(axis=0)
+        losses[judge] = (choose(found) - choices) @ reference.found[judge]
+        outside = [unit for unit in range(reference.units) if unit != judge]
+        chances[judge] = _by_pole(choices, reference.poles) @ best_pole_chances(reference, outside)
+    return float(chances.mean()), losses
 
 
 def _quality(probability: float, probability_se: float, loss: float, loss_se: float, draws: int) -> DecisionQuality:
@@ -212,6 +232,12 @@ def _quality(probability: float, probability_se: float, loss: float, loss_se: fl
         loss_se_points=round(100.0 * loss_se, 4),
         draws=draws,
     )
+
+
+def _weighted_mean(values: FloatArray, weights: FloatArray) -> float:
+    """Return the mean of the values that are not NaN."""
+    known = ~np.isnan(values)
+    return float((values[known] * weights[known]).sum() / weights[known].sum())
 
 
 def _standard_error(values: FloatArray) -> float:
@@ -261,4 +287,5 @@ def _unit_noise(values: FloatArray, *, heavy_tails: bool) -> FloatArray:
 
 def _by_pole(shares: FloatArray, poles: IntArray) -> FloatArray:
     """Return shares of mounts (n,) summed over the mounts of each pole, (poles,)."""
-    return np.bincount(poles, weights=shares)
+    by_pole: FloatArray = np.bincount(poles, weights=shares).astype(np.float64)
+    return by_pole

@@ -118,7 +118,7 @@ def draw_figure(settings: Sequence[SettingResult], tolerance: Tolerance, title: 
     _draw_front(axes, settings)
     _draw_settings(axes, settings)
     # below the panel, because a setting may be in any corner inside
-    below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.11), "ncols": 5}
+    below: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.11), "ncols": 5}
     axes.legend(fontsize=8, title="setting that varies (hollow: it measures something else)", title_fontsize=8,
                 frameon=False, **below)  # fmt: skip
     figure.draw_without_rendering()  # lays out the panel; labels need its size

@@ -129,13 +129,13 @@ class Pricing:
         scores = study_draws.unit_scores(runs, self._runs.units, priced)
         drawn = study_draws.draws(runs, self._runs.units, priced)
         if drawn:
-            quality = decision.assess_choices(drawn, self.reference)
+            quality = decision.assess_choices(drawn, scores, self.reference, priced.units)
             choices = np.mean([decision.choose(draw.scores) for draw in drawn], axis=0)
         else:
             quality = decision.assess_by_model(scores, self.reference, priced.units)
             choices = decision.choose(scores.mean(axis=0))
         by_pole = np.bincount(self.reference.poles, choices)
-        error, tau = self._score_errors(priced, scores, drawn)
+        score_error, tau = self._score_errors(priced, scores, drawn)
         seconds, measured = self._stage_seconds(variant, priced, scenario)
         return SettingResult(
             setting=priced.setting.name,
@@ -143,7 +143,11 @@ class Pricing:
             knob=priced.setting.knob,
             overrides=priced.setting.to_options(),
             seconds=sum(seconds.values()),
-            **{f"{stage}_s": value for stage, value in seconds.items()},
+            statics_s=seconds["statics"],
+            scan_s=seconds["scan"],
+            traffic_s=seconds["traffic"],
+            tpog_s=seconds["tpog"],
+            score_s=seconds["score"],
             measured=measured,
             frames=study_settings.counted_frames(scenario),
             sampled_frames=min(priced.sampled_frames, study_settings.counted_frames(scenario)),
@@ -152,7 +156,7 @@ class Pricing:
             probability_se=quality.probability_se,
             loss_points=quality.loss_points,
             loss_se_points=quality.loss_se_points,
-            error=error,
+            error=score_error,
             tau=tau,
             best=self._poles[int(by_pole.argmax())],
             best_share=round(float(by_pole.max()), 4),

@@ -137,6 +137,8 @@ def priced_settings(
         yield from _with_traffic(variant, scenario, factor, factor * run_units, 0)
     if scenario.score.rank_by in TARGET_SCORES:
         yield from _with_sampled_frames(scenario, run_units, values)
+    if scenario.score.rank_by != DEFAULT_SCORE:
+        yield from _by_vehicles_found(variant, scenario, units, values)
     if scenario.score.rank_by == DEFAULT_SCORE and values.detectors:
         for detector in DETECTORS:
             setting = Setting(f"model of {detector} alone", MEASURES, "detector")
@@ -157,6 +159,23 @@ def _with_traffic(
         name, knob = f"{name}, {variant.name}", variant.knob
     setting = replace(variant, name=name, kind=APPROXIMATES, knob=knob, overrides=(*kept, *overrides))
     yield PricedSetting(setting, variant.name, units, blocks, scenario.score.sampled_frames)
+
+
+def _by_vehicles_found(
+    variant: Setting, scenario: Scenario, units: TrafficUnits, values: SettingValues
+) -> Iterator[PricedSetting]:
+    """Yield the scenario, and parts of its traffic, ranked by the vehicles that sites are expected to find."""
+    override = f"score.rank_by={DEFAULT_SCORE}"
+    sampled = scenario.score.sampled_frames
+    setting = Setting(f"ranked by {DEFAULT_SCORE}", APPROXIMATES, "score", (override,))
+    yield PricedSetting(setting, variant.name, float(units.run_units), 0, sampled, DEFAULT_SCORE)
+    for count in units.block_counts(values):
+        share = count / units.blocks
+        for part in _with_traffic(variant, scenario, share, units.run_units * share, count):
+            name = f"{part.setting.name}, {setting.name}"
+            overrides = (*part.setting.overrides, override)
+            ranked = replace(part.setting, name=name, knob="score", overrides=overrides)
+            yield replace(part, setting=ranked, score=DEFAULT_SCORE)
 
 
 def _with_sampled_frames(scenario: Scenario, run_units: float, values: SettingValues) -> Iterator[PricedSetting]:

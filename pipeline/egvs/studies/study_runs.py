@@ -38,6 +38,9 @@ OVERSAMPLING = 3
 MAX_REFERENCE_SCANS = 30_000
 """The reference is not oversampled if mounts times frames are more than this."""
 
+_MARGIN = 1.25
+"""Factor for expected times, so that a study ends within its budget."""
+
 _MAX_FAILED_SEEDS = 4
 """So many seeds may fail, for example because a vehicle stands without end."""
 
@@ -182,7 +185,7 @@ class StudyRuns:
         seed = self.seeds[-1] + 1 if self.seeds else self.scenario.seed
         failed = ""
         last = self.scenario.seed + count + _MAX_FAILED_SEEDS
-        while len(self.seeds) < count and seed < last and self.left_s - 1.2 * self._run_wall_s > keep_s:
+        while len(self.seeds) < count and seed < last and self.left_s - _MARGIN * self._run_wall_s > keep_s:
             try:
                 self._add_run(seed)
             except RunError as error:
@@ -258,7 +261,7 @@ class StudyRuns:
 
     def _run_variant(self, variant: Setting) -> None:
         """Measure the stages of a setting and score its runs, unless the budget does not allow it or it fails."""
-        if self._saved(variant, self.seeds[0]) is None and self._expected_s(variant) > self.left_s:
+        if self._saved(variant, self.seeds[0]) is None and _MARGIN * self._expected_s(variant) > self.left_s:
             self._skip(variant.name, BEYOND_BUDGET)
             return
         try:

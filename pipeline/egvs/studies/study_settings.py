@@ -3,8 +3,9 @@ r"""The settings that an accuracy study prices.
 A study changes one setting at a time, and prices each with the scenario's amount of traffic, and with parts and
 multiples of it. There are two kinds:
 
-- Settings that *approximate* the scenario's scores: less or more traffic, fewer or more frames for detection, longer
-  frame periods and SUMO steps, no sublanes, the quality of an effect; for EGVS also thinned and reweighted beams.
+- Settings that *approximate* the scenario's decision: less or more traffic, fewer or more frames for detection, longer
+  frame periods and SUMO steps, no sublanes, the quality of an effect, and ranking by the vehicles found where another
+  score ranks.
 - Settings that *measure* something else: another voxel size or gamma, the model of one detector, thinned beams, other
   routes, without an effect of the scenario, or with an effect that it does not name. Such effects are tried if they
   need no parameter from the user (as a rain rate) and act in this scene.
@@ -304,7 +305,7 @@ def _thinned_setting(scenario: Scenario, name: str, knob: str, overrides: list[s
     if scenario.score.rank_by != "egvs":
         return Setting(name, MEASURES, knob, tuple(overrides))
     gamma = f"score.gamma={scenario.gamma / weight}"
-    return Setting(name, APPROXIMATES, knob, (*overrides, gamma), weight=weight)
+    return Setting(name, MEASURES, knob, (*overrides, gamma), weight=weight)
 
 
 def _sensor_overrides(scenario: Scenario, sensor: Sensor, factor: int, channels: Sequence[int]) -> Iterator[str]:

@@ -164,7 +164,9 @@ def score_run(
     """
     config = context.scenario.score
     rank_by = config.rank_by
-    names = list(dict.fromkeys([DEFAULT_SCORE, *([rank_by] if rank_by in TARGET_SCORES else [])]))
+    names: list[str] = [DEFAULT_SCORE]
+    if rank_by in TARGET_SCORES and rank_by != DEFAULT_SCORE:
+        names.append(rank_by)
     changes = {"others": (DEFAULT_SCORE,), "standard_error": False, "blindspots": False, "keep_visibility": ()}
     score_config = config.model_copy(update={**changes, "sampled_frames": sampled_frames})
     scenario = context.scenario.model_copy(update={"score": score_config})
@@ -178,12 +180,16 @@ def score_run(
     if rank_by not in TARGET_SCORES:
         scorer = _window_scorer(work, windows, periods)
 
+    def by_frame(values: FloatArray) -> FloatArray:
+        sums: FloatArray = np.bincount(frame, values, n_frames).astype(np.float64)
+        return sums
+
     def score_site(scan: SiteScan) -> _SiteSums:
         visible = targets.visible(scan.beams)
         values = {name: TARGET_SCORES[name](visible) for name in names}
         if by_detector:
             values |= {detector_score(detector): _detector_chances(visible, detector) for detector in DETECTORS}
-        sums = {name: np.bincount(frame, chances * targets.weight, n_frames) for name, chances in values.items()}
+        sums = {name: by_frame(chances * targets.weight) for name, chances in values.items()}
         voxel_scores = np.empty(0)
         if scorer is not None:
             by_window = scorer.score(scan.beams).by_period
@@ -198,7 +204,7 @@ def score_run(
         poles=tuple(site.pole for site in sites),
         rank_by=rank_by,
         block=_frame_blocks(targets.record.numbers, recorded_frames(work.folder.trajectories), periods),
-        weight=np.bincount(frame, targets.weight, n_frames),
+        weight=by_frame(targets.weight),
         sums={name: np.column_stack([site.sums[name] for site in sites]) for name in sites[0].sums},
         windows=tuple(windows) if scorer is not None else (),
         voxel_scores=np.column_stack([site.voxel_scores for site in sites]),
