@@ -64,8 +64,12 @@ class Pricing:
         self._plain = PricedSetting(
             SCENARIO_AS_IS, SCENARIO, float(runs.units.run_units), 0, runs.scenario.score.sampled_frames
         )
-        plain_unit = PricedSetting(SCENARIO_AS_IS, SCENARIO, 1.0, 0, self._plain.sampled_frames)
-        self._base_scores = study_draws.unit_scores(scenario_runs, runs.units, plain_unit)
+        self._base_scores = self._unit_scores("")
+
+    def _unit_scores(self, score: str) -> FloatArray:
+        """Return a score of all mounts (the one that ranks if empty) from each unit of the scenario, (k, n) float64."""
+        unit = PricedSetting(SCENARIO_AS_IS, SCENARIO, 1.0, 0, self._plain.sampled_frames, score)
+        return study_draws.unit_scores(self._runs.runs[SCENARIO], self._runs.units, unit)
 
     @property
     def best_pole(self) -> BestPole:
@@ -165,10 +169,12 @@ class Pricing:
     def _score_errors(self, priced: PricedSetting, scores: FloatArray, drawn: Sequence[Draw]) -> tuple[float, float]:
         """Return the relative error of the score, and the mean of Kendall's tau.
 
-        An approximation is compared with the scenario's scores from the units outside each draw; another quantity with
-        those of the same unit.
+        An approximation is compared with the scenario's scores from the units outside each draw (of the same score, if
+        another one than the scenario's ranks); another quantity with the scenario's scores of the same unit.
         """
         base = self._base_scores
+        if priced.setting.knob == "score":
+            base = self._unit_scores(priced.score)
         compared = drawn or [Draw((unit,), row) for unit, row in enumerate(scores)]
         errors, taus = [], []
         for draw in compared:
