@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperCommand
 from typer.models import CommandInfo
 
 from egvs._version import __version__
-from egvs.cli import city, exit, place, sources, validate
+from egvs.cli import city, compare, exit, place, sources, validate
 from egvs.cli import options as cli_options
 from egvs.cli.options import (
     DEFAULT_POLES,
@@ -306,41 +306,7 @@ def verify(
 # ---- studies
 
 
-@app.command()
-def compare(
-    runs: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="RUN...", help="Folders of finished runs; one is enough if its sites have several sensors."
-        ),
-    ],
-    by: Annotated[
-        Literal["pole", "site"] | None,
-        typer.Option(
-            help="Compare the best mounts of each pole, or sites of the same name. By default sites if no pole has "
-            "several sites and the common sites have the same mount in all runs, else poles."
-        ),
-    ] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="costs.KEY=VALUE",
-            help="Override a cost, e.g. 'costs.sensor={\"VLP-32C\"=8000}' (repeatable).",
-        ),
-    ] = None,
-    top: Top = None,
-) -> None:
-    """Compare runs or sensors: the best mount of each pole, what one more percentage point costs, and settings."""
-    from egvs.cli.console import ProgressDisplay
-
-    with ProgressDisplay("compare") as screen:
-        from egvs.cli import study_tables
-        from egvs.studies import run_comparison
-
-        run_comparison.check_distinct(runs)
-        comparison = run_comparison.compare_runs(runs, by, set_ or (), screen.progress)
-    study_tables.print_comparison(comparison, top)
+app.command()(compare.compare)
 
 
 @app.command()
@@ -349,31 +315,38 @@ def accuracy(
     out: Out = None,
     set_: Set = None,
     jobs: Jobs = None,
-    tolerance: Annotated[float, typer.Option(help="Largest relative error to accept, e.g. 0.02 for 2 %.")] = 0.02,
-    budget: Annotated[str, typer.Option(metavar="TIME", help="Time limit of the study, e.g. 60s or 10m.")] = "10m",
+    tolerance: Annotated[
+        float,
+        typer.Option(metavar="POINTS", help="Largest expected loss to accept, in percentage points of vehicles found."),
+    ] = 1.0,
+    score_tolerance: Annotated[
+        float | None,
+        typer.Option(metavar="SHARE", help="Instead, the largest relative error of the score, e.g. 0.02 for 2 %."),
+    ] = None,
+    budget: Annotated[str, typer.Option(metavar="TIME", help="Time limit of the study, e.g. 60s or 10m.")] = "2m",
     seeds: Annotated[
-        int,
+        int | None,
         typer.Option(
-            min=0,
-            help="Check the standard errors with this many further runs (at least 2), whatever the budget.",
+            min=1, help="Number of seeds of the scenario (at least 4), whatever the budget; by default 4 to 8."
         ),
-    ] = 0,
+    ] = None,
 ) -> None:
-    """Measure error against run time for many settings, and recommend the cheapest within a tolerance."""
+    """Price the choice of a pole: seconds and expected loss of many settings, and the cheapest one that suffices."""
     from egvs.cli.console import ProgressDisplay
 
     budget_s = cli_options.duration_s(budget)
     _, folder = sources.open_source(scenario, set_, out)
     with ProgressDisplay("accuracy") as screen:
-        from egvs.cli import study_tables
+        from egvs.cli import accuracy_table
         from egvs.studies.accuracy import StudyOptions, run_accuracy_study
+        from egvs.studies.recommendation import Tolerance
 
-        options = StudyOptions(tolerance, budget_s, seeds, jobs)
+        options = StudyOptions(Tolerance(tolerance, score_tolerance), budget_s, seeds, jobs)
         study = run_accuracy_study(
             scenario, set_ or (), folder, options, progress=screen.progress, listener=screen.setting_event
         )
     path, overrides, _ = sources.run_arguments(scenario, set_, out)
-    study_tables.print_study(study, cli_options.shell_command("run", path, overrides))
+    accuracy_table.print_study(study, cli_options.shell_command("run", path, overrides))
 
 
 @app.command()
@@ -560,12 +533,21 @@ app.add_typer(city.app, name="city")
 
 
 @app.command()
-def sensors() -> None:
-    """List the sensor catalogue."""
+def sensors(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[NAME...]", help="Print all that is known of these sensors, with the sources."),
+    ] = None,
+) -> None:
+    """List the sensor catalogue; with names, print the details and sources of these sensors."""
     from egvs.cli import run_tables
-    from egvs.sensors.sensor import CATALOGUE
+    from egvs.sensors.sensor import CATALOGUE, check_sensor_names
 
-    run_tables.print_sensors(CATALOGUE.values())
+    if not names:
+        run_tables.print_sensors(CATALOGUE.values())
+        return
+    check_sensor_names(names, (), "egvs sensors")
+    run_tables.print_sensor_details([CATALOGUE[name] for name in names])
 
 
 @app.command(cls=cli_options.PolesCommand)
@@ -608,7 +590,7 @@ def new(
         typer.Option(
             metavar="every METRES",
             help="Candidate poles along all kerbs of the region at this spacing, e.g. every 20m, instead of at most 12"
-            " near the junction.",
+            " spread over the arms of the junction.",
         ),
     ] = None,
 ) -> None:

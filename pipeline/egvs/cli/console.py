@@ -204,8 +204,11 @@ class ProgressDisplay:
         self.hidden_warnings = 0
         self.flow_source = stage_summary.COUNTS
         self._with_details = with_details
-        self._warnings = 0
+        self._warnings: set[str] = set()
         self._stage = verb
+        self._part = ""
+        self._part_seconds = 0.0
+        self._part_states: set[str] = set()
         self._console = Console(
             file=file, stderr=file is None, highlight=False, markup=False, emoji=False, soft_wrap=True
         )
@@ -235,33 +238,64 @@ class ProgressDisplay:
         if not self._has_bar:
             return
         count = f"{done}/{total}" if total else str(done)
-        self._bar.update(self._task, description=f"{self._stage}: {what} {count}", completed=done)
+        self._bar.update(self._task, description=f"{self._part}{self._stage}: {what} {count}", completed=done)
         self._bar.tasks[0].total = total or None  # update() takes None for "unchanged"
 
+    def begin_part(self, title: str) -> None:
+        """Begin one of several runs of a command: its stages are shown on the bar only, after the title."""
+        self._part = f"{title}: "
+        self._part_seconds = 0.0
+        self._part_states = set()
+
+    def end_parts(self, verb: str) -> None:
+        """Show what follows the last of several runs under the name of the command."""
+        self._part = ""
+        self._stage = verb
+        self._show_stage(verb)
+
+    @property
+    def part_duration(self) -> str:
+        """Time of the stages of this part that ran, "from store" or "unchanged"."""
+        if "done" in self._part_states:
+            return f"{self._part_seconds:.1f} s"
+        return "from store" if "fetched" in self._part_states else "unchanged"
+
     def stage_event(self, stage: str, state: str, record: StageRecord | None) -> None:
-        """Print one line when a stage ends; a :data:`egvs.runs.run.StageListener`."""
+        """Print one line when a stage ends; a :data:`egvs.runs.run.StageListener`.
+
+        A warning is printed once, also if several stages or runs have it.
+        """
         self._stage = stage
+        self._part_states.add(state)
         if state in ("runs", "fetched"):
             self.any_stage_ran = True
         self._show_stage(stage)
         if record is None:
             return
 
+        if state == "done":
+            self._part_seconds += record.cost.seconds
+        if not self._part:
+            self._print_stage(stage, state, record)
+        for warning in map(str, collect_warnings([record.summary])):
+            if warning in self._warnings:
+                continue
+            self._warnings.add(warning)
+            if len(self._warnings) > MAX_WARNINGS and not self._with_details:
+                self.hidden_warnings += 1
+            else:
+                self.say(f"warning: {warning}")
+
+    def _print_stage(self, stage: str, state: str, record: StageRecord) -> None:
         lines = stage_summary.stage_lines(
             stage, state, record, with_details=self._with_details, flow_source=self.flow_source
         )
         for line in lines:
             self.say(line)
-        for warning in collect_warnings([record.summary]):
-            self._warnings += 1
-            if self._warnings > MAX_WARNINGS and not self._with_details:
-                self.hidden_warnings += 1
-            else:
-                self.say(f"warning: {warning}")
 
     def _show_stage(self, stage: str) -> None:
         if self._has_bar:
-            self._bar.update(self._task, description=stage, completed=0)
+            self._bar.update(self._task, description=f"{self._part}{stage}", completed=0)
             self._bar.tasks[0].total = None
 
     def setting_event(self, name: str, state: str, details: dict[str, Any]) -> None:

@@ -259,6 +259,7 @@ def _template_environment() -> Environment:
     environment.filters |= {
         "svg": Markup,
         "share": formatting.format_percent,
+        "probability": formatting.format_probability,
         "whole": formatting.format_count,
         "plain": formatting.format_number,
         "degrees": formatting.format_degrees,
