@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 import pytest
+from shapely.geometry import LineString, MultiLineString, Point
 
 from egvs.core.errors import InputError
 from egvs.importers import openstreetmap
 from egvs.importers.openstreetmap import NewScenario
 from egvs.traffic.capacity import Capacity, TrialRun
 from tests.importers.small_maps import XY, degrees, street, write_map
+from tests.importers.test_openstreetmap import sites_of
 
 SIGNALISED = "signalised junction of A Street and B Street"
 PLAIN = "junction without signals of A Street and C Street"
@@ -80,3 +83,19 @@ def test_point_far_from_all_junctions_ends_the_program_with_2(tmp_path: Path, ru
     lat_deg, lon_deg = degrees((180.0, 100.0))
     code, _, error = run_egvs("new", tmp_path / "out", "--osm", osm, "--at", f"{lat_deg},{lon_deg}")
     assert code == 2 and "--at: no junction of 3 or more roads" in error
+
+
+def test_poles_are_spread_over_the_arms_of_a_fork(tmp_path: Path) -> None:
+    """Two arms leave eastwards with an angle of 50 degrees between them, a third one westwards."""
+    nodes = {1: (-300.0, 0.0), 2: (0.0, 0.0), 3: (270.0, 126.0), 4: (270.0, -126.0)}
+    ways = [street("West", 1, 2), street("North", 2, 3), street("South", 2, 4)]
+    osm = write_map(tmp_path / "fork.osm", nodes, ways)
+    summary = openstreetmap.create_scenario(tmp_path / "out", osm, degrees((0.0, 0.0)))
+    arms: dict[str, MultiLineString] = {}
+    for edge in summary.streets.network.edges:
+        arms[edge.name] = arms.get(edge.name, MultiLineString()).union(LineString(edge.lanes[0].shape_m[:, :2]))
+    nearest = Counter()
+    for row in sites_of(tmp_path / "out"):
+        pole = Point(float(row["x_m"]), float(row["y_m"]))
+        nearest[min(arms, key=lambda name: arms[name].distance(pole))] += 1
+    assert nearest == {"West": 4, "North": 4, "South": 4}

@@ -219,7 +219,7 @@ def check_sites(folder: Path, poles: int) -> None:
     box = shapely.box(low[0], low[1], low[0] + size[0], low[1] + size[1])
     for where in map(Point, set(places)):
         assert min(line.distance(where) - half_width_m for line, half_width_m in lanes) >= 0.5
-        assert min(solid.distance(where) for solid in solids) >= 1.0
+        assert min((solid.distance(where) for solid in solids), default=math.inf) >= 1.0
         assert box.distance(where) <= 5.0 * 2**0.5
     assert min(Point(a).distance(Point(b)) for a in places for b in places if a != b) >= 5.0
 

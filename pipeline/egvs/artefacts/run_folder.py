@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import overload
 
 STAGE_NAMES = ("check", "statics", "scan", "traffic", "tpog", "score", "report")
-"""In the order of execution: checks come first, and the fast stages come before SUMO runs."""
+"""In the order of execution. Errors are reported in this order as well, although SUMO starts before the check ends."""
 
 
 RUNS = Path("runs")
@@ -65,6 +65,7 @@ class RunFolder:
     run_record = RunFile("run.json", "run")
     lock = RunFile(".lock", "run")
     digests = RunFile(".digests.json", "run")
+    pending = RunFile(".pending", "run", is_folder=True)
 
     statics = RunFile("statics.ply", "statics")
     scans = RunFile("scans.parquet", "scan")

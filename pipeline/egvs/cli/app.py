@@ -315,31 +315,38 @@ def accuracy(
     out: Out = None,
     set_: Set = None,
     jobs: Jobs = None,
-    tolerance: Annotated[float, typer.Option(help="Largest relative error to accept, e.g. 0.02 for 2 %.")] = 0.02,
-    budget: Annotated[str, typer.Option(metavar="TIME", help="Time limit of the study, e.g. 60s or 10m.")] = "10m",
+    tolerance: Annotated[
+        float,
+        typer.Option(metavar="POINTS", help="Largest expected loss to accept, in percentage points of vehicles found."),
+    ] = 1.0,
+    score_tolerance: Annotated[
+        float | None,
+        typer.Option(metavar="SHARE", help="Instead, the largest relative error of the score, e.g. 0.02 for 2 %."),
+    ] = None,
+    budget: Annotated[str, typer.Option(metavar="TIME", help="Time limit of the study, e.g. 60s or 10m.")] = "2m",
     seeds: Annotated[
-        int,
+        int | None,
         typer.Option(
-            min=0,
-            help="Check the standard errors with this many further runs (at least 2), whatever the budget.",
+            min=1, help="Number of seeds of the scenario (at least 4), whatever the budget; by default 4 to 8."
         ),
-    ] = 0,
+    ] = None,
 ) -> None:
-    """Measure error against run time for many settings, and recommend the cheapest within a tolerance."""
+    """Price the choice of a pole: seconds and expected loss of many settings, and the cheapest one that suffices."""
     from egvs.cli.console import ProgressDisplay
 
     budget_s = cli_options.duration_s(budget)
     _, folder = sources.open_source(scenario, set_, out)
     with ProgressDisplay("accuracy") as screen:
-        from egvs.cli import study_tables
+        from egvs.cli import accuracy_table
         from egvs.studies.accuracy import StudyOptions, run_accuracy_study
+        from egvs.studies.recommendation import Tolerance
 
-        options = StudyOptions(tolerance, budget_s, seeds, jobs)
+        options = StudyOptions(Tolerance(tolerance, score_tolerance), budget_s, seeds, jobs)
         study = run_accuracy_study(
             scenario, set_ or (), folder, options, progress=screen.progress, listener=screen.setting_event
         )
     path, overrides, _ = sources.run_arguments(scenario, set_, out)
-    study_tables.print_study(study, cli_options.shell_command("run", path, overrides))
+    accuracy_table.print_study(study, cli_options.shell_command("run", path, overrides))
 
 
 @app.command()
@@ -583,7 +590,7 @@ def new(
         typer.Option(
             metavar="every METRES",
             help="Candidate poles along all kerbs of the region at this spacing, e.g. every 20m, instead of at most 12"
-            " near the junction.",
+            " spread over the arms of the junction.",
         ),
     ] = None,
 ) -> None:

@@ -400,10 +400,8 @@ def _format_cost(cost: EffectCost | None) -> str:
 def _format_cost_change(cost: EffectCost | None) -> str:
     if cost is None:
         return ""
-    best = "same best site"
-    if cost.regret != 0:
-        best = f"different best site, regret {cost.regret:.2%}"
-    return f"scores by up to {cost.change:.1%}; {best}; tau {cost.tau:.2f}"
+    loss = f"the choice loses {cost.loss_points:.2f} points"
+    return f"scores by up to {cost.change:.1%}; {loss}; tau {cost.tau:.2f}"
 
 
 def print_ablation(changes: Sequence[EffectChange]) -> None:

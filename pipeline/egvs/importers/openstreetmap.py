@@ -285,11 +285,17 @@ def create_scenario(
     notes = []
     if at is None and not junction.signalised:
         notes.append(_NO_SIGNALS_NOTE)
+    for ring in streets.large_rings:
+        if junction.id in ring.nodes:
+            notes.append(
+                f"the junction is one entry of a roundabout of {ring.side_m:.0f} m, which is larger than the largest"
+                f" region of interest ({junctions.ROI_MAX_M:g} m): the rest of the ring is not part of the ranking"
+            )
     notes += scenario_notes(roi.area.covers(junction.area), counts) + _level_notes(others, counts)
     notes += _range_notes(counts)
     if walk:
         notes.append(PEOPLE_HINT)
-    assumed = _assumed_traffic(network, streets, roi, traffic)
+    assumed = _assumed_traffic(network, streets, junction, traffic)
     if assumed is not None:
         notes += _traffic_notes(assumed)
     from_at_m = None
@@ -433,9 +439,11 @@ def _range_notes(counts: ImportCounts) -> list[str]:
     return [f"{left_out:,} of {total:,} static objects are left out: {reason}"]
 
 
-def _assumed_traffic(network: str, streets: Streets, roi: JunctionRegion, traffic: str | int) -> AssumedTraffic | None:
-    """Assume flows through a region, and find how much of them the network carries."""
-    flows = junctions.assumed_flows(streets, roi)
+def _assumed_traffic(
+    network: str, streets: Streets, junction: StreetJunction, traffic: str | int
+) -> AssumedTraffic | None:
+    """Assume flows through the region of a junction, and find how much of them the network carries."""
+    flows = junctions.assumed_flows(streets, junctions.region_around(junction), junction.ring)
     if isinstance(traffic, int):
         if not flows:
             problem = "no street leads vehicles through the region of interest"
@@ -614,7 +622,7 @@ def _scenario_toml(name: str, scenario: NewScenario) -> str:
     ]
     document = toml_document(comments, values, tables)
     if scenario.traffic is not None:
-        names = MovementNames(scenario.streets.network)
+        names = MovementNames(scenario.streets.network, scenario.junction.at_m)
         document["traffic"].update({"counts": _counts_array(scenario.traffic.flows, names)})
         origin = f"assumed from the road classes ({scenario.traffic.assumed_per_h:,} vehicles an hour)"
         if scenario.traffic.level is None:

@@ -30,6 +30,7 @@ from typing import IO, Any
 from egvs.core import files
 from egvs.core.errors import InputError, MissingBackendError, RunError
 from egvs.core.sumo_home import sumo_home
+from egvs.core.threads import checkpoint
 from egvs.traffic import sandbox
 from egvs.traffic.vehicle_boxes import VehicleSize
 
@@ -262,13 +263,13 @@ def _start_program(command: Sequence[str], folder: Path, stdout: Any, stderr: An
 
 def _wait(process: subprocess.Popen[bytes], watch: Callable[[int], None] | None) -> tuple[bytes, bytes]:
     """Return standard output and standard error of a process, at its end."""
-    if watch is None:
-        return process.communicate()
     while True:
+        checkpoint()
         try:
             return process.communicate(timeout=_WATCH_PERIOD_S)
         except subprocess.TimeoutExpired:
-            watch(process.pid)
+            if watch is not None:
+                watch(process.pid)
 
 
 def program_error(name: str, code: int, text: str) -> RunError:
