@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
-from egvs.cli.console import NARROW, Column, console, format_or_dash, make_table
+from egvs.cli.console import NARROW, Column, console, format_or_dash, make_table, print_sentences
 from egvs.report.formatting import SCORE_LABELS, join_names
 from egvs.report.ranking import RankedSite, share_of_limit
 from egvs.report.sensor_results import (
@@ -38,8 +38,18 @@ _COLUMN_GAP = 2
 """Space that rich leaves between two columns."""
 
 
-def print_comparison(comparison: Comparison, top: int | None = None) -> None:
-    """Print runs side by side; only the ``top`` poles or sites of the first run, if given."""
+def print_comparison(comparison: Comparison, top: int | None = None, command: Sequence[str] = ()) -> None:
+    """Print runs side by side.
+
+    Parameters
+    ----------
+    comparison
+        The runs.
+    top
+        How many poles or sites of the first run are printed; all for None.
+    command
+        Words of the command that compares these runs; by default ``egvs compare`` with their folders.
+    """
     out = console(_FILE_WIDTH, soft_wrap=False)
     for run in comparison.runs:
         out.print(f"{run.label}  {run.folder}  ({join_names(run.sensors)})", soft_wrap=True)
@@ -52,13 +62,12 @@ def print_comparison(comparison: Comparison, top: int | None = None) -> None:
     out.print(_agreement_table(comparison))
     out.print()
     if comparison.sensors is not None:
-        _print_sensors(out, comparison, comparison.sensors)
+        _print_sensors(out, comparison, comparison.sensors, command)
     if comparison.differences:
         out.print(_difference_table(comparison))
     elif len({run.folder for run in comparison.runs}) > 1:
         out.print("their settings and files are the same")
-    for note in comparison.notes:
-        out.print(f"note: {note}", soft_wrap=True)
+    print_sentences(f"note: {note}" for note in comparison.notes)
 
 
 def _result_tables(comparison: Comparison, top: int | None, width: int) -> Iterator[Table]:
@@ -160,21 +169,21 @@ def _print_pole_notes(out: Console, comparison: Comparison, top: int | None) -> 
         out.print(f"{len(comparison.poles) - top} more: without --top, all are listed")
     first = comparison.runs[0]
     compared = [run for run in range(1, len(comparison.runs)) if _gaps(comparison, run)]
+    sentences = []
     for run in compared:
         gaps = _gaps(comparison, run)
         better = [gap.is_clear for gap in gaps if gap.value > 0]
         worse = [gap.is_clear for gap in gaps if gap.value < 0]
-        out.print(
+        sentences.append(
             f"{comparison.runs[run].label} against {first.label} at {len(gaps)} common poles: better at {len(better)} "
-            f"(clearly at {sum(better)}), worse at {len(worse)} (clearly at {sum(worse)})",
-            soft_wrap=True,
+            f"(clearly at {sum(better)}), worse at {len(worse)} (clearly at {sum(worse)})"
         )
     if compared:
-        out.print(
-            f"differences of the best mounts are in {difference_unit(first.ranking.best[0])}, ± their standard error; "
-            f"~ it is not clear which is better (probability below {DISTINCT_PROBABILITY:.0%})",
-            soft_wrap=True,
+        sentences.append(
+            f"differences of the best mounts from {first.label} are in {difference_unit(first.ranking.best[0])}, ± "
+            f"their standard error; ~ it is not clear which is better (probability below {DISTINCT_PROBABILITY:.0%})"
         )
+    print_sentences(sentences)
     out.print()
 
 
@@ -186,7 +195,7 @@ def _gaps(comparison: Comparison, run: int) -> list[ScoreDifference]:
 # ---- sensors
 
 
-def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparison) -> None:
+def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparison, command: Sequence[str]) -> None:
     """Print the best mount of each sensor, what it costs, and how far the comparison can be trusted."""
     by = sensors.baseline.site.by
     columns: list[Column[SensorResult]] = []
@@ -201,7 +210,7 @@ def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparis
         columns.append(Column("yaw", lambda result: f"{result.mount.site.yaw_deg:.0f}", min_width=NARROW))
         columns.append(Column("pitch", lambda result: f"{result.mount.site.pitch_deg:z.0f}", min_width=NARROW))
     columns.append(Column(by.head, lambda result: format_score(result.mount.site)))
-    columns.append(Column("difference", lambda result: result.gain_text))
+    columns.append(Column(f"difference\nfrom {sensors.baseline_name}", lambda result: result.gain_text))
     if any(result.mount.cost is not None for result in sensors.results):
         columns.append(Column("cost", lambda result: result.cost_text))
     if sensors.shows_cost_per_point:
@@ -209,17 +218,16 @@ def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparis
     if sensors.shows_cost_per_point and sensors.has_steps:
         columns.append(Column("… from the best cheaper sensor", lambda result: result.step_cost_text, wrap=True))
     out.print(make_table(columns, sensors.results, width=out.width, title="the best mount of each sensor"))
-    out.print(sensors.explanation, soft_wrap=True)
+    print_sentences([sensors.explanation])
     if sensors.unpriced:
-        folders = " ".join(shlex.quote(str(folder)) for folder in dict.fromkeys(run.folder for run in comparison.runs))
+        words = command or ["egvs", "compare", *dict.fromkeys(str(run.folder) for run in comparison.runs)]
         option = costs_option(sensors.sensors if not sensors.has_costs else sensors.unpriced)
-        out.print(
-            f"What one more point costs: egvs compare {folders} {option}, or [costs] in scenario.toml", soft_wrap=True
-        )
+        hint = f"What one more point costs: {shlex.join(words)} {option}, or [costs] in scenario.toml"
+        out.print(hint, soft_wrap=True)  # a command that is broken into lines cannot be copied
     is_modelled = all(run.has_range_limit for run in comparison.runs)
     if note := range_note(sensors.sensors, is_modelled=is_modelled):
-        out.print(note, soft_wrap=True)
-    out.print(sensors.evidence, soft_wrap=True)
+        print_sentences([note])
+    print_sentences([sensors.evidence])
     out.print()
 
 

@@ -35,6 +35,7 @@ from egvs.report.ranking import (
     recorded_frames_hint,
     share_of_limit,
 )
+from egvs.report.reliability import describe_reliability
 from egvs.report.sections import (
     NAMED_POLES,
     PlacementSummary,
@@ -255,6 +256,7 @@ def _template_environment() -> Environment:
     environment.filters |= {
         "svg": Markup,
         "share": formatting.format_percent,
+        "probability": formatting.format_probability,
         "whole": formatting.format_count,
         "plain": formatting.format_number,
         "degrees": formatting.format_degrees,
@@ -333,6 +335,7 @@ def _warning_values(contents: PageContents) -> dict[str, Any]:
     warnings = collect_warnings(stage.summary for stage in contents.stages.values())
     return {
         "warnings": warnings,
+        "reliability": describe_reliability(contents.ranking),
         "poles_on_road": describe_poles_on_road(contents.ranking.poles[:NAMED_POLES], warnings),
     }
 

@@ -266,7 +266,8 @@ def describe_counts(scenario: Scenario, network: Path | None) -> dict[str, str]:
     periods = {name: period.traffic for name, period in scenario.by_period().items() if period.traffic.counts}
     if network is None or not periods:
         return {}
-    names = MovementNames(read_net_xml(network))
+    x_m, y_m, _ = scenario.roi.center_m
+    names = MovementNames(read_net_xml(network), (x_m, y_m))
     movements = {}
     for name, traffic in periods.items():
         period = f" ({name})" if name else ""
