@@ -182,7 +182,7 @@ GROWTH = {
     "traffic": 1.295,
     "tpog": 1.235,
     "score": 1.23,
-    "report": 1.33,
+    "report": 1.34,
 }
 """Allowed growth, 1.1 for the others: a stage runs again whenever a line behind its key changes."""
 
