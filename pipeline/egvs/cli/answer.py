@@ -6,6 +6,7 @@ what was assumed, further reasons to be careful, and the path of the report.
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -55,15 +56,18 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
     else:
         for warning in collect_warnings([summary]):
             out.print(str(warning))
+    sentences = []
     if on_road := sections.describe_poles_on_road(ranked.poles[: sections.NAMED_POLES], _check_warnings(record)):
-        out.print(f"Before you trust this ranking: {join_names(on_road)}.")
+        sentences.append(f"Before you trust this ranking: {join_names(on_road)}.")
     if assumed := sections.describe_assumptions(scenario, "ranking"):
-        out.print(assumed)
-    for sentence in reliability.describe_reliability(ranked):
-        out.print(sentence)
+        sentences.append(assumed)
+    sentences += reliability.describe_reliability(ranked)
     sensors = [site.sensor for site in ranked.sites]
     if note := range_note(sensors, is_modelled=scenario.effects.range_limit is not None):
-        out.print(note)
+        sentences.append(note)
+    print_sentences(sentences)
+    if ranked.best[0].score > 0 and len(set(sensors)) == 1:
+        out.print(f"Which sensor? {shlex.join(['egvs', 'compare', str(folder), '--sensors', 'NAME,NAME'])} (or all)")
     out.print(f"report: {run_folder.report}")
 
 
@@ -84,13 +88,13 @@ def _print_ranking(
     out: Console, folder: Path, ranked: Ranking, scenario: Scenario, record: RunRecord, poles: int | None
 ) -> None:
     """Print the verdict, the best poles, the lanes seen worst, and how the order by EGVS differs."""
-    out.print(verdict(ranked, ranking.recorded_frames_hint(scenario, ranked, record.stages)))
+    print_sentences([verdict(ranked, ranking.recorded_frames_hint(scenario, ranked, record.stages))])
     validation = sections.ValidationSummary.read(folder, record.stages)
     if validation is not None and validation.check.warning:
         print_sentences([f"{validation.check.warning} See {RunFolder(folder).report}#detected"])
     summary = record.stages["score"].summary
     if ranked.by.counts_vehicles and "weights" in summary:
-        out.print(f"Vehicles are weighted: {summary['weights']}.")
+        print_sentences([f"Vehicles are weighted: {summary['weights']}."])
     out.print()
     out.print(poles_table(ranked, PeriodRanking.read(folder), poles))
     if poles is not None and len(ranked.poles) > poles:
@@ -100,9 +104,9 @@ def _print_ranking(
     if location := _location(ranked.best[0]):
         out.print(location)
     if missed := summary.get("missed"):
-        out.print(missed)
+        print_sentences([missed])
     if other_order := order_by_egvs(ranked, parquet.read_metadata(RunFolder(folder).scores, "scores")):
-        out.print(other_order)
+        print_sentences([other_order])
 
 
 def verdict(ranked: Ranking, hint: str = "") -> str:
@@ -126,7 +130,10 @@ def order_by_egvs(ranked: Ranking, metadata: Mapping[str, Any]) -> str:
     if ranked.by.name == "egvs" or not by_egvs or by_egvs[0] == ranked.sites[0].site:
         return ""
     names = join_names(by_egvs)
-    return f"By the EGVS with gamma {metadata['gamma']:g}, the best sites are {names}."
+    return (
+        f"The EGVS (gamma {metadata['gamma']:g}) measures the traffic's uncertainty that beams cross, not "
+        f"{ranked.by.noun}, and prefers {names}."
+    )
 
 
 def poles_table(ranked: Ranking, by_period: PeriodRanking | None, count: int | None) -> Table:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.scenario.score_config import SCORES_IN_UNITS
 
 
@@ -191,6 +192,27 @@ SCORE_LABELS = {label.name: label for label in _LABELS}
 def format_percent(value: float) -> str:
     """Return a share in per cent, e.g. "12.5%"."""
     return f"{value:.1%}"
+
+
+def format_probability(probability: float) -> str:
+    """Return a probability in whole per cent; "over 99%" and "under 1%" where it rounds to 100 or 0.
+
+    A value below :data:`DISTINCT_PROBABILITY` is never written as this limit.
+
+    Examples
+    --------
+    >>> format_probability(0.578), format_probability(0.896), format_probability(0.9996)
+    ('58%', '89%', 'over 99%')
+    """
+    percent = round(100.0 * probability)
+    limit = round(100.0 * DISTINCT_PROBABILITY)
+    if percent >= 100:
+        return "over 99%"
+    if percent <= 0:
+        return "under 1%"
+    if percent >= limit and probability < DISTINCT_PROBABILITY:
+        percent = limit - 1
+    return f"{percent}%"
 
 
 def format_count(value: float) -> str:

@@ -246,16 +246,20 @@ def _template_environment() -> Environment:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
+    from egvs.report.template_cache import open_template_cache
+
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        bytecode_cache=open_template_cache(Path(__file__)),
     )
     environment.filters |= {
         "svg": Markup,
         "share": formatting.format_percent,
+        "probability": formatting.format_probability,
         "whole": formatting.format_count,
         "plain": formatting.format_number,
         "degrees": formatting.format_degrees,

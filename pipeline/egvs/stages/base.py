@@ -83,6 +83,9 @@ class Stage:
         Keyword arguments of ``run`` that change no artefact, for example where the work is done.
     reads_traffic
         Whether the stage reads files of recorded traffic that the scenario names.
+    prepare
+        Functions that load the kernels that ``run`` calls, or compile them, by calling them with made-up arguments; the
+        one that takes longest comes first.
     """
 
     name: str
@@ -94,6 +97,7 @@ class Stage:
     code: tuple[str, ...] = ()
     neutral_options: tuple[str, ...] = ()
     reads_traffic: bool = False
+    prepare: tuple[Callable[[], None], ...] = ()
 
     @property
     def artefacts(self) -> tuple[str, ...]:

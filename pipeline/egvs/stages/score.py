@@ -333,4 +333,5 @@ STAGE = Stage(
     reads=(RunFolder.tpog, RunFolder.trajectories, RunFolder.scans, RunFolder.statics),
     effect_stages=("scan", "score"),
     neutral_options=("scored_elsewhere",),
+    prepare=(site_scoring.prepare_targets, site_scoring.prepare_voxels),
 )

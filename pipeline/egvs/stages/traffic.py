@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from egvs.artefacts import parquet
+from egvs.core import files
 from egvs.core.errors import WARNINGS_KEY, InputError, MissingBackendError
 from egvs.core.platform import relative_path
 from egvs.core.sumo_home import sumo_home
@@ -62,6 +63,7 @@ def _installed_sumo_version() -> str | None:
     try:
         return sumo.sumo_version()
     except MissingBackendError:
+        files.tell_observers(None)  # SUMO may be installed later
         return None
 
 

@@ -264,19 +264,20 @@ class EffectCost:
     Attributes
     ----------
     seconds
-        Additional time of all stages.
+        Additional processor seconds of all stages.
     change
-        Largest relative change of a site's share of the limit.
+        Largest relative change of a site's score, of EGVS as a share of its limit.
     tau
         Kendall's tau of the rankings with and without it.
-    regret
-        Share of the best score that is lost by using the best site of the other ranking.
+    loss_points
+        Expected loss in percentage points of vehicles found by choosing with the other ranking, judged by the
+        scenario's own setting.
     """
 
     seconds: float
     change: float
     tau: float
-    regret: float
+    loss_points: float
 
 
 def effect_catalogue() -> list[EffectStatus]:
@@ -346,7 +347,7 @@ def effect_costs(scenario: Scenario, out: Path) -> dict[str, EffectCost] | None:
             row = rows.get(f"{prefix}{name}")
             if row is not None:
                 seconds = sign * (row["seconds"] - scenario_s)
-                costs[name] = EffectCost(seconds, row["error"], row["tau"], row["regret"])
+                costs[name] = EffectCost(seconds, row["error"], row["tau"], row["loss_points"])
     return costs
 
 
