@@ -31,6 +31,7 @@ from benchmarks import (
     detection,
     effects,
     file_checks,
+    first_run,
     site_costs,
     stability,
     start_up,
@@ -181,7 +182,7 @@ def main() -> None:
         folder = Path(temporary)
         rows, sumo = time_run(folder)
         rows += occupancy(folder, sumo) + sites(folder) + effects.rows(folder / "run") + detection.rows()
-        rows += clouds.rows(SCENARIO, folder / "run") + start_up.rows()
+        rows += clouds.rows(SCENARIO, folder / "run") + start_up.rows() + first_run.rows()
     for what, measured, bound, reached in rows:
         table.add_row(what, measured, bound, ("yes" if reached else "NO") if bound else "")
     console = Console(width=140, highlight=False)

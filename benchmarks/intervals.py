@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.intervals SCENARIO [SEEDS] [KEY=VALUE...]`` runs the scenario with as many seeds (32) and prints
 how far scores scatter between them, what the standard errors of single runs say, and in what share of cases the 90 %
-intervals hold the score of all runs taken together. The same as ``egvs accuracy --seeds``, without its other settings.
+intervals hold the score of all runs taken together.
 """
 
 from __future__ import annotations

@@ -319,6 +319,8 @@ COMMANDS = {
     "--osm missing": (["new", "{out}", "--osm", "x.osm"], r"x.osm: no such file. Give the path of an extract"),
     "--poles without every": (["new", "{out}", "--osm", "x.osm", "--poles", "20m"], r"x.osm: no such file"),
     "--poles= without every": (["new", "{out}", "--osm", "x.osm", "--poles=20", "--walk"], r"x.osm: no such file"),
+    "--poles in quotes": (["new", "{out}", "--osm", "x.osm", "--poles", "every 20m"], r"x.osm: no such file"),
+    "--poles= in quotes": (["new", "{out}", "--osm", "x.osm", "--poles=every 20m"], r"x.osm: no such file"),
     "--poles every": (["new", "{out}", "--osm", "x.osm", "--poles", "every", "20m"], r"x.osm: no such file"),
     "--poles=every": (["new", "{out}", "--osm", "x.osm", "--poles=every", "20m"], r"x.osm: no such file"),
     "--poles no length": (["new", "{out}", "--osm", "x.osm", "--poles", "far"], r"--poles.*2 arguments"),

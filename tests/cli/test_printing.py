@@ -36,7 +36,9 @@ def test_a_bar_takes_no_name_for_markup() -> None:
     assert "scan: sensor [/x] [red]S1 :car: 1/2" in shown.getvalue()
 
 
-@pytest.mark.parametrize(("beats_next", "text"), [(0.896, "~ 89%"), (0.9, "90%"), (0.612, "~ 61%")])
+@pytest.mark.parametrize(
+    ("beats_next", "text"), [(0.896, "~ 89%"), (0.9, "90%"), (0.612, "~ 61%"), (0.9996, "over 99%")]
+)
 def test_unclear_lead_is_not_rounded_up_to_the_limit(beats_next: float, text: str) -> None:
     site = RankedSite("a", 0.0, 0.0, 3.0, 10.0, 1, "a", 0.0, 0.0, 0.0, "s", 1e4, 1, 1, 0.5)
     sites = [replace(site, beats_next=beats_next, egvs_se=1.0), replace(site, site="b", rank=2)]

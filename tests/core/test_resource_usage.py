@@ -24,6 +24,18 @@ def test_peak_of_process_survives_measured_blocks() -> None:
     assert small.peak_mb < high_mb - MEMORY_MB / 2
 
 
+def test_peak_of_a_block_is_not_lost_when_another_block_begins() -> None:
+    with resource_usage.measure_usage() as outer:
+        array = bytearray(int(MEMORY_MB * 2**20))
+        high_mb = resource_usage.process_peak_mb()
+        del array
+        resource_usage.release_memory()
+        with resource_usage.measure_usage():
+            pass
+    assert outer.peak_mb > outer.held_mb + MEMORY_MB / 2
+    assert outer.peak_mb <= high_mb + 1.0
+
+
 @pytest.mark.system
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the memory of other processes is known on Linux only")
 def test_peak_of_another_process() -> None:

@@ -124,7 +124,7 @@ def junction_half_depth_m(summary: NewScenario) -> float:
 
 
 def test_junction_far_from_requested_position_is_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    far = openstreetmap.create_scenario(tmp_path / "far", SMALL, at=(52.0018, 10.0))
+    far = openstreetmap.create_scenario(tmp_path / "far", SMALL, at=(52.0008, 10.0))
     assert far.from_at_m is not None and far.from_at_m > openstreetmap.FAR_FROM_AT_M
     assert (
         f"warning: the junction ({far.junction.title}) is {far.from_at_m:,.0f} m from --at and may not be the one"

@@ -21,6 +21,7 @@ from egvs.cli import app, new_summary
 from egvs.core.errors import InputError
 from egvs.formats import osm
 from egvs.importers import openstreetmap
+from egvs.importers.osm_solids import ImportCounts
 from egvs.scenario import loading
 from egvs.sensors import sites
 from egvs.stages import check
@@ -115,6 +116,18 @@ def test_counts_changed_and_dropped_objects(made: Made) -> None:
     assert json.loads((made[0] / "statics.geojson").read_text(encoding="utf-8"))["summary"] == counted.to_json()
 
 
+def test_assumed_sizes_are_listed_with_their_numbers(made: Made) -> None:
+    assumed = loading.load(made[0]).assumed
+    assert {"heights of 3 of 11 buildings", "heights of 7 of 8 trees"} < set(assumed)
+    assert "crown widths of 7 of 8 trees" in assumed
+    assert not any("bridge" in entry for entry in assumed)
+
+
+def test_sizes_from_the_map_are_not_assumed() -> None:
+    counts = ImportCounts(heights={"tree": Counter(height=4), "bridge": Counter(height=1, default=2)})
+    assert openstreetmap.assumed_sizes(counts) == ["heights of 2 of 3 bridge decks"]
+
+
 def test_every_object_is_used_or_counted(footprints: dict[str, Any], made: Made) -> None:
     complete = Counter(f["properties"]["kind"] for name, f in footprints.items() if not name.endswith("#2"))
     assert complete == made[1].statics.objects
@@ -206,7 +219,7 @@ def check_sites(folder: Path, poles: int) -> None:
     box = shapely.box(low[0], low[1], low[0] + size[0], low[1] + size[1])
     for where in map(Point, set(places)):
         assert min(line.distance(where) - half_width_m for line, half_width_m in lanes) >= 0.5
-        assert min(solid.distance(where) for solid in solids) >= 1.0
+        assert min((solid.distance(where) for solid in solids), default=math.inf) >= 1.0
         assert box.distance(where) <= 5.0 * 2**0.5
     assert min(Point(a).distance(Point(b)) for a in places for b in places if a != b) >= 5.0
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from typing import get_args
 
-from egvs.report.formatting import SCORE_LABELS
+import pytest
+
+from egvs.report.formatting import SCORE_LABELS, format_probability
 from egvs.scenario.score_config import OtherScore
 
 
@@ -39,3 +41,19 @@ def test_small_standard_error_is_not_written_as_zero() -> None:
     assert detections.with_error(1.0, 0.0) == "100.0 ± 0.0%"
     assert detections.is_zero(0.0004)
     assert not detections.is_zero(0.0006)
+
+
+@pytest.mark.parametrize(
+    ("probability", "text"),
+    [
+        (0.004, "under 1%"),
+        (0.516, "52%"),
+        (0.897, "89%"),
+        (0.9, "90%"),
+        (0.994, "99%"),
+        (0.995, "over 99%"),
+        (1.0, "over 99%"),
+    ],
+)
+def test_probabilities_are_whole_per_cent_that_keep_their_side_of_the_limit(probability: float, text: str) -> None:
+    assert format_probability(probability) == text

@@ -35,7 +35,7 @@ PERIODS = "traffic.periods=[{name='morning_peak', length_s=12}, {name='evening_p
 SECTIONS = (
     "Where the sites are", "Ranking", "What the score means", "The best site on each pole",
     "Your columns from the sites file", "By period", "Where the traffic is", "What a site sees and misses",
-    "Which sites together?", "Does the score predict detection?", "What accuracy costs in computing time",
+    "Which sites together?", "Does the score predict detection?", "What a right decision costs in computing time",
     "Input data and computing time", "What is not modelled",
 )  # fmt: skip
 

@@ -106,7 +106,7 @@ def with_rivals(*rows: tuple[str, str, float, float, float]) -> Ranking:
     ("chance", "says"),
     [
         (0.903, "(it is truly worse with a probability of 90%)."),
-        (0.896, "(it is truly worse with a probability of 89.6%). These poles cannot be told apart. More helps."),
+        (0.896, "(it is truly worse with a probability of 89%). These poles cannot be told apart. More helps."),
         (0.7, "(it is truly worse with a probability of 70%). These poles cannot be told apart. More helps."),
         (0.9999, "(it is truly worse with a probability of over 99%)."),
     ],
@@ -123,8 +123,23 @@ def test_next_site_on_another_pole_is_compared_once() -> None:
     text = report_ranking.lead(with_rivals(("a", "p", 0.9, 0.0, 0.5), ("c", "q", 0.8999, 0.0001, 0.84)), "More helps.")
     assert text == (
         "It leads the next site, c, by 0.01 ± 0.01 percentage points (it is truly better with a probability of 84%)."
-        " These poles cannot be told apart. More helps."
+        " These poles cannot be told apart."
     )
+
+
+@pytest.mark.parametrize(("behind", "helps"), [(0.0009, False), (0.0011, True), (0.0, False)])
+def test_hint_is_given_where_poles_differ_by_a_tenth_of_a_point(behind: float, helps: bool) -> None:
+    sites = with_rivals(("a", "p", 0.9, 0.0, 0.5), ("c", "q", 0.9 - behind, 0.004, 0.6))
+    text = report_ranking.lead(sites, "More helps.")
+    assert "These poles cannot be told apart." in text
+    assert text.endswith("More helps.") == helps
+
+
+def test_no_hint_for_mounts_of_one_pole() -> None:
+    sites = with_rivals(("a", "p", 0.9, 0.0, 0.5), ("b", "p", 0.895, 0.004, 0.6), ("c", "q", 0.8, 0.004, 0.999))
+    text = report_ranking.lead(sites, "More helps.")
+    assert "These sites cannot be told apart." in text
+    assert "More helps." not in text
 
 
 def test_hint_names_the_setting_that_limits_the_error(mini: Path) -> None:

@@ -6,14 +6,15 @@ import base64
 import csv
 import html
 import math
-from dataclasses import replace
+from functools import partialmethod
 from pathlib import Path
 
 import pytest
 
 from egvs.artefacts import parquet
 from egvs.report.sections import RHO, RHO_RANGE, egvs_setting, ranking_disagreement
-from egvs.studies import score_errors, study_settings
+from egvs.studies import study_settings
+from egvs.studies.accuracy import StudyOptions
 from tests.report.test_ranking import by_vehicles, ranking
 
 
@@ -119,22 +120,14 @@ def test_is_silent_if_scores_agree() -> None:
 def test_shows_the_accuracy_study_of_the_same_run(mini, tmp_path, run_egvs, monkeypatch):
     """Its recommendation, the front, the figure; not of another scenario or other files; the run is verified in each
     case."""
-    few = study_settings.SettingValues(voxels_m=(1.0,), gammas=(2.0,), unnamed_effects=False)
-    list_settings = study_settings.list_settings
-    monkeypatch.setattr(study_settings, "list_settings", lambda scenario, _: list_settings(scenario, few))
-    expected = score_errors.mark_pareto_front
-
-    def thinned(rows, tolerance):
-        """The clock decides which of two fast settings is the cheapest: here it is always the same."""
-        return expected(
-            [replace(r, seconds=0.5 if r.setting == "every 2nd azimuth" else 1.0, judged=0.0) for r in rows], tolerance
-        )
-
-    monkeypatch.setattr(score_errors, "mark_pareto_front", thinned)
+    few = study_settings.SettingValues(
+        voxels_m=(1.0,), gammas=(2.0,), thinning_factors=(), frame_periods_s=(), unnamed_effects=False
+    )
+    monkeypatch.setattr(StudyOptions, "__init__", partialmethod(StudyOptions.__init__, values=few))
     out = tmp_path / "out"
 
     def is_shown():
-        return "What accuracy costs" in (out / "report.html").read_text()
+        return "What a right decision costs" in (out / "report.html").read_text()
 
     assert run_egvs("run", mini, "--out", out)[0] == 0
     assert not is_shown()
@@ -145,10 +138,11 @@ def test_shows_the_accuracy_study_of_the_same_run(mini, tmp_path, run_egvs, monk
     assert f"data:image/png;base64,{base64.b64encode((out / 'accuracy.png').read_bytes()).decode()}" in text
     rows = parquet.read_artefact(out / "accuracy.parquet", "accuracy")[0].to_pylist()
     best = next(row for row in rows if row["recommended"])
-    assert best["setting"] == "every 2nd azimuth"
-    section = text[text.index("What accuracy costs") :]
+    section = text[text.index("What a right decision costs") :]
     section = section[: section.index("</section>")]
-    assert f"<code>{best['overrides']}</code>" in html.unescape(section)
+    if best["overrides"]:
+        assert f"<code>{best['overrides']}</code>" in html.unescape(section)
+    assert f"expected to lose {best['loss_points']:.2f} ±" in section
     assert section.count("<tr") == 1 + sum(
         row["front"] or row["recommended"] or row["kind"] == "scenario" for row in rows
     )

@@ -65,7 +65,7 @@ def test_study_settings_keep_gamma(auto: Path, tmp_path: Path) -> None:
     runner = SettingRunner(auto, [], tmp_path, 1, lambda *_: None)
     settings = {
         setting.name: setting
-        for setting in study_settings.list_settings(runner.scenario(study_settings.SCENARIO_AS_IS))
+        for setting in study_settings.list_variants(runner.scenario(study_settings.SCENARIO_AS_IS))
     }
     gammas = {name: runner.scenario(setting).gamma for name, setting in settings.items()}
     assert gammas["scenario"] == gammas["voxel 1 m"] == gammas["with moving_occlusion"] == 4.5

@@ -85,3 +85,10 @@ def test_against_shapely(seed):
     ]
     at, yaw = rng.uniform(-5, 25, (40, 2)), rng.uniform(-7, 7, 40)
     assert match_lanes(at, yaw, lanes).tolist() == [slowly(*one, lanes) for one in zip(at, yaw, strict=True)]
+
+
+def test_lane_without_length_has_no_direction_and_no_vehicles() -> None:
+    """Roads that meet in one point: SUMO's lane inside the junction has the same point twice."""
+    point = line((5, 0), (5, 0))
+    assert match_lanes(np.array([[5.0, 0.0]]), np.zeros(1), [point, EAST]).tolist() == [1]
+    assert match_lanes(np.array([[5.0, 0.0]]), np.zeros(1), [point]).tolist() == [-1]

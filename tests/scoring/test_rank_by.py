@@ -17,9 +17,9 @@ from egvs.artefacts import parquet, readers
 from egvs.artefacts.readers import PeriodRanking, read_scores, read_scores_by_period, read_visibility
 from egvs.artefacts.tpog import read_tpog
 from egvs.artefacts.traffic_frames import read_frames
-from egvs.core.errors import collect_warnings
+from egvs.core.errors import InputError, collect_warnings
 from egvs.scenario import loading
-from egvs.scenario.score_config import OtherScore, ScoreConfig
+from egvs.scenario.score_config import VEHICLE_SCORES, OtherScore, ScoreConfig
 from egvs.scoring.egvs import binary_entropy
 from egvs.scoring.target_scores import TARGET_SCORES, expected_detections
 from egvs.scoring.targets import TargetRecord, visible_targets
@@ -210,6 +210,20 @@ def test_sampled_frames_are_recorded_only_where_set() -> None:
     assert "sampled_frames" not in ScoreConfig().model_dump(mode="json")
     dumped = ScoreConfig(sampled_frames=250, gamma=math.inf).model_dump(mode="json")
     assert (dumped["sampled_frames"], dumped["gamma"]) == (250, math.inf)
+
+
+def test_scores_over_vehicles_are_the_target_scores() -> None:
+    assert set(VEHICLE_SCORES) == set(TARGET_SCORES)
+
+
+@pytest.mark.parametrize("other", VEHICLE_SCORES)
+def test_sampled_frames_need_a_score_over_vehicles_or_blind_spots(mini: Path, other: str) -> None:
+    without = ["score.blindspots=false", "score.others=['coverage']", "score.sampled_frames=20"]
+    with pytest.raises(InputError, match="score: sampled_frames has no effect without blind spots"):
+        loading.load(mini, without)
+    for needed in ("score.blindspots=true", f"score.others=['{other}']", f"score.rank_by='{other}'"):
+        changed = [setting for setting in without if setting.split("=")[0] != needed.split("=")[0]]
+        assert loading.load(mini, [*changed, needed]).score.sampled_frames == 20
 
 
 def test_additional_scores_are_unique() -> None:

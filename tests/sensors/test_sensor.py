@@ -15,6 +15,8 @@ from hypothesis import strategies as st
 
 import egvs
 from egvs.core.errors import InputError
+from egvs.effects.range_limit import RangeLimit
+from egvs.scenario.effects_config import RangeLimitParameters
 from egvs.scenario.sensor_config import BeamPatternConfig, SensorConfig
 from egvs.sensors import sensor, sites
 from egvs.sensors.scene import Scene
@@ -538,10 +540,32 @@ def test_pandar128_agrees_with_the_table_of_the_maker() -> None:
     assert min(np.abs(np.diff(sensor.elevations_deg))) == pytest.approx(0.122, abs=1e-3)
 
 
-def test_list_of_sensors_prints_assumptions(run_egvs) -> None:  # type: ignore[no-untyped-def]
+def test_list_has_one_line_per_sensor_that_fits_a_narrow_terminal(run_egvs) -> None:  # type: ignore[no-untyped-def]
     code, out, _ = run_egvs("sensors")
     assert code == 0
-    for name in CATALOGUE:
-        assert name in out
+    lines = out.splitlines()
+    table = lines[1 : 1 + len(CATALOGUE)]
+    assert [line.split("  ")[0] for line in table] == list(CATALOGUE)
+    assert max(len(line.rstrip()) for line in lines[: 1 + len(CATALOGUE)]) <= 80
+    assert "120 x -12.7 to 12.7" in next(line for line in table if line.startswith("AT128"))
+    assert "costs.sensor" in out
+
+
+def test_list_converts_rated_ranges_as_the_effect_does(run_egvs) -> None:  # type: ignore[no-untyped-def]
+    effect = RangeLimit(RangeLimitParameters())
+    table = run_egvs("sensors")[1].splitlines()
+    for name, entry in CATALOGUE.items():
+        line = next(line for line in table if line.startswith(f"{name} "))
+        assert float(line.split()[-1]) == pytest.approx(effect.limit_m(entry), abs=0.5)
+
+
+def test_details_of_a_sensor_have_source_and_assumptions(run_egvs) -> None:  # type: ignore[no-untyped-def]
+    code, out, _ = run_egvs("sensors", "AT128", "VLP-16")
+    assert code == 0
+    for name in ("AT128", "VLP-16"):
+        assert f"source: {CATALOGUE[name].source}\n" in out
+        assert f"assumed: {CATALOGUE[name].assumed}\n" in out
     assert "-59.95 to 59.95" in out
-    assert "Assumed:" in out
+    code, out, error = run_egvs("sensors", "AT129")
+    assert (code, out) == (2, "")
+    assert "unknown sensor 'AT129'. Did you mean AT128?" in error

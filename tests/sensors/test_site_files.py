@@ -116,9 +116,11 @@ def test_reports_misspelt_column_once_for_all_rows(mini: Path, tmp_path: Path, r
     ("name", "hint"),
     [
         *((name, "Use z_m, the sensor's z in the world frame in metres") for name in
-          ("height", "height_m", "Height (m)", "heights_m", "height_ft", "mounting-height", "altitude_m")),
+          ("height", "height_m", "Height (m)", "heights_m", "height_ft", "mounting-height", "altitude_m",
+           "alt", "Elevation (m)", "elev", "h", "height above ground")),
         *((name, "Use yaw_deg, counter-clockwise from east: 90 minus the degrees clockwise from north") for name in
-          ("heading", "heading_deg", "azimuth", "bearing", "Bearing [deg]", "orientation_deg")),
+          ("heading", "heading_deg", "azimuth", "bearing", "Bearing [deg]", "orientation_deg",
+           "direction")),
         *((name, "Use pitch_deg, positive for nose up: minus the degrees by which the sensor is tilted") for name in
           ("tilt", "tilt_deg", "downtilt_deg")),
         *((name, "Use sensor, with a name from `egvs sensors`") for name in ("lidar", "sensor_model")),

@@ -14,42 +14,40 @@ from egvs.core.progress import no_progress
 from egvs.studies import accuracy, study_settings
 from egvs.studies.accuracy import AccuracyStudy, StudyOptions
 from egvs.studies.measurement import SettingRunner
-from egvs.studies.score_errors import SettingResult
+from egvs.studies.recommendation import SettingResult, Tolerance
 from egvs.studies.study_settings import Setting, SettingValues
 
 ROOT = Path(__file__).resolve().parents[2]
-MEASURED = {
-    "seconds",
-    "seconds_spread",
-    "busy_s",
-    "repeats",
-    "statics_s",
-    "scan_s",
-    "traffic_s",
-    "tpog_s",
-    "score_s",
-    "peak_mb",
-}
-RESTED = MEASURED | {"front", "recommended"}
+MEASURED = {"seconds", "statics_s", "scan_s", "traffic_s", "tpog_s", "score_s", "front", "recommended"}
 """Columns that depend on measured times."""
 
 FEW_VALUES = SettingValues(
+    traffic_parts=(0.5,),
+    traffic_factors=(2, 4),
+    steps_s=(0.5,),
+    frame_periods_s=(1.0,),
     voxels_m=(1.0,),
     gammas=(2.0,),
-    frame_periods_s=(1.0,),
+    detectors=False,
     unnamed_effects=False,
     traffic_options=False,
-    traffic_seeds=0,
 )
 
 
 def run_study(
-    path: Path, sets: list[str], out: Path, *, budget_s: float = 600.0, listener: Any = None, **options: Any
+    path: Path,
+    sets: list[str],
+    out: Path,
+    *,
+    budget_s: float = 600.0,
+    listener: Any = None,
+    tolerance: Tolerance = Tolerance(1.0),  # noqa: B008  (frozen)
+    **options: Any,
 ) -> AccuracyStudy:
     """Run a study of a few settings."""
-    values = {"tolerance": 0.02, "repeats": 2, "values": FEW_VALUES, **options}
+    values = {"values": FEW_VALUES, **options}
     return accuracy.run_accuracy_study(
-        path, sets, out, StudyOptions(budget_s=budget_s, **values), listener=listener or accuracy.ignore_setting
+        path, sets, out, StudyOptions(tolerance, budget_s, **values), listener=listener or accuracy.ignore_setting
     )
 
 
@@ -58,7 +56,7 @@ def make_runner(path: Path, out: Path, *sets: str) -> SettingRunner:
 
 
 def settings_by_name(path: Path, *sets: str) -> dict[str, Setting]:
-    return {setting.name: setting for setting in study_settings.list_settings(egvs.load(path, sets))}
+    return {setting.name: setting for setting in study_settings.list_variants(egvs.load(path, sets))}
 
 
 def count_progress(calls: list[str]) -> Callable[[str, int, int], None]:
@@ -79,5 +77,5 @@ def shares(path: Path, sets: list[str], out: Path, weight: float = 1.0) -> np.nd
 
 
 def compared(study: AccuracyStudy) -> list[tuple[object, ...]]:
-    names = [f for f in SettingResult.__dataclass_fields__ if f not in RESTED]
-    return sorted(tuple(getattr(row, name) for name in names) for row in study.rows)
+    names = [f for f in SettingResult.__dataclass_fields__ if f not in MEASURED]
+    return sorted(tuple(str(getattr(row, name)) for name in names) for row in study.rows)

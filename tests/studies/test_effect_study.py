@@ -62,24 +62,38 @@ def test_range_limit_beyond_region_has_little_effect_before_a_run(mini: Path) ->
         assert ("100% of returns" in statuses[1]) == (state == "little")
 
 
+def changes_of_runs(before: Path, after: Path, score: str) -> list[float]:
+    """Return relative changes of a score in units, or differences of shares in percentage points, the least first."""
+    old, new = (readers.read_scores(out / "scores.parquet").to_pylist() for out in (before, after))
+    whole = [row[score] if score == "egvs" else 1.0 for row in old]
+    changes = [100 * (b[score] - a[score]) / of for a, b, of in zip(old, new, whole, strict=True)]
+    return sorted(changes, key=abs)
+
+
 @pytest.mark.slow
-def test_expected_changes_equal_those_of_runs(mini: Path, tmp_path: Path) -> None:
-    plain = tmp_path / "plain"
-    egvs.run(egvs.load(mini), plain)
-    before = {row["site"]: row["egvs"] for row in readers.read_scores(plain / "scores.parquet").to_pylist()}
-    statuses = tried_statuses(mini, plain)
+@pytest.mark.parametrize(
+    ("rank_by", "noun", "unit"),
+    [("egvs", "EGVS", "%"), ("expected_detections", "the share of vehicles found", " percentage points")],
+)
+def test_expected_changes_equal_those_of_runs(mini: Path, tmp_path: Path, rank_by: str, noun: str, unit: str) -> None:
+    plain, ranked = tmp_path / "plain", f"score.rank_by='{rank_by}'"
+    egvs.run(egvs.load(mini, [ranked]), plain)
+    statuses = tried_statuses(mini, plain, ranked)
     for name, words in (
         ("dropout", "share=0.1"),
         ("moving_occlusion", "method='frames'"),
         ("divergence", "sub_beams=7"),
     ):
-        egvs.run(egvs.load(mini, [f"effects.{name}.{words}"]), tmp_path / name)
-        rows = readers.read_scores(tmp_path / name / "scores.parquet").to_pylist()
-        changes = sorted((row["egvs"] / before[row["site"]] - 1 for row in rows), key=abs)
-        assert f"EGVS by {changes[0]:+.1%} to {changes[-1]:+.1%}" in statuses[name].change, name
+        egvs.run(egvs.load(mini, [ranked, f"effects.{name}.{words}"]), tmp_path / name)
+        changes = changes_of_runs(plain, tmp_path / name, rank_by)
+        expected = f"{noun} by {changes[0]:+.1f} to {changes[-1]:+.1f}{unit}"
+        if abs(changes[-1]) < 0.1:
+            expected = f"{noun} by less than 0.1{unit}"
+        assert expected in statuses[name].change, name
         assert "measured on 2 of 2 sites, with the last run's traffic" in statuses[name].change
     assert statuses["dropout"].why.endswith("; tried with share = 0.1")
     assert statuses["foliage"].change == ""
+    assert (statuses["moving_occlusion"].state == "little") == (rank_by == "expected_detections")
 
 
 @pytest.mark.slow
@@ -189,7 +203,7 @@ def test_cost_of_effect_is_difference_with_and_without_it(
     """For named effects: the scenario less without it; for others: with it less the scenario."""
     scenario = egvs.load(mini, ["effects.rain.rate_mm_h=20"])
     rows = [
-        {"setting": name, "seconds": seconds, "error": 0.1, "tau": 0.9, "regret": 0.0}
+        {"setting": name, "seconds": seconds, "error": 0.1, "tau": 0.9, "loss_points": 0.0}
         for name, seconds in (("scenario", 5.0), ("without rain", 4.0), ("with divergence", 12.0), ("gamma 2", 5.0))
     ]
     metadata = {"inputs": files.hash_json(scenario_dependencies(scenario))}

@@ -35,11 +35,11 @@ def test_repeat_with_other_bytes_is_an_error(mini: Path, tmp_path: Path) -> None
     times = json.loads(cost.read_text().replace('"tpog.parquet": "', '"tpog.parquet": "0'))
     cost.write_text(files.to_json_text(files.add_checksum(times)))
     with pytest.raises(RunError, match="wrote bytes that differ"):
-        runner.time_again("tpog", original, trial)
+        runner.time_again("tpog", original, trial.stages["tpog"])
 
 
 def test_thinned_beams_score_as_if_each_hit_counted_twice(mini: Path, tmp_path: Path) -> None:
-    thin = next(s for s in study_settings.list_settings(egvs.load(mini)) if s.name == "every 2nd azimuth")
+    thin = next(s for s in study_settings.list_variants(egvs.load(mini)) if s.name == "every 2nd azimuth")
     scenario = egvs.load(mini, thin.overrides)
     thinned_shares = shares(mini, list(thin.overrides), tmp_path / "out")
     tpog = egvs.read_tpog(tmp_path / "out" / "tpog.parquet")
@@ -55,7 +55,7 @@ def test_thinned_beams_score_as_if_each_hit_counted_twice(mini: Path, tmp_path: 
 
 def test_thinned_beams_are_weighted_with_infinite_gamma(mini: Path, tmp_path: Path) -> None:
     runner = make_runner(mini, tmp_path / "out", "score.gamma=inf")
-    thinned_shares = {s.name: s for s in study_settings.list_settings(runner.scenario(SCENARIO_AS_IS))}
+    thinned_shares = {s.name: s for s in study_settings.list_variants(runner.scenario(SCENARIO_AS_IS))}
     complete, thin = (np.array(runner.run(thinned_shares[name]).shares) for name in ("scenario", "every 2nd azimuth"))
     assert np.abs(thin / complete - 1).max() < 0.1
 
@@ -72,10 +72,23 @@ def test_cached_stages_count_with_their_original_time_until_they_are_measured(mi
     Store.default().prune(-1)
     assert plain.run(SCENARIO_AS_IS) == scores  # standard errors too, which a cached stage does not contain
     cached = runner.stage_times("tpog", scores.stages["tpog"])
-    runner.time_again("tpog", SCENARIO_AS_IS, scores)
+    runner.time_again("tpog", SCENARIO_AS_IS, scores.stages["tpog"])
     timed = runner.stage_times("tpog", scores.stages["tpog"])
     assert (timed.repeats, len(timed.seconds)) == (1, 1)
     assert timed.seconds != cached.seconds
+
+
+def test_stages_of_another_run_are_measured_again(mini: Path, tmp_path: Path) -> None:
+    """The first run in a clone compiles: its times are not those of the scenario."""
+    egvs.run(egvs.load(mini), tmp_path / "run")
+    runner = make_runner(mini, tmp_path / "out")
+    keys = runner.run_stages(SCENARIO_AS_IS)
+    assert all(runner.stage_times(name, key).repeats == 0 for name, key in keys.items())
+    seconds = runner.measure_stages(SCENARIO_AS_IS)
+    for name, key in keys.items():
+        times = runner.stage_times(name, key)
+        assert (times.repeats, times.busy_s) == (1, (seconds[name],))
+    assert runner.measure_stages(SCENARIO_AS_IS) == seconds  # measured once
 
 
 def test_result_of_another_program_version_is_ignored(
@@ -95,7 +108,7 @@ def test_results_with_different_weights_are_saved_separately(mini: Path, tmp_pat
     """With infinite gamma, unweighted scores of every second beam are half as large."""
     runner = make_runner(mini, tmp_path, "score.gamma=inf")
     thin = next(
-        s for s in study_settings.list_settings(runner.scenario(SCENARIO_AS_IS)) if s.name == "every 2nd azimuth"
+        s for s in study_settings.list_variants(runner.scenario(SCENARIO_AS_IS)) if s.name == "every 2nd azimuth"
     )
     plain = replace(thin, weight=1.0)
     assert np.array(runner.run(thin).shares) == pytest.approx(2 * np.array(runner.run(plain).shares))
@@ -132,7 +145,7 @@ def test_memory_is_measured_above_what_the_program_holds(
     trial = runner.run(setting)
     plain = runner.stage_times("tpog", trial.stages["tpog"]).peak_mb
     monkeypatch.setattr(tpog, "STAGE", replace(tpog.STAGE, run=greedy))
-    runner.time_again("tpog", setting, trial)
+    runner.time_again("tpog", setting, trial.stages["tpog"])
     assert plain < 200
     assert runner.stage_times("tpog", trial.stages["tpog"]).peak_mb == pytest.approx(plain + 381, abs=60)
     assert held[0] == 1.0

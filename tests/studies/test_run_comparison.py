@@ -6,8 +6,10 @@ The expected numbers are read from the artefacts of small runs.
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import pytest
@@ -16,6 +18,7 @@ from scipy.stats import kendalltau
 
 import egvs
 from egvs.artefacts.run_record import RunRecord
+from egvs.cli import console as cli_console
 from egvs.cli import study_tables
 from egvs.core.errors import InputError
 from egvs.core.files import add_checksum
@@ -282,6 +285,7 @@ def by_pole(*runs: ComparedRun) -> run_comparison.Comparison:
 def printed_text(comparison: run_comparison.Comparison, width: int, monkeypatch: pytest.MonkeyPatch) -> str:
     console = Console(width=width, record=True, markup=False, highlight=False)
     monkeypatch.setattr(study_tables, "console", lambda *_, **__: console)
+    monkeypatch.setattr(cli_console, "console", lambda *_, **__: console)
     study_tables.print_comparison(comparison)
     return console.export_text()
 
@@ -337,7 +341,60 @@ def test_prints_how_to_set_costs_or_what_one_more_point_costs(monkeypatch: pytes
     assert "PRICE" not in text
     text = printed_text(by_pole(replace(a, costs=costs), made_run("B", *mounts("u", 0.95))), 160, monkeypatch)
     assert """'costs.sensor={"s" = PRICE, "u" = PRICE}'""" in text
-    assert SENSOR_EVIDENCE.split(".")[0] in text
+    assert SENSOR_EVIDENCE in " ".join(text.split())
+
+
+@pytest.mark.parametrize("width", [80, 160])
+def test_sentences_are_broken_between_words(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    a, b = made_run("A", *mounts("s", 0.9)), made_run("B", *mounts("t", 0.95))
+    lines = printed_text(by_pole(a, b), width, monkeypatch).splitlines()
+    first = next(number for number, line in enumerate(lines) if line.startswith("How far to trust this"))
+    paragraph = lines[first : lines.index("", first)]
+    assert len(paragraph) > 2
+    assert max(map(len, paragraph)) <= width
+    assert " ".join(line.rstrip() for line in paragraph) == SENSOR_EVIDENCE
+
+
+@pytest.mark.parametrize(("width", "is_table"), [(80, False), (160, True)])
+def test_settings_that_differ_are_sentences_where_the_table_is_too_wide(
+    width: int, is_table: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = [f"a sensor with a long name {number}" for number in range(4)]
+    runs = [
+        made_run(run_comparison.run_label(number), *mounts("s", 0.9), **{"sites.replace_sensor": name})
+        for number, name in enumerate(names)
+    ]
+    comparison = replace(by_pole(*runs), differences=tuple(run_comparison.find_differences(runs)))
+    text = printed_text(comparison, width, monkeypatch).split("what differs")[1]
+    assert max(map(len, text.splitlines())) <= width
+    for name in names:
+        assert name in " ".join(text.split())
+    assert ("sites.replace_sensor: A a sensor" in text) != is_table
+
+
+def test_many_runs_agree_or_not_with_the_first_one_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    def pairs(number_of_runs: int) -> set[str]:
+        runs = [made_run(run_comparison.run_label(n), *mounts("s", 0.9, 0.8)) for n in range(number_of_runs)]
+        comparison = by_pole(*runs)
+        agreements = [run_comparison.compare_rankings(a, b, "pole") for a, b in combinations(runs, 2)]
+        text = printed_text(replace(comparison, agreements=tuple(agreements)), 160, monkeypatch)
+        assert ("only pairs with A" in text) == (number_of_runs > 5)
+        return set(re.findall(r"^(\w, \w) ", text, re.MULTILINE))
+
+    assert pairs(5) == {f"{a}, {b}" for a, b in combinations("ABCDE", 2)}
+    assert pairs(6) == {f"A, {other}" for other in "BCDEF"}
+
+
+def test_tables_name_the_reference_of_their_differences(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first run for poles; the sensor that finds least, or the cheapest, for sensors."""
+    a, b = made_run("A", *mounts("s", 0.9)), made_run("B", *mounts("t", 0.95))
+    text = printed_text(by_pole(a, b), 160, monkeypatch)
+    assert "B - A" in text
+    assert "differences of the best mounts from A are" in text
+    assert "from s" in next(line for line in text.splitlines() if line.startswith("sensor"))
+    costs = CostsConfig(sensor={"s": 6000.0, "t": 1000.0})
+    text = printed_text(by_pole(replace(a, costs=costs), replace(b, costs=costs)), 160, monkeypatch)
+    assert "from t" in next(line for line in text.splitlines() if line.startswith("sensor"))
 
 
 def test_costs_of_the_command_line_replace_those_of_the_run(mini: Path, tmp_path: Path, run_egvs) -> None:

@@ -1,41 +1,11 @@
-"""Errors and rankings with ties; the recommended setting is the cheapest, or a familiar one that is nearly as cheap."""
+"""Errors and rankings with ties."""
 
 from __future__ import annotations
-
-from dataclasses import fields
 
 import numpy as np
 import pytest
 
 from egvs.studies import score_errors
-from egvs.studies.score_errors import SettingResult
-
-BLANK = {"str": "", "float": 0.0, "int": 0, "bool": False}
-
-
-def row(setting: str, seconds: float, judged: float = 0.01, **more: object) -> SettingResult:
-    blank = {field.name: BLANK[str(field.type)] for field in fields(SettingResult)}
-    kind = "scenario" if setting == "own" else "approximates"
-    return SettingResult(**{**blank, "setting": setting, "kind": kind, "seconds": seconds, "judged": judged, **more})
-
-
-@pytest.mark.parametrize(
-    ("rows", "expected"),
-    [
-        ([row("own", 10.0), row("thin", 8.5)], "own"),  # saves 15 %
-        ([row("own", 10.0), row("thin", 8.0)], "thin"),  # saves 20 %
-        ([row("own", 10.0, judged=0.03), row("thin", 9.9)], "thin"),
-        ([row("own", 10.0), row("usual", 9.0, default=True), row("thin", 8.5)], "own"),
-        ([row("own", 20.0), row("usual", 9.0, default=True), row("thin", 8.5)], "usual"),
-        ([row("own", 20.0), row("usual", 15.0, default=True), row("thin", 8.5)], "thin"),
-        ([row("own", 10.0, judged=0.03), row("usual", 9.0, judged=0.03, default=True)], None),
-    ],
-)
-def test_recommends_familiar_setting_unless_another_saves_a_fifth(
-    rows: list[SettingResult], expected: str | None
-) -> None:
-    chosen = [marked.setting for marked in score_errors.mark_pareto_front(rows, 0.02) if marked.recommended]
-    assert chosen == ([] if expected is None else [expected])
 
 
 def test_rank_agreement_best_sites_and_regret_with_ties() -> None:

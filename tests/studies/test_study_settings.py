@@ -57,14 +57,6 @@ def test_scaling_lengthens_each_period(
     assert frames_of(egvs.load(split, [*overrides, *period])) == frames
 
 
-def test_reference_lengthens_every_period(split: Path) -> None:
-    reference = study_settings.reference_setting(egvs.load(split), 8)
-    assert frames_of(egvs.load(split, reference.overrides)) == [3200, 6400]
-    names = {setting.name for setting in study_settings.traffic_settings(egvs.load(split))}
-    assert {"240 frames", "2400 frames", "4800 frames, step 0.5 s"} <= names | {"240 frames"}
-    assert "1200 frames" not in names
-
-
 def test_periods_of_finished_files_are_not_scaled(mini: Path) -> None:
     file = mini / "scenario.toml"
     day, night = ('name = "a"\nlength_s = 12\n', 'name = "b"\nbegin_s = 12\nlength_s = 8\n')
@@ -75,12 +67,12 @@ def test_periods_of_finished_files_are_not_scaled(mini: Path) -> None:
     assert study_settings.counted_frames(scenario) == 24 + 16
     assert study_settings.traffic_length_overrides(scenario, 2, 0.5) == (0, ())
     assert study_settings.traffic_length_overrides(scenario, 1, 0.5) == (40, ())
-    assert list(study_settings.traffic_settings(scenario)) == []
+    assert not {s.knob for s in study_settings.list_variants(scenario)} & {"period", "step"}
 
 
 def test_parameters_of_other_effect_method_are_not_varied(mini: Path) -> None:
     sets = ['effects.moving_occlusion.method="independent"']
-    names = {s.name for s in study_settings.list_settings(egvs.load(mini, sets))}
+    names = {s.name for s in study_settings.list_variants(egvs.load(mini, sets))}
     assert not {name for name in names if name.startswith("moving_occlusion")}
     assert "without moving_occlusion" in names
 
@@ -91,7 +83,7 @@ def test_thinned_catalogue_sensor_has_a_subset_of_its_beams(mini: Path, sensor: 
     from egvs.sensors.sensor import CATALOGUE, resolve_sensor
 
     complete = CATALOGUE[sensor]
-    for setting in study_settings.list_settings(egvs.load(mini, [f"sites.sensor={sensor}"])):
+    for setting in study_settings.list_variants(egvs.load(mini, [f"sites.sensor={sensor}"])):
         if setting.knob not in ("azimuth", "channels"):
             continue
         thin = resolve_sensor(sensor, egvs.load(mini, [f"sites.sensor={sensor}", *setting.overrides]).sensors, "")
@@ -104,8 +96,8 @@ def test_effects_are_left_out_and_their_quality_is_varied(mini: Path, tmp_path: 
     sets = ["effects.moving_occlusion.frames=500"]
     settings = settings_by_name(mini, *sets)
     assert settings["without moving_occlusion"].kind == study_settings.MEASURES
-    assert settings["moving_occlusion frames 0"].baseline == study_settings.SCENARIO  # all frames, the finest
-    assert settings["moving_occlusion frames 50"].baseline == "moving_occlusion frames 0"
+    assert settings["moving_occlusion frames 0"].kind == study_settings.APPROXIMATES
+    assert "moving_occlusion frames 50" in settings
     assert "moving_occlusion frames 500" not in settings
     bare = make_runner(mini, tmp_path / "out", *sets).run(settings["without moving_occlusion"])
     assert bare.shares == pytest.approx(shares(mini, [], tmp_path / "plain"))
@@ -115,12 +107,12 @@ def test_tries_unnamed_effects_that_act_in_the_scene(mini: Path) -> None:
     """Divergence needs no parameter; rain does; articulated vehicles do not occur."""
     with_ = {
         s.name: s
-        for s in study_settings.list_settings(egvs.load(mini))
+        for s in study_settings.list_variants(egvs.load(mini))
         if s.name.startswith(study_settings.WITH_PREFIX)
     }
     assert {"with divergence", "with moving_occlusion"} <= with_.keys()
     assert not {"with rain", "with articulated", "with slope", "with range_limit"} & with_.keys()
-    rated = study_settings.list_settings(
+    rated = study_settings.list_variants(
         egvs.load(mini, ["sites.sensor=VLP-16"])
     )  # it has a rated range, the scenario's sensor has none
     assert "with range_limit" in {s.name for s in rated}
@@ -128,7 +120,7 @@ def test_tries_unnamed_effects_that_act_in_the_scene(mini: Path) -> None:
         egvs.load(mini, s.overrides).effects.named.keys() == {s.name.removeprefix(study_settings.WITH_PREFIX)}
         for s in with_.values()
     )
-    named = {s.name for s in study_settings.list_settings(egvs.load(mini, ["effects.divergence={}"]))}
+    named = {s.name for s in study_settings.list_variants(egvs.load(mini, ["effects.divergence={}"]))}
     assert {"without divergence", "divergence sub_beams 19"} <= named
     assert "with divergence" not in named
 
@@ -136,27 +128,13 @@ def test_tries_unnamed_effects_that_act_in_the_scene(mini: Path) -> None:
 def test_measured_scans_are_not_thinned(mini: Path) -> None:
     (mini / "points.csv").write_text("x_m,y_m,z_m\n12,5,0.5\n")
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m,points\npole_a,10,12,3,points.csv\npole_b,30.5,-12,3,\n")
-    assert not {"azimuth", "channels"} & {s.knob for s in study_settings.list_settings(egvs.load(mini))}
+    assert not {"azimuth", "channels"} & {s.knob for s in study_settings.list_variants(egvs.load(mini))}
 
 
 @pytest.mark.parametrize("name", ["nishishinjuku", "ingolstadt", "roundabout"])
 def test_settings_are_valid_scenarios(name: str) -> None:
     folder = ROOT / "scenarios" / name
-    settings = study_settings.list_settings(egvs.load(folder))
+    settings = study_settings.list_variants(egvs.load(folder))
     assert len({s.name for s in settings}) == len(settings)
     for setting in settings:
         assert egvs.load(folder, setting.overrides)
-        assert setting.baseline in {s.name for s in settings}
-
-
-def test_default_setting_has_default_frames_period_and_step() -> None:
-    """The shipped junction has a frame period of 0.25 s; the default is 1 s."""
-    folder = ROOT / "scenarios" / "nishishinjuku"
-    scenario = egvs.load(folder)
-    settings = [
-        s.name
-        for s in study_settings.list_settings(scenario)
-        if study_settings.is_default(egvs.load(folder, s.overrides), scenario)
-    ]
-    assert settings == ["5000 frames every 1 s"]
-    assert study_settings.is_default(*[egvs.load(folder, ["traffic.frame_period_s=1.0"])] * 2)

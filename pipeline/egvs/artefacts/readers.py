@@ -6,6 +6,7 @@ table.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,6 +63,13 @@ class LocationVisibility:
     share: float
     se: float
 
+    def in_words(self) -> str:
+        """Return the location, the share found with its standard error, and the number of vehicles, in one phrase."""
+        share = f"{self.share:.0%}"
+        if not math.isnan(self.se):
+            share = f"{100 * self.share:.0f} ± {100 * self.se:.0f}%"
+        return f"{self.words} ({share} of {self.vehicles:,} vehicles)"
+
 
 @dataclass(frozen=True, eq=False)
 class SiteBlindspots:
@@ -116,7 +124,7 @@ class SiteBlindspots:
             return f"no vehicle in the region of interest, so none that {self.site} misses"
         if not self.worst:
             return f"{self.site}: {self.overall.share:.0%} of the vehicles are found, on no listed lane fewer"
-        worst = "; ".join(f"{location.words} ({location.share:.0%})" for location in self.worst[:2])
+        worst = "; ".join(location.in_words() for location in self.worst[:2])
         return f"{self.site}: fewest vehicles are found here: {worst}"
 
 

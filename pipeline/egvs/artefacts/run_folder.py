@@ -10,7 +10,14 @@ from pathlib import Path
 from typing import overload
 
 STAGE_NAMES = ("check", "statics", "scan", "traffic", "tpog", "score", "report")
-"""In the order of execution: checks come first, and the fast stages come before SUMO runs."""
+"""In the order of execution. Errors are reported in this order as well, although SUMO starts before the check ends."""
+
+
+RUNS = Path("runs")
+"""The folder of all runs for which no other is given."""
+
+UNCHANGED_PATTERN = ".unchanged-*.json"
+"""Names of what runs printed (:mod:`egvs.runs.unchanged`); a hash of the command takes the place of the star."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +65,7 @@ class RunFolder:
     run_record = RunFile("run.json", "run")
     lock = RunFile(".lock", "run")
     digests = RunFile(".digests.json", "run")
+    pending = RunFile(".pending", "run", is_folder=True)
 
     statics = RunFile("statics.ply", "statics")
     scans = RunFile("scans.parquet", "scan")

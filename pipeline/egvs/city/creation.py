@@ -77,8 +77,6 @@ ROADS_FILE = "roads.net.xml"
 IMPORT_FILE = "import.json"
 """What was created, assumed and left out."""
 
-_MIN_ARMS = 3
-
 _CROSSING_SPEED_M_S, _WARMUP_STEP_S = 8.0, 60.0
 """The warm-up lasts until a vehicle could have crossed the network at this speed, in whole steps."""
 
@@ -318,7 +316,7 @@ def choose_junctions(streets: Streets, which: str, within: BaseGeometry | None) 
     for junction in sorted(streets.junctions, key=lambda j: (-j.lanes_in, -j.area.area, j.id)):
         if which == SIGNALISED and not junction.signalised:
             left_out.setdefault(NO_SIGNALS, []).append(junction.id)
-        elif junction.arms < _MIN_ARMS:
+        elif not junction.is_crossing:
             left_out.setdefault(TOO_FEW_ARMS, []).append(junction.id)
         elif within is not None and not within.contains(Point(junction.at_m)):
             left_out.setdefault(NEAR_RIM, []).append(junction.id)
@@ -366,7 +364,7 @@ def _nearest_junction(streets: Streets, lat_deg: float, lon_deg: float) -> _Near
     if math.isfinite(point.x + point.y):
         for junction in sorted(streets.junctions, key=lambda j: j.id):
             junction_m = point.distance(junction.area)
-            if junction.arms >= _MIN_ARMS and junction_m < nearest.distance_m:
+            if junction.is_crossing and junction_m < nearest.distance_m:
                 nearest = _NearestJunction(junction, junction_m)
     return nearest
 

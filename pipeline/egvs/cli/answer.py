@@ -1,11 +1,12 @@
 """What ``egvs run`` prints at its end: the answer to "which pole?" in a few lines.
 
 First the verdict, then the best poles, each with its best mount, the lanes where the best site finds fewest vehicles,
-what was assumed, and the path of the report.
+what was assumed, further reasons to be careful, and the path of the report.
 """
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -22,7 +23,7 @@ from egvs.cli import stage_summary
 from egvs.cli.console import Column, console, make_table, print_sentences
 from egvs.cli.options import DEFAULT_POLES
 from egvs.core.errors import Diagnostic, collect_warnings
-from egvs.report import ranking, sections
+from egvs.report import ranking, reliability, sections
 from egvs.report.formatting import ScoreLabel, join_names
 from egvs.report.ranking import Pole, RankedSite, Ranking
 from egvs.report.sensor_results import range_note
@@ -55,13 +56,18 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
     else:
         for warning in collect_warnings([summary]):
             out.print(str(warning))
+    sentences = []
     if on_road := sections.describe_poles_on_road(ranked.poles[: sections.NAMED_POLES], _check_warnings(record)):
-        out.print(f"Before you trust this ranking: {join_names(on_road)}.")
+        sentences.append(f"Before you trust this ranking: {join_names(on_road)}.")
     if assumed := sections.describe_assumptions(scenario, "ranking"):
-        out.print(assumed)
+        sentences.append(assumed)
+    sentences += reliability.describe_reliability(ranked)
     sensors = [site.sensor for site in ranked.sites]
     if note := range_note(sensors, is_modelled=scenario.effects.range_limit is not None):
-        out.print(note)
+        sentences.append(note)
+    print_sentences(sentences)
+    if ranked.best[0].score > 0 and len(set(sensors)) == 1:
+        out.print(f"Which sensor? {shlex.join(['egvs', 'compare', str(folder), '--sensors', 'NAME,NAME'])} (or all)")
     out.print(f"report: {run_folder.report}")
 
 
@@ -82,23 +88,25 @@ def _print_ranking(
     out: Console, folder: Path, ranked: Ranking, scenario: Scenario, record: RunRecord, poles: int | None
 ) -> None:
     """Print the verdict, the best poles, the lanes seen worst, and how the order by EGVS differs."""
-    out.print(verdict(ranked, ranking.recorded_frames_hint(scenario, ranked, record.stages)))
+    print_sentences([verdict(ranked, ranking.recorded_frames_hint(scenario, ranked, record.stages))])
     validation = sections.ValidationSummary.read(folder, record.stages)
     if validation is not None and validation.check.warning:
         print_sentences([f"{validation.check.warning} See {RunFolder(folder).report}#detected"])
     summary = record.stages["score"].summary
     if ranked.by.counts_vehicles and "weights" in summary:
-        out.print(f"Vehicles are weighted: {summary['weights']}.")
+        print_sentences([f"Vehicles are weighted: {summary['weights']}."])
     out.print()
     out.print(poles_table(ranked, PeriodRanking.read(folder), poles))
     if poles is not None and len(ranked.poles) > poles:
         others = len(ranked.poles) - poles
         out.print(f"{others} more {'pole' if others == 1 else 'poles'}: --all lists all")
     out.print()
+    if location := _location(ranked.best[0]):
+        out.print(location)
     if missed := summary.get("missed"):
-        out.print(missed)
+        print_sentences([missed])
     if other_order := order_by_egvs(ranked, parquet.read_metadata(RunFolder(folder).scores, "scores")):
-        out.print(other_order)
+        print_sentences([other_order])
 
 
 def verdict(ranked: Ranking, hint: str = "") -> str:
@@ -109,13 +117,23 @@ def verdict(ranked: Ranking, hint: str = "") -> str:
     return " ".join(sentences)
 
 
+def _location(site: RankedSite) -> str:
+    """Return the geographic position of a site, in one sentence; empty where the scenario has no reference system."""
+    if site.latitude_deg is None or site.longitude_deg is None:
+        return ""
+    return f"{site.site} is at latitude {site.latitude_deg:.6f}, longitude {site.longitude_deg:.6f}."
+
+
 def order_by_egvs(ranked: Ranking, metadata: Mapping[str, Any]) -> str:
     """Return how the order by EGVS differs, in one sentence; empty where the EGVS ranks or has the same best site."""
     by_egvs = sections.best_sites(ranked.sites, "egvs")
     if ranked.by.name == "egvs" or not by_egvs or by_egvs[0] == ranked.sites[0].site:
         return ""
     names = join_names(by_egvs)
-    return f"By the EGVS with gamma {metadata['gamma']:g}, the best sites are {names}."
+    return (
+        f"The EGVS (gamma {metadata['gamma']:g}) measures the traffic's uncertainty that beams cross, not "
+        f"{ranked.by.noun}, and prefers {names}."
+    )
 
 
 def poles_table(ranked: Ranking, by_period: PeriodRanking | None, count: int | None) -> Table:

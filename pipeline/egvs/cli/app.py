@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 from typer.models import CommandInfo
 
 from egvs._version import __version__
-from egvs.cli import city, exit, place, sources, validate
+from egvs.cli import city, compare, exit, place, sources, validate
 from egvs.cli import options as cli_options
 from egvs.cli.options import (
     DEFAULT_POLES,
@@ -29,15 +30,18 @@ from egvs.cli.options import (
     Top,
     Verbose,
 )
+from egvs.cli.quick_help import QuickHelpCommand, QuickHelpGroup
 from egvs.core.errors import InputError
 
 if TYPE_CHECKING:
+    from egvs.cli import repeat
     from egvs.scenario.model import Scenario
     from egvs.studies.effect_study import EffectStatus
 
 
 app = typer.Typer(
     name="egvs",
+    cls=QuickHelpGroup,
     help="Rank candidate sites for roadside LiDARs by how well they see the traffic.",
     no_args_is_help=True,
     add_completion=False,
@@ -78,6 +82,8 @@ def _load(path: Path, overrides: Sequence[str] | None, out: Path | None) -> tupl
 
 # ---- a run and its stages
 
+NO_STAGE_RAN = "no stage ran: no input has changed since the last run"
+
 
 @app.command()
 def run(
@@ -92,14 +98,39 @@ def run(
     rehash: Rehash = False,
 ) -> None:
     """Run all stages in order and print the best poles; stages with unchanged inputs are skipped."""
-    from egvs.cli.console import ProgressDisplay
+    from egvs.cli import repeat
+
+    def run_all() -> repeat.FinishedRun:
+        return _run_all_stages(scenario, out, set_, jobs, audit=audit, poles=None if all_ else top, verbose=verbose,
+                               rehash=rehash)  # fmt: skip
+
+    if audit or rehash:
+        run_all()
+        return
+    words = ["run", str(scenario), str(out), *(set_ or ()), str(top), str(all_), str(verbose)]
+    repeat.print_or_run(words, out, run_all)
+
+
+def _run_all_stages(
+    path: Path,
+    out: Path | None,
+    overrides: Sequence[str] | None,
+    jobs: int | None,
+    *,
+    audit: bool,
+    poles: int | None,
+    verbose: bool,
+    rehash: bool,
+) -> repeat.FinishedRun:
+    """Run all stages and print the results; ``poles`` is the number of poles in the answer, None for all."""
+    from egvs.cli.console import ProgressDisplay, skipped_stages_text
 
     stage_options = {"score": {"audit": True}} if audit else None
     with ProgressDisplay("run", with_details=verbose) as screen:
-        from egvs.cli import answer, run_tables
+        from egvs.cli import answer, repeat, run_tables
         from egvs.runs import digest_cache, run
 
-        loaded, folder = _load(scenario, set_, out)
+        loaded, folder = _load(path, overrides, out)
         screen.flow_source = answer.flow_source(loaded)
         if rehash:
             digest_cache.forget_digests(folder)
@@ -107,13 +138,15 @@ def run(
             loaded, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event, options=stage_options
         )
     if not screen.any_stage_ran:
-        screen.say("no stage ran: no input has changed since the last run")
-    if all_:
+        screen.say(NO_STAGE_RAN)
+    if poles is None:
         run_tables.print_scores(folder, record, before_answer=True)
     if verbose:
         run_tables.print_costs(folder, record)
     run_tables.print_audit(record)
-    answer.print_answer(folder, loaded, record, poles=None if all_ else top)
+    answer.print_answer(folder, loaded, record, poles=poles)
+    text = skipped_stages_text(record, with_details=verbose, flow_source=screen.flow_source)
+    return repeat.FinishedRun(folder, record, f"{text}{NO_STAGE_RAN}\n")
 
 
 @app.command()
@@ -273,41 +306,7 @@ def verify(
 # ---- studies
 
 
-@app.command()
-def compare(
-    runs: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="RUN...", help="Folders of finished runs; one is enough if its sites have several sensors."
-        ),
-    ],
-    by: Annotated[
-        Literal["pole", "site"] | None,
-        typer.Option(
-            help="Compare the best mounts of each pole, or sites of the same name. By default sites if no pole has "
-            "several sites and the common sites have the same mount in all runs, else poles."
-        ),
-    ] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="costs.KEY=VALUE",
-            help="Override a cost, e.g. 'costs.sensor={\"VLP-32C\"=8000}' (repeatable).",
-        ),
-    ] = None,
-    top: Top = None,
-) -> None:
-    """Compare runs or sensors: the best mount of each pole, what one more percentage point costs, and settings."""
-    from egvs.cli.console import ProgressDisplay
-
-    with ProgressDisplay("compare") as screen:
-        from egvs.cli import study_tables
-        from egvs.studies import run_comparison
-
-        run_comparison.check_distinct(runs)
-        comparison = run_comparison.compare_runs(runs, by, set_ or (), screen.progress)
-    study_tables.print_comparison(comparison, top)
+app.command()(compare.compare)
 
 
 @app.command()
@@ -316,31 +315,38 @@ def accuracy(
     out: Out = None,
     set_: Set = None,
     jobs: Jobs = None,
-    tolerance: Annotated[float, typer.Option(help="Largest relative error to accept, e.g. 0.02 for 2 %.")] = 0.02,
-    budget: Annotated[str, typer.Option(metavar="TIME", help="Time limit of the study, e.g. 60s or 10m.")] = "10m",
+    tolerance: Annotated[
+        float,
+        typer.Option(metavar="POINTS", help="Largest expected loss to accept, in percentage points of vehicles found."),
+    ] = 1.0,
+    score_tolerance: Annotated[
+        float | None,
+        typer.Option(metavar="SHARE", help="Instead, the largest relative error of the score, e.g. 0.02 for 2 %."),
+    ] = None,
+    budget: Annotated[str, typer.Option(metavar="TIME", help="Time limit of the study, e.g. 60s or 10m.")] = "2m",
     seeds: Annotated[
-        int,
+        int | None,
         typer.Option(
-            min=0,
-            help="Check the standard errors with this many further runs (at least 2), whatever the budget.",
+            min=1, help="Number of seeds of the scenario (at least 4), whatever the budget; by default 4 to 8."
         ),
-    ] = 0,
+    ] = None,
 ) -> None:
-    """Measure error against run time for many settings, and recommend the cheapest within a tolerance."""
+    """Price the choice of a pole: seconds and expected loss of many settings, and the cheapest one that suffices."""
     from egvs.cli.console import ProgressDisplay
 
     budget_s = cli_options.duration_s(budget)
     _, folder = sources.open_source(scenario, set_, out)
     with ProgressDisplay("accuracy") as screen:
-        from egvs.cli import study_tables
+        from egvs.cli import accuracy_table
         from egvs.studies.accuracy import StudyOptions, run_accuracy_study
+        from egvs.studies.recommendation import Tolerance
 
-        options = StudyOptions(tolerance, budget_s, seeds, jobs)
+        options = StudyOptions(Tolerance(tolerance, score_tolerance), budget_s, seeds, jobs)
         study = run_accuracy_study(
             scenario, set_ or (), folder, options, progress=screen.progress, listener=screen.setting_event
         )
     path, overrides, _ = sources.run_arguments(scenario, set_, out)
-    study_tables.print_study(study, cli_options.shell_command("run", path, overrides))
+    accuracy_table.print_study(study, cli_options.shell_command("run", path, overrides))
 
 
 @app.command()
@@ -527,12 +533,21 @@ app.add_typer(city.app, name="city")
 
 
 @app.command()
-def sensors() -> None:
-    """List the sensor catalogue."""
+def sensors(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[NAME...]", help="Print all that is known of these sensors, with the sources."),
+    ] = None,
+) -> None:
+    """List the sensor catalogue; with names, print the details and sources of these sensors."""
     from egvs.cli import run_tables
-    from egvs.sensors.sensor import CATALOGUE
+    from egvs.sensors.sensor import CATALOGUE, check_sensor_names
 
-    run_tables.print_sensors(CATALOGUE.values())
+    if not names:
+        run_tables.print_sensors(CATALOGUE.values())
+        return
+    check_sensor_names(names, (), "egvs sensors")
+    run_tables.print_sensor_details([CATALOGUE[name] for name in names])
 
 
 @app.command(cls=cli_options.PolesCommand)
@@ -543,7 +558,11 @@ def new(
     ],
     at: Annotated[
         str | None,
-        typer.Option(metavar="LAT,LON", help="Use the junction nearest to this point instead of the largest one."),
+        typer.Option(
+            metavar="LAT,LON",
+            help="Use the junction at this point, or else the nearest one (one with signals within 40 m is preferred;"
+            " at most 100 m away), instead of the largest one with signals.",
+        ),
     ] = None,
     lefthand: Annotated[bool, typer.Option("--lefthand", help="Traffic drives on the left.")] = False,
     walk: Annotated[bool, typer.Option("--walk", help="Include sidewalks and crossings, for pedestrians.")] = False,
@@ -571,7 +590,7 @@ def new(
         typer.Option(
             metavar="every METRES",
             help="Candidate poles along all kerbs of the region at this spacing, e.g. every 20m, instead of at most 12"
-            " near the junction.",
+            " spread over the arms of the junction.",
         ),
     ] = None,
 ) -> None:
@@ -610,10 +629,11 @@ def runs(
     ] = None,
 ) -> None:
     """List the runs: settings that differ from the scenario, the best site, size and age; the latest run first."""
+    from egvs.artefacts.run_folder import RUNS
     from egvs.cli import run_list_table
-    from egvs.runs import run_list, run_names
+    from egvs.runs import run_list
 
-    run_list_table.print_runs(run_list.list_runs(folder or run_names.RUNS))
+    run_list_table.print_runs(run_list.list_runs(folder or RUNS))
 
 
 @app.command()
@@ -672,6 +692,8 @@ def _group_commands() -> None:
     app.registered_commands.sort(key=lambda info: order.index(command_name(info)))
     for command in app.registered_commands:
         command.rich_help_panel = group_of[command_name(command)]
+        if command.cls is TyperCommand:
+            command.cls = QuickHelpCommand
     for group in app.registered_groups:
         assert group.name is not None
         group.rich_help_panel = group_of[group.name]

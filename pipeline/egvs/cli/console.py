@@ -5,18 +5,19 @@ Results go to standard output; progress, stage lines and warnings go to standard
 
 from __future__ import annotations
 
+import io
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, TextIO, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-from egvs.artefacts.run_record import StageRecord
+from egvs.artefacts.run_record import RunRecord, StageRecord
 from egvs.cli import stage_summary
 from egvs.core.errors import collect_warnings
 
@@ -185,6 +186,8 @@ class ProgressDisplay:
     with_details
         Whether all that a stage reports is printed, and every warning; otherwise one short line for each stage, and the
         first :data:`MAX_WARNINGS` warnings.
+    file
+        Where lines are printed, without a bar; standard error when None.
 
     Attributes
     ----------
@@ -196,14 +199,19 @@ class ProgressDisplay:
         What the simulated flows are compared with; set by commands that know the scenario.
     """
 
-    def __init__(self, verb: str = "", *, with_details: bool = False) -> None:
+    def __init__(self, verb: str = "", *, with_details: bool = False, file: TextIO | None = None) -> None:
         self.any_stage_ran = False
         self.hidden_warnings = 0
         self.flow_source = stage_summary.COUNTS
         self._with_details = with_details
-        self._warnings = 0
+        self._warnings: set[str] = set()
         self._stage = verb
-        self._console = Console(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=True)
+        self._part = ""
+        self._part_seconds = 0.0
+        self._part_states: set[str] = set()
+        self._console = Console(
+            file=file, stderr=file is None, highlight=False, markup=False, emoji=False, soft_wrap=True
+        )
         self._bar = Progress(
             TextColumn("{task.description}", markup=False),  # names may have brackets
             BarColumn(),
@@ -212,7 +220,7 @@ class ProgressDisplay:
             transient=True,
         )
         self._task = self._bar.add_task(verb, total=None)
-        self._has_bar = sys.stderr.isatty()
+        self._has_bar = file is None and sys.stderr.isatty()
 
     def __enter__(self) -> ProgressDisplay:
         if self._has_bar:
@@ -230,33 +238,64 @@ class ProgressDisplay:
         if not self._has_bar:
             return
         count = f"{done}/{total}" if total else str(done)
-        self._bar.update(self._task, description=f"{self._stage}: {what} {count}", completed=done)
+        self._bar.update(self._task, description=f"{self._part}{self._stage}: {what} {count}", completed=done)
         self._bar.tasks[0].total = total or None  # update() takes None for "unchanged"
 
+    def begin_part(self, title: str) -> None:
+        """Begin one of several runs of a command: its stages are shown on the bar only, after the title."""
+        self._part = f"{title}: "
+        self._part_seconds = 0.0
+        self._part_states = set()
+
+    def end_parts(self, verb: str) -> None:
+        """Show what follows the last of several runs under the name of the command."""
+        self._part = ""
+        self._stage = verb
+        self._show_stage(verb)
+
+    @property
+    def part_duration(self) -> str:
+        """Time of the stages of this part that ran, "from store" or "unchanged"."""
+        if "done" in self._part_states:
+            return f"{self._part_seconds:.1f} s"
+        return "from store" if "fetched" in self._part_states else "unchanged"
+
     def stage_event(self, stage: str, state: str, record: StageRecord | None) -> None:
-        """Print one line when a stage ends; a :data:`egvs.runs.run.StageListener`."""
+        """Print one line when a stage ends; a :data:`egvs.runs.run.StageListener`.
+
+        A warning is printed once, also if several stages or runs have it.
+        """
         self._stage = stage
+        self._part_states.add(state)
         if state in ("runs", "fetched"):
             self.any_stage_ran = True
         self._show_stage(stage)
         if record is None:
             return
 
+        if state == "done":
+            self._part_seconds += record.cost.seconds
+        if not self._part:
+            self._print_stage(stage, state, record)
+        for warning in map(str, collect_warnings([record.summary])):
+            if warning in self._warnings:
+                continue
+            self._warnings.add(warning)
+            if len(self._warnings) > MAX_WARNINGS and not self._with_details:
+                self.hidden_warnings += 1
+            else:
+                self.say(f"warning: {warning}")
+
+    def _print_stage(self, stage: str, state: str, record: StageRecord) -> None:
         lines = stage_summary.stage_lines(
             stage, state, record, with_details=self._with_details, flow_source=self.flow_source
         )
         for line in lines:
             self.say(line)
-        for warning in collect_warnings([record.summary]):
-            self._warnings += 1
-            if self._warnings > MAX_WARNINGS and not self._with_details:
-                self.hidden_warnings += 1
-            else:
-                self.say(f"warning: {warning}")
 
     def _show_stage(self, stage: str) -> None:
         if self._has_bar:
-            self._bar.update(self._task, description=stage, completed=0)
+            self._bar.update(self._task, description=f"{self._part}{stage}", completed=0)
             self._bar.tasks[0].total = None
 
     def setting_event(self, name: str, state: str, details: dict[str, Any]) -> None:
@@ -275,3 +314,21 @@ class ProgressDisplay:
     def say(self, line: str) -> None:
         """Print a line above the bar."""
         self._console.print(line)
+
+
+def skipped_stages_text(record: RunRecord, *, with_details: bool, flow_source: str) -> str:
+    """Return what a :class:`ProgressDisplay` prints when all stages of a record are skipped.
+
+    Parameters
+    ----------
+    record
+        A complete run.
+    with_details, flow_source
+        As of the display.
+    """
+    text = io.StringIO()
+    with ProgressDisplay("run", with_details=with_details, file=text) as screen:
+        screen.flow_source = flow_source
+        for stage, stage_record in record.stages.items():
+            screen.stage_event(stage, "skipped", stage_record)
+    return text.getvalue()

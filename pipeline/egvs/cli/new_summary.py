@@ -58,7 +58,7 @@ def print_new_city(city: NewCity) -> None:
 
 def _scenario_lines(scenario: NewScenario) -> Iterator[tuple[str, str]]:
     junction, roi = scenario.junction, scenario.roi
-    arms = f"{junction.arms} arms, {junction.lanes_in} incoming lanes"
+    arms = f"{_count('arm', junction.arms)}, {_count('incoming lane', junction.lanes_in)}"
     yield "junction", f"{junction.title}: {arms}; {_position(scenario)}"
     yield "region", f"{roi.size_m[0]:g} m x {roi.size_m[1]:g} m x {junctions.ROI_HEIGHT_M:g} m around the junction"
     yield "streets", _describe_streets(scenario.streets)
@@ -141,7 +141,7 @@ def _scenario_warnings(scenario: NewScenario) -> Iterator[str]:
         distance = f"{scenario.from_at_m:,.0f} m from --at"
         yield (
             f"the junction ({scenario.junction.title}) is {distance} and may not be the one that you mean."
-            " Junctions with signals are preferred. Check the position, and that the extract contains the junction."
+            " Check the position, and that the extract contains the junction."
         )
     assumed, per_h = "the traffic is assumed", 0
     if scenario.traffic is not None:

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperCommand
 
+from egvs.cli.quick_help import QuickHelpCommand
 from egvs.core.errors import InputError
 
 ScenarioPath = Annotated[Path, typer.Argument(metavar="SCENARIO", help="Scenario folder, or its scenario.toml.")]
@@ -135,20 +135,23 @@ def pole_spacing_m(rule: str, spacing: str) -> float:
     return spacing_m
 
 
-class PolesCommand(TyperCommand):
-    """A command that accepts ``--poles 20m`` for ``--poles every 20m``."""
+class PolesCommand(QuickHelpCommand):
+    """A command that accepts ``--poles 20m`` and ``--poles "every 20m"`` for ``--poles every 20m``."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Insert the word that is missing."""
+        """Replace a spacing in one word by the two words that the option expects."""
         words: list[str] = []
         for arg in args:
-            option, equals, spacing = arg.partition("=")
-            if option == "--poles" and equals and not math.isnan(_parse_spacing_m(spacing)):
-                words += [option, "every", spacing]
-            elif words[-1:] == ["--poles"] and not math.isnan(_parse_spacing_m(arg)):
-                words += ["every", arg]
+            option, equals, value = arg.partition("=")
+            if option == "--poles" and equals:
+                words.append(option)
+            elif words[-1:] == ["--poles"]:
+                value = arg
             else:
                 words.append(arg)
+                continue
+            spacing = value.removeprefix("every ").strip()
+            words += [value] if math.isnan(_parse_spacing_m(spacing)) else ["every", spacing]
         return super().parse_args(ctx, words)
 
 

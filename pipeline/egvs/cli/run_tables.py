@@ -30,8 +30,9 @@ from egvs.cli.console import (
 )
 from egvs.core.errors import collect_warnings
 from egvs.report import sections
-from egvs.report.formatting import SCORE_LABELS, ScoreLabel
+from egvs.report.formatting import SCORE_LABELS, ScoreLabel, format_probability
 from egvs.report.ranking import Pole, RankedSite, companion_score, group_by_pole
+from egvs.scenario.effects_config import RangeLimitParameters
 
 if TYPE_CHECKING:
     from egvs.runs.store import Store, StoreEntry
@@ -41,6 +42,8 @@ if TYPE_CHECKING:
 
 _RESULT_FILE_WIDTH = 150
 _LIST_FILE_WIDTH = 160
+DARK_REFLECTIVITY = RangeLimitParameters().reflectivity
+"""Reflectivity of dark vehicles, the default of the effect ``range_limit``."""
 _EXTRA_COLUMNS_WIDTH = 130
 """Terminals at least this wide show the entropy seen and the companion score next to the ranking score."""
 
@@ -210,10 +213,8 @@ def _format_score(label: ScoreLabel, site: RankedSite) -> str:
 def _format_beats_next(site: RankedSite, last: RankedSite) -> str:
     if site.beats_next is None or site is last:
         return "-"
-    if site.is_separable:
-        return f"{site.beats_next:.0%}"
-    below_limit = min(site.beats_next, DISTINCT_PROBABILITY - 0.01)  # 0.896 is not shown as 90%
-    return f"~ {below_limit:.0%}"
+    text = format_probability(site.beats_next)
+    return text if site.is_separable else f"~ {text}"
 
 
 def poles_table(sites: Sequence[RankedSite], top: int | None = None) -> Table:
@@ -294,37 +295,82 @@ def print_demo_hints(results: Path) -> None:
 
 
 def print_sensors(sensors: Iterable[Sensor]) -> None:
-    """Print the sensor catalogue."""
+    """Print the sensor catalogue: one line per sensor, and what the columns mean."""
     columns: list[Column[Sensor]] = [
         Column("sensor", lambda sensor: sensor.name, "left"),
         Column("rings", lambda sensor: str(sensor.channels or "-")),
-        Column("elevation deg", lambda sensor: _format_span(sensor.elevation_span_deg)),
-        Column("azimuth deg", lambda sensor: _format_span(sensor.azimuth_span_deg)),
-        Column("step deg", lambda sensor: format_or_dash(sensor.azimuth_step_deg, ".6g")),
+        Column("view deg", _format_view),
         Column("beams", lambda sensor: str(sensor.beams)),
         Column("range m", lambda sensor: f"{sensor.range_m:g}"),
         Column("rated m", _format_rating),
-        Column("source", _format_sensor_source, "left", wrap=True),
+        Column(f"at {DARK_REFLECTIVITY:.0%}", lambda sensor: format_or_dash(dark_range_m(sensor), ".0f")),
     ]
     print_table(columns, sensors, file_width=_LIST_FILE_WIDTH)
+    print_sentences(
+        (
+            "view: azimuth x elevation. beams: of one turn or frame of 0.1 s, so ten times as many points per second.",
+            "range: no beam is longer. rated: how far the maker's sensor still detects a target of this reflectivity; "
+            f"the last column converts it to {DARK_REFLECTIVITY:.0%} (dark vehicles), so that sensors can be compared. "
+            "Scores use it only with --set effects.range_limit={}.",
+            "The catalogue has no prices: set yours with --set 'costs.sensor={\"NAME\" = PRICE}' or in [costs].",
+            "egvs sensors NAME prints sources and assumptions; egvs compare SCENARIO --sensors NAME,NAME compares.",
+        )
+    )
 
 
-def _format_span(span_deg: tuple[float, float] | None) -> str:
-    if span_deg is None:
+def dark_range_m(sensor: Sensor) -> float | None:
+    """Return the rated range for dark vehicles, by the power law of ``range_limit``; None where none is stated."""
+    if sensor.rated_range_m is None:
+        return None
+    return sensor.rated_range_m * math.sqrt(DARK_REFLECTIVITY / sensor.rated_reflectivity)
+
+
+def print_sensor_details(sensors: Iterable[Sensor]) -> None:
+    """Print all that is known of some sensors, with the sources."""
+    for sensor in sensors:
+        step = ""
+        if sensor.azimuth_step_deg is not None:
+            step = f", {sensor.azimuth_step_deg:.4g} deg apart in azimuth"
+        rings = f"{sensor.channels} rings" if sensor.channels else "scan pattern without rings"
+        divergence_mrad = " x ".join(f"{angle:g}" for angle in sensor.divergence_mrad)
+        lines = [
+            sensor.name,
+            f"  beams: {sensor.beams} of one turn or frame; {rings}{step}",
+            f"  view: azimuth {_format_azimuths(sensor)} deg, elevation {_format_elevations(sensor)} deg",
+            f"  range: {sensor.range_m:g} m; rated: {_format_rating(sensor, ' m')}",
+            f"  laser: {sensor.wavelength_nm:g} nm, divergence {divergence_mrad} mrad, range noise "
+            f"{sensor.range_sigma_m:g} m",
+            f"  source: {sensor.source}",
+        ]
+        if sensor.assumed:
+            lines.append(f"  assumed: {sensor.assumed}")
+        print_sentences(lines)
+
+
+def _format_view(sensor: Sensor) -> str:
+    """Return the field of view, azimuth x elevation, e.g. "360 x -25 to 15"."""
+    width_deg = 360.0
+    if sensor.azimuth_span_deg is not None:
+        width_deg = sensor.azimuth_span_deg[1] - sensor.azimuth_span_deg[0]
+    return f"{width_deg:.3g} x {_format_elevations(sensor)}"
+
+
+def _format_elevations(sensor: Sensor) -> str:
+    low_deg, high_deg = sensor.elevation_span_deg
+    return f"{low_deg:.3g} to {high_deg:.3g}"
+
+
+def _format_azimuths(sensor: Sensor) -> str:
+    if sensor.azimuth_span_deg is None:
         return "360"
-    return f"{span_deg[0]:.4g} to {span_deg[1]:.4g}"
+    first_deg, last_deg = sensor.azimuth_span_deg
+    return f"{first_deg:.4g} to {last_deg:.4g}"
 
 
-def _format_rating(sensor: Sensor) -> str:
+def _format_rating(sensor: Sensor, unit: str = "") -> str:
     if sensor.rated_range_m is None:
         return "-"
-    return f"{sensor.rated_range_m:g} at {sensor.rated_reflectivity:.0%}"
-
-
-def _format_sensor_source(sensor: Sensor) -> str:
-    if not sensor.assumed:
-        return sensor.source
-    return f"{sensor.source}. Assumed: {sensor.assumed}"
+    return f"{sensor.rated_range_m:g}{unit} at {sensor.rated_reflectivity:.0%}"
 
 
 def print_effects(effects: Sequence[EffectStatus], costs: Mapping[str, EffectCost] | None = None) -> None:
@@ -354,10 +400,8 @@ def _format_cost(cost: EffectCost | None) -> str:
 def _format_cost_change(cost: EffectCost | None) -> str:
     if cost is None:
         return ""
-    best = "same best site"
-    if cost.regret != 0:
-        best = f"different best site, regret {cost.regret:.2%}"
-    return f"scores by up to {cost.change:.1%}; {best}; tau {cost.tau:.2f}"
+    loss = f"the choice loses {cost.loss_points:.2f} points"
+    return f"scores by up to {cost.change:.1%}; {loss}; tau {cost.tau:.2f}"
 
 
 def print_ablation(changes: Sequence[EffectChange]) -> None:

@@ -1,14 +1,12 @@
-"""What ``egvs accuracy`` and ``egvs compare`` print.
+"""What ``egvs compare`` prints.
 
-An accuracy study: what each setting costs, how far its scores are off, and which setting is recommended. A comparison:
-runs in columns and poles or sites in rows, the agreement of their rankings, the best mount of each sensor and what one
+Runs in columns and poles or sites in rows, the agreement of their rankings, the best mount of each sensor and what one
 more percentage point costs, and the differences of settings.
 """
 
 from __future__ import annotations
 
 import json
-import math
 import shlex
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -18,8 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
-from egvs.cli import study_conclusions
-from egvs.cli.console import NARROW, WIDE, Column, console, format_or_dash, make_table, print_sentences
+from egvs.cli.console import NARROW, Column, console, format_or_dash, make_table, print_sentences
 from egvs.report.formatting import SCORE_LABELS, join_names
 from egvs.report.ranking import RankedSite, share_of_limit
 from egvs.report.sensor_results import (
@@ -32,180 +29,29 @@ from egvs.report.sensor_results import (
     range_note,
 )
 from egvs.runs.run_names import effect_state
-from egvs.studies.study_settings import MEASURES, SCENARIO, TRAFFIC
-from egvs.studies.traffic_options import OPTION_KNOBS, SeedSpread
 
 if TYPE_CHECKING:
-    from egvs.studies.accuracy import AccuracyStudy
     from egvs.studies.run_comparison import ComparedPole, ComparedRun, Comparison, Difference, RankAgreement
-    from egvs.studies.score_errors import SeedComparison, SettingResult
-
-_MAX_FRAMES = 1e8
-"""Traffic with more frames than this cannot be simulated in practice."""
-
-
-def print_study(study: AccuracyStudy, command: str) -> None:
-    """Print an accuracy study; ``command`` runs the scenario, and is printed with the recommended options."""
-    out = console(WIDE)
-    is_wide = out.width >= WIDE - 10
-    approximations = [row for row in study.rows if row.kind not in (MEASURES, TRAFFIC)]
-    measures = [row for row in study.rows if row.kind == MEASURES]
-
-    title = "settings that approximate the same number, compared with the reference"
-    out.print(_settings_table(title, approximations, has_errors=True, is_wide=is_wide))
-    out.print(f"reference: {_describe_reference(study)}. * on the Pareto front of time and error, = recommended")
-    out.print(f"seconds are medians; stages were repeated {study.repeated} times to measure them\n")
-    if measures:
-        title = "settings that measure something else, compared with the scenario on the same traffic"
-        out.print(_settings_table(title, measures, has_errors=False, is_wide=is_wide))
-    _print_traffic_options(out, study)
-    if not is_wide:
-        out.print("for seconds by stage, memory and disk, widen the window or see accuracy.parquet")
-
-    for reason in dict.fromkeys(study.skipped.values()):
-        names = [name for name, skip_reason in study.skipped.items() if skip_reason == reason]
-        out.print(f"skipped, {reason}: {'; '.join(names)}")
-    if study.seeds is not None:
-        _print_seeds(out, study.seeds)
-    for better, worse, probability, frames in study.neighbours[:3]:
-        needed = "no feasible amount of traffic would tell them apart"
-        if frames < _MAX_FRAMES:
-            needed = f"about {frames:,.0f} frames would tell them apart"
-        out.print(f"{better} above {worse}: probability {probability:.0%}; {needed}")
-    for path in study.files:
-        out.print(str(path))
-    out.print()
-    out.print(_describe_recommendation(study, command))
-    if not study.all_zero:
-        print_sentences(study_conclusions.accuracy_conclusion(study))
-
-
-def _print_traffic_options(out: Console, study: AccuracyStudy) -> None:
-    """Print what SUMO's step, sublanes and routing cost and change, and what other seeds change."""
-    options = [row for row in study.rows if row.kind == TRAFFIC]
-    if not options:
-        return
-    (scenario,) = (row for row in study.rows if row.kind == SCENARIO)
-    spread = SeedSpread.from_rows(options)
-    options.sort(key=lambda row: (OPTION_KNOBS.index(row.knob), row.setting))
-    title = "options of the traffic: another draw of it, compared with the scenario, beside other seeds"
-    columns = study_conclusions.traffic_columns(scenario, spread)
-    out.print(make_table(columns, [scenario, *options], width=out.width, title=title))
-    if math.isnan(spread.tpog):
-        out.print("fewer than two other seeds ran within the budget, so the spread of seeds is unknown")
-        return
-    explained = "busy: processor seconds, and times those of the scenario; TPOG: change of the occupancy"
-    out.print(f"{explained}; scores: largest change")
-    limits = f"TPOG {spread.tpog:.1%}, scores {spread.score:.1%}"
-    out.print(f"spread of {spread.seeds} other seeds: up to {limits}")
-
-
-def _describe_reference(study: AccuracyStudy) -> str:
-    for row in study.rows:
-        if row.kind == "reference":
-            factor = study.reference_factor
-            return f"traffic {factor} times as long, with a largest standard error of {row.error_se:.2%}"
-    return "the scenario itself, because longer traffic is not available, or not within the budget"
-
-
-def _settings_table(title: str, rows: Sequence[SettingResult], *, has_errors: bool, is_wide: bool) -> Table:
-    """Return settings with their times and errors; in narrow terminals without details."""
-    columns: list[Column[SettingResult]] = [
-        Column("", lambda row: "*" * row.front + "=" * row.recommended, "left"),
-        Column("setting", lambda row: row.setting, "left", wrap=not is_wide),
-        Column("seconds", lambda row: f"{row.seconds:.2f}"),
-    ]
-    if is_wide:
-        columns += [
-            Column("+-", lambda row: f"{row.seconds_spread:.2f}"),
-            Column("busy", lambda row: f"{row.busy_s:.2f}"),
-            Column("traffic", lambda row: f"{row.traffic_s:.2f}"),
-            Column("tpog", lambda row: f"{row.tpog_s:.2f}"),
-            Column("scan", lambda row: f"{row.scan_s:.2f}"),
-            Column("score", lambda row: f"{row.score_s:.2f}"),
-            Column("memory MB", lambda row: f"{row.peak_mb:.0f}"),
-            Column("disk MB", lambda row: f"{row.bytes / 1e6:.1f}"),
-        ]
-    if has_errors:
-        columns.append(Column("error", lambda row: f"{row.error:.2%}"))
-        columns.append(Column("std error", lambda row: _format_share(row.error_se)))
-    if has_errors and is_wide:
-        columns.append(Column("vs baseline", lambda row: f"{row.own_change:.2%}"))
-    columns.append(Column("tau", lambda row: f"{row.tau:.3f}"))
-    if is_wide:
-        columns.append(Column("rho", lambda row: f"{row.rho:.3f}"))
-    columns.append(Column("same", _format_same_sites))
-    columns.append(Column("regret", lambda row: f"{row.regret:.2%}"))
-    return make_table(columns, rows, title=title)
-
-
-def _format_share(share: float) -> str:
-    return "-" if math.isnan(share) else f"{share:.2%}"
-
-
-def _format_same_sites(row: SettingResult) -> str:
-    """Return whether the best site and the best three sites are those of the reference."""
-    same = []
-    if row.best_kept:
-        same.append("best")
-    if row.best_three_kept:
-        same.append("three")
-    return ", ".join(same) or "-"
-
-
-def _print_seeds(out: Console, seeds: SeedComparison) -> None:
-    """Print how much the scores of independent runs scatter, beside their standard errors."""
-    columns = [
-        Column[int]("site", lambda i: seeds.sites[i], "left"),
-        Column[int]("between runs", lambda i: f"{seeds.between[i]:.0f}"),
-        Column[int]("standard error", lambda i: f"{seeds.within[i]:.0f}"),
-        Column[int]("bias", lambda i: f"{seeds.bias[i]:.0f}"),
-        Column[int]("expected bias", lambda i: f"{seeds.expected_bias[i]:.0f}"),
-    ]
-    title = f"{seeds.seeds} independent runs of {seeds.frames} frames, bit"
-    out.print(make_table(columns, range(len(seeds.sites)), title=title, truncate=True))
-    out.print(f"90 % intervals contain the pooled score of all runs in {seeds.covered:.1%} of cases")
-
-
-def _describe_recommendation(study: AccuracyStudy, command: str) -> str:
-    from egvs.studies.score_errors import MIN_TIME_SAVING
-
-    if study.all_zero:
-        return "every score is 0, so there is nothing to compare: check the region of interest and the traffic"
-    candidates = [row for row in study.rows if row.kind in ("approximates", "scenario")]
-    best = study.best
-    if best is None and len(candidates) == 1:
-        return (
-            f"the budget only covered the scenario's own setting, with {_describe_error(candidates[0])}: "
-            "increase --budget"
-        )
-    if best is None:
-        nearest = min(candidates, key=lambda row: row.judged)
-        within = f"no setting is within {study.tolerance:.2%}"
-        return f"{within}; the closest is {nearest.setting!r}, with {_describe_error(nearest)}"
-
-    note = ""
-    if any(row.judged <= study.tolerance and row.seconds < best.seconds for row in candidates):
-        note = f" (cheaper settings save less than {MIN_TIME_SAVING:.0%})"
-    sentence = (
-        f"recommended within {study.tolerance:.2%}: {best.setting}, {best.seconds:.2f} s{note}, {_describe_error(best)}"
-    )
-    return f"{sentence}\n  {command} {best.overrides}".rstrip()
-
-
-def _describe_error(row: SettingResult) -> str:
-    """Name the two columns of the table of which the larger one must be within the tolerance."""
-    standard_error = "unknown" if math.isnan(row.error_se) else f"{row.error_se:.2%}"
-    return f"error {row.error:.2%} and standard error {standard_error}"
-
 
 _FILE_WIDTH = 190
+_ALL_PAIRS_RUNS = 5
+"""With more runs, the agreement of rankings is printed for pairs with the first run only."""
 _COLUMN_GAP = 2
 """Space that rich leaves between two columns."""
 
 
-def print_comparison(comparison: Comparison, top: int | None = None) -> None:
-    """Print runs side by side; only the ``top`` poles or sites of the first run, if given."""
+def print_comparison(comparison: Comparison, top: int | None = None, command: Sequence[str] = ()) -> None:
+    """Print runs side by side.
+
+    Parameters
+    ----------
+    comparison
+        The runs.
+    top
+        How many poles or sites of the first run are printed; all for None.
+    command
+        Words of the command that compares these runs; by default ``egvs compare`` with their folders.
+    """
     out = console(_FILE_WIDTH, soft_wrap=False)
     for run in comparison.runs:
         out.print(f"{run.label}  {run.folder}  ({join_names(run.sensors)})", soft_wrap=True)
@@ -218,13 +64,12 @@ def print_comparison(comparison: Comparison, top: int | None = None) -> None:
     out.print(_agreement_table(comparison))
     out.print()
     if comparison.sensors is not None:
-        _print_sensors(out, comparison, comparison.sensors)
+        _print_sensors(out, comparison, comparison.sensors, command)
     if comparison.differences:
-        out.print(_difference_table(comparison))
+        _print_differences(out, comparison)
     elif len({run.folder for run in comparison.runs}) > 1:
         out.print("their settings and files are the same")
-    for note in comparison.notes:
-        out.print(f"note: {note}", soft_wrap=True)
+    print_sentences(f"note: {note}" for note in comparison.notes)
 
 
 def _result_tables(comparison: Comparison, top: int | None, width: int) -> Iterator[Table]:
@@ -241,7 +86,11 @@ def _result_tables(comparison: Comparison, top: int | None, width: int) -> Itera
 
 def _result_width(comparison: Comparison, runs: Sequence[int], top: int | None, width: int) -> int:
     """Return the width of a table of some runs, if nothing is wrapped."""
-    table = _result_table(comparison, runs, top, width)
+    return _unwrapped_width(_result_table(comparison, runs, top, width))
+
+
+def _unwrapped_width(table: Table) -> int:
+    """Return the width of a table, if nothing is wrapped."""
     widths = []
     for column in table.columns:
         cells = [str(column.header), *(str(cell) for cell in column.cells)]
@@ -326,21 +175,21 @@ def _print_pole_notes(out: Console, comparison: Comparison, top: int | None) -> 
         out.print(f"{len(comparison.poles) - top} more: without --top, all are listed")
     first = comparison.runs[0]
     compared = [run for run in range(1, len(comparison.runs)) if _gaps(comparison, run)]
+    sentences = []
     for run in compared:
         gaps = _gaps(comparison, run)
         better = [gap.is_clear for gap in gaps if gap.value > 0]
         worse = [gap.is_clear for gap in gaps if gap.value < 0]
-        out.print(
+        sentences.append(
             f"{comparison.runs[run].label} against {first.label} at {len(gaps)} common poles: better at {len(better)} "
-            f"(clearly at {sum(better)}), worse at {len(worse)} (clearly at {sum(worse)})",
-            soft_wrap=True,
+            f"(clearly at {sum(better)}), worse at {len(worse)} (clearly at {sum(worse)})"
         )
     if compared:
-        out.print(
-            f"differences of the best mounts are in {difference_unit(first.ranking.best[0])}, ± their standard error; "
-            f"~ it is not clear which is better (probability below {DISTINCT_PROBABILITY:.0%})",
-            soft_wrap=True,
+        sentences.append(
+            f"differences of the best mounts from {first.label} are in {difference_unit(first.ranking.best[0])}, ± "
+            f"their standard error; ~ it is not clear which is better (probability below {DISTINCT_PROBABILITY:.0%})"
         )
+    print_sentences(sentences)
     out.print()
 
 
@@ -352,7 +201,7 @@ def _gaps(comparison: Comparison, run: int) -> list[ScoreDifference]:
 # ---- sensors
 
 
-def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparison) -> None:
+def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparison, command: Sequence[str]) -> None:
     """Print the best mount of each sensor, what it costs, and how far the comparison can be trusted."""
     by = sensors.baseline.site.by
     columns: list[Column[SensorResult]] = []
@@ -367,7 +216,7 @@ def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparis
         columns.append(Column("yaw", lambda result: f"{result.mount.site.yaw_deg:.0f}", min_width=NARROW))
         columns.append(Column("pitch", lambda result: f"{result.mount.site.pitch_deg:z.0f}", min_width=NARROW))
     columns.append(Column(by.head, lambda result: format_score(result.mount.site)))
-    columns.append(Column("difference", lambda result: result.gain_text))
+    columns.append(Column(f"difference\nfrom {sensors.baseline_name}", lambda result: result.gain_text))
     if any(result.mount.cost is not None for result in sensors.results):
         columns.append(Column("cost", lambda result: result.cost_text))
     if sensors.shows_cost_per_point:
@@ -375,17 +224,16 @@ def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparis
     if sensors.shows_cost_per_point and sensors.has_steps:
         columns.append(Column("… from the best cheaper sensor", lambda result: result.step_cost_text, wrap=True))
     out.print(make_table(columns, sensors.results, width=out.width, title="the best mount of each sensor"))
-    out.print(sensors.explanation, soft_wrap=True)
+    print_sentences([sensors.explanation])
     if sensors.unpriced:
-        folders = " ".join(shlex.quote(str(folder)) for folder in dict.fromkeys(run.folder for run in comparison.runs))
+        words = command or ["egvs", "compare", *dict.fromkeys(str(run.folder) for run in comparison.runs)]
         option = costs_option(sensors.sensors if not sensors.has_costs else sensors.unpriced)
-        out.print(
-            f"What one more point costs: egvs compare {folders} {option}, or [costs] in scenario.toml", soft_wrap=True
-        )
+        hint = f"What one more point costs: {shlex.join(words)} {option}, or [costs] in scenario.toml"
+        out.print(hint, soft_wrap=True)  # a command that is broken into lines cannot be copied
     is_modelled = all(run.has_range_limit for run in comparison.runs)
     if note := range_note(sensors.sensors, is_modelled=is_modelled):
-        out.print(note, soft_wrap=True)
-    out.print(sensors.evidence, soft_wrap=True)
+        print_sentences([note])
+    print_sentences([sensors.evidence])
     out.print()
 
 
@@ -450,7 +298,11 @@ def _agreement_table(comparison: Comparison) -> Table:
         Column("best", _format_best_sites, "left", wrap=True),
         Column("regret of the first run's best", lambda pair: format_or_dash(pair.regret_a, ".2%"), wrap=True),
     ]
-    return make_table(columns, comparison.agreements)
+    first = comparison.runs[0].label
+    with_first = [pair for pair in comparison.agreements if pair.a == first]
+    if len(comparison.runs) <= _ALL_PAIRS_RUNS:
+        return make_table(columns, comparison.agreements)
+    return make_table(columns, with_first, caption=f"only pairs with {first}; compare fewer runs for the others")
 
 
 def _format_best_sites(pair: RankAgreement) -> str:
@@ -473,6 +325,20 @@ def _difference_table(comparison: Comparison) -> Table:
     for number, run in enumerate(comparison.runs):
         columns.append(Column(run.label, partial(_format_setting, number), "left"))
     return make_table(columns, comparison.differences)
+
+
+def _print_differences(out: Console, comparison: Comparison) -> None:
+    """Print what differs as a table; if it is wider than the terminal, in a sentence for each setting."""
+    table = _difference_table(comparison)
+    if _unwrapped_width(table) <= out.width:
+        out.print(table)
+        return
+    out.print("what differs")
+    sentences = []
+    for difference in comparison.differences:
+        values = [f"{run.label} {_format_setting(number, difference)}" for number, run in enumerate(comparison.runs)]
+        sentences.append(f"{difference.what}: {', '.join(values)}")
+    print_sentences(sentences)
 
 
 def _format_setting(run: int, difference: Difference) -> str:

@@ -1,6 +1,7 @@
 """Time and memory of a block of code: wall seconds, processor seconds, and peak memory.
 
-Linux can reset the peak; elsewhere it is the highest so far.
+Linux can reset the peak; elsewhere it is the highest so far. Blocks may overlap, also in several threads: processor
+seconds and memory are those of the whole process meanwhile.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import ctypes
 import gc
 import os
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,6 +24,12 @@ _PROC_CLEAR_REFS = Path("/proc/self/clear_refs")
 
 _peak_before_reset_mb = 0.0
 """Highest memory of this process before its peak was last reset."""
+
+_unfinished: dict[int, ResourceUsage] = {}
+"""The blocks that have not ended, by number: a peak that is reset for another block was theirs as well."""
+
+_lock = threading.Lock()
+"""Held while the peak is reset, and while :data:`_unfinished` changes."""
 
 
 @dataclass
@@ -43,7 +51,10 @@ class ResourceUsage:
 @contextmanager
 def measure_usage() -> Iterator[ResourceUsage]:
     """Measure a block; the yielded object is filled at its end."""
-    usage, resettable = ResourceUsage(), _reset_peak()
+    usage = ResourceUsage()
+    with _lock:
+        resettable = _reset_peak()
+        _unfinished[id(usage)] = usage
     usage.held_mb = _status_mb("VmRSS:") if resettable else platform.peak_memory_mb()
     start, busy = time.perf_counter(), _cpu_seconds()
     try:
@@ -51,7 +62,9 @@ def measure_usage() -> Iterator[ResourceUsage]:
     finally:
         usage.seconds = time.perf_counter() - start
         usage.busy_s = _cpu_seconds() - busy
-        usage.peak_mb = _status_mb("VmHWM:") if resettable else platform.peak_memory_mb()
+        with _lock:
+            del _unfinished[id(usage)]
+            usage.peak_mb = max(usage.peak_mb, _status_mb("VmHWM:") if resettable else platform.peak_memory_mb())
 
 
 def process_peak_mb() -> float:
@@ -84,6 +97,9 @@ def _cpu_seconds() -> float:
 def _reset_peak() -> bool:
     global _peak_before_reset_mb
     _peak_before_reset_mb = process_peak_mb()
+    now_mb = peak_memory_of(os.getpid()) or platform.peak_memory_mb()
+    for usage in _unfinished.values():
+        usage.peak_mb = max(usage.peak_mb, now_mb)
     try:
         _PROC_CLEAR_REFS.write_text("5", encoding="utf-8")
     except OSError:

@@ -1,4 +1,4 @@
-"""Threads: how many, and work that is spread over them.
+"""Threads: how many, work that is spread over them, and work that another thread may end.
 
 :func:`map_ordered` returns results in the order of the work, and holds only a few in memory at once.
 """
@@ -9,6 +9,8 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import TypeVar
 
 Item = TypeVar("Item")
@@ -41,3 +43,23 @@ def thread_count(jobs: int | None) -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+_AT_CHECKPOINT: ContextVar[Callable[[], None] | None] = ContextVar("_AT_CHECKPOINT", default=None)
+
+
+@contextmanager
+def at_checkpoints(call: Callable[[], None]) -> Iterator[None]:
+    """Call a function at each :func:`checkpoint` of the block; an error that it raises ends the work."""
+    token = _AT_CHECKPOINT.set(call)
+    try:
+        yield
+    finally:
+        _AT_CHECKPOINT.reset(token)
+
+
+def checkpoint() -> None:
+    """Mark a moment at which this thread waits, and may be told to end."""
+    call = _AT_CHECKPOINT.get()
+    if call is not None:
+        call()

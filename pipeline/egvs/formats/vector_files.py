@@ -20,7 +20,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from egvs.core import plugins
+from egvs.core import files, plugins
 from egvs.core.errors import InputError
 from egvs.core.numbers import parse_decimal
 
@@ -46,7 +46,7 @@ def companion_files(path: Path) -> list[Path]:
     if path.suffix.lower() != ".shp":
         return []
     parts = [path.with_suffix(suffix) for suffix in _SHAPEFILE_PARTS]
-    return [part for part in parts if part.is_file()]
+    return [part for part in parts if files.is_input_file(part)]
 
 
 def read_gis_file(path: Path, geometry: str) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 r"""Choose a junction of a street network, its region of interest, poles along its kerbs, and flows through it.
 
-Steps: :func:`read_streets` turns a SUMO network into :class:`Streets`; :func:`choose_junction`; :func:`region_around`
-it; :func:`kerbside_poles` along the edge of the carriageway; :func:`assumed_flows` through the region.
+Steps: :func:`read_streets` turns a SUMO network into :class:`Streets`; :func:`largest_junction`, or
+:func:`choose_nearby` at a point; :func:`region_around` it; :func:`kerbside_poles` along the edge of the carriageway;
+:func:`assumed_flows` through the region.
 
 World frame: the network's own x (east), y (north) in metres. Longitude and latitude become x, y by the network's
 ``<location>``, as in netconvert:
@@ -22,7 +23,11 @@ https://archive.nptel.ac.in/content/storage2/courses/105101087/08-Ltexhtml/p6/p.
 
 where w is 1 if a route over gates i and j exists, from the fringe of the network to its fringe, that passes no node
 twice, and 0 otherwise. (Without this rule, a U-turn from one carriageway of a street to the other would be a turn like
-any other.) The inflows are met exactly, the outflows as well as possible.
+any other.) At a roundabout, w is also 0 between the two carriageways of one street. The inflows are met exactly, the
+outflows as well as possible.
+
+A roundabout is one junction if it fits the largest region of interest, see :mod:`egvs.importers.roundabouts`. Its area
+contains the central island, so that poles stand around it.
 """
 
 from __future__ import annotations
@@ -32,6 +37,7 @@ import math
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +47,8 @@ from shapely.geometry.base import BaseGeometry
 
 from egvs.core.grid import FloatArray
 from egvs.formats.georeference import WorldFrame
+from egvs.importers import roundabouts
+from egvs.importers.roundabouts import Ring
 from egvs.scenario.traffic_config import CountConfig
 from egvs.traffic import network as road_network
 from egvs.traffic.demand import RouteFinder
@@ -49,6 +57,12 @@ from egvs.world.geolocation import network_world_frame
 
 XY = tuple[float, float]
 """x, y in metres."""
+
+MIN_ARMS = 3
+"""A junction that a user can choose connects at least this number of streets."""
+
+AT_POINT_M, SIGNALS_WITHIN_M, MAX_FROM_POINT_M = 2.0, 40.0, 100.0
+"""Distances from a point: of a junction at the point, of a signalised one that is preferred, and of any."""
 
 ROI_MIN_M, ROI_MAX_M, ROI_STEP_M, ROI_HEIGHT_M = 60.0, 120.0, 10.0, 5.0
 
@@ -94,9 +108,9 @@ class StreetJunction:
     Attributes
     ----------
     id
-        SUMO's id.
+        SUMO's id; that of a roundabout contains the ids of its nodes.
     at_m
-        x, y of the junction's node.
+        x, y of the junction's node, or of the middle of a roundabout.
     area
         Outline, seen from above.
     lanes_in
@@ -107,6 +121,8 @@ class StreetJunction:
         Whether it has traffic lights.
     names
         Names of the streets that meet there, sorted.
+    ring
+        The roundabout; None for any other junction.
     """
 
     id: str
@@ -116,11 +132,28 @@ class StreetJunction:
     arms: int
     signalised: bool
     names: tuple[str, ...]
+    ring: Ring | None = None
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """SUMO's ids of its nodes."""
+        return (self.id,) if self.ring is None else self.ring.nodes
+
+    @property
+    def is_crossing(self) -> bool:
+        """Whether at least three streets meet there."""
+        return self.arms >= MIN_ARMS
+
+    def distance_m(self, point_m: XY) -> float:
+        """Return the distance from a point to its area or its node, whichever is nearer."""
+        return min(float(self.area.distance(Point(point_m))), math.dist(self.at_m, point_m))
 
     @property
     def title(self) -> str:
         """A description such as ``"signalised junction of A Street and B Road"``."""
         kind = "signalised junction" if self.signalised else "junction without signals"
+        if self.ring is not None:
+            kind = "signalised roundabout" if self.signalised else "roundabout"
         if not self.names:
             return kind
         if len(self.names) == 1:
@@ -140,11 +173,14 @@ class Streets:
         The carriageway by edge id: the lanes of each edge at full width, including edges inside junctions.
     junctions
         Junctions with incoming lanes, without dead ends.
+    large_rings
+        Roundabouts that do not fit the largest region of interest; each of their nodes is a junction.
     """
 
     network: Network
     areas: dict[str, BaseGeometry]
     junctions: tuple[StreetJunction, ...]
+    large_rings: tuple[Ring, ...] = ()
 
     @property
     def lane_length_m(self) -> float:
@@ -181,7 +217,7 @@ class Streets:
         edges = tuple(edge for edge in self.network.all_edges if edge.id in areas)
         nodes = tuple(node for node in self.network.junctions if window.intersects(Point(node.at_m)))
         network = replace(self.network, all_edges=edges, connections=(), junctions=nodes)
-        return Streets(network, areas, junctions)
+        return Streets(network, areas, junctions, self.large_rings)
 
     @cached_property
     def _areas_tree(self) -> shapely.STRtree:
@@ -254,7 +290,16 @@ def read_streets(path: Path) -> Streets:
 
     nodes = [node for node in network.junctions if node.incoming_lanes and node.type not in ("internal", "dead_end")]
     junctions = [_make_junction(node, roads_at_node.get(node.id, []), lanes_for_vehicles) for node in nodes]
-    return Streets(network, areas, tuple(junctions))
+
+    large_rings = []
+    for ring in roundabouts.find_rings(network, areas):
+        if ring.side_m > ROI_MAX_M:
+            large_rings.append(ring)
+            continue
+        on_ring = [junction for junction in junctions if junction.id in ring.nodes]
+        junctions = [junction for junction in junctions if junction.id not in ring.nodes]
+        junctions.append(_make_roundabout(ring, on_ring, roads_at_node))
+    return Streets(network, areas, tuple(junctions), tuple(large_rings))
 
 
 def _lane_area(edge: Edge) -> BaseGeometry:
@@ -288,38 +333,106 @@ def _make_junction(node: road_network.Junction, roads: Sequence[Edge], lanes_for
     )
 
 
+def _make_roundabout(
+    ring: Ring, on_ring: Sequence[StreetJunction], roads_at_node: Mapping[str, Sequence[Edge]]
+) -> StreetJunction:
+    """Make one junction of the junctions on a ring."""
+    roads = {road.id: road for node in ring.nodes for road in roads_at_node.get(node, [])}
+    ring_lanes = sum(not lane.is_pavement for edge_id in ring.edges for lane in roads[edge_id].lanes)
+    arms = roundabouts.ring_arms(ring, list(roads.values()))
+    names = {html.unescape(edge.name) for arm in arms for edge in arm if edge.name}
+    return StreetJunction(
+        f"roundabout_{'_'.join(ring.nodes)}",
+        ring.middle_m,
+        ring.area,
+        lanes_in=sum(junction.lanes_in for junction in on_ring) - ring_lanes,
+        arms=len(arms),
+        signalised=any(junction.signalised for junction in on_ring),
+        names=tuple(sorted(names)),
+        ring=ring,
+    )
+
+
 def _ends(road: Edge) -> tuple[str, str]:
     return road.from_node, road.to_node
 
 
-def choose_junction(streets: Streets, at_m: XY | None) -> StreetJunction | None:
-    """Choose the junction nearest to a position, or the largest one.
+def largest_junction(streets: Streets) -> StreetJunction | None:
+    """Return the junction with the most incoming lanes; None where the streets have no junction.
 
     Signalised junctions where at least three streets meet come first, so that pedestrian-only signals are ignored.
     Where there are none, any signals count, then any junction of three streets, then any junction.
+    """
+    crossings = [j for j in streets.junctions if j.is_crossing]
+    signalised = [j for j in streets.junctions if j.signalised]
+    signalised_crossings = [j for j in crossings if j.signalised]
+    candidates = signalised_crossings or signalised or crossings or streets.junctions
+    return min(candidates, key=lambda j: (-j.lanes_in, -j.area.area, j.id), default=None)
+
+
+@dataclass(frozen=True)
+class NearbyJunction:
+    """A junction, and the distance of its area or its node from a point, whichever is nearer."""
+
+    junction: StreetJunction
+    distance_m: float
+
+
+def nearest_junctions(streets: Streets, point_m: XY) -> list[NearbyJunction]:
+    """Return the junctions of at least three streets, the nearest first.
 
     Parameters
     ----------
     streets
-        The streets to choose from.
-    at_m
-        World-frame x, y; None for the junction with the most incoming lanes.
+        The streets.
+    point_m
+        World-frame x, y.
+    """
+    nearby = [NearbyJunction(j, j.distance_m(point_m)) for j in streets.junctions if j.is_crossing]
+    return sorted(nearby, key=lambda near: (near.distance_m, not near.junction.signalised, near.junction.id))
+
+
+def choose_nearby(nearby: Sequence[NearbyJunction]) -> NearbyJunction | None:
+    """Choose the junction that a point stands for.
+
+    It is the junction at the point (within :data:`AT_POINT_M`). Without one, it is the nearest signalised junction
+    within :data:`SIGNALS_WITHIN_M`, otherwise the nearest junction of any kind.
+
+    Parameters
+    ----------
+    nearby
+        From :func:`nearest_junctions`.
 
     Returns
     -------
-    StreetJunction or None
-        None where the streets have no junction.
+    NearbyJunction or None
+        None where no junction is within :data:`MAX_FROM_POINT_M`.
     """
-    crossings = [j for j in streets.junctions if j.arms >= 3]
-    signalised = [j for j in streets.junctions if j.signalised]
-    signalised_crossings = [j for j in crossings if j.signalised]
-    candidates = signalised_crossings or signalised or crossings or streets.junctions
-    if not candidates:
+    if not nearby or nearby[0].distance_m > MAX_FROM_POINT_M:
         return None
-    if at_m is None:
-        return min(candidates, key=lambda j: (-j.lanes_in, -j.area.area, j.id))
-    position = Point(at_m)
-    return min(candidates, key=lambda j: (position.distance(j.area), math.dist(at_m, j.at_m), j.id))
+    if nearby[0].distance_m <= AT_POINT_M:
+        return nearby[0]
+    for near in nearby:
+        if near.junction.signalised and near.distance_m <= SIGNALS_WITHIN_M:
+            return near
+    return nearby[0]
+
+
+def find_again(streets: Streets, junction: StreetJunction, at_m: XY) -> StreetJunction | None:
+    """Return the same junction in streets that were built anew.
+
+    Parameters
+    ----------
+    streets
+        The new streets.
+    junction
+        The junction in the former streets.
+    at_m
+        Its position in the frame of the new ones. The nearest junction is returned if its identifier has changed.
+    """
+    same = [j for j in streets.junctions if j.id == junction.id]
+    candidates = same or streets.junctions
+    return min(candidates, key=lambda j: (math.dist(at_m, j.at_m), j.id), default=None)
 
 
 def region_around(junction: StreetJunction) -> JunctionRegion:
@@ -358,7 +471,8 @@ def kerbside_poles(
     Returns
     -------
     list of KerbsidePole
-        Counter-clockwise around the junction: all locations, or the ``MAX_POLES`` nearest to the junction.
+        Counter-clockwise around the junction: all locations, or ``MAX_POLES``. The arms of the junction then take
+        turns: each adds, of the poles that are nearest to its street, the one nearest to the middle of the junction.
     """
     window = box(*roi.area.buffer(BEYOND_ROI_M, join_style="mitre").bounds)
     surroundings = window.buffer(_SEARCH_M)
@@ -380,7 +494,7 @@ def kerbside_poles(
     center = junction.area.centroid
     poles = _separate_poles(free, (center.x, center.y), spacing_m or SPACING_M)
     if spacing_m is None:
-        poles = poles[:MAX_POLES]
+        poles = _take_turns(poles, _arm_areas(streets, junction))[:MAX_POLES]
     poles.sort(key=lambda p: (math.degrees(math.atan2(center.y - p[1], center.x - p[0])), *p))
     return [KerbsidePole(x, y) for x, y in poles]
 
@@ -390,7 +504,7 @@ def _approaches(streets: Streets, junction: StreetJunction, window: BaseGeometry
     roads = streets.network.edges
     inside = {node.id for node in streets.network.junctions if window.covers(Point(node.at_m))}
 
-    reached = {junction.id}
+    reached = set(junction.nodes)
     while True:
         passable = reached & inside
         neighbours: set[str] = set()
@@ -401,8 +515,36 @@ def _approaches(streets: Streets, junction: StreetJunction, window: BaseGeometry
             break
         reached |= neighbours
 
-    start_nodes = reached & inside | {junction.id}
+    start_nodes = reached & inside | set(junction.nodes)
     return [streets.areas[road.id] for road in roads if not start_nodes.isdisjoint(_ends(road))]
+
+
+def _arm_areas(streets: Streets, junction: StreetJunction) -> list[BaseGeometry]:
+    """Return the carriageway of each arm of a junction, as far as the next node."""
+    roads = [road for road in streets.network.edges if not set(_ends(road)).isdisjoint(junction.nodes)]
+    if junction.ring is not None:
+        arms = roundabouts.ring_arms(junction.ring, roads)
+    else:
+        by_neighbour: dict[str, list[Edge]] = {}
+        for road in roads:
+            neighbour = road.from_node if road.to_node == junction.id else road.to_node
+            by_neighbour.setdefault(neighbour, []).append(road)
+        arms = list(by_neighbour.values())
+    areas = [shapely.union_all([streets.areas[road.id] for road in arm]) for arm in arms]
+    return [area for area in areas if not area.is_empty]
+
+
+def _take_turns(poles: Sequence[XY], arm_areas: Sequence[BaseGeometry]) -> list[XY]:
+    """Sort poles: one of each arm, then a second one of each, and so on; the order within an arm stays."""
+    if not arm_areas:
+        return list(poles)
+    queues: list[list[XY]] = [[] for _ in arm_areas]
+    for pole in poles:
+        point = Point(pole)
+        distances_m = [area.distance(point) for area in arm_areas]
+        queues[distances_m.index(min(distances_m))].append(pole)
+    turns = zip_longest(*queues)
+    return [pole for turn in turns for pole in turn if pole is not None]
 
 
 def _without_islands(area: BaseGeometry) -> BaseGeometry:
@@ -457,7 +599,7 @@ class _Gates:
     connected: FloatArray
 
 
-def assumed_flows(streets: Streets, roi: JunctionRegion) -> list[CountConfig]:
+def assumed_flows(streets: Streets, roi: JunctionRegion, ring: Ring | None = None) -> list[CountConfig]:
     """Assume the traffic through a region from the classes of its streets.
 
     Parameters
@@ -466,13 +608,15 @@ def assumed_flows(streets: Streets, roi: JunctionRegion) -> list[CountConfig]:
         The streets in and around the region.
     roi
         The region of interest.
+    ring
+        The roundabout in it: no vehicle turns back to the street from which it comes.
 
     Returns
     -------
     list of CountConfig
         Vehicles per hour from each gate to each other gate; empty where no street leads through the region.
     """
-    gates = _find_gates(streets, roi)
+    gates = _find_gates(streets, roi, ring)
     inflow_per_h = [edge_flow_h(edge) for edge in gates.entries]
     outflow_per_h = [edge_flow_h(edge) for edge in gates.exits]
     flows_per_h = balance_flows(gates.connected, inflow_per_h, outflow_per_h)
@@ -533,12 +677,13 @@ def _growth_factors(target: FloatArray, current: FloatArray) -> FloatArray:
     return np.divide(target, current, out=np.zeros_like(target), where=current > 0)
 
 
-def _find_gates(streets: Streets, roi: JunctionRegion) -> _Gates:
+def _find_gates(streets: Streets, roi: JunctionRegion, ring: Ring | None) -> _Gates:
     edges = streets.network.edges
-    successors: dict[int, list[int]] = {index: [] for index in _roads_inside(streets, roi)}
+    links = [(source, target) for source, target, turnaround in streets.network.links(_CAR).tolist() if not turnaround]
+    successors: dict[int, list[int]] = {index: [] for index in _with_merging(_roads_inside(streets, roi), links)}
     entered = set()
-    for source, target, is_turnaround in streets.network.links(_CAR).tolist():
-        if not is_turnaround and source in successors and target in successors:
+    for source, target in links:
+        if source in successors and target in successors:
             successors[source].append(target)
             entered.add(target)
 
@@ -551,6 +696,8 @@ def _find_gates(streets: Streets, roi: JunctionRegion) -> _Gates:
         for column, exit_index in enumerate(exits):
             if exit_index not in reachable or edges[exit_index].to_node == edges[entry].from_node:
                 continue
+            if ring is not None and roundabouts.is_same_street(ring, edges[entry], edges[exit_index]):
+                continue
             to_edge = None if exit_index == entry else edges[exit_index].id
             location = routes.locate(edges[entry].id, to_edge, "assumed flows")
             connected[row, column] = routes.has_route_without_loop(location)
@@ -558,13 +705,33 @@ def _find_gates(streets: Streets, roi: JunctionRegion) -> _Gates:
 
 
 def _roads_inside(streets: Streets, roi: JunctionRegion) -> list[int]:
-    """Return the positions of the roads for cars that cover part of the region."""
+    """Return the positions of the roads for cars that cover part of the region, or start and end in it."""
     region = roi.area
     indices = []
     for index, edge in enumerate(streets.network.edges):
-        if edge.lanes_for(_CAR) and streets.areas[edge.id].intersection(region).area >= _MIN_AREA_M2:
+        if not edge.lanes_for(_CAR):
+            continue
+        is_within = region.covers(Point(edge.start_m)) and region.covers(Point(edge.end_m))
+        if is_within or streets.areas[edge.id].intersection(region).area >= _MIN_AREA_M2:
             indices.append(index)
     return indices
+
+
+def _with_merging(roads: Sequence[int], links: Sequence[tuple[int, int]]) -> list[int]:
+    """Add the roads from outside that merge with roads of the region before they enter it, or diverge after it.
+
+    Otherwise the road after the merge would be no gate, because it is entered from the region too.
+    """
+    inside = set(roads)
+    inner_links = [(source, target) for source, target in links if source in inside and target in inside]
+    merged = {target for _, target in inner_links}
+    diverging = {source for source, _ in inner_links}
+    for source, target in links:
+        if target in merged and source not in roads:
+            inside.add(source)
+        if source in diverging and target not in roads:
+            inside.add(target)
+    return sorted(inside)
 
 
 def _reachable(start: int, successors: dict[int, list[int]]) -> set[int]:

@@ -32,7 +32,6 @@ from typing import Any
 
 import tomlkit
 from pydantic import TypeAdapter, ValidationError
-from shapely.geometry import Point
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core import files
@@ -40,7 +39,7 @@ from egvs.core.errors import InputError
 from egvs.formats import osm as osm_files
 from egvs.formats.osm import OsmExtract
 from egvs.importers import junctions, osm_network, osm_solids, road_levels
-from egvs.importers.junctions import XY, JunctionRegion, KerbsidePole, StreetJunction, Streets
+from egvs.importers.junctions import JunctionRegion, KerbsidePole, StreetJunction, Streets
 from egvs.importers.osm_network import ATTRIBUTION, NETWORK_FILE
 from egvs.importers.osm_solids import ImportCounts, MappedSolid
 from egvs.importers.road_levels import OtherLevels
@@ -75,11 +74,16 @@ MAX_VEHICLES_PER_H = 100_000
 """More do not pass any junction."""
 
 FAR_FROM_AT_M = 50.0
-"""A junction farther than this from the requested position may be the wrong one; cities reject it."""
+"""A junction farther than this from the requested position may be the wrong one."""
+
+_MOST_NAMED = 3
+"""Number of junctions that the message about a position without a junction names."""
 
 PEOPLE_HINT = (
     "pedestrians are added with --set effects.pedestrians_bicycles.pedestrians_per_h=300 (bicycles: bicycles_per_h)."
 )
+
+_NO_SIGNALS_NOTE = "no junction in the extract has signals; the one with the most incoming lanes was chosen"
 
 TomlTable = tuple[str, dict[str, Any]]
 """A comment, and the keys of a table."""
@@ -217,7 +221,8 @@ def create_scenario(
     osm
         An OpenStreetMap file: XML (plain or gzipped) or PBF.
     at
-        Latitude, longitude in degrees: choose the nearest signalised junction; without it, the largest one.
+        Latitude, longitude in degrees: choose the junction there, see :func:`junctions.choose_nearby`; without it, the
+        largest one with signals.
     lefthand
         Whether traffic drives on the left.
     walk
@@ -237,8 +242,8 @@ def create_scenario(
     Raises
     ------
     InputError
-        When the folder is not empty, the file is damaged or has no drivable streets, ``at`` is outside the extract, or
-        no site is possible. Nothing is written then.
+        When the folder is not empty, the file is damaged or has no drivable streets, ``at`` is outside the extract or
+        far from any junction, or no site is possible. Nothing is written then.
     """
     _check_traffic(traffic)
     _check_pole_spacing(pole_spacing_m)
@@ -254,20 +259,20 @@ def create_scenario(
 
     flags = osm_network.netconvert_flags(extract, lefthand=lefthand, walk=walk)
     network, streets = osm_network.build_network(extract, osm, flags)
-    near = streets.to_xy([at[1]], [at[0]])[0] if at else None
-    junction = _choose_junction(streets, osm, near)
+    junction = _junction_at(streets, at) if at else _existing(junctions.largest_junction(streets), osm)
     others = _other_levels(extract, streets, junction)
     if others.roads:
         location = streets.to_degrees([junction.at_m])[0]
         extract = osm_network.cut_out_roads(extract, streets, others.roads, _level_window(junction))
         network, streets = osm_network.build_network(extract, osm, flags)
-        junction = _choose_junction(streets, osm, streets.to_xy(*zip(location, strict=True))[0])
+        at_m = streets.to_xy(*zip(location, strict=True))[0]
+        junction = _existing(junctions.find_again(streets, junction, at_m), osm)
     window = reachable_area(junctions.region_around(junction))
     solids, counts = osm_solids.map_solids(extract, streets, others.decks, window)
 
     if surroundings_m is not None:
         network, streets = osm_network.crop_network(extract, osm, flags, streets, junction, surroundings_m)
-        junction = _choose_junction(streets, osm, junction.at_m)
+        junction = _existing(junctions.find_again(streets, junction, junction.at_m), osm)
     roi = junctions.region_around(junction)
     poles = junctions.kerbside_poles(streets, junction, roi, [solid.area for solid in solids], pole_spacing_m)
     if not poles:
@@ -277,15 +282,25 @@ def create_scenario(
             hint = "Choose a smaller spacing with --poles, or another junction with --at LAT,LON."
         raise InputError(osm, problem, hint)
 
-    notes = _junction_notes(junction, roi, counts) + _level_notes(others, counts) + _range_notes(counts)
+    notes = []
+    if at is None and not junction.signalised:
+        notes.append(_NO_SIGNALS_NOTE)
+    for ring in streets.large_rings:
+        if junction.id in ring.nodes:
+            notes.append(
+                f"the junction is one entry of a roundabout of {ring.side_m:.0f} m, which is larger than the largest"
+                f" region of interest ({junctions.ROI_MAX_M:g} m): the rest of the ring is not part of the ranking"
+            )
+    notes += scenario_notes(roi.area.covers(junction.area), counts) + _level_notes(others, counts)
+    notes += _range_notes(counts)
     if walk:
         notes.append(PEOPLE_HINT)
-    assumed = _assumed_traffic(network, streets, roi, traffic)
+    assumed = _assumed_traffic(network, streets, junction, traffic)
     if assumed is not None:
         notes += _traffic_notes(assumed)
     from_at_m = None
     if at is not None:
-        from_at_m = Point(streets.to_xy([at[1]], [at[0]])[0]).distance(junction.area)
+        from_at_m = junction.distance_m(streets.to_xy([at[1]], [at[0]])[0])
     n_solids = len(solids) + 1
     scenario = NewScenario(
         folder, junction, roi, streets, len(poles), counts, n_solids, assumed, tuple(notes), from_at_m
@@ -370,8 +385,23 @@ def check_inside_extract(extract: OsmExtract, at: tuple[float, float] | None, op
     raise InputError(option, f"{at[0]:g},{at[1]:g} is outside the extract", hint)
 
 
-def _choose_junction(streets: Streets, osm: Path, near: XY | None) -> StreetJunction:
-    junction = junctions.choose_junction(streets, near)
+def _junction_at(streets: Streets, at: tuple[float, float]) -> StreetJunction:
+    """Return the junction at a position; raise an InputError that names the nearest ones if it is far from any."""
+    nearby = junctions.nearest_junctions(streets, streets.to_xy([at[1]], [at[0]])[0])
+    chosen = junctions.choose_nearby(nearby)
+    if chosen is not None:
+        return chosen.junction
+    problem = f"no junction of {junctions.MIN_ARMS} or more roads is within {junctions.MAX_FROM_POINT_M:g} m"
+    if not nearby:
+        raise InputError("--at", problem, "The extract has no such junction; choose another one.")
+    titles = []
+    for near in nearby[:_MOST_NAMED]:
+        ((lon_deg, lat_deg),) = streets.to_degrees([near.junction.at_m])
+        titles.append(f"{near.junction.title} at {lat_deg:.5f},{lon_deg:.5f} ({near.distance_m:,.0f} m away)")
+    raise InputError("--at", problem, f"The nearest are: {'; '.join(titles)}.")
+
+
+def _existing(junction: StreetJunction | None, osm: Path) -> StreetJunction:
     if junction is None:
         raise InputError(osm, "the streets of the extract have no junction", "Choose an extract with a junction.")
     return junction
@@ -409,16 +439,11 @@ def _range_notes(counts: ImportCounts) -> list[str]:
     return [f"{left_out:,} of {total:,} static objects are left out: {reason}"]
 
 
-def _junction_notes(junction: StreetJunction, roi: JunctionRegion, counts: ImportCounts) -> list[str]:
-    notes = []
-    if not junction.signalised:
-        notes.append("no junction in the extract has signals; the one with the most incoming lanes was chosen")
-    return notes + scenario_notes(roi.area.covers(junction.area), counts)
-
-
-def _assumed_traffic(network: str, streets: Streets, roi: JunctionRegion, traffic: str | int) -> AssumedTraffic | None:
-    """Assume flows through a region, and find how much of them the network carries."""
-    flows = junctions.assumed_flows(streets, roi)
+def _assumed_traffic(
+    network: str, streets: Streets, junction: StreetJunction, traffic: str | int
+) -> AssumedTraffic | None:
+    """Assume flows through the region of a junction, and find how much of them the network carries."""
+    flows = junctions.assumed_flows(streets, junctions.region_around(junction), junction.ring)
     if isinstance(traffic, int):
         if not flows:
             problem = "no street leads vehicles through the region of interest"
@@ -597,7 +622,7 @@ def _scenario_toml(name: str, scenario: NewScenario) -> str:
     ]
     document = toml_document(comments, values, tables)
     if scenario.traffic is not None:
-        names = MovementNames(scenario.streets.network)
+        names = MovementNames(scenario.streets.network, scenario.junction.at_m)
         document["traffic"].update({"counts": _counts_array(scenario.traffic.flows, names)})
         origin = f"assumed from the road classes ({scenario.traffic.assumed_per_h:,} vehicles an hour)"
         if scenario.traffic.level is None:
@@ -619,10 +644,19 @@ def _assumptions(scenario: NewScenario) -> list[str]:
         assumed.append(f"traffic ({traffic.per_h:,} vehicles an hour, from the road classes)")
     if scenario.junction.signalised:
         assumed.append("signal plans")
-    heights = scenario.statics.heights.get("building", Counter())
-    if heights["default"]:
-        assumed.append(f"heights of {heights['default']} of {heights.total()} buildings")
-    return [*assumed, "positions of the poles"]
+    return [*assumed, *assumed_sizes(scenario.statics), "positions of the poles"]
+
+
+def assumed_sizes(counts: ImportCounts) -> list[str]:
+    """Return which sizes of static objects are assumed, for the key ``assumed``; objects that can hide vehicles."""
+    heights = {kind: counts.heights.get(kind, Counter()) for kind in ("building", "tree", "bridge")}
+    texts = [
+        (heights["building"]["default"], heights["building"].total(), "heights of {} buildings"),
+        (heights["tree"]["default"], heights["tree"].total(), "heights of {} trees"),
+        (counts.assumed_crowns, heights["tree"].total(), "crown widths of {} trees"),
+        (heights["bridge"]["default"], heights["bridge"].total(), "heights of {} bridge decks"),
+    ]
+    return [text.format(f"{number} of {total}") for number, total, text in texts if number]
 
 
 def _counts_array(flows: Sequence[CountConfig], names: MovementNames) -> Any:

@@ -82,6 +82,8 @@ class MappedSolid:
         Where the height comes from: ``height`` or ``levels`` (tags of the map), ``type`` or ``default``.
     radius_m
         Half the width of a line, radius of a point; None for an area.
+    assumed_radius
+        Whether the radius of a tree crown is assumed.
     """
 
     name: str
@@ -91,6 +93,7 @@ class MappedSolid:
     height_source: str
     base_m: float = 0.0
     radius_m: float | None = None
+    assumed_radius: bool = False
 
     @property
     def area(self) -> BaseGeometry:
@@ -120,11 +123,13 @@ class ImportCounts:
     dropped: dict[str, Counter[str]] = field(default_factory=dict)
     slivers: int = 0
     raised_crowns: int = 0
+    assumed_crowns: int = 0
     not_modelled: Counter[str] = field(default_factory=Counter)
 
     def keep(self, solid: MappedSolid) -> None:
         """Count an object that is used; a tree is counted once, by its trunk."""
         self.objects[solid.kind] += 1
+        self.assumed_crowns += solid.assumed_radius
         if solid.kind != "tree_crown":
             kind = solid.kind.removesuffix("_trunk")
             self.heights.setdefault(kind, Counter())[solid.height_source] += 1
@@ -602,5 +607,8 @@ def _make_tree(name: str, point: Point, tags: Tags, counts: ImportCounts) -> tup
 
     base_m = map_features.CROWN_BASE_SHARE * extent.top_m
     trunk = MappedSolid(f"{name}/trunk", "tree_trunk", point, base_m, extent.source, 0.0, trunk_radius_m)
-    crown = MappedSolid(f"{name}/crown", "tree_crown", point, extent.top_m, extent.source, base_m, crown_radius_m)
+    crown = MappedSolid(
+        f"{name}/crown", "tree_crown", point, extent.top_m, extent.source, base_m, crown_radius_m,
+        assumed_radius=not diameter_m,
+    )  # fmt: skip
     return trunk, crown

@@ -88,3 +88,13 @@ def _has_cache_folder() -> bool:
     from egvs.kernels.kernel_cache import use_cache_folder
 
     return use_cache_folder(Path(__file__).resolve().parent)
+
+
+def has_compiled_kernels() -> bool:
+    """Return whether the cache has compiled kernels of these sources; True, too, where kernels are not cached."""
+    if not _has_cache_folder():
+        return True
+    import numba
+
+    folder = Path(numba.config.CACHE_DIR)  # type: ignore[attr-defined]
+    return any(folder.rglob("*.kernel"))

@@ -6,6 +6,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from egvs.artefacts.readers import DISTINCT_PROBABILITY
+from egvs.scenario.score_config import SCORES_IN_UNITS
+
 
 @dataclass(frozen=True)
 class ScoreLabel:
@@ -21,8 +24,6 @@ class ScoreLabel:
         What a site with a score does, with ``{}`` for the score.
     means
         How the score is defined, in one or two sentences.
-    is_share
-        Whether values are shares, written in per cent.
     digits
         Number of decimals.
     unit
@@ -34,9 +35,13 @@ class ScoreLabel:
     head: str
     says: str
     means: str
-    is_share: bool = True
     digits: int = 1
     unit: str = ""
+
+    @property
+    def is_share(self) -> bool:
+        """Whether values are shares, written in per cent."""
+        return self.name not in SCORES_IN_UNITS
 
     @property
     def counts_vehicles(self) -> bool:
@@ -146,7 +151,7 @@ _VEHICLES_NOTE = (
 
 _LABELS = (
     ScoreLabel("egvs", "EGVS", "EGVS bit", "scores {}", "",
-        is_share=False, digits=0, unit="bit"),
+        digits=0, unit="bit"),
     ScoreLabel(
         "entropy_seen", "the entropy seen", "entropy seen", "sees {} of the traffic’s uncertainty",
         "Sites are ranked by the share of the traffic’s uncertainty in voxels that at least one beam crosses.",
@@ -165,7 +170,7 @@ _LABELS = (
         "points_on_target", "the points on vehicles", "log points", "has a mean log(1 + points) of {} on vehicles",
         f"Sites are ranked by their points on vehicles: the mean of log(1 + points). "
         f"{_VEHICLES_NOTE}",
-        is_share=False, digits=2,
+        digits=2,
     ),
     ScoreLabel(
         "seen_well", "the share of vehicles seen well", "seen well", "sees {} of vehicles well",
@@ -187,6 +192,27 @@ SCORE_LABELS = {label.name: label for label in _LABELS}
 def format_percent(value: float) -> str:
     """Return a share in per cent, e.g. "12.5%"."""
     return f"{value:.1%}"
+
+
+def format_probability(probability: float) -> str:
+    """Return a probability in whole per cent; "over 99%" and "under 1%" where it rounds to 100 or 0.
+
+    A value below :data:`DISTINCT_PROBABILITY` is never written as this limit.
+
+    Examples
+    --------
+    >>> format_probability(0.578), format_probability(0.896), format_probability(0.9996)
+    ('58%', '89%', 'over 99%')
+    """
+    percent = round(100.0 * probability)
+    limit = round(100.0 * DISTINCT_PROBABILITY)
+    if percent >= 100:
+        return "over 99%"
+    if percent <= 0:
+        return "under 1%"
+    if percent >= limit and probability < DISTINCT_PROBABILITY:
+        percent = limit - 1
+    return f"{percent}%"
 
 
 def format_count(value: float) -> str:

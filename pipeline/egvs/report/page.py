@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +36,7 @@ from egvs.report.ranking import (
     recorded_frames_hint,
     share_of_limit,
 )
+from egvs.report.reliability import describe_reliability
 from egvs.report.sections import (
     NAMED_POLES,
     PlacementSummary,
@@ -240,10 +242,20 @@ def render_page(contents: PageContents) -> str:
     return _template_environment().get_template("report.html.j2").render(values)
 
 
+def prepare() -> None:
+    """Load the templates, and the library that fills them."""
+    environment = _template_environment()
+    for path in TEMPLATES.glob("*.html.j2"):
+        environment.get_template(path.name)
+
+
+@cache
 def _template_environment() -> Environment:
     """Templates and filters; jinja2 is imported only when a page is written."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
+
+    from egvs.report.template_cache import open_template_cache
 
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
@@ -251,10 +263,12 @@ def _template_environment() -> Environment:
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        bytecode_cache=open_template_cache(Path(__file__)),
     )
     environment.filters |= {
         "svg": Markup,
         "share": formatting.format_percent,
+        "probability": formatting.format_probability,
         "whole": formatting.format_count,
         "plain": formatting.format_number,
         "degrees": formatting.format_degrees,
@@ -333,6 +347,7 @@ def _warning_values(contents: PageContents) -> dict[str, Any]:
     warnings = collect_warnings(stage.summary for stage in contents.stages.values())
     return {
         "warnings": warnings,
+        "reliability": describe_reliability(contents.ranking),
         "poles_on_road": describe_poles_on_road(contents.ranking.poles[:NAMED_POLES], warnings),
     }
 
@@ -366,4 +381,5 @@ STAGE = Stage(
         RunFolder.blindspots,
     ),
     effect_stages=("scan", "score"),
+    prepare=(prepare,),
 )

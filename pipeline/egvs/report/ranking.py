@@ -16,13 +16,24 @@ from egvs.artefacts import parquet
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.artefacts.run_record import StageRecord
 from egvs.core.errors import InputError
-from egvs.report.formatting import SCORE_LABELS, ScoreLabel, format_count, format_number, format_percent, join_names
+from egvs.report.formatting import (
+    SCORE_LABELS,
+    ScoreLabel,
+    format_count,
+    format_number,
+    format_percent,
+    format_probability,
+    join_names,
+)
 from egvs.report.svg_figures import MapSite
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
 
 CLOSE_SHARE = 0.01
 """The report names the sites whose score is this close to the best, as a share of the best score."""
+
+MIN_RELEVANT_LEAD = 0.001
+"""Poles whose scores differ by less are equally good; of shares as it is, of others relative to the best score."""
 
 _MIN_LEAD = 0.0005
 """Shares that differ by less than this look the same with one decimal."""
@@ -378,7 +389,8 @@ def lead(ranking: Ranking, hint: str = "") -> str:
     ranking
         The sites.
     hint
-        Sentence on what helps where sites cannot be told apart.
+        Sentence on what helps where poles cannot be told apart; left out for mounts of one pole, and where the poles
+        differ by less than :data:`MIN_RELEVANT_LEAD`.
     """
     if ranking.is_tie or not ranking.best[0].score > 0:
         return ""
@@ -394,10 +406,10 @@ def lead(ranking: Ranking, hint: str = "") -> str:
     if rival is not None and rival is not second:
         text += f" The best site on another pole, {rival.site}, is behind by {_format_gap(ranking, rival)}"
         text += f"{_format_probability(ranking, rival, 'worse')}."
-        if not rival.is_below_best:
+        is_separable = rival.is_below_best
+        if not is_separable:
             text += " These poles cannot be told apart."
-            is_separable = False
-    if hint and not is_separable:
+    if hint and rival is not None and not is_separable and _relative_gap(ranking, rival) >= MIN_RELEVANT_LEAD:
         text += f" {hint}"
     if len(ranking.close) > 1:
         names = ", ".join(site.site for site in ranking.close[:4])
@@ -417,22 +429,22 @@ def _format_probability(ranking: Ranking, site: RankedSite, comparison: str) -> 
     """Return how probable the lead of the best site is, in brackets; empty if that is unknown."""
     if site.best_beats is None:
         return ""
-    percent = f"{site.best_beats:.0%}"
-    if site.best_beats >= 0.995:
-        percent = "over 99%"
-    elif not site.is_below_best and round(site.best_beats, 2) >= DISTINCT_PROBABILITY:
-        percent = f"{site.best_beats:.1%}"
     owner = "it is" if len(ranking.best) == 1 or comparison == "worse" else "they are"
-    return f" ({owner} truly {comparison} with a probability of {percent})"
+    return f" ({owner} truly {comparison} with a probability of {format_probability(site.best_beats)})"
+
+
+def _relative_gap(ranking: Ranking, site: RankedSite) -> float:
+    """Return how far a site is behind the best one: in share, or relative to the best score for scores in units."""
+    best_score = ranking.best[0].score
+    gap = best_score - site.score
+    return gap if ranking.by.is_share else gap / best_score
 
 
 def _format_gap(ranking: Ranking, second: RankedSite) -> str:
     """Return the lead of the best site: in percentage points for shares, relative to its score otherwise."""
     best_score = ranking.best[0].score
     is_share = ranking.by.is_share
-    gap, error = best_score - second.score, second.behind_best_se
-    if not is_share:
-        gap /= best_score
+    gap, error = _relative_gap(ranking, second), second.behind_best_se
     gap_text = f"{100.0 * gap:.1f}" if gap >= _MIN_LEAD else "less than 0.1"
     if error is not None:
         if not is_share:

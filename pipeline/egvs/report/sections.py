@@ -266,7 +266,8 @@ def describe_counts(scenario: Scenario, network: Path | None) -> dict[str, str]:
     periods = {name: period.traffic for name, period in scenario.by_period().items() if period.traffic.counts}
     if network is None or not periods:
         return {}
-    names = MovementNames(read_net_xml(network))
+    x_m, y_m, _ = scenario.roi.center_m
+    names = MovementNames(read_net_xml(network), (x_m, y_m))
     movements = {}
     for name, traffic in periods.items():
         period = f" ({name})" if name else ""
@@ -465,10 +466,12 @@ class PlacementSummary:
         poles = _planned_poles(picks, joint, by)
         steps, objective = plan_steps(curve_rows), describe_objective(plan["asked"])
         curve = _curve(steps, curve_rows, plan["together"] or math.inf)
+        installed = [plan_answer.InstalledSite(pick.site, pick.score, pick.score_se) for pick in picks]
         answer = plan_answer.describe_count(
             steps,
             by,
             plans=[plan_answer.CurvePlan(row.sites, row.cost) for row in curve],
+            installed=[] if before is not None else installed,
             has_budget=plan["asked"]["budget"] is not None,
             objective=objective,
             next_count=plan_answer.next_count(steps, len(picks), plan["candidates"], plan["asked"]),
@@ -497,6 +500,11 @@ class PlacementSummary:
         if not self.together:
             return 0.0
         return self.joint / self.together
+
+    @property
+    def assumption(self) -> str:
+        """What the joint score assumes, in a sentence; may be empty."""
+        return plan_answer.describe_joint_score(self.by, len(self.picks))
 
     @property
     def has_errors(self) -> bool:
@@ -592,19 +600,24 @@ class StudiedSetting:
     kind: str
     overrides: str
     seconds: float
+    draws: int
+    probability: float
+    loss_points: float
+    loss_se_points: float
     error: float
-    error_se: float
-    tau: float
-    regret: float
-    best_kept: bool
-    default: bool
+    best: str
     front: bool
     recommended: bool
 
     @property
     def is_listed(self) -> bool:
         """Whether the page shows it."""
-        return self.kind in ("scenario", "reference") or self.front or self.recommended or self.default
+        return self.kind == "scenario" or self.front or self.recommended
+
+    @property
+    def label(self) -> str:
+        """Name in a sentence or a table."""
+        return "the scenario’s own setting" if self.kind == "scenario" else self.setting
 
 
 @dataclass(frozen=True)
@@ -612,7 +625,9 @@ class StudySummary:
     """Results of ``egvs accuracy``: the settings that the page shows, and the figure (PNG in base 64)."""
 
     settings: tuple[StudiedSetting, ...]
-    tolerance: float
+    best: StudiedSetting
+    tolerance_points: float
+    score_tolerance: float | None
     figure: str
 
     @classmethod
@@ -630,9 +645,19 @@ class StudySummary:
         names = [field.name for field in fields(StudiedSetting)]
         settings = [StudiedSetting(**{name: row[name] for name in names}) for row in rows]
         listed = tuple(setting for setting in settings if setting.is_listed)
-        return cls(listed, metadata["tolerance"], _read_base64(figure))
+        best = next(setting for setting in settings if setting.recommended)
+        return cls(listed, best, metadata["tolerance"], metadata.get("score_tolerance"), _read_base64(figure))
 
     @property
-    def best(self) -> StudiedSetting | None:
-        """The recommended setting."""
-        return next((setting for setting in self.settings if setting.recommended), None)
+    def is_within(self) -> bool:
+        """Whether the recommended setting is within the tolerance."""
+        if self.score_tolerance is not None:
+            return self.best.error <= self.score_tolerance
+        return self.best.loss_points <= self.tolerance_points
+
+    @property
+    def tolerance_text(self) -> str:
+        """The tolerance with its unit."""
+        if self.score_tolerance is not None:
+            return f"{100 * self.score_tolerance:g} % of the score"
+        return f"{self.tolerance_points:g} percentage points of vehicles found"

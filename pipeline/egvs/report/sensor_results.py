@@ -39,8 +39,8 @@ _NO_EVIDENCE = (
 )
 
 _RANGE_NOTE = (
-    "The range of a sensor on dark vehicles is not modelled: sensors with a short rated range look better than they "
-    "are. Try --set effects.range_limit={}."
+    "Ranges on dark vehicles are not modelled: sensors with a short rated range look better than they are. Try --set "
+    "effects.range_limit={}."
 )
 
 _PROBABILITY_DIGITS = 6
@@ -300,6 +300,13 @@ class SensorComparison:
         return self.results[0].mount
 
     @property
+    def baseline_name(self) -> str:
+        """The sensor of the baseline, and its run if a sensor is in several runs, e.g. "VLP-16 of A"."""
+        if len(self.results) > len(self.sensors):
+            return f"{self.baseline.sensor} of {self.baseline.run}"
+        return self.baseline.sensor
+
+    @property
     def has_yaw_or_pitch(self) -> bool:
         """Whether a mount is turned or tilted."""
         return any(result.mount.site.yaw_deg or result.mount.site.pitch_deg for result in self.results)
@@ -307,16 +314,14 @@ class SensorComparison:
     @property
     def explanation(self) -> str:
         """What the difference, and the cost of one more point, refer to."""
-        mount = self.baseline
-        run = f" of {mount.run}" if len(self.results) > len(self.sensors) else ""
         kind = "the cheapest" if self.has_costs else "which finds least"
         unpriced = ""
         if self.has_costs and self.unpriced:
             kind = "the cheapest with a known cost"
             unpriced = f" Without a known cost: {', '.join(self.unpriced)}."
         return (
-            f"Differences from {mount.sensor}{run} ({kind}) are in {difference_unit(mount.site)}, ± their standard "
-            f"error; ~ it is not clear which is better.{unpriced}"
+            f"Differences from {self.baseline_name} ({kind}) are in {difference_unit(self.baseline.site)}, ± their "
+            f"standard error; ~ it is not clear which is better.{unpriced}"
         )
 
     @property

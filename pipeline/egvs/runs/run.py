@@ -2,9 +2,10 @@
 
 :func:`run` brings every stage up to date. A stage is skipped when its key (settings by value, files by hash, source of
 the program) is that of the last run and its artefacts are unchanged; otherwise it is restored from the store, or runs
-and its artefacts are saved in the store. ``run.json`` is written after each stage that made something, with that stage
-and those before it: an interrupted run continues from there, and no record names artefacts of another scenario. A run
-that is rejected before any stage ran leaves the folder as it was.
+and its artefacts are saved in the store. Stages take turns; only SUMO simulates in the background from the beginning
+(:mod:`egvs.runs.background`). ``run.json`` is written after each stage that made something, with that stage and those
+before it: an interrupted run continues from there, and no record names artefacts of another scenario. A run that is
+rejected before any stage ran leaves the folder as it was.
 
 User files are not overwritten: no input lies where a run writes, and nothing is written through a link.
 """
@@ -13,9 +14,10 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +26,14 @@ from egvs.artefacts.origin import foreign_files
 from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.artefacts.run_record import RunRecord, StageRecord
 from egvs.core import files
-from egvs.core.errors import InputError, RunError
+from egvs.core.errors import EgvsError, InputError, RunError
 from egvs.core.platform import relative_path
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.formats.meshes import referenced_files
 from egvs.runs import locks, run_names, stage_keys, stage_registry, store
+from egvs.runs.background import BackgroundStage, run_in_background
 from egvs.runs.digest_cache import remember_digests
+from egvs.runs.kernel_compiler import KernelCompiler
 from egvs.runs.stage_keys import StageKey
 from egvs.runs.stage_registry import StageResult
 from egvs.runs.store import Store
@@ -108,10 +112,14 @@ def run(
     with lock_run_folder(folder, wait_s), files.hold_inputs(except_in=folder), remember_digests(RunFolder(folder)):
         context = open_folder(scenario, folder, jobs=jobs, progress=progress)
         current = _Run(context, start_record(scenario, folder), listener)
-        for stage in STAGE_NAMES:
-            if stage in only:
-                current.ensure_stage(stage, (options or {}).get(stage, {}))
-        return current.finish(keep=(*only, "report"))
+        stages = [stage for stage in STAGE_NAMES if stage in only]
+        key = None
+        if "traffic" in stages and "traffic" not in (options or {}):
+            key = current.key_to_simulate()
+        with run_in_background("traffic", key, context, current.store) as current.background, current.compiler:
+            for number, stage in enumerate(stages, 1):
+                current.ensure_stage(stage, (options or {}).get(stage, {}), next_stages=stages[number:])
+            return current.finish(keep=(*only, "report"))
 
 
 def run_one(
@@ -286,6 +294,10 @@ class _Run:
         The stages that belong to this scenario for certain.
     has_changed
         Whether the folder has other artefacts than before.
+    background
+        A stage that has been started before its turn.
+    compiler
+        Compiles kernels in another process.
     """
 
     context: StageContext
@@ -294,9 +306,32 @@ class _Run:
     store: Store = field(default_factory=Store.default)
     complete: set[str] = field(default_factory=set)
     has_changed: bool = False
+    background: BackgroundStage | None = None
+    compiler: KernelCompiler = field(default_factory=KernelCompiler)
 
-    def ensure_stage(self, name: str, options: Mapping[str, Any], *, again: bool = False) -> None:
-        """Bring one stage up to date; with ``again``, or with options that change artefacts, it always runs."""
+    def key_to_simulate(self) -> StageKey | None:
+        """Return the key of the traffic stage if SUMO has to simulate; None, too, where an error comes before that."""
+        if self.context.scenario.is_recorded:
+            return None
+        try:
+            if any(stage_inputs.missing_files(self.context.inputs)):
+                return None
+            key = stage_keys.stage_key("traffic", self.context)
+        except (EgvsError, OSError):
+            return None
+        if self.context.folder.trajectories.is_dir():
+            return None
+        last = self.record.stages.get("traffic")
+        is_up_to_date = last is not None and last.inputs == key.key and _is_intact(self.context, last)
+        return None if is_up_to_date else key
+
+    def ensure_stage(
+        self, name: str, options: Mapping[str, Any], *, again: bool = False, next_stages: Sequence[str] = ()
+    ) -> None:
+        """Bring one stage up to date; with ``again``, or with options that change artefacts, it always runs.
+
+        While a stage in the background goes on, what it and ``next_stages`` will call is loaded and compiled.
+        """
         key = stage_keys.stage_key(name, self.context)
         has_options = any(option not in stage_registry.stage(name).neutral_options for option in options)
         last = self.record.stages.get(name)
@@ -307,6 +342,7 @@ class _Run:
 
         def make() -> StageResult:
             self.listener(name, "runs", None)
+            self.compiler.before(name, next_stages)
             return stage_registry.run_stage(name, self.context, key.dependencies, **options)
 
         fetched = False
@@ -315,12 +351,23 @@ class _Run:
         elif again:
             result = make()
             self._save(name, key, result)
+        elif self.background is not None and self.background.key == key.key:
+            self.listener(name, "runs", None)
+            result = self.background.result(self._preparations([name, *next_stages]))
+            self.store.put(name, key.key, self.context.folder.path, result)
+            self.background.close()
         else:
             result, fetched = fetch_or_run(name, self.context, key.key, self.store, make)
         stage_record = key.record(result)
         self.has_changed |= bool(stage_record.artefacts)
         self._record_stage(name, stage_record)
         self.listener(name, "fetched" if fetched else "done", stage_record)
+
+    def _preparations(self, names: Iterable[str]) -> Iterator[Callable[[], None]]:
+        """Yield what loads, or compiles, what some stages call."""
+        for name in names:
+            yield partial(self.compiler.before, name, ())
+            yield from stage_registry.stage(name).prepare
 
     def restore_stage(self, name: str) -> None:
         """Restore a stage from the store if it has not been run in the folder; do nothing if the store lacks it."""

@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from egvs.artefacts import parquet
-from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
+from egvs.artefacts.run_folder import RUNS, STAGE_NAMES, RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.core.errors import InputError
 from egvs.runs import run_sources
-from egvs.runs.run_names import RUNS
 from egvs.scenario.model import Scenario
 from egvs.scenario.settings import flatten_settings
 

@@ -29,12 +29,10 @@ from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel
 
+from egvs.artefacts.run_folder import RUNS
 from egvs.core import files, reading
 from egvs.scenario.model import Scenario
 from egvs.scenario.settings import flatten_settings
-
-RUNS = Path("runs")
-"""The folder of all runs for which no other is given."""
 
 MAX_LABEL_LENGTH = 40
 """Characters of a label before its hash."""

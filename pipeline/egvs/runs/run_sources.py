@@ -119,6 +119,27 @@ class SettingsSource:
             scenario._overrides = load(self.path, self.overrides).overrides
         return scenario
 
+    def load_variant(self, more: Sequence[str]) -> Scenario:
+        """Return the scenario with further overrides, as that of another run, which has a folder of its own.
+
+        Parameters
+        ----------
+        more
+            Further overrides.
+
+        Raises
+        ------
+        InputError
+            When the scenario, the record of the run, or an override is not valid.
+        """
+        if not self.is_run:
+            return load(self.path, (*self.overrides, *more))
+        base = _rebuild(self.path, RunRecord.read(self.path))
+        scenario = _rebuild(self.path, RunRecord.read(self.path), more)
+        changed = changed_settings(base.model_dump(mode="json"), scenario.model_dump(mode="json"))
+        scenario._overrides = {**base.overrides, **changed}
+        return scenario
+
     def load_with_request(self, request: Sequence[str]) -> Scenario:
         """Return the scenario with a request for a plan in place of the one that the run recorded, if there is one.
 

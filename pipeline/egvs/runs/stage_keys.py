@@ -35,6 +35,7 @@ _ROOT = Path(__file__).resolve().parent.parent
 LIBRARIES = {
     "embreex": ("embreex",),
     "laspy": ("laspy", "lazrs"),
+    "mapbox_earcut": ("mapbox-earcut",),
     "numba": ("numba", "llvmlite"),
     "numpy": ("numpy",),
     "onnxruntime": ("onnxruntime",),
@@ -44,7 +45,7 @@ LIBRARIES = {
     "scipy": ("scipy",),
     "shapely": ("shapely",),
     "sklearn": ("scikit-learn",),
-    "trimesh": ("trimesh", "mapbox-earcut"),
+    "trimesh": ("trimesh",),
 }
 """Libraries whose version may change a result: name in an import -> distributions."""
 
@@ -211,6 +212,8 @@ def program_inputs(name: str, scenario: Scenario, loaded: tuple[str, ...] = ()) 
     described = stage(name)
     effects = registry.scenario_effects(scenario, *(described.effect_stages or (name,)))
     modules = sorted({*loaded, *registry.effect_modules(effects)})
+    if any(module.partition(".")[0] != PACKAGE for module in modules):
+        files.tell_observers(None)  # the source of plug-ins is found anew in each run
     source = source_digest(described.module, *described.code)
     loaded_sources = [source_digest(module) for module in modules]
     libraries = source.libraries.union(*(part.libraries for part in loaded_sources))

@@ -451,11 +451,9 @@ class Store:
 
         ``link`` makes hard links instead of copies: for folders in which files are replaced, never changed.
         """
-        if self.folder is None:
+        if self.folder is None or not self.has(stage, key):
             return None
         folder = self._entry_folder(stage, key)
-        if not _exists_as(Path.is_dir, folder):
-            return None
         try:
             with self._shared():
                 entry = _read_entry(folder)
@@ -469,6 +467,10 @@ class Store:
         with suppress(OSError), locked(self.folder / ".lock"):
             self._remove(folder)
         return None
+
+    def has(self, stage: str, key: str) -> bool:
+        """Return whether there is an entry in the folder, which may be damaged."""
+        return self.folder is not None and _exists_as(Path.is_dir, self._entry_folder(stage, key))
 
     def fetch(self, stage: str, key: str) -> None:
         """Copy an entry from the shared store into the folder, if it is missing there; within its :meth:`maker`."""

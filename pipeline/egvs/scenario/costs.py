@@ -38,7 +38,8 @@ def costs_from_dict(values: Mapping[str, Any], overrides: Iterable[str], where: 
     for override in overrides:
         if not override.strip().startswith("costs."):
             problem = "expected a key of [costs], because the runs are finished"
-            raise InputError(f"--set {override}", problem, "Use, for example, --set costs.pole=12000.")
+            hint = "Use, for example, --set costs.pole=12000, or run the scenario again with --sensors."
+            raise InputError(f"--set {override}", problem, hint)
     tables = apply_overrides({"costs": dict(values.get("costs", {}))}, overrides)
     if overrides:
         where = "--set"

@@ -32,6 +32,12 @@ OtherScore = Literal[
 DEFAULT_SCORE: OtherScore = "expected_detections"
 """The score that the validation study recommends (docs/validity.md), and that new scenarios rank by."""
 
+VEHICLE_SCORES: tuple[OtherScore, ...] = ("expected_detections", "seen_well", "points_on_target")
+"""Scores that are means over the vehicles of recorded frames."""
+
+SCORES_IN_UNITS = ("egvs", "points_on_target")
+"""Scores that have a unit; all others are shares."""
+
 DEFAULT_SAMPLED_FRAMES = 250
 """Recorded frames whose vehicles the scores over vehicles use."""
 
@@ -162,6 +168,21 @@ class ScoreConfig(StrictModel):
         if duplicates:
             raise ValueError(f"{duplicates[0]} is listed twice")
         return others
+
+    @model_validator(mode="after")
+    def _check_sampled_frames(self) -> Self:
+        if "sampled_frames" in self.model_fields_set and not self.needs_vehicles:
+            scores = ", ".join(VEHICLE_SCORES)
+            raise ValueError(
+                f"sampled_frames has no effect without blind spots and without a score over vehicles ({scores}). "
+                "Remove it, or add one of them to others"
+            )
+        return self
+
+    @property
+    def needs_vehicles(self) -> bool:
+        """Whether a score, or the blind spots, need the vehicles of recorded frames."""
+        return self.blindspots or any(name in VEHICLE_SCORES for name in self.additional)
 
     @property
     def additional(self) -> tuple[OtherScore, ...]:

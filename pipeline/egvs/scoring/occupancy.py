@@ -116,7 +116,7 @@ def warn_empty_region(boxes: float, trajectories: Path) -> Iterator[Diagnostic]:
         count = f"{boxes:.2g}"
         vehicles = "1 vehicle is" if count == "1" else f"{count} vehicles are"
         problem = f"{vehicles} in the region on average, so the ranking is based on very little traffic"
-        hint = "Add vehicles in [traffic], or use a region that covers more of the road."
+        hint = "If the streets are busier, correct [traffic]; otherwise record longer (traffic.frames)."
         yield Diagnostic(rule, "roi", problem, hint)
 
 

@@ -65,7 +65,8 @@ def match_lanes(fronts: Floats, yaw_rad: Floats, lanes: Sequence[MiddleLine]) ->
     yaw_rad
         Heading, counter-clockwise from east, (n,) float64.
     lanes
-        Lanes; of two equally near ones, the first is chosen.
+        Lanes; of two equally near ones, the first is chosen. A lane without length has no direction, so no vehicle is
+        matched to it; SUMO writes such lanes inside junctions whose roads meet in one point.
 
     Returns
     -------
@@ -79,7 +80,8 @@ def match_lanes(fronts: Floats, yaw_rad: Floats, lanes: Sequence[MiddleLine]) ->
         low = lane.points_m.min(axis=0) - half_m
         high = lane.points_m.max(axis=0) + half_m
         near = np.flatnonzero(((fronts >= low) & (fronts <= high)).all(axis=1))
-        if not len(near):
+        has_length = bool((lane.points_m != lane.points_m[0]).any())
+        if not len(near) or not has_length:
             continue
         distance_m, turned_rad = _distance_and_turn(fronts[near], yaw_rad[near], lane.points_m)
         better = (distance_m <= half_m) & (turned_rad <= SAME_WAY_RAD) & (distance_m < nearest_m[near])
@@ -89,7 +91,7 @@ def match_lanes(fronts: Floats, yaw_rad: Floats, lanes: Sequence[MiddleLine]) ->
 
 
 def _distance_and_turn(at_m: Floats, yaw_rad: Floats, line_m: Floats) -> tuple[Floats, Floats]:
-    """Distance of each point from a line, and the angle between its heading and the nearest segment, (n,) each.
+    """Distance of each point from a line with a length, and the angle between heading and nearest segment, (n,) each.
 
     At a bend with two equally near segments, the smaller angle.
     """

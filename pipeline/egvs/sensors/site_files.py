@@ -50,8 +50,9 @@ _PITCH_HINT = "Use pitch_deg, positive for nose up: minus the degrees by which t
 _SENSOR_HINT = "Use sensor, with a name from `egvs sensors` or from [sensors]."
 
 FOREIGN_COLUMNS = {
-    **dict.fromkeys(("height", "heights", "altitude", "sensor_height", "mount_height", "mounting_height"), _Z_HINT),
-    **dict.fromkeys(("heading", "bearing", "azimuth", "compass", "facing", "orientation"), _YAW_HINT),
+    **dict.fromkeys(("height", "heights", "h", "altitude", "alt", "elevation", "elev", "height_above_ground"), _Z_HINT),
+    **dict.fromkeys(("sensor_height", "mount_height", "mounting_height"), _Z_HINT),
+    **dict.fromkeys(("heading", "bearing", "azimuth", "compass", "facing", "orientation", "direction"), _YAW_HINT),
     **dict.fromkeys(("tilt", "tilt_angle", "downtilt", "inclination"), _PITCH_HINT),
     **dict.fromkeys(("lidar", "sensor_name", "sensor_model", "sensor_type"), _SENSOR_HINT),
 }

@@ -83,6 +83,9 @@ class Stage:
         Keyword arguments of ``run`` that change no artefact, for example where the work is done.
     reads_traffic
         Whether the stage reads files of recorded traffic that the scenario names.
+    prepare
+        Functions that load what ``run`` calls, for example by calling kernels with made-up arguments, which compiles
+        them in the first run; the function that takes longest comes first.
     """
 
     name: str
@@ -94,6 +97,7 @@ class Stage:
     code: tuple[str, ...] = ()
     neutral_options: tuple[str, ...] = ()
     reads_traffic: bool = False
+    prepare: tuple[Callable[[], None], ...] = ()
 
     @property
     def artefacts(self) -> tuple[str, ...]:

@@ -23,6 +23,7 @@ from egvs.effects import registry
 from egvs.effects.base import Effect
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import SCENARIO_FILE, Scenario
+from egvs.scenario.score_config import SCORES_IN_UNITS
 from egvs.scoring import score_table, standard_errors, zones
 from egvs.scoring.score_table import ScoreTable
 from egvs.sensors.sites import Site
@@ -30,15 +31,12 @@ from egvs.stages import site_scoring
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.blocked_sites import warn_blocked_sites
 from egvs.stages.scene_inputs import scan_dependencies, sensor_digests, sensor_settings
-from egvs.stages.site_scoring import BeamAudit, ScoredSite, SiteScoring, needs_targets
+from egvs.stages.site_scoring import BeamAudit, ScoredSite, SiteScoring
 from egvs.world import clearances, geolocation
 
 MIN_PERIOD_LOSS = 0.01
 """The best site of a period is clearly better, where errors are unknown, by at least 1 percentage point; by scores that
 are no shares, by at least 1 %."""
-
-_NO_SHARES = ("egvs", "points_on_target")
-"""Scores that are no shares."""
 
 
 def dependencies(context: StageContext) -> StageDependencies:
@@ -57,7 +55,7 @@ def dependencies(context: StageContext) -> StageDependencies:
     settings |= zones.file_settings(scenario.score.weights.zones, zones.weight_zones(scenario))
 
     artefacts = [RunFolder.tpog.name]
-    if needs_targets(scenario):
+    if scenario.score.needs_vehicles:
         artefacts.append(RunFolder.trajectories.name)
     for effect in effects:
         artefacts += effect.reads
@@ -248,7 +246,7 @@ def warn_period_disagreements(scores: ScoreTable, rank_by: str) -> Iterator[Diag
         Name of the score that ranks.
     """
     best = scores.column(rank_by).best
-    is_share = rank_by not in _NO_SHARES
+    is_share = rank_by not in SCORES_IN_UNITS
     for period, column in scores.by_period(rank_by).items():
         if not best or not column.best or best & column.best or not column.values.max() > 0:
             continue
@@ -335,4 +333,5 @@ STAGE = Stage(
     reads=(RunFolder.tpog, RunFolder.trajectories, RunFolder.scans, RunFolder.statics),
     effect_stages=("scan", "score"),
     neutral_options=("scored_elsewhere",),
+    prepare=(site_scoring.prepare_targets, site_scoring.prepare_voxels),
 )

@@ -20,13 +20,15 @@ from numpy.typing import NDArray
 from egvs.artefacts import parquet
 from egvs.artefacts.parquet import ArtefactWriter
 from egvs.artefacts.tpog import PeriodBlocks, Tpog, read_periods, read_tpog
+from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.errors import Diagnostic, InputError
 from egvs.core.grid import FloatArray, Grid
 from egvs.core.threads import map_ordered
-from egvs.kernels import traversal
-from egvs.scenario.model import SCENARIO_FILE, Scenario
+from egvs.kernels import occupancy, traversal
+from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.scoring.blindspots import SpotWriter, VehicleSpots, open_spot_writer
+from egvs.scoring.egvs import EntropyField
 from egvs.scoring.road_locations import RoadLocations
 from egvs.scoring.score_table import MIX, ScoreTable, SiteScores
 from egvs.scoring.scorer import PeriodTpog, Scorer, SiteScore
@@ -47,7 +49,8 @@ from egvs.scoring.targets import (
 )
 from egvs.scoring.visibility import Beams, to_voxel_units
 from egvs.scoring.zones import weight_zones
-from egvs.sensors.sites import ScannedSite
+from egvs.sensors.sensor import resolve_sensor
+from egvs.sensors.sites import Pose, ScannedSite
 from egvs.stages.base import StageContext
 from egvs.stages.blocked_sites import near_share
 from egvs.stages.site_scans import SiteScan, empty_scans
@@ -80,11 +83,6 @@ def vehicle_spots(
         roads = RoadLocations.of(network, context.scenario.roi.grid.roi)
     period = np.searchsorted(np.cumsum(recorded), record.numbers[record.frame], side="right")
     return VehicleSpots.of(record, roads, weight, period.astype(np.int64))
-
-
-def needs_targets(scenario: Scenario) -> bool:
-    """Whether a score, or the blind spots, need the vehicles of recorded frames."""
-    return scenario.score.blindspots or any(name in TARGET_SCORES for name in scenario.score.additional)
 
 
 class _PeriodRows(NamedTuple):
@@ -286,7 +284,7 @@ class SiteScoring:
         self.leave_out = BlockJackknife.of(path, self.tpog) if config.standard_error else None
         self.periods = _read_period_tpogs(path, standard_errors=config.standard_error)
         self.scorer = Scorer(context.scene, self.tpog, context.folder.trajectories, self.leave_out, self.periods)
-        self.targets = TargetScorer(context, self.tpog.grid) if needs_targets(context.scenario) else None
+        self.targets = TargetScorer(context, self.tpog.grid) if context.scenario.score.needs_vehicles else None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -318,6 +316,33 @@ class SiteScoring:
         limits = {MIX: self.scorer.limit, **dict(zip(periods, self.scorer.limits_by_period, strict=True))}
         scores = (SiteScores(site.site.name, site.score, site.targets) for site in sites)
         return ScoreTable.of(scores, groups, limits, periods)
+
+
+_UNIT_GRID = Grid((0.0, 0.0, 0.0), 1.0, (1, 1, 1))
+
+
+def _unit_beams() -> Beams:
+    """A beam through the single voxel of :data:`_UNIT_GRID`."""
+    sensor = resolve_sensor("VLP-32C", {}, "")
+    return Beams(Pose(-1.0, 0.5, 0.5), sensor, np.array([[3.0, 0.0, 0.0]]))
+
+
+def prepare_targets() -> None:
+    """Load or compile the kernels of scores over vehicles: score a beam that meets a vehicle."""
+    box = np.array([[0.5, 0.5, 0.5, 1.0, 1.0, 1.0, 0.0]])
+    record = TargetRecord.of([TrafficFrame(0, ("car",), ("passenger",), box, np.zeros(1))], _UNIT_GRID)
+    visible = visible_targets(record, _unit_beams())
+    for score in TARGET_SCORES.values():
+        score(visible)
+
+
+def prepare_voxels() -> None:
+    """Load or compile the kernels of scores over voxels, without effects: score a beam through a voxel."""
+    for counts in (np.int64, np.uint32):  # those of a TPOG, and of its groups of blocks
+        occupancy.accumulate(np.zeros(1, dtype=np.int64), np.ones(1, dtype=counts), np.zeros(1, dtype=counts))
+    hits = np.zeros(1, dtype=np.uint32)
+    traversal.count_hits(*to_voxel_units(_unit_beams(), _UNIT_GRID), _UNIT_GRID.voxel_m, hits)
+    EntropyField.of(np.ones(_UNIT_GRID.shape, dtype=np.int64), 2, _UNIT_GRID).score(hits, 1.0)
 
 
 def _read_period_tpogs(path: Path, *, standard_errors: bool) -> tuple[PeriodTpog, ...]:

@@ -28,6 +28,7 @@ from egvs.scoring import occupancy
 from egvs.scoring.autocorrelation import autocorrelation_time
 from egvs.scoring.occupancy import BlockCounts, count_blocks, static_voxels
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
+from egvs.world.mesh import World
 
 
 def dependencies(context: StageContext) -> StageDependencies:
@@ -104,6 +105,15 @@ def run(context: StageContext, inputs: StageDependencies) -> Summary:
         total = sum(period.frames for period in periods) + left_over
         summary["left_over"] = f"the last {left_over} of {total} frames, so that {n_blocks} blocks are alike"
     return summary
+
+
+def prepare() -> None:
+    """Load or compile the kernels of the stage: count a box, and a triangle, in a single voxel."""
+    grid = Grid((0.0, 0.0, 0.0), 1.0, (1, 1, 1))
+    box = FrameBoxes(np.zeros(1, dtype=np.int64), np.array([[0.5, 0.5, 0.5, 0.0, 0.0, 1.0, 1.0, 1.0]]))
+    occupancy.count_occupancy(box, grid, 1)
+    face, solid = np.array([[0, 1, 2]], dtype=np.int32), np.zeros(1, dtype=np.int32)
+    static_voxels(World(np.eye(3), face, solid, (("triangle", "wall"),)), grid)
 
 
 @dataclass
@@ -207,4 +217,5 @@ STAGE = Stage(
     run,
     reads=(RunFolder.trajectories, RunFolder.statics),
     code=("egvs.world.mesh",),
+    prepare=(prepare,),
 )

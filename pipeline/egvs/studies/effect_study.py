@@ -22,22 +22,22 @@ from egvs.artefacts import parquet
 from egvs.artefacts.readers import read_accuracy, read_scores
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import RunRecord
-from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files, plugins
 from egvs.core.errors import InputError, MissingBackendError, format_problem
+from egvs.core.grid import FloatArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.effects import registry
 from egvs.effects.articulated import Articulated
 from egvs.effects.base import Detect, Effect, Traffic
+from egvs.report.formatting import SCORE_LABELS, ScoreLabel
 from egvs.runs import run, stage_keys, stage_registry
 from egvs.runs.stage_registry import RANKING_STAGES
 from egvs.scenario.effects_config import GROUP, EffectParameters
 from egvs.scenario.model import Scenario
-from egvs.scoring.scorer import Scorer
-from egvs.sensors.scanner import Scanner
 from egvs.sensors.scene import Scene
 from egvs.stages import inputs
 from egvs.stages.inputs import build_scene, open_folder
+from egvs.stages.site_scoring import SiteScoring
 from egvs.studies.measurement import scenario_dependencies
 from egvs.studies.study_settings import SCENARIO, WITH_PREFIX, WITHOUT_PREFIX
 from egvs.traffic.vehicle_boxes import VehicleSize
@@ -46,9 +46,9 @@ MAX_TRIAL_SITES = 6
 
 UNTRIED = "not known before a run"
 SMALL_CHANGE, MIN_DISPLAYED_CHANGE = 0.01, 0.001
-"""An effect that changes all scores by less than the first share, and keeps their order, has little effect. Before a
+"""An effect that changes all scores by less than the first value, and keeps their order, has little effect. Before a
 run, the same holds for an effect whose formula loses less than the first share of returns. Changes below the second
-share are displayed as "less than"."""
+value are displayed as "less than". Changes of scores that are shares are differences, others are relative."""
 
 _TRAJECTORIES, _TPOG = RunFolder.trajectories.name, RunFolder.tpog.name
 
@@ -113,23 +113,42 @@ def run_ablation(
 
 @dataclass(frozen=True)
 class EffectTrial:
-    """What one effect does to the scores of a few sites.
+    """What one effect does to the score that ranks, at a few sites.
 
     Attributes
     ----------
+    by
+        Label of the score.
     least, most
-        Relative changes of scores: the one nearest to 0, and the one farthest from it.
+        Changes of the score: the one nearest to 0, and the one farthest from it. Differences if the score is a share,
+        else relative changes.
     sites, of_sites
         Number of sites that were scored, and of all sites.
     same_order
         Whether the ranking stays the same.
     """
 
+    by: ScoreLabel
     least: float
     most: float
     sites: int
     of_sites: int
     same_order: bool
+
+    @property
+    def is_small(self) -> bool:
+        """Whether the effect changes little."""
+        return abs(self.most) < SMALL_CHANGE and self.same_order
+
+    @property
+    def in_words(self) -> str:
+        """The change, e.g. "EGVS by -12.1 to -24.9%"."""
+        unit = " percentage points" if self.by.is_share else "%"
+        amount = f"{100 * self.least:+.1f} to {100 * self.most:+.1f}{unit}"
+        if abs(self.most) < MIN_DISPLAYED_CHANGE:
+            amount = f"less than {100 * MIN_DISPLAYED_CHANGE:.1f}{unit}"
+        order = "" if self.same_order else ", and their order"
+        return f"{self.by.noun} by {amount}{order}"
 
 
 class EffectTrials:
@@ -171,15 +190,17 @@ class EffectTrials:
             return None
         effects = self._scene.scenario.effects
         with_effect = effects.model_validate({**effects.named, effect.NAME: effect.parameters})
-        scene = inputs.resolve_scene(self._scene.scenario.with_effects(with_effect), self._scene.world)
-        scores = self._scores(scene)
+        scores = self._scores(self._scene.scenario.with_effects(with_effect))
+        by = SCORE_LABELS[self._scene.scenario.score.rank_by]
         is_scored = self._plain > 0
-        changes = scores[is_scored] / self._plain[is_scored] - 1
+        changes = scores[is_scored] - self._plain[is_scored]
+        if not by.is_share:
+            changes = changes / self._plain[is_scored]
         least = float(changes[np.argmin(np.abs(changes))])
         most = float(changes[np.argmax(np.abs(changes))])
         order = np.argsort(-scores, kind="stable")
         same_order = np.array_equal(order, np.argsort(-self._plain, kind="stable"))
-        return EffectTrial(least, most, len(self._sites), len(self._scene.sites), same_order)
+        return EffectTrial(by, least, most, len(self._sites), len(self._scene.sites), same_order)
 
     @cached_property
     def vehicle_shares(self) -> dict[str, tuple[VehicleSize, float]]:
@@ -192,17 +213,19 @@ class EffectTrials:
         return shares
 
     @cached_property
-    def _tpog(self) -> Tpog:
-        return read_tpog(self._folder / _TPOG)
+    def _plain(self) -> FloatArray:
+        """Scores without the effect."""
+        return self._scores(self._scene.scenario)
 
-    @cached_property
-    def _plain(self) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-        """EGVS without the effect."""
-        return self._scores(self._scene)
-
-    def _scores(self, scene: Scene) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-        scanner, scorer = Scanner(scene), Scorer(scene, self._tpog, self._folder / _TRAJECTORIES)
-        return np.array([scorer.score(scanner.scan_site(site)).egvs for site in self._sites])
+    def _scores(self, scenario: Scenario) -> FloatArray:
+        """The score that ranks, at each of the sites; the sites are scanned again."""
+        only_score = {"others": (), "blindspots": False, "standard_error": False, "keep_visibility": ()}
+        score = scenario.score.model_copy(update=only_score)
+        scan = scenario.scan.model_copy(update={"keep": False})
+        context = inputs.open_folder(scenario.model_copy(update={"score": score, "scan": scan}), self._folder)
+        scoring = SiteScoring(context)
+        table = scoring.score_table(scoring.all_sites([site.name for site in self._sites]))
+        return table.column(score.rank_by).values
 
 
 @dataclass(frozen=True)
@@ -241,19 +264,20 @@ class EffectCost:
     Attributes
     ----------
     seconds
-        Additional time of all stages.
+        Additional processor seconds of all stages.
     change
-        Largest relative change of a site's share of the limit.
+        Largest relative change of a site's score, of EGVS as a share of its limit.
     tau
         Kendall's tau of the rankings with and without it.
-    regret
-        Share of the best score that is lost by using the best site of the other ranking.
+    loss_points
+        Expected loss in percentage points of vehicles found by choosing with the other ranking, judged by the
+        scenario's own setting.
     """
 
     seconds: float
     change: float
     tau: float
-    regret: float
+    loss_points: float
 
 
 def effect_catalogue() -> list[EffectStatus]:
@@ -323,7 +347,7 @@ def effect_costs(scenario: Scenario, out: Path) -> dict[str, EffectCost] | None:
             row = rows.get(f"{prefix}{name}")
             if row is not None:
                 seconds = sign * (row["seconds"] - scenario_s)
-                costs[name] = EffectCost(seconds, row["error"], row["tau"], row["regret"])
+                costs[name] = EffectCost(seconds, row["error"], row["tau"], row["loss_points"])
     return costs
 
 
@@ -418,10 +442,5 @@ def _try_effect(effect: Effect[Any], trials: EffectTrials) -> tuple[bool, str]:
     trial = trials.trial(effect)
     if trial is None:
         return False, "only a run with it shows the change, because it changes the traffic"
-    change = f"{trial.least:+.1%} to {trial.most:+.1%}"
-    if abs(trial.most) < MIN_DISPLAYED_CHANGE:
-        change = f"less than {MIN_DISPLAYED_CHANGE:.1%}"
-    if not trial.same_order:
-        change += ", and their order"
     where = f"measured on {trial.sites} of {trial.of_sites} sites, with the last run's traffic"
-    return abs(trial.most) < SMALL_CHANGE and trial.same_order, f"EGVS by {change} ({where})"
+    return trial.is_small, f"{trial.in_words} ({where})"

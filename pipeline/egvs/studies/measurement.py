@@ -15,7 +15,7 @@ import json
 import math
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from itertools import pairwise
@@ -163,7 +163,7 @@ class SettingRunner:
         except OSError as error:
             problem = f"cannot be used as a folder for intermediate results ({error.strerror})"
             raise InputError(self._folder, problem, "Remove it.") from None
-        self._results: dict[Setting, Path] = {}
+        self._dependencies: dict[Setting, str] = {}
         self._gamma: float | None = None
 
     def scenario(self, setting: Setting) -> Scenario:
@@ -203,15 +203,37 @@ class SettingRunner:
         _write_json(self._result(setting), result)
         return scores
 
-    def time_again(self, name: str, setting: Setting, scores: SettingScores) -> None:
+    def run_stages(self, setting: Setting) -> dict[str, str]:
+        """Run the stages that are not cached, and return the key of each stage."""
+        with self._temporary_run(self.scenario(setting)) as work:
+            return {name: self._ensure_stage(name, work) for name in RANKING_STAGES}
+
+    def measure_stages(self, setting: Setting) -> dict[str, float]:
+        """Return the processor seconds of each stage, as this study measures them.
+
+        A stage whose artefacts are from another run is run again: that run may have included compilation.
+
+        Raises
+        ------
+        RunError
+            If a stage writes other bytes than before.
+        """
+        seconds = {}
+        for name, key in self.run_stages(setting).items():
+            if not self.stage_times(name, key).repeats:
+                self.time_again(name, setting, key)
+            seconds[name] = median(self.stage_times(name, key).busy_s)
+        return seconds
+
+    def time_again(self, name: str, setting: Setting, key: str) -> None:
         """Run one stage again to measure its time.
 
         Parameters
         ----------
-        name
-            The stage.
-        setting, scores
-            A setting and its scores.
+        name, key
+            The stage, and its key.
+        setting
+            A setting with this stage.
 
         Raises
         ------
@@ -220,7 +242,42 @@ class SettingRunner:
         """
         with self._temporary_run(self.scenario(setting), RANKING_STAGES[: RANKING_STAGES.index(name)]) as work:
             result = self._run_stage(name, work, stage_keys.stage_key(name, work))
-            self._save_times(name, scores.stages[name], work, result, is_measured=True)
+            self._save_times(name, key, work, result, is_measured=True)
+
+    @contextmanager
+    def open_run(self, setting: Setting, stages: Sequence[str] = RANKING_STAGES[:-1]) -> Iterator[StageContext]:
+        """Open a temporary run folder with the artefacts of some stages; by default those before scores."""
+        with self._temporary_run(self.scenario(setting), stages) as work:
+            yield work
+
+    def saved_result(self, setting: Setting, request: Mapping[str, Any]) -> dict[str, Any] | None:
+        """Read what :meth:`save_result` wrote for the same scenario and request; None if there is nothing."""
+        path = self._result(setting, request)
+        if not path.is_file():
+            return None
+        with _reject_altered(path):
+            result: dict[str, Any] = _read_json(path)["result"]
+            return result
+
+    def save_result(self, setting: Setting, request: Mapping[str, Any], result: Mapping[str, Any]) -> None:
+        """Save a result of a setting, so that an interrupted study can continue.
+
+        Parameters
+        ----------
+        setting
+            The setting.
+        request
+            What else the result depends on.
+        result
+            A JSON value.
+        """
+        _write_json(self._result(setting, request), {"setting": setting.name, "result": dict(result)})
+
+    @contextmanager
+    def reject_altered(self, setting: Setting, request: Mapping[str, Any]) -> Iterator[None]:
+        """Raise an InputError that names the file of a result if it cannot be understood."""
+        with _reject_altered(self._result(setting, request)):
+            yield
 
     def warm_up(self, setting: Setting) -> None:
         """Run all stages with a single site and discard the result, so that everything is compiled and loaded."""
@@ -239,9 +296,9 @@ class SettingRunner:
             peak_mb = max(round(cost.peak_mb - cost.held_mb, 1) for cost in costs)
             return StageTimes(seconds, busy_s, peak_mb, int(times["bytes"]), len(times["measured"]))
 
-    def median_seconds(self, scores: SettingScores) -> dict[str, float]:
-        """Return the median time of each stage."""
-        return {name: median(self.stage_times(name, scores.stages[name]).seconds) for name in RANKING_STAGES}
+    def median_seconds(self, keys: Mapping[str, str]) -> dict[str, float]:
+        """Return the median wall-clock time of each stage."""
+        return {name: median(self.stage_times(name, keys[name]).seconds) for name in RANKING_STAGES}
 
     def tpog(self, setting: Setting) -> Tpog:
         """Return the TPOG of a setting."""
@@ -304,12 +361,15 @@ class SettingRunner:
                 times["measured"].append(cost)
         _write_json(path, times)
 
-    def _result(self, setting: Setting) -> Path:
+    def _result(self, setting: Setting, request: Mapping[str, Any] | None = None) -> Path:
         """Return the file with the result of a setting; the scenario's files are hashed once for it."""
-        if setting not in self._results:
+        if setting not in self._dependencies:
             dependencies = {**scenario_dependencies(self.scenario(setting)), "weight": setting.weight}
-            self._results[setting] = self._folder / f"{files.hash_json(dependencies)[:16]}.json"
-        return self._results[setting]
+            self._dependencies[setting] = files.hash_json(dependencies)
+        name = self._dependencies[setting]
+        if request is not None:
+            name = files.hash_json({"dependencies": name, "request": dict(request)})
+        return self._folder / f"{name[:16]}.json"
 
     def _times(self, name: str, key: str) -> Path:
         return self._folder / "times" / f"{name}-{key[:16]}.json"

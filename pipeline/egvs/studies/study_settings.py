@@ -1,17 +1,19 @@
-r"""The settings that an accuracy study tries.
+r"""The settings that an accuracy study prices.
 
-A study changes one setting at a time, and tries a small grid of the settings that cost most. There are three kinds:
+A study changes one setting at a time, and prices each with the scenario's amount of traffic, and with parts and
+multiples of it. There are two kinds:
 
-- Settings that *approximate* the scenario's scores: less or more traffic, longer frame periods and SUMO steps, thinned
-  beams, the quality of an effect.
-- Settings that *measure* something else: another voxel size or gamma, without an effect of the scenario, or with an
-  effect that it does not name. Such effects are tried if they need no parameter from the user (as a rain rate) and act
-  in this scene.
-- Options of the *traffic*, whose random numbers fall differently (:mod:`egvs.studies.traffic_options`).
+- Settings that *approximate* the scenario's decision: less or more traffic, fewer or more frames for detection, longer
+  frame periods and SUMO steps, no sublanes, the quality of an effect, and ranking by the vehicles found where another
+  score ranks.
+- Settings that *measure* something else: another voxel size or gamma, the model of one detector, thinned beams, other
+  routes, without an effect of the scenario, or with an effect that it does not name. Such effects are tried if they
+  need no parameter from the user (as a rain rate) and act in this scene.
 
 Each setting is a list of ``--set`` overrides, so that users can type the recommended one. If only every f-th beam is
 cast, a voxel has n instead of about f n hits. Because :math:`\min(\gamma, f n) = f \min(\gamma / f, n)`, thinned
-settings divide gamma by f; scores as shares of ``egvs_limit`` are then the same as with weights.
+settings divide gamma by f; scores as shares of ``egvs_limit`` are then the same as with weights. Scores over vehicles
+count points, so thinned beams are another sensor for them.
 
 Traffic with periods is lengthened or shortened by the same factor in each period, whether the period has its own
 ``length_s`` or uses ``traffic.frames``. Frames are always complete blocks.
@@ -20,8 +22,9 @@ Traffic with periods is lengthened or shortened by the same factor in each perio
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from pydantic import ValidationError
 
@@ -30,17 +33,12 @@ from egvs.core.grid import Grid
 from egvs.effects import registry
 from egvs.effects.registry import AUTO_ENABLED
 from egvs.scenario.model import Scenario
-from egvs.scenario.traffic_config import DEFAULT_FRAMES, TrafficConfig
 from egvs.sensors import sites
 from egvs.sensors.sensor import Sensor, scenario_sensor
 from egvs.stages.inputs import build_scene
 from egvs.traffic.finished_fcd import recorded_frames
 
-APPROXIMATES, MEASURES, REFERENCE, SCENARIO = "approximates", "measures", "reference", "scenario"
-TRAFFIC = "traffic"
-"""Kind of settings with other traffic of the same demand."""
-SEED_KNOB = "seed"
-"""Knob of settings that only draw the traffic again."""
+APPROXIMATES, MEASURES, SCENARIO = "approximates", "measures", "scenario"
 WITHOUT_PREFIX, WITH_PREFIX = "without ", "with "
 """Prefixes of settings that leave out an effect, or add one."""
 
@@ -54,17 +52,13 @@ class Setting:
     name
         Description of what changes; unique in a study.
     kind, knob
-        ``APPROXIMATES``, ``MEASURES`` or ``TRAFFIC``, and what is changed.
+        ``SCENARIO``, ``APPROXIMATES`` or ``MEASURES``, and what is changed.
     overrides
         Arguments of ``--set``.
     without
         An effect that is left out.
     weight
         How many beams of the scenario one thinned beam stands for.
-    baseline
-        Name of the setting with the same traffic that it is compared with.
-    steps
-        Number of SUMO steps, for traffic that is simulated again.
     """
 
     name: str
@@ -73,12 +67,42 @@ class Setting:
     overrides: tuple[str, ...] = ()
     without: str | None = None
     weight: float = 1.0
-    baseline: str = SCENARIO
-    steps: float = 0.0
+
+    def to_options(self) -> str:
+        """Return the overrides as options of a command."""
+        return " ".join(f"--set {shlex.quote(override)}" for override in self.overrides)
 
 
 SCENARIO_AS_IS = Setting(SCENARIO, SCENARIO, "")
 """The scenario without changes."""
+
+
+@dataclass(frozen=True)
+class PricedSetting:
+    """A setting with an amount of traffic: a row of the study.
+
+    Attributes
+    ----------
+    setting
+        Description and overrides of everything, traffic included.
+    variant
+        Name of the setting whose runs it takes part of.
+    units
+        Length of the traffic in runs of the scenario's length; below 1 for a part of one.
+    blocks
+        The same in blocks of one run, if it is a part of one; else 0.
+    sampled_frames
+        Number of frames for scores over vehicles.
+    score
+        Score that chooses, if it is not the one that ranks.
+    """
+
+    setting: Setting
+    variant: str
+    units: float
+    blocks: int
+    sampled_frames: int
+    score: str = ""
 
 
 @dataclass(frozen=True)
@@ -87,41 +111,37 @@ class SettingValues:
 
     Attributes
     ----------
-    frames
-        Numbers of frames; those below the scenario's are tried.
+    traffic_parts
+        Parts of the scenario's traffic, rounded to complete blocks.
     traffic_factors
         How many times as long as the scenario's traffic.
+    sampled_factors
+        How many times as many frames for scores over vehicles.
     frame_periods_s, steps_s
         Seconds between frames, and SUMO's steps.
-    grid_factors, grid_seconds
-        A complete grid of ``traffic_factors`` and pairs of SUMO step and frame period (None: the scenario's).
     thinning_factors
         Every n-th azimuth.
     voxels_m, gammas
         Edges of voxels, and values of ``score.gamma``.
+    detectors
+        Whether the model of each detector alone is tried.
     unnamed_effects
         Whether effects that the scenario does not name are tried.
     traffic_options
-        Whether SUMO's step, sublanes and routing are compared with other seeds.
-    traffic_steps_s
-        SUMO's steps in this comparison.
-    traffic_seeds
-        Number of other seeds in this comparison.
+        Whether sublanes and routing are tried.
     """
 
-    frames: Sequence[int] = (250, 500, 1000, 2500)
-    traffic_factors: Sequence[int] = (2, 4, 8)
+    traffic_parts: Sequence[float] = (0.1, 0.2, 0.5)
+    traffic_factors: Sequence[int] = (2, 4)
+    sampled_factors: Sequence[float] = (0.2, 0.4, 2.0, 3.0)
     frame_periods_s: Sequence[float] = (0.5, 1.0, 2.0)
-    steps_s: Sequence[float] = (0.05, 0.1, 0.5, 1.0)
-    grid_factors: Sequence[int] = (1, 4, 8, 16)
-    grid_seconds: Sequence[tuple[float | None, float | None]] = ((None, None), (None, 1.0), (0.5, 1.0), (1.0, 1.0))
+    steps_s: Sequence[float] = (0.25, 0.5, 1.0)
     thinning_factors: Sequence[int] = (2, 4)
-    voxels_m: Sequence[float] = (1.0, 0.5, 0.25, 0.125)
-    gammas: Sequence[float] = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+    voxels_m: Sequence[float] = (1.0, 0.5, 0.25)
+    gammas: Sequence[float] = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
+    detectors: bool = True
     unnamed_effects: bool = True
     traffic_options: bool = True
-    traffic_steps_s: Sequence[float] = (0.25, 0.5, 1.0)
-    traffic_seeds: int = 3
 
 
 DEFAULT_VALUES = SettingValues()
@@ -180,25 +200,8 @@ def _frames_in_blocks(period: Scenario) -> int:
     return frames - frames % period.tpog.blocks
 
 
-def reference_setting(scenario: Scenario, factor: int) -> Setting:
-    """Return the scenario with traffic that is ``factor`` times as long."""
-    overrides: tuple[str, ...] = ()
-    if factor > 1:
-        _, overrides = traffic_length_overrides(scenario, factor, scenario.traffic.frame_period_s)
-    return Setting(REFERENCE, REFERENCE, "frames", overrides)
-
-
-def is_default(scenario: Scenario, base: Scenario) -> bool:
-    """Whether a scenario has the default frames, frame period and step, and is otherwise the same as ``base``."""
-    defaults = {key: TrafficConfig.model_fields[key].default for key in ("frame_period_s", "step_s")}
-    defaults["frames"] = DEFAULT_FRAMES
-    traffic = base.traffic.model_copy(update=defaults)
-    default = base.model_copy(update={"traffic": traffic})
-    return not base.is_recorded and scenario.model_dump() == default.model_dump()
-
-
-def list_settings(scenario: Scenario, values: SettingValues = DEFAULT_VALUES) -> list[Setting]:
-    """List all settings except the reference: the scenario first, then in the order in which they are tried.
+def list_variants(scenario: Scenario, values: SettingValues = DEFAULT_VALUES) -> list[Setting]:
+    """List the settings that need runs of their own, the scenario first; without :mod:`egvs.studies.traffic_options`.
 
     Parameters
     ----------
@@ -207,44 +210,23 @@ def list_settings(scenario: Scenario, values: SettingValues = DEFAULT_VALUES) ->
     values
         Values to try.
     """
-    settings = [SCENARIO_AS_IS, *_measure_settings(scenario, values), *_effect_quality_settings(scenario)]
-    settings += _thinned_sensor_settings(scenario, values)
-    settings += sorted(traffic_settings(scenario, values), key=lambda setting: setting.steps)
+    variants = [SCENARIO_AS_IS, *_period_settings(scenario, values)]
+    if not scenario.is_recorded:
+        variants += step_settings(scenario, values.steps_s)
+    variants += [*_effect_quality_settings(scenario), *_thinned_sensor_settings(scenario, values)]
+    variants += _measure_settings(scenario, values)
     distinct: dict[tuple[object, ...], Setting] = {}
-    for setting in settings:
-        distinct.setdefault((setting.overrides, setting.without), setting)
+    for variant in variants:
+        distinct.setdefault((variant.overrides, variant.without), variant)
     return list(distinct.values())
 
 
-def traffic_settings(scenario: Scenario, values: SettingValues = DEFAULT_VALUES) -> Iterator[Setting]:
-    """Yield settings with other frames, frame periods and SUMO steps.
-
-    Parameters
-    ----------
-    scenario
-        The scenario.
-    values
-        Values to try.
-    """
-    traffic = scenario.traffic
-    scenario_frames = counted_frames(scenario)
-    for requested in values.frames:
-        frames, overrides = traffic_length_overrides(scenario, requested / scenario_frames, traffic.frame_period_s)
-        if 0 < frames < scenario_frames and (frames == requested or traffic.periods):
-            yield Setting(f"{frames} frames", APPROXIMATES, "frames", overrides)
+def _period_settings(scenario: Scenario, values: SettingValues) -> Iterator[Setting]:
     for period_s in values.frame_periods_s:
-        yield from _scaled_traffic_setting(scenario, "period", 1, None, period_s)
-    if scenario.is_recorded:
-        return
-    yield from step_settings(scenario, values.steps_s, APPROXIMATES)
-    for factor in values.traffic_factors:
-        yield from _scaled_traffic_setting(scenario, "frames", factor, None, None)
-    for factor in values.grid_factors:
-        for grid_step_s, grid_period_s in values.grid_seconds:
-            yield from _scaled_traffic_setting(scenario, "grid", factor, grid_step_s, grid_period_s)
+        yield from _scaled_traffic_setting(scenario, "period", None, period_s)
 
 
-def step_settings(scenario: Scenario, steps_s: Sequence[float], kind: str) -> Iterator[Setting]:
+def step_settings(scenario: Scenario, steps_s: Sequence[float]) -> Iterator[Setting]:
     """Yield settings with other SUMO steps, and the nearest frame period that is a multiple of the step.
 
     Parameters
@@ -253,16 +235,10 @@ def step_settings(scenario: Scenario, steps_s: Sequence[float], kind: str) -> It
         The scenario.
     steps_s
         Steps to try.
-    kind
-        Kind of the settings; those of the traffic have a shorter name.
     """
     for step_s in steps_s:
         period_s = _nearest_period(step_s, scenario.traffic.frame_period_s)
-        for setting in _scaled_traffic_setting(scenario, "step", 1, step_s, period_s):
-            if kind == TRAFFIC:
-                frames = "" if period_s == scenario.traffic.frame_period_s else f", a frame every {period_s:g} s"
-                setting = replace(setting, name=f"step {step_s:g} s{frames}", kind=kind)
-            yield setting
+        yield from _scaled_traffic_setting(scenario, "step", step_s, period_s)
 
 
 def _nearest_period(step_s: float, period_s: float) -> float:
@@ -272,28 +248,24 @@ def _nearest_period(step_s: float, period_s: float) -> float:
     return max(1, int(period_s / step_s)) * step_s
 
 
-def _scaled_traffic_setting(
-    scenario: Scenario, knob: str, factor: int, step_s: float | None, period_s: float | None
-) -> Iterator[Setting]:
+def _scaled_traffic_setting(scenario: Scenario, knob: str, step_s: float | None, period_s: float) -> Iterator[Setting]:
     """Yield the setting with such traffic, if steps and periods divide, and if it differs from the scenario."""
     traffic = scenario.traffic
     step_s = step_s or traffic.step_s
-    period_s = period_s or traffic.frame_period_s
-    frames, length_overrides = traffic_length_overrides(scenario, factor, period_s)
+    frames, length_overrides = traffic_length_overrides(scenario, 1.0, period_s)
     is_possible = _divides(step_s, period_s) and _divides(step_s, traffic.warmup_s)
     if frames == 0 or not (is_possible or scenario.is_recorded):
         return
-    name = f"{frames} frames"
+    parts = []
     overrides = list(length_overrides)
-    if period_s != traffic.frame_period_s:
-        name += f" every {period_s:g} s"
-        overrides.append(f"traffic.frame_period_s={float(f'{period_s:.6g}')}")
     if step_s != traffic.step_s:
-        name += f", step {step_s:g} s"
+        parts.append(f"step {step_s:g} s")
         overrides.append(f"traffic.step_s={step_s}")
-    if overrides:
-        steps = (traffic.warmup_s + frames * period_s) / step_s
-        yield Setting(name, APPROXIMATES, knob, tuple(overrides), steps=steps)
+    if period_s != traffic.frame_period_s:
+        parts.append(f"a frame every {period_s:g} s")
+        overrides.append(f"traffic.frame_period_s={float(f'{period_s:.6g}')}")
+    if parts:
+        yield Setting(", ".join(parts), APPROXIMATES, knob, tuple(overrides))
 
 
 def _divides(part: float, total: float) -> bool:
@@ -301,9 +273,7 @@ def _divides(part: float, total: float) -> bool:
 
 
 def _thinned_sensor_settings(scenario: Scenario, values: SettingValues) -> Iterator[Setting]:
-    """Yield settings with every n-th azimuth and every second channel; only EGVS can be weighted for them."""
-    if scenario.score.rank_by != "egvs":
-        return
+    """Yield settings with every n-th azimuth and every second channel; EGVS is weighted for them."""
     candidates = sites.candidate_sites(scenario)
     if any(site.points is not None for site in candidates):
         return
@@ -319,7 +289,7 @@ def _thinned_sensor_settings(scenario: Scenario, values: SettingValues) -> Itera
         for sensor in sensors:
             overrides += _sensor_overrides(scenario, sensor, factor, range(sensor.channels))
         suffix = "nd" if factor == 2 else "th"
-        yield _weighted_setting(scenario, f"every {factor}{suffix} azimuth", "azimuth", overrides, float(factor))
+        yield _thinned_setting(scenario, f"every {factor}{suffix} azimuth", "azimuth", overrides, float(factor))
 
     weights = set()
     overrides = []
@@ -328,12 +298,14 @@ def _thinned_sensor_settings(scenario: Scenario, values: SettingValues) -> Itera
         weights.add(sensor.channels / len(channels))
         overrides += _sensor_overrides(scenario, sensor, 1, channels)
     if len(weights) == 1 and weights != {1.0}:
-        yield _weighted_setting(scenario, "every 2nd channel", "channels", overrides, weights.pop())
+        yield _thinned_setting(scenario, "every 2nd channel", "channels", overrides, weights.pop())
 
 
-def _weighted_setting(scenario: Scenario, name: str, knob: str, overrides: list[str], weight: float) -> Setting:
+def _thinned_setting(scenario: Scenario, name: str, knob: str, overrides: list[str], weight: float) -> Setting:
+    if scenario.score.rank_by != "egvs":
+        return Setting(name, MEASURES, knob, tuple(overrides))
     gamma = f"score.gamma={scenario.gamma / weight}"
-    return Setting(name, APPROXIMATES, knob, (*overrides, gamma), weight=weight)
+    return Setting(name, MEASURES, knob, (*overrides, gamma), weight=weight)
 
 
 def _sensor_overrides(scenario: Scenario, sensor: Sensor, factor: int, channels: Sequence[int]) -> Iterator[str]:
@@ -362,23 +334,23 @@ def _sensor_overrides(scenario: Scenario, sensor: Sensor, factor: int, channels:
 
 
 def _measure_settings(scenario: Scenario, values: SettingValues) -> Iterator[Setting]:
-    """Yield settings with other voxels and gammas, for scores that depend on them, and with other effects.
+    """Yield settings with other voxels, other gammas for EGVS, and other effects.
 
-    Voxels are tried with the same gamma, and with gamma in proportion to a face of the voxel.
+    Voxels are tried with the same gamma and, for EGVS, with gamma in proportion to a face of the voxel. Scores over
+    vehicles do not depend on voxels, only their cost does.
     """
     current_m = scenario.roi.voxel_m
     gamma = scenario.gamma
     is_egvs = scenario.score.rank_by == "egvs"
-    if is_egvs or scenario.score.rank_by == "entropy_seen":
-        for voxel_m in values.voxels_m:
-            if voxel_m == current_m or not _fits(scenario, voxel_m):
-                continue
-            overrides = (f"roi.voxel_m={voxel_m}",)
-            yield Setting(f"voxel {voxel_m:g} m", MEASURES, "voxel", overrides)
-            scaled = gamma * (voxel_m / current_m) ** 2
-            if scaled != gamma and is_egvs:
-                name = f"voxel {voxel_m:g} m, gamma {scaled:g}"
-                yield Setting(name, MEASURES, "voxel and gamma", (*overrides, f"score.gamma={scaled}"))
+    for voxel_m in values.voxels_m:
+        if voxel_m == current_m or not _fits(scenario, voxel_m):
+            continue
+        overrides = (f"roi.voxel_m={voxel_m}",)
+        yield Setting(f"voxel {voxel_m:g} m", MEASURES, "voxel", overrides)
+        scaled = gamma * (voxel_m / current_m) ** 2
+        if scaled != gamma and is_egvs:
+            name = f"voxel {voxel_m:g} m, gamma {scaled:g}"
+            yield Setting(name, MEASURES, "voxel and gamma", (*overrides, f"score.gamma={scaled}"))
     if is_egvs:
         for other_gamma in values.gammas:
             if other_gamma != gamma:
@@ -423,11 +395,7 @@ def _effect_quality_settings(scenario: Scenario) -> Iterator[Setting]:
             except ValidationError:  # the effect uses another method, without this parameter
                 continue
             current = getattr(effect.parameters, key)
-            finest = values[-1]
-            finest_setting = SCENARIO if finest == current else f"{name} {key} {finest}"
             for value in reversed(values):
-                if value == current:
-                    continue
-                overrides = (f"effects.{name}.{key}={json.dumps(value)}",)
-                baseline = SCENARIO if value == finest else finest_setting
-                yield Setting(f"{name} {key} {value}", APPROXIMATES, name, overrides, baseline=baseline)
+                if value != current:
+                    overrides = (f"effects.{name}.{key}={json.dumps(value)}",)
+                    yield Setting(f"{name} {key} {value}", APPROXIMATES, name, overrides)

@@ -1,22 +1,41 @@
 """Movements in words: "westbound on High Street, left to Station Road".
 
+The directions are those at the junction, not at the edges of the count, which may be far from it.
+
 World frame, in plan: x east, y north, metres.
 """
 
 from __future__ import annotations
 
 import html
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from egvs.traffic.directions import TURNS, compass, lane_heading
+from egvs.core.errors import InputError
+from egvs.traffic.demand import RouteFinder
+from egvs.traffic.directions import TURNS, Floats, compass
 from egvs.traffic.network import Edge, Network
 
 _WAYS = {"straight": "straight on", "left": "left", "right": "right", "back": "U-turn"}
 _UNNAMED_STREET = "an unnamed street"
+_CAR = "passenger"
+
+_HEADING_OVER_M = 30.0
+"""The direction of a movement is that of the last metres before the junction, and of the first ones after it."""
 
 _STRAIGHT_DEG, _BACK_DEG = 45.0, 135.0
 """Changes of direction that are not yet a turn, and more than a turn."""
+
+
+class _Passage(NamedTuple):
+    """How a movement passes a junction: the edges to it and from it, and the middle of a roundabout."""
+
+    to_junction: Sequence[Edge]
+    from_junction: Sequence[Edge]
+    ring_middle_m: Floats | None
 
 
 class MovementNames:
@@ -26,10 +45,16 @@ class MovementNames:
     ----------
     network
         Its edges should have names (netconvert's ``--output.street-names``).
+    center_m
+        x, y of the junction. Of the nodes on the way from one edge to the other, the nearest one is its node.
     """
 
-    def __init__(self, network: Network) -> None:
+    def __init__(self, network: Network, center_m: tuple[float, float]) -> None:
+        self._center_m = center_m
         self._edges = {edge.id: edge for edge in network.edges}
+        self._nodes_m = {node.id: node.at_m for node in network.junctions}
+        self._roundabouts = [set(roundabout.nodes) for roundabout in network.roundabouts]
+        self._routes = RouteFinder(network, _CAR)
         self._turns: dict[tuple[str, str], str] = {}
         for connection in network.connections:
             if connection.direction in TURNS:
@@ -39,7 +64,7 @@ class MovementNames:
     def describe(self, from_edge: str, to_edge: str | None) -> str:
         """Return a movement in words.
 
-        The turn is SUMO's where a connection joins the edges, otherwise that of their directions.
+        The turn is SUMO's where a connection joins the edges at the junction, otherwise that of their directions.
 
         Parameters
         ----------
@@ -53,15 +78,74 @@ class MovementNames:
         str
             For example ``"westbound on High Street, left to Station Road"``.
         """
-        approach = self._edges[from_edge]
-        words = f"{compass(lane_heading(approach.lanes[0], at_end=True))}bound on {_street(approach)}"
+        first = self._edges[from_edge]
         if to_edge is None:
-            return words
-        way_out = self._edges[to_edge]
-        turn = self._turns.get((from_edge, to_edge)) or _turn_between(approach, way_out)
+            return f"{compass(_end_heading([first]))}bound on {_street(first)}"
+
+        passage = self._passage(first, self._edges[to_edge])
+        approach, way_out = passage.to_junction[-1], passage.from_junction[0]
+        before, after = _headings(passage)
+        words = f"{compass(before)}bound on {_street(approach)}"
+        if first.name not in ("", approach.name):
+            words += f" from {_street(first)}"
+
+        turn = self._turns.get((approach.id, way_out.id)) or _turn_between(before, after)
+        last = passage.from_junction[-1]
+        towards = f" towards {_street(last)}" if last.name not in ("", way_out.name) else ""
         if turn == "straight" and approach.name == way_out.name:
-            return f"{words}, straight on"
-        return f"{words}, {_WAYS[turn]} to {_street(way_out)}"
+            return f"{words}, straight on{towards}"
+        return f"{words}, {_WAYS[turn]} to {_street(way_out)}{towards}"
+
+    def _passage(self, first: Edge, last: Edge) -> _Passage:
+        """Find the junction on the fastest way between two edges."""
+        try:
+            ids = self._routes.locate(first.id, last.id, "movement").edges
+        except InputError:  # cars may not drive there: the two edges describe the movement
+            return _Passage([first], [last], None)
+        way = [self._edges[edge_id] for edge_id in ids]
+        nodes = [edge.to_node for edge in way[:-1]]
+        distances_m = [math.dist(self._nodes_m[node], self._center_m) for node in nodes]
+        nearest = distances_m.index(min(distances_m))
+
+        for ring in self._roundabouts:
+            if nodes[nearest] in ring:
+                on_ring = [index for index, node in enumerate(nodes) if node in ring]
+                middle_m = np.mean([self._nodes_m[node] for node in sorted(ring)], axis=0)
+                return _Passage(way[: on_ring[0] + 1], way[on_ring[-1] + 1 :], middle_m)
+        return _Passage(way[: nearest + 1], way[nearest + 1 :], None)
+
+
+def _headings(passage: _Passage) -> tuple[Floats, Floats]:
+    """Return the directions before and after a junction, (2,) each; of a roundabout, to and from its middle."""
+    middle_m = passage.ring_middle_m
+    if middle_m is None:
+        return _end_heading(passage.to_junction), _start_heading(passage.from_junction)
+    far_before_m = _point_along(_middle_line(passage.to_junction)[::-1])
+    far_after_m = _point_along(_middle_line(passage.from_junction))
+    return middle_m - far_before_m, far_after_m - middle_m
+
+
+def _end_heading(edges: Sequence[Edge]) -> Floats:
+    line_m = _middle_line(edges)[::-1]
+    heading: Floats = line_m[0] - _point_along(line_m)
+    return heading
+
+
+def _start_heading(edges: Sequence[Edge]) -> Floats:
+    line_m = _middle_line(edges)
+    heading: Floats = _point_along(line_m) - line_m[0]
+    return heading
+
+
+def _middle_line(edges: Sequence[Edge]) -> Floats:
+    """Return the first lanes of edges, one after another, in plan, (n, 2)."""
+    return np.vstack([edge.lanes[0].shape_m[:, :2] for edge in edges])
+
+
+def _point_along(line_m: Floats) -> Floats:
+    """Return the point of a line at :data:`_HEADING_OVER_M` from its start, or its end if it is shorter, (2,)."""
+    distance_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(line_m, axis=0).T)))
+    return np.array([np.interp(_HEADING_OVER_M, distance_m, line_m[:, axis]) for axis in (0, 1)])
 
 
 def _street(edge: Edge) -> str:
@@ -70,10 +154,8 @@ def _street(edge: Edge) -> str:
     return " ".join("".join(printable).split()) or _UNNAMED_STREET
 
 
-def _turn_between(approach: Edge, way_out: Edge) -> str:
-    """Return a value of :data:`TURNS` from the directions of two edges."""
-    before = lane_heading(approach.lanes[0], at_end=True)
-    after = lane_heading(way_out.lanes[0], at_end=False)
+def _turn_between(before: Floats, after: Floats) -> str:
+    """Return a value of :data:`TURNS` from two directions, (2,) each."""
     cross = before[0] * after[1] - before[1] * after[0]
     turned_deg = float(np.degrees(np.arctan2(cross, before @ after)))
     if abs(turned_deg) <= _STRAIGHT_DEG:

@@ -173,6 +173,13 @@ class Junction(Shape):
     incoming_lanes: tuple[str, ...]
 
 
+class Roundabout(NamedTuple):
+    """Ids of the nodes and edges of a ring."""
+
+    nodes: tuple[str, ...]
+    edges: tuple[str, ...]
+
+
 @dataclass(frozen=True)
 class StopLine:
     """The end of a lane at a signal, and the longest time that one of its connections waits for green."""
@@ -229,6 +236,8 @@ class Network:
         Pairs of lanes that walking areas and crossings connect, in both directions.
     stop_lines
         The ends of lanes at signals that become green.
+    roundabouts
+        The roundabouts, in file order.
     """
 
     all_edges: tuple[Edge, ...]
@@ -238,6 +247,7 @@ class Network:
     location: Location | None = None
     lane_links: tuple[tuple[str, str], ...] = ()
     stop_lines: tuple[StopLine, ...] = ()
+    roundabouts: tuple[Roundabout, ...] = ()
 
     @property
     def red_s(self) -> float:
@@ -325,6 +335,7 @@ def _read_network_file(file: _NamedFile, _content: str) -> Network:
     signals: list[_Signal] = []
     reds_s: dict[tuple[str, int], float] = {}
     location = None
+    roundabouts: list[Roundabout] = []
     for element in xml.iter_elements(file.path, "net", file.name):
         try:
             match element.tag:
@@ -350,6 +361,9 @@ def _read_network_file(file: _NamedFile, _content: str) -> Network:
                     for position, red_s in _longest_reds(phases).items():
                         key = element.attrib["id"], position
                         reds_s[key] = max(red_s, reds_s.get(key, 0.0))
+                case "roundabout":
+                    nodes, ring = (tuple(element.attrib[key].split()) for key in ("nodes", "edges"))
+                    roundabouts.append(Roundabout(nodes, ring))
                 case "location":
                     location = _parse_location(element)
         except (KeyError, ValueError, IndexError) as error:
@@ -360,7 +374,10 @@ def _read_network_file(file: _NamedFile, _content: str) -> Network:
         raise InputError(file.name, "the network has no roads", "Use a network with at least one edge.")
     road_connections = tuple(_parse_connections(connections, roads, file.name))
     stop_lines = tuple(_stop_lines(signals, roads, reds_s))
-    return Network(tuple(edges), road_connections, tuple(junctions), cycle_s, location, tuple(lane_links), stop_lines)
+    return Network(
+        tuple(edges), road_connections, tuple(junctions), cycle_s, location, tuple(lane_links), stop_lines,
+        tuple(roundabouts),
+    )  # fmt: skip
 
 
 class _Phase(NamedTuple):

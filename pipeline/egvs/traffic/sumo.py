@@ -27,8 +27,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import IO, Any
 
+from egvs.core import files
 from egvs.core.errors import InputError, MissingBackendError, RunError
 from egvs.core.sumo_home import sumo_home
+from egvs.core.threads import checkpoint
 from egvs.traffic import sandbox
 from egvs.traffic.vehicle_boxes import VehicleSize
 
@@ -110,17 +112,25 @@ def sumo_environment() -> dict[str, str]:
     return {**defaults, **os.environ}
 
 
-@cache
 def sumo_version() -> str:
     """Return SUMO's version, e.g. ``"1.28.0"``: that of the wheel, or what ``sumo --version`` prints."""
+    version, is_wheel = _installed_version()
+    if not is_wheel:
+        files.observe_content(sumo_binary("sumo"))
+    return version
+
+
+@cache
+def _installed_version() -> tuple[str, bool]:
+    """Return SUMO's version, and whether it is that of the wheel."""
     program = sumo_binary("sumo")
     try:
         wheel = metadata.distribution("eclipse-sumo")
         if Path(str(wheel.locate_file("sumo"))).resolve() in program.resolve().parents:
-            return wheel.version
+            return wheel.version, True
     except metadata.PackageNotFoundError:
         pass
-    return parse_version(run_program("sumo", ["--version"], Path()))
+    return parse_version(run_program("sumo", ["--version"], Path())), False
 
 
 def parse_version(text: str) -> str:
@@ -253,13 +263,13 @@ def _start_program(command: Sequence[str], folder: Path, stdout: Any, stderr: An
 
 def _wait(process: subprocess.Popen[bytes], watch: Callable[[int], None] | None) -> tuple[bytes, bytes]:
     """Return standard output and standard error of a process, at its end."""
-    if watch is None:
-        return process.communicate()
     while True:
+        checkpoint()
         try:
             return process.communicate(timeout=_WATCH_PERIOD_S)
         except subprocess.TimeoutExpired:
-            watch(process.pid)
+            if watch is not None:
+                watch(process.pid)
 
 
 def program_error(name: str, code: int, text: str) -> RunError:

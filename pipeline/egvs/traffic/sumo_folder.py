@@ -11,6 +11,7 @@ compared exactly.
 from __future__ import annotations
 
 import shutil
+import threading
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -477,9 +478,14 @@ def _copy_files(
     return copies, notes
 
 
+_CONVERSION_LOCK = threading.Lock()
+"""Held while a map is converted: another thread that needs the same network waits for it."""
+
+
 def convert_osm_to_network(path: Path, network_path: Path) -> None:
     """Convert an OpenStreetMap map to a network, whose origin is at its south-west corner."""
-    content = _convert_osm_once(path, files.hash_file(path))
+    with _CONVERSION_LOCK:
+        content = _convert_osm_once(path, files.hash_file(path))
     with files.attach_filename(network_path):
         network_path.write_bytes(content)
 

@@ -202,7 +202,7 @@ def read_sumocfg(path: Path) -> DemandFiles:
     InputError
         When it names no network, a missing file, or an option that is not known to be harmless.
     """
-    files: dict[str, tuple[Path, ...]] = {}
+    paths: dict[str, tuple[Path, ...]] = {}
     options: dict[str, str] = {}
     begin_s = 0.0
     for option, value in _iter_options(path):
@@ -212,9 +212,9 @@ def read_sumocfg(path: Path) -> DemandFiles:
         elif option == "no-internal-links" and value.lower() in _TRUE:
             raise InputError(where, "makes vehicles jump across junctions (up to 42 m)", "Remove it.")
         elif option in FILE_OPTIONS:
-            files[option] = tuple(path.parent / name.strip() for name in value.split(",") if name.strip())
-            for file in files[option]:
-                if not file.is_file():
+            paths[option] = tuple(path.parent / name.strip() for name in value.split(",") if name.strip())
+            for file in paths[option]:
+                if not files.is_input_file(file):
                     raise InputError(where, f"no such file ({file})", "Use a path relative to the configuration.")
         elif option in ACCEPTED_OPTIONS:
             options[option] = value
@@ -222,9 +222,9 @@ def read_sumocfg(path: Path) -> DemandFiles:
             continue  # has no effect on the traffic
         elif value:
             raise InputError(where, "this SUMO option is not supported", "Remove it; see docs/security.md.")
-    if "net-file" not in files:
+    if "net-file" not in paths:
         raise InputError(path, "has no net-file", "Add <net-file value=.../> to its <input>.")
-    return DemandFiles(files, options, begin_s)
+    return DemandFiles(paths, options, begin_s)
 
 
 def _iter_options(path: Path) -> Iterator[tuple[str, str]]:

@@ -24,7 +24,7 @@ from egvs.core.errors import Diagnostic
 from egvs.report.formatting import SCORE_LABELS
 from egvs.report.ranking_check import DetectorCheck, RankingCheck
 from egvs.scenario.model import Scenario
-from egvs.studies.pareto_figure import LabelPlacement
+from egvs.studies.decision_figure import LabelPlacement
 from egvs.validation.correlation import CoefficientKind, Correlation
 from egvs.validation.detection_metrics import ALL_OBJECTS, SiteDetection
 from egvs.validation.held_out_traffic import TrafficSample

@@ -1,0 +1,271 @@
+"""Processor time of every command: cold, warm, and up to date.
+
+``python -m benchmarks.verbs --markdown docs/scaling.md`` measures the commands of :data:`VERBS` on the shipped
+roundabout with few frames, or on a small OpenStreetMap extract, and writes the table between the marks of the page.
+
+- *cold*: no kernel is compiled, and the store is empty
+- *warm*: the kernels are compiled, and the store is empty
+- *up to date*: the same command again in the same folder, for commands that keep their results
+
+Each command runs in a fresh copy of a folder with what it needs, for example a finished run. Seconds are processor
+time of the process and of those that it started. A command whose libraries are not installed is left out by name.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shutil
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+SCENARIO = ROOT / "scenarios" / "roundabout"
+EXTRACT = ROOT / "tests" / "importers" / "data" / "small.osm"
+MARKS = ("<!-- verbs -->", "<!-- end of verbs -->")
+HEADINGS = ("command", "cold s", "warm s", "up to date s")
+
+REPEATS = 3
+"""A quick command is measured so often, and the median counts."""
+
+QUICK_S = 2.0
+
+SHORT = 'extends = "../roundabout"\n\n[traffic]\nframes = 200\n'
+"""The scenario of most commands."""
+
+
+@dataclass(frozen=True)
+class Verb:
+    """A command that is measured.
+
+    Attributes
+    ----------
+    words
+        Its arguments.
+    keeps
+        Whether it keeps results that the same command uses again.
+    address
+        Whether it is stopped as soon as it prints the address of its page.
+    """
+
+    words: str
+    keeps: bool = False
+    address: bool = False
+
+    @property
+    def name(self) -> str:
+        """The words of the command without arguments."""
+        words = self.words.split()
+        return " ".join(words[:2] if words[0] == "city" else words[:1])
+
+
+VERBS = (
+    Verb("new imported --osm small.osm"),
+    Verb("demo example"),
+    Verb("check short"),
+    Verb("run short --out new", keeps=True),
+    Verb("place short --out run --count 2", keeps=True),
+    Verb("explore run --no-browser --port 0", keeps=True, address=True),
+    Verb("compare run other"),
+    Verb("city new town --osm small.osm --junctions all"),
+    Verb("city traffic city", keeps=True),
+    Verb("city run city --out new --cluster processes=1", keeps=True),
+    Verb("city place city --out city_run --count 2 --cluster processes=1", keeps=True),
+    Verb("city compare city_run city_other"),
+    Verb("validate short --out run --frames 20 --detector points", keeps=True),
+    Verb("accuracy short --out run --budget 20s", keeps=True),
+    Verb("effects short --out run"),
+    Verb("scores"),
+    Verb("clouds short --out clouds --frames 20"),
+    Verb("train short --out model.onnx --steps 10 --frames 10"),
+    Verb("traffic short --out run"),
+    Verb("statics short --out run"),
+    Verb("tpog short --out run"),
+    Verb("scan short --out run"),
+    Verb("score short --out run"),
+    Verb("report short --out run"),
+    Verb("runs ."),
+    Verb("export run --to geojson"),
+    Verb("figure run --what ranking"),
+    Verb("sensors"),
+    Verb("verify run"),
+    Verb("store"),
+)
+
+PREPARATION = (
+    "run short --out run",
+    "run short --out other --set score.gamma=5",
+    "city new city --osm small.osm --junctions all",
+    "city place city --out city_run --count 2 --cluster processes=1",
+    "city place city --out city_other --count 2 --cluster processes=1 --set score.gamma=5",
+)
+"""Commands that make what the others need."""
+
+
+class MissingLibraryError(Exception):
+    """A command needs libraries that are not installed."""
+
+
+class CommandError(Exception):
+    """A command ended with an error."""
+
+
+@dataclass(frozen=True)
+class Caches:
+    """Where a command finds compiled kernels and results of earlier runs."""
+
+    kernels: Path
+    store: Path
+
+    def environment(self) -> dict[str, str]:
+        """Return the environment variables of the command; bytecode is written, as after installing."""
+        variables = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+        return {**variables, "NUMBA_CACHE_DIR": str(self.kernels), "EGVS_STORE": str(self.store)}
+
+
+def processor_s(verb: Verb, folder: Path, caches: Caches) -> float:
+    """Run a command in a folder; return the processor time of its process and of those that it started, seconds.
+
+    Raises
+    ------
+    MissingLibraryError
+        When a library of an extra is missing.
+    CommandError
+        When the command fails.
+    """
+    words = [sys.executable, "-m", "egvs", *verb.words.split()]
+    with tempfile.TemporaryFile("w+", encoding="utf-8") as errors:
+        process = subprocess.Popen(
+            words, cwd=folder, env=caches.environment(), stdout=subprocess.PIPE, stderr=errors, text=True
+        )
+        assert process.stdout is not None
+        for line in process.stdout:
+            if verb.address and line.startswith("http"):
+                process.send_signal(signal.SIGINT)
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        process.stdout.close()
+        errors.seek(0)
+        message = errors.read()
+    if "Run pip install" in message:
+        raise MissingLibraryError(message.strip())
+    if process.returncode:
+        raise CommandError(f"egvs {verb.words}: exit code {process.returncode}\n{message}")
+    return usage.ru_utime + usage.ru_stime
+
+
+def prepare(folder: Path, caches: Caches) -> None:
+    """Make a folder with everything that the commands need."""
+    folder.mkdir()
+    shutil.copytree(SCENARIO, folder / SCENARIO.name)
+    shutil.copy(EXTRACT, folder)
+    (folder / "short").mkdir()
+    (folder / "short" / "scenario.toml").write_text(SHORT, encoding="utf-8")
+    for words in PREPARATION:
+        processor_s(Verb(words), folder, caches)
+
+
+@dataclass(frozen=True)
+class Row:
+    """Processor time of a command, seconds; None where it has no such time."""
+
+    verb: Verb
+    cold_s: float
+    warm_s: float
+    up_to_date_s: float | None
+
+    def cells(self) -> tuple[str, ...]:
+        """Return the row as text."""
+        up_to_date = "-" if self.up_to_date_s is None else f"{self.up_to_date_s:.2f}"
+        return f"`egvs {self.verb.words}`", f"{self.cold_s:.2f}", f"{self.warm_s:.2f}", up_to_date
+
+
+def measure(verb: Verb, prepared: Path, work: Path) -> Row:
+    """Measure a command in copies of the prepared folder."""
+    work.mkdir()
+    caches = [Caches(work / "kernels", work / f"store{number}") for number in range(1 + REPEATS)]
+    cold_s = processor_s(verb, _copy(prepared, work / "cold"), caches[0])
+
+    warm_s: list[float] = []
+    for number in range(1, 1 + REPEATS):
+        folder = _copy(prepared, work / f"warm{number}")
+        warm_s.append(processor_s(verb, folder, caches[number]))
+        if warm_s[-1] > QUICK_S:
+            break
+
+    up_to_date_s = None
+    if verb.keeps:
+        times_s = [processor_s(verb, folder, caches[number])]
+        while times_s[-1] <= QUICK_S and len(times_s) < REPEATS:
+            times_s.append(processor_s(verb, folder, caches[number]))
+        up_to_date_s = statistics.median(times_s)
+    return Row(verb, cold_s, statistics.median(warm_s), up_to_date_s)
+
+
+def _copy(folder: Path, to: Path) -> Path:
+    return Path(shutil.copytree(folder, to, symlinks=True))
+
+
+def markdown(rows: Iterable[Row], left_out: Iterable[str]) -> str:
+    """Return the rows as a Markdown table, with a sentence about the commands that are left out."""
+    lines = ["| " + " | ".join(HEADINGS) + " |", "|---|---:|---:|---:|"]
+    lines += ["| " + " | ".join(row.cells()) + " |" for row in rows]
+    names = ", ".join(f"`egvs {name}`" for name in left_out)
+    if names:
+        lines += ["", f"Not measured, because libraries of an extra were not installed: {names}."]
+    return "\n".join(lines)
+
+
+def write_between_marks(page: Path, text: str) -> None:
+    """Replace what stands between the marks of a page."""
+    start, end = (re.escape(mark) for mark in MARKS)
+    before = page.read_text(encoding="utf-8")
+    after, count = re.subn(f"{start}.*?{end}", lambda _: f"{MARKS[0]}\n{text}\n{MARKS[1]}", before, flags=re.DOTALL)
+    if count != 1:
+        raise ValueError(f"{page}: expected one pair of marks {' '.join(MARKS)}, got {count}")
+    page.write_text(after, encoding="utf-8")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Measure the commands, and print or write the table."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.verbs", description=__doc__)
+    parser.add_argument(
+        "verbs", nargs="*", metavar="VERB", help='names of commands, for example "city run"; all if none'
+    )
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the table between the marks of this page")
+    chosen = parser.parse_args(arguments)
+    known = [verb.name for verb in VERBS]
+    unknown = set(chosen.verbs) - set(known)
+    if unknown:
+        parser.error(f"expected names of commands ({', '.join(known)}), got {', '.join(sorted(unknown))}")
+
+    rows = []
+    left_out = []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        prepare(folder / "prepared", Caches(folder / "kernels", folder / "store"))
+        for number, verb in enumerate(VERBS):
+            if chosen.verbs and verb.name not in chosen.verbs:
+                continue
+            try:
+                rows.append(measure(verb, folder / "prepared", folder / str(number)))
+            except MissingLibraryError:
+                left_out.append(verb.name)
+                continue
+            print(*rows[-1].cells(), sep="   ", flush=True)
+            shutil.rmtree(folder / str(number))
+            if chosen.markdown is not None:
+                write_between_marks(chosen.markdown, markdown(rows, left_out))
+    if left_out:
+        print(f"left out: {', '.join(left_out)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,56 @@
+"""What a reader must know to judge a ranking, beyond its standard errors: one sentence per reason to be careful."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from egvs.report.formatting import join_names
+from egvs.report.ranking import RankedSite, Ranking
+from egvs.scenario.score_config import DEFAULT_SCORE
+
+MIN_TILT_DEG = 5.0
+"""A sensor is called tilted from this pitch or roll on. The sensors of the validation study were level."""
+
+_LEVEL_NOTE = (
+    "± is the error of a finite simulation only. The order of sites was validated, their level less: in the studies, "
+    "detectors found up to 27 percentage points fewer vehicles than expected (docs/validity.md)."
+)
+_TILT_NOTE = "Tilted sensors, such as {}, were not part of the validation (docs/validity.md)."
+
+
+def describe_reliability(ranking: Ranking) -> list[str]:
+    """Return the reasons to be careful with a ranking, in sentences.
+
+    - By ``expected_detections``: what the standard errors leave out, and how far the level of the score was validated.
+    - The best site is tilted.
+    - The best site is the lowest, the highest or the most tilted of those on its pole, so that others may be better.
+
+    Parameters
+    ----------
+    ranking
+        The ranking. Without a best site, there is no reason.
+    """
+    best = ranking.sites[0]
+    if not best.score > 0.0 or ranking.is_tie:
+        return []
+    sentences = []
+    if ranking.by.name == DEFAULT_SCORE:
+        sentences.append(_LEVEL_NOTE)
+    if max(abs(best.pitch_deg), abs(best.roll_deg)) >= MIN_TILT_DEG:
+        sentences.append(_TILT_NOTE.format(best.site))
+    limits = list(_limits(best, [site for site in ranking.sites if site.pole == best.pole]))
+    if limits:
+        others = "another one" if len(limits) == 1 else "others"
+        sentences.append(f"The best site has {join_names(limits)}: {others} may be better.")
+    return sentences
+
+
+def _limits(best: RankedSite, on_pole: Sequence[RankedSite]) -> Iterator[str]:
+    """Yield the limits of the mounts on a pole that its best one has reached, e.g. "the lowest height tried (3 m)"."""
+    heights_m = {site.z_m for site in on_pole}
+    if len(heights_m) > 1 and best.z_m in (min(heights_m), max(heights_m)):
+        end = "lowest" if best.z_m == min(heights_m) else "greatest"
+        yield f"the {end} height tried (z {best.z_m:.4g} m)"
+    steepest_deg = min(site.pitch_deg for site in on_pole)
+    if best.pitch_deg == steepest_deg <= -MIN_TILT_DEG and any(site.pitch_deg > steepest_deg for site in on_pole):
+        yield f"the steepest tilt tried ({best.pitch_deg:.0f} degrees)"

@@ -1,0 +1,61 @@
+"""Reasons to be careful with rankings made by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from egvs.report.ranking import RankedSite, Ranking, ScoreValue
+from egvs.report.reliability import describe_reliability
+
+
+def ranked(*mounts: tuple[str, float, float, float], rank_by: str = "egvs") -> Ranking:
+    """From (pole, z, pitch, score), best first; each site is named after its pole, z and pitch."""
+    sites = []
+    for rank, (pole, z_m, pitch_deg, score) in enumerate(mounts, 1):
+        name = f"{pole}@{z_m:g}m{pitch_deg:+g}deg"
+        site = RankedSite(name, 0.0, 0.0, z_m, score, rank, pole, 0.0, pitch_deg, 0.0, "s", 200.0, 1, 1, 0.5)
+        sites.append(replace(site, rank_by=rank_by, others=(ScoreValue("expected_detections", score, 0.01),)))
+    return Ranking(tuple(sites), (sites[0],), ())
+
+
+def test_nothing_is_said_of_a_level_site_between_the_limits() -> None:
+    assert describe_reliability(ranked(("a", 4, 0, 9.0), ("a", 3, 0, 5.0), ("a", 6, 0, 4.0), ("b", 9, -20, 1.0))) == []
+
+
+@pytest.mark.parametrize(
+    ("mounts", "limits"),
+    [
+        ([(3, 0), (4, 0)], "the lowest height tried (z 3 m): another one"),
+        ([(4, 0), (3, 0)], "the greatest height tried (z 4 m): another one"),
+        ([(3, -10), (3, 0)], "the steepest tilt tried (-10 degrees): another one"),
+        ([(3, -10), (4, 0)], "the lowest height tried (z 3 m) and the steepest tilt tried (-10 degrees): others"),
+    ],
+)
+def test_names_the_limits_that_the_best_mount_of_a_pole_reaches(mounts: list[tuple[float, float]], limits: str) -> None:
+    sites = [("a", z_m, pitch_deg, 9.0 - rank) for rank, (z_m, pitch_deg) in enumerate(mounts)]
+    assert describe_reliability(ranked(*sites))[-1] == f"The best site has {limits} may be better."
+
+
+def test_one_mount_on_each_pole_has_no_limits() -> None:
+    assert describe_reliability(ranked(("a", 3, 0, 9.0), ("b", 6, 0, 5.0))) == []
+
+
+@pytest.mark.parametrize(("pitch_deg", "is_tilted"), [(-5.0, True), (5.0, True), (-4.9, False), (0.0, False)])
+def test_says_that_tilted_sensors_were_not_validated(pitch_deg: float, is_tilted: bool) -> None:
+    sentences = describe_reliability(ranked(("a", 3, pitch_deg, 9.0), ("b", 3, 0, 5.0)))
+    assert sentences == is_tilted * [
+        f"Tilted sensors, such as a@3m{pitch_deg:+g}deg, were not part of the validation (docs/validity.md)."
+    ]
+
+
+def test_level_of_expected_detections_was_validated_less_than_its_order() -> None:
+    (sentence,) = describe_reliability(ranked(("a", 3, 0, 0.9), ("b", 3, 0, 0.5), rank_by="expected_detections"))
+    assert "their level less" in sentence
+
+
+def test_sites_that_see_nothing_or_score_the_same_need_no_further_words() -> None:
+    assert describe_reliability(ranked(("a", 3, -10, 0.0), ("a", 4, 0, 0.0))) == []
+    tie = ranked(("a", 3, -10, 5.0), ("a", 4, 0, 5.0))
+    assert describe_reliability(Ranking(tie.sites, tie.sites, ())) == []
