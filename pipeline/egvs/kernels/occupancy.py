@@ -218,7 +218,7 @@ def count_boxes(frames, boxes, shape, voxel_m, steps, latest):  # type: ignore[n
     nx, ny, nz = shape[0], shape[1], shape[2]
     px, py = np.empty(4), np.empty(4)
     axes, half, low = np.empty((3, 3)), np.empty(3), np.empty(3)
-    spare, n_spare, last_frame = np.empty((64, 4), np.int64), 0, np.int64(-1)
+    spare, n_spare, last_frame = np.empty((64, 4), np.int64), np.int64(0), np.int64(-1)
     for b in range(frames.shape[0]):
         frame = frames[b]
         if frame != last_frame:
