@@ -246,12 +246,15 @@ def _template_environment() -> Environment:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
+    from egvs.report.template_cache import open_template_cache
+
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        bytecode_cache=open_template_cache(Path(__file__)),
     )
     environment.filters |= {
         "svg": Markup,

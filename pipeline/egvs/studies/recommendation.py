@@ -87,7 +87,7 @@ def mark_rows(rows: Sequence[SettingResult], tolerance: Tolerance) -> list[Setti
     candidates = [row for row in rows if row.approximates]
     admitted = [row for row in candidates if tolerance.admits(row)]
     if admitted:
-        best = min(admitted, key=lambda row: (row.seconds, row.setting))
+        best = min(admitted, key=lambda row: (row.seconds, tolerance.excess(row), row.setting))
     else:
         best = min(candidates, key=lambda row: (tolerance.excess(row), row.seconds, row.setting))
     marked = []
