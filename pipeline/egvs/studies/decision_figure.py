@@ -206,6 +206,7 @@ def _label_settings(axes: Any, settings: Sequence[SettingResult]) -> None:
 
     for setting in sorted(settings, key=order):
         if setting.recommended:
-            labels.add(f"recommended: {setting.setting}", setting.seconds, setting.loss_points, 8.5)
+            name = "the scenario's own setting" if setting.kind == SCENARIO else setting.setting
+            labels.add(f"recommended: {name}", setting.seconds, setting.loss_points, 8.5)
         elif setting.kind != SCENARIO and (setting.front or setting.loss_points > least):
             labels.add(setting.setting, setting.seconds, setting.loss_points)
