@@ -37,7 +37,7 @@ REPEATS = 3
 
 QUICK_S = 2.0
 
-SHORT = 'extends = "../roundabout"\n\n[traffic]\nframes = 200\nwarmup_s = 20\n'
+SHORT = 'extends = "../roundabout"\n\n[traffic]\nframes = 200\n'
 """The scenario of most commands."""
 
 
@@ -72,7 +72,7 @@ VERBS = (
     Verb("check short"),
     Verb("run short --out new", keeps=True),
     Verb("place short --out run --count 2", keeps=True),
-    Verb("explore run --no-browser", keeps=True, address=True),
+    Verb("explore run --no-browser --port 0", keeps=True, address=True),
     Verb("compare run other"),
     Verb("city new town --osm small.osm --junctions all"),
     Verb("city traffic city", keeps=True),
@@ -113,6 +113,10 @@ class MissingLibraryError(Exception):
     """A command needs libraries that are not installed."""
 
 
+class CommandError(Exception):
+    """A command ended with an error."""
+
+
 @dataclass(frozen=True)
 class Caches:
     """Where a command finds compiled kernels and results of earlier runs."""
@@ -133,7 +137,7 @@ def processor_s(verb: Verb, folder: Path, caches: Caches) -> float:
     ------
     MissingLibraryError
         When a library of an extra is missing.
-    subprocess.CalledProcessError
+    CommandError
         When the command fails.
     """
     words = [sys.executable, "-m", "egvs", *verb.words.split()]
@@ -153,7 +157,7 @@ def processor_s(verb: Verb, folder: Path, caches: Caches) -> float:
     if "Run pip install" in message:
         raise MissingLibraryError(message.strip())
     if process.returncode:
-        raise subprocess.CalledProcessError(process.returncode, words, stderr=message)
+        raise CommandError(f"egvs {verb.words}: exit code {process.returncode}\n{message}")
     return usage.ru_utime + usage.ru_stime
 
 
@@ -257,10 +261,9 @@ def main(arguments: list[str] | None = None) -> None:
                 continue
             print(*rows[-1].cells(), sep="   ", flush=True)
             shutil.rmtree(folder / str(number))
-    text = markdown(rows, left_out)
-    if chosen.markdown is not None:
-        write_between_marks(chosen.markdown, text)
-    elif left_out:
+            if chosen.markdown is not None:
+                write_between_marks(chosen.markdown, markdown(rows, left_out))
+    if left_out:
         print(f"left out: {', '.join(left_out)}")
 
 

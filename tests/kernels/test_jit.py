@@ -34,7 +34,7 @@ def package(tmp_path: Path) -> Path:
     (tmp_path / "egvs" / "__init__.py").write_text("")
     shutil.copytree(PACKAGE / "core", tmp_path / "egvs" / "core", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(PACKAGE / "kernels" / "__init__.py", kernels)
-    for name in ("jit.py", "kernel_cache.py"):
+    for name in ("jit.py", "kernel_cache.py", "cache_folder.py"):
         shutil.copy(PACKAGE / "kernels" / name, kernels)
     (kernels / "inner.py").write_text(INNER.format(1))
     (kernels / "outer.py").write_text(OUTER)
@@ -86,6 +86,46 @@ def test_uses_user_cache_where_package_is_read_only(package: Path, tmp_path: Pat
     assert call(package, **home) == "2 compiled"
     assert call(package, **home) == "2 cached"
     assert cache_file_count(tmp_path / "cache" / "egvs") == 1
+
+
+SUMS = """
+import numpy as np
+from egvs.kernels.jit import njit
+
+@njit()
+def sums(x):
+    result = np.zeros(2)
+    result[0] = np.sum(x)
+    result[1] = x.min()
+    return result
+"""
+CALL_SUMS = """
+import sys
+import numpy as np
+from egvs.kernels.sums import sums
+print(sums(np.array([1.0, 4.0])).tolist(), "compiled" if sums.stats.cache_misses else "cached")
+print("numba.np.arraymath" in sys.modules or "scipy.linalg" in sys.modules)
+"""
+CALLS_SUMS = """
+from egvs.kernels.jit import njit
+from egvs.kernels.sums import sums
+
+@njit()
+def doubled(x):
+    return 2.0 * sums(x)
+"""
+CALL_DOUBLED = CALL_SUMS.replace("sums", "doubled")
+
+
+@pytest.mark.slow
+def test_cached_kernel_is_loaded_without_the_modules_that_compile_it(package: Path) -> None:
+    (package / "egvs" / "kernels" / "sums.py").write_text(SUMS)
+    (package / "egvs" / "kernels" / "doubled.py").write_text(CALLS_SUMS)
+    assert call(package, CALL_SUMS).splitlines() == ["[5.0, 1.0] compiled", "True"]
+    assert call(package, CALL_SUMS).splitlines() == ["[5.0, 1.0] cached", "False"]
+    # A kernel that calls a loaded one is compiled, cached and loaded in turn.
+    assert call(package, CALL_SUMS + CALL_DOUBLED).splitlines()[2] == "[10.0, 2.0] compiled"
+    assert call(package, CALL_DOUBLED).splitlines() == ["[10.0, 2.0] cached", "False"]
 
 
 DAMAGES = """

@@ -35,6 +35,7 @@ _ROOT = Path(__file__).resolve().parent.parent
 LIBRARIES = {
     "embreex": ("embreex",),
     "laspy": ("laspy", "lazrs"),
+    "mapbox_earcut": ("mapbox-earcut",),
     "numba": ("numba", "llvmlite"),
     "numpy": ("numpy",),
     "onnxruntime": ("onnxruntime",),
@@ -44,7 +45,7 @@ LIBRARIES = {
     "scipy": ("scipy",),
     "shapely": ("shapely",),
     "sklearn": ("scikit-learn",),
-    "trimesh": ("trimesh", "mapbox-earcut"),
+    "trimesh": ("trimesh",),
 }
 """Libraries whose version may change a result: name in an import -> distributions."""
 

@@ -27,6 +27,7 @@ from egvs.formats.meshes import are_closed, mesh_components
 from egvs.scenario.fields import MAX_COORDINATE_M
 from egvs.scenario.model import MeshConfig, Scenario
 from egvs.world import geolocation
+from egvs.world.extrusion import extrude_polygon
 from egvs.world.footprints import Footprint, read_footprints
 from egvs.world.map_features import SolidTypes
 from egvs.world.mesh import World
@@ -141,10 +142,8 @@ class _Builder:
 
 def _extrude(footprint: Footprint) -> tuple[Floats, NDArray[np.int64]]:
     """Return vertices and faces (outwards) of a closed prism over a footprint."""
-    import trimesh
-
-    mesh = trimesh.creation.extrude_polygon(footprint.polygon, footprint.height_m - footprint.base_m, engine="earcut")
-    return np.asarray(mesh.vertices) + np.array([0.0, 0.0, footprint.base_m]), np.asarray(mesh.faces)
+    vertices_m, faces = extrude_polygon(footprint.polygon, footprint.height_m - footprint.base_m)
+    return vertices_m + np.array([0.0, 0.0, footprint.base_m]), faces
 
 
 def _add_mesh(builder: _Builder, path: Path, config: MeshConfig, world: Georeference) -> None:
