@@ -48,6 +48,11 @@ def test_of_equally_cheap_settings_the_one_that_loses_less_is_recommended() -> N
     assert next(marked.setting for marked in rows if marked.recommended) == "thin traffic"
 
 
+def test_of_equally_cheap_settings_the_own_one_of_the_scenario_is_recommended() -> None:
+    rows = mark_rows([OWN, row("ranked otherwise", 10.0, 0.0)], Tolerance(1.0))
+    assert next(marked.setting for marked in rows if marked.recommended) == "own"
+
+
 def test_settings_that_measure_something_else_are_neither_recommended_nor_on_the_front() -> None:
     marked = {result.setting: result for result in mark_rows([OWN, SHORT, CHEAP_MEASURE], Tolerance(1.0))}
     assert not (marked["voxel"].recommended or marked["voxel"].front)
