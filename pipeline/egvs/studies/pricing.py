@@ -200,7 +200,7 @@ class Pricing:
             return variant_s, True
         if priced.setting.knob == "sampled frames":
             factor = priced.sampled_frames / self._plain.sampled_frames
-            return self._runs.sampled_seconds(priced.setting, factor), True
+            return self._runs.sampled_seconds(priced.setting, factor)
         original = self._runs.runner.scenario(variant)
         frames = study_settings.counted_frames(scenario) / study_settings.counted_frames(original)
         seconds = dict(variant_s)
