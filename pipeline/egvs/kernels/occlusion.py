@@ -118,15 +118,6 @@ def _fill_block(box, axes, low, high, o, block):  # type: ignore[no-untyped-def]
     return middle + lowest, middle + highest
 
 
-@_inlined
-def is_apart(o, size_m, low, high):  # type: ignore[no-untyped-def]
-    """Whether a box with corners ``low`` and ``high`` (3,) is beyond the block around the sensor and the grid."""
-    apart = False
-    for a in range(3):
-        apart |= low[a] > max(o[a], size_m[a]) or high[a] < min(o[a], 0.0)
-    return apart
-
-
 @_kernel
 def orient_boxes(o, order, boxes, low, high, size_m, facing, block, span, box):  # type: ignore[no-untyped-def]
     """Fill what the slab tests need of boxes; skip those that cannot be between sensor and grid, or contain the sensor.
@@ -160,14 +151,17 @@ def orient_boxes(o, order, boxes, low, high, size_m, facing, block, span, box): 
     """
     axes, count = np.empty((3, 3)), 0
     for b in order:
-        if is_apart(o, size_m, low[b], high[b]):
+        is_apart = False
+        for a in range(3):
+            is_apart |= low[b, a] > max(o[a], size_m[a]) or high[b, a] < min(o[a], 0.0)
+        if is_apart:
             continue
         box_axes(boxes[b, 3], boxes[b, 4], axes)
         x, y, z = o[0] - boxes[b, 0], o[1] - boxes[b, 1], o[2] - boxes[b, 2]
         is_inside = True
         for a in range(3):
             row = facing[count, 5 * a : 5 * a + 5]
-            row[:3] = axes[a]
+            row[0], row[1], row[2] = axes[a, 0], axes[a, 1], axes[a, 2]
             row[3] = axes[a, 0] * x + axes[a, 1] * y + axes[a, 2] * z
             row[4] = 0.5 * boxes[b, 5 + a] - SHRINK_M
             is_inside &= abs(row[3]) < row[4]

@@ -20,7 +20,7 @@ import math
 import numpy as np
 
 from egvs.kernels.jit import njit
-from egvs.kernels.occlusion import is_apart, orient_boxes
+from egvs.kernels.occlusion import orient_boxes
 from egvs.kernels.occupancy import SHRINK_M
 
 _kernel = njit()
@@ -85,13 +85,14 @@ def sort_beams(ends_m, azimuth, limits, cells, slopes, directions, length_m, cel
         Scratch, (n,) int64.
     """
     bands = limits.shape[0] + 1
-    slopes[:, 0], slopes[:, 1] = np.inf, -np.inf
+    for b in range(bands):
+        slopes[b, 0], slopes[b, 1] = np.inf, -np.inf
     for n in range(ends_m.shape[0]):
         x, y, z = ends_m[n, 0], ends_m[n, 1], ends_m[n, 2]
         slope = z / np.sqrt(x * x + y * y)
         if not abs(slope) < _STEEPEST:  # vertical, or without length
             slope = 0.0 if z == 0.0 else math.copysign(_STEEPEST, z)
-        band = 0
+        band = np.int64(0)
         while band < bands - 1 and limits[band] < slope + SAME_SLOPE:
             band += 1
         slopes[band, 0], slopes[band, 1] = min(slopes[band, 0], slope), max(slopes[band, 1], slope)
@@ -154,7 +155,7 @@ def _find_runs(span, bounds, cells, slopes, runs):  # type: ignore[no-untyped-de
     """
     first, last = _cells_of_span(span)
     lowest, highest = bounds
-    count = 0
+    count = np.int64(0)
     for band in range(slopes.shape[0]):
         if slopes[band, 0] <= highest and slopes[band, 1] >= lowest:
             begin = band * AZIMUTH_CELLS
@@ -176,16 +177,15 @@ def _slope_bounds(block):  # type: ignore[no-untyped-def]
 
 
 @_inlined
-def _facing_axis(box, a):  # type: ignore[no-untyped-def]
-    """One axis of a box, turned so that the sensor is on its negative side.
+def _facing_axis(x, y, z, o, half):  # type: ignore[no-untyped-def]
+    """One axis of a box, a fifth of a row of ``facing``, turned so that the sensor is on its negative side.
 
     Returns its direction (3), the sensor's coordinate, the half size; the distance along it to the face through which
     the box can be entered, 0 where the sensor is between both faces; and what the direction of a beam that enters must
     exceed, and its coordinate then.
     """
-    sign = -1.0 if box[5 * a + 3] > 0.0 else 1.0
-    x, y, z, o = sign * box[5 * a], sign * box[5 * a + 1], sign * box[5 * a + 2], sign * box[5 * a + 3]
-    half = box[5 * a + 4]
+    if o > 0.0:
+        x, y, z, o = -x, -y, -z, -o
     if o <= -half:
         return x, y, z, o, half, -half - o, 0.0, -np.inf
     return x, y, z, o, half, 0.0, -np.inf, -half
@@ -213,9 +213,9 @@ def _enter_box(box, directions, length_m, runs, nearest_m, t_m):  # type: ignore
     met, ties
         Number of beams that meet the box; of those that enter it exactly where they entered another box.
     """
-    ax, ay, az, ao, ah, to_a, least_a, low_a = _facing_axis(box, 0)
-    bx, by, bz, bo, bh, to_b, least_b, low_b = _facing_axis(box, 1)
-    cx, cy, cz, co, ch, to_c, least_c, low_c = _facing_axis(box, 2)
+    ax, ay, az, ao, ah, to_a, least_a, low_a = _facing_axis(box[0], box[1], box[2], box[3], box[4])
+    bx, by, bz, bo, bh, to_b, least_b, low_b = _facing_axis(box[5], box[6], box[7], box[8], box[9])
+    cx, cy, cz, co, ch, to_c, least_c, low_c = _facing_axis(box[10], box[11], box[12], box[13], box[14])
     met, ties, done = 0, 0, 0
     for r in range(runs.shape[0]):
         first, last = runs[r, 0], runs[r, 1]
@@ -301,9 +301,9 @@ def _list_rows(runs, nearest_m, t_m, rows):  # type: ignore[no-untyped-def]
 
     ``rows``: int64, one more than there are beams.
     """
-    count, done = 0, 0
+    count, done = np.int64(0), 0
     for r in range(runs.shape[0]):
-        first, last = runs[r]
+        first, last = runs[r, 0], runs[r, 1]
         nearest, t = nearest_m[first:last], t_m[done : done + last - first]
         for i in range(last - first):
             rows[count] = first + i
@@ -369,23 +369,13 @@ def _take_beams(runs, nearest_m, t_m):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def _boxes_by_distance(o, size_m, values, low, high, away, order):  # type: ignore[no-untyped-def]
-    """Fill ``order`` with the boxes that can be between the sensor and the grid, nearest first; returns their number.
-
-    ``away``, scratch, is the squared distance of each.
-    """
-    count = 0
-    for b in range(values.shape[0]):
-        if is_apart(o, size_m, low[b], high[b]):
-            continue
-        x, y, z = values[b, 0] - o[0], values[b, 1] - o[1], values[b, 2] - o[2]
-        away[count], order[count] = x * x + y * y + z * z, b
-        count += 1
-    by_distance = np.argsort(away[:count], kind="mergesort")
-    for k in range(count):
-        by_distance[k] = order[by_distance[k]]
-    order[:count] = by_distance
-    return count
+def _reset(runs, length_m, nearest_m):  # type: ignore[no-untyped-def]
+    """Reset the nearest entries of the beams of ``runs``."""
+    for r in range(runs.shape[0]):
+        first, last = runs[r, 0], runs[r, 1]
+        nearest, longest = nearest_m[first:last], length_m[first:last]
+        for i in range(last - first):
+            nearest[i] = longest[i]
 
 
 @_kernel
@@ -399,9 +389,10 @@ def first_hits(begin, o, size_m, boxes, beams, nearest_m, sums, hits):  # type: 
     o, size_m
         The sensor, (3,) float64; the grid is the box from 0 to ``size_m`` (3,).
     boxes
-        ``starts``: boxes starts[f] to starts[f + 1] are those of frame f, (frames + 1,) int64. ``values``, ``low``,
-        ``high``: as :func:`egvs.kernels.occlusion.box_bounds` takes and fills them, (b, 8), (b, 3), (b, 3).
-        ``listed``: for which boxes beams are added up or listed, (b,) bool; the others only occlude.
+        ``starts``, ``order``: boxes order[starts[f]] to order[starts[f + 1]] are those of frame f that can be between
+        sensor and grid, nearest first, (frames + 1,) and (m,) int64. ``values``, ``low``, ``high``: as
+        :func:`egvs.kernels.occlusion.box_bounds` takes and fills them, (b, 8), (b, 3), (b, 3). ``listed``: for which
+        boxes beams are added up or listed, (b,) bool; the others only occlude.
     beams
         ``cells``, ``slopes``, ``directions`` and ``length_m`` as :func:`sort_beams` fills them; the weight of each
         beam, or no weights (0,) where all are 1, float64. Weights are added in the order of the beams. Hits are
@@ -424,26 +415,26 @@ def first_hits(begin, o, size_m, boxes, beams, nearest_m, sums, hits):  # type: 
     next_frame, count
         The frame to continue with, and the number of listed hits.
     """
-    starts, values, low, high, listed = boxes
+    starts, order, values, low, high, listed = boxes
     cells, slopes, directions, length_m, weight = beams
     alone, added = sums[0], sums[1:]
-    max_boxes, count, room = 0, 0, hits[0].shape[0]
+    max_boxes, count, room = np.int64(0), np.int64(0), hits[0].shape[0]
     for f in range(begin, starts.shape[0] - 1):
         max_boxes = max(max_boxes, starts[f + 1] - starts[f])
     facing, block, span = np.empty((max_boxes, 15)), np.empty((max_boxes, 9)), np.empty((max_boxes, 2))
-    box, order, away = np.empty(max_boxes, np.int64), np.empty(max_boxes, np.int64), np.empty(max_boxes)
-    runs, filled = np.empty((max_boxes, 2 * slopes.shape[0], 2), np.int64), np.zeros(max_boxes, np.int64)
-    offset, t_m = np.zeros(max_boxes + 1, np.int64), np.empty(length_m.shape[0])
-    rows = np.empty(length_m.shape[0] + 1, np.int64)
+    box, filled, offset = (
+        np.empty(max_boxes, np.int64),
+        np.empty(max_boxes, np.int64),
+        np.empty(max_boxes + 1, np.int64),
+    )
+    runs = np.empty((max_boxes, 2 * slopes.shape[0], 2), np.int64)
+    rows, t_m = np.empty(length_m.shape[0] + 1, np.int64), np.empty(length_m.shape[0])
+    offset[0] = 0
     for f in range(begin, starts.shape[0] - 1):
         if room > 0 and count + length_m.shape[0] > room:
             return f, count
-        first, last = starts[f], starts[f + 1]
-        frame_values, frame_low, frame_high = values[first:last], low[first:last], high[first:last]
-        between = _boxes_by_distance(o, size_m, frame_values, frame_low, frame_high, away, order)
-        oriented = orient_boxes(
-            o, order[:between], frame_values, frame_low, frame_high, size_m, facing, block, span, box
-        )
+        frame_order = order[starts[f] : starts[f + 1]]
+        oriented = orient_boxes(o, frame_order, values, low, high, size_m, facing, block, span, box)
         for k in range(oriented):
             filled[k] = _find_runs(span[k], _slope_bounds(block[k]), cells, slopes, runs[k])
             offset[k + 1] = offset[k]
@@ -456,9 +447,9 @@ def first_hits(begin, o, size_m, boxes, beams, nearest_m, sums, hits):  # type: 
             box_runs, box_t_m = runs[k, : filled[k]], t_m[offset[k] :]
             met, box_ties = _enter_box(facing[k], directions, length_m, box_runs, nearest_m, box_t_m)
             ties += box_ties
-            alone[first + box[k]] = met if weight.shape[0] == 0 else _met_weight(box_runs, box_t_m, weight)
+            alone[box[k]] = met if weight.shape[0] == 0 else _met_weight(box_runs, box_t_m, weight)
         for k in range(oriented):
-            b, box_runs, box_t_m = first + box[k], runs[k, : filled[k]], t_m[offset[k] :]
+            b, box_runs, box_t_m = box[k], runs[k, : filled[k]], t_m[offset[k] :]
             if listed[b] and weight.shape[0] == 0:
                 _count_box_hits(b, facing[k], directions, box_runs, nearest_m, box_t_m, added)
             elif listed[b]:
@@ -470,8 +461,7 @@ def first_hits(begin, o, size_m, boxes, beams, nearest_m, sums, hits):  # type: 
             if ties > 0:
                 _take_beams(box_runs, nearest_m, box_t_m)
         for k in range(oriented):
-            for r in range(filled[k]):
-                nearest_m[runs[k, r, 0] : runs[k, r, 1]] = length_m[runs[k, r, 0] : runs[k, r, 1]]
+            _reset(runs[k, : filled[k]], length_m, nearest_m)
     return starts.shape[0] - 1, count
 
 

@@ -108,6 +108,25 @@ class AllBoxes:
         ends = np.cumsum([len(frame_rows) for frame_rows in rows], dtype=np.int64)
         return cls(np.append(0, ends), values, low, high)
 
+    def between(self, sensor_m: FloatArray, size_m: FloatArray) -> tuple[IntArray, IntArray]:
+        """Select the boxes that can be between a sensor (3,) and the grid, the box from 0 to ``size_m`` (3,).
+
+        Returns
+        -------
+        starts, order
+            Boxes order[starts[f]] to order[starts[f + 1]] are those of frame f, nearest first, (frames + 1,) and (m,)
+            int64.
+        """
+        is_apart = np.zeros(len(self.values), dtype=np.bool_)
+        for axis in range(3):
+            is_apart |= self.low[:, axis] > max(sensor_m[axis], size_m[axis])
+            is_apart |= self.high[:, axis] < min(sensor_m[axis], 0.0)
+        order = np.flatnonzero(~is_apart)
+        starts = np.searchsorted(order, self.starts)
+        x_m, y_m, z_m = (self.values[order, :3] - sensor_m).T
+        frame = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+        return starts, order[np.lexsort((x_m * x_m + y_m * y_m + z_m * z_m, frame))]
+
 
 @dataclass(frozen=True, eq=False)
 class TargetRecord:
@@ -376,7 +395,8 @@ def _count_points(
     beams = _sort_beams(site, _BANDS if is_counted else 1)
     is_target = np.zeros(count, dtype=np.bool_)
     is_target[record.row] = True
-    all_boxes = boxes.starts, boxes.values, boxes.low, boxes.high, is_target
+    size_m = np.asarray(record.grid.roi.size_m)
+    all_boxes = *boxes.between(sensor_m, size_m), boxes.values, boxes.low, boxes.high, is_target
 
     bounds = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
     result = _BoxHits(np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count, dtype=np.uint64), *bounds)
@@ -386,7 +406,6 @@ def _count_points(
         capacity = max(_MAX_HITS, len(beams.length_m))
     hits = (np.empty(capacity, dtype=np.int64), np.empty(capacity, dtype=np.int64), *np.empty((3, capacity)))
 
-    size_m = np.asarray(record.grid.roi.size_m)
     frame = 0
     while frame < len(record.numbers):
         frame, filled = vehicle_visibility.first_hits(
