@@ -23,7 +23,7 @@ def study_of(*rows: SettingResult, tolerance: Tolerance, **more: object) -> Accu
         rank_by="expected_detections",
         units=6,
         is_recorded=False,
-        best_pole=BestPole("c02", 0.801, 0.98),
+        best_pole=BestPole("c02", "c10", 0.801, 0.98),
         needed=None,
         files=(),
     )
@@ -32,8 +32,8 @@ def study_of(*rows: SettingResult, tolerance: Tolerance, **more: object) -> Accu
 
 def test_names_the_cheapest_setting_its_quality_and_the_reason() -> None:
     assert recommendation_sentences(study_of(OWN, SHORT, tolerance=Tolerance(1.0))) == [
-        "With all traffic of this study (6 seeds), c02 is the best pole with a probability of 98%; it should find "
-        "80.1% of the vehicles.",
+        "With all traffic of this study (6 seeds), c02 is the best pole with a probability of 98%; c10 there "
+        "should find 80.1% of the vehicles.",
         "Recommended: 500 frames, 2.0 processor seconds instead of 8.0. The pole that it chooses is the best one with "
         "a probability of 80%, and is expected to lose 0.80 ± 0.20 percentage points of the vehicles found.",
         "It is the cheapest of 2 settings (of 2) whose expected loss is within the tolerance of 1 percentage points.",

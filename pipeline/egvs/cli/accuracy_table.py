@@ -104,7 +104,8 @@ def recommendation_sentences(study: AccuracyStudy) -> list[str]:
     best_pole = study.best_pole
     sentences = [
         f"With all traffic of this study ({_describe_units(study)}), {best_pole.name} is the best pole with a "
-        f"probability of {best_pole.probability:.0%}; it should find {best_pole.found:.1%} of the vehicles."
+        f"probability of {best_pole.probability:.0%}; {best_pole.mount} there should find {best_pole.found:.1%} of the "
+        "vehicles."
     ]
     best = study.recommended
     name = "the scenario's own setting" if best.kind == SCENARIO else best.setting

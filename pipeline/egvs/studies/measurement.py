@@ -18,10 +18,9 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
-from itertools import pairwise
 from pathlib import Path
 from statistics import median
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -42,7 +41,7 @@ from egvs.scenario.model import Scenario, SiteGrid
 from egvs.scoring.egvs import EntropyField
 from egvs.scoring.score_table import MIX, ScoreColumn, ScoreTable, SiteScores
 from egvs.scoring.scorer import Scorer
-from egvs.scoring.standard_errors import BlockJackknife, ScoreUncertainty, rank_order
+from egvs.scoring.standard_errors import BlockJackknife, ScoreUncertainty
 from egvs.scoring.target_scores import TARGET_SCORES
 from egvs.sensors import sites
 from egvs.stages.base import StageContext
@@ -50,32 +49,13 @@ from egvs.stages.inputs import get_scene, open_folder
 from egvs.stages.scene_inputs import site_digests
 from egvs.stages.site_scans import empty_scans
 from egvs.stages.site_scoring import ScoredSite, TargetScorer
-from egvs.studies.study_settings import Setting, counted_frames
+from egvs.studies.study_settings import Setting
 
 STUDY_FOLDER = "accuracy"
 """Subfolder of the run folder for intermediate results."""
 
 SettingListener = Callable[[str, str, dict[str, Any]], None]
 """Called with a setting, its state ("done", "kept" or "skipped"), and its seconds or the reason."""
-
-
-class Neighbours(NamedTuple):
-    """Two sites that are next to each other in the ranking.
-
-    Attributes
-    ----------
-    better, worse
-        Names of the sites.
-    probability
-        Probability that the better one truly scores higher.
-    frames
-        Number of frames that would tell the two apart.
-    """
-
-    better: str
-    worse: str
-    probability: float
-    frames: float
 
 
 @dataclass(frozen=True)
@@ -95,8 +75,6 @@ class SettingScores:
         Of the score that ranks, (n,); the last two are NaN if the TPOG has one block.
     quantile
         Half the width of a confidence interval, in standard errors.
-    neighbours
-        Pairs of sites in the order of the ranking.
     stages
         Key of each stage.
     """
@@ -108,7 +86,6 @@ class SettingScores:
     ses: list[float]
     biases: list[float]
     quantile: float
-    neighbours: list[Neighbours]
     stages: dict[str, str]
 
 
@@ -182,7 +159,6 @@ class SettingRunner:
             return None
         with _reject_altered(path):
             values = _read_json(path)["scores"]
-            values["neighbours"] = [Neighbours(*pair) for pair in values["neighbours"]]
             scores = SettingScores(**values)
             for name in ("shares", "share_ses", "scores", "ses", "biases"):
                 if np.array(getattr(scores, name), dtype=np.float64).shape != (len(scores.sites),):
@@ -310,18 +286,6 @@ class SettingRunner:
         with self._temporary_run(self.scenario(setting), RANKING_STAGES) as work:
             scorer = Scorer(get_scene(work), tpog, work.folder.trajectories)
             return [scorer.score(scan.beams).egvs for scan in empty_scans(work)]
-
-    def read_note(self, name: str) -> dict[str, Any]:
-        """Read what :meth:`save_note` wrote; empty if there is nothing."""
-        path = self._folder / f"{name}.json"
-        if not path.is_file():
-            return {}
-        with _reject_altered(path):
-            return _read_json(path)
-
-    def save_note(self, name: str, value: dict[str, Any]) -> None:
-        """Save further values of the study."""
-        _write_json(self._folder / f"{name}.json", value)
 
     def _ensure_stage(self, name: str, work: StageContext, observe: Callable[[ScoredSite], None] | None = None) -> str:
         """Fetch or run a stage in a folder with the stages before it, and return its key.
@@ -455,12 +419,12 @@ def _collect_scores(work: StageContext, keys: dict[str, str], weight: float, sco
         column = _score_column(work, tpog, jackknife, scored)
     if column is None or column.replicates is None or column.estimate is None:
         unknown = [math.nan] * len(names)
-        return SettingScores(names, shares.tolist(), unknown, scores.tolist(), unknown, unknown, math.nan, [], keys)
+        return SettingScores(names, shares.tolist(), unknown, scores.tolist(), unknown, unknown, math.nan, keys)
     estimate = column.estimate
     share_estimate = ScoreUncertainty.of(column.replicates / np.where(limits > 0, limits, 1.0), column.groups)
     return SettingScores(
         names, shares.tolist(), share_estimate.se.tolist(), scores.tolist(), estimate.se.tolist(),
-        estimate.bias.tolist(), estimate.quantile(), _neighbours(estimate, names, counted_frames(work.scenario)), keys,
+        estimate.bias.tolist(), estimate.quantile(), keys,
     )  # fmt: skip
 
 
@@ -483,13 +447,3 @@ def _score_column(work: StageContext, tpog: Tpog, jackknife: BlockJackknife, sco
         target_scores = None if targets is None else targets.scores(targets.visible(scan.beams))
         scores.append(SiteScores(scan.site.name, site_score, target_scores))
     return ScoreTable.of(scores, {MIX: jackknife.groups}).column(config.rank_by)
-
-
-def _neighbours(estimate: ScoreUncertainty, names: list[str], frames: int) -> list[Neighbours]:
-    ranked = rank_order(estimate.scores)
-    probabilities = estimate.beats(ranked[:-1], ranked[1:]).tolist()
-    neighbours = []
-    for (better, worse), probability in zip(pairwise(ranked.tolist()), probabilities, strict=True):
-        needed = frames * estimate.times_needed(better, worse)
-        neighbours.append(Neighbours(names[better], names[worse], probability, needed))
-    return neighbours

@@ -26,8 +26,8 @@ class BestPole:
 
     Attributes
     ----------
-    name
-        Its name.
+    name, mount
+        Its name, and that of its best mount.
     found
         Share of the vehicles that its best mount is expected to find, 0 to 1.
     probability
@@ -35,6 +35,7 @@ class BestPole:
     """
 
     name: str
+    mount: str
     found: float
     probability: float
 
@@ -78,7 +79,8 @@ class Pricing:
         best = int(found.argmax())
         pole = int(self.reference.poles[best])
         chances = decision.best_pole_chances(self.reference, range(self.reference.units))
-        return BestPole(self._poles[pole], float(found[best]), round(float(chances[pole]), 4))
+        mount = self._runs.runs[SCENARIO][0].mounts[best]
+        return BestPole(self._poles[pole], mount, float(found[best]), round(float(chances[pole]), 4))
 
     @property
     def is_all_zero(self) -> bool:
@@ -198,7 +200,7 @@ class Pricing:
             return variant_s, True
         if priced.setting.knob == "sampled frames":
             factor = priced.sampled_frames / self._plain.sampled_frames
-            return self._runs.sampled_seconds(priced.setting, factor), True
+            return self._runs.sampled_seconds(priced.setting, factor)
         original = self._runs.runner.scenario(variant)
         frames = study_settings.counted_frames(scenario) / study_settings.counted_frames(original)
         seconds = dict(variant_s)

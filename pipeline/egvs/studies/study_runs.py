@@ -115,10 +115,11 @@ class StudyRuns:
             self._add_seeds(MAX_SEEDS, keep_s=0.0)
         return [variant for variant in variants if variant.name in self.seconds]
 
-    def sampled_seconds(self, setting: Setting, factor: float) -> dict[str, float]:
+    def sampled_seconds(self, setting: Setting, factor: float) -> tuple[dict[str, float], bool]:
         """Return the processor seconds of each stage with other frames for scores over vehicles.
 
-        They are measured if the budget lasts; else the score stage is taken as proportional to the frames.
+        They are measured if the budget lasts; else the score stage is taken as proportional to the frames. The second
+        value is whether they were measured.
 
         Parameters
         ----------
@@ -128,10 +129,10 @@ class StudyRuns:
             How many times as many frames as the scenario.
         """
         if 2.0 * factor * self.runner.median_seconds(self.stage_keys)["score"] < self.left_s:
-            return self.runner.measure_stages(setting)
+            return self.runner.measure_stages(setting), True
         seconds = dict(self.seconds[SCENARIO])
         seconds["score"] *= factor
-        return seconds
+        return seconds, False
 
     def _valid_variants(self) -> list[Setting]:
         """Return the settings whose overrides give a valid scenario; skip the others."""
