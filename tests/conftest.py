@@ -110,6 +110,13 @@ def store(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPa
     return folder
 
 
+@pytest.fixture(autouse=True)
+def compiles_alone(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a test may start no process, no second one compiles kernels beside a run."""
+    if request.node.get_closest_marker("system") is None:
+        monkeypatch.setattr("egvs.runs.kernel_compiler.thread_count", lambda _: 1)
+
+
 @pytest.hookimpl(tryfirst=True)  # before -m chooses
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark tests `system` or `unit`."""

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from io import StringIO
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from egvs.artefacts.plan_step import PlanStep
 from egvs.artefacts.planned_sensor import PlannedSensor
+from egvs.cli import console as cli_console
 from egvs.cli import place
 from egvs.scenario.score_config import PlacementConfig
 
@@ -17,6 +21,8 @@ The plan a, b should find 99.2 ± 0.3% of vehicles, 99.8% of what all 12 candida
 proved: no plan within the rules is better.
 A second sensor adds 4.7 ± 0.5 percentage points to the share of vehicles found: 99.2%, against 94.5% with one. \
 Try --count 3 to see what a third adds.
+Joint shares assume that sensors miss vehicles independently of each other; near 100% they are upper ends \
+(docs/placement.md).
 """
 
 
@@ -61,6 +67,23 @@ def test_shares_are_per_cent_with_errors_in_percentage_points(capsys: pytest.Cap
     assert "adds, % points  found together  lost if it fails, % points" in text
     assert " 4.7 ± 0.5     99.2 ± 0.3%                         4.0" in text
     assert "± is one standard error, from 10 blocks of 100 frames" in text
+
+
+@pytest.mark.parametrize("width", [80, 160])
+def test_tables_fit_the_terminal_and_cut_no_value(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    out = Console(width=width, record=True, file=StringIO(), highlight=False)
+    monkeypatch.setattr(cli_console, "console", lambda *_, **__: out)
+    sites = ("south@4.5m-12deg", "north@4.5m-12deg")
+    placed = placed_two(curve_sites=(sites[:1], sites))
+    placed.sensors = tuple(replace(row, site=site) for row, site in zip(placed.sensors, sites, strict=True))
+    place.print_placement(placed, PlacementConfig(count=2))
+    lines = out.export_text().splitlines()
+    assert max(len(line.rstrip()) for line in lines) <= width
+    text = " ".join(" ".join(lines).split())
+    for value in ("99.2 ± 0.3%", "4.7 ± 0.5", "99.8%", "VLP-32C", "lost if"):
+        assert value in text
+    assert "…" not in text
+    assert sum(line.rstrip().endswith("south@4.5m-12deg, north@4.5m-12deg") for line in lines) == (width == 160)
 
 
 def test_bits_have_thousands_separators(capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,6 +19,7 @@ pty = pytest.importorskip("pty", reason="pseudo-terminals are POSIX only")
 
 pytestmark = [pytest.mark.system, pytest.mark.slow]
 
+ROUNDABOUT = Path(__file__).parents[2] / "scenarios" / "roundabout"
 COLUMNS = 80
 ELAPSED = re.compile(r"(\w+)[^\r\n]*? (\d+):(\d\d):(\d\d)")
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
@@ -101,6 +102,20 @@ def test_bar_fits_on_one_line(long_scan: tuple[str, dict[str, float]]) -> None:
     bars = [line for line in re.split(r"[\r\n]+", shown) if ELAPSED.search(line)]
     assert bars
     assert max(len(bar) for bar in bars) <= COLUMNS
+
+
+def test_stages_beside_sumo_are_shown_in_order_while_time_goes_on(tmp_path: Path) -> None:
+    """SUMO is at work from the beginning; its progress is shown when its turn has come."""
+    settings = ("traffic.frames=2000", "tpog.blocks=10", "roi.voxel_m=1")
+    words = [word for setting in settings for word in ("--set", setting)]
+    shown = on_terminal("run", ROUNDABOUT, "--out", tmp_path / "run", *words)
+    lines = re.findall(r"^(\w+) +\d+\.\d s ", shown.replace("\r", "\n"), re.MULTILINE)
+    assert lines == ["check", "statics", "scan", "traffic", "occupancy", "score", "report"]
+    times = elapsed_s(shown)
+    assert times == sorted(times)
+    assert len(times) >= times[-1] // 2
+    bars = re.findall(r"(\w+): frames simulated", shown)
+    assert set(bars) <= {"traffic"}
 
 
 def test_output_that_is_no_terminal_has_plain_lines(mini: Path) -> None:

@@ -5,9 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from egvs.importers import junctions
+from egvs.formats import osm
+from egvs.importers import junctions, osm_network
 from egvs.importers.junctions import JunctionRegion
 from egvs.traffic.network import Edge, Lane, Permission
+from tests.importers.small_maps import street, write_map
 from tests.traffic.test_demand import LOOP_NET
 
 
@@ -48,3 +50,20 @@ def test_turn_that_is_only_possible_with_a_loop_gets_no_flow(tmp_path: Path) -> 
     streets = junctions.read_streets(path)
     flows = junctions.assumed_flows(streets, JunctionRegion((15.0, 0.0), (90.0, 90.0)))
     assert {(flow.title, flow.per_hour) for flow in flows} == {("in to on", 40.0), ("side to on", 40.0)}
+
+
+def test_street_that_merges_at_the_edge_of_the_region_brings_vehicles(tmp_path: Path) -> None:
+    """The main street leaves the region 2 m behind the side street (6) that joins it: too little to be inside."""
+    nodes = {1: (-400.0, 0.0), 2: (0.0, 0.0), 3: (28.0, 0.0), 4: (400.0, 0.0), 5: (0.0, 300.0), 6: (28.0, -300.0)}
+    ways = [street("A Street", 1, 2, 3, 4), street("B Street", 2, 5), street("C Street", 3, 6)]
+    path = write_map(tmp_path / "map.osm", nodes, ways)
+    extract = osm.read_osm(path)
+    flags = osm_network.netconvert_flags(extract, lefthand=False, walk=False)
+    _, streets = osm_network.build_network(extract, path, flags)
+    x, y = next(j.at_m for j in streets.junctions if j.id == "2")
+    flows = junctions.assumed_flows(streets, JunctionRegion((x, y), (60.0, 60.0)))
+    edges = {edge.id: edge for edge in streets.network.edges}
+    entries = {edges[flow.from_edge].from_node for flow in flows if flow.from_edge}
+    exits = {edges[flow.to_edge].to_node for flow in flows if flow.to_edge}
+    assert entries == exits == {"1", "4", "5", "6"}
+    assert sum(flow.per_hour for flow in flows) == 4 * 150

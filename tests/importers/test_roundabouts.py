@@ -89,9 +89,10 @@ def test_region_holds_ring_and_approaches(streets: Streets) -> None:
     assert roi.area.buffer(1.0 - junctions.APPROACH_M, join_style="mitre").covers(ring.area)
 
 
-@pytest.mark.parametrize("divided", [False, True])
-def test_flows_lead_from_each_arm_to_each_other_arm(tmp_path: Path, divided: bool) -> None:
-    streets = read(ring_map(tmp_path / "ring.osm", divided=divided))
+@pytest.mark.parametrize(("radius_m", "divided"), [(15.0, False), (15.0, True), (9.0, False)])
+def test_flows_lead_from_each_arm_to_each_other_arm(tmp_path: Path, radius_m: float, divided: bool) -> None:
+    """Also around a small ring, whose edges are a few metres long."""
+    streets = read(ring_map(tmp_path / "ring.osm", radius_m, divided=divided))
     junction = junctions.largest_junction(streets)
     assert junction is not None and junction.ring is not None and junction.arms == 4
     flows = junctions.assumed_flows(streets, junctions.region_around(junction), junction.ring)

@@ -9,7 +9,14 @@ import pytest
 
 from egvs.artefacts.plan_step import PlanStep
 from egvs.report.formatting import SCORE_LABELS
-from egvs.report.plan_answer import CurvePlan, describe_count, is_useful, next_count
+from egvs.report.plan_answer import (
+    CurvePlan,
+    InstalledSite,
+    describe_count,
+    describe_joint_score,
+    is_useful,
+    next_count,
+)
 
 FOUND = SCORE_LABELS["expected_detections"]
 EGVS = SCORE_LABELS["egvs"]
@@ -39,6 +46,36 @@ def test_names_the_plan_that_is_enough_where_it_is_smaller_than_the_one_shown() 
     )
     same = [*plans[:2], plans[1]]  # a third sensor is not used
     assert describe_count(steps, FOUND, plans=same).startswith("Two are enough: a third")
+
+
+def test_first_sites_of_a_larger_plan_are_compared_with_those_that_are_enough() -> None:
+    steps = steps_of(0.946, 0.992, 0.998, gain_se=0.001, beats=0.99)
+    plans = [CurvePlan(("a",), 0.0), CurvePlan(("b", "c"), 0.0), CurvePlan(("a", "b", "c"), 0.0)]
+    installed = [InstalledSite("a", 0.946), InstalledSite("b", 0.99, 0.003), InstalledSite("c", 0.998)]
+    assert describe_count(steps, FOUND, plans=plans, installed=installed) == (
+        "Two are enough (b and c): a third adds 0.6 ± 0.1 percentage points. The first two sites of the plan of three, "
+        "a and b, reach 99.0 ± 0.3% instead of 99.2%: begin with them only if one more is to follow."
+    )
+    same = [InstalledSite("c", 0.9), InstalledSite("b", 0.992), InstalledSite("a", 0.998)]
+    assert "instead of" not in describe_count(steps, FOUND, plans=plans, installed=same)
+    bought = describe_count(steps, FOUND, plans=plans, installed=installed, has_budget=True)
+    assert bought.endswith("begin with them only if one more is to follow.")
+
+
+def test_first_site_of_a_plan_is_compared_with_the_best_single_one() -> None:
+    steps = steps_of(0.946, 0.947, 0.948, gain_se=0.001, beats=0.6)
+    plans = [CurvePlan(("a",), 0.0), CurvePlan(("b", "c"), 0.0), CurvePlan(("b", "c", "d"), 0.0)]
+    installed = [InstalledSite("b", 0.93), InstalledSite("c", 0.947), InstalledSite("d", 0.948)]
+    assert describe_count(steps, FOUND, plans=plans, installed=installed).endswith(
+        "The first site of the plan of three, b, reaches 93.0% instead of 94.6%: begin with it only if two more are to "
+        "follow."
+    )
+
+
+def test_only_several_sensors_ranked_by_vehicles_found_assume_independence() -> None:
+    assert "independently of each other" in describe_joint_score(FOUND, 2)
+    assert describe_joint_score(FOUND, 1) == ""
+    assert describe_joint_score(EGVS, 2) == ""
 
 
 def test_plan_within_a_budget_is_not_contradicted() -> None:

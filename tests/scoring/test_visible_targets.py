@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -155,6 +156,96 @@ def test_as_every_beam_against_every_box(seed, upright):
     found, slow = seen(frames, beams, noticed), seen_slowly(frames, beams, noticed)
     for name, values in slow.items():
         np.testing.assert_allclose(getattr(found, name), values, rtol=1e-9, atol=1e-9, err_msg=name)
+
+
+def raster(sensor_m, azimuth_deg, elevation_deg, length_m=60.0):
+    """Beams from a sensor at all azimuths and elevations."""
+    azimuth, elevation = np.meshgrid(np.radians(azimuth_deg), np.radians(elevation_deg))
+    d = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    return beams_to(sensor_m, length_m * np.stack(d, axis=-1).reshape(-1, 3))
+
+
+ALL_ROUND_DEG = np.arange(-180, 181, 6)
+
+
+def boxes_that_touch():
+    row = [(110.0 + 4.0 * i, 210.0, 0.75, 4.0, 2.0, 1.5, 0.0) for i in range(3)]
+    beside, on_top = (114.0, 212.0, 0.75, 4.0, 2.0, 1.5, 0.0), (114.0, 210.0, 2.0, 4.0, 2.0, 1.0, 0.0)
+    return [*row, beside, on_top], raster((103.0, 205.0, 3.7), np.arange(1, 80, 3), np.arange(-40, 3, 3))
+
+
+def equal_boxes_and_fronts_in_one_plane():
+    wide, narrow = (112.0, 210.0, 1.0, 4.0, 3.0, 2.0, 0.0), (112.5, 210.5, 1.0, 5.0, 1.0, 2.0, 0.0)  # fronts at 110
+    return [wide, narrow, wide], raster((101.0, 210.0, 1.0), np.arange(-15.1, 16, 0.7), np.arange(-8.3, 9, 1.7))
+
+
+def sensor_beside_a_long_vehicle():
+    bus, car = (120.0, 210.0, 1.5, 18.0, 2.5, 3.0, 0.02), (120.0, 214.0, 0.75, 4.0, 2.0, 1.5, 0.0)
+    return [bus, car], raster((118.0, 208.6, 1.7), ALL_ROUND_DEG + 0.5, np.arange(-70, 71, 10))
+
+
+def behind_the_sensor_across_180_degrees():
+    boxes = [(120.0, 210.0, 1.0, 4.0, 2.0, 2.0, 0.3), (110.0, 210.0, 1.5, 8.0, 2.5, 3.0, math.pi)]
+    beams = raster((130.0, 210.0, 2.5), np.arange(160, 201, 1.0), np.arange(-20, 1, 2.3))
+    straight = [[-30.0, 0.0, -3.0], [-30.0, -0.0, -3.0], [-30.0, 1e-12, -3.0], [-30.0, -1e-12, -3.0]]
+    return boxes, beams_to(beams.pose.position_m, np.concatenate([beams.ends_m, straight]))
+
+
+def beams_past_edges_and_corners():
+    box = (112.0, 210.0, 1.0, 4.0, 2.0, 2.0, 0.0)
+    half = np.array([2.0, 1.0, 1.0]) - (1e-4 + 1e-9)
+    points = [np.array(signs) * half for signs in itertools.product((-1.0, 0.0, 1.0), repeat=3)]
+    moved = [p + 1e-6 * np.array(by) for p in points for by in itertools.product((-1.0, 1.0), repeat=3)]
+    sensor_m = (102.0, 206.0, 3.0)
+    return [box], beams_to(sensor_m, 3.0 * (np.array(moved) + box[:3] - np.array(sensor_m)))
+
+
+def sensor_above_a_vehicle():
+    below, half_below = (115.0, 210.0, 0.75, 4.0, 2.0, 1.5, 0.7), (118.0, 210.0, 1.0, 6.0, 2.0, 2.0, 0.0)
+    return [below, half_below], raster((115.1, 210.2, 4.0), ALL_ROUND_DEG, [-90, -80, -65, -50, -35, -20, 10])
+
+
+def tilted_sensor():
+    rng = np.random.default_rng(3)
+    d = SENSOR.directions(40.0, -35.0, 20.0)[::97]
+    return random_boxes(rng, 10), beams_to((115.0, 207.0, 5.5), 50.0 * d)
+
+
+def many_boxes_one_behind_another():
+    boxes = [(104.0 + 1.5 * i, 210.0, 1.0, 1.0, 8.0, 2.0 + 0.1 * i, 0.0) for i in range(20)]
+    return boxes, raster((101.0, 210.0, 2.5), np.arange(-20.5, 21, 5), np.arange(-15, 6, 1.5))
+
+
+ADVERSARIAL = (boxes_that_touch, equal_boxes_and_fronts_in_one_plane, sensor_beside_a_long_vehicle,
+               behind_the_sensor_across_180_degrees, beams_past_edges_and_corners, sensor_above_a_vehicle,
+               tilted_sensor, many_boxes_one_behind_another)  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", ADVERSARIAL, ids=lambda make: make.__name__)
+@pytest.mark.parametrize("noticed", [None, lambda r: np.exp(-r / 20.0)], ids=["counted", "listed"])
+def test_hard_scenes_as_every_beam_against_every_box(make, noticed):
+    boxes, beams = make()
+    found, slow = seen([frame(boxes)], beams, noticed), seen_slowly([frame(boxes)], beams, noticed)
+    assert sum(slow["points"]) > 0.0
+    for name, values in slow.items():
+        np.testing.assert_allclose(getattr(found, name), values, rtol=1e-9, atol=1e-9, err_msg=name)
+
+
+def test_of_two_equal_boxes_the_first_takes_all_beams():
+    boxes, beams = equal_boxes_and_fronts_in_one_plane()
+    points = seen([frame(boxes)], beams).points
+    assert points[0] > 0.0 and points[2] == 0.0
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_beams_that_are_counted_are_those_whose_hits_are_listed_or_weighted(seed):
+    frames, beams, _ = scene(3 * seed, seed % 2 == 0)
+    counted = seen(frames, beams)
+    for other in (seen(frames, beams, lambda r: np.ones(len(r))),
+                  seen(frames, beams_to(beams.pose.position_m, beams.ends_m, np.ones(len(beams.ends_m))))):  # fmt: skip
+        for name in COLUMNS:
+            assert getattr(counted, name).tobytes() == getattr(other, name).tobytes()
 
 
 def test_scenes_of_the_twin_have_something_to_see():

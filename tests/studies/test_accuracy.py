@@ -86,7 +86,7 @@ def test_choice_of_the_scenario_is_that_of_an_ordinary_run(junction: Path, tmp_p
         egvs.run(egvs.load(junction, [f"seed={seed}"]), tmp_path / f"run{seed}")
         table = egvs.read_scores(tmp_path / f"run{seed}" / "scores.parquet").to_pydict()
         poles.append(table["pole"][table["rank"].index(1)])
-    (row,) = run_study(junction, [], tmp_path / "out", values=values, seeds=4).rows
+    row = run_study(junction, [], tmp_path / "out", values=values, seeds=4).scenario
     assert row.best == max(set(poles), key=poles.count)
     assert row.best_share == poles.count(row.best) / 4
 

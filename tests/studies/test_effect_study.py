@@ -203,7 +203,7 @@ def test_cost_of_effect_is_difference_with_and_without_it(
     """For named effects: the scenario less without it; for others: with it less the scenario."""
     scenario = egvs.load(mini, ["effects.rain.rate_mm_h=20"])
     rows = [
-        {"setting": name, "seconds": seconds, "error": 0.1, "tau": 0.9, "regret": 0.0}
+        {"setting": name, "seconds": seconds, "error": 0.1, "tau": 0.9, "loss_points": 0.0}
         for name, seconds in (("scenario", 5.0), ("without rain", 4.0), ("with divergence", 12.0), ("gamma 2", 5.0))
     ]
     metadata = {"inputs": files.hash_json(scenario_dependencies(scenario))}

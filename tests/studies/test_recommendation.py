@@ -42,6 +42,17 @@ def test_recommends_the_cheapest_setting_within_the_tolerance(tolerance: Toleran
     assert [marked.setting for marked in rows if marked.recommended] == [expected]
 
 
+def test_of_equally_cheap_settings_the_one_that_loses_less_is_recommended() -> None:
+    same_cost = row("thin traffic", 2.0, 0.4)
+    rows = mark_rows([OWN, SHORT, same_cost], Tolerance(1.0))
+    assert next(marked.setting for marked in rows if marked.recommended) == "thin traffic"
+
+
+def test_of_equally_cheap_settings_the_own_one_of_the_scenario_is_recommended() -> None:
+    rows = mark_rows([OWN, row("ranked otherwise", 10.0, 0.0)], Tolerance(1.0))
+    assert next(marked.setting for marked in rows if marked.recommended) == "own"
+
+
 def test_settings_that_measure_something_else_are_neither_recommended_nor_on_the_front() -> None:
     marked = {result.setting: result for result in mark_rows([OWN, SHORT, CHEAP_MEASURE], Tolerance(1.0))}
     assert not (marked["voxel"].recommended or marked["voxel"].front)

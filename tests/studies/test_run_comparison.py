@@ -6,8 +6,10 @@ The expected numbers are read from the artefacts of small runs.
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
 import pytest
@@ -351,6 +353,36 @@ def test_sentences_are_broken_between_words(width: int, monkeypatch: pytest.Monk
     assert len(paragraph) > 2
     assert max(map(len, paragraph)) <= width
     assert " ".join(line.rstrip() for line in paragraph) == SENSOR_EVIDENCE
+
+
+@pytest.mark.parametrize(("width", "is_table"), [(80, False), (160, True)])
+def test_settings_that_differ_are_sentences_where_the_table_is_too_wide(
+    width: int, is_table: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = [f"a sensor with a long name {number}" for number in range(4)]
+    runs = [
+        made_run(run_comparison.run_label(number), *mounts("s", 0.9), **{"sites.replace_sensor": name})
+        for number, name in enumerate(names)
+    ]
+    comparison = replace(by_pole(*runs), differences=tuple(run_comparison.find_differences(runs)))
+    text = printed_text(comparison, width, monkeypatch).split("what differs")[1]
+    assert max(map(len, text.splitlines())) <= width
+    for name in names:
+        assert name in " ".join(text.split())
+    assert ("sites.replace_sensor: A a sensor" in text) != is_table
+
+
+def test_many_runs_agree_or_not_with_the_first_one_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    def pairs(number_of_runs: int) -> set[str]:
+        runs = [made_run(run_comparison.run_label(n), *mounts("s", 0.9, 0.8)) for n in range(number_of_runs)]
+        comparison = by_pole(*runs)
+        agreements = [run_comparison.compare_rankings(a, b, "pole") for a, b in combinations(runs, 2)]
+        text = printed_text(replace(comparison, agreements=tuple(agreements)), 160, monkeypatch)
+        assert ("only pairs with A" in text) == (number_of_runs > 5)
+        return set(re.findall(r"^(\w, \w) ", text, re.MULTILINE))
+
+    assert pairs(5) == {f"{a}, {b}" for a, b in combinations("ABCDE", 2)}
+    assert pairs(6) == {f"A, {other}" for other in "BCDEF"}
 
 
 def test_tables_name_the_reference_of_their_differences(monkeypatch: pytest.MonkeyPatch) -> None:

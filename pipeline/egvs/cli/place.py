@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -19,6 +21,9 @@ if TYPE_CHECKING:
     from egvs.placement.plan import Placement, RefinementSummary
     from egvs.report.formatting import ScoreLabel
     from egvs.scenario.score_config import PlacementConfig
+
+_NARROW_HEAD_WIDTH = 10
+"""Characters of a line of the head of a column on a narrow terminal."""
 
 _REQUEST_KEYS = ("count", "budget", "reach")
 """Keys of ``[placement]`` that are options of ``egvs place`` too."""
@@ -106,25 +111,25 @@ def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequen
     caveat
         A last sentence, on what was assumed; may be empty.
     """
-    from egvs.cli.console import WIDE, console
+    from egvs.cli.console import WIDE, console, print_sentences
 
-    out = console(WIDE)
-    out.print(_sensor_table(placed))
+    out = console(WIDE, soft_wrap=False)
+    out.print(_sensor_table(placed, out.width))
     if any(sensor.forced for sensor in placed.sensors):
         out.print("* already installed")
     out.print()
-    out.print(_curve_table(placed))
-    out.print(describe_errors(placed))
+    out.print(_curve_table(placed, out.width))
+    print_sentences([describe_errors(placed)])
     out.print()
     for zone in placed.zones:
         sensors = f" by {zone.by} sensors" if zone.by > 1 else ""
         out.print(f"zone {zone.name}: {zone.seen:.1%} of its entropy seen{sensors}, {zone.share:.1%} required")
     for path in placed.files:
-        out.print(str(path))
-    for sentence in (describe_plan(placed), *notes, *_further_sentences(placed, requested)):
-        out.print(sentence)
+        out.print(str(path), soft_wrap=True)
+    sentences = [describe_plan(placed), *notes, *_further_sentences(placed, requested)]
     if caveat:
-        out.print(caveat)
+        sentences.append(caveat)
+    print_sentences(sentences)
 
 
 def _further_sentences(placed: Placement, requested: PlacementConfig) -> Iterator[str]:
@@ -138,16 +143,22 @@ def _further_sentences(placed: Placement, requested: PlacementConfig) -> Iterato
         yield absent
     request = requested.model_dump(mode="json")
     next_count = plan_answer.next_count(placed.steps, len(placed.sensors), placed.candidates, request)
+    installed = []
+    if placed.refinement is None:
+        installed = [plan_answer.InstalledSite(row.site, row.score, row.score_se) for row in placed.sensors]
     answer = plan_answer.describe_count(
         placed.steps,
         _label(placed),
         plans=list(map(plan_answer.CurvePlan, placed.curve_sites, placed.curve_costs)),
+        installed=installed,
         has_budget=requested.budget is not None,
         objective=describe_objective(request),
         next_count=next_count,
     )
     if answer:
         yield answer
+    if assumption := plan_answer.describe_joint_score(_label(placed), len(placed.sensors)):
+        yield assumption
 
 
 def _label(placed: Placement) -> ScoreLabel:
@@ -156,40 +167,40 @@ def _label(placed: Placement) -> ScoreLabel:
     return SCORE_LABELS[placed.score]
 
 
-def _sensor_table(placed: Placement) -> Table:
+def _sensor_table(placed: Placement, width: int) -> Table:
     from egvs.cli.console import Column, make_table
 
-    by = _label(placed)
+    by, head = _label(placed), partial(_head, width)
     columns: list[Column[PlannedSensor]] = [
         Column("", lambda row: row.marked_order),
-        Column("site", lambda row: row.site, "left"),
+        Column("site", lambda row: row.site, "left", wrap=True),
         Column("z m", lambda row: f"{row.z_m:g}"),
-        Column("yaw deg", lambda row: f"{row.yaw_deg:.1f}"),
-        Column("pitch deg", lambda row: f"{row.pitch_deg:z.1f}"),
+        Column(head("yaw deg"), lambda row: f"{row.yaw_deg:.1f}"),
+        Column(head("pitch deg"), lambda row: f"{row.pitch_deg:z.1f}"),
         Column("sensor", lambda row: row.sensor, "left"),
-        Column(_with_unit("adds", by.change_head), lambda row: by.change(row.gain, row.gain_se)),
-        Column(_together_head(by), lambda row: by.with_error(row.score, row.score_se)),
-        Column(_with_unit("lost if it fails", by.change_head), lambda row: by.change(row.loss)),
+        Column(head("adds", by.change_head), lambda row: by.change(row.gain, row.gain_se)),
+        Column(head(_together_head(by)), lambda row: by.with_error(row.score, row.score_se)),
+        Column(head("lost if it fails", by.change_head), lambda row: by.change(row.loss)),
     ]
     if any(placed.curve_costs):
         columns.append(Column("cost", lambda row: f"{row.cost:g}"))
     if placed.refinement is not None:
-        columns.append(Column("moved m", lambda row: f"{row.moved_m:.2f}"))
-        head = _with_unit("gained by moving", by.change_head)
-        columns.append(Column(head, lambda row: by.change(row.gain_by_refining)))
+        columns.append(Column(head("moved m"), lambda row: f"{row.moved_m:.2f}"))
+        columns.append(Column(head("gained by moving", by.change_head), lambda row: by.change(row.gain_by_refining)))
     return make_table(columns, placed.sensors)
 
 
-def _curve_table(placed: Placement) -> Table:
+def _curve_table(placed: Placement, width: int) -> Table:
     from egvs.cli.console import Column, make_table
 
     by, curve, steps = _label(placed), placed.solution.curve, placed.steps
+    head = partial(_head, width)
     columns = [
         Column[int]("sensors", lambda i: str(steps[i].count)),
-        Column[int](_together_head(by), lambda i: by.with_error(steps[i].score, steps[i].score_se)),
-        Column[int](_with_unit("adds", by.change_head), lambda i: by.change(steps[i].gain, steps[i].gain_se)),
-        Column[int]("of all candidates", lambda i: f"{_score_share(placed, steps[i].score):.1%}"),
-        Column[int]("proved, of the best possible", lambda i: _format_rounded_down(curve[i].certificate)),
+        Column[int](head(_together_head(by)), lambda i: by.with_error(steps[i].score, steps[i].score_se)),
+        Column[int](head("adds", by.change_head), lambda i: by.change(steps[i].gain, steps[i].gain_se)),
+        Column[int](head("of all candidates"), lambda i: f"{_score_share(placed, steps[i].score):.1%}"),
+        Column[int](head("proved, of the best possible"), lambda i: _format_rounded_down(curve[i].certificate)),
     ]
     if any(placed.curve_costs):
         columns.append(Column("cost", lambda i: f"{placed.curve_costs[i]:g}"))
@@ -200,6 +211,18 @@ def _curve_table(placed: Placement) -> Table:
 def _together_head(by: ScoreLabel) -> str:
     """Return the head of a column of joint scores, e.g. "found together" or "EGVS together, bit"."""
     return _with_unit(f"{by.head.removesuffix(by.unit).rstrip()} together", by.unit)
+
+
+def _head(width: int, title: str, unit: str = "") -> str:
+    """Return the head of a column, in several lines on a narrow terminal."""
+    from egvs.cli.console import NARROW
+
+    head = _with_unit(title, unit)
+    if width >= NARROW:
+        return head
+    if head.endswith(" deg"):
+        return head.replace(" ", "\n")
+    return textwrap.fill(head, _NARROW_HEAD_WIDTH, break_long_words=False)
 
 
 def _with_unit(head: str, unit: str) -> str:

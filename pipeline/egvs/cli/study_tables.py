@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from egvs.studies.run_comparison import ComparedPole, ComparedRun, Comparison, Difference, RankAgreement
 
 _FILE_WIDTH = 190
+_ALL_PAIRS_RUNS = 5
+"""With more runs, the agreement of rankings is printed for pairs with the first run only."""
 _COLUMN_GAP = 2
 """Space that rich leaves between two columns."""
 
@@ -64,7 +66,7 @@ def print_comparison(comparison: Comparison, top: int | None = None, command: Se
     if comparison.sensors is not None:
         _print_sensors(out, comparison, comparison.sensors, command)
     if comparison.differences:
-        out.print(_difference_table(comparison))
+        _print_differences(out, comparison)
     elif len({run.folder for run in comparison.runs}) > 1:
         out.print("their settings and files are the same")
     print_sentences(f"note: {note}" for note in comparison.notes)
@@ -84,7 +86,11 @@ def _result_tables(comparison: Comparison, top: int | None, width: int) -> Itera
 
 def _result_width(comparison: Comparison, runs: Sequence[int], top: int | None, width: int) -> int:
     """Return the width of a table of some runs, if nothing is wrapped."""
-    table = _result_table(comparison, runs, top, width)
+    return _unwrapped_width(_result_table(comparison, runs, top, width))
+
+
+def _unwrapped_width(table: Table) -> int:
+    """Return the width of a table, if nothing is wrapped."""
     widths = []
     for column in table.columns:
         cells = [str(column.header), *(str(cell) for cell in column.cells)]
@@ -292,7 +298,11 @@ def _agreement_table(comparison: Comparison) -> Table:
         Column("best", _format_best_sites, "left", wrap=True),
         Column("regret of the first run's best", lambda pair: format_or_dash(pair.regret_a, ".2%"), wrap=True),
     ]
-    return make_table(columns, comparison.agreements)
+    first = comparison.runs[0].label
+    with_first = [pair for pair in comparison.agreements if pair.a == first]
+    if len(comparison.runs) <= _ALL_PAIRS_RUNS:
+        return make_table(columns, comparison.agreements)
+    return make_table(columns, with_first, caption=f"only pairs with {first}; compare fewer runs for the others")
 
 
 def _format_best_sites(pair: RankAgreement) -> str:
@@ -315,6 +325,20 @@ def _difference_table(comparison: Comparison) -> Table:
     for number, run in enumerate(comparison.runs):
         columns.append(Column(run.label, partial(_format_setting, number), "left"))
     return make_table(columns, comparison.differences)
+
+
+def _print_differences(out: Console, comparison: Comparison) -> None:
+    """Print what differs as a table; if it is wider than the terminal, in a sentence for each setting."""
+    table = _difference_table(comparison)
+    if _unwrapped_width(table) <= out.width:
+        out.print(table)
+        return
+    out.print("what differs")
+    sentences = []
+    for difference in comparison.differences:
+        values = [f"{run.label} {_format_setting(number, difference)}" for number, run in enumerate(comparison.runs)]
+        sentences.append(f"{difference.what}: {', '.join(values)}")
+    print_sentences(sentences)
 
 
 def _format_setting(run: int, difference: Difference) -> str:

@@ -679,10 +679,11 @@ def _growth_factors(target: FloatArray, current: FloatArray) -> FloatArray:
 
 def _find_gates(streets: Streets, roi: JunctionRegion, ring: Ring | None) -> _Gates:
     edges = streets.network.edges
-    successors: dict[int, list[int]] = {index: [] for index in _roads_inside(streets, roi)}
+    links = [(source, target) for source, target, turnaround in streets.network.links(_CAR).tolist() if not turnaround]
+    successors: dict[int, list[int]] = {index: [] for index in _with_merging(_roads_inside(streets, roi), links)}
     entered = set()
-    for source, target, is_turnaround in streets.network.links(_CAR).tolist():
-        if not is_turnaround and source in successors and target in successors:
+    for source, target in links:
+        if source in successors and target in successors:
             successors[source].append(target)
             entered.add(target)
 
@@ -704,13 +705,33 @@ def _find_gates(streets: Streets, roi: JunctionRegion, ring: Ring | None) -> _Ga
 
 
 def _roads_inside(streets: Streets, roi: JunctionRegion) -> list[int]:
-    """Return the positions of the roads for cars that cover part of the region."""
+    """Return the positions of the roads for cars that cover part of the region, or start and end in it."""
     region = roi.area
     indices = []
     for index, edge in enumerate(streets.network.edges):
-        if edge.lanes_for(_CAR) and streets.areas[edge.id].intersection(region).area >= _MIN_AREA_M2:
+        if not edge.lanes_for(_CAR):
+            continue
+        is_within = region.covers(Point(edge.start_m)) and region.covers(Point(edge.end_m))
+        if is_within or streets.areas[edge.id].intersection(region).area >= _MIN_AREA_M2:
             indices.append(index)
     return indices
+
+
+def _with_merging(roads: Sequence[int], links: Sequence[tuple[int, int]]) -> list[int]:
+    """Add the roads from outside that merge with roads of the region before they enter it, or diverge after it.
+
+    Otherwise the road after the merge would be no gate, because it is entered from the region too.
+    """
+    inside = set(roads)
+    inner_links = [(source, target) for source, target in links if source in inside and target in inside]
+    merged = {target for _, target in inner_links}
+    diverging = {source for source, _ in inner_links}
+    for source, target in links:
+        if target in merged and source not in roads:
+            inside.add(source)
+        if source in diverging and target not in roads:
+            inside.add(target)
+    return sorted(inside)
 
 
 def _reachable(start: int, successors: dict[int, list[int]]) -> set[int]:

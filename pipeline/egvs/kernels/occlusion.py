@@ -91,13 +91,14 @@ def _clip_to_slab(o, d, half, first, last):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def _fill_block(box, low, high, o, block):  # type: ignore[no-untyped-def]
+def _fill_block(box, axes, low, high, o, block):  # type: ignore[no-untyped-def]
     """Fill the upright block with the box's yaw around the (perhaps pitched) box, as described at :func:`orient_boxes`.
 
+    ``axes`` are those of :func:`egvs.kernels.occupancy.box_axes`, which hold the cosines and sines of its angles.
     Returns the first and last azimuth of the block, seen from the sensor; they may be outside [-pi, pi].
     """
-    cy, sy = math.cos(box[3]), math.sin(box[3])
-    half_u = 0.5 * (box[5] * abs(math.cos(box[4])) + box[7] * abs(math.sin(box[4])))
+    cy, sy = axes[1, 1], -axes[1, 0]
+    half_u = 0.5 * (box[5] * abs(axes[2, 2]) + box[7] * abs(axes[0, 2]))
     half_v = 0.5 * box[6]
     x, y = box[0] - o[0], box[1] - o[1]
     u, v = x * cy + y * sy, y * cy - x * sy
@@ -153,16 +154,20 @@ def orient_boxes(o, order, boxes, low, high, size_m, facing, block, span, box): 
         is_apart = False
         for a in range(3):
             is_apart |= low[b, a] > max(o[a], size_m[a]) or high[b, a] < min(o[a], 0.0)
-        if is_apart or contains_sensor(boxes[b], o):
+        if is_apart:
             continue
         box_axes(boxes[b, 3], boxes[b, 4], axes)
         x, y, z = o[0] - boxes[b, 0], o[1] - boxes[b, 1], o[2] - boxes[b, 2]
+        is_inside = True
         for a in range(3):
             row = facing[count, 5 * a : 5 * a + 5]
-            row[:3] = axes[a]
+            row[0], row[1], row[2] = axes[a, 0], axes[a, 1], axes[a, 2]
             row[3] = axes[a, 0] * x + axes[a, 1] * y + axes[a, 2] * z
             row[4] = 0.5 * boxes[b, 5 + a] - SHRINK_M
-        span[count, 0], span[count, 1] = _fill_block(boxes[b], low[b], high[b], o, block[count])
+            is_inside &= abs(row[3]) < row[4]
+        if is_inside:
+            continue
+        span[count, 0], span[count, 1] = _fill_block(boxes[b], axes, low[b], high[b], o, block[count])
         box[count] = b
         count += 1
     return count

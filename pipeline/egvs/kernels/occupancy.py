@@ -222,7 +222,7 @@ def count_boxes(frames, boxes, shape, voxel_m, steps, latest):  # type: ignore[n
     for b in range(frames.shape[0]):
         frame = frames[b]
         if frame != last_frame:
-            n_spare, last_frame = 0, frame
+            n_spare, last_frame = np.int64(0), frame
         c, pitch = boxes[b, :3], boxes[b, 4]
         for a in range(3):
             half[a] = 0.5 * boxes[b, 5 + a] - SHRINK_M

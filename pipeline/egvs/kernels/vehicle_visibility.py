@@ -3,10 +3,14 @@
 Frame: that of the grid, in metres. Boxes are shrunk by 0.1 mm on each of their six sides, as in
 :mod:`egvs.kernels.occlusion`; a hit is the point where a beam enters the shrunk box.
 
-Beams are sorted into bands of similar slope, and in each band by azimuth. So a box needs only the bands that are
-neither too steep nor too flat for it, and of these only the beams between the azimuths that it spans. Both bounds are
-those of the box *unshrunk*, so rounding loses no beam. What remains are a few long runs of beams, which
-:func:`_entry_ranges` intersects with the box together, without a branch.
+:func:`sort_beams` sorts beams into bands of similar slope, and in each band into cells of azimuth. So a box needs only
+the bands that are neither too steep nor too flat for it, and of these only the cells between the azimuths that it
+spans. Both bounds are those of the box *unshrunk*, so rounding loses no beam. What remains are a few long runs of
+beams, which :func:`_enter_box` intersects with the box without a branch. A run starts and ends at a multiple of
+:data:`BLOCK` beams: further beams do no harm, and whole blocks are computed at once.
+
+The beams that end on a box are then those whose nearest entry is that of the box. Where two boxes are entered at
+exactly the same range, the first one in the order of distance takes the beam.
 """
 
 from __future__ import annotations
@@ -27,6 +31,18 @@ _inlined = njit(forceinline=True)
 _MARGIN_RAD = 1e-9
 """Spans are widened by this: rounding loses no beam."""
 
+AZIMUTH_CELLS = 1024
+"""Cells of the circle."""
+
+BLOCK = 8
+"""Beams that are computed together: what a processor computes at once."""
+
+SAME_SLOPE = 1e-9
+"""Slopes that differ by less are those of one ring of a sensor, and belong to one band."""
+
+_STEEPEST = 1e308
+"""The slope of a vertical beam."""
+
 SLICES = 64
 """Slices of a vehicle's length, to find the longest stretch without points."""
 
@@ -34,26 +50,120 @@ _ON_SIDE_M = 1e-6
 """A beam that ends within this distance of the plane of a side meets the side, not the roof."""
 
 _TINY = 1e-300
-"""Replaces a direction of 0 along an axis: such a beam enters and leaves beyond any length."""
+"""Replaces a direction of 0 or less along an axis, which no beam has that enters through its face."""
+
+_LARGEST_KEY = np.int64(2**63 - 1)
+"""Above every key of :func:`_order_key`; its negative is below every one."""
+
+
+@_inlined
+def _azimuth_cell(azimuth):  # type: ignore[no-untyped-def]
+    """The cell of an azimuth in [-pi, pi]; cell 0 begins at -pi."""
+    cell = np.int64((azimuth + math.pi) * (AZIMUTH_CELLS / (2.0 * math.pi)))
+    return min(max(cell, 0), AZIMUTH_CELLS - 1)
 
 
 @_kernel
-def _append_runs(span, azimuth, start, runs, count):  # type: ignore[no-untyped-def]
-    """Append the runs of rows whose azimuths are in a span; returns the number of runs with the new ones.
+def sort_beams(ends_m, azimuth, limits, cells, slopes, directions, length_m, cell_of):  # type: ignore[no-untyped-def]
+    """Sort beams into bands of slopes, and in each band into cells of azimuth. Beams of one cell stay in their order.
 
-    Azimuths are ascending in [-pi, pi], the span may exceed that interval: one run for each turn of the circle. Each
-    row of ``runs`` (m, 2) is the first row and one past the last; ``start`` is the number of the first azimuth.
+    Parameters
+    ----------
+    ends_m, azimuth
+        End of each beam relative to the sensor, (n, 3) float64; its azimuth in [-pi, pi], (n,) float64.
+    limits
+        Slopes between the bands, ascending, (bands - 1,) float64.
+    cells
+        Filled, zeros at first: sorted beams cells[c] to cells[c + 1] are those of cell c % ``AZIMUTH_CELLS`` in band
+        c // ``AZIMUTH_CELLS``, (bands * AZIMUTH_CELLS + 1,) int64.
+    slopes
+        Filled: the lowest and the highest rise over run in each band, (bands, 2) float64.
+    directions, length_m
+        Filled, zeros at first: the sorted unit directions (3, m) and lengths (m,), float64. m is the
+        next multiple of :data:`BLOCK`; the last ones are beams without length, which meet nothing.
+    cell_of
+        Scratch, (n,) int64.
     """
+    bands = limits.shape[0] + 1
+    for b in range(bands):
+        slopes[b, 0], slopes[b, 1] = np.inf, -np.inf
+    for n in range(ends_m.shape[0]):
+        x, y, z = ends_m[n, 0], ends_m[n, 1], ends_m[n, 2]
+        slope = z / np.sqrt(x * x + y * y)
+        if not abs(slope) < _STEEPEST:  # vertical, or without length
+            slope = 0.0 if z == 0.0 else math.copysign(_STEEPEST, z)
+        band = np.int64(0)
+        while band < bands - 1 and limits[band] < slope + SAME_SLOPE:
+            band += 1
+        slopes[band, 0], slopes[band, 1] = min(slopes[band, 0], slope), max(slopes[band, 1], slope)
+        cell_of[n] = band * AZIMUTH_CELLS + _azimuth_cell(azimuth[n])
+        cells[cell_of[n] + 1] += 1
+    for c in range(cells.shape[0] - 1):
+        cells[c + 1] += cells[c]
+    for n in range(ends_m.shape[0]):
+        at = cells[cell_of[n]]
+        cells[cell_of[n]] += 1
+        x, y, z = ends_m[n, 0], ends_m[n, 1], ends_m[n, 2]
+        length = np.sqrt((x * x + y * y) + z * z)
+        directions[0, at], directions[1, at], directions[2, at] = x / length, y / length, z / length
+        length_m[at] = length
+    for c in range(cells.shape[0] - 1, 0, -1):  # each is now where the next one begins
+        cells[c] = cells[c - 1]
+    cells[0] = 0
+
+
+@_inlined
+def _cells_of_span(span):  # type: ignore[no-untyped-def]
+    """First and last cell of a span of azimuths; the first is larger where the span crosses -pi."""
     low, high = span[0] - _MARGIN_RAD, span[1] + _MARGIN_RAD
-    if high - low >= 2.0 * math.pi:
-        runs[count, 0], runs[count, 1] = start, start + azimuth.shape[0]
-        return count + 1
-    for turn in range(-1, 2):
-        first, last = low + turn * 2.0 * math.pi, high + turn * 2.0 * math.pi
-        if first <= math.pi and last >= -math.pi:
-            runs[count, 0] = start + np.searchsorted(azimuth, first)
-            runs[count, 1] = start + np.searchsorted(azimuth, last)
-            count += runs[count, 0] < runs[count, 1]
+    if low < -math.pi:
+        low, high = low + 2.0 * math.pi, high + 2.0 * math.pi
+    first = _azimuth_cell(low)
+    if high <= math.pi:
+        return first, _azimuth_cell(high)
+    last = _azimuth_cell(high - 2.0 * math.pi)
+    if high - low >= 2.0 * math.pi or last >= first:
+        return 0, AZIMUTH_CELLS - 1
+    return first, last
+
+
+@_inlined
+def _append_run(first, last, runs, count):  # type: ignore[no-untyped-def]
+    """Append beams first .. last in whole blocks, without those of the run before; returns the number of runs."""
+    if first < last:
+        first, last = first // BLOCK * BLOCK, (last + BLOCK - 1) // BLOCK * BLOCK
+        if count > 0:
+            first = max(first, runs[count - 1, 1])
+        if first < last:
+            runs[count, 0], runs[count, 1] = first, last
+            count += 1
+    return count
+
+
+@_kernel
+def _find_runs(span, bounds, cells, slopes, runs):  # type: ignore[no-untyped-def]
+    """Fill the runs of beams that can meet a box, ascending, and return their number.
+
+    Parameters
+    ----------
+    span, bounds
+        First and last azimuth of the box, lowest and highest slope.
+    cells, slopes
+        As :func:`sort_beams` fills them.
+    runs
+        Filled: the first beam of each run and one past the last, (2 * bands, 2) int64.
+    """
+    first, last = _cells_of_span(span)
+    lowest, highest = bounds
+    count = np.int64(0)
+    for band in range(slopes.shape[0]):
+        if slopes[band, 0] <= highest and slopes[band, 1] >= lowest:
+            begin = band * AZIMUTH_CELLS
+            if first <= last:
+                count = _append_run(cells[begin + first], cells[begin + last + 1], runs, count)
+            else:
+                count = _append_run(cells[begin], cells[begin + last + 1], runs, count)
+                count = _append_run(cells[begin + first], cells[begin + AZIMUTH_CELLS], runs, count)
     return count
 
 
@@ -67,105 +177,157 @@ def _slope_bounds(block):  # type: ignore[no-untyped-def]
 
 
 @_inlined
-def _face_distance(o, half):  # type: ignore[no-untyped-def]
-    """Distance along one axis from the sensor to the face through which a box can be entered; 0 within the slab."""
+def _facing_axis(x, y, z, o, half):  # type: ignore[no-untyped-def]
+    """One axis of a box, a fifth of a row of ``facing``, turned so that the sensor is on its negative side.
+
+    Returns its direction (3), the sensor's coordinate, the half size; the distance along it to the face through which
+    the box can be entered, 0 where the sensor is between both faces; and what the direction of a beam that enters must
+    exceed, and its coordinate then.
+    """
+    if o > 0.0:
+        x, y, z, o = -x, -y, -z, -o
     if o <= -half:
-        return -half - o
-    if o >= half:
-        return half - o
-    return 0.0
+        return x, y, z, o, half, -half - o, 0.0, -np.inf
+    return x, y, z, o, half, 0.0, -np.inf, -half
 
 
 @_kernel
-def _entry_ranges(box, d, first, last, t_m):  # type: ignore[no-untyped-def]
-    """Fill where rays first .. last, directions d (3, n), enter a box, a row of ``facing``; infinite where they do not.
+def _enter_box(box, directions, length_m, runs, nearest_m, t_m):  # type: ignore[no-untyped-def]
+    """Intersect runs of beams with a box, a row of ``facing``; lower ``nearest_m`` to where they enter it.
 
     The range is that of the last slab to be entered, to the last bit as in
-    :func:`egvs.kernels.occlusion._entry_range`. It counts when the ray has not left any slab by then, which needs only
-    a product: so there is a division for each plane that faces the sensor, and none for the others.
+    :func:`egvs.kernels.occlusion._entry_range`. It counts when the beam has not left any slab by then, which needs only
+    a product: so there is a division for each axis, not for each plane.
+
+    Parameters
+    ----------
+    box, directions, length_m, runs
+        The box, all beams and their lengths, and the runs to intersect.
+    nearest_m
+        Range of the nearest entry of each beam, or its length, (n,) float64.
+    t_m
+        Filled: where each beam of the runs enters the box, run after run, infinite where it does not.
+
+    Returns
+    -------
+    met, ties
+        Number of beams that meet the box; of those that enter it exactly where they entered another box.
     """
-    ax, ay, az, ao, ah = box[0], box[1], box[2], box[3], box[4]
-    bx, by, bz, bo, bh = box[5], box[6], box[7], box[8], box[9]
-    cx, cy, cz, co, ch = box[10], box[11], box[12], box[13], box[14]
-    to_a, to_b, to_c = _face_distance(ao, ah), _face_distance(bo, bh), _face_distance(co, ch)
-    x, y, z = d[0, first:last], d[1, first:last], d[2, first:last]
-    for n in range(last - first):
-        a = ax * x[n] + ay * y[n] + az * z[n]
-        b = bx * x[n] + by * y[n] + bz * z[n]
-        c = cx * x[n] + cy * y[n] + cz * z[n]
-        a, b, c = (a if a != 0.0 else _TINY), (b if b != 0.0 else _TINY), (c if c != 0.0 else _TINY)
-        t_a, t_b, t_c = to_a / a, to_b / b, to_c / c
-        t = t_a if t_a > t_b else t_b
-        t = t if t > t_c else t_c
-        meets = (t_a >= 0.0) & (t_b >= 0.0) & (t_c >= 0.0)
-        meets &= (ao if a > 0.0 else -ao) + t * abs(a) < ah
-        meets &= (bo if b > 0.0 else -bo) + t * abs(b) < bh
-        meets &= (co if c > 0.0 else -co) + t * abs(c) < ch
-        t_m[n] = t if meets else np.inf
+    ax, ay, az, ao, ah, to_a, least_a, low_a = _facing_axis(box[0], box[1], box[2], box[3], box[4])
+    bx, by, bz, bo, bh, to_b, least_b, low_b = _facing_axis(box[5], box[6], box[7], box[8], box[9])
+    cx, cy, cz, co, ch, to_c, least_c, low_c = _facing_axis(box[10], box[11], box[12], box[13], box[14])
+    met, ties, done = 0, 0, 0
+    for r in range(runs.shape[0]):
+        first, last = runs[r, 0], runs[r, 1]
+        x, y, z = directions[0, first:last], directions[1, first:last], directions[2, first:last]
+        longest, nearest, run_t_m = length_m[first:last], nearest_m[first:last], t_m[done : done + last - first]
+        for n in range(last - first):
+            a = ax * x[n] + ay * y[n] + az * z[n]
+            b = bx * x[n] + by * y[n] + bz * z[n]
+            c = cx * x[n] + cy * y[n] + cz * z[n]
+            t_a, t_b, t_c = to_a / max(a, _TINY), to_b / max(b, _TINY), to_c / max(c, _TINY)
+            t = t_a if t_a > t_b else t_b
+            t = t if t > t_c else t_c
+            on_a, on_b, on_c = ao + t * a, bo + t * b, co + t * c
+            meets = (t < longest[n]) & (a > least_a) & (b > least_b) & (c > least_c)
+            meets &= (on_a < ah) & (on_b < bh) & (on_c < ch) & (on_a > low_a) & (on_b > low_b) & (on_c > low_c)
+            t = t if meets else np.inf
+            run_t_m[n] = t
+            met += meets
+            ties += t == nearest[n]
+            nearest[n] = t if t < nearest[n] else nearest[n]
+        done += last - first
+    return met, ties
 
 
-@_kernel
-def _intersect_box(k, box, beams, runs, owner, range_m, t_m):  # type: ignore[no-untyped-def]
-    """End the beams of ``runs`` at box k where they meet it first; returns the weight of all beams that meet it."""
-    is_weighted, met_weight, met = beams[5].shape[0] > 0, 0.0, 0
-    for run in range(runs.shape[0]):
-        first, last = runs[run]
-        _entry_ranges(box, beams[3], first, last, t_m)
-        length_m, nearest_m, owners = beams[4][first:last], range_m[first:last], owner[first:last]
-        for i in range(last - first):
-            met += t_m[i] < length_m[i]
-        if is_weighted:
-            weight = beams[5][first:last]
-            for i in range(last - first):
-                met_weight += weight[i] if t_m[i] < length_m[i] else 0.0
-        for i in range(last - first):
-            is_nearer = t_m[i] < nearest_m[i]
-            owners[i] = np.int32(k) if is_nearer else owners[i]
-            nearest_m[i] = t_m[i] if is_nearer else nearest_m[i]
-    return met_weight if is_weighted else float(met)
+@_inlined
+def _order_key(x):  # type: ignore[no-untyped-def]
+    """An integer for each float64, in the same order: of integers, a processor finds the least of several at once."""
+    bits = np.float64(x).view(np.int64)
+    return bits ^ ((bits >> np.int64(63)) & _LARGEST_KEY)
+
+
+@_inlined
+def _key_value(key):  # type: ignore[no-untyped-def]
+    """The number whose key this is."""
+    return np.int64(key ^ ((key >> np.int64(63)) & _LARGEST_KEY)).view(np.float64)
 
 
 @_inlined
 def _is_on_side(along, across, half_length, half_width):  # type: ignore[no-untyped-def]
     """Whether a hit is on a side of its box, not on its roof (or, from below, its underside)."""
-    return abs(along) > half_length - _ON_SIDE_M or abs(across) > half_width - _ON_SIDE_M
+    return (abs(along) > half_length - _ON_SIDE_M) | (abs(across) > half_width - _ON_SIDE_M)
 
 
 @_inlined
 def _slice_of(along, half_length):  # type: ignore[no-untyped-def]
-    """The bit of the slice of the box's length that a hit is in."""
-    part = int(SLICES * (0.5 * along / half_length + 0.5))
-    return np.uint64(1) << np.uint64(min(max(part, 0), SLICES - 1))
+    """The slice of the box's length that a hit is in."""
+    part = SLICES * (0.5 * along / half_length + 0.5)
+    return np.uint64(np.int32(min(max(part, 0.0), SLICES - 1.0)))
 
 
 @_kernel
-def _add_box_hits(k, b, box, beams, runs, owner, range_m, selected, sums):  # type: ignore[no-untyped-def]
-    """Add up the beams that end on box k, which is box b of all frames, as in :func:`first_hits`.
-
-    They are listed in ``selected`` (n,) first, so that there is no branch for each of the others.
-    """
+def _count_box_hits(b, box, directions, runs, nearest_m, t_m, sums):  # type: ignore[no-untyped-def]
+    """Fill the sums of :func:`first_hits` for box b of all frames, where each beam counts 1."""
     ax, ay, az, ao, ah = box[0], box[1], box[2], box[3], box[4]
     bx, by, bz, bo, bh = box[5], box[6], box[7], box[8], box[9]
-    x, y, z, weight = beams[3][0], beams[3][1], beams[3][2], beams[5]
+    count, on_sides, parts, done = 0, 0, np.uint64(0), 0
+    a_low, a_high, b_low, b_high = _LARGEST_KEY, -_LARGEST_KEY, _LARGEST_KEY, -_LARGEST_KEY
+    for r in range(runs.shape[0]):
+        first, last = runs[r, 0], runs[r, 1]
+        x, y, z = directions[0, first:last], directions[1, first:last], directions[2, first:last]
+        nearest, run_t_m = nearest_m[first:last], t_m[done : done + last - first]
+        for n in range(last - first):
+            ends_here, t = run_t_m[n] == nearest[n], run_t_m[n]
+            along = ao + t * (ax * x[n] + ay * y[n] + az * z[n])
+            across = bo + t * (bx * x[n] + by * y[n] + bz * z[n])
+            count += ends_here
+            on_sides += ends_here & _is_on_side(along, across, ah, bh)
+            parts |= (np.uint64(1) if ends_here else np.uint64(0)) << _slice_of(along, ah)
+            u, v = _order_key(along), _order_key(across)
+            a_low, a_high = min(a_low, u if ends_here else _LARGEST_KEY), max(a_high, u if ends_here else -_LARGEST_KEY)
+            b_low, b_high = min(b_low, v if ends_here else _LARGEST_KEY), max(b_high, v if ends_here else -_LARGEST_KEY)
+        done += last - first
     total, sides, slices, low, high = sums
-    count, is_weighted = 0, weight.shape[0] > 0
-    for run in range(runs.shape[0]):
-        first, last = runs[run]
-        owners = owner[first:last]
+    if count > 0:
+        total[b], sides[b], slices[b] = count, on_sides, parts
+        low[b, 0], high[b, 0] = _key_value(a_low), _key_value(a_high)
+        low[b, 1], high[b, 1] = _key_value(b_low), _key_value(b_high)
+
+
+@_kernel
+def _list_rows(runs, nearest_m, t_m, rows):  # type: ignore[no-untyped-def]
+    """List the beams that end on a box, in their order, without a branch for each; returns their number.
+
+    ``rows``: int64, one more than there are beams.
+    """
+    count, done = np.int64(0), 0
+    for r in range(runs.shape[0]):
+        first, last = runs[r, 0], runs[r, 1]
+        nearest, t = nearest_m[first:last], t_m[done : done + last - first]
         for i in range(last - first):
-            selected[count] = first + i
-            count += owners[i] == k
+            rows[count] = first + i
+            count += t[i] == nearest[i]
+        done += last - first
+    return count
+
+
+@_kernel
+def _add_box_hits(b, box, directions, rows, nearest_m, weight, sums):  # type: ignore[no-untyped-def]
+    """Fill the sums of :func:`first_hits` for box b of all frames, on which the beams ``rows`` end."""
+    ax, ay, az, ao, ah = box[0], box[1], box[2], box[3], box[4]
+    bx, by, bz, bo, bh = box[5], box[6], box[7], box[8], box[9]
+    x, y, z = directions[0], directions[1], directions[2]
+    total, sides, slices, low, high = sums
     hit_weight, on_sides, parts = 0.0, 0.0, np.uint64(0)
     a_low, a_high, b_low, b_high = np.inf, -np.inf, np.inf, -np.inf
-    for i in range(count):
-        n = selected[i]
-        share = weight[n] if is_weighted else 1.0
-        hit_weight += share
-        if share > 0.0:
-            along = ao + range_m[n] * (ax * x[n] + ay * y[n] + az * z[n])
-            across = bo + range_m[n] * (bx * x[n] + by * y[n] + bz * z[n])
-            on_sides += share if _is_on_side(along, across, ah, bh) else 0.0
-            parts |= _slice_of(along, ah)
+    for n in rows:
+        hit_weight += weight[n]
+        if weight[n] > 0.0:
+            along = ao + nearest_m[n] * (ax * x[n] + ay * y[n] + az * z[n])
+            across = bo + nearest_m[n] * (bx * x[n] + by * y[n] + bz * z[n])
+            on_sides += weight[n] if _is_on_side(along, across, ah, bh) else 0.0
+            parts |= np.uint64(1) << _slice_of(along, ah)
             a_low, a_high = min(a_low, along), max(a_high, along)
             b_low, b_high = min(b_low, across), max(b_high, across)
     total[b], sides[b], slices[b] = hit_weight, on_sides, parts
@@ -173,31 +335,51 @@ def _add_box_hits(k, b, box, beams, runs, owner, range_m, selected, sums):  # ty
 
 
 @_kernel
-def _list_box_hits(k, b, box, beams, runs, owner, range_m, hits, count):  # type: ignore[no-untyped-def]
-    """List the beams that end on box k, which is box b of all frames, after ``count``; returns the new number."""
-    x, y, z = beams[3][0], beams[3][1], beams[3][2]
+def _list_box_hits(b, box, directions, rows, nearest_m, hits, count):  # type: ignore[no-untyped-def]
+    """List the hits of the beams ``rows`` on box b of all frames after ``count``; returns the new number."""
+    x, y, z = directions[0], directions[1], directions[2]
     hit_box, hit_row, hit_range, hit_along, hit_across = hits
-    for run in range(runs.shape[0]):
-        for n in range(runs[run, 0], runs[run, 1]):
-            if owner[n] == k:
-                hit_box[count], hit_row[count], hit_range[count] = b, n, range_m[n]
-                hit_along[count] = box[3] + range_m[n] * (box[0] * x[n] + box[1] * y[n] + box[2] * z[n])
-                hit_across[count] = box[8] + range_m[n] * (box[5] * x[n] + box[6] * y[n] + box[7] * z[n])
-                count += 1
+    for n in rows:
+        hit_box[count], hit_row[count], hit_range[count] = b, n, nearest_m[n]
+        hit_along[count] = box[3] + nearest_m[n] * (box[0] * x[n] + box[1] * y[n] + box[2] * z[n])
+        hit_across[count] = box[8] + nearest_m[n] * (box[5] * x[n] + box[6] * y[n] + box[7] * z[n])
+        count += 1
     return count
 
 
 @_kernel
-def _clear_box_hits(runs, length_m, owner, range_m):  # type: ignore[no-untyped-def]
-    """Reset the first hits of the beams of ``runs``."""
-    for run in range(runs.shape[0]):
-        first, last = runs[run]
-        owner[first:last] = -1
-        range_m[first:last] = length_m[first:last]
+def _met_weight(runs, t_m, weight):  # type: ignore[no-untyped-def]
+    """Add up the weights of the beams that meet a box, in their order."""
+    total, done = 0.0, 0
+    for r in range(runs.shape[0]):
+        for n in range(runs[r, 0], runs[r, 1]):
+            total += weight[n] if t_m[done] < np.inf else 0.0
+            done += 1
+    return total
 
 
 @_kernel
-def first_hits(begin, o, size_m, boxes, beams, owner, range_m, sums, hits):  # type: ignore[no-untyped-def]
+def _take_beams(runs, nearest_m, t_m):  # type: ignore[no-untyped-def]
+    """Leave nothing of the beams that end on a box to the boxes behind it that they enter at the same range."""
+    done = 0
+    for r in range(runs.shape[0]):
+        for n in range(runs[r, 0], runs[r, 1]):
+            nearest_m[n] = -1.0 if t_m[done] == nearest_m[n] else nearest_m[n]
+            done += 1
+
+
+@_kernel
+def _reset(runs, length_m, nearest_m):  # type: ignore[no-untyped-def]
+    """Reset the nearest entries of the beams of ``runs``."""
+    for r in range(runs.shape[0]):
+        first, last = runs[r, 0], runs[r, 1]
+        nearest, longest = nearest_m[first:last], length_m[first:last]
+        for i in range(last - first):
+            nearest[i] = longest[i]
+
+
+@_kernel
+def first_hits(begin, o, size_m, boxes, beams, nearest_m, sums, hits):  # type: ignore[no-untyped-def]
     """Add up, or list, the beams that meet each box first: of all frames, or as many as fit in the list.
 
     Parameters
@@ -207,15 +389,16 @@ def first_hits(begin, o, size_m, boxes, beams, owner, range_m, sums, hits):  # t
     o, size_m
         The sensor, (3,) float64; the grid is the box from 0 to ``size_m`` (3,).
     boxes
-        ``starts``: boxes starts[f] to starts[f + 1] are those of frame f, (frames + 1,) int64. ``values``, ``low``,
-        ``high``: as :func:`egvs.kernels.occlusion.box_bounds` takes and fills them, (b, 8), (b, 3), (b, 3).
-        ``listed``: for which boxes beams are added up or listed, (b,) bool; the others only occlude.
+        ``starts``, ``order``: boxes order[starts[f]] to order[starts[f + 1]] are those of frame f that can be between
+        sensor and grid, nearest first, (frames + 1,) and (m,) int64. ``values``, ``low``, ``high``: as
+        :func:`egvs.kernels.occlusion.box_bounds` takes and fills them, (b, 8), (b, 3), (b, 3). ``listed``: for which
+        boxes beams are added up or listed, (b,) bool; the others only occlude.
     beams
-        ``bands``: rows bands[i] to bands[i + 1] are those of band i, (bands + 1,) int64. ``slopes``: the lowest and the
-        highest rise over run in each, (bands, 2). Of each beam: azimuth in [-pi, pi], ascending in a band; unit
-        direction (3, n); its length without boxes; its weight, or no weights (0,) where all are 1; float64.
-    owner, range_m
-        Scratch, (n,) int32 and float64: -1 and the length of each beam, before and after the call.
+        ``cells``, ``slopes``, ``directions`` and ``length_m`` as :func:`sort_beams` fills them; the weight of each
+        beam, or no weights (0,) where all are 1, float64. Weights are added in the order of the beams. Hits are
+        listed only where there are weights.
+    nearest_m
+        Scratch, (m,) float64: the length of each beam, before and after the call.
     sums
         Filled: ``alone``, (b,) float64, the weight of all beams that meet the box, occluded or not; 0 at first. And,
         for ``listed`` boxes, unless ``hits`` are listed, of the beams that meet it first: ``total``, (b,) float64,
@@ -232,41 +415,53 @@ def first_hits(begin, o, size_m, boxes, beams, owner, range_m, sums, hits):  # t
     next_frame, count
         The frame to continue with, and the number of listed hits.
     """
-    starts, values, low, high, listed = boxes
-    bands, slopes, azimuth = beams[0], beams[1], beams[2]
-    alone, counted = sums[0], sums[1:]
-    max_boxes, count, room = 0, 0, hits[0].shape[0]
+    starts, order, values, low, high, listed = boxes
+    cells, slopes, directions, length_m, weight = beams
+    alone, added = sums[0], sums[1:]
+    max_boxes, count, room = np.int64(0), np.int64(0), hits[0].shape[0]
     for f in range(begin, starts.shape[0] - 1):
         max_boxes = max(max_boxes, starts[f + 1] - starts[f])
     facing, block, span = np.empty((max_boxes, 15)), np.empty((max_boxes, 9)), np.empty((max_boxes, 2))
-    box, away, t_m = np.empty(max_boxes, np.int64), np.empty(max_boxes), np.empty(azimuth.shape[0])
-    runs, filled = np.empty((max_boxes, 3 * bands.shape[0], 2), np.int64), np.zeros(max_boxes, np.int64)
-    selected = np.empty(azimuth.shape[0], np.int64)
+    box, filled, offset = (
+        np.empty(max_boxes, np.int64),
+        np.empty(max_boxes, np.int64),
+        np.empty(max_boxes + 1, np.int64),
+    )
+    runs = np.empty((max_boxes, 2 * slopes.shape[0], 2), np.int64)
+    rows, t_m = np.empty(length_m.shape[0] + 1, np.int64), np.empty(length_m.shape[0])
+    offset[0] = 0
     for f in range(begin, starts.shape[0] - 1):
-        if room > 0 and count + azimuth.shape[0] > room:
+        if room > 0 and count + length_m.shape[0] > room:
             return f, count
-        first, last = starts[f], starts[f + 1]
-        for b in range(first, last):
-            x, y, z = values[b, 0] - o[0], values[b, 1] - o[1], values[b, 2] - o[2]
-            away[b - first] = x * x + y * y + z * z
-        order = np.argsort(away[: last - first], kind="mergesort")
-        frame_values, frame_low, frame_high = values[first:last], low[first:last], high[first:last]
-        oriented = orient_boxes(o, order, frame_values, frame_low, frame_high, size_m, facing, block, span, box)
+        frame_order = order[starts[f] : starts[f + 1]]
+        oriented = orient_boxes(o, frame_order, values, low, high, size_m, facing, block, span, box)
         for k in range(oriented):
-            lowest, highest = _slope_bounds(block[k])
-            filled[k] = 0
-            for i in range(bands.shape[0] - 1):
-                if slopes[i, 0] <= highest and slopes[i, 1] >= lowest:
-                    filled[k] = _append_runs(span[k], azimuth[bands[i] : bands[i + 1]], bands[i], runs[k], filled[k])
-            alone[first + box[k]] = _intersect_box(k, facing[k], beams, runs[k, : filled[k]], owner, range_m, t_m)
+            filled[k] = _find_runs(span[k], _slope_bounds(block[k]), cells, slopes, runs[k])
+            offset[k + 1] = offset[k]
+            for r in range(filled[k]):
+                offset[k + 1] += runs[k, r, 1] - runs[k, r, 0]
+        if offset[oriented] > t_m.shape[0]:
+            t_m = np.empty(2 * offset[oriented])
+        ties = 0
         for k in range(oriented):
-            b, box_runs = first + box[k], runs[k, : filled[k]]
-            if listed[b] and room > 0:
-                count = _list_box_hits(k, b, facing[k], beams, box_runs, owner, range_m, hits, count)
+            box_runs, box_t_m = runs[k, : filled[k]], t_m[offset[k] :]
+            met, box_ties = _enter_box(facing[k], directions, length_m, box_runs, nearest_m, box_t_m)
+            ties += box_ties
+            alone[box[k]] = met if weight.shape[0] == 0 else _met_weight(box_runs, box_t_m, weight)
+        for k in range(oriented):
+            b, box_runs, box_t_m = box[k], runs[k, : filled[k]], t_m[offset[k] :]
+            if listed[b] and weight.shape[0] == 0:
+                _count_box_hits(b, facing[k], directions, box_runs, nearest_m, box_t_m, added)
             elif listed[b]:
-                _add_box_hits(k, b, facing[k], beams, box_runs, owner, range_m, selected, counted)
+                box_rows = rows[: _list_rows(box_runs, nearest_m, box_t_m, rows)]
+                if room > 0:
+                    count = _list_box_hits(b, facing[k], directions, box_rows, nearest_m, hits, count)
+                else:
+                    _add_box_hits(b, facing[k], directions, box_rows, nearest_m, weight, added)
+            if ties > 0:
+                _take_beams(box_runs, nearest_m, box_t_m)
         for k in range(oriented):
-            _clear_box_hits(runs[k, : filled[k]], beams[4], owner, range_m)
+            _reset(runs[k, : filled[k]], length_m, nearest_m)
     return starts.shape[0] - 1, count
 
 
@@ -289,7 +484,7 @@ def accumulate_hits(box, weight, along, across, boxes, sums):  # type: ignore[no
         total[b] += weight[i]
         if weight[i] > 0.0:
             sides[b] += weight[i] if _is_on_side(along[i], across[i], half_length, half_width) else 0.0
-            slices[b] |= _slice_of(along[i], half_length)
+            slices[b] |= np.uint64(1) << _slice_of(along[i], half_length)
             low[b, 0], high[b, 0] = min(low[b, 0], along[i]), max(high[b, 0], along[i])
             low[b, 1], high[b, 1] = min(low[b, 1], across[i]), max(high[b, 1], across[i])
 

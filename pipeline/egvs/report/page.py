@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -241,6 +242,14 @@ def render_page(contents: PageContents) -> str:
     return _template_environment().get_template("report.html.j2").render(values)
 
 
+def prepare() -> None:
+    """Load the templates, and the library that fills them."""
+    environment = _template_environment()
+    for path in TEMPLATES.glob("*.html.j2"):
+        environment.get_template(path.name)
+
+
+@cache
 def _template_environment() -> Environment:
     """Templates and filters; jinja2 is imported only when a page is written."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -372,4 +381,5 @@ STAGE = Stage(
         RunFolder.blindspots,
     ),
     effect_stages=("scan", "score"),
+    prepare=(prepare,),
 )

@@ -19,6 +19,9 @@ from egvs.report.formatting import ScoreLabel, join_names
 MIN_USEFUL_SHARE = 0.01
 """A useful sensor adds at least 1 percentage point; to scores that are no shares, at least 1 % of the plan's score."""
 
+_INDEPENDENT_SCORES = ("expected_detections",)
+"""Scores whose joint value treats the sensors of a plan as independent (:mod:`egvs.placement.problem`)."""
+
 _NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 _ORDINALS = ("", "first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth")
 
@@ -34,6 +37,32 @@ class CurvePlan(NamedTuple):
         """Sites and cost, e.g. "a and b for 6000"."""
         cost = f" for {self.cost:g}" if self.cost else ""
         return f"{join_names(self.sites)}{cost}"
+
+
+class InstalledSite(NamedTuple):
+    """A site of a plan in the order of installation, and the joint score of the sites up to this one."""
+
+    site: str
+    score: float
+    score_se: float = math.nan
+
+
+def describe_joint_score(by: ScoreLabel, sensors: int) -> str:
+    """Return what the joint score of a plan assumes, in one sentence; empty for one sensor, and for other scores.
+
+    Parameters
+    ----------
+    by
+        Label of the joint score.
+    sensors
+        Number of sensors of the plan.
+    """
+    if sensors < 2 or by.name not in _INDEPENDENT_SCORES:
+        return ""
+    return (
+        "Joint shares assume that sensors miss vehicles independently of each other; near 100% they are upper ends "
+        "(docs/placement.md)."
+    )
 
 
 def is_useful(before: PlanStep, step: PlanStep, by: ScoreLabel) -> bool:
@@ -68,6 +97,7 @@ def describe_count(
     by: ScoreLabel,
     *,
     plans: Sequence[CurvePlan] = (),
+    installed: Sequence[InstalledSite] = (),
     has_budget: bool = False,
     objective: str = "",
     next_count: int | None = None,
@@ -82,6 +112,9 @@ def describe_count(
         Label of the joint score.
     plans
         The plan of each step: if fewer sensors than those of the last plan are enough, their sites are named.
+    installed
+        The sites of the last plan in the order of installation: if the first ones are others than those that are
+        enough, a sentence compares them.
     has_budget
         Whether a budget limits the number of sensors of the last plan.
     objective
@@ -105,15 +138,16 @@ def describe_count(
         gain = f"{_describe_gain(steps[enough + 1], by)}{_describe_chance(steps[enough + 1], by)}"
         further = _ordinal(steps[enough + 1].count)
         is_smaller = bool(plans) and 0 < len(plans[enough].sites) < len(plans[-1].sites)
+        first_ones = _describe_first_ones(plans[enough], steps[enough], installed, by) if is_smaller else ""
         if is_smaller and has_budget:
             only = "only " if steps[enough + 1].gain else ""
             _, _, ordinal = further.partition(" ")
             return (
                 f"The budget buys {_number(len(plans[-1].sites))} sensors; the {ordinal} adds {only}{gain}, so "
-                f"{_count_is(steps[enough].count)} enough: {plans[enough].text}."
+                f"{_count_is(steps[enough].count)} enough: {plans[enough].text}.{first_ones}"
             )
         names = f" ({plans[enough].text})" if is_smaller else ""
-        return f"{_capitalise(_count_is(steps[enough].count))} enough{names}: {further} adds {gain}."
+        return f"{_capitalise(_count_is(steps[enough].count))} enough{names}: {further} adds {gain}.{first_ones}"
     if not before.met:
         sensor = _capitalise(_ordinal(last.count))
         answer = f"{sensor} sensor is needed to meet the requirements; it adds {_describe_gain(last, by)}."
@@ -124,6 +158,23 @@ def describe_count(
             f"{_number(before.count)}."
         )
     return f"{answer} {try_next}".rstrip()
+
+
+def _describe_first_ones(plan: CurvePlan, step: PlanStep, installed: Sequence[InstalledSite], by: ScoreLabel) -> str:
+    """Return how the first sites of a larger plan compare with a plan of as many; empty if they are the same."""
+    count = len(plan.sites)
+    first = installed[:count]
+    if len(first) < count or {site.site for site in first} == set(plan.sites):
+        return ""
+    which, verb = ("site", "reaches") if count == 1 else (f"{_number(count)} sites", "reach")
+    reached = f"{by.with_error(first[-1].score, first[-1].score_se)} {by.unit}".rstrip()
+    best = f"{by.with_error(step.score, step.score_se)} {by.unit}".rstrip()
+    follow = _number(len(installed) - count)
+    return (
+        f" The first {which} of the plan of {_number(len(installed))}, {join_names([site.site for site in first])}, "
+        f"{verb} {reached} instead of {best}: begin with {'it' if count == 1 else 'them'} only if {follow} more "
+        f"{'is' if follow == 'one' else 'are'} to follow."
+    )
 
 
 def next_count(steps: Sequence[PlanStep], sensors: int, candidates: int, requested: Mapping[str, Any]) -> int | None:

@@ -466,10 +466,12 @@ class PlacementSummary:
         poles = _planned_poles(picks, joint, by)
         steps, objective = plan_steps(curve_rows), describe_objective(plan["asked"])
         curve = _curve(steps, curve_rows, plan["together"] or math.inf)
+        installed = [plan_answer.InstalledSite(pick.site, pick.score, pick.score_se) for pick in picks]
         answer = plan_answer.describe_count(
             steps,
             by,
             plans=[plan_answer.CurvePlan(row.sites, row.cost) for row in curve],
+            installed=[] if before is not None else installed,
             has_budget=plan["asked"]["budget"] is not None,
             objective=objective,
             next_count=plan_answer.next_count(steps, len(picks), plan["candidates"], plan["asked"]),
@@ -498,6 +500,11 @@ class PlacementSummary:
         if not self.together:
             return 0.0
         return self.joint / self.together
+
+    @property
+    def assumption(self) -> str:
+        """What the joint score assumes, in a sentence; may be empty."""
+        return plan_answer.describe_joint_score(self.by, len(self.picks))
 
     @property
     def has_errors(self) -> bool:

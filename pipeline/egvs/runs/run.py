@@ -330,7 +330,7 @@ class _Run:
     ) -> None:
         """Bring one stage up to date; with ``again``, or with options that change artefacts, it always runs.
 
-        While a stage in the background goes on, the program of ``next_stages`` is loaded and compiled.
+        While a stage in the background goes on, what it and ``next_stages`` will call is loaded and compiled.
         """
         key = stage_keys.stage_key(name, self.context)
         has_options = any(option not in stage_registry.stage(name).neutral_options for option in options)
@@ -353,7 +353,7 @@ class _Run:
             self._save(name, key, result)
         elif self.background is not None and self.background.key == key.key:
             self.listener(name, "runs", None)
-            result = self.background.result(self._preparations(next_stages))
+            result = self.background.result(self._preparations([name, *next_stages]))
             self.store.put(name, key.key, self.context.folder.path, result)
             self.background.close()
         else:
@@ -364,7 +364,7 @@ class _Run:
         self.listener(name, "fetched" if fetched else "done", stage_record)
 
     def _preparations(self, names: Iterable[str]) -> Iterator[Callable[[], None]]:
-        """Yield what loads, or compiles, the program of some stages."""
+        """Yield what loads, or compiles, what some stages call."""
         for name in names:
             yield partial(self.compiler.before, name, ())
             yield from stage_registry.stage(name).prepare

@@ -68,14 +68,11 @@ SEEN_WELL_POINTS = 20.0
 _KERNEL_ORDER = [0, 1, 2, 6, 7, 3, 4, 5]
 """Columns of ``traffic_frames.BOX_COLUMNS`` and pitch, in the order of kernels: centre, yaw, pitch, sizes."""
 
-_BANDS = 16
+_BANDS = 12
 """Number of bands of slopes that beams are sorted into."""
 
 _STRIDE = 13
 """Every so manyth beam tells where bands begin; not a divisor of any common number of channels."""
-
-_SAME_SLOPE = 1e-9
-"""Slopes that differ by less are those of one ring of a sensor, and belong to one band."""
 
 _MAX_HITS = 2**17
 """Hits that are listed at once, which bounds the memory."""
@@ -110,6 +107,25 @@ class AllBoxes:
         occlusion.box_bounds(values, low, high)
         ends = np.cumsum([len(frame_rows) for frame_rows in rows], dtype=np.int64)
         return cls(np.append(0, ends), values, low, high)
+
+    def between(self, sensor_m: FloatArray, size_m: FloatArray) -> tuple[IntArray, IntArray]:
+        """Select the boxes that can be between a sensor (3,) and the grid, the box from 0 to ``size_m`` (3,).
+
+        Returns
+        -------
+        starts, order
+            Boxes order[starts[f]] to order[starts[f + 1]] are those of frame f, nearest first, (frames + 1,) and (m,)
+            int64.
+        """
+        is_apart = np.zeros(len(self.values), dtype=np.bool_)
+        for axis in range(3):
+            is_apart |= self.low[:, axis] > max(sensor_m[axis], size_m[axis])
+            is_apart |= self.high[:, axis] < min(sensor_m[axis], 0.0)
+        order = np.flatnonzero(~is_apart)
+        starts = np.searchsorted(order, self.starts)
+        x_m, y_m, z_m = (self.values[order, :3] - sensor_m).T
+        frame = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+        return starts, order[np.lexsort((x_m * x_m + y_m * y_m + z_m * z_m, frame))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -375,28 +391,25 @@ def _count_points(
     return_probability: Callable[[FloatArray], FloatArray] | None,
 ) -> _BoxHits:
     boxes, count = record.all_boxes, len(record.all_boxes.values)
-    if site.weight is None and return_probability is None:
-        beams = _sort_into_bands(site, _BANDS)._replace(weight=np.empty(0))  # beams are counted
-    else:
-        beams = _sort_into_bands(site, 1)  # shares are added in the order of azimuths alone
+    is_counted = site.weight is None and return_probability is None
+    beams = _sort_beams(site, _BANDS if is_counted else 1)
     is_target = np.zeros(count, dtype=np.bool_)
     is_target[record.row] = True
-    all_boxes = boxes.starts, boxes.values, boxes.low, boxes.high, is_target
+    size_m = np.asarray(record.grid.roi.size_m)
+    all_boxes = *boxes.between(sensor_m, size_m), boxes.values, boxes.low, boxes.high, is_target
 
     bounds = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
     result = _BoxHits(np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count, dtype=np.uint64), *bounds)
-    owner = np.full(len(beams.length_m), -1, dtype=np.int32)
-    range_m = beams.length_m.copy()
+    nearest_m = beams.length_m.copy()
     capacity = 0
     if return_probability is not None:
         capacity = max(_MAX_HITS, len(beams.length_m))
     hits = (np.empty(capacity, dtype=np.int64), np.empty(capacity, dtype=np.int64), *np.empty((3, capacity)))
 
-    size_m = np.asarray(record.grid.roi.size_m)
     frame = 0
     while frame < len(record.numbers):
         frame, filled = vehicle_visibility.first_hits(
-            frame, sensor_m, size_m, all_boxes, tuple(beams), owner, range_m, tuple(result), hits
+            frame, sensor_m, size_m, all_boxes, tuple(beams), nearest_m, tuple(result), hits
         )
         if return_probability is not None:
             box, row, hit_range_m, along_m, across_m = (column[:filled] for column in hits)
@@ -408,41 +421,41 @@ def _count_points(
 class _SortedBeams(NamedTuple):
     """Beams in the form that :func:`egvs.kernels.vehicle_visibility.first_hits` takes."""
 
-    starts: IntArray
+    cells: IntArray
     slopes: FloatArray
-    azimuth_rad: FloatArray
     directions: FloatArray
     length_m: FloatArray
     weight: FloatArray
 
 
-def _sort_into_bands(beams: Beams, bands: int) -> _SortedBeams:
-    """Sort beams into bands of slopes with nearly equal numbers of beams, and by azimuth within each band."""
-    ends = beams.ends_m
-    azimuth = np.arctan2(ends[:, 1], ends[:, 0])
-    run_m = np.sqrt(ends[:, 0] ** 2 + ends[:, 1] ** 2)
-    length_m = np.sqrt((ends[:, 0] ** 2 + ends[:, 1] ** 2) + ends[:, 2] ** 2)
-    with np.errstate(invalid="ignore", divide="ignore"):  # beams without length, which hit nothing, and vertical beams
-        slope = np.nan_to_num(ends[:, 2] / run_m)
-        directions = ends.T / length_m
+def _sort_beams(beams: Beams, bands: int) -> _SortedBeams:
+    """Sort beams into bands of slopes and cells of azimuth; in a single band by azimuth, and with their weights."""
+    ends_m, weight = beams.ends_m, np.empty(0)
+    azimuth = np.arctan2(ends_m[:, 1], ends_m[:, 0])
+    limits = _band_limits(ends_m[::_STRIDE], bands)
+    if bands == 1:  # the order in which shares are added
+        rows = np.argsort(azimuth, kind="stable")
+        ends_m, azimuth = ends_m[rows], azimuth[rows]
+        weight = np.ones(len(rows)) if beams.weight is None else beams.weight[rows]
+        weight = np.append(weight, np.zeros(-len(weight) % vehicle_visibility.BLOCK))
 
-    limits = np.sort(slope[::_STRIDE])
-    if len(limits):
-        limits = limits[len(limits) * np.arange(1, bands) // bands]
-    band = np.searchsorted(np.unique(limits), slope + _SAME_SLOPE).astype(np.uint8)
-    # The beams of an empty scan come in runs of ascending azimuth, which a stable sort makes use of.
-    by_azimuth = np.argsort(azimuth, kind="stable")
-    rows = by_azimuth[np.argsort(band[by_azimuth], kind="stable")]
-    counts = np.bincount(band)
-    starts = (np.cumsum(counts) - counts)[counts > 0]
-    slope = slope[rows]
-    slopes = np.column_stack([np.minimum.reduceat(slope, starts), np.maximum.reduceat(slope, starts)])
-    weight = np.ones(len(rows))
-    if beams.weight is not None:
-        weight = beams.weight[rows]
-    # np.take, not directions[:, rows]: the kernel's loops need each axis contiguous.
-    directions = np.take(directions, rows, axis=1)
-    return _SortedBeams(np.append(starts, len(rows)), slopes, azimuth[rows], directions, length_m[rows], weight)
+    bands = len(limits) + 1  # fewer than requested where a sensor has few rings
+    size = math.ceil(len(ends_m) / vehicle_visibility.BLOCK) * vehicle_visibility.BLOCK
+    cells = np.zeros(bands * vehicle_visibility.AZIMUTH_CELLS + 1, dtype=np.int64)
+    slopes = np.empty((bands, 2))
+    directions, length_m = np.zeros((3, size)), np.zeros(size)
+    scratch = np.empty(len(ends_m), dtype=np.int64)
+    vehicle_visibility.sort_beams(ends_m, azimuth, limits, cells, slopes, directions, length_m, scratch)
+    return _SortedBeams(cells, slopes, directions, length_m, weight)
+
+
+def _band_limits(ends_m: FloatArray, bands: int) -> FloatArray:
+    """Return slopes between bands with nearly equal numbers of beams, ascending."""
+    with np.errstate(invalid="ignore", divide="ignore"):  # beams without length, and vertical beams
+        slope = np.sort(np.nan_to_num(ends_m[:, 2] / np.hypot(ends_m[:, 0], ends_m[:, 1])))
+    if not len(slope):
+        return slope
+    return np.unique(slope[len(slope) * np.arange(1, bands) // bands])
 
 
 def weighted_mean(values: FloatArray, weight: FloatArray | None = None) -> float:

@@ -84,8 +84,8 @@ class Stage:
     reads_traffic
         Whether the stage reads files of recorded traffic that the scenario names.
     prepare
-        Functions that load the kernels that ``run`` calls, or compile them, by calling them with made-up arguments; the
-        one that takes longest comes first.
+        Functions that load what ``run`` calls, for example by calling kernels with made-up arguments, which compiles
+        them in the first run; the function that takes longest comes first.
     """
 
     name: str

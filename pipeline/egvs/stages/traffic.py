@@ -17,6 +17,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+
 from egvs.artefacts import parquet
 from egvs.core import files
 from egvs.core.errors import WARNINGS_KEY, InputError, MissingBackendError
@@ -85,6 +87,13 @@ def _relative_name(path: Path, scenario: Scenario) -> str:
     if path.is_relative_to(sumo_home()):
         return f"$SUMO_HOME/{path.relative_to(sumo_home()).as_posix()}"
     return relative_path(path, scenario.folder)
+
+
+def prepare() -> None:
+    """Load what reads SUMO's rows: pyarrow loads its functions, and pandas, when it first compares a column."""
+    import pyarrow.compute as pc
+
+    pc.not_equal(pa.array([""]), "")
 
 
 def run(context: StageContext, inputs: StageDependencies, traci: tuple[str, int] | None = None) -> Summary:
@@ -186,4 +195,4 @@ def merge_summaries(summaries: dict[str, Summary]) -> Summary:
     return merged
 
 
-STAGE = Stage("traffic", __name__, dependencies, run, reads_traffic=True)
+STAGE = Stage("traffic", __name__, dependencies, run, reads_traffic=True, prepare=(prepare,))

@@ -80,6 +80,8 @@ _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#
 _SHAPES = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "p", "h")
 _LEAST_TOP_POINTS = 0.5
 """Upper end of the axis of losses if all losses are small, in percentage points."""
+_LABELLED_SHARE = 0.08
+"""Settings off the front have a label if their loss is at least this share of the axis."""
 
 
 def write_figure(settings: Sequence[SettingResult], tolerance: Tolerance, title: str, path: Path) -> None:
@@ -197,12 +199,14 @@ def _coordinates(settings: Sequence[SettingResult]) -> tuple[list[float], list[f
 def _label_settings(axes: Any, settings: Sequence[SettingResult]) -> None:
     """Label the recommended setting, then the front, then others where there is room."""
     labels = LabelPlacement(axes, np.column_stack(_coordinates(settings)))
+    least = _LABELLED_SHARE * axes.get_ylim()[1]
 
     def order(setting: SettingResult) -> tuple[bool, bool, float]:
         return not setting.recommended, not setting.front, -setting.loss_points
 
     for setting in sorted(settings, key=order):
         if setting.recommended:
-            labels.add(f"recommended: {setting.setting}", setting.seconds, setting.loss_points, 8.5)
-        elif setting.kind != SCENARIO and (setting.front or setting.loss_points > 0.0):
+            name = "the scenario's own setting" if setting.kind == SCENARIO else setting.setting
+            labels.add(f"recommended: {name}", setting.seconds, setting.loss_points, 8.5)
+        elif setting.kind != SCENARIO and (setting.front or setting.loss_points > least):
             labels.add(setting.setting, setting.seconds, setting.loss_points)

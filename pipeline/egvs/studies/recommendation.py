@@ -87,7 +87,8 @@ def mark_rows(rows: Sequence[SettingResult], tolerance: Tolerance) -> list[Setti
     candidates = [row for row in rows if row.approximates]
     admitted = [row for row in candidates if tolerance.admits(row)]
     if admitted:
-        best = min(admitted, key=lambda row: (row.seconds, row.setting))
+        # of equally cheap settings the scenario's own, or else the one that loses least
+        best = min(admitted, key=lambda row: (row.seconds, row.kind != SCENARIO, tolerance.excess(row), row.setting))
     else:
         best = min(candidates, key=lambda row: (tolerance.excess(row), row.seconds, row.setting))
     marked = []
