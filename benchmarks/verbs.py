@@ -99,14 +99,14 @@ VERBS = (
     Verb("store"),
 )
 
-PREPARATION = (
-    "run short --out run",
-    "run short --out other --set score.gamma=5",
-    "city new city --osm small.osm --junctions all",
-    "city place city --out city_run --count 2 --cluster processes=1",
-    "city place city --out city_other --count 2 --cluster processes=1 --set score.gamma=5",
-)
-"""Commands that make what the others need."""
+PREPARATION = {
+    "run": "run short --out run",
+    "other": "run short --out other --set score.gamma=5",
+    "city": "city new city --osm small.osm --junctions all",
+    "city_run": "city place city --out city_run --count 2 --cluster processes=1",
+    "city_other": "city place city --out city_other --count 2 --cluster processes=1 --set score.gamma=5",
+}
+"""Folders that commands read, and the commands that make them, in order."""
 
 
 class MissingLibraryError(Exception):
@@ -119,15 +119,18 @@ class CommandError(Exception):
 
 @dataclass(frozen=True)
 class Caches:
-    """Where a command finds compiled kernels and results of earlier runs."""
+    """Where a command finds results of earlier runs, and compiled kernels; by default, those of the package."""
 
-    kernels: Path
     store: Path
+    kernels: Path | None = None
 
     def environment(self) -> dict[str, str]:
         """Return the environment variables of the command; bytecode is written, as after installing."""
         variables = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
-        return {**variables, "NUMBA_CACHE_DIR": str(self.kernels), "EGVS_STORE": str(self.store)}
+        variables["EGVS_STORE"] = str(self.store)
+        if self.kernels is not None:
+            variables["NUMBA_CACHE_DIR"] = str(self.kernels)
+        return variables
 
 
 def processor_s(verb: Verb, folder: Path, caches: Caches) -> float:
@@ -161,15 +164,19 @@ def processor_s(verb: Verb, folder: Path, caches: Caches) -> float:
     return usage.ru_utime + usage.ru_stime
 
 
-def prepare(folder: Path, caches: Caches) -> None:
-    """Make a folder with everything that the commands need."""
+def prepare(folder: Path, store: Path, verbs: Iterable[Verb]) -> None:
+    """Make a folder with everything that some commands need."""
     folder.mkdir()
     shutil.copytree(SCENARIO, folder / SCENARIO.name)
     shutil.copy(EXTRACT, folder)
     (folder / "short").mkdir()
     (folder / "short" / "scenario.toml").write_text(SHORT, encoding="utf-8")
-    for words in PREPARATION:
-        processor_s(Verb(words), folder, caches)
+    needed = {word for verb in verbs for word in verb.words.split()}
+    if needed & {"city_run", "city_other"}:
+        needed.add("city")
+    for name, words in PREPARATION.items():
+        if name in needed:
+            processor_s(Verb(words), folder, Caches(store))
 
 
 @dataclass(frozen=True)
@@ -190,7 +197,7 @@ class Row:
 def measure(verb: Verb, prepared: Path, work: Path) -> Row:
     """Measure a command in copies of the prepared folder."""
     work.mkdir()
-    caches = [Caches(work / "kernels", work / f"store{number}") for number in range(1 + REPEATS)]
+    caches = [Caches(work / f"store{number}", work / "kernels") for number in range(1 + REPEATS)]
     cold_s = processor_s(verb, _copy(prepared, work / "cold"), caches[0])
 
     warm_s: list[float] = []
@@ -246,14 +253,13 @@ def main(arguments: list[str] | None = None) -> None:
     if unknown:
         parser.error(f"expected names of commands ({', '.join(known)}), got {', '.join(sorted(unknown))}")
 
+    measured = [verb for verb in VERBS if not chosen.verbs or verb.name in chosen.verbs]
     rows = []
     left_out = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        prepare(folder / "prepared", Caches(folder / "kernels", folder / "store"))
-        for number, verb in enumerate(VERBS):
-            if chosen.verbs and verb.name not in chosen.verbs:
-                continue
+        prepare(folder / "prepared", folder / "store", measured)
+        for number, verb in enumerate(measured):
             try:
                 rows.append(measure(verb, folder / "prepared", folder / str(number)))
             except MissingLibraryError:
