@@ -277,7 +277,6 @@ def _template_environment() -> Environment:
         "style": Markup(STYLE_SHEET),
         "choose": Markup((TEMPLATES / "choose.js").read_text(encoding="utf-8")),
         "version": __version__,
-        "listed": LISTED,
         "separable": DISTINCT_PROBABILITY,
         "min_vehicles": MIN_VEHICLES,
     }
@@ -289,6 +288,7 @@ def _ranking_values(ranking: Ranking) -> dict[str, Any]:
     if ranking.by.name == "egvs":
         limit_share = share_of_limit(ranking.sites[0])
     return {
+        "listed": LISTED,
         "listing": SiteListing.from_ranking(ranking),
         "by": ranking.by,
         "companion": ranking.companion_score,
