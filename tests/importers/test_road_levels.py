@@ -105,7 +105,7 @@ def test_flyover_is_no_traffic_but_a_deck(tmp_path: Path) -> None:
     assert inside == {"1001", "1002"}
     note = "roads on another level are left out of the traffic in the region of interest: High Road (bridge)"
     assert note in made.notes
-    assert "1 of 1 bridge decks have no height: 5 m assumed" in made.notes
+    assert "no height is given for 1 of 1 bridge decks: 5 m assumed" in made.notes
 
     (deck,) = decks_of(tmp_path / "flyover")
     assert {key: deck["properties"][key] for key in ("height_m", "base_m", "radius_m")} == {

@@ -312,7 +312,8 @@ def print_sensors(sensors: Iterable[Sensor]) -> None:
             "range: no beam is longer. rated: how far the maker's sensor still detects a target of this reflectivity; "
             f"the last column converts it to {DARK_REFLECTIVITY:.0%} (dark vehicles), so that sensors can be compared. "
             "Scores use it only with --set effects.range_limit={}.",
-            "The catalogue has no prices: set yours with --set 'costs.sensor={\"NAME\" = PRICE}' or in [costs].",
+            "The catalogue has no prices, and does not say which sensors are still sold. Set prices with "
+            "--set 'costs.sensor={\"NAME\" = PRICE}' or in [costs].",
             "egvs sensors NAME prints sources and assumptions; egvs compare SCENARIO --sensors NAME,NAME compares.",
         )
     )

@@ -425,7 +425,7 @@ def _level_notes(others: OtherLevels, counts: ImportCounts) -> list[str]:
     heights = counts.heights.get("bridge", Counter())
     if heights["default"]:
         shares = f"{heights['default']} of {heights.total()}"
-        notes.append(f"{shares} bridge decks have no height: {osm_solids.DECK_BASE_M:g} m assumed")
+        notes.append(f"no height is given for {shares} bridge decks: {osm_solids.DECK_BASE_M:g} m assumed")
     return notes
 
 
