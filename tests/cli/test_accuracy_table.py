@@ -36,14 +36,14 @@ def test_names_the_cheapest_setting_its_quality_and_the_reason() -> None:
         "should find 80.1% of the vehicles.",
         "Recommended: 500 frames, 2.0 processor seconds instead of 8.0. The pole that it chooses is the best one with "
         "a probability of 80%, and is expected to lose 0.80 ± 0.20 percentage points of the vehicles found.",
-        "It is the cheapest of 2 settings (of 2) whose expected loss is within the tolerance of 1 percentage points.",
+        "2 of 2 settings have an expected loss within the tolerance of 1 percentage point; this is the cheapest.",
     ]
 
 
 def test_recommends_the_scenario_as_it_is() -> None:
     text = recommendation_sentences(study_of(OWN, SHORT, tolerance=Tolerance(0.5)))
     assert text[1].startswith("Recommended: the scenario's own setting, 8.0 processor seconds. The pole")
-    assert "cheapest of 1 settings (of 2)" in text[2]
+    assert "1 of 2 settings have an" in text[2]
 
 
 def test_without_a_setting_within_the_tolerance_says_what_it_needs() -> None:
@@ -69,7 +69,7 @@ def test_says_that_a_score_prefers_other_sites_however_long_the_traffic() -> Non
 def test_tolerance_of_the_score_counts_its_error() -> None:
     text = recommendation_sentences(study_of(OWN, SHORT, tolerance=Tolerance(1.0, 0.05)))
     assert text[1].startswith("Recommended: the scenario's own setting")
-    assert text[2].endswith("whose error of the score is within the tolerance of 5.00% of the score.")
+    assert text[2].startswith("1 of 2 settings have an error of the score within the tolerance of 5.00% of the score")
 
 
 def test_says_where_a_model_prices_the_setting() -> None:

@@ -148,7 +148,7 @@ def test_entry_of_a_ring_larger_than_the_region_has_a_note(tmp_path: Path) -> No
     summary = openstreetmap.create_scenario(tmp_path / "out", path, at=degrees((80.0, 0.0)))
     assert summary.junction.ring is None
     (note,) = (note for note in summary.notes if "roundabout" in note)
-    assert note.startswith("the junction is one entry of a roundabout of 16") and "(120 m)" in note
+    assert note.startswith("the junction is one entry of a roundabout 16") and "(120 m)" in note
 
 
 @pytest.mark.slow
@@ -177,3 +177,20 @@ def test_real_roundabout_is_one_junction(tmp_path: Path) -> None:
     poles = [Point(float(row["x_m"]), float(row["y_m"])) for row in sites_of(tmp_path / "out")]
     around = LineString([*poles, poles[0]]).convex_hull
     assert around.buffer(-5.0).covers(Point(summary.junction.at_m))
+
+
+def test_neighbouring_two_way_arms_without_names_are_different_streets(tmp_path: Path) -> None:
+    nodes: dict[int, XY] = {}
+    for number, angle_deg in enumerate(range(0, 360, 20)):
+        angle = math.radians(angle_deg)
+        nodes[10 + number] = 20.0 * math.cos(angle), 20.0 * math.sin(angle)
+    ends = {1: 10, 2: 12, 3: 19}  # in the east, 40 degrees north of it, and in the west
+    for end, on_ring in ends.items():
+        nodes[end] = 20.0 * nodes[on_ring][0], 20.0 * nodes[on_ring][1]
+    ring = MapWay((*range(10, 28), 10), {"highway": "tertiary", "junction": "roundabout"})
+    arms = [MapWay((end, on_ring), {"highway": "tertiary"}) for end, on_ring in ends.items()]
+    streets = read(write_map(tmp_path / "ring.osm", nodes, [ring, *arms]))
+    (junction,) = (junction for junction in streets.junctions if junction.is_crossing)
+    flows = junctions.assumed_flows(streets, junctions.region_around(junction), junction.ring)
+    assert junction.arms == 3
+    assert len(flows) == 6

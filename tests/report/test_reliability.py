@@ -27,15 +27,15 @@ def test_nothing_is_said_of_a_level_site_between_the_limits() -> None:
 @pytest.mark.parametrize(
     ("mounts", "limits"),
     [
-        ([(3, 0), (4, 0)], "the lowest height tried (z 3 m): another one"),
-        ([(4, 0), (3, 0)], "the greatest height tried (z 4 m): another one"),
-        ([(3, -10), (3, 0)], "the steepest tilt tried (-10 degrees): another one"),
-        ([(3, -10), (4, 0)], "the lowest height tried (z 3 m) and the steepest tilt tried (-10 degrees): others"),
+        ([(3, 0), (4, 0)], "the lowest height tried (z 3 m)"),
+        ([(4, 0), (3, 0)], "the greatest height tried (z 4 m)"),
+        ([(3, -10), (3, 0)], "the steepest tilt tried (-10 degrees)"),
+        ([(3, -10), (4, 0)], "the lowest height tried (z 3 m) and the steepest tilt tried (-10 degrees)"),
     ],
 )
 def test_names_the_limits_that_the_best_mount_of_a_pole_reaches(mounts: list[tuple[float, float]], limits: str) -> None:
     sites = [("a", z_m, pitch_deg, 9.0 - rank) for rank, (z_m, pitch_deg) in enumerate(mounts)]
-    assert describe_reliability(ranked(*sites))[-1] == f"The best site has {limits} may be better."
+    assert describe_reliability(ranked(*sites))[-1] == f"The best site has {limits}: a mount beyond it may be better."
 
 
 def test_one_mount_on_each_pole_has_no_limits() -> None:
@@ -46,13 +46,14 @@ def test_one_mount_on_each_pole_has_no_limits() -> None:
 def test_says_that_tilted_sensors_were_not_validated(pitch_deg: float, is_tilted: bool) -> None:
     sentences = describe_reliability(ranked(("a", 3, pitch_deg, 9.0), ("b", 3, 0, 5.0)))
     assert sentences == is_tilted * [
-        f"Tilted sensors, such as a@3m{pitch_deg:+g}deg, were not part of the validation (docs/validity.md)."
+        f"The sensor of a@3m{pitch_deg:+g}deg is tilted; tilted sensors were not part of the validation "
+        "(docs/validity.md)."
     ]
 
 
-def test_level_of_expected_detections_was_validated_less_than_its_order() -> None:
+def test_size_of_expected_detections_was_validated_less_than_its_order() -> None:
     (sentence,) = describe_reliability(ranked(("a", 3, 0, 0.9), ("b", 3, 0, 0.5), rank_by="expected_detections"))
-    assert "their level less" in sentence
+    assert "the size of the score less" in sentence and "±" not in sentence
 
 
 def test_sites_that_see_nothing_or_score_the_same_need_no_further_words() -> None:

@@ -331,3 +331,15 @@ def test_record_has_every_file_that_a_run_without_changes_opens(place: Path, wor
     }
     assert any(name.name == "scenario.toml" for name in inputs)
     assert inputs - probes_of_tempfile - of_the_run <= known
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
+def test_run_folder_with_a_pipe_is_not_recorded(place: Path) -> None:
+    os.mkfifo(place / "mini" / "pipe")
+    assert not save_observed(place / "mini", lambda: None)
+
+
+def test_broken_link_in_the_program_is_no_error(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (place / BASE / ".#module.py").symlink_to("nowhere")
+    monkeypatch.setattr(unchanged, "_PACKAGE", place / BASE)
+    assert unchanged.RunMemory(["run"], place / "mini").recall() is None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from egvs.cli.console import NARROW, WIDE, Column, console, make_table, print_sentences
-from egvs.report.formatting import SCORE_LABELS
+from egvs.report.formatting import SCORE_LABELS, format_probability
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.studies.study_settings import MEASURES, SCENARIO
 
@@ -39,13 +39,10 @@ def print_study(study: AccuracyStudy, command: str) -> None:
     if measures:
         title = "settings that measure something else, judged by the scenario's own setting"
         out.print(_settings_table(title, measures, study.scenario, out.width))
-    out.print(
-        "* no cheaper setting loses less, = recommended; seconds: processor seconds of all stages, ~ from those of"
-    )
-    out.print("the scenario by the number of frames; right pole: probability that the chosen pole is the best one;")
-    out.print(
-        "loss: expected, percentage points of vehicles found, ' by a model because independent traffic is too short"
-    )
+    out.print(f"* no cheaper setting has a smaller {_counted(study)}, = recommended")
+    out.print("seconds: processor seconds of all stages, ~ from those of the scenario by the number of frames;")
+    out.print("right pole: probability that the chosen pole is the best one; loss: expected, percentage points of")
+    out.print("vehicles found, ' by a model because independent traffic is too short")
     for reason in dict.fromkeys(study.skipped.values()):
         names = [name for name, skip_reason in study.skipped.items() if skip_reason == reason]
         out.print(f"skipped, {reason}: {'; '.join(names)}")
@@ -82,8 +79,8 @@ def _settings_table(title: str, rows: Sequence[SettingResult], scenario: Setting
 
 def _format_probability(row: SettingResult) -> str:
     if math.isnan(row.probability_se):
-        return f"{row.probability:.0%}"
-    return f"{row.probability:.0%} ±{row.probability_se:.0%}"
+        return format_probability(row.probability)
+    return f"{format_probability(row.probability)} ±{row.probability_se:.0%}"
 
 
 def _format_loss(row: SettingResult) -> str:
@@ -104,11 +101,11 @@ def recommendation_sentences(study: AccuracyStudy) -> list[str]:
     best_pole = study.best_pole
     sentences = [
         f"With all traffic of this study ({_describe_units(study)}), {best_pole.name} is the best pole with a "
-        f"probability of {best_pole.probability:.0%}; {best_pole.mount} there should find {best_pole.found:.1%} of the "
-        "vehicles."
+        f"probability of {format_probability(best_pole.probability)}; {best_pole.mount} there should find "
+        f"{best_pole.found:.1%} of the vehicles."
     ]
     best = study.recommended
-    name = "the scenario's own setting" if best.kind == SCENARIO else best.setting
+    name = best.label
     if study.is_within:
         sentences.append(f"Recommended: {name}, {_describe_cost(study)}. {_describe_quality(best)}")
         sentences.append(_reason_within(study))
@@ -135,11 +132,11 @@ def _describe_cost(study: AccuracyStudy) -> str:
 
 
 def _describe_quality(row: SettingResult) -> str:
-    """Return what the choices of a setting are worth."""
+    """Return the probability and the expected loss of the choices of a setting."""
     loss = f"{row.loss_points:.2f} ± {row.loss_se_points:.2f}"
     text = (
-        f"The pole that it chooses is the best one with a probability of {row.probability:.0%}, and is expected to "
-        f"lose {loss} percentage points of the vehicles found"
+        f"The pole that it chooses is the best one with a probability of {format_probability(row.probability)}, and is "
+        f"expected to lose {loss} percentage points of the vehicles found"
     )
     if not row.draws:
         text += " (by a model, because the study has too little independent traffic for a test)"
@@ -149,7 +146,8 @@ def _describe_quality(row: SettingResult) -> str:
 def _describe_tolerance(study: AccuracyStudy) -> str:
     if study.tolerance.score is not None:
         return f"{study.tolerance.score:.2%} of the score"
-    return f"{study.tolerance.loss_points:g} percentage points"
+    points = study.tolerance.loss_points
+    return f"{points:g} percentage point{'' if points == 1 else 's'}"
 
 
 def _reason_within(study: AccuracyStudy) -> str:
@@ -157,8 +155,8 @@ def _reason_within(study: AccuracyStudy) -> str:
     candidates = [row for row in study.rows if row.approximates]
     within = [row for row in candidates if study.tolerance.admits(row)]
     return (
-        f"It is the cheapest of {len(within)} settings (of {len(candidates)}) whose {_counted(study)} is within the "
-        f"tolerance of {_describe_tolerance(study)}."
+        f"{len(within)} of {len(candidates)} settings have an {_counted(study)} within the tolerance of "
+        f"{_describe_tolerance(study)}; this is the cheapest."
     )
 
 

@@ -326,9 +326,7 @@ def accuracy(
     budget: Annotated[str, typer.Option(metavar="TIME", help="Time limit of the study, e.g. 60s or 10m.")] = "2m",
     seeds: Annotated[
         int | None,
-        typer.Option(
-            min=1, help="Number of seeds of the scenario (at least 4), whatever the budget; by default 4 to 8."
-        ),
+        typer.Option(help="Number of seeds of the scenario (at least 4), whatever the budget; by default 4 to 8."),
     ] = None,
 ) -> None:
     """Price the choice of a pole: seconds and expected loss of many settings, and the cheapest one that suffices."""
@@ -560,8 +558,8 @@ def new(
         str | None,
         typer.Option(
             metavar="LAT,LON",
-            help="Use the junction at this point, or else the nearest one (one with signals within 40 m is preferred;"
-            " at most 100 m away), instead of the largest one with signals.",
+            help="Use the junction at this point; if there is none, the nearest one with signals within 40 m, or else "
+            "the nearest one within 100 m. Default: the largest junction with signals.",
         ),
     ] = None,
     lefthand: Annotated[bool, typer.Option("--lefthand", help="Traffic drives on the left.")] = False,

@@ -299,7 +299,7 @@ class ProgressDisplay:
             self._bar.tasks[0].total = None
 
     def setting_event(self, name: str, state: str, details: dict[str, Any]) -> None:
-        """Print one line for a setting of a study that is "done", "kept" or "skipped".
+        """Print one line for a setting of a study that is "done" or "skipped".
 
         Settings that the budget leaves out are listed at the end of the study instead.
         """
@@ -308,8 +308,7 @@ class ProgressDisplay:
         duration = state
         if "seconds" in details:
             duration = f"{details['seconds']:.2f} s"
-        note = " (cached)" if state == "kept" else ""
-        self.say(f"{duration:>10}   {name}{note} {details.get('why', '')}".rstrip())
+        self.say(f"{duration:>10}   {name} {details.get('why', '')}".rstrip())
 
     def say(self, line: str) -> None:
         """Print a line above the bar."""

@@ -53,7 +53,10 @@ def print_or_run(words: Sequence[str], out: Path | None, run: Callable[[], Finis
     digests: dict[str, str] = {}
     for stage in finished.record.stages.values():
         digests |= stage.artefacts | stage.companions
-    memory.save(finished.folder, digests, Output(stdout.getvalue(), finished.stderr))
+    from egvs.artefacts.run_record import RunRecord
+
+    if RunRecord.read(finished.folder) == finished.record:  # else another run has been there since
+        memory.save(finished.folder, digests, Output(stdout.getvalue(), finished.stderr))
 
 
 def _terminal_properties() -> list[str]:

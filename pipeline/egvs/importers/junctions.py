@@ -291,12 +291,13 @@ def read_streets(path: Path) -> Streets:
     nodes = [node for node in network.junctions if node.incoming_lanes and node.type not in ("internal", "dead_end")]
     junctions = [_make_junction(node, roads_at_node.get(node.id, []), lanes_for_vehicles) for node in nodes]
 
+    by_node = {junction.id: junction for junction in junctions}
     large_rings = []
     for ring in roundabouts.find_rings(network, areas):
         if ring.side_m > ROI_MAX_M:
             large_rings.append(ring)
             continue
-        on_ring = [junction for junction in junctions if junction.id in ring.nodes]
+        on_ring = [by_node[node] for node in ring.nodes if node in by_node]
         junctions = [junction for junction in junctions if junction.id not in ring.nodes]
         junctions.append(_make_roundabout(ring, on_ring, roads_at_node))
     return Streets(network, areas, tuple(junctions), tuple(large_rings))
@@ -687,6 +688,8 @@ def _find_gates(streets: Streets, roi: JunctionRegion, ring: Ring | None) -> _Ga
             successors[source].append(target)
             entered.add(target)
 
+    two_way = {_ends(edge) for edge in edges}
+    one_way = {edge.id for edge in edges if (edge.to_node, edge.from_node) not in two_way}
     entries = [index for index in successors if index not in entered]
     exits = [index for index, following in successors.items() if not following]
     routes = RouteFinder(streets.network, _CAR)
@@ -696,7 +699,12 @@ def _find_gates(streets: Streets, roi: JunctionRegion, ring: Ring | None) -> _Ga
         for column, exit_index in enumerate(exits):
             if exit_index not in reachable or edges[exit_index].to_node == edges[entry].from_node:
                 continue
-            if ring is not None and roundabouts.is_same_street(ring, edges[entry], edges[exit_index]):
+            are_carriageways = edges[entry].id in one_way and edges[exit_index].id in one_way
+            if (
+                ring is not None
+                and are_carriageways
+                and roundabouts.is_same_street(ring, edges[entry], edges[exit_index])
+            ):
                 continue
             to_edge = None if exit_index == entry else edges[exit_index].id
             location = routes.locate(edges[entry].id, to_edge, "assumed flows")
@@ -726,11 +734,8 @@ def _with_merging(roads: Sequence[int], links: Sequence[tuple[int, int]]) -> lis
     inner_links = [(source, target) for source, target in links if source in inside and target in inside]
     merged = {target for _, target in inner_links}
     diverging = {source for source, _ in inner_links}
-    for source, target in links:
-        if target in merged and source not in roads:
-            inside.add(source)
-        if source in diverging and target not in roads:
-            inside.add(target)
+    inside |= {source for source, target in links if target in merged}
+    inside |= {target for source, target in links if source in diverging}
     return sorted(inside)
 
 

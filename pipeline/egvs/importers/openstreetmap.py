@@ -259,20 +259,20 @@ def create_scenario(
 
     flags = osm_network.netconvert_flags(extract, lefthand=lefthand, walk=walk)
     network, streets = osm_network.build_network(extract, osm, flags)
-    junction = _junction_at(streets, at) if at else _existing(junctions.largest_junction(streets), osm)
+    junction = _junction_at(streets, at) if at else _require_junction(junctions.largest_junction(streets), osm)
     others = _other_levels(extract, streets, junction)
     if others.roads:
         location = streets.to_degrees([junction.at_m])[0]
         extract = osm_network.cut_out_roads(extract, streets, others.roads, _level_window(junction))
         network, streets = osm_network.build_network(extract, osm, flags)
         at_m = streets.to_xy(*zip(location, strict=True))[0]
-        junction = _existing(junctions.find_again(streets, junction, at_m), osm)
+        junction = _require_junction(junctions.find_again(streets, junction, at_m), osm)
     window = reachable_area(junctions.region_around(junction))
     solids, counts = osm_solids.map_solids(extract, streets, others.decks, window)
 
     if surroundings_m is not None:
         network, streets = osm_network.crop_network(extract, osm, flags, streets, junction, surroundings_m)
-        junction = _existing(junctions.find_again(streets, junction, junction.at_m), osm)
+        junction = _require_junction(junctions.find_again(streets, junction, junction.at_m), osm)
     roi = junctions.region_around(junction)
     poles = junctions.kerbside_poles(streets, junction, roi, [solid.area for solid in solids], pole_spacing_m)
     if not poles:
@@ -288,7 +288,7 @@ def create_scenario(
     for ring in streets.large_rings:
         if junction.id in ring.nodes:
             notes.append(
-                f"the junction is one entry of a roundabout of {ring.side_m:.0f} m, which is larger than the largest"
+                f"the junction is one entry of a roundabout {ring.side_m:.0f} m wide, which is larger than the largest"
                 f" region of interest ({junctions.ROI_MAX_M:g} m): the rest of the ring is not part of the ranking"
             )
     notes += scenario_notes(roi.area.covers(junction.area), counts) + _level_notes(others, counts)
@@ -401,7 +401,7 @@ def _junction_at(streets: Streets, at: tuple[float, float]) -> StreetJunction:
     raise InputError("--at", problem, f"The nearest are: {'; '.join(titles)}.")
 
 
-def _existing(junction: StreetJunction | None, osm: Path) -> StreetJunction:
+def _require_junction(junction: StreetJunction | None, osm: Path) -> StreetJunction:
     if junction is None:
         raise InputError(osm, "the streets of the extract have no junction", "Choose an extract with a junction.")
     return junction

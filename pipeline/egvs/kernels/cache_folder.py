@@ -102,5 +102,6 @@ def write_checked(path: Path, content: bytes) -> None:
                 file.write(hashlib.sha256(content).digest() + content)
                 file.close()
                 Path(file.name).replace(path)
-            except OSError:
+            except BaseException:
                 Path(file.name).unlink(missing_ok=True)
+                raise

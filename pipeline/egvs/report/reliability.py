@@ -11,17 +11,18 @@ from egvs.scenario.score_config import DEFAULT_SCORE
 MIN_TILT_DEG = 5.0
 """A sensor is called tilted from this pitch or roll on. The sensors of the validation study were level."""
 
-_LEVEL_NOTE = (
-    "± is the error of a finite simulation only. The order of sites was validated, their level less: in the studies, "
-    "detectors found up to 27 percentage points fewer vehicles than expected (docs/validity.md)."
+_ERROR_NOTE = "± is the error of a finite simulation only. "
+_SIZE_NOTE = (
+    "The order of sites by this score was validated, the size of the score less: in the studies, detectors found up to "
+    "27 percentage points fewer vehicles than expected (docs/validity.md)."
 )
-_TILT_NOTE = "Tilted sensors, such as {}, were not part of the validation (docs/validity.md)."
+_TILT_NOTE = "The sensor of {} is tilted; tilted sensors were not part of the validation (docs/validity.md)."
 
 
 def describe_reliability(ranking: Ranking) -> list[str]:
     """Return the reasons to be careful with a ranking, in sentences.
 
-    - By ``expected_detections``: what the standard errors leave out, and how far the level of the score was validated.
+    - By ``expected_detections``: what the standard errors leave out, and how far the size of the score was validated.
     - The best site is tilted.
     - The best site is the lowest, the highest or the most tilted of those on its pole, so that others may be better.
 
@@ -35,13 +36,12 @@ def describe_reliability(ranking: Ranking) -> list[str]:
         return []
     sentences = []
     if ranking.by.name == DEFAULT_SCORE:
-        sentences.append(_LEVEL_NOTE)
+        sentences.append((_ERROR_NOTE if ranking.has_errors else "") + _SIZE_NOTE)
     if max(abs(best.pitch_deg), abs(best.roll_deg)) >= MIN_TILT_DEG:
         sentences.append(_TILT_NOTE.format(best.site))
     limits = list(_limits(best, [site for site in ranking.sites if site.pole == best.pole]))
     if limits:
-        others = "another one" if len(limits) == 1 else "others"
-        sentences.append(f"The best site has {join_names(limits)}: {others} may be better.")
+        sentences.append(f"The best site has {join_names(limits)}: a mount beyond it may be better.")
     return sentences
 
 

@@ -1,4 +1,4 @@
-"""What a run printed, to be printed again as long as nothing that it depends on has changed.
+"""Recall the output of a complete run as long as nothing that the run depends on has changed.
 
 Computing the keys of the stages takes most of the time of a run in which nothing has changed: it imports the stages,
 reads the sites, the solids and the network, and hashes the source of the program. So a run writes down
@@ -159,27 +159,30 @@ class RunMemory:
         observed = self._observed
         if self._state is None or observed is None or not observed.is_complete:
             return
-        entries = _list_folder(folder)
-        home = os.path.realpath(folder)
-        if entries is None or any(not _is_within(name, home) for name in observed.changed):
-            return
+        # without a record, the next run only takes longer
+        with suppress(InputError, OSError, UnicodeError), locks.locked(RunFolder(folder).lock, wait=False) as is_locked:
+            if not is_locked:  # another run has begun
+                return
+            entries = _list_folder(folder)
+            home = os.path.realpath(folder)
+            if entries is None or any(not _is_within(name, home) for name in observed.changed):
+                return
 
-        states = {name: state for name, state in observed.states.items() if not _is_within(name, home)}
-        with files.use_digests(DigestCache(RunFolder(folder)).digest):
-            for name, kind in entries.items():
-                if kind == _FILE:
-                    path = (folder / name).absolute()
-                    states[str(path)] = digests.get(name) or observed.digest(path) or files.hash_file(path)
-        record = {
-            "state": self._state,
-            "folder": home,
-            "entries": entries,
-            "files": states,
-            "links": {name: real for name in states if (real := os.path.realpath(name)) != name},
-            "stdout": output.stdout,
-            "stderr": output.stderr,
-        }
-        with suppress(OSError, UnicodeError):  # without a record, the next run takes longer, nothing else
+            states = {name: state for name, state in observed.states.items() if not _is_within(name, home)}
+            with files.use_digests(DigestCache(RunFolder(folder)).digest):
+                for name, kind in entries.items():
+                    if kind == _FILE:
+                        path = (folder / name).absolute()
+                        states[str(path)] = digests.get(name) or observed.digest(path) or files.hash_file(path)
+            record = {
+                "state": self._state,
+                "folder": home,
+                "entries": entries,
+                "files": states,
+                "links": {name: real for name in states if (real := os.path.realpath(name)) != name},
+                "stdout": output.stdout,
+                "stderr": output.stderr,
+            }
             text = files.to_json_text(files.add_checksum(record)) + "\n"
             for other in folder.glob(UNCHANGED_PATTERN):
                 other.unlink()
@@ -279,17 +282,21 @@ def _hash_program() -> str | None:
     Returns
     -------
     str, or None
-        None where a file was written so shortly before that a further change might leave its stamp as it is.
+        None where a file cannot be read, or was written so shortly before that a further change might leave its stamp
+        as it is.
     """
     digest = hashlib.sha256()
     newest_ns = 0
-    for path in (*_package_files(str(_PACKAGE)), *_package_files(str(data_folder(SCHEMAS)))):
-        stamp = file_stamp(path)
-        if stamp is None:
-            digest.update(f"{path} {hashlib.sha256(Path(path).read_bytes()).hexdigest()}\n".encode())
-        else:
-            newest_ns = max(newest_ns, stamp[1])
-            digest.update(f"{path} {stamp}\n".encode())
+    try:
+        for path in (*_package_files(str(_PACKAGE)), *_package_files(str(data_folder(SCHEMAS)))):
+            stamp = file_stamp(path)
+            if stamp is None:
+                digest.update(f"{path} {hashlib.sha256(Path(path).read_bytes()).hexdigest()}\n".encode())
+            else:
+                newest_ns = max(newest_ns, stamp[1])
+                digest.update(f"{path} {stamp}\n".encode())
+    except OSError:  # a file is being edited, or a link leads nowhere
+        return None
     if newest_ns + RACY_NS > time.time_ns():
         return None
     return digest.hexdigest()

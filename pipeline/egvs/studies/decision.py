@@ -23,8 +23,9 @@ poles, and it includes that the study itself may not know the best pole.
 *Model.* A draw needs units that judge it, and a handful of draws that all choose the same pole do not prove that the
 next one would. So choices are also sampled: with judge e, the scores of traffic of length L (in units) are the means
 over the other units plus normal noise with their covariance divided by L. The model alone prices traffic of more than
-half of the units (:func:`assess_by_model`); otherwise it counts as one further draw, which matters among few draws. Its
-probability is of the poles given the units that it samples around, so it is too high among nearly equal poles.
+(k - 2) / 2 of the k units (:func:`assess_by_model`); otherwise it counts as one further draw, which matters among few
+draws. Its probability is of the poles given the units that it samples around, so it is too high among nearly equal
+poles.
 
 Probability and loss are means over draws. The squared standard error of the loss is the variance of its mean over the
 judging units, plus that over the units that draw; that of the probability the latter. Mounts with equal scores share a

@@ -117,7 +117,7 @@ def draw_figure(settings: Sequence[SettingResult], tolerance: Tolerance, title: 
     _scale_axes(axes, settings, tolerance)
     if tolerance.score is None:
         _draw_tolerance(axes, tolerance)
-    _draw_front(axes, settings)
+        _draw_front(axes, settings)
     _draw_settings(axes, settings)
     # below the panel, because a setting may be in any corner inside
     below: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.11), "ncols": 5}
@@ -206,7 +206,7 @@ def _label_settings(axes: Any, settings: Sequence[SettingResult]) -> None:
 
     for setting in sorted(settings, key=order):
         if setting.recommended:
-            name = "the scenario's own setting" if setting.kind == SCENARIO else setting.setting
+            name = setting.label
             labels.add(f"recommended: {name}", setting.seconds, setting.loss_points, 8.5)
         elif setting.kind != SCENARIO and (setting.front or setting.loss_points > least):
             labels.add(setting.setting, setting.seconds, setting.loss_points)

@@ -178,13 +178,15 @@ class Pricing:
         if priced.setting.knob == "score":
             base = self._unit_scores(priced.score)
         compared = drawn or [Draw((unit,), row) for unit, row in enumerate(scores)]
+        # scores of thinned beams; a finite gamma is divided by the weight already
+        weight = priced.setting.weight if math.isinf(self._runs.scenario.gamma) else 1.0
         errors, taus = [], []
         for draw in compared:
             if priced.setting.kind == MEASURES:
                 expected = base[list(draw.units)].mean(axis=0)
             else:
                 expected = np.delete(base, list(draw.units), axis=0).mean(axis=0)
-            errors.append(relative_errors(draw.scores, expected).max(initial=0.0))
+            errors.append(relative_errors(weight * draw.scores, expected).max(initial=0.0))
             taus.append(rank_agreement(draw.scores, expected, "tau"))
         error = float(np.sqrt(np.mean(np.square(errors))))
         if not drawn and priced.setting.kind != MEASURES:

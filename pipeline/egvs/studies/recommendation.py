@@ -1,8 +1,8 @@
 """Rows of an accuracy study, and the setting that it recommends.
 
 The cheapest setting that approximates the scenario's scores and whose expected loss is within the tolerance is
-recommended. If there is none, it is the setting with the smallest expected loss. With a tolerance of the score, its
-error counts instead of the loss.
+recommended; if no setting is within the tolerance, the one with the smallest expected loss. With a tolerance of the
+score, its error counts instead of the loss.
 """
 
 from __future__ import annotations
@@ -41,6 +41,11 @@ class SettingResult:
     best_share: float
     front: bool = False
     recommended: bool = False
+
+    @property
+    def label(self) -> str:
+        """Name in a sentence."""
+        return "the scenario's own setting" if self.kind == SCENARIO else self.setting
 
     @property
     def approximates(self) -> bool:

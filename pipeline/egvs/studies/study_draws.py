@@ -2,7 +2,8 @@
 
 A *unit* is independent traffic: a run with a seed of its own, or one of :data:`RECORDED_PARTS` parts of a recording.
 A *draw* is the traffic that a setting would have: a window of some blocks of a unit, a unit, or several consecutive
-units in a ring. A setting with more traffic than half of the units has no draws, and is priced by a model
+units in a ring. A setting whose traffic is longer than (k - 2) / 2 of the k units, or longer than one unit where the
+score is one over voxels, has no draws, and is priced by a model
 (:func:`egvs.studies.decision.assess_by_model`).
 """
 
