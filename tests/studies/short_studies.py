@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -64,12 +63,7 @@ def count_progress(calls: list[str]) -> Callable[[str, int, int], None]:
     return lambda what, _done, _total: calls.append(what)
 
 
-def override_values(row: SettingResult) -> list[str]:
-    """Return the values after each ``--set``."""
-    return shlex.split(row.overrides)[1::2]
-
-
-def shares(path: Path, sets: list[str], out: Path, weight: float = 1.0) -> np.ndarray:
+def shares(path: Path, sets: list[str], out: Path) -> np.ndarray:
     """Return scores as shares of their limit, from an ordinary run."""
     egvs.run(egvs.load(path, sets), out)
     table = egvs.read_scores(out / "scores.parquet")

@@ -30,6 +30,14 @@ from egvs.studies.recommendation import Tolerance
 from tests.studies.short_studies import FEW_VALUES, compared, count_progress, run_study
 
 
+@pytest.mark.slow
+def test_thinned_beams_are_reweighted_where_gamma_is_infinite(mini: Path, tmp_path: Path) -> None:
+    """Half of the beams have half of the hits; without the weight of 2, the error would be 0.5."""
+    study = run_study(mini, ["score.gamma=inf"], tmp_path / "out", budget_s=300)
+    (error,) = (row.error for row in study.rows if row.setting == "every 2nd azimuth")
+    assert error < 0.1
+
+
 def test_study_of_a_finished_file(mini: Path, tmp_path: Path) -> None:
     study = run_study(mini, [], tmp_path / "out", budget_s=300)
     names = [row.setting for row in study.rows]
