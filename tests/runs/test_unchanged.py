@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ import pytest
 
 import egvs.runs.run
 from egvs.artefacts.run_folder import UNCHANGED_PATTERN
+from egvs.artefacts.run_record import RunRecord
+from egvs.cli import repeat
 from egvs.core import files
 from egvs.runs import digest_cache, stage_keys, unchanged
 from tests.conftest import collection, write_mini
@@ -343,3 +346,12 @@ def test_broken_link_in_the_program_is_no_error(place: Path, monkeypatch: pytest
     (place / BASE / ".#module.py").symlink_to("nowhere")
     monkeypatch.setattr(unchanged, "_PACKAGE", place / BASE)
     assert unchanged.RunMemory(["run"], place / "mini").recall() is None
+
+
+def test_run_is_recorded_unless_another_one_followed_in_its_folder(place: Path, run_egvs: Callable) -> None:
+    """The other run may have the same artefacts, but another scenario."""
+    assert run_egvs(*RUN_MINI)[0] == 0
+    record = RunRecord.read(place / "out")
+    assert repeat._is_recorded(repeat.FinishedRun(place / "out", record, ""))
+    other = replace(record, overrides={"description": "other"})
+    assert not repeat._is_recorded(repeat.FinishedRun(place / "out", other, ""))

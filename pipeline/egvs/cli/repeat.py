@@ -53,10 +53,21 @@ def print_or_run(words: Sequence[str], out: Path | None, run: Callable[[], Finis
     digests: dict[str, str] = {}
     for stage in finished.record.stages.values():
         digests |= stage.artefacts | stage.companions
+    if _is_recorded(finished):  # else another run has been in the folder since
+        memory.save(finished.folder, digests, Output(stdout.getvalue(), finished.stderr))
+
+
+def _is_recorded(finished: FinishedRun) -> bool:
+    """Return whether the folder of a run still has its record."""
     from egvs.artefacts.run_record import RunRecord
 
-    if RunRecord.read(finished.folder) == finished.record:  # else another run has been there since
-        memory.save(finished.folder, digests, Output(stdout.getvalue(), finished.stderr))
+    present = RunRecord.read(finished.folder)
+    keys, present_keys = (
+        {name: (stage.inputs, stage.artefacts) for name, stage in record.stages.items()}
+        for record in (finished.record, present)
+    )
+    is_same_scenario = (present.scenario, present.overrides) == (finished.record.scenario, finished.record.overrides)
+    return is_same_scenario and present_keys == keys
 
 
 def _terminal_properties() -> list[str]:
