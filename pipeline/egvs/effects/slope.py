@@ -42,9 +42,6 @@ from egvs.traffic.vehicle_boxes import VehicleBoxes, VehicleSize, round_m, round
 from egvs.world import terrain
 from egvs.world.terrain import TerrainSurface
 
-MIN_RELIEF_M = 0.1
-"""A network whose heights differ by no more than this is flat."""
-
 _MAX_OFF_SURFACE_M = 1.0
 _UPRIGHT_KIND = "pedestrian"
 
@@ -65,11 +62,11 @@ class Slope(Traffic[SlopeParameters]):
         if not network.may_have_slopes(path):
             return False, "the network is flat"
         span_m, off_m = terrain.relief_m(network.read_net_xml(path))
-        if span_m > MIN_RELIEF_M:
+        if span_m > terrain.MIN_RELIEF_M:
             return True, f"the network has {span_m:.1f} m of relief"
-        if abs(off_m) > MIN_RELIEF_M:
+        if abs(off_m) > terrain.MIN_RELIEF_M:
             return True, f"the network lies at z = {off_m:.1f} m"
-        return False, f"the network has {span_m:.2g} m of relief, no more than {MIN_RELIEF_M:g} m"
+        return False, f"the network has {span_m:.2g} m of relief, no more than {terrain.MIN_RELIEF_M:g} m"
 
     def box_change(self, scenario: Scenario, sizes: Mapping[str, VehicleSize]) -> SurfaceFitter:
         """Return the change that sets boxes on the ground around the network."""

@@ -190,13 +190,20 @@ class Streets:
 
     def to_xy(self, lons_deg: Sequence[float], lats_deg: Sequence[float]) -> list[XY]:
         """World-frame x, y in metres of positions in degrees."""
-        xy_m = self._frame.from_lon_lat(np.column_stack([lons_deg, lats_deg]))
+        xy_m = self._known_frame.from_lon_lat(np.column_stack([lons_deg, lats_deg]))
         return [(x, y) for x, y in xy_m.tolist()]
 
     def to_degrees(self, points_m: Sequence[XY]) -> list[tuple[float, float]]:
         """Longitude and latitude in degrees of positions in the world frame."""
-        degrees = self._frame.to_degrees(np.array(points_m))
+        degrees = self._known_frame.to_degrees(np.array(points_m))
         return [(lon, lat) for lon, lat in degrees.tolist()]
+
+    def format_position(self, at_m: XY) -> str:
+        """Return latitude and longitude of a position, or its x and y if the network does not state its frame."""
+        if self.frame is None:
+            return f"x = {at_m[0]:.1f} m, y = {at_m[1]:.1f} m"
+        ((lon_deg, lat_deg),) = self.to_degrees([at_m])
+        return f"{lat_deg:.5f},{lon_deg:.5f}"
 
     def node_positions(self, nodes: Mapping[int, tuple[float, float]]) -> dict[int, XY]:
         """World-frame x, y in metres of nodes of a map, given as latitude and longitude in degrees by identifier."""
@@ -227,11 +234,15 @@ class Streets:
     def _junctions_tree(self) -> shapely.STRtree:
         return shapely.STRtree([junction.area for junction in self.junctions])
 
+    @cached_property
+    def frame(self) -> WorldFrame | None:
+        """Where the world frame is on the Earth; None if the network does not state it."""
+        return network_world_frame(self.network.location)
+
     @property
-    def _frame(self) -> WorldFrame:
-        frame = network_world_frame(self.network.location)
-        assert frame is not None, "netconvert writes a location"
-        return frame
+    def _known_frame(self) -> WorldFrame:
+        assert self.frame is not None, "callers check that the frame is known"
+        return self.frame
 
 
 @dataclass(frozen=True)
@@ -258,7 +269,7 @@ class KerbsidePole:
 
 
 def read_streets(path: Path) -> Streets:
-    """Read a network that netconvert wrote from OpenStreetMap.
+    """Read a network.
 
     Parameters
     ----------

@@ -21,6 +21,7 @@ from shapely.geometry.base import BaseGeometry
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.formats.georeference import WorldFrame, parse_crs
+from egvs.importers.junctions import Streets
 from egvs.importers.osm_solids import ImportCounts, MappedSolid
 
 HEAD_BYTES = 4096
@@ -175,11 +176,14 @@ class MapContext:
         World frame, metres: what sensors can reach. Objects outside it are left out, with a count.
     alignment
         From ``--align``; used for files without a reference system.
+    streets
+        The roads, for objects that are cut at the carriageway.
     """
 
     frame: WorldFrame | None
     window: BaseGeometry
     alignment: Alignment | None = None
+    streets: Streets | None = None
 
     def to_world(self, xy: FloatArray, crs: str | None, where: str) -> FloatArray:
         """Convert coordinates of a file to world-frame x, y in metres.

@@ -222,7 +222,9 @@ class SitesConfig(StrictModel):
         None, description="A sensor for all sites, also for those whose row names another one"
     )
     heights_m: tuple[Positive, ...] = Field(
-        (), description="Heights z of locations in `file` that have no z_m; each is a candidate"
+        (),
+        description="Heights of locations in `file` that have no z_m, above their ground_m (0 without it); each is a"
+        " candidate",
     )
     aim: Literal["roi"] | None = Field(
         None, description="'roi': yaw and pitch such that the central beam hits the centre of the region of interest"

@@ -43,6 +43,9 @@ class GroundSource(Protocol):
 
 Floats = NDArray[np.float64]
 
+MIN_RELIEF_M = 0.1
+"""A network whose heights differ by no more than this is flat."""
+
 _STEP_M = 10.0
 _CELL_M = 0.5
 _LEVEL_M = 1.5
