@@ -20,7 +20,7 @@ from shapely.geometry import LineString, Point, shape
 from egvs.cli import app, new_summary
 from egvs.core.errors import InputError
 from egvs.formats import osm
-from egvs.importers import assumed_traffic, new_scenario
+from egvs.importers import assumed_traffic, new_scenario, openstreetmap
 from egvs.importers.osm_solids import ImportCounts
 from egvs.scenario import loading
 from egvs.sensors import sites
@@ -350,7 +350,7 @@ def test_without_signals_chooses_largest_junction_with_note(tmp_path: Path) -> N
     plain = edited(tmp_path, (' <node id="1" ([^>]*)>.*?</node>', r' <node id="1" \1/>'))
     summary = create_scenario(tmp_path / "plain", plain)
     assert summary.junction.title == "junction without signals of East Street and North Street"
-    assert any("no junction in the extract has signals" in note for note in summary.notes)
+    assert any("no junction in the map has signals" in note for note in summary.notes)
 
 
 @pytest.mark.slow
@@ -562,7 +562,7 @@ def test_rejects_unknown_level_of_traffic(tmp_path: Path) -> None:
 
 
 def test_smaller_surroundings_keep_sites_and_flows(tmp_path: Path) -> None:
-    made = {r: create_scenario(tmp_path / str(r), SMALL, surroundings_m=r) for r in (120.0, 150.0, None)}
+    made = {r: create_scenario(tmp_path / str(r), SMALL, surroundings_m=r) for r in (120.0, 150.0, math.inf)}
     lengths = [summary.streets.lane_length_m for summary in made.values()]
     assert lengths == sorted(lengths) and lengths[0] < 0.8 * lengths[-1]
     for name in ("sites.csv", "statics.geojson"):
@@ -570,12 +570,12 @@ def test_smaller_surroundings_keep_sites_and_flows(tmp_path: Path) -> None:
     flows = [sorted(flow.per_hour for flow in summary.flows) for summary in made.values()]
     assert flows[0] == flows[1] == flows[2] and len(flows[0]) == 12 and sum(flows[0]) > 500
     assert len({summary.roi for summary in made.values()}) == 1
-    assert loading.load(tmp_path / "None").traffic.counts == made[None].flows
+    assert loading.load(tmp_path / "inf").traffic.counts == made[math.inf].flows
 
 
 def test_help_names_default_surroundings() -> None:
     (option,) = get_type_hints(app.new, include_extras=True)["surroundings"].__metadata__
-    assert f"; {new_scenario.SURROUNDINGS_M:g} by default" in option.help
+    assert f"; {openstreetmap.SURROUNDINGS_M:g} by default" in option.help
 
 
 def test_rejects_surroundings_smaller_than_junction(tmp_path: Path) -> None:

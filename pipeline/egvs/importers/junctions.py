@@ -94,6 +94,14 @@ _ISLAND_M2 = 100.0
 _SLIDES_M = (0.0, 1.0, -1.0, 2.0, -2.0, 3.0, -3.0, 4.0, -4.0)
 
 _OTHER_FLOW_PER_H = 40.0
+_CLASS_BY_SPEED = (
+    (19.0, "trunk"),
+    (16.0, "primary"),
+    (13.0, "secondary"),
+    (10.0, "unclassified"),
+    (0.0, "residential"),
+)
+"""Least speed limit in m/s of a road class, for maps without road classes: 70, 60, 50, 40 km/h, with some tolerance."""
 _CAR = "passenger"
 _MIN_AREA_M2 = 10.0
 
@@ -647,16 +655,24 @@ def assumed_flows(streets: Streets, roi: JunctionRegion, ring: Ring | None = Non
 
 
 def edge_flow_h(edge: Edge) -> float:
-    """Return the assumed vehicles per hour on all lanes of a street, by its road class.
+    """Return the assumed vehicles per hour on all lanes of a street, by its road class, or else by its speed limit.
 
     netconvert writes a street with tram tracks as ``"highway.secondary|railway.tram"``.
     """
     flows_per_h = []
+    if "highway." not in edge.type:
+        flows_per_h.append(LANE_FLOW_PER_H[_class_by_speed(edge)])
     for part in edge.type.split("|"):
         if part.startswith("highway."):
             road_class = part.removeprefix("highway.").removesuffix("_link")
             flows_per_h.append(LANE_FLOW_PER_H.get(road_class, _OTHER_FLOW_PER_H))
     return max(flows_per_h, default=_OTHER_FLOW_PER_H) * edge.lanes_for(_CAR)
+
+
+def _class_by_speed(edge: Edge) -> str:
+    """Return the class of roads that usually have the speed limit of a street."""
+    speed_m_s = max(lane.speed_m_s for lane in edge.lanes)
+    return next(road_class for limit_m_s, road_class in _CLASS_BY_SPEED if speed_m_s >= limit_m_s)
 
 
 def balance_flows(connected: FloatArray, inflow_per_h: Sequence[float], outflow_per_h: Sequence[float]) -> FloatArray:

@@ -123,6 +123,8 @@ def find_reader(path: Path) -> MapReader:
 
 def read_head(path: Path) -> bytes:
     """Return the first bytes of a file, after gunzip where possible; InputError when it cannot be read."""
+    if not path.is_file():
+        raise InputError(path, "no such file", "Check the path.")
     with files.open_input(path) as content:
         head: bytes = content.read(HEAD_BYTES)
     if not head.startswith(_GZIP):

@@ -55,9 +55,6 @@ from egvs.sensors.sensor import CATALOGUE
 from egvs.traffic.movements import MovementNames
 
 SURROUNDINGS_MIN_M = 100.0
-SURROUNDINGS_M = 300.0
-"""How far from the junction streets are simulated: enough for the queues and platoons that reach it."""
-
 FAR_FROM_AT_M = 50.0
 """A junction farther than this from the requested position may be the wrong one."""
 
@@ -146,8 +143,8 @@ class NewScenarioOptions:
     walk
         Whether the network gets sidewalks and crossings, which pedestrians need.
     surroundings_m
-        Distance from the junction at which streets end; inf for the complete map. By default, ``SURROUNDINGS_M`` for
-        OpenStreetMap; other maps are not cut.
+        Distance from the junction at which streets end; inf for the complete map. By default,
+        :data:`openstreetmap.SURROUNDINGS_M`; other maps than OpenStreetMap are not cut.
     traffic
         A key of :data:`assumed_traffic.TRAFFIC_LEVELS`: the share of the flow that the junction carries. Or vehicles
         per hour.

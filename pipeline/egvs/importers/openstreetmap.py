@@ -7,6 +7,7 @@ poles become solids (:mod:`egvs.importers.osm_solids`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +25,9 @@ from egvs.importers.osm_solids import ImportCounts, MappedSolid
 from egvs.importers.road_levels import OtherLevels
 
 NAME = "OpenStreetMap"
+
+SURROUNDINGS_M = 300.0
+"""How far from the junction streets are simulated: enough for the queues and platoons that reach it."""
 
 _ONE_LEVEL = OtherLevels()
 _SUFFIXES = (".osm", ".osm.xml", ".osm.pbf", ".pbf")
@@ -106,8 +110,9 @@ class OsmRoads:
         return replace(self, extract=extract, network=network, streets=streets, others=others)
 
     def around(self, junction: StreetJunction, radius_m: float | None) -> OsmRoads:
-        """Return the roads within a radius of a junction, in the same frame; by default (None), all roads."""
-        if radius_m is None:
+        """Return the roads within a radius of a junction, in the same frame; :data:`SURROUNDINGS_M` if it is None."""
+        radius_m = SURROUNDINGS_M if radius_m is None else radius_m
+        if math.isinf(radius_m):
             return self
         network, streets = osm_network.crop_network(
             self.extract, self.path, self.flags, self.streets, junction, radius_m

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -42,7 +43,7 @@ class RoadSource(Protocol):
         raise NotImplementedError
 
     def around(self, junction: StreetJunction, radius_m: float | None) -> RoadSource:
-        """Return the roads within a radius of a junction, in the same frame; by default (None), all roads."""
+        """Return the roads within a radius of a junction, in the same frame: all if it is inf, the default if None."""
         raise NotImplementedError
 
 
@@ -99,7 +100,7 @@ class NetworkRoads:
     def around(self, junction: StreetJunction, radius_m: float | None) -> NetworkRoads:
         """Return all roads; InputError if a radius is given."""
         del junction
-        if radius_m is not None:
+        if radius_m is not None and math.isfinite(radius_m):
             problem = "only roads from OpenStreetMap can be cut"
             hint = "Leave it out, or cut the network with netconvert --keep-edges.in-boundary."
             raise InputError("--surroundings", problem, hint)
