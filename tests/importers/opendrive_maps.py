@@ -7,7 +7,6 @@ from collections.abc import Sequence
 UTM = "+proj=utm +zone=32 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"
 
 LINE = "<line/>"
-FLAT = ""
 
 
 def geometry(x: float, y: float, hdg: float, length: float, shape: str = LINE, s: float = 0.0) -> str:
@@ -34,30 +33,21 @@ def section(right: Sequence[str], left: Sequence[str] = (), s: float = 0.0) -> s
     )
 
 
-def road(
-    number: str,
-    length: float,
-    plan: str,
-    sections: str,
-    link: str = "",
-    *,
-    junction: str = "-1",
-    elevation: str = FLAT,
-    lateral: str = "",
-    signals: str = "",
-    rule: str = "",
-) -> str:
-    """A road; ``link`` like ``predecessor road 3 end, successor junction 9``."""
+def road(number: str, length: float, plan: str, sections: str, link: str = "", **parts: str) -> str:
+    """A road; ``link`` like ``predecessor road 3 end, successor junction 9``.
+
+    ``parts``: junction, rule, and the content of elevation, lateral and signals.
+    """
     links = ""
     for part in (part.split() for part in link.split(",") if part):
         contact = f' contactPoint="{part[3]}"' if len(part) > 3 else ""
         links += f'<{part[0]} elementType="{part[1]}" elementId="{part[2]}"{contact}/>'
-    rules = f' rule="{rule}"' if rule else ""
+    rules = f' rule="{parts["rule"]}"' if "rule" in parts else ""
     return (
-        f'<road name="" length="{length}" id="{number}" junction="{junction}"{rules}><link>{links}</link>'
+        f'<road name="" length="{length}" id="{number}" junction="{parts.get("junction", "-1")}"{rules}><link>{links}</link>'
         f'<type s="0" type="town"><speed max="50" unit="km/h"/></type>'
-        f"<planView>{plan}</planView><elevationProfile>{elevation}</elevationProfile>"
-        f"<lateralProfile>{lateral}</lateralProfile><lanes>{sections}</lanes><signals>{signals}</signals></road>"
+        f"<planView>{plan}</planView><elevationProfile>{parts.get('elevation', '')}</elevationProfile>"
+        f"<lateralProfile>{parts.get('lateral', '')}</lateralProfile><lanes>{sections}</lanes><signals>{parts.get('signals', '')}</signals></road>"
     )
 
 
@@ -92,12 +82,11 @@ def two_lanes(length: float = 100.0) -> list[str]:
 
 
 def merge() -> str:
-    """Lanes -1 and -2 of road 1, 100 m along x, both lead to lane -1 of road 3 through the junction 9; road 4 turns left."""
+    """Lanes -1 and -2 of road 1, 100 m along x, both lead to lane -1 of road 2 through the junction 9."""
     first = section([lane(-1), lane(-2)])
     through = section([lane(-1, link="predecessor -1, successor -1")])
     right = section([lane(-1, link="predecessor -2, successor -1")])
     after = section([lane(-1)])
-    bend = '<paramPoly3 aU="0" bU="20" cU="0" dU="0" aV="0" bV="0" cV="-3.5" dV="0" pRange="normalized"/>'
     bend = '<poly3 a="0" b="0" c="0.02625" d="-0.000875"/>'  # 3.5 m to the left over 20 m, level at both ends
     return opendrive(
         road("1", 100, geometry(0, 0, 0, 100), first, "successor junction 9"),

@@ -1,7 +1,7 @@
 r"""Read the roads of an OpenDRIVE map (ASAM OpenDRIVE 1.4 to 1.8): geometry, lanes, links, junctions, signals.
 
-Steps of :func:`read_opendrive`: parse the file road by road; check that all numbers are finite and all lengths sensible.
-The functions of :class:`Road` evaluate the map at a distance s along a road.
+Steps of :func:`read_opendrive`: parse the file road by road; check that numbers are finite and lengths sensible. The
+functions of :class:`Road` evaluate the map at a distance s along a road.
 
 A road has a reference line in the plane, of elements that start at given points. With the distance :math:`s` from the
 start of an element, the heading of the tangent is

@@ -28,7 +28,7 @@ class CopyOptions:
     Attributes
     ----------
     reference
-        The text of ``<geoReference>``.
+        The text of ``<geoReference>``. If it is empty, the header's offset is left out.
     rotation_rad
         Angle by which the plan is turned about the origin, counter-clockwise.
     swap_lanes
@@ -75,7 +75,7 @@ def _change(element: Element, options: CopyOptions) -> None:
 
 def _change_header(header: Element, options: CopyOptions) -> None:
     for child in list(header):
-        if child.tag != "offset":
+        if child.tag != "offset" or not options.reference:
             header.remove(child)
     if options.reference:
         reference = Element("geoReference")

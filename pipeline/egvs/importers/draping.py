@@ -19,6 +19,7 @@ World frame, metres. Lengths of lanes stay as they are in the plane: at a grade 
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -162,7 +163,8 @@ def level_difference_m(text: str, terrain: Terrain, where: object = "the road ma
     differences = terrain.height_m(points_m[:, :2]) - points_m[:, 2]
     known = differences[np.isfinite(differences)]
     if 2 * len(known) < len(points_m):
-        problem = f"the terrain has no height at {_share(len(points_m) - len(known), len(points_m))} points of the roads"
+        unknown = _share(len(points_m) - len(known), len(points_m))
+        problem = f"the terrain has no height at {unknown} points of the roads"
         raise InputError(where, problem, _HINT)
     median_m = float(np.median(known))
     return median_m, float(np.median(np.abs(known - median_m)))
@@ -182,7 +184,7 @@ def _sample(shape: ShapeText) -> _Sample:
     if shape.tag == "junction" or len(given) < 2:
         return _Sample(given, np.ones(len(given), dtype=np.bool_))
     points, is_given = [given[:1]], [np.array([True])]
-    for start, end in zip(given[:-1], given[1:], strict=True):
+    for start, end in itertools.pairwise(given):
         steps = max(1, int(np.ceil(np.hypot(*(end - start)) / STEP_M)))
         points.append(start + (end - start) * (np.arange(1, steps + 1) / steps)[:, None])
         is_given.append(np.arange(1, steps + 1) == steps)
@@ -219,7 +221,8 @@ def _replacement(shape: ShapeText, sample: _Sample, z_m: FloatArray) -> Replacem
         if sample.is_given[index]:
             points.append(f"{next(texts)},{round(float(next(given_m)), 3) + 0.0:.3f}")
         else:
-            points.append(format_point(*sample.xy_m[index], z_m[index]))
+            x, y = sample.xy_m[index]
+            points.append(format_point(x, y, z_m[index]))
     return Replacement(shape.start, shape.end, " ".join(points))
 
 

@@ -125,9 +125,7 @@ def format_point(x_m: float, y_m: float, z_m: float) -> str:
     return f"{x_m:.5f},{y_m:.5f},{_format_m(z_m)}"
 
 
-def _shape_text(
-    tag: str, name: str, start: int, text: str, parts: list[list[str]], *, is_node: bool
-) -> ShapeText:
+def _shape_text(tag: str, name: str, start: int, text: str, parts: list[list[str]], *, is_node: bool) -> ShapeText:
     try:
         points = [[*map(parse_coordinate_m, part), 0.0][:3] for part in parts]
         points_m = np.array(points, dtype=np.float64).reshape(-1, 3)

@@ -84,7 +84,10 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
     lefthand = options.lefthand or is_lefthand_map
     reference, notes = _projection(road_map, path)
     copy_options = CopyOptions(
-        reference, road_map.offset_rad, swap_lanes=is_lefthand_map, keeps_type=_import_all if options.walk else is_driving
+        reference,
+        rotation_rad=road_map.offset_rad if reference else 0.0,
+        swap_lanes=is_lefthand_map,
+        keeps_type=_import_all if options.walk else is_driving,
     )
     with files.temporary_folder() as folder:
         write_copy(path, folder / _MAP, copy_options)
@@ -105,10 +108,12 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
         text = (folder / name).read_text(encoding="utf-8")
 
     text = _GENERATED.sub("<!-- made from an OpenDRIVE map -->", text, count=1)
-    height_m = road_map.offset_m[2]
+    height_m = copied.offset_m[2]
     if height_m:
         text = network_heights.shift_heights(text, height_m)
         notes += (f"The header's offset of {height_m:g} m was added to all heights.",)
+    if any(road_map.offset_m) and not reference:
+        notes += ("The header's offset is left out, since it refers to an unknown reference system.",)
     has_heights = bool(height_m) or any(_has_relief(road) for road in road_map.roads.values())
     return RoadMap(text, notes=(*notes, *_map_notes(road_map)), has_heights=has_heights)
 
@@ -164,9 +169,7 @@ def _netconvert(arguments: Sequence[str], folder: Path, name: str, path: Path) -
         raise InputError(path, problem, "Correct the map, or export it again.") from None
 
 
-def _patch(
-    folder: Path, made: MadeNetwork, comparison: MapComparison, options: RoadOptions, path: Path
-) -> str:
+def _patch(folder: Path, made: MadeNetwork, comparison: MapComparison, options: RoadOptions, path: Path) -> str:
     """Add missing connections and close lanes; return the name of the resulting network."""
     connections = [
         f"<connection from={quoteattr(source.edge)} to={quoteattr(target.edge)}"
@@ -247,7 +250,8 @@ def comparison_notes(comparison: MapComparison, road_map: OpenDriveMap) -> tuple
     signals = sum(signal.dynamic for road in road_map.roads.values() for signal in road.signals)
     if signals:
         notes.append(
-            f"{signals} traffic lights: their places and programs are not in the network; SUMO's default programs are used."
+            f"{signals} traffic lights: their places and programs are not in the network; SUMO's default programs are"
+            " used."
         )
     if comparison.unlit_roads:
         notes.append(f"Traffic lights of these roads have no effect: {_listed(comparison.unlit_roads)}.")

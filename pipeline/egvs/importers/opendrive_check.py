@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from xml.etree.ElementTree import Element
 
 import numpy as np
 import shapely
@@ -196,12 +197,10 @@ def compare_with_map(made: MadeNetwork, road_map: OpenDriveMap, *, mirrored: boo
     )
 
 
-def _network_lane(edge: str, lane: xml.Element, path: Path) -> NetworkLane:
+def _network_lane(edge: str, lane: Element, path: Path) -> NetworkLane:
     shape = network.Shape(lane.attrib["shape"], f"{path}: lane {lane.get('id')}").shape_m
     permission = network.Permission.from_attributes(lane.attrib)
-    return NetworkLane(
-        edge, int(lane.attrib["index"]), lane.get("type", ""), shape, not permission.admits("passenger")
-    )
+    return NetworkLane(edge, int(lane.attrib["index"]), lane.get("type", ""), shape, not permission.admits("passenger"))
 
 
 def _lane_lines(road_map: OpenDriveMap, offset_m: tuple[float, float], mirrored: bool) -> dict[LaneKey, FloatArray]:
@@ -247,9 +246,7 @@ def _driving_lanes(made: MadeNetwork) -> Iterator[NetworkLane]:
         yield from (lane for lane in lanes if lane.type in DRIVING_TYPES)
 
 
-def _added(
-    made: MadeNetwork, permitted: Iterable[tuple[str, int, str, int]]
-) -> Iterator[tuple[str, int, str, int]]:
+def _added(made: MadeNetwork, permitted: Iterable[tuple[str, int, str, int]]) -> Iterator[tuple[str, int, str, int]]:
     """Yield the connections for vehicles that are no permitted turn, and no joint of two pieces of one lane."""
     origin = {}
     for key, lanes in made.lanes.items():
