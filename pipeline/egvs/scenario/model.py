@@ -123,6 +123,10 @@ class MeshConfig(StrictModel):
         return None
 
 
+TERRAIN_KEY = "statics.terrain"
+"""The key of the file with the ground beyond the roads."""
+
+
 class StaticsConfig(StrictModel):
     """The static world: everything that does not move and that beams can hit."""
 
@@ -142,6 +146,15 @@ class StaticsConfig(StrictModel):
     )
     meshes: tuple[MeshConfig, ...] = ()
     ground: bool = Field(True, description="Add a ground plane at z = 0")
+    terrain: str | None = Field(
+        None,
+        description="PLY file with points of the ground beyond the roads, world frame; the traffic must have a network",
+    )
+
+    @model_serializer(mode="wrap")
+    def _serialize(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out terrain where it is not set, so that it does not change cache keys."""
+        return {name: value for name, value in serialize(self).items() if name != "terrain" or value is not None}
 
     @field_validator("polygon_types", mode="before")
     @classmethod
