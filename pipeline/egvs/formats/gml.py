@@ -86,6 +86,8 @@ def parse_coordinates(text: str, dimension: int, where: str) -> FloatArray:
         When it has something other than finite numbers, or not ``dimension`` of them for each point.
     """
     try:
+        if not text.isascii() or "_" in text:  # which float would accept
+            raise ValueError("it has characters that are no part of a number")
         values = np.array([float(word) for word in text.split()])
     except ValueError as error:
         raise InputError(where, f"expected numbers ({error})", COMPLETE_FILE) from None

@@ -138,8 +138,9 @@ def _with_heights(
 def objects_on_carriageway(
     meshes: Sequence[MappedMesh], lanes: Sequence[BaseGeometry], ground_m: Callable[[FloatArray], FloatArray]
 ) -> list[str]:
-    """Return the names of meshes that reach into the space of vehicles: over a lane, above the kerb and below the
-    clearance.
+    """Return the names of meshes that reach into the space of vehicles.
+
+    That is the space over a lane, above a kerb and below the clearance.
 
     Parameters
     ----------
