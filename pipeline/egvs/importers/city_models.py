@@ -29,6 +29,7 @@ from egvs.formats.gml import ReferenceSystem, parse_srs_name
 from egvs.formats.surface_meshes import SurfaceMesh, triangulate_surfaces
 from egvs.importers.map_parts import MapContext, MappedMesh, SolidMap
 from egvs.importers.osm_solids import DEFAULT_BUILDING_M, OUT_OF_RANGE, ImportCounts, MappedSolid, geometry_pieces
+from egvs.scenario.fields import MAX_COORDINATE_M
 from egvs.world.map_features import LEVEL_M
 
 SOLID_KINDS: Mapping[str, str] = {
@@ -159,6 +160,7 @@ class _Collector:
             self.counts.drop(kind, "no_surface")
             return
 
+        _check_coordinates(np.concatenate([ring for surface in rings for ring in surface]), where)
         placed = _Placed(rings, system)
         if not outside.is_in_window(placed, where):
             self.counts.drop(kind, OUT_OF_RANGE)
@@ -327,7 +329,8 @@ def _needs_template(city_object: CityObject, templates: Mapping[str, list[Surfac
 def _place_ring(ring: FloatArray, placement: Placement, system: ReferenceSystem) -> FloatArray:
     """Return the points (n, 3) of a template's ring in the reference system, in the order x, y, z."""
     matrix = np.reshape(placement.matrix, (4, 4))
-    local = ring @ matrix[:3, :3].T + matrix[:3, 3]
+    with np.errstate(over="ignore", invalid="ignore"):  # coordinates that are too large are rejected later
+        local = ring @ matrix[:3, :3].T + matrix[:3, 3]
     point = np.array([placement.point], dtype=np.float64)
     if not system.is_in_degrees:
         return system.to_xyz(local + point)
@@ -345,8 +348,17 @@ def _to_world(placed: _Placed, context: MapContext, where: str) -> Rings:
     rings = [ring for surface in placed.rings for ring in surface]
     points = np.concatenate(rings)
     points_m = np.column_stack([context.to_world(points[:, :2], placed.system.crs, where), points[:, 2]])
+    _check_coordinates(points_m, where)
     pieces = iter(np.split(points_m, np.cumsum([len(ring) for ring in rings])[:-1]))
     return [[next(pieces) for _ in surface] for surface in placed.rings]
+
+
+def _check_coordinates(points: FloatArray, where: str) -> None:
+    far = np.argwhere(~(np.abs(points) <= MAX_COORDINATE_M))
+    if len(far):
+        row, axis = far[0]
+        problem = f"expected coordinates within {MAX_COORDINATE_M:g} m, got {'xyz'[axis]} = {points[row, axis]:g}"
+        raise InputError(where, problem, "Check the file's coordinates and its reference system.")
 
 
 def _footprint(rings_m: Sequence[Sequence[FloatArray]]) -> BaseGeometry:
