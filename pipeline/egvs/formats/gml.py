@@ -121,6 +121,7 @@ class SurfaceParser:
         self.tags: list[str] = []
         self.default_srs_name = ""
         self.collected = 0
+        self._max_collected = limits.TRIANGLES.maximum
         self._declared: list[tuple[int, str | None, int | None]] = []
         self._rings: list[FloatArray] | None = None
         self._ring: list[FloatArray] | None = None
@@ -258,7 +259,8 @@ class SurfaceParser:
         self.collected += 1 + len(self._open_groups)
         if isinstance(member, Surface):
             self.collected += sum(len(ring) for ring in member.rings)
-        limits.TRIANGLES.check(f"{self.path}: {self.describe()}", self.collected, "has too many surfaces")
+        if self.collected > self._max_collected:
+            limits.TRIANGLES.check(f"{self.path}: {self.describe()}", self.collected, "has too many surfaces")
         for _, _, members in self._open_groups:
             members.append(member)
         self.add_member(member, srs_name)

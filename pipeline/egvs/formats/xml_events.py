@@ -19,6 +19,7 @@ from egvs.formats import xml
 from egvs.formats.xml import MAX_DEPTH, PARSER_ENCODINGS, Utf8Reader
 
 _CHUNK_BYTES = 1 << 16
+_MAX_NAMES = 1000
 
 
 class EventHandler(Protocol):
@@ -74,6 +75,7 @@ class _EventParser:
     def __init__(self, path: Path, root: str, handler: EventHandler, encoding: str | None) -> None:
         self._path, self._root, self._handler = path, root, handler
         self._depth = 0
+        self._tags: dict[str, str] = {}
         self._text: list[str] = []
         self._text_size = 0
         self._bytes_since_event = 0
@@ -95,7 +97,7 @@ class _EventParser:
 
     def _on_start(self, name: str, attributes: dict[str, str]) -> None:
         self._bytes_since_event = 0
-        tag = local_name(name)
+        tag = self._tag(name)
         if self._depth == 0 and tag != self._root:
             raise InputError(self._path, f"expected the root element <{self._root}>, got <{tag}>", "Check the file.")
         self._depth += 1
@@ -110,8 +112,17 @@ class _EventParser:
         self._bytes_since_event = 0
         self._depth -= 1
         self._parser.CharacterDataHandler = None
-        self._handler.end(local_name(name), "".join(self._text))
+        self._handler.end(self._tag(name), "".join(self._text))
         self._text.clear()
+
+    def _tag(self, name: str) -> str:
+        """Return :func:`local_name`, remembered for the names that all files of a format have."""
+        tag = self._tags.get(name)
+        if tag is None:
+            tag = local_name(name)
+            if len(self._tags) < _MAX_NAMES:
+                self._tags[name] = tag
+        return tag
 
     def _on_text(self, text: str) -> None:
         self._bytes_since_event = 0
