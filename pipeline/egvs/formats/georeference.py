@@ -162,6 +162,12 @@ def height_unit_m(crs: Any, where: str) -> float:
     return float(parsed.axis_info[0].unit_conversion_factor) if parsed.is_projected else 1.0
 
 
+def is_north_first(crs: Any, where: str) -> bool:
+    """Return whether the first axis of a system points north, as in EPSG:4326 (latitude, longitude) and EPSG:6677."""
+    directions = [axis.direction for axis in parse_crs(crs, where).axis_info[:2]]
+    return directions == ["north", "east"]
+
+
 def crs_name(frame: WorldFrame, at_m: tuple[float, float]) -> str:
     """Return the projection of a world frame as other programs show it: an EPSG code if there is one, else WKT.
 
