@@ -103,7 +103,7 @@ def read_ground_points(path: Path) -> FloatArray:
     Raises
     ------
     InputError
-        When the file is damaged, has no points, or points beyond any world.
+        When the file is damaged, has no points, or points that are not finite.
     """
     where = f"{path}: {TERRAIN_KEY}"
     limits.checked_size(path, limits.FILE, where)
@@ -111,10 +111,11 @@ def read_ground_points(path: Path) -> FloatArray:
         points_m = ply.read(path, where)
     limits.POINTS.check(where, len(points_m))
     is_valid = (np.abs(points_m) <= MAX_COORDINATE_M).all(axis=1)
-    if not len(points_m) or not is_valid.all():
-        problem = f"expected points with coordinates up to {MAX_COORDINATE_M:g} m"
-        actual = "none" if not len(points_m) else f"point {np.flatnonzero(~is_valid)[0]}"
-        raise InputError(where, f"{problem}, got {actual}", "Write the ground in the world frame again.")
+    if not is_valid.all():
+        first = int(np.flatnonzero(~is_valid)[0])
+        actual = f"got point {first}: {points_m[first].tolist()}"
+        expected = f"expected points with coordinates up to {MAX_COORDINATE_M:g} m"
+        raise InputError(where, f"{expected}, {actual}", "Write the ground in the world frame again.")
     return points_m
 
 

@@ -189,13 +189,16 @@ def _join_terrain(lanes: Floats, terrain: Floats, low_m: Floats | None, high_m: 
     GROUND_POINTS.check(where, len(terrain), f"needs {len(terrain):,} points of the terrain")
     height = _interpolate(terrain, lanes[:, :2])
     is_ground = ~(np.abs(lanes[:, 2] - height) > _LEVEL_M)  # also where the terrain is unknown
-    points = _thin_points(lanes[is_ground])
-    if not len(points):
+    if not is_ground.any():
         return _thin_points(terrain)
+    points = _thin_points(lanes[is_ground])
+    if not len(terrain):
+        return points
+
     from scipy.spatial import KDTree
 
-    distance_m = KDTree(points[:, :2]).query(terrain[:, :2])[0]
-    return np.concatenate([points, _thin_points(terrain[distance_m > _BESIDE_M])])
+    is_beyond = KDTree(points[:, :2]).query(terrain[:, :2])[0] > _BESIDE_M
+    return np.concatenate([points, _thin_points(terrain[is_beyond])]) if is_beyond.any() else points
 
 
 def _interpolate(points: Floats, at: Floats) -> Floats:
