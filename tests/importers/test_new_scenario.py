@@ -97,7 +97,7 @@ def test_heights_above_sea_level_are_lowered_to_the_ground() -> None:
     (summary,) = (objects := collect(reader("city", SolidMap(meshes=meshes, has_absolute_heights=True)))).maps
     assert [mesh.vertices_m[:, 2].min() for mesh in objects.meshes] == pytest.approx([-0.25, 0.25])
     assert summary.height_range_m == pytest.approx((5.75, 20.25))
-    assert "40.25 m is taken as the ground" in summary.notes[0]
+    assert "40.25 m, from the lowest points of the objects nearest to the junction, is subtracted" in summary.notes[0]
 
 
 def test_mesh_in_lanes_is_reported() -> None:
@@ -136,8 +136,8 @@ def test_ply_files_are_read_back(tmp_path: Path) -> None:
     import trimesh
 
     meshes = [block("a", (0, 0, 0), (1, 2, 3)), block("b", (5, 0, 0), (1, 1, 1))]
-    (content,) = static_objects.ply_files(meshes).values()
-    (tmp_path / "building.ply").write_bytes(content)
+    (write,) = static_objects.mesh_files(meshes).values()
+    write(tmp_path / "building.ply")
     mesh = trimesh.load_mesh(tmp_path / "building.ply", process=False)
     assert mesh.volume == pytest.approx(1 * 2 * 3 + 1)
     assert len(mesh.faces) == 24

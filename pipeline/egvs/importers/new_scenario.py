@@ -19,16 +19,22 @@ have heights. The same maps give the same bytes: no dates, no paths, objects sor
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tomlkit
+from shapely.geometry.base import BaseGeometry
 
 from egvs.core.errors import InputError
+from egvs.formats import ply
 from egvs.importers import (
     assumed_traffic,
+    ground_heights,
+    ground_reference,
     junctions,
     map_readers,
     openstreetmap,
@@ -39,14 +45,23 @@ from egvs.importers import (
 from egvs.importers.alignment import PointPair, make_alignment
 from egvs.importers.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, AssumedTraffic
 from egvs.importers.junctions import XY, JunctionRegion, StreetJunction, Streets
-from egvs.importers.map_parts import MapContext, RoadOptions
+from egvs.importers.map_parts import MapContext, RoadOptions, Terrain
 from egvs.importers.map_readers import MapFile
 from egvs.importers.openstreetmap import OsmRoads
 from egvs.importers.osm_network import ATTRIBUTION, NETWORK_FILE
 from egvs.importers.osm_solids import ImportCounts
 from egvs.importers.relief import Relief
 from egvs.importers.road_source import NetworkRoads, RoadSource
-from egvs.importers.scenario_files import PITCHES_DEG, SENSOR, SITES_FILE, STATICS_FILE, reachable_area
+from egvs.importers.scenario_files import (
+    PITCHES_DEG,
+    SENSOR,
+    SITES_FILE,
+    STATICS_FILE,
+    TERRAIN_FILE,
+    FileContent,
+    TomlTable,
+    reachable_area,
+)
 from egvs.importers.static_objects import MapSummary, StaticObjects
 from egvs.scenario.loading import load
 from egvs.scenario.model import SCENARIO_FILE
@@ -60,6 +75,12 @@ FAR_FROM_AT_M = 50.0
 
 _MOST_NAMED = 3
 """Number of junctions that the message about a position without a junction names."""
+
+TERRAIN_STEP_M = 5.0
+"""Distance of the points of the ground beyond the roads."""
+
+GROUND = "ground"
+"""The kind of meshes that are ground; the scenario has its own."""
 
 PEOPLE_HINT = (
     "pedestrians are added with --set effects.pedestrians_bicycles.pedestrians_per_h=300 (bicycles: bicycles_per_h)."
@@ -218,9 +239,14 @@ def create_scenario(
     frame = level.streets.frame
     alignment = make_alignment(options.align, frame) if options.align else None
     context = MapContext(frame, window, alignment, level.streets)
-    objects = static_objects.collect_objects(files.solids, level, files.roads, context, junction.at_m)
+    terrain = ground_reference.read_terrain(files.terrain, context)
+    zero = ground_reference.find_zero(level, files.roads, junction, terrain)
+    objects = static_objects.collect_objects(
+        files.solids, level, files.roads, context, junction.at_m, zero.height_m
+    )  # fmt: skip
 
     roads = level.around(junction, options.surroundings_m)
+    roads = ground_reference.lay_on_ground(roads, files.roads, junction, terrain)
     if roads.streets is not level.streets:
         junction = _require_junction(junctions.find_again(roads.streets, junction, junction.at_m), files.roads.path)
     streets = roads.streets
@@ -233,7 +259,7 @@ def create_scenario(
             hint = "Choose a smaller spacing with --poles, or another junction with --at LAT,LON."
         raise InputError(files.roads.path, problem, hint)
 
-    notes = [*roads.notes]
+    notes = [*roads.notes, *zero.notes, *(() if terrain is None else terrain.notes)]
     if at is None and not junction.signalised:
         notes.append(_NO_SIGNALS_NOTE)
     notes += _ring_notes(streets, junction)
@@ -252,16 +278,29 @@ def create_scenario(
         folder, junction, roi, streets, len(poles), objects.counts, objects.n_solids + 1, assumed, tuple(notes),
         maps=objects.maps, attributions=_attributions(roads, objects), from_at_m=_distance_m(streets, junction, at),
     )  # fmt: skip
-    meshes = static_objects.ply_files([mesh for mesh in objects.meshes if mesh.kind != "ground"])
-    contents: dict[str, str | bytes] = {
+    meshes = static_objects.mesh_files([mesh for mesh in objects.meshes if mesh.kind != GROUND])
+    terrain_files = {}
+    if terrain is not None:
+        terrain_files[TERRAIN_FILE] = _terrain_writer(terrain, window, zero.height_m or 0.0)
+    statics = scenario_files.statics_table(list(meshes), *terrain_files)
+    contents: dict[str, FileContent] = {
         NETWORK_FILE: roads.network,
         STATICS_FILE: scenario_files.solids_geojson(objects.solids, objects.counts, scenario.attributions),
         SITES_FILE: scenario_files.sites_csv(poles, relief.ground_m(streets, poles)),
         **meshes,
-        SCENARIO_FILE: _scenario_toml(name, scenario, relief, list(meshes)),
+        **terrain_files,
+        SCENARIO_FILE: _scenario_toml(
+            name, scenario, relief, scenario_files.statics_table(list(meshes), *terrain_files)
+        ),
     }
     scenario_files.publish_folder(folder, contents.items(), load)
     return scenario
+
+
+def _terrain_writer(terrain: Terrain, window: BaseGeometry, zero_height_m: float) -> Callable[[Path], None]:
+    """Return a function that writes points of the ground in a window as PLY."""
+    points_m = ground_heights.ground_points(terrain, window, TERRAIN_STEP_M) - np.array([0.0, 0.0, zero_height_m])
+    return partial(ply.write, points_m=points_m)
 
 
 def _read_roads(file: MapFile, options: RoadOptions, at: tuple[float, float] | None) -> RoadSource:
@@ -383,7 +422,7 @@ def scenario_notes(junction_fits: bool, counts: ImportCounts) -> list[str]:
     return notes
 
 
-def _scenario_toml(name: str, scenario: NewScenario, relief: Relief, meshes: Sequence[str]) -> str:
+def _scenario_toml(name: str, scenario: NewScenario, relief: Relief, statics: TomlTable) -> str:
     title = scenario.junction.title
     values: dict[str, Any] = {
         "description": title[0].upper() + title[1:],
@@ -406,7 +445,7 @@ def _scenario_toml(name: str, scenario: NewScenario, relief: Relief, meshes: Seq
     tables = {
         "roi": (roi_comment, roi | scenario_files.voxel_keys()),
         "traffic": ("SUMO", traffic),
-        "statics": scenario_files.statics_table(meshes),
+        "statics": statics,
         "sites": (sites_comment, sites | scenario_files.mount_keys()),
         "score": scenario_files.score_table(),
         "placement": scenario_files.placement_table(),

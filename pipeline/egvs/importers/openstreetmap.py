@@ -8,6 +8,7 @@ poles become solids (:mod:`egvs.importers.osm_solids`).
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,6 +29,9 @@ NAME = "OpenStreetMap"
 
 SURROUNDINGS_M = 300.0
 """How far from the junction streets are simulated: enough for the queues and platoons that reach it."""
+
+_WAY = re.compile(r"-?(\d+)")
+"""netconvert names an edge after its way: ``"12"``, ``"-12#3"``."""
 
 _ONE_LEVEL = OtherLevels()
 _SUFFIXES = (".osm", ".osm.xml", ".osm.pbf", ".pbf")
@@ -118,6 +122,17 @@ class OsmRoads:
             self.extract, self.path, self.flags, self.streets, junction, radius_m
         )  # fmt: skip
         return replace(self, network=network, streets=streets)
+
+    def edge_levels(self) -> dict[str, int]:
+        """Return the levels of the edges that are not on the ground: bridges and tunnels."""
+        levels = {}
+        for edge in self.streets.network.edges:
+            number = _WAY.match(edge.id)
+            way = self.extract.ways.get(int(number[1])) if number else None
+            level = 0 if way is None else road_levels.way_level(way.tags)
+            if level:
+                levels[edge.id] = level
+        return levels
 
     def solids(self, window: BaseGeometry) -> tuple[list[MappedSolid], ImportCounts]:
         """Return the static objects in a window (world frame, metres), and what happened to the others."""

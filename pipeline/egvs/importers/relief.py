@@ -46,7 +46,7 @@ class Relief:
         span_m, off_m = terrain.relief_m(network)
         if span_m <= terrain.MIN_RELIEF_M and abs(off_m) <= terrain.MIN_RELIEF_M:
             return cls()
-        middle_m = _lane_heights_near(streets, junction)
+        middle_m = lane_heights_near(streets, junction)
         low_m = high_m = float(np.median(middle_m))
         others: list[str] = []
         for edge in network.edges:
@@ -79,7 +79,7 @@ class Relief:
         return np.round(terrain.triangulate_ground(streets.network).height_m(x_m, y_m), 3)
 
 
-def _lane_heights_near(streets: Streets, junction: StreetJunction) -> FloatArray:
+def lane_heights_near(streets: Streets, junction: StreetJunction) -> FloatArray:
     """Return z of the ends of the lanes that meet at a junction."""
     heights = []
     for edge in streets.network.edges:

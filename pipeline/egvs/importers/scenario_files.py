@@ -31,7 +31,7 @@ from egvs.scenario.traffic_config import CountConfig
 from egvs.sensors.sensor import CATALOGUE
 from egvs.traffic.movements import MovementNames
 
-STATICS_FILE, SITES_FILE = "statics.geojson", "sites.csv"
+STATICS_FILE, SITES_FILE, TERRAIN_FILE = "statics.geojson", "sites.csv", "terrain.ply"
 SENSOR = "VLP-32C"
 
 PITCHES_DEG: tuple[float | str, ...] = (0.0, -10.0, "aim")
@@ -137,12 +137,14 @@ def voxel_keys() -> dict[str, Any]:
     return {"voxel_m": RoiConfig.model_fields["voxel_m"].default}
 
 
-def statics_table(meshes: Sequence[str] = ()) -> TomlTable:
-    """Return ``[statics]`` with mesh files, each named after the kind of its objects."""
+def statics_table(meshes: Sequence[str] = (), terrain: str | None = None) -> TomlTable:
+    """Return ``[statics]`` with mesh files, each named after the kind of its objects, and a terrain file."""
     comment = "buildings, trees, barriers, poles; the summary in the file counts what was assumed about them"
     keys: dict[str, Any] = {"footprints": [STATICS_FILE]}
     if meshes:
         keys["meshes"] = [{"file": name, "kind": name.removesuffix(".ply")} for name in meshes]
+    if terrain is not None:
+        keys["terrain"] = terrain
     return comment, keys
 
 
@@ -230,7 +232,11 @@ def periods_template(example: CountConfig) -> list[str]:
     ]
 
 
-def publish_folder(folder: Path, contents: Iterable[tuple[str, str | bytes]], check: Callable[[Path], object]) -> None:
+FileContent = str | Callable[[Path], None]
+"""A text, or a function that writes a file."""
+
+
+def publish_folder(folder: Path, contents: Iterable[tuple[str, FileContent]], check: Callable[[Path], object]) -> None:
     """Write files to a temporary folder, check it, and rename it: the folder appears complete or not at all.
 
     Parameters
@@ -238,7 +244,7 @@ def publish_folder(folder: Path, contents: Iterable[tuple[str, str | bytes]], ch
     folder
         Does not exist yet, or is empty.
     contents
-        Name and content of each file, text or bytes.
+        Name and content of each file.
     check
         Called with the temporary folder; raises if something is wrong with it.
     """
@@ -248,10 +254,10 @@ def publish_folder(folder: Path, contents: Iterable[tuple[str, str | bytes]], ch
     partial.mkdir(parents=True)
     try:
         for name, content in contents:
-            if isinstance(content, bytes):
-                (partial / name).write_bytes(content)
-            else:
+            if isinstance(content, str):
                 files.write_text(partial / name, content)
+            else:
+                content(partial / name)
         check(partial)
         if folder.is_dir():
             folder.rmdir()

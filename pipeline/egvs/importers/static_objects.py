@@ -11,8 +11,9 @@ World frame: x east, y north in metres; heights in metres above z = 0 of the net
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,8 @@ _COVERED_SHARE = 0.3
 
 _NEAREST_BASES = 20
 """Number of meshes whose lowest points tell the height of the ground, where no terrain does."""
+
+_LARGE_DIFFERENCE_M = 5.0
 
 _GROUND_KINDS = ("ground", "terrain")
 _LOW_M = 0.5
@@ -102,7 +105,12 @@ class StaticObjects:
 
 
 def collect_objects(
-    maps: Sequence[MapFile], roads: RoadSource, road_file: MapFile, context: MapContext, middle_m: XY
+    maps: Sequence[MapFile],
+    roads: RoadSource,
+    road_file: MapFile,
+    context: MapContext,
+    middle_m: XY,
+    zero_height_m: float | None = None,
 ) -> StaticObjects:
     """Collect the static objects of all maps.
 
@@ -115,7 +123,9 @@ def collect_objects(
     context
         The world frame and the window.
     middle_m
-        World-frame x, y of the junction, for the height of its ground.
+        World-frame x, y of the junction.
+    zero_height_m
+        Height above sea level of z = 0; None if unknown.
 
     Raises
     ------
@@ -127,7 +137,7 @@ def collect_objects(
         paths = tuple(file.path for file in group)
         reader = group[0].reader
         if reader is not openstreetmap:
-            solid_map = _lower_to_ground(reader.read_solids(paths, context), middle_m)
+            solid_map = _lower_to_ground(reader.read_solids(paths, context), middle_m, zero_height_m)
             solid_map = _clear_of_carriageway(solid_map, roads.streets)
         elif isinstance(roads, OsmRoads) and paths == (road_file.path,):
             solids, counts = roads.solids(context.window)
@@ -145,25 +155,24 @@ def outline(mesh: MappedMesh) -> BaseGeometry:
     return MultiPoint(mesh.vertices_m[:, :2]).convex_hull
 
 
-def ply_files(meshes: Sequence[MappedMesh]) -> dict[str, bytes]:
-    """Return the content of one binary PLY file for each kind of object, by file name.
+def mesh_files(meshes: Sequence[MappedMesh]) -> dict[str, Callable[[Path], None]]:
+    """Return the functions that write one PLY file for each kind of object, by file name.
 
     Parameters
     ----------
     meshes
         World-frame metres.
     """
-    contents = {}
-    for kind in sorted({mesh.kind for mesh in meshes}):
-        of_kind = [mesh for mesh in meshes if mesh.kind == kind]
-        contents[f"{kind}.ply"] = _to_ply(of_kind)
-    return contents
+    by_kind: dict[str, list[MappedMesh]] = {}
+    for mesh in sorted(meshes, key=lambda mesh: mesh.kind):
+        by_kind.setdefault(mesh.kind, []).append(mesh)
+    return {f"{kind}.ply": partial(_write_ply, of_kind) for kind, of_kind in by_kind.items()}
 
 
-def _to_ply(meshes: Sequence[MappedMesh]) -> bytes:
-    """Return a binary PLY with all triangles, which share no vertices between objects."""
+def _write_ply(meshes: Sequence[MappedMesh], path: Path) -> None:
+    """Write a binary PLY of all triangles; objects share no vertices."""
     first = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
-    vertices_m = np.concatenate([mesh.vertices_m for mesh in meshes])
+    vertices_m = np.round(np.concatenate([mesh.vertices_m for mesh in meshes]), 4)
     faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, first[:-1], strict=True)])
     rows = np.empty(len(faces), dtype=[("n", "u1"), ("corners", "<i4", 3)])
     rows["n"], rows["corners"] = 3, faces
@@ -172,7 +181,7 @@ def _to_ply(meshes: Sequence[MappedMesh]) -> bytes:
         f"element vertex {len(vertices_m)}\nproperty double x\nproperty double y\nproperty double z\n"
         f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
-    return header.encode("ascii") + np.round(vertices_m, 4).astype("<f8").tobytes() + rows.tobytes()
+    path.write_bytes(header.encode("ascii") + vertices_m.astype("<f8").tobytes() + rows.tobytes())
 
 
 def _group_by_reader(maps: Sequence[MapFile]) -> list[list[MapFile]]:
@@ -183,17 +192,24 @@ def _group_by_reader(maps: Sequence[MapFile]) -> list[list[MapFile]]:
     return list(groups.values())
 
 
-def _lower_to_ground(solid_map: SolidMap, middle_m: XY) -> SolidMap:
-    """Return a map whose heights count from the ground: the median of the lowest points of the nearest meshes."""
+def _lower_to_ground(solid_map: SolidMap, middle_m: XY, zero_height_m: float | None) -> SolidMap:
+    """Return a map whose heights count from z = 0.
+
+    Without a known height of z = 0, it is the median of the lowest points of the objects nearest to the junction.
+    """
     if not solid_map.has_absolute_heights or not solid_map.meshes:
         return solid_map
-    ground_m = _ground_height_m(solid_map.meshes, middle_m)
+    bases_m = _ground_height_m(solid_map.meshes, middle_m)
+    ground_m = bases_m if zero_height_m is None else zero_height_m
+    source = "the lowest points of the objects nearest to the junction" if zero_height_m is None else "the roads"
+    notes = [f"Heights count from sea level; {ground_m:.2f} m, from {source}, is subtracted."]
+    if abs(bases_m - ground_m) > _LARGE_DIFFERENCE_M:
+        notes.append(
+            f"The objects nearest to the junction begin {bases_m - ground_m:+.1f} m above its roads; check that both"
+            " maps count heights from the same level."
+        )
     meshes = tuple(_shift(mesh, -ground_m) for mesh in solid_map.meshes)
-    note = (
-        f"heights count from sea level; {ground_m:.2f} m is taken as the ground (the median of the lowest points of the"
-        " objects nearest to the junction) and subtracted"
-    )
-    return replace(solid_map, meshes=meshes, notes=(*solid_map.notes, note), has_absolute_heights=False)
+    return replace(solid_map, meshes=meshes, notes=(*solid_map.notes, *notes), has_absolute_heights=False)
 
 
 def _ground_height_m(meshes: Sequence[MappedMesh], middle_m: XY) -> float:
