@@ -11,18 +11,21 @@ constant within a junction; where the road map and the terrain both have heights
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from shapely.geometry import box
 
 from egvs.importers import draping, network_heights, relief, sumo_network
 from egvs.importers.ground_heights import CombinedTerrain
-from egvs.importers.junctions import StreetJunction
+from egvs.importers.junctions import StreetJunction, Streets
 from egvs.importers.map_parts import MapContext, RoadMap, Terrain
 from egvs.importers.map_readers import MapFile
 from egvs.importers.openstreetmap import OsmRoads
 from egvs.importers.road_source import NetworkRoads, RoadSource
+
+_MARGIN_M = 10.0
 
 _LARGE_SPREAD_M = 1.0
 """A terrain whose difference from the roads varies by more than this may be another place or an old survey."""
@@ -47,6 +50,13 @@ def read_terrain(files: Sequence[MapFile], context: MapContext) -> Terrain | Non
     if not terrains:
         return None
     return terrains[0] if len(terrains) == 1 else CombinedTerrain(terrains)
+
+
+def with_roads(context: MapContext, streets: Streets) -> MapContext:
+    """Return a context whose window also covers all roads."""
+    corners_m = np.array([area.bounds for area in streets.areas.values() if not area.is_empty])
+    low_m, high_m = corners_m[:, :2].min(axis=0), corners_m[:, 2:].max(axis=0)
+    return replace(context, window=context.window.union(box(*low_m, *high_m).buffer(_MARGIN_M)))
 
 
 def find_zero(roads: RoadSource, file: MapFile, junction: StreetJunction, terrain: Terrain | None) -> ZeroHeight:

@@ -239,13 +239,12 @@ def create_scenario(
     frame = level.streets.frame
     alignment = make_alignment(options.align, frame) if options.align else None
     context = MapContext(frame, window, alignment, level.streets)
-    terrain = ground_reference.read_terrain(files.terrain, context)
-    zero = ground_reference.find_zero(level, files.roads, junction, terrain)
+    roads = level.around(junction, options.surroundings_m)
+    terrain = ground_reference.read_terrain(files.terrain, ground_reference.with_roads(context, roads.streets))
+    zero = ground_reference.find_zero(roads, files.roads, junction, terrain)
     objects = static_objects.collect_objects(
         files.solids, level, files.roads, context, junction.at_m, zero.height_m
     )  # fmt: skip
-
-    roads = level.around(junction, options.surroundings_m)
     roads = ground_reference.lay_on_ground(roads, files.roads, junction, terrain)
     if roads.streets is not level.streets:
         junction = _require_junction(junctions.find_again(roads.streets, junction, junction.at_m), files.roads.path)
@@ -289,9 +288,7 @@ def create_scenario(
         SITES_FILE: scenario_files.sites_csv(poles, relief.ground_m(streets, poles)),
         **meshes,
         **terrain_files,
-        SCENARIO_FILE: _scenario_toml(
-            name, scenario, relief, scenario_files.statics_table(list(meshes), *terrain_files)
-        ),
+        SCENARIO_FILE: _scenario_toml(name, scenario, relief, statics),
     }
     scenario_files.publish_folder(folder, contents.items(), load)
     return scenario
