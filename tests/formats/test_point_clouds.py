@@ -337,7 +337,10 @@ def test_rejects_laz_that_needs_more_memory_than_the_limit(tmp_path: Path) -> No
     path, _ = las(tmp_path, "a.laz")
     points_at = struct.unpack_from("<I", path.read_bytes(), 96)[0]
     overwrite(path, points_at + 8 + 30 + 4 + 7 * 4, b"\xff\xff\xff\xf0")
-    message = r"its reader was killed by signal 6: it needed too much memory\)\. The limit is 2,000 MB; set EGVS_MAX_READER_MB"
+    message = (
+        r"its reader was killed by signal 6: it needed too much memory\)\. "
+        r"The limit is 2,000 MB; set EGVS_MAX_READER_MB"
+    )
     with pytest.raises(InputError, match=message):
         read_points(path, "")
 
