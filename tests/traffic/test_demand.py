@@ -286,7 +286,12 @@ def test_trips_follow_shares_lanes_and_minimum_length(town):
 )
 def test_rejects_wrong_kind(kind, message):
     with pytest.raises(InputError, match=message):
-        demand.check_kinds([kind], sumo.vehicle_classes(), "place")
+        demand.check_kinds([kind], "place")
+
+
+def test_common_vehicle_classes_are_those_of_sumo():
+    assert sumo.vehicle_classes() > sumo.COMMON_VEHICLE_CLASSES
+    assert sumo.is_vehicle_class("tram") and not sumo.is_vehicle_class("car")
 
 
 def test_attributes_of_a_kind_override_defaults():

@@ -154,22 +154,20 @@ class CountLocation:
         return f'    <edgeRelation from={first} to={last} count="{vehicles}"/>'
 
 
-def check_kinds(kinds: Sequence[VehicleKind], vehicle_classes: frozenset[str], where: str) -> None:
+def check_kinds(kinds: Sequence[VehicleKind], where: str) -> None:
     """Raise an InputError for an unknown vClass, or attributes that contradict the keys of the kind.
 
     Parameters
     ----------
     kinds
         The fleet.
-    vehicle_classes
-        SUMO's vClasses.
     where
         The traffic table, for messages.
     """
     for kind in kinds:
-        if kind.vclass not in vehicle_classes:
+        if not sumo.is_vehicle_class(kind.vclass):
             problem = f"kind {kind.name!r} has the unknown vClass {kind.vclass!r}"
-            raise InputError(f"{where}.kinds", problem, f"Use one of {', '.join(sorted(vehicle_classes))}.")
+            raise InputError(f"{where}.kinds", problem, f"Use one of {', '.join(sorted(sumo.vehicle_classes()))}.")
         reserved = sorted(_KIND_KEYS & kind.attributes.keys())
         if reserved:
             problem = f"kind {kind.name!r} has {', '.join(reserved)} among its attributes"
@@ -330,7 +328,7 @@ def _reachable_pairs(
     goes_back = np.array([[target.to_node == origin.from_node for target in targets] for origin in origins])
     start_m = np.array([edge.start_m for edge in origins])
     end_m = np.array([edge.end_m for edge in targets])
-    is_far = np.hypot(*(end_m - start_m[:, None]).T).T >= min_trip_m
+    is_far = min_trip_m <= np.hypot(*(end_m - start_m[:, None]).T).T
     is_pair = is_reached & is_far & ~goes_back & (sources[:, None] != sinks)
     source, sink = np.nonzero(is_pair)
     return np.column_stack([sources[source], sinks[sink]]).astype(np.int64)
