@@ -27,7 +27,7 @@ from benchmarks.start_up import SCENARIO
 
 ROOT = Path(__file__).resolve().parent.parent
 MARKS = ("<!-- first scan -->", "<!-- end of first scan -->")
-STARTS = 7
+STARTS = 3
 
 CODE = """
 import json, sys, time
