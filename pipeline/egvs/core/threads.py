@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from contextvars import ContextVar, copy_context
+from contextvars import ContextVar
 from typing import TypeVar
 
 Item = TypeVar("Item")
@@ -34,29 +34,6 @@ def map_ordered(work: Callable[[Item], Result], items: Iterable[Item], threads: 
         finally:
             for future in running:
                 future.cancel()
-
-
-@contextmanager
-def compute_beside(work: Callable[[], Result], threads: int) -> Iterator[Callable[[], Result]]:
-    """Compute something on another thread during the block, in the same context, if there is more than one.
-
-    Parameters
-    ----------
-    work
-        Returns the result.
-    threads
-        Number of threads; with one, ``work`` is called when its result is needed.
-
-    Yields
-    ------
-    callable
-        Waits for the result, and returns it.
-    """
-    if threads == 1:
-        yield work
-        return
-    with ThreadPoolExecutor(1) as pool:
-        yield pool.submit(copy_context().run, work).result
 
 
 def thread_count(jobs: int | None) -> int:

@@ -23,7 +23,7 @@ from egvs.artefacts.tpog import PeriodBlocks, Tpog, read_periods, read_tpog
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.errors import Diagnostic, InputError
 from egvs.core.grid import FloatArray, Grid
-from egvs.core.threads import compute_beside, map_ordered
+from egvs.core.threads import map_ordered
 from egvs.kernels import occupancy, traversal
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.score_config import DEFAULT_SCORE
@@ -281,17 +281,10 @@ class SiteScoring:
         self._audit = audit
         self._keep_visibility = config.keep_visibility
         self.tpog = read_tpog(path)
-        with compute_beside(self._read_targets, context.threads) as read_targets:
-            self.leave_out = BlockJackknife.of(path, self.tpog) if config.standard_error else None
-            self.periods = _read_period_tpogs(path, standard_errors=config.standard_error)
-            self.scorer = Scorer(context.scene, self.tpog, context.folder.trajectories, self.leave_out, self.periods)
-            self.targets = read_targets()
-
-    def _read_targets(self) -> TargetScorer | None:
-        if not self.context.scenario.score.needs_vehicles:
-            return None
-        with parquet.share_open_files():  # not those of another thread
-            return TargetScorer(self.context, self.tpog.grid)
+        self.leave_out = BlockJackknife.of(path, self.tpog) if config.standard_error else None
+        self.periods = _read_period_tpogs(path, standard_errors=config.standard_error)
+        self.scorer = Scorer(context.scene, self.tpog, context.folder.trajectories, self.leave_out, self.periods)
+        self.targets = TargetScorer(context, self.tpog.grid) if context.scenario.score.needs_vehicles else None
 
     @property
     def names(self) -> tuple[str, ...]:
