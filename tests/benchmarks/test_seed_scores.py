@@ -53,7 +53,8 @@ def test_failing_seeds_are_reported_and_left_out(mini: Path, tmp_path: Path) -> 
 @pytest.mark.slow
 @pytest.mark.system
 def test_step_trial_has_the_shares_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    traffic = ("traffic.frames=20", "traffic.warmup_s=5", 'traffic.hold="at_most"', "tpog.blocks=4")
+    few = ("traffic.frames=20", "traffic.warmup_s=60", 'traffic.hold="at_most"', "tpog.blocks=4")
+    traffic = (*few, 'score.rank_by="egvs"')
     egvs.run(egvs.load(steps.SCENARIO, [*traffic, "seed=7", "traffic.step_s=0.25"]), tmp_path / "run")
     scores = egvs.read_scores(tmp_path / "run" / "scores.parquet").to_pandas()
     monkeypatch.setattr(steps, "TRAFFIC", traffic)
