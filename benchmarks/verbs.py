@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import re
 import shutil
 import signal
 import statistics
@@ -28,14 +27,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks import page_tables
+from benchmarks.page_tables import Cells
+
 ROOT = Path(__file__).resolve().parent.parent
 SCENARIO = ROOT / "scenarios" / "roundabout"
 EXTRACT = ROOT / "tests" / "importers" / "data" / "small.osm"
 MARKS = ("<!-- verbs -->", "<!-- end of verbs -->")
 HEADINGS = ("command", "cold s", "warm s", "up to date s")
-
-Cells = tuple[str, ...]
-"""A row of the table as text, in the order of :data:`HEADINGS`."""
 
 REPEATS = 3
 """A quick command is measured so often, and the median counts."""
@@ -239,43 +238,25 @@ def merge_rows(table: str, measured: Iterable[Row]) -> list[Cells]:
     measured
         New rows; each replaces that of the same command.
     """
-    rows = {}
-    for line in table.splitlines():
-        cells = tuple(cell.strip() for cell in line.strip("| ").split(" | "))
-        if len(cells) == len(HEADINGS):
-            rows[cells[0]] = cells
-    rows |= {row.cells()[0]: row.cells() for row in measured}
+    old = page_tables.read_rows(table, len(HEADINGS))
+    rows = {cells[0]: cells for cells in page_tables.merge_rows(old, [row.cells() for row in measured])}
     commands = (f"`egvs {verb.command_line}`" for verb in VERBS)
     return [rows[command] for command in commands if command in rows]
 
 
 def markdown(rows: Sequence[Cells]) -> str:
     """Return the rows as a Markdown table, with a sentence about the commands of :data:`VERBS` that have none."""
-    lines = ["| " + " | ".join(HEADINGS) + " |", "|---|---:|---:|---:|"]
-    lines += ["| " + " | ".join(cells) + " |" for cells in rows]
+    text = page_tables.format_table(HEADINGS, rows)
     commands = {cells[0] for cells in rows}
     missing = [f"`egvs {verb.name}`" for verb in VERBS if f"`egvs {verb.command_line}`" not in commands]
     if missing:
-        lines += ["", f"Not measured: {', '.join(missing)}."]
-    return "\n".join(lines)
+        text += f"\n\nNot measured: {', '.join(missing)}."
+    return text
 
 
 def update_page(page: Path, measured: Iterable[Row]) -> None:
-    """Replace the rows of the measured commands in the table between the marks of a page.
-
-    Raises
-    ------
-    ValueError
-        Unless the page has one pair of marks.
-    """
-    start, end = MARKS
-    text = page.read_text(encoding="utf-8")
-    tables = re.findall(f"{re.escape(start)}(.*?){re.escape(end)}", text, flags=re.DOTALL)
-    if len(tables) != 1:
-        raise ValueError(f"{page}: expected one pair of marks {' '.join(MARKS)}, got {len(tables)}")
-    before, _, rest = text.partition(start)
-    table, _, after = rest.partition(end)
-    page.write_text(f"{before}{start}\n{markdown(merge_rows(table, measured))}\n{end}{after}", encoding="utf-8")
+    """Replace the rows of the measured commands in the table between the marks of a page."""
+    page_tables.replace_between(page, MARKS, lambda table: markdown(merge_rows(table, measured)))
 
 
 def main(arguments: list[str] | None = None) -> None:
