@@ -18,6 +18,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,7 +46,7 @@ FOLDER = ROOT / "runs" / "decisions"
 DATA = ROOT / "docs" / "data" / "predicted_loss.csv"
 DETECTOR = "cluster"
 FRAMES = 250
-"""Frames of a validation."""
+"""Frames in which a detector looks for vehicles."""
 
 SEEDS = 4
 """Seeds of the traffic that predictions are from."""
@@ -160,7 +161,7 @@ def run_area(path: Path, folder: Path, page: Path | None) -> None:
 
 DETECTOR_MARKS = ("<!-- predicted and measured loss -->", "<!-- end of predicted and measured loss -->")
 DETECTOR_HEADINGS = (
-    "scenario", "detector", "mounts", "AP per point", "correlation", "chosen", "loss of AP", "best by AP",
+    "scenario", "detector", "frames", "mounts", "AP per point", "correlation", "chosen", "loss of AP", "best by AP",
     "predicted loss",
 )  # fmt: skip
 DATA_COLUMNS = (
@@ -225,15 +226,15 @@ def regression(losses: Sequence[MountLoss]) -> tuple[float, float]:
     return float(x @ y / (x @ x)), float(np.corrcoef(x, y)[0, 1])
 
 
-def detector_cells(name: str, detector: str, losses: Sequence[MountLoss]) -> Cells:
-    """Return the row of a scenario and a detector."""
+def detector_cells(name: str, detector: str, frames: int, losses: Sequence[MountLoss]) -> Cells:
+    """Return the row of a scenario and a detector, which saw ``frames`` frames."""
     slope, correlation = regression(losses)
     chosen, best = losses[0], max(losses, key=lambda loss: loss.ap)
     lost = 100.0 * (best.ap - chosen.ap)
     lost_se = 100.0 * math.hypot(best.ap_se, chosen.ap_se) if best is not chosen else 0.0
     predicted = f"{best.predicted_points:z.1f} ± {best.predicted_se_points:.1f}"
     return (
-        name, f"`{detector}`", str(len(losses)), f"{slope:.2f}", f"{correlation:.2f}", chosen.mount,
+        name, f"`{detector}`", f"{frames:,}", str(len(losses)), f"{slope:.2f}", f"{correlation:.2f}", chosen.mount,
         f"{lost:z.1f} ± {lost_se:.1f}", best.mount, predicted,
     )  # fmt: skip
 
@@ -251,16 +252,24 @@ def predict_found(path: Path, folder: Path) -> dict[str, FloatArray]:
     return {mount: np.array([shares[mount] for shares in by_seed]) for mount in by_seed[0]}
 
 
-def measure_ap(path: Path, folder: Path) -> dict[str, tuple[float, float]]:
-    """Return AP at IoU 0.7, mean of BEV and 3D, of each mount, and validate the scenario unless the folder has that."""
+class DetectorResults(NamedTuple):
+    """Number of frames, and AP at IoU 0.7 (mean of BEV and 3D) of each mount with its standard error, 0 to 1."""
+
+    frames: int
+    ap: dict[str, tuple[float, float]]
+
+
+def measure_ap(path: Path, folder: Path, frames: int) -> DetectorResults:
+    """Return what a detector finds from each mount; the scenario is validated unless the folder has that already."""
     scenario = egvs.load(path, [f"score.rank_by={DEFAULT_SCORE}"])
     out = folder / scenario.name
     detection = RunFolder(out).detection
     if not detection.is_file():
-        validate_sites(scenario, out, sampling=FrameSampling(FRAMES, None), detectors=(DETECTOR,))
+        validate_sites(scenario, out, sampling=FrameSampling(frames, None), detectors=(DETECTOR,))
     rows = parquet.read_artefact(detection, "detection")[0].to_pylist()
     chosen = [row for row in rows if row["detector"] == DETECTOR and row["objects_of"] == "vehicles"]
-    return {row["site"]: (row["ap_mean_r40_iou70"], row["ap_mean_r40_iou70_se"]) for row in chosen}
+    ap = {row["site"]: (row["ap_mean_r40_iou70"], row["ap_mean_r40_iou70_se"]) for row in chosen}
+    return DetectorResults(chosen[0]["frames"], ap)
 
 
 def write_losses(name: str, losses: Sequence[MountLoss]) -> None:
@@ -287,15 +296,17 @@ def write_losses(name: str, losses: Sequence[MountLoss]) -> None:
     files.write_text(DATA, text.getvalue())
 
 
-def run_detectors(paths: Sequence[Path], folder: Path, page: Path | None) -> None:
+def run_detectors(paths: Sequence[Path], folder: Path, page: Path | None, frames: int) -> None:
     """Compare predicted and measured losses at scenarios."""
     for path in paths:
         name = egvs.load(path).name
-        losses = mount_losses(predict_found(path, folder), measure_ap(path, folder))
-        cells = detector_cells(name, DETECTOR, losses)
+        found = predict_found(path, folder)
+        detected = measure_ap(path, folder, frames)
+        losses = mount_losses(found, detected.ap)
+        cells = detector_cells(name, DETECTOR, detected.frames, losses)
         if page is not None:
             write_losses(name, losses)
-        write_rows(page, DETECTOR_MARKS, DETECTOR_HEADINGS, [cells], key_columns=2, text_columns=(0, 1, 5, 7))
+        write_rows(page, DETECTOR_MARKS, DETECTOR_HEADINGS, [cells], key_columns=2, text_columns=(0, 1, 6, 8))
 
 
 # ---- all
@@ -329,13 +340,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("what", choices=("scenarios", "area", "detectors"))
     parser.add_argument("scenarios", nargs="+", type=Path, metavar="SCENARIO")
     parser.add_argument("--folder", type=Path, default=FOLDER, help="intermediate results (default runs/decisions)")
+    parser.add_argument("--frames", type=int, default=FRAMES, help="frames for the detector (default %(default)s)")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the rows to this page")
     options = parser.parse_args(arguments)
     options.folder.mkdir(parents=True, exist_ok=True)
     if options.what == "scenarios":
         run_scenarios(options.scenarios, options.folder, options.markdown)
     elif options.what == "detectors":
-        run_detectors(options.scenarios, options.folder, options.markdown)
+        run_detectors(options.scenarios, options.folder, options.markdown, options.frames)
     else:
         for path in options.scenarios:
             run_area(path, options.folder, options.markdown)

@@ -41,8 +41,8 @@ def test_slope_and_correlation_by_hand() -> None:
 
 
 def test_row_of_a_detector_has_what_the_chosen_mount_loses() -> None:
-    cells = decision_costs.detector_cells("mini", "cluster", decision_costs.mount_losses(FOUND, AP))
-    assert cells == ("mini", "`cluster`", "3", "0.70", "0.76", "b", "10.0 ± 5.0", "a", "20.0 ± 20.0")
+    cells = decision_costs.detector_cells("mini", "cluster", 1000, decision_costs.mount_losses(FOUND, AP))
+    assert cells == ("mini", "`cluster`", "1,000", "3", "0.70", "0.76", "b", "10.0 ± 5.0", "a", "20.0 ± 20.0")
 
 
 def test_losses_of_other_scenarios_stay_in_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
