@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -63,8 +64,9 @@ def test_what_takes_longer_takes_longer() -> None:
     assert 0.0 <= seconds["short"] < seconds["long"]
 
 
+@pytest.mark.system  # taichi starts a process
 @pytest.mark.parametrize(("module", "make"), [peers.COUNTS["taichi"], peers.COUNTS["octomap, insertion of the scan"]])
-def test_a_traversal_of_a_peer_is_nearly_ours(tmp_path: Path, module: str, make) -> None:
+def test_a_traversal_of_a_peer_is_nearly_ours(tmp_path: Path, module: str, make: Any) -> None:
     pytest.importorskip(module, reason=f"{module} is a peer of make bench-peers, which nothing else needs")
     junction = peers.Junction.load(write_mini(tmp_path / "mini"), sites=1)
     result = make(junction)(junction.sites[0])

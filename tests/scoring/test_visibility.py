@@ -99,7 +99,15 @@ def test_a_smooth_function_is_evaluated_seldom_and_a_rough_one_for_each_voxel() 
         assert tried == (1 if name != "narrow bands" else 3)
 
 
-def thin_by_hand(hits, unit, o, cubics, cells, near, per_voxel):  # type: ignore[no-untyped-def]
+def thin_by_hand(
+    hits: np.ndarray,
+    unit: int,
+    o: np.ndarray,
+    cubics: np.ndarray,
+    cells: np.ndarray,
+    near: float,
+    per_voxel: float,
+) -> list[int]:
     """The formula of the kernel, voxel by voxel in Python's floats, which are those of the kernel."""
     result = []
     for cell in cells.tolist():
