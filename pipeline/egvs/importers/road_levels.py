@@ -27,8 +27,9 @@ from functools import cached_property
 from shapely.geometry import LineString, MultiPoint, Point
 from shapely.geometry.base import BaseGeometry
 
+from egvs.core.grid import XY
 from egvs.formats.osm import OsmExtract, Tags, Way, parse_number
-from egvs.importers.junctions import XY, StreetJunction, Streets
+from egvs.importers.junctions import StreetJunction, Streets
 from egvs.importers.osm_network import is_road
 
 MARGIN_M = 20.0
