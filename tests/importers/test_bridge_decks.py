@@ -43,7 +43,7 @@ def test_slab_of_a_bend_is_closed() -> None:
 
 
 def test_only_stretches_above_the_clearance_have_a_deck() -> None:
-    """The lane is level at z = 0; the ground falls below it by 10 m between x = 40 and 60, and is unknown after 200 m."""
+    """The lane is level at z = 0; the ground falls below it by 10 m between x = 40 and 60; unknown after 200 m."""
     ditch = Function(lambda x, y: np.where(x > 200, np.nan, np.where((x > 40) & (x < 60), 90.0, 100.0)))
     (deck,) = bridge_decks(LANE.format("0,0 300,0", 3), ditch, 100.0)
     assert solid(deck).bounds[:, 0].tolist() == [40, 60]  # one sample into the ground at each end

@@ -144,6 +144,20 @@ def test_signals_become_lights_and_signs_are_counted(tmp_path: Path) -> None:
 
 
 @pytest.mark.system
+def test_road_over_another_is_reported(tmp_path: Path) -> None:
+    """Road 2 crosses road 1 in its middle, 6 m higher."""
+    one_way = section([lane(-1)])
+    high = '<elevation s="0" a="6" b="0" c="0" d="0"/>'
+    low = road("1", 100, geometry(0, 0, 0, 100), one_way)
+    over = road("2", 100, geometry(50, -50, math.pi / 2, 100), one_way, elevation=high)
+    road_map, roads = convert(tmp_path, maps.opendrive(low, over))
+    assert any("1 times roads lead over others: -2 over -1." in note for note in road_map.notes)
+    assert not {"-1", "-2"} & {c for pair in turns(roads) for c in pair}
+    flat = maps.opendrive(low, over.replace('a="6"', 'a="1"'))
+    assert not any("lead over" in note for note in convert(tmp_path, flat)[0].notes)
+
+
+@pytest.mark.system
 @pytest.mark.parametrize("heading", [0.0, 0.5])
 def test_header_offset_places_the_map(heading: float, tmp_path: Path) -> None:
     """Its heading and z, which netconvert ignores, count as well."""

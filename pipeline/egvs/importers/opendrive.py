@@ -23,7 +23,7 @@ from egvs.core.errors import InputError
 from egvs.formats import georeference, opendrive
 from egvs.formats.opendrive import OpenDriveMap, Road
 from egvs.formats.opendrive_copy import CopyOptions, write_copy
-from egvs.importers import network_heights
+from egvs.importers import draping, network_heights
 from egvs.importers.map_parts import RoadMap, RoadOptions
 from egvs.importers.opendrive_check import (
     HEIGHT_OFF_M,
@@ -115,6 +115,8 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
     if any(road_map.offset_m) and not reference:
         notes += ("The header's offset is left out, since it refers to an unknown reference system.",)
     has_heights = bool(height_m) or any(_has_relief(road) for road in road_map.roads.values())
+    if has_heights:
+        notes += _level_notes(text)
     return RoadMap(text, notes=(*notes, *_map_notes(road_map)), has_heights=has_heights)
 
 
@@ -268,6 +270,17 @@ def _map_notes(road_map: OpenDriveMap) -> tuple[str, ...]:
     if signs:
         notes.append(f"{signs} signs and marks are left out.")
     return tuple(notes)
+
+
+def _level_notes(network_text: str) -> tuple[str, ...]:
+    """Return a sentence on roads that lead over others."""
+    pairs = draping.roads_above_others(network_text)
+    if not pairs:
+        return ()
+    listed = _listed(f"{upper} over {lower}" for upper, lower in pairs)
+    return (
+        f"{len(pairs)} times roads lead over others: {listed}. Without a terrain, the ground rises to the upper one.",
+    )
 
 
 def _has_relief(road: Road) -> bool:
