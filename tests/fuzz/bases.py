@@ -124,6 +124,17 @@ def drawn(folder: Path) -> None:
     _simulated(folder, 'network = "net.net.xml"')
 
 
+def terrain(folder: Path) -> None:
+    """The same, in a hollow: points of the ground beyond the roads."""
+    made = _simulated(folder, 'network = "net.net.xml"')
+    text = (made / "scenario.toml").read_text()
+    (made / "scenario.toml").write_text(text.replace("[statics]\n", '[statics]\nterrain = "terrain.ply"\n'))
+    lines = [f"{x} {y} {max(abs(x - 100), abs(y - 100)) / 50}" for x in range(0, 201, 20) for y in range(0, 201, 20)]
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(lines)}\n"
+    properties = "".join(f"property double {axis}\n" for axis in "xyz")
+    (made / "terrain.ply").write_text(head + properties + "end_header\n" + "\n".join(lines) + "\n")
+
+
 def drawn_gz(folder: Path) -> None:
     """The same, gzipped."""
     made = _simulated(folder, 'network = "net.net.xml.gz"')

@@ -108,6 +108,7 @@ _ALL = (
     _input("mesh.glb", "house.glb", bases.mesh("house.glb"), meaning.glb),
     _input("mesh.stl", "house.stl", bases.mesh("house.stl"), meaning.stl),
     _input("mesh.ply", "house.ply", bases.mesh("house.ply"), meaning.ply),
+    Kind("terrain.ply", "scenario/terrain.ply", bases.terrain, meaning.ply, results=("out/statics.ply",)),
     _input("sites.csv", "sites.csv", bases.plain, meaning.rows),
     _input("sites.geojson", "sites.geojson", bases.sites, meaning.text_json),
     _input("beams.csv", "beams.csv", bases.beams, meaning.rows),
