@@ -172,7 +172,8 @@ class NetworkBuilder:
         for key, other in (("changeLeft", left), ("changeRight", right)):
             if 0 <= other < len(road.lanes) and other not in self.lane_changes.to_lanes[road.id, index]:
                 attributes[key] = _NO_CHANGE
-        return PlainElement("lane", attributes)
+        origin = PlainElement("param", {"key": "origId", "value": str(lane.key.id)})
+        return PlainElement("lane", attributes, (origin,))
 
     def _connections(self) -> Iterator[PlainElement]:
         turns = self._layout.turns
