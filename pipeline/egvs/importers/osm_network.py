@@ -26,7 +26,7 @@ from shapely.geometry.base import BaseGeometry
 from egvs.core import files
 from egvs.core.errors import InputError, RunError
 from egvs.formats import xml
-from egvs.formats.osm import OsmExtract, Way, write_streets
+from egvs.formats.osm import OsmExtract, Way, parse_number, write_streets
 from egvs.importers import junctions
 from egvs.importers.junctions import XY, StreetJunction, Streets
 from egvs.traffic import sumo, sumo_folder
@@ -228,7 +228,8 @@ def cut_surroundings(extract: OsmExtract, middle: tuple[float, float], radius_m:
         next_id += max(0, len(pieces) - 1)
         ways |= pieces
 
-    inside = replace(extract, nodes=extract.nodes | circle.cuts, ways=dict(sorted(ways.items())))
+    node_tags = dict(sorted((extract.node_tags | circle.cut_tags).items()))
+    inside = replace(extract, nodes=extract.nodes | circle.cuts, node_tags=node_tags, ways=dict(sorted(ways.items())))
     connected = _connected_roads(inside, circle)
     return replace(inside, ways={i: way for i, way in inside.ways.items() if i in connected or not is_road(way)})
 
@@ -290,6 +291,8 @@ class _Circle:
         self._shrink = math.cos(math.radians(self._lat_deg))
         self._next_id = max(extract.nodes) + 1
         self.cuts: dict[int, tuple[float, float]] = {}
+        self.cut_tags: dict[int, dict[str, str]] = {}
+        self._tags = extract.node_tags
 
     def at_m(self, node: int) -> XY:
         """Metres east and north of the middle."""
@@ -318,8 +321,17 @@ class _Circle:
         for sign in (-1.0, 1.0):
             t = (-b + sign * math.sqrt(discriminant)) / a
             if 0.0 < t < 1.0:
-                nodes.append(self._add_cut(x0 + t * dx, y0 + t * dy))
+                node = self._add_cut(x0 + t * dx, y0 + t * dy)
+                self._interpolate_height(node, start, end, t)
+                nodes.append(node)
         return nodes
+
+    def _interpolate_height(self, node: int, start: int, end: int, t: float) -> None:
+        """Give a new node a height (``ele``) if both of its neighbours have one."""
+        heights_m = [parse_number(self._tags.get(neighbour, {}).get("ele", "")) for neighbour in (start, end)]
+        before_m, after_m = heights_m
+        if before_m is not None and after_m is not None:
+            self.cut_tags[node] = {"ele": f"{before_m + t * (after_m - before_m):.3f}"}
 
     def _add_cut(self, x_m: float, y_m: float) -> int:
         lat_deg = self._lat_deg + math.degrees(y_m / EARTH_M)
