@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
@@ -201,8 +202,19 @@ class WrittenNetwork:
     turns: set[tuple[str, str]]
 
 
-def write_network(network: Network) -> WrittenNetwork:
-    """Make a map of the lanes for cars of a network, and of its connections."""
+def internal_lanes(net_xml: str) -> dict[str, str]:
+    """Return the lane after each lane of a junction, from the text of a network."""
+    after = {}
+    for connection in ElementTree.fromstring(net_xml).iter("connection"):
+        if connection.attrib["from"].startswith(":"):
+            target = f"{connection.attrib['to']}_{connection.attrib['toLane']}"
+            source = f"{connection.attrib['from']}_{connection.attrib['fromLane']}"
+            after[source] = connection.get("via", target)
+    return after
+
+
+def write_network(network: Network, net_xml: str) -> WrittenNetwork:
+    """Make a map of the lanes for cars of a network, given also as text, and of its connections."""
     writer = MapWriter()
     lane_of: dict[int, str] = {}
     corners: dict[str, tuple[Line, Line]] = {}
@@ -218,7 +230,7 @@ def write_network(network: Network) -> WrittenNetwork:
             ends = bounds_m[position + 1], bounds_m[position]
             corners[f"{edge.id}_{index}"] = ends[::-1] if _drives_left(network) else ends
     turns = set()
-    following = dict(network.lane_links)
+    following = internal_lanes(net_xml)
     shapes = {f"{edge.id}_{i}": lane.shape_m for edge in network.all_edges for i, lane in enumerate(edge.lanes)}
     for connection in network.connections:
         source = f"{network.edges[connection.source].id}_{connection.source_lane}"

@@ -24,7 +24,7 @@ from egvs.importers.map_parts import RoadMap, RoadOptions
 from egvs.traffic import sumo
 from egvs.traffic.capacity import find_capacity
 from egvs.traffic.network import Network, read_net_xml
-from tests.importers.lanelet2_maps import MapWriter, make_crossing, write_network
+from tests.importers.lanelet2_maps import MapWriter, internal_lanes, make_crossing, write_network
 
 ROOT = Path(__file__).parents[2]
 REAL = ROOT.parent / "shared" / "real"
@@ -117,7 +117,7 @@ def lane_errors_m(built: BuiltMap) -> dict[str, float]:
 
 def internal_errors_m(built: BuiltMap) -> list[float]:
     """Distance of the internal lanes of each connection from the centre lines of all lanelets together."""
-    following = dict(built.network.lane_links)
+    following = internal_lanes(built.roads.network)
     lines = shapely.MultiLineString([lanelet.center_m[:, :2] for lanelet in built.graph.lanelets.values()])
     errors = []
     for lane in built.connections.values():
@@ -457,6 +457,58 @@ def test_signalised_crossing_carries_traffic(tmp_path: Path) -> None:
     assert drive(built, tmp_path) == (50, 0, 0)
 
 
+def responses(built: BuiltMap) -> dict[tuple[str, str], set[tuple[str, str]]]:
+    """Which connections each connection of the junction yields to, by roads."""
+    junction = next(j for j in built.root.findall("junction") if j.attrib["id"].startswith("junction"))
+    first_lanes = junction.attrib["intLanes"].split()
+    following = internal_lanes(built.roads.network)
+    order = []
+    for (source, target), via in built.connections.items():
+        lanes = [via]
+        while following[lanes[-1]].startswith(":"):
+            lanes.append(following[lanes[-1]])
+        position = next(i for i, lane in enumerate(first_lanes) if lane in lanes)
+        order.append((position, (source[:-2], target[:-2])))
+    roads = [pair for _, pair in sorted(order)]
+    bits = [request.attrib["response"][::-1] for request in junction.findall("request")]
+    return {roads[i]: {roads[j] for j, bit in enumerate(row) if bit == "1"} for i, row in enumerate(bits)}
+
+
+def test_right_of_way_is_that_of_the_map(tmp_path: Path) -> None:
+    """Straight on from the north meets straight on from the east: the map decides who yields."""
+    ways = {}
+    for prior, yielding in ((0, 1), (1, 0)):
+        crossing = make_crossing()
+        members = [("relation", crossing.into[prior], "right_of_way"), ("relation", crossing.into[yielding], "yield")]
+        crossing.writer.regulation(members, "right_of_way")
+        built = build(crossing.writer.write(tmp_path / f"{prior}.osm"))
+        east = f"road_{crossing.into[0]}", f"road_{crossing.out_of[2]}"
+        north = f"road_{crossing.into[1]}", f"road_{crossing.out_of[3]}"
+        yields = responses(built)
+        ways[prior] = (north in yields[east], east in yields[north])
+        assert built.note("Right of way as the map states it")
+    assert ways == {0: (False, True), 1: (True, False)}
+
+
+def test_contradictory_and_unused_rules(tmp_path: Path) -> None:
+    crossing = make_crossing()
+    for prior, yielding in ((0, 1), (1, 0)):
+        members = [("relation", crossing.into[prior], "right_of_way"), ("relation", crossing.into[yielding], "yield")]
+        crossing.writer.regulation(members, "right_of_way")
+    members = [("relation", crossing.out_of[0], "right_of_way"), ("relation", crossing.out_of[1], "yield")]
+    unused = crossing.writer.regulation(members, "right_of_way")
+    built = build(crossing.writer.write(tmp_path / "map.osm"))
+    assert built.note("Rules of right of way between lanelets that do not meet").endswith(f"1 ({unused}).")
+    assert not [note for note in built.roads.notes if note.startswith("Right of way as")]
+
+
+def test_all_way_stop(tmp_path: Path) -> None:
+    crossing = make_crossing()
+    crossing.writer.regulation([("relation", crossing.into[arm], "yield") for arm in range(4)], "all_way_stop")
+    built = build(crossing.writer.write(tmp_path / "map.osm"))
+    assert [j.type for j in built.network.junctions if j.id.startswith("junction")] == ["allway_stop"]
+
+
 def test_map_without_roads_is_rejected(tmp_path: Path) -> None:
     writer = MapWriter()
     writer.lanelet(writer.line([[0, 3], [60, 3]]), writer.line([[0, 0], [60, 0]]), subtype="walkway")
@@ -543,8 +595,9 @@ def test_known_numbers_of_real_maps() -> None:
     ("name", "lanes", "turns"), [("roundabout", 20, 20), ("hill", 12, 12), ("nishishinjuku", 218, 264)]
 )
 def test_network_written_as_lanelet2_comes_back(name: str, lanes: int, turns: int, tmp_path: Path) -> None:
-    original = read_net_xml(ROOT / "scenarios" / name / "network.net.xml")
-    written = write_network(original)
+    path = ROOT / "scenarios" / name / "network.net.xml"
+    original = read_net_xml(path)
+    written = write_network(original, path.read_text(encoding="utf-8"))
     built = build(written.writer.write(tmp_path / "map.osm", local=True, turn_lines=1))
     shapes = {f"{edge.id}_{i}": lane.shape_m for edge in original.edges for i, lane in enumerate(edge.lanes)}
     speeds = {f"{edge.id}_{i}": lane.speed_m_s for edge in original.edges for i, lane in enumerate(edge.lanes)}

@@ -23,6 +23,7 @@ from egvs.importers.lanelet2_network import (
     NetworkQuality,
     unused_relations,
 )
+from egvs.importers.lanelet2_right_of_way import RightOfWay
 from egvs.importers.lanelet2_roads import RoadLayout, make_roads
 from egvs.importers.lanelet2_signals import SignalPlan, plan_signals
 from egvs.importers.map_parts import RoadMap, RoadOptions
@@ -70,6 +71,7 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
         *_content_notes(lanelet_map, graph, layout),
         *_assumption_notes(builder.assumed),
         *_signal_notes(signals),
+        *_right_of_way_notes(builder.right_of_way),
         *_problem_notes(lanelet_map, graph, layout),
         *_quality_notes(quality, builder.lane_changes.opened),
     )
@@ -121,6 +123,16 @@ def _signal_notes(signals: SignalPlan) -> Iterator[str]:
         )
     if signals.unused:
         yield f"Traffic lights that govern no lane in a junction, left out: {_count(signals.unused)}."
+
+
+def _right_of_way_notes(right_of_way: RightOfWay) -> Iterator[str]:
+    if right_of_way.prohibitions or right_of_way.all_way_stops:
+        yield (
+            f"Right of way as the map states it: {len(right_of_way.prohibitions)} pairs of connections, "
+            f"{len(right_of_way.all_way_stops)} junctions where all stop. Elsewhere, smaller roads give way."
+        )
+    if right_of_way.unused:
+        yield f"Rules of right of way between lanelets that do not meet, left out: {_count(right_of_way.unused)}."
 
 
 def _problem_notes(lanelet_map: LaneletMap, graph: LaneletGraph, layout: RoadLayout) -> Iterator[str]:

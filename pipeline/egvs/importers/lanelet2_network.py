@@ -24,6 +24,7 @@ from egvs.formats.lanelet2 import LaneletMap
 from egvs.importers import lanelet2_rules as rules
 from egvs.importers.lanelet2_lane_changes import find_lane_changes
 from egvs.importers.lanelet2_nodes import ATTEMPTS, NodeShapes, lane_errors_m
+from egvs.importers.lanelet2_right_of_way import find_right_of_way
 from egvs.importers.lanelet2_roads import Road, RoadLayout, Turn
 from egvs.importers.lanelet2_signals import SignalPlan
 from egvs.importers.plain_network import NETWORK_FILE, PlainElement, PlainNetwork, format_number, format_shape
@@ -109,12 +110,13 @@ class NetworkBuilder:
         self._lefthand = lefthand
         self._shapes = NodeShapes(layout)
         self.lane_changes = find_lane_changes(layout, lanelet_map, lefthand=lefthand)
+        self.right_of_way = find_right_of_way(layout, lanelet_map, signals.nodes)
         self.assumed = rules.Assumptions()
 
     def build(self) -> tuple[str, NetworkQuality]:
         """Return the text of the network, and how it differs from the map."""
         edges = [self._edge(road) for road in self._layout.roads.values()]
-        connections = list(self._connections())
+        connections = [*self._connections(), *self.right_of_way.elements()]
         signals = list(self._signals.elements)
         flags = ["--lefthand"] if self._lefthand else []
         attempts = dict.fromkeys(self._layout.nodes(), 0)
@@ -141,7 +143,7 @@ class NetworkBuilder:
         if node in self._signals.nodes:
             attributes |= {"type": "traffic_light", "tl": node}
         else:
-            attributes["type"] = "priority"
+            attributes["type"] = "allway_stop" if node in self.right_of_way.all_way_stops else "priority"
         attributes["shape"] = format_shape(shape, z)
         return PlainElement("node", attributes)
 
