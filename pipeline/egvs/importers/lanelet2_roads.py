@@ -6,7 +6,8 @@ Steps of :func:`make_roads`:
    another one, or have the tag ``turn_direction``.
 2. Where the map begins or ends inside a junction, a piece of the inner lanelet is cut off as a road.
 3. Roads are chains of neighbours among the rest; lane 0 is the one at the kerb.
-4. Nodes are groups of road ends and inner lanelets that follow each other, overlap, or share the end of a bound.
+4. Nodes are groups of road ends and inner lanelets that follow each other, overlap, or share the end of a bound, and of
+   road ends side by side where the map ends.
 5. A road that starts and ends in the same node becomes inner if it is short, and is cut in the middle otherwise;
    then the nodes are found again.
 6. Turns are the shortest paths through inner lanelets from lane to lane.
@@ -30,6 +31,7 @@ from shapely.geometry import Point
 
 from egvs.core.grid import FloatArray
 from egvs.formats.lanelet2_graph import DirectedLanelet, LaneletGraph, LaneletKey, split_lanelets
+from egvs.importers.lanelet2_arms import Groups, join_arms
 
 LEVEL_M = 3.0
 """Roads at least so far above each other do not meet."""
@@ -293,26 +295,6 @@ def _make_road(graph: LaneletGraph, chain: list[LaneletKey]) -> Road:
     return Road(name, tuple(graph.lanelets[key] for key in chain))
 
 
-class _Groups:
-    """Union-find: groups of things that are joined."""
-
-    def __init__(self) -> None:
-        self._parents: dict[object, object] = {}
-
-    def find(self, thing: object) -> object:
-        """Return the representative of a thing's group."""
-        root = thing
-        while (parent := self._parents.setdefault(root, root)) != root:
-            root = parent
-        while self._parents[thing] != root:
-            self._parents[thing], thing = root, self._parents[thing]
-        return root
-
-    def join(self, a: object, b: object) -> None:
-        """Make one group of two."""
-        self._parents[self.find(a)] = self.find(b)
-
-
 def _find_nodes(
     graph: LaneletGraph,
     roads: list[Road],
@@ -321,7 +303,7 @@ def _find_nodes(
 ) -> tuple[dict[tuple[str, str], str], dict[LaneletKey, str]]:
     """Return the node of each road end, ``(road, "start" or "end")``, and of each inner lanelet."""
     road_of = {lane.key: road.id for road in roads for lane in road.lanes}
-    groups = _Groups()
+    groups = Groups()
     for key, after in graph.followers.items():
         leaving: object = key if key in inner else (road_of[key], "end")
         for other in after:
@@ -332,6 +314,7 @@ def _find_nodes(
     for ends_at_point in _ends_by_point(graph, roads).values():
         for one_end, other_end in pairwise(ends_at_point):
             groups.join(one_end, other_end)
+    join_arms(graph, roads, groups)
 
     members: dict[object, list[LaneletKey]] = defaultdict(list)
     for key in sorted(inner):
