@@ -509,6 +509,101 @@ def test_all_way_stop(tmp_path: Path) -> None:
     assert [j.type for j in built.network.junctions if j.id.startswith("junction")] == ["allway_stop"]
 
 
+def crossing_with_zebras(tmp_path: Path, along_m: float, *, lights: bool = False, lefthand: bool = False) -> BuiltMap:
+    """A crossing with a crosswalk 4 m wide over each arm, ``along_m`` from the middle."""
+    crossing = make_crossing(lefthand=lefthand)
+    writer = crossing.writer
+    for arm in range(4):
+        u = np.array([np.cos(arm * np.pi / 2), np.sin(arm * np.pi / 2)])
+        v = np.array([-u[1], u[0]])
+        sides = [[along * u + side * v for side in (-4.5, 4.5)] for along in (along_m - 2, along_m + 2)]
+        writer.lanelet(writer.line(sides[0]), writer.line(sides[1]), subtype="crosswalk", one_way="no")
+        if lights:
+            light = writer.regulation([], "traffic_light")
+            writer.refer(crossing.into[arm], light)
+    return build(writer.write(tmp_path / "map.osm", local=True), walk=True)
+
+
+def crossings(built: BuiltMap) -> list[ElementTree.Element]:
+    return [edge for edge in built.root.findall("edge") if edge.get("function") == "crossing"]
+
+
+@pytest.mark.parametrize(("along_m", "lefthand"), [(15.0, False), (15.0, True), (10.0, False)])
+def test_crosswalks_at_a_junction(tmp_path: Path, along_m: float, lefthand: bool) -> None:
+    built = crossing_with_zebras(tmp_path, along_m, lefthand=lefthand)
+    assert len(crossings(built)) == 4
+    for edge in crossings(built):
+        assert len(edge.attrib["crossingEdges"].split()) == 2
+        (lane,) = edge.iter("lane")
+        points = np.array([[float(v) for v in p.split(",")[:2]] for p in lane.attrib["shape"].split()])
+        middle_m = np.abs(points.mean(axis=0))
+        assert sorted(np.round(middle_m, 1)) == [0.0, along_m]
+        assert float(lane.attrib["width"]) == pytest.approx(4.0)
+    assert {lane.is_sidewalk for edge in built.network.edges for lane in edge.lanes[:1]} == {True}
+    assert all(len(edge.lanes) == 2 for edge in built.network.edges)
+    assert len(built.connections) == 12
+    assert built.network.walkways.crossings == 4
+    # vehicles stop before the crosswalk
+    into = [edge for edge in built.network.edges if edge.to_node.startswith("junction")]
+    for edge in into:
+        assert np.hypot(*edge.lanes[1].shape_m[-1][:2]) >= (17.3 if along_m == 15.0 else 11.8)
+
+
+def test_crosswalk_amid_a_road_cuts_it(tmp_path: Path) -> None:
+    built = crossing_with_zebras(tmp_path, 50.0)
+    assert len(crossings(built)) == 4
+    assert len([j for j in built.network.junctions if j.id.startswith("junction")]) == 5
+    assert len(built.connections) == 12 + 8
+    lengths_m = sorted(edge.lanes[-1].length_m for edge in built.network.edges)
+    np.testing.assert_allclose(lengths_m, [19.5] * 8 + [35.5] * 8, atol=0.3)
+
+
+def test_crosswalks_at_lights_get_a_phase(tmp_path: Path) -> None:
+    built = crossing_with_zebras(tmp_path, 15.0, lights=True)
+    (logic,) = built.root.iter("tlLogic")
+    states = [phase.attrib["state"] for phase in logic]
+    assert {len(state) for state in states} == {8 + 4}
+    assert [state for state in states if "G" in state[8:]] == ["r" * 8 + "G" * 4]
+    links = [c.attrib["linkIndex"] for c in built.root.findall("connection") if c.get("tl") and "_c" in c.attrib["to"]]
+    assert sorted(map(int, links)) == [8, 9, 10, 11]
+    assert drive(built, tmp_path) == (50, 0, 0)
+
+
+def test_pedestrians_walk_over_crosswalks(tmp_path: Path) -> None:
+    built = crossing_with_zebras(tmp_path, 15.0)
+    tmp_path.joinpath("net.net.xml").write_text(built.roads.network, encoding="utf-8")
+    names = [edge.id for edge in built.network.edges]
+    persons = "".join(
+        f'<person id="{i}" depart="{i}"><walk from="{names[i % 8]}" to="{names[(i * 3 + 1) % 8]}"/></person>'
+        for i in range(40)
+    )
+    tmp_path.joinpath("walks.xml").write_text(f"<routes>{persons}</routes>", encoding="utf-8")
+    options = ["-n", "net.net.xml", "-r", "walks.xml", "-e", "1500", "--statistic-output", "statistics.xml"]
+    sumo.run_program("sumo", [*options, "--no-step-log", "--no-warnings"], tmp_path)
+    counts = ElementTree.parse(tmp_path / "statistics.xml").getroot().find("persons")
+    assert counts is not None
+    assert (counts.get("loaded"), counts.get("running"), counts.get("jammed")) == ("40", "0", "0")
+
+
+def test_without_crosswalks_there_are_no_sidewalks(tmp_path: Path) -> None:
+    built = build(make_crossing().writer.write(tmp_path / "map.osm"), walk=True)
+    assert built.note("The map has no crosswalk of complete streets")
+    assert all(len(edge.lanes) == 1 for edge in built.network.edges)
+
+
+def test_carriageways_that_leave_the_map_together_are_one_arm(tmp_path: Path) -> None:
+    def nodes(gap_m: float, height_m: float) -> int:
+        writer = MapWriter()
+        writer.lanelet(writer.line([[0, 3, 0], [100, 3, 0]]), writer.line([[0, 0, 0], [100, 0, 0]]))
+        y, z = 3 + gap_m, height_m
+        writer.lanelet(writer.line([[100, y, z], [0, y, z]]), writer.line([[100, y + 3, z], [0, y + 3, z]]))
+        return len(build(writer.write(tmp_path / "map.osm", local=True)).network.junctions)
+
+    assert nodes(5.0, 0.0) == 2
+    assert nodes(30.0, 0.0) == 4
+    assert nodes(5.0, 6.0) == 4
+
+
 def test_map_without_roads_is_rejected(tmp_path: Path) -> None:
     writer = MapWriter()
     writer.lanelet(writer.line([[0, 3], [60, 3]]), writer.line([[0, 0], [60, 0]]), subtype="walkway")
