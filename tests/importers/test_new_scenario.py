@@ -47,7 +47,8 @@ def collect(*maps: MapFile) -> static_objects.StaticObjects:
     """Collect objects around the roundabout, whose lanes lie within 50 m of 0, 0."""
     roads = NetworkRoads.read(sumo_network.read_roads(ROUNDABOUT, sumo_network.RoadOptions()), ROUNDABOUT)
     context = MapContext(None, box(-300, -300, 300, 300), streets=roads.streets)
-    return static_objects.collect_objects(maps, roads, MapFile(ROUNDABOUT, sumo_network), context, (0.0, 0.0))
+    read = static_objects.read_maps(maps, roads, MapFile(ROUNDABOUT, sumo_network), context)
+    return static_objects.collect_objects(read, roads.streets, (0.0, 0.0))
 
 
 def test_sumo_network_is_used_as_it_is(tmp_path: Path) -> None:

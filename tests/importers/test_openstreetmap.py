@@ -582,3 +582,11 @@ def test_rejects_surroundings_smaller_than_junction(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"--surroundings: expected at least 100 m, got 60 m"):
         create_scenario(tmp_path / "small", SMALL, surroundings_m=60.0)
     assert not (tmp_path / "small").exists()
+
+
+@pytest.mark.parametrize("lefthand", [False, True])
+def test_junction_is_where_the_map_puts_it(tmp_path: Path, lefthand: bool) -> None:
+    """netconvert writes a wrong offset of y for left-hand traffic in a given frame."""
+    made = create_scenario(tmp_path / "out", SMALL, (52.0, 10.0), lefthand=lefthand)
+    ((lon_deg, lat_deg),) = made.streets.to_degrees([made.junction.at_m])
+    assert (lat_deg, lon_deg) == pytest.approx((52.0, 10.0), abs=1e-4)

@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 import shapely
+from scipy.spatial import KDTree
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core import limits
@@ -98,6 +99,31 @@ class TinTerrain:
         np.minimum.at(heights, point, height)
         heights[np.isinf(heights)] = np.nan
         return heights
+
+
+@dataclass(frozen=True)
+class ExtendedTerrain:
+    """Triangles, and beyond them the height of the nearest vertex."""
+
+    terrain: TinTerrain
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences for the user."""
+        return self.terrain.notes
+
+    def height_m(self, xy_m: FloatArray) -> FloatArray:
+        """Return the heights (n,) of the ground at world-frame points (n, 2)."""
+        heights_m = self.terrain.height_m(xy_m)
+        beyond = np.flatnonzero(np.isnan(heights_m))
+        if len(beyond):
+            nearest = self._vertices.query(xy_m[beyond])[1]
+            heights_m[beyond] = self.terrain.vertices_m[nearest, 2]
+        return heights_m
+
+    @cached_property
+    def _vertices(self) -> KDTree:
+        return KDTree(self.terrain.vertices_m[:, :2])
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,9 @@ import numpy as np
 from shapely.geometry import box
 
 from egvs.importers import draping, network_heights, relief, sumo_network
-from egvs.importers.ground_heights import CombinedTerrain
+from egvs.importers.ground_heights import CombinedTerrain, ExtendedTerrain, TinTerrain
 from egvs.importers.junctions import StreetJunction, Streets
-from egvs.importers.map_parts import MapContext, RoadMap, Terrain
+from egvs.importers.map_parts import MapContext, MappedMesh, RoadMap, Terrain
 from egvs.importers.map_readers import MapFile
 from egvs.importers.openstreetmap import OsmRoads
 from egvs.importers.road_source import NetworkRoads, RoadSource
@@ -50,6 +50,12 @@ def read_terrain(files: Sequence[MapFile], context: MapContext) -> Terrain | Non
     if not terrains:
         return None
     return terrains[0] if len(terrains) == 1 else CombinedTerrain(terrains)
+
+
+def measured_ground(mesh: MappedMesh) -> Terrain:
+    """Return the ground of a point cloud; beyond it, that of its nearest point."""
+    note = "The ground is that of the point cloud; beyond the cloud it continues at the nearest height."
+    return ExtendedTerrain(TinTerrain(mesh.vertices_m, mesh.faces, (note,)))
 
 
 def with_roads(context: MapContext, streets: Streets) -> MapContext:

@@ -79,9 +79,6 @@ _MOST_NAMED = 3
 TERRAIN_STEP_M = 5.0
 """Distance of the points of the ground beyond the roads."""
 
-GROUND = "ground"
-"""The kind of meshes that are ground; the scenario has its own."""
-
 PEOPLE_HINT = (
     "pedestrians are added with --set effects.pedestrians_bicycles.pedestrians_per_h=300 (bicycles: bicycles_per_h)."
 )
@@ -240,11 +237,13 @@ def create_scenario(
     alignment = make_alignment(options.align, frame) if options.align else None
     context = MapContext(frame, window, alignment, level.streets)
     roads = level.around(junction, options.surroundings_m)
+    maps_read = static_objects.read_maps(files.solids, level, files.roads, context)
     terrain = ground_reference.read_terrain(files.terrain, ground_reference.with_roads(context, roads.streets))
+    measured = static_objects.ground_mesh(maps_read)
+    if terrain is None and measured is not None:
+        terrain = ground_reference.measured_ground(measured)
     zero = ground_reference.find_zero(roads, files.roads, junction, terrain)
-    objects = static_objects.collect_objects(
-        files.solids, level, files.roads, context, junction.at_m, zero.height_m
-    )  # fmt: skip
+    objects = static_objects.collect_objects(maps_read, level.streets, junction.at_m, zero.height_m)
     roads = ground_reference.lay_on_ground(roads, files.roads, junction, terrain)
     if roads.streets is not level.streets:
         junction = _require_junction(junctions.find_again(roads.streets, junction, junction.at_m), files.roads.path)
@@ -277,7 +276,7 @@ def create_scenario(
         folder, junction, roi, streets, len(poles), objects.counts, objects.n_solids + 1, assumed, tuple(notes),
         maps=objects.maps, attributions=_attributions(roads, objects), from_at_m=_distance_m(streets, junction, at),
     )  # fmt: skip
-    meshes = static_objects.mesh_files([mesh for mesh in objects.meshes if mesh.kind != GROUND])
+    meshes = static_objects.mesh_files([mesh for mesh in objects.meshes if mesh.kind != static_objects.GROUND])
     terrain_files = {}
     if terrain is not None:
         terrain_files[TERRAIN_FILE] = _terrain_writer(terrain, window, zero.height_m or 0.0)

@@ -1,9 +1,8 @@
 """Collect the static objects of a new scenario from all its maps.
 
 Footprints become ``statics.geojson``; meshes become one PLY file for each kind of object. Steps of
-:func:`collect_objects`: read each format (:mod:`egvs.importers.map_readers`); lower meshes whose heights count from sea
-level to the network's ground; drop buildings of OpenStreetMap where another map has one; cut footprints that cover the
-carriageway, and count meshes that do.
+:func:`collect_objects`: lower meshes whose heights count from sea level to the network's ground; drop buildings of
+OpenStreetMap where another map has one; cut footprints that cover the carriageway, and count meshes that do.
 
 World frame: x east, y north in metres; heights in metres above z = 0 of the network.
 """
@@ -42,7 +41,8 @@ _NEAREST_BASES = 20
 
 _LARGE_DIFFERENCE_M = 5.0
 
-_GROUND_KINDS = ("ground", "terrain")
+GROUND = "ground"
+"""The kind of meshes that are ground; it becomes the terrain of the scenario."""
 _LOW_M = 0.5
 """What is no higher above the ground than this does not hinder vehicles."""
 
@@ -100,19 +100,21 @@ class StaticObjects:
     @property
     def areas(self) -> list[BaseGeometry]:
         """The areas covered by all objects except the ground, seen from above; meshes by their convex hull."""
-        outlines = [outline(mesh) for mesh in self.meshes if mesh.kind not in _GROUND_KINDS]
+        outlines = [outline(mesh) for mesh in self.meshes if mesh.kind != GROUND]
         return [*(solid.area for solid in self.solids), *outlines]
 
 
-def collect_objects(
-    maps: Sequence[MapFile],
-    roads: RoadSource,
-    road_file: MapFile,
-    context: MapContext,
-    middle_m: XY,
-    zero_height_m: float | None = None,
-) -> StaticObjects:
-    """Collect the static objects of all maps.
+@dataclass(frozen=True)
+class ReadMap:
+    """The objects of the files of one reader, with heights as the files count them."""
+
+    paths: tuple[Path, ...]
+    reader: str
+    objects: SolidMap
+
+
+def read_maps(maps: Sequence[MapFile], roads: RoadSource, road_file: MapFile, context: MapContext) -> list[ReadMap]:
+    """Read the static objects of all maps, OpenStreetMap last.
 
     Parameters
     ----------
@@ -122,31 +124,55 @@ def collect_objects(
         The road map, read, and its file.
     context
         The world frame and the window.
-    middle_m
-        World-frame x, y of the junction.
-    zero_height_m
-        Height above sea level of z = 0; None if unknown.
 
     Raises
     ------
     InputError
         When a file is damaged.
     """
-    collected = StaticObjects()
+    read = []
     for group in _group_by_reader(maps):
         paths = tuple(file.path for file in group)
         reader = group[0].reader
-        if reader is not openstreetmap:
-            solid_map = _lower_to_ground(reader.read_solids(paths, context), middle_m, zero_height_m)
-            solid_map = _clear_of_carriageway(solid_map, roads.streets)
-        elif isinstance(roads, OsmRoads) and paths == (road_file.path,):
+        if isinstance(roads, OsmRoads) and paths == (road_file.path,):
             solids, counts = roads.solids(context.window)
-            solid_map = SolidMap(tuple(solids), counts=counts, attribution=roads.attribution)
+            objects = SolidMap(tuple(solids), counts=counts, attribution=roads.attribution)
         else:
-            solid_map = openstreetmap.read_solids(paths, context)
-        if reader is openstreetmap:
-            solid_map = _without_replaced(solid_map, collected)
-        collected = _add(collected, solid_map, paths, reader.NAME)
+            objects = reader.read_solids(paths, context)
+        read.append(ReadMap(paths, reader.NAME, objects))
+    return read
+
+
+def ground_mesh(maps: Sequence[ReadMap]) -> MappedMesh | None:
+    """Return the ground that a map has measured, as a point cloud does; None if there is none."""
+    meshes = (mesh for read in maps for mesh in read.objects.meshes)
+    return next((mesh for mesh in meshes if mesh.kind == GROUND), None)
+
+
+def collect_objects(
+    maps: Sequence[ReadMap], streets: Streets, middle_m: XY, zero_height_m: float | None = None
+) -> StaticObjects:
+    """Put the objects of all maps on the ground, and clear the carriageway.
+
+    Parameters
+    ----------
+    maps
+        From :func:`read_maps`.
+    streets
+        The carriageway.
+    middle_m
+        World-frame x, y of the junction.
+    zero_height_m
+        Height above sea level of z = 0; None if unknown.
+    """
+    collected = StaticObjects()
+    for read in maps:
+        if read.reader == openstreetmap.NAME:
+            objects = _without_replaced(read.objects, collected)  # the carriageway is clear already
+        else:
+            objects = _lower_to_ground(read.objects, middle_m, zero_height_m)
+            objects = _clear_of_carriageway(objects, streets)
+        collected = _add(collected, objects, read.paths, read.reader)
     return collected
 
 
@@ -243,7 +269,7 @@ def _clear_of_carriageway(solid_map: SolidMap, streets: Streets) -> SolidMap:
 
 def _blocks_lanes(mesh: MappedMesh, lanes: shapely.STRtree) -> bool:
     """Return whether a vertex of a mesh is above a lane, where vehicles drive."""
-    if mesh.kind in _GROUND_KINDS:
+    if mesh.kind == GROUND:
         return False
     z_m = mesh.vertices_m[:, 2]
     low = mesh.vertices_m[(z_m > _LOW_M) & (z_m < CLEARANCE_M), :2]
@@ -277,7 +303,7 @@ def _is_covered(area: BaseGeometry, tree: shapely.STRtree) -> bool:
 
 def _add(collected: StaticObjects, solid_map: SolidMap, paths: tuple[Path, ...], reader: str) -> StaticObjects:
     tops_m = [solid.height_m for solid in solid_map.solids]
-    tops_m += [float(mesh.vertices_m[:, 2].max()) for mesh in solid_map.meshes if mesh.kind not in _GROUND_KINDS]
+    tops_m += [float(mesh.vertices_m[:, 2].max()) for mesh in solid_map.meshes if mesh.kind != GROUND]
     height_range_m = (min(tops_m), max(tops_m)) if tops_m else None
     summary = MapSummary(paths, reader, solid_map.counts, height_range_m, solid_map.notes)
     attributions = dict.fromkeys([*collected.attributions, solid_map.attribution])
