@@ -112,5 +112,4 @@ def test_some_mutants(tmp_path: Path, suffix: str) -> None:
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_200_mutants(tmp_path: Path, suffix: str) -> None:
     read, rejected = read_mutants(tmp_path, suffix, 200)
-    print(suffix, read, rejected)
     assert read + rejected == 200 and rejected > 20

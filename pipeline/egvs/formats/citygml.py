@@ -177,6 +177,8 @@ class _ObjectParser(SurfaceParser):
             self._add_to_template(member)
             return
         if isinstance(member, Surface):
+            if "ClosureSurface" in self.tags[self._object_depth :]:
+                self._object.openings.add(id(member))
             if self._object.srs_name and self._object.srs_name != srs_name:
                 problem = f"expected one reference system, got {self._object.srs_name!r} and {srs_name!r}"
                 raise InputError(f"{self.path}: {self._object.name}: srsName", problem, COMPLETE_FILE)
