@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import re
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -84,6 +84,8 @@ class CityGmlFile:
     ----------
     path
         The file.
+    kinds
+        Kinds of objects whose surfaces are read; others come without surfaces. None for all.
 
     Attributes
     ----------
@@ -91,13 +93,14 @@ class CityGmlFile:
         Surfaces of implicit geometries by name; complete after :meth:`objects` ends.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, kinds: Collection[str] | None = None) -> None:
         self.path = path
         self.templates: dict[str, list[Surface]] = {}
+        self._kinds = kinds
 
     def objects(self) -> Iterator[CityObject]:
         """Yield the objects in their order; InputError when the file is damaged."""
-        parser = _ObjectParser(self.path, self.templates)
+        parser = _ObjectParser(self.path, self.templates, self._kinds)
         for _ in iter_events(self.path, ROOT, parser):
             yield from parser.finished
             parser.finished.clear()
@@ -106,8 +109,10 @@ class CityGmlFile:
 class _ObjectParser(SurfaceParser):
     """Collects one object after the other."""
 
-    def __init__(self, path: Path, templates: dict[str, list[Surface]]) -> None:
+    def __init__(self, path: Path, templates: dict[str, list[Surface]], kinds: Collection[str] | None) -> None:
         super().__init__(path)
+        self._kinds = kinds
+        self._is_needed = False
         self.finished: list[CityObject] = []
         self._templates = templates
         self._template_points = 0
@@ -134,6 +139,8 @@ class _ObjectParser(SurfaceParser):
         if self._object is None:
             if len(self.tags) > 1 and self.tags[-2] in _MEMBERS:
                 self._open_object(tag, attributes)
+            return False
+        if not self._is_needed:
             return False
         if tag in _SKIPPED:
             self._skipped_depth = len(self.tags)
@@ -163,6 +170,8 @@ class _ObjectParser(SurfaceParser):
         elif depth == self._object_depth:
             self.finished.append(self._object)
             self._object = None
+        elif not self._is_needed:
+            return
         elif self._boundary_depths and self._boundary_depths[-1] == depth:
             self._boundary_depths.pop()
         elif self._components[-1][0] == depth:
@@ -198,6 +207,7 @@ class _ObjectParser(SurfaceParser):
         self._count += 1
         name = next((value for key, value in attributes.items() if local_name(key) == "id"), f"{tag} {self._count}")
         self._object = CityObject(name, tag)
+        self._is_needed = self._kinds is None or tag in self._kinds
         self._object_depth = len(self.tags)
         self.collected = 0
         self._components = [(self._object_depth, self._object.components[0])]

@@ -38,7 +38,7 @@ def read_solids(paths: Sequence[Path], context: MapContext) -> SolidMap:
     """Return the buildings, bridges, furniture and plants in the window; InputError when a file is damaged."""
     files = _expand_folders(paths)
     opened = [path for path in files if _is_needed(path, context, TILE_KINDS)]
-    result = collect_solids(map(CityGmlFile, opened), context, SOLID_KINDS)
+    result = collect_solids((CityGmlFile(path, SOLID_KINDS) for path in opened), context, SOLID_KINDS)
     return _with_skipped_files(result, len(files), len(opened))
 
 
@@ -49,7 +49,7 @@ def read_road_surfaces(paths: Sequence[Path], context: MapContext) -> SolidMap:
     """
     files = _expand_folders(paths)
     opened = [path for path in files if _is_needed(path, context, frozenset({"tran", "squr", "rwy", "trk"}))]
-    result = collect_solids(map(CityGmlFile, opened), context, ROAD_KINDS)
+    result = collect_solids((CityGmlFile(path, ROAD_KINDS) for path in opened), context, ROAD_KINDS)
     return _with_skipped_files(result, len(files), len(opened))
 
 
