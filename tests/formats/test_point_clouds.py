@@ -338,7 +338,8 @@ def test_rejects_laz_that_needs_more_memory_than_the_limit(tmp_path: Path) -> No
     points_at = struct.unpack_from("<I", path.read_bytes(), 96)[0]
     overwrite(path, points_at + 8 + 30 + 4 + 7 * 4, b"\xff\xff\xff\xf0")
     message = (
-        r"the decompressor was killed by signal 6: .*too much memory\)\. The limit is 2,000 MB; set EGVS_MAX_READER_MB"
+        r"its reader was killed by signal 6: it needed too much memory\)\. "
+        r"The limit is 2,000 MB; set EGVS_MAX_READER_MB"
     )
     with pytest.raises(InputError, match=message):
         read_points(path, "")
@@ -424,7 +425,7 @@ CSV = "x_m,y_m,z_m\n1,2,3\n"
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.xyz", "1 2 3", r"a\.xyz: unknown file format '\.xyz'. Use one of \.csv, \.las, \.laz, \.pcd, \.ply"),
+        ("a.xyz", "1 2 3", r"a\.xyz: unknown file format '\.xyz'. Use one of \.csv, .*\.las, \.laz, \.pcd, \.ply"),
         ("a", "1 2 3", r"/a: the file name has no suffix. Use one of \.csv"),
         # PCD, header
         ("a.pcd", "", r"a\.pcd: the PCD header has no DATA line"),

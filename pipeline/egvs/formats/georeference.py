@@ -97,6 +97,14 @@ class WorldFrame:
         eastings = _transform(crs, self.projection, np.asarray(xy, dtype=np.float64))
         return np.add(eastings, self.offset_m)
 
+    def to_crs(self, xy_m: FloatArray, crs: str) -> FloatArray:
+        """Convert world-frame x, y (n, 2) in metres to coordinates of another system, in its units, (n, 2) float64.
+
+        The inverse of :meth:`from_crs`, to some millimetres where the datum changes.
+        """
+        eastings = np.subtract(xy_m, self.offset_m, dtype=np.float64)
+        return _transform(self.projection, crs, eastings)
+
     def scale_factor(self, xy_m: tuple[float, float]) -> float:
         """Return how many times too long the projection draws a short line at x, y (1.0: true length)."""
         from pyproj import Proj
@@ -122,6 +130,19 @@ def parse_crs(crs: Any, where: str) -> CRS:
         problem = f"unknown coordinate reference system {crs!r}"[:160]
         raise InputError(where, problem, 'Use a name that PROJ knows, for example "EPSG:25832".') from None
     return parsed.sub_crs_list[0] if parsed.is_compound else parsed
+
+
+def proj_string(crs: str, where: str) -> str:
+    """Return a coordinate reference system as a PROJ string, which is all that SUMO reads; InputError if unknown."""
+    import warnings
+
+    parsed = parse_crs(crs, where)
+    if crs.strip().startswith("+proj="):
+        return crs.strip()
+    with warnings.catch_warnings():
+        # a PROJ string cannot say everything, such as the names of axes
+        warnings.simplefilter("ignore", UserWarning)
+        return str(parsed.to_proj4())
 
 
 def height_unit_m(crs: Any, where: str) -> float:

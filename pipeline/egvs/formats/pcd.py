@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,7 +26,7 @@ from egvs.core import limits
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.reading import COMPLETE_FILE
-from egvs.formats.point_clouds import AXES, RecordLayout, pack_records, parse_count, parse_float
+from egvs.formats.point_clouds import AXES, PointChunk, RecordLayout, pack_records, parse_count, parse_float
 
 _IDENTITY = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 _UNIT_TOLERANCE = 1e-3
@@ -77,6 +77,13 @@ def read(path: Path, where: str) -> FloatArray:
     if viewpoint == _IDENTITY:
         return points
     return _to_world(points, viewpoint)
+
+
+def stream(path: Path, where: str) -> Iterator[PointChunk]:
+    """Yield all points at once, with the position of VIEWPOINT as the station unless it is the identity."""
+    viewpoint = _viewpoint(where, _read_header(where, path.read_bytes()).words.get("VIEWPOINT"))
+    station_m = None if viewpoint == _IDENTITY else np.array(viewpoint[:3])
+    yield PointChunk(0, station_m, read(path, where))
 
 
 def write(path: Path, points_m: FloatArray) -> None:

@@ -16,7 +16,7 @@ records, or from blocks of one field each. Numbers in text files are read as flo
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import accumulate
@@ -31,7 +31,7 @@ from egvs.core.errors import EgvsError, InputError, MissingBackendError
 from egvs.core.files import atomic_write
 from egvs.core.grid import FloatArray
 from egvs.core.numbers import parse_decimal
-from egvs.core.reading import COMPLETE_FILE, describe_exception
+from egvs.core.reading import COMPLETE_FILE, describe_exception, translate_errors
 
 GROUP = "egvs.point_clouds"
 
@@ -59,6 +59,32 @@ class LocatedFormat(PointFormat, Protocol):
 
     def crs_of(self, path: Path, where: str, /) -> str | None:
         """Return the coordinate reference system of a file, in a form that PROJ knows; None if it declares none."""
+
+
+class PointChunk(NamedTuple):
+    """Some of the points of a file.
+
+    Attributes
+    ----------
+    scan
+        Number of the scan that they are from, from 0; a file has one scan, or several that follow one another.
+    station_m
+        Where the scanner stood, (3,) float64 in the frame of the points; None if the file does not say.
+    points_m
+        (n, 3) float64, including points that are not finite.
+    """
+
+    scan: int
+    station_m: FloatArray | None
+    points_m: FloatArray
+
+
+@runtime_checkable
+class StreamedFormat(PointFormat, Protocol):
+    """A file format that is read in chunks, or that says where scanners stood."""
+
+    def stream(self, path: Path, where: str, /) -> Iterator[PointChunk]:
+        """Yield the points in the file's order; InputError at ``where`` when the file is damaged."""
 
 
 class PointCloud(NamedTuple):
@@ -128,6 +154,33 @@ def _read_with(point_format: PointFormat, path: Path, where: str, reader: str) -
         raise InputError(where, problem, hint)
     limits.POINTS.check(where, len(points))
     return points.astype(np.float64, copy=False)
+
+
+def stream_points(path: Path, where: str) -> Iterator[PointChunk]:
+    """Yield the points of a file in chunks, where its format allows that, else all at once.
+
+    Parameters
+    ----------
+    path
+        As for :func:`read_points`.
+    where
+        The file, for messages.
+
+    Raises
+    ------
+    InputError
+        While iterating, as :func:`read_points`; but points that are not finite are kept, and there is no limit of their
+        number where they come in chunks.
+    """
+    where = _with_path(where, path)
+    suffix = _readable_suffix(path, where)
+    point_format = plugins.load_plugin(GROUP, suffix)
+    if not isinstance(point_format, StreamedFormat):
+        yield PointChunk(0, None, read_points(path, where).points_m)
+        return
+    limits.checked_size(path, limits.FILE, where)
+    with translate_errors(where, COMPLETE_FILE):
+        yield from point_format.stream(path, where)
 
 
 def point_cloud_crs(path: Path, where: str) -> str | None:

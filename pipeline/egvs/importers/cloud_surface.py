@@ -1,0 +1,287 @@
+"""Triangulate a point cloud: a ground surface, and small rectangles ("surfels") on everything else.
+
+Steps of :func:`triangulate_cloud`: tell ground points from others (:func:`is_ground`); triangulate the means of the
+ground points in cells of half a metre (:func:`triangulate_ground`); thin the other points and put a rectangle on each
+(:func:`make_surfels`). World frame (x east, y north, z up), metres.
+
+Ground filter: the lowest point of each cell of 1 m; grey openings of that height map with windows of 3 to 41 cells
+remove what stands out by more than 0.25 m and is narrower than the window. Source: Zhang et al. 2003, "A progressive
+morphological filter for removing nonground measurements from airborne LIDAR data", IEEE TGRS 41(4), 872-882, with one
+threshold for all windows.
+
+Surfels: oriented discs in Pfister et al. 2000, "Surfels: surface elements as rendering primitives", SIGGRAPH. Here they
+are rectangles: across the local normal (the direction in which 16 neighbours vary least), along the direction in which
+they vary most. On each of its four sides a rectangle extends 0.6 of the distance to the sixth neighbour, but no farther
+than the neighbours reach, so that walls and poles do not grow beyond their edges.
+
+Limits: the ground continues under buildings and through places that no beam reached; closed surfaces come out as open
+ones.
+
+Coordinates are rounded to 0.1 mm, so that last bits of eigenvectors do not change the result.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egvs.core.grid import FloatArray, IntArray
+
+GROUND_CELL_M = 0.5
+"""Ground vertices: one in each cell of this size."""
+
+SURFEL_SPACING_M = 0.15
+"""Other points are thinned to one in each cube of this size."""
+
+FILTER_CELL_M = 1.0
+MAX_WINDOW_CELLS = 41
+STEP_M = 0.25
+"""Points that are higher above the ground than this are objects."""
+PIT_M = 1.0
+"""Cells that are deeper below their neighbours than this hold a false return."""
+
+NEIGHBOURS = 16
+SIZE_NEIGHBOUR = 6
+SIZE_FACTOR = 0.75
+MIN_SIDE_M, MAX_SIDE_M, MIN_REACH_M = 0.08, 0.6, 0.02
+
+SKIPPED_NEIGHBOURS = 3
+
+_DIGITS = 4
+_BLOCK = 50_000
+
+
+@dataclass(frozen=True)
+class TriangleSurface:
+    """An open triangle mesh.
+
+    Attributes
+    ----------
+    vertices_m
+        (n, 3) float64, world frame, rounded to 0.1 mm.
+    faces
+        (m, 3) int64.
+    """
+
+    vertices_m: FloatArray
+    faces: IntArray
+
+
+@dataclass(frozen=True)
+class CloudSurface:
+    """The surface of a point cloud.
+
+    Attributes
+    ----------
+    ground
+        The triangulated ground; no faces where fewer than three cells have ground points.
+    objects
+        Surfels on everything else, two triangles each.
+    ground_points
+        Number of points on the ground.
+    """
+
+    ground: TriangleSurface
+    objects: TriangleSurface
+    ground_points: int
+
+
+def triangulate_cloud(points_m: FloatArray, spacing_m: float = SURFEL_SPACING_M) -> CloudSurface:
+    """Triangulate a point cloud.
+
+    Parameters
+    ----------
+    points_m
+        Finite points, (n, 3) float64, in any order; without moving objects.
+    spacing_m
+        Edge length of the cubes that thin the points above the ground.
+
+    Returns
+    -------
+    CloudSurface
+        Equal points in equal order give equal bytes.
+    """
+    ground = is_ground(points_m)
+    objects = thin_points(points_m[~ground], spacing_m)
+    return CloudSurface(triangulate_ground(points_m[ground]), make_surfels(objects), int(np.count_nonzero(ground)))
+
+
+def thin_points(points_m: FloatArray, cell_m: float) -> FloatArray:
+    """Return the mean of the points (n, 3) in each cube with edges of ``cell_m``, sorted by cube."""
+    cells = np.floor(points_m / cell_m).astype(np.int64)
+    return _means_by_cell(points_m, cells)
+
+
+def is_ground(points_m: FloatArray) -> NDArray[np.bool_]:
+    """Return which points (n, 3) lie on the ground, (n,) bool.
+
+    A point is on the ground when the lowest point of its cell survives all openings, and it is at most ``STEP_M`` above
+    that.
+    """
+    if not len(points_m):
+        return np.zeros(0, dtype=np.bool_)
+    low = np.floor(points_m[:, :2].min(axis=0) / FILTER_CELL_M)
+    column, row = (np.floor(points_m[:, :2] / FILTER_CELL_M) - low).astype(np.int64).T
+    heights = np.full((column.max() + 1, row.max() + 1), np.inf)
+    np.minimum.at(heights, (column, row), points_m[:, 2])
+    is_pit = _pits(_fill_gaps(heights))
+    heights[is_pit] = np.inf
+    lowest = _fill_gaps(heights)
+    is_low = _survives_openings(lowest) & ~is_pit
+    on_ground: NDArray[np.bool_] = is_low[column, row] & (points_m[:, 2] <= lowest[column, row] + STEP_M)
+    return on_ground
+
+
+def _fill_gaps(heights: FloatArray) -> FloatArray:
+    """Return a height map whose infinite cells have the height of the nearest finite one."""
+    from scipy.ndimage import distance_transform_edt
+
+    gaps = ~np.isfinite(heights)
+    if gaps.all():
+        return np.zeros_like(heights)
+    nearest = distance_transform_edt(gaps, return_distances=False, return_indices=True)
+    filled: FloatArray = heights[tuple(nearest)]
+    return filled
+
+
+def _pits(heights: FloatArray) -> NDArray[np.bool_]:
+    """Return the cells that are far below all their neighbours: returns by way of a mirror, not ground."""
+    from scipy.ndimage import grey_closing
+
+    deep: NDArray[np.bool_] = grey_closing(heights, size=(3, 3)) - heights > PIT_M
+    return deep
+
+
+def _survives_openings(heights: FloatArray) -> NDArray[np.bool_]:
+    """Return which cells stand out by no more than ``STEP_M`` in openings with growing windows."""
+    from scipy.ndimage import grey_opening
+
+    opened = heights
+    survives = np.ones(heights.shape, dtype=np.bool_)
+    for window in _window_sizes():
+        lower = grey_opening(opened, size=(window, window))
+        survives &= opened - lower <= STEP_M
+        opened = lower
+    return survives
+
+
+def _window_sizes() -> list[int]:
+    """Return odd sizes that about double: 3, 5, 9, 17, 33, 41."""
+    sizes = []
+    size = 3
+    while size < MAX_WINDOW_CELLS:
+        sizes.append(size)
+        size = 2 * size - 1
+    return [*sizes, MAX_WINDOW_CELLS]
+
+
+def triangulate_ground(points_m: FloatArray) -> TriangleSurface:
+    """Triangulate ground points (n, 3): Delaunay of the means in cells of ``GROUND_CELL_M``, facing up."""
+    from scipy.spatial import Delaunay
+
+    cells = np.floor(points_m[:, :2] / GROUND_CELL_M).astype(np.int64)
+    vertices = _rounded(_means_by_cell(points_m, cells))
+    if len(vertices) < 3 or np.linalg.matrix_rank(vertices[1:, :2] - vertices[0, :2]) < 2:
+        return TriangleSurface(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
+    faces = np.asarray(Delaunay(vertices[:, :2] - vertices[0, :2]).simplices, dtype=np.int64)
+    ax, ay = vertices[faces[:, 0], :2].T
+    bx, by = vertices[faces[:, 1], :2].T
+    cx, cy = vertices[faces[:, 2], :2].T
+    is_down = (bx - ax) * (cy - ay) < (by - ay) * (cx - ax)
+    faces[is_down] = faces[is_down][:, [0, 2, 1]]
+    # each face from its lowest vertex, faces sorted: the result does not depend on Qhull's order
+    first = np.argmin(faces, axis=1)
+    faces = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
+    return TriangleSurface(vertices, faces[np.lexsort(faces.T[::-1])])
+
+
+def make_surfels(points_m: FloatArray) -> TriangleSurface:
+    """Put a rectangle on each of some thinned points (n, 3): four vertices and two faces each.
+
+    Fewer than four points give no surfel.
+    """
+    from scipy.spatial import KDTree
+
+    if len(points_m) < 4:
+        return TriangleSurface(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
+    tree = KDTree(points_m)
+    neighbours = min(NEIGHBOURS, len(points_m) - 1)
+    corners = []
+    for start in range(0, len(points_m), _BLOCK):
+        centres = points_m[start : start + _BLOCK]
+        distances, index = tree.query(centres, k=neighbours + 1)
+        offsets = points_m[index[:, 1:]] - centres[:, None]
+        size_m = distances[:, min(SIZE_NEIGHBOUR, neighbours)]
+        corners.append(centres[:, None] + _rectangles(offsets, size_m))
+    vertices = _rounded(np.concatenate(corners).reshape(-1, 3))
+    first = 4 * np.arange(len(points_m), dtype=np.int64)[:, None, None]
+    faces = (first + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
+    return TriangleSurface(vertices, faces)
+
+
+def _rectangles(offsets: FloatArray, size_m: FloatArray) -> FloatArray:
+    """Return the corners of rectangles about their points, (n, 4, 3).
+
+    Parameters
+    ----------
+    offsets
+        From each point to its neighbours, (n, k, 3).
+    size_m
+        Distance to the neighbour that sets the size, (n,).
+    """
+    along, across = _main_directions(offsets)
+    longest = np.clip(SIZE_FACTOR * size_m, MIN_SIDE_M, MAX_SIDE_M)
+    u = np.einsum("nki,ni->nk", offsets, along)
+    v = np.einsum("nki,ni->nk", offsets, across)
+    right, left, front, back = (
+        np.clip(_reach(distances), MIN_REACH_M, longest)[:, None] for distances in (u, -u, v, -v)
+    )
+    corners = [right * along + front * across, -left * along + front * across,
+               -left * along - back * across, right * along - back * across]  # fmt: skip
+    return np.stack(corners, axis=1)
+
+
+def _reach(distances: FloatArray) -> FloatArray:
+    """Return how far neighbours (n, k) reach to one side, (n,): not the farthest ones, which noise may have moved."""
+    last = distances.shape[1] - 1
+    position = max(last - SKIPPED_NEIGHBOURS, 0)
+    reach: FloatArray = np.partition(distances, position, axis=1)[:, position]
+    return reach
+
+
+def _main_directions(offsets: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the unit vectors in which neighbours (n, k, 3) vary most and second most, (n, 3) each.
+
+    Their signs are chosen so that the component that is largest is positive.
+    """
+    centred = offsets - offsets.mean(axis=1, keepdims=True)
+    covariance = np.einsum("nki,nkj->nij", centred, centred)
+    _, vectors = np.linalg.eigh(covariance)
+    return _with_fixed_sign(vectors[:, :, 2]), _with_fixed_sign(vectors[:, :, 1])
+
+
+def _with_fixed_sign(vectors: FloatArray) -> FloatArray:
+    largest = np.take_along_axis(vectors, np.abs(vectors).argmax(axis=1)[:, None], axis=1)
+    fixed: FloatArray = vectors * np.where(largest < 0, -1.0, 1.0)
+    return fixed
+
+
+def _means_by_cell(points_m: FloatArray, cells: IntArray) -> FloatArray:
+    """Return the mean of the points (n, 3) in each cell (n, k), sorted by cell."""
+    if not len(points_m):
+        return np.empty((0, 3))
+    order = np.lexsort(cells.T[::-1])
+    cells = cells[order]
+    starts = np.flatnonzero(np.insert((np.diff(cells, axis=0) != 0).any(axis=1), 0, True))
+    count = np.diff(starts, append=len(points_m))
+    origin = points_m[order[starts]]  # sums of small differences keep their digits far from the world's origin
+    differences = points_m[order] - np.repeat(origin, count, axis=0)
+    means: FloatArray = origin + np.add.reduceat(differences, starts, axis=0) / count[:, None]
+    return means
+
+
+def _rounded(points_m: FloatArray) -> FloatArray:
+    rounded: FloatArray = np.round(points_m, _DIGITS) + 0.0  # no -0
+    return rounded
