@@ -290,9 +290,9 @@ def test_relief_outside_bounds_is_left_out(tmp_path: Path) -> None:
     far = [(x + 100, y, z) for x, y, z in UP]
     path = write_model(tmp_path / "dem.gml", relief(*(polygon(ring, tag="Triangle") for ring in (UP, far))))
     assert len(read_relief(path).faces) == 2
-    near = read_relief(path, bounds=(-1, 99, 2, 102))  # x is east, the second coordinate of the file
+    near = read_relief(path, lambda crs: (-1, 99, 2, 102))  # x is east, the second coordinate of the file
     assert near.vertices[:, 1].min() == 100.0 and len(near.faces) == 1
-    assert len(read_relief(path, bounds=(500, 500, 501, 501)).faces) == 0
+    assert len(read_relief(path, lambda crs: (500, 500, 501, 501)).faces) == 0
 
 
 def test_relief_without_triangles_is_rejected(tmp_path: Path) -> None:

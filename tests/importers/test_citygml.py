@@ -15,7 +15,6 @@ from egvs.formats.city_objects import select_surfaces
 from egvs.formats.citygml import CityGmlFile
 from egvs.formats.georeference import WorldFrame
 from egvs.importers import citygml, cityjson
-from egvs.importers.ground_level import ground_level
 from egvs.importers.map_parts import Alignment, MapContext, MapReader, SolidReader
 from egvs.importers.osm_solids import DEFAULT_BUILDING_M
 from tests.formats.small_city_models import (
@@ -313,14 +312,6 @@ def test_real_buildings_are_where_they_are(real: tuple[MapContext, citygml.Solid
     west, south = np.concatenate([mesh.vertices_m[:, :2] for mesh in result.meshes]).min(axis=0)
     assert west == pytest.approx((139.77492484 - 139.777) * 90_660, abs=2.0)
     assert south == pytest.approx((35.53821315 - 35.54) * 110_940, abs=2.0)
-
-
-def test_real_ground_is_at_sea_level(real: tuple[MapContext, citygml.SolidMap]) -> None:
-    """The lowest points of the eight buildings are at 2.5 to 3.7 m in the file."""
-    _, result = real
-    level = ground_level(result.meshes, np.zeros(2))
-    assert level is not None and level.deviation_m is not None
-    assert 2.9 < level.height_m < 3.7 and level.deviation_m < 0.6
 
 
 def test_every_edge_of_the_real_solids_is_passed_in_both_directions() -> None:

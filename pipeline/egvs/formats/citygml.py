@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import re
 from array import array
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -64,7 +64,16 @@ _LOD_LINES = frozenset({"TerrainIntersection", "MultiCurve", "Network"})
 
 def is_citygml(head: bytes) -> bool:
     """Return whether the beginning of a file is that of a city model, in any encoding."""
-    return re.search(rb"<(?:[\w.-]+:)?CityModel[\s>]", head.replace(b"\0", b"")) is not None
+    return _starts_element(head, b"CityModel")
+
+
+def has_relief(head: bytes) -> bool:
+    """Return whether the beginning of a city model has terrain."""
+    return is_citygml(head) and _starts_element(head, b"ReliefFeature")
+
+
+def _starts_element(head: bytes, tag: bytes) -> bool:
+    return re.search(rb"<(?:[\w.-]+:)?" + tag + rb"[\s>]", head.replace(b"\0", b"")) is not None
 
 
 def valid_height_m(height_m: float) -> float | None:
@@ -319,7 +328,11 @@ class Relief(NamedTuple):
     crs: str | None
 
 
-def read_relief(path: Path, bounds: Sequence[float] | None = None) -> Relief:
+BoundsOf = Callable[[str | None], Sequence[float]]
+"""Returns west, south, east and north in a reference system, in its units and in the order x, y."""
+
+
+def read_relief(path: Path, bounds_of: BoundsOf | None = None) -> Relief:
     """Read the triangulated terrain (``TINRelief``) of a CityGML file, e.g. of a PLATEAU tile ``..._dem_6697_op.gml``.
 
     Vertices are merged where they are equal. Triangles without area, seen from above, are left out.
@@ -328,16 +341,16 @@ def read_relief(path: Path, bounds: Sequence[float] | None = None) -> Relief:
     ----------
     path
         The file.
-    bounds
-        West, south, east and north, in the units of the file's system and in the order x, y; triangles wholly outside
-        are left out. None for all triangles.
+    bounds_of
+        Returns the bounds of the region in the file's system; triangles wholly outside are left out. None for all
+        triangles.
 
     Raises
     ------
     InputError
         When the file is damaged, has several reference systems, has no triangles, or has too many.
     """
-    parser = _ReliefParser(path, bounds)
+    parser = _ReliefParser(path, bounds_of)
     for _ in iter_events(path, ROOT, parser):
         limits.TRIANGLES.check(path, parser.triangle_count, "has too many triangles of terrain")
     if not parser.has_triangles:
@@ -363,12 +376,13 @@ def _turn_up(vertices: FloatArray, faces: IntArray) -> IntArray:
 class _ReliefParser(SurfaceParser):
     """Collects the triangles of ``TINRelief``."""
 
-    def __init__(self, path: Path, bounds: Sequence[float] | None) -> None:
+    def __init__(self, path: Path, bounds_of: BoundsOf | None) -> None:
         super().__init__(path)
         self.corners = array("d")
         self.relief_srs_name: str | None = None
         self.has_triangles = False
-        self._bounds = bounds
+        self._bounds_of = bounds_of
+        self._bounds: Sequence[float] | None = None
         self._is_y_first = False
         self._tin_depth = 0
         self._triangles = 0
@@ -403,7 +417,10 @@ class _ReliefParser(SurfaceParser):
         ring = member.rings[0]
         if self.relief_srs_name is None:
             self.relief_srs_name = srs_name
-            self._is_y_first = parse_srs_name(srs_name, str(self.path)).is_y_first
+            system = parse_srs_name(srs_name, str(self.path))
+            self._is_y_first = system.is_y_first
+            if self._bounds_of is not None:
+                self._bounds = self._bounds_of(system.crs)
         if srs_name != self.relief_srs_name:
             problem = f"expected one reference system, got {self.relief_srs_name!r} and {srs_name!r}"
             raise InputError(f"{self.path}: {self.describe()}: srsName", problem, COMPLETE_FILE)

@@ -30,8 +30,16 @@ TILE_MARGIN_M = 200.0
 
 
 def can_open(path: Path, head: bytes) -> bool:
-    """Return whether a file is a city model, or a folder has ``.gml`` files."""
-    return any(_folder_files(path)) if path.is_dir() else citygml.is_citygml(head)
+    """Return whether a file is a city model without terrain, or a folder has ``.gml`` files."""
+    if path.is_dir():
+        return any(_folder_files(path))
+    return citygml.is_citygml(head) and not is_relief(path, head)
+
+
+def is_relief(path: Path, head: bytes) -> bool:
+    """Return whether a file is terrain (:mod:`egvs.importers.citygml_relief`), by its name or its beginning."""
+    tile = parse_tile_name(path.name)
+    return citygml.has_relief(head) or (citygml.is_citygml(head) and tile is not None and tile.kind == "dem")
 
 
 def read_solids(paths: Sequence[Path], context: MapContext) -> SolidMap:
