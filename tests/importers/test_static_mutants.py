@@ -17,6 +17,7 @@ import shapely
 import trimesh
 
 from egvs.core.errors import InputError
+from egvs.formats.citygml import read_relief
 from egvs.importers import citygml, cityjson, footprint_maps, mesh_maps
 from egvs.importers.map_parts import Alignment, MapContext, SolidMap
 from tests.formats.small_city_models import city_model, city_object, multi_surface, nest, polygon
@@ -102,6 +103,27 @@ def read_mutants(folder: Path, suffix: str, count: int) -> tuple[int, int]:
     return read, rejected
 
 
+@pytest.mark.parametrize("count", [25, pytest.param(200, marks=pytest.mark.slow)])
+def test_mutants_of_relief(tmp_path: Path, count: int) -> None:
+    corners = [[(0.0, 0.0, 1.0), (1.0, 0.0, 2.0), (0.0, 1.0, 3.0)], [(1.0, 0.0, 2.0), (1.0, 1.0, 4.0), (0.0, 1.0, 3.0)]]
+    triangles = "".join(polygon(ring, tag="Triangle") for ring in corners)
+    tin = nest(triangles, "reliefComponent", "TINRelief", "tin", "TriangulatedSurface", "trianglePatches")
+    sound = city_model(city_object("ReliefFeature", "r", tin)).encode()
+    path = tmp_path / "dem.gml"
+    path.write_bytes(sound)
+    assert len(read_relief(path).faces) == 2
+    rejected = 0
+    for seed in range(count):
+        path.write_bytes(mutant(random.Random(seed), sound))
+        try:
+            vertices, faces, _ = read_relief(path)
+            assert np.isfinite(vertices).all() and (not len(faces) or faces.max() < len(vertices))
+        except InputError as error:
+            assert str(path) in str(error), seed
+            rejected += 1
+    assert rejected > count // 4
+
+
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_some_mutants(tmp_path: Path, suffix: str) -> None:
     read, rejected = read_mutants(tmp_path, suffix, 25)
@@ -112,5 +134,4 @@ def test_some_mutants(tmp_path: Path, suffix: str) -> None:
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_200_mutants(tmp_path: Path, suffix: str) -> None:
     read, rejected = read_mutants(tmp_path, suffix, 200)
-    print(suffix, read, rejected)
     assert read + rejected == 200 and rejected > 20
