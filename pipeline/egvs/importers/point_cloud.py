@@ -98,8 +98,7 @@ def read_solids(paths: Sequence[Path], context: MapContext) -> AsBuiltMap:
         counts=survey.counts,
         has_absolute_heights=True,
         notes=_notes(survey, surface, len(points)),
-        scans=tuple(StationScan(scan.station_m, scan.points_m) for scan in scans if scan.station_m is not None),
-        ground_xy_m=surface.ground.vertices_m[:, :2],
+        stations_m=np.array([scan.station_m for scan in scans if scan.station_m is not None]).reshape(-1, 3),
     )
 
 
