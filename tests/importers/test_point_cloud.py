@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import gzip
 import importlib.util
+import random
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,12 +25,14 @@ from egvs.importers.moving_points import StationScan
 from egvs.world.mesh import World
 from egvs.world.ray_casting import Caster
 from egvs.world.static_world import build_world
+from tests.fuzz import bases, mutating
 from tests.importers import as_built_clouds
 from tests.importers.test_moving_points import CAR, ROI, WALL, scan, world
 
 needs_pye57 = pytest.mark.skipif(importlib.util.find_spec("pye57") is None, reason="pye57 is not installed (egvs[las])")
 needs_laspy = pytest.mark.skipif(importlib.util.find_spec("laspy") is None, reason="laspy is not installed (egvs[las])")
 
+MUTANTS = 40
 SAME_FRAME = Alignment(np.array([[0.0, 0.0], [100.0, 0.0]]), np.array([[0.0, 0.0], [100.0, 0.0]]))
 CONTEXT = MapContext(None, box(-30, -30, 30, 30), SAME_FRAME)
 STATIONS = [(-12.0, -8.0, 2.0), (12.0, -2.0, 2.0), (-12.0, 12.0, 2.0), (10.0, 12.0, 2.0)]
@@ -136,6 +140,7 @@ def test_counts_add_up(tmp_path: Path) -> None:
         " within 0.075 m; 10 are used (10 on the ground)."
     )
     assert "unknown for 1 of 1 scan" in result.notes[2]
+    assert "If it is from one place, this is a world for that place only." in result.notes[2]
     assert [mesh.kind for mesh in result.meshes] == ["ground"]
 
 
@@ -202,6 +207,51 @@ def test_messages(tmp_path: Path, survey: list[Path], monkeypatch: pytest.Monkey
     monkeypatch.setenv("EGVS_MAX_POINTS", "1000")
     with pytest.raises(InputError, match=r"0\.pcd: has [\d,]+ points"):
         point_cloud.read_solids(survey[:1], CONTEXT)
+
+
+REAL = Path(__file__).parents[3] / "shared" / "real" / "chengdu" / "sweep.pcd.gz"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not REAL.is_file(), reason="chengdu/sweep.pcd.gz is not beside the checkout (shared/real)")
+def test_real_sweep_beside_a_freeway() -> None:
+    """144,000 rows, 48,974 with nan (``zgrep -c nan``); a carriageway 3.7 m below the sensor, other ground 6 to 8 m."""
+    result = point_cloud.read_solids([REAL], MapContext(None, box(-60, -60, 60, 60), SAME_FRAME))
+    assert result.notes[0].startswith("144,000 points read from 1 scan: ")
+    assert result.counts.dropped["not_finite"]["point"] == 48_974
+    ground, objects = result.meshes
+    heights = ground.vertices_m[:, 2]
+    assert np.mean((heights > -8.5) & (heights < -3.0)) > 0.95
+    assert 20_000 < len(objects.faces) < 200_000
+
+
+# --- damaged files ---
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["a.csv", "a.e57", "a.las", "a.laz", "a.pcd", "a.pcd.gz", "a.ply"])
+def test_mutants_are_read_or_rejected_with_one_message(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str
+) -> None:
+    """As in the fuzzer, which reads clouds as measured scans."""
+    library = {".e57": "pye57", ".las": "laspy", ".laz": "laspy"}.get(Path(name).suffix)
+    if library is not None:
+        pytest.importorskip(library)
+    path = tmp_path / name
+    bases.write_cloud(path)
+    content = path.read_bytes()
+    results = Counter[str]()
+    for case in range(MUTANTS):
+        path.write_bytes(mutating.mutant(random.Random(f"{name}/{case}"), content))
+        try:
+            point_cloud.read_solids([path], CONTEXT)
+            results["read"] += 1
+        except InputError as error:
+            assert name in str(error)
+            assert len(str(error)) < 4000
+            results["rejected"] += 1
+    assert results["rejected"] > MUTANTS // 5
+    assert capfd.readouterr() == ("", "")
 
 
 # --- what sites see of it ---

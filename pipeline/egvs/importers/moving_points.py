@@ -34,7 +34,7 @@ MAX_RANGE_RATIO = 5.0
 """A station judges only points that are at most this many times as far from it as from their own station."""
 
 DENSE_SHARE = 0.5
-"""Where more of the cells of a scan are filled than this, a patch of nine empty cells is sky, not a gap between beams."""
+"""Where more of the cells of a scan are filled, a patch of nine empty cells is sky, not a gap between beams."""
 
 _OUTER_PERCENT = 5
 
