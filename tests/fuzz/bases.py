@@ -284,13 +284,25 @@ def measured(name: str):
     def make(folder: Path) -> None:
         made = mini(folder, ('sensor = "small"', f'sensor = "small"\npoints = "{name}"'))
         (made / "sites.csv").write_text("".join(SITES.splitlines(keepends=True)[:2]))
-        _write_points(made / name)
+        write_cloud(made / name)
 
     return make
 
 
-def _write_points(path: Path) -> None:
+def write_cloud(path: Path) -> None:
+    """Write points of the ground in the format that the suffix names, maybe gzipped."""
     points, form = _points(), path.suffix.removeprefix(".")
+    if form == "gz":
+        plain = path.with_suffix("")
+        write_cloud(plain)
+        path.write_bytes(gzip.compress(plain.read_bytes(), mtime=0))
+        return
+    if form == "e57":
+        from tests.formats.test_e57 import NO_TURN, cartesian, write_e57
+
+        station = np.array([10.0, 12.0, 3.0])
+        write_e57(path, (cartesian(*(points - station)), NO_TURN, station))
+        return
     if form in ("las", "laz"):
         import laspy
 

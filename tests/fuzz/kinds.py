@@ -115,6 +115,7 @@ _ALL = (
     _input("scan.csv", "points.csv", bases.measured("points.csv"), meaning.rows),
     _input("scan.las", "points.las", bases.measured("points.las"), meaning.bytes_themselves),
     _input("scan.laz", "points.laz", bases.measured("points.laz"), meaning.bytes_themselves),
+    _input("scan.e57", "points.e57", bases.measured("points.e57"), meaning.bytes_themselves),
     _input("scan.ply", "points.ply", bases.measured("points.ply"), meaning.ply),
     _input("scan.ply binary", "binary.ply", bases.measured("binary.ply"), meaning.ply),
     _input("scan.pcd", "points.pcd", bases.measured("points.pcd"), meaning.pcd),
