@@ -140,7 +140,7 @@ def test_every_object_is_used_or_counted(footprints: dict[str, Any], made: Made)
         ("way/2001", 12.0, 0.0, "height"),
         ("way/2002", 12.192, 0.0, "height"),
         ("way/2003", 9.0, 0.0, "levels"),
-        ("way/2004", 9.0, 0.0, "default"),
+        ("way/2004", 9.0, 0.0, "neighbours"),
         ("way/2005", 6.0, 0.0, "levels"),
         ("way/2006", 9.0, 3.0, "height"),
         ("way/2014", 20.0, 0.0, "height"),

@@ -44,6 +44,7 @@ from egvs.importers import (
 )
 from egvs.importers.alignment import PointPair, make_alignment
 from egvs.importers.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, AssumedTraffic
+from egvs.importers.building_heights import ASSUMED, NEIGHBOURS
 from egvs.importers.junctions import XY, JunctionRegion, StreetJunction, Streets
 from egvs.importers.map_parts import MapContext, RoadOptions, Terrain
 from egvs.importers.map_readers import MapFile
@@ -415,6 +416,11 @@ def scenario_notes(junction_fits: bool, counts: ImportCounts) -> list[str]:
             f"{heights['default']} of {heights.total()} buildings have neither height nor levels:"
             f" {osm_solids.DEFAULT_BUILDING_M:g} m assumed"
         )
+    if heights[NEIGHBOURS]:
+        notes.append(
+            f"{heights[NEIGHBOURS]} of {heights.total()} buildings have neither height nor levels: the median height of"
+            " the buildings near by assumed"
+        )
     return notes
 
 
@@ -487,11 +493,15 @@ def _assumptions(scenario: NewScenario) -> list[str]:
     return [*assumed, *assumed_sizes(scenario.statics), "positions of the poles"]
 
 
+def _assumed_buildings(heights: Counter[str]) -> int:
+    return heights[ASSUMED] + heights[NEIGHBOURS]
+
+
 def assumed_sizes(counts: ImportCounts) -> list[str]:
     """Return which sizes of static objects are assumed, for the key ``assumed``; objects that can hide vehicles."""
     heights = {kind: counts.heights.get(kind, Counter()) for kind in ("building", "tree", "bridge")}
     texts = [
-        (heights["building"]["default"], heights["building"].total(), "heights of {} buildings"),
+        (_assumed_buildings(heights["building"]), heights["building"].total(), "heights of {} buildings"),
         (heights["tree"]["default"], heights["tree"].total(), "heights of {} trees"),
         (counts.assumed_crowns, heights["tree"].total(), "crown widths of {} trees"),
         (heights["bridge"]["default"], heights["bridge"].total(), "heights of {} bridge decks"),

@@ -2,7 +2,8 @@
 
 Footprints become ``statics.geojson``; meshes become one PLY file for each kind of object. Steps of
 :func:`collect_objects`: lower meshes whose heights count from sea level to the network's ground; drop buildings of
-OpenStreetMap where another map has one; cut footprints that cover the carriageway, and count meshes that do.
+OpenStreetMap where another map has one; cut footprints that cover the carriageway, and name meshes that do; give
+buildings without a height that of their neighbours.
 
 World frame: x east, y north in metres; heights in metres above z = 0 of the network.
 """
@@ -21,14 +22,13 @@ from shapely.geometry import MultiPoint, Point
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core.grid import FloatArray
-from egvs.importers import openstreetmap, osm_solids
+from egvs.importers import building_heights, openstreetmap, osm_solids
 from egvs.importers.junctions import XY, Streets
 from egvs.importers.map_parts import MapContext, MappedMesh, SolidMap
 from egvs.importers.map_readers import MapFile
 from egvs.importers.openstreetmap import OsmRoads
 from egvs.importers.osm_solids import ImportCounts, MappedSolid
 from egvs.importers.road_source import RoadSource
-from egvs.world.clearances import CLEARANCE_M
 
 REPLACED = "replaced_by_another_map"
 """The reason to leave out a building of OpenStreetMap."""
@@ -43,8 +43,9 @@ _LARGE_DIFFERENCE_M = 5.0
 
 GROUND = "ground"
 """The kind of meshes that are ground; it becomes the terrain of the scenario."""
-_LOW_M = 0.5
-"""What is no higher above the ground than this does not hinder vehicles."""
+
+_MAX_NAMES = 10
+"""How many objects a note names."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +153,7 @@ def ground_mesh(maps: Sequence[ReadMap]) -> MappedMesh | None:
 def collect_objects(
     maps: Sequence[ReadMap], streets: Streets, middle_m: XY, zero_height_m: float | None = None
 ) -> StaticObjects:
-    """Put the objects of all maps on the ground, and clear the carriageway.
+    """Put the objects of all maps on the ground, clear the carriageway, and assume heights that no map gives.
 
     Parameters
     ----------
@@ -173,7 +174,8 @@ def collect_objects(
             objects = _lower_to_ground(read.objects, middle_m, zero_height_m)
             objects = _clear_of_carriageway(objects, streets)
         collected = _add(collected, objects, read.paths, read.reader)
-    return collected
+    solids = building_heights.heights_from_neighbours(collected.solids, collected.counts, collected.meshes)
+    return replace(collected, solids=tuple(solids))
 
 
 def outline(mesh: MappedMesh) -> BaseGeometry:
@@ -256,24 +258,21 @@ def _clear_of_carriageway(solid_map: SolidMap, streets: Streets) -> SolidMap:
     counts = replace(solid_map.counts, objects=Counter(), heights={}) if solid_map.solids else solid_map.counts
     for solid in solid_map.solids:
         solids += osm_solids.clear_of_carriageway(solid, lanes, counts)
-    in_lanes = sum(_blocks_lanes(mesh, lanes) for mesh in solid_map.meshes)
+    in_lanes = building_heights.objects_on_carriageway(solid_map.meshes, list(streets.areas.values()), _flat_ground_m)
     notes = solid_map.notes
     if in_lanes:
-        verb = "stands" if in_lanes == 1 else "stand"
+        verb = "stands" if len(in_lanes) == 1 else "stand"
+        more = f" and {len(in_lanes) - _MAX_NAMES:,} more" if len(in_lanes) > _MAX_NAMES else ""
         notes = (
             *notes,
-            f"{in_lanes} of {len(solid_map.meshes)} objects {verb} in lanes; check the position of the map",
+            f"{len(in_lanes)} of {len(solid_map.meshes)} objects {verb} in lanes; check the position of the map:"
+            f" {', '.join(in_lanes[:_MAX_NAMES])}{more}",
         )
     return replace(solid_map, solids=tuple(solids), counts=counts, notes=notes)
 
 
-def _blocks_lanes(mesh: MappedMesh, lanes: shapely.STRtree) -> bool:
-    """Return whether a vertex of a mesh is above a lane, where vehicles drive."""
-    if mesh.kind == GROUND:
-        return False
-    z_m = mesh.vertices_m[:, 2]
-    low = mesh.vertices_m[(z_m > _LOW_M) & (z_m < CLEARANCE_M), :2]
-    return bool(len(lanes.query(shapely.points(low), predicate="within").T))
+def _flat_ground_m(xy_m: FloatArray) -> FloatArray:
+    return np.zeros(len(xy_m))
 
 
 def _without_replaced(solid_map: SolidMap, others: StaticObjects) -> SolidMap:
