@@ -22,6 +22,7 @@ import pyarrow.parquet as pq
 
 from tests.city.conftest import write_city
 from tests.conftest import SCENARIO, SITES, collection, fcd, feature, write_mini
+from tests.importers.lanelet2_maps import make_crossing
 
 _KINDS = SCENARIO[SCENARIO.index("[[traffic.kinds]]") : SCENARIO.index("[statics]")]
 _TRAFFIC = SCENARIO[SCENARIO.index("[traffic]") : SCENARIO.index("[statics]")]
@@ -347,6 +348,18 @@ def extract(name: str):
             (folder / name).write_bytes(gzip.compress(SMALL_OSM.read_bytes(), mtime=0))
         else:
             shutil.copyfile(SMALL_OSM, folder / name)
+
+    return make
+
+
+def lanelets(name: str):
+    """A Lanelet2 map of a crossing, beside no scenario."""
+
+    def make(folder: Path) -> None:
+        path = make_crossing(tags={"speed_limit": "50"}).writer.write(folder / "lanelets.osm")
+        if name.endswith(".gz"):
+            (folder / name).write_bytes(gzip.compress(path.read_bytes(), mtime=0))
+            path.unlink()
 
     return make
 

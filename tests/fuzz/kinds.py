@@ -79,6 +79,13 @@ def _new(name: str, reads: Meaning) -> Kind:
     return Kind(f"new {name}", name, bases.extract(name), reads, verb=("new", "made", "--osm", name), results=made)
 
 
+def _lanelets(name: str) -> Kind:
+    """A Lanelet2 map that becomes a scenario."""
+    made = tuple(f"made/{file}" for file in ("network.net.xml", "sites.csv"))
+    verb = ("new", "made", "--from", name, "--vehicles-per-hour", "200")
+    return Kind(f"new {name}", name, bases.lanelets(name), meaning.gzipped(meaning.xml), verb=verb, results=made)
+
+
 def _city(name: str, file: str, reads: Meaning) -> Kind:
     """What the cut of a city's traffic reads."""
     verb = ("city", "traffic", "town")
@@ -121,7 +128,7 @@ _ALL = (
     _input("scan.pcd", "points.pcd", bases.measured("points.pcd"), meaning.pcd),
     _input("scan.pcd binary", "binary.pcd", bases.measured("binary.pcd"), meaning.pcd),
     _new("map.osm", meaning.gzipped(meaning.xml)), _new("map.osm.gz", meaning.gzipped(meaning.xml)),
-    _new("map.osm.pbf", meaning.bytes_themselves),
+    _new("map.osm.pbf", meaning.bytes_themselves), _lanelets("lanelets.osm"), _lanelets("lanelets.osm.gz"),
     Kind("wanted junctions.csv", "wanted.csv", bases.wanted, meaning.rows, results=("made/junctions/*/*.csv",),
          verb=("city", "new", "made", "--osm", "map.osm", "--junctions", "wanted.csv")),
     _city("city.toml", "city.toml", meaning.toml), _city("junctions.csv", "junctions.csv", meaning.rows),

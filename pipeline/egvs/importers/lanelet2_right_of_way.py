@@ -84,12 +84,12 @@ def find_right_of_way(layout: RoadLayout, lanelet_map: LaneletMap, signalised: C
 def _turns_through(layout: RoadLayout, lanelets: Collection[int]) -> list[Turn]:
     """Return the turns in junctions that use any of some lanelets, or come from one."""
     chosen = set(lanelets)
-    turns = []
+    turns: dict[Turn, None] = {}
     for turn in layout.turns:
         source = layout.roads[turn.source].lanes[turn.source_lane].key
-        if turn.path and not chosen.isdisjoint(key.id for key in (source, *turn.path)):
-            turns.append(turn)
-    return turns
+        if not chosen.isdisjoint(key.id for key in (source, *turn.path)):
+            turns |= dict.fromkeys(layout.turns_in_junction(turn))
+    return list(turns)
 
 
 def _meet(a: Turn, b: Turn, layout: RoadLayout) -> bool:

@@ -23,6 +23,7 @@ import heapq
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -51,6 +52,9 @@ CROSSWALK_RANGE_M = 15.0
 
 MAX_STUB_M, MAX_STUB_SHARE = 15.0, 0.3
 """Length of the road that is cut off a lanelet where the map begins or ends in a junction, and its largest share."""
+
+APPROACH_M = 30.0
+"""Lights and signs govern the next junction if it is nearer than this to the lanelets that refer to them."""
 
 _TURN_DIRECTIONS = frozenset({"left", "right", "straight"})
 
@@ -149,6 +153,28 @@ class RoadLayout:
     def sumo_lane(self, road: str, index: int) -> int:
         """Return SUMO's index of a lane: a sidewalk comes first."""
         return index + 1 if road in self.sidewalks else index
+
+    @cached_property
+    def turns_from(self) -> dict[tuple[str, int], list[Turn]]:
+        """The turns from each lane, by road and lane."""
+        turns: dict[tuple[str, int], list[Turn]] = defaultdict(list)
+        for turn in self.turns:
+            turns[turn.source, turn.source_lane].append(turn)
+        return dict(turns)
+
+    def turns_in_junction(self, turn: Turn) -> list[Turn]:
+        """Return a turn, or those of the next junction within :data:`APPROACH_M` if it only leads to another road."""
+        walked_m = 0.0
+        while not turn.path:
+            lane = self.roads[turn.target].lanes[turn.target_lane]
+            walked_m += line_length_m(lane.center_m)
+            following = self.turns_from.get((turn.target, turn.target_lane), [])
+            if walked_m > APPROACH_M or not following:
+                return []
+            if len(following) > 1:
+                return [other for other in following if other.path]
+            turn = following[0]
+        return [turn]
 
     def nodes(self) -> list[str]:
         """Return all nodes, sorted."""

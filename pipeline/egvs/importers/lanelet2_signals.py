@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,14 +20,11 @@ from shapely.geometry import LineString, Point
 
 from egvs.core.grid import FloatArray
 from egvs.formats.lanelet2 import LaneletMap, Regulation
-from egvs.importers.lanelet2_roads import RoadLayout, Turn, line_length_m
+from egvs.importers.lanelet2_roads import RoadLayout, Turn
 from egvs.importers.plain_network import PlainElement
 
 STOP_LINE_RANGE_M = 10.0
 """A light without lanelets governs the lanes that end nearer than this to its stop line."""
-
-APPROACH_M = 30.0
-"""A light governs the next junction if it is nearer than this to the lanelets of the light."""
 
 GREEN_S, SIDE_GREEN_S, YELLOW_S, ALL_RED_S = 30, 15, 3, 2
 """Durations of the assumed plans; the second is for phases of turns across the oncoming traffic only."""
@@ -183,14 +180,11 @@ class _Assignment:
 
     def turn_groups(self) -> dict[Turn, int]:
         """Return the light of each governed turn in a junction."""
-        by_lane: dict[LaneId, list[Turn]] = defaultdict(list)
-        for turn in self._layout.turns:
-            by_lane[turn.source, turn.source_lane].append(turn)
         groups: dict[Turn, int] = {}
-        for lane, turns in by_lane.items():
+        for lane, turns in self._layout.turns_from.items():
             for turn in turns:
                 if (light := self._light_of_turn(lane, turn)) is not None:
-                    groups |= dict.fromkeys(self._turns_in_junction(turn, by_lane), light)
+                    groups |= dict.fromkeys(self._layout.turns_in_junction(turn), light)
         return groups
 
     def _light_of_turn(self, lane: LaneId, turn: Turn) -> int | None:
@@ -199,20 +193,6 @@ class _Assignment:
             if lights := self._lights_of.get(key.id):
                 return min(lights)
         return self._light_of_lane.get(lane)
-
-    def _turns_in_junction(self, turn: Turn, by_lane: Mapping[LaneId, Sequence[Turn]]) -> list[Turn]:
-        """Return the turn, or those of the next junction if it only leads to another road."""
-        walked_m = 0.0
-        while not turn.path:
-            lane = self._layout.roads[turn.target].lanes[turn.target_lane]
-            walked_m += line_length_m(lane.center_m)
-            following = by_lane.get((turn.target, turn.target_lane), ())
-            if walked_m > APPROACH_M or not following:
-                return []
-            if len(following) > 1:
-                return [other for other in following if other.path]
-            turn = following[0]
-        return [turn]
 
     def _lane_ends(self) -> Iterator[tuple[LaneId, FloatArray, FloatArray]]:
         """Yield the lanes that end in junctions, their end, and their direction there."""
