@@ -93,7 +93,7 @@ def edited(tmp_path: Path, *changes: tuple[str, str]) -> Path:
 # --- what is in the scenario ---------------------------------------------------------------------------------------
 def test_heights_by_source(made: Made) -> None:
     heights = made[1].statics.heights
-    assert heights["building"] == {"height": 5, "levels": 3, "default": 3}
+    assert heights["building"] == {"height": 5, "levels": 3, "neighbours": 3}
     assert heights["roof"] == {"type": 1}
     assert heights["tree"] == {"height": 1, "default": 7}
     assert heights["barrier"] == {"height": 1, "default": 3}
