@@ -184,6 +184,12 @@ def _nowhere(path: Path) -> None:
     write_tiff(path, np.zeros((4, 4)), transform=rasterio.Affine.identity())
 
 
+def _far(path: Path) -> None:
+    import rasterio
+
+    write_tiff(path, np.zeros((4, 4)), transform=rasterio.Affine(1e-300, 0, 0, 0, -10, 0))
+
+
 def _complex(path: Path) -> None:
     write_tiff(path, np.zeros((4, 4), dtype=np.complex64))
 
@@ -196,6 +202,7 @@ def _fathoms(path: Path) -> None:
 @pytest.mark.parametrize(("damage", "message"), [
     (_truncated, "cannot be read as GeoTIFF"), (_text, "cannot be read as GeoTIFF"),
     (_bands, "expected one band of heights, got 3"), (_nowhere, "the image has no georeference"),
+    (_far, "invalid georeference"),
     (_complex, "expected heights as real numbers, got complex64"), (_fathoms, "metres or feet, got 'fathom'"),
 ])  # fmt: skip
 def test_rejects_broken_tiffs(damage: Callable[[Path], None], message: str, tmp_path: Path) -> None:

@@ -39,6 +39,7 @@ _ASCII_HINT = "An ASCII grid begins with ncols, nrows, xllcorner, yllcorner and 
 _CHUNK_BYTES, _MAX_WORD_BYTES, _MAX_HEADER_LINES = 1 << 20, 1000, 100
 _MAX_CELLS_A_SIDE = 1_000_000
 _MAX_COORDINATE = 1e9
+_MIN_CELL_AREA = 1e-20
 _TO_SPACES = bytes.maketrans(b"\n\r\t\f\v", b"     ")
 _DEFAULT_NODATA = -9999.0
 
@@ -240,7 +241,8 @@ def _tiff_header(file: Any, path: Path) -> RasterHeader:
     if (a, b, c, d, e, f) == (1.0, 0.0, 0.0, 0.0, 1.0, 0.0):
         hint = "Export it with its georeference, as GeoTIFF."
         raise InputError(path, "the image has no georeference", hint)
-    if not all(map(math.isfinite, transform)) or not a * e - b * d:
+    is_small = all(abs(value) <= _MAX_COORDINATE for value in transform)  # false for NaN
+    if not is_small or not abs(a * e - b * d) > _MIN_CELL_AREA:
         raise InputError(path, f"invalid georeference {transform}", COMPLETE_FILE)
     crs = file.crs.to_wkt() if file.crs else None
     return RasterHeader(rows, columns, (a, b, c, d, e, f), crs)
