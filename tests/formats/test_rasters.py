@@ -13,6 +13,7 @@ import pytest
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.formats import xml
 from egvs.formats.rasters import HeightGrid, is_ascii_grid, is_geotiff, read_ascii_grid, read_geotiff
 
 EAST, NORTH, CELL_M = 500_000.0, 5_400_000.0, 10.0
@@ -128,8 +129,11 @@ GOOD = "ncols 2\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n1 2\n3 4\n"
 BROKEN_ASCII = {
     "truncated": (GOOD[:-4], "expected 2 x 2 heights, got 2"),
     "too many": (GOOD + "5\n", "has more than 2 x 2 heights"),
-    "word": (GOOD.replace("3 4", "3 four"), "expected heights, got b'3 four"),
+    "word": (GOOD.replace("3 4", "3 four"), "expected heights, got b'four'"),
     "underscore": (GOOD.replace("3 4", "3 4_0"), "expected heights"),
+    "infinite": (GOOD.replace("3 4", "3 inf"), "expected heights, got b'inf'"),
+    "endless word": (GOOD + "1" * 5000, "expected heights, got b'1111"),
+    "empty lines": (GOOD.replace("cellsize", "\n" * 200 + "cellsize"), "cellsize: is missing"),
     "no cell size": (GOOD.replace("cellsize 1\n", ""), "cellsize: is missing"),
     "no corner": (GOOD.replace("xllcorner 0\n", ""), "xllcorner: is missing"),
     "twice": (GOOD.replace("nrows 2", "ncols 2"), "invalid line"),
@@ -139,6 +143,18 @@ BROKEN_ASCII = {
     "huge": (GOOD.replace("ncols 2\nnrows 2", "ncols 1000000\nnrows 1000000"), "too many cells"),
     "far": (GOOD.replace("xllcorner 0", "xllcorner 1e300"), "xllcorner: expected a coordinate"),
 }
+
+
+def test_billion_empty_lines_are_read_in_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A small file that is packed: 30 MB of empty lines are some chunks, not thirty million lines."""
+    calls = []
+    monkeypatch.setattr(xml, "read_line", lambda file, path: calls.append(1) or file.readline())
+    (tmp_path / "a.asc.gz").write_bytes(gzip.compress(GOOD.encode() + b"\n" * 30_000_000, 1))
+    assert read_ascii_grid(tmp_path / "a.asc.gz").heights_m.tolist() == [[1, 2], [3, 4]]
+    assert len(calls) == 6
+    wrapped = GOOD.replace("1 2\n3 4\n", "1\t2 3\r\n\r\n4")
+    (tmp_path / "b.asc").write_text(wrapped, newline="")
+    assert read_ascii_grid(tmp_path / "b.asc").heights_m.tolist() == [[1, 2], [3, 4]]
 
 
 @pytest.mark.parametrize("case", BROKEN_ASCII)
@@ -168,6 +184,12 @@ def _nowhere(path: Path) -> None:
     write_tiff(path, np.zeros((4, 4)), transform=rasterio.Affine.identity())
 
 
+def _far(path: Path) -> None:
+    import rasterio
+
+    write_tiff(path, np.zeros((4, 4)), transform=rasterio.Affine(1e-300, 0, 0, 0, -10, 0))
+
+
 def _complex(path: Path) -> None:
     write_tiff(path, np.zeros((4, 4), dtype=np.complex64))
 
@@ -180,6 +202,7 @@ def _fathoms(path: Path) -> None:
 @pytest.mark.parametrize(("damage", "message"), [
     (_truncated, "cannot be read as GeoTIFF"), (_text, "cannot be read as GeoTIFF"),
     (_bands, "expected one band of heights, got 3"), (_nowhere, "the image has no georeference"),
+    (_far, "invalid georeference"),
     (_complex, "expected heights as real numbers, got complex64"), (_fathoms, "metres or feet, got 'fathom'"),
 ])  # fmt: skip
 def test_rejects_broken_tiffs(damage: Callable[[Path], None], message: str, tmp_path: Path) -> None:

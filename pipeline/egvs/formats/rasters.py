@@ -36,8 +36,11 @@ _UNITS_M = {
 }  # fmt: skip
 _ASCII_KEYS = ("ncols", "nrows", "xllcorner", "yllcorner", "xllcenter", "yllcenter", "cellsize", "nodata_value")
 _ASCII_HINT = "An ASCII grid begins with ncols, nrows, xllcorner, yllcorner and cellsize; then come the rows."
+_CHUNK_BYTES, _MAX_WORD_BYTES, _MAX_HEADER_LINES = 1 << 20, 1000, 100
 _MAX_CELLS_A_SIDE = 1_000_000
 _MAX_COORDINATE = 1e9
+_MIN_CELL_AREA = 1e-20
+_TO_SPACES = bytes.maketrans(b"\n\r\t\f\v", b"     ")
 _DEFAULT_NODATA = -9999.0
 
 
@@ -176,12 +179,11 @@ def read_ascii_grid(path: Path) -> HeightGrid:
         rows, columns = int(header["nrows"]), int(header["ncols"])
         values = np.empty(rows * columns)
         filled = 0
-        for line in _lines(first_row, file, path):
-            row = _parse_row(line, path)
-            if filled + len(row) > len(values):
+        for words in _words(first_row, file, path):
+            if filled + len(words) > len(values):
                 raise InputError(path, f"has more than {rows} x {columns} heights", _ASCII_HINT)
-            values[filled : filled + len(row)] = row
-            filled += len(row)
+            values[filled : filled + len(words)] = _parse_heights(words, path)
+            filled += len(words)
     if filled < len(values):
         raise InputError(path, f"expected {rows} x {columns} heights, got {filled}", COMPLETE_FILE)
     values[(values == header.get("nodata_value", _DEFAULT_NODATA)) | ~np.isfinite(values)] = np.nan
@@ -239,7 +241,8 @@ def _tiff_header(file: Any, path: Path) -> RasterHeader:
     if (a, b, c, d, e, f) == (1.0, 0.0, 0.0, 0.0, 1.0, 0.0):
         hint = "Export it with its georeference, as GeoTIFF."
         raise InputError(path, "the image has no georeference", hint)
-    if not all(map(math.isfinite, transform)) or not a * e - b * d:
+    is_small = all(abs(value) <= _MAX_COORDINATE for value in transform)  # false for NaN
+    if not is_small or not abs(a * e - b * d) > _MIN_CELL_AREA:
         raise InputError(path, f"invalid georeference {transform}", COMPLETE_FILE)
     crs = file.crs.to_wkt() if file.crs else None
     return RasterHeader(rows, columns, (a, b, c, d, e, f), crs)
@@ -259,7 +262,7 @@ def _tiff_unit_m(file: Any, crs: str | None, path: Path) -> float:
 def _read_ascii_header(file: IO[bytes], path: Path) -> tuple[dict[str, float], bytes]:
     """Return the values by key, and the first line after them."""
     header: dict[str, float] = {}
-    while True:
+    for _ in range(_MAX_HEADER_LINES):
         line = xml.read_line(file, path)
         words = line.split()
         key = words[0].decode("ascii", "replace").lower() if words else ""
@@ -300,19 +303,28 @@ def _ascii_transform(header: dict[str, float], path: Path) -> tuple[float, float
     return cell, 0.0, origin[0], 0.0, -cell, origin[1] + header["nrows"] * cell
 
 
-def _lines(first: bytes, file: IO[bytes], path: Path) -> Iterator[bytes]:
-    while first:
-        yield first
-        first = xml.read_line(file, path)
+def _words(first: bytes, file: IO[bytes], path: Path) -> Iterator[list[bytes]]:
+    """Yield the words of a line and of the rest of a file, chunk by chunk; a file may have a billion empty lines."""
+    yield first.split()
+    rest = b""
+    while chunk := file.read(_CHUNK_BYTES):
+        complete, _, rest = (rest + chunk).translate(_TO_SPACES).rpartition(b" ")
+        if len(rest) > _MAX_WORD_BYTES:
+            raise InputError(path, f"expected heights, got {rest[:60]!r}", _ASCII_HINT)
+        yield complete.split()
+    yield rest.split()
 
 
-def _parse_row(line: bytes, path: Path) -> FloatArray:
-    if b"_" not in line:  # Python accepts it between digits
+def _parse_heights(words: list[bytes], path: Path) -> FloatArray:
+    heights = np.empty(len(words))
+    for number, word in enumerate(words):
         try:
-            return np.array([float(word) for word in line.split()])
+            heights[number] = float(word)
         except ValueError:
-            pass
-    raise InputError(path, f"expected heights, got {line[:60]!r}", _ASCII_HINT)
+            heights[number] = np.inf
+        if b"_" in word or np.isinf(heights[number]):  # Python accepts _ between digits
+            raise InputError(path, f"expected heights, got {word[:60]!r}", _ASCII_HINT)
+    return heights
 
 
 def _parse_number(text: bytes, where: str) -> float:
