@@ -22,6 +22,7 @@ import pyarrow.parquet as pq
 
 from tests.city.conftest import write_city
 from tests.conftest import SCENARIO, SITES, collection, fcd, feature, write_mini
+from tests.importers.lanelet2_maps import make_crossing
 
 _KINDS = SCENARIO[SCENARIO.index("[[traffic.kinds]]") : SCENARIO.index("[statics]")]
 _TRAFFIC = SCENARIO[SCENARIO.index("[traffic]") : SCENARIO.index("[statics]")]
@@ -122,6 +123,17 @@ def _simulated(folder: Path, source: str) -> Path:
 def drawn(folder: Path) -> None:
     """Drawn trips on a network."""
     _simulated(folder, 'network = "net.net.xml"')
+
+
+def terrain(folder: Path) -> None:
+    """The same, in a hollow: points of the ground beyond the roads."""
+    made = _simulated(folder, 'network = "net.net.xml"')
+    text = (made / "scenario.toml").read_text()
+    (made / "scenario.toml").write_text(text.replace("[statics]\n", '[statics]\nterrain = "terrain.ply"\n'))
+    lines = [f"{x} {y} {max(abs(x - 100), abs(y - 100)) / 50}" for x in range(0, 201, 20) for y in range(0, 201, 20)]
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(lines)}\n"
+    properties = "".join(f"property double {axis}\n" for axis in "xyz")
+    (made / "terrain.ply").write_text(head + properties + "end_header\n" + "\n".join(lines) + "\n")
 
 
 def drawn_gz(folder: Path) -> None:
@@ -273,13 +285,25 @@ def measured(name: str):
     def make(folder: Path) -> None:
         made = mini(folder, ('sensor = "small"', f'sensor = "small"\npoints = "{name}"'))
         (made / "sites.csv").write_text("".join(SITES.splitlines(keepends=True)[:2]))
-        _write_points(made / name)
+        write_cloud(made / name)
 
     return make
 
 
-def _write_points(path: Path) -> None:
+def write_cloud(path: Path) -> None:
+    """Write points of the ground in the format that the suffix names, maybe gzipped."""
     points, form = _points(), path.suffix.removeprefix(".")
+    if form == "gz":
+        plain = path.with_suffix("")
+        write_cloud(plain)
+        path.write_bytes(gzip.compress(plain.read_bytes(), mtime=0))
+        return
+    if form == "e57":
+        from tests.formats.test_e57 import NO_TURN, cartesian, write_e57
+
+        station = np.array([10.0, 12.0, 3.0])
+        write_e57(path, (cartesian(*(points - station)), NO_TURN, station))
+        return
     if form in ("las", "laz"):
         import laspy
 
@@ -324,6 +348,18 @@ def extract(name: str):
             (folder / name).write_bytes(gzip.compress(SMALL_OSM.read_bytes(), mtime=0))
         else:
             shutil.copyfile(SMALL_OSM, folder / name)
+
+    return make
+
+
+def lanelets(name: str):
+    """A Lanelet2 map of a crossing, beside no scenario."""
+
+    def make(folder: Path) -> None:
+        path = make_crossing(tags={"speed_limit": "50"}).writer.write(folder / "lanelets.osm")
+        if name.endswith(".gz"):
+            (folder / name).write_bytes(gzip.compress(path.read_bytes(), mtime=0))
+            path.unlink()
 
     return make
 

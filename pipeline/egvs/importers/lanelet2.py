@@ -8,21 +8,25 @@ and what is wrong in it is reported in the notes, by the identifiers of lanelets
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray
 from egvs.core.reading import translate_errors
 from egvs.formats.lanelet2 import LaneletMap, is_lanelet2, read_lanelet2
-from egvs.formats.lanelet2_graph import LaneletGraph, LaneletKey, build_graph
-from egvs.formats.lanelet2_projection import project_points
+from egvs.formats.lanelet2_graph import DirectedLanelet, LaneletGraph, LaneletKey, build_graph
+from egvs.formats.lanelet2_projection import ProjectedPoints, project_points
 from egvs.importers import lanelet2_rules as rules
+from egvs.importers.lanelet2_crosswalks import Crosswalk, place_crosswalks
 from egvs.importers.lanelet2_network import (
     MAX_LANE_ERROR_M,
     NetworkBuilder,
     NetworkQuality,
     unused_relations,
 )
+from egvs.importers.lanelet2_right_of_way import RightOfWay
 from egvs.importers.lanelet2_roads import RoadLayout, make_roads
 from egvs.importers.lanelet2_signals import SignalPlan, plan_signals
 from egvs.importers.map_parts import RoadMap, RoadOptions
@@ -45,7 +49,8 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
     path
         An ``.osm`` file, plain or gzipped; a ``map_projector_info.yaml`` beside it is used.
     options
-        ``lefthand`` is needed only where no opposite lanes tell the driving side.
+        ``lefthand`` is needed only where no opposite lanes tell the driving side. With ``walk``, crosswalks become
+        crossings, and the roads at their junctions get sidewalks.
 
     Raises
     ------
@@ -60,16 +65,24 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
         raise InputError(path, "has no lanelets for motor vehicles", _NO_ROADS_HINT)
     lefthand, side_notes = rules.choose_driving_side(graph, options.lefthand, str(path))
     with translate_errors(path, "Correct the map in an editor.", "its lanelets cannot be made into roads"):
-        layout = make_roads(graph, lefthand=lefthand)
-    signals = plan_signals(layout, lanelet_map, points.xyz_m, lefthand=lefthand)
-    builder = NetworkBuilder(layout, lanelet_map, points.frame, signals, str(path), lefthand=lefthand)
+        crosswalk_lanelets = _crosswalks(lanelet_map, points.xyz_m) if options.walk else []
+        layout = make_roads(graph, lefthand=lefthand, crosswalks=crosswalk_lanelets)
+        crosswalks, unused_crosswalks = place_crosswalks(layout, crosswalk_lanelets)
+    builder = _make_builder(layout, lanelet_map, points, crosswalks, str(path), lefthand)
     network, quality = builder.build()
+    lost_crossings = quality.lost_crossings
+    if lost_crossings:
+        crosswalks = tuple(crosswalk for crosswalk in crosswalks if crosswalk not in lost_crossings)
+        builder = _make_builder(layout, lanelet_map, points, crosswalks, str(path), lefthand)
+        network, quality = builder.build()
     notes = (
         *points.notes,
         *side_notes,
         *_content_notes(lanelet_map, graph, layout),
+        *(_crosswalk_notes(crosswalks, unused_crosswalks, lost_crossings) if options.walk else ()),
         *_assumption_notes(builder.assumed),
-        *_signal_notes(signals),
+        *_signal_notes(builder.signals),
+        *_right_of_way_notes(builder.right_of_way),
         *_problem_notes(lanelet_map, graph, layout),
         *_quality_notes(quality, builder.lane_changes.opened),
     )
@@ -109,6 +122,43 @@ def _assumption_notes(assumed: rules.Assumptions) -> Iterator[str]:
         yield f"Road classes are assumed by subtype and number of lanes: {counts} roads."
 
 
+def _crosswalks(lanelet_map: LaneletMap, xyz_m: Mapping[int, FloatArray]) -> list[DirectedLanelet]:
+    """Return the lanelets of crosswalks, in one of their directions."""
+    graph = build_graph(lanelet_map, xyz_m, lambda lanelet: lanelet.tags.get("subtype") == "crosswalk")
+    return [lanelet for key, lanelet in graph.lanelets.items() if not key.is_reversed]
+
+
+def _make_builder(
+    layout: RoadLayout,
+    lanelet_map: LaneletMap,
+    points: ProjectedPoints,
+    crosswalks: Sequence[Crosswalk],
+    where: str,
+    lefthand: bool,
+) -> NetworkBuilder:
+    """Plan sidewalks and traffic lights of a layout, and return the builder of its network."""
+    nodes = Counter(crosswalk.node for crosswalk in crosswalks)
+    sidewalks = frozenset(road.id for road in layout.roads.values() if road.start in nodes or road.end in nodes)
+    layout = replace(layout, sidewalks=sidewalks)
+    signals = plan_signals(layout, lanelet_map, points.xyz_m, nodes, lefthand=lefthand)
+    return NetworkBuilder(layout, lanelet_map, points.frame, signals, where, lefthand=lefthand, crosswalks=crosswalks)
+
+
+def _crosswalk_notes(
+    crosswalks: Sequence[Crosswalk], unused: Sequence[int], lost: Sequence[Crosswalk]
+) -> Iterator[str]:
+    if crosswalks:
+        ids = _count([number for crosswalk in crosswalks for number in crosswalk.ids])
+        yield f"Crosswalks: {ids}. The roads at their junctions get sidewalks 2 m wide, which are assumed."
+    else:
+        yield "The map has no crosswalk of complete streets, so there are no sidewalks and no crossings."
+    if unused:
+        yield f"Crosswalks that cross no road for motor vehicles, left out: {_count(unused)}."
+    if lost:
+        ids = _count([number for crosswalk in lost for number in crosswalk.ids])
+        yield f"Crosswalks that end between the carriageways of a street, left out: {ids}."
+
+
 def _signal_notes(signals: SignalPlan) -> Iterator[str]:
     if signals.nodes:
         yield f"Junctions with traffic lights: {_count(signals.nodes)}. Their signal plans are assumed."
@@ -123,6 +173,16 @@ def _signal_notes(signals: SignalPlan) -> Iterator[str]:
         yield f"Traffic lights that govern no lane in a junction, left out: {_count(signals.unused)}."
 
 
+def _right_of_way_notes(right_of_way: RightOfWay) -> Iterator[str]:
+    if right_of_way.prohibitions or right_of_way.all_way_stops:
+        yield (
+            f"Right of way as the map states it: {len(right_of_way.prohibitions)} pairs of connections, "
+            f"{len(right_of_way.all_way_stops)} junctions where all stop. Elsewhere, smaller roads give way."
+        )
+    if right_of_way.unused:
+        yield f"Rules of right of way between lanelets that do not meet, left out: {_count(right_of_way.unused)}."
+
+
 def _problem_notes(lanelet_map: LaneletMap, graph: LaneletGraph, layout: RoadLayout) -> Iterator[str]:
     """Yield what is wrong in the map."""
     if lanelet_map.incomplete:
@@ -134,11 +194,10 @@ def _problem_notes(lanelet_map: LaneletMap, graph: LaneletGraph, layout: RoadLay
             "Lanelets that seem to run the wrong way, since they would continue others if their bounds were swapped: "
             f"{_count(reversed_keys)}. They are taken as the map states."
         )
-    stubs = sorted({str(lane.key) for road in layout.roads.values() for lane in road.lanes if lane.key.part})
-    if stubs:
+    if layout.stubs:
         yield (
             "Lanelets that begin or end inside a junction, without a predecessor or a follower: "
-            f"{_count(stubs)}. A piece of each became a road."
+            f"{_count(layout.stubs)}. A piece of each became a road."
         )
     if layout.unused:
         ids = sorted({str(key) for key in layout.unused})

@@ -22,9 +22,12 @@ from egvs.core.grid import FloatArray
 from egvs.formats.georeference import WorldFrame
 from egvs.formats.lanelet2 import LaneletMap
 from egvs.importers import lanelet2_rules as rules
+from egvs.importers.lanelet2_crosswalks import Crosswalk
 from egvs.importers.lanelet2_lane_changes import find_lane_changes
 from egvs.importers.lanelet2_nodes import ATTEMPTS, NodeShapes, lane_errors_m
+from egvs.importers.lanelet2_right_of_way import find_right_of_way
 from egvs.importers.lanelet2_roads import Road, RoadLayout, Turn
+from egvs.importers.lanelet2_sidewalks import crossing_elements, crossing_lines_m, sidewalk_element
 from egvs.importers.lanelet2_signals import SignalPlan
 from egvs.importers.plain_network import NETWORK_FILE, PlainElement, PlainNetwork, format_number, format_shape
 from egvs.traffic import network as road_network
@@ -64,12 +67,15 @@ class NetworkQuality:
         Lanes that are more than :data:`MAX_LANE_ERROR_M` off, as ``road_lane``.
     lost, added
         Connections that netconvert dropped or invented, as ``road_lane -> road_lane``.
+    lost_crossings
+        Crosswalks that netconvert cannot build.
     """
 
     max_lane_error_m: float = 0.0
     bad_lanes: list[str] = field(default_factory=list)
     lost: list[str] = field(default_factory=list)
     added: list[str] = field(default_factory=list)
+    lost_crossings: list[Crosswalk] = field(default_factory=list)
 
 
 class NetworkBuilder:
@@ -89,6 +95,8 @@ class NetworkBuilder:
         The file, for messages.
     lefthand
         Whether traffic drives on the left.
+    crosswalks
+        Crosswalks; the layout says which roads get a sidewalk.
     """
 
     def __init__(
@@ -100,32 +108,43 @@ class NetworkBuilder:
         where: str,
         *,
         lefthand: bool,
+        crosswalks: Sequence[Crosswalk] = (),
     ) -> None:
+        self._crosswalks = crosswalks
         self._layout = layout
-        self._signals = signals
+        self.signals = signals
         self._map = lanelet_map
         self._frame = frame
         self._where = where
         self._lefthand = lefthand
         self._shapes = NodeShapes(layout)
         self.lane_changes = find_lane_changes(layout, lanelet_map, lefthand=lefthand)
+        self.right_of_way = find_right_of_way(layout, lanelet_map, signals.nodes)
         self.assumed = rules.Assumptions()
 
     def build(self) -> tuple[str, NetworkQuality]:
         """Return the text of the network, and how it differs from the map."""
         edges = [self._edge(road) for road in self._layout.roads.values()]
-        connections = list(self._connections())
-        signals = list(self._signals.elements)
+        connections = [*self._connections(), *self.right_of_way.elements()]
+        signals = list(self.signals.elements)
         flags = ["--lefthand"] if self._lefthand else []
         attempts = dict.fromkeys(self._layout.nodes(), 0)
+        crossings = list(crossing_elements(self._crosswalks, self.signals, None))
         while True:
             nodes = [self._node(node, attempt) for node, attempt in attempts.items()]
-            text = self._convert(PlainNetwork(self._frame, nodes, edges, connections, signals), flags)
+            text = self._convert(PlainNetwork(self._frame, nodes, edges, connections + crossings, signals), flags)
             quality, bad_nodes = self._measure(text)
             improvable = {node for node in bad_nodes if attempts[node] < ATTEMPTS - 1}
             if not improvable:
-                return text, quality
+                break
             attempts |= {node: attempts[node] + 1 for node in improvable}
+        if self._crosswalks:
+            crossings = list(crossing_elements(self._crosswalks, self.signals, text))
+            text = self._convert(PlainNetwork(self._frame, nodes, edges, connections + crossings, signals), flags)
+            quality, _ = self._measure(text)
+            built = crossing_lines_m(text)
+            quality.lost_crossings = [walk for walk in self._crosswalks if frozenset(walk.roads) not in built]
+        return text, quality
 
     def _convert(self, plain: PlainNetwork, flags: Sequence[str]) -> str:
         try:
@@ -138,10 +157,10 @@ class NetworkBuilder:
         x, y, z = self._shapes.position_m(node).tolist()
         shape = self._shapes.shape_m(node, attempt)
         attributes = {"id": node, "x": format_number(x), "y": format_number(y), "z": format_number(z)}
-        if node in self._signals.nodes:
+        if node in self.signals.nodes:
             attributes |= {"type": "traffic_light", "tl": node}
         else:
-            attributes["type"] = "priority"
+            attributes["type"] = "allway_stop" if node in self.right_of_way.all_way_stops else "priority"
         attributes["shape"] = format_shape(shape, z)
         return PlainElement("node", attributes)
 
@@ -149,20 +168,24 @@ class NetworkBuilder:
         lanelets = list(road.lanes)
         kind = rules.road_class(lanelets[0].tags, len(lanelets), self.assumed)
         attributes = {
-            "id": road.id, "from": road.start, "to": road.end, "numLanes": str(len(road.lanes)),
+            "id": road.id, "from": road.start, "to": road.end,
+            "numLanes": str(self._layout.sumo_lane(road.id, len(road.lanes))),
             "type": f"highway.{kind}", "priority": str(_PRIORITIES.get(kind, _OTHER_PRIORITY)),
             "spreadType": "center", "shape": format_shape(simplify_line(_extend(_road_line_m(road)))),
         }  # fmt: skip
         if all("highway" in lanelet.tags for lanelet in lanelets):
             name = rules.common_tag(lanelets, "name")
             attributes |= {"name": name} if name else {}
-        return PlainElement("edge", attributes, tuple(self._lane(road, index) for index in range(len(road.lanes))))
+        lanes = [self._lane(road, index) for index in range(len(road.lanes))]
+        if road.id in self._layout.sidewalks:
+            lanes.insert(0, sidewalk_element(road, lefthand=self._lefthand))
+        return PlainElement("edge", attributes, tuple(lanes))
 
     def _lane(self, road: Road, index: int) -> PlainElement:
         lane = road.lanes[index]
         speed_km_h = rules.speed_limit_km_h(lane, self._map, self._where, self.assumed)
         attributes = {
-            "index": str(index),
+            "index": str(self._layout.sumo_lane(road.id, index)),
             "speed": format_number(speed_km_h / _KM_H_PER_M_S),
             "width": format_number(lane.width_m),
             "shape": format_shape(simplify_line(lane.center_m)),
@@ -172,7 +195,8 @@ class NetworkBuilder:
         for key, other in (("changeLeft", left), ("changeRight", right)):
             if 0 <= other < len(road.lanes) and other not in self.lane_changes.to_lanes[road.id, index]:
                 attributes[key] = _NO_CHANGE
-        return PlainElement("lane", attributes)
+        origin = PlainElement("param", {"key": "origId", "value": str(lane.key.id)})
+        return PlainElement("lane", attributes, (origin,))
 
     def _connections(self) -> Iterator[PlainElement]:
         turns = self._layout.turns
@@ -185,19 +209,21 @@ class NetworkBuilder:
 
     def _connection(self, turn: Turn) -> PlainElement:
         attributes = {"from": turn.source, "to": turn.target}
-        attributes |= {"fromLane": str(turn.source_lane), "toLane": str(turn.target_lane)}
+        attributes["fromLane"] = str(self._layout.sumo_lane(turn.source, turn.source_lane))
+        attributes["toLane"] = str(self._layout.sumo_lane(turn.target, turn.target_lane))
         if len(turn.shape_m):
             attributes["shape"] = format_shape(simplify_line(turn.shape_m))
-        is_signalised = self._layout.roads[turn.source].end in self._signals.nodes
-        if is_signalised and turn not in self._signals.index_of:
+        is_signalised = self._layout.roads[turn.source].end in self.signals.nodes
+        if is_signalised and turn not in self.signals.index_of:
             attributes["uncontrolled"] = "true"
         return PlainElement("connection", attributes)
 
     def _measure(self, text: str) -> tuple[NetworkQuality, set[str]]:
         """Compare a network with the map; return the nodes at the bad ends of lanes, too."""
         actual = read_network_text(text)
+        sumo_lane = self._layout.sumo_lane
         wanted_m = {
-            (road.id, index): lane.center_m
+            (road.id, sumo_lane(road.id, index)): lane.center_m
             for road in self._layout.roads.values()
             for index, lane in enumerate(road.lanes)
         }
@@ -220,7 +246,15 @@ class NetworkBuilder:
                 if error_m > MAX_LANE_ERROR_M
             }
             bad_nodes |= at_ends or {road.start, road.end}
-        wanted = {(turn.source, turn.source_lane, turn.target, turn.target_lane) for turn in self._layout.turns}
+        wanted = {
+            (
+                turn.source,
+                sumo_lane(turn.source, turn.source_lane),
+                turn.target,
+                sumo_lane(turn.target, turn.target_lane),
+            )
+            for turn in self._layout.turns
+        }
         edges = actual.edges
         built = {(edges[c.source].id, c.source_lane, edges[c.target].id, c.target_lane) for c in actual.connections}
         quality.lost = [_describe_turn(turn) for turn in sorted(wanted - built)]

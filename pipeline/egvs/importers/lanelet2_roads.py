@@ -6,7 +6,8 @@ Steps of :func:`make_roads`:
    another one, or have the tag ``turn_direction``.
 2. Where the map begins or ends inside a junction, a piece of the inner lanelet is cut off as a road.
 3. Roads are chains of neighbours among the rest; lane 0 is the one at the kerb.
-4. Nodes are groups of road ends and inner lanelets that follow each other, overlap, or share the end of a bound.
+4. Nodes are groups of road ends and inner lanelets that follow each other, overlap, or share the end of a bound, and of
+   road ends side by side where the map ends.
 5. A road that starts and ends in the same node becomes inner if it is short, and is cut in the middle otherwise;
    then the nodes are found again.
 6. Turns are the shortest paths through inner lanelets from lane to lane.
@@ -20,8 +21,9 @@ from __future__ import annotations
 
 import heapq
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -30,6 +32,8 @@ from shapely.geometry import Point
 
 from egvs.core.grid import FloatArray
 from egvs.formats.lanelet2_graph import DirectedLanelet, LaneletGraph, LaneletKey, split_lanelets
+from egvs.importers.lanelet2_arms import Groups, join_arms
+from egvs.importers.lanelet2_crosswalks import cut_at_crosswalks
 
 LEVEL_M = 3.0
 """Roads at least so far above each other do not meet."""
@@ -43,8 +47,14 @@ JOIN_OVERLAP_M2 = 0.5
 SHORT_ROAD_M = 40.0
 """A road between two parts of the same node is part of the node if it is shorter than this."""
 
+CROSSWALK_RANGE_M = 15.0
+"""A crosswalk nearer than this to a junction is part of it."""
+
 MAX_STUB_M, MAX_STUB_SHARE = 15.0, 0.3
 """Length of the road that is cut off a lanelet where the map begins or ends in a junction, and its largest share."""
+
+APPROACH_M = 30.0
+"""Lights and signs govern the next junction if it is nearer than this to the lanelets that refer to them."""
 
 _TURN_DIRECTIONS = frozenset({"left", "right", "straight"})
 
@@ -126,6 +136,10 @@ class RoadLayout:
         All permitted turns.
     unused
         Inner lanelets that no turn uses: their chain begins or ends in the junction.
+    stubs
+        The lanelets that begin or end inside a junction, a piece of which became a road.
+    sidewalks
+        The roads that get a sidewalk.
     """
 
     graph: LaneletGraph
@@ -133,13 +147,41 @@ class RoadLayout:
     inner: dict[LaneletKey, str]
     turns: tuple[Turn, ...]
     unused: tuple[LaneletKey, ...]
+    stubs: tuple[LaneletKey, ...]
+    sidewalks: frozenset[str] = frozenset()
+
+    def sumo_lane(self, road: str, index: int) -> int:
+        """Return SUMO's index of a lane: a sidewalk comes first."""
+        return index + 1 if road in self.sidewalks else index
+
+    @cached_property
+    def turns_from(self) -> dict[tuple[str, int], list[Turn]]:
+        """The turns from each lane, by road and lane."""
+        turns: dict[tuple[str, int], list[Turn]] = defaultdict(list)
+        for turn in self.turns:
+            turns[turn.source, turn.source_lane].append(turn)
+        return dict(turns)
+
+    def turns_in_junction(self, turn: Turn) -> list[Turn]:
+        """Return a turn, or those of the next junction within :data:`APPROACH_M` if it only leads to another road."""
+        walked_m = 0.0
+        while not turn.path:
+            lane = self.roads[turn.target].lanes[turn.target_lane]
+            walked_m += line_length_m(lane.center_m)
+            following = self.turns_from.get((turn.target, turn.target_lane), [])
+            if walked_m > APPROACH_M or not following:
+                return []
+            if len(following) > 1:
+                return [other for other in following if other.path]
+            turn = following[0]
+        return [turn]
 
     def nodes(self) -> list[str]:
         """Return all nodes, sorted."""
         return sorted({node for road in self.roads.values() for node in (road.start, road.end)})
 
 
-def make_roads(graph: LaneletGraph, *, lefthand: bool) -> RoadLayout:
+def make_roads(graph: LaneletGraph, *, lefthand: bool, crosswalks: Sequence[DirectedLanelet] = ()) -> RoadLayout:
     """Find the roads, nodes and turns of a map.
 
     Parameters
@@ -148,13 +190,21 @@ def make_roads(graph: LaneletGraph, *, lefthand: bool) -> RoadLayout:
         The lanelets for motor vehicles.
     lefthand
         Whether traffic drives on the left: then lane 0 is the leftmost.
+    crosswalks
+        Lanelets of crosswalks; the pieces of roads under them become inner.
     """
     overlaps = _find_overlaps(graph)
     inner = _inner_lanelets(graph, overlaps)
-    graph, inner, overlaps = _add_stubs(graph, inner, overlaps)
+    graph, inner, overlaps, stubs = _add_stubs(graph, inner, overlaps)
+    graph, crossed = cut_at_crosswalks(graph, _make_chains(graph, inner, lefthand), crosswalks)
+    inner |= set(crossed)
     while True:
         roads = _make_chains(graph, inner, lefthand)
-        node_of_end, node_of_inner = _find_nodes(graph, roads, inner, overlaps)
+        node_of_end, node_of_inner = _find_nodes(graph, roads, inner, overlaps, crossed)
+        beside_crosswalks = _short_roads_beside(roads, node_of_end, node_of_inner, crossed)
+        if beside_crosswalks:
+            inner |= beside_crosswalks
+            continue
         loops = [road for road in roads if node_of_end[road.id, "start"] == node_of_end[road.id, "end"]]
         if not loops:
             break
@@ -168,7 +218,7 @@ def make_roads(graph: LaneletGraph, *, lefthand: bool) -> RoadLayout:
     }
     turns = tuple(_find_turns(graph, placed, inner))
     used = {key for turn in turns for key in turn.path}
-    return RoadLayout(graph, placed, node_of_inner, turns, tuple(sorted(inner - used)))
+    return RoadLayout(graph, placed, node_of_inner, turns, tuple(sorted(inner - used)), stubs)
 
 
 def line_length_m(line_m: FloatArray) -> float:
@@ -223,7 +273,7 @@ def _inner_lanelets(graph: LaneletGraph, overlaps: list[Overlap]) -> set[Lanelet
 
 def _add_stubs(
     graph: LaneletGraph, inner: set[LaneletKey], overlaps: list[Overlap]
-) -> tuple[LaneletGraph, set[LaneletKey], list[Overlap]]:
+) -> tuple[LaneletGraph, set[LaneletKey], list[Overlap], tuple[LaneletKey, ...]]:
     """Cut pieces off the inner lanelets where the map begins or ends inside a junction; the pieces become roads.
 
     A lanelet with neither predecessor nor follower loses a piece at both ends.
@@ -241,7 +291,8 @@ def _add_stubs(
         if shares:
             graph = split_lanelets(graph, shares)
     moved = [replace(o, first=inner_part[o.first], second=inner_part[o.second]) for o in overlaps if o.is_within(inner)]
-    return graph, set(inner_part.values()), moved
+    stubs = tuple(sorted(whole for whole, part in inner_part.items() if part != whole))
+    return graph, set(inner_part.values()), moved, stubs
 
 
 def _stub_lengths_m(lengths_m: Mapping[LaneletKey, float], overlaps: list[Overlap]) -> dict[LaneletKey, float]:
@@ -293,24 +344,21 @@ def _make_road(graph: LaneletGraph, chain: list[LaneletKey]) -> Road:
     return Road(name, tuple(graph.lanelets[key] for key in chain))
 
 
-class _Groups:
-    """Union-find: groups of things that are joined."""
-
-    def __init__(self) -> None:
-        self._parents: dict[object, object] = {}
-
-    def find(self, thing: object) -> object:
-        """Return the representative of a thing's group."""
-        root = thing
-        while (parent := self._parents.setdefault(root, root)) != root:
-            root = parent
-        while self._parents[thing] != root:
-            self._parents[thing], thing = root, self._parents[thing]
-        return root
-
-    def join(self, a: object, b: object) -> None:
-        """Make one group of two."""
-        self._parents[self.find(a)] = self.find(b)
+def _short_roads_beside(
+    roads: Sequence[Road],
+    node_of_end: Mapping[tuple[str, str], str],
+    node_of_inner: Mapping[LaneletKey, str],
+    crossed: Mapping[LaneletKey, int],
+) -> set[LaneletKey]:
+    """Return the lanelets of short roads between a crosswalk and a junction, or another crosswalk."""
+    junctions = set(node_of_inner.values())
+    at_crosswalks = {node_of_inner[key] for key in crossed}
+    lanelets: set[LaneletKey] = set()
+    for road in roads:
+        ends = {node_of_end[road.id, "start"], node_of_end[road.id, "end"]}
+        if ends <= junctions and not ends.isdisjoint(at_crosswalks) and road.length_m < CROSSWALK_RANGE_M:
+            lanelets |= {lane.key for lane in road.lanes}
+    return lanelets
 
 
 def _find_nodes(
@@ -318,10 +366,11 @@ def _find_nodes(
     roads: list[Road],
     inner: set[LaneletKey],
     overlaps: list[Overlap],
+    crossed: Mapping[LaneletKey, int],
 ) -> tuple[dict[tuple[str, str], str], dict[LaneletKey, str]]:
     """Return the node of each road end, ``(road, "start" or "end")``, and of each inner lanelet."""
     road_of = {lane.key: road.id for road in roads for lane in road.lanes}
-    groups = _Groups()
+    groups = Groups()
     for key, after in graph.followers.items():
         leaving: object = key if key in inner else (road_of[key], "end")
         for other in after:
@@ -332,6 +381,9 @@ def _find_nodes(
     for ends_at_point in _ends_by_point(graph, roads).values():
         for one_end, other_end in pairwise(ends_at_point):
             groups.join(one_end, other_end)
+    for key, crosswalk in crossed.items():
+        groups.join(key, crosswalk)
+    join_arms(graph, roads, groups)
 
     members: dict[object, list[LaneletKey]] = defaultdict(list)
     for key in sorted(inner):

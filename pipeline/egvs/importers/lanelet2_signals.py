@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,17 +20,17 @@ from shapely.geometry import LineString, Point
 
 from egvs.core.grid import FloatArray
 from egvs.formats.lanelet2 import LaneletMap, Regulation
-from egvs.importers.lanelet2_roads import RoadLayout, Turn, line_length_m
+from egvs.importers.lanelet2_roads import RoadLayout, Turn
 from egvs.importers.plain_network import PlainElement
 
 STOP_LINE_RANGE_M = 10.0
 """A light without lanelets governs the lanes that end nearer than this to its stop line."""
 
-APPROACH_M = 30.0
-"""A light governs the next junction if it is nearer than this to the lanelets of the light."""
-
 GREEN_S, SIDE_GREEN_S, YELLOW_S, ALL_RED_S = 30, 15, 3, 2
 """Durations of the assumed plans; the second is for phases of turns across the oncoming traffic only."""
+
+WALK_S, WALK_CLEARANCE_S = 12, 10
+"""Green for all crosswalks of a junction, and the time to clear them."""
 
 _TURN_DEG, _OPPOSITE_DEG = 45.0, 135.0
 _MAX_CROSSING_COS = 0.8
@@ -51,6 +51,8 @@ class SignalPlan:
         Position in the states of the program, by turn.
     elements
         Programs and controlled connections, as plain XML.
+    crosswalk_index
+        Position of the first crosswalk of a node in the states of its program.
     by_stop_line, unused
         Regulatory elements that were assigned by their stop line, and those that govern no turn.
     """
@@ -58,6 +60,7 @@ class SignalPlan:
     nodes: tuple[str, ...]
     index_of: dict[Turn, int]
     elements: tuple[PlainElement, ...]
+    crosswalk_index: dict[str, int]
     by_stop_line: tuple[int, ...]
     unused: tuple[int, ...]
 
@@ -89,7 +92,12 @@ class _Movement:
 
 
 def plan_signals(
-    layout: RoadLayout, lanelet_map: LaneletMap, xyz_m: Mapping[int, FloatArray], *, lefthand: bool
+    layout: RoadLayout,
+    lanelet_map: LaneletMap,
+    xyz_m: Mapping[int, FloatArray],
+    crosswalks: Mapping[str, int],
+    *,
+    lefthand: bool,
 ) -> SignalPlan:
     """Assign the traffic lights of a map to the turns, and make plans for them.
 
@@ -101,6 +109,8 @@ def plan_signals(
         The map.
     xyz_m
         x, y, z of its points, for stop lines.
+    crosswalks
+        Number of crosswalks by node; they are green together, when no vehicle is.
     lefthand
         Whether traffic drives on the left: then right turns cross the oncoming traffic.
     """
@@ -116,15 +126,19 @@ def plan_signals(
     for turn, group in group_of.items():
         movements[layout.roads[turn.source].end].append(_make_movement(turn, group, layout, lefthand))
     index_of: dict[Turn, int] = {}
+    crosswalk_index: dict[str, int] = {}
     programs: list[PlainElement] = []
     connections: list[PlainElement] = []
     for node, governed in sorted(movements.items()):
-        program = _Program(node, governed)
+        program = _Program(node, governed, layout, crosswalks.get(node, 0))
+        if node in crosswalks:
+            crosswalk_index[node] = program.links
         index_of |= program.index_of
         programs.append(program.element())
         connections += program.connections()
     unused = tuple(light.id for light in lights if light.id not in set(group_of.values()))
-    return SignalPlan(tuple(sorted(movements)), index_of, (*programs, *connections), tuple(by_stop_line), unused)
+    elements = (*programs, *connections)
+    return SignalPlan(tuple(sorted(movements)), index_of, elements, crosswalk_index, tuple(by_stop_line), unused)
 
 
 class _Assignment:
@@ -166,14 +180,11 @@ class _Assignment:
 
     def turn_groups(self) -> dict[Turn, int]:
         """Return the light of each governed turn in a junction."""
-        by_lane: dict[LaneId, list[Turn]] = defaultdict(list)
-        for turn in self._layout.turns:
-            by_lane[turn.source, turn.source_lane].append(turn)
         groups: dict[Turn, int] = {}
-        for lane, turns in by_lane.items():
+        for lane, turns in self._layout.turns_from.items():
             for turn in turns:
                 if (light := self._light_of_turn(lane, turn)) is not None:
-                    groups |= dict.fromkeys(self._turns_in_junction(turn, by_lane), light)
+                    groups |= dict.fromkeys(self._layout.turns_in_junction(turn), light)
         return groups
 
     def _light_of_turn(self, lane: LaneId, turn: Turn) -> int | None:
@@ -182,20 +193,6 @@ class _Assignment:
             if lights := self._lights_of.get(key.id):
                 return min(lights)
         return self._light_of_lane.get(lane)
-
-    def _turns_in_junction(self, turn: Turn, by_lane: Mapping[LaneId, Sequence[Turn]]) -> list[Turn]:
-        """Return the turn, or those of the next junction if it only leads to another road."""
-        walked_m = 0.0
-        while not turn.path:
-            lane = self._layout.roads[turn.target].lanes[turn.target_lane]
-            walked_m += line_length_m(lane.center_m)
-            following = by_lane.get((turn.target, turn.target_lane), ())
-            if walked_m > APPROACH_M or not following:
-                return []
-            if len(following) > 1:
-                return [other for other in following if other.path]
-            turn = following[0]
-        return [turn]
 
     def _lane_ends(self) -> Iterator[tuple[LaneId, FloatArray, FloatArray]]:
         """Yield the lanes that end in junctions, their end, and their direction there."""
@@ -210,13 +207,15 @@ class _Assignment:
 class _Program:
     """A signal plan for one node."""
 
-    def __init__(self, node: str, movements: list[_Movement]) -> None:
+    def __init__(self, node: str, movements: list[_Movement], layout: RoadLayout, crosswalks: int) -> None:
         self._node = node
         self._movements = movements
+        self._layout = layout
+        self._crosswalks = crosswalks
         self._groups = sorted({movement.group for movement in movements})
         links = sorted({(movement.group, movement.is_across) for movement in movements})
         self.index_of = {movement.turn: links.index((movement.group, movement.is_across)) for movement in movements}
-        self._links = len(links)
+        self.links = len(links)
 
     def element(self) -> PlainElement:
         """Return the program as plain XML."""
@@ -227,23 +226,33 @@ class _Program:
         """Yield the controlled connections."""
         for movement in self._movements:
             turn = movement.turn
-            yield PlainElement("connection", {
-                "from": turn.source, "to": turn.target, "fromLane": str(turn.source_lane),
-                "toLane": str(turn.target_lane), "tl": self._node, "linkIndex": str(self.index_of[turn]),
-            })  # fmt: skip
+            attributes = {
+                "from": turn.source,
+                "to": turn.target,
+                "fromLane": str(self._layout.sumo_lane(turn.source, turn.source_lane)),
+                "toLane": str(self._layout.sumo_lane(turn.target, turn.target_lane)),
+                "tl": self._node,
+                "linkIndex": str(self.index_of[turn]),
+            }
+            yield PlainElement("connection", attributes)
 
     def _phase_elements(self) -> Iterator[PlainElement]:
+        """Yield the phases: greens with yellow and all red between them, and one for all crosswalks at the end."""
+        stop, walk = "r" * self._crosswalks, "G" * self._crosswalks
         phases = self.phases
         greens = [self._green_state(phase) for phase in phases]
-        for number, (phase, state) in enumerate(zip(phases, greens, strict=True)):
+        afterwards = [*greens[1:], "r" * self.links if self._crosswalks else greens[0]]
+        for phase, state, following in zip(phases, greens, afterwards, strict=True):
             is_side = all(movement.is_across for movement in self._of(phase))
-            yield _phase(SIDE_GREEN_S if is_side else GREEN_S, state)
-            following = greens[(number + 1) % len(greens)]
+            yield _phase(SIDE_GREEN_S if is_side else GREEN_S, state + stop)
             if following == state:
                 continue
             pairs = list(zip(state, following, strict=True))
-            yield _phase(YELLOW_S, "".join(_during_change(a, b, "y") for a, b in pairs))
-            yield _phase(ALL_RED_S, "".join(_during_change(a, b, "r") for a, b in pairs))
+            yield _phase(YELLOW_S, "".join(_during_change(a, b, "y") for a, b in pairs) + stop)
+            yield _phase(ALL_RED_S, "".join(_during_change(a, b, "r") for a, b in pairs) + stop)
+        if self._crosswalks:
+            yield _phase(WALK_S, "r" * self.links + walk)
+            yield _phase(WALK_CLEARANCE_S, "r" * self.links + stop)
 
     @cached_property
     def phases(self) -> list[tuple[int, ...]]:
@@ -263,7 +272,7 @@ class _Program:
 
     def _green_state(self, phase: tuple[int, ...]) -> str:
         """Return the state of a phase: G for green, g for green that yields, r for red."""
-        state = ["r"] * self._links
+        state = ["r"] * self.links
         active = self._of(phase)
         for movement in active:
             yields = any(movement.yields_to(other) for other in active)

@@ -18,16 +18,19 @@ from pathlib import Path
 
 import numpy as np
 import shapely
+from scipy.spatial import KDTree
 from shapely.geometry import MultiPoint, Point
 from shapely.geometry.base import BaseGeometry
 
-from egvs.core.grid import FloatArray
+from egvs.core.grid import XY, FloatArray, Roi
 from egvs.importers import building_heights, openstreetmap, osm_solids
-from egvs.importers.junctions import XY, Streets
+from egvs.importers.as_built_view import AsBuiltMap
+from egvs.importers.junctions import Streets
 from egvs.importers.map_parts import MapContext, MappedMesh, SolidMap
 from egvs.importers.map_readers import MapFile
 from egvs.importers.openstreetmap import OsmRoads
 from egvs.importers.osm_solids import ImportCounts, MappedSolid
+from egvs.importers.point_cloud import OBJECT_KIND
 from egvs.importers.road_source import RoadSource
 
 REPLACED = "replaced_by_another_map"
@@ -43,6 +46,10 @@ _LARGE_DIFFERENCE_M = 5.0
 
 GROUND = "ground"
 """The kind of meshes that are ground; it becomes the terrain of the scenario."""
+
+_SQUARE_M = 0.5
+_NEAR_GROUND_M = (0.5, 4.0)
+"""Heights above the ground in which the surface of a point cloud is in the way of a pole."""
 
 _MAX_NAMES = 10
 """How many objects a note names."""
@@ -100,9 +107,18 @@ class StaticObjects:
 
     @property
     def areas(self) -> list[BaseGeometry]:
-        """The areas covered by all objects except the ground, seen from above; meshes by their convex hull."""
-        outlines = [outline(mesh) for mesh in self.meshes if mesh.kind != GROUND]
-        return [*(solid.area for solid in self.solids), *outlines]
+        """The areas where no pole can stand, seen from above: all objects except the ground.
+
+        A mesh is taken as its convex hull, the surface of a point cloud as the squares in which it is near the ground.
+        """
+        areas = [solid.area for solid in self.solids]
+        ground = next((mesh for mesh in self.meshes if mesh.kind == GROUND), None)
+        for mesh in self.meshes:
+            if mesh.kind == OBJECT_KIND and ground is not None:
+                areas += _squares_near_ground(mesh, ground)
+            elif mesh.kind != GROUND:
+                areas.append(outline(mesh))
+        return areas
 
 
 @dataclass(frozen=True)
@@ -144,6 +160,22 @@ def read_maps(maps: Sequence[MapFile], roads: RoadSource, road_file: MapFile, co
     return read
 
 
+def unseen_shares(maps: Sequence[ReadMap], sites_m: FloatArray, roi: Roi) -> FloatArray | None:
+    """Return the share of each site's view that no station of a point cloud saw, (n,); None without a point cloud.
+
+    Parameters
+    ----------
+    maps
+        From :func:`read_maps`.
+    sites_m
+        Sensors, (n, 3), with heights as the point cloud counts them.
+    roi
+        The region of interest, in the same frame.
+    """
+    surveys = [read.objects for read in maps if isinstance(read.objects, AsBuiltMap)]
+    return surveys[0].unseen_shares(sites_m, roi) if surveys else None
+
+
 def ground_mesh(maps: Sequence[ReadMap]) -> MappedMesh | None:
     """Return the ground that a map has measured, as a point cloud does; None if there is none."""
     meshes = (mesh for read in maps for mesh in read.objects.meshes)
@@ -181,6 +213,16 @@ def collect_objects(
 def outline(mesh: MappedMesh) -> BaseGeometry:
     """Return the convex hull of a mesh, seen from above."""
     return MultiPoint(mesh.vertices_m[:, :2]).convex_hull
+
+
+def _squares_near_ground(mesh: MappedMesh, ground: MappedMesh) -> list[BaseGeometry]:
+    """Return the squares of a grid that contain vertices of a surface a little above the ground."""
+    nearest = KDTree(ground.vertices_m[:, :2]).query(mesh.vertices_m[:, :2])[1]
+    height_m = mesh.vertices_m[:, 2] - ground.vertices_m[nearest, 2]
+    low_m, high_m = _NEAR_GROUND_M
+    is_near = (height_m > low_m) & (height_m < high_m)
+    cells = np.unique(np.floor(mesh.vertices_m[is_near, :2] / _SQUARE_M), axis=0) * _SQUARE_M
+    return list(shapely.box(*cells.T, *(cells + _SQUARE_M).T))
 
 
 def mesh_files(meshes: Sequence[MappedMesh]) -> dict[str, Callable[[Path], None]]:
