@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from pyproj import CRS
 from shapely.geometry import box
 
 from egvs.core.errors import InputError
@@ -176,3 +177,30 @@ def test_alignment_turns_and_moves() -> None:
 def test_rejects_alignment(pairs: list[alignment.PointPair], problem: str) -> None:
     with pytest.raises(InputError, match=problem):
         alignment.make_alignment(pairs, None)
+
+
+def write_terrain(path: Path, rise_east: float) -> Path:
+    """An ASCII grid with a plane that rises to the east, around 52 N, 10 E in UTM zone 32."""
+    rows, cell_m = 120, 10.0
+    east_m, north_m = 568649.0, 5761510.0
+    x_m = (np.arange(rows) + 0.5 - rows / 2) * cell_m
+    z_m = np.broadcast_to(100 + rise_east * x_m, (rows, rows))
+    header = f"ncols {rows}\nnrows {rows}\nxllcorner {east_m - 600}\nyllcorner {north_m - 600}\ncellsize {cell_m}\n"
+    path.write_text(header + "\n".join(" ".join(f"{z:.4f}" for z in row) for row in z_m) + "\n", encoding="utf-8")
+    path.with_suffix(".prj").write_text(CRS.from_epsg(32632).to_wkt("WKT1_ESRI"), encoding="utf-8")
+    return path
+
+
+def test_roads_buildings_and_sites_follow_a_terrain(tmp_path: Path) -> None:
+    """On a plane that rises by 4 % to the east, heights differ by 4 % of the differences of x."""
+    small = Path(__file__).parent / "data" / "small.osm"
+    made = create_scenario(tmp_path / "made", [small, write_terrain(tmp_path / "plane.asc", 0.04)], (52.0, 10.0))
+    x0_m = made.junction.at_m[0]
+    for edge in made.streets.network.edges:
+        shape_m = edge.lanes[0].shape_m
+        assert shape_m[:, 2] == pytest.approx(0.04 * (shape_m[:, 0] - x0_m), abs=0.05)
+    scenario = loading.load(tmp_path / "made")
+    assert scenario.statics.terrain == "terrain.ply"
+    with (tmp_path / "made" / "sites.csv").open() as file:
+        for row in csv.DictReader(file):
+            assert float(row["ground_m"]) == pytest.approx(0.04 * (float(row["x_m"]) - x0_m), abs=0.05)

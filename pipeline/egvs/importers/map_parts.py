@@ -61,10 +61,14 @@ class RoadOptions:
         Whether traffic drives on the left.
     walk
         Whether the network gets sidewalks and crossings.
+    has_terrain
+        Whether the roads will be laid on a terrain: heights of OpenStreetMap are not needed then, but its bridges and
+        tunnels stay edges of their own.
     """
 
     lefthand: bool = False
     walk: bool = False
+    has_terrain: bool = False
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ have heights. The same maps give the same bytes: no dates, no paths, objects sor
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,6 +34,7 @@ from egvs.core.grid import XY, FloatArray, Roi
 from egvs.formats import ply
 from egvs.importers import (
     assumed_traffic,
+    bridge_decks,
     ground_heights,
     ground_reference,
     junctions,
@@ -228,7 +229,7 @@ def create_scenario(
     options.check()
     name = scenario_files.check_new_folder(folder)
     files = map_readers.open_maps([maps] if isinstance(maps, Path) else maps)
-    roads = _read_roads(files.roads, RoadOptions(options.lefthand, options.walk), at)
+    roads = _read_roads(files.roads, RoadOptions(options.lefthand, options.walk, has_terrain=bool(files.terrain)), at)
     junction = _choose_junction(roads.streets, at, files.roads.path)
 
     level = roads.on_level_of(junction)
@@ -247,6 +248,9 @@ def create_scenario(
     zero = ground_reference.find_zero(roads, files.roads, junction, terrain)
     objects = static_objects.collect_objects(maps_read, level.streets, junction.at_m, zero.height_m)
     roads = ground_reference.lay_on_ground(roads, files.roads, junction, terrain)
+    if files.terrain and terrain is not None and zero.height_m is not None:
+        decks = bridge_decks.bridge_decks(roads.network, terrain, zero.height_m)
+        objects = replace(objects, meshes=(*objects.meshes, *decks))
     if roads.streets is not level.streets:
         junction = _require_junction(junctions.find_again(roads.streets, junction, junction.at_m), files.roads.path)
     streets = roads.streets
@@ -278,11 +282,15 @@ def create_scenario(
         folder, junction, roi, streets, len(poles), objects.counts, objects.n_solids + 1, assumed, tuple(notes),
         maps=objects.maps, attributions=_attributions(roads, objects), from_at_m=_distance_m(streets, junction, at),
     )  # fmt: skip
-    columns = _site_columns(streets, poles, relief, maps_read, roi, zero.height_m or 0.0)
+    terrain_m = None
+    if terrain is not None:
+        terrain_m = _terrain_points(terrain, window, zero.height_m or 0.0)
+    ground_m = relief.ground_m(streets, poles, terrain_m)
+    columns = _site_columns(poles, ground_m, relief, maps_read, roi, zero.height_m or 0.0)
     meshes = static_objects.mesh_files([mesh for mesh in objects.meshes if mesh.kind != static_objects.GROUND])
     terrain_files = {}
-    if terrain is not None:
-        terrain_files[TERRAIN_FILE] = _terrain_writer(terrain, window, zero.height_m or 0.0)
+    if terrain_m is not None:
+        terrain_files[TERRAIN_FILE] = partial(ply.write, points_m=terrain_m)
     statics = scenario_files.statics_table(list(meshes), *terrain_files)
     contents: dict[str, FileContent] = {
         NETWORK_FILE: roads.network,
@@ -297,29 +305,26 @@ def create_scenario(
 
 
 def _site_columns(
-    streets: Streets, poles: Sequence[KerbsidePole], relief: Relief, maps: Sequence[ReadMap], roi: JunctionRegion,
-    zero_height_m: float,
+    poles: Sequence[KerbsidePole], ground_m: FloatArray | None, relief: Relief, maps: Sequence[ReadMap],
+    roi: JunctionRegion, zero_height_m: float,
 ) -> dict[str, FloatArray]:  # fmt: skip
     """Return further columns of the sites: z of the ground where it is not flat, and what a point cloud did not see."""
     columns = {}
-    ground_m = relief.ground_m(streets, poles)
-    if ground_m is not None:
-        columns["ground_m"] = ground_m
-    low_m, high_m = relief.z_range_m
-    center_m = *roi.center_m, (low_m + high_m) / 2 + zero_height_m
     sensors_m = np.array([(pole.x_m, pole.y_m, junctions.HEIGHTS_M[1] + zero_height_m) for pole in poles])
     if ground_m is not None:
+        columns["ground_m"] = ground_m
         sensors_m[:, 2] += ground_m
+    low_m, high_m = relief.z_range_m
+    center_m = *roi.center_m, (low_m + high_m) / 2 + zero_height_m
     unseen = static_objects.unseen_shares(maps, sensors_m, Roi.around(center_m, (*roi.size_m, high_m - low_m)))
     if unseen is not None and not np.isnan(unseen).all():
         columns["unseen_share"] = np.round(unseen, 3)
     return columns
 
 
-def _terrain_writer(terrain: Terrain, window: BaseGeometry, zero_height_m: float) -> Callable[[Path], None]:
-    """Return a function that writes points of the ground in a window as PLY."""
-    points_m = ground_heights.ground_points(terrain, window, TERRAIN_STEP_M) - np.array([0.0, 0.0, zero_height_m])
-    return partial(ply.write, points_m=points_m)
+def _terrain_points(terrain: Terrain, window: BaseGeometry, zero_height_m: float) -> FloatArray:
+    """Return points (n, 3) of the ground in a window, world frame."""
+    return ground_heights.ground_points(terrain, window, TERRAIN_STEP_M) - np.array([0.0, 0.0, zero_height_m])
 
 
 def _read_roads(file: MapFile, options: RoadOptions, at: tuple[float, float] | None) -> RoadSource:

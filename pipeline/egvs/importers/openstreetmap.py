@@ -8,7 +8,6 @@ poles become solids (:mod:`egvs.importers.osm_solids`).
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from shapely.geometry.base import BaseGeometry
 from egvs.core.errors import InputError
 from egvs.formats import osm as osm_files
 from egvs.formats.osm import OsmExtract
-from egvs.importers import junctions, osm_network, osm_solids, road_levels
+from egvs.importers import junctions, osm_elevation, osm_network, osm_solids, road_levels
 from egvs.importers.junctions import StreetJunction, Streets
 from egvs.importers.map_parts import MapContext, RoadMap, RoadOptions, SolidMap
 from egvs.importers.osm_network import ATTRIBUTION
@@ -29,9 +28,6 @@ NAME = "OpenStreetMap"
 
 SURROUNDINGS_M = 300.0
 """How far from the junction streets are simulated: enough for the queues and platoons that reach it."""
-
-_WAY = re.compile(r"-?(\d+)")
-"""netconvert names an edge after its way: ``"12"``, ``"-12#3"``."""
 
 _ONE_LEVEL = OtherLevels()
 _SUFFIXES = (".osm", ".osm.xml", ".osm.pbf", ".pbf")
@@ -100,8 +96,18 @@ class OsmRoads:
         extract = osm_files.read_osm(path)
         check_inside_extract(extract, at)
         flags = osm_network.netconvert_flags(extract, lefthand=options.lefthand, walk=options.walk)
+        notes: tuple[str, ...] = ()
+        if options.has_terrain:
+            flags += road_levels.keep_levels_flags(extract)
+        else:
+            elevations = osm_elevation.read_elevations(extract)
+            if elevations.note:
+                notes = (elevations.note,)
+            if elevations.heights_m:
+                extract = osm_elevation.add_elevations(extract, elevations.heights_m)
+                flags += osm_elevation.ELEVATION_FLAGS
         network, streets = osm_network.build_network(extract, path, flags)
-        return cls(extract, path, tuple(flags), network, streets)
+        return cls(extract, path, tuple(flags), network, streets, notes=notes)
 
     def on_level_of(self, junction: StreetJunction) -> OsmRoads:
         """Return the roads without those that cross a junction's region on another level."""
@@ -125,14 +131,7 @@ class OsmRoads:
 
     def edge_levels(self) -> dict[str, int]:
         """Return the levels of the edges that are not on the ground: bridges and tunnels."""
-        levels = {}
-        for edge in self.streets.network.edges:
-            number = _WAY.match(edge.id)
-            way = self.extract.ways.get(int(number[1])) if number else None
-            level = 0 if way is None else road_levels.way_level(way.tags)
-            if level:
-                levels[edge.id] = level
-        return levels
+        return road_levels.edge_levels((edge.id for edge in self.streets.network.edges), self.extract)
 
     def solids(self, window: BaseGeometry) -> tuple[list[MappedSolid], ImportCounts]:
         """Return the static objects in a window (world frame, metres), and what happened to the others."""

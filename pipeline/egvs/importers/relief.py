@@ -71,12 +71,24 @@ class Relief:
         rise_m = math.ceil((self.high_m - low_m) / _STEP_M) * _STEP_M
         return low_m, low_m + rise_m + junctions.ROI_HEIGHT_M
 
-    def ground_m(self, streets: Streets, poles: Sequence[KerbsidePole]) -> FloatArray | None:
-        """Return z of the ground (n,) at poles; None where the ground is flat."""
+    def ground_m(
+        self, streets: Streets, poles: Sequence[KerbsidePole], beyond_m: FloatArray | None = None
+    ) -> FloatArray | None:
+        """Return z of the ground (n,) at poles; None where the ground is flat.
+
+        Parameters
+        ----------
+        streets
+            The roads.
+        poles
+            The locations.
+        beyond_m
+            Points (n, 3) of the terrain beyond the roads, world frame; None without a terrain.
+        """
         if self.is_flat:
             return None
         x_m, y_m = np.array([(pole.x_m, pole.y_m) for pole in poles]).T
-        return np.round(terrain.triangulate_ground(streets.network).height_m(x_m, y_m), 3)
+        return np.round(terrain.triangulate_ground(streets.network, beyond_m=beyond_m).height_m(x_m, y_m), 3)
 
 
 def lane_heights_near(streets: Streets, junction: StreetJunction) -> FloatArray:
