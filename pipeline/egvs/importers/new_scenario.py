@@ -324,7 +324,9 @@ def _site_columns(
 
 def _terrain_points(terrain: Terrain, window: BaseGeometry, zero_height_m: float) -> FloatArray:
     """Return points (n, 3) of the ground in a window, world frame."""
-    return ground_heights.ground_points(terrain, window, TERRAIN_STEP_M) - np.array([0.0, 0.0, zero_height_m])
+    points_m = ground_heights.ground_points(terrain, window, TERRAIN_STEP_M)
+    points_m[:, 2] -= zero_height_m
+    return points_m
 
 
 def _read_roads(file: MapFile, options: RoadOptions, at: tuple[float, float] | None) -> RoadSource:
