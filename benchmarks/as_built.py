@@ -240,7 +240,7 @@ def _static_beams(sweep: Sweep, is_held_out: NDArray[np.bool_], ranges_m: FloatA
     range_m = np.sqrt((sweep.points_m**2).sum(axis=1))
     same = ranges_m[sweep.column, sweep.channel]
     print(
-        f"  the same beam of the other sweeps agrees in {np.mean(np.abs(same - range_m)[is_held_out] <= AGREE_M):.3f}"
+        f"  of all returns, the same beam of the other sweeps agrees in {np.mean(np.abs(same - range_m)[is_held_out] <= AGREE_M):.3f}"
     )
     is_static = is_held_out & (np.abs(same - range_m) <= AGREE_M) & (range_m < MAX_RANGE_M)
     neighbour = ranges_m[(sweep.column[is_static] + step) % COLUMNS, sweep.channel[is_static]]
