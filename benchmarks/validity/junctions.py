@@ -19,7 +19,7 @@ from typing import Literal
 from benchmarks.validity import poses
 from egvs.core import files
 from egvs.core.errors import InputError
-from egvs.importers import openstreetmap
+from egvs.importers import new_scenario
 from egvs.runs.run import ensure_stages
 from egvs.scenario.loading import load
 from egvs.scenario.model import Scenario, SitesConfig
@@ -81,7 +81,7 @@ def from_osm(role: Role, extract: Path, at: tuple[float, float] | None, folder: 
         if scenario_folder.is_dir():
             raise InputError(scenario_folder, "was made from another extract or location", "Remove it.")
         folder.mkdir(parents=True, exist_ok=True)
-        openstreetmap.create_scenario(scenario_folder, extract, at)
+        new_scenario.create_scenario(scenario_folder, extract, at)
         note.write_bytes(key)
     return name, role, scenario_folder
 

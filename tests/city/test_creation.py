@@ -21,12 +21,13 @@ from egvs.city import creation, model, traffic_split
 from egvs.city.creation import NewCityOptions
 from egvs.core.errors import InputError
 from egvs.formats import osm
-from egvs.importers import junctions, openstreetmap, osm_network
+from egvs.importers import junctions, osm_network
 from egvs.importers.junctions import StreetJunction
 from egvs.stages import traffic
 from egvs.traffic import network
 from egvs.traffic.capacity import FlowCapacity, FlowTrial
 from egvs.world import geolocation
+from tests.importers.creation import create_scenario
 from tests.stage_runner import run_stage
 
 pytestmark = pytest.mark.system
@@ -108,7 +109,7 @@ def test_selects_junctions_with_signals(made: creation.NewCity, extract: Path) -
 def test_junction_has_region_and_poles_of_egvs_new(made: creation.NewCity, extract: Path) -> None:
     for junction in model.load_city(made.folder).junctions:
         in_city, single = made.folder / "junctions" / junction.id, made.folder.parent / f"single-{junction.id}"
-        openstreetmap.create_scenario(single, extract, (junction.lat_deg, junction.lon_deg), surroundings_m=None)
+        create_scenario(single, extract, (junction.lat_deg, junction.lon_deg), surroundings_m=math.inf)
         scenario, expected = egvs.load(in_city), egvs.load(single)
         assert (scenario.roi, scenario.sites, scenario.score) == (expected.roi, expected.sites, expected.score)
         assert (in_city / "sites.csv").read_bytes() == (single / "sites.csv").read_bytes()

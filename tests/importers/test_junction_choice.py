@@ -9,9 +9,10 @@ import pytest
 from shapely.geometry import LineString, MultiLineString, Point
 
 from egvs.core.errors import InputError
-from egvs.importers import openstreetmap
-from egvs.importers.openstreetmap import NewScenario
+from egvs.importers import assumed_traffic
+from egvs.importers.new_scenario import NewScenario
 from egvs.traffic.capacity import Capacity, TrialRun
+from tests.importers.creation import create_scenario
 from tests.importers.small_maps import XY, degrees, street, write_map
 from tests.importers.test_openstreetmap import sites_of
 
@@ -28,14 +29,14 @@ SIGNALS = {2: {"highway": "traffic_signals"}}
 def carries_everything(monkeypatch: pytest.MonkeyPatch) -> None:
     """No trial simulations: they take longer than all the rest."""
     capacity = Capacity(1.0, (TrialRun(1.0, 100, 100, 20.0, 0),))
-    monkeypatch.setattr(openstreetmap, "find_capacity", lambda *_: capacity)
+    monkeypatch.setattr(assumed_traffic, "find_capacity", lambda *_: capacity)
 
 
 def create(folder: Path, at_m: XY | None, signals: bool = True) -> NewScenario:
     """A scenario of the map, with the junction at a position in metres."""
     osm = write_map(folder / "map.osm", NODES, WAYS, SIGNALS if signals else None)
     at = None if at_m is None else degrees(at_m)
-    return openstreetmap.create_scenario(folder / "out", osm, at)
+    return create_scenario(folder / "out", osm, at)
 
 
 @pytest.mark.parametrize(
@@ -55,12 +56,12 @@ def test_takes_junction_at_point_then_near_signals_then_the_nearest(
 ) -> None:
     summary = create(tmp_path, at_m)
     assert summary.junction.title == title
-    assert not any("no junction in the extract has signals" in note for note in summary.notes)
+    assert not any("no junction in the map has signals" in note for note in summary.notes)
 
 
 def test_largest_junction_without_any_signals_has_a_note(tmp_path: Path) -> None:
     notes = create(tmp_path, None, signals=False).notes
-    assert "no junction in the extract has signals; the one with the most incoming lanes was chosen" in notes
+    assert "no junction in the map has signals; the one with the most incoming lanes was chosen" in notes
 
 
 def test_junction_without_signals_at_the_point_has_no_note(tmp_path: Path) -> None:
@@ -90,7 +91,7 @@ def test_poles_are_spread_over_the_arms_of_a_fork(tmp_path: Path) -> None:
     nodes = {1: (-300.0, 0.0), 2: (0.0, 0.0), 3: (270.0, 126.0), 4: (270.0, -126.0)}
     ways = [street("West", 1, 2), street("North", 2, 3), street("South", 2, 4)]
     osm = write_map(tmp_path / "fork.osm", nodes, ways)
-    summary = openstreetmap.create_scenario(tmp_path / "out", osm, degrees((0.0, 0.0)))
+    summary = create_scenario(tmp_path / "out", osm, degrees((0.0, 0.0)))
     arms: dict[str, MultiLineString] = {}
     for edge in summary.streets.network.edges:
         arms[edge.name] = arms.get(edge.name, MultiLineString()).union(LineString(edge.lanes[0].shape_m[:, :2]))

@@ -13,12 +13,13 @@ from shapely.geometry import LineString, MultiLineString, Point
 from egvs.artefacts import parquet
 from egvs.core.errors import InputError
 from egvs.formats import osm
-from egvs.importers import junctions, openstreetmap, osm_network, osm_solids
-from egvs.importers.openstreetmap import NewScenario
+from egvs.importers import assumed_traffic, junctions, new_scenario, osm_network, osm_solids, scenario_files
+from egvs.importers.new_scenario import NewScenario
 from egvs.runs import run
 from egvs.scenario import loading
 from egvs.scenario.traffic_config import CountConfig
 from egvs.traffic.capacity import Capacity, TrialRun, distribute_total
+from tests.importers.creation import create_scenario
 from tests.importers.test_openstreetmap import SMALL, check_sites, lanes_of, sites_of
 
 FAR_BLOCK = (
@@ -40,7 +41,7 @@ FAR_BUILDING = (
 def carries_everything(monkeypatch: pytest.MonkeyPatch) -> None:
     """No trial simulations: they take longer than all the rest."""
     capacity = Capacity(1.0, (TrialRun(1.0, 100, 100, 20.0, 0),))
-    monkeypatch.setattr(openstreetmap, "find_capacity", lambda *_: capacity)
+    monkeypatch.setattr(assumed_traffic, "find_capacity", lambda *_: capacity)
 
 
 def with_far_objects(folder: Path) -> Path:
@@ -59,15 +60,15 @@ def write_all_solids(folder: Path, extract: Path) -> None:
     flags = osm_network.netconvert_flags(read, lefthand=False, walk=False)
     _, streets = osm_network.build_network(read, extract, flags)
     solids, counts = osm_solids.map_solids(read, streets)
-    text = openstreetmap.solids_geojson(solids, counts)
+    text = scenario_files.solids_geojson(solids, counts)
     assert '"way/9"' in text
     (folder / "statics.geojson").write_text(text, encoding="utf-8")
 
 
 # --- solids out of range -------------------------------------------------------------------------------------------
 def test_solids_beyond_sensor_range_are_left_out_with_a_note(tmp_path: Path) -> None:
-    plain = openstreetmap.create_scenario(tmp_path / "plain", SMALL)
-    summary = openstreetmap.create_scenario(tmp_path / "far", with_far_objects(tmp_path))
+    plain = create_scenario(tmp_path / "plain", SMALL)
+    summary = create_scenario(tmp_path / "far", with_far_objects(tmp_path))
     assert summary.statics.dropped["out_of_range"] == {"building": 1, "tree": 1}
     assert summary.statics.objects == plain.statics.objects
     total = 2 + plain.statics.objects.total() - plain.statics.objects["tree_crown"]
@@ -82,7 +83,7 @@ def test_solids_beyond_sensor_range_are_left_out_with_a_note(tmp_path: Path) -> 
 @pytest.mark.slow
 def test_solids_out_of_range_do_not_change_scores(tmp_path: Path) -> None:
     extract = with_far_objects(tmp_path)
-    openstreetmap.create_scenario(tmp_path / "cut", extract)
+    create_scenario(tmp_path / "cut", extract)
     shutil.copytree(tmp_path / "cut", tmp_path / "all")
     write_all_solids(tmp_path / "all", extract)
     overrides = [
@@ -108,13 +109,13 @@ def print_new(summary: NewScenario, capsys: pytest.CaptureFixture[str]) -> str:
 
 
 def test_distance_from_requested_position_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    near = openstreetmap.create_scenario(tmp_path / "near", SMALL, at=(52.0003, 10.0))
+    near = create_scenario(tmp_path / "near", SMALL, at=(52.0003, 10.0))
     assert near.from_at_m == pytest.approx(33.4 - junction_half_depth_m(near), abs=0.5)
     printed = print_new(near, capsys)
     assert f"at 52.00000,10.00000, {near.from_at_m:.0f} m from --at" in printed
     assert printed.count("warning:") == 1
 
-    without = openstreetmap.create_scenario(tmp_path / "without", SMALL)
+    without = create_scenario(tmp_path / "without", SMALL)
     assert without.from_at_m is None and "--at" not in print_new(without, capsys)
 
 
@@ -124,8 +125,8 @@ def junction_half_depth_m(summary: NewScenario) -> float:
 
 
 def test_junction_far_from_requested_position_is_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    far = openstreetmap.create_scenario(tmp_path / "far", SMALL, at=(52.0008, 10.0))
-    assert far.from_at_m is not None and far.from_at_m > openstreetmap.FAR_FROM_AT_M
+    far = create_scenario(tmp_path / "far", SMALL, at=(52.0008, 10.0))
+    assert far.from_at_m is not None and far.from_at_m > new_scenario.FAR_FROM_AT_M
     assert (
         f"warning: the junction ({far.junction.title}) is {far.from_at_m:,.0f} m from --at and may not be the one"
         in print_new(far, capsys)
@@ -134,9 +135,9 @@ def test_junction_far_from_requested_position_is_a_warning(tmp_path: Path, capsy
 
 # --- poles every N metres ------------------------------------------------------------------------------------------
 def test_poles_at_a_spacing_cover_all_kerbs(tmp_path: Path) -> None:
-    default = openstreetmap.create_scenario(tmp_path / "default", SMALL)
-    dense = openstreetmap.create_scenario(tmp_path / "dense", SMALL, pole_spacing_m=10.0)
-    sparse = openstreetmap.create_scenario(tmp_path / "sparse", SMALL, pole_spacing_m=20.0)
+    default = create_scenario(tmp_path / "default", SMALL)
+    dense = create_scenario(tmp_path / "dense", SMALL, pole_spacing_m=10.0)
+    sparse = create_scenario(tmp_path / "sparse", SMALL, pole_spacing_m=20.0)
     assert dense.poles > default.poles == junctions.MAX_POLES
     assert 0 < sparse.poles < dense.poles
     check_sites(tmp_path / "dense", dense.poles)
@@ -151,21 +152,21 @@ def test_poles_at_a_spacing_cover_all_kerbs(tmp_path: Path) -> None:
 
 
 def test_names_of_more_than_99_poles_sort_in_order() -> None:
-    lines = openstreetmap.sites_csv([junctions.KerbsidePole(float(i), 0.0) for i in range(100)]).splitlines()
+    lines = scenario_files.sites_csv([junctions.KerbsidePole(float(i), 0.0) for i in range(100)]).splitlines()
     assert (lines[1], lines[100]) == ("k001,0.0,0.0", "k100,99.0,0.0")
 
 
 @pytest.mark.parametrize("spacing_m", [0.0, 1.5, 101.0, math.nan])
 def test_rejects_spacing_of_poles(tmp_path: Path, spacing_m: float) -> None:
     with pytest.raises(InputError, match=r"--poles: expected a spacing of 2 to 100 m, got .* Use a spacing such as"):
-        openstreetmap.create_scenario(tmp_path / "out", SMALL, pole_spacing_m=spacing_m)
+        create_scenario(tmp_path / "out", SMALL, pole_spacing_m=spacing_m)
     assert not list(tmp_path.iterdir())
 
 
 # --- demand --------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("total_per_h", [7, 600, 2001])
 def test_requested_vehicles_per_hour_are_written(tmp_path: Path, total_per_h: int) -> None:
-    summary = openstreetmap.create_scenario(tmp_path / "out", SMALL, traffic=total_per_h)
+    summary = create_scenario(tmp_path / "out", SMALL, traffic=total_per_h)
     counts = loading.load(tmp_path / "out").traffic.counts
     assert sum(flow.per_hour for flow in counts) == total_per_h
     assert summary.traffic is not None
@@ -179,8 +180,8 @@ def test_requested_vehicles_per_hour_above_capacity_stay_and_are_named(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     runs = (TrialRun(1.0, 100, 50, 300.0, 20), TrialRun(0.5, 70, 70, 50.0, 0))
-    monkeypatch.setattr(openstreetmap, "find_capacity", lambda *_: Capacity(0.46, runs))
-    summary = openstreetmap.create_scenario(tmp_path / "out", SMALL, traffic=4000)
+    monkeypatch.setattr(assumed_traffic, "find_capacity", lambda *_: Capacity(0.46, runs))
+    summary = create_scenario(tmp_path / "out", SMALL, traffic=4000)
     assert sum(flow.per_hour for flow in summary.flows) == 4000
     note = "traffic jams are likely: the network carries 1,840 of the 4,000 requested vehicles an hour"
     assert any(text.startswith(note) and "Lower per_hour of traffic.counts" in text for text in summary.notes)
@@ -196,7 +197,7 @@ def test_total_is_divided_in_proportion_by_largest_remainder() -> None:
 @pytest.mark.parametrize("per_h", [0, -5, 100_001])
 def test_rejects_number_of_vehicles_per_hour(tmp_path: Path, per_h: int) -> None:
     with pytest.raises(InputError, match=r"--vehicles-per-hour: expected 1 to 100,000 vehicles an hour, got"):
-        openstreetmap.create_scenario(tmp_path / "out", SMALL, traffic=per_h)
+        create_scenario(tmp_path / "out", SMALL, traffic=per_h)
     assert not list(tmp_path.iterdir())
 
 
@@ -225,5 +226,5 @@ def test_command_line_rejects_options(tmp_path: Path, run_egvs, options: tuple[o
 
 
 def test_plans_of_a_new_scenario_have_one_sensor_per_pole(tmp_path: Path) -> None:
-    openstreetmap.create_scenario(tmp_path / "out", SMALL)
+    create_scenario(tmp_path / "out", SMALL)
     assert loading.load(tmp_path / "out").placement.most_per_pole == 1

@@ -20,13 +20,14 @@ from shapely.geometry import LineString, Point, shape
 from egvs.cli import app, new_summary
 from egvs.core.errors import InputError
 from egvs.formats import osm
-from egvs.importers import openstreetmap
+from egvs.importers import assumed_traffic, new_scenario, openstreetmap
 from egvs.importers.osm_solids import ImportCounts
 from egvs.scenario import loading
 from egvs.sensors import sites
 from egvs.stages import check
 from egvs.traffic.capacity import Capacity, TrialRun
 from tests.formats.test_osm import pbf_of
+from tests.importers.creation import create_scenario
 from tests.stage_runner import run_stage
 
 SMALL = Path(__file__).parent / "data" / "small.osm"
@@ -35,7 +36,7 @@ SMALL = Path(__file__).parent / "data" / "small.osm"
 REAL = Path(__file__).parents[3] / "shared" / "real" / "bad_hersfeld.osm"
 
 
-Made = tuple[Path, openstreetmap.NewScenario]
+Made = tuple[Path, new_scenario.NewScenario]
 
 
 NAMES = ["network.net.xml", "scenario.toml", "sites.csv", "statics.geojson"]
@@ -45,7 +46,7 @@ NAMES = ["network.net.xml", "scenario.toml", "sites.csv", "statics.geojson"]
 def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     """The small extract's scenario and its summary."""
     folder = tmp_path_factory.mktemp("osm") / "cross"
-    return folder, openstreetmap.create_scenario(folder, SMALL)
+    return folder, create_scenario(folder, SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +93,7 @@ def edited(tmp_path: Path, *changes: tuple[str, str]) -> Path:
 # --- what is in the scenario ---------------------------------------------------------------------------------------
 def test_heights_by_source(made: Made) -> None:
     heights = made[1].statics.heights
-    assert heights["building"] == {"height": 5, "levels": 3, "default": 3}
+    assert heights["building"] == {"height": 5, "levels": 3, "neighbours": 3}
     assert heights["roof"] == {"type": 1}
     assert heights["tree"] == {"height": 1, "default": 7}
     assert heights["barrier"] == {"height": 1, "default": 3}
@@ -125,7 +126,7 @@ def test_assumed_sizes_are_listed_with_their_numbers(made: Made) -> None:
 
 def test_sizes_from_the_map_are_not_assumed() -> None:
     counts = ImportCounts(heights={"tree": Counter(height=4), "bridge": Counter(height=1, default=2)})
-    assert openstreetmap.assumed_sizes(counts) == ["heights of 2 of 3 bridge decks"]
+    assert new_scenario.assumed_sizes(counts) == ["heights of 2 of 3 bridge decks"]
 
 
 def test_every_object_is_used_or_counted(footprints: dict[str, Any], made: Made) -> None:
@@ -139,7 +140,7 @@ def test_every_object_is_used_or_counted(footprints: dict[str, Any], made: Made)
         ("way/2001", 12.0, 0.0, "height"),
         ("way/2002", 12.192, 0.0, "height"),
         ("way/2003", 9.0, 0.0, "levels"),
-        ("way/2004", 9.0, 0.0, "default"),
+        ("way/2004", 9.0, 0.0, "neighbours"),
         ("way/2005", 6.0, 0.0, "levels"),
         ("way/2006", 9.0, 3.0, "height"),
         ("way/2014", 20.0, 0.0, "height"),
@@ -292,7 +293,7 @@ def test_names_junction_and_attributes_source(made: Made) -> None:
 
 def test_special_characters_in_street_name_and_comments(tmp_path: Path) -> None:
     named = edited(tmp_path, ('v="East Street"', 'v="East A\\\\B = #1 &quot;Straße&quot; &amp; more"'))
-    title = openstreetmap.create_scenario(tmp_path / "named", named).junction.title
+    title = create_scenario(tmp_path / "named", named).junction.title
     assert title == 'signalised junction of East A\\B = #1 "Straße" & more and North Street'
     assert loading.load(tmp_path / "named").description == f"S{title[1:]}"
     text = (tmp_path / "named" / "scenario.toml").read_text(encoding="utf-8")
@@ -310,7 +311,7 @@ def test_same_bytes_from_other_folder_pbf_and_other_order(made: Made, tmp_path: 
     packed.write_bytes(gzip.compress((text[:first] + "".join(reversed(nodes)) + text[last:]).encode()))
     for number, source in enumerate((packed, pbf_of(SMALL, tmp_path / "small.osm.pbf"))):
         again = tmp_path / "elsewhere" / str(number)
-        openstreetmap.create_scenario(again, source)
+        create_scenario(again, source)
         assert sorted(p.name for p in again.iterdir()) == NAMES
         for name in NAMES:
             content = (again / name).read_bytes().replace(f'name = "{number}"\n'.encode(), b"")
@@ -320,12 +321,12 @@ def test_same_bytes_from_other_folder_pbf_and_other_order(made: Made, tmp_path: 
 
 # --- variants ------------------------------------------------------------------------------------------------------
 def test_left_hand_traffic(tmp_path: Path) -> None:
-    openstreetmap.create_scenario(tmp_path / "left", SMALL, lefthand=True)
+    create_scenario(tmp_path / "left", SMALL, lefthand=True)
     assert 'lefthand="true"' in (tmp_path / "left" / "network.net.xml").read_text(encoding="utf-8")
 
 
 def test_sidewalks_and_crossings_change_neither_junction_nor_lanes(made: Made, tmp_path: Path) -> None:
-    walked = openstreetmap.create_scenario(tmp_path / "walked", SMALL, walk=True)
+    walked = create_scenario(tmp_path / "walked", SMALL, walk=True)
     plain = made[1]
     assert walked.notes[:-1] == plain.notes and "pedestrians_per_h" in walked.notes[-1]
     assert (walked.junction.title, walked.junction.lanes_in) == (plain.junction.title, plain.junction.lanes_in)
@@ -339,7 +340,7 @@ def test_sidewalks_and_crossings_change_neither_junction_nor_lanes(made: Made, t
 def test_fills_empty_folder_and_repairs_name_with_spaces(tmp_path: Path) -> None:
     folder = tmp_path / "my junction"
     folder.mkdir()
-    openstreetmap.create_scenario(folder, SMALL, at=(52.0, 10.0))
+    create_scenario(folder, SMALL, at=(52.0, 10.0))
     assert loading.load(folder).name == "my-junction"
     assert [p.name for p in tmp_path.iterdir()] == ["my junction"]
 
@@ -347,16 +348,16 @@ def test_fills_empty_folder_and_repairs_name_with_spaces(tmp_path: Path) -> None
 @pytest.mark.slow
 def test_without_signals_chooses_largest_junction_with_note(tmp_path: Path) -> None:
     plain = edited(tmp_path, (' <node id="1" ([^>]*)>.*?</node>', r' <node id="1" \1/>'))
-    summary = openstreetmap.create_scenario(tmp_path / "plain", plain)
+    summary = create_scenario(tmp_path / "plain", plain)
     assert summary.junction.title == "junction without signals of East Street and North Street"
-    assert any("no junction in the extract has signals" in note for note in summary.notes)
+    assert any("no junction in the map has signals" in note for note in summary.notes)
 
 
 @pytest.mark.slow
 def test_counts_open_ring(tmp_path: Path) -> None:
     deleted = ('<node id="1" ', '<node id="77" action="delete"/><node id="1" ')
     torn = edited(tmp_path, (' <way id="2102">.*?</way>', ""), deleted)
-    summary = openstreetmap.create_scenario(tmp_path / "torn", torn)
+    summary = create_scenario(tmp_path / "torn", torn)
     assert summary.statics.dropped["incomplete"] == {"building": 2}
     assert summary.statics.heights["building"]["levels"] == 2
 
@@ -368,7 +369,7 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> Made:
     if not REAL.is_file():
         pytest.skip(f"{REAL.name} is not beside the checkout (shared/real)")
     folder = tmp_path_factory.mktemp("osm") / "town"
-    return folder, openstreetmap.create_scenario(folder, REAL, surroundings_m=None)
+    return folder, create_scenario(folder, REAL, surroundings_m=math.inf)
 
 
 def test_real_town(town: Made) -> None:
@@ -395,7 +396,7 @@ def test_real_town_is_in_network_frame(town: Made) -> None:
 
 
 def test_real_town_at_position(town: Made, tmp_path: Path) -> None:
-    summary = openstreetmap.create_scenario(tmp_path / "other", REAL, at=(50.8704, 9.7080), surroundings_m=None)
+    summary = create_scenario(tmp_path / "other", REAL, at=(50.8704, 9.7080), surroundings_m=math.inf)
     assert summary.junction.title == "signalised junction of Benno-Schilde-Straße and Dippelstraße"
     check_sites(tmp_path / "other", 12)
     assert (tmp_path / "other" / "network.net.xml").read_bytes() == (town[0] / "network.net.xml").read_bytes()
@@ -407,7 +408,7 @@ def test_people_move_in_real_town(town: Made, tmp_path: Path, walk: bool) -> Non
     from egvs.stages import traffic
 
     del town  # the file is there
-    openstreetmap.create_scenario(tmp_path / "town", REAL, walk=walk)
+    create_scenario(tmp_path / "town", REAL, walk=walk)
     rates = {"bicycles_per_h": 100, "pedestrians_per_h": 200} if walk else {"bicycles_per_h": 100}
     people = [f"effects.pedestrians_bicycles.{key}={rate}" for key, rate in rates.items()]
     scenario = loading.load(tmp_path / "town", [*people, "traffic.frames=50", "traffic.warmup_s=60", "tpog.blocks=5",
@@ -421,7 +422,7 @@ def test_traffic_of_real_junction_flows(town: Made, tmp_path: Path) -> None:
     from egvs.stages import traffic
 
     del town  # the file is there
-    openstreetmap.create_scenario(tmp_path / "town", REAL, at=(50.8704, 9.7080))
+    create_scenario(tmp_path / "town", REAL, at=(50.8704, 9.7080))
     summary = run_stage(traffic, loading.load(tmp_path / "town", ["traffic.frames=400"]), tmp_path)
     assert all(count["geh"] < 5 for count in summary["counts"]) and summary["longest_standing_s"] < 120
     assert not {"counts", "standing", "waiting"} & {warning["rule"] for warning in summary["warnings"]}
@@ -470,7 +471,7 @@ def test_rejects_bad_extract(tmp_path: Path, changes: list[tuple[str, str]], mes
     else:
         bad = edited(tmp_path, *changes)
     with pytest.raises(InputError) as caught:
-        openstreetmap.create_scenario(tmp_path / "out", bad)
+        create_scenario(tmp_path / "out", bad)
     assert message in str(caught.value) and str(bad) in str(caught.value)
     assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == [bad], "something was written"
@@ -488,42 +489,42 @@ def test_rejects_bad_file(tmp_path: Path, content: bytes, message: str) -> None:
     bad = tmp_path / "bad.osm"
     bad.write_bytes(content)
     with pytest.raises(InputError, match=re.escape(str(bad)) + ".*" + message):
-        openstreetmap.create_scenario(tmp_path / "out", bad)
+        create_scenario(tmp_path / "out", bad)
     assert list(tmp_path.iterdir()) == [bad]
 
 
 def test_rejects_missing_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"nowhere\.osm: no such file"):
-        openstreetmap.create_scenario(tmp_path / "out", tmp_path / "nowhere.osm")
+        create_scenario(tmp_path / "out", tmp_path / "nowhere.osm")
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("at", [(0.0, 0.0), (52.0, 52.0), (float("nan"), 10.0)])
 def test_rejects_position_outside_extract(tmp_path: Path, at: tuple[float, float]) -> None:
     with pytest.raises(InputError, match=r"--at: .* is outside the extract.*latitude 51\.998"):
-        openstreetmap.create_scenario(tmp_path / "out", SMALL, at=at)
+        create_scenario(tmp_path / "out", SMALL, at=at)
     assert not list(tmp_path.iterdir())
 
 
 def test_suggests_position_with_latitude_first(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=re.escape("Latitude comes first: did you mean --at 52.0,10.0?")):
-        openstreetmap.create_scenario(tmp_path / "new", SMALL, (10.0, 52.0))
+        create_scenario(tmp_path / "new", SMALL, (10.0, 52.0))
     assert not (tmp_path / "new").exists()
 
 
 def test_rejects_folder_with_content(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("keep me", encoding="utf-8")
     with pytest.raises(InputError, match="not empty"):
-        openstreetmap.create_scenario(tmp_path, SMALL)
+        create_scenario(tmp_path, SMALL)
     with pytest.raises(InputError, match=r"mine\.txt: .*existing file"):
-        openstreetmap.create_scenario(tmp_path / "mine.txt", SMALL)
+        create_scenario(tmp_path / "mine.txt", SMALL)
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("level", "share"), [("light", 0.4), ("medium", 0.75), ("heavy", 1.0)])
 def test_traffic_is_a_share_of_what_the_junction_carries(tmp_path: Path, level: str, share: float) -> None:
-    summary = openstreetmap.create_scenario(tmp_path / "out", SMALL, traffic=level)
+    summary = create_scenario(tmp_path / "out", SMALL, traffic=level)
     traffic = summary.traffic
     assert traffic is not None and traffic.capacity.is_everything
     assert traffic.carried_per_h == traffic.assumed_per_h > 500
@@ -540,14 +541,14 @@ def test_traffic_is_a_share_of_what_the_junction_carries(tmp_path: Path, level: 
 def test_flow_above_capacity_is_reduced_and_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     jam = TrialRun(1.0, 100, 50, 300.0, 20, "junction 1, Main Street from 20 s on")
     runs = (jam, TrialRun(0.7, 70, 70, 50.0, 0))
-    monkeypatch.setattr(openstreetmap, "find_capacity", lambda *_: Capacity(0.644, runs))
-    traffic = openstreetmap.create_scenario(tmp_path / "out", SMALL).traffic
+    monkeypatch.setattr(assumed_traffic, "find_capacity", lambda *_: Capacity(0.644, runs))
+    traffic = create_scenario(tmp_path / "out", SMALL).traffic
     assert traffic is not None
     assert traffic.carried_per_h == 10 * round(0.0644 * traffic.assumed_per_h)
     assert traffic.summary == f"carries {traffic.carried_per_h:,} vehicles an hour; medium 75 % is used"
     assert traffic.per_h == pytest.approx(0.75 * traffic.carried_per_h, abs=12)
-    monkeypatch.setattr(openstreetmap, "find_capacity", lambda *_: Capacity(0.155, runs[:1]))
-    notes = openstreetmap.create_scenario(tmp_path / "jammed", SMALL).notes
+    monkeypatch.setattr(assumed_traffic, "find_capacity", lambda *_: Capacity(0.155, runs[:1]))
+    notes = create_scenario(tmp_path / "jammed", SMALL).notes
     assert notes[-1] == (
         "traffic jams in all 1 trials; a vehicle stood for 300 s at junction 1, Main Street from 20 s on."
         " Lower per_hour of traffic.counts, or check the signals and connections there"
@@ -556,12 +557,12 @@ def test_flow_above_capacity_is_reduced_and_said(monkeypatch: pytest.MonkeyPatch
 
 def test_rejects_unknown_level_of_traffic(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"--traffic: expected light, medium or heavy, got 'rush'"):
-        openstreetmap.create_scenario(tmp_path / "out", SMALL, traffic="rush")
+        create_scenario(tmp_path / "out", SMALL, traffic="rush")
     assert not (tmp_path / "out").exists()
 
 
 def test_smaller_surroundings_keep_sites_and_flows(tmp_path: Path) -> None:
-    made = {r: openstreetmap.create_scenario(tmp_path / str(r), SMALL, surroundings_m=r) for r in (120.0, 150.0, None)}
+    made = {r: create_scenario(tmp_path / str(r), SMALL, surroundings_m=r) for r in (120.0, 150.0, math.inf)}
     lengths = [summary.streets.lane_length_m for summary in made.values()]
     assert lengths == sorted(lengths) and lengths[0] < 0.8 * lengths[-1]
     for name in ("sites.csv", "statics.geojson"):
@@ -569,7 +570,7 @@ def test_smaller_surroundings_keep_sites_and_flows(tmp_path: Path) -> None:
     flows = [sorted(flow.per_hour for flow in summary.flows) for summary in made.values()]
     assert flows[0] == flows[1] == flows[2] and len(flows[0]) == 12 and sum(flows[0]) > 500
     assert len({summary.roi for summary in made.values()}) == 1
-    assert loading.load(tmp_path / "None").traffic.counts == made[None].flows
+    assert loading.load(tmp_path / "inf").traffic.counts == made[math.inf].flows
 
 
 def test_help_names_default_surroundings() -> None:
@@ -579,5 +580,13 @@ def test_help_names_default_surroundings() -> None:
 
 def test_rejects_surroundings_smaller_than_junction(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"--surroundings: expected at least 100 m, got 60 m"):
-        openstreetmap.create_scenario(tmp_path / "small", SMALL, surroundings_m=60.0)
+        create_scenario(tmp_path / "small", SMALL, surroundings_m=60.0)
     assert not (tmp_path / "small").exists()
+
+
+@pytest.mark.parametrize("lefthand", [False, True])
+def test_junction_is_where_the_map_puts_it(tmp_path: Path, lefthand: bool) -> None:
+    """netconvert writes a wrong offset of y for left-hand traffic in a given frame."""
+    made = create_scenario(tmp_path / "out", SMALL, (52.0, 10.0), lefthand=lefthand)
+    ((lon_deg, lat_deg),) = made.streets.to_degrees([made.junction.at_m])
+    assert (lat_deg, lon_deg) == pytest.approx((52.0, 10.0), abs=1e-4)

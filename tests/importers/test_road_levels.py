@@ -11,8 +11,9 @@ import pytest
 from shapely.geometry import LineString
 
 from egvs.formats import osm
-from egvs.importers import junctions, openstreetmap, osm_network, osm_solids, road_levels
+from egvs.importers import junctions, osm_network, osm_solids, road_levels
 from egvs.traffic import network as road_network
+from tests.importers.creation import create_scenario
 
 SMALL = Path(__file__).parent / "data" / "small.osm"
 """A cross of the streets 1001 (west to east) and 1002 (south to north) at node 1."""
@@ -95,8 +96,8 @@ def decks_of(folder: Path) -> list[dict[str, Any]]:
 
 def test_flyover_is_no_traffic_but_a_deck(tmp_path: Path) -> None:
     path = with_flyover(bridge="yes", layer="1", lanes="4").write(tmp_path / "flyover.osm")
-    plain = openstreetmap.create_scenario(tmp_path / "plain", SMALL)
-    made = openstreetmap.create_scenario(tmp_path / "flyover", path)
+    plain = create_scenario(tmp_path / "plain", SMALL)
+    made = create_scenario(tmp_path / "flyover", path)
 
     assert made.flows == plain.flows
     region = made.roi.area
@@ -185,8 +186,8 @@ def test_junction_on_a_bridge_loses_the_road_below(tmp_path: Path) -> None:
 
 def test_junction_on_a_bridge_becomes_a_scenario(tmp_path: Path) -> None:
     town = with_flyover().tag(1001, bridge="yes", layer="1").tag(1002, bridge="yes", layer="1")
-    plain = openstreetmap.create_scenario(tmp_path / "plain", SMALL)
-    made = openstreetmap.create_scenario(tmp_path / "above", town.write(tmp_path / "above.osm"))
+    plain = create_scenario(tmp_path / "plain", SMALL)
+    made = create_scenario(tmp_path / "above", town.write(tmp_path / "above.osm"))
     assert made.flows == plain.flows and made.poles == plain.poles
     assert not decks_of(tmp_path / "above")
 
@@ -224,6 +225,6 @@ def test_bridges_of_railways_and_paths_are_decks(tmp_path: Path, tags: dict[str,
 
 def test_pieces_outside_the_region_stay_in_the_network(tmp_path: Path) -> None:
     path = with_flyover(bridge="yes").write(tmp_path / "flyover.osm")
-    made = openstreetmap.create_scenario(tmp_path / "made", path)
+    made = create_scenario(tmp_path / "made", path)
     edges = {edge.id.lstrip("-") for edge in made.streets.network.edges}
     assert edges & {"9001", "9002", "9003"}

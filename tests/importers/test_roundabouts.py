@@ -11,11 +11,12 @@ from shapely.geometry import LineString, Point
 
 from egvs.city import creation
 from egvs.formats import osm
-from egvs.importers import junctions, openstreetmap, osm_network
+from egvs.importers import assumed_traffic, junctions, osm_network
 from egvs.importers.junctions import Streets
 from egvs.scenario import loading
 from egvs.traffic.capacity import Capacity, TrialRun
 from egvs.traffic.movements import MovementNames
+from tests.importers.creation import create_scenario
 from tests.importers.small_maps import XY, MapWay, degrees, street, write_map
 from tests.importers.test_openstreetmap import check_sites, sites_of
 from tests.stage_runner import run_stage
@@ -126,12 +127,12 @@ def test_movements_have_the_directions_of_the_arms(streets: Streets) -> None:
 def carries_everything(monkeypatch: pytest.MonkeyPatch) -> None:
     """No trial simulations: they take longer than all the rest."""
     capacity = Capacity(1.0, (TrialRun(1.0, 100, 100, 20.0, 0),))
-    monkeypatch.setattr(openstreetmap, "find_capacity", lambda *_: capacity)
+    monkeypatch.setattr(assumed_traffic, "find_capacity", lambda *_: capacity)
 
 
 @pytest.mark.usefixtures("carries_everything")
 def test_poles_stand_around_the_ring_at_all_arms(tmp_path: Path) -> None:
-    summary = openstreetmap.create_scenario(tmp_path / "out", ring_map(tmp_path / "ring.osm"), at=degrees((0.0, 0.0)))
+    summary = create_scenario(tmp_path / "out", ring_map(tmp_path / "ring.osm"), at=degrees((0.0, 0.0)))
     check_sites(tmp_path / "out", 12)
     (x, y), area = summary.junction.at_m, summary.junction.area
     quadrants: Counter[tuple[bool, bool]] = Counter()
@@ -145,7 +146,7 @@ def test_poles_stand_around_the_ring_at_all_arms(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("carries_everything")
 def test_entry_of_a_ring_larger_than_the_region_has_a_note(tmp_path: Path) -> None:
     path = ring_map(tmp_path / "large.osm", radius_m=80.0)
-    summary = openstreetmap.create_scenario(tmp_path / "out", path, at=degrees((80.0, 0.0)))
+    summary = create_scenario(tmp_path / "out", path, at=degrees((80.0, 0.0)))
     assert summary.junction.ring is None
     (note,) = (note for note in summary.notes if "roundabout" in note)
     assert note.startswith("the junction is one entry of a roundabout 16") and "(120 m)" in note
@@ -155,7 +156,7 @@ def test_entry_of_a_ring_larger_than_the_region_has_a_note(tmp_path: Path) -> No
 def test_vehicles_follow_the_flows_around_a_ring(tmp_path: Path) -> None:
     from egvs.stages import traffic
 
-    openstreetmap.create_scenario(tmp_path / "out", ring_map(tmp_path / "ring.osm"), at=degrees((0.0, 0.0)))
+    create_scenario(tmp_path / "out", ring_map(tmp_path / "ring.osm"), at=degrees((0.0, 0.0)))
     scenario = loading.load(tmp_path / "out", ["traffic.frames=900"])
     summary = run_stage(traffic, scenario, tmp_path / "run")
     counted = math.fsum(count["counted_per_h"] for count in summary["counts"])
@@ -169,7 +170,7 @@ def test_vehicles_follow_the_flows_around_a_ring(tmp_path: Path) -> None:
 def test_real_roundabout_is_one_junction(tmp_path: Path) -> None:
     if not REAL.is_file():
         pytest.skip(f"{REAL.name} is not beside the checkout (shared/real)")
-    summary = openstreetmap.create_scenario(tmp_path / "out", REAL, at=(50.8600, 9.7100))
+    summary = create_scenario(tmp_path / "out", REAL, at=(50.8600, 9.7100))
     assert summary.junction.title == "roundabout of Berliner Straße and Europaallee"
     assert (summary.junction.arms, summary.from_at_m) == (4, 0.0)
     assert len(summary.flows) == 12

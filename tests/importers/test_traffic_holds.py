@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from egvs.importers import openstreetmap
-from egvs.importers.openstreetmap import NewScenario
+from egvs.importers.new_scenario import NewScenario
 from egvs.scenario.loading import load
 from egvs.stages import traffic
+from tests.importers.creation import create_scenario
 from tests.importers.made_up_towns import write_town
 from tests.stage_runner import run_stage
 
@@ -29,7 +29,7 @@ def check_traffic(scenario: NewScenario, out: Path, seed: int, frames: int = 180
 @pytest.mark.slow
 @pytest.mark.parametrize("lefthand", [False, True])
 def test_small_extract(tmp_path: Path, lefthand: bool) -> None:
-    scenario = openstreetmap.create_scenario(tmp_path / "new", SMALL, lefthand=lefthand, traffic="heavy")
+    scenario = create_scenario(tmp_path / "new", SMALL, lefthand=lefthand, traffic="heavy")
     check_traffic(scenario, tmp_path / "out", seed=2)
 
 
@@ -37,7 +37,7 @@ def test_small_extract(tmp_path: Path, lefthand: bool) -> None:
 @pytest.mark.parametrize("kind", ["grid", "spider", "random"])
 def test_made_up_towns(tmp_path: Path, kind: str) -> None:
     at = write_town(tmp_path / "town.osm", kind, seed=1)[0]
-    scenario = openstreetmap.create_scenario(tmp_path / "new", tmp_path / "town.osm", at)
+    scenario = create_scenario(tmp_path / "new", tmp_path / "town.osm", at)
     check_traffic(scenario, tmp_path / "out", seed=1)
 
 
@@ -46,5 +46,5 @@ def test_made_up_towns(tmp_path: Path, kind: str) -> None:
 @pytest.mark.parametrize("at", [(50.8621925, 9.719901), (50.8546613, 9.7220179)], ids=["loops", "locks"])
 def test_junctions_of_real_town(tmp_path: Path, at: tuple[float, float]) -> None:
     """At the first, half of the vehicles used to pass the signals twice; at the second, short pieces locked."""
-    scenario = openstreetmap.create_scenario(tmp_path / "new", TOWN, at)
+    scenario = create_scenario(tmp_path / "new", TOWN, at)
     check_traffic(scenario, tmp_path / "out", seed=1)

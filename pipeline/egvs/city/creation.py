@@ -32,21 +32,20 @@ from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.formats.osm import read_osm as read_extract
-from egvs.importers import junctions, openstreetmap, osm_network, osm_solids
-from egvs.importers.junctions import HEIGHTS_M, JunctionRegion, KerbsidePole, StreetJunction, Streets
-from egvs.importers.openstreetmap import (
-    DEFAULT_TRAFFIC,
-    JUNCTION_BLOCKER_S,
-    PITCHES_DEG,
-    SITES_FILE,
-    STATICS_FILE,
-    TELEPORT_S,
-    TRAFFIC_LEVELS,
-    TomlTable,
-    check_inside_extract,
+from egvs.importers import assumed_traffic, junctions, new_scenario, osm_network, osm_solids, scenario_files
+from egvs.importers.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, TRAFFIC_LEVELS
+from egvs.importers.junctions import (
+    HEIGHTS_M,
+    JunctionRegion,
+    KerbsidePole,
+    NearbyJunction,
+    StreetJunction,
+    Streets,
 )
+from egvs.importers.openstreetmap import check_inside_extract
 from egvs.importers.osm_network import ATTRIBUTION, NETWORK_FILE, NetworkExcerpts
 from egvs.importers.osm_solids import ImportCounts, MappedSolid
+from egvs.importers.scenario_files import PITCHES_DEG, SITES_FILE, STATICS_FILE, TomlTable, reachable_area
 from egvs.scenario.loading import load
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, TrafficConfig
@@ -123,7 +122,7 @@ class NewJunction:
 
 @dataclass(frozen=True)
 class CityFlow:
-    """The traffic of a new city: what the network carries, and a key of :data:`openstreetmap.TRAFFIC_LEVELS`."""
+    """The traffic of a new city: what the network carries, and a key of :data:`TRAFFIC_LEVELS`."""
 
     capacity: FlowCapacity
     level: str
@@ -190,9 +189,9 @@ class NewCityOptions:
     which
         ``"signalised"``, ``"all"``, or the path of a table, see :func:`choose_junctions`.
     lefthand, walk
-        As in :func:`egvs.importers.openstreetmap.create_scenario`.
+        As in :func:`egvs.importers.new_scenario.NewScenarioOptions`.
     traffic
-        A key of :data:`egvs.importers.openstreetmap.TRAFFIC_LEVELS`: the share of the flow that the network carries.
+        A key of :data:`egvs.importers.assumed_traffic.TRAFFIC_LEVELS`: the share of the flow that the network carries.
     progress
         Called with the number of finished junctions.
     """
@@ -226,8 +225,8 @@ def create_city(folder: Path, osm: Path, options: NewCityOptions | None = None) 
     """
     options = options or NewCityOptions()
     around, radius_m, which = options.around, options.radius_m, options.which
-    openstreetmap.check_traffic_level(options.traffic)
-    name = openstreetmap.check_new_folder(folder)
+    assumed_traffic.check_traffic_level(options.traffic)
+    name = scenario_files.check_new_folder(folder)
     if radius_m is not None and around is None:
         raise InputError("--radius", "given without --around", "Add --around LAT,LON.")
     extract = read_extract(osm)
@@ -270,13 +269,13 @@ def create_city(folder: Path, osm: Path, options: NewCityOptions | None = None) 
     flow = CityFlow(find_flow(network, JUNCTION_BLOCKER_S), options.traffic)
     notes = _import_notes(made, counts, flow, options.walk)
     city = NewCity(folder, tuple(made), left_out, streets, counts, flow, notes)
-    openstreetmap.publish_folder(folder, _city_files(city, name, network, solids, areas), _check_city)
+    scenario_files.publish_folder(folder, _city_files(city, name, network, solids, areas), _check_city)
     return city
 
 
 def _import_notes(made: Sequence[NewJunction], counts: ImportCounts, flow: CityFlow, walk: bool) -> tuple[str, ...]:
     """Return what to know before trusting the city."""
-    notes = openstreetmap.scenario_notes(True, counts)
+    notes = new_scenario.scenario_notes(True, counts)
     if not flow.capacity.is_confirmed:
         runs = len(flow.capacity.runs)
         notes.append(f"traffic jams in all {runs} trials; check the signals and connections of the network")
@@ -341,32 +340,25 @@ def _junctions_from_table(streets: Streets, path: Path) -> Iterator[tuple[str, S
 def _junction_at(streets: Streets, lat_deg: float, lon_deg: float, where: str) -> StreetJunction:
     """Return the junction nearest to a position; raise an InputError if it is too far away."""
     nearest = _nearest_junction(streets, lat_deg, lon_deg)
-    if nearest.junction is not None and nearest.distance_m <= MAX_DISTANCE_M:
+    if nearest is not None and nearest.distance_m <= MAX_DISTANCE_M:
         return nearest.junction
-    problem = f"the nearest junction of three or more streets is {nearest.distance_m:,.0f} m away"
+    problem = "the streets have no junction of three or more streets"
+    if nearest is not None:
+        problem = f"the nearest junction of three or more streets is {nearest.distance_m:,.0f} m away"
     hint = f"Use coordinates within {MAX_DISTANCE_M:g} m of a junction."
-    if _nearest_junction(streets, lon_deg, lat_deg).distance_m <= MAX_DISTANCE_M:
+    swapped = _nearest_junction(streets, lon_deg, lat_deg)
+    if swapped is not None and swapped.distance_m <= MAX_DISTANCE_M:
         hint = f"Latitude and longitude are swapped: did you mean lat_deg {lon_deg!r}, lon_deg {lat_deg!r}?"
     raise InputError(where, problem, hint)
 
 
-class _NearestJunction(NamedTuple):
-    """A junction of three or more streets; None at an infinite distance if there is none."""
-
-    junction: StreetJunction | None
-    distance_m: float
-
-
-def _nearest_junction(streets: Streets, lat_deg: float, lon_deg: float) -> _NearestJunction:
-    """Return the junction whose area is nearest to a position."""
-    point = Point(streets.to_xy([lon_deg], [lat_deg])[0])
-    nearest = _NearestJunction(None, math.inf)
-    if math.isfinite(point.x + point.y):
-        for junction in sorted(streets.junctions, key=lambda j: j.id):
-            junction_m = point.distance(junction.area)
-            if junction.is_crossing and junction_m < nearest.distance_m:
-                nearest = _NearestJunction(junction, junction_m)
-    return nearest
+def _nearest_junction(streets: Streets, lat_deg: float, lon_deg: float) -> NearbyJunction | None:
+    """Return the junction of three or more streets that is nearest; None if there is none, or no such position."""
+    x_m, y_m = streets.to_xy([lon_deg], [lat_deg])[0]
+    if not math.isfinite(x_m + y_m):
+        return None
+    nearby = junctions.nearest_junctions(streets, (x_m, y_m))
+    return nearby[0] if nearby else None
 
 
 class DividedRegions(NamedTuple):
@@ -478,12 +470,12 @@ def _city_files(
     yield f"{JUNCTIONS_FOLDER}/{SCENARIO_FILE}", common_toml()
     excerpts = NetworkExcerpts(network)
     for junction in city.junctions:
-        reachable_area = openstreetmap.reachable_area(junction.roi)
-        near = [solids[i] for i in sorted(areas.query(reachable_area, predicate="intersects"))]
+        reachable = reachable_area(junction.roi)
+        near = [solids[i] for i in sorted(areas.query(reachable, predicate="intersects"))]
         roads = excerpts.near(city.streets.near(_surroundings(junction.roi, _ROADS_MARGIN_M)))
         folder = f"{JUNCTIONS_FOLDER}/{junction.id}"
-        yield f"{folder}/{STATICS_FILE}", openstreetmap.solids_geojson(near, _count_solids(near))
-        yield f"{folder}/{SITES_FILE}", openstreetmap.sites_csv(junction.poles)
+        yield f"{folder}/{STATICS_FILE}", scenario_files.solids_geojson(near, _count_solids(near))
+        yield f"{folder}/{SITES_FILE}", scenario_files.sites_csv(junction.poles)
         yield f"{folder}/{ROADS_FILE}", roads
         yield f"{folder}/{SCENARIO_FILE}", junction_toml(junction.id, junction.junction.title, junction.roi)
 
@@ -543,7 +535,7 @@ def city_toml(name: str, streets: Streets, flow: CityFlow, n_junctions: int) -> 
     }  # fmt: skip
     comment = "one simulation for all junctions, trips drawn in the whole network; or your own sumocfg, counts, fcd"
     comments = [f"A city. {_SOURCE_COMMENT}", _FRAME_COMMENT]
-    document = openstreetmap.toml_document(comments, values, {"traffic": (comment, traffic)})
+    document = scenario_files.toml_document(comments, values, {"traffic": (comment, traffic)})
     document["traffic"]["vehicles_per_h"].comment(f"the network {flow.summary}")
     return tomlkit.dumps(document)
 
@@ -552,25 +544,25 @@ def common_toml() -> str:
     """Return the text of ``junctions/scenario.toml``, which the scenarios of all junctions extend."""
     period_s = TrafficConfig.model_fields["frame_period_s"].default
     tables: dict[str, TomlTable] = {
-        "roi": ("", openstreetmap.voxel_keys()),
+        "roi": ("", scenario_files.voxel_keys()),
         "traffic": (f"as in {CITY_FILE}, or a multiple of it", {"frame_period_s": period_s}),
-        "sites": ("", openstreetmap.mount_keys()),
+        "sites": ("", scenario_files.mount_keys()),
         "scan": ("sites are scanned while they are scored; true keeps the scans, 0.7 MB per site", {"keep": False}),
-        "score": openstreetmap.score_table(),
-        "placement": openstreetmap.placement_table(),
+        "score": scenario_files.score_table(),
+        "placement": scenario_files.placement_table(),
     }
     comment = "Common settings of all junctions; the scenario of a junction may override them."
-    return tomlkit.dumps(openstreetmap.toml_document([comment], {"seed": 1}, tables))
+    return tomlkit.dumps(scenario_files.toml_document([comment], {"seed": 1}, tables))
 
 
 def junction_toml(junction_id: str, title: str, roi: JunctionRegion) -> str:
     """Return the text of a junction's ``scenario.toml``."""
     traffic = {"fcd": f"../../{TRAFFIC_FOLDER}/{junction_id}.parquet", "roads": ROADS_FILE}
     tables = {
-        "roi": openstreetmap.roi_table(roi),
+        "roi": scenario_files.roi_table(roi),
         "traffic": ("the city's traffic near this junction, written by egvs city traffic", traffic),
-        "statics": openstreetmap.statics_table(),
-        "sites": openstreetmap.sites_table(),
+        "statics": scenario_files.statics_table(),
+        "sites": scenario_files.sites_table(),
     }
     values = {"extends": "..", "description": title[0].upper() + title[1:]}
-    return tomlkit.dumps(openstreetmap.toml_document([f"A junction of a city. {_SOURCE_COMMENT}"], values, tables))
+    return tomlkit.dumps(scenario_files.toml_document([f"A junction of a city. {_SOURCE_COMMENT}"], values, tables))

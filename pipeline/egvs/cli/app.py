@@ -107,8 +107,8 @@ def run(
     if audit or rehash:
         run_all()
         return
-    words = ["run", str(scenario), str(out), *(set_ or ()), str(top), str(all_), str(verbose)]
-    repeat.print_or_run(words, out, run_all)
+    arguments = ["run", str(scenario), str(out), *(set_ or ()), str(top), str(all_), str(verbose)]
+    repeat.print_or_run(arguments, out, run_all)
 
 
 def _run_all_stages(
@@ -551,15 +551,26 @@ def sensors(
 @app.command(cls=cli_options.PolesCommand)
 def new(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of the new scenario.")],
-    osm: Annotated[
-        Path, typer.Option(metavar="FILE", help="An OpenStreetMap extract (.osm, .osm.xml, .osm.pbf, also gzipped).")
-    ],
+    more: Annotated[
+        list[Path] | None, typer.Argument(metavar="[FILE]...", help="Further map files or folders.")
+    ] = None,
+    maps: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--from",
+            "--osm",
+            metavar="FILE",
+            help="A map, or a folder of maps: roads (OpenStreetMap, SUMO .net.xml), and what stands beside them."
+            " Several files: --from A B C.",
+        ),
+    ] = None,
     at: Annotated[
         str | None,
         typer.Option(
             metavar="LAT,LON",
             help="Use the junction at this point; if there is none, the nearest one with signals within 40 m, or else "
-            "the nearest one within 100 m. Default: the largest junction with signals.",
+            "the nearest one within 100 m. X,Y in metres if the road map has no reference system. Default: the largest"
+            " junction with signals.",
         ),
     ] = None,
     lefthand: Annotated[bool, typer.Option("--lefthand", help="Traffic drives on the left.")] = False,
@@ -568,7 +579,8 @@ def new(
         str | None,
         typer.Option(
             metavar="METRES",
-            help="Simulate the streets within this radius of the junction, or 'all'; 300 by default.",
+            help="Simulate the streets within this radius of the junction, or 'all'; 300 by default (OpenStreetMap"
+            " only: other maps are not cut).",
         ),
     ] = None,
     traffic: Annotated[
@@ -591,32 +603,45 @@ def new(
             " spread over the arms of the junction.",
         ),
     ] = None,
+    align: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="X,Y=LAT,LON",
+            help="A point of the files without a reference system, in metres, and where it is; give two points.",
+        ),
+    ] = None,
 ) -> None:
-    """Create a scenario from an OpenStreetMap extract.
+    """Create a scenario from maps of roads, buildings and other objects.
 
     Its scenario.toml has a template for peaks and other parts of the day (traffic.periods).
     """
     from egvs.cli import new_summary
-    from egvs.importers import openstreetmap
+    from egvs.importers import new_scenario
+    from egvs.importers.assumed_traffic import DEFAULT_TRAFFIC
+    from egvs.importers.new_scenario import NewScenarioOptions
 
+    paths = [*(maps or []), *(more or [])]
+    if not paths:
+        raise InputError("--from", "no map is given", "Give a map of the roads, such as --from town.osm.")
     location = None
     if at is not None:
         location = cli_options.latitude_and_longitude(at)
-    surroundings_m: float | None = openstreetmap.SURROUNDINGS_M
+    surroundings_m = None
     if surroundings is not None:
         surroundings_m = cli_options.radius_m(surroundings)
     if traffic is not None and vehicles_per_hour is not None:
         raise InputError("--traffic", "cannot be combined with --vehicles-per-hour", "Use one of them.")
-    demand: str | int = traffic or openstreetmap.DEFAULT_TRAFFIC
+    demand: str | int = traffic or DEFAULT_TRAFFIC
     if vehicles_per_hour is not None:
         demand = vehicles_per_hour
     pole_spacing_m = None
     if poles is not None:
         pole_spacing_m = cli_options.pole_spacing_m(*poles)
-    scenario = openstreetmap.create_scenario(
-        folder, osm, location, lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=demand,
-        pole_spacing_m=pole_spacing_m,
+    options = NewScenarioOptions(
+        lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=demand, pole_spacing_m=pole_spacing_m,
+        align=tuple(cli_options.point_pair(text) for text in align or []),
     )  # fmt: skip
+    scenario = new_scenario.create_scenario(folder, paths, location, options)
     new_summary.print_new_scenario(scenario)
 
 

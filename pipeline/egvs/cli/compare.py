@@ -1,4 +1,4 @@
-"""``egvs compare``: compare finished runs, or run a scenario with each of several sensors and compare these runs."""
+"""``egvs compare``: compare finished runs, or runs of a scenario with several sensors or other heights of buildings."""
 
 from __future__ import annotations
 
@@ -13,10 +13,13 @@ from egvs.core.errors import InputError
 
 if TYPE_CHECKING:
     from egvs.cli.console import ProgressDisplay
+    from egvs.studies.assumed_heights import HeightRun
     from egvs.studies.sensor_runs import SensorRun
 
 _OPTION = "--sensors"
+_HEIGHTS_OPTION = "--assumed-heights"
 _COSTS = "costs."
+_LABEL_WIDTH = 10
 
 
 def compare(
@@ -37,6 +40,14 @@ def compare(
             "compare the runs. Folders that are up to date are used.",
         ),
     ] = None,
+    assumed_heights: Annotated[
+        bool,
+        typer.Option(
+            _HEIGHTS_OPTION,
+            help="Run the scenario also with all assumed heights of buildings 30 % lower and higher, and say which of "
+            "the best five sites change.",
+        ),
+    ] = False,
     by: Annotated[
         Literal["pole", "site"] | None,
         typer.Option(
@@ -59,6 +70,12 @@ def compare(
     from egvs.cli.console import ProgressDisplay
 
     overrides = set_ or []
+    if assumed_heights:
+        if sensors is not None:
+            problem = f"cannot be used together with {_OPTION}"
+            raise InputError(_HEIGHTS_OPTION, problem, "Set sites.replace_sensor for another sensor.")
+        _compare_heights(runs, overrides)
+        return
     costs = list(overrides)
     command: list[str] = []
     with ProgressDisplay("compare") as screen:
@@ -77,15 +94,46 @@ def compare(
     study_tables.print_comparison(comparison, top, command)
 
 
+def _compare_heights(paths: Sequence[Path], overrides: Sequence[str]) -> None:
+    """Run a scenario with several heights of buildings, print one line for each, and which sites change."""
+    from egvs.cli import study_tables
+    from egvs.cli.console import ProgressDisplay
+    from egvs.runs import run
+    from egvs.studies import assumed_heights
+
+    path = _single_path(paths, _HEIGHTS_OPTION)
+    with ProgressDisplay("compare") as screen:
+        prepared = assumed_heights.prepare_runs(path, overrides)
+        total = len(prepared.runs)
+
+        def run_one(number: int, height_run: HeightRun) -> None:
+            screen.begin_part(f"heights {height_run.label} ({number} of {total})")
+            run.run(height_run.scenario, height_run.folder, progress=screen.progress, listener=screen.stage_event)
+            screen.say(f"{height_run.label:<{_LABEL_WIDTH}}  {screen.part_duration:>10}   {height_run.folder}")
+
+        if prepared.assumed:
+            sensitivity = assumed_heights.compare_heights(prepared, run_one)
+        screen.end_parts("compare")
+    if prepared.assumed:
+        study_tables.print_height_sensitivity(sensitivity)
+    else:
+        study_tables.print_no_assumed_height(prepared)
+
+
+def _single_path(paths: Sequence[Path], option: str) -> Path:
+    """Return the only path; InputError if there are several."""
+    if len(paths) > 1:
+        problem = f"expected one scenario or run, got {len(paths)}"
+        raise InputError(option, problem, f"Give one of them, or leave out {option} to compare finished runs.")
+    return paths[0]
+
+
 def _run_sensors(screen: ProgressDisplay, paths: Sequence[Path], sensors: str, overrides: Sequence[str]) -> list[Path]:
     """Run a scenario with each sensor, print one line for each, and return the run folders."""
     from egvs.runs import run
     from egvs.studies import sensor_runs
 
-    if len(paths) > 1:
-        problem = f"expected one scenario or run, got {len(paths)}"
-        raise InputError(_OPTION, problem, f"Give one of them, or leave out {_OPTION} to compare finished runs.")
-    prepared = sensor_runs.prepare_runs(paths[0], sensors, overrides)
+    prepared = sensor_runs.prepare_runs(_single_path(paths, _OPTION), sensors, overrides)
     for note in prepared.notes:
         screen.say(f"note: {note}")
     total = len(prepared.runs)

@@ -12,14 +12,16 @@ from typing import TYPE_CHECKING
 
 from egvs.cli.console import WIDE, Column, console, make_table
 from egvs.importers import junctions
-from egvs.importers.openstreetmap import PITCHES_DEG, SENSOR, STATICS_FILE, NewScenario
+from egvs.importers.new_scenario import NewScenario
 from egvs.importers.osm_network import ATTRIBUTION
 from egvs.importers.osm_solids import OUT_OF_RANGE, ImportCounts
+from egvs.importers.scenario_files import PITCHES_DEG, SENSOR, STATICS_FILE
 
 if TYPE_CHECKING:
     from egvs.city.creation import NewCity, NewJunction
+    from egvs.importers.assumed_traffic import AssumedTraffic
     from egvs.importers.junctions import Streets
-    from egvs.importers.openstreetmap import AssumedTraffic
+    from egvs.importers.static_objects import MapSummary
 
 _FILE_WIDTH = 160
 
@@ -33,7 +35,8 @@ def print_new_scenario(scenario: NewScenario) -> None:
         out.print(f"note: {note}")
     for warning in _scenario_warnings(scenario):
         out.print(f"warning: {warning}")
-    out.print(f"Map data {ATTRIBUTION}")
+    if scenario.attributions:
+        out.print(f"Map data {'; '.join(scenario.attributions)}")
     out.print(f"next: egvs run {scenario.folder}")
 
 
@@ -68,6 +71,20 @@ def _scenario_lines(scenario: NewScenario) -> Iterator[tuple[str, str]]:
     yield "solids", _describe_solids(scenario.statics, scenario.n_solids)
     if left_out := _describe_dropped(scenario.statics):
         yield "", f"left out: {left_out} (all counts: {STATICS_FILE})"
+    for summary in scenario.maps if len(scenario.maps) > 1 or scenario.maps_have_notes else ():
+        yield "map", _describe_map(summary)
+        for note in summary.notes:
+            yield "", note
+
+
+def _describe_map(summary: MapSummary) -> str:
+    """Return the files of a map, its format, and its objects with their heights."""
+    first = summary.paths[0].name
+    files = first if len(summary.paths) == 1 else f"{first} and {len(summary.paths) - 1} more"
+    texts = [f"{files} ({summary.reader}): {_describe_solids(summary.counts)}"]
+    if summary.height_range_m is not None:
+        texts.append("{:.1f} to {:.1f} m high".format(*summary.height_range_m))
+    return ", ".join(texts)
 
 
 def _city_lines(city: NewCity) -> Iterator[tuple[str, str]]:
@@ -88,9 +105,8 @@ def _city_lines(city: NewCity) -> Iterator[tuple[str, str]]:
 
 
 def _position(scenario: NewScenario) -> str:
-    """Return longitude and latitude of the junction, and its distance from the requested position."""
-    longitude_deg, latitude_deg = scenario.streets.to_degrees([scenario.junction.at_m])[0]
-    position = f"at {latitude_deg:.5f},{longitude_deg:.5f}"
+    """Return the position of the junction, and its distance from the requested one."""
+    position = f"at {scenario.streets.format_position(scenario.junction.at_m)}"
     if scenario.from_at_m is None:
         return position
     return f"{position}, {scenario.from_at_m:,.0f} m from --at"

@@ -110,12 +110,24 @@ def width_mm(text: str, least: float, most: float) -> float:
     return width
 
 
-def radius_m(text: str) -> float | None:
-    """Return the radius of ``--surroundings`` in metres; None for "all"."""
+def point_pair(text: str) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return both points of ``--align X,Y=LAT,LON``."""
+    local, _, where = text.partition("=")
+    try:
+        x_m, y_m = (float(part) for part in local.split(","))
+        latitude_deg, longitude_deg = (float(part) for part in where.split(","))
+    except ValueError:
+        problem = f"expected X,Y=LAT,LON, got {text[:80]!r}"
+        raise InputError("--align", problem, "Use a pair such as 12.5,-3.0=50.8704,9.7080.") from None
+    return (x_m, y_m), (latitude_deg, longitude_deg)
+
+
+def radius_m(text: str) -> float:
+    """Return the radius of ``--surroundings`` in metres; inf for "all"."""
     from egvs.scenario.fields import MAX_COORDINATE_M
 
     if text == "all":
-        return None
+        return math.inf
     try:
         radius = float(text)
     except ValueError:

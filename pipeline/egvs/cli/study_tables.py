@@ -31,6 +31,7 @@ from egvs.report.sensor_results import (
 from egvs.runs.run_names import effect_state
 
 if TYPE_CHECKING:
+    from egvs.studies.assumed_heights import HeightRuns, HeightSensitivity, RankedAgain
     from egvs.studies.run_comparison import ComparedPole, ComparedRun, Comparison, Difference, RankAgreement
 
 _FILE_WIDTH = 190
@@ -70,6 +71,33 @@ def print_comparison(comparison: Comparison, top: int | None = None, command: Se
     elif len({run.folder for run in comparison.runs}) > 1:
         out.print("their settings and files are the same")
     print_sentences(f"note: {note}" for note in comparison.notes)
+
+
+def print_height_sensitivity(sensitivity: HeightSensitivity) -> None:
+    """Print the ranks of the best sites with changed heights of buildings, and which of them change."""
+    label = sensitivity.label
+
+    def rank_cell(number: int) -> Callable[[RankedAgain], str]:
+        def cell(site: RankedAgain) -> str:
+            score = site.scores[number]
+            return "-" if score is None else f"{site.ranks[number]}  {label.value(score)}"
+
+        return cell
+
+    columns: list[Column[RankedAgain]] = [Column("site", lambda site: site.name, align="left")]
+    for number, height_run in enumerate(sensitivity.runs.runs):
+        columns.append(Column(height_run.label, rank_cell(number)))
+    out = console(_FILE_WIDTH, soft_wrap=False)
+    out.print(make_table(columns, sensitivity.sites, width=out.width, title=f"rank, and {label.label}"))
+    out.print()
+    print_sentences(sensitivity.conclusion())
+
+
+def print_no_assumed_height(height_runs: HeightRuns) -> None:
+    """Print that the ranking depends on no assumed height."""
+    print_sentences(
+        [f"No height is assumed: all {height_runs.buildings:,} buildings have one from the map or by hand."]
+    )
 
 
 def _result_tables(comparison: Comparison, top: int | None, width: int) -> Iterator[Table]:

@@ -33,6 +33,10 @@ _REQUIREMENTS = {
         ("name", "formula", "source", "sign", "function"),
         "a SurrogateScore, see egvs.validation.surrogates",
     ),
+    "egvs.maps": (
+        ("NAME", "can_open"),
+        "a module with NAME, can_open and read_roads, read_solids or read_terrain, see egvs.importers.map_parts",
+    ),
     "egvs.point_clouds": (("read",), "a module or an object with a function read"),
 }
 """Required attributes of the objects of each group, and a description for messages."""

@@ -15,8 +15,9 @@ A triangulated surface is laid through the lanes (:mod:`egvs.world.terrain`). Th
 - *footprints* count ``base_m`` and ``height_m`` from the ground below their centre, and those that stand on the ground
   reach down to its lowest point below them. Meshes, sites and the region of interest stay in the world's z.
 
-The effect is enabled automatically when the network's lanes differ in height by more than 0.1 m, or lie off z = 0,
-because leaving it out would be wrong then; it never acts on a flat network. It has no parameters.
+The effect is enabled automatically when the network's lanes differ in height by more than 0.1 m, or lie off z = 0, or
+when ``statics.terrain`` gives the ground beyond the roads, because leaving it out would be wrong then; it never acts on
+a flat network without a terrain. It has no parameters.
 
 Source: SUMO's networks with elevation (https://sumo.dlr.de/docs/Networks/Elevation.html); linear interpolation over a
 Delaunay triangulation: Barber, Dobkin, Huhdanpaa 1996, ACM TOMS 22(4), 469-483 (Qhull).
@@ -29,21 +30,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
+from egvs.core import limits
+from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
+from egvs.core.reading import translate_errors
 from egvs.effects.base import Traffic
+from egvs.formats import ply
 from egvs.scenario.effects_config import EffectParameters, SlopeParameters
-from egvs.scenario.model import Scenario
+from egvs.scenario.fields import MAX_COORDINATE_M
+from egvs.scenario.model import TERRAIN_KEY, Scenario
 from egvs.traffic import network, sumo_folder
 from egvs.traffic.vehicle_boxes import VehicleBoxes, VehicleSize, round_m, round_rad
 from egvs.world import terrain
 from egvs.world.terrain import TerrainSurface
-
-MIN_RELIEF_M = 0.1
-"""A network whose heights differ by no more than this is flat."""
 
 _MAX_OFF_SURFACE_M = 1.0
 _UPRIGHT_KIND = "pedestrian"
@@ -60,16 +64,22 @@ class Slope(Traffic[SlopeParameters]):
     def acts(self, scenario: Scenario) -> tuple[bool, str]:
         """Return whether the network has relief, and how much."""
         path = sumo_folder.network_path(scenario)
+        terrain_file = scenario.statics.terrain
+        if terrain_file is not None:
+            if path is None:
+                where = f"{scenario.file}: {TERRAIN_KEY}"
+                raise InputError(where, "the traffic has no network", "Set traffic.roads, or remove the terrain.")
+            return True, f"the ground beyond the roads is {terrain_file}"
         if path is None:
             return False, "there is no network (traffic.roads), so the z and slope of the FCD file are used"
         if not network.may_have_slopes(path):
             return False, "the network is flat"
         span_m, off_m = terrain.relief_m(network.read_net_xml(path))
-        if span_m > MIN_RELIEF_M:
+        if span_m > terrain.MIN_RELIEF_M:
             return True, f"the network has {span_m:.1f} m of relief"
-        if abs(off_m) > MIN_RELIEF_M:
+        if abs(off_m) > terrain.MIN_RELIEF_M:
             return True, f"the network lies at z = {off_m:.1f} m"
-        return False, f"the network has {span_m:.2g} m of relief, no more than {MIN_RELIEF_M:g} m"
+        return False, f"the network has {span_m:.2g} m of relief, no more than {terrain.MIN_RELIEF_M:g} m"
 
     def box_change(self, scenario: Scenario, sizes: Mapping[str, VehicleSize]) -> SurfaceFitter:
         """Return the change that sets boxes on the ground around the network."""
@@ -78,10 +88,35 @@ class Slope(Traffic[SlopeParameters]):
     def ground(
         self, scenario: Scenario, low_m: FloatArray | None = None, high_m: FloatArray | None = None
     ) -> TerrainSurface:
-        """Return the ground through the network's lanes."""
+        """Return the ground through the network's lanes, and through the terrain beyond them."""
         path = sumo_folder.network_path(scenario)
         assert path is not None, "a scenario in which this effect acts has a network"
-        return terrain.triangulate_ground(network.read_net_xml(path), low_m, high_m, path)
+        beyond_m = None
+        if scenario.statics.terrain is not None:
+            beyond_m = read_ground_points(scenario.find(scenario.statics.terrain, TERRAIN_KEY))
+        return terrain.triangulate_ground(network.read_net_xml(path), low_m, high_m, path, beyond_m=beyond_m)
+
+
+def read_ground_points(path: Path) -> FloatArray:
+    """Read points of the ground, (n, 3) float64, world frame, from a PLY file.
+
+    Raises
+    ------
+    InputError
+        When the file is damaged, has no points, or points that are not finite.
+    """
+    where = f"{path}: {TERRAIN_KEY}"
+    limits.checked_size(path, limits.FILE, where)
+    with translate_errors(where):
+        points_m = ply.read(path, where)
+    limits.POINTS.check(where, len(points_m))
+    is_valid = (np.abs(points_m) <= MAX_COORDINATE_M).all(axis=1)
+    if not is_valid.all():
+        first = int(np.flatnonzero(~is_valid)[0])
+        actual = f"got point {first}: {points_m[first].tolist()}"
+        expected = f"expected points with coordinates up to {MAX_COORDINATE_M:g} m"
+        raise InputError(where, f"{expected}, {actual}", "Write the ground in the world frame again.")
+    return points_m
 
 
 @dataclass(frozen=True)

@@ -97,6 +97,14 @@ class WorldFrame:
         eastings = _transform(crs, self.projection, np.asarray(xy, dtype=np.float64))
         return np.add(eastings, self.offset_m)
 
+    def to_crs(self, xy_m: FloatArray, crs: str) -> FloatArray:
+        """Convert world-frame x, y (n, 2) in metres to coordinates of another system, in its units, (n, 2) float64.
+
+        The inverse of :meth:`from_crs`, to some millimetres where the datum changes.
+        """
+        eastings = np.subtract(xy_m, self.offset_m, dtype=np.float64)
+        return _transform(self.projection, crs, eastings)
+
     def scale_factor(self, xy_m: tuple[float, float]) -> float:
         """Return how many times too long the projection draws a short line at x, y (1.0: true length)."""
         from pyproj import Proj
@@ -124,6 +132,19 @@ def parse_crs(crs: Any, where: str) -> CRS:
     return parsed.sub_crs_list[0] if parsed.is_compound else parsed
 
 
+def proj_string(crs: str, where: str) -> str:
+    """Return a coordinate reference system as a PROJ string, which is all that SUMO reads; InputError if unknown."""
+    import warnings
+
+    parsed = parse_crs(crs, where)
+    if crs.strip().startswith("+proj="):
+        return crs.strip()
+    with warnings.catch_warnings():
+        # a PROJ string cannot say everything, such as the names of axes
+        warnings.simplefilter("ignore", UserWarning)
+        return str(parsed.to_proj4())
+
+
 def height_unit_m(crs: Any, where: str) -> float:
     """Return the length in metres of a height of 1 in a system; negative where its vertical axis points down.
 
@@ -139,6 +160,12 @@ def height_unit_m(crs: Any, where: str) -> float:
         if axis.direction == "down":
             return -float(axis.unit_conversion_factor)
     return float(parsed.axis_info[0].unit_conversion_factor) if parsed.is_projected else 1.0
+
+
+def is_north_first(crs: Any, where: str) -> bool:
+    """Return whether the first axis of a system points north, as in EPSG:4326 (latitude, longitude) and EPSG:6677."""
+    directions = [axis.direction for axis in parse_crs(crs, where).axis_info[:2]]
+    return directions == ["north", "east"]
 
 
 def crs_name(frame: WorldFrame, at_m: tuple[float, float]) -> str:

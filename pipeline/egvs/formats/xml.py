@@ -81,7 +81,7 @@ class Utf8Reader:
 
 
 _GZIP_MAGIC = b"\x1f\x8b"
-_MAX_DEPTH = 100
+MAX_DEPTH = 100
 """Nesting of elements; no file that is read here needs ten levels."""
 
 
@@ -159,8 +159,8 @@ def iter_elements(
             depth = 0
             for event, element in events:
                 depth += 1 if event == "start" else -1
-                if depth > _MAX_DEPTH:
-                    raise InputError(where, f"elements are nested more than {_MAX_DEPTH} deep", COMPLETE_FILE)
+                if depth > MAX_DEPTH:
+                    raise InputError(where, f"elements are nested more than {MAX_DEPTH} deep", COMPLETE_FILE)
                 if event == "end" and depth == 0:
                     meter.bytes_since_child = 0
                     yield element

@@ -45,7 +45,7 @@ import shapely
 from shapely.geometry import LineString, Point, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
-from egvs.core.grid import FloatArray
+from egvs.core.grid import XY, FloatArray
 from egvs.formats.georeference import WorldFrame
 from egvs.importers import roundabouts
 from egvs.importers.roundabouts import Ring
@@ -54,9 +54,6 @@ from egvs.traffic import network as road_network
 from egvs.traffic.demand import RouteFinder
 from egvs.traffic.network import Edge, Network
 from egvs.world.geolocation import network_world_frame
-
-XY = tuple[float, float]
-"""x, y in metres."""
 
 MIN_ARMS = 3
 """A junction that a user can choose connects at least this number of streets."""
@@ -94,6 +91,14 @@ _ISLAND_M2 = 100.0
 _SLIDES_M = (0.0, 1.0, -1.0, 2.0, -2.0, 3.0, -3.0, 4.0, -4.0)
 
 _OTHER_FLOW_PER_H = 40.0
+_CLASS_BY_SPEED = (
+    (19.0, "trunk"),
+    (16.0, "primary"),
+    (13.0, "secondary"),
+    (10.0, "unclassified"),
+    (0.0, "residential"),
+)
+"""Least speed limit in m/s of a road class, for maps without road classes: 70, 60, 50, 40 km/h, with some tolerance."""
 _CAR = "passenger"
 _MIN_AREA_M2 = 10.0
 
@@ -190,13 +195,20 @@ class Streets:
 
     def to_xy(self, lons_deg: Sequence[float], lats_deg: Sequence[float]) -> list[XY]:
         """World-frame x, y in metres of positions in degrees."""
-        xy_m = self._frame.from_lon_lat(np.column_stack([lons_deg, lats_deg]))
+        xy_m = self._known_frame.from_lon_lat(np.column_stack([lons_deg, lats_deg]))
         return [(x, y) for x, y in xy_m.tolist()]
 
     def to_degrees(self, points_m: Sequence[XY]) -> list[tuple[float, float]]:
         """Longitude and latitude in degrees of positions in the world frame."""
-        degrees = self._frame.to_degrees(np.array(points_m))
+        degrees = self._known_frame.to_degrees(np.array(points_m))
         return [(lon, lat) for lon, lat in degrees.tolist()]
+
+    def format_position(self, at_m: XY) -> str:
+        """Return latitude and longitude of a position, or its x and y if the network does not state its frame."""
+        if self.frame is None:
+            return f"x = {at_m[0]:.1f} m, y = {at_m[1]:.1f} m"
+        ((lon_deg, lat_deg),) = self.to_degrees([at_m])
+        return f"{lat_deg:.5f},{lon_deg:.5f}"
 
     def node_positions(self, nodes: Mapping[int, tuple[float, float]]) -> dict[int, XY]:
         """World-frame x, y in metres of nodes of a map, given as latitude and longitude in degrees by identifier."""
@@ -227,11 +239,15 @@ class Streets:
     def _junctions_tree(self) -> shapely.STRtree:
         return shapely.STRtree([junction.area for junction in self.junctions])
 
+    @cached_property
+    def frame(self) -> WorldFrame | None:
+        """Where the world frame is on the Earth; None if the network does not state it."""
+        return network_world_frame(self.network.location)
+
     @property
-    def _frame(self) -> WorldFrame:
-        frame = network_world_frame(self.network.location)
-        assert frame is not None, "netconvert writes a location"
-        return frame
+    def _known_frame(self) -> WorldFrame:
+        assert self.frame is not None, "callers check that the frame is known"
+        return self.frame
 
 
 @dataclass(frozen=True)
@@ -258,7 +274,7 @@ class KerbsidePole:
 
 
 def read_streets(path: Path) -> Streets:
-    """Read a network that netconvert wrote from OpenStreetMap.
+    """Read a network.
 
     Parameters
     ----------
@@ -636,16 +652,24 @@ def assumed_flows(streets: Streets, roi: JunctionRegion, ring: Ring | None = Non
 
 
 def edge_flow_h(edge: Edge) -> float:
-    """Return the assumed vehicles per hour on all lanes of a street, by its road class.
+    """Return the assumed vehicles per hour on all lanes of a street, by its road class, or else by its speed limit.
 
     netconvert writes a street with tram tracks as ``"highway.secondary|railway.tram"``.
     """
     flows_per_h = []
+    if "highway." not in edge.type:
+        flows_per_h.append(LANE_FLOW_PER_H[_class_by_speed(edge)])
     for part in edge.type.split("|"):
         if part.startswith("highway."):
             road_class = part.removeprefix("highway.").removesuffix("_link")
             flows_per_h.append(LANE_FLOW_PER_H.get(road_class, _OTHER_FLOW_PER_H))
     return max(flows_per_h, default=_OTHER_FLOW_PER_H) * edge.lanes_for(_CAR)
+
+
+def _class_by_speed(edge: Edge) -> str:
+    """Return the class of roads that usually have the speed limit of a street."""
+    speed_m_s = max(lane.speed_m_s for lane in edge.lanes)
+    return next(road_class for limit_m_s, road_class in _CLASS_BY_SPEED if speed_m_s >= limit_m_s)
 
 
 def balance_flows(connected: FloatArray, inflow_per_h: Sequence[float], outflow_per_h: Sequence[float]) -> FloatArray:

@@ -21,6 +21,7 @@ from shapely.geometry.base import BaseGeometry
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.formats.georeference import WorldFrame, parse_crs
+from egvs.importers.junctions import Streets
 from egvs.importers.osm_solids import ImportCounts, MappedSolid
 
 HEAD_BYTES = 4096
@@ -122,7 +123,10 @@ class SolidMap:
 class Terrain(Protocol):
     """Heights of the ground."""
 
-    notes: tuple[str, ...]
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences for the user."""
+        raise NotImplementedError
 
     def height_m(self, xy_m: FloatArray) -> FloatArray:
         """Return the heights (n,) of the ground at world-frame points (n, 2), in metres; NaN where unknown."""
@@ -150,6 +154,11 @@ class Alignment:
         moved: FloatArray = (xy - self.local_m.mean(axis=0)) @ rotation.T + self.world_m.mean(axis=0)
         return moved
 
+    def from_world(self, xy_m: FloatArray) -> FloatArray:
+        """Return x, y (n, 2) in the file of world-frame x, y (n, 2); the inverse of :meth:`to_world`."""
+        moved: FloatArray = (xy_m - self.world_m.mean(axis=0)) @ self._rotation + self.local_m.mean(axis=0)
+        return moved
+
     @property
     def scale(self) -> float:
         """Distance of the points in the world, divided by that in the file; 1 if both are metres."""
@@ -175,11 +184,14 @@ class MapContext:
         World frame, metres: what sensors can reach. Objects outside it are left out, with a count.
     alignment
         From ``--align``; used for files without a reference system.
+    streets
+        The roads, for objects that are cut at the carriageway.
     """
 
     frame: WorldFrame | None
     window: BaseGeometry
     alignment: Alignment | None = None
+    streets: Streets | None = None
 
     def to_world(self, xy: FloatArray, crs: str | None, where: str) -> FloatArray:
         """Convert coordinates of a file to world-frame x, y in metres.
@@ -204,21 +216,36 @@ class MapContext:
             When there is neither a system nor an alignment, when the network has no reference system, or where the
             projection is undefined.
         """
-        if crs is None or parse_crs(crs, where).is_engineering:
-            if self.alignment is None:
-                hint = "Give two of its points and where they are: --align X,Y=LAT,LON --align X,Y=LAT,LON."
-                raise InputError(where, "the file declares no coordinate reference system", hint)
-            return self.alignment.to_world(xy)
-        if self.frame is None:
-            problem = f"the file is in {crs}, but the road map has no reference system"
-            raise InputError(where, problem, "Use a road map with a reference system, or align it with --align.")
-        xy_m = self.frame.from_crs(xy, crs)
+        frame = self._frame_or_alignment(crs, where)
+        if isinstance(frame, Alignment):
+            return frame.to_world(xy)
+        xy_m = frame.from_crs(xy, str(crs))
         undefined = np.flatnonzero(~np.isfinite(xy_m).all(axis=1))
         if len(undefined):
             point = xy[undefined[0]]
             problem = f"({point[0]:.10g}, {point[1]:.10g}) cannot be converted from {crs}"
             raise InputError(where, problem, "Check the file's coordinates and its reference system.")
         return xy_m
+
+    def from_world(self, xy_m: FloatArray, crs: str | None, where: str) -> FloatArray:
+        """Convert world-frame x, y (n, 2) to the coordinates of a file; the inverse of :meth:`to_world`.
+
+        Not finite where the projection is undefined; InputError as there.
+        """
+        frame = self._frame_or_alignment(crs, where)
+        return frame.from_world(xy_m) if isinstance(frame, Alignment) else frame.to_crs(xy_m, str(crs))
+
+    def _frame_or_alignment(self, crs: str | None, where: str) -> WorldFrame | Alignment:
+        """Return what converts coordinates of a system; the alignment for files without one."""
+        if crs is None or parse_crs(crs, where).is_engineering:
+            if self.alignment is None:
+                hint = "Give two of its points and where they are: --align X,Y=LAT,LON --align X,Y=LAT,LON."
+                raise InputError(where, "the file declares no coordinate reference system", hint)
+            return self.alignment
+        if self.frame is None:
+            problem = f"the file is in {crs}, but the road map has no reference system"
+            raise InputError(where, problem, "Use a road map with a reference system, or align it with --align.")
+        return self.frame
 
 
 @runtime_checkable

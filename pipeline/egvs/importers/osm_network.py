@@ -25,11 +25,13 @@ from shapely.geometry.base import BaseGeometry
 
 from egvs.core import files
 from egvs.core.errors import InputError, RunError
+from egvs.core.grid import XY
 from egvs.formats import xml
-from egvs.formats.osm import OsmExtract, Way, write_streets
+from egvs.formats.osm import OsmExtract, Way, parse_number, write_streets
 from egvs.importers import junctions
-from egvs.importers.junctions import XY, StreetJunction, Streets
+from egvs.importers.junctions import StreetJunction, Streets
 from egvs.traffic import sumo, sumo_folder
+from egvs.traffic.network import Location
 
 ATTRIBUTION = "(c) OpenStreetMap contributors, ODbL"
 NETWORK_FILE = "network.net.xml"
@@ -68,6 +70,7 @@ PATH_HIGHWAYS = {
 }  # fmt: skip
 """Values of ``highway`` that are no roads for vehicles."""
 
+_NET_OFFSET = re.compile(r'netOffset="[^"]*"')
 _NOTHING_LOADED = re.compile(r"No (nodes|edges) loaded|has no road")
 _ELEMENT = re.compile(r"^    <(edge|junction|connection) [^\n]*?(?:/>|>\n.*?^    </\1>)\n", re.MULTILINE | re.DOTALL)
 
@@ -96,7 +99,9 @@ def netconvert_flags(extract: OsmExtract, *, lefthand: bool, walk: bool) -> list
     return flags
 
 
-def build_network(extract: OsmExtract, osm: Path, flags: Sequence[str]) -> tuple[str, Streets]:
+def build_network(
+    extract: OsmExtract, osm: Path, flags: Sequence[str], frame: Location | None = None
+) -> tuple[str, Streets]:
     """Run netconvert on the streets of an extract.
 
     Parameters
@@ -108,6 +113,8 @@ def build_network(extract: OsmExtract, osm: Path, flags: Sequence[str]) -> tuple
     flags
         Flags of netconvert. :data:`JOINED_SIGNALS_FLAG` is dropped if a signal program gets longer than
         :data:`LONGEST_PROGRAM_S`.
+    frame
+        The frame of the network; by default, netconvert chooses one.
 
     Returns
     -------
@@ -132,11 +139,13 @@ def build_network(extract: OsmExtract, osm: Path, flags: Sequence[str]) -> tuple
     with files.temporary_folder() as folder:
         write_streets(extract, folder / "streets.osm.xml")
         try:
-            arguments = ["--osm-files", "streets.osm.xml", *flags]
+            arguments = ["--osm-files", "streets.osm.xml", *flags, *_frame_flags(frame)]
             sumo.run_netconvert(arguments, folder, NETWORK_FILE)
             if JOINED_SIGNALS_FLAG in arguments and longest_program_s(folder / NETWORK_FILE) > LONGEST_PROGRAM_S:
                 arguments.remove(JOINED_SIGNALS_FLAG)
                 sumo.run_netconvert(arguments, folder, NETWORK_FILE)
+            if frame is not None:
+                _state_offset(folder / NETWORK_FILE, frame)
             streets = junctions.read_streets(folder / NETWORK_FILE)
         except (RunError, InputError) as error:
             if _NOTHING_LOADED.search(str(error)):
@@ -189,15 +198,27 @@ def crop_network(
     """
     location = streets.network.location
     assert location is not None, "netconvert writes a location"
-    east_m, north_m = location.offset_m
-    frame_flags = [
-        "--proj", location.projection, "--offset.disable-normalization",
-        "--offset.x", f"{east_m!r}", "--offset.y", f"{north_m!r}",
-    ]  # fmt: skip
 
     ((lon_deg, lat_deg),) = streets.to_degrees([junction.at_m])
     surroundings = cut_surroundings(extract, (lat_deg, lon_deg), radius_m)
-    return build_network(surroundings, osm, [*flags, *frame_flags])
+    return build_network(surroundings, osm, flags, location)
+
+
+def _frame_flags(frame: Location | None) -> list[str]:
+    if frame is None:
+        return []
+    east_m, north_m = frame.offset_m
+    return [
+        "--proj", frame.projection, "--offset.disable-normalization",
+        "--offset.x", f"{east_m!r}", "--offset.y", f"{north_m!r}",
+    ]  # fmt: skip
+
+
+def _state_offset(path: Path, frame: Location) -> None:
+    """Write the offset of a frame into a network: for left-hand traffic, netconvert negates that of y."""
+    east_m, north_m = frame.offset_m
+    text = path.read_text(encoding="utf-8")
+    files.write_text(path, _NET_OFFSET.sub(f'netOffset="{east_m:.3f},{north_m:.3f}"', text, count=1))
 
 
 def cut_surroundings(extract: OsmExtract, middle: tuple[float, float], radius_m: float) -> OsmExtract:
@@ -228,7 +249,8 @@ def cut_surroundings(extract: OsmExtract, middle: tuple[float, float], radius_m:
         next_id += max(0, len(pieces) - 1)
         ways |= pieces
 
-    inside = replace(extract, nodes=extract.nodes | circle.cuts, ways=dict(sorted(ways.items())))
+    node_tags = dict(sorted((extract.node_tags | circle.cut_tags).items()))
+    inside = replace(extract, nodes=extract.nodes | circle.cuts, node_tags=node_tags, ways=dict(sorted(ways.items())))
     connected = _connected_roads(inside, circle)
     return replace(inside, ways={i: way for i, way in inside.ways.items() if i in connected or not is_road(way)})
 
@@ -290,6 +312,8 @@ class _Circle:
         self._shrink = math.cos(math.radians(self._lat_deg))
         self._next_id = max(extract.nodes) + 1
         self.cuts: dict[int, tuple[float, float]] = {}
+        self.cut_tags: dict[int, dict[str, str]] = {}
+        self._tags = extract.node_tags
 
     def at_m(self, node: int) -> XY:
         """Metres east and north of the middle."""
@@ -318,8 +342,17 @@ class _Circle:
         for sign in (-1.0, 1.0):
             t = (-b + sign * math.sqrt(discriminant)) / a
             if 0.0 < t < 1.0:
-                nodes.append(self._add_cut(x0 + t * dx, y0 + t * dy))
+                node = self._add_cut(x0 + t * dx, y0 + t * dy)
+                self._interpolate_height(node, start, end, t)
+                nodes.append(node)
         return nodes
+
+    def _interpolate_height(self, node: int, start: int, end: int, t: float) -> None:
+        """Give a new node a height (``ele``) if both of its neighbours have one."""
+        heights_m = [parse_number(self._tags.get(neighbour, {}).get("ele", "")) for neighbour in (start, end)]
+        before_m, after_m = heights_m
+        if before_m is not None and after_m is not None:
+            self.cut_tags[node] = {"ele": f"{before_m + t * (after_m - before_m):.3f}"}
 
     def _add_cut(self, x_m: float, y_m: float) -> int:
         lat_deg = self._lat_deg + math.degrees(y_m / EARTH_M)

@@ -29,8 +29,9 @@ import shapely
 from shapely.geometry import LineString, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
+from egvs.core.grid import XY
 from egvs.formats.osm import OsmExtract, Relation, Tags, Way, parse_number
-from egvs.importers.junctions import XY, Streets
+from egvs.importers.junctions import Streets
 from egvs.importers.osm_network import PATH_HIGHWAYS
 from egvs.scenario.model import StaticsConfig
 from egvs.world import map_features
@@ -138,9 +139,20 @@ class ImportCounts:
         """Count an object that is left out."""
         self.dropped.setdefault(reason, Counter())[kind] += 1
 
+    def plus(self, other: ImportCounts) -> ImportCounts:
+        """Return the sums of two maps."""
+        return ImportCounts(**{key: _add_counts(value, vars(other)[key]) for key, value in vars(self).items()})
+
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON, sorted by key."""
         return {key: _sort_keys(value) for key, value in vars(self).items()}
+
+
+def _add_counts(one: Any, other: Any) -> Any:
+    """Return the sum of two numbers, counters, or dictionaries of counters."""
+    if isinstance(one, Counter) or not isinstance(one, dict):
+        return one + other
+    return {key: one.get(key, Counter()) + other.get(key, Counter()) for key in {**one, **other}}
 
 
 def _sort_keys(value: Any) -> Any:
@@ -182,7 +194,7 @@ def map_solids(
         if _is_outside(solid, window):
             counts.drop(solid.kind, OUT_OF_RANGE)
             continue
-        solids += _clear_of_carriageway(solid, lanes, counts)
+        solids += clear_of_carriageway(solid, lanes, counts)
     for trunk, crown in find_trees(extract, xy, counts):
         if _is_outside(crown, window):
             counts.drop("tree", OUT_OF_RANGE)
@@ -205,8 +217,8 @@ def _lanes_under(solid: MappedSolid, lanes: shapely.STRtree) -> list[BaseGeometr
     return list(lanes.geometries[sorted(lanes.query(solid.area, predicate="dwithin", distance=_MARGIN_M))])
 
 
-def _clear_of_carriageway(solid: MappedSolid, lanes: shapely.STRtree, counts: ImportCounts) -> list[MappedSolid]:
-    """Return the parts of an object outside the carriageway, one solid for each part."""
+def clear_of_carriageway(solid: MappedSolid, lanes: shapely.STRtree, counts: ImportCounts) -> list[MappedSolid]:
+    """Return the parts of an object outside the carriageway, one solid for each part; the object is counted."""
     covered_lanes = _lanes_under(solid, lanes)
     if solid.base_m >= CLEARANCE_M or not covered_lanes:
         pieces = geometry_pieces(solid.geometry)

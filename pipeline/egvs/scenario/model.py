@@ -123,6 +123,10 @@ class MeshConfig(StrictModel):
         return None
 
 
+TERRAIN_KEY = "statics.terrain"
+"""The key of the file with the ground beyond the roads."""
+
+
 class StaticsConfig(StrictModel):
     """The static world: everything that does not move and that beams can hit."""
 
@@ -142,6 +146,15 @@ class StaticsConfig(StrictModel):
     )
     meshes: tuple[MeshConfig, ...] = ()
     ground: bool = Field(True, description="Add a ground plane at z = 0")
+    terrain: str | None = Field(
+        None,
+        description="PLY file with points of the ground beyond the roads, world frame; the traffic must have a network",
+    )
+
+    @model_serializer(mode="wrap")
+    def _serialize(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out terrain where it is not set, so that it does not change cache keys."""
+        return {name: value for name, value in serialize(self).items() if name != "terrain" or value is not None}
 
     @field_validator("polygon_types", mode="before")
     @classmethod
@@ -222,7 +235,9 @@ class SitesConfig(StrictModel):
         None, description="A sensor for all sites, also for those whose row names another one"
     )
     heights_m: tuple[Positive, ...] = Field(
-        (), description="Heights z of locations in `file` that have no z_m; each is a candidate"
+        (),
+        description="Heights of locations in `file` that have no z_m, above their ground_m (0 without it); each is a"
+        " candidate",
     )
     aim: Literal["roi"] | None = Field(
         None, description="'roi': yaw and pitch such that the central beam hits the centre of the region of interest"

@@ -25,6 +25,9 @@ from egvs.scenario.model import SCENARIO_FILE
 from egvs.world import clearances
 from egvs.world.mesh import World
 
+_MAX_SHARE_IN_GROUND = 0.25
+"""On a slope, voxels that the ground cuts are both solid and below vehicles; more than this means a wrong height."""
+
 
 class BlockCounts(NamedTuple):
     """Frames in which each voxel is occupied, (nx, ny, nz) int32; boxes near the grid by frame, (frames,) int64."""
@@ -164,9 +167,11 @@ def warn_traffic_through_solids(
         return
     worst = np.array(np.unravel_index(voxels[int(np.argmax(hidden))], grid.shape))
     at_m = np.asarray(grid.origin_m) + (worst + 0.5) * grid.voxel_m
+    solid = _solid_at(world, at_m, grid.voxel_m)
+    if not solid and share <= _MAX_SHARE_IN_GROUND:
+        return
     point = ", ".join(f"{value:.1f}" for value in at_m)
     problem = f"{share:.1%} of the volume that vehicles occupy is inside solids, most often at ({point})"
-    solid = _solid_at(world, at_m, grid.voxel_m)
     if solid:
         problem += f", in {solid}"
     yield Diagnostic("traffic through solids", "statics", problem, "Move the solids, or check the coordinates of both.")

@@ -5,6 +5,8 @@ one of the names of :data:`LONGITUDE` and :data:`LATITUDE`. Where a row has both
 GeoJSON file are in the system that its member ``crs`` declares. GeoPackage, Shapefile, KML and GeoParquet are read as
 GeoJSON with the same content (:mod:`egvs.formats.vector_files`).
 
+``ground_m`` is the z of the ground, from which ``sites.heights_m`` count in that row; 0 without it.
+
 Further columns belong to the user (``fid``, ``owner``, ``note``) and are carried through to the scores. A column whose
 name is nearly one of the program's, which the file lacks, is rejected as misspelt. So is a column that other programs
 use for what this program reads from a column of another name (:data:`FOREIGN_COLUMNS`): ``height``, ``heading``.
@@ -35,7 +37,7 @@ from egvs.formats.georeference import WGS84, CoordinateReading, Georeference, de
 
 REQUIRED_COLUMNS = ("site", "x_m", "y_m", "z_m")
 AIM_COLUMNS = ("aim_x_m", "aim_y_m", "aim_z_m")
-NUMBER_COLUMNS = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg", *AIM_COLUMNS)
+NUMBER_COLUMNS = ("x_m", "y_m", "z_m", "ground_m", "yaw_deg", "pitch_deg", "roll_deg", *AIM_COLUMNS)
 TEXT_COLUMNS = ("sensor", "points", "aim")
 KNOWN_COLUMNS = ("site", *NUMBER_COLUMNS, *TEXT_COLUMNS)
 

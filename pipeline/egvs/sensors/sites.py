@@ -252,7 +252,7 @@ def _with_measured_scan(sites: tuple[Site, ...], scenario: Scenario) -> tuple[Si
 class MountRequest:
     """Position, angles and aim that a row states; None where it leaves a value to ``[sites]``.
 
-    ``heights_m`` are the heights of the row's rule, or the row's own height.
+    ``heights_m`` are the heights of the row's rule, or the row's own height; they count from ``ground_m``.
     """
 
     x_m: float
@@ -262,6 +262,7 @@ class MountRequest:
     pitch_deg: float | None = None
     roll_deg: float = 0.0
     aim_m: Vec3 | None = None
+    ground_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -340,14 +341,15 @@ class _SiteBuilder:
             aim_m = self._default_aim_m()
         pitches = self._pitches(request, has_aim=aim_m is not None)
         mounts = []
-        for z_m in heights_m:
+        for height_m in heights_m:
+            z_m = request.ground_m + height_m
             position_m = request.x_m, request.y_m, z_m
             aimed = None
             if aim_m is not None:
                 sensor = self._sensor(sensor_name, f"{where}: sensor")
                 aimed = aiming_angles(where, position_m, aim_m, request.roll_deg, sensor)
             for pitch in pitches:
-                suffix = _name_suffix(z_m, pitch, with_height=len(heights_m) > 1, with_pitch=len(pitches) > 1)
+                suffix = _name_suffix(height_m, pitch, with_height=len(heights_m) > 1, with_pitch=len(pitches) > 1)
                 yaw_deg, pitch_deg = self._angles(where, request, pitch, aimed)
                 mounts.append(Mount(suffix, z_m, yaw_deg, pitch_deg))
         return mounts
@@ -487,8 +489,12 @@ def _mount_request(row: SiteRow, scenario: Scenario) -> MountRequest:
         if value not in (None, ""):
             numbers[key] = _parse_number(row.where, key, value)
     heights_m = row.heights_m
+    ground_m = numbers.get("ground_m", 0.0)
     if not heights_m and "z_m" in numbers:
         heights_m = (numbers["z_m"],)
+        if ground_m:
+            problem = f"the row has ground_m = {ground_m:g} and z_m, which already contains the ground's z"
+            raise InputError(f"{row.where}: ground_m", problem, "Use ground_m with sites.heights_m, or z_m alone.")
     pitch_deg = numbers.get("pitch_deg")
     if pitch_deg is not None and not -90 <= pitch_deg <= 90:
         problem = f"expected an angle between -90 and 90, got {pitch_deg:g}"
@@ -498,7 +504,7 @@ def _mount_request(row: SiteRow, scenario: Scenario) -> MountRequest:
     if aim_m is not None and yaw_deg is not None:
         raise InputError(f"{row.where}: yaw_deg", f"the row has yaw_deg = {yaw_deg:g} and an aim", "Use one of them.")
     roll_deg = numbers.get("roll_deg", scenario.sites.roll_deg)
-    return MountRequest(numbers["x_m"], numbers["y_m"], heights_m, yaw_deg, pitch_deg, roll_deg, aim_m)
+    return MountRequest(numbers["x_m"], numbers["y_m"], heights_m, yaw_deg, pitch_deg, roll_deg, aim_m, ground_m)
 
 
 def _row_aim_m(row: SiteRow, numbers: Mapping[str, float], scenario: Scenario) -> Vec3 | None:

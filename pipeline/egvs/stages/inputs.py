@@ -21,7 +21,7 @@ from egvs.effects import registry
 from egvs.formats import point_clouds
 from egvs.formats.georeference import Georeference
 from egvs.formats.meshes import referenced_files
-from egvs.scenario.model import Scenario
+from egvs.scenario.model import TERRAIN_KEY, Scenario
 from egvs.scoring import zones
 from egvs.sensors import sites
 from egvs.sensors.scene import ActiveEffect, InactiveEffect, Scene
@@ -191,6 +191,8 @@ def named_files(scenario: Scenario) -> Iterator[tuple[str, str]]:
     yield from (("statics.footprints", name) for name in statics.footprints)
     yield from (("statics.polygons", name) for name in statics.polygons)
     yield from (("statics.meshes", mesh_config.file) for mesh_config in statics.meshes)
+    if statics.terrain is not None:
+        yield TERRAIN_KEY, statics.terrain
     yield from (("traffic.routes", name) for name in traffic.routes)
     yield from (("traffic.vtypes", name) for name in traffic.vtypes)
     for key, optional_name in (

@@ -9,6 +9,7 @@ from __future__ import annotations
 from egvs.effects import registry
 from egvs.formats import vector_files
 from egvs.formats.meshes import mesh_digests
+from egvs.scenario.model import TERRAIN_KEY
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.traffic import sumo_folder
 from egvs.world import geolocation
@@ -35,6 +36,8 @@ def dependencies(context: StageContext) -> StageDependencies:
         network = sumo_folder.network_path(scenario)
         if network is not None:
             digests["surface"] = context.inputs.digest(network)
+        if config.terrain is not None:
+            digests["terrain"] = context.inputs.digest(scenario.find(config.terrain, TERRAIN_KEY))
     box = scenario.roi.box
     settings = {"name": scenario.name, "statics": config.model_dump(mode="json"), "roi": [box.origin_m, box.size_m]}
     settings |= geolocation.world_frame_settings(scenario)
@@ -61,7 +64,9 @@ def run(context: StageContext, inputs: StageDependencies) -> Summary:
     summary: Summary = {"triangles": len(world.faces), "solids": len(world.solids), **counts.to_json()}
     ground = registry.ground_effect(context.scenario)
     if ground is not None:
-        summary["notes"] = [f"{ground.NAME}: on, the ground follows the network's roads"]
+        terrain = context.scenario.statics.terrain
+        beyond = "" if terrain is None else f", and {terrain} beyond them"
+        summary["notes"] = [f"{ground.NAME}: on, the ground follows the network's roads{beyond}"]
     return summary
 
 

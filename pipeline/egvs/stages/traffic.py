@@ -25,7 +25,7 @@ from egvs.core.errors import WARNINGS_KEY, InputError, MissingBackendError
 from egvs.core.platform import relative_path
 from egvs.core.sumo_home import sumo_home
 from egvs.effects import registry
-from egvs.scenario.model import Scenario
+from egvs.scenario.model import TERRAIN_KEY, Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.traffic import finished_fcd, recording, sumo, sumo_folder, trajectories
 from egvs.traffic.fcd import FrameWindow
@@ -44,12 +44,14 @@ def dependencies(context: StageContext) -> StageDependencies:
     settings = {"seed": scenario.seed, "name": scenario.name, "traffic": traffic}
     if scenario.is_recorded:
         settings |= geolocation.world_frame_settings(scenario)
-    # an effect that is enabled automatically depends on the network only
+    # an effect that is enabled automatically depends on the network and the terrain only
     named_effects = registry.effect_settings(effect for effect in effects if not effect.AUTO_ENABLED)
     if named_effects:
         settings["effects"] = named_effects
 
     digests = {}
+    if scenario.statics.terrain is not None:
+        digests["terrain"] = context.inputs.digest(scenario.find(scenario.statics.terrain, TERRAIN_KEY))
     for period_scenario in periods:
         for path in _source_files(period_scenario):
             digests[_relative_name(path, scenario)] = context.inputs.digest(path)

@@ -201,9 +201,9 @@ def rescue_s(teleport_s: float | None, roads: network.Network) -> float | None:
 
 
 def may_have_slopes(scenario: Scenario) -> bool:
-    """Whether the network of a scenario may have slopes, without parsing it."""
+    """Whether the network of a scenario may have slopes, or a terrain gives some, without parsing it."""
     path = network_path(scenario)
-    return path is not None and network.may_have_slopes(path)
+    return scenario.statics.terrain is not None or (path is not None and network.may_have_slopes(path))
 
 
 @dataclass(frozen=True)
@@ -322,7 +322,7 @@ def prepare_simulation(scenario: Scenario, folder: Path, extensions: Iterable[Tr
     vehicles = traffic.vehicles
     depart_delay_s = traffic.max_depart_delay_s
     if is_generated:
-        demand.check_kinds(traffic.kinds, sumo.vehicle_classes(), where)
+        demand.check_kinds(traffic.kinds, where)
         files.write_text(folder / VTYPES_FILE, demand.vtypes_xml(traffic.kinds))
         copies |= {"additional-files": VTYPES_FILE, "route-files": TRIPS_FILE}
         if traffic.counts:

@@ -5,10 +5,15 @@ metre (the mean, so that points of a plane stay on it; where lanes cross at diff
 triangulate the points (Delaunay). Beyond the roads, the ground continues at the height of the nearest lane. World frame
 (x east, y north, z up), metres.
 
+Where points of a terrain are given, the ground beyond the roads goes through them. Then lanes more than 1.5 m above or
+below the terrain are bridges and tunnels, and no part of the ground; near the other lanes, the ground is that of the
+lanes.
+
 Source: linear interpolation over a Delaunay triangulation: Barber, Dobkin, Huhdanpaa 1996, ACM TOMS 22(4), 469-483
 (Qhull).
 
-Limits: the ground is one surface, so it has ramps instead of bridges; between roads it is interpolated, not measured.
+Limits: the ground is one surface; without a terrain, it has ramps instead of bridges, and between roads it is
+interpolated, not measured.
 """
 
 from __future__ import annotations
@@ -43,10 +48,16 @@ class GroundSource(Protocol):
 
 Floats = NDArray[np.float64]
 
+MIN_RELIEF_M = 0.1
+"""A network whose heights differ by no more than this is flat."""
+
 _STEP_M = 10.0
 _CELL_M = 0.5
 _LEVEL_M = 1.5
 """Points of a cell that are higher above its lowest point than this belong to another level, e.g. a bridge."""
+
+_BESIDE_M = 5.0
+"""Within this distance of points of lanes, points of the terrain do not count."""
 
 _RIM_STEP_M = 50.0
 _MARGIN_M = 100.0
@@ -129,7 +140,12 @@ def relief_m(roads: Network) -> tuple[float, float]:
 
 
 def triangulate_ground(
-    roads: Network, low_m: Floats | None = None, high_m: Floats | None = None, where: object = "the network"
+    roads: Network,
+    low_m: Floats | None = None,
+    high_m: Floats | None = None,
+    where: object = "the network",
+    *,
+    beyond_m: Floats | None = None,
 ) -> TerrainSurface:
     """Triangulate the ground through the lanes of a network.
 
@@ -141,6 +157,8 @@ def triangulate_ground(
         Corners of the rectangle to cover, (2,) each. By default, the network with a margin.
     where
         The network, for messages.
+    beyond_m
+        Points (n, 3) of the terrain, world frame.
 
     Raises
     ------
@@ -148,14 +166,56 @@ def triangulate_ground(
         When the ground would have too many points.
     """
     _check_point_count(roads, low_m, high_m, where)
-    lanes = [_sample_lane(lane, _width_m(edge, lane)) for edge in roads.all_edges for lane in edge.lanes]
-    points = _thin_points(np.concatenate(lanes))
+    lanes = np.concatenate(
+        [_sample_lane(lane, _width_m(edge, lane)) for edge in roads.all_edges for lane in edge.lanes]
+    )
+    if beyond_m is None:
+        points = _thin_points(lanes)
+    else:
+        points = _join_terrain(lanes, beyond_m, low_m, high_m, where)
     low = points[:, :2].min(axis=0) - _MARGIN_M if low_m is None else low_m
     high = points[:, :2].max(axis=0) + _MARGIN_M if high_m is None else high_m
     is_inside = np.all((points[:, :2] > low) & (points[:, :2] < high), axis=1)
     rim = _rim(low, high)
     rim = np.column_stack([rim, points[_nearest(points[:, :2], rim), 2]])
     return _triangulate(np.concatenate([points[is_inside], rim]), low, high)
+
+
+def _join_terrain(lanes: Floats, terrain: Floats, low_m: Floats | None, high_m: Floats | None, where: object) -> Floats:
+    """Return the points (n, 3) of the ground: of lanes on the terrain, and of the terrain away from them."""
+    if low_m is not None and high_m is not None:
+        is_near = np.all((terrain[:, :2] > low_m - _MARGIN_M) & (terrain[:, :2] < high_m + _MARGIN_M), axis=1)
+        terrain = terrain[is_near]
+    GROUND_POINTS.check(where, len(terrain), f"needs {len(terrain):,} points of the terrain")
+    height = _interpolate(terrain, lanes[:, :2])
+    is_ground = ~(np.abs(lanes[:, 2] - height) > _LEVEL_M)  # also where the terrain is unknown
+    if not is_ground.any():
+        return _thin_points(terrain)
+    points = _thin_points(lanes[is_ground])
+    if not len(terrain):
+        return points
+
+    from scipy.spatial import KDTree
+
+    is_beyond = KDTree(points[:, :2]).query(terrain[:, :2])[0] > _BESIDE_M
+    return np.concatenate([points, _thin_points(terrain[is_beyond])]) if is_beyond.any() else points
+
+
+def _interpolate(points: Floats, at: Floats) -> Floats:
+    """Return heights (n,) at locations (n, 2) on triangles through points; NaN outside their hull."""
+    from scipy.spatial import QhullError
+
+    heights = np.full(len(at), np.nan)
+    if len(points) < 3:
+        return heights
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    try:
+        corners, shares = TerrainSurface(points, np.empty((0, 3), dtype=np.int64), low, high)._locate(at - low)
+    except QhullError:  # all points on one line
+        return heights
+    is_inside = shares.min(axis=1) >= -_EPSILON
+    heights[is_inside] = (points[corners, 2] * shares).sum(axis=1)[is_inside]
+    return heights
 
 
 def _check_point_count(roads: Network, low_m: Floats | None, high_m: Floats | None, where: object) -> None:

@@ -1,0 +1,111 @@
+"""Reader of triangle meshes: glTF, OBJ, PLY, STL, OFF.
+
+These formats have no reference system, so their files need an alignment (``--align``). Their unit is the metre. In glTF
+the y axis points up (glTF 2.0, 3.4) and -z north; in the other formats z points up. Heights count from the ground.
+
+Each closed piece of a file is a mesh of its own, so that a point inside can be recognised; the rest is one open mesh.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import shapely
+
+from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray
+from egvs.core.reading import translate_errors
+from egvs.formats import meshes
+from egvs.importers.map_parts import MapContext, MappedMesh, SolidMap
+from egvs.importers.osm_solids import OUT_OF_RANGE, ImportCounts
+from egvs.scenario.fields import MAX_COORDINATE_M
+
+if TYPE_CHECKING:
+    import trimesh
+
+NAME = "triangle mesh"
+
+_KIND = "mesh"
+_Y_UP = (".gltf", ".glb")
+
+
+def can_open(path: Path, head: bytes) -> bool:
+    """Return whether a file is a mesh; a PLY without faces is a point cloud."""
+    suffix = path.suffix.lower()
+    if suffix == ".ply":
+        return b"element face" in head
+    return suffix.removeprefix(".") in meshes.MESH_FORMATS
+
+
+def read_solids(paths: Sequence[Path], context: MapContext) -> SolidMap:
+    """Return the meshes in the window; InputError when a file is damaged, or no alignment is given."""
+    counts = ImportCounts()
+    notes = []
+    mapped: list[MappedMesh] = []
+    for path in paths:
+        mesh = _load(path)
+        if path.suffix.lower() in _Y_UP:
+            notes.append(f"{path.name}: its y axis is taken as up, as glTF defines it.")
+        mapped += _pieces(mesh, _to_world(mesh, path, context), path.stem, context, counts)
+    return SolidMap(meshes=tuple(_number_equal_names(mapped)), counts=counts, notes=tuple(notes))
+
+
+def _load(path: Path) -> trimesh.Trimesh:
+    """Return a mesh with equal vertices merged and triangles without area left out."""
+    mesh = meshes.load_mesh(path, str(path))
+    far = np.flatnonzero(~(np.abs(mesh.vertices) <= MAX_COORDINATE_M).all(axis=1))
+    if len(far):
+        expected = f"expected finite coordinates, at most {MAX_COORDINATE_M:g} m"
+        raise InputError(f"{path}: vertex {far[0]}", f"{expected}, got {mesh.vertices[far[0]].tolist()}")
+    triangles = len(mesh.faces)
+    with translate_errors(path, meshes.MESH_HINT, "cannot be divided into pieces"):
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
+        mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
+    if len(mesh.faces) == 0:
+        raise InputError(path, f"expected a triangle mesh, got {triangles} triangles without area", meshes.MESH_HINT)
+    return mesh
+
+
+def _to_world(mesh: trimesh.Trimesh, path: Path, context: MapContext) -> FloatArray:
+    """Return the vertices (n, 3): x and y in the world frame, z as in the file."""
+    vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    if path.suffix.lower() in _Y_UP:
+        vertices = vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
+    return np.column_stack([context.to_world(vertices[:, :2], None, str(path)), vertices[:, 2]])
+
+
+def _pieces(
+    mesh: trimesh.Trimesh, vertices_m: FloatArray, stem: str, context: MapContext, counts: ImportCounts
+) -> Iterator[MappedMesh]:
+    """Yield the closed pieces of a mesh in the window, then the rest."""
+    faces = np.asarray(mesh.faces, dtype=np.int64)
+    piece = meshes.mesh_components(mesh.face_adjacency, len(faces))
+    is_closed = meshes.are_closed(faces, piece)
+    order = np.argsort(piece, kind="stable")
+    by_piece = np.split(order, np.cumsum(np.bincount(piece))[:-1])
+    parts = [(f"{stem}_{number}", by_piece[number], True) for number in np.flatnonzero(is_closed).tolist()]
+    rest = order[~is_closed[piece[order]]]
+    if len(rest):
+        parts.append((f"{stem}_surface", rest, False))
+    for name, triangles, closed in parts:
+        used, corners = np.unique(faces[triangles], return_inverse=True)
+        low, high = vertices_m[used, :2].min(axis=0), vertices_m[used, :2].max(axis=0)
+        if not context.window.intersects(shapely.box(*low, *high)):
+            counts.drop(_KIND, OUT_OF_RANGE)
+            continue
+        counts.objects[_KIND] += 1
+        counts.heights.setdefault(_KIND, Counter())["geometry"] += 1
+        yield MappedMesh(name, _KIND, vertices_m[used], corners.reshape(-1, 3), closed)
+
+
+def _number_equal_names(mapped: Sequence[MappedMesh]) -> Iterator[MappedMesh]:
+    """Yield meshes with names that differ."""
+    times: Counter[str] = Counter()
+    for mesh in mapped:
+        times[mesh.name] += 1
+        name = mesh.name if times[mesh.name] == 1 else f"{mesh.name}#{times[mesh.name]}"
+        yield MappedMesh(name, mesh.kind, mesh.vertices_m, mesh.faces, mesh.is_closed)

@@ -1,0 +1,531 @@
+"""Make a scenario from maps: roads, and what stands beside them.
+
+Steps of :func:`create_scenario`: open the files (:mod:`egvs.importers.map_readers`); build the network; choose a
+junction and put the region of interest around it; cut the network to its surroundings; collect buildings and other
+static objects within sensor range (:mod:`egvs.importers.static_objects`); find candidate sites along the kerbs; assume
+flows, and find how much of them the network carries; write
+
+    network.net.xml    the streets                                       (traffic)
+    statics.geojson    footprints with heights, and import counts        (statics)
+    sites.csv          candidate sites                                   (scan, score)
+    scenario.toml      the scenario that names them
+
+and, where the maps have meshes, one PLY file for each kind of object.
+
+World frame: the network's x (east), y (north) in metres. The ground is z = 0, or follows the network's lanes where they
+have heights. The same maps give the same bytes: no dates, no paths, objects sorted.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomlkit
+from shapely.geometry.base import BaseGeometry
+
+from egvs.core.errors import InputError
+from egvs.core.grid import XY, FloatArray, Roi
+from egvs.formats import ply
+from egvs.importers import (
+    assumed_traffic,
+    ground_heights,
+    ground_reference,
+    junctions,
+    map_readers,
+    openstreetmap,
+    osm_solids,
+    scenario_files,
+    static_objects,
+)
+from egvs.importers.alignment import PointPair, make_alignment
+from egvs.importers.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, AssumedTraffic
+from egvs.importers.building_heights import ASSUMED, NEIGHBOURS
+from egvs.importers.junctions import JunctionRegion, KerbsidePole, StreetJunction, Streets
+from egvs.importers.map_parts import MapContext, RoadOptions, Terrain
+from egvs.importers.map_readers import MapFile
+from egvs.importers.openstreetmap import OsmRoads
+from egvs.importers.osm_network import ATTRIBUTION, NETWORK_FILE
+from egvs.importers.osm_solids import ImportCounts
+from egvs.importers.relief import Relief
+from egvs.importers.road_source import NetworkRoads, RoadSource
+from egvs.importers.scenario_files import (
+    PITCHES_DEG,
+    SENSOR,
+    SITES_FILE,
+    STATICS_FILE,
+    TERRAIN_FILE,
+    FileContent,
+    TomlTable,
+    reachable_area,
+)
+from egvs.importers.static_objects import MapSummary, ReadMap, StaticObjects
+from egvs.scenario.loading import load
+from egvs.scenario.model import SCENARIO_FILE
+from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, CountConfig, TrafficConfig
+from egvs.sensors.sensor import CATALOGUE
+from egvs.traffic.movements import MovementNames
+
+SURROUNDINGS_MIN_M = 100.0
+FAR_FROM_AT_M = 50.0
+"""A junction farther than this from the requested position may be the wrong one."""
+
+_MOST_NAMED = 3
+"""Number of junctions that the message about a position without a junction names."""
+
+TERRAIN_STEP_M = 5.0
+"""Distance of the points of the ground beyond the roads."""
+
+PEOPLE_HINT = (
+    "pedestrians are added with --set effects.pedestrians_bicycles.pedestrians_per_h=300 (bicycles: bicycles_per_h)."
+)
+
+_NO_SIGNALS_NOTE = "no junction in the map has signals; the one with the most incoming lanes was chosen"
+
+
+@dataclass(frozen=True)
+class NewScenario:
+    """What :func:`create_scenario` made.
+
+    Attributes
+    ----------
+    folder
+        The scenario's folder.
+    junction, roi
+        The junction, and the region of interest around it.
+    streets
+        The simulated streets.
+    poles
+        Number of locations for poles.
+    statics
+        What happened to the objects of the map.
+    n_solids
+        Number of solids of the static world, the ground included. A tree is two, an object that is cut may be several.
+    traffic
+        The traffic through the region of interest; None where no street leads through it.
+    notes
+        What to know before trusting the scenario.
+    maps
+        What each map with static objects contributed.
+    attributions
+        Who made the maps.
+    from_at_m
+        Distance of the junction from the requested position, 0 inside it; None without such a position.
+    """
+
+    folder: Path
+    junction: StreetJunction
+    roi: JunctionRegion
+    streets: Streets
+    poles: int
+    statics: ImportCounts
+    n_solids: int
+    traffic: AssumedTraffic | None
+    notes: tuple[str, ...]
+    maps: tuple[MapSummary, ...] = ()
+    attributions: tuple[str, ...] = ()
+    from_at_m: float | None = None
+
+    @property
+    def maps_have_notes(self) -> bool:
+        """Whether there is something to know about single maps."""
+        return any(summary.notes for summary in self.maps)
+
+    @property
+    def is_far_from_at(self) -> bool:
+        """Whether the junction may be another one than the user meant."""
+        return self.from_at_m is not None and self.from_at_m > FAR_FROM_AT_M
+
+    @property
+    def n_candidates(self) -> int:
+        """Number of candidates: each pole with each height and each tilt."""
+        return self.poles * len(junctions.HEIGHTS_M) * len(PITCHES_DEG)
+
+    @property
+    def flows(self) -> tuple[CountConfig, ...]:
+        """The flows of the scenario; empty where no street leads through the region of interest."""
+        return () if self.traffic is None else self.traffic.flows
+
+
+@dataclass(frozen=True)
+class NewScenarioOptions:
+    """Options of :func:`create_scenario`.
+
+    Attributes
+    ----------
+    lefthand
+        Whether traffic drives on the left.
+    walk
+        Whether the network gets sidewalks and crossings, which pedestrians need.
+    surroundings_m
+        Distance from the junction at which streets end; inf for the complete map. By default,
+        :data:`openstreetmap.SURROUNDINGS_M`; other maps than OpenStreetMap are not cut.
+    traffic
+        A key of :data:`assumed_traffic.TRAFFIC_LEVELS`: the share of the flow that the junction carries. Or vehicles
+        per hour.
+    pole_spacing_m
+        Distance between candidate poles along the kerbs; None for a few poles near the junction.
+    align
+        Two points that place files without a reference system; empty if there are no such files.
+    """
+
+    lefthand: bool = False
+    walk: bool = False
+    surroundings_m: float | None = None
+    traffic: str | int = DEFAULT_TRAFFIC
+    pole_spacing_m: float | None = None
+    align: tuple[PointPair, ...] = ()
+
+    def check(self) -> None:
+        """Raise an InputError when a value is out of its limits."""
+        assumed_traffic.check_traffic(self.traffic)
+        _check_pole_spacing(self.pole_spacing_m)
+        if self.surroundings_m is not None and self.surroundings_m < SURROUNDINGS_MIN_M:
+            raise InputError(
+                "--surroundings",
+                f"expected at least {SURROUNDINGS_MIN_M:g} m, got {self.surroundings_m:g} m",
+                "Choose a distance that includes the junction and its approaches.",
+            )
+
+
+def create_scenario(
+    folder: Path,
+    maps: Path | Sequence[Path],
+    at: tuple[float, float] | None = None,
+    options: NewScenarioOptions | None = None,
+) -> NewScenario:
+    """Make a scenario folder from maps.
+
+    Parameters
+    ----------
+    folder
+        Created by this function; may exist if it is empty.
+    maps
+        Files, or folders of files: one road map, and any number of maps of static objects.
+    at
+        Latitude, longitude in degrees, or x, y in metres if the road map has no reference system: choose the junction
+        there, see :func:`junctions.choose_nearby`. By default, the largest one with signals.
+    options
+        Options; the defaults when None.
+
+    Returns
+    -------
+    NewScenario
+        A summary of the new scenario.
+
+    Raises
+    ------
+    InputError
+        When the folder is not empty, a file is damaged or of an unknown format, the road map has no drivable streets,
+        ``at`` is outside or far from any junction, or no site is possible. Nothing is written then.
+    """
+    options = options or NewScenarioOptions()
+    options.check()
+    name = scenario_files.check_new_folder(folder)
+    files = map_readers.open_maps([maps] if isinstance(maps, Path) else maps)
+    roads = _read_roads(files.roads, RoadOptions(options.lefthand, options.walk), at)
+    junction = _choose_junction(roads.streets, at, files.roads.path)
+
+    level = roads.on_level_of(junction)
+    if level.streets is not roads.streets:
+        junction = _find_again(level.streets, junction, roads.streets, files.roads.path)
+    window = reachable_area(junctions.region_around(junction))
+    frame = level.streets.frame
+    alignment = make_alignment(options.align, frame) if options.align else None
+    context = MapContext(frame, window, alignment, level.streets)
+    roads = level.around(junction, options.surroundings_m)
+    maps_read = static_objects.read_maps(files.solids, level, files.roads, context)
+    terrain = ground_reference.read_terrain(files.terrain, ground_reference.with_roads(context, roads.streets))
+    measured = static_objects.ground_mesh(maps_read)
+    if terrain is None and measured is not None:
+        terrain = ground_reference.measured_ground(measured)
+    zero = ground_reference.find_zero(roads, files.roads, junction, terrain)
+    objects = static_objects.collect_objects(maps_read, level.streets, junction.at_m, zero.height_m)
+    roads = ground_reference.lay_on_ground(roads, files.roads, junction, terrain)
+    if roads.streets is not level.streets:
+        junction = _require_junction(junctions.find_again(roads.streets, junction, junction.at_m), files.roads.path)
+    streets = roads.streets
+    roi = junctions.region_around(junction)
+    poles = junctions.kerbside_poles(streets, junction, roi, objects.areas, options.pole_spacing_m)
+    if not poles:
+        problem = f"there is no free location for a pole along the kerbs of the {junction.title}"
+        hint = "Choose another junction with --at LAT,LON."
+        if options.pole_spacing_m is not None:
+            hint = "Choose a smaller spacing with --poles, or another junction with --at LAT,LON."
+        raise InputError(files.roads.path, problem, hint)
+
+    notes = [*roads.notes, *zero.notes, *(() if terrain is None else terrain.notes)]
+    if at is None and not junction.signalised:
+        notes.append(_NO_SIGNALS_NOTE)
+    notes += _ring_notes(streets, junction)
+    notes += scenario_notes(roi.area.covers(junction.area), objects.counts)
+    notes += _level_notes(level, objects.counts) + _range_notes(objects.counts)
+    if options.walk:
+        notes.append(PEOPLE_HINT)
+    assumed = assumed_traffic.assume_traffic(roads.network, streets, junction, options.traffic)
+    if assumed is not None:
+        notes += assumed_traffic.traffic_notes(assumed)
+    relief = Relief.of_region(streets, junction, roi)
+    if relief.other_levels:
+        notes.append(f"lanes on another level cross the region of interest: {', '.join(relief.other_levels)}")
+
+    scenario = NewScenario(
+        folder, junction, roi, streets, len(poles), objects.counts, objects.n_solids + 1, assumed, tuple(notes),
+        maps=objects.maps, attributions=_attributions(roads, objects), from_at_m=_distance_m(streets, junction, at),
+    )  # fmt: skip
+    columns = _site_columns(streets, poles, relief, maps_read, roi, zero.height_m or 0.0)
+    meshes = static_objects.mesh_files([mesh for mesh in objects.meshes if mesh.kind != static_objects.GROUND])
+    terrain_files = {}
+    if terrain is not None:
+        terrain_files[TERRAIN_FILE] = _terrain_writer(terrain, window, zero.height_m or 0.0)
+    statics = scenario_files.statics_table(list(meshes), *terrain_files)
+    contents: dict[str, FileContent] = {
+        NETWORK_FILE: roads.network,
+        STATICS_FILE: scenario_files.solids_geojson(objects.solids, objects.counts, scenario.attributions),
+        SITES_FILE: scenario_files.sites_csv(poles, columns),
+        **meshes,
+        **terrain_files,
+        SCENARIO_FILE: _scenario_toml(name, scenario, relief, statics),
+    }
+    scenario_files.publish_folder(folder, contents.items(), load)
+    return scenario
+
+
+def _site_columns(
+    streets: Streets, poles: Sequence[KerbsidePole], relief: Relief, maps: Sequence[ReadMap], roi: JunctionRegion,
+    zero_height_m: float,
+) -> dict[str, FloatArray]:  # fmt: skip
+    """Return further columns of the sites: z of the ground where it is not flat, and what a point cloud did not see."""
+    columns = {}
+    ground_m = relief.ground_m(streets, poles)
+    if ground_m is not None:
+        columns["ground_m"] = ground_m
+    low_m, high_m = relief.z_range_m
+    center_m = *roi.center_m, (low_m + high_m) / 2 + zero_height_m
+    sensors_m = np.array([(pole.x_m, pole.y_m, junctions.HEIGHTS_M[1] + zero_height_m) for pole in poles])
+    if ground_m is not None:
+        sensors_m[:, 2] += ground_m
+    unseen = static_objects.unseen_shares(maps, sensors_m, Roi.around(center_m, (*roi.size_m, high_m - low_m)))
+    if unseen is not None and not np.isnan(unseen).all():
+        columns["unseen_share"] = np.round(unseen, 3)
+    return columns
+
+
+def _terrain_writer(terrain: Terrain, window: BaseGeometry, zero_height_m: float) -> Callable[[Path], None]:
+    """Return a function that writes points of the ground in a window as PLY."""
+    points_m = ground_heights.ground_points(terrain, window, TERRAIN_STEP_M) - np.array([0.0, 0.0, zero_height_m])
+    return partial(ply.write, points_m=points_m)
+
+
+def _read_roads(file: MapFile, options: RoadOptions, at: tuple[float, float] | None) -> RoadSource:
+    if file.reader is openstreetmap:
+        return OsmRoads.read(file.path, options, at)
+    return NetworkRoads.read(file.reader.read_roads(file.path, options), file.path)
+
+
+def _choose_junction(streets: Streets, at: tuple[float, float] | None, path: Path) -> StreetJunction:
+    if at is None:
+        return _require_junction(junctions.largest_junction(streets), path)
+    return _junction_at(streets, _to_world(streets, at))
+
+
+def _to_world(streets: Streets, at: tuple[float, float]) -> XY:
+    """Return world-frame x, y of a position of ``--at``."""
+    if streets.frame is None:
+        return at
+    return streets.to_xy([at[1]], [at[0]])[0]
+
+
+def _distance_m(streets: Streets, junction: StreetJunction, at: tuple[float, float] | None) -> float | None:
+    return None if at is None else junction.distance_m(_to_world(streets, at))
+
+
+def _find_again(streets: Streets, junction: StreetJunction, former: Streets, path: Path) -> StreetJunction:
+    """Return the same junction in streets that were built anew, in another frame."""
+    location = former.to_degrees([junction.at_m])[0]
+    at_m = streets.to_xy(*zip(location, strict=True))[0]
+    return _require_junction(junctions.find_again(streets, junction, at_m), path)
+
+
+def _ring_notes(streets: Streets, junction: StreetJunction) -> list[str]:
+    notes = []
+    for ring in streets.large_rings:
+        if junction.id in ring.nodes:
+            notes.append(
+                f"the junction is one entry of a roundabout {ring.side_m:.0f} m wide, which is larger than the largest"
+                f" region of interest ({junctions.ROI_MAX_M:g} m): the rest of the ring is not part of the ranking"
+            )
+    return notes
+
+
+def _attributions(roads: RoadSource, objects: StaticObjects) -> tuple[str, ...]:
+    names = dict.fromkeys([roads.attribution, *objects.attributions])
+    return tuple(name for name in names if name)
+
+
+def _check_pole_spacing(spacing_m: float | None) -> None:
+    low_m, high_m = junctions.MIN_SPACING_M, junctions.MAX_SPACING_M
+    if spacing_m is not None and not low_m <= spacing_m <= high_m:
+        problem = f"expected a spacing of {low_m:g} to {high_m:g} m, got {spacing_m:g} m"
+        raise InputError("--poles", problem, "Use a spacing such as every 20m.")
+
+
+def _junction_at(streets: Streets, at_m: XY) -> StreetJunction:
+    """Return the junction at a position; raise an InputError that names the nearest ones if it is far from any."""
+    nearby = junctions.nearest_junctions(streets, at_m)
+    chosen = junctions.choose_nearby(nearby)
+    if chosen is not None:
+        return chosen.junction
+    problem = f"no junction of {junctions.MIN_ARMS} or more roads is within {junctions.MAX_FROM_POINT_M:g} m"
+    if not nearby:
+        raise InputError("--at", problem, "The map has no such junction; choose another one.")
+    titles = []
+    for near in nearby[:_MOST_NAMED]:
+        position = streets.format_position(near.junction.at_m)
+        titles.append(f"{near.junction.title} at {position} ({near.distance_m:,.0f} m away)")
+    raise InputError("--at", problem, f"The nearest are: {'; '.join(titles)}.")
+
+
+def _require_junction(junction: StreetJunction | None, path: Path) -> StreetJunction:
+    if junction is None:
+        raise InputError(path, "the streets of the map have no junction", "Choose a map with a junction.")
+    return junction
+
+
+def _level_notes(roads: RoadSource, counts: ImportCounts) -> list[str]:
+    notes = []
+    if isinstance(roads, OsmRoads) and roads.others.roads:
+        titles = ", ".join(roads.others.road_titles)
+        notes.append(f"roads on another level are left out of the traffic in the region of interest: {titles}")
+    heights = counts.heights.get("bridge", Counter())
+    if heights["default"]:
+        shares = f"{heights['default']} of {heights.total()}"
+        notes.append(f"no height is given for {shares} bridge decks: {osm_solids.DECK_BASE_M:g} m assumed")
+    return notes
+
+
+def _range_notes(counts: ImportCounts) -> list[str]:
+    left_out = counts.dropped.get(osm_solids.OUT_OF_RANGE, Counter()).total()
+    if not left_out:
+        return []
+    total = left_out + counts.objects.total() - counts.objects["tree_crown"]
+    range_m = CATALOGUE[SENSOR].range_m
+    reason = f"they are beyond the range of a {SENSOR} ({range_m:g} m) from the region of interest and change no score"
+    return [f"{left_out:,} of {total:,} static objects are left out: {reason}"]
+
+
+def scenario_notes(junction_fits: bool, counts: ImportCounts) -> list[str]:
+    """Return what to know before trusting a scenario.
+
+    Parameters
+    ----------
+    junction_fits
+        Whether the junction is inside its region of interest.
+    counts
+        What happened to the objects of the map.
+    """
+    notes = []
+    if not junction_fits:
+        notes.append(f"the junction is larger than the region of interest (at most {junctions.ROI_MAX_M:g} m)")
+    heights = counts.heights.get("building", Counter())
+    if heights["default"]:
+        notes.append(
+            f"{heights['default']} of {heights.total()} buildings have neither height nor levels:"
+            f" {osm_solids.DEFAULT_BUILDING_M:g} m assumed"
+        )
+    if heights[NEIGHBOURS]:
+        notes.append(
+            f"{heights[NEIGHBOURS]} of {heights.total()} buildings have neither height nor levels: the median height of"
+            " the buildings near by assumed"
+        )
+    return notes
+
+
+def _scenario_toml(name: str, scenario: NewScenario, relief: Relief, statics: TomlTable) -> str:
+    title = scenario.junction.title
+    values: dict[str, Any] = {
+        "description": title[0].upper() + title[1:],
+        "assumed": _assumptions(scenario),
+        "seed": 1,
+    }
+    if name:
+        values = {"name": name} | values
+
+    roi_comment, roi = scenario_files.roi_table(scenario.roi, relief.z_range_m)
+    sites_comment, sites = scenario_files.sites_table()
+    traffic = {
+        "network": NETWORK_FILE,
+        "frames": DEFAULT_FRAMES,
+        "frame_period_s": TrafficConfig.model_fields["frame_period_s"].default,
+        "warmup_s": DEFAULT_WARMUP_S,
+        "junction_blocker_s": JUNCTION_BLOCKER_S,
+        "teleport_s": TELEPORT_S,
+    }
+    tables = {
+        "roi": (roi_comment, roi | scenario_files.voxel_keys()),
+        "traffic": ("SUMO", traffic),
+        "statics": statics,
+        "sites": (sites_comment, sites | scenario_files.mount_keys()),
+        "score": scenario_files.score_table(),
+        "placement": scenario_files.placement_table(),
+    }
+    ground = "flat ground" if relief.is_flat else "zero height of the network"
+    comments = [
+        *_origin_comments(scenario.attributions),
+        f"World frame: x east, y north in metres as in {NETWORK_FILE}, z up from the {ground}.",
+    ]
+    document = scenario_files.toml_document(comments, values, tables)
+    if scenario.traffic is not None:
+        names = MovementNames(scenario.streets.network, scenario.junction.at_m)
+        document["traffic"].update({"counts": scenario_files.counts_array(scenario.traffic.flows, names)})
+        origin = f"assumed from the road classes ({scenario.traffic.assumed_per_h:,} vehicles an hour)"
+        if scenario.traffic.level is None:
+            origin = "divided among the movements by the road classes"
+        comment = f"{origin}; the network {scenario.traffic.summary}. Replace them by real counts"
+        document["traffic"]["counts"].comment(comment)
+        for line in scenario_files.periods_template(scenario.traffic.flows[0]):
+            document["traffic"].add(tomlkit.comment(line))
+    return tomlkit.dumps(document)
+
+
+def _origin_comments(attributions: Sequence[str]) -> list[str]:
+    """Return lines that name the maps, for the head of ``scenario.toml``."""
+    if list(attributions) == [ATTRIBUTION]:
+        return [f"A scenario made from OpenStreetMap. Map data {ATTRIBUTION} (openstreetmap.org/copyright)."]
+    if not attributions:
+        return ["A scenario made from maps."]
+    return [f"A scenario made from maps. Map data: {'; '.join(attributions)}."]
+
+
+def _assumptions(scenario: NewScenario) -> list[str]:
+    """Return what the map does not tell, for the key ``assumed``."""
+    assumed = []
+    traffic = scenario.traffic
+    if traffic is not None and traffic.level is None:
+        assumed.append(f"shares of the movements (of {traffic.per_h:,} vehicles an hour)")
+    elif traffic is not None:
+        assumed.append(f"traffic ({traffic.per_h:,} vehicles an hour, from the road classes)")
+    if scenario.junction.signalised:
+        assumed.append("signal plans")
+    return [*assumed, *assumed_sizes(scenario.statics), "positions of the poles"]
+
+
+def _assumed_buildings(heights: Counter[str]) -> int:
+    return heights[ASSUMED] + heights[NEIGHBOURS]
+
+
+def assumed_sizes(counts: ImportCounts) -> list[str]:
+    """Return which sizes of static objects are assumed, for the key ``assumed``; objects that can hide vehicles."""
+    heights = {kind: counts.heights.get(kind, Counter()) for kind in ("building", "tree", "bridge")}
+    texts = [
+        (_assumed_buildings(heights["building"]), heights["building"].total(), "heights of {} buildings"),
+        (heights["tree"]["default"], heights["tree"].total(), "heights of {} trees"),
+        (counts.assumed_crowns, heights["tree"].total(), "crown widths of {} trees"),
+        (heights["bridge"]["default"], heights["bridge"].total(), "heights of {} bridge decks"),
+    ]
+    return [text.format(f"{number} of {total}") for number, total, text in texts if number]

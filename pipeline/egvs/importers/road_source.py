@@ -1,0 +1,107 @@
+"""The roads of a map, from which those around a junction are taken."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from egvs.core import files
+from egvs.core.errors import InputError
+from egvs.importers import junctions
+from egvs.importers.junctions import StreetJunction, Streets
+from egvs.importers.map_parts import RoadMap
+from egvs.importers.osm_network import NETWORK_FILE
+
+
+class RoadSource(Protocol):
+    """A road map, read."""
+
+    @property
+    def network(self) -> str:
+        """The text of the network."""
+        raise NotImplementedError
+
+    @property
+    def streets(self) -> Streets:
+        """The same network, read."""
+        raise NotImplementedError
+
+    @property
+    def attribution(self) -> str:
+        """Who made the map, and its licence; empty if unknown."""
+        raise NotImplementedError
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences for the user about the complete map."""
+        raise NotImplementedError
+
+    def on_level_of(self, junction: StreetJunction) -> RoadSource:
+        """Return the roads without those that cross a junction's region on another level."""
+        raise NotImplementedError
+
+    def around(self, junction: StreetJunction, radius_m: float | None) -> RoadSource:
+        """Return the roads within a radius of a junction, in the same frame: all if it is inf, the default if None."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class NetworkRoads:
+    """Roads of a map that is converted as a whole; they are neither cut nor divided by level."""
+
+    road_map: RoadMap
+    streets: Streets
+
+    @classmethod
+    def read(cls, road_map: RoadMap, path: Path) -> NetworkRoads:
+        """Read the network of a road map.
+
+        Parameters
+        ----------
+        road_map
+            The road map.
+        path
+            Its file, for messages.
+
+        Raises
+        ------
+        InputError
+            When the network has no road, or SUMO cannot have written it.
+        """
+        with files.temporary_folder() as folder:
+            (folder / NETWORK_FILE).write_text(road_map.network, encoding="utf-8")
+            try:
+                return cls(road_map, junctions.read_streets(folder / NETWORK_FILE))
+            except InputError as error:
+                raise InputError(path, f"the network cannot be used: {error}", "Check the roads of the map.") from None
+
+    @property
+    def network(self) -> str:
+        """The text of the network."""
+        return self.road_map.network
+
+    @property
+    def attribution(self) -> str:
+        """Who made the map, and its licence; empty if unknown."""
+        return self.road_map.attribution
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences of the reader."""
+        return self.road_map.notes
+
+    def on_level_of(self, junction: StreetJunction) -> NetworkRoads:
+        """Return all roads: heights of lanes tell levels apart."""
+        del junction
+        return self
+
+    def around(self, junction: StreetJunction, radius_m: float | None) -> NetworkRoads:
+        """Return all roads; InputError if a radius is given."""
+        del junction
+        if radius_m is not None and math.isfinite(radius_m):
+            problem = "only roads from OpenStreetMap can be cut"
+            hint = "Leave it out, or cut the network with netconvert --keep-edges.in-boundary."
+            raise InputError("--surroundings", problem, hint)
+        return self

@@ -1,0 +1,66 @@
+"""Damaged Lanelet2 maps end in an InputError that names the file, or in a network that SUMO reads; in no other error.
+
+The mutants are those of the fuzzer (``tests/fuzz/mutating.py``).
+"""
+
+from __future__ import annotations
+
+import gzip
+import random
+from pathlib import Path
+
+import pytest
+
+from egvs.core.errors import InputError
+from egvs.importers import lanelet2
+from egvs.importers.lanelet2_network import read_network_text
+from egvs.importers.map_parts import RoadOptions
+from tests.fuzz.mutating import mutant
+from tests.importers.lanelet2_maps import make_crossing
+
+PROJECTOR = (
+    b"projector_type: LocalCartesian\nvertical_datum: WGS84\nmap_origin:\n  latitude: 49.0\n  longitude: 8.4\n"
+    b"  altitude: 0.0\n"
+)
+KINDS = ("map.osm", "map.osm.gz", "map_projector_info.yaml")
+
+
+def read_mutants(folder: Path, name: str, seeds: range) -> tuple[int, int]:
+    """Return how many mutants were read, and how many rejected."""
+    path = make_crossing(tags={"speed_limit": "50"}).writer.write(folder / "map.osm")
+    if name == "map.osm.gz":
+        path.rename(folder / "plain.osm")
+        path = folder / name
+        path.write_bytes(gzip.compress((folder / "plain.osm").read_bytes(), mtime=0))
+    changed = path
+    if name.endswith(".yaml"):
+        changed = folder / name
+        changed.write_bytes(PROJECTOR)
+    sound = changed.read_bytes()
+    assert read_network_text(lanelet2.read_roads(path, RoadOptions()).network).connections
+    read = rejected = 0
+    for seed in seeds:
+        changed.write_bytes(mutant(random.Random(seed), sound))
+        try:
+            read_network_text(lanelet2.read_roads(path, RoadOptions()).network)
+            read += 1
+        except InputError as error:
+            assert str(folder) in str(error), seed
+            assert len(str(error)) < 4000, seed
+            rejected += 1
+    return read, rejected
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_some_mutants(tmp_path: Path, name: str) -> None:
+    read, rejected = read_mutants(tmp_path, name, range(12))
+    assert read + rejected == 12
+    assert rejected > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", KINDS)
+def test_200_mutants(tmp_path: Path, name: str) -> None:
+    read, rejected = read_mutants(tmp_path, name, range(200))
+    assert read + rejected == 200
+    assert rejected > 20

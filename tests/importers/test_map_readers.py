@@ -1,0 +1,59 @@
+"""Which reader opens a map file, and what a set of files is rejected for."""
+
+import gzip
+from pathlib import Path
+
+import pytest
+
+from egvs.core.errors import InputError
+from egvs.importers import map_readers, openstreetmap, sumo_network
+
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
+NETWORK = SCENARIOS / "roundabout" / "network.net.xml"
+SMALL = Path(__file__).parent / "data" / "small.osm"
+
+
+def test_finds_readers_by_name_and_content(tmp_path: Path) -> None:
+    renamed = tmp_path / "roads.xml"
+    renamed.write_bytes(NETWORK.read_bytes())
+    packed = tmp_path / "packed.xml.gz"
+    packed.write_bytes(gzip.compress(NETWORK.read_bytes()))
+    for path in (NETWORK, renamed, packed):
+        assert map_readers.find_reader(path) is sumo_network
+    assert map_readers.find_reader(SMALL) is openstreetmap
+
+
+def test_openstreetmap_beside_another_road_map_has_static_objects_only() -> None:
+    maps = map_readers.open_maps([SMALL, NETWORK])
+    assert maps.roads.path == NETWORK
+    assert [file.path for file in maps.solids] == [SMALL]
+
+
+def test_folder_stands_for_its_maps(tmp_path: Path) -> None:
+    (tmp_path / "roads.net.xml").write_bytes(NETWORK.read_bytes())
+    (tmp_path / "notes.txt").write_text("not a map")
+    assert map_readers.list_files([tmp_path]) == [tmp_path / "roads.net.xml"]
+
+
+@pytest.mark.parametrize(
+    ("names", "problem"),
+    [
+        ((), "no road map"),
+        (("a.net.xml", "b.net.xml"), "expected one road map"),
+        (("a.net.xml", "photo.jpg"), "format of the file is unknown"),
+        (("a.net.xml", "missing.gml"), "no such file"),
+    ],
+)
+def test_rejects_files(tmp_path: Path, names: tuple[str, ...], problem: str) -> None:
+    for name in names:
+        if name.endswith(".net.xml"):
+            (tmp_path / name).write_bytes(NETWORK.read_bytes())
+        if name.endswith(".jpg"):
+            (tmp_path / name).write_bytes(b"\xff\xd8\xff")
+    with pytest.raises(InputError, match=problem):
+        map_readers.open_maps([tmp_path / name for name in names])
+
+
+def test_rejects_folder_without_maps(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no map that can be read"):
+        map_readers.list_files([tmp_path])
