@@ -239,10 +239,9 @@ def _static_beams(sweep: Sweep, is_held_out: NDArray[np.bool_], ranges_m: FloatA
     """
     range_m = np.sqrt((sweep.points_m**2).sum(axis=1))
     same = ranges_m[sweep.column, sweep.channel]
-    print(
-        f"  the same beam of the other sweeps agrees in {np.mean(np.abs(same - range_m)[is_held_out] <= AGREE_M):.3f}"
-    )
-    is_static = is_held_out & (np.abs(same - range_m) <= AGREE_M) & (range_m < MAX_RANGE_M)
+    agrees = np.abs(same - range_m) <= AGREE_M
+    print(f"  of all held-out returns, {np.mean(agrees[is_held_out]):.3f} agree with the same beam of the other sweeps")
+    is_static = is_held_out & agrees & (range_m < MAX_RANGE_M)
     neighbour = ranges_m[(sweep.column[is_static] + step) % COLUMNS, sweep.channel[is_static]]
     directions = sweep.points_m[is_static] / range_m[is_static, None]
     return Beams(np.zeros(3), directions, range_m[is_static], np.nan_to_num(neighbour, nan=np.inf))
