@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: run test test-slow test-train test-lowest test-portable unit lint bench scaling numerics validity detectability pictures schema reference docs fuzz clean
+.PHONY: run test test-slow test-train test-lowest test-portable unit lint bench bench-peers scaling numerics validity detectability pictures schema reference docs fuzz clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
@@ -48,6 +48,10 @@ docs: $(VENV)/.installed-docs
 
 bench: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks
+
+# Peers that are not installed are left out by name; "pip install egvs[peers]" installs them, Open3D alone takes 900 MB.
+bench-peers: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks.peers
 
 scaling: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.scaling

@@ -25,7 +25,7 @@ from egvs.stages.inputs import build_scene
 from egvs.world.ray_casting import Caster
 
 _SCENARIOS = Path(__file__).resolve().parent.parent / "scenarios"
-_ROUNDS = 21
+_ROUNDS = 7
 
 
 def _work(name: str) -> tuple[dict[str, Callable[[], Any]], int, int]:

@@ -27,14 +27,14 @@ REPEATS = 7
 SITES = 4
 
 COSTS: dict[str, tuple[list[str], float | None]] = {
-    "dropout": (["effects.dropout.share=0.1"], 1.5),
-    "rain": (["effects.rain.rate_mm_h=20"], 1.5),
-    "fog": (["effects.fog.visibility_m=200"], 1.5),
-    "range_limit": (["effects.range_limit.reflectivity=0.1"], 1.5),
-    "range_limit, hard": (["effects.range_limit={softness = 0, reflectivity = 0.1}"], 1.5),
+    "dropout": (["effects.dropout.share=0.1"], 1.2),
+    "rain": (["effects.rain.rate_mm_h=20"], 1.2),
+    "fog": (["effects.fog.visibility_m=200"], 1.2),
+    "range_limit": (["effects.range_limit.reflectivity=0.1"], 1.2),
+    "range_limit, hard": (["effects.range_limit={softness = 0, reflectivity = 0.1}"], 1.2),
     "foliage": (["effects.foliage.leaf_area_density=1"], None),
     "moving_occlusion, 500 frames": (["effects.moving_occlusion.frames=500"], 4.0),
-    "divergence, 7 sub-beams": (["effects.divergence.sub_beams=7"], 8.0),
+    "divergence, 7 sub-beams": (["effects.divergence.sub_beams=7"], 5.0),
 }
 """Settings, and the largest allowed ratio to the plain scene."""
 

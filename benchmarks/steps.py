@@ -18,8 +18,11 @@ from typing import Any
 
 import numpy as np
 
+from egvs.artefacts import parquet
 from egvs.core.progress import no_progress
 from egvs.core.threads import thread_count
+from egvs.runs.stage_keys import stage_key
+from egvs.runs.stage_registry import RANKING_STAGES
 from egvs.studies.measurement import SettingRunner
 from egvs.studies.study_settings import Setting
 
@@ -33,8 +36,13 @@ def trial(step_s: float, seed: int) -> tuple[list[str], list[float], float]:
     os.environ["EGVS_STORE"] = ""  # nothing may come from the cache
     with tempfile.TemporaryDirectory() as folder:
         runner = SettingRunner(SCENARIO, TRAFFIC, Path(folder), 1, no_progress)
-        scores = runner.run(Setting("run", "seed", "seed", (f"seed={seed}", f"traffic.step_s={step_s}")))
-        return scores.sites, scores.shares, runner.stage_times("traffic", scores.stages["traffic"]).seconds[0]
+        setting = Setting("run", "seed", "seed", (f"seed={seed}", f"traffic.step_s={step_s}"))
+        with runner.open_run(setting, RANKING_STAGES) as work:
+            key = stage_key("traffic", work).key
+            scores = parquet.read_artefact(work.folder.scores, "scores")[0].to_pydict()
+            traffic_s = runner.stage_times("traffic", key).seconds[0]
+    shares = np.array(scores["egvs"]) / np.array(scores["egvs_limit"])
+    return scores["site"], shares.tolist(), traffic_s
 
 
 def change(shares: Any, reference: Any) -> tuple[Any, Any]:

@@ -2,29 +2,33 @@
 
 ``python -m benchmarks.verbs --markdown docs/scaling.md`` measures the commands of :data:`VERBS` on the shipped
 roundabout with few frames, or on a small OpenStreetMap extract, and writes the table between the marks of the page.
+With names of commands, it measures those and replaces their rows; the other rows stay.
 
 - *cold*: no kernel is compiled, and the store is empty
 - *warm*: the kernels are compiled, and the store is empty
 - *up to date*: the same command again in the same folder, for commands that keep their results
 
 Each command runs in a fresh copy of a folder with what it needs, for example a finished run. Seconds are processor
-time of the process and of those that it started. A command whose libraries are not installed is left out by name.
+time of the process and of those that it started. A command whose libraries are not installed is left out; a line below
+the table names all commands without a row.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import re
 import shutil
 import signal
 import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+from benchmarks import page_tables
+from benchmarks.page_tables import Cells
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENARIO = ROOT / "scenarios" / "roundabout"
@@ -47,40 +51,44 @@ class Verb:
 
     Attributes
     ----------
-    words
-        Its arguments.
-    keeps
-        Whether it keeps results that the same command uses again.
-    address
-        Whether it is stopped as soon as it prints the address of its page.
+    command_line
+        What follows ``egvs``.
+    saves_results
+        Whether it saves results that the same command uses again.
+    is_server
+        Whether it serves a page; it is stopped as soon as it prints the address.
     """
 
-    words: str
-    keeps: bool = False
-    address: bool = False
+    command_line: str
+    saves_results: bool = False
+    is_server: bool = False
+
+    @property
+    def arguments(self) -> list[str]:
+        """The arguments of ``egvs``."""
+        return self.command_line.split()
 
     @property
     def name(self) -> str:
-        """The words of the command without arguments."""
-        words = self.words.split()
-        return " ".join(words[:2] if words[0] == "city" else words[:1])
+        """The name of the command, without its arguments."""
+        return " ".join(self.arguments[: 2 if self.arguments[0] == "city" else 1])
 
 
 VERBS = (
     Verb("new imported --osm small.osm"),
     Verb("demo example"),
     Verb("check short"),
-    Verb("run short --out new", keeps=True),
-    Verb("place short --out run --count 2", keeps=True),
-    Verb("explore run --no-browser --port 0", keeps=True, address=True),
+    Verb("run short --out new", saves_results=True),
+    Verb("place short --out run --count 2", saves_results=True),
+    Verb("explore run --no-browser --port 0", saves_results=True, is_server=True),
     Verb("compare run other"),
     Verb("city new town --osm small.osm --junctions all"),
-    Verb("city traffic city", keeps=True),
-    Verb("city run city --out new --cluster processes=1", keeps=True),
-    Verb("city place city --out city_run --count 2 --cluster processes=1", keeps=True),
+    Verb("city traffic city", saves_results=True),
+    Verb("city run city --out new --cluster processes=1", saves_results=True),
+    Verb("city place city --out city_run --count 2 --cluster processes=1", saves_results=True),
     Verb("city compare city_run city_other"),
-    Verb("validate short --out run --frames 20 --detector points", keeps=True),
-    Verb("accuracy short --out run --budget 20s", keeps=True),
+    Verb("validate short --out run --frames 20 --detector points", saves_results=True),
+    Verb("accuracy short --out run --budget 20s", saves_results=True),
     Verb("effects short --out run"),
     Verb("scores"),
     Verb("clouds short --out clouds --frames 20"),
@@ -143,14 +151,14 @@ def processor_s(verb: Verb, folder: Path, caches: Caches) -> float:
     CommandError
         When the command fails.
     """
-    words = [sys.executable, "-m", "egvs", *verb.words.split()]
+    command = [sys.executable, "-m", "egvs", *verb.arguments]
     with tempfile.TemporaryFile("w+", encoding="utf-8") as errors:
         process = subprocess.Popen(
-            words, cwd=folder, env=caches.environment(), stdout=subprocess.PIPE, stderr=errors, text=True
+            command, cwd=folder, env=caches.environment(), stdout=subprocess.PIPE, stderr=errors, text=True
         )
         assert process.stdout is not None
         for line in process.stdout:
-            if verb.address and line.startswith("http"):
+            if verb.is_server and line.startswith("http"):
                 process.send_signal(signal.SIGINT)
         _, status, usage = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
@@ -160,7 +168,7 @@ def processor_s(verb: Verb, folder: Path, caches: Caches) -> float:
     if "Run pip install" in message:
         raise MissingLibraryError(message.strip())
     if process.returncode:
-        raise CommandError(f"egvs {verb.words}: exit code {process.returncode}\n{message}")
+        raise CommandError(f"egvs {verb.command_line}: exit code {process.returncode}\n{message}")
     return usage.ru_utime + usage.ru_stime
 
 
@@ -171,12 +179,12 @@ def prepare(folder: Path, store: Path, verbs: Iterable[Verb]) -> None:
     shutil.copy(EXTRACT, folder)
     (folder / "short").mkdir()
     (folder / "short" / "scenario.toml").write_text(SHORT, encoding="utf-8")
-    needed = {word for verb in verbs for word in verb.words.split()}
+    needed = {argument for verb in verbs for argument in verb.arguments}
     if needed & {"city_run", "city_other"}:
         needed.add("city")
-    for name, words in PREPARATION.items():
+    for name, command_line in PREPARATION.items():
         if name in needed:
-            processor_s(Verb(words), folder, Caches(store))
+            processor_s(Verb(command_line), folder, Caches(store))
 
 
 @dataclass(frozen=True)
@@ -188,10 +196,10 @@ class Row:
     warm_s: float
     up_to_date_s: float | None
 
-    def cells(self) -> tuple[str, ...]:
+    def cells(self) -> Cells:
         """Return the row as text."""
         up_to_date = "-" if self.up_to_date_s is None else f"{self.up_to_date_s:.2f}"
-        return f"`egvs {self.verb.words}`", f"{self.cold_s:.2f}", f"{self.warm_s:.2f}", up_to_date
+        return f"`egvs {self.verb.command_line}`", f"{self.cold_s:.2f}", f"{self.warm_s:.2f}", up_to_date
 
 
 def measure(verb: Verb, prepared: Path, work: Path) -> Row:
@@ -208,7 +216,7 @@ def measure(verb: Verb, prepared: Path, work: Path) -> Row:
             break
 
     up_to_date_s = None
-    if verb.keeps:
+    if verb.saves_results:
         times_s = [processor_s(verb, folder, caches[number])]
         while times_s[-1] <= QUICK_S and len(times_s) < REPEATS:
             times_s.append(processor_s(verb, folder, caches[number]))
@@ -220,24 +228,35 @@ def _copy(folder: Path, to: Path) -> Path:
     return Path(shutil.copytree(folder, to, symlinks=True))
 
 
-def markdown(rows: Iterable[Row], left_out: Iterable[str]) -> str:
-    """Return the rows as a Markdown table, with a sentence about the commands that are left out."""
-    lines = ["| " + " | ".join(HEADINGS) + " |", "|---|---:|---:|---:|"]
-    lines += ["| " + " | ".join(row.cells()) + " |" for row in rows]
-    names = ", ".join(f"`egvs {name}`" for name in left_out)
-    if names:
-        lines += ["", f"Not measured, because libraries of an extra were not installed: {names}."]
-    return "\n".join(lines)
+def merge_rows(table: str, measured: Iterable[Row]) -> list[Cells]:
+    """Return the rows of a table with new measurements, in the order of :data:`VERBS`.
+
+    Parameters
+    ----------
+    table
+        The earlier table in Markdown. Rows of commands that are no longer measured in this form are dropped.
+    measured
+        New rows; each replaces that of the same command.
+    """
+    old = page_tables.read_rows(table, len(HEADINGS))
+    rows = {cells[0]: cells for cells in page_tables.merge_rows(old, [row.cells() for row in measured])}
+    commands = (f"`egvs {verb.command_line}`" for verb in VERBS)
+    return [rows[command] for command in commands if command in rows]
 
 
-def write_between_marks(page: Path, text: str) -> None:
-    """Replace what stands between the marks of a page."""
-    start, end = (re.escape(mark) for mark in MARKS)
-    before = page.read_text(encoding="utf-8")
-    after, count = re.subn(f"{start}.*?{end}", lambda _: f"{MARKS[0]}\n{text}\n{MARKS[1]}", before, flags=re.DOTALL)
-    if count != 1:
-        raise ValueError(f"{page}: expected one pair of marks {' '.join(MARKS)}, got {count}")
-    page.write_text(after, encoding="utf-8")
+def markdown(rows: Sequence[Cells]) -> str:
+    """Return the rows as a Markdown table, with a sentence about the commands of :data:`VERBS` that have none."""
+    text = page_tables.format_table(HEADINGS, rows)
+    commands = {cells[0] for cells in rows}
+    missing = [f"`egvs {verb.name}`" for verb in VERBS if f"`egvs {verb.command_line}`" not in commands]
+    if missing:
+        text += f"\n\nNot measured: {', '.join(missing)}."
+    return text
+
+
+def update_page(page: Path, measured: Iterable[Row]) -> None:
+    """Replace the rows of the measured commands in the table between the marks of a page."""
+    page_tables.replace_between(page, MARKS, lambda table: markdown(merge_rows(table, measured)))
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -246,7 +265,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "verbs", nargs="*", metavar="VERB", help='names of commands, for example "city run"; all if none'
     )
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the table between the marks of this page")
+    parser.add_argument(
+        "--markdown", type=Path, metavar="FILE", help="replace the rows of these commands in the table of this page"
+    )
     chosen = parser.parse_args(arguments)
     known = [verb.name for verb in VERBS]
     unknown = set(chosen.verbs) - set(known)
@@ -268,7 +289,7 @@ def main(arguments: list[str] | None = None) -> None:
             print(*rows[-1].cells(), sep="   ", flush=True)
             shutil.rmtree(folder / str(number))
             if chosen.markdown is not None:
-                write_between_marks(chosen.markdown, markdown(rows, left_out))
+                update_page(chosen.markdown, rows[-1:])
     if left_out:
         print(f"left out: {', '.join(left_out)}")
 

@@ -5,6 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import pytest
+from rich.console import Console
+
+from egvs.cli import accuracy_table
 from egvs.cli.accuracy_table import recommendation_sentences
 from egvs.studies.accuracy import AccuracyStudy
 from egvs.studies.pricing import BestPole
@@ -76,3 +80,19 @@ def test_says_where_a_model_prices_the_setting() -> None:
     modelled = replace(OWN, draws=0, probability_se=math.nan)
     (_, text, _) = recommendation_sentences(study_of(modelled, tolerance=Tolerance(1.0), is_recorded=True))
     assert "(by a model, because the study has too little independent traffic for a test)." in text
+
+
+@pytest.mark.parametrize("width", [190, 120, 90])
+def test_no_cell_is_cut_off_on_a_narrow_terminal(
+    width: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    long = row(
+        "500 frames, step 0.5 s, a frame every 1 s, without sublanes", 12345.6, 12.34, loss_se_points=10.2, draws=9
+    )
+    monkeypatch.setattr(accuracy_table, "console", lambda *_: Console(width=width, highlight=False))
+    accuracy_table.print_study(study_of(OWN, SHORT, long, tolerance=Tolerance(1.0)), "egvs run mini")
+    table = capsys.readouterr().out.partition("\n* no cheaper")[0]
+    assert max(map(len, table.splitlines())) <= width
+    cells = table.replace("\n", " ").split()
+    assert {"*=", "seconds", "loss", "chooses", "~8.0", "~2.0", "~12345.6", "±0.01", "±0.20", "±10.20"} <= set(cells)
+    assert set(long.setting.split()) <= set(cells)

@@ -4,7 +4,9 @@ from pathlib import Path
 
 import pytest
 
+import egvs
 from egvs.cli import answer
+from egvs.report import sections
 from egvs.report.ranking_check import RankingCheck
 from tests.report.test_ranking import by_vehicles
 
@@ -44,6 +46,14 @@ def test_says_what_was_assumed(mini: Path, tmp_path: Path, run_egvs) -> None:
     assert "assumed, not measured: traffic (guessed); positions of the poles." in printed
     assert "traffic (guessed); positions of the poles" in (tmp_path / "out" / "report.html").read_text()
     assert "not measured" not in run_egvs("run", mini, "--out", tmp_path / "two")[1]
+
+
+def test_poles_in_a_lane_and_assumptions_are_one_sentence(mini: Path) -> None:
+    guessed = egvs.load(mini, ["assumed=['traffic (guessed)']"])
+    sentence = "Before you trust this ranking: k02 stands in a lane; assumed, not measured: traffic (guessed)."
+    assert sections.describe_caveats(guessed, "ranking", ["k02 stands in a lane"]) == sentence
+    assert sections.describe_caveats(egvs.load(mini), "plan", ["a", "b"]) == "Before you trust this plan: a and b."
+    assert sections.describe_caveats(egvs.load(mini), "plan") == ""
 
 
 def test_says_that_the_range_of_several_sensors_is_not_modelled_until_it_is(

@@ -13,6 +13,7 @@ from PIL import Image
 
 from egvs.artefacts.readers import read_scores
 from egvs.core import plugins
+from egvs.export import figure
 from egvs.export.figure import FIGURES, draw_figure
 from egvs.report.svg_figures import Bar, FigureStyle, bar_chart
 
@@ -48,6 +49,19 @@ def test_bars_are_proportional_to_the_scores(local: Path, tmp_path: Path) -> Non
     assert bars[1] / bars[0] == pytest.approx(scores[1] / scores[0], abs=0.002)
     titles = [title.text for title in root.iter(f"{SVG}title")]
     assert [title.split(":")[0] for title in titles] == ["pole_b", "pole_a"] or scores[0] == scores[1]
+
+
+def test_ranking_says_how_many_sites_it_leaves_out(
+    local: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    note = "best 1 of 2 sites"
+    complete = drawn(local, "ranking", tmp_path)
+    monkeypatch.setattr(figure, "MAX_BARS", 1)
+    shortened = drawn(local, "ranking", tmp_path)
+    texts = [[text.text for text in root.iter(f"{SVG}text")] for root in (complete, shortened)]
+    assert (note in texts[0], note in texts[1]) == (False, True)
+    last_y = max(float(text.get("y")) for text in shortened.iter(f"{SVG}text"))
+    assert last_y + 4 <= float(shortened.get("viewBox").split()[3])  # letters that go below the line
 
 
 def test_letters_are_on_top_of_their_halo() -> None:

@@ -72,6 +72,17 @@ def test_boundary_surfaces_stand_in_for_a_solid_with_broken_references(tmp_path:
     assert (len(selection.surfaces), selection.unresolved) == (1, 1)
 
 
+def test_closure_surfaces_are_open(tmp_path: Path) -> None:
+    closure = nest(multi_surface([polygon(SQUARE, name="c")]), "boundedBy", "ClosureSurface", "lod2MultiSurface")
+    wall = nest(multi_surface([polygon(SQUARE, name="w")]), "boundedBy", "WallSurface", "lod2MultiSurface")
+    references = lod(2, "Solid", solid(["#c", "#w"]))
+    (with_solid,) = read(tmp_path, city_object("Building", "b", references, closure, wall))
+    (without,) = read(tmp_path, city_object("Building", "b", closure, wall))
+    for building in (with_solid, without):
+        selection = select_surfaces(building)
+        assert (len(selection.surfaces), selection.unresolved) == (1, 0)
+
+
 def test_reversed_surface_is_turned(tmp_path: Path) -> None:
     inner = f"<gml:baseSurface>{polygon(SQUARE)}</gml:baseSurface>"
     turned = f'<gml:OrientableSurface orientation="-">{inner}</gml:OrientableSurface>'
@@ -279,9 +290,9 @@ def test_relief_outside_bounds_is_left_out(tmp_path: Path) -> None:
     far = [(x + 100, y, z) for x, y, z in UP]
     path = write_model(tmp_path / "dem.gml", relief(*(polygon(ring, tag="Triangle") for ring in (UP, far))))
     assert len(read_relief(path).faces) == 2
-    near = read_relief(path, bounds=(-1, 99, 2, 102))  # x is east, the second coordinate of the file
+    near = read_relief(path, lambda crs: (-1, 99, 2, 102))  # x is east, the second coordinate of the file
     assert near.vertices[:, 1].min() == 100.0 and len(near.faces) == 1
-    assert len(read_relief(path, bounds=(500, 500, 501, 501)).faces) == 0
+    assert len(read_relief(path, lambda crs: (500, 500, 501, 501)).faces) == 0
 
 
 def test_relief_without_triangles_is_rejected(tmp_path: Path) -> None:

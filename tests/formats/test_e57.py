@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ CRS = 'LOCAL_CS["survey",UNIT["metre",1]]'
 
 
 def write_e57(path: Path, *scans: tuple[dict[str, Any], Any, Any], crs: str = "") -> Path:
-    """Write scans of columns, a quaternion and a translation each."""
+    """Write scans of columns, a quaternion and a translation each; equal scans give equal bytes."""
     import pye57
     from pye57 import libe57
 
@@ -44,8 +45,10 @@ def write_e57(path: Path, *scans: tuple[dict[str, Any], Any, Any], crs: str = ""
                 self.root.set(name, libe57.VectorNode(image, True))
 
     file = File(str(path), mode="w")
-    for columns, rotation, translation in scans:
-        file.write_scan_raw(columns, rotation=np.asarray(rotation), translation=np.asarray(translation, dtype=float))
+    with mock.patch("uuid.uuid4", return_value="1"):
+        for columns, rotation, translation in scans:
+            turn, shift = np.asarray(rotation), np.asarray(translation, dtype=float)
+            file.write_scan_raw(columns, rotation=turn, translation=shift)
     file.close()
     return path
 

@@ -280,3 +280,30 @@ def test_numbers_look_like_degrees_when_they_would_be_one_point_in_metres() -> N
     assert not georeference.look_like_degrees(CORNERS)
     assert not georeference.look_like_degrees(DEGREES[:1])
     assert not georeference.look_like_degrees(np.array([[10.0, 50.0], [10.5, 50.4]]))
+
+
+def test_other_systems_and_back() -> None:
+    """Degrees at the central meridian by the length of the meridian's arc; and the inverse of from_crs."""
+    frame = WorldFrame(UTM32.projection, (-500_000.0, -5_000_000.0))
+    northing_m = 0.9996 * meridian_arc_m(50.0)
+    at_m = np.array([[0.0, northing_m - 5_000_000.0], [1234.5, 567_890.1]])
+    assert frame.to_crs(at_m, WGS84)[0] == pytest.approx([9.0, 50.0], abs=1e-9)
+    for crs in ("EPSG:25832", "EPSG:31467", "EPSG:3857"):
+        assert frame.from_crs(frame.to_crs(at_m, crs), crs) == pytest.approx(at_m, abs=5e-3)
+
+
+@pytest.mark.parametrize(("crs", "text"), [
+    ("EPSG:32632", "+proj=utm +zone=32 +datum=WGS84 +units=m +no_defs"), (UTM32.projection, UTM32.projection),
+    ("EPSG:6677", "+proj=tmerc +lat_0=36 +lon_0=139.833333333333"),
+])  # fmt: skip
+def test_projection_as_a_proj_string(crs: str, text: str) -> None:
+    found = georeference.proj_string(crs, "map.xodr")
+    assert found.startswith(text)
+    at = np.array([[-1000.0, 2000.0]])
+    there = WorldFrame(crs).to_degrees(at)
+    assert WorldFrame(found).to_degrees(at) == pytest.approx(there, abs=1e-8)
+
+
+def test_unknown_projection_has_no_proj_string() -> None:
+    with pytest.raises(InputError, match="unknown coordinate reference system"):
+        georeference.proj_string("nowhere", "map.xodr")

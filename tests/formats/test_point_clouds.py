@@ -17,9 +17,10 @@ from hypothesis.extra import numpy as hnp
 
 from egvs.core import plugins
 from egvs.core.errors import InputError, MissingBackendError
+from egvs.formats import las as las_format
 from egvs.formats import pcd as pcd_format
 from egvs.formats import ply as ply_format
-from egvs.formats.point_clouds import GROUP, read_points, write_points
+from egvs.formats.point_clouds import GROUP, read_points, stream_points, write_points
 from tests import processes
 from tests.core.test_plugins import install, site  # noqa: F401  the fixture
 
@@ -376,6 +377,46 @@ def test_message_without_lazrs_says_how_to_install_it(tmp_path: Path, monkeypatc
     monkeypatch.setattr(laspy.LazBackend, "detect_available", lambda: ())
     with pytest.raises(InputError, match=r"needs lazrs, which is not installed\. Run pip install 'egvs\[las\]'"):
         read_points(path, "")
+
+
+# --- in chunks ---
+
+
+@needs_laspy
+@pytest.mark.system
+@pytest.mark.parametrize("name", ["a.las", "a.laz"])
+def test_las_comes_in_chunks_beyond_the_limit_of_points(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("EGVS_MAX_POINTS", "10")
+    path, expected = las(tmp_path, name)
+    chunks = list(stream_points(path, ""))
+    assert [(chunk.scan, chunk.station_m) for chunk in chunks] == [(0, None)]
+    assert np.concatenate([chunk.points_m for chunk in chunks]).tobytes() == expected.tobytes()
+
+
+@needs_laspy
+def test_large_las_file_is_never_held_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(las_format, "_CHUNK", 100)
+    path, expected = las(tmp_path, "a.las")
+    chunks = [chunk.points_m for chunk in stream_points(path, "")]
+    assert [len(chunk) for chunk in chunks] == [100, 100, 100]
+    assert np.concatenate(chunks).tobytes() == expected.tobytes()
+
+
+def test_pcd_viewpoint_is_the_station(tmp_path: Path) -> None:
+    (chunk,) = stream_points(put(tmp_path, "a.pcd", pcd_with_viewpoint("10 20 30 1 0 0 0")), "")
+    assert chunk.station_m is not None and chunk.station_m.tolist() == [10, 20, 30]
+    assert chunk.points_m.tolist() == [[11, 22, 33], [14, 25, 36]]
+    (chunk,) = stream_points(put(tmp_path, "a.pcd", ASCII_PCD), "")
+    assert chunk.station_m is None
+
+
+def test_formats_without_chunks_come_at_once_with_missing_returns(tmp_path: Path) -> None:
+    (chunk,) = stream_points(put(tmp_path, "a.csv", "x_m,y_m,z_m\n1,2,3\nnan,0,0\n"), "")
+    assert np.isnan(chunk.points_m).sum() == 1
+    with pytest.raises(InputError, match=r"a\.ply: not a PLY file"):
+        next(stream_points(put(tmp_path, "a.ply", "no"), ""))
 
 
 # --- points with more than x, y, z ---

@@ -125,6 +125,17 @@ def drawn(folder: Path) -> None:
     _simulated(folder, 'network = "net.net.xml"')
 
 
+def terrain(folder: Path) -> None:
+    """The same, in a hollow: points of the ground beyond the roads."""
+    made = _simulated(folder, 'network = "net.net.xml"')
+    text = (made / "scenario.toml").read_text()
+    (made / "scenario.toml").write_text(text.replace("[statics]\n", '[statics]\nterrain = "terrain.ply"\n'))
+    lines = [f"{x} {y} {max(abs(x - 100), abs(y - 100)) / 50}" for x in range(0, 201, 20) for y in range(0, 201, 20)]
+    head = f"ply\nformat ascii 1.0\nelement vertex {len(lines)}\n"
+    properties = "".join(f"property double {axis}\n" for axis in "xyz")
+    (made / "terrain.ply").write_text(head + properties + "end_header\n" + "\n".join(lines) + "\n")
+
+
 def drawn_gz(folder: Path) -> None:
     """The same, gzipped."""
     made = _simulated(folder, 'network = "net.net.xml.gz"')
@@ -274,13 +285,25 @@ def measured(name: str):
     def make(folder: Path) -> None:
         made = mini(folder, ('sensor = "small"', f'sensor = "small"\npoints = "{name}"'))
         (made / "sites.csv").write_text("".join(SITES.splitlines(keepends=True)[:2]))
-        _write_points(made / name)
+        write_cloud(made / name)
 
     return make
 
 
-def _write_points(path: Path) -> None:
+def write_cloud(path: Path) -> None:
+    """Write points of the ground in the format that the suffix names, maybe gzipped."""
     points, form = _points(), path.suffix.removeprefix(".")
+    if form == "gz":
+        plain = path.with_suffix("")
+        write_cloud(plain)
+        path.write_bytes(gzip.compress(plain.read_bytes(), mtime=0))
+        return
+    if form == "e57":
+        from tests.formats.test_e57 import NO_TURN, cartesian, write_e57
+
+        station = np.array([10.0, 12.0, 3.0])
+        write_e57(path, (cartesian(*(points - station)), NO_TURN, station))
+        return
     if form in ("las", "laz"):
         import laspy
 
@@ -337,6 +360,64 @@ def lanelets(name: str):
         if name.endswith(".gz"):
             (folder / name).write_bytes(gzip.compress(path.read_bytes(), mtime=0))
             path.unlink()
+
+    return make
+
+
+def beside_roads(name: str):
+    """A map of roads, and beside it a file with a house north-east of the signals, and a lamp or a ground."""
+    from tests.formats import small_city_models as models
+
+    lat, lon = 52.0006, 10.0008
+    corners = [(lat, lon), (lat, lon + 2e-4), (lat + 1e-4, lon + 2e-4), (lat + 1e-4, lon)]
+    floor, roof = ([(*corner, z_m) for corner in corners] for z_m in (40.0, 48.5))
+    walls = [[floor[i], floor[i - 3], roof[i - 3], roof[i]] for i in range(4)]
+    crs84 = [[[north_east[1], north_east[0]] for north_east in (*corners, corners[0])]]
+
+    def gml() -> str:
+        house = models.solid([models.polygon(ring) for ring in (floor[::-1], roof, *walls)])
+        foot = models.multi_surface([models.polygon([(lat - 0.0012, x[1], 0.0) if i < 2 else (lat - 0.0013, x[1], 0.0)
+                                                     for i, x in enumerate(corners)])])  # fmt: skip
+        storeys = "<x:storeysAboveGround>3</x:storeysAboveGround>"
+        return models.city_model(
+            models.city_object("Building", "h", models.nest(house, "lod1Solid")),
+            models.city_object("Building", "f", storeys, models.nest(foot, "lod0FootPrint")),
+            srs_name="EPSG:4326",
+        )
+
+    def dem() -> str:
+        cells = [(i, j) for i in range(-9, 9) for j in range(-9, 9)]
+        triangles = []
+        for i, j in cells:
+            square = [
+                (52 + (i + a) * 5e-4, 10 + (j + b) * 8e-4, 40.0 + 0.1 * (i + a))
+                for a, b in ((0, 0), (0, 1), (1, 1), (1, 0))
+            ]
+            triangles += [models.polygon(half, tag="Triangle") for half in (square[:3], [square[0], *square[2:]])]
+        tin = models.nest("".join(triangles), "reliefComponent", "TINRelief", "tin", "TriangulatedSurface", "patches")
+        return models.city_model(models.city_object("ReliefFeature", "r", tin), srs_name="EPSG:4326")
+
+    def city_json() -> str:
+        points = [*floor, *roof]
+        sides = [[i, (i + 1) % 4, (i + 1) % 4 + 4, i + 4] for i in range(4)]
+        shell = [[ring] for ring in ([3, 2, 1, 0], [4, 5, 6, 7], *sides)]
+        solid = {"type": "Solid", "lod": "1.2", "boundaries": [shell]}
+        scale = [1e-7, 1e-7, 0.001]
+        return json.dumps({
+            "type": "CityJSON", "version": "2.0", "transform": {"scale": scale, "translate": [0, 0, 0]},
+            "metadata": {"referenceSystem": "https://www.opengis.net/def/crs/EPSG/0/4326"},
+            "CityObjects": {"h": {"type": "Building", "geometry": [solid]}},
+            "vertices": [[round(value / unit) for value, unit in zip(point, scale, strict=True)] for point in points],
+        })  # fmt: skip
+
+    def footprints() -> str:
+        return collection(feature({"type": "Polygon", "coordinates": crs84}, name="h", height=8.5), crs="OGC:CRS84")
+
+    texts = {"city.gml": gml, "dem.gml": dem, "city.json": city_json, "houses.geojson": footprints}
+
+    def make(folder: Path) -> None:
+        extract("map.osm")(folder)
+        (folder / name).write_text(texts[name](), encoding="utf-8")
 
     return make
 

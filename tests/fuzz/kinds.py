@@ -86,6 +86,13 @@ def _lanelets(name: str) -> Kind:
     return Kind(f"new {name}", name, bases.lanelets(name), meaning.gzipped(meaning.xml), verb=verb, results=made)
 
 
+def _beside(name: str, reads: Meaning) -> Kind:
+    """A map of what stands beside roads, or of their ground, which becomes part of a scenario."""
+    made = ("made/network.net.xml", "made/sites.csv", "made/statics.geojson", "made/*.ply")
+    verb = ("new", "made", "--from", "map.osm", name)
+    return Kind(f"new {name}", name, bases.beside_roads(name), reads, verb=verb, results=made)
+
+
 def _city(name: str, file: str, reads: Meaning) -> Kind:
     """What the cut of a city's traffic reads."""
     verb = ("city", "traffic", "town")
@@ -115,18 +122,22 @@ _ALL = (
     _input("mesh.glb", "house.glb", bases.mesh("house.glb"), meaning.glb),
     _input("mesh.stl", "house.stl", bases.mesh("house.stl"), meaning.stl),
     _input("mesh.ply", "house.ply", bases.mesh("house.ply"), meaning.ply),
+    Kind("terrain.ply", "scenario/terrain.ply", bases.terrain, meaning.ply, results=("out/statics.ply",)),
     _input("sites.csv", "sites.csv", bases.plain, meaning.rows),
     _input("sites.geojson", "sites.geojson", bases.sites, meaning.text_json),
     _input("beams.csv", "beams.csv", bases.beams, meaning.rows),
     _input("scan.csv", "points.csv", bases.measured("points.csv"), meaning.rows),
     _input("scan.las", "points.las", bases.measured("points.las"), meaning.bytes_themselves),
     _input("scan.laz", "points.laz", bases.measured("points.laz"), meaning.bytes_themselves),
+    _input("scan.e57", "points.e57", bases.measured("points.e57"), meaning.bytes_themselves),
     _input("scan.ply", "points.ply", bases.measured("points.ply"), meaning.ply),
     _input("scan.ply binary", "binary.ply", bases.measured("binary.ply"), meaning.ply),
     _input("scan.pcd", "points.pcd", bases.measured("points.pcd"), meaning.pcd),
     _input("scan.pcd binary", "binary.pcd", bases.measured("binary.pcd"), meaning.pcd),
     _new("map.osm", meaning.gzipped(meaning.xml)), _new("map.osm.gz", meaning.gzipped(meaning.xml)),
     _new("map.osm.pbf", meaning.bytes_themselves), _lanelets("lanelets.osm"), _lanelets("lanelets.osm.gz"),
+    _beside("city.gml", meaning.bytes_themselves), _beside("dem.gml", meaning.bytes_themselves),
+    _beside("city.json", meaning.text_json), _beside("houses.geojson", meaning.text_json),
     Kind("wanted junctions.csv", "wanted.csv", bases.wanted, meaning.rows, results=("made/junctions/*/*.csv",),
          verb=("city", "new", "made", "--osm", "map.osm", "--junctions", "wanted.csv")),
     _city("city.toml", "city.toml", meaning.toml), _city("junctions.csv", "junctions.csv", meaning.rows),

@@ -1,7 +1,7 @@
 """Damages a file's bytes in the ways that files get damaged, and in those that someone who means harm would choose.
 
 A mutant is one to three changes on top of each other, all drawn from one generator: the same seed, the same mutant.
-Text gets changes that know of numbers, words, lines, brackets and encodings; gzip and zip are also opened, changed
+Text gets changes that know of numbers, words, lines, brackets and encodings; gzip, zip and E57 are also opened, changed
 inside, and closed again with right checksums, for else no mutant would come further than the checksum.
 """
 
@@ -16,6 +16,8 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from functools import cache
+
+from tests.formats.e57_pages import with_checksums
 
 Change = Callable[[random.Random, bytes], bytes]
 
@@ -70,6 +72,8 @@ def _changed(rng: random.Random, data: bytes) -> bytes:
         return _in_gzip(rng, data)
     if data.startswith(b"PK\x03\x04") and rng.random() < 0.7:
         return _in_zip(rng, data)
+    if data.startswith(b"ASTM-E57") and rng.random() < 0.7:
+        return _in_e57(rng, data)
     text = _as_text(data)
     if text is None or rng.random() < 0.25:
         return rng.choice(_ON_BYTES)(rng, data)[:_MOST_BYTES]
@@ -183,6 +187,23 @@ def _in_zip(rng: random.Random, data: bytes) -> bytes:
     chosen = rng.choice(sorted(members))
     members[chosen] = _changed(rng, members[chosen])
     return zipped(members)
+
+
+def _in_e57(rng: random.Random, data: bytes) -> bytes:
+    """Other bytes of the same length, in its XML more often than not, behind the right checksums."""
+    begin = max(0, data.find(b"<?xml")) if rng.random() < 0.7 else 0
+    change = rng.choice((_flip, _overwrite, _blank, _digit))
+    changed = data[:begin] + change(rng, data[begin:])
+    return with_checksums(changed[: len(data)])
+
+
+def _digit(rng: random.Random, data: bytes) -> bytes:
+    """A digit becomes another one, or a sign."""
+    places = [match.start() for match in re.finditer(rb"[0-9]", data)]
+    if not places:
+        return _flip(rng, data)
+    at = rng.choice(places)
+    return data[:at] + rng.choice((b"0", b"9", b"-", b"e", b".")) + data[at + 1 :]
 
 
 def zipped(members: dict[str, bytes]) -> bytes:

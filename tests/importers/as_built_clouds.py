@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from egvs.core.grid import FloatArray, Roi
+from egvs.core.grid import FloatArray, Grid, Roi
 from egvs.importers.moving_points import StationScan
 from egvs.sensors.sensor import Sensor
 from egvs.world.mesh import World
@@ -20,6 +20,13 @@ SURVEYOR = Sensor(
     "surveyor", tuple(np.linspace(-40.0, 50.0, 128).round(4).tolist()), (0.0,) * 128, 1800, 200.0, "made up"
 )
 """128 channels, 0.2 degrees between columns."""
+
+
+SITES_M = np.array(
+    [(x, y, 4.5) for x, y in ((150, 258), (175, 258), (200, 255), (220, 260), (240, 258),
+                              (150, 217), (170, 217), (195, 216), (221, 216), (240, 217))]
+)  # fmt: skip
+"""Ten sensors on both sides of the junction of nishishinjuku."""
 
 
 def stations_around(roi: Roi, height_m: float = 2.0) -> FloatArray:
@@ -43,6 +50,13 @@ def scan_stations(
         measured = ranges[hit] + rng.normal(0.0, noise_m, np.count_nonzero(hit))
         scans.append(StationScan(station, station + directions[hit] * measured[:, None]))
     return scans
+
+
+def random_voxel_centres(grid: Grid, count: int, seed: int = 1) -> FloatArray:
+    """Centres of random voxels of a grid, (count, 3)."""
+    index = np.random.default_rng(seed).integers(0, grid.shape, (count, 3))
+    centres: FloatArray = (index + 0.5) * grid.voxel_m + np.asarray(grid.origin_m)
+    return centres
 
 
 def visible_points(caster: Caster, roi: Roi, site_m: FloatArray, points_m: FloatArray) -> NDArray[np.bool_]:

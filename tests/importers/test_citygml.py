@@ -385,6 +385,17 @@ def test_cityjson_footprint_has_the_measured_height(tmp_path: Path) -> None:
     assert solid_.geometry.area == pytest.approx(200.0)
 
 
+def test_closure_surfaces_of_cityjson_are_open(tmp_path: Path) -> None:
+    document = city_json()
+    objects = document["CityObjects"]
+    assert isinstance(objects, dict)
+    surfaces = [{"type": "WallSurface"}, {"type": "ClosureSurface"}]
+    objects["part"]["geometry"][0]["semantics"] = {"surfaces": surfaces, "values": [[0, 0, 1, None, 0, 0]]}
+    (tmp_path / "a.json").write_text(json.dumps(document))
+    house = cityjson.read_solids([tmp_path / "a.json"], CONTEXT).meshes[0]
+    assert (len(house.faces), house.is_closed) == (10, False)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

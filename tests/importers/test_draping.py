@@ -16,13 +16,15 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.formats import ply
 from egvs.formats.georeference import WorldFrame
-from egvs.importers import opendrive, raster_terrain
-from egvs.importers.draping import STEP_M, TOLERANCE_M, drape_network, level_difference_m
+from egvs.formats.osm import read_osm
+from egvs.importers import opendrive, osm_network, raster_terrain, road_levels
+from egvs.importers.draping import STEP_M, TOLERANCE_M, drape_network, level_difference_m, roads_above_others
 from egvs.importers.ground_heights import ground_points
 from egvs.importers.map_parts import MapContext, RoadOptions
 from egvs.importers.network_heights import find_shapes, node_of_internal, shift_heights
 from egvs.traffic import network, sumo
 from tests.formats.test_rasters import write_tiff
+from tests.importers.small_maps import degrees, street, write_map
 from tests.importers.test_opendrive import TOWN01
 
 
@@ -189,6 +191,31 @@ def test_shifted_heights_change_nothing_else(tmp_path: Path) -> None:
     assert heights == {12.5} and read(there, tmp_path).has_heights
     without = re.sub(r",12\.500(?=[ \"])", "", there).replace(' z="12.500"', "")
     assert without == text
+
+
+@pytest.mark.system
+def test_bridge_of_a_map_is_an_edge_of_its_own(tmp_path: Path) -> None:
+    """Main leads over Low by the bridge 2, which netconvert would merge with the streets 1 and 3."""
+    nodes = {1: (0.0, 0.0), 2: (100.0, 0.0), 3: (200.0, 0.0), 4: (300.0, 0.0), 5: (0.0, 90.0), 6: (0.0, -90.0)}
+    nodes |= {7: (300.0, 90.0), 8: (300.0, -90.0), 9: (150.0, 90.0), 10: (150.0, -90.0)}
+    ways = [
+        street("Main", 1, 2), street("Main", 2, 3, bridge="yes"), street("Main", 3, 4), street("Low", 9, 10),
+        street("West", 5, 1, 6), street("East", 7, 4, 8), street("North", 5, 9, 7), street("South", 6, 10, 8),
+    ]  # fmt: skip
+    extract = read_osm(write_map(tmp_path / "map.osm", nodes, ways))
+    flags = osm_network.netconvert_flags(extract, lefthand=False, walk=False)
+    merged = osm_network.build_network(extract, tmp_path / "map.osm", flags)[1].network.edges
+    assert not road_levels.edge_levels([edge.id for edge in merged], extract)
+    flags += road_levels.keep_levels_flags(extract)
+    text, streets = osm_network.build_network(extract, tmp_path / "map.osm", flags)
+    levels = road_levels.edge_levels([edge.id for edge in streets.network.edges], extract)
+    assert levels == {"2": 1, "-2": 1}
+    west_m = np.array(streets.node_positions({1: degrees((0.0, 0.0))})[1])
+    valley = Function(lambda x, y: VALLEY.of(x - west_m[0], y))
+    draped = drape_network(text, valley, tuple(west_m), levels)
+    assert set(roads_above_others(draped.text)) == {("2", "4"), ("2", "-4"), ("-2", "4"), ("-2", "-4")}
+    ids = [edge.id for edge in streets.network.edges if edge.id.lstrip("-") not in "24"]
+    assert road_levels.edge_levels([*ids, "x", ":2_0", "2#x"], extract) == {}
 
 
 def test_nodes_of_internal_elements() -> None:

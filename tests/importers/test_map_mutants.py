@@ -1,116 +1,78 @@
-"""Damaged files of static objects end in an InputError that names the file, or in a result; never in another error.
-
-The mutants are those of the fuzzer (``tests/fuzz/mutating.py``).
-"""
+"""Damaged maps and terrain: every mutant is read, or refused with one message; no other exception, no endless work."""
 
 from __future__ import annotations
 
-import json
 import random
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 
-import numpy as np
 import pytest
-import shapely
-import trimesh
+from shapely.geometry import box
 
-from egvs.core.errors import InputError
-from egvs.importers import citygml, cityjson, footprint_maps, mesh_maps
-from egvs.importers.map_parts import Alignment, MapContext, SolidMap
-from tests.formats.small_city_models import city_model, city_object, multi_surface, nest, polygon
+from egvs.core.errors import EgvsError
+from egvs.formats.georeference import WorldFrame
+from egvs.importers import landxml_terrain, opendrive, raster_terrain
+from egvs.importers.map_parts import Alignment, MapContext, RoadOptions
+from tests.formats.test_landxml import FACES, landxml
+from tests.formats.test_rasters import EAST, NORTH, plane_cells, write_ascii, write_tiff
 from tests.fuzz.mutating import mutant
-from tests.importers.test_citygml import (
-    CONTEXT,
-    FRAME,
-    REFERENCE,
-    TEMPLATE,
-    at,
-    city_json,
-    house,
-    implicit,
-)
+from tests.importers import opendrive_maps as maps
 
-ALIGNED = MapContext(FRAME, CONTEXT.window, Alignment(np.array([[0.0, 0], [1, 0]]), np.array([[0.0, 0], [1, 0]])))
+CONTEXT = MapContext(WorldFrame("EPSG:32632", (-EAST, -NORTH)), box(0, 0, 120, 80))
 
 
-def _citygml() -> bytes:
-    ring = [at(30, 0, 2.0), at(35, 0, 2.0), at(35, 5, 2.0)]
-    foot = nest(multi_surface([polygon(ring)]), "lod0FootPrint")
-    storeys = "<x:storeysAboveGround>3</x:storeysAboveGround>"
-    members = [house("h", 0, 0), city_object("Building", "f", storeys, foot)]
-    members += [implicit("i", at(20, 30, 3), TEMPLATE), implicit("j", at(60, 30, 3), REFERENCE)]
-    return city_model(*members).encode()
+def _tiff(folder: Path) -> bytes:
+    return write_tiff(
+        folder / "base.tif", plane_cells().astype("float32"), compress="deflate", nodata=-9999
+    ).read_bytes()
 
 
-def _geojson() -> bytes:
-    ring = FRAME.to_degrees(np.array([[0.0, 0], [9, 0], [9, 9], [0, 0]])).tolist()
-    geometry = {"type": "Polygon", "coordinates": [ring]}
-    feature = {"type": "Feature", "properties": {"height": 9, "name": "a"}, "geometry": geometry}
-    return json.dumps({"type": "FeatureCollection", "features": [feature, feature]}).encode()
+def _ascii(folder: Path) -> bytes:
+    return write_ascii(folder / "base.asc", plane_cells()).read_bytes()
 
 
-def _mesh(suffix: str) -> Callable[[], bytes]:
-    def make() -> bytes:
-        data = trimesh.creation.box((4, 2, 6)).export(file_type=suffix)
-        return data.encode() if isinstance(data, str) else bytes(data)
-
-    return make
+def _landxml(folder: Path) -> bytes:
+    head = '<Units><Metric linearUnit="meter"/></Units><CoordinateSystem epsgCode="32632"/>'
+    return landxml(FACES, head).replace(">2000 1000", f">{NORTH} {EAST}").encode()
 
 
-FORMATS: dict[str, tuple[ModuleType, Callable[[], bytes]]] = {
-    "gml": (citygml, _citygml),
-    "city.json": (cityjson, lambda: json.dumps(city_json()).encode()),
-    "geojson": (footprint_maps, _geojson),
-    "obj": (mesh_maps, _mesh("obj")),
-    "ply": (mesh_maps, _mesh("ply")),
-    "stl": (mesh_maps, _mesh("stl")),
-    "glb": (mesh_maps, _mesh("glb")),
+def _opendrive(folder: Path) -> bytes:
+    signal = '<signal id="s1" s="95" t="-8" dynamic="yes" orientation="+" type="1000001"/>'
+    return maps.merge(signal).encode()
+
+
+def _read_aligned(path: Path) -> None:
+    import numpy as np
+
+    here = np.array([[EAST, NORTH], [EAST + 100, NORTH]])
+    context = MapContext(None, CONTEXT.window, Alignment(here, here - [EAST, NORTH]))
+    raster_terrain.read_terrain([path], context).height_m(np.array([[30.0, 30.0]]))
+
+
+READERS: dict[str, tuple[Callable[[Path], bytes], Callable[[Path], object]]] = {
+    "a.tif": (_tiff, lambda path: raster_terrain.read_terrain([path], CONTEXT)),
+    "a.asc": (_ascii, _read_aligned),
+    "a.xml": (_landxml, lambda path: landxml_terrain.read_terrain([path], CONTEXT)),
+    "a.xodr": (_opendrive, lambda path: opendrive.read_roads(path, RoadOptions(walk=True))),
 }
 
 
-def check(result: SolidMap) -> None:
-    """Whatever a reader accepts is finite and refers to its own vertices."""
-    for mesh in result.meshes:
-        assert np.isfinite(mesh.vertices_m).all() and len(mesh.faces)
-        assert mesh.faces.min() >= 0 and mesh.faces.max() < len(mesh.vertices_m)
-    for solid in result.solids:
-        assert solid.geometry.is_valid and 0 < solid.height_m - solid.base_m <= 1000
-        assert np.isfinite(shapely.get_coordinates(solid.geometry)).all()
-
-
-def read_mutants(folder: Path, suffix: str, count: int) -> tuple[int, int]:
-    """Return how many mutants were read, and how many rejected."""
-    reader, make = FORMATS[suffix]
-    sound = make()
-    path = folder / f"map.{suffix}"
-    path.write_bytes(sound)
-    original = reader.read_solids([path], ALIGNED)
-    check(original)
-    assert original.meshes or original.solids
-    read = rejected = 0
-    for seed in range(count):
-        path.write_bytes(mutant(random.Random(seed), sound))
-        try:
-            check(reader.read_solids([path], ALIGNED))
-            read += 1
-        except InputError as error:
-            assert str(path) in str(error), seed
-            assert len(str(error)) < 4000, seed
-            rejected += 1
-    return read, rejected
-
-
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_some_mutants(tmp_path: Path, suffix: str) -> None:
-    read, rejected = read_mutants(tmp_path, suffix, 25)
-    assert read + rejected == 25 and rejected > 0
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_200_mutants(tmp_path: Path, suffix: str) -> None:
-    read, rejected = read_mutants(tmp_path, suffix, 200)
-    print(suffix, read, rejected)
-    assert read + rejected == 200 and rejected > 20
+@pytest.mark.system
+@pytest.mark.parametrize("name", READERS)
+def test_mutants_are_read_or_refused(name: str, tmp_path: Path) -> None:
+    make, read = READERS[name]
+    data = make(tmp_path)
+    path = tmp_path / name
+    path.write_bytes(data)
+    read(path)
+    refused = 0
+    for case in range(200):
+        path.write_bytes(mutant(random.Random(f"{name}{case}"), data))
+        try:
+            read(path)
+        except EgvsError as error:
+            assert name in str(error) and "\n\n" not in str(error), (case, error)
+            assert error.exit_code == 2, (case, error)
+            refused += 1
+    assert 30 < refused < 200

@@ -15,6 +15,7 @@ from egvs.core.errors import InputError
 from egvs.importers import alignment, static_objects, sumo_network
 from egvs.importers.map_parts import MapContext, MappedMesh, SolidMap
 from egvs.importers.map_readers import MapFile
+from egvs.importers.new_scenario import assumed_sizes, scenario_notes
 from egvs.importers.osm_solids import ImportCounts, MappedSolid
 from egvs.importers.road_source import NetworkRoads
 from egvs.importers.static_objects import REPLACED
@@ -101,6 +102,19 @@ def test_heights_above_sea_level_are_lowered_to_the_ground() -> None:
     assert "40.25 m, from the lowest points of the objects nearest to the junction, is subtracted" in summary.notes[0]
 
 
+def test_buildings_without_a_height_get_that_of_their_neighbours() -> None:
+    known = [block(f"m{n}", (100.0 + 20 * n, 100, 0), (10, 10, 12.0 + n)) for n in range(3)]
+    unknown = MappedSolid("x", "building", box(100, 130, 110, 140), 9.0, "default")
+    counts = ImportCounts()
+    counts.keep(unknown)
+    footprints = reader("footprints", SolidMap((unknown,), counts=counts))
+    objects = collect(reader("city", SolidMap(meshes=tuple(known))), footprints)
+    assert [(solid.height_m, solid.height_source) for solid in objects.solids] == [(13.0, "neighbours")]
+    assert objects.counts.heights["building"] == {"neighbours": 1}
+    assert "1 of 1 buildings have neither height nor levels: the median" in scenario_notes(True, objects.counts)[0]
+    assert assumed_sizes(objects.counts) == ["heights of 1 of 1 buildings"]
+
+
 def test_mesh_in_lanes_is_reported() -> None:
     beside, above, inside = (
         block("beside", (100, 100, 0), (9, 9, 9)),
@@ -109,7 +123,7 @@ def test_mesh_in_lanes_is_reported() -> None:
     )
     assert collect(reader("one", SolidMap(meshes=(beside, above)))).maps[0].notes == ()
     (note,) = collect(reader("two", SolidMap(meshes=(beside, above, inside)))).maps[0].notes
-    assert note.startswith("1 of 3 objects stands in lanes")
+    assert note == "1 of 3 objects stands in lanes; check the position of the map: inside"
 
 
 def test_footprint_is_cut_at_the_carriageway() -> None:

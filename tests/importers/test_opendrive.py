@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from egvs.core.errors import InputError
 from egvs.formats.georeference import WorldFrame
+from egvs.formats.opendrive import read_opendrive
 from egvs.importers import opendrive
 from egvs.importers.map_parts import RoadMap, RoadOptions, RoadReader
-from egvs.traffic import network
+from egvs.importers.opendrive_check import compare_with_map, read_made_network
+from egvs.traffic import network, sumo
 from egvs.traffic.network import Network
 from tests.importers import opendrive_maps as maps
 from tests.importers.opendrive_maps import geometry, lane, road, section
 
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
 TOWN01 = Path(__file__).parents[3] / "shared" / "real" / "opendrive" / "town01.xodr.gz"
 
 OFFSET = '<offset x="500000" y="5400000" z="120" hdg="{}"/>'
@@ -93,6 +98,57 @@ def test_text_has_no_date_and_no_path(tmp_path: Path) -> None:
 
 
 @pytest.mark.system
+def test_connections_of_lanes_without_links_are_guesses(tmp_path: Path) -> None:
+    """Lane -2 of road 1 has no link; netconvert connects a lane to the one of the same number if no lane has links."""
+    two = section([lane(-1), lane(-2)])
+    second = road("2", 100, geometry(100, 0, 0, 100), two, "predecessor road 1 end")
+    first = road("1", 100, geometry(0, 0, 0, 100), two, "successor road 2 start")
+    road_map, roads = convert(tmp_path, maps.opendrive(first, second))
+    assert turns(roads) == {("-1", 0, "-2", 0), ("-1", 1, "-2", 1)}
+    expected = "2 connections are guessed, from lanes that the map links to none: -1 to -2."
+    assert expected in road_map.notes
+
+
+@pytest.mark.system
+def test_patch_removes_connections(tmp_path: Path) -> None:
+    roads = convert(tmp_path, maps.merge())[1]
+    made = read_made_network(tmp_path / "net.net.xml")
+    found = compare_with_map(made, read_opendrive(tmp_path / "map.xodr"), mirrored=False)
+    wrong = replace(found, added=(("-1", 0, "-2", 0),))
+    (tmp_path / "network.net.xml").write_bytes((tmp_path / "net.net.xml").read_bytes())
+    name = opendrive._patch(tmp_path, made, wrong, RoadOptions(), tmp_path / "map.xodr")
+    patched = network.read_net_xml(tmp_path / name)
+    assert turns(patched) == {("-1", 1, "-2", 0)} == turns(roads) - {("-1", 0, "-2", 0)}
+
+
+def test_connections_that_contradict_the_map_are_found(tmp_path: Path) -> None:
+    """Lane -1 leads to lane -2 in the map, but to lane -1 in the network."""
+    network_text = (
+        '<net><location netOffset="0,0"/>{}<connection from="-1" to="-2" fromLane="0" toLane="0" dir="s"/>'
+        '<connection from="-1" to="-2" fromLane="1" toLane="1" dir="s"/></net>'
+    )
+    edge = '<edge id="-{0}">{1}</edge>'
+    shape = '<lane index="{0}" type="driving" shape="{1},{2} {3},{2}"><param key="origId" value="{4}_{5}"/></lane>'
+    edges = ""
+    for number, x in ((1, 0), (2, 100)):
+        pieces = [shape.format(i, x, -5.25 + 3.5 * i, x + 100, number, i - 2) for i in (0, 1)]
+        edges += edge.format(number, "".join(pieces))
+    (tmp_path / "n.net.xml").write_text(network_text.format(edges))
+    linked = section([lane(-1, link="successor -2"), lane(-2)])
+    parts = [
+        road("1", 100, geometry(0, 0, 0, 100), linked, "successor road 2 start"),
+        road("2", 100, geometry(100, 0, 0, 100), section([lane(-1), lane(-2)]), "predecessor road 1 end"),
+    ]
+    (tmp_path / "map.xodr").write_text(maps.opendrive(*parts))
+    found = compare_with_map(
+        read_made_network(tmp_path / "n.net.xml"), read_opendrive(tmp_path / "map.xodr"), mirrored=False
+    )
+    assert [(a.index, b.index) for a, b in found.missing.values()] == [(1, 0)]
+    assert (found.added, found.guessed) == ((("-1", 1, "-2", 1),), (("-1", 0, "-2", 0),))
+    assert found.lost_lanes == () and found.lanes == 4 and max(found.off_m.values()) < 1e-9
+
+
+@pytest.mark.system
 def test_lane_drop_is_reported(tmp_path: Path) -> None:
     road_map, roads = convert(tmp_path, maps.lane_drop())
     notes = " ".join(road_map.notes)
@@ -141,6 +197,20 @@ def test_signals_become_lights_and_signs_are_counted(tmp_path: Path) -> None:
     alone = road("1", 100, geometry(0, 0, 0, 100), section([lane(-1), lane(-2)]), signals=light)
     road_map, roads = convert(tmp_path, maps.opendrive(alone))
     assert "Traffic lights of these roads have no effect: 1." in road_map.notes and roads.cycle_s == 0
+
+
+@pytest.mark.system
+def test_road_over_another_is_reported(tmp_path: Path) -> None:
+    """Road 2 crosses road 1 in its middle, 6 m higher."""
+    one_way = section([lane(-1)])
+    high = '<elevation s="0" a="6" b="0" c="0" d="0"/>'
+    low = road("1", 100, geometry(0, 0, 0, 100), one_way)
+    over = road("2", 100, geometry(50, -50, math.pi / 2, 100), one_way, elevation=high)
+    road_map, roads = convert(tmp_path, maps.opendrive(low, over))
+    assert any("1 times roads lead over others: -2 over -1." in note for note in road_map.notes)
+    assert not {"-1", "-2"} & {c for pair in turns(roads) for c in pair}
+    flat = maps.opendrive(low, over.replace('a="6"', 'a="1"'))
+    assert not any("lead over" in note for note in convert(tmp_path, flat)[0].notes)
 
 
 @pytest.mark.system
@@ -200,10 +270,56 @@ def test_map_for_lefthand_traffic(tmp_path: Path) -> None:
 
 @pytest.mark.system
 def test_option_draws_lanes_on_the_left(tmp_path: Path) -> None:
-    """As netconvert writes networks for left-hand traffic: without a rule, with ids of right-hand traffic."""
+    """Maps up to version 1.4 do not state a rule."""
     road_map, roads = convert(tmp_path, maps.opendrive(*maps.two_roads()), lefthand=True)
     assert lanes(roads)["-1_0"].shape_m[:, :2].tolist() == [[0, 1.75], [100, 1.75]]
     assert "4 of 4 lanes for vehicles and 2 of 2 turns" in " ".join(road_map.notes)
+    with pytest.raises(InputError, match=r"is for right-hand traffic: 2 turns are from lanes on the right, 0 from"):
+        convert(tmp_path, maps.merge(), lefthand=True)
+
+
+@pytest.mark.system
+def test_lanes_on_the_wrong_side_are_sorted(tmp_path: Path) -> None:
+    """SUMO writes connecting roads for left-hand traffic with negative ids under <left>, in the order -1, -2."""
+    first, through = section([lane(-1), lane(-2)]), [lane(n, link=f"predecessor {n}, successor {n}") for n in (-1, -2)]
+    parts = [
+        road("1", 100, geometry(0, 0, 0, 100), first, "successor junction 9"),
+        road("2", 100, geometry(120, 0, 0, 100), first, "predecessor junction 9"),
+        road("5", 20, geometry(100, 0, 0, 20), section(through), "predecessor road 1 end, successor road 2 start",
+             junction="9").replace("right>", "left>"),
+        maps.junction("9", ("1", "5", "start", "-1:-1 -2:-2")),
+    ]  # fmt: skip
+    road_map, roads = convert(tmp_path, maps.opendrive(*parts))
+    assert turns(roads) == {("-1", 0, "-2", 0), ("-1", 1, "-2", 1)}
+    assert "4 of 4 lanes for vehicles and 2 of 2 turns" in road_map.notes[0]
+
+
+@pytest.mark.system
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scenario", "lefthand", "most_m"), [("nishishinjuku", True, 0.02), ("roundabout", False, 1.4)]
+)
+def test_network_written_as_opendrive_comes_back(scenario: str, lefthand: bool, most_m: float, tmp_path: Path) -> None:
+    """All lanes with the same index, all connections, all signals; junctions of the ring cut lanes by 1.3 m more."""
+    source = SCENARIOS / scenario / "network.net.xml"
+    (tmp_path / "before.net.xml").write_bytes(source.read_bytes())
+    flags = ["--opendrive-output.lefthand-left"] if lefthand else []
+    sumo.run_program("netconvert", ["-s", "before.net.xml", "--opendrive-output", "map.xodr", *flags], tmp_path)
+    before = network.read_net_xml(source)
+    _, after = read(tmp_path / "map.xodr", tmp_path, lefthand=lefthand)
+
+    def ends_m(roads: Network) -> np.ndarray:
+        return np.array([[*lane.shape_m[0, :2], *lane.shape_m[-1, :2]] for lane in lanes(roads).values()])
+
+    off_m, index = KDTree(ends_m(before)).query(ends_m(after))
+    assert off_m.max() < most_m and sorted(index) == list(range(len(lanes(before))))
+    names = list(lanes(before))
+    match = dict(zip(lanes(after), (names[number] for number in index), strict=True))
+    assert all(name.rpartition("_")[2] == other.rpartition("_")[2] for name, other in match.items())
+    expected = {(f"{source}_{i}", f"{target}_{j}") for source, i, target, j in turns(before)}
+    assert {(match[f"{source}_{i}"], match[f"{target}_{j}"]) for source, i, target, j in turns(after)} == expected
+    lights = [sum(junction.type == "traffic_light" for junction in roads.junctions) for roads in (before, after)]
+    assert lights[0] == lights[1]
 
 
 def beside(kinds: str) -> str:

@@ -93,7 +93,7 @@ def edited(tmp_path: Path, *changes: tuple[str, str]) -> Path:
 # --- what is in the scenario ---------------------------------------------------------------------------------------
 def test_heights_by_source(made: Made) -> None:
     heights = made[1].statics.heights
-    assert heights["building"] == {"height": 5, "levels": 3, "default": 3}
+    assert heights["building"] == {"height": 5, "levels": 3, "neighbours": 3}
     assert heights["roof"] == {"type": 1}
     assert heights["tree"] == {"height": 1, "default": 7}
     assert heights["barrier"] == {"height": 1, "default": 3}
@@ -140,7 +140,7 @@ def test_every_object_is_used_or_counted(footprints: dict[str, Any], made: Made)
         ("way/2001", 12.0, 0.0, "height"),
         ("way/2002", 12.192, 0.0, "height"),
         ("way/2003", 9.0, 0.0, "levels"),
-        ("way/2004", 9.0, 0.0, "default"),
+        ("way/2004", 9.0, 0.0, "neighbours"),
         ("way/2005", 6.0, 0.0, "levels"),
         ("way/2006", 9.0, 3.0, "height"),
         ("way/2014", 20.0, 0.0, "height"),

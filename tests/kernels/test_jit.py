@@ -34,7 +34,7 @@ def package(tmp_path: Path) -> Path:
     (tmp_path / "egvs" / "__init__.py").write_text("")
     shutil.copytree(PACKAGE / "core", tmp_path / "egvs" / "core", ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(PACKAGE / "kernels" / "__init__.py", kernels)
-    for name in ("jit.py", "kernel_cache.py", "cache_folder.py"):
+    for name in ("jit.py", "kernel_cache.py"):
         shutil.copy(PACKAGE / "kernels" / name, kernels)
     (kernels / "inner.py").write_text(INNER.format(1))
     (kernels / "outer.py").write_text(OUTER)

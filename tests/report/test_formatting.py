@@ -34,6 +34,12 @@ def test_differences_are_in_percentage_points_or_units() -> None:
     assert (detections.change_unit, egvs.change_unit) == ("percentage points", "bit")
 
 
+def test_difference_that_is_rounded_to_zero_has_no_minus() -> None:
+    assert SCORE_LABELS["expected_detections"].change(-0.0004) == "0.0"
+    assert SCORE_LABELS["expected_detections"].change(-0.0006) == "-0.1"
+    assert SCORE_LABELS["egvs"].change(-0.4, 0.1) == "0 ± <1"
+
+
 def test_small_standard_error_is_not_written_as_zero() -> None:
     egvs, detections = SCORE_LABELS["egvs"], SCORE_LABELS["expected_detections"]
     assert detections.with_error(0.999, 0.0004) == "99.9 ± <0.1%"

@@ -122,6 +122,10 @@ def test_difference_of_unknown_error_is_shown_without_one() -> None:
     assert difference.is_clear
 
 
+def test_difference_that_is_rounded_to_zero_has_no_minus() -> None:
+    assert format_difference(ScoreDifference(-0.0004, 0.003, 0.5), site("a", "s", 0.6)) == "~ +0.0 ±0.3"
+
+
 def test_evidence_is_that_of_the_score_that_ranks() -> None:
     by_share = compare(site("a", "large", 0.85), site("b", "small", 0.60))
     assert by_share.evidence is SENSOR_EVIDENCE

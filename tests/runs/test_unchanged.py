@@ -48,7 +48,7 @@ def common_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def place(tmp_path: Path, common_store: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path: Path, common_store: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The working directory, with the scenario "mini", and "derived", which extends "base" and has an OBJ mesh."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("EGVS_STORE", str(common_store))
@@ -67,21 +67,21 @@ RUN_MINI = ("run", "mini", "--out", "out")
 RUN_DERIVED = ("run", DERIVED)
 
 
-def test_recalled_run_prints_the_same_as_computed_one(place: Path, runs: list[Path], run_egvs: Callable) -> None:
+def test_recalled_run_prints_the_same_as_computed_one(folder: Path, runs: list[Path], run_egvs: Callable) -> None:
     _, first_out, first_err = run_egvs(*RUN_MINI)
     recalled = run_egvs(*RUN_MINI)
     assert len(runs) == 1
     assert recalled[1] == first_out
     assert "no stage ran" in recalled[2] and "no stage ran" not in first_err
 
-    next((place / "out").glob(UNCHANGED_PATTERN)).unlink()
+    next((folder / "out").glob(UNCHANGED_PATTERN)).unlink()
     assert run_egvs(*RUN_MINI) == recalled
     assert len(runs) == 2
 
 
 @pytest.mark.parametrize("option", [("--all",), ("--top", 1), ("--verbose",), ("--jobs", 1)])
 def test_run_with_other_options_prints_their_output(
-    place: Path, runs: list[Path], run_egvs: Callable, option: tuple[object, ...]
+    folder: Path, runs: list[Path], run_egvs: Callable, option: tuple[object, ...]
 ) -> None:
     run_egvs(*RUN_MINI)
     computed = run_egvs(*RUN_MINI, *option)
@@ -91,15 +91,15 @@ def test_run_with_other_options_prints_their_output(
 
 
 @pytest.mark.parametrize("option", ["--rehash", "--audit"])
-def test_options_that_demand_work_are_not_recalled(
-    place: Path, runs: list[Path], run_egvs: Callable, option: str
+def test_options_that_recompute_are_not_recalled(
+    folder: Path, runs: list[Path], run_egvs: Callable, option: str
 ) -> None:
     run_egvs(*RUN_MINI)
     run_egvs(*RUN_MINI, option)
     assert len(runs) == 2
 
 
-def test_run_in_default_folder_is_recalled(place: Path, runs: list[Path], run_egvs: Callable) -> None:
+def test_run_in_default_folder_is_recalled(folder: Path, runs: list[Path], run_egvs: Callable) -> None:
     for settings in ((), ("--set", "score.gamma=3")):
         run_egvs(*RUN_DERIVED, *settings)
         run_egvs(*RUN_DERIVED, *settings)
@@ -109,8 +109,8 @@ def test_run_in_default_folder_is_recalled(place: Path, runs: list[Path], run_eg
 def edit(name: str) -> Callable[[Path], object]:
     """Change one byte of a file, but neither its size nor its times."""
 
-    def change(place: Path) -> None:
-        path = place / name
+    def change(folder: Path) -> None:
+        path = folder / name
         status = path.stat()
         content = bytearray(path.read_bytes())
         content[-2] ^= 1
@@ -122,25 +122,35 @@ def edit(name: str) -> Callable[[Path], object]:
 
 def append_comment(name: str) -> Callable[[Path], object]:
     """Change a file without changing what it means."""
-    return lambda place: (place / name).write_text((place / name).read_text() + "\n")
+    return lambda folder: (folder / name).write_text((folder / name).read_text() + "\n")
 
 
 def write(name: str, content: str = "x") -> Callable[[Path], object]:
     """Write a file that was not there."""
 
-    def change(place: Path) -> None:
-        assert not (place / name).exists()
-        (place / name).write_text(content)
+    def change(folder: Path) -> None:
+        assert not (folder / name).exists()
+        (folder / name).write_text(content)
+
+    return change
+
+
+def write_long_ago(name: str) -> Callable[[Path], object]:
+    """Write a file whose stamp is trusted."""
+
+    def change(folder: Path) -> None:
+        write(name)(folder)
+        os.utime(folder / name, (1e9, 1e9))
 
     return change
 
 
 def link_to_copy(name: str) -> Callable[[Path], object]:
-    """Put a link to a copy in the place of a file."""
+    """Put a link to a copy where a file was."""
 
-    def change(place: Path) -> None:
-        (place / name).rename(place / "copy")
-        (place / name).symlink_to(place / "copy")
+    def change(folder: Path) -> None:
+        (folder / name).rename(folder / "copy")
+        (folder / name).symlink_to(folder / "copy")
 
     return change
 
@@ -157,95 +167,100 @@ CHANGES = {
     "input becomes a link": link_to_copy("base/sites.csv"),
     "artefact": edit("runs/derived/tpog.parquet"),
     "report": edit("runs/derived/report.html"),
-    "artefact is missing": lambda place: (place / "runs/derived/scans.parquet").unlink(),
-    "folder of another": lambda place: (place / "runs/derived/export").mkdir(),
-    "link in the run folder": lambda place: (place / "runs/derived/more").symlink_to(place),
+    "artefact is missing": lambda folder: (folder / "runs/derived/scans.parquet").unlink(),
+    "folder of another": lambda folder: (folder / "runs/derived/export").mkdir(),
+    "link in the run folder": lambda folder: (folder / "runs/derived/more").symlink_to(folder),
     "result of a study": write("runs/derived/accuracy.sha256", ""),
-    "schema of artefacts": None,
-    "environment": None,
-    "program": None,
-    "libraries": None,
+    "module of the program": edit("program/module.py"),
+    "another module": write_long_ago("program/other.py"),
+    "schema of artefacts": edit("schemas/scores.schema.json"),
+    "library": lambda folder: (folder / "libraries" / "plugin-1.0.dist-info").mkdir(),
+    "environment": lambda _: os.environ.update(EGVS_MAX_SITES="1000"),
 }
 
 
+@pytest.fixture
+def program(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a run depend on a small program, its schemas and libraries in the working directory."""
+    monkeypatch.setenv("EGVS_MAX_SITES", "2000")
+    for name in ("program/module.py", "schemas/scores.schema.json", "libraries/numpy-1.0.dist-info/METADATA"):
+        path = folder / name
+        path.parent.mkdir(parents=True)
+        path.write_text("text\n")
+        os.utime(path, (1e9, 1e9))
+    monkeypatch.setattr(unchanged, "_PACKAGE", folder / "program")
+    monkeypatch.setattr(unchanged, "data_folder", lambda _: folder / "schemas")
+    monkeypatch.syspath_prepend(folder / "libraries")
+
+
+@pytest.mark.usefixtures("program")
 @pytest.mark.parametrize("what", CHANGES)
-def test_change_is_noticed(
-    place: Path, runs: list[Path], run_egvs: Callable, what: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_change_is_noticed(folder: Path, runs: list[Path], run_egvs: Callable, what: str) -> None:
     run_egvs(*RUN_DERIVED)
     run_egvs(*RUN_DERIVED)
     assert len(runs) == 1
-    change = CHANGES[what]
-    if change is not None:
-        change(place)
-    elif what == "environment":
-        monkeypatch.setenv("EGVS_MAX_SITES", "1000")
-    elif what == "libraries":
-        monkeypatch.syspath_prepend(place)
-        (place / "plugin-1.0.dist-info").mkdir()
-    elif what == "program":
-        monkeypatch.setattr(unchanged, "_PACKAGE", place / "base")
-    else:
-        monkeypatch.setattr(unchanged, "data_folder", lambda _: place / "base")
+    CHANGES[what](folder)
+    state = unchanged.RunMemory(["run"], None)._state
     run_egvs(*RUN_DERIVED)
     assert len(runs) == 2
+    assert state is not None  # a changed program is another program, not an unknown one
 
 
-def test_same_bytes_written_again_are_no_change(place: Path, runs: list[Path], run_egvs: Callable) -> None:
+def test_same_bytes_written_again_are_no_change(folder: Path, runs: list[Path], run_egvs: Callable) -> None:
     run_egvs(*RUN_DERIVED)
     for name in ("base/sites.csv", "derived/scenario.toml", "runs/derived/scores.parquet"):
-        content = (place / name).read_bytes()
-        (place / name).unlink()
-        (place / name).write_bytes(content)
+        content = (folder / name).read_bytes()
+        (folder / name).unlink()
+        (folder / name).write_bytes(content)
     run_egvs(*RUN_DERIVED)
     assert len(runs) == 1
 
 
-def test_run_in_a_locked_folder_is_not_recalled(place: Path, run_egvs: Callable) -> None:
+def test_run_in_a_locked_folder_is_not_recalled(folder: Path, run_egvs: Callable) -> None:
     run_egvs(*RUN_MINI)
-    with unchanged.locks.locked(place / "out" / ".lock"):
+    with unchanged.locks.locked(folder / "out" / ".lock"):
         code, out, err = run_egvs(*RUN_MINI)
     assert code == 1 and "another run is using this folder" in err and not out
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[1]", '{"state": "a", "own_sha256": "0"}'])
-def test_damaged_record_is_ignored(place: Path, runs: list[Path], run_egvs: Callable, content: str) -> None:
+def test_damaged_record_is_ignored(folder: Path, runs: list[Path], run_egvs: Callable, content: str) -> None:
     run_egvs(*RUN_MINI)
-    next((place / "out").glob(UNCHANGED_PATTERN)).write_text(content)
+    next((folder / "out").glob(UNCHANGED_PATTERN)).write_text(content)
     code, _, _ = run_egvs(*RUN_MINI)
     assert code == 0 and len(runs) == 2
 
 
-def test_forged_output_is_ignored(place: Path, runs: list[Path], run_egvs: Callable) -> None:
+def test_forged_output_is_ignored(folder: Path, runs: list[Path], run_egvs: Callable) -> None:
     run_egvs(*RUN_MINI)
-    path = next((place / "out").glob(UNCHANGED_PATTERN))
+    path = next((folder / "out").glob(UNCHANGED_PATTERN))
     path.write_text(path.read_text().replace("pole_b is the best", "pole_a is the best"))
     assert "pole_b is the best" in run_egvs(*RUN_MINI)[1]
     assert len(runs) == 2
 
 
-def test_failed_run_is_not_recalled(place: Path, runs: list[Path], run_egvs: Callable) -> None:
-    (place / "mini" / "sites.csv").write_text("site,x_m,y_m\n")
+def test_failed_run_is_not_recalled(folder: Path, runs: list[Path], run_egvs: Callable) -> None:
+    (folder / "mini" / "sites.csv").write_text("site,x_m,y_m\n")
     results = [run_egvs(*RUN_MINI) for _ in range(2)]
     assert results[0] == results[1] and results[0][0] == 2
     assert len(runs) == 2
 
 
-def test_program_edited_just_now_is_not_trusted(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(unchanged, "_PACKAGE", place / "base")
-    monkeypatch.setattr(digest_cache, "_local_devices", lambda: frozenset({place.stat().st_dev}))
+def test_program_edited_just_now_is_not_trusted(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(unchanged, "_PACKAGE", folder / "base")
+    monkeypatch.setattr(digest_cache, "_local_devices", lambda: frozenset({folder.stat().st_dev}))
     assert unchanged._hash_program() is None
-    for path in (place / "base").iterdir():
+    for path in (folder / "base").iterdir():
         os.utime(path, (1e9, 1e9))
     assert unchanged._hash_program() is not None
 
 
-def test_program_on_unknown_file_system_is_compared_by_content(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(unchanged, "_PACKAGE", place / "base")
+def test_program_on_unknown_file_system_is_compared_by_content(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(unchanged, "_PACKAGE", folder / "base")
     monkeypatch.setattr(digest_cache, "_local_devices", frozenset)
     before = unchanged._hash_program()
     assert before is not None
-    edit("base/sites.csv")(place)
+    edit("base/sites.csv")(folder)
     assert unchanged._hash_program() not in (None, before)
 
 
@@ -258,37 +273,37 @@ def save_observed(folder: Path, work: Callable[[], object]) -> list[Path]:
     return list(folder.glob(UNCHANGED_PATTERN))
 
 
-def test_run_that_no_file_tells_everything_about_is_not_recalled(place: Path) -> None:
-    assert not save_observed(place / "mini", lambda: files.tell_observers(None))
-    os.mkfifo(place / "pipe")
-    assert not save_observed(place / "mini", lambda: files.observe_content(place / "pipe"))
-    assert save_observed(place / "mini", lambda: files.hash_file(place / "base" / "sites.csv"))
+def test_run_that_depends_on_more_than_files_is_not_recalled(folder: Path) -> None:
+    assert not save_observed(folder / "mini", lambda: files.tell_observers(None))
+    os.mkfifo(folder / "pipe")
+    assert not save_observed(folder / "mini", lambda: files.observe_content(folder / "pipe"))
+    assert save_observed(folder / "mini", lambda: files.hash_file(folder / "base" / "sites.csv"))
 
 
-def test_plug_ins_are_not_recalled(place: Path) -> None:
-    scenario = egvs.load(place / "mini")
-    assert not save_observed(place / "mini", lambda: stage_keys.program_inputs("score", scenario, ("trimesh",)))
-    assert save_observed(place / "mini", lambda: stage_keys.program_inputs("score", scenario))
+def test_plug_ins_are_not_recalled(folder: Path) -> None:
+    scenario = egvs.load(folder / "mini")
+    assert not save_observed(folder / "mini", lambda: stage_keys.program_inputs("score", scenario, ("trimesh",)))
+    assert save_observed(folder / "mini", lambda: stage_keys.program_inputs("score", scenario))
 
 
-def test_input_that_changed_during_the_run_is_not_recalled(place: Path) -> None:
-    path = place / "base" / "sites.csv"
+def test_input_that_changed_during_the_run_is_not_recalled(folder: Path) -> None:
+    path = folder / "base" / "sites.csv"
 
     def read_twice() -> None:
         files.hash_file(path)
         path.write_text("changed")
         files.hash_file(path)
 
-    assert not save_observed(place / "mini", read_twice)
+    assert not save_observed(folder / "mini", read_twice)
 
 
-def test_temporary_files_are_left_out(place: Path) -> None:
+def test_temporary_files_are_left_out(folder: Path) -> None:
     def convert() -> None:
         with files.temporary_folder() as folder:
             (folder / "network").write_text("<net/>")
             files.hash_file(folder / "network")
 
-    (record,) = save_observed(place / "mini", convert)
+    (record,) = save_observed(folder / "mini", convert)
     assert not any(name.endswith("network") for name in json.loads(record.read_text())["files"])
 
 
@@ -310,14 +325,14 @@ print(json.dumps(sorted(opened)))
 
 ROUNDABOUT = Path(__file__).parents[2] / "scenarios" / "roundabout"
 SHORT = ('traffic.hold="at_most"', "traffic.frames=40", "traffic.warmup_s=5", "tpog.blocks=4", "roi.voxel_m=1")
-RUN_ROUNDABOUT = ("run", str(ROUNDABOUT), *(word for setting in SHORT for word in ("--set", setting)))
+RUN_ROUNDABOUT = ("run", str(ROUNDABOUT), *(part for setting in SHORT for part in ("--set", setting)))
 
 
-@pytest.mark.parametrize("words", [RUN_DERIVED, RUN_ROUNDABOUT], ids=["derived", "roundabout"])
-def test_record_has_every_file_that_a_run_without_changes_opens(place: Path, words: tuple[str, ...]) -> None:
-    command = [sys.executable, "-c", LIST_OPENED_FILES, *words, "--out", "out"]
+@pytest.mark.parametrize("arguments", [RUN_DERIVED, RUN_ROUNDABOUT], ids=["derived", "roundabout"])
+def test_record_has_every_file_that_a_run_without_changes_opens(folder: Path, arguments: tuple[str, ...]) -> None:
+    command = [sys.executable, "-c", LIST_OPENED_FILES, *arguments, "--out", "out"]
     subprocess.run(command, check=True, capture_output=True)
-    record_path = next((place / "out").glob(UNCHANGED_PATTERN))
+    record_path = next((folder / "out").glob(UNCHANGED_PATTERN))
     record_path.unlink()
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     assert "no stage ran" in done.stderr
@@ -337,21 +352,21 @@ def test_record_has_every_file_that_a_run_without_changes_opens(place: Path, wor
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
-def test_run_folder_with_a_pipe_is_not_recorded(place: Path) -> None:
-    os.mkfifo(place / "mini" / "pipe")
-    assert not save_observed(place / "mini", lambda: None)
+def test_run_folder_with_a_pipe_is_not_recorded(folder: Path) -> None:
+    os.mkfifo(folder / "mini" / "pipe")
+    assert not save_observed(folder / "mini", lambda: None)
 
 
-def test_broken_link_in_the_program_is_no_error(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (place / BASE / ".#module.py").symlink_to("nowhere")
-    monkeypatch.setattr(unchanged, "_PACKAGE", place / BASE)
-    assert unchanged.RunMemory(["run"], place / "mini").recall() is None
+def test_broken_link_in_the_program_is_no_error(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (folder / BASE / ".#module.py").symlink_to("nowhere")
+    monkeypatch.setattr(unchanged, "_PACKAGE", folder / BASE)
+    assert unchanged.RunMemory(["run"], folder / "mini").recall() is None
 
 
-def test_run_is_recorded_unless_another_one_followed_in_its_folder(place: Path, run_egvs: Callable) -> None:
+def test_run_is_recorded_unless_another_one_followed_in_its_folder(folder: Path, run_egvs: Callable) -> None:
     """The other run may have the same artefacts, but another scenario."""
     assert run_egvs(*RUN_MINI)[0] == 0
-    record = RunRecord.read(place / "out")
-    assert repeat._is_recorded(repeat.FinishedRun(place / "out", record, ""))
+    record = RunRecord.read(folder / "out")
+    assert repeat._is_recorded(repeat.FinishedRun(folder / "out", record, ""))
     other = replace(record, overrides={"description": "other"})
-    assert not repeat._is_recorded(repeat.FinishedRun(place / "out", other, ""))
+    assert not repeat._is_recorded(repeat.FinishedRun(folder / "out", other, ""))

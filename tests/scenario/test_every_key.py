@@ -159,6 +159,7 @@ KEYS: dict[str, Change] = {
     "statics.meshes.*.origin_deg": Change("[9, 50]", ("crs.epsg=25832", *MESH)),
     "statics.meshes.*.kind": Change("'kiosk'", MESH),
     "statics.ground": Change("false"),
+    "statics.terrain": Change("'other_box.ply'", (*NETWORK, "statics.terrain='box.ply'")),
     "tpog.blocks": Change("2"),
     "sites.file": Change("'five.csv'"),
     "sites.grid.low_m": Change("[3, -9]", GRID),

@@ -9,6 +9,7 @@ import pytest
 from scipy.special import ndtr
 
 from egvs.core.grid import Grid
+from egvs.kernels import hits as hit_kernels
 from egvs.scoring.visibility import TOLERANCE, ByRange, RangeTable
 
 GRID = Grid((0.0, 0.0, 0.0), 0.5, (30, 20, 6))
@@ -96,3 +97,62 @@ def test_a_smooth_function_is_evaluated_seldom_and_a_rough_one_for_each_voxel() 
         table.thin(hits, WHOLE, o_m / GRID.voxel_m, GRID, ALL, thinned)
         assert sum(calls[tried:]) <= most
         assert tried == (1 if name != "narrow bands" else 3)
+
+
+def thin_by_hand(
+    hits: np.ndarray,
+    unit: int,
+    o: np.ndarray,
+    cubics: np.ndarray,
+    cells: np.ndarray,
+    near: float,
+    per_voxel: float,
+) -> list[int]:
+    """The formula of the kernel, voxel by voxel in Python's floats, which are those of the kernel."""
+    result = []
+    for cell in cells.tolist():
+        ix, iy, iz = (int(i) for i in np.unravel_index(cell, GRID.shape))
+        squared = (ix + 0.5 - o[0]) ** 2 + (iy + 0.5 - o[1]) ** 2 + (iz + 0.5 - o[2]) ** 2
+        s = math.sqrt(squared) * per_voxel - near
+        piece = min(max(int(s), 0), len(cubics) - 1)
+        a, b, c, d = cubics[piece].tolist()
+        s -= piece
+        share, amount = ((d * s + c) * s + b) * s + a, int(hits[cell]) * unit
+        result.append(-1 - amount if math.isnan(share) else round(share * amount))  # halves to even
+    return result
+
+
+@pytest.mark.parametrize("order", ["ascending", "shuffled", "one", "none"])
+@pytest.mark.parametrize("sensor", ["inside", "beside and above"])
+def test_the_kernel_agrees_with_python_to_the_last_bit(sensor: str, order: str) -> None:
+    generator = np.random.default_rng(3)
+    cells = {"ascending": ALL[::3], "shuffled": generator.permutation(ALL), "one": ALL[-1:], "none": ALL[:0]}[order]
+    hits = generator.integers(0, 4, len(ALL)).astype(np.uint32)
+    cubics = generator.uniform(-0.5, 0.5, (16, 4))
+    cubics[[3, 7]] = np.nan
+    o = np.array(SENSORS[sensor]) / GRID.voxel_m
+    per_m, near_m = 1.0625, 0.8
+    shape, thinned = np.asarray(GRID.shape), np.full(len(ALL), -7)
+    unknown = hit_kernels.thin_by_range(hits, WHOLE, o, shape, GRID.voxel_m, near_m, per_m, cubics, cells, thinned)
+    expected = thin_by_hand(hits, WHOLE, o, cubics, cells, near_m * per_m, GRID.voxel_m * per_m)
+    assert thinned[cells].tolist() == expected
+    assert unknown == sum(value < 0 and value % WHOLE == WHOLE - 1 for value in expected)
+    assert (np.delete(thinned, cells) == -7).all()
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_cubics_go_through_four_points_and_are_checked_at_three(name: str) -> None:
+    """As with whole arrays in NumPy, to the last bit; here each piece has its own seven points."""
+    near_m, far_m, pieces = 1.5, 18.7, 64
+    nodes = np.arange(pieces)[:, None] + np.arange(7) / 6
+    values = FUNCTIONS[name]((near_m + nodes * ((far_m - near_m) / pieces)).ravel()).reshape(pieces, 7)
+    through = np.array([[2, 0, 0, 0], [-11, 18, -9, 2], [18, -45, 36, -9], [-9, 27, -27, 9]]) / 2
+    expected = (values[:, ::2, None] * through.T).sum(axis=1)
+    s = np.arange(1, 6, 2) / 6
+    between = ((expected[:, 3:] * s + expected[:, 2:3]) * s + expected[:, 1:2]) * s + expected[:, :1]
+    expected[~(np.abs(between - values[:, 1::2]) <= TOLERANCE).all(axis=1)] = np.nan
+
+    cubics, each = np.empty((pieces, 4)), np.append(values[:, :6], values[-1, 6])
+    rejected = hit_kernels.fit_cubics(each, through, TOLERANCE, cubics)
+    assert np.array_equal(cubics, expected, equal_nan=True)
+    assert rejected == np.isnan(expected[:, 0]).sum()

@@ -15,7 +15,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from rich.console import Console
 
 import egvs
 from egvs.artefacts import parquet
@@ -268,19 +267,6 @@ def test_recommends_nothing_if_every_score_is_0(mini: Path, tmp_path: Path, caps
     assert "Every score is 0" in printed
     assert "Recommended" not in printed
     assert "nan" not in printed
-
-
-@pytest.mark.slow
-def test_tables_fit_the_terminal(mini: Path, tmp_path: Path, capsys, monkeypatch) -> None:
-    study = run_study(mini, [], tmp_path / "out")
-    for width in (190, 120, 90):
-        narrow = Console(width=width, highlight=False)
-        monkeypatch.setattr(accuracy_table, "console", lambda _, narrow=narrow: narrow)
-        accuracy_table.print_study(study, "egvs run mini")
-        table = capsys.readouterr().out.partition("* no cheaper")[0]
-        assert "…" not in table
-        assert all(len(line) <= width for line in table.splitlines()), width
-        assert "= " in table
 
 
 def test_a_recording_needs_four_blocks(mini: Path, tmp_path: Path, run_egvs) -> None:

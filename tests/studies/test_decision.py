@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from itertools import pairwise
+from statistics import NormalDist
 
 import numpy as np
 import pytest
@@ -121,20 +121,35 @@ def test_model_agrees_with_draws_of_the_same_length() -> None:
     assert np.mean(modelled) == pytest.approx(np.mean(counted), abs=0.15)
 
 
-def test_longer_traffic_is_needed_for_a_smaller_loss() -> None:
-    found = units_of(0.62, 0.60, noise=0.03, units=8)
-    lengths = [length_needed(found, reference_of(found), tolerance) for tolerance in (1.0, 0.3, 0.01)]
-    assert all(short <= long for short, long in pairwise(lengths))
-    assert lengths[0] < lengths[-1] < math.inf
-    assert assess_by_model(found, reference_of(found), lengths[1]).loss_points <= 0.3
+def test_traffic_that_is_needed_follows_from_the_normal_distribution() -> None:
+    """With L units, the better of two poles is missed with probability Phi(-d sqrt(L) / s), where d is the mean
+    difference in the units that do not judge, and s its scatter; what that loses is the difference in the judging one.
+    """
+    differences = 0.02 + np.random.default_rng(3).normal(0.0, 0.06, 24)
+    found = 0.6 + np.column_stack([differences, np.zeros(24)])
+    reference = reference_of(found)
+
+    def loss_points(length: float) -> float:
+        losses = []
+        for judge, difference in enumerate(differences):
+            others = np.delete(differences, judge)
+            assert others.mean() > 0.0
+            missed = NormalDist().cdf(-others.mean() * math.sqrt(length) / others.std(ddof=1))
+            losses.append(100 * difference * missed)
+        return float(np.mean(losses))
+
+    for length in (1.0, 4.0, 16.0):
+        assert assess_by_model(found, reference, length).loss_points == pytest.approx(loss_points(length), abs=0.06)
+    for length in (8.0, 16.0):  # a tolerance between the losses of this length and of half of it
+        tolerance = (loss_points(length) + loss_points(length / 2)) / 2
+        assert length_needed(found, reference, tolerance) == length
 
 
-@given(st.lists(st.floats(0.0, 1.0), min_size=1, max_size=6))
-def test_choice_is_shared_by_the_best_mounts(scores: list[float]) -> None:
-    shares = choose(np.array(scores))
-    assert shares.sum() == pytest.approx(1.0)
-    best = max(scores)
-    assert all(share == 0.0 or score >= best * (1 - 1e-8) for share, score in zip(shares, scores, strict=True))
+@given(st.lists(st.integers(0, 5), min_size=1, max_size=6))
+def test_choice_is_shared_by_the_best_mounts(scores: list[int]) -> None:
+    expected = [(score == max(scores)) / scores.count(max(scores)) for score in scores]
+    assert choose(np.array(scores) / 7).tolist() == pytest.approx(expected)
+    assert choose(np.array([scores, scores[::-1]]) / 7)[1].tolist() == pytest.approx(expected[::-1])
 
 
 def test_single_mount_is_the_best_one() -> None:

@@ -1,11 +1,10 @@
-"""Scores of a setting are those of a run; each stage runs once, and its time and memory are measured."""
+"""Stages of a setting run once, and their times are measured."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from egvs.core import files
 from egvs.core.errors import RunError
 from egvs.core.resource_usage import measure_usage
 from egvs.runs import stage_keys, stage_registry
-from egvs.runs.store import Store
 from egvs.scoring.scorer import Scorer
 from egvs.stages.inputs import get_scene, open_folder
 from egvs.stages.site_scoring import empty_scans
@@ -30,12 +28,12 @@ from tests.studies.short_studies import (
 def test_repeat_with_other_bytes_is_an_error(mini: Path, tmp_path: Path) -> None:
     runner = make_runner(mini, tmp_path)
     original = SCENARIO_AS_IS
-    trial = runner.run(original)
-    cost = tmp_path / "accuracy" / "times" / f"tpog-{trial.stages['tpog'][:16]}.json"
+    keys = runner.run_stages(original)
+    cost = tmp_path / "accuracy" / "times" / f"tpog-{keys['tpog'][:16]}.json"
     times = json.loads(cost.read_text().replace('"tpog.parquet": "', '"tpog.parquet": "0'))
     cost.write_text(files.to_json_text(files.add_checksum(times)))
     with pytest.raises(RunError, match="wrote bytes that differ"):
-        runner.time_again("tpog", original, trial.stages["tpog"])
+        runner.time_again("tpog", original, keys["tpog"])
 
 
 def test_thinned_beams_score_as_if_each_hit_counted_twice(mini: Path, tmp_path: Path) -> None:
@@ -53,27 +51,17 @@ def test_thinned_beams_score_as_if_each_hit_counted_twice(mini: Path, tmp_path: 
         assert share == pytest.approx((entropy * twice).sum() / (4.0 * entropy.sum()), rel=1e-12)
 
 
-def test_thinned_beams_are_weighted_with_infinite_gamma(mini: Path, tmp_path: Path) -> None:
-    runner = make_runner(mini, tmp_path / "out", "score.gamma=inf")
-    thinned_shares = {s.name: s for s in study_settings.list_variants(runner.scenario(SCENARIO_AS_IS))}
-    complete, thin = (np.array(runner.run(thinned_shares[name]).shares) for name in ("scenario", "every 2nd azimuth"))
-    assert np.abs(thin / complete - 1).max() < 0.1
-
-
 def test_cached_stages_count_with_their_original_time_until_they_are_measured(mini: Path, tmp_path: Path) -> None:
     record = egvs.run(egvs.load(mini), tmp_path / "run")
     runner = make_runner(mini, tmp_path / "out")
-    scores = runner.run(SCENARIO_AS_IS)
-    assert scores.stages == {name: record.stages[name].inputs for name in stage_registry.RANKING_STAGES}
-    for name, key in scores.stages.items():
+    keys = runner.run_stages(SCENARIO_AS_IS)
+    assert keys == {name: record.stages[name].inputs for name in stage_registry.RANKING_STAGES}
+    for name, key in keys.items():
         cached = runner.stage_times(name, key)
         assert (cached.repeats, cached.seconds) == (0, (record.stages[name].cost.seconds,))  # the stage did not run
-    plain = make_runner(mini, tmp_path / "other")
-    Store.default().prune(-1)
-    assert plain.run(SCENARIO_AS_IS) == scores  # standard errors too, which a cached stage does not contain
-    cached = runner.stage_times("tpog", scores.stages["tpog"])
-    runner.time_again("tpog", SCENARIO_AS_IS, scores.stages["tpog"])
-    timed = runner.stage_times("tpog", scores.stages["tpog"])
+    cached = runner.stage_times("tpog", keys["tpog"])
+    runner.time_again("tpog", SCENARIO_AS_IS, keys["tpog"])
+    timed = runner.stage_times("tpog", keys["tpog"])
     assert (timed.repeats, len(timed.seconds)) == (1, 1)
     assert timed.seconds != cached.seconds
 
@@ -94,24 +82,14 @@ def test_stages_of_another_run_are_measured_again(mini: Path, tmp_path: Path) ->
 def test_result_of_another_program_version_is_ignored(
     mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-
     runner = make_runner(mini, tmp_path / "out")
-    runner.run(SCENARIO_AS_IS)
-    assert runner.saved_scores(SCENARIO_AS_IS) is not None
+    runner.save_result(SCENARIO_AS_IS, {"frames": 2}, {"score": 1.5})
+    assert make_runner(mini, tmp_path / "out").saved_result(SCENARIO_AS_IS, {"frames": 2}) == {"score": 1.5}
+    assert runner.saved_result(SCENARIO_AS_IS, {"frames": 3}) is None
     original = stage_keys.source_digest
     monkeypatch.setattr(stage_keys, "source_digest", lambda *names: replace(original(*names), digest="another"))
     changed = make_runner(mini, tmp_path / "out")
-    assert changed.saved_scores(SCENARIO_AS_IS) is None
-
-
-def test_results_with_different_weights_are_saved_separately(mini: Path, tmp_path: Path) -> None:
-    """With infinite gamma, unweighted scores of every second beam are half as large."""
-    runner = make_runner(mini, tmp_path, "score.gamma=inf")
-    thin = next(
-        s for s in study_settings.list_variants(runner.scenario(SCENARIO_AS_IS)) if s.name == "every 2nd azimuth"
-    )
-    plain = replace(thin, weight=1.0)
-    assert np.array(runner.run(thin).shares) == pytest.approx(2 * np.array(runner.run(plain).shares))
+    assert changed.saved_result(SCENARIO_AS_IS, {"frames": 2}) is None
 
 
 def test_memory_is_freed_before_a_stage_is_measured(
@@ -126,26 +104,5 @@ def test_memory_is_freed_before_a_stage_is_measured(
         return original()
 
     monkeypatch.setattr(stage_registry, "measure_usage", noted)
-    make_runner(mini, tmp_path).run(SCENARIO_AS_IS)
+    make_runner(mini, tmp_path).run_stages(SCENARIO_AS_IS)
     assert done == ["freed", "measured"] * len(stage_registry.RANKING_STAGES)
-
-
-@pytest.mark.slow
-def test_memory_is_measured_above_what_the_program_holds(
-    mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from egvs.stages import tpog
-
-    def greedy(*args: Any, **options: Any) -> dict[str, Any]:
-        assert np.ones(50_000_000).sum() > 0  # 400 MB
-        return tpog.run(*args, **options)
-
-    runner, setting = make_runner(mini, tmp_path), SCENARIO_AS_IS
-    held = np.ones(50_000_000)
-    trial = runner.run(setting)
-    plain = runner.stage_times("tpog", trial.stages["tpog"]).peak_mb
-    monkeypatch.setattr(tpog, "STAGE", replace(tpog.STAGE, run=greedy))
-    runner.time_again("tpog", setting, trial.stages["tpog"])
-    assert plain < 200
-    assert runner.stage_times("tpog", trial.stages["tpog"]).peak_mb == pytest.approx(plain + 381, abs=60)
-    assert held[0] == 1.0

@@ -28,7 +28,7 @@ def overrides_by_name(path: Path, *sets: str) -> dict[str, tuple[str, ...]]:
         *study_settings.list_variants(scenario, ONLY_TRAFFIC),
         *traffic_options.traffic_option_settings(scenario, ONLY_TRAFFIC),
     ]
-    knobs = (traffic_options.STEP_KNOB, traffic_options.SUBLANES_KNOB, traffic_options.ROUTING_KNOB)
+    knobs = (study_settings.STEP_KNOB, study_settings.SUBLANES_KNOB, study_settings.ROUTING_KNOB)
     return {setting.name: setting.overrides for setting in settings if setting.knob in knobs}
 
 

@@ -218,6 +218,24 @@ def test_trips_connect_fringe_edges_without_turnarounds(tmp_path):
     assert (result.origin.tolist(), result.target.tolist(), result.fringe) == ([0], [2], True)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_reached_edges_are_those_of_a_search_from_each_source(seed):
+    rng = np.random.default_rng(seed)
+    n_edges = 40
+    links = np.column_stack([rng.integers(0, n_edges, (50, 2)), np.zeros(50, dtype=int)])
+    sources = np.sort(rng.choice(n_edges, 11, replace=False))
+    reached = demand._reached_edges(links, sources, n_edges)
+    assert reached.shape == (11, n_edges)
+    for row, source in zip(reached, sources.tolist(), strict=True):
+        expected, pending = {source}, [source]
+        while pending:
+            edge = pending.pop()
+            after = {b for a, b, _ in links.tolist() if a == edge} - expected
+            expected |= after
+            pending += after
+        assert set(np.flatnonzero(row).tolist()) == expected
+
+
 def test_edge_weights_override_lane_counts(tmp_path):
     path = tmp_path / "n.net.xml"
     path.write_text(SMALL_NET)
@@ -268,7 +286,12 @@ def test_trips_follow_shares_lanes_and_minimum_length(town):
 )
 def test_rejects_wrong_kind(kind, message):
     with pytest.raises(InputError, match=message):
-        demand.check_kinds([kind], sumo.vehicle_classes(), "place")
+        demand.check_kinds([kind], "place")
+
+
+def test_common_vehicle_classes_are_those_of_sumo():
+    assert sumo.vehicle_classes() > sumo.COMMON_VEHICLE_CLASSES
+    assert sumo.is_vehicle_class("tram") and not sumo.is_vehicle_class("car")
 
 
 def test_attributes_of_a_kind_override_defaults():

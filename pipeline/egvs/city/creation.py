@@ -34,7 +34,14 @@ from egvs.core.progress import ProgressCallback, no_progress
 from egvs.formats.osm import read_osm as read_extract
 from egvs.importers import assumed_traffic, junctions, new_scenario, osm_network, osm_solids, scenario_files
 from egvs.importers.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, TRAFFIC_LEVELS
-from egvs.importers.junctions import HEIGHTS_M, JunctionRegion, KerbsidePole, StreetJunction, Streets
+from egvs.importers.junctions import (
+    HEIGHTS_M,
+    JunctionRegion,
+    KerbsidePole,
+    NearbyJunction,
+    StreetJunction,
+    Streets,
+)
 from egvs.importers.openstreetmap import check_inside_extract
 from egvs.importers.osm_network import ATTRIBUTION, NETWORK_FILE, NetworkExcerpts
 from egvs.importers.osm_solids import ImportCounts, MappedSolid
@@ -333,32 +340,25 @@ def _junctions_from_table(streets: Streets, path: Path) -> Iterator[tuple[str, S
 def _junction_at(streets: Streets, lat_deg: float, lon_deg: float, where: str) -> StreetJunction:
     """Return the junction nearest to a position; raise an InputError if it is too far away."""
     nearest = _nearest_junction(streets, lat_deg, lon_deg)
-    if nearest.junction is not None and nearest.distance_m <= MAX_DISTANCE_M:
+    if nearest is not None and nearest.distance_m <= MAX_DISTANCE_M:
         return nearest.junction
-    problem = f"the nearest junction of three or more streets is {nearest.distance_m:,.0f} m away"
+    problem = "the streets have no junction of three or more streets"
+    if nearest is not None:
+        problem = f"the nearest junction of three or more streets is {nearest.distance_m:,.0f} m away"
     hint = f"Use coordinates within {MAX_DISTANCE_M:g} m of a junction."
-    if _nearest_junction(streets, lon_deg, lat_deg).distance_m <= MAX_DISTANCE_M:
+    swapped = _nearest_junction(streets, lon_deg, lat_deg)
+    if swapped is not None and swapped.distance_m <= MAX_DISTANCE_M:
         hint = f"Latitude and longitude are swapped: did you mean lat_deg {lon_deg!r}, lon_deg {lat_deg!r}?"
     raise InputError(where, problem, hint)
 
 
-class _NearestJunction(NamedTuple):
-    """A junction of three or more streets; None at an infinite distance if there is none."""
-
-    junction: StreetJunction | None
-    distance_m: float
-
-
-def _nearest_junction(streets: Streets, lat_deg: float, lon_deg: float) -> _NearestJunction:
-    """Return the junction whose area is nearest to a position."""
-    point = Point(streets.to_xy([lon_deg], [lat_deg])[0])
-    nearest = _NearestJunction(None, math.inf)
-    if math.isfinite(point.x + point.y):
-        for junction in sorted(streets.junctions, key=lambda j: j.id):
-            junction_m = point.distance(junction.area)
-            if junction.is_crossing and junction_m < nearest.distance_m:
-                nearest = _NearestJunction(junction, junction_m)
-    return nearest
+def _nearest_junction(streets: Streets, lat_deg: float, lon_deg: float) -> NearbyJunction | None:
+    """Return the junction of three or more streets that is nearest; None if there is none, or no such position."""
+    x_m, y_m = streets.to_xy([lon_deg], [lat_deg])[0]
+    if not math.isfinite(x_m + y_m):
+        return None
+    nearby = junctions.nearest_junctions(streets, (x_m, y_m))
+    return nearby[0] if nearby else None
 
 
 class DividedRegions(NamedTuple):

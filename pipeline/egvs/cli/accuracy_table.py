@@ -60,7 +60,7 @@ def _settings_table(title: str, rows: Sequence[SettingResult], scenario: Setting
 
     columns: list[Column[SettingResult]] = [
         Column("", lambda row: "*" * row.front + "=" * row.recommended, "left"),
-        Column("setting", lambda row: row.setting, "left", wrap=width < NARROW),
+        Column("setting", lambda row: row.setting, "left", wrap=True),
         Column("seconds", lambda row: f"{'' if row.measured else '~'}{row.seconds:.1f}"),
         Column("times", format_factor, min_width=NARROW),
         Column("traffic", lambda row: f"{row.traffic_s:.1f}", min_width=WIDE - 10),

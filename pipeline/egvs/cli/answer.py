@@ -57,10 +57,9 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
         for warning in collect_warnings([summary]):
             out.print(str(warning))
     sentences = []
-    if on_road := sections.describe_poles_on_road(ranked.poles[: sections.NAMED_POLES], _check_warnings(record)):
-        sentences.append(f"Before you trust this ranking: {join_names(on_road)}.")
-    if assumed := sections.describe_assumptions(scenario, "ranking"):
-        sentences.append(assumed)
+    on_road = sections.describe_poles_on_road(ranked.poles[: sections.NAMED_POLES], _check_warnings(record))
+    if caveats := sections.describe_caveats(scenario, "ranking", on_road):
+        sentences.append(caveats)
     sentences += reliability.describe_reliability(ranked)
     sensors = [site.sensor for site in ranked.sites]
     if note := range_note(sensors, is_modelled=scenario.effects.range_limit is not None):

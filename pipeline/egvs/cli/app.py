@@ -107,8 +107,8 @@ def run(
     if audit or rehash:
         run_all()
         return
-    words = ["run", str(scenario), str(out), *(set_ or ()), str(top), str(all_), str(verbose)]
-    repeat.print_or_run(words, out, run_all)
+    arguments = ["run", str(scenario), str(out), *(set_ or ()), str(top), str(all_), str(verbose)]
+    repeat.print_or_run(arguments, out, run_all)
 
 
 def _run_all_stages(

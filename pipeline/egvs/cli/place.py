@@ -81,7 +81,7 @@ def place(
         notes.append(describe_replaced(replaced, request_now or {}))
     if exact and not (placed.solution.is_best or placed.solution.fewest_is_proved):
         notes.append(f"--exact reached its --time-limit of {time_limit} before any plan was proved optimal.")
-    print_placement(placed, loaded.placement, notes, sections.describe_assumptions(loaded, "plan"))
+    print_placement(placed, loaded.placement, notes, sections.describe_caveats(loaded, "plan"))
 
 
 def _check_request(count: int | None, budget: float | None, reach: float | None) -> None:

@@ -29,19 +29,19 @@ class FinishedRun:
     stderr: str
 
 
-def print_or_run(words: Sequence[str], out: Path | None, run: Callable[[], FinishedRun]) -> None:
+def print_or_run(arguments: Sequence[str], out: Path | None, run: Callable[[], FinishedRun]) -> None:
     """Print what a command printed before, if it would print the same again; else run it.
 
     Parameters
     ----------
-    words
-        The arguments that its output depends on.
+    arguments
+        The arguments of the command that its output depends on.
     out
         The run folder; None where it follows from the scenario.
     run
         Runs all stages and prints the results.
     """
-    memory = RunMemory([*words, *_terminal_properties()], out)
+    memory = RunMemory([*arguments, *_terminal_properties()], out)
     output = memory.recall()
     if output is not None:
         print(output.stderr, end="", file=sys.stderr, flush=True)

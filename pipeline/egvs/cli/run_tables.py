@@ -395,7 +395,7 @@ def print_effects(effects: Sequence[EffectStatus], costs: Mapping[str, EffectCos
 def _format_cost(cost: EffectCost | None) -> str:
     if cost is None:
         return ""
-    return f"{cost.seconds:+.2f} s"
+    return f"{cost.seconds:+z.2f} s"
 
 
 def _format_cost_change(cost: EffectCost | None) -> str:
@@ -441,8 +441,8 @@ def _format_change(plain: EffectChange, change: EffectChange, row: int) -> str:
     if plain.scores[row]:
         percent = 100 * (change.scores[row] / plain.scores[row] - 1)
     if change.ranks[row] == plain.ranks[row]:
-        return f"{percent:+.2f} %"
-    return f"{percent:+.2f} % ({plain.ranks[row]} to {change.ranks[row]})"
+        return f"{percent:+z.2f} %"
+    return f"{percent:+z.2f} % ({plain.ranks[row]} to {change.ranks[row]})"
 
 
 def print_store(store: Store) -> None:

@@ -34,6 +34,9 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 """Array of int64, of the shape that each docstring states."""
 
+XY = tuple[float, float]
+"""x, y in metres."""
+
 Vec3 = tuple[float, float, float]
 """Three numbers along x, y, z."""
 

@@ -83,7 +83,7 @@ def describe_score(rating: PoseScore, rank_by: str, candidate: PoseScore, candid
     title = f"{format_score(rank_by, rating.scores[rank_by])} {label.head if label.is_share else ''}".strip()
     before = candidate.scores[rank_by]
     if before > 0.0 and rating.site.pose != candidate.site.pose:
-        title += f" ({rating.scores[rank_by] / before - 1.0:+.1%})"
+        title += f" ({rating.scores[rank_by] / before - 1.0:+z.1%})"
     rows = [f"| {plain_name(name)} | {format_score(name, value)} |" for name, value in rating.scores.items()]
     rank = f"rank {rating.rank} of {candidates} by {plain_name(rank_by)}"
     return "\n".join([f"## {title}\n\n{rank}\n\n| score | value |\n|---|---|", *rows, "", findings_text])

@@ -158,8 +158,12 @@ def ranking_chart(ranking: Ranking, style: FigureStyle) -> str:
         Bar(site.site, site.score, site.score_se, f"rank {site.rank}, {by.with_noun(site.score)}")
         for site in ranking.sites[:MAX_BARS]
     ]
-    alt = f"Ranking of {len(ranking.sites)} sites by {by.noun}; best: {ranking.best[0].site}."
-    return bar_chart(bars, by.axis_title, alt, by.axis_factor, style)
+    number, note = f"{len(ranking.sites)}", ""
+    if len(ranking.sites) > MAX_BARS:
+        number = f"the best {MAX_BARS} of {len(ranking.sites)}"
+        note = f"best {MAX_BARS} of {len(ranking.sites)} sites"
+    alt = f"Ranking of {number} sites by {by.noun}; best: {ranking.best[0].site}."
+    return bar_chart(bars, by.axis_title, alt, by.axis_factor, style, note)
 
 
 def _convert_svg(svg: str, kind: str) -> bytes:

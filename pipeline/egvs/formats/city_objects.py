@@ -6,7 +6,7 @@ of the axes.
 An object has components: itself, its parts and its installations (balconies, chimneys, bridge piers). Each component
 is used at its highest level of detail (LOD). There, the surfaces are those of its solid; without a solid, those of its
 own multi-surface; without one, those of its boundary surfaces (walls, roofs). A surface that several components share
-is used once.
+is used once. Closure surfaces are left out: beams pass through them.
 """
 
 from __future__ import annotations
@@ -126,6 +126,8 @@ class CityObject:
         Surfaces of this object by name.
     ignored
         Geometries that are neither surfaces nor solids, e.g. points.
+    openings
+        Closure surfaces, by :func:`id`: they complete a solid where nothing is, e.g. at the entrance of an underpass.
     """
 
     name: str
@@ -134,6 +136,7 @@ class CityObject:
     components: list[Component] = field(default_factory=lambda: [Component()])
     groups: dict[str, list[Member]] = field(default_factory=dict)
     ignored: int = 0
+    openings: set[int] = field(default_factory=set)
 
     @property
     def lod(self) -> float:
@@ -160,7 +163,7 @@ class Selection(NamedTuple):
 
 def select_surfaces(city_object: CityObject) -> Selection:
     """Return the surfaces of an object at the highest level of detail of each component, LOD 1 or higher."""
-    resolver = _Resolver(city_object.groups)
+    resolver = _Resolver(city_object)
     placements: list[Placement] = []
     for component in city_object.components:
         lod = component.lod
@@ -180,7 +183,7 @@ def select_surfaces(city_object: CityObject) -> Selection:
 def select_footprint(city_object: CityObject) -> list[Surface]:
     """Return the surfaces of an object at LOD 0: its footprint, else the edge of its roof."""
     for role in FOOTPRINT_ROLES:
-        resolver = _Resolver(city_object.groups)
+        resolver = _Resolver(city_object)
         for component in city_object.components:
             resolver.add(_members(component, role, 0.0))
         if resolver.surfaces:
@@ -200,8 +203,9 @@ def _members(component: Component, role: str, lod: float) -> list[Member]:
 class _Resolver:
     """Collects surfaces, each once, and follows each reference once."""
 
-    def __init__(self, groups: Groups) -> None:
-        self._groups = groups
+    def __init__(self, city_object: CityObject) -> None:
+        self._groups: Groups = city_object.groups
+        self._openings = city_object.openings
         self._followed: set[str] = set()
         self.surfaces: dict[int, Surface] = {}
         self.unresolved = 0
@@ -211,6 +215,8 @@ class _Resolver:
         while pending:
             member, is_reversed = pending.pop()
             if isinstance(member, Surface):
+                if id(member) in self._openings:
+                    continue
                 self.surfaces.setdefault(id(member), member.reversed() if is_reversed else member)
             elif member.name not in self._groups:
                 self.unresolved += 1

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import re
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -64,7 +64,16 @@ _LOD_LINES = frozenset({"TerrainIntersection", "MultiCurve", "Network"})
 
 def is_citygml(head: bytes) -> bool:
     """Return whether the beginning of a file is that of a city model, in any encoding."""
-    return re.search(rb"<(?:[\w.-]+:)?CityModel[\s>]", head.replace(b"\0", b"")) is not None
+    return _starts_element(head, b"CityModel")
+
+
+def has_relief(head: bytes) -> bool:
+    """Return whether the beginning of a city model has terrain."""
+    return is_citygml(head) and _starts_element(head, b"ReliefFeature")
+
+
+def _starts_element(head: bytes, tag: bytes) -> bool:
+    return re.search(rb"<(?:[\w.-]+:)?" + tag + rb"[\s>]", head.replace(b"\0", b"")) is not None
 
 
 def valid_height_m(height_m: float) -> float | None:
@@ -84,6 +93,8 @@ class CityGmlFile:
     ----------
     path
         The file.
+    kinds
+        Kinds of objects whose surfaces are read; others come without surfaces. None for all.
 
     Attributes
     ----------
@@ -91,13 +102,14 @@ class CityGmlFile:
         Surfaces of implicit geometries by name; complete after :meth:`objects` ends.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, kinds: Collection[str] | None = None) -> None:
         self.path = path
         self.templates: dict[str, list[Surface]] = {}
+        self._kinds = kinds
 
     def objects(self) -> Iterator[CityObject]:
         """Yield the objects in their order; InputError when the file is damaged."""
-        parser = _ObjectParser(self.path, self.templates)
+        parser = _ObjectParser(self.path, self.templates, self._kinds)
         for _ in iter_events(self.path, ROOT, parser):
             yield from parser.finished
             parser.finished.clear()
@@ -106,8 +118,10 @@ class CityGmlFile:
 class _ObjectParser(SurfaceParser):
     """Collects one object after the other."""
 
-    def __init__(self, path: Path, templates: dict[str, list[Surface]]) -> None:
+    def __init__(self, path: Path, templates: dict[str, list[Surface]], kinds: Collection[str] | None) -> None:
         super().__init__(path)
+        self._kinds = kinds
+        self._is_needed = False
         self.finished: list[CityObject] = []
         self._templates = templates
         self._template_points = 0
@@ -134,6 +148,8 @@ class _ObjectParser(SurfaceParser):
         if self._object is None:
             if len(self.tags) > 1 and self.tags[-2] in _MEMBERS:
                 self._open_object(tag, attributes)
+            return False
+        if not self._is_needed:
             return False
         if tag in _SKIPPED:
             self._skipped_depth = len(self.tags)
@@ -163,6 +179,8 @@ class _ObjectParser(SurfaceParser):
         elif depth == self._object_depth:
             self.finished.append(self._object)
             self._object = None
+        elif not self._is_needed:
+            return
         elif self._boundary_depths and self._boundary_depths[-1] == depth:
             self._boundary_depths.pop()
         elif self._components[-1][0] == depth:
@@ -177,6 +195,8 @@ class _ObjectParser(SurfaceParser):
             self._add_to_template(member)
             return
         if isinstance(member, Surface):
+            if "ClosureSurface" in self.tags[self._object_depth :]:
+                self._object.openings.add(id(member))
             if self._object.srs_name and self._object.srs_name != srs_name:
                 problem = f"expected one reference system, got {self._object.srs_name!r} and {srs_name!r}"
                 raise InputError(f"{self.path}: {self._object.name}: srsName", problem, COMPLETE_FILE)
@@ -196,6 +216,7 @@ class _ObjectParser(SurfaceParser):
         self._count += 1
         name = next((value for key, value in attributes.items() if local_name(key) == "id"), f"{tag} {self._count}")
         self._object = CityObject(name, tag)
+        self._is_needed = self._kinds is None or tag in self._kinds
         self._object_depth = len(self.tags)
         self.collected = 0
         self._components = [(self._object_depth, self._object.components[0])]
@@ -307,7 +328,11 @@ class Relief(NamedTuple):
     crs: str | None
 
 
-def read_relief(path: Path, bounds: Sequence[float] | None = None) -> Relief:
+BoundsOf = Callable[[str | None], Sequence[float]]
+"""Returns west, south, east and north in a reference system, in its units and in the order x, y."""
+
+
+def read_relief(path: Path, bounds_of: BoundsOf | None = None) -> Relief:
     """Read the triangulated terrain (``TINRelief``) of a CityGML file, e.g. of a PLATEAU tile ``..._dem_6697_op.gml``.
 
     Vertices are merged where they are equal. Triangles without area, seen from above, are left out.
@@ -316,16 +341,16 @@ def read_relief(path: Path, bounds: Sequence[float] | None = None) -> Relief:
     ----------
     path
         The file.
-    bounds
-        West, south, east and north, in the units of the file's system and in the order x, y; triangles wholly outside
-        are left out. None for all triangles.
+    bounds_of
+        Returns the bounds of the region in the file's system; triangles wholly outside are left out. None for all
+        triangles.
 
     Raises
     ------
     InputError
         When the file is damaged, has several reference systems, has no triangles, or has too many.
     """
-    parser = _ReliefParser(path, bounds)
+    parser = _ReliefParser(path, bounds_of)
     for _ in iter_events(path, ROOT, parser):
         limits.TRIANGLES.check(path, parser.triangle_count, "has too many triangles of terrain")
     if not parser.has_triangles:
@@ -351,12 +376,13 @@ def _turn_up(vertices: FloatArray, faces: IntArray) -> IntArray:
 class _ReliefParser(SurfaceParser):
     """Collects the triangles of ``TINRelief``."""
 
-    def __init__(self, path: Path, bounds: Sequence[float] | None) -> None:
+    def __init__(self, path: Path, bounds_of: BoundsOf | None) -> None:
         super().__init__(path)
         self.corners = array("d")
         self.relief_srs_name: str | None = None
         self.has_triangles = False
-        self._bounds = bounds
+        self._bounds_of = bounds_of
+        self._bounds: Sequence[float] | None = None
         self._is_y_first = False
         self._tin_depth = 0
         self._triangles = 0
@@ -391,7 +417,10 @@ class _ReliefParser(SurfaceParser):
         ring = member.rings[0]
         if self.relief_srs_name is None:
             self.relief_srs_name = srs_name
-            self._is_y_first = parse_srs_name(srs_name, str(self.path)).is_y_first
+            system = parse_srs_name(srs_name, str(self.path))
+            self._is_y_first = system.is_y_first
+            if self._bounds_of is not None:
+                self._bounds = self._bounds_of(system.crs)
         if srs_name != self.relief_srs_name:
             problem = f"expected one reference system, got {self.relief_srs_name!r} and {srs_name!r}"
             raise InputError(f"{self.path}: {self.describe()}: srsName", problem, COMPLETE_FILE)

@@ -164,11 +164,30 @@ def _geometry(document: Mapping[str, Any], vertices: FloatArray, where: str) -> 
     if not isinstance(surfaces, list):
         raise InputError(f"{where}: boundaries", "expected a list of surfaces", _HINT)
     geometry = Geometry(_lod(document.get("lod"), where), SOLID if "Solid" in kind else SURFACE)
-    for surface in surfaces:
+    openings = _openings(document.get("semantics"), _SURFACES[kind])
+    for number, surface in enumerate(surfaces):
         if not isinstance(surface, list):
             raise InputError(f"{where}: boundaries", "expected a list of rings", _HINT)
-        geometry.members.append(Surface(tuple(_ring(ring, vertices, where) for ring in surface)))
+        rings = tuple(_ring(ring, vertices, where) for ring in surface)
+        if number not in openings:
+            geometry.members.append(Surface(rings))
     return geometry
+
+
+def _openings(semantics: Any, levels: int) -> set[int]:
+    """Return the numbers of the closure surfaces, through which beams pass; none for unreadable semantics."""
+    if not isinstance(semantics, dict) or not isinstance(semantics.get("surfaces"), list):
+        return set()
+    kinds = [surface.get("type") if isinstance(surface, dict) else None for surface in semantics["surfaces"]]
+    values = semantics.get("values")
+    for _ in range(levels):
+        if not isinstance(values, list) or not all(isinstance(item, list) for item in values):
+            return set()
+        values = [inner for item in values for inner in item]
+    if not isinstance(values, list):
+        return set()
+    closures = {number for number, kind in enumerate(kinds) if kind == "ClosureSurface"}
+    return {number for number, value in enumerate(values) if type(value) is int and value in closures}
 
 
 def _ring(ring: Any, vertices: FloatArray, where: str) -> FloatArray:

@@ -1,8 +1,9 @@
 """Write a copy of an OpenDRIVE map with only what SUMO's netconvert reads, and as netconvert expects it.
 
 netconvert (1.28) knows a projection only as a PROJ string with ``+proj=``; ignores the heading of the header's offset;
-imports parking and other lanes that no traffic uses; and, for left-hand traffic, expects the ids of lanes of right-hand
-traffic, which it draws on the other side of the reference line. What it needs not know is left out.
+imports parking and other lanes that no traffic uses; takes lanes in their order, whatever their ids; and, for left-hand
+traffic, expects the ids of lanes of right-hand traffic, which it draws on the other side of the reference line. What it
+need not know is left out.
 """
 
 from __future__ import annotations
@@ -101,6 +102,7 @@ def _change_road(road: Element, options: CopyOptions) -> None:
             _rotate(geometry, options.rotation_rad)
     if options.swap_lanes:
         _swap_lanes(road)
+    _sort_lanes(road)
 
 
 def _rotate(geometry: Element, angle_rad: float) -> None:
@@ -111,13 +113,23 @@ def _rotate(geometry: Element, angle_rad: float) -> None:
         geometry.set(key, repr(value))
 
 
-def _swap_lanes(road: Element) -> None:
+def _sort_lanes(road: Element) -> None:
+    """Put lanes on the side of their id, from the left to the right: netconvert goes by their order."""
     for section in road.iter("laneSection"):
-        for side in section:
-            side.tag = {"left": "right", "right": "left"}.get(side.tag, side.tag)
-            side[:] = reversed(side)
-        order = {"left": 0, "center": 1, "right": 2}
-        section[:] = sorted(section, key=lambda side: order.get(side.tag, 3))
+        lanes = sorted(section.iter("lane"), key=lambda lane: -int(lane.attrib["id"]))
+        section[:] = []
+        for tag, sign in (("left", 1), ("center", 0), ("right", -1)):
+            side = Element(tag)
+            side.extend(lane for lane in lanes if _sign(int(lane.attrib["id"])) == sign)
+            if len(side):
+                section.append(side)
+
+
+def _sign(number: int) -> int:
+    return (number > 0) - (number < 0)
+
+
+def _swap_lanes(road: Element) -> None:
     for lane in road.iter("lane"):
         _negate(lane, "id")
         for link in lane.iterfind("link/*"):

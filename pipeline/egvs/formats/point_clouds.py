@@ -121,18 +121,23 @@ def read_points(path: Path, where: str) -> PointCloud:
         does not return points.
     """
     where = _with_path(where, path)
-    suffix = _readable_suffix(path, where)
-    point_format: PointFormat = plugins.load_plugin(GROUP, suffix)
-    if path.is_file():
-        limits.checked_size(path, limits.FILE, where)
-    reader = f"its reader {plugins.plugin_module(GROUP, suffix)} (package {plugins.plugin_package(GROUP, suffix)})"
-    points = _read_with(point_format, path, where, reader)
+    points = _read_all(path, where)
     finite = np.isfinite(points).all(axis=1)
     dropped = len(points) - int(np.count_nonzero(finite))
     if dropped == len(points):
         problem = f"expected at least one return with finite x, y and z, got none of {len(points)}"
         raise InputError(where, problem, COMPLETE_FILE)
     return PointCloud(points[finite] if dropped else points, dropped)
+
+
+def _read_all(path: Path, where: str) -> FloatArray:
+    """Return all points of a file, (n, 3) float64, including those that are not finite."""
+    suffix = _readable_suffix(path, where)
+    point_format: PointFormat = plugins.load_plugin(GROUP, suffix)
+    if path.is_file():
+        limits.checked_size(path, limits.FILE, where)
+    reader = f"its reader {plugins.plugin_module(GROUP, suffix)} (package {plugins.plugin_package(GROUP, suffix)})"
+    return _read_with(point_format, path, where, reader)
 
 
 def _read_with(point_format: PointFormat, path: Path, where: str, reader: str) -> FloatArray:
@@ -176,7 +181,7 @@ def stream_points(path: Path, where: str) -> Iterator[PointChunk]:
     suffix = _readable_suffix(path, where)
     point_format = plugins.load_plugin(GROUP, suffix)
     if not isinstance(point_format, StreamedFormat):
-        yield PointChunk(0, None, read_points(path, where).points_m)
+        yield PointChunk(0, None, _read_all(path, where))
         return
     limits.checked_size(path, limits.FILE, where)
     with translate_errors(where, COMPLETE_FILE):

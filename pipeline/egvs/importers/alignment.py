@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from egvs.core.errors import InputError
+from egvs.core.grid import XY
 from egvs.formats.georeference import WorldFrame
-from egvs.importers.junctions import XY
 from egvs.importers.map_parts import Alignment
 
 PointPair = tuple[XY, XY]

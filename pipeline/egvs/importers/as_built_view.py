@@ -1,20 +1,18 @@
-"""How much of what a site sees in an as-built world nobody has measured.
+"""How much of what a site sees in an as-built world no station could see.
 
-A world from a point cloud is empty wherever no beam ended, also where no beam ever came. A site that looks into such
+A world from a point cloud is empty wherever no beam ended, also where no beam could come. A site that looks into such
 space is scored as if it were free. :meth:`AsBuiltMap.unseen_shares` tells how much of a site's view that is.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from egvs.core.grid import FloatArray, Grid, Roi
+from egvs.core.grid import FloatArray, Roi
 from egvs.importers.map_parts import SolidMap
-from egvs.importers.moving_points import StationScan
-from egvs.kernels import traversal
 from egvs.world.mesh import World
 from egvs.world.ray_casting import Caster, shapes_between
 
@@ -28,14 +26,11 @@ class AsBuiltMap(SolidMap):
 
     Attributes
     ----------
-    scans
-        The static points of each station that is known, world frame.
-    ground_xy_m
-        (n, 2): vertices of the ground.
+    stations_m
+        (n, 3) float64: where the scanner stood, as far as that is known, world frame.
     """
 
-    scans: tuple[StationScan, ...] = ()
-    ground_xy_m: FloatArray | None = None
+    stations_m: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
 
     def world(self) -> World:
         """Return both meshes as one static world."""
@@ -63,29 +58,53 @@ class AsBuiltMap(SolidMap):
         Returns
         -------
         ndarray of float64
-            (n,): of the voxels of 1 m in the region whose centres the site sees past the meshes, the share that no beam
-            of a station crossed. NaN where a site sees none, or where no station is known.
+            (n,), see :func:`unseen_shares`.
         """
-        return unseen_shares(self.world(), self.scans, sites_m, roi)
+        return unseen_shares(self.world(), self.stations_m, sites_m, roi)
 
 
-def unseen_shares(world: World, scans: tuple[StationScan, ...], sites_m: FloatArray, roi: Roi) -> FloatArray:
-    """Return which share of its view each site has into space that no station saw; see :class:`AsBuiltMap`."""
-    if not scans:
-        return np.full(len(sites_m), np.nan)
-    grid = _covering_grid(roi)
-    unseen = ~seen_voxels(scans, grid)
-    centres = _centres(grid)
-    caster = Caster(_faces_between(world, grid.roi, sites_m), grid.roi)
+def unseen_shares(world: World, stations_m: FloatArray, sites_m: FloatArray, roi: Roi) -> FloatArray:
+    """Return which share of its view each site has into space that no station could see.
+
+    Parameters
+    ----------
+    world
+        The as-built world.
+    stations_m, sites_m
+        Where the scanner stood, (k, 3), and sensors, (n, 3), in the frame of the world.
+    roi
+        The region of interest.
+
+    Returns
+    -------
+    ndarray of float64
+        (n,): of the voxels of 1 m in the region whose centres the site sees past the triangles, the share whose centres
+        no station sees. NaN where a site sees none, or where no station is known.
+    """
     shares = np.full(len(sites_m), np.nan)
+    if not len(stations_m):
+        return shares
+    centres = _voxel_centres(roi)
+    positions = np.concatenate([stations_m, sites_m])
+    caster = Caster(_faces_between(world, roi, positions), roi)
+    unseen = np.ones(len(centres), dtype=np.bool_)
+    for station in stations_m:
+        unseen &= ~_is_visible(caster, roi, station, centres)
     for number, site in enumerate(sites_m):
-        offsets = centres - site
-        distances = np.sqrt((offsets**2).sum(axis=1))
-        ranges, _ = caster.first_hits(site - grid.origin_m, offsets / np.maximum(distances, 1e-9)[:, None])
-        is_visible = ranges >= distances
-        if is_visible.any():
-            shares[number] = float(unseen[is_visible].mean())
+        visible = _is_visible(caster, roi, site, centres)
+        if visible.any():
+            shares[number] = float(unseen[visible].mean())
     return shares
+
+
+def _is_visible(caster: Caster, roi: Roi, position_m: FloatArray, points_m: FloatArray) -> NDArray[np.bool_]:
+    """Return which points (n, 3) no triangle hides from a position."""
+    offsets = points_m - position_m
+    distances = np.sqrt((offsets**2).sum(axis=1))
+    directions = offsets / np.maximum(distances, np.finfo(np.float64).tiny)[:, None]
+    ranges, _ = caster.first_hits(position_m - roi.origin_m, directions)
+    visible: NDArray[np.bool_] = ranges >= distances
+    return visible
 
 
 def _faces_between(world: World, roi: Roi, sites_m: FloatArray) -> World:
@@ -94,25 +113,9 @@ def _faces_between(world: World, roi: Roi, sites_m: FloatArray) -> World:
     return replace(world, faces=world.faces[kept], solid_of_face=world.solid_of_face[kept])
 
 
-def seen_voxels(scans: tuple[StationScan, ...], grid: Grid) -> NDArray[np.bool_]:
-    """Return which voxels some beam of a station crossed, in flat order, (nx * ny * nz,) bool."""
-    hits = np.zeros(int(np.prod(grid.shape)), dtype=np.uint32)
-    shape = np.array(grid.shape, dtype=np.int64)
-    for scan in scans:
-        x, y, z = scan.station_m.tolist()
-        o, d = grid.segments((x, y, z), scan.points_m - scan.station_m)
-        traversal.count_hits(o, d, shape, grid.voxel_m, hits)
-    return hits > 0
-
-
-def _covering_grid(roi: Roi) -> Grid:
-    """Return voxels of 1 m that cover the region."""
-    nx, ny, nz = (max(int(np.ceil(size / VOXEL_M - 1e-9)), 1) for size in roi.size_m)
-    return Grid(roi.origin_m, VOXEL_M, (nx, ny, nz))
-
-
-def _centres(grid: Grid) -> FloatArray:
-    """Return the centres of the voxels, world frame, (n, 3), in flat order."""
-    index = np.indices(grid.shape).reshape(3, -1).T
-    centres: FloatArray = (index + 0.5) * grid.voxel_m + np.asarray(grid.origin_m)
+def _voxel_centres(roi: Roi) -> FloatArray:
+    """Return the centres of voxels of about 1 m that fill the region, (n, 3)."""
+    shape = np.maximum(np.rint(np.asarray(roi.size_m) / VOXEL_M), 1).astype(np.int64)
+    index = np.indices(tuple(shape)).reshape(3, -1).T
+    centres: FloatArray = (index + 0.5) * (np.asarray(roi.size_m) / shape) + np.asarray(roi.origin_m)
     return centres

@@ -164,6 +164,8 @@ def _is_over_lane(mesh: MappedMesh, lanes: shapely.STRtree, ground_m: Callable[[
     is_low = corners[:, :, 2].min(axis=1) < ground + CLEARANCE_M
     is_high = corners[:, :, 2].max(axis=1) > ground + KERB_M
     # A wall is a line from above; a triangle with an area of 0 is no valid polygon, but its outline is a valid line.
-    outlines = shapely.linestrings(corners[is_low & is_high][:, [0, 1, 2, 0], :2])
-    areas = shapely.convex_hull(outlines)
+    near = corners[is_low & is_high]
+    low, high = near[:, :, :2].min(axis=1), near[:, :, :2].max(axis=1)
+    near = near[np.unique(lanes.query(shapely.box(*low.T, *high.T))[0])]
+    areas = shapely.convex_hull(shapely.linestrings(near[:, [0, 1, 2, 0], :2]))
     return bool(len(lanes.query(areas, predicate="intersects")[0]))

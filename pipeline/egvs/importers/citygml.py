@@ -30,15 +30,23 @@ TILE_MARGIN_M = 200.0
 
 
 def can_open(path: Path, head: bytes) -> bool:
-    """Return whether a file is a city model, or a folder has ``.gml`` files."""
-    return any(_folder_files(path)) if path.is_dir() else citygml.is_citygml(head)
+    """Return whether a file is a city model without terrain, or a folder has ``.gml`` files."""
+    if path.is_dir():
+        return any(_folder_files(path))
+    return citygml.is_citygml(head) and not is_relief(path, head)
+
+
+def is_relief(path: Path, head: bytes) -> bool:
+    """Return whether a file is terrain (:mod:`egvs.importers.citygml_relief`), by its name or its beginning."""
+    tile = parse_tile_name(path.name)
+    return citygml.has_relief(head) or (citygml.is_citygml(head) and tile is not None and tile.kind == "dem")
 
 
 def read_solids(paths: Sequence[Path], context: MapContext) -> SolidMap:
     """Return the buildings, bridges, furniture and plants in the window; InputError when a file is damaged."""
     files = _expand_folders(paths)
     opened = [path for path in files if _is_needed(path, context, TILE_KINDS)]
-    result = collect_solids(map(CityGmlFile, opened), context, SOLID_KINDS)
+    result = collect_solids((CityGmlFile(path, SOLID_KINDS) for path in opened), context, SOLID_KINDS)
     return _with_skipped_files(result, len(files), len(opened))
 
 
@@ -49,7 +57,7 @@ def read_road_surfaces(paths: Sequence[Path], context: MapContext) -> SolidMap:
     """
     files = _expand_folders(paths)
     opened = [path for path in files if _is_needed(path, context, frozenset({"tran", "squr", "rwy", "trk"}))]
-    result = collect_solids(map(CityGmlFile, opened), context, ROAD_KINDS)
+    result = collect_solids((CityGmlFile(path, ROAD_KINDS) for path in opened), context, ROAD_KINDS)
     return _with_skipped_files(result, len(files), len(opened))
 
 

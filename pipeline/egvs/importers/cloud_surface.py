@@ -7,7 +7,7 @@ ground points in cells of half a metre (:func:`triangulate_ground`); thin the ot
 Ground filter: the lowest point of each cell of 1 m; grey openings of that height map with windows of 3 to 41 cells
 remove what stands out by more than 0.25 m and is narrower than the window. Source: Zhang et al. 2003, "A progressive
 morphological filter for removing nonground measurements from airborne LIDAR data", IEEE TGRS 41(4), 872-882, with one
-threshold for all windows.
+threshold for all windows, after a plane has been subtracted.
 
 Surfels: oriented discs in Pfister et al. 2000, "Surfels: surface elements as rendering primitives", SIGGRAPH. Here they
 are rectangles: across the local normal (the direction in which 16 neighbours vary least), along the direction in which
@@ -49,6 +49,7 @@ MIN_SIDE_M, MAX_SIDE_M, MIN_REACH_M = 0.08, 0.6, 0.02
 
 SKIPPED_NEIGHBOURS = 3
 
+_PLANE_FITS = 6
 _DIGITS = 4
 _BLOCK = 50_000
 
@@ -129,7 +130,7 @@ def is_ground(points_m: FloatArray) -> NDArray[np.bool_]:
     is_pit = _pits(_fill_gaps(heights))
     heights[is_pit] = np.inf
     lowest = _fill_gaps(heights)
-    is_low = _survives_openings(lowest) & ~is_pit
+    is_low = _survives_openings(lowest - _trend(lowest)) & ~is_pit
     on_ground: NDArray[np.bool_] = is_low[column, row] & (points_m[:, 2] <= lowest[column, row] + STEP_M)
     return on_ground
 
@@ -152,6 +153,29 @@ def _pits(heights: FloatArray) -> NDArray[np.bool_]:
 
     deep: NDArray[np.bool_] = grey_closing(heights, size=(3, 3)) - heights > PIT_M
     return deep
+
+
+def _trend(heights: FloatArray) -> FloatArray:
+    """Return a plane below most of a height map, for openings cut off the upper end of a slope.
+
+    Least squares, repeated without the cells that are above the last plane.
+    """
+    columns, rows = np.indices(heights.shape).reshape(2, -1)
+    terms = np.column_stack([columns, rows, np.ones(columns.size)]).astype(np.float64)
+    flat = heights.ravel()
+    used = np.ones(flat.size, dtype=np.bool_)
+    plane = np.zeros(3)
+    for _ in range(_PLANE_FITS):
+        if np.count_nonzero(used) < 3:
+            break
+        plane = np.round(np.linalg.lstsq(terms[used], flat[used], rcond=None)[0], _DIGITS)
+        used = flat <= _along_plane(terms, plane) + STEP_M
+    return _along_plane(terms, plane).reshape(heights.shape)
+
+
+def _along_plane(terms: FloatArray, plane: FloatArray) -> FloatArray:
+    heights: FloatArray = terms[:, 0] * plane[0] + terms[:, 1] * plane[1] + plane[2]
+    return heights
 
 
 def _survives_openings(heights: FloatArray) -> NDArray[np.bool_]:

@@ -19,7 +19,6 @@ World frame, metres. Lengths of lanes stay as they are in the plane: at a grade 
 
 from __future__ import annotations
 
-import itertools
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -39,6 +38,7 @@ from egvs.importers.network_heights import (
     format_point,
     node_of_internal,
     replace_parts,
+    sample_line,
 )
 
 STEP_M = 5.0
@@ -170,6 +170,35 @@ def level_difference_m(text: str, terrain: Terrain, where: object = "the road ma
     return median_m, float(np.median(np.abs(known - median_m)))
 
 
+def roads_above_others(text: str, least_m: float = 3.0) -> tuple[tuple[str, str], ...]:
+    """Return the pairs of edges of a network with heights that cross at different levels: the upper one, the lower one.
+
+    Parameters
+    ----------
+    text
+        A network that netconvert wrote.
+    least_m
+        Difference of heights above which two roads are at different levels.
+    """
+    shapes = list(find_shapes(text))
+    graph = _EdgeGraph.from_text(text, shapes, {})
+    lines = {edge: shape.points_m for shape in reversed(shapes) if (edge := _edge_of_lane(shape)) in graph.nodes}
+    pairs = []
+    for one, other in graph.crossings(shapes):
+        at = shapely.LineString(lines[one][:, :2]).intersection(shapely.LineString(lines[other][:, :2]))
+        difference_m = _height_at(lines[one], at) - _height_at(lines[other], at)
+        if abs(difference_m) > least_m:
+            pairs.append((one, other) if difference_m > 0 else (other, one))
+    return tuple(pairs)
+
+
+def _height_at(line_m: FloatArray, at: shapely.Geometry) -> float:
+    """Return the height of a line (n, 3) at a point near it."""
+    line = shapely.LineString(line_m[:, :2])
+    along_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line_m[:, :2], axis=0).T))])
+    return float(np.interp(line.project(shapely.centroid(at)), along_m, line_m[:, 2]))
+
+
 @dataclass(frozen=True)
 class _Sample:
     """Points (n, 2) along a shape, and which of them are points of the shape."""
@@ -183,12 +212,7 @@ def _sample(shape: ShapeText) -> _Sample:
     given = shape.points_m[:, :2]
     if shape.tag == "junction" or len(given) < 2:
         return _Sample(given, np.ones(len(given), dtype=np.bool_))
-    points, is_given = [given[:1]], [np.array([True])]
-    for start, end in itertools.pairwise(given):
-        steps = max(1, int(np.ceil(np.hypot(*(end - start)) / STEP_M)))
-        points.append(start + (end - start) * (np.arange(1, steps + 1) / steps)[:, None])
-        is_given.append(np.arange(1, steps + 1) == steps)
-    return _Sample(np.concatenate(points), np.concatenate(is_given))
+    return _Sample(*sample_line(given, STEP_M))
 
 
 def _heights(terrain: Terrain, samples: Sequence[_Sample], where: object) -> list[FloatArray]:

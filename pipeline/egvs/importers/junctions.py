@@ -45,7 +45,7 @@ import shapely
 from shapely.geometry import LineString, Point, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
-from egvs.core.grid import FloatArray
+from egvs.core.grid import XY, FloatArray
 from egvs.formats.georeference import WorldFrame
 from egvs.importers import roundabouts
 from egvs.importers.roundabouts import Ring
@@ -54,9 +54,6 @@ from egvs.traffic import network as road_network
 from egvs.traffic.demand import RouteFinder
 from egvs.traffic.network import Edge, Network
 from egvs.world.geolocation import network_world_frame
-
-XY = tuple[float, float]
-"""x, y in metres."""
 
 MIN_ARMS = 3
 """A junction that a user can choose connects at least this number of streets."""

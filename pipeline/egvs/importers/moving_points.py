@@ -4,9 +4,9 @@ Two rules, both of which need to know where the scanner stood:
 
 - **Several sweeps from one place** (:func:`not_shared`): a direction ends at the farthest range that at least 30 % of
   the sweeps, and at least three, share. Points elsewhere are moving, or noise.
-- **Several places** (:func:`seen_through`): a point is moving when another station at a similar distance measured
-  farther in that direction and all around it, and no other station measured anything there. Source of the idea:
-  Pagad et al. 2020, "Robust method for removing dynamic objects from point clouds", ICRA.
+- **Several places** (:func:`seen_through`): a point is moving when another station measured farther in that direction
+  and all around it, or met nothing there, and no other station measured anything where the point is. Source of the
+  idea: Pagad et al. 2020, "Robust method for removing dynamic objects from point clouds", ICRA.
 
 Directions are compared in cells of azimuth and elevation. Frame: that of the points, metres.
 """
@@ -30,8 +30,13 @@ SWEEP_CELL_DEG = (0.2, 0.1)
 """Azimuth and elevation of the cells that compare sweeps: about one beam each."""
 
 VIEW_CELL_DEG = 0.5
-MAX_RANGE_RATIO = 1.5
+MAX_RANGE_RATIO = 5.0
 """A station judges only points that are at most this many times as far from it as from their own station."""
+
+DENSE_SHARE = 0.5
+"""Where more of the cells of a scan are filled, a patch of nine empty cells is sky, not a gap between beams."""
+
+_OUTER_PERCENT = 5
 
 _TOLERANCE_M, _TOLERANCE_SHARE = 0.3, 0.01
 _MIN_FILLED = 6
@@ -157,6 +162,9 @@ class _RangeImage:
         Nearest range in each cell and its eight neighbours.
     filled
         How many of these cells have a point.
+    sky_limits
+        Lowest and highest elevation in degrees, and largest range, up to which nine empty cells are sky; none of a
+        sparse scan.
     """
 
     station_m: FloatArray
@@ -164,6 +172,7 @@ class _RangeImage:
     farthest: FloatArray
     surrounding: FloatArray
     filled: IntArray
+    sky_limits: tuple[float, float, float]
 
     @classmethod
     def of(cls, view: StationScan) -> _RangeImage:
@@ -178,20 +187,37 @@ class _RangeImage:
         np.maximum.at(farthest.ravel(), cell, range_m)
         around = ("wrap", "nearest")
         filled = np.isfinite(nearest).astype(np.int64)
+        sky_limits = _sky_limits(filled, elevation, range_m)
         for axis, mode in enumerate(around):
             filled = convolve(filled, np.ones((3, 1) if axis == 0 else (1, 3), dtype=np.int64), mode=mode)
-        return cls(view.station_m, nearest, farthest, minimum_filter(nearest, size=3, mode=around), filled)
+        surrounding = minimum_filter(nearest, size=3, mode=around)
+        return cls(view.station_m, nearest, farthest, surrounding, filled, sky_limits)
 
     def judge(self, points_m: FloatArray, own_range_m: FloatArray) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return which points (n, 3) this station saw through, and which it confirms."""
         azimuth, elevation, range_m = _polar(points_m - self.station_m)
         cell = _cell_number(azimuth, elevation, (VIEW_CELL_DEG, VIEW_CELL_DEG))
         tolerance = tolerance_m(range_m)
-        may_judge = (self.filled.ravel()[cell] >= _MIN_FILLED) & (range_m <= MAX_RANGE_RATIO * own_range_m)
-        through = may_judge & (self.surrounding.ravel()[cell] > range_m + tolerance)
+        filled = self.filled.ravel()[cell]
+        is_farther = (filled >= _MIN_FILLED) & (self.surrounding.ravel()[cell] > range_m + tolerance)
+        lowest, highest, longest = self.sky_limits
+        is_sky = (filled == 0) & (elevation >= lowest) & (elevation <= highest) & (range_m <= longest)
+        through = (is_farther | is_sky) & (range_m <= MAX_RANGE_RATIO * own_range_m)
         nearest, farthest = self.nearest.ravel()[cell], self.farthest.ravel()[cell]
         confirmed = (nearest <= range_m + tolerance) & (farthest >= range_m - tolerance)
         return through, confirmed
+
+
+def _sky_limits(filled: IntArray, elevation: FloatArray, range_m: FloatArray) -> tuple[float, float, float]:
+    """Return the elevations and the range up to which empty cells of an image are sky, see :class:`_RangeImage`."""
+    nowhere = (np.inf, -np.inf, -np.inf)
+    if not len(range_m):
+        return nowhere
+    low, high = np.percentile(elevation, (_OUTER_PERCENT, 100 - _OUTER_PERCENT))
+    first, last = (int((edge + 90.0) / VIEW_CELL_DEG) for edge in (low, high))
+    if filled[:, first : last + 1].mean() <= DENSE_SHARE:
+        return nowhere
+    return float(low), float(high), float(np.percentile(range_m, 100 - _OUTER_PERCENT))
 
 
 def _polar(offsets: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

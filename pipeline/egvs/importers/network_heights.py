@@ -7,12 +7,14 @@ else, such as lengths and the digits of x and y, stays as it is. World frame, me
 from __future__ import annotations
 
 import html
+import itertools
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
@@ -107,6 +109,31 @@ def attribute(element: str, name: str) -> str:
     """Return an attribute in the text of an element; empty if it has none."""
     match = re.search(rf'\s{name}="([^"]*)"', element)
     return html.unescape(match[1]) if match else ""
+
+
+def sample_line(points_m: FloatArray, step_m: float) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Insert points into a line so that none are farther apart than a step.
+
+    Parameters
+    ----------
+    points_m
+        (n, 2) or (n, 3) float64.
+    step_m
+        Largest distance in the plane.
+
+    Returns
+    -------
+    points_m : ndarray of float64
+        (m, 2) or (m, 3).
+    is_given : ndarray of bool
+        (m,): which of them are points of the line.
+    """
+    pieces, is_given = [points_m[:1]], [np.array([True])]
+    for start, end in itertools.pairwise(points_m):
+        steps = max(1, int(np.ceil(np.hypot(*(end - start)[:2]) / step_m)))
+        pieces.append(start + (end - start) * (np.arange(1, steps + 1) / steps)[:, None])
+        is_given.append(np.arange(1, steps + 1) == steps)
+    return np.concatenate(pieces), np.concatenate(is_given)
 
 
 def node_of_internal(name: str) -> str:

@@ -30,6 +30,7 @@ import tomlkit
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core.errors import InputError
+from egvs.core.grid import XY, FloatArray, Roi
 from egvs.formats import ply
 from egvs.importers import (
     assumed_traffic,
@@ -44,7 +45,8 @@ from egvs.importers import (
 )
 from egvs.importers.alignment import PointPair, make_alignment
 from egvs.importers.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, AssumedTraffic
-from egvs.importers.junctions import XY, JunctionRegion, StreetJunction, Streets
+from egvs.importers.building_heights import ASSUMED, NEIGHBOURS
+from egvs.importers.junctions import JunctionRegion, KerbsidePole, StreetJunction, Streets
 from egvs.importers.map_parts import MapContext, RoadOptions, Terrain
 from egvs.importers.map_readers import MapFile
 from egvs.importers.openstreetmap import OsmRoads
@@ -62,7 +64,7 @@ from egvs.importers.scenario_files import (
     TomlTable,
     reachable_area,
 )
-from egvs.importers.static_objects import MapSummary, StaticObjects
+from egvs.importers.static_objects import MapSummary, ReadMap, StaticObjects
 from egvs.scenario.loading import load
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, CountConfig, TrafficConfig
@@ -276,6 +278,7 @@ def create_scenario(
         folder, junction, roi, streets, len(poles), objects.counts, objects.n_solids + 1, assumed, tuple(notes),
         maps=objects.maps, attributions=_attributions(roads, objects), from_at_m=_distance_m(streets, junction, at),
     )  # fmt: skip
+    columns = _site_columns(streets, poles, relief, maps_read, roi, zero.height_m or 0.0)
     meshes = static_objects.mesh_files([mesh for mesh in objects.meshes if mesh.kind != static_objects.GROUND])
     terrain_files = {}
     if terrain is not None:
@@ -284,13 +287,33 @@ def create_scenario(
     contents: dict[str, FileContent] = {
         NETWORK_FILE: roads.network,
         STATICS_FILE: scenario_files.solids_geojson(objects.solids, objects.counts, scenario.attributions),
-        SITES_FILE: scenario_files.sites_csv(poles, relief.ground_m(streets, poles)),
+        SITES_FILE: scenario_files.sites_csv(poles, columns),
         **meshes,
         **terrain_files,
         SCENARIO_FILE: _scenario_toml(name, scenario, relief, statics),
     }
     scenario_files.publish_folder(folder, contents.items(), load)
     return scenario
+
+
+def _site_columns(
+    streets: Streets, poles: Sequence[KerbsidePole], relief: Relief, maps: Sequence[ReadMap], roi: JunctionRegion,
+    zero_height_m: float,
+) -> dict[str, FloatArray]:  # fmt: skip
+    """Return further columns of the sites: z of the ground where it is not flat, and what a point cloud did not see."""
+    columns = {}
+    ground_m = relief.ground_m(streets, poles)
+    if ground_m is not None:
+        columns["ground_m"] = ground_m
+    low_m, high_m = relief.z_range_m
+    center_m = *roi.center_m, (low_m + high_m) / 2 + zero_height_m
+    sensors_m = np.array([(pole.x_m, pole.y_m, junctions.HEIGHTS_M[1] + zero_height_m) for pole in poles])
+    if ground_m is not None:
+        sensors_m[:, 2] += ground_m
+    unseen = static_objects.unseen_shares(maps, sensors_m, Roi.around(center_m, (*roi.size_m, high_m - low_m)))
+    if unseen is not None and not np.isnan(unseen).all():
+        columns["unseen_share"] = np.round(unseen, 3)
+    return columns
 
 
 def _terrain_writer(terrain: Terrain, window: BaseGeometry, zero_height_m: float) -> Callable[[Path], None]:
@@ -415,6 +438,11 @@ def scenario_notes(junction_fits: bool, counts: ImportCounts) -> list[str]:
             f"{heights['default']} of {heights.total()} buildings have neither height nor levels:"
             f" {osm_solids.DEFAULT_BUILDING_M:g} m assumed"
         )
+    if heights[NEIGHBOURS]:
+        notes.append(
+            f"{heights[NEIGHBOURS]} of {heights.total()} buildings have neither height nor levels: the median height of"
+            " the buildings near by assumed"
+        )
     return notes
 
 
@@ -487,11 +515,15 @@ def _assumptions(scenario: NewScenario) -> list[str]:
     return [*assumed, *assumed_sizes(scenario.statics), "positions of the poles"]
 
 
+def _assumed_buildings(heights: Counter[str]) -> int:
+    return heights[ASSUMED] + heights[NEIGHBOURS]
+
+
 def assumed_sizes(counts: ImportCounts) -> list[str]:
     """Return which sizes of static objects are assumed, for the key ``assumed``; objects that can hide vehicles."""
     heights = {kind: counts.heights.get(kind, Counter()) for kind in ("building", "tree", "bridge")}
     texts = [
-        (heights["building"]["default"], heights["building"].total(), "heights of {} buildings"),
+        (_assumed_buildings(heights["building"]), heights["building"].total(), "heights of {} buildings"),
         (heights["tree"]["default"], heights["tree"].total(), "heights of {} trees"),
         (counts.assumed_crowns, heights["tree"].total(), "crown widths of {} trees"),
         (heights["bridge"]["default"], heights["bridge"].total(), "heights of {} bridge decks"),

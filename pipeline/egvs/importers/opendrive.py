@@ -23,7 +23,7 @@ from egvs.core.errors import InputError
 from egvs.formats import georeference, opendrive
 from egvs.formats.opendrive import OpenDriveMap, Road
 from egvs.formats.opendrive_copy import CopyOptions, write_copy
-from egvs.importers import network_heights
+from egvs.importers import draping, network_heights
 from egvs.importers.map_parts import RoadMap, RoadOptions
 from egvs.importers.opendrive_check import (
     HEIGHT_OFF_M,
@@ -33,7 +33,7 @@ from egvs.importers.opendrive_check import (
     compare_with_map,
     read_made_network,
 )
-from egvs.importers.opendrive_turns import DRIVING_TYPES
+from egvs.importers.opendrive_turns import DRIVING_TYPES, permitted_turns
 from egvs.traffic import sumo
 
 NAME = "OpenDRIVE"
@@ -70,13 +70,14 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
     path
         The map, gzipped or not.
     options
-        Traffic drives on the left if they say so, or the map does (``rule="LHT"``). With ``walk``, sidewalks are
-        imported, and crossings are guessed.
+        Traffic drives on the left if they say so, or the map does (``rule="LHT"``); then lanes with positive ids lead
+        along their roads. With ``walk``, sidewalks are imported, and crossings are guessed.
 
     Raises
     ------
     InputError
-        When the map is damaged, has roads for left- and for right-hand traffic, or netconvert cannot use it.
+        When the map is damaged, is for right-hand traffic although the options say otherwise, has roads for left- and
+        for right-hand traffic, or netconvert cannot use it.
     """
     road_map = opendrive.read_opendrive(path)
     check_size(road_map, path)
@@ -86,12 +87,14 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
     copy_options = CopyOptions(
         reference,
         rotation_rad=road_map.offset_rad if reference else 0.0,
-        swap_lanes=is_lefthand_map,
+        swap_lanes=lefthand,
         keeps_type=_import_all if options.walk else is_driving,
     )
     with files.temporary_folder() as folder:
         write_copy(path, folder / _MAP, copy_options)
         copied = opendrive.read_opendrive(folder / _MAP)
+        if lefthand and not is_lefthand_map:
+            _check_lefthand(road_map, copied, path)
         flags = [*_FLAGS, *(["--lefthand"] if lefthand else []), *([] if reference else [_OWN_FRAME_FLAG])]
         if options.walk:
             flags.append("--opendrive.import-all-lanes")
@@ -100,11 +103,10 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
         made = read_made_network(folder / _NETWORK)
         comparison = compare_with_map(made, copied, mirrored=lefthand)
         name = _patch(folder, made, comparison, options, path)
+        after = comparison
         if name != _NETWORK:
-            patched = compare_with_map(read_made_network(folder / name), copied, mirrored=lefthand)
-            notes += (*_patch_notes(comparison, patched), *comparison_notes(patched, road_map))
-        else:
-            notes += comparison_notes(comparison, road_map)
+            after = compare_with_map(read_made_network(folder / name), copied, mirrored=lefthand)
+        notes += (*_patch_notes(comparison, after), *comparison_notes(after, road_map))
         text = (folder / name).read_text(encoding="utf-8")
 
     text = _GENERATED.sub("<!-- made from an OpenDRIVE map -->", text, count=1)
@@ -115,6 +117,8 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
     if any(road_map.offset_m) and not reference:
         notes += ("The header's offset is left out, since it refers to an unknown reference system.",)
     has_heights = bool(height_m) or any(_has_relief(road) for road in road_map.roads.values())
+    if has_heights:
+        notes += _level_notes(text)
     return RoadMap(text, notes=(*notes, *_map_notes(road_map)), has_heights=has_heights)
 
 
@@ -146,6 +150,15 @@ def _is_lefthand(road_map: OpenDriveMap, path: Path) -> bool:
     return bool(lefthand)
 
 
+def _check_lefthand(road_map: OpenDriveMap, swapped: OpenDriveMap, path: Path) -> None:
+    """Raise an InputError when the lanes on the right lead along their roads; older maps do not state a rule."""
+    right, left = len(permitted_turns(road_map)), len(permitted_turns(swapped))
+    if right > left:
+        problem = f"is for right-hand traffic: {right} turns are from lanes on the right, {left} from lanes on the left"
+        hint = "Read it without --lefthand; let netconvert write it with --opendrive-output.lefthand-left."
+        raise InputError(path, problem, hint)
+
+
 def _projection(road_map: OpenDriveMap, path: Path) -> tuple[str, tuple[str, ...]]:
     """Return the map's projection as a PROJ string, empty if it has none, and what to tell."""
     text = _GEOID.sub("", road_map.reference).strip()
@@ -170,8 +183,12 @@ def _netconvert(arguments: Sequence[str], folder: Path, name: str, path: Path) -
 
 
 def _patch(folder: Path, made: MadeNetwork, comparison: MapComparison, options: RoadOptions, path: Path) -> str:
-    """Add missing connections and close lanes; return the name of the resulting network."""
+    """Add missing connections, remove others, and close lanes; return the name of the resulting network."""
     connections = [
+        f'<delete from={quoteattr(source)} to={quoteattr(target)} fromLane="{source_lane}" toLane="{target_lane}"/>'
+        for source, source_lane, target, target_lane in comparison.added
+    ]
+    connections += [
         f"<connection from={quoteattr(source.edge)} to={quoteattr(target.edge)}"
         f' fromLane="{source.index}" toLane="{target.index}"/>'
         for source, target in comparison.missing.values()
@@ -213,11 +230,15 @@ def _element(tag: str, children: Iterable[str]) -> str:
 
 
 def _patch_notes(before: MapComparison, after: MapComparison) -> tuple[str, ...]:
-    added = len(before.missing) - len(after.missing)
-    if not added:
-        return ()
-    roads = _listed(turn.source.road for turn in before.missing if turn not in after.missing)
-    return (f"{added} of {before.turns} turns that netconvert had lost were added, from roads {roads}.",)
+    notes = []
+    added = [turn for turn in before.missing if turn not in after.missing]
+    if added:
+        roads = _listed(turn.source.road for turn in added)
+        notes.append(f"{len(added)} of {before.turns} turns that netconvert had lost were added, from roads {roads}.")
+    removed = {*before.added} - {*after.added}
+    if removed:
+        notes.append(f"{len(removed)} connections that are not in the map were removed.")
+    return tuple(notes)
 
 
 def comparison_notes(comparison: MapComparison, road_map: OpenDriveMap) -> tuple[str, ...]:
@@ -236,6 +257,10 @@ def comparison_notes(comparison: MapComparison, road_map: OpenDriveMap) -> tuple
     if comparison.added:
         edges = (f"{source} to {target}" for source, _, target, _ in comparison.added)
         notes.append(f"{len(comparison.added)} connections are not in the map: {_listed(edges)}.")
+    if comparison.guessed:
+        edges = (f"{source} to {target}" for source, _, target, _ in comparison.guessed)
+        guessed = f"{len(comparison.guessed)} connections are guessed, from lanes that the map links to none"
+        notes.append(f"{guessed}: {_listed(edges)}.")
     far = {road: off_m for road, off_m in comparison.off_m.items() if off_m > OFF_M}
     if far:
         notes.append(
@@ -268,6 +293,17 @@ def _map_notes(road_map: OpenDriveMap) -> tuple[str, ...]:
     if signs:
         notes.append(f"{signs} signs and marks are left out.")
     return tuple(notes)
+
+
+def _level_notes(network_text: str) -> tuple[str, ...]:
+    """Return a sentence on roads that lead over others."""
+    pairs = draping.roads_above_others(network_text)
+    if not pairs:
+        return ()
+    listed = _listed(f"{upper} over {lower}" for upper, lower in pairs)
+    return (
+        f"{len(pairs)} times roads lead over others: {listed}. Without a terrain, the ground rises to the upper one.",
+    )
 
 
 def _has_relief(road: Road) -> bool:

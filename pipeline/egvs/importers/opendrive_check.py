@@ -98,7 +98,9 @@ class MapComparison:
     lost_turns
         Turns that cannot be added, since one of their lanes is missing.
     added
-        Connections of the network that the map does not have.
+        Connections of the network that the map does not have, from lanes that lead elsewhere in the map.
+    guessed
+        Connections of the network from lanes that lead nowhere in the map.
     off_m
         Distance of each road's lanes from the map, by road.
     height_off_m
@@ -115,6 +117,7 @@ class MapComparison:
     missing: Mapping[Turn, tuple[NetworkLane, NetworkLane]]
     lost_turns: tuple[Turn, ...]
     added: tuple[tuple[str, int, str, int], ...]
+    guessed: tuple[tuple[str, int, str, int], ...] = ()
     off_m: Mapping[str, float] = field(default_factory=dict)
     height_off_m: Mapping[str, float] = field(default_factory=dict)
     unlit_roads: tuple[str, ...] = ()
@@ -182,6 +185,8 @@ def compare_with_map(made: MadeNetwork, road_map: OpenDriveMap, *, mirrored: boo
         permitted.add(connection)
         if source is not target and connection not in made.connections:
             missing[turn] = source, target
+    others = sorted(_added(made, permitted))
+    linked = {connection[:2] for connection in permitted}
     off_m, height_off_m = _distances(made, lines)
     return MapComparison(
         lanes=len(lines),
@@ -189,7 +194,8 @@ def compare_with_map(made: MadeNetwork, road_map: OpenDriveMap, *, mirrored: boo
         turns=len(turns),
         missing=missing,
         lost_turns=tuple(lost_turns),
-        added=tuple(sorted(_added(made, permitted))),
+        added=tuple(connection for connection in others if connection[:2] in linked),
+        guessed=tuple(connection for connection in others if connection[:2] not in linked),
         off_m=off_m,
         height_off_m=height_off_m,
         unlit_roads=tuple(_unlit_roads(made, road_map)),

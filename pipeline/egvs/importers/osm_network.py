@@ -25,10 +25,11 @@ from shapely.geometry.base import BaseGeometry
 
 from egvs.core import files
 from egvs.core.errors import InputError, RunError
+from egvs.core.grid import XY
 from egvs.formats import xml
 from egvs.formats.osm import OsmExtract, Way, parse_number, write_streets
 from egvs.importers import junctions
-from egvs.importers.junctions import XY, StreetJunction, Streets
+from egvs.importers.junctions import StreetJunction, Streets
 from egvs.traffic import sumo, sumo_folder
 from egvs.traffic.network import Location
 

@@ -29,8 +29,9 @@ import shapely
 from shapely.geometry import LineString, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
+from egvs.core.grid import XY
 from egvs.formats.osm import OsmExtract, Relation, Tags, Way, parse_number
-from egvs.importers.junctions import XY, Streets
+from egvs.importers.junctions import Streets
 from egvs.importers.osm_network import PATH_HIGHWAYS
 from egvs.scenario.model import StaticsConfig
 from egvs.world import map_features

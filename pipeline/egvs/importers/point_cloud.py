@@ -92,14 +92,13 @@ def read_solids(paths: Sequence[Path], context: MapContext) -> AsBuiltMap:
     triangles = len(surface.ground.faces) + len(surface.objects.faces)
     where = ", ".join(path.name for path in paths)
     limits.TRIANGLES.check(where, triangles, f"its surface in the window has {triangles:,} triangles")
-    survey.counts.objects.update({mesh.kind: 1 for mesh in _meshes(surface)})
+    survey.counts.objects.update({mesh.kind: 1 for mesh in make_meshes(surface)})
     return AsBuiltMap(
-        meshes=_meshes(surface),
+        meshes=make_meshes(surface),
         counts=survey.counts,
         has_absolute_heights=True,
         notes=_notes(survey, surface, len(points)),
-        scans=tuple(StationScan(scan.station_m, scan.points_m) for scan in scans if scan.station_m is not None),
-        ground_xy_m=surface.ground.vertices_m[:, :2],
+        stations_m=np.array([scan.station_m for scan in scans if scan.station_m is not None]).reshape(-1, 3),
     )
 
 
@@ -253,7 +252,7 @@ def _without_moving_objects(survey: _Survey) -> list[_Scan]:
     return [_Scan(view.station_m, _parts=[view.points_m]) for view in views] + unplaced
 
 
-def _meshes(surface: CloudSurface) -> tuple[MappedMesh, ...]:
+def make_meshes(surface: CloudSurface) -> tuple[MappedMesh, ...]:
     """Return the meshes that have triangles."""
     named = ((GROUND_KIND, surface.ground), (OBJECT_KIND, surface.objects))
     return tuple(_mesh(kind, triangles) for kind, triangles in named if len(triangles.faces))
@@ -282,11 +281,14 @@ def _station_note(survey: _Survey) -> str:
     placed = [StationScan(scan.station_m, scan.points_m) for scan in survey.scans if scan.station_m is not None]
     stations = len(group_by_station(placed))
     if len(placed) < len(survey.scans):
-        return (
+        unknown = (
             f"Where the scanner stood is unknown for {len(survey.scans) - len(placed)} of"
             f" {_count(len(survey.scans), 'scan')}: what moved there is part of the world. E57 scans and PCD files with"
             " a VIEWPOINT state it."
         )
+        if len(survey.scans) > 1:
+            return unknown
+        return f"{unknown} If it is from one place, this is a world for that place only."
     if stations == 1:
         return (
             "All scans are from one place. What is hidden from there is missing, so this is a world for sensors at that"

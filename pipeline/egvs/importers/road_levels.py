@@ -20,15 +20,16 @@ import heapq
 import math
 import re
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
 from shapely.geometry import LineString, MultiPoint, Point
 from shapely.geometry.base import BaseGeometry
 
+from egvs.core.grid import XY
 from egvs.formats.osm import OsmExtract, Tags, Way, parse_number
-from egvs.importers.junctions import XY, StreetJunction, Streets
+from egvs.importers.junctions import StreetJunction, Streets
 from egvs.importers.osm_network import is_road
 
 MARGIN_M = 20.0
@@ -36,6 +37,7 @@ MARGIN_M = 20.0
 
 _RAILWAYS = frozenset({"rail", "light_rail", "subway", "tram", "narrow_gauge", "monorail"})
 _SAME_NODE_M = 0.1
+_EDGE_NAME = re.compile(r"-?(\d+)(?:#\d+)?")
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,35 @@ def way_level(tags: Tags) -> int:
     if tags.get("tunnel", "no") not in ("no", "building_passage"):
         return -1
     return 0
+
+
+def keep_levels_flags(extract: OsmExtract) -> list[str]:
+    """Return flags with which netconvert does not merge bridges and tunnels with the streets before and after them.
+
+    It merges pieces of a street under the name of the first. Names of edges that do not exist are ignored.
+    """
+    uses = Counter(node for way in extract.ways.values() if is_road(way) for node in {*way.nodes})
+    names = []
+    for way in extract.ways.values():
+        if is_road(way) and way_level(way.tags):
+            splits = sum(uses[node] > 1 or node in extract.node_tags for node in way.nodes)
+            numbers = ["", *(f"#{number}" for number in range(splits + 1))]
+            names += [f"{sign}{way.id}{number}" for sign in ("", "-") for number in numbers]
+    return ["--geometry.remove.keep-edges.explicit", ",".join(names)] if names else []
+
+
+def edge_levels(edges: Iterable[str], extract: OsmExtract) -> dict[str, int]:
+    """Return the levels of edges of a network by id, without those on the ground.
+
+    The network must be made with :func:`keep_levels_flags`; an edge is named after its way ("-12#3").
+    """
+    levels = {}
+    for edge in edges:
+        match = _EDGE_NAME.fullmatch(edge)
+        way = extract.ways.get(int(match[1])) if match else None
+        if way is not None and way_level(way.tags):
+            levels[edge] = way_level(way.tags)
+    return levels
 
 
 def find_other_levels(

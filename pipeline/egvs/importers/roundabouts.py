@@ -17,10 +17,8 @@ import shapely
 from shapely.geometry import LineString, Polygon
 from shapely.geometry.base import BaseGeometry
 
+from egvs.core.grid import XY
 from egvs.traffic.network import Edge, Network
-
-XY = tuple[float, float]
-"""x, y in metres."""
 
 _ARM_M = 30.0
 """The direction of an arm is that of the point at this distance from the ring, seen from its middle."""

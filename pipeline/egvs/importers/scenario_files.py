@@ -100,22 +100,22 @@ def solids_geojson(
     return f'{opening},\n "features": [\n{lines}\n]}}\n'
 
 
-def sites_csv(poles: Sequence[KerbsidePole], ground_m: FloatArray | None = None) -> str:
+def sites_csv(poles: Sequence[KerbsidePole], columns: Mapping[str, FloatArray] | None = None) -> str:
     """Return the table of candidate sites.
 
     Parameters
     ----------
     poles
         Locations.
-    ground_m
-        (n,) z of the ground at each pole, in metres; None where it is 0.
+    columns
+        Further columns by name, (n,) each.
     """
     digits = max(2, len(str(len(poles))))
     rows = [f"k{number:0{digits}d},{pole.x_m},{pole.y_m}" for number, pole in enumerate(poles, 1)]
     header = "site,x_m,y_m"
-    if ground_m is not None:
-        header += ",ground_m"
-        rows = [f"{row},{height_m:g}" for row, height_m in zip(rows, ground_m.tolist(), strict=True)]
+    for name, values in (columns or {}).items():
+        header += f",{name}"
+        rows = [f"{row},{value:g}" for row, value in zip(rows, values.tolist(), strict=True)]
     return "\n".join([header, *rows, ""])
 
 

@@ -2,7 +2,8 @@
 
 Footprints become ``statics.geojson``; meshes become one PLY file for each kind of object. Steps of
 :func:`collect_objects`: lower meshes whose heights count from sea level to the network's ground; drop buildings of
-OpenStreetMap where another map has one; cut footprints that cover the carriageway, and count meshes that do.
+OpenStreetMap where another map has one; cut footprints that cover the carriageway, and name meshes that do; give
+buildings without a height that of their neighbours.
 
 World frame: x east, y north in metres; heights in metres above z = 0 of the network.
 """
@@ -17,18 +18,20 @@ from pathlib import Path
 
 import numpy as np
 import shapely
+from scipy.spatial import KDTree
 from shapely.geometry import MultiPoint, Point
 from shapely.geometry.base import BaseGeometry
 
-from egvs.core.grid import FloatArray
-from egvs.importers import openstreetmap, osm_solids
-from egvs.importers.junctions import XY, Streets
+from egvs.core.grid import XY, FloatArray, Roi
+from egvs.importers import building_heights, openstreetmap, osm_solids
+from egvs.importers.as_built_view import AsBuiltMap
+from egvs.importers.junctions import Streets
 from egvs.importers.map_parts import MapContext, MappedMesh, SolidMap
 from egvs.importers.map_readers import MapFile
 from egvs.importers.openstreetmap import OsmRoads
 from egvs.importers.osm_solids import ImportCounts, MappedSolid
+from egvs.importers.point_cloud import OBJECT_KIND
 from egvs.importers.road_source import RoadSource
-from egvs.world.clearances import CLEARANCE_M
 
 REPLACED = "replaced_by_another_map"
 """The reason to leave out a building of OpenStreetMap."""
@@ -43,8 +46,13 @@ _LARGE_DIFFERENCE_M = 5.0
 
 GROUND = "ground"
 """The kind of meshes that are ground; it becomes the terrain of the scenario."""
-_LOW_M = 0.5
-"""What is no higher above the ground than this does not hinder vehicles."""
+
+_SQUARE_M = 0.5
+_NEAR_GROUND_M = (0.5, 4.0)
+"""Heights above the ground in which the surface of a point cloud is in the way of a pole."""
+
+_MAX_NAMES = 10
+"""How many objects a note names."""
 
 
 @dataclass(frozen=True)
@@ -99,9 +107,18 @@ class StaticObjects:
 
     @property
     def areas(self) -> list[BaseGeometry]:
-        """The areas covered by all objects except the ground, seen from above; meshes by their convex hull."""
-        outlines = [outline(mesh) for mesh in self.meshes if mesh.kind != GROUND]
-        return [*(solid.area for solid in self.solids), *outlines]
+        """The areas where no pole can stand, seen from above: all objects except the ground.
+
+        A mesh is taken as its convex hull, the surface of a point cloud as the squares in which it is near the ground.
+        """
+        areas = [solid.area for solid in self.solids]
+        ground = next((mesh for mesh in self.meshes if mesh.kind == GROUND), None)
+        for mesh in self.meshes:
+            if mesh.kind == OBJECT_KIND and ground is not None:
+                areas += _squares_near_ground(mesh, ground)
+            elif mesh.kind != GROUND:
+                areas.append(outline(mesh))
+        return areas
 
 
 @dataclass(frozen=True)
@@ -143,6 +160,22 @@ def read_maps(maps: Sequence[MapFile], roads: RoadSource, road_file: MapFile, co
     return read
 
 
+def unseen_shares(maps: Sequence[ReadMap], sites_m: FloatArray, roi: Roi) -> FloatArray | None:
+    """Return the share of each site's view that no station of a point cloud saw, (n,); None without a point cloud.
+
+    Parameters
+    ----------
+    maps
+        From :func:`read_maps`.
+    sites_m
+        Sensors, (n, 3), with heights as the point cloud counts them.
+    roi
+        The region of interest, in the same frame.
+    """
+    surveys = [read.objects for read in maps if isinstance(read.objects, AsBuiltMap)]
+    return surveys[0].unseen_shares(sites_m, roi) if surveys else None
+
+
 def ground_mesh(maps: Sequence[ReadMap]) -> MappedMesh | None:
     """Return the ground that a map has measured, as a point cloud does; None if there is none."""
     meshes = (mesh for read in maps for mesh in read.objects.meshes)
@@ -152,7 +185,7 @@ def ground_mesh(maps: Sequence[ReadMap]) -> MappedMesh | None:
 def collect_objects(
     maps: Sequence[ReadMap], streets: Streets, middle_m: XY, zero_height_m: float | None = None
 ) -> StaticObjects:
-    """Put the objects of all maps on the ground, and clear the carriageway.
+    """Put the objects of all maps on the ground, clear the carriageway, and assume heights that no map gives.
 
     Parameters
     ----------
@@ -173,12 +206,23 @@ def collect_objects(
             objects = _lower_to_ground(read.objects, middle_m, zero_height_m)
             objects = _clear_of_carriageway(objects, streets)
         collected = _add(collected, objects, read.paths, read.reader)
-    return collected
+    solids = building_heights.heights_from_neighbours(collected.solids, collected.counts, collected.meshes)
+    return replace(collected, solids=tuple(solids))
 
 
 def outline(mesh: MappedMesh) -> BaseGeometry:
     """Return the convex hull of a mesh, seen from above."""
     return MultiPoint(mesh.vertices_m[:, :2]).convex_hull
+
+
+def _squares_near_ground(mesh: MappedMesh, ground: MappedMesh) -> list[BaseGeometry]:
+    """Return the squares of a grid that contain vertices of a surface a little above the ground."""
+    nearest = KDTree(ground.vertices_m[:, :2]).query(mesh.vertices_m[:, :2])[1]
+    height_m = mesh.vertices_m[:, 2] - ground.vertices_m[nearest, 2]
+    low_m, high_m = _NEAR_GROUND_M
+    is_near = (height_m > low_m) & (height_m < high_m)
+    cells = np.unique(np.floor(mesh.vertices_m[is_near, :2] / _SQUARE_M), axis=0) * _SQUARE_M
+    return list(shapely.box(*cells.T, *(cells + _SQUARE_M).T))
 
 
 def mesh_files(meshes: Sequence[MappedMesh]) -> dict[str, Callable[[Path], None]]:
@@ -256,24 +300,21 @@ def _clear_of_carriageway(solid_map: SolidMap, streets: Streets) -> SolidMap:
     counts = replace(solid_map.counts, objects=Counter(), heights={}) if solid_map.solids else solid_map.counts
     for solid in solid_map.solids:
         solids += osm_solids.clear_of_carriageway(solid, lanes, counts)
-    in_lanes = sum(_blocks_lanes(mesh, lanes) for mesh in solid_map.meshes)
+    in_lanes = building_heights.objects_on_carriageway(solid_map.meshes, list(streets.areas.values()), _flat_ground_m)
     notes = solid_map.notes
     if in_lanes:
-        verb = "stands" if in_lanes == 1 else "stand"
+        verb = "stands" if len(in_lanes) == 1 else "stand"
+        more = f" and {len(in_lanes) - _MAX_NAMES:,} more" if len(in_lanes) > _MAX_NAMES else ""
         notes = (
             *notes,
-            f"{in_lanes} of {len(solid_map.meshes)} objects {verb} in lanes; check the position of the map",
+            f"{len(in_lanes)} of {len(solid_map.meshes)} objects {verb} in lanes; check the position of the map:"
+            f" {', '.join(in_lanes[:_MAX_NAMES])}{more}",
         )
     return replace(solid_map, solids=tuple(solids), counts=counts, notes=notes)
 
 
-def _blocks_lanes(mesh: MappedMesh, lanes: shapely.STRtree) -> bool:
-    """Return whether a vertex of a mesh is above a lane, where vehicles drive."""
-    if mesh.kind == GROUND:
-        return False
-    z_m = mesh.vertices_m[:, 2]
-    low = mesh.vertices_m[(z_m > _LOW_M) & (z_m < CLEARANCE_M), :2]
-    return bool(len(lanes.query(shapely.points(low), predicate="within").T))
+def _flat_ground_m(xy_m: FloatArray) -> FloatArray:
+    return np.zeros(len(xy_m))
 
 
 def _without_replaced(solid_map: SolidMap, others: StaticObjects) -> SolidMap:

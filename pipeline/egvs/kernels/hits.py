@@ -14,6 +14,9 @@ from egvs.kernels.jit import njit
 
 _kernel = njit()
 
+_THIN_BLOCK = 256
+"""Voxels whose ranges are computed together."""
+
 
 @_kernel
 def list_crossings(o, d, shape, voxel_m, first, cells, enter_m, leave_m):  # type: ignore[no-untyped-def]
@@ -89,13 +92,18 @@ def add_stepwise_shares(o, d, shape, voxel_m, rows, first, range_m, share, weigh
     times, max_steps = traversal.crossing_buffer(shape), np.int64(0)
     for i in range(rows.shape[0]):
         max_steps = max(max_steps, first[i + 1] - first[i])
+    cells, tolerances = traversal.cell_buffer(shape), traversal.make_tolerances(o, shape, traversal.CHORD_M / voxel_m)
     t_falls, amounts = np.empty(max_steps + 1), np.empty(max_steps + 1, np.int64)
     for i in range(rows.shape[0]):
         beam, count = rows[i], first[i + 1] - first[i]
         weight = weights[beam]
         amounts[0] = np.int64(np.rint(weight * unit))
         if count == 0:
-            traversal.add_to_voxels(o, d[beam], shape, voxel_m, amounts[0], hits, times)
+            crossed = traversal.traverse_fixed_point(o, d[beam], shape, tolerances, cells)
+            if crossed < 0:
+                traversal.add_to_voxels(o, d[beam], shape, voxel_m, amounts[0], hits, times)
+            for k in range(crossed):
+                hits[cells[k]] += amounts[0]
             continue
         length_m = np.sqrt(d[beam, 0] ** 2 + d[beam, 1] ** 2 + d[beam, 2] ** 2) * voxel_m
         for k in range(count):
@@ -152,31 +160,83 @@ def thin_by_range(hits, unit, o, shape, voxel_m, near_m, per_m, cubics, cells, t
     int
         Number of voxels where the cubics are NaN.
     """
-    last, unknown = cubics.shape[0] - 1, 0
+    last, unknown = np.int32(cubics.shape[0] - 1), 0
     pieces_per_voxel, pieces_before = voxel_m * per_m, near_m * per_m
-    upward = np.empty(shape[2])
-    for iz in range(shape[2]):
-        upward[iz] = (iz + 0.5 - o[2]) ** 2
+    along_x, along_y, upward = _squared_offsets(o, shape)
+    piece, position = np.empty(_THIN_BLOCK, np.int32), np.empty(_THIN_BLOCK)
     bottom, across = -shape[2], 0.0  # of the voxel column of the previous cell
-    for n in range(cells.shape[0]):
-        cell = np.uint64(cells[n])
-        if hits[cell] == 0:
-            thinned[cell] = 0
-            continue
-        iz = cells[n] - bottom
-        if not 0 <= iz < shape[2]:
-            column = cells[n] // shape[2]
-            bottom = column * shape[2]
-            ix, iy, iz = column // shape[1], column % shape[1], cells[n] - bottom
-            across = (ix + 0.5 - o[0]) ** 2 + (iy + 0.5 - o[1]) ** 2
-        amount = np.int64(hits[cell]) * unit
-        s = np.sqrt(across + upward[iz]) * pieces_per_voxel - pieces_before
-        j = np.uint64(min(max(np.int64(s), 0), last))  # signed indices would be checked for negative values
-        s -= j
-        share = ((cubics[j, 3] * s + cubics[j, 2]) * s + cubics[j, 1]) * s + cubics[j, 0]
-        if share == share:
-            thinned[cell] = np.int64(np.rint(share * amount))
-        else:
-            thinned[cell] = -1 - amount
-            unknown += 1
+    for begin in range(0, cells.shape[0], _THIN_BLOCK):
+        block = cells[begin : min(begin + _THIN_BLOCK, cells.shape[0])]
+        for i in range(block.shape[0]):  # the squared range in voxels
+            iz = block[i] - bottom
+            if not 0 <= iz < shape[2]:
+                column = block[i] // shape[2]
+                bottom = column * shape[2]
+                iz = block[i] - bottom
+                across = along_x[column // shape[1]] + along_y[column % shape[1]]
+            position[i] = across + upward[np.uint64(iz)]
+        for i in range(block.shape[0]):  # has no branch, so several are computed at once
+            s = np.sqrt(position[i]) * pieces_per_voxel - pieces_before
+            piece[i] = min(max(np.int32(s), np.int32(0)), last)
+            position[i] = s - piece[i]
+        for i in range(block.shape[0]):
+            cell, j, s = np.uint64(block[i]), np.uint64(piece[i]), position[i]  # signed indices would be checked
+            amount = np.int64(hits[cell]) * unit
+            share = ((cubics[j, 3] * s + cubics[j, 2]) * s + cubics[j, 1]) * s + cubics[j, 0]
+            if share == share:
+                thinned[cell] = np.int64(np.rint(share * amount))
+            else:
+                thinned[cell] = -1 - amount
+                unknown += 1
     return unknown
+
+
+@_kernel
+def _squared_offsets(o, shape):  # type: ignore[no-untyped-def]
+    """Squared distance, along each axis, from the sensor to the centre of each voxel, in voxels."""
+    along_x, along_y, along_z = np.empty(shape[0]), np.empty(shape[1]), np.empty(shape[2])
+    for i in range(shape[0]):
+        along_x[i] = (i + 0.5 - o[0]) ** 2
+    for i in range(shape[1]):
+        along_y[i] = (i + 0.5 - o[1]) ** 2
+    for i in range(shape[2]):
+        along_z[i] = (i + 0.5 - o[2]) ** 2
+    return along_x, along_y, along_z
+
+
+@_kernel
+def fit_cubics(values, to_cubic, tolerance, cubics):  # type: ignore[no-untyped-def]
+    """Fit a cubic to each piece of a function, and reject those that are too inaccurate.
+
+    Parameters
+    ----------
+    values
+        The function at the start of each piece, at each sixth of it, and at the end of the last, (6 * pieces + 1,)
+        float64.
+    to_cubic
+        Row i times the values at thirds of a piece gives coefficient i: (4, 4) float64.
+    tolerance
+        Largest accepted difference at the three sixths between the thirds.
+    cubics
+        Filled, as :func:`thin_by_range` takes them, (pieces, 4) float64; NaN in all four where a cubic is rejected.
+
+    Returns
+    -------
+    int
+        Number of rejected cubics.
+    """
+    rejected = 0
+    for j in range(cubics.shape[0]):
+        piece, cubic = values[6 * j : 6 * j + 7], cubics[j]
+        for i in range(4):
+            cubic[i] = piece[0] * to_cubic[i, 0] + piece[2] * to_cubic[i, 1]
+            cubic[i] = (cubic[i] + piece[4] * to_cubic[i, 2]) + piece[6] * to_cubic[i, 3]
+        is_accurate = True
+        for k in (1, 3, 5):
+            s = k / 6.0
+            fitted = ((cubic[3] * s + cubic[2]) * s + cubic[1]) * s + cubic[0]
+            is_accurate &= abs(fitted - piece[k]) <= tolerance
+        if not is_accurate:
+            cubic[:] = np.nan
+            rejected += 1
+    return rejected

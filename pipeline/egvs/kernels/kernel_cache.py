@@ -25,7 +25,7 @@ from numba.core.environment import Environment, lookup_environment
 from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
 
-from egvs.kernels.cache_folder import find_cache_folder, read_checked, write_checked
+from egvs.core.cache_folder import find_cache_folder, read_checked, write_checked
 
 
 class CheckedCache(FunctionCache):
@@ -88,7 +88,7 @@ def _rebuild_environment(module: str, constants: list[Any], name: str) -> Any:
 def use_cache_folder(kernels: Path) -> bool:
     """Choose the folder of compiled kernels; call it before the first kernel is compiled.
 
-    It is the first one of :func:`egvs.kernels.cache_folder.find_cache_folder` that can be written.
+    It is the first one of :func:`egvs.core.cache_folder.find_cache_folder` that can be written.
 
     Parameters
     ----------

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +22,7 @@ from egvs.artefacts import readers
 from egvs.artefacts.readers import MIN_VEHICLES, LocationVisibility, SiteBlindspots
 from egvs.artefacts.tpog import Tpog
 from egvs.core.grid import Grid
+from egvs.core.threads import map_ordered
 from egvs.report import colours, formatting, maps, ranking
 from egvs.report.basemap import network_file, roads_within, world_outlines
 from egvs.report.colours import ColumnValues, IndexedImage
@@ -32,7 +33,7 @@ from egvs.scoring.egvs import EntropyField
 from egvs.scoring.scorer import Scorer
 from egvs.scoring.visibility import Beams
 from egvs.stages.base import StageContext
-from egvs.stages.site_scans import empty_scans
+from egvs.stages.site_scans import SiteScan, empty_scans
 
 MAX_FULL_IMAGES = 40
 """With more sites than this, only the best and the last have images in full resolution."""
@@ -205,14 +206,19 @@ def site_views(
     peak = float(column_entropy(scorer.field, np.ones(len(scorer.field.cells), dtype=np.bool_)).max())
     blindspots = read_blindspots(work, choosable)
 
+    site_of_name = {site.site: site for site in choosable}
+
+    def draw_images(scan: SiteScan) -> tuple[_SiteCoverage, dict[str, IndexedImage]]:
+        site = site_of_name[scan.site.name]
+        coverage = _site_coverage(site, scan.beams, scorer)
+        return coverage, _site_images(coverage, peak, box, in_full=site in ranking.extremes or not is_coarse)
+
     panels: dict[str, SitePanel] = {}
     site_data: dict[str, dict[str, Any]] = {}
-    for coverage in _site_coverages(work, choosable, scorer):
+    for coverage, images in map_ordered(draw_images, empty_scans(work, site_of_name.keys()), work.threads):
         site = coverage.scored
-        is_drawn = site in ranking.extremes
-        images = _site_images(coverage, peak, box, in_full=is_drawn or not is_coarse)
         site_data[site.site] = _panel_data(coverage, images, blindspots, box)
-        if is_drawn:
+        if site in ranking.extremes:
             prefix = f"view-{ranking.extremes.index(site)}"
             panels[site.site] = _draw_panel(
                 coverage, scorer.field.grid, peak, images["scan"], blindspots, backdrop, box, prefix
@@ -234,20 +240,17 @@ def site_views(
     )
 
 
-def _site_coverages(work: StageContext, choosable: Sequence[RankedSite], scorer: Scorer) -> Iterator[_SiteCoverage]:
-    """The sites in the order of the scans."""
-    site_of_name, field = {site.site: site for site in choosable}, scorer.field
-    for scan in empty_scans(work, site_of_name.keys()):
-        site, crossed = site_of_name[scan.site.name], scorer.hits(scan.beams) > 0
-        visible = crossed.ravel()[field.cells]
-        yield _SiteCoverage(
-            scored=site,
-            crossed=crossed,
-            visible_bit=column_entropy(field, visible),
-            missed_bit=column_entropy(field, ~visible),
-            caption=ranking.site_caption(site, int(visible.sum()), len(visible)),
-            ends_m=_hit_positions_m(scan.beams),
-        )
+def _site_coverage(site: RankedSite, beams: Beams, scorer: Scorer) -> _SiteCoverage:
+    field, crossed = scorer.field, scorer.hits(beams) > 0
+    visible = crossed.ravel()[field.cells]
+    return _SiteCoverage(
+        scored=site,
+        crossed=crossed,
+        visible_bit=column_entropy(field, visible),
+        missed_bit=column_entropy(field, ~visible),
+        caption=ranking.site_caption(site, int(visible.sum()), len(visible)),
+        ends_m=_hit_positions_m(beams),
+    )
 
 
 def _hit_positions_m(beams: Beams) -> NDArray[np.float64]:

@@ -130,7 +130,7 @@ class ScoreLabel:
     def _number(self, value: float) -> str:
         if self.is_share:
             value = 100.0 * value
-        return f"{value:,.{self.digits}f}"
+        return f"{value:z,.{self.digits}f}"
 
     def _error_number(self, se: float) -> str:
         if se > 0.0 and self.is_zero(se):

@@ -153,7 +153,7 @@ class DetectorCheck:
         """The loss with its standard error: "8.3 ± 1.1 AP points"."""
         error = "" if self.loss_se is None else f" ± {100 * self.loss_se:.1f}"
         unit = "AP points" if self.returns_boxes else "percentage points"
-        return f"{100 * self.loss:.1f}{error} {unit}"
+        return f"{100 * self.loss:z.1f}{error} {unit}"
 
 
 @dataclass(frozen=True)

@@ -240,12 +240,27 @@ def describe_poles_on_road(poles: Iterable[Pole], warnings: Iterable[Diagnostic]
     return phrases
 
 
-def describe_assumptions(scenario: Scenario, result: str) -> str:
-    """Return what a result ("ranking", "plan") assumes, in one sentence; empty where nothing is assumed."""
+def describe_caveats(scenario: Scenario, result: str, poles_on_road: Sequence[str] = ()) -> str:
+    """Return what to check before one trusts a result, in one sentence; empty where there is nothing.
+
+    Parameters
+    ----------
+    scenario
+        Its assumptions are listed.
+    result
+        ``"ranking"`` or ``"plan"``.
+    poles_on_road
+        From :func:`describe_poles_on_road`.
+    """
+    caveats = []
+    if poles_on_road:
+        caveats.append(join_names(poles_on_road))
     assumed = assumptions(scenario)
-    if not assumed:
+    if assumed:
+        caveats.append(f"assumed, not measured: {'; '.join(assumed)}")
+    if not caveats:
         return ""
-    return f"Before you trust this {result}: assumed, not measured: {'; '.join(assumed)}."
+    return f"Before you trust this {result}: {'; '.join(caveats)}."
 
 
 def assumes_flows(scenario: Scenario) -> bool:

@@ -365,7 +365,7 @@ def format_difference(difference: ScoreDifference, site: RankedSite) -> str:
     """
     label = site.by
     factor, digits = (100.0, 1) if label.is_share else (1.0, label.digits)
-    text = f"{factor * difference.value:+,.{digits}f}"
+    text = f"{factor * difference.value:+z,.{digits}f}"
     if difference.se is not None:
         text += f" ±{factor * difference.se:,.{digits}f}"
     return text if difference.is_clear else f"~ {text}"

@@ -480,7 +480,9 @@ class Bar:
     description: str
 
 
-def bar_chart(bars: Sequence[Bar], label: str, alt: str, factor: float = 1.0, style: FigureStyle = PAGE_STYLE) -> str:
+def bar_chart(
+    bars: Sequence[Bar], label: str, alt: str, factor: float = 1.0, style: FigureStyle = PAGE_STYLE, note: str = ""
+) -> str:
     """Return horizontal bars, the first at the top.
 
     Parameters
@@ -495,6 +497,8 @@ def bar_chart(bars: Sequence[Bar], label: str, alt: str, factor: float = 1.0, st
         Numbers on the axis are values times this: 100 for per cent.
     style
         Width and colours.
+    note
+        A line below the title of the axis.
     """
     names = [shorten_name(bar.name) for bar in bars]
     left = 15.0 + max(text_width(name) for name in names)
@@ -503,7 +507,7 @@ def bar_chart(bars: Sequence[Bar], label: str, alt: str, factor: float = 1.0, st
     values = [bar.value for bar in bars]
     low, high = min(values), max(values)
     base = _BARS_TOP + height
-    parts = [svg_start_tag(style.width, base + _BARS_BOTTOM, alt, style)]
+    parts = [svg_start_tag(style.width, base + _BARS_BOTTOM + (_LINE_SPACING if note else 0.0), alt, style)]
     for value, text in round_values(0.0, most * factor, max(2, int(width // 70))):
         x = left + width * value / factor / most
         parts.append(f'<path {style.shape("grid")} d="M{x:.1f} {_BARS_TOP:.1f}V{base:.1f}"/>')
@@ -519,6 +523,8 @@ def bar_chart(bars: Sequence[Bar], label: str, alt: str, factor: float = 1.0, st
         parts.append(_text(left - 7, y + 13, name, "end"))
     parts.append(f'<path {style.shape("axis")} d="M{left:.1f} {_BARS_TOP:.1f}V{base:.1f}H{left + width:.1f}"/>')
     parts.append(_text(left + width / 2, base + 36, label))
+    if note:
+        parts.append(_text(left + width / 2, base + 36 + _LINE_SPACING, note))
     return "".join([*parts, "</svg>"])
 
 

@@ -1,4 +1,4 @@
-"""A cache of compiled templates in the same folders as the compiled kernels (:mod:`egvs.kernels.cache_folder`).
+"""A cache of compiled templates in the same folders as the compiled kernels (:mod:`egvs.core.cache_folder`).
 
 Jinja checks that a cached template is of its version, of this version of Python, and of the same text, but trusts the
 rest of the file. Here, each file starts with the hash of its content, and a damaged one is compiled again. Templates
@@ -15,7 +15,7 @@ import jinja2
 from jinja2 import BytecodeCache
 from jinja2.bccache import Bucket
 
-from egvs.kernels.cache_folder import find_cache_folder, read_checked, write_checked
+from egvs.core.cache_folder import find_cache_folder, read_checked, write_checked
 
 
 class TemplateCache(BytecodeCache):

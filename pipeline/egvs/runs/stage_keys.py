@@ -41,6 +41,7 @@ LIBRARIES = {
     "onnxruntime": ("onnxruntime",),
     "osmium": ("osmium",),
     "pyarrow": ("pyarrow",),
+    "pye57": ("pye57",),
     "pyproj": ("pyproj",),
     "scipy": ("scipy",),
     "shapely": ("shapely",),

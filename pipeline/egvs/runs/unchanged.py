@@ -1,17 +1,17 @@
 """Recall the output of a complete run as long as nothing that the run depends on has changed.
 
 Computing the keys of the stages takes most of the time of a run in which nothing has changed: it imports the stages,
-reads the sites, the solids and the network, and hashes the source of the program. So a run writes down
+reads the sites, the solids and the network, and hashes the source of the program. So a run records
 
 - every input file that it looked for, opened or hashed (:func:`egvs.core.files.observe_files`): its sha256, or whether
   it existed, and where its links lead;
 - every file in the run folder by sha256, and every folder and link there;
 - a hash of everything else: the source of the program, the installed distributions, Python, the environment variables,
-  the working directory, the words of the command, and the terminal.
+  the working directory, the arguments of the command, and the terminal.
 
 If all of this is the same, the keys of all stages are, too, and so is what the command prints. Digests are those of
-:mod:`egvs.runs.digest_cache`: a file whose stamp is new is hashed. In doubt nothing is written down: where plug-ins are
-used, where a file changed during the run, or where the run depends on the output of another program.
+:mod:`egvs.runs.digest_cache`: a file whose stamp is new is hashed. No record is saved where plug-ins are used, where a
+file changed during the run, or where the run depends on the output of another program.
 
 The record is ``.unchanged-<hash of the command>.json`` in the run folder. It may be removed at any time.
 """
@@ -45,7 +45,7 @@ _FILE, _FOLDER = "file", "folder"
 """Kinds of entries of a run folder."""
 
 _MAX_FILES = 5000
-"""With more files in its folder, a run is not written down: comparing them would take longer than the keys."""
+"""With more files in its folder, a run is not recorded: comparing them would take longer than computing the keys."""
 
 
 @dataclass
@@ -60,7 +60,7 @@ class ObservedFiles:
     changed
         Files that changed during the run.
     is_complete
-        False where something was used that no file tells.
+        False where the run used something other than files.
     """
 
     states: dict[str, str] = field(default_factory=dict)
@@ -107,18 +107,17 @@ class RunMemory:
 
     Parameters
     ----------
-    words
-        Everything that tells the command from others: its arguments, and properties of the terminal that its output
-        depends on.
+    command
+        Arguments of the command, and properties of the terminal that its output depends on.
     out
         The run folder; None where it follows from the scenario.
     """
 
-    def __init__(self, words: Sequence[str], out: Path | None) -> None:
-        command = files.hash_json([str(Path.cwd()), *words])
-        self._name = UNCHANGED_PATTERN.replace("*", command[:16])
+    def __init__(self, command: Sequence[str], out: Path | None) -> None:
+        digest = files.hash_json([str(Path.cwd()), *command])
+        self._name = UNCHANGED_PATTERN.replace("*", digest[:16])
         self._out = out
-        self._state = _hash_surroundings(words)
+        self._state = _hash_surroundings(command)
         self._observed: ObservedFiles | None = None
 
     def recall(self) -> Output | None:
@@ -145,7 +144,7 @@ class RunMemory:
         self._observed.drop_temporary()
 
     def save(self, folder: Path, digests: Mapping[str, str], output: Output) -> None:
-        """Write down a complete run that was observed, if everything that it depends on is known.
+        """Record a complete run that was observed, if everything that it depends on is known.
 
         Parameters
         ----------
@@ -258,7 +257,7 @@ def _is_bookkeeping(name: str) -> bool:
     return name in hidden or Path(name).match(UNCHANGED_PATTERN)
 
 
-def _hash_surroundings(words: Sequence[str]) -> str | None:
+def _hash_surroundings(command: Sequence[str]) -> str | None:
     """Hash everything but the input files that a run depends on; None where a change could go unnoticed."""
     program = _hash_program()
     if program is None:
@@ -271,7 +270,7 @@ def _hash_surroundings(words: Sequence[str]) -> str | None:
             "distributions": _installed_distributions(),
             "variables": variables,
             "folder": str(Path.cwd()),
-            "words": list(words),
+            "command": list(command),
         }
     )
 
@@ -320,10 +319,10 @@ def _installed_distributions() -> list[tuple[str, int]]:
 
     Their names have the versions of the libraries; their entry points declare plug-ins.
     """
-    found = []
+    distributions = []
     for folder in sys.path:
         with suppress(OSError), os.scandir(folder or os.curdir) as children:
             for child in children:
                 if child.name.endswith((".dist-info", ".egg-info", ".egg-link", ".pth")):
-                    found.append((child.path, child.stat().st_mtime_ns))
-    return sorted(found)
+                    distributions.append((child.path, child.stat().st_mtime_ns))
+    return sorted(distributions)

@@ -228,7 +228,7 @@ class SitesConfig(StrictModel):
     along: tuple[SiteLine, ...] = ()
     only_free: bool = Field(True, description="Drop sites of grid and along in lanes, junctions and solids")
     points: str | None = Field(
-        None, description="Measured empty scan of the only site (PCD, PLY, LAS, LAZ, CSV; world frame)"
+        None, description="Measured empty scan of the only site (PCD, PLY, LAS, LAZ, E57, CSV; world frame)"
     )
     sensor: str = Field("VLP-32C", description="A sensor from `egvs sensors` or from [sensors]")
     replace_sensor: str | None = Field(

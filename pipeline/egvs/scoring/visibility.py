@@ -61,8 +61,8 @@ _INITIAL_PIECES = 1024
 _MAX_PIECES = 16384
 _MAX_ROUGH_SHARE = 1 / 64  # if a larger share of pieces needs the function itself, shorter pieces are tried
 
-_CUBIC_COEFFICIENTS = np.array([[2, 0, 0, 0], [-11, 18, -9, 2], [18, -45, 36, -9], [-9, 27, -27, 9]]).T / 2
-"""Converts values at 0, 1/3, 2/3 and 1 to the coefficients of the cubic through them."""
+_CUBIC_COEFFICIENTS = np.array([[2, 0, 0, 0], [-11, 18, -9, 2], [18, -45, 36, -9], [-9, 27, -27, 9]]) / 2
+"""Row i, times values at 0, 1/3, 2/3 and 1, is coefficient i of the cubic through them."""
 
 
 @dataclass(frozen=True)
@@ -327,12 +327,9 @@ class RangeTable:
 
 def _fit_cubics(function: ByRange, near_m: float, far_m: float, pieces: int) -> FloatArray:
     """Fit a cubic through four points of each piece; NaN if it is too inaccurate at the three points between them."""
-    nodes = np.arange(pieces)[:, None] + np.arange(7) / 6
-    values = function((near_m + nodes * ((far_m - near_m) / pieces)).ravel()).reshape(pieces, 7)
-    cubics: FloatArray = (values[:, ::2, None] * _CUBIC_COEFFICIENTS).sum(axis=1)
-
-    between = np.arange(1, 6, 2) / 6
-    fitted = ((cubics[:, 3:] * between + cubics[:, 2:3]) * between + cubics[:, 1:2]) * between + cubics[:, :1]
-    error = np.abs(fitted - values[:, 1::2])
-    cubics[~(error <= TOLERANCE).all(axis=1)] = np.nan
+    sixths = np.arange(pieces)[:, None] + np.arange(6) / 6
+    nodes = np.append(sixths, float(pieces))
+    values = np.asarray(function(near_m + nodes * ((far_m - near_m) / pieces)), dtype=np.float64)
+    cubics = np.empty((pieces, 4))
+    hit_kernels.fit_cubics(values, _CUBIC_COEFFICIENTS, TOLERANCE, cubics)
     return cubics

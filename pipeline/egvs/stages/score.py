@@ -81,7 +81,6 @@ def run(
     context: StageContext,
     inputs: StageDependencies,
     audit: bool = False,
-    observe: Callable[[ScoredSite], None] | None = None,
     scored_elsewhere: Callable[[SiteScoring], Iterable[ScoredSite]] | None = None,
 ) -> Summary:
     """Score and rank all sites, and write the files of :class:`egvs.artefacts.run_folder.RunFolder` of this stage.
@@ -94,8 +93,6 @@ def run(
         What the scores depend on.
     audit
         Check for every beam that the chords of its voxels add up to the clipped segment and that no voxel comes twice.
-    observe
-        Called with each site as it is scored, in order.
     scored_elsewhere
         Yields all sites in order, as :meth:`SiteScoring.score` scores them, so that other processes can share the work.
 
@@ -106,7 +103,7 @@ def run(
     """
     scoring = SiteScoring(context, audit=audit)  # TPOG by period, vehicles of recorded frames, scorers
     sites = scoring.all_sites() if scored_elsewhere is None else scored_elsewhere(scoring)
-    sites = _write_sites(context, inputs, scoring, sites, observe)
+    sites = _write_sites(context, inputs, scoring, sites)
     scores = scoring.score_table(sites)
     metadata = _metadata(context, inputs, scoring, sites)
     _write_scores(context, sites, scores, metadata)
@@ -121,14 +118,11 @@ def _write_sites(
     inputs: StageDependencies,
     scoring: SiteScoring,
     sites: Iterable[ScoredSite],
-    observe: Callable[[ScoredSite], None] | None,
 ) -> list[ScoredSite]:
     """Score the sites; write their hits in voxels and their blind spots, if requested, and drop these from memory."""
     scored: list[ScoredSite] = []
     with site_scoring.write_site_outputs(scoring) as outputs:
         for site in sites:
-            if observe is not None:
-                observe(site)
             scored.append(outputs.write(site))
             context.progress("sites", len(scored), 0)
         outputs.describe(_metadata(context, inputs, scoring, scored))

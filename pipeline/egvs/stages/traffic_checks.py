@@ -12,7 +12,7 @@ from egvs.core.errors import Diagnostic, InputError
 from egvs.effects import registry
 from egvs.scenario.model import Scenario
 from egvs.stages.inputs import CheckInputs, ErrorCollector
-from egvs.traffic import demand, fcd, finished_fcd, network, sumo, sumo_folder, user_files
+from egvs.traffic import demand, fcd, finished_fcd, network, sumo_folder, user_files
 from egvs.world import geolocation
 
 Rule = Callable[[CheckInputs], Iterator[Diagnostic]]
@@ -159,7 +159,7 @@ def check_vehicle_kinds(inputs: CheckInputs) -> Iterator[Diagnostic]:
         return
     for kind in traffic.kinds:
         try:
-            demand.check_kinds([kind], sumo.vehicle_classes(), key)
+            demand.check_kinds([kind], key)
         except InputError as error:
             yield Diagnostic.of("traffic", error)
     if inputs.network is None:

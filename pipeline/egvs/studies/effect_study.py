@@ -144,7 +144,7 @@ class EffectTrial:
     def in_words(self) -> str:
         """The change, e.g. "EGVS by -12.1 to -24.9%"."""
         unit = " percentage points" if self.by.is_share else "%"
-        amount = f"{100 * self.least:+.1f} to {100 * self.most:+.1f}{unit}"
+        amount = f"{100 * self.least:+z.1f} to {100 * self.most:+z.1f}{unit}"
         if abs(self.most) < MIN_DISPLAYED_CHANGE:
             amount = f"less than {100 * MIN_DISPLAYED_CHANGE:.1f}{unit}"
         order = "" if self.same_order else ", and their order"

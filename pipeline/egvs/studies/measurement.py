@@ -1,18 +1,17 @@
-"""Run one setting of a study: its scores, and what each of its stages costs.
+"""Run one setting of a study, and measure what each of its stages costs.
 
 Stages run in the usual order, in a temporary folder. Their artefacts are cached (:mod:`egvs.runs.store`), so settings
 that share traffic, static world or scans share the work, with each other and with all other runs. A stage can be run
 again to measure its time once more; it must then write the same bytes. Until the study has measured a stage that comes
 from the cache, the cost of the run that wrote it counts.
 
-    out/accuracy/<hash of the setting>.json     scores of the setting, so that an interrupted study can continue
-    out/accuracy/times/<stage>-<key>.json       seconds of each repeat, memory, hashes of the artefacts
+    out/accuracy/<hash of the setting>.json     results of the setting, so that an interrupted study can continue
+    out/accuracy/times/<stage>-<key>.json       resource usage of each repeat, hashes of the artefacts
 """
 
 from __future__ import annotations
 
 import json
-import math
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,10 +21,6 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-import numpy as np
-
-from egvs.artefacts import parquet
-from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files, reading
 from egvs.core.errors import InputError, RunError
 from egvs.core.files import CHECKSUM_KEY, add_checksum, has_valid_checksum
@@ -38,17 +33,10 @@ from egvs.runs.stage_keys import StageKey
 from egvs.runs.stage_registry import RANKING_STAGES, StageResult
 from egvs.runs.store import Store
 from egvs.scenario.model import Scenario, SiteGrid
-from egvs.scoring.egvs import EntropyField
-from egvs.scoring.score_table import MIX, ScoreColumn, ScoreTable, SiteScores
-from egvs.scoring.scorer import Scorer
-from egvs.scoring.standard_errors import BlockJackknife, ScoreUncertainty
-from egvs.scoring.target_scores import TARGET_SCORES
 from egvs.sensors import sites
 from egvs.stages.base import StageContext
-from egvs.stages.inputs import get_scene, open_folder
+from egvs.stages.inputs import open_folder
 from egvs.stages.scene_inputs import site_digests
-from egvs.stages.site_scans import empty_scans
-from egvs.stages.site_scoring import ScoredSite, TargetScorer
 from egvs.studies.study_settings import Setting
 
 STUDY_FOLDER = "accuracy"
@@ -59,37 +47,6 @@ SettingListener = Callable[[str, str, dict[str, Any]], None]
 
 
 @dataclass(frozen=True)
-class SettingScores:
-    """The scores of one setting.
-
-    Attributes
-    ----------
-    sites
-        Names, in the order of the sites.
-    shares
-        Scores as shares of ``egvs_limit`` (of the TPOG's entropy if gamma is infinite), (n,) float64; for other scores
-        than EGVS the scores themselves.
-    share_ses
-        Their standard errors, (n,); NaN if the TPOG has one block.
-    scores, ses, biases
-        Of the score that ranks, (n,); the last two are NaN if the TPOG has one block.
-    quantile
-        Half the width of a confidence interval, in standard errors.
-    stages
-        Key of each stage.
-    """
-
-    sites: list[str]
-    shares: list[float]
-    share_ses: list[float]
-    scores: list[float]
-    ses: list[float]
-    biases: list[float]
-    quantile: float
-    stages: dict[str, str]
-
-
-@dataclass(frozen=True)
 class StageTimes:
     """What one stage has cost so far.
 
@@ -97,18 +54,12 @@ class StageTimes:
     ----------
     seconds, busy_s
         Wall-clock time and processor time of each repeat.
-    peak_mb
-        Peak of memory above what the program held before.
-    bytes
-        Size of the artefacts.
     repeats
         How many times the study has measured the stage; 0 if the cost is that of the run that wrote the artefacts.
     """
 
     seconds: tuple[float, ...]
     busy_s: tuple[float, ...]
-    peak_mb: float
-    bytes: int
     repeats: int
 
 
@@ -152,33 +103,6 @@ class SettingRunner:
             return scenario
         return scenario.with_effects(scenario.effects.without(setting.without))
 
-    def saved_scores(self, setting: Setting) -> SettingScores | None:
-        """Read the scores of an earlier run; None if that run has none, or if times of a stage were removed."""
-        path = self._result(setting)
-        if not path.is_file():
-            return None
-        with _reject_altered(path):
-            values = _read_json(path)["scores"]
-            scores = SettingScores(**values)
-            for name in ("shares", "share_ses", "scores", "ses", "biases"):
-                if np.array(getattr(scores, name), dtype=np.float64).shape != (len(scores.sites),):
-                    raise ValueError(f"expected {len(scores.sites)} {name}")
-            has_times = all(self._times(name, key).is_file() for name, key in scores.stages.items())
-        return scores if has_times else None
-
-    def run(self, setting: Setting) -> SettingScores:
-        """Run the stages that are not cached, and return the scores."""
-        scores = self.saved_scores(setting)
-        if scores is not None:
-            return scores
-        scored: list[ScoredSite] = []
-        with self._temporary_run(self.scenario(setting)) as work:
-            keys = {name: self._ensure_stage(name, work, scored.append) for name in RANKING_STAGES}
-            scores = _collect_scores(work, keys, setting.weight, scored)
-        result = {"setting": setting.name, "overrides": setting.overrides, "scores": scores.__dict__}
-        _write_json(self._result(setting), result)
-        return scores
-
     def run_stages(self, setting: Setting) -> dict[str, str]:
         """Run the stages that are not cached, and return the key of each stage."""
         with self._temporary_run(self.scenario(setting)) as work:
@@ -218,7 +142,7 @@ class SettingRunner:
         """
         with self._temporary_run(self.scenario(setting), RANKING_STAGES[: RANKING_STAGES.index(name)]) as work:
             result = self._run_stage(name, work, stage_keys.stage_key(name, work))
-            self._save_times(name, key, work, result, is_measured=True)
+            self._save_times(name, key, result, is_measured=True)
 
     @contextmanager
     def open_run(self, setting: Setting, stages: Sequence[str] = RANKING_STAGES[:-1]) -> Iterator[StageContext]:
@@ -269,51 +193,32 @@ class SettingRunner:
             costs = [ResourceUsage(**cost) for cost in times["measured"] or [times["made"]]]
             seconds = tuple(float(cost.seconds) for cost in costs)
             busy_s = tuple(float(cost.busy_s) for cost in costs)
-            peak_mb = max(round(cost.peak_mb - cost.held_mb, 1) for cost in costs)
-            return StageTimes(seconds, busy_s, peak_mb, int(times["bytes"]), len(times["measured"]))
+            return StageTimes(seconds, busy_s, len(times["measured"]))
 
     def median_seconds(self, keys: Mapping[str, str]) -> dict[str, float]:
         """Return the median wall-clock time of each stage."""
         return {name: median(self.stage_times(name, keys[name]).seconds) for name in RANKING_STAGES}
 
-    def tpog(self, setting: Setting) -> Tpog:
-        """Return the TPOG of a setting."""
-        with self._temporary_run(self.scenario(setting), RANKING_STAGES[: RANKING_STAGES.index("tpog") + 1]) as work:
-            return read_tpog(work.folder.tpog)
-
-    def scores_against(self, setting: Setting, tpog: Tpog) -> list[float]:
-        """Return the EGVS of a setting's scans with another TPOG on its grid, in the order of the sites."""
-        with self._temporary_run(self.scenario(setting), RANKING_STAGES) as work:
-            scorer = Scorer(get_scene(work), tpog, work.folder.trajectories)
-            return [scorer.score(scan.beams).egvs for scan in empty_scans(work)]
-
-    def _ensure_stage(self, name: str, work: StageContext, observe: Callable[[ScoredSite], None] | None = None) -> str:
-        """Fetch or run a stage in a folder with the stages before it, and return its key.
-
-        ``observe`` is called with each site if the score stage runs.
-        """
+    def _ensure_stage(self, name: str, work: StageContext) -> str:
+        """Fetch or run a stage in a folder with the stages before it, and return its key."""
         inputs = stage_keys.stage_key(name, work)
         result, is_cached = fetch_or_run(
-            name, work, inputs.key, self._store, lambda: self._run_stage(name, work, inputs, observe), link=True
+            name, work, inputs.key, self._store, lambda: self._run_stage(name, work, inputs), link=True
         )
         if not (is_cached and self._times(name, inputs.key).is_file()):
-            self._save_times(name, inputs.key, work, result, is_measured=not is_cached)
+            self._save_times(name, inputs.key, result, is_measured=not is_cached)
         return inputs.key
 
-    def _run_stage(
-        self, name: str, work: StageContext, inputs: StageKey, observe: Callable[[ScoredSite], None] | None = None
-    ) -> StageResult:
+    @staticmethod
+    def _run_stage(name: str, work: StageContext, inputs: StageKey) -> StageResult:
         release_memory()
-        if name == "score" and observe is not None:
-            return stage_registry.run_stage(name, work, inputs.dependencies, observe=observe)
         return stage_registry.run_stage(name, work, inputs.dependencies)
 
-    def _save_times(self, name: str, key: str, work: StageContext, result: StageResult, *, is_measured: bool) -> None:
+    def _save_times(self, name: str, key: str, result: StageResult, *, is_measured: bool) -> None:
         """Add the cost of a stage, measured now or by the run that wrote the artefacts."""
         path = self._times(name, key)
         cost = asdict(result.cost)
-        size = sum(work.path(artefact).stat().st_size for artefact in result.artefacts)
-        times: dict[str, Any] = {"made": cost, "measured": [], "bytes": size, "sha256": result.artefacts}
+        times: dict[str, Any] = {"made": cost, "measured": [], "sha256": result.artefacts}
         with _reject_altered(path):
             if path.is_file():
                 times = _read_json(path)
@@ -325,14 +230,11 @@ class SettingRunner:
                 times["measured"].append(cost)
         _write_json(path, times)
 
-    def _result(self, setting: Setting, request: Mapping[str, Any] | None = None) -> Path:
-        """Return the file with the result of a setting; the scenario's files are hashed once for it."""
+    def _result(self, setting: Setting, request: Mapping[str, Any]) -> Path:
+        """Return the file with a result of a setting; the scenario's files are hashed once for it."""
         if setting not in self._dependencies:
-            dependencies = {**scenario_dependencies(self.scenario(setting)), "weight": setting.weight}
-            self._dependencies[setting] = files.hash_json(dependencies)
-        name = self._dependencies[setting]
-        if request is not None:
-            name = files.hash_json({"dependencies": name, "request": dict(request)})
+            self._dependencies[setting] = files.hash_json(scenario_dependencies(self.scenario(setting)))
+        name = files.hash_json({"dependencies": self._dependencies[setting], "request": dict(request)})
         return self._folder / f"{name[:16]}.json"
 
     def _times(self, name: str, key: str) -> Path:
@@ -393,57 +295,3 @@ def with_one_site(scenario: Scenario) -> Scenario:
     }  # fmt: skip
     score = scenario.score.model_copy(update={"keep_visibility": ()})
     return scenario.model_copy(update={"sites": scenario.sites.model_copy(update=changes), "score": score})
-
-
-def _collect_scores(work: StageContext, keys: dict[str, str], weight: float, scored: list[ScoredSite]) -> SettingScores:
-    """Return the scores of a finished run.
-
-    ``scored`` are the sites as the score stage scored them; it is empty if the stage came from the cache.
-    """
-    rank_by = work.scenario.score.rank_by
-    gamma = work.scenario.gamma
-    table = parquet.read_artefact(work.folder.scores, "scores")[0].to_pydict()
-    names, scores = table["site"], np.array(table[rank_by])
-    tpog = read_tpog(work.folder.tpog)
-    jackknife = BlockJackknife.of(work.folder.tpog, tpog)
-    shares, limits = scores, np.ones(1)
-    if rank_by == "egvs":
-        unit = 1.0 / weight if math.isinf(gamma) else gamma  # a finite gamma is divided by the weight already
-        limit = EntropyField.of(tpog.counts, tpog.frames, tpog.grid).limit(unit)
-        shares = scores / limit if limit > 0 else np.zeros(len(scores))
-        if jackknife is not None:
-            limits = jackknife.limits(unit)
-
-    column = None
-    if jackknife is not None:
-        column = _score_column(work, tpog, jackknife, scored)
-    if column is None or column.replicates is None or column.estimate is None:
-        unknown = [math.nan] * len(names)
-        return SettingScores(names, shares.tolist(), unknown, scores.tolist(), unknown, unknown, math.nan, keys)
-    estimate = column.estimate
-    share_estimate = ScoreUncertainty.of(column.replicates / np.where(limits > 0, limits, 1.0), column.groups)
-    return SettingScores(
-        names, shares.tolist(), share_estimate.se.tolist(), scores.tolist(), estimate.se.tolist(),
-        estimate.bias.tolist(), estimate.quantile(), keys,
-    )  # fmt: skip
-
-
-def _score_column(work: StageContext, tpog: Tpog, jackknife: BlockJackknife, scored: list[ScoredSite]) -> ScoreColumn:
-    """Return the score that ranks with its jackknife replicates, even if the scenario needs no standard errors."""
-    config = work.scenario.score
-    if scored and config.standard_error:
-        scores = [SiteScores(site.site.name, site.score, site.targets) for site in scored]
-        return ScoreTable.of(scores, {MIX: jackknife.groups}).column(config.rank_by)
-
-    with_errors = {"score": config.model_copy(update={"standard_error": True})}
-    again = open_folder(work.scenario.model_copy(update=with_errors), work.folder.path)
-    scorer = Scorer(get_scene(again), tpog, again.folder.trajectories, jackknife)
-    targets = None
-    if config.rank_by in TARGET_SCORES:
-        targets = TargetScorer(again, tpog.grid)
-    scores = []
-    for scan in empty_scans(again):
-        site_score = scorer.score(scan.beams)
-        target_scores = None if targets is None else targets.scores(targets.visible(scan.beams))
-        scores.append(SiteScores(scan.site.name, site_score, target_scores))
-    return ScoreTable.of(scores, {MIX: jackknife.groups}).column(config.rank_by)

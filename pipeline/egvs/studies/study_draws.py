@@ -23,7 +23,10 @@ from egvs.studies.decision import MIN_UNITS, Draw
 from egvs.studies.study_settings import (
     APPROXIMATES,
     MEASURES,
+    PERIOD_KNOB,
     SCENARIO,
+    STEP_KNOB,
+    SUBLANES_KNOB,
     PricedSetting,
     Setting,
     SettingValues,
@@ -35,7 +38,7 @@ from egvs.studies.traffic_scores import RunScores, Window, detector_score
 RECORDED_PARTS = 5
 """Number of units of a recording that has enough blocks."""
 
-_TRAFFIC_KNOBS = ("", "period", "step", "sublanes")
+_TRAFFIC_KNOBS = ("", PERIOD_KNOB, STEP_KNOB, SUBLANES_KNOB)
 """Settings that are also tried with parts of the traffic."""
 
 
@@ -74,7 +77,7 @@ class TrafficUnits:
         return cls(blocks, tuple(Window(part * per_part, per_part) for part in range(parts)))
 
     @property
-    def whole(self) -> Window:
+    def complete(self) -> Window:
         """All blocks of a run."""
         return Window(0, self.blocks)
 
@@ -92,7 +95,7 @@ class TrafficUnits:
 
     def windows(self, values: SettingValues) -> list[Window]:
         """Return every window that a draw takes, or that is a unit, or a run."""
-        windows = [*self.parts, self.whole]
+        windows = [*self.parts, self.complete]
         for unit in self.parts:
             for count in self.block_counts(values):
                 windows += self.windows_in(unit, count)
@@ -154,11 +157,11 @@ def _with_traffic(
     if frames == 0 or not overrides:
         return
     changed = {override.partition("=")[0] for override in overrides}
-    kept = [override for override in variant.overrides if override.partition("=")[0] not in changed]
+    unchanged = [override for override in variant.overrides if override.partition("=")[0] not in changed]
     name, knob = f"{frames} frames", "frames"
     if variant.kind != SCENARIO:
         name, knob = f"{name}, {variant.name}", variant.knob
-    setting = replace(variant, name=name, kind=APPROXIMATES, knob=knob, overrides=(*kept, *overrides))
+    setting = replace(variant, name=name, kind=APPROXIMATES, knob=knob, overrides=(*unchanged, *overrides))
     yield PricedSetting(setting, variant.name, units, blocks, scenario.score.sampled_frames)
 
 
@@ -219,26 +222,26 @@ def draws(runs: Sequence[RunScores], units: TrafficUnits, priced: PricedSetting)
     parts = [(run, part) for run in runs for part in units.parts]
     count = len(parts)
     if priced.blocks:
-        found = []
+        result = []
         for number, (run, unit) in enumerate(parts):
             for window in units.windows_in(unit, priced.blocks):
-                found.append(Draw((number,), _window_score(run, window, priced, priced.sampled_frames)))
-        return found
+                result.append(Draw((number,), _window_score(run, window, priced, priced.sampled_frames)))
+        return result
     length = round(priced.units)
     if length == 1:
         return [Draw((number,), row) for number, row in enumerate(unit_scores(runs, units, priced))]
     name = priced.score or runs[0].rank_by
     if length > (count - 2) // 2 or name not in runs[0].sums:
         return []
-    found = []
+    result = []
     frames = max(1, priced.sampled_frames // length)
     for first in range(count):
         ring = sorted((first + step) % count for step in range(length))
         sums = [parts[number][0].sum_over(name, parts[number][1], frames) for number in ring]
         weight = sum(part_weight for _, part_weight in sums)
         total = sum((part_sum for part_sum, _ in sums), np.zeros(len(runs[0].mounts)))
-        found.append(Draw(tuple(ring), total / weight if weight > 0.0 else total))
-    return found
+        result.append(Draw(tuple(ring), total / weight if weight > 0.0 else total))
+    return result
 
 
 def _window_score(run: RunScores, window: Window, priced: PricedSetting, frames: int) -> FloatArray:

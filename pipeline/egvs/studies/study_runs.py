@@ -23,7 +23,7 @@ from egvs.studies import study_settings, traffic_options
 from egvs.studies.decision import MIN_UNITS
 from egvs.studies.measurement import SettingListener, SettingRunner
 from egvs.studies.study_draws import TrafficUnits
-from egvs.studies.study_settings import MEASURES, SCENARIO, SCENARIO_AS_IS, Setting, SettingValues
+from egvs.studies.study_settings import MEASURES, PERIOD_KNOB, SCENARIO, SCENARIO_AS_IS, Setting, SettingValues
 from egvs.studies.traffic_scores import RunScores, score_run
 
 BEYOND_BUDGET = "beyond the budget"
@@ -282,7 +282,7 @@ class StudyRuns:
         Voxels and frame periods do not change what sites see of vehicles.
         """
         ranks_vehicles = self.scenario.score.rank_by in TARGET_SCORES
-        return not (ranks_vehicles and variant.knob in ("voxel", "period"))
+        return not (ranks_vehicles and variant.knob in ("voxel", PERIOD_KNOB))
 
     def _expected_s(self, variant: Setting) -> float:
         """Estimate the wall-clock time of :meth:`_run_variant` from that of the scenario."""

@@ -39,6 +39,10 @@ from egvs.stages.inputs import build_scene
 from egvs.traffic.finished_fcd import recorded_frames
 
 APPROXIMATES, MEASURES, SCENARIO = "approximates", "measures", "scenario"
+
+PERIOD_KNOB, STEP_KNOB, SUBLANES_KNOB, ROUTING_KNOB = "period", "step", "sublanes", "routing"
+"""What is changed: the frame period, SUMO's step, sublanes, and routing."""
+
 WITHOUT_PREFIX, WITH_PREFIX = "without ", "with "
 """Prefixes of settings that leave out an effect, or add one."""
 
@@ -212,7 +216,7 @@ def list_variants(scenario: Scenario, values: SettingValues = DEFAULT_VALUES) ->
     """
     variants = [SCENARIO_AS_IS, *_period_settings(scenario, values)]
     if not scenario.is_recorded:
-        variants += step_settings(scenario, values.steps_s)
+        variants += _step_settings(scenario, values.steps_s)
     variants += [*_effect_quality_settings(scenario), *_thinned_sensor_settings(scenario, values)]
     variants += _measure_settings(scenario, values)
     distinct: dict[tuple[object, ...], Setting] = {}
@@ -223,10 +227,10 @@ def list_variants(scenario: Scenario, values: SettingValues = DEFAULT_VALUES) ->
 
 def _period_settings(scenario: Scenario, values: SettingValues) -> Iterator[Setting]:
     for period_s in values.frame_periods_s:
-        yield from _scaled_traffic_setting(scenario, "period", None, period_s)
+        yield from _scaled_traffic_setting(scenario, PERIOD_KNOB, None, period_s)
 
 
-def step_settings(scenario: Scenario, steps_s: Sequence[float]) -> Iterator[Setting]:
+def _step_settings(scenario: Scenario, steps_s: Sequence[float]) -> Iterator[Setting]:
     """Yield settings with other SUMO steps, and the nearest frame period that is a multiple of the step.
 
     Parameters
@@ -238,7 +242,7 @@ def step_settings(scenario: Scenario, steps_s: Sequence[float]) -> Iterator[Sett
     """
     for step_s in steps_s:
         period_s = _nearest_period(step_s, scenario.traffic.frame_period_s)
-        yield from _scaled_traffic_setting(scenario, "step", step_s, period_s)
+        yield from _scaled_traffic_setting(scenario, STEP_KNOB, step_s, period_s)
 
 
 def _nearest_period(step_s: float, period_s: float) -> float:

@@ -10,9 +10,14 @@ from collections.abc import Iterator
 
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import TrafficConfig
-from egvs.studies.study_settings import APPROXIMATES, MEASURES, Setting, SettingValues
-
-STEP_KNOB, SUBLANES_KNOB, ROUTING_KNOB = "step", "sublanes", "routing"
+from egvs.studies.study_settings import (
+    APPROXIMATES,
+    MEASURES,
+    ROUTING_KNOB,
+    SUBLANES_KNOB,
+    Setting,
+    SettingValues,
+)
 
 _SUBLANES_KEY, _ROUTING_KEY, _STEP_KEY = "lateral_resolution_m", "reroute_at_departure", "step_s"
 

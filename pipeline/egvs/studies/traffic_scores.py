@@ -244,12 +244,12 @@ def _frame_blocks(numbers: IntArray, recorded: Sequence[int], periods: Sequence[
 def _window_scorer(context: StageContext, windows: Sequence[Window], periods: Sequence[PeriodBlocks]) -> Scorer:
     """Return a scorer whose periods are the windows."""
     grid = context.scenario.roi.grid
-    tpogs = window_tpogs(context.folder.tpog, grid, windows, periods)
+    tpogs = _window_tpogs(context.folder.tpog, grid, windows, periods)
     parts = tuple(PeriodTpog(str(number), tpog) for number, tpog in enumerate(tpogs))
     return Scorer(context.scene, read_tpog(context.folder.tpog), context.folder.trajectories, None, parts)
 
 
-def window_tpogs(path: Path, grid: Grid, windows: Sequence[Window], periods: Sequence[PeriodBlocks]) -> list[Tpog]:
+def _window_tpogs(path: Path, grid: Grid, windows: Sequence[Window], periods: Sequence[PeriodBlocks]) -> list[Tpog]:
     """Return the TPOG of each window of ``tpog.parquet``, in the mix of its periods.
 
     Parameters

@@ -37,6 +37,7 @@ All randomness comes from the generator or seed passed in.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -46,6 +47,7 @@ from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
+from numpy.typing import NDArray
 
 from egvs.core import files
 from egvs.core.errors import InputError
@@ -152,22 +154,20 @@ class CountLocation:
         return f'    <edgeRelation from={first} to={last} count="{vehicles}"/>'
 
 
-def check_kinds(kinds: Sequence[VehicleKind], vehicle_classes: frozenset[str], where: str) -> None:
+def check_kinds(kinds: Sequence[VehicleKind], where: str) -> None:
     """Raise an InputError for an unknown vClass, or attributes that contradict the keys of the kind.
 
     Parameters
     ----------
     kinds
         The fleet.
-    vehicle_classes
-        SUMO's vClasses.
     where
         The traffic table, for messages.
     """
     for kind in kinds:
-        if kind.vclass not in vehicle_classes:
+        if not sumo.is_vehicle_class(kind.vclass):
             problem = f"kind {kind.name!r} has the unknown vClass {kind.vclass!r}"
-            raise InputError(f"{where}.kinds", problem, f"Use one of {', '.join(sorted(vehicle_classes))}.")
+            raise InputError(f"{where}.kinds", problem, f"Use one of {', '.join(sorted(sumo.vehicle_classes()))}.")
         reserved = sorted(_KIND_KEYS & kind.attributes.keys())
         if reserved:
             problem = f"kind {kind.name!r} has {', '.join(reserved)} among its attributes"
@@ -319,24 +319,45 @@ def _reachable_pairs(
     network: Network, links: IntArray, sources: IntArray, sinks: IntArray, min_trip_m: float
 ) -> IntArray:
     """Return pairs of a source and a reachable sink, (n, 2), that are far apart and not a way back."""
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import breadth_first_order
+    if not len(sources) or not len(sinks):
+        return np.empty((0, 2), dtype=np.int64)
+    edges = network.edges
+    origins = [edges[i] for i in sources]
+    targets = [edges[i] for i in sinks]
+    is_reached = _reached_edges(links, sources, len(edges))[:, sinks]
+    goes_back = np.array([[target.to_node == origin.from_node for target in targets] for origin in origins])
+    start_m = np.array([edge.start_m for edge in origins])
+    end_m = np.array([edge.end_m for edge in targets])
+    is_far = min_trip_m <= np.hypot(*(end_m - start_m[:, None]).T).T
+    is_pair = is_reached & is_far & ~goes_back & (sources[:, None] != sinks)
+    source, sink = np.nonzero(is_pair)
+    return np.column_stack([sources[source], sinks[sink]]).astype(np.int64)
 
-    edges, n = network.edges, len(network.edges)
-    graph = csr_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(n, n))
-    start_m = np.array([edge.start_m for edge in edges])
-    end_m = np.array([edge.end_m for edge in edges])
-    is_sink = np.zeros(n, dtype=bool)
-    is_sink[sinks] = True
 
-    pairs = [np.empty((0, 2), np.int64)]
-    for source in sources:
-        reached = np.sort(breadth_first_order(graph, source, return_predecessors=False)).astype(np.int64)
-        goes_back = np.array([edges[target].to_node == edges[source].from_node for target in reached])
-        is_far = np.hypot(*(end_m[reached] - start_m[source]).T) >= min_trip_m
-        targets = reached[is_sink[reached] & (reached != source) & ~goes_back & is_far]
-        pairs.append(np.column_stack([np.full(targets.size, source), targets]))
-    return np.concatenate(pairs)
+def _reached_edges(links: IntArray, sources: IntArray, n_edges: int) -> NDArray[np.bool_]:
+    """Return which edges can be reached from each source, (n_sources, n_edges).
+
+    Loading a graph library would take longer than this search, and SUMO waits for it.
+    """
+    next_edges: list[list[int]] = [[] for _ in range(n_edges)]
+    for edge, next_edge in links[:, :2].tolist():
+        next_edges[edge].append(next_edge)
+
+    reached_from = [0] * n_edges  # bit k is set where the edge is reached from source k
+    for k, source in enumerate(sources.tolist()):
+        reached_from[source] |= 1 << k
+    pending = deque(sources.tolist())
+    while pending:
+        edge = pending.popleft()
+        for next_edge in next_edges[edge]:
+            if reached_from[edge] & ~reached_from[next_edge]:
+                reached_from[next_edge] |= reached_from[edge]
+                pending.append(next_edge)
+
+    n_bytes = (len(sources) + 7) // 8
+    packed = b"".join(bits.to_bytes(n_bytes, "little") for bits in reached_from)
+    bits = np.unpackbits(np.frombuffer(packed, np.uint8).reshape(n_edges, n_bytes), axis=1, bitorder="little")
+    return bits[:, : len(sources)].T.astype(bool)
 
 
 def draw_trips(

@@ -34,15 +34,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from egvs.core.errors import Diagnostic, RunError
-from egvs.core.grid import FloatArray, Roi
+from egvs.core.grid import XY, FloatArray, Roi
 from egvs.traffic.network import Network
 from egvs.traffic.sumo_folder import RED_MARGIN_S, Timing
 from egvs.traffic.vehicle_boxes import VehicleSize
 
 if TYPE_CHECKING:
     import shapely
-
-XY = tuple[float, float]
 
 MAX_TELEPORT_SHARE = 0.05
 MIN_TELEPORTS = 10

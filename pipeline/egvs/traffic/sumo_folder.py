@@ -322,7 +322,7 @@ def prepare_simulation(scenario: Scenario, folder: Path, extensions: Iterable[Tr
     vehicles = traffic.vehicles
     depart_delay_s = traffic.max_depart_delay_s
     if is_generated:
-        demand.check_kinds(traffic.kinds, sumo.vehicle_classes(), where)
+        demand.check_kinds(traffic.kinds, where)
         files.write_text(folder / VTYPES_FILE, demand.vtypes_xml(traffic.kinds))
         copies |= {"additional-files": VTYPES_FILE, "route-files": TRIPS_FILE}
         if traffic.counts:
