@@ -16,7 +16,7 @@ from egvs.importers import lanelet2
 from egvs.importers.lanelet2_network import read_network_text
 from egvs.importers.map_parts import RoadOptions
 from tests.fuzz.mutating import mutant
-from tests.importers.lanelet2_maps import make_crossing
+from tests.importers.lanelet2_maps import MapWriter, make_crossing
 
 PROJECTOR = (
     b"projector_type: LocalCartesian\nvertical_datum: WGS84\nmap_origin:\n  latitude: 49.0\n  longitude: 8.4\n"
@@ -64,3 +64,43 @@ def test_200_mutants(tmp_path: Path, name: str) -> None:
     read, rejected = read_mutants(tmp_path, name, range(200))
     assert read + rejected == 200
     assert rejected > 20
+
+
+def random_map(seed: int, folder: Path) -> Path:
+    """Write a map of lanelets between random lines: overlapping, turned, degenerate."""
+    draw = random.Random(seed)
+    writer = MapWriter()
+    points = [(draw.randint(0, 4) * 10, draw.randint(0, 4) * 10, draw.choice([0, 0, 6])) for _ in range(12)]
+    kinds = [{"type": "virtual"}, {"type": "line_thin", "subtype": "solid"}]
+    lines = [
+        writer.line([draw.choice(points) for _ in range(draw.randint(2, 4))], **draw.choice(kinds)) for _ in range(15)
+    ]
+    lanelets = [
+        writer.lanelet(
+            draw.choice(lines),
+            draw.choice(lines),
+            subtype=draw.choice(["road", "road", "crosswalk", "bus_lane"]),
+            one_way=draw.choice(["yes", "no"]),
+        )
+        for _ in range(15)
+    ]
+    for subtype in ("traffic_light", "right_of_way", "all_way_stop"):
+        members = [("way", draw.choice(lines), "ref_line")]
+        members += [("relation", draw.choice(lanelets), role) for role in ("yield", "right_of_way")]
+        writer.refer(draw.choice(lanelets), writer.regulation(members, subtype))
+    return writer.write(folder / "map.osm", local=True, turn_lines=seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("walk", [False, True])
+def test_random_maps(tmp_path: Path, walk: bool) -> None:
+    read = 0
+    for seed in range(12):
+        path = random_map(seed, tmp_path)
+        try:
+            read_network_text(lanelet2.read_roads(path, RoadOptions(walk=walk)).network)
+            read += 1
+        except InputError as error:
+            assert str(path) in str(error), seed
+            assert "cannot be made into roads" not in str(error), seed
+    assert read > 6

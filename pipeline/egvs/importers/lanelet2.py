@@ -16,7 +16,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.reading import translate_errors
 from egvs.formats.lanelet2 import LaneletMap, is_lanelet2, read_lanelet2
-from egvs.formats.lanelet2_graph import DirectedLanelet, LaneletGraph, LaneletKey, build_graph
+from egvs.formats.lanelet2_graph import DirectedLanelet, LaneletGraph, LaneletKey, build_graph, connect_lanelets
 from egvs.formats.lanelet2_projection import ProjectedPoints, project_points
 from egvs.importers import lanelet2_rules as rules
 from egvs.importers.lanelet2_crosswalks import Crosswalk, place_crosswalks
@@ -27,11 +27,14 @@ from egvs.importers.lanelet2_network import (
     unused_relations,
 )
 from egvs.importers.lanelet2_right_of_way import RightOfWay
-from egvs.importers.lanelet2_roads import RoadLayout, make_roads
+from egvs.importers.lanelet2_roads import RoadLayout, line_length_m, make_roads
 from egvs.importers.lanelet2_signals import SignalPlan, plan_signals
 from egvs.importers.map_parts import RoadMap, RoadOptions
 
 NAME = "Lanelet2"
+
+MIN_SIZE_M = 0.5
+"""Shorter or narrower lanelets are mistakes; netconvert makes no lanes of them."""
 
 _NO_ROADS_HINT = "Give a map with lanelets of subtype road or highway."
 
@@ -61,20 +64,24 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
     lanelet_map = read_lanelet2(path)
     points = project_points(lanelet_map, path)
     graph = build_graph(lanelet_map, points.xyz_m, rules.is_for_motor_vehicles)
+    graph, tiny = _without_tiny(graph)
     if not graph.lanelets:
         raise InputError(path, "has no lanelets for motor vehicles", _NO_ROADS_HINT)
-    lefthand, side_notes = rules.choose_driving_side(graph, options.lefthand, str(path))
     with translate_errors(path, "Correct the map in an editor.", "its lanelets cannot be made into roads"):
+        lefthand, side_notes = rules.choose_driving_side(graph, options.lefthand, str(path))
         crosswalk_lanelets = _crosswalks(lanelet_map, points.xyz_m) if options.walk else []
         layout = make_roads(graph, lefthand=lefthand, crosswalks=crosswalk_lanelets)
+        if not layout.roads:
+            problem = "none of its lanelets can be a road: all overlap others and have neither beginning nor end"
+            raise InputError(path, problem, "Correct the map in an editor.")
         crosswalks, unused_crosswalks = place_crosswalks(layout, crosswalk_lanelets)
-    builder = _make_builder(layout, lanelet_map, points, crosswalks, str(path), lefthand)
-    network, quality = builder.build()
-    lost_crossings = quality.lost_crossings
-    if lost_crossings:
-        crosswalks = tuple(crosswalk for crosswalk in crosswalks if crosswalk not in lost_crossings)
         builder = _make_builder(layout, lanelet_map, points, crosswalks, str(path), lefthand)
         network, quality = builder.build()
+        lost_crossings = quality.lost_crossings
+        if lost_crossings:
+            crosswalks = tuple(crosswalk for crosswalk in crosswalks if crosswalk not in lost_crossings)
+            builder = _make_builder(layout, lanelet_map, points, crosswalks, str(path), lefthand)
+            network, quality = builder.build()
     notes = (
         *points.notes,
         *side_notes,
@@ -83,10 +90,23 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
         *_assumption_notes(builder.assumed),
         *_signal_notes(builder.signals),
         *_right_of_way_notes(builder.right_of_way),
-        *_problem_notes(lanelet_map, graph, layout),
+        *_problem_notes(lanelet_map, graph, layout, tiny),
         *_quality_notes(quality, builder.lane_changes.opened),
     )
     return RoadMap(network, notes=notes, has_heights=points.has_heights)
+
+
+def _without_tiny(graph: LaneletGraph) -> tuple[LaneletGraph, list[LaneletKey]]:
+    """Return the graph without lanelets below :data:`MIN_SIZE_M`, and these."""
+    tiny = []
+    for key, lanelet in graph.lanelets.items():
+        shortest_bound_m = min(line_length_m(lanelet.left_m), line_length_m(lanelet.right_m))
+        if min(lanelet.length_m, lanelet.width_m) < MIN_SIZE_M or shortest_bound_m <= 0:
+            tiny.append(key)
+    if tiny:
+        left_out = set(tiny)
+        graph = connect_lanelets({key: lanelet for key, lanelet in graph.lanelets.items() if key not in left_out})
+    return graph, tiny
 
 
 def _content_notes(lanelet_map: LaneletMap, graph: LaneletGraph, layout: RoadLayout) -> Iterator[str]:
@@ -125,6 +145,7 @@ def _assumption_notes(assumed: rules.Assumptions) -> Iterator[str]:
 def _crosswalks(lanelet_map: LaneletMap, xyz_m: Mapping[int, FloatArray]) -> list[DirectedLanelet]:
     """Return the lanelets of crosswalks, in one of their directions."""
     graph = build_graph(lanelet_map, xyz_m, lambda lanelet: lanelet.tags.get("subtype") == "crosswalk")
+    graph, _ = _without_tiny(graph)
     return [lanelet for key, lanelet in graph.lanelets.items() if not key.is_reversed]
 
 
@@ -183,8 +204,12 @@ def _right_of_way_notes(right_of_way: RightOfWay) -> Iterator[str]:
         yield f"Rules of right of way between lanelets that do not meet, left out: {_count(right_of_way.unused)}."
 
 
-def _problem_notes(lanelet_map: LaneletMap, graph: LaneletGraph, layout: RoadLayout) -> Iterator[str]:
+def _problem_notes(
+    lanelet_map: LaneletMap, graph: LaneletGraph, layout: RoadLayout, tiny: Sequence[LaneletKey]
+) -> Iterator[str]:
     """Yield what is wrong in the map."""
+    if tiny:
+        yield f"Lanelets shorter or narrower than {MIN_SIZE_M:g} m, left out: {_count(tiny)}."
     if lanelet_map.incomplete:
         yield f"Lanelets without one left and one right bound, left out: {_count(lanelet_map.incomplete)}."
     if lanelet_map.missing_members:

@@ -36,7 +36,7 @@ _ROAD_RANGE_M = 10.0
 _EXTENSION_M = 1.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Crosswalk:
     """A crosswalk of the network.
 

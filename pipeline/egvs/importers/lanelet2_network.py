@@ -36,6 +36,7 @@ from egvs.traffic import sumo
 MAX_LANE_ERROR_M = 0.3
 """How far a lane may be from that of the map."""
 
+_EDITOR_HINT = "Correct the map in an editor."
 _SIMPLIFY_M = 0.01
 _EXTENSION_M = 20.0
 """netconvert gets the line of a road longer than it is by this: from the line, cut at the nodes, it finds the direction
@@ -151,7 +152,7 @@ class NetworkBuilder:
             return plain.build(flags)
         except sumo.SumoInputError as error:
             problem = f"netconvert cannot build a network of its lanelets: {error}"
-            raise InputError(self._where, problem, "Correct the map in an editor.") from None
+            raise InputError(self._where, problem, _EDITOR_HINT) from None
 
     def _node(self, node: str, attempt: int) -> PlainElement:
         x, y, z = self._shapes.position_m(node).tolist()
@@ -220,7 +221,11 @@ class NetworkBuilder:
 
     def _measure(self, text: str) -> tuple[NetworkQuality, set[str]]:
         """Compare a network with the map; return the nodes at the bad ends of lanes, too."""
-        actual = read_network_text(text)
+        try:
+            actual = read_network_text(text)
+        except InputError as error:  # netconvert writes a network without roads where it finds nothing to connect
+            problem = f"netconvert makes no network of its lanelets: {error.problem}"
+            raise InputError(self._where, problem, _EDITOR_HINT) from None
         sumo_lane = self._layout.sumo_lane
         wanted_m = {
             (road.id, sumo_lane(road.id, index)): lane.center_m
@@ -230,8 +235,8 @@ class NetworkBuilder:
         actual_m = {(edge.id, index): lane.shape_m for edge in actual.edges for index, lane in enumerate(edge.lanes)}
         missing = [key for key in wanted_m if key not in actual_m]
         if missing:
-            problem = f"netconvert dropped {len(missing)} lanes, the first of lanelet {missing[0][0]}"
-            raise InputError(self._where, problem, "Correct the map in an editor.")
+            problem = f"netconvert dropped {len(missing)} lanes, the first of {missing[0][0]}"
+            raise InputError(self._where, problem, _EDITOR_HINT)
         quality = NetworkQuality()
         bad_nodes = set()
         for (road_id, index), errors_m in lane_errors_m(wanted_m, actual_m).items():
