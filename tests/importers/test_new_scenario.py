@@ -203,5 +203,6 @@ def test_roads_buildings_and_sites_follow_a_terrain(tmp_path: Path) -> None:
     assert scenario.statics.terrain == "terrain.ply"
     with (tmp_path / "made" / "sites.csv").open() as file:
         for row in csv.DictReader(file):
+            # lanes are level across: half of 3.2 m
             expected_m = 0.04 * (float(row["x_m"]) - x0_m)
-            assert float(row["ground_m"]) == pytest.approx(expected_m, abs=0.08)  # lanes are level across: half of 3.2 m
+            assert float(row["ground_m"]) == pytest.approx(expected_m, abs=0.08)
