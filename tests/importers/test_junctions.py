@@ -28,11 +28,11 @@ def test_flows_equal_hand_computed_balance() -> None:
     ("kind", "per_lane_h"),
     [
         ("highway.secondary", 200), ("highway.primary_link", 250), ("highway.secondary|railway.tram", 200),
-        ("cycleway.lane|highway.tertiary", 150), ("highway.track", 40), ("railway.tram", 40), ("", 40),
+        ("cycleway.lane|highway.tertiary", 150), ("highway.track", 40), ("railway.tram", 40), ("", 200),
     ],
 )  # fmt: skip
 def test_road_class_sets_flow_per_lane(kind: str, per_lane_h: float) -> None:
-    """Of its three lanes one is for people on foot."""
+    """Of its three lanes one is for people on foot. Without a class, SUMO's default of 50 km/h is a secondary road."""
     on_foot, cars = Permission(frozenset({"pedestrian"}), frozenset()), Permission(None, frozenset())
     lanes = tuple(Lane("0,0 9,0", "lane", None, 9.0, permission) for permission in (on_foot, cars, cars))
     assert junctions.edge_flow_h(Edge("e", "", "a", "b", "", lanes, kind)) == 2 * per_lane_h
@@ -44,12 +44,12 @@ def test_inflow_is_met_where_outflow_cannot_be() -> None:
 
 
 def test_turn_that_is_only_possible_with_a_loop_gets_no_flow(tmp_path: Path) -> None:
-    """All that comes in, 40 an hour from each of two streets, goes on; nobody turns round through the signal."""
+    """All that comes in, 60 an hour from each of two streets with 40 km/h, goes on; nobody turns round."""
     path = tmp_path / "loop.net.xml"
     path.write_text(LOOP_NET)
     streets = junctions.read_streets(path)
     flows = junctions.assumed_flows(streets, JunctionRegion((15.0, 0.0), (90.0, 90.0)))
-    assert {(flow.title, flow.per_hour) for flow in flows} == {("in to on", 40.0), ("side to on", 40.0)}
+    assert {(flow.title, flow.per_hour) for flow in flows} == {("in to on", 60.0), ("side to on", 60.0)}
 
 
 def test_street_that_merges_at_the_edge_of_the_region_brings_vehicles(tmp_path: Path) -> None:

@@ -57,3 +57,18 @@ def test_rejects_files(tmp_path: Path, names: tuple[str, ...], problem: str) -> 
 def test_rejects_folder_without_maps(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no map that can be read"):
         map_readers.list_files([tmp_path])
+
+
+def test_network_made_from_openstreetmap_is_a_network(tmp_path: Path) -> None:
+    """netconvert names the option ``osm-files`` in a comment at the top of the network."""
+    path = tmp_path / "roads.xml"
+    head, root, rest = NETWORK.read_text(encoding="utf-8").partition("<net ")
+    path.write_text(f'{head}<!-- <osm-files value="town.osm"/> -->\n{root}{rest}', encoding="utf-8")
+    assert map_readers.find_reader(path) is sumo_network
+
+
+@pytest.mark.parametrize(("faces", "reader"), [(0, "point cloud"), (1, "triangle mesh")])
+def test_ply_is_a_mesh_if_it_has_faces(tmp_path: Path, faces: int, reader: str) -> None:
+    path = tmp_path / "a.ply"
+    path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\nelement face %d\nend_header\n" % faces)
+    assert reader == map_readers.find_reader(path).NAME

@@ -206,3 +206,35 @@ def test_roads_buildings_and_sites_follow_a_terrain(tmp_path: Path) -> None:
             # lanes are level across: half of 3.2 m
             expected_m = 0.04 * (float(row["x_m"]) - x0_m)
             assert float(row["ground_m"]) == pytest.approx(expected_m, abs=0.08)
+
+
+def test_openstreetmap_beside_roads_without_a_reference_system_is_rejected(tmp_path: Path) -> None:
+    small = Path(__file__).parent / "data" / "small.osm"
+    with pytest.raises(InputError, match="no reference system"):
+        create_scenario(tmp_path / "made", [ROUNDABOUT, small])
+
+
+def test_outline_of_an_open_mesh_is_the_area_below_its_triangles() -> None:
+    """Two houses without floors, 10 m apart: the space between them is free."""
+    houses = [block("a", (0, 0, 0), (4, 4, 3)), block("b", (14, 0, 0), (4, 4, 3))]
+    vertices_m = np.concatenate([house.vertices_m for house in houses])
+    without_floor = _BOX_FACES[2:]
+    faces = np.concatenate([without_floor, without_floor + 8])
+    mesh = MappedMesh("town", "mesh", vertices_m, faces, is_closed=False)
+    assert static_objects.outline(mesh).area == pytest.approx(2 * 16)
+
+
+def test_point_cloud_replaces_what_it_contains() -> None:
+    counts = ImportCounts()
+    solids = [MappedSolid("way/1", "barrier", box(0, 0, 9, 1), 2.0, "default"),
+              MappedSolid("way/2", "barrier", box(50, 0, 59, 1), 2.0, "default")]  # fmt: skip
+    for solid in solids:
+        counts.keep(solid)
+    survey = MappedMesh(
+        "s", "as_built", np.array([[-1.0, -1, 1], [20, -1, 1], [-1, 20, 1]]), np.array([[0, 1, 2]]), False
+    )
+    rest = static_objects._without_replaced(
+        SolidMap(tuple(solids), counts=counts), static_objects.StaticObjects(meshes=(survey,))
+    )
+    assert [solid.name for solid in rest.solids] == ["way/2"]
+    assert rest.counts.objects == {"barrier": 1}

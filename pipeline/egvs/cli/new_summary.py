@@ -63,7 +63,7 @@ def _scenario_lines(scenario: NewScenario) -> Iterator[tuple[str, str]]:
     junction, roi = scenario.junction, scenario.roi
     arms = f"{_count('arm', junction.arms)}, {_count('incoming lane', junction.lanes_in)}"
     yield "junction", f"{junction.title}: {arms}; {_position(scenario)}"
-    yield "region", f"{roi.size_m[0]:g} m x {roi.size_m[1]:g} m x {junctions.ROI_HEIGHT_M:g} m around the junction"
+    yield "region", f"{roi.size_m[0]:g} m x {roi.size_m[1]:g} m x {scenario.height_m:g} m around the junction"
     yield "streets", _describe_streets(scenario.streets)
     yield "traffic", _describe_traffic(scenario.traffic)
     mounts = f"{len(junctions.HEIGHTS_M)} heights x {len(PITCHES_DEG)} tilts"
@@ -83,7 +83,7 @@ def _describe_map(summary: MapSummary) -> str:
     files = first if len(summary.paths) == 1 else f"{first} and {len(summary.paths) - 1} more"
     texts = [f"{files} ({summary.reader}): {_describe_solids(summary.counts)}"]
     if summary.height_range_m is not None:
-        texts.append("{:.1f} to {:.1f} m high".format(*summary.height_range_m))
+        texts.append("tops at z = {:.1f} to {:.1f} m".format(*summary.height_range_m))
     return ", ".join(texts)
 
 
@@ -157,7 +157,7 @@ def _scenario_warnings(scenario: NewScenario) -> Iterator[str]:
         distance = f"{scenario.from_at_m:,.0f} m from --at"
         yield (
             f"the junction ({scenario.junction.title}) is {distance} and may not be the one that you mean."
-            " Check the position, and that the extract contains the junction."
+            " Check the position, and that the map contains the junction."
         )
     assumed, per_h = "the traffic is assumed", 0
     if scenario.traffic is not None:

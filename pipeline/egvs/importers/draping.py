@@ -48,6 +48,7 @@ TOLERANCE_M = 0.01
 """How far a shape may be above or below the ground between its points."""
 
 _EDGE = re.compile(r"<edge\s[^>]*>")
+_LEAST_POINTS = 3
 _HINT = "Use a terrain that covers all roads, or a smaller road map."
 
 
@@ -156,15 +157,14 @@ def level_difference_m(text: str, terrain: Terrain, where: object = "the road ma
     Raises
     ------
     InputError
-        When the terrain has no height at more than half of the points.
+        When the terrain has heights at fewer than 3 of the points.
     """
     lanes = [shape.points_m for shape in find_shapes(text) if shape.tag == "lane"]
     points_m = np.concatenate(lanes)
     differences = terrain.height_m(points_m[:, :2]) - points_m[:, 2]
     known = differences[np.isfinite(differences)]
-    if 2 * len(known) < len(points_m):
-        unknown = _share(len(points_m) - len(known), len(points_m))
-        problem = f"the terrain has no height at {unknown} points of the roads"
+    if len(known) < _LEAST_POINTS:
+        problem = f"the terrain has heights at {len(known)} of {len(points_m):,} points of the roads"
         raise InputError(where, problem, _HINT)
     median_m = float(np.median(known))
     return median_m, float(np.median(np.abs(known - median_m)))

@@ -83,18 +83,19 @@ def find_zero(roads: RoadSource, file: MapFile, junction: StreetJunction, terrai
         When the terrain has no height there.
     """
     has_heights = roads.streets.network.has_heights
-    own_m = 0.0
+    road_height_m = 0.0
     if has_heights and file.reader is not sumo_network:
-        own_m = round(float(np.median(relief.lane_heights_near(roads.streets, junction))), 3)
+        road_height_m = round(float(np.median(relief.lane_heights_near(roads.streets, junction))), 3)
     if terrain is None:
-        return ZeroHeight(own_m if has_heights else None)
+        return ZeroHeight(road_height_m if has_heights else None)
     if not has_heights:
         return ZeroHeight(draping.ground_height_m(terrain, junction.at_m, file.path))
-    difference_m, spread_m = draping.level_difference_m(roads.network, terrain, file.path)
+    measured = terrain.terrain if isinstance(terrain, ExtendedTerrain) else terrain
+    difference_m, spread_m = draping.level_difference_m(roads.network, measured, file.path)
     note = f"The terrain is {difference_m:+.2f} m above the heights of the road map (median; spread {spread_m:.2f} m)."
     if spread_m > _LARGE_SPREAD_M:
         note += " So large a spread suggests that one of them is wrong, or of another place."
-    return ZeroHeight(own_m + difference_m, (note,))
+    return ZeroHeight(road_height_m + difference_m, (note,))
 
 
 def lay_on_ground(

@@ -657,7 +657,7 @@ def edge_flow_h(edge: Edge) -> float:
     netconvert writes a street with tram tracks as ``"highway.secondary|railway.tram"``.
     """
     flows_per_h = []
-    if "highway." not in edge.type:
+    if not edge.type:
         flows_per_h.append(LANE_FLOW_PER_H[_class_by_speed(edge)])
     for part in edge.type.split("|"):
         if part.startswith("highway."):

@@ -30,6 +30,7 @@ from egvs.importers.lanelet2_right_of_way import RightOfWay
 from egvs.importers.lanelet2_roads import RoadLayout, line_length_m, make_roads
 from egvs.importers.lanelet2_signals import SignalPlan, plan_signals
 from egvs.importers.map_parts import RoadMap, RoadOptions
+from egvs.importers.openstreetmap import is_osm_xml
 
 NAME = "Lanelet2"
 
@@ -41,7 +42,7 @@ _NO_ROADS_HINT = "Give a map with lanelets of subtype road or highway."
 
 def can_open(path: Path, head: bytes) -> bool:
     """Return whether a file is an OSM-XML file with lanelets."""
-    return b"<osm" in head and is_lanelet2(path)
+    return is_osm_xml(head) and is_lanelet2(path)
 
 
 def read_roads(path: Path, options: RoadOptions) -> RoadMap:

@@ -248,7 +248,7 @@ class MapContext:
             return self.alignment
         if self.frame is None:
             problem = f"the file is in {crs}, but the road map has no reference system"
-            raise InputError(where, problem, "Use a road map with a reference system, or align it with --align.")
+            raise InputError(where, problem, "Use a road map with a reference system.")
         return self.frame
 
 

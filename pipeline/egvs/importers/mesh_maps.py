@@ -8,6 +8,7 @@ Each closed piece of a file is a mesh of its own, so that a point inside can be 
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -37,8 +38,14 @@ def can_open(path: Path, head: bytes) -> bool:
     """Return whether a file is a mesh; a PLY without faces is a point cloud."""
     suffix = path.suffix.lower()
     if suffix == ".ply":
-        return b"element face" in head
+        return has_faces(head)
     return suffix.removeprefix(".") in meshes.MESH_FORMATS
+
+
+def has_faces(head: bytes) -> bool:
+    """Return whether the header of a PLY file declares faces."""
+    declared = re.search(rb"element face +(\d+)", head.partition(b"end_header")[0])
+    return declared is not None and int(declared[1]) > 0
 
 
 def read_solids(paths: Sequence[Path], context: MapContext) -> SolidMap:

@@ -111,6 +111,8 @@ class NewScenario:
         The traffic through the region of interest; None where no street leads through it.
     notes
         What to know before trusting the scenario.
+    height_m
+        Height of the region of interest.
     maps
         What each map with static objects contributed.
     attributions
@@ -128,6 +130,7 @@ class NewScenario:
     n_solids: int
     traffic: AssumedTraffic | None
     notes: tuple[str, ...]
+    height_m: float = junctions.ROI_HEIGHT_M
     maps: tuple[MapSummary, ...] = ()
     attributions: tuple[str, ...] = ()
     from_at_m: float | None = None
@@ -243,8 +246,11 @@ def create_scenario(
     maps_read = static_objects.read_maps(files.solids, level, files.roads, context)
     terrain = ground_reference.read_terrain(files.terrain, ground_reference.with_roads(context, roads.streets))
     measured = static_objects.ground_mesh(maps_read)
+    ground_notes = []
     if terrain is None and measured is not None:
         terrain = ground_reference.measured_ground(measured)
+    elif measured is not None:
+        ground_notes.append("The ground of the point cloud is not used, since a terrain file is given.")
     zero = ground_reference.find_zero(roads, files.roads, junction, terrain)
     objects = static_objects.collect_objects(maps_read, level.streets, junction.at_m, zero.height_m)
     roads = ground_reference.lay_on_ground(roads, files.roads, junction, terrain)
@@ -263,7 +269,7 @@ def create_scenario(
             hint = "Choose a smaller spacing with --poles, or another junction with --at LAT,LON."
         raise InputError(files.roads.path, problem, hint)
 
-    notes = [*roads.notes, *zero.notes, *(() if terrain is None else terrain.notes)]
+    notes = [*roads.notes, *zero.notes, *(() if terrain is None else terrain.notes), *ground_notes]
     if at is None and not junction.signalised:
         notes.append(_NO_SIGNALS_NOTE)
     notes += _ring_notes(streets, junction)
@@ -280,7 +286,8 @@ def create_scenario(
 
     scenario = NewScenario(
         folder, junction, roi, streets, len(poles), objects.counts, objects.n_solids + 1, assumed, tuple(notes),
-        maps=objects.maps, attributions=_attributions(roads, objects), from_at_m=_distance_m(streets, junction, at),
+        height_m=relief.z_range_m[1] - relief.z_range_m[0], maps=objects.maps,
+        attributions=_attributions(roads, objects), from_at_m=_distance_m(streets, junction, at),
     )  # fmt: skip
     terrain_m = None
     if terrain is not None:
@@ -417,7 +424,8 @@ def _level_notes(roads: RoadSource, counts: ImportCounts) -> list[str]:
 
 
 def _range_notes(counts: ImportCounts) -> list[str]:
-    left_out = counts.dropped.get(osm_solids.OUT_OF_RANGE, Counter()).total()
+    dropped = counts.dropped.get(osm_solids.OUT_OF_RANGE, Counter())
+    left_out = dropped.total() - dropped["point"]  # a point cloud counts its own
     if not left_out:
         return []
     total = left_out + counts.objects.total() - counts.objects["tree_crown"]

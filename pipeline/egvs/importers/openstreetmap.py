@@ -8,6 +8,7 @@ poles become solids (:mod:`egvs.importers.osm_solids`).
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,7 +36,12 @@ _SUFFIXES = (".osm", ".osm.xml", ".osm.pbf", ".pbf")
 
 def can_open(path: Path, head: bytes) -> bool:
     """Return whether a file is named as an OpenStreetMap extract, or begins as one."""
-    return path.name.lower().removesuffix(".gz").endswith(_SUFFIXES) or b"<osm" in head
+    return path.name.lower().removesuffix(".gz").endswith(_SUFFIXES) or is_osm_xml(head)
+
+
+def is_osm_xml(head: bytes) -> bool:
+    """Return whether a file begins with an element ``<osm>``; the comment of a SUMO network may name ``<osm-files``."""
+    return re.search(rb"<osm[\s>]", head) is not None
 
 
 def check_inside_extract(extract: OsmExtract, at: tuple[float, float] | None, option: str = "--at") -> None:
@@ -146,6 +152,9 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
 def read_solids(paths: Sequence[Path], context: MapContext) -> SolidMap:
     """Return the static objects of extracts whose roads are not used; InputError when a file is damaged."""
     assert context.streets is not None, "the road map is read first"
+    if context.frame is None:
+        problem = "the extract is in degrees, but the road map has no reference system"
+        raise InputError(paths[0], problem, "Use a road map with a reference system.")
     solids: list[MappedSolid] = []
     counts = ImportCounts()
     for path in paths:

@@ -135,6 +135,13 @@ class ImportCounts:
             kind = solid.kind.removesuffix("_trunk")
             self.heights.setdefault(kind, Counter())[solid.height_source] += 1
 
+    def remove(self, solid: MappedSolid) -> None:
+        """Take back what :meth:`keep` counted."""
+        self.objects -= Counter({solid.kind: 1})
+        self.assumed_crowns -= solid.assumed_radius
+        if solid.kind != "tree_crown":
+            self.heights[solid.kind.removesuffix("_trunk")] -= Counter({solid.height_source: 1})
+
     def drop(self, kind: str, reason: str) -> None:
         """Count an object that is left out."""
         self.dropped.setdefault(reason, Counter())[kind] += 1

@@ -31,6 +31,7 @@ from egvs.formats.georeference import height_unit_m
 from egvs.importers.as_built_view import AsBuiltMap
 from egvs.importers.cloud_surface import CloudSurface, TriangleSurface, thin_points, triangulate_cloud
 from egvs.importers.map_parts import MapContext, MappedMesh
+from egvs.importers.mesh_maps import has_faces
 from egvs.importers.moving_points import MIN_SWEEPS, StationScan, group_by_station, not_shared, seen_through
 from egvs.importers.osm_solids import OUT_OF_RANGE, ImportCounts
 from egvs.scenario.fields import MAX_COORDINATE_M
@@ -57,9 +58,7 @@ def can_open(path: Path, head: bytes) -> bool:
     """Return whether a file is a point cloud; a PLY with faces is a mesh."""
     suffix = _suffix(path)
     if suffix == "ply":
-        header = head.partition(b"end_header")[0]
-        has_faces = b"element face" in header and b"element face 0" not in header
-        return head.startswith(b"ply") and b"element vertex" in header and not has_faces
+        return head.startswith(b"ply") and b"element vertex" in head and not has_faces(head)
     if suffix == "csv":
         names = {
             name.strip(' \t\r"').lower() for name in head.partition(b"\n")[0].decode("utf-8-sig", "replace").split(",")

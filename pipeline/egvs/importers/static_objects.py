@@ -47,6 +47,9 @@ _LARGE_DIFFERENCE_M = 5.0
 GROUND = "ground"
 """The kind of meshes that are ground; it becomes the terrain of the scenario."""
 
+_LEAST_TRIANGLE_M2 = 1e-6
+"""Smaller triangles, seen from above, are walls."""
+
 _SQUARE_M = 0.5
 _NEAR_GROUND_M = (0.5, 4.0)
 """Heights above the ground in which the surface of a point cloud is in the way of a pole."""
@@ -109,7 +112,7 @@ class StaticObjects:
     def areas(self) -> list[BaseGeometry]:
         """The areas where no pole can stand, seen from above: all objects except the ground.
 
-        A mesh is taken as its convex hull, the surface of a point cloud as the squares in which it is near the ground.
+        A mesh is taken as its outline, the surface of a point cloud as the squares in which it is near the ground.
         """
         areas = [solid.area for solid in self.solids]
         ground = next((mesh for mesh in self.meshes if mesh.kind == GROUND), None)
@@ -211,7 +214,17 @@ def collect_objects(
 
 
 def outline(mesh: MappedMesh) -> BaseGeometry:
-    """Return the convex hull of a mesh, seen from above."""
+    """Return the convex hull of a closed mesh, seen from above, or the area below the triangles of an open one.
+
+    An open mesh may be many objects, such as all buildings of a file.
+    """
+    if mesh.is_closed:
+        return _convex_hull(mesh)
+    triangles = shapely.polygons(mesh.vertices_m[mesh.faces][:, :, :2])
+    return shapely.union_all(triangles[shapely.area(triangles) > _LEAST_TRIANGLE_M2])
+
+
+def _convex_hull(mesh: MappedMesh) -> BaseGeometry:
     return MultiPoint(mesh.vertices_m[:, :2]).convex_hull
 
 
@@ -269,14 +282,23 @@ def _lower_to_ground(solid_map: SolidMap, middle_m: XY, zero_height_m: float | N
     """
     if not solid_map.has_absolute_heights or not solid_map.meshes:
         return solid_map
-    bases_m = _ground_height_m(solid_map.meshes, middle_m)
+    objects = [mesh for mesh in solid_map.meshes if mesh.kind not in (GROUND, OBJECT_KIND)]
+    if not objects:  # a point cloud, whose ground is the terrain
+        assert zero_height_m is not None, "a point cloud has a ground"
+        bases_m = zero_height_m
+    else:
+        bases_m = _ground_height_m(objects, middle_m)
     ground_m = bases_m if zero_height_m is None else zero_height_m
-    source = "the lowest points of the objects nearest to the junction" if zero_height_m is None else "the roads"
+    source = "the lowest points of the objects nearest to the junction"
+    if zero_height_m is not None:
+        source = "the ground at the junction"
     notes = [f"Heights count from sea level; {ground_m:.2f} m, from {source}, is subtracted."]
-    if abs(bases_m - ground_m) > _LARGE_DIFFERENCE_M:
+    difference_m = bases_m - ground_m
+    if abs(difference_m) > _LARGE_DIFFERENCE_M:
         notes.append(
-            f"The objects nearest to the junction begin {bases_m - ground_m:+.1f} m above its roads; check that both"
-            " maps count heights from the same level."
+            f"The objects nearest to the junction begin {abs(difference_m):.1f} m"
+            f" {'above' if difference_m > 0 else 'below'} its ground; check that both maps count heights from the same"
+            " level."
         )
     meshes = tuple(_shift(mesh, -ground_m) for mesh in solid_map.meshes)
     return replace(solid_map, meshes=meshes, notes=(*solid_map.notes, *notes), has_absolute_heights=False)
@@ -318,18 +340,21 @@ def _flat_ground_m(xy_m: FloatArray) -> FloatArray:
 
 
 def _without_replaced(solid_map: SolidMap, others: StaticObjects) -> SolidMap:
-    """Return a map without the buildings that another map has as well; its counts are updated."""
+    """Return a map without the buildings that another map has as well, and without all that a point cloud contains.
+
+    Its counts are updated.
+    """
     areas = [outline(mesh) for mesh in others.meshes if mesh.kind == "building"]
-    areas += [solid.area for solid in others.solids if solid.kind == "building"]
+    surveyed = [_convex_hull(mesh) for mesh in others.meshes if mesh.kind == OBJECT_KIND]
+    areas += surveyed + [solid.area for solid in others.solids if solid.kind == "building"]
     if not areas:
         return solid_map
     tree = shapely.STRtree(areas)
     counts = solid_map.counts
     remaining = []
     for solid in solid_map.solids:
-        if solid.kind in ("building", "roof") and _is_covered(solid.area, tree):
-            counts.objects[solid.kind] -= 1
-            counts.heights[solid.kind][solid.height_source] -= 1
+        if (surveyed or solid.kind in ("building", "roof")) and _is_covered(solid.area, tree):
+            counts.remove(solid)
             counts.drop(solid.kind, REPLACED)
         else:
             remaining.append(solid)
