@@ -654,10 +654,11 @@ def assumed_flows(streets: Streets, roi: JunctionRegion, ring: Ring | None = Non
 def edge_flow_h(edge: Edge) -> float:
     """Return the assumed vehicles per hour on all lanes of a street, by its road class, or else by its speed limit.
 
-    netconvert writes a street with tram tracks as ``"highway.secondary|railway.tram"``.
+    netconvert writes a street with tram tracks as ``"highway.secondary|railway.tram"``. Types of other maps, such as
+    ``"driving"`` in OpenDRIVE, tell no class.
     """
     flows_per_h = []
-    if not edge.type:
+    if "." not in edge.type:
         flows_per_h.append(LANE_FLOW_PER_H[_class_by_speed(edge)])
     for part in edge.type.split("|"):
         if part.startswith("highway."):
