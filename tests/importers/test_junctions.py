@@ -28,7 +28,8 @@ def test_flows_equal_hand_computed_balance() -> None:
     ("kind", "per_lane_h"),
     [
         ("highway.secondary", 200), ("highway.primary_link", 250), ("highway.secondary|railway.tram", 200),
-        ("cycleway.lane|highway.tertiary", 150), ("highway.track", 40), ("railway.tram", 40), ("", 200), ("driving", 200),
+        ("cycleway.lane|highway.tertiary", 150), ("highway.track", 40), ("railway.tram", 40), ("", 200),
+        ("driving", 200),
     ],
 )  # fmt: skip
 def test_road_class_sets_flow_per_lane(kind: str, per_lane_h: float) -> None:
