@@ -24,6 +24,7 @@ def test_table_replaces_what_is_between_the_marks():
 
 
 @pytest.mark.slow
+@pytest.mark.system
 def test_first_scan_of_each_process_takes_longer_than_its_second():
     (times,) = first_scan.measure([first_scan.ROOT], starts=1)
     for process in PROCESSES:

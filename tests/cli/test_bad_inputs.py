@@ -316,7 +316,7 @@ COMMANDS = {
     "unknown verb": (["rum", "x"], r"No such command"),
     "no such folder": (["run", "nowhere"], r"nowhere: no such folder. Give a folder with a scenario.toml"),
     "folder misspelt": (["run", "{mini}i"], r"minii: no such folder. Did you mean .*mini\?"),
-    "--osm missing": (["new", "{out}", "--osm", "x.osm"], r"x.osm: no such file. Give the path of an extract"),
+    "--osm missing": (["new", "{out}", "--osm", "x.osm"], r"x.osm: no such file. Check the path"),
     "--poles without every": (["new", "{out}", "--osm", "x.osm", "--poles", "20m"], r"x.osm: no such file"),
     "--poles= without every": (["new", "{out}", "--osm", "x.osm", "--poles=20", "--walk"], r"x.osm: no such file"),
     "--poles in quotes": (["new", "{out}", "--osm", "x.osm", "--poles", "every 20m"], r"x.osm: no such file"),

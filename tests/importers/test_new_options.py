@@ -13,7 +13,15 @@ from shapely.geometry import LineString, MultiLineString, Point
 from egvs.artefacts import parquet
 from egvs.core.errors import InputError
 from egvs.formats import osm
-from egvs.importers import assumed_traffic, junctions, new_scenario, osm_network, osm_solids, scenario_files
+from egvs.importers import (
+    assumed_traffic,
+    building_heights,
+    junctions,
+    new_scenario,
+    osm_network,
+    osm_solids,
+    scenario_files,
+)
 from egvs.importers.new_scenario import NewScenario
 from egvs.runs import run
 from egvs.scenario import loading
@@ -59,7 +67,8 @@ def write_all_solids(folder: Path, extract: Path) -> None:
     read = osm.read_osm(extract)
     flags = osm_network.netconvert_flags(read, lefthand=False, walk=False)
     _, streets = osm_network.build_network(read, extract, flags)
-    solids, counts = osm_solids.map_solids(read, streets)
+    mapped, counts = osm_solids.map_solids(read, streets)
+    solids = building_heights.heights_from_neighbours(mapped, counts, ())
     text = scenario_files.solids_geojson(solids, counts)
     assert '"way/9"' in text
     (folder / "statics.geojson").write_text(text, encoding="utf-8")

@@ -92,7 +92,7 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
     )
     with files.temporary_folder() as folder:
         write_copy(path, folder / _MAP, copy_options)
-        copied = opendrive.read_opendrive(folder / _MAP)
+        copied = _read_copy(folder / _MAP, path)
         if lefthand and not is_lefthand_map:
             _check_lefthand(road_map, copied, path)
         flags = [*_FLAGS, *(["--lefthand"] if lefthand else []), *([] if reference else [_OWN_FRAME_FLAG])]
@@ -120,6 +120,14 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
     if has_heights:
         notes += _level_notes(text)
     return RoadMap(text, notes=(*notes, *_map_notes(road_map)), has_heights=has_heights)
+
+
+def _read_copy(copy: Path, path: Path) -> OpenDriveMap:
+    """Read the copy of a map; messages name the map."""
+    try:
+        return opendrive.read_opendrive(copy)
+    except InputError as error:
+        raise InputError(error.where.replace(str(copy), str(path)), error.problem, error.hint) from None
 
 
 def is_driving(lane_type: str) -> bool:
