@@ -239,7 +239,7 @@ def detector_cells(name: str, detector: str, frames: int, losses: Sequence[Mount
     )  # fmt: skip
 
 
-def predict_found(path: Path, folder: Path) -> dict[str, FloatArray]:
+def expected_shares(path: Path, folder: Path) -> dict[str, FloatArray]:
     """Run a scenario with several seeds, and return the share of vehicles that each mount should find, (k,) each."""
     scenario = egvs.load(path)
     by_seed = []
@@ -300,9 +300,9 @@ def run_detectors(paths: Sequence[Path], folder: Path, page: Path | None, frames
     """Compare predicted and measured losses at scenarios."""
     for path in paths:
         name = egvs.load(path).name
-        found = predict_found(path, folder)
+        predicted = expected_shares(path, folder)
         detected = measure_ap(path, folder, frames)
-        losses = mount_losses(found, detected.ap)
+        losses = mount_losses(predicted, detected.ap)
         cells = detector_cells(name, DETECTOR, detected.frames, losses)
         if page is not None:
             write_losses(name, losses)

@@ -150,7 +150,7 @@ def test_rejects_invalid_projector(tmp_path: Path, text: str, message: str) -> N
         read_projector(path)
 
 
-def test_projector_beside_the_map_is_used(tmp_path: Path) -> None:
+def test_uses_projector_file_of_the_map(tmp_path: Path) -> None:
     path = square_map((81384.0, 49922.0)).write(tmp_path / "map.osm", frame=TOKYO)
     (tmp_path / "map_projector_info.yaml").write_text("projector_type: MGRS\nmgrs_grid: 54SUE\n", encoding="utf-8")
     np.testing.assert_allclose(xy_m(project(path))[0], [81384.0, 49925.0], atol=1e-3)

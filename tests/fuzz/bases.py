@@ -364,7 +364,7 @@ def lanelets(name: str):
     return make
 
 
-def beside_roads(name: str):
+def with_roads_map(name: str):
     """A map of roads, and beside it a file with a house north-east of the signals, and a lamp or a ground."""
     from tests.formats import small_city_models as models
 

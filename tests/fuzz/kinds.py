@@ -92,7 +92,7 @@ def _beside(name: str, reads: Meaning) -> Kind:
     """A map of what stands beside roads, or of their ground, which becomes part of a scenario."""
     made = ("made/network.net.xml", "made/sites.csv", "made/statics.geojson", "made/*.ply")
     verb = ("new", "made", "--from", "map.osm", name)
-    return Kind(f"new {name}", name, bases.beside_roads(name), reads, verb=verb, results=made)
+    return Kind(f"new {name}", name, bases.with_roads_map(name), reads, verb=verb, results=made)
 
 
 def _city(name: str, file: str, reads: Meaning) -> Kind:

@@ -119,7 +119,7 @@ def test_objects_in_the_space_of_vehicles_are_named() -> None:
     assert names == ["on the lane", "edge"]
 
 
-def test_thin_wall_on_the_lane_is_found() -> None:
+def test_reports_thin_wall_on_a_lane() -> None:
     wall = np.array([[10.0, -1, 0], [10, 1, 0], [10, 0, 3]])
     mesh = MappedMesh("wall", "furniture", wall, np.array([[0, 1, 2]]), False)
     lane = shapely.box(0, -2, 100, 2)

@@ -208,8 +208,6 @@ def test_kinds_of_objects(tmp_path: Path) -> None:
     assert kinds == {"b": "bridge", "f": "furniture", "t": "vegetation", "q": "vegetation"}
     assert [(item.name, item.kind, item.height_m) for item in result.solids] == [("p", "vegetation", 1.5)]
     assert result.counts.not_modelled == {"Road": 1, "LandUse": 1}
-    roads = citygml.read_road_surfaces([path], CONTEXT)
-    assert [(mesh.name, mesh.kind) for mesh in roads.meshes] == [("r", "ground")]
 
 
 def test_open_buildings_are_named_and_degenerate_rings_counted(tmp_path: Path) -> None:

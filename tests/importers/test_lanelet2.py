@@ -266,7 +266,7 @@ def test_kerb_lane_is_lane_0_on_both_sides(tmp_path: Path) -> None:
         assert len(built.network.edges) == 2
 
 
-def test_heights_are_kept_and_bridges_are_no_junctions(tmp_path: Path) -> None:
+def test_preserves_heights_and_makes_no_junctions_of_bridges(tmp_path: Path) -> None:
     writer = MapWriter()
 
     def straight(points: list[tuple[float, float, float]], aside: tuple[float, float]) -> int:

@@ -23,7 +23,7 @@ def test_finds_readers_by_name_and_content(tmp_path: Path) -> None:
     assert map_readers.find_reader(SMALL) is openstreetmap
 
 
-def test_openstreetmap_beside_another_road_map_has_static_objects_only() -> None:
+def test_openstreetmap_with_another_road_map_has_static_objects_only() -> None:
     maps = map_readers.open_maps([SMALL, NETWORK])
     assert maps.roads.path == NETWORK
     assert [file.path for file in maps.solids] == [SMALL]

@@ -208,7 +208,7 @@ def test_roads_buildings_and_sites_follow_a_terrain(tmp_path: Path) -> None:
             assert float(row["ground_m"]) == pytest.approx(expected_m, abs=0.08)
 
 
-def test_openstreetmap_beside_roads_without_a_reference_system_is_rejected(tmp_path: Path) -> None:
+def test_rejects_openstreetmap_with_roads_without_reference_system(tmp_path: Path) -> None:
     small = Path(__file__).parent / "data" / "small.osm"
     with pytest.raises(InputError, match="no reference system"):
         create_scenario(tmp_path / "made", [ROUNDABOUT, small])

@@ -68,7 +68,7 @@ def lanes(roads: Network) -> dict[str, network.Lane]:
     return {f"{edge.id}_{index}": lane for edge in roads.edges for index, lane in enumerate(edge.lanes)}
 
 
-def test_is_found_by_name_or_root_element() -> None:
+def test_recognises_name_and_root_element() -> None:
     assert isinstance(opendrive, RoadReader) and opendrive.NAME == "OpenDRIVE"
     for name in ("a.xodr", "a.XODR.gz"):
         assert opendrive.can_open(Path(name), b"")
@@ -121,7 +121,7 @@ def test_patch_removes_connections(tmp_path: Path) -> None:
     assert turns(patched) == {("-1", 1, "-2", 0)} == turns(roads) - {("-1", 0, "-2", 0)}
 
 
-def test_connections_that_contradict_the_map_are_found(tmp_path: Path) -> None:
+def test_reports_connections_that_contradict_the_map(tmp_path: Path) -> None:
     """Lane -1 leads to lane -2 in the map, but to lane -1 in the network."""
     network_text = (
         '<net><location netOffset="0,0"/>{}<connection from="-1" to="-2" fromLane="0" toLane="0" dir="s"/>'
@@ -173,7 +173,7 @@ def test_roundabout_turns_one_way(tmp_path: Path) -> None:
 
 
 @pytest.mark.system
-def test_elevation_is_kept_and_superelevation_reported(tmp_path: Path) -> None:
+def test_preserves_elevation_and_reports_superelevation(tmp_path: Path) -> None:
     road_map, roads = convert(tmp_path, maps.hill())
     assert road_map.has_heights
     assert lanes(roads)["-2_0"].shape_m.tolist() == [[100, -1.75, 6], [200, -1.75, 10]]

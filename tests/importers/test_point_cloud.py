@@ -214,7 +214,7 @@ REAL = Path(__file__).parents[3] / "shared" / "real" / "chengdu" / "sweep.pcd.gz
 
 @pytest.mark.slow
 @pytest.mark.skipif(not REAL.is_file(), reason="chengdu/sweep.pcd.gz is not beside the checkout (shared/real)")
-def test_real_sweep_beside_a_freeway() -> None:
+def test_real_sweep_next_to_a_freeway() -> None:
     """144,000 rows, 48,974 with nan (``zgrep -c nan``); a carriageway 3.7 m below the sensor, other ground 6 to 8 m."""
     result = point_cloud.read_solids([REAL], MapContext(None, box(-60, -60, 60, 60), SAME_FRAME))
     assert result.notes[0].startswith("144,000 points read from 1 scan: ")

@@ -353,7 +353,7 @@ def _junction_at(streets: Streets, lat_deg: float, lon_deg: float, where: str) -
 
 
 def _nearest_junction(streets: Streets, lat_deg: float, lon_deg: float) -> NearbyJunction | None:
-    """Return the junction of three or more streets that is nearest; None if there is none, or no such position."""
+    """Return the nearest junction of three or more streets; None without one, or for an impossible position."""
     x_m, y_m = streets.to_xy([lon_deg], [lat_deg])[0]
     if not math.isfinite(x_m + y_m):
         return None

@@ -200,7 +200,7 @@ class SurfaceParser:
         self.tags.pop()
 
     def srs_name(self) -> str:
-        """Return the name of the reference system that applies here; empty if there is none."""
+        """Return the name of the reference system that applies here; empty if it is not stated."""
         for _, srs_name, _ in reversed(self._declared):
             if srs_name is not None:
                 return srs_name
@@ -267,7 +267,7 @@ class SurfaceParser:
 
 
 def _attribute(attributes: Mapping[str, str], name: str) -> str:
-    """Return an attribute by its name without prefix; empty if there is none."""
+    """Return an attribute by its name without prefix; empty if it is absent."""
     for key, value in attributes.items():
         if local_name(key) == name:
             return value

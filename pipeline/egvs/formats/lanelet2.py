@@ -147,7 +147,7 @@ def read_lanelet2(path: Path) -> LaneletMap:
     Raises
     ------
     InputError
-        When the file is missing, damaged or incomplete, declares entities, has a number that is none, or has no
+        When the file is missing, damaged or incomplete, declares entities, has an invalid number, or has no
         lanelets. The message names the object.
     """
     if not path.is_file():

@@ -44,7 +44,7 @@ def parse_tile_name(name: str) -> TileName | None:
 
 
 def grid_square(code: str) -> Square | None:
-    """Return the square of a code; None if there is no such code.
+    """Return the square of a code; None if the code is invalid.
 
     Examples
     --------

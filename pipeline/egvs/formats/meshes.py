@@ -21,7 +21,7 @@ import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import unquote
 
 import numpy as np
@@ -279,6 +279,60 @@ class _LogCollector(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         self.messages.append(record.getMessage())
+
+
+def load_clean_mesh(path: Path, most_m: float) -> tuple[trimesh.Trimesh, int]:
+    """Load a mesh, with equal vertices merged and without triangles that have no area or occur twice.
+
+    Parameters
+    ----------
+    path
+        The file.
+    most_m
+        Largest coordinate.
+
+    Returns
+    -------
+    mesh : trimesh.Trimesh
+        With at least one triangle.
+    dropped : int
+        Number of triangles left out.
+
+    Raises
+    ------
+    InputError
+        When the file is damaged, a coordinate is not finite or too large, or no triangle is left.
+    """
+    mesh = load_mesh(path, str(path))
+    far = np.flatnonzero(~(np.abs(mesh.vertices) <= most_m).all(axis=1))
+    if len(far):
+        expected = f"expected finite coordinates, at most {most_m:g} m"
+        raise InputError(f"{path}: vertex {far[0]}", f"{expected}, got {mesh.vertices[far[0]].tolist()}")
+    triangles = len(mesh.faces)
+    with translate_errors(path, MESH_HINT, "cannot be divided into pieces"):
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
+        mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
+    if len(mesh.faces) == 0:
+        raise InputError(path, f"expected a triangle mesh, got {triangles} triangles without area")
+    return mesh, triangles - len(mesh.faces)
+
+
+class MeshPieces(NamedTuple):
+    """Triangles of a mesh: of each closed component by its number, and of all others together, (n,) int64 each."""
+
+    closed: dict[int, IntArray]
+    open: IntArray
+
+
+def divide_mesh(mesh: trimesh.Trimesh) -> MeshPieces:
+    """Divide a mesh into its closed components and the rest."""
+    faces = np.asarray(mesh.faces, dtype=np.int64)
+    component = mesh_components(mesh.face_adjacency, len(faces))
+    is_closed = are_closed(faces, component)
+    order = np.argsort(component, kind="stable")
+    by_component = np.split(order, np.cumsum(np.bincount(component))[:-1])
+    closed = {number: by_component[number] for number in np.flatnonzero(is_closed).tolist()}
+    return MeshPieces(closed, order[~is_closed[component[order]]])
 
 
 def mesh_components(adjacent: IntArray, triangles: int) -> IntArray:

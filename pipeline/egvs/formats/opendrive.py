@@ -295,7 +295,7 @@ class OpenDriveMap:
 
 
 def evaluate(cubics: Sequence[Cubic], s_m: FloatArray) -> FloatArray:
-    """Return the values (n,) of polynomials at distances (n,): 0 where there is none.
+    """Return the values (n,) of polynomials at distances (n,); 0 before the first polynomial.
 
     >>> evaluate([Cubic(0, 1, 0, 0, 0), Cubic(10, 1, 0.5, 0, 0)], np.array([5.0, 12.0])).tolist()
     [1.0, 2.0]

@@ -63,12 +63,6 @@ class HeightGrid:
     transform: tuple[float, float, float, float, float, float]
     crs: str | None
 
-    @property
-    def cell_size(self) -> float:
-        """Side of a cell, in the units of x and y: the root of its area."""
-        a, b, _, d, e, _ = self.transform
-        return math.sqrt(abs(a * e - b * d))
-
     def height_m(self, xy: FloatArray) -> FloatArray:
         """Return heights (n,) at points (n, 2) of the grid's system; NaN where unknown."""
         rows, columns = self.heights_m.shape
@@ -335,7 +329,7 @@ def _parse_number(text: bytes, where: str) -> float:
 
 
 def _crs_beside(path: Path) -> str | None:
-    """Return the reference system in the ``.prj`` file beside a grid; None if there is none."""
+    """Return the reference system in the ``.prj`` file beside a grid; None without such a file."""
     name = path.name.removesuffix(".gz").rpartition(".")[0] or path.name
     beside = path.with_name(f"{name}.prj")
     if not beside.is_file():

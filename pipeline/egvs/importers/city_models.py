@@ -42,9 +42,6 @@ SOLID_KINDS: Mapping[str, str] = {
 }
 """Kinds of objects that stand in the way of beams, by their type in CityGML."""
 
-ROAD_KINDS: Mapping[str, str] = dict.fromkeys(("Road", "Railway", "Square", "Track", "TransportationComplex"), "ground")
-"""Surfaces that vehicles drive on. They are no solids: the ground of the network is there already."""
-
 _EARTH_AXIS_M, _EARTH_ECCENTRICITY_2 = 6_378_137.0, 0.006_694_380_022_90
 """Half axis and squared eccentricity of the ellipsoid GRS 80."""
 

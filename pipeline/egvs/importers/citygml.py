@@ -17,7 +17,7 @@ from egvs.core import limits
 from egvs.formats import citygml
 from egvs.formats.citygml import CityGmlFile
 from egvs.formats.mesh_codes import TileName, parse_tile_name
-from egvs.importers.city_models import ROAD_KINDS, SOLID_KINDS, collect_solids
+from egvs.importers.city_models import SOLID_KINDS, collect_solids
 from egvs.importers.map_parts import MapContext, SolidMap
 
 NAME = "CityGML"
@@ -47,17 +47,6 @@ def read_solids(paths: Sequence[Path], context: MapContext) -> SolidMap:
     files = _expand_folders(paths)
     opened = [path for path in files if _is_needed(path, context, TILE_KINDS)]
     result = collect_solids((CityGmlFile(path, SOLID_KINDS) for path in opened), context, SOLID_KINDS)
-    return _with_skipped_files(result, len(files), len(opened))
-
-
-def read_road_surfaces(paths: Sequence[Path], context: MapContext) -> SolidMap:
-    """Return the surfaces of roads, railways and squares in the window, as meshes of the kind ``ground``.
-
-    They tell the height of the ground; as solids they would fill the lowest voxels.
-    """
-    files = _expand_folders(paths)
-    opened = [path for path in files if _is_needed(path, context, frozenset({"tran", "squr", "rwy", "trk"}))]
-    result = collect_solids((CityGmlFile(path, ROAD_KINDS) for path in opened), context, ROAD_KINDS)
     return _with_skipped_files(result, len(files), len(opened))
 
 

@@ -75,7 +75,7 @@ def find_zero(roads: RoadSource, file: MapFile, junction: StreetJunction, terrai
     junction
         z = 0 is its ground, unless the road map is a SUMO network, whose heights are used as they are.
     terrain
-        The ground; None if there is none.
+        The ground; None without a terrain.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def lay_on_ground(
     junction
         The junction.
     terrain
-        The ground; None if there is none.
+        The ground; None without a terrain.
 
     Raises
     ------

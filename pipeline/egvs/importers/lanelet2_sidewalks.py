@@ -50,7 +50,7 @@ def crossing_elements(
     signals
         The traffic lights, which govern the crossings at their nodes.
     network
-        A network built with these crossings without their lines; None while there is none.
+        A network built with these crossings without their lines; None for the first build.
     """
     built_m = {} if network is None else crossing_lines_m(network)
     numbers = dict(signals.crosswalk_index)

@@ -17,9 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import shapely
 
-from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.core.reading import translate_errors
 from egvs.formats import meshes
 from egvs.importers.map_parts import MapContext, MappedMesh, SolidMap
 from egvs.importers.osm_solids import OUT_OF_RANGE, ImportCounts
@@ -54,27 +52,11 @@ def read_solids(paths: Sequence[Path], context: MapContext) -> SolidMap:
     notes = []
     mapped: list[MappedMesh] = []
     for path in paths:
-        mesh = _load(path)
+        mesh, _ = meshes.load_clean_mesh(path, MAX_COORDINATE_M)
         if path.suffix.lower() in _Y_UP:
             notes.append(f"{path.name}: its y axis is taken as up, as glTF defines it.")
         mapped += _pieces(mesh, _to_world(mesh, path, context), path.stem, context, counts)
     return SolidMap(meshes=tuple(_number_equal_names(mapped)), counts=counts, notes=tuple(notes))
-
-
-def _load(path: Path) -> trimesh.Trimesh:
-    """Return a mesh with equal vertices merged and triangles without area left out."""
-    mesh = meshes.load_mesh(path, str(path))
-    far = np.flatnonzero(~(np.abs(mesh.vertices) <= MAX_COORDINATE_M).all(axis=1))
-    if len(far):
-        expected = f"expected finite coordinates, at most {MAX_COORDINATE_M:g} m"
-        raise InputError(f"{path}: vertex {far[0]}", f"{expected}, got {mesh.vertices[far[0]].tolist()}")
-    triangles = len(mesh.faces)
-    with translate_errors(path, meshes.MESH_HINT, "cannot be divided into pieces"):
-        mesh.merge_vertices(merge_tex=True, merge_norm=True)
-        mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
-    if len(mesh.faces) == 0:
-        raise InputError(path, f"expected a triangle mesh, got {triangles} triangles without area", meshes.MESH_HINT)
-    return mesh
 
 
 def _to_world(mesh: trimesh.Trimesh, path: Path, context: MapContext) -> FloatArray:
@@ -90,14 +72,10 @@ def _pieces(
 ) -> Iterator[MappedMesh]:
     """Yield the closed pieces of a mesh in the window, then the rest."""
     faces = np.asarray(mesh.faces, dtype=np.int64)
-    piece = meshes.mesh_components(mesh.face_adjacency, len(faces))
-    is_closed = meshes.are_closed(faces, piece)
-    order = np.argsort(piece, kind="stable")
-    by_piece = np.split(order, np.cumsum(np.bincount(piece))[:-1])
-    parts = [(f"{stem}_{number}", by_piece[number], True) for number in np.flatnonzero(is_closed).tolist()]
-    rest = order[~is_closed[piece[order]]]
-    if len(rest):
-        parts.append((f"{stem}_surface", rest, False))
+    pieces = meshes.divide_mesh(mesh)
+    parts = [(f"{stem}_{number}", triangles, True) for number, triangles in pieces.closed.items()]
+    if len(pieces.open):
+        parts.append((f"{stem}_surface", pieces.open, False))
     for name, triangles, closed in parts:
         used, corners = np.unique(faces[triangles], return_inverse=True)
         low, high = vertices_m[used, :2].min(axis=0), vertices_m[used, :2].max(axis=0)

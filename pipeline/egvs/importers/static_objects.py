@@ -180,7 +180,7 @@ def unseen_shares(maps: Sequence[ReadMap], sites_m: FloatArray, roi: Roi) -> Flo
 
 
 def ground_mesh(maps: Sequence[ReadMap]) -> MappedMesh | None:
-    """Return the ground that a map has measured, as a point cloud does; None if there is none."""
+    """Return the ground of a point cloud; None without a point cloud."""
     meshes = (mesh for read in maps for mesh in read.objects.meshes)
     return next((mesh for mesh in meshes if mesh.kind == GROUND), None)
 

@@ -18,12 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from egvs.core.errors import WARNINGS_KEY, Diagnostic, InputError
+from egvs.core.errors import WARNINGS_KEY, Diagnostic
 from egvs.core.progress import ProgressCallback, no_progress
-from egvs.core.reading import translate_errors
 from egvs.formats import meshes
 from egvs.formats.georeference import Georeference
-from egvs.formats.meshes import are_closed, mesh_components
 from egvs.scenario.fields import MAX_COORDINATE_M
 from egvs.scenario.model import MeshConfig, Scenario
 from egvs.world import geolocation
@@ -148,32 +146,18 @@ def _extrude(footprint: Footprint) -> tuple[Floats, NDArray[np.int64]]:
 
 def _add_mesh(builder: _Builder, path: Path, config: MeshConfig, world: Georeference) -> None:
     """Add each closed piece of a mesh as a solid, so that sites inside are detected; the rest is one open surface."""
-    mesh = meshes.load_mesh(path, str(path))
-    far = np.flatnonzero(~(np.abs(mesh.vertices) <= MAX_COORDINATE_M).all(axis=1))
-    if len(far):
-        expected = f"expected finite coordinates, at most {MAX_COORDINATE_M:g} m"
-        raise InputError(f"{path}: vertex {far[0]}", f"{expected}, got {mesh.vertices[far[0]].tolist()}")
-    faces = len(mesh.faces)
-    with translate_errors(path, meshes.MESH_HINT, "cannot be divided into pieces"):
-        mesh.merge_vertices(merge_tex=True, merge_norm=True)
-        mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
-    if len(mesh.faces) == 0:
-        raise InputError(path, f"expected a triangle mesh, got {faces} triangles without area")
-    if faces > len(mesh.faces):
-        builder.counts.repaired["degenerate or doubled triangles dropped"] += faces - len(mesh.faces)
+    mesh, dropped = meshes.load_clean_mesh(path, MAX_COORDINATE_M)
+    if dropped:
+        builder.counts.repaired["degenerate or doubled triangles dropped"] += dropped
 
     triangles = np.asarray(mesh.faces, dtype=np.int64)
     vertices_m = _to_world(mesh.vertices, config, path, world)
-    piece = mesh_components(mesh.face_adjacency, len(triangles))
-    is_closed = are_closed(triangles, piece)
-    order = np.argsort(piece, kind="stable")
-    by_piece = np.split(order, np.cumsum(np.bincount(piece))[:-1])
-    for number in np.flatnonzero(is_closed).tolist():
-        used, corners = np.unique(triangles[by_piece[number]], return_inverse=True)
+    pieces = meshes.divide_mesh(mesh)
+    for number, piece in pieces.closed.items():
+        used, corners = np.unique(triangles[piece], return_inverse=True)
         builder.add(vertices_m[used], corners.reshape(-1, 3), f"{path.stem}_{number}", config.kind)
-    rest = order[~is_closed[piece[order]]]
-    if len(rest):
-        builder.add(vertices_m, triangles[rest], f"{path.stem}_surface", config.kind, " (open surface)")
+    if len(pieces.open):
+        builder.add(vertices_m, triangles[pieces.open], f"{path.stem}_surface", config.kind, " (open surface)")
 
 
 def _to_world(vertices_m: Floats, config: MeshConfig, path: Path, world: Georeference) -> Floats:
