@@ -165,8 +165,12 @@ def test_failed_simulation_cancels_tasks_and_leaves_nothing(
 ) -> None:
     """One worker may work beside SUMO: the second task is waiting when the simulation fails."""
 
+    def tasks_at_workers() -> int:
+        return sum(client.run(count_tasks).values())
+
     def fail() -> None:
         _is_running.wait(60)
+        wait_until(lambda: tasks_at_workers() == 2)
         raise RunError("SUMO has failed")
 
     monkeypatch.setattr(tasks, "prepare_scene", wait_for_release)
@@ -175,7 +179,7 @@ def test_failed_simulation_cancels_tasks_and_leaves_nothing(
     try:
         with pytest.raises(RunError, match="SUMO has failed"):
             city_run.run_city(city, tmp_path / "out")
-        wait_until(lambda: sum(client.run(count_tasks).values()) == 1)  # workers hear of it later
+        wait_until(lambda: tasks_at_workers() == 1)  # workers hear of it later
     finally:
         _release.set()
     assert client.submit(len, _started, pure=False, workers=[*client.scheduler_info()["workers"]]).result() == 1
