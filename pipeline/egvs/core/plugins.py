@@ -37,6 +37,10 @@ _REQUIREMENTS = {
         ("NAME", "can_open"),
         "a module with NAME, can_open and read_roads, read_solids or read_terrain, see egvs.importers.map_parts",
     ),
+    "egvs.tracks": (
+        ("NAME", "can_open", "companions", "read"),
+        "a module with NAME, can_open, companions and read, see egvs.tracks.model",
+    ),
     "egvs.point_clouds": (("read",), "a module or an object with a function read"),
 }
 """Required attributes of the objects of each group, and a description for messages."""
