@@ -49,7 +49,9 @@ class Coverage:
     is_given
         Whether the user stated it.
     share
-        Share of the region of interest, seen from above.
+        Share of the lanes in the region of interest; without a network, of its area.
+    of_lanes
+        Whether ``share`` is that of the lanes.
     hidden_ends, ends
         How many tracks begin or end well inside, and how many ends there are; 0 if the area is given.
     """
@@ -57,27 +59,34 @@ class Coverage:
     area: BaseGeometry
     is_given: bool
     share: float
+    of_lanes: bool
     hidden_ends: int = 0
     ends: int = 0
 
-    def contains(self, x_m: FloatArray, y_m: FloatArray) -> NDArray[np.bool_]:
-        """Return whether points are inside, (n,)."""
-        shapely.prepare(self.area)
-        inside: NDArray[np.bool_] = shapely.intersects_xy(self.area, x_m, y_m)
-        return inside
+    def contains(self, xy_m: FloatArray) -> NDArray[np.bool_]:
+        """Return whether points (n, 2) are inside, (n,)."""
+        return _contains(self.area, xy_m)
 
     def to_json(self) -> dict[str, Any]:
         """Return plain JSON."""
-        values = {"source": "given" if self.is_given else "estimated", "share_of_region": round(self.share, 4)}
+        values = {
+            "source": "given" if self.is_given else "estimated",
+            "share": round(self.share, 4),
+            "of": self._of_what,
+        }
         if self.ends:
             values |= {"hidden_ends": self.hidden_ends, "ends": self.ends}
         return values
+
+    @property
+    def _of_what(self) -> str:
+        return "lanes in the region of interest" if self.of_lanes else "area of the region of interest"
 
     def warnings(self, where: str) -> Iterator[Diagnostic]:
         """Warn about a small coverage, and about tracks that begin or end inside it."""
         if self.share < MIN_SHARE:
             kind = "the given coverage is" if self.is_given else "recorded positions cover about"
-            problem = f"{kind} {self.share:.0%} of the region of interest; elsewhere the traffic is unknown"
+            problem = f"{kind} {self.share:.0%} of the {self._of_what}; elsewhere the traffic is unknown"
             yield Diagnostic("coverage", where, problem, "Make the region smaller, or use more recordings.")
         if self.hidden_ends > MAX_HIDDEN_SHARE * max(self.ends, 1):
             problem = (
@@ -87,7 +96,7 @@ class Coverage:
             yield Diagnostic("coverage", where, problem, "State what the recording could see in traffic.coverage.")
 
 
-def estimate(tracks: CleanTracks, region: Roi) -> Coverage:
+def estimate(tracks: CleanTracks, region: Roi, lanes_m: FloatArray) -> Coverage:
     """Estimate the coverage of a recording from its positions.
 
     Parameters
@@ -96,6 +105,8 @@ def estimate(tracks: CleanTracks, region: Roi) -> Coverage:
         The tracks, in the world frame.
     region
         The region of interest.
+    lanes_m
+        Points of equal spacing on the lanes there, (n, 2); none without a network.
     """
     xy_m = np.column_stack([tracks.x_m, tracks.y_m])
     step = -(-len(xy_m) // _MAX_POINTS)
@@ -112,10 +123,10 @@ def estimate(tracks: CleanTracks, region: Roi) -> Coverage:
     ends_m = np.concatenate([xy_m[is_first], xy_m[is_last]])
     points = shapely.points(ends_m)
     hidden = shapely.contains(area, points) & (shapely.distance(shapely.boundary(area), points) > INSIDE_M)
-    return Coverage(area, False, _share(area, region), int(hidden.sum()), len(ends_m))
+    return Coverage(area, False, _share(area, region, lanes_m), len(lanes_m) > 0, int(hidden.sum()), len(ends_m))
 
 
-def read(path: Path, world: Georeference, region: Roi) -> Coverage:
+def read(path: Path, world: Georeference, region: Roi, lanes_m: FloatArray) -> Coverage:
     """Read a coverage from GeoJSON.
 
     Parameters
@@ -124,8 +135,8 @@ def read(path: Path, world: Georeference, region: Roi) -> Coverage:
         A file with polygons.
     world
         The world frame.
-    region
-        The region of interest.
+    region, lanes_m
+        As for :func:`estimate`.
 
     Raises
     ------
@@ -147,13 +158,20 @@ def read(path: Path, world: Georeference, region: Roi) -> Coverage:
     area = shapely.transform(shapely.unary_union(areas), coordinates.to_world)
     if area.is_empty or area.area == 0 or not area.is_valid:
         raise InputError(where, "contains no valid polygon", hint)
-    share = _share(area, region)
-    if share == 0:
+    if _share(area, region, np.empty((0, 2))) == 0:
         raise InputError(where, "covers no part of the region of interest", "Check its coordinates.")
-    return Coverage(area, True, share)
+    return Coverage(area, True, _share(area, region, lanes_m), len(lanes_m) > 0)
 
 
-def _share(area: BaseGeometry, region: Roi) -> float:
+def _contains(area: BaseGeometry, xy_m: FloatArray) -> NDArray[np.bool_]:
+    shapely.prepare(area)
+    inside: NDArray[np.bool_] = shapely.intersects_xy(area, xy_m[:, 0], xy_m[:, 1])
+    return inside
+
+
+def _share(area: BaseGeometry, region: Roi, lanes_m: FloatArray) -> float:
+    if len(lanes_m):
+        return float(_contains(area, lanes_m).mean())
     (x_m, y_m), (width_m, depth_m) = region.origin_m[:2], region.size_m[:2]
     box = shapely.box(x_m, y_m, x_m + width_m, y_m + depth_m)
     return float(shapely.intersection(box, area).area / box.area)

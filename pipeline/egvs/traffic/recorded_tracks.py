@@ -29,8 +29,9 @@ from egvs.tracks.coverage import Coverage
 from egvs.tracks.model import TrackFrame, Tracks
 from egvs.tracks.resampling import ResampledTracks
 from egvs.tracks.sizes import class_sizes
-from egvs.traffic import sumo_folder
+from egvs.traffic import sumo_folder, track_alignment
 from egvs.traffic.fcd import FCD_SCHEMA, FrameWindow
+from egvs.traffic.track_alignment import Alignment
 from egvs.traffic.vehicle_boxes import VehicleSize
 
 FRAMES_EACH = 4096
@@ -38,6 +39,9 @@ FRAMES_EACH = 4096
 
 MAX_UNCERTAIN_SHARE = 0.05
 """Share of rows or tracks from which on something in them gets a warning."""
+
+MOTOR_CLASSES = frozenset(("car", "van", "truck", "bus"))
+"""Classes that should be on lanes for cars."""
 
 _SIZE_DIGITS = 2
 """Sizes are rounded to centimetres, so that tracks of one size share a vehicle type."""
@@ -59,6 +63,8 @@ class RecordedTracks:
         Sentences of the readers.
     outside
         Number of boxes outside the coverage, which are left out.
+    alignment
+        How well they fit the lanes; None without a network.
     """
 
     window: FrameWindow
@@ -67,6 +73,7 @@ class RecordedTracks:
     coverage: Coverage
     sources: tuple[str, ...]
     outside: int
+    alignment: Alignment | None
 
     @property
     def type_names(self) -> list[str]:
@@ -115,9 +122,12 @@ class RecordedTracks:
     def summary(self) -> dict[str, Any]:
         """Return what was read, changed and left out, as JSON."""
         report = self.tracks.report.to_json() | self.boxes.report()
-        return {**report, "outside_coverage": self.outside, "coverage": self.coverage.to_json()} | (
-            {"sources": list(self.sources)} if self.sources else {}
-        )
+        values = {**report, "outside_coverage": self.outside, "coverage": self.coverage.to_json()}
+        if self.alignment is not None:
+            values["alignment"] = self.alignment.to_json()
+        if self.sources:
+            values["sources"] = list(self.sources)
+        return values
 
 
 def track_files(scenario: Scenario) -> list[Path]:
@@ -148,16 +158,25 @@ def read_recorded_tracks(scenario: Scenario, world: Georeference) -> RecordedTra
     cleaned = cleaning.clean_tracks(tracks, class_sizes(scenario.traffic))
     first_s = float(tracks.time_s.min()) + window.skip_ms / 1000.0
     boxes = resampling.resample(cleaned, first_s, window.period_ms / 1000.0, window.count, scenario.traffic.track_gap_s)
-    region = scenario.roi.box
+    roads = sumo_folder.read_network(scenario)
+    lanes_m = np.empty((0, 2)) if roads is None else track_alignment.lane_points(roads, scenario.roi.box)
     if scenario.traffic.coverage is None:
-        area = coverage.estimate(cleaned, region)
-        return RecordedTracks(replace(window, skip_ms=0), cleaned, boxes, area, sources, 0)
-    path = scenario.find(scenario.traffic.coverage, "traffic.coverage")
-    area = coverage.read(path, world, region)
-    inside = area.contains(boxes.x_m, boxes.y_m)
-    return RecordedTracks(
-        replace(window, skip_ms=0), cleaned, boxes.select(inside), area, sources, int((~inside).sum())
-    )
+        area = coverage.estimate(cleaned, scenario.roi.box, lanes_m)
+        inside = np.ones(boxes.frame.size, dtype=bool)
+    else:
+        path = scenario.find(scenario.traffic.coverage, "traffic.coverage")
+        area = coverage.read(path, world, scenario.roi.box, lanes_m)
+        inside = area.contains(np.column_stack([boxes.x_m, boxes.y_m]))
+        boxes = boxes.select(inside)
+    alignment = None if roads is None else track_alignment.align(_moving_vehicles(cleaned, boxes), roads)
+    return RecordedTracks(replace(window, skip_ms=0), cleaned, boxes, area, sources, int((~inside).sum()), alignment)
+
+
+def _moving_vehicles(tracks: CleanTracks, boxes: ResampledTracks) -> FloatArray:
+    """Return the positions of motor vehicles that move, (n, 2)."""
+    is_motor = np.array([name in MOTOR_CLASSES for name in tracks.classes])
+    moves = is_motor[boxes.track] & (boxes.speed_m_s > cleaning.MOVING_M_S)
+    return np.column_stack([boxes.x_m[moves], boxes.y_m[moves]])
 
 
 def tracks_window(scenario: Scenario) -> FrameWindow:
@@ -204,6 +223,8 @@ def track_warnings(recorded: RecordedTracks, where: str) -> Iterator[Diagnostic]
         )
         yield Diagnostic("track gaps", where, problem, "Raise track_gap_s if straight lines are good enough.")
     yield from recorded.coverage.warnings(where)
+    if recorded.alignment is not None:
+        yield from recorded.alignment.warnings(where)
 
 
 def _named_files(scenario: Scenario) -> list[Path]:
