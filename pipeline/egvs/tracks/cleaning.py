@@ -102,6 +102,8 @@ class CleanTracks:
         Of each row, (n,).
     report
         What was changed.
+    sources
+        Sentences of the readers.
     """
 
     names: tuple[str, ...]
@@ -114,6 +116,7 @@ class CleanTracks:
     y_m: FloatArray
     yaw_rad: FloatArray
     report: CleaningReport
+    sources: tuple[str, ...] = ()
 
 
 def clean_tracks(tracks: Tracks, sizes: Mapping[str, ClassSize]) -> CleanTracks:
@@ -140,7 +143,7 @@ def clean_tracks(tracks: Tracks, sizes: Mapping[str, ClassSize]) -> CleanTracks:
     yaw_rad = _headings(tracks, part, report)
     return CleanTracks(
         tracks.names, tracks.classes, size_m, tracks.track, part, tracks.time_s, tracks.x_m, tracks.y_m, yaw_rad,
-        report,
+        report, tracks.sources,
     )  # fmt: skip
 
 

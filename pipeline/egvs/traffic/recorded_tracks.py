@@ -10,7 +10,7 @@ Tracks stand on the ground: heights of a recording are not used, because its zer
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -59,8 +59,6 @@ class RecordedTracks:
         The cleaned rows, and the boxes.
     coverage
         What the recording could see.
-    sources
-        Sentences of the readers.
     outside
         Number of boxes outside the coverage, which are left out.
     alignment
@@ -71,7 +69,6 @@ class RecordedTracks:
     tracks: CleanTracks
     boxes: ResampledTracks
     coverage: Coverage
-    sources: tuple[str, ...]
     outside: int
     alignment: Alignment | None
 
@@ -125,8 +122,8 @@ class RecordedTracks:
         values = {**report, "outside_coverage": self.outside, "coverage": self.coverage.to_json()}
         if self.alignment is not None:
             values["alignment"] = self.alignment.to_json()
-        if self.sources:
-            values["sources"] = list(self.sources)
+        if self.tracks.sources:
+            values["sources"] = list(self.tracks.sources)
         return values
 
 
@@ -153,7 +150,7 @@ def read_recorded_tracks(scenario: Scenario, world: Georeference) -> RecordedTra
     InputError
         When a file is damaged, far from the region of interest, or shorter than the requested frames.
     """
-    tracks, sources = _read_tracks(scenario, world)
+    tracks = read_in_world_frame(_named_files(scenario), world, scenario.traffic.track_crs)
     window = _window(scenario, tracks)
     cleaned = cleaning.clean_tracks(tracks, class_sizes(scenario.traffic))
     first_s = float(tracks.time_s.min()) + window.skip_ms / 1000.0
@@ -169,7 +166,7 @@ def read_recorded_tracks(scenario: Scenario, world: Georeference) -> RecordedTra
         inside = area.contains(np.column_stack([boxes.x_m, boxes.y_m]))
         boxes = boxes.select(inside)
     alignment = None if roads is None else track_alignment.align(_moving_vehicles(cleaned, boxes), roads)
-    return RecordedTracks(replace(window, skip_ms=0), cleaned, boxes, area, sources, int((~inside).sum()), alignment)
+    return RecordedTracks(replace(window, skip_ms=0), cleaned, boxes, area, int((~inside).sum()), alignment)
 
 
 def _moving_vehicles(tracks: CleanTracks, boxes: ResampledTracks) -> FloatArray:
@@ -181,7 +178,7 @@ def _moving_vehicles(tracks: CleanTracks, boxes: ResampledTracks) -> FloatArray:
 
 def tracks_window(scenario: Scenario) -> FrameWindow:
     """Return the frames of a scenario with tracks; InputError if a file is damaged or too short."""
-    recorded = [_read_file(path, path.stat().st_mtime_ns) for path in _named_files(scenario)]
+    recorded = [read_file(path) for path in _named_files(scenario)]
     return _window(scenario, _concatenate(recorded))
 
 
@@ -231,6 +228,11 @@ def _named_files(scenario: Scenario) -> list[Path]:
     return [scenario.find(name, "traffic.tracks") for name in scenario.traffic.tracks or ()]
 
 
+def read_file(path: Path) -> Tracks:
+    """Read a file of tracks; it is read again only when it has changed. InputError if it is damaged or empty."""
+    return _read_file(path, path.stat().st_mtime_ns)
+
+
 @lru_cache(maxsize=8)
 def _read_file(path: Path, _modified_ns: int) -> Tracks:
     tracks = track_readers.find_reader(path).read(path)
@@ -239,23 +241,31 @@ def _read_file(path: Path, _modified_ns: int) -> Tracks:
     return tracks
 
 
-def _read_tracks(scenario: Scenario, world: Georeference) -> tuple[Tracks, tuple[str, ...]]:
-    """Return the rows of all files in the world frame, and the sentences of their readers."""
-    converted = []
-    sources: dict[str, None] = {}
-    for path in _named_files(scenario):
-        tracks = _read_file(path, path.stat().st_mtime_ns)
-        converted.append(_to_world(tracks, scenario, world, path))
-        sources |= dict.fromkeys(tracks.sources)
-    return _concatenate(converted), tuple(sources)
+def read_in_world_frame(paths: Sequence[Path], world: Georeference, crs: str | None = None) -> Tracks:
+    """Read files of tracks on one clock, and convert positions and headings to the world frame.
+
+    Parameters
+    ----------
+    paths
+        The files.
+    world
+        The world frame.
+    crs
+        Coordinate system of the tracks instead of the one of their format; "world" for the world frame.
+
+    Raises
+    ------
+    InputError
+        When a file is damaged, or far from the region of interest.
+    """
+    return _concatenate([_to_world(read_file(path), crs, world, path) for path in paths])
 
 
-def _to_world(tracks: Tracks, scenario: Scenario, world: Georeference, path: Path) -> Tracks:
+def _to_world(tracks: Tracks, crs: str | None, world: Georeference, path: Path) -> Tracks:
     """Convert positions and headings to the world frame."""
     frame = tracks.frame
-    named = scenario.traffic.track_crs
-    if named is not None:
-        frame = TrackFrame() if named == "world" else TrackFrame(named)
+    if crs is not None:
+        frame = TrackFrame() if crs == "world" else TrackFrame(crs)
     finite = np.isfinite(tracks.x_m) & np.isfinite(tracks.y_m)
     xy = np.column_stack([tracks.x_m, tracks.y_m]) + frame.offset_m
     hint = 'Set traffic.track_crs to the coordinate system of the tracks, e.g. "EPSG:25832" or "world".'
@@ -288,7 +298,8 @@ def _concatenate(recorded: list[Tracks]) -> Tracks:
     arrays = {key: np.concatenate([getattr(tracks, key) for tracks in recorded]) for key in keys}
     track = np.concatenate([tracks.track + start for tracks, start in zip(recorded, starts, strict=False)])
     classes = tuple(name for tracks in recorded for name in tracks.classes)
-    return Tracks(tuple(names), classes, track, **arrays)
+    sources = dict.fromkeys(sentence for tracks in recorded for sentence in tracks.sources)
+    return Tracks(tuple(names), classes, track, **arrays, sources=tuple(sources))
 
 
 def _window(scenario: Scenario, tracks: Tracks) -> FrameWindow:
