@@ -618,6 +618,15 @@ def new(
             " one clock: --tracks A --tracks B.",
         ),
     ] = None,
+    track_crs: Annotated[
+        str | None,
+        typer.Option(
+            "--track-crs",
+            metavar="CRS",
+            help="Coordinate system of the tracks, if it is not the one of their format: e.g. EPSG:25832, or 'world'"
+            " for metres of the road map.",
+        ),
+    ] = None,
 ) -> None:
     """Create a scenario from maps of roads, buildings and other objects.
 
@@ -651,6 +660,7 @@ def new(
     options = NewScenarioOptions(
         lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=demand, pole_spacing_m=pole_spacing_m,
         align=tuple(cli_options.point_pair(text) for text in align or []), tracks=tuple(tracks or ()),
+        track_crs=track_crs,
     )  # fmt: skip
     scenario = new_scenario.create_scenario(folder, paths, location, options)
     new_summary.print_new_scenario(scenario)

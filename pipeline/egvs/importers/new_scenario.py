@@ -184,6 +184,8 @@ class NewScenarioOptions:
         Two points that place files without a reference system; empty if there are no such files.
     tracks
         Files of recorded tracks, or folders of them, which replace assumed traffic.
+    track_crs
+        Coordinate system of the tracks, as for the key ``traffic.track_crs``.
     """
 
     lefthand: bool = False
@@ -193,11 +195,14 @@ class NewScenarioOptions:
     pole_spacing_m: float | None = None
     align: tuple[PointPair, ...] = ()
     tracks: tuple[Path, ...] = ()
+    track_crs: str | None = None
 
     def check(self) -> None:
         """Raise an InputError when a value is out of its limits."""
         assumed_traffic.check_traffic(self.traffic)
         _check_pole_spacing(self.pole_spacing_m)
+        if self.track_crs is not None and not self.tracks:
+            raise InputError("--track-crs", "has no effect without recorded tracks", "Give them with --tracks.")
         if self.surroundings_m is not None and self.surroundings_m < SURROUNDINGS_MIN_M:
             raise InputError(
                 "--surroundings",
@@ -242,7 +247,7 @@ def create_scenario(
     name = scenario_files.check_new_folder(folder)
     files = map_readers.open_maps([maps] if isinstance(maps, Path) else maps)
     roads = _read_roads(files.roads, RoadOptions(options.lefthand, options.walk, has_terrain=bool(files.terrain)), at)
-    recording = TrackFiles.find(options.tracks) if options.tracks else None
+    recording = TrackFiles.find(options.tracks, options.track_crs) if options.tracks else None
     junction = _choose_junction(roads.streets, at, recording, files.roads.path)
 
     level = roads.on_level_of(junction)

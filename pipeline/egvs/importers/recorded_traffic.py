@@ -42,13 +42,16 @@ class TrackFiles:
         Files with tracks.
     companions
         Files beside them that their readers need.
+    crs
+        Their coordinate system instead of the one of their format; "world" for the world frame.
     """
 
     tracks: tuple[Path, ...]
     companions: tuple[Path, ...]
+    crs: str | None = None
 
     @classmethod
-    def find(cls, paths: Sequence[Path]) -> TrackFiles:
+    def find(cls, paths: Sequence[Path], crs: str | None = None) -> TrackFiles:
         """Return the files with tracks among some paths, and in the folders among them.
 
         Raises
@@ -62,7 +65,7 @@ class TrackFiles:
         companions: dict[Path, None] = {}
         for path in tracks:
             companions |= dict.fromkeys(track_readers.find_reader(path).companions(path))
-        return cls(tuple(tracks), tuple(path for path in companions if path not in tracks))
+        return cls(tuple(tracks), tuple(path for path in companions if path not in tracks), crs)
 
     def copies(self) -> dict[str, Callable[[Path], None]]:
         """Return functions that write the copies, by their path in the scenario.
@@ -82,11 +85,10 @@ class TrackFiles:
 
     def traffic_table(self) -> dict[str, Any]:
         """Return the keys of ``[traffic]``."""
-        return {
-            "tracks": [f"{FOLDER}/{path.name}" for path in self.tracks],
-            "frame_period_s": self._frame_period_s(),
-            "roads": NETWORK_FILE,
-        }
+        table: dict[str, Any] = {"tracks": [f"{FOLDER}/{path.name}" for path in self.tracks]}
+        if self.crs is not None:
+            table["track_crs"] = self.crs
+        return table | {"frame_period_s": self._frame_period_s(), "roads": NETWORK_FILE}
 
     def middle_m(self, streets: Streets) -> XY:
         """Return the median position in the world frame, metres; InputError where the tracks are far from the map."""
@@ -94,7 +96,7 @@ class TrackFiles:
         low_m, high_m = points_m.min(axis=0) - _MARGIN_M, points_m.max(axis=0) + _MARGIN_M
         region = Roi((*low_m.tolist(), 0.0), (*(high_m - low_m).tolist(), 1.0))
         world = Georeference(streets.frame, region, "the map")
-        tracks = recorded_tracks.read_in_world_frame(self.tracks, world)
+        tracks = recorded_tracks.read_in_world_frame(self.tracks, world, self.crs)
         return float(np.nanmedian(tracks.x_m)), float(np.nanmedian(tracks.y_m))
 
     def _frame_period_s(self) -> float:
