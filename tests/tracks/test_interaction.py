@@ -139,6 +139,7 @@ def test_karlsruhe() -> None:
     tracks = interaction.read(path)
     assert len(tracks.names) == 74 and tracks.time_s.max() == pytest.approx(157, abs=1.0)
     assert {"car", "bicycle", "pedestrian", "truck"} == set(tracks.classes)
-    sizes = {(tracks.classes[t], *size) for t, size in zip(tracks.track, zip(tracks.length_m, tracks.width_m))}
+    row_sizes = zip(np.array(tracks.classes)[tracks.track], tracks.length_m, tracks.width_m, strict=True)
+    sizes = {(str(cls), float(length), float(width)) for cls, length, width in row_sizes}
     assert sizes == {("car", 4.7, 2.1), ("bicycle", 1.0, 0.5), ("pedestrian", 0.5, 0.5), ("truck", 7.0, 2.5)}
     assert np.hypot(tracks.x_m, tracks.y_m).max() < 200.0

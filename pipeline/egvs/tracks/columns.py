@@ -56,6 +56,13 @@ class Table:
         """Return the texts of a column."""
         return self.columns[name]
 
+    def names(self, name: str) -> Sequence[str]:
+        """Return the names of tracks in a column; InputError for an empty cell."""
+        names = self.columns[name]
+        if "" in names:
+            raise self.error(list(names).index(""), name, "expected the name of a track, got nothing")
+        return names
+
     def numbers(self, name: str) -> FloatArray:
         """Return the numbers of a column, (n,) float64; InputError for a text, an empty cell, infinity or NaN."""
         values = self.optional_numbers(name)

@@ -47,7 +47,8 @@ def read(path: Path) -> Tracks:
     for name, size_m in (("width", length_m), ("height", width_m)):
         for row in np.flatnonzero(np.isnan(size_m)):
             raise table.error(int(row), name, "expected a size above 0 m, got none")
-    vehicle = vehicles.rows_of(table.texts("id"), "id", path)
+    names = table.names("id")
+    vehicle = vehicles.rows_of(names, "id", path)
     values = {
         "time_s": table.times_s("frame", 1.0 / rate_hz) - 1.0 / rate_hz,
         "x_m": table.positions_m("x") + length_m / 2.0,
@@ -57,4 +58,4 @@ def read(path: Path) -> Tracks:
         "width_m": width_m,
     }
     sources = ["positions are those in the image: x along the road, without a place on the Earth"]
-    return Tracks.from_rows(table.texts("id"), [classes[row] for row in vehicle], values, TrackFrame(), sources)
+    return Tracks.from_rows(names, [classes[row] for row in vehicle], values, TrackFrame(), sources)

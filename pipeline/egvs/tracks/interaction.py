@@ -57,7 +57,7 @@ def companions(path: Path) -> Sequence[Path]:
 def read(path: Path) -> Tracks:
     """Read a file."""
     table = columns.read_table(path, _REQUIRED, _OPTIONAL)
-    names, time_s = list(table.texts("track_id")), table.times_s("timestamp_ms", 0.001)
+    names, time_s = list(table.names("track_id")), table.times_s("timestamp_ms", 0.001)
     frame, sources = MAP_FRAME, []
     if "case_id" in table.columns:
         cases = table.texts("case_id")

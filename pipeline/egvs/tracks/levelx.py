@@ -55,7 +55,7 @@ def read(path: Path) -> Tracks:
         "length_m": table.sizes_m("length"),
         "width_m": table.sizes_m("width"),
     }
-    names = table.texts("trackId")
+    names = table.names("trackId")
     row_classes = [classes[row] for row in types.rows_of(names, "trackId", path)]
     sources = ['tracks of class "truck_bus" count as trucks'] if "truck_bus" in types.texts("class") else []
     return Tracks.from_rows(names, row_classes, values, _utm_frame(recording), sources)

@@ -65,4 +65,4 @@ def read(path: Path) -> Tracks:
     sources = [f"{n_by_hand:,} of {table.n_rows:,} boxes were corrected by hand",
                "classes 6 and 7 (van or unknown) are of class other"]  # fmt: skip
     frame = TrackFrame(_UTM) if is_utm else TrackFrame()
-    return Tracks.from_rows(table.texts("id"), table.classes("class", _CLASSES), values, frame, sources)
+    return Tracks.from_rows(table.names("id"), table.classes("class", _CLASSES), values, frame, sources)

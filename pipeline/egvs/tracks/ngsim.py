@@ -51,7 +51,7 @@ def read(path: Path) -> Tracks:
     length_m = table.sizes_m("v_Length", FOOT_M)
     for row in np.flatnonzero(np.isnan(length_m)):
         raise table.error(int(row), "v_Length", "expected a length above 0 ft, from the front to the centre, got none")
-    names, n_reused = _split_reused(table.texts("Vehicle_ID"), time_s)
+    names, n_reused = _split_reused(table.names("Vehicle_ID"), time_s)
     track = np.unique(names, return_inverse=True)[1].astype(np.int64)
     yaw_rad = motion_yaw_rad(track, time_s, x_m, y_m, _MOTION_STEP_M)
     n_still = np.unique(track[np.isnan(yaw_rad)]).size

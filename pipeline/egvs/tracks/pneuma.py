@@ -28,7 +28,7 @@ _CLASSES = {
 
 def can_open(_path: Path, head: bytes) -> bool:
     """Return whether the first line has pNEUMA's ten names."""
-    return tuple(name for name in columns.header(head, ";") if name) == (*_VEHICLE, *_POSITION)
+    return _is_header(columns.header(head, ";"))
 
 
 def companions(_path: Path) -> Sequence[Path]:
@@ -43,7 +43,11 @@ def read(path: Path) -> Tracks:
     xy_m, frame = to_utm(lon_deg, lat_deg, lambda row, problem: table.error(row, "lat, lon", problem))
     values = {"time_s": table.times_s("time"), "x_m": xy_m[:, 0], "y_m": xy_m[:, 1]}
     sources = ['"Medium Vehicle" counts as van, "Heavy Vehicle" as truck, "Taxi" as car']
-    return Tracks.from_rows(table.texts("track_id"), table.classes("type", _CLASSES), values, frame, sources)
+    return Tracks.from_rows(table.names("track_id"), table.classes("type", _CLASSES), values, frame, sources)
+
+
+def _is_header(names: Sequence[str]) -> bool:
+    return tuple(name for name in names if name) == (*_VEHICLE, *_POSITION)
 
 
 def _read_positions(path: Path) -> columns.Table:
@@ -51,7 +55,11 @@ def _read_positions(path: Path) -> columns.Table:
     cells: dict[str, list[str]] = {name: [] for name in ("track_id", "type", "lat", "lon", "time")}
     lines: list[int] = []
     seen: set[str] = set()
-    for line, row in columns.read_rows(path, ";")[1:]:
+    rows = columns.read_rows(path, ";")
+    if not rows or not _is_header([name.lower() for name in rows[0][1]]):
+        problem = f"expected {'; '.join((*_VEHICLE, *_POSITION))} in the first line"
+        raise InputError(path, problem, "Use the file as it was published.")
+    for line, row in rows[1:]:
         while row and not row[-1]:
             row.pop()
         count, rest = divmod(len(row) - len(_VEHICLE), len(_POSITION))

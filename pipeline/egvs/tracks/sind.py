@@ -47,4 +47,4 @@ def read(path: Path) -> Tracks:
     }
     classes = table.classes("agent_type", _CLASSES)
     sources = ["tricycles are of class other"] if "other" in classes else []
-    return Tracks.from_rows(table.texts("track_id"), classes, values, MAP_FRAME, sources)
+    return Tracks.from_rows(table.names("track_id"), classes, values, MAP_FRAME, sources)

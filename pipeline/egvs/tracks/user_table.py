@@ -68,9 +68,7 @@ def read(path: Path, mapping: TrackColumns, where: str = "traffic.track_columns"
         values["z_m"] = table.heights_m(mapping.z, unit_m)
         if mapping.z_reference == "bottom":
             values["z_m"] = values["z_m"] + values["height_m"] / 2.0
-    names, classes, sources = table.texts(mapping.id), _classes(table, mapping), list[str]()
-    if "" in names:
-        raise table.error(list(names).index(""), mapping.id, "expected the name of a track, got nothing")
+    names, classes, sources = table.names(mapping.id), _classes(table, mapping), list[str]()
     if mapping.reference == "front":
         is_placed = _move_to_centres(table, mapping, values)
         if not is_placed.all():
