@@ -610,6 +610,14 @@ def new(
             help="A point of the files without a reference system, in metres, and where it is; give two points.",
         ),
     ] = None,
+    tracks: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE",
+            help="Recorded tracks of road users, or a folder of them, instead of simulated traffic. Several files on"
+            " one clock: --tracks A --tracks B.",
+        ),
+    ] = None,
 ) -> None:
     """Create a scenario from maps of roads, buildings and other objects.
 
@@ -631,6 +639,9 @@ def new(
         surroundings_m = cli_options.radius_m(surroundings)
     if traffic is not None and vehicles_per_hour is not None:
         raise InputError("--traffic", "cannot be combined with --vehicles-per-hour", "Use one of them.")
+    if tracks and (traffic is not None or vehicles_per_hour is not None):
+        key = "--traffic" if traffic is not None else "--vehicles-per-hour"
+        raise InputError(key, "has no effect on recorded traffic (--tracks)", "Use one of them.")
     demand: str | int = traffic or DEFAULT_TRAFFIC
     if vehicles_per_hour is not None:
         demand = vehicles_per_hour
@@ -639,7 +650,7 @@ def new(
         pole_spacing_m = cli_options.pole_spacing_m(*poles)
     options = NewScenarioOptions(
         lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=demand, pole_spacing_m=pole_spacing_m,
-        align=tuple(cli_options.point_pair(text) for text in align or []),
+        align=tuple(cli_options.point_pair(text) for text in align or []), tracks=tuple(tracks or ()),
     )  # fmt: skip
     scenario = new_scenario.create_scenario(folder, paths, location, options)
     new_summary.print_new_scenario(scenario)

@@ -24,12 +24,24 @@ def find_reader(path: Path) -> TrackReader:
     InputError
         When the file does not exist, or no reader accepts it.
     """
+    reader = _find(path)
+    if reader is None:
+        raise InputError(path, "the format of the tracks is unknown", f"Formats: {describe_formats()}.")
+    return reader
+
+
+def can_read(path: Path) -> bool:
+    """Return whether a reader accepts a file; InputError when it does not exist."""
+    return _find(path) is not None
+
+
+def _find(path: Path) -> TrackReader | None:
     head = _read_head(path)
     for name in plugins.plugin_names(GROUP):
         reader: TrackReader = plugins.load_plugin(GROUP, name)
         if reader.can_open(path, head):
             return reader
-    raise InputError(path, "the format of the tracks is unknown", f"Formats: {describe_formats()}.")
+    return None
 
 
 def source_files(path: Path) -> Sequence[Path]:
