@@ -10,9 +10,11 @@ the scenario promises; with one message). Any other verdict is a fault.
 from __future__ import annotations
 
 import gc
+import hashlib
 import itertools
 import math
 import os
+import pickle
 import re
 import resource
 import select
@@ -22,7 +24,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -259,6 +261,7 @@ def warm_up(folder: Path) -> None:
     import typer.main
 
     from egvs.cli.app import main
+    from egvs.importers import assumed_traffic
     from tests.conftest import write_mini
 
     os.environ["EGVS_STORE"] = ""
@@ -272,6 +275,7 @@ def warm_up(folder: Path) -> None:
 
     jinja2.Environment.compile = compile_once
     typer.main.get_command = cache(typer.main.get_command)  # and so are the verbs, which are made anew at each call
+    assumed_traffic.find_capacity = _remembered(assumed_traffic.find_capacity, folder / "capacities")
     sys.argv = ["egvs", "run", str(write_mini(folder / "mini")), "--out", str(folder / "out"), "--jobs", "1"]
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
@@ -281,3 +285,22 @@ def warm_up(folder: Path) -> None:
             assert not end.code, printed.getvalue()
     gc.collect()
     gc.freeze()
+
+
+def _remembered(function: Callable[..., object], folder: Path) -> Callable[..., object]:
+    """The same results for the same arguments, in files, since the processes of the cases share nothing else.
+
+    Trials of traffic are most of the time of a case, and mutants of what stands beside roads do not change them.
+    """
+    folder.mkdir()
+
+    def remembering(*arguments: object) -> object:
+        path = folder / hashlib.sha256(repr(arguments).encode("utf-8", "surrogatepass")).hexdigest()
+        if not path.is_file():
+            result = function(*arguments)
+            part = path.with_suffix(f".{os.getpid()}")
+            part.write_bytes(pickle.dumps(result))
+            part.replace(path)
+        return pickle.loads(path.read_bytes())
+
+    return remembering
