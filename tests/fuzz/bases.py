@@ -490,9 +490,10 @@ def vectors(name: str):
         if name.endswith("parquet"):
             frame.to_parquet(folder / name)
         elif name.endswith("kml"):
-            ring = frame.to_crs("OGC:CRS84").geometry.iloc[0].exterior.coords
-            corners = " ".join(f"{x:.7f},{y:.7f},0" for x, y, *_ in ring)
-            outline = f"<Polygon><outerBoundaryIs><LinearRing><coordinates>{corners}</coordinates></LinearRing></outerBoundaryIs></Polygon>"
+            degrees = frame.to_crs("OGC:CRS84").geometry.iloc[0].exterior.coords
+            corners = " ".join(f"{x:.7f},{y:.7f},0" for x, y, *_ in degrees)
+            ring = f"<LinearRing><coordinates>{corners}</coordinates></LinearRing>"
+            outline = f"<Polygon><outerBoundaryIs>{ring}</outerBoundaryIs></Polygon>"
             (folder / name).write_text(
                 '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document>'
                 f"<Placemark><name>h</name>{outline}</Placemark></Document></kml>\n"
