@@ -24,7 +24,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -276,15 +276,36 @@ def warm_up(folder: Path) -> None:
     jinja2.Environment.compile = compile_once
     typer.main.get_command = cache(typer.main.get_command)  # and so are the verbs, which are made anew at each call
     assumed_traffic.find_capacity = _remembered(assumed_traffic.find_capacity, folder / "capacities")
-    sys.argv = ["egvs", "run", str(write_mini(folder / "mini")), "--out", str(folder / "out"), "--jobs", "1"]
     printed = io.StringIO()
-    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
-        try:
-            main()
-        except SystemExit as end:
-            assert not end.code, printed.getvalue()
+    for arguments in (
+        ["run", str(write_mini(folder / "mini")), "--out", str(folder / "out"), "--jobs", "1"],
+        *_maps(folder),
+    ):
+        sys.argv = ["egvs", *arguments]
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+            try:
+                main()
+            except SystemExit as end:
+                assert not end.code, printed.getvalue()
     gc.collect()
     gc.freeze()
+
+
+def _maps(folder: Path) -> Iterator[list[str]]:
+    """Arguments that make scenarios from maps of several formats, so that what reads them is imported."""
+    from tests.fuzz import bases
+
+    aligned = ["--align", "0,0=52.0,10.0", "--align", "0,100=52.000899,10.0"]
+    makers = {
+        "city.gml": bases.with_roads_map, "houses.gpkg": bases.vectors, "terrain.tif": bases.on_terrain,
+        "survey.las": bases.surveyed, "survey.e57": bases.surveyed, "house.glb": bases.modelled,
+    }  # fmt: skip
+    for number, (name, make) in enumerate(makers.items()):
+        maps = folder / f"maps{number}"
+        maps.mkdir()
+        make(name)(maps)
+        arguments = ["new", str(maps / "made"), "--from", str(maps / "roads.net.xml"), str(maps / name)]
+        yield [*arguments, "--vehicles-per-hour", "200", *(aligned if make in (bases.surveyed, bases.modelled) else ())]
 
 
 def _remembered(function: Callable[..., object], folder: Path) -> Callable[..., object]:
