@@ -15,7 +15,7 @@ from typer.core import TyperCommand
 from typer.models import CommandInfo
 
 from egvs._version import __version__
-from egvs.cli import city, compare, exit, place, sources, validate
+from egvs.cli import city, compare, exit, place, sensor, sources, validate
 from egvs.cli import options as cli_options
 from egvs.cli.options import (
     DEFAULT_POLES,
@@ -529,6 +529,8 @@ app.add_typer(city.app, name="city")
 
 # ---- scenarios, sensors, cached results
 
+app.add_typer(sensor.app, name="sensor")
+
 
 @app.command()
 def sensors(
@@ -719,7 +721,7 @@ COMMAND_GROUPS = {
     "Decide": ("place", "explore", "compare", "city"),
     "Study": ("validate", "accuracy", "effects", "scores", "clouds", "train"),
     "Stages of egvs run": ("traffic", "statics", "tpog", "scan", "score", "report"),
-    "Files": ("runs", "export", "figure", "sensors", "verify", "store"),
+    "Files": ("runs", "export", "figure", "sensors", "sensor", "verify", "store"),
 }
 """Groups of ``egvs --help``, and their commands."""
 
