@@ -620,6 +620,14 @@ def new(
             " one clock: --tracks A --tracks B.",
         ),
     ] = None,
+    track_columns: Annotated[
+        Path | None,
+        typer.Option(
+            "--track-columns",
+            metavar="FILE",
+            help="TOML file that names the columns of tracks in a table of your own (CSV or JSON lines).",
+        ),
+    ] = None,
     track_crs: Annotated[
         str | None,
         typer.Option(
@@ -662,7 +670,7 @@ def new(
     options = NewScenarioOptions(
         lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=demand, pole_spacing_m=pole_spacing_m,
         align=tuple(cli_options.point_pair(text) for text in align or []), tracks=tuple(tracks or ()),
-        track_crs=track_crs,
+        track_crs=track_crs, track_columns=track_columns,
     )  # fmt: skip
     scenario = new_scenario.create_scenario(folder, paths, location, options)
     new_summary.print_new_scenario(scenario)

@@ -186,6 +186,8 @@ class NewScenarioOptions:
         Files of recorded tracks, or folders of them, which replace assumed traffic.
     track_crs
         Coordinate system of the tracks, as for the key ``traffic.track_crs``.
+    track_columns
+        TOML file with the meaning of the columns of tracks in a table of one's own.
     """
 
     lefthand: bool = False
@@ -196,13 +198,15 @@ class NewScenarioOptions:
     align: tuple[PointPair, ...] = ()
     tracks: tuple[Path, ...] = ()
     track_crs: str | None = None
+    track_columns: Path | None = None
 
     def check(self) -> None:
         """Raise an InputError when a value is out of its limits."""
         assumed_traffic.check_traffic(self.traffic)
         _check_pole_spacing(self.pole_spacing_m)
-        if self.track_crs is not None and not self.tracks:
-            raise InputError("--track-crs", "has no effect without recorded tracks", "Give them with --tracks.")
+        for key, value in (("--track-crs", self.track_crs), ("--track-columns", self.track_columns)):
+            if value is not None and not self.tracks:
+                raise InputError(key, "has no effect without recorded tracks", "Give them with --tracks.")
         if self.surroundings_m is not None and self.surroundings_m < SURROUNDINGS_MIN_M:
             raise InputError(
                 "--surroundings",
@@ -247,7 +251,7 @@ def create_scenario(
     name = scenario_files.check_new_folder(folder)
     files = map_readers.open_maps([maps] if isinstance(maps, Path) else maps)
     roads = _read_roads(files.roads, RoadOptions(options.lefthand, options.walk, has_terrain=bool(files.terrain)), at)
-    recording = TrackFiles.find(options.tracks, options.track_crs) if options.tracks else None
+    recording = _find_tracks(options)
     junction = _choose_junction(roads.streets, at, recording, files.roads.path)
 
     level = roads.on_level_of(junction)
@@ -368,6 +372,16 @@ def _read_roads(file: MapFile, options: RoadOptions, at: tuple[float, float] | N
     if file.reader is openstreetmap:
         return OsmRoads.read(file.path, options, at)
     return NetworkRoads.read(file.reader.read_roads(file.path, options), file.path)
+
+
+def _find_tracks(options: NewScenarioOptions) -> TrackFiles | None:
+    """Return the recorded tracks of a new scenario, if there are any."""
+    if not options.tracks:
+        return None
+    columns = None
+    if options.track_columns is not None:
+        columns = recorded_traffic.read_track_columns(options.track_columns)
+    return TrackFiles.find(options.tracks, options.track_crs, columns)
 
 
 def _choose_junction(

@@ -213,9 +213,7 @@ def draw_empty_scan(fit: SensorFit) -> Figure | None:
     return figure
 
 
-def _bars(
-    axis: Any, bins: Sequence[tuple[float, float, Estimate]], scale: float, colour: str, label: str
-) -> None:
+def _bars(axis: Any, bins: Sequence[tuple[float, float, Estimate]], scale: float, colour: str, label: str) -> None:
     """Draw estimates as horizontal lines over their ranges, with bands for the 95 % intervals."""
     for index, (start, end, estimate) in enumerate(bins):
         start = max(start, 1.0)

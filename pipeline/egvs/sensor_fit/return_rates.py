@@ -28,7 +28,27 @@ from egvs.sensor_fit.ground_plane import GroundPlane
 from egvs.sensor_fit.intervals import MIN_VALUES, Estimate, estimate_share
 from egvs.sensor_fit.range_noise import MAX_SLOPE
 
-RANGE_EDGES_M = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 45.0, 50.0, 55.0, 60.0, 70.0, 85.0, 100.0, 150.0, 200.0, 400.0)
+RANGE_EDGES_M = (
+    0.0,
+    5.0,
+    10.0,
+    15.0,
+    20.0,
+    25.0,
+    30.0,
+    35.0,
+    40.0,
+    45.0,
+    50.0,
+    55.0,
+    60.0,
+    70.0,
+    85.0,
+    100.0,
+    150.0,
+    200.0,
+    400.0,
+)
 INCIDENCE_EDGES_DEG = (0.0, 30.0, 60.0, 75.0, 80.0, 85.0, 90.0)
 ROAD_BAND_M = 0.5
 """Returns within this height of the plane are from the road, including its camber and kerbs."""

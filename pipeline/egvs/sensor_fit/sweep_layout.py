@@ -204,7 +204,9 @@ def _sharpest_elevations(radius_m: FloatArray, height_m: FloatArray) -> FloatArr
         return np.degrees(np.arctan2(height_m[part] - shifted["height"], radius_m[part] - shifted["radius"]))
 
     def sharpness(name: str, offset_m: float) -> float:
-        counts = np.bincount(np.floor((elevations(shift | {name: offset_m}, sample) + 180) / _SHARPNESS_BIN_DEG).astype(int))
+        counts = np.bincount(
+            np.floor((elevations(shift | {name: offset_m}, sample) + 180) / _SHARPNESS_BIN_DEG).astype(int)
+        )
         return float((counts.astype(np.float64) ** 2).sum())
 
     for name in ("radius", "height", "radius"):
@@ -227,9 +229,7 @@ def _histogram_peaks(elevation_deg: FloatArray) -> FloatArray:
     return low + (peaks[tall] + 0.5) * _BIN_DEG
 
 
-def _fit_cones(
-    radius_m: FloatArray, height_m: FloatArray, ring: IntArray, rings: int
-) -> tuple[FloatArray, FloatArray]:
+def _fit_cones(radius_m: FloatArray, height_m: FloatArray, ring: IntArray, rings: int) -> tuple[FloatArray, FloatArray]:
     """Fit the tangent of the elevation and the offset of each ring with at least 20 points, ascending."""
     tangents, offsets_m = [], []
     order = np.argsort(ring, kind="stable")
