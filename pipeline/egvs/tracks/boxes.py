@@ -63,7 +63,7 @@ class Pose:
     translation: Vector = (0.0, 0.0, 0.0)
 
     @classmethod
-    def from_arrays(cls, rotation: FloatArray, translation: Sequence[float]) -> Pose:
+    def from_arrays(cls, rotation: FloatArray, translation: Sequence[float] | FloatArray) -> Pose:
         """Return a pose of arrays (3, 3) and (3,)."""
         x, y, z = ((float(a), float(b), float(c)) for a, b, c in rotation)
         east, north, up = map(float, translation)
@@ -151,7 +151,7 @@ def make_tracks(
         is_valid = (values >= lowest) & (values <= highest)
         if key not in _REQUIRED:
             is_valid |= np.isnan(values)
-        for row in np.flatnonzero(~is_valid):
+        for row in np.flatnonzero(~is_valid).tolist():
             where = f"{path}: track {names[row][:80]!r}, time {columns['time_s'][row]:g} s: {key}"
             problem = f"expected a number between {lowest:g} and {highest:g}, got {values[row]:g}"
             raise InputError(where, problem, "Correct the row, or remove it.")

@@ -67,8 +67,8 @@ def pose_in_world(root: Node, properties: Node | None, system: str) -> SystemPos
     """
     transforms = None if properties is None else properties.find("transforms")
     by_source = {}
-    for _, transform in transforms.members() if transforms is not None else ():
-        by_source[transform.get("src").text()] = transform
+    for _, member in transforms.members() if transforms is not None else ():
+        by_source[member.get("src").text()] = member
     matrix = np.eye(4)
     for _ in range(_MAX_PARENTS):
         transform, declared = by_source.get(system), _find_system(root, system)
