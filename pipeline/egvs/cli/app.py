@@ -15,7 +15,7 @@ from typer.core import TyperCommand
 from typer.models import CommandInfo
 
 from egvs._version import __version__
-from egvs.cli import city, compare, exit, place, sources, validate
+from egvs.cli import city, compare, exit, place, sensor, sources, validate
 from egvs.cli import options as cli_options
 from egvs.cli.options import (
     DEFAULT_POLES,
@@ -529,6 +529,8 @@ app.add_typer(city.app, name="city")
 
 # ---- scenarios, sensors, cached results
 
+app.add_typer(sensor.app, name="sensor")
+
 
 @app.command()
 def sensors(
@@ -610,6 +612,31 @@ def new(
             help="A point of the files without a reference system, in metres, and where it is; give two points.",
         ),
     ] = None,
+    tracks: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE",
+            help="Recorded tracks of road users, or a folder of them, instead of simulated traffic. Several files on"
+            " one clock: --tracks A --tracks B.",
+        ),
+    ] = None,
+    track_columns: Annotated[
+        Path | None,
+        typer.Option(
+            "--track-columns",
+            metavar="FILE",
+            help="TOML file that names the columns of tracks in a table of your own (CSV or JSON lines).",
+        ),
+    ] = None,
+    track_crs: Annotated[
+        str | None,
+        typer.Option(
+            "--track-crs",
+            metavar="CRS",
+            help="Coordinate system of the tracks, if it is not the one of their format: e.g. EPSG:25832, or 'world'"
+            " for metres of the road map.",
+        ),
+    ] = None,
 ) -> None:
     """Create a scenario from maps of roads, buildings and other objects.
 
@@ -631,6 +658,9 @@ def new(
         surroundings_m = cli_options.radius_m(surroundings)
     if traffic is not None and vehicles_per_hour is not None:
         raise InputError("--traffic", "cannot be combined with --vehicles-per-hour", "Use one of them.")
+    if tracks and (traffic is not None or vehicles_per_hour is not None):
+        key = "--traffic" if traffic is not None else "--vehicles-per-hour"
+        raise InputError(key, "has no effect on recorded traffic (--tracks)", "Use one of them.")
     demand: str | int = traffic or DEFAULT_TRAFFIC
     if vehicles_per_hour is not None:
         demand = vehicles_per_hour
@@ -639,7 +669,8 @@ def new(
         pole_spacing_m = cli_options.pole_spacing_m(*poles)
     options = NewScenarioOptions(
         lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=demand, pole_spacing_m=pole_spacing_m,
-        align=tuple(cli_options.point_pair(text) for text in align or []),
+        align=tuple(cli_options.point_pair(text) for text in align or []), tracks=tuple(tracks or ()),
+        track_crs=track_crs, track_columns=track_columns,
     )  # fmt: skip
     scenario = new_scenario.create_scenario(folder, paths, location, options)
     new_summary.print_new_scenario(scenario)
@@ -698,7 +729,7 @@ COMMAND_GROUPS = {
     "Decide": ("place", "explore", "compare", "city"),
     "Study": ("validate", "accuracy", "effects", "scores", "clouds", "train"),
     "Stages of egvs run": ("traffic", "statics", "tpog", "scan", "score", "report"),
-    "Files": ("runs", "export", "figure", "sensors", "verify", "store"),
+    "Files": ("runs", "export", "figure", "sensors", "sensor", "verify", "store"),
 }
 """Groups of ``egvs --help``, and their commands."""
 

@@ -11,11 +11,12 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from egvs.cli.console import WIDE, Column, console, make_table
-from egvs.importers import junctions
+from egvs.importers import junctions, recorded_traffic
 from egvs.importers.new_scenario import NewScenario
 from egvs.importers.osm_network import ATTRIBUTION
 from egvs.importers.osm_solids import OUT_OF_RANGE, ImportCounts
 from egvs.importers.scenario_files import PITCHES_DEG, SENSOR, STATICS_FILE
+from egvs.traffic.recorded_tracks import track_warnings
 
 if TYPE_CHECKING:
     from egvs.city.creation import NewCity, NewJunction
@@ -65,7 +66,10 @@ def _scenario_lines(scenario: NewScenario) -> Iterator[tuple[str, str]]:
     yield "junction", f"{junction.title}: {arms}; {_position(scenario)}"
     yield "region", f"{roi.size_m[0]:g} m x {roi.size_m[1]:g} m x {scenario.height_m:g} m around the junction"
     yield "streets", _describe_streets(scenario.streets)
-    yield "traffic", _describe_traffic(scenario.traffic)
+    traffic = _describe_traffic(scenario.traffic)
+    if scenario.recorded is not None:
+        traffic = recorded_traffic.describe(scenario.recorded)
+    yield "traffic", traffic
     mounts = f"{len(junctions.HEIGHTS_M)} heights x {len(PITCHES_DEG)} tilts"
     yield "sites", f"{scenario.n_candidates:,} candidates: {scenario.poles} poles x {mounts}, sensor {SENSOR}"
     yield "solids", _describe_solids(scenario.statics, scenario.n_solids)
@@ -159,6 +163,10 @@ def _scenario_warnings(scenario: NewScenario) -> Iterator[str]:
             f"the junction ({scenario.junction.title}) is {distance} and may not be the one that you mean."
             " Check the position, and that the map contains the junction."
         )
+    if scenario.recorded is not None:
+        for warning in track_warnings(scenario.recorded, f"{scenario.folder / 'scenario.toml'}: traffic.tracks"):
+            yield str(warning)
+        return
     assumed, per_h = "the traffic is assumed", 0
     if scenario.traffic is not None:
         per_h = scenario.traffic.per_h

@@ -87,10 +87,10 @@ class PedestriansBicycles(Traffic[PedestriansBicyclesParameters]):
     ADDS_TRAFFIC: ClassVar[bool] = True
 
     def scenario_error(self, scenario: Scenario) -> InputError | None:
-        """Return the error for a finished FCD file, to which nobody can be added."""
-        if scenario.traffic.fcd is None or not self.acts(scenario)[0]:
+        """Return the error for recorded traffic, to which nobody can be added."""
+        if not scenario.traffic.is_finished or not self.acts(scenario)[0]:
             return None
-        problem = "pedestrians and bicycles cannot be added to a finished FCD file"
+        problem = "pedestrians and bicycles cannot be added to recorded traffic"
         return InputError(self.config_key(scenario), problem, "Use network or sumocfg in [traffic].")
 
     def acts(self, scenario: Scenario) -> tuple[bool, str]:
@@ -102,7 +102,7 @@ class PedestriansBicycles(Traffic[PedestriansBicyclesParameters]):
     def summary(self, scene: Scene) -> str:
         """Return where people could walk, as a sentence."""
         path = sumo_folder.network_path(scene.scenario)
-        if path is None or network.is_osm(path) or scene.scenario.traffic.fcd is not None:
+        if path is None or network.is_osm(path) or scene.scenario.traffic.is_finished:
             return ""
         walkways = network.read_net_xml(path).walkways
         if not walkways.sidewalks or not walkways.areas:

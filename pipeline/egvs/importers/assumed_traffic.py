@@ -111,7 +111,9 @@ def assume_traffic(
     return AssumedTraffic(tuple(flows), find_capacity(network, flows, JUNCTION_BLOCKER_S), level)
 
 
-def traffic_notes(traffic: AssumedTraffic) -> list[str]:
+def traffic_notes(traffic: AssumedTraffic | None) -> list[str]:
+    if traffic is None:
+        return []
     capacity = traffic.capacity
     jam = f"; {capacity.jam}" if capacity.jam else ""
     hint = "Lower per_hour of traffic.counts, or check the signals and connections there"

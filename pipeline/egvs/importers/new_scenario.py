@@ -41,6 +41,7 @@ from egvs.importers import (
     map_readers,
     openstreetmap,
     osm_solids,
+    recorded_traffic,
     scenario_files,
     static_objects,
 )
@@ -53,6 +54,7 @@ from egvs.importers.map_readers import MapFile
 from egvs.importers.openstreetmap import OsmRoads
 from egvs.importers.osm_network import ATTRIBUTION, NETWORK_FILE
 from egvs.importers.osm_solids import ImportCounts
+from egvs.importers.recorded_traffic import TrackFiles
 from egvs.importers.relief import Relief
 from egvs.importers.road_source import NetworkRoads, RoadSource
 from egvs.importers.scenario_files import (
@@ -71,6 +73,7 @@ from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, CountConfig, TrafficConfig
 from egvs.sensors.sensor import CATALOGUE
 from egvs.traffic.movements import MovementNames
+from egvs.traffic.recorded_tracks import RecordedTracks
 
 SURROUNDINGS_MIN_M = 100.0
 FAR_FROM_AT_M = 50.0
@@ -119,6 +122,8 @@ class NewScenario:
         Who made the maps.
     from_at_m
         Distance of the junction from the requested position, 0 inside it; None without such a position.
+    recorded
+        The recorded traffic, if there is one.
     """
 
     folder: Path
@@ -134,6 +139,7 @@ class NewScenario:
     maps: tuple[MapSummary, ...] = ()
     attributions: tuple[str, ...] = ()
     from_at_m: float | None = None
+    recorded: RecordedTracks | None = None
 
     @property
     def maps_have_notes(self) -> bool:
@@ -176,6 +182,12 @@ class NewScenarioOptions:
         Distance between candidate poles along the kerbs; None for a few poles near the junction.
     align
         Two points that place files without a reference system; empty if there are no such files.
+    tracks
+        Files of recorded tracks, or folders of them, which replace assumed traffic.
+    track_crs
+        Coordinate system of the tracks, as for the key ``traffic.track_crs``.
+    track_columns
+        TOML file with the meaning of the columns of tracks in a table of one's own.
     """
 
     lefthand: bool = False
@@ -184,11 +196,17 @@ class NewScenarioOptions:
     traffic: str | int = DEFAULT_TRAFFIC
     pole_spacing_m: float | None = None
     align: tuple[PointPair, ...] = ()
+    tracks: tuple[Path, ...] = ()
+    track_crs: str | None = None
+    track_columns: Path | None = None
 
     def check(self) -> None:
         """Raise an InputError when a value is out of its limits."""
         assumed_traffic.check_traffic(self.traffic)
         _check_pole_spacing(self.pole_spacing_m)
+        for key, value in (("--track-crs", self.track_crs), ("--track-columns", self.track_columns)):
+            if value is not None and not self.tracks:
+                raise InputError(key, "has no effect without recorded tracks", "Give them with --tracks.")
         if self.surroundings_m is not None and self.surroundings_m < SURROUNDINGS_MIN_M:
             raise InputError(
                 "--surroundings",
@@ -233,7 +251,8 @@ def create_scenario(
     name = scenario_files.check_new_folder(folder)
     files = map_readers.open_maps([maps] if isinstance(maps, Path) else maps)
     roads = _read_roads(files.roads, RoadOptions(options.lefthand, options.walk, has_terrain=bool(files.terrain)), at)
-    junction = _choose_junction(roads.streets, at, files.roads.path)
+    recording = _find_tracks(options)
+    junction = _choose_junction(roads.streets, at, recording, files.roads.path)
 
     level = roads.on_level_of(junction)
     if level.streets is not roads.streets:
@@ -263,23 +282,20 @@ def create_scenario(
     roi = junctions.region_around(junction)
     poles = junctions.kerbside_poles(streets, junction, roi, objects.areas, options.pole_spacing_m)
     if not poles:
-        problem = f"there is no free location for a pole along the kerbs of the {junction.title}"
-        hint = "Choose another junction with --at LAT,LON."
-        if options.pole_spacing_m is not None:
-            hint = "Choose a smaller spacing with --poles, or another junction with --at LAT,LON."
-        raise InputError(files.roads.path, problem, hint)
+        raise _no_pole_error(junction, options, files.roads.path)
 
     notes = [*roads.notes, *zero.notes, *(() if terrain is None else terrain.notes), *ground_notes]
-    if at is None and not junction.signalised:
+    if at is None and recording is None and not junction.signalised:
         notes.append(_NO_SIGNALS_NOTE)
     notes += _ring_notes(streets, junction)
     notes += scenario_notes(roi.area.covers(junction.area), objects.counts)
     notes += _level_notes(level, objects.counts) + _range_notes(objects.counts)
     if options.walk:
         notes.append(PEOPLE_HINT)
-    assumed = assumed_traffic.assume_traffic(roads.network, streets, junction, options.traffic)
-    if assumed is not None:
-        notes += assumed_traffic.traffic_notes(assumed)
+    assumed = None
+    if recording is None:
+        assumed = assumed_traffic.assume_traffic(roads.network, streets, junction, options.traffic)
+    notes += assumed_traffic.traffic_notes(assumed)
     relief = Relief.of_region(streets, junction, roi)
     if relief.other_levels:
         notes.append(f"lanes on another level cross the region of interest: {', '.join(relief.other_levels)}")
@@ -305,10 +321,26 @@ def create_scenario(
         SITES_FILE: scenario_files.sites_csv(poles, columns),
         **meshes,
         **terrain_files,
-        SCENARIO_FILE: _scenario_toml(name, scenario, relief, statics),
+        **({} if recording is None else recording.copies()),
+        SCENARIO_FILE: _scenario_toml(name, scenario, relief, statics, recording),
     }
-    scenario_files.publish_folder(folder, contents.items(), load)
-    return scenario
+    recorded: list[RecordedTracks] = []
+
+    def check(partial_folder: Path) -> None:
+        loaded = load(partial_folder)
+        if recording is not None:
+            recorded.append(recorded_traffic.read_for_summary(loaded))
+
+    scenario_files.publish_folder(folder, contents.items(), check)
+    return replace(scenario, recorded=recorded[0] if recorded else None)
+
+
+def _no_pole_error(junction: StreetJunction, options: NewScenarioOptions, path: Path) -> InputError:
+    problem = f"there is no free location for a pole along the kerbs of the {junction.title}"
+    hint = "Choose another junction with --at LAT,LON."
+    if options.pole_spacing_m is not None:
+        hint = "Choose a smaller spacing with --poles, or another junction with --at LAT,LON."
+    return InputError(path, problem, hint)
 
 
 def _site_columns(
@@ -342,10 +374,25 @@ def _read_roads(file: MapFile, options: RoadOptions, at: tuple[float, float] | N
     return NetworkRoads.read(file.reader.read_roads(file.path, options), file.path)
 
 
-def _choose_junction(streets: Streets, at: tuple[float, float] | None, path: Path) -> StreetJunction:
+def _find_tracks(options: NewScenarioOptions) -> TrackFiles | None:
+    """Return the recorded tracks of a new scenario, if there are any."""
+    if not options.tracks:
+        return None
+    columns = None
+    if options.track_columns is not None:
+        columns = recorded_traffic.read_track_columns(options.track_columns)
+    return TrackFiles.find(options.tracks, options.track_crs, columns)
+
+
+def _choose_junction(
+    streets: Streets, at: tuple[float, float] | None, recording: TrackFiles | None, path: Path
+) -> StreetJunction:
+    """Return the junction at the requested position, or else that of the recording, or else the largest one."""
+    if at is None and recording is not None:
+        return _junction_at(streets, recording.middle_m(streets), "--tracks")
     if at is None:
         return _require_junction(junctions.largest_junction(streets), path)
-    return _junction_at(streets, _to_world(streets, at))
+    return _junction_at(streets, _to_world(streets, at), "--at")
 
 
 def _to_world(streets: Streets, at: tuple[float, float]) -> XY:
@@ -389,7 +436,7 @@ def _check_pole_spacing(spacing_m: float | None) -> None:
         raise InputError("--poles", problem, "Use a spacing such as every 20m.")
 
 
-def _junction_at(streets: Streets, at_m: XY) -> StreetJunction:
+def _junction_at(streets: Streets, at_m: XY, where: str) -> StreetJunction:
     """Return the junction at a position; raise an InputError that names the nearest ones if it is far from any."""
     nearby = junctions.nearest_junctions(streets, at_m)
     chosen = junctions.choose_nearby(nearby)
@@ -397,12 +444,12 @@ def _junction_at(streets: Streets, at_m: XY) -> StreetJunction:
         return chosen.junction
     problem = f"no junction of {junctions.MIN_ARMS} or more roads is within {junctions.MAX_FROM_POINT_M:g} m"
     if not nearby:
-        raise InputError("--at", problem, "The map has no such junction; choose another one.")
+        raise InputError(where, problem, "The map has no such junction; choose another one.")
     titles = []
     for near in nearby[:_MOST_NAMED]:
         position = streets.format_position(near.junction.at_m)
         titles.append(f"{near.junction.title} at {position} ({near.distance_m:,.0f} m away)")
-    raise InputError("--at", problem, f"The nearest are: {'; '.join(titles)}.")
+    raise InputError(where, problem, f"The nearest are: {'; '.join(titles)}.")
 
 
 def _require_junction(junction: StreetJunction | None, path: Path) -> StreetJunction:
@@ -461,11 +508,13 @@ def scenario_notes(junction_fits: bool, counts: ImportCounts) -> list[str]:
     return notes
 
 
-def _scenario_toml(name: str, scenario: NewScenario, relief: Relief, statics: TomlTable) -> str:
+def _scenario_toml(
+    name: str, scenario: NewScenario, relief: Relief, statics: TomlTable, recording: TrackFiles | None
+) -> str:
     title = scenario.junction.title
     values: dict[str, Any] = {
         "description": title[0].upper() + title[1:],
-        "assumed": _assumptions(scenario),
+        "assumed": _assumptions(scenario, is_recorded=recording is not None),
         "seed": 1,
     }
     if name:
@@ -481,9 +530,11 @@ def _scenario_toml(name: str, scenario: NewScenario, relief: Relief, statics: To
         "junction_blocker_s": JUNCTION_BLOCKER_S,
         "teleport_s": TELEPORT_S,
     }
+    if recording is not None:
+        traffic = recording.traffic_table()
     tables = {
         "roi": (roi_comment, roi | scenario_files.voxel_keys()),
-        "traffic": ("SUMO", traffic),
+        "traffic": ("SUMO" if recording is None else "recorded; nothing is simulated", traffic),
         "statics": statics,
         "sites": (sites_comment, sites | scenario_files.mount_keys()),
         "score": scenario_files.score_table(),
@@ -517,7 +568,7 @@ def _origin_comments(attributions: Sequence[str]) -> list[str]:
     return [f"A scenario made from maps. Map data: {'; '.join(attributions)}."]
 
 
-def _assumptions(scenario: NewScenario) -> list[str]:
+def _assumptions(scenario: NewScenario, *, is_recorded: bool) -> list[str]:
     """Return what the map does not tell, for the key ``assumed``."""
     assumed = []
     traffic = scenario.traffic
@@ -525,7 +576,7 @@ def _assumptions(scenario: NewScenario) -> list[str]:
         assumed.append(f"shares of the movements (of {traffic.per_h:,} vehicles an hour)")
     elif traffic is not None:
         assumed.append(f"traffic ({traffic.per_h:,} vehicles an hour, from the road classes)")
-    if scenario.junction.signalised:
+    if scenario.junction.signalised and not is_recorded:
         assumed.append("signal plans")
     return [*assumed, *assumed_sizes(scenario.statics), "positions of the poles"]
 

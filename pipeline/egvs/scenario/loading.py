@@ -25,7 +25,12 @@ from egvs.core.grid import Grid
 from egvs.scenario.fields import NAME_DESCRIPTION
 from egvs.scenario.model import SCENARIO_FILE, SITE_DIRECTIONS, SITE_SENSORS, SITE_SOURCES, Scenario, StaticsConfig
 from egvs.scenario.settings import changed_settings, flatten_settings
-from egvs.scenario.traffic_config import TRAFFIC_SOURCES, TrafficConfig, keys_without_effect
+from egvs.scenario.traffic_config import (
+    FINISHED_SOURCES,
+    TRAFFIC_SOURCES,
+    TrafficConfig,
+    keys_without_effect,
+)
 
 _ALTERNATIVE = re.compile(r"\.(?:(?:constrained-)?(?:float|int|str)|(?:literal|tuple)\[.*\])$")
 """End of pydantic's location of an error in a value that may have one of several types."""
@@ -323,7 +328,7 @@ def _drop_replaced_keys(base: dict[str, Any], values: dict[str, Any]) -> dict[st
 def _dropped_traffic_keys(source: str) -> frozenset[str]:
     """Return the keys of another source of traffic that a new source does not take over."""
     dropped = keys_without_effect(source) | {"routes"}
-    if source == "fcd":  # a finished file is used completely
+    if source in FINISHED_SOURCES:  # recorded traffic is used completely
         dropped |= {"frames", "frame_period_s", "warmup_s"}
     return dropped
 

@@ -382,8 +382,8 @@ class Scenario(StrictModel):
 
     @property
     def is_recorded(self) -> bool:
-        """Whether the traffic, or that of a period, is a finished FCD file."""
-        return any(traffic.fcd is not None for _, traffic in self._traffic_by_period())
+        """Whether the traffic, or that of a period, is a finished FCD file or recorded tracks."""
+        return any(traffic.is_finished for _, traffic in self._traffic_by_period())
 
     @property
     def period(self) -> str:

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from egvs.scenario.fields import Name, Positive, StrictModel, find_duplicates
+from egvs.scenario.track_columns import TrackColumns
 
 _ATTRIBUTE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*")
 """Names of attributes of a vType, which are written into XML unchanged."""
@@ -65,6 +66,12 @@ class CountConfig(StrictModel):
         return self.edge or f"{self.from_edge} to {self.to_edge}"
 
 
+_PERIOD_SOURCES = ("sumocfg", "fcd", "tracks")
+"""Sources of traffic that a period may have of its own."""
+
+Tracks = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1)]
+
+
 class PeriodConfig(StrictModel):
     """A part of the day with traffic of its own. Keys that are not set are those of ``[traffic]``."""
 
@@ -72,6 +79,7 @@ class PeriodConfig(StrictModel):
     weight: Positive = Field(1.0, description="Share of the mix, relative to the other periods, e.g. hours")
     sumocfg: str | None = Field(None, description="SUMO configuration of this period")
     fcd: str | None = Field(None, description="Finished FCD file of this period")
+    tracks: Tracks | None = Field(None, description="Files of recorded tracks of this period")
     routes: tuple[str, ...] = Field((), description="Route files of this period")
     counts: tuple[CountConfig, ...] = Field((), description="Traffic counts of this period")
     vehicles: int | None = Field(None, ge=1, description="Number of vehicles in the network in this period")
@@ -80,8 +88,9 @@ class PeriodConfig(StrictModel):
 
     @model_validator(mode="after")
     def _check_source(self) -> PeriodConfig:
-        if self.sumocfg is not None and self.fcd is not None:
-            raise ValueError("expected sumocfg or fcd, got both")
+        sources = [key for key in _PERIOD_SOURCES if getattr(self, key) is not None]
+        if len(sources) > 1:
+            raise ValueError(f"expected one of {', '.join(_PERIOD_SOURCES)}, got {' and '.join(sources)}")
         return self
 
     def apply_to(self, traffic: TrafficConfig) -> TrafficConfig:
@@ -98,7 +107,7 @@ class PeriodConfig(StrictModel):
             When the keys contradict each other.
         """
         values = {key: getattr(traffic, key) for key in traffic.model_fields_set - {"periods"}}
-        for source in ("sumocfg", "fcd"):
+        for source in _PERIOD_SOURCES:
             if getattr(self, source) is not None:
                 for key in (*TRAFFIC_SOURCES, "routes", "counts"):
                     values.pop(key, None)
@@ -135,21 +144,25 @@ DEFAULT_FRAMES, DEFAULT_WARMUP_S = 5000, 300.0
 
 
 def _is_finished(values: dict[str, Any]) -> bool:
-    """Return whether the traffic comes from a finished FCD file; ``values`` are the keys before ``frames``."""
-    return values.get("fcd") is not None
+    """Return whether the traffic was recorded, so that nothing is simulated; ``values`` are the keys before
+    ``frames``.
+    """
+    return any(values.get(key) is not None for key in FINISHED_SOURCES)
 
 
-def _first_source(values: dict[str, Any], key: str) -> str | None:
+def _first_source(values: dict[str, Any], key: str) -> Any:
     """Return the source of the first period, where ``[traffic]`` has none: it serves for what all periods share."""
     periods = values.get("periods")
     if not periods or any(values.get(source) is not None for source in ("network", "sumocfg")):
         return None
-    source: str | None = getattr(periods[0], key)
-    return source
+    return getattr(periods[0], key)
 
 
-TRAFFIC_SOURCES = ("network", "sumocfg", "fcd")
+TRAFFIC_SOURCES = ("network", "sumocfg", "fcd", "tracks")
 """Keys that set where vehicles come from; exactly one must be set."""
+
+FINISHED_SOURCES = ("fcd", "tracks")
+"""Those of them with which nothing is simulated."""
 
 _RANDOM_TRIP_KEYS = frozenset({
     "vehicles_per_lane_km", "vehicles_per_h", "trips_per_s", "min_trip_m", "reroute_at_departure",
@@ -190,17 +203,20 @@ def keys_without_effect(source: str) -> frozenset[str]:
     simulation = frozenset({
         "vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s", "junction_blocker_s", "teleport_s",
     })  # fmt: skip
-    if source == "fcd":
-        return simulation | demand - {"kinds"} | {"routes", "redraw_departures"}
-    unused = frozenset({"vtypes", "roads", "fcd_geo"})
+    for_fcd = frozenset({"vtypes", "fcd_geo"})
+    for_tracks = frozenset({"track_gap_s", "track_columns", "track_crs", "coverage"})
+    if source in FINISHED_SOURCES:
+        unused = simulation | demand - {"kinds"} | {"routes", "redraw_departures"}
+        return unused | (for_tracks if source == "fcd" else for_fcd)
+    unused = for_fcd | for_tracks | {"roads"}
     if source == "network":
         return unused | {"redraw_departures"}
     return unused | demand | ({"routes"} if source == "sumocfg" else set())
 
 
 class TrafficConfig(StrictModel):
-    """Where vehicles come from: a network (with random or given demand), a SUMO configuration, or a finished FCD
-    file.
+    """Where vehicles come from: a network (with random or given demand), a SUMO configuration, a finished FCD file, or
+    recorded tracks.
     """
 
     network: str | None = Field(
@@ -223,10 +239,31 @@ class TrafficConfig(StrictModel):
     fcd_geo: bool = Field(
         False, description="x and y of the finished FCD file are longitude and latitude (SUMO's --fcd-output.geo)"
     )
+    tracks: Tracks | None = Field(
+        default_factory=lambda values: _first_source(values, "tracks"),
+        description="Files of recorded tracks (see docs/tracks.md), all on one clock; nothing is simulated",
+    )
+    track_gap_s: Positive = Field(
+        2.0, description="Longest gap in a recorded track that is interpolated. In longer ones its position is unknown"
+    )
+    track_columns: TrackColumns | None = Field(
+        None, description="Meaning of the columns of recorded tracks in a table of your own (CSV or JSON lines)"
+    )
+    track_crs: str | None = Field(
+        None,
+        min_length=1,
+        description="Coordinate system of recorded tracks, instead of the one of their format: a name that PROJ knows,"
+        ' or "world" for metres of the network',
+    )
+    coverage: str | None = Field(
+        None,
+        description="GeoJSON file with the area that the recording could see; boxes outside are left out. By default it"
+        " is estimated from the tracks, and only reported",
+    )
     roads: str | None = Field(
         None,
-        description="Network (as in `network`) on which the vehicles of a finished FCD file drove. It is shown on maps,"
-        " names lanes with blind spots, and is used to check sites",
+        description="Network (as in `network`) on which the vehicles of a finished FCD file or of recorded tracks"
+        " drove. It is shown on maps, names lanes with blind spots, and is used to check sites and positions",
     )
     vtypes: tuple[str, ...] = Field(
         (), description="SUMO files with <vType>s: sizes of vehicles in a finished FCD file; `kinds` override them"
@@ -309,7 +346,10 @@ class TrafficConfig(StrictModel):
         (), description="Traffic counts. By default, random trips are drawn between the network's fringe edges"
     )
     kinds: tuple[VehicleKind, ...] = Field(
-        _DEFAULT_FLEET, min_length=1, description="The fleet of random trips; sizes of vehicles in a finished FCD file"
+        _DEFAULT_FLEET,
+        min_length=1,
+        description="The fleet of random trips; sizes of vehicles in a finished FCD file or, by class, in recorded"
+        " tracks without sizes",
     )
 
     @model_validator(mode="after")
@@ -327,7 +367,7 @@ class TrafficConfig(StrictModel):
         sources = [key for key in TRAFFIC_SOURCES if getattr(self, key) is not None]
         if len(sources) != 1:
             actual = " and ".join(sources) or "none"
-            raise ValueError(f"expected exactly one of network, sumocfg and fcd, got {actual}")
+            raise ValueError(f"expected exactly one of network, sumocfg, fcd and tracks, got {actual}")
         duplicates = find_duplicates([kind.name for kind in self.kinds])
         if duplicates:
             raise ValueError(f"two kinds have the same name: {', '.join(duplicates)}")
@@ -360,6 +400,11 @@ class TrafficConfig(StrictModel):
             if amount > maximum:
                 raise ValueError(f"expected at most {maximum:,.0f} {what}, got {amount:,.0f}")
         return self
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the traffic was recorded or simulated before, so that nothing is simulated."""
+        return any(getattr(self, key) is not None for key in FINISHED_SOURCES)
 
     @property
     def has_user_demand(self) -> bool:

@@ -195,10 +195,12 @@ def named_files(scenario: Scenario) -> Iterator[tuple[str, str]]:
         yield TERRAIN_KEY, statics.terrain
     yield from (("traffic.routes", name) for name in traffic.routes)
     yield from (("traffic.vtypes", name) for name in traffic.vtypes)
+    yield from (("traffic.tracks", name) for name in traffic.tracks or ())
     for key, optional_name in (
         ("traffic.network", traffic.network),
         ("traffic.sumocfg", traffic.sumocfg),
         ("traffic.fcd", traffic.fcd),
+        ("traffic.coverage", traffic.coverage),
         ("traffic.roads", traffic.roads),
         ("sites.file", site_config.file),
         (POINTS_KEY, site_config.points),
@@ -218,6 +220,7 @@ def named_files(scenario: Scenario) -> Iterator[tuple[str, str]]:
             yield f"{prefix}.sumocfg", period.sumocfg
         if period.fcd is not None:
             yield f"{prefix}.fcd", period.fcd
+        yield from ((f"{prefix}.tracks", name) for name in period.tracks or ())
     for sensor_name, model in scenario.sensors.items():
         if model.beams is not None:
             yield f"sensors.{sensor_name}.beams", model.beams

@@ -27,7 +27,7 @@ from egvs.core.sumo_home import sumo_home
 from egvs.effects import registry
 from egvs.scenario.model import TERRAIN_KEY, Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
-from egvs.traffic import finished_fcd, recording, sumo, sumo_folder, trajectories
+from egvs.traffic import finished_fcd, recorded_tracks, recording, sumo, sumo_folder, trajectories
 from egvs.traffic.fcd import FrameWindow
 from egvs.traffic.locks import WatchedRegion
 from egvs.world import geolocation
@@ -55,7 +55,7 @@ def dependencies(context: StageContext) -> StageDependencies:
     for period_scenario in periods:
         for path in _source_files(period_scenario):
             digests[_relative_name(path, scenario)] = context.inputs.digest(path)
-    needs_sumo = any(period.traffic.fcd is None or period.traffic.vtypes for period in periods)
+    needs_sumo = any(not period.traffic.is_finished or period.traffic.vtypes for period in periods)
     versions = {"sumo": sumo.sumo_version() if needs_sumo else None}
     if scenario.is_recorded:
         versions["sizes_by"] = _installed_sumo_version()
@@ -74,6 +74,12 @@ def _installed_sumo_version() -> str | None:
 def _source_files(scenario: Scenario) -> list[Path]:
     """The files that the traffic of one period comes from."""
     traffic = scenario.traffic
+    if traffic.tracks is not None:
+        sources = recorded_tracks.track_files(scenario)
+        if traffic.coverage is not None:
+            sources.append(scenario.find(traffic.coverage, "traffic.coverage"))
+        network = sumo_folder.network_path(scenario)
+        return sources if network is None else [*sources, network]
     if traffic.fcd is not None:
         sources = [scenario.find(traffic.fcd, "traffic.fcd"), *finished_fcd.size_files(scenario)]
         network = sumo_folder.network_path(scenario)
@@ -164,8 +170,11 @@ def _record_period(
     summary = tally.to_json(recorded.window.period_ms / 1000.0)
     if sumo_summary is not None:
         summary |= asdict(sumo_summary)
+    if recorded.tracks is not None:
+        summary["tracks"] = dict(recorded.tracks)
     if recorded.types:
         summary["sizes"] = {name: sized.to_json() for name, sized in recorded.types.items()}
+    warnings = [*recorded.warnings, *warnings]
     summary[WARNINGS_KEY] = [*summary.get(WARNINGS_KEY, []), *(warning.to_json() for warning in warnings)]
     if notes:
         summary["notes"] = [*summary.get("notes", []), *notes]

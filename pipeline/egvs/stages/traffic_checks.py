@@ -12,7 +12,7 @@ from egvs.core.errors import Diagnostic, InputError
 from egvs.effects import registry
 from egvs.scenario.model import Scenario
 from egvs.stages.inputs import CheckInputs, ErrorCollector
-from egvs.traffic import demand, fcd, finished_fcd, network, sumo_folder, user_files
+from egvs.traffic import demand, fcd, finished_fcd, network, recorded_tracks, sumo_folder, user_files
 from egvs.world import geolocation
 
 Rule = Callable[[CheckInputs], Iterator[Diagnostic]]
@@ -35,7 +35,7 @@ def _for_each_period(rule: Rule) -> Rule:
 def check_times(inputs: CheckInputs) -> Iterator[Diagnostic]:
     """Report times that are not multiples of SUMO's step, and a wrong SUMO configuration."""
     scenario = inputs.scenario
-    if scenario.traffic.fcd is not None:
+    if scenario.traffic.is_finished:
         return
     errors = ErrorCollector()
     demand_files = errors.attempt("traffic", lambda: sumo_folder.demand_files(scenario))
@@ -48,7 +48,7 @@ def check_times(inputs: CheckInputs) -> Iterator[Diagnostic]:
 @_for_each_period
 def check_sumo_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
     """Report each file that SUMO may not read: damaged, hostile, or with references to other files."""
-    if inputs.scenario.traffic.fcd is not None:
+    if inputs.scenario.traffic.is_finished:
         return
     try:
         paths = sumo_folder.demand_files(inputs.scenario).all()
@@ -106,7 +106,7 @@ def check_demand(inputs: CheckInputs) -> Iterator[Diagnostic]:
 
 def _has_demand(scenario: Scenario) -> bool:
     traffic = scenario.traffic
-    if traffic.fcd is not None or not (traffic.sumocfg or traffic.routes):
+    if traffic.is_finished or not (traffic.sumocfg or traffic.routes):
         return True
     effects, _ = registry.active_traffic_effects(scenario)
     if any(effect.ADDS_TRAFFIC for effect in effects):
@@ -140,9 +140,16 @@ def _check_recorded_position(scenario: Scenario, name: str) -> None:
 def check_finished_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
     """Report finished files without the requested frames, with vehicles of unknown size, or that disappear."""
     scenario = inputs.scenario
-    if scenario.traffic.fcd is None:
-        return
     errors = ErrorCollector()
+    if scenario.traffic.tracks is not None:
+        where = f"{sumo_folder.traffic_location(scenario)}.tracks"
+        world = geolocation.scenario_georeference(scenario)
+        tracks = errors.attempt("traffic", lambda: recorded_tracks.read_recorded_tracks(scenario, world))
+        if tracks is not None:
+            yield from recorded_tracks.track_warnings(tracks, where)
+    if scenario.traffic.fcd is None:
+        yield from errors.findings
+        return
     window = errors.attempt("traffic", lambda: finished_fcd.fcd_window(scenario))
     if window is not None:
         content = window[1]

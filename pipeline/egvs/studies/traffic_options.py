@@ -77,8 +77,8 @@ def why_without_effect(scenario: Scenario, key: str) -> str:
 
 
 def _why_without_effect_in_period(traffic: TrafficConfig, key: str) -> str:
-    if traffic.fcd is not None:
-        return "the traffic is a finished file"
+    if traffic.is_finished:
+        return "the traffic was recorded"
     if key != _ROUTING_KEY:
         return ""
     if traffic.sumocfg is not None:

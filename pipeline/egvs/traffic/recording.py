@@ -26,7 +26,9 @@ from egvs.formats import xml
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import TrafficConfig
-from egvs.traffic import fcd, finished_fcd, locks, network, sumo, sumo_folder
+from egvs.tracks import cleaning
+from egvs.tracks.sizes import CLASS_SIZES
+from egvs.traffic import fcd, finished_fcd, locks, network, recorded_tracks, sumo, sumo_folder
 from egvs.traffic.count_fit import CountFit, count_fits, missed_count_warnings
 from egvs.traffic.locks import DemandKey, RegionWatch, SumoFiles, WatchedRegion, describe_distance
 from egvs.traffic.sumo_folder import SimulationFolder, Timing
@@ -95,6 +97,12 @@ class Recording:
         Why a watched region is locked, by name; only locked regions. None where no region was watched.
     types
         The vehicle types of a finished file with their sizes.
+    uncounted_types
+        Types that do not count as vehicles: people on foot and on bicycles among recorded tracks.
+    tracks
+        What was read, changed and left out of recorded tracks, as JSON; None for other traffic.
+    warnings
+        Warnings about the source.
     """
 
     rows: Iterable[pa.Table]
@@ -111,6 +119,9 @@ class Recording:
     teleports: Sequence[locks.Teleport] = ()
     locked: Mapping[str, str] | None = None
     types: Mapping[str, finished_fcd.SizedType] = field(default_factory=dict)
+    uncounted_types: frozenset[str] = frozenset()
+    tracks: Mapping[str, Any] | None = None
+    warnings: Sequence[Diagnostic] = ()
 
 
 def record_traffic(
@@ -150,17 +161,19 @@ def record_traffic(
     Raises
     ------
     InputError
-        When ``traci`` is given for a finished file, or an extension does not support the scenario.
+        When ``traci`` is given for recorded traffic, or an extension does not support the scenario.
     """
-    if scenario.traffic.fcd is not None and traci is not None:
+    if scenario.traffic.is_finished and traci is not None:
         hint = "Set network or sumocfg in [traffic] instead."
-        raise InputError("--traci", "the scenario uses a finished FCD file", hint)
+        raise InputError("--traci", "the traffic of the scenario was recorded before", hint)
     for extension in extensions:
         error = extension.scenario_error(scenario)
         if error is not None:
             raise error
     if scenario.traffic.fcd is not None:
         return _record_finished(scenario, folder, world)
+    if scenario.traffic.tracks is not None:
+        return _record_tracks(scenario, folder, world)
     if traci is not None:
         return _record_running(scenario, *traci, extensions)
     return _record_simulated(scenario, folder, progress, extensions, regions or {})
@@ -181,6 +194,29 @@ def _record_finished(scenario: Scenario, folder: Path, world: Georeference) -> I
     if survey.metadata is None:
         rows = fcd.georeference_rows(rows, world, path, scenario.traffic.fcd_geo)
     yield Recording(rows, window, sizes, where, source=f"{where}.fcd = {name!r}", types=types)
+
+
+@contextmanager
+def _record_tracks(scenario: Scenario, folder: Path, world: Georeference) -> Iterator[Recording]:
+    where = sumo_folder.traffic_location(scenario)
+    sumo_folder.copy_network(scenario, folder)
+    recorded = recorded_tracks.read_recorded_tracks(scenario, world)
+    source = f"{where}.tracks"
+    vulnerable = frozenset(
+        name
+        for name, track_class in zip(recorded.type_names, recorded.tracks.classes, strict=True)
+        if track_class in cleaning.VULNERABLE
+    )
+    yield Recording(
+        recorded.rows(),
+        recorded.window,
+        recorded.vehicle_sizes({name: size.vclass for name, size in CLASS_SIZES.items()}),
+        where,
+        source=source,
+        uncounted_types=vulnerable,
+        tracks=recorded.summary(),
+        warnings=tuple(recorded_tracks.track_warnings(recorded, source)),
+    )
 
 
 @contextmanager

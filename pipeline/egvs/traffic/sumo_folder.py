@@ -145,9 +145,11 @@ def demand_files(scenario: Scenario) -> user_files.DemandFiles:
 
 
 def network_path(scenario: Scenario) -> Path | None:
-    """Return the network of a scenario, if any: that of the simulation, or ``traffic.roads`` with a finished file."""
+    """Return the network of a scenario, if any: that of the simulation, or ``traffic.roads`` of recorded
+    traffic.
+    """
     traffic = scenario.traffic
-    if traffic.fcd is not None:
+    if traffic.is_finished:
         return None if traffic.roads is None else scenario.find(traffic.roads, "traffic.roads")
     if traffic.network is not None:
         return scenario.find(traffic.network, "traffic.network")
@@ -169,14 +171,17 @@ def read_network(scenario: Scenario) -> network.Network | None:
 
 
 def copy_network(scenario: Scenario, folder: Path) -> None:
-    """Empty a folder, and copy the network of a scenario with a finished file to it, if there is one."""
+    """Empty a folder, and copy the network of a scenario with recorded traffic to it, if there is one."""
     path = network_path(scenario)
     if path is None:
         return
     traffic = scenario.traffic
-    assert traffic.fcd is not None, "a simulation needs prepare_simulation"
-    vtypes = [scenario.find(name, "traffic.vtypes") for name in traffic.vtypes]
-    _make_empty(folder, [scenario.find(traffic.fcd, "traffic.fcd"), path, *vtypes])
+    assert traffic.is_finished, "a simulation needs prepare_simulation"
+    inputs = [scenario.find(name, "traffic.vtypes") for name in traffic.vtypes]
+    inputs += [scenario.find(name, "traffic.tracks") for name in traffic.tracks or ()]
+    if traffic.fcd is not None:
+        inputs.append(scenario.find(traffic.fcd, "traffic.fcd"))
+    _make_empty(folder, [*inputs, path])
     if network.is_osm(path):
         convert_osm_to_network(path, folder / NETWORK_FILE)
     else:

@@ -392,7 +392,9 @@ def write_trajectories(
         statistics.blocker_frames = max(0, int(blocker_s / period_s) - 1)  # it stopped between two frames
     changes: list[BoxChange] | None = None
     for group in frame_groups(recording, GROUP_FRAMES):
-        uncounted = frozenset[str]().union(*(extension.uncounted_types(recording.sizes) for extension in extensions))
+        uncounted = recording.uncounted_types.union(
+            *(extension.uncounted_types(recording.sizes) for extension in extensions)
+        )
         if changes is None:  # here, because a running SUMO reports sizes with its first rows
             vehicle_sizes = {name: size for name, size in recording.sizes.items() if name not in uncounted}
             candidates = [extension.box_change(scenario, vehicle_sizes) for extension in extensions]
@@ -439,8 +441,14 @@ def check_recording(scenario: Scenario, statistics: TrafficStatistics, recording
         When there is no vehicle, the number of vehicles is not maintained, or a vehicle stands for good.
     """
     traffic = scenario.traffic
-    if not statistics.rows:
-        source = traffic.fcd or traffic.sumocfg or ", ".join(traffic.routes) or traffic.network
+    if not statistics.rows and not statistics.uncounted:
+        source = (
+            traffic.fcd
+            or ", ".join(traffic.tracks or ())
+            or traffic.sumocfg
+            or ", ".join(traffic.routes)
+            or traffic.network
+        )
         period = f" of the period {scenario.period!r}" if scenario.period else ""
         raise RunError(
             f"{recording.where}: no vehicle of {source} is in any of {statistics.frames} frames{period}."

@@ -300,8 +300,8 @@ def _method_section(record: HeldOutTraffic, sites: Sequence[SiteSummary]) -> str
     noise = ", ".join(f"{sensor} {sigma_m:g} m" for sensor, sigma_m in noise_m.items())
     numbers = record.numbers
     spacing_s = int(np.diff(numbers).min(initial=numbers[-1])) * scenario.traffic.frame_period_s
-    if scenario.traffic.fcd is not None:
-        traffic = "The traffic is read from a finished file, so these are the frames that the TPOG was computed from."
+    if scenario.traffic.is_finished:
+        traffic = "The traffic was recorded, so these are the frames that the TPOG was computed from."
     else:
         traffic = "The traffic has a seed of its own: the TPOG was not computed from it."
     rows = [

@@ -180,7 +180,7 @@ def default_spacing_s(scenario: Scenario, frames: int) -> float:
     user's demand have an end: where their frames do not allow as much, it is shorter, but at least ``MIN_SPACING_S``.
     """
     traffic = scenario.traffic
-    if not traffic.periods and traffic.fcd is None and not traffic.has_user_demand:
+    if not traffic.periods and not traffic.is_finished and not traffic.has_user_demand:
         return DEFAULT_SPACING_S
     recorded = sum(finished_fcd.recorded_frames(period) for period in scenario.by_period().values())
     widest = (recorded - 1) // max(frames - 1, 1)
@@ -203,7 +203,7 @@ def held_out_scenario(scenario: Scenario, frames: int, apart_s: float) -> Scenar
         If the simulated time would exceed the limit of a scenario.
     """
     traffic = scenario.traffic
-    if traffic.fcd is not None:
+    if traffic.is_finished:
         return scenario
 
     state = np.random.SeedSequence((scenario.seed, _SEED_STREAM)).generate_state(1, np.uint64)

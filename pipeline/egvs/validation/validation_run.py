@@ -105,15 +105,15 @@ def _check_scenario(scenario: Scenario, folder: Path, progress: ProgressCallback
 def _same_traffic_warnings(
     scenario: Scenario, record: HeldOutTraffic, frames: Sequence[TrafficFrame]
 ) -> Iterator[Diagnostic]:
-    """Warn if vehicles of the held-out frames are also in the traffic of the TPOG: those of a finished file."""
+    """Warn if vehicles of the held-out frames are also in the traffic of the TPOG: recorded traffic."""
     periods = list(scenario.by_period().values())
     vehicles = record.vehicles_in_region(frames)
-    n_shared = sum(periods[period].traffic.fcd is not None for period, _ in vehicles)
+    n_shared = sum(periods[period].traffic.is_finished for period, _ in vehicles)
     if n_shared:
         yield Diagnostic(
             "traffic not held out",
-            f"{scenario.file}: traffic.fcd",
-            "the traffic is a finished file, so sites are evaluated with the frames that the TPOG was computed from: "
+            f"{scenario.file}: traffic",
+            "the traffic was recorded, so sites are evaluated with the frames that the TPOG was computed from: "
             f"{n_shared:,} of {len(vehicles):,} vehicles ({n_shared / len(vehicles):.0%}) are in both",
             "Use a network or a sumocfg to simulate held-out traffic.",
         )
