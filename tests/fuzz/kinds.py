@@ -165,6 +165,18 @@ _ALL = (
     _new("map.osm.pbf", meaning.bytes_themselves), _lanelets("lanelets.osm"), _lanelets("lanelets.osm.gz"),
     _beside("city.gml", meaning.bytes_themselves), _beside("dem.gml", meaning.bytes_themselves),
     _beside("city.json", meaning.text_json), _beside("houses.geojson", meaning.text_json),
+    _road_map("roads.net.xml", meaning.gzipped(meaning.xml)), _road_map("roads.xodr", meaning.bytes_themselves),
+    *(_beside(f"houses.{form}", meaning.bytes_themselves, bases.vectors) for form in ("gpkg", "shp", "kml", "parquet")),
+    _beside("houses.shp", meaning.bytes_themselves, bases.vectors, "houses.dbf"),
+    *(_beside(f"terrain.{form}", meaning.bytes_themselves, bases.on_terrain) for form in ("asc", "tif", "xml")),
+    _beside("terrain.asc", meaning.bytes_themselves, bases.on_terrain, "terrain.prj"),
+    *(_beside(f"survey.{form}", reads, bases.surveyed) for form, reads in (
+        ("csv", meaning.rows), ("pcd", meaning.pcd), ("pcd.gz", meaning.bytes_themselves), ("ply", meaning.ply),
+        ("las", meaning.bytes_themselves), ("laz", meaning.bytes_themselves), ("e57", meaning.bytes_themselves))),
+    *(_beside(f"house.{form}", reads, bases.modelled) for form, reads in (
+        ("obj", meaning.obj), ("ply", meaning.ply), ("stl", meaning.stl), ("off", meaning.bytes_themselves),
+        ("gltf", meaning.text_json), ("glb", meaning.glb))),
+    _beside("house.gltf", meaning.bytes_themselves, bases.modelled, "house.bin"),
     _tracks("vehicle_tracks_000.csv", _TAF_BW, meaning.table),
     _tracks("meta_data.csv", _TAF_BW, meaning.table, "vehicle_tracks_000.csv"),
     _tracks("Veh_smoothed_tracks.csv", bases.tracks(writers.write_sind, "car", "pedestrian"), meaning.table),
@@ -178,3 +190,27 @@ _ALL = (
     _tracks("Label.csv", bases.tracks(writers.write_lumpi, "car", "pedestrian"), meaning.commas),
     _tracks("tracks.csv", bases.mapped_tracks(False), meaning.table, "", "mapping"),
     _tracks("tracks.jsonl", bases.mapped_tracks(True), meaning.json_lines, "", "mapping"),
+    Kind("wanted junctions.csv", "wanted.csv", bases.wanted, meaning.rows, results=("made/junctions/*/*.csv",),
+         verb=("city", "new", "made", "--osm", "map.osm", "--junctions", "wanted.csv")),
+    _city("city.toml", "city.toml", meaning.toml), _city("junctions.csv", "junctions.csv", meaning.rows),
+    _city("junction scenario.toml", "junctions/west/scenario.toml", meaning.toml),
+    _city("city fcd.csv", "fcd.csv", meaning.gzipped(meaning.semicolons)),
+    *(_artefact(name, verb) for name, verb in (
+        ("trajectories.parquet", "tpog"), ("statics.ply", "scan"), ("tpog.parquet", "score"),
+        ("scans.parquet", "score"), ("scores.parquet", "report"), ("blindspots.parquet", "report"),
+        ("visibility.parquet", "run"), ("statics.ply", "run"), ("trajectories.parquet", "run"))),
+    Kind("run.json run", "out/run.json", bases.plain, meaning.text_json, (_RUN,)),
+    Kind("run.json verify", "out/run.json", bases.plain, meaning.text_json, (_RUN,), ("verify", "out"), (".out",),
+         names_others=True, may_differ=True),
+    Kind("run.json compare", "out/run.json", bases.plain, meaning.text_json,
+         (_RUN, ("run", "scenario", "--out", "other", "--jobs", "1")), ("compare", "out", "other"), (".out",),
+         names_others=True),
+    Kind("store note", "store/*/entry.json", bases.plain, meaning.nothing_else,
+         (("run", "scenario", "--out", "first", "--jobs", "1"),), store=True),
+    Kind("study cache", "out/accuracy/**/*.json", bases.plain, meaning.nothing_else, (_STUDY,), _STUDY, (), store=True),
+    Kind("store artefact", "store/*/*.p*", bases.plain, meaning.nothing_else,
+         (("run", "scenario", "--out", "first", "--jobs", "1"),), store=True),
+)  # fmt: skip
+
+KINDS = {kind.name: kind for kind in _ALL}
+"""By name."""
