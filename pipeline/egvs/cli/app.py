@@ -610,6 +610,14 @@ def new(
             help="A point of the files without a reference system, in metres, and where it is; give two points.",
         ),
     ] = None,
+    surface: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE",
+            help="A raster of the heights of roofs and trees. With a terrain, buildings without a height get their"
+            " height from it.",
+        ),
+    ] = None,
 ) -> None:
     """Create a scenario from maps of roads, buildings and other objects.
 
@@ -639,7 +647,7 @@ def new(
         pole_spacing_m = cli_options.pole_spacing_m(*poles)
     options = NewScenarioOptions(
         lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=demand, pole_spacing_m=pole_spacing_m,
-        align=tuple(cli_options.point_pair(text) for text in align or []),
+        align=tuple(cli_options.point_pair(text) for text in align or []), surface=tuple(surface or []),
     )  # fmt: skip
     scenario = new_scenario.create_scenario(folder, paths, location, options)
     new_summary.print_new_scenario(scenario)
