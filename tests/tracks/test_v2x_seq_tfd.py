@@ -67,8 +67,8 @@ def test_recognises_its_files(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("row", "expected"),
     [
-        (CAR.replace(",10,5,", ",nan,5,"), "row 1: x: expected a number, got 'nan'"),
-        (CAR.replace(",10,5,", ",ten,5,"), "row 1: x: expected a number, got 'ten'"),
+        (CAR.replace(",10,5,", ",nan,5,"), "line 2: x: expected a number, got 'nan'"),
+        (CAR.replace(",10,5,", ",ten,5,"), "line 2: x: expected a number, got 'ten'"),
         (CAR.replace(",10,5,", ",1e300,5,"), "x_m: expected a number between -1e+08 and 1e+08, got 1e+300"),
         (CAR.replace(",4.6,", ",-4.6,"), "length_m: expected a number between 0 and 1000, got -4.6"),
         ("PEK,1", "line 2: expected 16 cells, got 2"),
