@@ -35,8 +35,9 @@ def main(arguments: Sequence[str]) -> None:
         if "mapping" in arguments:
             tracks = user_table.read(path, MAPPING)
         else:
-            track_readers.source_files(path)
-            tracks = track_readers.find_reader(path).read(path)
+            reader = track_readers.find_reader(path)
+            reader.companions(path)
+            tracks = reader.read(path)
         columns = {key: getattr(tracks, key) for key in _COLUMNS}
         for key in ("time_s", "x_m", "y_m"):
             if not np.isfinite(columns[key]).all():
