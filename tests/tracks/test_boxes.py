@@ -58,12 +58,12 @@ def test_rows_become_tracks() -> None:
 @pytest.mark.parametrize(
     ("name", "time_s", "values", "expected"),
     [
-        ("a", math.nan, (0, 0, 0, 0, 1, 1, 1), "time_s: expected a number between -1e+11 and 1e+11, got nan"),
+        ("a", math.nan, (0, 0, 0, 0, 1, 1, 1), "time_s: expected a number between -1e+10 and 1e+10, got nan"),
         ("a", 1, (math.inf, 0, 0, 0, 1, 1, 1), "file: track 'a', time 1 s: x_m: expected a number"),
         ("a", 1, (0, math.nan, 0, 0, 1, 1, 1), "y_m: expected a number"),
         ("a", 1, (0, 0, math.inf, 0, 1, 1, 1), "z_m: expected a number"),
         ("a", 1, (0, 0, 0, 1e9, 1, 1, 1), "yaw_rad: expected a number between -10000 and 10000, got 1e+09"),
-        ("a", 1, (0, 0, 0, 0, 1, 1001, 1), "width_m: expected a number between 0 and 1000, got 1001"),
+        ("a", 1, (0, 0, 0, 0, 1, 101, 1), "width_m: expected a number between 0 and 100, got 101"),
         ("x" * 1001, 1, (0, 0, 0, 0, 1, 1, 1), "expected a name of at most 1,000 characters, got 1,001"),
     ],
 )

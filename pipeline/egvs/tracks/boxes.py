@@ -16,17 +16,15 @@ import numpy as np
 from egvs.core import limits
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.scenario.fields import MAX_COORDINATE_M
+from egvs.tracks.columns import MAX_ANGLE_RAD, MAX_SIZE_M, MAX_TIME_S
 from egvs.tracks.model import TrackFrame, Tracks
 
-_MAX_TIME_S = 1e11
-_MAX_COORDINATE_M = 1e8
-_MAX_ANGLE_RAD = 1e4
-_MAX_SIZE_M = 1000.0
 _RANGES = {
-    "time_s": (-_MAX_TIME_S, _MAX_TIME_S), "x_m": (-_MAX_COORDINATE_M, _MAX_COORDINATE_M),
-    "y_m": (-_MAX_COORDINATE_M, _MAX_COORDINATE_M), "z_m": (-_MAX_COORDINATE_M, _MAX_COORDINATE_M),
-    "yaw_rad": (-_MAX_ANGLE_RAD, _MAX_ANGLE_RAD), "length_m": (0.0, _MAX_SIZE_M), "width_m": (0.0, _MAX_SIZE_M),
-    "height_m": (0.0, _MAX_SIZE_M),
+    "time_s": (-MAX_TIME_S, MAX_TIME_S), "x_m": (-MAX_COORDINATE_M, MAX_COORDINATE_M),
+    "y_m": (-MAX_COORDINATE_M, MAX_COORDINATE_M), "z_m": (-MAX_COORDINATE_M, MAX_COORDINATE_M),
+    "yaw_rad": (-MAX_ANGLE_RAD, MAX_ANGLE_RAD), "length_m": (0.0, MAX_SIZE_M), "width_m": (0.0, MAX_SIZE_M),
+    "height_m": (0.0, MAX_SIZE_M),
 }  # fmt: skip
 _REQUIRED = ("time_s", "x_m", "y_m")
 _MAX_NAME_LENGTH = 1000
