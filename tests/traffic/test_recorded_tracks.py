@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 import egvs
+from egvs.artefacts import parquet
 from egvs.artefacts.run_record import RunRecord
 from egvs.artefacts.tpog import read_tpog
 from egvs.formats.georeference import Georeference, WorldFrame
@@ -255,3 +256,30 @@ def test_own_table_gives_the_same_tpog(mini: Path, run_egvs, tmp_path: Path) -> 
     make_tpog(run_egvs, mini, tmp_path / "own")
     counts = [read_tpog(tmp_path / name / "tpog.parquet").counts for name in ("interaction", "own")]
     np.testing.assert_array_equal(*counts)
+
+
+def test_long_gap_is_unknown_and_not_empty(mini: Path, run_egvs, tmp_path: Path) -> None:
+    """Without the rows of one car between 6 and 10 s (frames 12 to 20), voxels on its way there are scaled."""
+    rows = [row for row in boxes_of_fcd() if not (row[0] == "east" and 6.0 <= row[1] <= 10.0)]
+    use_tracks(mini, interaction_csv(rows))
+    make_tpog(run_egvs, mini, tmp_path / "run")
+    (gap,) = parquet.read_metadata(tmp_path / "run" / "trajectories.parquet", "trajectories")["unknown_boxes"]
+    assert gap["frames"] == [12, 21]
+    assert gap["size_m"] == [4.5, 1.8]
+    np.testing.assert_allclose([*gap["start_m"], *gap["end_m"]], [5.5 * 2 + 1 - 2.25, -2, 10.5 * 2 + 1 - 2.25, -2])
+    stages = RunRecord.read(tmp_path / "run").stages
+    assert stages["traffic"].summary["tracks"]["unknown_frames"] == 9
+    assert stages["tpog"].summary["unknown_gaps"] == 1
+    assert stages["tpog"].summary["scaled_voxels"] + stages["tpog"].summary["unknown_voxels"] > 0
+
+
+def test_short_gap_is_interpolated(mini: Path, run_egvs, tmp_path: Path) -> None:
+    """Cars on a straight line: without two rows of one car, the trajectories are the same."""
+    use_tracks(mini, interaction_csv(boxes_of_fcd()))
+    make_tpog(run_egvs, mini, tmp_path / "complete")
+    rows = [row for row in boxes_of_fcd() if not (row[0] == "east" and row[1] in (6.0, 6.5))]
+    use_tracks(mini, interaction_csv(rows))
+    make_tpog(run_egvs, mini, tmp_path / "gap")
+    counts = [read_tpog(tmp_path / name / "tpog.parquet").counts for name in ("complete", "gap")]
+    np.testing.assert_array_equal(*counts)
+    assert RunRecord.read(tmp_path / "gap").stages["traffic"].summary["tracks"]["interpolated_gaps"] == 1

@@ -637,6 +637,14 @@ def new(
             " for metres of the road map.",
         ),
     ] = None,
+    surface: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE",
+            help="A raster of the heights of roofs and trees. With a terrain, buildings without a height get their"
+            " height from it.",
+        ),
+    ] = None,
 ) -> None:
     """Create a scenario from maps of roads, buildings and other objects.
 
@@ -669,8 +677,8 @@ def new(
         pole_spacing_m = cli_options.pole_spacing_m(*poles)
     options = NewScenarioOptions(
         lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=demand, pole_spacing_m=pole_spacing_m,
-        align=tuple(cli_options.point_pair(text) for text in align or []), tracks=tuple(tracks or ()),
-        track_crs=track_crs, track_columns=track_columns,
+        align=tuple(cli_options.point_pair(text) for text in align or []), surface=tuple(surface or []),
+        tracks=tuple(tracks or ()), track_crs=track_crs, track_columns=track_columns,
     )  # fmt: skip
     scenario = new_scenario.create_scenario(folder, paths, location, options)
     new_summary.print_new_scenario(scenario)

@@ -80,6 +80,12 @@ class TrackSource:
             found |= dict.fromkeys(find_reader(path).companions(path))
         return [path for path in found if path not in self.paths]
 
+    def reader_modules(self) -> list[str]:
+        """Return the modules that read the files."""
+        if self.columns is not None:
+            return [user_table.__name__]
+        return sorted({find_reader(path).__name__ for path in self.paths})
+
     def read(self) -> list[Tracks]:
         """Read each file; one that was read before is read again only when it has changed.
 

@@ -10,7 +10,7 @@ Tracks stand on the ground: heights of a recording are not used, because its zer
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from egvs.tracks.cleaning import CleanTracks
 from egvs.tracks.coverage import Coverage
 from egvs.tracks.model import TrackFrame, Tracks
 from egvs.tracks.resampling import ResampledTracks
-from egvs.tracks.sizes import class_sizes
+from egvs.tracks.sizes import CLASS_SIZES, class_sizes
 from egvs.tracks.track_readers import TrackSource
 from egvs.traffic import sumo_folder, track_alignment
 from egvs.traffic.fcd import FCD_SCHEMA, FrameWindow
@@ -85,10 +85,15 @@ class RecordedTracks:
         sizes_m: list[list[float]] = np.round(self.tracks.size_m, _SIZE_DIGITS).tolist()
         return sizes_m
 
-    def vehicle_sizes(self, vclasses: Mapping[str, str]) -> dict[str, VehicleSize]:
-        """Return the size of each vehicle type; ``vclasses`` are SUMO's classes by class of road user."""
+    def vulnerable_types(self) -> frozenset[str]:
+        """Return the vehicle types of people on foot and on bicycles."""
+        types = zip(self.type_names, self.tracks.classes, strict=True)
+        return frozenset(type_name for type_name, name in types if name in cleaning.VULNERABLE)
+
+    def vehicle_sizes(self) -> dict[str, VehicleSize]:
+        """Return the size of each vehicle type."""
         return {
-            type_name: VehicleSize(*size_m, vclasses[name])
+            type_name: VehicleSize(*size_m, CLASS_SIZES[name].vclass)
             for type_name, name, size_m in zip(self.type_names, self.tracks.classes, self._sizes_m, strict=True)
         }
 
@@ -115,6 +120,25 @@ class RecordedTracks:
                 ],
                 schema=FCD_SCHEMA,
             )
+
+    def unknown_boxes(self) -> list[dict[str, Any]]:
+        """Return the gaps in which positions are unknown, as JSON; frames count from the first of the recording.
+
+        Keys: ``frames`` (first, and one after the last), ``start_m`` and ``end_m`` (x, y of the centre before and after
+        the gap, world frame), ``yaw_rad``, ``size_m`` (length, width).
+        """
+        gaps = self.boxes.unknown
+        rows = zip(gaps.frames, gaps.start_m, gaps.end_m, gaps.yaw_rad, gaps.track, strict=True)
+        return [
+            {
+                "frames": frames.tolist(),
+                "start_m": np.round(start_m, 3).tolist(),
+                "end_m": np.round(end_m, 3).tolist(),
+                "yaw_rad": round(float(yaw_rad), 6),
+                "size_m": self._sizes_m[track][:2],
+            }
+            for frames, start_m, end_m, yaw_rad, track in rows
+        ]
 
     def summary(self) -> dict[str, Any]:
         """Return what was read, changed and left out, as JSON."""
