@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from egvs.core.errors import InputError
-from egvs.tracks.boxes import Box, BoxRows, ClassNames, Pose, front_of, is_rotation, to_rotations, yaw_of
+from egvs.tracks.boxes import Box, BoxRows, ClassNames, Pose, front_of, is_rotation, make_tracks, to_rotations, yaw_of
 from egvs.tracks.documents import Node
 from egvs.tracks.model import TrackFrame
 
@@ -45,8 +45,8 @@ def test_pose_moves_box_as_scipy() -> None:
 
 def test_rows_become_tracks() -> None:
     rows = BoxRows(Path("file"))
-    rows.add("b", "car", 0.5, Box(1, 2, math.nan, 0.3, 4, 2, math.nan))
-    rows.add("a", "bus", 0.6, Box(3, 4, 5, math.nan, 0, 0, 0))
+    rows.add(Path("file"), "b", "car", 0.5, Box(1, 2, math.nan, 0.3, 4, 2, math.nan))
+    rows.add(Path("file"), "a", "bus", 0.6, Box(3, 4, 5, math.nan, 0, 0, 0))
     tracks = rows.to_tracks(TrackFrame("EPSG:25832"), ["note"])
     assert len(rows) == 2 and tracks.names == ("a", "b") and tracks.classes == ("bus", "car")
     assert tracks.track.tolist() == [1, 0] and tracks.time_s.tolist() == [0.5, 0.6]
@@ -68,10 +68,15 @@ def test_rows_become_tracks() -> None:
     ],
 )
 def test_impossible_row_is_rejected(name: str, time_s: float, values: tuple[float, ...], expected: str) -> None:
-    rows = BoxRows(Path("file"))
-    rows.add(name, "car", time_s, Box(*values))
+    rows = BoxRows(Path("folder"))
     with pytest.raises(InputError) as error:
+        rows.add(Path("file"), name, "car", time_s, Box(*values))
         rows.to_tracks(TrackFrame(), [])
+    assert expected in str(error.value)
+    keys = ("time_s", "x_m", "y_m", "z_m", "yaw_rad", "length_m", "width_m", "height_m")
+    columns = dict(zip(keys, np.array([(time_s, *values)], dtype=np.float64).T, strict=True))
+    with pytest.raises(InputError) as error:
+        make_tracks(Path("file"), [name], ["car"], columns, TrackFrame(), [])
     assert expected in str(error.value)
 
 

@@ -101,6 +101,14 @@ def test_all_sweeps_of_sensor_are_one_recording(tmp_path: Path) -> None:
     assert "all 2 sweeps" in tracks.sources[0]
 
 
+def test_message_names_the_damaged_sweep(tmp_path: Path) -> None:
+    first = sweep(tmp_path, {"a": tumtraf_object()})
+    second = sweep(tmp_path, {"a": tumtraf_object([1e9, *CAR[1:]])}, name=f"1646667310_144009872_{SENSOR}.json")
+    with pytest.raises(InputError) as error:
+        openlabel.read(first)
+    assert str(error.value).startswith(f"{second}: track 'a', time 1.64667e+09 s: x_m: expected a number")
+
+
 def test_labels_in_common_road_have_z_at_bottom(tmp_path: Path) -> None:
     path = sweep(tmp_path, {"a": tumtraf_object([1, 2, 0, 0, 0, 0, 1, 4, 2, 1.5], coordinate_system="common_road")})
     assert only_box(path)[3] == 0.75

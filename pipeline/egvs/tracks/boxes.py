@@ -106,8 +106,14 @@ class BoxRows:
     def __len__(self) -> int:
         return len(self._names)
 
-    def add(self, name: str, cls: str, time_s: float, box: Box) -> None:
-        """Append a row: the name of the track, the class, the time and the box."""
+    def add(self, file: Path, name: str, cls: str, time_s: float, box: Box) -> None:
+        """Append a row: the file it is from, the name of the track, the class, the time and the box.
+
+        InputError as of :func:`make_tracks`.
+        """
+        for (key, (lowest, highest)), value in zip(_RANGES.items(), (time_s, *box), strict=True):
+            if not lowest <= value <= highest and (key in _REQUIRED or not math.isnan(value)):
+                raise _range_error(file, name, time_s, key, value)
         self._names.append(name)
         self._classes.append(cls)
         self._numbers.extend((time_s, *box))
@@ -150,10 +156,15 @@ def make_tracks(
         if key not in _REQUIRED:
             is_valid |= np.isnan(values)
         for row in np.flatnonzero(~is_valid).tolist():
-            where = f"{path}: track {names[row][:80]!r}, time {columns['time_s'][row]:g} s: {key}"
-            problem = f"expected a number between {lowest:g} and {highest:g}, got {values[row]:g}"
-            raise InputError(where, problem, "Correct the row, or remove it.")
+            raise _range_error(path, names[row], float(columns["time_s"][row]), key, float(values[row]))
     return Tracks.from_rows(names, classes, columns, frame, sources)
+
+
+def _range_error(file: Path, name: str, time_s: float, key: str, value: float) -> InputError:
+    lowest, highest = _RANGES[key]
+    problem = f"expected a number between {lowest:g} and {highest:g}, got {value:g}"
+    where = f"{file}: track {name[:80]!r}, time {time_s:g} s: {key}"
+    return InputError(where, problem, "Correct the row, or remove it.")
 
 
 class ClassNames:

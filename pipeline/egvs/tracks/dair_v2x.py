@@ -85,7 +85,7 @@ def read(path: Path) -> Tracks:
                 name = str(track.value)
             else:
                 raise track.error("expected a text or a whole number")
-            rows.add(name, cls, sweep.time_s, _box(item, pose))
+            rows.add(sweep.label, name, cls, sweep.time_s, _box(item, pose))
     sources = []
     if is_calibrated:
         sources.append("positions are in the frame of the data set's maps, whose place on Earth is unknown")
