@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tests.fuzz import bases, meaning, read_tracks
 from tests.fuzz.meaning import Meaning
-from tests.tracks import writers
+from tests.tracks import writers, writers_json
 
 Maker = Callable[[str], Callable[[Path], None]]
 """Returns what writes the base of a kind, by the name of its file."""
@@ -188,6 +188,19 @@ _ALL = (
     _tracks("trajectories.csv", bases.tracks(writers.write_ngsim, "car", "truck"), meaning.table),
     _tracks("20181024_d1_0830_0900.csv", bases.tracks(writers.write_pneuma, "car", "bus"), meaning.semicolons),
     _tracks("Label.csv", bases.tracks(writers.write_lumpi, "car", "pedestrian"), meaning.commas),
+    _tracks("labels.json", bases.tracks(writers_json.write_openlabel, "car", "pedestrian"), meaning.lenient_json),
+    _tracks(f"*_{writers_json.SENSOR}.json", bases.tracks(writers_json.write_tumtraf, "car", "bus"),
+            meaning.lenient_json, writers_json.sweep_name(0.0)),
+    *(_tracks(file, bases.tracks(writers_json.write_dair_v2x, "car", "pedestrian"), meaning.lenient_json,
+              "label/virtuallidar/000000.json")
+      for file in ("label/virtuallidar/*.json", "data_info.json", "calib/virtuallidar_to_world/*.json")),
+    _tracks("10001.csv", bases.tracks(writers_json.write_v2x_seq_tfd, "car", "bicycle"), meaning.table),
+    _tracks("scenario_hand-made.parquet", bases.tracks(writers_json.write_argoverse2_scenario, "car", "bus"),
+            meaning.parquet),
+    *(_tracks(file, bases.tracks(writers_json.write_argoverse2, "car", "bus"), meaning.feather, "annotations.feather")
+      for file in ("annotations.feather", "city_SE3_egovehicle.feather")),
+    _tracks("trace_gt_hand-made.osi", bases.tracks(writers_json.write_osi, "car", "tram"), meaning.bytes_themselves),
+    _tracks("trace.mcap", bases.tracks(writers_json.write_osi_mcap, "car", "tram"), meaning.bytes_themselves),
     _tracks("tracks.csv", bases.mapped_tracks(False), meaning.table, "", "mapping"),
     _tracks("tracks.jsonl", bases.mapped_tracks(True), meaning.json_lines, "", "mapping"),
     Kind("wanted junctions.csv", "wanted.csv", bases.wanted, meaning.rows, results=("made/junctions/*/*.csv",),
