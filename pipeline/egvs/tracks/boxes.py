@@ -27,7 +27,8 @@ _RANGES = {
     "height_m": (0.0, MAX_SIZE_M),
 }  # fmt: skip
 _REQUIRED = ("time_s", "x_m", "y_m")
-_MAX_NAME_LENGTH = 1000
+_MAX_NAME_LENGTH = 200
+"""Names are kept as long as the longest one, for each row."""
 
 
 class Box(NamedTuple):
