@@ -122,7 +122,7 @@ KEYS: dict[str, Change] = {
     **{
         f"traffic.track_columns.{key}": Change(value, MAPPED)
         for key, value in {
-            "time": "'s'", "id": "'x'", "x": "'a'", "y": "'a'", "z": "'a'", "yaw": "'l'", "length": "'w'",
+            "time": "'s'", "id": "'type'", "x": "'a'", "y": "'a'", "z": "'a'", "yaw": "'l'", "length": "'w'",
             "width": "'l'", "height": "'l'", "type": "'id'", "types": "{PKW='car'}", "default_type": "'bus'",
             "delimiter": "';'", "time_unit": "'ms'", "length_unit": "'ft'", "yaw_unit": "'deg'",
             "yaw_convention": "'cw_from_north'", "reference": "'front'", "z_reference": "'bottom'",
