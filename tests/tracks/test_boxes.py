@@ -64,7 +64,7 @@ def test_rows_become_tracks() -> None:
         ("a", 1, (0, 0, math.inf, 0, 1, 1, 1), "z_m: expected a number"),
         ("a", 1, (0, 0, 0, 1e9, 1, 1, 1), "yaw_rad: expected a number between -10000 and 10000, got 1e+09"),
         ("a", 1, (0, 0, 0, 0, 1, 101, 1), "width_m: expected a number between 0 and 100, got 101"),
-        ("x" * 1001, 1, (0, 0, 0, 0, 1, 1, 1), "expected a name of at most 1,000 characters, got 1,001"),
+        ("x" * 201, 1, (0, 0, 0, 0, 1, 1, 1), "expected a name of at most 200 characters, got 201"),
     ],
 )
 def test_impossible_row_is_rejected(name: str, time_s: float, values: tuple[float, ...], expected: str) -> None:

@@ -27,7 +27,8 @@ _RANGES = {
     "height_m": (0.0, MAX_SIZE_M),
 }  # fmt: skip
 _REQUIRED = ("time_s", "x_m", "y_m")
-_MAX_NAME_LENGTH = 1000
+_MAX_NAME_LENGTH = 200
+"""Names are kept as long as the longest one, for each row."""
 
 
 class Box(NamedTuple):
@@ -111,6 +112,7 @@ class BoxRows:
 
         InputError as of :func:`make_tracks`.
         """
+        _check_name(file, name)
         for (key, (lowest, highest)), value in zip(_RANGES.items(), (time_s, *box), strict=True):
             if not lowest <= value <= highest and (key in _REQUIRED or not math.isnan(value)):
                 raise _range_error(file, name, time_s, key, value)
@@ -146,10 +148,7 @@ def make_tracks(
     if not names:
         raise InputError(path, "contains no boxes of road users", "Use a file with labelled or tracked road users.")
     limits.ROWS.check(path, len(names))
-    longest = max(names, key=len)
-    if len(longest) > _MAX_NAME_LENGTH:
-        problem = f"expected a name of at most {_MAX_NAME_LENGTH:,} characters, got {len(longest):,}"
-        raise InputError(f"{path}: track {longest[:80]!r}", problem, "Use a shorter name.")
+    _check_name(path, max(names, key=len))
     for key, values in columns.items():
         lowest, highest = _RANGES[key]
         is_valid = (values >= lowest) & (values <= highest)
@@ -158,6 +157,12 @@ def make_tracks(
         for row in np.flatnonzero(~is_valid).tolist():
             raise _range_error(path, names[row], float(columns["time_s"][row]), key, float(values[row]))
     return Tracks.from_rows(names, classes, columns, frame, sources)
+
+
+def _check_name(file: Path, name: str) -> None:
+    if len(name) > _MAX_NAME_LENGTH:
+        problem = f"expected a name of at most {_MAX_NAME_LENGTH:,} characters, got {len(name):,}"
+        raise InputError(f"{file}: track {name[:80]!r}", problem, "Use a shorter name.")
 
 
 def _range_error(file: Path, name: str, time_s: float, key: str, value: float) -> InputError:
