@@ -153,7 +153,7 @@ def _is_finished(values: dict[str, Any]) -> bool:
 def _first_source(values: dict[str, Any], key: str) -> Any:
     """Return the source of the first period, where ``[traffic]`` has none: it serves for what all periods share."""
     periods = values.get("periods")
-    if not periods or any(values.get(source) is not None for source in ("network", "sumocfg")):
+    if not periods or any(values.get(source) is not None for source in TRAFFIC_SOURCES):
         return None
     return getattr(periods[0], key)
 

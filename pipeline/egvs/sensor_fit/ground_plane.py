@@ -3,8 +3,8 @@ r"""Find the ground below a sensor, and the height, roll and pitch that follow f
 Only returns count from surfaces whose normal is near that of the plane, so that walls and hedges do not. Candidate
 planes are drawn through three random returns (RANSAC, Fischler and Bolles 1981, Commun. ACM 24, 381-395); the one with
 most returns within 20 cm, which leaves room for a road's camber, is refined by least squares over the returns within
-2.5 robust standard deviations. Its returns are removed and the search is repeated, because roads, verges and yards often lie at different heights and
-only a person knows which of them is the ground of the map.
+2.5 robust standard deviations. Its returns are removed and the search is repeated, because roads, verges and yards
+often lie at different heights, and only a person knows which of them is the ground of the map.
 
 A plane with the unit normal n (upwards, in the sensor's frame) and the height h of the sensor above it satisfies
 :math:`n \cdot p = -h`. With the mount's rotation (roll first, then pitch, then yaw; nose up positive), the world's z

@@ -117,7 +117,7 @@ def _read_file(path: Path, name: str) -> list[Sweep]:
 
 def _read_npz(path: Path, name: str) -> Iterator[Sweep]:
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with path.open("rb") as file, zipfile.ZipFile(file), np.load(file, allow_pickle=False) as arrays:
             if not arrays.files:
                 raise InputError(name, "expected an array for each sweep, got none", _NPZ_HINT)
             for key in arrays.files:

@@ -1,4 +1,4 @@
-"""Find which channel fired each pulse of a sweep, from the points alone.
+r"""Find which channel fired each pulse of a sweep, from the points alone.
 
 Two kinds of files exist. An *organised* sweep has a slot for each pulse, with a missing return as NaN; slots run either
 channel by channel within a column (a column is one azimuth step), or column by column within a channel. Headers often
@@ -9,11 +9,11 @@ points lie on as many cones as the sensor has channels, and :func:`find_rings` s
 A return's optical path need not start at the origin of the frame. A channel at elevation e whose rays start at a height
 z0 on the axis gives points on the cone
 
-.. math:: z = \\rho \\tan e + z_0, \\qquad \\rho = \\sqrt{x^2 + y^2},
+.. math:: z = \rho \tan e + z_0, \qquad \rho = \sqrt{x^2 + y^2},
 
 so a few centimetres of offset smear the elevation of near points by more than the spacing of dense rings. Before
-clustering, one offset in radius and one in height for all channels are therefore chosen such that the elevations
-cluster best, as in the Hough transform of ALICE-LRI (Soutullo et al. 2025, arXiv 2510.20708).
+either, one offset in radius and one in height for all channels are therefore chosen such that the elevations cluster
+best, as in the Hough transform of ALICE-LRI (Soutullo et al. 2025, arXiv 2510.20708).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _ORGANISED_SPREAD_DEG = 0.2
 """Median spread of elevations within a channel, above which the slots are not in the tested order."""
 _SPREAD_RATIO = 1.5
 """A number of channels fits as well as the best one if its spread is at most this multiple of the least spread."""
-_ROUNDING_DEG = 1e-4
+_ROUNDING_DEG = 0.02
 _MIN_RETURNS_PER_CHANNEL = 20
 
 _OFFSETS_M = np.arange(-0.10, 0.1001, 0.004)
@@ -95,7 +95,10 @@ def find_layout(points_m: FloatArray, where: str) -> Layout:
 def _organised_layout(points_m: FloatArray) -> Layout | None:
     """Return the layout of an organised sweep; None if no number of channels fits."""
     n = len(points_m)
-    elevation_deg = np.degrees(np.arctan2(points_m[:, 2], np.hypot(points_m[:, 0], points_m[:, 1])))
+    returned = np.isfinite(points_m[:, 0])
+    elevation_deg = np.full(n, np.nan)
+    radius_m = np.hypot(points_m[returned, 0], points_m[returned, 1])
+    elevation_deg[returned] = _sharpest_elevations(radius_m, points_m[returned, 2])
     trials: list[tuple[float, int, str]] = []
     for channels in range(MIN_CHANNELS, min(MAX_CHANNELS, n // MIN_COLUMNS) + 1):
         if n % channels:
@@ -116,7 +119,6 @@ def _organised_layout(points_m: FloatArray) -> Layout | None:
         column, channel = np.divmod(slots, channels)
     else:
         channel, column = np.divmod(slots, n // channels)
-    returned = np.isfinite(elevation_deg)
     used = np.bincount(channel[returned], minlength=channels) >= _MIN_RETURNS_PER_CHANNEL
     fitted = np.where(used[channel], (np.cumsum(used) - 1)[channel], -1)
     return Layout(order, int(np.count_nonzero(used)), fitted, column, channels - int(np.count_nonzero(used)))
