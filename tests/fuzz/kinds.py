@@ -95,6 +95,12 @@ def _beside(name: str, reads: Meaning) -> Kind:
     return Kind(f"new {name}", name, bases.with_roads_map(name), reads, verb=verb, results=made)
 
 
+def _sweep(name: str, reads: Meaning) -> Kind:
+    """A sweep to which a sensor is fitted."""
+    verb = ("sensor", "fit", name, "--name", "mast", "--out", "made")
+    return Kind(f"sweep {name}", name, bases.sweep(name), reads, verb=verb, results=("made/sensor.toml",))
+
+
 def _city(name: str, file: str, reads: Meaning) -> Kind:
     """What the cut of a city's traffic reads."""
     verb = ("city", "traffic", "town")
@@ -140,6 +146,8 @@ _ALL = (
     _new("map.osm.pbf", meaning.bytes_themselves), _lanelets("lanelets.osm"), _lanelets("lanelets.osm.gz"),
     _beside("city.gml", meaning.bytes_themselves), _beside("dem.gml", meaning.bytes_themselves),
     _beside("city.json", meaning.text_json), _beside("houses.geojson", meaning.text_json),
+    _sweep("sweep.csv", meaning.rows), _sweep("sweep.pcd", meaning.pcd),
+    _sweep("sweep.ply.gz", meaning.gzipped(meaning.ply)), _sweep("sweep.npz", meaning.bytes_themselves),
     Kind("wanted junctions.csv", "wanted.csv", bases.wanted, meaning.rows, results=("made/junctions/*/*.csv",),
          verb=("city", "new", "made", "--osm", "map.osm", "--junctions", "wanted.csv")),
     _city("city.toml", "city.toml", meaning.toml), _city("junctions.csv", "junctions.csv", meaning.rows),
