@@ -285,6 +285,10 @@ def create_scenario(
         raise InputError(files.roads.path, problem, hint)
 
     notes = [*roads.notes, *zero.notes, *(() if terrain is None else terrain.notes), *ground_notes]
+    if surface is not None and not objects.counts.heights.get("building", Counter())[SURFACE_MODEL]:
+        notes.append(
+            "The surface model is not used: it is at least 2 m above the ground at no building without height."
+        )
     if at is None and not junction.signalised:
         notes.append(_NO_SIGNALS_NOTE)
     notes += _ring_notes(streets, junction)
