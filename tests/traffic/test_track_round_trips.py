@@ -57,7 +57,8 @@ ROUTES = """\
 def simulate(folder: Path, network: Path, pairs: list[tuple[str, str]]) -> Path:
     """Run SUMO; return its FCD of 500 frames, 0.1 s apart, with vehicles on all routes."""
     trips = "".join(
-        f'<trip id="{10 * number + route}" type="car" depart="{2.5 * number}" from="{start}" to="{end}" departSpeed="max"/>'
+        f'<trip id="{10 * number + route}" type="car" depart="{2.5 * number}" departSpeed="max"'
+        f' from="{start}" to="{end}"/>'
         for number in range(32)
         for route, (start, end) in enumerate(pairs)
     )
