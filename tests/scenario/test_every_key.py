@@ -116,6 +116,7 @@ KEYS: dict[str, Change] = {
     "traffic.fcd": Change("'others.csv'"),
     "traffic.fcd_geo": Change("true"),
     "traffic.tracks": Change("['other_tracks.csv']", TRACKED),
+    "traffic.pedestrian_tracks": Change("['tracks.csv']", NETWORK, "without_kinds.toml"),
     "traffic.track_gap_s": Change("3", TRACKED),
     "traffic.track_crs": Change("'EPSG:25832'", TRACKED),
     "traffic.coverage": Change("'others.geojson'", TRACKED),

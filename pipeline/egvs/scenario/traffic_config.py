@@ -173,6 +173,10 @@ _HELD_NUMBER_KEYS = frozenset({"vehicles_per_lane_km", "trips_per_s", "hold"})
 """Keys that maintain a number of vehicles, which have no effect with ``vehicles_per_h``."""
 
 
+_TRACK_KEYS = frozenset({"track_gap_s", "track_columns", "track_crs"})
+"""Keys that say how recorded tracks are read."""
+
+
 class UnusedKeys(NamedTuple):
     """Keys that are set although they have no effect.
 
@@ -204,8 +208,9 @@ def keys_without_effect(source: str) -> frozenset[str]:
         "vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s", "junction_blocker_s", "teleport_s",
     })  # fmt: skip
     for_fcd = frozenset({"vtypes", "fcd_geo"})
-    for_tracks = frozenset({"track_gap_s", "track_columns", "track_crs", "coverage"})
+    for_tracks = _TRACK_KEYS | {"coverage"}
     if source in FINISHED_SOURCES:
+        simulation |= {"pedestrian_tracks"}
         unused = simulation | demand - {"kinds"} | {"routes", "redraw_departures"}
         return unused | (for_tracks if source == "fcd" else for_fcd)
     unused = for_fcd | for_tracks | {"roads"}
@@ -242,6 +247,9 @@ class TrafficConfig(StrictModel):
     tracks: Tracks | None = Field(
         default_factory=lambda values: _first_source(values, "tracks"),
         description="Files of recorded tracks (see docs/tracks.md), all on one clock; nothing is simulated",
+    )
+    pedestrian_tracks: Tracks | None = Field(
+        None, description="Files of recorded pedestrians and bicycles, beside simulated vehicles"
     )
     track_gap_s: Positive = Field(
         2.0, description="Longest gap in a recorded track that is interpolated. In longer ones its position is unknown"
@@ -436,6 +444,8 @@ class TrafficConfig(StrictModel):
         if self.routes and source == "network":
             source = "routes"
         keys = self.model_fields_set & keys_without_effect(source)
+        if self.pedestrian_tracks is not None:
+            keys -= _TRACK_KEYS
         if not keys and self.counts:
             source = "counts"
             keys = self.model_fields_set & _RANDOM_TRIP_KEYS
