@@ -109,6 +109,12 @@ def _beside(name: str, reads: Meaning, make: Maker = bases.with_roads_map, mutat
     return Kind(f"new {mutated}", mutated, make(name), reads, verb=verb, results=made, names_others=mutated != name)
 
 
+def _sweep(name: str, reads: Meaning) -> Kind:
+    """A sweep to which a sensor is fitted."""
+    verb = ("sensor", "fit", name, "--name", "mast", "--out", "made")
+    return Kind(f"sweep {name}", name, bases.sweep(name), reads, verb=verb, results=("made/sensor.toml",))
+
+
 def _city(name: str, file: str, reads: Meaning) -> Kind:
     """What the cut of a city's traffic reads."""
     verb = ("city", "traffic", "town")
@@ -203,6 +209,8 @@ _ALL = (
     _tracks("trace.mcap", bases.tracks(writers_json.write_osi_mcap, "car", "tram"), meaning.bytes_themselves),
     _tracks("tracks.csv", bases.mapped_tracks(False), meaning.table, "", "mapping"),
     _tracks("tracks.jsonl", bases.mapped_tracks(True), meaning.json_lines, "", "mapping"),
+    _sweep("sweep.csv", meaning.rows), _sweep("sweep.pcd", meaning.pcd),
+    _sweep("sweep.ply.gz", meaning.gzipped(meaning.ply)), _sweep("sweep.npz", meaning.bytes_themselves),
     Kind("wanted junctions.csv", "wanted.csv", bases.wanted, meaning.rows, results=("made/junctions/*/*.csv",),
          verb=("city", "new", "made", "--osm", "map.osm", "--junctions", "wanted.csv")),
     _city("city.toml", "city.toml", meaning.toml), _city("junctions.csv", "junctions.csv", meaning.rows),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -20,6 +21,11 @@ def small_sensor(azimuth_deg: tuple[float, float] | None = None) -> Sensor:
     """Ten channels out of order, 900 azimuths; or a field of view, 0.4 degrees apart."""
     azimuths = 900 if azimuth_deg is None else round((azimuth_deg[1] - azimuth_deg[0]) / 0.4) + 1
     return Sensor("small", ELEVATIONS_DEG, OFFSETS_DEG, azimuths, 120.0, "test", azimuth_deg=azimuth_deg)
+
+
+def coarse_sensor() -> Sensor:
+    """The same channels with 300 azimuths."""
+    return replace(small_sensor(), azimuths=300)
 
 
 def sweep_of(truth: Truth, sensor: Sensor | None = None, seed: int = 0) -> FloatArray:

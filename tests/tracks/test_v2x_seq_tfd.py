@@ -87,3 +87,7 @@ def test_missing_column(tmp_path: Path) -> None:
     path = scene(tmp_path, CAR, header=",".join(TFD_COLUMNS).replace("theta", "angle"))
     with pytest.raises(InputError, match="expected a column 'theta'"):
         v2x_seq_tfd.read(path)
+    path = scene(tmp_path, CAR, header=",".join(TFD_COLUMNS).replace("theta", '"an\ngle"'))
+    with pytest.raises(InputError) as error:
+        v2x_seq_tfd.read(path)
+    assert "an gle" in str(error.value) and "\n" not in str(error.value)

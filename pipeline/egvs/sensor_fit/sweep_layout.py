@@ -167,11 +167,11 @@ def find_rings(points_m: FloatArray, where: str) -> Layout:
     elevation_deg = _sharpest_elevations(radius_m, height_m)
 
     centres_deg = _histogram_peaks(elevation_deg)
-    if len(centres_deg) < MIN_CHANNELS:
-        raise InputError(where, f"expected at least {MIN_CHANNELS} rings, got {len(centres_deg)}", _HINT)
+    _check_ring_count(len(centres_deg), where)
     ring = np.searchsorted(0.5 * (centres_deg[1:] + centres_deg[:-1]), elevation_deg)
     for _ in range(3):
         tangent, offset_m = _fit_cones(radius_m, height_m, ring, len(centres_deg))
+        _check_ring_count(len(tangent), where)
         ring, residual_deg = nearest_ring(radius_m, height_m, tangent, offset_m)
     is_stray = residual_deg > _MAX_RESIDUAL_DEG
     counts = np.bincount(ring[~is_stray], minlength=len(tangent))
@@ -184,6 +184,12 @@ def find_rings(points_m: FloatArray, where: str) -> Layout:
     channel = np.full(len(points_m), -1, dtype=np.int64)
     channel[finite] = np.where(is_stray, -1, number[ring])
     return Layout("list of returns", int(np.count_nonzero(used)), channel, None)
+
+
+def _check_ring_count(rings: int, where: str) -> None:
+    if rings < MIN_CHANNELS:
+        problem = f"expected at least {MIN_CHANNELS} rings of {_MIN_RETURNS_PER_CHANNEL} returns, got {rings}"
+        raise InputError(where, problem, _HINT)
 
 
 def nearest_ring(

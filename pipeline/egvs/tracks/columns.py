@@ -283,7 +283,7 @@ def _positions(
         if matches:
             positions[name] = matches[0]
         elif name in required:
-            actual_names = ", ".join(names)[:200] or "none"
+            actual_names = " ".join(", ".join(names)[:200].split()) or "none"  # a quoted name may have several lines
             raise InputError(path, f"expected a column {name!r}, got {actual_names}", hint)
     return positions
 
