@@ -16,6 +16,7 @@ from pydantic import ValidationError
 
 from egvs.formats.georeference import WorldFrame
 from egvs.scenario.track_columns import RoadUserClass, TrackColumns
+from egvs.scenario.traffic_config import TrafficConfig
 from egvs.tracks import interaction, user_table
 from egvs.tracks.model import CLASSES, TrackFrame
 from tests.tracks.boxes import assert_same_boxes, moving_boxes
@@ -250,6 +251,18 @@ def test_unusable_systems_and_places_get_one_message(tmp_path: Path) -> None:
 
 
 # ---- the keys themselves
+
+
+def test_mapping_is_the_same_after_json() -> None:
+    for keys in ({**PLAIN, "default_type": "car"}, FULL, {**FULL, "types": {"x": "car"}, "yaw_unit": "deg"}):
+        assert TrackColumns.model_validate_json(mapping(**keys).model_dump_json()) == mapping(**keys)
+
+
+def test_two_coordinate_systems_contradict() -> None:
+    traffic = {"tracks": ["own.csv"], "track_columns": FULL}
+    assert TrafficConfig.from_dict({**traffic, "track_crs": "world"}).track_columns == mapping(**FULL)
+    with pytest.raises(ValidationError, match=r"expected track_crs or track_columns\.crs, got both"):
+        TrafficConfig.from_dict({"tracks": ["a"], "track_crs": "world", "track_columns": {**FULL, "crs": "lonlat"}})
 
 
 @pytest.mark.parametrize(

@@ -376,6 +376,8 @@ class TrafficConfig(StrictModel):
         if len(sources) != 1:
             actual = " and ".join(sources) or "none"
             raise ValueError(f"expected exactly one of network, sumocfg, fcd and tracks, got {actual}")
+        if self.track_crs is not None and self.track_columns is not None and self.track_columns.crs is not None:
+            raise ValueError("expected track_crs or track_columns.crs, got both")
         duplicates = find_duplicates([kind.name for kind in self.kinds])
         if duplicates:
             raise ValueError(f"two kinds have the same name: {', '.join(duplicates)}")
