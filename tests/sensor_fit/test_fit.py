@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.sensor_fit import SENSORS, angle_errors, fit_list, interval_hits
-from benchmarks.simulated_sweeps import Truth, simulate_sweep
+from benchmarks.sensor_fit import SENSORS, angle_errors, fit_list, hard_truth, interval_hits
+from benchmarks.simulated_sweeps import simulate_sweep
 
 from egvs.sensor_fit.empty_scan import TRAFFIC
 from egvs.sensor_fit.fit import SensorFit, fit_sensor
@@ -28,7 +28,7 @@ def test_sensors_of_the_catalogue(name: str) -> None:
     """Lists of returns in random order: elevations to 0.01 degrees, offsets to a millimetre, and the pose."""
     sensor = CATALOGUE[name]
     rng = np.random.default_rng(1)
-    truth = Truth(sigma_m=sensor.range_sigma_m, lost=0.05, axis_distance_m=0.03, step_m=0.004)
+    truth = hard_truth(sensor)
     fit = fit_list(simulate_sweep(sensor, truth, rng), rng)
     errors = angle_errors(sensor, truth, fit)
     assert errors.elevation_deg < 0.01

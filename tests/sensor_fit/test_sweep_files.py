@@ -6,6 +6,7 @@ Evidence: the same 3,000 points by every writer, with NaN, infinite and zero poi
 from __future__ import annotations
 
 import gzip
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +92,21 @@ def _flat(path: Path) -> Path:
     return path
 
 
+def _far(path: Path) -> Path:
+    made = points()
+    made[100, 1] = 2e154
+    np.savez(path.with_suffix(".npz"), a=made)
+    return path.with_suffix(".npz")
+
+
+def _other_member(path: Path) -> Path:
+    path = path.with_suffix(".npz")
+    np.savez(path, a=points())
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("notes.txt", "no array")
+    return path
+
+
 def _bytes(suffix: str, data: bytes):
     def write_bytes(path: Path) -> Path:
         path = path.with_name(f"sweep{suffix}")
@@ -107,6 +123,8 @@ def _bytes(suffix: str, data: bytes):
         (_viewpoint, "in the sensor's frame, got a VIEWPOINT"),
         (_flat, "shape (n, 3), got float64 of shape (3000, 2)"),
         (_bytes(".npz", b"PK\x03\x04 no archive"), "cannot be read as .npz"),
+        (_far, "within 10,000 m of the sensor, got 2e+154"),
+        (_other_member, "notes.txt: expected an array"),
         (_bytes(".npz", b""), "cannot be read as .npz"),
         (_bytes(".pcd.gz", b"\x1f\x8b no gzip"), "cannot be unpacked"),
         (_bytes(".pcd.gz", gzip.compress(b"# .PCD v0.7\n")[:-6]), "cannot be unpacked"),

@@ -12,7 +12,7 @@ from egvs.sensor_fit import empty_scan, return_rates
 from egvs.sensor_fit.empty_scan import TRAFFIC, UNKNOWN
 from egvs.sensor_fit.fit import SensorFit
 from egvs.sensor_fit.intervals import Estimate
-from egvs.sensor_fit.sweep_layout import nearest_ring
+from egvs.sensor_fit.sweep_layout import axis_distances_m, nearest_ring
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -36,7 +36,7 @@ def draw_angles(fit: SensorFit) -> Figure:
     figure, ((left, middle, right),) = _figure(15.0, 4.6, 3)
     angles = fit.angles
     points, channel, column = _measured_points(fit)
-    radius_m = np.hypot(points[:, 0], points[:, 1])
+    radius_m = axis_distances_m(points)
     raw_deg = np.degrees(np.arctan2(points[:, 2], radius_m)) - angles.elevation_deg[channel]
     fitted_deg = np.degrees(
         np.arctan2(points[:, 2] - angles.offset_m[channel], radius_m) - np.radians(angles.elevation_deg[channel])
@@ -80,7 +80,7 @@ def _measured_points(fit: SensorFit) -> tuple[FloatArray, Any, Any]:
     points = points[:: max(1, len(points) // _MAX_POINTS)]
     angles = fit.angles
     order = angles.ascending
-    radius_m = np.hypot(points[:, 0], points[:, 1])
+    radius_m = axis_distances_m(points)
     tangent = np.tan(np.radians(angles.elevation_deg))[order]
     ring, _ = nearest_ring(radius_m, points[:, 2], tangent, angles.offset_m[order])
     channel = order[ring]

@@ -155,7 +155,7 @@ def _refine(points_m: FloatArray, normal: FloatArray, height_m: float, total: in
         residual = points_m[:, 2] - _design(points_m) @ coefficients
         used = np.abs(residual) <= tolerance_m
         design = _design(points_m[used])
-        coefficients = np.linalg.solve(design.T @ design, design.T @ points_m[used, 2])
+        coefficients = _solve(design.T @ design, design.T @ points_m[used, 2])
         residual = points_m[used, 2] - design @ coefficients
         tolerance_m = float(np.clip(2.5 * 1.4826 * np.median(np.abs(residual)), 0.01, _TOLERANCE_M))
     members = points_m[used]
@@ -177,6 +177,12 @@ def _refine(points_m: FloatArray, normal: FloatArray, height_m: float, total: in
         x_m=(float(low[0]), float(high[0])),
         y_m=(float(low[1]), float(high[1])),
     )
+
+
+def _solve(matrix: FloatArray, side: FloatArray) -> FloatArray:
+    """Solve the normal equations; where returns lie on a line, with the smallest slopes."""
+    solution: FloatArray = np.linalg.lstsq(matrix, side)[0]
+    return solution
 
 
 def _design(points_m: FloatArray) -> FloatArray:
@@ -209,9 +215,7 @@ def _jackknife(members: FloatArray) -> FloatArray:
         sides.append(part.T @ members[sector == number, 2])
     if len(sectors) < 3:
         return np.full(3, np.nan)
-    poses = np.array(
-        [_pose(np.linalg.solve(sum(products) - p, sum(sides) - s)) for p, s in zip(products, sides, strict=True)]
-    )
+    poses = np.array([_pose(_solve(sum(products) - p, sum(sides) - s)) for p, s in zip(products, sides, strict=True)])
     k = len(sectors)
     errors: FloatArray = np.sqrt((k - 1) / k * ((poses - poses.mean(axis=0)) ** 2).sum(axis=0))
     return errors

@@ -43,6 +43,8 @@ _BIN_DEG = 0.005
 _MIN_SPACING_DEG = 0.04
 _MIN_RING_SHARE = 0.02
 """A ring has at least this share of the returns of the median ring."""
+_FINEST_M = 1e-6
+"""Coordinates are not more exact than this."""
 _MAX_RESIDUAL_DEG = 0.05
 _MAX_STRAY_SHARE = 0.2
 
@@ -97,7 +99,7 @@ def _organised_layout(points_m: FloatArray) -> Layout | None:
     n = len(points_m)
     returned = np.isfinite(points_m[:, 0])
     elevation_deg = np.full(n, np.nan)
-    radius_m = np.hypot(points_m[returned, 0], points_m[returned, 1])
+    radius_m = axis_distances_m(points_m[returned])
     elevation_deg[returned] = _sharpest_elevations(radius_m, points_m[returned, 2])
     trials: list[tuple[float, int, str]] = []
     for channels in range(MIN_CHANNELS, min(MAX_CHANNELS, n // MIN_COLUMNS) + 1):
@@ -162,7 +164,7 @@ def find_rings(points_m: FloatArray, where: str) -> Layout:
         If there are no rings, or more than a fifth of the points are on none.
     """
     finite = np.isfinite(points_m[:, 0])
-    radius_m = np.hypot(points_m[finite, 0], points_m[finite, 1])
+    radius_m = axis_distances_m(points_m[finite])
     height_m = points_m[finite, 2]
     elevation_deg = _sharpest_elevations(radius_m, height_m)
 
@@ -184,6 +186,12 @@ def find_rings(points_m: FloatArray, where: str) -> Layout:
     channel = np.full(len(points_m), -1, dtype=np.int64)
     channel[finite] = np.where(is_stray, -1, number[ring])
     return Layout("list of returns", int(np.count_nonzero(used)), channel, None)
+
+
+def axis_distances_m(points_m: FloatArray) -> FloatArray:
+    """Return the horizontal distances of points (n, 3) from the axis of rotation, at least 1 mm."""
+    distance: FloatArray = np.maximum(np.hypot(points_m[:, 0], points_m[:, 1]), 0.001)
+    return distance
 
 
 def _check_ring_count(rings: int, where: str) -> None:
@@ -289,7 +297,7 @@ def fit_cone(radius_m: FloatArray, height_m: FloatArray) -> tuple[float, float, 
     for _ in range(4):
         inside = np.abs(residual) * np.sqrt(weight) <= 3.5 * scale
         used = weight * inside
-        prior = np.diag([0.0, max(scale, 1e-9) ** 2 / PRIOR_OFFSET_M**2])
+        prior = np.diag([0.0, scale**2 / PRIOR_OFFSET_M**2])
         normal = (design * used[:, None]).T @ design + prior
         parameters = np.linalg.solve(normal, design.T @ (used * height_m))
         residual = height_m - design @ parameters
@@ -302,4 +310,4 @@ def fit_cone(radius_m: FloatArray, height_m: FloatArray) -> tuple[float, float, 
 
 
 def _weighted_scale(residual: FloatArray, weight: FloatArray) -> float:
-    return 1.4826 * float(np.median(np.abs(residual) * np.sqrt(weight)))
+    return max(1.4826 * float(np.median(np.abs(residual) * np.sqrt(weight))), _FINEST_M)
