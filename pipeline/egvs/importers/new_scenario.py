@@ -35,6 +35,7 @@ from egvs.formats import ply
 from egvs.importers import (
     assumed_traffic,
     bridge_decks,
+    demand_from_tracks,
     ground_heights,
     ground_reference,
     junctions,
@@ -48,6 +49,7 @@ from egvs.importers import (
 from egvs.importers.alignment import PointPair, make_alignment
 from egvs.importers.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, AssumedTraffic
 from egvs.importers.building_heights import ASSUMED, NEIGHBOURS
+from egvs.importers.demand_from_tracks import TrackDemand
 from egvs.importers.junctions import JunctionRegion, KerbsidePole, StreetJunction, Streets
 from egvs.importers.map_parts import MapContext, RoadOptions, Terrain
 from egvs.importers.map_readers import MapFile
@@ -124,6 +126,8 @@ class NewScenario:
         Distance of the junction from the requested position, 0 inside it; None without such a position.
     recorded
         The recorded traffic, if there is one.
+    demand
+        The demand that was estimated from recorded tracks, if there are such tracks.
     """
 
     folder: Path
@@ -140,6 +144,7 @@ class NewScenario:
     attributions: tuple[str, ...] = ()
     from_at_m: float | None = None
     recorded: RecordedTracks | None = None
+    demand: TrackDemand | None = None
 
     @property
     def maps_have_notes(self) -> bool:
@@ -159,6 +164,8 @@ class NewScenario:
     @property
     def flows(self) -> tuple[CountConfig, ...]:
         """The flows of the scenario; empty where no street leads through the region of interest."""
+        if self.demand is not None:
+            return self.demand.flows
         return () if self.traffic is None else self.traffic.flows
 
 
@@ -184,6 +191,8 @@ class NewScenarioOptions:
         Two points that place files without a reference system; empty if there are no such files.
     tracks
         Files of recorded tracks, or folders of them, which replace assumed traffic.
+    like
+        The same, but from which the demand of simulated traffic is estimated.
     """
 
     lefthand: bool = False
@@ -193,11 +202,17 @@ class NewScenarioOptions:
     pole_spacing_m: float | None = None
     align: tuple[PointPair, ...] = ()
     tracks: tuple[Path, ...] = ()
+    like: tuple[Path, ...] = ()
 
     def check(self) -> None:
         """Raise an InputError when a value is out of its limits."""
         assumed_traffic.check_traffic(self.traffic)
         _check_pole_spacing(self.pole_spacing_m)
+        if self.tracks and self.like:
+            problem = "cannot be combined with --tracks"
+            raise InputError(
+                "--like", problem, "Replay the tracks with --tracks, or simulate similar traffic with --like."
+            )
         if self.surroundings_m is not None and self.surroundings_m < SURROUNDINGS_MIN_M:
             raise InputError(
                 "--surroundings",
@@ -243,7 +258,8 @@ def create_scenario(
     files = map_readers.open_maps([maps] if isinstance(maps, Path) else maps)
     roads = _read_roads(files.roads, RoadOptions(options.lefthand, options.walk, has_terrain=bool(files.terrain)), at)
     recording = TrackFiles.find(options.tracks) if options.tracks else None
-    junction = _choose_junction(roads.streets, at, recording, files.roads.path)
+    example = TrackFiles.find(options.like) if options.like else None
+    junction = _choose_junction(roads.streets, at, recording or example, files.roads.path)
 
     level = roads.on_level_of(junction)
     if level.streets is not roads.streets:
@@ -276,15 +292,18 @@ def create_scenario(
         raise _no_pole_error(junction, options, files.roads.path)
 
     notes = [*roads.notes, *zero.notes, *(() if terrain is None else terrain.notes), *ground_notes]
-    if at is None and recording is None and not junction.signalised:
+    if at is None and recording is None and example is None and not junction.signalised:
         notes.append(_NO_SIGNALS_NOTE)
     notes += _ring_notes(streets, junction)
     notes += scenario_notes(roi.area.covers(junction.area), objects.counts)
     notes += _level_notes(level, objects.counts) + _range_notes(objects.counts)
     if options.walk:
         notes.append(PEOPLE_HINT)
-    assumed = None
-    if recording is None:
+    assumed, demand = None, None
+    if example is not None:
+        demand = demand_from_tracks.estimate_demand(example.tracks, streets, junction)
+        notes += demand.notes
+    elif recording is None:
         assumed = assumed_traffic.assume_traffic(roads.network, streets, junction, options.traffic)
     notes += assumed_traffic.traffic_notes(assumed)
     relief = Relief.of_region(streets, junction, roi)
@@ -295,6 +314,7 @@ def create_scenario(
         folder, junction, roi, streets, len(poles), objects.counts, objects.n_solids + 1, assumed, tuple(notes),
         height_m=relief.z_range_m[1] - relief.z_range_m[0], maps=objects.maps,
         attributions=_attributions(roads, objects), from_at_m=_distance_m(streets, junction, at),
+        demand=demand,
     )  # fmt: skip
     terrain_m = None
     if terrain is not None:
@@ -370,7 +390,7 @@ def _choose_junction(
 ) -> StreetJunction:
     """Return the junction at the requested position, or else that of the recording, or else the largest one."""
     if at is None and recording is not None:
-        return _junction_at(streets, recording.middle_m(streets), "--tracks")
+        return _junction_at(streets, recording.middle_m(streets), str(recording.tracks[0]))
     if at is None:
         return _require_junction(junctions.largest_junction(streets), path)
     return _junction_at(streets, _to_world(streets, at), "--at")
@@ -527,8 +547,10 @@ def _scenario_toml(
         f"World frame: x east, y north in metres as in {NETWORK_FILE}, z up from the {ground}.",
     ]
     document = scenario_files.toml_document(comments, values, tables)
+    names = MovementNames(scenario.streets.network, scenario.junction.at_m)
+    if scenario.demand is not None:
+        _add_demand(document["traffic"], scenario.demand, names)
     if scenario.traffic is not None:
-        names = MovementNames(scenario.streets.network, scenario.junction.at_m)
         document["traffic"].update({"counts": scenario_files.counts_array(scenario.traffic.flows, names)})
         origin = f"assumed from the road classes ({scenario.traffic.assumed_per_h:,} vehicles an hour)"
         if scenario.traffic.level is None:
@@ -538,6 +560,19 @@ def _scenario_toml(
         for line in scenario_files.periods_template(scenario.traffic.flows[0]):
             document["traffic"].add(tomlkit.comment(line))
     return tomlkit.dumps(document)
+
+
+def _add_demand(table: Any, demand: TrackDemand, names: MovementNames) -> None:
+    """Add the demand that was estimated from recorded tracks to ``[traffic]``."""
+    kinds = [estimate.kind for estimate in demand.fleet]
+    table.update({"kinds": scenario_files.kinds_array(kinds, [estimate.comments for estimate in demand.fleet])})
+    table["kinds"].comment("estimated from the recorded vehicles")
+    comments = [movement.comment for movement in demand.movements]
+    table.update({"counts": scenario_files.counts_array(demand.flows, names, comments)})
+    table["counts"].comment(f"vehicles an hour, from {demand.duration_s:,.0f} s of recorded tracks")
+    table.add(tomlkit.comment("The profile of the day is not extrapolated from the recording; it is yours to enter."))
+    for line in scenario_files.periods_template(demand.flows[0]):
+        table.add(tomlkit.comment(line))
 
 
 def _origin_comments(attributions: Sequence[str]) -> list[str]:
@@ -557,6 +592,8 @@ def _assumptions(scenario: NewScenario, *, is_recorded: bool) -> list[str]:
         assumed.append(f"shares of the movements (of {traffic.per_h:,} vehicles an hour)")
     elif traffic is not None:
         assumed.append(f"traffic ({traffic.per_h:,} vehicles an hour, from the road classes)")
+    if scenario.demand is not None:
+        assumed += scenario.demand.assumptions
     if scenario.junction.signalised and not is_recorded:
         assumed.append("signal plans")
     return [*assumed, *assumed_sizes(scenario.statics), "positions of the poles"]

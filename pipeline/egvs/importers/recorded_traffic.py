@@ -90,17 +90,21 @@ class TrackFiles:
 
     def middle_m(self, streets: Streets) -> XY:
         """Return the median position in the world frame, metres; InputError where the tracks are far from the map."""
-        points_m = np.concatenate([lane.shape_m[:, :2] for edge in streets.network.edges for lane in edge.lanes])
-        low_m, high_m = points_m.min(axis=0) - _MARGIN_M, points_m.max(axis=0) + _MARGIN_M
-        region = Roi((*low_m.tolist(), 0.0), (*(high_m - low_m).tolist(), 1.0))
-        world = Georeference(streets.frame, region, "the map")
-        tracks = recorded_tracks.read_in_world_frame(self.tracks, world)
+        tracks = recorded_tracks.read_in_world_frame(self.tracks, world_of(streets))
         return float(np.nanmedian(tracks.x_m)), float(np.nanmedian(tracks.y_m))
 
     def _frame_period_s(self) -> float:
         time_s = np.concatenate([recorded_tracks.read_file(path).time_s for path in self.tracks])
         wanted_s = float(np.nanmax(time_s) - np.nanmin(time_s)) / FRAMES_WANTED
         return max((period_s for period_s in _PERIODS_S if period_s <= wanted_s), default=_PERIODS_S[0])
+
+
+def world_of(streets: Streets) -> Georeference:
+    """Return the world frame of streets, with the region in which tracks are expected."""
+    points_m = np.concatenate([lane.shape_m[:, :2] for edge in streets.network.edges for lane in edge.lanes])
+    low_m, high_m = points_m.min(axis=0) - _MARGIN_M, points_m.max(axis=0) + _MARGIN_M
+    region = Roi((*low_m.tolist(), 0.0), (*(high_m - low_m).tolist(), 1.0))
+    return Georeference(streets.frame, region, "the map")
 
 
 def describe(recorded: RecordedTracks) -> str:
