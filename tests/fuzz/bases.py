@@ -290,12 +290,12 @@ def measured(name: str):
     return make
 
 
-def write_cloud(path: Path) -> None:
-    """Write points of the ground in the format that the suffix names, maybe gzipped."""
-    points, form = _points(), path.suffix.removeprefix(".")
+def write_cloud(path: Path, points: np.ndarray | None = None) -> None:
+    """Write points, by default of the ground, in the format that the suffix names, maybe gzipped."""
+    points, form = _points() if points is None else points, path.suffix.removeprefix(".")
     if form == "gz":
         plain = path.with_suffix("")
-        write_cloud(plain)
+        write_cloud(plain, points)
         path.write_bytes(gzip.compress(plain.read_bytes(), mtime=0))
         return
     if form == "e57":
@@ -364,6 +364,146 @@ def lanelets(name: str):
     return make
 
 
+_LAT, _LON = 52.0, 10.0
+"""Where the signals of the crossing in :func:`roads` are."""
+
+
+def _utm_m(lat: float, lon: float) -> tuple[float, float]:
+    from pyproj import Transformer
+
+    return Transformer.from_crs("EPSG:4326", "EPSG:32632").transform(lat, lon)
+
+
+@cache
+def roads() -> bytes:
+    """The crossing with lights, in UTM."""
+    east_m, north_m = _utm_m(_LAT, _LON)
+    projection = "+proj=utm +zone=32 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"
+    offset = f'netOffset="{100 - east_m:.2f},{100 - north_m:.2f}"'
+    text, count = re.subn(rb'netOffset="[^"]*"', offset.encode(), network())
+    assert count == 1
+    return re.sub(rb'projParameter="[^"]*"', f'projParameter="{projection}"'.encode(), text)
+
+
+@cache
+def roads_as_opendrive() -> bytes:
+    """The same crossing as OpenDRIVE, without the date of its header."""
+    import tempfile
+
+    from egvs.traffic import sumo
+
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "roads.net.xml").write_bytes(roads())
+        sumo.run_program("netconvert", ["-s", "roads.net.xml", "--opendrive-output", "roads.xodr"], Path(folder))
+        text = re.sub(rb"<!--.*?-->\s*", b"", (Path(folder) / "roads.xodr").read_bytes(), flags=re.DOTALL)
+    return re.sub(rb' date="[^"]*"', b"", text)
+
+
+def road_map(name: str):
+    """A map of the crossing alone."""
+
+    def make(folder: Path) -> None:
+        (folder / name).write_bytes(roads_as_opendrive() if ".xodr" in name else roads())
+
+    return make
+
+
+def surveyed(name: str):
+    """The crossing, and beside it a point cloud without a reference system: its ground, and the wall of a house."""
+
+    def make(folder: Path) -> None:
+        (folder / "roads.net.xml").write_bytes(roads())
+        x, y = (part.ravel() for part in np.meshgrid(np.arange(-20.0, 21.0, 2.0), np.arange(-20.0, 21.0, 2.0)))
+        along, up = (part.ravel() for part in np.meshgrid(np.arange(0.0, 8.0, 0.5), np.arange(0.5, 6.0, 0.5)))
+        wall = np.column_stack([12 + along, np.full(len(up), 12.0), up])
+        write_cloud(folder / name, np.round(np.concatenate([np.column_stack([x, y, 0.01 * x]), wall]), 3))
+
+    return make
+
+
+def modelled(name: str):
+    """The crossing, and beside it a mesh of a house in local metres."""
+
+    def make(folder: Path) -> None:
+        (folder / "roads.net.xml").write_bytes(roads())
+        box, form = _box(), name.rpartition(".")[2]
+        if form == "glb":
+            (folder / name).write_bytes(_glb(box))
+        elif form == "gltf":
+            (folder / name).write_text(json.dumps(_gltf(box, "house.bin"), indent=1))
+            (folder / "house.bin").write_bytes(_buffer(box))
+        else:
+            box.export(folder / name)
+
+    return make
+
+
+def on_terrain(name: str):
+    """The crossing, and beside it its terrain, which rises to the north."""
+
+    def make(folder: Path) -> None:
+        from tests.formats.test_landxml import landxml
+        from tests.formats.test_rasters import write_tiff
+
+        (folder / "roads.net.xml").write_bytes(roads())
+        east_m, north_m = (round(value) for value in _utm_m(_LAT, _LON))
+        count, cell_m = 26, 20
+        west_m, south_m = east_m - 260, north_m - 260
+        rows = [[f"{40 + 0.2 * (count - row):.1f}"] * count for row in range(count)]
+        if name.endswith(".asc"):
+            head = f"ncols {count}\nnrows {count}\nxllcorner {west_m}\nyllcorner {south_m}\ncellsize {cell_m}\n"
+            (folder / name).write_text(head + "".join(" ".join(row) + "\n" for row in rows))
+            (folder / name).with_suffix(".prj").write_text("EPSG:32632")
+        elif name.endswith(".tif"):
+            import rasterio
+
+            transform = rasterio.Affine(cell_m, 0, west_m, 0, -cell_m, south_m + count * cell_m)
+            write_tiff(folder / name, np.array(rows, dtype="float32"), transform=transform, crs="EPSG:32632")
+        else:
+            corners = [
+                (south_m, west_m),
+                (south_m, west_m + 520),
+                (south_m + 520, west_m + 520),
+                (south_m + 520, west_m),
+            ]
+            points = "".join(
+                f'<P id="{number}">{north} {east} {40 + 0.01 * (north - south_m):g}</P>'
+                for number, (north, east) in enumerate(corners, 1)
+            )
+            head = '<Units><Metric linearUnit="meter"/></Units><CoordinateSystem epsgCode="32632"/>'
+            (folder / name).write_text(landxml("<F>1 2 3</F><F>1 3 4</F>", head, points))
+
+    return make
+
+
+def vectors(name: str):
+    """The crossing, and beside it the outline of a house in a format of GIS programs."""
+
+    def make(folder: Path) -> None:
+        import geopandas
+        from shapely.geometry import box
+
+        (folder / "roads.net.xml").write_bytes(roads())
+        east_m, north_m = _utm_m(_LAT, _LON)
+        outline = box(east_m + 20, north_m + 20, east_m + 32, north_m + 30)
+        frame = geopandas.GeoDataFrame({"name": ["h"], "height": [8.5]}, geometry=[outline], crs="EPSG:32632")
+        if name.endswith("parquet"):
+            frame.to_parquet(folder / name)
+        elif name.endswith("kml"):
+            degrees = frame.to_crs("OGC:CRS84").geometry.iloc[0].exterior.coords
+            corners = " ".join(f"{x:.7f},{y:.7f},0" for x, y, *_ in degrees)
+            ring = f"<LinearRing><coordinates>{corners}</coordinates></LinearRing>"
+            outline = f"<Polygon><outerBoundaryIs>{ring}</outerBoundaryIs></Polygon>"
+            (folder / name).write_text(
+                '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document>'
+                f"<Placemark><name>h</name>{outline}</Placemark></Document></kml>\n"
+            )
+        else:
+            frame.to_file(folder / name)
+
+    return make
+
+
 def with_roads_map(name: str):
     """A map of roads, and beside it a file with a house north-east of the signals, and a lamp or a ground."""
     from tests.formats import small_city_models as models
@@ -416,7 +556,7 @@ def with_roads_map(name: str):
     texts = {"city.gml": gml, "dem.gml": dem, "city.json": city_json, "houses.geojson": footprints}
 
     def make(folder: Path) -> None:
-        extract("map.osm")(folder)
+        (folder / "roads.net.xml").write_bytes(roads())
         (folder / name).write_text(texts[name](), encoding="utf-8")
 
     return make

@@ -10,9 +10,11 @@ the scenario promises; with one message). Any other verdict is a fault.
 from __future__ import annotations
 
 import gc
+import hashlib
 import itertools
 import math
 import os
+import pickle
 import re
 import resource
 import select
@@ -22,7 +24,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -259,6 +261,7 @@ def warm_up(folder: Path) -> None:
     import typer.main
 
     from egvs.cli.app import main
+    from egvs.importers import assumed_traffic
     from tests.conftest import write_mini
 
     os.environ["EGVS_STORE"] = ""
@@ -272,12 +275,53 @@ def warm_up(folder: Path) -> None:
 
     jinja2.Environment.compile = compile_once
     typer.main.get_command = cache(typer.main.get_command)  # and so are the verbs, which are made anew at each call
-    sys.argv = ["egvs", "run", str(write_mini(folder / "mini")), "--out", str(folder / "out"), "--jobs", "1"]
+    assumed_traffic.find_capacity = _remembered(assumed_traffic.find_capacity, folder / "capacities")
     printed = io.StringIO()
-    with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
-        try:
-            main()
-        except SystemExit as end:
-            assert not end.code, printed.getvalue()
+    for arguments in (
+        ["run", str(write_mini(folder / "mini")), "--out", str(folder / "out"), "--jobs", "1"],
+        *_maps(folder),
+    ):
+        sys.argv = ["egvs", *arguments]
+        with contextlib.redirect_stdout(printed), contextlib.redirect_stderr(printed):
+            try:
+                main()
+            except SystemExit as end:
+                assert not end.code, printed.getvalue()
     gc.collect()
     gc.freeze()
+
+
+def _maps(folder: Path) -> Iterator[list[str]]:
+    """Arguments that make scenarios from maps of several formats, so that what reads them is imported."""
+    from tests.fuzz import bases
+
+    aligned = ["--align", "0,0=52.0,10.0", "--align", "0,100=52.000899,10.0"]
+    makers = {
+        "city.gml": bases.with_roads_map, "houses.gpkg": bases.vectors, "terrain.tif": bases.on_terrain,
+        "survey.las": bases.surveyed, "survey.e57": bases.surveyed, "house.glb": bases.modelled,
+    }  # fmt: skip
+    for number, (name, make) in enumerate(makers.items()):
+        maps = folder / f"maps{number}"
+        maps.mkdir()
+        make(name)(maps)
+        arguments = ["new", str(maps / "made"), "--from", str(maps / "roads.net.xml"), str(maps / name)]
+        yield [*arguments, "--vehicles-per-hour", "200", *(aligned if make in (bases.surveyed, bases.modelled) else ())]
+
+
+def _remembered(function: Callable[..., object], folder: Path) -> Callable[..., object]:
+    """The same results for the same arguments, in files, since the processes of the cases share nothing else.
+
+    Trials of traffic are most of the time of a case, and mutants of what stands beside roads do not change them.
+    """
+    folder.mkdir()
+
+    def remembering(*arguments: object) -> object:
+        path = folder / hashlib.sha256(repr(arguments).encode("utf-8", "surrogatepass")).hexdigest()
+        if not path.is_file():
+            result = function(*arguments)
+            part = path.with_suffix(f".{os.getpid()}")
+            part.write_bytes(pickle.dumps(result))
+            part.replace(path)
+        return pickle.loads(path.read_bytes())
+
+    return remembering

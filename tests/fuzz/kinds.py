@@ -9,6 +9,9 @@ from pathlib import Path
 from tests.fuzz import bases, meaning
 from tests.fuzz.meaning import Meaning
 
+Maker = Callable[[str], Callable[[Path], None]]
+"""Returns what writes the base of a kind, by the name of its file."""
+
 _RUN = ("run", "scenario", "--out", "out", "--jobs", "1")
 _STUDY = ("accuracy", "scenario", "--out", "out", "--budget", "1s", "--jobs", "1")
 _SCORES = ("out/scores.parquet",)
@@ -88,11 +91,21 @@ def _lanelets(name: str) -> Kind:
     return Kind(f"new {name}", name, bases.lanelets(name), reads, verb=verb, results=made, names_others=True)
 
 
-def _beside(name: str, reads: Meaning) -> Kind:
+def _road_map(name: str, reads: Meaning) -> Kind:
+    """A SUMO network, or an OpenDRIVE map, that becomes a scenario."""
+    made = tuple(f"made/{file}" for file in ("network.net.xml", "sites.csv"))
+    verb = ("new", "made", "--from", name, "--vehicles-per-hour", "200")
+    return Kind(f"new {name}", name, bases.road_map(name), reads, verb=verb, results=made, names_others=True)
+
+
+def _beside(name: str, reads: Meaning, make: Maker = bases.with_roads_map, mutated: str = "") -> Kind:
     """A map of what stands beside roads, or of their ground, which becomes part of a scenario."""
     made = ("made/network.net.xml", "made/sites.csv", "made/statics.geojson", "made/*.ply")
-    verb = ("new", "made", "--from", "map.osm", name)
-    return Kind(f"new {name}", name, bases.with_roads_map(name), reads, verb=verb, results=made)
+    verb = ("new", "made", "--from", "roads.net.xml", name, "--vehicles-per-hour", "200")
+    if make in (bases.surveyed, bases.modelled):
+        verb += ("--align", "0,0=52.0,10.0", "--align", "0,100=52.000899,10.0")
+    mutated = mutated or name
+    return Kind(f"new {mutated}", mutated, make(name), reads, verb=verb, results=made, names_others=mutated != name)
 
 
 def _city(name: str, file: str, reads: Meaning) -> Kind:
@@ -140,6 +153,18 @@ _ALL = (
     _new("map.osm.pbf", meaning.bytes_themselves), _lanelets("lanelets.osm"), _lanelets("lanelets.osm.gz"),
     _beside("city.gml", meaning.bytes_themselves), _beside("dem.gml", meaning.bytes_themselves),
     _beside("city.json", meaning.text_json), _beside("houses.geojson", meaning.text_json),
+    _road_map("roads.net.xml", meaning.gzipped(meaning.xml)), _road_map("roads.xodr", meaning.bytes_themselves),
+    *(_beside(f"houses.{form}", meaning.bytes_themselves, bases.vectors) for form in ("gpkg", "shp", "kml", "parquet")),
+    _beside("houses.shp", meaning.bytes_themselves, bases.vectors, "houses.dbf"),
+    *(_beside(f"terrain.{form}", meaning.bytes_themselves, bases.on_terrain) for form in ("asc", "tif", "xml")),
+    _beside("terrain.asc", meaning.bytes_themselves, bases.on_terrain, "terrain.prj"),
+    *(_beside(f"survey.{form}", reads, bases.surveyed) for form, reads in (
+        ("csv", meaning.rows), ("pcd", meaning.pcd), ("pcd.gz", meaning.bytes_themselves), ("ply", meaning.ply),
+        ("las", meaning.bytes_themselves), ("laz", meaning.bytes_themselves), ("e57", meaning.bytes_themselves))),
+    *(_beside(f"house.{form}", reads, bases.modelled) for form, reads in (
+        ("obj", meaning.obj), ("ply", meaning.ply), ("stl", meaning.stl), ("off", meaning.bytes_themselves),
+        ("gltf", meaning.text_json), ("glb", meaning.glb))),
+    _beside("house.gltf", meaning.bytes_themselves, bases.modelled, "house.bin"),
     Kind("wanted junctions.csv", "wanted.csv", bases.wanted, meaning.rows, results=("made/junctions/*/*.csv",),
          verb=("city", "new", "made", "--osm", "map.osm", "--junctions", "wanted.csv")),
     _city("city.toml", "city.toml", meaning.toml), _city("junctions.csv", "junctions.csv", meaning.rows),

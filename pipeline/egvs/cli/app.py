@@ -15,7 +15,7 @@ from typer.core import TyperCommand
 from typer.models import CommandInfo
 
 from egvs._version import __version__
-from egvs.cli import city, compare, exit, place, sources, validate
+from egvs.cli import city, compare, exit, place, sensor, sources, validate
 from egvs.cli import options as cli_options
 from egvs.cli.options import (
     DEFAULT_POLES,
@@ -529,6 +529,8 @@ app.add_typer(city.app, name="city")
 
 # ---- scenarios, sensors, cached results
 
+app.add_typer(sensor.app, name="sensor")
+
 
 @app.command()
 def sensors(
@@ -626,6 +628,15 @@ def new(
             " traffic are estimated.",
         ),
     ] = None,
+    track_crs: Annotated[
+        str | None,
+        typer.Option(
+            "--track-crs",
+            metavar="CRS",
+            help="Coordinate system of the tracks, if it is not the one of their format: e.g. EPSG:25832, or 'world'"
+            " for metres of the road map.",
+        ),
+    ] = None,
 ) -> None:
     """Create a scenario from maps of roads, buildings and other objects.
 
@@ -660,7 +671,7 @@ def new(
     options = NewScenarioOptions(
         lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=demand, pole_spacing_m=pole_spacing_m,
         align=tuple(cli_options.point_pair(text) for text in align or []), tracks=tuple(tracks or ()),
-        like=tuple(like or ()),
+        like=tuple(like or ()), track_crs=track_crs,
     )  # fmt: skip
     scenario = new_scenario.create_scenario(folder, paths, location, options)
     new_summary.print_new_scenario(scenario)
@@ -719,7 +730,7 @@ COMMAND_GROUPS = {
     "Decide": ("place", "explore", "compare", "city"),
     "Study": ("validate", "accuracy", "effects", "scores", "clouds", "train"),
     "Stages of egvs run": ("traffic", "statics", "tpog", "scan", "score", "report"),
-    "Files": ("runs", "export", "figure", "sensors", "verify", "store"),
+    "Files": ("runs", "export", "figure", "sensors", "sensor", "verify", "store"),
 }
 """Groups of ``egvs --help``, and their commands."""
 

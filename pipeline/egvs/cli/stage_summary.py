@@ -142,10 +142,43 @@ def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any], flow_sourc
     if counts := rest.pop("counts", None):
         worst = max(count["geh"] for count in counts)
         yield Sentence(f"largest GEH against {flow_source} {worst:.1f}")
+    if tracks := rest.pop("tracks", None):
+        yield from _track_sentences(tracks)
     if sizes := rest.pop("sizes", None):
         yield Sentence(describe_sizes(sizes))
     if sumo := rest.pop("sumo", None):
         yield _detail(f"SUMO {sumo}")
+
+
+def _track_sentences(tracks: dict[str, Any]) -> Iterator[Sentence]:
+    """Yield what was read from recorded tracks, changed and left out."""
+    coverage = tracks["coverage"]
+    yield Sentence(f"{_count(tracks['tracks'], 'track')} cover {coverage['share']:.0%} of the {coverage['of']}")
+    if alignment := tracks.get("alignment"):
+        yield _detail(f"{alignment['share_on_lanes']:.0%} of the positions of moving vehicles lie on lanes")
+    yield _detail(f"{tracks['rows']:,} rows read, {tracks['step_s']:g} s apart")
+    for key, words in _TRACK_COUNTS.items():
+        if tracks[key]:
+            yield _detail(f"{words}: {tracks[key]:,}")
+    if filled := tracks["filled_sizes"]:
+        texts = [f"{name} ({number:,})" for name, number in filled.items()]
+        yield _detail(f"sizes of classes used for tracks without: {', '.join(texts)}")
+    for sentence in tracks.get("sources", ()):
+        yield _detail(sentence)
+
+
+_TRACK_COUNTS = {
+    "dropped_rows": "rows without a time or position",
+    "duplicates": "duplicate rows dropped",
+    "jumps": "jumps, where tracks are cut",
+    "headings_from_motion": "headings from the motion",
+    "headings_unknown": "headings unknown, set to east",
+    "flipped_headings": "headings turned by 180 degrees",
+    "interpolated_gaps": "gaps interpolated",
+    "unknown_gaps": "longer gaps, in which the position is unknown",
+    "outside_coverage": "boxes outside the coverage left out",
+}
+"""Numbers in the summary of recorded tracks, in words; those that are 0 are not printed."""
 
 
 def _tpog_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[Sentence]:

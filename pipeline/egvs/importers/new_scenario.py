@@ -193,6 +193,8 @@ class NewScenarioOptions:
         Files of recorded tracks, or folders of them, which replace assumed traffic.
     like
         The same, but from which the demand of simulated traffic is estimated.
+    track_crs
+        Coordinate system of the tracks, as for the key ``traffic.track_crs``.
     """
 
     lefthand: bool = False
@@ -203,16 +205,17 @@ class NewScenarioOptions:
     align: tuple[PointPair, ...] = ()
     tracks: tuple[Path, ...] = ()
     like: tuple[Path, ...] = ()
+    track_crs: str | None = None
 
     def check(self) -> None:
         """Raise an InputError when a value is out of its limits."""
         assumed_traffic.check_traffic(self.traffic)
         _check_pole_spacing(self.pole_spacing_m)
         if self.tracks and self.like:
-            problem = "cannot be combined with --tracks"
-            raise InputError(
-                "--like", problem, "Replay the tracks with --tracks, or simulate similar traffic with --like."
-            )
+            hint = "--tracks replays tracks, --like simulates such traffic."
+            raise InputError("--like", "cannot be combined with --tracks", hint)
+        if self.track_crs is not None and not self.tracks and not self.like:
+            raise InputError("--track-crs", "has no effect without recorded tracks", "Give them with --tracks.")
         if self.surroundings_m is not None and self.surroundings_m < SURROUNDINGS_MIN_M:
             raise InputError(
                 "--surroundings",
@@ -257,8 +260,7 @@ def create_scenario(
     name = scenario_files.check_new_folder(folder)
     files = map_readers.open_maps([maps] if isinstance(maps, Path) else maps)
     roads = _read_roads(files.roads, RoadOptions(options.lefthand, options.walk, has_terrain=bool(files.terrain)), at)
-    recording = TrackFiles.find(options.tracks) if options.tracks else None
-    example = TrackFiles.find(options.like) if options.like else None
+    recording, example = (_find_tracks(paths, options.track_crs) for paths in (options.tracks, options.like))
     junction = _choose_junction(roads.streets, at, recording or example, files.roads.path)
 
     level = roads.on_level_of(junction)
@@ -299,11 +301,10 @@ def create_scenario(
     notes += _level_notes(level, objects.counts) + _range_notes(objects.counts)
     if options.walk:
         notes.append(PEOPLE_HINT)
-    assumed, demand = None, None
-    if example is not None:
-        demand = demand_from_tracks.estimate_demand(example.tracks, streets, junction)
-        notes += demand.notes
-    elif recording is None:
+    demand = demand_from_tracks.estimate_demand(example, streets, junction) if example else None
+    notes += demand.notes if demand else ()
+    assumed = None
+    if not options.tracks and not options.like:
         assumed = assumed_traffic.assume_traffic(roads.network, streets, junction, options.traffic)
     notes += assumed_traffic.traffic_notes(assumed)
     relief = Relief.of_region(streets, junction, roi)
@@ -344,6 +345,10 @@ def create_scenario(
 
     scenario_files.publish_folder(folder, contents.items(), check)
     return replace(scenario, recorded=recorded[0] if recorded else None)
+
+
+def _find_tracks(paths: Sequence[Path], crs: str | None) -> TrackFiles | None:
+    return TrackFiles.find(paths, crs) if paths else None
 
 
 def _no_pole_error(junction: StreetJunction, options: NewScenarioOptions, path: Path) -> InputError:

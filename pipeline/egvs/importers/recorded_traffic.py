@@ -18,6 +18,7 @@ from egvs.importers.junctions import Streets
 from egvs.importers.osm_network import NETWORK_FILE
 from egvs.scenario.model import Scenario
 from egvs.tracks import track_readers
+from egvs.tracks.model import Tracks
 from egvs.traffic import recorded_tracks
 from egvs.traffic.recorded_tracks import RecordedTracks
 from egvs.world import geolocation
@@ -42,13 +43,16 @@ class TrackFiles:
         Files with tracks.
     companions
         Files beside them that their readers need.
+    crs
+        Their coordinate system instead of the one of their format; "world" for the world frame.
     """
 
     tracks: tuple[Path, ...]
     companions: tuple[Path, ...]
+    crs: str | None = None
 
     @classmethod
-    def find(cls, paths: Sequence[Path]) -> TrackFiles:
+    def find(cls, paths: Sequence[Path], crs: str | None = None) -> TrackFiles:
         """Return the files with tracks among some paths, and in the folders among them.
 
         Raises
@@ -62,7 +66,7 @@ class TrackFiles:
         companions: dict[Path, None] = {}
         for path in tracks:
             companions |= dict.fromkeys(track_readers.find_reader(path).companions(path))
-        return cls(tuple(tracks), tuple(path for path in companions if path not in tracks))
+        return cls(tuple(tracks), tuple(path for path in companions if path not in tracks), crs)
 
     def copies(self) -> dict[str, Callable[[Path], None]]:
         """Return functions that write the copies, by their path in the scenario.
@@ -82,29 +86,29 @@ class TrackFiles:
 
     def traffic_table(self) -> dict[str, Any]:
         """Return the keys of ``[traffic]``."""
-        return {
-            "tracks": [f"{FOLDER}/{path.name}" for path in self.tracks],
-            "frame_period_s": self._frame_period_s(),
-            "roads": NETWORK_FILE,
-        }
+        table: dict[str, Any] = {"tracks": [f"{FOLDER}/{path.name}" for path in self.tracks]}
+        if self.crs is not None:
+            table["track_crs"] = self.crs
+        return table | {"frame_period_s": self._frame_period_s(), "roads": NETWORK_FILE}
+
+    def read(self, streets: Streets) -> Tracks:
+        """Read the tracks in the world frame of streets; InputError where they are damaged or far from them."""
+        points_m = np.concatenate([lane.shape_m[:, :2] for edge in streets.network.edges for lane in edge.lanes])
+        low_m, high_m = points_m.min(axis=0) - _MARGIN_M, points_m.max(axis=0) + _MARGIN_M
+        region = Roi((*low_m.tolist(), 0.0), (*(high_m - low_m).tolist(), 1.0))
+        return recorded_tracks.read_in_world_frame(
+            self.tracks, Georeference(streets.frame, region, "the map"), self.crs
+        )
 
     def middle_m(self, streets: Streets) -> XY:
         """Return the median position in the world frame, metres; InputError where the tracks are far from the map."""
-        tracks = recorded_tracks.read_in_world_frame(self.tracks, world_of(streets))
+        tracks = self.read(streets)
         return float(np.nanmedian(tracks.x_m)), float(np.nanmedian(tracks.y_m))
 
     def _frame_period_s(self) -> float:
         time_s = np.concatenate([recorded_tracks.read_file(path).time_s for path in self.tracks])
         wanted_s = float(np.nanmax(time_s) - np.nanmin(time_s)) / FRAMES_WANTED
         return max((period_s for period_s in _PERIODS_S if period_s <= wanted_s), default=_PERIODS_S[0])
-
-
-def world_of(streets: Streets) -> Georeference:
-    """Return the world frame of streets, with the region in which tracks are expected."""
-    points_m = np.concatenate([lane.shape_m[:, :2] for edge in streets.network.edges for lane in edge.lanes])
-    low_m, high_m = points_m.min(axis=0) - _MARGIN_M, points_m.max(axis=0) + _MARGIN_M
-    region = Roi((*low_m.tolist(), 0.0), (*(high_m - low_m).tolist(), 1.0))
-    return Georeference(streets.frame, region, "the map")
 
 
 def describe(recorded: RecordedTracks) -> str:

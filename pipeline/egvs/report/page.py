@@ -345,9 +345,10 @@ def _cost_values(stages: Mapping[str, StageRecord]) -> dict[str, Any]:
 
 def _warning_values(contents: PageContents) -> dict[str, Any]:
     warnings = collect_warnings(stage.summary for stage in contents.stages.values())
+    traffic = contents.stages.get("traffic")
     return {
         "warnings": warnings,
-        "reliability": describe_reliability(contents.ranking),
+        "reliability": describe_reliability(contents.ranking, traffic.summary if traffic else None),
         "poles_on_road": describe_poles_on_road(contents.ranking.poles[:NAMED_POLES], warnings),
     }
 

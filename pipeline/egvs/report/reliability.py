@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 from egvs.report.formatting import join_names
 from egvs.report.ranking import RankedSite, Ranking
@@ -11,38 +12,51 @@ from egvs.scenario.score_config import DEFAULT_SCORE
 MIN_TILT_DEG = 5.0
 """A sensor is called tilted from this pitch or roll on. The sensors of the validation study were level."""
 
-_ERROR_NOTE = "± is the error of a finite simulation only. "
+_ERROR_NOTE = "± is the error of a finite {} only. "
 _SIZE_NOTE = (
     "The order of sites by this score was validated, the size of the score less: in the studies, detectors found up to "
     "27 percentage points fewer vehicles than expected (docs/validity.md)."
 )
+_COVERAGE_NOTE = "The recorded tracks cover {share:.0%} of the {of}; elsewhere the traffic is unknown."
 _TILT_NOTE = "The sensor of {} is tilted; tilted sensors were not part of the validation (docs/validity.md)."
 
 
-def describe_reliability(ranking: Ranking) -> list[str]:
+def describe_reliability(ranking: Ranking, traffic: Mapping[str, Any] | None = None) -> list[str]:
     """Return the reasons to be careful with a ranking, in sentences.
 
     - By ``expected_detections``: what the standard errors leave out, and how far the size of the score was validated.
     - The best site is tilted.
+    - The traffic was recorded: what share of the region the recording covers.
     - The best site is the lowest, the highest or the most tilted of those on its pole, so that others may be better.
 
     Parameters
     ----------
     ranking
         The ranking. Without a best site, there is no reason.
+    traffic
+        Summary of the traffic stage, if it is known.
     """
     best = ranking.sites[0]
     if not best.score > 0.0 or ranking.is_tie:
         return []
     sentences = []
+    recordings = _track_summaries(traffic or {})
     if ranking.by.name == DEFAULT_SCORE:
-        sentences.append((_ERROR_NOTE if ranking.has_errors else "") + _SIZE_NOTE)
+        error_note = _ERROR_NOTE.format("recording" if recordings else "simulation") if ranking.has_errors else ""
+        sentences.append(error_note + _SIZE_NOTE)
+    sentences += [_COVERAGE_NOTE.format(**coverage) for coverage in recordings]
     if max(abs(best.pitch_deg), abs(best.roll_deg)) >= MIN_TILT_DEG:
         sentences.append(_TILT_NOTE.format(best.site))
     limits = list(_limits(best, [site for site in ranking.sites if site.pole == best.pole]))
     if limits:
         sentences.append(f"The best site has {join_names(limits)}: a mount beyond it may be better.")
     return sentences
+
+
+def _track_summaries(traffic: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the coverage of recorded tracks, of each period."""
+    periods = traffic.get("periods", {"": traffic})
+    return [summary["tracks"]["coverage"] for summary in periods.values() if "tracks" in summary]
 
 
 def _limits(best: RankedSite, on_pole: Sequence[RankedSite]) -> Iterator[str]:

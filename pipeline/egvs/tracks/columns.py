@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,10 +13,20 @@ import numpy as np
 
 from egvs.core import reading
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray
+from egvs.core.grid import FloatArray, IntArray
 from egvs.formats import xml
+from egvs.scenario.fields import MAX_COORDINATE_M
 
 _HINT = "Use the file as it was published, with its header row."
+
+MAX_SIZE_M = 100.0
+"""No road user is longer; the longest trams have 75 m."""
+
+MAX_TIME_S = 1e10
+"""Seconds since 1970 stay below it until the year 2286; milliseconds exceed it."""
+
+MAX_ANGLE_RAD = 1e4
+"""A thousand turns, for headings that count full turns."""
 
 
 @dataclass(frozen=True)
@@ -28,10 +39,13 @@ class Table:
         The file.
     columns
         Texts of each column, by name.
+    lines
+        Line in the file of each row, for messages; without them, rows are counted.
     """
 
     path: Path
     columns: Mapping[str, Sequence[str]]
+    lines: Sequence[int] = ()
 
     @property
     def n_rows(self) -> int:
@@ -41,6 +55,13 @@ class Table:
     def texts(self, name: str) -> Sequence[str]:
         """Return the texts of a column."""
         return self.columns[name]
+
+    def names(self, name: str) -> Sequence[str]:
+        """Return the names of tracks in a column; InputError for an empty cell."""
+        names = self.columns[name]
+        if "" in names:
+            raise self.error(list(names).index(""), name, "expected the name of a track, got nothing")
+        return names
 
     def numbers(self, name: str) -> FloatArray:
         """Return the numbers of a column, (n,) float64; InputError for a text, an empty cell, infinity or NaN."""
@@ -54,18 +75,113 @@ class Table:
         if name not in self.columns:
             return np.full(self.n_rows, math.nan)
         texts = self.columns[name]
-        try:
-            values = np.array([text or "nan" for text in texts], dtype=np.str_).astype(np.float64)
-        except ValueError:
-            values = np.array([_to_float(text) for text in texts])
-        is_empty = np.array([not text or text.lower() in ("nan", "none", "null") for text in texts], dtype=bool)
+        values = _to_floats(texts)
+        is_empty = np.fromiter((text.lower() in _EMPTY for text in texts), dtype=np.bool_, count=len(texts))
         for row in np.flatnonzero(~np.isfinite(values) & ~is_empty):
             raise self.error(int(row), name, f"expected a number, got {texts[row][:80]!r}")
         return np.where(is_empty, math.nan, values)
 
+    def times_s(self, name: str, unit_s: float = 1.0) -> FloatArray:
+        """Return times in seconds, (n,) float64; InputError beyond :data:`MAX_TIME_S`."""
+        return self._within(self.numbers(name) * unit_s, name, -MAX_TIME_S, MAX_TIME_S, "a time", "s")
+
+    def positions_m(self, name: str, unit_m: float = 1.0) -> FloatArray:
+        """Return coordinates in metres, (n,) float64; InputError for those that are too large for the Earth."""
+        values = self.numbers(name) * unit_m
+        return self._within(values, name, -MAX_COORDINATE_M, MAX_COORDINATE_M, "a coordinate", "m")
+
+    def heights_m(self, name: str, unit_m: float = 1.0) -> FloatArray:
+        """Return coordinates in metres of a column that may be missing or have empty cells, which are NaN."""
+        values = self.optional_numbers(name) * unit_m
+        return self._within(values, name, -MAX_COORDINATE_M, MAX_COORDINATE_M, "a height", "m")
+
+    def sizes_m(self, name: str, unit_m: float = 1.0) -> FloatArray:
+        """Return lengths, widths or heights in metres, (n,) float64; NaN where they are missing or 0."""
+        values = self._within(self.optional_numbers(name) * unit_m, name, 0.0, MAX_SIZE_M, "a size", "m")
+        return np.where(values == 0.0, math.nan, values)
+
+    def angles_rad(self, name: str, unit_rad: float = 1.0) -> FloatArray:
+        """Return angles in radians, (n,) float64; NaN where they are missing."""
+        values = self.optional_numbers(name) * unit_rad
+        return self._within(values, name, -MAX_ANGLE_RAD, MAX_ANGLE_RAD, "an angle", "rad")
+
+    def classes(self, name: str, classes: Mapping[str, str]) -> list[str]:
+        """Return the class of each row, from its text in lower case; InputError for a text that is not in ``classes``.
+
+        Parameters
+        ----------
+        name
+            A column.
+        classes
+            Text of the file in lower case -> one of :data:`egvs.tracks.model.CLASSES`.
+        """
+        texts = self.columns[name]
+        by_text = {text: classes.get(text.lower()) for text in set(texts)}
+        if None in by_text.values():
+            row = next(row for row, text in enumerate(texts) if by_text[text] is None)
+            raise self.error(row, name, f"unknown class {texts[row][:80]!r}", f"Use one of {', '.join(classes)}.")
+        return [by_text[text] or "" for text in texts]
+
+    def rows_of(self, keys: Sequence[str], name: str, where: Path) -> IntArray:
+        """Return the row of this table for each key of another, (len(keys),) int64.
+
+        Parameters
+        ----------
+        keys
+            Texts, such as ids of tracks.
+        name
+            The column of this table with the same texts, each once.
+        where
+            File of the keys, for messages.
+
+        Raises
+        ------
+        InputError
+            When a key is missing in this table, or occurs twice in it.
+        """
+        row_of: dict[str, int] = {}
+        for row, text in enumerate(self.columns[name]):
+            if text in row_of:
+                raise self.error(row, name, f"{text[:80]!r} occurs twice")
+            row_of[text] = row
+        for key in keys:
+            if key not in row_of:
+                raise InputError(
+                    where, f"{name} {key[:80]!r} is not in {self.path.name}", "Use files of one recording."
+                )
+        return np.array([row_of[key] for key in keys], dtype=np.int64)
+
+    def _within(self, values: FloatArray, name: str, low: float, high: float, what: str, unit: str) -> FloatArray:
+        for row in np.flatnonzero((values < low) | (values > high)):
+            expected = f"expected {what} from {low:g} to {high:g} {unit}"
+            raise self.error(int(row), name, f"{expected}, got {values[row]:g} {unit}")
+        return values
+
     def error(self, row: int, name: str, problem: str, hint: str = "Correct the row, or remove it.") -> InputError:
-        """Return an error about a cell; rows count from 1, without the header."""
-        return InputError(f"{self.path}: row {row + 1}: {name}", problem, hint)
+        """Return an error about a cell; ``row`` counts from 0, without the header."""
+        where = f"line {self.lines[row]}" if self.lines else f"row {row + 1}"
+        return InputError(f"{self.path}: {where}: {name}", problem, hint)
+
+
+_EMPTY = frozenset({"", "nan", "none", "null"})
+"""Texts of a cell without a value, in lower case."""
+
+
+def _to_floats(texts: Sequence[str]) -> FloatArray:
+    """Return the numbers of texts, infinite where a text is no number.
+
+    Python's float also reads digits of other scripts, and underscores between digits; they are no numbers here.
+    """
+    try:
+        values = np.fromiter(map(float, texts), dtype=np.float64, count=len(texts))
+    except ValueError:
+        values = np.fromiter((_to_float(text) for text in texts), dtype=np.float64, count=len(texts))
+    joined = "".join(texts)
+    if not joined.isascii() or "_" in joined:
+        for row, text in enumerate(texts):
+            if not text.isascii() or "_" in text:
+                values[row] = math.inf
+    return values
 
 
 def _to_float(text: str) -> float:
@@ -89,7 +205,25 @@ def has_columns(head: bytes, *names: str) -> bool:
     return set(name.lower() for name in names) <= set(header(head))
 
 
-def read_table(path: Path, required: Sequence[str], optional: Sequence[str] = (), delimiter: str = ",") -> Table:
+def read_text(path: Path, hint: str = _HINT) -> str:
+    """Return the text of a file, plain or gzipped; InputError when it is damaged or no UTF-8."""
+    with reading.translate_errors(path, hint, "cannot be read as CSV"), xml.open_bounded(path) as file:
+        return file.read().decode("utf-8-sig")
+
+
+def read_rows(path: Path, delimiter: str = ",", hint: str = _HINT) -> list[tuple[int, list[str]]]:
+    """Return the rows of a CSV file that are not empty, with their line numbers, cells stripped.
+
+    InputError when it is damaged.
+    """
+    rows = csv.reader(io.StringIO(read_text(path, hint), newline=""), delimiter=delimiter, skipinitialspace=True)
+    with reading.translate_errors(path, hint, "cannot be read as CSV"):
+        return [(rows.line_num, [cell.strip() for cell in row]) for row in rows if row]
+
+
+def read_table(
+    path: Path, required: Sequence[str], optional: Sequence[str] = (), delimiter: str = ",", hint: str = _HINT
+) -> Table:
     """Read columns of a CSV file.
 
     Parameters
@@ -100,45 +234,67 @@ def read_table(path: Path, required: Sequence[str], optional: Sequence[str] = ()
         Names of columns. Names in the file may differ in case. Other columns are not read.
     delimiter
         Between the cells of a row.
+    hint
+        What to do when the file does not fit, for messages.
 
     Raises
     ------
     InputError
-        When the file is damaged, a required column is missing, a wanted column occurs twice, a row has too few cells,
-        or there is no row.
+        When the file is damaged, a required column is missing, a wanted column occurs twice, a row has another number
+        of cells than the header (empty ones at its end do not count), or there is no row.
     """
-    with reading.translate_errors(path, _HINT, "cannot be read as CSV"), xml.open_bounded(path) as file:
-        lines = file.read().decode("utf-8-sig").splitlines()
-    rows = csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
-    with reading.translate_errors(path, _HINT, "cannot be read as CSV"):
-        names = [name.strip() for name in next(rows, [])]
-        positions = _positions(path, names, required, optional)
-        cells: dict[str, list[str]] = {name: [] for name in positions}
-        for row in rows:
-            if not row:
-                continue
-            for name, position in positions.items():
-                if position >= len(row):
-                    where = f"{path}: line {rows.line_num}"
-                    raise InputError(where, f"expected {len(names)} cells, got {len(row)}", "Complete the row.")
-                cells[name].append(row[position].strip())
-    table = Table(path, cells)
+    rows = read_rows(path, delimiter, hint)
+    names = rows[0][1] if rows else []
+    positions = _positions(path, names, required, optional, hint)
+    for line, row in rows[1:]:
+        if len(row) < len(names) or any(row[len(names) :]):
+            raise InputError(f"{path}: line {line}", f"expected {len(names)} cells, got {len(row)}", "Correct the row.")
+    cells = {name: [row[position] for _, row in rows[1:]] for name, position in positions.items()}
+    table = Table(path, cells, [line for line, _ in rows[1:]])
     if not table.n_rows:
-        raise InputError(path, "contains no rows", _HINT)
+        raise InputError(path, "contains no rows", hint)
     return table
 
 
-def _positions(path: Path, names: list[str], required: Sequence[str], optional: Sequence[str]) -> dict[str, int]:
-    """Return the position of each wanted column in the file."""
-    lower = [name.lower() for name in names]
+def _positions(
+    path: Path, names: list[str], required: Sequence[str], optional: Sequence[str], hint: str
+) -> dict[str, int]:
+    """Return the position of each wanted column in the file, preferably in the same case."""
     positions: dict[str, int] = {}
     for name in (*required, *optional):
-        count = lower.count(name.lower())
-        if count > 1:
-            raise InputError(path, f"the column {name!r} occurs {count} times", _HINT)
-        if count:
-            positions[name] = lower.index(name.lower())
+        matches = [position for position, actual in enumerate(names) if actual == name]
+        matches = matches or [position for position, actual in enumerate(names) if actual.lower() == name.lower()]
+        if len(matches) > 1:
+            raise InputError(path, f"the column {name!r} occurs {len(matches)} times", hint)
+        if matches:
+            positions[name] = matches[0]
         elif name in required:
-            actual = ", ".join(names)[:200] or "none"
-            raise InputError(path, f"expected a column {name!r}, got {actual}", _HINT)
+            actual_names = ", ".join(names)[:200] or "none"
+            raise InputError(path, f"expected a column {name!r}, got {actual_names}", hint)
     return positions
+
+
+def companion(path: Path, ending: str, companion_ending: str) -> Path:
+    """Return the file beside a file of tracks that differs in the end of its name, plain or gzipped.
+
+    Parameters
+    ----------
+    path
+        The file of tracks: ``07_tracks.csv``.
+    ending, companion_ending
+        End of its name, and of that of the companion: ``_tracks.csv``, ``_tracksMeta.csv``.
+
+    Raises
+    ------
+    InputError
+        When the file has another name, or its companion does not exist.
+    """
+    name = path.name.removesuffix(".gz")
+    if not name.endswith(ending):
+        expected = f"expected a name that ends with {ending}, got {path.name}"
+        raise InputError(path, expected, f"Keep the published names; ...{companion_ending} must be beside it.")
+    other = name.removesuffix(ending) + companion_ending
+    for candidate in (path.with_name(other), path.with_name(f"{other}.gz")):
+        if candidate.is_file():
+            return candidate
+    raise InputError(path, f"expected the file {other} beside it", "Copy it there from the data set.")

@@ -11,17 +11,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.grid import FloatArray, IntArray
+from egvs.scenario.track_columns import RoadUserClass
 
 HEAD_BYTES = 4096
 """How much of a file :meth:`TrackReader.can_open` gets, after gunzip."""
 
-CLASSES = ("car", "van", "truck", "bus", "trailer", "tram", "motorcycle", "bicycle", "pedestrian", "other")
+CLASSES: tuple[str, ...] = get_args(RoadUserClass)
 """Classes of road users."""
 
 

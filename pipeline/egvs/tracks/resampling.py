@@ -110,6 +110,7 @@ def resample(tracks: CleanTracks, first_s: float, period_s: float, n_frames: int
 
     first_frame = np.searchsorted(frame_s, tracks.time_s[:-1] - tolerance_s)
     end_frame = np.searchsorted(frame_s, tracks.time_s[1:] - tolerance_s)
+    gap_frame = np.searchsorted(frame_s, tracks.time_s[:-1] + tolerance_s, side="right")
     pairs = np.flatnonzero(is_joined)
     left, frame = _repeat_over_frames(pairs, first_frame, end_frame)
     # the last row of a joined sequence is at a frame, too, if the times agree
@@ -143,9 +144,9 @@ def resample(tracks: CleanTracks, first_s: float, period_s: float, n_frames: int
         both(tracks.y_m[left] + share * dy_m, tracks.y_m[rows]),
         both(tracks.yaw_rad[left] + share * turn_rad, tracks.yaw_rad[rows]),
         both(np.hypot(dx_m, dy_m) / duration_s, last_speed_m_s[rows]),
-        int((is_gap & is_joined & (end_frame > first_frame)).sum()),
-        int((is_long & (end_frame > first_frame)).sum()),
-        _unknown_boxes(tracks, np.flatnonzero(is_long), first_frame, end_frame),
+        int((is_gap & is_joined & (end_frame > gap_frame)).sum()),
+        int((is_long & (end_frame > gap_frame)).sum()),
+        _unknown_boxes(tracks, np.flatnonzero(is_long), gap_frame, end_frame),
     )
 
 

@@ -1,0 +1,171 @@
+"""``egvs sensor``: derive a sensor from its own sweeps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from egvs.cli.quick_help import QuickHelpGroup
+from egvs.core.errors import InputError
+
+if TYPE_CHECKING:
+    from egvs.sensor_fit.fit import SensorFit
+    from egvs.sensor_fit.intervals import Estimate
+    from egvs.sensor_fit.output import FitFolder
+
+app = typer.Typer(cls=QuickHelpGroup, no_args_is_help=True, help="Derive a sensor from its own sweeps.")
+
+
+@app.callback()
+def sensor() -> None:
+    """Derive a sensor from its own sweeps."""
+
+
+@app.command()
+def fit(
+    sweeps: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SWEEPS...",
+            help="Sweeps of an installed LiDAR, one per file, in its own frame: .pcd, .ply, .las, .laz, .csv, .e57, or"
+            " .npz with an array per sweep; also with .gz.",
+        ),
+    ],
+    name: Annotated[str, typer.Option(metavar="NAME", help="Required: name of the sensor, as in [sensors.NAME].")] = "",
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Folder to write; sensors/NAME by default.")
+    ] = None,
+    ground: Annotated[
+        int,
+        typer.Option(metavar="N", min=1, help="Which of the ground planes that are listed the sensor stands over."),
+    ] = 1,
+    road: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FIRST,LAST",
+            help="Azimuths in degrees, counter-clockwise from the sensor's x axis, between which the road is in sight;"
+            " by default found from the ground plane.",
+        ),
+    ] = None,
+    without_empty_sector: Annotated[
+        bool,
+        typer.Option(
+            "--without-empty-sector",
+            help="Leave the widest sector without returns (mast, wall) out of the simulated beams.",
+        ),
+    ] = False,
+) -> None:
+    """Fit elevations, azimuths, range noise, return rates and the pose of a LiDAR to sweeps that it recorded."""
+    from egvs.cli.console import ProgressDisplay
+    from egvs.core import files, plugins
+
+    plugins.require_libraries("egvs sensor fit", "figure", "matplotlib")
+    with ProgressDisplay("sensor fit") as screen:
+        from egvs.sensor_fit import fit as fitting
+        from egvs.sensor_fit import output, sweep_files
+
+        if not name:
+            raise InputError("--name", "no name is given", "Use --name north-mast.")
+        output.check_name(name)
+        options = fitting.FitOptions(ground, None if road is None else _sector(road))
+        folder = out or Path("sensors") / name
+        files.check_writable(folder / output.SENSOR_FILE)
+        steps = iter(range(1, 100))
+        screen.progress("reading", 0, 7)
+        recorded = sweep_files.read_sweeps(sweeps)
+        result = fitting.fit_sensor(recorded, options, lambda step: screen.progress(step, next(steps), 7))
+        screen.progress("writing", 6, 7)
+        written = output.write_fit(result, name, folder, without_empty_sector=without_empty_sector)
+    print_fit(result, written)
+
+
+def _sector(text: str) -> tuple[float, float]:
+    words = text.split(",")
+    try:
+        first_deg, last_deg = (float(word) for word in words)
+    except ValueError:
+        first_deg = last_deg = float("nan")
+    if not (-360 <= first_deg < last_deg <= 360 and last_deg - first_deg <= 360):
+        problem = f"expected two azimuths from -360 to 360, ascending, got {text!r}"
+        raise InputError("--road", problem, "Use two numbers such as --road=-25,25.")
+    return first_deg, last_deg
+
+
+def print_fit(result: SensorFit, written: FitFolder) -> None:
+    """Print the fitted values, the ground planes, and the files."""
+    from egvs.cli.console import WIDE, Column, console, make_table
+
+    out = console(WIDE)
+    angles = result.angles
+    missing = sum(len(sweep.points_m) - sweep.returns for sweep in result.sweeps)
+    returns = sum(sweep.returns for sweep in result.sweeps)
+    stray = sum(grid.off_grid for grid in result.grids)
+    repeated = sum(grid.repeated for grid in result.grids)
+    coarse = sum(sweep.is_coarse for sweep in result.sweeps)
+    lines = [
+        f"sweeps: {len(result.sweeps)}; {returns:,} returns, {missing:,} missing returns; not used: {stray:,} on no "
+        f"ring, {repeated:,} further returns of a pulse",
+        f"order of points in the first sweep: {result.layout}",
+        f"elevations: {angles.channels} channels from {angles.elevation_deg.min():.3f} to "
+        f"{angles.elevation_deg.max():.3f} degrees, largest standard error {angles.elevation_se_deg.max():.4f}",
+        f"vertical offsets: {1000 * angles.offset_m.min():.1f} to {1000 * angles.offset_m.max():.1f} mm, as of optics "
+        f"{1000 * angles.axis_distance_m:.1f} mm from the axis",
+        f"azimuths: {angles.azimuths} every {angles.azimuth_step_deg:.4f} degrees, {_direction(result)}",
+        f"ranges: up to {result.max_range_m:.1f} m, {_range_step(result)}",
+        f"range noise: {_millimetres(result.sigma_m)}",
+        f"returns from smooth surfaces: {_percent(result.return_rate)}",
+    ]
+    if coarse:
+        lines.insert(1, f"sweeps with float16 coordinates, used only for the empty scan: {coarse}")
+    if result.empty_sectors_deg:
+        sectors = ", ".join(f"{first:.0f} to {last:.0f}" for first, last in result.empty_sectors_deg)
+        lines.append(f"sectors without returns: azimuth {sectors} degrees (a mast, a wall, or open sky)")
+    if result.empty_scan is not None:
+        background, traffic, unknown = result.empty_scan.counts
+        known = int((result.empty_scan.range_m > 0).sum())
+        lines.append(
+            f"empty scan: {known:,} of {result.empty_scan.range_m.size:,} pulses; {traffic:,} returns in front of it "
+            f"(traffic), {background:,} on it, {unknown:,} without a known background"
+        )
+    for line in lines:
+        out.print(line)
+    planes = result.planes
+    columns: list[Column[int]] = [
+        Column("ground plane", lambda i: f"{i + 1}{' (chosen)' if planes[i] is result.plane else ''}", "left"),
+        Column("below the sensor", lambda i: f"{planes[i].height_m:.2f} +- {planes[i].height_se_m:.2f} m"),
+        Column("roll", lambda i: f"{planes[i].roll_deg:.2f} deg"),
+        Column("pitch", lambda i: f"{planes[i].pitch_deg:.2f} deg"),
+        Column("returns", lambda i: f"{planes[i].returns:,}"),
+        Column("roughness", lambda i: f"{planes[i].roughness_m:.2f} m"),
+        Column("x", lambda i: f"{planes[i].x_m[0]:.0f} to {planes[i].x_m[1]:.0f} m"),
+        Column("y", lambda i: f"{planes[i].y_m[0]:.0f} to {planes[i].y_m[1]:.0f} m"),
+    ]
+    out.print(make_table(columns, range(len(planes))))
+    out.print(f"Check in {written.folder / 'ground.png'} that the chosen plane is the road; if not, use --ground N.")
+    for file in written.names:
+        print(written.folder / file)
+
+
+def _direction(result: SensorFit) -> str:
+    return {1: "counter-clockwise from above", -1: "clockwise from above", 0: "direction of rotation unknown"}[
+        result.angles.direction
+    ]
+
+
+def _range_step(result: SensorFit) -> str:
+    return "no step" if result.range_step_m is None else f"in steps of {1000 * result.range_step_m:.3g} mm"
+
+
+def _millimetres(estimate: Estimate | None) -> str:
+    if estimate is None:
+        return "unknown (too few neighbouring returns)"
+    low, high = 1000 * estimate.low, 1000 * estimate.high
+    return f"{1000 * estimate.value:.1f} mm (95 % interval {low:.1f} to {high:.1f})"
+
+
+def _percent(estimate: Estimate | None) -> str:
+    if estimate is None:
+        return "unknown (too few neighbouring returns)"
+    return f"{estimate.value:.2%} of pulses (95 % interval {estimate.low:.2%} to {estimate.high:.2%})"

@@ -1,0 +1,1 @@
+"""Fit a sensor of a scenario to sweeps that an installed LiDAR recorded (``egvs sensor fit``)."""

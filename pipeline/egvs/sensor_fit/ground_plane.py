@@ -1,0 +1,200 @@
+r"""Find the ground below a sensor, and the height, roll and pitch that follow from it.
+
+Candidate planes are drawn through three random returns (RANSAC, Fischler and Bolles 1981, Commun. ACM 24, 381-395); the
+one with most returns within 20 cm is refined by least squares over the returns within 2.5 robust standard deviations.
+Its returns are removed and the search is repeated, because roads, verges and yards often lie at different heights and
+only a person knows which of them is the ground of the map.
+
+A plane with the unit normal n (upwards, in the sensor's frame) and the height h of the sensor above it satisfies
+:math:`n \cdot p = -h`. With the mount's rotation (roll first, then pitch, then yaw; nose up positive), the world's z
+axis is :math:`n = (\sin p,\; \cos p \sin r,\; \cos p \cos r)`. Yaw and position do not follow from a plane.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray
+
+MAX_PLANES = 3
+MAX_TILT_DEG = 45.0
+MIN_HEIGHT_M = 0.3
+
+_TRIALS = 600
+_SAMPLE = 20_000
+_TOLERANCE_M = 0.20
+_REMOVED_M = 0.5
+_MIN_SHARE = 0.02
+_BLOCK_DEG = 10.0
+_ANGLE = 1e-12
+
+
+@dataclass(frozen=True)
+class GroundPlane:
+    """A plane below the sensor.
+
+    Attributes
+    ----------
+    normal
+        Unit normal in the sensor's frame, upwards, (3,).
+    height_m, roll_deg, pitch_deg
+        Pose of the sensor over this plane, in the convention of sites.
+    height_se_m, roll_se_deg, pitch_se_deg
+        Standard errors, from leaving out sectors of 10 degrees of azimuth in turn.
+    returns, share
+        Number of returns that were fitted, and their share of all.
+    roughness_m
+        Robust standard deviation of their distances to the plane.
+    x_m, y_m
+        Where they lie in the sensor's frame: 2nd and 98th percentile along each axis.
+    """
+
+    normal: FloatArray
+    height_m: float
+    roll_deg: float
+    pitch_deg: float
+    height_se_m: float
+    roll_se_deg: float
+    pitch_se_deg: float
+    returns: int
+    share: float
+    roughness_m: float
+    x_m: tuple[float, float]
+    y_m: tuple[float, float]
+
+    def distance_m(self, points_m: FloatArray) -> FloatArray:
+        """Height of points (..., 3) above the plane."""
+        distance: FloatArray = points_m @ self.normal + self.height_m
+        return distance
+
+
+def find_ground_planes(points_m: FloatArray, where: str) -> list[GroundPlane]:
+    """Return the planes below the sensor, the one with most returns first, at most :data:`MAX_PLANES`.
+
+    Parameters
+    ----------
+    points_m
+        Returns in the sensor's frame, (n, 3).
+    where
+        The sweep, for messages.
+
+    Raises
+    ------
+    InputError
+        If no plane below the sensor contains at least 2 % of the returns.
+    """
+    rng = np.random.default_rng(0)
+    total = len(points_m)
+    rest = points_m
+    planes: list[GroundPlane] = []
+    while len(planes) < MAX_PLANES and len(rest) >= _MIN_SHARE * total:
+        start = _strongest_plane(rest, rng)
+        if start is None:
+            break
+        normal, height_m = start
+        if np.count_nonzero(np.abs(rest @ normal + height_m) < _TOLERANCE_M) < _MIN_SHARE * total:
+            break
+        planes.append(_refine(rest, normal, height_m, total))
+        rest = rest[np.abs(planes[-1].distance_m(rest)) > _REMOVED_M]
+    if not planes:
+        hint = "Give sweeps in which the road is visible, with z upwards."
+        raise InputError(where, "expected a ground plane below the sensor, got none", hint)
+    return planes
+
+
+def _strongest_plane(points_m: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, float] | None:
+    """Return the plane through three returns that has most returns nearby."""
+    sample = points_m
+    if len(sample) > _SAMPLE:
+        sample = points_m[rng.choice(len(points_m), _SAMPLE, replace=False)]
+    best: tuple[FloatArray, float] | None = None
+    most = 0
+    for _ in range(_TRIALS):
+        a, b, c = sample[rng.integers(len(sample), size=3)]
+        normal = np.cross(b - a, c - a)
+        length = float(np.linalg.norm(normal))
+        if length < _ANGLE:
+            continue
+        normal = normal / (length if normal[2] > 0 else -length)
+        height_m = -float(normal @ a)
+        if normal[2] < math.cos(math.radians(MAX_TILT_DEG)) or height_m < MIN_HEIGHT_M:
+            continue
+        inside = int(np.count_nonzero(np.abs(sample @ normal + height_m) < _TOLERANCE_M))
+        if inside > most:
+            most = inside
+            best = normal, height_m
+    return best
+
+
+def _refine(points_m: FloatArray, normal: FloatArray, height_m: float, total: int) -> GroundPlane:
+    # z = slope_x x + slope_y y + level
+    coefficients = np.array([-normal[0] / normal[2], -normal[1] / normal[2], -height_m / normal[2]])
+    tolerance_m = _TOLERANCE_M
+    for _ in range(8):
+        residual = points_m[:, 2] - _design(points_m) @ coefficients
+        used = np.abs(residual) <= tolerance_m
+        design = _design(points_m[used])
+        coefficients = np.linalg.solve(design.T @ design, design.T @ points_m[used, 2])
+        residual = points_m[used, 2] - design @ coefficients
+        tolerance_m = float(np.clip(2.5 * 1.4826 * np.median(np.abs(residual)), 0.01, _TOLERANCE_M))
+    members = points_m[used]
+    pose = _pose(coefficients)
+    errors = _jackknife(members)
+    normal, height_m = _plane(coefficients)
+    low, high = np.percentile(members[:, :2], [2, 98], axis=0)
+    return GroundPlane(
+        normal=normal,
+        height_m=height_m,
+        roll_deg=float(pose[1]),
+        pitch_deg=float(pose[2]),
+        height_se_m=float(errors[0]),
+        roll_se_deg=float(errors[1]),
+        pitch_se_deg=float(errors[2]),
+        returns=len(members),
+        share=len(members) / total,
+        roughness_m=1.4826 * float(np.median(np.abs(residual))) * float(normal[2]),
+        x_m=(float(low[0]), float(high[0])),
+        y_m=(float(low[1]), float(high[1])),
+    )
+
+
+def _design(points_m: FloatArray) -> FloatArray:
+    return np.column_stack([points_m[:, 0], points_m[:, 1], np.ones(len(points_m))])
+
+
+def _plane(coefficients: FloatArray) -> tuple[FloatArray, float]:
+    """Return normal and height of z = a x + b y + c."""
+    normal = np.array([-coefficients[0], -coefficients[1], 1.0])
+    length = float(np.linalg.norm(normal))
+    return normal / length, float(-coefficients[2]) / length
+
+
+def _pose(coefficients: FloatArray) -> FloatArray:
+    """Return height (m), roll and pitch (degrees)."""
+    normal, height_m = _plane(coefficients)
+    roll = math.degrees(math.atan2(normal[1], normal[2]))
+    return np.array([height_m, roll, math.degrees(math.asin(normal[0]))])
+
+
+def _jackknife(members: FloatArray) -> FloatArray:
+    """Return standard errors of the pose: each sector of azimuth is left out in turn."""
+    sector = np.floor((np.degrees(np.arctan2(members[:, 1], members[:, 0])) + 180.0) / _BLOCK_DEG).astype(np.int64)
+    design = _design(members)
+    sectors = np.unique(sector)
+    products, sides = [], []
+    for number in sectors:
+        part = design[sector == number]
+        products.append(part.T @ part)
+        sides.append(part.T @ members[sector == number, 2])
+    if len(sectors) < 3:
+        return np.full(3, np.nan)
+    poses = np.array(
+        [_pose(np.linalg.solve(sum(products) - p, sum(sides) - s)) for p, s in zip(products, sides, strict=True)]
+    )
+    k = len(sectors)
+    errors: FloatArray = np.sqrt((k - 1) / k * ((poses - poses.mean(axis=0)) ** 2).sum(axis=0))
+    return errors

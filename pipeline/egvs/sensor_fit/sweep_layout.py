@@ -1,0 +1,287 @@
+"""Find which channel fired each pulse of a sweep, from the points alone.
+
+Two kinds of files exist. An *organised* sweep has a slot for each pulse, with a missing return as NaN; slots run either
+channel by channel within a column (a column is one azimuth step), or column by column within a channel. Headers often
+claim the wrong one of the two, so both are tested for every number of channels that divides the number of slots: the
+right one is the smallest number for which each channel keeps to one elevation. A *list of returns* has no slots; its
+points lie on as many cones as the sensor has channels, and :func:`find_rings` separates them by elevation.
+
+A return's optical path need not start at the origin of the frame. A channel at elevation e whose rays start at a height
+z0 on the axis gives points on the cone
+
+.. math:: z = \\rho \\tan e + z_0, \\qquad \\rho = \\sqrt{x^2 + y^2},
+
+so a few centimetres of offset smear the elevation of near points by more than the spacing of dense rings. Before
+clustering, one offset in radius and one in height for all channels are therefore chosen such that the elevations
+cluster best, as in the Hough transform of ALICE-LRI (Soutullo et al. 2025, arXiv 2510.20708).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import find_peaks
+
+from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray, IntArray
+
+MIN_CHANNELS, MAX_CHANNELS = 4, 512
+MIN_COLUMNS = 100
+
+_ORGANISED_SPREAD_DEG = 0.2
+"""Median spread of elevations within a channel, above which the slots are not in the tested order."""
+_SPREAD_RATIO = 1.5
+"""A number of channels fits as well as the best one if its spread is at most this multiple of the least spread."""
+_MIN_RETURNS_PER_CHANNEL = 20
+
+_OFFSETS_M = np.arange(-0.10, 0.1001, 0.004)
+_SHARPNESS_BIN_DEG = 0.02
+_BIN_DEG = 0.005
+_MIN_SPACING_DEG = 0.04
+_MIN_RING_SHARE = 0.02
+"""A ring has at least this share of the returns of the median ring."""
+_MAX_RESIDUAL_DEG = 0.05
+_MAX_STRAY_SHARE = 0.2
+
+_HINT = "Give complete sweeps of a sensor with rings, in the sensor's frame (z along the axis of rotation)."
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Channel and column of each slot of a sweep.
+
+    Attributes
+    ----------
+    order
+        ``"channel fastest"``, ``"column fastest"``, or ``"list of returns"``.
+    channels
+        Number of channels.
+    channel
+        (n,) int64; -1 for a point on no ring.
+    column
+        (n,) int64; None for a list of returns.
+    """
+
+    order: str
+    channels: int
+    channel: IntArray
+    column: IntArray | None
+
+
+def find_layout(points_m: FloatArray, where: str) -> Layout:
+    """Return the layout of a sweep.
+
+    Parameters
+    ----------
+    points_m
+        (n, 3), NaN for missing returns.
+    where
+        The sweep, for messages.
+
+    Raises
+    ------
+    InputError
+        If the points do not lie on rings.
+    """
+    return _organised_layout(points_m) or find_rings(points_m, where)
+
+
+def _organised_layout(points_m: FloatArray) -> Layout | None:
+    """Return the layout of an organised sweep; None if no number of channels fits."""
+    n = len(points_m)
+    elevation_deg = np.degrees(np.arctan2(points_m[:, 2], np.hypot(points_m[:, 0], points_m[:, 1])))
+    trials: list[tuple[float, int, str]] = []
+    for channels in range(MIN_CHANNELS, min(MAX_CHANNELS, n // MIN_COLUMNS) + 1):
+        if n % channels:
+            continue
+        for order in ("channel fastest", "column fastest"):
+            trials.append((_elevation_spread(_by_channel(elevation_deg, channels, order)), channels, order))
+    if not trials:
+        return None
+    least = min(spread for spread, _, _ in trials)
+    if not least < _ORGANISED_SPREAD_DEG:
+        return None
+    # Twice the channels fit as well: each is then divided in two. Random rounding makes none fit exactly equally.
+    _, channels, order = min(
+        (trial for trial in trials if trial[0] <= _SPREAD_RATIO * least + 1e-6), key=lambda trial: trial[1]
+    )
+    slots = np.arange(n)
+    if order == "channel fastest":
+        column, channel = np.divmod(slots, channels)
+    else:
+        channel, column = np.divmod(slots, n // channels)
+    return Layout(order, channels, channel, column)
+
+
+def _by_channel(values: FloatArray, channels: int, order: str) -> FloatArray:
+    """Return the values of all slots as (channels, columns)."""
+    if order == "channel fastest":
+        return values.reshape(-1, channels).T
+    return values.reshape(channels, -1)
+
+
+def _elevation_spread(elevation_deg: FloatArray) -> float:
+    """Median over channels of the median absolute deviation; infinite if channels do not differ or have few returns."""
+    counts = np.isfinite(elevation_deg).sum(axis=1)
+    filled = elevation_deg[counts >= _MIN_RETURNS_PER_CHANNEL]
+    if 2 * len(filled) < len(elevation_deg):
+        return float("inf")
+    median = np.nanmedian(filled, axis=1)
+    spread = float(np.median(np.nanmedian(np.abs(filled - median[:, None]), axis=1)))
+    total = float(np.median(np.abs(median - np.median(median))))
+    return spread if spread < 0.1 * total else float("inf")
+
+
+def find_rings(points_m: FloatArray, where: str) -> Layout:
+    """Return the layout of a list of returns: the ring of each point, in order of ascending elevation.
+
+    Parameters
+    ----------
+    points_m
+        (n, 3); NaN belongs to no ring.
+    where
+        The sweep, for messages.
+
+    Raises
+    ------
+    InputError
+        If there are no rings, or more than a fifth of the points are on none.
+    """
+    finite = np.isfinite(points_m[:, 0])
+    radius_m = np.hypot(points_m[finite, 0], points_m[finite, 1])
+    height_m = points_m[finite, 2]
+    elevation_deg = _sharpest_elevations(radius_m, height_m)
+
+    centres_deg = _histogram_peaks(elevation_deg)
+    if len(centres_deg) < MIN_CHANNELS:
+        raise InputError(where, f"expected at least {MIN_CHANNELS} rings, got {len(centres_deg)}", _HINT)
+    ring = np.searchsorted(0.5 * (centres_deg[1:] + centres_deg[:-1]), elevation_deg)
+    for _ in range(3):
+        tangent, offset_m = _fit_cones(radius_m, height_m, ring, len(centres_deg))
+        ring, residual_deg = nearest_ring(radius_m, height_m, tangent, offset_m)
+    is_stray = residual_deg > _MAX_RESIDUAL_DEG
+    counts = np.bincount(ring[~is_stray], minlength=len(tangent))
+    used = counts >= max(_MIN_RING_SHARE * np.median(counts[counts > 0]), _MIN_RETURNS_PER_CHANNEL)
+    is_stray |= ~used[ring]
+    if np.mean(is_stray) > _MAX_STRAY_SHARE or np.count_nonzero(used) < MIN_CHANNELS:
+        problem = f"expected points on rings, but {np.mean(is_stray):.0%} of them are on none"
+        raise InputError(where, problem, _HINT)
+    number = np.cumsum(used) - 1
+    channel = np.full(len(points_m), -1, dtype=np.int64)
+    channel[finite] = np.where(is_stray, -1, number[ring])
+    return Layout("list of returns", int(np.count_nonzero(used)), channel, None)
+
+
+def nearest_ring(
+    radius_m: FloatArray, height_m: FloatArray, tangent: FloatArray, offset_m: FloatArray
+) -> tuple[IntArray, FloatArray]:
+    """Return the ring whose cone is nearest to each point, and the angle between the two, degrees.
+
+    ``tangent`` is ascending. The cones of neighbouring rings do not cross within the range of returns, so the ring is
+    one of the two between whose heights at this radius the point lies.
+    """
+    ring = np.searchsorted(tangent, height_m / radius_m)
+    best = np.zeros(len(radius_m), dtype=np.int64)
+    least = np.full(len(radius_m), np.inf)
+    for shift in (-2, -1, 0, 1):
+        candidate = np.clip(ring + shift, 0, len(tangent) - 1)
+        cos2 = 1.0 / (1.0 + tangent[candidate] ** 2)
+        angle = np.abs(height_m - radius_m * tangent[candidate] - offset_m[candidate]) * cos2 / radius_m
+        is_nearer = angle < least
+        best[is_nearer] = candidate[is_nearer]
+        least[is_nearer] = angle[is_nearer]
+    return best, np.degrees(least)
+
+
+def _sharpest_elevations(radius_m: FloatArray, height_m: FloatArray) -> FloatArray:
+    """Return elevations (degrees) from the origin, shifted in radius and height, at which they cluster best."""
+    sample = slice(None, None, max(1, len(radius_m) // 40_000))
+    shift = {"radius": 0.0, "height": 0.0}
+
+    def elevations(shifted: dict[str, float], part: slice) -> FloatArray:
+        return np.degrees(np.arctan2(height_m[part] - shifted["height"], radius_m[part] - shifted["radius"]))
+
+    def sharpness(name: str, offset_m: float) -> float:
+        counts = np.bincount(
+            np.floor((elevations(shift | {name: offset_m}, sample) + 180) / _SHARPNESS_BIN_DEG).astype(int)
+        )
+        return float((counts.astype(np.float64) ** 2).sum())
+
+    for name in ("radius", "height", "radius"):
+        scores = [sharpness(name, float(offset_m)) for offset_m in _OFFSETS_M]
+        best = int(np.argmax(scores))
+        if scores[best] > 1.02 * sharpness(name, 0.0):
+            shift[name] = float(_OFFSETS_M[best])
+    return elevations(shift, slice(None))
+
+
+def _histogram_peaks(elevation_deg: FloatArray) -> FloatArray:
+    """Return the elevations at which points cluster, ascending."""
+    low = float(elevation_deg.min()) - 1.0
+    bins = np.floor((elevation_deg - low) / _BIN_DEG).astype(np.int64)
+    counts = gaussian_filter1d(np.bincount(bins, minlength=int(bins.max()) + 200).astype(np.float64), 2.0)
+    peaks, _ = find_peaks(counts, distance=max(1, round(_MIN_SPACING_DEG / _BIN_DEG)))
+    if not len(peaks):
+        return np.empty(0)
+    tall = counts[peaks] > 0.05 * np.median(np.sort(counts[peaks])[-max(4, len(peaks) // 2) :])
+    return low + (peaks[tall] + 0.5) * _BIN_DEG
+
+
+def _fit_cones(radius_m: FloatArray, height_m: FloatArray, ring: IntArray, rings: int) -> tuple[FloatArray, FloatArray]:
+    """Fit the tangent of the elevation and the offset of each ring with at least 20 points, ascending."""
+    tangents, offsets_m = [], []
+    order = np.argsort(ring, kind="stable")
+    for members in np.split(order, np.cumsum(np.bincount(ring, minlength=rings))[:-1]):
+        if len(members) >= _MIN_RETURNS_PER_CHANNEL:
+            tangent, offset_m, _ = fit_cone(radius_m[members], height_m[members])
+            tangents.append(tangent)
+            offsets_m.append(offset_m)
+    ascending = np.argsort(tangents)
+    return np.array(tangents)[ascending], np.array(offsets_m)[ascending]
+
+
+PRIOR_OFFSET_M = 0.05
+"""Standard deviation of a prior of the vertical offset around 0. Where all returns of a channel have the same range, it
+decides between elevation and offset; otherwise it has no effect."""
+
+
+def fit_cone(radius_m: FloatArray, height_m: FloatArray) -> tuple[float, float, FloatArray]:
+    """Fit z = rho tan(e) + z0 to the points of a channel, robustly.
+
+    Noise of the range moves a point along its cone. What remains is the pointing error, which grows with range, and the
+    rounding of coordinates, which does not; weights 1 / (1 + (rho / median)^2) serve both. Points beyond 3.5 robust
+    standard deviations get no weight (three rounds). The covariance is the heteroscedasticity-consistent "sandwich"
+    (White 1980, Econometrica 48, 817-838).
+
+    Returns
+    -------
+    tangent, offset_m
+        tan(e) and z0.
+    covariance
+        Of the two, (2, 2).
+    """
+    design = np.column_stack([radius_m, np.ones(len(radius_m))])
+    weight = 1.0 / (1.0 + (radius_m / np.median(radius_m)) ** 2)
+    tangent = float(np.median(height_m / radius_m))
+    parameters = np.array([tangent, 0.0])
+    residual = height_m - design @ parameters
+    scale = _weighted_scale(residual, weight)
+    for _ in range(4):
+        inside = np.abs(residual) * np.sqrt(weight) <= 3.5 * scale
+        used = weight * inside
+        prior = np.diag([0.0, max(scale, 1e-9) ** 2 / PRIOR_OFFSET_M**2])
+        normal = (design * used[:, None]).T @ design + prior
+        parameters = np.linalg.solve(normal, design.T @ (used * height_m))
+        residual = height_m - design @ parameters
+        scale = _weighted_scale(residual, weight)
+    inverse = np.linalg.inv(normal)
+    scores = design * (used * residual)[:, None]
+    correction = max(1.0, np.count_nonzero(used) / max(1, np.count_nonzero(used) - 2))
+    covariance = inverse @ (scores.T @ scores * correction + prior * scale**2) @ inverse
+    return float(parameters[0]), float(parameters[1]), covariance
+
+
+def _weighted_scale(residual: FloatArray, weight: FloatArray) -> float:
+    return 1.4826 * float(np.median(np.abs(residual) * np.sqrt(weight)))
