@@ -8,23 +8,24 @@ comment. What was not observed often enough keeps SUMO's default, or is marked f
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from egvs.core.errors import InputError
-from egvs.importers import junctions, recorded_traffic
+from egvs.importers import junctions
 from egvs.importers.fleet_from_tracks import VEHICLE_CLASSES, KindEstimate, estimate_fleet
 from egvs.importers.junctions import StreetJunction, Streets
+from egvs.importers.recorded_traffic import TrackFiles
 from egvs.scenario.traffic_config import CountConfig
 from egvs.tracks import cleaning, resampling
 from egvs.tracks.cleaning import CleanTracks
 from egvs.tracks.sizes import CLASS_SIZES
-from egvs.traffic import recorded_tracks, track_alignment, track_demand, track_matching
+from egvs.traffic import track_alignment, track_demand, track_matching
 from egvs.traffic.network import Network
 from egvs.traffic.track_alignment import Alignment
 from egvs.traffic.track_demand import MIN_OBSERVATIONS, Passage
@@ -118,12 +119,12 @@ class TrackDemand:
         return text
 
 
-def estimate_demand(paths: Sequence[Path], streets: Streets, junction: StreetJunction) -> TrackDemand:
+def estimate_demand(recording: TrackFiles, streets: Streets, junction: StreetJunction) -> TrackDemand:
     """Estimate the demand through a junction from recorded tracks.
 
     Parameters
     ----------
-    paths
+    recording
         Files of recorded tracks.
     streets
         The streets of the new scenario.
@@ -135,7 +136,7 @@ def estimate_demand(paths: Sequence[Path], streets: Streets, junction: StreetJun
     InputError
         When a file is damaged, or no vehicle passes the junction.
     """
-    tracks = recorded_tracks.read_in_world_frame(paths, recorded_traffic.world_of(streets))
+    tracks = recording.read(streets)
     cleaned = cleaning.clean_tracks(tracks, CLASS_SIZES)
     first_s, duration_s = float(cleaned.time_s.min()), float(np.ptp(cleaned.time_s))
     period_s = track_matching.PERIOD_S
@@ -150,7 +151,7 @@ def estimate_demand(paths: Sequence[Path], streets: Streets, junction: StreetJun
     if not passages.counted:
         problem = "no recorded vehicle passes a junction of the network"
         hint = "Check that map and tracks show the same place and use the same coordinates."
-        raise InputError(paths[0], problem, hint)
+        raise InputError(recording.tracks[0], problem, hint)
 
     counted = _count_movements(passages.counted, streets, junction)
     notes = list(_passage_notes(passages, counted.unassigned))
@@ -188,23 +189,24 @@ def _count_movements(passages: Sequence[Passage], streets: Streets, junction: St
     vehicles: Counter[int] = Counter()
     unassigned = 0
     for passage in passages:
-        start = _gate(passage.edges, entries, reach.before(passage.edges[0]))
-        end = _gate(passage.edges[::-1], exits, reach.after(passage.edges[-1]))
-        number = number_of.get((start, end))
-        if number is None:
-            unassigned += 1
+        starts = _gates(passage.edges[::-1], entries, reach.before(passage.edges[0]))
+        ends = _gates(passage.edges[::-1], exits, reach.after(passage.edges[-1]))
+        possible = [number_of[pair] for pair in itertools.product(starts, ends) if pair in number_of]
+        if possible:
+            vehicles[possible[0]] += 1
         else:
-            vehicles[number] += 1
+            unassigned += 1
     return _MovementCounts(tuple(flows), vehicles, unassigned)
 
 
-def _gate(edges: Sequence[str], gates: set[str], beyond: set[str]) -> str | None:
-    """Return the gate that a vehicle used: the first of its roads that is one, or the only one beyond."""
-    for edge in edges:
-        if edge in gates:
-            return edge
+def _gates(edges: Sequence[str], gates: set[str], beyond: set[str]) -> list[str]:
+    """Return the gates among the roads of a vehicle, or the only one beyond them.
+
+    A vehicle that changes between parallel roads uses several; the one nearest to the junction has its turn.
+    """
+    used = [edge for edge in edges if edge in gates]
     possible = gates & beyond
-    return possible.pop() if len(possible) == 1 else None
+    return used or (list(possible) if len(possible) == 1 else [])
 
 
 class _Reach:

@@ -89,11 +89,15 @@ class _KindAttributes:
 
     values: dict[str, str | float] = field(default_factory=dict)
     comments: list[str] = field(default_factory=list)
+    defaults: dict[str, int] = field(default_factory=dict)
 
-    def leave_default(self, what: str, number: int, verb: str) -> None:
-        """State that SUMO's default is kept."""
-        verb = verb if number != 1 else f"{verb.split()[0]}s {' '.join(verb.split()[1:])}"
-        self.comments.append(f"{what}: SUMO's default, since only {number} {verb}")
+    def all_comments(self) -> list[str]:
+        """Return the sentences, and one on the attributes that keep SUMO's defaults."""
+        if not self.defaults:
+            return self.comments
+        texts = ", ".join(f"{name} ({number})" for name, number in self.defaults.items())
+        few = f"fewer than {track_demand.MIN_OBSERVATIONS} vehicles show another value"
+        return [*self.comments, f"SUMO's default, since {few}: {texts}"]
 
 
 def estimate_fleet(tracks: CleanTracks, members: Sequence[int], matched: MatchedTracks) -> tuple[KindEstimate, ...]:
@@ -134,7 +138,7 @@ def _kinds(
             name=name, vclass=CLASS_SIZES[name].vclass, share=round(number / fleet.total(), 4), length_m=length_m,
             width_m=width_m, height_m=height_m, attributes=attributes.values,
         )  # fmt: skip
-        yield KindEstimate(kind, (share, size_origin, *attributes.comments), is_default)
+        yield KindEstimate(kind, (share, size_origin, *attributes.all_comments()), is_default)
 
 
 def _attributes(name: str, tracks: CleanTracks, behaviour: _Behaviour, *, has_sizes: bool) -> _KindAttributes:
@@ -158,7 +162,7 @@ def _attributes(name: str, tracks: CleanTracks, behaviour: _Behaviour, *, has_si
         min_gap_m = attributes.values["minGap"] = round(gap.value, 2)
         attributes.comments.append(f"minGap {gap.format(2, 'm')}")
     else:
-        attributes.leave_default("minGap", len(standing_m), "stand behind another")
+        attributes.defaults["minGap"] = len(standing_m)
 
     time_gaps_s = [
         follower.time_gap_s(min_gap_m, model.deceleration_m_s2, model.dawdling_m_s)
@@ -170,7 +174,7 @@ def _attributes(name: str, tracks: CleanTracks, behaviour: _Behaviour, *, has_si
         attributes.values["tau"] = round(time_gap.value, 2)
         attributes.comments.append(f"tau {time_gap.format(2, 's')}")
     else:
-        attributes.leave_default("tau", len(time_gaps_s), "follow in a queue at a stop line")
+        attributes.defaults["tau"] = len(time_gaps_s)
     return attributes
 
 
@@ -178,7 +182,7 @@ def _add_speed_factor(attributes: _KindAttributes, factors: Sequence[float], daw
     """Add SUMO's speedFactor; ``dawdling`` is by how much drivers fall short of it, as a share of the limit."""
     mean, deviation = track_demand.mean_of(factors), track_demand.deviation_of(factors)
     if mean is None or deviation is None or not mean.is_usable:
-        attributes.leave_default("speedFactor", len(factors), "drive freely")
+        attributes.defaults["speedFactor"] = len(factors)
         return
     mean = Estimate(mean.value + dawdling, mean.low + dawdling, mean.high + dawdling, mean.n)
     attributes.values["speedFactor"] = f"normc({mean.value:.3f},{deviation.value:.3f},0.2,2)"

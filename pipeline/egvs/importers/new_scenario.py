@@ -576,7 +576,7 @@ def _add_demand(table: Any, demand: TrackDemand, names: MovementNames) -> None:
     table.update({"counts": scenario_files.counts_array(demand.flows, names, comments)})
     table["counts"].comment(f"vehicles an hour, from {demand.duration_s:,.0f} s of recorded tracks")
     table.add(tomlkit.comment("The profile of the day is not extrapolated from the recording; it is yours to enter."))
-    for line in scenario_files.periods_template(demand.flows[0]):
+    for line in scenario_files.periods_template(max(demand.flows, key=lambda flow: flow.per_hour)):
         table.add(tomlkit.comment(line))
 
 

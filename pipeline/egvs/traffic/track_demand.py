@@ -4,14 +4,14 @@ r"""Demand and driving behaviour from recorded vehicles that were matched to lan
   was last seen. One that is inside a junction when the recording begins entered it before, and does not count.
 - **Counts** of k vehicles in a time T have the exact 95 % interval of a Poisson mean, from
   :math:`\chi^2_{0.025}(2 k) / 2` to :math:`\chi^2_{0.975}(2 k + 2) / 2` (Garwood 1936).
-- **Desired speed**, as a share of the limit: the median of a vehicle where nothing slows it down. It drives straight on,
-  at more than :data:`FREE_SHARE` of the limit, with no other vehicle within :data:`FREE_GAP_S` ahead, and its speed
+- **Desired speed**, as a share of the limit: the median of a vehicle where nothing slows it down. It drives straight
+  on, at more than :data:`FREE_SHARE` of the limit, with no other vehicle within :data:`FREE_GAP_S` ahead, and its speed
   changes by less than :data:`STEADY_M_S2`. Mean and standard deviation are those over vehicles.
 - **Minimum gap**: bumper to bumper, between vehicles that stand one behind the other on a lane.
 - **Headway**: between the fronts of vehicles of a queue at the stop line, from the :data:`FIRST_IN_QUEUE`\ th on.
-- **Desired time gap** there: that with which SUMO's car-following model keeps the recorded gap. A follower at the speed v,
-  with the gap g beyond the minimum gap and the speed l of the vehicle in front, drives at the safe speed of Krauss (1998,
-  "Microscopic modeling of traffic flow", equation 3.10 in continuous form) with the braking deceleration b:
+- **Desired time gap** there: that with which SUMO's car-following model keeps the recorded gap. A follower at the
+  speed v, with the gap g beyond the minimum gap and the speed l of the vehicle in front, drives at the safe speed of
+  Krauss (1998, "Microscopic modeling of traffic flow") with the braking deceleration b:
 
   .. math:: v^2 + 2 b \tau v = l^2 + 2 b g, \qquad \tau = g / v + (l^2 - v^2) / (2 b v)
 
@@ -285,12 +285,13 @@ def free_speed_factors(matched: MatchedTracks, leaders: Leaders) -> dict[int, fl
 
 
 def _is_steady(matched: MatchedTracks) -> NDArray[np.bool_]:
-    """Return where the speed changes little before and after a row, (n,)."""
-    step_s = np.diff(matched.time_s)
-    same = (np.diff(matched.track) == 0) & (step_s > 0)
-    change = np.abs(np.diff(matched.speed_m_s)) / np.where(same, step_s, 1.0)
-    steady = same & (change < STEADY_M_S2)
-    return np.append(steady, False) & np.append(False, steady)
+    """Return where the speed changes little from the row before to the row after, (n,)."""
+    steady = np.zeros(matched.track.size, dtype=bool)
+    same = matched.track[2:] == matched.track[:-2]
+    step_s = matched.time_s[2:] - matched.time_s[:-2]
+    change = np.abs(matched.speed_m_s[2:] - matched.speed_m_s[:-2]) / np.where(same, step_s, 1.0)
+    steady[1:-1] = same & (change < STEADY_M_S2)
+    return steady
 
 
 def standing_gaps_m(matched: MatchedTracks, leaders: Leaders, length_m: FloatArray) -> dict[int, float]:
@@ -384,7 +385,7 @@ def queue_followers(matched: MatchedTracks, leaders: Leaders, length_m: FloatArr
 
 @dataclass(frozen=True, order=True)
 class _Crossing:
-    """A front that passes the end of a road: when, the vehicle, the first row after it, and whether it was in a queue."""
+    """A front that passes the end of a road: its time, the vehicle, the first row after it, whether it was queued."""
 
     time_s: float
     track: int

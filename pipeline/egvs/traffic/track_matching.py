@@ -305,7 +305,7 @@ def _transition_costs(lanes: Sequence[DrivenLane], following: Sequence[Sequence[
     for number, lane in enumerate(lanes):
         if not lane.is_inside:
             beside[lane.edge].append(number)
-    for number, lane in enumerate(lanes):
+    for number in range(len(lanes)):
         reached, front = {number}, {number}
         for _ in range(_MAX_HOPS):
             front = {after for each in front for after in following[each]} - reached
