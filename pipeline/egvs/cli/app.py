@@ -628,6 +628,14 @@ def new(
             " traffic are estimated.",
         ),
     ] = None,
+    signals: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE",
+            help="Recorded signals of the junction, and a file that assigns their groups to lanes (KML or CSV), for"
+            " simulated traffic: --signals A --signals B.",
+        ),
+    ] = None,
     track_crs: Annotated[
         str | None,
         typer.Option(
@@ -671,7 +679,7 @@ def new(
     options = NewScenarioOptions(
         lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=demand, pole_spacing_m=pole_spacing_m,
         align=tuple(cli_options.point_pair(text) for text in align or []), tracks=tuple(tracks or ()),
-        like=tuple(like or ()), track_crs=track_crs,
+        like=tuple(like or ()), signals=tuple(signals or ()), track_crs=track_crs,
     )  # fmt: skip
     scenario = new_scenario.create_scenario(folder, paths, location, options)
     new_summary.print_new_scenario(scenario)

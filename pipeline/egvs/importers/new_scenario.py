@@ -42,8 +42,10 @@ from egvs.importers import (
     map_readers,
     openstreetmap,
     osm_solids,
+    recorded_signals,
     recorded_traffic,
     scenario_files,
+    signal_programs,
     static_objects,
 )
 from egvs.importers.alignment import PointPair, make_alignment
@@ -193,6 +195,8 @@ class NewScenarioOptions:
         Files of recorded tracks, or folders of them, which replace assumed traffic.
     like
         The same, but from which the demand of simulated traffic is estimated.
+    signals
+        Files of recorded signals of the junction, and of what their groups govern; see :mod:`recorded_signals`.
     track_crs
         Coordinate system of the tracks, as for the key ``traffic.track_crs``.
     """
@@ -205,6 +209,7 @@ class NewScenarioOptions:
     align: tuple[PointPair, ...] = ()
     tracks: tuple[Path, ...] = ()
     like: tuple[Path, ...] = ()
+    signals: tuple[Path, ...] = ()
     track_crs: str | None = None
 
     def check(self) -> None:
@@ -214,6 +219,9 @@ class NewScenarioOptions:
         if self.tracks and self.like:
             hint = "--tracks replays tracks, --like simulates such traffic."
             raise InputError("--like", "cannot be combined with --tracks", hint)
+        if self.tracks and self.signals:
+            hint = "Use them with --like, for simulated traffic."
+            raise InputError("--signals", "has no effect on recorded traffic (--tracks)", hint)
         if self.track_crs is not None and not self.tracks and not self.like:
             raise InputError("--track-crs", "has no effect without recorded tracks", "Give them with --tracks.")
         if self.surroundings_m is not None and self.surroundings_m < SURROUNDINGS_MIN_M:
@@ -301,12 +309,10 @@ def create_scenario(
     notes += _level_notes(level, objects.counts) + _range_notes(objects.counts)
     if options.walk:
         notes.append(PEOPLE_HINT)
-    demand = demand_from_tracks.estimate_demand(example, streets, junction) if example else None
-    notes += demand.notes if demand else ()
-    assumed = None
-    if not options.tracks and not options.like:
-        assumed = assumed_traffic.assume_traffic(roads.network, streets, junction, options.traffic)
-    notes += assumed_traffic.traffic_notes(assumed)
+    network, signal_notes = _with_signals(roads.network, junction, options.signals, streets)
+    junction = replace(junction, signalised=junction.signalised or bool(options.signals))
+    assumed, demand, traffic_notes = _plan_traffic(network, streets, junction, options, example)
+    notes += [*signal_notes, *traffic_notes]
     relief = Relief.of_region(streets, junction, roi)
     if relief.other_levels:
         notes.append(f"lanes on another level cross the region of interest: {', '.join(relief.other_levels)}")
@@ -328,13 +334,13 @@ def create_scenario(
         terrain_files[TERRAIN_FILE] = partial(ply.write, points_m=terrain_m)
     statics = scenario_files.statics_table(list(meshes), *terrain_files)
     contents: dict[str, FileContent] = {
-        NETWORK_FILE: roads.network,
+        NETWORK_FILE: network,
         STATICS_FILE: scenario_files.solids_geojson(objects.solids, objects.counts, scenario.attributions),
         SITES_FILE: scenario_files.sites_csv(poles, columns),
         **meshes,
         **terrain_files,
         **({} if recording is None else recording.copies()),
-        SCENARIO_FILE: _scenario_toml(name, scenario, relief, statics, recording),
+        SCENARIO_FILE: _scenario_toml(name, scenario, relief, statics, recording, has_signals=bool(options.signals)),
     }
     recorded: list[RecordedTracks] = []
 
@@ -345,6 +351,32 @@ def create_scenario(
 
     scenario_files.publish_folder(folder, contents.items(), check)
     return replace(scenario, recorded=recorded[0] if recorded else None)
+
+
+def _with_signals(
+    network: str, junction: StreetJunction, paths: Sequence[Path], streets: Streets
+) -> tuple[str, tuple[str, ...]]:
+    """Return the network with recorded signals at the junction, and notes on them; unchanged without files."""
+    if not paths:
+        return network, ()
+    if junction.ring is not None:
+        raise InputError("--signals", "the junction is a roundabout", "Choose another junction with --at LAT,LON.")
+    signals = recorded_signals.read_signals(paths)
+    plan = signal_programs.apply_signals(network, junction.id, signals, streets.frame, "--signals")
+    return plan.network, plan.notes
+
+
+def _plan_traffic(
+    network: str, streets: Streets, junction: StreetJunction, options: NewScenarioOptions, example: TrackFiles | None
+) -> tuple[AssumedTraffic | None, TrackDemand | None, Sequence[str]]:
+    """Return the assumed traffic, or the demand like recorded tracks, or neither for recorded traffic; and notes."""
+    if example is not None:
+        demand = demand_from_tracks.estimate_demand(example, streets, junction)
+        return None, demand, demand.notes
+    if options.tracks:
+        return None, None, ()
+    assumed = assumed_traffic.assume_traffic(network, streets, junction, options.traffic)
+    return assumed, None, assumed_traffic.traffic_notes(assumed)
 
 
 def _find_tracks(paths: Sequence[Path], crs: str | None) -> TrackFiles | None:
@@ -515,12 +547,13 @@ def scenario_notes(junction_fits: bool, counts: ImportCounts) -> list[str]:
 
 
 def _scenario_toml(
-    name: str, scenario: NewScenario, relief: Relief, statics: TomlTable, recording: TrackFiles | None
-) -> str:
+    name: str, scenario: NewScenario, relief: Relief, statics: TomlTable, recording: TrackFiles | None, *,
+    has_signals: bool,
+) -> str:  # fmt: skip
     title = scenario.junction.title
     values: dict[str, Any] = {
         "description": title[0].upper() + title[1:],
-        "assumed": _assumptions(scenario, is_recorded=recording is not None),
+        "assumed": _assumptions(scenario, is_recorded=recording is not None or has_signals),
         "seed": 1,
     }
     if name:
