@@ -37,8 +37,10 @@ from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.core.progress import ProgressCallback, no_progress
-from egvs.report.basemap import network_file
+from egvs.report.basemap import network_file, roads_within, world_outlines
+from egvs.report.maps import Backdrop
 from egvs.report.ranking import RankedSite, Ranking
+from egvs.report.svg_figures import extent
 from egvs.runs.stage_registry import recorded_digests
 from egvs.scenario.loading import scenario_from_dict
 from egvs.scoring.road_locations import LANE, TURN, RoadLocations
@@ -138,6 +140,8 @@ class TpogComparison:
         Entropy of the covered voxels: recorded, simulated, and simulated minus recorded.
     ranks
         Agreement of the rankings; None with fewer than two common sites.
+    backdrop
+        Background of maps.
     """
 
     folders: tuple[Path, Path]
@@ -150,6 +154,7 @@ class TpogComparison:
     occupancy: tuple[Measured, Measured]
     entropy_bit: tuple[Measured, Measured, Measured]
     ranks: RankComparison | None
+    backdrop: Backdrop
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +203,10 @@ def compare_tpogs(recorded: Path, simulated: Path, progress: ProgressCallback = 
         raise InputError(simulated, f"its region or voxels differ from those of {recorded}", hint)
     jackknives = [_jackknife(path, tpog) for path, tpog in zip(paths, tpogs, strict=True)]
     covered = _covered_columns(runs[0], tpogs[0].grid)
-    bins = lane_bins(_roads(runs), tpogs[0].grid, covered)
+    network_path = _network_file(runs)
+    box = extent(tpogs[0].grid, ())
+    backdrop = Backdrop(world_outlines(runs[0].world, box), roads_within(network_path, box))
+    bins = lane_bins(network.read_net_xml(network_path), tpogs[0].grid, covered)
     statistics = [_Statistics.of(jackknife, bins, covered, tpogs[0].grid) for jackknife in jackknives]
     both = _Pair(*statistics, tuple(jackknives[0].groups), tuple(jackknives[1].groups))
 
@@ -222,7 +230,7 @@ def compare_tpogs(recorded: Path, simulated: Path, progress: ProgressCallback = 
     return TpogComparison(
         (recorded, simulated), tpogs, (tpogs[0].frames, tpogs[1].frames),
         (both.n_groups(0), both.n_groups(1)), float(covered.mean()), tuple(lanes), distance, (mean[0], mean[1]),
-        (totals[0], totals[1], difference), _compare_ranks(recorded, simulated, progress),
+        (totals[0], totals[1], difference), _compare_ranks(recorded, simulated, progress), backdrop,
     )  # fmt: skip
 
 
@@ -263,11 +271,11 @@ def _column_centres(grid: Grid) -> FloatArray:
     return np.column_stack([values.ravel() for values in np.meshgrid(*axes, indexing="ij")])
 
 
-def _roads(runs: Sequence[StageContext]) -> network.Network:
+def _network_file(runs: Sequence[StageContext]) -> Path:
     for run in runs:
         path = network_file(run.folder.path)
         if path is not None:
-            return network.read_net_xml(path)
+            return path
     hint = "Set traffic.roads in its scenario, and repeat egvs run."
     raise InputError(runs[0].folder.path, "neither run has a network, so there are no lanes to compare", hint)
 
