@@ -57,7 +57,7 @@ def scores(folder: Path) -> list[float]:
     return list(egvs.read_scores(folder / "scores.parquet").column("egvs").to_pylist())
 
 
-@pytest.mark.parametrize("heading", ["An effect", "A format of point clouds", "A score"])
+@pytest.mark.parametrize("heading", ["An effect", "A format of point clouds", "A format of recorded tracks", "A score"])
 def test_the_example_is_short(heading: str) -> None:
     modules = [text for name, text in package(heading).items() if name.endswith(".py")]
     assert len(modules) == 1
@@ -129,6 +129,28 @@ read, dropped = read_points(path, "here")
 assert dropped == 0 and read.tobytes() == points.tobytes()
 """
     done = processes.python(code, tmp_path / "scan.xyz", beside=beside)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.system
+def test_a_format_of_tracks_of_another_package_is_read(tmp_path: Path) -> None:
+    """A car at 10 m, 20 m that heads east, beside the program's own formats."""
+    beside = install(package("A format of recorded tracks"), tmp_path / "installed")
+    code = """
+import math, sys, pathlib
+from egvs.tracks import track_readers
+path = pathlib.Path(sys.argv[1])
+reader = track_readers.find_reader(path)
+assert reader.NAME == "radar tracks" and "SinD tracks" in track_readers.describe_formats()
+tracks = reader.read(path)
+assert tracks.names == ("7",) and tracks.classes == ("car",) and tracks.frame.offset_m == (5e5, 5.6e6)
+box = [float(column[0]) for column in (tracks.time_s, tracks.x_m, tracks.y_m, tracks.yaw_rad, tracks.length_m)]
+assert all(math.isclose(a, b, abs_tol=1e-9) for a, b in zip(box, (1.5, 10, 20, 0, 4.5), strict=True)), box
+assert math.isnan(tracks.width_m[0])
+"""
+    path = tmp_path / "tracks.csv"
+    path.write_text("track,kind,x_cm,y_cm,stamp_ms,azimuth_deg,length_cm\n7,PKW,1000,2000,1500,90,450\n")
+    done = processes.python(code, path, beside=beside)
     assert done.returncode == 0, done.stderr
 
 

@@ -12,6 +12,7 @@ import json
 import re
 import shutil
 import struct
+from collections.abc import Callable
 from datetime import date
 from functools import cache
 from pathlib import Path
@@ -22,7 +23,10 @@ import pyarrow.parquet as pq
 
 from tests.city.conftest import write_city
 from tests.conftest import SCENARIO, SITES, collection, fcd, feature, write_mini
+from tests.fuzz import read_tracks
 from tests.importers.lanelet2_maps import make_crossing
+from tests.tracks.boxes import moving_boxes
+from tests.tracks.writers import TrackRows, write_sind, write_user_table
 
 _KINDS = SCENARIO[SCENARIO.index("[[traffic.kinds]]") : SCENARIO.index("[statics]")]
 _TRAFFIC = SCENARIO[SCENARIO.index("[traffic]") : SCENARIO.index("[statics]")]
@@ -187,6 +191,33 @@ def typed(folder: Path) -> None:
     """A finished file whose sizes stand in a file of vTypes."""
     made = mini(folder, (_KINDS, ""), ('fcd = "fcd.csv"', 'fcd = "fcd.csv"\nvtypes = ["own.add.xml"]'))
     (made / "own.add.xml").write_text(VTYPES)
+
+
+def tracks(write: Callable[[Path, TrackRows], Path], *classes: str, straight: bool = False) -> Callable[[Path], None]:
+    """Recorded tracks of two road users of each class, in one format."""
+
+    def make(folder: Path) -> None:
+        (folder / "tracks").mkdir()
+        write(folder / "tracks", moving_boxes(classes, n_frames=20, straight=straight))
+
+    return make
+
+
+def zipped_tracks(folder: Path) -> None:
+    """Tracks of SinD, gzipped."""
+    tracks(write_sind, "car", "pedestrian")(folder)
+    path = folder / "tracks" / "Veh_smoothed_tracks.csv"
+    path.with_name(f"{path.name}.gz").write_bytes(gzip.compress(path.read_bytes(), mtime=0))
+    path.unlink()
+
+
+def mapped_tracks(json_lines: bool) -> Callable[[Path], None]:
+    """A user's own table of tracks."""
+
+    def write(folder: Path, boxes: TrackRows) -> Path:
+        return write_user_table(folder, boxes, read_tracks.MAPPING, json_lines)
+
+    return tracks(write, "car", "pedestrian")
 
 
 # ---- static world

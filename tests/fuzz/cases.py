@@ -31,6 +31,7 @@ from functools import cache
 from pathlib import Path
 from types import CodeType
 
+from tests.fuzz import read_tracks
 from tests.fuzz.kinds import Kind
 from tests.fuzz.meaning import DAMAGED
 
@@ -101,10 +102,13 @@ def become(folder: Path, arguments: Sequence[str], printed: Sequence[Path], stor
         }
         tempfile.tempdir = None
         _limit()
-        sys.argv = ["egvs", *arguments]
-        from egvs.cli.app import main
+        if arguments[0] == read_tracks.VERB:
+            read_tracks.main(arguments[1:])
+        else:
+            sys.argv = ["egvs", *arguments]
+            from egvs.cli.app import main
 
-        main()
+            main()
         code = 0
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else int(end.code is not None)

@@ -6,8 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.fuzz import bases, meaning
+from tests.fuzz import bases, meaning, read_tracks
 from tests.fuzz.meaning import Meaning
+from tests.tracks import writers
 
 Maker = Callable[[str], Callable[[Path], None]]
 """Returns what writes the base of a kind, by the name of its file."""
@@ -116,6 +117,17 @@ def _city(name: str, file: str, reads: Meaning) -> Kind:
     )
 
 
+def _tracks(file: str, make: Callable[[Path], None], reads: Meaning, main: str = "", *words: str) -> Kind:
+    """A file of recorded tracks, or one beside it, and the reader alone."""
+    verb = (read_tracks.VERB, f"tracks/{main or file}", *words)
+    reads = meaning.gzipped(reads)
+    return Kind(f"tracks {file}", f"tracks/{file}", make, reads, verb=verb, results=(read_tracks.RESULT,))
+
+
+_IND = bases.tracks(writers.write_levelx, "car", "pedestrian")
+_HIGHD = bases.tracks(writers.write_highd, "car", "truck", straight=True)
+_TAF_BW = bases.tracks(writers.write_taf_bw, "car", "pedestrian")
+
 _ALL = (
     _input("scenario.toml", "scenario.toml", bases.plain, meaning.toml, True),
     Kind("extended scenario.toml", "scenario/scenario.toml", bases.heir, meaning.toml,
@@ -165,6 +177,19 @@ _ALL = (
         ("obj", meaning.obj), ("ply", meaning.ply), ("stl", meaning.stl), ("off", meaning.bytes_themselves),
         ("gltf", meaning.text_json), ("glb", meaning.glb))),
     _beside("house.gltf", meaning.bytes_themselves, bases.modelled, "house.bin"),
+    _tracks("vehicle_tracks_000.csv", _TAF_BW, meaning.table),
+    _tracks("meta_data.csv", _TAF_BW, meaning.table, "vehicle_tracks_000.csv"),
+    _tracks("Veh_smoothed_tracks.csv", bases.tracks(writers.write_sind, "car", "pedestrian"), meaning.table),
+    _tracks("Veh_smoothed_tracks.csv.gz", bases.zipped_tracks, meaning.table),
+    *(_tracks(f"07_{file}.csv", _IND, meaning.table, "07_tracks.csv")
+      for file in ("tracks", "tracksMeta", "recordingMeta")),
+    *(_tracks(f"03_{file}.csv", _HIGHD, meaning.table, "03_tracks.csv")
+      for file in ("tracks", "tracksMeta", "recordingMeta")),
+    _tracks("trajectories.csv", bases.tracks(writers.write_ngsim, "car", "truck"), meaning.table),
+    _tracks("20181024_d1_0830_0900.csv", bases.tracks(writers.write_pneuma, "car", "bus"), meaning.semicolons),
+    _tracks("Label.csv", bases.tracks(writers.write_lumpi, "car", "pedestrian"), meaning.commas),
+    _tracks("tracks.csv", bases.mapped_tracks(False), meaning.table, "", "mapping"),
+    _tracks("tracks.jsonl", bases.mapped_tracks(True), meaning.json_lines, "", "mapping"),
     Kind("wanted junctions.csv", "wanted.csv", bases.wanted, meaning.rows, results=("made/junctions/*/*.csv",),
          verb=("city", "new", "made", "--osm", "map.osm", "--junctions", "wanted.csv")),
     _city("city.toml", "city.toml", meaning.toml), _city("junctions.csv", "junctions.csv", meaning.rows),

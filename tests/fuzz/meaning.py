@@ -111,11 +111,32 @@ def rows(data: bytes) -> object:
     return table
 
 
+def table(data: bytes) -> object:
+    """Cells of a CSV, each row as long as the header, beside which only empty ones may stand."""
+    lines = [
+        [cell.strip() for cell in row] for row in csv.reader(io.StringIO(data.decode("utf-8-sig"), newline="")) if row
+    ]
+    if any(len(row) < len(lines[0]) or any(row[len(lines[0]) :]) for row in lines):
+        raise ValueError("rows of different lengths")
+    return [row[: len(lines[0])] for row in lines]
+
+
+def json_lines(data: bytes) -> object:
+    """Values of each line; NaN is one."""
+    lines = [line for line in data.decode("utf-8-sig").split("\n") if line.strip()]
+    return [text_json(line.replace("NaN", "null").encode()) for line in lines]
+
+
 def semicolons(data: bytes) -> object:
     """Cells of SUMO's CSV, separated by semicolons or commas."""
     text = data.decode("utf-8-sig")
     table = list(csv.reader(io.StringIO(text, newline=""), delimiter=";" if ";" in text.split("\n")[0] else ","))
     return [row for row in table if row]
+
+
+def commas(data: bytes) -> object:
+    """Cells of a CSV without a header."""
+    return [row for row in csv.reader(io.StringIO(data.decode("utf-8-sig"), newline="")) if row]
 
 
 def words(data: bytes) -> object:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.formats.georeference import WorldFrame
 from egvs.importers import landxml_terrain, raster_terrain
+from egvs.importers.alignment import check_used
 from egvs.importers.ground_heights import CombinedTerrain, TinTerrain, ground_points, tin_terrain
 from egvs.importers.map_parts import Alignment, MapContext, TerrainReader
 from tests.formats.test_landxml import FACES, landxml
@@ -183,3 +185,32 @@ def test_ground_points_are_a_grid_of_known_heights(monkeypatch: pytest.MonkeyPat
     monkeypatch.setenv("EGVS_MAX_GROUND_POINTS", "5")
     with pytest.raises(InputError, match="needs 9 points in the region"):
         ground_points(terrain, box(0, 0, 12, 10), 5.0)
+
+
+def test_surface_outside_the_region_is_left_out_and_counted(tmp_path: Path) -> None:
+    """Two tiles of LandXML, one of them 5 km away; both far away are an error."""
+    head = '<CoordinateSystem epsgCode="32632"/>'
+    near, far = tmp_path / "near.xml", tmp_path / "far.xml"
+    for path, start_m in ((near, 0), (far, 5000)):
+        corners = ((7, 0, 0), (8, 9, 0), (9, 9, 9), (3, 0, 9))
+        rows = [f'<P id="{number}">{NORTH + start_m + y} {EAST + start_m + x} 50</P>' for number, x, y in corners]
+        path.write_text(landxml(FACES, head, "".join(rows)))
+    context = MapContext(FRAME, box(-2000, -2000, 2000, 2000))
+    alone = landxml_terrain.read_terrain([near], context)
+    both = landxml_terrain.read_terrain([far, near], context)
+    assert both.notes == (*alone.notes, "1 of 2 terrain surfaces are outside the region and were left out.")
+    xy_m = np.array([[1.0, 0.5]])
+    assert both.height_m(xy_m) == alone.height_m(xy_m) and np.isfinite(alone.height_m(xy_m)).all()
+    with pytest.raises(InputError, match=r"far.xml: the terrain has no triangle in the region"):
+        landxml_terrain.read_terrain([far], context)
+
+
+def test_alignment_that_no_file_needs_is_rejected() -> None:
+    here = np.array([[0.0, 0.0], [100.0, 0.0]])
+    context = MapContext(FRAME, WINDOW, Alignment(here, here))
+    context.to_world(np.array([[EAST, NORTH]]), "EPSG:32632", "a.tif")
+    with pytest.raises(InputError, match="--align: no file needs it: all files declare a reference system"):
+        check_used(context)
+    replace(context, window=box(0, 0, 1, 1)).to_world(np.zeros((1, 2)), None, "b.ply")
+    check_used(context)
+    check_used(MapContext(FRAME, WINDOW))

@@ -56,12 +56,12 @@ def test_takes_junction_at_point_then_near_signals_then_the_nearest(
 ) -> None:
     summary = create(tmp_path, at_m)
     assert summary.junction.title == title
-    assert not any("no junction in the map has signals" in note for note in summary.notes)
+    assert not any("No junction in the map has signals" in note for note in summary.notes)
 
 
 def test_largest_junction_without_any_signals_has_a_note(tmp_path: Path) -> None:
     notes = create(tmp_path, None, signals=False).notes
-    assert "no junction in the map has signals; the one with the most incoming lanes was chosen" in notes
+    assert "No junction in the map has signals; the one with the most incoming lanes was chosen." in notes
 
 
 def test_junction_without_signals_at_the_point_has_no_note(tmp_path: Path) -> None:

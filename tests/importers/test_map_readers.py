@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.importers import map_readers, openstreetmap, sumo_network
 
@@ -52,6 +53,38 @@ def test_rejects_files(tmp_path: Path, names: tuple[str, ...], problem: str) -> 
             (tmp_path / name).write_bytes(b"\xff\xd8\xff")
     with pytest.raises(InputError, match=problem):
         map_readers.open_maps([tmp_path / name for name in names])
+
+
+def test_rejects_truncated_file_in_folder_by_name(tmp_path: Path, run_egvs) -> None:
+    """Also if it is not needed: what it would add is unknown."""
+    (tmp_path / "maps").mkdir()
+    (tmp_path / "maps" / "roads.net.xml").write_bytes(NETWORK.read_bytes())
+    (tmp_path / "maps" / "town.osm.gz").write_bytes(gzip.compress(SMALL.read_bytes())[:-200])
+    code, _, error = run_egvs("new", tmp_path / "made", "--from", tmp_path / "maps")
+    assert code == 2 and f"{tmp_path / 'maps' / 'town.osm.gz'}: damaged gzip file" in error and "Traceback" not in error
+    assert not (tmp_path / "made").exists()
+
+
+def test_rejects_unreadable_file_in_folder_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "locked.gml").write_text("<CityModel/>")
+    real = files.open_input
+
+    def open_input(path: Path) -> object:
+        if path.name == "locked.gml":
+            raise PermissionError(13, "Permission denied", str(path))
+        return real(path)
+
+    monkeypatch.setattr(files, "open_input", open_input)
+    with pytest.raises(InputError, match=r"locked.gml: the file cannot be read \(Permission denied\)"):
+        map_readers.list_files([tmp_path])
+
+
+def test_surface_model_has_heights(tmp_path: Path) -> None:
+    (tmp_path / "surface.asc").write_text("ncols 2")
+    (file,) = map_readers.open_surface([tmp_path / "surface.asc"])
+    assert file.reader.NAME == "GeoTIFF or ASCII grid"
+    with pytest.raises(InputError, match=r"small.osm: expected a surface model, got OpenStreetMap"):
+        map_readers.open_surface([SMALL])
 
 
 def test_rejects_folder_without_maps(tmp_path: Path) -> None:

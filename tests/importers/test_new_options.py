@@ -192,7 +192,7 @@ def test_requested_vehicles_per_hour_above_capacity_stay_and_are_named(
     monkeypatch.setattr(assumed_traffic, "find_capacity", lambda *_: Capacity(0.46, runs))
     summary = create_scenario(tmp_path / "out", SMALL, traffic=4000)
     assert sum(flow.per_hour for flow in summary.flows) == 4000
-    note = "traffic jams are likely: the network carries 1,840 of the 4,000 requested vehicles an hour"
+    note = "Traffic jams are likely: the network carries 1,840 of the 4,000 requested vehicles an hour"
     assert any(text.startswith(note) and "Lower per_hour of traffic.counts" in text for text in summary.notes)
     assert "the shares of the movements are assumed (4,000 vehicles an hour)" in print_new(summary, capsys)
 

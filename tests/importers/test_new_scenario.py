@@ -1,11 +1,14 @@
 """New scenarios from other maps than OpenStreetMap, and from several maps."""
 
 import csv
+import json
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +16,7 @@ from pyproj import CRS
 from shapely.geometry import box
 
 from egvs.core.errors import InputError
+from egvs.formats import meshes
 from egvs.importers import alignment, static_objects, sumo_network
 from egvs.importers.map_parts import MapContext, MappedMesh, SolidMap
 from egvs.importers.map_readers import MapFile
@@ -22,10 +26,12 @@ from egvs.importers.road_source import NetworkRoads
 from egvs.importers.static_objects import REPLACED
 from egvs.scenario import loading
 from egvs.sensors import sites
+from egvs.world.terrain import TerrainSurface
 from tests.importers.creation import create_scenario
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 ROUNDABOUT = SCENARIOS / "roundabout" / "network.net.xml"
+SMALL = Path(__file__).parent / "data" / "small.osm"
 HILL = SCENARIOS / "hill" / "network.net.xml"
 
 _CORNERS = np.array([[x, y, z] for z in (0.0, 1.0) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], dtype=np.float64)
@@ -45,12 +51,12 @@ def reader(name: str, solid_map: SolidMap) -> MapFile:
     return MapFile(Path(f"{name}.map"), SimpleNamespace(NAME=name, read_solids=lambda paths, context: solid_map))
 
 
-def collect(*maps: MapFile) -> static_objects.StaticObjects:
+def collect(*maps: MapFile, zero_height_m: float | None = None, **options: Any) -> static_objects.StaticObjects:
     """Collect objects around the roundabout, whose lanes lie within 50 m of 0, 0."""
     roads = NetworkRoads.read(sumo_network.read_roads(ROUNDABOUT, sumo_network.RoadOptions()), ROUNDABOUT)
     context = MapContext(None, box(-300, -300, 300, 300), streets=roads.streets)
     read = static_objects.read_maps(maps, roads, MapFile(ROUNDABOUT, sumo_network), context)
-    return static_objects.collect_objects(read, roads.streets, (0.0, 0.0))
+    return static_objects.collect_objects(read, roads.streets, (0.0, 0.0), zero_height_m, **options)
 
 
 def test_sumo_network_is_used_as_it_is(tmp_path: Path) -> None:
@@ -100,7 +106,67 @@ def test_heights_above_sea_level_are_lowered_to_the_ground() -> None:
     (summary,) = (objects := collect(reader("city", SolidMap(meshes=meshes, has_absolute_heights=True)))).maps
     assert [mesh.vertices_m[:, 2].min() for mesh in objects.meshes] == pytest.approx([-0.25, 0.25])
     assert summary.height_range_m == pytest.approx((5.75, 20.25))
-    assert "40.25 m, from the lowest points of the objects nearest to the junction, is subtracted" in summary.notes[0]
+    lowest = "the height of the lowest points of the objects nearest to the junction"
+    assert summary.notes[0] == f"40.25 m, {lowest}, is subtracted from the heights in the map."
+    assert objects.zero_height_m == 40.25
+
+
+def slope(rise: float) -> TerrainSurface:
+    """A ground that rises by this much per metre to the east; 0 at x = 0."""
+    corners = np.array([[x, y, rise * x] for x, y in ((-300, -300), (300, -300), (300, 300), (-300, 300))], dtype=float)
+    return TerrainSurface(corners, np.array([[0, 1, 2], [0, 2, 3]]), corners[0, :2], corners[2, :2])
+
+
+def test_meshes_above_the_ground_stand_on_the_slope() -> None:
+    """Parts of one file keep their heights to each other; those of the other file stand 10 m further up the slope."""
+    wall, roof = block("wall", (95, 60, 0), (10, 10, 6)), block("roof", (97, 60, 6), (8, 10, 1))
+    house = tuple(replace(part, group="house") for part in (wall, roof))
+    shed = block("shed", (195, 60, 0), (10, 10, 3))
+    objects = collect(reader("meshes", SolidMap(meshes=(*house, shed))), ground=slope(0.1))
+    bases_m = [mesh.vertices_m[:, 2].min() for mesh in objects.meshes]
+    assert bases_m == pytest.approx([10.0, 16.0, 20.0])
+    assert (
+        objects.maps[0].notes[0]
+        == "house: 10.00 m, the height of the ground below its middle, is added to its heights."
+    )
+
+
+def test_space_of_vehicles_counts_from_the_sloping_ground() -> None:
+    """At x = -40 m, the lanes lie 8 m below z = 0: a sign at z = -2 m is above the vehicles, one at z = -7 m is not."""
+    high = replace(block("high", (-42, -2, -2.0), (4, 4, 0.5)), kind="furniture")
+    low = replace(block("low", (-42, -2, -7.0), (4, 4, 0.5)), kind="furniture")
+    absolute = SolidMap(meshes=(high, low), has_absolute_heights=True)
+    notes = collect(reader("city", absolute), zero_height_m=0.0, ground=slope(0.2)).maps[0].notes
+    assert notes[-1] == "1 of 2 objects stands in lanes; check the position of the map: low."
+
+
+def test_heights_from_surface_model_count_as_known_for_neighbours() -> None:
+    """The surface model ends at x = 200 m; beyond it, the median of three buildings in it is taken."""
+    solids = tuple(
+        MappedSolid(f"s{x}", "building", box(x, 100, x + 10, 110), 9.0, "default") for x in (150, 165, 180, 205)
+    )
+    counts = ImportCounts()
+    for solid in solids:
+        counts.keep(solid)
+    model = static_objects.SurfaceModel(Plane(20.0), Plane(8.0))
+    objects = collect(reader("footprints", SolidMap(solids, counts=counts)), surface_model=model)
+    assert [(solid.height_m, solid.height_source) for solid in objects.solids] == [
+        (12.0, "surface model"), (12.0, "surface model"), (12.0, "surface model"), (12.0, "neighbours"),
+    ]  # fmt: skip
+    notes = scenario_notes(True, objects.counts)
+    assert any("3 of 4 buildings" in note and "surface model above the terrain" in note for note in notes)
+
+
+class Plane:
+    """A height west of x = 200 m."""
+
+    notes = ()
+
+    def __init__(self, height_m: float) -> None:
+        self._height_m = height_m
+
+    def height_m(self, xy_m: np.ndarray) -> np.ndarray:
+        return np.where(xy_m[:, 0] < 200, self._height_m, np.nan)
 
 
 def test_buildings_without_a_height_get_that_of_their_neighbours() -> None:
@@ -124,7 +190,7 @@ def test_mesh_in_lanes_is_reported() -> None:
     )
     assert collect(reader("one", SolidMap(meshes=(beside, above)))).maps[0].notes == ()
     (note,) = collect(reader("two", SolidMap(meshes=(beside, above, inside)))).maps[0].notes
-    assert note == "1 of 3 objects stands in lanes; check the position of the map: inside"
+    assert note == "1 of 3 objects stands in lanes; check the position of the map: inside."
 
 
 def test_footprint_is_cut_at_the_carriageway() -> None:
@@ -238,3 +304,37 @@ def test_point_cloud_replaces_what_it_contains() -> None:
     )
     assert [solid.name for solid in rest.solids] == ["way/2"]
     assert rest.counts.objects == {"barrier": 1}
+
+
+@pytest.mark.slow
+@pytest.mark.system
+def test_slope_surface_model_and_mesh_in_one_scenario(tmp_path: Path, run_egvs) -> None:
+    """On a plane that rises by 5 % to the north; the surface model is 12 m higher, and 3 m on the northern house."""
+    made = tmp_path / "made"
+    for name, above_m in (("terrain", 0.0), ("surface", 12.0)):
+        rows = [[f"{100 + 0.05 * (520 - 20 * row - 10) + above_m:.3f}"] * 26 for row in range(26)]
+        east_m, north_m = 568648, 5761510
+        head = f"ncols 26\nnrows 26\nxllcorner {east_m - 260}\nyllcorner {north_m - 260}\ncellsize 20\n"
+        (tmp_path / f"{name}.asc").write_text(head + "\n".join(" ".join(row) for row in rows))
+        (tmp_path / f"{name}.prj").write_text("EPSG:32632")
+    import trimesh
+
+    boxes = [trimesh.creation.box((4, 4, 4), trimesh.transformations.translation_matrix((x, 60, 2))) for x in (60, 80)]
+    trimesh.util.concatenate(boxes).export(tmp_path / "sheds.obj")
+    maps = [SMALL, tmp_path / "terrain.asc", tmp_path / "sheds.obj"]
+    align = ("--align", "0,0=52.0,10.0", "--align", "0,100=52.000899,10.0")
+    code, printed, error = run_egvs(
+        "new", made, "--from", *maps, *align, "--surface", tmp_path / "surface.asc", "--vehicles-per-hour", "200"
+    )
+    assert code == 0, error
+    scenario = loading.load(made)
+    assert scenario.crs.zero_height_m == pytest.approx(113.0, abs=0.1)  # 260 m north of the grid's corner
+    features = json.loads((made / "statics.geojson").read_text())["features"]
+    heights = [f["properties"] for f in features if f["properties"].get("height_from") == "surface model"]
+    assert heights and {round(properties["height_m"], 2) for properties in heights} == {12.0}
+    vertices_m = meshes.load_clean_mesh(made / "mesh.ply", 1e6)[0].vertices
+    assert vertices_m[:, 2].min() == pytest.approx(3.0, abs=0.1)  # 60 m north of the junction
+    code, checked, error = run_egvs("check", made)
+    solids = re.search(r"\((\d+) solids with", printed)
+    assert code == 0 and solids is not None, error
+    assert f"{solids[1]} solids" in checked

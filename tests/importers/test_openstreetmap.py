@@ -350,7 +350,7 @@ def test_without_signals_chooses_largest_junction_with_note(tmp_path: Path) -> N
     plain = edited(tmp_path, (' <node id="1" ([^>]*)>.*?</node>', r' <node id="1" \1/>'))
     summary = create_scenario(tmp_path / "plain", plain)
     assert summary.junction.title == "junction without signals of East Street and North Street"
-    assert any("no junction in the map has signals" in note for note in summary.notes)
+    assert any("No junction in the map has signals" in note for note in summary.notes)
 
 
 @pytest.mark.slow
@@ -550,7 +550,7 @@ def test_flow_above_capacity_is_reduced_and_said(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(assumed_traffic, "find_capacity", lambda *_: Capacity(0.155, runs[:1]))
     notes = create_scenario(tmp_path / "jammed", SMALL).notes
     assert notes[-1] == (
-        "traffic jams in all 1 trials; a vehicle stood for 300 s at junction 1, Main Street from 20 s on."
+        "Traffic jams occur in all 1 trials; a vehicle stood for 300 s at junction 1, Main Street from 20 s on."
         " Lower per_hour of traffic.counts, or check the signals and connections there"
     )
 

@@ -139,7 +139,7 @@ def test_counts_add_up(tmp_path: Path) -> None:
         "15 points read from 1 scan: 3 outside the window, 2 not finite, 0 on moving objects, 0 merged with neighbours"
         " within 0.075 m; 10 are used (10 on the ground)."
     )
-    assert "unknown for 1 of 1 scan" in result.notes[2]
+    assert "Where the scanner stood is unknown: what moved" in result.notes[2]
     assert "If it is from one place, this is a world for that place only." in result.notes[2]
     assert [mesh.kind for mesh in result.meshes] == ["ground"]
 

@@ -31,7 +31,8 @@ def test_companions_are_found_and_copied(tmp_path: Path) -> None:
     meta = tmp_path / "meta_data.csv"
     meta.write_text("id,originLat,originLon\n000,49.0,8.4\n")
     files = TrackFiles.find([tracks])
-    assert files == TrackFiles((tracks,), (meta,))
+    assert files.source.paths == (tracks,)
+    assert files.source.companions() == [meta]
     for name, copy in files.copies().items():
         copy(tmp_path / name)
     assert {path.name for path in (tmp_path / "tracks").iterdir()} == {tracks.name, meta.name}
@@ -42,7 +43,7 @@ def test_folder_stands_for_the_tracks_in_it(tmp_path: Path) -> None:
     folder.mkdir()
     paths = [write_tracks(folder / name) for name in ("pedestrian_tracks_000.csv", "vehicle_tracks_000.csv")]
     (folder / "README.md").write_text("read me")
-    assert TrackFiles.find([folder]).tracks == tuple(paths)
+    assert TrackFiles.find([folder]).source.paths == tuple(paths)
 
 
 def test_rejects_folder_without_tracks(tmp_path: Path) -> None:
@@ -98,6 +99,32 @@ def test_tracks_in_metres_of_the_map(tmp_path: Path) -> None:
     assert egvs.load(tmp_path / "new").traffic.track_crs == "world"
 
 
+def test_own_table_of_tracks(run_egvs, tmp_path: Path) -> None:
+    road_map = write_crossing(tmp_path / "map.osm")
+    at_m = create_scenario(tmp_path / "first", road_map).junction.at_m
+    rows = [f"{0.1 * k:.1f};7;{at_m[0] - 50 + k};{at_m[1] - 1.6}" for k in range(101)]
+    (tmp_path / "mine.csv").write_text("\n".join(["t;who;east;north", *rows, ""]), encoding="utf-8")
+    columns = 'time = "t"\nid = "who"\nx = "east"\ny = "north"\ndelimiter = ";"\ndefault_type = "car"\n'
+    (tmp_path / "columns.toml").write_text(columns)
+    options = ["--tracks", tmp_path / "mine.csv", "--track-columns", tmp_path / "columns.toml"]
+    code, out, err = run_egvs("new", tmp_path / "new", "--from", road_map, *options)
+    assert (code, err) == (0, "")
+    assert "1 recorded track" in out
+    mapping = egvs.load(tmp_path / "new").traffic.track_columns
+    assert mapping is not None
+    assert (mapping.time, mapping.delimiter) == ("t", ";")
+
+
+def test_wrong_track_columns_are_reported(run_egvs, tmp_path: Path) -> None:
+    road_map, tracks = write_crossing(tmp_path / "map.osm"), write_tracks(tmp_path / "tracks.csv")
+    (tmp_path / "columns.toml").write_text('time = "t"\nyax = "x"\n')
+    options = ["--tracks", tracks, "--track-columns", tmp_path / "columns.toml"]
+    code, _, err = run_egvs("new", tmp_path / "new", "--from", road_map, *options)
+    assert code == 2
+    assert "columns.toml" in err
+    assert not (tmp_path / "new").exists()
+
+
 def test_track_crs_without_tracks_is_an_error(run_egvs, tmp_path: Path) -> None:
     road_map = write_crossing(tmp_path / "map.osm")
     code, _, err = run_egvs("new", tmp_path / "new", "--from", road_map, "--track-crs", "world")
@@ -148,9 +175,10 @@ def test_position_of_k733_by_hand(k733: Path) -> None:
     from egvs.traffic import recorded_tracks
     from egvs.world import geolocation
 
-    world = geolocation.scenario_georeference(egvs.load(k733))
+    scenario = egvs.load(k733)
+    world = geolocation.scenario_georeference(scenario)
     assert world.frame is not None
-    tracks: Tracks = recorded_tracks.read_in_world_frame([k733 / "tracks" / "vehicle_tracks_000.csv.gz"], world)
+    tracks: Tracks = recorded_tracks.read_in_world_frame(recorded_tracks.track_source(scenario), world)
     row = int(np.flatnonzero((tracks.track == tracks.names.index("5")) & (tracks.time_s == 0.0))[0])
     metres_per_degree = np.array([111_320.0 * np.cos(np.deg2rad(49.0053)), 111_320.0])
     expected_deg = np.array([8.4374089, 49.005306]) + np.array([-19.356829, -33.837784]) / metres_per_degree

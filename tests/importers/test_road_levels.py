@@ -104,9 +104,9 @@ def test_flyover_is_no_traffic_but_a_deck(tmp_path: Path) -> None:
     roads = road_network.read_net_xml(tmp_path / "flyover" / "network.net.xml").edges
     inside = {edge.id.lstrip("-").partition("#")[0] for edge in roads if made.streets.areas[edge.id].intersects(region)}
     assert inside == {"1001", "1002"}
-    note = "roads on another level are left out of the traffic in the region of interest: High Road (bridge)"
+    note = "Roads on another level are left out of the traffic in the region of interest: High Road (bridge)."
     assert note in made.notes
-    assert "no height is given for 1 of 1 bridge decks: 5 m assumed" in made.notes
+    assert "No height is given for 1 of 1 bridge decks: 5 m assumed." in made.notes
 
     (deck,) = decks_of(tmp_path / "flyover")
     assert {key: deck["properties"][key] for key in ("height_m", "base_m", "radius_m")} == {

@@ -149,7 +149,7 @@ def test_entry_of_a_ring_larger_than_the_region_has_a_note(tmp_path: Path) -> No
     summary = create_scenario(tmp_path / "out", path, at=degrees((80.0, 0.0)))
     assert summary.junction.ring is None
     (note,) = (note for note in summary.notes if "roundabout" in note)
-    assert note.startswith("the junction is one entry of a roundabout 16") and "(120 m)" in note
+    assert note.startswith("The junction is one entry of a roundabout 16") and "(120 m)" in note
 
 
 @pytest.mark.slow

@@ -431,3 +431,24 @@ def test_equal_losses_end_search() -> None:
         np.random.default_rng(0),
     )
     assert sum(calls) < 30_000
+
+
+def test_pole_that_moves_on_slope_keeps_its_height_above_ground(mini: Path) -> None:
+    """The ground rises by 0.2 m per metre to the east: sensors 3 m and 5 m above it."""
+
+    def ground_m(x_m: float, _: float) -> float:
+        return 0.2 * x_m
+
+    low, high = make_site("a", 10, 12, 5.0), make_site("b", 30, -12, 11.0)
+    config = RefinementConfig(radius_m=2.0)
+    freedom, other = sensor_freedoms(egvs.load(mini), config, [low, high], [low, high], [False, False], ground_m)
+    assert freedom is not None and other is not None
+    assert [(axis.name, axis.low, axis.high) for axis in freedom.axes[:3]] == [
+        ("x_m", 8.0, 12.0), ("y_m", 10.0, 14.0), ("z_m", 3.0, 5.0),
+    ]  # fmt: skip
+    moved = freedom.pose_at(np.array([0.75, 0.5, 0.25, 0.5, 0.75]))
+    assert moved == Pose(11.0, 12.0, 3.5 + 2.2, 0.0, 0.0)
+    assert freedom.point(moved).tolist() == [0.75, 0.5, 0.25, 0.5, 0.75]
+    fixed = sensor_freedoms(egvs.load(mini), RefinementConfig(heights_m=(4, 4)), [low], [low], [False], ground_m)[0]
+    assert fixed is not None
+    assert fixed.pose_at(np.array([0.5, 0.75])) == low.pose  # no axis for its height: it stays 3 m above the ground

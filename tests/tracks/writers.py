@@ -184,6 +184,9 @@ def write_user_table(folder: Path, boxes: TrackRows, mapping: TrackColumns, json
     columns = {str(column): texts for key, texts in values.items() if (column := getattr(mapping, key)) is not None}
     if not json_lines:
         return _write(folder / "tracks.csv", columns, mapping.delimiter)
+    texts = (mapping.id, mapping.type)
+    columns = {name: cells if name in texts else [float(cell or "nan") for cell in cells]
+               for name, cells in columns.items()}  # fmt: skip
     rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
     path = folder / "tracks.jsonl"
     path.write_text("".join(f"{json.dumps(row)}\n" for row in rows), encoding="utf-8")

@@ -12,9 +12,11 @@ import pyarrow.parquet as pq
 import pytest
 
 import egvs
+from egvs.artefacts import parquet
 from egvs.artefacts.run_record import RunRecord
 from egvs.artefacts.tpog import read_tpog
 from egvs.formats.georeference import Georeference, WorldFrame
+from egvs.tracks.track_readers import TrackSource
 from egvs.traffic import recorded_tracks
 from tests.conftest import SCENARIO, collection, fcd, feature
 
@@ -156,7 +158,7 @@ def test_position_and_heading_are_converted_from_another_grid(tmp_path: Path) ->
     path = tmp_path / "tracks.csv"
     path.write_text(interaction_csv([("a", 0.0, *east_m, yaw_rad), ("a", 1.0, *north_m, yaw_rad)]))
     world = Georeference(frame, egvs.core.grid.Roi((-50.0, -50.0, 0.0), (100.0, 100.0, 5.0)), "scenario.toml")
-    tracks = recorded_tracks.read_in_world_frame([path], world, "EPSG:32633")
+    tracks = recorded_tracks.read_in_world_frame(TrackSource((path,), crs="EPSG:32633"), world)
     assert abs(math.degrees(yaw_rad)) > 4.0
     np.testing.assert_allclose(tracks.x_m, [0.0, 10.0], atol=1e-4)
     np.testing.assert_allclose(tracks.y_m, [0.0, 0.0], atol=1e-4)
@@ -171,7 +173,7 @@ def test_position_and_heading_are_converted_from_another_grid(tmp_path: Path) ->
         (lambda folder: (folder / "tracks.csv").write_text(interaction_csv([]).strip()), "contains no rows"),
         (
             lambda folder: (folder / "tracks.csv").write_text(interaction_csv([("a", 0.0, 1.0, math.nan, 0.0)])),
-            "row 1: y: expected a number, got 'nan'",
+            "line 2: y: expected a number, got 'nan'",
         ),
         (
             lambda folder: (folder / "tracks.csv").write_text(interaction_csv([("a", 0.0, 1.0, 1.0, 0.0)])),
@@ -224,3 +226,60 @@ def test_warns_of_a_cut_track(mini: Path, run_egvs, tmp_path: Path) -> None:
     assert run_egvs("traffic", mini, "--out", tmp_path / "run")[0] == 0
     rules = [warning["rule"] for warning in RunRecord.read(tmp_path / "run").stages["traffic"].summary["warnings"]]
     assert "track jumps" in rules
+
+
+COLUMNS = """
+[traffic.track_columns]
+time = "t"
+id = "who"
+x = "east"
+y = "north"
+yaw = "heading"
+yaw_unit = "deg"
+yaw_convention = "cw_from_north"
+length = "l"
+width = "w"
+default_type = "car"
+"""
+
+
+def test_own_table_gives_the_same_tpog(mini: Path, run_egvs, tmp_path: Path) -> None:
+    """The same boxes with other names of columns, and headings clockwise from north in degrees."""
+    use_tracks(mini, interaction_csv(boxes_of_fcd()))
+    make_tpog(run_egvs, mini, tmp_path / "interaction")
+    lines = ["t,who,east,north,heading,l,w"]
+    for name, time_s, x_m, y_m, yaw_rad in boxes_of_fcd():
+        lines.append(f"{time_s},{name},{x_m:.9f},{y_m:.9f},{90.0 - math.degrees(yaw_rad):.9f},4.5,1.8")
+    use_tracks(mini, "\n".join(lines) + "\n")
+    text = (mini / "scenario.toml").read_text().replace("[[traffic.kinds]]", f"{COLUMNS}\n[[traffic.kinds]]")
+    (mini / "scenario.toml").write_text(text)
+    make_tpog(run_egvs, mini, tmp_path / "own")
+    counts = [read_tpog(tmp_path / name / "tpog.parquet").counts for name in ("interaction", "own")]
+    np.testing.assert_array_equal(*counts)
+
+
+def test_long_gap_is_unknown_and_not_empty(mini: Path, run_egvs, tmp_path: Path) -> None:
+    """Without the rows of one car between 6 and 10 s (frames 12 to 20), voxels on its way there are scaled."""
+    rows = [row for row in boxes_of_fcd() if not (row[0] == "east" and 6.0 <= row[1] <= 10.0)]
+    use_tracks(mini, interaction_csv(rows))
+    make_tpog(run_egvs, mini, tmp_path / "run")
+    (gap,) = parquet.read_metadata(tmp_path / "run" / "trajectories.parquet", "trajectories")["unknown_boxes"]
+    assert gap["frames"] == [12, 21]
+    assert gap["size_m"] == [4.5, 1.8]
+    np.testing.assert_allclose([*gap["start_m"], *gap["end_m"]], [5.5 * 2 + 1 - 2.25, -2, 10.5 * 2 + 1 - 2.25, -2])
+    stages = RunRecord.read(tmp_path / "run").stages
+    assert stages["traffic"].summary["tracks"]["unknown_frames"] == 9
+    assert stages["tpog"].summary["unknown_gaps"] == 1
+    assert stages["tpog"].summary["scaled_voxels"] + stages["tpog"].summary["unknown_voxels"] > 0
+
+
+def test_short_gap_is_interpolated(mini: Path, run_egvs, tmp_path: Path) -> None:
+    """Cars on a straight line: without two rows of one car, the trajectories are the same."""
+    use_tracks(mini, interaction_csv(boxes_of_fcd()))
+    make_tpog(run_egvs, mini, tmp_path / "complete")
+    rows = [row for row in boxes_of_fcd() if not (row[0] == "east" and row[1] in (6.0, 6.5))]
+    use_tracks(mini, interaction_csv(rows))
+    make_tpog(run_egvs, mini, tmp_path / "gap")
+    counts = [read_tpog(tmp_path / name / "tpog.parquet").counts for name in ("complete", "gap")]
+    np.testing.assert_array_equal(*counts)
+    assert RunRecord.read(tmp_path / "gap").stages["traffic"].summary["tracks"]["interpolated_gaps"] == 1

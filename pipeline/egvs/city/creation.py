@@ -68,7 +68,7 @@ OVERLAPPING_REGION = "too near to a larger junction"
 """Reasons to leave a junction out."""
 
 PEDESTRIANS_NOTE = (
-    f"for pedestrians, add [effects.pedestrians_bicycles] pedestrians_per_h = 300 to {CITY_FILE} (and bicycles_per_h)"
+    f"For pedestrians, add [effects.pedestrians_bicycles] pedestrians_per_h = 300 to {CITY_FILE} (and bicycles_per_h)."
 )
 ROADS_FILE = "roads.net.xml"
 """The streets near a junction, for its maps, lanes and checks."""
@@ -278,11 +278,11 @@ def _import_notes(made: Sequence[NewJunction], counts: ImportCounts, flow: CityF
     notes = new_scenario.scenario_notes(True, counts)
     if not flow.capacity.is_confirmed:
         runs = len(flow.capacity.runs)
-        notes.append(f"traffic jams in all {runs} trials; check the signals and connections of the network")
+        notes.append(f"Traffic jams occur in all {runs} trials; check the signals and connections of the network.")
     n_larger = sum(not junction.roi.area.covers(junction.junction.area) for junction in made)
     if n_larger:
         limit = f"at most {junctions.ROI_MAX_M:g} m"
-        notes.append(f"{n_larger} junctions are larger than their regions of interest ({limit})")
+        notes.append(f"{n_larger} junctions are larger than their regions of interest ({limit}).")
     if walk:
         notes.append(PEDESTRIANS_NOTE)
     return tuple(notes)

@@ -636,6 +636,14 @@ def new(
             " simulated traffic: --signals A --signals B.",
         ),
     ] = None,
+    track_columns: Annotated[
+        Path | None,
+        typer.Option(
+            "--track-columns",
+            metavar="FILE",
+            help="TOML file that names the columns of tracks in a table of your own (CSV or JSON lines).",
+        ),
+    ] = None,
     track_crs: Annotated[
         str | None,
         typer.Option(
@@ -643,6 +651,14 @@ def new(
             metavar="CRS",
             help="Coordinate system of the tracks, if it is not the one of their format: e.g. EPSG:25832, or 'world'"
             " for metres of the road map.",
+        ),
+    ] = None,
+    surface: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE",
+            help="A raster of the heights of roofs and trees. With a terrain, buildings without a height get their"
+            " height from it.",
         ),
     ] = None,
 ) -> None:
@@ -678,8 +694,9 @@ def new(
         pole_spacing_m = cli_options.pole_spacing_m(*poles)
     options = NewScenarioOptions(
         lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=demand, pole_spacing_m=pole_spacing_m,
-        align=tuple(cli_options.point_pair(text) for text in align or []), tracks=tuple(tracks or ()),
-        like=tuple(like or ()), signals=tuple(signals or ()), track_crs=track_crs,
+        align=tuple(cli_options.point_pair(text) for text in align or []), surface=tuple(surface or []),
+        tracks=tuple(tracks or ()), like=tuple(like or ()), signals=tuple(signals or ()), track_crs=track_crs,
+        track_columns=track_columns,
     )  # fmt: skip
     scenario = new_scenario.create_scenario(folder, paths, location, options)
     new_summary.print_new_scenario(scenario)

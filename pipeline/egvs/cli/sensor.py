@@ -117,6 +117,8 @@ def print_fit(result: SensorFit, written: FitFolder) -> None:
         f"range noise: {_millimetres(result.sigma_m)}",
         f"returns from smooth surfaces: {_percent(result.return_rate)}",
     ]
+    if result.silent_channels:
+        lines.append(f"channels with fewer than 20 returns, left out: {result.silent_channels}")
     if coarse:
         lines.insert(1, f"sweeps with float16 coordinates, used only for the empty scan: {coarse}")
     if result.empty_sectors_deg:

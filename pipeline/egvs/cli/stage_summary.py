@@ -189,6 +189,10 @@ def _tpog_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[S
     if isinstance(memory, float):
         memory = f"{memory:.4g}"
     yield _detail(f"autocorrelation time {memory} frames")
+    if gaps := rest.pop("unknown_gaps", 0):
+        scaled, left_out = rest.pop("scaled_voxels"), rest.pop("unknown_voxels")
+        text = f"counts of {_count(scaled, 'voxel')} scaled, and {left_out:,} left out, where tracks have"
+        yield _detail(f"{text} {_count(gaps, 'long gap')}")
 
 
 def _score_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[Sentence]:

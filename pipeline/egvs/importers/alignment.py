@@ -10,7 +10,7 @@ import numpy as np
 from egvs.core.errors import InputError
 from egvs.core.grid import XY
 from egvs.formats.georeference import WorldFrame
-from egvs.importers.map_parts import Alignment
+from egvs.importers.map_parts import Alignment, MapContext
 
 PointPair = tuple[XY, XY]
 """x, y of a point in a file without a reference system, and its latitude, longitude (or world-frame x, y)."""
@@ -47,3 +47,10 @@ def make_alignment(pairs: Sequence[PointPair], frame: WorldFrame | None) -> Alig
         problem = f"the points are {distances_m[0]:,.2f} m apart in the file and {distances_m[1]:,.2f} m on the ground"
         raise InputError("--align", problem, "Check both points; the file must be in metres.")
     return alignment
+
+
+def check_used(context: MapContext) -> None:
+    """Raise an InputError when there is an alignment that no file needed."""
+    if context.alignment is not None and not context.aligned:
+        problem = "no file needs it: all files declare a reference system"
+        raise InputError("--align", problem, "Leave it out; if a file is misplaced, correct its reference system.")

@@ -116,13 +116,13 @@ def traffic_notes(traffic: AssumedTraffic | None) -> list[str]:
         return []
     capacity = traffic.capacity
     jam = f"; {capacity.jam}" if capacity.jam else ""
-    hint = "Lower per_hour of traffic.counts, or check the signals and connections there"
+    hint = "Lower per_hour of traffic.counts, or check the signals and connections there."
     if traffic.level is None:
         if capacity.is_everything:
             return []
-        return [f"traffic jams are likely: the network {traffic.summary}{jam}. {hint}"]
+        return [f"Traffic jams are likely: the network {traffic.summary}{jam}. {hint}"]
     if not capacity.is_confirmed:
-        return [f"traffic jams in all {len(capacity.runs)} trials{jam}. {hint}"]
+        return [f"Traffic jams occur in all {len(capacity.runs)} trials{jam}. {hint}"]
     if not capacity.is_everything:
-        return [f"the junction does not carry the {traffic.assumed_per_h:,} vehicles an hour of its road classes"]
+        return [f"The junction does not carry the {traffic.assumed_per_h:,} vehicles an hour of its road classes."]
     return []

@@ -29,7 +29,7 @@ NEIGHBOUR_M, MIN_NEIGHBOURS = 100.0, 3
 MIN_HEIGHT_M = 2.0
 """Lower objects in a surface model are no buildings, e.g. a place where a building was removed."""
 
-_KNOWN = frozenset({"height", "levels", "geometry"})
+_KNOWN = frozenset({"height", "levels", "geometry", SURFACE_MODEL})
 _SAMPLE_M = 1.0
 _MIN_SAMPLES = 3
 _MAX_SAMPLES = 10_000

@@ -15,7 +15,7 @@ from egvs.core.errors import InputError
 from egvs.formats.citygml import read_relief
 from egvs.formats.mesh_codes import parse_tile_name
 from egvs.importers import citygml
-from egvs.importers.ground_heights import CombinedTerrain, TinTerrain, tin_terrain
+from egvs.importers.ground_heights import CombinedTerrain, TinTerrain, combine_tins, tin_terrain
 from egvs.importers.map_parts import MapContext
 
 NAME = "CityGML relief"
@@ -39,11 +39,8 @@ def read_terrain(paths: Sequence[Path], context: MapContext) -> CombinedTerrain:
         is no alignment.
     """
     near = [path for path in paths if _is_in_reach(path, context)]
-    terrains = [terrain for path in near if (terrain := _read_file(path, context)) is not None]
-    if not terrains:
-        problem = "the terrain has no triangle in the region"
-        raise InputError(paths[0], problem, "Use a terrain that covers the road map.")
-    return CombinedTerrain(tuple(terrains))
+    beyond = [None] * (len(paths) - len(near))
+    return combine_tins([*(_read_file(path, context) for path in near), *beyond], str(paths[0]))
 
 
 def _is_in_reach(path: Path, context: MapContext) -> bool:

@@ -151,7 +151,7 @@ def estimate_demand(recording: TrackFiles, streets: Streets, junction: StreetJun
     if not passages.counted:
         problem = "no recorded vehicle passes a junction of the network"
         hint = "Check that map and tracks show the same place and use the same coordinates."
-        raise InputError(recording.tracks[0], problem, hint)
+        raise InputError(recording.source.paths[0], problem, hint)
 
     counted = _count_movements(passages.counted, streets, junction)
     notes = list(_passage_notes(passages, counted.unassigned))

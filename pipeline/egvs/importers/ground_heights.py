@@ -7,7 +7,7 @@ linear; where triangles lie above each other, the lowest counts. World frame, me
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -164,8 +164,8 @@ def grid_terrain(grids: Sequence[tuple[HeightGrid, str]], context: MapContext) -
 
 def tin_terrain(
     vertices: FloatArray, faces: IntArray, crs: str | None, where: str, context: MapContext, notes: Sequence[str] = ()
-) -> TinTerrain:
-    """Return the terrain of triangles of a file.
+) -> TinTerrain | None:
+    """Return the terrain of triangles of a file; None if no triangle is in the region.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ def tin_terrain(
     Raises
     ------
     InputError
-        When no triangle is in the region, or the coordinates cannot be converted.
+        When the coordinates cannot be converted.
     """
     vertices_m = np.column_stack([context.to_world(vertices[:, :2], crs, where), vertices[:, 2]])
     corners = vertices_m[faces]
@@ -195,7 +195,7 @@ def tin_terrain(
     area = _cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     is_used = is_near & (np.abs(area) > _MIN_AREA_M2)
     if not is_used.any():
-        raise InputError(where, "the terrain has no triangle in the region", "Use a terrain that covers the road map.")
+        return None
     heights = corners[is_used, :, 2]
     summary = (
         f"{where}: terrain of {np.count_nonzero(is_used):,} triangles in the region, {heights.min():.1f} to"
@@ -203,6 +203,31 @@ def tin_terrain(
     )
     used, inverse = np.unique(faces[is_used], return_inverse=True)
     return TinTerrain(vertices_m[used], inverse.reshape(-1, 3), (summary, *notes))
+
+
+def combine_tins(terrains: Sequence[TinTerrain | None], where: str) -> CombinedTerrain:
+    """Return the terrain of several surfaces; where they overlap, of the first.
+
+    Parameters
+    ----------
+    terrains
+        From :func:`tin_terrain`; None for surfaces outside the region, which a note counts.
+    where
+        The files, for messages.
+
+    Raises
+    ------
+    InputError
+        When all surfaces are outside the region.
+    """
+    inside = tuple(terrain for terrain in terrains if terrain is not None)
+    if not inside:
+        raise InputError(where, "the terrain has no triangle in the region", "Use a terrain that covers the road map.")
+    left_out = len(terrains) - len(inside)
+    if left_out:
+        note = f"{left_out:,} of {len(terrains):,} terrain surfaces are outside the region and were left out."
+        inside = (*inside[:-1], replace(inside[-1], notes=(*inside[-1].notes, note)))
+    return CombinedTerrain(inside)
 
 
 def ground_points(terrain: Terrain, window: BaseGeometry, step_m: float) -> FloatArray:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from egvs.formats import landxml
-from egvs.importers.ground_heights import CombinedTerrain, tin_terrain
+from egvs.importers.ground_heights import CombinedTerrain, combine_tins, tin_terrain
 from egvs.importers.map_parts import MapContext
 
 NAME = "LandXML"
@@ -23,7 +23,8 @@ def read_terrain(paths: Sequence[Path], context: MapContext) -> CombinedTerrain:
     Raises
     ------
     InputError
-        When a file is damaged, has no surface in the region, or declares no reference system and there is no alignment.
+        When a file is damaged, no file has a surface in the region, or a file declares no reference system and there
+        is no alignment.
     """
     terrains = []
     for path in paths:
@@ -33,4 +34,4 @@ def read_terrain(paths: Sequence[Path], context: MapContext) -> CombinedTerrain:
             where = f"{path}: surface {surface.name!r}"
             terrains.append(tin_terrain(surface.vertices, surface.faces, file.crs, where, context, notes))
             notes = []
-    return CombinedTerrain(tuple(terrains))
+    return combine_tins(terrains, ", ".join(str(path) for path in paths))

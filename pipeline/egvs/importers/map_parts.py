@@ -87,6 +87,9 @@ class MappedMesh:
         (m, 3) int64.
     is_closed
         Whether the triangles enclose a volume.
+    group
+        Meshes of one group, such as the parts of a file, keep their heights to each other on a sloping ground.
+        By default each mesh is a group of its own.
     """
 
     name: str
@@ -94,6 +97,7 @@ class MappedMesh:
     vertices_m: FloatArray
     faces: IntArray
     is_closed: bool
+    group: str = ""
 
 
 @dataclass(frozen=True)
@@ -190,12 +194,15 @@ class MapContext:
         From ``--align``; used for files without a reference system.
     streets
         The roads, for objects that are cut at the carriageway.
+    aligned
+        Files that the alignment placed; filled while files are read.
     """
 
     frame: WorldFrame | None
     window: BaseGeometry
     alignment: Alignment | None = None
     streets: Streets | None = None
+    aligned: set[str] = field(default_factory=set)
 
     def to_world(self, xy: FloatArray, crs: str | None, where: str) -> FloatArray:
         """Convert coordinates of a file to world-frame x, y in metres.
@@ -245,6 +252,7 @@ class MapContext:
             if self.alignment is None:
                 hint = "Give two of its points and where they are: --align X,Y=LAT,LON --align X,Y=LAT,LON."
                 raise InputError(where, "the file declares no coordinate reference system", hint)
+            self.aligned.add(where)
             return self.alignment
         if self.frame is None:
             problem = f"the file is in {crs}, but the road map has no reference system"

@@ -89,6 +89,22 @@ def open_maps(paths: Sequence[Path]) -> MapFiles:
     )
 
 
+def open_surface(paths: Sequence[Path]) -> tuple[MapFile, ...]:
+    """Find the readers of surface models: files with heights, and folders of them.
+
+    Raises
+    ------
+    InputError
+        When a file does not exist, or contains no heights of a surface.
+    """
+    maps = tuple(MapFile(path, find_reader(path)) for path in list_files(paths))
+    for file in maps:
+        if not file.has(TERRAIN):
+            formats = describe_formats(TERRAIN)
+            raise InputError(file.path, f"expected a surface model, got {file.reader.NAME}", f"Formats: {formats}.")
+    return maps
+
+
 def list_files(paths: Sequence[Path]) -> list[Path]:
     """Return the files among some paths, and the files in the folders among them, without repetitions.
 
@@ -125,8 +141,12 @@ def read_head(path: Path) -> bytes:
     """Return the first bytes of a file, after gunzip where possible; InputError when it cannot be read."""
     if not path.is_file():
         raise InputError(path, "no such file", "Check the path.")
-    with files.open_input(path) as content:
-        head: bytes = content.read(HEAD_BYTES)
+    try:
+        with files.open_input(path) as content:
+            head: bytes = content.read(HEAD_BYTES)
+    except OSError as error:
+        problem = f"the file cannot be read ({error.strerror or error})"
+        raise InputError(path, problem, "Check its permissions, or leave it out.") from None
     if not head.startswith(_GZIP):
         return head
     try:

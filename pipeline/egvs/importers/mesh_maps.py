@@ -1,7 +1,8 @@
 """Reader of triangle meshes: glTF, OBJ, PLY, STL, OFF.
 
 These formats have no reference system, so their files need an alignment (``--align``). Their unit is the metre. In glTF
-the y axis points up (glTF 2.0, 3.4) and -z north; in the other formats z points up. Heights count from the ground.
+the y axis points up (glTF 2.0, 3.4) and -z north; in the other formats z points up. Heights count from the ground: on a
+slope, z = 0 of a file is the ground below the middle of its meshes.
 
 Each closed piece of a file is a mesh of its own, so that a point inside can be recognised; the rest is one open mesh.
 """
@@ -11,6 +12,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -84,7 +86,7 @@ def _pieces(
             continue
         counts.objects[_KIND] += 1
         counts.heights.setdefault(_KIND, Counter())["geometry"] += 1
-        yield MappedMesh(name, _KIND, vertices_m[used], corners.reshape(-1, 3), closed)
+        yield MappedMesh(name, _KIND, vertices_m[used], corners.reshape(-1, 3), closed, group=stem)
 
 
 def _number_equal_names(mapped: Sequence[MappedMesh]) -> Iterator[MappedMesh]:
@@ -93,4 +95,4 @@ def _number_equal_names(mapped: Sequence[MappedMesh]) -> Iterator[MappedMesh]:
     for mesh in mapped:
         times[mesh.name] += 1
         name = mesh.name if times[mesh.name] == 1 else f"{mesh.name}#{times[mesh.name]}"
-        yield MappedMesh(name, mesh.kind, mesh.vertices_m, mesh.faces, mesh.is_closed)
+        yield replace(mesh, name=name)

@@ -48,9 +48,9 @@ from egvs.importers import (
     signal_programs,
     static_objects,
 )
-from egvs.importers.alignment import PointPair, make_alignment
+from egvs.importers.alignment import PointPair, check_used, make_alignment
 from egvs.importers.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, AssumedTraffic
-from egvs.importers.building_heights import ASSUMED, NEIGHBOURS
+from egvs.importers.building_heights import ASSUMED, NEIGHBOURS, SURFACE_MODEL
 from egvs.importers.demand_from_tracks import TrackDemand
 from egvs.importers.junctions import JunctionRegion, KerbsidePole, StreetJunction, Streets
 from egvs.importers.map_parts import MapContext, RoadOptions, Terrain
@@ -59,7 +59,7 @@ from egvs.importers.openstreetmap import OsmRoads
 from egvs.importers.osm_network import ATTRIBUTION, NETWORK_FILE
 from egvs.importers.osm_solids import ImportCounts
 from egvs.importers.recorded_traffic import TrackFiles
-from egvs.importers.relief import Relief
+from egvs.importers.relief import Relief, ground_surface
 from egvs.importers.road_source import NetworkRoads, RoadSource
 from egvs.importers.scenario_files import (
     PITCHES_DEG,
@@ -71,13 +71,14 @@ from egvs.importers.scenario_files import (
     TomlTable,
     reachable_area,
 )
-from egvs.importers.static_objects import MapSummary, ReadMap, StaticObjects
+from egvs.importers.static_objects import MapSummary, ReadMap, StaticObjects, SurfaceModel
 from egvs.scenario.loading import load
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, CountConfig, TrafficConfig
 from egvs.sensors.sensor import CATALOGUE
 from egvs.traffic.movements import MovementNames
 from egvs.traffic.recorded_tracks import RecordedTracks
+from egvs.world.static_world import build_world
 
 SURROUNDINGS_MIN_M = 100.0
 FAR_FROM_AT_M = 50.0
@@ -90,10 +91,10 @@ TERRAIN_STEP_M = 5.0
 """Distance of the points of the ground beyond the roads."""
 
 PEOPLE_HINT = (
-    "pedestrians are added with --set effects.pedestrians_bicycles.pedestrians_per_h=300 (bicycles: bicycles_per_h)."
+    "Pedestrians are added with --set effects.pedestrians_bicycles.pedestrians_per_h=300 (bicycles: bicycles_per_h)."
 )
 
-_NO_SIGNALS_NOTE = "no junction in the map has signals; the one with the most incoming lanes was chosen"
+_NO_SIGNALS_NOTE = "No junction in the map has signals; the one with the most incoming lanes was chosen."
 
 
 @dataclass(frozen=True)
@@ -199,6 +200,10 @@ class NewScenarioOptions:
         Files of recorded signals of the junction, and of what their groups govern; see :mod:`recorded_signals`.
     track_crs
         Coordinate system of the tracks, as for the key ``traffic.track_crs``.
+    track_columns
+        TOML file with the meaning of the columns of tracks in a table of one's own.
+    surface
+        Rasters of the heights of roofs and trees; with a terrain, they give heights to buildings that have none.
     """
 
     lefthand: bool = False
@@ -211,6 +216,8 @@ class NewScenarioOptions:
     like: tuple[Path, ...] = ()
     signals: tuple[Path, ...] = ()
     track_crs: str | None = None
+    track_columns: Path | None = None
+    surface: tuple[Path, ...] = ()
 
     def check(self) -> None:
         """Raise an InputError when a value is out of its limits."""
@@ -222,8 +229,9 @@ class NewScenarioOptions:
         if self.tracks and self.signals:
             hint = "Use them with --like, for simulated traffic."
             raise InputError("--signals", "has no effect on recorded traffic (--tracks)", hint)
-        if self.track_crs is not None and not self.tracks and not self.like:
-            raise InputError("--track-crs", "has no effect without recorded tracks", "Give them with --tracks.")
+        for key, value in (("--track-crs", self.track_crs), ("--track-columns", self.track_columns)):
+            if value is not None and not self.tracks and not self.like:
+                raise InputError(key, "has no effect without recorded tracks", "Give them with --tracks or --like.")
         if self.surroundings_m is not None and self.surroundings_m < SURROUNDINGS_MIN_M:
             raise InputError(
                 "--surroundings",
@@ -261,14 +269,16 @@ def create_scenario(
     ------
     InputError
         When the folder is not empty, a file is damaged or of an unknown format, the road map has no drivable streets,
-        ``at`` is outside or far from any junction, or no site is possible. Nothing is written then.
+        ``at`` is outside or far from any junction, no site is possible, or an option has no effect. Nothing is written
+        then.
     """
     options = options or NewScenarioOptions()
     options.check()
     name = scenario_files.check_new_folder(folder)
     files = map_readers.open_maps([maps] if isinstance(maps, Path) else maps)
+    surface_files = map_readers.open_surface(options.surface)
     roads = _read_roads(files.roads, RoadOptions(options.lefthand, options.walk, has_terrain=bool(files.terrain)), at)
-    recording, example = (_find_tracks(paths, options.track_crs) for paths in (options.tracks, options.like))
+    recording, example = (_find_tracks(paths, options) for paths in (options.tracks, options.like))
     junction = _choose_junction(roads.streets, at, recording or example, files.roads.path)
 
     level = roads.on_level_of(junction)
@@ -282,14 +292,20 @@ def create_scenario(
     maps_read = static_objects.read_maps(files.solids, level, files.roads, context)
     terrain = ground_reference.read_terrain(files.terrain, ground_reference.with_roads(context, roads.streets))
     measured = static_objects.ground_mesh(maps_read)
+    surface = ground_reference.read_terrain(surface_files, context)
+    check_used(context)
     ground_notes = []
     if terrain is None and measured is not None:
         terrain = ground_reference.measured_ground(measured)
     elif measured is not None:
         ground_notes.append("The ground of the point cloud is not used, since a terrain file is given.")
     zero = ground_reference.find_zero(roads, files.roads, junction, terrain)
-    objects = static_objects.collect_objects(maps_read, level.streets, junction.at_m, zero.height_m)
     roads = ground_reference.lay_on_ground(roads, files.roads, junction, terrain)
+    terrain_m = None if terrain is None else _terrain_points(terrain, window, zero.height_m or 0.0)
+    ground = ground_surface(roads.streets, terrain_m)
+    objects = static_objects.collect_objects(
+        maps_read, level.streets, junction.at_m, zero.height_m, ground, _surface_model(surface, terrain)
+    )
     if files.terrain and terrain is not None and zero.height_m is not None:
         decks = bridge_decks.bridge_decks(roads.network, terrain, zero.height_m)
         objects = replace(objects, meshes=(*objects.meshes, *decks))
@@ -299,7 +315,9 @@ def create_scenario(
     roi = junctions.region_around(junction)
     poles = junctions.kerbside_poles(streets, junction, roi, objects.areas, options.pole_spacing_m)
     if not poles:
-        raise _no_pole_error(junction, options, files.roads.path)
+        has_free_poles = bool(junctions.kerbside_poles(streets, junction, roi, [], options.pole_spacing_m))
+        covering = objects.file_names if has_free_poles else ()
+        raise _no_pole_error(junction, options, files.roads.path, covering)
 
     notes = [*roads.notes, *zero.notes, *(() if terrain is None else terrain.notes), *ground_notes]
     if at is None and recording is None and example is None and not junction.signalised:
@@ -315,18 +333,15 @@ def create_scenario(
     notes += [*signal_notes, *traffic_notes]
     relief = Relief.of_region(streets, junction, roi)
     if relief.other_levels:
-        notes.append(f"lanes on another level cross the region of interest: {', '.join(relief.other_levels)}")
+        notes.append(f"Lanes on another level cross the region of interest: {', '.join(relief.other_levels)}.")
 
     scenario = NewScenario(
-        folder, junction, roi, streets, len(poles), objects.counts, objects.n_solids + 1, assumed, tuple(notes),
+        folder, junction, roi, streets, len(poles), objects.counts, 0, assumed, tuple(notes),
         height_m=relief.z_range_m[1] - relief.z_range_m[0], maps=objects.maps,
         attributions=_attributions(roads, objects), from_at_m=_distance_m(streets, junction, at),
         demand=demand,
     )  # fmt: skip
-    terrain_m = None
-    if terrain is not None:
-        terrain_m = _terrain_points(terrain, window, zero.height_m or 0.0)
-    ground_m = relief.ground_m(streets, poles, terrain_m)
+    ground_m = relief.ground_m(ground, poles)
     columns = _site_columns(poles, ground_m, relief, maps_read, roi, zero.height_m or 0.0)
     meshes = static_objects.mesh_files([mesh for mesh in objects.meshes if mesh.kind != static_objects.GROUND])
     terrain_files = {}
@@ -340,7 +355,9 @@ def create_scenario(
         **meshes,
         **terrain_files,
         **({} if recording is None else recording.copies()),
-        SCENARIO_FILE: _scenario_toml(name, scenario, relief, statics, recording, has_signals=bool(options.signals)),
+        SCENARIO_FILE: _scenario_toml(
+            name, scenario, relief, statics, objects.zero_height_m, recording, has_signals=bool(options.signals)
+        ),
     }
     recorded: list[RecordedTracks] = []
 
@@ -350,7 +367,8 @@ def create_scenario(
             recorded.append(recorded_traffic.read_for_summary(loaded))
 
     scenario_files.publish_folder(folder, contents.items(), check)
-    return replace(scenario, recorded=recorded[0] if recorded else None)
+    world, _ = build_world(load(folder))
+    return replace(scenario, n_solids=len(world.solids), recorded=recorded[0] if recorded else None)
 
 
 def _with_signals(
@@ -379,13 +397,24 @@ def _plan_traffic(
     return assumed, None, assumed_traffic.traffic_notes(assumed)
 
 
-def _find_tracks(paths: Sequence[Path], crs: str | None) -> TrackFiles | None:
-    return TrackFiles.find(paths, crs) if paths else None
+def _surface_model(surface: Terrain | None, ground: Terrain | None) -> SurfaceModel | None:
+    if surface is None:
+        return None
+    if ground is None:
+        hint = "Add a terrain, or a point cloud, to --from."
+        raise InputError("--surface", "heights of buildings need the ground too, but no map contains it", hint)
+    return SurfaceModel(surface, ground)
 
 
-def _no_pole_error(junction: StreetJunction, options: NewScenarioOptions, path: Path) -> InputError:
+def _no_pole_error(
+    junction: StreetJunction, options: NewScenarioOptions, path: Path, covering: Sequence[str]
+) -> InputError:
+    """Return the error where no pole fits; ``covering`` are the maps whose objects cover the kerbs."""
     problem = f"there is no free location for a pole along the kerbs of the {junction.title}"
     hint = "Choose another junction with --at LAT,LON."
+    if covering:
+        problem += f": the objects of {', '.join(covering)} cover them"
+        hint = "Check the position of these maps, or choose another junction with --at LAT,LON."
     if options.pole_spacing_m is not None:
         hint = "Choose a smaller spacing with --poles, or another junction with --at LAT,LON."
     return InputError(path, problem, hint)
@@ -422,12 +451,22 @@ def _read_roads(file: MapFile, options: RoadOptions, at: tuple[float, float] | N
     return NetworkRoads.read(file.reader.read_roads(file.path, options), file.path)
 
 
+def _find_tracks(paths: Sequence[Path], options: NewScenarioOptions) -> TrackFiles | None:
+    """Return recorded tracks, if there are any."""
+    if not paths:
+        return None
+    columns = None
+    if options.track_columns is not None:
+        columns = recorded_traffic.read_track_columns(options.track_columns)
+    return TrackFiles.find(paths, options.track_crs, columns)
+
+
 def _choose_junction(
     streets: Streets, at: tuple[float, float] | None, recording: TrackFiles | None, path: Path
 ) -> StreetJunction:
     """Return the junction at the requested position, or else that of the recording, or else the largest one."""
     if at is None and recording is not None:
-        return _junction_at(streets, recording.middle_m(streets), str(recording.tracks[0]))
+        return _junction_at(streets, recording.middle_m(streets), str(recording.source.paths[0]))
     if at is None:
         return _require_junction(junctions.largest_junction(streets), path)
     return _junction_at(streets, _to_world(streets, at), "--at")
@@ -456,8 +495,8 @@ def _ring_notes(streets: Streets, junction: StreetJunction) -> list[str]:
     for ring in streets.large_rings:
         if junction.id in ring.nodes:
             notes.append(
-                f"the junction is one entry of a roundabout {ring.side_m:.0f} m wide, which is larger than the largest"
-                f" region of interest ({junctions.ROI_MAX_M:g} m): the rest of the ring is not part of the ranking"
+                f"The junction is one entry of a roundabout {ring.side_m:.0f} m wide, which is larger than the largest"
+                f" region of interest ({junctions.ROI_MAX_M:g} m): the rest of the ring is not part of the ranking."
             )
     return notes
 
@@ -500,11 +539,11 @@ def _level_notes(roads: RoadSource, counts: ImportCounts) -> list[str]:
     notes = []
     if isinstance(roads, OsmRoads) and roads.others.roads:
         titles = ", ".join(roads.others.road_titles)
-        notes.append(f"roads on another level are left out of the traffic in the region of interest: {titles}")
+        notes.append(f"Roads on another level are left out of the traffic in the region of interest: {titles}.")
     heights = counts.heights.get("bridge", Counter())
     if heights["default"]:
         shares = f"{heights['default']} of {heights.total()}"
-        notes.append(f"no height is given for {shares} bridge decks: {osm_solids.DECK_BASE_M:g} m assumed")
+        notes.append(f"No height is given for {shares} bridge decks: {osm_solids.DECK_BASE_M:g} m assumed.")
     return notes
 
 
@@ -515,7 +554,7 @@ def _range_notes(counts: ImportCounts) -> list[str]:
         return []
     total = left_out + counts.objects.total() - counts.objects["tree_crown"]
     range_m = CATALOGUE[SENSOR].range_m
-    reason = f"they are beyond the range of a {SENSOR} ({range_m:g} m) from the region of interest and change no score"
+    reason = f"they are beyond the range of a {SENSOR} ({range_m:g} m) from the region of interest and change no score."
     return [f"{left_out:,} of {total:,} static objects are left out: {reason}"]
 
 
@@ -531,24 +570,29 @@ def scenario_notes(junction_fits: bool, counts: ImportCounts) -> list[str]:
     """
     notes = []
     if not junction_fits:
-        notes.append(f"the junction is larger than the region of interest (at most {junctions.ROI_MAX_M:g} m)")
+        notes.append(f"The junction is larger than the region of interest (at most {junctions.ROI_MAX_M:g} m).")
     heights = counts.heights.get("building", Counter())
     if heights["default"]:
         notes.append(
             f"{heights['default']} of {heights.total()} buildings have neither height nor levels:"
-            f" {osm_solids.DEFAULT_BUILDING_M:g} m assumed"
+            f" {osm_solids.DEFAULT_BUILDING_M:g} m assumed."
         )
     if heights[NEIGHBOURS]:
         notes.append(
             f"{heights[NEIGHBOURS]} of {heights.total()} buildings have neither height nor levels: the median height of"
-            " the buildings near by assumed"
+            " the buildings near by assumed."
+        )
+    if heights[SURFACE_MODEL]:
+        notes.append(
+            f"{heights[SURFACE_MODEL]} of {heights.total()} buildings have neither height nor levels: their heights are"
+            " those of the surface model above the terrain."
         )
     return notes
 
 
 def _scenario_toml(
-    name: str, scenario: NewScenario, relief: Relief, statics: TomlTable, recording: TrackFiles | None, *,
-    has_signals: bool,
+    name: str, scenario: NewScenario, relief: Relief, statics: TomlTable, zero_height_m: float | None,
+    recording: TrackFiles | None, *, has_signals: bool,
 ) -> str:  # fmt: skip
     title = scenario.junction.title
     values: dict[str, Any] = {
@@ -579,6 +623,9 @@ def _scenario_toml(
         "score": scenario_files.score_table(),
         "placement": scenario_files.placement_table(),
     }
+    if zero_height_m:
+        zero = {"zero_height_m": round(zero_height_m, 3)}
+        tables["crs"] = ("height of z = 0 above sea level, for measured scans that state their reference system", zero)
     ground = "flat ground" if relief.is_flat else "zero height of the network"
     comments = [
         *_origin_comments(scenario.attributions),

@@ -280,10 +280,10 @@ def _station_note(survey: _Survey) -> str:
     placed = [StationScan(scan.station_m, scan.points_m) for scan in survey.scans if scan.station_m is not None]
     stations = len(group_by_station(placed))
     if len(placed) < len(survey.scans):
+        share = f" for {len(survey.scans) - len(placed)} of {_count(len(survey.scans), 'scan')}" if placed else ""
         unknown = (
-            f"Where the scanner stood is unknown for {len(survey.scans) - len(placed)} of"
-            f" {_count(len(survey.scans), 'scan')}: what moved there is part of the world. E57 scans and PCD files with"
-            " a VIEWPOINT state it."
+            f"Where the scanner stood is unknown{share}: what moved there is part of the world. E57 scans and"
+            " PCD files with a VIEWPOINT state it."
         )
         if len(survey.scans) > 1:
             return unknown

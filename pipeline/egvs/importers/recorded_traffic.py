@@ -10,15 +10,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
+from egvs.core import reading
 from egvs.core.errors import InputError
 from egvs.core.grid import XY, Roi
 from egvs.formats.georeference import Georeference
 from egvs.importers.junctions import Streets
 from egvs.importers.osm_network import NETWORK_FILE
 from egvs.scenario.model import Scenario
+from egvs.scenario.track_columns import TrackColumns
 from egvs.tracks import track_readers
 from egvs.tracks.model import Tracks
+from egvs.tracks.track_readers import TrackSource
 from egvs.traffic import recorded_tracks
 from egvs.traffic.recorded_tracks import RecordedTracks
 from egvs.world import geolocation
@@ -35,25 +39,20 @@ _MARGIN_M = 1000.0
 
 @dataclass(frozen=True)
 class TrackFiles:
-    """Files of recorded tracks.
+    """Files of recorded tracks, and how to read them."""
 
-    Attributes
-    ----------
-    tracks
-        Files with tracks.
-    companions
-        Files beside them that their readers need.
-    crs
-        Their coordinate system instead of the one of their format; "world" for the world frame.
-    """
-
-    tracks: tuple[Path, ...]
-    companions: tuple[Path, ...]
-    crs: str | None = None
+    source: TrackSource
 
     @classmethod
-    def find(cls, paths: Sequence[Path], crs: str | None = None) -> TrackFiles:
+    def find(cls, paths: Sequence[Path], crs: str | None = None, columns: TrackColumns | None = None) -> TrackFiles:
         """Return the files with tracks among some paths, and in the folders among them.
+
+        Parameters
+        ----------
+        paths
+            Files and folders.
+        crs, columns
+            As for :class:`egvs.tracks.track_readers.TrackSource`; with columns, folders are not searched.
 
         Raises
         ------
@@ -62,11 +61,9 @@ class TrackFiles:
         """
         tracks: dict[Path, None] = {}
         for path in paths:
-            tracks |= dict.fromkeys(_tracks_in_folder(path) if path.is_dir() else [path])
-        companions: dict[Path, None] = {}
-        for path in tracks:
-            companions |= dict.fromkeys(track_readers.find_reader(path).companions(path))
-        return cls(tuple(tracks), tuple(path for path in companions if path not in tracks), crs)
+            is_folder = path.is_dir() and columns is None
+            tracks |= dict.fromkeys(_tracks_in_folder(path) if is_folder else [path])
+        return cls(TrackSource(tuple(tracks), columns, crs))
 
     def copies(self) -> dict[str, Callable[[Path], None]]:
         """Return functions that write the copies, by their path in the scenario.
@@ -77,7 +74,7 @@ class TrackFiles:
             When two files have one name.
         """
         copies: dict[str, Callable[[Path], None]] = {}
-        for path in (*self.tracks, *self.companions):
+        for path in (*self.source.paths, *self.source.companions()):
             name = f"{FOLDER}/{path.name}"
             if name in copies:
                 raise InputError(path, "a second file of tracks has the same name", "Rename one of them.")
@@ -86,19 +83,21 @@ class TrackFiles:
 
     def traffic_table(self) -> dict[str, Any]:
         """Return the keys of ``[traffic]``."""
-        table: dict[str, Any] = {"tracks": [f"{FOLDER}/{path.name}" for path in self.tracks]}
-        if self.crs is not None:
-            table["track_crs"] = self.crs
-        return table | {"frame_period_s": self._frame_period_s(), "roads": NETWORK_FILE}
+        source = self.source
+        table: dict[str, Any] = {"tracks": [f"{FOLDER}/{path.name}" for path in source.paths]}
+        if source.crs is not None:
+            table["track_crs"] = source.crs
+        table |= {"frame_period_s": self._frame_period_s(), "roads": NETWORK_FILE}
+        if source.columns is not None:
+            table["track_columns"] = source.columns.model_dump(exclude_unset=True)
+        return table
 
     def read(self, streets: Streets) -> Tracks:
         """Read the tracks in the world frame of streets; InputError where they are damaged or far from them."""
         points_m = np.concatenate([lane.shape_m[:, :2] for edge in streets.network.edges for lane in edge.lanes])
         low_m, high_m = points_m.min(axis=0) - _MARGIN_M, points_m.max(axis=0) + _MARGIN_M
         region = Roi((*low_m.tolist(), 0.0), (*(high_m - low_m).tolist(), 1.0))
-        return recorded_tracks.read_in_world_frame(
-            self.tracks, Georeference(streets.frame, region, "the map"), self.crs
-        )
+        return recorded_tracks.read_in_world_frame(self.source, Georeference(streets.frame, region, "the map"))
 
     def middle_m(self, streets: Streets) -> XY:
         """Return the median position in the world frame, metres; InputError where the tracks are far from the map."""
@@ -106,7 +105,7 @@ class TrackFiles:
         return float(np.nanmedian(tracks.x_m)), float(np.nanmedian(tracks.y_m))
 
     def _frame_period_s(self) -> float:
-        time_s = np.concatenate([recorded_tracks.read_file(path).time_s for path in self.tracks])
+        time_s = np.concatenate([tracks.time_s for tracks in self.source.read()])
         wanted_s = float(np.nanmax(time_s) - np.nanmin(time_s)) / FRAMES_WANTED
         return max((period_s for period_s in _PERIODS_S if period_s <= wanted_s), default=_PERIODS_S[0])
 
@@ -131,6 +130,18 @@ def _count(name: str, number: int) -> str:
 def read_for_summary(scenario: Scenario) -> RecordedTracks:
     """Read the tracks of a scenario as a run does; InputError if they are wrong."""
     return recorded_tracks.read_recorded_tracks(scenario, geolocation.scenario_georeference(scenario))
+
+
+def read_track_columns(path: Path) -> TrackColumns:
+    """Read a TOML file with the keys of ``[traffic.track_columns]``; InputError if it is invalid."""
+    try:
+        return TrackColumns.from_dict(reading.read_toml(path))
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(map(str, first["loc"]))
+        problem = first["msg"].removeprefix("Value error, ")
+        hint = "Write the keys of [traffic.track_columns], see docs/tracks.md."
+        raise InputError(f"{path}: {key}" if key else path, problem, hint) from None
 
 
 def _tracks_in_folder(folder: Path) -> list[Path]:

@@ -13,6 +13,7 @@ from egvs.importers import junctions
 from egvs.importers.junctions import JunctionRegion, KerbsidePole, StreetJunction, Streets
 from egvs.traffic.network import Edge
 from egvs.world import terrain
+from egvs.world.terrain import TerrainSurface
 
 _STEP_M = 0.25
 """The region of interest grows by whole steps of this where its ground is not flat; a voxel's default size."""
@@ -39,12 +40,9 @@ class Relief:
 
     @classmethod
     def of_region(cls, streets: Streets, junction: StreetJunction, roi: JunctionRegion) -> Relief:
-        """Return the heights of the lanes in a region; those of a network that the effect ``slope`` takes as flat."""
+        """Return the heights of the lanes in a region; all 0 in a flat network."""
         network = streets.network
-        if not network.has_heights:
-            return cls()
-        span_m, off_m = terrain.relief_m(network)
-        if span_m <= terrain.MIN_RELIEF_M and abs(off_m) <= terrain.MIN_RELIEF_M:
+        if _is_flat(streets):
             return cls()
         middle_m = lane_heights_near(streets, junction)
         low_m = high_m = float(np.median(middle_m))
@@ -71,24 +69,43 @@ class Relief:
         rise_m = math.ceil((self.high_m - low_m) / _STEP_M) * _STEP_M
         return low_m, low_m + rise_m + junctions.ROI_HEIGHT_M
 
-    def ground_m(
-        self, streets: Streets, poles: Sequence[KerbsidePole], beyond_m: FloatArray | None = None
-    ) -> FloatArray | None:
+    def ground_m(self, ground: TerrainSurface | None, poles: Sequence[KerbsidePole]) -> FloatArray | None:
         """Return z of the ground (n,) at poles; None where the ground is flat.
 
         Parameters
         ----------
-        streets
-            The roads.
+        ground
+            From :func:`ground_surface`.
         poles
             The locations.
-        beyond_m
-            Points (n, 3) of the terrain beyond the roads, world frame; None without a terrain.
         """
-        if self.is_flat:
+        if self.is_flat or ground is None:
             return None
         x_m, y_m = np.array([(pole.x_m, pole.y_m) for pole in poles]).T
-        return np.round(terrain.triangulate_ground(streets.network, beyond_m=beyond_m).height_m(x_m, y_m), 3)
+        return np.round(ground.height_m(x_m, y_m), 3)
+
+
+def ground_surface(streets: Streets, beyond_m: FloatArray | None = None) -> TerrainSurface | None:
+    """Return the ground of roads with heights; None where the ground is flat.
+
+    Parameters
+    ----------
+    streets
+        The roads.
+    beyond_m
+        Points (n, 3) of the terrain beyond the roads, world frame; None without a terrain.
+    """
+    if _is_flat(streets):
+        return None
+    return terrain.triangulate_ground(streets.network, beyond_m=beyond_m)
+
+
+def _is_flat(streets: Streets) -> bool:
+    """Return whether the effect ``slope`` takes a network as flat."""
+    if not streets.network.has_heights:
+        return True
+    span_m, off_m = terrain.relief_m(streets.network)
+    return span_m <= terrain.MIN_RELIEF_M and abs(off_m) <= terrain.MIN_RELIEF_M
 
 
 def lane_heights_near(streets: Streets, junction: StreetJunction) -> FloatArray:

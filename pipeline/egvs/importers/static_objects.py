@@ -1,9 +1,10 @@
 """Collect the static objects of a new scenario from all its maps.
 
 Footprints become ``statics.geojson``; meshes become one PLY file for each kind of object. Steps of
-:func:`collect_objects`: lower meshes whose heights count from sea level to the network's ground; drop buildings of
-OpenStreetMap where another map has one; cut footprints that cover the carriageway, and name meshes that do; give
-buildings without a height that of their neighbours.
+:func:`collect_objects`: lower meshes whose heights count from sea level to the network's ground, and lift those whose
+heights count from a sloping ground; drop buildings of OpenStreetMap where another map has one; cut footprints that
+cover the carriageway, and name meshes that do; give buildings without a height that of a surface model or of their
+neighbours.
 
 World frame: x east, y north in metres; heights in metres above z = 0 of the network.
 """
@@ -26,12 +27,13 @@ from egvs.core.grid import XY, FloatArray, Roi
 from egvs.importers import building_heights, openstreetmap, osm_solids
 from egvs.importers.as_built_view import AsBuiltMap
 from egvs.importers.junctions import Streets
-from egvs.importers.map_parts import MapContext, MappedMesh, SolidMap
+from egvs.importers.map_parts import MapContext, MappedMesh, SolidMap, Terrain
 from egvs.importers.map_readers import MapFile
 from egvs.importers.openstreetmap import OsmRoads
 from egvs.importers.osm_solids import ImportCounts, MappedSolid
 from egvs.importers.point_cloud import OBJECT_KIND
 from egvs.importers.road_source import RoadSource
+from egvs.world.terrain import TerrainSurface
 
 REPLACED = "replaced_by_another_map"
 """The reason to leave out a building of OpenStreetMap."""
@@ -95,6 +97,8 @@ class StaticObjects:
         The same for each map.
     attributions
         Who made the maps, without repetitions.
+    zero_height_m
+        Height above sea level of z = 0; None if no map states heights above sea level.
     """
 
     solids: tuple[MappedSolid, ...] = ()
@@ -102,11 +106,12 @@ class StaticObjects:
     counts: ImportCounts = field(default_factory=ImportCounts)
     maps: tuple[MapSummary, ...] = ()
     attributions: tuple[str, ...] = ()
+    zero_height_m: float | None = None
 
     @property
-    def n_solids(self) -> int:
-        """Number of footprints and meshes."""
-        return len(self.solids) + len(self.meshes)
+    def file_names(self) -> list[str]:
+        """Names of the files that contributed objects."""
+        return [path.name for summary in self.maps if summary.height_range_m for path in summary.paths]
 
     @property
     def areas(self) -> list[BaseGeometry]:
@@ -185,8 +190,21 @@ def ground_mesh(maps: Sequence[ReadMap]) -> MappedMesh | None:
     return next((mesh for mesh in meshes if mesh.kind == GROUND), None)
 
 
+@dataclass(frozen=True)
+class SurfaceModel:
+    """Heights of roofs, trees and everything else, and of the ground below, in the same vertical system."""
+
+    surface: Terrain
+    ground: Terrain
+
+
 def collect_objects(
-    maps: Sequence[ReadMap], streets: Streets, middle_m: XY, zero_height_m: float | None = None
+    maps: Sequence[ReadMap],
+    streets: Streets,
+    middle_m: XY,
+    zero_height_m: float | None = None,
+    ground: TerrainSurface | None = None,
+    surface_model: SurfaceModel | None = None,
 ) -> StaticObjects:
     """Put the objects of all maps on the ground, clear the carriageway, and assume heights that no map gives.
 
@@ -200,15 +218,28 @@ def collect_objects(
         World-frame x, y of the junction.
     zero_height_m
         Height above sea level of z = 0; None if unknown.
+    ground
+        The ground, world frame; None where it is flat.
+    surface_model
+        Heights of buildings that no map states; None without one.
     """
-    collected = StaticObjects()
+    collected = StaticObjects(zero_height_m=zero_height_m)
     for read in maps:
         if read.reader == openstreetmap.NAME:
             objects = _without_replaced(read.objects, collected)  # the carriageway is clear already
         else:
-            objects = _lower_to_ground(read.objects, middle_m, zero_height_m)
-            objects = _clear_of_carriageway(objects, streets)
+            objects, subtracted_m = _lower_to_ground(read.objects, middle_m, zero_height_m)
+            if collected.zero_height_m is None and subtracted_m is not None:
+                collected = replace(collected, zero_height_m=subtracted_m)
+            if ground is not None and not read.objects.has_absolute_heights:
+                objects = _lift_to_ground(objects, ground)
+            objects = _clear_of_carriageway(objects, streets, ground)
         collected = _add(collected, objects, read.paths, read.reader)
+    if surface_model is not None:
+        measured = building_heights.heights_from_surface(
+            collected.solids, collected.counts, surface_model.surface, surface_model.ground
+        )
+        collected = replace(collected, solids=tuple(measured))
     solids = building_heights.heights_from_neighbours(collected.solids, collected.counts, collected.meshes)
     return replace(collected, solids=tuple(solids))
 
@@ -275,13 +306,15 @@ def _group_by_reader(maps: Sequence[MapFile]) -> list[list[MapFile]]:
     return list(groups.values())
 
 
-def _lower_to_ground(solid_map: SolidMap, middle_m: XY, zero_height_m: float | None) -> SolidMap:
-    """Return a map whose heights count from z = 0.
+def _lower_to_ground(
+    solid_map: SolidMap, middle_m: XY, zero_height_m: float | None
+) -> tuple[SolidMap, float | None]:  # fmt: skip
+    """Return a map whose heights count from z = 0, and what was subtracted from its heights; None if nothing was.
 
     Without a known height of z = 0, it is the median of the lowest points of the objects nearest to the junction.
     """
     if not solid_map.has_absolute_heights or not solid_map.meshes:
-        return solid_map
+        return solid_map, None
     objects = [mesh for mesh in solid_map.meshes if mesh.kind not in (GROUND, OBJECT_KIND)]
     if not objects:  # a point cloud, whose ground is the terrain
         assert zero_height_m is not None, "a point cloud has a ground"
@@ -289,10 +322,10 @@ def _lower_to_ground(solid_map: SolidMap, middle_m: XY, zero_height_m: float | N
     else:
         bases_m = _ground_height_m(objects, middle_m)
     ground_m = bases_m if zero_height_m is None else zero_height_m
-    source = "the lowest points of the objects nearest to the junction"
+    source = "of the lowest points of the objects nearest to the junction"
     if zero_height_m is not None:
-        source = "the ground at the junction"
-    notes = [f"Heights count from sea level; {ground_m:.2f} m, from {source}, is subtracted."]
+        source = "of the ground at the junction"
+    notes = [f"{ground_m:.2f} m, the height {source}, is subtracted from the heights in the map."]
     difference_m = bases_m - ground_m
     if abs(difference_m) > _LARGE_DIFFERENCE_M:
         notes.append(
@@ -301,7 +334,23 @@ def _lower_to_ground(solid_map: SolidMap, middle_m: XY, zero_height_m: float | N
             " level."
         )
     meshes = tuple(_shift(mesh, -ground_m) for mesh in solid_map.meshes)
-    return replace(solid_map, meshes=meshes, notes=(*solid_map.notes, *notes), has_absolute_heights=False)
+    return replace(solid_map, meshes=meshes, notes=(*solid_map.notes, *notes), has_absolute_heights=False), ground_m
+
+
+def _lift_to_ground(solid_map: SolidMap, ground: TerrainSurface) -> SolidMap:
+    """Return a map whose meshes, with heights above the ground, stand on it: each group below its middle."""
+    groups: dict[str, list[MappedMesh]] = {}
+    for mesh in solid_map.meshes:
+        groups.setdefault(mesh.group or f"mesh {mesh.name}", []).append(mesh)
+    lifted, notes = {}, []
+    for name, meshes in groups.items():
+        corners_m = np.concatenate([mesh.vertices_m[:, :2] for mesh in meshes])
+        middle_m = (corners_m.min(axis=0) + corners_m.max(axis=0)) / 2
+        by_m = float(ground.height_m(middle_m[:1], middle_m[1:])[0])
+        lifted |= {mesh.name: _shift(mesh, by_m) for mesh in meshes}
+        notes.append(f"{name}: {by_m:.2f} m, the height of the ground below its middle, is added to its heights.")
+    meshes_on_ground = tuple(lifted[mesh.name] for mesh in solid_map.meshes)
+    return replace(solid_map, meshes=meshes_on_ground, notes=(*solid_map.notes, *notes))
 
 
 def _ground_height_m(meshes: Sequence[MappedMesh], middle_m: XY) -> float:
@@ -315,14 +364,18 @@ def _shift(mesh: MappedMesh, by_m: float) -> MappedMesh:
     return replace(mesh, vertices_m=vertices_m)
 
 
-def _clear_of_carriageway(solid_map: SolidMap, streets: Streets) -> SolidMap:
+def _clear_of_carriageway(solid_map: SolidMap, streets: Streets, ground: TerrainSurface | None) -> SolidMap:
     """Return a map whose footprints do not cover lanes; its counts name meshes that do."""
     lanes = shapely.STRtree(list(streets.areas.values()))
     solids: list[MappedSolid] = []
     counts = replace(solid_map.counts, objects=Counter(), heights={}) if solid_map.solids else solid_map.counts
     for solid in solid_map.solids:
         solids += osm_solids.clear_of_carriageway(solid, lanes, counts)
-    in_lanes = building_heights.objects_on_carriageway(solid_map.meshes, list(streets.areas.values()), _flat_ground_m)
+
+    def ground_m(xy_m: FloatArray) -> FloatArray:
+        return np.zeros(len(xy_m)) if ground is None else ground.height_m(*xy_m.T)
+
+    in_lanes = building_heights.objects_on_carriageway(solid_map.meshes, list(streets.areas.values()), ground_m)
     notes = solid_map.notes
     if in_lanes:
         verb = "stands" if len(in_lanes) == 1 else "stand"
@@ -330,13 +383,9 @@ def _clear_of_carriageway(solid_map: SolidMap, streets: Streets) -> SolidMap:
         notes = (
             *notes,
             f"{len(in_lanes)} of {len(solid_map.meshes)} objects {verb} in lanes; check the position of the map:"
-            f" {', '.join(in_lanes[:_MAX_NAMES])}{more}",
+            f" {', '.join(in_lanes[:_MAX_NAMES])}{more}.",
         )
     return replace(solid_map, solids=tuple(solids), counts=counts, notes=notes)
-
-
-def _flat_ground_m(xy_m: FloatArray) -> FloatArray:
-    return np.zeros(len(xy_m))
 
 
 def _without_replaced(solid_map: SolidMap, others: StaticObjects) -> SolidMap:
@@ -379,4 +428,5 @@ def _add(collected: StaticObjects, solid_map: SolidMap, paths: tuple[Path, ...],
         collected.counts.plus(solid_map.counts),
         (*collected.maps, summary),
         tuple(name for name in attributions if name),
+        collected.zero_height_m,
     )

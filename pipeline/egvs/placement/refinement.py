@@ -6,8 +6,9 @@ of the plan is computed from a new empty scan. The best pose is kept, so the val
 sensor improves the plan by :data:`MIN_IMPROVEMENT`.
 
 What a sensor may do (:class:`Freedom`) is a box with one axis from 0 to 1 per free quantity: the position along a line
-of sites, in a circle or in a polygon; the height; the angles. An unlimited yaw is periodic. Positions are rounded to
-millimetres and angles to hundredths of a degree: nobody mounts a sensor more precisely. World frame.
+of sites, in a circle or in a polygon; the height above the ground, so that a pole that moves on a slope keeps its
+length; the angles. An unlimited yaw is periodic. Positions are rounded to millimetres and angles to hundredths of a
+degree: nobody mounts a sensor more precisely. World frame.
 
 The optimiser first spreads a quarter of the evaluations at random over the box. The covariance matrix adaptation
 evolution strategy (Hansen and Ostermeier 2001; library ``cma``) then starts twice, with half of the remaining
@@ -34,12 +35,14 @@ from egvs.placement.problem_builder import PlacementProblem, candidate_costs
 from egvs.scenario.model import Scenario, SiteLine
 from egvs.scenario.score_config import RefinementConfig
 from egvs.scoring.visibility import Beams
+from egvs.sensors import site_feasibility
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.sites import Pose, Site, candidate_sites
 from egvs.stages.base import StageContext
 from egvs.stages.inputs import get_scene
 from egvs.traffic import sumo_folder
 from egvs.world.carriageway import Carriageway
+from egvs.world.mesh import World
 
 if TYPE_CHECKING:
     from shapely import LineString
@@ -47,6 +50,9 @@ if TYPE_CHECKING:
 
 VisibilityRows = tuple[VisibilityRow, ...]
 """Visibility of one sensor, one row per view of the problem."""
+
+GroundHeight = Callable[[float, float], float]
+"""From x, y to z of the ground there, world frame, in metres."""
 
 LossFunction = Callable[[FloatArray], FloatArray]
 """From points (n, axes) to their losses (n,), float64 and finite."""
@@ -88,7 +94,7 @@ class Axis:
     Attributes
     ----------
     name
-        A field of :class:`egvs.sensors.sites.Pose`, or the distance along a line.
+        A field of :class:`egvs.sensors.sites.Pose`, or the distance along a line. ``z_m`` counts from the ground.
     low, high
         Its range, in m or degrees.
     is_periodic
@@ -118,7 +124,7 @@ class Axis:
 
 @dataclass(frozen=True, eq=False)
 class Freedom:
-    """How one sensor may move.
+    """How one sensor may move. Its height above the ground changes with the axis ``z_m`` only.
 
     Attributes
     ----------
@@ -132,6 +138,8 @@ class Freedom:
         Maximum distance of the pole from its candidate.
     area
         Area in which the pole must be.
+    ground_m
+        The ground; None where it is z = 0.
     """
 
     pose: Pose
@@ -139,6 +147,7 @@ class Freedom:
     line: LineString | None = None
     radius_m: float = math.inf
     area: BaseGeometry | None = None
+    ground_m: GroundHeight | None = None
 
     @property
     def moves_pole(self) -> bool:
@@ -158,6 +167,7 @@ class Freedom:
     def point(self, pose: Pose) -> FloatArray:
         """Return the point of the box that is closest to a pose, (axes,) float64."""
         values = asdict(pose)
+        values["z_m"] = self._height_m(pose)
         if self.line is not None:
             import shapely
 
@@ -178,7 +188,15 @@ class Freedom:
 
             if not shapely.intersects_xy(self.area, values["x_m"], values["y_m"]):
                 return None
-        return Pose(**{**asdict(self.pose), **values})
+        values = {**asdict(self.pose), "z_m": self._height_m(self.pose), **values}
+        if self.ground_m is not None:
+            ground_m = self.ground_m(values["x_m"], values["y_m"])
+            values["z_m"] = round(values["z_m"] + ground_m, _LENGTH_DIGITS)
+        return Pose(**values)
+
+    def _height_m(self, pose: Pose) -> float:
+        """Return the height of a sensor above the ground."""
+        return pose.z_m if self.ground_m is None else pose.z_m - self.ground_m(pose.x_m, pose.y_m)
 
     def _clip_to_circle(self, x_m: float, y_m: float) -> tuple[float, float]:
         """Return a position, moved to the rim of the circle if it is outside."""
@@ -212,6 +230,7 @@ def sensor_freedoms(
     candidates: Sequence[Site],
     plan: Sequence[Site],
     is_fixed: Sequence[bool],
+    ground_m: GroundHeight | None = None,
 ) -> tuple[Freedom | None, ...]:
     """Return the freedom of each sensor of a plan; None for a fixed sensor, or one with a measured scan.
 
@@ -224,11 +243,13 @@ def sensor_freedoms(
     config
         ``[placement.refine]``.
     candidates
-        All candidates; the range of their heights is the default range of heights.
+        All candidates; the range of their heights above the ground is the default range of heights.
     plan
         The sensors of the plan.
     is_fixed
         Which of them do not move.
+    ground_m
+        The ground; None where it is z = 0.
 
     Raises
     ------
@@ -238,6 +259,12 @@ def sensor_freedoms(
     heights_m = config.heights_m
     if heights_m is None:
         candidate_heights_m = [site.pose.z_m for site in candidates]
+        if ground_m is not None:
+            grounds_m = [ground_m(site.pose.x_m, site.pose.y_m) for site in candidates]
+            candidate_heights_m = [
+                round(z_m - under_m, _LENGTH_DIGITS)
+                for z_m, under_m in zip(candidate_heights_m, grounds_m, strict=True)
+            ]
         heights_m = (min(candidate_heights_m), max(candidate_heights_m))
     sensors_on_pole = Counter(site.pole for site in plan)
 
@@ -246,6 +273,7 @@ def sensor_freedoms(
         freedom = None
         if not fixed and site.points is None:
             freedom = _sensor_freedom(scenario, config, heights_m, site, sensors_on_pole[site.pole] > 1)
+            freedom = replace(freedom, ground_m=ground_m)
         freedoms.append(freedom if freedom is not None and freedom.axes else None)
     if not any(freedoms):
         raise InputError(
@@ -497,9 +525,11 @@ def refine_plan(
     """
     before = PlanPoses.of(context.scenario, placement_problem, plan)
     is_fixed = [candidate in placement_problem.problem.rules.forced for candidate in plan]
-    freedoms = sensor_freedoms(context.scenario, config, placement_problem.sites, before.sites, is_fixed)
-    movable = [(number, freedom) for number, freedom in enumerate(freedoms) if freedom is not None]
     evaluator = _PoseEvaluator(context, placement_problem)
+    freedoms = sensor_freedoms(
+        context.scenario, config, placement_problem.sites, before.sites, is_fixed, evaluator.ground_m
+    )
+    movable = [(number, freedom) for number, freedom in enumerate(freedoms) if freedom is not None]
 
     poses = before
     settled: set[int] = set()
@@ -542,6 +572,18 @@ class _PoseEvaluator:
         in_lane: NDArray[np.bool_] = np.array([lane is not None for lane in self._carriageway.lanes_at(positions_m)])
         return in_lane | self._carriageway.in_junctions(positions_m)
 
+    @cached_property
+    def ground_m(self) -> GroundHeight | None:
+        """The ground; None where it is z = 0, or where there is none."""
+        world = self._scene.world
+        if not world.vertices_m[world.faces[_ground_faces(world)], 2].any():
+            return None
+
+        def height_m(x_m: float, y_m: float) -> float:
+            return site_feasibility.ground_height_m(world, Pose(x_m, y_m, 0.0))
+
+        return height_m
+
     def rows(self, site: Site) -> VisibilityRows | None:
         """Visibility of a sensor; None if no sensor can be there."""
         sensor = self._scene.sensor(site.sensor)
@@ -559,6 +601,13 @@ class _PoseEvaluator:
             return None
         network = sumo_folder.read_network(scenario)
         return None if network is None else Carriageway.of(network)
+
+
+def _ground_faces(world: World) -> NDArray[np.bool_]:
+    """Return which faces are ground, (n,)."""
+    is_ground = np.array([solid == ("ground", "ground") for solid in world.solids], dtype=np.bool_)
+    faces: NDArray[np.bool_] = is_ground[world.solid_of_face]
+    return faces
 
 
 class _SensorSearch:

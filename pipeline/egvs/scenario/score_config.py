@@ -237,7 +237,7 @@ class RefinementConfig(StrictModel):
         (), description="Polygons: a pole inside one may be moved anywhere in it, regardless of radius_m"
     )
     heights_m: tuple[Positive, Positive] | None = Field(
-        None, description="Lowest and highest z_m. By default those of all candidates"
+        None, description="Lowest and highest height above the ground. By default those of all candidates"
     )
     yaw_deg: tuple[Turn, Turn] | None = Field(None, description="Lowest and highest yaw. By default any")
     pitch_deg: tuple[Tilt, Tilt] = Field((-30.0, 10.0), description="Lowest and highest pitch, positive for nose up")

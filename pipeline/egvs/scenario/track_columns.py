@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -85,7 +85,8 @@ class TrackColumns(StrictModel):
         if duplicates := find_duplicates(names):
             raise ValueError(f"time, id, x and y are different columns, got {duplicates[0]!r} twice")
         for column, keys in _KEYS_THAT_NEED.items():
-            if getattr(self, column) is None and (unused := sorted(self.model_fields_set & set(keys))):
+            unused = [key for key in keys if getattr(self, key) != self._default(key)]
+            if getattr(self, column) is None and unused:
                 raise ValueError(f"{unused[0]} has no effect without {column}")
         if self.type is None and self.default_type is None:
             raise ValueError("expected type, the column with the class, or default_type, the class of all tracks")
@@ -94,3 +95,7 @@ class TrackColumns(StrictModel):
         if self.z_reference == "bottom" and self.height is None:
             raise ValueError('z_reference = "bottom" needs height: the centre is half a height above the bottom')
         return self
+
+    @classmethod
+    def _default(cls, key: str) -> Any:
+        return cls.model_fields[key].get_default(call_default_factory=True)

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import Field, ValidationError, field_validator, model_validator
 
 from egvs.scenario.fields import Name, Positive, StrictModel, find_duplicates
+from egvs.scenario.track_columns import TrackColumns
 
 _ATTRIBUTE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*")
 """Names of attributes of a vType, which are written into XML unchanged."""
@@ -203,7 +204,7 @@ def keys_without_effect(source: str) -> frozenset[str]:
         "vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s", "junction_blocker_s", "teleport_s",
     })  # fmt: skip
     for_fcd = frozenset({"vtypes", "fcd_geo"})
-    for_tracks = frozenset({"track_gap_s", "track_crs", "coverage"})
+    for_tracks = frozenset({"track_gap_s", "track_columns", "track_crs", "coverage"})
     if source in FINISHED_SOURCES:
         unused = simulation | demand - {"kinds"} | {"routes", "redraw_departures"}
         return unused | (for_tracks if source == "fcd" else for_fcd)
@@ -244,6 +245,9 @@ class TrafficConfig(StrictModel):
     )
     track_gap_s: Positive = Field(
         2.0, description="Longest gap in a recorded track that is interpolated. In longer ones its position is unknown"
+    )
+    track_columns: TrackColumns | None = Field(
+        None, description="Meaning of the columns of recorded tracks in a table of your own (CSV or JSON lines)"
     )
     track_crs: str | None = Field(
         None,

@@ -17,6 +17,7 @@ one step, and the direction of rotation only if the list is in order of time.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -31,8 +32,11 @@ _FULL_CIRCLE_GAP_DEG = 60.0
 """A wider gap without any return is taken for the end of the field of view, in a list of returns."""
 _MAX_AZIMUTHS = 20_000
 _MIN_COHERENCE = 0.5
-_RANGE_STEPS_M = (0.0005, 0.1)
-_MIN_STEP_COHERENCE = 0.4
+_RANGE_STEPS_M = (0.001, 0.05)
+_MIN_STEP_COHERENCE = 0.5
+_MIN_HARMONIC = 0.5
+"""Least coherence at twice the frequency of a step, relative to that at the frequency."""
+_WINDOW_M, _TENTH_M, _FINE_M = 4.0, 0.1, 0.0001
 _MAX_MISS_DEG = 0.1
 
 
@@ -268,16 +272,18 @@ def _azimuths_of_columns(
         centred = column - _channel_means(column.astype(np.float64), channel, inside, channels)[channel]
         change = float((centred * residual_deg)[inside].sum() / (centred[inside] ** 2).sum())
         step_deg += change
-    step_se_deg = float(np.sqrt(((centred * residual_deg)[inside] ** 2).sum()) / (centred[inside] ** 2).sum())
+    step_se_deg = _slope_error(centred[inside], residual_deg[inside], column[inside])
 
-    phase = _wrap(azimuth_deg - step_deg * column)
+    azimuths = round(360.0 / abs(step_deg))
+    is_full_circle = abs(step_deg) * (columns + 0.5) >= 360.0 - 0.5 * _FULL_CIRCLE_GAP_DEG
+    grid_step_deg = math.copysign(360.0 / azimuths, step_deg) if is_full_circle else step_deg
+    phase = _wrap(azimuth_deg - grid_step_deg * column)
     offset_deg = np.array([_circular_median(phase[channel == c]) for c in range(channels)])
     residual_deg = _wrap(phase - offset_deg[channel])
     mean, se_deg = _robust_means(residual_deg, channel, channels)
     offset_deg = offset_deg + mean
 
     direction = 1 if step_deg > 0 else -1
-    is_full_circle = abs(step_deg) * (columns + 0.5) >= 360.0 - 0.5 * _FULL_CIRCLE_GAP_DEG
     if not is_full_circle:
         if direction < 0:  # columns ascend counter-clockwise in the result
             offset_deg = offset_deg + step_deg * (columns - 1)
@@ -285,8 +291,16 @@ def _azimuths_of_columns(
         return _Azimuths(
             _wrap(offset_deg - first_deg), se_deg, abs(step_deg), step_se_deg, columns, first_deg, False, direction
         )
-    azimuths = round(360.0 / abs(step_deg))
     return _Azimuths(_wrap(offset_deg), se_deg, abs(step_deg), step_se_deg, azimuths, 0.0, True, direction)
+
+
+def _slope_error(centred: FloatArray, residual_deg: FloatArray, column: IntArray) -> float:
+    """Return the standard error of the step, from leaving out each of 20 parts of the turn: its speed may vary."""
+    part = np.minimum(column * 20 // (int(column.max()) + 1), 19)
+    products = np.bincount(part, weights=centred * residual_deg, minlength=20)
+    squares = np.bincount(part, weights=centred**2, minlength=20)
+    slopes = (products.sum() - products) / (squares.sum() - squares)
+    return float(np.sqrt(19 / 20 * ((slopes - slopes.mean()) ** 2).sum()))
 
 
 def _azimuths_of_list(sweep: Sweep, channels: int, channel: IntArray, azimuth_deg: FloatArray) -> _Azimuths:
@@ -439,32 +453,45 @@ def pulse_grid(sweep: Sweep, angles: BeamAngles) -> PulseGrid:
 
 
 def range_step(range_m: FloatArray) -> float | None:
-    """Return the step of measured ranges, metres; None if there is none between 0.5 mm and 10 cm.
+    """Return the step of measured ranges, metres; None if there is none between 1 mm and 5 cm.
 
-    The longest step at which the ranges have the same phase: the mean of exp(2 pi i r / step) is near 1 in size. Steps
-    are tried at equal distances of frequency, fine enough for ranges up to 250 m by starting from differences between
-    near ranges.
+    Ranges that are multiples of a step q have the same phase at the frequency 1 / q and its multiples: the mean of
+    exp(2 pi i r / q) is near 1 in size. The lowest such frequency counts. To keep phases exact, only ranges within the
+    4 m are used that contain most distinct ranges; to keep surfaces from imitating a step, each 10 cm of range has the
+    same weight.
     """
-    ranges = np.sort(range_m[np.isfinite(range_m)])
-    ranges = ranges[:: max(1, len(ranges) // 20_000)]
-    # Phases drift by (r / step) (d step / step); with ranges within a window of 4 m, few frequencies suffice.
-    span_m = 4.0
-    start_m = float(np.median(ranges))
-    window = ranges[np.abs(ranges - start_m) < 0.5 * span_m] - start_m
-    if len(window) < 200:
+    window = _varied_ranges(range_m[np.isfinite(range_m)])
+    if window is None:
         return None
-    frequencies = np.arange(1 / _RANGE_STEPS_M[1], 1 / _RANGE_STEPS_M[0], 0.2 / span_m)
-    coherence = np.empty(len(frequencies))
-    for start in range(0, len(frequencies), 500):
-        part = frequencies[start : start + 500]
-        coherence[start : start + 500] = np.abs(np.exp(2j * np.pi * part[:, None] * window).mean(axis=1))
-    # Neighbouring frequencies of 1/100 mm or so are coherent because the window itself is short: ask for a peak.
-    aligned = np.flatnonzero(coherence >= max(_MIN_STEP_COHERENCE, 0.7 * float(coherence[frequencies > 20.0].max())))
-    aligned = aligned[frequencies[aligned] > 10.0]
-    if not len(aligned):
+    tenth = np.floor(window / _TENTH_M).astype(np.int64)
+    weight = 1.0 / np.bincount(tenth)[tenth]
+    bins = round(_WINDOW_M / _FINE_M)
+    density = np.bincount(np.minimum((window / _FINE_M).astype(np.int64), bins - 1), weights=weight, minlength=bins)
+    padded = 8 * bins
+    coherence = np.abs(np.fft.rfft(density, padded)) / weight.sum()
+    per_metre = 1.0 / (padded * _FINE_M)  # frequency of the first element
+    shortest_m, longest_m = _RANGE_STEPS_M
+    lowest = math.ceil(1.0 / (longest_m * per_metre))
+    for k in range(lowest, math.floor(1.0 / (shortest_m * per_metre))):
+        is_peak = coherence[k] >= max(coherence[k - 1], coherence[k + 1], _MIN_STEP_COHERENCE)
+        if is_peak and coherence[2 * k - 1 : 2 * k + 2].max() >= _MIN_HARMONIC * coherence[k]:
+            # The top of a parabola through the peak and its neighbours.
+            before, top, after = coherence[k - 1 : k + 2]
+            bend = before - 2.0 * top + after
+            return float(1.0 / ((k + (0.5 * (before - after) / bend if bend < 0 else 0.0)) * per_metre))
+    return None
+
+
+def _varied_ranges(ranges_m: FloatArray) -> FloatArray | None:
+    """Return the ranges in the 4 m with most occupied tenths of a metre, from its start; None if few are occupied."""
+    if not len(ranges_m):
         return None
-    first = aligned[0]
-    last = first
-    while last + 1 < len(coherence) and coherence[last + 1] > coherence[last]:
-        last += 1
-    return float(1.0 / frequencies[last])
+    counts = np.bincount(np.floor(ranges_m / _TENTH_M).astype(np.int64))
+    width = round(_WINDOW_M / _TENTH_M)
+    occupied = np.convolve(counts >= 5, np.ones(width), mode="full")[width - 1 :]
+    start = int(np.argmax(occupied))
+    if occupied[start] < 0.5 * width:
+        return None
+    inside = (ranges_m >= start * _TENTH_M) & (ranges_m < start * _TENTH_M + _WINDOW_M)
+    window: FloatArray = ranges_m[inside] - start * _TENTH_M
+    return window

@@ -12,6 +12,7 @@ from egvs.sensor_fit import empty_scan, return_rates
 from egvs.sensor_fit.empty_scan import TRAFFIC, UNKNOWN
 from egvs.sensor_fit.fit import SensorFit
 from egvs.sensor_fit.intervals import Estimate
+from egvs.sensor_fit.sweep_layout import nearest_ring
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -77,15 +78,6 @@ def _measured_points(fit: SensorFit) -> tuple[FloatArray, Any, Any]:
     points = fit.sweeps[number].points_m
     points = points[np.isfinite(points[:, 0])]
     points = points[:: max(1, len(points) // _MAX_POINTS)]
-    directions = fit.angles.directions()
-    _, channels, columns = _nearest_pulses(points, fit)
-    del directions
-    return points, channels, columns
-
-
-def _nearest_pulses(points: FloatArray, fit: SensorFit) -> tuple[FloatArray, Any, Any]:
-    from egvs.sensor_fit.sweep_layout import nearest_ring
-
     angles = fit.angles
     order = angles.ascending
     radius_m = np.hypot(points[:, 0], points[:, 1])
@@ -95,7 +87,7 @@ def _nearest_pulses(points: FloatArray, fit: SensorFit) -> tuple[FloatArray, Any
     turned = np.degrees(np.arctan2(points[:, 1], points[:, 0])) - angles.azimuth_offset_deg[channel]
     turned = np.mod(turned - angles.first_azimuth_deg, 360.0)
     column = np.round(turned / angles.grid_step_deg).astype(np.int64) % angles.azimuths
-    return radius_m, channel, column
+    return points, channel, column
 
 
 def draw_ranges(fit: SensorFit) -> Figure:
@@ -166,7 +158,7 @@ def draw_ground(fit: SensorFit) -> Figure:
         axis.plot(0, 0, "^", color=_RED, label="sensor")
     above.set(xlabel="x (m)", ylabel="y (m)", xlim=(-_VIEW_M, _VIEW_M), ylim=(-_VIEW_M, _VIEW_M), aspect="equal")
     above.set_title("From above, in the sensor's frame")
-    above.legend(loc="upper left", fontsize=8)
+    above.legend(loc="upper left", fontsize=8, bbox_to_anchor=(1.02, 1.0))
     deepest = min(-1.3 * max(plane.height_m for plane in fit.planes), -2.0)
     for axis, name, slope in ((side, "x", 0), (across, "y", 1)):
         line = np.array([-_VIEW_M, _VIEW_M])

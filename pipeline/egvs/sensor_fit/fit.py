@@ -13,9 +13,10 @@ from egvs.sensor_fit import empty_scan, ground_plane, range_noise, return_rates
 from egvs.sensor_fit.beam_angles import BeamAngles, PulseGrid, fit_beam_angles, pulse_grid, range_step
 from egvs.sensor_fit.empty_scan import EmptyScanFit
 from egvs.sensor_fit.ground_plane import GroundPlane
-from egvs.sensor_fit.intervals import Estimate
+from egvs.sensor_fit.intervals import Estimate, estimate_scale
 from egvs.sensor_fit.range_noise import NoiseBin, RangeResiduals
 from egvs.sensor_fit.return_rates import PlaneView, RateBin
+from egvs.sensor_fit.surface_normals import surface_normals
 from egvs.sensor_fit.sweep_files import Sweep
 
 SIGMA_RANGE_M = (5.0, 25.0)
@@ -48,7 +49,9 @@ class SensorFit:
     sweeps
         The sweeps.
     layout
-        Order of the first sweep's points, see :class:`.sweep_layout.Layout`.
+        Order of the first sweep's points, see :class:`egvs.sensor_fit.sweep_layout.Layout`.
+    silent_channels
+        Channels of an organised sweep with too few returns to be fitted.
     angles
         Directions of all pulses.
     grids
@@ -77,6 +80,7 @@ class SensorFit:
 
     sweeps: Sequence[Sweep]
     layout: str
+    silent_channels: int
     angles: BeamAngles
     grids: list[PulseGrid]
     range_step_m: float | None
@@ -122,8 +126,7 @@ def fit_sensor(
     fine = [grid.range_m for grid, sweep in zip(grids, sweeps, strict=True) if not sweep.is_coarse]
 
     on_step("ground")
-    points = [sweep.points_m[np.isfinite(sweep.points_m[:, 0])] for sweep in sweeps if not sweep.is_coarse]
-    planes = ground_plane.find_ground_planes(np.concatenate(points), sweeps[0].name)
+    planes = _find_ground_planes(fine, angles, sweeps[0].name)
     if not 1 <= options.ground <= len(planes):
         raise InputError("--ground", f"expected a plane from 1 to {len(planes)}, got {options.ground}")
     plane = planes[options.ground - 1]
@@ -145,6 +148,7 @@ def fit_sensor(
     return SensorFit(
         sweeps=sweeps,
         layout=layout.order,
+        silent_channels=layout.silent,
         angles=angles,
         grids=grids,
         range_step_m=step_m,
@@ -163,6 +167,15 @@ def fit_sensor(
         empty_scan=background,
         residuals=residuals,
     )
+
+
+def _find_ground_planes(grids: list[FloatArray], angles: BeamAngles, where: str) -> list[GroundPlane]:
+    points, normals = [], []
+    for grid in grids:
+        returned = np.isfinite(grid)
+        points.append(empty_scan.points_of(grid, angles)[returned])
+        normals.append(surface_normals(grid, angles)[returned])
+    return ground_plane.find_ground_planes(np.concatenate(points), np.concatenate(normals), where)
 
 
 def _max_range_m(grids: list[FloatArray]) -> float:
@@ -185,6 +198,4 @@ def _near(residuals: RangeResiduals) -> RangeResiduals:
 
 
 def _sensor_sigma(residuals: RangeResiduals, step_m: float) -> Estimate | None:
-    from egvs.sensor_fit.intervals import estimate_scale
-
     return estimate_scale(_near(residuals).residual_m, range_noise.VARIANCE_FACTOR, step_m)

@@ -1,8 +1,9 @@
 r"""Find the ground below a sensor, and the height, roll and pitch that follow from it.
 
-Candidate planes are drawn through three random returns (RANSAC, Fischler and Bolles 1981, Commun. ACM 24, 381-395); the
-one with most returns within 20 cm is refined by least squares over the returns within 2.5 robust standard deviations.
-Its returns are removed and the search is repeated, because roads, verges and yards often lie at different heights and
+Only returns count from surfaces whose normal is near that of the plane, so that walls and hedges do not. Candidate
+planes are drawn through three random returns (RANSAC, Fischler and Bolles 1981, Commun. ACM 24, 381-395); the one with
+most returns within 20 cm, which leaves room for a road's camber, is refined by least squares over the returns within
+2.5 robust standard deviations. Its returns are removed and the search is repeated, because roads, verges and yards often lie at different heights and
 only a person knows which of them is the ground of the map.
 
 A plane with the unit normal n (upwards, in the sensor's frame) and the height h of the sensor above it satisfies
@@ -30,7 +31,9 @@ _TOLERANCE_M = 0.20
 _REMOVED_M = 0.5
 _MIN_SHARE = 0.02
 _BLOCK_DEG = 10.0
-_ANGLE = 1e-12
+_SHORTEST = 1e-12
+_MIN_COSINE = math.cos(math.radians(25.0))
+"""Normals of surfaces deviate by at most this angle from that of the plane."""
 
 
 @dataclass(frozen=True)
@@ -72,13 +75,15 @@ class GroundPlane:
         return distance
 
 
-def find_ground_planes(points_m: FloatArray, where: str) -> list[GroundPlane]:
+def find_ground_planes(points_m: FloatArray, normals: FloatArray, where: str) -> list[GroundPlane]:
     """Return the planes below the sensor, the one with most returns first, at most :data:`MAX_PLANES`.
 
     Parameters
     ----------
     points_m
         Returns in the sensor's frame, (n, 3).
+    normals
+        Unit normals of their surfaces, (n, 3); returns with NaN do not count.
     where
         The sweep, for messages.
 
@@ -89,45 +94,57 @@ def find_ground_planes(points_m: FloatArray, where: str) -> list[GroundPlane]:
     """
     rng = np.random.default_rng(0)
     total = len(points_m)
-    rest = points_m
+    with np.errstate(invalid="ignore"):
+        is_flat = normals[:, 2] > math.cos(math.radians(MAX_TILT_DEG + 25.0))
+    rest, normals = points_m[is_flat], normals[is_flat]
     planes: list[GroundPlane] = []
-    while len(planes) < MAX_PLANES and len(rest) >= _MIN_SHARE * total:
-        start = _strongest_plane(rest, rng)
-        if start is None:
+    while len(planes) < MAX_PLANES and len(rest) >= max(3, _MIN_SHARE * total):
+        start = _strongest_plane(rest, normals, rng)
+        if start is None or start.inside < _MIN_SHARE * total:
             break
-        normal, height_m = start
-        if np.count_nonzero(np.abs(rest @ normal + height_m) < _TOLERANCE_M) < _MIN_SHARE * total:
-            break
-        planes.append(_refine(rest, normal, height_m, total))
-        rest = rest[np.abs(planes[-1].distance_m(rest)) > _REMOVED_M]
+        members = normals @ start.normal > _MIN_COSINE
+        planes.append(_refine(rest[members], start.normal, start.height_m, total))
+        away = np.abs(planes[-1].distance_m(rest)) > _REMOVED_M
+        rest, normals = rest[away], normals[away]
     if not planes:
         hint = "Give sweeps in which the road is visible, with z upwards."
         raise InputError(where, "expected a ground plane below the sensor, got none", hint)
     return planes
 
 
-def _strongest_plane(points_m: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, float] | None:
+@dataclass(frozen=True)
+class _Candidate:
+    """A plane, and the number of returns near it."""
+
+    normal: FloatArray
+    height_m: float
+    inside: int
+
+
+def _strongest_plane(points_m: FloatArray, normals: FloatArray, rng: np.random.Generator) -> _Candidate | None:
     """Return the plane through three returns that has most returns nearby."""
-    sample = points_m
-    if len(sample) > _SAMPLE:
-        sample = points_m[rng.choice(len(points_m), _SAMPLE, replace=False)]
-    best: tuple[FloatArray, float] | None = None
-    most = 0
+    sample = slice(None)
+    if len(points_m) > _SAMPLE:
+        sample = np.sort(rng.choice(len(points_m), _SAMPLE, replace=False))
+    points, directions = points_m[sample], normals[sample]
+    best: _Candidate | None = None
     for _ in range(_TRIALS):
-        a, b, c = sample[rng.integers(len(sample), size=3)]
+        a, b, c = points[rng.integers(len(points), size=3)]
         normal = np.cross(b - a, c - a)
         length = float(np.linalg.norm(normal))
-        if length < _ANGLE:
+        if length < _SHORTEST:
             continue
         normal = normal / (length if normal[2] > 0 else -length)
         height_m = -float(normal @ a)
         if normal[2] < math.cos(math.radians(MAX_TILT_DEG)) or height_m < MIN_HEIGHT_M:
             continue
-        inside = int(np.count_nonzero(np.abs(sample @ normal + height_m) < _TOLERANCE_M))
-        if inside > most:
-            most = inside
-            best = normal, height_m
-    return best
+        near = np.abs(points @ normal + height_m) < _TOLERANCE_M
+        inside = int(np.count_nonzero(near & (directions @ normal > _MIN_COSINE)))
+        if best is None or inside > best.inside:
+            best = _Candidate(normal, height_m, inside)
+    if best is None:
+        return None
+    return _Candidate(best.normal, best.height_m, round(best.inside * len(points_m) / len(points)))
 
 
 def _refine(points_m: FloatArray, normal: FloatArray, height_m: float, total: int) -> GroundPlane:

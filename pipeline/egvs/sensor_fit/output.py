@@ -80,7 +80,7 @@ def write_fit(fit: SensorFit, name: str, folder: Path, *, without_empty_sector: 
     config = sensor_table(fit, without_empty_sector)
     SensorConfig.from_dict(config)  # what is written can be read
     table = _toml(name, config)
-    files.ensure_writable_folder(folder)
+    files.ensure_writable_folder(folder / SENSOR_FILE)
     names = [SENSOR_FILE, REPORT_FILE]
     files.write_text(folder / SENSOR_FILE, _comments(fit, name) + table)
     files.write_text(folder / REPORT_FILE, files.to_json_text(report(fit, name), indent=1) + "\n")
@@ -205,6 +205,7 @@ def report(fit: SensorFit, name: str) -> dict[str, Any]:
             for sweep, grid in zip(fit.sweeps, fit.grids, strict=True)
         ],
         "order_of_points": fit.layout,
+        "channels_with_too_few_returns": fit.silent_channels,
         "azimuth_step_deg": _value(angles.azimuth_step_deg, angles.azimuth_step_se_deg),
         "azimuths": angles.azimuths,
         "full_circle": angles.is_full_circle,

@@ -27,6 +27,7 @@ from egvs.sensor_fit.beam_angles import BeamAngles
 from egvs.sensor_fit.ground_plane import GroundPlane
 from egvs.sensor_fit.intervals import MIN_VALUES, Estimate, estimate_share
 from egvs.sensor_fit.range_noise import MAX_SLOPE
+from egvs.sensor_fit.surface_normals import incidence_angles_deg
 
 RANGE_EDGES_M = (
     0.0,
@@ -59,7 +60,6 @@ _MIN_SECTOR_RETURNS = 50
 _MIN_ON_ROAD, _MAX_BEHIND = 0.6, 0.05
 _EMPTY_SHARE = 0.05
 _MIN_EMPTY_DEG = 2.0
-_NORMAL_COLUMNS = 4
 
 
 @dataclass(frozen=True)
@@ -204,7 +204,7 @@ def smooth_pulses(grids: list[FloatArray], angles: BeamAngles) -> SmoothPulses:
             expected = 2.0 / (1.0 / before + 1.0 / after)
             chosen = np.abs(after - before) <= MAX_SLOPE * expected
             chosen &= np.isnan(grid) | (np.abs(grid - expected) <= MAX_SLOPE * expected)
-        incidence_deg = local_incidence_deg(np.where(np.isnan(grid), expected, grid), angles)
+        incidence_deg = incidence_angles_deg(np.where(np.isnan(grid), expected, grid), angles)
         parts.append((expected[chosen], incidence_deg[chosen], np.isfinite(grid[chosen])))
     return SmoothPulses(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
@@ -227,29 +227,6 @@ def smooth_rates(pulses: SmoothPulses) -> tuple[Estimate | None, list[RateBin]]:
 def _rate(returned: NDArray[np.bool_]) -> Estimate:
     share = float(np.mean(returned))
     return estimate_share(returned.astype(np.float64), 1.0 + 2.0 * share * (1.0 - share))
-
-
-def local_incidence_deg(range_m: FloatArray, angles: BeamAngles) -> FloatArray:
-    """Return the angle of incidence at each return, from returns 4 columns and one channel away, (channels, azimuths).
-
-    NaN where one of these is missing, or where ranges across differ by more than a quarter.
-    """
-    order = angles.ascending
-    rays = angles.directions()[order]
-    points = rays * range_m[order][..., None]
-    left, right = np.roll(points, _NORMAL_COLUMNS, axis=1), np.roll(points, -_NORMAL_COLUMNS, axis=1)
-    below, above = np.full_like(points, np.nan), np.full_like(points, np.nan)
-    below[1:], above[:-1] = points[:-1], points[1:]
-    below[0], above[-1] = points[0], points[-1]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        normal = np.cross(right - left, above - below)
-        cosine = np.abs((normal * rays).sum(axis=-1)) / np.linalg.norm(normal, axis=-1)
-        spread = np.linalg.norm(above, axis=-1) / np.linalg.norm(below, axis=-1)
-    angle = np.degrees(np.arccos(np.clip(cosine, 0.0, 1.0)))
-    angle[~(np.abs(np.log(spread)) < 0.25)] = np.nan
-    result = np.empty_like(angle)
-    result[order] = angle
-    return result
 
 
 def empty_sectors(grids: list[FloatArray], angles: BeamAngles) -> list[tuple[float, float]]:

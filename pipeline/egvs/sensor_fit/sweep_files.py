@@ -78,7 +78,7 @@ def read_sweeps(paths: Sequence[Path]) -> list[Sweep]:
         if path.suffix.lower() == ".gz":
             sweeps += _read_gzip(path)
         else:
-            sweeps += _read_file(path, str(path))
+            sweeps += _read_file(path, path.name)
     for sweep in sweeps:
         if sweep.returns < MIN_RETURNS:
             problem = f"expected a sweep of at least {MIN_RETURNS:,} returns, got {sweep.returns:,}"
@@ -98,7 +98,7 @@ def _read_gzip(path: Path) -> list[Sweep]:
                     file.write(chunk)
         except (OSError, EOFError, gzip.zlib.error) as error:  # type: ignore[attr-defined]
             raise InputError(path, f"cannot be unpacked ({error})", COMPLETE_FILE) from None
-        return _read_file(unpacked, str(path))
+        return _read_file(unpacked, path.name)
 
 
 def _read_file(path: Path, name: str) -> list[Sweep]:

@@ -34,6 +34,7 @@ _ORGANISED_SPREAD_DEG = 0.2
 """Median spread of elevations within a channel, above which the slots are not in the tested order."""
 _SPREAD_RATIO = 1.5
 """A number of channels fits as well as the best one if its spread is at most this multiple of the least spread."""
+_ROUNDING_DEG = 1e-4
 _MIN_RETURNS_PER_CHANNEL = 20
 
 _OFFSETS_M = np.arange(-0.10, 0.1001, 0.004)
@@ -62,12 +63,15 @@ class Layout:
         (n,) int64; -1 for a point on no ring.
     column
         (n,) int64; None for a list of returns.
+    silent
+        Number of further channels with fewer than 20 returns, which cannot be fitted.
     """
 
     order: str
     channels: int
     channel: IntArray
     column: IntArray | None
+    silent: int = 0
 
 
 def find_layout(points_m: FloatArray, where: str) -> Layout:
@@ -103,16 +107,19 @@ def _organised_layout(points_m: FloatArray) -> Layout | None:
     least = min(spread for spread, _, _ in trials)
     if not least < _ORGANISED_SPREAD_DEG:
         return None
-    # Twice the channels fit as well: each is then divided in two. Random rounding makes none fit exactly equally.
+    # Twice the channels fit as well: each of them is then divided in two.
     _, channels, order = min(
-        (trial for trial in trials if trial[0] <= _SPREAD_RATIO * least + 1e-6), key=lambda trial: trial[1]
+        (trial for trial in trials if trial[0] <= _SPREAD_RATIO * least + _ROUNDING_DEG), key=lambda trial: trial[1]
     )
     slots = np.arange(n)
     if order == "channel fastest":
         column, channel = np.divmod(slots, channels)
     else:
         channel, column = np.divmod(slots, n // channels)
-    return Layout(order, channels, channel, column)
+    returned = np.isfinite(elevation_deg)
+    used = np.bincount(channel[returned], minlength=channels) >= _MIN_RETURNS_PER_CHANNEL
+    fitted = np.where(used[channel], (np.cumsum(used) - 1)[channel], -1)
+    return Layout(order, int(np.count_nonzero(used)), fitted, column, channels - int(np.count_nonzero(used)))
 
 
 def _by_channel(values: FloatArray, channels: int, order: str) -> FloatArray:
@@ -123,14 +130,17 @@ def _by_channel(values: FloatArray, channels: int, order: str) -> FloatArray:
 
 
 def _elevation_spread(elevation_deg: FloatArray) -> float:
-    """Median over channels of the median absolute deviation; infinite if channels do not differ or have few returns."""
+    """Median over channels of the width that holds 80 % of their elevations; infinite if channels do not differ.
+
+    Two channels that are taken for one differ by their distance in at least 20 % of the slots.
+    """
     counts = np.isfinite(elevation_deg).sum(axis=1)
     filled = elevation_deg[counts >= _MIN_RETURNS_PER_CHANNEL]
-    if 2 * len(filled) < len(elevation_deg):
+    if len(filled) < MIN_CHANNELS:
         return float("inf")
-    median = np.nanmedian(filled, axis=1)
-    spread = float(np.median(np.nanmedian(np.abs(filled - median[:, None]), axis=1)))
-    total = float(np.median(np.abs(median - np.median(median))))
+    low, middle, high = np.nanpercentile(filled, [10, 50, 90], axis=1)
+    spread = float(np.median(high - low))
+    total = float(np.median(np.abs(middle - np.median(middle))))
     return spread if spread < 0.1 * total else float("inf")
 
 

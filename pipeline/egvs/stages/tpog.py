@@ -27,6 +27,7 @@ from egvs.scenario.model import Scenario
 from egvs.scoring import occupancy
 from egvs.scoring.autocorrelation import autocorrelation_time
 from egvs.scoring.occupancy import BlockCounts, count_blocks, static_voxels
+from egvs.scoring.unknown_occupancy import UnknownOccupancy
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.world.mesh import World
 
@@ -62,7 +63,8 @@ def run(context: StageContext, inputs: StageDependencies) -> Summary:
     -------
     dict
         ``occupied_voxels``, ``static_voxels`` (left out), ``boxes_in_roi`` (mean per frame of the mix),
-        ``memory_frames``; ``left_over`` where the frames of a finished file do not fill the blocks; warnings.
+        ``memory_frames``; ``unknown_gaps``, ``scaled_voxels`` and ``unknown_voxels`` where recorded tracks have long
+        gaps; ``left_over`` where the frames of a finished file do not fill the blocks; warnings.
     """
     source = context.folder.trajectories
     scenario = context.scenario
@@ -73,11 +75,14 @@ def run(context: StageContext, inputs: StageDependencies) -> Summary:
     periods: list[PeriodBlocks] = []
     boxes_in_roi = []
     left_over = 0
+    unknown = UnknownOccupancy.from_metadata(parquet.read_metadata(source, "trajectories"), grid)
+    first_frame = 0
     with parquet.artefact_writer(context.folder.tpog, "tpog") as file:
         for name, recorded, boxes in _recorded_periods(source, grid):
             unused = _leftover_frames(by_period.get(name, scenario), recorded)
             frames = recorded - unused
-            blocks = count_blocks(boxes, grid, frames // n_blocks, n_blocks)
+            blocks = _known_blocks(count_blocks(boxes, grid, frames // n_blocks, n_blocks), unknown, first_frame)
+            first_frame += recorded
             boxes_near = writer.write(file, blocks, n_blocks * len(periods), context.progress)
             boxes_in_roi.append(int(boxes_near.sum()) / frames)
             periods.append(PeriodBlocks(name, 1.0, frames, frames // n_blocks, autocorrelation_time(boxes_near)))
@@ -100,7 +105,7 @@ def run(context: StageContext, inputs: StageDependencies) -> Summary:
         "boxes_in_roi": mean_boxes,
         "memory_frames": memory,
         WARNINGS_KEY: [warning.to_json() for warning in warnings],
-    }
+    } | unknown.summary()
     if left_over:
         total = sum(period.frames for period in periods) + left_over
         summary["left_over"] = f"the last {left_over} of {total} frames, so that {n_blocks} blocks are alike"
@@ -143,6 +148,15 @@ class _BlockWriter:
             boxes.append(boxes_near)
             progress("blocks", block + 1, 0)
         return np.concatenate(boxes)
+
+
+def _known_blocks(blocks: Iterator[BlockCounts], unknown: UnknownOccupancy, first_frame: int) -> Iterator[BlockCounts]:
+    """Yield blocks, with their counts adjusted for what the recording does not know."""
+    for block in blocks:
+        frames = block.boxes_per_frame.size
+        unknown.adjust(block.counts, first_frame, frames)
+        first_frame += frames
+        yield block
 
 
 class _RecordedPeriod(NamedTuple):

@@ -20,6 +20,7 @@ from typing import Any
 import pyarrow as pa
 
 from egvs.artefacts import parquet
+from egvs.artefacts.frame_boxes import UNKNOWN_BOXES_KEY
 from egvs.core import files
 from egvs.core.errors import WARNINGS_KEY, InputError, MissingBackendError
 from egvs.core.platform import relative_path
@@ -27,7 +28,7 @@ from egvs.core.sumo_home import sumo_home
 from egvs.effects import registry
 from egvs.scenario.model import TERRAIN_KEY, Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
-from egvs.traffic import finished_fcd, recorded_tracks, recording, sumo, sumo_folder, trajectories
+from egvs.traffic import finished_fcd, recording, sumo, sumo_folder, trajectories
 from egvs.traffic.fcd import FrameWindow
 from egvs.traffic.locks import WatchedRegion
 from egvs.world import geolocation
@@ -59,7 +60,10 @@ def dependencies(context: StageContext) -> StageDependencies:
     versions = {"sumo": sumo.sumo_version() if needs_sumo else None}
     if scenario.is_recorded:
         versions["sizes_by"] = _installed_sumo_version()
-    return StageDependencies(settings, digests, versions, registry.effect_modules(effects))
+    modules = list(registry.effect_modules(effects))
+    for period_scenario in periods:
+        modules += _reader_modules(period_scenario)
+    return StageDependencies(settings, digests, versions, tuple(dict.fromkeys(modules)))
 
 
 def _installed_sumo_version() -> str | None:
@@ -71,10 +75,21 @@ def _installed_sumo_version() -> str | None:
         return None
 
 
+def _reader_modules(scenario: Scenario) -> list[str]:
+    """The modules that read the recorded tracks of one period; they are loaded by name."""
+    if scenario.traffic.tracks is None:
+        return []
+    from egvs.traffic import recorded_tracks
+
+    return recorded_tracks.track_source(scenario).reader_modules()
+
+
 def _source_files(scenario: Scenario) -> list[Path]:
     """The files that the traffic of one period comes from."""
     traffic = scenario.traffic
     if traffic.tracks is not None:
+        from egvs.traffic import recorded_tracks
+
         sources = recorded_tracks.track_files(scenario)
         if traffic.coverage is not None:
             sources.append(scenario.find(traffic.coverage, "traffic.coverage"))
@@ -133,15 +148,19 @@ def run(context: StageContext, inputs: StageDependencies, traci: tuple[str, int]
         raise InputError("--traci", "the scenario has periods", "Use a scenario without [[traffic.periods]].")
     summaries = {}
     periods = []
+    unknown_boxes: list[dict[str, Any]] = []
     frames = 0
     with parquet.artefact_writer(context.folder.trajectories, "trajectories") as file:
         for name, scenario in context.scenario.by_period().items():
-            window, summaries[name] = _record_period(context, scenario, name, file, frames, traci)
+            window, summaries[name], unknown = _record_period(context, scenario, name, file, frames, traci)
+            unknown_boxes += unknown
             frames += window.count
             periods.append({"name": name, "frames": window.count})
         metadata: dict[str, Any] = {"frames": frames, "frame_period_s": window.period_ms / 1000.0}
         if has_periods:
             metadata["periods"] = periods
+        if unknown_boxes:
+            metadata[UNKNOWN_BOXES_KEY] = unknown_boxes
         file.describe(context.metadata(inputs, **metadata, sumo=inputs.more["sumo"]))
     return merge_summaries(summaries) if has_periods else summaries[""]
 
@@ -153,8 +172,8 @@ def _record_period(
     file: parquet.ArtefactWriter,
     first_frame: int,
     traci: tuple[str, int] | None,
-) -> tuple[FrameWindow, Summary]:
-    """Write the frames of one period."""
+) -> tuple[FrameWindow, Summary, list[dict[str, Any]]]:
+    """Write the frames of one period; return them, what happened, and where positions are unknown."""
     effects, notes = registry.active_traffic_effects(scenario)
     folder = context.folder.sumo / period
     georeference = context.inputs.georeference
@@ -178,7 +197,8 @@ def _record_period(
     summary[WARNINGS_KEY] = [*summary.get(WARNINGS_KEY, []), *(warning.to_json() for warning in warnings)]
     if notes:
         summary["notes"] = [*summary.get("notes", []), *notes]
-    return recorded.window, summary | reports
+    unknown = [{**gap, "frames": [first_frame + frame for frame in gap["frames"]]} for gap in recorded.unknown_boxes]
+    return recorded.window, summary | reports, unknown
 
 
 def merge_summaries(summaries: dict[str, Summary]) -> Summary:

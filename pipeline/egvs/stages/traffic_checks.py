@@ -12,7 +12,7 @@ from egvs.core.errors import Diagnostic, InputError
 from egvs.effects import registry
 from egvs.scenario.model import Scenario
 from egvs.stages.inputs import CheckInputs, ErrorCollector
-from egvs.traffic import demand, fcd, finished_fcd, network, recorded_tracks, sumo_folder, user_files
+from egvs.traffic import demand, fcd, finished_fcd, network, sumo_folder, user_files
 from egvs.world import geolocation
 
 Rule = Callable[[CheckInputs], Iterator[Diagnostic]]
@@ -142,6 +142,8 @@ def check_finished_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
     scenario = inputs.scenario
     errors = ErrorCollector()
     if scenario.traffic.tracks is not None:
+        from egvs.traffic import recorded_tracks
+
         where = f"{sumo_folder.traffic_location(scenario)}.tracks"
         world = geolocation.scenario_georeference(scenario)
         tracks = errors.attempt("traffic", lambda: recorded_tracks.read_recorded_tracks(scenario, world))

@@ -5,9 +5,11 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
@@ -76,10 +78,9 @@ class Table:
             return np.full(self.n_rows, math.nan)
         texts = self.columns[name]
         values = _to_floats(texts)
-        is_empty = np.fromiter((text.lower() in _EMPTY for text in texts), dtype=np.bool_, count=len(texts))
-        for row in np.flatnonzero(~np.isfinite(values) & ~is_empty):
+        for row in np.flatnonzero(np.isinf(values)):
             raise self.error(int(row), name, f"expected a number, got {texts[row][:80]!r}")
-        return np.where(is_empty, math.nan, values)
+        return values
 
     def times_s(self, name: str, unit_s: float = 1.0) -> FloatArray:
         """Return times in seconds, (n,) float64; InputError beyond :data:`MAX_TIME_S`."""
@@ -168,7 +169,7 @@ _EMPTY = frozenset({"", "nan", "none", "null"})
 
 
 def _to_floats(texts: Sequence[str]) -> FloatArray:
-    """Return the numbers of texts, infinite where a text is no number.
+    """Return the numbers of texts: NaN where a text stands for a missing value, infinite where it is no number.
 
     Python's float also reads digits of other scripts, and underscores between digits; they are no numbers here.
     """
@@ -186,7 +187,7 @@ def _to_floats(texts: Sequence[str]) -> FloatArray:
 
 def _to_float(text: str) -> float:
     try:
-        return float(text)
+        return math.nan if text.lower() in _EMPTY else float(text)
     except ValueError:
         return math.inf
 
@@ -205,20 +206,20 @@ def has_columns(head: bytes, *names: str) -> bool:
     return set(name.lower() for name in names) <= set(header(head))
 
 
-def read_text(path: Path, hint: str = _HINT) -> str:
-    """Return the text of a file, plain or gzipped; InputError when it is damaged or no UTF-8."""
-    with reading.translate_errors(path, hint, "cannot be read as CSV"), xml.open_bounded(path) as file:
-        return file.read().decode("utf-8-sig")
+@contextmanager
+def open_text(path: Path, hint: str = _HINT) -> Iterator[TextIO]:
+    """Open a file, plain or gzipped, to read its text; InputError when it is damaged or no UTF-8."""
+    with reading.translate_errors(path, hint), xml.open_bounded(path) as file:
+        yield io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
 
 
-def read_rows(path: Path, delimiter: str = ",", hint: str = _HINT) -> list[tuple[int, list[str]]]:
-    """Return the rows of a CSV file that are not empty, with their line numbers, cells stripped.
-
-    InputError when it is damaged.
-    """
-    rows = csv.reader(io.StringIO(read_text(path, hint), newline=""), delimiter=delimiter, skipinitialspace=True)
-    with reading.translate_errors(path, hint, "cannot be read as CSV"):
-        return [(rows.line_num, [cell.strip() for cell in row]) for row in rows if row]
+def read_rows(path: Path, delimiter: str = ",", hint: str = _HINT) -> Iterator[tuple[int, list[str]]]:
+    """Yield the rows of a CSV file that are not empty, with their line numbers; InputError when it is damaged."""
+    with open_text(path, hint) as file:
+        rows = csv.reader(file, delimiter=delimiter, skipinitialspace=True)
+        for row in rows:
+            if row:
+                yield rows.line_num, row
 
 
 def read_table(
@@ -244,16 +245,20 @@ def read_table(
         of cells than the header (empty ones at its end do not count), or there is no row.
     """
     rows = read_rows(path, delimiter, hint)
-    names = rows[0][1] if rows else []
+    names = [name.strip() for name in next(rows, (0, []))[1]]
     positions = _positions(path, names, required, optional, hint)
-    for line, row in rows[1:]:
-        if len(row) < len(names) or any(row[len(names) :]):
+    cells: dict[str, list[str]] = {name: [] for name in positions}
+    columns = [(cells[name], position) for name, position in positions.items()]
+    lines: list[int] = []
+    for line, row in rows:
+        if len(row) < len(names) or any(cell.strip() for cell in row[len(names) :]):
             raise InputError(f"{path}: line {line}", f"expected {len(names)} cells, got {len(row)}", "Correct the row.")
-    cells = {name: [row[position] for _, row in rows[1:]] for name, position in positions.items()}
-    table = Table(path, cells, [line for line, _ in rows[1:]])
-    if not table.n_rows:
+        for texts, position in columns:
+            texts.append(row[position].strip())
+        lines.append(line)
+    if not lines:
         raise InputError(path, "contains no rows", hint)
-    return table
+    return Table(path, cells, lines)
 
 
 def _positions(

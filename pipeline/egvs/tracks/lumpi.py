@@ -45,18 +45,7 @@ def companions(_path: Path) -> Sequence[Path]:
 
 def read(path: Path) -> Tracks:
     """Read a file."""
-    rows = columns.read_rows(path)
-    if rows and not rows[0][1][0][:1].isdecimal():  # names of columns
-        del rows[0]
-    if not rows:
-        raise InputError(path, "contains no rows", "Use the file as it was published.")
-    for line, row in rows:
-        if len(row) < len(_CELLS):
-            problem = f"expected at least {len(_CELLS)} cells, got {len(row)}"
-            raise InputError(f"{path}: line {line}", problem, "Complete the row, or remove it.")
-    cells = {name: [row[position] for _, row in rows] for position, name in enumerate(_CELLS)}
-    table = columns.Table(path, cells, [line for line, _ in rows])
-    cells["class"] = [f"{number:g}" for number in table.numbers("class")]
+    table = _read_boxes(path)
     values = {f"{name}_m": table.sizes_m(name) for name in ("length", "width", "height")}
     values |= {f"{name}_m": table.positions_m(name) for name in ("x", "y", "z")}
     values |= {"time_s": table.times_s("time"), "yaw_rad": table.angles_rad("heading")}
@@ -66,3 +55,23 @@ def read(path: Path) -> Tracks:
                "classes 6 and 7 (van or unknown) are of class other"]  # fmt: skip
     frame = TrackFrame(_UTM) if is_utm else TrackFrame()
     return Tracks.from_rows(table.names("id"), table.classes("class", _CLASSES), values, frame, sources)
+
+
+def _read_boxes(path: Path) -> columns.Table:
+    """Return the rows, with classes as whole numbers."""
+    cells: dict[str, list[str]] = {name: [] for name in _CELLS}
+    lines: list[int] = []
+    for line, row in columns.read_rows(path):
+        if not lines and row[0].strip().isidentifier():  # names of columns
+            continue
+        if len(row) < len(_CELLS):
+            problem = f"expected at least {len(_CELLS)} cells, got {len(row)}"
+            raise InputError(f"{path}: line {line}", problem, "Complete the row, or remove it.")
+        for name, text in zip(_CELLS, row, strict=False):
+            cells[name].append(text.strip())
+        lines.append(line)
+    if not lines:
+        raise InputError(path, "contains no rows", "Use the file as it was published.")
+    table = columns.Table(path, cells, lines)
+    cells["class"] = [f"{number:g}" for number in table.numbers("class")]
+    return table

@@ -140,6 +140,8 @@ _NUMBERS = ("time_s", "x_m", "y_m", "z_m", "yaw_rad", "length_m", "width_m", "he
 class TrackReader(Protocol):
     """A module that reads one format."""
 
+    __name__: str
+
     NAME: str
     """The format, for messages: "INTERACTION tracks"."""
 

@@ -56,10 +56,11 @@ def _read_positions(path: Path) -> columns.Table:
     lines: list[int] = []
     seen: set[str] = set()
     rows = columns.read_rows(path, ";")
-    if not rows or not _is_header([name.lower() for name in rows[0][1]]):
+    if not _is_header([name.strip().lower() for name in next(rows, (0, []))[1]]):
         problem = f"expected {'; '.join((*_VEHICLE, *_POSITION))} in the first line"
         raise InputError(path, problem, "Use the file as it was published.")
-    for line, row in rows[1:]:
+    for line, texts in rows:
+        row = [text.strip() for text in texts]
         while row and not row[-1]:
             row.pop()
         count, rest = divmod(len(row) - len(_VEHICLE), len(_POSITION))

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import gzip
 import zlib
-from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+
+import numpy as np
 
 from egvs.core import files, plugins
 from egvs.core.errors import InputError
-from egvs.tracks.model import HEAD_BYTES, TrackReader
+from egvs.scenario.track_columns import TrackColumns
+from egvs.tracks import user_table
+from egvs.tracks.model import HEAD_BYTES, TrackReader, Tracks
 
 GROUP = "egvs.tracks"
 
@@ -26,13 +31,17 @@ def find_reader(path: Path) -> TrackReader:
     """
     reader = _find(path)
     if reader is None:
-        raise InputError(path, "the format of the tracks is unknown", f"Formats: {describe_formats()}.")
+        raise InputError(path, "the format of the tracks is unknown", _format_hint())
     return reader
 
 
 def can_read(path: Path) -> bool:
     """Return whether a reader accepts a file; InputError when it does not exist."""
     return _find(path) is not None
+
+
+def _format_hint() -> str:
+    return f"Formats: {describe_formats()}. For your own table, name its columns in [traffic.track_columns]."
 
 
 def _find(path: Path) -> TrackReader | None:
@@ -44,9 +53,61 @@ def _find(path: Path) -> TrackReader | None:
     return None
 
 
-def source_files(path: Path) -> Sequence[Path]:
-    """Return a file of tracks and the files beside it that its reader needs."""
-    return [path, *find_reader(path).companions(path)]
+@dataclass(frozen=True)
+class TrackSource:
+    """Files of recorded tracks on one clock, and how to read them.
+
+    Attributes
+    ----------
+    paths
+        Files with tracks.
+    columns
+        Meaning of their columns, where they are a user's own tables; None for files in a known format.
+    crs
+        Coordinate system instead of the one of the format; "world" for the world frame; None for that of the format.
+    """
+
+    paths: tuple[Path, ...]
+    columns: TrackColumns | None = None
+    crs: str | None = None
+
+    def companions(self) -> list[Path]:
+        """Return the files beside the tracks that their readers need."""
+        if self.columns is not None:
+            return []
+        found: dict[Path, None] = {}
+        for path in self.paths:
+            found |= dict.fromkeys(find_reader(path).companions(path))
+        return [path for path in found if path not in self.paths]
+
+    def reader_modules(self) -> list[str]:
+        """Return the modules that read the files."""
+        if self.columns is not None:
+            return [user_table.__name__]
+        return sorted({find_reader(path).__name__ for path in self.paths})
+
+    def read(self) -> list[Tracks]:
+        """Read each file; one that was read before is read again only when it has changed.
+
+        Raises
+        ------
+        InputError
+            When a file is damaged, or has no row with a time and a position.
+        """
+        key = None if self.columns is None else self.columns.model_dump_json()
+        return [_read_file(path, path.stat().st_mtime_ns, key) for path in self.paths]
+
+
+@lru_cache(maxsize=8)
+def _read_file(path: Path, _modified_ns: int, columns: str | None) -> Tracks:
+    """Read a file, by the JSON of the columns of a user's own table."""
+    if columns is None:
+        tracks = find_reader(path).read(path)
+    else:
+        tracks = user_table.read(path, TrackColumns.model_validate_json(columns))
+    if not (np.isfinite(tracks.time_s) & np.isfinite(tracks.x_m) & np.isfinite(tracks.y_m)).any():
+        raise InputError(path, "contains no row with a time and a position", "Use a file with at least one track.")
+    return tracks
 
 
 def describe_formats() -> str:

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from egvs.core import reading
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.formats import xml
 from egvs.formats.georeference import WGS84, WorldFrame, parse_crs
 from egvs.scenario.track_columns import TrackColumns
 from egvs.tracks import columns
@@ -32,7 +31,7 @@ _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _METRES = {"m": 1.0, "ft": 0.3048}
 _RADIANS = {"rad": 1.0, "deg": math.radians(1.0)}
 _MOTION_STEP_M = 2.0
-_HEAD_BYTES = 256
+_HEAD_CHARACTERS = 256
 
 
 def read(path: Path, mapping: TrackColumns, where: str = "traffic.track_columns") -> Tracks:
@@ -133,8 +132,8 @@ def _read_table(path: Path, mapping: TrackColumns) -> Table:
     """Return the columns that the mapping names."""
     keys = ("time", "id", "x", "y", "z", "yaw", "length", "width", "height", "type")
     names = list(dict.fromkeys(name for key in keys if (name := getattr(mapping, key)) is not None))
-    with reading.translate_errors(path, _HINT), xml.open_bounded(path) as file:
-        is_json = file.read(_HEAD_BYTES).removeprefix(b"\xef\xbb\xbf").lstrip().startswith(b"{")
+    with columns.open_text(path, _HINT) as file:
+        is_json = file.read(_HEAD_CHARACTERS).lstrip().startswith("{")
     if is_json:
         return _read_json_lines(path, names)
     return columns.read_table(path, names, delimiter=mapping.delimiter, hint=_HINT)
@@ -144,20 +143,22 @@ def _read_json_lines(path: Path, names: Sequence[str]) -> Table:
     """Return columns of JSON lines; a key that an object lacks is an empty cell, unless all lack it."""
     cells: dict[str, list[str]] = {name: [] for name in names}
     lines: list[int] = []
-    for line, text in enumerate(columns.read_text(path, _HINT).split("\n"), start=1):
-        if not text.strip():
-            continue
-        with reading.translate_errors(f"{path}: line {line}", "Write one JSON object per line.", "is not valid JSON"):
-            item = reading.parse_json(text.encode("utf-8"))
-        if not isinstance(item, dict):
-            raise InputError(f"{path}: line {line}", "expected a JSON object", "Write one JSON object per line.")
-        for name in names:
-            value = _value(item, name)
-            if isinstance(value, dict | list):
-                problem = f"expected a number or a text, got {type(value).__name__}"
-                raise InputError(f"{path}: line {line}: {name}", problem, _HINT)
-            cells[name].append("" if value is None else str(value).strip())
-        lines.append(line)
+    with columns.open_text(path, _HINT) as file:
+        for line, text in enumerate(file, start=1):
+            if not text.strip():
+                continue
+            where, hint = f"{path}: line {line}", "Write one JSON object per line."
+            with reading.translate_errors(where, hint, "is not valid JSON"):
+                item = reading.parse_json(text.encode("utf-8"))
+            if not isinstance(item, dict):
+                raise InputError(where, "expected a JSON object", hint)
+            for name in names:
+                value = _value(item, name)
+                if isinstance(value, dict | list):
+                    problem = f"expected a number or a text, got {type(value).__name__}"
+                    raise InputError(f"{where}: {name}", problem, _HINT)
+                cells[name].append("" if value is None else str(value).strip())
+            lines.append(line)
     for name in names:
         if not any(cells[name]):
             raise InputError(path, f"expected a key {name!r}, which no line has", _HINT)

@@ -10,9 +10,8 @@ Tracks stand on the ground: heights of a recording are not used, because its zer
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +22,13 @@ from egvs.core.errors import Diagnostic, InputError
 from egvs.core.grid import FloatArray
 from egvs.formats.georeference import WORLD, Georeference
 from egvs.scenario.model import Scenario
-from egvs.tracks import cleaning, coverage, resampling, track_readers
+from egvs.tracks import cleaning, coverage, resampling
 from egvs.tracks.cleaning import CleanTracks
 from egvs.tracks.coverage import Coverage
 from egvs.tracks.model import TrackFrame, Tracks
 from egvs.tracks.resampling import ResampledTracks
-from egvs.tracks.sizes import class_sizes
+from egvs.tracks.sizes import CLASS_SIZES, class_sizes
+from egvs.tracks.track_readers import TrackSource
 from egvs.traffic import sumo_folder, track_alignment
 from egvs.traffic.fcd import FCD_SCHEMA, FrameWindow
 from egvs.traffic.track_alignment import Alignment
@@ -85,10 +85,15 @@ class RecordedTracks:
         sizes_m: list[list[float]] = np.round(self.tracks.size_m, _SIZE_DIGITS).tolist()
         return sizes_m
 
-    def vehicle_sizes(self, vclasses: Mapping[str, str]) -> dict[str, VehicleSize]:
-        """Return the size of each vehicle type; ``vclasses`` are SUMO's classes by class of road user."""
+    def vulnerable_types(self) -> frozenset[str]:
+        """Return the vehicle types of people on foot and on bicycles."""
+        types = zip(self.type_names, self.tracks.classes, strict=True)
+        return frozenset(type_name for type_name, name in types if name in cleaning.VULNERABLE)
+
+    def vehicle_sizes(self) -> dict[str, VehicleSize]:
+        """Return the size of each vehicle type."""
         return {
-            type_name: VehicleSize(*size_m, vclasses[name])
+            type_name: VehicleSize(*size_m, CLASS_SIZES[name].vclass)
             for type_name, name, size_m in zip(self.type_names, self.tracks.classes, self._sizes_m, strict=True)
         }
 
@@ -116,6 +121,25 @@ class RecordedTracks:
                 schema=FCD_SCHEMA,
             )
 
+    def unknown_boxes(self) -> list[dict[str, Any]]:
+        """Return the gaps in which positions are unknown, as JSON; frames count from the first of the recording.
+
+        Keys: ``frames`` (first, and one after the last), ``start_m`` and ``end_m`` (x, y of the centre before and after
+        the gap, world frame), ``yaw_rad``, ``size_m`` (length, width).
+        """
+        gaps = self.boxes.unknown
+        rows = zip(gaps.frames, gaps.start_m, gaps.end_m, gaps.yaw_rad, gaps.track, strict=True)
+        return [
+            {
+                "frames": frames.tolist(),
+                "start_m": np.round(start_m, 3).tolist(),
+                "end_m": np.round(end_m, 3).tolist(),
+                "yaw_rad": round(float(yaw_rad), 6),
+                "size_m": self._sizes_m[track][:2],
+            }
+            for frames, start_m, end_m, yaw_rad, track in rows
+        ]
+
     def summary(self) -> dict[str, Any]:
         """Return what was read, changed and left out, as JSON."""
         report = self.tracks.report.to_json() | self.boxes.report()
@@ -129,10 +153,8 @@ class RecordedTracks:
 
 def track_files(scenario: Scenario) -> list[Path]:
     """Return the files of a scenario's tracks, with those that their readers need."""
-    paths: dict[Path, None] = {}
-    for name in scenario.traffic.tracks or ():
-        paths |= dict.fromkeys(track_readers.source_files(scenario.find(name, "traffic.tracks")))
-    return list(paths)
+    source = track_source(scenario)
+    return [*source.paths, *source.companions()]
 
 
 def read_recorded_tracks(scenario: Scenario, world: Georeference) -> RecordedTracks:
@@ -150,7 +172,7 @@ def read_recorded_tracks(scenario: Scenario, world: Georeference) -> RecordedTra
     InputError
         When a file is damaged, far from the region of interest, or shorter than the requested frames.
     """
-    tracks = read_in_world_frame(_named_files(scenario), world, scenario.traffic.track_crs)
+    tracks = read_in_world_frame(track_source(scenario), world)
     window = _window(scenario, tracks)
     cleaned = cleaning.clean_tracks(tracks, class_sizes(scenario.traffic))
     first_s = float(tracks.time_s.min()) + window.skip_ms / 1000.0
@@ -178,8 +200,7 @@ def _moving_vehicles(tracks: CleanTracks, boxes: ResampledTracks) -> FloatArray:
 
 def tracks_window(scenario: Scenario) -> FrameWindow:
     """Return the frames of a scenario with tracks; InputError if a file is damaged or too short."""
-    recorded = [read_file(path) for path in _named_files(scenario)]
-    return _window(scenario, _concatenate(recorded))
+    return _window(scenario, concatenate(track_source(scenario).read()))
 
 
 def track_warnings(recorded: RecordedTracks, where: str) -> Iterator[Diagnostic]:
@@ -224,41 +245,30 @@ def track_warnings(recorded: RecordedTracks, where: str) -> Iterator[Diagnostic]
         yield from recorded.alignment.warnings(where)
 
 
-def _named_files(scenario: Scenario) -> list[Path]:
-    return [scenario.find(name, "traffic.tracks") for name in scenario.traffic.tracks or ()]
+def track_source(scenario: Scenario) -> TrackSource:
+    """Return the files of a scenario's tracks, and how to read them; InputError if one does not exist."""
+    traffic = scenario.traffic
+    paths = tuple(scenario.find(name, "traffic.tracks") for name in traffic.tracks or ())
+    return TrackSource(paths, traffic.track_columns, traffic.track_crs)
 
 
-def read_file(path: Path) -> Tracks:
-    """Read a file of tracks; it is read again only when it has changed. InputError if it is damaged or empty."""
-    return _read_file(path, path.stat().st_mtime_ns)
-
-
-@lru_cache(maxsize=8)
-def _read_file(path: Path, _modified_ns: int) -> Tracks:
-    tracks = track_readers.find_reader(path).read(path)
-    if not (np.isfinite(tracks.time_s) & np.isfinite(tracks.x_m) & np.isfinite(tracks.y_m)).any():
-        raise InputError(path, "contains no row with a time and a position", "Use a file with at least one track.")
-    return tracks
-
-
-def read_in_world_frame(paths: Sequence[Path], world: Georeference, crs: str | None = None) -> Tracks:
+def read_in_world_frame(source: TrackSource, world: Georeference) -> Tracks:
     """Read files of tracks on one clock, and convert positions and headings to the world frame.
 
     Parameters
     ----------
-    paths
+    source
         The files.
     world
         The world frame.
-    crs
-        Coordinate system of the tracks instead of the one of their format; "world" for the world frame.
 
     Raises
     ------
     InputError
         When a file is damaged, or far from the region of interest.
     """
-    return _concatenate([_to_world(read_file(path), crs, world, path) for path in paths])
+    recorded = zip(source.read(), source.paths, strict=True)
+    return concatenate([_to_world(tracks, source.crs, world, path) for tracks, path in recorded])
 
 
 def _to_world(tracks: Tracks, crs: str | None, world: Georeference, path: Path) -> Tracks:
@@ -285,7 +295,7 @@ def _grid_turn_rad(convert: Any, xy: FloatArray) -> float:
     return float(np.arctan2(end[1] - start[1], end[0] - start[0]))
 
 
-def _concatenate(recorded: list[Tracks]) -> Tracks:
+def concatenate(recorded: list[Tracks]) -> Tracks:
     """Join the tracks of several files on one clock; tracks of different files are different."""
     if len(recorded) == 1:
         return recorded[0]

@@ -26,9 +26,7 @@ from egvs.formats import xml
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import TrafficConfig
-from egvs.tracks import cleaning
-from egvs.tracks.sizes import CLASS_SIZES
-from egvs.traffic import fcd, finished_fcd, locks, network, recorded_tracks, sumo, sumo_folder
+from egvs.traffic import fcd, finished_fcd, locks, network, sumo, sumo_folder
 from egvs.traffic.count_fit import CountFit, count_fits, missed_count_warnings
 from egvs.traffic.locks import DemandKey, RegionWatch, SumoFiles, WatchedRegion, describe_distance
 from egvs.traffic.sumo_folder import SimulationFolder, Timing
@@ -103,6 +101,8 @@ class Recording:
         What was read, changed and left out of recorded tracks, as JSON; None for other traffic.
     warnings
         Warnings about the source.
+    unknown_boxes
+        Gaps in recorded tracks, as JSON.
     """
 
     rows: Iterable[pa.Table]
@@ -122,6 +122,7 @@ class Recording:
     uncounted_types: frozenset[str] = frozenset()
     tracks: Mapping[str, Any] | None = None
     warnings: Sequence[Diagnostic] = ()
+    unknown_boxes: Sequence[Mapping[str, Any]] = ()
 
 
 def record_traffic(
@@ -198,24 +199,22 @@ def _record_finished(scenario: Scenario, folder: Path, world: Georeference) -> I
 
 @contextmanager
 def _record_tracks(scenario: Scenario, folder: Path, world: Georeference) -> Iterator[Recording]:
+    from egvs.traffic import recorded_tracks
+
     where = sumo_folder.traffic_location(scenario)
     sumo_folder.copy_network(scenario, folder)
     recorded = recorded_tracks.read_recorded_tracks(scenario, world)
     source = f"{where}.tracks"
-    vulnerable = frozenset(
-        name
-        for name, track_class in zip(recorded.type_names, recorded.tracks.classes, strict=True)
-        if track_class in cleaning.VULNERABLE
-    )
     yield Recording(
         recorded.rows(),
         recorded.window,
-        recorded.vehicle_sizes({name: size.vclass for name, size in CLASS_SIZES.items()}),
+        recorded.vehicle_sizes(),
         where,
         source=source,
-        uncounted_types=vulnerable,
+        uncounted_types=recorded.vulnerable_types(),
         tracks=recorded.summary(),
         warnings=tuple(recorded_tracks.track_warnings(recorded, source)),
+        unknown_boxes=recorded.unknown_boxes(),
     )
 
 
