@@ -117,7 +117,7 @@ def estimate_fleet(tracks: CleanTracks, members: Sequence[int], matched: Matched
     behaviour = _Behaviour(
         track_demand.free_speed_factors(matched, leaders),
         track_demand.standing_gaps_m(matched, leaders, length_m),
-        track_demand.queue_followers(matched, leaders, length_m),
+        track_demand.queue_followers(matched, leaders, length_m, _STEP_S),
         float(np.median([lane.speed_m_s for lane in matched.lanes if not lane.is_inside])),
     )
     fleet = Counter(tracks.classes[track] for track in members)

@@ -131,6 +131,8 @@ class NewScenario:
         The recorded traffic, if there is one.
     demand
         The demand that was estimated from recorded tracks, if there are such tracks.
+    signal_notes
+        Durations of recorded signals, with intervals; empty without them.
     """
 
     folder: Path
@@ -148,6 +150,7 @@ class NewScenario:
     from_at_m: float | None = None
     recorded: RecordedTracks | None = None
     demand: TrackDemand | None = None
+    signal_notes: tuple[str, ...] = ()
 
     @property
     def maps_have_notes(self) -> bool:
@@ -339,7 +342,7 @@ def create_scenario(
         folder, junction, roi, streets, len(poles), objects.counts, 0, assumed, tuple(notes),
         height_m=relief.z_range_m[1] - relief.z_range_m[0], maps=objects.maps,
         attributions=_attributions(roads, objects), from_at_m=_distance_m(streets, junction, at),
-        demand=demand,
+        demand=demand, signal_notes=signal_notes,
     )  # fmt: skip
     ground_m = relief.ground_m(ground, poles)
     columns = _site_columns(poles, ground_m, relief, maps_read, roi, zero.height_m or 0.0)
@@ -355,9 +358,7 @@ def create_scenario(
         **meshes,
         **terrain_files,
         **({} if recording is None else recording.copies()),
-        SCENARIO_FILE: _scenario_toml(
-            name, scenario, relief, statics, objects.zero_height_m, recording, has_signals=bool(options.signals)
-        ),
+        SCENARIO_FILE: _scenario_toml(name, scenario, relief, statics, objects.zero_height_m, recording),
     }
     recorded: list[RecordedTracks] = []
 
@@ -592,12 +593,12 @@ def scenario_notes(junction_fits: bool, counts: ImportCounts) -> list[str]:
 
 def _scenario_toml(
     name: str, scenario: NewScenario, relief: Relief, statics: TomlTable, zero_height_m: float | None,
-    recording: TrackFiles | None, *, has_signals: bool,
+    recording: TrackFiles | None,
 ) -> str:  # fmt: skip
     title = scenario.junction.title
     values: dict[str, Any] = {
         "description": title[0].upper() + title[1:],
-        "assumed": _assumptions(scenario, is_recorded=recording is not None or has_signals),
+        "assumed": _assumptions(scenario, is_recorded=recording is not None or bool(scenario.signal_notes)),
         "seed": 1,
     }
     if name:
@@ -632,6 +633,8 @@ def _scenario_toml(
         f"World frame: x east, y north in metres as in {NETWORK_FILE}, z up from the {ground}.",
     ]
     document = scenario_files.toml_document(comments, values, tables)
+    for note in scenario.signal_notes:
+        document["traffic"].add(tomlkit.comment(f"{NETWORK_FILE}: {note}"))
     names = MovementNames(scenario.streets.network, scenario.junction.at_m)
     if scenario.demand is not None:
         _add_demand(document["traffic"], scenario.demand, names)

@@ -6,6 +6,8 @@ Formats, told apart by their columns or root element:
 - states of SinD: ``timestamp(ms)`` and a column for each light with 0 (red), 1 (green) or 3 (yellow); changes only;
 - groups as KML, as TAF-BW writes MAP messages: lanes with ``Source``, ``Sink`` and the ``SignalGroup`` of each sink;
 - groups as CSV: ``group``, ``from_edge`` and ``to_edge``, with ids of the network's edges; an empty ``to_edge`` is all.
+
+Names of groups (in SinD: of columns) are compared in lower case.
 """
 
 from __future__ import annotations
@@ -134,7 +136,7 @@ def read_signals(paths: Sequence[Path]) -> RecordedSignals:
         elif set(_GROUPS) <= set(names):
             table = columns.read_table(path, _GROUPS)
             rows = zip(*(table.texts(name) for name in _GROUPS), strict=True)
-            edges += [GroupOfEdges(*row) for row in rows]
+            edges += [GroupOfEdges(group.lower(), start, end) for group, start, end in rows]
         else:
             raise InputError(path, "neither recorded states of signals nor an assignment of signal groups", _HINT)
     if not records:
@@ -151,7 +153,7 @@ def _head(path: Path) -> bytes:
 
 def _read_taf_bw(path: Path) -> dict[str, SignalRecord]:
     table = columns.read_table(path, _TAF_BW)
-    names, time_s = np.array(table.texts(_TAF_BW[0])), table.times_s(_TAF_BW[1], 1e-3)
+    names, time_s = np.array([text.lower() for text in table.texts(_TAF_BW[0])]), table.times_s(_TAF_BW[1], 1e-3)
     states = []
     for row, text in enumerate(table.texts(_TAF_BW[2])):
         if text.upper() not in _J2735:
@@ -165,6 +167,8 @@ def _read_sind(path: Path, lights: Sequence[str]) -> dict[str, SignalRecord]:
     table = columns.read_table(path, (_SIND_TIME, *lights))
     time_s = table.optional_numbers(_SIND_TIME) / 1000.0
     known = np.isfinite(time_s)  # the first row of some recordings has no time
+    if not known.any():
+        raise InputError(path, "no row has a time", "Use the file as it was published.")
     records = {}
     for light in lights:
         letters = []
@@ -193,7 +197,7 @@ def _read_kml(path: Path) -> Iterator[GroupOfWay]:
             if "Source" not in values:
                 continue
             lines[values["Source"]] = _coordinates(placemark, path)
-            groups = [part.strip() for part in values.get("SignalGroup", "").split(",")]
+            groups = [part.strip().lower() for part in values.get("SignalGroup", "").split(",")]
             sinks = [part.strip() for part in values.get("Sink", "").split(",")]
             ways += [(values["Source"], *pair) for pair in zip(sinks, groups, strict=False) if all(pair)]
     for source, sink, group in ways:

@@ -43,7 +43,7 @@ from egvs.report.ranking import RankedSite, Ranking
 from egvs.report.svg_figures import extent
 from egvs.runs.stage_registry import recorded_digests
 from egvs.scenario.loading import scenario_from_dict
-from egvs.scoring.road_locations import LANE, TURN, RoadLocations
+from egvs.scoring.road_locations import LANE, TURN, RoadLocations, disambiguate
 from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, ScoreUncertainty
 from egvs.stages.base import StageContext
 from egvs.stages.inputs import open_folder
@@ -325,7 +325,7 @@ def lane_bins(roads: network.Network, grid: Grid, covered: FloatArray) -> LaneBi
     column_lane, column_bin = np.full(lane.size, -1, dtype=np.int64), np.full(lane.size, -1, dtype=np.int64)
     column_bin[on_place] = new_bin[number_of.ravel()]
     column_lane[on_place] = new_lane[lane_of_bin][number_of.ravel()]
-    described = [locations.locations[index] for index in used[kept]]
+    described = disambiguate([locations.locations[index] for index in used[kept]])
     return LaneBins(
         column_lane, column_bin, new_lane[lane_of_bin][is_long],
         tuple(each.name for each in described), tuple(each.words for each in described),

@@ -12,7 +12,7 @@ from egvs.core import files
 from egvs.report import formatting, maps, page
 from egvs.report.colours import STYLE_SHEET, ColumnValues
 from egvs.report.maps import MapScale
-from egvs.report.svg_figures import FigureStyle, shared_scale
+from egvs.report.svg_figures import FigureStyle
 from egvs.studies.tpog_comparison import Measured, TpogComparison
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -54,9 +54,8 @@ def render_page(comparison: TpogComparison) -> str:
         "svg": Markup, "percent": formatting.format_percent, "integer": formatting.format_count,
         "measured": format_measured, "measured_share": format_share, "measured_bit": format_bit,
     }  # fmt: skip
-    figures, scale = draw_maps(comparison)
     return environment.get_template("tpog.html.j2").render(
-        comparison=comparison, figures=figures, scale=scale, style=Markup(STYLE_SHEET), version=__version__
+        comparison=comparison, figures=draw_maps(comparison), style=Markup(STYLE_SHEET), version=__version__
     )
 
 
@@ -83,8 +82,8 @@ def format_bit(measured: Measured) -> str:
     return f"{measured.value:,.0f} ± {measured.se:,.0f}"
 
 
-def draw_maps(comparison: TpogComparison) -> tuple[list[str], str]:
-    """Return the maps of both TPOGs from above and their common colour scale, SVG text."""
+def draw_maps(comparison: TpogComparison) -> list[str]:
+    """Return the maps of both TPOGs from above, with the same colour scale, SVG text."""
     values: list[ColumnValues] = [tpog.counts.max(axis=2) / tpog.frames for tpog in comparison.tpogs]
     peak = max(float(each.max(initial=0.0)) for each in values)
     label = "Share of the frames in which the column is occupied"
@@ -97,4 +96,4 @@ def draw_maps(comparison: TpogComparison) -> tuple[list[str], str]:
                 MapScale(f"tpog-{side}", peak),
             )
         )  # fmt: skip
-    return figures, shared_scale(peak, label)
+    return figures

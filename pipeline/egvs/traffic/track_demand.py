@@ -15,6 +15,8 @@ r"""Demand and driving behaviour from recorded vehicles that were matched to lan
 
   .. math:: v^2 + 2 b \tau v = l^2 + 2 b g, \qquad \tau = g / v + (l^2 - v^2) / (2 b v)
 
+  SUMO's vehicles reach v one time step after g and l.
+
 - **Dawdling.** SUMO's drivers fall short of these speeds by :math:`\sigma a \Delta t / 2` on average, with imperfection
   sigma, acceleration a and step length. The recorded speed is that of drivers who do, so it is added.
 
@@ -326,8 +328,10 @@ class Follower:
         Time since the front of the vehicle before passed.
     gap_m
         Distance to it, bumper to bumper; NaN where it has left the lanes that follow.
-    speed_m_s, ahead_m_s
-        Speed of the vehicle, and of the one before.
+    speed_m_s
+        Speed of the vehicle one time step later.
+    ahead_m_s
+        Speed of the one before.
     """
 
     track: int
@@ -353,7 +357,7 @@ class Follower:
         return (self.gap_m - min_gap_m) / speed_m_s + braking
 
 
-def queue_followers(matched: MatchedTracks, leaders: Leaders, length_m: FloatArray) -> list[Follower]:
+def queue_followers(matched: MatchedTracks, leaders: Leaders, length_m: FloatArray, step_s: float) -> list[Follower]:
     """Return the vehicles of queues at stop lines, from the :data:`FIRST_IN_QUEUE`\\ th on.
 
     Parameters
@@ -362,6 +366,8 @@ def queue_followers(matched: MatchedTracks, leaders: Leaders, length_m: FloatArr
         Vehicles on lanes, and the next ones ahead.
     length_m
         Length of each vehicle, by track.
+    step_s
+        Time step of the simulation.
     """
     followers = []
     for crossings in _stop_line_crossings(matched, length_m).values():
@@ -378,9 +384,18 @@ def queue_followers(matched: MatchedTracks, leaders: Leaders, length_m: FloatArr
             ahead, gap_m = int(leaders.row[row]), math.nan
             if ahead >= 0 and matched.track[ahead] == before.track:
                 gap_m = float(leaders.distance_m[row] - (length_m[crossing.track] + length_m[before.track]) / 2.0)
-            speeds = float(matched.speed_m_s[row]), float(matched.speed_m_s[ahead])
+            speeds = _speed_after(matched, row, step_s), float(matched.speed_m_s[ahead])
             followers.append(Follower(crossing.track, headway_s, gap_m, *speeds))
     return followers
+
+
+def _speed_after(matched: MatchedTracks, row: int, step_s: float) -> float:
+    """Return the speed of a vehicle some time after a row; that of the row where its track ends."""
+    speed_m_s = float(matched.speed_m_s[row])
+    if row + 1 == matched.track.size or matched.track[row + 1] != matched.track[row]:
+        return speed_m_s
+    share = step_s / float(matched.time_s[row + 1] - matched.time_s[row])
+    return speed_m_s + min(share, 1.0) * (float(matched.speed_m_s[row + 1]) - speed_m_s)
 
 
 @dataclass(frozen=True, order=True)
