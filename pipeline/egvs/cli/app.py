@@ -620,6 +620,22 @@ def new(
             " one clock: --tracks A --tracks B.",
         ),
     ] = None,
+    like: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE",
+            help="Recorded tracks, or a folder of them, from which turning counts, fleet, speeds and gaps of simulated"
+            " traffic are estimated.",
+        ),
+    ] = None,
+    signals: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE",
+            help="Recorded signals of the junction, and a file that assigns their groups to lanes (KML or CSV), for"
+            " simulated traffic: --signals A --signals B.",
+        ),
+    ] = None,
     track_columns: Annotated[
         Path | None,
         typer.Option(
@@ -666,9 +682,10 @@ def new(
         surroundings_m = cli_options.radius_m(surroundings)
     if traffic is not None and vehicles_per_hour is not None:
         raise InputError("--traffic", "cannot be combined with --vehicles-per-hour", "Use one of them.")
-    if tracks and (traffic is not None or vehicles_per_hour is not None):
+    if (tracks or like) and (traffic is not None or vehicles_per_hour is not None):
         key = "--traffic" if traffic is not None else "--vehicles-per-hour"
-        raise InputError(key, "has no effect on recorded traffic (--tracks)", "Use one of them.")
+        source = "--tracks" if tracks else "--like"
+        raise InputError(key, f"has no effect on recorded traffic ({source})", "Use one of them.")
     demand: str | int = traffic or DEFAULT_TRAFFIC
     if vehicles_per_hour is not None:
         demand = vehicles_per_hour
@@ -678,7 +695,8 @@ def new(
     options = NewScenarioOptions(
         lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=demand, pole_spacing_m=pole_spacing_m,
         align=tuple(cli_options.point_pair(text) for text in align or []), surface=tuple(surface or []),
-        tracks=tuple(tracks or ()), track_crs=track_crs, track_columns=track_columns,
+        tracks=tuple(tracks or ()), like=tuple(like or ()), signals=tuple(signals or ()), track_crs=track_crs,
+        track_columns=track_columns,
     )  # fmt: skip
     scenario = new_scenario.create_scenario(folder, paths, location, options)
     new_summary.print_new_scenario(scenario)

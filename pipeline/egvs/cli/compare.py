@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 _OPTION = "--sensors"
 _HEIGHTS_OPTION = "--assumed-heights"
+_TPOG_OPTION = "--tpog"
 _COSTS = "costs."
 _LABEL_WIDTH = 10
 
@@ -64,12 +65,24 @@ def compare(
             "scenario, for all runs, e.g. effects.range_limit={} (repeatable).",
         ),
     ] = None,
+    tpog: Annotated[
+        Path | None,
+        typer.Option(
+            _TPOG_OPTION,
+            metavar="PAGE.html",
+            help="Compare the traffic of two runs, a recorded and a simulated one: distances by lane, entropy, ranks."
+            " Writes a page with both maps.",
+        ),
+    ] = None,
     top: Top = None,
 ) -> None:
     """Which sensor? Compare sensors or runs: the best mount of each pole, the cost of one more point, and settings."""
     from egvs.cli.console import ProgressDisplay
 
     overrides = set_ or []
+    if tpog is not None:
+        _compare_tpogs(runs, tpog, top)
+        return
     if assumed_heights:
         if sensors is not None:
             problem = f"cannot be used together with {_OPTION}"
@@ -92,6 +105,24 @@ def compare(
             command = [*command_words("compare", runs[0], settings), _OPTION, sensors]
         comparison = run_comparison.compare_runs(folders, by, costs, screen.progress)
     study_tables.print_comparison(comparison, top, command)
+
+
+def _compare_tpogs(runs: Sequence[Path], page: Path, top: int | None) -> None:
+    """Compare the traffic of two runs, print the numbers, and write a page."""
+    from egvs.cli import tpog_table
+    from egvs.cli.console import ProgressDisplay
+
+    if len(runs) != 2:
+        problem = f"expected two runs, the recorded and the simulated one, got {len(runs)}"
+        raise InputError(_TPOG_OPTION, problem, "Give their folders, in this order.")
+    if page.suffix != ".html":
+        raise InputError(_TPOG_OPTION, f"expected a file PAGE.html to write, got {page}", "Use --tpog traffic.html.")
+    with ProgressDisplay("compare") as screen:
+        from egvs.studies import tpog_comparison, tpog_page
+
+        comparison = tpog_comparison.compare_tpogs(runs[0], runs[1], screen.progress)
+        tpog_page.write_page(page, comparison)
+    tpog_table.print_tpog_comparison(comparison, page, top)
 
 
 def _compare_heights(paths: Sequence[Path], overrides: Sequence[str]) -> None:

@@ -17,10 +17,12 @@ from egvs.importers.osm_network import ATTRIBUTION
 from egvs.importers.osm_solids import OUT_OF_RANGE, ImportCounts
 from egvs.importers.scenario_files import PITCHES_DEG, SENSOR, STATICS_FILE
 from egvs.traffic.recorded_tracks import track_warnings
+from egvs.traffic.track_demand import MIN_OBSERVATIONS
 
 if TYPE_CHECKING:
     from egvs.city.creation import NewCity, NewJunction
     from egvs.importers.assumed_traffic import AssumedTraffic
+    from egvs.importers.demand_from_tracks import TrackDemand
     from egvs.importers.junctions import Streets
     from egvs.importers.static_objects import MapSummary
 
@@ -69,6 +71,8 @@ def _scenario_lines(scenario: NewScenario) -> Iterator[tuple[str, str]]:
     traffic = _describe_traffic(scenario.traffic)
     if scenario.recorded is not None:
         traffic = recorded_traffic.describe(scenario.recorded)
+    if scenario.demand is not None:
+        traffic = scenario.demand.describe()
     yield "traffic", traffic
     mounts = f"{len(junctions.HEIGHTS_M)} heights x {len(PITCHES_DEG)} tilts"
     yield "sites", f"{scenario.n_candidates:,} candidates: {scenario.poles} poles x {mounts}, sensor {SENSOR}"
@@ -167,6 +171,9 @@ def _scenario_warnings(scenario: NewScenario) -> Iterator[str]:
         for warning in track_warnings(scenario.recorded, f"{scenario.folder / 'scenario.toml'}: traffic.tracks"):
             yield str(warning)
         return
+    if scenario.demand is not None:
+        yield from _demand_warnings(scenario, scenario.demand)
+        return
     assumed, per_h = "the traffic is assumed", 0
     if scenario.traffic is not None:
         per_h = scenario.traffic.per_h
@@ -177,3 +184,16 @@ def _scenario_warnings(scenario: NewScenario) -> Iterator[str]:
         f" Enter counted traffic under [traffic] in {scenario.folder / 'scenario.toml'} before you rely on the ranking,"
         " and remove its entry from assumed."
     )
+
+
+def _demand_warnings(scenario: NewScenario, demand: TrackDemand) -> Iterator[str]:
+    """Warn about counts from few vehicles, and about tracks beside the lanes."""
+    where = scenario.folder / "scenario.toml"
+    if demand.marked:
+        yield (
+            f"{demand.marked} of {len(demand.movements)} counts come from fewer than {MIN_OBSERVATIONS} vehicles. Enter"
+            f" your own counts under [traffic] in {where}; they are marked there, with their intervals."
+        )
+    if demand.alignment is not None:
+        for warning in demand.alignment.warnings("--like"):
+            yield str(warning)

@@ -35,19 +35,23 @@ from egvs.formats import ply
 from egvs.importers import (
     assumed_traffic,
     bridge_decks,
+    demand_from_tracks,
     ground_heights,
     ground_reference,
     junctions,
     map_readers,
     openstreetmap,
     osm_solids,
+    recorded_signals,
     recorded_traffic,
     scenario_files,
+    signal_programs,
     static_objects,
 )
 from egvs.importers.alignment import PointPair, check_used, make_alignment
 from egvs.importers.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, AssumedTraffic
 from egvs.importers.building_heights import ASSUMED, NEIGHBOURS, SURFACE_MODEL
+from egvs.importers.demand_from_tracks import TrackDemand
 from egvs.importers.junctions import JunctionRegion, KerbsidePole, StreetJunction, Streets
 from egvs.importers.map_parts import MapContext, RoadOptions, Terrain
 from egvs.importers.map_readers import MapFile
@@ -125,6 +129,10 @@ class NewScenario:
         Distance of the junction from the requested position, 0 inside it; None without such a position.
     recorded
         The recorded traffic, if there is one.
+    demand
+        The demand that was estimated from recorded tracks, if there are such tracks.
+    signal_notes
+        Durations of recorded signals, with intervals; empty without them.
     """
 
     folder: Path
@@ -141,6 +149,8 @@ class NewScenario:
     attributions: tuple[str, ...] = ()
     from_at_m: float | None = None
     recorded: RecordedTracks | None = None
+    demand: TrackDemand | None = None
+    signal_notes: tuple[str, ...] = ()
 
     @property
     def maps_have_notes(self) -> bool:
@@ -160,6 +170,8 @@ class NewScenario:
     @property
     def flows(self) -> tuple[CountConfig, ...]:
         """The flows of the scenario; empty where no street leads through the region of interest."""
+        if self.demand is not None:
+            return self.demand.flows
         return () if self.traffic is None else self.traffic.flows
 
 
@@ -185,6 +197,10 @@ class NewScenarioOptions:
         Two points that place files without a reference system; empty if there are no such files.
     tracks
         Files of recorded tracks, or folders of them, which replace assumed traffic.
+    like
+        The same, but from which the demand of simulated traffic is estimated.
+    signals
+        Files of recorded signals of the junction, and of what their groups govern; see :mod:`recorded_signals`.
     track_crs
         Coordinate system of the tracks, as for the key ``traffic.track_crs``.
     track_columns
@@ -200,6 +216,8 @@ class NewScenarioOptions:
     pole_spacing_m: float | None = None
     align: tuple[PointPair, ...] = ()
     tracks: tuple[Path, ...] = ()
+    like: tuple[Path, ...] = ()
+    signals: tuple[Path, ...] = ()
     track_crs: str | None = None
     track_columns: Path | None = None
     surface: tuple[Path, ...] = ()
@@ -208,9 +226,15 @@ class NewScenarioOptions:
         """Raise an InputError when a value is out of its limits."""
         assumed_traffic.check_traffic(self.traffic)
         _check_pole_spacing(self.pole_spacing_m)
+        if self.tracks and self.like:
+            hint = "--tracks replays tracks, --like simulates such traffic."
+            raise InputError("--like", "cannot be combined with --tracks", hint)
+        if self.tracks and self.signals:
+            hint = "Use them with --like, for simulated traffic."
+            raise InputError("--signals", "has no effect on recorded traffic (--tracks)", hint)
         for key, value in (("--track-crs", self.track_crs), ("--track-columns", self.track_columns)):
-            if value is not None and not self.tracks:
-                raise InputError(key, "has no effect without recorded tracks", "Give them with --tracks.")
+            if value is not None and not self.tracks and not self.like:
+                raise InputError(key, "has no effect without recorded tracks", "Give them with --tracks or --like.")
         if self.surroundings_m is not None and self.surroundings_m < SURROUNDINGS_MIN_M:
             raise InputError(
                 "--surroundings",
@@ -257,8 +281,8 @@ def create_scenario(
     files = map_readers.open_maps([maps] if isinstance(maps, Path) else maps)
     surface_files = map_readers.open_surface(options.surface)
     roads = _read_roads(files.roads, RoadOptions(options.lefthand, options.walk, has_terrain=bool(files.terrain)), at)
-    recording = _find_tracks(options)
-    junction = _choose_junction(roads.streets, at, recording, files.roads.path)
+    recording, example = (_find_tracks(paths, options) for paths in (options.tracks, options.like))
+    junction = _choose_junction(roads.streets, at, recording or example, files.roads.path)
 
     level = roads.on_level_of(junction)
     if level.streets is not roads.streets:
@@ -300,17 +324,17 @@ def create_scenario(
 
     notes = [*roads.notes, *zero.notes, *(() if terrain is None else terrain.notes), *ground_notes]
     notes += _surface_notes(surface, objects.counts)
-    if at is None and recording is None and not junction.signalised:
+    if at is None and recording is None and example is None and not junction.signalised:
         notes.append(_NO_SIGNALS_NOTE)
     notes += _ring_notes(streets, junction)
     notes += scenario_notes(roi.area.covers(junction.area), objects.counts)
     notes += _level_notes(level, objects.counts) + _range_notes(objects.counts)
     if options.walk:
         notes.append(PEOPLE_HINT)
-    assumed = None
-    if recording is None:
-        assumed = assumed_traffic.assume_traffic(roads.network, streets, junction, options.traffic)
-    notes += assumed_traffic.traffic_notes(assumed)
+    network, signal_notes = _with_signals(roads.network, junction, options.signals, streets)
+    junction = replace(junction, signalised=junction.signalised or bool(options.signals))
+    assumed, demand, traffic_notes = _plan_traffic(network, streets, junction, options, example)
+    notes += [*signal_notes, *traffic_notes]
     relief = Relief.of_region(streets, junction, roi)
     if relief.other_levels:
         notes.append(f"Lanes on another level cross the region of interest: {', '.join(relief.other_levels)}.")
@@ -319,6 +343,7 @@ def create_scenario(
         folder, junction, roi, streets, len(poles), objects.counts, 0, assumed, tuple(notes),
         height_m=relief.z_range_m[1] - relief.z_range_m[0], maps=objects.maps,
         attributions=_attributions(roads, objects), from_at_m=_distance_m(streets, junction, at),
+        demand=demand, signal_notes=signal_notes,
     )  # fmt: skip
     ground_m = relief.ground_m(ground, poles)
     columns = _site_columns(poles, ground_m, relief, maps_read, roi, zero.height_m or 0.0)
@@ -328,7 +353,7 @@ def create_scenario(
         terrain_files[TERRAIN_FILE] = partial(ply.write, points_m=terrain_m)
     statics = scenario_files.statics_table(list(meshes), *terrain_files)
     contents: dict[str, FileContent] = {
-        NETWORK_FILE: roads.network,
+        NETWORK_FILE: network,
         STATICS_FILE: scenario_files.solids_geojson(objects.solids, objects.counts, scenario.attributions),
         SITES_FILE: scenario_files.sites_csv(poles, columns),
         **meshes,
@@ -346,6 +371,32 @@ def create_scenario(
     scenario_files.publish_folder(folder, contents.items(), check)
     world, _ = build_world(load(folder))
     return replace(scenario, n_solids=len(world.solids), recorded=recorded[0] if recorded else None)
+
+
+def _with_signals(
+    network: str, junction: StreetJunction, paths: Sequence[Path], streets: Streets
+) -> tuple[str, tuple[str, ...]]:
+    """Return the network with recorded signals at the junction, and notes on them; unchanged without files."""
+    if not paths:
+        return network, ()
+    if junction.ring is not None:
+        raise InputError("--signals", "the junction is a roundabout", "Choose another junction with --at LAT,LON.")
+    signals = recorded_signals.read_signals(paths)
+    plan = signal_programs.apply_signals(network, junction.id, signals, streets.frame, "--signals")
+    return plan.network, plan.notes
+
+
+def _plan_traffic(
+    network: str, streets: Streets, junction: StreetJunction, options: NewScenarioOptions, example: TrackFiles | None
+) -> tuple[AssumedTraffic | None, TrackDemand | None, Sequence[str]]:
+    """Return the assumed traffic, or the demand like recorded tracks, or neither for recorded traffic; and notes."""
+    if example is not None:
+        demand = demand_from_tracks.estimate_demand(example, streets, junction)
+        return None, demand, demand.notes
+    if options.tracks:
+        return None, None, ()
+    assumed = assumed_traffic.assume_traffic(network, streets, junction, options.traffic)
+    return assumed, None, assumed_traffic.traffic_notes(assumed)
 
 
 def _surface_model(surface: Terrain | None, ground: Terrain | None) -> SurfaceModel | None:
@@ -402,14 +453,14 @@ def _read_roads(file: MapFile, options: RoadOptions, at: tuple[float, float] | N
     return NetworkRoads.read(file.reader.read_roads(file.path, options), file.path)
 
 
-def _find_tracks(options: NewScenarioOptions) -> TrackFiles | None:
-    """Return the recorded tracks of a new scenario, if there are any."""
-    if not options.tracks:
+def _find_tracks(paths: Sequence[Path], options: NewScenarioOptions) -> TrackFiles | None:
+    """Return recorded tracks, if there are any."""
+    if not paths:
         return None
     columns = None
     if options.track_columns is not None:
         columns = recorded_traffic.read_track_columns(options.track_columns)
-    return TrackFiles.find(options.tracks, options.track_crs, columns)
+    return TrackFiles.find(paths, options.track_crs, columns)
 
 
 def _choose_junction(
@@ -417,7 +468,7 @@ def _choose_junction(
 ) -> StreetJunction:
     """Return the junction at the requested position, or else that of the recording, or else the largest one."""
     if at is None and recording is not None:
-        return _junction_at(streets, recording.middle_m(streets), "--tracks")
+        return _junction_at(streets, recording.middle_m(streets), str(recording.source.paths[0]))
     if at is None:
         return _require_junction(junctions.largest_junction(streets), path)
     return _junction_at(streets, _to_world(streets, at), "--at")
@@ -554,7 +605,7 @@ def _scenario_toml(
     title = scenario.junction.title
     values: dict[str, Any] = {
         "description": title[0].upper() + title[1:],
-        "assumed": _assumptions(scenario, is_recorded=recording is not None),
+        "assumed": _assumptions(scenario, is_recorded=recording is not None or bool(scenario.signal_notes)),
         "seed": 1,
     }
     if name:
@@ -589,8 +640,12 @@ def _scenario_toml(
         f"World frame: x east, y north in metres as in {NETWORK_FILE}, z up from the {ground}.",
     ]
     document = scenario_files.toml_document(comments, values, tables)
+    for note in scenario.signal_notes:
+        document["traffic"].add(tomlkit.comment(f"{NETWORK_FILE}: {note}"))
+    names = MovementNames(scenario.streets.network, scenario.junction.at_m)
+    if scenario.demand is not None:
+        _add_demand(document["traffic"], scenario.demand, names)
     if scenario.traffic is not None:
-        names = MovementNames(scenario.streets.network, scenario.junction.at_m)
         document["traffic"].update({"counts": scenario_files.counts_array(scenario.traffic.flows, names)})
         origin = f"assumed from the road classes ({scenario.traffic.assumed_per_h:,} vehicles an hour)"
         if scenario.traffic.level is None:
@@ -600,6 +655,19 @@ def _scenario_toml(
         for line in scenario_files.periods_template(scenario.traffic.flows[0]):
             document["traffic"].add(tomlkit.comment(line))
     return tomlkit.dumps(document)
+
+
+def _add_demand(table: Any, demand: TrackDemand, names: MovementNames) -> None:
+    """Add the demand that was estimated from recorded tracks to ``[traffic]``."""
+    kinds = [estimate.kind for estimate in demand.fleet]
+    table.update({"kinds": scenario_files.kinds_array(kinds, [estimate.comments for estimate in demand.fleet])})
+    table["kinds"].comment("estimated from the recorded vehicles")
+    comments = [movement.comment for movement in demand.movements]
+    table.update({"counts": scenario_files.counts_array(demand.flows, names, comments)})
+    table["counts"].comment(f"vehicles an hour, from {demand.duration_s:,.0f} s of recorded tracks")
+    table.add(tomlkit.comment("The profile of the day is not extrapolated from the recording; it is yours to enter."))
+    for line in scenario_files.periods_template(max(demand.flows, key=lambda flow: flow.per_hour)):
+        table.add(tomlkit.comment(line))
 
 
 def _origin_comments(attributions: Sequence[str]) -> list[str]:
@@ -619,6 +687,8 @@ def _assumptions(scenario: NewScenario, *, is_recorded: bool) -> list[str]:
         assumed.append(f"shares of the movements (of {traffic.per_h:,} vehicles an hour)")
     elif traffic is not None:
         assumed.append(f"traffic ({traffic.per_h:,} vehicles an hour, from the road classes)")
+    if scenario.demand is not None:
+        assumed += scenario.demand.assumptions
     if scenario.junction.signalised and not is_recorded:
         assumed.append("signal plans")
     return [*assumed, *assumed_sizes(scenario.statics), "positions of the poles"]

@@ -22,6 +22,7 @@ from egvs.importers.osm_network import NETWORK_FILE
 from egvs.scenario.model import Scenario
 from egvs.scenario.track_columns import TrackColumns
 from egvs.tracks import track_readers
+from egvs.tracks.model import Tracks
 from egvs.tracks.track_readers import TrackSource
 from egvs.traffic import recorded_tracks
 from egvs.traffic.recorded_tracks import RecordedTracks
@@ -105,13 +106,16 @@ class TrackFiles:
             table["track_columns"] = source.columns.model_dump(exclude_unset=True)
         return table
 
-    def middle_m(self, streets: Streets) -> XY:
-        """Return the median position in the world frame, metres; InputError where the tracks are far from the map."""
+    def read(self, streets: Streets) -> Tracks:
+        """Read the tracks in the world frame of streets; InputError where they are damaged or far from them."""
         points_m = np.concatenate([lane.shape_m[:, :2] for edge in streets.network.edges for lane in edge.lanes])
         low_m, high_m = points_m.min(axis=0) - _MARGIN_M, points_m.max(axis=0) + _MARGIN_M
         region = Roi((*low_m.tolist(), 0.0), (*(high_m - low_m).tolist(), 1.0))
-        world = Georeference(streets.frame, region, "the map")
-        tracks = recorded_tracks.read_in_world_frame(self.source, world)
+        return recorded_tracks.read_in_world_frame(self.source, Georeference(streets.frame, region, "the map"))
+
+    def middle_m(self, streets: Streets) -> XY:
+        """Return the median position in the world frame, metres; InputError where the tracks are far from the map."""
+        tracks = self.read(streets)
         return float(np.nanmedian(tracks.x_m)), float(np.nanmedian(tracks.y_m))
 
     def _frame_period_s(self) -> float:

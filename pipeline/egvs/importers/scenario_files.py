@@ -27,7 +27,7 @@ from egvs.importers.osm_solids import ImportCounts, MappedSolid
 from egvs.scenario.fields import Name
 from egvs.scenario.model import RoiConfig
 from egvs.scenario.score_config import DEFAULT_SCORE, ScoreConfig
-from egvs.scenario.traffic_config import CountConfig
+from egvs.scenario.traffic_config import CountConfig, VehicleKind
 from egvs.sensors.sensor import CATALOGUE
 from egvs.traffic.movements import MovementNames
 
@@ -205,19 +205,37 @@ def toml_document(comments: Sequence[str], values: Mapping[str, Any], tables: Ma
     return document
 
 
-def counts_array(flows: Sequence[CountConfig], names: MovementNames) -> Any:
-    """Return a TOML array with one flow per line, and its movement in words."""
+def counts_array(flows: Sequence[CountConfig], names: MovementNames, comments: Sequence[str] = ()) -> Any:
+    """Return a TOML array with one flow per line, and its movement in words, followed by a comment of its own."""
     rows = tomlkit.array()
-    for flow in flows:
+    for number, flow in enumerate(flows):
         movement = names.describe(flow.edge or flow.from_edge or "", flow.to_edge)
+        if comments:
+            movement += f"; {comments[number]}"
         rows.add_line(_count_row(flow), comment=movement)
     rows.add_line(indent="")
     return rows
 
 
+def kinds_array(kinds: Sequence[VehicleKind], comments: Sequence[Sequence[str]]) -> Any:
+    """Return a TOML array with one kind of vehicle per line, each after its comments."""
+    rows = tomlkit.array()
+    for kind, lines in zip(kinds, comments, strict=True):
+        for line in lines:
+            rows.add_line(comment=line)
+        rows.add_line(_inline_table(kind.model_dump(exclude_defaults=True)))
+    rows.add_line(indent="")
+    return rows
+
+
 def _count_row(flow: CountConfig) -> Any:
+    return _inline_table(flow.model_dump(exclude_defaults=True))
+
+
+def _inline_table(values: Mapping[str, Any]) -> Any:
     row = tomlkit.inline_table()
-    row.update(flow.model_dump(exclude_defaults=True))
+    for key, value in values.items():
+        row[key] = _inline_table(value) if isinstance(value, Mapping) else value
     return row
 
 

@@ -77,6 +77,13 @@ class SiteViewFigure:
     box: Box
 
 
+class MapScale(NamedTuple):
+    """The prefix of ids in a map, different for each on a page, and the value at which its colours end."""
+
+    prefix: str
+    peak: float
+
+
 def occupancy(
     grid: Grid,
     values: ColumnValues,
@@ -85,6 +92,7 @@ def occupancy(
     sites: Sequence[MapSite],
     alt: str,
     style: FigureStyle = PAGE_STYLE,
+    scale: MapScale | None = None,
 ) -> str:
     """Return a map of values over the region of interest, with roads, static outlines and sites.
 
@@ -102,9 +110,11 @@ def occupancy(
         Text for people who do not see the figure.
     style
         Width and colours.
+    scale
+        For one of several maps on a page; by default the colours end at the largest value.
     """
-    plan = _sites_frame(extent(grid, sites), "tpog", style)
-    peak = float(values.max(initial=0.0))
+    scale = scale or MapScale("tpog", float(values.max(initial=0.0)))
+    plan, peak = _sites_frame(extent(grid, sites), scale.prefix, style), scale.peak
     street_names, _ = _street_names(plan, backdrop.roads.names, sites)
     parts = [
         _road_paths(plan, backdrop.roads),

@@ -1,0 +1,99 @@
+"""The page of a comparison of a recorded with a simulated TPOG: numbers with standard errors, and both maps.
+
+It is one file that loads nothing, and depends on the runs alone, not on a clock or a machine.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from egvs._version import __version__
+from egvs.core import files
+from egvs.report import formatting, maps, page
+from egvs.report.colours import STYLE_SHEET, ColumnValues
+from egvs.report.maps import MapScale
+from egvs.report.svg_figures import FigureStyle
+from egvs.studies.tpog_comparison import Measured, TpogComparison
+
+TEMPLATES = Path(__file__).parent / "templates"
+
+SIDES = ("recorded", "simulated")
+
+_MAP_WIDTH = 460.0
+
+
+def write_page(path: Path, comparison: TpogComparison) -> None:
+    """Write the page.
+
+    Parameters
+    ----------
+    path
+        The file.
+    comparison
+        The numbers.
+    """
+    files.write_text(path, render_page(comparison))
+
+
+def render_page(comparison: TpogComparison) -> str:
+    """Return the page, HTML text.
+
+    Parameters
+    ----------
+    comparison
+        The numbers.
+    """
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined
+    from markupsafe import Markup
+
+    environment = Environment(
+        loader=FileSystemLoader([TEMPLATES, page.TEMPLATES]), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    environment.filters |= {
+        "svg": Markup, "percent": formatting.format_percent, "integer": formatting.format_count,
+        "measured": format_measured, "measured_share": format_share, "measured_bit": format_bit,
+    }  # fmt: skip
+    return environment.get_template("tpog.html.j2").render(
+        comparison=comparison, figures=draw_maps(comparison), style=Markup(STYLE_SHEET), version=__version__
+    )
+
+
+def format_measured(measured: Measured | None) -> str:
+    """Return a number with its standard error: "0.43 ± 0.03"."""
+    if measured is None:
+        return "–"
+    if measured.se is None:
+        return f"{measured.value:.2f}"
+    return f"{measured.value:.2f} ± {measured.se:.2f}"
+
+
+def format_share(measured: Measured) -> str:
+    """Return a share in percent with its standard error: "2.4 ± 1.4 %"."""
+    if measured.se is None:
+        return f"{100 * measured.value:.1f} %"
+    return f"{100 * measured.value:.1f} ± {100 * measured.se:.1f} %"
+
+
+def format_bit(measured: Measured) -> str:
+    """Return bits with their standard error: "36,357 ± 12,943"."""
+    if measured.se is None:
+        return f"{measured.value:,.0f}"
+    return f"{measured.value:,.0f} ± {measured.se:,.0f}"
+
+
+def draw_maps(comparison: TpogComparison) -> list[str]:
+    """Return the maps of both TPOGs from above, with the same colour scale, SVG text."""
+    values: list[ColumnValues] = [tpog.counts.max(axis=2) / tpog.frames for tpog in comparison.tpogs]
+    peak = max(float(each.max(initial=0.0)) for each in values)
+    label = "Share of the frames in which the column is occupied"
+    figures = []
+    for side, tpog, each in zip(SIDES, comparison.tpogs, values, strict=True):
+        alt = f"The {side} occupancy from above; vehicles use {(each > 0).mean():.0%} of the region."
+        figures.append(
+            maps.occupancy(
+                tpog.grid, each, label, comparison.backdrop, (), alt, FigureStyle(width=_MAP_WIDTH),
+                MapScale(f"tpog-{side}", peak),
+            )
+        )  # fmt: skip
+    return figures
