@@ -92,10 +92,11 @@ class RecordedTracks:
 
     def vehicle_sizes(self) -> dict[str, VehicleSize]:
         """Return the size of each vehicle type."""
-        return {
-            type_name: VehicleSize(*size_m, CLASS_SIZES[name].vclass)
-            for type_name, name, size_m in zip(self.type_names, self.tracks.classes, self._sizes_m, strict=True)
-        }
+        sizes = {}
+        for type_name, name, size_m in zip(self.type_names, self.tracks.classes, self._sizes_m, strict=True):
+            length_m, width_m, height_m = size_m
+            sizes[type_name] = VehicleSize(length_m, width_m, height_m, CLASS_SIZES[name].vclass)
+        return sizes
 
     def rows(self, first_ms: int = 0) -> Iterator[pa.Table]:
         """Yield rows of :data:`egvs.traffic.fcd.FCD_SCHEMA`, in order of time; the first frame is at ``first_ms``."""
@@ -354,11 +355,11 @@ def concatenate(recorded: list[Tracks]) -> Tracks:
         names = [name for tracks in recorded for name in tracks.names]
     starts = np.cumsum([0, *(len(tracks.names) for tracks in recorded)])
     keys = ("time_s", "x_m", "y_m", "z_m", "yaw_rad", "length_m", "width_m", "height_m")
-    arrays = {key: np.concatenate([getattr(tracks, key) for tracks in recorded]) for key in keys}
+    arrays: dict[str, FloatArray] = {key: np.concatenate([getattr(tracks, key) for tracks in recorded]) for key in keys}
     track = np.concatenate([tracks.track + start for tracks, start in zip(recorded, starts, strict=False)])
     classes = tuple(name for tracks in recorded for name in tracks.classes)
     sources = dict.fromkeys(sentence for tracks in recorded for sentence in tracks.sources)
-    return Tracks(tuple(names), classes, track, **arrays, sources=tuple(sources))
+    return Tracks(tuple(names), classes, track, frame=TrackFrame(), sources=tuple(sources), **arrays)
 
 
 def _window(scenario: Scenario, tracks: Tracks) -> FrameWindow:
