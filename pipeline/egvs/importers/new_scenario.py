@@ -48,9 +48,10 @@ from egvs.importers import (
 from egvs.importers.alignment import PointPair, check_used, make_alignment
 from egvs.importers.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, AssumedTraffic
 from egvs.importers.building_heights import ASSUMED, NEIGHBOURS, SURFACE_MODEL
+from egvs.importers.ground_heights import HIGHEST_M, LOWEST_M
 from egvs.importers.junctions import JunctionRegion, KerbsidePole, StreetJunction, Streets
 from egvs.importers.map_parts import MapContext, RoadOptions, Terrain
-from egvs.importers.map_readers import MapFile
+from egvs.importers.map_readers import MapFile, MapFiles
 from egvs.importers.openstreetmap import OsmRoads
 from egvs.importers.osm_network import ATTRIBUTION, NETWORK_FILE
 from egvs.importers.osm_solids import ImportCounts
@@ -285,6 +286,7 @@ def create_scenario(
     objects = static_objects.collect_objects(
         maps_read, level.streets, junction.at_m, zero.height_m, ground, _surface_model(surface, terrain)
     )
+    _check_zero_height(objects.zero_height_m, files)
     if files.terrain and terrain is not None and zero.height_m is not None:
         decks = bridge_decks.bridge_decks(roads.network, terrain, zero.height_m)
         objects = replace(objects, meshes=(*objects.meshes, *decks))
@@ -346,6 +348,14 @@ def create_scenario(
     scenario_files.publish_folder(folder, contents.items(), check)
     world, _ = build_world(load(folder))
     return replace(scenario, n_solids=len(world.solids), recorded=recorded[0] if recorded else None)
+
+
+def _check_zero_height(height_m: float | None, maps: MapFiles) -> None:
+    if height_m is None or LOWEST_M <= height_m <= HIGHEST_M:
+        return
+    paths = dict.fromkeys(file.path for file in (maps.roads, *maps.terrain, *maps.solids))
+    problem = f"expected heights of {LOWEST_M:,.0f} to {HIGHEST_M:,.0f} m, got {height_m:g} m at the junction"
+    raise InputError(", ".join(str(path) for path in paths), problem, "Check the heights in these maps.")
 
 
 def _surface_model(surface: Terrain | None, ground: Terrain | None) -> SurfaceModel | None:
