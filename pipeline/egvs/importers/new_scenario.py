@@ -75,6 +75,7 @@ from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, Count
 from egvs.sensors.sensor import CATALOGUE
 from egvs.traffic.movements import MovementNames
 from egvs.traffic.recorded_tracks import RecordedTracks
+from egvs.traffic.sumo import SumoInputError
 from egvs.world.static_world import build_world
 
 SURROUNDINGS_MIN_M = 100.0
@@ -311,7 +312,7 @@ def create_scenario(
         notes.append(PEOPLE_HINT)
     assumed = None
     if recording is None:
-        assumed = assumed_traffic.assume_traffic(roads.network, streets, junction, options.traffic)
+        assumed = _assume_traffic(roads, junction, options, files.roads.path)
     notes += assumed_traffic.traffic_notes(assumed)
     relief = Relief.of_region(streets, junction, roi)
     if relief.other_levels:
@@ -348,6 +349,18 @@ def create_scenario(
     scenario_files.publish_folder(folder, contents.items(), check)
     world, _ = build_world(load(folder))
     return replace(scenario, n_solids=len(world.solids), recorded=recorded[0] if recorded else None)
+
+
+def _assume_traffic(
+    roads: RoadSource, junction: StreetJunction, options: NewScenarioOptions, path: Path
+) -> AssumedTraffic | None:
+    """Return the flows through a junction; InputError if SUMO rejects the network."""
+    try:
+        return assumed_traffic.assume_traffic(roads.network, roads.streets, junction, options.traffic)
+    except SumoInputError as error:
+        lines = "; ".join(line.strip() for line in str(error).splitlines())
+        hint = "Check the map, e.g. its traffic lights and connections in netedit."
+        raise InputError(path, f"SUMO cannot simulate the network ({lines})", hint) from None
 
 
 def _check_zero_height(height_m: float | None, maps: MapFiles) -> None:
