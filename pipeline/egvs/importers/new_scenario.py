@@ -358,7 +358,7 @@ def _assume_traffic(
     try:
         return assumed_traffic.assume_traffic(roads.network, roads.streets, junction, options.traffic)
     except SumoInputError as error:
-        lines = "; ".join(line.strip() for line in str(error).splitlines())
+        lines = " ".join(line.strip() for line in str(error).splitlines()).rstrip(":.")
         hint = "Check the map, e.g. its traffic lights and connections in netedit."
         raise InputError(path, f"SUMO cannot simulate the network ({lines})", hint) from None
 
