@@ -102,6 +102,19 @@ def test_columns_sum_values_over_height() -> None:
     assert colours.tolist() == [[0x44, 0x01, 0x54], drawing.colour_scale([0.25, 1.0], 0.0)[0].tolist()]
 
 
+def test_layers_lie_on_the_sloping_ground() -> None:
+    """The ground rises by 1 m per 10 m to the east; a flat ground, and points beyond the ground, stay as they are."""
+    corners = np.array([[0.0, 0, 5], [40, 0, 9], [40, 40, 9], [0, 40, 5]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
+    world = World(corners, faces, np.zeros(2, dtype=np.int32), (("ground", "ground"),))
+    points = np.array([[10.0, 10, 0], [20, 15, 0], [60, 10, 0]], dtype=np.float32)
+    zero_m = (0.0, 10.0, 5.0)
+    lifted = drawing.lift_to_ground(points, world, zero_m)
+    assert lifted == pytest.approx(np.array([[10, 10, 1 + drawing.LAYER_HEIGHT_M], [20, 15, 2.09], [60, 10, 0]]))
+    level = World(corners * [1, 1, 0], faces, world.solid_of_face, world.solids)
+    assert drawing.lift_to_ground(points, level, zero_m) is points
+
+
 def test_colour_scale_is_darkest_for_highest_and_allows_equal_values() -> None:
     assert drawing.colour_scale([1.0, 3.0]).tolist() == [[0xFD, 0xE7, 0x25], [0x44, 0x01, 0x54]]
     assert len(set(map(tuple, drawing.colour_scale([2.0, 2.0]).tolist()))) == 1

@@ -171,7 +171,7 @@ _ALL = (
     _new("map.osm.pbf", meaning.bytes_themselves), _lanelets("lanelets.osm"), _lanelets("lanelets.osm.gz"),
     _beside("city.gml", meaning.bytes_themselves), _beside("dem.gml", meaning.bytes_themselves),
     _beside("city.json", meaning.text_json), _beside("houses.geojson", meaning.text_json),
-    _road_map("roads.net.xml", meaning.gzipped(meaning.xml)), _road_map("roads.xodr", meaning.bytes_themselves),
+    _road_map("roads.net.xml", meaning.bytes_themselves), _road_map("roads.xodr", meaning.bytes_themselves),
     *(_beside(f"houses.{form}", meaning.bytes_themselves, bases.vectors) for form in ("gpkg", "shp", "kml", "parquet")),
     _beside("houses.shp", meaning.bytes_themselves, bases.vectors, "houses.dbf"),
     *(_beside(f"terrain.{form}", meaning.bytes_themselves, bases.on_terrain) for form in ("asc", "tif", "xml")),

@@ -223,3 +223,15 @@ def test_alignment_that_no_file_needs_is_rejected() -> None:
     replace(context, window=box(0, 0, 1, 1)).to_world(np.zeros((1, 2)), None, "b.ply")
     check_used(context)
     check_used(MapContext(FRAME, WINDOW))
+
+
+def test_impossible_heights_are_rejected(tmp_path: Path) -> None:
+    """-9999 that the file does not declare as unknown, and a damaged number."""
+    cells = plane_cells()
+    cells[3, 4] = -9999.0
+    path = write_tiff(tmp_path / "a.tif", cells)
+    with pytest.raises(InputError, match=r"a.tif: expected heights of -1,000 to 9,000 m, got -9999 m"):
+        raster_terrain.read_terrain([path], CONTEXT)
+    corners = np.array([[EAST, NORTH, 50.0], [EAST + 50, NORTH, 50.0], [EAST, NORTH + 50, 5e6]])
+    with pytest.raises(InputError, match=r"b.xml: expected heights of -1,000 to 9,000 m, got 5e\+06 m"):
+        tin_terrain(corners, np.array([[0, 1, 2]]), "EPSG:32632", "b.xml", CONTEXT)

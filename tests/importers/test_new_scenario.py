@@ -307,6 +307,19 @@ def test_point_cloud_replaces_what_it_contains() -> None:
 
 
 @pytest.mark.system
+def test_network_that_sumo_rejects_is_named(tmp_path: Path, run_egvs) -> None:
+    network = tmp_path / "roads.net.xml"
+    text, count = re.subn(
+        r'<tlLogic ([^>]*)type="[a-z_]+"', r'<tlLogic \1type="none_such"', HILL.read_text(encoding="utf-8")
+    )
+    assert count
+    network.write_text(text, encoding="utf-8")
+    code, _, error = run_egvs("new", tmp_path / "made", "--from", network)
+    assert code == 2 and f"{network}: SUMO cannot simulate the network (" in error and "none_such" in error
+    assert not (tmp_path / "made").exists()
+
+
+@pytest.mark.system
 def test_maps_that_cover_all_kerbs_are_named(tmp_path: Path) -> None:
     ring = [[9.99, 51.99], [10.01, 51.99], [10.01, 52.01], [9.99, 52.01], [9.99, 51.99]]
     outline = {"type": "Feature", "properties": {"height": 9}, "geometry": {"type": "Polygon", "coordinates": [ring]}}

@@ -55,6 +55,7 @@ _SITE_RADIUS_M, _PLAN_RADIUS_M = 0.9, 1.3
 _PLAN_COLOUR, _NEXT_SITE_COLOUR = (214, 40, 120), (120, 60, 200)
 
 LAYER_HEIGHT_M = 3.0 * LANE_HEIGHT_M
+_GROUND_MARGIN_M = 50.0
 """Height of a drawn layer above the road and its markings."""
 
 _SCALE_STEPS, _MIN_OPACITY = 255, 0.4
@@ -186,6 +187,28 @@ def difference_points(
 def _column_middles(grid: Grid, ix: NDArray[np.intp], iy: NDArray[np.intp], zero_m: Vec3) -> Points:
     middles = np.column_stack([ix + 0.5, iy + 0.5, np.zeros(len(ix))]) * grid.voxel_m
     return (middles + grid.origin_m - zero_m + (0.0, 0.0, LAYER_HEIGHT_M)).astype(np.float32)
+
+
+def lift_to_ground(points: Points, world: World, zero_m: Vec3) -> Points:
+    """Return points (n, 3) of a layer on the ground, where it is not flat.
+
+    Heights are linear between the vertices of the ground (Delaunay triangulation). Without a ground around them, points
+    stay where they are.
+    """
+    is_ground = np.array([solid == ("ground", "ground") for solid in world.solids], dtype=np.bool_)
+    ground_m = world.vertices_m[np.unique(world.faces[is_ground[world.solid_of_face]])] - zero_m
+    if not len(points) or not len(ground_m) or not np.ptp(ground_m[:, 2]):
+        return points
+    from scipy.interpolate import LinearNDInterpolator
+
+    low_m, high_m = points[:, :2].min(axis=0) - _GROUND_MARGIN_M, points[:, :2].max(axis=0) + _GROUND_MARGIN_M
+    near_m = ground_m[((ground_m[:, :2] >= low_m) & (ground_m[:, :2] <= high_m)).all(axis=1)]
+    if len(near_m) < 3:
+        return points
+    heights_m = LinearNDInterpolator(near_m[:, :2], near_m[:, 2])(points[:, :2]) + LAYER_HEIGHT_M
+    lifted = points.copy()
+    lifted[:, 2] = np.where(np.isnan(heights_m), points[:, 2], heights_m)
+    return lifted
 
 
 def colour_scale(values: Floats | Sequence[float], low: float | None = None, high: float | None = None) -> Bytes:
@@ -468,6 +491,10 @@ class LayerContext:
                 LAYER_NAME, points, point_colours, point_size=size_m, precision="float32", point_shading="flat"
             )
 
+    def draw_columns(self, points: Points, point_colours: Bytes, size_m: float) -> None:
+        """Draw points (n, 3) that stand for columns, on the ground."""
+        self.draw_points(lift_to_ground(points, self.session.scene.world, self.zero_m), point_colours, size_m)
+
 
 def draw_layer(context: LayerContext) -> str:
     """Replace the layer, and return its legend (HTML).
@@ -485,7 +512,7 @@ def draw_layer(context: LayerContext) -> str:
 def _draw_traffic(context: LayerContext) -> str:
     tpog = context.session.tpog
     points, point_colours = column_points(tpog, tpog.p, context.zero_m)
-    context.draw_points(points, point_colours, tpog.grid.voxel_m)
+    context.draw_columns(points, point_colours, tpog.grid.voxel_m)
     peak = float(tpog.p.sum(axis=2).max(initial=0.0))
     return _scale_legend("share of time for which voxels are occupied by vehicles, summed over height", 0.0, peak)
 
@@ -497,7 +524,7 @@ def _draw_entropy(context: LayerContext) -> str:
     entropy = np.where(is_crossed == draws_seen, session.entropy_bit, 0.0)
     peak = float(session.entropy_bit.sum(axis=2).max(initial=0.0))
     points, point_colours = column_points(session.tpog, entropy, context.zero_m, peak)
-    context.draw_points(points, point_colours, session.tpog.grid.voxel_m)
+    context.draw_columns(points, point_colours, session.tpog.grid.voxel_m)
     where = "that beams cross" if draws_seen else "that no beam crosses"
     return _scale_legend(f"entropy (bits) of voxels {where}, summed over height", 0.0, peak)
 
@@ -508,7 +535,7 @@ def _draw_blindspots(context: LayerContext) -> str:
     middles = np.column_stack([ix + 0.5, iy + 0.5, np.zeros(len(ix))]) * spots.cell_m
     points = middles + np.array([*spots.origin_m, LAYER_HEIGHT_M]) - context.zero_m
     point_colours = colour_scale(spots.share_missed[ix, iy], 0.0, 1.0)
-    context.draw_points(points.astype(np.float32), point_colours, spots.cell_m)
+    context.draw_columns(points.astype(np.float32), point_colours, spots.cell_m)
     overall = "no vehicles were recorded"
     if spots.overall is not None:
         overall = f"all vehicles: {spots.overall.share:.1%} found"
@@ -526,7 +553,7 @@ def _draw_difference(context: LayerContext) -> str:
     only_this, only_other = np.where(this & ~other, entropy, 0.0), np.where(other & ~this, entropy, 0.0)
     palette = (_THIS_COLOUR, _OTHER_COLOUR, _EQUAL_COLOUR)
     points, point_colours = difference_points(session.tpog, only_this, only_other, context.zero_m, palette)
-    context.draw_points(points, point_colours, session.tpog.grid.voxel_m)
+    context.draw_columns(points, point_colours, session.tpog.grid.voxel_m)
     return _swatch_legend(
         [
             (_THIS_COLOUR, f"seen only by {context.rating.site.name}: {float(only_this.sum()):,.1f} bits"),

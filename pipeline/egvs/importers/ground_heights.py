@@ -24,6 +24,9 @@ from egvs.importers.map_parts import MapContext, Terrain
 _EDGE_SHARE = 1e-9
 """A point may be outside a triangle by this share of it: it is on a side."""
 
+LOWEST_M, HIGHEST_M = -1000.0, 9000.0
+"""Limits of heights above sea level; -9999, which often stands for unknown heights, is below."""
+
 _QUERY = 100_000
 _MIN_AREA_M2 = 1e-9
 
@@ -152,8 +155,10 @@ def grid_terrain(grids: Sequence[tuple[HeightGrid, str]], context: MapContext) -
     Raises
     ------
     InputError
-        When none of them has a height in the region, or their coordinates cannot be converted.
+        When none of them has a height in the region, a height is impossible, or their coordinates cannot be converted.
     """
+    for grid, where in grids:
+        _check_heights(grid.heights_m, where)
     present = [(grid, where) for grid, where in grids if grid.heights_m.size]
     terrain = GridTerrain(tuple(present), context)
     if not present or not np.isfinite(terrain.height_m(_window_points(context.window))).any():
@@ -185,7 +190,7 @@ def tin_terrain(
     Raises
     ------
     InputError
-        When the coordinates cannot be converted.
+        When a height in the region is impossible, or the coordinates cannot be converted.
     """
     vertices_m = np.column_stack([context.to_world(vertices[:, :2], crs, where), vertices[:, 2]])
     corners = vertices_m[faces]
@@ -197,6 +202,7 @@ def tin_terrain(
     if not is_used.any():
         return None
     heights = corners[is_used, :, 2]
+    _check_heights(heights, where)
     summary = (
         f"{where}: terrain of {np.count_nonzero(is_used):,} triangles in the region, {heights.min():.1f} to"
         f" {heights.max():.1f} m high; {np.count_nonzero(~is_used):,} outside it or without area were left out."
@@ -259,6 +265,14 @@ def ground_points(terrain: Terrain, window: BaseGeometry, step_m: float) -> Floa
     heights_m = terrain.height_m(xy_m)
     is_known = np.isfinite(heights_m)
     return np.column_stack([xy_m[is_known], heights_m[is_known]])
+
+
+def _check_heights(heights_m: FloatArray, where: str) -> None:
+    """Raise an InputError if a known height cannot be one."""
+    wrong = heights_m[(heights_m < LOWEST_M) | (heights_m > HIGHEST_M)]
+    if len(wrong):
+        problem = f"expected heights of {LOWEST_M:,.0f} to {HIGHEST_M:,.0f} m, got {wrong[0]:g} m"
+        raise InputError(where, problem, "Check the heights, their unit, and which value stands for no data.")
 
 
 def _cross(one: FloatArray, other: FloatArray) -> FloatArray:

@@ -52,9 +52,10 @@ from egvs.importers.alignment import PointPair, check_used, make_alignment
 from egvs.importers.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, AssumedTraffic
 from egvs.importers.building_heights import ASSUMED, NEIGHBOURS, SURFACE_MODEL
 from egvs.importers.demand_from_tracks import TrackDemand
+from egvs.importers.ground_heights import HIGHEST_M, LOWEST_M
 from egvs.importers.junctions import JunctionRegion, KerbsidePole, StreetJunction, Streets
 from egvs.importers.map_parts import MapContext, RoadOptions, Terrain
-from egvs.importers.map_readers import MapFile
+from egvs.importers.map_readers import MapFile, MapFiles
 from egvs.importers.openstreetmap import OsmRoads
 from egvs.importers.osm_network import ATTRIBUTION, NETWORK_FILE
 from egvs.importers.osm_solids import ImportCounts
@@ -78,6 +79,7 @@ from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, Count
 from egvs.sensors.sensor import CATALOGUE
 from egvs.traffic.movements import MovementNames
 from egvs.traffic.recorded_tracks import RecordedTracks
+from egvs.traffic.sumo import SumoInputError
 from egvs.world.static_world import build_world
 
 SURROUNDINGS_MIN_M = 100.0
@@ -309,6 +311,7 @@ def create_scenario(
     objects = static_objects.collect_objects(
         maps_read, level.streets, junction.at_m, zero.height_m, ground, _surface_model(surface, terrain)
     )
+    _check_zero_height(objects.zero_height_m, files)
     if files.terrain and terrain is not None and zero.height_m is not None:
         decks = bridge_decks.bridge_decks(roads.network, terrain, zero.height_m)
         objects = replace(objects, meshes=(*objects.meshes, *decks))
@@ -333,7 +336,7 @@ def create_scenario(
         notes.append(PEOPLE_HINT)
     network, signal_notes = _with_signals(roads.network, junction, options.signals, streets)
     junction = replace(junction, signalised=junction.signalised or bool(options.signals))
-    assumed, demand, traffic_notes = _plan_traffic(network, streets, junction, options, example)
+    assumed, demand, traffic_notes = _plan_traffic(network, streets, junction, options, example, files.roads.path)
     notes += [*signal_notes, *traffic_notes]
     relief = Relief.of_region(streets, junction, roi)
     if relief.other_levels:
@@ -387,16 +390,30 @@ def _with_signals(
 
 
 def _plan_traffic(
-    network: str, streets: Streets, junction: StreetJunction, options: NewScenarioOptions, example: TrackFiles | None
-) -> tuple[AssumedTraffic | None, TrackDemand | None, Sequence[str]]:
+    network: str, streets: Streets, junction: StreetJunction, options: NewScenarioOptions, example: TrackFiles | None,
+    path: Path,
+) -> tuple[AssumedTraffic | None, TrackDemand | None, Sequence[str]]:  # fmt: skip
     """Return the assumed traffic, or the demand like recorded tracks, or neither for recorded traffic; and notes."""
     if example is not None:
         demand = demand_from_tracks.estimate_demand(example, streets, junction)
         return None, demand, demand.notes
     if options.tracks:
         return None, None, ()
-    assumed = assumed_traffic.assume_traffic(network, streets, junction, options.traffic)
+    try:
+        assumed = assumed_traffic.assume_traffic(network, streets, junction, options.traffic)
+    except SumoInputError as error:
+        lines = " ".join(line.strip() for line in str(error).splitlines()).rstrip(":.")
+        hint = "Check the map, e.g. its traffic lights and connections in netedit."
+        raise InputError(path, f"SUMO cannot simulate the network ({lines})", hint) from None
     return assumed, None, assumed_traffic.traffic_notes(assumed)
+
+
+def _check_zero_height(height_m: float | None, maps: MapFiles) -> None:
+    if height_m is None or LOWEST_M <= height_m <= HIGHEST_M:
+        return
+    paths = dict.fromkeys(file.path for file in (maps.roads, *maps.terrain, *maps.solids))
+    problem = f"expected heights of {LOWEST_M:,.0f} to {HIGHEST_M:,.0f} m, got {height_m:g} m at the junction"
+    raise InputError(", ".join(str(path) for path in paths), problem, "Check the heights in these maps.")
 
 
 def _surface_model(surface: Terrain | None, ground: Terrain | None) -> SurfaceModel | None:

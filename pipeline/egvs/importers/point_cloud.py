@@ -30,6 +30,7 @@ from egvs.formats import point_clouds, xml
 from egvs.formats.georeference import height_unit_m
 from egvs.importers.as_built_view import AsBuiltMap
 from egvs.importers.cloud_surface import CloudSurface, TriangleSurface, thin_points, triangulate_cloud
+from egvs.importers.ground_heights import HIGHEST_M, LOWEST_M
 from egvs.importers.map_parts import MapContext, MappedMesh
 from egvs.importers.mesh_maps import has_faces
 from egvs.importers.moving_points import MIN_SWEEPS, StationScan, group_by_station, not_shared, seen_through
@@ -222,10 +223,10 @@ def _station(station: FloatArray | None, crs: str | None, context: MapContext, w
 
 
 def _in_window(points_m: FloatArray, context: MapContext) -> FloatArray:
-    """Return the points (n, 3) whose x, y is in the window."""
+    """Return the points (n, 3) whose x, y is in the window, and whose z can be a height."""
     x0, y0, x1, y1 = context.window.bounds
-    x, y = points_m[:, 0], points_m[:, 1]
-    near = points_m[(x >= x0) & (x <= x1) & (y >= y0) & (y <= y1)]
+    x, y, z = points_m.T
+    near = points_m[(x >= x0) & (x <= x1) & (y >= y0) & (y <= y1) & (z >= LOWEST_M) & (z <= HIGHEST_M)]
     shapely.prepare(context.window)
     inside: FloatArray = near[shapely.intersects_xy(context.window, near[:, 0], near[:, 1])]
     return inside
