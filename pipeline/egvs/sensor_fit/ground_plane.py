@@ -123,10 +123,10 @@ class _Candidate:
 
 def _strongest_plane(points_m: FloatArray, normals: FloatArray, rng: np.random.Generator) -> _Candidate | None:
     """Return the plane through three returns that has most returns nearby."""
-    sample = slice(None)
+    points, directions = points_m, normals
     if len(points_m) > _SAMPLE:
         sample = np.sort(rng.choice(len(points_m), _SAMPLE, replace=False))
-    points, directions = points_m[sample], normals[sample]
+        points, directions = points_m[sample], normals[sample]
     best: _Candidate | None = None
     for _ in range(_TRIALS):
         a, b, c = points[rng.integers(len(points), size=3)]
