@@ -233,7 +233,8 @@ def report(comparison: Comparison) -> str:
 
 
 def _share(ranges_m: FloatArray, pulses: NDArray[np.bool_]) -> float:
-    return returns(ranges_m, pulses) / max(1, np.count_nonzero(pulses))
+    n = int(np.count_nonzero(pulses))
+    return returns(ranges_m, pulses) / max(1, n)
 
 
 def _noise_table(comparison: Comparison, head: str) -> str:

@@ -181,8 +181,7 @@ def _refine(points_m: FloatArray, normal: FloatArray, height_m: float, total: in
 
 def _solve(matrix: FloatArray, side: FloatArray) -> FloatArray:
     """Solve the normal equations; where returns lie on a line, with the smallest slopes."""
-    solution: FloatArray = np.linalg.lstsq(matrix, side)[0]
-    return solution
+    return np.linalg.lstsq(matrix, side)[0].astype(np.float64)
 
 
 def _design(points_m: FloatArray) -> FloatArray:
