@@ -63,6 +63,9 @@ class Comparison:
         mast hides.
     sector
         Sector of azimuth of each pulse.
+    is_ground, is_known
+        Whether the simulated beam meets the triangulated ground, and whether the pulse has a background in the ten
+        frames.
     on_road, road_range_m
         Whether a pulse is towards the road, and its range to the ground plane.
     """
@@ -72,6 +75,8 @@ class Comparison:
     simulated_m: FloatArray
     used: NDArray[np.bool_]
     sector: NDArray[np.int64]
+    is_ground: NDArray[np.bool_]
+    is_known: NDArray[np.bool_]
     on_road: NDArray[np.bool_]
     road_range_m: FloatArray
 
@@ -106,8 +111,14 @@ def compare(folder: Path) -> Comparison:
     ranges = np.where(scan.returned, np.sqrt((scan.ends_m**2).sum(axis=1)), np.nan)
     simulated = ranges.reshape(sensor.azimuths, sensor.channels).T
 
+    assert scan.face is not None
+    solids = np.array([kind for _, kind in world.solids])
+    met = solids[world.solid_of_face[np.maximum(scan.face, 0)]] == "ground"
+    is_ground = (met & scan.returned).reshape(sensor.azimuths, sensor.channels).T
+
     order = fit.angles.ascending
-    measured = sweep.range_m[order]
+    # From the origin of the frame, as simulated beams, not from the optics.
+    measured = np.linalg.norm(empty_scan.points_of(sweep.range_m, fit.angles), axis=-1)[order]
     with np.errstate(invalid="ignore"):
         tolerance_m = 2.0 * empty_scan.tolerance_m(background.range_m)
         in_front = sweep.range_m < background.range_m - tolerance_m
@@ -119,6 +130,8 @@ def compare(folder: Path) -> Comparison:
         simulated_m=simulated,
         used=~in_front[order] & ~far & ~_in_sectors(azimuth_deg, fit.empty_sectors_deg),
         sector=np.floor(azimuth_deg / SECTOR_DEG).astype(np.int64),
+        is_ground=is_ground,
+        is_known=np.isfinite(background.range_m)[order],
         on_road=fit.plane_view.on_road[order],
         road_range_m=fit.plane_view.range_m[order],
     )
@@ -220,7 +233,8 @@ def report(comparison: Comparison) -> str:
 
 
 def _share(ranges_m: FloatArray, pulses: NDArray[np.bool_]) -> float:
-    return returns(ranges_m, pulses) / max(1, np.count_nonzero(pulses))
+    n = int(np.count_nonzero(pulses))
+    return returns(ranges_m, pulses) / max(1, n)
 
 
 def _noise_table(comparison: Comparison, head: str) -> str:
@@ -263,7 +277,26 @@ def _agreement(comparison: Comparison) -> str:
         f"{np.mean(~measured & ~simulated):.1%} in neither, {only_measured:.1%} only in the measurement, "
         f"{only_simulated:.1%} only in the simulation. Of those that return in both, "
         f"{np.mean(difference <= AGREE_M):.1%} agree within {AGREE_M:g} m "
-        f"(median difference {1000 * np.median(difference):.0f} mm)."
+        f"(median difference {1000 * np.median(difference):.0f} mm).\n\n{_only_simulated(comparison)}"
+    )
+
+
+def _only_simulated(comparison: Comparison) -> str:
+    """Say what the beams met that return only in the simulation."""
+    only = comparison.used & np.isnan(comparison.measured_m) & np.isfinite(comparison.simulated_m)
+    with np.errstate(invalid="ignore"):
+        is_far = comparison.simulated_m > 50.0
+    ground = comparison.is_ground
+    shares = {
+        "ground beyond 50 m": ground & is_far,
+        "ground up to 50 m": ground & ~is_far,
+        "anything else beyond 50 m": ~ground & is_far,
+        "anything else up to 50 m": ~ground & ~is_far,
+    }
+    parts = ", ".join(f"{np.mean(members[only]):.0%} {name}" for name, members in shares.items())
+    return (
+        f"Of the {np.count_nonzero(only):,} pulses that return only in the simulation, the beam meets: {parts}. "
+        f"{np.mean(~comparison.is_known[only]):.0%} have no background in the ten frames either."
     )
 
 

@@ -27,8 +27,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from benchmarks import page_tables
 from benchmarks.page_tables import Cells
+from benchmarks.simulated_sweeps import Truth, simulate_sweep
+from egvs.sensors.sensor import CATALOGUE
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENARIO = ROOT / "scenarios" / "roundabout"
@@ -103,6 +107,7 @@ VERBS = (
     Verb("export run --to geojson"),
     Verb("figure run --what ranking"),
     Verb("sensors"),
+    Verb("sensor fit sweep.npz --name mast"),
     Verb("verify run"),
     Verb("store"),
 )
@@ -177,6 +182,8 @@ def prepare(folder: Path, store: Path, verbs: Iterable[Verb]) -> None:
     folder.mkdir()
     shutil.copytree(SCENARIO, folder / SCENARIO.name)
     shutil.copy(EXTRACT, folder)
+    sweep = simulate_sweep(CATALOGUE["VLP-32C"], Truth(), np.random.default_rng(0))
+    np.savez(folder / "sweep.npz", sweep=sweep.astype(np.float32))
     (folder / "short").mkdir()
     (folder / "short" / "scenario.toml").write_text(SHORT, encoding="utf-8")
     needed = {argument for verb in verbs for argument in verb.arguments}

@@ -12,7 +12,7 @@ from benchmarks.simulated_sweeps import Truth
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.sensor_fit.beam_angles import fit_beam_angles, pulse_grid, range_step
+from egvs.sensor_fit.beam_angles import fit_beam_angles, pulse_grid, range_step, share_offsets
 from egvs.sensor_fit.fit import fit_sensor
 from egvs.sensor_fit.sweep_files import Sweep
 from egvs.sensors.sensor import CATALOGUE
@@ -72,6 +72,30 @@ def test_field_of_view(is_list: bool) -> None:
     expected = np.array(OFFSETS_DEG)
     assert azimuth_deg.min() == pytest.approx(-50.0 + expected.min(), abs=1.3 if is_list else 1e-3)
     assert azimuth_deg.max() == pytest.approx(70.0 + expected.max(), abs=3.0 if is_list else 1e-3)
+
+
+def test_channels_share_offsets_of_one_line() -> None:
+    """40 channels whose own offsets are known to 5 mm, on the line -0.03 tan(e) with deviations of 0 or 20 mm.
+
+    Without deviations, offsets are determined by the line, and tangents gain as much as they are correlated. With large
+    ones, each channel keeps its own. Deviations in units of the standard errors have a standard deviation of 1.
+    """
+    rng = np.random.default_rng(0)
+    tangent = np.linspace(-0.4, 0.2, 40)
+    covariance = np.tile([[1e-6, -4.5e-6], [-4.5e-6, 25e-6]], (40, 1, 1))
+    for deviation_m, largest_se_m in ((0.0, 0.002), (0.02, 0.006)):
+        scores = []
+        largest_m = []
+        for _ in range(200):
+            offset_m = -0.03 * tangent + deviation_m * rng.standard_normal(40)
+            error = rng.multivariate_normal([0.0, 0.0], covariance[0], 40)
+            cones = share_offsets(tangent + error[:, 0], offset_m + error[:, 1], covariance)
+            largest_m.append(cones.offset_se_m.max())
+            assert cones.axis_distance_m == pytest.approx(0.03, abs=0.1)
+            scores.append((cones.offset_m - offset_m) / cones.offset_se_m)
+            scores.append((cones.tangent - tangent) / cones.tangent_se)
+        assert np.mean(largest_m) < largest_se_m
+        assert np.std(scores) == pytest.approx(1.0, abs=0.1)
 
 
 def test_second_sweep_narrows_errors() -> None:

@@ -24,14 +24,13 @@ from egvs.sensors.sensor import resolve_sensor
 from tests.sensor_fit.small_sensor import ELEVATIONS_DEG, TRUTH, small_fit, small_sensor, sweep_of
 
 
-def read_config(path: Path, name: str) -> SensorConfig:
+def read_config(text: str, name: str) -> SensorConfig:
     """Read the table as a scenario does."""
-    return SensorConfig.from_dict(tomllib.loads(path.read_text(encoding="utf-8"))["sensors"][name])
+    return SensorConfig.from_dict(tomllib.loads(text)["sensors"][name])
 
 
-def test_sensor_has_the_simulated_beams(tmp_path: Path) -> None:
-    output.write_fit(small_fit(), "north mast", tmp_path)
-    config = read_config(tmp_path / "sensor.toml", "north mast")
+def test_sensor_has_the_simulated_beams() -> None:
+    config = read_config(output.table_text(small_fit(), "north mast"), "north mast")
     fitted = resolve_sensor("north mast", {"north mast": config}, "test")
     order = np.argsort(ELEVATIONS_DEG)
     expected = small_sensor().directions().reshape(900, 10, 3)[:, order]
@@ -41,10 +40,10 @@ def test_sensor_has_the_simulated_beams(tmp_path: Path) -> None:
     assert 50.0 < fitted.range_m <= 120.0
 
 
-def test_field_of_view_is_written(tmp_path: Path) -> None:
+def test_field_of_view_is_written() -> None:
     sensor = small_sensor((-50.0, 70.0))
-    output.write_fit(fit_sensor([Sweep("view", sweep_of(TRUTH, sensor))]), "view", tmp_path)
-    config = read_config(tmp_path / "sensor.toml", "view")
+    fit = fit_sensor([Sweep("view", sweep_of(TRUTH, sensor))])
+    config = read_config(output.table_text(fit, "view"), "view")
     fitted = resolve_sensor("view", {"view": config}, "test")
     order = np.argsort(ELEVATIONS_DEG)
     expected = sensor.directions().reshape(301, 10, 3)[:, order]
@@ -52,10 +51,9 @@ def test_field_of_view_is_written(tmp_path: Path) -> None:
     assert angle.max() < 0.002
 
 
-def test_empty_sector_is_left_out(tmp_path: Path) -> None:
+def test_empty_sector_is_left_out() -> None:
     fit = replace(small_fit(), empty_sectors_deg=[(100.0, 130.0), (150.0, 210.0)])
-    output.write_fit(fit, "mast", tmp_path, without_empty_sector=True)
-    config = read_config(tmp_path / "sensor.toml", "mast")
+    config = read_config(output.table_text(fit, "mast", without_empty_sector=True), "mast")
     assert config.azimuth_deg is not None
     first_deg, last_deg = config.azimuth_deg
     assert (first_deg, last_deg) == (-150.0, pytest.approx(150.0, abs=0.41))
@@ -71,6 +69,8 @@ def test_no_empty_sector_to_leave_out(tmp_path: Path) -> None:
 
 def test_report_has_standard_errors(tmp_path: Path) -> None:
     output.write_fit(small_fit(), "a", tmp_path)
+    config = read_config((tmp_path / "sensor.toml").read_text(encoding="utf-8"), "a")
+    assert config.rings == 10
     report = json.loads((tmp_path / "fit.json").read_text(encoding="utf-8"))
     elevations = [channel["elevation_deg"] for channel in report["channels"]]
     assert [value["value"] for value in elevations] == pytest.approx(sorted(ELEVATIONS_DEG), abs=1e-3)
@@ -95,6 +95,7 @@ def four_sweeps() -> SensorFit:
     return fit_sensor([Sweep(str(number), sweep.reshape(-1, 3)) for number, sweep in enumerate(sweeps)])
 
 
+@pytest.mark.slow
 def test_empty_scan_is_upright(tmp_path: Path, four_sweeps: SensorFit) -> None:
     written = output.write_fit(four_sweeps, "four", tmp_path)
     assert {"empty_scan.png", "empty_scan.pcd", "returns.ply"} <= set(written.names)

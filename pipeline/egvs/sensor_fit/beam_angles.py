@@ -28,6 +28,8 @@ from egvs.core.grid import FloatArray, IntArray
 from egvs.sensor_fit.sweep_files import Sweep
 from egvs.sensor_fit.sweep_layout import Layout, axis_distances_m, find_layout, fit_cone, nearest_ring
 
+_OFFSET_ROUNDING_M = 1e-5
+"""Offsets are not more exact than this."""
 _FULL_CIRCLE_GAP_DEG = 60.0
 """A wider gap without any return is taken for the end of the field of view, in a list of returns."""
 _MAX_AZIMUTHS = 20_000
@@ -155,19 +157,17 @@ def fit_beam_angles(sweeps: Sequence[Sweep]) -> tuple[BeamAngles, Layout]:
     radius_m, height_m, channel = _pool(fine, layout)
 
     fits = [fit_cone(radius_m[channel == c], height_m[channel == c]) for c in range(layout.channels)]
-    tangent = np.array([fit[0] for fit in fits])
-    offset_m = np.array([fit[1] for fit in fits])
-    tangent_se = np.sqrt([fit[2][0, 0] for fit in fits])
-    offset_se_m = np.sqrt([fit[2][1, 1] for fit in fits])
-    distance_m, distance_se_m = _axis_distance(tangent, offset_m, offset_se_m)
+    cones = share_offsets(
+        np.array([fit[0] for fit in fits]), np.array([fit[1] for fit in fits]), np.array([fit[2] for fit in fits])
+    )
     azimuth = _fit_azimuths(fine[0], layout)
     return BeamAngles(
-        elevation_deg=np.degrees(np.arctan(tangent)),
-        elevation_se_deg=np.degrees(tangent_se / (1.0 + tangent**2)),
-        offset_m=offset_m,
-        offset_se_m=offset_se_m,
-        axis_distance_m=distance_m,
-        axis_distance_se_m=distance_se_m,
+        elevation_deg=np.degrees(np.arctan(cones.tangent)),
+        elevation_se_deg=np.degrees(cones.tangent_se / (1.0 + cones.tangent**2)),
+        offset_m=cones.offset_m,
+        offset_se_m=cones.offset_se_m,
+        axis_distance_m=cones.axis_distance_m,
+        axis_distance_se_m=cones.axis_distance_se_m,
         azimuth_offset_deg=azimuth.offset_deg,
         azimuth_offset_se_deg=azimuth.offset_se_deg,
         azimuth_step_deg=azimuth.step_deg,
@@ -209,15 +209,59 @@ def _check_same_rings(sweep: Sweep, channel: IntArray) -> None:
         raise InputError(sweep.name, problem, "Give sweeps of one sensor, all in its frame.")
 
 
-def _axis_distance(tangent: FloatArray, offset_m: FloatArray, offset_se_m: FloatArray) -> tuple[float, float]:
-    """Fit z0 = z_common - rho0 tan(e) over channels; rho0 and its standard error."""
-    weight = 1.0 / (offset_se_m**2 + 1e-5**2)
+@dataclass(frozen=True)
+class Cones:
+    """Cones of all channels, (channels,) each, and the distance of the optics from the axis."""
+
+    tangent: FloatArray
+    tangent_se: FloatArray
+    offset_m: FloatArray
+    offset_se_m: FloatArray
+    axis_distance_m: float
+    axis_distance_se_m: float
+
+
+def share_offsets(tangent: FloatArray, offset_m: FloatArray, covariance: FloatArray) -> Cones:
+    r"""Let the channels tell each other their offsets, which one channel alone determines badly.
+
+    Elevation and offset of a channel are strongly correlated (Glennie and Lichti 2011, Remote Sens. 3, 539-553).
+    Offsets of all channels follow :math:`z_c = z_0 - \rho_0 \tan e_c` up to deviations with the variance
+    :math:`\tau^2`. This line is fitted; :math:`\tau^2` is what channels scatter more than their standard errors say
+    (Paule and Mandel 1982, J. Res. Natl. Bur. Stand. 87, 377-385). Each offset becomes the weighted mean of its own
+    value and the line, and each tangent changes by as much as its covariance with the offset says. Where deviations are
+    large, nothing changes.
+
+    Parameters
+    ----------
+    tangent, offset_m
+        Of each channel, (n,).
+    covariance
+        Of the two, (n, 2, 2).
+    """
+    variance = covariance[:, 1, 1] + _OFFSET_ROUNDING_M**2
     design = np.column_stack([np.ones(len(tangent)), -tangent])
-    inverse = np.linalg.inv((design * weight[:, None]).T @ design)
-    parameters = inverse @ (design.T @ (weight * offset_m))
-    residual = offset_m - design @ parameters
-    scatter = max(1.0, float((weight * residual**2).sum()) / max(1, len(tangent) - 2))
-    return float(parameters[1]), float(np.sqrt(inverse[1, 1] * scatter))
+    tau2 = 0.0
+    for _ in range(20):
+        weight = 1.0 / (variance + tau2)
+        inverse = np.linalg.pinv((design * weight[:, None]).T @ design)
+        line = inverse @ (design.T @ (weight * offset_m))
+        excess = float((weight * (offset_m - design @ line) ** 2).sum()) - (len(tangent) - 2)
+        tau2 = max(0.0, tau2 + excess / float(weight.sum()))
+    common_m = design @ line
+    own = tau2 / (tau2 + variance)  # weight of a channel's own offset
+    shared_m = own * offset_m + (1.0 - own) * common_m
+    gain = covariance[:, 0, 1] / variance
+    line_variance = np.einsum("ij,jk,ik->i", design, inverse, design)
+    shared_variance = own * variance + (1.0 - own) ** 2 * line_variance
+    tangent_variance = covariance[:, 0, 0] - gain**2 * (variance - shared_variance)
+    return Cones(
+        tangent=tangent + gain * (shared_m - offset_m),
+        tangent_se=np.sqrt(np.maximum(tangent_variance, 0.0)),
+        offset_m=shared_m,
+        offset_se_m=np.sqrt(shared_variance),
+        axis_distance_m=float(line[1]),
+        axis_distance_se_m=float(np.sqrt(inverse[1, 1])),
+    )
 
 
 # ---- azimuths
@@ -404,8 +448,8 @@ def _circular_median(angle_deg: FloatArray) -> float:
 
 def _channel_means(values: FloatArray, channel: IntArray, used: np.ndarray, channels: int) -> FloatArray:
     counts = np.bincount(channel[used], minlength=channels)
-    sums: FloatArray = np.bincount(channel[used], weights=values[used], minlength=channels)
-    return sums / np.maximum(counts, 1)
+    means: FloatArray = np.bincount(channel[used], weights=values[used], minlength=channels) / np.maximum(counts, 1)
+    return means
 
 
 def _robust_means(residual: FloatArray, channel: IntArray, channels: int) -> tuple[FloatArray, FloatArray]:

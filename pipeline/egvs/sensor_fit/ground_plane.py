@@ -123,10 +123,10 @@ class _Candidate:
 
 def _strongest_plane(points_m: FloatArray, normals: FloatArray, rng: np.random.Generator) -> _Candidate | None:
     """Return the plane through three returns that has most returns nearby."""
-    sample = slice(None)
+    points, directions = points_m, normals
     if len(points_m) > _SAMPLE:
         sample = np.sort(rng.choice(len(points_m), _SAMPLE, replace=False))
-    points, directions = points_m[sample], normals[sample]
+        points, directions = points_m[sample], normals[sample]
     best: _Candidate | None = None
     for _ in range(_TRIALS):
         a, b, c = points[rng.integers(len(points), size=3)]
@@ -181,8 +181,7 @@ def _refine(points_m: FloatArray, normal: FloatArray, height_m: float, total: in
 
 def _solve(matrix: FloatArray, side: FloatArray) -> FloatArray:
     """Solve the normal equations; where returns lie on a line, with the smallest slopes."""
-    solution: FloatArray = np.linalg.lstsq(matrix, side)[0]
-    return solution
+    return np.linalg.lstsq(matrix, side)[0].astype(np.float64)
 
 
 def _design(points_m: FloatArray) -> FloatArray:

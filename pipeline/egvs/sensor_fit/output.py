@@ -77,9 +77,7 @@ def write_fit(fit: SensorFit, name: str, folder: Path, *, without_empty_sector: 
     InputError
         If the sensor has no sector without returns, or the folder cannot be written.
     """
-    config = sensor_table(fit, without_empty_sector)
-    SensorConfig.from_dict(config)  # what is written can be read
-    table = _toml(name, config)
+    table = table_text(fit, name, without_empty_sector)
     files.ensure_writable_folder(folder / SENSOR_FILE)
     names = [SENSOR_FILE, REPORT_FILE]
     files.write_text(folder / SENSOR_FILE, _comments(fit, name) + table)
@@ -97,6 +95,13 @@ def write_fit(fit: SensorFit, name: str, folder: Path, *, without_empty_sector: 
             ply.write_columns(partial, _labelled_returns(fit))
         names += [EMPTY_SCAN_FILE, LABELS_FILE]
     return FitFolder(folder, tuple(names), table)
+
+
+def table_text(fit: SensorFit, name: str, without_empty_sector: bool = False) -> str:
+    """Return the lines of ``[sensors.NAME]``; raises as :func:`sensor_table`."""
+    config = sensor_table(fit, without_empty_sector)
+    SensorConfig.from_dict(config)  # a scenario can read it
+    return _toml(name, config)
 
 
 def sensor_table(fit: SensorFit, without_empty_sector: bool = False) -> dict[str, Any]:

@@ -280,13 +280,13 @@ def empty_sectors(grids: list[FloatArray], angles: BeamAngles) -> list[tuple[flo
     if empty.all() or not empty.any():
         return [(-180.0, 180.0)] if empty.all() else []
     starts = np.flatnonzero(empty & ~np.roll(empty, 1))
-    sectors = []
+    sectors: list[tuple[float, float]] = []
     for start in starts:
         length = 1
         while empty[(start + length) % bins]:
             length += 1
         if length * 360.0 / bins >= _MIN_EMPTY_DEG:
-            first_deg = start * 360.0 / bins
+            first_deg = float(start * 360.0 / bins)
             first_deg -= 360.0 if first_deg >= 180.0 else 0.0
             sectors.append((first_deg, first_deg + length * 360.0 / bins))
     return sectors

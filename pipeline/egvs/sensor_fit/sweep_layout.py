@@ -252,7 +252,8 @@ def _histogram_peaks(elevation_deg: FloatArray) -> FloatArray:
     if not len(peaks):
         return np.empty(0)
     tall = counts[peaks] > 0.05 * np.median(np.sort(counts[peaks])[-max(4, len(peaks) // 2) :])
-    return low + (peaks[tall] + 0.5) * _BIN_DEG
+    centres: FloatArray = low + (peaks[tall] + 0.5) * _BIN_DEG
+    return centres
 
 
 def _fit_cones(radius_m: FloatArray, height_m: FloatArray, ring: IntArray, rings: int) -> tuple[FloatArray, FloatArray]:
@@ -304,7 +305,8 @@ def fit_cone(radius_m: FloatArray, height_m: FloatArray) -> tuple[float, float, 
         scale = _weighted_scale(residual, weight)
     inverse = np.linalg.inv(normal)
     scores = design * (used * residual)[:, None]
-    correction = max(1.0, np.count_nonzero(used) / max(1, np.count_nonzero(used) - 2))
+    n_used = int(np.count_nonzero(used))
+    correction = n_used / max(1, n_used - 2)
     covariance = inverse @ (scores.T @ scores * correction + prior * scale**2) @ inverse
     return float(parameters[0]), float(parameters[1]), covariance
 
