@@ -119,6 +119,13 @@ def test_rejects_tracks_that_pass_no_junction(tmp_path: Path, network_path: Path
     assert not (tmp_path / "new").exists()
 
 
+def test_rejects_recording_of_pedestrians(tmp_path: Path, network_path: Path) -> None:
+    rows = [f"P1,{k},{1000 * k},pedestrian,-20.0,{k / 10:.1f},,,,," for k in range(60)]
+    (tmp_path / "tracks.csv").write_text("\n".join([HEADER, *rows, ""]), encoding="utf-8")
+    with pytest.raises(InputError, match="no recorded vehicle passes a junction of the network"):
+        new_like(tmp_path / "new", network_path, tmp_path / "tracks.csv")
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

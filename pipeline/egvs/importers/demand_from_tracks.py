@@ -134,7 +134,7 @@ def estimate_demand(recording: TrackFiles, streets: Streets, junction: StreetJun
     Raises
     ------
     InputError
-        When a file is damaged, or no vehicle passes the junction.
+        When a file is damaged or far from the streets, or no vehicle passes the junction.
     """
     tracks = recording.read(streets)
     cleaned = cleaning.clean_tracks(tracks, CLASS_SIZES)
@@ -154,6 +154,9 @@ def estimate_demand(recording: TrackFiles, streets: Streets, junction: StreetJun
         raise InputError(recording.source.paths[0], problem, hint)
 
     counted = _count_movements(passages.counted, streets, junction)
+    if not counted.vehicles:
+        problem = f"no recorded vehicle passes the {junction.title}"
+        raise InputError(recording.source.paths[0], problem, "Choose another junction with --at LAT,LON.")
     notes = list(_passage_notes(passages, counted.unassigned))
     notes += _people_notes(cleaned)
     fleet = estimate_fleet(cleaned, [passage.track for passage in passages.counted], matched)

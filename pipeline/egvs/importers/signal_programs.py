@@ -313,7 +313,8 @@ def _notes(
         ]
         text += f" from {(in_cycle_s or offsets_s)[0]:.1f} s" if offsets_s else ""
         texts.append(text)
-    yield f"green of each signal group, median and range, and its beginning in the cycle: {'; '.join(texts)}"
+    meaning = "median (95 % interval; the range where there are few), and its beginning in the cycle"
+    yield f"green of each signal group, {meaning}: {'; '.join(texts)}"
     free = len(junction.links) - len(groups)
     if free:
         yield f"{free} of {len(junction.links)} connections have no recorded signal; vehicles there give way"
