@@ -129,13 +129,14 @@ def apply_signals(
         problem = f"no signal group governs a connection of the junction {node}"
         raise InputError(where, problem, "Check that the assignment of groups is for this junction.")
     used = {name: signals.records[name] for name in dict.fromkeys(groups.values())}
-    cycles = _cycles(used.values())
+    records = list(used.values())
+    cycles = _cycles(records)
     if not cycles:
         hint = "Record longer: two beginnings of green of one group."
         raise InputError(where, "no complete cycle of the signals is recorded", hint)
     lengths = track_demand.median_of([cycle.length_s for cycle in cycles])
     assert lengths is not None
-    cycle = _typical_cycle(cycles, lengths.value, used.values())
+    cycle = _typical_cycle(cycles, lengths.value, records)
     phases = _phases(junction, groups, used, cycle)
     text = _write_program(network, junction.program, phases)
     return SignalPlan(text, tuple(_notes(junction, groups, used, cycle, lengths)))
@@ -214,7 +215,7 @@ def _assign_groups(links: Sequence[_Link], signals: RecordedSignals, frame: Worl
     return groups
 
 
-def _cycles(records: Sequence[SignalRecord] | Iterator[SignalRecord]) -> list[_Cycle]:
+def _cycles(records: Sequence[SignalRecord]) -> list[_Cycle]:
     """Return all recorded cycles, from each beginning of green to the next of the same group."""
     cycles = []
     for record in records:
