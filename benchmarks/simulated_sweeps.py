@@ -32,6 +32,8 @@ class Truth:
         Distance of the optics from the axis of rotation.
     step_m
         Ranges are rounded to multiples of it; 0 for none.
+    pointing_deg
+        Standard deviation of the elevation and azimuth of a pulse around those of its channel.
     """
 
     sigma_m: float = 0.02
@@ -41,6 +43,7 @@ class Truth:
     pitch_deg: float = -1.5
     axis_distance_m: float = 0.0
     step_m: float = 0.0
+    pointing_deg: float = 0.0
 
 
 def simulate_sweep(sensor: Sensor, truth: Truth, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -49,9 +52,12 @@ def simulate_sweep(sensor: Sensor, truth: Truth, rng: np.random.Generator) -> ND
     if sensor.azimuth_deg is not None:
         azimuths = azimuths + sensor.azimuth_deg[0]
     azimuth = np.radians(azimuths[:, None] + np.array(sensor.azimuth_offsets_deg))
-    elevation = np.radians(np.array(sensor.elevations_deg))[None, :]
+    elevation = np.radians(np.array(sensor.elevations_deg))[None, :] + 0.0 * azimuth
+    if truth.pointing_deg:
+        azimuth = azimuth + np.radians(truth.pointing_deg) * rng.standard_normal(azimuth.shape)
+        elevation = elevation + np.radians(truth.pointing_deg) * rng.standard_normal(elevation.shape)
     flat = np.cos(elevation)
-    rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation) + 0.0 * azimuth], axis=-1)
+    rays = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=-1)
     origins = truth.axis_distance_m * np.stack([np.cos(azimuth), np.sin(azimuth), 0.0 * azimuth], axis=-1)
 
     roll, pitch = np.radians(truth.roll_deg), np.radians(truth.pitch_deg)

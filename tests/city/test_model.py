@@ -78,7 +78,7 @@ def test_rejects_wrong_row(tmp_path: Path, rows: list[str], message: str) -> Non
         ),
         ("sed = 1\n[traffic]\nnetwork = 'n'\n", "city.toml: sed: unknown key. Did you mean seed?"),
         ("seed = 1\n", "city.toml: traffic: this key is required"),
-        ("[traffic]\nfcd = 'a'\nnetwork = 'n'\n", "exactly one of network, sumocfg and fcd"),
+        ("[traffic]\nfcd = 'a'\nnetwork = 'n'\n", "exactly one of network, sumocfg, fcd and tracks"),
         ("[traffic]\nfcd = 'a'\nvehicles = 3\n", "city.toml: traffic: vehicles has no effect with fcd"),
         ("[traffic\n", "city.toml: is not valid TOML"),
     ],

@@ -97,7 +97,10 @@ BAD: dict[str, tuple[Change, str]] = {
     "blocks do not divide": (edit("blocks = 4", "blocks = 7"), r"tpog.blocks = 7 does not divide traffic.frames = 40"),
     "gamma below 0": (edit("gamma = 4", "gamma = -1"), r"score.gamma: .*, got -1"),
     "gamma NaN": (edit("gamma = 4", "gamma = nan"), r"score.gamma: .*, got nan"),
-    "two traffic sources": (traffic('fcd = "fcd.csv"\nnetwork = "n.xml"'), r"exactly one of network, sumocfg and fcd"),
+    "two traffic sources": (
+        traffic('fcd = "fcd.csv"\nnetwork = "n.xml"'),
+        r"exactly one of network, sumocfg, fcd and tracks",
+    ),
     "key that acts on nothing": (
         edit("frames = 40", "frames = 40\nvehicles = 3"),
         r"vehicles has no effect with fcd",

@@ -129,6 +129,20 @@ def test_columns_of_other_programs_are_rejected_with_the_hint(located: Path, suf
         candidates(located, f"poles.{suffix}")
 
 
+@pytest.mark.parametrize("suffix", [".shp", ".shx", ".dbf"])
+def test_truncated_part_of_shapefile_is_rejected(located: Path, suffix: str) -> None:
+    """GDAL alone would read a Shapefile without its last records."""
+    path = write(located / "poles.shp", frame_of({"site": ["a", "b"], "z_m": [3.0, 3.0]}))
+    assert len(candidates(located, "poles.shp")) == 2
+    part = path.with_suffix(suffix)
+    data = part.read_bytes()
+    declared = len(data) - (suffix == ".dbf")  # without the mark at its end
+    for size, problem in ((len(data) - 20, f"the header declares {declared} bytes"), (30, "the file")):
+        part.write_bytes(data[:size])
+        with pytest.raises(InputError, match=rf"poles\{suffix}: {problem}"):
+            candidates(located, "poles.shp")
+
+
 def test_geometries_other_than_points_are_rejected(located: Path) -> None:
     frame = frame_of({"site": ["a", "b"], "z_m": [3.0, 3.0]})
     write(located / "poles.gpkg", frame.set_geometry(frame.to_crs(25832).buffer(2.0).to_crs(4326)))

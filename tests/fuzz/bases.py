@@ -361,6 +361,28 @@ def write_cloud(path: Path, points: np.ndarray | None = None) -> None:
         path.write_text(head + rows.replace(",", " "), encoding="utf-8")
 
 
+def sweep(name: str):
+    """A sweep of a LiDAR with ten channels, in the format that the suffix names, maybe gzipped."""
+
+    def make(folder: Path) -> None:
+        from egvs.formats.point_clouds import write_points
+        from tests.sensor_fit.small_sensor import TRUTH, coarse_sensor, sweep_of
+
+        points = sweep_of(TRUTH, coarse_sensor())
+        path = folder / name.removesuffix(".gz")
+        if path.suffix == ".npz":
+            np.savez(path, sweep=points)
+        elif path.suffix == ".csv":
+            rows = "".join(f"{x:.4f},{y:.4f},{z:.4f}\n" for x, y, z in points if np.isfinite(x))
+            path.write_text("x_m,y_m,z_m\n" + rows, encoding="utf-8")
+        else:
+            write_points(path, points)
+        if name.endswith(".gz"):
+            (folder / name).write_bytes(gzip.compress(path.read_bytes(), mtime=0))
+
+    return make
+
+
 # ---- maps
 
 

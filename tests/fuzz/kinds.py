@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tests.fuzz import bases, meaning, read_tracks
 from tests.fuzz.meaning import Meaning
-from tests.tracks import writers
+from tests.tracks import writers, writers_json
 
 Maker = Callable[[str], Callable[[Path], None]]
 """Returns what writes the base of a kind, by the name of its file."""
@@ -109,6 +109,12 @@ def _beside(name: str, reads: Meaning, make: Maker = bases.with_roads_map, mutat
     return Kind(f"new {mutated}", mutated, make(name), reads, verb=verb, results=made, names_others=mutated != name)
 
 
+def _sweep(name: str, reads: Meaning) -> Kind:
+    """A sweep to which a sensor is fitted."""
+    verb = ("sensor", "fit", name, "--name", "mast", "--out", "made")
+    return Kind(f"sweep {name}", name, bases.sweep(name), reads, verb=verb, results=("made/sensor.toml",))
+
+
 def _city(name: str, file: str, reads: Meaning) -> Kind:
     """What the cut of a city's traffic reads."""
     verb = ("city", "traffic", "town")
@@ -188,8 +194,23 @@ _ALL = (
     _tracks("trajectories.csv", bases.tracks(writers.write_ngsim, "car", "truck"), meaning.table),
     _tracks("20181024_d1_0830_0900.csv", bases.tracks(writers.write_pneuma, "car", "bus"), meaning.semicolons),
     _tracks("Label.csv", bases.tracks(writers.write_lumpi, "car", "pedestrian"), meaning.commas),
+    _tracks("labels.json", bases.tracks(writers_json.write_openlabel, "car", "pedestrian"), meaning.lenient_json),
+    _tracks(f"*_{writers_json.SENSOR}.json", bases.tracks(writers_json.write_tumtraf, "car", "bus"),
+            meaning.lenient_json, writers_json.sweep_name(0.0)),
+    *(_tracks(file, bases.tracks(writers_json.write_dair_v2x, "car", "pedestrian"), meaning.lenient_json,
+              "label/virtuallidar/000000.json")
+      for file in ("label/virtuallidar/*.json", "data_info.json", "calib/virtuallidar_to_world/*.json")),
+    _tracks("10001.csv", bases.tracks(writers_json.write_v2x_seq_tfd, "car", "bicycle"), meaning.table),
+    _tracks("scenario_hand-made.parquet", bases.tracks(writers_json.write_argoverse2_scenario, "car", "bus"),
+            meaning.parquet),
+    *(_tracks(file, bases.tracks(writers_json.write_argoverse2, "car", "bus"), meaning.feather, "annotations.feather")
+      for file in ("annotations.feather", "city_SE3_egovehicle.feather")),
+    _tracks("trace_gt_hand-made.osi", bases.tracks(writers_json.write_osi, "car", "tram"), meaning.bytes_themselves),
+    _tracks("trace.mcap", bases.tracks(writers_json.write_osi_mcap, "car", "tram"), meaning.bytes_themselves),
     _tracks("tracks.csv", bases.mapped_tracks(False), meaning.table, "", "mapping"),
     _tracks("tracks.jsonl", bases.mapped_tracks(True), meaning.json_lines, "", "mapping"),
+    _sweep("sweep.csv", meaning.rows), _sweep("sweep.pcd", meaning.pcd),
+    _sweep("sweep.ply.gz", meaning.gzipped(meaning.ply)), _sweep("sweep.npz", meaning.bytes_themselves),
     Kind("wanted junctions.csv", "wanted.csv", bases.wanted, meaning.rows, results=("made/junctions/*/*.csv",),
          verb=("city", "new", "made", "--osm", "map.osm", "--junctions", "wanted.csv")),
     _city("city.toml", "city.toml", meaning.toml), _city("junctions.csv", "junctions.csv", meaning.rows),

@@ -10,6 +10,7 @@ import csv
 import gzip
 import io
 import json
+import re
 import struct
 import tomllib
 import zipfile
@@ -127,6 +128,11 @@ def json_lines(data: bytes) -> object:
     return [text_json(line.replace("NaN", "null").encode()) for line in lines]
 
 
+def lenient_json(data: bytes) -> object:
+    """Values, of which NaN and Infinity may be some that are not used."""
+    return text_json(re.sub(rb"-?\b(NaN|Infinity)\b", b"null", data.removeprefix(b"\xef\xbb\xbf")))
+
+
 def semicolons(data: bytes) -> object:
     """Cells of SUMO's CSV, separated by semicolons or commas."""
     text = data.decode("utf-8-sig")
@@ -151,6 +157,14 @@ def parquet(data: bytes) -> object:
 
     table = pq.read_table(pyarrow.BufferReader(data))
     return repr(table.to_pydict())
+
+
+def feather(data: bytes) -> object:
+    """Columns and values."""
+    import pyarrow
+    from pyarrow import feather as arrow_feather
+
+    return repr(arrow_feather.read_table(pyarrow.BufferReader(data)).to_pydict())
 
 
 def obj(data: bytes) -> object:

@@ -213,23 +213,33 @@ def internal_lanes(net_xml: str) -> dict[str, str]:
     return after
 
 
-def write_network(network: Network, net_xml: str) -> WrittenNetwork:
-    """Make a map of the lanes for cars of a network, given also as text, and of its connections."""
+def write_network(network: Network, net_xml: str, *, refer: bool = True) -> WrittenNetwork:
+    """Make a map of a network, given also as text: lanes for cars, their turns, markings, lights and right of way.
+
+    With ``refer``, the lanelets of turns refer to their traffic light; else only its stop line tells what it governs.
+    """
+    root = ElementTree.fromstring(net_xml)
     writer = MapWriter()
-    lane_of: dict[int, str] = {}
+    lane_of: dict[str, int] = {}
     corners: dict[str, tuple[Line, Line]] = {}
+    lefthand = _drives_left(network)
+    marks = {lane.attrib["id"]: dict(lane.attrib) for lane in root.iter("lane")}
     for edge in network.edges:
         lanes = [index for index, lane in enumerate(edge.lanes) if lane.permission.admits("passenger")]
-        bounds_m = _edge_bounds_m(edge, lanes, lefthand=_drives_left(network))
-        lines = [writer.line(bound, type="line_thin", subtype="dashed") for bound in bounds_m]
+        bounds_m = _edge_bounds_m(edge, lanes, lefthand=lefthand)
+        between = [_marking(marks[f"{edge.id}_{a}"], marks[f"{edge.id}_{b}"], lefthand) for a, b in pairwise(lanes)]
+        kinds = ["solid", *between, "solid"]
+        lines = [
+            writer.line(bound, type="line_thin", subtype=kind) for bound, kind in zip(bounds_m, kinds, strict=True)
+        ]
         for position, index in enumerate(lanes):
             sides = (lines[position + 1], lines[position])
-            left, right = sides[::-1] if _drives_left(network) else sides
-            lanelet = writer.lanelet(left, right, speed_limit=f"{edge.lanes[index].speed_m_s * 3.6:.2f}")
-            lane_of[lanelet] = f"{edge.id}_{index}"
+            left, right = sides[::-1] if lefthand else sides
+            name = f"{edge.id}_{index}"
+            lane_of[name] = writer.lanelet(left, right, speed_limit=f"{edge.lanes[index].speed_m_s * 3.6:.2f}")
             ends = bounds_m[position + 1], bounds_m[position]
-            corners[f"{edge.id}_{index}"] = ends[::-1] if _drives_left(network) else ends
-    turns = set()
+            corners[name] = ends[::-1] if lefthand else ends
+    turns: dict[tuple[str, str], int] = {}
     following = internal_lanes(net_xml)
     shapes = {f"{edge.id}_{i}": lane.shape_m for edge in network.all_edges for i, lane in enumerate(edge.lanes)}
     for connection in network.connections:
@@ -237,15 +247,102 @@ def write_network(network: Network, net_xml: str) -> WrittenNetwork:
         target = f"{network.edges[connection.target].id}_{connection.target_lane}"
         if source not in corners or target not in corners:
             continue
-        turns.add((source, target))
         parts, lane = [], connection.via
         while lane.startswith(":"):
             parts.append(_with_heights(shapes[lane]))
             lane = following[lane]
         path = np.vstack([part[int(i > 0) :] for i, part in enumerate(parts)])
         left, right = _turn_bounds_m(path, corners[source], corners[target])
-        writer.lanelet(writer.line(left, type="virtual"), writer.line(right, type="virtual"))
-    return WrittenNetwork(writer, lane_of, turns)
+        bounds = writer.line(left, type="virtual"), writer.line(right, type="virtual")
+        speed_m_s = network.edges[connection.source].lanes[connection.source_lane].speed_m_s
+        turns[source, target] = writer.lanelet(*bounds, speed_limit=f"{speed_m_s * 3.6:.2f}")
+    _write_lights(writer, root, turns, corners, refer=refer)
+    _write_right_of_way(writer, root, turns)
+    return WrittenNetwork(writer, {number: name for name, number in lane_of.items()}, set(turns))
+
+
+def _marking(first: Mapping[str, str], second: Mapping[str, str], lefthand: bool) -> str:
+    """Return the marking between two lanes, the first at the kerb, by who may change between them."""
+    left, right = (first, second) if lefthand else (second, first)
+    to_left, to_right = "changeLeft" not in right, "changeRight" not in left
+    names = {(True, True): "dashed", (True, False): "solid_dashed", (False, True): "dashed_solid"}
+    return names.get((to_left, to_right), "solid")
+
+
+def signal_sequences(root: ElementTree.Element) -> dict[tuple[str, int], tuple[str, ...]]:
+    """Return the states of each link of each program of a network, phase by phase."""
+    sequences = {}
+    for logic in root.iter("tlLogic"):
+        states = [phase.attrib["state"] for phase in logic.iter("phase")]
+        for index, sequence in enumerate(zip(*states, strict=True)):
+            sequences[logic.attrib["id"], index] = sequence
+    return sequences
+
+
+def lane_names(connection: ElementTree.Element) -> tuple[str, str]:
+    """Return the lanes that a ``<connection>`` connects."""
+    a = connection.attrib
+    return f"{a['from']}_{a['fromLane']}", f"{a['to']}_{a['toLane']}"
+
+
+def _write_lights(
+    writer: MapWriter,
+    root: ElementTree.Element,
+    turns: Mapping[tuple[str, str], int],
+    corners: Mapping[str, tuple[Line, Line]],
+    *,
+    refer: bool,
+) -> None:
+    """Write a regulatory element, with a light and a stop line, for the turns of each edge that always switch alike."""
+    sequences = signal_sequences(root)
+    groups: dict[tuple[str, str, tuple[str, ...]], list[tuple[str, str]]] = {}
+    for connection in root.findall("connection"):
+        pair = lane_names(connection)
+        if "tl" in connection.attrib and pair in turns:
+            light, index = connection.attrib["tl"], int(connection.attrib["linkIndex"])
+            groups.setdefault((light, connection.attrib["from"], sequences[light, index]), []).append(pair)
+    for pairs in groups.values():
+        ends = [corners[source] for source in sorted({source for source, _ in pairs})]
+        across = [line[-1] for pair in ends for line in pair]
+        stop_m = _longest_line(across)
+        raised_m = stop_m + np.array([0, 0, 5.0])
+        members = [
+            ("way", writer.line(stop_m, type="stop_line"), "ref_line"),
+            ("way", writer.line(raised_m, type="traffic_light", subtype="red_yellow_green"), "refers"),
+        ]
+        light_id = writer.regulation(members, "traffic_light")
+        for pair in pairs if refer else ():
+            writer.refer(turns[pair], light_id)
+
+
+def _longest_line(points: Sequence[Line]) -> Line:
+    """Return the two points farthest from each other."""
+    return np.array(max(((a, b) for a in points for b in points), key=lambda pair: np.linalg.norm(pair[0] - pair[1])))
+
+
+def _write_right_of_way(writer: MapWriter, root: ElementTree.Element, turns: Mapping[tuple[str, str], int]) -> None:
+    """Write a regulatory element for each turn that yields to others, at junctions without lights."""
+    last_lanes = {}
+    following = internal_lanes(ElementTree.tostring(root, encoding="unicode"))
+    for connection in root.findall("connection"):
+        pair = lane_names(connection)
+        if pair in turns:
+            lane = connection.get("via", "")
+            while following.get(lane, "").startswith(":"):
+                lane = following[lane]
+            last_lanes[lane] = turns[pair]
+    for junction in root.findall("junction"):
+        if junction.attrib["type"] not in ("priority", "right_before_left", "unregulated"):
+            continue
+        links = [last_lanes.get(lane) for lane in junction.attrib["intLanes"].split()]
+        for request in junction.findall("request"):
+            yielding = links[int(request.attrib["index"])]
+            bits = request.attrib["response"][::-1]
+            prior = [link for link, bit in zip(links, bits, strict=True) if bit == "1" and link is not None]
+            if yielding is not None and prior:
+                members = [("relation", link, "right_of_way") for link in prior]
+                rule = writer.regulation([("relation", yielding, "yield"), *members], "right_of_way")
+                writer.refer(yielding, rule)
 
 
 def _drives_left(network: Network) -> bool:

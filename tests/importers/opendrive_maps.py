@@ -15,14 +15,20 @@ def geometry(x: float, y: float, hdg: float, length: float, shape: str = LINE, s
     return f'<geometry s="{s}" x="{x}" y="{y}" hdg="{hdg}" length="{length}">{shape}</geometry>'
 
 
-def lane(number: int, kind: str = "driving", width: str = "3.5 0 0 0", link: str = "") -> str:
+def lane(number: int, kind: str = "driving", width: str = "3.5 0 0 0", link: str = "", marks: str = "") -> str:
     """A lane; ``link`` like ``predecessor -1, successor -2``, ``width`` the coefficients a b c d."""
     a, b, c, d = width.split()
     links = "".join(f'<{end} id="{at}"/>' for end, at in (part.split() for part in link.split(",") if part))
     return (
         f'<lane id="{number}" type="{kind}" level="false"><link>{links}</link>'
-        f'<width sOffset="0" a="{a}" b="{b}" c="{c}" d="{d}"/></lane>'
+        f'<width sOffset="0" a="{a}" b="{b}" c="{c}" d="{d}"/>{marks}</lane>'
     )
+
+
+def mark(kind: str, change: str = "", s: float = 0.0) -> str:
+    """A road mark, with ``laneChange`` if ``change`` is given."""
+    changes = f' laneChange="{change}"' if change else ""
+    return f'<roadMark sOffset="{s}" type="{kind}"{changes}/>'
 
 
 def section(right: Sequence[str], left: Sequence[str] = (), s: float = 0.0) -> str:

@@ -205,6 +205,15 @@ def test_surface_outside_the_region_is_left_out_and_counted(tmp_path: Path) -> N
         landxml_terrain.read_terrain([far], context)
 
 
+def test_coordinates_beyond_the_earth_are_rejected() -> None:
+    """A damaged number such as 1e304 would else become a polygon around everything."""
+    here = np.array([[0.0, 0.0], [100.0, 0.0]])
+    for crs, name in ((None, "local metres"), ("EPSG:32632", "EPSG:32632")):
+        context = MapContext(FRAME, WINDOW, Alignment(here, here))
+        with pytest.raises(InputError, match=rf"a.shp: \(1e\+304, 5\) cannot be converted from {name}"):
+            context.to_world(np.array([[1.0, 2.0], [1e304, 5.0]]), crs, "a.shp")
+
+
 def test_alignment_that_no_file_needs_is_rejected() -> None:
     here = np.array([[0.0, 0.0], [100.0, 0.0]])
     context = MapContext(FRAME, WINDOW, Alignment(here, here))

@@ -24,7 +24,7 @@ from egvs.importers.map_parts import RoadMap, RoadOptions
 from egvs.traffic import sumo
 from egvs.traffic.capacity import find_capacity
 from egvs.traffic.network import Network, read_net_xml
-from tests.importers.lanelet2_maps import MapWriter, internal_lanes, make_crossing, write_network
+from tests.importers.lanelet2_maps import MapWriter, internal_lanes, make_crossing, signal_sequences, write_network
 
 ROOT = Path(__file__).parents[2]
 REAL = ROOT.parent / "shared" / "real"
@@ -717,6 +717,33 @@ def test_network_written_as_lanelet2_comes_back(name: str, lanes: int, turns: in
         assert built_speeds[lane] == pytest.approx(speeds[was], abs=0.01)
     assert connected_origins(built, origin) == written.turns
     assert len(written.turns) == turns
+
+
+@pytest.mark.parametrize("refer", [True, False])
+@pytest.mark.parametrize("name", ["roundabout", pytest.param("nishishinjuku", marks=pytest.mark.slow)])
+def test_signals_and_right_of_way_come_back(name: str, refer: bool, tmp_path: Path) -> None:
+    """Turns that the original switches alike share a signal; roundabouts stay roundabouts; lanes keep their ends."""
+    path = ROOT / "scenarios" / name / "network.net.xml"
+    text = path.read_text(encoding="utf-8")
+    original = read_net_xml(path)
+    written = write_network(original, text, refer=refer)
+    built = build(written.writer.write(tmp_path / "map.osm", local=True, turn_lines=1))
+    lights = [sum(junction.type == "traffic_light" for junction in n.junctions) for n in (original, built.network)]
+    assert lights[0] == lights[1]
+    groups = {  # turns from one edge that switch alike
+        (element.attrib["from"], signal_sequences(ElementTree.fromstring(text))[element.attrib["tl"], index])
+        for element in ElementTree.fromstring(text).findall("connection")
+        if (index := int(element.get("linkIndex", "-1"))) >= 0
+    }
+    links = {(c.attrib["tl"], c.attrib["linkIndex"]) for c in built.root.findall("connection") if "tl" in c.attrib}
+    assert len(links) == len(groups)
+    assert len(built.network.roundabouts) == len(original.roundabouts)
+    assert not [note for note in built.roads.notes if "govern no lane" in note or "do not meet" in note]
+    shapes = {f"{edge.id}_{i}": lane.shape_m for edge in original.edges for i, lane in enumerate(edge.lanes)}
+    for lane, number in built.lanelet_of.items():
+        if number in written.lane_of:
+            was = shapes[written.lane_of[number]]
+            np.testing.assert_allclose(built.shapes_m[lane][[0, -1], :2], was[[0, -1], :2], atol=0.05)
 
 
 def connected_origins(built: BuiltMap, origin: Mapping[str, str]) -> set[tuple[str, str]]:

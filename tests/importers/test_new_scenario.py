@@ -306,6 +306,16 @@ def test_point_cloud_replaces_what_it_contains() -> None:
     assert rest.counts.objects == {"barrier": 1}
 
 
+@pytest.mark.system
+def test_maps_that_cover_all_kerbs_are_named(tmp_path: Path) -> None:
+    ring = [[9.99, 51.99], [10.01, 51.99], [10.01, 52.01], [9.99, 52.01], [9.99, 51.99]]
+    outline = {"type": "Feature", "properties": {"height": 9}, "geometry": {"type": "Polygon", "coordinates": [ring]}}
+    (tmp_path / "hall.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [outline]}))
+    with pytest.raises(InputError, match=r"no free location for a pole .*: the objects of .*hall.geojson.* cover them"):
+        create_scenario(tmp_path / "made", [SMALL, tmp_path / "hall.geojson"])
+    assert not (tmp_path / "made").exists()
+
+
 @pytest.mark.slow
 @pytest.mark.system
 def test_slope_surface_model_and_mesh_in_one_scenario(tmp_path: Path, run_egvs) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from egvs.importers.opendrive_check import compare_with_map, read_made_network
 from egvs.traffic import network, sumo
 from egvs.traffic.network import Network
 from tests.importers import opendrive_maps as maps
-from tests.importers.opendrive_maps import geometry, lane, road, section
+from tests.importers.opendrive_maps import geometry, lane, mark, road, section
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 TOWN01 = Path(__file__).parents[3] / "shared" / "real" / "opendrive" / "town01.xodr.gz"
@@ -320,6 +321,67 @@ def test_network_written_as_opendrive_comes_back(scenario: str, lefthand: bool, 
     assert {(match[f"{source}_{i}"], match[f"{target}_{j}"]) for source, i, target, j in turns(after)} == expected
     lights = [sum(junction.type == "traffic_light" for junction in roads.junctions) for roads in (before, after)]
     assert lights[0] == lights[1]
+
+
+def three_lanes(inner: str, middle: str, rule: str = "RHT") -> str:
+    """A road of 100 m with three lanes, with the marks of the inner and of the middle one."""
+    side = 1 if rule == "LHT" else -1
+    parts = [lane(side * number, marks=marks) for number, marks in enumerate((inner, middle, ""), 1)]
+    sides = ((), parts[::-1]) if rule == "LHT" else (parts, ())
+    return maps.opendrive(road("1", 100, geometry(0, 0, 0, 100), section(*sides), rule=rule))
+
+
+def changes(road_map: RoadMap) -> dict[str, set[str]]:
+    """The directions in which no vehicle may change lanes, by index of the lane."""
+    found = {}
+    for element in ElementTree.fromstring(road_map.network).iter("lane"):
+        keys = {key for key in ("changeLeft", "changeRight") if element.get(key) == "emergency"}
+        if keys:
+            found[element.attrib["id"].rpartition("_")[2]] = keys
+    return found
+
+
+@pytest.mark.system
+@pytest.mark.parametrize(("marks", "expected"), [
+    ((mark("broken"), mark("broken")), {}),
+    ((mark("solid"), mark("broken")), {"2": {"changeRight"}, "1": {"changeLeft"}}),
+    ((mark("broken"), mark("solid solid")), {"1": {"changeRight"}, "0": {"changeLeft"}}),
+    ((mark("solid broken"), ""), {"2": {"changeRight"}}),  # the line of the inner lane is solid
+    ((mark("broken solid"), ""), {"1": {"changeLeft"}}),
+    ((mark("solid", "both"), ""), {}),  # laneChange counts
+    ((mark("broken", "none"), ""), {"2": {"changeRight"}, "1": {"changeLeft"}}),
+    ((mark("broken", "increase"), ""), {"2": {"changeRight"}}),  # only from lane -2 to lane -1
+    ((mark("broken", "decrease"), ""), {"1": {"changeLeft"}}),
+    ((mark("solid") + mark("broken", s=49), ""), {}),  # on most of its length
+    ((mark("solid") + mark("broken", s=51), ""), {"2": {"changeRight"}, "1": {"changeLeft"}}),
+])  # fmt: skip
+def test_road_marks_forbid_lane_changes(marks: tuple[str, str], expected: dict[str, set[str]], tmp_path: Path) -> None:
+    """Lane -3 is lane 0, at the kerb."""
+    road_map, _ = convert(tmp_path, three_lanes(*marks))
+    assert changes(road_map) == expected
+    notes = [note for note in road_map.notes if note.startswith("Road marks forbid")]
+    assert notes == ([f"Road marks forbid lane changes from {len(expected)} lanes, of -1."] if expected else [])
+
+
+@pytest.mark.system
+def test_road_marks_of_lefthand_traffic(tmp_path: Path) -> None:
+    """Lane 3 is lane 0, at the kerb on the left; ``increase`` leads to the left, from lane 1 to lane 2."""
+    road_map, _ = convert(tmp_path, three_lanes(mark("broken", "increase"), mark("solid broken"), rule="LHT"))
+    assert changes(road_map) == {"1": {"changeRight", "changeLeft"}}
+
+
+@pytest.mark.system
+def test_lane_that_nothing_leads_to_may_be_reached(tmp_path: Path) -> None:
+    """Of road 2, only lane -1 is entered."""
+    first = section([lane(-1, link="successor -1")])
+    second = section([lane(-1, link="predecessor -1", marks=mark("solid")), lane(-2)])
+    road_map, roads = convert(tmp_path, maps.opendrive(
+        road("1", 100, geometry(0, 0, 0, 100), first, "successor road 2 start"),
+        road("2", 100, geometry(100, 0, 0, 100), second, "predecessor road 1 end"),
+    ))  # fmt: skip
+    assert turns(roads) == {("-1", 0, "-2", 1)}
+    assert changes(road_map) == {"0": {"changeLeft"}}
+    assert any(note.startswith("Lanes that nothing leads to") and note.endswith("-2_0.") for note in road_map.notes)
 
 
 def beside(kinds: str) -> str:

@@ -13,6 +13,8 @@ from egvs.importers.new_scenario import NewScenarioOptions, create_scenario
 from egvs.importers.recorded_traffic import TrackFiles
 from egvs.tracks.model import Tracks
 from tests.importers.small_maps import degrees, street, write_map
+from tests.tracks.boxes import assert_same_boxes, moving_boxes
+from tests.tracks.writers_json import write_dair_v2x, write_tumtraf
 
 K733 = Path(__file__).parents[3] / "shared" / "real" / "karlsruhe_k733"
 
@@ -44,6 +46,28 @@ def test_folder_stands_for_the_tracks_in_it(tmp_path: Path) -> None:
     paths = [write_tracks(folder / name) for name in ("pedestrian_tracks_000.csv", "vehicle_tracks_000.csv")]
     (folder / "README.md").write_text("read me")
     assert TrackFiles.find([folder]).source.paths == tuple(paths)
+
+
+def test_sweeps_of_a_folder_are_one_recording(tmp_path: Path) -> None:
+    """Reading one of them reads all, so they are not listed again."""
+    folder = tmp_path / "sweeps"
+    folder.mkdir()
+    first = write_tumtraf(folder, moving_boxes(["car"], 5))
+    files = TrackFiles.find([folder])
+    assert files.source.paths == (first,)
+    assert files.traffic_table()["tracks"] == [f"tracks/{first.name}"]
+    assert len(files.copies()) == 5
+
+
+def test_copies_keep_the_folders_of_a_data_set(tmp_path: Path) -> None:
+    rows = moving_boxes(["car"], 5)
+    label = write_dair_v2x(tmp_path, rows)
+    files = TrackFiles.find([label.parent])
+    for name, copy in files.copies().items():
+        copy(tmp_path / "made" / name)
+    (name,) = files.traffic_table()["tracks"]
+    assert name == "tracks/label/virtuallidar/000000.json"
+    assert_same_boxes(TrackFiles.find([tmp_path / "made" / name]).source.read()[0], rows)
 
 
 def test_rejects_folder_without_tracks(tmp_path: Path) -> None:

@@ -50,6 +50,12 @@ TURNS = (*NETWORK, "traffic.counts=[{from_edge='a', to_edge='b', per_hour=100}]"
 HALVES = ("traffic.periods=[{name='a', length_s=12}, {name='b', begin_s=12, length_s=8}]",)
 PERIOD_COUNTS = (*NETWORK, "traffic.periods=[{name='a', counts=[{edge='a', per_hour=100}]}]")
 PERIOD_TURNS = (*NETWORK, "traffic.periods=[{name='a', counts=[{from_edge='a', to_edge='b', per_hour=100}]}]")
+TRACKED = ("traffic.tracks=['tracks.csv']", "traffic.track_crs='world'")
+MAPPED = (
+    "traffic.tracks=['own.csv']",
+    "traffic.track_columns={time='t', id='id', x='x', y='y', z='z', yaw='a', length='l', width='w', height='h',"
+    " type='type', default_type='car'}",
+)
 PERIODS = (*NETWORK, "traffic.periods=[{name='a'}, {name='b'}]")
 POLYGONS = ("statics.polygons=['solids.poly.xml']",)
 MESH = ("statics.meshes=[{file='box.ply'}]",)
@@ -69,6 +75,11 @@ def pattern(keys: tuple[str, ...]) -> tuple[str, ...]:
 def effect(name: str, parameters: str = "") -> tuple[str, ...]:
     return (f"effects.{name}={{{parameters}}}",)
 
+
+TRACKS = """track_id,frame_id,timestamp_ms,agent_type,x,y,vx,vy,psi_rad,length,width
+1,0,0,car,2,2.5,0,10,0,4,1.8
+1,1,60000,car,12,2.5,0,10,0,4,1.8
+"""
 
 NAMES = {
     "sensors": "small",
@@ -104,6 +115,21 @@ KEYS: dict[str, Change] = {
     "traffic.sumocfg": Change("'streets.sumocfg'", file="without_kinds.toml"),
     "traffic.fcd": Change("'others.csv'"),
     "traffic.fcd_geo": Change("true"),
+    "traffic.tracks": Change("['other_tracks.csv']", TRACKED),
+    "traffic.pedestrian_tracks": Change("['tracks.csv']", NETWORK, "without_kinds.toml"),
+    "traffic.track_gap_s": Change("3", TRACKED),
+    "traffic.track_crs": Change("'EPSG:25832'", TRACKED),
+    "traffic.coverage": Change("'others.geojson'", TRACKED),
+    **{
+        f"traffic.track_columns.{key}": Change(value, MAPPED)
+        for key, value in {
+            "time": "'s'", "id": "'type'", "x": "'a'", "y": "'a'", "z": "'a'", "yaw": "'l'", "length": "'w'",
+            "width": "'l'", "height": "'l'", "type": "'id'", "types": "{PKW='car'}", "default_type": "'bus'",
+            "delimiter": "';'", "time_unit": "'ms'", "length_unit": "'ft'", "yaw_unit": "'deg'",
+            "yaw_convention": "'cw_from_north'", "reference": "'front'", "z_reference": "'bottom'",
+            "crs": "'EPSG:25832'",
+        }.items()
+    },
     "traffic.roads": Change("'streets.net.xml'"),
     "traffic.vtypes": Change("['sizes.add.xml']"),
     "traffic.vehicles": Change("20", NETWORK),
@@ -140,6 +166,7 @@ KEYS: dict[str, Change] = {
     "traffic.periods.*.weight": Change("2", HALVES),
     "traffic.periods.*.sumocfg": Change("'streets.sumocfg'", PERIODS),
     "traffic.periods.*.fcd": Change("'others.csv'", HALVES),
+    "traffic.periods.*.tracks": Change("['tracks.csv']", HALVES),
     "traffic.periods.*.routes": Change("['trips.rou.xml']", PERIODS),
     "traffic.periods.*.vehicles": Change("20", PERIODS),
     "traffic.periods.*.begin_s": Change("1", HALVES),
@@ -305,6 +332,9 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "sizes.add.xml": "<additional/>",
         "streets.sumocfg": '<configuration><input><net-file value="streets.net.xml"/>'
         '<route-files value="trips.rou.xml"/></input></configuration>',
+        "tracks.csv": TRACKS,
+        "other_tracks.csv": TRACKS.replace("2.5", "2.6"),
+        "own.csv": "t,s,id,x,y,z,a,l,w,h,type\n0,0,a,0,0,1,0,4,2,1,car\n60,6,a,9,0,1,0,4,2,1,car\n",
         "others.csv": fcd.replace("-2.0", "-2.5"),
         "others.geojson": collection(feature(house, name="house", height_m=6)),
         "solids.poly.xml": '<additional><poly id="p" type="building" fill="1" shape="1,5 4,5 4,8"/></additional>',

@@ -91,7 +91,9 @@ def test_override_replaces_source(tmp_path: Path) -> None:
 
 
 def test_rejects_two_sources(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="expected exactly one of network, sumocfg and fcd, got network and fcd"):
+    with pytest.raises(
+        InputError, match="expected exactly one of network, sumocfg, fcd and tracks, got network and fcd"
+    ):
         extended(tmp_path, '[traffic]\nfcd = "x.csv"\nnetwork = "b.net.xml"\n')
     with pytest.raises(InputError, match="vehicles has no effect with fcd"):
         extended(tmp_path, '[traffic]\nfcd = "x.csv"\nvehicles = 5\n')

@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from egvs.core.errors import InputError
-from egvs.tracks.boxes import Box, BoxRows, ClassNames, Pose, front_of, is_rotation, to_rotations, yaw_of
+from egvs.tracks.boxes import Box, BoxRows, ClassNames, Pose, front_of, is_rotation, make_tracks, to_rotations, yaw_of
 from egvs.tracks.documents import Node
 from egvs.tracks.model import TrackFrame
 
@@ -45,8 +45,8 @@ def test_pose_moves_box_as_scipy() -> None:
 
 def test_rows_become_tracks() -> None:
     rows = BoxRows(Path("file"))
-    rows.add("b", "car", 0.5, Box(1, 2, math.nan, 0.3, 4, 2, math.nan))
-    rows.add("a", "bus", 0.6, Box(3, 4, 5, math.nan, 0, 0, 0))
+    rows.add(Path("file"), "b", "car", 0.5, Box(1, 2, math.nan, 0.3, 4, 2, math.nan))
+    rows.add(Path("file"), "a", "bus", 0.6, Box(3, 4, 5, math.nan, 0, 0, 0))
     tracks = rows.to_tracks(TrackFrame("EPSG:25832"), ["note"])
     assert len(rows) == 2 and tracks.names == ("a", "b") and tracks.classes == ("bus", "car")
     assert tracks.track.tolist() == [1, 0] and tracks.time_s.tolist() == [0.5, 0.6]
@@ -58,20 +58,25 @@ def test_rows_become_tracks() -> None:
 @pytest.mark.parametrize(
     ("name", "time_s", "values", "expected"),
     [
-        ("a", math.nan, (0, 0, 0, 0, 1, 1, 1), "time_s: expected a number between -1e+11 and 1e+11, got nan"),
+        ("a", math.nan, (0, 0, 0, 0, 1, 1, 1), "time_s: expected a number between -1e+10 and 1e+10, got nan"),
         ("a", 1, (math.inf, 0, 0, 0, 1, 1, 1), "file: track 'a', time 1 s: x_m: expected a number"),
         ("a", 1, (0, math.nan, 0, 0, 1, 1, 1), "y_m: expected a number"),
         ("a", 1, (0, 0, math.inf, 0, 1, 1, 1), "z_m: expected a number"),
         ("a", 1, (0, 0, 0, 1e9, 1, 1, 1), "yaw_rad: expected a number between -10000 and 10000, got 1e+09"),
-        ("a", 1, (0, 0, 0, 0, 1, 1001, 1), "width_m: expected a number between 0 and 1000, got 1001"),
-        ("x" * 1001, 1, (0, 0, 0, 0, 1, 1, 1), "expected a name of at most 1,000 characters, got 1,001"),
+        ("a", 1, (0, 0, 0, 0, 1, 101, 1), "width_m: expected a number between 0 and 100, got 101"),
+        ("x" * 201, 1, (0, 0, 0, 0, 1, 1, 1), "expected a name of at most 200 characters, got 201"),
     ],
 )
 def test_impossible_row_is_rejected(name: str, time_s: float, values: tuple[float, ...], expected: str) -> None:
-    rows = BoxRows(Path("file"))
-    rows.add(name, "car", time_s, Box(*values))
+    rows = BoxRows(Path("folder"))
     with pytest.raises(InputError) as error:
+        rows.add(Path("file"), name, "car", time_s, Box(*values))
         rows.to_tracks(TrackFrame(), [])
+    assert expected in str(error.value)
+    keys = ("time_s", "x_m", "y_m", "z_m", "yaw_rad", "length_m", "width_m", "height_m")
+    columns = dict(zip(keys, np.array([(time_s, *values)], dtype=np.float64).T, strict=True))
+    with pytest.raises(InputError) as error:
+        make_tracks(Path("file"), [name], ["car"], columns, TrackFrame(), [])
     assert expected in str(error.value)
 
 

@@ -60,6 +60,16 @@ def test_tables_that_do_not_fit(tmp_path: Path, text: bytes, expected: str) -> N
         columns.read_table(path, ("a",), ("b",))
 
 
+@pytest.mark.parametrize(
+    ("end", "expected"),
+    [(b"\n" * 2000, "has more than 1,000 blank lines one after another"), (b" " * 17_000_000, "unterminated line")],
+)
+def test_endless_blanks_get_one_message(tmp_path: Path, end: bytes, expected: str) -> None:
+    path = tmp_path / "t.csv.gz"
+    path.write_bytes(gzip.compress(b"a\n1\n" + end))
+    assert_one_message(lambda: columns.read_table(path, ("a",)), expected)
+
+
 def test_empty_cells_at_the_end_of_a_row_are_ignored(tmp_path: Path) -> None:
     path = tmp_path / "t.csv"
     path.write_text("a,b\n1,2,,\n")

@@ -13,7 +13,8 @@ import pytest
 from egvs.core.errors import InputError
 from egvs.tracks import dair_v2x
 from egvs.tracks.model import HEAD_BYTES, TrackFrame
-from tests.tracks.writers_json import assert_same_boxes, make_rows, write_dair_v2x
+from tests.tracks.boxes import assert_same_boxes, moving_boxes
+from tests.tracks.writers_json import CLASSES, write_dair_v2x
 
 QUARTER_TURN = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
 
@@ -130,8 +131,8 @@ def test_static_classes_are_counted(tmp_path: Path) -> None:
 
 
 def test_500_sweeps(tmp_path: Path) -> None:
-    rows = make_rows()
-    assert_same_boxes(dair_v2x.read(write_dair_v2x(tmp_path, rows)), rows, atol=1e-9)
+    rows = moving_boxes(CLASSES)
+    assert_same_boxes(dair_v2x.read(write_dair_v2x(tmp_path, rows)), rows)
 
 
 def test_recognises_its_files(tmp_path: Path) -> None:
@@ -150,8 +151,9 @@ def test_recognises_its_files(tmp_path: Path) -> None:
         ({"3d_location": {"x": 1, "y": 2}}, "0.3d_location.z: is missing"),
         ({"3d_location": {"x": "nan", "y": 2, "z": 3}}, "0.3d_location.x: expected a number, got 'nan'"),
         ({"3d_dimensions": [1, 2, 3]}, "0.3d_dimensions: expected an object, got [1, 2, 3]"),
-        ({"3d_dimensions": {"l": -4, "w": 2, "h": 1}}, "length_m: expected a number between 0 and 1000, got -4"),
+        ({"3d_dimensions": {"l": -4, "w": 2, "h": 1}}, "length_m: expected a number between 0 and 100, got -4"),
         ({"type": 3}, "0.type: expected a text, got 3"),
+        ({"track_id": [1]}, "0.track_id: expected a text or a whole number"),
     ],
 )
 def test_damaged_label_gives_one_message(tmp_path: Path, item: dict[str, Any], expected: str) -> None:
@@ -178,6 +180,24 @@ def test_damaged_companions(tmp_path: Path) -> None:
     (tmp_path / "data_info.json").unlink()
     with pytest.raises(InputError, match=r"expected data_info\.json, which has the times"):
         dair_v2x.read(path)
+
+
+def test_labels_in_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = data_set(tmp_path, [[label(track_id=1)]])
+    monkeypatch.chdir(path.parent)
+    assert dair_v2x.read(Path(path.name)).names == ("1",)
+    assert dair_v2x.companions(Path(path.name)) == [tmp_path / "data_info.json"]
+
+
+def test_labels_of_the_vehicle_are_rejected(tmp_path: Path) -> None:
+    path = data_set(tmp_path, [[label()]])
+    path.parent.rename(tmp_path / "label" / "lidar")
+    with pytest.raises(
+        InputError, match=r"there are no labels in label/virtuallidar\. Use the infrastructure's side\."
+    ):
+        dair_v2x.read(tmp_path / "data_info.json")
+    with pytest.raises(InputError, match="expected a label in a folder 'virtuallidar'"):
+        dair_v2x.read(tmp_path / "label" / "lidar" / path.name)
 
 
 def test_labels_at_times_of_images_are_rejected(tmp_path: Path) -> None:

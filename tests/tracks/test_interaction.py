@@ -77,7 +77,10 @@ def test_map_frame_is_that_of_maps_about_latitude_and_longitude_zero() -> None:
 def test_origin_of_taf_bw_is_at_zero_with_true_scale(tmp_path: Path) -> None:
     """A spherical Mercator projection with the scale of its origin: 1e-4 degrees are R times the angle there."""
     path = write_taf_bw(tmp_path, moving_boxes(["car"], 2))
-    assert [file.name for file in track_readers.source_files(path)] == ["vehicle_tracks_000.csv", "meta_data.csv"]
+    assert [file.name for file in [path, *track_readers.TrackSource((path,)).companions()]] == [
+        "vehicle_tracks_000.csv",
+        "meta_data.csv",
+    ]
     frame = interaction.read(path).frame
     lat, lon = TAF_BW_ORIGIN_DEG
     world = WorldFrame(str(frame.crs), tuple(-m for m in frame.offset_m))

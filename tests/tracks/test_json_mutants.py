@@ -13,14 +13,14 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from egvs.core import limits
+from egvs.core import limits, plugins
 from egvs.core.errors import InputError
-from egvs.tracks import argoverse2, dair_v2x, openlabel, osi, v2x_seq_tfd
+from egvs.tracks import argoverse2, dair_v2x, openlabel, osi, track_readers, v2x_seq_tfd
 from egvs.tracks.model import HEAD_BYTES
 from tests.fuzz.mutating import mutant
 from tests.tracks import writers_json
+from tests.tracks.boxes import moving_boxes
 from tests.tracks.writers import TrackRows
-from tests.tracks.writers_json import make_rows
 
 Writer = Callable[[Path, TrackRows], Path]
 
@@ -45,9 +45,10 @@ def read_mutants(folder: Path, kind: str, seeds: range) -> tuple[int, int]:
     reader, write, other = KINDS[kind]
     if reader is osi:
         pytest.importorskip("osi3", reason="osi-python is not installed (egvs[osi])")
-    path = write(folder, make_rows(3))
+    rows = moving_boxes(("car", "pedestrian"), 10)
+    path = write(folder, rows)
     assert reader.can_open(path, path.read_bytes()[:HEAD_BYTES])
-    assert reader.read(path).n_rows == 12
+    assert reader.read(path).n_rows == len(rows.name)
     changed = folder / other if other else path
     sound = changed.read_bytes()
     read = rejected = 0
@@ -64,6 +65,18 @@ def read_mutants(folder: Path, kind: str, seeds: range) -> tuple[int, int]:
             assert len(str(error)) < 4000 and "\n" not in str(error), seed
             rejected += 1
     return read, rejected
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_one_reader_accepts_file(tmp_path: Path, kind: str) -> None:
+    reader, write, _ = KINDS[kind]
+    if reader is osi:
+        pytest.importorskip("osi3", reason="osi-python is not installed (egvs[osi])")
+    path = write(tmp_path, moving_boxes(("car", "pedestrian"), 10))
+    head = path.read_bytes()[:HEAD_BYTES]
+    names = plugins.plugin_names(track_readers.GROUP)
+    readers = [plugins.load_plugin(track_readers.GROUP, name) for name in names]
+    assert [other for other in readers if other.can_open(path, head)] == [reader]
 
 
 @pytest.fixture(autouse=True)

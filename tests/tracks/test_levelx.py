@@ -39,7 +39,7 @@ def test_by_hand(tmp_path: Path) -> None:
     """Frame 2 at 25 frames per second is 0.08 s; 270 degrees are -y; a size of 0 is none."""
     path = write(tmp_path)
     assert track_readers.find_reader(path) is levelx
-    names = [file.name for file in track_readers.source_files(path)]
+    names = [file.name for file in [path, *track_readers.TrackSource((path,)).companions()]]
     assert names == ["00_tracks.csv", "00_tracksMeta.csv", "00_recordingMeta.csv"]
     tracks = levelx.read(path)
     assert_boxes(tracks, [("0", "car", 0.08, 50, -30.8, NAN, math.radians(270).__round__(4), 4.6, 1.9, NAN),
@@ -109,6 +109,8 @@ def test_missing_companions_and_damaged_gzip_get_one_message(tmp_path: Path) -> 
     assert_one_message(lambda: levelx.read(truncated_gzip(path)), "00_tracks.csv.gz: damaged gzip file")
     (tmp_path / "00_recordingMeta.csv").unlink()
     assert_one_message(lambda: levelx.read(path), "expected the file 00_recordingMeta.csv beside it")
-    assert_one_message(lambda: track_readers.source_files(path), "expected the file 00_recordingMeta.csv beside it")
+    assert_one_message(
+        lambda: track_readers.TrackSource((path,)).companions(), "expected the file 00_recordingMeta.csv beside it"
+    )
     renamed = path.rename(tmp_path / "inD.csv")
     assert_one_message(lambda: levelx.read(renamed), "expected a name that ends with _tracks.csv, got inD.csv")

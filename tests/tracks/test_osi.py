@@ -16,7 +16,8 @@ from egvs.core import limits, plugins
 from egvs.core.errors import InputError, MissingExtraError
 from egvs.tracks import osi
 from egvs.tracks.model import HEAD_BYTES, TrackFrame
-from tests.tracks.writers_json import assert_same_boxes, make_rows, write_osi, write_osi_mcap
+from tests.tracks.boxes import assert_same_boxes, moving_boxes
+from tests.tracks.writers_json import CLASSES, write_osi, write_osi_mcap
 
 groundtruth = pytest.importorskip("osi3.osi_groundtruth_pb2", reason="osi-python is not installed (egvs[osi])")
 
@@ -153,14 +154,14 @@ def test_classes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("write", [write_osi, write_osi_mcap])
 def test_500_frames(tmp_path: Path, write: Callable[..., Path]) -> None:
-    rows = make_rows()
+    rows = moving_boxes(CLASSES)
     nan = np.where(np.arange(len(rows.name)) % 7 == 0, np.nan, rows.height_m)
     rows = dataclasses.replace(rows, height_m=nan)
-    assert_same_boxes(osi.read(write(tmp_path, rows)), rows, atol=1e-9)
+    assert_same_boxes(osi.read(write(tmp_path, rows)), rows)
 
 
 def test_recognises_its_files(tmp_path: Path) -> None:
-    path = write_osi_mcap(tmp_path, make_rows(2))
+    path = write_osi_mcap(tmp_path, moving_boxes(CLASSES, 5))
     assert osi.can_open(tmp_path / "a", path.read_bytes()[:HEAD_BYTES])
     assert osi.can_open(tmp_path / "a.OSI", b"")
     assert not osi.can_open(tmp_path / "a.csv", b"\x05\x00\x00\x00")

@@ -16,10 +16,11 @@ from pydantic import ValidationError
 
 from egvs.formats.georeference import WorldFrame
 from egvs.scenario.track_columns import RoadUserClass, TrackColumns
-from egvs.tracks import user_table
+from egvs.scenario.traffic_config import TrafficConfig
+from egvs.tracks import interaction, user_table
 from egvs.tracks.model import CLASSES, TrackFrame
 from tests.tracks.boxes import assert_same_boxes, moving_boxes
-from tests.tracks.hand import assert_boxes, assert_one_message, box_list, truncated_gzip
+from tests.tracks.hand import REAL, assert_boxes, assert_one_message, box_list, needs_karlsruhe, truncated_gzip
 from tests.tracks.writers import write_user_table
 
 NAN = math.nan
@@ -252,6 +253,18 @@ def test_unusable_systems_and_places_get_one_message(tmp_path: Path) -> None:
 # ---- the keys themselves
 
 
+def test_mapping_is_the_same_after_json() -> None:
+    for keys in ({**PLAIN, "default_type": "car"}, FULL, {**FULL, "types": {"x": "car"}, "yaw_unit": "deg"}):
+        assert TrackColumns.model_validate_json(mapping(**keys).model_dump_json()) == mapping(**keys)
+
+
+def test_two_coordinate_systems_contradict() -> None:
+    traffic = {"tracks": ["own.csv"], "track_columns": FULL}
+    assert TrafficConfig.from_dict({**traffic, "track_crs": "world"}).track_columns == mapping(**FULL)
+    with pytest.raises(ValidationError, match=r"expected track_crs or track_columns\.crs, got both"):
+        TrafficConfig.from_dict({"tracks": ["a"], "track_crs": "world", "track_columns": {**FULL, "crs": "lonlat"}})
+
+
 @pytest.mark.parametrize(
     ("keys", "expected"),
     [
@@ -274,3 +287,15 @@ def test_unusable_systems_and_places_get_one_message(tmp_path: Path) -> None:
 def test_keys_that_contradict(keys: dict[str, Any], expected: str) -> None:
     with pytest.raises(ValidationError, match=expected):
         mapping(**keys)
+
+
+@needs_karlsruhe
+def test_mapping_reads_karlsruhe_as_its_reader_does() -> None:
+    path = REAL / "karlsruhe_k733" / "vehicle_tracks_000.csv.gz"
+    keys = {"time": "timestamp_ms", "id": "track_id", "x": "x", "y": "y", "yaw": "psi_rad", "length": "length",
+            "width": "width", "type": "agent_type"}  # fmt: skip
+    tracks = user_table.read(path, mapping(**keys, time_unit="ms", types={"Bike": "bicycle"}))
+    expected = interaction.read(path)
+    assert tracks.names == expected.names and tracks.classes == expected.classes
+    for key in ("track", "time_s", "x_m", "y_m", "yaw_rad", "length_m", "width_m"):
+        assert np.array_equal(getattr(tracks, key), getattr(expected, key)), key

@@ -11,7 +11,8 @@ import pytest
 from egvs.core.errors import InputError
 from egvs.tracks import v2x_seq_tfd
 from egvs.tracks.model import HEAD_BYTES, TrackFrame
-from tests.tracks.writers_json import TFD_COLUMNS, assert_same_boxes, make_rows, write_v2x_seq_tfd
+from tests.tracks.boxes import assert_same_boxes, moving_boxes
+from tests.tracks.writers_json import CLASSES, TFD_COLUMNS, write_v2x_seq_tfd
 
 CAR = "PEK,1626155123.9,7,VEHICLE,CAR,TARGET_AGENT,10,5,20.5,4.6,1.9,1.6,1.5708,0,8,yizhuang#4-1_po"
 WALKER = "PEK,1626155124.0,8,PEDESTRIAN,PEDESTRIAN,OTHERS,1,2,20,,,,,0,1,yizhuang#4-1_po"
@@ -48,12 +49,12 @@ def test_times_in_other_units(tmp_path: Path, time: str) -> None:
 
 
 def test_500_frames(tmp_path: Path) -> None:
-    rows = make_rows()
+    rows = moving_boxes(CLASSES)
     path = write_v2x_seq_tfd(tmp_path, rows)
-    assert_same_boxes(v2x_seq_tfd.read(path), rows, atol=1e-12)
+    assert_same_boxes(v2x_seq_tfd.read(path), rows)
     zipped = tmp_path / "scene.csv.gz"
     zipped.write_bytes(gzip.compress(path.read_bytes()))
-    assert_same_boxes(v2x_seq_tfd.read(zipped), rows, atol=1e-12)
+    assert_same_boxes(v2x_seq_tfd.read(zipped), rows)
     assert v2x_seq_tfd.companions(path) == ()
 
 
@@ -67,10 +68,10 @@ def test_recognises_its_files(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("row", "expected"),
     [
-        (CAR.replace(",10,5,", ",nan,5,"), "row 1: x: expected a number, got 'nan'"),
-        (CAR.replace(",10,5,", ",ten,5,"), "row 1: x: expected a number, got 'ten'"),
-        (CAR.replace(",10,5,", ",1e300,5,"), "x_m: expected a number between -1e+08 and 1e+08, got 1e+300"),
-        (CAR.replace(",4.6,", ",-4.6,"), "length_m: expected a number between 0 and 1000, got -4.6"),
+        (CAR.replace(",10,5,", ",nan,5,"), "line 2: x: expected a number, got 'nan'"),
+        (CAR.replace(",10,5,", ",ten,5,"), "line 2: x: expected a number, got 'ten'"),
+        (CAR.replace(",10,5,", ",1e300,5,"), "line 2: x: expected a coordinate from -1e+08 to 1e+08 m, got 1e+300 m"),
+        (CAR.replace(",4.6,", ",-4.6,"), "line 2: length: expected a size from 0 to 100 m, got -4.6 m"),
         ("PEK,1", "line 2: expected 16 cells, got 2"),
         (CAR.replace("CAR", "TRAFFICCONE"), "contains no boxes of road users"),
     ],
@@ -86,3 +87,7 @@ def test_missing_column(tmp_path: Path) -> None:
     path = scene(tmp_path, CAR, header=",".join(TFD_COLUMNS).replace("theta", "angle"))
     with pytest.raises(InputError, match="expected a column 'theta'"):
         v2x_seq_tfd.read(path)
+    path = scene(tmp_path, CAR, header=",".join(TFD_COLUMNS).replace("theta", '"an\ngle"'))
+    with pytest.raises(InputError) as error:
+        v2x_seq_tfd.read(path)
+    assert "an gle" in str(error.value) and "\n" not in str(error.value)

@@ -9,7 +9,7 @@ import csv
 import json
 import math
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,57 +18,12 @@ import pyarrow as pa
 from pyarrow import feather, parquet
 
 from egvs.core.grid import FloatArray
-from egvs.tracks.model import Tracks
 from tests.tracks.writers import TrackRows
 
 SENSOR = "s110_lidar_ouster_south"
 
-
-def make_rows(frames: int = 500, step_s: float = 0.1) -> TrackRows:
-    """Return boxes of six road users of different classes on circles and lines, some of them for a part of the time."""
-    classes = ("car", "truck", "bus", "motorcycle", "bicycle", "pedestrian")
-    sizes = ((4.6, 1.9, 1.6), (9.0, 2.5, 3.4), (12.0, 2.55, 3.2), (2.1, 0.8, 1.5), (1.8, 0.6, 1.7), (0.5, 0.6, 1.75))
-    rows: list[tuple[Any, ...]] = []
-    for frame in range(frames):
-        time_s = round(frame * step_s, 6)
-        for index, cls in enumerate(classes):
-            if index > 3 and not 50 <= frame < frames - 60:
-                continue
-            length, width, height = sizes[index]
-            if index % 2:
-                x, y, yaw = 3.0 * index - 20 + 0.5 * frame * step_s, 4.0 * index - 9, 0.0
-            else:
-                angle = 0.07 * time_s + index
-                radius = 12.0 + 3 * index
-                x, y = radius * math.cos(angle), radius * math.sin(angle)
-                yaw = math.remainder(angle + math.pi / 2, 2 * math.pi)
-            rows.append((time_s, f"{index + 10}", cls, x, y, height / 2 + 0.01 * index, yaw, length, width, height))
-    time, names, kinds, *numbers = zip(*rows, strict=True)
-    return TrackRows(np.array(time), names, kinds, *(np.array(column) for column in numbers))
-
-
-def assert_same_boxes(
-    tracks: Tracks, rows: TrackRows, atol: float = 1e-6, without: Sequence[str] = (), classes: bool = True
-) -> None:
-    """Check that tracks have the boxes of rows, except for the columns ``without``, which are unknown in the format."""
-    assert tracks.n_rows == len(rows.name)
-    names = np.array([tracks.names[track] for track in tracks.track])
-    order = np.lexsort((names, tracks.time_s))
-    expected_names = np.array(rows.name)
-    expected_order = np.lexsort((expected_names, rows.time_s))
-    assert names[order].tolist() == expected_names[expected_order].tolist()
-    if classes:
-        kinds = np.array([tracks.classes[track] for track in tracks.track])
-        assert kinds[order].tolist() == np.array(rows.cls)[expected_order].tolist()
-    for key in ("time_s", "x_m", "y_m", "z_m", "yaw_rad", "length_m", "width_m", "height_m"):
-        actual, expected = getattr(tracks, key)[order], getattr(rows, key)[expected_order]
-        if key in without:
-            assert np.isnan(actual).all(), key
-        elif key == "yaw_rad":
-            error = np.abs(np.angle(np.exp(1j * (actual - expected))))
-            assert error.max() < atol, key
-        else:
-            np.testing.assert_allclose(actual, expected, rtol=0, atol=atol, err_msg=key)
+CLASSES = ("car", "truck", "bus", "motorcycle", "bicycle", "pedestrian")
+"""Classes that all formats here have, except for scenarios of Argoverse 2."""
 
 
 def write_openlabel(folder: Path, rows: TrackRows) -> Path:
@@ -88,17 +43,22 @@ def write_openlabel(folder: Path, rows: TrackRows) -> Path:
     return path
 
 
+def sweep_name(time_s: float) -> str:
+    """Return the name of TUMTraf's file of a sweep at a time."""
+    seconds, nanoseconds = divmod(round(time_s * 1e9), 10**9)
+    return f"{seconds:010d}_{nanoseconds:09d}_{SENSOR}.json"
+
+
 def write_tumtraf(folder: Path, rows: TrackRows) -> Path:
     """Write TUMTraf's dialect of OpenLABEL, a file per sweep; return the first. Precise to a nanosecond."""
     paths = []
     for number, (time_s, indices) in enumerate(_by_time(rows)):
-        nanoseconds = round(time_s * 1e9)
         objects = {}
         for index in indices:
             cuboid = {"name": "shape3D", "val": _cuboid(rows, index), "attributes": {"text": [], "num": []}}
             data = {"name": rows.name[index], "type": rows.cls[index].upper(), "cuboid": cuboid}
             objects[rows.name[index]] = {"object_data": data}
-        path = folder / f"{nanoseconds // 10**9:010d}_{nanoseconds % 10**9:09d}_{SENSOR}.json"
+        path = folder / sweep_name(time_s)
         frame = {"frame_properties": {"timestamp": time_s}, "objects": objects}
         path.write_text(json.dumps({"openlabel": {"frames": {str(number): frame}}}))
         paths.append(path)

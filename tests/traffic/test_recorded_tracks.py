@@ -19,6 +19,7 @@ from egvs.formats.georeference import Georeference, WorldFrame
 from egvs.tracks.track_readers import TrackSource
 from egvs.traffic import recorded_tracks
 from tests.conftest import SCENARIO, collection, fcd, feature
+from tests.traffic.helpers import netgenerate
 
 HALF_CAR_M = 2.25
 
@@ -283,3 +284,57 @@ def test_short_gap_is_interpolated(mini: Path, run_egvs, tmp_path: Path) -> None
     counts = [read_tpog(tmp_path / name / "tpog.parquet").counts for name in ("complete", "gap")]
     np.testing.assert_array_equal(*counts)
     assert RunRecord.read(tmp_path / "gap").stages["traffic"].summary["tracks"]["interpolated_gaps"] == 1
+
+
+def walkers(seconds: int) -> str:
+    """Return a pedestrian who walks along the road, and a car, which does not count."""
+    rows = [("walker", 1.0 * k, 1.2 * k, 9.0, 0.0) for k in range(seconds)]
+    text = interaction_csv(rows).replace(",car,", ",pedestrian,")
+    return text + "\n".join(interaction_csv([("seen", 0.0, 0.0, 0.0, 0.0)]).splitlines()[1:]) + "\n"
+
+
+def simulated(folder: Path, text: str) -> None:
+    """Write a scenario with simulated cars on two streets that cross, and recorded pedestrians."""
+    netgenerate(folder, "--grid", "--grid.number", "1", "--grid.length", "60", "--grid.attach-length", "60")
+    (folder / "people.csv").write_text(text)
+    source = 'network = "net.xml"\npedestrian_tracks = ["people.csv"]\ntrack_crs = "world"'
+    scenario = SCENARIO.replace('fcd = "fcd.csv"', source).replace("warmup_s = 0", "warmup_s = 30")
+    scenario = scenario.replace("frame_period_s = 0.5", "frame_period_s = 1.0\nvehicles = 3")
+    (folder / "scenario.toml").write_text(scenario.replace("center_m = [20, 0, 2.5]", "center_m = [60, 60, 2.5]"))
+
+
+def test_recorded_pedestrians_walk_beside_simulated_vehicles(mini: Path, run_egvs, tmp_path: Path) -> None:
+    """At frame k the pedestrian is at x = 1.2 k: the warm-up of the simulation shifts nothing."""
+    simulated(mini, walkers(41))
+    assert run_egvs("traffic", mini, "--out", tmp_path / "run")[0] == 0
+    table = pq.read_table(tmp_path / "run" / "trajectories.parquet").to_pandas()
+    people = table[table["kind"] == "pedestrian"]
+    assert set(people["vehicle"]) == {"walker"}
+    np.testing.assert_allclose(people["x_m"], 1.2 * people["frame"], atol=1e-5)
+    assert set(table[table["kind"] != "pedestrian"].groupby("frame").size()) == {3}
+    summary = RunRecord.read(tmp_path / "run").stages["traffic"].summary
+    assert summary["beside_vehicles"]["pedestrian"]["different"] == 1
+    assert "recorded pedestrians" in [warning["rule"] for warning in summary["warnings"]]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (walkers(20), "people.csv last 19 s, 20 frames"),
+        (interaction_csv(boxes_of_fcd()), "contains nobody on foot or on a bicycle"),
+    ],
+    ids=["too short", "cars only"],
+)
+def test_wrong_pedestrian_tracks_are_reported(mini: Path, run_egvs, tmp_path: Path, text: str, message: str) -> None:
+    simulated(mini, text)
+    code, _, err = run_egvs("run", mini, "--out", tmp_path / "run")
+    assert code == 2
+    assert message in err
+
+
+def test_recorded_and_simulated_pedestrians_exclude_each_other(mini: Path, run_egvs, tmp_path: Path) -> None:
+    simulated(mini, walkers(41))
+    options = ("--set", "effects.pedestrians_bicycles.pedestrians_per_h=10")
+    code, _, err = run_egvs("traffic", mini, "--out", tmp_path / "run", *options)
+    assert code == 2
+    assert "pedestrians are recorded, and an effect simulates others" in err

@@ -755,7 +755,7 @@ COMMAND_GROUPS = {
     "Decide": ("place", "explore", "compare", "city"),
     "Study": ("validate", "accuracy", "effects", "scores", "clouds", "train"),
     "Stages of egvs run": ("traffic", "statics", "tpog", "scan", "score", "report"),
-    "Files": ("runs", "export", "figure", "sensors", "sensor", "verify", "store"),
+    "Files": ("runs", "export", "figure", "sensors", "verify", "store", "sensor"),
 }
 """Groups of ``egvs --help``, and their commands."""
 

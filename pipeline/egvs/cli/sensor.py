@@ -109,7 +109,7 @@ def print_fit(result: SensorFit, written: FitFolder) -> None:
         f"ring, {repeated:,} further returns of a pulse",
         f"order of points in the first sweep: {result.layout}",
         f"elevations: {angles.channels} channels from {angles.elevation_deg.min():.3f} to "
-        f"{angles.elevation_deg.max():.3f} degrees, largest standard error {angles.elevation_se_deg.max():.4f}",
+        f"{angles.elevation_deg.max():.3f} degrees, largest standard error {angles.elevation_se_deg.max():.0e}",
         f"vertical offsets: {1000 * angles.offset_m.min():.1f} to {1000 * angles.offset_m.max():.1f} mm, as of optics "
         f"{1000 * angles.axis_distance_m:.1f} mm from the axis",
         f"azimuths: {angles.azimuths} every {angles.azimuth_step_deg:.4f} degrees, {_direction(result)}",

@@ -152,8 +152,12 @@ def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any], flow_sourc
 
 def _track_sentences(tracks: dict[str, Any]) -> Iterator[Sentence]:
     """Yield what was read from recorded tracks, changed and left out."""
-    coverage = tracks["coverage"]
-    yield Sentence(f"{_count(tracks['tracks'], 'track')} cover {coverage['share']:.0%} of the {coverage['of']}")
+    text = _count(tracks["tracks"], "track")
+    if coverage := tracks.get("coverage"):
+        text += f" cover {coverage['share']:.0%} of the {coverage['of']}"
+    else:
+        text += " of people beside the vehicles"
+    yield Sentence(text)
     if alignment := tracks.get("alignment"):
         yield _detail(f"{alignment['share_on_lanes']:.0%} of the positions of moving vehicles lie on lanes")
     yield _detail(f"{tracks['rows']:,} rows read, {tracks['step_s']:g} s apart")

@@ -40,6 +40,7 @@ _MAX_COORDINATE_M = 1e8
 _STEP_M = 0.5
 _HINT = "Correct the map, or export it again."
 _GAUSS_POINTS, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(5)
+_CLOSED_LINES = frozenset({"solid", "curb", "grass"})
 _SHAPES = ("line", "arc", "spiral", "poly3", "paramPoly3")
 
 ContactPoint = Literal["start", "end"]
@@ -138,6 +139,22 @@ class PlanElement:
         return parameters
 
 
+class RoadMark(NamedTuple):
+    """The marking at the outer border of a lane, from a distance after the start of its section on.
+
+    Attributes
+    ----------
+    start_m
+        That distance.
+    outwards, inwards
+        Whether vehicles may change lanes over it, away from the reference line and towards it.
+    """
+
+    start_m: float
+    outwards: bool
+    inwards: bool
+
+
 @dataclass(frozen=True)
 class RoadLane:
     """A lane of a lane section.
@@ -152,6 +169,8 @@ class RoadLane:
         Its width, from distances after the start of the section on.
     predecessors, successors
         Ids of lanes in the sections, or on the roads, before and after.
+    marks
+        Markings at its outer border, sorted.
     """
 
     id: int
@@ -159,6 +178,12 @@ class RoadLane:
     widths: tuple[Cubic, ...]
     predecessors: tuple[int, ...]
     successors: tuple[int, ...]
+    marks: tuple[RoadMark, ...] = ()
+
+    def mark_at(self, ds_m: float) -> RoadMark | None:
+        """Return the marking at a distance from the start of the section; None without one."""
+        marks = [mark for mark in self.marks if mark.start_m <= ds_m]
+        return marks[-1] if marks else None
 
 
 @dataclass(frozen=True)
@@ -467,7 +492,25 @@ def _parse_lane(element: Element) -> RoadLane:
     widths = _parse_cubics(element.iterfind("width"), "sOffset")
     predecessors = tuple(_integer(link, "id") for link in element.iterfind("link/predecessor"))
     successors = tuple(_integer(link, "id") for link in element.iterfind("link/successor"))
-    return RoadLane(number, element.get("type", "none"), widths, predecessors, successors)
+    marks = tuple(sorted(_parse_mark(mark, number) for mark in element.iterfind("roadMark")))
+    return RoadLane(number, element.get("type", "none"), widths, predecessors, successors, marks)
+
+
+def _parse_mark(element: Element, lane: int) -> RoadMark:
+    """Return a marking at the outer border of a lane.
+
+    ``laneChange`` counts, with ids of lanes growing from the right to the left; else the type of line, of which the
+    inner one is named first. By the standard, a solid line without ``laneChange`` may be crossed; exporters that do not
+    know the attribute, SUMO's among them, mean that it may not.
+    """
+    start_m = _number(element, "sOffset", 0.0)
+    change = element.get("laneChange")
+    if change in ("both", "none", "increase", "decrease"):
+        away = "increase" if lane > 0 else "decrease"
+        towards = "decrease" if lane > 0 else "increase"
+        return RoadMark(start_m, change in ("both", away), change in ("both", towards))
+    lines = element.get("type", "none").split() or ["none"]
+    return RoadMark(start_m, lines[0] not in _CLOSED_LINES, lines[-1] not in _CLOSED_LINES)
 
 
 def _parse_signal(element: Element) -> RoadSignal:

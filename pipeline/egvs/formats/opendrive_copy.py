@@ -20,6 +20,7 @@ from egvs.formats import xml
 _ROAD_PARTS = frozenset({"link", "type", "planView", "elevationProfile", "lanes", "signals"})
 _PARTS = frozenset({"header", "road", "junction", "controller"})
 _IGNORED_TYPE = "none"
+_SWAPPED_CHANGES = {"increase": "decrease", "decrease": "increase"}
 
 
 @dataclass(frozen=True)
@@ -134,6 +135,10 @@ def _swap_lanes(road: Element) -> None:
         _negate(lane, "id")
         for link in lane.iterfind("link/*"):
             _negate(link, "id")
+        for mark in lane.iterfind("roadMark"):
+            change = mark.get("laneChange", "")
+            if change in _SWAPPED_CHANGES:
+                mark.set("laneChange", _SWAPPED_CHANGES[change])
     for validity in road.iter("validity"):
         _negate(validity, "fromLane")
         _negate(validity, "toLane")

@@ -10,7 +10,9 @@ the ground. The fields of LIBKML that describe how a placemark is drawn are left
 
 from __future__ import annotations
 
+import io
 import json
+import struct
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from datetime import date, datetime
@@ -23,6 +25,7 @@ import pyarrow.parquet as pq
 from egvs.core import files, plugins
 from egvs.core.errors import InputError
 from egvs.core.numbers import parse_decimal
+from egvs.core.reading import COMPLETE_FILE
 
 GIS_FORMATS = {
     ".gpkg": "GeoPackage", ".shp": "Shapefile", ".kml": "KML", ".parquet": "GeoParquet", ".geoparquet": "GeoParquet",
@@ -89,6 +92,8 @@ def _read_gdal(path: Path, kind: str, geometry: str) -> tuple[pa.Table, str, str
     import pyogrio
     from pyogrio.errors import DataLayerError, DataSourceError
 
+    if kind == "Shapefile":
+        _check_shapefile_complete(path)
     try:
         layer = _choose_layer(path, pyogrio.list_layers(path).tolist(), geometry)
         metadata, table = pyogrio.read_arrow(path, layer=layer)
@@ -96,6 +101,34 @@ def _read_gdal(path: Path, kind: str, geometry: str) -> tuple[pa.Table, str, str
         problem = f"the file cannot be read as {kind} ({error})"
         raise InputError(path, problem, "Export it again, or use GeoJSON or CSV.") from None
     return table, metadata["geometry_name"] or "wkb_geometry", metadata["crs"]
+
+
+def _check_shapefile_complete(path: Path) -> None:
+    """Raise an InputError when a file of a Shapefile is shorter than its header says: GDAL would leave out the rest.
+
+    Sources: ESRI Shapefile Technical Description (1998), p. 4 (.shp and .shx: length in 16-bit words, big-endian, at
+    byte 24); dBASE III (.dbf: number of records at byte 4, size of the header at byte 8 and of a record at byte 10,
+    little-endian).
+    """
+    for suffix in (".shp", ".shx", ".dbf"):
+        part = path.with_suffix(suffix)
+        if not files.is_input_file(part):
+            continue
+        with files.open_input(part) as content:
+            head = content.read(32)
+            size = content.seek(0, io.SEEK_END)
+        if len(head) < 32:
+            if suffix == ".shp":
+                return  # GDAL says what is wrong
+            raise InputError(part, f"the file has only {size} bytes", COMPLETE_FILE)
+        if suffix == ".dbf":
+            records, head_size, record_size = struct.unpack_from("<IHH", head, 4)
+            declared = head_size + records * record_size
+        else:
+            declared = 2 * struct.unpack_from(">I", head, 24)[0]
+        if size < declared:
+            problem = f"the header declares {declared:,} bytes, but the file contains {size:,}"
+            raise InputError(part, problem, COMPLETE_FILE)
 
 
 def _choose_layer(path: Path, layers: list[list[Any]], geometry: str) -> str:

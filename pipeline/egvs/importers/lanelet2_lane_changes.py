@@ -1,8 +1,4 @@
-"""Where vehicles may change lanes, by the markings of a Lanelet2 map.
-
-A lane that no connection leads to, and that no marking lets vehicles change to, would never be used by those who come
-from upstream, and those whose turn begins there would wait forever. Changes to such a lane are allowed and reported.
-"""
+"""Where vehicles may change lanes, by the markings of a Lanelet2 map."""
 
 from __future__ import annotations
 
@@ -10,6 +6,7 @@ from collections import defaultdict
 from dataclasses import dataclass
 
 from egvs.formats.lanelet2 import LaneletMap
+from egvs.importers.lane_changes import open_unreachable_lanes
 from egvs.importers.lanelet2_roads import Road, RoadLayout
 from egvs.importers.lanelet2_rules import may_cross
 
@@ -40,7 +37,7 @@ def find_lane_changes(layout: RoadLayout, lanelet_map: LaneletMap, *, lefthand: 
     for road in layout.roads.values():
         changes = _marked_changes(road, lanelet_map, lefthand)
         if entered[road.id]:
-            opened += [(road.id, lane) for lane in _open_unreachable(changes, entered[road.id])]
+            opened += [(road.id, lane) for lane in open_unreachable_lanes(changes, entered[road.id])]
         to_lanes |= {(road.id, index): frozenset(others) for index, others in enumerate(changes)}
     return LaneChanges(to_lanes, tuple(opened))
 
@@ -56,27 +53,3 @@ def _marked_changes(road: Road, lanelet_map: LaneletMap, lefthand: bool) -> list
             if is_allowed and 0 <= other < len(road.lanes):
                 changes[index].add(other)
     return changes
-
-
-def _open_unreachable(changes: list[set[int]], entered: set[int]) -> list[int]:
-    """Allow changes to the lanes that cannot be reached from those that are entered; return these lanes."""
-    opened: list[int] = []
-    while True:
-        reached = set(entered)
-        queue = list(entered)
-        while queue:
-            new = changes[queue.pop()] - reached
-            reached |= new
-            queue += new
-        beside = [
-            (lane, other)
-            for lane in range(len(changes))
-            if lane not in reached
-            for other in (lane - 1, lane + 1)
-            if other in reached
-        ]
-        if not beside:
-            return sorted(opened)
-        lane, other = beside[0]
-        changes[other].add(lane)
-        opened.append(lane)

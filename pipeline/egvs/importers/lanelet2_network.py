@@ -9,7 +9,7 @@ Frame: x, y, z in metres of the world frame.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -22,6 +22,7 @@ from egvs.core.grid import FloatArray
 from egvs.formats.georeference import WorldFrame
 from egvs.formats.lanelet2 import LaneletMap
 from egvs.importers import lanelet2_rules as rules
+from egvs.importers.lane_changes import NO_CHANGE
 from egvs.importers.lanelet2_crosswalks import Crosswalk
 from egvs.importers.lanelet2_lane_changes import find_lane_changes
 from egvs.importers.lanelet2_nodes import ATTEMPTS, NodeShapes, lane_errors_m
@@ -40,7 +41,8 @@ _EDITOR_HINT = "Correct the map in an editor."
 _SIMPLIFY_M = 0.01
 _EXTENSION_M = 20.0
 """netconvert gets the line of a road longer than it is by this: from the line, cut at the nodes, it finds the direction
-of the road, and with it those of the turns. Very short roads would be turned anywhere."""
+of the road, and with it those of the turns. Very short roads would be turned anywhere. It finds no roundabout in such
+lines, so these are found without, before."""
 _PRIORITIES = {
     "motorway": 12,
     "trunk": 11,
@@ -52,8 +54,6 @@ _PRIORITIES = {
 }
 _OTHER_PRIORITY = 4
 _KM_H_PER_M_S = 3.6
-_NO_CHANGE = "emergency"
-"""Who may change lanes across a solid line; SUMO has no word for nobody."""
 
 
 @dataclass
@@ -125,11 +125,13 @@ class NetworkBuilder:
 
     def build(self) -> tuple[str, NetworkQuality]:
         """Return the text of the network, and how it differs from the map."""
-        edges = [self._edge(road) for road in self._layout.roads.values()]
+        edges: list[PlainElement] = [self._edge(road, _EXTENSION_M) for road in self._layout.roads.values()]
         connections = [*self._connections(), *self.right_of_way.elements()]
         signals = list(self.signals.elements)
         flags = ["--lefthand"] if self._lefthand else []
         attempts = dict.fromkeys(self._layout.nodes(), 0)
+        if _has_ring({(road.start, road.end) for road in self._layout.roads.values()}):
+            edges += self._roundabouts(connections, signals, flags)
         crossings = list(crossing_elements(self._crosswalks, self.signals, None))
         while True:
             nodes = [self._node(node, attempt) for node, attempt in attempts.items()]
@@ -146,6 +148,21 @@ class NetworkBuilder:
             built = crossing_lines_m(text)
             quality.lost_crossings = [walk for walk in self._crosswalks if frozenset(walk.roads) not in built]
         return text, quality
+
+    def _roundabouts(
+        self, connections: list[PlainElement], signals: list[PlainElement], flags: Sequence[str]
+    ) -> list[PlainElement]:
+        """Return the roundabouts that netconvert finds."""
+        nodes = [self._node(node, 0) for node in self._layout.nodes()]
+        edges = [self._edge(road, 0.0) for road in self._layout.roads.values()]
+        text = self._convert(PlainNetwork(self._frame, nodes, edges, connections, signals), flags)
+        try:
+            rings = read_network_text(text).roundabouts
+        except InputError:  # of a network without roads, as in _measure, which reports it
+            return []
+        return [
+            PlainElement("roundabout", {"nodes": " ".join(ring.nodes), "edges": " ".join(ring.edges)}) for ring in rings
+        ]
 
     def _convert(self, plain: PlainNetwork, flags: Sequence[str]) -> str:
         try:
@@ -165,14 +182,14 @@ class NetworkBuilder:
         attributes["shape"] = format_shape(shape, z)
         return PlainElement("node", attributes)
 
-    def _edge(self, road: Road) -> PlainElement:
+    def _edge(self, road: Road, extension_m: float) -> PlainElement:
         lanelets = list(road.lanes)
         kind = rules.road_class(lanelets[0].tags, len(lanelets), self.assumed)
         attributes = {
             "id": road.id, "from": road.start, "to": road.end,
             "numLanes": str(self._layout.sumo_lane(road.id, len(road.lanes))),
             "type": f"highway.{kind}", "priority": str(_PRIORITIES.get(kind, _OTHER_PRIORITY)),
-            "spreadType": "center", "shape": format_shape(simplify_line(_extend(_road_line_m(road)))),
+            "spreadType": "center", "shape": format_shape(simplify_line(_extend(_road_line_m(road), extension_m))),
         }  # fmt: skip
         if all("highway" in lanelet.tags for lanelet in lanelets):
             name = rules.common_tag(lanelets, "name")
@@ -195,7 +212,7 @@ class NetworkBuilder:
         left, right = (index - 1, index + 1) if self._lefthand else (index + 1, index - 1)
         for key, other in (("changeLeft", left), ("changeRight", right)):
             if 0 <= other < len(road.lanes) and other not in self.lane_changes.to_lanes[road.id, index]:
-                attributes[key] = _NO_CHANGE
+                attributes[key] = NO_CHANGE
         origin = PlainElement("param", {"key": "origId", "value": str(lane.key.id)})
         return PlainElement("lane", attributes, (origin,))
 
@@ -303,14 +320,27 @@ def _road_line_m(road: Road) -> FloatArray:
     return np.asarray((both[0] + both[1]) / 2)
 
 
-def _extend(line_m: FloatArray) -> FloatArray:
+def _extend(line_m: FloatArray, extension_m: float) -> FloatArray:
     """Extend a line (n, 3) straight at both ends."""
+    if not extension_m:
+        return line_m
     ends = []
     for end, inner in ((line_m[0], line_m[1]), (line_m[-1], line_m[-2])):
         step = end[:2] - inner[:2]
-        point_m = end[:2] + _EXTENSION_M * step / max(float(np.hypot(*step)), 1e-9)
+        point_m = end[:2] + extension_m * step / max(float(np.hypot(*step)), 1e-9)
         ends.append([*point_m, end[2]])
     return np.vstack([ends[:1], line_m, ends[1:]])
+
+
+def _has_ring(roads: Set[tuple[str, str]]) -> bool:
+    """Return whether roads between nodes lead around in a circle, without those that others lead back along."""
+    one_way = {(start, end) for start, end in roads if (end, start) not in roads}
+    while True:
+        starts, ends = {start for start, _ in one_way}, {end for _, end in one_way}
+        inner = {(start, end) for start, end in one_way if start in ends and end in starts}
+        if inner == one_way:
+            return bool(inner)
+        one_way = inner
 
 
 def _describe_turn(turn: tuple[str, int, str, int]) -> str:

@@ -82,7 +82,7 @@ class NodeShapes:
             area = area.difference(
                 shapely.union_all([lane.area for road, _ in self._roads[node] for lane in road.lanes])
             )
-        area = area.difference(MultiLineString(lines).buffer(strip_m, quad_segs=2))
+        area = area.difference(MultiLineString(lines).buffer(strip_m, quad_segs=2, cap_style="flat"))
         parts = [part for part in shapely.get_parts(area) if isinstance(part, Polygon)]
         largest = max(parts, key=lambda part: part.area, default=None)
         if largest is None or largest.area < _MIN_AREA_M2:

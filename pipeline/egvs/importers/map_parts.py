@@ -23,6 +23,7 @@ from egvs.core.grid import FloatArray, IntArray
 from egvs.formats.georeference import WorldFrame, parse_crs
 from egvs.importers.junctions import Streets
 from egvs.importers.osm_solids import ImportCounts, MappedSolid
+from egvs.scenario.fields import MAX_COORDINATE_M
 
 HEAD_BYTES = 4096
 """How much of a file :meth:`MapReader.can_open` gets, after gunzip."""
@@ -225,16 +226,14 @@ class MapContext:
         ------
         InputError
             When there is neither a system nor an alignment, when the network has no reference system, or where the
-            projection is undefined.
+            projection is undefined or the result is not on the Earth.
         """
         frame = self._frame_or_alignment(crs, where)
-        if isinstance(frame, Alignment):
-            return frame.to_world(xy)
-        xy_m = frame.from_crs(xy, str(crs))
-        undefined = np.flatnonzero(~np.isfinite(xy_m).all(axis=1))
+        xy_m = frame.to_world(xy) if isinstance(frame, Alignment) else frame.from_crs(xy, str(crs))
+        undefined = np.flatnonzero(~(np.abs(xy_m) <= MAX_COORDINATE_M).all(axis=1))
         if len(undefined):
             point = xy[undefined[0]]
-            problem = f"({point[0]:.10g}, {point[1]:.10g}) cannot be converted from {crs}"
+            problem = f"({point[0]:.10g}, {point[1]:.10g}) cannot be converted from {crs or 'local metres'}"
             raise InputError(where, problem, "Check the file's coordinates and its reference system.")
         return xy_m
 

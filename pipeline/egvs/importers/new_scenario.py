@@ -323,6 +323,7 @@ def create_scenario(
         raise _no_pole_error(junction, options, files.roads.path, covering)
 
     notes = [*roads.notes, *zero.notes, *(() if terrain is None else terrain.notes), *ground_notes]
+    notes += _surface_notes(surface, objects.counts)
     if at is None and recording is None and example is None and not junction.signalised:
         notes.append(_NO_SIGNALS_NOTE)
     notes += _ring_notes(streets, junction)
@@ -534,6 +535,12 @@ def _require_junction(junction: StreetJunction | None, path: Path) -> StreetJunc
     if junction is None:
         raise InputError(path, "the streets of the map have no junction", "Choose a map with a junction.")
     return junction
+
+
+def _surface_notes(surface: Terrain | None, counts: ImportCounts) -> list[str]:
+    if surface is None or counts.heights.get("building", Counter())[SURFACE_MODEL]:
+        return []
+    return ["The surface model is not used: it is at least 2 m above the ground at no building without height."]
 
 
 def _level_notes(roads: RoadSource, counts: ImportCounts) -> list[str]:

@@ -3,10 +3,11 @@
 Steps of :func:`read_roads`: parse and check the map (:mod:`egvs.formats.opendrive`); write a copy as netconvert expects
 it (:mod:`egvs.formats.opendrive_copy`); run netconvert; compare its network with the map
 (:mod:`egvs.importers.opendrive_check`); add the connections that it lacks, and close lanes that are not for vehicles,
-by patches that netconvert applies; add the height of the header's offset, which netconvert ignores.
+by patches that netconvert applies; forbid the lane changes that the road marks forbid; add the height of the header's
+offset.
 
-netconvert (1.28) loses the second of two lanes that lead to one in a junction, and opens sidewalks to cars when it
-imports them.
+netconvert (1.28) loses the second of two lanes that lead to one in a junction, opens sidewalks to cars when it imports
+them, and ignores road marks and the height of the header's offset.
 
 World frame: that of the network, x east, y north in metres. Without a projection in the map, it is the map's own frame.
 """
@@ -33,6 +34,7 @@ from egvs.importers.opendrive_check import (
     compare_with_map,
     read_made_network,
 )
+from egvs.importers.opendrive_lane_changes import ForbiddenChanges, find_forbidden_changes, forbid_changes
 from egvs.importers.opendrive_turns import DRIVING_TYPES, permitted_turns
 from egvs.traffic import sumo
 
@@ -108,6 +110,9 @@ def read_roads(path: Path, options: RoadOptions) -> RoadMap:
             after = compare_with_map(read_made_network(folder / name), copied, mirrored=lefthand)
         notes += (*_patch_notes(comparison, after), *comparison_notes(after, road_map))
         text = (folder / name).read_text(encoding="utf-8")
+        changes = find_forbidden_changes(read_made_network(folder / name), copied, mirrored=lefthand)
+    text = forbid_changes(text, changes, lefthand=lefthand)
+    notes += _lane_change_notes(changes)
 
     text = _GENERATED.sub("<!-- made from an OpenDRIVE map -->", text, count=1)
     height_m = copied.offset_m[2]
@@ -246,6 +251,21 @@ def _patch_notes(before: MapComparison, after: MapComparison) -> tuple[str, ...]
     removed = {*before.added} - {*after.added}
     if removed:
         notes.append(f"{len(removed)} connections that are not in the map were removed.")
+    return tuple(notes)
+
+
+def _lane_change_notes(changes: ForbiddenChanges) -> tuple[str, ...]:
+    """Return sentences on lane changes, by edge."""
+    notes = []
+    if changes.to_lanes:
+        count = len(changes.to_lanes)
+        notes.append(f"Road marks forbid lane changes from {count} lanes, of {_listed(changes.edges)}.")
+    if changes.opened:
+        lanes = _listed(f"{edge}_{lane}" for edge, lane in changes.opened)
+        notes.append(
+            "Lanes that nothing leads to, and that can only be reached across a mark that forbids it; vehicles may"
+            f" change to them: {lanes}."
+        )
     return tuple(notes)
 
 

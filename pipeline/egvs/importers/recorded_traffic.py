@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -47,6 +48,8 @@ class TrackFiles:
     def find(cls, paths: Sequence[Path], crs: str | None = None, columns: TrackColumns | None = None) -> TrackFiles:
         """Return the files with tracks among some paths, and in the folders among them.
 
+        A file that the reader of another reads with it, such as a further sweep, is not among them.
+
         Parameters
         ----------
         paths
@@ -60,9 +63,14 @@ class TrackFiles:
             When a file does not exist or no reader opens it, or a folder has no tracks.
         """
         tracks: dict[Path, None] = {}
+        read_with_others: set[Path] = set()
         for path in paths:
             is_folder = path.is_dir() and columns is None
-            tracks |= dict.fromkeys(_tracks_in_folder(path) if is_folder else [path])
+            for file in _tracks_in_folder(path) if is_folder else [path]:
+                if file.absolute() in read_with_others:
+                    continue
+                tracks[file] = None
+                read_with_others |= {other.absolute() for other in TrackSource((file,), columns).companions()}
         return cls(TrackSource(tuple(tracks), columns, crs))
 
     def copies(self) -> dict[str, Callable[[Path], None]]:
@@ -73,18 +81,24 @@ class TrackFiles:
         InputError
             When two files have one name.
         """
-        copies: dict[str, Callable[[Path], None]] = {}
-        for path in (*self.source.paths, *self.source.companions()):
-            name = f"{FOLDER}/{path.name}"
-            if name in copies:
-                raise InputError(path, "a second file of tracks has the same name", "Rename one of them.")
-            copies[name] = _copier(path)
-        return copies
+        sources: dict[str, Path] = {}
+        for path in self.source.paths:
+            for source, name in self._names(path).items():
+                if sources.setdefault(name, source) != source:
+                    raise InputError(source, "a second file of tracks has the same name", "Rename one of them.")
+        return {name: _copier(source) for name, source in sources.items()}
+
+    def _names(self, path: Path) -> dict[Path, str]:
+        """Return the paths in the scenario of a file and of those beside it, which keep their places to each other."""
+        companions = TrackSource((path,), self.source.columns).companions()
+        files = [file.absolute() for file in (path, *companions)]
+        folder = Path(os.path.commonpath([file.parent for file in files]))
+        return {file: f"{FOLDER}/{file.relative_to(folder).as_posix()}" for file in files}
 
     def traffic_table(self) -> dict[str, Any]:
         """Return the keys of ``[traffic]``."""
         source = self.source
-        table: dict[str, Any] = {"tracks": [f"{FOLDER}/{path.name}" for path in source.paths]}
+        table: dict[str, Any] = {"tracks": [self._names(path)[path.absolute()] for path in source.paths]}
         if source.crs is not None:
             table["track_crs"] = source.crs
         table |= {"frame_period_s": self._frame_period_s(), "roads": NETWORK_FILE}
@@ -155,7 +169,7 @@ def _tracks_in_folder(folder: Path) -> list[Path]:
 
 def _copier(source: Path) -> Callable[[Path], None]:
     def copy(target: Path) -> None:
-        target.parent.mkdir(exist_ok=True)
+        target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(source, target)
 
     return copy

@@ -342,7 +342,8 @@ def _lift_to_ground(solid_map: SolidMap, ground: TerrainSurface) -> SolidMap:
     groups: dict[str, list[MappedMesh]] = {}
     for mesh in solid_map.meshes:
         groups.setdefault(mesh.group or f"mesh {mesh.name}", []).append(mesh)
-    lifted, notes = {}, []
+    lifted: dict[str, MappedMesh] = {}
+    notes = []
     for name, meshes in groups.items():
         corners_m = np.concatenate([mesh.vertices_m[:, :2] for mesh in meshes])
         middle_m = (corners_m.min(axis=0) + corners_m.max(axis=0)) / 2

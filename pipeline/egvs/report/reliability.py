@@ -56,7 +56,8 @@ def describe_reliability(ranking: Ranking, traffic: Mapping[str, Any] | None = N
 def _track_summaries(traffic: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the coverage of recorded tracks, of each period."""
     periods = traffic.get("periods", {"": traffic})
-    return [summary["tracks"]["coverage"] for summary in periods.values() if "tracks" in summary]
+    tracks = [summary["tracks"] for summary in periods.values() if "tracks" in summary]
+    return [summary["coverage"] for summary in tracks if "coverage" in summary]
 
 
 def _limits(best: RankedSite, on_pole: Sequence[RankedSite]) -> Iterator[str]:

@@ -153,7 +153,7 @@ def _is_finished(values: dict[str, Any]) -> bool:
 def _first_source(values: dict[str, Any], key: str) -> Any:
     """Return the source of the first period, where ``[traffic]`` has none: it serves for what all periods share."""
     periods = values.get("periods")
-    if not periods or any(values.get(source) is not None for source in ("network", "sumocfg")):
+    if not periods or any(values.get(source) is not None for source in TRAFFIC_SOURCES):
         return None
     return getattr(periods[0], key)
 
@@ -171,6 +171,10 @@ _RANDOM_TRIP_KEYS = frozenset({
 
 _HELD_NUMBER_KEYS = frozenset({"vehicles_per_lane_km", "trips_per_s", "hold"})
 """Keys that maintain a number of vehicles, which have no effect with ``vehicles_per_h``."""
+
+
+_TRACK_KEYS = frozenset({"track_gap_s", "track_columns", "track_crs"})
+"""Keys that say how recorded tracks are read."""
 
 
 class UnusedKeys(NamedTuple):
@@ -204,8 +208,9 @@ def keys_without_effect(source: str) -> frozenset[str]:
         "vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s", "junction_blocker_s", "teleport_s",
     })  # fmt: skip
     for_fcd = frozenset({"vtypes", "fcd_geo"})
-    for_tracks = frozenset({"track_gap_s", "track_columns", "track_crs", "coverage"})
+    for_tracks = _TRACK_KEYS | {"coverage"}
     if source in FINISHED_SOURCES:
+        simulation |= {"pedestrian_tracks"}
         unused = simulation | demand - {"kinds"} | {"routes", "redraw_departures"}
         return unused | (for_tracks if source == "fcd" else for_fcd)
     unused = for_fcd | for_tracks | {"roads"}
@@ -242,6 +247,9 @@ class TrafficConfig(StrictModel):
     tracks: Tracks | None = Field(
         default_factory=lambda values: _first_source(values, "tracks"),
         description="Files of recorded tracks (see docs/tracks.md), all on one clock; nothing is simulated",
+    )
+    pedestrian_tracks: Tracks | None = Field(
+        None, description="Files of recorded pedestrians and bicycles, beside simulated vehicles"
     )
     track_gap_s: Positive = Field(
         2.0, description="Longest gap in a recorded track that is interpolated. In longer ones its position is unknown"
@@ -368,6 +376,8 @@ class TrafficConfig(StrictModel):
         if len(sources) != 1:
             actual = " and ".join(sources) or "none"
             raise ValueError(f"expected exactly one of network, sumocfg, fcd and tracks, got {actual}")
+        if self.track_crs is not None and self.track_columns is not None and self.track_columns.crs is not None:
+            raise ValueError("expected track_crs or track_columns.crs, got both")
         duplicates = find_duplicates([kind.name for kind in self.kinds])
         if duplicates:
             raise ValueError(f"two kinds have the same name: {', '.join(duplicates)}")
@@ -436,6 +446,8 @@ class TrafficConfig(StrictModel):
         if self.routes and source == "network":
             source = "routes"
         keys = self.model_fields_set & keys_without_effect(source)
+        if self.pedestrian_tracks is not None:
+            keys -= _TRACK_KEYS
         if not keys and self.counts:
             source = "counts"
             keys = self.model_fields_set & _RANDOM_TRIP_KEYS

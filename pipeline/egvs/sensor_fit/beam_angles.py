@@ -26,7 +26,7 @@ import numpy as np
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.sensor_fit.sweep_files import Sweep
-from egvs.sensor_fit.sweep_layout import Layout, find_layout, fit_cone, nearest_ring
+from egvs.sensor_fit.sweep_layout import Layout, axis_distances_m, find_layout, fit_cone, nearest_ring
 
 _FULL_CIRCLE_GAP_DEG = 60.0
 """A wider gap without any return is taken for the end of the field of view, in a list of returns."""
@@ -185,7 +185,7 @@ def _pool(sweeps: Sequence[Sweep], layout: Layout) -> tuple[FloatArray, FloatArr
     for number, sweep in enumerate(sweeps):
         finite = np.isfinite(sweep.points_m[:, 0])
         points = sweep.points_m[finite]
-        radius_m = np.hypot(points[:, 0], points[:, 1])
+        radius_m = axis_distances_m(points)
         if number == 0:
             channel = layout.channel[finite]
             rings = [fit_cone(radius_m[channel == c], points[channel == c, 2]) for c in range(layout.channels)]
@@ -427,7 +427,7 @@ def _robust_means(residual: FloatArray, channel: IntArray, channels: int) -> tup
 def pulse_grid(sweep: Sweep, angles: BeamAngles) -> PulseGrid:
     """Sort the returns of a sweep into the grid of pulses, by their direction."""
     points = sweep.points_m[np.isfinite(sweep.points_m[:, 0])]
-    radius_m = np.hypot(points[:, 0], points[:, 1])
+    radius_m = axis_distances_m(points)
     order = angles.ascending
     tangent = np.tan(np.radians(angles.elevation_deg))[order]
     nearest, miss_deg = nearest_ring(radius_m, points[:, 2], tangent, angles.offset_m[order])

@@ -12,7 +12,7 @@ from egvs.sensor_fit import empty_scan, return_rates
 from egvs.sensor_fit.empty_scan import TRAFFIC, UNKNOWN
 from egvs.sensor_fit.fit import SensorFit
 from egvs.sensor_fit.intervals import Estimate
-from egvs.sensor_fit.sweep_layout import nearest_ring
+from egvs.sensor_fit.sweep_layout import axis_distances_m, nearest_ring
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -36,7 +36,7 @@ def draw_angles(fit: SensorFit) -> Figure:
     figure, ((left, middle, right),) = _figure(15.0, 4.6, 3)
     angles = fit.angles
     points, channel, column = _measured_points(fit)
-    radius_m = np.hypot(points[:, 0], points[:, 1])
+    radius_m = axis_distances_m(points)
     raw_deg = np.degrees(np.arctan2(points[:, 2], radius_m)) - angles.elevation_deg[channel]
     fitted_deg = np.degrees(
         np.arctan2(points[:, 2] - angles.offset_m[channel], radius_m) - np.radians(angles.elevation_deg[channel])
@@ -80,7 +80,7 @@ def _measured_points(fit: SensorFit) -> tuple[FloatArray, Any, Any]:
     points = points[:: max(1, len(points) // _MAX_POINTS)]
     angles = fit.angles
     order = angles.ascending
-    radius_m = np.hypot(points[:, 0], points[:, 1])
+    radius_m = axis_distances_m(points)
     tangent = np.tan(np.radians(angles.elevation_deg))[order]
     ring, _ = nearest_ring(radius_m, points[:, 2], tangent, angles.offset_m[order])
     channel = order[ring]
@@ -167,9 +167,10 @@ def draw_ground(fit: SensorFit) -> Figure:
         axis.set(xlabel=f"{name} (m)", ylabel="z (m)", xlim=(-_VIEW_M, _VIEW_M), ylim=(deepest, 2.0))
     side.set_title(f"From the side: roll {fit.plane.roll_deg:.2f}, pitch {fit.plane.pitch_deg:.2f} degrees")
     across.set_title("Along the sensor's x axis")
-    _bars(rates, [(b.from_m, b.to_m, b.rate) for b in fit.road_rates], 100.0, _GREEN, "95 % interval")
+    _bars(rates, [(b.from_m, b.to_m, b.rate) for b in fit.road_rates], 100.0, _GREEN, "from the road alone")
+    _bars(rates, [(b.from_m, b.to_m, b.rate) for b in fit.rates_towards_road], 100.0, _GREY, "from vehicles as well")
     rates.set(xlabel="range to the plane (m)", ylabel="returns of 100 pulses", ylim=(0, 102))
-    rates.set_title("Returns from the road (pulses that vehicles hide are left out)")
+    rates.set_title("Returns of pulses towards the road (95 % intervals)")
     if fit.road_rates:
         rates.set_xlim(0, 150)
         rates.legend(loc="best")
@@ -214,7 +215,7 @@ def _bars(axis: Any, bins: Sequence[tuple[float, float, Estimate]], scale: float
         axis.plot([start, end], [scale * estimate.value] * 2, color=colour, linewidth=2, label=name)
 
 
-FIGURES: dict[str, Callable[[SensorFit], "Figure | None"]] = {
+FIGURES: dict[str, Callable[[SensorFit], Figure | None]] = {
     "angles.png": draw_angles,
     "ranges.png": draw_ranges,
     "ground.png": draw_ground,

@@ -66,6 +66,8 @@ class SensorFit:
         Range noise on all surfaces and on the road, by range; and by channel.
     return_rate, return_rates, road_rates
         Share of returns on smooth surfaces, in all and by range and incidence; and on the road by range.
+    rates_towards_road
+        Share of returns of all pulses towards the road, from vehicles as well, by range.
     empty_sectors_deg
         Sectors of azimuth without returns.
     planes, plane
@@ -92,6 +94,7 @@ class SensorFit:
     return_rate: Estimate | None
     return_rates: list[RateBin]
     road_rates: list[RateBin]
+    rates_towards_road: list[RateBin]
     empty_sectors_deg: list[tuple[float, float]]
     planes: list[GroundPlane]
     plane: GroundPlane
@@ -159,7 +162,8 @@ def fit_sensor(
         noise_by_channel=range_noise.noise_by_channel(_near(residuals), angles.channels, step),
         return_rate=return_rate,
         return_rates=rates,
-        road_rates=return_rates.road_rates(fine, view),
+        rates_towards_road=return_rates.rates_towards_road(fine, view),
+        road_rates=return_rates.road_rates(fine, angles, view),
         empty_sectors_deg=return_rates.empty_sectors(fine, angles),
         planes=planes,
         plane=plane,

@@ -3,8 +3,8 @@ r"""Find the ground below a sensor, and the height, roll and pitch that follow f
 Only returns count from surfaces whose normal is near that of the plane, so that walls and hedges do not. Candidate
 planes are drawn through three random returns (RANSAC, Fischler and Bolles 1981, Commun. ACM 24, 381-395); the one with
 most returns within 20 cm, which leaves room for a road's camber, is refined by least squares over the returns within
-2.5 robust standard deviations. Its returns are removed and the search is repeated, because roads, verges and yards often lie at different heights and
-only a person knows which of them is the ground of the map.
+2.5 robust standard deviations. Its returns are removed and the search is repeated, because roads, verges and yards
+often lie at different heights, and only a person knows which of them is the ground of the map.
 
 A plane with the unit normal n (upwards, in the sensor's frame) and the height h of the sensor above it satisfies
 :math:`n \cdot p = -h`. With the mount's rotation (roll first, then pitch, then yaw; nose up positive), the world's z
@@ -155,7 +155,7 @@ def _refine(points_m: FloatArray, normal: FloatArray, height_m: float, total: in
         residual = points_m[:, 2] - _design(points_m) @ coefficients
         used = np.abs(residual) <= tolerance_m
         design = _design(points_m[used])
-        coefficients = np.linalg.solve(design.T @ design, design.T @ points_m[used, 2])
+        coefficients = _solve(design.T @ design, design.T @ points_m[used, 2])
         residual = points_m[used, 2] - design @ coefficients
         tolerance_m = float(np.clip(2.5 * 1.4826 * np.median(np.abs(residual)), 0.01, _TOLERANCE_M))
     members = points_m[used]
@@ -177,6 +177,12 @@ def _refine(points_m: FloatArray, normal: FloatArray, height_m: float, total: in
         x_m=(float(low[0]), float(high[0])),
         y_m=(float(low[1]), float(high[1])),
     )
+
+
+def _solve(matrix: FloatArray, side: FloatArray) -> FloatArray:
+    """Solve the normal equations; where returns lie on a line, with the smallest slopes."""
+    solution: FloatArray = np.linalg.lstsq(matrix, side)[0]
+    return solution
 
 
 def _design(points_m: FloatArray) -> FloatArray:
@@ -209,9 +215,7 @@ def _jackknife(members: FloatArray) -> FloatArray:
         sides.append(part.T @ members[sector == number, 2])
     if len(sectors) < 3:
         return np.full(3, np.nan)
-    poses = np.array(
-        [_pose(np.linalg.solve(sum(products) - p, sum(sides) - s)) for p, s in zip(products, sides, strict=True)]
-    )
+    poses = np.array([_pose(_solve(sum(products) - p, sum(sides) - s)) for p, s in zip(products, sides, strict=True)])
     k = len(sectors)
     errors: FloatArray = np.sqrt((k - 1) / k * ((poses - poses.mean(axis=0)) ** 2).sum(axis=0))
     return errors

@@ -221,6 +221,7 @@ def report(fit: SensorFit, name: str) -> dict[str, Any]:
         "return_rate_on_smooth_surfaces": _estimate(fit.return_rate),
         "return_rates_on_smooth_surfaces": [_rate(rate) for rate in fit.return_rates],
         "return_rates_on_road": [_rate(rate) for rate in fit.road_rates],
+        "return_rates_towards_road": [_rate(rate) for rate in fit.rates_towards_road],
         "sectors_without_returns_deg": [list(sector) for sector in fit.empty_sectors_deg],
         "ground_planes": [_plane(plane, plane is fit.plane) for plane in fit.planes],
     }

@@ -14,6 +14,7 @@ add to it: the result is then an upper bound.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,7 +112,7 @@ def range_residuals(
 def noise_by_range(residuals: RangeResiduals, step_m: float) -> list[NoiseBin]:
     """Return the noise in each interval of :data:`RANGE_EDGES_M` with at least 100 residuals."""
     bins = []
-    for start_m, end_m in zip(RANGE_EDGES_M[:-1], RANGE_EDGES_M[1:], strict=True):
+    for start_m, end_m in pairwise(RANGE_EDGES_M):
         members = (residuals.range_m >= start_m) & (residuals.range_m < end_m)
         sigma_m = estimate_scale(residuals.residual_m[members], VARIANCE_FACTOR, step_m)
         if sigma_m is not None:

@@ -12,12 +12,14 @@ The range of a pulse without a return is unknown, so what it would have met must
   for both neighbours, against :math:`p (1 - p) p^2` for one pulse alone. Losses in patches, as on dark or wet surfaces,
   are missed: the share is then an upper bound.
 - *On the road*: the pulse aims at the ground plane, in a sector of azimuth where nearly all returns are from the plane.
-  Returns from in front of it (vehicles) and behind it do not count. All losses count, also those in patches.
+  Only pulses count whose nearest returns in the same channel, within 3 degrees to the left and to the right, are from
+  the road too: a lost pulse next to a vehicle or a wall may have been aimed at that. Losses in patches count.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,8 +58,9 @@ ROAD_BAND_M = 0.5
 
 _SECTOR_DEG = 2.0
 _SECTOR_RANGE_M = (5.0, 60.0)
-_MIN_SECTOR_RETURNS = 50
+_MIN_SECTOR_RETURNS = 20
 _MIN_ON_ROAD, _MAX_BEHIND = 0.6, 0.05
+_NEIGHBOUR_DEG = 3.0
 _EMPTY_SHARE = 0.05
 _MIN_EMPTY_DEG = 2.0
 
@@ -132,7 +135,7 @@ def view_of_plane(
     azimuth_deg = angles.azimuth_deg()
     if sector_deg is not None:
         first, last = sector_deg
-        on_road = np.mod(azimuth_deg - first, 360.0) <= np.mod(last - first, 360.0)
+        on_road = np.mod(azimuth_deg - first, 360.0) <= last - first
         return PlaneView(range_m, incidence_deg, on_road)
 
     sector = np.floor(np.mod(azimuth_deg + 180.0, 360.0) / _SECTOR_DEG).astype(np.int64)
@@ -153,24 +156,56 @@ def view_of_plane(
     return PlaneView(range_m, incidence_deg, is_road[sector])
 
 
-def road_rates(grids: list[FloatArray], view: PlaneView) -> list[RateBin]:
+def road_rates(grids: list[FloatArray], angles: BeamAngles, view: PlaneView) -> list[RateBin]:
     """Return the share of returns from the road, in each interval of :data:`RANGE_EDGES_M` with 100 pulses."""
+    returned = []
+    aimed = []
+    for grid in grids:
+        is_road, counts = _road_pulses(grid, angles, view)
+        returned.append(is_road)
+        aimed.append(counts)
     bins = []
-    for start_m, end_m in zip(RANGE_EDGES_M[:-1], RANGE_EDGES_M[1:], strict=True):
-        aimed = view.on_road & (view.range_m >= start_m) & (view.range_m < end_m)
-        if not aimed.any():
-            continue
-        hits = []
-        for grid in grids:
-            height_m = view.height_m(grid)[aimed]
-            lost = np.isnan(height_m)
-            with np.errstate(invalid="ignore"):
-                hits.append((~lost)[lost | (np.abs(height_m) <= ROAD_BAND_M)])
-        values = np.concatenate(hits).astype(np.float64)
-        if len(values) >= MIN_VALUES:
-            angles = view.incidence_deg[aimed]
-            bins.append(RateBin(start_m, end_m, float(angles.min()), float(angles.max()), estimate_share(values)))
+    for start_m, end_m in pairwise(RANGE_EDGES_M):
+        in_range = (view.range_m >= start_m) & (view.range_m < end_m)
+        values = [hits[in_range & counts] for hits, counts in zip(returned, aimed, strict=True)]
+        hits = np.concatenate(values).astype(np.float64)
+        if len(hits) >= MIN_VALUES:
+            incidence_deg = view.incidence_deg[in_range & view.on_road]
+            bins.append(
+                RateBin(start_m, end_m, float(incidence_deg.min()), float(incidence_deg.max()), estimate_share(hits))
+            )
     return bins
+
+
+def rates_towards_road(grids: list[FloatArray], view: PlaneView) -> list[RateBin]:
+    """Return the share of pulses towards the road that returned at all, from vehicles and kerbs as well."""
+    bins = []
+    for start_m, end_m in pairwise(RANGE_EDGES_M):
+        members = view.on_road & (view.range_m >= start_m) & (view.range_m < end_m)
+        hits = np.concatenate([np.isfinite(grid[members]) for grid in grids]).astype(np.float64)
+        if len(hits) >= MIN_VALUES:
+            incidence_deg = view.incidence_deg[members]
+            bins.append(
+                RateBin(start_m, end_m, float(incidence_deg.min()), float(incidence_deg.max()), estimate_share(hits))
+            )
+    return bins
+
+
+_NOTHING, _ROAD, _OTHER = 0, 1, 2
+
+
+def _road_pulses(grid: FloatArray, angles: BeamAngles, view: PlaneView) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which pulses returned from the road, and which count."""
+    with np.errstate(invalid="ignore"):
+        is_road = np.abs(view.height_m(grid)) <= ROAD_BAND_M
+    met = np.where(np.isnan(grid), _NOTHING, np.where(is_road, _ROAD, _OTHER))
+    counts = view.on_road & (met != _OTHER)
+    for side in (-1, 1):
+        nearest = np.zeros_like(met)
+        for columns in range(1, round(_NEIGHBOUR_DEG / angles.grid_step_deg) + 1):
+            nearest = np.where(nearest == _NOTHING, np.roll(met, side * columns, axis=1), nearest)
+        counts &= nearest != _OTHER
+    return is_road, counts
 
 
 @dataclass(frozen=True)
@@ -215,9 +250,9 @@ def smooth_rates(pulses: SmoothPulses) -> tuple[Estimate | None, list[RateBin]]:
     if len(pulses.returned) >= MIN_VALUES:
         everything = _rate(pulses.returned)
     bins = []
-    for start_m, end_m in zip(RANGE_EDGES_M[:-1], RANGE_EDGES_M[1:], strict=True):
+    for start_m, end_m in pairwise(RANGE_EDGES_M):
         in_range = (pulses.range_m >= start_m) & (pulses.range_m < end_m)
-        for low_deg, high_deg in zip(INCIDENCE_EDGES_DEG[:-1], INCIDENCE_EDGES_DEG[1:], strict=True):
+        for low_deg, high_deg in pairwise(INCIDENCE_EDGES_DEG):
             members = in_range & (pulses.incidence_deg >= low_deg) & (pulses.incidence_deg < high_deg)
             if np.count_nonzero(members) >= MIN_VALUES:
                 bins.append(RateBin(start_m, end_m, low_deg, high_deg, _rate(pulses.returned[members])))
@@ -230,7 +265,7 @@ def _rate(returned: NDArray[np.bool_]) -> Estimate:
 
 
 def empty_sectors(grids: list[FloatArray], angles: BeamAngles) -> list[tuple[float, float]]:
-    """Return the sectors of azimuth with less than 5 % returns, first and last azimuth in degrees, counter-clockwise."""
+    """Return the sectors of azimuth with less than 5 % returns, counter-clockwise (first and last azimuth, degrees)."""
     bins = 720
     index = np.floor(np.mod(angles.azimuth_deg(), 360.0) / 360.0 * bins).astype(np.int64) % bins
     pulses = np.bincount(index.ravel(), minlength=bins).astype(np.float64) * len(grids)

@@ -27,9 +27,12 @@ from egvs.formats import point_clouds
 MIN_RETURNS = 2000
 """Fewest returns of a sweep; sensors with rings have 30,000 or more."""
 
+MAX_COORDINATE_M = 10_000.0
+"""Farther than any LiDAR reaches: such coordinates are not metres, or not from the sensor."""
+
 _ORIGIN_M = 0.05
 _NPZ_HINT = "Save each sweep as one array of shape (n, 3): x, y, z in metres."
-_FRAME_HINT = "Export the sweep in the sensor's frame, with VIEWPOINT 0 0 0 1 0 0 0."
+_FRAME_HINT = "Export the sweep in metres, in the sensor's frame (PCD: VIEWPOINT 0 0 0 1 0 0 0)."
 
 
 @dataclass(frozen=True)
@@ -80,6 +83,10 @@ def read_sweeps(paths: Sequence[Path]) -> list[Sweep]:
         else:
             sweeps += _read_file(path, path.name)
     for sweep in sweeps:
+        farthest_m = float(np.nan_to_num(np.abs(sweep.points_m)).max(initial=0.0))
+        if farthest_m > MAX_COORDINATE_M:
+            problem = f"expected coordinates within {MAX_COORDINATE_M:,.0f} m of the sensor, got {farthest_m:g}"
+            raise InputError(sweep.name, problem, _FRAME_HINT)
         if sweep.returns < MIN_RETURNS:
             problem = f"expected a sweep of at least {MIN_RETURNS:,} returns, got {sweep.returns:,}"
             raise InputError(sweep.name, problem, "Give complete sweeps, one per file.")
@@ -117,11 +124,13 @@ def _read_file(path: Path, name: str) -> list[Sweep]:
 
 def _read_npz(path: Path, name: str) -> Iterator[Sweep]:
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with path.open("rb") as file, zipfile.ZipFile(file), np.load(file, allow_pickle=False) as arrays:
             if not arrays.files:
                 raise InputError(name, "expected an array for each sweep, got none", _NPZ_HINT)
             for key in arrays.files:
                 array = arrays[key]
+                if not isinstance(array, np.ndarray):
+                    raise InputError(f"{name}: {key}", "expected an array, got another file", _NPZ_HINT)
                 if array.ndim != 2 or array.shape[1] < 3 or array.dtype.kind not in "fiu":
                     problem = f"expected numbers of shape (n, 3), got {array.dtype} of shape {array.shape}"
                     raise InputError(f"{name}: {key}", problem, _NPZ_HINT)

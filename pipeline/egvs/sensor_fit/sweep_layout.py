@@ -1,4 +1,4 @@
-"""Find which channel fired each pulse of a sweep, from the points alone.
+r"""Find which channel fired each pulse of a sweep, from the points alone.
 
 Two kinds of files exist. An *organised* sweep has a slot for each pulse, with a missing return as NaN; slots run either
 channel by channel within a column (a column is one azimuth step), or column by column within a channel. Headers often
@@ -9,11 +9,11 @@ points lie on as many cones as the sensor has channels, and :func:`find_rings` s
 A return's optical path need not start at the origin of the frame. A channel at elevation e whose rays start at a height
 z0 on the axis gives points on the cone
 
-.. math:: z = \\rho \\tan e + z_0, \\qquad \\rho = \\sqrt{x^2 + y^2},
+.. math:: z = \rho \tan e + z_0, \qquad \rho = \sqrt{x^2 + y^2},
 
 so a few centimetres of offset smear the elevation of near points by more than the spacing of dense rings. Before
-clustering, one offset in radius and one in height for all channels are therefore chosen such that the elevations
-cluster best, as in the Hough transform of ALICE-LRI (Soutullo et al. 2025, arXiv 2510.20708).
+either, one offset in radius and one in height for all channels are therefore chosen such that the elevations cluster
+best, as in the Hough transform of ALICE-LRI (Soutullo et al. 2025, arXiv 2510.20708).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _ORGANISED_SPREAD_DEG = 0.2
 """Median spread of elevations within a channel, above which the slots are not in the tested order."""
 _SPREAD_RATIO = 1.5
 """A number of channels fits as well as the best one if its spread is at most this multiple of the least spread."""
-_ROUNDING_DEG = 1e-4
+_ROUNDING_DEG = 0.02
 _MIN_RETURNS_PER_CHANNEL = 20
 
 _OFFSETS_M = np.arange(-0.10, 0.1001, 0.004)
@@ -43,6 +43,8 @@ _BIN_DEG = 0.005
 _MIN_SPACING_DEG = 0.04
 _MIN_RING_SHARE = 0.02
 """A ring has at least this share of the returns of the median ring."""
+_FINEST_M = 1e-6
+"""Coordinates are not more exact than this."""
 _MAX_RESIDUAL_DEG = 0.05
 _MAX_STRAY_SHARE = 0.2
 
@@ -95,7 +97,10 @@ def find_layout(points_m: FloatArray, where: str) -> Layout:
 def _organised_layout(points_m: FloatArray) -> Layout | None:
     """Return the layout of an organised sweep; None if no number of channels fits."""
     n = len(points_m)
-    elevation_deg = np.degrees(np.arctan2(points_m[:, 2], np.hypot(points_m[:, 0], points_m[:, 1])))
+    returned = np.isfinite(points_m[:, 0])
+    elevation_deg = np.full(n, np.nan)
+    radius_m = axis_distances_m(points_m[returned])
+    elevation_deg[returned] = _sharpest_elevations(radius_m, points_m[returned, 2])
     trials: list[tuple[float, int, str]] = []
     for channels in range(MIN_CHANNELS, min(MAX_CHANNELS, n // MIN_COLUMNS) + 1):
         if n % channels:
@@ -116,7 +121,6 @@ def _organised_layout(points_m: FloatArray) -> Layout | None:
         column, channel = np.divmod(slots, channels)
     else:
         channel, column = np.divmod(slots, n // channels)
-    returned = np.isfinite(elevation_deg)
     used = np.bincount(channel[returned], minlength=channels) >= _MIN_RETURNS_PER_CHANNEL
     fitted = np.where(used[channel], (np.cumsum(used) - 1)[channel], -1)
     return Layout(order, int(np.count_nonzero(used)), fitted, column, channels - int(np.count_nonzero(used)))
@@ -160,16 +164,16 @@ def find_rings(points_m: FloatArray, where: str) -> Layout:
         If there are no rings, or more than a fifth of the points are on none.
     """
     finite = np.isfinite(points_m[:, 0])
-    radius_m = np.hypot(points_m[finite, 0], points_m[finite, 1])
+    radius_m = axis_distances_m(points_m[finite])
     height_m = points_m[finite, 2]
     elevation_deg = _sharpest_elevations(radius_m, height_m)
 
     centres_deg = _histogram_peaks(elevation_deg)
-    if len(centres_deg) < MIN_CHANNELS:
-        raise InputError(where, f"expected at least {MIN_CHANNELS} rings, got {len(centres_deg)}", _HINT)
+    _check_ring_count(len(centres_deg), where)
     ring = np.searchsorted(0.5 * (centres_deg[1:] + centres_deg[:-1]), elevation_deg)
     for _ in range(3):
         tangent, offset_m = _fit_cones(radius_m, height_m, ring, len(centres_deg))
+        _check_ring_count(len(tangent), where)
         ring, residual_deg = nearest_ring(radius_m, height_m, tangent, offset_m)
     is_stray = residual_deg > _MAX_RESIDUAL_DEG
     counts = np.bincount(ring[~is_stray], minlength=len(tangent))
@@ -182,6 +186,18 @@ def find_rings(points_m: FloatArray, where: str) -> Layout:
     channel = np.full(len(points_m), -1, dtype=np.int64)
     channel[finite] = np.where(is_stray, -1, number[ring])
     return Layout("list of returns", int(np.count_nonzero(used)), channel, None)
+
+
+def axis_distances_m(points_m: FloatArray) -> FloatArray:
+    """Return the horizontal distances of points (n, 3) from the axis of rotation, at least 1 mm."""
+    distance: FloatArray = np.maximum(np.hypot(points_m[:, 0], points_m[:, 1]), 0.001)
+    return distance
+
+
+def _check_ring_count(rings: int, where: str) -> None:
+    if rings < MIN_CHANNELS:
+        problem = f"expected at least {MIN_CHANNELS} rings of {_MIN_RETURNS_PER_CHANNEL} returns, got {rings}"
+        raise InputError(where, problem, _HINT)
 
 
 def nearest_ring(
@@ -281,7 +297,7 @@ def fit_cone(radius_m: FloatArray, height_m: FloatArray) -> tuple[float, float, 
     for _ in range(4):
         inside = np.abs(residual) * np.sqrt(weight) <= 3.5 * scale
         used = weight * inside
-        prior = np.diag([0.0, max(scale, 1e-9) ** 2 / PRIOR_OFFSET_M**2])
+        prior = np.diag([0.0, scale**2 / PRIOR_OFFSET_M**2])
         normal = (design * used[:, None]).T @ design + prior
         parameters = np.linalg.solve(normal, design.T @ (used * height_m))
         residual = height_m - design @ parameters
@@ -294,4 +310,4 @@ def fit_cone(radius_m: FloatArray, height_m: FloatArray) -> tuple[float, float, 
 
 
 def _weighted_scale(residual: FloatArray, weight: FloatArray) -> float:
-    return 1.4826 * float(np.median(np.abs(residual) * np.sqrt(weight)))
+    return max(1.4826 * float(np.median(np.abs(residual) * np.sqrt(weight))), _FINEST_M)

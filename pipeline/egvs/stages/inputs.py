@@ -196,6 +196,7 @@ def named_files(scenario: Scenario) -> Iterator[tuple[str, str]]:
     yield from (("traffic.routes", name) for name in traffic.routes)
     yield from (("traffic.vtypes", name) for name in traffic.vtypes)
     yield from (("traffic.tracks", name) for name in traffic.tracks or ())
+    yield from (("traffic.pedestrian_tracks", name) for name in traffic.pedestrian_tracks or ())
     for key, optional_name in (
         ("traffic.network", traffic.network),
         ("traffic.sumocfg", traffic.sumocfg),

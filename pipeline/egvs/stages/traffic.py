@@ -43,7 +43,7 @@ def dependencies(context: StageContext) -> StageDependencies:
     for period in traffic["periods"]:
         del period["weight"]
     settings = {"seed": scenario.seed, "name": scenario.name, "traffic": traffic}
-    if scenario.is_recorded:
+    if scenario.is_recorded or scenario.traffic.pedestrian_tracks is not None:
         settings |= geolocation.world_frame_settings(scenario)
     # an effect that is enabled automatically depends on the network and the terrain only
     named_effects = registry.effect_settings(effect for effect in effects if not effect.AUTO_ENABLED)
@@ -77,7 +77,7 @@ def _installed_sumo_version() -> str | None:
 
 def _reader_modules(scenario: Scenario) -> list[str]:
     """The modules that read the recorded tracks of one period; they are loaded by name."""
-    if scenario.traffic.tracks is None:
+    if scenario.traffic.tracks is None and scenario.traffic.pedestrian_tracks is None:
         return []
     from egvs.traffic import recorded_tracks
 
@@ -102,6 +102,10 @@ def _source_files(scenario: Scenario) -> list[Path]:
     sources = []
     if traffic.sumocfg is not None:
         sources.append(scenario.find(traffic.sumocfg, "traffic.sumocfg"))
+    if traffic.pedestrian_tracks is not None:
+        from egvs.traffic import recorded_tracks
+
+        sources += recorded_tracks.track_files(scenario)
     return [*sources, *sumo_folder.demand_files(scenario).all()]
 
 

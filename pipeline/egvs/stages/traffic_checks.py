@@ -149,6 +149,11 @@ def check_finished_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
         tracks = errors.attempt("traffic", lambda: recorded_tracks.read_recorded_tracks(scenario, world))
         if tracks is not None:
             yield from recorded_tracks.track_warnings(tracks, where)
+    if scenario.traffic.pedestrian_tracks is not None:
+        from egvs.traffic import recorded_tracks
+
+        world = geolocation.scenario_georeference(scenario)
+        errors.attempt("traffic", lambda: recorded_tracks.read_recorded_pedestrians(scenario, world))
     if scenario.traffic.fcd is None:
         yield from errors.findings
         return

@@ -261,7 +261,8 @@ def _covered_columns(recorded: StageContext, grid: Grid) -> FloatArray:
     if recorded.scenario.traffic.tracks:
         world = geolocation.scenario_georeference(recorded.scenario)
         coverage = recorded_tracks.read_recorded_tracks(recorded.scenario, world).coverage
-        covered = coverage.contains(_column_centres(grid)).astype(np.float64)
+        if coverage is not None:
+            covered = coverage.contains(_column_centres(grid)).astype(np.float64)
     return covered
 
 

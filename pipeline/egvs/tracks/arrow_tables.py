@@ -135,11 +135,16 @@ def _feather_batches(
 ) -> Iterator[pa.RecordBatch]:
     import pyarrow as pa
 
-    with pa.OSFile(str(path)) as source, pa.ipc.open_file(source) as file:
-        wanted = _select(path, file.schema.names, names, optional)
+    with pa.OSFile(str(path)) as source:
+        with pa.ipc.open_file(source) as file:
+            actual = file.schema.names
+        wanted = _select(path, actual, names, optional)
+        options = pa.ipc.IpcReadOptions(use_threads=False, included_fields=[actual.index(name) for name in wanted])
+        source.seek(0)
+        file = pa.ipc.open_file(source, options=options)
         rows = 0
         for index in range(file.num_record_batches):
-            batch = file.get_batch(index).select(wanted)
+            batch = file.get_batch(index)
             batch.validate(full=True)
             rows += batch.num_rows
             limits.ROWS.check(path, rows)

@@ -16,20 +16,19 @@ import numpy as np
 from egvs.core import limits
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.scenario.fields import MAX_COORDINATE_M
+from egvs.tracks.columns import MAX_ANGLE_RAD, MAX_SIZE_M, MAX_TIME_S
 from egvs.tracks.model import TrackFrame, Tracks
 
-_MAX_TIME_S = 1e11
-_MAX_COORDINATE_M = 1e8
-_MAX_ANGLE_RAD = 1e4
-_MAX_SIZE_M = 1000.0
 _RANGES = {
-    "time_s": (-_MAX_TIME_S, _MAX_TIME_S), "x_m": (-_MAX_COORDINATE_M, _MAX_COORDINATE_M),
-    "y_m": (-_MAX_COORDINATE_M, _MAX_COORDINATE_M), "z_m": (-_MAX_COORDINATE_M, _MAX_COORDINATE_M),
-    "yaw_rad": (-_MAX_ANGLE_RAD, _MAX_ANGLE_RAD), "length_m": (0.0, _MAX_SIZE_M), "width_m": (0.0, _MAX_SIZE_M),
-    "height_m": (0.0, _MAX_SIZE_M),
+    "time_s": (-MAX_TIME_S, MAX_TIME_S), "x_m": (-MAX_COORDINATE_M, MAX_COORDINATE_M),
+    "y_m": (-MAX_COORDINATE_M, MAX_COORDINATE_M), "z_m": (-MAX_COORDINATE_M, MAX_COORDINATE_M),
+    "yaw_rad": (-MAX_ANGLE_RAD, MAX_ANGLE_RAD), "length_m": (0.0, MAX_SIZE_M), "width_m": (0.0, MAX_SIZE_M),
+    "height_m": (0.0, MAX_SIZE_M),
 }  # fmt: skip
 _REQUIRED = ("time_s", "x_m", "y_m")
-_MAX_NAME_LENGTH = 1000
+_MAX_NAME_LENGTH = 200
+"""Names are kept as long as the longest one, for each row."""
 
 
 class Box(NamedTuple):
@@ -108,8 +107,15 @@ class BoxRows:
     def __len__(self) -> int:
         return len(self._names)
 
-    def add(self, name: str, cls: str, time_s: float, box: Box) -> None:
-        """Append a row: the name of the track, the class, the time and the box."""
+    def add(self, file: Path, name: str, cls: str, time_s: float, box: Box) -> None:
+        """Append a row: the file it is from, the name of the track, the class, the time and the box.
+
+        InputError as of :func:`make_tracks`.
+        """
+        _check_name(file, name)
+        for (key, (lowest, highest)), value in zip(_RANGES.items(), (time_s, *box), strict=True):
+            if not lowest <= value <= highest and (key in _REQUIRED or not math.isnan(value)):
+                raise _range_error(file, name, time_s, key, value)
         self._names.append(name)
         self._classes.append(cls)
         self._numbers.extend((time_s, *box))
@@ -142,20 +148,28 @@ def make_tracks(
     if not names:
         raise InputError(path, "contains no boxes of road users", "Use a file with labelled or tracked road users.")
     limits.ROWS.check(path, len(names))
-    longest = max(names, key=len)
-    if len(longest) > _MAX_NAME_LENGTH:
-        problem = f"expected a name of at most {_MAX_NAME_LENGTH:,} characters, got {len(longest):,}"
-        raise InputError(f"{path}: track {longest[:80]!r}", problem, "Use a shorter name.")
+    _check_name(path, max(names, key=len))
     for key, values in columns.items():
         lowest, highest = _RANGES[key]
         is_valid = (values >= lowest) & (values <= highest)
         if key not in _REQUIRED:
             is_valid |= np.isnan(values)
         for row in np.flatnonzero(~is_valid).tolist():
-            where = f"{path}: track {names[row][:80]!r}, time {columns['time_s'][row]:g} s: {key}"
-            problem = f"expected a number between {lowest:g} and {highest:g}, got {values[row]:g}"
-            raise InputError(where, problem, "Correct the row, or remove it.")
+            raise _range_error(path, names[row], float(columns["time_s"][row]), key, float(values[row]))
     return Tracks.from_rows(names, classes, columns, frame, sources)
+
+
+def _check_name(file: Path, name: str) -> None:
+    if len(name) > _MAX_NAME_LENGTH:
+        problem = f"expected a name of at most {_MAX_NAME_LENGTH:,} characters, got {len(name):,}"
+        raise InputError(f"{file}: track {name[:80]!r}", problem, "Use a shorter name.")
+
+
+def _range_error(file: Path, name: str, time_s: float, key: str, value: float) -> InputError:
+    lowest, highest = _RANGES[key]
+    problem = f"expected a number between {lowest:g} and {highest:g}, got {value:g}"
+    where = f"{file}: track {name[:80]!r}, time {time_s:g} s: {key}"
+    return InputError(where, problem, "Correct the row, or remove it.")
 
 
 class ClassNames:

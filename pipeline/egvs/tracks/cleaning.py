@@ -8,7 +8,7 @@ Steps, in order:
 3. The size of a track is the median of its rows. Missing lengths, widths and heights are those of its class.
 4. The heading is the recorded one, turned by 180 degrees where the road user would drive backwards (faster than
    :data:`MOVING_M_S` and more than 90 degrees off the motion; a box looks the same). A heading that is not given comes
-   from the motion over at least :data:`HEADING_BASE_M`; while a road user stands, it keeps the last one.
+   from the motion over at least :data:`HEADING_BASE_M` (:mod:`egvs.tracks.motion`).
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import numpy as np
 
 from egvs.core.grid import FloatArray, IntArray
 from egvs.tracks.model import Tracks
+from egvs.tracks.motion import motion_yaw_rad
 from egvs.tracks.sizes import ClassSize
 
 MOVING_M_S = 3.0
@@ -194,10 +195,8 @@ def _headings(tracks: Tracks, part: IntArray, report: CleaningReport) -> FloatAr
     """Return the heading of each row."""
     given = np.isfinite(tracks.yaw_rad)
     yaw_rad = np.where(given, tracks.yaw_rad, np.nan)
-    motion_rad, speed_m_s = np.full(tracks.n_rows, np.nan), np.zeros(tracks.n_rows)
-    for rows in _runs(part):
-        motion_rad[rows], speed_m_s[rows] = _motion(tracks.time_s[rows], tracks.x_m[rows], tracks.y_m[rows])
-
+    motion_rad = motion_yaw_rad(part, tracks.time_s, tracks.x_m, tracks.y_m, HEADING_BASE_M)
+    speed_m_s = _speeds(part, tracks)
     off_motion = np.cos(yaw_rad - motion_rad) < 0.0
     flipped = given & (speed_m_s > MOVING_M_S) & off_motion
     yaw_rad = np.where(flipped, yaw_rad + np.pi, yaw_rad)
@@ -211,31 +210,12 @@ def _headings(tracks: Tracks, part: IntArray, report: CleaningReport) -> FloatAr
     return np.where(unknown, 0.0, yaw_rad)
 
 
-def _motion(time_s: FloatArray, x_m: FloatArray, y_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return direction and speed of the motion at each row of one track; NaN for a direction that never shows.
-
-    The direction at row i is that from the last row at least half of :data:`HEADING_BASE_M` behind it, along the path,
-    to the first one as far ahead. Where the path ends before, or the road user stands, the nearest direction holds.
-    """
-    step_m = np.hypot(np.diff(x_m), np.diff(y_m))
-    path_m = np.concatenate([[0.0], np.cumsum(step_m)])
-    behind = np.searchsorted(path_m, path_m - HEADING_BASE_M / 2, side="right") - 1
-    ahead = np.searchsorted(path_m, path_m + HEADING_BASE_M / 2, side="left")
-    last = time_s.size - 1
-    is_measured = (behind >= 0) & (ahead <= last)
-    behind, ahead = np.clip(behind, 0, last), np.clip(ahead, 0, last)
-    dx_m, dy_m = x_m[ahead] - x_m[behind], y_m[ahead] - y_m[behind]
-    is_measured &= np.hypot(dx_m, dy_m) >= HEADING_BASE_M / 2  # noise of one that stands goes to and fro
-    direction_rad = np.where(is_measured, np.arctan2(dy_m, dx_m), np.nan)
-    duration_s = time_s[ahead] - time_s[behind]
-    speed_m_s = np.divide(np.hypot(dx_m, dy_m), duration_s, out=np.zeros_like(dx_m), where=duration_s > 0)
-    return _nearest_known(direction_rad), np.where(is_measured, speed_m_s, 0.0)
-
-
-def _nearest_known(values: FloatArray) -> FloatArray:
-    """Replace each NaN by the last finite value before it, or else by the first one after it."""
-    known = np.flatnonzero(np.isfinite(values))
-    if not known.size:
-        return values
-    position = np.searchsorted(known, np.arange(values.size), side="right") - 1
-    return values[known[np.maximum(position, 0)]]
+def _speeds(part: IntArray, tracks: Tracks) -> FloatArray:
+    """Return the speed between the rows before and after each row of a track, m/s; 0 for a single row."""
+    before, after = np.arange(tracks.n_rows) - 1, np.arange(tracks.n_rows) + 1
+    before[np.diff(part, prepend=-1) != 0] += 1
+    after[np.diff(part, append=part.max(initial=0) + 1) != 0] -= 1
+    distance_m = np.hypot(tracks.x_m[after] - tracks.x_m[before], tracks.y_m[after] - tracks.y_m[before])
+    duration_s = tracks.time_s[after] - tracks.time_s[before]
+    speed_m_s: FloatArray = np.divide(distance_m, duration_s, out=np.zeros_like(distance_m), where=duration_s > 0)
+    return speed_m_s

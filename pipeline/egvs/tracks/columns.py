@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import csv
-import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 
@@ -26,6 +23,9 @@ MAX_SIZE_M = 100.0
 
 MAX_TIME_S = 1e10
 """Seconds since 1970 stay below it until the year 2286; milliseconds exceed it."""
+
+MAX_BLANK_LINES = 1000
+"""A packed file of some kB can hold a billion blank lines, which take minutes to read."""
 
 MAX_ANGLE_RAD = 1e4
 """A thousand turns, for headings that count full turns."""
@@ -68,8 +68,8 @@ class Table:
     def numbers(self, name: str) -> FloatArray:
         """Return the numbers of a column, (n,) float64; InputError for a text, an empty cell, infinity or NaN."""
         values = self.optional_numbers(name)
-        for row in np.flatnonzero(np.isnan(values)):
-            raise self.error(int(row), name, f"expected a number, got {self.columns[name][row]!r}")
+        for row in np.flatnonzero(np.isnan(values)).tolist():
+            raise self.error(row, name, f"expected a number, got {self.columns[name][row]!r}")
         return values
 
     def optional_numbers(self, name: str) -> FloatArray:
@@ -78,8 +78,8 @@ class Table:
             return np.full(self.n_rows, math.nan)
         texts = self.columns[name]
         values = _to_floats(texts)
-        for row in np.flatnonzero(np.isinf(values)):
-            raise self.error(int(row), name, f"expected a number, got {texts[row][:80]!r}")
+        for row in np.flatnonzero(np.isinf(values)).tolist():
+            raise self.error(row, name, f"expected a number, got {texts[row][:80]!r}")
         return values
 
     def times_s(self, name: str, unit_s: float = 1.0) -> FloatArray:
@@ -206,17 +206,26 @@ def has_columns(head: bytes, *names: str) -> bool:
     return set(name.lower() for name in names) <= set(header(head))
 
 
-@contextmanager
-def open_text(path: Path, hint: str = _HINT) -> Iterator[TextIO]:
-    """Open a file, plain or gzipped, to read its text; InputError when it is damaged or no UTF-8."""
+def read_lines(path: Path, hint: str = _HINT) -> Iterator[str]:
+    """Yield the lines of a text file, plain or gzipped.
+
+    InputError when it is damaged or no UTF-8, or has a line longer than :data:`egvs.core.limits.ELEMENT`, or more than
+    :data:`MAX_BLANK_LINES` blank lines one after another.
+    """
+    n_blank, encoding = 0, "utf-8-sig"
     with reading.translate_errors(path, hint), xml.open_bounded(path) as file:
-        yield io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
+        while line := xml.read_line(file, path):
+            text = line.decode(encoding)
+            n_blank, encoding = 0 if text.strip() else n_blank + 1, "utf-8"
+            if n_blank > MAX_BLANK_LINES:
+                raise InputError(path, f"has more than {MAX_BLANK_LINES:,} blank lines one after another", hint)
+            yield text
 
 
 def read_rows(path: Path, delimiter: str = ",", hint: str = _HINT) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows of a CSV file that are not empty, with their line numbers; InputError when it is damaged."""
-    with open_text(path, hint) as file:
-        rows = csv.reader(file, delimiter=delimiter, skipinitialspace=True)
+    rows = csv.reader(read_lines(path, hint), delimiter=delimiter, skipinitialspace=True)
+    with reading.translate_errors(path, hint):
         for row in rows:
             if row:
                 yield rows.line_num, row
@@ -274,7 +283,7 @@ def _positions(
         if matches:
             positions[name] = matches[0]
         elif name in required:
-            actual_names = ", ".join(names)[:200] or "none"
+            actual_names = " ".join(", ".join(names)[:200].split()) or "none"  # a quoted name may have several lines
             raise InputError(path, f"expected a column {name!r}, got {actual_names}", hint)
     return positions
 

@@ -81,9 +81,11 @@ def read(path: Path) -> Tracks:
             if track is None or track.value in ("", "-1", -1):
                 name = f"{PurePosixPath(sweep.name).stem}-{index}"
                 without_track += 1
+            elif isinstance(track.value, str | int):
+                name = str(track.value)
             else:
-                name = str(track.value)[:1000]
-            rows.add(name, cls, sweep.time_s, _box(item, pose))
+                raise track.error("expected a text or a whole number")
+            rows.add(sweep.label, name, cls, sweep.time_s, _box(item, pose))
     sources = []
     if is_calibrated:
         sources.append("positions are in the frame of the data set's maps, whose place on Earth is unknown")
@@ -110,7 +112,7 @@ def _sweeps(path: Path) -> list[_Sweep]:
     folder = _folder(path)
     index = folder / _INDEX_FILE
     is_index = path.name == _INDEX_FILE
-    if not is_index and path.parent.name != _LABEL_FOLDER:
+    if not is_index and path.absolute().parent.name != _LABEL_FOLDER:
         raise InputError(path, f"expected a label in a folder {_LABEL_FOLDER!r}", "Use label/virtuallidar.")
     if not index.is_file():
         problem = f"expected {_INDEX_FILE}, which has the times of the labels, in {folder}"
@@ -124,6 +126,8 @@ def _sweeps(path: Path) -> list[_Sweep]:
         problem = "is empty" if is_index else f"is not listed in {_INDEX_FILE}"
         raise InputError(path, problem, "Keep the folders of the data set as they are.")
     labels, calibrations = _files(folder / "label" / _LABEL_FOLDER), _files(folder / "calib" / _CALIBRATION_FOLDER)
+    if not labels:
+        raise InputError(index, f"there are no labels in label/{_LABEL_FOLDER}", "Use the infrastructure's side.")
     sweeps = []
     for sequence, entry, name in entries:
         if sequence == names[0]:

@@ -89,7 +89,8 @@ def _one_after_another(cases: Sequence[str], time_s: FloatArray) -> FloatArray:
     np.minimum.at(first_s, case, time_s)
     np.maximum.at(last_s, case, time_s)
     begin_s = np.concatenate([[0.0], np.cumsum(last_s - first_s + _CASE_PAUSE_S)[:-1]])
-    return time_s - first_s[case] + begin_s[case]
+    moved_s: FloatArray = time_s - first_s[case] + begin_s[case]
+    return moved_s
 
 
 def _frame_from_origin(meta: Path) -> TrackFrame:

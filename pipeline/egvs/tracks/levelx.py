@@ -84,7 +84,7 @@ def _utm_frame(recording: columns.Table) -> TrackFrame:
         raise recording.error(0, "latLocation, lonLocation", f"expected degrees, got {lat_deg:g}, {lon_deg:g}")
     offset_m = (float(recording.positions_m("xUtmOrigin")[0]), float(recording.positions_m("yUtmOrigin")[0]))
     location_deg = np.array([[lon_deg, lat_deg]])
-    distances_m = {}
+    distances_m: dict[str, float] = {}
     for zone_lon_deg in (lon_deg, lon_deg - 6.0, lon_deg + 6.0):  # near its edge, data may keep to the zone beside
         crs = f"EPSG:{utm_epsg(zone_lon_deg, lat_deg)}"
         distances_m.setdefault(crs, math.dist(WorldFrame(crs).from_lon_lat(location_deg)[0], offset_m))

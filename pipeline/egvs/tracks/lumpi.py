@@ -35,7 +35,8 @@ _MIN_UTM_NORTHING_M = 1e6
 
 def can_open(path: Path, head: bytes) -> bool:
     """Return whether the file has the data set's name, and lines with enough cells."""
-    return path.name.lower().startswith("label") and len(columns.header(head)) >= len(_CELLS)
+    is_json = head.removeprefix(b"\xef\xbb\xbf").lstrip().startswith((b"{", b"["))
+    return path.name.lower().startswith("label") and not is_json and len(columns.header(head)) >= len(_CELLS)
 
 
 def companions(_path: Path) -> Sequence[Path]:

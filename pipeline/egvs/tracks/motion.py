@@ -41,7 +41,8 @@ def motion_yaw_rad(track: IntArray, time_s: FloatArray, x_m: FloatArray, y_m: Fl
         before, after = np.maximum(np.arange(x.size) - 1, 0), np.minimum(np.arange(x.size) + 1, x.size - 1)
         directions = np.unwrap(np.arctan2(y[after] - y[before], x[after] - x[before]))
         yaw_rad[rows] = np.interp(time_s[rows], time_s[rows][anchors], directions)
-    return np.arctan2(np.sin(yaw_rad), np.cos(yaw_rad))
+    wrapped_rad: FloatArray = np.arctan2(np.sin(yaw_rad), np.cos(yaw_rad))
+    return wrapped_rad
 
 
 def _positions_apart(x_m: FloatArray, y_m: FloatArray, step_m: float) -> list[int]:

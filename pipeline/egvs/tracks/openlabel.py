@@ -129,7 +129,7 @@ class _Recording:
                     box = box._replace(z_m=box.z_m + box.height_m / 2)
                     self._counts["bottoms"] += 1
                 self._counts["without yaw"] += is_tumtraf and cuboid.get("val").value[3:6] == [0, 0, 0]
-                self._rows.add(name, cls, time_s, box)
+                self._rows.add(file, name, cls, time_s, box)
 
     def _cuboids(self, frame: Node) -> Iterator[tuple[str, Node, Node, bool]]:
         """Yield the track, the object, its cuboid, and whether it is TUMTraf's dialect, of all objects of a frame."""

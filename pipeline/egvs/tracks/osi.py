@@ -157,7 +157,7 @@ class _Trace:
             if not (item.base.position.HasField("x") and item.base.position.HasField("y")):
                 self._without_position += 1
             else:
-                self._rows.add(str(item.id.value), _class_of(item), time_s, _box(item))
+                self._rows.add(self._path, str(item.id.value), _class_of(item), time_s, _box(item))
 
     def _set_projection(self, truth: GroundTruth, where: str) -> None:
         offset = truth.proj_frame_offset

@@ -95,11 +95,12 @@ class TrackSource:
             When a file is damaged, or has no row with a time and a position.
         """
         key = None if self.columns is None else self.columns.model_dump_json()
-        return [_read_file(path, path.stat().st_mtime_ns, key) for path in self.paths]
+        modified_ns = tuple(path.stat().st_mtime_ns for path in (*self.paths, *self.companions()))
+        return [_read_file(path, modified_ns, key) for path in self.paths]
 
 
 @lru_cache(maxsize=8)
-def _read_file(path: Path, _modified_ns: int, columns: str | None) -> Tracks:
+def _read_file(path: Path, _modified_ns: tuple[int, ...], columns: str | None) -> Tracks:
     """Read a file, by the JSON of the columns of a user's own table."""
     if columns is None:
         tracks = find_reader(path).read(path)

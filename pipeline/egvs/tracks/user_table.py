@@ -31,7 +31,6 @@ _SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _METRES = {"m": 1.0, "ft": 0.3048}
 _RADIANS = {"rad": 1.0, "deg": math.radians(1.0)}
 _MOTION_STEP_M = 2.0
-_HEAD_CHARACTERS = 256
 
 
 def read(path: Path, mapping: TrackColumns, where: str = "traffic.track_columns") -> Tracks:
@@ -132,9 +131,8 @@ def _read_table(path: Path, mapping: TrackColumns) -> Table:
     """Return the columns that the mapping names."""
     keys = ("time", "id", "x", "y", "z", "yaw", "length", "width", "height", "type")
     names = list(dict.fromkeys(name for key in keys if (name := getattr(mapping, key)) is not None))
-    with columns.open_text(path, _HINT) as file:
-        is_json = file.read(_HEAD_CHARACTERS).lstrip().startswith("{")
-    if is_json:
+    first = next((line for line in columns.read_lines(path, _HINT) if line.strip()), "")
+    if first.lstrip().startswith("{"):
         return _read_json_lines(path, names)
     return columns.read_table(path, names, delimiter=mapping.delimiter, hint=_HINT)
 
@@ -143,22 +141,21 @@ def _read_json_lines(path: Path, names: Sequence[str]) -> Table:
     """Return columns of JSON lines; a key that an object lacks is an empty cell, unless all lack it."""
     cells: dict[str, list[str]] = {name: [] for name in names}
     lines: list[int] = []
-    with columns.open_text(path, _HINT) as file:
-        for line, text in enumerate(file, start=1):
-            if not text.strip():
-                continue
-            where, hint = f"{path}: line {line}", "Write one JSON object per line."
-            with reading.translate_errors(where, hint, "is not valid JSON"):
-                item = reading.parse_json(text.encode("utf-8"))
-            if not isinstance(item, dict):
-                raise InputError(where, "expected a JSON object", hint)
-            for name in names:
-                value = _value(item, name)
-                if isinstance(value, dict | list):
-                    problem = f"expected a number or a text, got {type(value).__name__}"
-                    raise InputError(f"{where}: {name}", problem, _HINT)
-                cells[name].append("" if value is None else str(value).strip())
-            lines.append(line)
+    for line, text in enumerate(columns.read_lines(path, _HINT), start=1):
+        if not text.strip():
+            continue
+        where, hint = f"{path}: line {line}", "Write one JSON object per line."
+        with reading.translate_errors(where, hint, "is not valid JSON"):
+            item = reading.parse_json(text.encode("utf-8"))
+        if not isinstance(item, dict):
+            raise InputError(where, "expected a JSON object", hint)
+        for name in names:
+            value = _value(item, name)
+            if isinstance(value, dict | list):
+                problem = f"expected a number or a text, got {type(value).__name__}"
+                raise InputError(f"{where}: {name}", problem, _HINT)
+            cells[name].append("" if value is None else str(value).strip())
+        lines.append(line)
     for name in names:
         if not any(cells[name]):
             raise InputError(path, f"expected a key {name!r}, which no line has", _HINT)

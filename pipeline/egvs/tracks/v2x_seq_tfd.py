@@ -47,19 +47,18 @@ def read(path: Path) -> Tracks:
     pairs = zip(table.texts("sub_type"), table.texts("type"), strict=True)
     classes = [types.convert(sub_type or kind) for sub_type, kind in pairs]
     rows = np.array([row for row, cls in enumerate(classes) if cls is not None], dtype=np.intp)
-    time = table.numbers("timestamp")
-    latest = float(np.abs(time).max())
+    latest = float(np.abs(table.numbers("timestamp")).max())
     values = {
-        "time_s": time / (1e6 if latest > 1e14 else 1e3 if latest > 1e11 else 1.0),
-        "x_m": table.numbers("x"),
-        "y_m": table.numbers("y"),
-        "z_m": table.optional_numbers("z"),
-        "yaw_rad": table.optional_numbers("theta"),
-        "length_m": table.optional_numbers("length"),
-        "width_m": table.optional_numbers("width"),
-        "height_m": table.optional_numbers("height"),
+        "time_s": table.times_s("timestamp", 1e-6 if latest > 1e14 else 1e-3 if latest > 1e11 else 1.0),
+        "x_m": table.positions_m("x"),
+        "y_m": table.positions_m("y"),
+        "z_m": table.heights_m("z"),
+        "yaw_rad": table.angles_rad("theta"),
+        "length_m": table.sizes_m("length"),
+        "width_m": table.sizes_m("width"),
+        "height_m": table.sizes_m("height"),
     }
-    names = table.texts("id")
+    names = table.names("id")
     sources = ["positions are in the frame of the data set's maps, whose place on Earth is unknown"]
     return make_tracks(
         path,

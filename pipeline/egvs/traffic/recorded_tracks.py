@@ -58,7 +58,7 @@ class RecordedTracks:
     tracks, boxes
         The cleaned rows, and the boxes.
     coverage
-        What the recording could see.
+        What the recording could see; None for people beside simulated vehicles.
     outside
         Number of boxes outside the coverage, which are left out.
     alignment
@@ -68,7 +68,7 @@ class RecordedTracks:
     window: FrameWindow
     tracks: CleanTracks
     boxes: ResampledTracks
-    coverage: Coverage
+    coverage: Coverage | None
     outside: int
     alignment: Alignment | None
 
@@ -92,13 +92,14 @@ class RecordedTracks:
 
     def vehicle_sizes(self) -> dict[str, VehicleSize]:
         """Return the size of each vehicle type."""
-        return {
-            type_name: VehicleSize(*size_m, CLASS_SIZES[name].vclass)
-            for type_name, name, size_m in zip(self.type_names, self.tracks.classes, self._sizes_m, strict=True)
-        }
+        sizes = {}
+        for type_name, name, size_m in zip(self.type_names, self.tracks.classes, self._sizes_m, strict=True):
+            length_m, width_m, height_m = size_m
+            sizes[type_name] = VehicleSize(length_m, width_m, height_m, CLASS_SIZES[name].vclass)
+        return sizes
 
-    def rows(self) -> Iterator[pa.Table]:
-        """Yield rows of :data:`egvs.traffic.fcd.FCD_SCHEMA`, in order of time."""
+    def rows(self, first_ms: int = 0) -> Iterator[pa.Table]:
+        """Yield rows of :data:`egvs.traffic.fcd.FCD_SCHEMA`, in order of time; the first frame is at ``first_ms``."""
         boxes, names = self.boxes, pa.array(self.tracks.names)
         type_names = pa.array(self.type_names)
         half_m = np.array(self._sizes_m).reshape(-1, 3)[:, 0] / 2.0
@@ -108,7 +109,7 @@ class RecordedTracks:
             zeros = np.zeros(track.size)
             yield pa.table(
                 [
-                    boxes.frame[rows] * self.window.period_ms,
+                    first_ms + boxes.frame[rows] * self.window.period_ms,
                     names.take(pa.array(track)),
                     type_names.take(pa.array(track)),
                     boxes.x_m[rows] + half_m[track] * np.cos(yaw_rad),
@@ -143,7 +144,9 @@ class RecordedTracks:
     def summary(self) -> dict[str, Any]:
         """Return what was read, changed and left out, as JSON."""
         report = self.tracks.report.to_json() | self.boxes.report()
-        values = {**report, "outside_coverage": self.outside, "coverage": self.coverage.to_json()}
+        values = {**report, "outside_coverage": self.outside}
+        if self.coverage is not None:
+            values["coverage"] = self.coverage.to_json()
         if self.alignment is not None:
             values["alignment"] = self.alignment.to_json()
         if self.tracks.sources:
@@ -152,7 +155,7 @@ class RecordedTracks:
 
 
 def track_files(scenario: Scenario) -> list[Path]:
-    """Return the files of a scenario's tracks, with those that their readers need."""
+    """Return the files of a scenario's tracks, or of its recorded pedestrians, with those that their readers need."""
     source = track_source(scenario)
     return [*source.paths, *source.companions()]
 
@@ -175,7 +178,7 @@ def read_recorded_tracks(scenario: Scenario, world: Georeference) -> RecordedTra
     tracks = read_in_world_frame(track_source(scenario), world)
     window = _window(scenario, tracks)
     cleaned = cleaning.clean_tracks(tracks, class_sizes(scenario.traffic))
-    first_s = float(tracks.time_s.min()) + window.skip_ms / 1000.0
+    first_s = float(np.nanmin(tracks.time_s)) + window.skip_ms / 1000.0
     boxes = resampling.resample(cleaned, first_s, window.period_ms / 1000.0, window.count, scenario.traffic.track_gap_s)
     roads = sumo_folder.read_network(scenario)
     lanes_m = np.empty((0, 2)) if roads is None else track_alignment.lane_points(roads, scenario.roi.box)
@@ -189,6 +192,45 @@ def read_recorded_tracks(scenario: Scenario, world: Georeference) -> RecordedTra
         boxes = boxes.select(inside)
     alignment = None if roads is None else track_alignment.align(_moving_vehicles(cleaned, boxes), roads)
     return RecordedTracks(replace(window, skip_ms=0), cleaned, boxes, area, int((~inside).sum()), alignment)
+
+
+def read_recorded_pedestrians(scenario: Scenario, world: Georeference) -> RecordedTracks:
+    """Read the tracks of people on foot and on bicycles, for ``traffic.pedestrian_tracks``.
+
+    Parameters
+    ----------
+    scenario
+        With simulated vehicles.
+    world
+        The world frame.
+
+    Raises
+    ------
+    InputError
+        When a file is damaged, far from the region of interest, shorter than the simulation, or has nobody on foot or
+        on a bicycle.
+    """
+    source = track_source(scenario)
+    tracks = read_in_world_frame(source, world)
+    is_vulnerable = np.array([name in cleaning.VULNERABLE for name in tracks.classes])[tracks.track]
+    if not is_vulnerable.any():
+        hint = "Use tracks of pedestrians or bicycles; with vehicles, name them in traffic.tracks."
+        raise InputError(source.paths[0], "contains nobody on foot or on a bicycle", hint)
+    window = _window(scenario, tracks)
+    cleaned = cleaning.clean_tracks(tracks.select(is_vulnerable), class_sizes(scenario.traffic))
+    first_s = float(np.nanmin(tracks.time_s))
+    boxes = resampling.resample(cleaned, first_s, window.period_ms / 1000.0, window.count, scenario.traffic.track_gap_s)
+    return RecordedTracks(window, cleaned, boxes, None, 0, None)
+
+
+def pedestrian_warnings(where: str) -> Iterator[Diagnostic]:
+    """Warn that recorded pedestrians and simulated vehicles know nothing of each other."""
+    problem = (
+        "people were recorded among other vehicles than the simulated ones, and under other signals unless the network"
+        " has the recorded plan: they do not react to each other, and may cross at the same time"
+    )
+    hint = "Use it to see where people are; for their encounters with vehicles, record both, or simulate both."
+    yield Diagnostic("recorded pedestrians", where, problem, hint)
 
 
 def _moving_vehicles(tracks: CleanTracks, boxes: ResampledTracks) -> FloatArray:
@@ -240,15 +282,23 @@ def track_warnings(recorded: RecordedTracks, where: str) -> Iterator[Diagnostic]
             " position is unknown"
         )
         yield Diagnostic("track gaps", where, problem, "Raise track_gap_s if straight lines are good enough.")
-    yield from recorded.coverage.warnings(where)
+    if recorded.coverage is not None:
+        yield from recorded.coverage.warnings(where)
     if recorded.alignment is not None:
         yield from recorded.alignment.warnings(where)
 
 
 def track_source(scenario: Scenario) -> TrackSource:
-    """Return the files of a scenario's tracks, and how to read them; InputError if one does not exist."""
+    """Return the files of a scenario's tracks, or else of its recorded pedestrians, and how to read them.
+
+    Raises
+    ------
+    InputError
+        When a file does not exist.
+    """
     traffic = scenario.traffic
-    paths = tuple(scenario.find(name, "traffic.tracks") for name in traffic.tracks or ())
+    key = "tracks" if traffic.tracks is not None else "pedestrian_tracks"
+    paths = tuple(scenario.find(name, f"traffic.{key}") for name in getattr(traffic, key) or ())
     return TrackSource(paths, traffic.track_columns, traffic.track_crs)
 
 
@@ -305,24 +355,26 @@ def concatenate(recorded: list[Tracks]) -> Tracks:
         names = [name for tracks in recorded for name in tracks.names]
     starts = np.cumsum([0, *(len(tracks.names) for tracks in recorded)])
     keys = ("time_s", "x_m", "y_m", "z_m", "yaw_rad", "length_m", "width_m", "height_m")
-    arrays = {key: np.concatenate([getattr(tracks, key) for tracks in recorded]) for key in keys}
+    arrays: dict[str, FloatArray] = {key: np.concatenate([getattr(tracks, key) for tracks in recorded]) for key in keys}
     track = np.concatenate([tracks.track + start for tracks, start in zip(recorded, starts, strict=False)])
     classes = tuple(name for tracks in recorded for name in tracks.classes)
     sources = dict.fromkeys(sentence for tracks in recorded for sentence in tracks.sources)
-    return Tracks(tuple(names), classes, track, **arrays, sources=tuple(sources))
+    return Tracks(tuple(names), classes, track, frame=TrackFrame(), sources=tuple(sources), **arrays)
 
 
 def _window(scenario: Scenario, tracks: Tracks) -> FrameWindow:
     """Return the frames of a recording, from its first row on."""
     traffic, where = scenario.traffic, sumo_folder.traffic_location(scenario)
     period_ms = max(1, sumo_folder.to_milliseconds(traffic.frame_period_s, f"{where}.frame_period_s"))
-    skip_ms = sumo_folder.to_milliseconds(traffic.warmup_s + (traffic.begin_s or 0.0), f"{where}.warmup_s")
+    skip_ms = 0
+    if traffic.tracks is not None:
+        skip_ms = sumo_folder.to_milliseconds(traffic.warmup_s + (traffic.begin_s or 0.0), f"{where}.warmup_s")
     finite_s = tracks.time_s[np.isfinite(tracks.time_s)]
     duration_ms = int(np.floor(np.ptp(finite_s) * 1000.0 + 1e-3)) if finite_s.size else 0
     available = (duration_ms - skip_ms) // period_ms + 1
     count = available if traffic.frames is None else traffic.frames
     if count < 1 or count > available:
-        names = ", ".join(traffic.tracks or ())
+        names = ", ".join(traffic.tracks or traffic.pedestrian_tracks or ())
         problem = f"{names} last {duration_ms / 1000:g} s, {max(available, 0)} frames after {skip_ms / 1000:g} s"
         raise InputError(f"{where}.frames", problem, "Use fewer frames, or a shorter frame_period_s or warmup_s.")
     return FrameWindow(count, period_ms, 0, skip_ms, complete=True)

@@ -14,7 +14,7 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -31,6 +31,9 @@ from egvs.traffic.count_fit import CountFit, count_fits, missed_count_warnings
 from egvs.traffic.locks import DemandKey, RegionWatch, SumoFiles, WatchedRegion, describe_distance
 from egvs.traffic.sumo_folder import SimulationFolder, Timing
 from egvs.traffic.vehicle_boxes import TrafficHook, VehicleSize
+
+if TYPE_CHECKING:
+    from egvs.traffic.recorded_tracks import RecordedTracks
 
 _MIN_STANDING_LIMIT_S = 180.0
 _MAX_WAITING_SHARE = 0.02
@@ -177,7 +180,7 @@ def record_traffic(
         return _record_tracks(scenario, folder, world)
     if traci is not None:
         return _record_running(scenario, *traci, extensions)
-    return _record_simulated(scenario, folder, progress, extensions, regions or {})
+    return _record_simulated(scenario, folder, progress, extensions, regions or {}, world)
 
 
 @contextmanager
@@ -225,8 +228,10 @@ def _record_simulated(
     progress: ProgressCallback,
     extensions: Sequence[TrafficHook],
     regions: Mapping[str, WatchedRegion],
+    world: Georeference,
 ) -> Iterator[Recording]:
     where = sumo_folder.traffic_location(scenario)
+    people = _recorded_people(scenario, extensions, world)
     prepared = sumo_folder.prepare_simulation(scenario, folder, extensions)
     sources = ", ".join(path.name for path in prepared.sources)
     try:
@@ -260,6 +265,16 @@ def _record_simulated(
             fits, warnings,
         )  # fmt: skip
         persons = _read_rows(folder / sumo_folder.PERSONS_FILE, "person") if prepared.has_extra_traffic else None
+        people_values: dict[str, Any] = {}
+        if people is not None:
+            persons = people.rows(prepared.timing.first_ms)
+            sizes |= people.vehicle_sizes()
+            people_values = {
+                "uncounted_types": people.vulnerable_types(),
+                "tracks": people.summary(),
+                "warnings": tuple(_people_warnings(people, f"{where}.pedestrian_tracks")),
+                "unknown_boxes": people.unknown_boxes(),
+            }
         yield Recording(
             _read_rows(folder / sumo_folder.FCD_FILE, "vehicle"),
             prepared.timing.window(),
@@ -274,10 +289,33 @@ def _record_simulated(
             prepared.roads,
             teleports,
             None if watch is None else watch.locked,
+            **people_values,
         )
     finally:
         for name in (*_TABLES, sumo_folder.DRIVEN_ROUTES_FILE, sumo_folder.STATISTICS_FILE):
             (folder / name).unlink(missing_ok=True)
+
+
+def _recorded_people(
+    scenario: Scenario, extensions: Sequence[TrafficHook], world: Georeference
+) -> RecordedTracks | None:
+    """Read the recorded pedestrians of a scenario, if there are any; InputError where others are simulated."""
+    if scenario.traffic.pedestrian_tracks is None:
+        return None
+    from egvs.traffic import recorded_tracks
+
+    if any(extension.ADDS_TRAFFIC for extension in extensions):
+        where = f"{sumo_folder.traffic_location(scenario)}.pedestrian_tracks"
+        problem = "pedestrians are recorded, and an effect simulates others"
+        raise InputError(where, problem, "Remove effects.pedestrians_bicycles, or pedestrian_tracks.")
+    return recorded_tracks.read_recorded_pedestrians(scenario, world)
+
+
+def _people_warnings(people: RecordedTracks, where: str) -> Iterator[Diagnostic]:
+    from egvs.traffic import recorded_tracks
+
+    yield from recorded_tracks.track_warnings(people, where)
+    yield from recorded_tracks.pedestrian_warnings(where)
 
 
 def _read_rows(path: Path, element: str) -> Iterable[pa.Table]:

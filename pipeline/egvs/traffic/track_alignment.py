@@ -111,7 +111,8 @@ def align(xy_m: FloatArray, roads: Network) -> Alignment | None:
 
     def move(change: FloatArray) -> FloatArray:
         cos, sin = np.cos(change[2]), np.sin(change[2])
-        return (xy_m - middle_m) @ np.array([[cos, sin], [-sin, cos]]) + middle_m + change[:2]
+        moved_m: FloatArray = (xy_m - middle_m) @ np.array([[cos, sin], [-sin, cos]]) + middle_m + change[:2]
+        return moved_m
 
     def mean_distance_m(change: FloatArray) -> float:
         distance_m, _ = tree.query(move(change), distance_upper_bound=FAR_M)
@@ -135,7 +136,8 @@ def lane_points(roads: Network, region: Roi) -> FloatArray:
     points_m, _ = _centre_lines(roads)
     low_m = np.array(region.origin_m[:2])
     inside = ((points_m >= low_m) & (points_m <= low_m + region.size_m[:2])).all(axis=1)
-    return points_m[inside]
+    points_inside_m: FloatArray = points_m[inside]
+    return points_inside_m
 
 
 def _centre_lines(roads: Network) -> tuple[FloatArray, FloatArray]:
