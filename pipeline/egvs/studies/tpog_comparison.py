@@ -18,7 +18,7 @@ occupancy of a bin is the mean of its columns.
 Standard errors and biases come from the block jackknife over both records together
 (:mod:`egvs.scoring.standard_errors`). Entropy is biased low, and distance high, in short records.
 
-Only columns that the recording covered count. World frame, metres.
+Only columns that the recording covered count, except in the ranks: scores are those of the runs. World frame, metres.
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ class TpogComparison:
     frames, blocks
         Number of frames of each, and of the groups of blocks that standard errors come from.
     covered_share
-        Share of the region's columns that the recording covered.
+        Share of the area of the region's lanes that the recording covered.
     lanes
         By occupancy in the recording, the busiest first.
     distance
@@ -206,9 +206,14 @@ def compare_tpogs(recorded: Path, simulated: Path, progress: ProgressCallback = 
     network_path = _network_file(runs)
     box = extent(tpogs[0].grid, ())
     backdrop = Backdrop(world_outlines(runs[0].world, box), roads_within(network_path, box))
-    bins = lane_bins(network.read_net_xml(network_path), tpogs[0].grid, covered)
+    roads = network.read_net_xml(network_path)
+    bins = lane_bins(roads, tpogs[0].grid, covered)
+    on_lane = lane_bins(roads, tpogs[0].grid, np.ones_like(covered)).lane >= 0
+    covered_share = float(covered[on_lane].mean()) if on_lane.any() else 0.0
+    if not len(bins.names):
+        raise InputError(recorded, "no lane is in the part of the region that the recording covered", "Check [roi].")
     statistics = [_Statistics.of(jackknife, bins, covered, tpogs[0].grid) for jackknife in jackknives]
-    both = _Pair(*statistics, tuple(jackknives[0].groups), tuple(jackknives[1].groups))
+    both = _Pair(statistics[0], statistics[1], jackknives[0].groups, jackknives[1].groups)
 
     occupancy = [both.single(which, lambda each: each.occupancy) for which in (0, 1)]
     entropy = [both.single(which, lambda each: each.lane_entropy_bit) for which in (0, 1)]
@@ -229,7 +234,7 @@ def compare_tpogs(recorded: Path, simulated: Path, progress: ProgressCallback = 
     difference = both.joint(lambda first, second: second.entropy_bit - first.entropy_bit)[0]
     return TpogComparison(
         (recorded, simulated), tpogs, (tpogs[0].frames, tpogs[1].frames),
-        (both.n_groups(0), both.n_groups(1)), float(covered.mean()), tuple(lanes), distance, (mean[0], mean[1]),
+        (both.n_groups(0), both.n_groups(1)), covered_share, tuple(lanes), distance, (mean[0], mean[1]),
         (totals[0], totals[1], difference), _compare_ranks(recorded, simulated, progress), backdrop,
     )  # fmt: skip
 
