@@ -6,7 +6,8 @@ groups as possible; write its states as phases. A cycle that was recorded has no
 recorded clearance times. Vehicle-actuated signals vary from cycle to cycle: the notes state medians and their
 intervals.
 
-A connection without a group is never stopped. Of two greens that cross, SUMO's right of way decides who waits ("g").
+A connection without a group is never stopped. Of two greens that cross, SUMO's right of way decides who waits ("g");
+where a program governs several junctions, whoever turns.
 
 World frame, metres, seconds.
 """
@@ -36,6 +37,9 @@ NEAR_M = 6.0
 """A way of the file that assigns groups belongs to a connection if both its ends are nearer than this to its path."""
 
 STEP_S = 0.1
+MIN_CYCLE_S, MAX_CYCLE_S = 5.0, 600.0
+"""Shorter and longer times between two beginnings of green are no cycles."""
+
 MIN_YELLOW_S = 3.0
 """Yellow that is added where a recorded cycle ends in a green that the next one begins with red."""
 
@@ -158,6 +162,7 @@ def _read_junction(path: Path, node: str) -> _Junction:
     junction = _Junction(programs.pop())
     shapes: dict[str, FloatArray] = {}
     governed: set[str] = set()
+    turning: set[int] = set()
     requests: dict[str, dict[int, set[int]]] = {}
     for element in xml.iter_elements(path, "net"):
         if element.tag == "edge":
@@ -172,9 +177,14 @@ def _read_junction(path: Path, node: str) -> _Junction:
             lanes = f"{start}_{element.attrib['fromLane']}", via, f"{end}_{element.attrib['toLane']}"
             path_m = np.vstack([shapes[lane] for lane in lanes if lane in shapes])
             junction.links.append(_Link(int(element.attrib["linkIndex"]), start, end, path_m))
+            if element.get("dir") != "s":
+                turning.add(junction.links[-1].index)
             governed.add(via.rsplit("_", 2)[0].removeprefix(":"))
     if governed == {node}:  # positions in the states are those of the requests only where it governs one junction
         junction.yields_to = requests[node]
+    else:
+        indices = {link.index for link in junction.links}
+        junction.yields_to = {index: indices - {index} for index in turning}
     return junction
 
 
@@ -221,7 +231,7 @@ def _cycles(records: Sequence[SignalRecord]) -> list[_Cycle]:
     for record in records:
         starts_s = record.green_starts_s
         cycles += [_Cycle(begin_s, end_s) for begin_s, end_s in itertools.pairwise(starts_s)]
-    return cycles
+    return [cycle for cycle in cycles if MIN_CYCLE_S <= cycle.length_s <= MAX_CYCLE_S]
 
 
 def _typical_cycle(cycles: Sequence[_Cycle], median_s: float, records: Sequence[SignalRecord]) -> _Cycle:
