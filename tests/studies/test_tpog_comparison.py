@@ -13,7 +13,8 @@ from egvs.core.errors import InputError
 from egvs.core.grid import Grid
 from egvs.scoring.standard_errors import BlockGroups
 from egvs.studies import tpog_page
-from egvs.studies.tpog_comparison import BIN_M, Measured, compare_tpogs, lane_bins, lane_distances, measure
+from egvs.studies.lane_bins import BIN_M, lane_bins, lane_distances
+from egvs.studies.tpog_comparison import Measured, compare_tpogs, measure
 from egvs.traffic.network import read_net_xml
 from tests.conftest import write_mini
 

@@ -30,8 +30,8 @@ from egvs.formats import xml
 from egvs.formats.georeference import WorldFrame
 from egvs.importers.plain_network import NETCONVERT_FLAGS, NETWORK_FILE
 from egvs.importers.recorded_signals import GREEN, RED, YELLOW, RecordedSignals, SignalRecord
-from egvs.traffic import sumo, track_demand
-from egvs.traffic.track_demand import Estimate
+from egvs.traffic import estimates, sumo
+from egvs.traffic.estimates import Estimate
 
 NEAR_M = 6.0
 """A way of the file that assigns groups belongs to a connection if both its ends are nearer than this to its path."""
@@ -138,7 +138,7 @@ def apply_signals(
     if not cycles:
         hint = "Record longer: two beginnings of green of one group."
         raise InputError(where, "no complete cycle of the signals is recorded", hint)
-    lengths = track_demand.median_of([cycle.length_s for cycle in cycles])
+    lengths = estimates.median_of([cycle.length_s for cycle in cycles])
     assert lengths is not None
     cycle = _typical_cycle(cycles, lengths.value, records)
     phases = _phases(junction, groups, used, cycle)
@@ -314,7 +314,7 @@ def _notes(
     )
     texts = []
     for name, record in sorted(records.items(), key=lambda item: (len(item[0]), item[0])):
-        green = track_demand.median_of(record.green_durations_s)
+        green = estimates.median_of(record.green_durations_s)
         offsets_s = [(start_s - cycle.begin_s) % cycle.length_s for start_s in record.green_starts_s]
         text = f"{name}: no complete green"
         if green is not None:
