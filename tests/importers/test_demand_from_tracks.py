@@ -14,7 +14,7 @@ import egvs
 from egvs.core.errors import InputError
 from egvs.importers.new_scenario import NewScenarioOptions, create_scenario
 from egvs.scenario.model import SCENARIO_FILE
-from egvs.traffic import sumo, track_demand
+from egvs.traffic import estimates, sumo
 from tests.importers.test_recorded_traffic import HEADER, K733
 from tests.traffic.crossing import NETWORK
 
@@ -119,6 +119,13 @@ def test_rejects_tracks_that_pass_no_junction(tmp_path: Path, network_path: Path
     assert not (tmp_path / "new").exists()
 
 
+def test_rejects_recording_of_pedestrians(tmp_path: Path, network_path: Path) -> None:
+    rows = [f"P1,{k},{1000 * k},pedestrian,-20.0,{k / 10:.1f},,,,," for k in range(60)]
+    (tmp_path / "tracks.csv").write_text("\n".join([HEADER, *rows, ""]), encoding="utf-8")
+    with pytest.raises(InputError, match="no recorded vehicle passes a junction of the network"):
+        new_like(tmp_path / "new", network_path, tmp_path / "tracks.csv")
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -219,7 +226,7 @@ def test_demand_of_a_simulation_is_recovered(tmp_path: Path) -> None:
     assert sum(others) <= 2
     car, truck = egvs.load(tmp_path / "new").traffic.kinds
     total = sum(each.vehicles for each in new.demand.movements)
-    low, high = track_demand.share_interval(round(truck.share * total), total)
+    low, high = estimates.share_interval(round(truck.share * total), total)
     assert low <= TRUCK_SHARE <= high
     assert car.length_m == pytest.approx(4.5, abs=0.01)
     assert car.attributes["minGap"] == pytest.approx(MIN_GAP_M, abs=0.02)

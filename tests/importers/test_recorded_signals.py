@@ -107,6 +107,12 @@ def test_typical_cycle_has_green_for_all_groups(signals: RecordedSignals) -> Non
     assert cycle.begin_s == pytest.approx(21.0)
 
 
+def test_breaks_and_flicker_are_no_cycles() -> None:
+    starts_s = np.array([0.0, 1.0, 2.0, 3.0, 4.0, 64.0, 65.0, 1000.0])
+    record = SignalRecord(starts_s, tuple("rGrGrGrG"), 1010.0)
+    assert [cycle.length_s for cycle in signal_programs._cycles([record])] == [61.0]
+
+
 def test_cycle_that_ends_in_green_gets_yellow() -> None:
     states = ["r"] * 50 + ["G"] * 50
     result = signal_programs._with_yellow(states)

@@ -13,7 +13,8 @@ from egvs.core.errors import InputError
 from egvs.core.grid import Grid
 from egvs.scoring.standard_errors import BlockGroups
 from egvs.studies import tpog_page
-from egvs.studies.tpog_comparison import BIN_M, Measured, compare_tpogs, lane_bins, lane_distances, measure
+from egvs.studies.lane_bins import BIN_M, lane_bins, lane_distances
+from egvs.studies.tpog_comparison import Measured, compare_tpogs, measure
 from egvs.traffic.network import read_net_xml
 from tests.conftest import write_mini
 
@@ -142,6 +143,34 @@ def test_car_that_stands_is_told_from_one_that_drives(run_egvs, tmp_path: Path) 
     assert html.count("<svg") == 2
     assert "Recorded" in html
     assert "Simulated" in html
+
+
+@pytest.mark.slow
+def test_only_what_the_recording_covered_counts(run_egvs, tmp_path: Path) -> None:
+    """The recorded cars drive in the western half of the region, and the recording saw no more."""
+    simulated = make_run(tmp_path / "simulated")
+    scenario = write_mini(tmp_path / "recorded")
+    (scenario / "roads.net.xml").write_text(NETWORK)
+    rows = ["track_id,frame_id,timestamp_ms,agent_type,x,y,vx,vy,psi_rad,length,width"]
+    for k in range(41):
+        rows.append(f"1,{k},{500 * k},car,{0.5 * k},-2,1,0,0,4.5,1.8")
+        rows.append(f"2,{k},{500 * k},car,{20 - 0.5 * k},2,-1,0,{np.pi},4.5,1.8")
+    (scenario / "tracks.csv").write_text("\n".join([*rows, ""]))
+    text = (scenario / "scenario.toml").read_text()
+    source = 'tracks = ["tracks.csv"]\ntrack_crs = "world"\nroads = "roads.net.xml"'
+    (scenario / "scenario.toml").write_text(text.replace('fcd = "fcd.csv"', source))
+    recorded = tmp_path / "run-recorded"
+    egvs.run(egvs.load(scenario), recorded)
+
+    comparison = compare_tpogs(recorded, simulated)
+    # the hull of the centres ends at x = 20, and is widened by 2 m: 22 of 40 m
+    assert comparison.covered_share == pytest.approx(0.55, abs=0.03)
+    # both traffics are uniform in the common part
+    assert comparison.distance.value < 0.35
+    code, out, err = run_egvs("compare", recorded, simulated, "--tpog", tmp_path / "page.html")
+    assert (code, err) == (0, "")
+    assert "note: the recording covered 5" in out
+    assert "where the recording did not cover it, ranks differ" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
 def test_rejects_other_numbers_of_runs(run_egvs, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from egvs.traffic import track_demand
+from egvs.traffic import estimates, track_demand
 from egvs.traffic.track_demand import Follower
 from egvs.traffic.track_matching import MatchedTracks, match_tracks
 from tests.traffic.crossing import LEFT, PERIOD_S, Drive, boxes_of, constant, read_network
@@ -23,22 +23,22 @@ def match(folder: Path, *drives: Drive) -> MatchedTracks:
 )
 def test_poisson_interval_is_that_of_the_tables(count: int, low: float, high: float) -> None:
     """Garwood's limits as printed in textbooks."""
-    assert track_demand.poisson_interval(count) == pytest.approx((low, high), abs=1e-4)
+    assert estimates.poisson_interval(count) == pytest.approx((low, high), abs=1e-4)
 
 
 def test_share_interval_of_extreme_shares() -> None:
     """With 0 of 10, the upper limit solves (1 - p)^10 = 0.025."""
-    assert track_demand.share_interval(0, 10) == pytest.approx((0.0, 1.0 - 0.025**0.1))
-    assert track_demand.share_interval(10, 10) == pytest.approx((0.025**0.1, 1.0))
+    assert estimates.share_interval(0, 10) == pytest.approx((0.0, 1.0 - 0.025**0.1))
+    assert estimates.share_interval(10, 10) == pytest.approx((0.025**0.1, 1.0))
 
 
 def test_interval_of_a_median_is_that_of_order_statistics() -> None:
     """Of ten values, the second and the ninth enclose the median with a probability of 97.9 %."""
-    estimate = track_demand.median_of(list(range(1, 11)))
+    estimate = estimates.median_of(list(range(1, 11)))
     assert estimate is not None
     assert (estimate.value, estimate.low, estimate.high, estimate.n) == (5.5, 2.0, 9.0, 10)
     assert not estimate.is_usable
-    assert track_demand.median_of([]) is None
+    assert estimates.median_of([]) is None
 
 
 def test_intervals_cover_the_truth_in_95_percent_of_trials() -> None:
@@ -46,8 +46,8 @@ def test_intervals_cover_the_truth_in_95_percent_of_trials() -> None:
     covered = np.zeros(3)
     for _ in range(400):
         values = rng.normal(1.1, 0.08, 40)
-        estimates = [track_demand.mean_of(values), track_demand.deviation_of(values), track_demand.median_of(values)]
-        for number, (estimate, truth) in enumerate(zip(estimates, (1.1, 0.08, 1.1), strict=True)):
+        results = [estimates.mean_of(values), estimates.deviation_of(values), estimates.median_of(values)]
+        for number, (estimate, truth) in enumerate(zip(results, (1.1, 0.08, 1.1), strict=True)):
             assert estimate is not None
             covered[number] += estimate.low <= truth <= estimate.high
     assert (covered / 400 >= 0.92).all()

@@ -16,8 +16,8 @@ from egvs.importers.new_scenario import NewScenario
 from egvs.importers.osm_network import ATTRIBUTION
 from egvs.importers.osm_solids import OUT_OF_RANGE, ImportCounts
 from egvs.importers.scenario_files import PITCHES_DEG, SENSOR, STATICS_FILE
+from egvs.traffic.estimates import MIN_OBSERVATIONS
 from egvs.traffic.recorded_tracks import track_warnings
-from egvs.traffic.track_demand import MIN_OBSERVATIONS
 
 if TYPE_CHECKING:
     from egvs.city.creation import NewCity, NewJunction

@@ -6,7 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egvs.cli.console import WIDE, Column, console, make_table
+from egvs.report.formatting import format_percent
 from egvs.studies.tpog_page import format_bit, format_measured, format_share
+
+FULLY_COVERED = 0.95
+"""A smaller covered share of the lanes is reported."""
 
 if TYPE_CHECKING:
     from egvs.studies.tpog_comparison import LaneComparison, TpogComparison
@@ -48,6 +52,11 @@ def print_tpog_comparison(comparison: TpogComparison, page: Path, top: int | Non
         )
         if ranks.note:
             out.print(f"note: no standard errors of the ranks: {ranks.note}")
+    if comparison.covered_share < FULLY_COVERED:
+        share = format_percent(comparison.covered_share)
+        out.print(
+            f"note: the recording covered {share} of the area of the lanes; only this part counts, except in the ranks"
+        )
     first, second = comparison.blocks
     out.print(f"± is one standard error, from {first} and {second} groups of blocks")
     out.print(f"page: {page}")

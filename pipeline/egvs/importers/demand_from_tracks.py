@@ -25,10 +25,11 @@ from egvs.scenario.traffic_config import CountConfig
 from egvs.tracks import cleaning, resampling
 from egvs.tracks.cleaning import CleanTracks
 from egvs.tracks.sizes import CLASS_SIZES
-from egvs.traffic import track_alignment, track_demand, track_matching
+from egvs.traffic import estimates, track_alignment, track_demand, track_matching
+from egvs.traffic.estimates import MIN_OBSERVATIONS
 from egvs.traffic.network import Network
 from egvs.traffic.track_alignment import Alignment
-from egvs.traffic.track_demand import MIN_OBSERVATIONS, Passage
+from egvs.traffic.track_demand import Passage
 
 _MAX_GAP_S = 2.0
 
@@ -134,7 +135,7 @@ def estimate_demand(recording: TrackFiles, streets: Streets, junction: StreetJun
     Raises
     ------
     InputError
-        When a file is damaged, or no vehicle passes the junction.
+        When a file is damaged or far from the streets, or no vehicle passes the junction.
     """
     tracks = recording.read(streets)
     cleaned = cleaning.clean_tracks(tracks, CLASS_SIZES)
@@ -154,6 +155,9 @@ def estimate_demand(recording: TrackFiles, streets: Streets, junction: StreetJun
         raise InputError(recording.source.paths[0], problem, hint)
 
     counted = _count_movements(passages.counted, streets, junction)
+    if not counted.vehicles:
+        problem = f"no recorded vehicle passes the {junction.title}"
+        raise InputError(recording.source.paths[0], problem, "Choose another junction with --at LAT,LON.")
     notes = list(_passage_notes(passages, counted.unassigned))
     notes += _people_notes(cleaned)
     fleet = estimate_fleet(cleaned, [passage.track for passage in passages.counted], matched)
@@ -164,7 +168,7 @@ def estimate_demand(recording: TrackFiles, streets: Streets, junction: StreetJun
 
 
 def _movement(flow: CountConfig, vehicles: int, duration_s: float) -> MovementEstimate:
-    low, high = track_demand.poisson_interval(vehicles)
+    low, high = estimates.poisson_interval(vehicles)
     hours = duration_s / 3600.0
     count = flow.model_copy(update={"per_hour": round(vehicles / hours, 1)})
     return MovementEstimate(count, vehicles, low / hours, high / hours)

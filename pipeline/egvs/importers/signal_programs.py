@@ -6,7 +6,8 @@ groups as possible; write its states as phases. A cycle that was recorded has no
 recorded clearance times. Vehicle-actuated signals vary from cycle to cycle: the notes state medians and their
 intervals.
 
-A connection without a group is never stopped. Of two greens that cross, SUMO's right of way decides who waits ("g").
+A connection without a group is never stopped. Of two greens that cross, SUMO's right of way decides who waits ("g");
+where a program governs several junctions, whoever turns.
 
 World frame, metres, seconds.
 """
@@ -29,13 +30,16 @@ from egvs.formats import xml
 from egvs.formats.georeference import WorldFrame
 from egvs.importers.plain_network import NETCONVERT_FLAGS, NETWORK_FILE
 from egvs.importers.recorded_signals import GREEN, RED, YELLOW, RecordedSignals, SignalRecord
-from egvs.traffic import sumo, track_demand
-from egvs.traffic.track_demand import Estimate
+from egvs.traffic import estimates, sumo
+from egvs.traffic.estimates import Estimate
 
 NEAR_M = 6.0
 """A way of the file that assigns groups belongs to a connection if both its ends are nearer than this to its path."""
 
 STEP_S = 0.1
+MIN_CYCLE_S, MAX_CYCLE_S = 5.0, 600.0
+"""Shorter and longer times between two beginnings of green are no cycles."""
+
 MIN_YELLOW_S = 3.0
 """Yellow that is added where a recorded cycle ends in a green that the next one begins with red."""
 
@@ -129,13 +133,14 @@ def apply_signals(
         problem = f"no signal group governs a connection of the junction {node}"
         raise InputError(where, problem, "Check that the assignment of groups is for this junction.")
     used = {name: signals.records[name] for name in dict.fromkeys(groups.values())}
-    cycles = _cycles(used.values())
+    records = list(used.values())
+    cycles = _cycles(records)
     if not cycles:
         hint = "Record longer: two beginnings of green of one group."
         raise InputError(where, "no complete cycle of the signals is recorded", hint)
-    lengths = track_demand.median_of([cycle.length_s for cycle in cycles])
+    lengths = estimates.median_of([cycle.length_s for cycle in cycles])
     assert lengths is not None
-    cycle = _typical_cycle(cycles, lengths.value, used.values())
+    cycle = _typical_cycle(cycles, lengths.value, records)
     phases = _phases(junction, groups, used, cycle)
     text = _write_program(network, junction.program, phases)
     return SignalPlan(text, tuple(_notes(junction, groups, used, cycle, lengths)))
@@ -157,6 +162,7 @@ def _read_junction(path: Path, node: str) -> _Junction:
     junction = _Junction(programs.pop())
     shapes: dict[str, FloatArray] = {}
     governed: set[str] = set()
+    turning: set[int] = set()
     requests: dict[str, dict[int, set[int]]] = {}
     for element in xml.iter_elements(path, "net"):
         if element.tag == "edge":
@@ -171,9 +177,14 @@ def _read_junction(path: Path, node: str) -> _Junction:
             lanes = f"{start}_{element.attrib['fromLane']}", via, f"{end}_{element.attrib['toLane']}"
             path_m = np.vstack([shapes[lane] for lane in lanes if lane in shapes])
             junction.links.append(_Link(int(element.attrib["linkIndex"]), start, end, path_m))
+            if element.get("dir") != "s":
+                turning.add(junction.links[-1].index)
             governed.add(via.rsplit("_", 2)[0].removeprefix(":"))
     if governed == {node}:  # positions in the states are those of the requests only where it governs one junction
         junction.yields_to = requests[node]
+    else:
+        indices = {link.index for link in junction.links}
+        junction.yields_to = {index: indices - {index} for index in turning}
     return junction
 
 
@@ -214,13 +225,13 @@ def _assign_groups(links: Sequence[_Link], signals: RecordedSignals, frame: Worl
     return groups
 
 
-def _cycles(records: Sequence[SignalRecord] | Iterator[SignalRecord]) -> list[_Cycle]:
+def _cycles(records: Sequence[SignalRecord]) -> list[_Cycle]:
     """Return all recorded cycles, from each beginning of green to the next of the same group."""
     cycles = []
     for record in records:
         starts_s = record.green_starts_s
         cycles += [_Cycle(begin_s, end_s) for begin_s, end_s in itertools.pairwise(starts_s)]
-    return cycles
+    return [cycle for cycle in cycles if MIN_CYCLE_S <= cycle.length_s <= MAX_CYCLE_S]
 
 
 def _typical_cycle(cycles: Sequence[_Cycle], median_s: float, records: Sequence[SignalRecord]) -> _Cycle:
@@ -303,7 +314,7 @@ def _notes(
     )
     texts = []
     for name, record in sorted(records.items(), key=lambda item: (len(item[0]), item[0])):
-        green = track_demand.median_of(record.green_durations_s)
+        green = estimates.median_of(record.green_durations_s)
         offsets_s = [(start_s - cycle.begin_s) % cycle.length_s for start_s in record.green_starts_s]
         text = f"{name}: no complete green"
         if green is not None:
@@ -313,7 +324,8 @@ def _notes(
         ]
         text += f" from {(in_cycle_s or offsets_s)[0]:.1f} s" if offsets_s else ""
         texts.append(text)
-    yield f"green of each signal group, median and range, and its beginning in the cycle: {'; '.join(texts)}"
+    meaning = "median (95 % interval; the range where there are few), and its beginning in the cycle"
+    yield f"green of each signal group, {meaning}: {'; '.join(texts)}"
     free = len(junction.links) - len(groups)
     if free:
         yield f"{free} of {len(junction.links)} connections have no recorded signal; vehicles there give way"

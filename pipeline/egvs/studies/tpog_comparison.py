@@ -1,8 +1,8 @@
 r"""Compare the traffic of two runs: a recorded TPOG with a simulated one.
 
-Columns of voxels are assigned to the nearest lane in whose strip they are, and to bins of :data:`BIN_M` along it. With
-p(c) the share of frames in which the lowest voxels of column c are occupied, at whatever height most often, the
-occupancy of a bin is the mean of its columns.
+Columns of voxels are assigned to the nearest lane in whose strip they are, and to bins along it
+(:mod:`egvs.studies.lane_bins`). With p(c) the share of frames in which column c is occupied, at the height where that
+is most often, the occupancy of a bin is the mean of its columns.
 
 - **Distance** of a lane: the Jensen-Shannon distance (Endres and Schindelin 2003) between the two distributions Q of
   occupancy over its bins, each with the sum 1; M is their mean, logarithms are to base 2:
@@ -18,7 +18,7 @@ occupancy of a bin is the mean of its columns.
 Standard errors and biases come from the block jackknife over both records together
 (:mod:`egvs.scoring.standard_errors`). Entropy is biased low, and distance high, in short records.
 
-Only columns that the recording covered count. World frame, metres.
+Only columns that the recording covered count, except in the ranks: scores are those of the runs. World frame, metres.
 """
 
 from __future__ import annotations
@@ -29,13 +29,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import shapely
 
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray, Grid, IntArray
+from egvs.core.grid import FloatArray, Grid
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.report.basemap import network_file, roads_within, world_outlines
 from egvs.report.maps import Backdrop
@@ -43,20 +42,14 @@ from egvs.report.ranking import RankedSite, Ranking
 from egvs.report.svg_figures import extent
 from egvs.runs.stage_registry import recorded_digests
 from egvs.scenario.loading import scenario_from_dict
-from egvs.scoring.road_locations import LANE, TURN, RoadLocations, disambiguate
 from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, ScoreUncertainty
 from egvs.stages.base import StageContext
 from egvs.stages.inputs import open_folder
+from egvs.studies.lane_bins import LaneBins, column_centres_m, lane_bins, lane_distances, mean_groups, sum_groups
 from egvs.studies.paired_errors import SiteReplicates, read_replicates
 from egvs.studies.score_errors import rank_agreement, regret
 from egvs.traffic import network, recorded_tracks
 from egvs.world import geolocation
-
-BIN_M = 2.5
-"""Length of a bin along a lane."""
-
-MIN_BINS = 3
-"""A lane with fewer bins in the region is left out."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +122,7 @@ class TpogComparison:
     frames, blocks
         Number of frames of each, and of the groups of blocks that standard errors come from.
     covered_share
-        Share of the region's columns that the recording covered.
+        Share of the area of the region's lanes that the recording covered.
     lanes
         By occupancy in the recording, the busiest first.
     distance
@@ -155,29 +148,6 @@ class TpogComparison:
     entropy_bit: tuple[Measured, Measured, Measured]
     ranks: RankComparison | None
     backdrop: Backdrop
-
-
-@dataclass(frozen=True, eq=False)
-class LaneBins:
-    """Columns of the grid by lane.
-
-    Attributes
-    ----------
-    lane
-        Lane of each column, an index into ``names``, (nx * ny,) int64; -1 for none.
-    bin
-        Bin of each column, numbered over all lanes, (nx * ny,) int64; -1 for none.
-    lane_of_bin
-        Lane of each bin.
-    names, words
-        Id and description of each lane.
-    """
-
-    lane: IntArray
-    bin: IntArray
-    lane_of_bin: IntArray
-    names: tuple[str, ...]
-    words: tuple[str, ...]
 
 
 def compare_tpogs(recorded: Path, simulated: Path, progress: ProgressCallback = no_progress) -> TpogComparison:
@@ -206,9 +176,14 @@ def compare_tpogs(recorded: Path, simulated: Path, progress: ProgressCallback = 
     network_path = _network_file(runs)
     box = extent(tpogs[0].grid, ())
     backdrop = Backdrop(world_outlines(runs[0].world, box), roads_within(network_path, box))
-    bins = lane_bins(network.read_net_xml(network_path), tpogs[0].grid, covered)
+    roads = network.read_net_xml(network_path)
+    bins = lane_bins(roads, tpogs[0].grid, covered)
+    on_lane = lane_bins(roads, tpogs[0].grid, np.ones_like(covered)).lane >= 0
+    covered_share = float(covered[on_lane].mean()) if on_lane.any() else 0.0
+    if not len(bins.names):
+        raise InputError(recorded, "no lane is in the part of the region that the recording covered", "Check [roi].")
     statistics = [_Statistics.of(jackknife, bins, covered, tpogs[0].grid) for jackknife in jackknives]
-    both = _Pair(*statistics, tuple(jackknives[0].groups), tuple(jackknives[1].groups))
+    both = _Pair(statistics[0], statistics[1], jackknives[0].groups, jackknives[1].groups)
 
     occupancy = [both.single(which, lambda each: each.occupancy) for which in (0, 1)]
     entropy = [both.single(which, lambda each: each.lane_entropy_bit) for which in (0, 1)]
@@ -229,7 +204,7 @@ def compare_tpogs(recorded: Path, simulated: Path, progress: ProgressCallback = 
     difference = both.joint(lambda first, second: second.entropy_bit - first.entropy_bit)[0]
     return TpogComparison(
         (recorded, simulated), tpogs, (tpogs[0].frames, tpogs[1].frames),
-        (both.n_groups(0), both.n_groups(1)), float(covered.mean()), tuple(lanes), distance, (mean[0], mean[1]),
+        (both.n_groups(0), both.n_groups(1)), covered_share, tuple(lanes), distance, (mean[0], mean[1]),
         (totals[0], totals[1], difference), _compare_ranks(recorded, simulated, progress), backdrop,
     )  # fmt: skip
 
@@ -262,14 +237,8 @@ def _covered_columns(recorded: StageContext, grid: Grid) -> FloatArray:
         world = geolocation.scenario_georeference(recorded.scenario)
         coverage = recorded_tracks.read_recorded_tracks(recorded.scenario, world).coverage
         if coverage is not None:
-            covered = coverage.contains(_column_centres(grid)).astype(np.float64)
+            covered = coverage.contains(column_centres_m(grid)).astype(np.float64)
     return covered
-
-
-def _column_centres(grid: Grid) -> FloatArray:
-    """Return x, y of the middle of each column, (nx * ny, 2), world frame."""
-    axes = [grid.origin_m[axis] + (np.arange(grid.shape[axis]) + 0.5) * grid.voxel_m for axis in (0, 1)]
-    return np.column_stack([values.ravel() for values in np.meshgrid(*axes, indexing="ij")])
 
 
 def _network_file(runs: Sequence[StageContext]) -> Path:
@@ -279,58 +248,6 @@ def _network_file(runs: Sequence[StageContext]) -> Path:
             return path
     hint = "Set traffic.roads in its scenario, and repeat egvs run."
     raise InputError(runs[0].folder.path, "neither run has a network, so there are no lanes to compare", hint)
-
-
-def lane_bins(roads: network.Network, grid: Grid, covered: FloatArray) -> LaneBins:
-    """Assign the columns of a grid to lanes and bins.
-
-    Parameters
-    ----------
-    roads
-        The network.
-    grid
-        The grid.
-    covered
-        1 for columns that count, (nx * ny,).
-    """
-    locations = RoadLocations.of(roads, grid.roi)
-    centres_m = _column_centres(grid)
-    lane = np.full(len(centres_m), -1, dtype=np.int64)
-    along_m = np.full(len(centres_m), np.nan)
-    nearest_m = np.full(len(centres_m), np.inf)
-    places = []
-    for number, middle in enumerate(locations.lanes):
-        owner = locations.locations_of_lane[number][0]
-        places.append(owner if locations.locations[owner].by in (LANE, TURN) else -1)
-        line = shapely.LineString(middle.points_m)
-        low_m, high_m = middle.points_m.min(axis=0) - middle.width_m, middle.points_m.max(axis=0) + middle.width_m
-        near = np.flatnonzero(((centres_m >= low_m) & (centres_m <= high_m)).all(axis=1) & (covered > 0))
-        if not near.size or line.length == 0.0:
-            continue
-        points = shapely.points(centres_m[near])
-        distance_m = shapely.distance(line, points)
-        better = (distance_m <= middle.width_m / 2.0) & (distance_m < nearest_m[near])
-        lane[near[better]], nearest_m[near[better]] = number, distance_m[better]
-        along_m[near[better]] = shapely.line_locate_point(line, points[better])
-
-    place = np.where(lane >= 0, np.array([*places, -1])[lane], -1)
-    on_place = np.flatnonzero(place >= 0)
-    keys = np.column_stack([place[on_place], lane[on_place], np.floor(along_m[on_place] / BIN_M)]).astype(np.int64)
-    unique, number_of = np.unique(keys, axis=0, return_inverse=True)
-    used, lane_of_bin, counts = np.unique(unique[:, 0], return_inverse=True, return_counts=True)
-    is_long = counts[lane_of_bin] >= MIN_BINS
-    new_bin = np.where(is_long, np.cumsum(is_long) - 1, -1)
-    kept = np.flatnonzero(counts >= MIN_BINS)
-    new_lane = np.full(used.size, -1, dtype=np.int64)
-    new_lane[kept] = np.arange(kept.size)
-    column_lane, column_bin = np.full(lane.size, -1, dtype=np.int64), np.full(lane.size, -1, dtype=np.int64)
-    column_bin[on_place] = new_bin[number_of.ravel()]
-    column_lane[on_place] = new_lane[lane_of_bin][number_of.ravel()]
-    described = disambiguate([locations.locations[index] for index in used[kept]])
-    return LaneBins(
-        column_lane, column_bin, new_lane[lane_of_bin][is_long],
-        tuple(each.name for each in described), tuple(each.words for each in described),
-    )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -367,10 +284,10 @@ class _Statistics:
         on_lane = bins.lane >= 0
         lanes = bins.lane[on_lane]
         return cls(
-            _means(columns[on_lane], bins.bin[on_lane], bins.lane_of_bin.size),
-            _means(columns[on_lane], lanes, len(bins.names)),
+            mean_groups(columns[on_lane], bins.bin[on_lane], bins.lane_of_bin.size),
+            mean_groups(columns[on_lane], lanes, len(bins.names)),
             columns[on_lane].mean(axis=0, keepdims=True),
-            _sums(entropy[on_lane], lanes, len(bins.names)),
+            sum_groups(entropy[on_lane], lanes, len(bins.names)),
             entropy[covered > 0].sum(axis=0, keepdims=True),
         )
 
@@ -381,37 +298,6 @@ class _Statistics:
             self.bins[:, part], self.occupancy[:, part], self.mean_occupancy[:, part],
             self.lane_entropy_bit[:, part], self.entropy_bit[:, part],
         )  # fmt: skip
-
-
-def _sums(values: FloatArray, group: IntArray, n_groups: int) -> FloatArray:
-    sums = np.zeros((n_groups, values.shape[1]))
-    np.add.at(sums, group, values)
-    return sums
-
-
-def _means(values: FloatArray, group: IntArray, n_groups: int) -> FloatArray:
-    means: FloatArray = _sums(values, group, n_groups) / np.bincount(group, minlength=n_groups)[:, None]
-    return means
-
-
-def lane_distances(first: FloatArray, second: FloatArray, lane_of_bin: IntArray) -> FloatArray:
-    """Return the Jensen-Shannon distance of each lane, (n_lanes, m); NaN for a lane without traffic.
-
-    Parameters
-    ----------
-    first, second
-        Occupancy of the bins, (n_bins, m) each.
-    lane_of_bin
-        Lane of each bin, (n_bins,).
-    """
-    n_lanes = int(lane_of_bin.max(initial=-1)) + 1
-    with np.errstate(divide="ignore", invalid="ignore"):
-        p, q = (values / _sums(values, lane_of_bin, n_lanes)[lane_of_bin] for values in (first, second))
-        middle = (p + q) / 2.0
-        terms = [np.where(part == 0.0, 0.0, part * np.log2(part / middle)) for part in (p, q)]
-    divergence = _sums((terms[0] + terms[1]) / 2.0, lane_of_bin, n_lanes)
-    distances: FloatArray = np.sqrt(np.clip(divergence, 0.0, 1.0))
-    return distances
 
 
 @dataclass(frozen=True, eq=False)

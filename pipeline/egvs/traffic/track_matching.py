@@ -143,7 +143,7 @@ def match_tracks(boxes: ResampledTracks, period_s: float, network: Network) -> M
     for start, end in itertools.pairwise(bounds.tolist()):
         for row, number, along_m in _most_likely_path(near.of_rows(start, end), costs):
             lane[start + row], at_m[start + row] = number, along_m
-    time_s = boxes.frame[order] * period_s
+    time_s: FloatArray = boxes.frame[order].astype(np.float64) * period_s
     return MatchedTracks(lanes, following, track, time_s, lane, at_m, _speeds(track, time_s, xy_m))
 
 
