@@ -1,4 +1,4 @@
-"""Do recorded tracks lie on the lanes of the network?
+"""Compare recorded tracks with the lanes of the network.
 
 The centre of a moving motor vehicle lies on a lane when the nearest centre line is at most half of the lane's width
 away. If positions do not fit, a shift and a rotation about their middle are sought that bring them nearer: they
