@@ -2,9 +2,7 @@ r"""Fit elevations, azimuths and offsets of a sensor's channels, and sort return
 
 The model of a return of channel c in column k, at the measured range r:
 
-.. math::
-
-    \rho = \rho_0 + r \cos e_c, \qquad z = z_c + \rho \tan e_c, \qquad \alpha = \alpha_c + s\, k\, \Delta
+.. math:: \rho = \rho_0 + r \cos e_c, \qquad z = z_c + \rho \tan e_c, \qquad \alpha = \alpha_c + s\, k\, \Delta
 
 with the elevation e, the vertical offset :math:`z_c` of the channel's cone on the axis (fitted together:
 :func:`egvs.sensor_fit.sweep_layout.fit_cone`), the azimuth offset :math:`\alpha_c`, the step :math:`\Delta` and the
