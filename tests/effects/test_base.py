@@ -576,7 +576,7 @@ BAD_TRAFFIC = {
     "a wrong word": ("effects.articulated.kind=1", r"articulated\.kind: unknown key. Did you mean kinds\?"),
     "people beside a finished file": (
         "effects.pedestrians_bicycles.bicycles_per_h=9",
-        r"cannot be added to a finished FCD file",
+        r"cannot be added to recorded traffic",
     ),
 }
 

@@ -49,7 +49,7 @@ def test_statuses_of_effects_in_plain_scene(mini: Path) -> None:
     assert statuses["rain"][1].startswith("the weather decides; by its formula, ")
     assert statuses["foliage"][1] == "not called for: there is no closed tree crown"
     assert "cannot act here: rated_range_m is missing" in statuses["range_limit"][1]
-    assert "pedestrians and bicycles cannot be added to a finished FCD file" in statuses["pedestrians_bicycles"][1]
+    assert "pedestrians and bicycles cannot be added to recorded traffic" in statuses["pedestrians_bicycles"][1]
     assert "no vehicle type has more than one part" in statuses["articulated"][1]
     assert "flat" in statuses["slope"][1] or "no network" in statuses["slope"][1] or "relief" in statuses["slope"][1]
 
@@ -218,7 +218,7 @@ def test_effect_with_missing_input_is_refused(mini: Path) -> None:
     assert statuses["range_limit"][0] == "refused"
     assert "rated_range_m is missing" in statuses["range_limit"][1]
     assert statuses["pedestrians_bicycles"][0] == "refused"
-    assert "finished FCD file" in statuses["pedestrians_bicycles"][1]
+    assert "recorded traffic" in statuses["pedestrians_bicycles"][1]
 
 
 @pytest.mark.slow

@@ -71,7 +71,7 @@ def test_every_option_is_a_valid_scenario(junction: Path) -> None:
 
 def test_finished_file_has_no_options(mini: Path) -> None:
     assert overrides_by_name(mini) == {}
-    assert reasons(mini) == dict.fromkeys(("SUMO's step", "sublanes", "routing"), "the traffic is a finished file")
+    assert reasons(mini) == dict.fromkeys(("SUMO's step", "sublanes", "routing"), "the traffic was recorded")
 
 
 def test_given_routes_leave_out_routing_only(junction: Path) -> None:
@@ -87,4 +87,4 @@ def test_given_routes_leave_out_routing_only(junction: Path) -> None:
 
 def test_study_of_a_finished_file_names_what_is_left_out(mini: Path, tmp_path: Path) -> None:
     study = run_study(mini, [], tmp_path / "out", values=ONLY_TRAFFIC)
-    assert study.skipped == dict.fromkeys(("SUMO's step", "sublanes", "routing"), "the traffic is a finished file")
+    assert study.skipped == dict.fromkeys(("SUMO's step", "sublanes", "routing"), "the traffic was recorded")

@@ -152,7 +152,7 @@ def test_rejects_wrong_input(town, tmp_path, prepare, keys, error, message):
 
 def test_rejects_traci_with_finished_file(tmp_path):
     (tmp_path / "f.csv").write_text("x")
-    with pytest.raises(InputError, match="--traci: the scenario uses a finished FCD file"):
+    with pytest.raises(InputError, match="--traci: the traffic of the scenario was recorded before"):
         run_stage(traffic, scenario(tmp_path, fcd="f.csv"), tmp_path, traci=("localhost", 1))
 
 

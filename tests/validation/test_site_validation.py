@@ -82,7 +82,7 @@ def test_warns_if_traffic_is_not_held_out(validated):
     warning = next(warning for warning in validated[2].warnings if warning.rule == "traffic not held out")
     assert "sites are evaluated with the frames that the TPOG was computed from" in str(warning)
     metadata = parquet.read_metadata(validated[1] / "detection.parquet", "detection")
-    assert any(entry["where"] == "scenario.toml: traffic.fcd" for entry in metadata["warnings"])  # wherever that is
+    assert any(entry["where"] == "scenario.toml: traffic" for entry in metadata["warnings"])  # wherever that is
 
 
 @pytest.mark.slow
