@@ -338,3 +338,24 @@ def test_recorded_and_simulated_pedestrians_exclude_each_other(mini: Path, run_e
     code, _, err = run_egvs("traffic", mini, "--out", tmp_path / "run", *options)
     assert code == 2
     assert "pedestrians are recorded, and an effect simulates others" in err
+
+
+SLOPING = """<net version="1.20">
+    <edge id="up" from="a" to="b"><lane id="up_0" index="0" speed="9" length="100" shape="-50,-2,0 50,-2,10"/></edge>
+    <edge id="down" from="b" to="a"><lane id="down_0" index="0" speed="9" length="100" shape="50,2,10 -50,2,0"/></edge>
+    <junction id="a" type="dead_end" x="-50" y="0" z="0" incLanes="down_0" intLanes="" shape="-50,-4,0 -50,4,0"/>
+    <junction id="b" type="dead_end" x="50" y="0" z="10" incLanes="up_0" intLanes="" shape="50,4,10 50,-4,10"/>
+</net>
+"""
+
+
+def test_tracks_stand_on_a_sloping_road(mini: Path, run_egvs, tmp_path: Path) -> None:
+    """The road rises by a tenth: at x = 20 m it is at z = 7 m. A box of 4.5 m is pitched by 5.7 degrees."""
+    rows = [row for row in boxes_of_fcd() if row[0] == "east"]
+    use_tracks(mini, interaction_csv(rows), 'roads = "roads.net.xml"\n')
+    (mini / "roads.net.xml").write_text(SLOPING)
+    assert run_egvs("traffic", mini, "--out", tmp_path / "run")[0] == 0
+    table = pq.read_table(tmp_path / "run" / "trajectories.parquet")
+    np.testing.assert_allclose(table["pitch_rad"].to_numpy(), math.atan(0.1), atol=2e-3)
+    centre_m = 5.0 + 0.1 * table["x_m"].to_numpy() + 0.75 * math.cos(math.atan(0.1))
+    np.testing.assert_allclose(table["z_m"].to_numpy(), centre_m, atol=0.05)

@@ -5,7 +5,7 @@ tracks, compute their boxes at the frames, and leave out those that the recordin
 way of a finished FCD file: as rows with a front bumper, an angle, and a vehicle type of their size
 (:mod:`egvs.traffic.fcd`).
 
-Tracks stand on the ground: heights of a recording are not used, because its zero is rarely that of the map.
+Tracks stand on the road: heights of a recording are not used, because its zero is rarely that of the map.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from egvs.tracks.sizes import CLASS_SIZES, class_sizes
 from egvs.tracks.track_readers import TrackSource
 from egvs.traffic import sumo_folder, track_alignment
 from egvs.traffic.fcd import FCD_SCHEMA, FrameWindow
+from egvs.traffic.network import Network
 from egvs.traffic.track_alignment import Alignment
 from egvs.traffic.vehicle_boxes import VehicleSize
 
@@ -63,6 +64,8 @@ class RecordedTracks:
         Number of boxes outside the coverage, which are left out.
     alignment
         How well they fit the lanes; None without a network.
+    roads
+        The network, whose heights the boxes get; z = 0 without one.
     """
 
     window: FrameWindow
@@ -71,6 +74,7 @@ class RecordedTracks:
     coverage: Coverage | None
     outside: int
     alignment: Alignment | None
+    roads: Network | None = None
 
     @property
     def type_names(self) -> list[str]:
@@ -107,14 +111,17 @@ class RecordedTracks:
             rows = slice(*np.searchsorted(boxes.frame, [first, first + FRAMES_EACH]))
             track, yaw_rad = boxes.track[rows], boxes.yaw_rad[rows]
             zeros = np.zeros(track.size)
+            front_m = np.column_stack([
+                boxes.x_m[rows] + half_m[track] * np.cos(yaw_rad), boxes.y_m[rows] + half_m[track] * np.sin(yaw_rad)
+            ])  # fmt: skip
+            heights_m = zeros if self.roads is None else track_alignment.road_heights(self.roads, front_m)
             yield pa.table(
                 [
                     first_ms + boxes.frame[rows] * self.window.period_ms,
                     names.take(pa.array(track)),
                     type_names.take(pa.array(track)),
-                    boxes.x_m[rows] + half_m[track] * np.cos(yaw_rad),
-                    boxes.y_m[rows] + half_m[track] * np.sin(yaw_rad),
-                    zeros,
+                    *front_m.T,
+                    heights_m,
                     90.0 - np.rad2deg(yaw_rad),
                     zeros,
                     boxes.speed_m_s[rows],
@@ -191,7 +198,8 @@ def read_recorded_tracks(scenario: Scenario, world: Georeference) -> RecordedTra
         inside = area.contains(np.column_stack([boxes.x_m, boxes.y_m]))
         boxes = boxes.select(inside)
     alignment = None if roads is None else track_alignment.align(_moving_vehicles(cleaned, boxes), roads)
-    return RecordedTracks(replace(window, skip_ms=0), cleaned, boxes, area, int((~inside).sum()), alignment)
+    outside = int((~inside).sum())
+    return RecordedTracks(replace(window, skip_ms=0), cleaned, boxes, area, outside, alignment, roads)
 
 
 def read_recorded_pedestrians(scenario: Scenario, world: Georeference) -> RecordedTracks:
@@ -220,7 +228,7 @@ def read_recorded_pedestrians(scenario: Scenario, world: Georeference) -> Record
     cleaned = cleaning.clean_tracks(tracks.select(is_vulnerable), class_sizes(scenario.traffic))
     first_s = float(np.nanmin(tracks.time_s))
     boxes = resampling.resample(cleaned, first_s, window.period_ms / 1000.0, window.count, scenario.traffic.track_gap_s)
-    return RecordedTracks(window, cleaned, boxes, None, 0, None)
+    return RecordedTracks(window, cleaned, boxes, None, 0, None, sumo_folder.read_network(scenario))
 
 
 def pedestrian_warnings(where: str) -> Iterator[Diagnostic]:

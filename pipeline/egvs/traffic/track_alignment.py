@@ -140,6 +140,25 @@ def lane_points(roads: Network, region: Roi) -> FloatArray:
     return points_inside_m
 
 
+def road_heights(roads: Network, xy_m: FloatArray) -> FloatArray:
+    """Return the height of the nearest lane for cars below each position (n, 2), z in the world frame, (n,)."""
+    lines_m = [lane.shape_m for edge in roads.edges for lane in edge.lanes if lane.permission.admits(_MOTOR_CLASS)]
+    has_heights = any(line_m[:, 2].any() for line_m in lines_m)
+    if not has_heights or not len(xy_m):
+        return np.zeros(len(xy_m))
+    points_m = np.concatenate([_divide(line_m) for line_m in lines_m])
+    _, nearest = KDTree(points_m[:, :2]).query(xy_m)
+    heights_m: FloatArray = points_m[nearest, 2]
+    return heights_m
+
+
+def _divide(line_m: FloatArray) -> FloatArray:
+    """Return points every :data:`_SPACING_M` on a line (n, 2) or (n, 3)."""
+    along_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line_m[:, :2], axis=0).T))])
+    at_m = np.arange(0.0, along_m[-1], _SPACING_M)
+    return np.column_stack([np.interp(at_m, along_m, column) for column in line_m.T])
+
+
 def _centre_lines(roads: Network) -> tuple[FloatArray, FloatArray]:
     """Return points every :data:`_SPACING_M` of the lanes for cars, (n, 2), and half of the width at each."""
     points, half_widths = [np.empty((0, 2))], [np.empty(0)]
@@ -147,9 +166,6 @@ def _centre_lines(roads: Network) -> tuple[FloatArray, FloatArray]:
         for lane in edge.lanes:
             if not lane.permission.admits(_MOTOR_CLASS) or edge.function in ("crossing", "walkingarea"):
                 continue
-            line_m = lane.shape_m[:, :2]
-            along_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line_m, axis=0).T))])
-            at_m = np.arange(0.0, along_m[-1], _SPACING_M)
-            points.append(np.column_stack([np.interp(at_m, along_m, line_m[:, axis]) for axis in (0, 1)]))
-            half_widths.append(np.full(at_m.size, (lane.width_m or LANE_WIDTH_M) / 2.0))
+            points.append(_divide(lane.shape_m[:, :2]))
+            half_widths.append(np.full(len(points[-1]), (lane.width_m or LANE_WIDTH_M) / 2.0))
     return np.concatenate(points), np.concatenate(half_widths)
