@@ -28,6 +28,7 @@ from egvs.scenario import loading
 from egvs.sensors import sites
 from egvs.world.terrain import TerrainSurface
 from tests.importers.creation import create_scenario
+from tests.traffic.helpers import netgenerate
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 ROUNDABOUT = SCENARIOS / "roundabout" / "network.net.xml"
@@ -96,9 +97,21 @@ def test_network_has_its_own_side_and_sidewalks(tmp_path: Path, option: str) -> 
     assert not (tmp_path / "made").exists()
 
 
-def test_network_is_not_cut(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--surroundings"):
-        create_scenario(tmp_path / "made", ROUNDABOUT, surroundings_m=200.0)
+def test_network_is_cut_on_request(tmp_path: Path) -> None:
+    """What is left in the square is within a centimetre of where it was; the junction and its region are the same."""
+    grid = netgenerate(tmp_path / "map", "--grid", "--grid.number", "4", "--grid.length", "120", name="grid.net.xml")
+    whole = create_scenario(tmp_path / "whole", grid, at=(120.0, 120.0))
+    cut = create_scenario(tmp_path / "cut", grid, at=(120.0, 120.0), surroundings_m=130.0)
+    assert (cut.junction.id, cut.roi) == (whole.junction.id, whole.roi)
+    before, after = ({edge.id: edge for edge in made.streets.network.edges} for made in (whole, cut))
+    assert after.keys() < before.keys()
+    for name, edge in after.items():
+        for lane, lane_before in zip(edge.lanes, before[name].lanes, strict=True):
+            near = (np.abs(lane.shape_m[:, :2] - 120.0) < 130.0).all(
+                axis=1
+            )  # roads end where their junction is cut off
+            np.testing.assert_allclose(lane.shape_m[near], lane_before.shape_m[near], atol=0.011)
+    assert "The network is cut 130 m from the junction." in cut.notes
 
 
 def test_heights_above_sea_level_are_lowered_to_the_ground() -> None:

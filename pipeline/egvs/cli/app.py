@@ -581,8 +581,8 @@ def new(
         str | None,
         typer.Option(
             metavar="METRES",
-            help="Simulate the streets within this radius of the junction, or 'all'; 300 by default (OpenStreetMap"
-            " only: other maps are not cut).",
+            help="Simulate the streets within this radius of the junction, or 'all'; 300 by default for OpenStreetMap,"
+            " 'all' for other maps.",
         ),
     ] = None,
     traffic: Annotated[

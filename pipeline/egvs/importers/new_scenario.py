@@ -189,7 +189,7 @@ class NewScenarioOptions:
         Whether the network gets sidewalks and crossings, which pedestrians need.
     surroundings_m
         Distance from the junction at which streets end; inf for the complete map. By default,
-        :data:`openstreetmap.SURROUNDINGS_M`; other maps than OpenStreetMap are not cut.
+        :data:`openstreetmap.SURROUNDINGS_M` for OpenStreetMap, and inf for other maps.
     traffic
         A key of :data:`assumed_traffic.TRAFFIC_LEVELS`: the share of the flow that the junction carries. Or vehicles
         per hour.

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
 from egvs.core import files
-from egvs.core.errors import InputError
+from egvs.core.errors import InputError, RunError
 from egvs.importers import junctions
 from egvs.importers.junctions import StreetJunction, Streets
 from egvs.importers.map_parts import RoadMap
 from egvs.importers.osm_network import NETWORK_FILE
+from egvs.traffic import sumo
+
+_GENERATED = re.compile(r"<!-- generated on .*?-->\n*", re.DOTALL)
+"""Date and paths that netconvert writes at the top of a network."""
 
 
 class RoadSource(Protocol):
@@ -49,10 +54,11 @@ class RoadSource(Protocol):
 
 @dataclass(frozen=True)
 class NetworkRoads:
-    """Roads of a map that is converted as a whole; they are neither cut nor divided by level."""
+    """Roads of a map that is converted as a whole; they are not divided by level, and cut on request only."""
 
     road_map: RoadMap
     streets: Streets
+    path: Path
 
     @classmethod
     def read(cls, road_map: RoadMap, path: Path) -> NetworkRoads:
@@ -73,7 +79,7 @@ class NetworkRoads:
         with files.temporary_folder() as folder:
             (folder / NETWORK_FILE).write_text(road_map.network, encoding="utf-8")
             try:
-                return cls(road_map, junctions.read_streets(folder / NETWORK_FILE))
+                return cls(road_map, junctions.read_streets(folder / NETWORK_FILE), path)
             except InputError as error:
                 raise InputError(path, f"the network cannot be used: {error}", "Check the roads of the map.") from None
 
@@ -98,10 +104,21 @@ class NetworkRoads:
         return self
 
     def around(self, junction: StreetJunction, radius_m: float | None) -> NetworkRoads:
-        """Return all roads; InputError if a radius is given."""
-        del junction
-        if radius_m is not None and math.isfinite(radius_m):
-            problem = "only roads from OpenStreetMap can be cut"
-            hint = "Leave it out, or cut the network with netconvert --keep-edges.in-boundary."
-            raise InputError("--surroundings", problem, hint)
-        return self
+        """Return the roads that reach into a square around a junction, in the same frame; all if the radius is None."""
+        if radius_m is None or math.isinf(radius_m):
+            return self
+        (x_m, y_m), name = junction.at_m, "whole.net.xml"
+        square = f"{x_m - radius_m:.2f},{y_m - radius_m:.2f},{x_m + radius_m:.2f},{y_m + radius_m:.2f}"
+        flags = ["-s", name, "--keep-edges.in-boundary", square, "--offset.disable-normalization", "true"]
+        with files.temporary_folder() as folder:
+            (folder / name).write_text(self.network, encoding="utf-8")
+            try:
+                sumo.run_netconvert(flags, folder, NETWORK_FILE)
+            except RunError as error:
+                hint = "Use another radius, or --surroundings all."
+                raise InputError("--surroundings", f"netconvert cannot cut the network: {error}", hint) from None
+            network = (folder / NETWORK_FILE).read_text(encoding="utf-8")
+        note = f"The network is cut {radius_m:g} m from the junction."
+        network = _GENERATED.sub("", network, count=1)
+        road_map = replace(self.road_map, network=network, notes=(*self.road_map.notes, note))
+        return NetworkRoads.read(road_map, self.path)
