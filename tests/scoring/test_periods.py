@@ -351,7 +351,7 @@ def test_the_world_frame_counts_where_a_period_alone_is_a_finished_file(
         ("begin_s = 12", "begin = 12", "begin"),
         ("blocks = 4", "blocks = 40000", "blocks = 40000 gives 80000 blocks in all periods, more than 65535"),
         ("length_s = 8", "length_s = 80", "frames"),
-        ("length_s = 8", 'fcd = "a"\nsumocfg = "b"', "expected sumocfg or fcd, got both"),
+        ("length_s = 8", 'fcd = "a"\nsumocfg = "b"', "expected one of sumocfg, fcd, tracks, got sumocfg and fcd"),
         (
             "length_s = 8",
             "vehicles = 5",
