@@ -155,8 +155,8 @@ def wait_for_release(job: Job, _settings: object) -> None:
 
 
 def count_tasks(dask_worker: Any) -> int:
-    """Return the number of tasks that run on a worker or wait there; called by Dask on each worker."""
-    return len(dask_worker.state.tasks)
+    """Return the number of tasks of this test that run on a worker or wait there; called by Dask on each worker."""
+    return sum(str(key).startswith("wait_for_release") for key in dask_worker.state.tasks)
 
 
 @pytest.mark.usefixtures("in_process_cluster")
