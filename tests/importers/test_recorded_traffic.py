@@ -28,7 +28,7 @@ def write_tracks(path: Path, duration_s: float = 10.0, x_m: float = 0.0, y_m: fl
     return path
 
 
-def test_companions_are_found_and_copied(tmp_path: Path) -> None:
+def test_copies_companion_files(tmp_path: Path) -> None:
     tracks = write_tracks(tmp_path / "vehicle_tracks_000.csv")
     meta = tmp_path / "meta_data.csv"
     meta.write_text("id,originLat,originLon\n000,49.0,8.4\n")

@@ -37,6 +37,15 @@ def test_voxels_on_the_way() -> None:
     assert set(iz.tolist()) == {0, 1, 2}
 
 
+def test_gap_that_leads_far_away_is_cut_at_the_grid() -> None:
+    """A wrong row at the origin of UTM: 5,600 km away."""
+    near, far = (unknown(gap([0, 5], [14.0, -0.5], [end_m, -0.5])).gaps[0] for end_m in (60.0, 5.6e6))
+    np.testing.assert_array_equal(far.cells, near.cells)
+    assert unknown(gap([0, 5], [500.0, 0.0], [5.6e6, 0.0])).gaps[0].cells.size == 0
+    standing = unknown(gap([0, 5], [14.0, -0.5], [14.0, -0.5])).gaps[0]
+    assert standing.cells.size == 4 * 3 * 3
+
+
 def test_share_is_that_of_the_known_frames() -> None:
     """Unknown in 20 of 100 frames, occupied in 40 of the 80 others: 50 % of 100 frames."""
     counts = block(40)

@@ -32,7 +32,7 @@ def test_rows_without_time_or_position_are_dropped_and_counted() -> None:
     assert (cleaned.report.rows, cleaned.report.dropped_rows) == (4, 2)
 
 
-def test_first_of_two_rows_at_one_time_is_kept() -> None:
+def test_drops_second_row_at_same_time() -> None:
     cleaned = clean(make_tracks(("a", "car", 0.0, 0.0, 0.0), ("a", "car", 0.0, 9.0, 0.0), ("a", "car", 0.1, 1.0, 0.0)))
     np.testing.assert_array_equal(cleaned.x_m, [0.0, 1.0])
     assert cleaned.report.duplicates == 1
@@ -95,10 +95,21 @@ def test_heading_against_the_motion_is_turned() -> None:
     assert slow.report.flipped_headings == 0
 
 
-def test_given_headings_are_kept() -> None:
+def test_recorded_headings_are_unchanged() -> None:
     cleaned = clean(make_tracks(*straight("a", "car", [0.0, 0.1], 10.0), yaw_rad=[0.2, 0.3]))
     np.testing.assert_array_equal(cleaned.yaw_rad, [0.2, 0.3])
     assert cleaned.report.headings_given == 2
+
+
+def test_recorded_heights_are_reported() -> None:
+    """Centres at 100.75 m, and one 1 m higher, of boxes of 1.5 m: bottoms at 100 m; the median deviation is 0."""
+    rows = straight("a", "car", [0.0, 0.1, 0.2], 10.0)
+    tracks = make_tracks(*rows, z_m=[100.75, 100.75, 101.75], height_m=[1.5] * 3)
+    report = clean(tracks).report
+    assert (report.rows_with_height, report.bottom_height_m, report.height_scatter_m) == (3, 100.0, 0.0)
+    report = clean(make_tracks(*rows, z_m=[100.75, 100.95, 100.55], height_m=[1.5] * 3)).report
+    assert report.height_scatter_m == pytest.approx(1.4826 * 0.2, abs=1e-3)
+    assert clean(make_tracks(*rows)).report.rows_with_height == 0
 
 
 def test_usual_step_is_the_median() -> None:

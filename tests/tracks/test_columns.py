@@ -119,7 +119,7 @@ def test_rows_of_keys() -> None:
     assert_one_message(lambda: table("7", "7").rows_of([], "a", PATH), "t.csv: line 3: a: '7' occurs twice")
 
 
-def test_companions_are_found_plain_or_gzipped(tmp_path: Path) -> None:
+def test_companion_may_be_gzipped(tmp_path: Path) -> None:
     (tmp_path / "07_meta.csv.gz").touch()
     for name in ("07_tracks.csv", "07_tracks.csv.gz"):
         assert columns.companion(tmp_path / name, "_tracks.csv", "_meta.csv").name == "07_meta.csv.gz"

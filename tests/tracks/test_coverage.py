@@ -27,6 +27,9 @@ def square(x0_m: float, y0_m: float, x1_m: float, y1_m: float) -> dict[str, obje
     return feature({"type": "Polygon", "coordinates": [ring]})
 
 
+BOW_TIE = feature({"type": "Polygon", "coordinates": [[[0, 0], [9, 9], [9, 0], [0, 9], [0, 0]]]})
+
+
 def write(folder: Path, *features: dict[str, object], crs: str | None = None) -> Path:
     path = folder / "coverage.geojson"
     path.write_text(collection(*features, crs=crs))
@@ -43,7 +46,7 @@ def rectangle_of_tracks(vanish_at_m: float | None = None) -> CleanTracks:
     return clean_tracks(make_tracks(*rows), CLASS_SIZES)
 
 
-def test_given_area_is_read(tmp_path: Path) -> None:
+def test_reads_coverage_polygon(tmp_path: Path) -> None:
     """Half of a region of 100 m x 50 m."""
     area = coverage.read(write(tmp_path, square(0, 0, 50, 50)), WORLD, REGION, NO_LANES)
     assert area.share == pytest.approx(0.5)
@@ -75,13 +78,14 @@ def test_degrees_are_converted(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("[]", "is no GeoJSON FeatureCollection"),
+        ("[]", "expected a GeoJSON FeatureCollection"),
         ("{", "is not valid JSON"),
         (json.dumps({"features": [], "crs": None}), "contains no valid polygon"),
         (collection(feature({"type": "Point", "coordinates": [1, 2]})), "contains no valid polygon"),
         (collection(feature({"type": "Polygon", "coordinates": [[[0, 0], [1]]]})), "feature 0"),
+        (collection(BOW_TIE, square(0, 0, 5, 9)), "contains no valid polygon"),
         (collection(square(200, 0, 300, 50)), "covers no part of the region"),
-        (collection(feature({"type": "Polygon", "coordinates": [[[0, 0], [9, 9], [9, 0], [0, 9], [0, 0]]]})), "valid"),
+        (collection(BOW_TIE), "contains no valid polygon"),
     ],
 )
 def test_rejects_damaged_file(tmp_path: Path, content: str, message: str) -> None:

@@ -87,8 +87,7 @@ def less_memory(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_some_mutants(tmp_path: Path, kind: str) -> None:
-    read, rejected = read_mutants(tmp_path, kind, range(12))
-    assert read + rejected == 12
+    _, rejected = read_mutants(tmp_path, kind, range(12))
     assert rejected > 0
 
 
@@ -96,5 +95,5 @@ def test_some_mutants(tmp_path: Path, kind: str) -> None:
 @pytest.mark.parametrize("kind", KINDS)
 def test_200_mutants(tmp_path: Path, kind: str) -> None:
     read, rejected = read_mutants(tmp_path, kind, range(200))
-    assert read + rejected == 200
+    assert read > 0
     assert rejected > 20

@@ -114,7 +114,7 @@ def test_labels_in_common_road_have_z_at_bottom(tmp_path: Path) -> None:
     assert only_box(path)[3] == 0.75
 
 
-def test_headings_of_zero_are_not_given(tmp_path: Path) -> None:
+def test_zero_headings_are_missing(tmp_path: Path) -> None:
     """Predictions saved by TUMTraf's development kit have yaw 0."""
     objects = {str(n): tumtraf_object([n, 0, 0, 0, 0, 0, 1, 4, 2, 1.5]) for n in range(20)}
     tracks = openlabel.read(sweep(tmp_path, objects))

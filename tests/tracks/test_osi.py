@@ -103,7 +103,7 @@ def test_box_in_sensor_view(tmp_path: Path) -> None:
     assert only_box(trace(tmp_path, sensor_view(), name="20261101T120000Z_sv_370_700_1_test.osi")) == EXPECTED
 
 
-def test_what_is_not_set_is_unknown(tmp_path: Path) -> None:
+def test_unset_fields_are_missing(tmp_path: Path) -> None:
     """A number that is not set reads 0."""
     truth = one_car()
     base = truth.moving_object[0].base

@@ -208,7 +208,7 @@ def test_front_without_length_and_damaged_gzip_get_one_message(tmp_path: Path) -
 # ---- coordinate reference systems
 
 
-def test_projected_coordinates_are_kept_and_named(tmp_path: Path) -> None:
+def test_projected_coordinates_are_unchanged_and_have_crs(tmp_path: Path) -> None:
     path = tmp_path / "own.csv"
     path.write_text(CSV.replace("10,20", "293500,5629700"))
     columns = mapping(**FULL, crs="EPSG:25832", length_unit="ft")

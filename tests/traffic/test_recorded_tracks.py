@@ -15,6 +15,7 @@ import egvs
 from egvs.artefacts import parquet
 from egvs.artefacts.run_record import RunRecord
 from egvs.artefacts.tpog import read_tpog
+from egvs.core.errors import InputError
 from egvs.formats.georeference import Georeference, WorldFrame
 from egvs.tracks.track_readers import TrackSource
 from egvs.traffic import recorded_tracks
@@ -90,6 +91,14 @@ def test_all_frames_of_the_recording_are_used(mini: Path) -> None:
     assert (window.count, window.period_ms) == (40, 500)
 
 
+def test_wrong_time_does_not_make_billions_of_frames(mini: Path) -> None:
+    use_tracks(mini, interaction_csv([*boxes_of_fcd(), ("b", 4e9, 1.0, 1.0, 0.0)]))
+    text = (mini / "scenario.toml").read_text().replace("frames = 40\n", "")
+    (mini / "scenario.toml").write_text(text)
+    with pytest.raises(InputError, match="more than 5,000,000 frames"):
+        recorded_tracks.tracks_window(egvs.load(mini))
+
+
 def test_two_files_are_on_one_clock(mini: Path, run_egvs, tmp_path: Path) -> None:
     """The vehicles of one file in two files: the same frames; names that occur twice get the number of their file."""
     rows = boxes_of_fcd()
@@ -119,7 +128,7 @@ def test_recording_of_pedestrians_only(mini: Path, run_egvs, tmp_path: Path) -> 
     assert read_tpog(tmp_path / "run" / "tpog.parquet").counts.any()
 
 
-def test_boxes_outside_given_coverage_are_left_out(mini: Path, run_egvs, tmp_path: Path) -> None:
+def test_drops_boxes_outside_coverage(mini: Path, run_egvs, tmp_path: Path) -> None:
     """The western half of the region, where x < 20 m."""
     use_tracks(mini, interaction_csv(boxes_of_fcd()), 'coverage = "coverage.geojson"\n')
     ring = [[-50, -20], [20, -20], [20, 20], [-50, 20], [-50, -20]]
@@ -314,6 +323,7 @@ def test_recorded_pedestrians_walk_beside_simulated_vehicles(mini: Path, run_egv
     assert set(table[table["kind"] != "pedestrian"].groupby("frame").size()) == {3}
     summary = RunRecord.read(tmp_path / "run").stages["traffic"].summary
     assert summary["beside_vehicles"]["pedestrian"]["different"] == 1
+    assert summary["tracks"]["classes"] == {"pedestrian": 1}
     assert "recorded pedestrians" in [warning["rule"] for warning in summary["warnings"]]
 
 

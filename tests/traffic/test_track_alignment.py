@@ -41,7 +41,7 @@ def test_position_beside_a_lane_does_not_count(roads: Network) -> None:
 
 
 @pytest.mark.parametrize("shift_m", [(3.0, -2.0), (-4.0, 5.0)])
-def test_shift_is_found(roads: Network, shift_m: tuple[float, float]) -> None:
+def test_estimates_shift(roads: Network, shift_m: tuple[float, float]) -> None:
     alignment = track_alignment.align(positions() - shift_m, roads)
     assert alignment is not None
     np.testing.assert_allclose(alignment.shift_m, shift_m, atol=0.3)
@@ -50,7 +50,7 @@ def test_shift_is_found(roads: Network, shift_m: tuple[float, float]) -> None:
     assert "moved by" in str(warning)
 
 
-def test_rotation_is_found(roads: Network) -> None:
+def test_estimates_rotation(roads: Network) -> None:
     """Turned clockwise by 4 degrees about their middle, they must turn counter-clockwise by 4."""
     xy_m = positions()
     middle_m = xy_m.mean(axis=0)

@@ -54,7 +54,7 @@ def test_intervals_cover_the_truth_in_95_percent_of_trials() -> None:
     assert (covered[:2] / 400 <= 0.98).all()
 
 
-def test_passages_and_what_is_none(tmp_path: Path) -> None:
+def test_passages_of_junction(tmp_path: Path) -> None:
     straight, left = Drive(constant(10.0), 0.0, 22.0), Drive(constant(4.0), 0.0, 54.0, LEFT)
     inside = Drive(constant(10.0, start_m=105.0), 0.0, 9.0)
     stays = Drive(constant(1.0), 0.0, 10.0)

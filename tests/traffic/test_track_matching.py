@@ -44,7 +44,7 @@ def test_vehicle_that_drives_straight_on(tmp_path: Path) -> None:
     assert matched.speed_m_s == pytest.approx(np.full(matched.time_s.size, 10.0))
 
 
-def test_left_turn_is_told_from_the_way_ahead_by_its_end(tmp_path: Path) -> None:
+def test_end_of_path_distinguishes_left_turn_from_straight_on(tmp_path: Path) -> None:
     """Both lanes begin with the same ten metres, in which only the rest of the way tells them apart."""
     matched = match(tmp_path, Drive(constant(4.0), 0.0, 54.0, LEFT))
     assert edges(matched) == ["in", ":c_1", ":c_2", "north"]

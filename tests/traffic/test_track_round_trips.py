@@ -183,7 +183,7 @@ def test_own_table_gives_the_same_tpog(json_lines: bool, crossing: Recorded, tmp
     assert np.abs(actual - expected).sum() <= 1e-3 * expected.sum()
 
 
-def test_moved_track_is_noticed(crossing: Recorded, tmp_path: Path) -> None:
+def test_detects_moved_track(crossing: Recorded, tmp_path: Path) -> None:
     """The comparison can fail: 0.2 m to the side change a tenth of the counts."""
     path = writers.write_interaction(tmp_path, replace(crossing.rows, x_m=crossing.rows.x_m + 0.2))
     assert difference(crossing, path, WORLD, "") > 0.05

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from egvs.cli.options import Top, command_words
+from egvs.core import files
 from egvs.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -81,6 +82,9 @@ def compare(
 
     overrides = set_ or []
     if tpog is not None:
+        for option, value in ((_OPTION, sensors), (_HEIGHTS_OPTION, assumed_heights or None), ("--set", set_)):
+            if value:
+                raise InputError(_TPOG_OPTION, f"cannot be used together with {option}", "Use one of them.")
         _compare_tpogs(runs, tpog, top)
         return
     if assumed_heights:
@@ -117,6 +121,7 @@ def _compare_tpogs(runs: Sequence[Path], page: Path, top: int | None) -> None:
         raise InputError(_TPOG_OPTION, problem, "Give their folders, in this order.")
     if page.suffix != ".html":
         raise InputError(_TPOG_OPTION, f"expected a file PAGE.html to write, got {page}", "Use --tpog traffic.html.")
+    files.check_writable(page)
     with ProgressDisplay("compare") as screen:
         from egvs.studies import tpog_comparison, tpog_page
 

@@ -164,6 +164,9 @@ def _track_sentences(tracks: dict[str, Any]) -> Iterator[Sentence]:
     for key, words in _TRACK_COUNTS.items():
         if tracks[key]:
             yield _detail(f"{words}: {tracks[key]:,}")
+    if tracks["rows_with_height"]:
+        scatter = f"the bottoms of boxes scatter by {tracks['height_scatter_m']:.2f} m"
+        yield _detail(f"heights of {tracks['rows_with_height']:,} rows are not used; {scatter}")
     if filled := tracks["filled_sizes"]:
         texts = [f"{name} ({number:,})" for name, number in filled.items()]
         yield _detail(f"sizes of classes used for tracks without: {', '.join(texts)}")

@@ -25,7 +25,7 @@ from egvs.scenario.traffic_config import CountConfig
 from egvs.tracks import cleaning, resampling
 from egvs.tracks.cleaning import CleanTracks
 from egvs.tracks.sizes import CLASS_SIZES
-from egvs.traffic import estimates, track_alignment, track_demand, track_matching
+from egvs.traffic import estimates, recorded_tracks, track_alignment, track_demand, track_matching
 from egvs.traffic.estimates import MIN_OBSERVATIONS
 from egvs.traffic.network import Network
 from egvs.traffic.track_alignment import Alignment
@@ -142,6 +142,9 @@ def estimate_demand(recording: TrackFiles, streets: Streets, junction: StreetJun
     first_s, duration_s = float(cleaned.time_s.min()), float(np.ptp(cleaned.time_s))
     period_s = track_matching.PERIOD_S
     n_frames = int(duration_s / period_s + 1e-6) + 1
+    if n_frames > recorded_tracks.MAX_FRAMES:
+        problem = f"the tracks last {duration_s:,.0f} s, more than {recorded_tracks.MAX_FRAMES * period_s:,.0f} s"
+        raise InputError(recording.source.paths[0], problem, "Check the times.")
     boxes = resampling.resample(cleaned, first_s, period_s, n_frames, _MAX_GAP_S)
     is_vehicle = np.array([name in VEHICLE_CLASSES for name in cleaned.classes])
     boxes = boxes.select(is_vehicle[boxes.track])

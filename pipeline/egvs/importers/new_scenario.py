@@ -364,16 +364,16 @@ def create_scenario(
         **({} if recording is None else recording.copies()),
         SCENARIO_FILE: _scenario_toml(name, scenario, relief, statics, objects.zero_height_m, recording),
     }
-    recorded: list[RecordedTracks] = []
+    checked: list[NewScenario] = []
 
     def check(partial_folder: Path) -> None:
         loaded = load(partial_folder)
-        if recording is not None:
-            recorded.append(recorded_traffic.read_for_summary(loaded))
+        world, _ = build_world(loaded)
+        recorded = None if recording is None else recorded_traffic.read_for_summary(loaded)
+        checked.append(replace(scenario, n_solids=len(world.solids), recorded=recorded))
 
     scenario_files.publish_folder(folder, contents.items(), check)
-    world, _ = build_world(load(folder))
-    return replace(scenario, n_solids=len(world.solids), recorded=recorded[0] if recorded else None)
+    return checked[0]
 
 
 def _with_signals(
@@ -434,7 +434,7 @@ def _no_pole_error(
     if covering:
         problem += f": the objects of {', '.join(covering)} cover them"
         hint = "Check the position of these maps, or choose another junction with --at LAT,LON."
-    if options.pole_spacing_m is not None:
+    elif options.pole_spacing_m is not None:
         hint = "Choose a smaller spacing with --poles, or another junction with --at LAT,LON."
     return InputError(path, problem, hint)
 

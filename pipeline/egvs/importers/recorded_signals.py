@@ -219,6 +219,9 @@ def _coordinates(placemark: Element, path: Path) -> FloatArray:
     texts = [(line.text or "").split() for line in placemark.iter(_tag("coordinates"))]
     try:
         points = [[float(number) for number in point.split(",")[:2]] for point in texts[0]]
-        return np.array(points, dtype=np.float64).reshape(-1, 2)
+        lon_lat_deg = np.array(points, dtype=np.float64).reshape(-1, 2)
     except (ValueError, IndexError):
-        raise InputError(path, "a lane has no valid coordinates", "Use the file as it was published.") from None
+        lon_lat_deg = np.empty((0, 2))
+    if not len(lon_lat_deg) or not (np.abs(lon_lat_deg) <= (180.0, 90.0)).all():
+        raise InputError(path, "a lane has no valid coordinates", "Use the file as it was published.")
+    return lon_lat_deg

@@ -34,7 +34,9 @@ class TrackColumns(StrictModel):
     id: Column = Field(description="Column with the name of the track, a text or a number")
     x: Column = Field(description="Column with the x coordinate, easting or longitude")
     y: Column = Field(description="Column with the y coordinate, northing or latitude")
-    z: Column | None = Field(None, description="Column with the height of the position")
+    z: Column | None = Field(
+        None, description="Column with the height of the position. It is reported only: boxes stand on the road"
+    )
     yaw: Column | None = Field(
         None, description="Column with the direction of the front. By default, directions of motion are used"
     )

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from egvs.artefacts.frame_boxes import UNKNOWN_BOXES_KEY, FrameBoxes
@@ -24,7 +25,7 @@ from egvs.core.grid import Grid, IntArray
 from egvs.scoring.occupancy import count_occupancy
 
 MAX_UNKNOWN_SHARE = 0.5
-"""Share of a block's frames from which on the occupancy of a voxel counts as 0."""
+"""Share of a block's frames above which an unknown voxel counts as 0."""
 
 _STEPS_PER_VOXEL = 2.0
 
@@ -95,7 +96,15 @@ class UnknownOccupancy:
 def _sweep(values: Mapping[str, Any], grid: Grid) -> SweptGap:
     """Find the voxels on the way through a gap."""
     first, end = values["frames"]
-    start_m, end_m = (np.array(values[key], dtype=np.float64) for key in ("start_m", "end_m"))
+    half_m = 0.5 * float(np.hypot(*values["size_m"]))
+    low_m, size_m = np.array(grid.origin_m[:2]), np.array(grid.roi.size_m[:2])
+    around = shapely.box(*(low_m - half_m), *(low_m + size_m + half_m))
+    ends_m = [values["start_m"], values["end_m"]]
+    whole_way = shapely.Point(ends_m[0]) if ends_m[0] == ends_m[1] else shapely.LineString(ends_m)
+    way = shapely.intersection(whole_way, around)
+    if way.is_empty:
+        return SweptGap(int(first), int(end), np.empty(0, dtype=np.int64))
+    start_m, end_m = shapely.get_coordinates(way)[[0, -1]]
     steps = int(np.ceil(_STEPS_PER_VOXEL * np.hypot(*(end_m - start_m)) / grid.voxel_m)) + 1
     xy_m = start_m + np.linspace(0.0, 1.0, steps)[:, None] * (end_m - start_m)
     height_m = grid.voxel_m * grid.shape[2]

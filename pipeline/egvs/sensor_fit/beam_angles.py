@@ -495,7 +495,7 @@ def pulse_grid(sweep: Sweep, angles: BeamAngles) -> PulseGrid:
 
 
 def range_step(range_m: FloatArray) -> float | None:
-    """Return the step of measured ranges, metres; None if there is none between 1 mm and 5 cm.
+    """Return the step of measured ranges, metres, between 1 mm and 5 cm; None if they have no such step.
 
     Ranges that are multiples of a step q have the same phase at the frequency 1 / q and its multiples: the mean of
     exp(2 pi i r / q) is near 1 in size. The lowest such frequency counts. To keep phases exact, only ranges within the

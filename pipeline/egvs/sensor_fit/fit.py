@@ -57,7 +57,7 @@ class SensorFit:
     grids
         Returns of each sweep by pulse.
     range_step_m
-        Step of measured ranges; None if there is none.
+        Step of measured ranges, metres; None if they have none.
     max_range_m
         Largest measured range.
     sigma_m

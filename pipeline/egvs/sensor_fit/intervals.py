@@ -36,7 +36,7 @@ class Estimate(NamedTuple):
     low, high
         Ends of the interval.
     n
-        Number of values that it is from.
+        Number of values used.
     """
 
     value: float

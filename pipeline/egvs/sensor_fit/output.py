@@ -22,6 +22,7 @@ from egvs.sensor_fit import empty_scan, figures
 from egvs.sensor_fit.fit import SensorFit
 from egvs.sensor_fit.ground_plane import GroundPlane
 from egvs.sensor_fit.intervals import Estimate
+from egvs.sensor_fit.range_noise import NoiseBin
 from egvs.sensors.sensor import rotation_world_sensor
 
 SENSOR_FILE, REPORT_FILE = "sensor.toml", "fit.json"
@@ -42,13 +43,10 @@ class FitFolder:
         The folder.
     names
         Names of the files in it.
-    table
-        The lines of ``[sensors.NAME]``.
     """
 
     folder: Path
     names: tuple[str, ...]
-    table: str
 
 
 def check_name(name: str) -> None:
@@ -94,7 +92,7 @@ def write_fit(fit: SensorFit, name: str, folder: Path, *, without_empty_sector: 
         with files.atomic_write(folder / LABELS_FILE) as partial:
             ply.write_columns(partial, _labelled_returns(fit))
         names += [EMPTY_SCAN_FILE, LABELS_FILE]
-    return FitFolder(folder, tuple(names), table)
+    return FitFolder(folder, tuple(names))
 
 
 def table_text(fit: SensorFit, name: str, without_empty_sector: bool = False) -> str:
@@ -112,7 +110,7 @@ def sensor_table(fit: SensorFit, without_empty_sector: bool = False) -> dict[str
     Raises
     ------
     InputError
-        If the sector without returns is to be left out and there is none.
+        If ``without_empty_sector`` is set and no sector is without returns, or the view is not a full circle.
     """
     angles = fit.angles
     order = angles.ascending
@@ -221,8 +219,8 @@ def report(fit: SensorFit, name: str) -> dict[str, Any]:
         "max_range_m": fit.max_range_m,
         "range_sigma_m": _estimate(fit.sigma_m),
         "channels": _channels(fit),
-        "range_noise": [_bin(noise.sigma_m, noise.from_m, noise.to_m) for noise in fit.noise],
-        "range_noise_on_road": [_bin(noise.sigma_m, noise.from_m, noise.to_m) for noise in fit.noise_on_road],
+        "range_noise": [_noise(noise) for noise in fit.noise],
+        "range_noise_on_road": [_noise(noise) for noise in fit.noise_on_road],
         "return_rate_on_smooth_surfaces": _estimate(fit.return_rate),
         "return_rates_on_smooth_surfaces": [_rate(rate) for rate in fit.return_rates],
         "return_rates_on_road": [_rate(rate) for rate in fit.road_rates],
@@ -251,8 +249,10 @@ def _estimate(estimate: Estimate | None) -> dict[str, Any] | None:
     return None if estimate is None else estimate._asdict()
 
 
-def _bin(estimate: Estimate, from_m: float, to_m: float) -> dict[str, Any]:
-    return {"from_m": from_m, "to_m": to_m, **estimate._asdict()}
+def _noise(noise: NoiseBin) -> dict[str, Any]:
+    incidence_deg = None if math.isnan(noise.incidence_deg) else round(noise.incidence_deg, 2)
+    interval = {"from_m": noise.from_m, "to_m": noise.to_m, "incidence_deg": incidence_deg}
+    return interval | noise.sigma_m._asdict()
 
 
 def _rate(rate: Any) -> dict[str, Any]:

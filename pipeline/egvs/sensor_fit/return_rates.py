@@ -203,7 +203,11 @@ def _road_pulses(grid: FloatArray, angles: BeamAngles, view: PlaneView) -> tuple
     for side in (-1, 1):
         nearest = np.zeros_like(met)
         for columns in range(1, round(_NEIGHBOUR_DEG / angles.grid_step_deg) + 1):
-            nearest = np.where(nearest == _NOTHING, np.roll(met, side * columns, axis=1), nearest)
+            moved = np.roll(met, side * columns, axis=1)
+            if not angles.is_full_circle:
+                moved[:, :columns] = _NOTHING if side > 0 else moved[:, :columns]
+                moved[:, -columns:] = _NOTHING if side < 0 else moved[:, -columns:]
+            nearest = np.where(nearest == _NOTHING, moved, nearest)
         counts &= nearest != _OTHER
     return is_road, counts
 

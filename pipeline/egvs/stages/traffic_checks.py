@@ -152,8 +152,15 @@ def check_finished_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
     if scenario.traffic.pedestrian_tracks is not None:
         from egvs.traffic import recorded_tracks
 
+        where = f"{sumo_folder.traffic_location(scenario)}.pedestrian_tracks"
         world = geolocation.scenario_georeference(scenario)
-        errors.attempt("traffic", lambda: recorded_tracks.read_recorded_pedestrians(scenario, world))
+        effects, _ = registry.active_traffic_effects(scenario)
+        are_simulated = any(effect.ADDS_TRAFFIC for effect in effects)
+        errors.attempt("traffic", lambda: recorded_tracks.check_recorded_people(scenario, are_simulated=are_simulated))
+        people = errors.attempt("traffic", lambda: recorded_tracks.read_recorded_pedestrians(scenario, world))
+        if people is not None:
+            yield from recorded_tracks.track_warnings(people, where)
+            yield from recorded_tracks.pedestrian_warnings(where)
     if scenario.traffic.fcd is None:
         yield from errors.findings
         return

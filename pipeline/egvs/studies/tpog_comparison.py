@@ -126,7 +126,7 @@ class TpogComparison:
     lanes
         By occupancy in the recording, the busiest first.
     distance
-        Jensen-Shannon distance over the bins of all lanes.
+        Jensen-Shannon distance over the bins of all lanes; None where a run has no traffic.
     occupancy
         Mean occupancy of all lanes, recorded and simulated.
     entropy_bit
@@ -143,7 +143,7 @@ class TpogComparison:
     blocks: tuple[int, int]
     covered_share: float
     lanes: tuple[LaneComparison, ...]
-    distance: Measured
+    distance: Measured | None
     occupancy: tuple[Measured, Measured]
     entropy_bit: tuple[Measured, Measured, Measured]
     ranks: RankComparison | None
@@ -198,7 +198,9 @@ def compare_tpogs(recorded: Path, simulated: Path, progress: ProgressCallback = 
             )
         )  # fmt: skip
     everywhere = np.zeros_like(bins.lane_of_bin)
-    distance = both.joint(lambda first, second: lane_distances(first.bins, second.bins, everywhere))[0]
+    distance: Measured | None = both.joint(lambda first, second: lane_distances(first.bins, second.bins, everywhere))[0]
+    if not all(each.mean_occupancy[0, 0] > 0 for each in statistics):
+        distance = None
     mean = [both.single(which, lambda each: each.mean_occupancy)[0] for which in (0, 1)]
     totals = [both.single(which, lambda each: each.entropy_bit)[0] for which in (0, 1)]
     difference = both.joint(lambda first, second: second.entropy_bit - first.entropy_bit)[0]

@@ -61,6 +61,11 @@ class CleaningReport:
         Rows whose heading was turned by 180 degrees.
     filled_sizes
         Number of tracks with the size of their class, by class and dimension ("car: height_m").
+    rows_with_height
+        Rows with a recorded height. They are not used; boxes stand on the road.
+    bottom_height_m, height_scatter_m
+        Median height of the bottoms of these boxes, in the recording's system, and their standard deviation, estimated
+        from the median absolute deviation.
     step_s
         Usual time between the rows of a track.
     classes
@@ -77,6 +82,9 @@ class CleaningReport:
     headings_unknown: int = 0
     flipped_headings: int = 0
     filled_sizes: dict[str, int] = field(default_factory=dict)
+    rows_with_height: int = 0
+    bottom_height_m: float = 0.0
+    height_scatter_m: float = 0.0
     step_s: float = 0.0
     classes: dict[str, int] = field(default_factory=dict)
 
@@ -141,6 +149,7 @@ def clean_tracks(tracks: Tracks, sizes: Mapping[str, ClassSize]) -> CleanTracks:
 
     part = _cut_at_jumps(tracks, report)
     size_m = _sizes_of_tracks(tracks, sizes, report)
+    _report_heights(tracks, size_m, report)
     yaw_rad = _headings(tracks, part, report)
     return CleanTracks(
         tracks.names, tracks.classes, size_m, tracks.track, part, tracks.time_s, tracks.x_m, tracks.y_m, yaw_rad,
@@ -174,6 +183,16 @@ def _sizes_of_tracks(tracks: Tracks, sizes: Mapping[str, ClassSize], report: Cle
             report.filled_sizes[label] = report.filled_sizes.get(label, 0) + 1
         result[:, axis] = medians
     return result
+
+
+def _report_heights(tracks: Tracks, size_m: FloatArray, report: CleaningReport) -> None:
+    bottoms_m = tracks.z_m - size_m[tracks.track, 2] / 2.0
+    bottoms_m = bottoms_m[np.isfinite(bottoms_m)]
+    report.rows_with_height = bottoms_m.size
+    if bottoms_m.size:
+        median_m = float(np.median(bottoms_m))
+        report.bottom_height_m = round(median_m, 3)
+        report.height_scatter_m = round(1.4826 * float(np.median(np.abs(bottoms_m - median_m))), 3)
 
 
 def _medians(group: IntArray, values: FloatArray, n_groups: int) -> FloatArray:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from egvs.core import reading
+from egvs.core import limits, reading
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.formats import xml
@@ -259,12 +259,15 @@ def read_table(
     cells: dict[str, list[str]] = {name: [] for name in positions}
     columns = [(cells[name], position) for name, position in positions.items()]
     lines: list[int] = []
+    most_rows = limits.ROWS.maximum
     for line, row in rows:
         if len(row) < len(names) or any(cell.strip() for cell in row[len(names) :]):
             raise InputError(f"{path}: line {line}", f"expected {len(names)} cells, got {len(row)}", "Correct the row.")
         for texts, position in columns:
             texts.append(row[position].strip())
         lines.append(line)
+        if len(lines) > most_rows:
+            limits.ROWS.check(path, len(lines))
     if not lines:
         raise InputError(path, "contains no rows", hint)
     return Table(path, cells, lines)

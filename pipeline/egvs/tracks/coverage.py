@@ -147,7 +147,7 @@ def read(path: Path, world: Georeference, region: Roi, lanes_m: FloatArray) -> C
     where = str(path)
     hint = "Use a GeoJSON FeatureCollection with polygons of what the recording could see."
     if not isinstance(document, dict) or not isinstance(document.get("features"), list):
-        raise InputError(where, "is no GeoJSON FeatureCollection", hint)
+        raise InputError(where, "expected a GeoJSON FeatureCollection", hint)
     features = document["features"]
     declared = declared_crs(document, where)
     coordinates = world.read_coordinates(geojson_coordinates(features), where, declared)
@@ -155,7 +155,8 @@ def read(path: Path, world: Georeference, region: Roi, lanes_m: FloatArray) -> C
     for number, feature in enumerate(features):
         with reading.translate_errors(f"{where}: feature {number}", hint):
             areas.append(shapely.geometry.shape(feature["geometry"]))
-    area = shapely.transform(shapely.unary_union(areas), coordinates.to_world)
+    with reading.translate_errors(where, hint, "contains no valid polygon"):
+        area = shapely.transform(shapely.unary_union(areas), coordinates.to_world)
     if area.is_empty or area.area == 0 or not area.is_valid:
         raise InputError(where, "contains no valid polygon", hint)
     if _share(area, region, np.empty((0, 2))) == 0:

@@ -94,7 +94,8 @@ def read(path: Path) -> Tracks:
         sources.append(f"positions are in the LiDAR's frame, as there is no {folder}: they count as x, y of the map")
     if without_track:
         sources.append(
-            f"{without_track:,} boxes have no track_id: each is a track of one row, and nothing is known between sweeps"
+            f"{without_track:,} boxes have no track_id: each is a track of one row, and counts only in a frame at"
+            " exactly its time"
         )
     if without_label:
         sources.append(f"sweeps without a label file left out: {without_label:,}")

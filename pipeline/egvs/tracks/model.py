@@ -9,7 +9,7 @@ of :mod:`egvs.tracks.cleaning` and :mod:`egvs.tracks.resampling`, which treat al
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, get_args
 
@@ -127,6 +127,14 @@ class Tracks:
             frame=frame,
             sources=tuple(sources),
         )
+
+    def select_tracks(self, mask: NDArray[np.bool_]) -> Tracks:
+        """Return some of the tracks, (n_tracks,), with their rows and names only."""
+        number = np.cumsum(mask) - 1
+        rows = self.select(mask[self.track])
+        names = tuple(name for name, is_selected in zip(self.names, mask, strict=True) if is_selected)
+        classes = tuple(name for name, is_selected in zip(self.classes, mask, strict=True) if is_selected)
+        return replace(rows, names=names, classes=classes, track=number[rows.track])
 
     def select(self, mask: NDArray[np.bool_] | IntArray) -> Tracks:
         """Return some of the rows, with all names."""

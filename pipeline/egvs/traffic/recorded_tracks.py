@@ -41,6 +41,9 @@ FRAMES_EACH = 4096
 MAX_UNCERTAIN_SHARE = 0.05
 """Share of rows or tracks from which on something in them gets a warning."""
 
+MAX_FRAMES = 5_000_000
+"""Largest number of frames: two months at one frame per second."""
+
 MOTOR_CLASSES = frozenset(("car", "van", "truck", "bus"))
 """Classes that should be on lanes for cars."""
 
@@ -220,15 +223,23 @@ def read_recorded_pedestrians(scenario: Scenario, world: Georeference) -> Record
     """
     source = track_source(scenario)
     tracks = read_in_world_frame(source, world)
-    is_vulnerable = np.array([name in cleaning.VULNERABLE for name in tracks.classes])[tracks.track]
+    is_vulnerable = np.array([name in cleaning.VULNERABLE for name in tracks.classes])
     if not is_vulnerable.any():
         hint = "Use tracks of pedestrians or bicycles; with vehicles, name them in traffic.tracks."
         raise InputError(source.paths[0], "contains nobody on foot or on a bicycle", hint)
     window = _window(scenario, tracks)
-    cleaned = cleaning.clean_tracks(tracks.select(is_vulnerable), class_sizes(scenario.traffic))
+    cleaned = cleaning.clean_tracks(tracks.select_tracks(is_vulnerable), class_sizes(scenario.traffic))
     first_s = float(np.nanmin(tracks.time_s))
     boxes = resampling.resample(cleaned, first_s, window.period_ms / 1000.0, window.count, scenario.traffic.track_gap_s)
     return RecordedTracks(window, cleaned, boxes, None, 0, None, sumo_folder.read_network(scenario))
+
+
+def check_recorded_people(scenario: Scenario, *, are_simulated: bool) -> None:
+    """Raise an InputError when people are recorded (``traffic.pedestrian_tracks``) and simulated as well."""
+    if are_simulated and scenario.traffic.pedestrian_tracks is not None:
+        where = f"{sumo_folder.traffic_location(scenario)}.pedestrian_tracks"
+        problem = "pedestrians are recorded, and an effect simulates others"
+        raise InputError(where, problem, "Remove effects.pedestrians_bicycles, or pedestrian_tracks.")
 
 
 def pedestrian_warnings(where: str) -> Iterator[Diagnostic]:
@@ -381,6 +392,10 @@ def _window(scenario: Scenario, tracks: Tracks) -> FrameWindow:
     duration_ms = int(np.floor(np.ptp(finite_s) * 1000.0 + 1e-3)) if finite_s.size else 0
     available = (duration_ms - skip_ms) // period_ms + 1
     count = available if traffic.frames is None else traffic.frames
+    if count > MAX_FRAMES:
+        times = f"from {finite_s.min():g} s to {finite_s.max():g} s"
+        problem = f"the tracks last {times}, which are more than {MAX_FRAMES:,} frames"
+        raise InputError(f"{where}.frame_period_s", problem, "Check the times, or set a longer frame_period_s.")
     if count < 1 or count > available:
         names = ", ".join(traffic.tracks or traffic.pedestrian_tracks or ())
         problem = f"{names} last {duration_ms / 1000:g} s, {max(available, 0)} frames after {skip_ms / 1000:g} s"

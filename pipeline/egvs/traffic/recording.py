@@ -304,10 +304,8 @@ def _recorded_people(
         return None
     from egvs.traffic import recorded_tracks
 
-    if any(extension.ADDS_TRAFFIC for extension in extensions):
-        where = f"{sumo_folder.traffic_location(scenario)}.pedestrian_tracks"
-        problem = "pedestrians are recorded, and an effect simulates others"
-        raise InputError(where, problem, "Remove effects.pedestrians_bicycles, or pedestrian_tracks.")
+    are_simulated = any(extension.ADDS_TRAFFIC for extension in extensions)
+    recorded_tracks.check_recorded_people(scenario, are_simulated=are_simulated)
     return recorded_tracks.read_recorded_pedestrians(scenario, world)
 
 

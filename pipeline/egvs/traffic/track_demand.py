@@ -144,8 +144,7 @@ def find_leaders(matched: MatchedTracks) -> Leaders:
     distance_m = np.full(matched.track.size, np.inf)
     on_lane = np.flatnonzero(matched.lane >= 0)
     order = on_lane[np.lexsort((matched.at_m[on_lane], matched.lane[on_lane], matched.time_s[on_lane]))]
-    times_s, first = np.unique(matched.time_s[order], return_index=True)
-    del times_s
+    _, first = np.unique(matched.time_s[order], return_index=True)
     for rows in np.split(order, first[1:]):
         first_on_lane: dict[int, int] = {}
         for each in rows[::-1].tolist():
