@@ -180,7 +180,7 @@ GROWTH = {
     "statics": 1.27,
     "scan": 1.29,
     "traffic": 1.7,
-    "tpog": 1.33,
+    "tpog": 1.34,
     "score": 1.28,
     "report": 1.38,
 }
