@@ -28,6 +28,7 @@ MAX_UNKNOWN_SHARE = 0.5
 """Share of a block's frames above which an unknown voxel counts as 0."""
 
 _STEPS_PER_VOXEL = 2.0
+_MIN_WAY_M = 1e-6
 
 
 @dataclass(frozen=True)
@@ -99,8 +100,9 @@ def _sweep(values: Mapping[str, Any], grid: Grid) -> SweptGap:
     half_m = 0.5 * float(np.hypot(*values["size_m"]))
     low_m, size_m = np.array(grid.origin_m[:2]), np.array(grid.roi.size_m[:2])
     around = shapely.box(*(low_m - half_m), *(low_m + size_m + half_m))
-    ends_m = [values["start_m"], values["end_m"]]
-    whole_way = shapely.Point(ends_m[0]) if ends_m[0] == ends_m[1] else shapely.LineString(ends_m)
+    ends_m = np.array([values["start_m"], values["end_m"]], dtype=np.float64)
+    stands = np.hypot(*(ends_m[1] - ends_m[0])) < _MIN_WAY_M
+    whole_way = shapely.Point(ends_m[0]) if stands else shapely.LineString(ends_m)
     way = shapely.intersection(whole_way, around)
     if way.is_empty:
         return SweptGap(int(first), int(end), np.empty(0, dtype=np.int64))
