@@ -468,14 +468,16 @@ for verb in validate.VERBS:
 @app.command()
 def export(
     run: Run,
-    to: Annotated[str, typer.Option(metavar="FORMAT", help="gpkg, geojson, geoparquet, kml, csv or geotiff.")],
+    to: Annotated[
+        str, typer.Option(metavar="FORMAT", help="gpkg, geojson, geoparquet, kml, csv, geotiff, dxf, glb or usd.")
+    ],
     crs: Annotated[
         str | None,
         typer.Option(metavar="CRS", help="scenario or wgs84; by default the one that is usual for the format."),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="FILE|DIR", help="A file (gpkg, kml) or a folder; RUN/export by default."),
+        typer.Option("--out", metavar="FILE|DIR", help="A file (gpkg, kml, dxf) or a folder; RUN/export by default."),
     ] = None,
     site: Annotated[
         list[str] | None,
@@ -484,7 +486,7 @@ def export(
         ),
     ] = None,
 ) -> None:
-    """Export a run for GIS and spreadsheets: sites, plan, blind spots and footprints, or rasters."""
+    """Export a run for GIS, CAD and 3D: sites, plan, blind spots and footprints, rasters, a site plan, a scene."""
     from egvs.cli.console import ProgressDisplay
     from egvs.export import export
 
