@@ -575,6 +575,22 @@ def new(
             " junction with signals.",
         ),
     ] = None,
+    download: Annotated[
+        bool,
+        typer.Option(
+            "--download",
+            help="Download the OpenStreetMap extract around --at LAT,LON from an Overpass server. Nothing is downloaded"
+            " without this option.",
+        ),
+    ] = False,
+    overpass_url: Annotated[
+        str | None,
+        typer.Option(
+            "--overpass",
+            metavar="URL",
+            help="Overpass server for --download; default: EGVS_OVERPASS_URL, or overpass-api.de.",
+        ),
+    ] = None,
     lefthand: Annotated[bool, typer.Option("--lefthand", help="Traffic drives on the left.")] = False,
     walk: Annotated[bool, typer.Option("--walk", help="Include sidewalks and crossings, for pedestrians.")] = False,
     surroundings: Annotated[
@@ -672,8 +688,11 @@ def new(
     from egvs.importers.new_scenario import NewScenarioOptions
 
     paths = [*(maps or []), *(more or [])]
-    if not paths:
-        raise InputError("--from", "no map is given", "Give a map of the roads, such as --from town.osm.")
+    if not paths and not download:
+        hint = "Give a map of the roads, such as --from town.osm, or --at LAT,LON --download."
+        raise InputError("--from", "no map is given", hint)
+    if overpass_url is not None and not download:
+        raise InputError("--overpass", "has no effect without --download", "Add --download.")
     location = None
     if at is not None:
         location = cli_options.latitude_and_longitude(at)
@@ -698,8 +717,13 @@ def new(
         tracks=tuple(tracks or ()), like=tuple(like or ()), signals=tuple(signals or ()), track_crs=track_crs,
         track_columns=track_columns,
     )  # fmt: skip
+    notes = []
+    if download:
+        extract = new_scenario.download_map(folder, location, options, overpass_url)
+        paths.append(extract.path)
+        notes.append(extract.note)
     scenario = new_scenario.create_scenario(folder, paths, location, options)
-    new_summary.print_new_scenario(scenario)
+    new_summary.print_new_scenario(scenario, notes)
 
 
 @app.command()

@@ -42,6 +42,7 @@ from egvs.importers import (
     map_readers,
     openstreetmap,
     osm_solids,
+    overpass,
     recorded_signals,
     recorded_traffic,
     scenario_files,
@@ -59,6 +60,7 @@ from egvs.importers.map_readers import MapFile, MapFiles
 from egvs.importers.openstreetmap import OsmRoads
 from egvs.importers.osm_network import ATTRIBUTION, NETWORK_FILE
 from egvs.importers.osm_solids import ImportCounts
+from egvs.importers.overpass import DownloadedExtract
 from egvs.importers.recorded_traffic import TrackFiles
 from egvs.importers.relief import Relief, ground_surface
 from egvs.importers.road_source import NetworkRoads, RoadSource
@@ -374,6 +376,34 @@ def create_scenario(
 
     scenario_files.publish_folder(folder, contents.items(), check)
     return checked[0]
+
+
+def download_map(
+    folder: Path, at: tuple[float, float] | None, options: NewScenarioOptions, url: str | None = None
+) -> DownloadedExtract:
+    """Download the map of a new scenario after its folder and its options were checked.
+
+    Parameters
+    ----------
+    folder
+        Folder of the new scenario.
+    at
+        Latitude, longitude in degrees.
+    options
+        Options of :func:`create_scenario`.
+    url
+        Address of the Overpass server, see :func:`egvs.importers.overpass.download_extract`.
+
+    Raises
+    ------
+    InputError
+        When ``at`` is None, the folder is not empty, an option is out of its limits, or there is no complete answer.
+    """
+    if at is None:
+        raise InputError("--download", "needs a point", "Add --at LAT,LON, such as --at 50.8704,9.7080.")
+    options.check()
+    scenario_files.check_new_folder(folder)
+    return overpass.download_extract(at, options.surroundings_m, url)
 
 
 def _with_signals(
