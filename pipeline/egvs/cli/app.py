@@ -613,6 +613,14 @@ def new(
         int | None,
         typer.Option(metavar="N", help="Instead of --traffic: vehicles per hour that pass the junction, in all."),
     ] = None,
+    counts: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Instead of assumed traffic: your counts, a CSV file with columns street, approach (the side on which"
+            " vehicles arrive), turn, start and count; docs/scenarios.md.",
+        ),
+    ] = None,
     poles: Annotated[
         tuple[str, str] | None,
         typer.Option(
@@ -701,6 +709,9 @@ def new(
         surroundings_m = cli_options.radius_m(surroundings)
     if traffic is not None and vehicles_per_hour is not None:
         raise InputError("--traffic", "cannot be combined with --vehicles-per-hour", "Use one of them.")
+    if counts is not None and (traffic is not None or vehicles_per_hour is not None):
+        key = "--traffic" if traffic is not None else "--vehicles-per-hour"
+        raise InputError(key, "has no effect on counted traffic (--counts)", "Use one of them.")
     if (tracks or like) and (traffic is not None or vehicles_per_hour is not None):
         key = "--traffic" if traffic is not None else "--vehicles-per-hour"
         source = "--tracks" if tracks else "--like"
@@ -715,7 +726,7 @@ def new(
         lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=demand, pole_spacing_m=pole_spacing_m,
         align=tuple(cli_options.point_pair(text) for text in align or []), surface=tuple(surface or []),
         tracks=tuple(tracks or ()), like=tuple(like or ()), signals=tuple(signals or ()), track_crs=track_crs,
-        track_columns=track_columns,
+        track_columns=track_columns, counts=counts,
     )  # fmt: skip
     notes = []
     if download:

@@ -73,6 +73,8 @@ def _scenario_lines(scenario: NewScenario) -> Iterator[tuple[str, str]]:
         traffic = recorded_traffic.describe(scenario.recorded)
     if scenario.demand is not None:
         traffic = scenario.demand.describe()
+    if scenario.counted is not None:
+        traffic = scenario.counted.describe()
     yield "traffic", traffic
     mounts = f"{len(junctions.HEIGHTS_M)} heights x {len(PITCHES_DEG)} tilts"
     yield "sites", f"{scenario.n_candidates:,} candidates: {scenario.poles} poles x {mounts}, sensor {SENSOR}"
@@ -173,6 +175,8 @@ def _scenario_warnings(scenario: NewScenario) -> Iterator[str]:
         return
     if scenario.demand is not None:
         yield from _demand_warnings(scenario, scenario.demand)
+        return
+    if scenario.counted is not None:
         return
     assumed, per_h = "the traffic is assumed", 0
     if scenario.traffic is not None:
