@@ -326,8 +326,8 @@ def create_scenario(
         terrain = ground_reference.measured_ground(measured)
     elif measured is not None:
         ground_notes.append("The ground of the point cloud is not used, since a terrain file is given.")
-    zero = ground_reference.find_zero(roads, files.roads, junction, terrain)
-    roads = ground_reference.lay_on_ground(roads, files.roads, junction, terrain)
+    zero = ground_reference.find_zero(roads, files.roads, junction, terrain, files.terrain)
+    roads = ground_reference.lay_on_ground(roads, files.roads, junction, terrain, files.terrain)
     terrain_m = None if terrain is None else _terrain_points(terrain, window, zero.height_m or 0.0)
     ground = ground_surface(roads.streets, terrain_m)
     objects = static_objects.collect_objects(
