@@ -29,8 +29,8 @@ def fit(
         list[Path],
         typer.Argument(
             metavar="SWEEPS...",
-            help="Sweeps of an installed LiDAR, one per file, in its own frame: .pcd, .ply, .las, .laz, .csv, .e57, or"
-            " .npz with an array per sweep; also with .gz.",
+            help="Sweeps of an installed LiDAR in its own frame: one per file (.pcd, .ply, .las, .laz, .csv, .e57; also"
+            " with .gz), an array per sweep (.npz), or a recording (.bag, .mcap, .db3, .pcap).",
         ),
     ],
     name: Annotated[str, typer.Option(metavar="NAME", help="Required: name of the sensor, as in [sensors.NAME].")] = "",
@@ -49,6 +49,17 @@ def fit(
             " by default found from the ground plane.",
         ),
     ] = None,
+    topic: Annotated[
+        str | None,
+        typer.Option(metavar="TOPIC", help="Topic of the point clouds, where a recording of ROS has several."),
+    ] = None,
+    max_sweeps: Annotated[
+        int, typer.Option(metavar="N", min=1, help="Most sweeps that are read of a recording, spread evenly over it.")
+    ] = 20,
+    max_range: Annotated[
+        float,
+        typer.Option(metavar="M", min=1.0, max=10_000.0, help="Range beyond which the decoder of .pcap drops returns."),
+    ] = 500.0,
     without_empty_sector: Annotated[
         bool,
         typer.Option(
@@ -63,6 +74,7 @@ def fit(
 
     plugins.require_libraries("egvs sensor fit", "figure", "matplotlib")
     with ProgressDisplay("sensor fit") as screen:
+        from egvs.formats.recordings import RecordingOptions
         from egvs.sensor_fit import fit as fitting
         from egvs.sensor_fit import output, sweep_files
 
@@ -74,7 +86,7 @@ def fit(
         files.check_writable(folder / output.SENSOR_FILE)
         steps = iter(range(1, 100))
         screen.progress("reading", 0, 7)
-        recorded = sweep_files.read_sweeps(sweeps)
+        recorded = sweep_files.read_sweeps(sweeps, RecordingOptions(topic, max_sweeps, max_range))
         result = fitting.fit_sensor(recorded, options, lambda step: screen.progress(step, next(steps), 7))
         screen.progress("writing", 6, 7)
         written = output.write_fit(result, name, folder, without_empty_sector=without_empty_sector)
@@ -119,6 +131,12 @@ def print_fit(result: SensorFit, written: FitFolder) -> None:
     ]
     if result.silent_channels:
         lines.append(f"channels with fewer than 20 returns, left out: {result.silent_channels}")
+    recordings = {id(sweep.recording): sweep.recording for sweep in result.sweeps if sweep.recording is not None}
+    for recording in recordings.values():
+        used = sum(sweep.recording is recording for sweep in result.sweeps)
+        notes = "".join(f"; {note}" for note in recording.notes)
+        lines.insert(0, f"{recording.name}: {used} of {recording.sweeps} sweeps read; {recording.source}{notes}")
+    lines.append(f"rotation: {_rotation(result)}")
     if coarse:
         lines.insert(1, f"sweeps with float16 coordinates, used only for the empty scan: {coarse}")
     if result.empty_sectors_deg:
@@ -154,6 +172,22 @@ def _direction(result: SensorFit) -> str:
     return {1: "counter-clockwise from above", -1: "clockwise from above", 0: "direction of rotation unknown"}[
         result.angles.direction
     ]
+
+
+def _rotation(result: SensorFit) -> str:
+    rotation = result.rotation
+    if rotation is None:
+        return "rate unknown (the sweeps have no times)"
+    text = (
+        f"{abs(rotation.rate_hz):.4f} +- {rotation.rate_se_hz:.1g} turns per second, from {rotation.source} of "
+        f"{rotation.sweeps} sweeps"
+    )
+    if rotation.step_deg is None or rotation.firing_interval_s is None:
+        return text
+    return (
+        f"{text}; a firing every {1e6 * rotation.firing_interval_s:.3f} us makes an azimuth step of "
+        f"{rotation.step_deg:.4f} degrees"
+    )
 
 
 def _range_step(result: SensorFit) -> str:

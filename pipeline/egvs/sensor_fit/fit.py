@@ -16,6 +16,7 @@ from egvs.sensor_fit.ground_plane import GroundPlane
 from egvs.sensor_fit.intervals import Estimate, estimate_scale
 from egvs.sensor_fit.range_noise import NoiseBin, RangeResiduals
 from egvs.sensor_fit.return_rates import PlaneView, RateBin
+from egvs.sensor_fit.rotation import Rotation, fit_rotation
 from egvs.sensor_fit.surface_normals import surface_normals
 from egvs.sensor_fit.sweep_files import Sweep
 
@@ -78,6 +79,8 @@ class SensorFit:
         The background; None with fewer than three sweeps.
     residuals
         Differences between ranges of neighbours, for figures.
+    rotation
+        How fast the sensor turns; None if the sweeps have no times.
     """
 
     sweeps: Sequence[Sweep]
@@ -101,6 +104,7 @@ class SensorFit:
     plane_view: PlaneView
     empty_scan: EmptyScanFit | None
     residuals: RangeResiduals
+    rotation: Rotation | None = None
 
 
 def fit_sensor(
@@ -170,6 +174,7 @@ def fit_sensor(
         plane_view=view,
         empty_scan=background,
         residuals=residuals,
+        rotation=fit_rotation(sweeps, angles),
     )
 
 

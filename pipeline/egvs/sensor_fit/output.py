@@ -214,6 +214,7 @@ def report(fit: SensorFit, name: str) -> dict[str, Any]:
         "full_circle": angles.is_full_circle,
         "first_azimuth_deg": angles.first_azimuth_deg,
         "rotation_from_above": direction,
+        "rotation": _rotation(fit),
         "optics_to_axis_m": _value(angles.axis_distance_m, angles.axis_distance_se_m),
         "range_step_m": fit.range_step_m,
         "max_range_m": fit.max_range_m,
@@ -239,6 +240,19 @@ def report(fit: SensorFit, name: str) -> dict[str, Any]:
             "returns_of_pulses_without_background": unknown,
         }
     return result
+
+
+def _rotation(fit: SensorFit) -> dict[str, Any] | None:
+    rotation = fit.rotation
+    if rotation is None:
+        return None
+    return {
+        "turns_per_second": _value(rotation.rate_hz, rotation.rate_se_hz),
+        "from": rotation.source,
+        "sweeps": rotation.sweeps,
+        "firing_interval_s": rotation.firing_interval_s,
+        "azimuth_step_deg": rotation.step_deg,
+    }
 
 
 def _value(value: float, se: float) -> dict[str, float]:
