@@ -654,12 +654,21 @@ def new(
             " traffic are estimated.",
         ),
     ] = None,
+    pedestrian_tracks: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--pedestrian-tracks",
+            metavar="FILE",
+            help="Recorded tracks of people on foot and on bicycles, or a folder of them, beside simulated vehicles."
+            " Give the signals that they were recorded under by --signals.",
+        ),
+    ] = None,
     signals: Annotated[
         list[Path] | None,
         typer.Option(
             metavar="FILE",
-            help="Recorded signals of the junction, and a file that assigns their groups to lanes (KML or CSV), for"
-            " simulated traffic: --signals A --signals B.",
+            help="Recorded signals of the junction, and a file that assigns their groups to lanes (KML or CSV); without"
+            " one, it is guessed from the tracks. --signals A --signals B.",
         ),
     ] = None,
     track_columns: Annotated[
@@ -687,6 +696,9 @@ def new(
             " height from it.",
         ),
     ] = None,
+    run_: Annotated[
+        bool, typer.Option("--run", help="Run the new scenario at once, as egvs run does, up to the ranking.")
+    ] = False,
 ) -> None:
     """Create a scenario from maps of roads, buildings and other objects.
 
@@ -728,7 +740,7 @@ def new(
         lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=demand, pole_spacing_m=pole_spacing_m,
         align=tuple(cli_options.point_pair(text) for text in align or []), surface=tuple(surface or []),
         tracks=tuple(tracks or ()), like=tuple(like or ()), signals=tuple(signals or ()), track_crs=track_crs,
-        track_columns=track_columns, counts=counts,
+        track_columns=track_columns, pedestrian_tracks=tuple(pedestrian_tracks or ()), counts=counts,
     )  # fmt: skip
     notes = []
     if download:
@@ -737,6 +749,8 @@ def new(
         notes.append(extract.note)
     scenario = new_scenario.create_scenario(folder, paths, location, options)
     new_summary.print_new_scenario(scenario, notes)
+    if run_:
+        _run_all_stages(folder, None, None, None, audit=False, poles=DEFAULT_POLES, verbose=False, rehash=False)
 
 
 @app.command()
