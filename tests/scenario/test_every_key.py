@@ -154,6 +154,7 @@ KEYS: dict[str, Change] = {
     "traffic.counts.*.from_edge": Change("'c'", TURNS),
     "traffic.counts.*.to_edge": Change("'c'", TURNS),
     "traffic.counts.*.per_hour": Change("200", COUNTED),
+    "traffic.observed": Change("'observed.csv'", COUNTED),
     "traffic.counts.*.kind": Change("'car'", COUNTED),
     "traffic.kinds.*.name": Change("'other'"),
     "traffic.kinds.*.vclass": Change("'bus'"),
@@ -329,6 +330,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     texts = {
         "streets.net.xml": "<net/>",
         "others.net.xml": "<net> </net>",
+        "observed.csv": "approach,queue_m\nN,40\n",
         "trips.rou.xml": "<routes/>",
         "sizes.add.xml": "<additional/>",
         "streets.sumocfg": '<configuration><input><net-file value="streets.net.xml"/>'

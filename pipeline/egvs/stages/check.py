@@ -32,6 +32,7 @@ RULES: tuple[Callable[[CheckInputs], Iterator[Diagnostic]], ...] = (
     traffic_checks.check_finished_files,
     traffic_checks.check_vehicle_kinds,
     traffic_checks.check_counts,
+    traffic_checks.check_observed,
     scene_checks.check_sensors_known,
     scene_checks.warn_repeated_beams,
     scene_checks.check_effects,

@@ -220,3 +220,20 @@ def check_counts(inputs: CheckInputs) -> Iterator[Diagnostic]:
         for edge in (count.edge, count.from_edge, count.to_edge):
             if edge and edge not in edges:
                 yield Diagnostic.of("traffic", demand.unknown_edge_error(demand.count_key(count, key), edge))
+
+
+def check_observed(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Report a file of observed queues and speeds that is not valid, or that no counts belong to."""
+    scenario = inputs.scenario
+    if scenario.traffic.observed is None or inputs.network is None:
+        return
+    from egvs.traffic import observed
+
+    edges = {edge.id for edge in inputs.network.edges}
+    for period in scenario.by_period().values():
+        for count in period.traffic.counts:
+            if not {count.edge, count.from_edge, count.to_edge} - {None} <= edges:
+                return  # check_counts reports it
+    errors = ErrorCollector()
+    errors.attempt("traffic", partial(observed.read_observed, scenario, inputs.network))
+    yield from errors.findings
