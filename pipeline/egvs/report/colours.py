@@ -301,6 +301,12 @@ def _palette(colours: bytes, alpha: bytes) -> bytes:
     return _png_chunk(b"PLTE", colours) + _png_chunk(b"tRNS", alpha)
 
 
+def category_palette(categories: Sequence[str]) -> bytes:
+    """Return a palette of one colour per index, RRGGBB or, with its opacity, RRGGBBAA, for :meth:`IndexedImage.uri`."""
+    rgba = [bytes.fromhex(colour.ljust(8, "f")) for colour in categories]
+    return _palette(b"".join(colour[:3] for colour in rgba), bytes(colour[3] for colour in rgba))
+
+
 def _field_palette(stops: Sequence[str]) -> bytes:
     alpha = bytes([0, *(round(255 * opacity(i / 254)) for i in range(255))])
     return _palette(_scale_colours(stops), alpha)
