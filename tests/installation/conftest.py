@@ -67,6 +67,7 @@ def write_installed_scenario(folder: Path) -> Path:
     lamp = feature({"type": "Point", "coordinates": [22, -5]}, name="lamp", kind="pole", height_m=5, radius_m=0.1)
     (folder / "statics.geojson").write_text(collection(*features, lamp))
     scenario = (folder / "scenario.toml").read_text().replace('sensor = "small"', 'sensor = "wide"')
+    scenario = scenario.replace("gamma = 4", 'gamma = 4\nrank_by = "expected_detections"')
     (folder / "scenario.toml").write_text(f"{scenario}\n{SENSOR}")
     (folder / "sites.csv").write_text(
         "site,x_m,y_m,z_m,yaw_deg,pitch_deg\npole_a,10,12,5,-60,-5\npole_b,30.5,-12,5,90,0\n"

@@ -526,6 +526,7 @@ def figure(
     print(path)
 
 
+app.command()(installation.sheets)
 app.command()(installation.accept)
 
 
@@ -795,7 +796,7 @@ COMMAND_GROUPS = {
     "Decide": ("place", "explore", "compare", "city"),
     "Study": ("validate", "accuracy", "effects", "scores", "clouds", "train"),
     "Stages of egvs run": ("traffic", "statics", "tpog", "scan", "score", "report"),
-    "Install": ("accept",),
+    "Install": ("sheets", "accept"),
     "Files": ("runs", "export", "figure", "sensors", "verify", "store", "sensor"),
 }
 """Groups of ``egvs --help``, and their commands."""

@@ -1,4 +1,4 @@
-"""``egvs accept``: check an installed sensor."""
+"""``egvs sheets`` and ``egvs accept``: install a sensor, and check it."""
 
 from __future__ import annotations
 
@@ -12,6 +12,38 @@ from egvs.core.errors import EgvsError, InputError
 
 if TYPE_CHECKING:
     from egvs.installation.acceptance import Acceptance, Check
+
+
+def sheets(
+    run: Run,
+    site: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SITE",
+            help="A site (repeatable); by default the sensors of the plan in the folder, or the best site without one.",
+        ),
+    ] = None,
+    kind: Annotated[str, typer.Option("--format", metavar="FORMAT", help="pdf or svg.")] = "pdf",
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Folder to write; RUN/sheets by default.")
+    ] = None,
+) -> None:
+    """Write an installation sheet for each sensor of the plan: position, bearing, tilt, view, map, tolerances."""
+    from egvs.cli.console import ProgressDisplay, print_sentences
+
+    with ProgressDisplay("sheets") as screen:
+        from egvs.installation import sheet, tolerances
+
+        written = sheet.write_sheets(run, site or (), kind=kind, out=out, progress=screen.progress)
+    sentences = []
+    for data, _ in written:
+        angles = f"bearing {sheet.format_angle(data.grid_bearing_deg)} from grid north"
+        height = f"{data.mounting_height_m:.2f} m above the ground"
+        costs = tolerances.describe_tolerances(data.tolerances)
+        sentences.append(f"{data.site.name}: {height}, {angles}; {costs} ({data.tolerances.frames:,} frames).")
+    print_sentences(sentences)
+    for _, path in written:
+        print(path)
 
 
 def accept(

@@ -257,6 +257,11 @@ class Session:
         return str(self.scenario.score.rank_by)
 
     @property
+    def frames(self) -> int:
+        """Number of recorded frames that scores over vehicles use; of all frames if the scenario has no such score."""
+        return self.tpog.frames if self._targets is None else len(self._targets.record.numbers)
+
+    @property
     def ranked(self) -> list[PoseScore]:
         """The candidates, best first."""
         return sorted(self.candidates.values(), key=lambda candidate: candidate.rank)
