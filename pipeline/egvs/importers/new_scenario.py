@@ -8,6 +8,7 @@ flows, and find how much of them the network carries; write
     network.net.xml    the streets                                       (traffic)
     statics.geojson    footprints with heights, and import counts        (statics)
     sites.csv          candidate sites                                   (scan, score)
+    zones.geojson      crosswalks, stop lines, approaches                (score)
     scenario.toml      the scenario that names them
 
 and, where the maps have meshes, one PLY file for each kind of object.
@@ -38,6 +39,7 @@ from egvs.importers import (
     demand_from_tracks,
     ground_heights,
     ground_reference,
+    junction_zones,
     junctions,
     map_readers,
     openstreetmap,
@@ -55,6 +57,7 @@ from egvs.importers.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, 
 from egvs.importers.building_heights import ASSUMED, NEIGHBOURS, SURFACE_MODEL
 from egvs.importers.demand_from_tracks import TrackDemand
 from egvs.importers.ground_heights import HIGHEST_M, LOWEST_M
+from egvs.importers.junction_zones import Zone
 from egvs.importers.junctions import JunctionRegion, KerbsidePole, StreetJunction, Streets
 from egvs.importers.map_parts import MapContext, RoadOptions, Terrain
 from egvs.importers.map_readers import MapFile, MapFiles
@@ -71,6 +74,7 @@ from egvs.importers.scenario_files import (
     SITES_FILE,
     STATICS_FILE,
     TERRAIN_FILE,
+    ZONES_FILE,
     FileContent,
     TomlTable,
     reachable_area,
@@ -141,6 +145,8 @@ class NewScenario:
         Durations of recorded signals, with intervals; empty without them.
     counted
         The user's counts, if there are any.
+    zones
+        Zones of the junction, for which results are reported.
     """
 
     folder: Path
@@ -160,6 +166,7 @@ class NewScenario:
     demand: TrackDemand | None = None
     signal_notes: tuple[str, ...] = ()
     counted: StreetCounts | None = None
+    zones: tuple[Zone, ...] = ()
 
     @property
     def maps_have_notes(self) -> bool:
@@ -319,8 +326,8 @@ def create_scenario(
         terrain = ground_reference.measured_ground(measured)
     elif measured is not None:
         ground_notes.append("The ground of the point cloud is not used, since a terrain file is given.")
-    zero = ground_reference.find_zero(roads, files.roads, junction, terrain)
-    roads = ground_reference.lay_on_ground(roads, files.roads, junction, terrain)
+    zero = ground_reference.find_zero(roads, files.roads, junction, terrain, files.terrain)
+    roads = ground_reference.lay_on_ground(roads, files.roads, junction, terrain, files.terrain)
     terrain_m = None if terrain is None else _terrain_points(terrain, window, zero.height_m or 0.0)
     ground = ground_surface(roads.streets, terrain_m)
     objects = static_objects.collect_objects(
@@ -362,6 +369,7 @@ def create_scenario(
         height_m=relief.z_range_m[1] - relief.z_range_m[0], maps=objects.maps,
         attributions=_attributions(roads, objects), from_at_m=_distance_m(streets, junction, at),
         demand=planned.demand, signal_notes=signal_notes, counted=planned.counted,
+        zones=junction_zones.junction_zones(streets, junction, roi),
     )  # fmt: skip
     ground_m = relief.ground_m(ground, poles)
     columns = _site_columns(poles, ground_m, relief, maps_read, roi, zero.height_m or 0.0)
@@ -374,6 +382,7 @@ def create_scenario(
         NETWORK_FILE: network,
         STATICS_FILE: scenario_files.solids_geojson(objects.solids, objects.counts, scenario.attributions),
         SITES_FILE: scenario_files.sites_csv(poles, columns),
+        **({ZONES_FILE: junction_zones.zones_geojson(scenario.zones)} if scenario.zones else {}),
         **meshes,
         **terrain_files,
         **({} if recording is None else recording.copies()),
@@ -699,7 +708,7 @@ def _scenario_toml(
         "traffic": ("SUMO" if recording is None else "recorded; nothing is simulated", traffic),
         "statics": statics,
         "sites": (sites_comment, sites | scenario_files.mount_keys()),
-        "score": scenario_files.score_table(),
+        "score": scenario_files.score_table(ZONES_FILE if scenario.zones else None),
         "placement": scenario_files.placement_table(),
     }
     if zero_height_m:
