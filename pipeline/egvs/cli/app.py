@@ -15,7 +15,7 @@ from typer.core import TyperCommand
 from typer.models import CommandInfo
 
 from egvs._version import __version__
-from egvs.cli import city, compare, exit, place, sensor, sources, validate
+from egvs.cli import city, compare, exit, installation, place, sensor, sources, validate
 from egvs.cli import options as cli_options
 from egvs.cli.options import (
     DEFAULT_POLES,
@@ -526,6 +526,10 @@ def figure(
     print(path)
 
 
+app.command()(installation.sheets)
+app.command()(installation.accept)
+
+
 app.add_typer(city.app, name="city")
 
 
@@ -806,6 +810,7 @@ COMMAND_GROUPS = {
     "Decide": ("place", "explore", "compare", "city"),
     "Study": ("validate", "accuracy", "effects", "scores", "clouds", "train"),
     "Stages of egvs run": ("traffic", "statics", "tpog", "scan", "score", "report"),
+    "Install": ("sheets", "accept"),
     "Files": ("runs", "export", "figure", "sensors", "verify", "store", "sensor"),
 }
 """Groups of ``egvs --help``, and their commands."""
