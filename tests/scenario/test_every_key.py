@@ -234,6 +234,7 @@ KEYS: dict[str, Change] = {
     "score.weights.zones.*.polygon_m": Change("[[0, 0], [9, 0], [9, 9]]", WEIGHTED),
     "score.weights.zones.*.file": Change("'other_zones.csv'", WEIGHTED_BY_FILE),
     "score.weights.zones.*.weight": Change("3", WEIGHTED),
+    "score.zones": Change("'other_zones.csv'", ("score.zones='zones.csv'",)),
     "score.keep_visibility": Change("'all'"),
     "score.blindspots": Change("false"),
     "score.standard_error": Change("false"),

@@ -578,6 +578,22 @@ def new(
             " junction with signals.",
         ),
     ] = None,
+    download: Annotated[
+        bool,
+        typer.Option(
+            "--download",
+            help="Download the OpenStreetMap extract around --at LAT,LON from an Overpass server. Nothing is downloaded"
+            " without this option.",
+        ),
+    ] = False,
+    overpass_url: Annotated[
+        str | None,
+        typer.Option(
+            "--overpass",
+            metavar="URL",
+            help="Overpass server for --download; default: EGVS_OVERPASS_URL, or overpass-api.de.",
+        ),
+    ] = None,
     lefthand: Annotated[bool, typer.Option("--lefthand", help="Traffic drives on the left.")] = False,
     walk: Annotated[bool, typer.Option("--walk", help="Include sidewalks and crossings, for pedestrians.")] = False,
     surroundings: Annotated[
@@ -599,6 +615,14 @@ def new(
     vehicles_per_hour: Annotated[
         int | None,
         typer.Option(metavar="N", help="Instead of --traffic: vehicles per hour that pass the junction, in all."),
+    ] = None,
+    counts: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Instead of assumed traffic: your counts, a CSV file with columns street, approach (the side on which"
+            " vehicles arrive), turn, start and count; docs/scenarios.md.",
+        ),
     ] = None,
     poles: Annotated[
         tuple[str, str] | None,
@@ -675,8 +699,11 @@ def new(
     from egvs.importers.new_scenario import NewScenarioOptions
 
     paths = [*(maps or []), *(more or [])]
-    if not paths:
-        raise InputError("--from", "no map is given", "Give a map of the roads, such as --from town.osm.")
+    if not paths and not download:
+        hint = "Give a map of the roads, such as --from town.osm, or --at LAT,LON --download."
+        raise InputError("--from", "no map is given", hint)
+    if overpass_url is not None and not download:
+        raise InputError("--overpass", "has no effect without --download", "Add --download.")
     location = None
     if at is not None:
         location = cli_options.latitude_and_longitude(at)
@@ -685,6 +712,9 @@ def new(
         surroundings_m = cli_options.radius_m(surroundings)
     if traffic is not None and vehicles_per_hour is not None:
         raise InputError("--traffic", "cannot be combined with --vehicles-per-hour", "Use one of them.")
+    if counts is not None and (traffic is not None or vehicles_per_hour is not None):
+        key = "--traffic" if traffic is not None else "--vehicles-per-hour"
+        raise InputError(key, "has no effect on counted traffic (--counts)", "Use one of them.")
     if (tracks or like) and (traffic is not None or vehicles_per_hour is not None):
         key = "--traffic" if traffic is not None else "--vehicles-per-hour"
         source = "--tracks" if tracks else "--like"
@@ -699,10 +729,15 @@ def new(
         lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=demand, pole_spacing_m=pole_spacing_m,
         align=tuple(cli_options.point_pair(text) for text in align or []), surface=tuple(surface or []),
         tracks=tuple(tracks or ()), like=tuple(like or ()), signals=tuple(signals or ()), track_crs=track_crs,
-        track_columns=track_columns,
+        track_columns=track_columns, counts=counts,
     )  # fmt: skip
+    notes = []
+    if download:
+        extract = new_scenario.download_map(folder, location, options, overpass_url)
+        paths.append(extract.path)
+        notes.append(extract.note)
     scenario = new_scenario.create_scenario(folder, paths, location, options)
-    new_summary.print_new_scenario(scenario)
+    new_summary.print_new_scenario(scenario, notes)
 
 
 @app.command()

@@ -27,6 +27,7 @@ from egvs.report import figures, formatting, maps
 from egvs.report.basemap import network_file
 from egvs.report.colours import STYLE_SHEET
 from egvs.report.figures import Figures
+from egvs.report.map_credits import read_map_credits
 from egvs.report.ranking import (
     RankedSite,
     Ranking,
@@ -71,6 +72,8 @@ TEMPLATES = Path(__file__).parent / "templates"
 _OPTIONAL_FILES = (
     RunFolder.scores_by_period.name,
     RunFolder.blindspots.name,
+    RunFolder.zones.name,
+    RunFolder.plan_zones.name,
     *ACCURACY_FILES,
     *VALIDATION_FILES,
     *PLACEMENT_FILES,
@@ -141,6 +144,8 @@ def dependencies(work: StageContext) -> StageDependencies:
     scenario, stages = work.scenario, _recorded_stages(work.folder.path)
     names = [RunFolder.trajectories.name, RunFolder.tpog.name, RunFolder.statics.name, RunFolder.scores.name]
     settings: dict[str, Any] = {"shown": _displayed_settings(scenario), "keep": scenario.scan.keep}
+    if map_credits := read_map_credits(scenario):
+        settings["map_credits"] = map_credits
     hashes: dict[str, str] = {}
     if scenario.scan.keep:
         names.append(RunFolder.scans.name)
@@ -311,6 +316,7 @@ def _setting_values(contents: PageContents) -> dict[str, Any]:
         "assumed": assumptions(scenario),
         "assumes_flows": assumes_flows(scenario),
         "gamma": "∞" if math.isinf(gamma) else f"{gamma:g}",
+        "map_credits": read_map_credits(scenario),
         "uncapped": math.isinf(gamma),
         "gamma_auto": scenario.score.gamma == "auto",
         "has_traffic": bool(contents.tpog.counts.any()),
