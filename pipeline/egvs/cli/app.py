@@ -15,7 +15,7 @@ from typer.core import TyperCommand
 from typer.models import CommandInfo
 
 from egvs._version import __version__
-from egvs.cli import city, compare, exit, installation, place, sensor, sources, validate
+from egvs.cli import city, compare, exit, installation, place, sensor, sources, validate, what_if
 from egvs.cli import options as cli_options
 from egvs.cli.options import (
     DEFAULT_POLES,
@@ -307,6 +307,7 @@ def verify(
 
 
 app.command()(compare.compare)
+app.command("what-if")(what_if.what_if)
 
 
 @app.command()
@@ -807,7 +808,7 @@ def store(
 
 COMMAND_GROUPS = {
     "Start here": ("new", "demo", "check", "run"),
-    "Decide": ("place", "explore", "compare", "city"),
+    "Decide": ("place", "explore", "compare", "what-if", "city"),
     "Study": ("validate", "accuracy", "effects", "scores", "clouds", "train"),
     "Stages of egvs run": ("traffic", "statics", "tpog", "scan", "score", "report"),
     "Install": ("sheets", "accept"),
