@@ -106,6 +106,8 @@ def _print_ranking(
         out.print(location)
     if missed := summary.get("missed"):
         print_sentences([missed])
+    if in_zones := summary.get("zones"):
+        print_sentences([in_zones])
     if other_order := order_by_egvs(ranked, parquet.read_metadata(RunFolder(folder).scores, "scores")):
         print_sentences([other_order])
 

@@ -27,6 +27,7 @@ _OMITTED_KEYS = frozenset(
         "solids",
         "sumo_seconds",
         "sumo_peak_mb",
+        "zones",
         WARNINGS_KEY,
     )
 )

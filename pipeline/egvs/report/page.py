@@ -75,6 +75,8 @@ TEMPLATES = Path(__file__).parent / "templates"
 _OPTIONAL_FILES = (
     RunFolder.scores_by_period.name,
     RunFolder.blindspots.name,
+    RunFolder.zones.name,
+    RunFolder.plan_zones.name,
     *ACCURACY_FILES,
     *VALIDATION_FILES,
     *PLACEMENT_FILES,

@@ -195,7 +195,9 @@ def _merge_findings(findings: Iterable[Diagnostic]) -> Iterator[Diagnostic]:
         yield replace(first, where=f"{first.where} and {len(others)} more") if others else first
 
 
-IGNORED_SETTINGS = ("description", "extends", "seed", "tpog", "scan", "score", "validation", "placement", "costs")
+IGNORED_SETTINGS = (
+    "description", "extends", "seed", "tpog", "scan", "score", "validation", "placement", "costs", "what_if",
+)  # fmt: skip
 """Settings that no rule reads."""
 
 

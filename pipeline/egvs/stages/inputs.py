@@ -209,6 +209,8 @@ def named_files(scenario: Scenario) -> Iterator[tuple[str, str]]:
     ):
         if optional_name is not None:
             yield key, optional_name
+    if scenario.score.zones is not None:
+        yield zones.REPORTED_KEY, scenario.score.zones
     for name, weighted in scenario.score.weights.zones.items():
         if weighted.file is not None:
             yield f"{zones.WEIGHTS_KEY}.{name}.file", weighted.file
@@ -363,6 +365,7 @@ def resolve_check_inputs(inputs: Inputs) -> tuple[CheckInputs, list[Diagnostic]]
         errors.findings += _static_file_errors(scenario)
     errors.attempt("zones", lambda: zones.weight_zones(scenario))
     errors.attempt("zones", lambda: zones.placement_zones(scenario))
+    errors.attempt("zones", lambda: zones.reported_zones(scenario))
     carriageway = None if network is None else inputs.carriageway
     readable = CheckInputs(scenario, network, carriageway, world)
 
