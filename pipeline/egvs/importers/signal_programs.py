@@ -32,6 +32,7 @@ from egvs.importers.plain_network import NETCONVERT_FLAGS, NETWORK_FILE
 from egvs.importers.recorded_signals import GREEN, RED, YELLOW, RecordedSignals, SignalRecord
 from egvs.traffic import estimates, sumo
 from egvs.traffic.estimates import Estimate
+from egvs.traffic.signals import Phase, Program, replace_programs, request_bits
 
 NEAR_M = 6.0
 """A way of the file that assigns groups belongs to a connection if both its ends are nearer than this to its path."""
@@ -43,7 +44,6 @@ MIN_CYCLE_S, MAX_CYCLE_S = 5.0, 600.0
 MIN_YELLOW_S = 3.0
 """Yellow that is added where a recorded cycle ends in a green that the next one begins with red."""
 
-_PROGRAM = re.compile(r"    <tlLogic id=(\"[^\"]*\").*?</tlLogic>\n", re.DOTALL)
 _GENERATED = re.compile(r"<!-- generated on .*?-->\n*", re.DOTALL)
 
 
@@ -169,7 +169,8 @@ def _read_junction(path: Path, node: str) -> _Junction:
             shapes |= {lane.attrib["id"]: _line(lane.attrib["shape"]) for lane in element.iter("lane")}
         elif element.tag == "junction":
             requests[element.attrib["id"]] = {
-                int(request.attrib["index"]): _bits(request.attrib["response"]) for request in element.iter("request")
+                int(request.attrib["index"]): request_bits(request.attrib["response"])
+                for request in element.iter("request")
             }
         elif element.tag == "connection" and element.get("tl") == junction.program:
             start, end = element.attrib["from"], element.attrib["to"]
@@ -190,11 +191,6 @@ def _read_junction(path: Path, node: str) -> _Junction:
 
 def _line(text: str) -> FloatArray:
     return np.array([[float(value) for value in point.split(",")[:2]] for point in text.split()], dtype=np.float64)
-
-
-def _bits(response: str) -> set[int]:
-    """Return the links that a link gives way to; the last letter is that of link 0."""
-    return {index for index, bit in enumerate(reversed(response)) if bit == "1"}
 
 
 def _assign_groups(links: Sequence[_Link], signals: RecordedSignals, frame: WorldFrame | None) -> dict[int, str]:
@@ -291,14 +287,8 @@ def _with_right_of_way(
 
 def _write_program(network: str, program: str, phases: Sequence[tuple[float, str]]) -> str:
     """Replace a program of a network."""
-    lines = "".join(f'        <phase duration="{duration_s:g}" state="{state}"/>\n' for duration_s, state in phases)
-
-    def replacement(match: re.Match[str]) -> str:
-        if match[1] != f'"{program}"':
-            return match[0]
-        return f'    <tlLogic id={match[1]} type="static" programID="0" offset="0">\n{lines}    </tlLogic>\n'
-
-    return _PROGRAM.sub(replacement, network)
+    recorded = Program("static", 0.0, tuple(Phase(duration_s, state) for duration_s, state in phases))
+    return replace_programs(network, {program: recorded})
 
 
 def _notes(
