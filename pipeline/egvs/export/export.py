@@ -140,6 +140,10 @@ def export_run(
     with files.temporary_folder() as temp_folder:
         if file_format.name == "geotiff":
             written = list(_write_rasters(run, reference, temp_folder, selected, progress))
+            if run.work.inputs.common_network is None:
+                notes.append("points on target are left out: the traffic does not come from one road network")
+            if run.has_outdated_plan:
+                notes.append("the plan's overlap is left out: it is for other traffic. Run egvs place again")
         else:
             layers, notes = city_layers(folder) if of_city else run_layers(run)
             if file_format.name == "kml" and not of_city:
@@ -282,7 +286,7 @@ def _write_rasters(
             name += "_"
         used |= _raster_file_stems(name)
         yield from rasters.write_geotiff(folder, raster, reference, name)
-        progress(f"{raster.name} written", number, 1 + 3 * len(sites))
+        progress(f"{raster.name} written", number, 0)
 
 
 def _raster_file_stems(name: str) -> set[str]:

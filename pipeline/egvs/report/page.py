@@ -27,6 +27,7 @@ from egvs.report import figures, formatting, maps
 from egvs.report.basemap import network_file
 from egvs.report.colours import STYLE_SHEET
 from egvs.report.figures import Figures
+from egvs.report.points_section import MAPPED_POLES, PointsSection
 from egvs.report.ranking import (
     RankedSite,
     Ranking,
@@ -50,6 +51,7 @@ from egvs.report.sections import (
     ranking_disagreement,
 )
 from egvs.report.sensor_results import SensorComparison, costs_option, range_note
+from egvs.report.zone_section import ZoneSection
 from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.scene_inputs import scan_dependencies
@@ -100,6 +102,8 @@ class PageContents:
         Records of the stages, as far as ``run.json`` has them, in the order of :data:`STAGES`.
     study, by_period, detected, plan
         Results of other commands and of periods; None if those commands have not run.
+    zones, points
+        Road users found in zones, and maps of points on target; None where the scenario has no zones or no lanes.
     movements
         What each counted location is in words; empty if the run folder has no network.
     """
@@ -114,6 +118,8 @@ class PageContents:
     detected: ValidationSummary | None = None
     plan: PlacementSummary | None = None
     movements: Mapping[str, str] = field(default_factory=dict)
+    zones: ZoneSection | None = None
+    points: PointsSection | None = None
 
 
 @dataclass(frozen=True)
@@ -150,6 +156,9 @@ def dependencies(work: StageContext) -> StageDependencies:
         scan = scan_dependencies(work)
         settings["scan"], hashes = scan.settings, dict(scan.files)
     hashes |= work.digests(*(name for name in (*names, *_OPTIONAL_FILES) if work.path(name).is_file()))
+    network = work.inputs.common_network_path
+    if network is not None:
+        hashes["network"] = work.inputs.digest(network)
     if (roads := network_file(work.folder.path)) is not None:
         hashes |= work.digests(roads.relative_to(work.folder.path).as_posix())
 
@@ -208,6 +217,10 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
     drawn = figures.draw_figures(work, ranking, SiteListing.from_ranking(ranking).choices, tpog)
     work.progress("figures drawn", 2, 3)
 
+    plan = PlacementSummary.read(out, stages, ranking.sites, tpog, drawn.backdrop)
+    mapped = [pole.best for pole in ranking.poles[:MAPPED_POLES]]
+    mounts = [] if plan is None else [pick.mount for pick in plan.picks]
+    moved = plan is not None and plan.before is not None
     contents = PageContents(
         work.scenario,
         ranking,
@@ -217,8 +230,10 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
         study=StudySummary.read(out, stages),
         by_period=PeriodRanking.read(out),
         detected=ValidationSummary.read(out, stages),
-        plan=PlacementSummary.read(out, stages, ranking.sites, tpog, drawn.backdrop),
+        plan=plan,
         movements=describe_counts(work.scenario, network_file(out)),
+        zones=ZoneSection.read(work, ranking.sites[0], tpog.grid, drawn.backdrop, has_plan=plan is not None),
+        points=PointsSection.draw(work, mapped, mounts, tpog.grid, drawn.backdrop, moved=moved),
     )
     html = render_page(contents)
     files.write_text(work.folder.report, html)
@@ -382,6 +397,7 @@ STAGE = Stage(
         RunFolder.scores,
         RunFolder.scores_by_period,
         RunFolder.blindspots,
+        RunFolder.zones,
     ),
     effect_stages=("scan", "score"),
     prepare=(prepare,),
