@@ -299,7 +299,7 @@ def classes_view(
     """
     plan = site_view_frame(box, prefix)
     image = colours.share_image(values / (len(classes.labels) - 1))
-    parts = [_road_paths(plan, backdrop.roads)]
+    parts = [road_paths(plan, backdrop.roads)]
     for theme in colours.THEMES:
         parts.append(plan.image(plan.region(grid), image.uri(colours.SHARE_PALETTES[theme]), f"field share {theme}"))
     parts += [_outline_paths(plan, backdrop.outlines), plan.roi(grid)]
@@ -323,7 +323,7 @@ def zone_map(grid: Grid, zones: Sequence[MapZone], site: MapSite, backdrop: Back
     See :func:`classes_view` for the parameters.
     """
     plan = MapFrame(box, "zones", north=True)
-    parts = [_road_paths(plan, backdrop.roads), _outline_paths(plan, backdrop.outlines), plan.roi(grid)]
+    parts = [road_paths(plan, backdrop.roads), _outline_paths(plan, backdrop.outlines), plan.roi(grid)]
     numbers = []
     for zone in sorted(zones, key=lambda zone: -zone.area.area):
         rings = []
