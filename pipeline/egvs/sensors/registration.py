@@ -12,13 +12,14 @@ The method is the iterative closest point method with distances from points to p
 Vision Computing 10, 145-155), and with the correspondence along the beam (Blais and Levine 1995, IEEE Trans. Pattern
 Anal. 17, 820-824): each point is compared with the plane of the face of the static world that its own beam hits first
 from the current pose. So occlusion is exact, and no nearest point needs to be searched. Weights are Tukey's biweight
-inside a gate that narrows to four robust standard deviations; points on vehicles, or on trees that the static world
-does not have, get no weight.
+inside a gate that narrows to four robust standard deviations, but not below 0.4 m; points on vehicles, or on trees that
+the static world does not have, get no weight.
 
 Errors of neighbouring points are correlated, since the static world differs from the real one. The covariance is
-therefore the sandwich estimator with sectors of azimuth as clusters (Liang and Zeger 1986, Biometrika 73, 13-22). A
-parameter that no surface fixes, such as the position along an endless wall, has an infinite variance and keeps its
-start value. The covariance knows nothing about errors that all of the world shares.
+therefore that of the jackknife over clusters (one step from each; Cameron and Miller 2015, J. Hum. Resour. 50, 317-372,
+CR3). Clusters are sectors of azimuth, or the walls of a solid within a wider sector, whichever gives the larger
+variance. A parameter that no surface fixes, such as the position along an endless wall, has an infinite variance and
+keeps its start value. The covariance knows nothing about errors that all of the world shares.
 """
 
 from __future__ import annotations
@@ -51,7 +52,8 @@ MIN_POINTS = 200
 _MAX_POINTS = 20_000
 _SEARCH_POINTS = 3_000
 _START_GATE_M = 3.0
-_MIN_GATE_M = 0.05
+_MIN_GATE_M = 0.4
+"""Walls of a map may be wrong by decimetres, while the ground fits to a centimetre: they must not count as outliers."""
 _GATE_SIGMAS = 4.0
 _NARROWING = 0.75
 _RANGE_GATES = 5.0
@@ -61,7 +63,9 @@ _STEADY = 1.02
 """The gate narrows until it is at most this multiple of its final width."""
 _MIN_INFORMATION = 1e-6
 """Mean squared cosine between normals and a direction of motion, below which the direction counts as not fixed."""
-_BLOCK_DEG = 5.0
+_BLOCK_DEG, _WALL_BLOCK_DEG = 5.0, 30.0
+_LEVEL = 0.7
+"""Surfaces that face up: the z component of their normals is larger."""
 _YAW_STEP_DEG = 2.0
 _SEARCH_CAP_M = 2.0
 _COST_CAP_M = 0.5
@@ -167,13 +171,14 @@ class YawSearch:
 class _Matches:
     """Each point against the face that its beam hits; arrays of n rows.
 
-    ``along_m`` is the measured range minus that of the face.
+    ``along_m`` is the measured range minus that of the face, ``solid`` the solid of the face (-1 for none).
     """
 
     arms: FloatArray
     normal: FloatArray
     distance_m: FloatArray
     along_m: FloatArray
+    solid: IntArray
 
 
 class _Limit(NamedTuple):
@@ -218,6 +223,7 @@ class StaticSurfaces:
         corners = world.triangles_m - np.asarray(position_m)
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         length = np.linalg.norm(normals, axis=1)[:, None]
+        self._solids: IntArray = world.solid_of_face.astype(np.int64)
         self._normals: FloatArray = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
 
     def match(self, points_m: FloatArray, pose: Pose) -> _Matches:
@@ -230,7 +236,8 @@ class StaticSurfaces:
         ends = np.where(hit[:, None], scan.ends_m, np.nan)
         normal = np.where(hit[:, None], self._normals[np.maximum(scan.face, 0)], np.nan)
         distance = np.einsum("ij,ij->i", normal, arms - ends)
-        return _Matches(arms, normal, distance, range_m - np.linalg.norm(ends, axis=1))
+        solid = np.where(hit, self._solids[np.maximum(scan.face, 0)], -1)
+        return _Matches(arms, normal, distance, range_m - np.linalg.norm(ends, axis=1), solid)
 
 
 def register_scan(
@@ -359,6 +366,44 @@ def _azimuth_blocks(points_m: FloatArray) -> IntArray:
     return block.astype(np.int64)
 
 
+def _jackknife(along: FloatArray, curvature: FloatArray, scores: FloatArray, cluster: IntArray) -> FloatArray:
+    """Return the covariance of parameters, (k, k), from one step without each cluster of rows in turn."""
+    order = np.argsort(cluster, kind="stable")
+    starts = np.searchsorted(cluster[order], np.arange(int(cluster.max()) + 1))
+    products = (along * curvature[:, None])[order, :, None] * along[order, None, :]
+    normals = np.add.reduceat(products, starts, axis=0)
+    sums = np.add.reduceat(scores[order], starts, axis=0)
+    without = np.linalg.pinv(normals.sum(axis=0) - normals, rcond=1e-9, hermitian=True)
+    shifts = np.einsum("gij,gj->gi", without, sums)
+    covariance: FloatArray = shifts.T @ shifts * ((len(shifts) - 1) / len(shifts))
+    return covariance
+
+
+def _larger(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Return a covariance that is at least each of two, in every direction where they differ most."""
+    from scipy.linalg import eigh
+
+    tiny = 1e-9 * max(float(np.trace(one)), 1e-12) / len(one)
+    ratio, vectors = eigh(other, one + tiny * np.eye(len(one)))
+    back = np.linalg.inv(vectors)
+    larger: FloatArray = back.T @ (np.maximum(ratio, 1.0)[:, None] * back)
+    return larger
+
+
+def _clusters(points_m: FloatArray, matches: _Matches, rows: NDArray[np.bool_]) -> IntArray:
+    """Return the number of the cluster of each point, from 0: errors within a cluster are correlated.
+
+    A cluster is what a sector of 30 degrees has of the walls of one solid, which a map may have in the wrong place, or
+    what a sector of 5 degrees has of surfaces that face up.
+    """
+    azimuth_deg = np.degrees(np.arctan2(points_m[:, 1], points_m[:, 0]))
+    is_level = np.abs(matches.normal[rows, 2]) > _LEVEL
+    sector = np.floor(azimuth_deg / np.where(is_level, _BLOCK_DEG, _WALL_BLOCK_DEG))
+    keys = np.column_stack([np.where(is_level, -1, matches.solid[rows]), sector])
+    _, cluster = np.unique(keys, axis=0, return_inverse=True)
+    return cluster.ravel().astype(np.int64)
+
+
 def _fit(
     points_m: FloatArray, surfaces: StaticSurfaces, start: Pose, columns: IntArray, limit: _Limit, where: str
 ) -> _Optimum:
@@ -372,7 +417,7 @@ def _fit(
         distance_m = matches.distance_m[inside]
         weight = (1.0 - (distance_m / gate_m) ** 2) ** 2
         design = _design(matches, inside, parameters)[:, columns]
-        inverse, _ = _fixed_inverse(design, weight, weight)
+        inverse = _fixed_inverse(design, weight)
         step = inverse @ (design.T @ (weight * distance_m))
         parameters[columns] -= _UNITS[columns] * step
         narrow_m = max(_MIN_GATE_M, _GATE_SIGMAS * _inlier_sigma(distance_m))
@@ -451,8 +496,16 @@ def _design(matches: _Matches, rows: NDArray[np.bool_], parameters: FloatArray) 
     return np.column_stack([normal, *turned])
 
 
-def _fixed_inverse(design: FloatArray, weight: FloatArray, curvature: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the pseudo-inverse of the curved normal matrix, and the directions that no surface fixes, as columns.
+def _fixed_inverse(design: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return the inverse of the normal matrix in the directions that surfaces fix, (k, k)."""
+    basis, _ = _fixed_directions(design, weight)
+    along = design @ basis
+    inverse: FloatArray = basis @ np.linalg.inv((along * weight[:, None]).T @ along) @ basis.T
+    return inverse
+
+
+def _fixed_directions(design: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the directions of the parameters that surfaces fix, and those that none fixes, as columns.
 
     Angles are scaled by a typical arm, so that all parameters move points by about as much.
     """
@@ -460,10 +513,8 @@ def _fixed_inverse(design: FloatArray, weight: FloatArray, curvature: FloatArray
     scale = 1.0 / np.where(lengths > 1.0, lengths, 1.0)
     scaled = design * scale
     values, vectors = np.linalg.eigh((scaled * (weight / weight.sum())[:, None]).T @ scaled)
-    fixed = vectors[:, values > _MIN_INFORMATION]
-    normal = (scaled * curvature[:, None]).T @ scaled
-    inverse = fixed @ np.linalg.inv(fixed.T @ normal @ fixed) @ fixed.T
-    return scale[:, None] * inverse * scale, vectors[:, values <= _MIN_INFORMATION]
+    is_fixed = values > _MIN_INFORMATION
+    return scale[:, None] * vectors[:, is_fixed], vectors[:, ~is_fixed]
 
 
 def _covariance(
@@ -476,12 +527,15 @@ def _covariance(
     relative = (matches.distance_m[inside] / optimum.gate_m) ** 2
     weight = (1.0 - relative) ** 2
     # The derivative of weight * distance, which is less than the weight.
-    inverse, null = _fixed_inverse(design, weight, (1.0 - relative) * (1.0 - 5.0 * relative))
+    curvature = (1.0 - relative) * (1.0 - 5.0 * relative)
+    basis, null = _fixed_directions(design, weight)
     scores = design * (weight * matches.distance_m[inside])[:, None]
-    blocks = _azimuth_blocks(points_m[inside])
-    sums = np.column_stack([np.bincount(blocks, weights=column) for column in scores.T])
-    n_blocks = len(sums)
-    fitted = inverse @ (sums.T @ sums) @ inverse * (n_blocks / max(1, n_blocks - 1))
+    along, scores = design @ basis, scores @ basis
+    by_sector, by_wall = (
+        _jackknife(along, curvature, scores, clusters)
+        for clusters in (_azimuth_blocks(points_m[inside]), _clusters(points_m[inside], matches, inside))
+    )
+    fitted = basis @ _larger(by_sector, by_wall) @ basis.T
     fitted = _UNITS[columns, None] * fitted * _UNITS[columns]
     is_free = (null**2).sum(axis=1) > 1e-6
     fitted[np.diag_indices(len(columns))] = np.where(is_free, np.inf, np.diag(fitted))
