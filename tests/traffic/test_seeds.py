@@ -13,6 +13,7 @@ from egvs.artefacts import parquet
 from egvs.artefacts.tpog import PeriodBlocks, read_periods, read_tpog
 from egvs.core.errors import InputError
 from egvs.scenario.loading import load, scenario_from_dict
+from egvs.scenario.traffic_config import TrafficConfig
 from egvs.scoring.standard_errors import ScoreUncertainty, block_groups, summarise_uncertainty
 from egvs.stages import statics, tpog, traffic
 from tests.conftest import write_mini
@@ -150,6 +151,13 @@ def test_one_seed_is_the_run_without_the_key(town, tmp_path):
     for artefact in ("trajectories.parquet", "tpog.parquet"):
         assert (tmp_path / "without" / artefact).read_bytes() == (tmp_path / "one" / artefact).read_bytes()
     assert "seeds" not in parquet.read_metadata(tmp_path / "one" / "tpog.parquet", "tpog")
+
+
+def test_keys_that_are_not_set_do_not_change_cache_keys():
+    """A dump of the traffic is part of the stage key: without several seeds and plans, it is as before these keys."""
+    config = TrafficConfig(network="net.xml")
+    assert TrafficConfig.model_fields.keys() - config.model_dump().keys() == {"seeds", "signals"}
+    assert config.model_copy(update={"seeds": 5}).model_dump()["seeds"] == 5
 
 
 @pytest.mark.parametrize(

@@ -231,6 +231,8 @@ _REQUIRED_METADATA: dict[str, tuple[str, ...]] = {
     "scans": ("sites",),
     "visibility": ("grid", "sites"),
     "blindspots": ("sites", "cells", "points"),
+    "zones": ("sites",),
+    "plan_zones": ("inputs", "stages"),
     "accuracy": ("inputs", "tolerance", "stages"),
     "placement": ("inputs", "stages", "plan"),
     "curve": ("inputs", "stages", "plan"),

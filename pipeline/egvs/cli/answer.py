@@ -28,7 +28,7 @@ from egvs.report.formatting import ScoreLabel, join_names
 from egvs.report.ranking import Pole, RankedSite, Ranking
 from egvs.report.sensor_results import range_note
 from egvs.scenario.model import Scenario
-from egvs.traffic.signals import format_plan
+from egvs.traffic.signal_descriptions import format_plan
 
 _FILE_WIDTH = 150
 _MAX_SIGNALS = 2
@@ -118,6 +118,8 @@ def _print_ranking(
         out.print(location)
     if missed := summary.get("missed"):
         print_sentences([missed])
+    if in_zones := summary.get("zones"):
+        print_sentences([in_zones])
     if other_order := order_by_egvs(ranked, parquet.read_metadata(RunFolder(folder).scores, "scores")):
         print_sentences([other_order])
 

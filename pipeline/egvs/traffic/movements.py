@@ -38,6 +38,27 @@ class _Passage(NamedTuple):
     ring_middle_m: Floats | None
 
 
+class Movement(NamedTuple):
+    """A way through a junction.
+
+    Attributes
+    ----------
+    approach
+        The edges that lead to the junction, in the order of driving; at least one.
+    street
+        Name of the street of the approach at the junction; empty if it has none.
+    heading
+        Direction (2,) in which vehicles arrive at the junction, not normalised: x east, y north.
+    turn
+        A value of :data:`~egvs.traffic.directions.TURNS`; empty for all vehicles of an approach.
+    """
+
+    approach: tuple[Edge, ...]
+    street: str
+    heading: Floats
+    turn: str
+
+
 class MovementNames:
     """Describes movements from one edge of a network to another.
 
@@ -80,21 +101,32 @@ class MovementNames:
         """
         first = self._edges[from_edge]
         if to_edge is None:
-            return f"{compass(_end_heading([first]))}bound on {street_name(first)}"
+            return f"{compass(_end_heading([first]))}bound on {_street(first)}"
 
         passage = self._passage(first, self._edges[to_edge])
         approach, way_out = passage.to_junction[-1], passage.from_junction[0]
         before, after = _headings(passage)
-        words = f"{compass(before)}bound on {street_name(approach)}"
+        words = f"{compass(before)}bound on {_street(approach)}"
         if first.name not in ("", approach.name):
-            words += f" from {street_name(first)}"
+            words += f" from {_street(first)}"
 
         turn = self._turns.get((approach.id, way_out.id)) or _turn_between(before, after)
         last = passage.from_junction[-1]
-        towards = f" towards {street_name(last)}" if last.name not in ("", way_out.name) else ""
+        towards = f" towards {_street(last)}" if last.name not in ("", way_out.name) else ""
         if turn == "straight" and approach.name == way_out.name:
             return f"{words}, straight on{towards}"
-        return f"{words}, {_WAYS[turn]} to {street_name(way_out)}{towards}"
+        return f"{words}, {_WAYS[turn]} to {_street(way_out)}{towards}"
+
+    def movement(self, from_edge: str, to_edge: str | None) -> Movement:
+        """Return approach and turn of a movement; parameters as of :meth:`describe`."""
+        first = self._edges[from_edge]
+        if to_edge is None:
+            return Movement((first,), plain_text(first.name), _end_heading([first]), "")
+        passage = self._passage(first, self._edges[to_edge])
+        before, after = _headings(passage)
+        approach = passage.to_junction[-1]
+        turn = self._turns.get((approach.id, passage.from_junction[0].id)) or _turn_between(before, after)
+        return Movement(tuple(passage.to_junction), plain_text(approach.name), before, turn)
 
     def _passage(self, first: Edge, last: Edge) -> _Passage:
         """Find the junction on the fastest way between two edges."""
@@ -148,10 +180,15 @@ def _point_along(line_m: Floats) -> Floats:
     return np.array([np.interp(_HEADING_OVER_M, distance_m, line_m[:, axis]) for axis in (0, 1)])
 
 
-def street_name(edge: Edge) -> str:
-    """Return the name of an edge's street on one line; netconvert escapes names twice."""
-    printable = (character if character.isprintable() else " " for character in html.unescape(edge.name))
-    return " ".join("".join(printable).split()) or _UNNAMED_STREET
+def _street(edge: Edge) -> str:
+    """Return the name of an edge's street on one line."""
+    return plain_text(edge.name) or _UNNAMED_STREET
+
+
+def plain_text(name: str) -> str:
+    """Return a name of a network on one line; netconvert escapes names twice."""
+    printable = (character if character.isprintable() else " " for character in html.unescape(name))
+    return " ".join("".join(printable).split())
 
 
 def _turn_between(before: Floats, after: Floats) -> str:
