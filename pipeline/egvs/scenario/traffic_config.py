@@ -390,8 +390,10 @@ class TrafficConfig(StrictModel):
     @model_serializer(mode="wrap")
     def _serialize(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Leave out keys that have their defaults and are rarely set, so that they do not change cache keys."""
-        defaults = {"seeds": 1, "signals": {}}
-        return {name: value for name, value in serialize(self).items() if defaults.get(name) != value}
+        optional = {"seeds": 1, "signals": {}}
+        return {
+            name: value for name, value in serialize(self).items() if name not in optional or value != optional[name]
+        }
 
     @model_validator(mode="after")
     def _check_periods(self) -> TrafficConfig:
