@@ -222,6 +222,20 @@ def _report_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator
     rest.pop("best", None)
     rest.pop("worst", None)
     yield Sentence(f"{rest.pop('kilobytes'):,} kB")
+    for fit in rest.pop("approaches", ()):
+        yield Sentence(_describe_approach(fit))
+
+
+def _describe_approach(fit: dict[str, Any]) -> str:
+    """Return queue and speed of an approach, simulated and observed."""
+    texts = []
+    if fit["observed_queue_m"] is not None:
+        texts.append(f"queue {fit['queue_m']:.0f} m (observed {fit['observed_queue_m']:.0f} m)")
+    if fit["observed_speed_kmh"] is not None:
+        speed = "no vehicle" if fit["speed_kmh"] is None else f"{fit['speed_kmh']:.0f} km/h"
+        texts.append(f"{speed} (observed {fit['observed_speed_kmh']:.0f} km/h)")
+    period = f" in {fit['period']}" if fit["period"] else ""
+    return f"from {fit['approach']}{period}: {', '.join(texts)}"
 
 
 _SENTENCES: dict[str, Callable[[dict[str, Any], dict[str, Any]], Iterator[Sentence]]] = {

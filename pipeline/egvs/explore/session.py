@@ -259,6 +259,11 @@ class Session:
         return str(self.scenario.score.rank_by)
 
     @property
+    def frames(self) -> int:
+        """Number of recorded frames that scores over vehicles use; of all frames if the scenario has no such score."""
+        return self.tpog.frames if self._targets is None else len(self._targets.record.numbers)
+
+    @property
     def ranked(self) -> list[PoseScore]:
         """The candidates, best first."""
         return sorted(self.candidates.values(), key=lambda candidate: candidate.rank)
@@ -447,8 +452,19 @@ class Session:
         return Scorer(scene, read_tpog(folder.tpog), folder.trajectories, periods=(PeriodTpog(self.period, self.tpog),))
 
     def _scores(self, site: Site) -> dict[str, float]:
+        return self.score_beams(site, Beams.of(self._engine(site).scanner.scan_site(site)))
+
+    def score_beams(self, site: Site, beams: Beams) -> dict[str, float]:
+        """Return the scores of an empty scan, by name, as :attr:`PoseScore.scores`.
+
+        Parameters
+        ----------
+        site
+            The sensor.
+        beams
+            Its empty scan, such as a part of :meth:`beams`.
+        """
         engine = self._engine(site)
-        beams = Beams.of(engine.scanner.scan_site(site))
         result = engine.scorer.score(beams)
         if self.period:
             result = result.by_period[0]

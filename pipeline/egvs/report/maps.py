@@ -120,7 +120,7 @@ def occupancy(
     plan, peak = _sites_frame(extent(grid, sites), scale.prefix, style), scale.peak
     street_names, _ = _street_names(plan, backdrop.roads.names, sites)
     parts = [
-        _road_paths(plan, backdrop.roads),
+        road_paths(plan, backdrop.roads),
         _field_image(plan, grid, values, peak),
         _outline_paths(plan, backdrop.outlines),
         plan.roi(grid),
@@ -175,7 +175,7 @@ def base_layers(plan: MapFrame, grid: Grid, values: ColumnValues, backdrop: Back
     """Return the layers below the sites: roads, faint traffic, static outlines, the region."""
     traffic = _field_image(plan, grid, values, float(values.max(initial=0.0)))
     return [
-        _road_paths(plan, backdrop.roads),
+        road_paths(plan, backdrop.roads),
         f"<g {plan.style.shape('faint')}>{traffic}</g>",
         f"<g>{_outline_paths(plan, backdrop.outlines)}</g>",
         plan.roi(grid),
@@ -219,7 +219,7 @@ def site_view(
         plan = _sites_frame(view.box, prefix, style)
     shade = colours.shade_image(np.logical_not(view.crossed.any(axis=2)))
     parts = [
-        _road_paths(plan, view.backdrop.roads),
+        road_paths(plan, view.backdrop.roads),
         *_shade_images(plan, grid, shade),
         _field_image(plan, grid, values, peak),
         _outline_paths(plan, view.backdrop.outlines),
@@ -252,7 +252,7 @@ def missed_view(
     plan, image = site_view_frame(box, prefix), colours.share_image(blindspots.share_missed)
     (x, y), (nx, ny), cell_m = blindspots.origin_m, blindspots.share_missed.shape, blindspots.cell_m
     rectangle = (plan.x(x), plan.y(y + ny * cell_m), nx * cell_m * plan.scale, ny * cell_m * plan.scale)
-    parts = [_road_paths(plan, backdrop.roads)]
+    parts = [road_paths(plan, backdrop.roads)]
     for theme in colours.THEMES:
         parts.append(plan.image(rectangle, image.uri(colours.SHARE_PALETTES[theme]), f"field share {theme}"))
     parts += [_outline_paths(plan, backdrop.outlines), plan.roi(grid), _sensor_mark(plan, site.x_m, site.y_m)]
@@ -299,7 +299,7 @@ def classes_view(
     """
     plan = site_view_frame(box, prefix)
     image = colours.share_image(values / (len(classes.labels) - 1))
-    parts = [_road_paths(plan, backdrop.roads)]
+    parts = [road_paths(plan, backdrop.roads)]
     for theme in colours.THEMES:
         parts.append(plan.image(plan.region(grid), image.uri(colours.SHARE_PALETTES[theme]), f"field share {theme}"))
     parts += [_outline_paths(plan, backdrop.outlines), plan.roi(grid)]
@@ -323,7 +323,7 @@ def zone_map(grid: Grid, zones: Sequence[MapZone], site: MapSite, backdrop: Back
     See :func:`classes_view` for the parameters.
     """
     plan = MapFrame(box, "zones", north=True)
-    parts = [_road_paths(plan, backdrop.roads), _outline_paths(plan, backdrop.outlines), plan.roi(grid)]
+    parts = [road_paths(plan, backdrop.roads), _outline_paths(plan, backdrop.outlines), plan.roi(grid)]
     numbers = []
     for zone in sorted(zones, key=lambda zone: -zone.area.area):
         rings = []
@@ -371,7 +371,7 @@ def _shade_images(plan: MapFrame, grid: Grid, shade: IndexedImage) -> Iterator[s
         yield plan.image(plan.region(grid), shade.uri(colours.SHADE_PALETTES[theme]), f"shade {theme}")
 
 
-def _road_paths(plan: MapFrame, roads: Roads) -> str:
+def road_paths(plan: MapFrame, roads: Roads) -> str:
     """Junctions, and lanes with a fine line between them: each lane is drawn twice, the second time narrower."""
     paths_of: dict[tuple[str, float], list[str]] = {}
     for piece in roads.lanes:

@@ -24,9 +24,12 @@ from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files
 from egvs.core.errors import WARNINGS_KEY, collect_warnings
 from egvs.report import figures, formatting, maps
+from egvs.report.approach_fits import ApproachFit, compare_approaches
+from egvs.report.approach_map import busiest_counts, draw_approach_map
 from egvs.report.basemap import network_file
 from egvs.report.colours import STYLE_SHEET
 from egvs.report.figures import Figures
+from egvs.report.map_credits import read_map_credits
 from egvs.report.points_section import MAPPED_POLES, PointsSection
 from egvs.report.ranking import (
     RankedSite,
@@ -55,6 +58,7 @@ from egvs.report.zone_section import ZoneSection
 from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.scene_inputs import scan_dependencies
+from egvs.traffic import observed
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -106,6 +110,10 @@ class PageContents:
         Road users found in zones, and maps of points on target; None where the scenario has no zones or no lanes.
     movements
         What each counted location is in words; empty if the run folder has no network.
+    approaches
+        Observed and simulated queues and speeds.
+    approach_map
+        SVG with the names and counts of the approaches; empty without counts.
     """
 
     scenario: Scenario
@@ -120,6 +128,8 @@ class PageContents:
     movements: Mapping[str, str] = field(default_factory=dict)
     zones: ZoneSection | None = None
     points: PointsSection | None = None
+    approaches: tuple[ApproachFit, ...] = ()
+    approach_map: str = ""
 
 
 @dataclass(frozen=True)
@@ -149,6 +159,11 @@ def dependencies(work: StageContext) -> StageDependencies:
     scenario, stages = work.scenario, _recorded_stages(work.folder.path)
     names = [RunFolder.trajectories.name, RunFolder.tpog.name, RunFolder.statics.name, RunFolder.scores.name]
     settings: dict[str, Any] = {"shown": _displayed_settings(scenario), "keep": scenario.scan.keep}
+    if scenario.traffic.observed is not None:
+        settings["observed"] = work.inputs.digest(scenario.find(scenario.traffic.observed, observed.KEY))
+        settings["counts"] = describe_counts(scenario, network_file(work.folder.path))
+    if map_credits := read_map_credits(scenario):
+        settings["map_credits"] = map_credits
     hashes: dict[str, str] = {}
     if scenario.scan.keep:
         names.append(RunFolder.scans.name)
@@ -221,6 +236,7 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
     mapped = [pole.best for pole in ranking.poles[:MAPPED_POLES]]
     mounts = [] if plan is None else [pick.mount for pick in plan.picks]
     moved = plan is not None and plan.before is not None
+    approaches = compare_approaches(work.scenario, work.folder.trajectories, network_file(out))
     contents = PageContents(
         work.scenario,
         ranking,
@@ -234,12 +250,16 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
         movements=describe_counts(work.scenario, network_file(out)),
         zones=ZoneSection.read(work, ranking.sites[0], tpog.grid, drawn.backdrop, has_plan=plan is not None),
         points=PointsSection.draw(work, mapped, mounts, tpog.grid, drawn.backdrop, moved=moved),
+        approaches=approaches,
+        approach_map=draw_approach_map(work.scenario, network_file(out)),
     )
     html = render_page(contents)
     files.write_text(work.folder.report, html)
     work.progress("page written", 3, 3)
 
     summary: Summary = {"kilobytes": round(len(html.encode("utf-8")) / 1000)}
+    if approaches:
+        summary["approaches"] = [approach.to_json() for approach in approaches]
     if ranking.sites[0].score > 0:
         summary = {"best": ranking.sites[0].site, "worst": ranking.last.site, **summary}
     return summary
@@ -328,6 +348,8 @@ def _setting_values(contents: PageContents) -> dict[str, Any]:
         "assumed": assumptions(scenario),
         "assumes_flows": assumes_flows(scenario),
         "gamma": "∞" if math.isinf(gamma) else f"{gamma:g}",
+        "map_credits": read_map_credits(scenario),
+        "map_period": busiest_counts(scenario)[0],
         "uncapped": math.isinf(gamma),
         "gamma_auto": scenario.score.gamma == "auto",
         "has_traffic": bool(contents.tpog.counts.any()),

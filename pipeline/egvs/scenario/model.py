@@ -34,6 +34,7 @@ from egvs.scenario.fields import Latitude, Longitude, Name, Point2, Point3, Posi
 from egvs.scenario.score_config import CostsConfig, PlacementConfig, ScoreConfig, default_gamma
 from egvs.scenario.sensor_config import SensorConfig
 from egvs.scenario.traffic_config import TrafficConfig
+from egvs.scenario.what_if_config import WhatIfConfig
 
 
 class CrsConfig(StrictModel):
@@ -319,6 +320,7 @@ class Scenario(StrictModel):
     costs: CostsConfig = CostsConfig()
     placement: PlacementConfig = PlacementConfig()
     validation: ValidationConfig = ValidationConfig()
+    what_if: dict[Name, WhatIfConfig] = Field(default_factory=dict)
 
     _folders: tuple[Path, ...] = PrivateAttr(default=(Path(),))
     _period: str = PrivateAttr(default="")
@@ -326,6 +328,11 @@ class Scenario(StrictModel):
     _file_name: str = PrivateAttr(default=SCENARIO_FILE)
     _written_site_keys: frozenset[str] = PrivateAttr(default=frozenset())
     _overrides: dict[str, Any] = PrivateAttr(default_factory=dict)
+
+    @model_serializer(mode="wrap")
+    def _serialize(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out what_if where it is empty, so that records of scenarios without it do not change."""
+        return {name: value for name, value in serialize(self).items() if name != "what_if" or value}
 
     @model_validator(mode="after")
     def _check_tables_together(self) -> Scenario:

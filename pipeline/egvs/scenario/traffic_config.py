@@ -203,7 +203,7 @@ def keys_without_effect(source: str) -> frozenset[str]:
     source
         One of :data:`TRAFFIC_SOURCES`, or "routes" for a network with routes.
     """
-    demand = _RANDOM_TRIP_KEYS | {"counts", "edge_weights", "kinds"}
+    demand = _RANDOM_TRIP_KEYS | {"counts", "edge_weights", "kinds", "observed"}
     simulation = frozenset({
         "vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s", "junction_blocker_s", "teleport_s",
     })  # fmt: skip
@@ -352,6 +352,12 @@ class TrafficConfig(StrictModel):
     )
     counts: tuple[CountConfig, ...] = Field(
         (), description="Traffic counts. By default, random trips are drawn between the network's fringe edges"
+    )
+    observed: str | None = Field(
+        None,
+        min_length=1,
+        description="CSV file with queues and speeds that were observed on approaches (columns approach, queue_m,"
+        " speed_kmh), which are compared with those of the simulated counts",
     )
     kinds: tuple[VehicleKind, ...] = Field(
         _DEFAULT_FLEET,

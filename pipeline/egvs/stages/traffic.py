@@ -40,6 +40,7 @@ def dependencies(context: StageContext) -> StageDependencies:
     periods = scenario.by_period().values()
     effects, _ = registry.active_traffic_effects(scenario)
     traffic = scenario.traffic.model_dump(mode="json")
+    del traffic["observed"]  # it is compared with the traffic later
     for period in traffic["periods"]:
         del period["weight"]
     settings = {"seed": scenario.seed, "name": scenario.name, "traffic": traffic}

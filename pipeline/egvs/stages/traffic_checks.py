@@ -160,7 +160,9 @@ def check_finished_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
         people = errors.attempt("traffic", lambda: recorded_tracks.read_recorded_pedestrians(scenario, world))
         if people is not None:
             yield from recorded_tracks.track_warnings(people, where)
-            yield from recorded_tracks.pedestrian_warnings(where)
+            first_s = errors.attempt("traffic", lambda: _first_frame_s(scenario))
+            if first_s is not None:
+                yield from recorded_tracks.pedestrian_warnings(people, first_s, where)
     if scenario.traffic.fcd is None:
         yield from errors.findings
         return
@@ -170,6 +172,13 @@ def check_finished_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
         errors.attempt("traffic", lambda: finished_fcd.check_types(scenario, content.types, content.sizes))
         yield from finished_fcd.presence_warnings(scenario, content)
     yield from errors.findings
+
+
+def _first_frame_s(scenario: Scenario) -> float:
+    """Return the time of the first frame in the simulation."""
+    begin_s = sumo_folder.demand_files(scenario).begin_s
+    timing = sumo_folder.make_timing(scenario.traffic, begin_s, sumo_folder.traffic_location(scenario))
+    return timing.first_ms / 1000.0
 
 
 def check_vehicle_kinds(inputs: CheckInputs) -> Iterator[Diagnostic]:
@@ -211,3 +220,20 @@ def check_counts(inputs: CheckInputs) -> Iterator[Diagnostic]:
         for edge in (count.edge, count.from_edge, count.to_edge):
             if edge and edge not in edges:
                 yield Diagnostic.of("traffic", demand.unknown_edge_error(demand.count_key(count, key), edge))
+
+
+def check_observed(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Report a file of observed queues and speeds that is not valid, or that no counts belong to."""
+    scenario = inputs.scenario
+    if scenario.traffic.observed is None or inputs.network is None:
+        return
+    from egvs.traffic import observed
+
+    edges = {edge.id for edge in inputs.network.edges}
+    for period in scenario.by_period().values():
+        for count in period.traffic.counts:
+            if not {count.edge, count.from_edge, count.to_edge} - {None} <= edges:
+                return  # check_counts reports it
+    errors = ErrorCollector()
+    errors.attempt("traffic", partial(observed.read_observed, scenario, inputs.network))
+    yield from errors.findings
