@@ -574,7 +574,8 @@ class ElevationCurve:
     @staticmethod
     def _ascending(elevations_deg: Sequence[float]) -> FloatArray:
         """Return elevations of which no two are equal."""
-        return np.asarray(elevations_deg) + 1e-6 * np.arange(len(elevations_deg))
+        ascending: FloatArray = np.asarray(elevations_deg) + 1e-6 * np.arange(len(elevations_deg))
+        return ascending
 
     def _spread(self, elevations: FloatArray) -> tuple[float, ...]:
         """Round, move neighbours apart, and keep all within the bounds."""
@@ -594,7 +595,8 @@ class ElevationCurve:
         gaps = np.diff(self._knots(elevations_deg))
         log_shares = np.log(gaps / gaps.sum())
         middle = 0.5 * (log_shares.min() + log_shares.max())  # the shares do not depend on it
-        return np.clip(np.append(ends, 0.5 + (log_shares - middle) / _LOG_SHARE), 0.0, 1.0)
+        point: FloatArray = np.clip(np.append(ends, 0.5 + (log_shares - middle) / _LOG_SHARE), 0.0, 1.0)
+        return point
 
 
 def sensor_table(sensor: Sensor) -> dict[str, Any]:
