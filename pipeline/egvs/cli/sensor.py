@@ -12,8 +12,8 @@ from egvs.cli.quick_help import QuickHelpGroup
 from egvs.core.errors import InputError
 
 if TYPE_CHECKING:
-    from egvs.scenario.model import Scenario
     from egvs.placement.sensor_design import Design, DesignResult
+    from egvs.scenario.model import Scenario
     from egvs.sensor_fit.fit import SensorFit
     from egvs.sensor_fit.intervals import Estimate
     from egvs.sensor_fit.map_pose import MapPose

@@ -23,6 +23,7 @@ from scipy.spatial import KDTree
 from shapely.geometry import MultiPoint, Point
 from shapely.geometry.base import BaseGeometry
 
+from egvs.core.errors import InputError
 from egvs.core.grid import XY, FloatArray, Roi
 from egvs.importers import building_heights, openstreetmap, osm_solids
 from egvs.importers.as_built_view import AsBuiltMap
