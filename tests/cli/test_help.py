@@ -17,7 +17,7 @@ def test_help_starts_with_new_and_shows_groups_in_order(run_egvs: Any) -> None:
     assert code == 0
     titles = re.findall(r"╭─ ([\w ]+?) ─", printed)
     assert titles == ["Options", *COMMAND_GROUPS]
-    commands = re.findall(r"^│ (\w+)  ", printed, re.MULTILINE)
+    commands = re.findall(r"^│ (\w[\w-]*)  ", printed, re.MULTILINE)
     assert commands == [name for names in COMMAND_GROUPS.values() for name in names]
     assert commands[0] == "new"
 

@@ -156,6 +156,10 @@ def test_layers_draw_their_data(page: Page, session: Session, layer: str) -> Non
         "seen": (entropy * (hits > 0)).any(axis=2).sum(),
         "missed": (entropy * (hits == 0)).any(axis=2).sum(),
         "blindspots": (~np.isnan(session.blindspots(site).share_missed)).sum(),
+        "points_car": 0,  # without a road network there is no surface
+        "points_pedestrian": 0,
+        "overlap_car": 0,
+        "overlap_pedestrian": 0,
         "difference": (entropy * ((hits > 0) != (other > 0))).any(axis=2).sum(),
         "scan": len(session.returns_m(site)),
         "ring": len(session.beams_m(site, 0)),

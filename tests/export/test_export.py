@@ -21,7 +21,10 @@ Call = Callable[..., tuple[int, str, str]]
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--to", "shp"), "--to: expected one of gpkg, geojson, geoparquet, kml, csv, geotiff, got 'shp'"),
+        (
+            ("--to", "shp"),
+            "--to: expected one of gpkg, geojson, geoparquet, kml, csv, geotiff, dxf, glb, usd, got 'shp'",
+        ),
         (("--to", "gpkg", "--crs", "EPSG:4326"), "--crs: expected scenario or wgs84, got 'EPSG:4326'"),
         (("--to", "kml", "--crs", "scenario"), "--crs: KML files are always in degrees"),
         (("--to", "csv", "--crs", "wgs84"), "cannot write degrees, because the scenario has no reference system"),

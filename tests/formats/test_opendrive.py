@@ -119,6 +119,8 @@ BROKEN = {
     "no shape": (maps.merge().replace("<line/>", "", 1), "<geometry>: expected one of line, arc"),
     "twice": (opendrive(*maps.two_roads()[:1] * 2), "the id occurs twice"),
     "lane": (maps.merge().replace('<lane id="-2"', '<lane id="two"', 1), "id: expected a whole number, got 'two'"),
+    "centre": (maps.merge().replace('<lane id="0"', '<lane id="zero"', 1), "id: expected a whole number, got 'zero'"),
+    "centre 1": (maps.merge().replace('<lane id="0"', '<lane id="1"', 1), "<center>: expected a lane with the id 0"),
     "lane 0": (maps.merge().replace('<lane id="-2"', '<lane id="0"', 1), "expected an id other than 0"),
     "missing": (maps.merge().replace('id="1" junction', "junction", 1), "the attribute 'id' is missing"),
     "offset": (maps.merge().replace("</geoReference>", '</geoReference><offset x="a"/>'), "<header>"),

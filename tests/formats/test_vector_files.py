@@ -167,6 +167,16 @@ def test_damaged_file_is_named(located: Path, suffix: str) -> None:
         candidates(located, f"poles.{suffix}")
 
 
+@pytest.mark.parametrize(("suffix", "damaged"), [("shp", "dbf"), ("parquet", "parquet")])
+def test_text_that_is_not_utf_8_is_rejected(located: Path, suffix: str, damaged: str) -> None:
+    options = {"compression": None} if suffix == "parquet" else {}
+    write(located / f"poles.{suffix}", frame_of(ROWS), **options)
+    path = located / f"poles.{damaged}"
+    path.write_bytes(path.read_bytes().replace(b"City", b"C\xfft\xff"))
+    with pytest.raises(InputError, match=rf"poles\.{suffix}: the file cannot be read as \w+ \(.*UTF8"):
+        candidates(located, f"poles.{suffix}")
+
+
 def test_parquet_without_geometry_is_rejected(located: Path) -> None:
     pq.write_table(pa.table({"site": ["a"], "x_m": [1.0]}), located / "poles.parquet")
     with pytest.raises(InputError, match=r"poles\.parquet: the file cannot be read as GeoParquet \(KeyError\(b'geo'\)"):

@@ -3,6 +3,9 @@
 Both sides have the same trips (between the same ends of roads, at the same times), signal programs, statics, sites and
 region. SUMO's traffic is chaotic: small differences of a network give other vehicles at other times, so the sides are
 compared by the differences of several seeds.
+
+In the ring of ``roundabout``, lanes are so wide that SUMO lets vehicles stand side by side, and now and then two of
+them lock at an exit. So its traffic has the keys by which ``egvs new`` frees locked vehicles.
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ from scipy import stats
 
 import egvs
 from egvs.artefacts.tpog import read_tpog
+from egvs.importers.assumed_traffic import JUNCTION_BLOCKER_S, TELEPORT_S
 from egvs.scenario import loading
 from egvs.traffic import demand
 from tests.importers import network_copies as copies
@@ -34,8 +38,11 @@ COLUMN_VOXELS = 4
 """Side of the columns of voxels in which TPOGs are compared: 1 m."""
 
 CONFIDENCE = 0.99
-MAX_RELATIVE_SE = 0.03
+MAX_RELATIVE_SE = 0.04
 """Larger standard errors would tell nothing."""
+
+RESCUES = {"roundabout": {"junction_blocker_s": JUNCTION_BLOCKER_S, "teleport_s": TELEPORT_S}}
+"""More keys of the traffic, by scenario."""
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
 
@@ -90,6 +97,7 @@ def run_network(name: str, original: NetworkText, network: NetworkText, folder: 
             "frames": FRAMES,
             "frame_period_s": 1.0,
             "max_depart_delay_s": 120,
+            **RESCUES.get(name, {}),
         }
         out = folder / f"seed{seed}"
         egvs.run(loading.scenario_from_dict(values, SCENARIOS / name, "round trip"), out, only=STAGES)
@@ -226,15 +234,38 @@ def make_copy(kind: str, original: NetworkText, folder: Path) -> NetworkText:
 def compare_copy(name: str, kind: str, originals: Path, folder: Path) -> Comparison:
     original = read_original(name)
     before = _run_original(name, originals)
+    return _compare_sides(name, kind, original, before, folder)
+
+
+def _compare_sides(name: str, kind: str, original: NetworkText, before: Runs, folder: Path) -> Comparison:
     after = run_network(name, original, make_copy(kind, original, folder), folder / kind)
     comparison = compare(before, after)
     print(f"\n{name}, {kind}: {comparison.describe()}")
     return comparison
 
 
-@pytest.mark.parametrize("kind", ["lanelet2", "opendrive"])
-def test_tpog_and_ranks_agree_after_a_round_trip(kind: str, originals: Path, tmp_path: Path) -> None:
-    result = compare_copy("nishishinjuku", kind, originals, tmp_path)
+@pytest.mark.parametrize(
+    ("name", "kind"), [("nishishinjuku", "lanelet2"), ("nishishinjuku", "opendrive"), ("roundabout", "lanelet2")]
+)
+def test_tpog_and_ranks_agree_after_a_round_trip(name: str, kind: str, originals: Path, tmp_path: Path) -> None:
+    check_agreement(compare_copy(name, kind, originals, tmp_path))
+
+
+def test_tpog_and_ranks_agree_once_lanes_end_as_opendrive_can_say(tmp_path: Path) -> None:
+    """Roads of OpenDRIVE end square; those of the roundabout's ring end up to 1.3 m aslant, which netconvert cuts off.
+
+    So the original here is the roundabout after one round trip, and the copy that after two.
+    """
+    folders = [tmp_path / str(i) for i in range(2)]
+    for folder in folders:
+        folder.mkdir()
+    square = make_copy("opendrive", read_original("roundabout"), folders[0])
+    before = run_network("roundabout", square, square, tmp_path / "before")
+    check_agreement(_compare_sides("roundabout", "opendrive", square, before, folders[1]))
+
+
+def check_agreement(result: Comparison) -> None:
+    """Check that scores, ranks and TPOG differ by no more than their standard errors explain."""
     for score in SCORES:
         sites = len(result.original[score])
         assert np.mean(result.se[score] / result.original[score]) < MAX_RELATIVE_SE

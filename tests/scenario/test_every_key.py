@@ -20,6 +20,7 @@ from egvs.runs import stage_keys
 from egvs.scenario.loading import load
 from egvs.scenario.model import Scenario
 from egvs.stages.inputs import Inputs, open_folder
+from egvs.studies import what_if
 from egvs.validation import cloud_simulation
 from tests.conftest import SCENARIO, SITES, collection, feature, write_mini
 
@@ -48,6 +49,8 @@ NETWORK = ("traffic.network='streets.net.xml'",)
 COUNTED = (*NETWORK, "traffic.counts=[{edge='a', per_hour=100}]")
 TURNS = (*NETWORK, "traffic.counts=[{from_edge='a', to_edge='b', per_hour=100}]")
 HALVES = ("traffic.periods=[{name='a', length_s=12}, {name='b', begin_s=12, length_s=8}]",)
+SIGNALS = (*NETWORK, "traffic.signals.a={phases=[{green={north=['all']}, green_s=30}]}")
+ACTUATED = (*SIGNALS, "traffic.signals.a.type='actuated'")
 PERIOD_COUNTS = (*NETWORK, "traffic.periods=[{name='a', counts=[{edge='a', per_hour=100}]}]")
 PERIOD_TURNS = (*NETWORK, "traffic.periods=[{name='a', counts=[{from_edge='a', to_edge='b', per_hour=100}]}]")
 TRACKED = ("traffic.tracks=['tracks.csv']", "traffic.track_crs='world'")
@@ -83,9 +86,11 @@ TRACKS = """track_id,frame_id,timestamp_ms,agent_type,x,y,vx,vy,psi_rad,length,w
 
 NAMES = {
     "sensors": "small",
+    "traffic.signals": "a",
     "articulated.kinds": "car",
     "weights.zones": "crossing",
     "placement.zones": "crossing",
+    "what_if": "works",
 }
 """Names in tables of tables."""
 
@@ -97,6 +102,8 @@ COVERED = (*TWO, "placement.zones.crossing={polygon_m=[[5, -8], [12, -8], [12, 8
 WEIGHTED_BY_FILE = ("score.weights.zones.crossing={file='zones.csv', weight=2}",)
 COVERED_BY_FILE = (*TWO, "placement.zones.crossing={file='zones.csv', share=0.05}")
 BUDGET = ("sites.file='five.csv'", "costs.pole=10", "costs.sensor={small=10}", "placement.budget=45")
+WHAT_IF = ("what_if.works={share=0.5, boxes=[{x_m=1, y_m=9, length_m=2, width_m=1, height_m=3}]}",)
+GROWN = ("what_if.works={share=0.5, tree_scale=2}", "statics.footprints=['trees.geojson']")
 REFINED = (*ONE, "placement.refine={radius_m=1, evaluations=100}")
 
 KEYS: dict[str, Change] = {
@@ -113,6 +120,7 @@ KEYS: dict[str, Change] = {
     "traffic.network": Change("'others.net.xml'", NETWORK),
     "traffic.routes": Change("['trips.rou.xml']", file="without_kinds.toml"),
     "traffic.sumocfg": Change("'streets.sumocfg'", file="without_kinds.toml"),
+    "traffic.seeds": Change("2", NETWORK),
     "traffic.fcd": Change("'others.csv'"),
     "traffic.fcd_geo": Change("true"),
     "traffic.tracks": Change("['other_tracks.csv']", TRACKED),
@@ -150,10 +158,23 @@ KEYS: dict[str, Change] = {
     "traffic.redraw_departures": Change("true", ("traffic.routes=['trips.rou.xml']",), file="without_kinds.toml"),
     "traffic.min_trip_m": Change("10", NETWORK),
     "traffic.edge_weights": Change("{a=2}", NETWORK),
+    "traffic.signals.*.file": Change("'plan.csv'", (*NETWORK, "traffic.signals.a={file='trips.rou.xml'}")),
+    "traffic.signals.*.type": Change("'actuated'", SIGNALS),
+    "traffic.signals.*.cycle_s": Change("35", SIGNALS),
+    "traffic.signals.*.offset_s": Change("5", SIGNALS),
+    "traffic.signals.*.yellow_s": Change("4", SIGNALS),
+    "traffic.signals.*.all_red_s": Change("1", SIGNALS),
+    "traffic.signals.*.phases.*.green": Change("{south=['left']}", SIGNALS),
+    "traffic.signals.*.phases.*.green_s": Change("40", SIGNALS),
+    "traffic.signals.*.phases.*.yellow_s": Change("4", SIGNALS),
+    "traffic.signals.*.phases.*.all_red_s": Change("1", SIGNALS),
+    "traffic.signals.*.phases.*.min_green_s": Change("8", ACTUATED),
+    "traffic.signals.*.phases.*.max_green_s": Change("60", ACTUATED),
     "traffic.counts.*.edge": Change("'b'", COUNTED),
     "traffic.counts.*.from_edge": Change("'c'", TURNS),
     "traffic.counts.*.to_edge": Change("'c'", TURNS),
     "traffic.counts.*.per_hour": Change("200", COUNTED),
+    "traffic.observed": Change("'observed.csv'", COUNTED),
     "traffic.counts.*.kind": Change("'car'", COUNTED),
     "traffic.kinds.*.name": Change("'other'"),
     "traffic.kinds.*.vclass": Change("'bus'"),
@@ -230,6 +251,7 @@ KEYS: dict[str, Change] = {
     "score.weights.zones.*.polygon_m": Change("[[0, 0], [9, 0], [9, 9]]", WEIGHTED),
     "score.weights.zones.*.file": Change("'other_zones.csv'", WEIGHTED_BY_FILE),
     "score.weights.zones.*.weight": Change("3", WEIGHTED),
+    "score.zones": Change("'other_zones.csv'", ("score.zones='zones.csv'",)),
     "score.keep_visibility": Change("'all'"),
     "score.blindspots": Change("false"),
     "score.standard_error": Change("false"),
@@ -245,6 +267,14 @@ KEYS: dict[str, Change] = {
     "effects.fog.model": Change("'kruse'", effect("fog", "visibility_m=100")),
     "effects.fog.contrast": Change("0.05", effect("fog", "visibility_m=100")),
     "effects.dropout.share": Change("0.5", effect("dropout", "share=0.2")),
+    "effects.surface_losses.grazing_loss": Change("0.5", effect("surface_losses")),
+    "effects.surface_losses.grazing_deg": Change("80", effect("surface_losses")),
+    "effects.surface_losses.grazing_width_deg": Change("1", effect("surface_losses")),
+    "effects.surface_losses.dark_share": Change("0.5", effect("surface_losses")),
+    "effects.surface_losses.dark_loss": Change("0.5", effect("surface_losses")),
+    "effects.surface_losses.glass_loss": Change("0.5", effect("surface_losses")),
+    "effects.range_noise.footprint_mrad": Change("0.5", effect("range_noise")),
+    "effects.range_noise.max_sigma_m": Change("0.5", effect("range_noise")),
     "effects.moving_occlusion.method": Change("'independent'", effect("moving_occlusion")),
     "effects.moving_occlusion.frames": Change("20", effect("moving_occlusion")),
     "effects.divergence.sub_beams": Change("19", effect("divergence")),
@@ -289,6 +319,17 @@ KEYS: dict[str, Change] = {
     "placement.refine.roll_deg": Change("[-9, 9]", REFINED),
     "placement.refine.evaluations": Change("50", REFINED),
     "validation.bodies": Change("{sedan='box.ply'}"),
+    "what_if.*.share": Change("0.3", WHAT_IF),
+    "what_if.*.vehicles": Change("'parked.csv'", WHAT_IF),
+    "what_if.*.footprints": Change("['others.geojson']", WHAT_IF),
+    "what_if.*.boxes.*.x_m": Change("5", WHAT_IF),
+    "what_if.*.boxes.*.y_m": Change("5", WHAT_IF),
+    "what_if.*.boxes.*.yaw_deg": Change("5", WHAT_IF),
+    "what_if.*.boxes.*.length_m": Change("5", WHAT_IF),
+    "what_if.*.boxes.*.width_m": Change("5", WHAT_IF),
+    "what_if.*.boxes.*.height_m": Change("5", WHAT_IF),
+    "what_if.*.boxes.*.kind": Change("'container'", WHAT_IF),
+    "what_if.*.tree_scale": Change("1.5", GROWN),
 }  # fmt: skip
 
 
@@ -328,7 +369,9 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     texts = {
         "streets.net.xml": "<net/>",
         "others.net.xml": "<net> </net>",
+        "observed.csv": "approach,queue_m\nN,40\n",
         "trips.rou.xml": "<routes/>",
+        "plan.csv": "phase,approach,movement,green_s\na,north,all,30\n",
         "sizes.add.xml": "<additional/>",
         "streets.sumocfg": '<configuration><input><net-file value="streets.net.xml"/>'
         '<route-files value="trips.rou.xml"/></input></configuration>',
@@ -338,6 +381,8 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "others.csv": fcd.replace("-2.0", "-2.5"),
         "others.geojson": collection(feature(house, name="house", height_m=6)),
         "solids.poly.xml": '<additional><poly id="p" type="building" fill="1" shape="1,5 4,5 4,8"/></additional>',
+        "parked.csv": "x_m,y_m,yaw_deg,type\n1,9,0,car\n",
+        "trees.geojson": collection(feature(house, name="oak", kind="tree", height_m=6)),
         "five.csv": SITES + "b_high,30.5,-12,5\nc,2,-12,4\nd,38,12,4\n",
         "one.csv": "site,x_m,y_m,z_m\na,10,12,3\n",
         "sensors.csv": "site,x_m,y_m,z_m,sensor\na,10,12,3,VLP-32C\nb,30,12,3,\n",
@@ -370,6 +415,10 @@ def outcome(key: str, small: Path, file: str, overrides: tuple[str, ...]) -> obj
         case "costs" | "placement":
             placed = solve_placement(open_folder(scenario, run_folder), exact=True, time_limit_s=60)
             return placed.sensors, placed.joint, placed.cost, placed.zones, placed.curve_costs
+        case "what_if":
+            runs = what_if.prepare_runs(small / file, overrides)
+            statics = [(one.share, one.scenario.statics.footprints) for one in runs]
+            return statics, what_if.solid_documents(scenario, "works")
         case "validation":
             return json.dumps(cloud_simulation.hash_body_files(scenario))
     context = open_folder(scenario, run_folder)

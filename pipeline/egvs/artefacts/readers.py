@@ -7,10 +7,10 @@ table.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -20,6 +20,9 @@ from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import read_periods
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, Grid
+
+if TYPE_CHECKING:
+    from shapely.geometry.base import BaseGeometry
 
 MIN_VEHICLES = 10
 """Locations with fewer different vehicles are not listed: a share of three cars says nothing about a lane."""
@@ -174,6 +177,111 @@ def _site_blindspots(
     locations = tuple(LocationVisibility(*row) for row in rows if row[0] != "cell")
     x_m, y_m = cells["origin_m"]
     return SiteBlindspots(site, locations, share_missed, (x_m, y_m), cells["cell_m"])
+
+
+ALL_USERS, PEDESTRIANS, TWO_WHEELERS = "all", "pedestrian", "two-wheeler"
+"""Classes of road users in ``zones.parquet``; :data:`egvs.scoring.zone_results.CLASSES` has the others."""
+
+_WHOLE_PERCENT = 0.95
+"""Shares with a standard error below this have a decimal, in per cent."""
+
+_CLASS_WORDS = {
+    ALL_USERS: "road users", "car": "cars", "truck": "trucks", "bus": "buses", "rail": "trams",
+    TWO_WHEELERS: "two-wheelers", PEDESTRIANS: "pedestrians", "other": "others",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ZoneVisibility:
+    """The road users of one class in one zone, and the share of them that is found.
+
+    Attributes
+    ----------
+    zone, user_class
+        Name of the zone; class of road users, as in the artefact.
+    road_users, observations
+        Number of different road users, and of observations of them.
+    share, se
+        Share that is expected to be found, 0 to 1, and its standard error; NaN with one road user.
+    """
+
+    zone: str
+    user_class: str
+    road_users: int
+    observations: int
+    share: float
+    se: float
+
+    @property
+    def class_words(self) -> str:
+        """Plural of the class."""
+        return _CLASS_WORDS[self.user_class]
+
+    @property
+    def share_words(self) -> str:
+        """The share with its standard error, where it is known."""
+        if math.isnan(self.se):
+            return f"{self.share:.0%}"
+        digits = 0 if 100 * self.se >= _WHOLE_PERCENT else 1
+        return f"{100 * self.share:.{digits}f} ± {100 * self.se:.{digits}f}%"
+
+    def in_words(self) -> str:
+        """Return zone, class, share and number of road users in one phrase."""
+        return f"{self.zone}, {self.class_words}: {self.share_words} found (of {self.road_users:,})"
+
+
+def read_zones(path: Path, site: str) -> list[ZoneVisibility]:
+    """Return the rows of one site in ``zones.parquet``, in their order.
+
+    Raises
+    ------
+    InputError
+        When the file is corrupt.
+    """
+    import pyarrow.compute as pc
+
+    table = parquet.read_artefact(path, "zones")[0]
+    return _zone_rows(table.filter(pc.equal(table.column("site"), site)))
+
+
+def read_zone_areas(path: Path) -> dict[str, BaseGeometry]:
+    """Return the areas of the zones in ``zones.parquet`` by name, world frame, in the order of their file.
+
+    Raises
+    ------
+    InputError
+        When the file is corrupt.
+    """
+    import shapely
+
+    metadata = parquet.read_metadata(path, "zones")
+    try:
+        return {name: shapely.from_wkb(area) for name, area in metadata["zones"]}
+    except (TypeError, ValueError, shapely.errors.ShapelyError) as error:
+        raise InputError(path, f"invalid areas in the metadata ({error})", _REMAKE_HINT) from None
+
+
+def read_plan_zones(path: Path) -> list[ZoneVisibility]:
+    """Return the rows of ``plan_zones.parquet``; :func:`read_zones` describes them."""
+    return _zone_rows(parquet.read_artefact(path, "plan_zones")[0])
+
+
+def _zone_rows(table: pa.Table) -> list[ZoneVisibility]:
+    names = ("zone", "class", "road_users", "observations", "share_found", "share_found_se")
+    columns = table.to_pydict()
+    return [ZoneVisibility(*row) for row in zip(*(columns[name] for name in names), strict=True)]
+
+
+def telling_zones(rows: Sequence[ZoneVisibility]) -> list[ZoneVisibility]:
+    """Return where fewest road users are found: of pedestrians, of two-wheelers, and of all vehicles on more wheels.
+
+    The zone with the smallest share of each, among zones with at least :data:`MIN_VEHICLES` of them.
+    """
+    groups: dict[str, list[ZoneVisibility]] = {PEDESTRIANS: [], TWO_WHEELERS: [], "": []}
+    for row in rows:
+        if row.road_users >= MIN_VEHICLES and row.user_class != ALL_USERS:
+            groups[row.user_class if row.user_class in groups else ""].append(row)
+    return [min(group, key=lambda row: (row.share, row.zone)) for group in groups.values() if group]
 
 
 DISTINCT_PROBABILITY = 0.9

@@ -76,6 +76,7 @@ class RunFolder:
     visibility = RunFile("visibility.parquet", "score")
     scores_by_period = RunFile("scores_by_period.parquet", "score")
     blindspots = RunFile("blindspots.parquet", "score")
+    zones = RunFile("zones.parquet", "score")
     report = RunFile("report.html", "report")
 
     accuracy = RunFile("accuracy.parquet", "accuracy")
@@ -89,6 +90,7 @@ class RunFolder:
     validation_checksums = RunFile("validation.sha256", "validate")
     placement = RunFile("placement.parquet", "place")
     curve = RunFile("curve.parquet", "place")
+    plan_zones = RunFile("plan_zones.parquet", "place")
     placement_checksums = RunFile("placement.sha256", "place")
 
     def __truediv__(self, name: str) -> Path:

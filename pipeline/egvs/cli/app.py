@@ -15,7 +15,7 @@ from typer.core import TyperCommand
 from typer.models import CommandInfo
 
 from egvs._version import __version__
-from egvs.cli import city, compare, exit, place, sensor, sources, validate
+from egvs.cli import city, compare, exit, installation, place, sensor, sources, validate, what_if
 from egvs.cli import options as cli_options
 from egvs.cli.options import (
     DEFAULT_POLES,
@@ -190,6 +190,7 @@ def traffic(
     scenario: ScenarioPath,
     out: Out = None,
     set_: Set = None,
+    jobs: Jobs = None,
     traci: Annotated[
         str | None,
         typer.Option(metavar="HOST:PORT", help="Record from a running SUMO, started with --remote-port."),
@@ -199,7 +200,7 @@ def traffic(
     stage_options: dict[str, Any] = {}
     if traci is not None:
         stage_options["traci"] = cli_options.parse_host_and_port(traci)
-    _run_stage("traffic", scenario, out, set_, **stage_options)
+    _run_stage("traffic", scenario, out, set_, jobs, **stage_options)
 
 
 @app.command()
@@ -307,6 +308,7 @@ def verify(
 
 
 app.command()(compare.compare)
+app.command("what-if")(what_if.what_if)
 
 
 @app.command()
@@ -468,14 +470,16 @@ for verb in validate.VERBS:
 @app.command()
 def export(
     run: Run,
-    to: Annotated[str, typer.Option(metavar="FORMAT", help="gpkg, geojson, geoparquet, kml, csv or geotiff.")],
+    to: Annotated[
+        str, typer.Option(metavar="FORMAT", help="gpkg, geojson, geoparquet, kml, csv, geotiff, dxf, glb or usd.")
+    ],
     crs: Annotated[
         str | None,
         typer.Option(metavar="CRS", help="scenario or wgs84; by default the one that is usual for the format."),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="FILE|DIR", help="A file (gpkg, kml) or a folder; RUN/export by default."),
+        typer.Option("--out", metavar="FILE|DIR", help="A file (gpkg, kml, dxf) or a folder; RUN/export by default."),
     ] = None,
     site: Annotated[
         list[str] | None,
@@ -484,7 +488,7 @@ def export(
         ),
     ] = None,
 ) -> None:
-    """Export a run for GIS and spreadsheets: sites, plan, blind spots and footprints, or rasters."""
+    """Export a run for GIS, CAD and 3D: sites, plan, blind spots and footprints, rasters, a site plan, a scene."""
     from egvs.cli.console import ProgressDisplay
     from egvs.export import export
 
@@ -522,6 +526,10 @@ def figure(
     with ProgressDisplay("figure") as screen:
         path = figure.draw_figure(run, what, site=site, kind=kind, width_mm=width_mm, out=out, progress=screen.progress)
     print(path)
+
+
+app.command()(installation.sheets)
+app.command()(installation.accept)
 
 
 app.add_typer(city.app, name="city")
@@ -575,6 +583,22 @@ def new(
             " junction with signals.",
         ),
     ] = None,
+    download: Annotated[
+        bool,
+        typer.Option(
+            "--download",
+            help="Download the OpenStreetMap extract around --at LAT,LON from an Overpass server. Nothing is downloaded"
+            " without this option.",
+        ),
+    ] = False,
+    overpass_url: Annotated[
+        str | None,
+        typer.Option(
+            "--overpass",
+            metavar="URL",
+            help="Overpass server for --download; default: EGVS_OVERPASS_URL, or overpass-api.de.",
+        ),
+    ] = None,
     lefthand: Annotated[bool, typer.Option("--lefthand", help="Traffic drives on the left.")] = False,
     walk: Annotated[bool, typer.Option("--walk", help="Include sidewalks and crossings, for pedestrians.")] = False,
     surroundings: Annotated[
@@ -596,6 +620,14 @@ def new(
     vehicles_per_hour: Annotated[
         int | None,
         typer.Option(metavar="N", help="Instead of --traffic: vehicles per hour that pass the junction, in all."),
+    ] = None,
+    counts: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Instead of assumed traffic: your counts, a CSV file with columns street, approach (the side on which"
+            " vehicles arrive), turn, start and count; docs/scenarios.md.",
+        ),
     ] = None,
     poles: Annotated[
         tuple[str, str] | None,
@@ -684,8 +716,11 @@ def new(
     from egvs.importers.new_scenario import NewScenarioOptions
 
     paths = [*(maps or []), *(more or [])]
-    if not paths:
-        raise InputError("--from", "no map is given", "Give a map of the roads, such as --from town.osm.")
+    if not paths and not download:
+        hint = "Give a map of the roads, such as --from town.osm, or --at LAT,LON --download."
+        raise InputError("--from", "no map is given", hint)
+    if overpass_url is not None and not download:
+        raise InputError("--overpass", "has no effect without --download", "Add --download.")
     location = None
     if at is not None:
         location = cli_options.latitude_and_longitude(at)
@@ -694,6 +729,9 @@ def new(
         surroundings_m = cli_options.radius_m(surroundings)
     if traffic is not None and vehicles_per_hour is not None:
         raise InputError("--traffic", "cannot be combined with --vehicles-per-hour", "Use one of them.")
+    if counts is not None and (traffic is not None or vehicles_per_hour is not None):
+        key = "--traffic" if traffic is not None else "--vehicles-per-hour"
+        raise InputError(key, "has no effect on counted traffic (--counts)", "Use one of them.")
     if (tracks or like) and (traffic is not None or vehicles_per_hour is not None):
         key = "--traffic" if traffic is not None else "--vehicles-per-hour"
         source = "--tracks" if tracks else "--like"
@@ -708,10 +746,15 @@ def new(
         lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=demand, pole_spacing_m=pole_spacing_m,
         align=tuple(cli_options.point_pair(text) for text in align or []), surface=tuple(surface or []),
         tracks=tuple(tracks or ()), like=tuple(like or ()), signals=tuple(signals or ()), track_crs=track_crs,
-        track_columns=track_columns, pedestrian_tracks=tuple(pedestrian_tracks or ()),
+        track_columns=track_columns, pedestrian_tracks=tuple(pedestrian_tracks or ()), counts=counts,
     )  # fmt: skip
+    notes = []
+    if download:
+        extract = new_scenario.download_map(folder, location, options, overpass_url)
+        paths.append(extract.path)
+        notes.append(extract.note)
     scenario = new_scenario.create_scenario(folder, paths, location, options)
-    new_summary.print_new_scenario(scenario)
+    new_summary.print_new_scenario(scenario, notes)
     if run_:
         _run_all_stages(folder, None, None, None, audit=False, poles=DEFAULT_POLES, verbose=False, rehash=False)
 
@@ -766,9 +809,10 @@ def store(
 
 COMMAND_GROUPS = {
     "Start here": ("new", "demo", "check", "run"),
-    "Decide": ("place", "explore", "compare", "city"),
+    "Decide": ("place", "explore", "compare", "what-if", "city"),
     "Study": ("validate", "accuracy", "effects", "scores", "clouds", "train"),
     "Stages of egvs run": ("traffic", "statics", "tpog", "scan", "score", "report"),
+    "Install": ("sheets", "accept"),
     "Files": ("runs", "export", "figure", "sensors", "verify", "store", "sensor"),
 }
 """Groups of ``egvs --help``, and their commands."""

@@ -7,7 +7,7 @@ the line says which file has them.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from egvs.cli.console import WIDE, Column, console, make_table
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 _FILE_WIDTH = 160
 
 
-def print_new_scenario(scenario: NewScenario) -> None:
-    """Print what ``egvs new`` created."""
+def print_new_scenario(scenario: NewScenario, map_notes: Sequence[str] = ()) -> None:
+    """Print what ``egvs new`` created; ``map_notes`` say where the map comes from."""
     out = console(_FILE_WIDTH)
     for name, text in _scenario_lines(scenario):
         out.print(f"{name:<9} {text}")
-    for note in scenario.notes:
+    for note in (*map_notes, *scenario.notes):
         out.print(f"note: {note}")
     for warning in _scenario_warnings(scenario):
         out.print(f"warning: {warning}")
@@ -73,6 +73,8 @@ def _scenario_lines(scenario: NewScenario) -> Iterator[tuple[str, str]]:
         traffic = recorded_traffic.describe(scenario.recorded)
     if scenario.demand is not None:
         traffic = scenario.demand.describe()
+    if scenario.counted is not None:
+        traffic = scenario.counted.describe()
     yield "traffic", traffic
     mounts = f"{len(junctions.HEIGHTS_M)} heights x {len(PITCHES_DEG)} tilts"
     yield "sites", f"{scenario.n_candidates:,} candidates: {scenario.poles} poles x {mounts}, sensor {SENSOR}"
@@ -173,6 +175,8 @@ def _scenario_warnings(scenario: NewScenario) -> Iterator[str]:
         return
     if scenario.demand is not None:
         yield from _demand_warnings(scenario, scenario.demand)
+        return
+    if scenario.counted is not None:
         return
     assumed, per_h = "the traffic is assumed", 0
     if scenario.traffic is not None:

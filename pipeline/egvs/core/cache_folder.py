@@ -1,4 +1,4 @@
-"""Folders for what is compiled once and used by later processes."""
+"""Folders for what is compiled or downloaded once and used by later processes."""
 
 from __future__ import annotations
 
@@ -46,13 +46,30 @@ def find_cache_folder(package: Path, prefix: str, digest: str, chosen: str | Non
     return None
 
 
+def user_cache_folder() -> Path | None:
+    """Return the folder ``egvs`` in the user's cache, or else a private one in the temporary directory.
+
+    None if neither can be written.
+    """
+    return next((folder for folder in _user_folders() if _is_writable_folder(folder)), None)
+
+
 def _candidate_folders(package: Path, chosen: str | None) -> Iterator[Path]:
     if chosen:
         yield Path(chosen)
+        yield from _temporary_folders()
     else:
         yield package / "__pycache__"
-        with suppress(RuntimeError):  # a user without a home
-            yield Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "egvs"
+        yield from _user_folders()
+
+
+def _user_folders() -> Iterator[Path]:
+    with suppress(RuntimeError):  # a user without a home
+        yield Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "egvs"
+    yield from _temporary_folders()
+
+
+def _temporary_folders() -> Iterator[Path]:
     if not hasattr(os, "geteuid"):  # Windows, where the temporary folder is the user's
         return
     with suppress(OSError):

@@ -87,7 +87,9 @@ VOXELS = Limit("EGVS_MAX_VOXELS", 2**30, "voxels", "a region of interest")
 ROWS = Limit("EGVS_MAX_ROWS", 3_000_000, "rows", "the frames of an FCD file held in memory, or recorded tracks")
 MAP_OBJECTS = Limit("EGVS_MAX_MAP_OBJECTS", 5_000_000, "objects", "an OpenStreetMap extract")
 GROUND_POINTS = Limit("EGVS_MAX_GROUND_POINTS", 2_000_000, "points", "the ground surface built from a network")
-READER_MEMORY = Limit("EGVS_MAX_READER_MB", 2000, "MB", "the program that reads a LAZ or E57 file")
+DOWNLOAD = Limit("EGVS_MAX_DOWNLOAD_MB", 200, "MB", "a downloaded map")
+DOWNLOAD_TIME = Limit("EGVS_MAX_DOWNLOAD_S", 120, "s", "the download of a map")
+READER_MEMORY = Limit("EGVS_MAX_READER_MB", 2000, "MB", "the program that reads a LAZ or E57 file or a recording")
 
 
 def checked_size(path: Path, limit: Limit, where: object = "") -> int:

@@ -519,7 +519,7 @@ class Page:
             if site != other.site:
                 other = self.session.rate(name, site.pose, site.sensor)
         return drawing.LayerContext(
-            self.server.scene, self.session, self._playback, self.rating, self.view, other, self.zero_m
+            self.server.scene, self.session, self._playback, self.rating, self.view, other, self.zero_m, self.plan
         )
 
     def _status_text(self, is_dragging: bool) -> str:

@@ -1,4 +1,5 @@
-"""Exports a run or a city: vector layers as GeoPackage, GeoJSON, GeoParquet, KML or CSV, rasters as GeoTIFF.
+"""Exports a run or a city: vector layers as GeoPackage, GeoJSON, GeoParquet, KML or CSV, rasters as GeoTIFF; of a run
+also a site plan as DXF and a 3D scene as glTF or USD.
 
 Steps: check the request; open the run and choose the reference system; make the layers or rasters; write the files to a
 temporary folder, and move them to their names when all are complete.
@@ -18,6 +19,7 @@ from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files, plugins
 from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
+from egvs.export import drawing, scene_files
 from egvs.export.finished_run import CRS_CHOICES, SCENARIO_CRS, WGS84_CRS, ExportCrs, FinishedRun
 from egvs.export.layers import (
     NAMES,
@@ -49,6 +51,10 @@ class Format:
         Default reference system, one of :data:`egvs.export.finished_run.CRS_CHOICES`.
     libraries
         Optional libraries that write the format.
+    extra
+        The extra that installs them.
+    of_city
+        Whether a city can be exported.
     """
 
     name: str
@@ -56,6 +62,8 @@ class Format:
     is_one_file: bool
     crs: str
     libraries: tuple[str, ...] = ()
+    extra: str = "gis"
+    of_city: bool = True
 
 
 _FORMATS = (
@@ -64,8 +72,13 @@ _FORMATS = (
     Format("geoparquet", ".parquet", False, SCENARIO_CRS, ("geopandas",)),
     Format("kml", ".kml", True, WGS84_CRS),
     Format("csv", ".csv", False, SCENARIO_CRS),
-    Format("geotiff", ".tif", False, SCENARIO_CRS, ("rasterio",)),
+    Format("geotiff", ".tif", False, SCENARIO_CRS, ("rasterio",), of_city=False),
+    Format("dxf", ".dxf", True, SCENARIO_CRS, ("ezdxf",), of_city=False),
+    Format("glb", ".glb", False, SCENARIO_CRS, of_city=False),
+    Format("usd", ".usdc", False, SCENARIO_CRS, ("pxr",), extra="usd", of_city=False),
 )
+_METRES = ("dxf", "glb", "usd")
+"""Formats without degrees."""
 FORMATS = {file_format.name: file_format for file_format in _FORMATS}
 
 
@@ -121,9 +134,9 @@ def export_run(
     file_format = _check_request(to, crs, sites)
     of_city = is_city(folder)
     if of_city:
-        if to == "geotiff":
+        if not file_format.of_city:
             hint = f"Export a junction: {folder / 'junctions' / 'NAME'}."
-            raise InputError("--to geotiff", f"{folder} is the folder of a city", hint)
+            raise InputError(f"--to {to}", f"{folder} is the folder of a city", hint)
         run = open_junction_run(folder)
         title = city_name(folder)
     else:
@@ -140,12 +153,23 @@ def export_run(
     with files.temporary_folder() as temp_folder:
         if file_format.name == "geotiff":
             written = list(_write_rasters(run, reference, temp_folder, selected, progress))
+            if run.work.inputs.common_network is None:
+                notes.append("points on target are left out: the traffic does not come from one road network")
+            if run.has_outdated_plan:
+                notes.append("the plan's overlap is left out: it is for other traffic. Run egvs place again")
+        elif file_format.name in ("glb", "usd"):
+            written = list(scene_files.write_scene(temp_folder, run, reference, is_usd=to == "usd"))
+            progress("files written", 1, 1)
         else:
             layers, notes = city_layers(folder) if of_city else run_layers(run)
             if file_format.name == "kml" and not of_city:
                 layers = kml_layers(run, layers, notes)
             progress("layers made", 1, 2)
-            written = list(_write_vectors(file_format, layers, reference, temp_folder, target.name, title))
+            if file_format.name == "dxf":
+                notes += drawing.write_dxf(temp_folder / target.name, run, layers, reference)
+                written = [temp_folder / target.name]
+            else:
+                written = list(_write_vectors(file_format, layers, reference, temp_folder, target.name, title))
             progress("files written", 2, 2)
         paths = [target]
         if not file_format.is_one_file:
@@ -163,12 +187,15 @@ def _check_request(to: str, crs: str | None, sites: Collection[str]) -> Format:
     if crs is not None and crs not in CRS_CHOICES:
         hint = f"Use {SCENARIO_CRS} for the scenario's reference system, {WGS84_CRS} for degrees."
         raise InputError("--crs", f"expected {' or '.join(CRS_CHOICES)}, got {crs!r}", hint)
+    if to in _METRES and crs == WGS84_CRS:
+        problem = f"{to} files are always in metres"
+        raise InputError("--crs", problem, f"Use --crs {SCENARIO_CRS}, or omit --crs.")
     if to == "kml" and crs == SCENARIO_CRS:
         raise InputError("--crs", "KML files are always in degrees", f"Use --crs {WGS84_CRS}, or omit --crs.")
     if sites and to != "geotiff":
         hint = "Omit --site: the other formats contain all sites."
         raise InputError("--site", f"works only with --to geotiff, got --to {to}", hint)
-    plugins.require_libraries(f"export to {to}", "gis", *FORMATS[to].libraries)
+    plugins.require_libraries(f"export to {to}", FORMATS[to].extra, *FORMATS[to].libraries)
     return FORMATS[to]
 
 
@@ -282,7 +309,7 @@ def _write_rasters(
             name += "_"
         used |= _raster_file_stems(name)
         yield from rasters.write_geotiff(folder, raster, reference, name)
-        progress(f"{raster.name} written", number, 1 + 3 * len(sites))
+        progress(f"{raster.name} written", number, 0)
 
 
 def _raster_file_stems(name: str) -> set[str]:

@@ -480,6 +480,8 @@ def _parse_sections(road: Element, length_m: float) -> Iterator[LaneSection]:
     ends = [*(_number(element, "s") for element in elements[1:]), length_m]
     for element, end_m in zip(elements, ends, strict=True):
         lanes = [_parse_lane(lane) for side in ("left", "right") for lane in element.iterfind(f"{side}/lane")]
+        if any(_integer(lane, "id") for lane in element.iterfind("center/lane")):
+            raise ValueError("<center>: expected a lane with the id 0")
         by_id = {lane.id: lane for lane in sorted(lanes, key=lambda lane: lane.id)}
         start_m = _number(element, "s")
         yield LaneSection(start_m, max(start_m, end_m), by_id)

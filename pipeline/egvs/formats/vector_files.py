@@ -97,9 +97,10 @@ def _read_gdal(path: Path, kind: str, geometry: str) -> tuple[pa.Table, str, str
     try:
         layer = _choose_layer(path, pyogrio.list_layers(path).tolist(), geometry)
         metadata, table = pyogrio.read_arrow(path, layer=layer)
+        table.validate(full=True)
     except (DataSourceError, DataLayerError, pa.ArrowException) as error:
         problem = f"the file cannot be read as {kind} ({error})"
-        raise InputError(path, problem, "Export it again, or use GeoJSON or CSV.") from None
+        raise InputError(path, problem, "Export it again, with the encoding UTF-8, or use GeoJSON or CSV.") from None
     return table, metadata["geometry_name"] or "wkb_geometry", metadata["crs"]
 
 
@@ -148,6 +149,7 @@ def _read_geoparquet(path: Path) -> tuple[pa.Table, str, str | None]:
     """Return the table of a GeoParquet file, the name of its geometry column, and its reference system."""
     try:
         table = pq.read_table(path)
+        table.validate(full=True)
         header = json.loads((table.schema.metadata or {})[b"geo"])
         name = header["primary_column"]
         column = header["columns"][name]

@@ -8,6 +8,7 @@ flows, and find how much of them the network carries; write
     network.net.xml    the streets                                       (traffic)
     statics.geojson    footprints with heights, and import counts        (statics)
     sites.csv          candidate sites                                   (scan, score)
+    zones.geojson      crosswalks, stop lines, approaches                (score)
     scenario.toml      the scenario that names them
 
 and, where the maps have meshes, one PLY file for each kind of object.
@@ -23,7 +24,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import tomlkit
@@ -38,27 +39,32 @@ from egvs.importers import (
     demand_from_tracks,
     ground_heights,
     ground_reference,
+    junction_zones,
     junctions,
     map_readers,
     openstreetmap,
     osm_solids,
+    overpass,
     recorded_signals,
     recorded_traffic,
     scenario_files,
     signal_programs,
     static_objects,
+    street_counts,
 )
 from egvs.importers.alignment import PointPair, check_used, make_alignment
 from egvs.importers.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, AssumedTraffic
 from egvs.importers.building_heights import ASSUMED, NEIGHBOURS, SURFACE_MODEL
 from egvs.importers.demand_from_tracks import TrackDemand
 from egvs.importers.ground_heights import HIGHEST_M, LOWEST_M
+from egvs.importers.junction_zones import Zone
 from egvs.importers.junctions import JunctionRegion, KerbsidePole, StreetJunction, Streets
 from egvs.importers.map_parts import MapContext, RoadOptions, Terrain
 from egvs.importers.map_readers import MapFile, MapFiles
 from egvs.importers.openstreetmap import OsmRoads
 from egvs.importers.osm_network import ATTRIBUTION, NETWORK_FILE
 from egvs.importers.osm_solids import ImportCounts
+from egvs.importers.overpass import DownloadedExtract
 from egvs.importers.recorded_motion import MatchedRecording, match_recording
 from egvs.importers.recorded_traffic import TrackFiles
 from egvs.importers.relief import Relief, ground_surface
@@ -69,6 +75,7 @@ from egvs.importers.scenario_files import (
     SITES_FILE,
     STATICS_FILE,
     TERRAIN_FILE,
+    ZONES_FILE,
     FileContent,
     TomlTable,
     reachable_area,
@@ -76,6 +83,7 @@ from egvs.importers.scenario_files import (
 from egvs.importers.signal_assignment import RecordedMotion
 from egvs.importers.signal_programs import Replay, SignalPlan
 from egvs.importers.static_objects import MapSummary, ReadMap, StaticObjects, SurfaceModel
+from egvs.importers.street_counts import StreetCounts
 from egvs.scenario.loading import load
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, CountConfig, TrafficConfig
@@ -142,6 +150,10 @@ class NewScenario:
         The demand that was estimated from recorded tracks, if there are such tracks.
     signal_notes
         Durations of recorded signals, with intervals; empty without them.
+    counted
+        The user's counts, if there are any.
+    zones
+        Zones of the junction, for which results are reported.
     are_lights_guessed
         Whether it was guessed which recorded light governs which road.
     """
@@ -162,6 +174,8 @@ class NewScenario:
     recorded: RecordedTracks | None = None
     demand: TrackDemand | None = None
     signal_notes: tuple[str, ...] = ()
+    counted: StreetCounts | None = None
+    zones: tuple[Zone, ...] = ()
     are_lights_guessed: bool = False
 
     @property
@@ -184,6 +198,8 @@ class NewScenario:
         """The flows of the scenario; empty where no street leads through the region of interest."""
         if self.demand is not None:
             return self.demand.flows
+        if self.counted is not None:
+            return self.counted.flows
         return () if self.traffic is None else self.traffic.flows
 
 
@@ -221,6 +237,8 @@ class NewScenarioOptions:
         TOML file with the meaning of the columns of tracks in a table of one's own.
     surface
         Rasters of the heights of roofs and trees; with a terrain, they give heights to buildings that have none.
+    counts
+        CSV file with counts by street, side of arrival and turn, see :mod:`street_counts`; instead of assumed traffic.
     """
 
     lefthand: bool = False
@@ -236,6 +254,7 @@ class NewScenarioOptions:
     track_crs: str | None = None
     track_columns: Path | None = None
     surface: tuple[Path, ...] = ()
+    counts: Path | None = None
 
     def check(self) -> None:
         """Raise an InputError when a value is out of its limits."""
@@ -244,6 +263,9 @@ class NewScenarioOptions:
         if self.tracks and self.like:
             hint = "--tracks replays tracks, --like simulates such traffic."
             raise InputError("--like", "cannot be combined with --tracks", hint)
+        if self.counts is not None and (self.tracks or self.like):
+            key = "--tracks" if self.tracks else "--like"
+            raise InputError("--counts", f"cannot be combined with {key}", "Use one of them.")
         if self.tracks and self.pedestrian_tracks:
             hint = "Give the files of all recorded road users by --tracks."
             raise InputError("--pedestrian-tracks", "is for simulated vehicles, not for --tracks", hint)
@@ -321,8 +343,8 @@ def create_scenario(
         terrain = ground_reference.measured_ground(measured)
     elif measured is not None:
         ground_notes.append("The ground of the point cloud is not used, since a terrain file is given.")
-    zero = ground_reference.find_zero(roads, files.roads, junction, terrain)
-    roads = ground_reference.lay_on_ground(roads, files.roads, junction, terrain)
+    zero = ground_reference.find_zero(roads, files.roads, junction, terrain, files.terrain)
+    roads = ground_reference.lay_on_ground(roads, files.roads, junction, terrain, files.terrain)
     terrain_m = None if terrain is None else _terrain_points(terrain, window, zero.height_m or 0.0)
     ground = ground_surface(roads.streets, terrain_m)
     objects = static_objects.collect_objects(
@@ -363,17 +385,18 @@ def create_scenario(
         junction = replace(junction, signalised=True)
         notes += [] if recording is None else [_SIGNALS_OF_TRACKS_NOTE]
     like = None if example is None else matched[0]
-    assumed, demand, traffic_notes = _plan_traffic(signals.network, streets, junction, options, like, files.roads.path)
-    notes += [*signals.notes, *traffic_notes]
+    planned = _plan_traffic(signals.network, streets, junction, options, like, files.roads.path)
+    notes += [*signals.notes, *planned.notes]
     relief = Relief.of_region(streets, junction, roi)
     if relief.other_levels:
         notes.append(f"Lanes on another level cross the region of interest: {', '.join(relief.other_levels)}.")
 
     scenario = NewScenario(
-        folder, junction, roi, streets, len(poles), objects.counts, 0, assumed, tuple(notes),
+        folder, junction, roi, streets, len(poles), objects.counts, 0, planned.assumed, tuple(notes),
         height_m=relief.z_range_m[1] - relief.z_range_m[0], maps=objects.maps,
         attributions=_attributions(roads, objects), from_at_m=_distance_m(streets, junction, at),
-        demand=demand, signal_notes=signals.notes, are_lights_guessed=signals.is_guessed,
+        demand=planned.demand, signal_notes=signals.notes, counted=planned.counted,
+        zones=junction_zones.junction_zones(streets, junction, roi), are_lights_guessed=signals.is_guessed,
     )  # fmt: skip
     ground_m = relief.ground_m(ground, poles)
     columns = _site_columns(poles, ground_m, relief, maps_read, roi, zero.height_m or 0.0)
@@ -390,6 +413,7 @@ def create_scenario(
         NETWORK_FILE: signals.network,
         STATICS_FILE: scenario_files.solids_geojson(objects.solids, objects.counts, scenario.attributions),
         SITES_FILE: scenario_files.sites_csv(poles, columns),
+        **({ZONES_FILE: junction_zones.zones_geojson(scenario.zones)} if scenario.zones else {}),
         **meshes,
         **terrain_files,
         **({} if recording is None else recording.copies()),
@@ -408,6 +432,34 @@ def create_scenario(
     return checked[0]
 
 
+def download_map(
+    folder: Path, at: tuple[float, float] | None, options: NewScenarioOptions, url: str | None = None
+) -> DownloadedExtract:
+    """Download the map of a new scenario after its folder and its options were checked.
+
+    Parameters
+    ----------
+    folder
+        Folder of the new scenario.
+    at
+        Latitude, longitude in degrees.
+    options
+        Options of :func:`create_scenario`.
+    url
+        Address of the Overpass server, see :func:`egvs.importers.overpass.download_extract`.
+
+    Raises
+    ------
+    InputError
+        When ``at`` is None, the folder is not empty, an option is out of its limits, or there is no complete answer.
+    """
+    if at is None:
+        raise InputError("--download", "needs a point", "Add --at LAT,LON, such as --at 50.8704,9.7080.")
+    options.check()
+    scenario_files.check_new_folder(folder)
+    return overpass.download_extract(at, options.surroundings_m, url)
+
+
 def _with_signals(
     network: str, junction: StreetJunction, paths: Sequence[Path], streets: Streets,
     matched: Sequence[MatchedRecording], replay: Replay | None,
@@ -421,23 +473,34 @@ def _with_signals(
     return signal_programs.apply_signals(network, junction.id, signals, streets.frame, where, motion, replay)
 
 
+class _PlannedTraffic(NamedTuple):
+    """The assumed traffic, the demand like recorded tracks, or the counts; neither for recorded traffic. And notes."""
+
+    notes: Sequence[str] = ()
+    assumed: AssumedTraffic | None = None
+    demand: TrackDemand | None = None
+    counted: StreetCounts | None = None
+
+
 def _plan_traffic(
     network: str, streets: Streets, junction: StreetJunction, options: NewScenarioOptions,
     example: MatchedRecording | None, path: Path,
-) -> tuple[AssumedTraffic | None, TrackDemand | None, Sequence[str]]:  # fmt: skip
-    """Return the assumed traffic, or the demand like recorded tracks, or neither for recorded traffic; and notes."""
+) -> _PlannedTraffic:  # fmt: skip
     if example is not None:
         demand = demand_from_tracks.estimate_demand(example, streets, junction)
-        return None, demand, demand.notes
+        return _PlannedTraffic(demand.notes, demand=demand)
+    if options.counts is not None:
+        counted = street_counts.read_junction_counts(options.counts, streets, junction)
+        return _PlannedTraffic(counted.notes, counted=counted)
     if options.tracks:
-        return None, None, ()
+        return _PlannedTraffic()
     try:
         assumed = assumed_traffic.assume_traffic(network, streets, junction, options.traffic)
     except SumoInputError as error:
         lines = " ".join(line.strip() for line in str(error).splitlines()).rstrip(":.")
         hint = "Check the map, e.g. its traffic lights and connections in netedit."
         raise InputError(path, f"SUMO cannot simulate the network ({lines})", hint) from None
-    return assumed, None, assumed_traffic.traffic_notes(assumed)
+    return _PlannedTraffic(assumed_traffic.traffic_notes(assumed), assumed)
 
 
 def _check_zero_height(height_m: float | None, maps: MapFiles) -> None:
@@ -679,7 +742,7 @@ def _scenario_toml(
         "traffic": ("SUMO" if recording is None else "recorded; nothing is simulated", traffic),
         "statics": statics,
         "sites": (sites_comment, sites | scenario_files.mount_keys()),
-        "score": scenario_files.score_table(),
+        "score": scenario_files.score_table(ZONES_FILE if scenario.zones else None),
         "placement": scenario_files.placement_table(),
     }
     if zero_height_m:
@@ -696,6 +759,8 @@ def _scenario_toml(
     names = MovementNames(scenario.streets.network, scenario.junction.at_m)
     if scenario.demand is not None:
         _add_demand(document["traffic"], scenario.demand, names)
+    if scenario.counted is not None:
+        _add_counts(document["traffic"], scenario.counted, names)
     if scenario.traffic is not None:
         document["traffic"].update({"counts": scenario_files.counts_array(scenario.traffic.flows, names)})
         origin = f"assumed from the road classes ({scenario.traffic.assumed_per_h:,} vehicles an hour)"
@@ -706,6 +771,22 @@ def _scenario_toml(
         for line in scenario_files.periods_template(scenario.traffic.flows[0]):
             document["traffic"].add(tomlkit.comment(line))
     return tomlkit.dumps(document)
+
+
+def _add_counts(table: Any, counted: StreetCounts, names: MovementNames) -> None:
+    """Add the user's counts to ``[traffic]``; several hours become periods."""
+    origin = f"vehicles an hour, from {counted.path.name}"
+    if len(counted.hours) == 1:
+        table.update({"counts": scenario_files.counts_array(counted.hours[0].flows, names)})
+        table["counts"].comment(origin)
+        return
+    table.add(tomlkit.comment(f"{origin}; one period for each hour"))
+    periods = tomlkit.aot()
+    for hour in counted.hours:
+        period = tomlkit.table()
+        period.update({"name": hour.name, "weight": 1, "counts": scenario_files.counts_array(hour.flows, names)})
+        periods.append(period)
+    table.add("periods", periods)
 
 
 def _add_demand(table: Any, demand: TrackDemand, names: MovementNames) -> None:
@@ -740,6 +821,8 @@ def _assumptions(scenario: NewScenario, *, is_recorded: bool) -> list[str]:
         assumed.append(f"traffic ({traffic.per_h:,} vehicles an hour, from the road classes)")
     if scenario.demand is not None:
         assumed += scenario.demand.assumptions
+    if scenario.counted is not None:
+        assumed += scenario.counted.assumptions
     if scenario.junction.signalised and not is_recorded:
         assumed.append("signal plans")
     if scenario.are_lights_guessed:

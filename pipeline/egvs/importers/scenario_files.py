@@ -32,6 +32,7 @@ from egvs.sensors.sensor import CATALOGUE
 from egvs.traffic.movements import MovementNames
 
 STATICS_FILE, SITES_FILE, TERRAIN_FILE = "statics.geojson", "sites.csv", "terrain.ply"
+ZONES_FILE = "zones.geojson"
 SENSOR = "VLP-32C"
 
 PITCHES_DEG: tuple[float | str, ...] = (0.0, -10.0, "aim")
@@ -48,6 +49,7 @@ _KEY_COMMENTS = {  # of tables and keys; the table of a key above all tables is 
     ): "vehicles drive through one that blocks them on a junction; overlaps are counted",
     ("traffic", "teleport_s"): "the last resort against locks; vehicles that are moved on are counted",
     ("score", "rank_by"): "the expected share of vehicles that detectors find; docs/validity.md",
+    ("score", "zones"): "results are also reported for these areas; edit, add or remove them as you like",
     ("sites", "aim"): "sensors face the centre of the region",
     ("sites", "pitch_deg"): "each height with each tilt is a candidate; 'aim': the central ray points at the centre",
 }
@@ -160,9 +162,12 @@ def mount_keys() -> dict[str, Any]:
     return {"sensor": SENSOR, "heights_m": list(junctions.HEIGHTS_M), "aim": "roi", "pitch_deg": list(PITCHES_DEG)}
 
 
-def score_table() -> TomlTable:
-    """Return ``[score]``."""
-    return "", {"gamma": ScoreConfig.model_fields["gamma"].default, "rank_by": DEFAULT_SCORE}
+def score_table(zones_file: str | None = None) -> TomlTable:
+    """Return ``[score]``, with the file of the zones for which results are reported, if there are any."""
+    keys = {"gamma": ScoreConfig.model_fields["gamma"].default, "rank_by": DEFAULT_SCORE}
+    if zones_file is not None:
+        keys["zones"] = zones_file
+    return "", keys
 
 
 def placement_table() -> TomlTable:

@@ -22,12 +22,14 @@ import numpy as np
 from egvs.artefacts import checksums, parquet
 from egvs.artefacts.plan_step import ERROR_COLUMNS, PlanStep
 from egvs.artefacts.planned_sensor import PlannedSensor, plan_columns
+from egvs.artefacts.readers import ZoneVisibility, read_plan_zones
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files, plugins
 from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.placement import problem_builder, refinement, solver
 from egvs.placement.plan_error import PlanErrors
+from egvs.placement.plan_zones import PlanZones
 from egvs.placement.problem import Problem
 from egvs.placement.problem_builder import PlacementProblem
 from egvs.placement.solver import CurvePoint, Solution
@@ -258,6 +260,8 @@ class Placement:
         Whether there are standard errors.
     refinement
         With refined poses, what the refinement did; ``sensors``, ``joint``, ``cost`` and ``zones`` are those after it.
+    zone_results
+        What the sensors find together in the zones of ``[score] zones``; empty without them.
     files
         The files that were written.
     """
@@ -276,6 +280,7 @@ class Placement:
     errors_from: str
     has_errors: bool
     refinement: RefinementSummary | None = None
+    zone_results: tuple[ZoneVisibility, ...] = ()
     files: tuple[Path, ...] = ()
 
     @property
@@ -346,7 +351,12 @@ def place(
         )
         placed = solve_placement(context, exact=exact, time_limit_s=time_limit_s)
         inputs_by_stage = {name: record.stages[name].inputs for name in REQUIRED_STAGES}
-        written = write_placement(folder, scenario, placed, inputs_by_stage)
+        zones = None
+        if scenario.score.zones is not None and placed.sensors:
+            zones = PlanZones.of(context, placed.sensors, moved=placed.refinement is not None)
+        written = write_placement(folder, scenario, placed, inputs_by_stage, zones)
+        if zones is not None:
+            placed = replace(placed, zone_results=tuple(read_plan_zones(RunFolder(folder).plan_zones)))
         report = run.refresh_report(folder)
         if report is not None:
             written = (*written, report)
@@ -582,9 +592,13 @@ def _unmet_zone_error(
 
 
 def write_placement(
-    folder: Path, scenario: Scenario, placed: Placement, stage_keys: Mapping[str, str]
+    folder: Path,
+    scenario: Scenario,
+    placed: Placement,
+    stage_keys: Mapping[str, str],
+    zones: PlanZones | None = None,
 ) -> tuple[Path, ...]:
-    """Write ``placement.parquet``, ``curve.parquet`` and their checksums.
+    """Write ``placement.parquet``, ``curve.parquet``, with zones ``plan_zones.parquet``, and their checksums.
 
     Parameters
     ----------
@@ -594,11 +608,13 @@ def write_placement(
         The scenario and its plan.
     stage_keys
         Keys of the stages that the plan was made from, by name.
+    zones
+        What the plan finds in the zones of ``[score] zones``, if there are any.
 
     Returns
     -------
     tuple of pathlib.Path
-        The two tables.
+        The tables.
     """
     paths = RunFolder(folder)
     metadata = _placement_metadata(scenario, placed, stage_keys)
@@ -612,8 +628,14 @@ def write_placement(
     with parquet.artefact_writer(paths.curve, "curve", ERROR_COLUMNS if placed.has_errors else ()) as out:
         out.write(_curve_columns(placed))
         out.describe(metadata)
-    checksums.write_checksums(paths.placement_checksums, (paths.placement, paths.curve))
-    return paths.placement, paths.curve
+    written: tuple[Path, ...] = (paths.placement, paths.curve)
+    if zones is None:
+        paths.plan_zones.unlink(missing_ok=True)
+    else:
+        zones.write(paths.plan_zones, metadata)
+        written = (*written, paths.plan_zones)
+    checksums.write_checksums(paths.placement_checksums, written)
+    return written
 
 
 def _curve_columns(placed: Placement) -> dict[str, list[Any]]:
@@ -640,6 +662,7 @@ def _placement_metadata(scenario: Scenario, placed: Placement, stage_keys: Mappi
         "score": scenario.score.model_copy(update={"gamma": scenario.gamma}).model_dump(mode="json"),
     }
     settings |= zone_files.file_settings(scenario.placement.zones, zone_files.placement_zones(scenario))
+    settings |= zone_files.reported_settings(scenario)
     solution, refined = placed.solution, placed.refinement
     plan = {
         "score": placed.score,

@@ -28,7 +28,7 @@ from egvs.scoring.scorer import ever_occupied
 from egvs.scoring.target_scores import TARGET_SCORES
 from egvs.scoring.targets import VisibleTargets
 from egvs.scoring.visibility import Beams, HitCounter
-from egvs.scoring.zones import placement_zones
+from egvs.scoring.zones import placement_zones, region_bounds_m
 from egvs.sensors.sensor import check_sensor_names
 from egvs.sensors.sites import Site, candidate_sites
 from egvs.stages.base import StageContext
@@ -436,10 +436,7 @@ def _check_zone_in_roi(scenario: Scenario, name: str, area: BaseGeometry) -> Non
     """Raise InputError for a zone outside the region of interest."""
     import shapely
 
-    center_x_m, center_y_m, _ = scenario.roi.center_m
-    size_x_m, size_y_m, _ = scenario.roi.size_m
-    west_m, east_m = center_x_m - size_x_m / 2, center_x_m + size_x_m / 2
-    south_m, north_m = center_y_m - size_y_m / 2, center_y_m + size_y_m / 2
+    (west_m, south_m), (east_m, north_m) = region_bounds_m(scenario)
     if area.intersects(shapely.box(west_m, south_m, east_m, north_m)):
         return
     key = "polygon_m" if scenario.placement.zones[name].file is None else "file"

@@ -69,7 +69,7 @@ def world_outlines(world: World, box: Box) -> tuple[Outlines, ...]:
     for kind in sorted(set(kinds[is_visible].tolist()) - {"ground"}):
         of_kind = is_visible & (kinds == kind)
         shape = union_of_triangles(corners[of_kind], box)
-        names, shapes = by_class[_solid_style(kind, shape.area / len(np.unique(world.solid_of_face[of_kind])))]
+        names, shapes = by_class[solid_group(kind, shape.area / len(np.unique(world.solid_of_face[of_kind])))]
         names.append(kind.replace("_", " "))
         shapes.append(shape)
     frame = shapely.box(box[0] - 1.0, box[1] - 1.0, box[2] + 1.0, box[3] + 1.0)
@@ -112,7 +112,8 @@ def union_of_triangles(triangles: NDArray[np.float64], box: Box) -> Any:
     return shapely.union_all([*runs, shapely.union_all(shapely.polygons(triangles[~small]))])
 
 
-def _solid_style(kind: str, area_m2: float) -> str:
+def solid_group(kind: str, area_m2: float) -> str:
+    """Return the group of a solid that looks alike on a map: ``large``, ``green`` or ``small``."""
     if area_m2 < _SMALL_M2 and "crown" not in kind:
         return "small"
     if any(word in kind.lower() for word in _GREEN):

@@ -148,12 +148,17 @@ class ScoreConfig(StrictModel):
         description="Recorded frames, spread evenly, whose vehicles the scores over vehicles and the blind spots use;"
         " at most all. Their cost grows in proportion",
     )
+    zones: str | None = Field(
+        None,
+        description="GeoJSON, GeoPackage, Shapefile, KML, GeoParquet, or CSV with a row per corner: areas with names, "
+        "for which zones.parquet reports the road users found, by class. They change no score",
+    )
 
     @model_serializer(mode="wrap")
     def _serialize(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out sampled_frames where it is not set, so that it does not change cache keys."""
-        is_set = "sampled_frames" in self.model_fields_set
-        return {name: value for name, value in serialize(self).items() if name != "sampled_frames" or is_set}
+        """Leave out sampled_frames and zones where they are not set, so that they do not change cache keys."""
+        unset = {"sampled_frames", "zones"} - self.model_fields_set
+        return {name: value for name, value in serialize(self).items() if name not in unset}
 
     @field_validator("gamma", mode="before")
     @classmethod
@@ -174,15 +179,15 @@ class ScoreConfig(StrictModel):
         if "sampled_frames" in self.model_fields_set and not self.needs_vehicles:
             scores = ", ".join(VEHICLE_SCORES)
             raise ValueError(
-                f"sampled_frames has no effect without blind spots and without a score over vehicles ({scores}). "
+                f"sampled_frames has no effect without blind spots, zones and a score over vehicles ({scores}). "
                 "Remove it, or add one of them to others"
             )
         return self
 
     @property
     def needs_vehicles(self) -> bool:
-        """Whether a score, or the blind spots, need the vehicles of recorded frames."""
-        return self.blindspots or any(name in VEHICLE_SCORES for name in self.additional)
+        """Whether a score, the blind spots or the zones need the vehicles of recorded frames."""
+        return self.blindspots or self.zones is not None or any(name in VEHICLE_SCORES for name in self.additional)
 
     @property
     def additional(self) -> tuple[OtherScore, ...]:

@@ -11,9 +11,9 @@ World frame, in plan, metres.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -114,13 +114,31 @@ class VehicleSpots:
         cell_row, cells = cells_of(boxes, record.grid.roi)
         cell, at_cell = np.unique(cells, axis=0, return_inverse=True)
         row, spot = vehicles[np.append(rows, cell_row)], np.append(at, len(locations) + at_cell.reshape(-1))
+        spots = cls.at_locations(record, locations, row, spot, weight, period)
+        spots.at_m[len(locations) :] = np.asarray(record.grid.origin_m[:2]) + (cell + 0.5) * CELL_M
+        return replace(spots, cells=cell)
+
+    @classmethod
+    def at_locations(
+        cls,
+        record: TargetRecord,
+        locations: Sequence[RoadLocation],
+        row: Ints,
+        spot: Ints,
+        weight: Floats,
+        period: Ints,
+    ) -> VehicleSpots:
+        """Return spots without cells, from pairs of a vehicle-frame ``row`` and its ``spot``, (m,) int64 each.
+
+        Every spot has a row; the other parameters are those of :meth:`of`.
+        """
         vehicle = record.vehicle + len(record.vehicles) * period
         vehicles_in_all = int(vehicle.max(initial=0)) + 1
         visits, visit = np.unique(spot * vehicles_in_all + vehicle[row], return_inverse=True)
         at_m = np.column_stack([np.bincount(spot, record.boxes[row, axis]) for axis in (0, 1)]).astype(np.float64)
         at_m /= np.bincount(spot)[:, None]
-        at_m[len(locations) :] = np.asarray(record.grid.origin_m[:2]) + (cell + 0.5) * CELL_M
-        return cls(locations, cell, at_m, row, visit.reshape(-1), visits // vehicles_in_all, weight)
+        no_cells = np.empty((0, 2), dtype=np.int64)
+        return cls(tuple(locations), no_cells, at_m, row, visit.reshape(-1), visits // vehicles_in_all, weight)
 
     def __len__(self) -> int:
         """Number of spots."""

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
 
 WEIGHTS_KEY = "score.weights.zones"
+REPORTED_KEY = "score.zones"
 PLACEMENT_KEY = "placement.zones"
 
 _MIN_CORNERS = 3
@@ -30,6 +31,54 @@ _MIN_CORNERS = 3
 def weight_zones(scenario: Scenario) -> dict[str, BaseGeometry]:
     """Return the areas of ``[score.weights.zones]`` by name, as :func:`zone_areas`."""
     return zone_areas(scenario, scenario.score.weights.zones, WEIGHTS_KEY)
+
+
+def reported_zones(scenario: Scenario) -> dict[str, BaseGeometry]:
+    """Return the areas of the file ``[score] zones`` by name, in the order of the file; empty without the key.
+
+    Raises
+    ------
+    InputError
+        When the file cannot be read, an area has no name, encloses nothing or crosses itself, or is outside the region
+        of interest.
+    """
+    file = scenario.score.zones
+    if file is None:
+        return {}
+
+    import shapely
+
+    path = scenario.find(file, REPORTED_KEY)
+    areas = _read_areas(path, geolocation.scenario_georeference(scenario), need_names=True)
+    if not areas:
+        raise InputError(path, "expected at least one area, got none", f"Draw one, or remove {REPORTED_KEY}.")
+    (west_m, south_m), (east_m, north_m) = region_bounds_m(scenario)
+    region = shapely.box(west_m, south_m, east_m, north_m)
+    for name, area in areas.items():
+        if not area.intersects(region):
+            x_m, y_m = shapely.get_coordinates(area.centroid)[0].tolist()
+            problem = f"expected an area in the region of interest, got one around x {x_m:g} m, y {y_m:g} m"
+            hint = f"Use corners within x {west_m:g} to {east_m:g} m and y {south_m:g} to {north_m:g} m."
+            raise InputError(f"{path}: zone {name}", problem, hint)
+    return areas
+
+
+def region_bounds_m(scenario: Scenario) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the south-western and the north-eastern corner of the region of interest, world frame."""
+    x_m, y_m, _ = scenario.roi.center_m
+    width_m, length_m, _ = scenario.roi.size_m
+    return (x_m - width_m / 2, y_m - length_m / 2), (x_m + width_m / 2, y_m + length_m / 2)
+
+
+def reported_settings(scenario: Scenario) -> dict[str, Any]:
+    """Return the areas of ``[score] zones`` for keys and hashes; empty without the key."""
+    areas = reported_zones(scenario)
+    if not areas:
+        return {}
+
+    import shapely
+
+    return {"zones": [[name, shapely.to_wkb(area, hex=True)] for name, area in areas.items()]}
 
 
 def placement_zones(scenario: Scenario) -> dict[str, BaseGeometry]:
@@ -91,14 +140,14 @@ def file_settings(zones: Mapping[str, ZoneArea], areas: Mapping[str, BaseGeometr
     return {"zone_files": {name: shapely.to_wkb(areas[name], hex=True) for name in names}}
 
 
-def _read_areas(path: Path, world: Georeference) -> dict[str, BaseGeometry]:
+def _read_areas(path: Path, world: Georeference, *, need_names: bool = False) -> dict[str, BaseGeometry]:
     """Return the areas of a file by name; parts of the same name are joined."""
     import shapely
 
     if path.suffix.lower() == ".csv":
         return _read_corners(path, world)
     parts: dict[str, list[BaseGeometry]] = {}
-    for name, polygon in footprints.read_named_polygons(path, world):
+    for name, polygon in footprints.read_named_polygons(path, world, need_names=need_names):
         parts.setdefault(name, []).append(polygon)
     return {name: shapely.union_all(polygons) for name, polygons in parts.items()}
 

@@ -28,10 +28,13 @@ RULES: tuple[Callable[[CheckInputs], Iterator[Diagnostic]], ...] = (
     traffic_checks.check_sumo_files,
     traffic_checks.check_period_weights,
     traffic_checks.check_demand,
+    traffic_checks.check_signals,
+    traffic_checks.warn_equal_demand,
     traffic_checks.check_recorded_positions,
     traffic_checks.check_finished_files,
     traffic_checks.check_vehicle_kinds,
     traffic_checks.check_counts,
+    traffic_checks.check_observed,
     scene_checks.check_sensors_known,
     scene_checks.warn_repeated_beams,
     scene_checks.check_effects,
@@ -194,7 +197,9 @@ def _merge_findings(findings: Iterable[Diagnostic]) -> Iterator[Diagnostic]:
         yield replace(first, where=f"{first.where} and {len(others)} more") if others else first
 
 
-IGNORED_SETTINGS = ("description", "extends", "seed", "tpog", "scan", "score", "validation", "placement", "costs")
+IGNORED_SETTINGS = (
+    "description", "extends", "seed", "tpog", "scan", "score", "validation", "placement", "costs", "what_if",
+)  # fmt: skip
 """Settings that no rule reads."""
 
 

@@ -202,12 +202,15 @@ def named_files(scenario: Scenario) -> Iterator[tuple[str, str]]:
         ("traffic.sumocfg", traffic.sumocfg),
         ("traffic.fcd", traffic.fcd),
         ("traffic.coverage", traffic.coverage),
+        ("traffic.observed", traffic.observed),
         ("traffic.roads", traffic.roads),
         ("sites.file", site_config.file),
         (POINTS_KEY, site_config.points),
     ):
         if optional_name is not None:
             yield key, optional_name
+    if scenario.score.zones is not None:
+        yield zones.REPORTED_KEY, scenario.score.zones
     for name, weighted in scenario.score.weights.zones.items():
         if weighted.file is not None:
             yield f"{zones.WEIGHTS_KEY}.{name}.file", weighted.file
@@ -362,6 +365,7 @@ def resolve_check_inputs(inputs: Inputs) -> tuple[CheckInputs, list[Diagnostic]]
         errors.findings += _static_file_errors(scenario)
     errors.attempt("zones", lambda: zones.weight_zones(scenario))
     errors.attempt("zones", lambda: zones.placement_zones(scenario))
+    errors.attempt("zones", lambda: zones.reported_zones(scenario))
     carriageway = None if network is None else inputs.carriageway
     readable = CheckInputs(scenario, network, carriageway, world)
 

@@ -24,7 +24,7 @@ from egvs.effects.base import Effect
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import SCENARIO_FILE, Scenario
 from egvs.scenario.score_config import SCORES_IN_UNITS
-from egvs.scoring import score_table, standard_errors, zones
+from egvs.scoring import score_table, standard_errors, zone_results, zones
 from egvs.scoring.score_table import ScoreTable
 from egvs.sensors.sites import Site
 from egvs.stages import site_scoring
@@ -53,6 +53,7 @@ def dependencies(context: StageContext) -> StageDependencies:
         settings["own_columns"] = {name: column.to_pylist() for name, column in user_columns.items()}
     settings |= geolocation.world_frame_settings(scenario)
     settings |= zones.file_settings(scenario.score.weights.zones, zones.weight_zones(scenario))
+    settings |= zones.reported_settings(scenario)
 
     artefacts = [RunFolder.tpog.name]
     if scenario.score.needs_vehicles:
@@ -107,6 +108,7 @@ def run(
     scores = scoring.score_table(sites)
     metadata = _metadata(context, inputs, scoring, sites)
     _write_scores(context, sites, scores, metadata)
+    _write_zones(context, scoring, sites, metadata)
     config = context.scenario.score
     by_period = context.folder.scores_by_period
     score_table.write_scores_by_period(by_period, scores, config.rank_by, config.additional, metadata)
@@ -181,6 +183,18 @@ def _write_scores(
         file.describe(metadata)
 
 
+def _write_zones(
+    context: StageContext, scoring: SiteScoring, sites: Sequence[ScoredSite], metadata: dict[str, Any]
+) -> None:
+    """Write ``zones.parquet`` if the scenario has zones; remove that of an earlier run if not."""
+    if scoring.zones is None:
+        context.folder.zones.unlink(missing_ok=True)
+        return
+    in_zones = [(site.site.name, site.zones) for site in sites if site.zones is not None]
+    areas = zones.reported_settings(context.scenario)
+    zone_results.write_zones(context.folder.zones, scoring.zones, in_zones, metadata | areas)
+
+
 def _user_columns(context: StageContext) -> dict[str, pa.Array]:
     """The user's columns of the sites file, in the order of the sites."""
     rows = [site.user_columns for site in context.scene.sites]
@@ -214,6 +228,12 @@ def _summary(
     if config.blindspots:
         for blindspots in readers.read_blindspots(context.folder.blindspots, best[:1]):
             summary["missed"] = blindspots.in_words()
+    if scoring.zones is not None and best:
+        telling = readers.telling_zones(readers.read_zones(context.folder.zones, best[0]))
+        if telling:
+            summary["zones"] = (
+                f"{best[0]} in zones, where it finds fewest: {'; '.join(zone.in_words() for zone in telling)}"
+            )
     skipped = context.scene.skipped("score")
     if skipped:
         summary["skipped"] = skipped
@@ -274,6 +294,8 @@ def _warnings(context: StageContext, scoring: SiteScoring, scores: ScoreTable) -
     yield from warn_period_disagreements(scores, rank_by)
     if scoring.targets is not None:
         yield from scoring.targets.warn_undefined_scores(scoring.tpog, scoring.periods)
+    if scoring.zones is not None:
+        yield from scoring.zones.warn_empty()
     for column in (ranking, *others):
         yield from score_table.warn_no_standard_error(column)
     if np.any(ranking.values > 0):

@@ -20,14 +20,14 @@ from numpy.typing import NDArray
 from egvs.artefacts import parquet
 from egvs.artefacts.parquet import ArtefactWriter
 from egvs.artefacts.tpog import PeriodBlocks, Tpog, read_periods, read_tpog
-from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS, TrafficFrame
 from egvs.core.errors import Diagnostic, InputError
-from egvs.core.grid import FloatArray, Grid
+from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.core.threads import map_ordered
 from egvs.kernels import occupancy, traversal
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.score_config import DEFAULT_SCORE
-from egvs.scoring.blindspots import SpotWriter, VehicleSpots, open_spot_writer
+from egvs.scoring.blindspots import SpotVisibility, SpotWriter, VehicleSpots, open_spot_writer
 from egvs.scoring.egvs import EntropyField
 from egvs.scoring.road_locations import RoadLocations
 from egvs.scoring.score_table import MIX, ScoreTable, SiteScores
@@ -48,7 +48,8 @@ from egvs.scoring.targets import (
     weights_in_mix,
 )
 from egvs.scoring.visibility import Beams, to_voxel_units
-from egvs.scoring.zones import weight_zones
+from egvs.scoring.zone_results import ZoneUsers
+from egvs.scoring.zones import reported_zones, weight_zones
 from egvs.sensors.sensor import resolve_sensor
 from egvs.sensors.sites import Pose, ScannedSite
 from egvs.stages.base import StageContext
@@ -81,8 +82,29 @@ def vehicle_spots(
     roads = None
     if network is not None:
         roads = RoadLocations.of(network, context.scenario.roi.grid.roi)
+    return VehicleSpots.of(record, roads, weight, _period_of_rows(record, recorded))
+
+
+def _period_of_rows(record: TargetRecord, recorded: Sequence[int]) -> IntArray:
+    """The period of each vehicle-frame of a record, (n,) int64."""
     period = np.searchsorted(np.cumsum(recorded), record.numbers[record.frame], side="right")
-    return VehicleSpots.of(record, roads, weight, period.astype(np.int64))
+    return period.astype(np.int64)
+
+
+def zone_users(context: StageContext) -> ZoneUsers:
+    """Return the road users of the recorded traffic in the zones of ``[score] zones``.
+
+    Parameters
+    ----------
+    context
+        Its folder has ``trajectories.parquet`` and the ``tpog.parquet`` that was counted from it.
+    """
+    trajectories, tpog = context.folder.trajectories, context.folder.tpog
+    frames = context.scenario.score.sampled_frames
+    record = TargetRecord.read(trajectories, read_tpog(tpog).grid, frames, NON_VEHICLE_KINDS)
+    recorded = recorded_frames(trajectories)
+    weight = weights_in_mix(read_periods(tpog), recorded, record)
+    return ZoneUsers.of(record, reported_zones(context.scenario), weight, _period_of_rows(record, recorded))
 
 
 class _PeriodRows(NamedTuple):
@@ -251,7 +273,7 @@ class BeamAudit:
 class ScoredSite:
     """A site and its scores; if requested, an audit of its beams, and its hits in the voxels that it sees.
 
-    ``near_share`` is the share of beams that end near the sensor.
+    ``near_share`` is the share of beams that end near the sensor; ``zones`` is what it sees of road users in zones.
     """
 
     site: ScannedSite
@@ -260,6 +282,7 @@ class ScoredSite:
     audit: BeamAudit | None
     visible: dict[str, NDArray[Any]] | None
     near_share: float = 0.0
+    zones: SpotVisibility | None = None
 
 
 class SiteScoring:
@@ -285,6 +308,7 @@ class SiteScoring:
         self.periods = _read_period_tpogs(path, standard_errors=config.standard_error)
         self.scorer = Scorer(context.scene, self.tpog, context.folder.trajectories, self.leave_out, self.periods)
         self.targets = TargetScorer(context, self.tpog.grid) if context.scenario.score.needs_vehicles else None
+        self.zones = zone_users(context) if config.zones is not None else None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -298,14 +322,23 @@ class SiteScoring:
     def score(self, scan: SiteScan) -> ScoredSite:
         """Score one scan."""
         audit = BeamAudit.of(scan.beams, self.tpog.grid) if self._audit else None
-        targets = None
+        targets, zones = None, None
         if self.targets is not None:
-            targets = self.targets.scores(self.targets.visible(scan.beams))
+            visible = self.targets.visible(scan.beams)
+            targets = self.targets.scores(visible)
+            if self.zones is not None:
+                zones = self.zones.visibility(self._visible_in_zones(self.zones, scan.beams, visible))
         near = near_share(scan.beams.ends_m, scan.beams.weight)
         if self._keep_visibility != "all" and scan.site.name not in self._keep_visibility:
-            return ScoredSite(scan.site, self.scorer.score(scan.beams), targets, audit, None, near)
+            return ScoredSite(scan.site, self.scorer.score(scan.beams), targets, audit, None, near, zones)
         score, hits = self.scorer.score_and_hits(scan.beams)
-        return ScoredSite(scan.site, score, targets, audit, _sparse_hits(hits), near)
+        return ScoredSite(scan.site, score, targets, audit, _sparse_hits(hits), near, zones)
+
+    def _visible_in_zones(self, zones: ZoneUsers, beams: Beams, visible: VisibleTargets) -> VisibleTargets:
+        """What a scan sees of the road users of the zones: ``visible``, unless there are people without a weight."""
+        if len(zones.record) == len(visible.record):
+            return visible
+        return visible_targets(zones.record, beams, detection_probability(self.context.scene, beams.sensor))
 
     def score_table(self, sites: Iterable[ScoredSite]) -> ScoreTable:
         """Return the scores of sites as one table."""

@@ -9,24 +9,20 @@ The changed footprints are written to the run folders, as ``assumed_heights_1.ge
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from egvs.artefacts.run_folder import RunFolder
-from egvs.core import files
-from egvs.core.errors import InputError
 from egvs.core.platform import relative_path
-from egvs.core.reading import read_json
-from egvs.formats import vector_files
 from egvs.report.formatting import ScoreLabel, join_names
 from egvs.report.ranking import RankedSite, Ranking
 from egvs.runs import run_names
 from egvs.runs.run_sources import SettingsSource
 from egvs.scenario.model import Scenario
 from egvs.scenario.settings import format_overrides
+from egvs.studies.footprint_files import read_document, write_if_changed
 
 OPTION = "--assumed-heights"
 
@@ -163,7 +159,7 @@ def prepare_runs(path: Path, overrides: Sequence[str] = ()) -> HeightRuns:
     source = SettingsSource(path)
     base = source.load_variant(overrides)
     folder = source.folder(base) if not overrides else run_names.run_folder(base.name, base.overrides)
-    documents = [_read_document(base.find(name, "statics.footprints")) for name in base.statics.footprints]
+    documents = [read_document(base.find(name, "statics.footprints")) for name in base.statics.footprints]
     buildings = sum(_is_building(feature) for document in documents for feature in document["features"])
     assumed = sum(_is_assumed(feature) for document in documents for feature in document["features"])
     runs = [HeightRun(1.0, base, folder)]
@@ -216,7 +212,7 @@ def _changed_run(
     names = []
     for number, document in enumerate(documents, start=1):
         path = folder / f"assumed_heights_{number}.geojson"
-        _write_if_changed(path, scale_heights(document, factor))
+        write_if_changed(path, scale_heights(document, factor))
         names.append(relative_path(path.resolve(), base.folder.resolve()))
     scenario = source.load_variant((*overrides, *format_overrides({"statics.footprints": names})))
     return HeightRun(factor, scenario, folder)
@@ -236,16 +232,6 @@ def scale_heights(document: Mapping[str, Any], factor: float) -> dict[str, Any]:
     return {**document, "features": features}
 
 
-def _read_document(path: Path) -> dict[str, Any]:
-    """Return the features of a file of footprints, as a GeoJSON FeatureCollection."""
-    if vector_files.is_gis_file(path):
-        return vector_files.read_gis_file(path, "Polygon")
-    document = read_json(path, "Use a GeoJSON FeatureCollection.")
-    if not isinstance(document, dict) or not isinstance(document.get("features"), list):
-        raise InputError(path, "expected a GeoJSON FeatureCollection, got no features list")
-    return document
-
-
 def _is_building(feature: Any) -> bool:
     properties = feature.get("properties") if isinstance(feature, dict) else None
     return isinstance(properties, dict) and properties.get("kind") == _KIND
@@ -253,13 +239,3 @@ def _is_building(feature: Any) -> bool:
 
 def _is_assumed(feature: Any) -> bool:
     return _is_building(feature) and feature["properties"].get("height_from") in ASSUMED_SOURCES
-
-
-def _write_if_changed(path: Path, document: Mapping[str, Any]) -> None:
-    """Write JSON; a file with the same content is not touched, so that a run stays up to date."""
-    text = json.dumps(document, ensure_ascii=False, separators=(",", ":")) + "\n"
-    if path.is_file() and path.read_text(encoding="utf-8") == text:
-        return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with files.atomic_write(path) as partial:
-        partial.write_text(text, encoding="utf-8")

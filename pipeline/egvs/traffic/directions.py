@@ -17,6 +17,9 @@ TURNS = {"s": "straight", "l": "left", "L": "left", "r": "right", "R": "right", 
 
 _COMPASS = ("east", "north-east", "north", "north-west", "west", "south-west", "south", "south-east")
 
+SIDES = ("E", "NE", "N", "NW", "W", "SW", "S", "SE")
+"""Letters of the compass points, counter-clockwise from east."""
+
 _HEADING_OVER_M = 10.0
 """The direction of a road is that of its last metres, or of its first ones where it leaves the region."""
 
@@ -24,6 +27,15 @@ _HEADING_OVER_M = 10.0
 def compass(along_m: Floats) -> str:
     """Return the nearest of eight compass points to a direction (2,), x east and y north."""
     return _COMPASS[round(float(np.arctan2(along_m[1], along_m[0])) / (np.pi / 4)) % 8]
+
+
+def arrival_side(heading: Floats) -> str:
+    """Return the side of a junction on which vehicles with a heading (2,) arrive, the nearest of :data:`SIDES`.
+
+    >>> arrival_side(np.array([0.0, 1.0]))  # northbound vehicles arrive from the south
+    'S'
+    """
+    return SIDES[round(float(np.arctan2(-heading[1], -heading[0])) / (np.pi / 4)) % 8]
 
 
 def lane_heading(lane: Lane, *, at_end: bool) -> Floats:

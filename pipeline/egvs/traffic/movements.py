@@ -37,6 +37,27 @@ class _Passage(NamedTuple):
     ring_middle_m: Floats | None
 
 
+class Movement(NamedTuple):
+    """A way through a junction.
+
+    Attributes
+    ----------
+    approach
+        The edges that lead to the junction, in the order of driving; at least one.
+    street
+        Name of the street of the approach at the junction; empty if it has none.
+    heading
+        Direction (2,) in which vehicles arrive at the junction, not normalised: x east, y north.
+    turn
+        A value of :data:`~egvs.traffic.directions.TURNS`; empty for all vehicles of an approach.
+    """
+
+    approach: tuple[Edge, ...]
+    street: str
+    heading: Floats
+    turn: str
+
+
 class MovementNames:
     """Describes movements from one edge of a network to another.
 
@@ -95,6 +116,17 @@ class MovementNames:
             return f"{words}, straight on{towards}"
         return f"{words}, {_WAYS[turn]} to {_street(way_out)}{towards}"
 
+    def movement(self, from_edge: str, to_edge: str | None) -> Movement:
+        """Return approach and turn of a movement; parameters as of :meth:`describe`."""
+        first = self._edges[from_edge]
+        if to_edge is None:
+            return Movement((first,), plain_text(first.name), _end_heading([first]), "")
+        passage = self._passage(first, self._edges[to_edge])
+        before, after = _headings(passage)
+        approach = passage.to_junction[-1]
+        turn = self._turns.get((approach.id, passage.from_junction[0].id)) or _turn_between(before, after)
+        return Movement(tuple(passage.to_junction), plain_text(approach.name), before, turn)
+
     def _passage(self, first: Edge, last: Edge) -> _Passage:
         """Find the junction on the fastest way between two edges."""
         try:
@@ -148,9 +180,14 @@ def _point_along(line_m: Floats) -> Floats:
 
 
 def _street(edge: Edge) -> str:
-    """Return the name of an edge's street on one line; netconvert escapes names twice."""
-    printable = (character if character.isprintable() else " " for character in html.unescape(edge.name))
-    return " ".join("".join(printable).split()) or _UNNAMED_STREET
+    """Return the name of an edge's street on one line."""
+    return plain_text(edge.name) or _UNNAMED_STREET
+
+
+def plain_text(name: str) -> str:
+    """Return a name of a network on one line; netconvert escapes names twice."""
+    printable = (character if character.isprintable() else " " for character in html.unescape(name))
+    return " ".join("".join(printable).split())
 
 
 def _turn_between(before: Floats, after: Floats) -> str:

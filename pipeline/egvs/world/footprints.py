@@ -104,7 +104,7 @@ def read_footprints(path: Path, world: Georeference) -> FootprintFile:
     return file
 
 
-def read_named_polygons(path: Path, world: Georeference) -> Iterator[tuple[str, Polygon]]:
+def read_named_polygons(path: Path, world: Georeference, *, need_names: bool = False) -> Iterator[tuple[str, Polygon]]:
     """Yield the name and the polygons (world frame, metres) of each feature of a file; heights are not needed.
 
     Parameters
@@ -114,6 +114,8 @@ def read_named_polygons(path: Path, world: Georeference) -> Iterator[tuple[str, 
         property ``name`` names a feature; by default, its number does.
     world
         Where the world frame is.
+    need_names
+        Whether a feature without a name is an error.
 
     Raises
     ------
@@ -124,7 +126,9 @@ def read_named_polygons(path: Path, world: Georeference) -> Iterator[tuple[str, 
     for number, feature in enumerate(features):
         where = f"{path}: feature {number}"
         properties = _feature_properties(feature, where)
-        name = str(_property(properties, "name", number))
+        name = str(_property(properties, "name", "" if need_names else number)).strip()
+        if not name:
+            raise InputError(where, "expected the property name, got none", "Name each area, for tables and messages.")
         for polygon in to_polygons(feature.get("geometry"), properties, f"{where} ({name})", Counter(), reading):
             yield name, polygon
 

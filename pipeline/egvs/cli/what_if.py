@@ -1,0 +1,113 @@
+"""``egvs what-if``: whether parked vehicles, works or growing trees change the ranking."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from egvs.cli.options import Set, SettingsPath
+
+if TYPE_CHECKING:
+    from egvs.studies.what_if import SiteScores, WhatIfAnswer, WhatIfResult, WhatIfRun
+
+_WIDTH = 190
+
+_Values = Callable[["SiteScores"], tuple[float | None, ...]]
+
+
+def what_if(
+    scenario: SettingsPath,
+    set_: Set = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Evaluate only the table [what_if.NAME] (repeatable); all by default."),
+    ] = None,
+) -> None:
+    """What if a lorry parks there? Does the best site change with solids that are there for a share of the time?"""
+    from egvs.cli.console import ProgressDisplay
+
+    with ProgressDisplay("what-if") as screen:
+        from egvs.runs import run
+        from egvs.studies import what_if as study
+
+        prepared = study.prepare_runs(scenario, set_ or [], only or [])
+        total = len(prepared)
+        width = max(len(_run_label(what_if_run)) for what_if_run in prepared)
+
+        def run_one(number: int, what_if_run: WhatIfRun) -> None:
+            label = _run_label(what_if_run)
+            screen.begin_part(f"{label} ({number} of {total})")
+            run.run(what_if_run.scenario, what_if_run.folder, progress=screen.progress, listener=screen.stage_event)
+            screen.say(f"{label:<{width}}  {screen.part_duration:>10}   {what_if_run.folder}")
+
+        result = study.compare_runs(prepared, run_one)
+        screen.end_parts("what-if")
+    print_what_if(result)
+
+
+def _run_label(what_if_run: WhatIfRun) -> str:
+    return what_if_run.name or "as it is"
+
+
+def print_what_if(result: WhatIfResult) -> None:
+    """Print the scores of the best sites, the answer of each table, and notes."""
+    from egvs.cli.console import Column, console, format_or_dash, make_table, print_sentences
+    from egvs.report.formatting import format_probability
+    from egvs.report.sensor_results import difference_unit, format_difference
+    from egvs.studies.what_if import impossible_note
+
+    label, best = result.label, result.best
+    out = console(_WIDTH, soft_wrap=False)
+
+    def score_cell(values: _Values, number: int) -> Callable[[SiteScores], str]:
+        def cell(site: SiteScores) -> str:
+            value = values(site)[number]
+            return "-" if value is None else label.value(value)
+
+        return cell
+
+    columns: list[Column[SiteScores]] = [
+        Column("site", lambda site: site.site, align="left"),
+        Column("as it is", lambda site: label.value(site.before)),
+    ]
+    for number, what_if_run in enumerate(result.runs[1:]):
+        columns.append(Column(f"with {what_if_run.name}", score_cell(lambda site: site.present, number)))
+    for number, answer in enumerate(result.answers):
+        columns.append(Column(f"expected, {_share(answer)}", score_cell(lambda site: site.expected, number)))
+    out.print(make_table(columns, result.sites, width=out.width, title=label.label))
+    out.print()
+
+    answers: list[Column[WhatIfAnswer]] = [
+        Column("what if", lambda answer: answer.name, align="left"),
+        Column("share of time", lambda answer: format_or_dash(answer.share, ".0%")),
+        Column("best before", lambda answer: answer.best_before, align="left"),
+        Column("best with it", lambda answer: answer.best_present or "-", align="left"),
+        Column("best expected", lambda answer: answer.best_expected, align="left"),
+        Column(
+            f"change of {best.site}, {difference_unit(best)}",
+            lambda answer: "-" if answer.change is None else format_difference(answer.change, best),
+        ),
+        Column("probability that another is better", _chance(format_probability)),
+    ]
+    out.print(make_table(answers, result.answers, width=out.width))
+    out.print()
+    print_sentences(answer.conclusion() for answer in result.answers)
+    notes = [*result.notes, *filter(None, map(impossible_note, result.answers))]
+    print_sentences(f"note: {note}" for note in notes)
+
+
+def _share(answer: WhatIfAnswer) -> str:
+    return answer.name if answer.share is None else f"{answer.name} {answer.share:.0%}"
+
+
+def _chance(format_probability: Callable[[float], str]) -> Callable[[WhatIfAnswer], str]:
+    def cell(answer: WhatIfAnswer) -> str:
+        if answer.change is None:
+            return "certain"
+        if answer.overtakes is None:
+            return "-"
+        return f"{format_probability(answer.overtakes)} ({answer.rival})"
+
+    return cell

@@ -1,0 +1,207 @@
+r"""What share of the road users is found in each zone of ``[score] zones``, by class: ``zones.parquet``.
+
+A road user is in a zone while the centre of its box is in the zone's area or on its edge; it may be in several zones.
+Articulated vehicles count once for each part. All road users count, pedestrians and bicycles included, whether or not
+they have a weight in ``[score.weights]``, and all count alike.
+
+The share found is the mean probability of detection, as in the score ``expected_detections``. Detectors of pedestrians
+and bicycles have no model; for them it is the share of well visible ones, the mean of :math:`1 - e^{-n / 20}` for n
+points (:func:`egvs.scoring.target_scores.saturating_gain`).
+
+With several sensors, a road user is found when at least one of them finds it, each independently of the others:
+
+.. math:: p = 1 - \prod_s (1 - p_s)
+
+Standard errors are those of a ratio of sums over independent road users, as for blind spots.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egvs.artefacts import parquet
+from egvs.artefacts.readers import ALL_USERS
+from egvs.core.errors import Diagnostic
+from egvs.core.grid import FloatArray, IntArray
+from egvs.scenario.model import SCENARIO_FILE
+from egvs.scenario.score_config import DEFAULT_SCORE
+from egvs.scoring.blindspots import SpotVisibility, VehicleSpots
+from egvs.scoring.road_locations import RoadLocation
+from egvs.scoring.target_scores import TARGET_SCORES
+from egvs.scoring.targets import TargetRecord, VisibleTargets
+from egvs.scoring.zones import REPORTED_KEY
+
+if TYPE_CHECKING:
+    from shapely.geometry.base import BaseGeometry
+
+CLASSES: Mapping[str, frozenset[str]] = {
+    "car": frozenset(
+        {
+            "passenger",
+            "private",
+            "hov",
+            "taxi",
+            "evehicle",
+            "emergency",
+            "authority",
+            "army",
+            "vip",
+            "custom1",
+            "custom2",
+        }
+    ),
+    "truck": frozenset({"truck", "trailer", "delivery"}),
+    "bus": frozenset({"bus", "coach"}),
+    "rail": frozenset({"tram", "rail_urban", "subway", "rail", "rail_electric", "rail_fast", "cable_car"}),
+    "two-wheeler": frozenset({"bicycle", "scooter", "moped", "motorcycle"}),
+    "pedestrian": frozenset({"pedestrian", "wheelchair"}),
+}
+"""Classes of road users: SUMO's vClasses of each, in the order of the artefact."""
+
+OTHER = "other"
+"""Class of the vClasses that :data:`CLASSES` leaves out."""
+
+_MAX_NAMED = 3
+"""Zones that a warning names."""
+
+ZONES, PLAN_ZONES = "zones", "plan_zones"
+"""Names of the artefacts."""
+
+
+def road_user_class(kind: str) -> str:
+    """Return the class of a SUMO vClass.
+
+    Examples
+    --------
+    >>> road_user_class("coach"), road_user_class("bicycle"), road_user_class("ship")
+    ('bus', 'two-wheeler', 'other')
+    """
+    return next((name for name, kinds in CLASSES.items() if kind in kinds), OTHER)
+
+
+@dataclass(frozen=True, eq=False)
+class ZoneUsers:
+    """The road users of a record in each zone, by class.
+
+    Attributes
+    ----------
+    record
+        Road users of recorded frames, pedestrians and bicycles included.
+    spots
+        One spot for each zone and class with a road user; its location has the class as ``by`` and the zone as
+        ``name``.
+    empty
+        Zones without a road user.
+    """
+
+    record: TargetRecord
+    spots: VehicleSpots
+    empty: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls, record: TargetRecord, areas: Mapping[str, BaseGeometry], weight: FloatArray, period: IntArray
+    ) -> ZoneUsers:
+        """Find the zones of the vehicle-frames of a record.
+
+        Parameters
+        ----------
+        record
+            Road users of recorded frames.
+        areas
+            Area of each zone by name, world frame, metres.
+        weight
+            Weight of each vehicle-frame in a mix of periods, (n,) float64; 1 without a mix.
+        period
+            Period of each vehicle-frame, (n,) int64.
+        """
+        import shapely
+
+        of_kind = np.array([road_user_class(kind) for kind in record.kinds], dtype=object)
+        classes: NDArray[Any] = of_kind[record.kind] if len(record) else np.empty(0, dtype=object)
+        locations: list[RoadLocation] = []
+        rows: list[IntArray] = []
+        empty = []
+        for name, area in areas.items():
+            inside = shapely.intersects_xy(area, record.boxes[:, 0], record.boxes[:, 1])
+            if not inside.any():
+                empty.append(name)
+                continue
+            for user_class in (ALL_USERS, *CLASSES, OTHER):
+                of_class = inside if user_class == ALL_USERS else inside & (classes == user_class)
+                if of_class.any():
+                    locations.append(RoadLocation(user_class, name, "", (0.0, 0.0)))
+                    rows.append(np.flatnonzero(of_class))
+        row = np.concatenate([np.empty(0, dtype=np.int64), *rows])
+        spot = np.repeat(np.arange(len(rows)), [len(spot_rows) for spot_rows in rows])
+        spots = VehicleSpots.at_locations(record, locations, row, spot, weight, period)
+        return cls(record, spots, tuple(empty))
+
+    def visibility(self, visible: VisibleTargets) -> SpotVisibility:
+        """Return what one site sees in each zone of each class; ``visible`` is of the same record."""
+        return self.spots.visibility(visible.points, found_chances(visible))
+
+    def together(self, sensors: Sequence[VisibleTargets]) -> SpotVisibility:
+        """Return what several sensors see together in each zone of each class."""
+        missed, points = np.ones(len(self.record)), np.zeros(len(self.record))
+        for visible in sensors:
+            missed = missed * (1.0 - found_chances(visible))
+            points = points + visible.points
+        return self.spots.visibility(points, 1.0 - missed)
+
+    def columns(self, visibility: SpotVisibility) -> dict[str, Any]:
+        """Return the columns of the artefacts for one site or plan."""
+        return {
+            "zone": [location.name for location in self.spots.locations],
+            "class": [location.by for location in self.spots.locations],
+            "road_users": self.spots.vehicles,
+            "observations": self.spots.vehicle_frames,
+            "share_found": visibility.share,
+            "share_found_se": visibility.se,
+            "with_points": visibility.with_points,
+        }
+
+    def warn_empty(self) -> Iterator[Diagnostic]:
+        """Warn about zones without a road user."""
+        if not self.empty:
+            return
+        names = ", ".join(self.empty[:_MAX_NAMED])
+        if len(self.empty) > _MAX_NAMED:
+            names += f" and {len(self.empty) - _MAX_NAMED} more"
+        problem = f"no road user has its centre in {names} in the {len(self.record.numbers)} frames examined"
+        hint = "Check these zones and the traffic; pedestrians need [effects.pedestrians_bicycles]."
+        yield Diagnostic("zones", f"{SCENARIO_FILE}: {REPORTED_KEY}", problem, hint)
+
+
+def found_chances(visible: VisibleTargets) -> FloatArray:
+    """Return the probability that each vehicle-frame is found, 0 to 1, (n,) float64."""
+    return TARGET_SCORES[DEFAULT_SCORE](visible)
+
+
+def write_zones(
+    path: Path, users: ZoneUsers, sites: Sequence[tuple[str, SpotVisibility]], metadata: Mapping[str, Any]
+) -> None:
+    """Write ``zones.parquet``.
+
+    Parameters
+    ----------
+    path
+        The file.
+    users
+        Road users in the zones.
+    sites
+        Name of each site, and what it sees, in the order of the sites.
+    metadata
+        Metadata of the stage.
+    """
+    with parquet.artefact_writer(path, ZONES) as file:
+        for name, visibility in sites:
+            columns = users.columns(visibility)
+            file.write({"site": [name] * len(columns["zone"]), **columns})
+        file.describe(dict(metadata))

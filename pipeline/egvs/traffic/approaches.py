@@ -1,0 +1,211 @@
+"""The approaches of a junction by the names that planners use: street, and side on which vehicles arrive.
+
+An **approach** is named by the side of the junction on which its vehicles arrive: the vehicles of the approach ``N``
+come *from* the north and head south (southbound, "SB"). Sides are the nearest of eight compass points, measured over
+the last 30 m before the junction.
+
+:class:`ApproachBook` finds the movements that a planner's words mean. Names of streets are compared without case
+and punctuation, and with common abbreviations written out (St, Rd, Ave, Str., Straße).
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from egvs.core.errors import InputError
+from egvs.scenario.traffic_config import CountConfig
+from egvs.traffic.directions import SIDES, Floats, arrival_side
+from egvs.traffic.movements import MovementNames
+from egvs.traffic.network import Edge
+
+TURN_WORDS = {
+    "left": "left", "l": "left",
+    "straight": "straight", "straight on": "straight", "through": "straight", "thru": "straight", "t": "straight",
+    "s": "straight",
+    "right": "right", "r": "right",
+    "u-turn": "back", "uturn": "back", "u turn": "back", "u": "back", "back": "back",
+}  # fmt: skip
+"""What planners write for the turns of :data:`egvs.traffic.directions.TURNS`."""
+
+_SIDE_WORDS = {
+    "n": "N", "north": "N", "ne": "NE", "north-east": "NE", "northeast": "NE", "e": "E", "east": "E",
+    "se": "SE", "south-east": "SE", "southeast": "SE", "s": "S", "south": "S", "sw": "SW", "south-west": "SW",
+    "southwest": "SW", "w": "W", "west": "W", "nw": "NW", "north-west": "NW", "northwest": "NW",
+}  # fmt: skip
+_BOUND = {f"{side.lower()}b": side for side in SIDES}
+"""Abbreviations of headings: "nb" for northbound."""
+
+_ABBREVIATIONS = {
+    "st": "street", "str": "street", "strasse": "street", "rd": "road", "ave": "avenue", "av": "avenue",
+    "blvd": "boulevard", "dr": "drive", "ln": "lane", "hwy": "highway", "pl": "place", "platz": "place",
+    "sq": "square", "ct": "court", "pkwy": "parkway",
+}  # fmt: skip
+
+_LANE_GROUP = re.compile(r"(NB|NEB|EB|SEB|SB|SWB|WB|NWB)([LTRU]{1,4})")
+
+
+def normalise_street(name: str) -> str:
+    """Return a name in the form in which names of streets are compared.
+
+    >>> normalise_street("Main St.") == normalise_street("MAIN STREET")
+    True
+    >>> normalise_street("Breite Straße") == normalise_street("Breitestr.")
+    True
+    """
+    text = unicodedata.normalize("NFKC", name).casefold()
+    words = re.sub(r"[^\w]+", " ", text).split()
+    words = [re.sub(r"(?<=\w)(strasse|str)$", " street", word) for word in words]
+    words = [_ABBREVIATIONS.get(word, word) for word in " ".join(words).split()]
+    return "".join(words)
+
+
+def parse_side(text: str) -> str | None:
+    """Return the side on which vehicles arrive, a value of :data:`SIDES`; None if the text is no direction.
+
+    >>> parse_side("N"), parse_side("from north"), parse_side("northbound"), parse_side("NB")
+    ('N', 'N', 'S', 'S')
+    """
+    word = " ".join(text.split()).casefold().removeprefix("from ").removeprefix("the ")
+    if word in _SIDE_WORDS:
+        return _SIDE_WORDS[word]
+    heading = _BOUND.get(word) or _SIDE_WORDS.get(word.removesuffix("bound").rstrip("- "))
+    if heading is None:
+        return None
+    return SIDES[(SIDES.index(heading) + 4) % 8]
+
+
+def parse_lane_group(text: str) -> tuple[str, tuple[str, ...]] | None:
+    """Return side and turns of a lane group as signal engineers write it; None if it is none.
+
+    >>> parse_lane_group("NBL"), parse_lane_group("EBTR")
+    (('S', ('left',)), ('W', ('straight', 'right')))
+    """
+    match = _LANE_GROUP.fullmatch(text.strip().upper())
+    if match is None:
+        return None
+    side = parse_side(match[1])
+    assert side is not None
+    return side, tuple(dict.fromkeys(TURN_WORDS[letter.casefold()] for letter in match[2]))
+
+
+@dataclass(frozen=True)
+class ApproachMovement:
+    """A movement of a junction.
+
+    Attributes
+    ----------
+    flow
+        The edges, and the assumed vehicles per hour.
+    side, street, turn
+        Side on which the vehicles arrive, street there (may be empty), and turn.
+    edges, heading
+        The edges to the junction, and the direction (2,) of arrival.
+    """
+
+    flow: CountConfig
+    side: str
+    street: str
+    turn: str
+    edges: tuple[Edge, ...]
+    heading: Floats
+
+    @property
+    def approach_title(self) -> str:
+        """E.g. ``"N (Main Street)"``."""
+        return approach_title(self.side, self.street)
+
+
+def approach_title(side: str, street: str) -> str:
+    """Return an approach in words."""
+    return f"{side} ({street})" if street else side
+
+
+@dataclass(frozen=True)
+class ApproachBook:
+    """The movements of a junction, found by the names of planners."""
+
+    movements: tuple[ApproachMovement, ...]
+
+    @classmethod
+    def of_flows(cls, flows: Iterable[CountConfig], names: MovementNames) -> ApproachBook:
+        """Name the movements of flows from one edge to another.
+
+        Parameters
+        ----------
+        flows
+            Counts; those on a single edge are approaches without a turn.
+        names
+            Of the network.
+        """
+        movements = []
+        for flow in flows:
+            found = names.movement(flow.edge or flow.from_edge or "", flow.to_edge)
+            side = arrival_side(found.heading)
+            movements.append(ApproachMovement(flow, side, found.street, found.turn, found.approach, found.heading))
+        return cls(tuple(movements))
+
+    def find(self, street: str, side: str | None, turns: Sequence[str], where: str) -> list[ApproachMovement]:
+        """Return the movements that a planner means.
+
+        Parameters
+        ----------
+        street
+            Name of the street of the approach; any if empty.
+        side
+            Side on which the vehicles arrive; any if None. Without an approach on exactly this side, one on a
+            neighbouring side is taken.
+        turns
+            Turns; any if empty.
+        where
+            File and row, for messages.
+
+        Raises
+        ------
+        InputError
+            When no approach, several different approaches, or no movement has these names.
+        """
+        name = normalise_street(street)
+        candidates = [move for move in self.movements if not name or normalise_street(move.street) == name]
+        if not candidates:
+            raise InputError(where, f"no approach of the junction is called {street!r}", self.hint)
+        if side is not None:
+            near = [move for move in candidates if _side_distance(move.side, side) <= 1]
+            candidates = [move for move in near if move.side == side] or near
+        words = " ".join(word for word in (street, f"from {side}" if side else "") if word)
+        approaches = dict.fromkeys(move.approach_title for move in candidates)
+        if not approaches:
+            raise InputError(where, f"no approach of the junction is {words!r}", self.hint)
+        if len(approaches) > 1:
+            problem = f"{words!r} may be {' or '.join(approaches)}"
+            raise InputError(where, problem, f"Give street and approach. {self.hint}")
+        moves = [move for move in candidates if not turns or move.turn in turns]
+        missing = sorted(set(turns) - {move.turn for move in moves})
+        if missing:
+            known = ", ".join(sorted({move.turn for move in candidates if move.turn})) or "none"
+            problem = f"no vehicle can go {' or '.join(missing)} from {next(iter(approaches))}"
+            raise InputError(where, problem, f"Its turns are: {known}.")
+        return moves
+
+    @property
+    def hint(self) -> str:
+        """The names of the junction, as a sentence."""
+        return f"The approaches are: {', '.join(self.titles)}."
+
+    @property
+    def titles(self) -> list[str]:
+        """The approaches, in the order of the compass."""
+        sides = sorted(self.movements, key=lambda move: (_COMPASS_ORDER[move.side], move.street))
+        return list(dict.fromkeys(move.approach_title for move in sides))
+
+
+_COMPASS_ORDER = {side: (2 - index) % 8 for index, side in enumerate(SIDES)}
+"""Clockwise from north."""
+
+
+def _side_distance(first: str, second: str) -> int:
+    """Return the number of compass points between two sides, 0 to 4."""
+    apart = abs(SIDES.index(first) - SIDES.index(second))
+    return min(apart, 8 - apart)
