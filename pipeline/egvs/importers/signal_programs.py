@@ -219,8 +219,8 @@ def apply_signals(
     assert lengths is not None
     cycle = _typical_cycle(cycles, lengths.value, records)
     clock = None
-    steps = np.arange(round(cycle.length_s / STEP_S), dtype=np.float64)
-    times_s: FloatArray = np.float64(cycle.begin_s) + STEP_S * (steps + 0.5)
+    n_steps = round(cycle.length_s / STEP_S)
+    times_s = np.asarray(cycle.begin_s + STEP_S * (np.arange(n_steps) + 0.5), dtype=np.float64)
     if replay is not None:
         clock = _clock(replay, records, cycle)
         times_s = _replayed_times_s(replay, clock)
@@ -239,8 +239,8 @@ def _guess_groups(
     guesses = guess_lights(approaches, signals.records, motion)
     if not guesses:
         problem = "no file says which lanes each signal group governs, and recorded road users do not show it either"
-        listed = ", ".join(f"{approach.edge} (from the {_side(approach)})" for approach in approaches)
-        hint = f"Add a CSV file with the columns {', '.join(GroupOfEdges.COLUMNS)}; the roads are {listed}."
+        names = ", ".join(f"{approach.edge} (from the {_side(approach)})" for approach in approaches)
+        hint = f"Add a CSV file with the columns {', '.join(GroupOfEdges.COLUMNS)}; the roads are {names}."
         raise InputError(where, problem, hint)
     roads: dict[tuple[str, str], list[str]] = {}
     for guess in guesses:
