@@ -231,7 +231,7 @@ _REQUIRED_METADATA: dict[str, tuple[str, ...]] = {
     "scans": ("sites",),
     "visibility": ("grid", "sites"),
     "blindspots": ("sites", "cells", "points"),
-    "zones": ("sites",),
+    "zones": ("sites", "zones"),
     "plan_zones": ("inputs", "stages"),
     "accuracy": ("inputs", "tolerance", "stages"),
     "placement": ("inputs", "stages", "plan"),
@@ -284,6 +284,8 @@ def _is_valid(key: str, value: Any) -> bool:
             return _is_grid(value)
         case "cells":
             return _is_cell_grid(value)
+        case "zones":
+            return isinstance(value, list) and bool(value)
         case "sites":
             return isinstance(value, list) and all(_has_keys(site, _SITE_KEYS) for site in value)
         case "periods":

@@ -219,7 +219,7 @@ def apply_signals(
     assert lengths is not None
     cycle = _typical_cycle(cycles, lengths.value, records)
     clock = None
-    times_s = cycle.begin_s + STEP_S * (np.arange(round(cycle.length_s / STEP_S)) + 0.5)
+    times_s: FloatArray = cycle.begin_s + STEP_S * (np.arange(round(cycle.length_s / STEP_S)) + 0.5)
     if replay is not None:
         clock = _clock(replay, records, cycle)
         times_s = _replayed_times_s(replay, clock)
@@ -238,8 +238,8 @@ def _guess_groups(
     guesses = guess_lights(approaches, signals.records, motion)
     if not guesses:
         problem = "no file says which lanes each signal group governs, and recorded road users do not show it either"
-        roads = ", ".join(f"{approach.edge} (from the {_side(approach)})" for approach in approaches)
-        hint = f"Add a CSV file with the columns {', '.join(GroupOfEdges.COLUMNS)}; the roads are {roads}."
+        listed = ", ".join(f"{approach.edge} (from the {_side(approach)})" for approach in approaches)
+        hint = f"Add a CSV file with the columns {', '.join(GroupOfEdges.COLUMNS)}; the roads are {listed}."
         raise InputError(where, problem, hint)
     roads: dict[tuple[str, str], list[str]] = {}
     for guess in guesses:

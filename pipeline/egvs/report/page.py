@@ -30,6 +30,7 @@ from egvs.report.basemap import network_file
 from egvs.report.colours import STYLE_SHEET
 from egvs.report.figures import Figures
 from egvs.report.map_credits import read_map_credits
+from egvs.report.points_section import MAPPED_POLES, PointsSection
 from egvs.report.ranking import (
     RankedSite,
     Ranking,
@@ -54,6 +55,7 @@ from egvs.report.sections import (
 )
 from egvs.report.sensor_results import SensorComparison, costs_option, range_note
 from egvs.report.signal_diagram import signal_diagrams
+from egvs.report.zone_section import ZoneSection
 from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.scene_inputs import scan_dependencies
@@ -105,6 +107,8 @@ class PageContents:
         Records of the stages, as far as ``run.json`` has them, in the order of :data:`STAGES`.
     study, by_period, detected, plan
         Results of other commands and of periods; None if those commands have not run.
+    zones, points
+        Road users found in zones, and maps of points on target; None where the scenario has no zones or no lanes.
     movements
         What each counted location is in words; empty if the run folder has no network.
     approaches
@@ -125,6 +129,8 @@ class PageContents:
     movements: Mapping[str, str] = field(default_factory=dict)
     approaches: tuple[ApproachFit, ...] = ()
     approach_map: str = ""
+    zones: ZoneSection | None = None
+    points: PointsSection | None = None
 
 
 @dataclass(frozen=True)
@@ -166,6 +172,9 @@ def dependencies(work: StageContext) -> StageDependencies:
         scan = scan_dependencies(work)
         settings["scan"], hashes = scan.settings, dict(scan.files)
     hashes |= work.digests(*(name for name in (*names, *_OPTIONAL_FILES) if work.path(name).is_file()))
+    network = work.inputs.common_network_path
+    if network is not None:
+        hashes["network"] = work.inputs.digest(network)
     if (roads := network_file(work.folder.path)) is not None:
         hashes |= work.digests(roads.relative_to(work.folder.path).as_posix())
 
@@ -225,6 +234,10 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
     work.progress("figures drawn", 2, 3)
 
     approaches = compare_approaches(work.scenario, work.folder.trajectories, network_file(out))
+    plan = PlacementSummary.read(out, stages, ranking.sites, tpog, drawn.backdrop)
+    mapped = [pole.best for pole in ranking.poles[:MAPPED_POLES]]
+    mounts = [] if plan is None else [pick.mount for pick in plan.picks]
+    moved = plan is not None and plan.before is not None
     contents = PageContents(
         work.scenario,
         ranking,
@@ -234,10 +247,12 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
         study=StudySummary.read(out, stages),
         by_period=PeriodRanking.read(out),
         detected=ValidationSummary.read(out, stages),
-        plan=PlacementSummary.read(out, stages, ranking.sites, tpog, drawn.backdrop),
+        plan=plan,
         movements=describe_counts(work.scenario, network_file(out)),
         approaches=approaches,
         approach_map=draw_approach_map(work.scenario, network_file(out)),
+        zones=ZoneSection.read(work, ranking.sites[0], tpog.grid, drawn.backdrop, has_plan=plan is not None),
+        points=PointsSection.draw(work, mapped, mounts, tpog.grid, drawn.backdrop, moved=moved),
     )
     html = render_page(contents)
     files.write_text(work.folder.report, html)
@@ -410,6 +425,7 @@ STAGE = Stage(
         RunFolder.scores,
         RunFolder.scores_by_period,
         RunFolder.blindspots,
+        RunFolder.zones,
     ),
     effect_stages=("scan", "score"),
     prepare=(prepare,),

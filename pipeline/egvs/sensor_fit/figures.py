@@ -238,7 +238,7 @@ def draw_map(fit: SensorFit) -> Figure | None:
     plan.set(xlabel="x (m)", ylabel="y (m)", xlim=limits[0], ylim=limits[1], aspect="equal")
     yaw_se_deg = best.standard_errors["yaw_deg"]
     plan.set_title(f"From above: yaw {pose.yaw_deg:.2f} +- {yaw_se_deg:.2g} degrees")
-    plan.legend(loc="upper left", fontsize=8)
+    plan.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=2, fontsize=8, frameon=False)
 
     curve.plot(map_pose.search.yaws_deg, map_pose.search.costs_m, color=_GREY, label="tried, at the given position")
     curve.axvline(pose.yaw_deg % 360.0, color=_RED, label="best fit")
