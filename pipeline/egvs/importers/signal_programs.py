@@ -219,7 +219,8 @@ def apply_signals(
     assert lengths is not None
     cycle = _typical_cycle(cycles, lengths.value, records)
     clock = None
-    times_s: FloatArray = cycle.begin_s + STEP_S * (np.arange(round(cycle.length_s / STEP_S)) + 0.5)
+    n_steps = round(cycle.length_s / STEP_S)
+    times_s: FloatArray = cycle.begin_s + STEP_S * (np.arange(n_steps, dtype=np.float64) + 0.5)
     if replay is not None:
         clock = _clock(replay, records, cycle)
         times_s = _replayed_times_s(replay, clock)
