@@ -172,6 +172,9 @@ def test_layers_draw_their_data(page: Page, session: Session, layer: str) -> Non
         alone = (entropy * ((hits > 0) & (other == 0))).sum(), (entropy * ((hits == 0) & (other > 0))).sum()
         for name, bit in zip(("pole_a", "pole_b"), alone, strict=True):
             assert f"seen only by {name}: {bit:,.1f} bits" in page.controls.legend.content
+    if layer == "replay":
+        last_s = (playback.frames - 1) * playback.period_s
+        assert f"{7 * playback.period_s:,.1f} s of {last_s:,.1f} s" in page.controls.legend.content
     if layer == "blindspots":
         assert f"{session.blindspots(site).overall.share:.1%} found" in page.controls.legend.content
 

@@ -49,6 +49,8 @@ NETWORK = ("traffic.network='streets.net.xml'",)
 COUNTED = (*NETWORK, "traffic.counts=[{edge='a', per_hour=100}]")
 TURNS = (*NETWORK, "traffic.counts=[{from_edge='a', to_edge='b', per_hour=100}]")
 HALVES = ("traffic.periods=[{name='a', length_s=12}, {name='b', begin_s=12, length_s=8}]",)
+SIGNALS = (*NETWORK, "traffic.signals.a={phases=[{green={north=['all']}, green_s=30}]}")
+ACTUATED = (*SIGNALS, "traffic.signals.a.type='actuated'")
 PERIOD_COUNTS = (*NETWORK, "traffic.periods=[{name='a', counts=[{edge='a', per_hour=100}]}]")
 PERIOD_TURNS = (*NETWORK, "traffic.periods=[{name='a', counts=[{from_edge='a', to_edge='b', per_hour=100}]}]")
 TRACKED = ("traffic.tracks=['tracks.csv']", "traffic.track_crs='world'")
@@ -84,6 +86,7 @@ TRACKS = """track_id,frame_id,timestamp_ms,agent_type,x,y,vx,vy,psi_rad,length,w
 
 NAMES = {
     "sensors": "small",
+    "traffic.signals": "a",
     "articulated.kinds": "car",
     "weights.zones": "crossing",
     "placement.zones": "crossing",
@@ -117,6 +120,7 @@ KEYS: dict[str, Change] = {
     "traffic.network": Change("'others.net.xml'", NETWORK),
     "traffic.routes": Change("['trips.rou.xml']", file="without_kinds.toml"),
     "traffic.sumocfg": Change("'streets.sumocfg'", file="without_kinds.toml"),
+    "traffic.seeds": Change("2", NETWORK),
     "traffic.fcd": Change("'others.csv'"),
     "traffic.fcd_geo": Change("true"),
     "traffic.tracks": Change("['other_tracks.csv']", TRACKED),
@@ -154,6 +158,18 @@ KEYS: dict[str, Change] = {
     "traffic.redraw_departures": Change("true", ("traffic.routes=['trips.rou.xml']",), file="without_kinds.toml"),
     "traffic.min_trip_m": Change("10", NETWORK),
     "traffic.edge_weights": Change("{a=2}", NETWORK),
+    "traffic.signals.*.file": Change("'plan.csv'", (*NETWORK, "traffic.signals.a={file='trips.rou.xml'}")),
+    "traffic.signals.*.type": Change("'actuated'", SIGNALS),
+    "traffic.signals.*.cycle_s": Change("35", SIGNALS),
+    "traffic.signals.*.offset_s": Change("5", SIGNALS),
+    "traffic.signals.*.yellow_s": Change("4", SIGNALS),
+    "traffic.signals.*.all_red_s": Change("1", SIGNALS),
+    "traffic.signals.*.phases.*.green": Change("{south=['left']}", SIGNALS),
+    "traffic.signals.*.phases.*.green_s": Change("40", SIGNALS),
+    "traffic.signals.*.phases.*.yellow_s": Change("4", SIGNALS),
+    "traffic.signals.*.phases.*.all_red_s": Change("1", SIGNALS),
+    "traffic.signals.*.phases.*.min_green_s": Change("8", ACTUATED),
+    "traffic.signals.*.phases.*.max_green_s": Change("60", ACTUATED),
     "traffic.counts.*.edge": Change("'b'", COUNTED),
     "traffic.counts.*.from_edge": Change("'c'", TURNS),
     "traffic.counts.*.to_edge": Change("'c'", TURNS),
@@ -251,6 +267,14 @@ KEYS: dict[str, Change] = {
     "effects.fog.model": Change("'kruse'", effect("fog", "visibility_m=100")),
     "effects.fog.contrast": Change("0.05", effect("fog", "visibility_m=100")),
     "effects.dropout.share": Change("0.5", effect("dropout", "share=0.2")),
+    "effects.surface_losses.grazing_loss": Change("0.5", effect("surface_losses")),
+    "effects.surface_losses.grazing_deg": Change("80", effect("surface_losses")),
+    "effects.surface_losses.grazing_width_deg": Change("1", effect("surface_losses")),
+    "effects.surface_losses.dark_share": Change("0.5", effect("surface_losses")),
+    "effects.surface_losses.dark_loss": Change("0.5", effect("surface_losses")),
+    "effects.surface_losses.glass_loss": Change("0.5", effect("surface_losses")),
+    "effects.range_noise.footprint_mrad": Change("0.5", effect("range_noise")),
+    "effects.range_noise.max_sigma_m": Change("0.5", effect("range_noise")),
     "effects.moving_occlusion.method": Change("'independent'", effect("moving_occlusion")),
     "effects.moving_occlusion.frames": Change("20", effect("moving_occlusion")),
     "effects.divergence.sub_beams": Change("19", effect("divergence")),
@@ -347,6 +371,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "others.net.xml": "<net> </net>",
         "observed.csv": "approach,queue_m\nN,40\n",
         "trips.rou.xml": "<routes/>",
+        "plan.csv": "phase,approach,movement,green_s\na,north,all,30\n",
         "sizes.add.xml": "<additional/>",
         "streets.sumocfg": '<configuration><input><net-file value="streets.net.xml"/>'
         '<route-files value="trips.rou.xml"/></input></configuration>',

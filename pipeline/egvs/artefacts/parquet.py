@@ -249,6 +249,9 @@ _SITE_KEYS = ("site", "x_m", "y_m", "z_m", "sensor")
 _PLAN_KEYS = ("candidates", "joint", "together", "value", "bound", "certificate", "cost")
 """Numbers in the metadata of a plan."""
 
+_SEEDS_KEY = "seeds"
+"""Number of independent simulations in the metadata of a TPOG or of one of its periods; 1 where it is missing."""
+
 _PERIOD_TYPES = {"name": str, "weight": float, "frames": int, "block_frames": int, "memory_frames": float, "times": int}
 
 
@@ -269,6 +272,8 @@ def _parse_metadata(path: Path, artefact: str, content: bytes) -> dict[str, Any]
     for key in required:
         if not _is_valid(key, metadata.get(key)):
             raise InputError(path, f"invalid metadata: {key} = {metadata.get(key)!r}", _REMAKE_HINT)
+    if artefact == "tpog" and not _is_valid(_SEEDS_KEY, metadata.get(_SEEDS_KEY, 1)):
+        raise InputError(path, f"invalid metadata: {_SEEDS_KEY} = {metadata[_SEEDS_KEY]!r}", _REMAKE_HINT)
     return metadata
 
 
@@ -305,7 +310,9 @@ def _is_number(value: Any) -> bool:
 
 
 def _is_period(value: Any) -> bool:
-    if not isinstance(value, dict) or value.keys() != _PERIOD_TYPES.keys():
+    if not isinstance(value, dict) or value.keys() - {_SEEDS_KEY} != _PERIOD_TYPES.keys():
+        return False
+    if not _is_valid(_SEEDS_KEY, value.get(_SEEDS_KEY, 1)):
         return False
     for key, expected_type in _PERIOD_TYPES.items():
         if type(value[key]) is not expected_type:

@@ -190,6 +190,7 @@ def traffic(
     scenario: ScenarioPath,
     out: Out = None,
     set_: Set = None,
+    jobs: Jobs = None,
     traci: Annotated[
         str | None,
         typer.Option(metavar="HOST:PORT", help="Record from a running SUMO, started with --remote-port."),
@@ -199,7 +200,7 @@ def traffic(
     stage_options: dict[str, Any] = {}
     if traci is not None:
         stage_options["traci"] = cli_options.parse_host_and_port(traci)
-    _run_stage("traffic", scenario, out, set_, **stage_options)
+    _run_stage("traffic", scenario, out, set_, jobs, **stage_options)
 
 
 @app.command()

@@ -24,6 +24,7 @@ _OMITTED_KEYS = frozenset(
         "overlapping_pairs",
         "rows",
         "settled_in_float64",
+        "signals",
         "solids",
         "sumo_seconds",
         "sumo_peak_mb",
@@ -127,7 +128,10 @@ def _scan_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[S
 
 
 def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any], flow_source: str = COUNTS) -> Iterator[Sentence]:
-    yield Sentence(_count(rest.pop("frames"), "frame"))
+    frames = _count(rest.pop("frames"), "frame")
+    if seeds := rest.pop("seeds", None):
+        frames += f" of {len(seeds)} simulations"
+    yield Sentence(frames)
     if "vehicles" in rest:
         yield Sentence(describe_vehicles(rest.pop("vehicles")))
         standing, longest_s = rest.pop("share_standing"), rest.pop("longest_standing_s")

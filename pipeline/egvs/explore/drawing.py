@@ -630,13 +630,20 @@ def _draw_replay(context: LayerContext) -> str:
             context.scene.add_mesh_simple(
                 f"{LAYER_NAME}/{name}", mesh.points, mesh.faces, color=colour, flat_shading=True, cast_shadow=False
             )
-    return _swatch_legend(
-        [
-            (_VISIBLE_COLOUR, f"{int(visible.sum())} vehicles with {SEEN_WELL_POINTS:g} or more points"),
-            (_HIDDEN_COLOUR, f"{int((~visible).sum())} vehicles with fewer"),
-            (_SCAN_COLOUR, f"{int(on_vehicle.sum()):,} points on vehicles"),
-        ]
-    )
+    time_s, last_s = (playback.period_s * number for number in (played.frame.number, playback.frames - 1))
+    swatches = [
+        (_VISIBLE_COLOUR, f"{_count_road_users(played.frame, visible)} with {SEEN_WELL_POINTS:g} or more points"),
+        (_HIDDEN_COLOUR, f"{_count_road_users(played.frame, ~visible)} with fewer"),
+        (_SCAN_COLOUR, f"{int(on_vehicle.sum()):,} points on them"),
+    ]
+    return _text_legend([f"<b>{time_s:,.1f} s of {last_s:,.1f} s</b>"]) + _swatch_legend(swatches)
+
+
+def _count_road_users(frame: TrafficFrame, selected: NDArray[np.bool_]) -> str:
+    """Return how many of some boxes are vehicles, and how many are people on foot or on bicycles."""
+    is_vehicle = frame.are_vehicles()
+    vehicles, people = int((selected & is_vehicle).sum()), int((selected & ~is_vehicle).sum())
+    return f"{vehicles} vehicles, {people} people" if people else f"{vehicles} vehicles"
 
 
 _DRAW_FUNCTIONS: dict[str, Callable[[LayerContext], str]] = {

@@ -554,12 +554,18 @@ class Playback:
         The session.
     frames_per_chunk
         Number of frames that are read at once.
+
+    Attributes
+    ----------
+    frames, period_s
+        Number of frames, and the time between two.
     """
 
     def __init__(self, session: Session, frames_per_chunk: int = 240) -> None:
         self._session, self._path = session, session.work.folder.trajectories
         self._frames_per_chunk = frames_per_chunk
-        self.frames = int(parquet.read_metadata(self._path, "trajectories")["frames"])
+        metadata = parquet.read_metadata(self._path, "trajectories")
+        self.frames, self.period_s = int(metadata["frames"]), float(metadata["frame_period_s"])
         self.parts = cloud_simulation.body_parts(session.scenario)
         self._meshes = VehicleMeshes.from_parts(self.parts)
         self._first_cached, self._cached_frames = -1, list[TrafficFrame]()

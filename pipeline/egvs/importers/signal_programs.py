@@ -40,6 +40,7 @@ from egvs.importers.signal_assignment import Approach, RecordedMotion, green_sha
 from egvs.traffic import estimates, sumo
 from egvs.traffic.estimates import Estimate
 from egvs.traffic.signal_clock import SignalClock
+from egvs.traffic.signals import Phase, Program, replace_programs, request_bits
 
 NEAR_M = 6.0
 """A way of the file that assigns groups belongs to a connection if both its ends are nearer than this to its path."""
@@ -57,7 +58,6 @@ MIN_IN_GREEN = 0.8
 MIN_YELLOW_S = 3.0
 """Yellow that is added where a recorded cycle ends in a green that the next one begins with red."""
 
-_PROGRAM = re.compile(r"    <tlLogic id=(\"[^\"]*\").*?</tlLogic>\n", re.DOTALL)
 _GENERATED = re.compile(r"<!-- generated on .*?-->\n*", re.DOTALL)
 
 
@@ -325,7 +325,8 @@ def _read_junction(path: Path, node: str) -> _Junction:
         elif element.tag == "junction":
             internal_lanes[element.attrib["id"]] = element.get("intLanes", "").split()
             requests[element.attrib["id"]] = {
-                int(request.attrib["index"]): _bits(request.attrib["response"]) for request in element.iter("request")
+                int(request.attrib["index"]): request_bits(request.attrib["response"])
+                for request in element.iter("request")
             }
         elif element.tag == "connection" and element.get("tl") == junction.program:
             start, end = element.attrib["from"], element.attrib["to"]
@@ -364,11 +365,6 @@ def _yields_to(
 
 def _line(text: str) -> FloatArray:
     return np.array([[float(value) for value in point.split(",")[:2]] for point in text.split()], dtype=np.float64)
-
-
-def _bits(response: str) -> set[int]:
-    """Return the links that a link gives way to; the last letter is that of link 0."""
-    return {index for index, bit in enumerate(reversed(response)) if bit == "1"}
 
 
 def _assign_groups(links: Sequence[_Link], signals: RecordedSignals, frame: WorldFrame | None) -> dict[int, str]:
@@ -488,16 +484,8 @@ def _write_program(
     network: str, program: str, phases: Sequence[tuple[float, str]], clock: SignalClock | None = None
 ) -> str:
     """Replace a program of a network."""
-    lines = "".join(f'        <phase duration="{duration_s:g}" state="{state}"/>\n' for duration_s, state in phases)
-    if clock is not None:
-        lines += f"        {clock.to_param()}\n"
-
-    def replacement(match: re.Match[str]) -> str:
-        if match[1] != f'"{program}"':
-            return match[0]
-        return f'    <tlLogic id={match[1]} type="static" programID="0" offset="0">\n{lines}    </tlLogic>\n'
-
-    return _PROGRAM.sub(replacement, network)
+    recorded = Program("static", 0.0, tuple(Phase(duration_s, state) for duration_s, state in phases), clock)
+    return replace_programs(network, {program: recorded})
 
 
 def _notes(

@@ -95,24 +95,40 @@ def draw_approach_map(scenario: Scenario, network: Path | None) -> str:
 
 
 def _draw_label(plan: MapFrame, label: ApproachLabel, covered: list[Box]) -> Iterator[str]:
-    """Draw a disc at the approach and its text beside it, below the labels that are there already."""
+    """Draw a disc at the approach, and its text beside it where no other text is; with a line if that is far away."""
     x = min(max(plan.x(float(label.at_m[0])), plan.left + 12.0), plan.left + plan.frame_width - 12.0)
     y = min(max(plan.y(float(label.at_m[1])), plan.top + 12.0), plan.top + plan.frame_height - 12.0)
+    box = _free_box(plan, (x, y), label, covered)
+    covered.append(box)
+    left, top, right, _ = box
+    text_x, anchor = (left, "start") if left > x else (right, "end")
+    if abs(top - y + _LINE_HEIGHT / 2) > _LINE_HEIGHT:
+        yield f'<path {plan.style.shape("lead")} d="M{x:.1f} {y:.1f}L{text_x:.1f} {top + _LINE_HEIGHT / 2:.1f}"/>'
     yield f'<circle {plan.style.shape("spot")} cx="{x:.1f}" cy="{y:.1f}" r="4.5"/>'
-    width = max(text_width(line) for line in label.lines)
-    fits_right = x + 10.0 + width <= plan.left + plan.frame_width
-    text_x, anchor = (x + 10.0, "start") if fits_right else (x - 10.0, "end")
-    left = text_x if fits_right else text_x - width
-    height = _LINE_HEIGHT * len(label.lines)
-    lowest = plan.top + plan.frame_height - height
-    top = min(max(y - _LINE_HEIGHT / 2, plan.top), lowest)
-    for other in covered:
-        overlaps = left < other[2] and other[0] < left + width and top < other[3] and other[1] < top + height
-        if overlaps:
-            top = other[3] if other[3] <= lowest else other[1] - height
-    covered.append((left, top, left + width, top + height))
     for number, line in enumerate(label.lines):
         position = f'x="{text_x:.1f}" y="{top + (number + 0.8) * _LINE_HEIGHT:.1f}" text-anchor="{anchor}"'
         if number == 0:
             position += ' font-weight="700"'
         yield plan.style.text_with_halo("label", position, line)
+
+
+def _free_box(plan: MapFrame, at: tuple[float, float], label: ApproachLabel, covered: Sequence[Box]) -> Box:
+    """Return the box of a label: the one nearest to its approach that covers no other, or else the first one."""
+    width, height = max(text_width(line) for line in label.lines), _LINE_HEIGHT * len(label.lines)
+    x, y = at
+    boxes = []
+    for step in range(int(plan.frame_height / _LINE_HEIGHT)):
+        for shift in dict.fromkeys((step, -step)):
+            top = y + (shift - 0.5) * _LINE_HEIGHT
+            for left in (x + 10.0, x - 10.0 - width):
+                box = (left, top, left + width, top + height)
+                fits = plan.left <= box[0] and box[2] <= plan.left + plan.frame_width
+                if fits and plan.top <= top and box[3] <= plan.top + plan.frame_height:
+                    boxes.append(box)
+    if not boxes:
+        return x + 10.0, y, x + 10.0 + width, y + height
+    return next((box for box in boxes if not any(_overlaps(box, other) for other in covered)), boxes[0])
+
+
+def _overlaps(a: Box, b: Box) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]

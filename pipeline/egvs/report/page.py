@@ -54,6 +54,7 @@ from egvs.report.sections import (
     ranking_disagreement,
 )
 from egvs.report.sensor_results import SensorComparison, costs_option, range_note
+from egvs.report.signal_diagram import signal_diagrams
 from egvs.report.zone_section import ZoneSection
 from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
@@ -273,10 +274,15 @@ def render_page(contents: PageContents) -> str:
         **_setting_values(contents),
         **_sensor_values(contents),
         **_cost_values(contents.stages),
+        "signals": signal_diagrams(_traffic_summary(contents.stages).get("signals", ())),
         **_sentences(contents),
         **_warning_values(contents),
     }
     return _template_environment().get_template("report.html.j2").render(values)
+
+
+def _traffic_summary(stages: Mapping[str, StageRecord]) -> Summary:
+    return stages["traffic"].summary if "traffic" in stages else {}
 
 
 def prepare() -> None:

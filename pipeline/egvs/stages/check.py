@@ -28,6 +28,8 @@ RULES: tuple[Callable[[CheckInputs], Iterator[Diagnostic]], ...] = (
     traffic_checks.check_sumo_files,
     traffic_checks.check_period_weights,
     traffic_checks.check_demand,
+    traffic_checks.check_signals,
+    traffic_checks.warn_equal_demand,
     traffic_checks.check_recorded_positions,
     traffic_checks.check_finished_files,
     traffic_checks.check_vehicle_kinds,

@@ -104,6 +104,32 @@ def check_demand(inputs: CheckInputs) -> Iterator[Diagnostic]:
         yield Diagnostic("traffic", key, problem, hint, is_error=True)
 
 
+@_for_each_period
+def check_signals(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Report plans of signals that do not fit the network."""
+    traffic = inputs.scenario.traffic
+    if not traffic.signals or traffic.is_finished:
+        return
+    try:
+        path = sumo_folder.demand_files(inputs.scenario).files["net-file"][0]
+    except InputError:
+        return  # check_times reports it
+    errors = ErrorCollector()
+    errors.attempt("traffic", partial(sumo_folder.check_signal_plans, inputs.scenario, path))
+    yield from errors.findings
+
+
+@_for_each_period
+def warn_equal_demand(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Warn if several seeds simulate the same departures of a user's demand, which hides part of the error."""
+    traffic = inputs.scenario.traffic
+    if traffic.seeds == 1 or not traffic.has_user_demand or traffic.redraw_departures:
+        return
+    key = f"{sumo_folder.traffic_location(inputs.scenario)}.seeds"
+    problem = "all simulations have the same vehicles and departures, so standard errors may be too small"
+    yield Diagnostic("seeds", key, problem, "Set redraw_departures = true.")
+
+
 def _has_demand(scenario: Scenario) -> bool:
     traffic = scenario.traffic
     if traffic.is_finished or not (traffic.sumocfg or traffic.routes):

@@ -17,11 +17,10 @@ import numpy as np
 from egvs.core.errors import InputError
 from egvs.traffic.demand import RouteFinder
 from egvs.traffic.directions import TURNS, Floats, compass
-from egvs.traffic.network import Edge, Network
+from egvs.traffic.network import CAR, Edge, Network
 
 _WAYS = {"straight": "straight on", "left": "left", "right": "right", "back": "U-turn"}
 _UNNAMED_STREET = "an unnamed street"
-_CAR = "passenger"
 
 _HEADING_OVER_M = 30.0
 """The direction of a movement is that of the last metres before the junction, and of the first ones after it."""
@@ -75,7 +74,7 @@ class MovementNames:
         self._edges = {edge.id: edge for edge in network.edges}
         self._nodes_m = {node.id: node.at_m for node in network.junctions}
         self._roundabouts = [set(roundabout.nodes) for roundabout in network.roundabouts]
-        self._routes = RouteFinder(network, _CAR)
+        self._routes = RouteFinder(network, CAR)
         self._turns: dict[tuple[str, str], str] = {}
         for connection in network.connections:
             if connection.direction in TURNS:

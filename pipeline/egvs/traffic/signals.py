@@ -1,0 +1,336 @@
+"""Read the traffic signals of a network: their programs, and the links that these govern.
+
+A signal governs links, one for each way from lane to lane or over a crossing; each belongs to a movement of an approach
+("north Main Street: left"). Two links that conflict are foes in the network.
+
+World frame, metres, seconds.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from egvs.core.errors import InputError
+from egvs.formats import xml
+from egvs.traffic import network
+from egvs.traffic.directions import TURNS, Floats, compass, lane_heading
+from egvs.traffic.movements import plain_text
+from egvs.traffic.signal_clock import SignalClock
+
+GREEN_LETTERS = frozenset("Gg")
+YELLOW_LETTERS = frozenset("yY")
+
+CROSSING = "crossing"
+MOVEMENTS = ("left", "straight", "right", "back", CROSSING)
+
+_PROGRAM = re.compile(r"    <tlLogic id=(\"[^\"]*\").*?</tlLogic>\n", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Link:
+    """A way over a signalised junction.
+
+    Attributes
+    ----------
+    index
+        Its position in the states of the program.
+    approach
+        Compass direction and street that it comes from; of a crossing, the arm that it crosses.
+    movement
+        One of :data:`MOVEMENTS`.
+    edge, street
+        Edge of the approach, and its street; empty for a crossing, and for a street without a name.
+    heading
+        Direction of travel at the stop line, (2,); None for a crossing.
+    foes, yields_to
+        Positions of the links that conflict with it, and of those that it gives way to.
+    """
+
+    index: int
+    approach: str
+    movement: str
+    edge: str
+    street: str
+    heading: Floats | None
+    foes: frozenset[int] = frozenset()
+    yields_to: frozenset[int] = frozenset()
+
+    @property
+    def title(self) -> str:
+        """Approach and movement."""
+        return f"{self.approach} {self.movement}"
+
+
+class Phase(NamedTuple):
+    """A phase of a program: seconds, one letter for each link, and the limits of an actuated phase."""
+
+    duration_s: float
+    state: str
+    min_s: float | None = None
+    max_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Program:
+    """Phases of a signal.
+
+    Attributes
+    ----------
+    type
+        SUMO's ("static", "actuated", ...).
+    offset_s
+        Start of the first phase.
+    phases
+        In order.
+    clock
+        Clock of a recording that the program replays, if it does.
+    """
+
+    type: str
+    offset_s: float
+    phases: tuple[Phase, ...]
+    clock: SignalClock | None = None
+
+    @classmethod
+    def from_element(cls, element: Any) -> Program:
+        """Parse a ``<tlLogic>``."""
+        phases = []
+        for phase in element.iter("phase"):
+            limits = [float(phase.attrib[key]) if key in phase.attrib else None for key in ("minDur", "maxDur")]
+            phases.append(Phase(float(phase.attrib["duration"]), phase.attrib["state"], *limits))
+        clock = SignalClock.from_program(element)
+        return cls(element.get("type", "static"), float(element.get("offset", "0")), tuple(phases), clock)
+
+    @property
+    def cycle_s(self) -> float:
+        """Sum of the durations of the phases."""
+        return sum(phase.duration_s for phase in self.phases)
+
+    def to_xml(self, name: str) -> str:
+        """Return the ``<tlLogic>`` as netconvert writes it."""
+        lines = []
+        for phase in self.phases:
+            limits = "".join(
+                f' {key}="{value:g}"'
+                for key, value in (("minDur", phase.min_s), ("maxDur", phase.max_s))
+                if value is not None
+            )
+            lines.append(f'        <phase duration="{phase.duration_s:g}" state="{phase.state}"{limits}/>\n')
+        if self.clock is not None:
+            lines.append(f"        {self.clock.to_param()}\n")
+        head = f'    <tlLogic id={quoteattr(name)} type="{self.type}" programID="0" offset="{self.offset_s:g}">\n'
+        return f"{head}{''.join(lines)}    </tlLogic>\n"
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A traffic signal of a network.
+
+    Attributes
+    ----------
+    id
+        Id of its program.
+    nodes
+        Ids of the junctions that it governs.
+    at_m
+        Mean position of these.
+    links
+        In the order of the states.
+    program
+        Its program in the network.
+    """
+
+    id: str
+    nodes: tuple[str, ...]
+    at_m: tuple[float, float]
+    links: tuple[Link, ...]
+    program: Program
+
+    @property
+    def approaches(self) -> dict[str, list[str]]:
+        """Movements of each approach."""
+        movements: dict[str, list[str]] = {}
+        for link in self.links:
+            known = movements.setdefault(link.approach, [])
+            if link.movement not in known:
+                known.append(link.movement)
+        return movements
+
+    @property
+    def streets(self) -> tuple[str, ...]:
+        """Names of its streets."""
+        return tuple(dict.fromkeys(link.street for link in self.links if link.street))
+
+    @property
+    def states(self) -> int:
+        """Number of letters of a state."""
+        return max(link.index for link in self.links) + 1
+
+
+@dataclass
+class _NetworkParts:
+    """Elements of a network that concern signals."""
+
+    connections: list[dict[str, str]] = field(default_factory=list)
+    requests: dict[str, list[dict[str, str]]] = field(default_factory=dict)
+    programs: dict[str, Program] = field(default_factory=dict)
+    crossed_edges: dict[str, list[str]] = field(default_factory=dict)
+
+
+def read_signals(path: Path, roads: network.Network) -> tuple[Signal, ...]:
+    """Read the signals of a network.
+
+    Parameters
+    ----------
+    path
+        The network.
+    roads
+        The same network.
+
+    Raises
+    ------
+    InputError
+        When the file is damaged.
+    """
+    parts = _NetworkParts()
+    for element in xml.iter_elements(path, "net"):
+        try:
+            if element.tag == "connection" and "tl" in element.attrib:
+                parts.connections.append(dict(element.attrib))
+            elif element.tag == "junction":
+                parts.requests[element.attrib["id"]] = [dict(each.attrib) for each in element.iter("request")]
+            elif element.tag == "tlLogic":
+                parts.programs[element.attrib["id"]] = Program.from_element(element)
+            elif element.tag == "edge" and element.get("function") == "crossing":
+                parts.crossed_edges[element.attrib["id"]] = element.get("crossingEdges", "").split()
+        except (KeyError, ValueError) as error:
+            raise InputError(path, f"invalid <{element.tag}> of a signal ({error!r})", "Use netconvert.") from None
+    by_signal: dict[str, list[dict[str, str]]] = {}
+    for connection in parts.connections:
+        by_signal.setdefault(connection["tl"], []).append(connection)
+    signals = []
+    for name, connections in by_signal.items():
+        if name in parts.programs:
+            signals.append(_read_signal(name, connections, parts, roads))
+    return tuple(signals)
+
+
+def _read_signal(
+    name: str, connections: Sequence[Mapping[str, str]], parts: _NetworkParts, roads: network.Network
+) -> Signal:
+    edges = {edge.id: edge for edge in roads.all_edges}
+    positions: dict[tuple[str, int], int] = {}  # of the links, by junction and position among its requests
+    keys = []
+    for connection in connections:
+        key = _request_key(connection, parts)
+        positions[key] = int(connection["linkIndex"])
+        keys.append(key)
+
+    incoming = {connection["from"] for connection in connections if not connection["from"].startswith(":")}
+    names = _approach_names([edges[edge] for edge in sorted(incoming)])
+    links = []
+    for connection, (node, number) in zip(connections, keys, strict=True):
+        request = next((each for each in parts.requests[node] if int(each["index"]) == number), {})
+        foes, yields_to = (
+            frozenset(positions[node, bit] for bit in request_bits(request.get(key, "")) if (node, bit) in positions)
+            for key in ("foes", "response")
+        )
+        start = connection["from"]
+        if start in names:
+            lane = edges[start].lanes[int(connection["fromLane"])]
+            movement = TURNS.get(connection.get("dir", ""), "straight")
+            heading = lane_heading(lane, at_end=True)
+            street = plain_text(edges[start].name)
+            link = Link(int(connection["linkIndex"]), names[start], movement, start, street, heading, foes, yields_to)
+        else:
+            arm = _crossed_arm(parts.crossed_edges.get(connection["to"], ()), names, edges)
+            link = Link(int(connection["linkIndex"]), arm, CROSSING, "", "", None, foes, yields_to)
+        links.append(link)
+        if "linkIndex2" in connection:
+            links.append(replace(link, index=int(connection["linkIndex2"])))
+    nodes = tuple(dict.fromkeys(node for node, _ in keys))
+    at_m = np.mean([junction.at_m for junction in roads.junctions if junction.id in nodes], axis=0)
+    links.sort(key=lambda link: link.index)
+    return Signal(name, nodes, (float(at_m[0]), float(at_m[1])), tuple(links), parts.programs[name])
+
+
+def _request_key(connection: Mapping[str, str], parts: _NetworkParts) -> tuple[str, int]:
+    """Return the junction of a connection, and its position among the junction's requests.
+
+    Internal edges are numbered by the first of their links; the crossings are the last requests of a junction.
+    """
+    to = connection["to"]
+    if to in parts.crossed_edges:
+        node, _, number = to[1:].rpartition("_c")
+        crossings = sum(name.startswith(f":{node}_c") for name in parts.crossed_edges)
+        return node, len(parts.requests[node]) - crossings + int(number)
+    node, first, lane = connection["via"][1:].rsplit("_", 2)
+    return node, int(first) + int(lane)
+
+
+def request_bits(bits: str) -> set[int]:
+    """Return the links in ``foes`` or ``response`` of a request; the last letter is that of link 0."""
+    return {index for index, bit in enumerate(reversed(bits)) if bit == "1"}
+
+
+def _approach_names(edges: Sequence[network.Edge]) -> dict[str, str]:
+    """Return the name of each approach by the id of its edge: where it comes from, and its street."""
+    names = {}
+    for edge in edges:
+        words = [compass(-lane_heading(edge.lanes[0], at_end=True))]
+        names[edge.id] = " ".join([*words, plain_text(edge.name)]).strip()
+    listed = list(names.values())
+    return {edge: name if listed.count(name) == 1 else f"{name} ({edge})" for edge, name in names.items()}
+
+
+def _crossed_arm(crossed: Sequence[str], names: Mapping[str, str], edges: Mapping[str, network.Edge]) -> str:
+    """Return the approach of the arm that a crossing crosses; where only its exit is crossed, the one beside it."""
+    for edge in crossed:
+        if edge in names:
+            return names[edge]
+    for edge in crossed:
+        if edge in edges:
+            side = compass(lane_heading(edges[edge].lanes[0], at_end=False))
+            beside = [name for name in names.values() if name.partition(" ")[0] == side]
+            return beside[0] if beside else side
+    return "the junction"
+
+
+def replace_programs(text: str, programs: Mapping[str, Program]) -> str:
+    """Return the text of a network with other programs. All programs that a signal has are replaced by one.
+
+    Parameters
+    ----------
+    text
+        The network, as netconvert writes it.
+    programs
+        New programs by the id of their signal.
+
+    Raises
+    ------
+    ValueError
+        When a signal has no program in the text.
+    """
+    by_name = {quoteattr(name): (name, program) for name, program in programs.items()}
+    replaced: set[str] = set()
+
+    def replacement(match: re.Match[str]) -> str:
+        if match[1] not in by_name:
+            return match[0]
+        if match[1] in replaced:
+            return ""
+        replaced.add(match[1])
+        name, program = by_name[match[1]]
+        return program.to_xml(name)
+
+    text = _PROGRAM.sub(replacement, text)
+    if missing := by_name.keys() - replaced:
+        raise ValueError(f"no <tlLogic> of {', '.join(sorted(missing))} on lines of its own")
+    return text
