@@ -5,6 +5,7 @@ Evidence: a sweep of a simulated sensor; options that are wrong.
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ import numpy as np
 import pytest
 
 from egvs.formats import ply
-from tests.sensor_fit.small_sensor import TRUTH, sweep_of
+from tests.sensor_fit.ros_recordings import write_recording
+from tests.sensor_fit.small_sensor import TRUTH, coarse_sensor, sweep_of
 
 
 @pytest.fixture
@@ -30,12 +32,42 @@ def test_prints_sensor_pose_and_files(sweep: Path, tmp_path: Path, run_egvs: Any
     assert "optics 30.0 mm from the axis" in printed
     assert "azimuths: 900 every 0.4000 degrees, counter-clockwise from above" in printed
     assert "in steps of 4 mm" in printed
+    assert "rotation: rate unknown (the sweeps have no times)" in printed
     assert "1 (chosen)" in printed
     assert "ground.png that the chosen plane is the road" in printed
     assert sorted(path.name for path in out.iterdir()) == [
         "angles.png", "fit.json", "ground.png", "ranges.png", "sensor.toml"
     ]  # fmt: skip
     assert "# Sensor mast, fitted by egvs sensor fit to:" in (out / "sensor.toml").read_text(encoding="utf-8")
+
+
+@pytest.mark.system
+def test_prints_recording_and_rotation(tmp_path: Path, run_egvs: Any) -> None:
+    pytest.importorskip("rosbags")
+    times = np.repeat(np.arange(300), 10) * 0.1 / 300
+    clouds = [(50.0 + 0.1 * i, sweep_of(TRUTH, coarse_sensor(), seed=i), times) for i in range(3)]
+    path = write_recording(tmp_path / "run.mcap", clouds)
+    out = tmp_path / "made"
+    code, printed, error = run_egvs("sensor", "fit", path, "--name", "mast", "--out", out, "--max-sweeps", "2")
+    assert code == 0, error
+    assert "run.mcap: 2 of 3 sweeps read; topic /lidar/points, frame lidar" in printed
+    assert "rotation: 10.0000 +- " in printed
+    assert "turns per second, from times of points of 2 sweeps; a firing every 333.333 us" in printed
+    rotation = json.loads((out / "fit.json").read_text(encoding="utf-8"))["rotation"]
+    assert rotation["turns_per_second"]["value"] == pytest.approx(10.0, abs=1e-3)
+    assert rotation["azimuth_step_deg"] == pytest.approx(1.2, abs=1e-3)
+
+
+@pytest.mark.system
+def test_rejects_unknown_topic(tmp_path: Path, run_egvs: Any) -> None:
+    pytest.importorskip("rosbags")
+    path = write_recording(tmp_path / "run.bag", [(50.0, sweep_of(TRUTH, coarse_sensor()), None)])
+    arguments = ("sensor", "fit", path, "--name", "mast", "--out", tmp_path / "made", "--topic", "/rear")
+    code, _, error = run_egvs(*arguments)
+    assert code == 2
+    assert "--topic: expected one of /lidar/points, got '/rear'" in error
+    assert "Traceback" not in error
+    assert not (tmp_path / "made").exists()
 
 
 @pytest.mark.parametrize(

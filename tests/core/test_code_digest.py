@@ -176,13 +176,13 @@ SOURCE_BEFORE = {
 """Code lines behind the key of each stage before the layout with one module per subject."""
 
 GROWTH = {
-    "check": 1.43,
-    "statics": 1.28,
-    "scan": 1.29,
-    "traffic": 1.7,
-    "tpog": 1.35,
-    "score": 1.28,
-    "report": 1.38,
+    "check": 1.56,
+    "statics": 1.43,
+    "scan": 1.42,
+    "traffic": 1.77,
+    "tpog": 1.42,
+    "score": 1.39,
+    "report": 1.7,
 }
 """Allowed growth, 1.1 for the others: a stage runs again whenever a line behind its key changes."""
 

@@ -156,6 +156,10 @@ def test_layers_draw_their_data(page: Page, session: Session, layer: str) -> Non
         "seen": (entropy * (hits > 0)).any(axis=2).sum(),
         "missed": (entropy * (hits == 0)).any(axis=2).sum(),
         "blindspots": (~np.isnan(session.blindspots(site).share_missed)).sum(),
+        "points_car": 0,  # without a road network there is no surface
+        "points_pedestrian": 0,
+        "overlap_car": 0,
+        "overlap_pedestrian": 0,
         "difference": (entropy * ((hits > 0) != (other > 0))).any(axis=2).sum(),
         "scan": len(session.returns_m(site)),
         "ring": len(session.beams_m(site, 0)),
@@ -168,6 +172,9 @@ def test_layers_draw_their_data(page: Page, session: Session, layer: str) -> Non
         alone = (entropy * ((hits > 0) & (other == 0))).sum(), (entropy * ((hits == 0) & (other > 0))).sum()
         for name, bit in zip(("pole_a", "pole_b"), alone, strict=True):
             assert f"seen only by {name}: {bit:,.1f} bits" in page.controls.legend.content
+    if layer == "replay":
+        last_s = (playback.frames - 1) * playback.period_s
+        assert f"{7 * playback.period_s:,.1f} s of {last_s:,.1f} s" in page.controls.legend.content
     if layer == "blindspots":
         assert f"{session.blindspots(site).overall.share:.1%} found" in page.controls.legend.content
 

@@ -361,6 +361,33 @@ def write_cloud(path: Path, points: np.ndarray | None = None) -> None:
         path.write_text(head + rows.replace(",", " "), encoding="utf-8")
 
 
+def recording(name: str):
+    """Two sweeps of a LiDAR: a recording of ROS with times of points, or a capture of a VLP-16 that turns fast."""
+
+    def make(folder: Path) -> None:
+        from tests.sensor_fit.ros_recordings import write_recording
+        from tests.sensor_fit.small_sensor import TRUTH, coarse_sensor, sweep_of
+        from tests.sensor_fit.velodyne_packets import packets, write_pcap
+
+        if name.endswith(".pcap"):
+            rng = np.random.default_rng(0)
+
+            def yard(azimuth_deg, elevation_deg):
+                azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
+                with np.errstate(divide="ignore"):
+                    walls = np.minimum(20.0 / np.abs(np.cos(azimuth)), 24.0 / np.abs(np.sin(azimuth)))
+                    ground = np.where(elevation < 0, -2.0 / np.sin(elevation), np.inf)
+                return np.minimum(walls / np.cos(elevation), ground) + rng.normal(0.0, 0.01, azimuth.shape)
+
+            write_pcap(folder / name, packets(yard, turns=2.1, rotation_hz=20.0))
+            return
+        times = np.repeat(np.arange(300), 10) * 0.1 / 300
+        clouds = [(1000.0 + 0.1 * i, sweep_of(TRUTH, coarse_sensor(), seed=i), times) for i in range(2)]
+        write_recording(folder / name, clouds)
+
+    return make
+
+
 def sweep(name: str):
     """A sweep of a LiDAR with ten channels, in the format that the suffix names, maybe gzipped."""
 

@@ -115,6 +115,13 @@ def _sweep(name: str, reads: Meaning) -> Kind:
     return Kind(f"sweep {name}", name, bases.sweep(name), reads, verb=verb, results=("made/sensor.toml",))
 
 
+def _recording(name: str) -> Kind:
+    """A recording of sweeps to which a sensor is fitted."""
+    verb = ("sensor", "fit", name, "--name", "mast", "--out", "made")
+    make = bases.recording(name)
+    return Kind(f"sweep {name}", name, make, meaning.bytes_themselves, verb=verb, results=("made/sensor.toml",))
+
+
 def _city(name: str, file: str, reads: Meaning) -> Kind:
     """What the cut of a city's traffic reads."""
     verb = ("city", "traffic", "town")
@@ -210,6 +217,7 @@ _ALL = (
     _tracks("tracks.csv", bases.mapped_tracks(False), meaning.table, "", "mapping"),
     _tracks("tracks.jsonl", bases.mapped_tracks(True), meaning.json_lines, "", "mapping"),
     _sweep("sweep.csv", meaning.rows), _sweep("sweep.pcd", meaning.pcd),
+    _recording("sweep.bag"), _recording("sweep.mcap"), _recording("sweep.db3"), _recording("sweep.pcap"),
     _sweep("sweep.ply.gz", meaning.gzipped(meaning.ply)), _sweep("sweep.npz", meaning.bytes_themselves),
     Kind("wanted junctions.csv", "wanted.csv", bases.wanted, meaning.rows, results=("made/junctions/*/*.csv",),
          verb=("city", "new", "made", "--osm", "map.osm", "--junctions", "wanted.csv")),

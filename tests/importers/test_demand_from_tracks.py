@@ -130,7 +130,10 @@ def test_rejects_recording_of_pedestrians(tmp_path: Path, network_path: Path) ->
     ("options", "message"),
     [
         ({"tracks": True, "like": True}, "--like: cannot be combined with --tracks"),
-        ({"tracks": True, "signals": True}, "--signals: has no effect on recorded traffic"),
+        (
+            {"tracks": True, "pedestrian_tracks": True},
+            "--pedestrian-tracks: is for simulated vehicles, not for --tracks",
+        ),
     ],
 )
 def test_rejects_options_that_exclude_each_other(

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray
 from egvs.formats.georeference import WorldFrame
 from egvs.importers import recorded_signals, signal_programs
 from egvs.importers.new_scenario import NewScenarioOptions, create_scenario
@@ -43,6 +44,10 @@ def write_groups(path: Path) -> Path:
 def signals(tmp_path: Path) -> RecordedSignals:
     states = write_states(tmp_path / "states.csv.gz", g1=MAIN, g2=LEFT)
     return read_signals([states, write_groups(tmp_path / "groups.csv")])
+
+
+def straight_link(index: int, from_edge: str, to_edge: str, path_m: FloatArray) -> signal_programs._Link:
+    return signal_programs._Link(index, from_edge, to_edge, path_m, path_m[:2], path_m[-2:])
 
 
 def test_states_of_taf_bw(signals: RecordedSignals) -> None:
@@ -93,7 +98,7 @@ def test_groups_of_kml(tmp_path: Path) -> None:
     result = read_signals([write_states(tmp_path / "states.csv.gz", g1=MAIN, g2=LEFT), tmp_path / "map.kml"])
     assert [way.group for way in result.ways] == ["1", "2"]
     line = np.array([(-110.0, 0.0), (110.0, 0.0)]), np.array([(-110.0, 0.0), (0.0, 0.0), (0.0, 110.0)])
-    links = [signal_programs._Link(index, "a", f"b{index}", path_m) for index, path_m in enumerate(line)]
+    links = [straight_link(index, "a", f"b{index}", path_m) for index, path_m in enumerate(line)]
     assert signal_programs._assign_groups(links, result, frame) == {0: "1", 1: "2"}
 
 
@@ -137,7 +142,7 @@ def test_program_of_the_network(tmp_path: Path, signals: RecordedSignals) -> Non
         (9.0, "rG"), (12.0, "ry"), (19.0, "rr"), (31.0, "Gr"), (34.0, "yr"), (39.0, "rr"), (40.0, "ru"),
     ]  # fmt: skip
     assert (
-        "the signals repeat a recorded cycle of 40.0 s; median of 3 recorded cycles 40.0 s (37.0 to 40.0 s)"
+        "The signals repeat a recorded cycle of 40.0 s; median of 3 recorded cycles 40.0 s (37.0 to 40.0 s)."
         in plan.notes
     )
     (tmp_path / "plan.net.xml").write_text(plan.network)
@@ -152,9 +157,9 @@ def test_scenario_with_recorded_signals(run_egvs, tmp_path: Path) -> None:
     options = ["--like", tracks, "--track-crs", "world", "--signals", states, "--signals", groups]
     code, out, err = run_egvs("new", tmp_path / "new", "--from", tmp_path / "map.net.xml", *options)
     assert (code, err) == (0, "")
-    assert "the signals repeat a recorded cycle of 40.0 s" in out
+    assert "The signals repeat a recorded cycle of 40.0 s" in out
     text = (tmp_path / "new" / "scenario.toml").read_text(encoding="utf-8")
-    assert "# network.net.xml: the signals repeat a recorded cycle of 40.0 s" in text
+    assert "# network.net.xml: The signals repeat a recorded cycle of 40.0 s" in text
     assert "signal plans" not in text
     assert "<tlLogic" in (tmp_path / "new" / "network.net.xml").read_text(encoding="utf-8")
 
@@ -168,7 +173,7 @@ def test_green_that_crosses_another_gives_way() -> None:
 def test_dark_group_governs_nothing() -> None:
     dark = SignalRecord(np.array([0.0]), (recorded_signals.DARK,), 10.0)
     group = recorded_signals.GroupOfEdges("1", "in", "out")
-    link = signal_programs._Link(0, "in", "out", np.array([(0.0, 0.0), (1.0, 0.0)]))
+    link = straight_link(0, "in", "out", np.array([(0.0, 0.0), (1.0, 0.0)]))
     assert signal_programs._assign_groups([link], RecordedSignals({"1": dark}, (), (group,)), None) == {}
 
 
@@ -183,10 +188,6 @@ def test_dark_group_governs_nothing() -> None:
         ("signal_group_id,timestamp_ms,movement_state\n1,x,DARK\n", "expected a number, got 'x'"),
         ("timestamp(ms),Traffic light 1\n,1\n", "no row has a time"),
         ("timestamp(ms),Traffic light 1\n0,7\n", "expected 0, 1 or 3, got '7'"),
-        (
-            "signal_group_id,timestamp_ms,movement_state\n1,0,DARK\n",
-            "no file says which lanes each signal group governs",
-        ),
         ("group,from_edge,to_edge\n1,in,out\n", "no file has recorded states of signals"),
     ],
 )

@@ -49,6 +49,8 @@ NETWORK = ("traffic.network='streets.net.xml'",)
 COUNTED = (*NETWORK, "traffic.counts=[{edge='a', per_hour=100}]")
 TURNS = (*NETWORK, "traffic.counts=[{from_edge='a', to_edge='b', per_hour=100}]")
 HALVES = ("traffic.periods=[{name='a', length_s=12}, {name='b', begin_s=12, length_s=8}]",)
+SIGNALS = (*NETWORK, "traffic.signals.a={phases=[{green={north=['all']}, green_s=30}]}")
+ACTUATED = (*SIGNALS, "traffic.signals.a.type='actuated'")
 PERIOD_COUNTS = (*NETWORK, "traffic.periods=[{name='a', counts=[{edge='a', per_hour=100}]}]")
 PERIOD_TURNS = (*NETWORK, "traffic.periods=[{name='a', counts=[{from_edge='a', to_edge='b', per_hour=100}]}]")
 TRACKED = ("traffic.tracks=['tracks.csv']", "traffic.track_crs='world'")
@@ -84,6 +86,7 @@ TRACKS = """track_id,frame_id,timestamp_ms,agent_type,x,y,vx,vy,psi_rad,length,w
 
 NAMES = {
     "sensors": "small",
+    "traffic.signals": "a",
     "articulated.kinds": "car",
     "weights.zones": "crossing",
     "placement.zones": "crossing",
@@ -117,6 +120,7 @@ KEYS: dict[str, Change] = {
     "traffic.network": Change("'others.net.xml'", NETWORK),
     "traffic.routes": Change("['trips.rou.xml']", file="without_kinds.toml"),
     "traffic.sumocfg": Change("'streets.sumocfg'", file="without_kinds.toml"),
+    "traffic.seeds": Change("2", NETWORK),
     "traffic.fcd": Change("'others.csv'"),
     "traffic.fcd_geo": Change("true"),
     "traffic.tracks": Change("['other_tracks.csv']", TRACKED),
@@ -154,10 +158,23 @@ KEYS: dict[str, Change] = {
     "traffic.redraw_departures": Change("true", ("traffic.routes=['trips.rou.xml']",), file="without_kinds.toml"),
     "traffic.min_trip_m": Change("10", NETWORK),
     "traffic.edge_weights": Change("{a=2}", NETWORK),
+    "traffic.signals.*.file": Change("'plan.csv'", (*NETWORK, "traffic.signals.a={file='trips.rou.xml'}")),
+    "traffic.signals.*.type": Change("'actuated'", SIGNALS),
+    "traffic.signals.*.cycle_s": Change("35", SIGNALS),
+    "traffic.signals.*.offset_s": Change("5", SIGNALS),
+    "traffic.signals.*.yellow_s": Change("4", SIGNALS),
+    "traffic.signals.*.all_red_s": Change("1", SIGNALS),
+    "traffic.signals.*.phases.*.green": Change("{south=['left']}", SIGNALS),
+    "traffic.signals.*.phases.*.green_s": Change("40", SIGNALS),
+    "traffic.signals.*.phases.*.yellow_s": Change("4", SIGNALS),
+    "traffic.signals.*.phases.*.all_red_s": Change("1", SIGNALS),
+    "traffic.signals.*.phases.*.min_green_s": Change("8", ACTUATED),
+    "traffic.signals.*.phases.*.max_green_s": Change("60", ACTUATED),
     "traffic.counts.*.edge": Change("'b'", COUNTED),
     "traffic.counts.*.from_edge": Change("'c'", TURNS),
     "traffic.counts.*.to_edge": Change("'c'", TURNS),
     "traffic.counts.*.per_hour": Change("200", COUNTED),
+    "traffic.observed": Change("'observed.csv'", COUNTED),
     "traffic.counts.*.kind": Change("'car'", COUNTED),
     "traffic.kinds.*.name": Change("'other'"),
     "traffic.kinds.*.vclass": Change("'bus'"),
@@ -344,7 +361,9 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
     texts = {
         "streets.net.xml": "<net/>",
         "others.net.xml": "<net> </net>",
+        "observed.csv": "approach,queue_m\nN,40\n",
         "trips.rou.xml": "<routes/>",
+        "plan.csv": "phase,approach,movement,green_s\na,north,all,30\n",
         "sizes.add.xml": "<additional/>",
         "streets.sumocfg": '<configuration><input><net-file value="streets.net.xml"/>'
         '<route-files value="trips.rou.xml"/></input></configuration>',

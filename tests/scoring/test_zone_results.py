@@ -171,6 +171,22 @@ def test_without_zones_all_other_artefacts_are_the_same(scored: tuple[egvs.Scena
         assert (out / name).read_bytes() == (tmp_path / "plain" / name).read_bytes()
 
 
+def test_table_has_the_areas(scored: tuple[egvs.Scenario, Path]) -> None:
+    areas = readers.read_zone_areas(scored[1] / "zones.parquet")
+    assert [(name, area.bounds) for name, area in areas.items()] == list(ZONES)
+
+
+def test_report_shows_the_zones_of_the_best_site(scored: tuple[egvs.Scenario, Path]) -> None:
+    page = (scored[1] / "report.html").read_text()
+    rows = readers.read_zones(scored[1] / "zones.parquet", "pole_b")
+    section = page[page.index('<section id="zones">') :]
+    assert "from pole_b, the best site" in section
+    for row in rows:
+        assert f">{row.zone}</th>" in section
+        assert row.share_words in section
+    assert ">far</th>" not in section
+
+
 def test_editing_the_file_scores_again(scored: tuple[egvs.Scenario, Path]) -> None:
     scenario, out = scored
     before = pq.read_table(out / "zones.parquet").to_pylist()

@@ -231,7 +231,7 @@ _REQUIRED_METADATA: dict[str, tuple[str, ...]] = {
     "scans": ("sites",),
     "visibility": ("grid", "sites"),
     "blindspots": ("sites", "cells", "points"),
-    "zones": ("sites",),
+    "zones": ("sites", "zones"),
     "plan_zones": ("inputs", "stages"),
     "accuracy": ("inputs", "tolerance", "stages"),
     "placement": ("inputs", "stages", "plan"),
@@ -248,6 +248,9 @@ _SITE_KEYS = ("site", "x_m", "y_m", "z_m", "sensor")
 
 _PLAN_KEYS = ("candidates", "joint", "together", "value", "bound", "certificate", "cost")
 """Numbers in the metadata of a plan."""
+
+_SEEDS_KEY = "seeds"
+"""Number of independent simulations in the metadata of a TPOG or of one of its periods; 1 where it is missing."""
 
 _PERIOD_TYPES = {"name": str, "weight": float, "frames": int, "block_frames": int, "memory_frames": float, "times": int}
 
@@ -269,6 +272,8 @@ def _parse_metadata(path: Path, artefact: str, content: bytes) -> dict[str, Any]
     for key in required:
         if not _is_valid(key, metadata.get(key)):
             raise InputError(path, f"invalid metadata: {key} = {metadata.get(key)!r}", _REMAKE_HINT)
+    if artefact == "tpog" and not _is_valid(_SEEDS_KEY, metadata.get(_SEEDS_KEY, 1)):
+        raise InputError(path, f"invalid metadata: {_SEEDS_KEY} = {metadata[_SEEDS_KEY]!r}", _REMAKE_HINT)
     return metadata
 
 
@@ -279,6 +284,8 @@ def _is_valid(key: str, value: Any) -> bool:
             return _is_grid(value)
         case "cells":
             return _is_cell_grid(value)
+        case "zones":
+            return isinstance(value, list) and bool(value)
         case "sites":
             return isinstance(value, list) and all(_has_keys(site, _SITE_KEYS) for site in value)
         case "periods":
@@ -303,7 +310,9 @@ def _is_number(value: Any) -> bool:
 
 
 def _is_period(value: Any) -> bool:
-    if not isinstance(value, dict) or value.keys() != _PERIOD_TYPES.keys():
+    if not isinstance(value, dict) or value.keys() - {_SEEDS_KEY} != _PERIOD_TYPES.keys():
+        return False
+    if not _is_valid(_SEEDS_KEY, value.get(_SEEDS_KEY, 1)):
         return False
     for key, expected_type in _PERIOD_TYPES.items():
         if type(value[key]) is not expected_type:

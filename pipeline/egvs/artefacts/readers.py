@@ -10,7 +10,7 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -20,6 +20,9 @@ from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import read_periods
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, Grid
+
+if TYPE_CHECKING:
+    from shapely.geometry.base import BaseGeometry
 
 MIN_VEHICLES = 10
 """Locations with fewer different vehicles are not listed: a share of three cars says nothing about a lane."""
@@ -179,9 +182,12 @@ def _site_blindspots(
 ALL_USERS, PEDESTRIANS, TWO_WHEELERS = "all", "pedestrian", "two-wheeler"
 """Classes of road users in ``zones.parquet``; :data:`egvs.scoring.zone_results.CLASSES` has the others."""
 
+_WHOLE_PERCENT = 0.95
+"""Shares with a standard error below this have a decimal, in per cent."""
+
 _CLASS_WORDS = {
     ALL_USERS: "road users", "car": "cars", "truck": "trucks", "bus": "buses", "rail": "trams",
-    TWO_WHEELERS: "bicycles and motorcycles", PEDESTRIANS: "pedestrians", "other": "others",
+    TWO_WHEELERS: "two-wheelers", PEDESTRIANS: "pedestrians", "other": "others",
 }  # fmt: skip
 
 
@@ -216,7 +222,8 @@ class ZoneVisibility:
         """The share with its standard error, where it is known."""
         if math.isnan(self.se):
             return f"{self.share:.0%}"
-        return f"{100 * self.share:.0f} ± {100 * self.se:.0f}%"
+        digits = 0 if 100 * self.se >= _WHOLE_PERCENT else 1
+        return f"{100 * self.share:.{digits}f} ± {100 * self.se:.{digits}f}%"
 
     def in_words(self) -> str:
         """Return zone, class, share and number of road users in one phrase."""
@@ -235,6 +242,23 @@ def read_zones(path: Path, site: str) -> list[ZoneVisibility]:
 
     table = parquet.read_artefact(path, "zones")[0]
     return _zone_rows(table.filter(pc.equal(table.column("site"), site)))
+
+
+def read_zone_areas(path: Path) -> dict[str, BaseGeometry]:
+    """Return the areas of the zones in ``zones.parquet`` by name, world frame, in the order of their file.
+
+    Raises
+    ------
+    InputError
+        When the file is corrupt.
+    """
+    import shapely
+
+    metadata = parquet.read_metadata(path, "zones")
+    try:
+        return {name: shapely.from_wkb(area) for name, area in metadata["zones"]}
+    except (TypeError, ValueError, shapely.errors.ShapelyError) as error:
+        raise InputError(path, f"invalid areas in the metadata ({error})", _REMAKE_HINT) from None
 
 
 def read_plan_zones(path: Path) -> list[ZoneVisibility]:

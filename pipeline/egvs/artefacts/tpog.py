@@ -45,6 +45,8 @@ class PeriodBlocks:
         Autocorrelation time of the traffic.
     times
         How often each of its frames counts in the mix.
+    seeds
+        Number of independent simulations that share the frames and blocks equally, one after another.
     """
 
     name: str
@@ -53,6 +55,7 @@ class PeriodBlocks:
     block_frames: int
     memory_frames: float
     times: int = 1
+    seeds: int = 1
 
     @property
     def blocks(self) -> int:
@@ -60,8 +63,11 @@ class PeriodBlocks:
         return self.frames // self.block_frames
 
     def to_json(self) -> dict[str, Any]:
-        """Return the entry of the metadata."""
-        return asdict(self)
+        """Return the entry of the metadata; ``seeds`` only where there are several."""
+        values = asdict(self)
+        if self.seeds == 1:
+            del values["seeds"]
+        return values
 
 
 def frame_multiplicities(weights: Sequence[float], frames: Sequence[int], where: str) -> tuple[int, ...]:
@@ -97,10 +103,16 @@ def periods_from_metadata(metadata: dict[str, Any], path: Path) -> tuple[PeriodB
     if "periods" in metadata:
         periods = tuple(PeriodBlocks(**row) for row in metadata["periods"])
     else:
-        periods = (PeriodBlocks("", 1.0, metadata["frames"], metadata["block_frames"], metadata["memory_frames"]),)
+        seeds = metadata.get("seeds", 1)
+        periods = (
+            PeriodBlocks("", 1.0, metadata["frames"], metadata["block_frames"], metadata["memory_frames"], seeds=seeds),
+        )
     for period in periods:
         if period.frames % period.block_frames:
             problem = f"{period.frames} frames do not fill blocks of {period.block_frames} frames"
+            raise InputError(path, problem, "Create the file again.")
+        if period.blocks % period.seeds:
+            problem = f"{period.blocks} blocks cannot be shared by {period.seeds} simulations"
             raise InputError(path, problem, "Create the file again.")
     return periods
 

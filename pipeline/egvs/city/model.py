@@ -134,6 +134,9 @@ def load_city(folder: str | Path) -> City:
     except ValidationError as error:
         raise format_validation_error(error, str(file), CityModel) from None
     check_unused_keys(model.traffic, file)
+    if model.traffic.seeds > 1:
+        problem = f"expected 1 in a city, got {model.traffic.seeds}"
+        raise InputError(f"{file}: traffic.seeds", problem, "Remove it, or use a scenario of one junction.")
 
     rows = read_junction_rows(file.parent / JUNCTIONS_FILE, JUNCTION_COLUMNS)
     city = City(

@@ -28,8 +28,12 @@ from egvs.report.formatting import ScoreLabel, join_names
 from egvs.report.ranking import Pole, RankedSite, Ranking
 from egvs.report.sensor_results import range_note
 from egvs.scenario.model import Scenario
+from egvs.traffic.signals import format_plan
 
 _FILE_WIDTH = 150
+_MAX_SIGNALS = 2
+"""Further signals are left to the report."""
+
 _MAX_PERIODS = 4
 """With more periods, their ranks are left to ``--all`` and the report."""
 
@@ -56,13 +60,12 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
     else:
         for warning in collect_warnings([summary]):
             out.print(str(warning))
-    sentences = []
+    traffic_summary = record.stages["traffic"].summary if "traffic" in record.stages else {}
+    sentences = signal_sentences(traffic_summary.get("signals", ()))
     on_road = sections.describe_poles_on_road(ranked.poles[: sections.NAMED_POLES], _check_warnings(record))
     if caveats := sections.describe_caveats(scenario, "ranking", on_road):
         sentences.append(caveats)
-    sentences += reliability.describe_reliability(
-        ranked, record.stages["traffic"].summary if "traffic" in record.stages else None
-    )
+    sentences += reliability.describe_reliability(ranked, traffic_summary)
     sensors = [site.sensor for site in ranked.sites]
     if note := range_note(sensors, is_modelled=scenario.effects.range_limit is not None):
         sentences.append(note)
@@ -70,6 +73,15 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
     if ranked.best[0].score > 0 and len(set(sensors)) == 1:
         out.print(f"Which sensor? {shlex.join(['egvs', 'compare', str(folder), '--sensors', 'NAME,NAME'])} (or all)")
     out.print(f"report: {run_folder.report}")
+
+
+def signal_sentences(plans: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the plans of the signals in the region, one sentence each, and how many more there are."""
+    sentences = [format_plan(plan) for plan in plans[:_MAX_SIGNALS]]
+    more = len(plans) - _MAX_SIGNALS
+    if more > 0:
+        sentences.append(f"{more} more {'signal is' if more == 1 else 'signals are'} in the region; see the report.")
+    return sentences
 
 
 def _check_warnings(record: RunRecord) -> list[Diagnostic]:

@@ -15,7 +15,7 @@ from typer.core import TyperCommand
 from typer.models import CommandInfo
 
 from egvs._version import __version__
-from egvs.cli import city, compare, exit, place, sensor, sources, validate, what_if
+from egvs.cli import city, compare, exit, installation, place, sensor, sources, validate, what_if
 from egvs.cli import options as cli_options
 from egvs.cli.options import (
     DEFAULT_POLES,
@@ -190,6 +190,7 @@ def traffic(
     scenario: ScenarioPath,
     out: Out = None,
     set_: Set = None,
+    jobs: Jobs = None,
     traci: Annotated[
         str | None,
         typer.Option(metavar="HOST:PORT", help="Record from a running SUMO, started with --remote-port."),
@@ -199,7 +200,7 @@ def traffic(
     stage_options: dict[str, Any] = {}
     if traci is not None:
         stage_options["traci"] = cli_options.parse_host_and_port(traci)
-    _run_stage("traffic", scenario, out, set_, **stage_options)
+    _run_stage("traffic", scenario, out, set_, jobs, **stage_options)
 
 
 @app.command()
@@ -527,6 +528,10 @@ def figure(
     print(path)
 
 
+app.command()(installation.sheets)
+app.command()(installation.accept)
+
+
 app.add_typer(city.app, name="city")
 
 
@@ -655,12 +660,21 @@ def new(
             " traffic are estimated.",
         ),
     ] = None,
+    pedestrian_tracks: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--pedestrian-tracks",
+            metavar="FILE",
+            help="Recorded tracks of people on foot and on bicycles, or a folder of them, beside simulated vehicles."
+            " Give the signals that they were recorded under by --signals.",
+        ),
+    ] = None,
     signals: Annotated[
         list[Path] | None,
         typer.Option(
             metavar="FILE",
-            help="Recorded signals of the junction, and a file that assigns their groups to lanes (KML or CSV), for"
-            " simulated traffic: --signals A --signals B.",
+            help="Recorded signals of the junction, and a file that assigns their groups to lanes (KML or CSV); without"
+            " one, it is guessed from the tracks. --signals A --signals B.",
         ),
     ] = None,
     track_columns: Annotated[
@@ -688,6 +702,9 @@ def new(
             " height from it.",
         ),
     ] = None,
+    run_: Annotated[
+        bool, typer.Option("--run", help="Run the new scenario at once, as egvs run does, up to the ranking.")
+    ] = False,
 ) -> None:
     """Create a scenario from maps of roads, buildings and other objects.
 
@@ -729,7 +746,7 @@ def new(
         lefthand=lefthand, walk=walk, surroundings_m=surroundings_m, traffic=demand, pole_spacing_m=pole_spacing_m,
         align=tuple(cli_options.point_pair(text) for text in align or []), surface=tuple(surface or []),
         tracks=tuple(tracks or ()), like=tuple(like or ()), signals=tuple(signals or ()), track_crs=track_crs,
-        track_columns=track_columns, counts=counts,
+        track_columns=track_columns, pedestrian_tracks=tuple(pedestrian_tracks or ()), counts=counts,
     )  # fmt: skip
     notes = []
     if download:
@@ -738,6 +755,8 @@ def new(
         notes.append(extract.note)
     scenario = new_scenario.create_scenario(folder, paths, location, options)
     new_summary.print_new_scenario(scenario, notes)
+    if run_:
+        _run_all_stages(folder, None, None, None, audit=False, poles=DEFAULT_POLES, verbose=False, rehash=False)
 
 
 @app.command()
@@ -793,6 +812,7 @@ COMMAND_GROUPS = {
     "Decide": ("place", "explore", "compare", "what-if", "city"),
     "Study": ("validate", "accuracy", "effects", "scores", "clouds", "train"),
     "Stages of egvs run": ("traffic", "statics", "tpog", "scan", "score", "report"),
+    "Install": ("sheets", "accept"),
     "Files": ("runs", "export", "figure", "sensors", "verify", "store", "sensor"),
 }
 """Groups of ``egvs --help``, and their commands."""

@@ -13,8 +13,10 @@ from egvs.core.errors import InputError
 
 if TYPE_CHECKING:
     from egvs.placement.sensor_design import Design, DesignResult
+    from egvs.scenario.model import Scenario
     from egvs.sensor_fit.fit import SensorFit
     from egvs.sensor_fit.intervals import Estimate
+    from egvs.sensor_fit.map_pose import MapPose
     from egvs.sensor_fit.output import FitFolder
 
 _DESIGN_WIDTH = 190
@@ -33,8 +35,8 @@ def fit(
         list[Path],
         typer.Argument(
             metavar="SWEEPS...",
-            help="Sweeps of an installed LiDAR, one per file, in its own frame: .pcd, .ply, .las, .laz, .csv, .e57, or"
-            " .npz with an array per sweep; also with .gz.",
+            help="Sweeps of an installed LiDAR in its own frame: one per file (.pcd, .ply, .las, .laz, .csv, .e57; also"
+            " with .gz), an array per sweep (.npz), or a recording (.bag, .mcap, .db3, .pcap).",
         ),
     ],
     name: Annotated[str, typer.Option(metavar="NAME", help="Required: name of the sensor, as in [sensors.NAME].")] = "",
@@ -53,6 +55,29 @@ def fit(
             " by default found from the ground plane.",
         ),
     ] = None,
+    topic: Annotated[
+        str | None,
+        typer.Option(metavar="TOPIC", help="Topic of the point clouds, where a recording of ROS has several."),
+    ] = None,
+    max_sweeps: Annotated[
+        int, typer.Option(metavar="N", min=1, help="Most sweeps that are read of a recording, spread evenly over it.")
+    ] = 20,
+    max_range: Annotated[
+        float,
+        typer.Option(metavar="M", min=1.0, max=10_000.0, help="Range beyond which the decoder of .pcap drops returns."),
+    ] = 500.0,
+    scenario: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="SCENARIO", help="Fit yaw and position as well, to the static world of this scenario; with --site."
+        ),
+    ] = None,
+    site: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y[,Z]", help="With --scenario: where the sensor is in its world, to 2 m; Z if it has no ground."
+        ),
+    ] = None,
     without_empty_sector: Annotated[
         bool,
         typer.Option(
@@ -67,22 +92,47 @@ def fit(
 
     plugins.require_libraries("egvs sensor fit", "figure", "matplotlib")
     with ProgressDisplay("sensor fit") as screen:
+        from egvs.formats.recordings import RecordingOptions
         from egvs.sensor_fit import fit as fitting
         from egvs.sensor_fit import output, sweep_files
 
         if not name:
             raise InputError("--name", "no name is given", "Use --name north-mast.")
         output.check_name(name)
+        map_options = _map_options(scenario, site)
         options = fitting.FitOptions(ground, None if road is None else _sector(road))
         folder = out or Path("sensors") / name
         files.check_writable(folder / output.SENSOR_FILE)
         steps = iter(range(1, 100))
         screen.progress("reading", 0, 7)
-        recorded = sweep_files.read_sweeps(sweeps)
+        recorded = sweep_files.read_sweeps(sweeps, RecordingOptions(topic, max_sweeps, max_range))
         result = fitting.fit_sensor(recorded, options, lambda step: screen.progress(step, next(steps), 7))
+        if map_options is not None:
+            screen.progress("map", 6, 7)
+            result = fitting.with_map_pose(result, *map_options)
         screen.progress("writing", 6, 7)
         written = output.write_fit(result, name, folder, without_empty_sector=without_empty_sector)
     print_fit(result, written)
+
+
+def _map_options(path: Path | None, site: str | None) -> tuple[Scenario, tuple[float, ...]] | None:
+    """Return the scenario and the position of the sensor; None if neither is given."""
+    from egvs.scenario.fields import MAX_COORDINATE_M
+    from egvs.scenario.loading import load
+
+    if path is None and site is None:
+        return None
+    if path is None or site is None:
+        given, other = ("--site", "--scenario") if path is None else ("--scenario", "--site")
+        raise InputError(given, f"expected {other} as well", "Use both: --scenario FOLDER --site X,Y.")
+    try:
+        site_m = tuple(float(word) for word in site.split(","))
+    except ValueError:
+        site_m = ()
+    if len(site_m) not in (2, 3) or not all(abs(value) <= MAX_COORDINATE_M for value in site_m):
+        problem = f"expected two or three coordinates in metres, got {site!r}"
+        raise InputError("--site", problem, "Use the world frame of the scenario, as in --site=12.5,-3.")
+    return load(path), site_m
 
 
 def _sector(text: str) -> tuple[float, float]:
@@ -123,6 +173,12 @@ def print_fit(result: SensorFit, written: FitFolder) -> None:
     ]
     if result.silent_channels:
         lines.append(f"channels with fewer than 20 returns, left out: {result.silent_channels}")
+    recordings = {id(sweep.recording): sweep.recording for sweep in result.sweeps if sweep.recording is not None}
+    for recording in recordings.values():
+        used = sum(sweep.recording is recording for sweep in result.sweeps)
+        notes = "".join(f"; {note}" for note in recording.notes)
+        lines.insert(0, f"{recording.name}: {used} of {recording.sweeps} sweeps read; {recording.source}{notes}")
+    lines.append(f"rotation: {_rotation(result)}")
     if coarse:
         lines.insert(1, f"sweeps with float16 coordinates, used only for the empty scan: {coarse}")
     if result.empty_sectors_deg:
@@ -150,6 +206,10 @@ def print_fit(result: SensorFit, written: FitFolder) -> None:
     ]
     out.print(make_table(columns, range(len(planes))))
     out.print(f"Check in {written.folder / 'ground.png'} that the chosen plane is the road; if not, use --ground N.")
+    if result.map_pose is not None:
+        for line in _map_lines(result.map_pose):
+            out.print(line)
+        out.print(f"Check in {written.folder / 'map.png'} that the returns lie on the walls.")
     for file in written.names:
         print(written.folder / file)
 
@@ -158,6 +218,38 @@ def _direction(result: SensorFit) -> str:
     return {1: "counter-clockwise from above", -1: "clockwise from above", 0: "direction of rotation unknown"}[
         result.angles.direction
     ]
+
+
+def _map_lines(pose: MapPose) -> list[str]:
+    from egvs.sensors.registration import PARAMETERS
+
+    best = pose.best
+    errors = best.standard_errors
+    values = {name: f"{getattr(best.pose, name):.3f} +- {errors[name]:.2g}" for name in PARAMETERS}
+    lines = [
+        f"pose in the world of {pose.scenario}: yaw {values['yaw_deg']}, pitch {values['pitch_deg']}, "
+        f"roll {values['roll_deg']} degrees; x {values['x_m']}, y {values['y_m']}, z {values['z_m']} m",
+        f"fit to the map: {pose.share_on_surface:.0%} of {len(pose.points_m):,} returns on the static world, mean "
+        f"distance {1000 * pose.residual_m:.1f} +- {1000 * pose.residual_se_m:.1f} mm, standard deviation "
+        f"{1000 * best.sigma_m:.1f} mm; {pose.shift_m:.2f} m from --site",
+    ]
+    return lines + list(pose.warnings)
+
+
+def _rotation(result: SensorFit) -> str:
+    rotation = result.rotation
+    if rotation is None:
+        return "rate unknown (the sweeps have no times)"
+    text = (
+        f"{abs(rotation.rate_hz):.4f} +- {rotation.rate_se_hz:.1g} turns per second, from {rotation.source} of "
+        f"{rotation.sweeps} sweeps"
+    )
+    if rotation.step_deg is None or rotation.firing_interval_s is None:
+        return text
+    return (
+        f"{text}; a firing every {1e6 * rotation.firing_interval_s:.3f} us makes an azimuth step of "
+        f"{rotation.step_deg:.4f} degrees"
+    )
 
 
 def _range_step(result: SensorFit) -> str:

@@ -24,6 +24,7 @@ _OMITTED_KEYS = frozenset(
         "overlapping_pairs",
         "rows",
         "settled_in_float64",
+        "signals",
         "solids",
         "sumo_seconds",
         "sumo_peak_mb",
@@ -127,7 +128,10 @@ def _scan_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[S
 
 
 def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any], flow_source: str = COUNTS) -> Iterator[Sentence]:
-    yield Sentence(_count(rest.pop("frames"), "frame"))
+    frames = _count(rest.pop("frames"), "frame")
+    if seeds := rest.pop("seeds", None):
+        frames += f" of {len(seeds)} simulations"
+    yield Sentence(frames)
     if "vehicles" in rest:
         yield Sentence(describe_vehicles(rest.pop("vehicles")))
         standing, longest_s = rest.pop("share_standing"), rest.pop("longest_standing_s")
@@ -222,6 +226,20 @@ def _report_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator
     rest.pop("best", None)
     rest.pop("worst", None)
     yield Sentence(f"{rest.pop('kilobytes'):,} kB")
+    for fit in rest.pop("approaches", ()):
+        yield Sentence(_describe_approach(fit))
+
+
+def _describe_approach(fit: dict[str, Any]) -> str:
+    """Return queue and speed of an approach, simulated and observed."""
+    texts = []
+    if fit["observed_queue_m"] is not None:
+        texts.append(f"queue {fit['queue_m']:.0f} m (observed {fit['observed_queue_m']:.0f} m)")
+    if fit["observed_speed_kmh"] is not None:
+        speed = "no vehicle" if fit["speed_kmh"] is None else f"{fit['speed_kmh']:.0f} km/h"
+        texts.append(f"{speed} (observed {fit['observed_speed_kmh']:.0f} km/h)")
+    period = f" in {fit['period']}" if fit["period"] else ""
+    return f"from {fit['approach']}{period}: {', '.join(texts)}"
 
 
 _SENTENCES: dict[str, Callable[[dict[str, Any], dict[str, Any]], Iterator[Sentence]]] = {

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from egvs.cli.console import WIDE, Column, console, make_table
 from egvs.report.formatting import format_percent
-from egvs.studies.tpog_page import format_bit, format_measured, format_share
+from egvs.studies.tpog_page import format_bit, format_measured, format_share, format_speed
 
 FULLY_COVERED = 0.95
 """A smaller covered share of the lanes is reported."""
@@ -33,6 +33,9 @@ def print_tpog_comparison(comparison: TpogComparison, page: Path, top: int | Non
         Column("distance", lambda lane: format_measured(lane.distance)),
         Column("occupancy recorded", lambda lane: format_share(lane.occupancy[0])),
         Column("simulated", lambda lane: format_share(lane.occupancy[1])),
+        Column("m/s recorded", lambda lane: format_speed(lane.speed.mean_m_s[0] if lane.speed else None)),
+        Column("simulated", lambda lane: format_speed(lane.speed.mean_m_s[1] if lane.speed else None)),
+        Column("speed distance", lambda lane: format_speed(lane.speed.distance_m_s if lane.speed else None)),
     ]
     out = console(WIDE)
     out.print(make_table(columns, comparison.lanes[:top]))

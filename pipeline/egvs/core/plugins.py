@@ -45,7 +45,14 @@ _REQUIREMENTS = {
 }
 """Required attributes of the objects of each group, and a description for messages."""
 
-_PACKAGES = {"PIL": "Pillow", "osi3": "osi-python", "pxr": "usd-core", "sklearn": "scikit-learn", "torch": "PyTorch"}
+_PACKAGES = {
+    "PIL": "Pillow",
+    "osi3": "osi-python",
+    "pxr": "usd-core",
+    "sklearn": "scikit-learn",
+    "torch": "PyTorch",
+    "velodyne_decoder": "velodyne-decoder",
+}
 """Names of packages that differ from the name that is imported."""
 
 

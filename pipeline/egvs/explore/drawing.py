@@ -28,6 +28,7 @@ from egvs.explore.road_meshes import LANE_HEIGHT_M, Mesh, junction_mesh, lane_me
 from egvs.explore.session import MovingPlan, Playback, PoseScore, Session
 from egvs.explore.view_state import View
 from egvs.report import colours
+from egvs.scoring.points_map import CLASS_LABELS, OVERLAP_POINTS, PointsMap, overlap_map
 from egvs.scoring.targets import SEEN_WELL_POINTS
 from egvs.sensors.sites import Pose, Site
 from egvs.validation.cloud_simulation import MeshPart
@@ -456,6 +457,7 @@ _SCAN_COLOUR, _STATIC_COLOUR = (200, 30, 80), (150, 150, 150)
 _VISIBLE_COLOUR, _HIDDEN_COLOUR = (0, 90, 181), (220, 95, 0)
 _THIS_COLOUR, _OTHER_COLOUR, _EQUAL_COLOUR = (0, 90, 181), (220, 95, 0), (222, 222, 222)
 _LEGEND_STEPS = 8
+_NO_NETWORK = "the traffic does not come from one road network"
 
 
 @dataclass(frozen=True)
@@ -474,6 +476,8 @@ class LayerContext:
         The site that the layer ``difference`` compares with; None if there is no other site.
     zero_m
         Origin of the drawing.
+    plan
+        The plan; None if there is none.
     """
 
     scene: viser.SceneApi
@@ -483,6 +487,7 @@ class LayerContext:
     view: View
     other: PoseScore | None
     zero_m: Vec3
+    plan: MovingPlan | None = None
 
     def draw_points(self, points: Points, point_colours: Bytes, size_m: float) -> None:
         """Draw points (n, 3) with their colours (n, 3)."""
@@ -503,7 +508,7 @@ def draw_layer(context: LayerContext) -> str:
     """
     context.scene.remove_by_name(LAYER_NAME)
     layer = context.view.layer
-    needs_sensor = layer not in ("traffic", "replay")
+    needs_sensor = layer not in ("traffic", "replay", "overlap_car", "overlap_pedestrian")
     if layer not in _DRAW_FUNCTIONS or (needs_sensor and not context.rating.is_feasible):
         return ""
     return _DRAW_FUNCTIONS[layer](context)
@@ -542,6 +547,41 @@ def _draw_blindspots(context: LayerContext) -> str:
     rows = [f"<b>{_escape_html(overall)}</b>"]
     rows += [_escape_html(f"{location.words}: {location.share:.0%} found") for location in spots.worst]
     return _scale_legend("share of vehicles not found", 0.0, 1.0, "{:.0%}") + _text_legend(rows)
+
+
+def _draw_points(context: LayerContext) -> str:
+    target = context.view.layer.removeprefix("points_")
+    points = context.session.points_map(context.rating.site, target)
+    if points is None:
+        return _text_legend([_NO_NETWORK])
+    shares = [f"{points.share_with(limit):.1%} of the surface with {limit:g} points or more" for limit in (1, 20)]
+    return _draw_classes(context, points, points.classes, CLASS_LABELS, f"points on a {target}") + _text_legend(shares)
+
+
+def _draw_overlap(context: LayerContext) -> str:
+    target = context.view.layer.removeprefix("overlap_")
+    if context.plan is None:
+        return _text_legend(["there is no plan"])
+    maps = [context.session.points_map(site, target) for site in context.plan.poses.sites]
+    known = [points for points in maps if points is not None]
+    if not known:
+        return _text_legend([_NO_NETWORK])
+    overlap = overlap_map(known)
+    labels = [str(count) for count in range(len(known) + 1)]
+    title = f"sensors of the plan with {OVERLAP_POINTS:g} points or more on a {target}"
+    return _draw_classes(context, overlap, overlap.values, labels, title)
+
+
+def _draw_classes(context: LayerContext, points: PointsMap, classes: Floats, labels: Sequence[str], title: str) -> str:
+    """Draw the class of each square metre of a map, and return the legend."""
+    ix, iy = np.nonzero(points.on_surface)
+    middles = np.column_stack([ix + 0.5, iy + 0.5, np.zeros(len(ix))]) * points.cell_m
+    at_m = middles + np.array([*points.origin_m, LAYER_HEIGHT_M]) - context.zero_m
+    highest = len(labels) - 1
+    context.draw_columns(at_m.astype(np.float32), colour_scale(classes[ix, iy], 0.0, highest), points.cell_m)
+    swatches = colour_scale(np.arange(len(labels), dtype=np.float64), 0.0, highest).tolist()
+    rows = [((red, green, blue), label) for (red, green, blue), label in zip(swatches, labels, strict=True)]
+    return _text_legend([f"<b>{title}</b>"]) + _swatch_legend(rows)
 
 
 def _draw_difference(context: LayerContext) -> str:
@@ -590,13 +630,20 @@ def _draw_replay(context: LayerContext) -> str:
             context.scene.add_mesh_simple(
                 f"{LAYER_NAME}/{name}", mesh.points, mesh.faces, color=colour, flat_shading=True, cast_shadow=False
             )
-    return _swatch_legend(
-        [
-            (_VISIBLE_COLOUR, f"{int(visible.sum())} vehicles with {SEEN_WELL_POINTS:g} or more points"),
-            (_HIDDEN_COLOUR, f"{int((~visible).sum())} vehicles with fewer"),
-            (_SCAN_COLOUR, f"{int(on_vehicle.sum()):,} points on vehicles"),
-        ]
-    )
+    time_s, last_s = (playback.period_s * number for number in (played.frame.number, playback.frames - 1))
+    swatches = [
+        (_VISIBLE_COLOUR, f"{_count_road_users(played.frame, visible)} with {SEEN_WELL_POINTS:g} or more points"),
+        (_HIDDEN_COLOUR, f"{_count_road_users(played.frame, ~visible)} with fewer"),
+        (_SCAN_COLOUR, f"{int(on_vehicle.sum()):,} points on them"),
+    ]
+    return _text_legend([f"<b>{time_s:,.1f} s of {last_s:,.1f} s</b>"]) + _swatch_legend(swatches)
+
+
+def _count_road_users(frame: TrafficFrame, selected: NDArray[np.bool_]) -> str:
+    """Return how many of some boxes are vehicles, and how many are people on foot or on bicycles."""
+    is_vehicle = frame.are_vehicles()
+    vehicles, people = int((selected & is_vehicle).sum()), int((selected & ~is_vehicle).sum())
+    return f"{vehicles} vehicles, {people} people" if people else f"{vehicles} vehicles"
 
 
 _DRAW_FUNCTIONS: dict[str, Callable[[LayerContext], str]] = {
@@ -604,6 +651,10 @@ _DRAW_FUNCTIONS: dict[str, Callable[[LayerContext], str]] = {
     "seen": _draw_entropy,
     "missed": _draw_entropy,
     "blindspots": _draw_blindspots,
+    "points_car": _draw_points,
+    "points_pedestrian": _draw_points,
+    "overlap_car": _draw_overlap,
+    "overlap_pedestrian": _draw_overlap,
     "difference": _draw_difference,
     "scan": _draw_scan,
     "ring": _draw_ring,

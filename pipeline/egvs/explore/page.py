@@ -49,7 +49,7 @@ HOST = "127.0.0.1"
 
 GIZMO_M = 6.0
 FRAME_S = 0.25
-"""Shortest time between frames when recorded traffic plays."""
+"""Shortest time between two pictures when recorded traffic plays."""
 
 FREE_MEMORY_EVERY = 32
 """Moves after which unused memory is returned to the system."""
@@ -85,6 +85,15 @@ class _Server(viser.ViserServer):
     def request_share_url(self, verbose: bool = True) -> str | None:
         """Refuse to publish the page."""
         return None
+
+
+def frames_per_step(period_s: float) -> int:
+    """Return by how many frames a new picture moves on: traffic with short frames plays in real time.
+
+    >>> frames_per_step(0.1), frames_per_step(1.0)
+    (2, 1)
+    """
+    return max(1, round(FRAME_S / period_s))
 
 
 class Page:
@@ -193,7 +202,9 @@ class Page:
                 if self._is_stopped:
                     return
                 if not self._has_request:
-                    next_frame = (self._requested.frame + 1) % self._playback.frames
+                    next_frame = (
+                        self._requested.frame + frames_per_step(self._playback.period_s)
+                    ) % self._playback.frames
                     self._requested = replace(self._requested, frame=next_frame)
                 view, self._has_request, self._is_busy = self._requested, False, True
             self._show_or_reject(view)
@@ -508,7 +519,7 @@ class Page:
             if site != other.site:
                 other = self.session.rate(name, site.pose, site.sensor)
         return drawing.LayerContext(
-            self.server.scene, self.session, self._playback, self.rating, self.view, other, self.zero_m
+            self.server.scene, self.session, self._playback, self.rating, self.view, other, self.zero_m, self.plan
         )
 
     def _status_text(self, is_dragging: bool) -> str:

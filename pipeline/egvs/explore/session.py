@@ -40,6 +40,7 @@ from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.scoring import blindspots
 from egvs.scoring.blindspots import CELL_M, SpotVisibility, VehicleSpots
 from egvs.scoring.egvs import EntropyField
+from egvs.scoring.points_map import PointsMap
 from egvs.scoring.scorer import PeriodTpog, Scorer
 from egvs.scoring.target_scores import TARGET_SCORES
 from egvs.scoring.targets import SEEN_WELL_POINTS, detection_probability, visible_targets
@@ -51,6 +52,7 @@ from egvs.sensors.sites import Pose, Site
 from egvs.stages import inputs, scene_checks
 from egvs.stages.base import StageContext
 from egvs.stages.inputs import CheckInputs, get_scene
+from egvs.stages.points_maps import target_positions
 from egvs.stages.site_scoring import TargetScorer
 from egvs.traffic import sumo_folder
 from egvs.traffic.network import Network
@@ -257,6 +259,11 @@ class Session:
         return str(self.scenario.score.rank_by)
 
     @property
+    def frames(self) -> int:
+        """Number of recorded frames that scores over vehicles use; of all frames if the scenario has no such score."""
+        return self.tpog.frames if self._targets is None else len(self._targets.record.numbers)
+
+    @property
     def ranked(self) -> list[PoseScore]:
         """The candidates, best first."""
         return sorted(self.candidates.values(), key=lambda candidate: candidate.rank)
@@ -363,6 +370,28 @@ class Session:
         visibility = targets.spots.visibility(visible.points, TARGET_SCORES[DEFAULT_SCORE](visible))
         return site_blindspots(site.name, targets.spots, visibility, self.tpog.grid)
 
+    def points_map(self, site: Site, target: str) -> PointsMap | None:
+        """Return the points that a standard target gets from a sensor at each square metre of the road surface.
+
+        Parameters
+        ----------
+        site
+            The sensor in a pose.
+        target
+            Name of one of :data:`egvs.scoring.points_map.TARGETS`.
+
+        Returns
+        -------
+        PointsMap, or None
+            None where the traffic does not come from one road network.
+        """
+        positions = self.work.remember("target positions", (), lambda: target_positions(self.work, self.tpog.grid))
+        for place in positions:
+            if place.target.name == target:
+                beams = self.beams(site)
+                return place.points_map(beams, detection_probability(self.scene_with(site), beams.sensor))
+        return None
+
     def scene_with(self, site: Site) -> Scene:
         """Return the scene with the effects that act when the candidate of a site is moved there."""
         return self._engine(site).scene
@@ -423,8 +452,19 @@ class Session:
         return Scorer(scene, read_tpog(folder.tpog), folder.trajectories, periods=(PeriodTpog(self.period, self.tpog),))
 
     def _scores(self, site: Site) -> dict[str, float]:
+        return self.score_beams(site, Beams.of(self._engine(site).scanner.scan_site(site)))
+
+    def score_beams(self, site: Site, beams: Beams) -> dict[str, float]:
+        """Return the scores of an empty scan, by name, as :attr:`PoseScore.scores`.
+
+        Parameters
+        ----------
+        site
+            The sensor.
+        beams
+            Its empty scan, such as a part of :meth:`beams`.
+        """
         engine = self._engine(site)
-        beams = Beams.of(engine.scanner.scan_site(site))
         result = engine.scorer.score(beams)
         if self.period:
             result = result.by_period[0]
@@ -514,12 +554,18 @@ class Playback:
         The session.
     frames_per_chunk
         Number of frames that are read at once.
+
+    Attributes
+    ----------
+    frames, period_s
+        Number of frames, and the time between two.
     """
 
     def __init__(self, session: Session, frames_per_chunk: int = 240) -> None:
         self._session, self._path = session, session.work.folder.trajectories
         self._frames_per_chunk = frames_per_chunk
-        self.frames = int(parquet.read_metadata(self._path, "trajectories")["frames"])
+        metadata = parquet.read_metadata(self._path, "trajectories")
+        self.frames, self.period_s = int(metadata["frames"]), float(metadata["frame_period_s"])
         self.parts = cloud_simulation.body_parts(session.scenario)
         self._meshes = VehicleMeshes.from_parts(self.parts)
         self._first_cached, self._cached_frames = -1, list[TrafficFrame]()

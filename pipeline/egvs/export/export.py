@@ -153,6 +153,10 @@ def export_run(
     with files.temporary_folder() as temp_folder:
         if file_format.name == "geotiff":
             written = list(_write_rasters(run, reference, temp_folder, selected, progress))
+            if run.work.inputs.common_network is None:
+                notes.append("points on target are left out: the traffic does not come from one road network")
+            if run.has_outdated_plan:
+                notes.append("the plan's overlap is left out: it is for other traffic. Run egvs place again")
         elif file_format.name in ("glb", "usd"):
             written = list(scene_files.write_scene(temp_folder, run, reference, is_usd=to == "usd"))
             progress("files written", 1, 1)
@@ -305,7 +309,7 @@ def _write_rasters(
             name += "_"
         used |= _raster_file_stems(name)
         yield from rasters.write_geotiff(folder, raster, reference, name)
-        progress(f"{raster.name} written", number, 1 + 3 * len(sites))
+        progress(f"{raster.name} written", number, 0)
 
 
 def _raster_file_stems(name: str) -> set[str]:

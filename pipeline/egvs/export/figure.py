@@ -91,7 +91,7 @@ def draw_figure(
     svg = _figure_svg(run, what, ranking, selected, FigureStyle.for_print(width_mm))
     progress("drawn", 1, 2)
     with files.atomic_write(path) as partial:
-        partial.write_bytes(_convert_svg(f"{svg}\n", kind))
+        partial.write_bytes(convert_svg(f"{svg}\n", kind))
     progress("written", 2, 2)
     return path
 
@@ -166,8 +166,21 @@ def ranking_chart(ranking: Ranking, style: FigureStyle) -> str:
     return bar_chart(bars, by.axis_title, alt, by.axis_factor, style, note)
 
 
-def _convert_svg(svg: str, kind: str) -> bytes:
-    """Content of a file; it does not depend on the time."""
+def convert_svg(svg: str, kind: str) -> bytes:
+    """Return a figure as the content of a file that does not depend on the time.
+
+    Parameters
+    ----------
+    svg
+        The figure.
+    kind
+        One of :data:`FILE_TYPES`.
+
+    Raises
+    ------
+    MissingBackendError
+        If the system library cairo is missing, unless ``kind`` is ``"svg"``.
+    """
     if kind == "svg":
         return svg.encode("utf-8")
     try:

@@ -25,8 +25,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
-from egvs.artefacts.readers import read_placement
-from egvs.artefacts.run_folder import PLACEMENT_FILES, RunFolder
+from egvs.artefacts.run_folder import RunFolder
 from egvs.city import results
 from egvs.core.errors import InputError
 from egvs.export.finished_run import FinishedRun
@@ -185,15 +184,12 @@ def _with_periods(run: FinishedRun, scores: pa.Table) -> pa.Table:
 
 
 def _plan_layers(run: FinishedRun, notes: list[str]) -> Iterator[Layer]:
-    plan = read_placement(*(run.work.path(name) for name in PLACEMENT_FILES))
+    if run.has_outdated_plan:
+        notes.append("the plan is left out: it is for other traffic, sites or settings. Run egvs place again")
+    plan = run.plan
     if plan is None:
         return
-    rows, _, metadata = plan
-    for name, key in metadata["stages"].items():
-        if name not in run.record.stages or run.record.stages[name].inputs != key:
-            notes.append("the plan is left out: it is for other traffic, sites or settings. Run egvs place again")
-            return
-    table = pa.Table.from_pylist(rows)
+    table = pa.Table.from_pylist(plan.rows)
     yield Layer(PLAN, point_geometries(table), to_plain_table(table))
 
 

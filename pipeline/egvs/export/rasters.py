@@ -1,7 +1,8 @@
 """Rasters of a run, seen from above, and their GeoTIFF files.
 
-The rasters show the occupancy by traffic, the entropy that a site sees and misses, and the share of vehicles that it
-misses. Cells are columns of voxels, or squares of a metre; a cell without observations has no data.
+The rasters show the occupancy by traffic, the entropy that a site sees and misses, the share of vehicles that it
+misses, the points that a car and a pedestrian get from it, and the overlap of the sensors of a plan. Cells are columns
+of voxels, or squares of a metre; a cell without observations, or off the road surface, has no data.
 
 - ``NAME.tif`` has the values, float32, with :data:`NODATA`, and ``NAME.qml`` the colours for QGIS.
 - ``NAME_colours.tif`` has the values in 254 steps with a colour table, for programs that show images as they are. 0 is
@@ -24,10 +25,15 @@ from numpy.typing import NDArray
 from egvs.artefacts import readers
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import read_tpog
+from egvs.core.grid import Grid
 from egvs.export.finished_run import ExportCrs, FinishedRun
 from egvs.export.layers import raster_qml
 from egvs.report import colours
 from egvs.report.figures import column_entropy
+from egvs.scoring.points_map import OVERLAP_POINTS, overlap_map
+from egvs.sensors.sites import Pose, Site
+from egvs.stages.plan_scans import plan_beams
+from egvs.stages.points_maps import points_maps, target_positions
 from egvs.stages.site_scans import empty_scans
 
 CellValues = NDArray[np.float64]
@@ -85,6 +91,36 @@ def run_rasters(run: FinishedRun, sites: Collection[str]) -> Iterator[Raster]:
         for spots in readers.read_blindspots(run.artefact(RunFolder.blindspots.name), set(sites)):
             name, description = f"vehicles_missed_{spots.site}", f"Share of the vehicles that {spots.site} misses"
             yield Raster(name, description, "1", spots.share_missed, spots.origin_m, spots.cell_m, 1.0)
+    yield from _points_rasters(run, sites, tpog.grid)
+
+
+def _points_rasters(run: FinishedRun, sites: Collection[str], grid: Grid) -> Iterator[Raster]:
+    """Points on a car and on a pedestrian from some sites, then by how many sensors of the plan; none without lanes."""
+    positions = target_positions(run.work, grid)
+    scans = ((scan.site.name, scan.beams) for scan in empty_scans(run.work, sites))
+    for site, points in points_maps(run.work, positions, scans):
+        description = f"Points that a {points.target.name} gets from {site}"
+        name = f"points_{points.target.name}_{site}"
+        yield Raster(name, description, "1", points.values, points.origin_m, points.cell_m, _max_value(points.values))
+
+    plan = run.plan
+    if plan is None or not plan.rows or not positions:
+        return
+    sensors = [_planned_site(row) for row in plan.rows]
+    moved = "moves" in plan.metadata["plan"]
+    rows = list(points_maps(run.work, positions, plan_beams(run.work, sensors, moved=moved)))
+    for place in positions:
+        overlap = overlap_map([row.points for row in rows if row.points.target is place.target])
+        target = place.target.name
+        description = f"Sensors of the plan from which a {target} gets {OVERLAP_POINTS:g} points or more"
+        peak = float(len(sensors))
+        yield Raster(f"overlap_{target}", description, "1", overlap.values, overlap.origin_m, overlap.cell_m, peak)
+
+
+def _planned_site(row: Mapping[str, Any]) -> Site:
+    """A row of ``placement.parquet`` as a site."""
+    pose = Pose(**{name: row[name] for name in ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")})
+    return Site(row["site"], pose, row["sensor"])
 
 
 def _max_value(values: CellValues) -> float:

@@ -2,8 +2,8 @@
 
 Libraries in C++ and Rust allocate as much memory as a damaged file asks for, print to the terminal, and may end their
 process. Here they do so in a process of their own, which runs a module of this package as a program:
-``python -m MODULE PATH MEMORY_MB``. It calls :func:`serve`, which writes what a generator yields to standard output:
-each :class:`Block` as a line of JSON and the bytes of its points.
+``python -m MODULE PATH MEMORY_MB [ARGUMENTS...]``. It calls :func:`serve`, which writes what a generator yields to
+standard output: each :class:`Block` as a line of JSON and the bytes of its points.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -69,7 +69,9 @@ def serve(read: Callable[[Path], Iterator[Block]]) -> None:
         os._exit(1)
 
 
-def read_blocks(module: str, path: Path, where: str, doing: str) -> Iterator[Block]:
+def read_blocks(
+    module: str, path: Path, where: str, doing: str, arguments: Sequence[str] = ()
+) -> Generator[Block, None, None]:
     """Yield the blocks that a module's :func:`serve` writes for a file.
 
     Parameters
@@ -82,6 +84,8 @@ def read_blocks(module: str, path: Path, where: str, doing: str) -> Iterator[Blo
         The file, for messages.
     doing
         What failed, for messages, e.g. "cannot be read as E57".
+    arguments
+        Passed on to the module as ``sys.argv[3:]``.
 
     Raises
     ------
@@ -89,6 +93,7 @@ def read_blocks(module: str, path: Path, where: str, doing: str) -> Iterator[Blo
         When the other process fails, or needs more memory than :data:`egvs.core.limits.READER_MEMORY`.
     """
     command = [sys.executable, "-P", "-m", module, os.fspath(path.resolve()), str(limits.READER_MEMORY.maximum)]
+    command += arguments
     with (
         tempfile.TemporaryFile() as errors,
         subprocess.Popen(command, env=_environment(), stdout=subprocess.PIPE, stderr=errors) as reader,

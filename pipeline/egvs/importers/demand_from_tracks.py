@@ -1,7 +1,7 @@
 """Estimate the demand of a new scenario from recorded tracks: turning counts, fleet, speeds and gaps.
 
-Steps of :func:`estimate_demand`: read and clean the tracks; match motor vehicles to lanes
-(:mod:`egvs.traffic.track_matching`); count them by movement, and estimate how they drive
+Steps of :func:`estimate_demand`, after the motor vehicles were matched to lanes
+(:mod:`egvs.importers.recorded_motion`): count them by movement, and estimate how they drive
 (:mod:`egvs.traffic.track_demand`). The result is written as ordinary keys of ``[traffic]``, each with its interval in a
 comment. What was not observed often enough keeps SUMO's default, or is marked for the user.
 """
@@ -14,24 +14,18 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from egvs.core.errors import InputError
 from egvs.importers import junctions
 from egvs.importers.fleet_from_tracks import VEHICLE_CLASSES, KindEstimate, estimate_fleet
 from egvs.importers.junctions import StreetJunction, Streets
-from egvs.importers.recorded_traffic import TrackFiles
+from egvs.importers.recorded_motion import MatchedRecording
 from egvs.scenario.traffic_config import CountConfig
-from egvs.tracks import cleaning, resampling
 from egvs.tracks.cleaning import CleanTracks
-from egvs.tracks.sizes import CLASS_SIZES
-from egvs.traffic import estimates, recorded_tracks, track_alignment, track_demand, track_matching
+from egvs.traffic import estimates, track_demand
 from egvs.traffic.estimates import MIN_OBSERVATIONS
 from egvs.traffic.network import Network
 from egvs.traffic.track_alignment import Alignment
 from egvs.traffic.track_demand import Passage
-
-_MAX_GAP_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -120,13 +114,13 @@ class TrackDemand:
         return text
 
 
-def estimate_demand(recording: TrackFiles, streets: Streets, junction: StreetJunction) -> TrackDemand:
+def estimate_demand(recording: MatchedRecording, streets: Streets, junction: StreetJunction) -> TrackDemand:
     """Estimate the demand through a junction from recorded tracks.
 
     Parameters
     ----------
     recording
-        Files of recorded tracks.
+        The recorded tracks, matched to the lanes of the streets.
     streets
         The streets of the new scenario.
     junction
@@ -135,39 +129,26 @@ def estimate_demand(recording: TrackFiles, streets: Streets, junction: StreetJun
     Raises
     ------
     InputError
-        When a file is damaged or far from the streets, or no vehicle passes the junction.
+        When no vehicle passes the junction.
     """
-    tracks = recording.read(streets)
-    cleaned = cleaning.clean_tracks(tracks, CLASS_SIZES)
-    first_s, duration_s = float(cleaned.time_s.min()), float(np.ptp(cleaned.time_s))
-    period_s = track_matching.PERIOD_S
-    n_frames = int(duration_s / period_s + 1e-6) + 1
-    if n_frames > recorded_tracks.MAX_FRAMES:
-        problem = f"the tracks last {duration_s:,.0f} s, more than {recorded_tracks.MAX_FRAMES * period_s:,.0f} s"
-        raise InputError(recording.source.paths[0], problem, "Check the times.")
-    boxes = resampling.resample(cleaned, first_s, period_s, n_frames, _MAX_GAP_S)
-    is_vehicle = np.array([name in VEHICLE_CLASSES for name in cleaned.classes])
-    boxes = boxes.select(is_vehicle[boxes.track])
-    moves = boxes.speed_m_s > cleaning.MOVING_M_S
-    alignment = track_alignment.align(np.column_stack([boxes.x_m, boxes.y_m])[moves], streets.network)
-    matched = track_matching.match_tracks(boxes, period_s, streets.network)
+    cleaned, matched, duration_s = recording.tracks, recording.matched, recording.duration_s
     passages = track_demand.find_passages(matched)
     if not passages.counted:
         problem = "no recorded vehicle passes a junction of the network"
         hint = "Check that map and tracks show the same place and use the same coordinates."
-        raise InputError(recording.source.paths[0], problem, hint)
+        raise InputError(recording.path, problem, hint)
 
     counted = _count_movements(passages.counted, streets, junction)
     if not counted.vehicles:
         problem = f"no recorded vehicle passes the {junction.title}"
-        raise InputError(recording.source.paths[0], problem, "Choose another junction with --at LAT,LON.")
+        raise InputError(recording.path, problem, "Choose another junction with --at LAT,LON.")
     notes = list(_passage_notes(passages, counted.unassigned))
     notes += _people_notes(cleaned)
     fleet = estimate_fleet(cleaned, [passage.track for passage in passages.counted], matched)
     movements = tuple(
         _movement(flow, counted.vehicles[number], duration_s) for number, flow in enumerate(counted.flows)
     )
-    return TrackDemand(duration_s, movements, fleet, tuple(notes), alignment)
+    return TrackDemand(duration_s, movements, fleet, tuple(notes), recording.alignment)
 
 
 def _movement(flow: CountConfig, vehicles: int, duration_s: float) -> MovementEstimate:
@@ -256,7 +237,7 @@ def _passage_notes(passages: track_demand.Passages, unassigned: int) -> Iterator
     ]
     texts = [f"{number} {reason}" for number, reason in left_out if number]
     if texts:
-        yield f"recorded vehicles that count for no movement: {', '.join(texts)}"
+        yield f"Recorded vehicles that count for no movement: {', '.join(texts)}."
 
 
 def _people_notes(tracks: CleanTracks) -> Iterator[str]:
@@ -265,6 +246,6 @@ def _people_notes(tracks: CleanTracks) -> Iterator[str]:
     if others:
         texts = [f"{number} {name}{'' if number == 1 else 's'}" for name, number in others.most_common()]
         yield (
-            f"not part of the demand: {', '.join(texts)}. Pedestrians and bicycles are added with the effect"
-            " pedestrians_bicycles"
+            f"Not part of the demand: {', '.join(texts)}. Pedestrians and bicycles are added with the effect"
+            " pedestrians_bicycles."
         )

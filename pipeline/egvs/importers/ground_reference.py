@@ -65,7 +65,13 @@ def with_roads(context: MapContext, streets: Streets) -> MapContext:
     return replace(context, window=context.window.union(box(*low_m, *high_m).buffer(_MARGIN_M)))
 
 
-def find_zero(roads: RoadSource, file: MapFile, junction: StreetJunction, terrain: Terrain | None) -> ZeroHeight:
+def find_zero(
+    roads: RoadSource,
+    file: MapFile,
+    junction: StreetJunction,
+    terrain: Terrain | None,
+    terrain_files: Sequence[MapFile] = (),
+) -> ZeroHeight:
     """Return the height of z = 0.
 
     Parameters
@@ -76,6 +82,8 @@ def find_zero(roads: RoadSource, file: MapFile, junction: StreetJunction, terrai
         z = 0 is its ground, unless the road map is a SUMO network, whose heights are used as they are.
     terrain
         The ground; None without a terrain.
+    terrain_files
+        Its files, for messages.
 
     Raises
     ------
@@ -89,9 +97,9 @@ def find_zero(roads: RoadSource, file: MapFile, junction: StreetJunction, terrai
     if terrain is None:
         return ZeroHeight(road_height_m if has_heights else None)
     if not has_heights:
-        return ZeroHeight(draping.ground_height_m(terrain, junction.at_m, file.path))
+        return ZeroHeight(draping.ground_height_m(terrain, junction.at_m, _names(terrain_files) or file.path))
     measured = terrain.terrain if isinstance(terrain, ExtendedTerrain) else terrain
-    difference_m, spread_m = draping.level_difference_m(roads.network, measured, file.path)
+    difference_m, spread_m = draping.level_difference_m(roads.network, measured, _names(terrain_files) or file.path)
     note = f"The terrain is {difference_m:+.2f} m above the heights of the road map (median; spread {spread_m:.2f} m)."
     if spread_m > _LARGE_SPREAD_M:
         note += " So large a spread suggests that one of them is wrong, or of another place."
@@ -99,8 +107,12 @@ def find_zero(roads: RoadSource, file: MapFile, junction: StreetJunction, terrai
 
 
 def lay_on_ground(
-    roads: RoadSource, file: MapFile, junction: StreetJunction, terrain: Terrain | None
-) -> RoadSource:  # fmt: skip
+    roads: RoadSource,
+    file: MapFile,
+    junction: StreetJunction,
+    terrain: Terrain | None,
+    terrain_files: Sequence[MapFile] = (),
+) -> RoadSource:
     """Return the roads with heights that count from the ground at a junction.
 
     Parameters
@@ -111,6 +123,8 @@ def lay_on_ground(
         The junction.
     terrain
         The ground; None without a terrain.
+    terrain_files
+        Its files, for messages.
 
     Raises
     ------
@@ -128,8 +142,12 @@ def lay_on_ground(
     if terrain is None:
         return roads
     levels = roads.edge_levels() if isinstance(roads, OsmRoads) else {}
-    draped = draping.drape_network(roads.network, terrain, junction.at_m, levels, file.path)
+    draped = draping.drape_network(roads.network, terrain, junction.at_m, levels, _names(terrain_files) or file.path)
     return _with_network(roads, draped.text, draped.notes, file.path)
+
+
+def _names(files: Sequence[MapFile]) -> str:
+    return ", ".join(str(file.path) for file in files)
 
 
 def _with_network(roads: RoadSource, network: str, notes: Sequence[str], path: Path) -> NetworkRoads:

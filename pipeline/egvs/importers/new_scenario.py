@@ -65,6 +65,7 @@ from egvs.importers.openstreetmap import OsmRoads
 from egvs.importers.osm_network import ATTRIBUTION, NETWORK_FILE
 from egvs.importers.osm_solids import ImportCounts
 from egvs.importers.overpass import DownloadedExtract
+from egvs.importers.recorded_motion import MatchedRecording, match_recording
 from egvs.importers.recorded_traffic import TrackFiles
 from egvs.importers.relief import Relief, ground_surface
 from egvs.importers.road_source import NetworkRoads, RoadSource
@@ -79,6 +80,8 @@ from egvs.importers.scenario_files import (
     TomlTable,
     reachable_area,
 )
+from egvs.importers.signal_assignment import RecordedMotion
+from egvs.importers.signal_programs import Replay, SignalPlan
 from egvs.importers.static_objects import MapSummary, ReadMap, StaticObjects, SurfaceModel
 from egvs.importers.street_counts import StreetCounts
 from egvs.scenario.loading import load
@@ -104,6 +107,10 @@ PEOPLE_HINT = (
     "Pedestrians are added with --set effects.pedestrians_bicycles.pedestrians_per_h=300 (bicycles: bicycles_per_h)."
 )
 
+_SIGNALS_OF_TRACKS_NOTE = (
+    "Recorded traffic does not depend on the signals. They are tested against it, and network.net.xml replays them on"
+    " its clock; with --like instead of --tracks, simulated traffic obeys them."
+)
 _NO_SIGNALS_NOTE = "No junction in the map has signals; the one with the most incoming lanes was chosen."
 
 
@@ -147,6 +154,8 @@ class NewScenario:
         The user's counts, if there are any.
     zones
         Zones of the junction, for which results are reported.
+    are_lights_guessed
+        Whether it was guessed which recorded light governs which road.
     """
 
     folder: Path
@@ -167,6 +176,7 @@ class NewScenario:
     signal_notes: tuple[str, ...] = ()
     counted: StreetCounts | None = None
     zones: tuple[Zone, ...] = ()
+    are_lights_guessed: bool = False
 
     @property
     def maps_have_notes(self) -> bool:
@@ -217,6 +227,8 @@ class NewScenarioOptions:
         Files of recorded tracks, or folders of them, which replace assumed traffic.
     like
         The same, but from which the demand of simulated traffic is estimated.
+    pedestrian_tracks
+        The same, of people on foot and on bicycles, who are put beside simulated vehicles.
     signals
         Files of recorded signals of the junction, and of what their groups govern; see :mod:`recorded_signals`.
     track_crs
@@ -237,6 +249,7 @@ class NewScenarioOptions:
     align: tuple[PointPair, ...] = ()
     tracks: tuple[Path, ...] = ()
     like: tuple[Path, ...] = ()
+    pedestrian_tracks: tuple[Path, ...] = ()
     signals: tuple[Path, ...] = ()
     track_crs: str | None = None
     track_columns: Path | None = None
@@ -250,15 +263,16 @@ class NewScenarioOptions:
         if self.tracks and self.like:
             hint = "--tracks replays tracks, --like simulates such traffic."
             raise InputError("--like", "cannot be combined with --tracks", hint)
-        if self.tracks and self.signals:
-            hint = "Use them with --like, for simulated traffic."
-            raise InputError("--signals", "has no effect on recorded traffic (--tracks)", hint)
         if self.counts is not None and (self.tracks or self.like):
             key = "--tracks" if self.tracks else "--like"
             raise InputError("--counts", f"cannot be combined with {key}", "Use one of them.")
+        if self.tracks and self.pedestrian_tracks:
+            hint = "Give the files of all recorded road users by --tracks."
+            raise InputError("--pedestrian-tracks", "is for simulated vehicles, not for --tracks", hint)
         for key, value in (("--track-crs", self.track_crs), ("--track-columns", self.track_columns)):
-            if value is not None and not self.tracks and not self.like:
-                raise InputError(key, "has no effect without recorded tracks", "Give them with --tracks or --like.")
+            if value is not None and not (self.tracks or self.like or self.pedestrian_tracks):
+                hint = "Give them with --tracks, --like or --pedestrian-tracks."
+                raise InputError(key, "has no effect without recorded tracks", hint)
         if self.surroundings_m is not None and self.surroundings_m < SURROUNDINGS_MIN_M:
             raise InputError(
                 "--surroundings",
@@ -305,8 +319,11 @@ def create_scenario(
     files = map_readers.open_maps([maps] if isinstance(maps, Path) else maps)
     surface_files = map_readers.open_surface(options.surface)
     roads = _read_roads(files.roads, RoadOptions(options.lefthand, options.walk, has_terrain=bool(files.terrain)), at)
-    recording, example = (_find_tracks(paths, options) for paths in (options.tracks, options.like))
-    junction = _choose_junction(roads.streets, at, recording or example, files.roads.path)
+    recording, example, people = (
+        _find_tracks(paths, options) for paths in (options.tracks, options.like, options.pedestrian_tracks)
+    )
+    any_tracks = recording or example or people
+    junction = _choose_junction(roads.streets, at, any_tracks, files.roads.path)
 
     level = roads.on_level_of(junction)
     if level.streets is not roads.streets:
@@ -326,8 +343,8 @@ def create_scenario(
         terrain = ground_reference.measured_ground(measured)
     elif measured is not None:
         ground_notes.append("The ground of the point cloud is not used, since a terrain file is given.")
-    zero = ground_reference.find_zero(roads, files.roads, junction, terrain)
-    roads = ground_reference.lay_on_ground(roads, files.roads, junction, terrain)
+    zero = ground_reference.find_zero(roads, files.roads, junction, terrain, files.terrain)
+    roads = ground_reference.lay_on_ground(roads, files.roads, junction, terrain, files.terrain)
     terrain_m = None if terrain is None else _terrain_points(terrain, window, zero.height_m or 0.0)
     ground = ground_surface(roads.streets, terrain_m)
     objects = static_objects.collect_objects(
@@ -349,17 +366,27 @@ def create_scenario(
 
     notes = [*roads.notes, *zero.notes, *(() if terrain is None else terrain.notes), *ground_notes]
     notes += _surface_notes(surface, objects.counts)
-    if at is None and recording is None and example is None and not junction.signalised:
+    if at is None and any_tracks is None and not junction.signalised:
         notes.append(_NO_SIGNALS_NOTE)
     notes += _ring_notes(streets, junction)
     notes += scenario_notes(roi.area.covers(junction.area), objects.counts)
     notes += _level_notes(level, objects.counts) + _range_notes(objects.counts)
     if options.walk:
         notes.append(PEOPLE_HINT)
-    network, signal_notes = _with_signals(roads.network, junction, options.signals, streets)
-    junction = replace(junction, signalised=junction.signalised or bool(options.signals))
-    planned = _plan_traffic(network, streets, junction, options, example, files.roads.path)
-    notes += [*signal_notes, *planned.notes]
+    matched = [match_recording(tracks, streets) for tracks in (recording, example, people) if tracks is not None]
+    signals = SignalPlan(roads.network, ())
+    if options.signals:
+        replay = None
+        if recording is not None:
+            replay = Replay.of(recording.time_range_s, begin_s=0.0)
+        elif people is not None:
+            replay = Replay.of(people.time_range_s, begin_s=DEFAULT_WARMUP_S)
+        signals = _with_signals(roads.network, junction, options.signals, streets, matched, replay)
+        junction = replace(junction, signalised=True)
+        notes += [] if recording is None else [_SIGNALS_OF_TRACKS_NOTE]
+    like = None if example is None else matched[0]
+    planned = _plan_traffic(signals.network, streets, junction, options, like, files.roads.path)
+    notes += [*signals.notes, *planned.notes]
     relief = Relief.of_region(streets, junction, roi)
     if relief.other_levels:
         notes.append(f"Lanes on another level cross the region of interest: {', '.join(relief.other_levels)}.")
@@ -368,8 +395,8 @@ def create_scenario(
         folder, junction, roi, streets, len(poles), objects.counts, 0, planned.assumed, tuple(notes),
         height_m=relief.z_range_m[1] - relief.z_range_m[0], maps=objects.maps,
         attributions=_attributions(roads, objects), from_at_m=_distance_m(streets, junction, at),
-        demand=planned.demand, signal_notes=signal_notes, counted=planned.counted,
-        zones=junction_zones.junction_zones(streets, junction, roi),
+        demand=planned.demand, signal_notes=signals.notes, counted=planned.counted,
+        zones=junction_zones.junction_zones(streets, junction, roi), are_lights_guessed=signals.is_guessed,
     )  # fmt: skip
     ground_m = relief.ground_m(ground, poles)
     columns = _site_columns(poles, ground_m, relief, maps_read, roi, zero.height_m or 0.0)
@@ -378,15 +405,20 @@ def create_scenario(
     if terrain_m is not None:
         terrain_files[TERRAIN_FILE] = partial(ply.write, points_m=terrain_m)
     statics = scenario_files.statics_table(list(meshes), *terrain_files)
+    signals_end_s = None if signals.clock is None else signals.clock.to_s
+    document = _scenario_toml(
+        name, scenario, relief, statics, objects.zero_height_m, recording, people, signals_end_s
+    )  # fmt: skip
     contents: dict[str, FileContent] = {
-        NETWORK_FILE: network,
+        NETWORK_FILE: signals.network,
         STATICS_FILE: scenario_files.solids_geojson(objects.solids, objects.counts, scenario.attributions),
         SITES_FILE: scenario_files.sites_csv(poles, columns),
         **({ZONES_FILE: junction_zones.zones_geojson(scenario.zones)} if scenario.zones else {}),
         **meshes,
         **terrain_files,
         **({} if recording is None else recording.copies()),
-        SCENARIO_FILE: _scenario_toml(name, scenario, relief, statics, objects.zero_height_m, recording),
+        **({} if people is None else people.copies()),
+        SCENARIO_FILE: document,
     }
     checked: list[NewScenario] = []
 
@@ -429,16 +461,15 @@ def download_map(
 
 
 def _with_signals(
-    network: str, junction: StreetJunction, paths: Sequence[Path], streets: Streets
-) -> tuple[str, tuple[str, ...]]:
-    """Return the network with recorded signals at the junction, and notes on them; unchanged without files."""
-    if not paths:
-        return network, ()
+    network: str, junction: StreetJunction, paths: Sequence[Path], streets: Streets,
+    matched: Sequence[MatchedRecording], replay: Replay | None,
+) -> SignalPlan:  # fmt: skip
+    """Return the network with recorded signals at the junction, and notes on them."""
     if junction.ring is not None:
         raise InputError("--signals", "the junction is a roundabout", "Choose another junction with --at LAT,LON.")
     signals = recorded_signals.read_signals(paths)
-    plan = signal_programs.apply_signals(network, junction.id, signals, streets.frame, "--signals")
-    return plan.network, plan.notes
+    motion = RecordedMotion.joined([each.motion() for each in matched])
+    return signal_programs.apply_signals(network, junction.id, signals, streets.frame, "--signals", motion, replay)
 
 
 class _PlannedTraffic(NamedTuple):
@@ -451,8 +482,8 @@ class _PlannedTraffic(NamedTuple):
 
 
 def _plan_traffic(
-    network: str, streets: Streets, junction: StreetJunction, options: NewScenarioOptions, example: TrackFiles | None,
-    path: Path,
+    network: str, streets: Streets, junction: StreetJunction, options: NewScenarioOptions,
+    example: MatchedRecording | None, path: Path,
 ) -> _PlannedTraffic:  # fmt: skip
     if example is not None:
         demand = demand_from_tracks.estimate_demand(example, streets, junction)
@@ -680,7 +711,7 @@ def scenario_notes(junction_fits: bool, counts: ImportCounts) -> list[str]:
 
 def _scenario_toml(
     name: str, scenario: NewScenario, relief: Relief, statics: TomlTable, zero_height_m: float | None,
-    recording: TrackFiles | None,
+    recording: TrackFiles | None, people: TrackFiles | None, signals_end_s: float | None,
 ) -> str:  # fmt: skip
     title = scenario.junction.title
     values: dict[str, Any] = {
@@ -701,6 +732,8 @@ def _scenario_toml(
         "junction_blocker_s": JUNCTION_BLOCKER_S,
         "teleport_s": TELEPORT_S,
     }
+    if people is not None:
+        traffic |= people.pedestrian_table(signals_end_s)
     if recording is not None:
         traffic = recording.traffic_table()
     tables = {
@@ -791,6 +824,8 @@ def _assumptions(scenario: NewScenario, *, is_recorded: bool) -> list[str]:
         assumed += scenario.counted.assumptions
     if scenario.junction.signalised and not is_recorded:
         assumed.append("signal plans")
+    if scenario.are_lights_guessed:
+        assumed.append("which recorded light governs which road")
     return [*assumed, *assumed_sizes(scenario.statics), "positions of the poles"]
 
 

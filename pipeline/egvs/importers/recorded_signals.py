@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -35,7 +36,6 @@ _J2735 = {
 _SIND = {"0": RED, "1": GREEN, "3": YELLOW}
 _TAF_BW = ("signal_group_id", "timestamp_ms", "movement_state")
 _SIND_TIME = "timestamp(ms)"
-_GROUPS = ("group", "from_edge", "to_edge")
 _KML = "{http://www.opengis.net/kml/2.2}"
 _HINT = "Give the recorded states (TAF-BW or SinD) and a file that assigns the groups (KML or CSV)."
 
@@ -98,10 +98,13 @@ class GroupOfEdges:
     from_edge: str
     to_edge: str
 
+    COLUMNS: ClassVar = ("group", "from_edge", "to_edge")
+    """Columns of a CSV file with such rows."""
+
 
 @dataclass(frozen=True, eq=False)
 class RecordedSignals:
-    """States by signal group, and what the groups govern."""
+    """States by signal group, and what the groups govern; nothing, where no file says so."""
 
     records: dict[str, SignalRecord]
     ways: tuple[GroupOfWay, ...]
@@ -119,7 +122,7 @@ def read_signals(paths: Sequence[Path]) -> RecordedSignals:
     Raises
     ------
     InputError
-        When a file does not exist, is damaged or of an unknown format, or one of the two kinds is missing.
+        When a file does not exist, is damaged or of an unknown format, or no file has states.
     """
     records: dict[str, SignalRecord] = {}
     ways: list[GroupOfWay] = []
@@ -133,16 +136,14 @@ def read_signals(paths: Sequence[Path]) -> RecordedSignals:
             records |= _read_taf_bw(path)
         elif _SIND_TIME in names:
             records |= _read_sind(path, [name for name in names if "light" in name.lower()])
-        elif set(_GROUPS) <= set(names):
-            table = columns.read_table(path, _GROUPS)
-            rows = zip(*(table.texts(name) for name in _GROUPS), strict=True)
+        elif set(GroupOfEdges.COLUMNS) <= set(names):
+            table = columns.read_table(path, GroupOfEdges.COLUMNS)
+            rows = zip(*(table.texts(name) for name in GroupOfEdges.COLUMNS), strict=True)
             edges += [GroupOfEdges(group.lower(), start, end) for group, start, end in rows]
         else:
             raise InputError(path, "neither recorded states of signals nor an assignment of signal groups", _HINT)
     if not records:
         raise InputError("--signals", "no file has recorded states of signals", _HINT)
-    if not ways and not edges:
-        raise InputError("--signals", "no file says which lanes each signal group governs", _HINT)
     return RecordedSignals(records, tuple(ways), tuple(edges))
 
 

@@ -7,6 +7,7 @@ import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,9 @@ from egvs.core.grid import XY, Roi
 from egvs.formats.georeference import Georeference
 from egvs.importers.junctions import Streets
 from egvs.importers.osm_network import NETWORK_FILE
-from egvs.scenario.model import Scenario
+from egvs.scenario.model import Scenario, TpogConfig
 from egvs.scenario.track_columns import TrackColumns
+from egvs.scenario.traffic_config import DEFAULT_FRAMES
 from egvs.tracks import track_readers
 from egvs.tracks.model import Tracks
 from egvs.tracks.track_readers import TrackSource
@@ -31,10 +33,14 @@ from egvs.world import geolocation
 FOLDER = "tracks"
 """Folder of the copies in the scenario."""
 
-FRAMES_WANTED, MAX_PERIOD_S = 1000, 1.0
-"""The frame period of a short recording is shorter than this, so that there are enough frames."""
+MIN_FRAMES, MAX_PERIOD_S = 1000, 1.0
+"""A recording with fewer frames than this gets a shorter frame period than that."""
 
 _PERIODS_S = (0.1, 0.2, 0.25, 0.5, MAX_PERIOD_S)
+_SIMULATED_PERIODS_S = (0.25, 0.5, MAX_PERIOD_S)
+"""Multiples of the default step of a simulation."""
+
+_BLOCKS = int(TpogConfig.model_fields["blocks"].default)
 _MARGIN_M = 1000.0
 
 
@@ -96,15 +102,50 @@ class TrackFiles:
         return {file: f"{FOLDER}/{file.relative_to(folder).as_posix()}" for file in files}
 
     def traffic_table(self) -> dict[str, Any]:
-        """Return the keys of ``[traffic]``."""
+        """Return the keys of ``[traffic]`` for recorded traffic."""
+        period_s = self._frame_period_s(_PERIODS_S)
+        return self._source_keys("tracks", {"frame_period_s": period_s, "roads": NETWORK_FILE})
+
+    def pedestrian_table(self, until_s: float | None = None) -> dict[str, Any]:
+        """Return the keys of ``[traffic]`` for recorded people beside simulated vehicles.
+
+        Parameters
+        ----------
+        until_s
+            When the recorded signals end, on the clock of the recording; frames after it are left out.
+
+        Raises
+        ------
+        InputError
+            When the recording is too short for the blocks of the TPOG.
+        """
+        period_s = self._frame_period_s(_SIMULATED_PERIODS_S)
+        first_s, last_s = self.time_range_s
+        if until_s is not None:
+            last_s = min(last_s, until_s)
+        frames = min(int((last_s - first_s) / period_s + 1e-6) + 1, DEFAULT_FRAMES)
+        if frames < _BLOCKS:
+            problem = f"expected at least {_BLOCKS} frames of {period_s:g} s, got {max(frames, 0)}"
+            raise InputError(self.source.paths[0], problem, "Use a longer recording of people and signals.")
+        frames -= frames % _BLOCKS
+        return self._source_keys("pedestrian_tracks", {"frames": frames, "frame_period_s": period_s})
+
+    def _source_keys(self, key: str, times: dict[str, Any]) -> dict[str, Any]:
+        """Return the key with the files, those of times, and those that say how the files are read."""
         source = self.source
-        table: dict[str, Any] = {"tracks": [self._names(path)[path.absolute()] for path in source.paths]}
+        table: dict[str, Any] = {key: [self._names(path)[path.absolute()] for path in source.paths]}
         if source.crs is not None:
             table["track_crs"] = source.crs
-        table |= {"frame_period_s": self._frame_period_s(), "roads": NETWORK_FILE}
+        table |= times
         if source.columns is not None:
             table["track_columns"] = source.columns.model_dump(exclude_unset=True)
         return table
+
+    @cached_property
+    def time_range_s(self) -> tuple[float, float]:
+        """The first and the last time, on the clock of the recording."""
+        time_s = np.concatenate([tracks.time_s for tracks in self.source.read()])
+        return float(np.nanmin(time_s)), float(np.nanmax(time_s))
 
     def read(self, streets: Streets) -> Tracks:
         """Read the tracks in the world frame of streets; InputError where they are damaged or far from them."""
@@ -118,10 +159,10 @@ class TrackFiles:
         tracks = self.read(streets)
         return float(np.nanmedian(tracks.x_m)), float(np.nanmedian(tracks.y_m))
 
-    def _frame_period_s(self) -> float:
-        time_s = np.concatenate([tracks.time_s for tracks in self.source.read()])
-        wanted_s = float(np.nanmax(time_s) - np.nanmin(time_s)) / FRAMES_WANTED
-        return max((period_s for period_s in _PERIODS_S if period_s <= wanted_s), default=_PERIODS_S[0])
+    def _frame_period_s(self, periods_s: Sequence[float]) -> float:
+        first_s, last_s = self.time_range_s
+        longest_s = (last_s - first_s) / MIN_FRAMES
+        return max((period_s for period_s in periods_s if period_s <= longest_s), default=periods_s[0])
 
 
 def describe(recorded: RecordedTracks) -> str:

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,11 @@ from egvs.artefacts.planned_sensor import PlannedSensor
 from egvs.core.grid import FloatArray
 from egvs.scoring.blindspots import SpotVisibility
 from egvs.scoring.targets import detection_probability, visible_targets
-from egvs.scoring.visibility import Beams
 from egvs.scoring.zone_results import PLAN_ZONES, ZoneUsers
-from egvs.sensors.scanner import Scanner
-from egvs.sensors.sites import Pose
+from egvs.sensors.sites import Pose, Site
 from egvs.stages.base import StageContext
 from egvs.stages.inputs import get_scene
-from egvs.stages.site_scans import empty_scans
+from egvs.stages.plan_scans import plan_beams
 from egvs.stages.site_scoring import zone_users
 
 
@@ -60,8 +58,9 @@ class PlanZones:
         """
         users = zone_users(context)
         scene = get_scene(context)
+        sites = [_site(sensor) for sensor in sensors]
         visible = []
-        for beams in plan_beams(context, sensors, moved=moved):
+        for _, beams in plan_beams(context, sites, moved=moved):
             visible.append(visible_targets(users.record, beams, detection_probability(scene, beams.sensor)))
         single = [users.visibility(of_sensor).share for of_sensor in visible]
         return cls(users, users.together(visible), np.max(single, axis=0))
@@ -72,13 +71,6 @@ class PlanZones:
         parquet.write_artefact(path, PLAN_ZONES, columns, metadata)
 
 
-def plan_beams(context: StageContext, sensors: Sequence[PlannedSensor], *, moved: bool) -> Iterator[Beams]:
-    """Yield the empty scan of each sensor of a plan, in any order; parameters as in :meth:`PlanZones.of`."""
-    if not moved:
-        yield from (scan.beams for scan in empty_scans(context, {sensor.site for sensor in sensors}))
-        return
-    scene = get_scene(context)
-    scanner = Scanner(scene)
-    for sensor in sensors:
-        pose = Pose(sensor.x_m, sensor.y_m, sensor.z_m, sensor.yaw_deg, sensor.pitch_deg, sensor.roll_deg)
-        yield Beams.of(scanner.scan(pose, scene.sensor(sensor.sensor)))
+def _site(sensor: PlannedSensor) -> Site:
+    pose = Pose(sensor.x_m, sensor.y_m, sensor.z_m, sensor.yaw_deg, sensor.pitch_deg, sensor.roll_deg)
+    return Site(sensor.site, pose, sensor.sensor)

@@ -199,6 +199,8 @@ STYLE_SHEET = _style_sheet()
 ColumnValues = NDArray[np.float64]
 """One value per column of voxels, shape (nx, ny)."""
 
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
 MAX_PIXELS = 240_000
 """Maximum number of pixels; larger grids are averaged."""
 
@@ -220,12 +222,22 @@ class IndexedImage:
         rows = np.zeros((height, width + 1), dtype=np.uint8)  # the first byte of a row is its filter: none
         rows[:, 1:] = index
         head = width.to_bytes(4, "big") + height.to_bytes(4, "big") + bytes((8, 3, 0, 0, 0))
-        return cls(b"\x89PNG\r\n\x1a\n" + _png_chunk(b"IHDR", head), _png_chunk(b"IDAT", _deflate(rows.tobytes())))
+        return cls(PNG_SIGNATURE + _png_chunk(b"IHDR", head), _png_chunk(b"IDAT", _deflate(rows.tobytes())))
 
     def uri(self, palette: bytes) -> str:
         """Return the complete image as a data URI."""
         data = self.head + palette + self.data + PNG_END
         return f"data:image/png;base64,{base64.b64encode(data).decode('ascii')}"
+
+
+def rgb_image_uri(rgb: NDArray[np.uint8]) -> str:
+    """Return an image of colours, shape (height, width, 3), as a PNG in a data URI."""
+    height, width, _ = rgb.shape
+    rows = np.zeros((height, 1 + 3 * width), dtype=np.uint8)  # the first byte of a row is its filter: none
+    rows[:, 1:] = rgb.reshape(height, -1)
+    head = width.to_bytes(4, "big") + height.to_bytes(4, "big") + bytes((8, 2, 0, 0, 0))
+    chunks = _png_chunk(b"IHDR", head) + _png_chunk(b"IDAT", _deflate(rows.tobytes())) + PNG_END
+    return f"data:image/png;base64,{base64.b64encode(PNG_SIGNATURE + chunks).decode('ascii')}"
 
 
 def field_image(values: ColumnValues, peak: float, max_pixels: int = MAX_PIXELS) -> IndexedImage:
@@ -299,6 +311,12 @@ def _png_chunk(name: bytes, body: bytes) -> bytes:
 
 def _palette(colours: bytes, alpha: bytes) -> bytes:
     return _png_chunk(b"PLTE", colours) + _png_chunk(b"tRNS", alpha)
+
+
+def category_palette(categories: Sequence[str]) -> bytes:
+    """Return a palette of one colour per index, RRGGBB or, with its opacity, RRGGBBAA, for :meth:`IndexedImage.uri`."""
+    rgba = [bytes.fromhex(colour.ljust(8, "f")) for colour in categories]
+    return _palette(b"".join(colour[:3] for colour in rgba), bytes(colour[3] for colour in rgba))
 
 
 def _field_palette(stops: Sequence[str]) -> bytes:

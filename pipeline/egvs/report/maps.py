@@ -6,6 +6,8 @@
   :func:`egvs.report.svg_figures.shared_scale`;
 - :func:`scan_view`: where the beams of an empty scan end;
 - :func:`missed_view`: the share of vehicles that a site misses in each cell, with the worst locations numbered;
+- :func:`classes_view`: values of square metres in classes, such as points on target;
+- :func:`zone_map`: zones, coloured by the share of road users that is found there, and numbered;
 - :func:`plan_map`: the poles of a plan.
 
 All but the empty scan have roads in the background. Labels are placed so that they hide little.
@@ -17,7 +19,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +34,7 @@ from egvs.report.svg_figures import (
     PAGE_STYLE,
     Box,
     ColourBar,
+    ColourClasses,
     FigureStyle,
     MapFrame,
     MapSite,
@@ -117,7 +120,7 @@ def occupancy(
     plan, peak = _sites_frame(extent(grid, sites), scale.prefix, style), scale.peak
     street_names, _ = _street_names(plan, backdrop.roads.names, sites)
     parts = [
-        _road_paths(plan, backdrop.roads),
+        road_paths(plan, backdrop.roads),
         _field_image(plan, grid, values, peak),
         _outline_paths(plan, backdrop.outlines),
         plan.roi(grid),
@@ -172,7 +175,7 @@ def base_layers(plan: MapFrame, grid: Grid, values: ColumnValues, backdrop: Back
     """Return the layers below the sites: roads, faint traffic, static outlines, the region."""
     traffic = _field_image(plan, grid, values, float(values.max(initial=0.0)))
     return [
-        _road_paths(plan, backdrop.roads),
+        road_paths(plan, backdrop.roads),
         f"<g {plan.style.shape('faint')}>{traffic}</g>",
         f"<g>{_outline_paths(plan, backdrop.outlines)}</g>",
         plan.roi(grid),
@@ -216,12 +219,12 @@ def site_view(
         plan = _sites_frame(view.box, prefix, style)
     shade = colours.shade_image(np.logical_not(view.crossed.any(axis=2)))
     parts = [
-        _road_paths(plan, view.backdrop.roads),
+        road_paths(plan, view.backdrop.roads),
         *_shade_images(plan, grid, shade),
         _field_image(plan, grid, values, peak),
         _outline_paths(plan, view.backdrop.outlines),
         plan.roi(grid),
-        _sensor_mark(plan, view.site),
+        _sensor_mark(plan, view.site.x_m, view.site.y_m),
     ]
     if not label:
         return plan.svg(parts, alt)
@@ -235,7 +238,7 @@ def scan_view(grid: Grid, image: IndexedImage, view: SiteViewFigure, prefix: str
     for theme in colours.THEMES:
         images.append(plan.image(plan.full_extent, image.uri(colours.DOT_PALETTES[theme]), f"field {theme}"))
     outlines = _outline_paths(plan, view.backdrop.outlines)
-    return plan.svg([outlines, *images, plan.roi(grid), _sensor_mark(plan, view.site)], alt)
+    return plan.svg([outlines, *images, plan.roi(grid), _sensor_mark(plan, view.site.x_m, view.site.y_m)], alt)
 
 
 def missed_view(
@@ -249,10 +252,10 @@ def missed_view(
     plan, image = site_view_frame(box, prefix), colours.share_image(blindspots.share_missed)
     (x, y), (nx, ny), cell_m = blindspots.origin_m, blindspots.share_missed.shape, blindspots.cell_m
     rectangle = (plan.x(x), plan.y(y + ny * cell_m), nx * cell_m * plan.scale, ny * cell_m * plan.scale)
-    parts = [_road_paths(plan, backdrop.roads)]
+    parts = [road_paths(plan, backdrop.roads)]
     for theme in colours.THEMES:
         parts.append(plan.image(rectangle, image.uri(colours.SHARE_PALETTES[theme]), f"field share {theme}"))
-    parts += [_outline_paths(plan, backdrop.outlines), plan.roi(grid), _sensor_mark(plan, site)]
+    parts += [_outline_paths(plan, backdrop.outlines), plan.roi(grid), _sensor_mark(plan, site.x_m, site.y_m)]
     for number, position in enumerate(label_positions(plan, blindspots), start=1):
         transform = 'display="none"'
         if position:
@@ -267,6 +270,76 @@ def missed_view(
     return plan.svg(parts, alt, bar)
 
 
+def classes_view(
+    grid: Grid,
+    values: ColumnValues,
+    classes: ColourClasses,
+    sites: Sequence[tuple[float, float]],
+    backdrop: Backdrop,
+    box: Box,
+    prefix: str,
+    alt: str,
+) -> str:
+    """Return classes of square cells, from above, with the sensors.
+
+    Parameters
+    ----------
+    grid, values
+        Grid of the cells, and the number of the class of each, (nx, ny) float64; NaN for a cell without colour.
+    classes
+        Their names.
+    sites
+        x, y of the sensors, world frame, metres.
+    backdrop, box
+        Background and extent of the map.
+    prefix
+        Makes ids unique on a page.
+    alt
+        Text for people who do not see the figure.
+    """
+    plan = site_view_frame(box, prefix)
+    image = colours.share_image(values / (len(classes.labels) - 1))
+    parts = [road_paths(plan, backdrop.roads)]
+    for theme in colours.THEMES:
+        parts.append(plan.image(plan.region(grid), image.uri(colours.SHARE_PALETTES[theme]), f"field share {theme}"))
+    parts += [_outline_paths(plan, backdrop.outlines), plan.roi(grid)]
+    parts += [_sensor_mark(plan, x_m, y_m) for x_m, y_m in sites]
+    return plan.svg(parts, alt, classes)
+
+
+@dataclass(frozen=True)
+class MapZone:
+    """A zone on a map: its area (shapely, world frame), its number, the share found, and a text for the pointer."""
+
+    area: Any
+    number: int
+    share: float
+    title: str
+
+
+def zone_map(grid: Grid, zones: Sequence[MapZone], site: MapSite, backdrop: Backdrop, box: Box, alt: str) -> str:
+    """Return zones coloured by the share found, and numbered; small zones lie above large ones.
+
+    See :func:`classes_view` for the parameters.
+    """
+    plan = MapFrame(box, "zones", north=True)
+    parts = [road_paths(plan, backdrop.roads), _outline_paths(plan, backdrop.outlines), plan.roi(grid)]
+    numbers = []
+    for zone in sorted(zones, key=lambda zone: -zone.area.area):
+        rings = []
+        for polygon in getattr(zone.area, "geoms", [zone.area]):
+            rings += [polygon.exterior, *polygon.interiors]
+        d = "".join(_closed_path(plan, np.asarray(ring.coords)[:-1, :2]) for ring in rings)
+        colour = plan.style.shape(f"q{colours.colour_class(zone.share, 0.0, 1.0)}")
+        shape = f'<path {colour} fill-rule="evenodd" stroke="currentColor" stroke-width="1" d="{d}"/>'
+        parts.append(f"<g><title>{escape(zone.title)}</title>{shape}</g>")
+        middle = zone.area.representative_point()
+        at = f'transform="translate({plan.x(middle.x):.1f} {plan.y(middle.y):.1f})"'
+        numbers.append(f'<g class="worst" {at}><circle r="8.5"/><text y="4">{zone.number}</text></g>')
+    parts += [*numbers, _sensor_mark(plan, site.x_m, site.y_m)]
+    return plan.svg(parts, alt, ColourBar(0.0, 100.0, "Share of all road users found (%)", even=True))
+
+
 def label_positions(plan: MapFrame, blindspots: SiteBlindspots) -> list[tuple[float, float] | None]:
     """Return the positions of the numbers of the worst locations on a figure; None for unused numbers."""
     worst = [(round(plan.x(location.x_m), 1), round(plan.y(location.y_m), 1)) for location in blindspots.worst]
@@ -278,8 +351,8 @@ def site_view_frame(box: Box, prefix: str = "") -> MapFrame:
     return MapFrame(box, prefix, width=460.0, tallest=420.0)
 
 
-def _sensor_mark(plan: MapFrame, site: MapSite) -> str:
-    position = f'transform="translate({plan.x(site.x_m):.1f} {plan.y(site.y_m):.1f})"'
+def _sensor_mark(plan: MapFrame, x_m: float, y_m: float) -> str:
+    position = f'transform="translate({plan.x(x_m):.1f} {plan.y(y_m):.1f})"'
     return f'<path {plan.style.shape("sensor")} {position} d="M0 -9l7.8 13.5h-15.6z"/>'
 
 
@@ -298,7 +371,7 @@ def _shade_images(plan: MapFrame, grid: Grid, shade: IndexedImage) -> Iterator[s
         yield plan.image(plan.region(grid), shade.uri(colours.SHADE_PALETTES[theme]), f"shade {theme}")
 
 
-def _road_paths(plan: MapFrame, roads: Roads) -> str:
+def road_paths(plan: MapFrame, roads: Roads) -> str:
     """Junctions, and lanes with a fine line between them: each lane is drawn twice, the second time narrower."""
     paths_of: dict[tuple[str, float], list[str]] = {}
     for piece in roads.lanes:

@@ -24,10 +24,13 @@ from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files
 from egvs.core.errors import WARNINGS_KEY, collect_warnings
 from egvs.report import figures, formatting, maps
+from egvs.report.approach_fits import ApproachFit, compare_approaches
+from egvs.report.approach_map import busiest_counts, draw_approach_map
 from egvs.report.basemap import network_file
 from egvs.report.colours import STYLE_SHEET
 from egvs.report.figures import Figures
 from egvs.report.map_credits import read_map_credits
+from egvs.report.points_section import MAPPED_POLES, PointsSection
 from egvs.report.ranking import (
     RankedSite,
     Ranking,
@@ -51,9 +54,12 @@ from egvs.report.sections import (
     ranking_disagreement,
 )
 from egvs.report.sensor_results import SensorComparison, costs_option, range_note
+from egvs.report.signal_diagram import signal_diagrams
+from egvs.report.zone_section import ZoneSection
 from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.scene_inputs import scan_dependencies
+from egvs.traffic import observed
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -101,8 +107,14 @@ class PageContents:
         Records of the stages, as far as ``run.json`` has them, in the order of :data:`STAGES`.
     study, by_period, detected, plan
         Results of other commands and of periods; None if those commands have not run.
+    zones, points
+        Road users found in zones, and maps of points on target; None where the scenario has no zones or no lanes.
     movements
         What each counted location is in words; empty if the run folder has no network.
+    approaches
+        Observed and simulated queues and speeds.
+    approach_map
+        SVG with the names and counts of the approaches; empty without counts.
     """
 
     scenario: Scenario
@@ -115,6 +127,10 @@ class PageContents:
     detected: ValidationSummary | None = None
     plan: PlacementSummary | None = None
     movements: Mapping[str, str] = field(default_factory=dict)
+    approaches: tuple[ApproachFit, ...] = ()
+    approach_map: str = ""
+    zones: ZoneSection | None = None
+    points: PointsSection | None = None
 
 
 @dataclass(frozen=True)
@@ -144,6 +160,9 @@ def dependencies(work: StageContext) -> StageDependencies:
     scenario, stages = work.scenario, _recorded_stages(work.folder.path)
     names = [RunFolder.trajectories.name, RunFolder.tpog.name, RunFolder.statics.name, RunFolder.scores.name]
     settings: dict[str, Any] = {"shown": _displayed_settings(scenario), "keep": scenario.scan.keep}
+    if scenario.traffic.observed is not None:
+        settings["observed"] = work.inputs.digest(scenario.find(scenario.traffic.observed, observed.KEY))
+        settings["counts"] = describe_counts(scenario, network_file(work.folder.path))
     if map_credits := read_map_credits(scenario):
         settings["map_credits"] = map_credits
     hashes: dict[str, str] = {}
@@ -153,6 +172,9 @@ def dependencies(work: StageContext) -> StageDependencies:
         scan = scan_dependencies(work)
         settings["scan"], hashes = scan.settings, dict(scan.files)
     hashes |= work.digests(*(name for name in (*names, *_OPTIONAL_FILES) if work.path(name).is_file()))
+    network = work.inputs.common_network_path
+    if network is not None:
+        hashes["network"] = work.inputs.digest(network)
     if (roads := network_file(work.folder.path)) is not None:
         hashes |= work.digests(roads.relative_to(work.folder.path).as_posix())
 
@@ -211,6 +233,11 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
     drawn = figures.draw_figures(work, ranking, SiteListing.from_ranking(ranking).choices, tpog)
     work.progress("figures drawn", 2, 3)
 
+    approaches = compare_approaches(work.scenario, work.folder.trajectories, network_file(out))
+    plan = PlacementSummary.read(out, stages, ranking.sites, tpog, drawn.backdrop)
+    mapped = [pole.best for pole in ranking.poles[:MAPPED_POLES]]
+    mounts = [] if plan is None else [pick.mount for pick in plan.picks]
+    moved = plan is not None and plan.before is not None
     contents = PageContents(
         work.scenario,
         ranking,
@@ -220,14 +247,20 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
         study=StudySummary.read(out, stages),
         by_period=PeriodRanking.read(out),
         detected=ValidationSummary.read(out, stages),
-        plan=PlacementSummary.read(out, stages, ranking.sites, tpog, drawn.backdrop),
+        plan=plan,
         movements=describe_counts(work.scenario, network_file(out)),
+        approaches=approaches,
+        approach_map=draw_approach_map(work.scenario, network_file(out)),
+        zones=ZoneSection.read(work, ranking.sites[0], tpog.grid, drawn.backdrop, has_plan=plan is not None),
+        points=PointsSection.draw(work, mapped, mounts, tpog.grid, drawn.backdrop, moved=moved),
     )
     html = render_page(contents)
     files.write_text(work.folder.report, html)
     work.progress("page written", 3, 3)
 
     summary: Summary = {"kilobytes": round(len(html.encode("utf-8")) / 1000)}
+    if approaches:
+        summary["approaches"] = [approach.to_json() for approach in approaches]
     if ranking.sites[0].score > 0:
         summary = {"best": ranking.sites[0].site, "worst": ranking.last.site, **summary}
     return summary
@@ -241,10 +274,15 @@ def render_page(contents: PageContents) -> str:
         **_setting_values(contents),
         **_sensor_values(contents),
         **_cost_values(contents.stages),
+        "signals": signal_diagrams(_traffic_summary(contents.stages).get("signals", ())),
         **_sentences(contents),
         **_warning_values(contents),
     }
     return _template_environment().get_template("report.html.j2").render(values)
+
+
+def _traffic_summary(stages: Mapping[str, StageRecord]) -> Summary:
+    return stages["traffic"].summary if "traffic" in stages else {}
 
 
 def prepare() -> None:
@@ -317,6 +355,7 @@ def _setting_values(contents: PageContents) -> dict[str, Any]:
         "assumes_flows": assumes_flows(scenario),
         "gamma": "∞" if math.isinf(gamma) else f"{gamma:g}",
         "map_credits": read_map_credits(scenario),
+        "map_period": busiest_counts(scenario)[0],
         "uncapped": math.isinf(gamma),
         "gamma_auto": scenario.score.gamma == "auto",
         "has_traffic": bool(contents.tpog.counts.any()),
@@ -386,6 +425,7 @@ STAGE = Stage(
         RunFolder.scores,
         RunFolder.scores_by_period,
         RunFolder.blindspots,
+        RunFolder.zones,
     ),
     effect_stages=("scan", "score"),
     prepare=(prepare,),

@@ -31,6 +31,7 @@ from egvs.report.ranking_check import RankingCheck
 from egvs.report.svg_figures import CurveStep, MapSite
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
+from egvs.sensors.sites import Pose, Site
 from egvs.traffic.movements import MovementNames
 from egvs.traffic.network import read_net_xml
 
@@ -369,6 +370,7 @@ class PlanRow:
     z_m: float
     yaw_deg: float
     pitch_deg: float
+    roll_deg: float
     forced: bool
     gain: float
     score: float
@@ -381,6 +383,12 @@ class PlanRow:
     def from_row(cls, row: Mapping[str, Any]) -> PlanRow:
         """Return a row of ``placement.parquet``; standard errors are NaN where it has none."""
         return cls(**{field.name: row[field.name] for field in fields(cls) if field.name in row})
+
+    @property
+    def mount(self) -> Site:
+        """The sensor as a site, with the name of its candidate."""
+        pose = Pose(self.x_m, self.y_m, self.z_m, self.yaw_deg, self.pitch_deg, self.roll_deg)
+        return Site(self.site, pose, self.sensor)
 
 
 @dataclass(frozen=True)

@@ -208,7 +208,7 @@ class MapFrame:
         rendering = 'preserveAspectRatio="none" image-rendering="pixelated"'
         return f'<image class="{css_class}" {position} {rendering} href="{png}"/>'
 
-    def svg(self, parts: Iterable[str], alt: str, bar: ColourBar | None = None) -> str:
+    def svg(self, parts: Iterable[str], alt: str, bar: ColourBar | ColourClasses | None = None) -> str:
         """Return the complete figure.
 
         Parameters
@@ -373,6 +373,37 @@ class ColourBar:
             if all(abs(tick_x - other.value) > 5.0 * (len(text) + len(other.text)) for other in placed):
                 placed.append(Tick(tick_x, text))
         return placed
+
+
+@dataclass(frozen=True)
+class ColourClasses:
+    """A row of coloured boxes, one for each class of values, evenly spaced on the scale; two classes or more."""
+
+    labels: tuple[str, ...]
+    label: str
+
+    def title_lines(self, width: float) -> list[str]:
+        """Return the label in lines of at most a width, in the figure's units."""
+        return wrap_text(self.label, width)
+
+    def svg(
+        self, prefix: str, corner: tuple[float, float], width: float, title: Sequence[str],
+        style: FigureStyle = PAGE_STYLE,
+    ) -> str:  # fmt: skip
+        """Return the boxes with their texts, see :meth:`ColourBar.svg`; ``prefix`` is not used."""
+        del prefix
+        (x, y), count = corner, len(self.labels)
+        each = width / count
+        parts = []
+        for number, text in enumerate(self.labels):
+            colour = style.shape(f"q{round(STEPS * number / (count - 1))}")
+            left = x + each * number
+            parts.append(f'<rect {colour} x="{left:.1f}" y="{y:.1f}" width="{each:.1f}" height="12"/>')
+            parts.append(_text(left + each / 2.0, y + 28, text))
+        for number, line in enumerate(title):
+            position = f'x="{x + width / 2:.1f}" y="{y + 44 + _LINE_SPACING * number:.1f}"'
+            parts.append(f'<text class="title" {position} text-anchor="middle">{escape(line)}</text>')
+        return f"<g>{''.join(parts)}</g>"
 
 
 def svg_start_tag(width: float, height: float, alt: str, style: FigureStyle = PAGE_STYLE) -> str:

@@ -294,6 +294,10 @@ class ScanConfig(StrictModel):
     )
 
 
+_SEEDS_STREAM = 1_000_000
+"""Spawn key of the seeds of ``traffic.seeds``; one simulation spawns far fewer child sequences from its seed."""
+
+
 class Scenario(StrictModel):
     """Everything that the results of a run depend on; made by :func:`egvs.scenario.loading.load`."""
 
@@ -340,6 +344,13 @@ class Scenario(StrictModel):
         all_blocks = blocks * max(1, len(self.traffic.periods))
         if all_blocks > MAX_BLOCKS:
             raise ValueError(f"tpog.blocks = {blocks} gives {all_blocks} blocks in all periods, more than {MAX_BLOCKS}")
+        seeds = self.traffic.seeds
+        if blocks % seeds:
+            near = f"{seeds * (blocks // seeds)} or " if blocks > seeds else ""
+            raise ValueError(
+                f"traffic.seeds = {seeds} does not divide tpog.blocks = {blocks}, and no block spans two simulations."
+                f" Use tpog.blocks = {near}{seeds * (blocks // seeds + 1)}"
+            )
         for period, traffic in self._traffic_by_period():
             if traffic.frames is not None and traffic.frames % blocks:
                 suffix = f" of the period {period!r}" if period else ""
@@ -379,6 +390,33 @@ class Scenario(StrictModel):
             scenario._period_keys = frozenset(period.model_fields_set)
             scenarios[name] = scenario
         return scenarios
+
+    def by_seed(self) -> tuple[Scenario, ...]:
+        """Split a scenario without periods, or one of :meth:`by_period`, by ``traffic.seeds``.
+
+        Returns
+        -------
+        tuple
+            For each simulation, a scenario with an equal share of the frames. The first keeps the seed; the others have
+            seeds from child sequences of it.
+        """
+        seeds = self.traffic.seeds
+        if seeds == 1:
+            return (self,)
+        assert self.traffic.frames is not None, "several seeds are simulated"
+        traffic = self.traffic.model_copy(update={"frames": self.traffic.frames // seeds, "seeds": 1})
+        scenarios = []
+        for number in range(seeds):
+            seed = self.seed
+            if number:
+                sequence = np.random.SeedSequence(self.seed, spawn_key=(_SEEDS_STREAM, number))
+                seed = int(sequence.generate_state(1, np.uint64)[0]) >> 1
+            scenario = self.model_copy(update={"traffic": traffic, "seed": seed})
+            scenario._folders = self._folders
+            scenario._period = self._period
+            scenario._period_keys = self._period_keys
+            scenarios.append(scenario)
+        return tuple(scenarios)
 
     @property
     def gamma(self) -> float:

@@ -6,9 +6,17 @@ import re
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from egvs.scenario.fields import Name, Positive, StrictModel, find_duplicates
+from egvs.scenario.signal_config import SignalConfig
 from egvs.scenario.track_columns import TrackColumns
 
 _ATTRIBUTE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9]*")
@@ -203,14 +211,14 @@ def keys_without_effect(source: str) -> frozenset[str]:
     source
         One of :data:`TRAFFIC_SOURCES`, or "routes" for a network with routes.
     """
-    demand = _RANDOM_TRIP_KEYS | {"counts", "edge_weights", "kinds"}
+    demand = _RANDOM_TRIP_KEYS | {"counts", "edge_weights", "kinds", "observed"}
     simulation = frozenset({
         "vehicles", "hold", "step_s", "lateral_resolution_m", "max_depart_delay_s", "junction_blocker_s", "teleport_s",
     })  # fmt: skip
     for_fcd = frozenset({"vtypes", "fcd_geo"})
     for_tracks = _TRACK_KEYS | {"coverage"}
     if source in FINISHED_SOURCES:
-        simulation |= {"pedestrian_tracks"}
+        simulation |= {"pedestrian_tracks", "signals"}
         unused = simulation | demand - {"kinds"} | {"routes", "redraw_departures"}
         return unused | (for_tracks if source == "fcd" else for_fcd)
     unused = for_fcd | for_tracks | {"roads"}
@@ -300,6 +308,14 @@ class TrafficConfig(StrictModel):
         le=2**32 - 1,
         description=f"Number of recorded frames. By default {DEFAULT_FRAMES}, or all of a finished file",
     )
+    seeds: int = Field(
+        1,
+        ge=1,
+        le=1000,
+        description="Number of independent simulations that share `frames` equally, each with a warm-up and a seed of"
+        " its own; the first has the scenario's seed. From 2 on, standard errors come from the differences between"
+        " them. It must divide tpog.blocks",
+    )
     frame_period_s: Positive = Field(1.0, description="Time between two frames; a multiple of step_s")
     begin_s: float | None = Field(
         None,
@@ -350,8 +366,19 @@ class TrafficConfig(StrictModel):
         default_factory=dict,
         description="Weight of an edge (id) as start or end of random trips. By default its number of lanes",
     )
+    signals: dict[str, SignalConfig] = Field(
+        default_factory=dict,
+        description="Plans of traffic signals, by the id of the signal or junction, or its street names with '/'"
+        " between them. By default, those of the network",
+    )
     counts: tuple[CountConfig, ...] = Field(
         (), description="Traffic counts. By default, random trips are drawn between the network's fringe edges"
+    )
+    observed: str | None = Field(
+        None,
+        min_length=1,
+        description="CSV file with queues and speeds that were observed on approaches (columns approach, queue_m,"
+        " speed_kmh), which are compared with those of the simulated counts",
     )
     kinds: tuple[VehicleKind, ...] = Field(
         _DEFAULT_FLEET,
@@ -359,6 +386,12 @@ class TrafficConfig(StrictModel):
         description="The fleet of random trips; sizes of vehicles in a finished FCD file or, by class, in recorded"
         " tracks without sizes",
     )
+
+    @model_serializer(mode="wrap")
+    def _serialize(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out keys that have their defaults and are rarely set, so that they do not change cache keys."""
+        defaults = {"seeds": 1, "signals": {}}
+        return {name: value for name, value in serialize(self).items() if defaults.get(name) != value}
 
     @model_validator(mode="after")
     def _check_periods(self) -> TrafficConfig:
@@ -381,6 +414,10 @@ class TrafficConfig(StrictModel):
         duplicates = find_duplicates([kind.name for kind in self.kinds])
         if duplicates:
             raise ValueError(f"two kinds have the same name: {', '.join(duplicates)}")
+        if self.seeds > 1 and self.is_finished:
+            raise ValueError(
+                f"seeds: expected 1 with {sources[0]}, because nothing is simulated, got {self.seeds}. Remove seeds"
+            )
         return self
 
     @model_validator(mode="after")
@@ -396,7 +433,7 @@ class TrafficConfig(StrictModel):
     @model_validator(mode="after")
     def _check_amounts(self) -> TrafficConfig:
         frames = self.frames or 0
-        duration_s = self.warmup_s + frames * self.frame_period_s
+        duration_s = self.seeds * self.warmup_s + frames * self.frame_period_s
         counted_per_s = sum(count.per_hour for count in self.counts) / 3600.0
         trips_per_s = self.trips_per_s
         if self.vehicles_per_h is not None:

@@ -24,6 +24,12 @@ between the groups of a short record inflates the error
 they are joined in pairs. Groups shorter than the window in which that time was estimated, and groups that stay
 correlated, give a warning.
 
+Where the traffic was simulated with several seeds, each simulation is one group: groups are independent, whatever their
+length, so none are joined and nothing is widened. For equal frames, the pseudo-values of a mean are the means of the
+simulations, and the error is that of independent replications (Law, Simulation Modeling and Analysis, 2015, section
+9.5.1), :math:`se^2 = \sum_r (S_r - \bar S)^2 / (R (R - 1))` with R - 1 degrees of freedom. It contains all that varies
+between simulations, which blocks of a single one miss (docs/accuracy.md).
+
 Voxels that have equal counts in every group share one class (0.5 million occupied voxels of a real junction make 50,000
 classes), so a site costs one pass over the voxels and one over the classes. Nothing is random; the result does not
 depend on threads or on other sites. Hits are not resampled: where an effect lets traffic hide voxels, its part of the
@@ -73,10 +79,21 @@ _CLASS_KEY_SEED = 0x9E3779B97F4A7C15
 
 @dataclass(frozen=True)
 class BlockGroups:
-    """Consecutive groups of one record: the ``frames`` of each, (k,) int64, and the traffic's autocorrelation time."""
+    """Consecutive groups of one record.
+
+    Attributes
+    ----------
+    frames
+        Frames of each group, (k,) int64.
+    autocorrelation_frames
+        Autocorrelation time of the traffic.
+    are_seeds
+        Whether each group is a simulation with a seed of its own, so that groups are independent.
+    """
 
     frames: IntArray
     autocorrelation_frames: float
+    are_seeds: bool = False
 
     @property
     def total(self) -> int:
@@ -96,7 +113,10 @@ def group_sizes(blocks: int, block_frames: int = 1, autocorrelation_frames: floa
 
 
 def block_groups(period: tpog_file.PeriodBlocks) -> BlockGroups:
-    """Return the groups that the blocks of one record are joined to."""
+    """Return the groups that the blocks of one record are joined to: one of each seed, if there are several."""
+    if period.seeds > 1:
+        frames = np.full(period.seeds, period.frames // period.seeds, dtype=np.int64)
+        return BlockGroups(frames, period.memory_frames, are_seeds=True)
     sizes = group_sizes(period.blocks, period.block_frames, period.memory_frames)
     return BlockGroups(period.block_frames * np.array(sizes, dtype=np.int64), period.memory_frames)
 
@@ -356,6 +376,8 @@ class Stratum:
 
         first_correlation = correlation = lag_one_autocorrelation(pseudo[:, :n_joined_by])
         joined = 1
+        if groups.are_seeds:
+            return cls(pseudo, h - 1.0, centre, 1.0, groups, first_correlation, joined, still_correlated=False)
         while correlation > _critical_autocorrelation(len(pseudo)) and len(pseudo) // 2 >= MIN_GROUPS:
             pseudo, frames = _join_pairs(pseudo, frames)
             joined *= 2
@@ -379,7 +401,9 @@ class Stratum:
 
     @property
     def is_short(self) -> bool:
-        """Whether groups are shorter than the window in which the autocorrelation time was estimated."""
+        """Whether blocks are shorter than the window in which the autocorrelation time was estimated."""
+        if self.groups.are_seeds:
+            return False
         return self.groups.total < len(self.pseudo) * WINDOW_TIMES * self.groups.autocorrelation_frames
 
 
@@ -605,6 +629,8 @@ def summarise_uncertainty(estimate: ScoreUncertainty, names: Sequence[str] = (""
 
 def _describe_stratum(stratum: Stratum) -> str:
     blocks = len(stratum.pseudo)
+    if stratum.groups.are_seeds:
+        return f"{blocks} simulations of {stratum.groups.total // blocks:,} frames, each with its own seed"
     text = f"{blocks} blocks of {stratum.groups.total // blocks:,} frames"
     if stratum.joined > 1:
         text += f", joined because neighbours were correlated ({stratum.correlation:.2f})"

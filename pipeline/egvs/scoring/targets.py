@@ -242,6 +242,41 @@ class TargetRecord:
             row=row,
         )
 
+    @classmethod
+    def alone(cls, boxes: FloatArray, kind: str, grid: Grid) -> TargetRecord:
+        """Return level boxes, each alone in a frame of its own, so that none occludes another.
+
+        Parameters
+        ----------
+        boxes
+            As ``boxes`` of the class, (n, 7) float64; their centres are in the region of interest.
+        kind
+            SUMO vClass of all of them.
+        grid
+            The grid.
+        """
+        count = len(boxes)
+        values = np.ascontiguousarray(np.column_stack([boxes, np.zeros(count)])[:, _KERNEL_ORDER])
+        values[:, :3] = grid.to_grid_m(values[:, :3])
+        low, high = np.empty((count, 3)), np.empty((count, 3))
+        occlusion.box_bounds(values, low, high)
+        numbers, zeros = np.arange(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
+        return cls(
+            grid=grid,
+            numbers=numbers,
+            frame=numbers,
+            vehicles=("",),
+            vehicle=zeros,
+            kinds=(kind,),
+            kind=zeros,
+            part=zeros,
+            boxes=boxes,
+            pitch_rad=np.zeros(count),
+            gap_m=np.full(count, np.inf),
+            all_boxes=AllBoxes(np.arange(count + 1, dtype=np.int64), values, low, high),
+            row=numbers,
+        )
+
 
 def _index_names(names: Sequence[str]) -> tuple[tuple[str, ...], IntArray]:
     """Return the distinct names, sorted, and the index of each name among them."""

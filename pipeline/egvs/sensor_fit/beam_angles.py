@@ -470,10 +470,7 @@ def pulse_grid(sweep: Sweep, angles: BeamAngles) -> PulseGrid:
     """Sort the returns of a sweep into the grid of pulses, by their direction."""
     points = sweep.points_m[np.isfinite(sweep.points_m[:, 0])]
     radius_m = axis_distances_m(points)
-    order = angles.ascending
-    tangent = np.tan(np.radians(angles.elevation_deg))[order]
-    nearest, miss_deg = nearest_ring(radius_m, points[:, 2], tangent, angles.offset_m[order])
-    channel = order[nearest]
+    channel, miss_deg = _match_channels(points, angles)
     azimuth_deg = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
     turned = azimuth_deg - angles.azimuth_offset_deg[channel] - angles.first_azimuth_deg
     column = np.round(_wrap(turned) / angles.grid_step_deg).astype(np.int64)
@@ -492,6 +489,20 @@ def pulse_grid(sweep: Sweep, angles: BeamAngles) -> PulseGrid:
     off_grid = int(np.count_nonzero(~on_grid))
     repeated = int(np.count_nonzero(on_grid)) - len(pulse)
     return PulseGrid(grid.reshape(angles.channels, angles.azimuths), off_grid, repeated)
+
+
+def nearest_channels(points_m: FloatArray, angles: BeamAngles) -> IntArray:
+    """Return the channel whose cone each point (n, 3) lies on, (n,); -1 on none."""
+    channel, miss_deg = _match_channels(points_m, angles)
+    return np.where(miss_deg <= _MAX_MISS_DEG, channel, -1)
+
+
+def _match_channels(points_m: FloatArray, angles: BeamAngles) -> tuple[IntArray, FloatArray]:
+    """Return the channel whose cone is nearest to each point, and the angle between the two, degrees."""
+    order = angles.ascending
+    tangent = np.tan(np.radians(angles.elevation_deg))[order]
+    ring, miss_deg = nearest_ring(axis_distances_m(points_m), points_m[:, 2], tangent, angles.offset_m[order])
+    return order[ring], miss_deg
 
 
 def range_step(range_m: FloatArray) -> float | None:

@@ -13,12 +13,16 @@ from egvs.sensor_fit.empty_scan import TRAFFIC, UNKNOWN
 from egvs.sensor_fit.fit import SensorFit
 from egvs.sensor_fit.intervals import Estimate
 from egvs.sensor_fit.sweep_layout import axis_distances_m, nearest_ring
+from egvs.sensors.sensor import rotation_world_sensor
+from egvs.world.mesh import World
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MAX_POINTS = 60_000
 _VIEW_M = 80.0
+_STEEP = 0.3
+"""Walls: triangles whose normal rises by less."""
 _BLUE, _ORANGE, _GREEN, _GREY, _RED = "#1f77b4", "#e07b00", "#2a9d4a", "#b5b5b5", "#d62728"
 
 
@@ -206,6 +210,59 @@ def draw_empty_scan(fit: SensorFit) -> Figure | None:
     return figure
 
 
+def draw_map(fit: SensorFit) -> Figure | None:
+    """The sweep on the static world from above, and how well it fits at each yaw; None without a pose in the world."""
+    if fit.map_pose is None:
+        return None
+    from matplotlib.collections import LineCollection
+
+    figure, ((plan, curve),) = _figure(15.0, 7.6, 2)
+    map_pose = fit.map_pose
+    best, pose = map_pose.best, map_pose.best.pose
+    rotation = rotation_world_sensor(pose.yaw_deg, pose.pitch_deg, pose.roll_deg)
+    points = map_pose.points_m @ rotation.T + np.array(pose.position_m)
+    for members, colour, label in (
+        (~best.on_surface, _ORANGE, "returns elsewhere (vehicles, trees, errors of the map)"),
+        (best.on_surface, _BLUE, "returns on the static world"),
+    ):
+        plan.plot(points[members, 0], points[members, 1], ",", color=colour)
+        plan.plot([], [], "s", color=colour, label=f"{label}: {np.mean(members):.0%}")
+    plan.add_collection(LineCollection(_wall_lines(map_pose.world), colors="black", linewidths=0.8))
+    plan.plot([], [], color="black", linewidth=0.8, label="walls of the static world")
+    ahead = np.radians(pose.yaw_deg)
+    tip = (pose.x_m + 12.0 * np.cos(ahead), pose.y_m + 12.0 * np.sin(ahead))
+    plan.annotate("", tip, (pose.x_m, pose.y_m), arrowprops={"color": _RED, "width": 1.5, "headwidth": 8})
+    plan.plot(pose.x_m, pose.y_m, "o", color=_RED, label="fitted position, and the sensor's x axis")
+    plan.plot(map_pose.start.x_m, map_pose.start.y_m, "x", color=_RED, label="given position")
+    limits = [(centre - _VIEW_M, centre + _VIEW_M) for centre in (pose.x_m, pose.y_m)]
+    plan.set(xlabel="x (m)", ylabel="y (m)", xlim=limits[0], ylim=limits[1], aspect="equal")
+    yaw_se_deg = best.standard_errors["yaw_deg"]
+    plan.set_title(f"From above: yaw {pose.yaw_deg:.2f} +- {yaw_se_deg:.2g} degrees")
+    plan.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=2, fontsize=8, frameon=False)
+
+    curve.plot(map_pose.search.yaws_deg, map_pose.search.costs_m, color=_GREY, label="tried, at the given position")
+    curve.axvline(pose.yaw_deg % 360.0, color=_RED, label="best fit")
+    for number, yaw_deg in enumerate(map_pose.ambiguous_yaws_deg):
+        label = "fits as well" if number == 0 else None
+        curve.axvline(yaw_deg % 360.0, color=_ORANGE, linestyle="--", label=label)
+    curve.set(xlabel="yaw (degrees)", ylabel="mean distance from surfaces, at most 2 m (m)", xlim=(0, 360))
+    curve.set_ylim(bottom=0.0)
+    curve.set_title("How well the sweep fits at each yaw")
+    curve.legend(loc="best", fontsize=8)
+    return figure
+
+
+def _wall_lines(world: World) -> FloatArray:
+    """Return the longest side in plan of each steep triangle, (n, 2, 2)."""
+    corners = world.triangles_m
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    steep = corners[np.abs(normals[:, 2]) < _STEEP * np.linalg.norm(normals, axis=1)][:, :, :2]
+    sides = np.stack([steep, np.roll(steep, -1, axis=1)], axis=2)
+    longest = np.linalg.norm(sides[:, :, 1] - sides[:, :, 0], axis=2).argmax(axis=1)
+    lines: FloatArray = sides[np.arange(len(sides)), longest]
+    return lines
+
+
 def _bars(axis: Any, bins: Sequence[tuple[float, float, Estimate]], scale: float, colour: str, label: str) -> None:
     """Draw estimates as horizontal lines over their ranges, with bands for the 95 % intervals."""
     for index, (start, end, estimate) in enumerate(bins):
@@ -220,5 +277,6 @@ FIGURES: dict[str, Callable[[SensorFit], Figure | None]] = {
     "ranges.png": draw_ranges,
     "ground.png": draw_ground,
     "empty_scan.png": draw_empty_scan,
+    "map.png": draw_map,
 }
 """The function that draws each file."""

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.scenario.model import Scenario
 from egvs.sensor_fit import empty_scan, ground_plane, range_noise, return_rates
 from egvs.sensor_fit.beam_angles import BeamAngles, PulseGrid, fit_beam_angles, pulse_grid, range_step
 from egvs.sensor_fit.empty_scan import EmptyScanFit
 from egvs.sensor_fit.ground_plane import GroundPlane
 from egvs.sensor_fit.intervals import Estimate, estimate_scale
+from egvs.sensor_fit.map_pose import MapPose, fit_map_pose
 from egvs.sensor_fit.range_noise import NoiseBin, RangeResiduals
 from egvs.sensor_fit.return_rates import PlaneView, RateBin
+from egvs.sensor_fit.rotation import Rotation, fit_rotation
 from egvs.sensor_fit.surface_normals import surface_normals
 from egvs.sensor_fit.sweep_files import Sweep
+from egvs.stages.inputs import Inputs
 
 SIGMA_RANGE_M = (5.0, 25.0)
 """The range noise of the sensor is that between these ranges: nearer, curved surfaces and the mount add to it, farther,
@@ -78,6 +82,10 @@ class SensorFit:
         The background; None with fewer than three sweeps.
     residuals
         Differences between ranges of neighbours, for figures.
+    rotation
+        How fast the sensor turns; None if the sweeps have no times.
+    map_pose
+        The pose in the world of a scenario; None unless :func:`with_map_pose` adds it.
     """
 
     sweeps: Sequence[Sweep]
@@ -101,6 +109,8 @@ class SensorFit:
     plane_view: PlaneView
     empty_scan: EmptyScanFit | None
     residuals: RangeResiduals
+    rotation: Rotation | None = None
+    map_pose: MapPose | None = None
 
 
 def fit_sensor(
@@ -170,7 +180,35 @@ def fit_sensor(
         plane_view=view,
         empty_scan=background,
         residuals=residuals,
+        rotation=fit_rotation(sweeps, angles),
     )
+
+
+def with_map_pose(fit: SensorFit, scenario: Scenario, site_m: tuple[float, ...]) -> SensorFit:
+    """Return a fit with the pose in the world of a scenario.
+
+    Parameters
+    ----------
+    fit
+        The fitted sensor. Its empty scan is registered, or all returns if it has none.
+    scenario
+        Its static world is built.
+    site_m
+        x and y of the sensor to 2 m, and z if the world has no ground there.
+
+    Raises
+    ------
+    InputError
+        As of :func:`egvs.sensor_fit.map_pose.fit_map_pose`, or if the static world cannot be built.
+    """
+    if fit.empty_scan is not None:
+        points = empty_scan.points_of(fit.empty_scan.range_m, fit.angles)
+        points_m = points[np.isfinite(fit.empty_scan.range_m)]
+    else:
+        fine = [sweep.points_m for sweep in fit.sweeps if not sweep.is_coarse]
+        points_m = np.concatenate([points[np.isfinite(points[:, 0])] for points in fine])
+    world = Inputs(scenario).world
+    return replace(fit, map_pose=fit_map_pose(points_m, fit.plane, world, site_m, scenario.name, fit.sweeps[0].name))
 
 
 def _find_ground_planes(grids: list[FloatArray], angles: BeamAngles, where: str) -> list[GroundPlane]:

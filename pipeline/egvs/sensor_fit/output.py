@@ -22,7 +22,9 @@ from egvs.sensor_fit import empty_scan, figures
 from egvs.sensor_fit.fit import SensorFit
 from egvs.sensor_fit.ground_plane import GroundPlane
 from egvs.sensor_fit.intervals import Estimate
+from egvs.sensor_fit.map_pose import MapPose
 from egvs.sensor_fit.range_noise import NoiseBin
+from egvs.sensors.registration import PARAMETERS
 from egvs.sensors.sensor import rotation_world_sensor
 
 SENSOR_FILE, REPORT_FILE = "sensor.toml", "fit.json"
@@ -161,6 +163,13 @@ def _comments(fit: SensorFit, name: str) -> str:
         f"Pose over the chosen ground plane: {plane.height_m:.2f} m above it, "
         f"roll {plane.roll_deg:.2f}, pitch {plane.pitch_deg:.2f} degrees."
     )
+    if fit.map_pose is not None:
+        pose = fit.map_pose.best.pose
+        lines.append(
+            f"Pose in the world of {fit.map_pose.scenario}: x {pose.x_m:.3f}, y {pose.y_m:.3f}, z {pose.z_m:.3f} m, "
+            f"yaw {pose.yaw_deg:.3f}, pitch {pose.pitch_deg:.3f}, roll {pose.roll_deg:.3f} degrees."
+        )
+        lines += fit.map_pose.warnings
     if fit.return_rate is not None:
         lines.append(
             f"Lost returns on smooth surfaces: {1 - fit.return_rate.value:.2%}. To model them: "
@@ -215,6 +224,7 @@ def report(fit: SensorFit, name: str) -> dict[str, Any]:
         "full_circle": angles.is_full_circle,
         "first_azimuth_deg": angles.first_azimuth_deg,
         "rotation_from_above": direction,
+        "rotation": _rotation(fit),
         "optics_to_axis_m": _value(angles.axis_distance_m, angles.axis_distance_se_m),
         "range_step_m": fit.range_step_m,
         "max_range_m": fit.max_range_m,
@@ -229,6 +239,8 @@ def report(fit: SensorFit, name: str) -> dict[str, Any]:
         "sectors_without_returns_deg": [list(sector) for sector in fit.empty_sectors_deg],
         "ground_planes": [_plane(plane, plane is fit.plane) for plane in fit.planes],
     }
+    if fit.map_pose is not None:
+        result["map_pose"] = _map_pose(fit.map_pose)
     if fit.empty_scan is not None:
         background, traffic, unknown = fit.empty_scan.counts
         result["empty_scan"] = {
@@ -242,8 +254,44 @@ def report(fit: SensorFit, name: str) -> dict[str, Any]:
     return result
 
 
+def _rotation(fit: SensorFit) -> dict[str, Any] | None:
+    rotation = fit.rotation
+    if rotation is None:
+        return None
+    return {
+        "turns_per_second": _value(rotation.rate_hz, rotation.rate_se_hz),
+        "from": rotation.source,
+        "sweeps": rotation.sweeps,
+        "firing_interval_s": rotation.firing_interval_s,
+        "azimuth_step_deg": rotation.step_deg,
+    }
+
+
 def _value(value: float, se: float) -> dict[str, float]:
     return {"value": float(value), "se": float(se)}
+
+
+def _map_pose(pose: MapPose) -> dict[str, Any]:
+    best = pose.best
+    errors = best.standard_errors
+    return {
+        "scenario": pose.scenario,
+        **{
+            name: {
+                "value": float(getattr(best.pose, name)),
+                "se": errors[name] if math.isfinite(errors[name]) else None,
+            }
+            for name in PARAMETERS
+        },
+        "not_fixed": list(best.not_fixed),
+        "returns": len(pose.points_m),
+        "share_on_surface": pose.share_on_surface,
+        "residual_m": _value(pose.residual_m, pose.residual_se_m),
+        "residual_sigma_m": best.sigma_m,
+        "shift_m": pose.shift_m,
+        "ambiguous_yaws_deg": list(pose.ambiguous_yaws_deg),
+        "warnings": list(pose.warnings),
+    }
 
 
 def _estimate(estimate: Estimate | None) -> dict[str, Any] | None:

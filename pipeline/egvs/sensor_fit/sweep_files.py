@@ -5,6 +5,9 @@ A file is a sweep, and so is each array of an ``.npz`` file. The formats are tho
 (right-handed, z along the axis of rotation), metres. Missing returns (NaN, infinite, or within 5 cm of the origin, as
 many drivers write zeros for them) stay in the list, because their positions tell which pulses gave no return.
 
+Recordings of ROS (:mod:`egvs.formats.ros_bags`) and network captures (:mod:`egvs.formats.velodyne_pcap`) hold many
+sweeps, of which some are read, spread evenly.
+
 Nothing in a file's header says how its points are ordered; :mod:`egvs.sensor_fit.sweep_layout` finds out.
 """
 
@@ -22,7 +25,8 @@ from egvs.core import files, limits
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.reading import COMPLETE_FILE
-from egvs.formats import point_clouds
+from egvs.formats import point_clouds, ros_bags, velodyne_pcap
+from egvs.formats.recordings import RecordedSweep, Recording, RecordingOptions
 
 MIN_RETURNS = 2000
 """Fewest returns of a sweep; sensors with rings have 30,000 or more."""
@@ -48,11 +52,17 @@ class Sweep:
     is_coarse
         Whether the coordinates were saved as float16, with steps of 6 cm beyond 64 m. Such a sweep serves the empty
         scan only.
+    time_s
+        Time of each point, seconds, from the first, (n,); None if the file does not say.
+    recording
+        The recording that the sweep is of; None for a file of one sweep.
     """
 
     name: str
     points_m: FloatArray
     is_coarse: bool = False
+    time_s: FloatArray | None = None
+    recording: Recording | None = None
 
     @property
     def returns(self) -> int:
@@ -60,14 +70,16 @@ class Sweep:
         return int(np.count_nonzero(np.isfinite(self.points_m[:, 0])))
 
 
-def read_sweeps(paths: Sequence[Path]) -> list[Sweep]:
+def read_sweeps(paths: Sequence[Path], options: RecordingOptions | None = None) -> list[Sweep]:
     """Read all sweeps of some files, in their order.
 
     Parameters
     ----------
     paths
         Files with the suffix .pcd, .ply, .las, .laz, .csv, .e57 or .npz, or of a format that an installed package adds;
-        also with .gz after it.
+        also with .gz after it. Or recordings: .bag, .mcap, .db3, the folder of a ROS 2 recording, or .pcap.
+    options
+        What is read of recordings.
 
     Raises
     ------
@@ -76,7 +88,14 @@ def read_sweeps(paths: Sequence[Path]) -> list[Sweep]:
         :data:`MIN_RETURNS` returns.
     """
     sweeps: list[Sweep] = []
+    options = options or RecordingOptions()
     for path in paths:
+        if ros_bags.is_recording(path):
+            sweeps += _recorded(*ros_bags.read(path, path.name, options))
+            continue
+        if path.suffix.lower() in velodyne_pcap.SUFFIXES:
+            sweeps += _recorded(*velodyne_pcap.read(path, path.name, options))
+            continue
         limits.checked_size(path, limits.FILE)
         if path.suffix.lower() == ".gz":
             sweeps += _read_gzip(path)
@@ -91,6 +110,12 @@ def read_sweeps(paths: Sequence[Path]) -> list[Sweep]:
             problem = f"expected a sweep of at least {MIN_RETURNS:,} returns, got {sweep.returns:,}"
             raise InputError(sweep.name, problem, "Give complete sweeps, one per file.")
     return sweeps
+
+
+def _recorded(recording: Recording, recorded: list[RecordedSweep]) -> Iterator[Sweep]:
+    for sweep in recorded:
+        points_m = _clean_sweep(sweep.label, sweep.points_m).points_m
+        yield Sweep(f"{recording.name}: {sweep.label}", points_m, time_s=sweep.time_s, recording=recording)
 
 
 def _read_gzip(path: Path) -> list[Sweep]:

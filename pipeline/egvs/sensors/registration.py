@@ -56,6 +56,7 @@ _GATE_SIGMAS = 4.0
 _NARROWING = 0.75
 _RANGE_GATES = 5.0
 """Along the beam, a point may be this many gates away from the face: surfaces are seen at grazing incidence too."""
+_OUTLIER_RATIO = 3.0
 _STEADY = 1.02
 """The gate narrows until it is at most this multiple of its final width."""
 _MIN_INFORMATION = 1e-6
@@ -138,10 +139,23 @@ class Alternative:
 
 @dataclass(frozen=True)
 class YawSearch:
-    """The best fit of a scan among all yaws, and the other local optima, best first."""
+    """The best fit of a scan among all yaws.
+
+    Attributes
+    ----------
+    best
+        The best fit.
+    alternatives
+        The other local optima, best first.
+    yaws_deg, costs_m
+        The yaws that were tried at the start position, (k,), and the mean distance of points from surfaces at each,
+        capped at 2 m.
+    """
 
     best: Registration
     alternatives: tuple[Alternative, ...]
+    yaws_deg: FloatArray
+    costs_m: FloatArray
 
     @property
     def equally_good(self) -> tuple[Alternative, ...]:
@@ -303,7 +317,7 @@ def search_yaw(
     best = register_scan(points_m, surfaces, fits[0].pose, free=free, where=where)
     blocks = _azimuth_blocks(points_m)
     others = [fit for fit in fits[1:] if not _is_same(fit.pose, best.pose)]
-    return YawSearch(best, tuple(_alternative(best, other, blocks) for other in others))
+    return YawSearch(best, tuple(_alternative(best, other, blocks) for other in others), yaws_deg, costs)
 
 
 def _thinned(points_m: FloatArray, count: int) -> FloatArray:
@@ -361,7 +375,7 @@ def _fit(
         inverse, _ = _fixed_inverse(design, weight, weight)
         step = inverse @ (design.T @ (weight * distance_m))
         parameters[columns] -= _UNITS[columns] * step
-        narrow_m = max(_MIN_GATE_M, _GATE_SIGMAS * _robust_sigma(distance_m))
+        narrow_m = max(_MIN_GATE_M, _GATE_SIGMAS * _inlier_sigma(distance_m))
         is_narrow = gate_m <= _STEADY * narrow_m
         if is_narrow and np.abs(step).max(initial=0.0) < limit.step:
             return _Optimum(parameters, gate_m, True)
@@ -411,6 +425,16 @@ def _inside(matches: _Matches, gate_m: float) -> NDArray[np.bool_]:
 
 def _robust_sigma(distance_m: FloatArray) -> float:
     return 1.4826 * float(np.median(np.abs(distance_m))) if len(distance_m) else float("nan")
+
+
+def _inlier_sigma(distance_m: FloatArray) -> float:
+    """Return the robust standard deviation of distances, also where up to two thirds of them are outliers.
+
+    A fifth of the distances is within 0.2533 standard deviations. Where that tells of far less scatter than the median
+    does, outliers determine the median.
+    """
+    fifth = float(np.quantile(np.abs(distance_m), 0.2)) / 0.2533
+    return min(_robust_sigma(distance_m), _OUTLIER_RATIO * fifth)
 
 
 def _design(matches: _Matches, rows: NDArray[np.bool_], parameters: FloatArray) -> FloatArray:

@@ -202,6 +202,7 @@ def named_files(scenario: Scenario) -> Iterator[tuple[str, str]]:
         ("traffic.sumocfg", traffic.sumocfg),
         ("traffic.fcd", traffic.fcd),
         ("traffic.coverage", traffic.coverage),
+        ("traffic.observed", traffic.observed),
         ("traffic.roads", traffic.roads),
         ("sites.file", site_config.file),
         (POINTS_KEY, site_config.points),

@@ -191,7 +191,8 @@ def _write_zones(
         context.folder.zones.unlink(missing_ok=True)
         return
     in_zones = [(site.site.name, site.zones) for site in sites if site.zones is not None]
-    zone_results.write_zones(context.folder.zones, scoring.zones, in_zones, metadata)
+    areas = zones.reported_settings(context.scenario)
+    zone_results.write_zones(context.folder.zones, scoring.zones, in_zones, metadata | areas)
 
 
 def _user_columns(context: StageContext) -> dict[str, pa.Array]:
@@ -230,7 +231,9 @@ def _summary(
     if scoring.zones is not None and best:
         telling = readers.telling_zones(readers.read_zones(context.folder.zones, best[0]))
         if telling:
-            summary["zones"] = f"{best[0]} in zones: {'; '.join(zone.in_words() for zone in telling)}"
+            summary["zones"] = (
+                f"{best[0]} in zones, where it finds fewest: {'; '.join(zone.in_words() for zone in telling)}"
+            )
     skipped = context.scene.skipped("score")
     if skipped:
         summary["skipped"] = skipped

@@ -78,14 +78,15 @@ def run(context: StageContext, inputs: StageDependencies) -> Summary:
     unknown = UnknownOccupancy.from_metadata(parquet.read_metadata(source, "trajectories"), grid)
     first_frame = 0
     with parquet.artefact_writer(context.folder.tpog, "tpog") as file:
-        for name, recorded, boxes in _recorded_periods(source, grid):
+        for name, recorded, seeds, boxes in _recorded_periods(source, grid):
             unused = _leftover_frames(by_period.get(name, scenario), recorded)
             frames = recorded - unused
             blocks = _known_blocks(count_blocks(boxes, grid, frames // n_blocks, n_blocks), unknown, first_frame)
             first_frame += recorded
             boxes_near = writer.write(file, blocks, n_blocks * len(periods), context.progress)
             boxes_in_roi.append(int(boxes_near.sum()) / frames)
-            periods.append(PeriodBlocks(name, 1.0, frames, frames // n_blocks, autocorrelation_time(boxes_near)))
+            memory_frames = max(autocorrelation_time(series) for series in np.split(boxes_near, seeds))
+            periods.append(PeriodBlocks(name, 1.0, frames, frames // n_blocks, memory_frames, seeds=seeds))
             left_over += unused
         periods = _with_weights(periods, scenario)
         file.describe(context.metadata(inputs, grid=grid.to_json(), **_frame_metadata(periods)))
@@ -160,23 +161,28 @@ def _known_blocks(blocks: Iterator[BlockCounts], unknown: UnknownOccupancy, firs
 
 
 class _RecordedPeriod(NamedTuple):
-    """One period of the trajectories; its frames are counted from 0, and its name is empty without periods."""
+    """One period of the trajectories; its frames are counted from 0, and its name is empty without periods.
+
+    Its simulations with seeds of their own follow one another.
+    """
 
     name: str
     frames: int
+    seeds: int
     boxes: Iterator[FrameBoxes]
 
 
 def _recorded_periods(source: Path, grid: Grid) -> Iterator[_RecordedPeriod]:
     metadata = parquet.read_metadata(source, "trajectories")
+    seeds = int(metadata.get("seeds", 1))
     if "periods" not in metadata:
-        yield _RecordedPeriod("", int(metadata["frames"]), read_boxes(source, grid))
+        yield _RecordedPeriod("", int(metadata["frames"]), seeds, read_boxes(source, grid))
         return
     start = 0
     for period in metadata["periods"]:
         frames = int(period["frames"])
         boxes = read_boxes(source, grid, np.arange(start, start + frames))
-        yield _RecordedPeriod(period["name"], frames, _count_from_zero(boxes, start))
+        yield _RecordedPeriod(period["name"], frames, seeds, _count_from_zero(boxes, start))
         start += frames
 
 
@@ -207,7 +213,10 @@ def _frame_metadata(periods: list[PeriodBlocks]) -> dict[str, Any]:
     """Entries of the metadata about frames and blocks."""
     if not periods[0].name:
         one = periods[0]
-        return {"frames": one.frames, "block_frames": one.block_frames, "memory_frames": one.memory_frames}
+        entries = {"frames": one.frames, "block_frames": one.block_frames, "memory_frames": one.memory_frames}
+        if one.seeds > 1:
+            entries["seeds"] = one.seeds
+        return entries
     frames = sum(period.frames * period.times for period in periods)
     return {"frames": frames, "periods": [period.to_json() for period in periods]}
 

@@ -13,9 +13,12 @@ SUMO (https://eclipse.dev/sumo) stands in for the paper's game-engine simulator.
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from contextvars import copy_context
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pyarrow as pa
 
@@ -24,13 +27,17 @@ from egvs.artefacts.frame_boxes import UNKNOWN_BOXES_KEY
 from egvs.core import files
 from egvs.core.errors import WARNINGS_KEY, InputError, MissingBackendError
 from egvs.core.platform import relative_path
+from egvs.core.progress import SummedProgress
 from egvs.core.sumo_home import sumo_home
+from egvs.core.threads import map_ordered
 from egvs.effects import registry
 from egvs.scenario.model import TERRAIN_KEY, Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
-from egvs.traffic import finished_fcd, recording, sumo, sumo_folder, trajectories
+from egvs.stages.seed_summaries import merge_seed_summaries
+from egvs.traffic import finished_fcd, network, recording, signals, sumo, sumo_folder, trajectories
 from egvs.traffic.fcd import FrameWindow
 from egvs.traffic.locks import WatchedRegion
+from egvs.traffic.vehicle_boxes import TrafficHook
 from egvs.world import geolocation
 
 
@@ -40,6 +47,7 @@ def dependencies(context: StageContext) -> StageDependencies:
     periods = scenario.by_period().values()
     effects, _ = registry.active_traffic_effects(scenario)
     traffic = scenario.traffic.model_dump(mode="json")
+    del traffic["observed"]  # it is compared with the traffic later
     for period in traffic["periods"]:
         del period["weight"]
     settings = {"seed": scenario.seed, "name": scenario.name, "traffic": traffic}
@@ -106,7 +114,7 @@ def _source_files(scenario: Scenario) -> list[Path]:
         from egvs.traffic import recorded_tracks
 
         sources += recorded_tracks.track_files(scenario)
-    return [*sources, *sumo_folder.demand_files(scenario).all()]
+    return [*sources, *sumo_folder.demand_files(scenario).all(), *signals.signal_files(scenario)]
 
 
 def _relative_name(path: Path, scenario: Scenario) -> str:
@@ -124,7 +132,7 @@ def prepare() -> None:
 
 
 def run(context: StageContext, inputs: StageDependencies, traci: tuple[str, int] | None = None) -> Summary:
-    """Make the trajectories. SUMO runs on one thread, so that its output does not depend on their number.
+    """Make the trajectories. Each SUMO runs on one thread, so that its output does not depend on their number.
 
     Parameters
     ----------
@@ -150,6 +158,11 @@ def run(context: StageContext, inputs: StageDependencies, traci: tuple[str, int]
     has_periods = bool(context.scenario.traffic.periods)
     if traci is not None and has_periods:
         raise InputError("--traci", "the scenario has periods", "Use a scenario without [[traffic.periods]].")
+    seeds = context.scenario.traffic.seeds
+    if traci is not None and seeds > 1:
+        raise InputError("--traci", f"expected traffic.seeds = 1, got {seeds}", "A running SUMO has one seed.")
+    if traci is not None and context.scenario.traffic.signals:
+        raise InputError("--traci", "a running SUMO has plans of its own", "Remove [traffic.signals].")
     summaries = {}
     periods = []
     unknown_boxes: list[dict[str, Any]] = []
@@ -163,10 +176,27 @@ def run(context: StageContext, inputs: StageDependencies, traci: tuple[str, int]
         metadata: dict[str, Any] = {"frames": frames, "frame_period_s": window.period_ms / 1000.0}
         if has_periods:
             metadata["periods"] = periods
+        if seeds > 1:
+            metadata["seeds"] = seeds
         if unknown_boxes:
             metadata[UNKNOWN_BOXES_KEY] = unknown_boxes
         file.describe(context.metadata(inputs, **metadata, sumo=inputs.more["sumo"]))
-    return merge_summaries(summaries) if has_periods else summaries[""]
+    summary = merge_summaries(summaries) if has_periods else summaries[""]
+    if plans := _signal_plans(context):
+        summary["signals"] = plans
+    return summary
+
+
+def _signal_plans(context: StageContext) -> list[dict[str, Any]]:
+    """Return the plans of the signals in the region, from the network that was simulated; none where none was."""
+    scenario = next(iter(context.scenario.by_period().values()))
+    paths = sorted(context.folder.sumo.rglob(sumo_folder.NETWORK_FILE))
+    if scenario.traffic.is_finished or not paths:
+        return []
+    roads = network.read_net_xml(paths[0])
+    if not roads.stop_lines:
+        return []
+    return signals.describe_simulated(scenario, paths[0], roads)
 
 
 def _record_period(
@@ -179,17 +209,77 @@ def _record_period(
 ) -> tuple[FrameWindow, Summary, list[dict[str, Any]]]:
     """Write the frames of one period; return them, what happened, and where positions are unknown."""
     effects, notes = registry.active_traffic_effects(scenario)
-    folder = context.folder.sumo / period
+    summaries = []
+    unknown: list[dict[str, Any]] = []
+    frames = 0
+    runs = scenario.by_seed()
+    with ExitStack() as simulations:
+        for number, recorded in enumerate(_record_runs(context, runs, period, effects, traci, simulations), start=1):
+            prefix = f"{number}:" if len(runs) > 1 else ""
+            written = _write_run(context, runs[number - 1], recorded, effects, file, first_frame + frames, prefix)
+            if notes:
+                written.summary["notes"] = [*written.summary.get("notes", []), *notes]
+            summaries.append(written.summary)
+            unknown += written.unknown_boxes
+            frames += recorded.window.count
+            window = replace(recorded.window, count=frames)
+    if len(runs) == 1:
+        return window, summaries[0], unknown
+    return window, merge_seed_summaries(summaries, [run.seed for run in runs]), unknown
+
+
+def _record_runs(
+    context: StageContext,
+    runs: Sequence[Scenario],
+    period: str,
+    effects: Sequence[TrafficHook],
+    traci: tuple[str, int] | None,
+    simulations: ExitStack,
+) -> Iterator[recording.Recording]:
+    """Yield the recording of each simulation in order; several run at the same time, on the threads of the context.
+
+    ``simulations`` ends them, and removes their temporary files.
+    """
     georeference = context.inputs.georeference
-    regions = {"": WatchedRegion(scenario.roi.box)}
-    with recording.record_traffic(
-        scenario, folder, effects, context.progress, traci, georeference, regions
-    ) as recorded:
-        tally, reports = trajectories.write_trajectories(
-            scenario, recorded, effects, file, context.progress, first_frame
+    regions = {"": WatchedRegion(context.scenario.roi.box)}
+    progress = SummedProgress(context.progress)
+
+    def record(number: int) -> recording.Recording:
+        folder = context.folder.sumo / period
+        if len(runs) > 1:
+            folder /= f"seed{number + 1}"
+        return simulations.enter_context(
+            recording.record_traffic(runs[number], folder, effects, progress.part(number), traci, georeference, regions)
         )
-        sumo_summary = recorded.summary()
-        warnings = trajectories.traffic_warnings(tally, recorded, scenario.roi.box, recording.demand_key(scenario))
+
+    # a copy for each thread, so that a run in the background can be told to end
+    contexts = [copy_context() for _ in runs]
+    threads = min(context.threads, len(runs))
+    yield from map_ordered(lambda number: contexts[number].run(record, number), range(len(runs)), threads)
+
+
+class _WrittenRun(NamedTuple):
+    """What happened in a simulation whose frames were written, and where positions are unknown."""
+
+    summary: Summary
+    unknown_boxes: list[dict[str, Any]]
+
+
+def _write_run(
+    context: StageContext,
+    scenario: Scenario,
+    recorded: recording.Recording,
+    effects: Sequence[TrafficHook],
+    file: parquet.ArtefactWriter,
+    first_frame: int,
+    name_prefix: str,
+) -> _WrittenRun:
+    """Write the frames of one simulation, or of a finished file."""
+    tally, reports = trajectories.write_trajectories(
+        scenario, recorded, effects, file, context.progress, first_frame, name_prefix
+    )
+    sumo_summary = recorded.summary()
+    warnings = trajectories.traffic_warnings(tally, recorded, scenario.roi.box, recording.demand_key(scenario))
     summary = tally.to_json(recorded.window.period_ms / 1000.0)
     if sumo_summary is not None:
         summary |= asdict(sumo_summary)
@@ -199,10 +289,8 @@ def _record_period(
         summary["sizes"] = {name: sized.to_json() for name, sized in recorded.types.items()}
     warnings = [*recorded.warnings, *warnings]
     summary[WARNINGS_KEY] = [*summary.get(WARNINGS_KEY, []), *(warning.to_json() for warning in warnings)]
-    if notes:
-        summary["notes"] = [*summary.get("notes", []), *notes]
     unknown = [{**gap, "frames": [first_frame + frame for frame in gap["frames"]]} for gap in recorded.unknown_boxes]
-    return recorded.window, summary | reports, unknown
+    return _WrittenRun(summary | reports, unknown)
 
 
 def merge_summaries(summaries: dict[str, Summary]) -> Summary:

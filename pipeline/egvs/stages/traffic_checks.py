@@ -104,6 +104,32 @@ def check_demand(inputs: CheckInputs) -> Iterator[Diagnostic]:
         yield Diagnostic("traffic", key, problem, hint, is_error=True)
 
 
+@_for_each_period
+def check_signals(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Report plans of signals that do not fit the network."""
+    traffic = inputs.scenario.traffic
+    if not traffic.signals or traffic.is_finished:
+        return
+    try:
+        path = sumo_folder.demand_files(inputs.scenario).files["net-file"][0]
+    except InputError:
+        return  # check_times reports it
+    errors = ErrorCollector()
+    errors.attempt("traffic", partial(sumo_folder.check_signal_plans, inputs.scenario, path))
+    yield from errors.findings
+
+
+@_for_each_period
+def warn_equal_demand(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Warn if several seeds simulate the same departures of a user's demand, which hides part of the error."""
+    traffic = inputs.scenario.traffic
+    if traffic.seeds == 1 or not traffic.has_user_demand or traffic.redraw_departures:
+        return
+    key = f"{sumo_folder.traffic_location(inputs.scenario)}.seeds"
+    problem = "all simulations have the same vehicles and departures, so standard errors may be too small"
+    yield Diagnostic("seeds", key, problem, "Set redraw_departures = true.")
+
+
 def _has_demand(scenario: Scenario) -> bool:
     traffic = scenario.traffic
     if traffic.is_finished or not (traffic.sumocfg or traffic.routes):
@@ -160,7 +186,9 @@ def check_finished_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
         people = errors.attempt("traffic", lambda: recorded_tracks.read_recorded_pedestrians(scenario, world))
         if people is not None:
             yield from recorded_tracks.track_warnings(people, where)
-            yield from recorded_tracks.pedestrian_warnings(where)
+            first_s = errors.attempt("traffic", lambda: _first_frame_s(scenario))
+            if first_s is not None:
+                yield from recorded_tracks.pedestrian_warnings(people, first_s, where)
     if scenario.traffic.fcd is None:
         yield from errors.findings
         return
@@ -170,6 +198,13 @@ def check_finished_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
         errors.attempt("traffic", lambda: finished_fcd.check_types(scenario, content.types, content.sizes))
         yield from finished_fcd.presence_warnings(scenario, content)
     yield from errors.findings
+
+
+def _first_frame_s(scenario: Scenario) -> float:
+    """Return the time of the first frame in the simulation."""
+    begin_s = sumo_folder.demand_files(scenario).begin_s
+    timing = sumo_folder.make_timing(scenario.traffic, begin_s, sumo_folder.traffic_location(scenario))
+    return timing.first_ms / 1000.0
 
 
 def check_vehicle_kinds(inputs: CheckInputs) -> Iterator[Diagnostic]:
@@ -211,3 +246,20 @@ def check_counts(inputs: CheckInputs) -> Iterator[Diagnostic]:
         for edge in (count.edge, count.from_edge, count.to_edge):
             if edge and edge not in edges:
                 yield Diagnostic.of("traffic", demand.unknown_edge_error(demand.count_key(count, key), edge))
+
+
+def check_observed(inputs: CheckInputs) -> Iterator[Diagnostic]:
+    """Report a file of observed queues and speeds that is not valid, or that no counts belong to."""
+    scenario = inputs.scenario
+    if scenario.traffic.observed is None or inputs.network is None:
+        return
+    from egvs.traffic import observed
+
+    edges = {edge.id for edge in inputs.network.edges}
+    for period in scenario.by_period().values():
+        for count in period.traffic.counts:
+            if not {count.edge, count.from_edge, count.to_edge} - {None} <= edges:
+                return  # check_counts reports it
+    errors = ErrorCollector()
+    errors.attempt("traffic", partial(observed.read_observed, scenario, inputs.network))
+    yield from errors.findings

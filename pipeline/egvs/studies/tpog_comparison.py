@@ -12,6 +12,7 @@ is most often, the occupancy of a bin is the mean of its columns.
   It tells where along the lane vehicles are, from 0 (the same) to 1 (never in the same bin). How many there are is a
   number of its own: the mean occupancy of the lane.
 - **Entropy**: the sum over its voxels, bits.
+- **Speeds** (:mod:`egvs.studies.lane_speeds`): mean, and Wasserstein distance of the two distributions.
 - **Ranks**: Kendall's tau-b over the sites of the same name, by the score that ranks, and the share of the best
   recorded score that is lost at the best simulated site.
 
@@ -30,6 +31,7 @@ from pathlib import Path
 
 import numpy as np
 
+from egvs.artefacts import parquet
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.artefacts.tpog import Tpog, read_tpog
@@ -45,6 +47,7 @@ from egvs.scenario.loading import scenario_from_dict
 from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, ScoreUncertainty
 from egvs.stages.base import StageContext
 from egvs.stages.inputs import open_folder
+from egvs.studies import lane_speeds
 from egvs.studies.lane_bins import LaneBins, column_centres_m, lane_bins, lane_distances, mean_groups, sum_groups
 from egvs.studies.paired_errors import SiteReplicates, read_replicates
 from egvs.studies.score_errors import rank_agreement, regret
@@ -61,6 +64,28 @@ class Measured:
     bias: float | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class SpeedComparison:
+    """Speeds on a lane.
+
+    Attributes
+    ----------
+    mean_m_s
+        Mean, recorded and simulated.
+    distance_m_s
+        Wasserstein distance of the distributions.
+    vehicles
+        Number of vehicles, recorded and simulated.
+    cumulative
+        Share of speeds up to the end of each bin of :data:`lane_speeds.BIN_M_S`, recorded and simulated.
+    """
+
+    mean_m_s: tuple[Measured, Measured]
+    distance_m_s: Measured
+    vehicles: tuple[int, int]
+    cumulative: tuple[FloatArray, FloatArray]
+
+
 @dataclass(frozen=True)
 class LaneComparison:
     """A lane, or a turn in a junction.
@@ -75,6 +100,8 @@ class LaneComparison:
         Jensen-Shannon distance; None where a run has no traffic on the lane.
     entropy_bit
         Entropy of its voxels, recorded and simulated.
+    speed
+        Speeds of its vehicles; None with few vehicles, or where they are not compared.
     """
 
     name: str
@@ -82,6 +109,7 @@ class LaneComparison:
     occupancy: tuple[Measured, Measured]
     distance: Measured | None
     entropy_bit: tuple[Measured, Measured]
+    speed: SpeedComparison | None = None
 
 
 @dataclass(frozen=True)
@@ -188,6 +216,7 @@ def compare_tpogs(recorded: Path, simulated: Path, progress: ProgressCallback = 
     occupancy = [both.single(which, lambda each: each.occupancy) for which in (0, 1)]
     entropy = [both.single(which, lambda each: each.lane_entropy_bit) for which in (0, 1)]
     distances = both.joint(lambda first, second: lane_distances(first.bins, second.bins, bins.lane_of_bin))
+    speeds = _compare_speeds(runs, bins, tpogs[0].grid, jackknives)
     lanes = []
     for number in np.argsort(-statistics[0].occupancy[:, 0], kind="stable").tolist():
         has_traffic = all(each.occupancy[number, 0] > 0 for each in statistics)
@@ -195,6 +224,7 @@ def compare_tpogs(recorded: Path, simulated: Path, progress: ProgressCallback = 
             LaneComparison(
                 bins.names[number], bins.words[number], (occupancy[0][number], occupancy[1][number]),
                 distances[number] if has_traffic else None, (entropy[0][number], entropy[1][number]),
+                speeds.get(number),
             )
         )  # fmt: skip
     everywhere = np.zeros_like(bins.lane_of_bin)
@@ -209,6 +239,42 @@ def compare_tpogs(recorded: Path, simulated: Path, progress: ProgressCallback = 
         (both.n_groups(0), both.n_groups(1)), covered_share, tuple(lanes), distance, (mean[0], mean[1]),
         (totals[0], totals[1], difference), _compare_ranks(recorded, simulated, progress), backdrop,
     )  # fmt: skip
+
+
+def _compare_speeds(
+    runs: Sequence[StageContext], bins: LaneBins, grid: Grid, jackknives: Sequence[BlockJackknife]
+) -> dict[int, SpeedComparison]:
+    """Compare the speeds on each lane with enough vehicles; on none where a run has several periods."""
+    if any(len(jackknife.groups) > 1 for jackknife in jackknives):
+        return {}
+    periods_s = [
+        float(parquet.read_metadata(run.folder.trajectories, "trajectories")["frame_period_s"]) for run in runs
+    ]
+    base_s = lane_speeds.shared_base_s(periods_s)
+    first, second = (
+        lane_speeds.read_lane_speeds(run.folder.trajectories, period_s, base_s, bins, grid, jackknife.groups[0])
+        for run, period_s, jackknife in zip(runs, periods_s, jackknives, strict=True)
+    )
+    counts = first.replicates(), second.replicates()
+    distances = [lane_speeds.speed_distances(counts[0][:, :, :1], counts[1][:, :, :1])]
+    distances += [
+        lane_speeds.speed_distances(counts[0][:, :, k : k + 1], counts[1][:, :, :1])
+        for k in range(1, 1 + first.n_groups)
+    ]
+    distances += [
+        lane_speeds.speed_distances(counts[0][:, :, :1], counts[1][:, :, k : k + 1])
+        for k in range(1, 1 + second.n_groups)
+    ]
+    groups = jackknives[0].groups[0], jackknives[1].groups[0]
+    measured = measure(np.hstack(distances), groups)
+    means = [measure(each.means_m_s(), (of_run,)) for each, of_run in zip((first, second), groups, strict=True)]
+    results = {}
+    for lane in range(len(bins.names)):
+        vehicles = int(first.vehicles[lane]), int(second.vehicles[lane])
+        if min(vehicles) >= lane_speeds.MIN_VEHICLES:
+            cumulative = first.cumulative(lane), second.cumulative(lane)
+            results[lane] = SpeedComparison((means[0][lane], means[1][lane]), measured[lane], vehicles, cumulative)
+    return results
 
 
 def _open_run(folder: Path) -> StageContext:

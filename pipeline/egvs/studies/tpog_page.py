@@ -13,11 +13,15 @@ from egvs.report import formatting, maps, page
 from egvs.report.colours import STYLE_SHEET, ColumnValues
 from egvs.report.maps import MapScale
 from egvs.report.svg_figures import FigureStyle
-from egvs.studies.tpog_comparison import Measured, TpogComparison
+from egvs.studies import speed_figure
+from egvs.studies.tpog_comparison import LaneComparison, Measured, TpogComparison
 
 TEMPLATES = Path(__file__).parent / "templates"
 
 SIDES = ("recorded", "simulated")
+
+MAX_SPEED_FIGURES = 6
+"""Lanes whose distributions of speeds are drawn, the busiest first."""
 
 _MAP_WIDTH = 460.0
 
@@ -53,9 +57,14 @@ def render_page(comparison: TpogComparison) -> str:
     environment.filters |= {
         "svg": Markup, "percent": formatting.format_percent, "integer": formatting.format_count,
         "measured": format_measured, "measured_share": format_share, "measured_bit": format_bit,
+        "measured_speed": format_speed,
     }  # fmt: skip
     return environment.get_template("tpog.html.j2").render(
-        comparison=comparison, figures=draw_maps(comparison), style=Markup(STYLE_SHEET), version=__version__
+        comparison=comparison,
+        figures=draw_maps(comparison),
+        speeds=draw_lane_speeds(comparison),
+        style=Markup(STYLE_SHEET),
+        version=__version__,
     )
 
 
@@ -80,6 +89,27 @@ def format_bit(measured: Measured) -> str:
     if measured.se is None:
         return f"{measured.value:,.0f}"
     return f"{measured.value:,.0f} ± {measured.se:,.0f}"
+
+
+def format_speed(measured: Measured | None) -> str:
+    """Return a speed with its standard error: "7.3 ± 0.6"."""
+    if measured is None:
+        return "–"
+    if measured.se is None:
+        return f"{measured.value:.1f}"
+    return f"{measured.value:.1f} ± {measured.se:.1f}"
+
+
+def draw_lane_speeds(comparison: TpogComparison) -> list[tuple[LaneComparison, str]]:
+    """Return lanes with the figure of their speeds, SVG text, all with one axis."""
+    lanes = [(lane, lane.speed) for lane in comparison.lanes if lane.speed is not None][:MAX_SPEED_FIGURES]
+    top_m_s = speed_figure.highest_speed_m_s([shares for _, speed in lanes for shares in speed.cumulative])
+    figures = []
+    for lane, speed in lanes:
+        means = [f"{each.value:.1f} m/s {side}" for side, each in zip(SIDES, speed.mean_m_s, strict=True)]
+        alt = f"Speeds on the {lane.words}: on average {' and '.join(means)}."
+        figures.append((lane, speed_figure.draw_speeds(speed.cumulative, top_m_s, alt)))
+    return figures
 
 
 def draw_maps(comparison: TpogComparison) -> list[str]:

@@ -101,21 +101,21 @@ class MovementNames:
         """
         first = self._edges[from_edge]
         if to_edge is None:
-            return f"{compass(_end_heading([first]))}bound on {_street(first)}"
+            return f"{compass(_end_heading([first]))}bound on {street_name(first)}"
 
         passage = self._passage(first, self._edges[to_edge])
         approach, way_out = passage.to_junction[-1], passage.from_junction[0]
         before, after = _headings(passage)
-        words = f"{compass(before)}bound on {_street(approach)}"
+        words = f"{compass(before)}bound on {street_name(approach)}"
         if first.name not in ("", approach.name):
-            words += f" from {_street(first)}"
+            words += f" from {street_name(first)}"
 
         turn = self._turns.get((approach.id, way_out.id)) or _turn_between(before, after)
         last = passage.from_junction[-1]
-        towards = f" towards {_street(last)}" if last.name not in ("", way_out.name) else ""
+        towards = f" towards {street_name(last)}" if last.name not in ("", way_out.name) else ""
         if turn == "straight" and approach.name == way_out.name:
             return f"{words}, straight on{towards}"
-        return f"{words}, {_WAYS[turn]} to {_street(way_out)}{towards}"
+        return f"{words}, {_WAYS[turn]} to {street_name(way_out)}{towards}"
 
     def movement(self, from_edge: str, to_edge: str | None) -> Movement:
         """Return approach and turn of a movement; parameters as of :meth:`describe`."""
@@ -180,7 +180,7 @@ def _point_along(line_m: Floats) -> Floats:
     return np.array([np.interp(_HEADING_OVER_M, distance_m, line_m[:, axis]) for axis in (0, 1)])
 
 
-def _street(edge: Edge) -> str:
+def street_name(edge: Edge) -> str:
     """Return the name of an edge's street on one line."""
     return plain_text(edge.name) or _UNNAMED_STREET
 

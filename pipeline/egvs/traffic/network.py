@@ -26,6 +26,7 @@ from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.formats import xml
 from egvs.scenario.fields import parse_coordinate_m
+from egvs.traffic.signal_clock import SignalClock
 
 LANE_WIDTH_M, DEFAULT_SPEED_M_S = 3.2, 13.89
 """SUMO's defaults for lanes without a width or a speed limit."""
@@ -238,6 +239,8 @@ class Network:
         The ends of lanes at signals that become green.
     roundabouts
         The roundabouts, in file order.
+    signal_clock
+        The clock of a program that replays recorded signals, if there is one.
     """
 
     all_edges: tuple[Edge, ...]
@@ -248,6 +251,7 @@ class Network:
     lane_links: tuple[tuple[str, str], ...] = ()
     stop_lines: tuple[StopLine, ...] = ()
     roundabouts: tuple[Roundabout, ...] = ()
+    signal_clock: SignalClock | None = None
 
     @property
     def red_s(self) -> float:
@@ -336,6 +340,7 @@ def _read_network_file(file: _NamedFile, _content: str) -> Network:
     reds_s: dict[tuple[str, int], float] = {}
     location = None
     roundabouts: list[Roundabout] = []
+    signal_clock: SignalClock | None = None
     for element in xml.iter_elements(file.path, "net", file.name):
         try:
             match element.tag:
@@ -357,7 +362,10 @@ def _read_network_file(file: _NamedFile, _content: str) -> Network:
                     junctions.append(_parse_junction(element.attrib, file.name))
                 case "tlLogic":
                     phases = [_Phase.from_attributes(phase.attrib) for phase in element.iter("phase")]
-                    cycle_s = max(cycle_s, sum(phase.duration_s for phase in phases))
+                    clock = SignalClock.from_program(element)
+                    signal_clock = signal_clock or clock
+                    program_s = sum(phase.duration_s for phase in phases)
+                    cycle_s = max(cycle_s, program_s if clock is None else clock.cycle_s)
                     for position, red_s in _longest_reds(phases).items():
                         key = element.attrib["id"], position
                         reds_s[key] = max(red_s, reds_s.get(key, 0.0))
@@ -376,7 +384,7 @@ def _read_network_file(file: _NamedFile, _content: str) -> Network:
     stop_lines = tuple(_stop_lines(signals, roads, reds_s))
     return Network(
         tuple(edges), road_connections, tuple(junctions), cycle_s, location, tuple(lane_links), stop_lines,
-        tuple(roundabouts),
+        tuple(roundabouts), signal_clock,
     )  # fmt: skip
 
 

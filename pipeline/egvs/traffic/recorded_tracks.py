@@ -69,6 +69,8 @@ class RecordedTracks:
         How well they fit the lanes; None without a network.
     roads
         The network, whose heights the boxes get; z = 0 without one.
+    first_s
+        Time of the first frame, on the clock of the recording.
     """
 
     window: FrameWindow
@@ -78,6 +80,7 @@ class RecordedTracks:
     outside: int
     alignment: Alignment | None
     roads: Network | None = None
+    first_s: float = 0.0
 
     @property
     def type_names(self) -> list[str]:
@@ -231,7 +234,7 @@ def read_recorded_pedestrians(scenario: Scenario, world: Georeference) -> Record
     cleaned = cleaning.clean_tracks(tracks.select_tracks(is_vulnerable), class_sizes(scenario.traffic))
     first_s = float(np.nanmin(tracks.time_s))
     boxes = resampling.resample(cleaned, first_s, window.period_ms / 1000.0, window.count, scenario.traffic.track_gap_s)
-    return RecordedTracks(window, cleaned, boxes, None, 0, None, sumo_folder.read_network(scenario))
+    return RecordedTracks(window, cleaned, boxes, None, 0, None, sumo_folder.read_network(scenario), first_s)
 
 
 def check_recorded_people(scenario: Scenario, *, are_simulated: bool) -> None:
@@ -242,13 +245,35 @@ def check_recorded_people(scenario: Scenario, *, are_simulated: bool) -> None:
         raise InputError(where, problem, "Remove effects.pedestrians_bicycles, or pedestrian_tracks.")
 
 
-def pedestrian_warnings(where: str) -> Iterator[Diagnostic]:
-    """Warn that recorded pedestrians and simulated vehicles know nothing of each other."""
+def pedestrian_warnings(people: RecordedTracks, begin_s: float, where: str) -> Iterator[Diagnostic]:
+    """Warn that recorded pedestrians and simulated vehicles know nothing of each other.
+
+    There is no warning where the network replays the signals that the people were recorded under, on their clock.
+
+    Parameters
+    ----------
+    people
+        The recorded people, with the network of the vehicles.
+    begin_s
+        Time of the first frame in the simulation.
+    where
+        Key of the tracks, for messages.
+    """
+    clock = None if people.roads is None else people.roads.signal_clock
+    if clock is not None:
+        duration_s = (people.window.count - 1) * people.window.period_ms / 1000.0
+        problem = clock.problem(begin_s, people.first_s, people.first_s + duration_s)
+        if not problem:
+            return
+        begin_s = people.first_s - clock.zero_s
+        hint = f"Set traffic.warmup_s and begin_s so that their sum is {begin_s:g}, and frames within the signals."
+        yield Diagnostic("recorded pedestrians", where, problem, hint)
+        return
     problem = (
-        "people were recorded among other vehicles than the simulated ones, and under other signals unless the network"
-        " has the recorded plan: they do not react to each other, and may cross at the same time"
+        "people were recorded among other vehicles than the simulated ones, and under other signals: they do not react"
+        " to each other, and may cross at the same time"
     )
-    hint = "Use it to see where people are; for their encounters with vehicles, record both, or simulate both."
+    hint = "Give the recorded signals: egvs new --pedestrian-tracks with --signals. Or record or simulate both."
     yield Diagnostic("recorded pedestrians", where, problem, hint)
 
 

@@ -272,7 +272,7 @@ def _record_simulated(
             people_values = {
                 "uncounted_types": people.vulnerable_types(),
                 "tracks": people.summary(),
-                "warnings": tuple(_people_warnings(people, f"{where}.pedestrian_tracks")),
+                "warnings": tuple(_people_warnings(people, prepared.timing, f"{where}.pedestrian_tracks")),
                 "unknown_boxes": people.unknown_boxes(),
             }
         yield Recording(
@@ -309,11 +309,11 @@ def _recorded_people(
     return recorded_tracks.read_recorded_pedestrians(scenario, world)
 
 
-def _people_warnings(people: RecordedTracks, where: str) -> Iterator[Diagnostic]:
+def _people_warnings(people: RecordedTracks, timing: Timing, where: str) -> Iterator[Diagnostic]:
     from egvs.traffic import recorded_tracks
 
     yield from recorded_tracks.track_warnings(people, where)
-    yield from recorded_tracks.pedestrian_warnings(where)
+    yield from recorded_tracks.pedestrian_warnings(people, timing.first_ms / 1000.0, where)
 
 
 def _read_rows(path: Path, element: str) -> Iterable[pa.Table]:

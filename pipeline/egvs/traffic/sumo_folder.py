@@ -26,7 +26,7 @@ from egvs.core.grid import FloatArray
 from egvs.formats import osm
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import TrafficConfig
-from egvs.traffic import demand, departures, network, sumo, town_trips, user_files
+from egvs.traffic import demand, departures, network, signals, sumo, town_trips, user_files
 from egvs.traffic.fcd import FrameWindow
 from egvs.traffic.vehicle_boxes import TrafficHook
 
@@ -168,6 +168,16 @@ def read_network(scenario: Scenario) -> network.Network | None:
     with files.temporary_folder() as folder:
         convert_osm_to_network(path, folder / NETWORK_FILE)
         return network.read_net_xml(folder / NETWORK_FILE, path)
+
+
+def check_signal_plans(scenario: Scenario, path: Path) -> None:
+    """Raise an InputError if a plan of a signal does not fit the network in a file, which may be a map."""
+    if not network.is_osm(path):
+        signals.check_plans(scenario, path, network.read_net_xml(path))
+        return
+    with files.temporary_folder() as folder:
+        convert_osm_to_network(path, folder / NETWORK_FILE)
+        signals.check_plans(scenario, folder / NETWORK_FILE, network.read_net_xml(folder / NETWORK_FILE, path))
 
 
 def copy_network(scenario: Scenario, folder: Path) -> None:
@@ -318,6 +328,9 @@ def prepare_simulation(scenario: Scenario, folder: Path, extensions: Iterable[Tr
 
     _make_empty(folder, inputs.all())
     copies, notes = _copy_files(inputs, folder, extra_files)
+    if traffic.signals:
+        _check_additional_programs(copies, folder, where)
+        signals.apply_plans(scenario, folder / copies["net-file"], inputs.files["net-file"][0])
     roads = network.read_net_xml(folder / copies["net-file"], inputs.files["net-file"][0])
     demand_seed, sumo_seed, *extra_seeds = np.random.SeedSequence(scenario.seed).spawn(2 + len(adding))
 
@@ -364,6 +377,14 @@ def prepare_simulation(scenario: Scenario, folder: Path, extensions: Iterable[Tr
         folder, tuple(inputs.all()), options, timing, roads, vehicles, is_generated, bool(traffic.counts),
         has_fixed_count, bool(adding), notes,
     )  # fmt: skip
+
+
+def _check_additional_programs(copies: Mapping[str, str], folder: Path, where: str) -> None:
+    """Raise an InputError if a user's additional file has signal programs, which SUMO would prefer."""
+    for name in filter(None, copies.get("additional-files", "").split(",")):
+        if b"<tlLogic" in (folder / name).read_bytes():
+            problem = f"{name} of the SUMO configuration also contains signal programs (<tlLogic>)"
+            raise InputError(f"{where}.signals", problem, "Remove them there, or remove signals.")
 
 
 def _redraw_departures(copies: Mapping[str, str], folder: Path, rng: np.random.Generator) -> list[str]:

@@ -353,6 +353,7 @@ def write_trajectories(
     file: ArtefactWriter,
     progress: ProgressCallback,
     first_frame: int = 0,
+    name_prefix: str = "",
 ) -> tuple[TrafficStatistics, dict[str, Any]]:
     """Write the boxes of a recording.
 
@@ -370,6 +371,8 @@ def write_trajectories(
         Reports written frames.
     first_frame
         Number of the first frame in the file.
+    name_prefix
+        Put before the names of vehicles, so that those of several simulations differ.
 
     Returns
     -------
@@ -404,7 +407,7 @@ def write_trajectories(
         for change in changes:
             boxes = change.change(boxes)
         if boxes.frame.size:
-            file.write(boxes.columns(first_frame))
+            file.write(boxes.columns(first_frame, name_prefix))
         statistics.add(boxes)
         progress("frames written", group.first_frame + group.frames, statistics.frames)
     check_recording(scenario, statistics, recording)

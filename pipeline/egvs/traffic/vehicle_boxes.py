@@ -110,13 +110,17 @@ class VehicleBoxes:
         """Return some of the boxes."""
         return replace(self, **self.rows(np.flatnonzero(mask)))
 
-    def columns(self, first_frame: int = 0) -> dict[str, Any]:
-        """Return the columns of the artefact ``trajectories``; ``first_frame`` is added to the frame numbers."""
+    def columns(self, first_frame: int = 0, name_prefix: str = "") -> dict[str, Any]:
+        """Return the columns of the artefact ``trajectories``.
+
+        ``first_frame`` is added to the frame numbers, and ``name_prefix`` is put before the names of vehicles.
+        """
+        names = [name_prefix + name for name in self.names]
         part = np.zeros(self.frame.size, np.int64) if self.part is None else self.part
         return {
             "frame": (self.frame + first_frame).astype(np.uint32),
             "part": part.astype(np.uint8),
-            "vehicle": _decode_strings(self.names, self.code),
+            "vehicle": _decode_strings(names, self.code),
             "kind": _decode_strings(self.kinds, self.kind),
             **{name: getattr(self, name) for name in _NUMBERS},
         }

@@ -208,7 +208,8 @@ def held_out_scenario(scenario: Scenario, frames: int, apart_s: float) -> Scenar
 
     state = np.random.SeedSequence((scenario.seed, _SEED_STREAM)).generate_state(1, np.uint64)
     seed = int(state[0]) >> 33  # SUMO takes seeds of 31 bits
-    values = {key: getattr(traffic, key) for key in traffic.model_fields_set}
+    # one simulation: frames far apart need no replications
+    values = {key: getattr(traffic, key) for key in traffic.model_fields_set - {"seeds"}}
     if any(period.traffic.has_user_demand for period in scenario.by_period().values()):
         values["redraw_departures"] = True
     if not traffic.periods:

@@ -1,0 +1,152 @@
+"""``egvs sheets`` and ``egvs accept``: install a sensor, and check it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from egvs.cli.options import Run
+from egvs.core.errors import EgvsError, InputError
+
+if TYPE_CHECKING:
+    from egvs.installation.acceptance import Acceptance, Check
+
+
+def sheets(
+    run: Run,
+    site: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SITE",
+            help="A site (repeatable); by default the sensors of the plan in the folder, or the best site without one.",
+        ),
+    ] = None,
+    kind: Annotated[str, typer.Option("--format", metavar="FORMAT", help="pdf or svg.")] = "pdf",
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Folder to write; RUN/sheets by default.")
+    ] = None,
+) -> None:
+    """Write an installation sheet for each sensor of the plan: position, bearing, tilt, view, map, tolerances."""
+    from egvs.cli.console import ProgressDisplay, print_sentences
+
+    with ProgressDisplay("sheets") as screen:
+        from egvs.installation import sheet, tolerances
+
+        written = sheet.write_sheets(run, site or (), kind=kind, out=out, progress=screen.progress)
+    sentences = []
+    for data, _ in written:
+        angles = f"bearing {sheet.format_angle(data.grid_bearing_deg)} from grid north"
+        height = f"{data.mounting_height_m:.2f} m above the ground"
+        costs = tolerances.describe_tolerances(data.tolerances)
+        sentences.append(f"{data.site.name}: {height}, {angles}; {costs} ({data.tolerances.frames:,} frames).")
+    print_sentences(sentences)
+    for _, path in written:
+        print(path)
+
+
+def accept(
+    run: Run,
+    scan: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE",
+            help="Required: a measured scan in the sensor's frame (x forward, y left, z up, metres): .pcd, .ply, .las,"
+            " .laz, .csv, .e57 or .npz. Several scans, minutes apart: --scan A --scan B --scan C.",
+        ),
+    ] = None,
+    site: Annotated[str, typer.Option(metavar="SITE", help="Required: the site where the sensor is installed.")] = "",
+    position: Annotated[float, typer.Option(metavar="M", min=0, help="Largest error of the position.")] = 0.3,
+    tilt: Annotated[float, typer.Option(metavar="DEG", min=0, help="Largest error of pitch and roll together.")] = 1.0,
+    yaw: Annotated[float, typer.Option(metavar="DEG", min=0, help="Largest error of the yaw.")] = 2.0,
+    blocked: Annotated[
+        float, typer.Option(metavar="DEG", min=0, help="Largest width of all blocked sectors together.")
+    ] = 5.0,
+    missing_channels: Annotated[
+        int, typer.Option("--missing-channels", metavar="N", min=0, help="Largest number of channels without returns.")
+    ] = 0,
+    returns: Annotated[
+        float, typer.Option(metavar="SHARE", min=0, max=1, help="Smallest share of the expected returns.")
+    ] = 0.8,
+    off_beams: Annotated[
+        float,
+        typer.Option(
+            "--off-beams", metavar="SHARE", min=0, max=1, help="Largest share of returns on no beam of the sensor."
+        ),
+    ] = 0.05,
+    loss: Annotated[
+        float, typer.Option(metavar="SHARE", min=0, help="Largest loss of the score, as a share of the planned score.")
+    ] = 0.05,
+    vehicle_height: Annotated[
+        float,
+        typer.Option(
+            "--vehicle-height", metavar="M", min=0,
+            help="A return in front of the static world that is higher above the ground is of an obstacle.",
+        ),
+    ] = 4.5,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Folder to write; RUN/acceptance by default.")
+    ] = None,
+) -> None:  # fmt: skip
+    """Compare a measured scan of an installed sensor with the planned one: pass (exit code 0) or fail (1)."""
+    from egvs.cli.console import ProgressDisplay
+
+    with ProgressDisplay("accept") as screen:
+        from egvs.core import files
+        from egvs.installation import acceptance, acceptance_page
+        from egvs.installation.acceptance import Limits
+
+        if not scan:
+            raise InputError("--scan", "no scan is given", "Use --scan measured.pcd.")
+        if not site:
+            raise InputError("--site", "no site is given", "Use the name of a site, such as --site c03.")
+        limits = Limits(position, tilt, yaw, blocked, missing_channels, returns, off_beams, loss)
+        folder = out or run / "acceptance"
+        result = acceptance.accept(
+            run, site, scan, limits, max_vehicle_height_m=vehicle_height, progress=screen.progress
+        )  # fmt: skip
+        files.check_writable(acceptance_page.AcceptanceFiles.of(folder, site).json)
+        written = acceptance_page.write_files(folder, result)
+    _print_acceptance(result)
+    print(written.json)
+    print(written.page)
+    if not result.passed:
+        raise typer.Exit(EgvsError.exit_code)
+
+
+def _print_acceptance(result: Acceptance) -> None:
+    """Print the verdict, the checks and the pose error."""
+    from egvs.cli.console import Column, print_sentences, print_table
+    from egvs.installation.acceptance import describe_error, describe_sector
+    from egvs.report.formatting import SCORE_LABELS
+
+    verdict = "passed" if result.passed else f"failed: {'; '.join(result.reasons)}"
+    print_sentences([f"{result.site.name} ({result.sensor.name}): {verdict}."])
+    print()
+    columns: list[Column[Check]] = [
+        Column("check", lambda check: check.name, "left"),
+        Column("measured", lambda check: check.measured, "left"),
+        Column("limit", lambda check: check.limit, "left"),
+        Column("", lambda check: ("pass" if check.passed else "FAIL") + (", close" if check.is_close else ""), "left"),
+    ]
+    print_table(columns, result.checks)
+    print()
+    errors = result.pose.standard_errors
+    pose = ", ".join(f"{name} {describe_error(value, errors[name])}" for name, value in result.pose.values.items())
+    sentences = [
+        f"Pose error, measured minus planned: {pose}.",
+        f"{result.on_surface_share:.0%} of {result.comparison.returns:,} returns lie on the static world; "
+        f"{result.comparison.nearer_share:.0%} are nearer than expected.",
+    ]
+    sentences += [f"Blocked: {describe_sector(sector)}." for sector in result.comparison.sectors]
+    if result.score is not None:
+        score, label = result.score, SCORE_LABELS[result.score.name]
+        sentences.append(
+            f"{label.noun[:1].upper()}{label.noun[1:]}: planned {label.value(score.planned)}, at the measured pose"
+            f" {label.value(score.at_measured_pose)}, with obstacles and missing channels"
+            f" {label.value(score.as_installed)} {label.unit}".rstrip()
+            + "."
+        )
+    sentences += [f"Note: {note}." for note in result.notes]
+    print_sentences(sentences)

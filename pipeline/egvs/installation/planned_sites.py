@@ -1,0 +1,96 @@
+"""The sites of a finished run at which sensors are installed: those of its plan, and every candidate by its name."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+
+from egvs.artefacts.readers import read_placement
+from egvs.core.errors import InputError
+from egvs.explore.session import Session
+from egvs.export.export import unknown_site
+from egvs.export.finished_run import FinishedRun
+from egvs.sensors import site_feasibility
+from egvs.sensors.sensor import Sensor
+from egvs.sensors.sites import Pose, Site
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedSites:
+    """The sites of a finished run.
+
+    Attributes
+    ----------
+    run
+        The run.
+    """
+
+    run: FinishedRun
+
+    @classmethod
+    def open(cls, folder: Path) -> PlannedSites:
+        """Open a run folder; InputError if it has no finished run."""
+        return cls(FinishedRun.open(folder))
+
+    @cached_property
+    def session(self) -> Session:
+        """Scores of any pose in the run."""
+        return Session(self.run.work, {name: stage.inputs for name, stage in self.run.record.stages.items()})
+
+    @cached_property
+    def plan(self) -> dict[str, Pose]:
+        """Poses of the sensors of the plan in the run folder, in its order; empty without a plan.
+
+        Raises
+        ------
+        InputError
+            If the plan is for other traffic, sites or settings than the run.
+        """
+        folder = self.run.work.folder
+        placement = read_placement(folder.placement, folder.curve)
+        if placement is None:
+            return {}
+        rows, _, metadata = placement
+        stages = self.run.record.stages
+        for name, key in metadata["stages"].items():
+            if name not in stages or stages[name].inputs != key:
+                problem = "the plan is for other traffic, sites or settings than the run"
+                raise InputError(folder.placement, problem, "Run egvs place again, or remove the file.")
+        return {row["site"]: Pose(**{field.name: row[field.name] for field in fields(Pose)}) for row in rows}
+
+    def site(self, name: str) -> Site:
+        """Return a candidate by its name, at its pose in the plan if it is part of the plan.
+
+        Parameters
+        ----------
+        name
+            Name of the site.
+
+        Raises
+        ------
+        InputError
+            If there is no such site, with the names of those that exist.
+        """
+        candidates = self.session.candidates
+        if name not in candidates:
+            raise unknown_site(name, list(candidates))
+        site = candidates[name].site
+        return replace(site, pose=self.plan.get(name, site.pose))
+
+    def sensor(self, site: Site) -> Sensor:
+        """Return the sensor of a site."""
+        return self.session.scene.sensor(site.sensor, f"site {site.name}")
+
+    def ground_m(self, site: Site) -> float:
+        """Return the height of the ground below a site, world frame."""
+        return site_feasibility.ground_height_m(self.session.scene.world, site.pose)
+
+    @property
+    def default_sites(self) -> tuple[str, ...]:
+        """The sites of the plan, or the best site without a plan."""
+        return tuple(self.plan) or (self.session.ranked[0].site.name,)
+
+    def output_folder(self, name: str, out: Path | None) -> Path:
+        """Return where files are written: ``out``, or a folder of the run."""
+        return out or self.run.work.folder.path / name

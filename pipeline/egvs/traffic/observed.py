@@ -1,0 +1,129 @@
+"""Observed queues and speeds of a junction's approaches (``traffic.observed``), a CSV file.
+
+Columns: ``approach`` (side on which vehicles arrive) and/or ``street``, as in counts by street
+(:mod:`egvs.traffic.approaches`); ``queue_m`` (95th percentile of the queue) and/or ``speed_kmh`` (mean speed in the
+last 100 m before the stop line), of which one may be empty; and ``period`` in a scenario with periods.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from egvs.core import limits
+from egvs.core.errors import InputError, find_misspelling
+from egvs.scenario.model import Scenario
+from egvs.traffic.approaches import ApproachBook, parse_side
+from egvs.traffic.movements import MovementNames
+from egvs.traffic.network import Network
+
+KEY = "traffic.observed"
+COLUMNS = ("street", "approach", "period", "queue_m", "speed_kmh")
+
+_LIMITS = {"queue_m": 10_000.0, "speed_kmh": 300.0}
+
+
+@dataclass(frozen=True)
+class Observation:
+    """An approach as it was observed; ``queue_m`` or ``speed_kmh`` may be None, ``period`` empty."""
+
+    approach: str
+    period: str
+    queue_m: float | None
+    speed_kmh: float | None
+
+
+def approach_book(scenario: Scenario, network: Network) -> ApproachBook:
+    """Return the names of the movements that a scenario counts, in all its periods."""
+    x_m, y_m, _ = scenario.roi.center_m
+    counts = {count.title: count for period in scenario.by_period().values() for count in period.traffic.counts}
+    return ApproachBook.of_flows(counts.values(), MovementNames(network, (x_m, y_m)))
+
+
+def read_observed(scenario: Scenario, network: Network) -> tuple[Observation, ...]:
+    """Read the observations of a scenario that has ``traffic.observed``.
+
+    Raises
+    ------
+    InputError
+        When the scenario has no counts, or the file is not valid.
+    """
+    assert scenario.traffic.observed is not None
+    periods = scenario.by_period()
+    if not all(period.traffic.counts for period in periods.values()):
+        problem = "needs counted traffic in every period"
+        raise InputError(f"{scenario.file}: {KEY}", problem, "Add traffic.counts, e.g. with egvs new --counts.")
+    path = scenario.find(scenario.traffic.observed, KEY)
+    names = [name for name in periods if name]
+    return read_observations(path, approach_book(scenario, network), names)
+
+
+def read_observations(path: Path, book: ApproachBook, periods: Sequence[str]) -> tuple[Observation, ...]:
+    """Read observations; ``periods`` are the names of the scenario's periods, empty without periods."""
+    try:
+        text = limits.read_bytes(path, limits.DOCUMENT).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(path, f"is not UTF-8 text (byte {error.start})", "Save it as CSV in UTF-8.") from None
+    table = csv.DictReader(io.StringIO(text, newline=""), strict=True)
+    header = [name.strip() for name in table.fieldnames or ()]
+    table.fieldnames = header
+    for name in header:
+        if name not in COLUMNS:
+            meant = find_misspelling([name], COLUMNS)
+            hint = f"Did you mean {meant[1]}?" if meant else f"Columns: {', '.join(COLUMNS)}."
+            raise InputError(f"{path}: header", f"unknown column {name!r}", hint)
+    if not {"street", "approach"} & set(header) or not _LIMITS.keys() & set(header):
+        problem = "expected approach or street, and queue_m or speed_kmh"
+        raise InputError(f"{path}: header", problem, "Example: approach,queue_m,speed_kmh.")
+    observations: dict[tuple[str, str], Observation] = {}
+    try:
+        for row in table:
+            where = f"{path}: row {table.line_num}"
+            if None in row or None in row.values():
+                raise InputError(where, f"expected {len(header)} values", "Check the separators.")
+            observation = _parse_row(where, {name: value.strip() for name, value in row.items()}, book, periods)
+            if observations.setdefault((observation.approach, observation.period), observation) is not observation:
+                raise InputError(
+                    where, f"the approach {observation.approach} is there twice", "Remove one of the rows."
+                )
+    except csv.Error as error:
+        raise InputError(f"{path}: row {table.line_num}", f"is not CSV ({error})", "Check the quotes.") from None
+    if not observations:
+        raise InputError(path, "has no observations", "Add one row per approach below the header.")
+    return tuple(observations.values())
+
+
+def _parse_row(where: str, values: Mapping[str, str], book: ApproachBook, periods: Sequence[str]) -> Observation:
+    side = None
+    if values.get("approach"):
+        side = parse_side(values["approach"])
+        if side is None:
+            problem = f"expected the side on which vehicles arrive, got {values['approach']!r}"
+            raise InputError(f"{where}: approach", problem, f"Use N, north or southbound. {book.hint}")
+    if side is None and not values.get("street"):
+        raise InputError(where, "names no approach", book.hint)
+    title = book.find(values.get("street", ""), side, (), where)[0].approach_title
+    period = values.get("period", "")
+    if (period or periods) and period not in periods:
+        known = f"Periods: {', '.join(periods)}." if periods else "The scenario has no periods; remove the column."
+        raise InputError(f"{where}: period", f"expected a period of the scenario, got {period!r}", known)
+    numbers = {name: _parse_number(f"{where}: {name}", values.get(name, ""), limit) for name, limit in _LIMITS.items()}
+    if all(number is None for number in numbers.values()):
+        raise InputError(where, "has neither queue_m nor speed_kmh", "Enter one of them.")
+    return Observation(title, period, numbers["queue_m"], numbers["speed_kmh"])
+
+
+def _parse_number(where: str, text: str, limit: float) -> float | None:
+    if not text:
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value <= limit:
+        raise InputError(where, f"expected a number of 0 to {limit:,.0f}, got {text!r}", "Use a number such as 45.")
+    return value

@@ -1,0 +1,292 @@
+"""Signal plans: what a plan becomes in SUMO, and each wrong plan with its message.
+
+Evidence: states that a person can check at a crossing of two streets, SUMO's states second by second over TraCI, and
+the network's foes for conflicts.
+"""
+
+import re
+import shutil
+
+import pytest
+
+from egvs.core.errors import InputError
+from egvs.core.grid import Roi
+from egvs.scenario.loading import scenario_from_dict
+from egvs.scenario.traffic_config import TrafficConfig
+from egvs.stages import traffic
+from egvs.traffic import network, signals, sumo, sumo_folder
+from tests.stage_runner import run_stage
+from tests.traffic.helpers import netgenerate
+
+pytestmark = pytest.mark.system
+
+NS = {"green": {"north": ["all"], "south": ["all"]}, "green_s": 30}
+EW = {"green": {"east": ["straight", "right", "left"], "west": ["all"]}, "green_s": 20}
+
+
+@pytest.fixture(scope="module")
+def crossing(tmp_path_factory):
+    """One signalised crossing of two streets, with names, sidewalks and pedestrian crossings."""
+    folder = tmp_path_factory.mktemp("crossing")
+    nodes = {"c": (0, 0), "n": (0, 200), "e": (200, 0), "s": (0, -200), "w": (-200, 0)}
+    listed = "".join(
+        f'<node id="{name}" x="{x}" y="{y}" type="{"traffic_light" if name == "c" else "priority"}"/>'
+        for name, (x, y) in nodes.items()
+    )
+    streets = {"n": "Mill Lane", "s": "Mill Lane", "e": "High Street", "w": "High Street"}
+    edges = "".join(
+        f'<edge id="{name}{way}" from="{a}" to="{b}" name="{streets[name]}" numLanes="2" sidewalkWidth="2"/>'
+        for name in "nesw"
+        for way, a, b in (("in", name, "c"), ("out", "c", name))
+    )
+    (folder / "n.nod.xml").write_text(f"<nodes>{listed}</nodes>")
+    (folder / "e.edg.xml").write_text(f"<edges>{edges}</edges>")
+    flags = ["-n", "n.nod.xml", "-e", "e.edg.xml", "--crossings.guess", "--no-turnarounds", "--output.street-names",
+             "--offset.disable-normalization"]  # fmt: skip
+    sumo.run_netconvert(flags, folder, "net.net.xml")
+    return folder
+
+
+def scenario(folder, plans, **keys):
+    """A scenario with plans; its region is the junction at (0, 0)."""
+    values = {
+        "name": "crossing",
+        "roi": {"center_m": [0, 0, 2.5], "size_m": [60, 60, 5], "voxel_m": 1.0},
+        "sites": {"grid": {"low_m": [0, 0], "high_m": [1, 1], "spacing_m": 1, "heights_m": [3]}},
+        "tpog": {"blocks": 1},
+        "traffic": {"network": "net.net.xml", "vehicles": 6, "frames": 40, "warmup_s": 20.0, "signals": plans, **keys},
+    }
+    return scenario_from_dict(values, folder, str(folder / "scenario.toml"))
+
+
+def programs(folder, plans):
+    """The programs of plans, by signal."""
+    path = folder / "net.net.xml"
+    return signals._programs(scenario(folder, plans), path, network.read_net_xml(path))
+
+
+def read_crossing(folder):
+    (signal,) = signals.read_signals(folder / "net.net.xml", network.read_net_xml(folder / "net.net.xml"))
+    return signal
+
+
+def letters(folder, state):
+    """The letters of a state by approach and movement."""
+    found = {}
+    for link in read_crossing(folder).links:
+        found.setdefault(link.title, set()).add(state[link.index])
+    return {title: "".join(sorted(each)) for title, each in found.items()}
+
+
+def test_approaches_are_named_by_side_and_street(crossing):
+    signal = read_crossing(crossing)
+    assert set(signal.approaches) == {
+        "north Mill Lane", "east High Street", "south Mill Lane", "west High Street",
+    }  # fmt: skip
+    assert all(set(m) == {"left", "straight", "right", "crossing"} for m in signal.approaches.values())
+    assert set(signal.streets) == {"Mill Lane", "High Street"}
+
+
+def test_plan_by_hand(crossing):
+    """Two phases of 30 s and 20 s, each with 3 s of yellow and 2 s of all-red: 60 s."""
+    program = programs(crossing, {"c": {"phases": [NS, EW], "offset_s": 7, "cycle_s": 60}})["c"]
+    assert [phase.duration_s for phase in program.phases] == [30, 3, 2, 20, 3, 2]
+    assert (program.type, program.offset_s, program.cycle_s) == ("static", 7, 60)
+    first = letters(crossing, program.phases[0].state)
+    # left turns give way to oncoming traffic, right turns to people; both cross the side streets' crossings
+    assert first["north Mill Lane straight"] == "G"
+    assert first["north Mill Lane left"] == first["north Mill Lane right"] == "g"
+    assert first["east High Street straight"] == first["west High Street left"] == "r"
+    assert first["east High Street crossing"] == "G"  # people walk along Mill Lane, over the arms of High Street
+    assert first["north Mill Lane crossing"] == "r"
+    yellow = letters(crossing, program.phases[1].state)
+    assert yellow["north Mill Lane straight"] == yellow["south Mill Lane left"] == "y"
+    assert yellow["east High Street crossing"] == "r"
+    assert set(program.phases[2].state) == {"r"}
+
+
+def test_green_in_two_phases_is_not_interrupted(crossing):
+    """North alone, then north and south: north keeps its green through yellow and all-red of nobody."""
+    plan = [{"green": {"north": ["all"]}, "green_s": 10}, NS, EW]
+    program = programs(crossing, {"c": {"phases": plan}})["c"]
+    north = [letters(crossing, phase.state)["north Mill Lane straight"] for phase in program.phases]
+    south = [letters(crossing, phase.state)["south Mill Lane straight"] for phase in program.phases]
+    assert north == ["G", "G", "G", "G", "y", "r", "r", "r", "r"]
+    assert south == ["r", "r", "r", "G", "y", "r", "r", "r", "r"]
+
+
+@pytest.mark.parametrize("name", ["c", "Mill Lane / High Street", "high street & mill lane"])
+def test_signal_by_id_or_streets(crossing, name):
+    assert list(programs(crossing, {name: {"phases": [NS, EW]}})) == ["c"]
+
+
+def test_edges_and_full_names_are_approaches(crossing):
+    plan = [{"green": {"nin": ["all"], "South Mill Lane": ["all"]}, "green_s": 30}, EW]
+    assert programs(crossing, {"c": {"phases": plan}}) == programs(crossing, {"c": {"phases": [NS, EW]}})
+
+
+def test_csv_and_sumo_file_give_the_same_program(crossing, tmp_path):
+    shutil.copy(crossing / "net.net.xml", tmp_path)
+    rows = ["phase,approach,movement,green_s", "main,north,all,30", "main,south,all,", "side,east,straight right,20",
+            "side,east,left,20", "side,west,all,20"]  # fmt: skip
+    (tmp_path / "plan.csv").write_text("\n".join(rows) + "\n")
+    expected = programs(tmp_path, {"c": {"phases": [NS, EW]}})["c"]
+    assert programs(tmp_path, {"c": {"file": "plan.csv"}})["c"] == expected
+    (tmp_path / "plan.add.xml").write_text(f"<additional>\n{expected.to_xml('other')}</additional>")
+    assert programs(tmp_path, {"c": {"file": "plan.add.xml"}})["c"] == expected
+
+
+def test_actuated_phases_have_limits(crossing):
+    phases = [NS | {"min_green_s": 8, "max_green_s": 45}, EW]
+    program = programs(crossing, {"c": {"type": "actuated", "phases": phases}})["c"]
+    assert program.type == "actuated"
+    assert [(phase.min_s, phase.max_s) for phase in program.phases] == [
+        (8, 45), (None, None), (None, None), (5, 20), (None, None), (None, None),
+    ]  # fmt: skip
+
+
+def test_sumo_shows_the_states_of_the_plan_each_second(crossing, tmp_path):
+    """With offset 7 and a cycle of 60 s, second t of SUMO is second (t - 7) mod 60 of the plan."""
+    setup = scenario(crossing, {"c": {"phases": [NS, EW], "offset_s": 7}})
+    program = programs(crossing, {"c": {"phases": [NS, EW], "offset_s": 7}})["c"]
+    expected = [phase.state for phase in program.phases for _ in range(round(phase.duration_s))]
+    prepared = sumo_folder.prepare_simulation(setup, tmp_path / "sumo")
+    assert prepared.roads.cycle_s == 60
+    with sumo.serve_traci(["-c", sumo_folder.CONFIG_FILE, "--step-length", "1"], prepared.folder) as connection:
+        for second in range(130):
+            connection.simulationStep()
+            assert connection.trafficlight.getRedYellowGreenState("c") == expected[(second - 7) % 60], second
+
+
+def test_summary_names_the_plan(crossing, tmp_path):
+    summary = run_stage(traffic, scenario(crossing, {"c": {"phases": [NS, EW]}}), tmp_path / "own")
+    (plan,) = summary["signals"]
+    assert (plan["source"], plan["cycle_s"], plan["type"]) == ("from the scenario", 60, "fixed")
+    rows = {(row["approach"], *row["movements"]): row for row in plan["rows"]}
+    north = rows["north Mill Lane", "straight"]
+    assert (north["green_s"], north["yellow_s"], north["gives_way"]) == ([[0, 30]], [[30, 33]], False)
+    east = rows["east High Street", "left", "right"]
+    assert (east["green_s"], east["gives_way"]) == ([[35, 55]], True)
+    text = signals.format_plan(plan)
+    assert text == (
+        "Signals at Mill Lane / High Street (from the scenario): fixed, cycle 60 s; green 30 s north Mill Lane and"
+        " south Mill Lane; 20 s east High Street and west High Street."
+    )
+
+
+def test_plan_of_the_network_is_described_only_in_the_region(crossing):
+    found = signals.read_signals(crossing / "net.net.xml", network.read_net_xml(crossing / "net.net.xml"))
+    here, elsewhere = (
+        signals.describe_signals(found, Roi((x, -30.0, 0.0), (60.0, 60.0, 5.0)), {}, "assumed") for x in (-30.0, 100.0)
+    )
+    assert [plan["source"] for plan in here] == ["assumed"]
+    assert elsewhere == []
+
+
+def test_signal_of_several_junctions_knows_its_foes(tmp_path):
+    """One program for two junctions: positions in the states differ from those of each junction's requests."""
+    netgenerate(tmp_path, "--grid", "--grid.x-number", "2", "--grid.y-number", "1", "--grid.length", "60",
+                "--grid.attach-length", "100", "--default-junction-type", "traffic_light", "--no-turnarounds",
+                "--tls.join", "--tls.join-dist", "100", name="net.net.xml")  # fmt: skip
+    (signal,) = signals.read_signals(tmp_path / "net.net.xml", network.read_net_xml(tmp_path / "net.net.xml"))
+    assert len(signal.nodes) == 2
+    for link in signal.links:
+        assert link.index not in link.foes
+        assert all(link.index in signal.links[foe].foes for foe in link.foes)
+    # in the program that netconvert made, no two foes have green with right of way
+    for phase in signal.program.phases:
+        green = {link.index for link in signal.links if phase.state[link.index] == "G"}
+        assert not any(link.foes & green for link in signal.links if link.index in green)
+
+
+WRONG = [
+    ({"x": {"phases": [NS, EW]}}, r"traffic.signals.x: the network has no such signal. Its signals are: c \("),
+    ({"c": {"phases": [NS, EW | {"green": {"nrth": ["all"]}}]}},
+     r"phase 2: signal c has no approach 'nrth'. Its approaches are: north Mill Lane \(right, straight, left"),
+    ({"c": {"phases": [NS, EW | {"green": {"Mill Lane": ["all"]}}]}},
+     "approach 'Mill Lane' may be 'north Mill Lane' or 'south Mill Lane'. Use the full name"),
+    ({"c": {"phases": [NS | {"green": {"north": ["sideways"]}}, EW]}},
+     "approach 'north' has no movement 'sideways'. Its movements are: right, straight, left, crossing"),
+    ({"c": {"phases": [NS | {"green": {"north": ["straight"], "east": ["straight"]}}]}},
+     "phase 1: north Mill Lane straight and east High Street straight conflict, but both have green"),
+    ({"c": {"phases": [NS | {"green": {"north": ["left"], "east": ["straight"]}}]}}, "conflict, but both have green"),
+    ({"c": {"phases": [NS | {"green": {"north": ["straight", "crossing"]}}]}},
+     "north Mill Lane straight and north Mill Lane crossing conflict"),
+    ({"c": {"phases": [NS]}}, "never green: east High Street right, east High Street straight"),
+    ({"c": {"phases": [NS, EW], "cycle_s": 90}},
+     r"cycle_s = 90: the phases with yellow and all-red add up to 60 s \(30, 3, 2, 20, 3, 2\). Use cycle_s = 60"),
+    ({"c": {"phases": [NS, EW]}, "Mill Lane": {"phases": [NS, EW]}}, "signal 'c' has two plans"),
+    ({"c": {"file": "missing.csv"}}, "missing.csv"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("plans", "message"), WRONG)
+def test_rejects_plans_that_do_not_fit(crossing, plans, message):
+    with pytest.raises(InputError, match=message):
+        programs(crossing, plans)
+
+
+@pytest.mark.parametrize(
+    ("plan", "message"),
+    [
+        ({}, "expected either phases or file, got none"),
+        ({"phases": [NS], "file": "a.csv"}, "got both"),
+        ({"phases": [NS], "type": "actuated", "cycle_s": 60}, "cycle_s has no effect with actuated"),
+        ({"phases": [NS | {"max_green_s": 40}]}, 'max_green_s has no effect with a fixed plan. Set type = "actuated"'),
+        ({"phases": [NS | {"min_green_s": 40}], "type": "actuated"}, "expected min_green_s up to max_green_s"),
+        ({"file": "a.add.xml", "yellow_s": 4}, "yellow_s has no effect with a <tlLogic> file"),
+        ({"phases": [NS | {"green": {}}]}, "at least 1"),
+    ],
+)
+def test_rejects_contradictory_keys(plan, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        TrafficConfig.from_dict({"network": "net.net.xml", "signals": {"c": plan}})
+
+
+CSV = "phase,approach,movement,green_s\na,north,all,30\na,south,all,30\nb,east,all,20\nb,west,all,20\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("p.csv", "phase,approach\na,north\n", "the column 'movement' is missing"),
+        ("p.csv", "", "expected a phase in each row, got none"),
+        ("p.csv", CSV.replace("a,south,all,30", "a,south,all,25"),
+         "line 3: green_s: expected 30 as before in phase 'a', got 25"),
+        ("p.csv", CSV.replace("b,east,all,20", "b,east,all,often"), "line 4: green_s: expected seconds, got 'often'"),
+        ("p.csv", CSV.replace("b,east,all,20", "b,east,all"), "line 4: the row has more or fewer values"),
+        ("p.csv", CSV.replace("green_s", "green_s,colour").replace("0\n", "0,red\n"), "unknown column 'colour'"),
+        ("p.add.xml", "<additional/>", "no <tlLogic> with phases for signal 'c'"),
+        ("p.add.xml", '<additional><tlLogic id="c"><phase duration="9" state="GG"/></tlLogic></additional>',
+         "expected a state of 20 letters, got 2"),
+        ("p.add.xml", f'<additional><tlLogic id="c"><phase duration="9" state="{"G" * 20}"/></tlLogic></additional>',
+         "conflict, but both have green with right of way (G)"),
+        ("p.add.xml", f'<additional><tlLogic id="c"><phase duration="9" state="{"r" * 20}"/></tlLogic></additional>',
+         "never green"),
+        ("p.add.xml", '<additional><tlLogic id="c"><phase state="r"/></tlLogic></additional>', "invalid <tlLogic>"),
+    ],
+)  # fmt: skip
+def test_rejects_files_that_are_no_plan(crossing, tmp_path, name, content, message):
+    shutil.copy(crossing / "net.net.xml", tmp_path)
+    (tmp_path / name).write_text(content)
+    with pytest.raises(InputError, match=re.escape(message)):
+        programs(tmp_path, {"c": {"file": name}})
+
+
+def test_check_reports_plans_before_the_simulation(crossing, tmp_path):
+    shutil.copytree(crossing, tmp_path / "in")
+    folder = tmp_path / "in"
+    config = '<configuration><net-file value="net.net.xml"/><additional-files value="own.add.xml"/></configuration>'
+    (folder / "own.sumocfg").write_text(config)
+    (folder / "own.add.xml").write_text('<additional><tlLogic id="c" type="static" programID="x"/></additional>')
+    setup = scenario(folder, {"c": {"phases": [NS, EW]}})
+    values = setup.model_dump(exclude_unset=True)
+    values["traffic"] = {"sumocfg": "own.sumocfg", "frames": 40, "signals": {"c": {"phases": [NS, EW]}}}
+    setup = scenario_from_dict(values, folder, str(folder / "scenario.toml"))
+    with pytest.raises(InputError, match=r"own\.add\.xml of the SUMO configuration also contains signal programs"):
+        sumo_folder.prepare_simulation(setup, tmp_path / "sumo")
+
+
+def test_finished_traffic_has_no_plans(crossing):
+    config = TrafficConfig.from_dict({"fcd": "a.csv", "signals": {"c": {"phases": [NS, EW]}}})
+    assert [unused.keys for unused in config.unused_keys()] == [{"signals"}]
