@@ -484,8 +484,7 @@ def _write_program(
     network: str, program: str, phases: Sequence[tuple[float, str]], clock: SignalClock | None = None
 ) -> str:
     """Replace a program of a network."""
-    params = () if clock is None else (clock.to_param(),)
-    recorded = Program("static", 0.0, tuple(Phase(duration_s, state) for duration_s, state in phases), params)
+    recorded = Program("static", 0.0, tuple(Phase(duration_s, state) for duration_s, state in phases), clock)
     return replace_programs(network, {program: recorded})
 
 

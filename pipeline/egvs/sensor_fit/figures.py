@@ -227,7 +227,7 @@ def draw_map(fit: SensorFit) -> Figure | None:
     ):
         plan.plot(points[members, 0], points[members, 1], ",", color=colour)
         plan.plot([], [], "s", color=colour, label=f"{label}: {np.mean(members):.0%}")
-    plan.add_collection(LineCollection(_wall_lines(map_pose.world), colors="black", linewidths=0.8))
+    plan.add_collection(LineCollection(list(_wall_lines(map_pose.world)), colors="black", linewidths=0.8))
     plan.plot([], [], color="black", linewidth=0.8, label="walls of the static world")
     ahead = np.radians(pose.yaw_deg)
     tip = (pose.x_m + 12.0 * np.cos(ahead), pose.y_m + 12.0 * np.sin(ahead))
@@ -242,9 +242,10 @@ def draw_map(fit: SensorFit) -> Figure | None:
 
     curve.plot(map_pose.search.yaws_deg, map_pose.search.costs_m, color=_GREY, label="tried, at the given position")
     curve.axvline(pose.yaw_deg % 360.0, color=_RED, label="best fit")
-    for number, yaw_deg in enumerate(map_pose.ambiguous_yaws_deg):
-        label = "fits as well" if number == 0 else None
-        curve.axvline(yaw_deg % 360.0, color=_ORANGE, linestyle="--", label=label)
+    for yaw_deg in map_pose.ambiguous_yaws_deg:
+        curve.axvline(yaw_deg % 360.0, color=_ORANGE, linestyle="--")
+    if map_pose.ambiguous_yaws_deg:
+        curve.plot([], [], color=_ORANGE, linestyle="--", label="fits as well")
     curve.set(xlabel="yaw (degrees)", ylabel="mean distance from surfaces, at most 2 m (m)", xlim=(0, 360))
     curve.set_ylim(bottom=0.0)
     curve.set_title("How well the sweep fits at each yaw")
