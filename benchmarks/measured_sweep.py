@@ -33,13 +33,15 @@ from egvs.importers.cloud_surface import triangulate_cloud
 from egvs.importers.point_cloud import make_meshes
 from egvs.scenario.sensor_config import SensorConfig
 from egvs.sensor_fit import empty_scan, output
+from egvs.sensor_fit.empty_scan import EmptyScanFit
 from egvs.sensor_fit.fit import SensorFit, fit_sensor
 from egvs.sensor_fit.intervals import estimate_scale
 from egvs.sensor_fit.range_noise import VARIANCE_FACTOR, range_residuals
 from egvs.sensor_fit.return_rates import ROAD_BAND_M
 from egvs.sensor_fit.sweep_files import read_sweeps
 from egvs.sensors.sensor import Sensor, resolve_sensor
-from egvs.world.ray_casting import Caster
+from egvs.world.mesh import World
+from egvs.world.ray_casting import Caster, EmptyScan
 
 SECTOR_DEG = 10.0
 WORLD_M = 150.0
@@ -89,25 +91,38 @@ def fitted_sensor(fit: SensorFit) -> Sensor:
     return resolve_sensor("fitted", {"fitted": SensorConfig.from_dict(table["sensors"]["fitted"])}, "fit")
 
 
-def compare(folder: Path) -> Comparison:
-    """Fit, build the world, simulate, and align the pulses."""
+def fit_sweeps(folder: Path) -> tuple[SensorFit, EmptyScanFit]:
+    """Fit the sensor to the sweep; return it with the empty scan of the ten frames, which do not contain the sweep."""
     fit = fit_sensor(read_sweeps([folder / "sweep.pcd.gz", folder / "frames.npz"]))
-    sweep, *frames = fit.grids
-    background = empty_scan.fit_empty_scan([frame.range_m for frame in frames])
+    return fit, empty_scan.fit_empty_scan([frame.range_m for frame in fit.grids[1:]])
 
+
+def build_world(fit: SensorFit, background: EmptyScanFit) -> World:
+    """Triangulate what the ten frames show of the static world, upright."""
     points = []
-    for number, frame in enumerate(frames):
+    for number, frame in enumerate(fit.grids[1:]):
         is_static = np.isfinite(frame.range_m) & (background.labels[number] == empty_scan.BACKGROUND)
         points.append(empty_scan.points_of(frame.range_m, fit.angles)[is_static])
     cloud = output.upright(np.concatenate(points), fit.plane)
     cloud = cloud[np.hypot(cloud[:, 0], cloud[:, 1]) < WORLD_M]
-    world = AsBuiltMap(meshes=make_meshes(triangulate_cloud(cloud))).world()
+    return AsBuiltMap(meshes=make_meshes(triangulate_cloud(cloud))).world()
 
-    sensor = fitted_sensor(fit)
+
+def cast_static(fit: SensorFit, world: World, sensor: Sensor) -> EmptyScan:
+    """Cast all beams of the fitted sensor from the fitted pose."""
     corner = (-WORLD_M, -WORLD_M, -30.0)
     caster = Caster(world, Roi(corner, (2 * WORLD_M, 2 * WORLD_M, 90.0)))
     directions = sensor.directions(0.0, fit.plane.pitch_deg, fit.plane.roll_deg)
-    scan = caster.sweep((0.0, 0.0, fit.plane.height_m), directions, sensor.range_m)
+    return caster.sweep((0.0, 0.0, fit.plane.height_m), directions, sensor.range_m)
+
+
+def compare(folder: Path) -> Comparison:
+    """Fit, build the world, simulate, and align the pulses."""
+    fit, background = fit_sweeps(folder)
+    sweep = fit.grids[0]
+    world = build_world(fit, background)
+    sensor = fitted_sensor(fit)
+    scan = cast_static(fit, world, sensor)
     ranges = np.where(scan.returned, np.sqrt((scan.ends_m**2).sum(axis=1)), np.nan)
     simulated = ranges.reshape(sensor.azimuths, sensor.channels).T
 

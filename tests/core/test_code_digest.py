@@ -176,13 +176,13 @@ SOURCE_BEFORE = {
 """Code lines behind the key of each stage before the layout with one module per subject."""
 
 GROWTH = {
-    "check": 1.52,
-    "statics": 1.41,
-    "scan": 1.41,
-    "traffic": 1.75,
-    "tpog": 1.4,
-    "score": 1.36,
-    "report": 1.46,
+    "check": 1.56,
+    "statics": 1.44,
+    "scan": 1.43,
+    "traffic": 1.81,
+    "tpog": 1.43,
+    "score": 1.4,
+    "report": 1.72,
 }
 """Allowed growth, 1.1 for the others: a stage runs again whenever a line behind its key changes."""
 

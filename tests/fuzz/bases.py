@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 
 from tests.city.conftest import write_city
 from tests.conftest import SCENARIO, SITES, collection, fcd, feature, write_mini
-from tests.fuzz import read_tracks
+from tests.fuzz import read_signals, read_tracks
 from tests.importers.lanelet2_maps import make_crossing
 from tests.tracks.boxes import moving_boxes
 from tests.tracks.writers import TrackRows, write_sind, write_user_table
@@ -218,6 +218,29 @@ def mapped_tracks(json_lines: bool) -> Callable[[Path], None]:
         return write_user_table(folder, boxes, read_tracks.MAPPING, json_lines)
 
     return tracks(write, "car", "pedestrian")
+
+
+def signals(folder: Path) -> None:
+    """Recorded signals in both formats, and both kinds of files that say what they govern."""
+    target = folder / "signals"
+    target.mkdir()
+    rows = [
+        f"{group},{100 * k},{'PERMISSIVE_MOVEMENT_ALLOWED' if (k + 200 * group) % 400 < 100 else 'STOP_AND_REMAIN'}"
+        for group in (1, 2) for k in range(0, 1000, 10)
+    ]  # fmt: skip
+    (target / "states.csv").write_text("\n".join(["signal_group_id,timestamp_ms,movement_state", *rows, ""]))
+    lights = ["RawFrameID,timestamp(ms),Vehicle Traffic light 1,Vehicle Traffic light 2"]
+    lights += [
+        f"{300 * number},{10000.5 * number},{states}"
+        for number, states in enumerate(("1,0", "3,0", "0,0", "0,1", "0,3", "0,0") * 4)
+    ]
+    (target / "lights.csv").write_text("\n".join([*lights, ""]))
+    (target / "groups.csv").write_text("group,from_edge,to_edge\n1,in,out\n2,in,north\n")
+    names = [f"Vehicle Traffic light {number},in,{end}" for number, end in ((1, "out"), (2, "north"))]
+    (target / "light_groups.csv").write_text("\n".join(["group,from_edge,to_edge", *names, ""]))
+    lanes = [("1", "2, 3", "1, 2", ((-12, 1), (-100, 1))), ("2", "", "", ((12, 1), (100, 1))),
+             ("3", "", "", ((1, 12), (1, 100)))]  # fmt: skip
+    (target / "map.kml").write_text(read_signals.kml(lanes))
 
 
 # ---- static world

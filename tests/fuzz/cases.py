@@ -31,7 +31,7 @@ from functools import cache
 from pathlib import Path
 from types import CodeType
 
-from tests.fuzz import read_tracks
+from tests.fuzz import read_signals, read_tracks
 from tests.fuzz.kinds import Kind
 from tests.fuzz.meaning import DAMAGED
 
@@ -104,6 +104,8 @@ def become(folder: Path, arguments: Sequence[str], printed: Sequence[Path], stor
         _limit()
         if arguments[0] == read_tracks.VERB:
             read_tracks.main(arguments[1:])
+        elif arguments[0] == read_signals.VERB:
+            read_signals.main(arguments[1:])
         else:
             sys.argv = ["egvs", *arguments]
             from egvs.cli.app import main

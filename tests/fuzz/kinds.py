@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.fuzz import bases, meaning, read_tracks
+from tests.fuzz import bases, meaning, read_signals, read_tracks
 from tests.fuzz.meaning import Meaning
 from tests.tracks import writers, writers_json
 
@@ -137,6 +137,13 @@ def _tracks(file: str, make: Callable[[Path], None], reads: Meaning, main: str =
     return Kind(f"tracks {file}", f"tracks/{file}", make, reads, verb=verb, results=(read_tracks.RESULT,))
 
 
+def _signals(file: str, reads: Meaning, *others: str) -> Kind:
+    """A file of recorded signals, or of what they govern, and the program that they become."""
+    verb = (read_signals.VERB, f"signals/{file}", *(f"signals/{other}" for other in others))
+    reads = meaning.gzipped(reads)
+    return Kind(f"signals {file}", f"signals/{file}", bases.signals, reads, verb=verb, results=(read_signals.RESULT,))
+
+
 _IND = bases.tracks(writers.write_levelx, "car", "pedestrian")
 _HIGHD = bases.tracks(writers.write_highd, "car", "truck", straight=True)
 _TAF_BW = bases.tracks(writers.write_taf_bw, "car", "pedestrian")
@@ -216,6 +223,8 @@ _ALL = (
     _tracks("trace.mcap", bases.tracks(writers_json.write_osi_mcap, "car", "tram"), meaning.bytes_themselves),
     _tracks("tracks.csv", bases.mapped_tracks(False), meaning.table, "", "mapping"),
     _tracks("tracks.jsonl", bases.mapped_tracks(True), meaning.json_lines, "", "mapping"),
+    _signals("states.csv", meaning.table, "groups.csv"), _signals("lights.csv", meaning.table, "light_groups.csv"),
+    _signals("groups.csv", meaning.table, "states.csv"), _signals("map.kml", meaning.xml, "states.csv"),
     _sweep("sweep.csv", meaning.rows), _sweep("sweep.pcd", meaning.pcd),
     _recording("sweep.bag"), _recording("sweep.mcap"), _recording("sweep.db3"), _recording("sweep.pcap"),
     _sweep("sweep.ply.gz", meaning.gzipped(meaning.ply)), _sweep("sweep.npz", meaning.bytes_themselves),

@@ -39,7 +39,7 @@ REAL = Path(__file__).parents[3] / "shared" / "real" / "bad_hersfeld.osm"
 Made = tuple[Path, new_scenario.NewScenario]
 
 
-NAMES = ["network.net.xml", "scenario.toml", "sites.csv", "statics.geojson"]
+NAMES = ["network.net.xml", "scenario.toml", "sites.csv", "statics.geojson", "zones.geojson"]
 
 
 @pytest.fixture(scope="module")

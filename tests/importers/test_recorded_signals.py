@@ -230,3 +230,16 @@ def test_rejects_signals_that_do_not_fit(tmp_path: Path, states: dict[str, str],
     with pytest.raises(InputError, match=message):
         create_scenario(tmp_path / "new", tmp_path / "map.net.xml", options=options)
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.system
+def test_kml_needs_a_map_with_a_reference_system(tmp_path: Path) -> None:
+    (tmp_path / "map.net.xml").write_text(NETWORK)
+    (tmp_path / "map.kml").write_text(
+        KML.format(lanes=LANE.format(points="8.4,49.0", source="1", sinks="1", groups="1"))
+    )
+    files = (write_states(tmp_path / "states.csv.gz", g1=MAIN), tmp_path / "map.kml")
+    options = NewScenarioOptions(like=(write_recording(tmp_path / "tracks.csv"),), track_crs="world", signals=files)
+    message = "the map has no reference system, so lanes in longitude and latitude cannot be assigned to its roads"
+    with pytest.raises(InputError, match=message):
+        create_scenario(tmp_path / "new", tmp_path / "map.net.xml", options=options)

@@ -25,9 +25,11 @@ _FACES = np.array(
 )  # fmt: skip
 
 
-def box(center_m: Iterable[float], size_m: Iterable[float]) -> FloatArray:
+def box(center_m: Iterable[float], size_m: Iterable[float], yaw_rad: float = 0.0) -> FloatArray:
     """Return the triangles of an upright box, (12, 3, 3), world frame."""
-    corners: FloatArray = np.asarray(tuple(center_m)) + _CORNERS * np.asarray(tuple(size_m))
+    cosine, sine = np.cos(yaw_rad), np.sin(yaw_rad)
+    turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    corners: FloatArray = np.asarray(tuple(center_m)) + (_CORNERS * np.asarray(tuple(size_m))) @ turn.T
     return corners[_FACES]
 
 

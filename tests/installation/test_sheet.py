@@ -16,6 +16,7 @@ import egvs
 from egvs.formats.georeference import WorldFrame
 from egvs.installation import sheet, view
 from egvs.installation.planned_sites import PlannedSites
+from egvs.installation.tolerances import QUANTITIES, Tolerance
 from egvs.sensors.sites import Pose
 from tests.installation.conftest import InstalledRun, write_installed_scenario
 
@@ -69,6 +70,12 @@ def test_grid_bearing_and_angles_are_those_of_the_pose(installed: InstalledRun) 
     assert rows["Tilt of the front"] == "5.0° down"
     assert dict(data.position_rows)["x, y"] == "10.000 m, 12.000 m"
     assert data.rank.endswith("of 2 sites")
+
+
+def test_losses_name_the_direction() -> None:
+    tilt = Tolerance(QUANTITIES[0], (-4.0, 0.0, 4.0), (1.62, 0.0, -0.7), 2.5, math.inf)
+    assert sheet.describe_losses(tilt) == "4° down: -1.6, 4° up: +0.7 points"
+    assert sheet.describe_limit(tilt) == "2.5 degrees"
 
 
 def test_sheet_is_one_page_with_picture_and_map(installed: InstalledRun, tmp_path: Path) -> None:

@@ -42,6 +42,8 @@ def test_statuses_of_effects_in_plain_scene(mini: Path) -> None:
         "rain": "your choice",
         "fog": "your choice",
         "dropout": "your choice",
+        "surface_losses": "your choice",
+        "range_noise": "your choice",
         "mount_sway": "your choice",
         "moving_occlusion": "called for",
         "divergence": "called for",

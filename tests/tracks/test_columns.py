@@ -108,7 +108,7 @@ def test_units_and_limits() -> None:
     assert_one_message(lambda: table("1e5").angles_rad("a"), "expected an angle")
 
 
-def test_classes_are_found_by_text_in_lower_case() -> None:
+def test_classes_are_matched_by_text_in_lower_case() -> None:
     assert table("Car", "PKW").classes("a", {"car": "car", "pkw": "car"}) == ["car", "car"]
     assert_one_message(lambda: table("car", "cart").classes("a", {"car": "car"}), "line 3: a: unknown class 'cart'")
 

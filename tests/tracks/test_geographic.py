@@ -25,7 +25,7 @@ def test_aachen_is_in_zone_32_whose_grid_is_turned_there() -> None:
     turn_rad = grid_turn_rad(lon_deg, lat_deg, frame)
     expected = math.atan(math.tan(math.radians(6.07116 - 9.0)) * math.sin(math.radians(50.78207)))
     assert turn_rad[0] == pytest.approx(expected, abs=2e-5)
-    # the second place is due east of the first: its grid direction is the turn
+    # the second position is due east of the first: its grid direction is the turn
     east = xy_m[1] - xy_m[0]
     assert math.atan2(east[1], east[0]) == pytest.approx(turn_rad[0], abs=1e-4)
 
@@ -40,6 +40,6 @@ def test_southern_hemisphere_and_other_datum() -> None:
 
 
 @pytest.mark.parametrize(("lon", "lat"), [(200.0, 50.0), (10.0, 89.0), (12.0, 50.0), (10.0, 51.5)])
-def test_places_far_from_the_others_are_errors(lon: float, lat: float) -> None:
+def test_positions_far_from_the_others_are_errors(lon: float, lat: float) -> None:
     with pytest.raises(InputError, match="row 3"):
         to_utm(np.array([10.0, 10.1, 10.0, lon]), np.array([50.0, 50.0, 50.1, lat]), error)

@@ -299,7 +299,7 @@ def walkers(seconds: int) -> str:
     """Return a pedestrian who walks along the road, and a car, which does not count."""
     rows = [("walker", 1.0 * k, 1.2 * k, 9.0, 0.0) for k in range(seconds)]
     text = interaction_csv(rows).replace(",car,", ",pedestrian,")
-    return text + "\n".join(interaction_csv([("seen", 0.0, 0.0, 0.0, 0.0)]).splitlines()[1:]) + "\n"
+    return text + "\n".join(interaction_csv([("driver", 0.0, 0.0, 0.0, 0.0)]).splitlines()[1:]) + "\n"
 
 
 def simulated(folder: Path, text: str) -> None:

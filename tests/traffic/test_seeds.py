@@ -13,6 +13,7 @@ from egvs.artefacts import parquet
 from egvs.artefacts.tpog import PeriodBlocks, read_periods, read_tpog
 from egvs.core.errors import InputError
 from egvs.scenario.loading import load, scenario_from_dict
+from egvs.scenario.traffic_config import TrafficConfig
 from egvs.scoring.standard_errors import ScoreUncertainty, block_groups, summarise_uncertainty
 from egvs.stages import statics, tpog, traffic
 from tests.conftest import write_mini
@@ -73,17 +74,21 @@ def test_simulations_are_neither_joined_nor_widened():
     assert of_blocks.joined > 1
 
 
-def test_intervals_of_simulations_cover_what_they_promise():
+def test_intervals_cover_levels_that_blocks_of_one_simulation_miss():
     """Each simulation has a level of its own: blocks of one cannot show it, differences between five do."""
     rng = np.random.default_rng(3)
-    groups = block_groups(PeriodBlocks("", 1.0, 500, 50, 1.0, seeds=5))
-    covered = 0
+    seeds = block_groups(PeriodBlocks("", 1.0, 500, 50, 1.0, seeds=5))
+    blocks = block_groups(PeriodBlocks("", 1.0, 500, 50, 1.0))
+    covered = {"seeds": 0, "blocks": 0}
     for _ in range(500):
-        means = rng.normal(0.0, 1.0, size=5)
-        left_out = np.append(means.mean(), (means.sum() - means) / 4)[None]
-        low, high = ScoreUncertainty.of(left_out, [groups]).intervals()[0]
-        covered += low <= 0.0 <= high
-    assert covered / 500 == pytest.approx(0.9, abs=0.04)
+        levels = rng.normal(0.0, 1.0, size=5)
+        in_blocks = levels[0] + rng.normal(0.0, 0.3, size=10)
+        for name, values, groups in (("seeds", levels, seeds), ("blocks", in_blocks, blocks)):
+            left_out = np.append(values.mean(), (values.sum() - values) / (len(values) - 1))[None]
+            low, high = ScoreUncertainty.of(left_out, [groups]).intervals()[0]
+            covered[name] += low <= 0.0 <= high
+    assert covered["seeds"] / 500 == pytest.approx(0.9, abs=0.04)
+    assert covered["blocks"] / 500 < 0.3
 
 
 @pytest.mark.system
@@ -150,6 +155,13 @@ def test_one_seed_is_the_run_without_the_key(town, tmp_path):
     for artefact in ("trajectories.parquet", "tpog.parquet"):
         assert (tmp_path / "without" / artefact).read_bytes() == (tmp_path / "one" / artefact).read_bytes()
     assert "seeds" not in parquet.read_metadata(tmp_path / "one" / "tpog.parquet", "tpog")
+
+
+def test_keys_that_are_not_set_do_not_change_cache_keys():
+    """A dump of the traffic is part of the stage key: without several seeds and plans, it is as before these keys."""
+    config = TrafficConfig(network="net.xml")
+    assert TrafficConfig.model_fields.keys() - config.model_dump().keys() == {"seeds", "signals"}
+    assert config.model_copy(update={"seeds": 5}).model_dump()["seeds"] == 5
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from egvs.core.grid import Roi
 from egvs.scenario.loading import scenario_from_dict
 from egvs.scenario.traffic_config import TrafficConfig
 from egvs.stages import traffic
-from egvs.traffic import network, signals, sumo, sumo_folder
+from egvs.traffic import network, signal_descriptions, signal_plans, signals, sumo, sumo_folder
 from tests.stage_runner import run_stage
 from tests.traffic.helpers import netgenerate
 
@@ -62,7 +62,7 @@ def scenario(folder, plans, **keys):
 def programs(folder, plans):
     """The programs of plans, by signal."""
     path = folder / "net.net.xml"
-    return signals._programs(scenario(folder, plans), path, network.read_net_xml(path))
+    return signal_plans._programs(scenario(folder, plans), path, network.read_net_xml(path))
 
 
 def read_crossing(folder):
@@ -115,13 +115,15 @@ def test_green_in_two_phases_is_not_interrupted(crossing):
     assert south == ["r", "r", "r", "G", "y", "r", "r", "r", "r"]
 
 
-@pytest.mark.parametrize("name", ["c", "Mill Lane / High Street", "high street & mill lane"])
+@pytest.mark.parametrize("name", ["c", "Mill Lane / High Street", "high st & Mill Ln."])
 def test_signal_by_id_or_streets(crossing, name):
     assert list(programs(crossing, {name: {"phases": [NS, EW]}})) == ["c"]
 
 
 def test_edges_and_full_names_are_approaches(crossing):
-    plan = [{"green": {"nin": ["all"], "South Mill Lane": ["all"]}, "green_s": 30}, EW]
+    plan = [{"green": {"nin": ["all"], "South Mill Lane": ["thru", "L", "right"]}, "green_s": 30}, EW]
+    assert programs(crossing, {"c": {"phases": plan}}) == programs(crossing, {"c": {"phases": [NS, EW]}})
+    plan = [{"green": {"southbound": ["all"], "S": ["all"]}, "green_s": 30}, EW]
     assert programs(crossing, {"c": {"phases": plan}}) == programs(crossing, {"c": {"phases": [NS, EW]}})
 
 
@@ -167,7 +169,7 @@ def test_summary_names_the_plan(crossing, tmp_path):
     assert (north["green_s"], north["yellow_s"], north["gives_way"]) == ([[0, 30]], [[30, 33]], False)
     east = rows["east High Street", "left", "right"]
     assert (east["green_s"], east["gives_way"]) == ([[35, 55]], True)
-    text = signals.format_plan(plan)
+    text = signal_descriptions.format_plan(plan)
     assert text == (
         "Signals at Mill Lane / High Street (from the scenario): fixed, cycle 60 s; green 30 s north Mill Lane and"
         " south Mill Lane; 20 s east High Street and west High Street."
@@ -177,7 +179,8 @@ def test_summary_names_the_plan(crossing, tmp_path):
 def test_plan_of_the_network_is_described_only_in_the_region(crossing):
     found = signals.read_signals(crossing / "net.net.xml", network.read_net_xml(crossing / "net.net.xml"))
     here, elsewhere = (
-        signals.describe_signals(found, Roi((x, -30.0, 0.0), (60.0, 60.0, 5.0)), {}, "assumed") for x in (-30.0, 100.0)
+        signal_descriptions.describe_signals(found, Roi((x, -30.0, 0.0), (60.0, 60.0, 5.0)), {}, "assumed")
+        for x in (-30.0, 100.0)
     )
     assert [plan["source"] for plan in here] == ["assumed"]
     assert elsewhere == []

@@ -113,3 +113,86 @@ def test_foliage_returns_some_beams_and_transmits_others(mini):
     assert plain.sweep(frame, sweep_rng(1, "here", 0)).points_on(1)[0] < 0.2 * through
     assert 0.2 < share < 0.8
     assert json.dumps(scene.skipped("scan")) == "[]"
+
+
+CAR = [(10.0, 17.0, 0.75, 4.5, 1.8, 1.5, 0.4, 0.0)]
+NO_LOSSES = "grazing_loss=0, dark_share=0, glass_loss=0"
+
+
+def sweep_with(mini, *settings, number=0, noise_m=0.0):
+    """A labelled sweep of a car, and its simulator."""
+    sensor = make_sensor(**FINE, range_sigma_m=noise_m)
+    simulator = CloudSimulator(build_scene(mini, *settings), POSE, sensor, "here")
+    return simulator.sweep(frame_of(CAR), sweep_rng(1, "here", number)), simulator
+
+
+@pytest.mark.parametrize("setting", [f"surface_losses={{{NO_LOSSES}}}", "range_noise={footprint_mrad=0}"])
+def test_echo_effects_without_losses_change_no_byte(mini, setting):
+    plain, _ = sweep_with(mini, noise_m=0.03)
+    result, _ = sweep_with(mini, f"effects.{setting}", noise_m=0.03)
+    assert result.sweep.points.tobytes() == plain.sweep.points.tobytes()
+    assert result.sweep.beam.tobytes() == plain.sweep.beam.tobytes()
+
+
+def test_dark_vehicles_lose_all_returns_and_the_ground_none(mini):
+    plain, _ = sweep_with(mini)
+    dark, _ = sweep_with(mini, "effects.surface_losses={grazing_loss=0, dark_share=1, dark_loss=1, glass_loss=0}")
+    assert plain.points_on(1)[0] > 20 and dark.points_on(1)[0] == 0
+    np.testing.assert_array_equal(dark.sweep.beam, plain.sweep.beam[plain.owner < 0])
+
+
+def test_opaque_to_lidar_windows_leave_only_paint_and_tyres(mini):
+    """Intensity is reflectivity times cosine: windows (10 %) give at most 0.1."""
+    plain, simulator = sweep_with(mini)
+    lost, _ = sweep_with(mini, "effects.surface_losses={grazing_loss=0, dark_share=0, glass_loss=1}")
+    surfaces = simulator._bodies.surfaces[simulator.first_hits(frame_of(CAR)).triangle]
+    on_car = plain.sweep.beam[plain.owner == 0]
+    is_glass = surfaces[on_car] == "glass"
+    assert is_glass.sum() > 3
+    assert (plain.sweep.points[plain.owner == 0][is_glass, 3] <= 0.1 + 1e-6).all()
+    np.testing.assert_array_equal(lost.sweep.beam[lost.owner == 0], on_car[~is_glass])
+    assert (lost.owner < 0).sum() == (plain.owner < 0).sum()
+
+
+def test_grazing_loss_on_flat_ground_has_its_probability(mini):
+    """From 5 m, a beam at elevation e meets the ground at an incidence of 90 - e degrees."""
+    setting = (
+        "effects.surface_losses={grazing_deg=80, grazing_width_deg=3, grazing_loss=0.8, dark_share=0, glass_loss=0}"
+    )
+    simulator = sweep_with(mini)[1]
+    echoes = simulator._echoes(simulator._beam, simulator.first_hits(frame_of([])), frame_of([]))
+    on_ground = np.abs(echoes.range_m * echoes.cosine - 5.0) < 1e-6
+    assert on_ground.sum() > 2000
+    chance = 1 - 0.8 / (1 + np.exp(-(np.degrees(np.arccos(echoes.cosine[on_ground])) - 80) / 3))
+    kept = np.zeros(len(on_ground))
+    other = CloudSimulator(build_scene(mini, setting), POSE, make_sensor(**FINE), "here")
+    for number in range(SWEEPS):
+        kept[other.sweep(frame_of([]), sweep_rng(1, "here", number)).sweep.beam] += 1
+    spread = math.sqrt(SWEEPS * (chance * (1 - chance)).sum())
+    assert abs(kept[on_ground].sum() - SWEEPS * chance.sum()) < 4 * spread
+
+
+def test_range_noise_adds_to_the_noise_of_the_sensor(mini):
+    """On flat ground: variances of the sensor (2 cm) and of the footprint add."""
+    simulator = sweep_with(mini, "effects.range_noise={footprint_mrad=1, max_sigma_m=9}", noise_m=0.02)[1]
+    hits = simulator.first_hits(frame_of([]))
+    echoes = simulator._echoes(simulator._beam, hits, frame_of([]))
+    sine = np.sqrt(1 - echoes.cosine**2)
+    expected = np.hypot(0.02, 1e-3 * echoes.range_m * sine / np.maximum(echoes.cosine, 1e-9))
+    scaled = []
+    for number in range(3):
+        cloud = simulator.sweep(frame_of([]), sweep_rng(1, "here", number)).sweep
+        range_m = np.sqrt((cloud.points[:, :3].astype(np.float64) ** 2).sum(axis=1))
+        scaled.append((range_m - hits.range_m[cloud.beam]) / expected[cloud.beam])
+    scaled = np.concatenate(scaled)
+    assert abs(scaled.std() - 1.0) < 4 / math.sqrt(2 * len(scaled))
+    assert abs(scaled.mean()) < 4 / math.sqrt(len(scaled))
+
+
+def test_vehicle_draws_are_even_and_fixed_by_name_and_seed():
+    from egvs.validation.cloud_simulation import vehicle_draws
+
+    names = [f"car.{number}" for number in range(2000)]
+    draws = vehicle_draws(names, 1)
+    assert draws[7] == vehicle_draws([names[7]], 1)[0] != vehicle_draws([names[7]], 2)[0]
+    assert abs((draws < 0.12).mean() - 0.12) < 4 * math.sqrt(0.12 * 0.88 / 2000)

@@ -28,7 +28,7 @@ from egvs.report.formatting import ScoreLabel, join_names
 from egvs.report.ranking import Pole, RankedSite, Ranking
 from egvs.report.sensor_results import range_note
 from egvs.scenario.model import Scenario
-from egvs.traffic.signals import format_plan
+from egvs.traffic.signal_descriptions import format_plan
 
 _FILE_WIDTH = 150
 _MAX_SIGNALS = 2

@@ -1,4 +1,4 @@
-"""``egvs sensor``: derive a sensor from its own sweeps."""
+"""``egvs sensor``: derive a sensor from its own sweeps, or design one for a pole."""
 
 from __future__ import annotations
 
@@ -7,22 +7,26 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from egvs.cli.options import Jobs, Set, SettingsPath
 from egvs.cli.quick_help import QuickHelpGroup
 from egvs.core.errors import InputError
 
 if TYPE_CHECKING:
+    from egvs.placement.sensor_design import Design, DesignResult
     from egvs.scenario.model import Scenario
     from egvs.sensor_fit.fit import SensorFit
     from egvs.sensor_fit.intervals import Estimate
     from egvs.sensor_fit.map_pose import MapPose
     from egvs.sensor_fit.output import FitFolder
 
-app = typer.Typer(cls=QuickHelpGroup, no_args_is_help=True, help="Derive a sensor from its own sweeps.")
+_DESIGN_WIDTH = 190
+
+app = typer.Typer(cls=QuickHelpGroup, no_args_is_help=True, help="Derive a sensor from its sweeps, or design one.")
 
 
 @app.callback()
 def sensor() -> None:
-    """Derive a sensor from its own sweeps."""
+    """Derive a sensor from its sweeps, or design one."""
 
 
 @app.command()
@@ -263,3 +267,132 @@ def _percent(estimate: Estimate | None) -> str:
     if estimate is None:
         return "unknown (too few neighbouring returns)"
     return f"{estimate.value:.2%} of pulses (95 % interval {estimate.low:.2%} to {estimate.high:.2%})"
+
+
+@app.command()
+def design(
+    scenario: SettingsPath,
+    pole: Annotated[str, typer.Option(metavar="NAME", help="Required: the pole, or a site on it.")] = "",
+    sensors: Annotated[
+        str,
+        typer.Option(
+            metavar="A,B,...|all", help="Sensors to choose from; by default all that egvs sensors lists (minutes)."
+        ),
+    ] = "all",
+    heights: Annotated[
+        str | None,
+        typer.Option(metavar="LOW,HIGH", help="Heights above the ground; by default those of the sites on the pole."),
+    ] = None,
+    channels: Annotated[
+        int | None, typer.Option(metavar="N", help="Design a sensor with N channels whose elevations are free.")
+    ] = None,
+    elevations: Annotated[
+        str,
+        typer.Option(
+            metavar="free|LOW,HIGH",
+            help="Bounds of the elevations of free channels; free: from -45 to 25 degrees. A negative number needs"
+            " an equals sign: --elevations=-30,10.",
+        ),
+    ] = "free",
+    name: Annotated[str, typer.Option(metavar="NAME", help="Name of the designed sensor.")] = "designed",
+    evaluations: Annotated[int, typer.Option(metavar="N", help="Mounts that are tried for each sensor.")] = 100,
+    elevation_evaluations: Annotated[
+        int, typer.Option(metavar="N", help="Sets of elevations that are tried for free channels.")
+    ] = 300,
+    set_: Set = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FILE", help="File for the designed sensor; sensors/NAME.toml by default."),
+    ] = None,
+    jobs: Jobs = None,
+) -> None:
+    """Choose sensor, height, yaw and pitch for a pole; with --channels, also the elevations of the channels."""
+    from egvs.cli import options, sources
+    from egvs.cli.console import ProgressDisplay
+    from egvs.core import files
+
+    if not pole:
+        raise InputError("--pole", "no pole is given", "Use the name of a pole, or of a site on it.")
+    heights_m = None if heights is None else options.heights_m(heights)
+    loaded, folder = sources.open_source(scenario, set_, None)
+    with ProgressDisplay("sensor design") as screen:
+        from egvs.placement import sensor_design
+        from egvs.sensor_fit import output
+
+        output.check_name(name)
+        bounds_deg = sensor_design.ELEVATION_BOUNDS_DEG
+        if elevations != "free":
+            if channels is None:
+                raise InputError("--elevations", "needs --channels, the number of channels", "Use --channels 32.")
+            bounds_deg = _bounds(elevations)
+        file = out or Path("sensors") / f"{name}.toml"
+        if channels is not None:
+            files.check_writable(file)
+        names = tuple(word.strip() for word in sensors.split(",") if word.strip())
+        request = sensor_design.DesignRequest(
+            pole, names, heights_m, evaluations, channels, bounds_deg, elevation_evaluations, name
+        )
+        result = sensor_design.design_sensor(
+            loaded, request, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event
+        )
+        if result.designed is not None:
+            files.ensure_writable_folder(file)
+            table = output.format_sensor_table(name, sensor_design.sensor_table(result.designed.sensor))
+            comment = f"# {result.designed.sensor.source}, for pole {result.pole} of {loaded.name}.\n"
+            files.write_text(file, comment + table)
+    print_design(result, file if result.designed is not None else None)
+
+
+def _bounds(text: str) -> tuple[float, float]:
+    try:
+        low_deg, high_deg = (float(word) for word in text.split(","))
+    except ValueError:
+        problem = f"expected free, or two elevations in degrees, got {text!r}"
+        raise InputError("--elevations", problem, "Use, for example, --elevations=-30,10.") from None
+    return low_deg, high_deg
+
+
+def print_design(result: DesignResult, file: Path | None) -> None:
+    """Print the best mounts of all sensors, the designed sensor, and how to use the chosen one."""
+    from egvs.cli.console import Column, console, make_table, print_sentences
+    from egvs.report.formatting import SCORE_LABELS
+    from egvs.scenario.score_config import DEFAULT_SCORE
+
+    label = SCORE_LABELS[DEFAULT_SCORE]
+    designs = [*result.catalogue]
+    if result.start is not None and result.designed is not None:
+        designs += [result.start, result.designed]
+    columns: list[Column[Design]] = [
+        Column("sensor", lambda design: design.sensor.name, align="left"),
+        Column("height m", lambda design: f"{design.pose.z_m - result.ground_m:.2f}"),
+        Column("yaw deg", lambda design: f"{design.pose.yaw_deg:.1f}"),
+        Column("pitch deg", lambda design: f"{design.pose.pitch_deg:.1f}"),
+        Column("found, frames of the search", lambda design: f"{design.search_score:.1%}"),
+        Column("found, other frames", lambda design: f"{100 * design.score:.1f} ± {100 * (design.se or 0.0):.1f}%"),
+        Column(f"minus {designs[0].sensor.name}, % points", _format_gain),
+    ]
+    out = console(_DESIGN_WIDTH, soft_wrap=False)
+    out.print(make_table(columns, designs, width=out.width, title=f"pole {result.pole}: {label.label}"))
+    out.print()
+    chosen = result.chosen
+    searched, others = result.frames
+    lines = [
+        f"The search saw {searched:,} frames; scores with ± are those of {others:,} other frames, so they are not"
+        " flattered by the search.",
+        f"Best by the search: {chosen.sensor.name}. Row of sites.csv (site,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg,"
+        f"sensor): {result.pole},{chosen.pose.x_m:g},{chosen.pose.y_m:g},{chosen.pose.z_m:g},{chosen.pose.yaw_deg:g},"
+        f"{chosen.pose.pitch_deg:g},{chosen.pose.roll_deg:g},{chosen.sensor.name}",
+    ]
+    if result.designed is not None:
+        elevations = ", ".join(f"{value:g}" for value in result.designed.sensor.elevations_deg)
+        lines.append(f"Elevations of {result.designed.sensor.name}: {elevations} degrees.")
+    print_sentences(lines)
+    print_sentences(f"note: {note}" for note in result.notes)
+    if file is not None:
+        print(f"table for scenario.toml: {file}")
+
+
+def _format_gain(design: Design) -> str:
+    difference = design.difference
+    text = f"{100 * difference.value:+.1f} ± {100 * (difference.se or 0.0):.1f}"
+    return text if difference.is_clear or not difference.value else f"~ {text}"

@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING
 from egvs.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from egvs.effects.base import Detect, Effect, Expand, Traffic, TransmitScan, TransmitScore
+    from egvs.effects.base import Detect, Echo, Echoes, Effect, Expand, Traffic, TransmitScan, TransmitScore
     from egvs.effects.registry import effect_names, load_effect_class
 
 __all__ = [
     "Detect",
+    "Echo",
+    "Echoes",
     "Effect",
     "Expand",
     "Traffic",
@@ -24,7 +26,7 @@ __all__ = [
 __getattr__, __dir__ = lazy_exports(
     __name__,
     {
-        "base": ["Detect", "Effect", "Expand", "Traffic", "TransmitScan", "TransmitScore"],
+        "base": ["Detect", "Echo", "Echoes", "Effect", "Expand", "Traffic", "TransmitScan", "TransmitScore"],
         "registry": ["effect_names", "load_effect_class"],
     },
 )

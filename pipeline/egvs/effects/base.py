@@ -12,6 +12,7 @@ TransmitScan  scan     cuts a cast beam into parts; each is the share of the bea
 TransmitScore score    gives the share of a beam that reaches each voxel that it crosses
 Detect        score    gives the probability that the return of a target at a given range is detected
 Traffic       traffic  changes who is on the road, and how boxes are made from it
+Echo          clouds   loses or disturbs single returns of a simulated point cloud, by surface; scores do not see it
 ============= ======== ========================================================================================
 
 .. math:: hits(v) = \sum_{beams} \sum_{sub} w_{sub} \cdot transmit(beam, v) \cdot detect(range(v))
@@ -35,6 +36,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from numpy.typing import NDArray
+
     from egvs.artefacts.tpog import Tpog
     from egvs.core.grid import FloatArray, Grid
     from egvs.scenario.model import Scenario
@@ -44,6 +47,30 @@ if TYPE_CHECKING:
 
 
 P = TypeVar("P", bound=EffectParameters)
+
+
+@dataclass(frozen=True)
+class Echoes:
+    """Returns of one simulated sweep before losses and noise.
+
+    Attributes
+    ----------
+    range_m
+        Range, (n,) float64.
+    cosine
+        Cosine of the angle of incidence, 0 to 1, (n,) float64.
+    is_glass
+        Whether the return is from a window of a vehicle, (n,) bool.
+    vehicle_draw
+        A number from 0 to 1, evenly distributed over vehicles, the same for a vehicle in all frames and at all sites;
+        NaN for the static world, (n,) float64.
+    """
+
+    range_m: FloatArray
+    cosine: FloatArray
+    is_glass: NDArray[np.bool_]
+    vehicle_draw: FloatArray
+
 
 _SAMPLES = 8
 """Points along each side of the region of interest over which a probability is averaged."""
@@ -198,6 +225,24 @@ class Detect(Effect[P]):
         It is not called for each beam and voxel, see :mod:`egvs.scoring.visibility`.
         """
         raise NotImplementedError
+
+
+class Echo(Effect[P]):
+    """Loses or disturbs returns of simulated point clouds (``egvs clouds``, ``egvs validate``).
+
+    It needs the surface that a beam meets, which scores do not know: they count beams through voxels and boxes.
+    """
+
+    STAGE: ClassVar[str] = "clouds"
+    KIND: ClassVar[str] = "echo"
+
+    def probability(self, echoes: Echoes) -> FloatArray:
+        """Return the probability that each return is detected, (n,), 0 to 1."""
+        return np.ones(len(echoes.range_m))
+
+    def sigma_m(self, echoes: Echoes) -> FloatArray:
+        """Return the standard deviation that is added to the noise of the sensor, as variances add, (n,)."""
+        return np.zeros(len(echoes.range_m))
 
 
 class Traffic(Effect[P], TrafficHook):

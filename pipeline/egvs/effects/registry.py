@@ -23,7 +23,7 @@ from egvs.traffic.vehicle_boxes import VehicleSize
 if TYPE_CHECKING:
     from egvs.world.terrain import GroundSource
 
-_BASE_CLASSES = (base.Expand, base.TransmitScan, base.TransmitScore, base.Detect, base.Traffic)
+_BASE_CLASSES = (base.Expand, base.TransmitScan, base.TransmitScore, base.Detect, base.Traffic, base.Echo)
 
 AUTO_ENABLED: dict[str, Callable[[Scenario], bool]] = {"slope": sumo_folder.may_have_slopes}
 """Effects that are enabled automatically, each with a quick test of whether it may act."""

@@ -44,7 +44,7 @@ from egvs.world.carriageway import Carriageway
 
 if TYPE_CHECKING:
     from ezdxf.document import Drawing
-    from ezdxf.layouts import Modelspace
+    from ezdxf.layouts.layout import Modelspace
 
     from egvs.report.svg_figures import Box
 
@@ -115,15 +115,16 @@ def write_dxf(path: Path, run: FinishedRun, layers: Sequence[Layer], reference: 
     list of str
         Notes on what was left out.
     """
-    import ezdxf
+    from ezdxf._options import options
+    from ezdxf.filemanagement import new
 
     by_name = {layer.name: layer for layer in layers}
     sites = by_name[SITES]
     box = _map_box(by_name[REGION], sites)
-    keeps_metadata = ezdxf.options.write_fixed_meta_data_for_testing
-    ezdxf.options.write_fixed_meta_data_for_testing = True  # no times, no random identifiers
+    keeps_metadata = options.write_fixed_meta_data_for_testing
+    options.write_fixed_meta_data_for_testing = True  # no times, no random identifiers
     try:
-        document = ezdxf.new(DXF_VERSION, setup=True, units=_METRES)
+        document = new(DXF_VERSION, setup=True, units=_METRES)
         document.header["$MEASUREMENT"] = 1
         document.header.custom_vars.append("Scenario", _plain_text(run.scenario.name))
         document.header.custom_vars.append("Reference system", _plain_text(reference.description))
@@ -141,7 +142,7 @@ def write_dxf(path: Path, run: FinishedRun, layers: Sequence[Layer], reference: 
         document.set_modelspace_vport(height=1.1 * (y1 - y0), center=((x0 + x1) / 2, (y0 + y1) / 2))
         document.saveas(path)
     finally:
-        ezdxf.options.write_fixed_meta_data_for_testing = keeps_metadata
+        options.write_fixed_meta_data_for_testing = keeps_metadata
     return notes
 
 

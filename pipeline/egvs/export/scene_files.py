@@ -14,6 +14,7 @@ origin (:func:`scene_origin_m`), which is stated in ``extrinsics.json``.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -33,6 +34,7 @@ from egvs.export.extrinsics import (
     transform_world_sensor,
 )
 from egvs.export.finished_run import ExportCrs, FinishedRun
+from egvs.report.basemap import solid_group
 from egvs.sensors.sites import Pose
 
 if TYPE_CHECKING:
@@ -65,6 +67,8 @@ class SceneMesh:
     @property
     def colour(self) -> tuple[int, int, int]:
         """RGB, 0 to 255."""
+        if solid_group(self.kind, math.inf) == "green":
+            return _COLOURS["tree"]
         return _COLOURS.get(self.kind, _OTHER_COLOUR)
 
 
@@ -131,11 +135,11 @@ def make_gltf(meshes: Sequence[SceneMesh], sensors: Sequence[PosedSensor], origi
     """Return a scene as binary glTF; parameters as those of the module."""
     import trimesh
 
-    scene = trimesh.Scene()
+    scene: Any = trimesh.Scene()
     to_gltf = np.eye(4)
     to_gltf[:3, :3] = R_GLTF_WORLD
     scene.graph.update(frame_to=WORLD_NODE, frame_from=scene.graph.base_frame, matrix=to_gltf)
-    used = {WORLD_NODE, scene.graph.base_frame}
+    used: set[str] = {WORLD_NODE, scene.graph.base_frame}
     for mesh in meshes:
         name = _unique(mesh.kind, used)
         _add(scene, name, trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False), np.eye(4), mesh.colour)
@@ -147,13 +151,14 @@ def make_gltf(meshes: Sequence[SceneMesh], sensors: Sequence[PosedSensor], origi
     return exported
 
 
-def _add(scene: trimesh.Scene, name: str, mesh: trimesh.Trimesh, matrix: Floats, colour: tuple[int, int, int]) -> None:
+def _add(scene: Any, name: str, mesh: trimesh.Trimesh, matrix: Floats, colour: tuple[int, int, int]) -> None:
     import trimesh
 
-    material = trimesh.visual.material.PBRMaterial(
+    visual: Any = trimesh.visual
+    material = visual.material.PBRMaterial(
         name=name, baseColorFactor=[*colour, 255], metallicFactor=0.0, roughnessFactor=0.9, doubleSided=True
     )
-    mesh.visual = trimesh.visual.TextureVisuals(material=material)
+    mesh.visual = visual.TextureVisuals(material=material)
     scene.add_geometry(mesh, node_name=name, geom_name=name, parent_node_name=WORLD_NODE, transform=matrix)
 
 
@@ -169,11 +174,12 @@ def _marker() -> trimesh.Trimesh:
     import trimesh
 
     body = trimesh.creation.cylinder(radius=0.1, height=0.2, sections=16)
-    to_front = trimesh.transformations.rotation_matrix(np.pi / 2, [0.0, 1.0, 0.0])
+    to_front = np.array([[0.0, 0.0, 1.0, 0.1], [0.0, 1.0, 0.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
     cone = trimesh.creation.cone(radius=0.06, height=0.5, sections=12, transform=to_front)
-    cone.apply_translation([0.1, 0.0, 0.0])
-    joined: trimesh.Trimesh = trimesh.util.concatenate([body, cone])
-    return joined
+    count = len(body.vertices)
+    return trimesh.Trimesh(
+        np.concatenate([body.vertices, cone.vertices]), np.concatenate([body.faces, cone.faces + count]), process=False
+    )
 
 
 def _unique(name: str, used: set[str]) -> str:

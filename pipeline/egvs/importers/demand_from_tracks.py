@@ -23,7 +23,7 @@ from egvs.scenario.traffic_config import CountConfig
 from egvs.tracks.cleaning import CleanTracks
 from egvs.traffic import estimates, track_demand
 from egvs.traffic.estimates import MIN_OBSERVATIONS
-from egvs.traffic.network import Network
+from egvs.traffic.network import CAR, Network
 from egvs.traffic.track_alignment import Alignment
 from egvs.traffic.track_demand import Passage
 
@@ -204,7 +204,7 @@ class _Reach:
         edges = network.edges
         self._after: dict[str, set[str]] = {}
         self._before: dict[str, set[str]] = {}
-        for source, target, turns_back in network.links("passenger").tolist():
+        for source, target, turns_back in network.links(CAR).tolist():
             if not turns_back:
                 self._after.setdefault(edges[source].id, set()).add(edges[target].id)
                 self._before.setdefault(edges[target].id, set()).add(edges[source].id)

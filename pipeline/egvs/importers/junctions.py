@@ -52,7 +52,7 @@ from egvs.importers.roundabouts import Ring
 from egvs.scenario.traffic_config import CountConfig
 from egvs.traffic import network as road_network
 from egvs.traffic.demand import RouteFinder
-from egvs.traffic.network import Edge, Network
+from egvs.traffic.network import CAR, Edge, Network
 from egvs.world.geolocation import network_world_frame
 
 MIN_ARMS = 3
@@ -99,7 +99,6 @@ _CLASS_BY_SPEED = (
     (0.0, "residential"),
 )
 """Least speed limit in m/s of a road class, for maps without road classes: 70, 60, 50, 40 km/h, with some tolerance."""
-_CAR = "passenger"
 _MIN_AREA_M2 = 10.0
 
 _ITERATIONS = 3
@@ -664,7 +663,7 @@ def edge_flow_h(edge: Edge) -> float:
         if part.startswith("highway."):
             road_class = part.removeprefix("highway.").removesuffix("_link")
             flows_per_h.append(LANE_FLOW_PER_H.get(road_class, _OTHER_FLOW_PER_H))
-    return max(flows_per_h, default=_OTHER_FLOW_PER_H) * edge.lanes_for(_CAR)
+    return max(flows_per_h, default=_OTHER_FLOW_PER_H) * edge.lanes_for(CAR)
 
 
 def _class_by_speed(edge: Edge) -> str:
@@ -705,7 +704,7 @@ def _growth_factors(target: FloatArray, current: FloatArray) -> FloatArray:
 
 def _find_gates(streets: Streets, roi: JunctionRegion, ring: Ring | None) -> _Gates:
     edges = streets.network.edges
-    links = [(source, target) for source, target, turnaround in streets.network.links(_CAR).tolist() if not turnaround]
+    links = [(source, target) for source, target, turnaround in streets.network.links(CAR).tolist() if not turnaround]
     successors: dict[int, list[int]] = {index: [] for index in _with_merging(_roads_inside(streets, roi), links)}
     entered = set()
     for source, target in links:
@@ -717,7 +716,7 @@ def _find_gates(streets: Streets, roi: JunctionRegion, ring: Ring | None) -> _Ga
     one_way = {edge.id for edge in edges if (edge.to_node, edge.from_node) not in two_way}
     entries = [index for index in successors if index not in entered]
     exits = [index for index, following in successors.items() if not following]
-    routes = RouteFinder(streets.network, _CAR)
+    routes = RouteFinder(streets.network, CAR)
     connected = np.zeros((len(entries), len(exits)))
     for row, entry in enumerate(entries):
         reachable = _reachable(entry, successors)
@@ -742,7 +741,7 @@ def _roads_inside(streets: Streets, roi: JunctionRegion) -> list[int]:
     region = roi.area
     indices = []
     for index, edge in enumerate(streets.network.edges):
-        if not edge.lanes_for(_CAR):
+        if not edge.lanes_for(CAR):
             continue
         is_within = region.covers(Point(edge.start_m)) and region.covers(Point(edge.end_m))
         if is_within or streets.areas[edge.id].intersection(region).area >= _MIN_AREA_M2:

@@ -468,8 +468,9 @@ def _with_signals(
     if junction.ring is not None:
         raise InputError("--signals", "the junction is a roundabout", "Choose another junction with --at LAT,LON.")
     signals = recorded_signals.read_signals(paths)
+    where = ", ".join(map(str, paths))
     motion = RecordedMotion.joined([each.motion() for each in matched])
-    return signal_programs.apply_signals(network, junction.id, signals, streets.frame, "--signals", motion, replay)
+    return signal_programs.apply_signals(network, junction.id, signals, streets.frame, where, motion, replay)
 
 
 class _PlannedTraffic(NamedTuple):

@@ -143,7 +143,7 @@ def read_signals(paths: Sequence[Path]) -> RecordedSignals:
         else:
             raise InputError(path, "neither recorded states of signals nor an assignment of signal groups", _HINT)
     if not records:
-        raise InputError("--signals", "no file has recorded states of signals", _HINT)
+        raise InputError(", ".join(map(str, paths)), "no file has recorded states of signals", _HINT)
     return RecordedSignals(records, tuple(ways), tuple(edges))
 
 

@@ -95,7 +95,7 @@ class TrackFiles:
         return {name: _copier(source) for name, source in sources.items()}
 
     def _names(self, path: Path) -> dict[Path, str]:
-        """Return the paths in the scenario of a file and of those beside it, which keep their places to each other."""
+        """Return the paths in the scenario of a file and of those beside it, in the same folders as before."""
         companions = TrackSource((path,), self.source.columns).companions()
         files = [file.absolute() for file in (path, *companions)]
         folder = Path(os.path.commonpath([file.parent for file in files]))

@@ -219,7 +219,8 @@ def apply_signals(
     assert lengths is not None
     cycle = _typical_cycle(cycles, lengths.value, records)
     clock = None
-    times_s = cycle.begin_s + STEP_S * (np.arange(round(cycle.length_s / STEP_S)) + 0.5)
+    n_steps = round(cycle.length_s / STEP_S)
+    times_s = np.asarray(cycle.begin_s + STEP_S * (np.arange(n_steps) + 0.5), dtype=np.float64)
     if replay is not None:
         clock = _clock(replay, records, cycle)
         times_s = _replayed_times_s(replay, clock)
@@ -238,8 +239,8 @@ def _guess_groups(
     guesses = guess_lights(approaches, signals.records, motion)
     if not guesses:
         problem = "no file says which lanes each signal group governs, and recorded road users do not show it either"
-        roads = ", ".join(f"{approach.edge} (from the {_side(approach)})" for approach in approaches)
-        hint = f"Add a CSV file with the columns {', '.join(GroupOfEdges.COLUMNS)}; the roads are {roads}."
+        names = ", ".join(f"{approach.edge} (from the {_side(approach)})" for approach in approaches)
+        hint = f"Add a CSV file with the columns {', '.join(GroupOfEdges.COLUMNS)}; the roads are {names}."
         raise InputError(where, problem, hint)
     roads: dict[tuple[str, str], list[str]] = {}
     for guess in guesses:
@@ -484,8 +485,7 @@ def _write_program(
     network: str, program: str, phases: Sequence[tuple[float, str]], clock: SignalClock | None = None
 ) -> str:
     """Replace a program of a network."""
-    params = () if clock is None else (clock.to_param(),)
-    recorded = Program("static", 0.0, tuple(Phase(duration_s, state) for duration_s, state in phases), params)
+    recorded = Program("static", 0.0, tuple(Phase(duration_s, state) for duration_s, state in phases), clock)
     return replace_programs(network, {program: recorded})
 
 

@@ -23,6 +23,7 @@ from scipy.spatial import KDTree
 from shapely.geometry import MultiPoint, Point
 from shapely.geometry.base import BaseGeometry
 
+from egvs.core.errors import InputError
 from egvs.core.grid import XY, FloatArray, Roi
 from egvs.importers import building_heights, openstreetmap, osm_solids
 from egvs.importers.as_built_view import AsBuiltMap
@@ -228,7 +229,7 @@ def collect_objects(
         if read.reader == openstreetmap.NAME:
             objects = _without_replaced(read.objects, collected)  # the carriageway is clear already
         else:
-            objects, subtracted_m = _lower_to_ground(read.objects, middle_m, zero_height_m)
+            objects, subtracted_m = _lower_to_ground(read, middle_m, zero_height_m)
             if collected.zero_height_m is None and subtracted_m is not None:
                 collected = replace(collected, zero_height_m=subtracted_m)
             if ground is not None and not read.objects.has_absolute_heights:
@@ -306,21 +307,22 @@ def _group_by_reader(maps: Sequence[MapFile]) -> list[list[MapFile]]:
     return list(groups.values())
 
 
-def _lower_to_ground(
-    solid_map: SolidMap, middle_m: XY, zero_height_m: float | None
-) -> tuple[SolidMap, float | None]:  # fmt: skip
+def _lower_to_ground(read: ReadMap, middle_m: XY, zero_height_m: float | None) -> tuple[SolidMap, float | None]:
     """Return a map whose heights count from z = 0, and what was subtracted from its heights; None if nothing was.
 
     Without a known height of z = 0, it is the median of the lowest points of the objects nearest to the junction.
     """
+    solid_map = read.objects
     if not solid_map.has_absolute_heights or not solid_map.meshes:
         return solid_map, None
     objects = [mesh for mesh in solid_map.meshes if mesh.kind not in (GROUND, OBJECT_KIND)]
-    if not objects:  # a point cloud, whose ground is the terrain
-        assert zero_height_m is not None, "a point cloud has a ground"
+    if objects:
+        bases_m = _ground_height_m(objects, middle_m)
+    elif zero_height_m is not None:  # a point cloud, whose ground is the terrain
         bases_m = zero_height_m
     else:
-        bases_m = _ground_height_m(objects, middle_m)
+        problem = "the points show no ground, so the height of z = 0 is unknown"
+        raise InputError(", ".join(map(str, read.paths)), problem, "Add a map of the terrain, or a denser cloud.")
     ground_m = bases_m if zero_height_m is None else zero_height_m
     source = "of the lowest points of the objects nearest to the junction"
     if zero_height_m is not None:

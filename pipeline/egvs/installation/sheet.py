@@ -339,7 +339,7 @@ def _table(parts: list[str], title: str, rows: Sequence[tuple[str, str]], x: flo
     parts.append(_text(x, y, title, 15, bold=True))
     y += 8
     for label, value in rows:
-        lines = _wrap(value, 34)
+        lines = _wrap(value, 32)
         for number, line in enumerate(lines):
             y += 21
             if number == 0 and label:
@@ -390,11 +390,14 @@ def describe_limit(tolerance: Tolerance) -> str:
 
 
 def describe_losses(tolerance: Tolerance) -> str:
-    """Return the change in points at the outermost offsets, e.g. "-4: -1.6, +4: -1.5 points"."""
-    unit = "m" if tolerance.quantity.unit == "m" else "°"
-    ends = (tolerance.offsets[0], tolerance.losses[0]), (tolerance.offsets[-1], tolerance.losses[-1])
-    texts = [f"{offset:+g}{' ' * (unit == 'm')}{unit}: {-loss:+z.1f}" for offset, loss in ends if offset]
-    return f"change of the score in points: {', '.join(texts)}"
+    """Return the change in points at the outermost offsets, e.g. "4° down: -1.6, 4° up: -1.5 points"."""
+    unit = " m" if tolerance.quantity.unit == "m" else "°"
+    texts = []
+    for index, direction in zip((0, -1), tolerance.quantity.directions, strict=True):
+        if tolerance.offsets[index]:
+            change = f"{-tolerance.losses[index]:+z.1f}"
+            texts.append(f"{abs(tolerance.offsets[index]):g}{unit} {direction}: {change}")
+    return f"{', '.join(texts)} points"
 
 
 def _draw_map(planned: PlannedSites, data: SheetData, width: float) -> str:

@@ -35,19 +35,22 @@ class Quantity:
         For readers.
     steps
         Ascending, above 0.
+    directions
+        What a lower and a higher value of the parameter mean.
     """
 
     name: str
     parameter: str
     unit: str
     steps: tuple[float, ...]
+    directions: tuple[str, str]
 
 
 QUANTITIES = (
-    Quantity("tilt", "pitch_deg", "degrees", (1.0, 2.0, 4.0)),
-    Quantity("roll", "roll_deg", "degrees", (1.0, 2.0, 4.0)),
-    Quantity("bearing", "yaw_deg", "degrees", (2.0, 5.0, 10.0)),
-    Quantity("height", "z_m", "m", (0.25, 0.5, 1.0)),
+    Quantity("tilt", "pitch_deg", "degrees", (1.0, 2.0, 4.0), ("down", "up")),
+    Quantity("roll", "roll_deg", "degrees", (1.0, 2.0, 4.0), ("right side up", "left side up")),
+    Quantity("bearing", "yaw_deg", "degrees", (2.0, 5.0, 10.0), ("clockwise", "counter-clockwise")),
+    Quantity("height", "z_m", "m", (0.25, 0.5, 1.0), ("lower", "higher")),
 )
 
 

@@ -164,7 +164,7 @@ def _cosine(triangle, size, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def cast_meshes(d, row, starts, boxes, kinds, shapes, ranges, sent, owner):  # type: ignore[no-untyped-def]
+def cast_meshes(d, row, starts, boxes, kinds, shapes, ranges, sent, owner, triangle):  # type: ignore[no-untyped-def]
     """Intersect the beams of one sensor with vehicle bodies; the nearest surface wins, the static world included.
 
     Parameters
@@ -181,9 +181,10 @@ def cast_meshes(d, row, starts, boxes, kinds, shapes, ranges, sent, owner):  # t
         Where each shape's parts start (shapes + 1,) int64; boxes of parts (p, 6) float64, and whether each is closed
         and faces outwards (p,) bool; where each part's triangles start (p + 1,) int64; triangles as a corner and two
         sides from it (m, 3, 3), length of each cross product (m,) and reflectivity (m,), in the unit box, float64.
-    ranges, sent, owner
+    ranges, sent, owner, triangle
         Of each row: range of the nearest surface so far (float64; a negative one is never replaced), reflectivity times
-        the cosine of the angle of incidence (float64), and its box (int32); changed where a body is nearer.
+        the cosine of the angle of incidence (float64), its box and its triangle of ``shapes`` (int32 each); changed
+        where a body is nearer.
     """
     part_starts, _, _, triangle_starts, triangles, _, reflectivity = shapes
     axes, half, c, o = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
@@ -224,6 +225,7 @@ def cast_meshes(d, row, starts, boxes, kinds, shapes, ranges, sent, owner):  # t
                     best, nearest = _nearest(parts, part_boxes, firsts, prepared, dx, dy, dz, ranges[row[n]])
                     if nearest >= 0:
                         ranges[row[n]], owner[row[n]], m = best, b, source[nearest]
+                        triangle[row[n]] = m
                         sent[row[n]] = reflectivity[m] * _cosine(triangles[m], size, fx, fy, fz)
 
 

@@ -78,7 +78,7 @@ _RANDOM_SHARE = 0.25
 """Share of the evaluations that are spread at random over the box."""
 
 _INITIAL_STEP = 0.15
-"""Initial standard deviation of CMA-ES, as a share of the sides of the box."""
+"""Default of the initial standard deviation of CMA-ES, as a share of the sides of the box."""
 
 _JOINT_WEIGHT = 1e-3
 """Weight of the joint score beside the objective in the loss of a pose."""
@@ -680,7 +680,12 @@ class _SensorSearch:
 
 
 def minimise(
-    losses: LossFunction, start: FloatArray, ends: BoxEnds, evaluations: int, rng: np.random.Generator
+    losses: LossFunction,
+    start: FloatArray,
+    ends: BoxEnds,
+    evaluations: int,
+    rng: np.random.Generator,
+    step: float = _INITIAL_STEP,
 ) -> None:
     """Evaluate losses until the evaluations are used up or the search converges.
 
@@ -698,17 +703,19 @@ def minimise(
         Maximum number of points.
     rng
         The points depend only on it and on the losses.
+    step
+        Initial standard deviation of CMA-ES, as a share of the sides of the box.
     """
     random_points = rng.random((max(1, int(_RANDOM_SHARE * evaluations)), len(start)))
     random_losses = losses(random_points)
     remaining = evaluations - len(random_points)
-    _run_cma_es(losses, start, ends, remaining // 2, rng)
+    _run_cma_es(losses, start, ends, remaining // 2, rng, step)
     best_random_point = random_points[int(np.argmin(random_losses))]
-    _run_cma_es(losses, best_random_point, ends, remaining - remaining // 2, rng)
+    _run_cma_es(losses, best_random_point, ends, remaining - remaining // 2, rng, step)
 
 
 def _run_cma_es(
-    losses: LossFunction, start: FloatArray, ends: BoxEnds, evaluations: int, rng: np.random.Generator
+    losses: LossFunction, start: FloatArray, ends: BoxEnds, evaluations: int, rng: np.random.Generator, step: float
 ) -> None:
     from cma import CMAEvolutionStrategy
 
@@ -719,7 +726,7 @@ def _run_cma_es(
         "verbose": -9,
         "verb_log": 0,
     }
-    strategy = CMAEvolutionStrategy(start, _INITIAL_STEP, options)
+    strategy = CMAEvolutionStrategy(start, step, options)
     while evaluations >= strategy.popsize and not strategy.stop():
         points = strategy.ask()
         strategy.tell(points, losses(np.array(points)).tolist())

@@ -127,10 +127,10 @@ class PageContents:
     detected: ValidationSummary | None = None
     plan: PlacementSummary | None = None
     movements: Mapping[str, str] = field(default_factory=dict)
-    approaches: tuple[ApproachFit, ...] = ()
-    approach_map: str = ""
     zones: ZoneSection | None = None
     points: PointsSection | None = None
+    approaches: tuple[ApproachFit, ...] = ()
+    approach_map: str = ""
 
 
 @dataclass(frozen=True)
@@ -233,11 +233,11 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
     drawn = figures.draw_figures(work, ranking, SiteListing.from_ranking(ranking).choices, tpog)
     work.progress("figures drawn", 2, 3)
 
-    approaches = compare_approaches(work.scenario, work.folder.trajectories, network_file(out))
     plan = PlacementSummary.read(out, stages, ranking.sites, tpog, drawn.backdrop)
     mapped = [pole.best for pole in ranking.poles[:MAPPED_POLES]]
     mounts = [] if plan is None else [pick.mount for pick in plan.picks]
     moved = plan is not None and plan.before is not None
+    approaches = compare_approaches(work.scenario, work.folder.trajectories, network_file(out))
     contents = PageContents(
         work.scenario,
         ranking,
@@ -249,10 +249,10 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
         detected=ValidationSummary.read(out, stages),
         plan=plan,
         movements=describe_counts(work.scenario, network_file(out)),
-        approaches=approaches,
-        approach_map=draw_approach_map(work.scenario, network_file(out)),
         zones=ZoneSection.read(work, ranking.sites[0], tpog.grid, drawn.backdrop, has_plan=plan is not None),
         points=PointsSection.draw(work, mapped, mounts, tpog.grid, drawn.backdrop, moved=moved),
+        approaches=approaches,
+        approach_map=draw_approach_map(work.scenario, network_file(out)),
     )
     html = render_page(contents)
     files.write_text(work.folder.report, html)

@@ -72,12 +72,12 @@ class PointsSection:
         by_name = {site.site: site for site in best}
         scans = ((scan.site.name, scan.beams) for scan in empty_scans(work, by_name.keys()))
         mapped = {(row.site, row.points.target.name): row.points for row in points_maps(work, positions, scans)}
-        figures = []
+        figures: list[PointsFigure] = []
         for site in best:
             for place in positions:
                 points = mapped[site.site, place.target.name]
                 figures.append(_site_figure(site, points, backdrop, box, f"points-{len(figures)}"))
-        overlap = []
+        overlap: list[PointsFigure] = []
         if len(plan) > 1:
             rows = list(points_maps(work, positions, plan_beams(work, plan, moved=moved)))
             for place in positions:

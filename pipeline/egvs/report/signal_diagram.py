@@ -8,7 +8,7 @@ from html import escape
 from typing import Any
 
 from egvs.report.svg_figures import PAGE_STYLE, FigureStyle, round_values, svg_start_tag, text_width
-from egvs.traffic.signals import plan_title
+from egvs.traffic.signal_descriptions import plan_title
 
 _TOP, _BOTTOM, _ROW, _RIGHT = 8.0, 44.0, 22.0, 16.0
 _BAR_INSET = 4.0
@@ -28,9 +28,11 @@ class SignalDiagram:
 
 
 def signal_diagrams(plans: Sequence[Mapping[str, Any]]) -> tuple[SignalDiagram, ...]:
-    """Return the diagrams of plans from :func:`egvs.traffic.signals.describe_signals`."""
+    """Return the diagrams of plans (:func:`egvs.traffic.signal_descriptions.describe_signals`) that do not replay."""
     diagrams = []
     for plan in plans:
+        if not plan["rows"]:
+            continue
         cycle = f"Cycle {plan['cycle_s']:g} s"
         if plan["type"] != "fixed":
             cycle += f", {plan['type']}: up to {plan['max_cycle_s']:g} s, drawn without extensions"
@@ -45,7 +47,7 @@ def stage_diagram(plan: Mapping[str, Any], style: FigureStyle = PAGE_STYLE) -> s
     Parameters
     ----------
     plan
-        A plan of :func:`egvs.traffic.signals.describe_signals`.
+        A plan of :func:`egvs.traffic.signal_descriptions.describe_signals`.
     style
         Width and colours.
     """

@@ -70,6 +70,29 @@ class DropoutParameters(EffectParameters):
     share: float = Field(ge=0, le=1, description="Share of the returns that are lost")
 
 
+_Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class SurfaceLossesParameters(EffectParameters):
+    """Returns lost at grazing incidence, on dark vehicles and on their windows, in simulated point clouds."""
+
+    grazing_loss: _Share = Field(0.66, description="Share of the returns that are lost at the most grazing incidence")
+    grazing_deg: float = Field(86.0, ge=0, le=90, description="Angle of incidence at which half of them are lost")
+    grazing_width_deg: float = Field(0.18, gt=0, le=30, description="Scale of the logistic increase of this loss")
+    dark_share: _Share = Field(0.12, description="Share of dark vehicles")
+    dark_loss: _Share = Field(0.4, description="Share of the returns from a dark vehicle that are lost")
+    glass_loss: _Share = Field(0.21, description="Share of the returns from windows that are lost")
+
+
+class RangeNoiseParameters(EffectParameters):
+    """Range noise that grows with range and incidence, in simulated point clouds."""
+
+    footprint_mrad: float = Field(
+        0.037, ge=0, le=10, description="Standard deviation per metre of range and tangent of the incidence, 1e-3"
+    )
+    max_sigma_m: float = Field(0.1, ge=0, le=10, description="Largest standard deviation that is added")
+
+
 def _parse_all(frames: object) -> object:
     return 0 if frames == "all" else frames
 
@@ -184,6 +207,8 @@ class EffectsConfig(StrictModel):
     rain: RainParameters | None = None
     fog: FogParameters | None = None
     dropout: DropoutParameters | None = None
+    surface_losses: SurfaceLossesParameters | None = None
+    range_noise: RangeNoiseParameters | None = None
     moving_occlusion: MovingOcclusionParameters | None = None
     divergence: DivergenceParameters | None = None
     mount_sway: MountSwayParameters | None = None

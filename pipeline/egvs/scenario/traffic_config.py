@@ -390,8 +390,10 @@ class TrafficConfig(StrictModel):
     @model_serializer(mode="wrap")
     def _serialize(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Leave out keys that have their defaults and are rarely set, so that they do not change cache keys."""
-        defaults = {"seeds": 1, "signals": {}}
-        return {name: value for name, value in serialize(self).items() if defaults.get(name) != value}
+        optional = {"seeds": 1, "signals": {}}
+        return {
+            name: value for name, value in serialize(self).items() if name not in optional or value != optional[name]
+        }
 
     @model_validator(mode="after")
     def _check_periods(self) -> TrafficConfig:
@@ -405,6 +407,10 @@ class TrafficConfig(StrictModel):
 
     @model_validator(mode="after")
     def _check_source(self) -> TrafficConfig:
+        # defaults know the keys before their own only, so a later source of [traffic] outranks them here
+        if any(getattr(self, key) is not None for key in self.model_fields_set.intersection(TRAFFIC_SOURCES)):
+            for key in set(_PERIOD_SOURCES) - self.model_fields_set:
+                self.__dict__[key] = None
         sources = [key for key in TRAFFIC_SOURCES if getattr(self, key) is not None]
         if len(sources) != 1:
             actual = " and ".join(sources) or "none"

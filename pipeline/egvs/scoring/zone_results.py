@@ -28,10 +28,10 @@ from numpy.typing import NDArray
 from egvs.artefacts import parquet
 from egvs.artefacts.readers import ALL_USERS
 from egvs.core.errors import Diagnostic
-from egvs.core.grid import FloatArray
+from egvs.core.grid import FloatArray, IntArray
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.score_config import DEFAULT_SCORE
-from egvs.scoring.blindspots import Ints, SpotVisibility, VehicleSpots
+from egvs.scoring.blindspots import SpotVisibility, VehicleSpots
 from egvs.scoring.road_locations import RoadLocation
 from egvs.scoring.target_scores import TARGET_SCORES
 from egvs.scoring.targets import TargetRecord, VisibleTargets
@@ -105,7 +105,9 @@ class ZoneUsers:
     empty: tuple[str, ...]
 
     @classmethod
-    def of(cls, record: TargetRecord, areas: Mapping[str, BaseGeometry], weight: FloatArray, period: Ints) -> ZoneUsers:
+    def of(
+        cls, record: TargetRecord, areas: Mapping[str, BaseGeometry], weight: FloatArray, period: IntArray
+    ) -> ZoneUsers:
         """Find the zones of the vehicle-frames of a record.
 
         Parameters
@@ -124,7 +126,7 @@ class ZoneUsers:
         of_kind = np.array([road_user_class(kind) for kind in record.kinds], dtype=object)
         classes: NDArray[Any] = of_kind[record.kind] if len(record) else np.empty(0, dtype=object)
         locations: list[RoadLocation] = []
-        rows: list[Ints] = []
+        rows: list[IntArray] = []
         empty = []
         for name, area in areas.items():
             inside = shapely.intersects_xy(area, record.boxes[:, 0], record.boxes[:, 1])

@@ -101,7 +101,7 @@ def table_text(fit: SensorFit, name: str, without_empty_sector: bool = False) ->
     """Return the lines of ``[sensors.NAME]``; raises as :func:`sensor_table`."""
     config = sensor_table(fit, without_empty_sector)
     SensorConfig.from_dict(config)  # a scenario can read it
-    return _toml(name, config)
+    return format_sensor_table(name, config)
 
 
 def sensor_table(fit: SensorFit, without_empty_sector: bool = False) -> dict[str, Any]:
@@ -178,7 +178,8 @@ def _comments(fit: SensorFit, name: str) -> str:
     return "".join(f"# {line}\n" for line in lines) + "\n"
 
 
-def _toml(name: str, table: dict[str, Any]) -> str:
+def format_sensor_table(name: str, table: dict[str, Any]) -> str:
+    """Return the lines of ``[sensors.NAME]`` with these keys."""
     key = name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else f'"{name}"'
     lines = [f"[sensors.{key}]"]
     for entry, value in table.items():

@@ -138,7 +138,7 @@ def check_effects(inputs: CheckInputs) -> Iterator[Diagnostic]:
     """Report each effect that cannot act in this scenario, or lacks something that it needs."""
     if inputs.scene is None or any(check_sensors_known(inputs)):
         return
-    for effect in registry.scenario_effects(inputs.scenario, "traffic", "scan", "score"):
+    for effect in registry.scenario_effects(inputs.scenario, "traffic", "scan", "score", "clouds"):
         yield from _effect_errors(effect, inputs.scene)
 
 

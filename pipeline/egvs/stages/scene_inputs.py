@@ -83,12 +83,12 @@ def _check_kept_sites(scenario: Scenario, selection: SiteSelection) -> None:
 
 
 def with_effects(plain: Scene) -> Scene:
-    """Add the effects of the scan and score stages that the scenario names and that can change a result."""
+    """Add the effects on beams and clouds that the scenario names and that can change a result."""
     if not plain.scenario.effects.named:
         return plain
     active = []
     inactive = []
-    for effect in registry.scenario_effects(plain.scenario, "scan", "score"):
+    for effect in registry.scenario_effects(plain.scenario, "scan", "score", "clouds"):
         reason = effect.why_idle(plain)
         if reason is None:
             active.append(effect)

@@ -34,7 +34,16 @@ from egvs.effects import registry
 from egvs.scenario.model import TERRAIN_KEY, Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.seed_summaries import merge_seed_summaries
-from egvs.traffic import finished_fcd, network, recording, signals, sumo, sumo_folder, trajectories
+from egvs.traffic import (
+    finished_fcd,
+    network,
+    recording,
+    signal_descriptions,
+    signal_plans,
+    sumo,
+    sumo_folder,
+    trajectories,
+)
 from egvs.traffic.fcd import FrameWindow
 from egvs.traffic.locks import WatchedRegion
 from egvs.traffic.vehicle_boxes import TrafficHook
@@ -114,7 +123,7 @@ def _source_files(scenario: Scenario) -> list[Path]:
         from egvs.traffic import recorded_tracks
 
         sources += recorded_tracks.track_files(scenario)
-    return [*sources, *sumo_folder.demand_files(scenario).all(), *signals.signal_files(scenario)]
+    return [*sources, *sumo_folder.demand_files(scenario).all(), *signal_plans.signal_files(scenario)]
 
 
 def _relative_name(path: Path, scenario: Scenario) -> str:
@@ -196,7 +205,7 @@ def _signal_plans(context: StageContext) -> list[dict[str, Any]]:
     roads = network.read_net_xml(paths[0])
     if not roads.stop_lines:
         return []
-    return signals.describe_simulated(scenario, paths[0], roads)
+    return signal_descriptions.describe_simulated(scenario, paths[0], roads)
 
 
 def _record_period(

@@ -28,7 +28,7 @@ from egvs.core.grid import FloatArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.effects import registry
 from egvs.effects.articulated import Articulated
-from egvs.effects.base import Detect, Effect, Traffic
+from egvs.effects.base import Detect, Echo, Effect, Traffic
 from egvs.report.formatting import SCORE_LABELS, ScoreLabel
 from egvs.runs import run, stage_keys, stage_registry
 from egvs.runs.stage_registry import RANKING_STAGES
@@ -45,6 +45,7 @@ from egvs.traffic.vehicle_boxes import VehicleSize
 MAX_TRIAL_SITES = 6
 
 UNTRIED = "not known before a run"
+ONLY_CLOUDS = "no score; egvs validate shows the change of detection"
 SMALL_CHANGE, MIN_DISPLAYED_CHANGE = 0.01, 0.001
 """An effect that changes all scores by less than the first value, and keeps their order, has little effect. Before a
 run, the same holds for an effect whose formula loses less than the first share of returns. Changes below the second
@@ -409,6 +410,8 @@ def _unnamed_effect_status(kind: type[Effect[Any]], scene: Scene, trials: Effect
     if refusal is not None:
         return _status(kind, "off", format_problem("cannot act here", refusal.problem, refusal.hint))
 
+    if isinstance(effect, Echo):
+        return _status(kind, "your choice", f"{kind.USER_KNOWLEDGE} decides", ONLY_CLOUDS)
     summary = effect.summary(scene)
     is_small, change = False, UNTRIED
     if trials is not None:

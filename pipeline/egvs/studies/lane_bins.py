@@ -67,10 +67,10 @@ def lane_bins(roads: network.Network, grid: Grid, covered: FloatArray) -> LaneBi
     lane = np.full(len(centres_m), -1, dtype=np.int64)
     along_m = np.full(len(centres_m), np.nan)
     nearest_m = np.full(len(centres_m), np.inf)
-    places = []
+    owners = []
     for number, middle in enumerate(locations.lanes):
         owner = locations.locations_of_lane[number][0]
-        places.append(owner if locations.locations[owner].by in (LANE, TURN) else -1)
+        owners.append(owner if locations.locations[owner].by in (LANE, TURN) else -1)
         line = shapely.LineString(middle.points_m)
         low_m, high_m = middle.points_m.min(axis=0) - middle.width_m, middle.points_m.max(axis=0) + middle.width_m
         near = np.flatnonzero(((centres_m >= low_m) & (centres_m <= high_m)).all(axis=1) & (covered > 0))
@@ -82,20 +82,20 @@ def lane_bins(roads: network.Network, grid: Grid, covered: FloatArray) -> LaneBi
         lane[near[better]], nearest_m[near[better]] = number, distance_m[better]
         along_m[near[better]] = shapely.line_locate_point(line, points[better])
 
-    place = np.where(lane >= 0, np.array([*places, -1])[lane], -1)
-    on_place = np.flatnonzero(place >= 0)
-    keys = np.column_stack([place[on_place], lane[on_place], np.floor(along_m[on_place] / BIN_M)]).astype(np.int64)
+    location = np.where(lane >= 0, np.array([*owners, -1])[lane], -1)
+    located = np.flatnonzero(location >= 0)
+    keys = np.column_stack([location[located], lane[located], np.floor(along_m[located] / BIN_M)]).astype(np.int64)
     unique, number_of = np.unique(keys, axis=0, return_inverse=True)
     used, lane_of_bin, counts = np.unique(unique[:, 0], return_inverse=True, return_counts=True)
     is_long = counts[lane_of_bin] >= MIN_BINS
     new_bin = np.where(is_long, np.cumsum(is_long) - 1, -1)
-    kept = np.flatnonzero(counts >= MIN_BINS)
+    long_enough = np.flatnonzero(counts >= MIN_BINS)
     new_lane = np.full(used.size, -1, dtype=np.int64)
-    new_lane[kept] = np.arange(kept.size)
+    new_lane[long_enough] = np.arange(long_enough.size)
     column_lane, column_bin = np.full(lane.size, -1, dtype=np.int64), np.full(lane.size, -1, dtype=np.int64)
-    column_bin[on_place] = new_bin[number_of.ravel()]
-    column_lane[on_place] = new_lane[lane_of_bin][number_of.ravel()]
-    described = disambiguate([locations.locations[index] for index in used[kept]])
+    column_bin[located] = new_bin[number_of.ravel()]
+    column_lane[located] = new_lane[lane_of_bin][number_of.ravel()]
+    described = disambiguate([locations.locations[index] for index in used[long_enough]])
     return LaneBins(
         column_lane, column_bin, new_lane[lane_of_bin][is_long],
         tuple(each.name for each in described), tuple(each.words for each in described),

@@ -61,7 +61,7 @@ class LaneSpeeds:
     @property
     def n_groups(self) -> int:
         """Number of groups of blocks."""
-        return self.counts.shape[2]
+        return int(self.counts.shape[2])
 
     def replicates(self) -> FloatArray:
         """Return the counts of all frames, then with each group left out, (n_lanes, :data:`N_BINS`, 1 + k)."""

@@ -31,6 +31,7 @@ from pydantic import ValidationError
 from egvs.core.errors import InputError
 from egvs.core.grid import Grid
 from egvs.effects import registry
+from egvs.effects.base import Echo
 from egvs.effects.registry import AUTO_ENABLED
 from egvs.scenario.model import Scenario
 from egvs.sensors import sites
@@ -367,13 +368,15 @@ def _measure_settings(scenario: Scenario, values: SettingValues) -> Iterator[Set
 
 
 def _acting_effects(scenario: Scenario) -> Iterator[str]:
-    """Yield effects that the scenario does not name, that need no parameter, and that act in its scene."""
+    """Yield effects on scores that the scenario does not name, that need no parameter, and that act in its scene."""
     scene = None
     for name in registry.effect_names():
         if name in scenario.effects.named or name in AUTO_ENABLED or registry.required_parameters(name):
             continue
         scene = scene or build_scene(scenario)
         kind = registry.load_effect_class(name)
+        if issubclass(kind, Echo):
+            continue
         effect = kind(kind.Model())
         if effect.why_idle(scene) is None and effect.refusal(scene) is None:
             yield name

@@ -1,4 +1,4 @@
-r"""What if a lorry parks there? The ranking with solids that are in the scene for a share of the time.
+r"""The ranking with solids that are in the scene for a share of the time, for ``egvs what-if``.
 
 For each table ``[what_if.NAME]``, the scenario runs as it is and with the solids of the table; traffic is the same and
 comes from the store, so only the static world, the scans and the scores are made again. With the score :math:`S_0` of a
@@ -248,8 +248,8 @@ def compare_runs(runs: Sequence[WhatIfRun], run_one: Callable[[int, WhatIfRun], 
         mixes.append({number: runs[number].share for number in range(1, len(runs))})
         notes.append(f"{TOGETHER}: the changes by each table are added, as if they were independent of each other")
     answers = [_answer(runs, by_name, replicates, shares, best.site) for shares in mixes]
-    sites = [_site_scores(name, by_name, mixes) for name in by_name[0]]
-    shown = [site for site in sites if _is_shown(site, sites)]
+    scored = [_site_scores(name, by_name, mixes) for name in by_name[0]]
+    shown = [site for site in scored if _is_shown(site, scored)]
     order = sorted(shown, key=lambda site: -site.before)
     return WhatIfResult(tuple(runs), tuple(answers), tuple(order), best.by, best, tuple(notes))
 
@@ -519,13 +519,12 @@ def _site_scores(
 
 def _is_shown(site: SiteScores, sites: Sequence[SiteScores]) -> bool:
     """Whether a site is among the best :data:`BEST` by any column."""
-    columns = [(site.before, [other.before for other in sites])]
-    for number, value in enumerate((*site.present, *site.expected)):
-        columns.append((value, [(*other.present, *other.expected)[number] for other in sites]))
-    return any(
-        value is not None and sum(other is not None and other > value for other in others) < BEST
-        for value, others in columns
-    )
+    others = [(other.before, *other.present, *other.expected) for other in sites]
+    for number, value in enumerate((site.before, *site.present, *site.expected)):
+        better = [row[number] for row in others]
+        if value is not None and sum(score is not None and score > value for score in better) < BEST:
+            return True
+    return False
 
 
 def impossible_note(answer: WhatIfAnswer) -> str:

@@ -121,11 +121,11 @@ def _parquet_batches(
 
     # Texts stay encoded: a long one that occurs in each row would otherwise fill the memory.
     with pq.ParquetFile(path, read_dictionary=list(texts)) as file:
-        wanted = _select(path, file.schema_arrow.names, names, optional)
+        selected = _select(path, file.schema_arrow.names, names, optional)
         limits.ROWS.check(path, file.metadata.num_rows)
         groups = (file.metadata.row_group(index) for index in range(file.metadata.num_row_groups))
         limits.UNPACKED.check_bytes(path, sum(group.total_byte_size for group in groups))
-        for batch in file.iter_batches(columns=wanted, use_threads=False):
+        for batch in file.iter_batches(columns=selected, use_threads=False):
             batch.validate(full=True)
             yield batch
 
@@ -138,8 +138,8 @@ def _feather_batches(
     with pa.OSFile(str(path)) as source:
         with pa.ipc.open_file(source) as file:
             actual = file.schema.names
-        wanted = _select(path, actual, names, optional)
-        options = pa.ipc.IpcReadOptions(use_threads=False, included_fields=[actual.index(name) for name in wanted])
+        selected = _select(path, actual, names, optional)
+        options = pa.ipc.IpcReadOptions(use_threads=False, included_fields=[actual.index(name) for name in selected])
         source.seek(0)
         file = pa.ipc.open_file(source, options=options)
         rows = 0
@@ -152,7 +152,7 @@ def _feather_batches(
 
 
 def _select(path: Path, actual: Sequence[str], names: Sequence[str], optional: Collection[str]) -> list[str]:
-    """Return the wanted columns that a file has; InputError when a required one is missing or occurs twice."""
+    """Return the requested columns that a file has; InputError when a required one is missing or occurs twice."""
     for name in names:
         count = actual.count(name)
         if count > 1 or (count == 0 and name not in optional):

@@ -104,9 +104,6 @@ class BoxRows:
         self._classes: list[str] = []
         self._numbers = array("d")
 
-    def __len__(self) -> int:
-        return len(self._names)
-
     def add(self, file: Path, name: str, cls: str, time_s: float, box: Box) -> None:
         """Append a row: the file it is from, the name of the track, the class, the time and the box.
 

@@ -250,7 +250,7 @@ def read_table(
     Raises
     ------
     InputError
-        When the file is damaged, a required column is missing, a wanted column occurs twice, a row has another number
+        When the file is damaged, a required column is missing, a requested one occurs twice, a row has another number
         of cells than the header (empty ones at its end do not count), or there is no row.
     """
     rows = read_rows(path, delimiter, hint)
@@ -276,7 +276,7 @@ def read_table(
 def _positions(
     path: Path, names: list[str], required: Sequence[str], optional: Sequence[str], hint: str
 ) -> dict[str, int]:
-    """Return the position of each wanted column in the file, preferably in the same case."""
+    """Return the position of each requested column in the file, preferably in the same case."""
     positions: dict[str, int] = {}
     for name in (*required, *optional):
         matches = [position for position, actual in enumerate(names) if actual == name]

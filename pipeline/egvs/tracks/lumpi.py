@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from egvs.core import limits
 from egvs.core.errors import InputError
 from egvs.tracks import columns
 from egvs.tracks.model import TrackFrame, Tracks
@@ -71,6 +72,7 @@ def _read_boxes(path: Path) -> columns.Table:
         for name, text in zip(_CELLS, row, strict=False):
             cells[name].append(text.strip())
         lines.append(line)
+        limits.ROWS.check(path, len(lines))
     if not lines:
         raise InputError(path, "contains no rows", "Use the file as it was published.")
     table = columns.Table(path, cells, lines)

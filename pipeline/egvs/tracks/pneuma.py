@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from egvs.core import limits
 from egvs.core.errors import InputError
 from egvs.tracks import columns
 from egvs.tracks.geographic import to_utm
@@ -75,6 +76,7 @@ def _read_positions(path: Path) -> columns.Table:
         for name in ("lat", "lon", "time"):
             cells[name] += row[len(_VEHICLE) + _POSITION.index(name) :: len(_POSITION)]
         lines += [line] * count
+        limits.ROWS.check(path, len(lines))
     if not lines:
         raise InputError(path, "contains no vehicles", "Use the file as it was published.")
     return columns.Table(path, cells, lines)

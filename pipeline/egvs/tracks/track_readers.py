@@ -75,10 +75,10 @@ class TrackSource:
         """Return the files beside the tracks that their readers need."""
         if self.columns is not None:
             return []
-        found: dict[Path, None] = {}
+        companions: dict[Path, None] = {}
         for path in self.paths:
-            found |= dict.fromkeys(find_reader(path).companions(path))
-        return [path for path in found if path not in self.paths]
+            companions |= dict.fromkeys(find_reader(path).companions(path))
+        return [path for path in companions if path not in self.paths]
 
     def reader_modules(self) -> list[str]:
         """Return the modules that read the files."""

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from egvs.core import reading
+from egvs.core import limits, reading
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.formats.georeference import WGS84, WorldFrame, parse_crs
@@ -156,6 +156,7 @@ def _read_json_lines(path: Path, names: Sequence[str]) -> Table:
                 raise InputError(f"{where}: {name}", problem, _HINT)
             cells[name].append("" if value is None else str(value).strip())
         lines.append(line)
+        limits.ROWS.check(path, len(lines))
     for name in names:
         if not any(cells[name]):
             raise InputError(path, f"expected a key {name!r}, which no line has", _HINT)

@@ -17,11 +17,10 @@ import numpy as np
 from egvs.core.errors import InputError
 from egvs.traffic.demand import RouteFinder
 from egvs.traffic.directions import TURNS, Floats, compass
-from egvs.traffic.network import Edge, Network
+from egvs.traffic.network import CAR, Edge, Network
 
 _WAYS = {"straight": "straight on", "left": "left", "right": "right", "back": "U-turn"}
 _UNNAMED_STREET = "an unnamed street"
-_CAR = "passenger"
 
 _HEADING_OVER_M = 30.0
 """The direction of a movement is that of the last metres before the junction, and of the first ones after it."""
@@ -75,7 +74,7 @@ class MovementNames:
         self._edges = {edge.id: edge for edge in network.edges}
         self._nodes_m = {node.id: node.at_m for node in network.junctions}
         self._roundabouts = [set(roundabout.nodes) for roundabout in network.roundabouts]
-        self._routes = RouteFinder(network, _CAR)
+        self._routes = RouteFinder(network, CAR)
         self._turns: dict[tuple[str, str], str] = {}
         for connection in network.connections:
             if connection.direction in TURNS:
@@ -101,21 +100,21 @@ class MovementNames:
         """
         first = self._edges[from_edge]
         if to_edge is None:
-            return f"{compass(_end_heading([first]))}bound on {street_name(first)}"
+            return f"{compass(_end_heading([first]))}bound on {_street(first)}"
 
         passage = self._passage(first, self._edges[to_edge])
         approach, way_out = passage.to_junction[-1], passage.from_junction[0]
         before, after = _headings(passage)
-        words = f"{compass(before)}bound on {street_name(approach)}"
+        words = f"{compass(before)}bound on {_street(approach)}"
         if first.name not in ("", approach.name):
-            words += f" from {street_name(first)}"
+            words += f" from {_street(first)}"
 
         turn = self._turns.get((approach.id, way_out.id)) or _turn_between(before, after)
         last = passage.from_junction[-1]
-        towards = f" towards {street_name(last)}" if last.name not in ("", way_out.name) else ""
+        towards = f" towards {_street(last)}" if last.name not in ("", way_out.name) else ""
         if turn == "straight" and approach.name == way_out.name:
             return f"{words}, straight on{towards}"
-        return f"{words}, {_WAYS[turn]} to {street_name(way_out)}{towards}"
+        return f"{words}, {_WAYS[turn]} to {_street(way_out)}{towards}"
 
     def movement(self, from_edge: str, to_edge: str | None) -> Movement:
         """Return approach and turn of a movement; parameters as of :meth:`describe`."""
@@ -180,7 +179,7 @@ def _point_along(line_m: Floats) -> Floats:
     return np.array([np.interp(_HEADING_OVER_M, distance_m, line_m[:, axis]) for axis in (0, 1)])
 
 
-def street_name(edge: Edge) -> str:
+def _street(edge: Edge) -> str:
     """Return the name of an edge's street on one line."""
     return plain_text(edge.name) or _UNNAMED_STREET
 

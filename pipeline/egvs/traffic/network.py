@@ -38,6 +38,9 @@ _SHAPE_WITH_HEIGHT = re.compile(rb"(?:^|\s)[^,\s]+,[^,\s]+,[^,\s]+(?:\s|$)")
 _MAY_PASS = frozenset("GgsoO")
 """States of a signal in which a vehicle may drive on, at once or after giving way."""
 
+CAR = "passenger"
+"""SUMO vClass of cars."""
+
 _PEDESTRIAN = "pedestrian"
 _OSM_SUFFIXES = (".osm", ".osm.xml", ".osm.pbf")
 _HINT = "Use a network that netconvert wrote."
@@ -103,7 +106,7 @@ class Lane(Shape):
     @property
     def is_sidewalk(self) -> bool:
         """Whether pedestrians may use it, and cars may not."""
-        return self.permission.admits(_PEDESTRIAN) and not self.permission.admits("passenger")
+        return self.permission.admits(_PEDESTRIAN) and not self.permission.admits(CAR)
 
 
 @dataclass(frozen=True)

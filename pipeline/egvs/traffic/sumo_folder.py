@@ -26,7 +26,7 @@ from egvs.core.grid import FloatArray
 from egvs.formats import osm
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import TrafficConfig
-from egvs.traffic import demand, departures, network, signals, sumo, town_trips, user_files
+from egvs.traffic import demand, departures, network, signal_plans, sumo, town_trips, user_files
 from egvs.traffic.fcd import FrameWindow
 from egvs.traffic.vehicle_boxes import TrafficHook
 
@@ -173,11 +173,11 @@ def read_network(scenario: Scenario) -> network.Network | None:
 def check_signal_plans(scenario: Scenario, path: Path) -> None:
     """Raise an InputError if a plan of a signal does not fit the network in a file, which may be a map."""
     if not network.is_osm(path):
-        signals.check_plans(scenario, path, network.read_net_xml(path))
+        signal_plans.check_plans(scenario, path, network.read_net_xml(path))
         return
     with files.temporary_folder() as folder:
         convert_osm_to_network(path, folder / NETWORK_FILE)
-        signals.check_plans(scenario, folder / NETWORK_FILE, network.read_net_xml(folder / NETWORK_FILE, path))
+        signal_plans.check_plans(scenario, folder / NETWORK_FILE, network.read_net_xml(folder / NETWORK_FILE, path))
 
 
 def copy_network(scenario: Scenario, folder: Path) -> None:
@@ -330,7 +330,7 @@ def prepare_simulation(scenario: Scenario, folder: Path, extensions: Iterable[Tr
     copies, notes = _copy_files(inputs, folder, extra_files)
     if traffic.signals:
         _check_additional_programs(copies, folder, where)
-        signals.apply_plans(scenario, folder / copies["net-file"], inputs.files["net-file"][0])
+        signal_plans.apply_plans(scenario, folder / copies["net-file"], inputs.files["net-file"][0])
     roads = network.read_net_xml(folder / copies["net-file"], inputs.files["net-file"][0])
     demand_seed, sumo_seed, *extra_seeds = np.random.SeedSequence(scenario.seed).spawn(2 + len(adding))
 

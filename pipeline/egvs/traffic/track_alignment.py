@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, Roi
-from egvs.traffic.network import LANE_WIDTH_M, Network
+from egvs.traffic.network import CAR, LANE_WIDTH_M, Network
 
 FAR_M = 5.0
 """Distance from which on a position belongs to no lane."""
@@ -28,7 +28,6 @@ MIN_SHARE, MIN_GAIN = 0.7, 0.1
 _SPACING_M = 0.5
 _MAX_POINTS = 2000
 _SHIFTS_M = (-6.0, -3.0, 0.0, 3.0, 6.0)
-_MOTOR_CLASS = "passenger"
 
 
 @dataclass(frozen=True)
@@ -142,7 +141,7 @@ def lane_points(roads: Network, region: Roi) -> FloatArray:
 
 def road_heights(roads: Network, xy_m: FloatArray) -> FloatArray:
     """Return the height of the nearest lane for cars below each position (n, 2), z in the world frame, (n,)."""
-    lines_m = [lane.shape_m for edge in roads.edges for lane in edge.lanes if lane.permission.admits(_MOTOR_CLASS)]
+    lines_m = [lane.shape_m for edge in roads.edges for lane in edge.lanes if lane.permission.admits(CAR)]
     has_heights = any(line_m[:, 2].any() for line_m in lines_m)
     if not has_heights or not len(xy_m):
         return np.zeros(len(xy_m))
@@ -164,7 +163,7 @@ def _centre_lines(roads: Network) -> tuple[FloatArray, FloatArray]:
     points, half_widths = [np.empty((0, 2))], [np.empty(0)]
     for edge in roads.all_edges:
         for lane in edge.lanes:
-            if not lane.permission.admits(_MOTOR_CLASS) or edge.function in ("crossing", "walkingarea"):
+            if not lane.permission.admits(CAR) or edge.function in ("crossing", "walkingarea"):
                 continue
             points.append(_divide(lane.shape_m[:, :2]))
             half_widths.append(np.full(len(points[-1]), (lane.width_m or LANE_WIDTH_M) / 2.0))

@@ -23,19 +23,18 @@ import numpy as np
 
 from egvs.core.grid import FloatArray, IntArray
 from egvs.tracks.resampling import ResampledTracks
-from egvs.traffic.network import DEFAULT_SPEED_M_S, Lane, Network
+from egvs.traffic.network import CAR, DEFAULT_SPEED_M_S, Lane, Network
+from egvs.traffic.track_alignment import FAR_M
 
 PERIOD_S = 0.5
 """Usual time between matched positions."""
 
-FAR_M = 5.0
 SAME_WAY_RAD = np.pi / 3
 SIGMA_M = 1.0
 """Standard deviation of positions across the lane."""
 
 CHANGE_COST, BREAK_COST = 2.0, 12.0
 
-_CAR = "passenger"
 _MAX_HOPS = 4
 """Lanes that may be passed between two positions; lanes inside junctions can be shorter than the way between them."""
 
@@ -173,7 +172,7 @@ def driven_lanes(network: Network) -> tuple[tuple[DrivenLane, ...], tuple[tuple[
     for edge in network.all_edges:
         for which, lane in enumerate(edge.lanes):
             name = f"{edge.id}_{which}"
-            if not lane.permission.admits(_CAR) or len(lane.shape_m) < 2 or edge.function not in ("", "internal"):
+            if not lane.permission.admits(CAR) or len(lane.shape_m) < 2 or edge.function not in ("", "internal"):
                 continue
             source, target, turn = edge.id, edge.id, ""
             if edge.function:

@@ -3,9 +3,9 @@ r"""Point clouds of a static world with traffic: vehicle meshes, first hits, int
 The empty scan of *all* beams of a sensor is cast once; a frame then costs only the beams near its vehicles.
 
 Steps for a frame: where effects weight the sub-beams of a beam, draw one of them; intersect beams with the bodies of
-all boxes, of which the nearest surface wins (:mod:`egvs.kernels.mesh_casting`); drop returns that effects lose; add
-noise to the ranges. A point is where the sensor measures it: along the nominal direction of the beam, at the measured
-range.
+all boxes, of which the nearest surface wins (:mod:`egvs.kernels.mesh_casting`); drop returns that effects lose, by
+range and by surface; add noise to the ranges. A point is where the sensor measures it: along the nominal direction of
+the beam, at the measured range.
 
 .. math:: p = (r + \sigma n)\, d_{sensor}, \quad n \sim N(0, 1)
 
@@ -45,9 +45,10 @@ any other                                               ``truck``
 
 from __future__ import annotations
 
+import hashlib
 import tomllib
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import chain
@@ -61,7 +62,7 @@ from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
-from egvs.effects.base import Detect
+from egvs.effects.base import Detect, Echo, Echoes
 from egvs.formats import meshes
 from egvs.kernels import mesh_casting
 from egvs.scenario.model import Scenario
@@ -126,10 +127,21 @@ class MeshPart:
 
 @dataclass(frozen=True)
 class VehicleMeshes:
-    """The bodies of all kinds, in the form that :func:`egvs.kernels.mesh_casting.cast_meshes` takes (``shapes``)."""
+    """The bodies of all kinds.
+
+    Attributes
+    ----------
+    kinds
+        Names of the kinds.
+    shapes
+        The bodies in the form that :func:`egvs.kernels.mesh_casting.cast_meshes` takes.
+    surfaces
+        Key of :data:`REFLECTIVITY` of each triangle of ``shapes``, (m,).
+    """
 
     kinds: tuple[str, ...]
     shapes: tuple[IntArray, FloatArray, NDArray[np.bool_], IntArray, FloatArray, FloatArray, FloatArray]
+    surfaces: NDArray[np.str_]
 
     @classmethod
     def from_parts(cls, parts_by_kind: Mapping[str, tuple[MeshPart, ...]]) -> VehicleMeshes:
@@ -144,11 +156,12 @@ class VehicleMeshes:
         closed = np.array([part.closed for part in parts])
 
         triangle_counts = [len(part.triangles) for part in parts]
-        reflectivity = np.repeat([REFLECTIVITY[part.surface] for part in parts], triangle_counts)
+        surfaces = np.repeat([part.surface for part in parts], triangle_counts)
+        reflectivity = np.array([REFLECTIVITY[surface] for surface in surfaces])
         part_starts = np.cumsum([0, *map(len, parts_by_kind.values())])
         triangle_starts = np.cumsum([0, *triangle_counts])
         shapes = (part_starts, np.array(boxes) + padding, closed, triangle_starts, sides, normal_lengths, reflectivity)
-        return cls(tuple(parts_by_kind), shapes)
+        return cls(tuple(parts_by_kind), shapes, surfaces)
 
     def kinds_of_boxes(self, frame: TrafficFrame) -> IntArray:
         """Return the index in :attr:`kinds` of each box of a frame, (n,)."""
@@ -321,6 +334,15 @@ def sweep_rng(seed: int, site: str, frame: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence((seed, zlib.crc32(site.encode()), frame)))
 
 
+def vehicle_draws(vehicles: Sequence[str], seed: int) -> FloatArray:
+    """Return a number from 0 to 1 for each vehicle, by its name and the seed of the scenario, (n,)."""
+    draws = []
+    for vehicle in vehicles:
+        digest = hashlib.blake2b(f"{seed} {vehicle}".encode(), digest_size=8).digest()
+        draws.append(int.from_bytes(digest, "big") / 2.0**64)
+    return np.array(draws)
+
+
 def check_no_measured_scan(site: Site) -> None:
     """Raise an InputError for a site with a measured scan, which does not contain the beams without a return."""
     if site.points is not None:
@@ -340,11 +362,61 @@ class FirstHits:
         Row of the frame's boxes, -1 for the static world, (n,) int32.
     intensity
         From 0 to 1, (n,) float64.
+    triangle
+        Triangle of the body, -1 for the static world, (n,) int32.
     """
 
     range_m: FloatArray
     owner: NDArray[np.int32]
     intensity: FloatArray
+    triangle: NDArray[np.int32]
+
+
+class BodyCaster:
+    """Intersects beams from one position with the bodies of traffic.
+
+    Parameters
+    ----------
+    directions
+        Unit vectors along the world's axes, (n, 3).
+    bodies
+        The bodies.
+    """
+
+    def __init__(self, directions: FloatArray, bodies: VehicleMeshes) -> None:
+        self._bodies = bodies
+        cell = np.empty(len(directions), dtype=np.int64)
+        mesh_casting.direction_cells(directions, cell)
+        self._row = np.argsort(cell, kind="stable")
+        self._directions = directions[self._row]
+        self._starts = np.searchsorted(cell[self._row], np.arange(mesh_casting.ROWS * mesh_casting.COLUMNS + 1))
+
+    def cast(
+        self, frame: TrafficFrame, position_m: tuple[float, float, float], range_m: FloatArray, intensity: FloatArray
+    ) -> FirstHits:
+        """Return the first hits of all beams.
+
+        Parameters
+        ----------
+        frame
+            The traffic.
+        position_m
+            Where the beams start.
+        range_m
+            Range of the static world along each beam, (n,); replaced where a body is nearer.
+        intensity
+            Intensity of the static world, (n,).
+        """
+        owner = np.full(len(range_m), -1, dtype=np.int32)
+        triangle = owner.copy()
+        intensity = intensity.copy()
+        boxes = np.column_stack([frame.boxes, frame.pitch_rad])
+        boxes[:, :3] -= position_m
+        mesh_casting.cast_meshes(
+            self._directions, self._row, self._starts, boxes, self._bodies.kinds_of_boxes(frame), self._bodies.shapes,
+            range_m, intensity, owner, triangle,
+        )  # fmt: skip
+        return FirstHits(range_m, owner, intensity, triangle)
 
 
 class CloudSimulator:
@@ -380,6 +452,8 @@ class CloudSimulator:
         assert self._scanner.full_sweep
         self._bodies = bodies or vehicle_meshes(scene.scenario)
         self._detects = scene.acting(Detect)
+        self._echo_effects = scene.acting(Echo)
+        self._seed = scene.scenario.seed
 
         scan = self._scanner.scan(pose, sensor).rows
         self._range_m = np.sqrt((scan.ends_m**2).sum(axis=1))
@@ -389,13 +463,10 @@ class CloudSimulator:
         self._cumulated_weight: FloatArray | None = None
         if scan.weight is not None:
             self._cumulated_weight = _cumulate_weights(self._beam, scan.weight)
-        self._intensity = _static_intensity(self._scanner, scan, directions)
+        self._static_cosine, reflectivity = _static_surfaces(self._scanner, scan, directions)
+        self._intensity = reflectivity * self._static_cosine
 
-        cell = np.empty(len(directions), dtype=np.int64)
-        mesh_casting.direction_cells(directions, cell)
-        self._row = np.argsort(cell, kind="stable")
-        self._directions = directions[self._row]
-        self._starts = np.searchsorted(cell[self._row], np.arange(mesh_casting.ROWS * mesh_casting.COLUMNS + 1))
+        self._body_caster = BodyCaster(directions, self._bodies)
         self._nominal = sensor.directions()
         self.view = SiteView(site, pose, sensor, self._empty_range_m(scan, sensor.beams))
 
@@ -430,7 +501,14 @@ class CloudSimulator:
         returned = (hits.owner >= 0) | self._returned
         rows = np.flatnonzero(returned) if drawn is None else drawn[returned[drawn]]
         rows = self._drop_lost_returns(rows, hits.range_m, rng)
-        noise = self.view.sensor.range_sigma_m * rng.standard_normal(len(rows), dtype=np.float32)
+        sigma_m: float | FloatArray = self.view.sensor.range_sigma_m
+        if self._echo_effects:
+            echoes = self._echoes(rows, hits, frame)
+            sigma_m = np.sqrt(sigma_m**2 + sum(effect.sigma_m(echoes) ** 2 for effect in self._echo_effects))
+            probability = np.prod([effect.probability(echoes) for effect in self._echo_effects], axis=0)
+            is_kept = rng.random(len(rows)) < probability
+            rows, sigma_m = rows[is_kept], sigma_m[is_kept]
+        noise = sigma_m * rng.standard_normal(len(rows), dtype=np.float32)
         points = np.empty((len(rows), 4), dtype=np.float32)
         mesh_casting.fill_returns(self._beam, rows, hits.range_m, noise, hits.intensity, self._nominal, points)
         return LabelledSweep(Sweep(points, self._beam[rows].astype(np.uint32)), hits.owner[rows])
@@ -442,16 +520,21 @@ class CloudSimulator:
         else:
             range_m = np.full(len(self._range_m), _NOT_DRAWN_M)
             range_m[rows] = self._range_m[rows]
-        owner = np.full(len(range_m), -1, dtype=np.int32)
-        intensity = self._intensity.copy()
-        boxes = np.column_stack([frame.boxes, frame.pitch_rad])
-        boxes[:, :3] -= self.view.pose.position_m
-        kinds = self._bodies.kinds_of_boxes(frame)
-        mesh_casting.cast_meshes(
-            self._directions, self._row, self._starts, boxes, kinds, self._bodies.shapes, range_m, intensity, owner
-        )
-        range_m[(owner < 0) & ~self._returned & (range_m >= 0.0)] = np.inf
-        return FirstHits(range_m, owner, intensity)
+        hits = self._body_caster.cast(frame, self.view.pose.position_m, range_m, self._intensity)
+        range_m[(hits.owner < 0) & ~self._returned & (range_m >= 0.0)] = np.inf
+        return hits
+
+    def _echoes(self, rows: IntArray, hits: FirstHits, frame: TrafficFrame) -> Echoes:
+        """Return the surfaces that some rows meet."""
+        owner, triangle = hits.owner[rows], hits.triangle[rows]
+        on_body = owner >= 0
+        cosine = self._static_cosine[rows]
+        cosine[on_body] = hits.intensity[rows][on_body] / self._bodies.shapes[-1][triangle[on_body]]
+        is_glass = np.zeros(len(rows), dtype=np.bool_)
+        is_glass[on_body] = self._bodies.surfaces[triangle[on_body]] == "glass"
+        draw = np.full(len(rows), np.nan)
+        draw[on_body] = vehicle_draws(frame.vehicles, self._seed)[owner[on_body]]
+        return Echoes(hits.range_m[rows], cosine, is_glass, draw)
 
     def _draw_rows(self, cumulated_weight: FloatArray, rng: np.random.Generator) -> IntArray:
         """Draw one row of each beam by weight; where the weights of a beam sum to less than 1, possibly none."""
@@ -491,15 +574,20 @@ def _cumulate_weights(beam: IntArray, weight: FloatArray) -> FloatArray:
     return beam.astype(np.float64) + np.minimum(within_beam, 1.0)
 
 
-def _static_intensity(scanner: Scanner, scan: EmptyScan, directions: FloatArray) -> FloatArray:
-    """Return the intensity of the static world along each row; leaves, of any orientation, have a cosine of 1/2."""
+def _static_surfaces(scanner: Scanner, scan: EmptyScan, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the cosine of the angle of incidence on the static world along each row, and the reflectivity there.
+
+    Leaves, of any orientation, have a cosine of 1/2.
+    """
     assert scan.face is not None
     world = scanner.opaque_world
     on_face = scan.face >= 0
     corners = world.triangles_m[scan.face[on_face]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    cosine = np.abs((normals * directions[on_face]).sum(axis=1)) / np.sqrt((normals**2).sum(axis=1))
-    reflectivity = solid_reflectivity(kind for _, kind in world.solids)
-    intensity = np.full(len(directions), 0.5 * REFLECTIVITY["leaves"])
-    intensity[on_face] = reflectivity[world.solid_of_face[scan.face[on_face]]] * cosine
-    return intensity
+    cosine = np.full(len(directions), 0.5)
+    cosine[on_face] = np.abs((normals * directions[on_face]).sum(axis=1)) / np.sqrt((normals**2).sum(axis=1))
+    reflectivity = np.full(len(directions), REFLECTIVITY["leaves"])
+    reflectivity[on_face] = solid_reflectivity(kind for _, kind in world.solids)[
+        world.solid_of_face[scan.face[on_face]]
+    ]
+    return cosine, reflectivity

@@ -9,7 +9,7 @@ from egvs.core.grid import Roi
 from egvs.sensors.sensor import CATALOGUE
 from egvs.sensors.sites import Pose
 from egvs.validation.detection_metrics import paired_overlap
-from egvs.validation.detectors.cluster import Cluster, box_scores, load_kinds
+from egvs.validation.detectors.cluster import Cluster, RangeImage, box_scores, elevation_cell_deg, load_kinds
 from egvs.validation.detectors.clustering import SQUARE_M, Density, find_clusters
 from egvs.validation.sweeps import SiteView, Sweep
 
@@ -188,3 +188,24 @@ def test_score_depends_on_points_and_fit():
     full = 1.0 - np.exp(-1.0)
     scores = box_scores(np.array([100, 100, 100, 0]), np.array([0.0, 10.0, -3.0, 0.0]))
     np.testing.assert_allclose(scores, [full, full / np.e, full, 0.0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["VLP-16", "VLP-32C", "OS1-64", "OS1-128"])
+def test_cells_of_sensors_with_wide_channels_are_one_degree_high(name):
+    """The sensors of the validity study: their results do not depend on the rule for dense channels."""
+    assert elevation_cell_deg(CATALOGUE[name]) == 1.0
+
+
+def test_cells_are_four_median_spacings_of_dense_channels():
+    dense = replace(SENSOR, elevations_deg=(-25.0, -8.0, -0.3, -0.2, -0.1, 0.0), azimuth_offsets_deg=(0.0,) * 6)
+    assert elevation_cell_deg(dense) == pytest.approx(0.4)
+    one = replace(SENSOR, elevations_deg=(0.0,), azimuth_offsets_deg=(0.0,))
+    assert elevation_cell_deg(one) == 1.0
+
+
+def test_low_barrier_does_not_share_low_cells_with_points_far_behind_and_above_it():
+    """At 20 m, 0.3 m below the sensor (-0.86 degrees); at 60 m, 0.2 m below it (-0.19 degrees)."""
+    barrier, vehicle = np.array([[20.0, 0.0, -0.3]]), np.array([[60.0, 0.0, -0.2]])
+    for cell_deg, cells in ((1.0, 1), (0.4, 2)):
+        image = RangeImage.from_points(np.concatenate([barrier, vehicle]), cell_deg)
+        assert np.isfinite(image.range_m).sum() == cells

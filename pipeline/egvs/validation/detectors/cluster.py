@@ -31,6 +31,7 @@ Frame: the world's axes from the sensor, also for a tilted sensor. Ranges are ho
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
@@ -44,6 +45,7 @@ from egvs.core import files
 from egvs.core.grid import FloatArray, IntArray, Roi
 from egvs.core.special import cosdg, sindg
 from egvs.kernels import detection
+from egvs.sensors.sensor import Sensor
 from egvs.validation.detectors import background
 from egvs.validation.detectors.background import GroundMap, empty_scan_points
 from egvs.validation.detectors.base import AtOneSite, suppress_overlaps
@@ -61,6 +63,10 @@ ON_SIDE_M = 0.05
 CELL_DEG = 0.5, 1.0
 """Azimuth and elevation of a cell of the range image: a few beams of most sensors."""
 
+CHANNELS_PER_CELL = 4.0
+"""Cells are lower than that for a sensor with dense channels: this number of median spacings. Otherwise a low barrier
+shares its cells with vehicles far behind and above it, and seems to hide the rest of them."""
+
 NEARER_M = 0.5
 """An occluder is nearer by more than this."""
 
@@ -76,7 +82,8 @@ AROUND_M = 8.0
 SCORE_POINTS, SCORE_COST = 100.0, 10.0
 """Points with which a score reaches 63 % of 1; cost of a box that reduces it by 63 %."""
 
-_SHAPE = round(360.0 / CELL_DEG[0]), round(180.0 / CELL_DEG[1])
+_COLUMNS = round(360.0 / CELL_DEG[0])
+_MIN_CELL_DEG = 0.1
 _NO_OWNER = -1
 _ON_END_M = 0.2  # points nearer than this to an end of a rectangle are on it
 _SIDE_M = 0.5  # points on an end that extend this far show a side, even if the outermost one is at the hidden edge
@@ -162,13 +169,25 @@ class _ImageCells(NamedTuple):
     range_m: FloatArray
 
 
-def _image_cells(points_m: FloatArray) -> _ImageCells:
+def _image_cells(points_m: FloatArray, cell_deg: float) -> _ImageCells:
     range_m = np.hypot(points_m[:, 0], points_m[:, 1])
     azimuth_deg = np.rad2deg(np.arctan2(points_m[:, 1], points_m[:, 0]))
     elevation_deg = np.rad2deg(np.arctan2(points_m[:, 2], range_m))
-    column = np.floor(azimuth_deg / CELL_DEG[0]).astype(np.int64) % _SHAPE[0]
-    row = np.floor((elevation_deg + 90.0) / CELL_DEG[1]).astype(np.int64)
-    return _ImageCells(column, np.minimum(row, _SHAPE[1] - 1), range_m)
+    column = np.floor(azimuth_deg / CELL_DEG[0]).astype(np.int64) % _COLUMNS
+    row = np.floor((elevation_deg + 90.0) / cell_deg).astype(np.int64)
+    return _ImageCells(column, np.minimum(row, _image_rows(cell_deg) - 1), range_m)
+
+
+def _image_rows(cell_deg: float) -> int:
+    return math.ceil(180.0 / cell_deg)
+
+
+def elevation_cell_deg(sensor: Sensor) -> float:
+    """Return the height of a cell of the range image of a sensor."""
+    spacing_deg = np.diff(np.sort(sensor.elevations_deg))
+    if sensor.table is not None or not len(spacing_deg):
+        return CELL_DEG[1]
+    return float(min(CELL_DEG[1], max(CHANNELS_PER_CELL * np.median(spacing_deg), _MIN_CELL_DEG)))
 
 
 @dataclass(frozen=True)
@@ -181,15 +200,19 @@ class RangeImage:
         Horizontal range, (azimuths, elevations) float64, infinite for an empty cell.
     owner
         Cluster of this point, -1 for none, (azimuths, elevations) int64.
+    cell_deg
+        Height of a cell.
     """
 
     range_m: FloatArray
     owner: IntArray
+    cell_deg: float = CELL_DEG[1]
 
     @classmethod
-    def from_points(cls, points_m: FloatArray) -> RangeImage:
+    def from_points(cls, points_m: FloatArray, cell_deg: float = CELL_DEG[1]) -> RangeImage:
         """Return the image of points (n, 3) that belong to no cluster."""
-        empty = cls(np.full(_SHAPE, np.inf), np.full(_SHAPE, _NO_OWNER))
+        shape = _COLUMNS, _image_rows(cell_deg)
+        empty = cls(np.full(shape, np.inf), np.full(shape, _NO_OWNER), cell_deg)
         return empty.with_points(points_m, np.full(len(points_m), _NO_OWNER))
 
     def with_points(self, points_m: FloatArray, owner: IntArray) -> RangeImage:
@@ -197,7 +220,7 @@ class RangeImage:
 
         Of points with the same range, that of a cluster is stored.
         """
-        cells = _image_cells(points_m)
+        cells = _image_cells(points_m, self.cell_deg)
         order = np.lexsort((owner, -cells.range_m))  # the nearest is written last
         column, row, range_m = cells.column[order], cells.row[order], cells.range_m[order]
         is_nearer = range_m <= self.range_m[column, row]
@@ -206,7 +229,7 @@ class RangeImage:
         owners = self.owner.copy()
         ranges[nearer_cells] = range_m[is_nearer]
         owners[nearer_cells] = owner[order][is_nearer]
-        return RangeImage(ranges, owners)
+        return RangeImage(ranges, owners, self.cell_deg)
 
 
 @dataclass(frozen=True)
@@ -241,7 +264,7 @@ def angular_spans(points_m: FloatArray, clusters: Clusters, image: RangeImage) -
     image
         A range image with these points in it.
     """
-    cells = _image_cells(points_m)
+    cells = _image_cells(points_m, image.cell_deg)
     azimuth = np.arctan2(points_m[:, 1], points_m[:, 0])
     middle = np.empty(len(clusters))
     right = np.empty(len(clusters))
@@ -275,9 +298,9 @@ class _ClusterCells:
         """Return how far an occluder extends beyond the outermost point, to the left (1) or to the right (-1)."""
         column, row, range_m = self.cells
         end = column[outermost]
-        at_end = np.abs((column - end + _SHAPE[0] // 2) % _SHAPE[0] - _SHAPE[0] // 2) <= 1
+        at_end = np.abs((column - end + _COLUMNS // 2) % _COLUMNS - _COLUMNS // 2) <= 1
         rows = slice(row[at_end].min(), row[at_end].max() + 1)
-        beside = (end + direction * np.arange(1, round(MAX_HIDDEN_DEG / CELL_DEG[0]) + 1)) % _SHAPE[0]
+        beside = (end + direction * np.arange(1, round(MAX_HIDDEN_DEG / CELL_DEG[0]) + 1)) % _COLUMNS
         is_nearer = image.range_m[beside, rows] < range_m[at_end].min() - NEARER_M
         hides = (is_nearer & (image.owner[beside, rows] != self.number)).any(axis=1)
         if not hides[:2].any():
@@ -522,7 +545,8 @@ class Cluster:
         for view in views:
             points = empty_scan_points(view)
             above_ground = points[points[:, 2] - ground.height_m(points[:, :2]) > HEIGHTS_M[0]]
-            images.append(RangeImage.from_points(above_ground - np.asarray(view.pose.position_m)))
+            relative_m = above_ground - np.asarray(view.pose.position_m)
+            images.append(RangeImage.from_points(relative_m, elevation_cell_deg(view.sensor)))
         return ClusterAtSites(self, tuple(views), roi, ground, tuple(images))
 
 

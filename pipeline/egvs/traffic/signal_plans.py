@@ -1,0 +1,368 @@
+"""Plans of traffic signals from a scenario: check them, and write them into a network.
+
+Steps of :func:`apply_plans`: find the signal and the links of each movement; check the plan; write its phases, each
+followed by yellow and all-red for the links that lose their green.
+
+In a phase, a link has green with right of way ("G"), or gives way to another green ("g"), as the network's right of way
+says. Two links that conflict may be green together only if one of them turns and gives way to oncoming traffic, or to
+people on a crossing.
+
+World frame, metres, seconds.
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+import re
+from collections.abc import Iterator, Sequence, Set
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from egvs.core import files
+from egvs.core.errors import InputError
+from egvs.formats import xml
+from egvs.scenario.model import Scenario
+from egvs.scenario.signal_config import SignalConfig, SignalPhaseConfig
+from egvs.traffic import network
+from egvs.traffic.approaches import TURN_WORDS, normalise_street, parse_side
+from egvs.traffic.directions import Floats
+from egvs.traffic.signals import CROSSING, GREEN_LETTERS, Link, Phase, Program, Signal, read_signals, replace_programs
+
+_MAY_PASS = GREEN_LETTERS | frozenset("sOo")
+"""States in which a vehicle may drive on, at once or after giving way."""
+
+_ALL = "all"
+
+_OPPOSITE_COSINE = -0.5
+"""Approaches whose directions differ by more than 120 degrees are opposite."""
+
+_GZIP = b"\x1f\x8b"
+_MAX_NAMED = 20
+_MAX_CSV_BYTES = 1_000_000
+
+CSV_COLUMNS = ("phase", "approach", "movement", "green_s")
+CSV_OPTIONAL = ("yellow_s", "all_red_s", "min_green_s", "max_green_s")
+
+
+def check_plans(scenario: Scenario, path: Path, roads: network.Network) -> None:
+    """Raise an InputError if a plan of the scenario is wrong for a network; parameters as in :func:`apply_plans`."""
+    _programs(scenario, path, roads)
+
+
+def apply_plans(scenario: Scenario, path: Path, name: Path) -> None:
+    """Replace the programs in a network by the plans of the scenario.
+
+    Parameters
+    ----------
+    scenario
+        The plans, ``[traffic.signals]``.
+    path
+        A copy of its network, which is changed.
+    name
+        The network, for messages.
+
+    Raises
+    ------
+    InputError
+        When a signal, an approach or a movement is unknown, movements of a phase conflict, one never has green, or the
+        phases do not fill the cycle.
+    """
+    if not scenario.traffic.signals:
+        return
+    programs = _programs(scenario, path, network.read_net_xml(path, name))
+    with files.attach_filename(path):
+        content = path.read_bytes()
+        if content.startswith(_GZIP):
+            content = gzip.decompress(content)
+        try:
+            text = replace_programs(content.decode("utf-8"), programs)
+        except ValueError as error:
+            raise InputError(
+                name, f"signal programs cannot be replaced: {error}", "Convert it with netconvert."
+            ) from None
+        path.write_text(text, encoding="utf-8")
+
+
+def signal_files(scenario: Scenario) -> list[Path]:
+    """Return the files of the plans of a scenario; InputError where one is missing."""
+    paths = []
+    for name, config in scenario.traffic.signals.items():
+        if config.file is not None:
+            paths.append(scenario.find(config.file, f"traffic.signals.{name}.file"))
+    return paths
+
+
+def _programs(scenario: Scenario, path: Path, roads: network.Network) -> dict[str, Program]:
+    signals = read_signals(path, roads)
+    programs: dict[str, Program] = {}
+    for name, config in scenario.traffic.signals.items():
+        where = f"{scenario.file}: traffic.signals.{name}"
+        signal = find_signal(name, signals, where)
+        if signal.id in programs:
+            raise InputError(where, f"signal {signal.id!r} has two plans", "Remove one of them.")
+        programs[signal.id] = _make_program(config, signal, scenario, where)
+    return programs
+
+
+def find_signal(name: str, signals: Sequence[Signal], where: str) -> Signal:
+    """Return the signal of a name: its id, the id of a junction, or street names with "/" or "&" between them."""
+    for signal in signals:
+        if name == signal.id or name in signal.nodes:
+            return signal
+    streets = {normalise_street(street) for street in re.split("[/&]", name)}
+    found = [signal for signal in signals if streets <= {normalise_street(street) for street in signal.streets}]
+    if len(found) == 1:
+        return found[0]
+    known = ", ".join(_describe_signal(signal) for signal in (found or signals)[:_MAX_NAMED]) or "none"
+    if found:
+        raise InputError(where, f"{len(found)} signals are at these streets: {known}", "Use an id.")
+    raise InputError(where, "the network has no such signal", f"Its signals are: {known}.")
+
+
+def _describe_signal(signal: Signal) -> str:
+    return f"{signal.id} ({' / '.join(signal.streets)})" if signal.streets else signal.id
+
+
+def _make_program(config: SignalConfig, signal: Signal, scenario: Scenario, where: str) -> Program:
+    if config.file is not None:
+        path = scenario.find(config.file, f"{where.partition(': ')[2]}.file")
+        if config.is_sumo_file:
+            return _read_program(path, config, signal)
+        config = config.model_copy(update={"phases": _read_csv(path, config), "file": None})
+        where = str(path)
+    greens = [_green_links(phase, signal, f"{where}: phase {n}") for n, phase in enumerate(config.phases, start=1)]
+    for number, green in enumerate(greens, start=1):
+        _check_conflicts(green, signal, f"{where}: phase {number}")
+    _check_never_green(set().union(*greens), signal, where)
+    phases = tuple(_phases(config, greens, signal))
+    program = Program("static" if config.type == "fixed" else "actuated", config.offset_s, phases)
+    if config.cycle_s is not None and abs(program.cycle_s - config.cycle_s) > 1e-6:
+        parts = ", ".join(f"{phase.duration_s:g}" for phase in phases)
+        problem = f"the phases with yellow and all-red add up to {program.cycle_s:g} s ({parts})"
+        raise InputError(f"{where}: cycle_s = {config.cycle_s:g}", problem, f"Use cycle_s = {program.cycle_s:g}.")
+    return program
+
+
+def _green_links(phase: SignalPhaseConfig, signal: Signal, where: str) -> set[int]:
+    """Return the positions of the links with green in a phase.
+
+    A crossing that no phase names has green where no green conflicts with it, except turns that give way to people.
+    """
+    green: set[int] = set()
+    for approach, movements in phase.green.items():
+        on_approach = _links_of_approach(approach, signal, where)
+        for movement in movements:
+            wanted = " ".join(movement.split()).casefold()
+            wanted = TURN_WORDS.get(wanted, wanted)
+            found = [link for link in on_approach if wanted in (_ALL, link.movement)]
+            if wanted == _ALL:
+                found = [link for link in found if link.movement != CROSSING]
+            if not found:
+                known = ", ".join(dict.fromkeys(link.movement for link in on_approach))
+                problem = f"approach {approach!r} has no movement {movement!r}"
+                raise InputError(where, problem, f"Its movements are: {known}.")
+            green |= {link.index for link in found}
+    vehicles = [link for link in signal.links if link.index in green and link.movement != CROSSING]
+    for link in signal.links:
+        if link.movement == CROSSING and all(_gives_way_to_people(each, link) for each in vehicles):
+            green.add(link.index)
+    return green
+
+
+def _gives_way_to_people(link: Link, crossing: Link) -> bool:
+    if crossing.index not in link.foes and link.index not in crossing.foes:
+        return True
+    return link.movement != "straight" and crossing.index in link.yields_to
+
+
+def _links_of_approach(approach: str, signal: Signal, where: str) -> list[Link]:
+    side = parse_side(approach)
+    street = normalise_street(approach)
+    matches: list[str] = []
+    for link in signal.links:
+        link_side, _, _ = link.approach.partition(" ")
+        names = {normalise_street(link.approach), normalise_street(link.street), normalise_street(link.edge)} - {""}
+        is_meant = street in names or (side is not None and side == parse_side(link_side))
+        if is_meant and link.approach not in matches:
+            matches.append(link.approach)
+    known = "; ".join(f"{name} ({', '.join(movements)})" for name, movements in signal.approaches.items())
+    if not matches:
+        raise InputError(where, f"signal {signal.id} has no approach {approach!r}", f"Its approaches are: {known}.")
+    if len(matches) > 1:
+        problem = f"approach {approach!r} may be {' or '.join(map(repr, matches))}"
+        raise InputError(where, problem, "Use the full name.")
+    return [link for link in signal.links if link.approach == matches[0]]
+
+
+def _check_conflicts(green: set[int], signal: Signal, where: str) -> None:
+    links = {link.index: link for link in signal.links}
+    for index in sorted(green):
+        for foe in sorted(links[index].foes & green):
+            a, b = links[index], links[foe]
+            if index < foe and not _may_be_green_together(a, b):
+                problem = f"{a.title} and {b.title} conflict, but both have green"
+                raise InputError(where, problem, "Give them green in different phases.")
+
+
+def _may_be_green_together(a: Link, b: Link) -> bool:
+    """Whether one of two links that conflict turns and gives way to people, or to oncoming traffic."""
+    for turning, other in ((a, b), (b, a)):
+        if turning.movement == CROSSING:
+            continue
+        if other.movement == CROSSING:
+            if _gives_way_to_people(turning, other):
+                return True
+            continue
+        assert turning.heading is not None and other.heading is not None
+        gives_way = turning.movement != "straight" and other.index in turning.yields_to
+        if gives_way and (turning.edge == other.edge or _cosine(turning.heading, other.heading) < _OPPOSITE_COSINE):
+            return True
+    return False
+
+
+def _cosine(a: Floats, b: Floats) -> float:
+    return float(a @ b / np.sqrt((a @ a) * (b @ b)))
+
+
+def _check_never_green(green: set[int], signal: Signal, where: str) -> None:
+    red = dict.fromkeys(link.title for link in signal.links if link.index not in green and link.movement != CROSSING)
+    if red:
+        raise InputError(where, f"never green: {', '.join(red)}", "Add these movements to a phase.")
+
+
+def _phases(config: SignalConfig, greens: Sequence[set[int]], signal: Signal) -> Iterator[Phase]:
+    """Yield each phase, and the yellow and all-red after it for the links that lose their green."""
+    is_actuated = config.type == "actuated"
+    for number, (phase, green) in enumerate(zip(config.phases, greens, strict=True)):
+        limits = (phase.shortest_green_s, phase.longest_green_s) if is_actuated else ()
+        yield Phase(phase.green_s, state_of(green, signal), *limits)
+        remaining = green & greens[(number + 1) % len(greens)]
+        ending = {link.index for link in signal.links if link.index in green - remaining and link.movement != CROSSING}
+        yellow_s = config.yellow_s if phase.yellow_s is None else phase.yellow_s
+        all_red_s = config.all_red_s if phase.all_red_s is None else phase.all_red_s
+        if yellow_s:
+            yield Phase(yellow_s, state_of(remaining, signal, ending))
+        if all_red_s:
+            yield Phase(all_red_s, state_of(remaining, signal))
+
+
+def state_of(green: Set[int], signal: Signal, yellow: Set[int] = frozenset()) -> str:
+    """Return the state with green and yellow links; a green that gives way to another one is "g".
+
+    Parameters
+    ----------
+    green, yellow
+        Positions of links.
+    signal
+        Their signal.
+    """
+    letters = ["r"] * signal.states
+    for link in signal.links:
+        if link.index in green:
+            letters[link.index] = "g" if link.yields_to & green else "G"
+        elif link.index in yellow:
+            letters[link.index] = "y"
+    return "".join(letters)
+
+
+def _read_program(path: Path, config: SignalConfig, signal: Signal) -> Program:
+    """Read the program of a signal from a SUMO file: that of its id, or the only one."""
+    programs = {}
+    try:
+        for element in xml.iter_elements(path, ""):
+            if element.tag == "tlLogic":
+                programs[element.attrib["id"]] = Program.from_element(element)
+    except (KeyError, ValueError) as error:
+        raise InputError(path, f"invalid <tlLogic> ({error!r})", "See SUMO's documentation of tlLogic.") from None
+    program = programs.get(signal.id)
+    if program is None and len(programs) == 1:
+        program = next(iter(programs.values()))
+    if program is None or not program.phases:
+        known = ", ".join(programs) or "none"
+        raise InputError(path, f"no <tlLogic> with phases for signal {signal.id!r}", f"It has: {known}.")
+    by_index = {link.index: link for link in signal.links}
+    never_green = set(by_index)
+    for number, phase in enumerate(program.phases, start=1):
+        where = f"{path}: phase {number}"
+        if len(phase.state) != signal.states:
+            problem = f"expected a state of {signal.states} letters, got {len(phase.state)}"
+            raise InputError(where, problem, f"The signal {signal.id} has {signal.states} links.")
+        never_green -= {index for index, letter in enumerate(phase.state) if letter in _MAY_PASS}
+        with_right_of_way = {
+            link.index for link in signal.links if phase.state[link.index] == "G" and link.movement != CROSSING
+        }
+        for index in sorted(with_right_of_way):
+            for foe in sorted(by_index[index].foes & with_right_of_way):
+                problem = (
+                    f"{by_index[index].title} and {by_index[foe].title} conflict, but both have green with right of"
+                    " way (G)"
+                )
+                raise InputError(where, problem, "Use g for the one that gives way, or another phase.")
+    _check_never_green(set(by_index) - never_green, signal, str(path))
+    return replace(program, offset_s=program.offset_s + config.offset_s)
+
+
+def _read_csv(path: Path, config: SignalConfig) -> tuple[SignalPhaseConfig, ...]:
+    """Read the phases of a plan, in the order in which they first occur."""
+    hint = f"Columns: {', '.join(CSV_COLUMNS)}; optional: {', '.join(CSV_OPTIONAL)}."
+    with files.open_input(path) as content:
+        raw = content.read(_MAX_CSV_BYTES + 1)
+    try:
+        rows = list(csv.DictReader(io.StringIO(raw.decode("utf-8-sig")), skipinitialspace=True, strict=True))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(path, f"cannot be read as CSV ({error})", hint) from None
+    if len(raw) > _MAX_CSV_BYTES:
+        raise InputError(path, f"expected a signal plan, got more than {_MAX_CSV_BYTES:,} bytes", hint)
+    if not rows:
+        raise InputError(path, "expected a phase in each row, got none", hint)
+    if missing := [name for name in CSV_COLUMNS if name not in rows[0]]:
+        raise InputError(path, f"the column {missing[0]!r} is missing", hint)
+    if unknown := [name for name in rows[0] if name not in (*CSV_COLUMNS, *CSV_OPTIONAL) and name is not None]:
+        raise InputError(path, f"unknown column {unknown[0]!r}", hint)
+    phases: dict[str, dict[str, Any]] = {}
+    for line, row in enumerate(rows, start=2):
+        where = f"{path}: line {line}"
+        if None in row or None in row.values():
+            raise InputError(where, "the row has more or fewer values than the header has columns", hint)
+        values = phases.setdefault(row["phase"].strip(), {"green": {}})
+        movements = values["green"].setdefault(row["approach"].strip(), [])
+        movements += row["movement"].split()
+        for key in ("green_s", *CSV_OPTIONAL):
+            text = (row.get(key) or "").strip()
+            if not text:
+                continue
+            number = _parse_seconds(text, f"{where}: {key}")
+            if values.setdefault(key, number) != number:
+                problem = f"expected {values[key]:g} as before in phase {row['phase']!r}, got {number:g}"
+                raise InputError(f"{where}: {key}", problem, "Use one value for each phase.")
+    configs = []
+    for name, values in phases.items():
+        try:
+            configs.append(SignalPhaseConfig.from_dict(values))
+        except ValidationError as error:
+            first = error.errors()[0]
+            key = ".".join(map(str, first["loc"]))
+            raise InputError(
+                f"{path}: phase {name!r}: {key}", first["msg"].removeprefix("Value error, "), hint
+            ) from None
+        unused = sorted({"min_green_s", "max_green_s"} & values.keys())
+        if unused and config.type == "fixed":
+            problem = f"{', '.join(unused)} has no effect with a fixed plan"
+            raise InputError(f"{path}: phase {name!r}", problem, 'Set type = "actuated".')
+    return tuple(configs)
+
+
+def _parse_seconds(text: str, where: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = float("nan")
+    if not 0 <= number < 1e5:
+        raise InputError(where, f"expected seconds, got {text!r}", "Use a number such as 30.")
+    return number
