@@ -100,7 +100,9 @@ def detect_all(folder: Path) -> tuple[SensorFit, list[SweepResult]]:
         members = [vehicle for vehicle in vehicles if vehicle.frame == number]
         near = np.array([[_is_near(box, vehicle.box) for box in detections.boxes] for vehicle in members])
         near = near.reshape(len(members), len(detections.boxes)).astype(np.bool_)
-        results.append(SweepResult(number, detections, members, near.any(axis=1), near.any(axis=0)))
+        found = np.asarray(np.any(near, axis=1), dtype=np.bool_)
+        correct = np.asarray(np.any(near, axis=0), dtype=np.bool_)
+        results.append(SweepResult(number, detections, members, found, correct))
     return fit, results
 
 

@@ -316,8 +316,8 @@ def compare_vehicles(
 def _inside(points_m: FloatArray, box: FloatArray) -> NDArray[np.bool_]:
     half = box[3:6] / 2 + MARGIN_M
     with np.errstate(invalid="ignore"):
-        inside: NDArray[np.bool_] = (np.abs(points_m - box[:3]) < half).all(axis=-1)
-    return inside
+        is_near = np.abs(points_m - box[:3]) < half
+    return np.asarray(np.all(is_near, axis=-1), dtype=np.bool_)
 
 
 def _with_neighbours(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
