@@ -64,6 +64,7 @@ SYSTEM = (
     "tests/effects/test_pedestrians_bicycles",
     "tests/effects/test_slope",
     "tests/importers/",
+    "tests/installation/",
     "tests/runs/",
     "tests/studies/",
     "tests/traffic/",
