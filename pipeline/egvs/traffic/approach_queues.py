@@ -31,7 +31,7 @@ MAX_GAP_M = 20.0
 SPEED_OVER_M = 100.0
 PERCENTILE = 95.0
 
-_LENGTH_M = 400.0
+MAX_QUEUE_M = 400.0
 """How far from the stop line queues are followed."""
 _SIGNAL_TYPES = frozenset({"traffic_light", "traffic_light_unregulated", "traffic_light_right_on_red"})
 _MIN_COSINE = 0.7
@@ -145,7 +145,7 @@ def _make_path(title: str, edges: list[Edge], before: Mapping[str, Edge], signal
     length_m = sum(_length_m(part) for part in parts)
     known = {edge.id for edge in edges}
     first = edges[0]
-    while length_m < _LENGTH_M and first.from_node not in signals and first.id in before:
+    while length_m < MAX_QUEUE_M and first.from_node not in signals and first.id in before:
         first = before[first.id]
         if first.id in known:
             break
@@ -193,7 +193,7 @@ def measure_approach(path: ApproachPath, boxes: VehicleFrames, first: int, end: 
     line = shapely.LineString(path.line_m)
     points = shapely.points(boxes.at_m)
     distance_m = shapely.line_locate_point(line, points)
-    near = shapely.dwithin(line, points, path.half_width_m) & (distance_m > 0) & (distance_m < _LENGTH_M)
+    near = shapely.dwithin(line, points, path.half_width_m) & (distance_m > 0) & (distance_m < MAX_QUEUE_M)
     ahead_m = path_points(path.line_m, np.maximum(distance_m - 1.0, 0.0))
     there_m = path_points(path.line_m, distance_m)
     heading = ahead_m - there_m
