@@ -39,7 +39,7 @@ from egvs.sensors.sites import Pose, Site
 MIN_STRUCTURE_SHARE = 0.3
 """A scan is of another place if it agrees with less of the walls, poles and other solids of the static world."""
 
-MAX_SHIFT_M = 3.0
+MAX_DISPLACEMENT_M = 3.0
 """A registration that ends farther from the planned position has not found the pose."""
 
 _GOOD_STRUCTURE_SHARE = 0.6
@@ -404,8 +404,8 @@ def _register(
 
     problem = f"the scan does not fit the static world around {planned.name} at any yaw"
     hint = (
-        f"Check that it was measured at this site, in the sensor's frame in metres, less than {MAX_SHIFT_M:g} m and"
-        " about 5 degrees of tilt from the planned pose."
+        f"Check that it was measured at this site, in the sensor's frame in metres, less than {MAX_DISPLACEMENT_M:g} m"
+        " and about 5 degrees of tilt from the planned pose."
     )
     try:
         search = registration.search_yaw(points_m, surfaces, start, where=where)
@@ -425,7 +425,7 @@ def _register(
 
 def _is_plausible(fit: Registration, planned: Pose) -> bool:
     """Return whether a registration ended, and where it can have started."""
-    return fit.converged and _distance_m(planned, fit.pose) <= MAX_SHIFT_M
+    return fit.converged and _distance_m(planned, fit.pose) <= MAX_DISPLACEMENT_M
 
 
 def _mirror_share(

@@ -90,7 +90,3 @@ class PlannedSites:
     def default_sites(self) -> tuple[str, ...]:
         """The sites of the plan, or the best site without a plan."""
         return tuple(self.plan) or (self.session.ranked[0].site.name,)
-
-    def output_folder(self, name: str, out: Path | None) -> Path:
-        """Return where files are written: ``out``, or a folder of the run."""
-        return out or self.run.work.folder.path / name

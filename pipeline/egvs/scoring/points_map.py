@@ -28,7 +28,7 @@ from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.scoring.blindspots import CELL_M, blindspot_map_shape
 from egvs.scoring.targets import SEEN_WELL_POINTS, TargetRecord, visible_targets
 from egvs.scoring.visibility import Beams
-from egvs.traffic.network import LANE_WIDTH_M, Lane, Network
+from egvs.traffic.network import Lane, Network
 from egvs.world.carriageway import is_carriageway
 
 OVERLAP_POINTS = SEEN_WELL_POINTS
@@ -213,14 +213,7 @@ def _surfaces(target: StandardTarget, network: Network) -> Iterator[tuple[Any, _
                 is_surface = is_surface or edge.function == "crossing" or lane.is_sidewalk
             if not is_surface or len(line_m) < 2 or not (line_m[:, :2] != line_m[0, :2]).any():
                 continue
-            yield _strip(lane), _along(lane)
-
-
-def _strip(lane: Lane) -> Any:
-    import shapely
-
-    width_m = LANE_WIDTH_M if lane.width_m is None else lane.width_m
-    return shapely.buffer(shapely.LineString(lane.shape_m[:, :2]), width_m / 2.0, cap_style="flat")
+            yield lane.area(), _along(lane)
 
 
 def _at_height(height_m: float) -> _PoseAt:

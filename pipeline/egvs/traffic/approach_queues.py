@@ -3,7 +3,7 @@ r"""Queues and speeds on the approaches of a junction: simulated against observe
 Steps of :func:`measure_approach`: take the vehicles on the path that leads to the stop line; sort those of each frame
 that stand by their distance from it; follow the queue from the stop line backwards.
 
-**Queue.** In one frame, standing vehicles (below :data:`STANDING_M_S`) belong to the queue if the gap to the vehicle
+**Queue.** In one frame, standing vehicles (below :data:`QUEUE_SPEED_M_S`) belong to the queue if the gap to the vehicle
 ahead, or of the first one to the stop line, is at most :data:`MAX_GAP_M`. Its length is the distance from the stop
 line to the rear of the last one, over all lanes of the approach; 0 without a queue. The number that is compared is the
 95th percentile over the frames, which is what a queue observed at a junction usually means (Highway Capacity Manual:
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from egvs.traffic.approaches import ApproachMovement
 from egvs.traffic.network import LANE_WIDTH_M, Edge, Network
 
-STANDING_M_S = 5.0 / 3.6
+QUEUE_SPEED_M_S = 5.0 / 3.6
 MAX_GAP_M = 20.0
 SPEED_OVER_M = 100.0
 PERCENTILE = 95.0
@@ -206,7 +206,7 @@ def measure_approach(path: ApproachPath, boxes: VehicleFrames, first: int, end: 
     frame, distance_m, half_m = boxes.frame[near], distance_m[near], boxes.length_m[near] / 2
     close = (distance_m < SPEED_OVER_M) & ~np.isnan(speeds)
     mean_m_s = float(speeds[close].mean()) if close.any() else float("nan")
-    standing = speeds < STANDING_M_S
+    standing = speeds < QUEUE_SPEED_M_S
     queues_m = queue_lengths_m(frame[standing] - first, distance_m[standing], half_m[standing], end - first)
     return ApproachTraffic(
         float(np.percentile(queues_m, PERCENTILE)),

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 from egvs.core.errors import InputError
 from egvs.scenario.traffic_config import CountConfig
-from egvs.traffic.directions import SIDES, Floats, arrival_side
+from egvs.traffic.directions import CLOCKWISE, SIDES, Floats, arrival_side
 from egvs.traffic.movements import MovementNames
 from egvs.traffic.network import Edge
 
@@ -199,12 +199,8 @@ class ApproachIndex:
     @property
     def titles(self) -> list[str]:
         """The approaches, in the order of the compass."""
-        sides = sorted(self.movements, key=lambda move: (_COMPASS_ORDER[move.side], move.street))
+        sides = sorted(self.movements, key=lambda move: (CLOCKWISE.index(SIDES.index(move.side)), move.street))
         return list(dict.fromkeys(move.approach_title for move in sides))
-
-
-_COMPASS_ORDER = {side: (2 - index) % 8 for index, side in enumerate(SIDES)}
-"""Clockwise from north."""
 
 
 def _side_distance(first: str, second: str) -> int:

@@ -32,10 +32,7 @@ from egvs.scenario.signal_config import SignalConfig, SignalPhaseConfig
 from egvs.traffic import network
 from egvs.traffic.approaches import TURN_WORDS, normalise_street, parse_side
 from egvs.traffic.directions import Floats
-from egvs.traffic.signals import CROSSING, GREEN_LETTERS, Link, Phase, Program, Signal, read_signals, replace_programs
-
-_MAY_PASS = GREEN_LETTERS | frozenset("sOo")
-"""States in which a vehicle may drive on, at once or after giving way."""
+from egvs.traffic.signals import CROSSING, Link, Phase, Program, Signal, read_signals, replace_programs
 
 _ALL = "all"
 
@@ -293,7 +290,7 @@ def _read_program(path: Path, config: SignalConfig, signal: Signal) -> Program:
         if len(phase.state) != signal.states:
             problem = f"expected a state of {signal.states} letters, got {len(phase.state)}"
             raise InputError(where, problem, f"The signal {signal.id} has {signal.states} links.")
-        never_green -= {index for index, letter in enumerate(phase.state) if letter in _MAY_PASS}
+        never_green -= {index for index, letter in enumerate(phase.state) if letter in network.MAY_PASS_LETTERS}
         with_right_of_way = {
             link.index for link in signal.links if phase.state[link.index] == "G" and link.movement != CROSSING
         }
