@@ -156,8 +156,8 @@ BAD: dict[str, tuple[list[str], str]] = {
     "two columns": (["street,street,count", "a,b,1"], r"two columns are called 'street'"),
     "no number": (["street,approach", "a,N"], r"expected a column count, or columns named by their start, got none"),
     "both": (["approach,count,07:00", "N,1,1"], r"got both"),
-    "no location": (["count", "1"], r"no column says where was counted"),
-    "empty location": ([HEAD, ",,left,,5"], r"row 2: does not say where was counted"),
+    "no location": (["count", "1"], r"no column gives the location of the counts"),
+    "empty location": ([HEAD, ",,left,,5"], r"row 2: has no location"),
     "unknown street": ([HEAD, "High St,,,,5"], rf"row 2: no approach of the junction is called 'High St'. {NAMES}"),
     "ambiguous street": (
         [HEAD, "North Street,,left,,5"],

@@ -208,7 +208,7 @@ def test_worst_zones_of_each_group() -> None:
     ]
     worst = readers.worst_zones(rows)
     assert [(row.zone, row.user_class) for row in worst] == [("a", "pedestrian"), ("b", "bus")]
-    assert worst[0].in_words() == "a, pedestrians: 71 ± 3% found (of 30)"
+    assert worst[0].in_words() == "a, 71 ± 3% of 30 pedestrians"
 
 
 BOW_TIE = {"type": "Polygon", "coordinates": [[[0, 0], [9, 9], [9, 0], [0, 9], [0, 0]]]}

@@ -62,7 +62,7 @@ BAD = {
     "nothing observed": ([HEAD, "N,,"], r"row 2: has neither queue_m nor speed_kmh"),
     "no number": ([HEAD, "N,long,"], r"row 2: queue_m: expected a number of 0 to 10,000, got 'long'"),
     "negative": ([HEAD, "N,,-1"], r"row 2: speed_kmh: expected a number of 0 to 300, got '-1'"),
-    "twice": ([HEAD, "N,1,", "southbound,2,"], r"row 3: the approach N \(North Street\) is there twice"),
+    "twice": ([HEAD, "N,1,", "southbound,2,"], r"row 3: two rows for the approach N \(North Street\)"),
     "period": (["approach,period,queue_m", "N,morning,3"], r"row 2: period: .* The scenario has no periods"),
     "few values": ([HEAD, "N,3"], r"row 2: expected 3 values"),
 }

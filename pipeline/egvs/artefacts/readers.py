@@ -227,7 +227,7 @@ class ZoneVisibility:
 
     def in_words(self) -> str:
         """Return zone, class, share and number of road users in one phrase."""
-        return f"{self.zone}, {self.class_plural}: {self.share_text} found (of {self.road_users:,})"
+        return f"{self.zone}, {self.share_text} of {self.road_users:,} {self.class_plural}"
 
 
 def read_zones(path: Path, site: str) -> list[ZoneVisibility]:

@@ -58,7 +58,9 @@ def accept(
     ] = None,
     site: Annotated[str, typer.Option(metavar="SITE", help="Required: the site where the sensor is installed.")] = "",
     position: Annotated[float, typer.Option(metavar="M", min=0, help="Largest error of the position.")] = 0.3,
-    tilt: Annotated[float, typer.Option(metavar="DEG", min=0, help="Largest error of pitch and roll together.")] = 1.0,
+    tilt: Annotated[
+        float, typer.Option(metavar="DEG", min=0, help="Largest angle between the planned and the measured z axis.")
+    ] = 1.0,
     yaw: Annotated[float, typer.Option(metavar="DEG", min=0, help="Largest error of the yaw.")] = 2.0,
     blocked: Annotated[
         float, typer.Option(metavar="DEG", min=0, help="Largest width of all blocked sectors together.")
@@ -103,10 +105,10 @@ def accept(
             raise InputError("--site", "no site is given", "Use the name of a site, such as --site c03.")
         limits = Limits(position, tilt, yaw, blocked, missing_channels, returns, off_beams, loss)
         folder = out or run / "acceptance"
+        files.check_writable(acceptance_page.AcceptanceFiles.of(folder, site).json)
         result = acceptance.accept(
             run, site, scan, limits, max_vehicle_height_m=vehicle_height, progress=screen.progress
         )  # fmt: skip
-        files.check_writable(acceptance_page.AcceptanceFiles.of(folder, site).json)
         written = acceptance_page.write_files(folder, result)
     _print_acceptance(result)
     print(written.json)
@@ -120,6 +122,7 @@ def _print_acceptance(result: Acceptance) -> None:
     from egvs.cli.console import Column, print_sentences, print_table
     from egvs.installation.acceptance import describe_error, describe_sector
     from egvs.report.formatting import SCORE_LABELS
+    from egvs.sensors.registration import parameter_name_and_unit
 
     verdict = "passed" if result.passed else f"failed: {'; '.join(result.reasons)}"
     print_sentences([f"{result.site.name} ({result.sensor.name}): {verdict}."])
@@ -133,7 +136,11 @@ def _print_acceptance(result: Acceptance) -> None:
     print_table(columns, result.checks)
     print()
     errors = result.pose.standard_errors
-    pose = ", ".join(f"{name} {describe_error(value, errors[name])}" for name, value in result.pose.values.items())
+    parts = []
+    for parameter, value in result.pose.values.items():
+        name, unit = parameter_name_and_unit(parameter)
+        parts.append(f"{name} {describe_error(value, errors[parameter], unit)}")
+    pose = ", ".join(parts)
     sentences = [
         f"Pose error, measured minus planned: {pose}.",
         f"{result.on_surface_share:.0%} of {result.comparison.returns:,} returns lie on the static world; "

@@ -126,7 +126,7 @@ def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequen
         sensors = f" by {zone.by} sensors" if zone.by > 1 else ""
         out.print(f"zone {zone.name}: {zone.seen:.1%} of its entropy seen{sensors}, {zone.share:.1%} required")
     if worst := worst_zones(placed.zone_results):
-        print_sentences([f"The plan in zones, where it finds fewest: {'; '.join(zone.in_words() for zone in worst)}"])
+        print_sentences([f"The plan finds the smallest shares in: {'; '.join(zone.in_words() for zone in worst)}"])
     for path in placed.files:
         out.print(str(path), soft_wrap=True)
     sentences = [describe_plan(placed), *notes, *_further_sentences(placed, requested)]

@@ -320,6 +320,15 @@ def design(
         from egvs.sensor_fit import output
 
         output.check_name(name)
+        if channels is None:
+            defaults = sensor_design.DesignRequest("")
+            for option, is_given in (
+                ("--name", name != defaults.name),
+                ("--out", out is not None),
+                ("--elevation-evaluations", elevation_evaluations != defaults.elevation_evaluations),
+            ):
+                if is_given:
+                    raise InputError(option, "has no effect without --channels", "Add --channels 32.")
         bounds_deg = sensor_design.ELEVATION_BOUNDS_DEG
         if elevations != "free":
             if channels is None:
@@ -368,7 +377,7 @@ def print_design(result: DesignResult, file: Path | None) -> None:
         Column("yaw deg", lambda design: f"{design.pose.yaw_deg:.1f}"),
         Column("pitch deg", lambda design: f"{design.pose.pitch_deg:.1f}"),
         Column("found, frames of the search", lambda design: f"{design.search_score:.1%}"),
-        Column("found, other frames", lambda design: f"{100 * design.score:.1f} ± {100 * (design.se or 0.0):.1f}%"),
+        Column("found, other frames", lambda design: f"{100 * design.score:.1f} ± {100 * design.se:.1f}%"),
         Column(f"minus {designs[0].sensor.name}, % points", _format_gain),
     ]
     out = console(_DESIGN_WIDTH, soft_wrap=False)

@@ -2,8 +2,8 @@
 
 Coordinates are metres: eastings and northings of the scenario's reference system, or those of the world frame where the
 scenario has none. They are not shifted; a drawing in a national grid has coordinates of millions of metres. North is
-up, and angles are those of the grid: the bearing of a sensor's front is clockwise from grid north, its tilt is negative
-where the front points down.
+up, and angles are those of the grid: the bearing of a sensor's front is clockwise from grid north, and the pitch is
+negative where the front points down.
 
 The base map comes from the run: centre lines, sidewalks and street names of the network, footprints of the static
 world, the region of interest. Kerbs are the outline of the network's junctions and of all lanes that vehicles drive on,
@@ -92,7 +92,7 @@ LAYERS = (LANES, WALKWAYS, KERBS, STREETS, BUILDINGS, TREES, FURNITURE, ROI, POL
 VIEW_PREFIX = "EGVS-VIEW-"
 _VIEW_COLOUR = 140
 _GROUP_LAYERS = {"large": BUILDINGS, "green": TREES, "small": FURNITURE}
-_SITE_TAGS = ("SITE", "SENSOR", "HEIGHT_M", "BEARING_DEG", "TILT_DEG", "RANK")
+_SITE_TAGS = ("SITE", "SENSOR", "HEIGHT_M", "BEARING_DEG", "PITCH_DEG", "RANK")
 
 
 def write_dxf(path: Path, run: FinishedRun, layers: Sequence[Layer], reference: ExportCrs) -> list[str]:
@@ -377,7 +377,9 @@ def _site_texts(row: Mapping[str, Any]) -> tuple[str, ...]:
 
 def _label(row: Mapping[str, Any]) -> str:
     bearing = round(grid_bearing_deg(row["yaw_deg"])) % 360
-    return _mtext(f"{row['site']}  z {row['z_m']:.2f} m  {bearing:03d}°  tilt {row['pitch_deg'] + 0.0:.1f}°")
+    pitch_deg = row["pitch_deg"]
+    tilt = f"{abs(pitch_deg):.1f}° {'up' if pitch_deg > 0 else 'down'}"
+    return _mtext(f"{row['site']}  z {row['z_m']:.2f} m  {bearing:03d}°  {tilt}")
 
 
 def _mtext(text: str) -> str:

@@ -293,7 +293,8 @@ def _check_header(path: Path, header: list[str]) -> list[str]:
     if has_starts and "start" in names:
         raise InputError(where, "the start is in a column and in names of columns", "Remove the column start.")
     if not any(name in names for name in ("street", "approach", "lane_group", "edge", "from_edge")):
-        raise InputError(where, "no column says where was counted", "Add street and approach, lane_group, or edge.")
+        problem = "no column gives the location of the counts"
+        raise InputError(where, problem, "Add street and approach, lane_group, or edge.")
     return names
 
 
@@ -332,7 +333,7 @@ def _find_movements(
     """Return the movements of a row, and whether its count is divided among several."""
     named = [name for name in ("street", "approach", "lane_group", "edge", "from_edge") if values.get(name)]
     if not named:
-        raise InputError(where, "does not say where was counted", "Give street and approach, lane_group, or edge.")
+        raise InputError(where, "has no location", "Give street and approach, lane_group, or edge.")
     if "edge" in named or "from_edge" in named:
         return (_edge_movement(where, values, edges),), False
     turns: tuple[str, ...] = ()

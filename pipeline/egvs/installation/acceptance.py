@@ -32,7 +32,7 @@ from egvs.report.formatting import SCORE_LABELS
 from egvs.scoring.visibility import Beams
 from egvs.sensor_fit import sweep_files
 from egvs.sensors import registration
-from egvs.sensors.registration import PARAMETERS, Registration, StaticSurfaces
+from egvs.sensors.registration import PARAMETERS, Registration, StaticSurfaces, parameter_name_and_unit
 from egvs.sensors.sensor import Sensor, rotation_world_sensor
 from egvs.sensors.sites import Pose, Site
 
@@ -53,7 +53,7 @@ _METRES_HINT = "Export the scan in metres, in the sensor's frame: x forward, y l
 
 @dataclass(frozen=True)
 class Limits:
-    """What an accepted sensor must keep; infinity switches a limit off.
+    """Limits of an accepted sensor; infinity switches an upper limit off, 0 switches ``returns`` off.
 
     Attributes
     ----------
@@ -450,8 +450,8 @@ def _structure(comparison: ScanComparison) -> float:
 def _notes(fit: Registration, comparison: ScanComparison, other_yaws_deg: Sequence[float]) -> list[str]:
     notes = []
     if fit.not_fixed:
-        names = ", ".join(fit.not_fixed)
-        notes.append(f"no surface of the static world fixes {names}: the planned value was kept")
+        names = " and ".join(parameter_name_and_unit(name)[0] for name in fit.not_fixed)
+        notes.append(f"no surface of the static world fixes {names}: planned values are used instead")
     if other_yaws_deg:
         yaws = ", ".join(f"{yaw:.0f}" for yaw in other_yaws_deg)
         notes.append(f"the scan fits as well at a yaw of {yaws} degrees: check where the front of the sensor points")
@@ -572,7 +572,7 @@ def _measured_check(name: str, value: float, se: float, limit: float, unit: str)
     return Check(name, measured, f"at most {limit:g} {unit}", passed, reason, abs(abs(value) - limit) <= 2.0 * se)
 
 
-def describe_error(value: float, se: float) -> str:
+def describe_error(value: float, se: float, unit: str = "") -> str:
     """Return an error of the pose with its standard error, e.g. "1.502 ± 0.004"; digits end at a thousandth.
 
     Examples
@@ -583,7 +583,7 @@ def describe_error(value: float, se: float) -> str:
     if math.isinf(se):
         return "cannot be measured"
     scatter = f"{se:.3f}" if se >= 0.0005 or se == 0.0 else "<0.001"
-    return f"{value:z.3f} ± {scatter}"
+    return f"{value:z.3f} ± {scatter} {unit}".rstrip()
 
 
 def describe_sector(sector: BlockedSector) -> str:

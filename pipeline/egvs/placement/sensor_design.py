@@ -130,7 +130,7 @@ class Design:
     search_score
         Score on the frames of the search.
     score, se
-        Score on other frames, and its standard error; None where errors are unknown.
+        Score on other frames, and its standard error.
     difference
         This score minus that of the best design of the catalogue, on the same other frames.
     """
@@ -139,7 +139,7 @@ class Design:
     pose: Pose
     search_score: float
     score: float
-    se: float | None
+    se: float
     difference: ScoreDifference
 
 
@@ -151,8 +151,8 @@ class DesignResult:
     ----------
     pole
         Its name.
-    height_m
-        Height of the ground at the pole.
+    ground_m
+        Height of the ground at the pole, world frame.
     catalogue
         The best mount of each sensor, the best first by the score of the search.
     start, designed
@@ -232,7 +232,8 @@ def design_sensor(
     if request.channels is not None:
         base = next((trial for trial in best_mounts if trial.sensor.channels), None)
         if base is None:
-            raise InputError("--channels", "expected a sensor with rings among --sensors, got beam tables only")
+            problem = "expected a sensor with rings among --sensors, got beam tables only"
+            raise InputError("--channels", problem, "Add one, such as --sensors VLP-16.")
         start, designed = designer.best_elevations(base, request, len(names))
         trials += [start, designed]
     designs = designer.evaluate(trials)
@@ -253,12 +254,13 @@ def _check_request(request: DesignRequest) -> None:
         most = int((high - low) / MIN_GAP_DEG) + 1
         if not 2 <= request.channels <= most:
             problem = f"expected 2 to {most} channels between {low:g} and {high:g} degrees, got {request.channels}"
-            raise InputError("--channels", problem)
+            raise InputError("--channels", problem, f"Use a number such as {min(32, most)}, or wider --elevations.")
     for option, evaluations in (
         ("--evaluations", request.evaluations), ("--elevation-evaluations", request.elevation_evaluations),
     ):  # fmt: skip
         if evaluations < MIN_EVALUATIONS:
-            raise InputError(option, f"expected at least {MIN_EVALUATIONS}, got {evaluations}")
+            problem = f"expected at least {MIN_EVALUATIONS}, got {evaluations}"
+            raise InputError(option, problem, "Leave it out, or use 100.")
 
 
 def _sensor_names(scenario: Scenario, request: DesignRequest) -> tuple[str, ...]:
@@ -337,7 +339,8 @@ class _Designer:
         poses = [*(site.pose for site in self._sites), *self._usual_poses(sensor)]
         starts = [trial for trial in self._try_all([(sensor, pose) for pose in poses]) if trial is not None]
         if not starts:
-            raise InputError(f"--pole {self._sites[0].pole}", f"no candidate there is possible with {sensor.name}")
+            problem = f"no candidate there is possible with {sensor.name}"
+            raise InputError(f"--pole {self._sites[0].pole}", problem, "Use another pole, or other sensors.")
         start = max(starts, key=lambda trial: trial.score)
         low_m, high_m = (height_m + self.ground_m for height_m in self._heights_m)
         axes = [Axis("yaw_deg", -180.0, 180.0, is_periodic=True), Axis("pitch_deg", *PITCH_DEG)]

@@ -19,6 +19,7 @@ from egvs.sensors.registration import (
     StaticSurfaces,
     YawSearch,
     clustered_mean_se,
+    parameter_name_and_unit,
     sample_points,
     search_yaw,
 )
@@ -92,7 +93,7 @@ class MapPose:
         if "yaw_deg" in self.best.not_fixed:
             messages.append("No surface of the static world fixes the yaw.")
         elif self.best.not_fixed:
-            names = ", ".join(name.rpartition("_")[0] for name in self.best.not_fixed)
+            names = ", ".join(parameter_name_and_unit(name)[0] for name in self.best.not_fixed)
             messages.append(f"No surface of the static world fixes {names}, which kept the start value.")
         if self.ambiguous_yaws_deg:
             yaws = ", ".join(f"{yaw_deg:.1f}" for yaw_deg in self.ambiguous_yaws_deg)

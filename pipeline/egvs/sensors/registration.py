@@ -364,6 +364,16 @@ def _alternative(best: Registration, other: Registration, blocks: IntArray) -> A
     return Alternative(other, *clustered_mean_se(capped[0] - capped[1], blocks))
 
 
+def parameter_name_and_unit(parameter: str) -> tuple[str, str]:
+    """Return the name and the unit of one of :data:`PARAMETERS`.
+
+    >>> parameter_name_and_unit("yaw_deg"), parameter_name_and_unit("x_m")
+    (('yaw', 'degrees'), ('x', 'm'))
+    """
+    name, _, unit = parameter.rpartition("_")
+    return name, "degrees" if unit == "deg" else unit
+
+
 def clustered_mean_se(values: FloatArray, block: IntArray) -> tuple[float, float]:
     """Return the mean of values and its standard error, which takes values of a block as dependent.
 

@@ -231,9 +231,7 @@ def _summary(
     if scoring.zones is not None and best:
         worst = readers.worst_zones(readers.read_zones(context.folder.zones, best[0]))
         if worst:
-            summary["zones"] = (
-                f"{best[0]} in zones, where it finds fewest: {'; '.join(zone.in_words() for zone in worst)}"
-            )
+            summary["zones"] = f"{best[0]} finds the smallest shares in: {'; '.join(zone.in_words() for zone in worst)}"
     skipped = context.scene.skipped("score")
     if skipped:
         summary["skipped"] = skipped

@@ -326,7 +326,7 @@ def read_vehicles(path: Path, scenario: Scenario) -> list[WhatIfBox]:
                 kind = (row["type"] or "").strip()
                 if kind not in sizes:
                     problem = f"expected one of {', '.join(sizes)}, got {kind!r}"
-                    raise InputError(f"{where}: type", problem)
+                    raise InputError(f"{where}: type", problem, "Use one of these, or add the kind to traffic.kinds.")
                 x_m, y_m, yaw_deg = (_parse(row[name], f"{where}: {name}") for name in VEHICLE_COLUMNS[:3])
                 size = sizes[kind]
                 extent = {"length_m": size.length_m, "width_m": size.width_m, "height_m": size.height_m}

@@ -87,9 +87,7 @@ def read_observations(path: Path, index: ApproachIndex, periods: Sequence[str]) 
                 raise InputError(where, f"expected {len(header)} values", "Check the separators.")
             observation = _parse_row(where, {name: value.strip() for name, value in row.items()}, index, periods)
             if observations.setdefault((observation.approach, observation.period), observation) is not observation:
-                raise InputError(
-                    where, f"the approach {observation.approach} is there twice", "Remove one of the rows."
-                )
+                raise InputError(where, f"two rows for the approach {observation.approach}", "Remove one of the rows.")
     except csv.Error as error:
         raise InputError(f"{path}: row {table.line_num}", f"is not CSV ({error})", "Check the quotes.") from None
     if not observations:
