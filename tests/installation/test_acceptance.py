@@ -12,7 +12,8 @@ import pytest
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.installation.acceptance import Acceptance, Limits, accept
+from egvs.installation.acceptance import Acceptance, accept
+from egvs.installation.acceptance_limits import Limits
 from egvs.installation.scan_comparison import StaticWorld
 from egvs.scoring.visibility import Beams
 from egvs.sensors.sites import Pose

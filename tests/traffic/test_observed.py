@@ -56,15 +56,15 @@ BAD = {
     "empty": (["approach"], r"header: expected approach or street, and queue_m or speed_kmh"),
     "unknown column": (["approach,queue", "N,1"], r"header: unknown column 'queue'"),
     "no rows": ([HEAD], r"o.csv: has no observations"),
-    "unknown approach": (["street,queue_m", "High St,4"], r"row 2: no approach of the junction is called 'High St'"),
-    "ambiguous": (["street,queue_m", "North St,4"], r"row 2: 'North St' may be N \(North Street\) or S \(North"),
-    "no side": ([HEAD, "up,3,4"], r"row 2: approach: expected the side on which vehicles arrive, got 'up'"),
-    "nothing observed": ([HEAD, "N,,"], r"row 2: has neither queue_m nor speed_kmh"),
-    "no number": ([HEAD, "N,long,"], r"row 2: queue_m: expected a number of 0 to 10,000, got 'long'"),
-    "negative": ([HEAD, "N,,-1"], r"row 2: speed_kmh: expected a number of 0 to 300, got '-1'"),
-    "twice": ([HEAD, "N,1,", "southbound,2,"], r"row 3: two rows for the approach N \(North Street\)"),
-    "period": (["approach,period,queue_m", "N,morning,3"], r"row 2: period: .* The scenario has no periods"),
-    "few values": ([HEAD, "N,3"], r"row 2: expected 3 values"),
+    "unknown approach": (["street,queue_m", "High St,4"], r"line 2: no approach of the junction is called 'High St'"),
+    "ambiguous": (["street,queue_m", "North St,4"], r"line 2: 'North St' may be N \(North Street\) or S \(North"),
+    "no side": ([HEAD, "up,3,4"], r"line 2: approach: expected the side on which vehicles arrive, got 'up'"),
+    "nothing observed": ([HEAD, "N,,"], r"line 2: has neither queue_m nor speed_kmh"),
+    "no number": ([HEAD, "N,long,"], r"line 2: queue_m: expected a number of 0 to 10,000, got 'long'"),
+    "negative": ([HEAD, "N,,-1"], r"line 2: speed_kmh: expected a number of 0 to 300, got '-1'"),
+    "twice": ([HEAD, "N,1,", "southbound,2,"], r"line 3: two rows for the approach N \(North Street\)"),
+    "period": (["approach,period,queue_m", "N,morning,3"], r"line 2: period: .* The scenario has no periods"),
+    "few values": ([HEAD, "N,3"], r"line 2: expected 3 values"),
 }
 
 
@@ -87,7 +87,7 @@ def test_check_reports_a_bad_file_and_missing_counts(crossing: Path, tmp_path: P
     (tmp_path / "bad.csv").write_text(f"{HEAD}\nX,1,2\n")
     overrides = [f"traffic.observed='{tmp_path / 'bad.csv'}'"]
     (error,) = check.check_scenario(loading.load(crossing, overrides)).errors
-    assert "bad.csv: row 2: approach: expected the side" in str(error)
+    assert "bad.csv: line 2: approach: expected the side" in str(error)
     (error,) = check.check_scenario(loading.load(crossing, [*overrides, "traffic.counts=[]"])).errors
     assert "scenario.toml: traffic.observed: needs counted traffic in every period" in str(error)
 

@@ -9,9 +9,12 @@ import typer
 
 from egvs.cli.options import Run
 from egvs.core.errors import EgvsError, InputError
+from egvs.installation.acceptance_limits import MAX_VEHICLE_HEIGHT_M, Limits
 
 if TYPE_CHECKING:
     from egvs.installation.acceptance import Acceptance, Check
+
+_LIMITS = Limits()
 
 
 def sheets(
@@ -57,36 +60,38 @@ def accept(
         ),
     ] = None,
     site: Annotated[str, typer.Option(metavar="SITE", help="Required: the site where the sensor is installed.")] = "",
-    position: Annotated[float, typer.Option(metavar="M", min=0, help="Largest error of the position.")] = 0.3,
+    position: Annotated[
+        float, typer.Option(metavar="M", min=0, help="Largest error of the position.")
+    ] = _LIMITS.position_m,
     tilt: Annotated[
         float, typer.Option(metavar="DEG", min=0, help="Largest angle between the planned and the measured z axis.")
-    ] = 1.0,
-    yaw: Annotated[float, typer.Option(metavar="DEG", min=0, help="Largest error of the yaw.")] = 2.0,
+    ] = _LIMITS.tilt_deg,
+    yaw: Annotated[float, typer.Option(metavar="DEG", min=0, help="Largest error of the yaw.")] = _LIMITS.yaw_deg,
     blocked: Annotated[
         float, typer.Option(metavar="DEG", min=0, help="Largest width of all blocked sectors together.")
-    ] = 5.0,
+    ] = _LIMITS.blocked_deg,
     missing_channels: Annotated[
         int, typer.Option("--missing-channels", metavar="N", min=0, help="Largest number of channels without returns.")
-    ] = 0,
+    ] = int(_LIMITS.missing_channels),
     returns: Annotated[
         float, typer.Option(metavar="SHARE", min=0, max=1, help="Smallest share of the expected returns.")
-    ] = 0.8,
+    ] = _LIMITS.returns,
     off_beams: Annotated[
         float,
         typer.Option(
             "--off-beams", metavar="SHARE", min=0, max=1, help="Largest share of returns on no beam of the sensor."
         ),
-    ] = 0.05,
+    ] = _LIMITS.off_beams,
     loss: Annotated[
         float, typer.Option(metavar="SHARE", min=0, help="Largest loss of the score, as a share of the planned score.")
-    ] = 0.05,
+    ] = _LIMITS.loss,
     vehicle_height: Annotated[
         float,
         typer.Option(
             "--vehicle-height", metavar="M", min=0,
             help="A return in front of the static world that is higher above the ground is of an obstacle.",
         ),
-    ] = 4.5,
+    ] = MAX_VEHICLE_HEIGHT_M,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Folder to write; RUN/acceptance by default.")
     ] = None,
@@ -97,7 +102,6 @@ def accept(
     with ProgressDisplay("accept") as screen:
         from egvs.core import files
         from egvs.installation import acceptance, acceptance_page
-        from egvs.installation.acceptance import Limits
 
         if not scan:
             raise InputError("--scan", "no scan is given", "Use --scan measured.pcd.")

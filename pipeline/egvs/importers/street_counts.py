@@ -17,17 +17,16 @@ there are several.
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from egvs.core import limits
 from egvs.core.errors import InputError, find_misspelling
+from egvs.formats import csv_tables
 from egvs.importers import junctions
 from egvs.importers.junctions import StreetJunction, Streets
 from egvs.scenario.traffic_config import CountConfig, TrafficConfig
@@ -253,29 +252,12 @@ def _notes(
 
 
 def _read_rows(path: Path, index: ApproachIndex, edges: frozenset[str], kinds: frozenset[str]) -> Iterator[_Row]:
-    try:
-        text = limits.read_bytes(path, limits.DOCUMENT).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(path, f"is not UTF-8 text (byte {error.start})", "Save it as CSV in UTF-8.") from None
-    delimiter = ";" if text.partition("\n")[0].count(";") > text.partition("\n")[0].count(",") else ","
-    table = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
-    header = _check_header(path, [name.strip() for name in next(table, [])])
-    try:
-        for cells in table:
-            where = f"{path}: row {table.line_num}"
-            if not any(cell.strip() for cell in cells):
-                continue
-            if len(cells) != len(header):
-                problem = f"expected {len(header)} values, got {len(cells)}"
-                raise InputError(where, problem, "Check the separators.")
-            values = {name: cell.strip() for name, cell in zip(header, cells, strict=True)}
-            yield from _parse_row(where, values, index, edges, kinds)
-    except csv.Error as error:
-        raise InputError(f"{path}: row {table.line_num}", f"is not CSV ({error})", "Check the quotes.") from None
+    for where, values in csv_tables.read_rows(path, partial(_check_header, path)):
+        yield from _parse_row(where, values, index, edges, kinds)
 
 
 def _check_header(path: Path, header: list[str]) -> list[str]:
-    """Return the names of the columns in lower case; InputError when one is unknown, repeated or missing."""
+    """Return the names of the columns in lower case; InputError when one is unknown or missing."""
     names = [name.casefold() for name in header]
     known = (*LOCATION_COLUMNS, *VALUE_COLUMNS)
     where = f"{path}: header"
@@ -284,8 +266,6 @@ def _check_header(path: Path, header: list[str]) -> list[str]:
             meant = find_misspelling([name], known)
             hint = f"Did you mean {meant[1]}?" if meant else f"Columns: {', '.join(known)}, or starts such as 07:15."
             raise InputError(where, f"unknown column {name!r}", hint)
-        if names.count(name) > 1:
-            raise InputError(where, f"two columns are called {name!r}", "Rename or remove one.")
     has_starts = any(_CLOCK.fullmatch(name) for name in names)
     if has_starts == ("count" in names):
         problem = "expected a column count, or columns named by their start, got " + ("both" if has_starts else "none")

@@ -26,6 +26,7 @@ from egvs.core.grid import FloatArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.explore.session import Session
 from egvs.installation import scan_comparison
+from egvs.installation.acceptance_limits import MAX_VEHICLE_HEIGHT_M, Limits
 from egvs.installation.planned_sites import PlannedSites
 from egvs.installation.scan_comparison import BlockedSector, ScanComparison, StaticWorld
 from egvs.report.formatting import SCORE_LABELS
@@ -49,40 +50,6 @@ _BLOCKED_BEAM_DEG = 0.3
 """An expected beam is stopped by the return of an obstacle that is at most this far beside it."""
 _STEP = 1e-4
 _METRES_HINT = "Export the scan in metres, in the sensor's frame: x forward, y left, z up."
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Limits of an accepted sensor; infinity switches an upper limit off, 0 switches ``returns`` off.
-
-    Attributes
-    ----------
-    position_m
-        Largest distance of the measured from the planned position.
-    tilt_deg
-        Largest angle between the measured and the planned z axis of the sensor.
-    yaw_deg
-        Largest error of the yaw.
-    blocked_deg
-        Largest width of all blocked sectors together.
-    missing_channels
-        Largest number of channels without returns.
-    returns
-        Smallest share of the expected returns.
-    off_beams
-        Largest share of returns on no beam of the sensor.
-    loss
-        Largest loss of the score that ranks, as a share of the planned one.
-    """
-
-    position_m: float = 0.3
-    tilt_deg: float = 1.0
-    yaw_deg: float = 2.0
-    blocked_deg: float = 5.0
-    missing_channels: float = 0.0
-    returns: float = 0.8
-    off_beams: float = 0.05
-    loss: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -309,7 +276,7 @@ def accept(
     scans: Sequence[str | Path],
     limits: Limits | None = None,
     *,
-    max_vehicle_height_m: float = scan_comparison.MAX_VEHICLE_HEIGHT_M,
+    max_vehicle_height_m: float = MAX_VEHICLE_HEIGHT_M,
     progress: ProgressCallback = no_progress,
 ) -> Acceptance:
     """Compare measured scans of an installed sensor with the empty scan that was planned.

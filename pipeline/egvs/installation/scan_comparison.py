@@ -23,6 +23,7 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial import KDTree
 
 from egvs.core.grid import FloatArray, IntArray
+from egvs.installation.acceptance_limits import MAX_VEHICLE_HEIGHT_M
 from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import Sensor, rotation_world_sensor
 from egvs.sensors.sites import Pose
@@ -34,9 +35,6 @@ Bools = NDArray[np.bool_]
 
 NEAR_M = 1.5
 """No vehicle comes closer to a sensor on a pole than this."""
-
-MAX_VEHICLE_HEIGHT_M = 4.5
-"""Legal heights are 4.0 m in Europe, 3.8 m in Japan and 4.1 to 4.3 m in the United States."""
 
 PERSISTENT_SCANS, PERSISTENT_SHARE = 3, 0.8
 """From so many scans on, a beam that is stopped in this share of them is stopped by an obstacle at any height."""

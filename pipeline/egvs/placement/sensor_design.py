@@ -37,6 +37,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.threads import map_ordered
+from egvs.placement.design_request import ALL_SENSORS, DesignRequest
 from egvs.placement.refinement import Axis, BoxEnds, Freedom, minimise
 from egvs.report.sensor_results import ScoreDifference
 from egvs.runs import run, stage_registry
@@ -65,13 +66,9 @@ from egvs.sensors.sites import Pose, Site
 from egvs.stages.base import StageContext
 from egvs.stages.inputs import open_folder
 
-ALL_SENSORS = "all"
-"""Stands for the sensors of the scenario and the complete catalogue."""
-
 STAGES = ("check", "statics", "traffic", "tpog")
 MAX_PIECES = 7
 MIN_GAP_DEG = 0.05
-ELEVATION_BOUNDS_DEG = (-45.0, 25.0)
 PITCH_DEG = (-30.0, 10.0)
 START_PITCHES_DEG = (0.0, -5.0, -10.0, -15.0, -20.0)
 MIN_EVALUATIONS = 20
@@ -83,40 +80,6 @@ _LOG_SHARE = 8.0
 _ELEVATION_STEP = 0.03
 """Initial step of the elevations, as a share of their bounds: about two degrees."""
 _IMPOSSIBLE_LOSS = 1e6
-
-
-@dataclass(frozen=True)
-class DesignRequest:
-    """What to design.
-
-    Attributes
-    ----------
-    pole
-        Name of the pole.
-    sensors
-        Names of sensors, or :data:`ALL_SENSORS`.
-    heights_m
-        Lowest and highest height above the ground; None for those of the candidates at the pole.
-    evaluations
-        Number of mounts that are tried for each sensor.
-    channels
-        Number of free channels; None for no free ones.
-    bounds_deg
-        Lowest and highest elevation of free channels.
-    elevation_evaluations
-        Number of sets of elevations that are tried.
-    name
-        Name of the designed sensor.
-    """
-
-    pole: str
-    sensors: tuple[str, ...] = (ALL_SENSORS,)
-    heights_m: tuple[float, float] | None = None
-    evaluations: int = 100
-    channels: int | None = None
-    bounds_deg: tuple[float, float] = ELEVATION_BOUNDS_DEG
-    elevation_evaluations: int = 300
-    name: str = "designed"
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,10 @@ The solids are written to the run folders, as ``what_if_1.geojson`` and so on.
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ from egvs.core.grid import FloatArray
 from egvs.core.numbers import parse_decimal
 from egvs.core.platform import relative_path
 from egvs.core.special import cosdg, sindg
+from egvs.formats import csv_tables
 from egvs.report.basemap import solid_group
 from egvs.report.formatting import ScoreLabel, format_probability, join_names
 from egvs.report.ranking import RankedSite, Ranking
@@ -310,38 +311,34 @@ def read_vehicles(path: Path, scenario: Scenario) -> list[WhatIfBox]:
     Raises
     ------
     InputError
-        Naming file, row and value.
+        Naming file, line and value.
     """
     sizes = class_sizes(scenario.traffic)
     boxes = []
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = csv.DictReader(file, skipinitialspace=True)
-            for column in VEHICLE_COLUMNS:
-                if column not in (rows.fieldnames or ()):
-                    hint = f"The header needs the columns {', '.join(VEHICLE_COLUMNS)}, separated by commas."
-                    raise InputError(path, f"the file has no column {column}", hint)
-            for number, row in enumerate(rows, start=1):
-                where = f"{path}: row {number}"
-                kind = (row["type"] or "").strip()
-                if kind not in sizes:
-                    problem = f"expected one of {', '.join(sizes)}, got {kind!r}"
-                    raise InputError(f"{where}: type", problem, "Use one of these, or add the kind to traffic.kinds.")
-                x_m, y_m, yaw_deg = (_parse(row[name], f"{where}: {name}") for name in VEHICLE_COLUMNS[:3])
-                size = sizes[kind]
-                extent = {"length_m": size.length_m, "width_m": size.width_m, "height_m": size.height_m}
-                boxes.append(WhatIfBox(x_m=x_m, y_m=y_m, yaw_deg=yaw_deg, kind=PARKED, **extent))
-    except (UnicodeDecodeError, csv.Error) as error:
-        hint = "Save it as UTF-8 text with a header row."
-        raise InputError(path, f"the file cannot be read as CSV ({error})", hint) from None
+    for where, row in csv_tables.read_rows(path, partial(_check_vehicle_columns, path)):
+        kind = row["type"]
+        if kind not in sizes:
+            problem = f"expected one of {', '.join(sizes)}, got {kind!r}"
+            raise InputError(f"{where}: type", problem, "Use one of these, or add the kind to traffic.kinds.")
+        x_m, y_m, yaw_deg = (_parse(row[name], f"{where}: {name}") for name in VEHICLE_COLUMNS[:3])
+        size = sizes[kind]
+        extent = {"length_m": size.length_m, "width_m": size.width_m, "height_m": size.height_m}
+        boxes.append(WhatIfBox(x_m=x_m, y_m=y_m, yaw_deg=yaw_deg, kind=PARKED, **extent))
     if not boxes:
         raise InputError(path, "expected at least one vehicle, got none", "Write one row per vehicle.")
     return boxes
 
 
-def _parse(text: str | None, where: str) -> float:
+def _check_vehicle_columns(path: Path, header: list[str]) -> list[str]:
+    for column in VEHICLE_COLUMNS:
+        if column not in header:
+            raise InputError(path, f"the file has no column {column}", f"Columns: {', '.join(VEHICLE_COLUMNS)}.")
+    return header
+
+
+def _parse(text: str, where: str) -> float:
     try:
-        value = parse_decimal(text or "")
+        value = parse_decimal(text)
     except ValueError:
         value = math.nan
     if not abs(value) <= MAX_COORDINATE_M:

@@ -162,7 +162,7 @@ class ApproachIndex:
         turns
             Turns; any if empty.
         where
-            File and row, for messages.
+            File and line, for messages.
 
         Raises
         ------

@@ -7,15 +7,14 @@ last 100 m before the stop line), of which one may be empty; and ``period`` in a
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from egvs.core import limits
 from egvs.core.errors import InputError, find_misspelling
+from egvs.formats import csv_tables
 from egvs.scenario.model import Scenario
 from egvs.traffic.approaches import ApproachIndex, parse_side
 from egvs.traffic.movements import MovementNames
@@ -64,13 +63,18 @@ def read_observed(scenario: Scenario, network: Network) -> tuple[Observation, ..
 
 def read_observations(path: Path, index: ApproachIndex, periods: Sequence[str]) -> tuple[Observation, ...]:
     """Read observations; ``periods`` are the names of the scenario's periods, empty without periods."""
-    try:
-        text = limits.read_bytes(path, limits.DOCUMENT).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(path, f"is not UTF-8 text (byte {error.start})", "Save it as CSV in UTF-8.") from None
-    table = csv.DictReader(io.StringIO(text, newline=""), strict=True)
-    header = [name.strip() for name in table.fieldnames or ()]
-    table.fieldnames = header
+    observations: dict[tuple[str, str], Observation] = {}
+    for where, values in csv_tables.read_rows(path, partial(_check_header, path)):
+        observation = _parse_row(where, values, index, periods)
+        if observations.setdefault((observation.approach, observation.period), observation) is not observation:
+            raise InputError(where, f"two rows for the approach {observation.approach}", "Remove one of the rows.")
+    if not observations:
+        raise InputError(path, "has no observations", "Add one row per approach below the header.")
+    return tuple(observations.values())
+
+
+def _check_header(path: Path, header: list[str]) -> list[str]:
+    """Return the names of the columns; InputError when one is unknown or missing."""
     for name in header:
         if name not in COLUMNS:
             meant = find_misspelling([name], COLUMNS)
@@ -79,20 +83,7 @@ def read_observations(path: Path, index: ApproachIndex, periods: Sequence[str]) 
     if not {"street", "approach"} & set(header) or not _LIMITS.keys() & set(header):
         problem = "expected approach or street, and queue_m or speed_kmh"
         raise InputError(f"{path}: header", problem, "Example: approach,queue_m,speed_kmh.")
-    observations: dict[tuple[str, str], Observation] = {}
-    try:
-        for row in table:
-            where = f"{path}: row {table.line_num}"
-            if None in row or None in row.values():
-                raise InputError(where, f"expected {len(header)} values", "Check the separators.")
-            observation = _parse_row(where, {name: value.strip() for name, value in row.items()}, index, periods)
-            if observations.setdefault((observation.approach, observation.period), observation) is not observation:
-                raise InputError(where, f"two rows for the approach {observation.approach}", "Remove one of the rows.")
-    except csv.Error as error:
-        raise InputError(f"{path}: row {table.line_num}", f"is not CSV ({error})", "Check the quotes.") from None
-    if not observations:
-        raise InputError(path, "has no observations", "Add one row per approach below the header.")
-    return tuple(observations.values())
+    return header
 
 
 def _parse_row(where: str, values: Mapping[str, str], index: ApproachIndex, periods: Sequence[str]) -> Observation:

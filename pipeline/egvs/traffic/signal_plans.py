@@ -12,12 +12,11 @@ World frame, metres, seconds.
 
 from __future__ import annotations
 
-import csv
 import gzip
-import io
 import re
 from collections.abc import Iterator, Sequence, Set
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ from pydantic import ValidationError
 
 from egvs.core import files
 from egvs.core.errors import InputError
-from egvs.formats import xml
+from egvs.formats import csv_tables, xml
 from egvs.scenario.model import Scenario
 from egvs.scenario.signal_config import SignalConfig, SignalPhaseConfig
 from egvs.traffic import network
@@ -41,10 +40,10 @@ _OPPOSITE_COSINE = -0.5
 
 _GZIP = b"\x1f\x8b"
 _MAX_NAMED = 20
-_MAX_CSV_BYTES = 1_000_000
 
 CSV_COLUMNS = ("phase", "approach", "movement", "green_s")
 CSV_OPTIONAL = ("yellow_s", "all_red_s", "min_green_s", "max_green_s")
+_CSV_HINT = f"Columns: {', '.join(CSV_COLUMNS)}; optional: {', '.join(CSV_OPTIONAL)}."
 
 
 def check_plans(scenario: Scenario, path: Path, roads: network.Network) -> None:
@@ -307,37 +306,21 @@ def _read_program(path: Path, config: SignalConfig, signal: Signal) -> Program:
 
 def _read_csv(path: Path, config: SignalConfig) -> tuple[SignalPhaseConfig, ...]:
     """Read the phases of a plan, in the order in which they first occur."""
-    hint = f"Columns: {', '.join(CSV_COLUMNS)}; optional: {', '.join(CSV_OPTIONAL)}."
-    with files.open_input(path) as content:
-        raw = content.read(_MAX_CSV_BYTES + 1)
-    try:
-        rows = list(csv.DictReader(io.StringIO(raw.decode("utf-8-sig")), skipinitialspace=True, strict=True))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(path, f"cannot be read as CSV ({error})", hint) from None
-    if len(raw) > _MAX_CSV_BYTES:
-        raise InputError(path, f"expected a signal plan, got more than {_MAX_CSV_BYTES:,} bytes", hint)
-    if not rows:
-        raise InputError(path, "expected a phase in each row, got none", hint)
-    if missing := [name for name in CSV_COLUMNS if name not in rows[0]]:
-        raise InputError(path, f"the column {missing[0]!r} is missing", hint)
-    if unknown := [name for name in rows[0] if name not in (*CSV_COLUMNS, *CSV_OPTIONAL) and name is not None]:
-        raise InputError(path, f"unknown column {unknown[0]!r}", hint)
     phases: dict[str, dict[str, Any]] = {}
-    for line, row in enumerate(rows, start=2):
-        where = f"{path}: line {line}"
-        if None in row or None in row.values():
-            raise InputError(where, "the row has more or fewer values than the header has columns", hint)
-        values = phases.setdefault(row["phase"].strip(), {"green": {}})
-        movements = values["green"].setdefault(row["approach"].strip(), [])
+    for where, row in csv_tables.read_rows(path, partial(_check_header, path)):
+        values = phases.setdefault(row["phase"], {"green": {}})
+        movements = values["green"].setdefault(row["approach"], [])
         movements += row["movement"].split()
         for key in ("green_s", *CSV_OPTIONAL):
-            text = (row.get(key) or "").strip()
+            text = row.get(key, "")
             if not text:
                 continue
             number = _parse_seconds(text, f"{where}: {key}")
             if values.setdefault(key, number) != number:
                 problem = f"expected {values[key]:g} as before in phase {row['phase']!r}, got {number:g}"
                 raise InputError(f"{where}: {key}", problem, "Use one value for each phase.")
+    if not phases:
+        raise InputError(path, "expected a phase in each row, got none", _CSV_HINT)
     configs = []
     for name, values in phases.items():
         try:
@@ -346,13 +329,22 @@ def _read_csv(path: Path, config: SignalConfig) -> tuple[SignalPhaseConfig, ...]
             first = error.errors()[0]
             key = ".".join(map(str, first["loc"]))
             raise InputError(
-                f"{path}: phase {name!r}: {key}", first["msg"].removeprefix("Value error, "), hint
+                f"{path}: phase {name!r}: {key}", first["msg"].removeprefix("Value error, "), _CSV_HINT
             ) from None
         unused = sorted({"min_green_s", "max_green_s"} & values.keys())
         if unused and config.type == "fixed":
             problem = f"{', '.join(unused)} has no effect with a fixed plan"
             raise InputError(f"{path}: phase {name!r}", problem, 'Set type = "actuated".')
     return tuple(configs)
+
+
+def _check_header(path: Path, header: list[str]) -> list[str]:
+    """Return the names of the columns; InputError when one is unknown or missing."""
+    if missing := [name for name in CSV_COLUMNS if name not in header]:
+        raise InputError(path, f"the column {missing[0]!r} is missing", _CSV_HINT)
+    if unknown := [name for name in header if name not in (*CSV_COLUMNS, *CSV_OPTIONAL)]:
+        raise InputError(path, f"unknown column {unknown[0]!r}", _CSV_HINT)
+    return header
 
 
 def _parse_seconds(text: str, where: str) -> float:
