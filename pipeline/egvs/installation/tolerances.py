@@ -169,7 +169,7 @@ def distance_to_one_point(losses: Sequence[tuple[float, float]]) -> float:
 
 
 def describe_tolerances(tolerances: PoseTolerances) -> str:
-    """Return the tolerances as a sentence, e.g. "a loss of 1 percentage point allows: tilt 2.1 degrees, height 0.30 m"."""
+    """Return the tolerances as a sentence, e.g. "a loss of 1 percentage point allows: tilt 2.1 degrees"."""
     parts = []
     for tolerance in tolerances.tolerances:
         quantity = tolerance.quantity
