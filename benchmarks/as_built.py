@@ -26,10 +26,10 @@ from tests.importers import as_built_clouds
 
 import egvs
 from egvs.core.grid import FloatArray, IntArray, Roi
-from egvs.importers.as_built_view import AsBuiltMap
-from egvs.importers.cloud_surface import SURFEL_SPACING_M, triangulate_cloud
-from egvs.importers.moving_points import StationScan, not_shared
-from egvs.importers.point_cloud import make_meshes
+from egvs.importers.point_clouds.as_built_view import AsBuiltMap
+from egvs.importers.point_clouds.moving_points import StationScan, not_shared
+from egvs.importers.point_clouds.reader import make_meshes
+from egvs.importers.point_clouds.surface import SURFEL_SPACING_M, triangulate_cloud
 from egvs.world.mesh import World
 from egvs.world.ray_casting import Caster
 from egvs.world.static_world import build_world

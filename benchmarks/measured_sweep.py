@@ -28,9 +28,9 @@ from scipy.stats import t
 
 from egvs.core.files import temporary_folder
 from egvs.core.grid import FloatArray, Roi
-from egvs.importers.as_built_view import AsBuiltMap
-from egvs.importers.cloud_surface import triangulate_cloud
-from egvs.importers.point_cloud import make_meshes
+from egvs.importers.point_clouds.as_built_view import AsBuiltMap
+from egvs.importers.point_clouds.reader import make_meshes
+from egvs.importers.point_clouds.surface import triangulate_cloud
 from egvs.scenario.sensor_config import SensorConfig
 from egvs.sensor_fit import empty_scan, output
 from egvs.sensor_fit.empty_scan import EmptyScanFit

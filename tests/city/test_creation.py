@@ -21,8 +21,9 @@ from egvs.city import creation, model, traffic_split
 from egvs.city.creation import NewCityOptions
 from egvs.core.errors import InputError
 from egvs.formats import osm
-from egvs.importers import junctions, osm_network
+from egvs.importers import junctions
 from egvs.importers.junctions import StreetJunction
+from egvs.importers.openstreetmap import street_network
 from egvs.stages import traffic
 from egvs.traffic import network
 from egvs.traffic.capacity import FlowCapacity, FlowTrial
@@ -138,7 +139,9 @@ def read_solids(folder: Path) -> dict[str, dict]:
 
 def test_nearby_streets_give_same_poles_as_all_streets(extract: Path) -> None:
     read = osm.read_osm(extract)
-    _, streets = osm_network.build_network(read, extract, osm_network.netconvert_flags(read, lefthand=False, walk=True))
+    _, streets = street_network.build_network(
+        read, extract, street_network.netconvert_flags(read, lefthand=False, walk=True)
+    )
     for junction in streets.junctions:
         roi = junctions.region_around(junction)
         near = streets.near(roi.area.buffer(60.0, join_style="mitre"))
@@ -148,10 +151,10 @@ def test_nearby_streets_give_same_poles_as_all_streets(extract: Path) -> None:
 
 def test_network_excerpt_keeps_streets(extract: Path, tmp_path: Path) -> None:
     read = osm.read_osm(extract)
-    text, streets = osm_network.build_network(
-        read, extract, osm_network.netconvert_flags(read, lefthand=False, walk=True)
+    text, streets = street_network.build_network(
+        read, extract, street_network.netconvert_flags(read, lefthand=False, walk=True)
     )
-    excerpts, complete = osm_network.NetworkExcerpts(text), streets.network
+    excerpts, complete = street_network.NetworkExcerpts(text), streets.network
     (tmp_path / "complete.net.xml").write_text(text)
     for junction in (junction for junction in streets.junctions if junction.arms >= 3):
         window = junctions.region_around(junction).area.buffer(80.0, join_style="mitre")

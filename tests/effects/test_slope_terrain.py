@@ -15,8 +15,8 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.effects.slope import Slope, read_ground_points
 from egvs.formats import ply
-from egvs.importers.draping import drape_network
-from egvs.importers.ground_heights import ground_points
+from egvs.importers.terrain.draping import drape_network
+from egvs.importers.terrain.ground_heights import ground_points
 from egvs.scenario.effects_config import SlopeParameters
 from egvs.scenario.loading import scenario_from_dict
 from egvs.scenario.model import Scenario

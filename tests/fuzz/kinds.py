@@ -224,7 +224,7 @@ _ALL = (
     _tracks("tracks.csv", bases.mapped_tracks(False), meaning.table, "", "mapping"),
     _tracks("tracks.jsonl", bases.mapped_tracks(True), meaning.json_lines, "", "mapping"),
     _signals("states.csv", meaning.table, "groups.csv"), _signals("lights.csv", meaning.table, "light_groups.csv"),
-    _signals("groups.csv", meaning.table, "states.csv"), _signals("map.kml", meaning.xml, "states.csv"),
+    _signals("groups.csv", meaning.table, "states.csv"), _signals("map.kml", meaning.kml, "states.csv"),
     _sweep("sweep.csv", meaning.rows), _sweep("sweep.pcd", meaning.pcd),
     _recording("sweep.bag"), _recording("sweep.mcap"), _recording("sweep.db3"), _recording("sweep.pcap"),
     _sweep("sweep.ply.gz", meaning.gzipped(meaning.ply)), _sweep("sweep.npz", meaning.bytes_themselves),

@@ -93,6 +93,11 @@ def xml(data: bytes) -> object:
     return [(event, one.tag, sorted(one.attrib.items()) if event == "start" else None) for event, one in events]
 
 
+def kml(data: bytes) -> object:
+    """Elements with their texts and attributes."""
+    return [xml(data), [one.text for one in ElementTree.fromstring(_utf8(data)).iter()]]
+
+
 def _utf8(data: bytes) -> bytes:
     """As UTF-8, whatever encoding the file declares: expat knows no Shift_JIS."""
     head, mark, rest = data.partition(b"?>")

@@ -12,7 +12,8 @@ import numpy as np
 
 from egvs.cli import exit
 from egvs.formats.georeference import WorldFrame
-from egvs.importers import recorded_signals, signal_programs
+from egvs.importers.recorded import signal_programs
+from egvs.importers.recorded import signals as recorded_signals
 from tests.traffic.crossing import NETWORK
 
 VERB = "read-signals"

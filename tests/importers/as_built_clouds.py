@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.grid import FloatArray, Grid, Roi
-from egvs.importers.moving_points import StationScan
+from egvs.importers.point_clouds.moving_points import StationScan
 from egvs.sensors.sensor import Sensor
 from egvs.world.mesh import World
 from egvs.world.ray_casting import Caster

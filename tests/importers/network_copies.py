@@ -11,9 +11,10 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.spatial import KDTree
 
-from egvs.importers import lanelet2, opendrive
-from egvs.importers.lanelet2_network import read_network_text
+from egvs.importers.lanelet2 import reader as lanelet2
+from egvs.importers.lanelet2.network import read_network_text
 from egvs.importers.map_parts import RoadOptions
+from egvs.importers.opendrive import reader as opendrive
 from egvs.traffic import sumo
 from egvs.traffic.network import Lane, Network
 from tests.importers.lanelet2_maps import lane_names, signal_sequences, write_network

@@ -10,9 +10,9 @@ import trimesh
 
 from egvs.formats import ply
 from egvs.importers.bridge_decks import CLEARANCE_M, EDGE_M, THICKNESS_M, bridge_decks
-from egvs.importers.draping import drape_network, roads_above_others
-from egvs.importers.ground_heights import ground_points
 from egvs.importers.map_parts import MappedMesh
+from egvs.importers.terrain.draping import drape_network, roads_above_others
+from egvs.importers.terrain.ground_heights import ground_points
 from egvs.traffic import network
 from egvs.world import terrain
 from tests.importers.test_draping import VALLEY, Function, build

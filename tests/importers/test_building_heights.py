@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import shapely
 
-from egvs.importers.building_heights import (
+from egvs.importers.buildings.building_heights import (
     heights_from_neighbours,
     heights_from_surface,
     objects_on_carriageway,
     sample_points,
 )
 from egvs.importers.map_parts import MappedMesh
-from egvs.importers.osm_solids import ImportCounts, MappedSolid
+from egvs.importers.openstreetmap.solids import ImportCounts, MappedSolid
 from egvs.world.extrusion import extrude_polygon
 
 

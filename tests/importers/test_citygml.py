@@ -14,9 +14,9 @@ from egvs.core.errors import InputError
 from egvs.formats.city_objects import select_surfaces
 from egvs.formats.citygml import CityGmlFile
 from egvs.formats.georeference import WorldFrame
-from egvs.importers import citygml, cityjson
+from egvs.importers.buildings import citygml, cityjson
 from egvs.importers.map_parts import Alignment, MapContext, MapReader, SolidReader
-from egvs.importers.osm_solids import DEFAULT_BUILDING_M
+from egvs.importers.openstreetmap.solids import DEFAULT_BUILDING_M
 from tests.formats.small_city_models import (
     Point,
     box,

@@ -22,7 +22,7 @@ import json
 from pathlib import Path
 import shapely
 from egvs.formats.georeference import WorldFrame
-from egvs.importers import citygml
+from egvs.importers.buildings import citygml
 from egvs.importers.map_parts import MapContext
 frame = WorldFrame("EPSG:6677", (7000.0, 51000.0))
 result = citygml.read_solids([Path(sys.argv[1])], MapContext(frame, shapely.box(-110, -110, 90, 90)))

@@ -9,8 +9,9 @@ import pytest
 import shapely
 
 from egvs.core.errors import InputError
-from egvs.importers import citygml, citygml_relief
+from egvs.importers.buildings import citygml
 from egvs.importers.map_parts import MapContext, TerrainReader
+from egvs.importers.terrain import citygml_relief
 from tests.formats.small_city_models import city_object, nest, polygon, write_model
 from tests.importers.test_citygml import FRAME, at, house
 

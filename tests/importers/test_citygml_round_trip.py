@@ -10,7 +10,7 @@ import shapely
 
 from egvs.core.grid import Grid
 from egvs.formats.georeference import WorldFrame
-from egvs.importers import citygml
+from egvs.importers.buildings import citygml
 from egvs.importers.map_parts import MapContext
 from egvs.scenario import loading
 from egvs.scenario.model import Scenario

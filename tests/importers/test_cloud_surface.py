@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 
 from egvs.core.grid import FloatArray
-from egvs.importers import cloud_surface
-from egvs.importers.cloud_surface import is_ground, make_surfels, thin_points, triangulate_cloud, triangulate_ground
+from egvs.importers.point_clouds import surface as cloud_surface
+from egvs.importers.point_clouds.surface import (
+    is_ground,
+    make_surfels,
+    thin_points,
+    triangulate_cloud,
+    triangulate_ground,
+)
 
 
 def grid_points(x: FloatArray, y: FloatArray, z: float = 0.0) -> FloatArray:

@@ -17,11 +17,14 @@ from egvs.core.grid import FloatArray
 from egvs.formats import ply
 from egvs.formats.georeference import WorldFrame
 from egvs.formats.osm import read_osm
-from egvs.importers import opendrive, osm_network, raster_terrain, road_levels
-from egvs.importers.draping import STEP_M, TOLERANCE_M, drape_network, level_difference_m, roads_above_others
-from egvs.importers.ground_heights import ground_points
+from egvs.importers import road_levels
 from egvs.importers.map_parts import MapContext, RoadOptions
-from egvs.importers.network_heights import find_shapes, node_of_internal, shift_heights
+from egvs.importers.opendrive import reader as opendrive
+from egvs.importers.openstreetmap import street_network
+from egvs.importers.terrain import rasters
+from egvs.importers.terrain.draping import STEP_M, TOLERANCE_M, drape_network, level_difference_m, roads_above_others
+from egvs.importers.terrain.ground_heights import ground_points
+from egvs.importers.terrain.network_heights import find_shapes, node_of_internal, shift_heights
 from egvs.traffic import network, sumo
 from tests.formats.test_rasters import write_tiff
 from tests.importers.small_maps import degrees, street, write_map
@@ -203,11 +206,11 @@ def test_bridge_of_a_map_is_an_edge_of_its_own(tmp_path: Path) -> None:
         street("West", 5, 1, 6), street("East", 7, 4, 8), street("North", 5, 9, 7), street("South", 6, 10, 8),
     ]  # fmt: skip
     extract = read_osm(write_map(tmp_path / "map.osm", nodes, ways))
-    flags = osm_network.netconvert_flags(extract, lefthand=False, walk=False)
-    merged = osm_network.build_network(extract, tmp_path / "map.osm", flags)[1].network.edges
+    flags = street_network.netconvert_flags(extract, lefthand=False, walk=False)
+    merged = street_network.build_network(extract, tmp_path / "map.osm", flags)[1].network.edges
     assert not road_levels.edge_levels([edge.id for edge in merged], extract)
     flags += road_levels.keep_levels_flags(extract)
-    text, streets = osm_network.build_network(extract, tmp_path / "map.osm", flags)
+    text, streets = street_network.build_network(extract, tmp_path / "map.osm", flags)
     levels = road_levels.edge_levels([edge.id for edge in streets.network.edges], extract)
     assert levels == {"2": 1, "-2": 1}
     west_m = np.array(streets.node_positions({1: degrees((0.0, 0.0))})[1])
@@ -241,7 +244,7 @@ def test_town01_on_a_raster(tmp_path: Path) -> None:
     rasterio = pytest.importorskip("rasterio")
     transform = rasterio.Affine(5, 0, 500_000 - 100, 0, -5, 5_400_000 + 100)
     path = write_tiff(tmp_path / "hill.tif", hill, transform=transform)
-    terrain = raster_terrain.read_terrain([path], MapContext(frame, box(-50, -380, 450, 50)))
+    terrain = rasters.read_terrain([path], MapContext(frame, box(-50, -380, 450, 50)))
     draped = drape_network(road_map.network, terrain, (200.0, -150.0), where=TOWN01)
     roads = read(draped.text, tmp_path)
     assert draped.zero_height_m == pytest.approx(320, abs=0.1)

@@ -12,9 +12,9 @@ import shapely
 
 from egvs.core.errors import InputError
 from egvs.formats.georeference import WorldFrame
-from egvs.importers import footprint_maps
+from egvs.importers.buildings import footprint_maps
 from egvs.importers.map_parts import Alignment, MapContext, SolidReader
-from egvs.importers.osm_solids import DEFAULT_BUILDING_M
+from egvs.importers.openstreetmap.solids import DEFAULT_BUILDING_M
 
 FRAME = WorldFrame("EPSG:25832", (-540_000.0, -5_630_000.0))
 CONTEXT = MapContext(FRAME, shapely.box(-100, -100, 100, 100))

@@ -13,10 +13,11 @@ from shapely.geometry import box
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.formats.georeference import WorldFrame
-from egvs.importers import landxml_terrain, raster_terrain
 from egvs.importers.alignment import check_used
-from egvs.importers.ground_heights import CombinedTerrain, TinTerrain, ground_points, tin_terrain
 from egvs.importers.map_parts import Alignment, MapContext, TerrainReader
+from egvs.importers.terrain import landxml as landxml_terrain
+from egvs.importers.terrain import rasters
+from egvs.importers.terrain.ground_heights import CombinedTerrain, TinTerrain, ground_points, tin_terrain
 from tests.formats.test_landxml import FACES, landxml
 from tests.formats.test_rasters import EAST, NORTH, plane_cells, plane_m, write_ascii, write_tiff
 
@@ -26,16 +27,16 @@ CONTEXT = MapContext(FRAME, WINDOW)
 
 
 def test_readers_know_their_files() -> None:
-    assert isinstance(raster_terrain, TerrainReader) and isinstance(landxml_terrain, TerrainReader)
-    assert raster_terrain.can_open(Path("a.tif"), b"II*\x00") and raster_terrain.can_open(Path("a.asc.gz"), b"ncols 2")
-    assert not raster_terrain.can_open(Path("a.xml"), b"<LandXML>")
+    assert isinstance(rasters, TerrainReader) and isinstance(landxml_terrain, TerrainReader)
+    assert rasters.can_open(Path("a.tif"), b"II*\x00") and rasters.can_open(Path("a.asc.gz"), b"ncols 2")
+    assert not rasters.can_open(Path("a.xml"), b"<LandXML>")
     assert landxml_terrain.can_open(Path("a.xml"), b"<LandXML>") and not landxml_terrain.can_open(
         Path("a.xml"), b"<osm>"
     )
 
 
 def test_raster_in_the_projection_of_the_network(tmp_path: Path) -> None:
-    terrain = raster_terrain.read_terrain([write_tiff(tmp_path / "a.tif", plane_cells())], CONTEXT)
+    terrain = rasters.read_terrain([write_tiff(tmp_path / "a.tif", plane_cells())], CONTEXT)
     xy_m = np.array([[5.0, 5.0], [33.0, 47.0], [114.0, 74.0]])
     assert terrain.height_m(xy_m) == pytest.approx(plane_m(xy_m[:, 0] + EAST, xy_m[:, 1] + NORTH), abs=1e-9)
     assert terrain.notes == (f"{tmp_path}/a.tif: terrain of 8 x 12 cells, 99.4 to 103.4 m high.",)
@@ -53,7 +54,7 @@ def test_raster_in_degrees(tmp_path: Path) -> None:
     cells = plane_m(x + EAST, y + NORTH).reshape(rows, columns)
     transform = rasterio.Affine(step, 0, west, 0, -step, north)
     path = write_tiff(tmp_path / "a.tif", cells, crs="EPSG:4326", transform=transform)
-    terrain = raster_terrain.read_terrain([path], CONTEXT)
+    terrain = rasters.read_terrain([path], CONTEXT)
     xy_m = np.random.default_rng(2).uniform([0, 0], [120, 80], (100, 2))
     assert terrain.height_m(xy_m) == pytest.approx(plane_m(xy_m[:, 0] + EAST, xy_m[:, 1] + NORTH), abs=1e-3)
 
@@ -68,7 +69,7 @@ def test_tiles_complete_each_other(tmp_path: Path) -> None:
     ]
     for path in paths:
         path.with_suffix(".prj").write_text("EPSG:32632")
-    terrain = raster_terrain.read_terrain(paths, CONTEXT)
+    terrain = rasters.read_terrain(paths, CONTEXT)
     xy_m = np.array([[20.0, 40.0], [57.0, 33.0], [100.0, 60.0]])
     assert terrain.height_m(xy_m) == pytest.approx(plane_m(xy_m[:, 0] + EAST, xy_m[:, 1] + NORTH), abs=1e-5)
     assert [note.rpartition(";")[2] for note in terrain.notes] == [" 48 cells have no data.", " 40 cells have no data."]
@@ -76,7 +77,7 @@ def test_tiles_complete_each_other(tmp_path: Path) -> None:
 
 def test_share_without_heights_is_reported(tmp_path: Path) -> None:
     path = write_tiff(tmp_path / "a.tif", plane_cells())
-    terrain = raster_terrain.read_terrain([path], MapContext(FRAME, box(0, 0, 240, 80)))
+    terrain = rasters.read_terrain([path], MapContext(FRAME, box(0, 0, 240, 80)))
     assert terrain.notes[-1] == "The terrain has no height in 50.0% of the region."
     assert np.isnan(terrain.height_m(np.array([[121.0, 10.0], [10.0, 81.0]]))).all()
 
@@ -87,9 +88,9 @@ def test_local_grid_needs_an_alignment(tmp_path: Path) -> None:
     cells = (np.arange(columns) + 0.5)[None, :] * 2.0 + np.zeros((rows, 1))  # 0.2 m a metre of local x
     path = write_ascii(tmp_path / "a.asc", cells, "xllcorner 0\nyllcorner 0\ncellsize 10\n")
     with pytest.raises(InputError, match=r"declares no coordinate reference system.*--align"):
-        raster_terrain.read_terrain([path], CONTEXT)
+        rasters.read_terrain([path], CONTEXT)
     turned = Alignment(np.array([[0.0, 0.0], [50.0, 0.0]]), np.array([[60.0, 10.0], [60.0, 60.0]]))
-    terrain = raster_terrain.read_terrain([path], MapContext(None, WINDOW, turned))
+    terrain = rasters.read_terrain([path], MapContext(None, WINDOW, turned))
     assert terrain.height_m(np.array([[30.0, 20.0], [20.0, 45.0]])) == pytest.approx([2.0, 7.0])
 
 
@@ -100,7 +101,7 @@ def test_local_grid_needs_an_alignment(tmp_path: Path) -> None:
 def test_rejects_rasters_elsewhere(context: MapContext, message: str, tmp_path: Path) -> None:
     path = write_tiff(tmp_path / "a.tif", plane_cells())
     with pytest.raises(InputError) as error:
-        raster_terrain.read_terrain([path], context)
+        rasters.read_terrain([path], context)
     assert message in str(error.value) and "a.tif" in str(error.value)
 
 
@@ -109,7 +110,7 @@ def test_rejects_other_files(tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match="expected a GeoTIFF or an ASCII grid, got a file that starts with b'no raster'"
     ):
-        raster_terrain.read_terrain([tmp_path / "a.tif"], CONTEXT)
+        rasters.read_terrain([tmp_path / "a.tif"], CONTEXT)
 
 
 def slow_tin_height(vertices: FloatArray, faces: np.ndarray, x: float, y: float) -> float:
@@ -231,7 +232,7 @@ def test_impossible_heights_are_rejected(tmp_path: Path) -> None:
     cells[3, 4] = -9999.0
     path = write_tiff(tmp_path / "a.tif", cells)
     with pytest.raises(InputError, match=r"a.tif: expected heights of -1,000 to 9,000 m, got -9999 m"):
-        raster_terrain.read_terrain([path], CONTEXT)
+        rasters.read_terrain([path], CONTEXT)
     corners = np.array([[EAST, NORTH, 50.0], [EAST + 50, NORTH, 50.0], [EAST, NORTH + 50, 5e6]])
     with pytest.raises(InputError, match=r"b.xml: expected heights of -1,000 to 9,000 m, got 5e\+06 m"):
         tin_terrain(corners, np.array([[0, 1, 2]]), "EPSG:32632", "b.xml", CONTEXT)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from egvs.formats import osm
-from egvs.importers import junctions, osm_network
+from egvs.importers import junctions
 from egvs.importers.junctions import JunctionRegion
+from egvs.importers.openstreetmap import street_network
 from egvs.traffic.network import Edge, Lane, Permission
 from tests.importers.small_maps import street, write_map
 from tests.traffic.test_demand import LOOP_NET
@@ -59,8 +60,8 @@ def test_street_that_merges_at_the_edge_of_the_region_brings_vehicles(tmp_path: 
     ways = [street("A Street", 1, 2, 3, 4), street("B Street", 2, 5), street("C Street", 3, 6)]
     path = write_map(tmp_path / "map.osm", nodes, ways)
     extract = osm.read_osm(path)
-    flags = osm_network.netconvert_flags(extract, lefthand=False, walk=False)
-    _, streets = osm_network.build_network(extract, path, flags)
+    flags = street_network.netconvert_flags(extract, lefthand=False, walk=False)
+    _, streets = street_network.build_network(extract, path, flags)
     x, y = next(j.at_m for j in streets.junctions if j.id == "2")
     flows = junctions.assumed_flows(streets, JunctionRegion((x, y), (60.0, 60.0)))
     edges = {edge.id: edge for edge in streets.network.edges}

@@ -18,8 +18,10 @@ from egvs.formats import lanelet2 as lanelet2_format
 from egvs.formats import lanelet2_projection
 from egvs.formats.georeference import WorldFrame
 from egvs.formats.lanelet2_graph import LaneletGraph, LaneletKey, build_graph
-from egvs.importers import junctions, lanelet2, lanelet2_rules
-from egvs.importers.lanelet2_network import read_network_text
+from egvs.importers import junctions
+from egvs.importers.lanelet2 import reader as lanelet2
+from egvs.importers.lanelet2 import rules
+from egvs.importers.lanelet2.network import read_network_text
 from egvs.importers.map_parts import RoadMap, RoadOptions
 from egvs.traffic import sumo
 from egvs.traffic.capacity import find_capacity
@@ -75,7 +77,7 @@ class BuiltMap:
     def graph(self) -> LaneletGraph:
         lanelet_map = lanelet2_format.read_lanelet2(self.path)
         points = lanelet2_projection.project_points(lanelet_map, self.path)
-        return build_graph(lanelet_map, points.xyz_m, lanelet2_rules.is_for_motor_vehicles)
+        return build_graph(lanelet_map, points.xyz_m, rules.is_for_motor_vehicles)
 
     def note(self, start: str) -> str:
         return next(note for note in self.roads.notes if note.startswith(start))

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from egvs.core.errors import InputError
-from egvs.importers import lanelet2
-from egvs.importers.lanelet2_network import read_network_text
+from egvs.importers.lanelet2 import reader as lanelet2
+from egvs.importers.lanelet2.network import read_network_text
 from egvs.importers.map_parts import RoadOptions
 from tests.fuzz.mutating import mutant
 from tests.importers.lanelet2_maps import MapWriter, make_crossing

@@ -11,8 +11,10 @@ from shapely.geometry import box
 
 from egvs.core.errors import EgvsError
 from egvs.formats.georeference import WorldFrame
-from egvs.importers import landxml_terrain, opendrive, raster_terrain
 from egvs.importers.map_parts import Alignment, MapContext, RoadOptions
+from egvs.importers.opendrive import reader as opendrive
+from egvs.importers.terrain import landxml as landxml_terrain
+from egvs.importers.terrain import rasters
 from tests.formats.test_landxml import FACES, landxml
 from tests.formats.test_rasters import EAST, NORTH, plane_cells, write_ascii, write_tiff
 from tests.fuzz.mutating import mutant
@@ -46,11 +48,11 @@ def _read_aligned(path: Path) -> None:
 
     here = np.array([[EAST, NORTH], [EAST + 100, NORTH]])
     context = MapContext(None, CONTEXT.window, Alignment(here, here - [EAST, NORTH]))
-    raster_terrain.read_terrain([path], context).height_m(np.array([[30.0, 30.0]]))
+    rasters.read_terrain([path], context).height_m(np.array([[30.0, 30.0]]))
 
 
 READERS: dict[str, tuple[Callable[[Path], bytes], Callable[[Path], object]]] = {
-    "a.tif": (_tiff, lambda path: raster_terrain.read_terrain([path], CONTEXT)),
+    "a.tif": (_tiff, lambda path: rasters.read_terrain([path], CONTEXT)),
     "a.asc": (_ascii, _read_aligned),
     "a.xml": (_landxml, lambda path: landxml_terrain.read_terrain([path], CONTEXT)),
     "a.xodr": (_opendrive, lambda path: opendrive.read_roads(path, RoadOptions(walk=True))),

@@ -7,7 +7,8 @@ import pytest
 
 from egvs.core import files
 from egvs.core.errors import InputError
-from egvs.importers import map_readers, openstreetmap, sumo_network
+from egvs.importers import map_readers, sumo_network
+from egvs.importers.openstreetmap import reader as openstreetmap
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
 NETWORK = SCENARIOS / "roundabout" / "network.net.xml"

@@ -10,7 +10,7 @@ import shapely
 import trimesh
 
 from egvs.core.errors import InputError
-from egvs.importers import mesh_maps
+from egvs.importers.buildings import mesh_maps
 from egvs.importers.map_parts import Alignment, MapContext, SolidReader
 
 QUARTER_TURN = Alignment(np.array([[0.0, 0.0], [10.0, 0.0]]), np.array([[100.0, 50.0], [100.0, 60.0]]))

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from egvs.core.grid import FloatArray, Roi
-from egvs.importers.moving_points import StationScan, group_by_station, not_shared, seen_through
+from egvs.importers.point_clouds.moving_points import StationScan, group_by_station, not_shared, seen_through
 from egvs.sensors.sensor import Sensor
 from egvs.world.mesh import World
 from egvs.world.ray_casting import Caster

@@ -13,16 +13,11 @@ from shapely.geometry import LineString, MultiLineString, Point
 from egvs.artefacts import parquet
 from egvs.core.errors import InputError
 from egvs.formats import osm
-from egvs.importers import (
-    assumed_traffic,
-    building_heights,
-    junctions,
-    new_scenario,
-    osm_network,
-    osm_solids,
-    scenario_files,
-)
+from egvs.importers import assumed_traffic, junctions, new_scenario, scenario_files
+from egvs.importers.buildings import building_heights
 from egvs.importers.new_scenario import NewScenario
+from egvs.importers.openstreetmap import solids as osm_solids
+from egvs.importers.openstreetmap import street_network
 from egvs.runs import run
 from egvs.scenario import loading
 from egvs.scenario.traffic_config import CountConfig
@@ -65,8 +60,8 @@ def with_far_objects(folder: Path) -> Path:
 def write_all_solids(folder: Path, extract: Path) -> None:
     """Replace the solids of a scenario by all solids of the extract."""
     read = osm.read_osm(extract)
-    flags = osm_network.netconvert_flags(read, lefthand=False, walk=False)
-    _, streets = osm_network.build_network(read, extract, flags)
+    flags = street_network.netconvert_flags(read, lefthand=False, walk=False)
+    _, streets = street_network.build_network(read, extract, flags)
     mapped, counts = osm_solids.map_solids(read, streets)
     solids = building_heights.heights_from_neighbours(mapped, counts, ())
     text = scenario_files.solids_geojson(solids, counts)

@@ -21,7 +21,7 @@ from egvs.importers import alignment, static_objects, sumo_network
 from egvs.importers.map_parts import MapContext, MappedMesh, SolidMap
 from egvs.importers.map_readers import MapFile
 from egvs.importers.new_scenario import assumed_sizes, scenario_notes
-from egvs.importers.osm_solids import ImportCounts, MappedSolid
+from egvs.importers.openstreetmap.solids import ImportCounts, MappedSolid
 from egvs.importers.road_source import NetworkRoads
 from egvs.importers.static_objects import REPLACED
 from egvs.scenario import loading

@@ -14,9 +14,9 @@ from scipy.spatial import KDTree
 from egvs.core.errors import InputError
 from egvs.formats.georeference import WorldFrame
 from egvs.formats.opendrive import read_opendrive
-from egvs.importers import opendrive
 from egvs.importers.map_parts import RoadMap, RoadOptions, RoadReader
-from egvs.importers.opendrive_check import compare_with_map, read_made_network
+from egvs.importers.opendrive import reader as opendrive
+from egvs.importers.opendrive.check import compare_with_map, read_made_network
 from egvs.traffic import network, sumo
 from egvs.traffic.network import Network
 from tests.importers import opendrive_maps as maps

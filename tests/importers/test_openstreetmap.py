@@ -20,8 +20,9 @@ from shapely.geometry import LineString, Point, shape
 from egvs.cli import app, new_summary
 from egvs.core.errors import InputError
 from egvs.formats import osm
-from egvs.importers import assumed_traffic, new_scenario, openstreetmap
-from egvs.importers.osm_solids import ImportCounts
+from egvs.importers import assumed_traffic, new_scenario
+from egvs.importers.openstreetmap import reader as openstreetmap
+from egvs.importers.openstreetmap.solids import ImportCounts
 from egvs.scenario import loading
 from egvs.sensors import sites
 from egvs.stages import check

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from egvs.formats.osm import OsmExtract, read_osm
-from egvs.importers import osm_network
-from egvs.importers.network_heights import find_shapes
-from egvs.importers.osm_elevation import ELEVATION_FLAGS, MIN_SHARE, add_elevations, read_elevations
+from egvs.importers.openstreetmap import street_network
+from egvs.importers.openstreetmap.elevation import ELEVATION_FLAGS, MIN_SHARE, add_elevations, read_elevations
+from egvs.importers.terrain.network_heights import find_shapes
 from tests.importers.small_maps import degrees, street, write_map
 
 # a street along x every 50 m (nodes 1 to 9), another that begins at its node 5 and leads north (10, 11)
@@ -73,9 +73,9 @@ def test_network_has_the_heights_also_where_streets_are_cut(tmp_path: Path) -> N
     steep = {node: 200 + 0.3 * NODES[node][0] for node in NODES}
     raw = extract(tmp_path, steep)
     elevated = add_elevations(raw, read_elevations(raw).heights_m)
-    cut = osm_network.cut_surroundings(elevated, degrees((0.0, 0.0)), 170.0)
-    flags = [*osm_network.netconvert_flags(cut, lefthand=False, walk=False), *ELEVATION_FLAGS]
-    text, streets = osm_network.build_network(cut, tmp_path / "map.osm", flags)
+    cut = street_network.cut_surroundings(elevated, degrees((0.0, 0.0)), 170.0)
+    flags = [*street_network.netconvert_flags(cut, lefthand=False, walk=False), *ELEVATION_FLAGS]
+    text, streets = street_network.build_network(cut, tmp_path / "map.osm", flags)
     middle = np.array(streets.node_positions({5: degrees((0.0, 0.0))})[5])
     ends = []
     for shape in find_shapes(text):

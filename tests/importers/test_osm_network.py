@@ -7,15 +7,15 @@ import pytest
 
 from egvs.formats import osm
 from egvs.formats.osm import Bounds, OsmExtract, Way
-from egvs.importers import osm_network
+from egvs.importers.openstreetmap import street_network
 
 CENTRE = (52.0, 10.0)
 
 
 def node(east_m: float, north_m: float) -> tuple[float, float]:
     """Latitude, longitude of a place beside the middle."""
-    lat = CENTRE[0] + math.degrees(north_m / osm_network.EARTH_M)
-    return lat, CENTRE[1] + math.degrees(east_m / osm_network.EARTH_M / math.cos(math.radians(CENTRE[0])))
+    lat = CENTRE[0] + math.degrees(north_m / street_network.EARTH_M)
+    return lat, CENTRE[1] + math.degrees(east_m / street_network.EARTH_M / math.cos(math.radians(CENTRE[0])))
 
 
 def extract(ways: dict[int, list[tuple[float, float]]], tags: dict[int, dict[str, str]] | None = None) -> OsmExtract:
@@ -39,13 +39,13 @@ def lines_m(cut: OsmExtract) -> dict[int, list[tuple[float, float]]]:
 
     def to_metres(lat: float, lon: float) -> tuple[float, float]:
         east, north = math.radians(lon - CENTRE[1]) * shrink, math.radians(lat - CENTRE[0])
-        return round(east * osm_network.EARTH_M, 1), round(north * osm_network.EARTH_M, 1)
+        return round(east * street_network.EARTH_M, 1), round(north * street_network.EARTH_M, 1)
 
     return {name: [to_metres(*cut.nodes[n]) for n in way.nodes] for name, way in cut.ways.items()}
 
 
 def test_streets_end_on_the_circle() -> None:
-    cut = osm_network.cut_surroundings(
+    cut = street_network.cut_surroundings(
         extract({7: [(-500, 0), (0, 0), (80, 0)], 8: [(0, -90), (0, 0), (0, 200)]}), CENTRE, 100
     )
     assert lines_m(cut) == {7: [(-100, 0), (0, 0), (80, 0)], 8: [(0, -90), (0, 0), (0, 100)]}
@@ -54,22 +54,22 @@ def test_streets_end_on_the_circle() -> None:
 def test_longer_piece_of_street_keeps_its_id() -> None:
     way = [(-50, 0), (0, 0), (60, 0), (300, 0), (300, 80), (0, 80), (0, 70)]
     joining = [(0, 0), (0, 70)]
-    cut = lines_m(osm_network.cut_surroundings(extract({7: way, 9: joining}), CENTRE, 100))
+    cut = lines_m(street_network.cut_surroundings(extract({7: way, 9: joining}), CENTRE, 100))
     assert cut == {7: [(-50, 0), (0, 0), (60, 0), (100, 0)], 9: joining, 10: [(60, 80), (0, 80), (0, 70)]}
 
 
 def test_cuts_street_across_circle_without_node_inside() -> None:
     ways = {7: [(-300, 60), (300, 60)], 8: [(0, 0), (0, 50)]}
-    everything = lines_m(osm_network.cut_surroundings(extract(ways, {8: {"highway": "footway"}}), CENTRE, 100))
+    everything = lines_m(street_network.cut_surroundings(extract(ways, {8: {"highway": "footway"}}), CENTRE, 100))
     assert everything[8] == ways[8]  # a path goes where it likes
     assert everything[7] == [(-80, 60), (80, 60)]
 
 
 def test_drops_roads_connected_only_outside_circle() -> None:
     ways = {7: [(0, 0), (300, 0)], 8: [(0, 60), (300, 60)], 9: [(300, 0), (300, 60)], 10: [(5, 5), (9, 5), (5, 9)]}
-    cut = osm_network.cut_surroundings(extract(ways, {10: {"building": "yes"}}), CENTRE, 100)
+    cut = street_network.cut_surroundings(extract(ways, {10: {"building": "yes"}}), CENTRE, 100)
     assert lines_m(cut) == {7: [(0, 0), (100, 0)], 10: ways[10]}
-    assert osm_network.cut_surroundings(extract(ways), CENTRE, 1000).ways.keys() >= {7, 8, 9}
+    assert street_network.cut_surroundings(extract(ways), CENTRE, 1000).ways.keys() >= {7, 8, 9}
 
 
 PROGRAMS = """<net version="1.20">
@@ -85,7 +85,7 @@ PROGRAMS = """<net version="1.20">
 def test_longest_signal_program_counts_planned_durations(tmp_path: Path, phases: int, longest_s: float) -> None:
     path = tmp_path / "n.net.xml"
     path.write_text(PROGRAMS.format('<phase duration="17" minDur="5" maxDur="50" state="G"/>' * phases))
-    assert osm_network.longest_program_s(path) == longest_s
+    assert street_network.longest_program_s(path) == longest_s
 
 
 @pytest.mark.parametrize(("longest_s", "runs"), [(120.0, 1), (121.0, 2)])
@@ -93,16 +93,16 @@ def test_signals_are_not_joined_if_a_program_gets_too_long(
     monkeypatch: pytest.MonkeyPatch, longest_s: float, runs: int
 ) -> None:
     calls = []
-    convert = osm_network.sumo.run_netconvert
+    convert = street_network.sumo.run_netconvert
 
     def recorded(arguments: list[str], folder: Path, name: str) -> None:
         calls.append(list(arguments))
         convert(arguments, folder, name)
 
-    monkeypatch.setattr(osm_network.sumo, "run_netconvert", recorded)
-    monkeypatch.setattr(osm_network, "longest_program_s", lambda _: longest_s)
+    monkeypatch.setattr(street_network.sumo, "run_netconvert", recorded)
+    monkeypatch.setattr(street_network, "longest_program_s", lambda _: longest_s)
     small = osm.read_osm(Path(__file__).parent / "data" / "small.osm")
-    flags = osm_network.netconvert_flags(small, lefthand=False, walk=False)
-    osm_network.build_network(small, Path("small.osm"), flags)
+    flags = street_network.netconvert_flags(small, lefthand=False, walk=False)
+    street_network.build_network(small, Path("small.osm"), flags)
     assert [("--tls.join" in arguments) for arguments in calls] == [True, False][:runs]
     assert set(calls[0]) - set(calls[-1]) == ({"--tls.join"} if runs == 2 else set())

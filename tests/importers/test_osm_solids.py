@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from egvs.formats.osm import Bounds, OsmExtract, Tags, Way
-from egvs.importers import osm_solids
-from egvs.importers.osm_solids import ImportCounts, MappedSolid, find_buildings
+from egvs.importers.openstreetmap import solids as osm_solids
+from egvs.importers.openstreetmap.solids import ImportCounts, MappedSolid, find_buildings
 
 XY = {1: (0.0, 0.0), 2: (10.0, 0.0), 3: (10.0, 10.0), 4: (0.0, 10.0)}
 

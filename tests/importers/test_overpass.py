@@ -15,7 +15,9 @@ import pytest
 
 from egvs._version import __version__
 from egvs.core.errors import InputError
-from egvs.importers import assumed_traffic, junctions, openstreetmap, overpass
+from egvs.importers import assumed_traffic, junctions
+from egvs.importers.openstreetmap import overpass
+from egvs.importers.openstreetmap import reader as openstreetmap
 from egvs.traffic.capacity import Capacity, TrialRun
 from tests.importers.overpass_server import Respond, overpass_server, recorded_answer, send
 

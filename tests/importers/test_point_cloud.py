@@ -18,10 +18,10 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, Roi
 from egvs.formats.georeference import WorldFrame
 from egvs.formats.point_clouds import write_points
-from egvs.importers import point_cloud
-from egvs.importers.as_built_view import AsBuiltMap, unseen_shares
 from egvs.importers.map_parts import Alignment, MapContext, MappedMesh
-from egvs.importers.moving_points import StationScan
+from egvs.importers.point_clouds import reader as point_cloud
+from egvs.importers.point_clouds.as_built_view import AsBuiltMap, unseen_shares
+from egvs.importers.point_clouds.moving_points import StationScan
 from egvs.world.mesh import World
 from egvs.world.ray_casting import Caster
 from egvs.world.static_world import build_world

@@ -12,9 +12,10 @@ import pytest
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.formats.georeference import WorldFrame
-from egvs.importers import recorded_signals, signal_programs
 from egvs.importers.new_scenario import NewScenarioOptions, create_scenario
-from egvs.importers.recorded_signals import RecordedSignals, SignalRecord, read_signals
+from egvs.importers.recorded import signal_programs
+from egvs.importers.recorded import signals as recorded_signals
+from egvs.importers.recorded.signals import RecordedSignals, SignalRecord, read_signals
 from egvs.traffic import sumo
 from tests.importers.test_demand_from_tracks import write_recording
 from tests.traffic.crossing import NETWORK

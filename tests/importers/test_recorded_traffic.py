@@ -10,7 +10,7 @@ import pytest
 import egvs
 from egvs.core.errors import InputError
 from egvs.importers.new_scenario import NewScenarioOptions, create_scenario
-from egvs.importers.recorded_traffic import TrackFiles
+from egvs.importers.recorded.traffic import TrackFiles
 from egvs.tracks.model import Tracks
 from tests.importers.small_maps import degrees, street, write_map
 from tests.tracks.boxes import assert_same_boxes, moving_boxes
@@ -184,7 +184,7 @@ def test_k733_uses_the_tracks(k733: Path) -> None:
 
 @pytest.mark.slow
 def test_tracks_and_map_of_k733_agree(k733: Path) -> None:
-    from egvs.importers import recorded_traffic
+    from egvs.importers.recorded import traffic as recorded_traffic
 
     recorded = recorded_traffic.read_for_summary(egvs.load(k733))
     assert recorded.alignment is not None

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from egvs.artefacts.run_record import RunRecord
-from egvs.importers import signal_programs
 from egvs.importers.new_scenario import NewScenarioOptions, create_scenario
-from egvs.importers.recorded_signals import GroupOfEdges, RecordedSignals, SignalRecord
-from egvs.importers.signal_programs import Replay
+from egvs.importers.recorded import signal_programs
+from egvs.importers.recorded.signal_programs import Replay
+from egvs.importers.recorded.signals import GroupOfEdges, RecordedSignals, SignalRecord
 from egvs.traffic import sumo
 from egvs.traffic.network import read_net_xml
 from tests.importers.test_demand_from_tracks import write_recording

@@ -11,7 +11,8 @@ import pytest
 from shapely.geometry import LineString
 
 from egvs.formats import osm
-from egvs.importers import junctions, osm_network, osm_solids, road_levels
+from egvs.importers import junctions, road_levels
+from egvs.importers.openstreetmap import solids, street_network
 from egvs.traffic import network as road_network
 from tests.importers.creation import create_scenario
 
@@ -25,8 +26,8 @@ FLYOVER: list[XY] = [(-180, -10), (-60, -20), (60, 20), (190, 40)]
 
 
 def degrees(east_m: float, north_m: float) -> tuple[float, float]:
-    lat_deg = 52.0 + math.degrees(north_m / osm_network.EARTH_M)
-    return lat_deg, 10.0 + math.degrees(east_m / osm_network.EARTH_M / math.cos(math.radians(52.0)))
+    lat_deg = 52.0 + math.degrees(north_m / street_network.EARTH_M)
+    return lat_deg, 10.0 + math.degrees(east_m / street_network.EARTH_M / math.cos(math.radians(52.0)))
 
 
 class Extract:
@@ -79,8 +80,8 @@ def with_flyover(**tags: str) -> Extract:
 def other_levels(path: Path) -> road_levels.OtherLevels:
     """Return what is above and below the junction at node 1."""
     extract = osm.read_osm(path)
-    flags = osm_network.netconvert_flags(extract, lefthand=False, walk=False)
-    _, streets = osm_network.build_network(extract, path, flags)
+    flags = street_network.netconvert_flags(extract, lefthand=False, walk=False)
+    _, streets = street_network.build_network(extract, path, flags)
     junction = next(junction for junction in streets.junctions if junction.id == "1")
     return road_levels.find_other_levels(extract, streets, junction, junctions.region_around(junction).area)
 
@@ -145,10 +146,10 @@ def test_width_of_deck(tags: dict[str, str], width_m: float) -> None:
     assert deck.radius_m == width_m / 2
 
 
-def make_decks(tags: dict[str, str]) -> list[osm_solids.MappedSolid]:
+def make_decks(tags: dict[str, str]) -> list[solids.MappedSolid]:
     """Return the deck of a bridge 50 m long."""
     way = osm.Way(1, (1, 2), {"bridge": "yes", **tags})
-    return list(osm_solids.make_decks([way], {1: (0.0, 0.0), 2: (50.0, 0.0)}, osm_solids.ImportCounts()))
+    return list(solids.make_decks([way], {1: (0.0, 0.0), 2: (50.0, 0.0)}, solids.ImportCounts()))
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,9 @@ from shapely.geometry import LineString, Point
 
 from egvs.city import creation
 from egvs.formats import osm
-from egvs.importers import assumed_traffic, junctions, osm_network
+from egvs.importers import assumed_traffic, junctions
 from egvs.importers.junctions import Streets
+from egvs.importers.openstreetmap import street_network
 from egvs.scenario import loading
 from egvs.traffic.capacity import Capacity, TrialRun
 from egvs.traffic.movements import MovementNames
@@ -56,8 +57,8 @@ def ring_map(path: Path, radius_m: float = 15.0, *, divided: bool = False) -> Pa
 def read(path: Path) -> Streets:
     """The streets of a map."""
     extract = osm.read_osm(path)
-    flags = osm_network.netconvert_flags(extract, lefthand=False, walk=False)
-    return osm_network.build_network(extract, path, flags)[1]
+    flags = street_network.netconvert_flags(extract, lefthand=False, walk=False)
+    return street_network.build_network(extract, path, flags)[1]
 
 
 @pytest.fixture(scope="module")

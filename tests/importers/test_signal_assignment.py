@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from egvs.importers.recorded_signals import SignalRecord
-from egvs.importers.signal_assignment import (
+from egvs.importers.recorded.signal_assignment import (
     Approach,
     Crossing,
     RecordedMotion,
@@ -14,6 +13,7 @@ from egvs.importers.signal_assignment import (
     green_share,
     guess_lights,
 )
+from egvs.importers.recorded.signals import SignalRecord
 
 
 def record(green_from_s: float, green_to_s: float) -> SignalRecord:

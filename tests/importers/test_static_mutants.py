@@ -18,7 +18,7 @@ import trimesh
 
 from egvs.core.errors import InputError
 from egvs.formats.citygml import read_relief
-from egvs.importers import citygml, cityjson, footprint_maps, mesh_maps
+from egvs.importers.buildings import citygml, cityjson, footprint_maps, mesh_maps
 from egvs.importers.map_parts import Alignment, MapContext, SolidMap
 from tests.formats.small_city_models import city_model, city_object, multi_surface, nest, polygon
 from tests.fuzz.mutating import mutant

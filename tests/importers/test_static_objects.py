@@ -9,7 +9,7 @@ import pytest
 
 from egvs.core.errors import InputError
 from egvs.importers.map_parts import MappedMesh, SolidMap
-from egvs.importers.point_cloud import OBJECT_KIND
+from egvs.importers.point_clouds.reader import OBJECT_KIND
 from egvs.importers.static_objects import ReadMap, _lower_to_ground
 
 WALL = np.array([[0.0, 0.0, 40.0], [4.0, 0.0, 40.0], [4.0, 0.0, 43.0]])

@@ -10,8 +10,9 @@ import pytest
 
 from egvs.core.errors import InputError
 from egvs.formats import osm
-from egvs.importers import assumed_traffic, junctions, osm_network, street_counts
+from egvs.importers import assumed_traffic, junctions, street_counts
 from egvs.importers.junctions import StreetJunction, Streets
+from egvs.importers.openstreetmap import street_network
 from egvs.importers.street_counts import StreetCounts
 from egvs.scenario import loading
 from tests.importers.overpass_server import SMALL
@@ -26,8 +27,8 @@ Read = Callable[..., StreetCounts]
 def crossing() -> tuple[Streets, StreetJunction]:
     """North Street and East Street cross."""
     extract = osm.read_osm(SMALL)
-    flags = osm_network.netconvert_flags(extract, lefthand=False, walk=False)
-    _, streets = osm_network.build_network(extract, SMALL, flags)
+    flags = street_network.netconvert_flags(extract, lefthand=False, walk=False)
+    _, streets = street_network.build_network(extract, SMALL, flags)
     junction = junctions.largest_junction(streets)
     assert junction is not None
     return streets, junction

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from egvs.formats import osm
-from egvs.importers import junctions, osm_network
+from egvs.importers import junctions
+from egvs.importers.openstreetmap import street_network
 from egvs.report import approach_map
 from egvs.report.approach_map import ApproachLabel
 from egvs.report.svg_figures import Box, MapFrame
@@ -27,8 +28,8 @@ COUNTS = (
 @pytest.mark.system
 def test_labels_name_side_street_and_vehicles_per_hour(tmp_path: Path) -> None:
     extract = osm.read_osm(SMALL)
-    flags = osm_network.netconvert_flags(extract, lefthand=False, walk=False)
-    network, streets = osm_network.build_network(extract, SMALL, flags)
+    flags = street_network.netconvert_flags(extract, lefthand=False, walk=False)
+    network, streets = street_network.build_network(extract, SMALL, flags)
     (tmp_path / "network.net.xml").write_text(network)
     junction = junctions.largest_junction(streets)
     assert junction is not None

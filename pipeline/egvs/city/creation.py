@@ -32,7 +32,7 @@ from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.formats.osm import read_osm as read_extract
-from egvs.importers import assumed_traffic, junctions, new_scenario, osm_network, osm_solids, scenario_files
+from egvs.importers import assumed_traffic, junctions, new_scenario, scenario_files
 from egvs.importers.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, TRAFFIC_LEVELS
 from egvs.importers.junctions import (
     HEIGHTS_M,
@@ -42,9 +42,11 @@ from egvs.importers.junctions import (
     StreetJunction,
     Streets,
 )
-from egvs.importers.openstreetmap import check_inside_extract
-from egvs.importers.osm_network import ATTRIBUTION, NETWORK_FILE, NetworkExcerpts
-from egvs.importers.osm_solids import ImportCounts, MappedSolid
+from egvs.importers.openstreetmap import solids as osm_solids
+from egvs.importers.openstreetmap import street_network as osm_network
+from egvs.importers.openstreetmap.reader import check_inside_extract
+from egvs.importers.openstreetmap.solids import ImportCounts, MappedSolid
+from egvs.importers.openstreetmap.street_network import ATTRIBUTION, NETWORK_FILE, NetworkExcerpts
 from egvs.importers.scenario_files import PITCHES_DEG, SITES_FILE, STATICS_FILE, TomlTable, reachable_area
 from egvs.scenario.loading import load
 from egvs.scenario.model import SCENARIO_FILE

@@ -11,10 +11,11 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from egvs.cli.console import WIDE, Column, console, make_table
-from egvs.importers import junctions, recorded_traffic
+from egvs.importers import junctions
 from egvs.importers.new_scenario import NewScenario
-from egvs.importers.osm_network import ATTRIBUTION
-from egvs.importers.osm_solids import OUT_OF_RANGE, ImportCounts
+from egvs.importers.openstreetmap.solids import OUT_OF_RANGE, ImportCounts
+from egvs.importers.openstreetmap.street_network import ATTRIBUTION
+from egvs.importers.recorded import traffic as recorded_traffic
 from egvs.importers.scenario_files import PITCHES_DEG, SENSOR, STATICS_FILE
 from egvs.traffic.estimates import MIN_OBSERVATIONS
 from egvs.traffic.recorded_tracks import track_warnings
@@ -22,8 +23,8 @@ from egvs.traffic.recorded_tracks import track_warnings
 if TYPE_CHECKING:
     from egvs.city.creation import NewCity, NewJunction
     from egvs.importers.assumed_traffic import AssumedTraffic
-    from egvs.importers.demand_from_tracks import TrackDemand
     from egvs.importers.junctions import Streets
+    from egvs.importers.recorded.demand import TrackDemand
     from egvs.importers.static_objects import MapSummary
 
 _FILE_WIDTH = 160

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from egvs.core.grid import FloatArray
 from egvs.importers.map_parts import MappedMesh, Terrain
-from egvs.importers.network_heights import attribute, sample_line
+from egvs.importers.terrain.network_heights import attribute, sample_line
 from egvs.traffic.network import LANE_WIDTH_M, Shape
 
 CLEARANCE_M = 1.5

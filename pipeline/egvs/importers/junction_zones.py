@@ -26,7 +26,7 @@ from shapely.geometry.base import BaseGeometry
 
 from egvs.core.grid import XY, FloatArray
 from egvs.importers.junctions import JunctionRegion, StreetJunction, Streets
-from egvs.importers.osm_network import NETWORK_FILE
+from egvs.importers.openstreetmap.street_network import NETWORK_FILE
 from egvs.traffic.directions import compass, lane_heading
 from egvs.traffic.network import LANE_WIDTH_M, Edge, Lane, Network
 

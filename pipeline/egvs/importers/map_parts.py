@@ -22,7 +22,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.formats.georeference import WorldFrame, parse_crs
 from egvs.importers.junctions import Streets
-from egvs.importers.osm_solids import ImportCounts, MappedSolid
+from egvs.importers.openstreetmap.solids import ImportCounts, MappedSolid
 from egvs.scenario.fields import MAX_COORDINATE_M
 
 HEAD_BYTES = 4096

@@ -36,38 +36,36 @@ from egvs.formats import ply
 from egvs.importers import (
     assumed_traffic,
     bridge_decks,
-    demand_from_tracks,
-    ground_heights,
-    ground_reference,
     junction_zones,
     junctions,
     map_readers,
-    openstreetmap,
-    osm_solids,
-    overpass,
-    recorded_signals,
-    recorded_traffic,
     scenario_files,
-    signal_programs,
     static_objects,
     street_counts,
 )
 from egvs.importers.alignment import PointPair, check_used, make_alignment
 from egvs.importers.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, AssumedTraffic
-from egvs.importers.building_heights import ASSUMED, NEIGHBOURS, SURFACE_MODEL
-from egvs.importers.demand_from_tracks import TrackDemand
-from egvs.importers.ground_heights import HIGHEST_M, LOWEST_M
+from egvs.importers.buildings.building_heights import ASSUMED, NEIGHBOURS, SURFACE_MODEL
 from egvs.importers.junction_zones import Zone
 from egvs.importers.junctions import JunctionRegion, KerbsidePole, StreetJunction, Streets
 from egvs.importers.map_parts import MapContext, RoadOptions, Terrain
 from egvs.importers.map_readers import MapFile, MapFiles
-from egvs.importers.openstreetmap import OsmRoads
-from egvs.importers.osm_network import ATTRIBUTION, NETWORK_FILE
-from egvs.importers.osm_solids import ImportCounts
-from egvs.importers.overpass import DownloadedExtract
-from egvs.importers.recorded_motion import MatchedRecording, match_recording
-from egvs.importers.recorded_traffic import TrackFiles
-from egvs.importers.relief import Relief, ground_surface
+from egvs.importers.openstreetmap import overpass
+from egvs.importers.openstreetmap import reader as openstreetmap
+from egvs.importers.openstreetmap import solids as osm_solids
+from egvs.importers.openstreetmap.overpass import DownloadedExtract
+from egvs.importers.openstreetmap.reader import OsmRoads
+from egvs.importers.openstreetmap.solids import ImportCounts
+from egvs.importers.openstreetmap.street_network import ATTRIBUTION, NETWORK_FILE
+from egvs.importers.recorded import demand as demand_from_tracks
+from egvs.importers.recorded import signal_programs
+from egvs.importers.recorded import signals as recorded_signals
+from egvs.importers.recorded import traffic as recorded_traffic
+from egvs.importers.recorded.demand import TrackDemand
+from egvs.importers.recorded.motion import MatchedRecording, match_recording
+from egvs.importers.recorded.signal_assignment import RecordedMotion
+from egvs.importers.recorded.signal_programs import Replay, SignalPlan
+from egvs.importers.recorded.traffic import TrackFiles
 from egvs.importers.road_source import NetworkRoads, RoadSource
 from egvs.importers.scenario_files import (
     PITCHES_DEG,
@@ -80,10 +78,11 @@ from egvs.importers.scenario_files import (
     TomlTable,
     reachable_area,
 )
-from egvs.importers.signal_assignment import RecordedMotion
-from egvs.importers.signal_programs import Replay, SignalPlan
 from egvs.importers.static_objects import MapSummary, ReadMap, StaticObjects, SurfaceModel
 from egvs.importers.street_counts import StreetCounts
+from egvs.importers.terrain import ground_heights, ground_reference
+from egvs.importers.terrain.ground_heights import HIGHEST_M, LOWEST_M
+from egvs.importers.terrain.relief import Relief, ground_surface
 from egvs.scenario.loading import load
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, CountConfig, TrafficConfig
@@ -446,7 +445,7 @@ def download_map(
     options
         Options of :func:`create_scenario`.
     url
-        Address of the Overpass server, see :func:`egvs.importers.overpass.download_extract`.
+        Address of the Overpass server, see :func:`egvs.importers.openstreetmap.overpass.download_extract`.
 
     Raises
     ------

@@ -30,7 +30,7 @@ from shapely.geometry.base import BaseGeometry
 from egvs.core.grid import XY
 from egvs.formats.osm import OsmExtract, Tags, Way, parse_number
 from egvs.importers.junctions import StreetJunction, Streets
-from egvs.importers.osm_network import is_road
+from egvs.importers.openstreetmap.street_network import is_road
 
 MARGIN_M = 20.0
 """How far from the region of interest roads are cut: more than half a carriageway, and than the region moves then."""

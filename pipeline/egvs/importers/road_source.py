@@ -13,7 +13,7 @@ from egvs.core.errors import InputError, RunError
 from egvs.importers import junctions
 from egvs.importers.junctions import StreetJunction, Streets
 from egvs.importers.map_parts import RoadMap
-from egvs.importers.osm_network import NETWORK_FILE
+from egvs.importers.openstreetmap.street_network import NETWORK_FILE
 from egvs.traffic import sumo
 
 _GENERATED = re.compile(r"<!-- generated on .*?-->\n*", re.DOTALL)

@@ -22,8 +22,8 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.importers import junctions
 from egvs.importers.junctions import JunctionRegion, KerbsidePole
-from egvs.importers.osm_network import ATTRIBUTION, NETWORK_FILE
-from egvs.importers.osm_solids import ImportCounts, MappedSolid
+from egvs.importers.openstreetmap.solids import ImportCounts, MappedSolid
+from egvs.importers.openstreetmap.street_network import ATTRIBUTION, NETWORK_FILE
 from egvs.scenario.fields import Name
 from egvs.scenario.model import RoiConfig
 from egvs.scenario.score_config import DEFAULT_SCORE, ScoreConfig

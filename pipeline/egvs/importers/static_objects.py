@@ -25,14 +25,16 @@ from shapely.geometry.base import BaseGeometry
 
 from egvs.core.errors import InputError
 from egvs.core.grid import XY, FloatArray, Roi
-from egvs.importers import building_heights, openstreetmap, osm_solids
-from egvs.importers.as_built_view import AsBuiltMap
+from egvs.importers.buildings import building_heights
 from egvs.importers.junctions import Streets
 from egvs.importers.map_parts import MapContext, MappedMesh, SolidMap, Terrain
 from egvs.importers.map_readers import MapFile
-from egvs.importers.openstreetmap import OsmRoads
-from egvs.importers.osm_solids import ImportCounts, MappedSolid
-from egvs.importers.point_cloud import OBJECT_KIND
+from egvs.importers.openstreetmap import reader as openstreetmap
+from egvs.importers.openstreetmap import solids as osm_solids
+from egvs.importers.openstreetmap.reader import OsmRoads
+from egvs.importers.openstreetmap.solids import ImportCounts, MappedSolid
+from egvs.importers.point_clouds.as_built_view import AsBuiltMap
+from egvs.importers.point_clouds.reader import OBJECT_KIND
 from egvs.importers.road_source import RoadSource
 from egvs.world.terrain import TerrainSurface
 

@@ -1,0 +1,1 @@
+"""Buildings and furniture from city models, outlines and meshes."""

@@ -1,0 +1,1 @@
+"""Lanelet2 maps, Autoware's included, as SUMO networks."""

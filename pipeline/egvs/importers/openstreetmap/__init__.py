@@ -1,0 +1,1 @@
+"""Extracts of OpenStreetMap: streets, and what stands beside them."""

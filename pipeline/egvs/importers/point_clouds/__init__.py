@@ -1,0 +1,1 @@
+"""As-built point clouds as the static world."""

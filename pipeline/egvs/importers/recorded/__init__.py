@@ -1,0 +1,1 @@
+"""Recorded tracks and signals in new scenarios."""

@@ -1,0 +1,1 @@
+"""Terrain, and roads that follow it."""
