@@ -20,7 +20,7 @@ from egvs.core.grid import FloatArray
 from egvs.export.export import safe_file_name
 from egvs.installation.acceptance import Acceptance, describe_error
 from egvs.installation.planned_sites import path_in_run
-from egvs.installation.scan_comparison import ScanComparison
+from egvs.installation.scan_comparison import NEARER_M, NEARER_SHARE, SURE_RANGE, ScanComparison
 from egvs.report import colours, command_sections, page
 from egvs.report.colours import STYLE_SHEET, IndexedImage
 from egvs.report.formatting import SCORE_LABELS
@@ -41,8 +41,6 @@ CATEGORIES = (
 
 _AZIMUTHS, _MAX_ROWS = 720, 64
 _WIDTH, _LEFT, _TOP, _IMAGE_HEIGHT = 760.0, 52.0, 8.0, 150.0
-_AGREES_M, _AGREES_SHARE = 0.5, 0.05
-_SURE_RANGE = 0.5
 
 
 @dataclass(frozen=True)
@@ -192,13 +190,13 @@ def beam_categories(comparison: ScanComparison) -> NDArray[np.uint8]:
     expected_m, measured_m = comparison.expected_m, comparison.measured_m
     category = np.zeros(len(expected_m), dtype=np.uint8)
     returned = ~np.isnan(measured_m)
-    tolerance_m = np.maximum(_AGREES_M, _AGREES_SHARE * np.where(np.isfinite(expected_m), expected_m, 0.0))
+    tolerance_m = np.maximum(NEARER_M, NEARER_SHARE * np.where(np.isfinite(expected_m), expected_m, 0.0))
     with np.errstate(invalid="ignore"):
         gap_m = expected_m - measured_m
         category[returned & (np.abs(gap_m) <= tolerance_m)] = 2
         category[returned & (gap_m < -tolerance_m)] = 3
         category[returned & (gap_m > tolerance_m)] = 4
-    category[~returned & (expected_m <= _SURE_RANGE * np.nanmax([*measured_m, 1.0]))] = 1
+    category[~returned & (expected_m <= SURE_RANGE * np.nanmax([*measured_m, 1.0]))] = 1
     category[comparison.obstacle_beams] = 5
     return category
 

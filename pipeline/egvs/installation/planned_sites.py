@@ -92,10 +92,6 @@ class PlannedSites:
         """The sites of the plan, or the best site without a plan."""
         return tuple(self.plan) or (self.session.ranked[0].site.name,)
 
-    def output_folder(self, name: str, out: Path | None) -> Path:
-        """Return where files are written: ``out``, or a folder of the run."""
-        return out or self.run.work.folder.path / name
-
 
 def path_in_run(path: Path, folder: RunFolder) -> str:
     """Return the path of a file relative to its run folder, with slashes; empty if it is elsewhere."""

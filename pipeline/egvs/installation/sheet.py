@@ -43,7 +43,7 @@ from egvs.report.maps import Backdrop
 from egvs.report.svg_figures import Box, FigureStyle, MapFrame, svg_start_tag
 from egvs.runs.command_results import add_to_report
 from egvs.sensors.sensor import Sensor
-from egvs.sensors.sites import Pose, Site
+from egvs.sensors.sites import Pose, Site, grid_bearing_deg
 
 FILE_TYPES = ("pdf", "svg")
 SHEETS_FOLDER = "sheets"
@@ -110,7 +110,7 @@ class SheetData:
     @property
     def grid_bearing_deg(self) -> float:
         """Bearing of the front, clockwise from grid north."""
-        return (90.0 - self.pose.yaw_deg) % 360.0
+        return grid_bearing_deg(self.pose.yaw_deg)
 
     @property
     def true_bearing_deg(self) -> float:
@@ -336,7 +336,7 @@ def draw_sheet(planned: PlannedSites, data: SheetData) -> str:
     session = planned.session
     camera = view.camera_pose(data.pose, data.sensor, session.scene.roi)
     pixels = view.render_view(session.scene, data.pose, data.sensor, session.carriageway)
-    caption = f"View from the sensor, towards {format_angle((90.0 - camera.yaw_deg) % 360.0)} from grid north"
+    caption = f"View from the sensor, towards {format_angle(grid_bearing_deg(camera.yaw_deg))} from grid north"
     parts.append(_text(_MARGIN, top, f"{caption}, {view.HORIZONTAL_DEG:g}° wide", 15, bold=True))
     parts.append(
         f'<image x="{_MARGIN}" y="{top + 12:.1f}" width="{inner:.1f}" height="{picture_height:.1f}"'

@@ -226,30 +226,31 @@ def design_sensor(
     context = open_folder(scenario, folder, jobs=jobs, progress=progress, recorded=recorded)
     designer = _Designer(context, request)
     notes: list[str] = []
-    found: list[_Trial] = []
+    best_mounts: list[_Trial] = []
     for number, name in enumerate(names):
         try:
-            found.append(designer.best_mount(context.scene.sensor(name, "--sensors"), number))
+            best_mounts.append(designer.best_mount(context.scene.sensor(name, "--sensors"), number))
         except InputError as error:
             if request.sensors != (ALL_SENSORS,):
                 raise
             notes.append(f"{name} is left out: {error}")
         progress("sensors", number + 1, len(names))
-    if not found:
+    if not best_mounts:
         raise InputError("--sensors", "expected a sensor that is possible in this scenario, got none", notes[0])
-    found.sort(key=lambda trial: -trial.score)
-    trials = list(found)
+    best_mounts.sort(key=lambda trial: -trial.score)
+    trials = list(best_mounts)
     if request.channels is not None:
-        base = next((trial for trial in found if trial.sensor.channels), None)
+        base = next((trial for trial in best_mounts if trial.sensor.channels), None)
         if base is None:
             raise InputError("--channels", "expected a sensor with rings among --sensors, got beam tables only")
         start, designed = designer.best_elevations(base, request, len(names))
         trials += [start, designed]
     designs = designer.evaluate(trials)
-    free = designs[len(found) :]
+    designed_pair = designs[len(best_mounts) :]
     result = DesignResult(
-        request.pole, designer.ground_m, tuple(designs[: len(found)]), free[0] if free else None,
-        free[1] if free else None, designer.frames, tuple(notes),
+        request.pole, designer.ground_m, tuple(designs[: len(best_mounts)]),
+        designed_pair[0] if designed_pair else None, designed_pair[1] if designed_pair else None, designer.frames,
+        tuple(notes),
     )  # fmt: skip
     entry = {**_report_entry(result), DIGEST_KEY: design_digest(scenario)}
     add_to_report(folder, RunFolder.sensor_design, {request.pole: entry}, STAGES)
@@ -548,10 +549,10 @@ def start_elevations(base: Sensor, channels: int, bounds_deg: tuple[float, float
         Lowest and highest elevation.
     """
     low_deg, high_deg = bounds_deg
-    own = tuple(sorted(base.elevations_deg))
-    if len(own) == channels and low_deg <= own[0] and own[-1] <= high_deg:
-        return own
-    first, last = (min(max(value, low_deg), high_deg) for value in (own[0], own[-1]))
+    base_elevations = tuple(sorted(base.elevations_deg))
+    if len(base_elevations) == channels and low_deg <= base_elevations[0] and base_elevations[-1] <= high_deg:
+        return base_elevations
+    first, last = (min(max(value, low_deg), high_deg) for value in (base_elevations[0], base_elevations[-1]))
     if last - first < (channels - 1) * MIN_GAP_DEG:
         first, last = low_deg, high_deg
     return tuple(np.round(np.linspace(first, last, channels), _ANGLE_DIGITS).tolist())

@@ -1,7 +1,7 @@
 r"""The ranking with solids that are in the scene for a share of the time, for ``egvs what-if``.
 
 For each table ``[what_if.NAME]``, the scenario runs as it is and with the solids of the table; traffic is the same and
-comes from the store, so only the static world, the scans and the scores are made again. With the score :math:`S_0` of a
+comes from the cache, so only the static world, the scans and the scores are made again. With the score :math:`S_0` of a
 site without the solids, :math:`S_1` with them, and the share :math:`q` of the time in which they are there, its
 expected score is
 
