@@ -194,9 +194,13 @@ def read_street_counts(
         counted.append(CountedHour(hour, shortest_min, flows_of_hour))
     if not any(flow.per_hour for hour in counted for flow in hour.flows):
         raise InputError(path, "all counts are 0", "Give at least one count above 0.")
-    counted = [hour for hour in counted if any(flow.per_hour for flow in hour.flows)]
+    empty = [hour for hour in counted if not any(flow.per_hour for flow in hour.flows)]
+    counted = [hour for hour in counted if hour not in empty]
     split = tuple(dict.fromkeys(row.movements[0].approach_title for row in rows if row.is_split))
-    return StreetCounts(path, tuple(counted), tuple(_notes(rows, counted, split, flows, index)), split)
+    notes = list(_notes(rows, counted, split, flows, index))
+    if empty:
+        notes.append(f"Hours without a vehicle are left out: {', '.join(hour.name for hour in empty)}.")
+    return StreetCounts(path, tuple(counted), tuple(notes), split)
 
 
 def _to_flows(
@@ -218,6 +222,9 @@ def _interval_min(path: Path, rows: Sequence[_Row]) -> int:
     lengths = {row.minutes for row in rows if row.minutes is not None}
     starts = sorted({row.start_min for row in rows if row.start_min is not None})
     if not starts:
+        if lengths:
+            hint = "Add a column start, or give vehicles per hour and remove minutes."
+            raise InputError(path, "minutes has no effect without a start", hint)
         return 60
     if not lengths:
         lengths = {min((after - before for before, after in itertools.pairwise(starts)), default=0)}

@@ -13,15 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs._version import __version__
+from egvs.artefacts.command_results import read_results
+from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
 from egvs.core.grid import FloatArray
 from egvs.export.export import safe_file_name
 from egvs.installation.acceptance import Acceptance, describe_error
+from egvs.installation.planned_sites import path_in_run
 from egvs.installation.scan_comparison import NEARER_M, NEARER_SHARE, SURE_RANGE, ScanComparison
-from egvs.report import colours, page
+from egvs.report import colours, command_sections, page
 from egvs.report.colours import STYLE_SHEET, IndexedImage
 from egvs.report.formatting import SCORE_LABELS
 from egvs.report.svg_figures import ColourBar, svg_start_tag
+from egvs.runs.command_results import add_to_report
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -68,6 +72,41 @@ def write_files(folder: Path, result: Acceptance) -> AcceptanceFiles:
     files.write_text(names.json, files.to_json_text(result.to_json(), indent=2) + "\n")
     files.write_text(names.page, render_page(result))
     return names
+
+
+def write_acceptance(run: str | Path, result: Acceptance, out: Path | None = None) -> tuple[Path, ...]:
+    """Write the files of an acceptance check, and add its verdict to the report of the run.
+
+    Parameters
+    ----------
+    run
+        The run folder.
+    result
+        From :func:`egvs.installation.acceptance.accept`.
+    out
+        Folder to write; ``acceptance`` in the run folder by default.
+
+    Returns
+    -------
+    tuple of Path
+        ``acceptance_SITE.json`` and ``acceptance_SITE.html``, then the file with all verdicts, and the report if the
+        run is complete.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be written, or the file with the verdicts is damaged.
+    """
+    folder = RunFolder(Path(run))
+    read_results(folder.acceptance)
+    written = write_files(out or folder.path / "acceptance", result)
+    entry = {
+        **result.to_json(),
+        "pose": command_sections.pose_json(result.pose.planned),
+        "path": path_in_run(written.page, folder),
+    }
+    reported = add_to_report(folder.path, RunFolder.acceptance, {result.site.name: entry})
+    return (written.json, written.page, *reported)
 
 
 def render_page(result: Acceptance) -> str:

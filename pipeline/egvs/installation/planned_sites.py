@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 
 from egvs.artefacts.readers import read_placement
+from egvs.artefacts.run_folder import RunFolder
 from egvs.core.errors import InputError
 from egvs.explore.session import Session
 from egvs.export.export import unknown_site
@@ -90,3 +91,11 @@ class PlannedSites:
     def default_sites(self) -> tuple[str, ...]:
         """The sites of the plan, or the best site without a plan."""
         return tuple(self.plan) or (self.session.ranked[0].site.name,)
+
+
+def path_in_run(path: Path, folder: RunFolder) -> str:
+    """Return the path of a file relative to its run folder, with slashes; empty if it is elsewhere."""
+    try:
+        return path.resolve().relative_to(folder.path.resolve()).as_posix()
+    except ValueError:
+        return ""

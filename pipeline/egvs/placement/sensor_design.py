@@ -31,6 +31,8 @@ from typing import Any
 import numpy as np
 
 from egvs.artefacts import traffic_frames
+from egvs.artefacts.command_results import read_results
+from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import PeriodBlocks, read_periods, read_tpog
 from egvs.core import plugins
 from egvs.core.errors import InputError
@@ -39,8 +41,10 @@ from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.threads import map_ordered
 from egvs.placement.design_request import ALL_SENSORS, DesignRequest
 from egvs.placement.refinement import Axis, BoxEnds, Freedom, minimise
+from egvs.report.command_sections import DIGEST_KEY, design_digest
 from egvs.report.sensor_results import ScoreDifference
 from egvs.runs import run, stage_registry
+from egvs.runs.command_results import add_to_report
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.scenario.sensor_config import SensorConfig
@@ -165,6 +169,11 @@ def design_sensor(
     progress, listener
         Called with the progress of stages and trials, and when a stage begins or ends.
 
+    Returns
+    -------
+    DesignResult
+        The designs, which are also added to the report if the folder has a complete run.
+
     Raises
     ------
     InputError
@@ -174,6 +183,7 @@ def design_sensor(
     _check_request(request)
     folder = Path(out) if out is not None else run.default_folder(scenario)
     names = _sensor_names(scenario, request)
+    read_results(RunFolder(folder).sensor_design)
     record = run.run(scenario, folder, only=STAGES, jobs=jobs, progress=progress, listener=listener)
     recorded = stage_registry.recorded_digests(record)
     context = open_folder(scenario, folder, jobs=jobs, progress=progress, recorded=recorded)
@@ -201,11 +211,38 @@ def design_sensor(
         trials += [start, designed]
     designs = designer.evaluate(trials)
     designed_pair = designs[len(best_mounts) :]
-    return DesignResult(
+    result = DesignResult(
         request.pole, designer.ground_m, tuple(designs[: len(best_mounts)]),
         designed_pair[0] if designed_pair else None, designed_pair[1] if designed_pair else None, designer.frames,
         tuple(notes),
     )  # fmt: skip
+    entry = {**_report_entry(result), DIGEST_KEY: design_digest(scenario)}
+    add_to_report(folder, RunFolder.sensor_design, {request.pole: entry}, STAGES)
+    return result
+
+
+def _report_entry(result: DesignResult) -> dict[str, Any]:
+    """Return what the report says about the designs, JSON values."""
+    designs = list(result.catalogue)
+    if result.start is not None and result.designed is not None:
+        designs += [result.start, result.designed]
+    rows = []
+    for design in designs:
+        difference = design.difference
+        rows.append(
+            {
+                "sensor": design.sensor.name,
+                "height_m": design.pose.z_m - result.ground_m,
+                "yaw_deg": design.pose.yaw_deg,
+                "pitch_deg": design.pose.pitch_deg,
+                "search_score": design.search_score,
+                "score": design.score,
+                "se": design.se,
+                "difference": {"value": difference.value, "se": difference.se, "better": difference.better},
+                "chosen": design is result.chosen,
+            }
+        )
+    return {"frames": list(result.frames), "designs": rows, "notes": list(result.notes)}
 
 
 def _check_request(request: DesignRequest) -> None:
