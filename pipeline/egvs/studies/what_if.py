@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -49,9 +49,17 @@ from egvs.scenario.model import Scenario
 from egvs.scenario.settings import format_overrides
 from egvs.scenario.what_if_config import WhatIfBox, WhatIfConfig
 from egvs.scoring.standard_errors import ScoreUncertainty
+from egvs.scoring.zones import region_bounds_m
+from egvs.sensors.sensor import scenario_sensor
+from egvs.sensors.sites import candidate_sites
 from egvs.studies.footprint_files import read_document, write_if_changed
 from egvs.studies.paired_errors import SiteReplicates, read_replicates
 from egvs.tracks.sizes import class_sizes
+from egvs.world import geolocation
+from egvs.world.footprints import read_footprints
+
+if TYPE_CHECKING:
+    from shapely.geometry.base import BaseGeometry
 
 TABLE = "what_if"
 TOGETHER = "all together"
@@ -268,13 +276,15 @@ def prepare_runs(path: Path, overrides: Sequence[str] = (), names: Sequence[str]
     Raises
     ------
     InputError
-        When the scenario or a file is wrong, or it has no such table.
+        When the scenario or a file is wrong, it has no such table, or all solids of a source are out of range.
     """
     source = SettingsSource(path)
     base = source.load_variant(overrides)
     tables = _chosen_tables(base, names)
     folder = source.folder(base) if not overrides else run_names.run_folder(base.name, base.overrides)
     documents = {name: solid_documents(base, name) for name in tables}
+    for name in tables:
+        check_positions(base, name)
     runs = [WhatIfRun("", 0.0, base, folder)]
     for name, table in tables.items():
         changed = run_names.run_folder(base.name, {**base.overrides, TABLE: name})
@@ -369,6 +379,59 @@ def solid_documents(scenario: Scenario, name: str) -> list[dict[str, Any]]:
         problem = "no footprint of the scenario is a tree or a hedge"
         raise InputError(f"{scenario.file}: {key}.tree_scale", problem, "Leave it out, or use boxes.")
     return documents
+
+
+def check_positions(scenario: Scenario, name: str) -> None:
+    """Raise an InputError if no solid of a source of a table can be met by a beam that reaches the region of interest.
+
+    Such a beam is never farther from the region than the range of its sensor. The sources are the boxes, the parked
+    vehicles, and the footprints; coordinates in degrees or of another frame are found so.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    name
+        Name of the table.
+    """
+    import shapely
+
+    table = scenario.what_if[name]
+    key = f"{TABLE}.{name}"
+    sources: dict[str, list[Any]] = {}
+    if table.boxes:
+        sources[f"{scenario.file}: {key}.boxes.0"] = [_box_shape(box) for box in table.boxes]
+    if table.vehicles is not None:
+        path = scenario.find(table.vehicles, f"{key}.vehicles")
+        sources[f"{path}: row 1"] = [_box_shape(box) for box in read_vehicles(path, scenario)]
+    if table.footprints:
+        world = geolocation.scenario_georeference(scenario)
+        paths = [scenario.find(file, f"{key}.footprints") for file in table.footprints]
+        shapes = [each.polygon for path in paths for each in read_footprints(path, world).footprints]
+        if shapes:
+            sources[str(paths[0])] = shapes
+    if not sources:
+        return
+
+    sensors = {site.sensor: f"site {site.name}" for site in candidate_sites(scenario)}
+    range_m = max(scenario_sensor(sensor, scenario, where).range_m for sensor, where in sensors.items())
+    (west_m, south_m), (east_m, north_m) = region_bounds_m(scenario)
+    region = shapely.box(west_m, south_m, east_m, north_m)
+    for where, shapes in sources.items():
+        distances_m = shapely.distance(region, shapes)
+        if distances_m.min() > range_m:
+            problem = (
+                f"none of {len(shapes)} solids is within {range_m:g} m of the region of interest, the range of the"
+                f" sensors; this one is {distances_m[0]:,.0f} m away"
+            )
+            region_text = f"x {west_m:g} to {east_m:g}, y {south_m:g} to {north_m:g}"
+            raise InputError(where, problem, f"Use the world frame in metres; the region is {region_text}.")
+
+
+def _box_shape(box: WhatIfBox) -> BaseGeometry:
+    from shapely.geometry import shape
+
+    return shape(_box_feature(box, "")["geometry"])
 
 
 def read_vehicles(path: Path, scenario: Scenario) -> list[WhatIfBox]:
