@@ -115,6 +115,12 @@ def test_hourly_counts_and_kinds(read: Read) -> None:
     ]
 
 
+def test_hours_without_a_vehicle_are_left_out_with_a_note(read: Read) -> None:
+    counts = read("approach,turn,start,count", "N,left,02:00,0", "N,left,03:00,0", "N,left,07:00,40", "N,left,08:00,9")
+    assert [hour.name for hour in counts.hours] == ["07-08", "08-09"]
+    assert "Hours without a vehicle are left out: 02-03, 03-04." in counts.notes
+
+
 def test_movements_without_a_count_are_named(read: Read) -> None:
     lines = ["approach,turn,count", "N,,10", "S,,10", "E,,10", "W,left,10", "W,right,10"]
     assert "Movements without a count get no vehicles: W (East Street) straight." in read(*lines).notes
@@ -179,6 +185,7 @@ BAD: dict[str, tuple[list[str], str]] = {
     "across an hour": ([HEAD, ",N,left,07:30,5", ",N,left,08:30,5"], r"interval of 60 minutes ends in another hour"),
     "some starts": ([HEAD, ",N,left,07:00,5", ",S,left,,5"], r"only some rows have a start"),
     "minutes": (["approach,turn,start,minutes,count", "N,left,07:00,7,1"], r"minutes: expected one of 5, 10, 15"),
+    "no starts": (["approach,turn,minutes,count", "N,left,15,30"], r"minutes has no effect without a start. Add a"),
     "twice": (
         [HEAD, "North St,N,left,,5", ",N,left,,6"],
         r"row 3: N left is counted twice, also in row 2",

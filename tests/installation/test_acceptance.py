@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+import egvs
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.installation.acceptance import Acceptance, Limits, accept
@@ -242,3 +244,23 @@ def test_rejects_unknown_site_and_missing_options(installed: InstalledRun, run_e
     ):
         code, _, errors = run_egvs("accept", installed.folder, *words)
         assert (code, message in errors) == (2, True), errors
+
+
+def test_report_shows_the_sheet_and_the_verdict_while_they_belong_to_the_run(installed: InstalledRun) -> None:
+    """1.5 degrees of tilt fail; after a run with another gamma, neither is shown."""
+    folder = installed.folder.parent / "reported"
+    shutil.copytree(installed.folder, folder)
+    egvs.write_sheets(folder, ["pole_a"], kind="svg")
+    scan = installed.write("tilted_for_report.pcd", installed.points(pitch_deg=1.5))
+    written = egvs.write_acceptance(folder, egvs.accept(folder, "pole_a", [scan]))
+    assert [path.name for path in written[2:]] == ["acceptance.json", "report.html"]
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    assert 'href="sheets/installation_pole_a.svg"' in text
+    assert 'href="acceptance/acceptance_pole_a.html"' in text
+    assert "tilt is off by 1." in text
+    assert egvs.verify(folder) == []
+    scenario = egvs.load(installed.folder.parent / "crossing", ["score.gamma=3"])
+    egvs.run(scenario, folder, jobs=1)
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    assert 'id="installation"' not in text
+    assert 'id="acceptance"' not in text

@@ -132,7 +132,7 @@ def test_default_is_the_plan_and_command_prints_tolerances(located: Path, run_eg
     assert code == 0
     (name,) = PlannedSites.open(located).default_sites
     assert [path.name for path in (tmp_path / "out").iterdir()] == [f"installation_{name}.svg"]
-    assert "of tilt" in printed
+    assert ": tilt " in printed
     assert "(40 frames)" in printed
 
 

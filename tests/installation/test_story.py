@@ -50,7 +50,7 @@ def test_commands_of_the_page_lead_from_a_map_to_an_accepted_sensor(
     assert name == refused[refused.index("--site") + 1]
 
     code, printed, _ = run_egvs(*sheets)
-    assert (code, "of tilt" in printed) == (0, True)
+    assert (code, ": tilt " in printed) == (0, True)
     (sheet,) = (folder / "sheets").iterdir()
     assert sheet.read_bytes().startswith(b"%PDF")
 

@@ -107,10 +107,10 @@ def accept(
             run, site, scan, limits, max_vehicle_height_m=vehicle_height, progress=screen.progress
         )  # fmt: skip
         files.check_writable(acceptance_page.AcceptanceFiles.of(folder, site).json)
-        written = acceptance_page.write_files(folder, result)
+        written = acceptance_page.write_acceptance(run, result, folder)
     _print_acceptance(result)
-    print(written.json)
-    print(written.page)
+    for path in written:
+        print(path)
     if not result.passed:
         raise typer.Exit(EgvsError.exit_code)
 

@@ -377,8 +377,8 @@ def print_design(result: DesignResult, file: Path | None) -> None:
     chosen = result.chosen
     searched, others = result.frames
     lines = [
-        f"The search saw {searched:,} frames; scores with ± are those of {others:,} other frames, so they are not"
-        " flattered by the search.",
+        f"The search saw {searched:,} frames; scores with ± come from {others:,} other frames, so the search"
+        " does not bias them.",
         f"Best by the search: {chosen.sensor.name}. Row of sites.csv (site,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg,"
         f"sensor): {result.pole},{chosen.pose.x_m:g},{chosen.pose.y_m:g},{chosen.pose.z_m:g},{chosen.pose.yaw_deg:g},"
         f"{chosen.pose.pitch_deg:g},{chosen.pose.roll_deg:g},{chosen.sensor.name}",

@@ -6,7 +6,7 @@ Model: the footprint of a beam on a slanted surface extends along the beam by an
 
 .. math:: \sigma^2 = \sigma_0^2 + \min(f r \tan\theta, \sigma_{max})^2
 
-The default f is measured on one real unit, on a carriageway between 25 and 70 m, see "Against a measurement" in
+The default f is measured on one real unit, on a carriageway between 25 and 120 m, see "Against a measurement" in
 ``docs/validity.md``; the roughness of the road is part of it. :math:`\sigma_{max}` is assumed.
 
 Use it for low sensors and long ranges. Limits: scores do not see it; no bias of the range at grazing incidence (Laconte

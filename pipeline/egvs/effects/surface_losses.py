@@ -9,7 +9,7 @@ A vehicle is dark, or not, in all frames and from all sites: its name and the sc
 
 The defaults are measured on one real unit, see "Against a measurement" in ``docs/validity.md``: grazing loss on a
 carriageway, where incidence and range grow together (so it may partly be a loss by range); dark vehicles and windows on
-46 cars and vans. Windows are those of the simulated bodies.
+48 cars and vans. Windows are those of the simulated bodies.
 
 Use it to learn what such losses do to detection; ``dropout`` is the loss that is the same everywhere. Limits: scores do
 not see it, since they know voxels and boxes, not surfaces. A lost return does not reappear from behind the window. Dark

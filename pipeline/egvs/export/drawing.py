@@ -32,13 +32,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from egvs.export.extrinsics import bearing_deg
 from egvs.export.finished_run import ExportCrs, FinishedRun
 from egvs.export.layers import FOOTPRINTS, PLAN, REGION, SITES, Layer
 from egvs.report.basemap import network_file, roads_within, solid_group
 from egvs.sensors.sensor import Sensor, scenario_sensor
 from egvs.sensors.site_feasibility import ground_height_m
-from egvs.sensors.sites import Pose
+from egvs.sensors.sites import Pose, grid_bearing_deg
 from egvs.traffic import network
 from egvs.world.carriageway import Carriageway
 
@@ -242,10 +241,8 @@ def _carriageway(path: Path, box: Box) -> Iterator[Any]:
     frame = shapely.box(*box)
     areas = []
     for lane in carriageway.lanes:
-        width_m = network.LANE_WIDTH_M if lane.width_m is None else lane.width_m
-        line = shapely.LineString(lane.shape_m[:, :2])
-        if shapely.intersects(line, frame):
-            areas.append(shapely.buffer(line, width_m / 2.0 + _GAP_M, cap_style="flat"))
+        if shapely.intersects(shapely.LineString(lane.shape_m[:, :2]), frame):
+            areas.append(lane.area(margin_m=_GAP_M))
     junctions, corners = (
         shapely.union_all([shapely.make_valid(shapely.Polygon(shape.shape_m[:, :2])) for shape in shapes])
         for shapes in (carriageway.junctions, carriageway.corners)
@@ -373,13 +370,13 @@ def _draw_plan(model: Modelspace, layer: Layer, reference: ExportCrs) -> None:
 def _site_texts(row: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the values of :data:`_SITE_TAGS`."""
     return (
-        _plain_text(row["site"]), _plain_text(row["sensor"]), f"{row['z_m']:.3f}", f"{bearing_deg(row['yaw_deg']):.2f}",
-        f"{row['pitch_deg'] + 0.0:.2f}", str(row["rank"]),
+        _plain_text(row["site"]), _plain_text(row["sensor"]), f"{row['z_m']:.3f}",
+        f"{grid_bearing_deg(row['yaw_deg']):.2f}", f"{row['pitch_deg'] + 0.0:.2f}", str(row["rank"]),
     )  # fmt: skip
 
 
 def _label(row: Mapping[str, Any]) -> str:
-    bearing = round(bearing_deg(row["yaw_deg"])) % 360
+    bearing = round(grid_bearing_deg(row["yaw_deg"])) % 360
     return _mtext(f"{row['site']}  z {row['z_m']:.2f} m  {bearing:03d}°  tilt {row['pitch_deg'] + 0.0:.1f}°")
 
 

@@ -98,7 +98,7 @@ def _read_gdal(path: Path, kind: str, geometry: str) -> tuple[pa.Table, str, str
         layer = _choose_layer(path, pyogrio.list_layers(path).tolist(), geometry)
         metadata, table = pyogrio.read_arrow(path, layer=layer)
         table.validate(full=True)
-    except (DataSourceError, DataLayerError, pa.ArrowException) as error:
+    except (DataSourceError, DataLayerError, pa.ArrowException, UnicodeDecodeError) as error:
         problem = f"the file cannot be read as {kind} ({error})"
         raise InputError(path, problem, "Export it again, with the encoding UTF-8, or use GeoJSON or CSV.") from None
     return table, metadata["geometry_name"] or "wkb_geometry", metadata["crs"]

@@ -3,7 +3,7 @@ r"""Accept an installed sensor: compare one measured scan, or several, with the 
 Steps: read the scans (sensor frame: x forward, y left, z up, metres); register them to the static world
 (:mod:`egvs.sensors.registration`), which gives the measured pose with standard errors; compare them with the empty scan
 that is expected from there (:mod:`egvs.installation.scan_comparison`); score the measured pose, and the sensor with its
-obstacles and missing channels; hold everything against the limits.
+obstacles and missing channels; check each value against its limit.
 
 The tilt error is the angle between the planned and the measured z axis of the sensor. Errors of the pose are measured
 minus planned; those of angles are from -180 to 180 degrees. Standard errors cover the scatter of the returns about the
@@ -39,7 +39,7 @@ from egvs.sensors.sites import Pose, Site
 MIN_STRUCTURE_SHARE = 0.3
 """A scan is of another place if it agrees with less of the walls, poles and other solids of the static world."""
 
-MAX_SHIFT_M = 3.0
+MAX_DISPLACEMENT_M = 3.0
 """A registration that ends farther from the planned position has not found the pose."""
 
 _GOOD_STRUCTURE_SHARE = 0.6
@@ -47,7 +47,7 @@ _GOOD_STRUCTURE_SHARE = 0.6
 _MIRROR = np.array([1.0, -1.0, 1.0])
 _BLOCKED_BEAM_DEG = 0.3
 """An expected beam is stopped by the return of an obstacle that is at most this far beside it."""
-_STEP_DEG = 1e-4
+_STEP = 1e-4
 _METRES_HINT = "Export the scan in metres, in the sensor's frame: x forward, y left, z up."
 
 
@@ -138,9 +138,9 @@ def _propagate(function: Callable[[Pose], float], fit: Registration) -> tuple[fl
     """Return a function of the fitted pose, and its standard error to first order."""
     gradient = np.zeros(len(PARAMETERS))
     for index, name in enumerate(PARAMETERS):
-        ahead = replace(fit.pose, **{name: getattr(fit.pose, name) + _STEP_DEG})
-        behind = replace(fit.pose, **{name: getattr(fit.pose, name) - _STEP_DEG})
-        gradient[index] = (function(ahead) - function(behind)) / (2.0 * _STEP_DEG)
+        ahead = replace(fit.pose, **{name: getattr(fit.pose, name) + _STEP})
+        behind = replace(fit.pose, **{name: getattr(fit.pose, name) - _STEP})
+        gradient[index] = (function(ahead) - function(behind)) / (2.0 * _STEP)
     gradient[np.abs(gradient) < 1e-6] = 0.0  # so that a parameter without influence may have an infinite variance
     used = np.flatnonzero(gradient)
     variance = gradient[used] @ fit.covariance[np.ix_(used, used)] @ gradient[used] if len(used) else 0.0
@@ -185,7 +185,7 @@ class Check:
     measured, limit
         Both, in words.
     passed
-        Whether the limit is kept.
+        Whether the value is within its limit.
     reason
         Why it is not; empty if it is.
     is_close
@@ -244,7 +244,7 @@ class Acceptance:
 
     @property
     def passed(self) -> bool:
-        """Whether all limits are kept."""
+        """Whether all checks pass."""
         return all(check.passed for check in self.checks)
 
     @property
@@ -323,7 +323,7 @@ def accept(
     scans
         Files of measured scans in the sensor's frame, see :func:`egvs.sensor_fit.sweep_files.read_sweeps`.
     limits
-        What to keep; by default :class:`Limits`.
+        The limits; by default :class:`Limits`.
     max_vehicle_height_m
         A return in front of the static world that is higher above the ground is of an obstacle, not of a vehicle.
     progress
@@ -404,8 +404,8 @@ def _register(
 
     problem = f"the scan does not fit the static world around {planned.name} at any yaw"
     hint = (
-        f"Check that it was measured at this site, in the sensor's frame in metres, less than {MAX_SHIFT_M:g} m and"
-        " about 5 degrees of tilt from the planned pose."
+        f"Check that it was measured at this site, in the sensor's frame in metres, less than {MAX_DISPLACEMENT_M:g} m"
+        " and about 5 degrees of tilt from the planned pose."
     )
     try:
         search = registration.search_yaw(points_m, surfaces, start, where=where)
@@ -425,7 +425,7 @@ def _register(
 
 def _is_plausible(fit: Registration, planned: Pose) -> bool:
     """Return whether a registration ended, and where it can have started."""
-    return fit.converged and _distance_m(planned, fit.pose) <= MAX_SHIFT_M
+    return fit.converged and _distance_m(planned, fit.pose) <= MAX_DISPLACEMENT_M
 
 
 def _mirror_share(

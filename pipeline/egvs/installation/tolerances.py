@@ -169,17 +169,17 @@ def distance_to_one_point(losses: Sequence[tuple[float, float]]) -> float:
 
 
 def describe_tolerances(tolerances: PoseTolerances) -> str:
-    """Return the tolerances as a sentence, e.g. "1 percentage point costs: 2.1 degrees of tilt, 0.30 m of height"."""
+    """Return the tolerances as a sentence, e.g. "a loss of 1 percentage point allows: tilt 2.1 degrees"."""
     parts = []
     for tolerance in tolerances.tolerances:
         quantity = tolerance.quantity
         if math.isinf(tolerance.limit):
-            parts.append(f"more than {tolerance.tried:g} {quantity.unit} of {quantity.name}")
+            parts.append(f"{quantity.name} more than {tolerance.tried:g} {quantity.unit}")
         else:
-            parts.append(f"{format_distance(tolerance.limit, quantity)} of {quantity.name}")
+            parts.append(f"{quantity.name} {format_distance(tolerance.limit, quantity)}")
     if not parts:
         return "unknown, because other poses cannot be scored"
-    return f"{tolerances.point} is lost by {', '.join(parts)}"
+    return f"a loss of {tolerances.point} allows: {', '.join(parts)}"
 
 
 def format_distance(value: float, quantity: Quantity) -> str:

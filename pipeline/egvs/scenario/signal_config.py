@@ -69,8 +69,12 @@ class SignalConfig(StrictModel):
         None, description="Cycle of a fixed plan; phases must add up to it. By default their sum"
     )
     offset_s: float = Field(0.0, description="Start of the first phase in the cycle, in simulation time")
-    yellow_s: float = Field(3.0, ge=0, description="Yellow after each phase, for who has no green in the next one")
-    all_red_s: float = Field(2.0, ge=0, description="All-red after each yellow, for who has no green in the next phase")
+    yellow_s: float = Field(
+        3.0, ge=0, description="Yellow after each phase, for movements without green in the next phase"
+    )
+    all_red_s: float = Field(
+        2.0, ge=0, description="All-red after each yellow, for movements without green in the next phase"
+    )
     phases: tuple[SignalPhaseConfig, ...] = Field((), description="Phases in order; or set file")
 
     @property

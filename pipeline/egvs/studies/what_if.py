@@ -1,7 +1,7 @@
 r"""The ranking with solids that are in the scene for a share of the time, for ``egvs what-if``.
 
 For each table ``[what_if.NAME]``, the scenario runs as it is and with the solids of the table; traffic is the same and
-comes from the store, so only the static world, the scans and the scores are made again. With the score :math:`S_0` of a
+comes from the cache, so only the static world, the scans and the scores are made again. With the score :math:`S_0` of a
 site without the solids, :math:`S_1` with them, and the share :math:`q` of the time in which they are there, its
 expected score is
 
@@ -22,7 +22,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +33,15 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.numbers import parse_decimal
 from egvs.core.platform import relative_path
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.special import cosdg, sindg
 from egvs.report.basemap import solid_group
+from egvs.report.command_sections import DIGEST_KEY, what_if_digest
 from egvs.report.formatting import ScoreLabel, format_probability, join_names
 from egvs.report.ranking import RankedSite, Ranking
 from egvs.report.sensor_results import ScoreDifference
-from egvs.runs import run_names
+from egvs.runs import run, run_names
+from egvs.runs.command_results import add_to_report
 from egvs.runs.run_sources import SettingsSource
 from egvs.scenario.fields import MAX_COORDINATE_M
 from egvs.scenario.model import Scenario
@@ -184,6 +187,69 @@ class WhatIfResult:
     label: ScoreLabel
     best: RankedSite
     notes: tuple[str, ...]
+
+
+def what_if(
+    path: str | Path,
+    overrides: Sequence[str] = (),
+    names: Sequence[str] = (),
+    *,
+    jobs: int | None = None,
+    progress: ProgressCallback = no_progress,
+    listener: run.StageListener = run.ignore_stage,
+) -> WhatIfResult:
+    """Run a scenario as it is and with the solids of its tables, compare the rankings, and add the answers to a report.
+
+    Parameters
+    ----------
+    path, overrides, names
+        As in :func:`prepare_runs`.
+    jobs
+        Number of threads; one per core when None. Results do not depend on it.
+    progress, listener
+        Called with the progress of stages, and when a stage begins or ends.
+
+    Returns
+    -------
+    WhatIfResult
+        The answers. Those in the report of the first run are the same.
+
+    Raises
+    ------
+    InputError
+        When the scenario or a file is wrong, or it has no such table.
+    """
+
+    def run_one(_: int, what_if_run: WhatIfRun) -> None:
+        run.run(what_if_run.scenario, what_if_run.folder, jobs=jobs, progress=progress, listener=listener)
+
+    result = compare_runs(prepare_runs(Path(path), overrides, names), run_one)
+    record_answers(result)
+    return result
+
+
+def record_answers(result: WhatIfResult) -> tuple[Path, ...]:
+    """Write the answers into the folder of the run as it is, and add them to its report; return both files.
+
+    Parameters
+    ----------
+    result
+        From :func:`compare_runs`.
+    """
+    base, *others = result.runs
+    entries = {}
+    for answer in result.answers:
+        tables = [other.name for other in others] if answer.name == TOGETHER else [answer.name]
+        values = asdict(answer)
+        del values["name"]
+        entries[answer.name] = {
+            **values,
+            "impossible": list(answer.impossible),
+            "conclusion": answer.conclusion(),
+            "tables": tables,
+            DIGEST_KEY: what_if_digest(base.scenario, tables),
+        }
+    return add_to_report(base.folder, RunFolder.what_if, entries)
 
 
 def prepare_runs(path: Path, overrides: Sequence[str] = (), names: Sequence[str] = ()) -> tuple[WhatIfRun, ...]:

@@ -17,7 +17,7 @@ from pathlib import Path
 from egvs.core import limits
 from egvs.core.errors import InputError, find_misspelling
 from egvs.scenario.model import Scenario
-from egvs.traffic.approaches import ApproachBook, parse_side
+from egvs.traffic.approaches import ApproachIndex, parse_side
 from egvs.traffic.movements import MovementNames
 from egvs.traffic.network import Network
 
@@ -37,11 +37,11 @@ class Observation:
     speed_kmh: float | None
 
 
-def approach_book(scenario: Scenario, network: Network) -> ApproachBook:
+def approach_index(scenario: Scenario, network: Network) -> ApproachIndex:
     """Return the names of the movements that a scenario counts, in all its periods."""
     x_m, y_m, _ = scenario.roi.center_m
     counts = {count.title: count for period in scenario.by_period().values() for count in period.traffic.counts}
-    return ApproachBook.of_flows(counts.values(), MovementNames(network, (x_m, y_m)))
+    return ApproachIndex.of_flows(counts.values(), MovementNames(network, (x_m, y_m)))
 
 
 def read_observed(scenario: Scenario, network: Network) -> tuple[Observation, ...]:
@@ -59,10 +59,10 @@ def read_observed(scenario: Scenario, network: Network) -> tuple[Observation, ..
         raise InputError(f"{scenario.file}: {KEY}", problem, "Add traffic.counts, e.g. with egvs new --counts.")
     path = scenario.find(scenario.traffic.observed, KEY)
     names = [name for name in periods if name]
-    return read_observations(path, approach_book(scenario, network), names)
+    return read_observations(path, approach_index(scenario, network), names)
 
 
-def read_observations(path: Path, book: ApproachBook, periods: Sequence[str]) -> tuple[Observation, ...]:
+def read_observations(path: Path, index: ApproachIndex, periods: Sequence[str]) -> tuple[Observation, ...]:
     """Read observations; ``periods`` are the names of the scenario's periods, empty without periods."""
     try:
         text = limits.read_bytes(path, limits.DOCUMENT).decode("utf-8-sig")
@@ -85,7 +85,7 @@ def read_observations(path: Path, book: ApproachBook, periods: Sequence[str]) ->
             where = f"{path}: row {table.line_num}"
             if None in row or None in row.values():
                 raise InputError(where, f"expected {len(header)} values", "Check the separators.")
-            observation = _parse_row(where, {name: value.strip() for name, value in row.items()}, book, periods)
+            observation = _parse_row(where, {name: value.strip() for name, value in row.items()}, index, periods)
             if observations.setdefault((observation.approach, observation.period), observation) is not observation:
                 raise InputError(
                     where, f"the approach {observation.approach} is there twice", "Remove one of the rows."
@@ -97,16 +97,16 @@ def read_observations(path: Path, book: ApproachBook, periods: Sequence[str]) ->
     return tuple(observations.values())
 
 
-def _parse_row(where: str, values: Mapping[str, str], book: ApproachBook, periods: Sequence[str]) -> Observation:
+def _parse_row(where: str, values: Mapping[str, str], index: ApproachIndex, periods: Sequence[str]) -> Observation:
     side = None
     if values.get("approach"):
         side = parse_side(values["approach"])
         if side is None:
             problem = f"expected the side on which vehicles arrive, got {values['approach']!r}"
-            raise InputError(f"{where}: approach", problem, f"Use N, north or southbound. {book.hint}")
+            raise InputError(f"{where}: approach", problem, f"Use N, north or southbound. {index.hint}")
     if side is None and not values.get("street"):
-        raise InputError(where, "names no approach", book.hint)
-    title = book.find(values.get("street", ""), side, (), where)[0].approach_title
+        raise InputError(where, "names no approach", index.hint)
+    title = index.find(values.get("street", ""), side, (), where)[0].approach_title
     period = values.get("period", "")
     if (period or periods) and period not in periods:
         known = f"Periods: {', '.join(periods)}." if periods else "The scenario has no periods; remove the column."

@@ -32,10 +32,7 @@ from egvs.scenario.signal_config import SignalConfig, SignalPhaseConfig
 from egvs.traffic import network
 from egvs.traffic.approaches import TURN_WORDS, normalise_street, parse_side
 from egvs.traffic.directions import Floats
-from egvs.traffic.signals import CROSSING, GREEN_LETTERS, Link, Phase, Program, Signal, read_signals, replace_programs
-
-_MAY_PASS = GREEN_LETTERS | frozenset("sOo")
-"""States in which a vehicle may drive on, at once or after giving way."""
+from egvs.traffic.signals import CROSSING, Link, Phase, Program, Signal, read_signals, replace_programs
 
 _ALL = "all"
 
@@ -55,7 +52,7 @@ def check_plans(scenario: Scenario, path: Path, roads: network.Network) -> None:
     _programs(scenario, path, roads)
 
 
-def apply_plans(scenario: Scenario, path: Path, name: Path) -> None:
+def apply_plans(scenario: Scenario, path: Path, source: Path) -> None:
     """Replace the programs in a network by the plans of the scenario.
 
     Parameters
@@ -64,7 +61,7 @@ def apply_plans(scenario: Scenario, path: Path, name: Path) -> None:
         The plans, ``[traffic.signals]``.
     path
         A copy of its network, which is changed.
-    name
+    source
         The network, for messages.
 
     Raises
@@ -75,7 +72,7 @@ def apply_plans(scenario: Scenario, path: Path, name: Path) -> None:
     """
     if not scenario.traffic.signals:
         return
-    programs = _programs(scenario, path, network.read_net_xml(path, name))
+    programs = _programs(scenario, path, network.read_net_xml(path, source))
     with files.attach_filename(path):
         content = path.read_bytes()
         if content.startswith(_GZIP):
@@ -84,7 +81,7 @@ def apply_plans(scenario: Scenario, path: Path, name: Path) -> None:
             text = replace_programs(content.decode("utf-8"), programs)
         except ValueError as error:
             raise InputError(
-                name, f"signal programs cannot be replaced: {error}", "Convert it with netconvert."
+                source, f"signal programs cannot be replaced: {error}", "Convert it with netconvert."
             ) from None
         path.write_text(text, encoding="utf-8")
 
@@ -116,12 +113,12 @@ def find_signal(name: str, signals: Sequence[Signal], where: str) -> Signal:
         if name == signal.id or name in signal.nodes:
             return signal
     streets = {normalise_street(street) for street in re.split("[/&]", name)}
-    found = [signal for signal in signals if streets <= {normalise_street(street) for street in signal.streets}]
-    if len(found) == 1:
-        return found[0]
-    known = ", ".join(_describe_signal(signal) for signal in (found or signals)[:_MAX_NAMED]) or "none"
-    if found:
-        raise InputError(where, f"{len(found)} signals are at these streets: {known}", "Use an id.")
+    matches = [signal for signal in signals if streets <= {normalise_street(street) for street in signal.streets}]
+    if len(matches) == 1:
+        return matches[0]
+    known = ", ".join(_describe_signal(signal) for signal in (matches or signals)[:_MAX_NAMED]) or "none"
+    if matches:
+        raise InputError(where, f"{len(matches)} signals are at these streets: {known}", "Use an id.")
     raise InputError(where, "the network has no such signal", f"Its signals are: {known}.")
 
 
@@ -158,16 +155,16 @@ def _green_links(phase: SignalPhaseConfig, signal: Signal, where: str) -> set[in
     for approach, movements in phase.green.items():
         on_approach = _links_of_approach(approach, signal, where)
         for movement in movements:
-            wanted = " ".join(movement.split()).casefold()
-            wanted = TURN_WORDS.get(wanted, wanted)
-            found = [link for link in on_approach if wanted in (_ALL, link.movement)]
-            if wanted == _ALL:
-                found = [link for link in found if link.movement != CROSSING]
-            if not found:
+            requested = " ".join(movement.split()).casefold()
+            requested = TURN_WORDS.get(requested, requested)
+            selected = [link for link in on_approach if requested in (_ALL, link.movement)]
+            if requested == _ALL:
+                selected = [link for link in selected if link.movement != CROSSING]
+            if not selected:
                 known = ", ".join(dict.fromkeys(link.movement for link in on_approach))
                 problem = f"approach {approach!r} has no movement {movement!r}"
                 raise InputError(where, problem, f"Its movements are: {known}.")
-            green |= {link.index for link in found}
+            green |= {link.index for link in selected}
     vehicles = [link for link in signal.links if link.index in green and link.movement != CROSSING]
     for link in signal.links:
         if link.movement == CROSSING and all(_gives_way_to_people(each, link) for each in vehicles):
@@ -293,7 +290,7 @@ def _read_program(path: Path, config: SignalConfig, signal: Signal) -> Program:
         if len(phase.state) != signal.states:
             problem = f"expected a state of {signal.states} letters, got {len(phase.state)}"
             raise InputError(where, problem, f"The signal {signal.id} has {signal.states} links.")
-        never_green -= {index for index, letter in enumerate(phase.state) if letter in _MAY_PASS}
+        never_green -= {index for index, letter in enumerate(phase.state) if letter in network.MAY_PASS_LETTERS}
         with_right_of_way = {
             link.index for link in signal.links if phase.state[link.index] == "G" and link.movement != CROSSING
         }
