@@ -94,7 +94,10 @@ BAD: dict[str, tuple[Change, str]] = {
         r"roi.size_m: 40.3 m along x .* nearest sizes that fit are 40 or 40.5 m",
     ),
     "too many voxels": (edit("voxel_m = 0.5", "voxel_m = 0.001"), r"roi.voxel_m: 0.001 m gives .* voxels"),
-    "blocks do not divide": (edit("blocks = 4", "blocks = 7"), r"tpog.blocks = 7 does not divide traffic.frames = 40"),
+    "blocks do not divide": (
+        edit("blocks = 4", "blocks = 7"),
+        r"tpog.blocks = 7 does not divide traffic.frames = 40. Use traffic.frames = 35 or 42, or other blocks",
+    ),
     "gamma below 0": (edit("gamma = 4", "gamma = -1"), r"score.gamma: .*, got -1"),
     "gamma NaN": (edit("gamma = 4", "gamma = nan"), r"score.gamma: .*, got nan"),
     "two traffic sources": (

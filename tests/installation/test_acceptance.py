@@ -6,6 +6,7 @@ import json
 import math
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +16,18 @@ import pytest
 import egvs
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.installation.acceptance import Acceptance, accept
+from egvs.installation import acceptance, scan_comparison
+from egvs.installation.acceptance import Acceptance, PoseError, accept
 from egvs.installation.acceptance_limits import Limits
-from egvs.installation.scan_comparison import StaticWorld
+from egvs.installation.scan_comparison import ScanComparison, StaticWorld
 from egvs.scoring.visibility import Beams
+from egvs.sensors.registration import PARAMETERS, StaticSurfaces, register_scan
+from egvs.sensors.sensor import BeamTable, Sensor
 from egvs.sensors.sites import Pose
 from egvs.world.ray_casting import Caster
 from tests.installation.conftest import InstalledRun
 from tests.installation.simulated_scan import box, simulate_scan, with_triangles, without_elevation
+from tests.sensors.yard import room, room_scan
 
 CAR = (4.5, 1.8, 1.5)
 TRUCK = box((16.0, 4.0, 2.0), (10.0, 2.5, 4.0))
@@ -166,6 +171,80 @@ def test_expected_range_of_a_beam_to_the_ground_is_height_by_sine(installed: Ins
     assert world.heights_m(np.array([[1.0, 2.0, 3.5]])).tolist() == pytest.approx([3.5])
 
 
+ENDLESS = (-math.inf, math.inf)
+CORRIDOR = (-8.0, 6.0)
+
+
+def test_direction_that_no_wall_fixes_fails_the_position() -> None:
+    """Between two endless walls along x, nothing tells that the sensor is 1.5 m further along x."""
+    planned = Pose(3.0, 1.0, 4.0, 20.0, -1.0, 0.5)
+    surfaces = StaticSurfaces(room(ENDLESS, CORRIDOR), planned.position_m)
+    fit = register_scan(room_scan(replace(planned, x_m=4.5), ENDLESS, CORRIDOR), surfaces, planned)
+    error = PoseError.of(planned, fit)
+    assert error.position_m < 0.01
+    assert error.position_se_m == math.inf
+    assert math.isfinite(error.tilt_se_deg)
+    check = acceptance._measured_check("position", error.position_m, error.position_se_m, 0.3, "m")
+    assert (check.passed, check.measured) == (False, "cannot be measured")
+
+
+def test_sensor_that_points_backwards_in_a_symmetric_street_fails_the_yaw() -> None:
+    planned, walls_y_m = Pose(0.0, 0.0, 4.0, 20.0, 0.0, 0.0), (-12.0, 12.0)
+    surfaces = StaticSurfaces(room(ENDLESS, walls_y_m), planned.position_m)
+    points = room_scan(replace(planned, yaw_deg=200.2), ENDLESS, walls_y_m)
+    fit = register_scan(points, surfaces, planned)
+    assert fit.pose.yaw_deg == pytest.approx(20.2, abs=0.05)
+    others = acceptance._other_yaws(points, surfaces, fit, planned, "scan")
+    assert others == pytest.approx([-159.8], abs=0.1)
+    check = acceptance._yaw_check(PoseError.of(planned, fit, others), 2.0)
+    assert not check.passed
+    assert "cannot be told: it is off by 0.2 or -179.8 degrees" in check.reason
+    assert acceptance._yaw_check(PoseError.of(planned, fit, others), math.inf).passed
+
+
+def test_one_yaw_fits_where_the_walls_differ(installed: InstalledRun) -> None:
+    assert accept_points(installed, installed.points(TRAFFIC)).pose.other_yaws_deg == ()
+
+
+def test_fit_at_a_worse_yaw_is_not_taken() -> None:
+    """The walls ahead and behind are 8 m and 14 m away: turned around, a scan fits half of the room only."""
+    planned, walls = Pose(0.0, 0.0, 4.0, 20.0, 0.0, 0.0), ((-14.0, 8.0), (-10.0, 10.0))
+    surfaces = StaticSurfaces(room(*walls), planned.position_m)
+    points = room_scan(replace(planned, yaw_deg=200.0), *walls)
+    good = register_scan(points, surfaces, replace(planned, yaw_deg=199.0))
+    worse = replace(good, pose=planned)
+    assert acceptance._other_yaws(points, surfaces, good, planned, "scan") == ()
+    assert acceptance._other_yaws(points, surfaces, worse, planned, "scan") is None
+
+
+def unblocked_comparison(missing_channels: tuple[float, ...] = ()) -> ScanComparison:
+    """A comparison in which every expected return came back, except for those of some channels."""
+    none, beams = np.empty(0), np.empty(0, dtype=np.int64)
+    return ScanComparison(
+        scans=1, azimuth_deg=none, elevation_deg=none, expected_m=none, measured_m=none, returns=1000, off_beams=0,
+        nearer=0, obstacle_beams=beams, obstacle_directions=np.empty((0, 3)), obstacle_ranges_m=none, return_share=1.0,
+        sectors=(), missing_channels=missing_channels, unchecked_channels=0, structure_share=1.0,
+    )  # fmt: skip
+
+
+def test_score_that_cannot_be_computed_fails() -> None:
+    pose, zero = Pose(0.0, 0.0, 4.0, 0.0, 0.0, 0.0), dict.fromkeys(PARAMETERS, 0.0)
+    error = PoseError(pose, pose, zero, zero, 0.0, 0.0, 0.0, 0.0)
+    for limit, passed in ((0.05, False), (math.inf, True)):
+        (check,) = acceptance._checks(error, unblocked_comparison(), None, Limits(loss=limit))[-1:]
+        assert (check.name, check.measured, check.passed) == ("score", "cannot be scored", passed)
+
+
+def test_missing_channel_of_a_sensor_from_a_table_costs_its_beams() -> None:
+    """Channels are named to a hundredth of a degree; the beams of one are those nearest to its elevation."""
+    elevation, azimuth = np.meshgrid([-10.123, -5.456, 0.789], np.arange(0.0, 360.0, 2.0))
+    sensor = Sensor("table", (), (), 0, 50.0, "", table=BeamTable(elevation.ravel(), azimuth.ravel()))
+    assert scan_comparison.channel_elevations_deg(sensor).tolist() == [-10.12, -5.46, 0.79]
+    beams = Beams(Pose(0.0, 0.0, 5.0, 30.0, 4.0), sensor, 20.0 * sensor.directions(30.0, 4.0, 0.0))
+    left = acceptance._installed_beams(beams, unblocked_comparison(missing_channels=(-5.46,)))
+    assert (len(beams.ends_m), len(left.ends_m)) == (540, 360)
+
+
 # ---- command line
 
 
@@ -235,6 +314,13 @@ def test_rejects_scan_of_another_place(installed: InstalledRun) -> None:
     elsewhere = simulate_scan(sites.session.scene, sensor, there.pose, there.pose, sigma_m=0.02)
     with pytest.raises(InputError, match=f"does not fit the static world around {here.name}"):
         accept_points(installed, elsewhere)
+
+
+@pytest.mark.parametrize("option", ["--position", "--loss", "--vehicle-height"])
+def test_rejects_limit_that_is_no_number(run_egvs: Any, tmp_path: Path, option: str) -> None:
+    code, printed, errors = run_egvs("accept", tmp_path, "--site", "a", "--scan", "scan.ply", option, "nan")
+    assert (code, printed) == (2, "")
+    assert f"{option}: expected a number, got nan." in errors
 
 
 def test_rejects_unknown_site_and_missing_options(installed: InstalledRun, run_egvs: Any) -> None:

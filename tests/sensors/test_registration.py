@@ -89,6 +89,35 @@ def test_position_along_corridor_is_not_fixed() -> None:
     assert np.abs(errors(fit.pose, truth)[1:]).max() < 0.01
 
 
+@pytest.mark.parametrize("is_alone", [True, False])
+def test_direction_that_one_small_wall_fixes_is_as_uncertain_as_the_wall(is_alone: bool) -> None:
+    """In a corridor along x, a gable of 4 m, or one at each end, tells where along it the sensor is."""
+    truth = Pose(0.0, 0.0, 4.0, 0.0, 0.0, 0.0)
+    gables = [(20.0, 1.0)] if is_alone else [(20.0, 1.0), (-20.0, 1.0)]
+    quads = [list(corners.reshape(4, 3)) for corners in room(ENDLESS, (-8.0, 6.0)).vertices_m.reshape(-1, 4, 3)]
+    for x_m, y_m in gables:
+        ends = ((y_m, 0.0), (y_m + 4.0, 0.0), (y_m + 4.0, 30.0), (y_m, 30.0))
+        quads.append([np.array([x_m, y, z]) for y, z in ends])
+    points = room_scan(truth, ENDLESS, (-8.0, 6.0), sigma_m=0.0)
+    for x_m, y_m in gables:
+        ranges_m = np.linalg.norm(points, axis=1)
+        at_gable = points * (x_m / np.where(points[:, 0] == 0.0, np.nan, points[:, 0]))[:, None]
+        is_stopped = (
+            (points[:, 0] * x_m > 0.0) & (np.linalg.norm(at_gable, axis=1) < ranges_m)
+            & (at_gable[:, 1] > y_m) & (at_gable[:, 1] < y_m + 4.0)
+        )  # fmt: skip
+        points = np.where(is_stopped[:, None], at_gable, points)
+    points *= 1.0 + 0.01 * np.random.default_rng(0).standard_normal(len(points))[:, None] / 20.0
+    fit = register_scan(points, StaticSurfaces(mesh_of(quads), truth.position_m), truth)
+    assert fit.not_fixed == ()
+    assert fit.pose.x_m == pytest.approx(0.0, abs=0.01)
+    if is_alone:
+        assert fit.standard_errors["x_m"] == pytest.approx(0.2, rel=0.1)
+    else:
+        assert fit.standard_errors["x_m"] < 0.02
+    assert fit.standard_errors["y_m"] < 0.02
+
+
 def test_ground_fixes_height_and_tilt_only() -> None:
     truth = Pose(0.0, 0.0, 4.0, 20.0, -1.0, 0.5)
     points = room_scan(truth, ENDLESS, ENDLESS)

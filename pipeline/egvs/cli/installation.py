@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -107,6 +108,12 @@ def accept(
             raise InputError("--scan", "no scan is given", "Use --scan measured.pcd.")
         if not site:
             raise InputError("--site", "no site is given", "Use the name of a site, such as --site c03.")
+        for option, value in (
+            ("--position", position), ("--tilt", tilt), ("--yaw", yaw), ("--blocked", blocked), ("--returns", returns),
+            ("--off-beams", off_beams), ("--loss", loss), ("--vehicle-height", vehicle_height),
+        ):  # fmt: skip
+            if math.isnan(value):
+                raise InputError(option, "expected a number, got nan", "Give a number, or inf to switch a limit off.")
         limits = Limits(position, tilt, yaw, blocked, missing_channels, returns, off_beams, loss)
         folder = out or run / "acceptance"
         files.check_writable(acceptance_page.AcceptanceFiles.of(folder, site).json)

@@ -119,7 +119,8 @@ def _position(scenario: NewScenario) -> str:
     """Return the position of the junction, and its distance from the requested one."""
     position = f"at {scenario.streets.format_position(scenario.junction.at_m)}"
     if scenario.from_at_m is None:
-        return position
+        is_free = scenario.recorded is None and scenario.demand is None
+        return f"{position}, the largest of the map; --at chooses another" if is_free else position
     return f"{position}, {scenario.from_at_m:,.0f} m from --at"
 
 

@@ -48,6 +48,8 @@ _GOOD_STRUCTURE_SHARE = 0.6
 _MIRROR = np.array([1.0, -1.0, 1.0])
 _BLOCKED_BEAM_DEG = 0.3
 """An expected beam is stopped by the return of an obstacle that is at most this far beside it."""
+_SEARCH_POINTS = 6_000
+"""Of a scan that fits near the planned pose, about as many points tell whether other yaws fit as well."""
 _STEP = 1e-4
 _METRES_HINT = "Export the scan in metres, in the sensor's frame: x forward, y left, z up."
 
@@ -66,7 +68,9 @@ class PoseError:
     position_m, position_se_m
         Distance of the positions.
     tilt_deg, tilt_se_deg
-        Angle between the z axes of the sensor.
+        Angle between the z axes of the sensor. Standard errors are infinite if no surface fixes a part of the quantity.
+    other_yaws_deg
+        Measured minus planned yaw of the other poses at which the scans fit as well.
     """
 
     planned: Pose
@@ -77,18 +81,29 @@ class PoseError:
     position_se_m: float
     tilt_deg: float
     tilt_se_deg: float
+    other_yaws_deg: tuple[float, ...] = ()
 
     @classmethod
-    def of(cls, planned: Pose, fit: Registration) -> PoseError:
-        """Return the error of a registered pose."""
+    def of(cls, planned: Pose, fit: Registration, other_yaws_deg: Sequence[float] = ()) -> PoseError:
+        """Return the error of a registered pose; ``other_yaws_deg`` are those of poses that fit as well."""
         values = {name: getattr(fit.pose, name) - getattr(planned, name) for name in PARAMETERS}
         for name in PARAMETERS[3:]:
-            values[name] = (values[name] + 180.0) % 360.0 - 180.0
+            values[name] = _signed_angle_deg(values[name])
         position_m, position_se_m = _propagate(lambda pose: _distance_m(planned, pose), fit)
         tilt_deg, tilt_se_deg = _propagate(lambda pose: _tilt_deg(planned, pose), fit)
+        # A parameter that is not fixed has its planned value, where the derivatives of distance and tilt are 0.
+        if {"x_m", "y_m", "z_m"} & set(fit.not_fixed):
+            position_se_m = math.inf
+        if {"pitch_deg", "roll_deg"} & set(fit.not_fixed):
+            tilt_se_deg = math.inf
+        others = tuple(_signed_angle_deg(yaw_deg - planned.yaw_deg) for yaw_deg in other_yaws_deg)
         return cls(
-            planned, fit.pose, values, fit.standard_errors, position_m, position_se_m, tilt_deg, tilt_se_deg
+            planned, fit.pose, values, fit.standard_errors, position_m, position_se_m, tilt_deg, tilt_se_deg, others
         )  # fmt: skip
+
+
+def _signed_angle_deg(angle_deg: float) -> float:
+    return (angle_deg + 180.0) % 360.0 - 180.0
 
 
 def _distance_m(planned: Pose, pose: Pose) -> float:
@@ -237,6 +252,7 @@ class Acceptance:
             "planned_pose": asdict(self.pose.planned),
             "measured_pose": asdict(self.pose.measured),
             "pose_error": errors,
+            "other_yaw_errors_deg": list(self.pose.other_yaws_deg),
             "residual_m": self.residual_m,
             "on_surface_share": self.on_surface_share,
             "blocked_sectors": [_sector_json(sector) for sector in comparison.sectors],
@@ -321,7 +337,7 @@ def accept(
     fit, comparison, others = _register(clouds, sensor, planned, surfaces, world, where, max_vehicle_height_m)
     progress("registered", 2, steps)
 
-    error = PoseError.of(planned.pose, fit)
+    error = PoseError.of(planned.pose, fit, others)
     notes = list(_notes(fit, comparison, others))
     score = _score_change(planned_sites.session, planned, fit.pose, comparison, notes)
     progress("scored", 3, steps)
@@ -367,32 +383,59 @@ def _register(
     if fit is not None:
         comparison = scan_comparison.compare_scans(clouds, sensor, fit.pose, world, max_vehicle_height_m)
         if _is_plausible(fit, start) and _structure(comparison) >= _GOOD_STRUCTURE_SHARE:
-            return fit, comparison, ()
+            others = _other_yaws(points_m, surfaces, fit, start, where)
+            if others is not None:
+                return fit, comparison, others
 
     problem = f"the scan does not fit the static world around {planned.name} at any yaw"
     hint = (
         f"Check that it was measured at this site, in the sensor's frame in metres, less than {MAX_DISPLACEMENT_M:g} m"
         " and about 5 degrees of tilt from the planned pose."
     )
+    search, share = None, 0.0
     try:
         search = registration.search_yaw(points_m, surfaces, start, where=where)
-    except InputError:
-        raise InputError(where, problem, hint) from None
-    best = search.best
-    comparison = scan_comparison.compare_scans(clouds, sensor, best.pose, world, max_vehicle_height_m)
-    if _structure(comparison) < _GOOD_STRUCTURE_SHARE:
+    except InputError:  # at no yaw do enough points lie on the static world
+        pass
+    if search is not None:
+        best = search.best
+        comparison = scan_comparison.compare_scans(clouds, sensor, best.pose, world, max_vehicle_height_m)
+        share = _structure(comparison)
+    if share < _GOOD_STRUCTURE_SHARE:
         mirrored = [cloud * _MIRROR for cloud in clouds]
-        if _mirror_share(mirrored, sensor, start, surfaces, world) > max(_structure(comparison), _GOOD_STRUCTURE_SHARE):
+        if _mirror_share(mirrored, sensor, start, surfaces, world) > max(share, _GOOD_STRUCTURE_SHARE):
             problem = "the scan fits the static world as its mirror image only"
             raise InputError(where, problem, "Export y to the left of x: azimuths count counter-clockwise from above.")
-    if not _is_plausible(best, start) or _structure(comparison) < MIN_STRUCTURE_SHARE:
+    if search is None or not _is_plausible(best, start) or share < MIN_STRUCTURE_SHARE:
         raise InputError(where, problem, hint)
-    return best, comparison, tuple(other.registration.pose.yaw_deg for other in search.equally_good)
+    equally_good = [other.registration for other in search.equally_good]
+    return best, comparison, tuple(other.pose.yaw_deg for other in equally_good if _is_near(other, start))
+
+
+def _other_yaws(
+    points_m: FloatArray, surfaces: StaticSurfaces, fit: Registration, planned: Pose, where: str
+) -> tuple[float, ...] | None:
+    """Return the other yaws at which the scans fit as well as in ``fit``; None if they fit better at another yaw."""
+    few = points_m[:: max(1, len(points_m) // _SEARCH_POINTS)]
+    try:
+        search = registration.search_yaw(few, surfaces, fit.pose, where=where)
+    except InputError:  # too few of these points lie on the static world
+        return ()
+    found = [search.best, *(other.registration for other in search.equally_good)]
+    near = [other for other in found if _is_near(other, planned)]
+    others = [other for other in near if not registration.is_same_pose(other.pose, fit.pose)]
+    if others and len(others) == len(near):
+        return None
+    return tuple(other.pose.yaw_deg for other in others)
+
+
+def _is_near(fit: Registration, planned: Pose) -> bool:
+    return _distance_m(planned, fit.pose) <= MAX_DISPLACEMENT_M
 
 
 def _is_plausible(fit: Registration, planned: Pose) -> bool:
     """Return whether a registration ended, and where it can have started."""
-    return fit.converged and _distance_m(planned, fit.pose) <= MAX_DISPLACEMENT_M
+    return fit.converged and _is_near(fit, planned)
 
 
 def _mirror_share(
@@ -476,8 +519,10 @@ def _installed_beams(beams: Beams, comparison: ScanComparison) -> Beams:
     for sector in comparison.sectors:
         if not sector.has_returns:
             lost |= np.mod(azimuth_deg - sector.first_deg, 360.0) < sector.width_deg
-    for channel_deg in comparison.missing_channels:
-        lost |= np.abs(elevation_deg - channel_deg) < 1e-3
+    if comparison.missing_channels:
+        channels_deg = scan_comparison.channel_elevations_deg(beams.sensor)
+        channel = np.abs(elevation_deg[:, None] - channels_deg).argmin(axis=1)
+        lost |= np.isin(channels_deg[channel], comparison.missing_channels)
     weight = None if beams.weight is None else beams.weight[~lost]
     return replace(beams, ends_m=ends_m[~lost], weight=weight)
 
@@ -486,11 +531,10 @@ def _installed_beams(beams: Beams, comparison: ScanComparison) -> Beams:
 
 
 def _checks(error: PoseError, comparison: ScanComparison, score: ScoreChange | None, limits: Limits) -> list[Check]:
-    yaw_se_deg = error.standard_errors["yaw_deg"]
     checks = [
         _measured_check("position", error.position_m, error.position_se_m, limits.position_m, "m"),
         _measured_check("tilt", error.tilt_deg, error.tilt_se_deg, limits.tilt_deg, "degrees"),
-        _measured_check("yaw", error.values["yaw_deg"], yaw_se_deg, limits.yaw_deg, "degrees"),
+        _yaw_check(error, limits.yaw_deg),
     ]
     sectors = "; ".join(describe_sector(sector) for sector in comparison.sectors)
     blocked = comparison.blocked_deg <= limits.blocked_deg
@@ -518,7 +562,11 @@ def _checks(error: PoseError, comparison: ScanComparison, score: ScoreChange | N
     passed = off <= limits.off_beams
     reason = "" if passed else f"{off:.0%} of the returns lie on no beam of the planned sensor: is it another model?"
     checks.append(Check("returns on no beam", f"{off:.1%}", f"at most {limits.off_beams:.0%}", passed, reason))
-    if score is not None:
+    if score is None:
+        passed = math.isinf(limits.loss)
+        reason = "" if passed else "the score of the installed sensor cannot be computed"
+        checks.append(Check("score", "cannot be scored", f"at least {-limits.loss:+.0%}", passed, reason))
+    else:
         label = SCORE_LABELS[score.name]
         passed = score.loss <= limits.loss
         measured = f"{label.value(score.as_installed)} instead of {label.value(score.planned)} {label.unit}".rstrip()
@@ -537,6 +585,18 @@ def _measured_check(name: str, value: float, se: float, limit: float, unit: str)
     measured = f"{describe_error(value, se)} {unit}"
     reason = "" if passed else f"{name} is off by {describe_error(abs(value), se)} {unit}, limit {limit:g}"
     return Check(name, measured, f"at most {limit:g} {unit}", passed, reason, abs(abs(value) - limit) <= 2.0 * se)
+
+
+def _yaw_check(error: PoseError, limit_deg: float) -> Check:
+    """Return the check of the yaw; it fails if the scans fit as well at a yaw beyond the limit."""
+    value_deg = error.values["yaw_deg"]
+    check = _measured_check("yaw", value_deg, error.standard_errors["yaw_deg"], limit_deg, "degrees")
+    beyond_deg = [other_deg for other_deg in error.other_yaws_deg if abs(other_deg) > limit_deg]
+    if not beyond_deg or not math.isfinite(error.standard_errors["yaw_deg"]):
+        return check
+    errors = " or ".join(f"{error_deg:z.1f}" for error_deg in (value_deg, *beyond_deg))
+    reason = f"yaw cannot be told: it is off by {errors} degrees, the scan fits as well at each"
+    return replace(check, measured=f"{errors} degrees", passed=False, reason=reason, is_close=False)
 
 
 def describe_error(value: float, se: float, unit: str = "") -> str:

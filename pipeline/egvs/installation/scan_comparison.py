@@ -269,7 +269,7 @@ def compare_scans(
     obstacle = far_nearer & impossible & on_beam
 
     azimuth_deg = np.mod(np.degrees(np.arctan2(beams[:, 1], beams[:, 0])), 360.0)
-    elevation_deg = np.degrees(np.arcsin(np.clip(beams[:, 2], -1.0, 1.0)))
+    elevation_deg = _elevations_deg(beams)
     returned = np.zeros((len(scans), len(beams)), dtype=np.bool_)
     returned[scan_of_point[on_beam], beam[on_beam]] = True
     sure = expected_m <= SURE_RANGE * sensor.range_m
@@ -396,17 +396,33 @@ def _circular_runs(marked: Bools) -> list[tuple[int, int]]:
     return runs
 
 
+def channel_elevations_deg(sensor: Sensor) -> FloatArray:
+    """Return the elevation of each channel of a sensor, (channels,) float64.
+
+    Those of a sensor from a table are its different elevations, to a hundredth of a degree.
+    """
+    if sensor.table is None:
+        return np.asarray(sensor.elevations_deg, dtype=np.float64)
+    elevations_deg: FloatArray = np.unique(np.round(_elevations_deg(sensor.directions()), 2))
+    return elevations_deg
+
+
+def _elevations_deg(directions: FloatArray) -> FloatArray:
+    elevations_deg: FloatArray = np.degrees(np.arcsin(np.clip(directions[:, 2], -1.0, 1.0)))
+    return elevations_deg
+
+
 def _missing_channels(
     sensor: Sensor, elevation_deg: FloatArray, sure: Bools, returned: Bools
 ) -> tuple[tuple[float, ...], int | None]:
     """Return the elevations of channels without returns, and how many could not be checked (None without channels)."""
+    elevations = channel_elevations_deg(sensor)
     if sensor.table is None:
         channel = np.arange(sensor.beams) % sensor.channels
-        elevations = np.asarray(sensor.elevations_deg)
     else:
-        elevations, channel = np.unique(np.round(elevation_deg, 2), return_inverse=True)
         if len(elevations) > _MAX_CHANNELS:
             return (), None
+        channel = np.searchsorted(elevations, np.round(elevation_deg, 2))
     expected = len(returned) * np.bincount(channel[sure], minlength=len(elevations))
     came_back = np.bincount(channel[sure], weights=returned[:, sure].sum(axis=0), minlength=len(elevations))
     checked = expected >= _CHANNEL_EXPECTED

@@ -354,7 +354,12 @@ class Scenario(StrictModel):
         for period, traffic in self._traffic_by_period():
             if traffic.frames is not None and traffic.frames % blocks:
                 suffix = f" of the period {period!r}" if period else ""
-                raise ValueError(f"tpog.blocks = {blocks} does not divide traffic.frames = {traffic.frames}{suffix}")
+                below = traffic.frames - traffic.frames % blocks
+                near = f"{below} or {below + blocks}" if below else f"{blocks}"
+                raise ValueError(
+                    f"tpog.blocks = {blocks} does not divide traffic.frames = {traffic.frames}{suffix}. Use"
+                    f" traffic.frames = {near}, or other blocks"
+                )
         occlusion = self.effects.named.get("moving_occlusion")
         if self.traffic.periods and getattr(occlusion, "method", "") == "frames":
             raise ValueError(

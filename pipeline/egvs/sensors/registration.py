@@ -18,8 +18,9 @@ the static world does not have, get no weight.
 Errors of neighbouring points are correlated, since the static world differs from the real one. The covariance is
 therefore that of the jackknife over clusters (one step from each; Cameron and Miller 2015, J. Hum. Resour. 50, 317-372,
 CR3). Clusters are sectors of azimuth, or the walls of a solid within a wider sector, whichever gives the larger
-variance. A parameter that no surface fixes, such as the position along an endless wall, has an infinite variance and
-keeps its start value. The covariance knows nothing about errors that all of the world shares.
+variance. A direction that one cluster alone fixes is as uncertain as the place of a wall on a map, 0.2 m, since without
+the cluster no step can tell. A parameter that no surface fixes, such as the position along an endless wall, has an
+infinite variance and keeps its start value. The covariance knows nothing about errors that all of the world shares.
 """
 
 from __future__ import annotations
@@ -54,6 +55,10 @@ _SEARCH_POINTS = 3_000
 _START_GATE_M = 3.0
 _MIN_GATE_M = 0.4
 """Walls of a map may be wrong by decimetres, while the ground fits to a centimetre: they must not count as outliers."""
+_SINGLE_CLUSTER_M = 0.5 * _MIN_GATE_M
+"""How wrong a wall of a map may be if no other surface confirms where it is."""
+_SINGLE_CLUSTER_SHARE = 1e-3
+"""A cluster alone fixes a direction if the others have less than this share of the information about it."""
 _GATE_SIGMAS = 4.0
 _NARROWING = 0.75
 _RANGE_GATES = 5.0
@@ -316,14 +321,14 @@ def search_yaw(
             optimum = _fit(few, surfaces, _with_yaw(start, float(yaw_deg)), columns, _ROUGH, where)
         except InputError:  # hardly a point lies on the static world at this yaw
             continue
-        if not any(_is_same(optimum.pose, fit.pose) for fit in fits):
+        if not any(is_same_pose(optimum.pose, fit.pose) for fit in fits):
             fits.append(_registration(points_m, few, surfaces, optimum, columns))
     if not fits:
         raise _off_surface(where)
     fits.sort(key=lambda fit: fit.cost_m)
     best = register_scan(points_m, surfaces, fits[0].pose, free=free, where=where)
     blocks = _azimuth_blocks(points_m)
-    others = [fit for fit in fits[1:] if not _is_same(fit.pose, best.pose)]
+    others = [fit for fit in fits[1:] if not is_same_pose(fit.pose, best.pose)]
     return YawSearch(best, tuple(_alternative(best, other, blocks) for other in others), yaws_deg, costs)
 
 
@@ -347,7 +352,8 @@ def _with_yaw(pose: Pose, yaw_deg: float) -> Pose:
     return Pose(*pose.position_m, yaw_deg, pose.pitch_deg, pose.roll_deg)
 
 
-def _is_same(one: Pose, other: Pose) -> bool:
+def is_same_pose(one: Pose, other: Pose) -> bool:
+    """Return whether two poses are one optimum: their yaws within 1 degree, their positions within 0.5 m."""
     turn_deg = (one.yaw_deg - other.yaw_deg + 180.0) % 360.0 - 180.0
     apart_m = float(np.linalg.norm(np.subtract(one.position_m, other.position_m)))
     return abs(turn_deg) < _SAME_YAW_DEG and apart_m < _SAME_POSITION_M
@@ -406,6 +412,35 @@ def _jackknife(along: FloatArray, curvature: FloatArray, scores: FloatArray, clu
     without = np.linalg.pinv(normals.sum(axis=0) - normals, rcond=1e-9, hermitian=True)
     shifts = np.einsum("gij,gj->gi", without, sums)
     covariance: FloatArray = shifts.T @ shifts * ((len(shifts) - 1) / len(shifts))
+    information = np.bincount(cluster, weights=curvature).astype(np.float64)
+    summed: FloatArray = covariance + _single_cluster_variance(normals, information)
+    return summed
+
+
+def _single_cluster_variance(normals: FloatArray, information: FloatArray) -> FloatArray:
+    """Return the covariance of directions that one cluster alone fixes, (k, k): nothing else tells where it is.
+
+    Such a cluster may be off by :data:`_SINGLE_CLUSTER_M` (root mean square over its points), which moves the pose in
+    this direction.
+
+    Parameters
+    ----------
+    normals
+        Normal matrix of each cluster, (g, k, k).
+    information
+        Sum of the weights of each cluster, (g,).
+    """
+    values, vectors = np.linalg.eigh(normals.sum(axis=0))
+    covariance: FloatArray = np.zeros(normals.shape[1:])
+    if not len(values) or values[0] <= 0.0:
+        return covariance
+    root = vectors / np.sqrt(values) @ vectors.T
+    remaining, directions = np.linalg.eigh(root @ (normals.sum(axis=0) - normals) @ root)
+    for cluster, k in np.argwhere(remaining < _SINGLE_CLUSTER_SHARE):
+        if information[cluster] > 0.0:
+            # The direction moves the points of the cluster by 1 / sqrt(information), root mean square.
+            moved = root @ directions[cluster, :, k] * (_SINGLE_CLUSTER_M * np.sqrt(information[cluster]))
+            covariance += np.outer(moved, moved)
     return covariance
 
 
