@@ -215,7 +215,7 @@ def test_trees_grow_about_their_centres_and_houses_and_street_lamps_do_not() -> 
         ("[what_if.a]\nshare = 0.5\n", "expected vehicles, footprints, boxes or tree_scale, got none of them"),
         ("[what_if.a]\nshare = 1.5\nvehicles = 'p.csv'\n", "what_if.a.share"),
         ("[what_if.a]\nshare = 0.5\nvehicles = 'nowhere.csv'\n", "nowhere.csv"),
-        (FAR, "parked.csv: row 1: type: expected one of car, van, truck"),
+        (FAR, "parked.csv: line 2: type: expected one of car, van, truck"),
     ],
 )
 def test_wrong_tables_get_one_message(tmp_path: Path, run_egvs: Any, monkeypatch: Any, text: str, message: str) -> None:
@@ -230,7 +230,7 @@ def test_wrong_tables_get_one_message(tmp_path: Path, run_egvs: Any, monkeypatch
 
 def test_wrong_number_names_row_and_column(tmp_path: Path) -> None:
     path = scenario(tmp_path, FAR, parked_csv='x_m,y_m,yaw_deg,type\n1,2,0,car\n"1,5",2,0,car\n')
-    with pytest.raises(InputError, match=r"parked.csv: row 2: x_m: expected a number, got '1,5'"):
+    with pytest.raises(InputError, match=r"parked.csv: line 3: x_m: expected a number, got '1,5'"):
         solid_documents(load(path), "far")
 
 

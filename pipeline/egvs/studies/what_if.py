@@ -1,7 +1,7 @@
 r"""The ranking with solids that are in the scene for a share of the time, for ``egvs what-if``.
 
 For each table ``[what_if.NAME]``, the scenario runs as it is and with the solids of the table; traffic is the same and
-comes from the store, so only the static world, the scans and the scores are made again. With the score :math:`S_0` of a
+comes from the cache, so only the static world, the scans and the scores are made again. With the score :math:`S_0` of a
 site without the solids, :math:`S_1` with them, and the share :math:`q` of the time in which they are there, its
 expected score is
 
@@ -19,10 +19,10 @@ The solids are written to the run folders, as ``what_if_1.geojson`` and so on.
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,12 +33,16 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.numbers import parse_decimal
 from egvs.core.platform import relative_path
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.special import cosdg, sindg
+from egvs.formats import csv_tables
 from egvs.report.basemap import solid_group
+from egvs.report.command_sections import DIGEST_KEY, what_if_digest
 from egvs.report.formatting import ScoreLabel, format_probability, join_names
 from egvs.report.ranking import RankedSite, Ranking
 from egvs.report.sensor_results import ScoreDifference
-from egvs.runs import run_names
+from egvs.runs import run, run_names
+from egvs.runs.command_results import add_to_report
 from egvs.runs.run_sources import SettingsSource
 from egvs.scenario.fields import MAX_COORDINATE_M
 from egvs.scenario.model import Scenario
@@ -192,6 +196,69 @@ class WhatIfResult:
     label: ScoreLabel
     best: RankedSite
     notes: tuple[str, ...]
+
+
+def what_if(
+    path: str | Path,
+    overrides: Sequence[str] = (),
+    names: Sequence[str] = (),
+    *,
+    jobs: int | None = None,
+    progress: ProgressCallback = no_progress,
+    listener: run.StageListener = run.ignore_stage,
+) -> WhatIfResult:
+    """Run a scenario as it is and with the solids of its tables, compare the rankings, and add the answers to a report.
+
+    Parameters
+    ----------
+    path, overrides, names
+        As in :func:`prepare_runs`.
+    jobs
+        Number of threads; one per core when None. Results do not depend on it.
+    progress, listener
+        Called with the progress of stages, and when a stage begins or ends.
+
+    Returns
+    -------
+    WhatIfResult
+        The answers. Those in the report of the first run are the same.
+
+    Raises
+    ------
+    InputError
+        When the scenario or a file is wrong, or it has no such table.
+    """
+
+    def run_one(_: int, what_if_run: WhatIfRun) -> None:
+        run.run(what_if_run.scenario, what_if_run.folder, jobs=jobs, progress=progress, listener=listener)
+
+    result = compare_runs(prepare_runs(Path(path), overrides, names), run_one)
+    record_answers(result)
+    return result
+
+
+def record_answers(result: WhatIfResult) -> tuple[Path, ...]:
+    """Write the answers into the folder of the run as it is, and add them to its report; return both files.
+
+    Parameters
+    ----------
+    result
+        From :func:`compare_runs`.
+    """
+    base, *others = result.runs
+    entries = {}
+    for answer in result.answers:
+        tables = [other.name for other in others] if answer.name == TOGETHER else [answer.name]
+        values = asdict(answer)
+        del values["name"]
+        entries[answer.name] = {
+            **values,
+            "impossible": list(answer.impossible),
+            "conclusion": answer.conclusion(),
+            "tables": tables,
+            DIGEST_KEY: what_if_digest(base.scenario, tables),
+        }
+    return add_to_report(base.folder, RunFolder.what_if, entries)
 
 
 def prepare_runs(path: Path, overrides: Sequence[str] = (), names: Sequence[str] = ()) -> tuple[WhatIfRun, ...]:
@@ -373,38 +440,34 @@ def read_vehicles(path: Path, scenario: Scenario) -> list[WhatIfBox]:
     Raises
     ------
     InputError
-        Naming file, row and value.
+        Naming file, line and value.
     """
     sizes = class_sizes(scenario.traffic)
     boxes = []
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = csv.DictReader(file, skipinitialspace=True)
-            for column in VEHICLE_COLUMNS:
-                if column not in (rows.fieldnames or ()):
-                    hint = f"The header needs the columns {', '.join(VEHICLE_COLUMNS)}, separated by commas."
-                    raise InputError(path, f"the file has no column {column}", hint)
-            for number, row in enumerate(rows, start=1):
-                where = f"{path}: row {number}"
-                kind = (row["type"] or "").strip()
-                if kind not in sizes:
-                    problem = f"expected one of {', '.join(sizes)}, got {kind!r}"
-                    raise InputError(f"{where}: type", problem)
-                x_m, y_m, yaw_deg = (_parse(row[name], f"{where}: {name}") for name in VEHICLE_COLUMNS[:3])
-                size = sizes[kind]
-                extent = {"length_m": size.length_m, "width_m": size.width_m, "height_m": size.height_m}
-                boxes.append(WhatIfBox(x_m=x_m, y_m=y_m, yaw_deg=yaw_deg, kind=PARKED, **extent))
-    except (UnicodeDecodeError, csv.Error) as error:
-        hint = "Save it as UTF-8 text with a header row."
-        raise InputError(path, f"the file cannot be read as CSV ({error})", hint) from None
+    for where, row in csv_tables.read_rows(path, partial(_check_vehicle_columns, path)):
+        kind = row["type"]
+        if kind not in sizes:
+            problem = f"expected one of {', '.join(sizes)}, got {kind!r}"
+            raise InputError(f"{where}: type", problem, "Use one of these, or add the kind to traffic.kinds.")
+        x_m, y_m, yaw_deg = (_parse(row[name], f"{where}: {name}") for name in VEHICLE_COLUMNS[:3])
+        size = sizes[kind]
+        extent = {"length_m": size.length_m, "width_m": size.width_m, "height_m": size.height_m}
+        boxes.append(WhatIfBox(x_m=x_m, y_m=y_m, yaw_deg=yaw_deg, kind=PARKED, **extent))
     if not boxes:
         raise InputError(path, "expected at least one vehicle, got none", "Write one row per vehicle.")
     return boxes
 
 
-def _parse(text: str | None, where: str) -> float:
+def _check_vehicle_columns(path: Path, header: list[str]) -> list[str]:
+    for column in VEHICLE_COLUMNS:
+        if column not in header:
+            raise InputError(path, f"the file has no column {column}", f"Columns: {', '.join(VEHICLE_COLUMNS)}.")
+    return header
+
+
+def _parse(text: str, where: str) -> float:
     try:
-        value = parse_decimal(text or "")
+        value = parse_decimal(text)
     except ValueError:
         value = math.nan
     if not abs(value) <= MAX_COORDINATE_M:
