@@ -169,6 +169,8 @@ def test_green_that_crosses_another_gives_way() -> None:
     """Link 1 gives way to link 0; where both are green, it gets the letter for that."""
     letters = signal_programs._with_right_of_way(["G", "G", "r"], {0: "a", 1: "b", 2: "c"}, {1: {0}, 2: {0}})
     assert "".join(letters) == "Ggr"
+    letters = signal_programs._with_right_of_way(["y", "G", "r"], {0: "a", 1: "b", 2: "c"}, {1: {0}, 2: {0}})
+    assert "".join(letters) == "ygr"  # vehicles still come in yellow
 
 
 def test_dark_group_governs_nothing() -> None:

@@ -7,6 +7,7 @@ the network's foes for conflicts.
 import re
 import shutil
 
+import numpy as np
 import pytest
 
 from egvs.core.errors import InputError
@@ -113,6 +114,29 @@ def test_green_in_two_phases_is_not_interrupted(crossing):
     south = [letters(crossing, phase.state)["south Mill Lane straight"] for phase in program.phases]
     assert north == ["G", "G", "G", "G", "y", "r", "r", "r", "r"]
     assert south == ["r", "r", "r", "G", "y", "r", "r", "r", "r"]
+
+
+def test_left_turn_gives_way_to_oncoming_yellow(crossing):
+    """North keeps its green while the oncoming vehicles have yellow: they may still come, so no right of way."""
+    alone = {"green": {"north": ["all"]}, "green_s": 10}
+    program = programs(crossing, {"c": {"phases": [NS, alone, EW]}})["c"]
+    both, yellow, all_red, after = (letters(crossing, phase.state) for phase in program.phases[:4])
+    assert yellow["south Mill Lane straight"] == "y"
+    assert [state["north Mill Lane left"] for state in (both, yellow)] == ["g", "g"]
+    assert [state["north Mill Lane straight"] for state in (both, yellow, all_red, after)] == ["G"] * 4
+
+
+def test_position_of_two_links_gives_way_if_one_of_them_does():
+    """Left and straight share position 0; the left turn gives way to position 1, whichever comes last."""
+    north = np.array([0.0, -1.0])
+    left = signals.Link(0, "north", "left", "a", "", north, frozenset({1}), frozenset({1}))
+    straight = signals.Link(0, "north", "straight", "a", "", north)
+    oncoming = signals.Link(1, "south", "straight", "b", "", -north, frozenset({0}))
+    for links in ((left, straight, oncoming), (straight, left, oncoming)):
+        signal = signals.Signal("c", ("c",), (0.0, 0.0), links, signals.Program("static", 0.0, ()))
+        assert signal_plans.state_of({0, 1}, signal) == "gG"
+        assert signal_plans.state_of({0}, signal) == "Gr"
+        assert signal_plans.state_of({0}, signal, {1}) == "gy"
 
 
 @pytest.mark.parametrize("name", ["c", "Mill Lane / High Street", "high st & Mill Ln."])

@@ -249,7 +249,9 @@ def _phases(config: SignalConfig, greens: Sequence[set[int]], signal: Signal) ->
 
 
 def state_of(green: Set[int], signal: Signal, yellow: Set[int] = frozenset()) -> str:
-    """Return the state with green and yellow links; a green that gives way to another one is "g".
+    """Return the state with green and yellow links; a green that gives way to green or yellow is "g".
+
+    One position may govern several links; it gives way if one of them does.
 
     Parameters
     ----------
@@ -259,9 +261,11 @@ def state_of(green: Set[int], signal: Signal, yellow: Set[int] = frozenset()) ->
         Their signal.
     """
     letters = ["r"] * signal.states
+    may_drive = green | yellow
+    giving_way = {link.index for link in signal.links if link.yields_to & may_drive}
     for link in signal.links:
         if link.index in green:
-            letters[link.index] = "g" if link.yields_to & green else "G"
+            letters[link.index] = "g" if link.index in giving_way else "G"
         elif link.index in yellow:
             letters[link.index] = "y"
     return "".join(letters)

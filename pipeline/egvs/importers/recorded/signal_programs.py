@@ -472,10 +472,10 @@ def _with_yellow(states: list[str]) -> list[str]:
 def _with_right_of_way(
     letters: Sequence[str], governed: Collection[int], yields_to: Mapping[int, set[int]]
 ) -> Iterator[str]:
-    """Yield the letters, with "g" for a green that gives way to another."""
-    green = {index for index, letter in enumerate(letters) if letter == GREEN}
+    """Yield the letters, with "g" for a green that gives way to green or yellow."""
+    may_drive = {index for index, letter in enumerate(letters) if letter in (GREEN, YELLOW)}
     for index, letter in enumerate(letters):
-        if index in governed and letter == GREEN and yields_to.get(index, set()) & green:
+        if index in governed and letter == GREEN and yields_to.get(index, set()) & may_drive:
             yield "g"
         else:
             yield letter
