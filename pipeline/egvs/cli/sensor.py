@@ -391,8 +391,8 @@ def print_design(result: DesignResult, file: Path | None) -> None:
         f"The search saw {searched:,} frames; scores with ± come from {others:,} other frames, so the search"
         " does not bias them.",
         f"Best by the search: {chosen.sensor.name}. Row of sites.csv (site,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg,"
-        f"sensor): {result.pole},{chosen.pose.x_m:g},{chosen.pose.y_m:g},{chosen.pose.z_m:g},{chosen.pose.yaw_deg:g},"
-        f"{chosen.pose.pitch_deg:g},{chosen.pose.roll_deg:g},{chosen.sensor.name}",
+        f"sensor): {result.pole},{chosen.pose.x_m:.3f},{chosen.pose.y_m:.3f},{chosen.pose.z_m:.3f},"
+        f"{chosen.pose.yaw_deg:z.3f},{chosen.pose.pitch_deg:z.3f},{chosen.pose.roll_deg:z.3f},{chosen.sensor.name}",
     ]
     if result.designed is not None:
         elevations = ", ".join(f"{value:g}" for value in result.designed.sensor.elevations_deg)
