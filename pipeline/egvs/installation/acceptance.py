@@ -12,6 +12,7 @@ static world, not an error of the whole map.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -393,10 +394,8 @@ def _register(
         " and about 5 degrees of tilt from the planned pose."
     )
     search, share = None, 0.0
-    try:
+    with contextlib.suppress(InputError):  # where at no yaw enough points lie on the static world
         search = registration.search_yaw(points_m, surfaces, start, where=where)
-    except InputError:  # at no yaw do enough points lie on the static world
-        pass
     if search is not None:
         best = search.best
         comparison = scan_comparison.compare_scans(clouds, sensor, best.pose, world, max_vehicle_height_m)
