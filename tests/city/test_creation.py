@@ -112,7 +112,8 @@ def test_junction_has_region_and_poles_of_egvs_new(made: creation.NewCity, extra
         in_city, single = made.folder / "junctions" / junction.id, made.folder.parent / f"single-{junction.id}"
         create_scenario(single, extract, (junction.lat_deg, junction.lon_deg), surroundings_m=math.inf)
         scenario, expected = egvs.load(in_city), egvs.load(single)
-        assert (scenario.roi, scenario.sites, scenario.score) == (expected.roi, expected.sites, expected.score)
+        without_zones = expected.score.model_copy(update={"zones": None})  # a city has none
+        assert (scenario.roi, scenario.sites, scenario.score) == (expected.roi, expected.sites, without_zones)
         assert (in_city / "sites.csv").read_bytes() == (single / "sites.csv").read_bytes()
 
         near, all_solids = read_solids(in_city), read_solids(single)
