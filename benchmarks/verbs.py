@@ -28,10 +28,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from tests.installation.simulated_scan import simulate_scan
 
 from benchmarks import page_tables
 from benchmarks.page_tables import Cells
 from benchmarks.simulated_sweeps import Truth, simulate_sweep
+from egvs.formats import point_clouds
+from egvs.installation.planned_sites import PlannedSites
 from egvs.sensors.sensor import CATALOGUE
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -45,7 +48,15 @@ REPEATS = 3
 
 QUICK_S = 2.0
 
-SHORT = 'extends = "../roundabout"\n\n[traffic]\nframes = 200\n'
+SHORT = """extends = "../roundabout"
+
+[traffic]
+frames = 200
+
+[what_if.works]
+share = 0.2
+boxes = [{x_m = 22, y_m = 20, length_m = 6, width_m = 2.5, height_m = 2.6}]
+"""
 """The scenario of most commands."""
 
 
@@ -78,6 +89,9 @@ class Verb:
         return " ".join(self.arguments[: 2 if self.arguments[0] == "city" else 1])
 
 
+ACCEPTED_SITE, SCAN = "kerb_NW", "scan.pcd"
+"""The site of ``egvs accept``, and a simulated scan of its sensor."""
+
 VERBS = (
     Verb("new imported --osm small.osm"),
     Verb("demo example"),
@@ -86,6 +100,7 @@ VERBS = (
     Verb("place short --out run --count 2", saves_results=True),
     Verb("explore run --no-browser --port 0", saves_results=True, is_server=True),
     Verb("compare run other"),
+    Verb("what-if short", saves_results=True),
     Verb("city new town --osm small.osm --junctions all"),
     Verb("city traffic city", saves_results=True),
     Verb("city run city --out new --cluster processes=1", saves_results=True),
@@ -103,6 +118,8 @@ VERBS = (
     Verb("scan short --out run"),
     Verb("score short --out run"),
     Verb("report short --out run"),
+    Verb("sheets run"),
+    Verb(f"accept run --site {ACCEPTED_SITE} --scan {SCAN}"),
     Verb("runs ."),
     Verb("export run --to geojson"),
     Verb("figure run --what ranking"),
@@ -192,6 +209,11 @@ def prepare(folder: Path, store: Path, verbs: Iterable[Verb]) -> None:
     for name, command_line in PREPARATION.items():
         if name in needed:
             processor_s(Verb(command_line), folder, Caches(store))
+    if SCAN in needed:
+        planned = PlannedSites.open(folder / "run")
+        site = planned.site(ACCEPTED_SITE)
+        scan = simulate_scan(planned.session.scene, planned.sensor(site), site.pose, site.pose)
+        point_clouds.write_points(folder / SCAN, scan)
 
 
 @dataclass(frozen=True)

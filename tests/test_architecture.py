@@ -121,6 +121,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 SCENE = "from egvs import *; s = load('mini'); scene = build_scene(s); "
 USES = {
+    "DesignRequest": "DesignRequest('pole_a').channels is None",
     "EgvsError": "EgvsError('text')",
     "InputError": "InputError('file', 'problem', 'Hint').hint == 'Hint'",
     "JointScore": "JointScore.of(__import__('egvs').load('mini'), 'joint').candidates == ('pole_a', 'pole_b')",
@@ -134,8 +135,11 @@ USES = {
     "Site": "Site('a', __import__('egvs').Pose(1.0, 2.0, 3.0), 'VLP-16').points is None",
     "Tpog": "(Tpog.p.fget(__import__('egvs').read_tpog('run/tpog.parquet')) <= 1).all()",
     "World": SCENE + "isinstance(scene.world, World) and scene.world.triangles_m.shape[1:] == (3, 3)",
+    "accept": "accept.__kwdefaults__['max_vehicle_height_m'] == 4.5",
     "build_scene": "build_scene(__import__('egvs').load('mini')).sites",
     "compare_runs": "compare_runs(['run', 'run']).agreements[0].tau == 1.0",
+    "design_sensor": "from egvs import DesignRequest, load; "
+    "design_sensor(load('mini'), DesignRequest('pole_a', ('small',), evaluations=20), 'design').chosen.score > 0",
     "load": "load('mini').name == 'mini'",
     "open_session": "open_session('run').ranked[0].rank == 1",
     "place": "len(place(__import__('egvs').load('mini', ['placement.count=1']), 'placed').sensors) == 1",
@@ -150,6 +154,10 @@ USES = {
     "read_visibility": "read_visibility('run/visibility.parquet', 'pole_a').sum() > 0",
     "run": "run(__import__('egvs').load('mini'), 'again').stages['score']",
     "verify": "verify('run') == []",
+    "what_if": "from egvs import load; box = '{share=0.5,boxes=[{x_m=10,y_m=30,length_m=1,width_m=1,height_m=1}]}'; "
+    "what_if('mini', ['what_if.crate=' + box]).answers[0].name == 'crate'",
+    "write_acceptance": "write_acceptance.__defaults__ == (None,)",
+    "write_sheets": "len(write_sheets('run', ['pole_a'], kind='svg', out=__import__('pathlib').Path('sheets'))) == 1",
 }
 """Public name to an expression that uses it, in a folder with a scenario and its run."""
 

@@ -111,7 +111,7 @@ def _table(model: dict[str, Any], models: dict[str, Any], prefix: str, heading: 
     for key, field in model.get("properties", {}).items():
         name = f"{prefix}{key}"
         is_list = field.get("type") == "array" or '"items"' in json.dumps(field)
-        if "additionalProperties" in field:
+        if "additionalProperties" in field or "patternProperties" in field:
             name = f"{name}.<name>"
         for nested in _nested_models(field):
             below += _table(models[nested], models, f"{name}.", f"[[{name}]]" if is_list else f"[{name}]")

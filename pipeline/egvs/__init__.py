@@ -35,6 +35,13 @@ Several poses together, and plans with proven bounds on their quality::
     joint.gain("c10")
     egvs.place(egvs.load("scenarios/nishishinjuku", ["placement.count=3"])).certificate
 
+What a planner does next; the report of the run shows each result::
+
+    egvs.what_if("scenarios/nishishinjuku").answers
+    egvs.design_sensor(scenario, egvs.DesignRequest("c05", ("VLP-16", "VLP-32C")), "runs/trial").chosen
+    egvs.write_sheets("runs/trial", ["c03"])
+    egvs.write_acceptance("runs/trial", egvs.accept("runs/trial", "c03", ["measured.pcd"]))
+
 Names are imported when they are first used, so that ``import egvs`` costs nothing.
 """
 
@@ -51,7 +58,12 @@ if TYPE_CHECKING:
     from egvs.artefacts.traffic_frames import read_trajectories
     from egvs.core.errors import EgvsError, InputError, RunError
     from egvs.explore.settings import open_session
+    from egvs.installation.acceptance import accept
+    from egvs.installation.acceptance_page import write_acceptance
+    from egvs.installation.sheet import write_sheets
+    from egvs.placement.design_request import DesignRequest
     from egvs.placement.plan import JointScore, place
+    from egvs.placement.sensor_design import design_sensor
     from egvs.runs.run import run
     from egvs.runs.verification import verify
     from egvs.scenario.loading import load
@@ -63,9 +75,11 @@ if TYPE_CHECKING:
     from egvs.sensors.sites import Pose, Site
     from egvs.stages.inputs import build_scene
     from egvs.studies.run_comparison import compare_runs
+    from egvs.studies.what_if import what_if
     from egvs.world.mesh import World
 
 __all__ = [
+    "DesignRequest",
     "EgvsError",
     "InputError",
     "JointScore",
@@ -80,8 +94,10 @@ __all__ = [
     "Tpog",
     "World",
     "__version__",
+    "accept",
     "build_scene",
     "compare_runs",
+    "design_sensor",
     "load",
     "open_session",
     "place",
@@ -93,6 +109,9 @@ __all__ = [
     "read_visibility",
     "run",
     "verify",
+    "what_if",
+    "write_acceptance",
+    "write_sheets",
 ]
 
 __getattr__, __dir__ = lazy_exports(
@@ -103,7 +122,12 @@ __getattr__, __dir__ = lazy_exports(
         "artefacts.traffic_frames": ["read_trajectories"],
         "core.errors": ["EgvsError", "InputError", "RunError"],
         "explore.settings": ["open_session"],
+        "installation.acceptance": ["accept"],
+        "installation.acceptance_page": ["write_acceptance"],
+        "installation.sheet": ["write_sheets"],
+        "placement.design_request": ["DesignRequest"],
         "placement.plan": ["JointScore", "place"],
+        "placement.sensor_design": ["design_sensor"],
         "runs.run": ["run"],
         "runs.verification": ["verify"],
         "scenario.loading": ["load"],
@@ -115,6 +139,7 @@ __getattr__, __dir__ = lazy_exports(
         "sensors.sites": ["Pose", "Site"],
         "stages.inputs": ["build_scene"],
         "studies.run_comparison": ["compare_runs"],
+        "studies.what_if": ["what_if"],
         "world.mesh": ["World"],
         "_version": ["__version__"],
     },

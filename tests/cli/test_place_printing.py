@@ -42,7 +42,8 @@ def placed_two(score: str = "expected_detections", scale: float = 1.0, **changes
     points = [SimpleNamespace(certificate=1.0, count=1), SimpleNamespace(certificate=1.0, count=2)]
     points[-1].plan_value = SimpleNamespace(joint=steps[-1].score)
     placed = SimpleNamespace(
-        score=score, steps=steps, joint_of_all=0.9942 * scale, candidates=12, refinement=None, zones=(), files=(),
+        score=score, steps=steps, joint_of_all=0.9942 * scale, candidates=12, refinement=None, zones=(),
+        zone_results=(), files=(),
         sensors=(
             sensor(1, "a", steps[0].gain, steps[0].score, gain_se=steps[0].gain_se, score_se=steps[0].score_se),
             sensor(2, "b", steps[1].gain, steps[1].score, gain_se=steps[1].gain_se, score_se=steps[1].score_se),

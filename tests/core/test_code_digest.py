@@ -182,7 +182,7 @@ GROWTH = {
     "traffic": 1.81,
     "tpog": 1.43,
     "score": 1.4,
-    "report": 1.72,
+    "report": 1.73,
 }
 """Allowed growth, 1.1 for the others: a stage runs again whenever a line behind its key changes."""
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from egvs.explore import page
+from egvs.explore import page, server
 from tests.processes import EGVS
 
 
@@ -91,7 +91,7 @@ def test_says_how_to_install_viser(run_egvs, mini: Path, monkeypatch: pytest.Mon
 def test_port_in_use_is_reported_before_any_work(run_egvs, mini: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(mini.parent)
     with socket.socket() as other:
-        other.bind((page.HOST, 0))
+        other.bind((server.HOST, 0))
         other.listen()
         port = other.getsockname()[1]
         code, out, err = run_egvs("explore", mini, "--port", port)
@@ -106,6 +106,13 @@ def test_port_in_use_is_reported_before_any_work(run_egvs, mini: Path, monkeypat
         (("nowhere", "--no-browser"), "nowhere"),
         (("mini", "--port", "70000"), "less than or equal to 65535"),
         (("mini", "--set", "score.gamma=-1"), "score.gamma"),
+        (
+            ("mini", "--to", "page.txt"),
+            "--to: expected a file name ending in .html, got 'page.txt'. Use --to page.html.",
+        ),
+        (("mini", "--to", "mini"), "--to: expected a file name ending in .html, got 'mini'. Use --to page.html."),
+        (("mini", "--to", "page.html", "--port", "8080"), "--to: cannot be combined with --port or --view."),
+        (("nowhere", "--to", "page.html"), "nowhere"),
     ],
 )
 def test_invalid_options_give_one_message(
@@ -117,3 +124,15 @@ def test_invalid_options_give_one_message(
     assert message in err
     assert "Traceback" not in err
     assert not Path("runs").exists()
+
+
+def test_writes_page_file_without_serving(
+    run_egvs, mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(webbrowser, "open", lambda _: pytest.fail("a browser was opened"))
+    file = tmp_path / "page.html"
+    code, out, err = run_egvs("explore", mini, "--out", tmp_path / "run", "--to", file)
+    assert (code, err.splitlines()[-1].partition(" ")[0]) == (0, "score")
+    size = f"{file.stat().st_size / 1e6:.1f} MB"
+    assert out.startswith(f"{file}  ({size}; 20 s of traffic from pole_b; ")
+    assert out.endswith(" returns on road users)\n")

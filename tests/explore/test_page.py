@@ -21,7 +21,8 @@ import pytest
 import egvs
 from egvs.core.errors import InputError
 from egvs.explore import controls, drawing
-from egvs.explore.page import HOST, Page
+from egvs.explore.page import Page
+from egvs.explore.server import HOST
 from egvs.explore.session import Playback, Session
 from egvs.explore.settings import SessionFactory, Settings, open_session
 from egvs.explore.view_state import LAYERS

@@ -74,7 +74,7 @@ def test_drawing_has_sites_at_eastings_and_northings_with_labels(located: Path, 
     assert sites["pole_a"].get_attrib_text("BEARING_DEG") == "90.00"  # yaw 0 is east
     assert sites["pole_a"].get_attrib_text("HEIGHT_M") == "3.000"
     labels = [text.plain_text() for text in model.query('MTEXT[layer=="EGVS-SITE-LABELS"]')]
-    assert labels == ["pole_a  z 3.00 m  090°  tilt 0.0°", "pole & <b>  z 3.25 m  090°  tilt 0.0°"]
+    assert labels == ["pole_a  z 3.00 m  090°  0.0° down", "pole & <b>  z 3.25 m  090°  0.0° down"]
 
 
 def test_only_the_view_of_the_best_site_is_switched_on(located: Path, tmp_path: Path) -> None:

@@ -429,7 +429,7 @@ def test_files_have_the_same_bytes_twice(on_roads: Path, tmp_path: Path, to: str
         export_run(on_roads, to, out=out / f"run{FORMATS[to].suffix}" if FORMATS[to].is_one_file else out)
         made.append({path.name: path.read_bytes() for path in sorted(out.iterdir())})
     assert made[0] == made[1]
-    assert len(made[0]) == {"gpkg": 1, "kml": 1, "geotiff": 12, "dxf": 1, "glb": 2, "usd": 2}.get(to, len(LAYERS))
+    assert len(made[0]) == {"gpkg": 1, "kml": 1, "geotiff": 24, "dxf": 1, "glb": 2, "usd": 2}.get(to, len(LAYERS))
 
 
 @pytest.mark.system  # SUMO drives in this run

@@ -115,6 +115,12 @@ def test_hourly_counts_and_kinds(read: Read) -> None:
     ]
 
 
+def test_hours_without_a_vehicle_are_left_out_with_a_note(read: Read) -> None:
+    counts = read("approach,turn,start,count", "N,left,02:00,0", "N,left,03:00,0", "N,left,07:00,40", "N,left,08:00,9")
+    assert [hour.name for hour in counts.hours] == ["07-08", "08-09"]
+    assert "Hours without a vehicle are left out: 02-03, 03-04." in counts.notes
+
+
 def test_movements_without_a_count_are_named(read: Read) -> None:
     lines = ["approach,turn,count", "N,,10", "S,,10", "E,,10", "W,left,10", "W,right,10"]
     assert "Movements without a count get no vehicles: W (East Street) straight." in read(*lines).notes
@@ -156,39 +162,40 @@ BAD: dict[str, tuple[list[str], str]] = {
     "two columns": (["street,street,count", "a,b,1"], r"two columns are called 'street'"),
     "no number": (["street,approach", "a,N"], r"expected a column count, or columns named by their start, got none"),
     "both": (["approach,count,07:00", "N,1,1"], r"got both"),
-    "no location": (["count", "1"], r"no column says where was counted"),
-    "empty location": ([HEAD, ",,left,,5"], r"row 2: does not say where was counted"),
-    "unknown street": ([HEAD, "High St,,,,5"], rf"row 2: no approach of the junction is called 'High St'. {NAMES}"),
+    "no location": (["count", "1"], r"no column gives the location of the counts"),
+    "empty location": ([HEAD, ",,left,,5"], r"line 2: has no location"),
+    "unknown street": ([HEAD, "High St,,,,5"], rf"line 2: no approach of the junction is called 'High St'. {NAMES}"),
     "ambiguous street": (
         [HEAD, "North Street,,left,,5"],
         rf"may be N \(North Street\) or S \(North Street\). Give street and approach. {NAMES}",
     ),
     "contradiction": ([HEAD, "North Street,W,left,,5"], rf"no approach .* is 'North Street from W'. {NAMES}"),
-    "unknown side": ([HEAD, ",up,left,,5"], r"row 2: approach: expected the side on which vehicles arrive, got 'up'"),
+    "unknown side": ([HEAD, ",up,left,,5"], r"line 2: approach: expected the side on which vehicles arrive, got 'up'"),
     "between two": ([HEAD, ",NE,left,,5"], r"'from NE' may be"),
-    "unknown turn": ([HEAD, ",N,sideways,,5"], r"row 2: turn: expected left, straight, right, u-turn or all"),
+    "unknown turn": ([HEAD, ",N,sideways,,5"], r"line 2: turn: expected left, straight, right, u-turn or all"),
     "no such turn": ([HEAD, ",N,u-turn,,5"], r"no vehicle can go back from N .*Its turns are: left, right"),
-    "unknown group": (["lane_group,count", "XBL,5"], r"row 2: lane_group: expected a lane group such as NBL or EBTR"),
-    "negative": ([HEAD, ",N,left,,-5"], r"row 2: count: expected a number of vehicles of 0 to 100,000, got '-5'"),
+    "unknown group": (["lane_group,count", "XBL,5"], r"line 2: lane_group: expected a lane group such as NBL or EBTR"),
+    "negative": ([HEAD, ",N,left,,-5"], r"line 2: count: expected a number of vehicles of 0 to 100,000, got '-5'"),
     "text": ([HEAD, ",N,left,,many"], r"count: expected a number of vehicles .* got 'many'"),
     "nan": ([HEAD, ",N,left,,nan"], r"count: expected a number of vehicles .* got 'nan'"),
     "all zero": ([HEAD, ",N,left,,0"], r"all counts are 0"),
-    "time": ([HEAD, ",N,left,25:00,5"], r"row 2: start: expected a time of the day, got '25:00'"),
+    "time": ([HEAD, ",N,left,25:00,5"], r"line 2: start: expected a time of the day, got '25:00'"),
     "one start": ([HEAD, ",N,left,07:00,5"], r"intervals of one length .* got a single start. Add a column min"),
     "odd interval": ([HEAD, ",N,left,07:00,5", ",N,left,07:07,5"], r"expected intervals of one length .* got 7"),
     "across an hour": ([HEAD, ",N,left,07:30,5", ",N,left,08:30,5"], r"interval of 60 minutes ends in another hour"),
     "some starts": ([HEAD, ",N,left,07:00,5", ",S,left,,5"], r"only some rows have a start"),
     "minutes": (["approach,turn,start,minutes,count", "N,left,07:00,7,1"], r"minutes: expected one of 5, 10, 15"),
+    "no starts": (["approach,turn,minutes,count", "N,left,15,30"], r"minutes has no effect without a start. Add a"),
     "twice": (
         [HEAD, "North St,N,left,,5", ",N,left,,6"],
-        r"row 3: N left is counted twice, also in row 2",
+        r"line 3: N left is counted twice, also in line 2",
     ),
-    "twice by approach": ([HEAD, ",N,,,5", ",N,left,,6"], r"row 3: N left is counted twice, also in row 2"),
+    "twice by approach": ([HEAD, ",N,,,5", ",N,left,,6"], r"line 3: N left is counted twice, also in line 2"),
     "unknown kind": (["approach,count,kind", "N,5,tram"], r"kind: expected a kind of the fleet, got 'tram'"),
-    "unknown edge": (["edge,count", "77,5"], r"row 2: edge: the network has no edge '77'"),
+    "unknown edge": (["edge,count", "77,5"], r"line 2: edge: the network has no edge '77'"),
     "one edge": (["from_edge,to_edge,count", f"{FROM_NORTH},,5"], r"expected either edge, or from_edge and to_edge"),
     "edge and street": (["edge,street,count", f"{FROM_NORTH},North St,5"], r"names a street and an edge"),
-    "few values": ([HEAD, ",N,left,5"], r"row 2: expected 5 values, got 4"),
+    "few values": ([HEAD, ",N,left,5"], r"line 2: expected 5 values, got 4"),
     "quotes": ([HEAD, '"N"x,,,,5'], r"is not CSV"),
 }  # fmt: skip
 

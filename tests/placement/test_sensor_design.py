@@ -19,10 +19,9 @@ from hypothesis import strategies as st
 
 import egvs
 from egvs.core.errors import InputError
+from egvs.placement.design_request import ELEVATION_BOUNDS_DEG, DesignRequest
 from egvs.placement.sensor_design import (
-    ELEVATION_BOUNDS_DEG,
     MIN_GAP_DEG,
-    DesignRequest,
     DesignResult,
     ElevationCurve,
     design_sensor,
@@ -193,6 +192,9 @@ def test_command_writes_a_sensor_that_a_scenario_can_use(tmp_path: Path, monkeyp
         (("--pole", "pole_a", "--channels", "8", "--elevations", "steep"), "--elevations: expected free, or two"),
         (("--pole", "pole_a", "--channels", "8", "--elevations=5,-5"), "--elevations: expected two ascending"),
         (("--pole", "pole_a", "--elevations=-5,5"), "--elevations: needs --channels"),
+        (("--pole", "pole_a", "--name", "mine"), "--name: has no effect without --channels. Add --channels 32."),
+        (("--pole", "pole_a", "--out", "sensors/a.toml"), "--out: has no effect without --channels"),
+        (("--pole", "pole_a", "--elevation-evaluations", "50"), "--elevation-evaluations: has no effect without"),
         (("--pole", "pole_a", "--evaluations", "3"), "--evaluations: expected at least 20, got 3"),
     ],
 )

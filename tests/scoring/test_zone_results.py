@@ -183,7 +183,7 @@ def test_report_shows_the_zones_of_the_best_site(scored: tuple[egvs.Scenario, Pa
     assert "from pole_b, the best site" in section
     for row in rows:
         assert f">{row.zone}</th>" in section
-        assert row.share_words in section
+        assert row.share_text in section
     assert ">far</th>" not in section
 
 
@@ -197,7 +197,7 @@ def test_editing_the_file_scores_again(scored: tuple[egvs.Scenario, Path]) -> No
     assert {row["zone"] for row in after} == {"north"}
 
 
-def test_telling_zones_are_the_worst_of_each_group() -> None:
+def test_worst_zones_of_each_group() -> None:
     rows = [
         ZoneVisibility("a", "all", 99, 99, 0.1, 0.01),
         ZoneVisibility("a", "pedestrian", 30, 90, 0.71, 0.03),
@@ -206,9 +206,9 @@ def test_telling_zones_are_the_worst_of_each_group() -> None:
         ZoneVisibility("a", "car", 30, 90, 0.90, 0.03),
         ZoneVisibility("b", "bus", 30, 90, 0.85, 0.03),
     ]
-    telling = readers.telling_zones(rows)
-    assert [(row.zone, row.user_class) for row in telling] == [("a", "pedestrian"), ("b", "bus")]
-    assert telling[0].in_words() == "a, pedestrians: 71 ± 3% found (of 30)"
+    worst = readers.worst_zones(rows)
+    assert [(row.zone, row.user_class) for row in worst] == [("a", "pedestrian"), ("b", "bus")]
+    assert worst[0].in_words() == "a, 71 ± 3% of 30 pedestrians"
 
 
 BOW_TIE = {"type": "Polygon", "coordinates": [[[0, 0], [9, 9], [9, 0], [0, 9], [0, 0]]]}

@@ -20,7 +20,7 @@ from egvs.formats import ply
 from egvs.sensor_fit import figures
 from egvs.sensor_fit.fit import fit_sensor
 from egvs.sensor_fit.ground_plane import GroundPlane
-from egvs.sensor_fit.map_pose import MapPose, fit_map_pose, ground_height_m
+from egvs.sensor_fit.map_pose import MapPose, fit_map_pose, lowest_surface_m
 from egvs.sensor_fit.sweep_files import Sweep
 from egvs.sensors.sites import Pose
 from tests.conftest import collection, feature, write_mini
@@ -96,10 +96,10 @@ def test_height_of_ground() -> None:
     slope, roof, cellar = (
         [np.array([x, y, z(x)]) for x, y in square] for z in (lambda x: x / 10, lambda x: 7.0, lambda x: -3.0)
     )
-    assert ground_height_m(mesh_of([roof, slope, cellar], ["building", "ground", "building"]), 5.0, 2.0) == 0.5
-    assert ground_height_m(mesh_of([roof, slope], ["building", "building"]), 5.0, 2.0) == 0.5
+    assert lowest_surface_m(mesh_of([roof, slope, cellar], ["building", "ground", "building"]), 5.0, 2.0) == 0.5
+    assert lowest_surface_m(mesh_of([roof, slope], ["building", "building"]), 5.0, 2.0) == 0.5
     with pytest.raises(InputError, match="--site: the static world has no ground at x = 11, y = 0"):
-        ground_height_m(mesh_of([slope]), 11.0, 0.0)
+        lowest_surface_m(mesh_of([slope]), 11.0, 0.0)
 
 
 def test_figure_shows_other_yaws() -> None:

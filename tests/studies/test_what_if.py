@@ -40,7 +40,7 @@ FAR = """
 share = 0.5
 vehicles = "parked.csv"
 """
-PARKED = "x_m,y_m,yaw_deg,type\n200,100,90,truck\n210,100,0,car\n"
+PARKED = "x_m,y_m,yaw_deg,type\n110,60,90,truck\n120,60,0,car\n"
 
 
 def scenario(folder: Path, text: str, **files: str) -> Path:
@@ -186,24 +186,25 @@ def test_parked_vehicles_have_the_sizes_of_their_classes(tmp_path: Path) -> None
     assert [item["properties"]["height_m"] for item in document["features"]] == [3.0, 1.5]
 
 
-def test_trees_grow_about_their_centres_and_houses_do_not() -> None:
+def test_trees_grow_about_their_centres_and_houses_and_street_lamps_do_not() -> None:
     tree = {"type": "Polygon", "coordinates": [[[0, 0], [2, 0], [2, 2], [0, 2], [0, 0]]]}
     document = json.loads(
         collection(
             feature(tree, kind="tree_crown", height_m=8, base_m=2),
             feature({"type": "Point", "coordinates": [5, 5]}, kind="tree", height_m=6, radius_m=1.5),
             feature(tree, kind="building", height_m=8),
+            feature(tree, kind="street_lamp", height_m=8),
         )
     )
     grown, count = grow_trees(document, 1.5)
-    crown, point, house = grown["features"]
+    crown, point, *others = grown["features"]
     assert count == 2
     assert sorted(set(map(tuple, crown["geometry"]["coordinates"][0]))) == [
         (-0.5, -0.5), (-0.5, 2.5), (2.5, -0.5), (2.5, 2.5),
     ]  # fmt: skip
     assert (crown["properties"]["height_m"], crown["properties"]["base_m"]) == (12, 2)
     assert (point["properties"]["height_m"], point["properties"]["radius_m"]) == (9, 2.25)
-    assert house == document["features"][2]
+    assert others == document["features"][2:]
 
 
 @pytest.mark.parametrize(
@@ -214,7 +215,7 @@ def test_trees_grow_about_their_centres_and_houses_do_not() -> None:
         ("[what_if.a]\nshare = 0.5\n", "expected vehicles, footprints, boxes or tree_scale, got none of them"),
         ("[what_if.a]\nshare = 1.5\nvehicles = 'p.csv'\n", "what_if.a.share"),
         ("[what_if.a]\nshare = 0.5\nvehicles = 'nowhere.csv'\n", "nowhere.csv"),
-        (FAR, "parked.csv: row 1: type: expected one of car, van, truck"),
+        (FAR, "parked.csv: line 2: type: expected one of car, van, truck"),
     ],
 )
 def test_wrong_tables_get_one_message(tmp_path: Path, run_egvs: Any, monkeypatch: Any, text: str, message: str) -> None:
@@ -229,5 +230,30 @@ def test_wrong_tables_get_one_message(tmp_path: Path, run_egvs: Any, monkeypatch
 
 def test_wrong_number_names_row_and_column(tmp_path: Path) -> None:
     path = scenario(tmp_path, FAR, parked_csv='x_m,y_m,yaw_deg,type\n1,2,0,car\n"1,5",2,0,car\n')
-    with pytest.raises(InputError, match=r"parked.csv: row 2: x_m: expected a number, got '1,5'"):
+    with pytest.raises(InputError, match=r"parked.csv: line 3: x_m: expected a number, got '1,5'"):
         solid_documents(load(path), "far")
+
+
+@pytest.mark.parametrize(
+    ("text", "files", "message"),
+    [
+        (LORRY.replace("y_m = 10", "y_m = -3950500"), {}, r"what_if.lorry.boxes.0: none of 1 solids is within 100 m .*"
+         r"this one is 3,950,489 m away. Use the world frame in metres; the region is x 0 to 40, y -10 to 10."),
+        (FAR, {"parked_csv": PARKED.replace("110,60", "5,-900").replace("120,60", "900,0")},
+         r"parked.csv: row 1: none of 2 solids"),
+        ('[what_if.works]\nshare = 1\nfootprints = ["works.geojson"]\n', {"works_geojson": collection(feature(
+            {"type": "Point", "coordinates": [-500, 0]}, kind="crane", height_m=9, radius_m=1))},
+         r"works.geojson: none of 1 solids .* this one is 499 m away"),
+    ],
+)  # fmt: skip
+def test_solids_that_no_beam_can_meet_are_an_error(tmp_path: Path, text: str, files: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        prepare_runs(scenario(tmp_path, text, **files))
+    assert not (tmp_path / "runs").exists()
+
+
+def test_one_vehicle_within_the_range_is_enough(tmp_path: Path, monkeypatch: Any) -> None:
+    """The car is 1.8 m wide: its side is 99.9 m from the region when its centre is at y = -110.8."""
+    monkeypatch.chdir(tmp_path)
+    path = scenario(tmp_path, FAR, parked_csv="x_m,y_m,yaw_deg,type\n900,0,0,car\n5,-110.8,0,car\n")
+    assert len(prepare_runs(path.relative_to(tmp_path))) == 2

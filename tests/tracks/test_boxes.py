@@ -48,7 +48,7 @@ def test_rows_become_tracks() -> None:
     rows.add(Path("file"), "b", "car", 0.5, Box(1, 2, math.nan, 0.3, 4, 2, math.nan))
     rows.add(Path("file"), "a", "bus", 0.6, Box(3, 4, 5, math.nan, 0, 0, 0))
     tracks = rows.to_tracks(TrackFrame("EPSG:25832"), ["note"])
-    assert len(rows) == 2 and tracks.names == ("a", "b") and tracks.classes == ("bus", "car")
+    assert tracks.names == ("a", "b") and tracks.classes == ("bus", "car")
     assert tracks.track.tolist() == [1, 0] and tracks.time_s.tolist() == [0.5, 0.6]
     np.testing.assert_equal(tracks.z_m, [math.nan, 5])
     np.testing.assert_equal(tracks.yaw_rad, [0.3, math.nan])

@@ -12,7 +12,7 @@ from egvs.core.errors import InputError
 from egvs.scenario import loading
 from egvs.stages import check
 from egvs.traffic import observed
-from egvs.traffic.approaches import ApproachBook
+from egvs.traffic.approaches import ApproachIndex
 from egvs.traffic.movements import MovementNames
 from egvs.traffic.network import read_net_xml
 from tests.importers.creation import create_scenario
@@ -31,21 +31,21 @@ def crossing(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def book(crossing: Path) -> ApproachBook:
+def index(crossing: Path) -> ApproachIndex:
     scenario = loading.load(crossing)
     names = MovementNames(read_net_xml(crossing / "network.net.xml"), scenario.roi.center_m[:2])
-    return ApproachBook.of_flows(scenario.traffic.counts, names)
+    return ApproachIndex.of_flows(scenario.traffic.counts, names)
 
 
-def read(tmp_path: Path, book: ApproachBook, *lines: str, periods: tuple[str, ...] = ()) -> Any:
+def read(tmp_path: Path, index: ApproachIndex, *lines: str, periods: tuple[str, ...] = ()) -> Any:
     (tmp_path / "o.csv").write_text("\n".join(lines) + "\n")
-    return observed.read_observations(tmp_path / "o.csv", book, periods)
+    return observed.read_observations(tmp_path / "o.csv", index, periods)
 
 
-def test_approaches_are_found_as_in_counts(tmp_path: Path, book: ApproachBook) -> None:
-    assert book.titles == APPROACHES
+def test_approaches_are_found_as_in_counts(tmp_path: Path, index: ApproachIndex) -> None:
+    assert index.titles == APPROACHES
     lines = "street,approach,queue_m,speed_kmh", "North St,N,40,", ",westbound,,22", ",S,0,12.5"
-    rows = read(tmp_path, book, *lines)
+    rows = read(tmp_path, index, *lines)
     assert [(row.approach, row.queue_m, row.speed_kmh) for row in rows] == [
         ("N (North Street)", 40.0, None), ("E (East Street)", None, 22.0), ("S (North Street)", 0.0, 12.5),
     ]  # fmt: skip
@@ -56,38 +56,38 @@ BAD = {
     "empty": (["approach"], r"header: expected approach or street, and queue_m or speed_kmh"),
     "unknown column": (["approach,queue", "N,1"], r"header: unknown column 'queue'"),
     "no rows": ([HEAD], r"o.csv: has no observations"),
-    "unknown approach": (["street,queue_m", "High St,4"], r"row 2: no approach of the junction is called 'High St'"),
-    "ambiguous": (["street,queue_m", "North St,4"], r"row 2: 'North St' may be N \(North Street\) or S \(North"),
-    "no side": ([HEAD, "up,3,4"], r"row 2: approach: expected the side on which vehicles arrive, got 'up'"),
-    "nothing observed": ([HEAD, "N,,"], r"row 2: has neither queue_m nor speed_kmh"),
-    "no number": ([HEAD, "N,long,"], r"row 2: queue_m: expected a number of 0 to 10,000, got 'long'"),
-    "negative": ([HEAD, "N,,-1"], r"row 2: speed_kmh: expected a number of 0 to 300, got '-1'"),
-    "twice": ([HEAD, "N,1,", "southbound,2,"], r"row 3: the approach N \(North Street\) is there twice"),
-    "period": (["approach,period,queue_m", "N,morning,3"], r"row 2: period: .* The scenario has no periods"),
-    "few values": ([HEAD, "N,3"], r"row 2: expected 3 values"),
+    "unknown approach": (["street,queue_m", "High St,4"], r"line 2: no approach of the junction is called 'High St'"),
+    "ambiguous": (["street,queue_m", "North St,4"], r"line 2: 'North St' may be N \(North Street\) or S \(North"),
+    "no side": ([HEAD, "up,3,4"], r"line 2: approach: expected the side on which vehicles arrive, got 'up'"),
+    "nothing observed": ([HEAD, "N,,"], r"line 2: has neither queue_m nor speed_kmh"),
+    "no number": ([HEAD, "N,long,"], r"line 2: queue_m: expected a number of 0 to 10,000, got 'long'"),
+    "negative": ([HEAD, "N,,-1"], r"line 2: speed_kmh: expected a number of 0 to 300, got '-1'"),
+    "twice": ([HEAD, "N,1,", "southbound,2,"], r"line 3: two rows for the approach N \(North Street\)"),
+    "period": (["approach,period,queue_m", "N,morning,3"], r"line 2: period: .* The scenario has no periods"),
+    "few values": ([HEAD, "N,3"], r"line 2: expected 3 values"),
 }
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_bad_observations_give_one_message(name: str, tmp_path: Path, book: ApproachBook) -> None:
+def test_bad_observations_give_one_message(name: str, tmp_path: Path, index: ApproachIndex) -> None:
     lines, expected = BAD[name]
     with pytest.raises(InputError, match=expected):
-        read(tmp_path, book, *lines)
+        read(tmp_path, index, *lines)
 
 
-def test_scenario_with_periods_needs_them_in_the_file(tmp_path: Path, book: ApproachBook) -> None:
+def test_scenario_with_periods_needs_them_in_the_file(tmp_path: Path, index: ApproachIndex) -> None:
     periods = ("07-08", "08-09")
-    (row,) = read(tmp_path, book, "approach,period,queue_m", "N,07-08,3", periods=periods)
+    (row,) = read(tmp_path, index, "approach,period,queue_m", "N,07-08,3", periods=periods)
     assert row.period == "07-08"
     with pytest.raises(InputError, match=r"expected a period of the scenario, got ''. Periods: 07-08, 08-09"):
-        read(tmp_path, book, HEAD, "N,3,", periods=periods)
+        read(tmp_path, index, HEAD, "N,3,", periods=periods)
 
 
 def test_check_reports_a_bad_file_and_missing_counts(crossing: Path, tmp_path: Path) -> None:
     (tmp_path / "bad.csv").write_text(f"{HEAD}\nX,1,2\n")
     overrides = [f"traffic.observed='{tmp_path / 'bad.csv'}'"]
     (error,) = check.check_scenario(loading.load(crossing, overrides)).errors
-    assert "bad.csv: row 2: approach: expected the side" in str(error)
+    assert "bad.csv: line 2: approach: expected the side" in str(error)
     (error,) = check.check_scenario(loading.load(crossing, [*overrides, "traffic.counts=[]"])).errors
     assert "scenario.toml: traffic.observed: needs counted traffic in every period" in str(error)
 

@@ -253,11 +253,11 @@ CSV = "phase,approach,movement,green_s\na,north,all,30\na,south,all,30\nb,east,a
     ("name", "content", "message"),
     [
         ("p.csv", "phase,approach\na,north\n", "the column 'movement' is missing"),
-        ("p.csv", "", "expected a phase in each row, got none"),
+        ("p.csv", "", "the column 'phase' is missing"),
         ("p.csv", CSV.replace("a,south,all,30", "a,south,all,25"),
          "line 3: green_s: expected 30 as before in phase 'a', got 25"),
         ("p.csv", CSV.replace("b,east,all,20", "b,east,all,often"), "line 4: green_s: expected seconds, got 'often'"),
-        ("p.csv", CSV.replace("b,east,all,20", "b,east,all"), "line 4: the row has more or fewer values"),
+        ("p.csv", CSV.replace("b,east,all,20", "b,east,all"), "line 4: expected 4 values, got 3"),
         ("p.csv", CSV.replace("green_s", "green_s,colour").replace("0\n", "0,red\n"), "unknown column 'colour'"),
         ("p.add.xml", "<additional/>", "no <tlLogic> with phases for signal 'c'"),
         ("p.add.xml", '<additional><tlLogic id="c"><phase duration="9" state="GG"/></tlLogic></additional>',

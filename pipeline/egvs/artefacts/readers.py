@@ -185,7 +185,7 @@ ALL_USERS, PEDESTRIANS, TWO_WHEELERS = "all", "pedestrian", "two-wheeler"
 _WHOLE_PERCENT = 0.95
 """Shares with a standard error below this have a decimal, in per cent."""
 
-_CLASS_WORDS = {
+_CLASS_PLURALS = {
     ALL_USERS: "road users", "car": "cars", "truck": "trucks", "bus": "buses", "rail": "trams",
     TWO_WHEELERS: "two-wheelers", PEDESTRIANS: "pedestrians", "other": "others",
 }  # fmt: skip
@@ -213,12 +213,12 @@ class ZoneVisibility:
     se: float
 
     @property
-    def class_words(self) -> str:
+    def class_plural(self) -> str:
         """Plural of the class."""
-        return _CLASS_WORDS[self.user_class]
+        return _CLASS_PLURALS[self.user_class]
 
     @property
-    def share_words(self) -> str:
+    def share_text(self) -> str:
         """The share with its standard error, where it is known."""
         if math.isnan(self.se):
             return f"{self.share:.0%}"
@@ -227,7 +227,7 @@ class ZoneVisibility:
 
     def in_words(self) -> str:
         """Return zone, class, share and number of road users in one phrase."""
-        return f"{self.zone}, {self.class_words}: {self.share_words} found (of {self.road_users:,})"
+        return f"{self.zone}, {self.share_text} of {self.road_users:,} {self.class_plural}"
 
 
 def read_zones(path: Path, site: str) -> list[ZoneVisibility]:
@@ -272,7 +272,7 @@ def _zone_rows(table: pa.Table) -> list[ZoneVisibility]:
     return [ZoneVisibility(*row) for row in zip(*(columns[name] for name in names), strict=True)]
 
 
-def telling_zones(rows: Sequence[ZoneVisibility]) -> list[ZoneVisibility]:
+def worst_zones(rows: Sequence[ZoneVisibility]) -> list[ZoneVisibility]:
     """Return where fewest road users are found: of pedestrians, of two-wheelers, and of all vehicles on more wheels.
 
     The zone with the smallest share of each, among zones with at least :data:`MIN_VEHICLES` of them.

@@ -92,6 +92,10 @@ class RunFolder:
     curve = RunFile("curve.parquet", "place")
     plan_zones = RunFile("plan_zones.parquet", "place")
     placement_checksums = RunFile("placement.sha256", "place")
+    what_if = RunFile("what_if.json", "what-if")
+    sheets = RunFile("sheets.json", "sheets")
+    acceptance = RunFile("acceptance.json", "accept")
+    sensor_design = RunFile("sensor_design.json", "sensor design")
 
     def __truediv__(self, name: str) -> Path:
         return self.path / name
@@ -126,3 +130,6 @@ VALIDATION_FILES = (RunFolder.detection.name, RunFolder.correlation.name, RunFol
 
 PLACEMENT_FILES = (RunFolder.placement.name, RunFolder.curve.name)
 """Files of a plan, shown likewise."""
+
+COMMAND_RESULTS = (RunFolder.what_if, RunFolder.sheets, RunFolder.acceptance, RunFolder.sensor_design)
+"""Results of commands that work on a finished run (:mod:`egvs.artefacts.command_results`), shown likewise."""

@@ -427,8 +427,12 @@ def explore(
     view: Annotated[
         str, typer.Option(metavar="LINK", help='View to open, copied from "Link to this view" in the page.')
     ] = "",
+    to: Annotated[
+        Path | None,
+        typer.Option(metavar="PAGE.html", help="Write the 3D view as one file to share, and serve no page."),
+    ] = None,
 ) -> None:
-    """Move sensors in the browser and see their new scores immediately."""
+    """Move sensors in the browser and see their new scores immediately; or write the 3D view as one file."""
     import webbrowser
 
     from egvs.cli.console import ProgressDisplay
@@ -438,6 +442,9 @@ def explore(
     from egvs.explore.page import Page, check_port_free
     from egvs.explore.settings import open_session
 
+    if to is not None:
+        _write_page_file(folder, set_, out, jobs, to, has_page_options=bool(port or view))
+        return
     check_port_free(port)
     sources.open_source(folder, set_, out)
     with ProgressDisplay("explore") as screen:
@@ -458,6 +465,30 @@ def explore(
             print()
         finally:
             page.stop()
+
+
+def _write_page_file(
+    folder: Path, set_: list[str] | None, out: Path | None, jobs: int | None, to: Path, *, has_page_options: bool
+) -> None:
+    """Write the 3D view of a run as one HTML file, and print what is in it."""
+    from egvs.cli.console import ProgressDisplay
+    from egvs.explore.page_file import check_page_file, write_page_file
+    from egvs.explore.settings import open_session
+
+    if has_page_options:
+        raise InputError("--to", "cannot be combined with --port or --view", "Leave them out: no page is served.")
+    check_page_file(to)
+    sources.open_source(folder, set_, out)
+    with ProgressDisplay("explore") as screen:
+        session = open_session(
+            folder, set_ or (), out, jobs=jobs, progress=screen.progress, listener=screen.stage_event
+        )  # fmt: skip
+        page = write_page_file(session, to, screen.progress)
+    drawn = f"{page.returns:,} returns on road users"
+    if page.returns_drawn < page.returns:
+        drawn += f", {page.returns_drawn:,} of them drawn"
+    sensors = ", ".join(page.sensors)
+    print(f"{page.path}  ({page.size_bytes / 1e6:.1f} MB; {page.duration_s:.0f} s of traffic from {sensors}; {drawn})")
 
 
 for verb in validate.VERBS:

@@ -10,9 +10,12 @@ import typer
 
 from egvs.cli.options import Run
 from egvs.core.errors import EgvsError, InputError
+from egvs.installation.acceptance_limits import MAX_VEHICLE_HEIGHT_M, Limits
 
 if TYPE_CHECKING:
     from egvs.installation.acceptance import Acceptance, Check
+
+_LIMITS = Limits()
 
 
 def sheets(
@@ -58,34 +61,38 @@ def accept(
         ),
     ] = None,
     site: Annotated[str, typer.Option(metavar="SITE", help="Required: the site where the sensor is installed.")] = "",
-    position: Annotated[float, typer.Option(metavar="M", min=0, help="Largest error of the position.")] = 0.3,
-    tilt: Annotated[float, typer.Option(metavar="DEG", min=0, help="Largest error of pitch and roll together.")] = 1.0,
-    yaw: Annotated[float, typer.Option(metavar="DEG", min=0, help="Largest error of the yaw.")] = 2.0,
+    position: Annotated[
+        float, typer.Option(metavar="M", min=0, help="Largest error of the position.")
+    ] = _LIMITS.position_m,
+    tilt: Annotated[
+        float, typer.Option(metavar="DEG", min=0, help="Largest angle between the planned and the measured z axis.")
+    ] = _LIMITS.tilt_deg,
+    yaw: Annotated[float, typer.Option(metavar="DEG", min=0, help="Largest error of the yaw.")] = _LIMITS.yaw_deg,
     blocked: Annotated[
         float, typer.Option(metavar="DEG", min=0, help="Largest width of all blocked sectors together.")
-    ] = 5.0,
+    ] = _LIMITS.blocked_deg,
     missing_channels: Annotated[
         int, typer.Option("--missing-channels", metavar="N", min=0, help="Largest number of channels without returns.")
-    ] = 0,
+    ] = int(_LIMITS.missing_channels),
     returns: Annotated[
         float, typer.Option(metavar="SHARE", min=0, max=1, help="Smallest share of the expected returns.")
-    ] = 0.8,
+    ] = _LIMITS.returns,
     off_beams: Annotated[
         float,
         typer.Option(
             "--off-beams", metavar="SHARE", min=0, max=1, help="Largest share of returns on no beam of the sensor."
         ),
-    ] = 0.05,
+    ] = _LIMITS.off_beams,
     loss: Annotated[
         float, typer.Option(metavar="SHARE", min=0, help="Largest loss of the score, as a share of the planned score.")
-    ] = 0.05,
+    ] = _LIMITS.loss,
     vehicle_height: Annotated[
         float,
         typer.Option(
             "--vehicle-height", metavar="M", min=0,
             help="A return in front of the static world that is higher above the ground is of an obstacle.",
         ),
-    ] = 4.5,
+    ] = MAX_VEHICLE_HEIGHT_M,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="DIR", help="Folder to write; RUN/acceptance by default.")
     ] = None,
@@ -96,7 +103,6 @@ def accept(
     with ProgressDisplay("accept") as screen:
         from egvs.core import files
         from egvs.installation import acceptance, acceptance_page
-        from egvs.installation.acceptance import Limits
 
         if not scan:
             raise InputError("--scan", "no scan is given", "Use --scan measured.pcd.")
@@ -110,14 +116,14 @@ def accept(
                 raise InputError(option, "expected a number, got nan", "Give a number, or inf to switch a limit off.")
         limits = Limits(position, tilt, yaw, blocked, missing_channels, returns, off_beams, loss)
         folder = out or run / "acceptance"
+        files.check_writable(acceptance_page.AcceptanceFiles.of(folder, site).json)
         result = acceptance.accept(
             run, site, scan, limits, max_vehicle_height_m=vehicle_height, progress=screen.progress
         )  # fmt: skip
-        files.check_writable(acceptance_page.AcceptanceFiles.of(folder, site).json)
-        written = acceptance_page.write_files(folder, result)
+        written = acceptance_page.write_acceptance(run, result, folder)
     _print_acceptance(result)
-    print(written.json)
-    print(written.page)
+    for path in written:
+        print(path)
     if not result.passed:
         raise typer.Exit(EgvsError.exit_code)
 
@@ -127,6 +133,7 @@ def _print_acceptance(result: Acceptance) -> None:
     from egvs.cli.console import Column, print_sentences, print_table
     from egvs.installation.acceptance import describe_error, describe_sector
     from egvs.report.formatting import SCORE_LABELS
+    from egvs.sensors.registration import parameter_name_and_unit
 
     verdict = "passed" if result.passed else f"failed: {'; '.join(result.reasons)}"
     print_sentences([f"{result.site.name} ({result.sensor.name}): {verdict}."])
@@ -140,7 +147,11 @@ def _print_acceptance(result: Acceptance) -> None:
     print_table(columns, result.checks)
     print()
     errors = result.pose.standard_errors
-    pose = ", ".join(f"{name} {describe_error(value, errors[name])}" for name, value in result.pose.values.items())
+    parts = []
+    for parameter, value in result.pose.values.items():
+        name, unit = parameter_name_and_unit(parameter)
+        parts.append(f"{name} {describe_error(value, errors[parameter], unit)}")
+    pose = ", ".join(parts)
     sentences = [
         f"Pose error, measured minus planned: {pose}.",
         f"{result.on_surface_share:.0%} of {result.comparison.returns:,} returns lie on the static world; "

@@ -111,7 +111,7 @@ def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequen
     caveat
         A last sentence, on what was assumed; may be empty.
     """
-    from egvs.artefacts.readers import telling_zones
+    from egvs.artefacts.readers import worst_zones
     from egvs.cli.console import WIDE, console, print_sentences
 
     out = console(WIDE, soft_wrap=False)
@@ -125,8 +125,8 @@ def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequen
     for zone in placed.zones:
         sensors = f" by {zone.by} sensors" if zone.by > 1 else ""
         out.print(f"zone {zone.name}: {zone.seen:.1%} of its entropy seen{sensors}, {zone.share:.1%} required")
-    if telling := telling_zones(placed.zone_results):
-        print_sentences([f"The plan in zones, where it finds fewest: {'; '.join(zone.in_words() for zone in telling)}"])
+    if worst := worst_zones(placed.zone_results):
+        print_sentences([f"The plan finds the smallest shares in: {'; '.join(zone.in_words() for zone in worst)}"])
     for path in placed.files:
         out.print(str(path), soft_wrap=True)
     sentences = [describe_plan(placed), *notes, *_further_sentences(placed, requested)]

@@ -10,6 +10,7 @@ import typer
 from egvs.cli.options import Jobs, Set, SettingsPath
 from egvs.cli.quick_help import QuickHelpGroup
 from egvs.core.errors import InputError
+from egvs.placement.design_request import ALL_SENSORS, ELEVATION_BOUNDS_DEG, DesignRequest
 
 if TYPE_CHECKING:
     from egvs.placement.sensor_design import Design, DesignResult
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from egvs.sensor_fit.output import FitFolder
 
 _DESIGN_WIDTH = 190
+_REQUEST = DesignRequest("")
+_LOW_DEG, _HIGH_DEG = ELEVATION_BOUNDS_DEG
 
 app = typer.Typer(cls=QuickHelpGroup, no_args_is_help=True, help="Derive a sensor from its sweeps, or design one.")
 
@@ -278,7 +281,7 @@ def design(
         typer.Option(
             metavar="A,B,...|all", help="Sensors to choose from; by default all that egvs sensors lists (minutes)."
         ),
-    ] = "all",
+    ] = ALL_SENSORS,
     heights: Annotated[
         str | None,
         typer.Option(metavar="LOW,HIGH", help="Heights above the ground; by default those of the sites on the pole."),
@@ -290,15 +293,17 @@ def design(
         str,
         typer.Option(
             metavar="free|LOW,HIGH",
-            help="Bounds of the elevations of free channels; free: from -45 to 25 degrees. A negative number needs"
-            " an equals sign: --elevations=-30,10.",
+            help=f"Bounds of the elevations of free channels; free: from {_LOW_DEG:g} to {_HIGH_DEG:g} degrees. A"
+            " negative number needs an equals sign: --elevations=-30,10.",
         ),
     ] = "free",
-    name: Annotated[str, typer.Option(metavar="NAME", help="Name of the designed sensor.")] = "designed",
-    evaluations: Annotated[int, typer.Option(metavar="N", help="Mounts that are tried for each sensor.")] = 100,
+    name: Annotated[str, typer.Option(metavar="NAME", help="Name of the designed sensor.")] = _REQUEST.name,
+    evaluations: Annotated[
+        int, typer.Option(metavar="N", help="Mounts that are tried for each sensor.")
+    ] = _REQUEST.evaluations,
     elevation_evaluations: Annotated[
         int, typer.Option(metavar="N", help="Sets of elevations that are tried for free channels.")
-    ] = 300,
+    ] = _REQUEST.elevation_evaluations,
     set_: Set = None,
     out: Annotated[
         Path | None,
@@ -320,7 +325,15 @@ def design(
         from egvs.sensor_fit import output
 
         output.check_name(name)
-        bounds_deg = sensor_design.ELEVATION_BOUNDS_DEG
+        if channels is None:
+            for option, is_given in (
+                ("--name", name != _REQUEST.name),
+                ("--out", out is not None),
+                ("--elevation-evaluations", elevation_evaluations != _REQUEST.elevation_evaluations),
+            ):
+                if is_given:
+                    raise InputError(option, "has no effect without --channels", "Add --channels 32.")
+        bounds_deg = ELEVATION_BOUNDS_DEG
         if elevations != "free":
             if channels is None:
                 raise InputError("--elevations", "needs --channels, the number of channels", "Use --channels 32.")
@@ -329,9 +342,7 @@ def design(
         if channels is not None:
             files.check_writable(file)
         names = tuple(word.strip() for word in sensors.split(",") if word.strip())
-        request = sensor_design.DesignRequest(
-            pole, names, heights_m, evaluations, channels, bounds_deg, elevation_evaluations, name
-        )
+        request = DesignRequest(pole, names, heights_m, evaluations, channels, bounds_deg, elevation_evaluations, name)
         result = sensor_design.design_sensor(
             loaded, request, folder, jobs=jobs, progress=screen.progress, listener=screen.stage_event
         )
@@ -368,7 +379,7 @@ def print_design(result: DesignResult, file: Path | None) -> None:
         Column("yaw deg", lambda design: f"{design.pose.yaw_deg:.1f}"),
         Column("pitch deg", lambda design: f"{design.pose.pitch_deg:.1f}"),
         Column("found, frames of the search", lambda design: f"{design.search_score:.1%}"),
-        Column("found, other frames", lambda design: f"{100 * design.score:.1f} ± {100 * (design.se or 0.0):.1f}%"),
+        Column("found, other frames", lambda design: f"{100 * design.score:.1f} ± {100 * design.se:.1f}%"),
         Column(f"minus {designs[0].sensor.name}, % points", _format_gain),
     ]
     out = console(_DESIGN_WIDTH, soft_wrap=False)

@@ -43,8 +43,11 @@ def what_if(
             screen.say(f"{label:<{width}}  {screen.part_duration:>10}   {what_if_run.folder}")
 
         result = study.compare_runs(prepared, run_one)
+        written = study.record_answers(result)
         screen.end_parts("what-if")
     print_what_if(result)
+    for path in written:
+        print(path)
 
 
 def _run_label(what_if_run: WhatIfRun) -> str:

@@ -26,7 +26,7 @@ from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.grid import Grid, Roi, Vec3
 from egvs.explore.road_meshes import LANE_HEIGHT_M, Mesh, junction_mesh, lane_mesh, marking_mesh
 from egvs.explore.session import MovingPlan, Playback, PoseScore, Session
-from egvs.explore.view_state import View
+from egvs.explore.view_state import Camera, View
 from egvs.report import colours
 from egvs.scoring.points_map import CLASS_LABELS, OVERLAP_POINTS, PointsMap, overlap_map
 from egvs.scoring.targets import SEEN_WELL_POINTS
@@ -47,7 +47,7 @@ _LIGHT_COLOURS: dict[str, Colour] = {
     "building": (205, 208, 216), "ground": (225, 222, 214), "tree_crown": (150, 190, 165), "lanes": (112, 118, 130),
     "junctions": (112, 118, 130), "markings": (250, 250, 250), "other": (150, 154, 166),
 }  # fmt: skip
-_DARK_COLOURS: dict[str, Colour] = {
+DARK_COLOURS: dict[str, Colour] = {
     "building": (66, 70, 82), "ground": (34, 36, 42), "tree_crown": (52, 88, 66), "lanes": (52, 56, 66),
     "junctions": (52, 56, 66), "markings": (150, 154, 164), "other": (92, 96, 108),
 }  # fmt: skip
@@ -73,6 +73,13 @@ def drawing_origin(roi: Roi) -> Vec3:
     """Return the origin of the drawing in the world frame: the middle of the region's floor, in whole metres."""
     (x, y, z), (width, length, _) = roi.origin_m, roi.size_m
     return float(round(x + width / 2.0)), float(round(y + length / 2.0)), float(round(z))
+
+
+def first_camera(roi: Roi) -> Camera:
+    """Return a camera south of the region and above it, which looks at its middle."""
+    x, y, z = drawing_origin(roi)
+    size_m = max(roi.size_m)
+    return Camera((x, y - 0.4 * size_m, z + 0.6 * size_m), (x, y, z))
 
 
 def solid_meshes(world: World, zero_m: Vec3, max_triangles: int = MAX_TRIANGLES) -> dict[str, Mesh]:
@@ -271,7 +278,7 @@ class SceneMeshes:
             if not len(mesh.faces):
                 continue
             handles[kind] = scene.add_mesh_simple(
-                f"/world/{kind}", mesh.points, mesh.faces, color=_solid_colour(kind, _LIGHT_COLOURS),
+                f"/world/{kind}", mesh.points, mesh.faces, color=solid_colour(kind, _LIGHT_COLOURS),
                 flat_shading=kind not in _FLAT_KINDS, side="double", cast_shadow=False,
             )  # fmt: skip
         return cls(handles, drawn, len(session.scene.world.faces))
@@ -279,22 +286,26 @@ class SceneMeshes:
     def set_dark(self, is_dark: bool) -> None:
         """Use dark or light colours."""
         for kind, mesh in self.meshes.items():
-            mesh.color = _solid_colour(kind, _DARK_COLOURS if is_dark else _LIGHT_COLOURS)
+            mesh.color = solid_colour(kind, DARK_COLOURS if is_dark else _LIGHT_COLOURS)
 
 
-def _solid_colour(kind: str, palette: dict[str, Colour]) -> Colour:
+def solid_colour(kind: str, palette: dict[str, Colour]) -> Colour:
     return palette.get(kind, palette["other"])
 
 
-def draw_sites(scene: viser.SceneApi, session: Session, zero_m: Vec3, on_click: Callable[[Site], None]) -> None:
-    """Draw the candidates as balls, the best ones darkest."""
+OnClick = Callable[[Site], None]
+"""Called with the site that is clicked."""
+
+
+def draw_sites(scene: viser.SceneApi, session: Session, zero_m: Vec3, on_click: OnClick | None) -> None:
+    """Draw the candidates as balls, the best ones darkest; without ``on_click`` they cannot be clicked."""
     sites = [candidate.site for candidate in session.ranked]
     ball_colours = colour_scale([candidate.scores[session.rank_by] for candidate in session.ranked])
     _draw_balls(scene, "/sites", _Balls(sites, ball_colours, _SITE_RADIUS_M), zero_m, on_click)
 
 
 def draw_plan(
-    scene: viser.SceneApi, plan: MovingPlan | None, selected: str, zero_m: Vec3, on_click: Callable[[Site], None]
+    scene: viser.SceneApi, plan: MovingPlan | None, selected: str, zero_m: Vec3, on_click: OnClick | None
 ) -> None:
     """Draw the sensors of a plan and the best additional candidate, with labels.
 
@@ -309,7 +320,7 @@ def draw_plan(
     zero_m
         Origin of the drawing.
     on_click
-        Called with the site that is clicked.
+        Called with the site that is clicked; None for balls that cannot be clicked.
     """
     scene.remove_by_name("/plan")
     if plan is None:
@@ -344,9 +355,7 @@ class _Balls(NamedTuple):
     radius_m: float
 
 
-def _draw_balls(
-    scene: viser.SceneApi, name: str, balls: _Balls, zero_m: Vec3, on_click: Callable[[Site], None]
-) -> None:
+def _draw_balls(scene: viser.SceneApi, name: str, balls: _Balls, zero_m: Vec3, on_click: OnClick | None) -> None:
     ball = trimesh.creation.icosphere(subdivisions=2, radius=balls.radius_m)
     handle = scene.add_batched_meshes_simple(
         name, np.asarray(ball.vertices, dtype=np.float32), np.asarray(ball.faces, dtype=np.int32),
@@ -354,6 +363,8 @@ def _draw_balls(
         batched_positions=np.array([site.pose.position_m for site in balls.sites]) - zero_m,
         batched_colors=balls.colours, lod="off",
     )  # fmt: skip
+    if on_click is None:
+        return
 
     @handle.on_click
     def _(event: viser.SceneNodePointerEvent[viser.BatchedMeshHandle]) -> None:
@@ -452,9 +463,9 @@ def _fit_to_box(triangles: Floats, box: Floats, pitch_rad: float) -> Floats:
 LAYER_NAME = "/layer"
 """Name of the layer in the page's scene; vehicles are its children."""
 
-_RETURN_M, _BEAM_M = 0.12, 0.04
-_SCAN_COLOUR, _STATIC_COLOUR = (200, 30, 80), (150, 150, 150)
-_VISIBLE_COLOUR, _HIDDEN_COLOUR = (0, 90, 181), (220, 95, 0)
+RETURN_M, _BEAM_M = 0.12, 0.04
+SCAN_COLOUR, _STATIC_COLOUR = (200, 30, 80), (150, 150, 150)
+VISIBLE_COLOUR, HIDDEN_COLOUR = (0, 90, 181), (220, 95, 0)
 _THIS_COLOUR, _OTHER_COLOUR, _EQUAL_COLOUR = (0, 90, 181), (220, 95, 0), (222, 222, 222)
 _LEGEND_STEPS = 8
 _NO_NETWORK = "the traffic does not come from one road network"
@@ -478,6 +489,8 @@ class LayerContext:
         Origin of the drawing.
     plan
         The plan; None if there is none.
+    node
+        Name of the layer in the scene.
     """
 
     scene: viser.SceneApi
@@ -488,12 +501,13 @@ class LayerContext:
     other: PoseScore | None
     zero_m: Vec3
     plan: MovingPlan | None = None
+    node: str = LAYER_NAME
 
     def draw_points(self, points: Points, point_colours: Bytes, size_m: float) -> None:
         """Draw points (n, 3) with their colours (n, 3)."""
         if len(points):
             self.scene.add_point_cloud(
-                LAYER_NAME, points, point_colours, point_size=size_m, precision="float32", point_shading="flat"
+                self.node, points, point_colours, point_size=size_m, precision="float32", point_shading="flat"
             )
 
     def draw_columns(self, points: Points, point_colours: Bytes, size_m: float) -> None:
@@ -506,7 +520,7 @@ def draw_layer(context: LayerContext) -> str:
 
     Most layers are empty if no sensor can be mounted at the current pose.
     """
-    context.scene.remove_by_name(LAYER_NAME)
+    context.scene.remove_by_name(context.node)
     layer = context.view.layer
     needs_sensor = layer not in ("traffic", "replay", "overlap_car", "overlap_pedestrian")
     if layer not in _DRAW_FUNCTIONS or (needs_sensor and not context.rating.is_feasible):
@@ -546,26 +560,26 @@ def _draw_blindspots(context: LayerContext) -> str:
         overall = f"all vehicles: {spots.overall.share:.1%} found"
     rows = [f"<b>{_escape_html(overall)}</b>"]
     rows += [_escape_html(f"{location.words}: {location.share:.0%} found") for location in spots.worst]
-    return _scale_legend("share of vehicles not found", 0.0, 1.0, "{:.0%}") + _text_legend(rows)
+    return _scale_legend("share of vehicles not found", 0.0, 1.0, "{:.0%}") + text_legend(rows)
 
 
 def _draw_points(context: LayerContext) -> str:
     target = context.view.layer.removeprefix("points_")
     points = context.session.points_map(context.rating.site, target)
     if points is None:
-        return _text_legend([_NO_NETWORK])
+        return text_legend([_NO_NETWORK])
     shares = [f"{points.share_with(limit):.1%} of the surface with {limit:g} points or more" for limit in (1, 20)]
-    return _draw_classes(context, points, points.classes, CLASS_LABELS, f"points on a {target}") + _text_legend(shares)
+    return _draw_classes(context, points, points.classes, CLASS_LABELS, f"points on a {target}") + text_legend(shares)
 
 
 def _draw_overlap(context: LayerContext) -> str:
     target = context.view.layer.removeprefix("overlap_")
     if context.plan is None:
-        return _text_legend(["there is no plan"])
+        return text_legend(["there is no plan"])
     maps = [context.session.points_map(site, target) for site in context.plan.poses.sites]
     known = [points for points in maps if points is not None]
     if not known:
-        return _text_legend([_NO_NETWORK])
+        return text_legend([_NO_NETWORK])
     overlap = overlap_map(known)
     labels = [str(count) for count in range(len(known) + 1)]
     title = f"sensors of the plan with {OVERLAP_POINTS:g} points or more on a {target}"
@@ -581,12 +595,12 @@ def _draw_classes(context: LayerContext, points: PointsMap, classes: Floats, lab
     context.draw_columns(at_m.astype(np.float32), colour_scale(classes[ix, iy], 0.0, highest), points.cell_m)
     swatches = colour_scale(np.arange(len(labels), dtype=np.float64), 0.0, highest).tolist()
     rows = [((red, green, blue), label) for (red, green, blue), label in zip(swatches, labels, strict=True)]
-    return _text_legend([f"<b>{title}</b>"]) + _swatch_legend(rows)
+    return text_legend([f"<b>{title}</b>"]) + swatch_legend(rows)
 
 
 def _draw_difference(context: LayerContext) -> str:
     if context.other is None or not context.other.is_feasible:
-        return _text_legend(["there is no other site to compare with"])
+        return text_legend(["there is no other site to compare with"])
     session, entropy = context.session, context.session.entropy_bit
     this = session.hits(context.rating.site) > 0.0
     other = session.hits(context.other.site) > 0.0
@@ -594,7 +608,7 @@ def _draw_difference(context: LayerContext) -> str:
     palette = (_THIS_COLOUR, _OTHER_COLOUR, _EQUAL_COLOUR)
     points, point_colours = difference_points(session.tpog, only_this, only_other, context.zero_m, palette)
     context.draw_columns(points, point_colours, session.tpog.grid.voxel_m)
-    return _swatch_legend(
+    return swatch_legend(
         [
             (_THIS_COLOUR, f"seen only by {context.rating.site.name}: {float(only_this.sum()):,.1f} bits"),
             (_OTHER_COLOUR, f"seen only by {context.other.site.name}: {float(only_other.sum()):,.1f} bits"),
@@ -604,39 +618,39 @@ def _draw_difference(context: LayerContext) -> str:
 
 def _draw_scan(context: LayerContext) -> str:
     points = (context.session.returns_m(context.rating.site) - context.zero_m).astype(np.float32)
-    context.draw_points(points, np.full(points.shape, _SCAN_COLOUR, dtype=np.uint8), _RETURN_M)
-    return _swatch_legend([(_SCAN_COLOUR, f"{len(points):,} returns from beams directed at the region")])
+    context.draw_points(points, np.full(points.shape, SCAN_COLOUR, dtype=np.uint8), RETURN_M)
+    return swatch_legend([(SCAN_COLOUR, f"{len(points):,} returns from beams directed at the region")])
 
 
 def _draw_ring(context: LayerContext) -> str:
     lines = (context.session.beams_m(context.rating.site, context.view.ring) - context.zero_m).astype(np.float32)
     if len(lines):
-        context.scene.add_line_segments(LAYER_NAME, lines, _SCAN_COLOUR, thickness=_BEAM_M)
-    return _swatch_legend([(_SCAN_COLOUR, f"{len(lines):,} beams of this ring towards the region")])
+        context.scene.add_line_segments(context.node, lines, SCAN_COLOUR, thickness=_BEAM_M)
+    return swatch_legend([(SCAN_COLOUR, f"{len(lines):,} beams of this ring towards the region")])
 
 
 def _draw_replay(context: LayerContext) -> str:
     playback = context.playback
     played = playback.simulate(context.rating.site, playback.frame(context.view.frame))
     on_vehicle = played.owner >= 0
-    point_colours = np.where(on_vehicle[:, None], _SCAN_COLOUR, _STATIC_COLOUR).astype(np.uint8)
-    context.draw_points((played.returns_m - context.zero_m).astype(np.float32), point_colours, _RETURN_M)
+    point_colours = np.where(on_vehicle[:, None], SCAN_COLOUR, _STATIC_COLOUR).astype(np.uint8)
+    context.draw_points((played.returns_m - context.zero_m).astype(np.float32), point_colours, RETURN_M)
     if not len(played.returns_m):
-        context.scene.add_frame(LAYER_NAME, show_axes=False)  # parent of the vehicles
+        context.scene.add_frame(context.node, show_axes=False)  # parent of the vehicles
     visible, kinds = played.is_visible, playback.kinds(played.frame)
-    for name, selected, colour in (("seen", visible, _VISIBLE_COLOUR), ("missed", ~visible, _HIDDEN_COLOUR)):
+    for name, selected, colour in (("seen", visible, VISIBLE_COLOUR), ("missed", ~visible, HIDDEN_COLOUR)):
         if selected.any():
             mesh = vehicle_mesh(played.frame, kinds, playback.parts, selected, context.zero_m)
             context.scene.add_mesh_simple(
-                f"{LAYER_NAME}/{name}", mesh.points, mesh.faces, color=colour, flat_shading=True, cast_shadow=False
+                f"{context.node}/{name}", mesh.points, mesh.faces, color=colour, flat_shading=True, cast_shadow=False
             )
     time_s, last_s = (playback.period_s * number for number in (played.frame.number, playback.frames - 1))
     swatches = [
-        (_VISIBLE_COLOUR, f"{_count_road_users(played.frame, visible)} with {SEEN_WELL_POINTS:g} or more points"),
-        (_HIDDEN_COLOUR, f"{_count_road_users(played.frame, ~visible)} with fewer"),
-        (_SCAN_COLOUR, f"{int(on_vehicle.sum()):,} points on them"),
+        (VISIBLE_COLOUR, f"{_count_road_users(played.frame, visible)} with {SEEN_WELL_POINTS:g} or more points"),
+        (HIDDEN_COLOUR, f"{_count_road_users(played.frame, ~visible)} with fewer"),
+        (SCAN_COLOUR, f"{int(on_vehicle.sum()):,} points on them"),
     ]
-    return _text_legend([f"<b>{time_s:,.1f} s of {last_s:,.1f} s</b>"]) + _swatch_legend(swatches)
+    return text_legend([f"<b>{time_s:,.1f} s of {last_s:,.1f} s</b>"]) + swatch_legend(swatches)
 
 
 def _count_road_users(frame: TrafficFrame, selected: NDArray[np.bool_]) -> str:
@@ -670,16 +684,16 @@ def _scale_legend(title: str, low: float, high: float, number_format: str = "{:.
     return _legend_box(f'{title}{bar}<div style="display:flex;justify-content:space-between">{ends}</div>')
 
 
-def _swatch_legend(rows: Sequence[tuple[Colour, str]]) -> str:
+def swatch_legend(rows: Sequence[tuple[Colour, str]]) -> str:
     """Return coloured squares with texts."""
     square = "display:inline-block;width:0.8em;height:0.8em;margin-right:0.5em"
     lines = []
     for colour, text in rows:
         lines.append(f'<span style="{square};background:{_css_colour(colour)}"></span>{_escape_html(text)}')
-    return _text_legend(lines)
+    return text_legend(lines)
 
 
-def _text_legend(rows: Sequence[str]) -> str:
+def text_legend(rows: Sequence[str]) -> str:
     return _legend_box("".join(f"<div>{row}</div>" for row in rows))
 
 

@@ -25,7 +25,7 @@ _COLOUR = (232, 89, 12)
 _HEIGHT_M = 4.0 * LANE_HEIGHT_M
 _BAR_SHARE, _MARGIN_M, _CLEARANCE_M = 0.15, 1.5, 2.0
 _LABEL_SCALE = 0.7
-_ABOVE_BALL_M = 1.2
+ABOVE_BALL_M = 1.2
 
 
 def scale_length_m(longest_m: float) -> float:
@@ -160,7 +160,7 @@ def draw_pole_names(scene: viser.SceneApi, sites: Sequence[Site], without: Colle
         if name in without:
             continue
         position_m = np.subtract(site.pose.position_m, zero_m)
-        position_m[2] += _ABOVE_BALL_M
+        position_m[2] += ABOVE_BALL_M
         scene.add_label(
             f"/poles/{number}", name, position=position_m, anchor="bottom-center", font_screen_scale=_LABEL_SCALE
         )

@@ -15,7 +15,6 @@ import shlex
 import socket
 import threading
 from collections.abc import Sequence
-from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,12 +23,14 @@ import numpy as np
 import viser
 from PIL import Image
 
-from egvs.core.errors import EgvsError, InputError, RunError
+from egvs.core.errors import EgvsError, InputError
 from egvs.core.grid import Vec3
 from egvs.core.resource_usage import release_memory
 from egvs.explore import controls, drawing, map_symbols, settings
 from egvs.explore.access import KEY_PARAMETER, AccessGuard
 from egvs.explore.controls import Controls, PanelContent, show_modal
+from egvs.explore.recorded_traffic import FRAME_S, frames_per_step
+from egvs.explore.server import HOST, start_server, stop_server
 from egvs.explore.session import MovingPlan, Playback, Session
 from egvs.explore.settings import SessionFactory
 from egvs.explore.view_state import (
@@ -44,17 +45,10 @@ from egvs.explore.view_state import (
 )
 from egvs.sensors.sites import Pose, Site
 
-HOST = "127.0.0.1"
-"""The page cannot be reached from other machines."""
-
 GIZMO_M = 6.0
-FRAME_S = 0.25
-"""Shortest time between two pictures when recorded traffic plays."""
-
 FREE_MEMORY_EVERY = 32
 """Moves after which unused memory is returned to the system."""
 
-_SHUTDOWN_S = 5.0
 _ADD_SENSOR, _RESET_PLAN = "add", "reset"
 _WHERE = "the page"
 """Used in messages about invalid values."""
@@ -77,23 +71,6 @@ _PORT_HINT = "Use another port, or 0 for any free one."
 
 def _port_taken(port: int) -> InputError:
     return InputError("--port", f"port {port} is in use", _PORT_HINT)
-
-
-class _Server(viser.ViserServer):
-    """A server whose page cannot be published."""
-
-    def request_share_url(self, verbose: bool = True) -> str | None:
-        """Refuse to publish the page."""
-        return None
-
-
-def frames_per_step(period_s: float) -> int:
-    """Return by how many frames a new picture moves on: traffic with short frames plays in real time.
-
-    >>> frames_per_step(0.1), frames_per_step(1.0)
-    (2, 1)
-    """
-    return max(1, round(FRAME_S / period_s))
 
 
 class Page:
@@ -142,11 +119,7 @@ class Page:
         self._notice, self._draw_count = "", 0
         self._plan_request: str | None = None
         self.guard = AccessGuard(self._open_query)
-        with redirect_stdout(io.StringIO()), self.guard.protect_new_servers():  # viser prints a banner
-            self.server = _Server(host=HOST, port=port, label="egvs explore", verbose=False)
-        if not self.guard.is_active:
-            self.stop()
-            raise RunError("this version of viser starts its server differently, so the page cannot be protected")
+        self.server = start_server(self.guard, port)
         if port and self.server.get_port() != port:  # viser uses another port instead
             self.stop()
             raise _port_taken(port)
@@ -225,11 +198,7 @@ class Page:
 
     def stop(self) -> None:
         """Stop serving."""
-        with redirect_stdout(io.StringIO()):  # viser prints a message at the end of its thread
-            self.server.stop()
-            thread = self.server._websock_server._server_thread
-            if thread is not None:
-                thread.join(_SHUTDOWN_S)
+        stop_server(self.server)
 
     def current_site(self, candidate: Site) -> Site:
         """Return where a candidate's sensor is in the plan now; the candidate itself if the plan does not use it."""
@@ -299,9 +268,7 @@ class Page:
         self.label = scene.add_label("/sensor/label", "", anchor="top-center")
         self.gizmo.on_update(self._on_gizmo)
         self.server.on_client_disconnect(lambda client: self.disconnect(client.client_id))
-        size_m = max(session.scene.roi.size_m)
-        x, y, z = self.zero_m
-        self.set_camera(Camera((x, y - 0.4 * size_m, z + 0.6 * size_m), self.zero_m))
+        self.set_camera(drawing.first_camera(session.scene.roi))
         content = PanelContent(
             effects=settings.offered_effects(session),
             frames=self._playback.frames,

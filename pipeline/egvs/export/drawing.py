@@ -2,8 +2,8 @@
 
 Coordinates are metres: eastings and northings of the scenario's reference system, or those of the world frame where the
 scenario has none. They are not shifted; a drawing in a national grid has coordinates of millions of metres. North is
-up, and angles are those of the grid: the bearing of a sensor's front is clockwise from grid north, its tilt is negative
-where the front points down.
+up, and angles are those of the grid: the bearing of a sensor's front is clockwise from grid north, and the pitch is
+negative where the front points down.
 
 The base map comes from the run: centre lines, sidewalks and street names of the network, footprints of the static
 world, the region of interest. Kerbs are the outline of the network's junctions and of all lanes that vehicles drive on,
@@ -32,13 +32,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from egvs.export.extrinsics import bearing_deg
 from egvs.export.finished_run import ExportCrs, FinishedRun
 from egvs.export.layers import FOOTPRINTS, PLAN, REGION, SITES, Layer
 from egvs.report.basemap import network_file, roads_within, solid_group
 from egvs.sensors.sensor import Sensor, scenario_sensor
 from egvs.sensors.site_feasibility import ground_height_m
-from egvs.sensors.sites import Pose
+from egvs.sensors.sites import Pose, grid_bearing_deg
 from egvs.traffic import network
 from egvs.world.carriageway import Carriageway
 
@@ -93,7 +92,7 @@ LAYERS = (LANES, WALKWAYS, KERBS, STREETS, BUILDINGS, TREES, FURNITURE, ROI, POL
 VIEW_PREFIX = "EGVS-VIEW-"
 _VIEW_COLOUR = 140
 _GROUP_LAYERS = {"large": BUILDINGS, "green": TREES, "small": FURNITURE}
-_SITE_TAGS = ("SITE", "SENSOR", "HEIGHT_M", "BEARING_DEG", "TILT_DEG", "RANK")
+_SITE_TAGS = ("SITE", "SENSOR", "HEIGHT_M", "BEARING_DEG", "PITCH_DEG", "RANK")
 
 
 def write_dxf(path: Path, run: FinishedRun, layers: Sequence[Layer], reference: ExportCrs) -> list[str]:
@@ -242,10 +241,8 @@ def _carriageway(path: Path, box: Box) -> Iterator[Any]:
     frame = shapely.box(*box)
     areas = []
     for lane in carriageway.lanes:
-        width_m = network.LANE_WIDTH_M if lane.width_m is None else lane.width_m
-        line = shapely.LineString(lane.shape_m[:, :2])
-        if shapely.intersects(line, frame):
-            areas.append(shapely.buffer(line, width_m / 2.0 + _GAP_M, cap_style="flat"))
+        if shapely.intersects(shapely.LineString(lane.shape_m[:, :2]), frame):
+            areas.append(lane.area(margin_m=_GAP_M))
     junctions, corners = (
         shapely.union_all([shapely.make_valid(shapely.Polygon(shape.shape_m[:, :2])) for shape in shapes])
         for shapes in (carriageway.junctions, carriageway.corners)
@@ -373,14 +370,16 @@ def _draw_plan(model: Modelspace, layer: Layer, reference: ExportCrs) -> None:
 def _site_texts(row: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the values of :data:`_SITE_TAGS`."""
     return (
-        _plain_text(row["site"]), _plain_text(row["sensor"]), f"{row['z_m']:.3f}", f"{bearing_deg(row['yaw_deg']):.2f}",
-        f"{row['pitch_deg'] + 0.0:.2f}", str(row["rank"]),
+        _plain_text(row["site"]), _plain_text(row["sensor"]), f"{row['z_m']:.3f}",
+        f"{grid_bearing_deg(row['yaw_deg']):.2f}", f"{row['pitch_deg'] + 0.0:.2f}", str(row["rank"]),
     )  # fmt: skip
 
 
 def _label(row: Mapping[str, Any]) -> str:
-    bearing = round(bearing_deg(row["yaw_deg"])) % 360
-    return _mtext(f"{row['site']}  z {row['z_m']:.2f} m  {bearing:03d}°  tilt {row['pitch_deg'] + 0.0:.1f}°")
+    bearing = round(grid_bearing_deg(row["yaw_deg"])) % 360
+    pitch_deg = row["pitch_deg"]
+    tilt = f"{abs(pitch_deg):.1f}° {'up' if pitch_deg > 0 else 'down'}"
+    return _mtext(f"{row['site']}  z {row['z_m']:.2f} m  {bearing:03d}°  {tilt}")
 
 
 def _mtext(text: str) -> str:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from egvs.export.finished_run import ExportCrs
 from egvs.sensors.sensor import rotation_world_sensor
-from egvs.sensors.sites import Pose
+from egvs.sensors.sites import Pose, grid_bearing_deg
 
 Matrix = NDArray[np.float64]
 
@@ -81,15 +81,6 @@ class PosedSensor:
     sensor: str
     pose: Pose
     rank: int
-
-
-def bearing_deg(yaw_deg: float) -> float:
-    """Return the bearing, clockwise from grid north, 0 to 360, of a yaw counter-clockwise from east.
-
-    >>> bearing_deg(0.0), bearing_deg(90.0), bearing_deg(-90.0)
-    (90.0, 0.0, 180.0)
-    """
-    return (90.0 - yaw_deg) % 360.0
 
 
 def transform_world_sensor(pose: Pose) -> Matrix:
@@ -200,7 +191,7 @@ def _sensor_entry(sensor: PosedSensor, origin_m: Matrix, reference: ExportCrs) -
         "yaw_deg": pose.yaw_deg,
         "pitch_deg": pose.pitch_deg,
         "roll_deg": pose.roll_deg,
-        "bearing_deg": bearing_deg(pose.yaw_deg),
+        "bearing_deg": grid_bearing_deg(pose.yaw_deg),
         "T_world_sensor": matrix.tolist(),
         "T_sensor_world": _without_negative_zero(inverse).tolist(),
         "quaternion_wxyz": [w, x, y, z],

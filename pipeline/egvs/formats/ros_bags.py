@@ -83,11 +83,11 @@ def _read_file(path: Path) -> Iterator[Block]:
         if not stamps_s:
             yield problem_block(f"the topic {topic} has no messages", "Choose another topic with --topic.")
             return
-        wanted = set(chosen_sweeps(len(stamps_s), options.max_sweeps).tolist())
+        selected = set(chosen_sweeps(len(stamps_s), options.max_sweeps).tolist())
         frames: set[str] = set()
         blocks: list[Block] = []
         for number, (connection, _, data) in enumerate(reader.messages(chosen)):
-            if number not in wanted:
+            if number not in selected:
                 continue
             message: Any = reader.deserialize(data, connection.msgtype)
             frames.add(str(message.header.frame_id))

@@ -70,10 +70,10 @@ def _read_file(path: Path) -> Iterator[Block]:
         yield problem_block(f"expected a complete turn, got {actual}", hint)
         return
     complete = len(stamps_s) - 1
-    wanted = set(chosen_sweeps(complete, options.max_sweeps).tolist())
+    selected = set(chosen_sweeps(complete, options.max_sweeps).tolist())
     blocks: list[Block] = []
     for number, (_, points) in enumerate(_turns(path, options.range_m)):
-        if number in wanted:
+        if number in selected:
             points_m, time_s = organise(points)
             blocks += sweep_blocks(f"turn {number + 1}", points_m, time_s)
     notes = ["the last turn is incomplete and left out"]

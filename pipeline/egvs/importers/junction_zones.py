@@ -21,14 +21,13 @@ from typing import Any
 
 import numpy as np
 import shapely
-import shapely.ops
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core.grid import XY, FloatArray
 from egvs.importers.junctions import JunctionRegion, StreetJunction, Streets
 from egvs.importers.openstreetmap.street_network import NETWORK_FILE
 from egvs.traffic.directions import compass, lane_heading
-from egvs.traffic.network import LANE_WIDTH_M, Edge, Lane, Network
+from egvs.traffic.network import Edge, Lane, Network
 
 STOP_LINE_M = 10.0
 """Length of the zone before a stop line."""
@@ -125,21 +124,12 @@ def _crosswalks(network: Network, junction: StreetJunction) -> Iterator[Zone]:
             for lane in edge.lanes:
                 if len(lane.shape_m) > 1:
                     middle_m = lane.shape_m[:, :2].mean(axis=0)
-                    yield Zone(f"{_side(middle_m, junction.at_m)} crosswalk", "crosswalk", _strip(lane))
+                    yield Zone(f"{_side(middle_m, junction.at_m)} crosswalk", "crosswalk", lane.area())
 
 
 def _side(point_m: FloatArray, junction_m: XY) -> str:
     """The compass point of a point, as seen from the junction."""
     return compass(point_m - np.asarray(junction_m))
-
-
-def _strip(lane: Lane, last_m: float | None = None) -> BaseGeometry:
-    """The area of a lane; of its last metres only, if they are given."""
-    line = shapely.LineString(lane.shape_m[:, :2])
-    if last_m is not None and last_m < line.length:
-        line = shapely.ops.substring(line, line.length - last_m, line.length)
-    width_m = LANE_WIDTH_M if lane.width_m is None else lane.width_m
-    return shapely.buffer(line, width_m / 2.0, cap_style="flat")
 
 
 def _approach_zones(network: Network, junction: StreetJunction) -> Iterator[Zone]:
@@ -169,7 +159,7 @@ def _last_metres(network: Network, number: int, length_m: float) -> Iterator[Bas
     while length_m > 0.0 and number not in visited:
         visited.add(number)
         lanes = _lanes_for_vehicles(network.edges[number])
-        yield from (_strip(lane, length_m) for lane in lanes)
+        yield from (lane.area(length_m) for lane in lanes)
         length_m -= max(shapely.LineString(lane.shape_m[:, :2]).length for lane in lanes)
         entering = [link for link in network.connections if link.target == number and link.direction not in ("t", "T")]
         sources = {link.source for link in entering}
@@ -178,7 +168,7 @@ def _last_metres(network: Network, number: int, length_m: float) -> Iterator[Bas
         (number,) = sources
         vias = [inside[link.via] for link in entering if link.via in inside and len(inside[link.via].shape_m) > 1]
         if vias and length_m > 0.0:
-            yield from (_strip(lane, length_m) for lane in vias)
+            yield from (lane.area(length_m) for lane in vias)
             length_m -= max(shapely.LineString(lane.shape_m[:, :2]).length for lane in vias)
 
 
@@ -200,7 +190,7 @@ def _walking_areas(network: Network) -> Iterator[BaseGeometry]:
             if edge.function == "walkingarea" and len(lane.shape_m) > 2:
                 yield shapely.make_valid(shapely.Polygon(lane.shape_m[:, :2]))
             elif not edge.function and lane.is_pavement and len(lane.shape_m) > 1:
-                yield _strip(lane)
+                yield lane.area()
 
 
 def _only_areas(shape: BaseGeometry) -> BaseGeometry:

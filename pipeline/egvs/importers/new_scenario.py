@@ -64,7 +64,7 @@ from egvs.importers.recorded import traffic as recorded_traffic
 from egvs.importers.recorded.demand import TrackDemand
 from egvs.importers.recorded.motion import MatchedRecording, match_recording
 from egvs.importers.recorded.signal_assignment import RecordedMotion
-from egvs.importers.recorded.signal_programs import Replay, SignalPlan
+from egvs.importers.recorded.signal_programs import RecordedSignalNetwork, Replay
 from egvs.importers.recorded.traffic import TrackFiles
 from egvs.importers.road_source import NetworkRoads, RoadSource
 from egvs.importers.scenario_files import (
@@ -373,7 +373,7 @@ def create_scenario(
     if options.walk:
         notes.append(PEOPLE_HINT)
     matched = [match_recording(tracks, streets) for tracks in (recording, example, people) if tracks is not None]
-    signals = SignalPlan(roads.network, ())
+    signals = RecordedSignalNetwork(roads.network, ())
     if options.signals:
         replay = None
         if recording is not None:
@@ -462,7 +462,7 @@ def download_map(
 def _with_signals(
     network: str, junction: StreetJunction, paths: Sequence[Path], streets: Streets,
     matched: Sequence[MatchedRecording], replay: Replay | None,
-) -> SignalPlan:  # fmt: skip
+) -> RecordedSignalNetwork:  # fmt: skip
     """Return the network with recorded signals at the junction, and notes on them."""
     if junction.ring is not None:
         raise InputError("--signals", "the junction is a roundabout", "Choose another junction with --at LAT,LON.")

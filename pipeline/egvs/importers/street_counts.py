@@ -17,21 +17,20 @@ there are several.
 
 from __future__ import annotations
 
-import csv
-import io
 import itertools
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from egvs.core import limits
 from egvs.core.errors import InputError, find_misspelling
+from egvs.formats import csv_tables
 from egvs.importers import junctions
 from egvs.importers.junctions import StreetJunction, Streets
 from egvs.scenario.traffic_config import CountConfig, TrafficConfig
-from egvs.traffic.approaches import TURN_WORDS, ApproachBook, ApproachMovement, parse_lane_group, parse_side
+from egvs.traffic.approaches import TURN_WORDS, ApproachIndex, ApproachMovement, parse_lane_group, parse_side
 from egvs.traffic.movements import MovementNames
 
 LOCATION_COLUMNS = ("street", "approach", "turn", "lane_group", "edge", "from_edge", "to_edge")
@@ -102,7 +101,7 @@ class StreetCounts:
 
     @property
     def assumptions(self) -> list[str]:
-        """What the counts do not tell, for the key ``assumed``."""
+        """Assumptions, for the key ``assumed``."""
         return [f"turns of the approaches {', '.join(self.split)}"] if self.split else []
 
     def describe(self) -> str:
@@ -134,14 +133,14 @@ def read_junction_counts(path: Path, streets: Streets, junction: StreetJunction)
     if not flows:
         problem = "no street leads vehicles through the region of interest"
         raise InputError("--counts", problem, "Choose another junction with --at LAT,LON.")
-    book = ApproachBook.of_flows(flows, MovementNames(streets.network, junction.at_m))
+    index = ApproachIndex.of_flows(flows, MovementNames(streets.network, junction.at_m))
     edges = frozenset(edge.id for edge in streets.network.edges)
     kinds = frozenset(kind.name for kind in TrafficConfig.model_fields["kinds"].default)
-    return read_street_counts(path, flows, book, edges, kinds)
+    return read_street_counts(path, flows, index, edges, kinds)
 
 
 def read_street_counts(
-    path: Path, flows: Sequence[CountConfig], book: ApproachBook, edges: frozenset[str], kinds: frozenset[str]
+    path: Path, flows: Sequence[CountConfig], index: ApproachIndex, edges: frozenset[str], kinds: frozenset[str]
 ) -> StreetCounts:
     """Read counts by street, side of arrival and turn.
 
@@ -151,7 +150,7 @@ def read_street_counts(
         CSV file, UTF-8, with commas or semicolons.
     flows
         The assumed flows of the junction, whose proportions divide counts of several movements.
-    book
+    index
         Names of these flows.
     edges
         Ids of the edges of the network.
@@ -164,14 +163,14 @@ def read_street_counts(
         When a column or a value is not valid, a name is unknown or ambiguous, a movement is counted twice, or all
         counts are 0.
     """
-    rows = list(_read_rows(path, book, edges, kinds))
+    rows = list(_read_rows(path, index, edges, kinds))
     if not rows:
         raise InputError(path, "has no counts", "Add one row per count below the header.")
     if len({row.start_min is None for row in rows}) > 1:
         raise InputError(path, "only some rows have a start", "Give a start for every count, or for none.")
     interval_min = _interval_min(path, rows)
     hours: dict[int | None, dict[tuple[str, str], list[tuple[int | None, float]]]] = {}
-    seen: dict[tuple[str, str, int | None], str] = {}
+    first_row: dict[tuple[str, str, int | None], str] = {}
     templates: dict[str, CountConfig] = {}
     for row in rows:
         hour = None if row.start_min is None else row.start_min // 60 * 60
@@ -181,7 +180,7 @@ def read_street_counts(
         total = math.fsum(move.flow.per_hour for move in row.movements)
         for move in row.movements:
             key = (move.flow.title, row.kind)
-            former = seen.setdefault((*key, row.start_min), row.where)
+            former = first_row.setdefault((*key, row.start_min), row.where)
             if former != row.where:
                 problem = f"{row.title} is counted twice, also in {former.rpartition(': ')[2]}"
                 raise InputError(row.where, problem, "Give one count for each movement, interval and kind.")
@@ -195,9 +194,13 @@ def read_street_counts(
         counted.append(CountedHour(hour, shortest_min, flows_of_hour))
     if not any(flow.per_hour for hour in counted for flow in hour.flows):
         raise InputError(path, "all counts are 0", "Give at least one count above 0.")
-    counted = [hour for hour in counted if any(flow.per_hour for flow in hour.flows)]
+    empty = [hour for hour in counted if not any(flow.per_hour for flow in hour.flows)]
+    counted = [hour for hour in counted if hour not in empty]
     split = tuple(dict.fromkeys(row.movements[0].approach_title for row in rows if row.is_split))
-    return StreetCounts(path, tuple(counted), tuple(_notes(rows, counted, split, flows, book)), split)
+    notes = list(_notes(rows, counted, split, flows, index))
+    if empty:
+        notes.append(f"Hours without a vehicle are left out: {', '.join(hour.name for hour in empty)}.")
+    return StreetCounts(path, tuple(counted), tuple(notes), split)
 
 
 def _to_flows(
@@ -219,6 +222,9 @@ def _interval_min(path: Path, rows: Sequence[_Row]) -> int:
     lengths = {row.minutes for row in rows if row.minutes is not None}
     starts = sorted({row.start_min for row in rows if row.start_min is not None})
     if not starts:
+        if lengths:
+            hint = "Add a column start, or give vehicles per hour and remove minutes."
+            raise InputError(path, "minutes has no effect without a start", hint)
         return 60
     if not lengths:
         lengths = {min((after - before for before, after in itertools.pairwise(starts)), default=0)}
@@ -234,7 +240,7 @@ def _interval_min(path: Path, rows: Sequence[_Row]) -> int:
 
 def _notes(
     rows: Sequence[_Row], hours: Sequence[CountedHour], split: Sequence[str], flows: Sequence[CountConfig],
-    book: ApproachBook,
+    index: ApproachIndex,
 ) -> Iterator[str]:  # fmt: skip
     if split:
         yield f"Counts of several movements are divided by the assumed shares: {', '.join(split)}."
@@ -246,36 +252,19 @@ def _notes(
     if incomplete:
         yield f"Movements that were not counted in an hour get no vehicles in it: {', '.join(incomplete)}."
     counted = {move.flow.title for row in rows for move in row.movements}
-    missing = [move for move in book.movements if move.flow.title not in counted]
+    missing = [move for move in index.movements if move.flow.title not in counted]
     if missing and len(missing) < len(flows):
         names = dict.fromkeys(f"{move.approach_title} {move.turn}".strip() for move in missing)
         yield f"Movements without a count get no vehicles: {', '.join(names)}."
 
 
-def _read_rows(path: Path, book: ApproachBook, edges: frozenset[str], kinds: frozenset[str]) -> Iterator[_Row]:
-    try:
-        text = limits.read_bytes(path, limits.DOCUMENT).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(path, f"is not UTF-8 text (byte {error.start})", "Save it as CSV in UTF-8.") from None
-    delimiter = ";" if text.partition("\n")[0].count(";") > text.partition("\n")[0].count(",") else ","
-    table = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
-    header = _check_header(path, [name.strip() for name in next(table, [])])
-    try:
-        for cells in table:
-            where = f"{path}: row {table.line_num}"
-            if not any(cell.strip() for cell in cells):
-                continue
-            if len(cells) != len(header):
-                problem = f"expected {len(header)} values, got {len(cells)}"
-                raise InputError(where, problem, "Check the separators.")
-            values = {name: cell.strip() for name, cell in zip(header, cells, strict=True)}
-            yield from _parse_row(where, values, book, edges, kinds)
-    except csv.Error as error:
-        raise InputError(f"{path}: row {table.line_num}", f"is not CSV ({error})", "Check the quotes.") from None
+def _read_rows(path: Path, index: ApproachIndex, edges: frozenset[str], kinds: frozenset[str]) -> Iterator[_Row]:
+    for where, values in csv_tables.read_rows(path, partial(_check_header, path)):
+        yield from _parse_row(where, values, index, edges, kinds)
 
 
 def _check_header(path: Path, header: list[str]) -> list[str]:
-    """Return the names of the columns in lower case; InputError when one is unknown, repeated or missing."""
+    """Return the names of the columns in lower case; InputError when one is unknown or missing."""
     names = [name.casefold() for name in header]
     known = (*LOCATION_COLUMNS, *VALUE_COLUMNS)
     where = f"{path}: header"
@@ -284,8 +273,6 @@ def _check_header(path: Path, header: list[str]) -> list[str]:
             meant = find_misspelling([name], known)
             hint = f"Did you mean {meant[1]}?" if meant else f"Columns: {', '.join(known)}, or starts such as 07:15."
             raise InputError(where, f"unknown column {name!r}", hint)
-        if names.count(name) > 1:
-            raise InputError(where, f"two columns are called {name!r}", "Rename or remove one.")
     has_starts = any(_CLOCK.fullmatch(name) for name in names)
     if has_starts == ("count" in names):
         problem = "expected a column count, or columns named by their start, got " + ("both" if has_starts else "none")
@@ -293,12 +280,13 @@ def _check_header(path: Path, header: list[str]) -> list[str]:
     if has_starts and "start" in names:
         raise InputError(where, "the start is in a column and in names of columns", "Remove the column start.")
     if not any(name in names for name in ("street", "approach", "lane_group", "edge", "from_edge")):
-        raise InputError(where, "no column says where was counted", "Add street and approach, lane_group, or edge.")
+        problem = "no column gives the location of the counts"
+        raise InputError(where, problem, "Add street and approach, lane_group, or edge.")
     return names
 
 
 def _parse_row(
-    where: str, values: Mapping[str, str], book: ApproachBook, edges: frozenset[str], kinds: frozenset[str]
+    where: str, values: Mapping[str, str], index: ApproachIndex, edges: frozenset[str], kinds: frozenset[str]
 ) -> Iterator[_Row]:
     kind = values.get("kind", "")
     if kind in ("all", "total"):
@@ -307,7 +295,7 @@ def _parse_row(
         raise InputError(
             f"{where}: kind", f"expected a kind of the fleet, got {kind!r}", f"Kinds: {', '.join(sorted(kinds))}."
         )
-    movements, is_split = _find_movements(where, values, book, edges)
+    movements, is_split = _find_movements(where, values, index, edges)
     title = " ".join(values[name] for name in LOCATION_COLUMNS if values.get(name))
     minutes = None
     if values.get("minutes"):
@@ -327,12 +315,12 @@ def _parse_row(
 
 
 def _find_movements(
-    where: str, values: Mapping[str, str], book: ApproachBook, edges: frozenset[str]
+    where: str, values: Mapping[str, str], index: ApproachIndex, edges: frozenset[str]
 ) -> tuple[tuple[ApproachMovement, ...], bool]:
     """Return the movements of a row, and whether its count is divided among several."""
     named = [name for name in ("street", "approach", "lane_group", "edge", "from_edge") if values.get(name)]
     if not named:
-        raise InputError(where, "does not say where was counted", "Give street and approach, lane_group, or edge.")
+        raise InputError(where, "has no location", "Give street and approach, lane_group, or edge.")
     if "edge" in named or "from_edge" in named:
         return (_edge_movement(where, values, edges),), False
     turns: tuple[str, ...] = ()
@@ -352,14 +340,14 @@ def _find_movements(
             side = parse_side(values["approach"])
             if side is None:
                 problem = f"expected the side on which vehicles arrive, got {values['approach']!r}"
-                raise InputError(f"{where}: approach", problem, f"Use N, north or southbound. {book.hint}")
+                raise InputError(f"{where}: approach", problem, f"Use N, north or southbound. {index.hint}")
         if turn not in _ALL_TURNS:
             if turn not in TURN_WORDS:
                 problem = f"expected left, straight, right, u-turn or all, got {values['turn']!r}"
                 raise InputError(f"{where}: turn", problem, "Leave it empty for all vehicles of the approach.")
             turns = (TURN_WORDS[turn],)
-    found = tuple(book.find(values.get("street", ""), side, turns, where))
-    return found, len(found) > 1
+    movements = tuple(index.find(values.get("street", ""), side, turns, where))
+    return movements, len(movements) > 1
 
 
 def _edge_movement(where: str, values: Mapping[str, str], edges: frozenset[str]) -> ApproachMovement:

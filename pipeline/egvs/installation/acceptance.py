@@ -3,7 +3,7 @@ r"""Accept an installed sensor: compare one measured scan, or several, with the 
 Steps: read the scans (sensor frame: x forward, y left, z up, metres); register them to the static world
 (:mod:`egvs.sensors.registration`), which gives the measured pose with standard errors; compare them with the empty scan
 that is expected from there (:mod:`egvs.installation.scan_comparison`); score the measured pose, and the sensor with its
-obstacles and missing channels; hold everything against the limits.
+obstacles and missing channels; check each value against its limit.
 
 The tilt error is the angle between the planned and the measured z axis of the sensor. Errors of the pose are measured
 minus planned; those of angles are from -180 to 180 degrees. Standard errors cover the scatter of the returns about the
@@ -26,20 +26,21 @@ from egvs.core.grid import FloatArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.explore.session import Session
 from egvs.installation import scan_comparison
+from egvs.installation.acceptance_limits import MAX_VEHICLE_HEIGHT_M, Limits
 from egvs.installation.planned_sites import PlannedSites
 from egvs.installation.scan_comparison import BlockedSector, ScanComparison, StaticWorld
 from egvs.report.formatting import SCORE_LABELS
 from egvs.scoring.visibility import Beams
 from egvs.sensor_fit import sweep_files
 from egvs.sensors import registration
-from egvs.sensors.registration import PARAMETERS, Registration, StaticSurfaces
+from egvs.sensors.registration import PARAMETERS, Registration, StaticSurfaces, parameter_name_and_unit
 from egvs.sensors.sensor import Sensor, rotation_world_sensor
 from egvs.sensors.sites import Pose, Site
 
 MIN_STRUCTURE_SHARE = 0.3
 """A scan is of another place if it agrees with less of the walls, poles and other solids of the static world."""
 
-MAX_SHIFT_M = 3.0
+MAX_DISPLACEMENT_M = 3.0
 """A registration that ends farther from the planned position has not found the pose."""
 
 _GOOD_STRUCTURE_SHARE = 0.6
@@ -49,42 +50,8 @@ _BLOCKED_BEAM_DEG = 0.3
 """An expected beam is stopped by the return of an obstacle that is at most this far beside it."""
 _SEARCH_POINTS = 6_000
 """Of a scan that fits near the planned pose, about as many points tell whether other yaws fit as well."""
-_STEP_DEG = 1e-4
+_STEP = 1e-4
 _METRES_HINT = "Export the scan in metres, in the sensor's frame: x forward, y left, z up."
-
-
-@dataclass(frozen=True)
-class Limits:
-    """What an accepted sensor must keep; infinity switches a limit off.
-
-    Attributes
-    ----------
-    position_m
-        Largest distance of the measured from the planned position.
-    tilt_deg
-        Largest angle between the measured and the planned z axis of the sensor.
-    yaw_deg
-        Largest error of the yaw.
-    blocked_deg
-        Largest width of all blocked sectors together.
-    missing_channels
-        Largest number of channels without returns.
-    returns
-        Smallest share of the expected returns.
-    off_beams
-        Largest share of returns on no beam of the sensor.
-    loss
-        Largest loss of the score that ranks, as a share of the planned one.
-    """
-
-    position_m: float = 0.3
-    tilt_deg: float = 1.0
-    yaw_deg: float = 2.0
-    blocked_deg: float = 5.0
-    missing_channels: float = 0.0
-    returns: float = 0.8
-    off_beams: float = 0.05
-    loss: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -153,9 +120,9 @@ def _propagate(function: Callable[[Pose], float], fit: Registration) -> tuple[fl
     """Return a function of the fitted pose, and its standard error to first order."""
     gradient = np.zeros(len(PARAMETERS))
     for index, name in enumerate(PARAMETERS):
-        ahead = replace(fit.pose, **{name: getattr(fit.pose, name) + _STEP_DEG})
-        behind = replace(fit.pose, **{name: getattr(fit.pose, name) - _STEP_DEG})
-        gradient[index] = (function(ahead) - function(behind)) / (2.0 * _STEP_DEG)
+        ahead = replace(fit.pose, **{name: getattr(fit.pose, name) + _STEP})
+        behind = replace(fit.pose, **{name: getattr(fit.pose, name) - _STEP})
+        gradient[index] = (function(ahead) - function(behind)) / (2.0 * _STEP)
     gradient[np.abs(gradient) < 1e-6] = 0.0  # so that a parameter without influence may have an infinite variance
     used = np.flatnonzero(gradient)
     variance = gradient[used] @ fit.covariance[np.ix_(used, used)] @ gradient[used] if len(used) else 0.0
@@ -200,7 +167,7 @@ class Check:
     measured, limit
         Both, in words.
     passed
-        Whether the limit is kept.
+        Whether the value is within its limit.
     reason
         Why it is not; empty if it is.
     is_close
@@ -259,7 +226,7 @@ class Acceptance:
 
     @property
     def passed(self) -> bool:
-        """Whether all limits are kept."""
+        """Whether all checks pass."""
         return all(check.passed for check in self.checks)
 
     @property
@@ -325,7 +292,7 @@ def accept(
     scans: Sequence[str | Path],
     limits: Limits | None = None,
     *,
-    max_vehicle_height_m: float = scan_comparison.MAX_VEHICLE_HEIGHT_M,
+    max_vehicle_height_m: float = MAX_VEHICLE_HEIGHT_M,
     progress: ProgressCallback = no_progress,
 ) -> Acceptance:
     """Compare measured scans of an installed sensor with the empty scan that was planned.
@@ -339,7 +306,7 @@ def accept(
     scans
         Files of measured scans in the sensor's frame, see :func:`egvs.sensor_fit.sweep_files.read_sweeps`.
     limits
-        What to keep; by default :class:`Limits`.
+        The limits; by default :class:`Limits`.
     max_vehicle_height_m
         A return in front of the static world that is higher above the ground is of an obstacle, not of a vehicle.
     progress
@@ -422,8 +389,8 @@ def _register(
 
     problem = f"the scan does not fit the static world around {planned.name} at any yaw"
     hint = (
-        f"Check that it was measured at this site, in the sensor's frame in metres, less than {MAX_SHIFT_M:g} m and"
-        " about 5 degrees of tilt from the planned pose."
+        f"Check that it was measured at this site, in the sensor's frame in metres, less than {MAX_DISPLACEMENT_M:g} m"
+        " and about 5 degrees of tilt from the planned pose."
     )
     try:
         search = registration.search_yaw(points_m, surfaces, start, where=where)
@@ -460,7 +427,7 @@ def _other_yaws(
 
 
 def _is_near(fit: Registration, planned: Pose) -> bool:
-    return _distance_m(planned, fit.pose) <= MAX_SHIFT_M
+    return _distance_m(planned, fit.pose) <= MAX_DISPLACEMENT_M
 
 
 def _is_plausible(fit: Registration, planned: Pose) -> bool:
@@ -490,8 +457,8 @@ def _structure(comparison: ScanComparison) -> float:
 def _notes(fit: Registration, comparison: ScanComparison, other_yaws_deg: Sequence[float]) -> list[str]:
     notes = []
     if fit.not_fixed:
-        names = ", ".join(fit.not_fixed)
-        notes.append(f"no surface of the static world fixes {names}: the planned value was kept")
+        names = " and ".join(parameter_name_and_unit(name)[0] for name in fit.not_fixed)
+        notes.append(f"no surface of the static world fixes {names}: planned values are used instead")
     if other_yaws_deg:
         yaws = ", ".join(f"{yaw:.0f}" for yaw in other_yaws_deg)
         notes.append(f"the scan fits as well at a yaw of {yaws} degrees: check where the front of the sensor points")
@@ -629,7 +596,7 @@ def _yaw_check(error: PoseError, limit_deg: float) -> Check:
     return replace(check, measured=f"{errors} degrees", passed=False, reason=reason, is_close=False)
 
 
-def describe_error(value: float, se: float) -> str:
+def describe_error(value: float, se: float, unit: str = "") -> str:
     """Return an error of the pose with its standard error, e.g. "1.502 ± 0.004"; digits end at a thousandth.
 
     Examples
@@ -640,7 +607,7 @@ def describe_error(value: float, se: float) -> str:
     if math.isinf(se):
         return "cannot be measured"
     scatter = f"{se:.3f}" if se >= 0.0005 or se == 0.0 else "<0.001"
-    return f"{value:z.3f} ± {scatter}"
+    return f"{value:z.3f} ± {scatter} {unit}".rstrip()
 
 
 def describe_sector(sector: BlockedSector) -> str:

@@ -13,15 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs._version import __version__
+from egvs.artefacts.command_results import read_results
+from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
 from egvs.core.grid import FloatArray
 from egvs.export.export import safe_file_name
 from egvs.installation.acceptance import Acceptance, describe_error
-from egvs.installation.scan_comparison import ScanComparison
-from egvs.report import colours, page
+from egvs.installation.planned_sites import path_in_run
+from egvs.installation.scan_comparison import NEARER_M, NEARER_SHARE, SURE_RANGE, ScanComparison
+from egvs.report import colours, command_sections, page
 from egvs.report.colours import STYLE_SHEET, IndexedImage
 from egvs.report.formatting import SCORE_LABELS
 from egvs.report.svg_figures import ColourBar, svg_start_tag
+from egvs.runs.command_results import add_to_report
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -37,8 +41,6 @@ CATEGORIES = (
 
 _AZIMUTHS, _MAX_ROWS = 720, 64
 _WIDTH, _LEFT, _TOP, _IMAGE_HEIGHT = 760.0, 52.0, 8.0, 150.0
-_AGREES_M, _AGREES_SHARE = 0.5, 0.05
-_SURE_RANGE = 0.5
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,41 @@ def write_files(folder: Path, result: Acceptance) -> AcceptanceFiles:
     files.write_text(names.json, files.to_json_text(result.to_json(), indent=2) + "\n")
     files.write_text(names.page, render_page(result))
     return names
+
+
+def write_acceptance(run: str | Path, result: Acceptance, out: Path | None = None) -> tuple[Path, ...]:
+    """Write the files of an acceptance check, and add its verdict to the report of the run.
+
+    Parameters
+    ----------
+    run
+        The run folder.
+    result
+        From :func:`egvs.installation.acceptance.accept`.
+    out
+        Folder to write; ``acceptance`` in the run folder by default.
+
+    Returns
+    -------
+    tuple of Path
+        ``acceptance_SITE.json`` and ``acceptance_SITE.html``, then the file with all verdicts, and the report if the
+        run is complete.
+
+    Raises
+    ------
+    InputError
+        If a file cannot be written, or the file with the verdicts is damaged.
+    """
+    folder = RunFolder(Path(run))
+    read_results(folder.acceptance)
+    written = write_files(out or folder.path / "acceptance", result)
+    entry = {
+        **result.to_json(),
+        "pose": command_sections.pose_json(result.pose.planned),
+        "path": path_in_run(written.page, folder),
+    }
+    reported = add_to_report(folder.path, RunFolder.acceptance, {result.site.name: entry})
+    return (written.json, written.page, *reported)
 
 
 def render_page(result: Acceptance) -> str:
@@ -153,13 +190,13 @@ def beam_categories(comparison: ScanComparison) -> NDArray[np.uint8]:
     expected_m, measured_m = comparison.expected_m, comparison.measured_m
     category = np.zeros(len(expected_m), dtype=np.uint8)
     returned = ~np.isnan(measured_m)
-    tolerance_m = np.maximum(_AGREES_M, _AGREES_SHARE * np.where(np.isfinite(expected_m), expected_m, 0.0))
+    tolerance_m = np.maximum(NEARER_M, NEARER_SHARE * np.where(np.isfinite(expected_m), expected_m, 0.0))
     with np.errstate(invalid="ignore"):
         gap_m = expected_m - measured_m
         category[returned & (np.abs(gap_m) <= tolerance_m)] = 2
         category[returned & (gap_m < -tolerance_m)] = 3
         category[returned & (gap_m > tolerance_m)] = 4
-    category[~returned & (expected_m <= _SURE_RANGE * np.nanmax([*measured_m, 1.0]))] = 1
+    category[~returned & (expected_m <= SURE_RANGE * np.nanmax([*measured_m, 1.0]))] = 1
     category[comparison.obstacle_beams] = 5
     return category
 

@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 
 from egvs.artefacts.readers import read_placement
+from egvs.artefacts.run_folder import RunFolder
 from egvs.core.errors import InputError
 from egvs.explore.session import Session
 from egvs.export.export import unknown_site
@@ -91,6 +92,10 @@ class PlannedSites:
         """The sites of the plan, or the best site without a plan."""
         return tuple(self.plan) or (self.session.ranked[0].site.name,)
 
-    def output_folder(self, name: str, out: Path | None) -> Path:
-        """Return where files are written: ``out``, or a folder of the run."""
-        return out or self.run.work.folder.path / name
+
+def path_in_run(path: Path, folder: RunFolder) -> str:
+    """Return the path of a file relative to its run folder, with slashes; empty if it is elsewhere."""
+    try:
+        return path.resolve().relative_to(folder.path.resolve()).as_posix()
+    except ValueError:
+        return ""

@@ -23,6 +23,7 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial import KDTree
 
 from egvs.core.grid import FloatArray, IntArray
+from egvs.installation.acceptance_limits import MAX_VEHICLE_HEIGHT_M
 from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import Sensor, rotation_world_sensor
 from egvs.sensors.sites import Pose
@@ -35,13 +36,10 @@ Bools = NDArray[np.bool_]
 NEAR_M = 1.5
 """No vehicle comes closer to a sensor on a pole than this."""
 
-MAX_VEHICLE_HEIGHT_M = 4.5
-"""Legal heights are 4.0 m in Europe, 3.8 m in Japan and 4.1 to 4.3 m in the United States."""
-
 PERSISTENT_SCANS, PERSISTENT_SHARE = 3, 0.8
 """From so many scans on, a beam that is stopped in this share of them is stopped by an obstacle at any height."""
 
-_NEARER_M, _NEARER_SHARE = 0.5, 0.05
+NEARER_M, NEARER_SHARE = 0.5, 0.05
 """A return is in front of the static world if it is nearer than expected by more than both."""
 _BLOCKED_M, _BLOCKED_SHARE = 1.0, 0.3
 """An obstacle is nearer than expected by more than both: a wall that the map puts a little too far away is none."""
@@ -53,7 +51,7 @@ _BLOCKED_BEAMS, _SILENT_RETURNS = 0.2, 0.1
 _MIN_EXPECTED = 5
 """Fewest expected returns of a bin, in all, whose absence says something."""
 _MIN_SILENT_DEG = 2.0
-_SURE_RANGE = 0.5
+SURE_RANGE = 0.5
 """Surfaces within this share of the sensor's range are expected to return."""
 _CHANNEL_EXPECTED, _CHANNEL_RETURNS = 50, 0.05
 """A channel is checked from so many expected returns on, and missing below this share of them."""
@@ -257,7 +255,7 @@ def compare_scans(
 
     gap_m = behind_m - range_m
     with np.errstate(invalid="ignore"):
-        nearer = gap_m > np.maximum(_NEARER_M, _NEARER_SHARE * behind_m)
+        nearer = gap_m > np.maximum(NEARER_M, NEARER_SHARE * behind_m)
         far_nearer = gap_m > np.maximum(_BLOCKED_M, _BLOCKED_SHARE * behind_m)
     is_open = np.isinf(behind_m)
     nearer |= is_open
@@ -266,7 +264,7 @@ def compare_scans(
     height_m = world.heights_m(world_m)
     impossible = (range_m < NEAR_M) | (height_m > max_vehicle_height_m)
     # A surface that the map ends too low, or leaves out beyond the expected ones, blocks nothing that was expected.
-    impossible &= ~is_open | (range_m < _SURE_RANGE * sensor.range_m)
+    impossible &= ~is_open | (range_m < SURE_RANGE * sensor.range_m)
     impossible |= _persistent(far_nearer, beam, scan_of_point, len(scans), len(beams))[beam]
     obstacle = far_nearer & impossible & on_beam
 
@@ -274,7 +272,7 @@ def compare_scans(
     elevation_deg = _elevations_deg(beams)
     returned = np.zeros((len(scans), len(beams)), dtype=np.bool_)
     returned[scan_of_point[on_beam], beam[on_beam]] = True
-    sure = expected_m <= _SURE_RANGE * sensor.range_m
+    sure = expected_m <= SURE_RANGE * sensor.range_m
     returns = _Returns(beam, range_m, height_m, gap_m)
     sectors = _blocked_sectors(
         azimuth_deg, sure, returned, beam[obstacle], points_m[obstacle], len(scans), pose

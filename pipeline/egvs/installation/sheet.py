@@ -17,10 +17,13 @@ from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from egvs._version import __version__
+from egvs.artefacts.command_results import read_results
+from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import Tpog
 from egvs.core import files, plugins
 from egvs.core.errors import InputError
@@ -31,15 +34,16 @@ from egvs.export.finished_run import SCENARIO_CRS, ExportCrs
 from egvs.formats import georeference
 from egvs.formats.georeference import WorldFrame
 from egvs.installation import tolerances, view
-from egvs.installation.planned_sites import PlannedSites
+from egvs.installation.planned_sites import PlannedSites, path_in_run
 from egvs.installation.tolerances import PoseTolerances, Tolerance
-from egvs.report import colours, maps
+from egvs.report import colours, command_sections, maps
 from egvs.report.basemap import network_file, roads_within, world_outlines
 from egvs.report.formatting import SCORE_LABELS, format_degrees
 from egvs.report.maps import Backdrop
 from egvs.report.svg_figures import Box, FigureStyle, MapFrame, svg_start_tag
+from egvs.runs.command_results import add_to_report
 from egvs.sensors.sensor import Sensor
-from egvs.sensors.sites import Pose, Site
+from egvs.sensors.sites import Pose, Site, grid_bearing_deg
 
 FILE_TYPES = ("pdf", "svg")
 SHEETS_FOLDER = "sheets"
@@ -106,7 +110,7 @@ class SheetData:
     @property
     def grid_bearing_deg(self) -> float:
         """Bearing of the front, clockwise from grid north."""
-        return (90.0 - self.pose.yaw_deg) % 360.0
+        return grid_bearing_deg(self.pose.yaw_deg)
 
     @property
     def true_bearing_deg(self) -> float:
@@ -239,7 +243,7 @@ def write_sheets(
     out: Path | None = None,
     progress: ProgressCallback = no_progress,
 ) -> list[tuple[SheetData, Path]]:
-    """Write an installation sheet for each site.
+    """Write an installation sheet for each site, and add what they say to the report of the run.
 
     Parameters
     ----------
@@ -269,10 +273,12 @@ def write_sheets(
     if kind != "svg":
         plugins.require_libraries(f"a {kind} sheet", "figure", "cairosvg")
     planned = PlannedSites.open(Path(run))
+    run_folder = planned.run.work.folder
+    read_results(run_folder.sheets)
     names = tuple(dict.fromkeys(sites)) or planned.default_sites
     for name in names:
         planned.site(name)
-    folder = out or planned.run.work.folder.path / SHEETS_FOLDER
+    folder = out or run_folder.path / SHEETS_FOLDER
     paths = [folder / f"installation_{safe_file_name(name)}.{kind}" for name in names]
     for path in paths:
         files.check_writable(path)
@@ -284,7 +290,23 @@ def write_sheets(
             partial.write_bytes(convert_svg(f"{svg}\n", kind))
         written.append((data, path))
         progress("sheets", number, len(names))
+    entries = {data.site.name: _report_entry(data, path, run_folder) for data, path in written}
+    add_to_report(run_folder.path, RunFolder.sheets, entries)
     return written
+
+
+def _report_entry(data: SheetData, path: Path, folder: RunFolder) -> dict[str, Any]:
+    """Return what the report says about a sheet, JSON values."""
+    return {
+        "sensor": data.sensor.name,
+        "pose": command_sections.pose_json(data.pose),
+        "height_m": data.mounting_height_m,
+        "bearing_deg": data.grid_bearing_deg,
+        "tolerances": {row.quantity.name: describe_limit(row) for row in data.tolerances.tolerances},
+        "frames": data.tolerances.frames,
+        "file": path.name,
+        "path": path_in_run(path, folder),
+    }
 
 
 # ---- drawing
@@ -314,7 +336,7 @@ def draw_sheet(planned: PlannedSites, data: SheetData) -> str:
     session = planned.session
     camera = view.camera_pose(data.pose, data.sensor, session.scene.roi)
     pixels = view.render_view(session.scene, data.pose, data.sensor, session.carriageway)
-    caption = f"View from the sensor, towards {format_angle((90.0 - camera.yaw_deg) % 360.0)} from grid north"
+    caption = f"View from the sensor, towards {format_angle(grid_bearing_deg(camera.yaw_deg))} from grid north"
     parts.append(_text(_MARGIN, top, f"{caption}, {view.HORIZONTAL_DEG:g}° wide", 15, bold=True))
     parts.append(
         f'<image x="{_MARGIN}" y="{top + 12:.1f}" width="{inner:.1f}" height="{picture_height:.1f}"'

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.grid import FloatArray, Roi
+from egvs.report.basemap import is_vegetation
 from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import Sensor, rotation_world_sensor
 from egvs.sensors.sites import Pose
@@ -120,7 +121,7 @@ def _style(name: str, kind: str) -> str:
     """Return the colour of a solid."""
     if (name, kind) == ("ground", "ground"):
         return "ground"
-    if "tree" in kind or kind in ("vegetation", "hedge"):
+    if is_vegetation(kind):
         return "green"
     return "building" if "building" in kind else "other"
 

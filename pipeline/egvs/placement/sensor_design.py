@@ -31,15 +31,20 @@ from typing import Any
 import numpy as np
 
 from egvs.artefacts import traffic_frames
+from egvs.artefacts.command_results import read_results
+from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import PeriodBlocks, read_periods, read_tpog
 from egvs.core import plugins
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.threads import map_ordered
+from egvs.placement.design_request import ALL_SENSORS, DesignRequest
 from egvs.placement.refinement import Axis, BoxEnds, Freedom, minimise
+from egvs.report.command_sections import DIGEST_KEY, design_digest
 from egvs.report.sensor_results import ScoreDifference
 from egvs.runs import run, stage_registry
+from egvs.runs.command_results import add_to_report
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.scenario.sensor_config import SensorConfig
@@ -65,13 +70,9 @@ from egvs.sensors.sites import Pose, Site
 from egvs.stages.base import StageContext
 from egvs.stages.inputs import open_folder
 
-ALL_SENSORS = "all"
-"""Stands for the sensors of the scenario and the complete catalogue."""
-
 STAGES = ("check", "statics", "traffic", "tpog")
 MAX_PIECES = 7
 MIN_GAP_DEG = 0.05
-ELEVATION_BOUNDS_DEG = (-45.0, 25.0)
 PITCH_DEG = (-30.0, 10.0)
 START_PITCHES_DEG = (0.0, -5.0, -10.0, -15.0, -20.0)
 MIN_EVALUATIONS = 20
@@ -86,40 +87,6 @@ _IMPOSSIBLE_LOSS = 1e6
 
 
 @dataclass(frozen=True)
-class DesignRequest:
-    """What to design.
-
-    Attributes
-    ----------
-    pole
-        Name of the pole.
-    sensors
-        Names of sensors, or :data:`ALL_SENSORS`.
-    heights_m
-        Lowest and highest height above the ground; None for those of the candidates at the pole.
-    evaluations
-        Number of mounts that are tried for each sensor.
-    channels
-        Number of free channels; None for no free ones.
-    bounds_deg
-        Lowest and highest elevation of free channels.
-    elevation_evaluations
-        Number of sets of elevations that are tried.
-    name
-        Name of the designed sensor.
-    """
-
-    pole: str
-    sensors: tuple[str, ...] = (ALL_SENSORS,)
-    heights_m: tuple[float, float] | None = None
-    evaluations: int = 100
-    channels: int | None = None
-    bounds_deg: tuple[float, float] = ELEVATION_BOUNDS_DEG
-    elevation_evaluations: int = 300
-    name: str = "designed"
-
-
-@dataclass(frozen=True)
 class Design:
     """A sensor at a mount, with its scores.
 
@@ -130,7 +97,7 @@ class Design:
     search_score
         Score on the frames of the search.
     score, se
-        Score on other frames, and its standard error; None where errors are unknown.
+        Score on other frames, and its standard error.
     difference
         This score minus that of the best design of the catalogue, on the same other frames.
     """
@@ -139,7 +106,7 @@ class Design:
     pose: Pose
     search_score: float
     score: float
-    se: float | None
+    se: float
     difference: ScoreDifference
 
 
@@ -151,8 +118,8 @@ class DesignResult:
     ----------
     pole
         Its name.
-    height_m
-        Height of the ground at the pole.
+    ground_m
+        Height of the ground at the pole, world frame.
     catalogue
         The best mount of each sensor, the best first by the score of the search.
     start, designed
@@ -202,6 +169,11 @@ def design_sensor(
     progress, listener
         Called with the progress of stages and trials, and when a stage begins or ends.
 
+    Returns
+    -------
+    DesignResult
+        The designs, which are also added to the report if the folder has a complete run.
+
     Raises
     ------
     InputError
@@ -211,36 +183,66 @@ def design_sensor(
     _check_request(request)
     folder = Path(out) if out is not None else run.default_folder(scenario)
     names = _sensor_names(scenario, request)
+    read_results(RunFolder(folder).sensor_design)
     record = run.run(scenario, folder, only=STAGES, jobs=jobs, progress=progress, listener=listener)
     recorded = stage_registry.recorded_digests(record)
     context = open_folder(scenario, folder, jobs=jobs, progress=progress, recorded=recorded)
     designer = _Designer(context, request)
     notes: list[str] = []
-    found: list[_Trial] = []
+    best_mounts: list[_Trial] = []
     for number, name in enumerate(names):
         try:
-            found.append(designer.best_mount(context.scene.sensor(name, "--sensors"), number))
+            best_mounts.append(designer.best_mount(context.scene.sensor(name, "--sensors"), number))
         except InputError as error:
             if request.sensors != (ALL_SENSORS,):
                 raise
             notes.append(f"{name} is left out: {error}")
         progress("sensors", number + 1, len(names))
-    if not found:
+    if not best_mounts:
         raise InputError("--sensors", "expected a sensor that is possible in this scenario, got none", notes[0])
-    found.sort(key=lambda trial: -trial.score)
-    trials = list(found)
+    best_mounts.sort(key=lambda trial: -trial.score)
+    trials = list(best_mounts)
     if request.channels is not None:
-        base = next((trial for trial in found if trial.sensor.channels), None)
+        base = next((trial for trial in best_mounts if trial.sensor.channels), None)
         if base is None:
-            raise InputError("--channels", "expected a sensor with rings among --sensors, got beam tables only")
+            problem = "expected a sensor with rings among --sensors, got beam tables only"
+            raise InputError("--channels", problem, "Add one, such as --sensors VLP-16.")
         start, designed = designer.best_elevations(base, request, len(names))
         trials += [start, designed]
     designs = designer.evaluate(trials)
-    free = designs[len(found) :]
-    return DesignResult(
-        request.pole, designer.ground_m, tuple(designs[: len(found)]), free[0] if free else None,
-        free[1] if free else None, designer.frames, tuple(notes),
+    designed_pair = designs[len(best_mounts) :]
+    result = DesignResult(
+        request.pole, designer.ground_m, tuple(designs[: len(best_mounts)]),
+        designed_pair[0] if designed_pair else None, designed_pair[1] if designed_pair else None, designer.frames,
+        tuple(notes),
     )  # fmt: skip
+    entry = {**_report_entry(result), DIGEST_KEY: design_digest(scenario)}
+    add_to_report(folder, RunFolder.sensor_design, {request.pole: entry}, STAGES)
+    return result
+
+
+def _report_entry(result: DesignResult) -> dict[str, Any]:
+    """Return what the report says about the designs, JSON values."""
+    designs = list(result.catalogue)
+    if result.start is not None and result.designed is not None:
+        designs += [result.start, result.designed]
+    rows = []
+    for design in designs:
+        difference = design.difference
+        rows.append(
+            {
+                "sensor": design.sensor.name,
+                "height_m": design.pose.z_m - result.ground_m,
+                "yaw_deg": design.pose.yaw_deg,
+                "pitch_deg": design.pose.pitch_deg,
+                "search_score": design.search_score,
+                "score": design.score,
+                "se": design.se,
+                "difference": {"value": difference.value, "se": difference.se, "better": difference.better},
+                "chosen": design is result.chosen,
+            }
+        )
+    return {"frames": list(result.frames), "designs": rows, "notes": list(result.notes)}
 
 
 def _check_request(request: DesignRequest) -> None:
@@ -252,12 +254,13 @@ def _check_request(request: DesignRequest) -> None:
         most = int((high - low) / MIN_GAP_DEG) + 1
         if not 2 <= request.channels <= most:
             problem = f"expected 2 to {most} channels between {low:g} and {high:g} degrees, got {request.channels}"
-            raise InputError("--channels", problem)
+            raise InputError("--channels", problem, f"Use a number such as {min(32, most)}, or wider --elevations.")
     for option, evaluations in (
         ("--evaluations", request.evaluations), ("--elevation-evaluations", request.elevation_evaluations),
     ):  # fmt: skip
         if evaluations < MIN_EVALUATIONS:
-            raise InputError(option, f"expected at least {MIN_EVALUATIONS}, got {evaluations}")
+            problem = f"expected at least {MIN_EVALUATIONS}, got {evaluations}"
+            raise InputError(option, problem, "Leave it out, or use 100.")
 
 
 def _sensor_names(scenario: Scenario, request: DesignRequest) -> tuple[str, ...]:
@@ -336,7 +339,8 @@ class _Designer:
         poses = [*(site.pose for site in self._sites), *self._usual_poses(sensor)]
         starts = [trial for trial in self._try_all([(sensor, pose) for pose in poses]) if trial is not None]
         if not starts:
-            raise InputError(f"--pole {self._sites[0].pole}", f"no candidate there is possible with {sensor.name}")
+            problem = f"no candidate there is possible with {sensor.name}"
+            raise InputError(f"--pole {self._sites[0].pole}", problem, "Use another pole, or other sensors.")
         start = max(starts, key=lambda trial: trial.score)
         low_m, high_m = (height_m + self.ground_m for height_m in self._heights_m)
         axes = [Axis("yaw_deg", -180.0, 180.0, is_periodic=True), Axis("pitch_deg", *PITCH_DEG)]
@@ -511,10 +515,10 @@ def start_elevations(base: Sensor, channels: int, bounds_deg: tuple[float, float
         Lowest and highest elevation.
     """
     low_deg, high_deg = bounds_deg
-    own = tuple(sorted(base.elevations_deg))
-    if len(own) == channels and low_deg <= own[0] and own[-1] <= high_deg:
-        return own
-    first, last = (min(max(value, low_deg), high_deg) for value in (own[0], own[-1]))
+    base_elevations = tuple(sorted(base.elevations_deg))
+    if len(base_elevations) == channels and low_deg <= base_elevations[0] and base_elevations[-1] <= high_deg:
+        return base_elevations
+    first, last = (min(max(value, low_deg), high_deg) for value in (base_elevations[0], base_elevations[-1]))
     if last - first < (channels - 1) * MIN_GAP_DEG:
         first, last = low_deg, high_deg
     return tuple(np.round(np.linspace(first, last, channels), _ANGLE_DIGITS).tolist())

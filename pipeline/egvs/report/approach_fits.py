@@ -63,7 +63,7 @@ def compare_approaches(scenario: Scenario, trajectories: Path, network: Path | N
         raise InputError(f"{scenario.file}: {observed.KEY}", problem, "Use traffic that is simulated on a network.")
     roads = read_net_xml(network)
     observations = observed.read_observed(scenario, roads)
-    paths = approach_queues.approach_paths(observed.approach_book(scenario, roads).movements, roads)
+    paths = approach_queues.approach_paths(observed.approach_index(scenario, roads).movements, roads)
     boxes, windows = _read_boxes(trajectories)
     fits = []
     for observation in observations:
@@ -82,8 +82,7 @@ def compare_approaches(scenario: Scenario, trajectories: Path, network: Path | N
 def _read_boxes(path: Path) -> tuple[VehicleFrames, Mapping[str, tuple[int, int]]]:
     """Return the boxes of vehicles without their rear parts, and the frames of each period ("" without periods)."""
     table, metadata = parquet.read_artefact(path, "trajectories", columns=list(_COLUMNS))
-    names, vehicle = np.unique(table.column("vehicle").to_numpy(zero_copy_only=False).astype(str), return_inverse=True)
-    del names
+    _, vehicle = np.unique(table.column("vehicle").to_numpy(zero_copy_only=False).astype(str), return_inverse=True)
     kinds = table.column("kind").to_numpy(zero_copy_only=False).astype(str)
     keep = (table.column("part").to_numpy() == 0) & ~np.isin(kinds, sorted(NON_VEHICLE_KINDS))
     values = {name: table.column(name).to_numpy()[keep] for name in ("frame", "x_m", "y_m", "yaw_rad", "length_m")}

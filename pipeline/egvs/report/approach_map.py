@@ -19,7 +19,7 @@ from egvs.report.svg_figures import Box, MapFrame, text_width
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import CountConfig
 from egvs.traffic.approach_queues import approach_paths, path_points
-from egvs.traffic.approaches import ApproachBook, ApproachMovement
+from egvs.traffic.approaches import ApproachIndex, ApproachMovement
 from egvs.traffic.directions import Floats
 from egvs.traffic.movements import MovementNames
 from egvs.traffic.network import read_net_xml
@@ -59,10 +59,10 @@ def busiest_counts(scenario: Scenario) -> tuple[str, tuple[CountConfig, ...]]:
 def approach_labels(counts: Sequence[CountConfig], network: Path, center_m: tuple[float, float]) -> list[ApproachLabel]:
     """Return the approaches of counts, in the order of the compass."""
     roads = read_net_xml(network)
-    book = ApproachBook.of_flows(counts, MovementNames(roads, center_m))
-    paths = approach_paths(book.movements, roads)
-    by_title: dict[str, list[ApproachMovement]] = {title: [] for title in book.titles}
-    for movement in book.movements:
+    index = ApproachIndex.of_flows(counts, MovementNames(roads, center_m))
+    paths = approach_paths(index.movements, roads)
+    by_title: dict[str, list[ApproachMovement]] = {title: [] for title in index.titles}
+    for movement in index.movements:
         by_title[movement.approach_title].append(movement)
     labels = []
     for title, movements in by_title.items():

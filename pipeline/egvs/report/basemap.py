@@ -9,6 +9,7 @@ A run whose traffic is a finished FCD file without ``traffic.roads`` has no netw
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
@@ -31,7 +32,8 @@ _SMALL_M2 = 4.0
 _MAX_SMALL_TRIANGLES = 100_000
 """If there are more small triangles of a kind than this, they are drawn as squares."""
 _SMALL_M, _SQUARE_M = 0.5, 0.25
-_GREEN = ("tree", "crown", "canopy", "hedge", "bush", "vegetation", "forest", "wood")
+_GREEN = re.compile(r"(?<![a-z])(tree|crown|canopy|hedge|bush|vegetation|forest|wood(?!en))")
+"""Words that begin with one of these: "trees" and "tree_crown", but not "street_lamp"."""
 
 
 @dataclass(frozen=True)
@@ -116,9 +118,16 @@ def solid_group(kind: str, area_m2: float) -> str:
     """Return the group of a solid that looks alike on a map: ``large``, ``green`` or ``small``."""
     if area_m2 < _SMALL_M2 and "crown" not in kind:
         return "small"
-    if any(word in kind.lower() for word in _GREEN):
-        return "green"
-    return "large"
+    return "green" if is_vegetation(kind) else "large"
+
+
+def is_vegetation(kind: str) -> bool:
+    """Whether a word of a kind of solid is a tree, a hedge or the like.
+
+    >>> [is_vegetation(kind) for kind in ("tree_crown", "Hedges", "street_lamp", "wooden_fence")]
+    [True, True, False, False]
+    """
+    return _GREEN.search(kind.lower()) is not None
 
 
 def _shape_rings(shape: Any) -> Iterable[NDArray[np.float64]]:

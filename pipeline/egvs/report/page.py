@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from egvs._version import __version__
 from egvs.artefacts.readers import DISTINCT_PROBABILITY, MIN_VEHICLES, PeriodRanking
-from egvs.artefacts.run_folder import ACCURACY_FILES, PLACEMENT_FILES, VALIDATION_FILES, RunFolder
+from egvs.artefacts.run_folder import ACCURACY_FILES, COMMAND_RESULTS, PLACEMENT_FILES, VALIDATION_FILES, RunFolder
 from egvs.artefacts.run_record import RunRecord, StageRecord
 from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files
@@ -28,6 +28,7 @@ from egvs.report.approach_fits import ApproachFit, compare_approaches
 from egvs.report.approach_map import busiest_counts, draw_approach_map
 from egvs.report.basemap import network_file
 from egvs.report.colours import STYLE_SHEET
+from egvs.report.command_sections import CommandSections, current_entries
 from egvs.report.figures import Figures
 from egvs.report.map_credits import read_map_credits
 from egvs.report.points_section import MAPPED_POLES, PointsSection
@@ -83,6 +84,7 @@ _OPTIONAL_FILES = (
     *ACCURACY_FILES,
     *VALIDATION_FILES,
     *PLACEMENT_FILES,
+    *(file.name for file in COMMAND_RESULTS),
 )
 
 _UNMODELLED = (
@@ -107,6 +109,8 @@ class PageContents:
         Records of the stages, as far as ``run.json`` has them, in the order of :data:`STAGES`.
     study, by_period, detected, plan
         Results of other commands and of periods; None if those commands have not run.
+    commands
+        Results of what-ifs, sheets, acceptance checks and sensor design.
     zones, points
         Road users found in zones, and maps of points on target; None where the scenario has no zones or no lanes.
     movements
@@ -127,6 +131,7 @@ class PageContents:
     detected: ValidationSummary | None = None
     plan: PlacementSummary | None = None
     movements: Mapping[str, str] = field(default_factory=dict)
+    commands: CommandSections = field(default_factory=CommandSections)
     zones: ZoneSection | None = None
     points: PointsSection | None = None
     approaches: tuple[ApproachFit, ...] = ()
@@ -165,6 +170,8 @@ def dependencies(work: StageContext) -> StageDependencies:
         settings["counts"] = describe_counts(scenario, network_file(work.folder.path))
     if map_credits := read_map_credits(scenario):
         settings["map_credits"] = map_credits
+    if current := current_entries(work, stages):
+        settings["command_results"] = {name: list(entries) for name, entries in current.items()}
     hashes: dict[str, str] = {}
     if scenario.scan.keep:
         names.append(RunFolder.scans.name)
@@ -248,6 +255,7 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
         by_period=PeriodRanking.read(out),
         detected=ValidationSummary.read(out, stages),
         plan=plan,
+        commands=CommandSections.read(work, stages, ranking.sites, {mount.name: mount.pose for mount in mounts}),
         movements=describe_counts(work.scenario, network_file(out)),
         zones=ZoneSection.read(work, ranking.sites[0], tpog.grid, drawn.backdrop, has_plan=plan is not None),
         points=PointsSection.draw(work, mapped, mounts, tpog.grid, drawn.backdrop, moved=moved),

@@ -65,7 +65,7 @@ class PointsSection:
         moved
             Whether the sensors of the plan were moved from their candidates.
         """
-        positions = [place for place in target_positions(work, grid) if len(place.boxes)]
+        positions = [each for each in target_positions(work, grid) if len(each.boxes)]
         if not positions:
             return None
         box = extent(grid, best)
@@ -74,14 +74,14 @@ class PointsSection:
         mapped = {(row.site, row.points.target.name): row.points for row in points_maps(work, positions, scans)}
         figures: list[PointsFigure] = []
         for site in best:
-            for place in positions:
-                points = mapped[site.site, place.target.name]
+            for positions_of_target in positions:
+                points = mapped[site.site, positions_of_target.target.name]
                 figures.append(_site_figure(site, points, backdrop, box, f"points-{len(figures)}"))
         overlap: list[PointsFigure] = []
         if len(plan) > 1:
             rows = list(points_maps(work, positions, plan_beams(work, plan, moved=moved)))
-            for place in positions:
-                of_target = [row.points for row in rows if row.points.target is place.target]
+            for positions_of_target in positions:
+                of_target = [row.points for row in rows if row.points.target is positions_of_target.target]
                 overlap.append(_overlap_figure(of_target, plan, backdrop, box, f"overlap-{len(overlap)}"))
         return cls(tuple(figures), tuple(overlap))
 

@@ -35,14 +35,15 @@ class ZoneTable:
     @classmethod
     def of(cls, zones: Sequence[ZoneVisibility], numbers: Mapping[str, int]) -> ZoneTable:
         """Arrange the rows of an artefact; ``numbers`` are those of the zones on the map."""
-        heads = {zone.user_class: zone.class_words for zone in sorted(zones, key=lambda zone: zone.user_class != "all")}
+        all_first = sorted(zones, key=lambda zone: zone.user_class != "all")
+        heads = {zone.user_class: zone.class_plural for zone in all_first}
         by_key = {(zone.zone, zone.user_class): zone for zone in zones}
         rows = []
         for name in dict.fromkeys(zone.zone for zone in zones):
             cells: list[tuple[str, str] | None] = []
             for user_class in heads:
                 zone = by_key.get((name, user_class))
-                cells.append(None if zone is None else (zone.share_words, f"of {zone.road_users:,}"))
+                cells.append(None if zone is None else (zone.share_text, f"of {zone.road_users:,}"))
             rows.append((numbers[name], name, tuple(cells)))
         return cls(tuple(heads.values()), tuple(rows))
 
@@ -93,7 +94,7 @@ class ZoneSection:
         shown = []
         for zone in zones:
             if zone.user_class == ALL_USERS:
-                title = f"{zone.zone}: {zone.share_words} of {zone.road_users:,} road users found"
+                title = f"{zone.zone}: {zone.share_text} of {zone.road_users:,} road users found"
                 shown.append(MapZone(areas[zone.zone], numbers[zone.zone], zone.share, title))
         alt = f"Map of {len(shown)} zones by the share of road users that is found from {best.site}."
         figure = maps.zone_map(grid, shown, best, backdrop, extent(grid, [best]), alt)

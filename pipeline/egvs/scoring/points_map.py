@@ -28,7 +28,7 @@ from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.scoring.blindspots import CELL_M, blindspot_map_shape
 from egvs.scoring.targets import SEEN_WELL_POINTS, TargetRecord, visible_targets
 from egvs.scoring.visibility import Beams
-from egvs.traffic.network import LANE_WIDTH_M, Lane, Network
+from egvs.traffic.network import Lane, Network
 from egvs.world.carriageway import is_carriageway
 
 OVERLAP_POINTS = SEEN_WELL_POINTS
@@ -118,14 +118,14 @@ class TargetPositions:
     def of(cls, target: StandardTarget, network: Network, grid: Grid) -> TargetPositions:
         """Find the positions of a target on the surface of a network, in the region of interest of a grid."""
         cells = [np.empty((0, 2), dtype=np.int64)]
-        places = [np.empty((0, 4))]
+        poses = [np.empty((0, 4))]
         middles_m = _cell_middles_m(grid)
         for area, height_and_yaw in _surfaces(target, network):
             covered = _covered_cells(area, middles_m, grid)
             at_m = middles_m[covered[:, 0], covered[:, 1]]
             cells.append(covered)
-            places.append(np.column_stack([at_m, height_and_yaw(at_m)]))
-        cell, (x_m, y_m, z_m, yaw_rad) = np.concatenate(cells), np.concatenate(places).T
+            poses.append(np.column_stack([at_m, height_and_yaw(at_m)]))
+        cell, (x_m, y_m, z_m, yaw_rad) = np.concatenate(cells), np.concatenate(poses).T
         size_m = np.tile([target.length_m, target.width_m, target.height_m], (len(cell), 1))
         boxes = np.column_stack([x_m, y_m, z_m + target.height_m / 2.0, size_m, yaw_rad])
         roi = grid.roi
@@ -193,11 +193,11 @@ def _covered_cells(area: Any, middles_m: FloatArray, grid: Grid) -> IntArray:
     return cells
 
 
-_Placed = Callable[[FloatArray], FloatArray]
+_PoseAt = Callable[[FloatArray], FloatArray]
 """Height and yaw, (k, 2), of points (k, 2) on a surface."""
 
 
-def _surfaces(target: StandardTarget, network: Network) -> Iterator[tuple[Any, _Placed]]:
+def _surfaces(target: StandardTarget, network: Network) -> Iterator[tuple[Any, _PoseAt]]:
     """Yield the areas on which a target stands, with their heights and headings."""
     import shapely
 
@@ -213,31 +213,24 @@ def _surfaces(target: StandardTarget, network: Network) -> Iterator[tuple[Any, _
                 is_surface = is_surface or edge.function == "crossing" or lane.is_sidewalk
             if not is_surface or len(line_m) < 2 or not (line_m[:, :2] != line_m[0, :2]).any():
                 continue
-            yield _strip(lane), _along(lane)
+            yield lane.area(), _along(lane)
 
 
-def _strip(lane: Lane) -> Any:
-    import shapely
-
-    width_m = LANE_WIDTH_M if lane.width_m is None else lane.width_m
-    return shapely.buffer(shapely.LineString(lane.shape_m[:, :2]), width_m / 2.0, cap_style="flat")
-
-
-def _at_height(height_m: float) -> _Placed:
-    def placed(at_m: FloatArray) -> FloatArray:
+def _at_height(height_m: float) -> _PoseAt:
+    def pose_at(at_m: FloatArray) -> FloatArray:
         return np.tile([height_m, 0.0], (len(at_m), 1))
 
-    return placed
+    return pose_at
 
 
-def _along(lane: Lane) -> _Placed:
+def _along(lane: Lane) -> _PoseAt:
     """Height and heading of the nearest point of the middle line of a lane."""
     line_m = lane.shape_m
-    kept = np.append(True, (np.diff(line_m[:, :2], axis=0) != 0.0).any(axis=1))
-    start, step = line_m[kept][:-1], np.diff(line_m[kept], axis=0)
+    is_distinct = np.append(True, (np.diff(line_m[:, :2], axis=0) != 0.0).any(axis=1))
+    start, step = line_m[is_distinct][:-1], np.diff(line_m[is_distinct], axis=0)
     heading = np.arctan2(step[:, 1], step[:, 0])
 
-    def placed(at_m: FloatArray) -> FloatArray:
+    def pose_at(at_m: FloatArray) -> FloatArray:
         to = at_m[:, None, :] - start[None, :, :2]
         share = np.clip((to * step[:, :2]).sum(axis=2) / (step[:, :2] ** 2).sum(axis=1), 0.0, 1.0)
         distance2 = ((to - share[:, :, None] * step[:, :2]) ** 2).sum(axis=2)
@@ -245,4 +238,4 @@ def _along(lane: Lane) -> _Placed:
         along = np.take_along_axis(share, nearest[:, None], axis=1)[:, 0]
         return np.column_stack([start[nearest, 2] + along * step[nearest, 2], heading[nearest]])
 
-    return placed
+    return pose_at

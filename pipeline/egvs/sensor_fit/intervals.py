@@ -63,7 +63,7 @@ def estimate_share(hits: FloatArray, inflation: float = 1.0) -> Estimate:
     if binomial > 0.0 and n >= MIN_VALUES:
         counts, sums = _block_sums(np.column_stack([np.ones(n), hits])).T
         left_out = (sums.sum() - sums) / (counts.sum() - counts)
-        factor = max(factor, _jackknife_variance(left_out) / binomial)
+        factor = max(factor, jackknife_variance(left_out) / binomial)
     effective = n / factor
     z = float(norm.ppf(0.975))
     centre = (share + z * z / (2 * effective)) / (1 + z * z / effective)
@@ -113,7 +113,7 @@ def estimate_scale(residual: FloatArray, variance_factor: float, step: float = 0
     sensitivity = 1.0 - _CLIP**3 * float(norm.pdf(_CLIP)) * (1.0 - _CLIPPED_VARIANCE / _CLIP**2) / (
         _INSIDE * _CLIPPED_VARIANCE
     )
-    variance_se = math.sqrt(_jackknife_variance(left_out)) / sensitivity
+    variance_se = math.sqrt(jackknife_variance(left_out)) / sensitivity
 
     to_range = 1.0 / (_CLIPPED_VARIANCE * variance_factor)
     variance = full * to_range - step**2 / 12.0
@@ -132,6 +132,7 @@ def _block_sums(values: FloatArray) -> FloatArray:
     return sums
 
 
-def _jackknife_variance(left_out: FloatArray) -> float:
+def jackknife_variance(left_out: FloatArray) -> float:
+    """Return the variance of an estimate from its values without each of k blocks in turn, (k,)."""
     k = len(left_out)
     return float((k - 1) / k * ((left_out - left_out.mean()) ** 2).sum())

@@ -14,11 +14,19 @@ import numpy as np
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.sensor_fit.ground_plane import GroundPlane
-from egvs.sensors.registration import Registration, StaticSurfaces, YawSearch, search_yaw
+from egvs.sensors.registration import (
+    Registration,
+    StaticSurfaces,
+    YawSearch,
+    clustered_mean_se,
+    parameter_name_and_unit,
+    sample_points,
+    search_yaw,
+)
 from egvs.sensors.sites import Pose
 from egvs.world.mesh import World
 
-MAX_SHIFT_M = 5.0
+MAX_HORIZONTAL_SHIFT_M = 5.0
 """A fit that is farther than this from the given position is not that of the sensor."""
 
 MIN_ON_SURFACE = 0.3
@@ -75,8 +83,8 @@ class MapPose:
     @property
     def ambiguous_yaws_deg(self) -> tuple[float, ...]:
         """Other yaws within reach of the position that fit as well as the best one."""
-        near = (other for other in self.search.equally_good if _shift_m(other.registration, self.start) <= MAX_SHIFT_M)
-        return tuple(other.registration.pose.yaw_deg for other in near)
+        fits = (other.registration for other in self.search.equally_good)
+        return tuple(fit.pose.yaw_deg for fit in fits if _shift_m(fit, self.start) <= MAX_HORIZONTAL_SHIFT_M)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -85,12 +93,12 @@ class MapPose:
         if "yaw_deg" in self.best.not_fixed:
             messages.append("No surface of the static world fixes the yaw.")
         elif self.best.not_fixed:
-            names = ", ".join(name.rpartition("_")[0] for name in self.best.not_fixed)
+            names = ", ".join(parameter_name_and_unit(name)[0] for name in self.best.not_fixed)
             messages.append(f"No surface of the static world fixes {names}, which kept the start value.")
         if self.ambiguous_yaws_deg:
             yaws = ", ".join(f"{yaw_deg:.1f}" for yaw_deg in self.ambiguous_yaws_deg)
             messages.append(f"Ambiguous: the sweep fits as well at a yaw of {yaws} degrees. Choose by the map figure.")
-        if self.shift_m > MAX_SHIFT_M:
+        if self.shift_m > MAX_HORIZONTAL_SHIFT_M:
             messages.append(f"The fit is {self.shift_m:.1f} m from --site: check the position.")
         if self.share_on_surface < MIN_ON_SURFACE:
             share = self.share_on_surface
@@ -131,18 +139,15 @@ def fit_map_pose(
         If the world has no ground at the site and z is not given, or hardly any return lies on the static world.
     """
     x_m, y_m = site_m[:2]
-    z_m = site_m[2] if len(site_m) > 2 else ground_height_m(world, x_m, y_m) + plane.height_m
+    z_m = site_m[2] if len(site_m) > 2 else lowest_surface_m(world, x_m, y_m) + plane.height_m
     start = Pose(x_m, y_m, z_m, 0.0, plane.pitch_deg, plane.roll_deg)
-    if len(points_m) > _MAX_POINTS:
-        chosen = np.sort(np.random.default_rng(0).choice(len(points_m), _MAX_POINTS, replace=False))
-        points_m = points_m[chosen]
+    points_m = sample_points(points_m, _MAX_POINTS)
     search = search_yaw(points_m, StaticSurfaces(world, start.position_m), start, where=where)
     best = search.best
     distance_m = best.distance_m[best.on_surface]
     sector = np.floor(np.degrees(np.arctan2(points_m[:, 1], points_m[:, 0])) / _BLOCK_DEG).astype(np.int64)
-    residual_m = float(distance_m.mean())
     _, block = np.unique(sector[best.on_surface], return_inverse=True)
-    sums = np.bincount(block, weights=distance_m - residual_m)
+    residual_m, residual_se_m = clustered_mean_se(distance_m, block)
     return MapPose(
         scenario=scenario,
         world=world,
@@ -150,11 +155,11 @@ def fit_map_pose(
         start=start,
         search=search,
         residual_m=residual_m,
-        residual_se_m=float(np.sqrt((sums**2).sum())) / len(distance_m),
+        residual_se_m=residual_se_m,
     )
 
 
-def ground_height_m(world: World, x_m: float, y_m: float) -> float:
+def lowest_surface_m(world: World, x_m: float, y_m: float) -> float:
     """Return the height of the ground at a location, world frame; of all surfaces, the lowest, if none is a ground.
 
     Raises

@@ -15,6 +15,7 @@ differs says that columns are missing in the file, or that times are not those o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -22,6 +23,7 @@ import numpy as np
 
 from egvs.core.grid import FloatArray
 from egvs.sensor_fit.beam_angles import BeamAngles, nearest_channels
+from egvs.sensor_fit.intervals import jackknife_variance
 from egvs.sensor_fit.sweep_files import Sweep
 
 MIN_RATE_HZ, MAX_RATE_HZ = 1.0, 60.0
@@ -114,8 +116,7 @@ def _fit_sweep(sweep: Sweep, angles: BeamAngles) -> tuple[float, float, float] |
     products = np.bincount(part, weights=centred * residual_deg, minlength=_PARTS)
     squares = np.bincount(part, weights=centred**2, minlength=_PARTS)
     slopes = (products.sum() - products) / (squares.sum() - squares) / 360.0
-    error = float(np.sqrt((_PARTS - 1) / _PARTS * ((slopes - slopes.mean()) ** 2).sum()))
-    return rate_hz, error, _firing_interval_s(channel, time_s)
+    return rate_hz, math.sqrt(jackknife_variance(slopes)), _firing_interval_s(channel, time_s)
 
 
 def _coarse_rate(azimuth_deg: FloatArray, time_s: FloatArray) -> float | None:
@@ -160,6 +161,5 @@ def rotation_of_stamps(stamps_s: FloatArray) -> Rotation | None:
     slopes = np.array(
         [np.polyfit(turns[part != number], stamps_s[part != number] - stamps_s[0], 1)[0] for number in np.unique(part)]
     )
-    k = len(slopes)
-    slope_se = float(np.sqrt((k - 1) / k * ((slopes - slopes.mean()) ** 2).sum()))
+    slope_se = math.sqrt(jackknife_variance(slopes))
     return Rotation(1.0 / float(slope), slope_se / float(slope) ** 2, "times of sweeps", len(stamps_s))

@@ -258,8 +258,8 @@ def register_scan(
     Parameters
     ----------
     points_m
-        Returns in the sensor's frame, (n, 3) float64, finite, none at the origin. Of more than 20,000, an even
-        selection is fitted; distances are those of all.
+        Returns in the sensor's frame, (n, 3) float64, finite, none at the origin. Of more than 20,000, a random
+        sample is fitted; distances are those of all.
     surfaces
         The static world around the sensor.
     start
@@ -277,7 +277,7 @@ def register_scan(
     if len(points_m) < MIN_POINTS:
         raise InputError(where, f"expected at least {MIN_POINTS} returns, got {len(points_m)}", "Give complete scans.")
     columns = np.array(sorted(PARAMETERS.index(name) for name in free))
-    fitted_m = _thinned(points_m, _MAX_POINTS)
+    fitted_m = sample_points(points_m, _MAX_POINTS)
     optimum = _fit(fitted_m, surfaces, start, columns, _EXACT, where)
     return _registration(points_m, fitted_m, surfaces, optimum, columns)
 
@@ -309,7 +309,7 @@ def search_yaw(
     if len(points_m) < MIN_POINTS:
         raise InputError(where, f"expected at least {MIN_POINTS} returns, got {len(points_m)}", "Give complete scans.")
     columns = np.array(sorted(PARAMETERS.index(name) for name in free))
-    few = _thinned(points_m, _SEARCH_POINTS)
+    few = sample_points(points_m, _SEARCH_POINTS)
     yaws_deg = np.arange(0.0, 360.0, _YAW_STEP_DEG)
     costs = np.array([_capped(surfaces.match(few, _with_yaw(start, yaw)), _SEARCH_CAP_M).mean() for yaw in yaws_deg])
     is_optimum = (costs <= np.roll(costs, 1)) & (costs <= np.roll(costs, -1))
@@ -332,8 +332,16 @@ def search_yaw(
     return YawSearch(best, tuple(_alternative(best, other, blocks) for other in others), yaws_deg, costs)
 
 
-def _thinned(points_m: FloatArray, count: int) -> FloatArray:
-    """Return at most ``count`` points, spread evenly over the list."""
+def sample_points(points_m: FloatArray, count: int) -> FloatArray:
+    """Return at most ``count`` points, drawn at random with a fixed seed, in their order.
+
+    Parameters
+    ----------
+    points_m
+        The points, (n, 3).
+    count
+        Largest number of points.
+    """
     if len(points_m) <= count:
         return points_m
     chosen = np.sort(np.random.default_rng(0).choice(len(points_m), count, replace=False))
@@ -359,10 +367,32 @@ def _capped(matches: _Matches, cap_m: float) -> FloatArray:
 
 def _alternative(best: Registration, other: Registration, blocks: IntArray) -> Alternative:
     capped = [np.minimum(np.nan_to_num(np.abs(fit.distance_m), nan=_COST_CAP_M), _COST_CAP_M) for fit in (other, best)]
-    difference = capped[0] - capped[1]
-    mean = float(difference.mean())
-    sums = np.bincount(blocks, weights=difference - mean)
-    return Alternative(other, mean, float(np.sqrt((sums**2).sum())) / len(difference))
+    return Alternative(other, *clustered_mean_se(capped[0] - capped[1], blocks))
+
+
+def parameter_name_and_unit(parameter: str) -> tuple[str, str]:
+    """Return the name and the unit of one of :data:`PARAMETERS`.
+
+    >>> parameter_name_and_unit("yaw_deg"), parameter_name_and_unit("x_m")
+    (('yaw', 'degrees'), ('x', 'm'))
+    """
+    name, _, unit = parameter.rpartition("_")
+    return name, "degrees" if unit == "deg" else unit
+
+
+def clustered_mean_se(values: FloatArray, block: IntArray) -> tuple[float, float]:
+    """Return the mean of values and its standard error, which takes values of a block as dependent.
+
+    Parameters
+    ----------
+    values
+        The values, (n,).
+    block
+        Number of the block of each value, from 0, (n,).
+    """
+    mean = float(values.mean())
+    sums = np.bincount(block, weights=values - mean)
+    return mean, float(np.sqrt((sums**2).sum())) / len(values)
 
 
 def _azimuth_blocks(points_m: FloatArray) -> IntArray:

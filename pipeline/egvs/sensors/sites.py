@@ -77,6 +77,15 @@ class Pose:
         return self.yaw_deg, self.pitch_deg, self.roll_deg
 
 
+def grid_bearing_deg(yaw_deg: float) -> float:
+    """Return the bearing, clockwise from grid north, 0 to 360, of a yaw counter-clockwise from east.
+
+    >>> grid_bearing_deg(0.0), grid_bearing_deg(90.0), grid_bearing_deg(-90.0)
+    (90.0, 0.0, 180.0)
+    """
+    return (90.0 - yaw_deg) % 360.0
+
+
 @dataclass(frozen=True)
 class Site:
     """A candidate site.

@@ -42,5 +42,5 @@ def points_maps(
     positions = tuple(positions)
     for name, beams in scans:
         probability = detection_probability(context.scene, beams.sensor)
-        for place in positions:
-            yield SitePointsMap(name, place.points_map(beams, probability))
+        for positions_of_target in positions:
+            yield SitePointsMap(name, positions_of_target.points_map(beams, probability))

@@ -229,11 +229,9 @@ def _summary(
         for blindspots in readers.read_blindspots(context.folder.blindspots, best[:1]):
             summary["missed"] = blindspots.in_words()
     if scoring.zones is not None and best:
-        telling = readers.telling_zones(readers.read_zones(context.folder.zones, best[0]))
-        if telling:
-            summary["zones"] = (
-                f"{best[0]} in zones, where it finds fewest: {'; '.join(zone.in_words() for zone in telling)}"
-            )
+        worst = readers.worst_zones(readers.read_zones(context.folder.zones, best[0]))
+        if worst:
+            summary["zones"] = f"{best[0]} finds the smallest shares in: {'; '.join(zone.in_words() for zone in worst)}"
     skipped = context.scene.skipped("score")
     if skipped:
         summary["skipped"] = skipped

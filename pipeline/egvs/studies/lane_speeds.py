@@ -33,7 +33,7 @@ BIN_M_S = 0.5
 N_BINS = 140
 """Number of bins; faster vehicles are counted in the last."""
 
-BASE_S = 1.0
+SPEED_INTERVAL_S = 1.0
 """Time between the two positions, or the frame period where that is longer."""
 
 MIN_VEHICLES = 5
@@ -159,6 +159,6 @@ def _lanes_at(xy_m: FloatArray, bins: LaneBins, grid: Grid) -> IntArray:
     return lane
 
 
-def shared_base_s(periods_s: Sequence[float]) -> float:
-    """Return the time between two positions that suits both runs: at least :data:`BASE_S` and each frame period."""
-    return max(BASE_S, *periods_s)
+def common_interval_s(periods_s: Sequence[float]) -> float:
+    """Return the time between two positions of both runs: at least :data:`SPEED_INTERVAL_S` and each frame period."""
+    return max(SPEED_INTERVAL_S, *periods_s)

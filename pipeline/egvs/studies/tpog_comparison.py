@@ -250,7 +250,7 @@ def _compare_speeds(
     periods_s = [
         float(parquet.read_metadata(run.folder.trajectories, "trajectories")["frame_period_s"]) for run in runs
     ]
-    base_s = lane_speeds.shared_base_s(periods_s)
+    base_s = lane_speeds.common_interval_s(periods_s)
     first, second = (
         lane_speeds.read_lane_speeds(run.folder.trajectories, period_s, base_s, bins, grid, jackknife.groups[0])
         for run, period_s, jackknife in zip(runs, periods_s, jackknives, strict=True)

@@ -1,7 +1,7 @@
 r"""The ranking with solids that are in the scene for a share of the time, for ``egvs what-if``.
 
 For each table ``[what_if.NAME]``, the scenario runs as it is and with the solids of the table; traffic is the same and
-comes from the store, so only the static world, the scans and the scores are made again. With the score :math:`S_0` of a
+comes from the cache, so only the static world, the scans and the scores are made again. With the score :math:`S_0` of a
 site without the solids, :math:`S_1` with them, and the share :math:`q` of the time in which they are there, its
 expected score is
 
@@ -19,12 +19,12 @@ The solids are written to the run folders, as ``what_if_1.geojson`` and so on.
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -33,21 +33,33 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.numbers import parse_decimal
 from egvs.core.platform import relative_path
+from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.special import cosdg, sindg
+from egvs.formats import csv_tables
 from egvs.report.basemap import solid_group
+from egvs.report.command_sections import DIGEST_KEY, what_if_digest
 from egvs.report.formatting import ScoreLabel, format_probability, join_names
 from egvs.report.ranking import RankedSite, Ranking
 from egvs.report.sensor_results import ScoreDifference
-from egvs.runs import run_names
+from egvs.runs import run, run_names
+from egvs.runs.command_results import add_to_report
 from egvs.runs.run_sources import SettingsSource
 from egvs.scenario.fields import MAX_COORDINATE_M
 from egvs.scenario.model import Scenario
 from egvs.scenario.settings import format_overrides
 from egvs.scenario.what_if_config import WhatIfBox, WhatIfConfig
 from egvs.scoring.standard_errors import ScoreUncertainty
+from egvs.scoring.zones import region_bounds_m
+from egvs.sensors.sensor import scenario_sensor
+from egvs.sensors.sites import candidate_sites
 from egvs.studies.footprint_files import read_document, write_if_changed
 from egvs.studies.paired_errors import SiteReplicates, read_replicates
 from egvs.tracks.sizes import class_sizes
+from egvs.world import geolocation
+from egvs.world.footprints import read_footprints
+
+if TYPE_CHECKING:
+    from shapely.geometry.base import BaseGeometry
 
 TABLE = "what_if"
 TOGETHER = "all together"
@@ -186,6 +198,69 @@ class WhatIfResult:
     notes: tuple[str, ...]
 
 
+def what_if(
+    path: str | Path,
+    overrides: Sequence[str] = (),
+    names: Sequence[str] = (),
+    *,
+    jobs: int | None = None,
+    progress: ProgressCallback = no_progress,
+    listener: run.StageListener = run.ignore_stage,
+) -> WhatIfResult:
+    """Run a scenario as it is and with the solids of its tables, compare the rankings, and add the answers to a report.
+
+    Parameters
+    ----------
+    path, overrides, names
+        As in :func:`prepare_runs`.
+    jobs
+        Number of threads; one per core when None. Results do not depend on it.
+    progress, listener
+        Called with the progress of stages, and when a stage begins or ends.
+
+    Returns
+    -------
+    WhatIfResult
+        The answers. Those in the report of the first run are the same.
+
+    Raises
+    ------
+    InputError
+        When the scenario or a file is wrong, or it has no such table.
+    """
+
+    def run_one(_: int, what_if_run: WhatIfRun) -> None:
+        run.run(what_if_run.scenario, what_if_run.folder, jobs=jobs, progress=progress, listener=listener)
+
+    result = compare_runs(prepare_runs(Path(path), overrides, names), run_one)
+    record_answers(result)
+    return result
+
+
+def record_answers(result: WhatIfResult) -> tuple[Path, ...]:
+    """Write the answers into the folder of the run as it is, and add them to its report; return both files.
+
+    Parameters
+    ----------
+    result
+        From :func:`compare_runs`.
+    """
+    base, *others = result.runs
+    entries = {}
+    for answer in result.answers:
+        tables = [other.name for other in others] if answer.name == TOGETHER else [answer.name]
+        values = asdict(answer)
+        del values["name"]
+        entries[answer.name] = {
+            **values,
+            "impossible": list(answer.impossible),
+            "conclusion": answer.conclusion(),
+            "tables": tables,
+            DIGEST_KEY: what_if_digest(base.scenario, tables),
+        }
+    return add_to_report(base.folder, RunFolder.what_if, entries)
+
+
 def prepare_runs(path: Path, overrides: Sequence[str] = (), names: Sequence[str] = ()) -> tuple[WhatIfRun, ...]:
     """Return the runs of a scenario with the solids of its tables, and write the solids; nothing is run yet.
 
@@ -201,13 +276,15 @@ def prepare_runs(path: Path, overrides: Sequence[str] = (), names: Sequence[str]
     Raises
     ------
     InputError
-        When the scenario or a file is wrong, or it has no such table.
+        When the scenario or a file is wrong, it has no such table, or all solids of a source are out of range.
     """
     source = SettingsSource(path)
     base = source.load_variant(overrides)
     tables = _chosen_tables(base, names)
     folder = source.folder(base) if not overrides else run_names.run_folder(base.name, base.overrides)
     documents = {name: solid_documents(base, name) for name in tables}
+    for name in tables:
+        check_positions(base, name)
     runs = [WhatIfRun("", 0.0, base, folder)]
     for name, table in tables.items():
         changed = run_names.run_folder(base.name, {**base.overrides, TABLE: name})
@@ -304,44 +381,93 @@ def solid_documents(scenario: Scenario, name: str) -> list[dict[str, Any]]:
     return documents
 
 
+def check_positions(scenario: Scenario, name: str) -> None:
+    """Raise an InputError if no solid of a source of a table can be met by a beam that reaches the region of interest.
+
+    Such a beam is never farther from the region than the range of its sensor. The sources are the boxes, the parked
+    vehicles, and the footprints; coordinates in degrees or of another frame are found so.
+
+    Parameters
+    ----------
+    scenario
+        The scenario.
+    name
+        Name of the table.
+    """
+    import shapely
+
+    table = scenario.what_if[name]
+    key = f"{TABLE}.{name}"
+    sources: dict[str, list[Any]] = {}
+    if table.boxes:
+        sources[f"{scenario.file}: {key}.boxes.0"] = [_box_shape(box) for box in table.boxes]
+    if table.vehicles is not None:
+        path = scenario.find(table.vehicles, f"{key}.vehicles")
+        sources[f"{path}: row 1"] = [_box_shape(box) for box in read_vehicles(path, scenario)]
+    if table.footprints:
+        world = geolocation.scenario_georeference(scenario)
+        paths = [scenario.find(file, f"{key}.footprints") for file in table.footprints]
+        shapes = [each.polygon for path in paths for each in read_footprints(path, world).footprints]
+        if shapes:
+            sources[str(paths[0])] = shapes
+    if not sources:
+        return
+
+    sensors = {site.sensor: f"site {site.name}" for site in candidate_sites(scenario)}
+    range_m = max(scenario_sensor(sensor, scenario, where).range_m for sensor, where in sensors.items())
+    (west_m, south_m), (east_m, north_m) = region_bounds_m(scenario)
+    region = shapely.box(west_m, south_m, east_m, north_m)
+    for where, shapes in sources.items():
+        distances_m = shapely.distance(region, shapes)
+        if distances_m.min() > range_m:
+            problem = (
+                f"none of {len(shapes)} solids is within {range_m:g} m of the region of interest, the range of the"
+                f" sensors; this one is {distances_m[0]:,.0f} m away"
+            )
+            region_text = f"x {west_m:g} to {east_m:g}, y {south_m:g} to {north_m:g}"
+            raise InputError(where, problem, f"Use the world frame in metres; the region is {region_text}.")
+
+
+def _box_shape(box: WhatIfBox) -> BaseGeometry:
+    from shapely.geometry import shape
+
+    return shape(_box_feature(box, "")["geometry"])
+
+
 def read_vehicles(path: Path, scenario: Scenario) -> list[WhatIfBox]:
     """Read parked vehicles: a CSV with x_m, y_m (centre, world frame), yaw_deg and type.
 
     Raises
     ------
     InputError
-        Naming file, row and value.
+        Naming file, line and value.
     """
     sizes = class_sizes(scenario.traffic)
     boxes = []
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = csv.DictReader(file, skipinitialspace=True)
-            for column in VEHICLE_COLUMNS:
-                if column not in (rows.fieldnames or ()):
-                    hint = f"The header needs the columns {', '.join(VEHICLE_COLUMNS)}, separated by commas."
-                    raise InputError(path, f"the file has no column {column}", hint)
-            for number, row in enumerate(rows, start=1):
-                where = f"{path}: row {number}"
-                kind = (row["type"] or "").strip()
-                if kind not in sizes:
-                    problem = f"expected one of {', '.join(sizes)}, got {kind!r}"
-                    raise InputError(f"{where}: type", problem)
-                x_m, y_m, yaw_deg = (_parse(row[name], f"{where}: {name}") for name in VEHICLE_COLUMNS[:3])
-                size = sizes[kind]
-                extent = {"length_m": size.length_m, "width_m": size.width_m, "height_m": size.height_m}
-                boxes.append(WhatIfBox(x_m=x_m, y_m=y_m, yaw_deg=yaw_deg, kind=PARKED, **extent))
-    except (UnicodeDecodeError, csv.Error) as error:
-        hint = "Save it as UTF-8 text with a header row."
-        raise InputError(path, f"the file cannot be read as CSV ({error})", hint) from None
+    for where, row in csv_tables.read_rows(path, partial(_check_vehicle_columns, path)):
+        kind = row["type"]
+        if kind not in sizes:
+            problem = f"expected one of {', '.join(sizes)}, got {kind!r}"
+            raise InputError(f"{where}: type", problem, "Use one of these, or add the kind to traffic.kinds.")
+        x_m, y_m, yaw_deg = (_parse(row[name], f"{where}: {name}") for name in VEHICLE_COLUMNS[:3])
+        size = sizes[kind]
+        extent = {"length_m": size.length_m, "width_m": size.width_m, "height_m": size.height_m}
+        boxes.append(WhatIfBox(x_m=x_m, y_m=y_m, yaw_deg=yaw_deg, kind=PARKED, **extent))
     if not boxes:
         raise InputError(path, "expected at least one vehicle, got none", "Write one row per vehicle.")
     return boxes
 
 
-def _parse(text: str | None, where: str) -> float:
+def _check_vehicle_columns(path: Path, header: list[str]) -> list[str]:
+    for column in VEHICLE_COLUMNS:
+        if column not in header:
+            raise InputError(path, f"the file has no column {column}", f"Columns: {', '.join(VEHICLE_COLUMNS)}.")
+    return header
+
+
+def _parse(text: str, where: str) -> float:
     try:
-        value = parse_decimal(text or "")
+        value = parse_decimal(text)
     except ValueError:
         value = math.nan
     if not abs(value) <= MAX_COORDINATE_M:

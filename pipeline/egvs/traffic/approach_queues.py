@@ -3,7 +3,7 @@ r"""Queues and speeds on the approaches of a junction: simulated against observe
 Steps of :func:`measure_approach`: take the vehicles on the path that leads to the stop line; sort those of each frame
 that stand by their distance from it; follow the queue from the stop line backwards.
 
-**Queue.** In one frame, standing vehicles (below :data:`STANDING_M_S`) belong to the queue if the gap to the vehicle
+**Queue.** In one frame, standing vehicles (below :data:`QUEUE_SPEED_M_S`) belong to the queue if the gap to the vehicle
 ahead, or of the first one to the stop line, is at most :data:`MAX_GAP_M`. Its length is the distance from the stop
 line to the rear of the last one, over all lanes of the approach; 0 without a queue. The number that is compared is the
 95th percentile over the frames, which is what a queue observed at a junction usually means (Highway Capacity Manual:
@@ -26,12 +26,12 @@ from numpy.typing import NDArray
 from egvs.traffic.approaches import ApproachMovement
 from egvs.traffic.network import LANE_WIDTH_M, Edge, Network
 
-STANDING_M_S = 5.0 / 3.6
+QUEUE_SPEED_M_S = 5.0 / 3.6
 MAX_GAP_M = 20.0
 SPEED_OVER_M = 100.0
 PERCENTILE = 95.0
 
-_LENGTH_M = 400.0
+MAX_QUEUE_M = 400.0
 """How far from the stop line queues are followed."""
 _SIGNAL_TYPES = frozenset({"traffic_light", "traffic_light_unregulated", "traffic_light_right_on_red"})
 _MIN_COSINE = 0.7
@@ -145,7 +145,7 @@ def _make_path(title: str, edges: list[Edge], before: Mapping[str, Edge], signal
     length_m = sum(_length_m(part) for part in parts)
     known = {edge.id for edge in edges}
     first = edges[0]
-    while length_m < _LENGTH_M and first.from_node not in signals and first.id in before:
+    while length_m < MAX_QUEUE_M and first.from_node not in signals and first.id in before:
         first = before[first.id]
         if first.id in known:
             break
@@ -193,7 +193,7 @@ def measure_approach(path: ApproachPath, boxes: VehicleFrames, first: int, end: 
     line = shapely.LineString(path.line_m)
     points = shapely.points(boxes.at_m)
     distance_m = shapely.line_locate_point(line, points)
-    near = shapely.dwithin(line, points, path.half_width_m) & (distance_m > 0) & (distance_m < _LENGTH_M)
+    near = shapely.dwithin(line, points, path.half_width_m) & (distance_m > 0) & (distance_m < MAX_QUEUE_M)
     ahead_m = path_points(path.line_m, np.maximum(distance_m - 1.0, 0.0))
     there_m = path_points(path.line_m, distance_m)
     heading = ahead_m - there_m
@@ -206,7 +206,7 @@ def measure_approach(path: ApproachPath, boxes: VehicleFrames, first: int, end: 
     frame, distance_m, half_m = boxes.frame[near], distance_m[near], boxes.length_m[near] / 2
     close = (distance_m < SPEED_OVER_M) & ~np.isnan(speeds)
     mean_m_s = float(speeds[close].mean()) if close.any() else float("nan")
-    standing = speeds < STANDING_M_S
+    standing = speeds < QUEUE_SPEED_M_S
     queues_m = queue_lengths_m(frame[standing] - first, distance_m[standing], half_m[standing], end - first)
     return ApproachTraffic(
         float(np.percentile(queues_m, PERCENTILE)),

@@ -4,7 +4,7 @@ An **approach** is named by the side of the junction on which its vehicles arriv
 come *from* the north and head south (southbound, "SB"). Sides are the nearest of eight compass points, measured over
 the last 30 m before the junction.
 
-:class:`ApproachBook` finds the movements that a planner's words mean. Names of streets are compared without case
+:class:`ApproachIndex` finds the movements that a planner's words mean. Names of streets are compared without case
 and punctuation, and with common abbreviations written out (St, Rd, Ave, Str., Straße).
 """
 
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 from egvs.core.errors import InputError
 from egvs.scenario.traffic_config import CountConfig
-from egvs.traffic.directions import SIDES, Floats, arrival_side
+from egvs.traffic.directions import CLOCKWISE, SIDES, Floats, arrival_side
 from egvs.traffic.movements import MovementNames
 from egvs.traffic.network import Edge
 
@@ -124,13 +124,13 @@ def approach_title(side: str, street: str) -> str:
 
 
 @dataclass(frozen=True)
-class ApproachBook:
+class ApproachIndex:
     """The movements of a junction, found by the names of planners."""
 
     movements: tuple[ApproachMovement, ...]
 
     @classmethod
-    def of_flows(cls, flows: Iterable[CountConfig], names: MovementNames) -> ApproachBook:
+    def of_flows(cls, flows: Iterable[CountConfig], names: MovementNames) -> ApproachIndex:
         """Name the movements of flows from one edge to another.
 
         Parameters
@@ -142,9 +142,11 @@ class ApproachBook:
         """
         movements = []
         for flow in flows:
-            found = names.movement(flow.edge or flow.from_edge or "", flow.to_edge)
-            side = arrival_side(found.heading)
-            movements.append(ApproachMovement(flow, side, found.street, found.turn, found.approach, found.heading))
+            movement = names.movement(flow.edge or flow.from_edge or "", flow.to_edge)
+            side = arrival_side(movement.heading)
+            movements.append(
+                ApproachMovement(flow, side, movement.street, movement.turn, movement.approach, movement.heading)
+            )
         return cls(tuple(movements))
 
     def find(self, street: str, side: str | None, turns: Sequence[str], where: str) -> list[ApproachMovement]:
@@ -160,7 +162,7 @@ class ApproachBook:
         turns
             Turns; any if empty.
         where
-            File and row, for messages.
+            File and line, for messages.
 
         Raises
         ------
@@ -197,12 +199,8 @@ class ApproachBook:
     @property
     def titles(self) -> list[str]:
         """The approaches, in the order of the compass."""
-        sides = sorted(self.movements, key=lambda move: (_COMPASS_ORDER[move.side], move.street))
+        sides = sorted(self.movements, key=lambda move: (CLOCKWISE.index(SIDES.index(move.side)), move.street))
         return list(dict.fromkeys(move.approach_title for move in sides))
-
-
-_COMPASS_ORDER = {side: (2 - index) % 8 for index, side in enumerate(SIDES)}
-"""Clockwise from north."""
 
 
 def _side_distance(first: str, second: str) -> int:

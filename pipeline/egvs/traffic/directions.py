@@ -15,18 +15,27 @@ Floats = NDArray[np.float64]
 TURNS = {"s": "straight", "l": "left", "L": "left", "r": "right", "R": "right", "t": "back", "T": "back"}
 """SUMO's directions of connections; a partial turn counts as a turn."""
 
-_COMPASS = ("east", "north-east", "north", "north-west", "west", "south-west", "south", "south-east")
+COMPASS = ("east", "north-east", "north", "north-west", "west", "south-west", "south", "south-east")
+"""Names of the compass points, counter-clockwise from east."""
 
 SIDES = ("E", "NE", "N", "NW", "W", "SW", "S", "SE")
-"""Letters of the compass points, counter-clockwise from east."""
+"""Letters of the compass points, in the order of :data:`COMPASS`."""
+
+CLOCKWISE = tuple((2 - index) % 8 for index in range(8))
+"""Index of the compass points in :data:`COMPASS`, clockwise from north."""
 
 _HEADING_OVER_M = 10.0
 """The direction of a road is that of its last metres, or of its first ones where it leaves the region."""
 
 
+def compass_index(along_m: Floats) -> int:
+    """Return the index in :data:`COMPASS` of the nearest compass point to a direction (2,), x east and y north."""
+    return round(float(np.arctan2(along_m[1], along_m[0])) / (np.pi / 4)) % 8
+
+
 def compass(along_m: Floats) -> str:
     """Return the nearest of eight compass points to a direction (2,), x east and y north."""
-    return _COMPASS[round(float(np.arctan2(along_m[1], along_m[0])) / (np.pi / 4)) % 8]
+    return COMPASS[compass_index(along_m)]
 
 
 def arrival_side(heading: Floats) -> str:
@@ -35,7 +44,7 @@ def arrival_side(heading: Floats) -> str:
     >>> arrival_side(np.array([0.0, 1.0]))  # northbound vehicles arrive from the south
     'S'
     """
-    return SIDES[round(float(np.arctan2(-heading[1], -heading[0])) / (np.pi / 4)) % 8]
+    return SIDES[compass_index(-heading)]
 
 
 def lane_heading(lane: Lane, *, at_end: bool) -> Floats:

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -28,6 +28,9 @@ from egvs.formats import xml
 from egvs.scenario.fields import parse_coordinate_m
 from egvs.traffic.signal_clock import SignalClock
 
+if TYPE_CHECKING:
+    from shapely import Polygon
+
 LANE_WIDTH_M, DEFAULT_SPEED_M_S = 3.2, 13.89
 """SUMO's defaults for lanes without a width or a speed limit."""
 
@@ -35,7 +38,7 @@ _TURNAROUNDS = ("t", "T")
 _SHAPE_WITH_HEIGHT = re.compile(rb"(?:^|\s)[^,\s]+,[^,\s]+,[^,\s]+(?:\s|$)")
 """A point with a third coordinate, which SUMO omits where it is 0."""
 
-_MAY_PASS = frozenset("GgsoO")
+MAY_PASS_LETTERS = frozenset("GgsoO")
 """States of a signal in which a vehicle may drive on, at once or after giving way."""
 
 CAR = "passenger"
@@ -107,6 +110,25 @@ class Lane(Shape):
     def is_sidewalk(self) -> bool:
         """Whether pedestrians may use it, and cars may not."""
         return self.permission.admits(_PEDESTRIAN) and not self.permission.admits(CAR)
+
+    def area(self, last_m: float | None = None, *, margin_m: float = 0.0) -> Polygon:
+        """Return the area of a lane with a centre line of at least two points, with flat ends.
+
+        Parameters
+        ----------
+        last_m
+            Length of the last part that is meant; None for the complete lane.
+        margin_m
+            Width that is added on both sides.
+        """
+        import shapely
+        import shapely.ops
+
+        line = shapely.LineString(self.shape_m[:, :2])
+        if last_m is not None and last_m < line.length:
+            line = shapely.ops.substring(line, line.length - last_m, line.length)
+        width_m = LANE_WIDTH_M if self.width_m is None else self.width_m
+        return shapely.buffer(line, width_m / 2.0 + margin_m, cap_style="flat")
 
 
 @dataclass(frozen=True)
@@ -406,11 +428,11 @@ def _longest_reds(phases: Sequence[_Phase]) -> dict[int, float]:
     """Return how long each connection of a signal program waits for green; those that never have green are left out."""
     longest_s = {}
     for position, states in enumerate(zip(*(phase.state for phase in phases), strict=False)):
-        if _MAY_PASS.isdisjoint(states):
+        if MAY_PASS_LETTERS.isdisjoint(states):
             continue
         red_s = longest_s[position] = 0.0
         for state, phase in zip(states * 2, [*phases, *phases], strict=True):  # two cycles contain every red phase
-            red_s = 0.0 if state in _MAY_PASS else red_s + phase.duration_s
+            red_s = 0.0 if state in MAY_PASS_LETTERS else red_s + phase.duration_s
             longest_s[position] = max(longest_s[position], red_s)
     return longest_s
 

@@ -7,17 +7,16 @@ last 100 m before the stop line), of which one may be empty; and ``period`` in a
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from egvs.core import limits
 from egvs.core.errors import InputError, find_misspelling
+from egvs.formats import csv_tables
 from egvs.scenario.model import Scenario
-from egvs.traffic.approaches import ApproachBook, parse_side
+from egvs.traffic.approaches import ApproachIndex, parse_side
 from egvs.traffic.movements import MovementNames
 from egvs.traffic.network import Network
 
@@ -37,11 +36,11 @@ class Observation:
     speed_kmh: float | None
 
 
-def approach_book(scenario: Scenario, network: Network) -> ApproachBook:
+def approach_index(scenario: Scenario, network: Network) -> ApproachIndex:
     """Return the names of the movements that a scenario counts, in all its periods."""
     x_m, y_m, _ = scenario.roi.center_m
     counts = {count.title: count for period in scenario.by_period().values() for count in period.traffic.counts}
-    return ApproachBook.of_flows(counts.values(), MovementNames(network, (x_m, y_m)))
+    return ApproachIndex.of_flows(counts.values(), MovementNames(network, (x_m, y_m)))
 
 
 def read_observed(scenario: Scenario, network: Network) -> tuple[Observation, ...]:
@@ -59,18 +58,23 @@ def read_observed(scenario: Scenario, network: Network) -> tuple[Observation, ..
         raise InputError(f"{scenario.file}: {KEY}", problem, "Add traffic.counts, e.g. with egvs new --counts.")
     path = scenario.find(scenario.traffic.observed, KEY)
     names = [name for name in periods if name]
-    return read_observations(path, approach_book(scenario, network), names)
+    return read_observations(path, approach_index(scenario, network), names)
 
 
-def read_observations(path: Path, book: ApproachBook, periods: Sequence[str]) -> tuple[Observation, ...]:
+def read_observations(path: Path, index: ApproachIndex, periods: Sequence[str]) -> tuple[Observation, ...]:
     """Read observations; ``periods`` are the names of the scenario's periods, empty without periods."""
-    try:
-        text = limits.read_bytes(path, limits.DOCUMENT).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(path, f"is not UTF-8 text (byte {error.start})", "Save it as CSV in UTF-8.") from None
-    table = csv.DictReader(io.StringIO(text, newline=""), strict=True)
-    header = [name.strip() for name in table.fieldnames or ()]
-    table.fieldnames = header
+    observations: dict[tuple[str, str], Observation] = {}
+    for where, values in csv_tables.read_rows(path, partial(_check_header, path)):
+        observation = _parse_row(where, values, index, periods)
+        if observations.setdefault((observation.approach, observation.period), observation) is not observation:
+            raise InputError(where, f"two rows for the approach {observation.approach}", "Remove one of the rows.")
+    if not observations:
+        raise InputError(path, "has no observations", "Add one row per approach below the header.")
+    return tuple(observations.values())
+
+
+def _check_header(path: Path, header: list[str]) -> list[str]:
+    """Return the names of the columns; InputError when one is unknown or missing."""
     for name in header:
         if name not in COLUMNS:
             meant = find_misspelling([name], COLUMNS)
@@ -79,34 +83,19 @@ def read_observations(path: Path, book: ApproachBook, periods: Sequence[str]) ->
     if not {"street", "approach"} & set(header) or not _LIMITS.keys() & set(header):
         problem = "expected approach or street, and queue_m or speed_kmh"
         raise InputError(f"{path}: header", problem, "Example: approach,queue_m,speed_kmh.")
-    observations: dict[tuple[str, str], Observation] = {}
-    try:
-        for row in table:
-            where = f"{path}: row {table.line_num}"
-            if None in row or None in row.values():
-                raise InputError(where, f"expected {len(header)} values", "Check the separators.")
-            observation = _parse_row(where, {name: value.strip() for name, value in row.items()}, book, periods)
-            if observations.setdefault((observation.approach, observation.period), observation) is not observation:
-                raise InputError(
-                    where, f"the approach {observation.approach} is there twice", "Remove one of the rows."
-                )
-    except csv.Error as error:
-        raise InputError(f"{path}: row {table.line_num}", f"is not CSV ({error})", "Check the quotes.") from None
-    if not observations:
-        raise InputError(path, "has no observations", "Add one row per approach below the header.")
-    return tuple(observations.values())
+    return header
 
 
-def _parse_row(where: str, values: Mapping[str, str], book: ApproachBook, periods: Sequence[str]) -> Observation:
+def _parse_row(where: str, values: Mapping[str, str], index: ApproachIndex, periods: Sequence[str]) -> Observation:
     side = None
     if values.get("approach"):
         side = parse_side(values["approach"])
         if side is None:
             problem = f"expected the side on which vehicles arrive, got {values['approach']!r}"
-            raise InputError(f"{where}: approach", problem, f"Use N, north or southbound. {book.hint}")
+            raise InputError(f"{where}: approach", problem, f"Use N, north or southbound. {index.hint}")
     if side is None and not values.get("street"):
-        raise InputError(where, "names no approach", book.hint)
-    title = book.find(values.get("street", ""), side, (), where)[0].approach_title
+        raise InputError(where, "names no approach", index.hint)
+    title = index.find(values.get("street", ""), side, (), where)[0].approach_title
     period = values.get("period", "")
     if (period or periods) and period not in periods:
         known = f"Periods: {', '.join(periods)}." if periods else "The scenario has no periods; remove the column."

@@ -9,6 +9,7 @@ from typing import Any
 from egvs.core.grid import Roi
 from egvs.scenario.model import Scenario
 from egvs.traffic import network
+from egvs.traffic.directions import CLOCKWISE, COMPASS
 from egvs.traffic.signal_plans import find_signal
 from egvs.traffic.signals import (
     CROSSING,
@@ -104,12 +105,9 @@ def _movement_rows(signal: Signal) -> Iterator[dict[str, Any]]:
         }
 
 
-_CLOCKWISE = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
-
-
 def _clockwise(link: Link) -> tuple[int, str]:
     side = link.approach.partition(" ")[0]
-    return (_CLOCKWISE.index(side) if side in _CLOCKWISE else len(_CLOCKWISE)), link.approach
+    return (CLOCKWISE.index(COMPASS.index(side)) if side in COMPASS else len(COMPASS)), link.approach
 
 
 def _intervals(letters: str, program: Program, accepted: frozenset[str]) -> list[list[float]]:

@@ -12,12 +12,11 @@ World frame, metres, seconds.
 
 from __future__ import annotations
 
-import csv
 import gzip
-import io
 import re
 from collections.abc import Iterator, Sequence, Set
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,16 +25,13 @@ from pydantic import ValidationError
 
 from egvs.core import files
 from egvs.core.errors import InputError
-from egvs.formats import xml
+from egvs.formats import csv_tables, xml
 from egvs.scenario.model import Scenario
 from egvs.scenario.signal_config import SignalConfig, SignalPhaseConfig
 from egvs.traffic import network
 from egvs.traffic.approaches import TURN_WORDS, normalise_street, parse_side
 from egvs.traffic.directions import Floats
-from egvs.traffic.signals import CROSSING, GREEN_LETTERS, Link, Phase, Program, Signal, read_signals, replace_programs
-
-_MAY_PASS = GREEN_LETTERS | frozenset("sOo")
-"""States in which a vehicle may drive on, at once or after giving way."""
+from egvs.traffic.signals import CROSSING, Link, Phase, Program, Signal, read_signals, replace_programs
 
 _ALL = "all"
 
@@ -44,10 +40,10 @@ _OPPOSITE_COSINE = -0.5
 
 _GZIP = b"\x1f\x8b"
 _MAX_NAMED = 20
-_MAX_CSV_BYTES = 1_000_000
 
 CSV_COLUMNS = ("phase", "approach", "movement", "green_s")
 CSV_OPTIONAL = ("yellow_s", "all_red_s", "min_green_s", "max_green_s")
+_CSV_HINT = f"Columns: {', '.join(CSV_COLUMNS)}; optional: {', '.join(CSV_OPTIONAL)}."
 
 
 def check_plans(scenario: Scenario, path: Path, roads: network.Network) -> None:
@@ -55,7 +51,7 @@ def check_plans(scenario: Scenario, path: Path, roads: network.Network) -> None:
     _programs(scenario, path, roads)
 
 
-def apply_plans(scenario: Scenario, path: Path, name: Path) -> None:
+def apply_plans(scenario: Scenario, path: Path, source: Path) -> None:
     """Replace the programs in a network by the plans of the scenario.
 
     Parameters
@@ -64,7 +60,7 @@ def apply_plans(scenario: Scenario, path: Path, name: Path) -> None:
         The plans, ``[traffic.signals]``.
     path
         A copy of its network, which is changed.
-    name
+    source
         The network, for messages.
 
     Raises
@@ -75,7 +71,7 @@ def apply_plans(scenario: Scenario, path: Path, name: Path) -> None:
     """
     if not scenario.traffic.signals:
         return
-    programs = _programs(scenario, path, network.read_net_xml(path, name))
+    programs = _programs(scenario, path, network.read_net_xml(path, source))
     with files.attach_filename(path):
         content = path.read_bytes()
         if content.startswith(_GZIP):
@@ -84,7 +80,7 @@ def apply_plans(scenario: Scenario, path: Path, name: Path) -> None:
             text = replace_programs(content.decode("utf-8"), programs)
         except ValueError as error:
             raise InputError(
-                name, f"signal programs cannot be replaced: {error}", "Convert it with netconvert."
+                source, f"signal programs cannot be replaced: {error}", "Convert it with netconvert."
             ) from None
         path.write_text(text, encoding="utf-8")
 
@@ -116,12 +112,12 @@ def find_signal(name: str, signals: Sequence[Signal], where: str) -> Signal:
         if name == signal.id or name in signal.nodes:
             return signal
     streets = {normalise_street(street) for street in re.split("[/&]", name)}
-    found = [signal for signal in signals if streets <= {normalise_street(street) for street in signal.streets}]
-    if len(found) == 1:
-        return found[0]
-    known = ", ".join(_describe_signal(signal) for signal in (found or signals)[:_MAX_NAMED]) or "none"
-    if found:
-        raise InputError(where, f"{len(found)} signals are at these streets: {known}", "Use an id.")
+    matches = [signal for signal in signals if streets <= {normalise_street(street) for street in signal.streets}]
+    if len(matches) == 1:
+        return matches[0]
+    known = ", ".join(_describe_signal(signal) for signal in (matches or signals)[:_MAX_NAMED]) or "none"
+    if matches:
+        raise InputError(where, f"{len(matches)} signals are at these streets: {known}", "Use an id.")
     raise InputError(where, "the network has no such signal", f"Its signals are: {known}.")
 
 
@@ -158,16 +154,16 @@ def _green_links(phase: SignalPhaseConfig, signal: Signal, where: str) -> set[in
     for approach, movements in phase.green.items():
         on_approach = _links_of_approach(approach, signal, where)
         for movement in movements:
-            wanted = " ".join(movement.split()).casefold()
-            wanted = TURN_WORDS.get(wanted, wanted)
-            found = [link for link in on_approach if wanted in (_ALL, link.movement)]
-            if wanted == _ALL:
-                found = [link for link in found if link.movement != CROSSING]
-            if not found:
+            requested = " ".join(movement.split()).casefold()
+            requested = TURN_WORDS.get(requested, requested)
+            selected = [link for link in on_approach if requested in (_ALL, link.movement)]
+            if requested == _ALL:
+                selected = [link for link in selected if link.movement != CROSSING]
+            if not selected:
                 known = ", ".join(dict.fromkeys(link.movement for link in on_approach))
                 problem = f"approach {approach!r} has no movement {movement!r}"
                 raise InputError(where, problem, f"Its movements are: {known}.")
-            green |= {link.index for link in found}
+            green |= {link.index for link in selected}
     vehicles = [link for link in signal.links if link.index in green and link.movement != CROSSING]
     for link in signal.links:
         if link.movement == CROSSING and all(_gives_way_to_people(each, link) for each in vehicles):
@@ -293,7 +289,7 @@ def _read_program(path: Path, config: SignalConfig, signal: Signal) -> Program:
         if len(phase.state) != signal.states:
             problem = f"expected a state of {signal.states} letters, got {len(phase.state)}"
             raise InputError(where, problem, f"The signal {signal.id} has {signal.states} links.")
-        never_green -= {index for index, letter in enumerate(phase.state) if letter in _MAY_PASS}
+        never_green -= {index for index, letter in enumerate(phase.state) if letter in network.MAY_PASS_LETTERS}
         with_right_of_way = {
             link.index for link in signal.links if phase.state[link.index] == "G" and link.movement != CROSSING
         }
@@ -310,37 +306,21 @@ def _read_program(path: Path, config: SignalConfig, signal: Signal) -> Program:
 
 def _read_csv(path: Path, config: SignalConfig) -> tuple[SignalPhaseConfig, ...]:
     """Read the phases of a plan, in the order in which they first occur."""
-    hint = f"Columns: {', '.join(CSV_COLUMNS)}; optional: {', '.join(CSV_OPTIONAL)}."
-    with files.open_input(path) as content:
-        raw = content.read(_MAX_CSV_BYTES + 1)
-    try:
-        rows = list(csv.DictReader(io.StringIO(raw.decode("utf-8-sig")), skipinitialspace=True, strict=True))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(path, f"cannot be read as CSV ({error})", hint) from None
-    if len(raw) > _MAX_CSV_BYTES:
-        raise InputError(path, f"expected a signal plan, got more than {_MAX_CSV_BYTES:,} bytes", hint)
-    if not rows:
-        raise InputError(path, "expected a phase in each row, got none", hint)
-    if missing := [name for name in CSV_COLUMNS if name not in rows[0]]:
-        raise InputError(path, f"the column {missing[0]!r} is missing", hint)
-    if unknown := [name for name in rows[0] if name not in (*CSV_COLUMNS, *CSV_OPTIONAL) and name is not None]:
-        raise InputError(path, f"unknown column {unknown[0]!r}", hint)
     phases: dict[str, dict[str, Any]] = {}
-    for line, row in enumerate(rows, start=2):
-        where = f"{path}: line {line}"
-        if None in row or None in row.values():
-            raise InputError(where, "the row has more or fewer values than the header has columns", hint)
-        values = phases.setdefault(row["phase"].strip(), {"green": {}})
-        movements = values["green"].setdefault(row["approach"].strip(), [])
+    for where, row in csv_tables.read_rows(path, partial(_check_header, path)):
+        values = phases.setdefault(row["phase"], {"green": {}})
+        movements = values["green"].setdefault(row["approach"], [])
         movements += row["movement"].split()
         for key in ("green_s", *CSV_OPTIONAL):
-            text = (row.get(key) or "").strip()
+            text = row.get(key, "")
             if not text:
                 continue
             number = _parse_seconds(text, f"{where}: {key}")
             if values.setdefault(key, number) != number:
                 problem = f"expected {values[key]:g} as before in phase {row['phase']!r}, got {number:g}"
                 raise InputError(f"{where}: {key}", problem, "Use one value for each phase.")
+    if not phases:
+        raise InputError(path, "expected a phase in each row, got none", _CSV_HINT)
     configs = []
     for name, values in phases.items():
         try:
@@ -349,13 +329,22 @@ def _read_csv(path: Path, config: SignalConfig) -> tuple[SignalPhaseConfig, ...]
             first = error.errors()[0]
             key = ".".join(map(str, first["loc"]))
             raise InputError(
-                f"{path}: phase {name!r}: {key}", first["msg"].removeprefix("Value error, "), hint
+                f"{path}: phase {name!r}: {key}", first["msg"].removeprefix("Value error, "), _CSV_HINT
             ) from None
         unused = sorted({"min_green_s", "max_green_s"} & values.keys())
         if unused and config.type == "fixed":
             problem = f"{', '.join(unused)} has no effect with a fixed plan"
             raise InputError(f"{path}: phase {name!r}", problem, 'Set type = "actuated".')
     return tuple(configs)
+
+
+def _check_header(path: Path, header: list[str]) -> list[str]:
+    """Return the names of the columns; InputError when one is unknown or missing."""
+    if missing := [name for name in CSV_COLUMNS if name not in header]:
+        raise InputError(path, f"the column {missing[0]!r} is missing", _CSV_HINT)
+    if unknown := [name for name in header if name not in (*CSV_COLUMNS, *CSV_OPTIONAL)]:
+        raise InputError(path, f"unknown column {unknown[0]!r}", _CSV_HINT)
+    return header
 
 
 def _parse_seconds(text: str, where: str) -> float:

@@ -51,9 +51,9 @@ MAX_RADIUS_M = 5000.0
 """A square of 10 km is the most that a public server should be asked for."""
 
 _MARGIN_M = 50.0
-_EARTH_M = 6_371_008.8
-_SERVER_TIME_S, _SERVER_MEMORY = 60, 268_435_456
-_CHUNK = 1 << 16
+_EARTH_RADIUS_M = 6_371_008.8
+_SERVER_TIME_S, _SERVER_MEMORY_BYTES = 60, 268_435_456
+_CHUNK_BYTES = 1 << 16
 _HEAD_BYTES = 4096
 _OTHER_SERVER = "Try again in a few minutes, or use another server with --overpass URL."
 
@@ -83,7 +83,7 @@ class DownloadedExtract:
     def note(self) -> str:
         """Where the map comes from, as a sentence."""
         state = f", as of {self.timestamp}" if self.timestamp else ""
-        origin = f"The map was downloaded from {self.server}{state}, and is kept in {self.path}"
+        origin = f"The map was downloaded from {self.server}{state}, and is cached in {self.path}"
         if self.is_cached:
             origin = (
                 f"The map was downloaded from {self.server} earlier{state}: {self.path}; delete it to get a new one"
@@ -161,7 +161,7 @@ def square_around(at: tuple[float, float], surroundings_m: float | None = None) 
         raise InputError("--surroundings", problem, "Download a larger extract yourself and give it with --osm.")
     solids_m = junctions.ROI_MAX_M / math.sqrt(2) + junctions.BEYOND_ROI_M + CATALOGUE[SENSOR].range_m
     half_m = junctions.MAX_FROM_POINT_M + max(streets_m, solids_m) + _MARGIN_M
-    north_deg = math.degrees(half_m / _EARTH_M)
+    north_deg = math.degrees(half_m / _EARTH_RADIUS_M)
     east_deg = north_deg / math.cos(math.radians(latitude_deg))
     if abs(longitude_deg) + east_deg > 180:
         hint = "Download an extract yourself and give it with --osm."
@@ -179,7 +179,7 @@ def make_query(square: Bounds) -> str:
     """
     box = f"({square.south_deg:.6f},{square.west_deg:.6f},{square.north_deg:.6f},{square.east_deg:.6f})"
     return (
-        f"[out:xml][timeout:{_SERVER_TIME_S}][maxsize:{_SERVER_MEMORY}];"
+        f"[out:xml][timeout:{_SERVER_TIME_S}][maxsize:{_SERVER_MEMORY_BYTES}];"
         f"(node{box};way{box};"
         f'relation["type"="restriction"]{box};'
         f'relation["type"="multipolygon"]["building"]{box};'
@@ -251,7 +251,7 @@ def _fetch(address: str, path: Path, where: str) -> None:
     end_s = time.monotonic() + DOWNLOAD_TIME.maximum
     size = 0
     with _open_connection(address, DOWNLOAD_TIME.maximum) as response, path.open("wb") as file:
-        while chunk := response.read1(_CHUNK):
+        while chunk := response.read1(_CHUNK_BYTES):
             size += len(chunk)
             DOWNLOAD.check_bytes(where, size, f"the answer is larger than {DOWNLOAD.maximum:,} MB")
             if time.monotonic() > end_s:
@@ -330,5 +330,5 @@ def _move_into_cache(answer: Path, cached: Path) -> None:
         with atomic_write(cached) as partial:
             shutil.copyfile(answer, partial)
     except OSError as error:
-        problem = f"the map cannot be kept ({error.strerror})"
+        problem = f"the map cannot be cached ({error.strerror})"
         raise InputError(cached, problem, "Set XDG_CACHE_HOME to a folder that you can write to.") from None

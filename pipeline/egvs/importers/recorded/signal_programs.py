@@ -38,6 +38,7 @@ from egvs.importers.plain_network import NETCONVERT_FLAGS, NETWORK_FILE
 from egvs.importers.recorded.signal_assignment import Approach, RecordedMotion, green_share, guess_lights, is_opposite
 from egvs.importers.recorded.signals import GREEN, RED, YELLOW, GroupOfEdges, RecordedSignals, SignalRecord
 from egvs.traffic import estimates, sumo
+from egvs.traffic.directions import compass
 from egvs.traffic.estimates import Estimate
 from egvs.traffic.signal_clock import SignalClock
 from egvs.traffic.signals import Phase, Program, replace_programs, request_bits
@@ -62,7 +63,7 @@ _GENERATED = re.compile(r"<!-- generated on .*?-->\n*", re.DOTALL)
 
 
 @dataclass(frozen=True)
-class SignalPlan:
+class RecordedSignalNetwork:
     """A network with recorded signals.
 
     Attributes
@@ -160,7 +161,7 @@ def apply_signals(
     where: str,
     motion: RecordedMotion | None = None,
     replay: Replay | None = None,
-) -> SignalPlan:
+) -> RecordedSignalNetwork:
     """Replace the signals of a junction by recorded ones.
 
     Parameters
@@ -228,7 +229,7 @@ def apply_signals(
     text = _write_program(network, junction.program, phases, clock)
     notes += _notes(junction, groups, used, cycle, lengths, clock)
     notes += _agreement_notes(junction, groups, used, motion)
-    return SignalPlan(text, tuple(notes), is_guessed, clock)
+    return RecordedSignalNetwork(text, tuple(notes), is_guessed, clock)
 
 
 def _guess_groups(
@@ -239,7 +240,7 @@ def _guess_groups(
     guesses = guess_lights(approaches, signals.records, motion)
     if not guesses:
         problem = "no file says which lanes each signal group governs, and recorded road users do not show it either"
-        names = ", ".join(f"{approach.edge} (from the {_side(approach)})" for approach in approaches)
+        names = ", ".join(f"{approach.edge} (from the {compass(-_direction(approach))})" for approach in approaches)
         hint = f"Add a CSV file with the columns {', '.join(GroupOfEdges.COLUMNS)}; the roads are {names}."
         raise InputError(where, problem, hint)
     roads: dict[tuple[str, str], list[str]] = {}
@@ -269,10 +270,9 @@ def _approaches(junction: _Junction) -> list[Approach]:
     return [Approach(edge, np.array(list(points_m)), directions_rad[edge]) for edge, points_m in ends_m.items()]
 
 
-def _side(approach: Approach) -> str:
-    """Return the side of the junction from which a road comes."""
-    sides = ("west", "southwest", "south", "southeast", "east", "northeast", "north", "northwest")
-    return sides[round(approach.direction_rad / (np.pi / 4.0)) % len(sides)]
+def _direction(approach: Approach) -> FloatArray:
+    """Return the unit vector in which vehicles of an approach drive, (2,)."""
+    return np.array([np.cos(approach.direction_rad), np.sin(approach.direction_rad)])
 
 
 def _direction_rad(points_m: FloatArray) -> float:

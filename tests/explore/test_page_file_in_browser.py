@@ -1,0 +1,60 @@
+"""The written page opens from disk without network, draws the scene, and shows the chosen layer."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.conftest import write_mini
+
+pytest.importorskip("viser", reason="the page needs viser: pip install 'egvs[explore]'")
+
+from egvs.explore.page_file import write_page_file
+from egvs.explore.settings import open_session
+from tests.explore.test_page_in_browser import CHROMIUM, GRAPHICS, READY_MS
+
+pytestmark = [
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: apt-get install chromium"),
+    pytest.mark.system,
+    pytest.mark.slow,
+]
+
+VISIBLE = """() => Object.entries(window.__viserSceneTree.getState())
+    .filter(([name, node]) => /^\\/layers\\/[a-z]+$/.test(name) && node.effectiveVisibility).map(([name]) => name)"""
+
+
+def test_opens_from_disk_without_network(tmp_path: Path) -> None:
+    from playwright.sync_api import sync_playwright
+
+    page = write_page_file(open_session(write_mini(tmp_path / "mini"), (), tmp_path / "run"), tmp_path / "page.html")
+    errors: list[str] = []
+    requests: list[str] = []
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=GRAPHICS)
+        context = browser.new_context(
+            viewport={"width": 800, "height": 500}, device_scale_factor=0.5, offline=True, color_scheme="dark"
+        )
+        tab: Any = context.new_page()
+        tab.set_default_timeout(READY_MS)
+        tab.on("pageerror", lambda error: errors.append(str(error)))
+        tab.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+        tab.on("request", lambda request: requests.append(request.url))
+        tab.goto(page.path.as_uri(), wait_until="commit")
+        tab.wait_for_function("window.__viserSceneTree?.getState()['/traffic/returns'] !== undefined")
+        tab.wait_for_function(f"({VISIBLE})().join() === '/layers/blindspots'")
+        assert tab.locator("#egvs").get_attribute("data-theme") == "dark"
+        tab.get_by_label("entropy seen").check()
+        tab.wait_for_function(f"({VISIBLE})().join() === '/layers/seen'")
+        tab.get_by_label("none").check()
+        tab.wait_for_function(f"({VISIBLE})().join() === ''")
+        tab.wait_for_timeout(500)
+        picture = np.asarray(Image.open(io.BytesIO(tab.locator("canvas").first.screenshot())).convert("RGB"))
+        browser.close()
+    assert len(np.unique(picture[:, :200].reshape(-1, 3), axis=0)) > 50  # beside the panel
+    assert errors == []
+    assert {url.split(":")[0] for url in requests} <= {"file", "blob", "data"}
