@@ -57,6 +57,8 @@ def dependencies(context: StageContext) -> StageDependencies:
     effects, _ = registry.active_traffic_effects(scenario)
     traffic = scenario.traffic.model_dump(mode="json")
     del traffic["observed"]  # it is compared with the traffic later
+    if all(period.traffic.is_finished for period in periods):
+        traffic.pop("signals", None)  # nothing is simulated
     for period in traffic["periods"]:
         del period["weight"]
     settings = {"seed": scenario.seed, "name": scenario.name, "traffic": traffic}

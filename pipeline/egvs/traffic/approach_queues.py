@@ -83,6 +83,14 @@ class VehicleFrames:
     length_m: Floats
     period_s: float
 
+    def between(self, first: int, end: int) -> VehicleFrames:
+        """Return the vehicles in some frames, ``end`` excluded."""
+        inside = (self.frame >= first) & (self.frame < end)
+        return VehicleFrames(
+            self.frame[inside], self.vehicle[inside], self.at_m[inside], self.yaw_rad[inside], self.length_m[inside],
+            self.period_s,
+        )  # fmt: skip
+
     def speeds_m_s(self) -> Floats:
         """Return the speed from each frame to the vehicle's next one, or from the former one at its end; shape (n,).
 
@@ -190,6 +198,7 @@ def measure_approach(path: ApproachPath, boxes: VehicleFrames, first: int, end: 
     """
     import shapely
 
+    boxes = boxes.between(first, end)  # vehicles of another period may have the same names
     line = shapely.LineString(path.line_m)
     points = shapely.points(boxes.at_m)
     distance_m = shapely.line_locate_point(line, points)
@@ -200,7 +209,6 @@ def measure_approach(path: ApproachPath, boxes: VehicleFrames, first: int, end: 
     scale = np.hypot(*heading.T)
     along = np.cos(boxes.yaw_rad) * heading[:, 0] + np.sin(boxes.yaw_rad) * heading[:, 1]
     near &= along > _MIN_COSINE * scale
-    near &= (boxes.frame >= first) & (boxes.frame < end)
 
     speeds = boxes.speeds_m_s()[near]
     frame, distance_m, half_m = boxes.frame[near], distance_m[near], boxes.length_m[near] / 2

@@ -17,6 +17,7 @@ import re
 from collections.abc import Iterator, Sequence, Set
 from dataclasses import replace
 from functools import partial
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -197,13 +198,11 @@ def _links_of_approach(approach: str, signal: Signal, where: str) -> list[Link]:
 
 
 def _check_conflicts(green: set[int], signal: Signal, where: str) -> None:
-    links = {link.index: link for link in signal.links}
-    for index in sorted(green):
-        for foe in sorted(links[index].foes & green):
-            a, b = links[index], links[foe]
-            if index < foe and not _may_be_green_together(a, b):
-                problem = f"{a.title} and {b.title} conflict, but both have green"
-                raise InputError(where, problem, "Give them green in different phases.")
+    links = [link for link in signal.links if link.index in green]
+    for a, b in combinations(links, 2):
+        if a.index != b.index and b.index in a.foes and not _may_be_green_together(a, b):
+            problem = f"{a.title} and {b.title} conflict, but both have green"
+            raise InputError(where, problem, "Give them green in different phases.")
 
 
 def _may_be_green_together(a: Link, b: Link) -> bool:
@@ -277,7 +276,14 @@ def _read_program(path: Path, config: SignalConfig, signal: Signal) -> Program:
     try:
         for element in xml.iter_elements(path, ""):
             if element.tag == "tlLogic":
-                programs[element.attrib["id"]] = Program.from_element(element)
+                name = element.attrib["id"]
+                if name in programs:
+                    problem = f"signal {name!r} has several programs"
+                    raise InputError(path, problem, "Leave the one that is to be simulated.")
+                if any("next" in phase.attrib for phase in element.iter("phase")):
+                    problem = f"signal {name!r}: phases in another order (the attribute next) are not supported"
+                    raise InputError(path, problem, "Write the phases in the order in which they are shown.")
+                programs[name] = Program.from_element(element)
     except (KeyError, ValueError) as error:
         raise InputError(path, f"invalid <tlLogic> ({error!r})", "See SUMO's documentation of tlLogic.") from None
     program = programs.get(signal.id)
@@ -286,25 +292,21 @@ def _read_program(path: Path, config: SignalConfig, signal: Signal) -> Program:
     if program is None or not program.phases:
         known = ", ".join(programs) or "none"
         raise InputError(path, f"no <tlLogic> with phases for signal {signal.id!r}", f"It has: {known}.")
-    by_index = {link.index: link for link in signal.links}
-    never_green = set(by_index)
+    never_green = {link.index for link in signal.links}
     for number, phase in enumerate(program.phases, start=1):
         where = f"{path}: phase {number}"
         if len(phase.state) != signal.states:
             problem = f"expected a state of {signal.states} letters, got {len(phase.state)}"
             raise InputError(where, problem, f"The signal {signal.id} has {signal.states} links.")
         never_green -= {index for index, letter in enumerate(phase.state) if letter in network.MAY_PASS_LETTERS}
-        with_right_of_way = {
-            link.index for link in signal.links if phase.state[link.index] == "G" and link.movement != CROSSING
-        }
-        for index in sorted(with_right_of_way):
-            for foe in sorted(by_index[index].foes & with_right_of_way):
-                problem = (
-                    f"{by_index[index].title} and {by_index[foe].title} conflict, but both have green with right of"
-                    " way (G)"
-                )
+        with_right_of_way = [
+            link for link in signal.links if phase.state[link.index] == "G" and link.movement != CROSSING
+        ]
+        for a, b in combinations(with_right_of_way, 2):
+            if a.index != b.index and b.index in a.foes:
+                problem = f"{a.title} and {b.title} conflict, but both have green with right of way (G)"
                 raise InputError(where, problem, "Use g for the one that gives way, or another phase.")
-    _check_never_green(set(by_index) - never_green, signal, str(path))
+    _check_never_green({link.index for link in signal.links} - never_green, signal, str(path))
     return replace(program, offset_s=program.offset_s + config.offset_s)
 
 

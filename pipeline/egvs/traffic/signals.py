@@ -22,6 +22,7 @@ from egvs.formats import xml
 from egvs.traffic import network
 from egvs.traffic.directions import TURNS, Floats, compass, lane_heading
 from egvs.traffic.movements import plain_text
+from egvs.traffic.signal_clock import PARAM as CLOCK_PARAM
 from egvs.traffic.signal_clock import SignalClock
 
 GREEN_LETTERS = frozenset("Gg")
@@ -91,12 +92,15 @@ class Program:
         In order.
     clock
         Clock of a recording that the program replays, if it does.
+    params
+        Further parameters of SUMO, such as ``max-gap``.
     """
 
     type: str
     offset_s: float
     phases: tuple[Phase, ...]
     clock: SignalClock | None = None
+    params: tuple[tuple[str, str], ...] = ()
 
     @classmethod
     def from_element(cls, element: Any) -> Program:
@@ -105,8 +109,13 @@ class Program:
         for phase in element.iter("phase"):
             limits = [float(phase.attrib[key]) if key in phase.attrib else None for key in ("minDur", "maxDur")]
             phases.append(Phase(float(phase.attrib["duration"]), phase.attrib["state"], *limits))
+        params = tuple(
+            (param.attrib["key"], param.attrib["value"])
+            for param in element.iterfind("param")
+            if param.get("key") != CLOCK_PARAM
+        )
         clock = SignalClock.from_program(element)
-        return cls(element.get("type", "static"), float(element.get("offset", "0")), tuple(phases), clock)
+        return cls(element.get("type", "static"), float(element.get("offset", "0")), tuple(phases), clock, params)
 
     @property
     def cycle_s(self) -> float:
@@ -118,15 +127,22 @@ class Program:
         lines = []
         for phase in self.phases:
             limits = "".join(
-                f' {key}="{value:g}"'
+                f' {key}="{_number(value)}"'
                 for key, value in (("minDur", phase.min_s), ("maxDur", phase.max_s))
                 if value is not None
             )
-            lines.append(f'        <phase duration="{phase.duration_s:g}" state="{phase.state}"{limits}/>\n')
+            lines.append(f'        <phase duration="{_number(phase.duration_s)}" state="{phase.state}"{limits}/>\n')
         if self.clock is not None:
             lines.append(f"        {self.clock.to_param()}\n")
-        head = f'    <tlLogic id={quoteattr(name)} type="{self.type}" programID="0" offset="{self.offset_s:g}">\n'
+        lines += [f"        <param key={quoteattr(key)} value={quoteattr(value)}/>\n" for key, value in self.params]
+        offset_s = _number(self.offset_s)
+        head = f'    <tlLogic id={quoteattr(name)} type="{self.type}" programID="0" offset="{offset_s}">\n'
         return f"{head}{''.join(lines)}    </tlLogic>\n"
+
+
+def _number(value: float) -> str:
+    """Return a number as text, to thousandths."""
+    return f"{round(value, 3):.12g}"
 
 
 @dataclass(frozen=True)
