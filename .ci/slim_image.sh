@@ -9,4 +9,4 @@ rm -rf sumo/lib64 sumo/include sumo/cmake  # for programs in C++
 rm -rf pyarrow/include pyarrow/src pyarrow/*flight* pyarrow/*s3*
 find numpy scipy pyarrow shapely -type d -name tests -prune -exec rm -rf {} +
 # What every command imports is compiled in advance, since the user of the container cannot write here.
-"$1"/bin/python -m compileall -q -j 1 egvs jinja2 numba numpy pyarrow pydantic rich typer traci || true
+"$1"/bin/python -m compileall -q -j 1 egvs jinja2 numba numpy pyarrow pydantic rich typer traci
