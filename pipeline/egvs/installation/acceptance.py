@@ -399,13 +399,13 @@ def _register(
     if search is not None:
         best = search.best
         comparison = scan_comparison.compare_scans(clouds, sensor, best.pose, world, max_vehicle_height_m)
-        share = _structure(comparison)
+        share = _structure(comparison) if _is_plausible(best, start) else 0.0
     if share < _GOOD_STRUCTURE_SHARE:
         mirrored = [cloud * _MIRROR for cloud in clouds]
         if _mirror_share(mirrored, sensor, start, surfaces, world) > max(share, _GOOD_STRUCTURE_SHARE):
             problem = "the scan fits the static world as its mirror image only"
             raise InputError(where, problem, "Export y to the left of x: azimuths count counter-clockwise from above.")
-    if search is None or not _is_plausible(best, start) or share < MIN_STRUCTURE_SHARE:
+    if search is None or share < MIN_STRUCTURE_SHARE:
         raise InputError(where, problem, hint)
     equally_good = [other.registration for other in search.equally_good]
     return best, comparison, tuple(other.pose.yaw_deg for other in equally_good if _is_near(other, start))
