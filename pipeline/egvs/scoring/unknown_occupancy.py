@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from egvs.artefacts.frame_boxes import UNKNOWN_BOXES_KEY, FrameBoxes
@@ -96,6 +95,8 @@ class UnknownOccupancy:
 
 def _sweep(values: Mapping[str, Any], grid: Grid) -> SweptGap:
     """Find the voxels on the way through a gap."""
+    import shapely
+
     first, end = values["frames"]
     half_m = 0.5 * float(np.hypot(*values["size_m"]))
     low_m, size_m = np.array(grid.origin_m[:2]), np.array(grid.roi.size_m[:2])
