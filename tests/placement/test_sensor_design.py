@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -207,6 +208,12 @@ def test_wrong_requests_get_one_message(
     assert message in error
     assert "Traceback" not in error
     assert not (mini.parent / "sensors").exists()
+
+
+def test_several_seeds_are_rejected_because_one_simulation_is_split() -> None:
+    scenario: Any = SimpleNamespace(file="scenario.toml", traffic=SimpleNamespace(seeds=2))
+    with pytest.raises(InputError, match=r"scenario\.toml: traffic\.seeds = 2: one simulation is split .* Use 1 seed"):
+        design_sensor(scenario, DesignRequest("pole_a"))
 
 
 def test_record_without_vehicles_in_one_half_is_rejected(tmp_path: Path) -> None:

@@ -102,11 +102,18 @@ def write_scene(folder: Path, run: FinishedRun, reference: ExportCrs, *, is_usd:
 
 
 def posed_sensors(run: FinishedRun) -> list[PosedSensor]:
-    """Return the sensors of all sites of a run, in the order of its scores."""
+    """Return the sensors of all sites of a run, in the order of its scores; those of a plan at their poses in it."""
+    plan = run.plan
+    planned = {} if plan is None else {row["site"]: row for row in plan.rows}
     scores = parquet.read_artefact(run.artefact(RunFolder.scores.name), "scores")[0]
     angles = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
     return [
-        PosedSensor(row["site"], row["sensor"], Pose(*(float(row[name]) for name in angles)), int(row["rank"]))
+        PosedSensor(
+            row["site"],
+            row["sensor"],
+            Pose(*(float(planned.get(row["site"], row)[name]) for name in angles)),
+            int(row["rank"]),
+        )
         for row in scores.select(["site", "sensor", "rank", *angles]).to_pylist()
     ]
 

@@ -180,7 +180,7 @@ def design_sensor(
         When the request is wrong, or the second half of the record has no vehicle in the region.
     """
     plugins.require_libraries("egvs sensor design", "place", "cma")
-    _check_request(request)
+    _check_request(request, scenario)
     folder = Path(out) if out is not None else run.default_folder(scenario)
     names = _sensor_names(scenario, request)
     read_results(RunFolder(folder).sensor_design)
@@ -245,7 +245,10 @@ def _report_entry(result: DesignResult) -> dict[str, Any]:
     return {"frames": list(result.frames), "designs": rows, "notes": list(result.notes)}
 
 
-def _check_request(request: DesignRequest) -> None:
+def _check_request(request: DesignRequest, scenario: Scenario) -> None:
+    if scenario.traffic.seeds > 1:
+        problem = "one simulation is split into frames of the search and other frames"
+        raise InputError(f"{scenario.file}: traffic.seeds = {scenario.traffic.seeds}", problem, "Use 1 seed.")
     low, high = request.bounds_deg
     if not -90 <= low < high <= 90:
         problem = f"expected two ascending elevations from -90 to 90 degrees, got {low:g},{high:g}"
