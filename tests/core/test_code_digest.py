@@ -176,13 +176,13 @@ SOURCE_BEFORE = {
 """Code lines behind the key of each stage before the layout with one module per subject."""
 
 GROWTH = {
-    "check": 1.56,
-    "statics": 1.44,
-    "scan": 1.43,
-    "traffic": 1.81,
-    "tpog": 1.43,
-    "score": 1.4,
-    "report": 1.73,
+    "check": 1.58,
+    "statics": 1.46,
+    "scan": 1.45,
+    "traffic": 1.83,
+    "tpog": 1.45,
+    "score": 1.42,
+    "report": 1.75,
 }
 """Allowed growth, 1.1 for the others: a stage runs again whenever a line behind its key changes."""
 

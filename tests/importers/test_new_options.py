@@ -120,7 +120,8 @@ def test_distance_from_requested_position_is_printed(tmp_path: Path, capsys: pyt
     assert printed.count("warning:") == 1
 
     without = create_scenario(tmp_path / "without", SMALL)
-    assert without.from_at_m is None and "--at" not in print_new(without, capsys)
+    assert without.from_at_m is None
+    assert "the largest of the map; --at chooses another" in print_new(without, capsys)
 
 
 def junction_half_depth_m(summary: NewScenario) -> float:

@@ -180,7 +180,7 @@ def test_command_writes_a_sensor_that_a_scenario_can_use(tmp_path: Path, monkeyp
     used = egvs.load(path).sensors["mine"]
     sensor = resolve_sensor("mine", {"mine": used}, "")
     assert (sensor.elevations_deg, sensor.azimuths, sensor.range_m) == (tuple(table["elevations_deg"]), 72, 60.0)
-    assert "pole_a,10,12,3," in printed
+    assert "pole_a,10.000,12.000,3.000," in printed
 
 
 @pytest.mark.parametrize(
