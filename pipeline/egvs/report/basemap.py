@@ -124,8 +124,10 @@ def solid_group(kind: str, area_m2: float) -> str:
 def is_vegetation(kind: str) -> bool:
     """Whether a word of a kind of solid is a tree, a hedge or the like.
 
-    >>> [is_vegetation(kind) for kind in ("tree_crown", "Hedges", "street_lamp", "wooden_fence")]
-    [True, True, False, False]
+    >>> is_vegetation("tree_crown") and is_vegetation("Hedges")
+    True
+    >>> is_vegetation("street_lamp") or is_vegetation("wooden_fence")
+    False
     """
     return _GREEN.search(kind.lower()) is not None
 
