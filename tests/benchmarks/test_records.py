@@ -13,7 +13,7 @@ from benchmarks import history, records
 from benchmarks.records import Machine, Record, limit_results, parse_quantity, table_results
 
 suite = pytest.importorskip(
-    "benchmarks.__main__", reason="benchmarks measure with modules that only POSIX systems have"
+    "benchmarks.__main__", reason="benchmarks need modules that only POSIX systems have"
 )
 
 MACHINE = Machine(
