@@ -12,9 +12,7 @@ import pytest
 from benchmarks import history, records
 from benchmarks.records import Machine, Record, limit_results, parse_quantity, table_results
 
-suite = pytest.importorskip(
-    "benchmarks.__main__", reason="benchmarks need modules that only POSIX systems have"
-)
+suite = pytest.importorskip("benchmarks.__main__", reason="benchmarks need modules that only POSIX systems have")
 
 MACHINE = Machine(
     processor="Model 7", cores=2, memory_gb=8.0, system="Linux x86_64", python="3.11.7", libraries={"numpy": "2.4.6"}
