@@ -262,6 +262,7 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     ),
     "no host": (["--download", "--at", "52,10", "--overpass", "https://"], r"^--overpass: expected an address"),
     "a query": (["--download", "--at", "52,10", "--overpass", "http://h/?a=b"], r"^--overpass: expected an address"),
+    "a fragment": (["--download", "--at", "52,10", "--overpass", "http://h/#a"], r"^--overpass: expected an address"),
     "a port": (["--download", "--at", "52,10", "--overpass", "http://h:port/"], r"^--overpass: expected an address"),
 }
 

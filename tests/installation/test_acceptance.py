@@ -41,7 +41,7 @@ def accept_points(run: InstalledRun, *scans: FloatArray, limits: Limits | None =
     return accept(run.folder, "pole_a", paths, limits)
 
 
-def pole_beside(pose: Pose, azimuth_deg: float, distance_m: float, width_m: float) -> FloatArray:
+def pole_at_azimuth(pose: Pose, azimuth_deg: float, distance_m: float, width_m: float) -> FloatArray:
     """A pole from the ground to 8 m, in a direction of the upright sensor."""
     direction = math.radians(pose.yaw_deg + azimuth_deg)
     x_m, y_m = pose.x_m + distance_m * math.cos(direction), pose.y_m + distance_m * math.sin(direction)
@@ -63,7 +63,7 @@ def test_sensor_as_planned_is_accepted(installed: InstalledRun) -> None:
 
 @pytest.mark.parametrize("name", ["pitch_deg", "roll_deg"])
 def test_tilt_error_of_one_and_a_half_degrees_is_measured_within_a_tenth(installed: InstalledRun, name: str) -> None:
-    pole = pole_beside(installed.planned, 90.0, 0.8, 0.1)
+    pole = pole_at_azimuth(installed.planned, 90.0, 0.8, 0.1)
     result = accept_points(installed, installed.points([*TRAFFIC, pole], **{name: 1.5}))
     assert result.pose.tilt_deg == pytest.approx(1.5, abs=0.1)
     assert result.pose.values[name] == pytest.approx(1.5, abs=0.1)
@@ -88,7 +88,7 @@ def test_front_that_points_the_wrong_way_is_reported(installed: InstalledRun) ->
 
 
 def test_pole_in_front_of_the_sensor_blocks_the_sector_that_it_covers(installed: InstalledRun) -> None:
-    pole = pole_beside(installed.planned, 90.0, 1.0, 0.15)
+    pole = pole_at_azimuth(installed.planned, 90.0, 1.0, 0.15)
     (sector,) = accept_points(installed, installed.points([pole])).comparison.sectors
     half_deg = math.degrees(math.atan(0.075 * math.sqrt(2) / 0.95))  # at most, if it stands cornerwise
     assert 90.0 - half_deg - 1.0 <= sector.first_deg < 90.0 < sector.last_deg <= 90.0 + half_deg + 1.0
@@ -102,7 +102,7 @@ def test_score_with_obstacle_is_that_of_a_world_with_it(installed: InstalledRun)
     sites = installed.sites
     site, session = sites.site("pole_a"), sites.session
     sensor = sites.sensor(site)
-    pole = pole_beside(site.pose, 0.0, 1.0, 0.4)
+    pole = pole_at_azimuth(site.pose, 0.0, 1.0, 0.4)
     world = with_triangles(session.scene.world, pole)
     rows = Caster(world, session.scene.roi).scan(
         site.pose.position_m, sensor.directions(*site.pose.angles_deg), sensor.range_m

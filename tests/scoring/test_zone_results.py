@@ -88,7 +88,7 @@ def test_sensors_together_miss_what_both_miss(monkeypatch: pytest.MonkeyPatch) -
         def __init__(self, chance: float) -> None:
             self.points, self.chance = np.full(len(record), 12.0), chance
 
-    monkeypatch.setattr(zone_results, "found_chances", lambda seen: np.full(len(record), seen.chance))
+    monkeypatch.setattr(zone_results, "detection_probabilities", lambda seen: np.full(len(record), seen.chance))
     both = users.together([Seen(0.5), Seen(0.6)])  # type: ignore[list-item]
     assert both.share == pytest.approx([0.8] * 4)
     assert both.with_points.tolist() == [4, 2, 1, 1]
@@ -126,7 +126,7 @@ def test_table_equals_a_loop_over_frames(scored: tuple[egvs.Scenario, Path]) -> 
     expected = {}
     for scan in empty_scans(context):
         visible = targets.visible(scan.beams)
-        chances = zone_results.found_chances(visible)
+        chances = zone_results.detection_probabilities(visible)
         row = 0
         found = defaultdict(list)
         for recorded in traffic_frames.read_frames(out / "trajectories.parquet", np.arange(40)):
@@ -243,6 +243,20 @@ def test_zone_in_degrees_of_a_scenario_with_a_reference_system(mini: Path) -> No
     keys = ["score.zones='zones.geojson'", "crs.epsg=25832", "crs.offset_m=[-500000, -5600000]"]
     area = zones.reported_zones(loading.load(mini, keys))["x"]
     assert area.symmetric_difference(shapely.Polygon(corners)).area < 0.01
+
+
+def test_zones_that_reach_out_of_the_region_are_a_warning(mini: Path) -> None:
+    """Of 40 m, 30 are east of the region: three quarters."""
+    scenario = loading.load(mini, ["score.zones='zones.geojson'"])
+    (west_m, south_m), (east_m, _) = zones.region_bounds_m(scenario)
+    inside = square(west_m, south_m, west_m + 4.0, south_m + 4.0)
+    partly = square(east_m - 10.0, south_m, east_m + 30.0, south_m + 4.0)
+    path = mini / "zones.geojson"
+    path.write_text(collection(feature(inside, name="inside"), feature(partly, name="partly")))
+    (warning,) = zones.warn_partly_outside(scenario)
+    assert "75% of partly" in str(warning) and "of inside" not in str(warning)
+    path.write_text(collection(feature(inside, name="inside")))
+    assert not list(zones.warn_partly_outside(scenario))
 
 
 def test_degrees_declared_without_reference_system_are_refused(mini: Path) -> None:

@@ -64,6 +64,6 @@ def test_progress_of_parts_is_summed():
 
 
 @pytest.mark.parametrize("values", [[{"a": 1}, {"a": 1}], [{"a": 1}, {"a": 2}]])
-def test_unknown_keys_are_kept(values):
+def test_unknown_keys_remain(values):
     merged = merge_seed_summaries([summary(**value) for value in values], [1, 2])
     assert merged["a"] == (1 if values[0] == values[1] else [1, 2])

@@ -42,7 +42,7 @@ def read(tmp_path: Path, index: ApproachIndex, *lines: str, periods: tuple[str, 
     return observed.read_observations(tmp_path / "o.csv", index, periods)
 
 
-def test_approaches_are_found_as_in_counts(tmp_path: Path, index: ApproachIndex) -> None:
+def test_approaches_are_named_as_in_counts(tmp_path: Path, index: ApproachIndex) -> None:
     assert index.titles == APPROACHES
     lines = "street,approach,queue_m,speed_kmh", "North St,N,40,", ",westbound,,22", ",S,0,12.5"
     rows = read(tmp_path, index, *lines)

@@ -405,5 +405,7 @@ def print_design(result: DesignResult, file: Path | None) -> None:
 
 def _format_gain(design: Design) -> str:
     difference = design.difference
-    text = f"{100 * difference.value:+.1f} ± {100 * (difference.se or 0.0):.1f}"
+    text = f"{100 * difference.value:+.1f}"
+    if difference.se is not None:
+        text += f" ± {100 * difference.se:.1f}"
     return text if difference.is_clear or not difference.value else f"~ {text}"

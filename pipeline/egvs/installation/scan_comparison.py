@@ -42,7 +42,7 @@ PERSISTENT_SCANS, PERSISTENT_SHARE = 3, 0.8
 NEARER_M, NEARER_SHARE = 0.5, 0.05
 """A return is in front of the static world if it is nearer than expected by more than both."""
 _BLOCKED_M, _BLOCKED_SHARE = 1.0, 0.3
-"""An obstacle is nearer than expected by more than both: a wall that the map puts a little too far away is none."""
+"""An obstacle is nearer than expected by more than both. A wall that the map puts a little too far away is not."""
 _ON_BEAM_DEG = 1.0
 """A return is on no beam of the sensor if the nearest one is farther away."""
 _BIN_DEG = 1.0

@@ -217,8 +217,11 @@ def design_sensor(
         tuple(notes),
     )  # fmt: skip
     entry = {**_report_entry(result), DIGEST_KEY: design_digest(scenario)}
-    add_to_report(folder, RunFolder.sensor_design, {request.pole: entry}, STAGES)
-    return result
+    written = add_to_report(folder, RunFolder.sensor_design, {request.pole: entry}, STAGES)
+    if RunFolder(folder).report in written:
+        return result
+    note = "The report will show this once the run folder has current scores (egvs run)."
+    return replace(result, notes=(*result.notes, note))
 
 
 def _report_entry(result: DesignResult) -> dict[str, Any]:
@@ -481,7 +484,7 @@ class _Search:
 
 
 def _sites_at(sites: Sequence[Site], pole: str) -> tuple[Site, ...]:
-    """Return the candidates on a pole, which may also be named by one of them; InputError if there are none."""
+    """Return the candidates on a pole, which may also be named by one of them; InputError without any."""
     poles = {site.pole for site in sites if pole in (site.pole, site.name)}
     at_pole = tuple(site for site in sites if site.pole in poles and site.points is None)
     if not at_pole:

@@ -182,7 +182,7 @@ class Roads:
 
 
 def network_file(folder: Path) -> Path | None:
-    """Return the network in a run folder; None if there is none."""
+    """Return the network in a run folder, if it has one."""
     for name in (sumo_folder.NETWORK_FILE, f"{sumo_folder.NETWORK_FILE}.gz"):
         for path in sorted((folder / SUMO_FOLDER).rglob(name)):
             return path

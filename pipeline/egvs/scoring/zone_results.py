@@ -145,13 +145,13 @@ class ZoneUsers:
 
     def visibility(self, visible: VisibleTargets) -> SpotVisibility:
         """Return what one site sees in each zone of each class; ``visible`` is of the same record."""
-        return self.spots.visibility(visible.points, found_chances(visible))
+        return self.spots.visibility(visible.points, detection_probabilities(visible))
 
     def together(self, sensors: Sequence[VisibleTargets]) -> SpotVisibility:
         """Return what several sensors see together in each zone of each class."""
         missed, points = np.ones(len(self.record)), np.zeros(len(self.record))
         for visible in sensors:
-            missed = missed * (1.0 - found_chances(visible))
+            missed = missed * (1.0 - detection_probabilities(visible))
             points = points + visible.points
         return self.spots.visibility(points, 1.0 - missed)
 
@@ -179,7 +179,7 @@ class ZoneUsers:
         yield Diagnostic("zones", f"{SCENARIO_FILE}: {REPORTED_KEY}", problem, hint)
 
 
-def found_chances(visible: VisibleTargets) -> FloatArray:
+def detection_probabilities(visible: VisibleTargets) -> FloatArray:
     """Return the probability that each vehicle-frame is found, 0 to 1, (n,) float64."""
     return TARGET_SCORES[DEFAULT_SCORE](visible)
 

@@ -7,13 +7,13 @@ frame, metres.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from egvs.core.errors import InputError
+from egvs.core.errors import Diagnostic, InputError
 from egvs.formats.georeference import Georeference
-from egvs.scenario.model import Scenario
+from egvs.scenario.model import SCENARIO_FILE, Scenario
 from egvs.scenario.score_config import ZoneArea
 from egvs.sensors import site_files
 from egvs.world import footprints, geolocation
@@ -26,6 +26,8 @@ REPORTED_KEY = "score.zones"
 PLACEMENT_KEY = "placement.zones"
 
 _MIN_CORNERS = 3
+_MIN_OUTSIDE = 0.01
+"""Of the area of a zone."""
 
 
 def weight_zones(scenario: Scenario) -> dict[str, BaseGeometry]:
@@ -61,6 +63,25 @@ def reported_zones(scenario: Scenario) -> dict[str, BaseGeometry]:
             hint = f"Use corners within x {west_m:g} to {east_m:g} m and y {south_m:g} to {north_m:g} m."
             raise InputError(f"{path}: zone {name}", problem, hint)
     return areas
+
+
+def warn_partly_outside(scenario: Scenario) -> Iterator[Diagnostic]:
+    """Warn about zones of ``[score] zones`` that reach out of the region of interest, where nobody is counted."""
+    import shapely
+
+    (west_m, south_m), (east_m, north_m) = region_bounds_m(scenario)
+    region = shapely.box(west_m, south_m, east_m, north_m)
+    outside = {
+        name: 1.0 - area.intersection(region).area / area.area for name, area in reported_zones(scenario).items()
+    }
+    parts = [f"{share:.0%} of {name}" for name, share in outside.items() if share > _MIN_OUTSIDE]
+    if parts:
+        problem = (
+            f"these parts of zones are outside the region of interest, so nobody in them counts: {', '.join(parts)}"
+        )
+        yield Diagnostic(
+            "zones outside", f"{SCENARIO_FILE}: {REPORTED_KEY}", problem, "Draw them smaller, or enlarge roi."
+        )
 
 
 def region_bounds_m(scenario: Scenario) -> tuple[tuple[float, float], tuple[float, float]]:

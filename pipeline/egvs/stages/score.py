@@ -294,6 +294,7 @@ def _warnings(context: StageContext, scoring: SiteScoring, scores: ScoreTable) -
         yield from scoring.targets.warn_undefined_scores(scoring.tpog, scoring.periods)
     if scoring.zones is not None:
         yield from scoring.zones.warn_empty()
+        yield from zones.warn_partly_outside(scenario)
     for column in (ranking, *others):
         yield from score_table.warn_no_standard_error(column)
     if np.any(ranking.values > 0):

@@ -78,7 +78,7 @@ def parse_side(text: str) -> str | None:
 
 
 def parse_lane_group(text: str) -> tuple[str, tuple[str, ...]] | None:
-    """Return side and turns of a lane group as signal engineers write it; None if it is none.
+    """Return side and turns of a lane group as signal engineers write it; None for other words.
 
     >>> parse_lane_group("NBL"), parse_lane_group("EBTR")
     (('S', ('left',)), ('W', ('straight', 'right')))

@@ -16,6 +16,7 @@ import math
 import os
 import re
 import shutil
+import ssl
 import time
 import urllib.error
 import urllib.request
@@ -198,7 +199,7 @@ def _check_url(url: str | None) -> tuple[str, str]:
         return DEFAULT_URL, "--download"
     try:
         parts = urlsplit(url)
-        is_valid = parts.scheme in ("http", "https") and bool(parts.hostname) and not parts.query
+        is_valid = parts.scheme in ("http", "https") and bool(parts.hostname) and not (parts.query or parts.fragment)
         _ = parts.port
     except ValueError:
         is_valid = False
@@ -277,7 +278,7 @@ def _translate_failures(where: str) -> Iterator[None]:
         raise InputError(where, f"the server cannot be reached ({reason})", hint) from None
     except TimeoutError:
         raise _timeout_error(where) from None
-    except (http.client.HTTPException, ConnectionError) as error:
+    except (http.client.HTTPException, ConnectionError, ssl.SSLError) as error:
         problem = f"the connection broke before the answer was complete ({type(error).__name__})"
         raise InputError(where, problem, _OTHER_SERVER) from None
 
