@@ -266,7 +266,7 @@ def test_karlsruhe(tmp_path: Path, karlsruhe: Path) -> None:
     vehicles = sum(movement.vehicles for movement in new.demand.movements)
     assert 50 <= vehicles <= 58
     assert new.demand.fleet[0].has_default_size
-    assert any("the signals repeat a recorded cycle of 88.0 s" in note for note in new.notes)
+    assert any("The signals repeat a recorded cycle of 88.0 s" in note for note in new.notes)
     network = (tmp_path / "new" / "network.net.xml").read_text(encoding="utf-8")
     phases = [phase.attrib for phase in ElementTree.fromstring(network).iter("phase")]
     assert sum(float(phase["duration"]) for phase in phases) == pytest.approx(88.0)

@@ -511,7 +511,8 @@ def _notes(
         offsets_s = [(start_s - cycle.begin_s) % cycle.length_s for start_s in record.green_starts_s]
         text = f"{name}: no complete green"
         if green is not None:
-            text = f"{name}: {green.value:.1f} s ({green.low:.1f} to {green.high:.1f}, {green.n} greens)"
+            greens = f"{green.n} {'green' if green.n == 1 else 'greens'}"
+            text = f"{name}: {green.value:.1f} s ({green.low:.1f} to {green.high:.1f}, {greens})"
         in_cycle_s = [
             start_s - cycle.begin_s for start_s in record.green_starts_s if cycle.begin_s <= start_s < cycle.end_s
         ]
