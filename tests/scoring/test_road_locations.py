@@ -80,8 +80,8 @@ def test_a_road_round_in_circles_ends(tmp_path: Path) -> None:
         (("straight", "left"), "left-and-straight lane"),
         (("right", "straight"), "straight-and-right lane"),
         (("left", "right", "straight"), "lane for all directions"),
-        (("back",), "U-turn lane"),
-        (("back", "right"), "right-turn lane"),
+        (("U-turn",), "U-turn lane"),
+        (("U-turn", "right"), "right-turn lane"),
     ],
 )
 def test_lanes_in_words(turns: tuple[str, ...], words: str) -> None:
@@ -89,7 +89,7 @@ def test_lanes_in_words(turns: tuple[str, ...], words: str) -> None:
 
 
 def test_turns_in_words() -> None:
-    assert [describe_turn(turn) for turn in ("left", "straight", "back", "")] == [
+    assert [describe_turn(turn) for turn in ("left", "straight", "U-turn", "")] == [
         "left turn in the junction",
         "straight movement through the junction",
         "U-turn in the junction",

@@ -13,9 +13,10 @@ import pytest
 from egvs.core.errors import InputError
 from egvs.core.grid import Roi
 from egvs.scenario.loading import scenario_from_dict
+from egvs.scenario.signal_config import SignalPhaseConfig
 from egvs.scenario.traffic_config import TrafficConfig
 from egvs.stages import traffic
-from egvs.traffic import network, signal_descriptions, signal_plans, signals, sumo, sumo_folder
+from egvs.traffic import directions, network, signal_descriptions, signal_plans, signals, sumo, sumo_folder
 from tests.stage_runner import run_stage
 from tests.traffic.helpers import netgenerate
 
@@ -317,3 +318,16 @@ def test_check_reports_plans_before_the_simulation(crossing, tmp_path):
 def test_finished_traffic_has_no_plans(crossing):
     config = TrafficConfig.from_dict({"fcd": "a.csv", "signals": {"c": {"phases": [NS, EW]}}})
     assert [unused.keys for unused in config.unused_keys()] == [{"signals"}]
+
+
+@pytest.mark.parametrize("word", ["back", "U-turn", "u turn", "U"])
+def test_u_turn_has_one_printed_name(word):
+    """A link of SUMO's direction "t" is found by each spelling, and printed as U-turn."""
+    heading = np.array([0.0, -1.0])
+    link = signals.Link(0, "north", directions.TURNS["t"], "a", "", heading)
+    program = signals.Program("static", 0.0, (signals.Phase(20.0, "G"), signals.Phase(10.0, "r")))
+    signal = signals.Signal("c", ("c",), (0.0, 0.0), (link,), program)
+    phase = SignalPhaseConfig.from_dict({"green": {"north": [word]}, "green_s": 20})
+    assert signal_plans._green_links(phase, signal, "plan") == {0}
+    (plan,) = signal_descriptions.describe_signals([signal], Roi((-1.0, -1.0, 0.0), (2.0, 2.0, 1.0)), {}, "assumed")
+    assert [row["movements"] for row in plan["rows"]] == [["U-turn"]]

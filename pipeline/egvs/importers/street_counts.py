@@ -343,7 +343,7 @@ def _find_movements(
                 raise InputError(f"{where}: approach", problem, f"Use N, north or southbound. {index.hint}")
         if turn not in _ALL_TURNS:
             if turn not in TURN_WORDS:
-                problem = f"expected left, straight, right, u-turn or all, got {values['turn']!r}"
+                problem = f"expected left, straight, right, U-turn or all, got {values['turn']!r}"
                 raise InputError(f"{where}: turn", problem, "Leave it empty for all vehicles of the approach.")
             turns = (TURN_WORDS[turn],)
     movements = tuple(index.find(values.get("street", ""), side, turns, where))

@@ -1,7 +1,7 @@
 """A map of a junction with the names that counts use: streets, approaches, and the vehicles of each turn.
 
 Every approach has the letter of the side on which its vehicles arrive, at its road, and the counted vehicles per hour
-that turn left, drive straight on, turn right or turn back.
+that turn left, drive straight on, turn right or make a U-turn.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import CountConfig
 from egvs.traffic.approach_queues import approach_paths, path_points
 from egvs.traffic.approaches import ApproachIndex, ApproachMovement
-from egvs.traffic.directions import Floats
+from egvs.traffic.directions import U_TURN, Floats
 from egvs.traffic.movements import MovementNames
 from egvs.traffic.network import read_net_xml
 
-_TURN_LABELS = {"left": "left", "straight": "straight", "right": "right", "back": "U-turn", "": "all"}
+_TURN_LABELS = {"left": "left", "straight": "straight", "right": "right", U_TURN: U_TURN, "": "all"}
 _MARGIN_M = 25.0
 _LABEL_AT_M = 32.0
 """Distance of a label from the stop line."""

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.grid import Roi
-from egvs.traffic.directions import TURNS, compass, lane_heading
+from egvs.traffic.directions import TURNS, U_TURN, compass, lane_heading
 from egvs.traffic.network import LANE_WIDTH_M, Connection, Edge, Lane, Network
 from egvs.world.carriageway import is_carriageway
 
@@ -170,7 +170,7 @@ def describe_lane(turns: Iterable[str]) -> str:
     if len(ways) == 3:
         return "lane for all directions"
     if not ways:
-        return "U-turn lane" if "back" in turns else "lane"
+        return f"{U_TURN} lane" if U_TURN in turns else "lane"
     if len(ways) == 2:
         return f"{ways[0]}-and-{ways[1]} lane"
     return f"{ways[0]} lane" if ways[0] == "straight" else f"{ways[0]}-turn lane"
@@ -180,7 +180,7 @@ def describe_turn(turn: str) -> str:
     """Return the description of a turn in a junction."""
     if turn in ("", "straight"):
         return f"{turn} movement through the junction".lstrip()
-    return f"{'U-turn' if turn == 'back' else f'{turn} turn'} in the junction"
+    return f"{turn if turn == U_TURN else f'{turn} turn'} in the junction"
 
 
 class _RoadLocationBuilder:
@@ -225,7 +225,7 @@ class _RoadLocationBuilder:
         before: dict[int, set[int]] = defaultdict(set)
         for source, connections in self.leaving.items():
             for connection in connections:
-                if TURNS.get(connection.direction) != "back":
+                if TURNS.get(connection.direction) != U_TURN:
                     after[source].add(connection.target)
                     before[connection.target].add(source)
         for source, targets in after.items():

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 from egvs.core.errors import InputError
 from egvs.scenario.traffic_config import CountConfig
-from egvs.traffic.directions import CLOCKWISE, SIDES, Floats, arrival_side
+from egvs.traffic.directions import CLOCKWISE, SIDES, U_TURN, Floats, arrival_side
 from egvs.traffic.movements import MovementNames
 from egvs.traffic.network import Edge
 
@@ -26,7 +26,7 @@ TURN_WORDS = {
     "straight": "straight", "straight on": "straight", "through": "straight", "thru": "straight", "t": "straight",
     "s": "straight",
     "right": "right", "r": "right",
-    "u-turn": "back", "uturn": "back", "u turn": "back", "u": "back", "back": "back",
+    "u-turn": U_TURN, "uturn": U_TURN, "u turn": U_TURN, "u": U_TURN, "back": U_TURN,
 }  # fmt: skip
 """What planners write for the turns of :data:`egvs.traffic.directions.TURNS`."""
 
@@ -187,7 +187,7 @@ class ApproachIndex:
         missing = sorted(set(turns) - {move.turn for move in moves})
         if missing:
             known = ", ".join(sorted({move.turn for move in candidates if move.turn})) or "none"
-            problem = f"no vehicle can go {' or '.join(missing)} from {next(iter(approaches))}"
+            problem = f"the approach {next(iter(approaches))} has no movement {' or '.join(missing)}"
             raise InputError(where, problem, f"Its turns are: {known}.")
         return moves
 

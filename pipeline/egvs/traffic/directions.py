@@ -12,8 +12,10 @@ from egvs.traffic.network import Lane
 
 Floats = NDArray[np.float64]
 
-TURNS = {"s": "straight", "l": "left", "L": "left", "r": "right", "R": "right", "t": "back", "T": "back"}
-"""SUMO's directions of connections; a partial turn counts as a turn."""
+U_TURN = "U-turn"
+
+TURNS = {"s": "straight", "l": "left", "L": "left", "r": "right", "R": "right", "t": U_TURN, "T": U_TURN}
+"""SUMO's directions of connections in words, as they are printed; a partial turn counts as a turn."""
 
 COMPASS = ("east", "north-east", "north", "north-west", "west", "south-west", "south", "south-east")
 """Names of the compass points, counter-clockwise from east."""

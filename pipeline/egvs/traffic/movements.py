@@ -16,10 +16,10 @@ import numpy as np
 
 from egvs.core.errors import InputError
 from egvs.traffic.demand import RouteFinder
-from egvs.traffic.directions import TURNS, Floats, compass
+from egvs.traffic.directions import TURNS, U_TURN, Floats, compass
 from egvs.traffic.network import CAR, Edge, Network
 
-_WAYS = {"straight": "straight on", "left": "left", "right": "right", "back": "U-turn"}
+_WAYS = {"straight": "straight on", "left": "left", "right": "right", U_TURN: U_TURN}
 _UNNAMED_STREET = "an unnamed street"
 
 _HEADING_OVER_M = 30.0
@@ -197,5 +197,5 @@ def _turn_between(before: Floats, after: Floats) -> str:
     if abs(turned_deg) <= _STRAIGHT_DEG:
         return "straight"
     if abs(turned_deg) > _BACK_DEG:
-        return "back"
+        return U_TURN
     return "left" if turned_deg > 0 else "right"

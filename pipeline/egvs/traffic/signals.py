@@ -20,7 +20,7 @@ import numpy as np
 from egvs.core.errors import InputError
 from egvs.formats import xml
 from egvs.traffic import network
-from egvs.traffic.directions import TURNS, Floats, compass, lane_heading
+from egvs.traffic.directions import TURNS, U_TURN, Floats, compass, lane_heading
 from egvs.traffic.movements import plain_text
 from egvs.traffic.signal_clock import PARAM as CLOCK_PARAM
 from egvs.traffic.signal_clock import SignalClock
@@ -29,7 +29,7 @@ GREEN_LETTERS = frozenset("Gg")
 YELLOW_LETTERS = frozenset("yY")
 
 CROSSING = "crossing"
-MOVEMENTS = ("left", "straight", "right", "back", CROSSING)
+MOVEMENTS = ("left", "straight", "right", U_TURN, CROSSING)
 
 _PROGRAM = re.compile(r"    <tlLogic id=(\"[^\"]*\").*?</tlLogic>\n", re.DOTALL)
 
