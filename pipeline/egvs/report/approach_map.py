@@ -1,7 +1,7 @@
 """A map of a junction with the names that counts use: streets, approaches, and the vehicles of each turn.
 
-Every approach has the letter of the side on which its vehicles arrive, at its road, and the counted vehicles per hour
-that turn left, drive straight on, turn right or make a U-turn.
+Every approach has its name (street and side on which its vehicles arrive) at its road, and the counted vehicles per
+hour that turn left, drive straight on, turn right or make a U-turn.
 """
 
 from __future__ import annotations
@@ -35,18 +35,17 @@ _WIDTH = 420.0
 
 @dataclass(frozen=True)
 class ApproachLabel:
-    """An approach on the map: where it is (2,), side, street, and vehicles per hour by turn."""
+    """An approach on the map: where it is (2,), its name, and vehicles per hour by turn."""
 
     at_m: Floats
-    side: str
-    street: str
+    name: str
     per_hour: Mapping[str, float]
 
     @property
     def lines(self) -> tuple[str, ...]:
         """The text."""
         turns = [f"{_TURN_LABELS[turn]} {number:.0f}" for turn, number in self.per_hour.items() if number]
-        return f"{self.side} · {self.street or 'unnamed street'}", *turns
+        return self.name, *turns
 
 
 def busiest_counts(scenario: Scenario) -> tuple[str, tuple[CountConfig, ...]]:
@@ -70,7 +69,7 @@ def approach_labels(counts: Sequence[CountConfig], network: Path, center_m: tupl
         for movement in movements:
             per_hour[movement.turn] += movement.flow.per_hour
         at_m = path_points(paths[title].line_m, np.array([_LABEL_AT_M]))[0]
-        labels.append(ApproachLabel(at_m, movements[0].side, movements[0].street, per_hour))
+        labels.append(ApproachLabel(at_m, title, per_hour))
     return labels
 
 
