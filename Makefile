@@ -40,6 +40,7 @@ unit: $(VENV)/.installed-dev
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/codespell . .github/*
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
 

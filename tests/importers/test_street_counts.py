@@ -86,8 +86,8 @@ def test_approach_count_is_divided_by_the_assumed_shares(read: Read, crossing: t
     for (_, to_edge), per_hour in rates(counts).items():
         assert per_hour == pytest.approx(300 * assumed[to_edge] / sum(assumed.values()), abs=0.05)
     assert sum(rates(counts).values()) == pytest.approx(300, abs=0.2)
-    assert counts.assumptions == ["turns of the approaches S (North Street)"]
-    assert "divided by the assumed shares: S (North Street)" in counts.notes[0]
+    assert counts.assumptions == ["turns of the approaches North Street (south)"]
+    assert "divided by the assumed shares: North Street (south)" in counts.notes[0]
 
 
 def test_quarter_hours_become_vehicles_per_hour_of_each_hour(read: Read) -> None:
@@ -123,7 +123,7 @@ def test_hours_without_a_vehicle_are_left_out_with_a_note(read: Read) -> None:
 
 def test_movements_without_a_count_are_named(read: Read) -> None:
     lines = ["approach,turn,count", "N,,10", "S,,10", "E,,10", "W,left,10", "W,right,10"]
-    assert "Movements without a count get no vehicles: W (East Street) straight." in read(*lines).notes
+    assert "Movements without a count get no vehicles: East Street (west) straight." in read(*lines).notes
 
 
 # --- the scenario ----------------------------------------------------------------------------------------------------
@@ -139,7 +139,7 @@ def test_scenario_has_the_counts_as_periods(tmp_path: Path, run_egvs: Any, monke
     scenario = loading.load(tmp_path / "new")
     assert [period.name for period in scenario.traffic.periods] == ["07-08", "08-09"]
     assert scenario.traffic.periods[0].counts[0].per_hour == 40.0
-    assert "turns of the approaches S (North Street)" in scenario.assumed
+    assert "turns of the approaches North Street (south)" in scenario.assumed
     assert not [text for text in scenario.assumed if text.startswith("traffic")]
 
 
@@ -149,11 +149,13 @@ def test_counts_of_one_hour_are_no_period(tmp_path: Path, run_egvs: Any) -> None
     traffic = loading.load(tmp_path / "new").traffic
     assert (traffic.periods, [count.per_hour for count in traffic.counts]) == ((), [40.0])
     text = (tmp_path / "new" / "scenario.toml").read_text()
-    assert "southbound on North Street, left to East Street" in text
+    assert "North Street (north), left to East Street" in text
 
 
 # --- bad input -------------------------------------------------------------------------------------------------------
-NAMES = r"The approaches are: N \(North Street\), E \(East Street\), S \(North Street\), W \(East Street\)\."
+NAMES = (
+    r"The approaches are: North Street \(north\), East Street \(east\), North Street \(south\), East Street \(west\)\."
+)
 HEAD = "street,approach,turn,start,count"
 BAD: dict[str, tuple[list[str], str]] = {
     "empty": ([""], r"header: expected a column count"),
@@ -167,13 +169,13 @@ BAD: dict[str, tuple[list[str], str]] = {
     "unknown street": ([HEAD, "High St,,,,5"], rf"line 2: no approach of the junction is called 'High St'. {NAMES}"),
     "ambiguous street": (
         [HEAD, "North Street,,left,,5"],
-        rf"may be N \(North Street\) or S \(North Street\). Give street and approach. {NAMES}",
+        rf"may be North Street \(north\) or North Street \(south\). Give street and approach. {NAMES}",
     ),
-    "contradiction": ([HEAD, "North Street,W,left,,5"], rf"no approach .* is 'North Street from W'. {NAMES}"),
+    "contradiction": ([HEAD, "North Street,W,left,,5"], rf"no approach .* is 'North Street from the west'. {NAMES}"),
     "unknown side": ([HEAD, ",up,left,,5"], r"line 2: approach: expected the side on which vehicles arrive, got 'up'"),
-    "between two": ([HEAD, ",NE,left,,5"], r"'from NE' may be"),
-    "unknown turn": ([HEAD, ",N,sideways,,5"], r"line 2: turn: expected left, straight, right, u-turn or all"),
-    "no such turn": ([HEAD, ",N,u-turn,,5"], r"no vehicle can go back from N .*Its turns are: left, right"),
+    "between two": ([HEAD, ",NE,left,,5"], r"'from the north-east' may be"),
+    "unknown turn": ([HEAD, ",N,sideways,,5"], r"line 2: turn: expected left, straight, right, U-turn or all"),
+    "no such turn": ([HEAD, ",N,u-turn,,5"], r"North Street .* has no movement U-turn\. Its turns are: left, right"),
     "unknown group": (["lane_group,count", "XBL,5"], r"line 2: lane_group: expected a lane group such as NBL or EBTR"),
     "negative": ([HEAD, ",N,left,,-5"], r"line 2: count: expected a number of vehicles of 0 to 100,000, got '-5'"),
     "text": ([HEAD, ",N,left,,many"], r"count: expected a number of vehicles .* got 'many'"),

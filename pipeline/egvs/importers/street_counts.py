@@ -30,7 +30,7 @@ from egvs.formats import csv_tables
 from egvs.importers import junctions
 from egvs.importers.junctions import StreetJunction, Streets
 from egvs.scenario.traffic_config import CountConfig, TrafficConfig
-from egvs.traffic.approaches import TURN_WORDS, ApproachIndex, ApproachMovement, parse_lane_group, parse_side
+from egvs.traffic.approaches import TURN_WORDS, ApproachIndex, ApproachMovement, parse_lane_group
 from egvs.traffic.movements import MovementNames
 
 LOCATION_COLUMNS = ("street", "approach", "turn", "lane_group", "edge", "from_edge", "to_edge")
@@ -323,6 +323,7 @@ def _find_movements(
         raise InputError(where, "has no location", "Give street and approach, lane_group, or edge.")
     if "edge" in named or "from_edge" in named:
         return (_edge_movement(where, values, edges),), False
+    street = ""
     turns: tuple[str, ...] = ()
     turn = values.get("turn", "").casefold()
     if "lane_group" in named:
@@ -337,16 +338,13 @@ def _find_movements(
     else:
         side = None
         if values.get("approach"):
-            side = parse_side(values["approach"])
-            if side is None:
-                problem = f"expected the side on which vehicles arrive, got {values['approach']!r}"
-                raise InputError(f"{where}: approach", problem, f"Use N, north or southbound. {index.hint}")
+            street, side = index.parse_approach(values["approach"], where)
         if turn not in _ALL_TURNS:
             if turn not in TURN_WORDS:
-                problem = f"expected left, straight, right, u-turn or all, got {values['turn']!r}"
+                problem = f"expected left, straight, right, U-turn or all, got {values['turn']!r}"
                 raise InputError(f"{where}: turn", problem, "Leave it empty for all vehicles of the approach.")
             turns = (TURN_WORDS[turn],)
-    movements = tuple(index.find(values.get("street", ""), side, turns, where))
+    movements = tuple(index.find(values.get("street") or street, side, turns, where))
     return movements, len(movements) > 1
 
 

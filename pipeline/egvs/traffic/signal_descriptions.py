@@ -106,8 +106,7 @@ def _movement_rows(signal: Signal) -> Iterator[dict[str, Any]]:
 
 
 def _clockwise(link: Link) -> tuple[int, str]:
-    side = link.approach.partition(" ")[0]
-    return (CLOCKWISE.index(COMPASS.index(side)) if side in COMPASS else len(COMPASS)), link.approach
+    return (CLOCKWISE.index(COMPASS.index(link.side)) if link.side else len(COMPASS)), link.approach
 
 
 def _intervals(letters: str, program: Program, accepted: frozenset[str]) -> list[list[float]]:

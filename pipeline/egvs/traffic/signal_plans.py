@@ -30,11 +30,12 @@ from egvs.formats import csv_tables, xml
 from egvs.scenario.model import Scenario
 from egvs.scenario.signal_config import SignalConfig, SignalPhaseConfig
 from egvs.traffic import network
-from egvs.traffic.approaches import TURN_WORDS, normalise_street, parse_side
+from egvs.traffic.approaches import TURN_WORDS, approach_spellings, normalise_street, parse_side
 from egvs.traffic.directions import Floats
 from egvs.traffic.signals import CROSSING, Link, Phase, Program, Signal, read_signals, replace_programs
 
 _ALL = "all"
+_MOVEMENT_WORDS = {**TURN_WORDS, "crossing": CROSSING}
 
 _OPPOSITE_COSINE = -0.5
 """Approaches whose directions differ by more than 120 degrees are opposite."""
@@ -156,7 +157,7 @@ def _green_links(phase: SignalPhaseConfig, signal: Signal, where: str) -> set[in
         on_approach = _links_of_approach(approach, signal, where)
         for movement in movements:
             requested = " ".join(movement.split()).casefold()
-            requested = TURN_WORDS.get(requested, requested)
+            requested = _MOVEMENT_WORDS.get(requested, requested)
             selected = [link for link in on_approach if requested in (_ALL, link.movement)]
             if requested == _ALL:
                 selected = [link for link in selected if link.movement != CROSSING]
@@ -183,9 +184,10 @@ def _links_of_approach(approach: str, signal: Signal, where: str) -> list[Link]:
     street = normalise_street(approach)
     matches: list[str] = []
     for link in signal.links:
-        link_side, _, _ = link.approach.partition(" ")
         names = {normalise_street(link.approach), normalise_street(link.street), normalise_street(link.edge)} - {""}
-        is_meant = street in names or (side is not None and side == parse_side(link_side))
+        if link.side and link.street:
+            names |= approach_spellings(link.side, link.street)
+        is_meant = street in names or (side is not None and side == link.side)
         if is_meant and link.approach not in matches:
             matches.append(link.approach)
     known = "; ".join(f"{name} ({', '.join(movements)})" for name, movements in signal.approaches.items())
