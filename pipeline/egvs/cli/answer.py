@@ -119,8 +119,9 @@ def _print_ranking(
         out.print(location)
     if missed := summary.get("missed"):
         print_sentences([missed])
-    if in_zones := summary.get("zones"):
-        print_sentences([in_zones])
+    for key in ("zones", "zones_for_pedestrians"):
+        if in_zones := summary.get(key):
+            print_sentences([in_zones])
     if other_order := order_by_egvs(ranked, parquet.read_metadata(RunFolder(folder).scores, "scores")):
         print_sentences([other_order])
 
