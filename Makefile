@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: run test test-slow test-train test-lowest test-portable unit lint wheel project-files image image-test bench bench-history bench-peers scaling numerics validity detectability pictures schema reference docs fuzz clean
+.PHONY: run test test-slow test-train test-lowest test-portable unit lint wheel project-files image image-test bench bench-history bench-peers scaling numerics validity detectability pictures schema reference docs notebooks fuzz clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
@@ -109,6 +109,10 @@ detectability: $(VENV)/.installed-dev
 pictures: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.pictures
 
+# Executes docs/notebooks/*.ipynb and writes their outputs; NOTEBOOKS: names of some, or "--to FOLDER"
+notebooks: $(VENV)/.installed-notebooks
+	$(BIN)/python docs/mkdocs/execute_notebooks.py $(NOTEBOOKS)
+
 # FUZZ: options, as in FUZZ="--cases 10000 --seed 2"; what is bad lies in build/fuzz
 fuzz: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.fuzz $(FUZZ)
@@ -138,6 +142,10 @@ $(VENV)/.installed-train: $(VENV)/.installed-dev
 
 $(VENV)/.installed-docs: $(VENV)/.installed
 	$(INSTALL) --no-build-isolation --editable '.[docs]'
+	@touch $@
+
+$(VENV)/.installed-notebooks: $(VENV)/.installed
+	$(INSTALL) --no-build-isolation --editable '.[notebooks]'
 	@touch $@
 
 clean:
