@@ -4,7 +4,10 @@ VENV := .venv
 BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: run test test-slow test-train test-lowest test-portable unit lint wheel project-files image image-test bench bench-history bench-peers scaling numerics validity detectability pictures schema reference docs notebooks fuzz clean
+# Every test process would compile all modules again.
+unexport PYTHONDONTWRITEBYTECODE
+
+.PHONY: run test test-slow test-nightly test-train test-lowest test-portable unit lint wheel project-files image image-test bench bench-history bench-peers scaling numerics validity detectability pictures schema reference docs notebooks fuzz clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
@@ -14,7 +17,11 @@ test: $(VENV)/.installed-dev
 
 # Sweeps, whole studies, browsers, kills: what takes more than some tenths of a second each.
 test-slow: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -m slow --ignore=tests/validation/training
+	$(BIN)/python -m pytest -m "slow and not nightly" --ignore=tests/validation/training
+
+# Statistics over many simulations, which take minutes each.
+test-nightly: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -m nightly --ignore=tests/validation/training
 
 # PyTorch is large, and only those who train a detector need it.
 test-train: $(VENV)/.installed-train
@@ -29,7 +36,7 @@ test-lowest: $(VENV)/.installed
 		'.[place]' hypothesis mpmath pytest pytest-xdist
 	build/lowest/bin/python -m pytest -m unit -p no:cacheprovider -W ignore::DeprecationWarning tests/core tests/scenario tests/scoring tests/sensors tests/world
 
-# The unit tests without the modules and flags that only POSIX systems have.
+# Without the modules and flags that only POSIX systems have: the unit tests of what depends on the system.
 test-portable: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -m unit -p tests.without_posix --ignore=tests/validation/training
 
