@@ -85,6 +85,7 @@ from egvs.importers.terrain.ground_heights import HIGHEST_M, LOWEST_M
 from egvs.importers.terrain.relief import Relief, ground_surface
 from egvs.scenario.loading import load
 from egvs.scenario.model import SCENARIO_FILE
+from egvs.scenario.signal_config import ASSUMED_PLANS
 from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, CountConfig, TrafficConfig
 from egvs.sensors.sensor import CATALOGUE
 from egvs.traffic.movements import MovementNames
@@ -835,7 +836,7 @@ def _assumptions(scenario: NewScenario, *, is_recorded: bool) -> list[str]:
     if scenario.counted is not None:
         assumed += scenario.counted.assumptions
     if scenario.junction.signalised and not is_recorded:
-        assumed.append("signal plans")
+        assumed.append(ASSUMED_PLANS)
     if scenario.are_lights_guessed:
         assumed.append("which recorded light governs which road")
     return [*assumed, *assumed_sizes(scenario.statics), "positions of the poles"]
