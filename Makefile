@@ -51,8 +51,13 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
 
-docs: $(VENV)/.installed-docs
+docs: $(VENV)/.installed-docs build/view.html
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --config-file docs/mkdocs/mkdocs.yml
+
+# The 3D view that the first page of the documentation opens; remove it to make it again.
+build/view.html: $(VENV)/.installed
+	$(BIN)/egvs run scenarios/nishishinjuku --out build/view
+	$(BIN)/egvs explore build/view --to $@
 
 wheel: $(VENV)/.installed-dev
 	rm -rf build/wheel
