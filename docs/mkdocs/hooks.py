@@ -1,5 +1,5 @@
 """Add to the documentation site what comes from the program: the diagram of the packages, tables of public names
-and of study results, a reference page for each package, and formulas as MathML."""
+and of study results, a reference page for each package, the notebooks, and formulas as MathML."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from mkdocs.structure.pages import Page
 from mkdocs.utils import get_relative_url
 
 sys.path.insert(0, str(Path(__file__).parent))
+import notebooks
 import package_diagram
 import tables
 from formulas import mathml
@@ -37,7 +38,7 @@ def on_config(config: MkDocsConfig) -> None:
 
 
 def on_files(files: Files, config: MkDocsConfig) -> None:
-    """One page a package, with every module that says something."""
+    """One page a package, with every module that says something; one a notebook, with its figures."""
     for name in package_diagram.packages():
         folder = ROOT / "pipeline" / "egvs" / name
         modules = [
@@ -46,6 +47,10 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
         text = f"# {name}\n\n{_first_line(folder / '__init__.py')}\n"
         text += "".join(f"\n::: {module}\n" for module in modules if not module.endswith("__init__"))
         files.append(File.generated(config, f"api/{name}.md", content=text))
+    for page in notebooks.pages().values():
+        files.append(File.generated(config, f"notebooks/{page.name}.md", content=page.markdown))
+        for name, content in page.figures.items():
+            files.append(File.generated(config, f"notebooks/{name}", content=content))
     if _VIEW.is_file():
         files.append(File.generated(config, _VIEW.name, abs_src_path=str(_VIEW)))
 
@@ -61,7 +66,9 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
         shown = {name for what, name in _INSERT.findall(markdown) if what == "study table"}
         if missing := tables.study_files() - shown:
             raise ValueError(f"docs/validity-tables.md does not show {', '.join(sorted(missing))}")
-    return _INSERT.sub(lambda m: _MAKE[m[1]](m[2]), markdown)
+    if page.file.src_uri == "notebooks/index.md":
+        markdown = notebooks.gallery(markdown)
+    return notebooks.link_pages(_INSERT.sub(lambda m: _MAKE[m[1]](m[2]), markdown))
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:

@@ -67,7 +67,7 @@ class Installed:
 
     def install(self, requirement: str) -> None:
         """Install a wheel, with the versions of the constraints file."""
-        pip = [self.bin / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+        pip = [self.bin / "python", "-m", "pip", "install", "--quiet", "--no-compile", "--disable-pip-version-check"]
         subprocess.run([*pip, "--constraint", ROOT / "constraints.txt", requirement], check=True)
 
     def egvs(self, *arguments: object, code: int = 0) -> CompletedProcess[str]:
