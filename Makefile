@@ -7,7 +7,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 # Every test process would compile all modules again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run test test-slow test-nightly test-all test-train test-lowest test-portable unit lint wheel project-files image image-test bench bench-history bench-peers scaling numerics validity detectability pictures schema reference docs fuzz clean
+.PHONY: run test test-slow test-nightly test-train test-lowest test-portable unit lint wheel project-files image image-test bench bench-history bench-peers scaling numerics validity detectability pictures schema reference docs notebooks fuzz clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
@@ -22,10 +22,6 @@ test-slow: $(VENV)/.installed-dev
 # Statistics over many simulations, which take minutes each.
 test-nightly: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -m nightly --ignore=tests/validation/training
-
-# As test and test-slow, in one go: the tests are collected once.
-test-all: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -m "not nightly" --ignore=tests/validation/training
 
 # PyTorch is large, and only those who train a detector need it.
 test-train: $(VENV)/.installed-train
@@ -51,11 +47,17 @@ unit: $(VENV)/.installed-dev
 lint: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/codespell . .github/*
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
 
-docs: $(VENV)/.installed-docs
+docs: $(VENV)/.installed-docs build/view.html
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --config-file docs/mkdocs/mkdocs.yml
+
+# The 3D view that the first page of the documentation opens; remove it to make it again.
+build/view.html: $(VENV)/.installed
+	$(BIN)/egvs run scenarios/nishishinjuku --out build/view
+	$(BIN)/egvs explore build/view --to $@
 
 wheel: $(VENV)/.installed-dev
 	rm -rf build/wheel
@@ -119,6 +121,10 @@ detectability: $(VENV)/.installed-dev
 pictures: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.pictures
 
+# Executes docs/notebooks/*.ipynb and writes their outputs; NOTEBOOKS: names of some, or "--to FOLDER"
+notebooks: $(VENV)/.installed-notebooks
+	$(BIN)/python docs/mkdocs/execute_notebooks.py $(NOTEBOOKS)
+
 # FUZZ: options, as in FUZZ="--cases 10000 --seed 2"; what is bad lies in build/fuzz
 fuzz: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.fuzz $(FUZZ)
@@ -148,6 +154,10 @@ $(VENV)/.installed-train: $(VENV)/.installed-dev
 
 $(VENV)/.installed-docs: $(VENV)/.installed
 	$(INSTALL) --no-build-isolation --editable '.[docs]'
+	@touch $@
+
+$(VENV)/.installed-notebooks: $(VENV)/.installed
+	$(INSTALL) --no-build-isolation --editable '.[notebooks]'
 	@touch $@
 
 clean:

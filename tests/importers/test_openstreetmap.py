@@ -262,9 +262,9 @@ def test_each_count_has_its_movement_as_a_comment(made: Made) -> None:
     text = (made[0] / "scenario.toml").read_text(encoding="utf-8")
     comments = re.findall(r"^    \{from_edge = .*\}, # (.*)$", text, re.MULTILINE)
     assert len(comments) == len(set(comments)) == 12
-    assert "northbound on North Street, straight on" in comments
-    assert "northbound on North Street, left to East Street" in comments
-    assert "eastbound on East Street, right to North Street" in comments
+    assert "North Street (south), straight on" in comments
+    assert "North Street (south), left to East Street" in comments
+    assert "East Street (west), right to North Street" in comments
 
 
 def test_template_of_periods_can_be_used(made: Made, tmp_path: Path) -> None:

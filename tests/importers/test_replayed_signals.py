@@ -104,7 +104,7 @@ def test_keys_of_the_scenario(tmp_path: Path, run_egvs) -> None:
     code, _, err = run_egvs("new", tmp_path / "bad", "--from", tmp_path / "map.net.xml", *options, *signals)
     assert code == 2
     assert "recorded road users do not show it either" in err
-    assert "the roads are in (from the west)" in err
+    assert "the roads are in (west)" in err
     assert not (tmp_path / "bad").exists()
     signals += ["--signals", write_groups(tmp_path / "groups.csv")]
     code, out, _ = run_egvs("new", tmp_path / "new", "--from", tmp_path / "map.net.xml", *options, *signals)

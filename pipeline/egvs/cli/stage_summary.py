@@ -29,6 +29,7 @@ _OMITTED_KEYS = frozenset(
         "sumo_seconds",
         "sumo_peak_mb",
         "zones",
+        "zones_for_pedestrians",
         WARNINGS_KEY,
     )
 )

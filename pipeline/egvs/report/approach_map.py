@@ -1,7 +1,7 @@
 """A map of a junction with the names that counts use: streets, approaches, and the vehicles of each turn.
 
-Every approach has the letter of the side on which its vehicles arrive, at its road, and the counted vehicles per hour
-that turn left, drive straight on, turn right or turn back.
+Every approach has its name (street and side on which its vehicles arrive) at its road, and the counted vehicles per
+hour that turn left, drive straight on, turn right or make a U-turn.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import CountConfig
 from egvs.traffic.approach_queues import approach_paths, path_points
 from egvs.traffic.approaches import ApproachIndex, ApproachMovement
-from egvs.traffic.directions import Floats
+from egvs.traffic.directions import U_TURN, Floats
 from egvs.traffic.movements import MovementNames
 from egvs.traffic.network import read_net_xml
 
-_TURN_LABELS = {"left": "left", "straight": "straight", "right": "right", "back": "U-turn", "": "all"}
+_TURN_LABELS = {"left": "left", "straight": "straight", "right": "right", U_TURN: U_TURN, "": "all"}
 _MARGIN_M = 25.0
 _LABEL_AT_M = 32.0
 """Distance of a label from the stop line."""
@@ -35,18 +35,17 @@ _WIDTH = 420.0
 
 @dataclass(frozen=True)
 class ApproachLabel:
-    """An approach on the map: where it is (2,), side, street, and vehicles per hour by turn."""
+    """An approach on the map: where it is (2,), its name, and vehicles per hour by turn."""
 
     at_m: Floats
-    side: str
-    street: str
+    name: str
     per_hour: Mapping[str, float]
 
     @property
     def lines(self) -> tuple[str, ...]:
         """The text."""
         turns = [f"{_TURN_LABELS[turn]} {number:.0f}" for turn, number in self.per_hour.items() if number]
-        return f"{self.side} · {self.street or 'unnamed street'}", *turns
+        return self.name, *turns
 
 
 def busiest_counts(scenario: Scenario) -> tuple[str, tuple[CountConfig, ...]]:
@@ -70,7 +69,7 @@ def approach_labels(counts: Sequence[CountConfig], network: Path, center_m: tupl
         for movement in movements:
             per_hour[movement.turn] += movement.flow.per_hour
         at_m = path_points(paths[title].line_m, np.array([_LABEL_AT_M]))[0]
-        labels.append(ApproachLabel(at_m, movements[0].side, movements[0].street, per_hour))
+        labels.append(ApproachLabel(at_m, title, per_hour))
     return labels
 
 

@@ -38,8 +38,9 @@ from egvs.importers.plain_network import NETCONVERT_FLAGS, NETWORK_FILE
 from egvs.importers.recorded.signal_assignment import Approach, RecordedMotion, green_share, guess_lights, is_opposite
 from egvs.importers.recorded.signals import GREEN, RED, YELLOW, GroupOfEdges, RecordedSignals, SignalRecord
 from egvs.traffic import estimates, sumo
-from egvs.traffic.directions import compass
+from egvs.traffic.approach_names import ApproachNames
 from egvs.traffic.estimates import Estimate
+from egvs.traffic.network import read_net_xml
 from egvs.traffic.signal_clock import SignalClock
 from egvs.traffic.signals import Phase, Program, replace_programs, request_bits
 
@@ -129,11 +130,12 @@ class _Link:
 
 @dataclass
 class _Junction:
-    """The signal of a junction: program, links, and for each link those that it gives way to."""
+    """The signal of a junction: program, links, for each link those that it gives way to, and names of approaches."""
 
     program: str
     links: list[_Link] = field(default_factory=list)
     yields_to: dict[int, set[int]] = field(default_factory=dict)
+    titles: dict[str, str] = field(default_factory=dict)
 
     @property
     def connections(self) -> list[_Link]:
@@ -240,7 +242,7 @@ def _guess_groups(
     guesses = guess_lights(approaches, signals.records, motion)
     if not guesses:
         problem = "no file says which lanes each signal group governs, and recorded road users do not show it either"
-        names = ", ".join(f"{approach.edge} (from the {compass(-_direction(approach))})" for approach in approaches)
+        names = ", ".join(f"{approach.edge} ({junction.titles[approach.edge]})" for approach in approaches)
         hint = f"Add a CSV file with the columns {', '.join(GroupOfEdges.COLUMNS)}; the roads are {names}."
         raise InputError(where, problem, hint)
     roads: dict[tuple[str, str], list[str]] = {}
@@ -268,11 +270,6 @@ def _approaches(junction: _Junction) -> list[Approach]:
             if is_opposite(direction_rad, away_rad):
                 ends_m[edge][tuple(link.exit_m[0].tolist())] = None
     return [Approach(edge, np.array(list(points_m)), directions_rad[edge]) for edge, points_m in ends_m.items()]
-
-
-def _direction(approach: Approach) -> FloatArray:
-    """Return the unit vector in which vehicles of an approach drive, (2,)."""
-    return np.array([np.cos(approach.direction_rad), np.sin(approach.direction_rad)])
 
 
 def _direction_rad(points_m: FloatArray) -> float:
@@ -340,6 +337,8 @@ def _read_junction(path: Path, node: str) -> _Junction:
             ends_m = path_m[0][-2:], path_m[-1][:2]
             link = _Link(index, start, end, np.vstack(path_m), *ends_m, turns, crossed.get(end, frozenset()))
             junction.links.append(link)
+    names = ApproachNames(read_net_xml(path))
+    junction.titles = {link.from_edge: names.approach(link.from_edge) for link in junction.connections}
     governed = {lane.rsplit("_", 2)[0].removeprefix(":") for lane in link_of_lane}
     if governed == {node}:
         junction.yields_to = _yields_to(internal_lanes[node], requests[node], link_of_lane)
