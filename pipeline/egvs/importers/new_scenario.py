@@ -115,7 +115,7 @@ _SIGNALS_OF_TRACKS_NOTE = (
 _NO_SIGNALS_NOTE = "No junction in the map has signals; the one with the most incoming lanes was chosen."
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class NewScenario:
     """What :func:`create_scenario` made.
 
@@ -178,6 +178,16 @@ class NewScenario:
     counted: StreetCounts | None = None
     zones: tuple[Zone, ...] = ()
     are_lights_guessed: bool = False
+
+    def __repr__(self) -> str:
+        vehicles_per_hour = sum(flow.per_hour for flow in self.flows)
+        parts = (
+            f"{self.junction.title}, {self.junction.arms} arms",
+            f"{self.n_candidates} candidate sites on {self.poles} poles",
+            f"{self.n_solids} solids",
+            f"{vehicles_per_hour:,.0f} vehicles an hour",
+        )
+        return f"NewScenario({self.folder.name}: {'; '.join(parts)})"
 
     @property
     def maps_have_notes(self) -> bool:
@@ -283,8 +293,8 @@ class NewScenarioOptions:
 
 
 def create_scenario(
-    folder: Path,
-    maps: Path | Sequence[Path],
+    folder: str | Path,
+    maps: str | Path | Sequence[str | Path],
     at: tuple[float, float] | None = None,
     options: NewScenarioOptions | None = None,
 ) -> NewScenario:
@@ -316,8 +326,10 @@ def create_scenario(
     """
     options = options or NewScenarioOptions()
     options.check()
+    folder = Path(folder)
     name = scenario_files.check_new_folder(folder)
-    files = map_readers.open_maps([maps] if isinstance(maps, Path) else maps)
+    map_paths = [maps] if isinstance(maps, str | Path) else maps
+    files = map_readers.open_maps([Path(path) for path in map_paths])
     surface_files = map_readers.open_surface(options.surface)
     roads = _read_roads(files.roads, RoadOptions(options.lefthand, options.walk, has_terrain=bool(files.terrain)), at)
     recording, example, people = (

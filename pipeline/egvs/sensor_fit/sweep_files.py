@@ -71,7 +71,7 @@ class Sweep:
         return int(np.count_nonzero(np.isfinite(self.points_m[:, 0])))
 
 
-def read_sweeps(paths: Sequence[Path], options: RecordingOptions | None = None) -> list[Sweep]:
+def read_sweeps(paths: Sequence[str | Path], options: RecordingOptions | None = None) -> list[Sweep]:
     """Read all sweeps of some files, in their order.
 
     Parameters
@@ -90,7 +90,7 @@ def read_sweeps(paths: Sequence[Path], options: RecordingOptions | None = None) 
     """
     sweeps: list[Sweep] = []
     options = options or RecordingOptions()
-    for path in paths:
+    for path in map(Path, paths):
         if ros_bags.is_recording(path):
             sweeps += _recorded(*ros_bags.read(path, path.name, options))
             continue
