@@ -16,6 +16,7 @@ import pytest
 from importlinter.cli import lint_imports
 
 import egvs
+from tests import platform_tests
 from tests.conftest import write_mini
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -31,13 +32,7 @@ def tree(name: str) -> ast.Module:
 
 def imported_names(name: str) -> set[str]:
     """Return all imports of a module, also inside functions: ``a.b`` for ``import a.b`` and for ``from a import b``."""
-    names = set()
-    for node in ast.walk(tree(name)):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-    return names
+    return platform_tests.imported_names((PACKAGE / name).read_text(encoding="utf-8"))
 
 
 def run_python(code: str, folder: Path = ROOT, stdin: str = "") -> str:

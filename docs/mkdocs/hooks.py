@@ -22,6 +22,9 @@ from formulas import mathml
 
 ROOT = Path(__file__).resolve().parents[2]
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
+_VIEW = ROOT / "build" / "view.html"
+"""The 3D view of a run, which `make docs` writes. Without it, the first page links to docs/explore.md."""
+_LINK_WITHOUT_VIEW = "](explore.md#one-file-to-share)"
 _ELSEWHERE = "https://unpkg.com/iframe-worker/shim"
 _INSERT = re.compile(r"<!-- (names of|picture of|study conditions|study table) ([\w-]+) -->")
 
@@ -48,11 +51,17 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
         files.append(File.generated(config, f"notebooks/{page.name}.md", content=page.markdown))
         for name, content in page.figures.items():
             files.append(File.generated(config, f"notebooks/{name}", content=content))
+    if _VIEW.is_file():
+        files.append(File.generated(config, _VIEW.name, abs_src_path=str(_VIEW)))
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Put tables and pictures in place of ``<!-- names of egvs -->`` and the like."""
-    del config, files
+    del config
+    if page.file.src_uri == "index.md" and files.get_file_from_path(_VIEW.name):
+        if _LINK_WITHOUT_VIEW not in markdown:
+            raise ValueError(f"docs/index.md has no picture with the link {_LINK_WITHOUT_VIEW}")
+        markdown = markdown.replace(_LINK_WITHOUT_VIEW, f"]({_VIEW.name})")
     if page.file.src_uri == "validity-tables.md":
         shown = {name for what, name in _INSERT.findall(markdown) if what == "study table"}
         if missing := tables.study_files() - shown:

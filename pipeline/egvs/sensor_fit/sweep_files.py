@@ -26,7 +26,8 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.reading import COMPLETE_FILE
 from egvs.formats import point_clouds, ros_bags, velodyne_pcap
-from egvs.formats.recordings import RecordedSweep, Recording, RecordingOptions
+from egvs.formats.recording_options import RecordingOptions
+from egvs.formats.recordings import RecordedSweep, Recording
 
 MIN_RETURNS = 2000
 """Fewest returns of a sweep; sensors with rings have 30,000 or more."""
