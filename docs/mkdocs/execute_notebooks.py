@@ -1,8 +1,10 @@
 """Execute the notebooks of ``docs/notebooks`` in place: ``make notebooks``.
 
-Each notebook runs in a temporary copy of its folder, with an empty cache, as on the first day of a new user; nothing
-else is written in the checkout. Its outputs are then saved without what differs from run to run: times, ids, and the
-metadata of editors. A cell that raises, writes to standard error, or prints a path of this machine is an error.
+Each notebook runs in a temporary copy of its folder, with an empty cache of results; nothing else is written in the
+checkout. Compiled kernels are kept as always: the first notebook after a change of them takes a minute longer.
+
+Outputs are saved without what differs from run to run: times, ids, and the metadata of editors. A cell that raises,
+writes to standard error, or prints a path of this machine is an error.
 
     python docs/mkdocs/execute_notebooks.py               all notebooks
     python docs/mkdocs/execute_notebooks.py NAME...       some of them; names without .ipynb
@@ -127,7 +129,7 @@ def texts_of(output: nbformat.NotebookNode) -> Iterator[str]:
     """Yield the texts of an output: what is printed, and its representations that are not images."""
     if output.output_type == "stream":
         yield output.text
-    for kind, value in output.get("data", {}).items():
+    for kind, value in sorted(output.get("data", {}).items()):
         if kind.startswith("text/"):
             yield value
 

@@ -200,6 +200,17 @@ def run_tool(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.slow
 @pytest.mark.system
+def test_outputs_are_those_of_this_program() -> None:
+    """A notebook that runs again says the same; if the program changed on purpose, run make notebooks."""
+    name = "two-lidars"
+    executed = execution.execute(FOLDER / f"{name}.ipynb")
+    for cell, again in zip(read(name).cells, executed.cells, strict=True):
+        texts, new_texts = ([*map(list, map(execution.texts_of, c.get("outputs", ())))] for c in (cell, again))
+        assert new_texts == texts, cell.source
+
+
+@pytest.mark.slow
+@pytest.mark.system
 def test_tool_executes_in_place_and_leaves_no_files(tmp_path: Path) -> None:
     source = 'from pathlib import Path\nPath("made").mkdir()\nprint(sorted(p.name for p in Path().iterdir()))'
     cells = [nbformat.v4.new_markdown_cell("# Title"), nbformat.v4.new_code_cell(source)]
