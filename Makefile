@@ -78,10 +78,10 @@ project-files: wheel
 image:
 	docker build --tag egvs .
 
-# Not root, below 1.1 GB, and the demo works for a user that the image does not know.
+# Not root, below 1 GB, and the demo works for a user that the image does not know.
 image-test:
 	test "$$(docker run --rm --entrypoint id egvs -u)" != 0
-	test "$$(docker image inspect --format '{{.Size}}' egvs)" -lt 1100000000
+	test "$$(docker image inspect --format '{{.Size}}' egvs)" -lt 1000000000
 	mkdir -p build/image-test
 	docker run --rm --user "$$(id -u):$$(id -g)" --volume "$(CURDIR)/build/image-test:/work" egvs demo
 
