@@ -112,3 +112,23 @@ def test_command_prints_the_quoted_message(
     code, out, error = run_egvs(*(argument.format(mini=mini, tmp=tmp_path) for argument in command))
     assert code == 2
     assert quoted(beginning).search(out + error), out + error
+
+
+@pytest.mark.slow
+def test_run_prints_the_quoted_messages(mini: Path, tmp_path: Path, run_egvs: Any) -> None:
+    folder = tmp_path / "run"
+    code, out, error = run_egvs("run", mini, "--out", folder, "--set", "roi.center_m=[20,60,2.5]")
+    assert code == 0, error
+    assert quoted("no vehicle ever enters the region").search(out + error)
+
+    record = folder / "run.json"
+    record.write_text(record.read_text(encoding="utf-8").replace("gamma", "gamme"), encoding="utf-8")
+    code, _, error = run_egvs("verify", folder)
+    assert code == 2
+    assert quoted("was changed after the run").search(error)
+
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "scores.parquet").write_text("mine", encoding="utf-8")
+    code, _, error = run_egvs("run", mini, "--out", tmp_path / "notes")
+    assert code == 2
+    assert quoted("a run would overwrite").search(error)
