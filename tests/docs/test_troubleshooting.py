@@ -23,11 +23,17 @@ def quoted_messages() -> list[str]:
 
 
 def text_of(node: ast.AST) -> str | None:
-    """Return the text of a string or an f-string, with an ellipsis for each value; None for other nodes."""
+    """Return the text of a string or an f-string, with an ellipsis for each value; None for other nodes.
+
+    ``number_of(x, "frame")`` becomes "… frames".
+    """
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return node.value
     if isinstance(node, ast.JoinedStr):
         return "".join(text_of(part) or VARIABLE for part in node.values)
+    match node:
+        case ast.FormattedValue(value=ast.Call(func=ast.Name(id="number_of"), args=[_, ast.Constant(str(noun)), *_])):
+            return f"{VARIABLE} {noun}s"
     return None
 
 
@@ -74,6 +80,9 @@ def test_reads_variable_parts_of_messages() -> None:
     (statement,) = ast.parse('f"{a} of {b:,} vehicles" f" ({c!r}) wait"').body
     assert isinstance(statement, ast.Expr)
     assert text_of(statement.value) == "… of … vehicles (…) wait"
+    (statement,) = ast.parse("""f"in {number_of(n, 'frame')} of it\"""").body
+    assert isinstance(statement, ast.Expr)
+    assert text_of(statement.value) == "in … frames of it"
 
 
 def quoted(beginning: str) -> re.Pattern[str]:
