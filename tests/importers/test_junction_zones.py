@@ -27,10 +27,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, tuple[Zone, ..
 def test_crossroads_has_a_zone_of_each_kind_on_each_side(made: tuple[Path, tuple[Zone, ...]]) -> None:
     names = {zone.name for zone in made[1]}
     for side, street in (("north", "North"), ("east", "East"), ("south", "North"), ("west", "East")):
-        assert f"{side} crosswalk" in names
+        assert f"{street} Street ({side}) crosswalk" in names
         assert f"{side} sidewalk" in names
-        assert f"stop line from the {side}, {street} Street" in names
-        assert f"approach from the {side}, {street} Street" in names
+        assert f"{street} Street ({side}) stop line" in names
+        assert f"{street} Street ({side}) approach" in names
     assert "conflict area" in names
     assert len(names) == len(made[1])
 
@@ -39,12 +39,12 @@ def test_zones_lie_where_their_names_say(made: tuple[Path, tuple[Zone, ...]]) ->
     """One lane of 3.2 m leads in from each side, so a stop line has 32 m2."""
     area = {zone.name: zone.area for zone in made[1]}
     middle = area["conflict area"].centroid
-    assert area["north crosswalk"].centroid.y > middle.y + 3
-    assert area["west crosswalk"].centroid.x < middle.x - 3
-    stop = area["stop line from the west, East Street"]
+    assert area["North Street (north) crosswalk"].centroid.y > middle.y + 3
+    assert area["East Street (west) crosswalk"].centroid.x < middle.x - 3
+    stop = area["East Street (west) stop line"]
     assert stop.area == pytest.approx(32.0, abs=0.1)
-    assert stop.centroid.x < area["west crosswalk"].centroid.x  # vehicles wait before the crosswalk
-    assert stop.difference(area["approach from the west, East Street"].buffer(0.02)).is_empty
+    assert stop.centroid.x < area["East Street (west) crosswalk"].centroid.x  # vehicles wait before the crosswalk
+    assert stop.difference(area["East Street (west) approach"].buffer(0.02)).is_empty
     assert area["conflict area"].intersection(stop).area < 0.5
 
 

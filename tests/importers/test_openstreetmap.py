@@ -262,9 +262,9 @@ def test_each_count_has_its_movement_as_a_comment(made: Made) -> None:
     text = (made[0] / "scenario.toml").read_text(encoding="utf-8")
     comments = re.findall(r"^    \{from_edge = .*\}, # (.*)$", text, re.MULTILINE)
     assert len(comments) == len(set(comments)) == 12
-    assert "northbound on North Street, straight on" in comments
-    assert "northbound on North Street, left to East Street" in comments
-    assert "eastbound on East Street, right to North Street" in comments
+    assert "North Street (south), straight on" in comments
+    assert "North Street (south), left to East Street" in comments
+    assert "East Street (west), right to North Street" in comments
 
 
 def test_template_of_periods_can_be_used(made: Made, tmp_path: Path) -> None:
@@ -551,7 +551,7 @@ def test_flow_above_capacity_is_reduced_and_said(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(assumed_traffic, "find_capacity", lambda *_: Capacity(0.155, runs[:1]))
     notes = create_scenario(tmp_path / "jammed", SMALL).notes
     assert notes[-1] == (
-        "Traffic jams occur in all 1 trials; a vehicle stood for 300 s at junction 1, Main Street from 20 s on."
+        "Traffic jams occur in the trial; a vehicle stood for 300 s at junction 1, Main Street from 20 s on."
         " Lower per_hour of traffic.counts, or check the signals and connections there."
     )
 

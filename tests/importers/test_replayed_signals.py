@@ -104,7 +104,7 @@ def test_keys_of_the_scenario(tmp_path: Path, run_egvs) -> None:
     code, _, err = run_egvs("new", tmp_path / "bad", "--from", tmp_path / "map.net.xml", *options, *signals)
     assert code == 2
     assert "recorded road users do not show it either" in err
-    assert "the roads are in (from the west)" in err
+    assert "the roads are in (west)" in err
     assert not (tmp_path / "bad").exists()
     signals += ["--signals", write_groups(tmp_path / "groups.csv")]
     code, out, _ = run_egvs("new", tmp_path / "new", "--from", tmp_path / "map.net.xml", *options, *signals)
@@ -173,7 +173,7 @@ def test_crossings_are_green_while_vehicles_have_red(tmp_path: Path, replay: Rep
     records = {name: crossing_record(name) for name in ("a", "b")}
     signals = RecordedSignals(records, (), groups)
     plan = signal_programs.apply_signals(network, "A0", signals, None, "--signals", replay=replay)
-    assert "4 crossings have no recorded signal; they are green while the vehicles they cross have red." in plan.notes
+    assert "4 crossings without recorded signal: green while the crossed vehicles have red." in plan.notes
 
     root = ElementTree.fromstring(plan.network)
     crossed = {

@@ -115,12 +115,12 @@ def test_movements_have_the_directions_of_the_arms(streets: Streets) -> None:
     flows = junctions.assumed_flows(streets, junctions.region_around(junction), junction.ring)
     words = {names.describe(flow.from_edge or "", flow.to_edge) for flow in flows}
     assert words == {
-        "eastbound on A Street, straight on", "eastbound on A Street, left to B Street",
-        "eastbound on A Street, right to C Street", "westbound on A Street, straight on",
-        "westbound on A Street, right to B Street", "westbound on A Street, left to C Street",
-        "southbound on B Street, straight on to C Street", "southbound on B Street, left to A Street",
-        "southbound on B Street, right to A Street", "northbound on C Street, straight on to B Street",
-        "northbound on C Street, left to A Street", "northbound on C Street, right to A Street",
+        "A Street (west), straight on", "A Street (west), left to B Street",
+        "A Street (west), right to C Street", "A Street (east), straight on",
+        "A Street (east), right to B Street", "A Street (east), left to C Street",
+        "B Street (north), straight on to C Street", "B Street (north), left to A Street",
+        "B Street (north), right to A Street", "C Street (south), straight on to B Street",
+        "C Street (south), left to A Street", "C Street (south), right to A Street",
     }  # fmt: skip
 
 

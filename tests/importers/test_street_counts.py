@@ -86,8 +86,8 @@ def test_approach_count_is_divided_by_the_assumed_shares(read: Read, crossing: t
     for (_, to_edge), per_hour in rates(counts).items():
         assert per_hour == pytest.approx(300 * assumed[to_edge] / sum(assumed.values()), abs=0.05)
     assert sum(rates(counts).values()) == pytest.approx(300, abs=0.2)
-    assert counts.assumptions == ["turns of the approaches S (North Street)"]
-    assert "divided by the assumed shares: S (North Street)" in counts.notes[0]
+    assert counts.assumptions == ["turns of the approaches North Street (south)"]
+    assert "divided by the assumed shares: North Street (south)" in counts.notes[0]
 
 
 def test_quarter_hours_become_vehicles_per_hour_of_each_hour(read: Read) -> None:
@@ -97,7 +97,24 @@ def test_quarter_hours_become_vehicles_per_hour_of_each_hour(read: Read) -> None
         ("07-08", {(FROM_NORTH, TO_EAST): 75.0}),
         ("08-09", {(FROM_NORTH, TO_EAST): 32.0}),  # 16 in half an hour
     ]
-    assert "scaled up to an hour: 08-09 (30 min)" in str(counts.notes)
+    assert counts.notes[0] == (
+        "Counts of a part of the hour 08-09 are scaled up to an hour for 1 movement:"
+        " North Street (north) left (30 min)."
+    )
+    assert "hour 07-08" not in str(counts.notes)
+
+
+def test_note_on_scaled_counts_names_four_movements_and_how_many_more(read: Read) -> None:
+    """Six movements were counted for a quarter of an hour, and one for the complete hour."""
+    partial = ["N,left", "N,through", "N,right", "S,left", "S,through", "S,right"]
+    rows = [f"{move},07:00,5" for move in partial]
+    rows += [f"E,through,07:{minute:02d},10" for minute in (0, 15, 30, 45)]
+    (note,) = [text for text in read("approach,turn,start,count", *rows).notes if "scaled up" in text]
+    assert note == (
+        "Counts of a part of the hour 07-08 are scaled up to an hour for 6 movements:"
+        " North Street (north) left (15 min), North Street (north) straight (15 min),"
+        " North Street (north) right (15 min), North Street (south) left (15 min) and 2 more."
+    )
 
 
 def test_columns_named_by_their_start_mean_the_same_as_rows(read: Read) -> None:
@@ -123,7 +140,7 @@ def test_hours_without_a_vehicle_are_left_out_with_a_note(read: Read) -> None:
 
 def test_movements_without_a_count_are_named(read: Read) -> None:
     lines = ["approach,turn,count", "N,,10", "S,,10", "E,,10", "W,left,10", "W,right,10"]
-    assert "Movements without a count get no vehicles: W (East Street) straight." in read(*lines).notes
+    assert "Movements without a count get no vehicles: East Street (west) straight." in read(*lines).notes
 
 
 # --- the scenario ----------------------------------------------------------------------------------------------------
@@ -139,7 +156,7 @@ def test_scenario_has_the_counts_as_periods(tmp_path: Path, run_egvs: Any, monke
     scenario = loading.load(tmp_path / "new")
     assert [period.name for period in scenario.traffic.periods] == ["07-08", "08-09"]
     assert scenario.traffic.periods[0].counts[0].per_hour == 40.0
-    assert "turns of the approaches S (North Street)" in scenario.assumed
+    assert "turns of the approaches North Street (south)" in scenario.assumed
     assert not [text for text in scenario.assumed if text.startswith("traffic")]
 
 
@@ -149,11 +166,13 @@ def test_counts_of_one_hour_are_no_period(tmp_path: Path, run_egvs: Any) -> None
     traffic = loading.load(tmp_path / "new").traffic
     assert (traffic.periods, [count.per_hour for count in traffic.counts]) == ((), [40.0])
     text = (tmp_path / "new" / "scenario.toml").read_text()
-    assert "southbound on North Street, left to East Street" in text
+    assert "North Street (north), left to East Street" in text
 
 
 # --- bad input -------------------------------------------------------------------------------------------------------
-NAMES = r"The approaches are: N \(North Street\), E \(East Street\), S \(North Street\), W \(East Street\)\."
+NAMES = (
+    r"The approaches are: North Street \(north\), East Street \(east\), North Street \(south\), East Street \(west\)\."
+)
 HEAD = "street,approach,turn,start,count"
 BAD: dict[str, tuple[list[str], str]] = {
     "empty": ([""], r"header: expected a column count"),
@@ -167,13 +186,13 @@ BAD: dict[str, tuple[list[str], str]] = {
     "unknown street": ([HEAD, "High St,,,,5"], rf"line 2: no approach of the junction is called 'High St'. {NAMES}"),
     "ambiguous street": (
         [HEAD, "North Street,,left,,5"],
-        rf"may be N \(North Street\) or S \(North Street\). Give street and approach. {NAMES}",
+        rf"may be North Street \(north\) or North Street \(south\). Give street and approach. {NAMES}",
     ),
-    "contradiction": ([HEAD, "North Street,W,left,,5"], rf"no approach .* is 'North Street from W'. {NAMES}"),
+    "contradiction": ([HEAD, "North Street,W,left,,5"], rf"no approach .* is 'North Street from the west'. {NAMES}"),
     "unknown side": ([HEAD, ",up,left,,5"], r"line 2: approach: expected the side on which vehicles arrive, got 'up'"),
-    "between two": ([HEAD, ",NE,left,,5"], r"'from NE' may be"),
-    "unknown turn": ([HEAD, ",N,sideways,,5"], r"line 2: turn: expected left, straight, right, u-turn or all"),
-    "no such turn": ([HEAD, ",N,u-turn,,5"], r"no vehicle can go back from N .*Its turns are: left, right"),
+    "between two": ([HEAD, ",NE,left,,5"], r"'from the north-east' may be"),
+    "unknown turn": ([HEAD, ",N,sideways,,5"], r"line 2: turn: expected left, straight, right, U-turn or all"),
+    "no such turn": ([HEAD, ",N,u-turn,,5"], r"North Street .* has no movement U-turn\. Its turns are: left, right"),
     "unknown group": (["lane_group,count", "XBL,5"], r"line 2: lane_group: expected a lane group such as NBL or EBTR"),
     "negative": ([HEAD, ",N,left,,-5"], r"line 2: count: expected a number of vehicles of 0 to 100,000, got '-5'"),
     "text": ([HEAD, ",N,left,,many"], r"count: expected a number of vehicles .* got 'many'"),

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import tomllib
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import egvs
+from egvs.artefacts.tpog import PeriodBlocks
 from egvs.core.errors import InputError
 from egvs.placement.design_request import ELEVATION_BOUNDS_DEG, DesignRequest
 from egvs.placement.sensor_design import (
@@ -26,6 +26,7 @@ from egvs.placement.sensor_design import (
     DesignResult,
     ElevationCurve,
     design_sensor,
+    second_half_groups,
     start_elevations,
 )
 from egvs.scoring.target_scores import TARGET_SCORES
@@ -38,6 +39,7 @@ from tests.conftest import write_mini
 pytest.importorskip("cma", reason="the extra egvs[place] is not installed")
 pytestmark = pytest.mark.system
 
+ROOT = Path(__file__).resolve().parents[2]
 LOWEST_DEG = -math.degrees(math.atan(3.0 / 13.1))
 HIGHEST_DEG = -math.degrees(math.atan(1.5 / 16.2))
 
@@ -210,10 +212,44 @@ def test_wrong_requests_get_one_message(
     assert not (mini.parent / "sensors").exists()
 
 
-def test_several_seeds_are_rejected_because_one_simulation_is_split() -> None:
-    scenario: Any = SimpleNamespace(file="scenario.toml", traffic=SimpleNamespace(seeds=2))
-    with pytest.raises(InputError, match=r"scenario\.toml: traffic\.seeds = 2: one simulation is split .* Use 1 seed"):
-        design_sensor(scenario, DesignRequest("pole_a"))
+def test_groups_of_the_second_halves_by_hand() -> None:
+    """Four simulations of 11 frames: the search has frames 0 to 4 of each, the scores have frames 5 to 10."""
+    groups, starts = second_half_groups(PeriodBlocks("", 1.0, 44, 11, 3.0, seeds=4), 44)
+    assert groups.are_seeds
+    assert groups.frames.tolist() == [6, 6, 6, 6]
+    assert starts.tolist() == [5, 16, 27, 38]
+    groups, starts = second_half_groups(
+        PeriodBlocks("", 1.0, 44, 11, 0.0), 44
+    )  # one simulation: ten blocks of 22 frames
+    assert not groups.are_seeds
+    assert groups.frames.tolist() == [3, 3] + [2] * 8
+    assert starts.tolist() == [22, 25, *range(28, 44, 2)]
+
+
+@pytest.mark.slow
+def test_scores_of_several_seeds_are_those_of_each_simulation(tmp_path: Path) -> None:
+    """Twin: the vehicles of the second half of each simulation; the error by leaving out one simulation in turn."""
+    simulated = ['traffic.network="network.net.xml"', "traffic.vehicles=28", "traffic.warmup_s=20", "traffic.frames=80"]
+    keys = [*simulated, "traffic.seeds=4", "tpog.blocks=4", "score.sampled_frames=80"]
+    scenario = egvs.load(ROOT / "scenarios" / "demo", keys)
+    request = DesignRequest("kerb_NE", ("VLP-16",), None, 20)
+    result = design_sensor(scenario, request, tmp_path / "run", jobs=2)
+    assert result.frames == (40, 40)
+    assert "4 simulations: the search saw the first half of each" in result.notes[0]
+
+    context = open_folder(scenario, tmp_path / "run", jobs=1)
+    scoring = SiteScoring(context)
+    assert scoring.targets is not None
+    (chosen,) = result.catalogue
+    scan = egvs.Scanner(context.scene).scan(chosen.pose, chosen.sensor)
+    values = TARGET_SCORES["expected_detections"](scoring.targets.visible(egvs_beams(scan)))
+    frame = scoring.targets.record.numbers[scoring.targets.record.frame]
+    simulation, number = np.divmod(frame, 20)
+    assert chosen.search_score == pytest.approx(values[number < 10].mean())
+    assert chosen.score == pytest.approx(values[number >= 10].mean())
+    left_out = np.array([values[(number >= 10) & (simulation != one)].mean() for one in range(4)])
+    pseudo = 4 * chosen.score - 3 * left_out
+    assert chosen.se == pytest.approx(math.sqrt(((pseudo - pseudo.mean()) ** 2).sum() / (4 * 3)))
 
 
 def test_record_without_vehicles_in_one_half_is_rejected(tmp_path: Path) -> None:

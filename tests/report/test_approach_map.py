@@ -35,8 +35,8 @@ def test_labels_name_side_street_and_vehicles_per_hour(tmp_path: Path) -> None:
     assert junction is not None
     labels = approach_map.approach_labels(COUNTS, tmp_path / "network.net.xml", junction.at_m)
     assert [label.lines for label in labels] == [
-        ("N · North Street", "left 87", "straight 30"),
-        ("W · East Street", "all 120"),
+        ("North Street (north)", "left 87", "straight 30"),
+        ("East Street (west)", "all 120"),
     ]
     north, west = (label.at_m - np.array(junction.at_m) for label in labels)
     assert north[1] > 25 and abs(north[0]) < 5
@@ -48,7 +48,9 @@ def test_labels_cover_no_other_label_and_stay_on_the_map() -> None:
     covered: list[Box] = []
     drawing = []
     for number, at_m in enumerate([(50, 50), (52, 50), (50, 52), (99, 99), (1, 1), (99, 1)]):
-        label = ApproachLabel(np.array(at_m, dtype=np.float64), "N", f"Street <{number}>", {"left": 10.0, "right": 5.0})
+        label = ApproachLabel(
+            np.array(at_m, dtype=np.float64), f"Street <{number}> (north)", {"left": 10.0, "right": 5.0}
+        )
         drawing += approach_map._draw_label(plan, label, covered)
     assert len(covered) == 6
     for a, b in itertools.combinations(covered, 2):
@@ -58,3 +60,14 @@ def test_labels_cover_no_other_label_and_stay_on_the_map() -> None:
         assert plan.top <= top and bottom <= plan.top + plan.frame_height
     assert "Street &lt;3&gt;" in "".join(drawing)
     assert sum("<path" in part for part in drawing) >= 1  # a line to a label that is far away
+
+
+def test_long_name_in_the_middle_stays_on_the_map() -> None:
+    """A name of more than half the map fits on neither side of its disc in the middle: it goes above or below."""
+    plan = MapFrame((0.0, 0.0, 100.0, 100.0), "approaches", width=420.0, north=True)
+    covered: list[Box] = []
+    label = ApproachLabel(np.array([50.0, 50.0]), "Wehneberger Straße (north)", {"left": 299.0, "right": 76.0})
+    list(approach_map._draw_label(plan, label, covered))
+    ((left, top, right, bottom),) = covered
+    assert plan.left <= left and right <= plan.left + plan.frame_width
+    assert not top < plan.y(50.0) < bottom

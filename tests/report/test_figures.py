@@ -31,22 +31,22 @@ def place(by: str, words: str, frames: int, vehicles: int, share: float, se: flo
 ALL = place("all", "all vehicles", 1000, 80, 0.875)
 
 
-LEFT = place("lane", "eastbound left-turn lane", 120, 12, 0.41, 0.08)
+LEFT = place("lane", "Mill Lane (west), left-turn lane", 120, 12, 0.41, 0.08)
 
 
-TURN = place("turn", "eastbound left turn in the junction", 30, 11, 0.5)
+TURN = place("turn", "Mill Lane (west), left turn in the junction", 30, 11, 0.5)
 
 
-CROSSING = place("crossing", "pedestrian crossing on the east side of the junction", 30, 10, 0.5)
+CROSSING = place("crossing", "east crosswalk", 30, 10, 0.5)
 
 
-APPROACH = place("approach", "eastbound approach", 400, 30, 0.63)
+APPROACH = place("approach", "Mill Lane (west) approach", 400, 30, 0.63)
 
 
-FEW = place("lane", "northbound lane", 90, 9, 0.0)
+FEW = place("lane", "Mill Lane (south), lane", 90, 9, 0.0)
 
 
-GOOD = place("lane", "westbound lane", 90, 40, 0.875)
+GOOD = place("lane", "Mill Lane (east), lane", 90, 40, 0.875)
 
 
 def site(places: Sequence[LocationVisibility], share: object = ((0.0, NAN), (0.25, 1.0))) -> SiteBlindspots:
@@ -57,14 +57,14 @@ def test_lists_the_worst_locations_first_and_none_with_few_vehicles() -> None:
     blindspots = site([ALL, APPROACH, GOOD, FEW, CROSSING, TURN, LEFT])
     assert blindspots.worst == [LEFT, TURN, CROSSING]
     assert figures.describe_worst_locations(blindspots)[0] == (
-        "eastbound left-turn lane: 41% found",
+        "Mill Lane (west), left-turn lane: 41% found",
         "± 8%, from 12 vehicles in 120 observations",
     )
     assert figures.format_missed_share(blindspots) == "12.5%"
-    assert figures.blindspot_note(blindspots) == "Share of vehicles found on each approach: eastbound 63%."
+    assert figures.blindspot_note(blindspots) == "Share of vehicles found on each approach: Mill Lane (west) 63%."
     assert blindspots.in_words() == (
-        "p1: fewest vehicles are found here: eastbound left-turn lane (41 ± 8% of 12 vehicles); "
-        "eastbound left turn in the junction (50 ± 5% of 11 vehicles)"
+        "p1: fewest vehicles are found here: Mill Lane (west), left-turn lane (41 ± 8% of 12 vehicles); "
+        "Mill Lane (west), left turn in the junction (50 ± 5% of 11 vehicles)"
     )
 
 

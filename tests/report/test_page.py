@@ -80,8 +80,8 @@ def test_counts_are_described_as_movements_of_the_network(tmp_path):
     ]
     (out / "run.json").write_text(json.dumps(add_checksum(record)), encoding="utf-8")
     read = PageReader(render_report(scenario, out))
-    assert "near to up|eastbound on High Street, left to an unnamed street|all|60|60|0.0|" in read.rows
-    assert "back|westbound on High Street|all|60|60|0.0|" in read.rows
+    assert "near to up|High Street (west), left to an unnamed street|all|60|60|0.0|" in read.rows
+    assert "back|High Street (east)|all|60|60|0.0|" in read.rows
 
 
 def test_has_no_table_of_counts_without_counts(plain_run):

@@ -116,7 +116,7 @@ def test_counts_are_those_of_the_points(on_roads: tuple[model.Scenario, Path]) -
         rows = {row["place"]: row for row in rows_of(out, its.site.name) if row["by"] == "lane"}
         assert rows["near_2"]["with_points"] == int((visible.points[left] >= 20).sum())
         assert rows["near_2"]["share_found"] == pytest.approx(detection_chances(visible)[left].mean())
-        assert rows["near_2"]["words"] == "eastbound left-turn lane, High Street"
+        assert rows["near_2"]["words"] == "High Street (west), left-turn lane"
         assert (rows["near_2"]["vehicle_frames"], rows["near_2"]["vehicles"]) == (40, 12)
 
 

@@ -22,33 +22,33 @@ def words_of_lanes(places: RoadLocations) -> dict[tuple[float, ...], list[str]]:
 
 def test_lanes_of_an_approach_are_called_by_where_they_lead(tmp_path: Path) -> None:
     said = words_of_lanes(RoadLocations.of(read(tmp_path), GRID.roi))
-    assert said[15.1, -4.8] == ["eastbound straight lane, High Street", "eastbound approach, High Street"]
-    assert said[15.1, -1.6] == ["eastbound left-turn lane, High Street", "eastbound approach, High Street"]
+    assert said[15.1, -4.8] == ["High Street (west), straight lane", "High Street (west) approach"]
+    assert said[15.1, -1.6] == ["High Street (west), left-turn lane", "High Street (west) approach"]
 
 
 def test_a_road_that_is_cut_in_two_is_one_approach(tmp_path: Path) -> None:
     said = words_of_lanes(RoadLocations.of(read(tmp_path), GRID.roi))
-    far = ["eastbound left-and-straight lane further back, High Street", "eastbound approach, High Street"]
+    far = ["High Street (west), left-and-straight lane further back", "High Street (west) approach"]
     assert said[-15.0, -4.8] == said[15.0, -4.8] == far  # and what lies between the pieces belongs to the first
 
 
 def test_roads_that_leave_the_region_are_exits_and_others_pass(tmp_path: Path) -> None:
     said = words_of_lanes(RoadLocations.of(read(tmp_path), GRID.roi))
-    assert said[36.0, -4.8] == ["eastbound exit lane, High Street", "eastbound exit, High Street"]
-    assert said[35.0, 4.0] == ["northbound exit lane", "northbound exit"]
-    assert said[120.0, 1.6] == ["westbound lane, High Street", "westbound road, High Street"]
+    assert said[36.0, -4.8] == ["High Street (east), exit lane", "High Street (east) exit"]
+    assert said[35.0, 4.0] == ["north, exit lane", "north exit"]
+    assert said[120.0, 1.6] == ["High Street (westbound road), lane", "High Street (westbound road)"]
 
 
 def test_in_the_junction_the_approach_and_the_turn_are_named_to_its_end(tmp_path: Path) -> None:
     said = words_of_lanes(RoadLocations.of(read(tmp_path), GRID.roi))
-    assert said[30.0, -4.8] == ["eastbound straight movement through the junction, High Street"]
-    assert said[30.0, -1.6] == said[33.0, -1.0] == ["eastbound left turn in the junction, High Street"]
+    assert said[30.0, -4.8] == ["High Street (west), straight movement through the junction"]
+    assert said[30.0, -1.6] == said[33.0, -1.0] == ["High Street (west), left turn in the junction"]
 
 
 def test_crossings_and_sidewalks_are_not_lanes(tmp_path: Path) -> None:
     found = RoadLocations.of(read(tmp_path), GRID.roi)
     ((strip, place),) = found.crossings
-    assert found.locations[place].words == "pedestrian crossing on the east side of the junction"
+    assert found.locations[place].words == "east crosswalk"
     assert (strip.width_m, found.locations[place].at_m) == (4.0, (38.0, -3.5))
     assert len(found.lanes) == 11 and not any(place.name in ("near_0", ":j_w0_0") for place in found.locations)
 
@@ -56,8 +56,8 @@ def test_crossings_and_sidewalks_are_not_lanes(tmp_path: Path) -> None:
 def test_lanes_that_lead_the_same_way_are_counted_from_the_kerb(tmp_path: Path) -> None:
     text = NETWORK.replace('dir="l"', 'dir="s"')
     said = words_of_lanes(RoadLocations.of(read(tmp_path, text), GRID.roi))
-    assert said[15.1, -4.8][0] == "eastbound straight lane 1 of 2 from the kerb, High Street"
-    assert said[15.1, -1.6][0] == "eastbound straight lane 2 of 2 from the kerb, High Street"
+    assert said[15.1, -4.8][0] == "High Street (west), straight lane 1 of 2 from the kerb"
+    assert said[15.1, -1.6][0] == "High Street (west), straight lane 2 of 2 from the kerb"
 
 
 def test_a_road_round_in_circles_ends(tmp_path: Path) -> None:
@@ -80,8 +80,8 @@ def test_a_road_round_in_circles_ends(tmp_path: Path) -> None:
         (("straight", "left"), "left-and-straight lane"),
         (("right", "straight"), "straight-and-right lane"),
         (("left", "right", "straight"), "lane for all directions"),
-        (("back",), "U-turn lane"),
-        (("back", "right"), "right-turn lane"),
+        (("U-turn",), "U-turn lane"),
+        (("U-turn", "right"), "right-turn lane"),
     ],
 )
 def test_lanes_in_words(turns: tuple[str, ...], words: str) -> None:
@@ -89,7 +89,7 @@ def test_lanes_in_words(turns: tuple[str, ...], words: str) -> None:
 
 
 def test_turns_in_words() -> None:
-    assert [describe_turn(turn) for turn in ("left", "straight", "back", "")] == [
+    assert [describe_turn(turn) for turn in ("left", "straight", "U-turn", "")] == [
         "left turn in the junction",
         "straight movement through the junction",
         "U-turn in the junction",

@@ -13,7 +13,7 @@ from egvs.traffic import approach_queues
 from egvs.traffic.approach_queues import ApproachPath, VehicleFrames, measure_approach, queue_lengths_m
 
 # vehicles arrive from the south on x = 2 and stop at y = 0
-PATH = ApproachPath("S (North Street)", np.array([[2.0, 0.0], [2.0, -150.0], [2.0, -400.0]]), 3.0)
+PATH = ApproachPath("North Street (south)", np.array([[2.0, 0.0], [2.0, -150.0], [2.0, -400.0]]), 3.0)
 
 
 def frames(*rows: tuple[int, int, float, float], yaw_rad: float = math.pi / 2, period_s: float = 1.0) -> VehicleFrames:

@@ -15,13 +15,13 @@ CENTER_M = (33.0, -2.0)
 @pytest.mark.parametrize(
     ("from_edge", "to_edge", "expected"),
     [
-        ("near", "out", "eastbound on High Street, straight on"),
-        ("near", "up", "eastbound on High Street, left to an unnamed street"),
-        ("far", "up", "eastbound on High Street, left to an unnamed street"),
-        ("back", "up", "westbound on High Street, right to an unnamed street"),
-        ("near", "back", "eastbound on High Street, U-turn to High Street"),
-        ("up", "back", "northbound on an unnamed street, left to High Street"),
-        ("back", None, "westbound on High Street"),
+        ("near", "out", "High Street (west), straight on"),
+        ("near", "up", "High Street (west), left to an unnamed street"),
+        ("far", "up", "High Street (west), left to an unnamed street"),
+        ("back", "up", "High Street (east), right to an unnamed street"),
+        ("near", "back", "High Street (west), U-turn to High Street"),
+        ("up", "back", "south, left to High Street"),
+        ("back", None, "High Street (east)"),
     ],
 )
 def test_describes_movement(tmp_path: Path, from_edge: str, to_edge: str | None, expected: str) -> None:
@@ -35,12 +35,12 @@ def test_turn_of_a_connection_goes_before_the_directions(tmp_path: Path) -> None
     )
     assert text != NETWORK
     words = MovementNames(read(tmp_path, text), CENTER_M).describe("near", "up")
-    assert words == "eastbound on High Street, straight on to an unnamed street"
+    assert words == "High Street (west), straight on to an unnamed street"
 
 
 def test_street_name_is_one_line_without_double_escapes(tmp_path: Path) -> None:
     text = NETWORK.replace('name="High Street"', 'name="A &amp;amp; B&#10;C&#x7f;"')
-    assert MovementNames(read(tmp_path, text), CENTER_M).describe("back", None) == "westbound on A & B C"
+    assert MovementNames(read(tmp_path, text), CENTER_M).describe("back", None) == "A & B C (east)"
 
 
 def test_directions_are_those_at_the_junction(tmp_path: Path) -> None:
@@ -51,4 +51,4 @@ def test_directions_are_those_at_the_junction(tmp_path: Path) -> None:
             f'shape="15.1,{y_m} 30', f'shape="-20,{y_m} 30'
         )
     words = MovementNames(read(tmp_path, text), CENTER_M).describe("far", "up")
-    assert words == "eastbound on High Street from Side Street, left to an unnamed street"
+    assert words == "High Street (west) from Side Street, left to an unnamed street"

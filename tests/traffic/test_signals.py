@@ -6,6 +6,7 @@ the network's foes for conflicts.
 
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,9 +14,10 @@ import pytest
 from egvs.core.errors import InputError
 from egvs.core.grid import Roi
 from egvs.scenario.loading import scenario_from_dict
+from egvs.scenario.signal_config import SignalPhaseConfig
 from egvs.scenario.traffic_config import TrafficConfig
 from egvs.stages import traffic
-from egvs.traffic import network, signal_descriptions, signal_plans, signals, sumo, sumo_folder
+from egvs.traffic import directions, network, signal_descriptions, signal_plans, signals, sumo, sumo_folder
 from tests.stage_runner import run_stage
 from tests.traffic.helpers import netgenerate
 
@@ -82,9 +84,9 @@ def letters(folder, state):
 def test_approaches_are_named_by_side_and_street(crossing):
     signal = read_crossing(crossing)
     assert set(signal.approaches) == {
-        "north Mill Lane", "east High Street", "south Mill Lane", "west High Street",
+        "Mill Lane (north)", "High Street (east)", "Mill Lane (south)", "High Street (west)",
     }  # fmt: skip
-    assert all(set(m) == {"left", "straight", "right", "crossing"} for m in signal.approaches.values())
+    assert all(set(m) == {"left", "straight", "right", "crosswalk"} for m in signal.approaches.values())
     assert set(signal.streets) == {"Mill Lane", "High Street"}
 
 
@@ -95,14 +97,14 @@ def test_plan_by_hand(crossing):
     assert (program.type, program.offset_s, program.cycle_s) == ("static", 7, 60)
     first = letters(crossing, program.phases[0].state)
     # left turns give way to oncoming traffic, right turns to people; both cross the side streets' crossings
-    assert first["north Mill Lane straight"] == "G"
-    assert first["north Mill Lane left"] == first["north Mill Lane right"] == "g"
-    assert first["east High Street straight"] == first["west High Street left"] == "r"
-    assert first["east High Street crossing"] == "G"  # people walk along Mill Lane, over the arms of High Street
-    assert first["north Mill Lane crossing"] == "r"
+    assert first["Mill Lane (north) straight"] == "G"
+    assert first["Mill Lane (north) left"] == first["Mill Lane (north) right"] == "g"
+    assert first["High Street (east) straight"] == first["High Street (west) left"] == "r"
+    assert first["High Street (east) crosswalk"] == "G"  # people walk along Mill Lane, over the arms of High Street
+    assert first["Mill Lane (north) crosswalk"] == "r"
     yellow = letters(crossing, program.phases[1].state)
-    assert yellow["north Mill Lane straight"] == yellow["south Mill Lane left"] == "y"
-    assert yellow["east High Street crossing"] == "r"
+    assert yellow["Mill Lane (north) straight"] == yellow["Mill Lane (south) left"] == "y"
+    assert yellow["High Street (east) crosswalk"] == "r"
     assert set(program.phases[2].state) == {"r"}
 
 
@@ -110,8 +112,8 @@ def test_green_in_two_phases_is_not_interrupted(crossing):
     """North alone, then north and south: north keeps its green through yellow and all-red of nobody."""
     plan = [{"green": {"north": ["all"]}, "green_s": 10}, NS, EW]
     program = programs(crossing, {"c": {"phases": plan}})["c"]
-    north = [letters(crossing, phase.state)["north Mill Lane straight"] for phase in program.phases]
-    south = [letters(crossing, phase.state)["south Mill Lane straight"] for phase in program.phases]
+    north = [letters(crossing, phase.state)["Mill Lane (north) straight"] for phase in program.phases]
+    south = [letters(crossing, phase.state)["Mill Lane (south) straight"] for phase in program.phases]
     assert north == ["G", "G", "G", "G", "y", "r", "r", "r", "r"]
     assert south == ["r", "r", "r", "G", "y", "r", "r", "r", "r"]
 
@@ -121,9 +123,9 @@ def test_left_turn_gives_way_to_oncoming_yellow(crossing):
     alone = {"green": {"north": ["all"]}, "green_s": 10}
     program = programs(crossing, {"c": {"phases": [NS, alone, EW]}})["c"]
     both, yellow, all_red, after = (letters(crossing, phase.state) for phase in program.phases[:4])
-    assert yellow["south Mill Lane straight"] == "y"
-    assert [state["north Mill Lane left"] for state in (both, yellow)] == ["g", "g"]
-    assert [state["north Mill Lane straight"] for state in (both, yellow, all_red, after)] == ["G"] * 4
+    assert yellow["Mill Lane (south) straight"] == "y"
+    assert [state["Mill Lane (north) left"] for state in (both, yellow)] == ["g", "g"]
+    assert [state["Mill Lane (north) straight"] for state in (both, yellow, all_red, after)] == ["G"] * 4
 
 
 def test_position_of_two_links_gives_way_if_one_of_them_does():
@@ -145,7 +147,9 @@ def test_signal_by_id_or_streets(crossing, name):
 
 
 def test_edges_and_full_names_are_approaches(crossing):
-    plan = [{"green": {"nin": ["all"], "South Mill Lane": ["thru", "L", "right"]}, "green_s": 30}, EW]
+    plan = [{"green": {"nin": ["all"], "Mill Lane (south)": ["thru", "L", "right"]}, "green_s": 30}, EW]
+    assert programs(crossing, {"c": {"phases": plan}}) == programs(crossing, {"c": {"phases": [NS, EW]}})
+    plan = [{"green": {"N (Mill Ln.)": ["all"], "South Mill Lane": ["all"]}, "green_s": 30}, EW]
     assert programs(crossing, {"c": {"phases": plan}}) == programs(crossing, {"c": {"phases": [NS, EW]}})
     plan = [{"green": {"southbound": ["all"], "S": ["all"]}, "green_s": 30}, EW]
     assert programs(crossing, {"c": {"phases": plan}}) == programs(crossing, {"c": {"phases": [NS, EW]}})
@@ -189,14 +193,29 @@ def test_summary_names_the_plan(crossing, tmp_path):
     (plan,) = summary["signals"]
     assert (plan["source"], plan["cycle_s"], plan["type"]) == ("from the scenario", 60, "fixed")
     rows = {(row["approach"], *row["movements"]): row for row in plan["rows"]}
-    north = rows["north Mill Lane", "straight"]
+    north = rows["Mill Lane (north)", "straight"]
     assert (north["green_s"], north["yellow_s"], north["gives_way"]) == ([[0, 30]], [[30, 33]], False)
-    east = rows["east High Street", "left", "right"]
+    east = rows["High Street (east)", "left", "right"]
     assert (east["green_s"], east["gives_way"]) == ([[35, 55]], True)
     text = signal_descriptions.format_plan(plan)
     assert text == (
-        "Signals at Mill Lane / High Street (from the scenario): fixed, cycle 60 s; green 30 s north Mill Lane and"
-        " south Mill Lane; 20 s east High Street and west High Street."
+        "Signals at High Street / Mill Lane (from the scenario): fixed, cycle 60 s; green 30 s Mill Lane (north) and"
+        " Mill Lane (south); 20 s High Street (east) and High Street (west)."
+    )
+
+
+def test_movements_with_equal_green_share_an_entry():
+    """Left turns have 10 s of their own; straight on and right have green together, one of them giving way."""
+    row = {"approach": "Mill Lane (north)", "yellow_s": [], "gives_way": False}
+    rows = [
+        row | {"movements": ["left"], "green_s": [[0, 10]]},
+        row | {"movements": ["straight"], "green_s": [[10, 40]]},
+        row | {"movements": ["right"], "green_s": [[10, 40]], "gives_way": True},
+    ]
+    plan = {"signal": "c", "streets": ["Mill Lane"], "source": "assumed", "type": "fixed", "cycle_s": 60, "rows": rows}
+    assert signal_descriptions.format_plan(plan) == (
+        "Signals at Mill Lane (assumed): fixed, cycle 60 s; green 10 s Mill Lane (north) left;"
+        " 30 s Mill Lane (north) straight, right."
     )
 
 
@@ -227,22 +246,22 @@ def test_signal_of_several_junctions_knows_its_foes(tmp_path):
 
 
 WRONG = [
-    ({"x": {"phases": [NS, EW]}}, r"traffic.signals.x: the network has no such signal. Its signals are: c \("),
+    ({"x": {"phases": [NS, EW]}}, r"traffic.signals.x: the network has no such signal. Its signals are: High Street"),
     ({"c": {"phases": [NS, EW | {"green": {"nrth": ["all"]}}]}},
-     r"phase 2: signal c has no approach 'nrth'. Its approaches are: north Mill Lane \(right, straight, left"),
+     r"Lane \(c\) has no approach 'nrth'. Its approaches are: Mill Lane \(north\) \(right, straight, left"),
     ({"c": {"phases": [NS, EW | {"green": {"Mill Lane": ["all"]}}]}},
-     "approach 'Mill Lane' may be 'north Mill Lane' or 'south Mill Lane'. Use the full name"),
+     r"approach 'Mill Lane' may be 'Mill Lane \(north\)' or 'Mill Lane \(south\)'. Use the full name"),
     ({"c": {"phases": [NS | {"green": {"north": ["sideways"]}}, EW]}},
-     "approach 'north' has no movement 'sideways'. Its movements are: right, straight, left, crossing"),
+     "approach 'north' has no movement 'sideways'. Its movements are: right, straight, left, crosswalk"),
     ({"c": {"phases": [NS | {"green": {"north": ["straight"], "east": ["straight"]}}]}},
-     "phase 1: north Mill Lane straight and east High Street straight conflict, but both have green"),
+     r"phase 1: Mill Lane \(north\) straight and High Street \(east\) straight conflict, but both have green"),
     ({"c": {"phases": [NS | {"green": {"north": ["left"], "east": ["straight"]}}]}}, "conflict, but both have green"),
     ({"c": {"phases": [NS | {"green": {"north": ["straight", "crossing"]}}]}},
-     "north Mill Lane straight and north Mill Lane crossing conflict"),
-    ({"c": {"phases": [NS]}}, "never green: east High Street right, east High Street straight"),
+     r"Mill Lane \(north\) straight and Mill Lane \(north\) crosswalk conflict"),
+    ({"c": {"phases": [NS]}}, r"never green: High Street \(east\) right, High Street \(east\) straight"),
     ({"c": {"phases": [NS, EW], "cycle_s": 90}},
      r"cycle_s = 90: the phases with yellow and all-red add up to 60 s \(30, 3, 2, 20, 3, 2\). Use cycle_s = 60"),
-    ({"c": {"phases": [NS, EW]}, "Mill Lane": {"phases": [NS, EW]}}, "signal 'c' has two plans"),
+    ({"c": {"phases": [NS, EW]}, "Mill Lane": {"phases": [NS, EW]}}, r"High Street / Mill Lane \(c\) has two plans"),
     ({"c": {"file": "missing.csv"}}, "missing.csv"),
 ]  # fmt: skip
 
@@ -283,7 +302,7 @@ CSV = "phase,approach,movement,green_s\na,north,all,30\na,south,all,30\nb,east,a
         ("p.csv", CSV.replace("b,east,all,20", "b,east,all,often"), "line 4: green_s: expected seconds, got 'often'"),
         ("p.csv", CSV.replace("b,east,all,20", "b,east,all"), "line 4: expected 4 values, got 3"),
         ("p.csv", CSV.replace("green_s", "green_s,colour").replace("0\n", "0,red\n"), "unknown column 'colour'"),
-        ("p.add.xml", "<additional/>", "no <tlLogic> with phases for signal 'c'"),
+        ("p.add.xml", "<additional/>", "no <tlLogic> with phases for the signal High Street / Mill Lane (c)"),
         ("p.add.xml", '<additional><tlLogic id="c"><phase duration="9" state="GG"/></tlLogic></additional>',
          "expected a state of 20 letters, got 2"),
         ("p.add.xml", f'<additional><tlLogic id="c"><phase duration="9" state="{"G" * 20}"/></tlLogic></additional>',
@@ -317,3 +336,35 @@ def test_check_reports_plans_before_the_simulation(crossing, tmp_path):
 def test_finished_traffic_has_no_plans(crossing):
     config = TrafficConfig.from_dict({"fcd": "a.csv", "signals": {"c": {"phases": [NS, EW]}}})
     assert [unused.keys for unused in config.unused_keys()] == [{"signals"}]
+
+
+@pytest.mark.parametrize("word", ["back", "U-turn", "u turn", "U"])
+def test_u_turn_has_one_printed_name(word):
+    """A link of SUMO's direction "t" is found by each spelling, and printed as U-turn."""
+    heading = np.array([0.0, -1.0])
+    link = signals.Link(0, "north", directions.TURNS["t"], "a", "", heading)
+    program = signals.Program("static", 0.0, (signals.Phase(20.0, "G"), signals.Phase(10.0, "r")))
+    signal = signals.Signal("c", ("c",), (0.0, 0.0), (link,), program)
+    phase = SignalPhaseConfig.from_dict({"green": {"north": [word]}, "green_s": 20})
+    assert signal_plans._green_links(phase, signal, "plan") == {0}
+    (plan,) = signal_descriptions.describe_signals([signal], Roi((-1.0, -1.0, 0.0), (2.0, 2.0, 1.0)), {}, "assumed")
+    assert [row["movements"] for row in plan["rows"]] == [["U-turn"]]
+
+
+def test_long_ids_are_shortened_and_still_accepted(tmp_path):
+    """SUMO's id of joined nodes is cut after 19 characters in messages; both spellings find the signal."""
+    name = "cluster_1423165998_1698047149_31384678"
+    link = signals.Link(0, "Mill Lane (north)", "straight", "a", "Mill Lane", np.array([0.0, -1.0]))
+    program = signals.Program("static", 0.0, ())
+    long, other = (
+        signals.Signal(each, (each,), (0.0, 0.0), (replace(link, street=street),), program)
+        for each, street in ((name, "Mill Lane"), ("J2", "High Street"))
+    )
+    assert long.title == "Mill Lane (cluster_1423165998_…)"
+    for spelling in (name, "cluster_1423165998_…", "mill ln"):
+        assert signal_plans.find_signal(spelling, [long, other], "x") is long
+    with pytest.raises(InputError, match=r"Its signals are: Mill Lane \(cluster_1423165998_…\), High Street \(J2\)\."):
+        signal_plans.find_signal("Oak Street", [long, other], "x")
+    twin = replace(long, id=f"{name}_2", nodes=(f"{name}_2",))
+    with pytest.raises(InputError, match=rf"2 signals have this name: Mill Lane \({name}\), Mill Lane \({name}_2\)"):
+        signal_plans.find_signal("cluster_1423165998_…", [long, twin], "x")

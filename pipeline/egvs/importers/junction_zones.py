@@ -3,7 +3,7 @@
 They come from the network, and are cut at the region of interest:
 
 - *conflict area*: all lanes for vehicles inside the junction; of a roundabout, the ring as well;
-- *crosswalks*, named after their side of the junction;
+- *crosswalks*, named after the approach that they cross;
 - *stop lines*: the last :data:`STOP_LINE_M` metres of the lanes of each approach;
 - *approaches*: its last :data:`APPROACH_M` metres, followed back across nodes with a single road;
 - *sidewalks* and the corners between them, joined by their side of the junction.
@@ -26,7 +26,8 @@ from shapely.geometry.base import BaseGeometry
 from egvs.core.grid import XY, FloatArray
 from egvs.importers.junctions import JunctionRegion, StreetJunction, Streets
 from egvs.importers.openstreetmap.street_network import NETWORK_FILE
-from egvs.traffic.directions import compass, lane_heading
+from egvs.traffic.approach_names import ApproachNames
+from egvs.traffic.directions import compass
 from egvs.traffic.network import Edge, Lane, Network
 
 STOP_LINE_M = 10.0
@@ -64,10 +65,11 @@ def junction_zones(streets: Streets, junction: StreetJunction, roi: JunctionRegi
         Its region of interest.
     """
     network = streets.network
+    names = ApproachNames(network)
     zones = [
         Zone("conflict area", "conflict area", _conflict_area(streets, junction)),
-        *_crosswalks(network, junction),
-        *_approach_zones(network, junction),
+        *_crosswalks(network, junction, names),
+        *_approach_zones(network, junction, names),
         *_sidewalks(network, junction, roi.area),
     ]
     clipped = []
@@ -118,13 +120,12 @@ def _node_of(edge: Edge) -> str:
     return edge.id.removeprefix(":").rpartition("_")[0]
 
 
-def _crosswalks(network: Network, junction: StreetJunction) -> Iterator[Zone]:
+def _crosswalks(network: Network, junction: StreetJunction, names: ApproachNames) -> Iterator[Zone]:
     for edge in network.all_edges:
         if edge.function == "crossing" and _node_of(edge) in junction.nodes:
             for lane in edge.lanes:
                 if len(lane.shape_m) > 1:
-                    middle_m = lane.shape_m[:, :2].mean(axis=0)
-                    yield Zone(f"{_side(middle_m, junction.at_m)} crosswalk", "crosswalk", lane.area())
+                    yield Zone(names.crosswalk(edge.id), "crosswalk", lane.area())
 
 
 def _side(point_m: FloatArray, junction_m: XY) -> str:
@@ -132,7 +133,7 @@ def _side(point_m: FloatArray, junction_m: XY) -> str:
     return compass(point_m - np.asarray(junction_m))
 
 
-def _approach_zones(network: Network, junction: StreetJunction) -> Iterator[Zone]:
+def _approach_zones(network: Network, junction: StreetJunction, names: ApproachNames) -> Iterator[Zone]:
     """Stop lines, then approaches."""
     approaches = []
     for number, edge in enumerate(network.edges):
@@ -141,11 +142,11 @@ def _approach_zones(network: Network, junction: StreetJunction) -> Iterator[Zone
             approaches.append((number, edge))
     for kind, length_m in (("stop line", STOP_LINE_M), ("approach", APPROACH_M)):
         for number, edge in approaches:
-            heading = lane_heading(_lanes_for_vehicles(edge)[0], at_end=True)
-            name = f"{kind} from the {compass(-heading)}"
-            if edge.name:
-                name = f"{name}, {edge.name}"
-            yield Zone(name, kind, shapely.union_all(list(_last_metres(network, number, length_m))))
+            yield Zone(
+                f"{names.approach(edge.id)} {kind}",
+                kind,
+                shapely.union_all(list(_last_metres(network, number, length_m))),
+            )
 
 
 def _lanes_for_vehicles(edge: Edge) -> list[Lane]:
@@ -199,7 +200,7 @@ def _only_areas(shape: BaseGeometry) -> BaseGeometry:
 
 
 def _with_distinct_names(zones: Iterable[Zone]) -> Iterator[Zone]:
-    """Number zones of equal names: "north crosswalk", "north crosswalk 2"."""
+    """Number zones of equal names: "north sidewalk", "north sidewalk 2"."""
     counts: Counter[str] = Counter()
     for zone in zones:
         counts[zone.name] += 1

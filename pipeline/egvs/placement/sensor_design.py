@@ -6,9 +6,10 @@ expected share of vehicles found (:data:`egvs.scenario.score_config.DEFAULT_SCOR
 each trial. The search is that of ``egvs place --refine`` (:func:`egvs.placement.refinement.minimise`: random points,
 then CMA-ES).
 
-*Other frames.* A search finds what suits its frames, also by chance. So it sees the first half of each record only, and
-all scores and differences that are reported come from the second half, with errors of the block jackknife over its
-frames (:class:`egvs.scoring.targets.FrameGroups`). The score on the first half is reported beside it.
+*Other frames.* A search finds what suits its frames, also by chance. So it sees the first half of each simulation only,
+and all scores and differences that are reported come from the second half, with errors of the block jackknife over its
+frames (:class:`egvs.scoring.targets.FrameGroups`). With several seeds (``traffic.seeds``), the second half of each
+simulation is one group of the jackknife, as in ``egvs run``. The score on the first halves is reported beside it.
 
 *Elevations.* The search starts at the channels of the base sensor as they are if it has as many, else evenly spread
 between its lowest and its highest elevation. It divides them into at most :data:`MAX_PIECES` pieces, which it stretches
@@ -177,10 +178,10 @@ def design_sensor(
     Raises
     ------
     InputError
-        When the request is wrong, or the second half of the record has no vehicle in the region.
+        When the request is wrong, or the second half of the traffic has no vehicle in the region.
     """
     plugins.require_libraries("egvs sensor design", "place", "cma")
-    _check_request(request, scenario)
+    _check_request(request)
     folder = Path(out) if out is not None else run.default_folder(scenario)
     names = _sensor_names(scenario, request)
     read_results(RunFolder(folder).sensor_design)
@@ -189,6 +190,9 @@ def design_sensor(
     context = open_folder(scenario, folder, jobs=jobs, progress=progress, recorded=recorded)
     designer = _Designer(context, request)
     notes: list[str] = []
+    seeds = scenario.traffic.seeds
+    if seeds > 1:
+        notes.append(f"{seeds} simulations: the search saw the first half of each; ± is from their differences.")
     best_mounts: list[_Trial] = []
     for number, name in enumerate(names):
         try:
@@ -248,10 +252,7 @@ def _report_entry(result: DesignResult) -> dict[str, Any]:
     return {"frames": list(result.frames), "designs": rows, "notes": list(result.notes)}
 
 
-def _check_request(request: DesignRequest, scenario: Scenario) -> None:
-    if scenario.traffic.seeds > 1:
-        problem = "one simulation is split into frames of the search and other frames"
-        raise InputError(f"{scenario.file}: traffic.seeds = {scenario.traffic.seeds}", problem, "Use 1 seed.")
+def _check_request(request: DesignRequest) -> None:
     low, high = request.bounds_deg
     if not -90 <= low < high <= 90:
         problem = f"expected two ascending elevations from -90 to 90 degrees, got {low:g},{high:g}"
@@ -287,7 +288,7 @@ class _Trial:
 
 @dataclass(frozen=True, eq=False)
 class _Half:
-    """The vehicle-frames of one half of each record, and their weights (n,)."""
+    """The vehicle-frames of one half of each simulation, and their weights (n,)."""
 
     record: TargetRecord
     weight: FloatArray
@@ -315,15 +316,16 @@ class _Designer:
         return len(self._search_half.record.numbers), len(self._other_half.record.numbers)
 
     def _read_halves(self) -> tuple[_Half, _Half]:
-        """Read the vehicles of the sampled frames: those of the first half of each period, and of the second."""
+        """Read the vehicles of the sampled frames: those of the first half of each simulation, and of the second."""
         folder, config = self._context.folder, self._context.scenario.score
         recorded = recorded_frames(folder.trajectories)
         numbers = traffic_frames.spaced_frames(sum(recorded), config.sampled_frames)
         is_first = np.zeros(len(numbers), dtype=np.bool_)
         start = 0
-        for frames in recorded:
-            is_first |= (numbers >= start) & (numbers < start + frames // 2)
-            start += frames
+        for period, frames in zip(read_periods(folder.tpog), recorded, strict=True):
+            for simulation in _simulations(period, frames):
+                is_first |= (numbers >= start) & (numbers < start + simulation // 2)
+                start += simulation
         return self._read_half(numbers[is_first], "first"), self._read_half(numbers[~is_first], "second")
 
     def _read_half(self, numbers: IntArray, which: str) -> _Half:
@@ -439,28 +441,56 @@ class _Designer:
         return designs
 
     def _other_groups(self) -> FrameGroups:
-        """Return groups of consecutive frames of the second half of each period."""
+        """Return the groups of the second half of each simulation."""
         record = self._other_half.record
         periods = read_periods(self._context.folder.tpog)
         recorded = recorded_frames(self._context.folder.trajectories)
         groups, starts, start = [], [], 0
         for period, frames in zip(periods, recorded, strict=True):
-            period_groups = _second_half_groups(period, frames)
+            period_groups, group_starts = second_half_groups(period, frames)
             groups.append(period_groups)
-            starts.append(start + frames // 2 + np.append(0, np.cumsum(period_groups.frames[:-1])))
+            starts.append(start + group_starts)
             start += frames
         first_rows = np.searchsorted(record.numbers[record.frame], np.concatenate(starts))
         return FrameGroups(tuple(groups), np.append(first_rows, len(record)), weights_in_mix(periods, recorded, record))
 
 
-def _second_half_groups(period: PeriodBlocks, frames: int) -> BlockGroups:
+def _simulations(period: PeriodBlocks, frames: int) -> list[int]:
+    """Return the number of recorded frames of each simulation of a period, one after another."""
+    return [len(part) for part in np.array_split(np.arange(frames), period.seeds)]
+
+
+def second_half_groups(period: PeriodBlocks, frames: int) -> tuple[BlockGroups, IntArray]:
+    """Return the groups of the frames that the search does not see, for standard errors.
+
+    With several seeds, the second half of each simulation is a group. With one, up to ten blocks of its second half are
+    joined as in :func:`egvs.scoring.standard_errors.block_groups`.
+
+    Parameters
+    ----------
+    period
+        The period.
+    frames
+        Number of its recorded frames.
+
+    Returns
+    -------
+    tuple
+        The groups, and the first frame of each, counted from the start of the period, (k,) int64.
+    """
+    if period.seeds > 1:
+        simulations = np.array(_simulations(period, frames), dtype=np.int64)
+        first_halves = simulations // 2
+        starts = np.cumsum(simulations) - simulations + first_halves
+        return BlockGroups(simulations - first_halves, period.memory_frames, are_seeds=True), starts
     half = frames - frames // 2
     blocks = min(_BLOCKS, half)
     sizes = group_sizes(blocks, half // blocks, period.memory_frames)
     lengths = [len(part) for part in np.array_split(np.arange(half), blocks)]
     ends = np.append(0, np.cumsum(sizes))
-    totals = [sum(lengths[first:last]) for first, last in pairwise(ends.tolist())]
-    return BlockGroups(np.array(totals, dtype=np.int64), period.memory_frames)
+    totals = np.array([sum(lengths[first:last]) for first, last in pairwise(ends.tolist())], dtype=np.int64)
+    starts = frames // 2 + np.cumsum(totals) - totals
+    return BlockGroups(totals, period.memory_frames), starts
 
 
 class _Search:

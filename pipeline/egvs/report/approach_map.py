@@ -1,7 +1,7 @@
 """A map of a junction with the names that counts use: streets, approaches, and the vehicles of each turn.
 
-Every approach has the letter of the side on which its vehicles arrive, at its road, and the counted vehicles per hour
-that turn left, drive straight on, turn right or turn back.
+Every approach has its name (street and side on which its vehicles arrive) at its road, and the counted vehicles per
+hour that turn left, drive straight on, turn right or make a U-turn.
 """
 
 from __future__ import annotations
@@ -20,33 +20,34 @@ from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import CountConfig
 from egvs.traffic.approach_queues import approach_paths, path_points
 from egvs.traffic.approaches import ApproachIndex, ApproachMovement
-from egvs.traffic.directions import Floats
+from egvs.traffic.directions import U_TURN, Floats
 from egvs.traffic.movements import MovementNames
 from egvs.traffic.network import read_net_xml
 
-_TURN_LABELS = {"left": "left", "straight": "straight", "right": "right", "back": "U-turn", "": "all"}
+_TURN_LABELS = {"left": "left", "straight": "straight", "right": "right", U_TURN: U_TURN, "": "all"}
 _MARGIN_M = 25.0
 _LABEL_AT_M = 32.0
 """Distance of a label from the stop line."""
 _LINE_HEIGHT = 14.0
+_BOLD_WIDTH = 1.15
+"""Width of bold letters, relative to the others."""
 _WIDTH = 420.0
 """Small, so that the text can be read on the screen of a telephone."""
 
 
 @dataclass(frozen=True)
 class ApproachLabel:
-    """An approach on the map: where it is (2,), side, street, and vehicles per hour by turn."""
+    """An approach on the map: where it is (2,), its name, and vehicles per hour by turn."""
 
     at_m: Floats
-    side: str
-    street: str
+    name: str
     per_hour: Mapping[str, float]
 
     @property
     def lines(self) -> tuple[str, ...]:
         """The text."""
         turns = [f"{_TURN_LABELS[turn]} {number:.0f}" for turn, number in self.per_hour.items() if number]
-        return f"{self.side} · {self.street or 'unnamed street'}", *turns
+        return self.name, *turns
 
 
 def busiest_counts(scenario: Scenario) -> tuple[str, tuple[CountConfig, ...]]:
@@ -70,7 +71,7 @@ def approach_labels(counts: Sequence[CountConfig], network: Path, center_m: tupl
         for movement in movements:
             per_hour[movement.turn] += movement.flow.per_hour
         at_m = path_points(paths[title].line_m, np.array([_LABEL_AT_M]))[0]
-        labels.append(ApproachLabel(at_m, movements[0].side, movements[0].street, per_hour))
+        labels.append(ApproachLabel(at_m, title, per_hour))
     return labels
 
 
@@ -100,10 +101,14 @@ def _draw_label(plan: MapFrame, label: ApproachLabel, covered: list[Box]) -> Ite
     y = min(max(plan.y(float(label.at_m[1])), plan.top + 12.0), plan.top + plan.frame_height - 12.0)
     box = _free_box(plan, (x, y), label, covered)
     covered.append(box)
-    left, top, right, _ = box
+    left, top, right, bottom = box
     text_x, anchor = (left, "start") if left > x else (right, "end")
-    if abs(top - y + _LINE_HEIGHT / 2) > _LINE_HEIGHT:
-        yield f'<path {plan.style.shape("lead")} d="M{x:.1f} {y:.1f}L{text_x:.1f} {top + _LINE_HEIGHT / 2:.1f}"/>'
+    if left <= x <= right:
+        end = x, top if top > y else bottom
+    else:
+        end = text_x, top + _LINE_HEIGHT / 2
+    if abs(end[1] - y) > _LINE_HEIGHT:
+        yield f'<path {plan.style.shape("lead")} d="M{x:.1f} {y:.1f}L{end[0]:.1f} {end[1]:.1f}"/>'
     yield f'<circle {plan.style.shape("spot")} cx="{x:.1f}" cy="{y:.1f}" r="4.5"/>'
     for number, line in enumerate(label.lines):
         position = f'x="{text_x:.1f}" y="{top + (number + 0.8) * _LINE_HEIGHT:.1f}" text-anchor="{anchor}"'
@@ -114,13 +119,17 @@ def _draw_label(plan: MapFrame, label: ApproachLabel, covered: list[Box]) -> Ite
 
 def _free_box(plan: MapFrame, at: tuple[float, float], label: ApproachLabel, covered: Sequence[Box]) -> Box:
     """Return the box of a label: the one nearest to its approach that covers no other, or else the first one."""
-    width, height = max(text_width(line) for line in label.lines), _LINE_HEIGHT * len(label.lines)
+    widths = [_BOLD_WIDTH * text_width(label.lines[0]), *(text_width(line) for line in label.lines[1:])]
+    width, height = max(widths), _LINE_HEIGHT * len(label.lines)
     x, y = at
     boxes = []
     for step in range(int(plan.frame_height / _LINE_HEIGHT)):
         for shift in dict.fromkeys((step, -step)):
             top = y + (shift - 0.5) * _LINE_HEIGHT
-            for left in (x + 10.0, x - 10.0 - width):
+            beside = [x + 10.0, x - 10.0 - width]
+            if top > y + 5.0 or top + height < y - 5.0:  # a long name may be above or below its disc
+                beside.append(min(max(x - width / 2, plan.left), plan.left + plan.frame_width - width))
+            for left in beside:
                 box = (left, top, left + width, top + height)
                 fits = plan.left <= box[0] and box[2] <= plan.left + plan.frame_width
                 if fits and plan.top <= top and box[3] <= plan.top + plan.frame_height:

@@ -48,7 +48,7 @@ class ApproachPath:
     Attributes
     ----------
     title
-        Side and street, from :func:`egvs.traffic.approaches.approach_title`.
+        Its name, from :func:`egvs.traffic.approach_names.approach_name`.
     line_m
         From the stop line backwards, shape (n, 2).
     half_width_m

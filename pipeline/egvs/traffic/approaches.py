@@ -1,8 +1,7 @@
-"""The approaches of a junction by the names that planners use: street, and side on which vehicles arrive.
+"""The approaches of a junction by the words of planners: street, and side on which vehicles arrive.
 
-An **approach** is named by the side of the junction on which its vehicles arrive: the vehicles of the approach ``N``
-come *from* the north and head south (southbound, "SB"). Sides are the nearest of eight compass points, measured over
-the last 30 m before the junction.
+The vehicles of the approach on the north side come *from* the north and head south (southbound, "SB"); its name is
+"North Street (north)", see :mod:`egvs.traffic.approach_names`.
 
 :class:`ApproachIndex` finds the movements that a planner's words mean. Names of streets are compared without case
 and punctuation, and with common abbreviations written out (St, Rd, Ave, Str., Straße).
@@ -17,7 +16,8 @@ from dataclasses import dataclass
 
 from egvs.core.errors import InputError
 from egvs.scenario.traffic_config import CountConfig
-from egvs.traffic.directions import CLOCKWISE, SIDES, Floats, arrival_side
+from egvs.traffic.approach_names import approach_name
+from egvs.traffic.directions import CLOCKWISE, COMPASS, U_TURN, Floats, arrival_side
 from egvs.traffic.movements import MovementNames
 from egvs.traffic.network import Edge
 
@@ -26,16 +26,17 @@ TURN_WORDS = {
     "straight": "straight", "straight on": "straight", "through": "straight", "thru": "straight", "t": "straight",
     "s": "straight",
     "right": "right", "r": "right",
-    "u-turn": "back", "uturn": "back", "u turn": "back", "u": "back", "back": "back",
+    "u-turn": U_TURN, "uturn": U_TURN, "u turn": U_TURN, "u": U_TURN, "back": U_TURN,
 }  # fmt: skip
 """What planners write for the turns of :data:`egvs.traffic.directions.TURNS`."""
 
+_LETTERS = dict(zip(COMPASS, ("e", "ne", "n", "nw", "w", "sw", "s", "se"), strict=True))
 _SIDE_WORDS = {
-    "n": "N", "north": "N", "ne": "NE", "north-east": "NE", "northeast": "NE", "e": "E", "east": "E",
-    "se": "SE", "south-east": "SE", "southeast": "SE", "s": "S", "south": "S", "sw": "SW", "south-west": "SW",
-    "southwest": "SW", "w": "W", "west": "W", "nw": "NW", "north-west": "NW", "northwest": "NW",
-}  # fmt: skip
-_BOUND = {f"{side.lower()}b": side for side in SIDES}
+    **{side: side for side in COMPASS},
+    **{side.replace("-", ""): side for side in COMPASS},
+    **{letters: side for side, letters in _LETTERS.items()},
+}
+_BOUND = {f"{letters}b": side for side, letters in _LETTERS.items()}
 """Abbreviations of headings: "nb" for northbound."""
 
 _ABBREVIATIONS = {
@@ -63,10 +64,10 @@ def normalise_street(name: str) -> str:
 
 
 def parse_side(text: str) -> str | None:
-    """Return the side on which vehicles arrive, a value of :data:`SIDES`; None if the text is no direction.
+    """Return the side on which vehicles arrive, a value of ``COMPASS``; None if the text is no direction.
 
     >>> parse_side("N"), parse_side("from north"), parse_side("northbound"), parse_side("NB")
-    ('N', 'N', 'S', 'S')
+    ('north', 'north', 'south', 'south')
     """
     word = " ".join(text.split()).casefold().removeprefix("from ").removeprefix("the ")
     if word in _SIDE_WORDS:
@@ -74,14 +75,14 @@ def parse_side(text: str) -> str | None:
     heading = _BOUND.get(word) or _SIDE_WORDS.get(word.removesuffix("bound").rstrip("- "))
     if heading is None:
         return None
-    return SIDES[(SIDES.index(heading) + 4) % 8]
+    return COMPASS[(COMPASS.index(heading) + 4) % 8]
 
 
 def parse_lane_group(text: str) -> tuple[str, tuple[str, ...]] | None:
     """Return side and turns of a lane group as signal engineers write it; None for other words.
 
     >>> parse_lane_group("NBL"), parse_lane_group("EBTR")
-    (('S', ('left',)), ('W', ('straight', 'right')))
+    (('south', ('left',)), ('west', ('straight', 'right')))
     """
     match = _LANE_GROUP.fullmatch(text.strip().upper())
     if match is None:
@@ -89,6 +90,24 @@ def parse_lane_group(text: str) -> tuple[str, tuple[str, ...]] | None:
     side = parse_side(match[1])
     assert side is not None
     return side, tuple(dict.fromkeys(TURN_WORDS[letter.casefold()] for letter in match[2]))
+
+
+def approach_spellings(side: str, street: str) -> frozenset[str]:
+    """Return what a user may write for an approach, in the form of :func:`normalise_street`.
+
+    >>> normalise_street("North St. (north)") in approach_spellings("north", "North Street")
+    True
+    >>> former = normalise_street("N (Mill Ln)"), normalise_street("north Mill Lane")
+    >>> approach_spellings("north", "Mill Lane").issuperset(former)
+    True
+    """
+    names = (
+        approach_name(side, street),
+        f"{side} {street}",
+        f"{_LETTERS[side]} {street}",
+        f"{street} {_LETTERS[side]}",
+    )
+    return frozenset(normalise_street(name) for name in names)
 
 
 @dataclass(frozen=True)
@@ -114,13 +133,12 @@ class ApproachMovement:
 
     @property
     def approach_title(self) -> str:
-        """E.g. ``"N (Main Street)"``."""
-        return approach_title(self.side, self.street)
+        """E.g. ``"Main Street (north)"``."""
+        return approach_name(self.side, self.street)
 
-
-def approach_title(side: str, street: str) -> str:
-    """Return an approach in words."""
-    return f"{side} ({street})" if street else side
+    def is_called(self, name: str) -> bool:
+        """Whether a name in the form of :func:`normalise_street` is its street, or its approach."""
+        return name == normalise_street(self.street) or name in approach_spellings(self.side, self.street)
 
 
 @dataclass(frozen=True)
@@ -149,6 +167,24 @@ class ApproachIndex:
             )
         return cls(tuple(movements))
 
+    def parse_approach(self, text: str, where: str) -> tuple[str, str]:
+        """Return street (empty if the text has none) and side of an approach that a planner means.
+
+        Raises
+        ------
+        InputError
+            When the text is neither a direction nor the name of an approach.
+        """
+        side = parse_side(text)
+        if side is not None:
+            return "", side
+        name = normalise_street(text)
+        for move in self.movements:
+            if name in approach_spellings(move.side, move.street):
+                return move.street, move.side
+        problem = f"expected the side on which vehicles arrive, got {text!r}"
+        raise InputError(f"{where}: approach", problem, f"Use N, north or southbound. {self.hint}")
+
     def find(self, street: str, side: str | None, turns: Sequence[str], where: str) -> list[ApproachMovement]:
         """Return the movements that a planner means.
 
@@ -170,13 +206,13 @@ class ApproachIndex:
             When no approach, several different approaches, or no movement has these names.
         """
         name = normalise_street(street)
-        candidates = [move for move in self.movements if not name or normalise_street(move.street) == name]
+        candidates = [move for move in self.movements if not name or move.is_called(name)]
         if not candidates:
             raise InputError(where, f"no approach of the junction is called {street!r}", self.hint)
         if side is not None:
             near = [move for move in candidates if _side_distance(move.side, side) <= 1]
             candidates = [move for move in near if move.side == side] or near
-        words = " ".join(word for word in (street, f"from {side}" if side else "") if word)
+        words = " ".join(word for word in (street, f"from the {side}" if side else "") if word)
         approaches = dict.fromkeys(move.approach_title for move in candidates)
         if not approaches:
             raise InputError(where, f"no approach of the junction is {words!r}", self.hint)
@@ -187,7 +223,7 @@ class ApproachIndex:
         missing = sorted(set(turns) - {move.turn for move in moves})
         if missing:
             known = ", ".join(sorted({move.turn for move in candidates if move.turn})) or "none"
-            problem = f"no vehicle can go {' or '.join(missing)} from {next(iter(approaches))}"
+            problem = f"the approach {next(iter(approaches))} has no movement {' or '.join(missing)}"
             raise InputError(where, problem, f"Its turns are: {known}.")
         return moves
 
@@ -199,11 +235,11 @@ class ApproachIndex:
     @property
     def titles(self) -> list[str]:
         """The approaches, in the order of the compass."""
-        sides = sorted(self.movements, key=lambda move: (CLOCKWISE.index(SIDES.index(move.side)), move.street))
+        sides = sorted(self.movements, key=lambda move: (CLOCKWISE.index(COMPASS.index(move.side)), move.street))
         return list(dict.fromkeys(move.approach_title for move in sides))
 
 
 def _side_distance(first: str, second: str) -> int:
     """Return the number of compass points between two sides, 0 to 4."""
-    apart = abs(SIDES.index(first) - SIDES.index(second))
+    apart = abs(COMPASS.index(first) - COMPASS.index(second))
     return min(apart, 8 - apart)

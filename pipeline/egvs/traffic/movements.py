@@ -1,13 +1,13 @@
-"""Movements in words: "westbound on High Street, left to Station Road".
+"""Movements in words: "High Street (east), left to Station Road".
 
-The directions are those at the junction, not at the edges of the count, which may be far from it.
+The approach is that at the junction (:mod:`egvs.traffic.approach_names`), not the edge of the count, which may be far
+from it.
 
 World frame, in plan: x east, y north, metres.
 """
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -15,26 +15,23 @@ from typing import NamedTuple
 import numpy as np
 
 from egvs.core.errors import InputError
+from egvs.traffic.approach_names import ApproachNames, plain_text
 from egvs.traffic.demand import RouteFinder
-from egvs.traffic.directions import TURNS, Floats, compass
+from egvs.traffic.directions import TURNS, U_TURN, Floats
 from egvs.traffic.network import CAR, Edge, Network
 
-_WAYS = {"straight": "straight on", "left": "left", "right": "right", "back": "U-turn"}
+_WAYS = {"straight": "straight on", "left": "left", "right": "right", U_TURN: U_TURN}
 _UNNAMED_STREET = "an unnamed street"
-
-_HEADING_OVER_M = 30.0
-"""The direction of a movement is that of the last metres before the junction, and of the first ones after it."""
 
 _STRAIGHT_DEG, _BACK_DEG = 45.0, 135.0
 """Changes of direction that are not yet a turn, and more than a turn."""
 
 
 class _Passage(NamedTuple):
-    """How a movement passes a junction: the edges to it and from it, and the middle of a roundabout."""
+    """How a movement passes a junction: the edges to it and from it."""
 
     to_junction: Sequence[Edge]
     from_junction: Sequence[Edge]
-    ring_middle_m: Floats | None
 
 
 class Movement(NamedTuple):
@@ -72,6 +69,7 @@ class MovementNames:
     def __init__(self, network: Network, center_m: tuple[float, float]) -> None:
         self._center_m = center_m
         self._edges = {edge.id: edge for edge in network.edges}
+        self._approaches = ApproachNames(network)
         self._nodes_m = {node.id: node.at_m for node in network.junctions}
         self._roundabouts = [set(roundabout.nodes) for roundabout in network.roundabouts]
         self._routes = RouteFinder(network, CAR)
@@ -96,20 +94,19 @@ class MovementNames:
         Returns
         -------
         str
-            For example ``"westbound on High Street, left to Station Road"``.
+            For example ``"High Street (east), left to Station Road"``.
         """
         first = self._edges[from_edge]
         if to_edge is None:
-            return f"{compass(_end_heading([first]))}bound on {_street(first)}"
+            return self._approaches.approach(first.id)
 
         passage = self._passage(first, self._edges[to_edge])
         approach, way_out = passage.to_junction[-1], passage.from_junction[0]
-        before, after = _headings(passage)
-        words = f"{compass(before)}bound on {_street(approach)}"
+        words = self._approaches.approach(approach.id)
         if first.name not in ("", approach.name):
             words += f" from {_street(first)}"
 
-        turn = self._turns.get((approach.id, way_out.id)) or _turn_between(before, after)
+        turn = self._turn(passage)
         last = passage.from_junction[-1]
         towards = f" towards {_street(last)}" if last.name not in ("", way_out.name) else ""
         if turn == "straight" and approach.name == way_out.name:
@@ -120,19 +117,25 @@ class MovementNames:
         """Return approach and turn of a movement; parameters as of :meth:`describe`."""
         first = self._edges[from_edge]
         if to_edge is None:
-            return Movement((first,), plain_text(first.name), _end_heading([first]), "")
+            return Movement((first,), self._approaches.street(first.id), self._approaches.heading(first.id), "")
         passage = self._passage(first, self._edges[to_edge])
-        before, after = _headings(passage)
-        approach = passage.to_junction[-1]
-        turn = self._turns.get((approach.id, passage.from_junction[0].id)) or _turn_between(before, after)
-        return Movement(tuple(passage.to_junction), plain_text(approach.name), before, turn)
+        edge = passage.to_junction[-1].id
+        street, heading = self._approaches.street(edge), self._approaches.heading(edge)
+        return Movement(tuple(passage.to_junction), street, heading, self._turn(passage))
+
+    def _turn(self, passage: _Passage) -> str:
+        """Return SUMO's turn where a connection joins the edges at the junction, otherwise that of their directions."""
+        ends = passage.to_junction[-1].id, passage.from_junction[0].id
+        if ends in self._turns:
+            return self._turns[ends]
+        return _turn_between(self._approaches.heading(ends[0]), self._approaches.exit_heading(ends[1]))
 
     def _passage(self, first: Edge, last: Edge) -> _Passage:
         """Find the junction on the fastest way between two edges."""
         try:
             ids = self._routes.locate(first.id, last.id, "movement").edges
         except InputError:  # cars may not drive there: the two edges describe the movement
-            return _Passage([first], [last], None)
+            return _Passage([first], [last])
         way = [self._edges[edge_id] for edge_id in ids]
         nodes = [edge.to_node for edge in way[:-1]]
         distances_m = [math.dist(self._nodes_m[node], self._center_m) for node in nodes]
@@ -141,53 +144,13 @@ class MovementNames:
         for ring in self._roundabouts:
             if nodes[nearest] in ring:
                 on_ring = [index for index, node in enumerate(nodes) if node in ring]
-                middle_m = np.mean([self._nodes_m[node] for node in sorted(ring)], axis=0)
-                return _Passage(way[: on_ring[0] + 1], way[on_ring[-1] + 1 :], middle_m)
-        return _Passage(way[: nearest + 1], way[nearest + 1 :], None)
-
-
-def _headings(passage: _Passage) -> tuple[Floats, Floats]:
-    """Return the directions before and after a junction, (2,) each; of a roundabout, to and from its middle."""
-    middle_m = passage.ring_middle_m
-    if middle_m is None:
-        return _end_heading(passage.to_junction), _start_heading(passage.from_junction)
-    far_before_m = _point_along(_middle_line(passage.to_junction)[::-1])
-    far_after_m = _point_along(_middle_line(passage.from_junction))
-    return middle_m - far_before_m, far_after_m - middle_m
-
-
-def _end_heading(edges: Sequence[Edge]) -> Floats:
-    line_m = _middle_line(edges)[::-1]
-    heading: Floats = line_m[0] - _point_along(line_m)
-    return heading
-
-
-def _start_heading(edges: Sequence[Edge]) -> Floats:
-    line_m = _middle_line(edges)
-    heading: Floats = _point_along(line_m) - line_m[0]
-    return heading
-
-
-def _middle_line(edges: Sequence[Edge]) -> Floats:
-    """Return the first lanes of edges, one after another, in plan, (n, 2)."""
-    return np.vstack([edge.lanes[0].shape_m[:, :2] for edge in edges])
-
-
-def _point_along(line_m: Floats) -> Floats:
-    """Return the point of a line at :data:`_HEADING_OVER_M` from its start, or its end if it is shorter, (2,)."""
-    distance_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(line_m, axis=0).T)))
-    return np.array([np.interp(_HEADING_OVER_M, distance_m, line_m[:, axis]) for axis in (0, 1)])
+                return _Passage(way[: on_ring[0] + 1], way[on_ring[-1] + 1 :])
+        return _Passage(way[: nearest + 1], way[nearest + 1 :])
 
 
 def _street(edge: Edge) -> str:
     """Return the name of an edge's street on one line."""
     return plain_text(edge.name) or _UNNAMED_STREET
-
-
-def plain_text(name: str) -> str:
-    """Return a name of a network on one line; netconvert escapes names twice."""
-    printable = (character if character.isprintable() else " " for character in html.unescape(name))
-    return " ".join("".join(printable).split())
 
 
 def _turn_between(before: Floats, after: Floats) -> str:
@@ -197,5 +160,5 @@ def _turn_between(before: Floats, after: Floats) -> str:
     if abs(turned_deg) <= _STRAIGHT_DEG:
         return "straight"
     if abs(turned_deg) > _BACK_DEG:
-        return "back"
+        return U_TURN
     return "left" if turned_deg > 0 else "right"

@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 LANE_WIDTH_M, DEFAULT_SPEED_M_S = 3.2, 13.89
 """SUMO's defaults for lanes without a width or a speed limit."""
 
-_TURNAROUNDS = ("t", "T")
+TURNAROUNDS = ("t", "T")
+"""SUMO's directions of connections back to the road from which a vehicle comes."""
 _SHAPE_WITH_HEIGHT = re.compile(rb"(?:^|\s)[^,\s]+,[^,\s]+,[^,\s]+(?:\s|$)")
 """A point with a third coordinate, which SUMO omits where it is 0."""
 
@@ -143,6 +144,8 @@ class Edge:
     lanes: tuple[Lane, ...]
     type: str = ""
     """Type of the road, e.g. ``"highway.primary"``; may be empty."""
+    crossed_edges: tuple[str, ...] = ()
+    """Ids of the roads that a crossing crosses."""
 
     @cached_property
     def start_m(self) -> tuple[float, float]:
@@ -307,7 +310,7 @@ class Network:
             target_lane = self.edges[connection.target].lanes[connection.target_lane]
             permissions = (source_lane.permission, target_lane.permission, connection.permission)
             if all(permission.admits(vclass) for permission in permissions):
-                is_turnaround = connection.direction in _TURNAROUNDS
+                is_turnaround = connection.direction in TURNAROUNDS
                 usable.append((connection.source, connection.target, int(is_turnaround)))
         return np.array(usable, dtype=np.int64).reshape(-1, 3)
 
@@ -495,7 +498,8 @@ def _parse_location(element: Element) -> Location:
 def _parse_edge(element: Element, path: Path) -> Edge:
     function, start, end, name, kind = (element.get(key, "") for key in ("function", "from", "to", "name", "type"))
     lanes = tuple(_parse_lane(lane, path) for lane in element.iter("lane"))
-    edge = Edge(element.attrib["id"], function, start, end, name, lanes, kind)
+    crossed = tuple(element.get("crossingEdges", "").split())
+    edge = Edge(element.attrib["id"], function, start, end, name, lanes, kind, crossed)
     if not function:
         if not start or not end:
             raise KeyError("to" if start else "from")

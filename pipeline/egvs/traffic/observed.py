@@ -16,7 +16,7 @@ from pathlib import Path
 from egvs.core.errors import InputError, find_misspelling
 from egvs.formats import csv_tables
 from egvs.scenario.model import Scenario
-from egvs.traffic.approaches import ApproachIndex, parse_side
+from egvs.traffic.approaches import ApproachIndex
 from egvs.traffic.movements import MovementNames
 from egvs.traffic.network import Network
 
@@ -87,15 +87,12 @@ def _check_header(path: Path, header: list[str]) -> list[str]:
 
 
 def _parse_row(where: str, values: Mapping[str, str], index: ApproachIndex, periods: Sequence[str]) -> Observation:
-    side = None
+    street, side = "", None
     if values.get("approach"):
-        side = parse_side(values["approach"])
-        if side is None:
-            problem = f"expected the side on which vehicles arrive, got {values['approach']!r}"
-            raise InputError(f"{where}: approach", problem, f"Use N, north or southbound. {index.hint}")
+        street, side = index.parse_approach(values["approach"], where)
     if side is None and not values.get("street"):
         raise InputError(where, "names no approach", index.hint)
-    title = index.find(values.get("street", ""), side, (), where)[0].approach_title
+    title = index.find(values.get("street") or street, side, (), where)[0].approach_title
     period = values.get("period", "")
     if (period or periods) and period not in periods:
         known = f"Periods: {', '.join(periods)}." if periods else "The scenario has no periods; remove the column."

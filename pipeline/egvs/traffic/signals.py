@@ -1,7 +1,7 @@
 """Read the traffic signals of a network: their programs, and the links that these govern.
 
 A signal governs links, one for each way from lane to lane or over a crossing; each belongs to a movement of an approach
-("north Main Street: left"). Two links that conflict are foes in the network.
+("Main Street (north) left"). Two links that conflict are foes in the network.
 
 World frame, metres, seconds.
 """
@@ -18,18 +18,19 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from egvs.core.errors import InputError
+from egvs.core.wording import shorten_id
 from egvs.formats import xml
 from egvs.traffic import network
-from egvs.traffic.directions import TURNS, Floats, compass, lane_heading
-from egvs.traffic.movements import plain_text
+from egvs.traffic.approach_names import ApproachNames, disambiguate_approaches
+from egvs.traffic.directions import TURNS, U_TURN, Floats
 from egvs.traffic.signal_clock import PARAM as CLOCK_PARAM
 from egvs.traffic.signal_clock import SignalClock
 
 GREEN_LETTERS = frozenset("Gg")
 YELLOW_LETTERS = frozenset("yY")
 
-CROSSING = "crossing"
-MOVEMENTS = ("left", "straight", "right", "back", CROSSING)
+CROSSING = "crosswalk"
+MOVEMENTS = ("left", "straight", "right", U_TURN, CROSSING)
 
 _PROGRAM = re.compile(r"    <tlLogic id=(\"[^\"]*\").*?</tlLogic>\n", re.DOTALL)
 
@@ -43,15 +44,17 @@ class Link:
     index
         Its position in the states of the program.
     approach
-        Compass direction and street that it comes from; of a crossing, the arm that it crosses.
+        Name of the approach that it comes from; of a crossing, of the arm that it crosses.
     movement
         One of :data:`MOVEMENTS`.
     edge, street
         Edge of the approach, and its street; empty for a crossing, and for a street without a name.
     heading
-        Direction of travel at the stop line, (2,); None for a crossing.
+        Direction in which vehicles arrive, (2,); None for a crossing.
     foes, yields_to
         Positions of the links that conflict with it, and of those that it gives way to.
+    side
+        Side of the junction where the approach lies.
     """
 
     index: int
@@ -62,6 +65,7 @@ class Link:
     heading: Floats | None
     foes: frozenset[int] = frozenset()
     yields_to: frozenset[int] = frozenset()
+    side: str = ""
 
     @property
     def title(self) -> str:
@@ -181,8 +185,22 @@ class Signal:
 
     @property
     def streets(self) -> tuple[str, ...]:
-        """Names of its streets."""
-        return tuple(dict.fromkeys(link.street for link in self.links if link.street))
+        """Names of its streets, sorted, as in the title of a junction."""
+        return tuple(sorted({link.street for link in self.links if link.street}))
+
+    @property
+    def title(self) -> str:
+        """Its streets and its id in brackets, shortened, e.g. ``"High Street / Mill Lane (cluster_123456789_9…)"``."""
+        return self.titled(shorten_id(self.id))
+
+    def titled(self, name: str) -> str:
+        """Return its streets, and in brackets its id as it is given."""
+        return f"{' / '.join(self.streets)} ({name})" if self.streets else name
+
+    def is_called(self, name: str) -> bool:
+        """Whether a name is its id, or that of one of its junctions; also as it is shortened in messages."""
+        ids = {self.id, *self.nodes}
+        return name in ids | {shorten_id(each) for each in ids}
 
     @property
     def states(self) -> int:
@@ -197,7 +215,7 @@ class _NetworkParts:
     connections: list[dict[str, str]] = field(default_factory=list)
     requests: dict[str, list[dict[str, str]]] = field(default_factory=dict)
     programs: dict[str, Program] = field(default_factory=dict)
-    crossed_edges: dict[str, list[str]] = field(default_factory=dict)
+    crossings: set[str] = field(default_factory=set)
 
 
 def read_signals(path: Path, roads: network.Network) -> tuple[Signal, ...]:
@@ -225,23 +243,27 @@ def read_signals(path: Path, roads: network.Network) -> tuple[Signal, ...]:
             elif element.tag == "tlLogic":
                 parts.programs[element.attrib["id"]] = Program.from_element(element)
             elif element.tag == "edge" and element.get("function") == "crossing":
-                parts.crossed_edges[element.attrib["id"]] = element.get("crossingEdges", "").split()
+                parts.crossings.add(element.attrib["id"])
         except (KeyError, ValueError) as error:
             raise InputError(path, f"invalid <{element.tag}> of a signal ({error!r})", "Use netconvert.") from None
     by_signal: dict[str, list[dict[str, str]]] = {}
     for connection in parts.connections:
         by_signal.setdefault(connection["tl"], []).append(connection)
+    approaches = ApproachNames(roads)
     signals = []
     for name, connections in by_signal.items():
         if name in parts.programs:
-            signals.append(_read_signal(name, connections, parts, roads))
+            signals.append(_read_signal(name, connections, parts, roads, approaches))
     return tuple(signals)
 
 
 def _read_signal(
-    name: str, connections: Sequence[Mapping[str, str]], parts: _NetworkParts, roads: network.Network
+    name: str,
+    connections: Sequence[Mapping[str, str]],
+    parts: _NetworkParts,
+    roads: network.Network,
+    approaches: ApproachNames,
 ) -> Signal:
-    edges = {edge.id: edge for edge in roads.all_edges}
     positions: dict[tuple[str, int], int] = {}  # of the links, by junction and position among its requests
     keys = []
     for connection in connections:
@@ -249,8 +271,9 @@ def _read_signal(
         positions[key] = int(connection["linkIndex"])
         keys.append(key)
 
-    incoming = {connection["from"] for connection in connections if not connection["from"].startswith(":")}
-    names = _approach_names([edges[edge] for edge in sorted(incoming)])
+    incoming = sorted({connection["from"] for connection in connections if not connection["from"].startswith(":")})
+    titles = disambiguate_approaches([approaches.approach(edge) for edge in incoming], incoming)
+    names = dict(zip(incoming, titles, strict=True))
     links = []
     for connection, (node, number) in zip(connections, keys, strict=True):
         request = next((each for each in parts.requests[node] if int(each["index"]) == number), {})
@@ -259,15 +282,14 @@ def _read_signal(
             for key in ("foes", "response")
         )
         start = connection["from"]
+        index = int(connection["linkIndex"])
         if start in names:
-            lane = edges[start].lanes[int(connection["fromLane"])]
             movement = TURNS.get(connection.get("dir", ""), "straight")
-            heading = lane_heading(lane, at_end=True)
-            street = plain_text(edges[start].name)
-            link = Link(int(connection["linkIndex"]), names[start], movement, start, street, heading, foes, yields_to)
+            street, heading, side = approaches.street(start), approaches.heading(start), approaches.side(start)
+            link = Link(index, names[start], movement, start, street, heading, foes, yields_to, side)
         else:
-            arm = _crossed_arm(parts.crossed_edges.get(connection["to"], ()), names, edges)
-            link = Link(int(connection["linkIndex"]), arm, CROSSING, "", "", None, foes, yields_to)
+            arm = approaches.crossed_arm(connection["to"])
+            link = Link(index, names.get(arm.edge, arm.name), CROSSING, "", "", None, foes, yields_to, arm.side)
         links.append(link)
         if "linkIndex2" in connection:
             links.append(replace(link, index=int(connection["linkIndex2"])))
@@ -283,9 +305,9 @@ def _request_key(connection: Mapping[str, str], parts: _NetworkParts) -> tuple[s
     Internal edges are numbered by the first of their links; the crossings are the last requests of a junction.
     """
     to = connection["to"]
-    if to in parts.crossed_edges:
+    if to in parts.crossings:
         node, _, number = to[1:].rpartition("_c")
-        crossings = sum(name.startswith(f":{node}_c") for name in parts.crossed_edges)
+        crossings = sum(name.startswith(f":{node}_c") for name in parts.crossings)
         return node, len(parts.requests[node]) - crossings + int(number)
     node, first, lane = connection["via"][1:].rsplit("_", 2)
     return node, int(first) + int(lane)
@@ -294,29 +316,6 @@ def _request_key(connection: Mapping[str, str], parts: _NetworkParts) -> tuple[s
 def request_bits(bits: str) -> set[int]:
     """Return the links in ``foes`` or ``response`` of a request; the last letter is that of link 0."""
     return {index for index, bit in enumerate(reversed(bits)) if bit == "1"}
-
-
-def _approach_names(edges: Sequence[network.Edge]) -> dict[str, str]:
-    """Return the name of each approach by the id of its edge: where it comes from, and its street."""
-    names = {}
-    for edge in edges:
-        words = [compass(-lane_heading(edge.lanes[0], at_end=True))]
-        names[edge.id] = " ".join([*words, plain_text(edge.name)]).strip()
-    listed = list(names.values())
-    return {edge: name if listed.count(name) == 1 else f"{name} ({edge})" for edge, name in names.items()}
-
-
-def _crossed_arm(crossed: Sequence[str], names: Mapping[str, str], edges: Mapping[str, network.Edge]) -> str:
-    """Return the approach of the arm that a crossing crosses; where only its exit is crossed, the one beside it."""
-    for edge in crossed:
-        if edge in names:
-            return names[edge]
-    for edge in crossed:
-        if edge in edges:
-            side = compass(lane_heading(edges[edge].lanes[0], at_end=False))
-            beside = [name for name in names.values() if name.partition(" ")[0] == side]
-            return beside[0] if beside else side
-    return "the junction"
 
 
 def replace_programs(text: str, programs: Mapping[str, Program]) -> str:

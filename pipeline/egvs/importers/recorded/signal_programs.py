@@ -32,14 +32,16 @@ from shapely.geometry import LineString, Point
 from egvs.core import files
 from egvs.core.errors import InputError, RunError
 from egvs.core.grid import FloatArray
+from egvs.core.wording import by_number, number_of
 from egvs.formats import xml
 from egvs.formats.georeference import WorldFrame
 from egvs.importers.plain_network import NETCONVERT_FLAGS, NETWORK_FILE
 from egvs.importers.recorded.signal_assignment import Approach, RecordedMotion, green_share, guess_lights, is_opposite
 from egvs.importers.recorded.signals import GREEN, RED, YELLOW, GroupOfEdges, RecordedSignals, SignalRecord
 from egvs.traffic import estimates, sumo
-from egvs.traffic.directions import compass
+from egvs.traffic.approach_names import ApproachNames
 from egvs.traffic.estimates import Estimate
+from egvs.traffic.network import read_net_xml
 from egvs.traffic.signal_clock import SignalClock
 from egvs.traffic.signals import Phase, Program, replace_programs, request_bits
 
@@ -129,11 +131,12 @@ class _Link:
 
 @dataclass
 class _Junction:
-    """The signal of a junction: program, links, and for each link those that it gives way to."""
+    """The signal of a junction: program, links, for each link those that it gives way to, and names of approaches."""
 
     program: str
     links: list[_Link] = field(default_factory=list)
     yields_to: dict[int, set[int]] = field(default_factory=dict)
+    titles: dict[str, str] = field(default_factory=dict)
 
     @property
     def connections(self) -> list[_Link]:
@@ -240,7 +243,7 @@ def _guess_groups(
     guesses = guess_lights(approaches, signals.records, motion)
     if not guesses:
         problem = "no file says which lanes each signal group governs, and recorded road users do not show it either"
-        names = ", ".join(f"{approach.edge} (from the {compass(-_direction(approach))})" for approach in approaches)
+        names = ", ".join(f"{approach.edge} ({junction.titles[approach.edge]})" for approach in approaches)
         hint = f"Add a CSV file with the columns {', '.join(GroupOfEdges.COLUMNS)}; the roads are {names}."
         raise InputError(where, problem, hint)
     roads: dict[tuple[str, str], list[str]] = {}
@@ -268,11 +271,6 @@ def _approaches(junction: _Junction) -> list[Approach]:
             if is_opposite(direction_rad, away_rad):
                 ends_m[edge][tuple(link.exit_m[0].tolist())] = None
     return [Approach(edge, np.array(list(points_m)), directions_rad[edge]) for edge, points_m in ends_m.items()]
-
-
-def _direction(approach: Approach) -> FloatArray:
-    """Return the unit vector in which vehicles of an approach drive, (2,)."""
-    return np.array([np.cos(approach.direction_rad), np.sin(approach.direction_rad)])
 
 
 def _direction_rad(points_m: FloatArray) -> float:
@@ -340,6 +338,8 @@ def _read_junction(path: Path, node: str) -> _Junction:
             ends_m = path_m[0][-2:], path_m[-1][:2]
             link = _Link(index, start, end, np.vstack(path_m), *ends_m, turns, crossed.get(end, frozenset()))
             junction.links.append(link)
+    names = ApproachNames(read_net_xml(path))
+    junction.titles = {link.from_edge: names.approach(link.from_edge) for link in junction.connections}
     governed = {lane.rsplit("_", 2)[0].removeprefix(":") for lane in link_of_lane}
     if governed == {node}:
         junction.yields_to = _yields_to(internal_lanes[node], requests[node], link_of_lane)
@@ -502,7 +502,7 @@ def _notes(
         seconds = f"{clock.from_s:.1f} to {clock.to_s:.1f} s"
         program = f"The signals replay the record from {seconds} on the clock of the tracks"
     yield (
-        f"{program}; median of {lengths.n} recorded cycles"
+        f"{program}; median of {number_of(lengths.n, 'recorded cycle')}"
         f" {lengths.value:.1f} s ({lengths.low:.1f} to {lengths.high:.1f} s)."
     )
     texts = []
@@ -511,7 +511,7 @@ def _notes(
         offsets_s = [(start_s - cycle.begin_s) % cycle.length_s for start_s in record.green_starts_s]
         text = f"{name}: no complete green"
         if green is not None:
-            greens = f"{green.n} {'green' if green.n == 1 else 'greens'}"
+            greens = number_of(green.n, "green")
             text = f"{name}: {green.value:.1f} s ({green.low:.1f} to {green.high:.1f}, {greens})"
         in_cycle_s = [
             start_s - cycle.begin_s for start_s in record.green_starts_s if cycle.begin_s <= start_s < cycle.end_s
@@ -522,10 +522,13 @@ def _notes(
     yield f"Green of each signal group, {meaning}: {'; '.join(texts)}."
     free = sum(link.index not in groups for link in junction.connections)
     if free:
-        yield f"{free} of {len(junction.connections)} connections have no recorded signal; vehicles there give way."
+        yield (
+            f"{free} of {number_of(len(junction.connections), 'connection')} {by_number(free, 'has', 'have')}"
+            " no recorded signal; vehicles there give way."
+        )
     crossings = sum(bool(link.crossed_edges) and link.index not in groups for link in junction.links)
     if crossings:
-        yield f"{crossings} crossings have no recorded signal; they are green while the vehicles they cross have red."
+        yield f"{number_of(crossings, 'crossing')} without recorded signal: green while the crossed vehicles have red."
 
 
 def _agreement_notes(
@@ -535,6 +538,9 @@ def _agreement_notes(
     by_edges = {(link.from_edge, link.to_edge): groups[link.index] for link in junction.links if link.index in groups}
     in_green, count = green_share(by_edges, records, motion)
     if count:
-        text = f"{in_green} of {count} recorded vehicles ({in_green / count:.0%}) pass the stop line in green or yellow"
+        text = (
+            f"{in_green} of {number_of(count, 'recorded vehicle')} ({in_green / count:.0%}) pass the stop"
+            " line in green or yellow"
+        )
         doubtful = in_green < MIN_IN_GREEN * count
         yield f"{text}{': check the clock and the assignment of the signals' if doubtful else ''}."

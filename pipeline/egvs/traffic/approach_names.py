@@ -1,0 +1,207 @@
+"""The one name of an approach: its street, and the side of the junction where it lies: "North Street (north)".
+
+The approach from the north lies on the north side, and its vehicles drive south. Exits and crosswalks are named after
+the arm that they belong to in the same way, so that counts, signal plans, zones, lanes and crosswalks of one arm share
+one name.
+
+**Side.** The nearest of eight compass points to the direction from the junction along the last :data:`HEADING_OVER_M`
+of the road (of an exit: the first ones). A shorter road is followed back while a single road leads to it. At a
+roundabout, the direction is that from the middle of its ring.
+
+World frame, in plan: x east, y north, metres.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from egvs.traffic.directions import Floats, arrival_side, compass
+from egvs.traffic.network import TURNAROUNDS, Edge, Network
+
+HEADING_OVER_M = 30.0
+"""The direction of a road at a junction is that of its last metres before it, or of its first ones after it."""
+
+
+def approach_name(side: str, street: str) -> str:
+    """Return the name of an approach.
+
+    Parameters
+    ----------
+    side
+        Side of the junction where it lies, a value of :data:`~egvs.traffic.directions.COMPASS`; may be empty.
+    street
+        Its street; may be empty.
+
+    >>> approach_name("north", "North Street"), approach_name("north", ""), approach_name("", "North Street")
+    ('North Street (north)', 'north', 'North Street')
+    """
+    return f"{street} ({side})" if street and side else street or side
+
+
+def crosswalk_name(approach: str) -> str:
+    """Return the name of the crosswalk over the arm of an approach.
+
+    >>> crosswalk_name(approach_name("north", "North Street"))
+    'North Street (north) crosswalk'
+    """
+    return f"{approach} crosswalk"
+
+
+def plain_text(name: str) -> str:
+    """Return a name of a network on one line; netconvert escapes names twice."""
+    printable = (character if character.isprintable() else " " for character in html.unescape(name))
+    return " ".join("".join(printable).split())
+
+
+class Arm(NamedTuple):
+    """Side and street of an arm of a junction, and the id of the edge of its approach; each may be empty."""
+
+    side: str
+    street: str
+    edge: str
+
+    @property
+    def name(self) -> str:
+        """The name of its approach; "junction" where nothing is known."""
+        return approach_name(self.side, self.street) or "junction"
+
+
+class ApproachNames:
+    """Names the approaches, exits and crosswalks of a network.
+
+    Parameters
+    ----------
+    network
+        Its edges should have names (netconvert's ``--output.street-names``).
+    """
+
+    def __init__(self, network: Network) -> None:
+        self._edges = {edge.id: edge for edge in network.all_edges}
+        self._nodes_m = {node.id: np.asarray(node.at_m) for node in network.junctions}
+        self._rings = [frozenset(roundabout.nodes) for roundabout in network.roundabouts]
+        before: dict[str, set[str]] = {}
+        after: dict[str, set[str]] = {}
+        for connection in network.connections:
+            if connection.direction not in TURNAROUNDS:
+                source, target = network.edges[connection.source].id, network.edges[connection.target].id
+                before.setdefault(target, set()).add(source)
+                after.setdefault(source, set()).add(target)
+        self._previous = {edge: min(others) for edge, others in before.items() if len(others) == 1}
+        self._next = {edge: min(others) for edge, others in after.items() if len(others) == 1}
+
+    def heading(self, edge_id: str) -> Floats:
+        """Return the direction (2,) in which vehicles arrive at the end of an edge, not normalised."""
+        line_m = self._line_back(edge_id)
+        edge = self._edges[edge_id]
+        middle_m = self._ring_middle_m(edge.to_node, edge.from_node)
+        there_m = line_m[0] if middle_m is None else middle_m
+        heading: Floats = there_m - point_along(line_m, HEADING_OVER_M)
+        return heading
+
+    def exit_heading(self, edge_id: str) -> Floats:
+        """Return the direction (2,) in which vehicles leave a junction on an edge, not normalised."""
+        line_m = self._line_ahead(edge_id)
+        edge = self._edges[edge_id]
+        middle_m = self._ring_middle_m(edge.from_node, edge.to_node)
+        there_m = line_m[0] if middle_m is None else middle_m
+        heading: Floats = point_along(line_m, HEADING_OVER_M) - there_m
+        return heading
+
+    def side(self, edge_id: str) -> str:
+        """Return the side of its junction where an approach lies, a value of ``COMPASS``."""
+        return arrival_side(self.heading(edge_id))
+
+    def street(self, edge_id: str) -> str:
+        """Return the street of an edge on one line; empty if it has none."""
+        return plain_text(self._edges[edge_id].name)
+
+    def approach(self, edge_id: str) -> str:
+        """Return the name of the approach that ends with an edge."""
+        return approach_name(self.side(edge_id), self.street(edge_id))
+
+    def exit(self, edge_id: str) -> str:
+        """Return the name of the arm on which an edge leaves a junction."""
+        return approach_name(compass(self.exit_heading(edge_id)), self.street(edge_id))
+
+    def crossed_arm(self, crossing_id: str) -> Arm:
+        """Return the arm that a crossing crosses; where only its exit is crossed, the approach beside it."""
+        crossing = self._edges[crossing_id]
+        node = crossing_id.removeprefix(":").rpartition("_c")[0]
+        crossed = [edge for edge in crossing.crossed_edges if edge in self._edges]
+        for edge in crossed:
+            if self._edges[edge].to_node == node:
+                return Arm(self.side(edge), self.street(edge), edge)
+        for edge in crossed:
+            side = compass(self.exit_heading(edge))
+            for beside in self._edges.values():
+                if not beside.function and beside.to_node == node and self.side(beside.id) == side:
+                    return Arm(side, self.street(beside.id), beside.id)
+            return Arm(side, self.street(edge), "")
+        lines_m = [lane.shape_m[:, :2].mean(axis=0) for lane in crossing.lanes if len(lane.shape_m)]
+        if node in self._nodes_m and lines_m:
+            return Arm(compass(np.mean(lines_m, axis=0) - self._nodes_m[node]), "", "")
+        return Arm("", "", "")
+
+    def crosswalk(self, crossing_id: str) -> str:
+        """Return the name of a crossing, e.g. ``"North Street (north) crosswalk"``."""
+        return crosswalk_name(self.crossed_arm(crossing_id).name)
+
+    def _line_back(self, edge_id: str) -> Floats:
+        """Return a line from the end of an edge backwards, (n, 2), over 30 m where a single road leads there."""
+        return _joined(self._edges, edge_id, self._previous, backwards=True)
+
+    def _line_ahead(self, edge_id: str) -> Floats:
+        """Return a line from the start of an edge onwards, (n, 2)."""
+        return _joined(self._edges, edge_id, self._next, backwards=False)
+
+    def _ring_middle_m(self, node: str, other_node: str) -> Floats | None:
+        """Return the middle of the roundabout at a node (2,), for an edge that is not a part of its ring."""
+        for ring in self._rings:
+            if node in ring and other_node not in ring:
+                middle_m: Floats = np.mean([self._nodes_m[each] for each in sorted(ring)], axis=0)
+                return middle_m
+        return None
+
+
+def _joined(edges: dict[str, Edge], edge_id: str, following: dict[str, str], *, backwards: bool) -> Floats:
+    parts: list[Floats] = []
+    length_m = 0.0
+    visited: set[str] = set()
+    next_id: str | None = edge_id
+    while next_id is not None and next_id not in visited:
+        visited.add(next_id)
+        line_m = _middle_line(edges[next_id])
+        parts.append(line_m[::-1] if backwards else line_m)
+        length_m = float(line_lengths_m(np.vstack(parts))[-1])
+        next_id = following.get(next_id) if length_m < HEADING_OVER_M else None
+    return np.vstack(parts)
+
+
+def _middle_line(edge: Edge) -> Floats:
+    """Return the first lane for vehicles of an edge in plan, or its first lane if it has none, (n, 2)."""
+    lane = next((lane for lane in edge.lanes if not lane.is_pavement and len(lane.shape_m) > 1), edge.lanes[0])
+    return lane.shape_m[:, :2]
+
+
+def line_lengths_m(line_m: Floats) -> Floats:
+    """Return the distance of each point of a line from its start, measured along the line, (n,)."""
+    return np.append(0.0, np.cumsum(np.hypot(*np.diff(line_m, axis=0).T)))
+
+
+def point_along(line_m: Floats, distance_m: float) -> Floats:
+    """Return the point of a line at a distance from its start, or its end if it is shorter, (2,)."""
+    lengths_m = line_lengths_m(line_m)
+    return np.array([np.interp(distance_m, lengths_m, line_m[:, axis]) for axis in (0, 1)])
+
+
+def disambiguate_approaches(names: Sequence[str], ids: Sequence[str]) -> list[str]:
+    """Return names of approaches that are all different; equal ones get the id of their edge.
+
+    >>> disambiguate_approaches(["High Street (east)", "High Street (east)", "north"], ["a", "b", "c"])
+    ['High Street (east), edge a', 'High Street (east), edge b', 'north']
+    """
+    return [f"{name}, edge {edge}" if names.count(name) > 1 else name for name, edge in zip(names, ids, strict=True)]

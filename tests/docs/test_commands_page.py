@@ -1,0 +1,46 @@
+"""docs/commands.md has every command of the program, each with a how-to that shows it."""
+
+from __future__ import annotations
+
+import re
+
+import typer
+from typer.core import TyperGroup
+
+from egvs.cli.app import COMMAND_GROUPS, app
+from tests.docs.pages import DOCS, links, section
+
+PAGE = DOCS / "commands.md"
+_ROW = re.compile(r"^\| `egvs ([\w -]+)` \| (.+) \| (.+) \|$", re.MULTILINE)
+
+
+def program_commands() -> list[str]:
+    """Return all commands, those of a group with the name of the group, in the order of the help."""
+    commands = typer.main.get_command(app)
+    assert isinstance(commands, TyperGroup)
+    names = []
+    for name in [name for group in COMMAND_GROUPS.values() for name in group]:
+        command = commands.commands[name]
+        if isinstance(command, TyperGroup):
+            names += [f"{name} {part}" for part in command.commands]
+        else:
+            names.append(name)
+    assert {name.split()[0] for name in names} == set(commands.commands)
+    return names
+
+
+def test_page_lists_every_command_in_the_order_of_the_help() -> None:
+    listed = [match[1] for match in _ROW.finditer(PAGE.read_text(encoding="utf-8"))]
+    assert listed == program_commands()
+
+
+def test_how_to_shows_the_command() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    for name, _, how_to in _ROW.findall(text):
+        targets = list(links(how_to))
+        assert targets, name
+        page, _, anchor = targets[0].partition("#")
+        how_to_text = (DOCS / page).read_text(encoding="utf-8") if page else text
+        if anchor:
+            how_to_text = section(how_to_text, anchor)
+        assert re.search(rf"egvs {name}\b", how_to_text), f"{targets[0]} does not mention egvs {name}"
