@@ -3,9 +3,10 @@
 FROM python:3.11-slim-bookworm AS build
 
 # SUMO is linked to OpenGL but opens no window. Only the three libraries are copied: their package brings 200 MB of drivers.
+# binutils has the program strip, which .ci/slim_image.sh uses.
 # hadolint ignore=DL3008
 RUN apt-get update \
-    && apt-get install --yes --no-install-recommends libgl1 \
+    && apt-get install --yes --no-install-recommends binutils libgl1 \
     && mkdir /opt/gl \
     && cp -L /usr/lib/*-linux-gnu/libGL.so.1 /usr/lib/*-linux-gnu/libGLX.so.0 /usr/lib/*-linux-gnu/libGLdispatch.so.0 /opt/gl/ \
     && rm -rf /var/lib/apt/lists/*

@@ -4,7 +4,10 @@ VENV := .venv
 BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-.PHONY: run test test-slow test-train test-lowest test-portable unit lint wheel project-files image image-test bench bench-history bench-peers scaling numerics validity detectability pictures schema reference docs fuzz clean
+# Every test process would compile all modules again.
+unexport PYTHONDONTWRITEBYTECODE
+
+.PHONY: run test test-slow test-nightly test-train test-lowest test-portable unit lint wheel project-files image image-test bench bench-history bench-peers scaling numerics validity detectability pictures schema reference docs notebooks fuzz clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
@@ -14,7 +17,11 @@ test: $(VENV)/.installed-dev
 
 # Sweeps, whole studies, browsers, kills: what takes more than some tenths of a second each.
 test-slow: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -m slow --ignore=tests/validation/training
+	$(BIN)/python -m pytest -m "slow and not nightly" --ignore=tests/validation/training
+
+# Statistics over many simulations, which take minutes each.
+test-nightly: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest -m nightly --ignore=tests/validation/training
 
 # PyTorch is large, and only those who train a detector need it.
 test-train: $(VENV)/.installed-train
@@ -29,7 +36,7 @@ test-lowest: $(VENV)/.installed
 		'.[place]' hypothesis mpmath pytest pytest-xdist
 	build/lowest/bin/python -m pytest -m unit -p no:cacheprovider -W ignore::DeprecationWarning tests/core tests/scenario tests/scoring tests/sensors tests/world
 
-# The unit tests without the modules and flags that only POSIX systems have.
+# Without the modules and flags that only POSIX systems have: the unit tests of what depends on the system.
 test-portable: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest -m unit -p tests.without_posix --ignore=tests/validation/training
 
@@ -44,8 +51,13 @@ lint: $(VENV)/.installed-dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
 
-docs: $(VENV)/.installed-docs
+docs: $(VENV)/.installed-docs build/view.html
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --config-file docs/mkdocs/mkdocs.yml
+
+# The 3D view that the first page of the documentation opens; remove it to make it again.
+build/view.html: $(VENV)/.installed
+	$(BIN)/egvs run scenarios/nishishinjuku --out build/view
+	$(BIN)/egvs explore build/view --to $@
 
 wheel: $(VENV)/.installed-dev
 	rm -rf build/wheel
@@ -66,10 +78,10 @@ project-files: wheel
 image:
 	docker build --tag egvs .
 
-# Not root, below 1.1 GB, and the demo works for a user that the image does not know.
+# Not root, below 1 GB, and the demo works for a user that the image does not know.
 image-test:
 	test "$$(docker run --rm --entrypoint id egvs -u)" != 0
-	test "$$(docker image inspect --format '{{.Size}}' egvs)" -lt 1100000000
+	test "$$(docker image inspect --format '{{.Size}}' egvs)" -lt 1000000000
 	mkdir -p build/image-test
 	docker run --rm --user "$$(id -u):$$(id -g)" --volume "$(CURDIR)/build/image-test:/work" egvs demo
 
@@ -109,6 +121,10 @@ detectability: $(VENV)/.installed-dev
 pictures: $(VENV)/.installed-dev
 	$(BIN)/python -m benchmarks.pictures
 
+# Executes docs/notebooks/*.ipynb and writes their outputs; NOTEBOOKS: names of some, or "--to FOLDER"
+notebooks: $(VENV)/.installed-notebooks
+	$(BIN)/python docs/mkdocs/execute_notebooks.py $(NOTEBOOKS)
+
 # FUZZ: options, as in FUZZ="--cases 10000 --seed 2"; what is bad lies in build/fuzz
 fuzz: $(VENV)/.installed-dev
 	$(BIN)/python -m tests.fuzz $(FUZZ)
@@ -138,6 +154,10 @@ $(VENV)/.installed-train: $(VENV)/.installed-dev
 
 $(VENV)/.installed-docs: $(VENV)/.installed
 	$(INSTALL) --no-build-isolation --editable '.[docs]'
+	@touch $@
+
+$(VENV)/.installed-notebooks: $(VENV)/.installed
+	$(INSTALL) --no-build-isolation --editable '.[notebooks]'
 	@touch $@
 
 clean:

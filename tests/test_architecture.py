@@ -16,6 +16,7 @@ import pytest
 from importlinter.cli import lint_imports
 
 import egvs
+from tests import platform_tests
 from tests.conftest import write_mini
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -31,13 +32,7 @@ def tree(name: str) -> ast.Module:
 
 def imported_names(name: str) -> set[str]:
     """Return all imports of a module, also inside functions: ``a.b`` for ``import a.b`` and for ``from a import b``."""
-    names = set()
-    for node in ast.walk(tree(name)):
-        if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-    return names
+    return platform_tests.imported_names((PACKAGE / name).read_text(encoding="utf-8"))
 
 
 def run_python(code: str, folder: Path = ROOT, stdin: str = "") -> str:
@@ -123,8 +118,10 @@ SCENE = "from egvs import *; s = load('mini'); scene = build_scene(s); "
 USES = {
     "DesignRequest": "DesignRequest('pole_a').channels is None",
     "EgvsError": "EgvsError('text')",
+    "FrameSampling": "FrameSampling(30).spacing_s is None",
     "InputError": "InputError('file', 'problem', 'Hint').hint == 'Hint'",
     "JointScore": "JointScore.of(__import__('egvs').load('mini'), 'joint').candidates == ('pole_a', 'pole_b')",
+    "NewScenarioOptions": "NewScenarioOptions(walk=True).check() is None",
     "Pose": "Pose(1.0, 2.0, 3.0).position_m == (1.0, 2.0, 3.0)",
     "RunError": "RunError('text').exit_code == 1",
     "Scanner": SCENE + "Scanner(scene).scan_site(scene.sites[0]).beams_in_roi > 0",
@@ -133,13 +130,19 @@ USES = {
     "Scorer": SCENE + "Scorer(scene, read_tpog('run/tpog.parquet')).limit > 0",
     "Sensor": SCENE + "isinstance(scene.sensor('small'), Sensor) and Sensor.directions(scene.sensor('small')).any()",
     "Site": "Site('a', __import__('egvs').Pose(1.0, 2.0, 3.0), 'VLP-16').points is None",
+    "StudyOptions": "StudyOptions(__import__('egvs').Tolerance(1.0), 60.0).seeds is None",
+    "Tolerance": "Tolerance(0.5).score is None",
     "Tpog": "(Tpog.p.fget(__import__('egvs').read_tpog('run/tpog.parquet')) <= 1).all()",
     "World": SCENE + "isinstance(scene.world, World) and scene.world.triangles_m.shape[1:] == (3, 3)",
     "accept": "accept.__kwdefaults__['max_vehicle_height_m'] == 4.5",
     "build_scene": "build_scene(__import__('egvs').load('mini')).sites",
     "compare_runs": "compare_runs(['run', 'run']).agreements[0].tau == 1.0",
+    "create_scenario": "list(create_scenario.__annotations__)[:2] == ['folder', 'maps']",
     "design_sensor": "from egvs import DesignRequest, load; "
     "design_sensor(load('mini'), DesignRequest('pole_a', ('small',), evaluations=20), 'design').chosen.score > 0",
+    "draw_figure": "draw_figure('run', 'ranking', kind='svg', out='ranking.svg').stat().st_size > 0",
+    "effect_statuses": "'rain' in [status.name for status in effect_statuses(__import__('egvs').load('mini'))]",
+    "fit_sensor": "'sweeps' in fit_sensor.__annotations__",
     "load": "load('mini').name == 'mini'",
     "open_session": "open_session('run').ranked[0].rank == 1",
     "place": "len(place(__import__('egvs').load('mini', ['placement.count=1']), 'placed').sensors) == 1",
@@ -149,14 +152,20 @@ USES = {
     'halves = \'[{name="a",length_s=12},{name="b",begin_s=12,length_s=8}]\'; '
     "run(load('mini', ['traffic.periods=' + halves]), 'split'); "
     "read_scores_by_period('split/scores_by_period.parquet').to_pandas().period.nunique() == 2",
+    "read_sweeps": "read_sweeps([]) == []",
     "read_tpog": "read_tpog('run/tpog.parquet').p.max() > 0",
     "read_trajectories": "len(read_trajectories('run/trajectories.parquet').to_pandas()) == 80",
     "read_visibility": "read_visibility('run/visibility.parquet', 'pole_a').sum() > 0",
     "run": "run(__import__('egvs').load('mini'), 'again').stages['score']",
+    "run_ablation": "run_ablation(__import__('egvs').load('mini'), 'alone')[0].effect == 'none'",
+    "run_accuracy_study": "list(run_accuracy_study.__annotations__)[:2] == ['path', 'overrides']",
+    "shipped_scenario": "shipped_scenario('demo').is_dir()",
+    "validate_sites": "validate_sites.__kwdefaults__['jobs'] is None",
     "verify": "verify('run') == []",
     "what_if": "from egvs import load; box = '{share=0.5,boxes=[{x_m=10,y_m=30,length_m=1,width_m=1,height_m=1}]}'; "
     "what_if('mini', ['what_if.crate=' + box]).answers[0].name == 'crate'",
     "write_acceptance": "write_acceptance.__defaults__ == (None,)",
+    "write_fit": "list(write_fit.__annotations__)[:2] == ['fit', 'name']",
     "write_sheets": "len(write_sheets('run', ['pole_a'], kind='svg', out=__import__('pathlib').Path('sheets'))) == 1",
 }
 """Public name to an expression that uses it, in a folder with a scenario and its run."""

@@ -1,5 +1,7 @@
 """Hides what only POSIX systems have, so that the code for Windows runs here: ``make test-portable``.
 
+Only tests that can depend on the system are collected; see :mod:`tests.platform_tests`.
+
 psutil is imported before, because on Linux it needs ``resource`` itself.
 """
 
@@ -11,6 +13,8 @@ from pathlib import Path
 
 import psutil  # noqa: F401
 
+from tests.platform_tests import depends_on_platform
+
 for module in ("fcntl", "resource"):
     sys.modules[module] = None  # type: ignore[assignment]
 for flag in ("O_NOFOLLOW", "O_DIRECTORY", "O_CLOEXEC"):
@@ -19,5 +23,8 @@ for flag in ("O_NOFOLLOW", "O_DIRECTORY", "O_CLOEXEC"):
 
 
 def pytest_ignore_collect(collection_path: Path) -> bool | None:
-    """Leave out the test of a benchmark that measures with ``resource``."""
-    return True if collection_path.name == "test_file_checks.py" else None
+    """Leave out tests that only compute, and the test of a benchmark that measures with ``resource``."""
+    name = collection_path.name
+    if not (name.startswith("test_") and name.endswith(".py")):
+        return None
+    return True if name == "test_file_checks.py" or not depends_on_platform(collection_path) else None

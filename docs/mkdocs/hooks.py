@@ -1,5 +1,5 @@
 """Add to the documentation site what comes from the program: the diagram of the packages, tables of public names
-and of study results, a reference page for each package, and formulas as MathML."""
+and of study results, a reference page for each package, the notebooks, and formulas as MathML."""
 
 from __future__ import annotations
 
@@ -15,12 +15,16 @@ from mkdocs.structure.pages import Page
 from mkdocs.utils import get_relative_url
 
 sys.path.insert(0, str(Path(__file__).parent))
+import notebooks
 import package_diagram
 import tables
 from formulas import mathml
 
 ROOT = Path(__file__).resolve().parents[2]
 _FORMULA = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL)
+_VIEW = ROOT / "build" / "view.html"
+"""The 3D view of a run, which `make docs` writes. Without it, the first page links to docs/explore.md."""
+_LINK_WITHOUT_VIEW = "](explore.md#one-file-to-share)"
 _ELSEWHERE = "https://unpkg.com/iframe-worker/shim"
 _INSERT = re.compile(r"<!-- (names of|picture of|study conditions|study table) ([\w-]+) -->")
 
@@ -34,7 +38,7 @@ def on_config(config: MkDocsConfig) -> None:
 
 
 def on_files(files: Files, config: MkDocsConfig) -> None:
-    """One page a package, with every module that says something."""
+    """One page a package, with every module that says something; one a notebook, with its figures."""
     for name in package_diagram.packages():
         folder = ROOT / "pipeline" / "egvs" / name
         modules = [
@@ -43,16 +47,28 @@ def on_files(files: Files, config: MkDocsConfig) -> None:
         text = f"# {name}\n\n{_first_line(folder / '__init__.py')}\n"
         text += "".join(f"\n::: {module}\n" for module in modules if not module.endswith("__init__"))
         files.append(File.generated(config, f"api/{name}.md", content=text))
+    for page in notebooks.pages().values():
+        files.append(File.generated(config, f"notebooks/{page.name}.md", content=page.markdown))
+        for name, content in page.figures.items():
+            files.append(File.generated(config, f"notebooks/{name}", content=content))
+    if _VIEW.is_file():
+        files.append(File.generated(config, _VIEW.name, abs_src_path=str(_VIEW)))
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Put tables and pictures in place of ``<!-- names of egvs -->`` and the like."""
-    del config, files
+    del config
+    if page.file.src_uri == "index.md" and files.get_file_from_path(_VIEW.name):
+        if _LINK_WITHOUT_VIEW not in markdown:
+            raise ValueError(f"docs/index.md has no picture with the link {_LINK_WITHOUT_VIEW}")
+        markdown = markdown.replace(_LINK_WITHOUT_VIEW, f"]({_VIEW.name})")
     if page.file.src_uri == "validity-tables.md":
         shown = {name for what, name in _INSERT.findall(markdown) if what == "study table"}
         if missing := tables.study_files() - shown:
             raise ValueError(f"docs/validity-tables.md does not show {', '.join(sorted(missing))}")
-    return _INSERT.sub(lambda m: _MAKE[m[1]](m[2]), markdown)
+    if page.file.src_uri == "notebooks/index.md":
+        markdown = notebooks.gallery(markdown)
+    return notebooks.link_pages(_INSERT.sub(lambda m: _MAKE[m[1]](m[2]), markdown))
 
 
 def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:

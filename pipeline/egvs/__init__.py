@@ -42,6 +42,12 @@ What a planner does next; the report of the run shows each result::
     egvs.write_sheets("runs/trial", ["c03"])
     egvs.write_acceptance("runs/trial", egvs.accept("runs/trial", "c03", ["measured.pcd"]))
 
+From maps to a scenario, and what accuracy and effects cost::
+
+    egvs.create_scenario("myplace", "extract.osm", at=(50.8704, 9.7080))
+    egvs.run_accuracy_study("myplace", [], "runs/myplace", egvs.StudyOptions(egvs.Tolerance(1.0), budget_s=120.0))
+    egvs.effect_statuses(egvs.load("myplace"), "runs/myplace")
+
 Names are imported when they are first used, so that ``import egvs`` costs nothing.
 """
 
@@ -58,6 +64,8 @@ if TYPE_CHECKING:
     from egvs.artefacts.traffic_frames import read_trajectories
     from egvs.core.errors import EgvsError, InputError, RunError
     from egvs.explore.settings import open_session
+    from egvs.export.figure import draw_figure
+    from egvs.importers.new_scenario import NewScenarioOptions, create_scenario
     from egvs.installation.acceptance import accept
     from egvs.installation.acceptance_page import write_acceptance
     from egvs.installation.sheet import write_sheets
@@ -68,21 +76,32 @@ if TYPE_CHECKING:
     from egvs.runs.verification import verify
     from egvs.scenario.loading import load
     from egvs.scenario.model import Scenario
+    from egvs.scenario.shipped import shipped_scenario
     from egvs.scoring.scorer import Scorer
+    from egvs.sensor_fit.fit import fit_sensor
+    from egvs.sensor_fit.output import write_fit
+    from egvs.sensor_fit.sweep_files import read_sweeps
     from egvs.sensors.scanner import Scanner
     from egvs.sensors.scene import Scene
     from egvs.sensors.sensor import Sensor
     from egvs.sensors.sites import Pose, Site
     from egvs.stages.inputs import build_scene
+    from egvs.studies.accuracy import StudyOptions, run_accuracy_study
+    from egvs.studies.effect_study import effect_statuses, run_ablation
+    from egvs.studies.recommendation import Tolerance
     from egvs.studies.run_comparison import compare_runs
     from egvs.studies.what_if import what_if
+    from egvs.validation.held_out_traffic import FrameSampling
+    from egvs.validation.site_validation import validate_sites
     from egvs.world.mesh import World
 
 __all__ = [
     "DesignRequest",
     "EgvsError",
+    "FrameSampling",
     "InputError",
     "JointScore",
+    "NewScenarioOptions",
     "Pose",
     "RunError",
     "Scanner",
@@ -91,26 +110,38 @@ __all__ = [
     "Scorer",
     "Sensor",
     "Site",
+    "StudyOptions",
+    "Tolerance",
     "Tpog",
     "World",
     "__version__",
     "accept",
     "build_scene",
     "compare_runs",
+    "create_scenario",
     "design_sensor",
+    "draw_figure",
+    "effect_statuses",
+    "fit_sensor",
     "load",
     "open_session",
     "place",
     "read_scans",
     "read_scores",
     "read_scores_by_period",
+    "read_sweeps",
     "read_tpog",
     "read_trajectories",
     "read_visibility",
     "run",
+    "run_ablation",
+    "run_accuracy_study",
+    "shipped_scenario",
+    "validate_sites",
     "verify",
     "what_if",
     "write_acceptance",
+    "write_fit",
     "write_sheets",
 ]
 
@@ -122,6 +153,8 @@ __getattr__, __dir__ = lazy_exports(
         "artefacts.traffic_frames": ["read_trajectories"],
         "core.errors": ["EgvsError", "InputError", "RunError"],
         "explore.settings": ["open_session"],
+        "export.figure": ["draw_figure"],
+        "importers.new_scenario": ["NewScenarioOptions", "create_scenario"],
         "installation.acceptance": ["accept"],
         "installation.acceptance_page": ["write_acceptance"],
         "installation.sheet": ["write_sheets"],
@@ -132,14 +165,23 @@ __getattr__, __dir__ = lazy_exports(
         "runs.verification": ["verify"],
         "scenario.loading": ["load"],
         "scenario.model": ["Scenario"],
+        "scenario.shipped": ["shipped_scenario"],
         "scoring.scorer": ["Scorer"],
+        "sensor_fit.fit": ["fit_sensor"],
+        "sensor_fit.output": ["write_fit"],
+        "sensor_fit.sweep_files": ["read_sweeps"],
         "sensors.scanner": ["Scanner"],
         "sensors.scene": ["Scene"],
         "sensors.sensor": ["Sensor"],
         "sensors.sites": ["Pose", "Site"],
         "stages.inputs": ["build_scene"],
+        "studies.accuracy": ["StudyOptions", "run_accuracy_study"],
+        "studies.effect_study": ["effect_statuses", "run_ablation"],
+        "studies.recommendation": ["Tolerance"],
         "studies.run_comparison": ["compare_runs"],
         "studies.what_if": ["what_if"],
+        "validation.held_out_traffic": ["FrameSampling"],
+        "validation.site_validation": ["validate_sites"],
         "world.mesh": ["World"],
         "_version": ["__version__"],
     },

@@ -23,6 +23,7 @@ def test_table_replaces_what_is_between_the_marks():
         first_scan.with_table("no marks", table)
 
 
+@pytest.mark.nightly  # a measurement of times, of which only the order is checked
 @pytest.mark.slow
 @pytest.mark.system
 def test_first_scan_of_each_process_takes_longer_than_its_second():

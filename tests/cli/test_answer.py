@@ -56,6 +56,21 @@ def test_poles_in_a_lane_and_assumptions_are_one_sentence(mini: Path) -> None:
     assert sections.describe_caveats(egvs.load(mini), "plan") == ""
 
 
+def test_signal_plans_are_no_assumption_once_they_are_given(mini: Path) -> None:
+    """The entry goes when every signal of the region has a plan; otherwise it names those without."""
+    keys = ["assumed=['traffic (guessed)', 'signal plans']"]
+    given = {"signal": "a", "streets": ["Mill Lane", "High Street"], "source": "from the scenario"}
+    guessed = {"signal": "b", "streets": ["Oak Street"], "source": "assumed"}
+    none = egvs.load(mini, keys)
+    assert sections.assumptions(none, [guessed]) == ("traffic (guessed)", "signal plans")
+    plan = {"phases": [{"green": {"north": ["all"]}, "green_s": 30}]}
+    some = none.model_copy(update={"traffic": none.traffic.model_copy(update={"signals": {"a": plan}})})
+    assert sections.assumptions(some, [given]) == ("traffic (guessed)",)
+    assert sections.assumptions(some, [given, guessed]) == ("traffic (guessed)", "signal plans of Oak Street")
+    sentence = "Before you trust this ranking: assumed, not measured: traffic (guessed)."
+    assert sections.describe_caveats(some, "ranking", plans=[given]) == sentence
+
+
 def test_says_that_the_range_of_several_sensors_is_not_modelled_until_it_is(
     mini: Path, tmp_path: Path, run_egvs
 ) -> None:

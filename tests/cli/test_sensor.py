@@ -5,6 +5,7 @@ Evidence: a sweep of a simulated sensor; options that are wrong.
 
 from __future__ import annotations
 
+import inspect
 import json
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from egvs.cli import sensor
 from egvs.formats import ply
+from egvs.formats.recording_options import RecordingOptions
 from tests.sensor_fit.ros_recordings import write_recording
 from tests.sensor_fit.small_sensor import TRUTH, coarse_sensor, sweep_of
 
@@ -106,3 +109,10 @@ def test_rejects_cloud_without_rings(tmp_path: Path, run_egvs: Any) -> None:
     assert code == 2
     assert "cloud.ply: expected" in error
     assert not (tmp_path / "made").exists()
+
+
+def test_defaults_of_recordings_have_one_definition() -> None:
+    """The command's defaults are those of the reader: 20 sweeps and 500 m."""
+    options = {name: parameter.default for name, parameter in inspect.signature(sensor.fit).parameters.items()}
+    assert RecordingOptions() == RecordingOptions(None, options["max_sweeps"], options["max_range"])
+    assert (options["max_sweeps"], options["max_range"]) == (20, 500.0)

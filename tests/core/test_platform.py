@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import importlib
 import ntpath
 import os
+import pkgutil
 import subprocess
 import sys
 from pathlib import Path, PureWindowsPath
 
 import pytest
 
+import egvs
 from egvs.core import platform
+from tests.platform_tests import depends_on_platform, platform_modules
 
 ROOT = Path(__file__).parents[2]
 
@@ -56,6 +60,22 @@ def test_peak_memory_grows_with_an_array() -> None:
     data = bytearray(b"x") * (size_mb * 2**20)
     assert platform.peak_memory_mb() > size_mb
     assert len(data) == size_mb * 2**20
+
+
+@pytest.mark.skipif(platform.HAS_POSIX, reason="other tests import all modules where POSIX modules exist")
+def test_all_modules_can_be_imported() -> None:
+    for module in pkgutil.walk_packages(egvs.__path__, "egvs."):
+        if not module.name.startswith(("egvs.__main__", "egvs.validation.training")):  # PyTorch is an extra
+            importlib.import_module(module.name)
+
+
+def test_portable_suite_has_tests_of_what_differs_between_systems() -> None:
+    used_by = {"egvs.core.files", "egvs.core.resource_usage", "egvs.runs.locks", "egvs.formats.reader_process"}
+    assert {"egvs.core.platform", *used_by} <= platform_modules()
+    tests = ROOT / "tests"
+    assert depends_on_platform(tests / "core" / "test_platform.py")
+    assert depends_on_platform(tests / "placement" / "test_plan.py")
+    assert not depends_on_platform(tests / "kernels" / "test_traversal.py")
 
 
 WITHOUT_POSIX = """

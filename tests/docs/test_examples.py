@@ -15,6 +15,7 @@ MODULES = [
     "egvs.runs.run_names",
     "egvs.scenario.loading",
     "egvs.scenario.settings",
+    "egvs.scenario.shipped",
     "egvs.scoring.egvs",
     pytest.param("egvs.runs.run", marks=SLOW),
 ]

@@ -7,10 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 
 from egvs.core.errors import InputError
-from egvs.export.drawing import LAYERS, VIEW_PREFIX, ground_view
+from egvs.export import drawing
+from egvs.export.drawing import DXF_VERSION, LAYERS, VIEW_PREFIX, View, ground_view
 from egvs.export.export import export_run
+from egvs.export.finished_run import ExportCrs
 from egvs.sensors.sensor import Sensor
 from egvs.sensors.sites import Pose
 from tests.export.conftest import OFFSET_M
@@ -54,6 +57,36 @@ def test_view_without_ground_reaches_the_range() -> None:
     view = ground_view(make_sensor((-30.0,)), Pose(0.0, 0.0, 3.0), math.inf)
     assert np.hypot(*view.outer_m.T) == pytest.approx(np.full(180, 100.0 * math.cos(math.radians(30.0))))
     assert not len(view.inner_m)
+
+
+def _draw(view: View) -> list[list[tuple[float, float]]]:
+    """Draw a view, and read its outlines with ezdxf."""
+    document = ezdxf.new(DXF_VERSION)
+    drawing._draw_view(document.modelspace(), view, "0", ExportCrs("", "world frame", None, is_degrees=False))
+    assert not document.audit().errors
+    lines = document.modelspace().query("LWPOLYLINE")
+    assert all(line.closed for line in lines)
+    return [[(x, y) for x, y in line.get_points("xy")] for line in lines]
+
+
+def test_sector_without_ground_is_closed_at_the_sensor() -> None:
+    """29 triangles of 2 degrees with sides of 100 m, from 151 to 209 degrees; not only the segment beyond the chord."""
+    (outline,) = _draw(ground_view(make_sensor((0.0,), (-30.0, 29.0)), Pose(5.0, 6.0, 2.0, yaw_deg=180.0), math.inf))
+    area = shapely.Polygon(outline)
+    assert area.is_valid
+    assert area.area == pytest.approx(29 * 0.5 * 100.0**2 * math.sin(math.radians(2.0)))
+    assert area.covers(shapely.Point(4.0, 6.0)) and not area.covers(shapely.Point(6.0, 6.0))
+    assert (5.0, 6.0) in outline
+
+
+def test_view_of_a_tilted_sensor_begins_at_the_sensor_where_no_beam_meets_the_ground() -> None:
+    """4 m high and tilted by 10 degrees, beams meet the ground in front, 22.7 m away; behind, none does."""
+    view = ground_view(make_sensor((0.0,)), Pose(0.0, 0.0, 4.0, pitch_deg=-10.0), 4.0)
+    outer, hole = (shapely.Polygon(outline) for outline in _draw(view))
+    assert outer.is_valid and hole.is_valid
+    assert hole.covers(shapely.Point(20.0, 0.0)) and not hole.covers(shapely.Point(23.0, 0.0))
+    assert not hole.covers(shapely.Point(-0.1, 0.0)) and outer.covers(shapely.Point(-50.0, 0.0))
+    assert sum(point == (0.0, 0.0) for point in hole.exterior.coords[:-1]) == 1
 
 
 def test_drawing_has_sites_at_eastings_and_northings_with_labels(located: Path, tmp_path: Path) -> None:

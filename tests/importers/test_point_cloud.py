@@ -295,6 +295,7 @@ def test_visibility_of_a_house_on_a_plane(survey: list[Path]) -> None:
     assert different.max() < 0.04
 
 
+@pytest.mark.nightly  # the house on a plane, above, has the same limits
 @pytest.mark.slow
 @needs_pye57
 def test_visibility_of_a_junction_from_nine_stations(tmp_path: Path) -> None:

@@ -44,6 +44,10 @@ MAX_RELATIVE_SE = 0.04
 RESCUES = {"roundabout": {"junction_blocker_s": JUNCTION_BLOCKER_S, "teleport_s": TELEPORT_S}}
 """More keys of the traffic, by scenario."""
 
+QUICK_SEEDS, QUICK_FRAMES = range(1, 4), 150
+QUICK_DIFFERENCE = 0.15
+"""How much a score may differ, relative to the original, on average over the sites and a few short simulations."""
+
 pytestmark = [pytest.mark.slow, pytest.mark.system]
 
 Floats = NDArray[np.float64]
@@ -65,8 +69,10 @@ class Runs:
     occupancy: Floats
 
 
-def run_network(name: str, original: NetworkText, network: NetworkText, folder: Path) -> Runs:
-    """Run a shipped scenario on a network for all seeds; the trips are drawn on the original network."""
+def run_network(
+    name: str, original: NetworkText, network: NetworkText, folder: Path, seeds: range = SEEDS, frames: int = FRAMES
+) -> Runs:
+    """Run a shipped scenario on a network for some seeds; the trips are drawn on the original network."""
     values = tomllib.loads((SCENARIOS / name / "scenario.toml").read_text(encoding="utf-8"))
     settings = loading.load(SCENARIOS / name).traffic
     folder.mkdir()
@@ -74,14 +80,14 @@ def run_network(name: str, original: NetworkText, network: NetworkText, folder: 
     types = demand.vtypes_xml(settings.kinds).replace("additional", "routes")
     (folder / "types.rou.xml").write_text(types, encoding="utf-8")
     edges = copies.match_edges(copies.match_lanes(original, network))
-    count = int((settings.warmup_s + FRAMES) * settings.trips_per_s)
+    count = int((settings.warmup_s + frames) * settings.trips_per_s)
     departs_s = np.arange(count) / settings.trips_per_s
     for key in ("edge_weights", "kinds", "trips_per_s"):
         values["traffic"].pop(key, None)
 
     scores: dict[str, list[Floats]] = {score: [] for score in SCORES}
     occupancy = []
-    for seed in SEEDS:
+    for seed in seeds:
         rng = np.random.default_rng(seed)
         pairs = [
             demand.origin_destination_pairs(original.network, kind, settings, rng, name) for kind in settings.kinds
@@ -94,7 +100,7 @@ def run_network(name: str, original: NetworkText, network: NetworkText, folder: 
         values["traffic"] |= {
             "network": str(folder / "network.net.xml"),
             "routes": [str(folder / "types.rou.xml"), str(routes)],
-            "frames": FRAMES,
+            "frames": frames,
             "frame_period_s": 1.0,
             "max_depart_delay_s": 120,
             **RESCUES.get(name, {}),
@@ -244,6 +250,22 @@ def _compare_sides(name: str, kind: str, original: NetworkText, before: Runs, fo
     return comparison
 
 
+def test_scores_are_close_after_a_round_trip(tmp_path: Path) -> None:
+    """A few short simulations: enough for a road, a signal or a turn that is lost, not for details of the traffic."""
+    name = "nishishinjuku"
+    original = read_original(name)
+    before = run_network(name, original, original, tmp_path / "before", QUICK_SEEDS, QUICK_FRAMES)
+    for kind in ("lanelet2", "opendrive"):
+        folder = tmp_path / kind
+        folder.mkdir()
+        copy = make_copy(kind, original, folder)
+        after = run_network(name, original, copy, folder / "runs", QUICK_SEEDS, QUICK_FRAMES)
+        for score in SCORES:
+            difference = after.scores[score].mean(axis=0) / before.scores[score].mean(axis=0) - 1
+            assert abs(difference.mean()) < QUICK_DIFFERENCE, (kind, score, difference)
+
+
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("name", "kind"), [("nishishinjuku", "lanelet2"), ("nishishinjuku", "opendrive"), ("roundabout", "lanelet2")]
 )
@@ -251,6 +273,7 @@ def test_tpog_and_ranks_agree_after_a_round_trip(name: str, kind: str, originals
     check_agreement(compare_copy(name, kind, originals, tmp_path))
 
 
+@pytest.mark.nightly
 def test_tpog_and_ranks_agree_once_lanes_end_as_opendrive_can_say(tmp_path: Path) -> None:
     """Roads of OpenDRIVE end square; those of the roundabout's ring end up to 1.3 m aslant, which netconvert cuts off.
 
@@ -274,6 +297,7 @@ def check_agreement(result: Comparison) -> None:
     assert result.tpog_p > 1 - CONFIDENCE, result.describe()
 
 
+@pytest.mark.nightly
 def test_forbidden_lane_changes_matter(originals: Path, tmp_path: Path) -> None:
     """netconvert writes broken lines where the original has solid ones; so the other test can tell a difference."""
     result = compare_copy("nishishinjuku", "opendrive without marks", originals, tmp_path)

@@ -97,7 +97,24 @@ def test_quarter_hours_become_vehicles_per_hour_of_each_hour(read: Read) -> None
         ("07-08", {(FROM_NORTH, TO_EAST): 75.0}),
         ("08-09", {(FROM_NORTH, TO_EAST): 32.0}),  # 16 in half an hour
     ]
-    assert "scaled up to an hour: 08-09 (30 min)" in str(counts.notes)
+    assert counts.notes[0] == (
+        "Counts of a part of the hour 08-09 are scaled up to an hour for 1 movement:"
+        " North Street (north) left (30 min)."
+    )
+    assert "hour 07-08" not in str(counts.notes)
+
+
+def test_note_on_scaled_counts_names_four_movements_and_how_many_more(read: Read) -> None:
+    """Six movements were counted for a quarter of an hour, and one for the complete hour."""
+    partial = ["N,left", "N,through", "N,right", "S,left", "S,through", "S,right"]
+    rows = [f"{move},07:00,5" for move in partial]
+    rows += [f"E,through,07:{minute:02d},10" for minute in (0, 15, 30, 45)]
+    (note,) = [text for text in read("approach,turn,start,count", *rows).notes if "scaled up" in text]
+    assert note == (
+        "Counts of a part of the hour 07-08 are scaled up to an hour for 6 movements:"
+        " North Street (north) left (15 min), North Street (north) straight (15 min),"
+        " North Street (north) right (15 min), North Street (south) left (15 min) and 2 more."
+    )
 
 
 def test_columns_named_by_their_start_mean_the_same_as_rows(read: Read) -> None:

@@ -34,13 +34,16 @@ def test_small_extract(tmp_path: Path, lefthand: bool) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["grid", "spider", "random"])
+@pytest.mark.parametrize(
+    "kind", ["grid", *(pytest.param(kind, marks=pytest.mark.nightly) for kind in ("spider", "random"))]
+)
 def test_made_up_towns(tmp_path: Path, kind: str) -> None:
     at = write_town(tmp_path / "town.osm", kind, seed=1)[0]
     scenario = create_scenario(tmp_path / "new", tmp_path / "town.osm", at)
     check_traffic(scenario, tmp_path / "out", seed=1)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.skipif(not TOWN.is_file(), reason=f"{TOWN.name} is not beside the checkout (shared/real)")
 @pytest.mark.parametrize("at", [(50.8621925, 9.719901), (50.8546613, 9.7220179)], ids=["loops", "locks"])

@@ -25,6 +25,8 @@ from egvs.scoring.zone_results import ZoneUsers
 from egvs.stages import site_scoring
 from egvs.stages.inputs import open_folder
 from egvs.stages.site_scans import empty_scans
+from egvs.traffic.network import Lane, Permission
+from egvs.world.carriageway import Carriageway
 from tests.conftest import collection, feature
 from tests.scoring.target_scenes import GRID, frame
 
@@ -77,6 +79,33 @@ def test_shares_by_hand() -> None:
     assert users.empty == ("nowhere",)
     (warning,) = users.warn_empty()
     assert "no road user has its centre in nowhere in the 2 frames examined" in str(warning)
+
+
+def test_zones_beside_the_lanes_are_no_warning_without_pedestrians() -> None:
+    """The lane leads along y = 205 from x = 100 to 140: through the zone ahead, not over the sidewalk at y = 215.
+
+    The car and the bus are at x = 105 to 115. With a pedestrian anywhere, both empty zones are a warning.
+    """
+    lane = Lane("100,205 140,205", "lane", None, 40.0, Permission(None, frozenset()))
+    carriageway = Carriageway(("lane_0",), (lane,))
+    record = people_record()
+    empty = {"ahead": shapely.box(125, 203, 135, 207), "north sidewalk": shapely.box(100, 214, 140, 216)}
+
+    def users(record: TargetRecord, carriageway: Carriageway | None) -> ZoneUsers:
+        rows = np.ones(len(record)), np.zeros(len(record), dtype=np.int64)
+        return ZoneUsers.of(record, empty, *rows, carriageway)
+
+    with_people = users(record, carriageway)
+    assert with_people.for_pedestrians == () and "ahead, north sidewalk" in str(next(with_people.warn_empty()))
+    cars = frame([[105.0, 205.0, 1.0, 4.0, 2.0, 1.5, 0.0]], ("passenger",), vehicles=("c",))
+    without_people = users(TargetRecord.of([cars], GRID, PEOPLE), carriageway)
+    (warning,) = without_people.warn_empty()
+    assert "no road user has its centre in ahead in the 1 frame examined" in str(warning)
+    assert without_people.describe_for_pedestrians() == (
+        "no results for 1 zone beside the lanes, since the traffic has no pedestrians"
+        " ([effects.pedestrians_bicycles]): north sidewalk"
+    )
+    assert users(TargetRecord.of([cars], GRID, PEOPLE), None).for_pedestrians == ()
 
 
 def test_sensors_together_miss_what_both_miss(monkeypatch: pytest.MonkeyPatch) -> None:

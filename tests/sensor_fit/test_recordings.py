@@ -17,7 +17,8 @@ from egvs.core import plugins
 from egvs.core.errors import EgvsError, InputError
 from egvs.core.grid import FloatArray
 from egvs.formats import ros_bags, velodyne_pcap
-from egvs.formats.recordings import RecordingOptions, chosen_sweeps
+from egvs.formats.recording_options import RecordingOptions
+from egvs.formats.recordings import chosen_sweeps
 from egvs.sensor_fit.fit import fit_sensor
 from egvs.sensor_fit.sweep_files import read_sweeps
 from tests.sensor_fit.ros_recordings import TOPIC, write_recording

@@ -6,6 +6,7 @@ the network's foes for conflicts.
 
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -198,8 +199,23 @@ def test_summary_names_the_plan(crossing, tmp_path):
     assert (east["green_s"], east["gives_way"]) == ([[35, 55]], True)
     text = signal_descriptions.format_plan(plan)
     assert text == (
-        "Signals at Mill Lane / High Street (from the scenario): fixed, cycle 60 s; green 30 s Mill Lane (north) and"
+        "Signals at High Street / Mill Lane (from the scenario): fixed, cycle 60 s; green 30 s Mill Lane (north) and"
         " Mill Lane (south); 20 s High Street (east) and High Street (west)."
+    )
+
+
+def test_movements_with_equal_green_share_an_entry():
+    """Left turns have 10 s of their own; straight on and right have green together, one of them giving way."""
+    row = {"approach": "Mill Lane (north)", "yellow_s": [], "gives_way": False}
+    rows = [
+        row | {"movements": ["left"], "green_s": [[0, 10]]},
+        row | {"movements": ["straight"], "green_s": [[10, 40]]},
+        row | {"movements": ["right"], "green_s": [[10, 40]], "gives_way": True},
+    ]
+    plan = {"signal": "c", "streets": ["Mill Lane"], "source": "assumed", "type": "fixed", "cycle_s": 60, "rows": rows}
+    assert signal_descriptions.format_plan(plan) == (
+        "Signals at Mill Lane (assumed): fixed, cycle 60 s; green 10 s Mill Lane (north) left;"
+        " 30 s Mill Lane (north) straight, right."
     )
 
 
@@ -230,9 +246,9 @@ def test_signal_of_several_junctions_knows_its_foes(tmp_path):
 
 
 WRONG = [
-    ({"x": {"phases": [NS, EW]}}, r"traffic.signals.x: the network has no such signal. Its signals are: c \("),
+    ({"x": {"phases": [NS, EW]}}, r"traffic.signals.x: the network has no such signal. Its signals are: High Street"),
     ({"c": {"phases": [NS, EW | {"green": {"nrth": ["all"]}}]}},
-     r"phase 2: signal c has no approach 'nrth'. Its approaches are: Mill Lane \(north\) \(right, straight, left"),
+     r"Lane \(c\) has no approach 'nrth'. Its approaches are: Mill Lane \(north\) \(right, straight, left"),
     ({"c": {"phases": [NS, EW | {"green": {"Mill Lane": ["all"]}}]}},
      r"approach 'Mill Lane' may be 'Mill Lane \(north\)' or 'Mill Lane \(south\)'. Use the full name"),
     ({"c": {"phases": [NS | {"green": {"north": ["sideways"]}}, EW]}},
@@ -245,7 +261,7 @@ WRONG = [
     ({"c": {"phases": [NS]}}, r"never green: High Street \(east\) right, High Street \(east\) straight"),
     ({"c": {"phases": [NS, EW], "cycle_s": 90}},
      r"cycle_s = 90: the phases with yellow and all-red add up to 60 s \(30, 3, 2, 20, 3, 2\). Use cycle_s = 60"),
-    ({"c": {"phases": [NS, EW]}, "Mill Lane": {"phases": [NS, EW]}}, "signal 'c' has two plans"),
+    ({"c": {"phases": [NS, EW]}, "Mill Lane": {"phases": [NS, EW]}}, r"High Street / Mill Lane \(c\) has two plans"),
     ({"c": {"file": "missing.csv"}}, "missing.csv"),
 ]  # fmt: skip
 
@@ -286,7 +302,7 @@ CSV = "phase,approach,movement,green_s\na,north,all,30\na,south,all,30\nb,east,a
         ("p.csv", CSV.replace("b,east,all,20", "b,east,all,often"), "line 4: green_s: expected seconds, got 'often'"),
         ("p.csv", CSV.replace("b,east,all,20", "b,east,all"), "line 4: expected 4 values, got 3"),
         ("p.csv", CSV.replace("green_s", "green_s,colour").replace("0\n", "0,red\n"), "unknown column 'colour'"),
-        ("p.add.xml", "<additional/>", "no <tlLogic> with phases for signal 'c'"),
+        ("p.add.xml", "<additional/>", "no <tlLogic> with phases for the signal High Street / Mill Lane (c)"),
         ("p.add.xml", '<additional><tlLogic id="c"><phase duration="9" state="GG"/></tlLogic></additional>',
          "expected a state of 20 letters, got 2"),
         ("p.add.xml", f'<additional><tlLogic id="c"><phase duration="9" state="{"G" * 20}"/></tlLogic></additional>',
@@ -333,3 +349,22 @@ def test_u_turn_has_one_printed_name(word):
     assert signal_plans._green_links(phase, signal, "plan") == {0}
     (plan,) = signal_descriptions.describe_signals([signal], Roi((-1.0, -1.0, 0.0), (2.0, 2.0, 1.0)), {}, "assumed")
     assert [row["movements"] for row in plan["rows"]] == [["U-turn"]]
+
+
+def test_long_ids_are_shortened_and_still_accepted(tmp_path):
+    """SUMO's id of joined nodes is cut after 19 characters in messages; both spellings find the signal."""
+    name = "cluster_1423165998_1698047149_31384678"
+    link = signals.Link(0, "Mill Lane (north)", "straight", "a", "Mill Lane", np.array([0.0, -1.0]))
+    program = signals.Program("static", 0.0, ())
+    long, other = (
+        signals.Signal(each, (each,), (0.0, 0.0), (replace(link, street=street),), program)
+        for each, street in ((name, "Mill Lane"), ("J2", "High Street"))
+    )
+    assert long.title == "Mill Lane (cluster_1423165998_…)"
+    for spelling in (name, "cluster_1423165998_…", "mill ln"):
+        assert signal_plans.find_signal(spelling, [long, other], "x") is long
+    with pytest.raises(InputError, match=r"Its signals are: Mill Lane \(cluster_1423165998_…\), High Street \(J2\)\."):
+        signal_plans.find_signal("Oak Street", [long, other], "x")
+    twin = replace(long, id=f"{name}_2", nodes=(f"{name}_2",))
+    with pytest.raises(InputError, match=rf"2 signals have this name: Mill Lane \({name}\), Mill Lane \({name}_2\)"):
+        signal_plans.find_signal("cluster_1423165998_…", [long, twin], "x")

@@ -61,9 +61,10 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
         for warning in collect_warnings([summary]):
             out.print(str(warning))
     traffic_summary = record.stages["traffic"].summary if "traffic" in record.stages else {}
-    sentences = signal_sentences(traffic_summary.get("signals", ()))
+    plans = traffic_summary.get("signals", ())
+    sentences = signal_sentences(plans)
     on_road = sections.describe_poles_on_road(ranked.poles[: sections.NAMED_POLES], _check_warnings(record))
-    if caveats := sections.describe_caveats(scenario, "ranking", on_road):
+    if caveats := sections.describe_caveats(scenario, "ranking", on_road, plans):
         sentences.append(caveats)
     sentences += reliability.describe_reliability(ranked, traffic_summary)
     sensors = [site.sensor for site in ranked.sites]
@@ -118,8 +119,9 @@ def _print_ranking(
         out.print(location)
     if missed := summary.get("missed"):
         print_sentences([missed])
-    if in_zones := summary.get("zones"):
-        print_sentences([in_zones])
+    for key in ("zones", "zones_for_pedestrians"):
+        if in_zones := summary.get(key):
+            print_sentences([in_zones])
     if other_order := order_by_egvs(ranked, parquet.read_metadata(RunFolder(folder).scores, "scores")):
         print_sentences([other_order])
 

@@ -66,6 +66,7 @@ def place(
             request.append(f"placement.{key}={value!r}")
     loaded, folder = sources.open_source(scenario, set_, out, request)
     with ProgressDisplay("place") as screen:
+        from egvs.artefacts.run_record import RunRecord
         from egvs.cli import answer
         from egvs.placement import plan
         from egvs.report import sections
@@ -81,7 +82,8 @@ def place(
         notes.append(describe_replaced(replaced, request_now or {}))
     if exact and not (placed.solution.is_best or placed.solution.fewest_is_proved):
         notes.append(f"--exact reached its --time-limit of {time_limit} before any plan was proved optimal.")
-    print_placement(placed, loaded.placement, notes, sections.describe_caveats(loaded, "plan"))
+    plans = RunRecord.read(folder).stages["traffic"].summary.get("signals", ())
+    print_placement(placed, loaded.placement, notes, sections.describe_caveats(loaded, "plan", plans=plans))
 
 
 def _check_request(count: int | None, budget: float | None, reach: float | None) -> None:

@@ -10,6 +10,7 @@ import typer
 from egvs.cli.options import Jobs, Set, SettingsPath
 from egvs.cli.quick_help import QuickHelpGroup
 from egvs.core.errors import InputError
+from egvs.formats.recording_options import RecordingOptions
 from egvs.placement.design_request import ALL_SENSORS, ELEVATION_BOUNDS_DEG, DesignRequest
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 _DESIGN_WIDTH = 190
 _REQUEST = DesignRequest("")
+_RECORDING = RecordingOptions()
 _LOW_DEG, _HIGH_DEG = ELEVATION_BOUNDS_DEG
 
 app = typer.Typer(cls=QuickHelpGroup, no_args_is_help=True, help="Derive a sensor from its sweeps, or design one.")
@@ -64,11 +66,11 @@ def fit(
     ] = None,
     max_sweeps: Annotated[
         int, typer.Option(metavar="N", min=1, help="Most sweeps that are read of a recording, spread evenly over it.")
-    ] = 20,
+    ] = _RECORDING.max_sweeps,
     max_range: Annotated[
         float,
         typer.Option(metavar="M", min=1.0, max=10_000.0, help="Range beyond which the decoder of .pcap drops returns."),
-    ] = 500.0,
+    ] = _RECORDING.range_m,
     scenario: Annotated[
         Path | None,
         typer.Option(
@@ -95,7 +97,6 @@ def fit(
 
     plugins.require_libraries("egvs sensor fit", "figure", "matplotlib")
     with ProgressDisplay("sensor fit") as screen:
-        from egvs.formats.recordings import RecordingOptions
         from egvs.sensor_fit import fit as fitting
         from egvs.sensor_fit import output, sweep_files
 

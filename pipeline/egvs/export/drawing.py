@@ -17,7 +17,7 @@ a beam of range :math:`R`, the beam ends at the horizontal distance
 
 (the second term only for beams that point down). For each azimuth, the outer edge is the largest of these distances and
 the inner edge, around the area below the sensor that no beam reaches, is the smallest one of the beams that meet the
-ground.
+ground. Where none of an azimuth does, the view begins at the sensor.
 """
 
 from __future__ import annotations
@@ -152,8 +152,8 @@ class View:
     Attributes
     ----------
     outer_m, inner_m
-        Farthest and nearest point for each azimuth, (n, 2) each, world frame; ``inner_m`` is empty where no beam meets
-        the ground.
+        Farthest and nearest point for each azimuth, (n, 2) each, world frame. Where no beam meets the ground,
+        ``inner_m`` has the position of the sensor, once for neighbouring azimuths, or nothing for a full circle.
     is_full_circle
         Whether there is a point for every azimuth.
     """
@@ -190,10 +190,14 @@ def ground_view(sensor: Sensor, pose: Pose, height_m: float) -> View:
     angle = np.radians((np.arange(sectors) + 0.5) * _SECTOR_DEG)
     unit = np.column_stack([np.cos(angle), np.sin(angle)])
     center = np.array([pose.x_m, pose.y_m])
-    inner = order[np.isfinite(inner_m[order])]
-    return View(
-        center + outer_m[order, None] * unit[order], center + inner_m[inner, None] * unit[inner], bool(has_beam.all())
-    )
+    is_full_circle = bool(has_beam.all())
+    near_m = np.where(np.isfinite(inner_m), inner_m, 0.0)[order]
+    at_sensor = near_m == 0.0
+    follows = np.roll(at_sensor, 1)
+    follows[0] &= is_full_circle
+    kept = ~(at_sensor & follows)  # the position of the sensor once for neighbouring azimuths
+    inner_points_m = center + near_m[kept, None] * unit[order[kept]]
+    return View(center + outer_m[order, None] * unit[order], inner_points_m, is_full_circle)
 
 
 def _from_widest_gap(has_beam: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -41,13 +41,13 @@ MAX_BARS = 40
 
 
 def draw_figure(
-    folder: Path,
+    folder: str | Path,
     what: str,
     *,
     site: str | None = None,
     kind: str = "pdf",
     width_mm: float = 85.0,
-    out: Path | None = None,
+    out: str | Path | None = None,
     progress: ProgressCallback = no_progress,
 ) -> Path:
     """Draw a figure of a finished run.
@@ -78,6 +78,7 @@ def draw_figure(
         If an option is unknown, an artefact is missing or damaged, or the file cannot be written. Nothing is written
         then.
     """
+    folder, out = Path(folder), None if out is None else Path(out)
     _check_arguments(what, site, kind, out)
     run = FinishedRun.open(folder)
     ranking = Ranking.read(run.artefact(RunFolder.scores.name))

@@ -19,28 +19,10 @@ from egvs.core import limits
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.formats.reader_process import Block, read_blocks
+from egvs.formats.recording_options import RecordingOptions
 
 _SPANS_S = (0.002, 5.0)
 """The points of one sweep are recorded in between; times with another span are not in the expected unit."""
-
-
-@dataclass(frozen=True)
-class RecordingOptions:
-    """What is read of a recording.
-
-    Attributes
-    ----------
-    topic
-        Name of the ROS topic; None for the only one with point clouds.
-    max_sweeps
-        Most sweeps that are read, spread evenly over the recording.
-    range_m
-        Returns of a network capture beyond this range are dropped by its decoder.
-    """
-
-    topic: str | None = None
-    max_sweeps: int = 20
-    range_m: float = 500.0
 
 
 @dataclass(frozen=True)

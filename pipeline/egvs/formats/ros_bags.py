@@ -18,10 +18,10 @@ import numpy as np
 from egvs.core import limits, plugins
 from egvs.core.grid import FloatArray
 from egvs.formats.reader_process import Block, serve
+from egvs.formats.recording_options import RecordingOptions
 from egvs.formats.recordings import (
     RecordedSweep,
     Recording,
-    RecordingOptions,
     chosen_sweeps,
     header_block,
     problem_block,

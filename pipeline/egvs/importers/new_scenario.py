@@ -32,6 +32,7 @@ from shapely.geometry.base import BaseGeometry
 
 from egvs.core.errors import InputError
 from egvs.core.grid import XY, FloatArray, Roi
+from egvs.core.wording import by_number, number_of
 from egvs.formats import ply
 from egvs.importers import (
     assumed_traffic,
@@ -85,6 +86,7 @@ from egvs.importers.terrain.ground_heights import HIGHEST_M, LOWEST_M
 from egvs.importers.terrain.relief import Relief, ground_surface
 from egvs.scenario.loading import load
 from egvs.scenario.model import SCENARIO_FILE
+from egvs.scenario.signal_config import ASSUMED_PLANS
 from egvs.scenario.traffic_config import DEFAULT_FRAMES, DEFAULT_WARMUP_S, CountConfig, TrafficConfig
 from egvs.sensors.sensor import CATALOGUE
 from egvs.traffic.movements import MovementNames
@@ -113,7 +115,7 @@ _SIGNALS_OF_TRACKS_NOTE = (
 _NO_SIGNALS_NOTE = "No junction in the map has signals; the one with the most incoming lanes was chosen."
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class NewScenario:
     """What :func:`create_scenario` made.
 
@@ -176,6 +178,16 @@ class NewScenario:
     counted: StreetCounts | None = None
     zones: tuple[Zone, ...] = ()
     are_lights_guessed: bool = False
+
+    def __repr__(self) -> str:
+        vehicles_per_hour = sum(flow.per_hour for flow in self.flows)
+        parts = (
+            f"{self.junction.title}, {self.junction.arms} arms",
+            f"{self.n_candidates} candidate sites on {self.poles} poles",
+            f"{self.n_solids} solids",
+            f"{vehicles_per_hour:,.0f} vehicles an hour",
+        )
+        return f"NewScenario({self.folder.name}: {'; '.join(parts)})"
 
     @property
     def maps_have_notes(self) -> bool:
@@ -281,8 +293,8 @@ class NewScenarioOptions:
 
 
 def create_scenario(
-    folder: Path,
-    maps: Path | Sequence[Path],
+    folder: str | Path,
+    maps: str | Path | Sequence[str | Path],
     at: tuple[float, float] | None = None,
     options: NewScenarioOptions | None = None,
 ) -> NewScenario:
@@ -314,8 +326,10 @@ def create_scenario(
     """
     options = options or NewScenarioOptions()
     options.check()
+    folder = Path(folder)
     name = scenario_files.check_new_folder(folder)
-    files = map_readers.open_maps([maps] if isinstance(maps, Path) else maps)
+    map_paths = [maps] if isinstance(maps, str | Path) else maps
+    files = map_readers.open_maps([Path(path) for path in map_paths])
     surface_files = map_readers.open_surface(options.surface)
     roads = _read_roads(files.roads, RoadOptions(options.lefthand, options.walk, has_terrain=bool(files.terrain)), at)
     recording, example, people = (
@@ -662,7 +676,10 @@ def _level_notes(roads: RoadSource, counts: ImportCounts) -> list[str]:
     heights = counts.heights.get("bridge", Counter())
     if heights["default"]:
         shares = f"{heights['default']} of {heights.total()}"
-        notes.append(f"No height is given for {shares} bridge decks: {osm_solids.DECK_BASE_M:g} m assumed.")
+        notes.append(
+            f"No height is given for {shares} {by_number(heights.total(), 'bridge deck', 'bridge decks')}:"
+            f" {osm_solids.DECK_BASE_M:g} m assumed."
+        )
     return notes
 
 
@@ -674,7 +691,9 @@ def _range_notes(counts: ImportCounts) -> list[str]:
     total = left_out + counts.objects.total() - counts.objects["tree_crown"]
     range_m = CATALOGUE[SENSOR].range_m
     reason = f"they are beyond the range of a {SENSOR} ({range_m:g} m) from the region of interest and change no score."
-    return [f"{left_out:,} of {total:,} static objects are left out: {reason}"]
+    return [
+        f"{left_out:,} of {number_of(total, 'static object')} {by_number(left_out, 'is', 'are')} left out: {reason}"
+    ]
 
 
 def scenario_notes(junction_fits: bool, counts: ImportCounts) -> list[str]:
@@ -693,17 +712,20 @@ def scenario_notes(junction_fits: bool, counts: ImportCounts) -> list[str]:
     heights = counts.heights.get("building", Counter())
     if heights["default"]:
         notes.append(
-            f"{heights['default']} of {heights.total()} buildings have neither height nor levels:"
+            f"{heights['default']} of {number_of(heights.total(), 'building')}"
+            f" {by_number(heights['default'], 'has', 'have')} neither height nor levels:"
             f" {osm_solids.DEFAULT_BUILDING_M:g} m assumed."
         )
     if heights[NEIGHBOURS]:
         notes.append(
-            f"{heights[NEIGHBOURS]} of {heights.total()} buildings have neither height nor levels: the median height of"
+            f"{heights[NEIGHBOURS]} of {number_of(heights.total(), 'building')}"
+            f" {by_number(heights[NEIGHBOURS], 'has', 'have')} neither height nor levels: the median height of"
             " the buildings near by assumed."
         )
     if heights[SURFACE_MODEL]:
         notes.append(
-            f"{heights[SURFACE_MODEL]} of {heights.total()} buildings have neither height nor levels: their heights are"
+            f"{heights[SURFACE_MODEL]} of {number_of(heights.total(), 'building')}"
+            f" {by_number(heights[SURFACE_MODEL], 'has', 'have')} neither height nor levels: their heights are"
             " those of the surface model above the terrain."
         )
     return notes
@@ -823,7 +845,7 @@ def _assumptions(scenario: NewScenario, *, is_recorded: bool) -> list[str]:
     if scenario.counted is not None:
         assumed += scenario.counted.assumptions
     if scenario.junction.signalised and not is_recorded:
-        assumed.append("signal plans")
+        assumed.append(ASSUMED_PLANS)
     if scenario.are_lights_guessed:
         assumed.append("which recorded light governs which road")
     return [*assumed, *assumed_sizes(scenario.statics), "positions of the poles"]
@@ -837,9 +859,9 @@ def assumed_sizes(counts: ImportCounts) -> list[str]:
     """Return which sizes of static objects are assumed, for the key ``assumed``; objects that can hide vehicles."""
     heights = {kind: counts.heights.get(kind, Counter()) for kind in ("building", "tree", "bridge")}
     texts = [
-        (_assumed_buildings(heights["building"]), heights["building"].total(), "heights of {} buildings"),
-        (heights["tree"]["default"], heights["tree"].total(), "heights of {} trees"),
-        (counts.assumed_crowns, heights["tree"].total(), "crown widths of {} trees"),
-        (heights["bridge"]["default"], heights["bridge"].total(), "heights of {} bridge decks"),
+        (_assumed_buildings(heights["building"]), heights["building"].total(), "heights of {}", "building"),
+        (heights["tree"]["default"], heights["tree"].total(), "heights of {}", "tree"),
+        (counts.assumed_crowns, heights["tree"].total(), "crown widths of {}", "tree"),
+        (heights["bridge"]["default"], heights["bridge"].total(), "heights of {}", "bridge deck"),
     ]
-    return [text.format(f"{number} of {total}") for number, total, text in texts if number]
+    return [text.format(f"{number} of {number_of(total, noun)}") for number, total, text, noun in texts if number]

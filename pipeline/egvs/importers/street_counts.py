@@ -26,6 +26,7 @@ from functools import partial
 from pathlib import Path
 
 from egvs.core.errors import InputError, find_misspelling
+from egvs.core.wording import list_first, number_of
 from egvs.formats import csv_tables
 from egvs.importers import junctions
 from egvs.importers.junctions import StreetJunction, Streets
@@ -39,6 +40,7 @@ VALUE_COLUMNS = ("start", "minutes", "count", "kind")
 _CLOCK = re.compile(r"([01]?\d|2[0-3])[:.h]?([0-5]\d)")
 _INTERVALS_MIN = (5, 10, 15, 20, 30, 60)
 _MAX_COUNT = 100_000.0
+_MAX_NAMED = 4
 _ALL_TURNS = ("", "all", "total", "any")
 
 
@@ -50,14 +52,14 @@ class CountedHour:
     ----------
     start_min
         Minutes after midnight; None for counts without a start.
-    covered_min
-        Minutes of it in which the movement with the fewest counts was counted.
+    partial_min
+        Minutes of it that were counted, by the names of the movements that were not counted during all of it.
     flows
         Vehicles per hour.
     """
 
     start_min: int | None
-    covered_min: int
+    partial_min: Mapping[str, int]
     flows: tuple[CountConfig, ...]
 
     @property
@@ -106,11 +108,11 @@ class StreetCounts:
 
     def describe(self) -> str:
         """Return a sentence."""
-        movements = len({flow.title for hour in self.hours for flow in hour.flows})
+        movements = number_of(len({flow.title for hour in self.hours for flow in hour.flows}), "movement")
         if len(self.hours) == 1:
-            return f"{self.hours[0].per_h:,} vehicles an hour in {movements} movements, counted ({self.path.name})"
+            return f"{number_of(self.hours[0].per_h, 'vehicle')} an hour in {movements}, counted ({self.path.name})"
         amounts = [f"{hour.name} {hour.per_h:,}" for hour in self.hours]
-        return f"vehicles an hour in {movements} movements, counted ({self.path.name}): {', '.join(amounts)}"
+        return f"vehicles an hour in {movements}, counted ({self.path.name}): {', '.join(amounts)}"
 
 
 @dataclass(frozen=True)
@@ -172,6 +174,7 @@ def read_street_counts(
     hours: dict[int | None, dict[tuple[str, str], list[tuple[int | None, float]]]] = {}
     first_row: dict[tuple[str, str, int | None], str] = {}
     templates: dict[str, CountConfig] = {}
+    names: dict[str, str] = {}
     for row in rows:
         hour = None if row.start_min is None else row.start_min // 60 * 60
         if row.start_min is not None and row.start_min % 60 + interval_min > 60:
@@ -187,11 +190,16 @@ def read_street_counts(
             share = move.flow.per_hour / total if len(row.movements) > 1 else 1.0
             hours.setdefault(hour, {}).setdefault(key, []).append((row.start_min, row.vehicles * share))
             templates[move.flow.title] = move.flow
+            names[move.flow.title] = _movement_name(move)
     counted = []
     for hour in sorted(hours, key=lambda start: start or 0):
         flows_of_hour = _to_flows(hours[hour], templates, interval_min)
-        shortest_min = min(len(values) for values in hours[hour].values()) * interval_min
-        counted.append(CountedHour(hour, shortest_min, flows_of_hour))
+        partial_min: dict[str, int] = {}
+        for (title, _), values in hours[hour].items():
+            minutes = len(values) * interval_min
+            if minutes < 60:
+                partial_min[names[title]] = min(minutes, partial_min.get(names[title], 60))
+        counted.append(CountedHour(hour, partial_min, flows_of_hour))
     if not any(flow.per_hour for hour in counted for flow in hour.flows):
         raise InputError(path, "all counts are 0", "Give at least one count above 0.")
     empty = [hour for hour in counted if not any(flow.per_hour for flow in hour.flows)]
@@ -244,9 +252,14 @@ def _notes(
 ) -> Iterator[str]:  # fmt: skip
     if split:
         yield f"Counts of several movements are divided by the assumed shares: {', '.join(split)}."
-    partial = [f"{hour.name} ({hour.covered_min} min)" for hour in hours if hour.covered_min < 60]
-    if partial:
-        yield f"Hours that were counted in part are scaled up to an hour: {', '.join(partial)}."
+    for hour in hours:
+        if hour.partial_min:
+            parts = [f"{name} ({minutes} min)" for name, minutes in hour.partial_min.items()]
+            movements = number_of(len(parts), "movement")
+            yield (
+                f"Counts of a part of the hour {hour.name} are scaled up to an hour for {movements}:"
+                f" {list_first(parts, _MAX_NAMED)}."
+            )
     titles = [{flow.title for flow in hour.flows} for hour in hours]
     incomplete = [hour.name for hour, known in zip(hours, titles, strict=True) if known != set.union(*titles)]
     if incomplete:
@@ -254,8 +267,11 @@ def _notes(
     counted = {move.flow.title for row in rows for move in row.movements}
     missing = [move for move in index.movements if move.flow.title not in counted]
     if missing and len(missing) < len(flows):
-        names = dict.fromkeys(f"{move.approach_title} {move.turn}".strip() for move in missing)
-        yield f"Movements without a count get no vehicles: {', '.join(names)}."
+        yield f"Movements without a count get no vehicles: {', '.join(dict.fromkeys(map(_movement_name, missing)))}."
+
+
+def _movement_name(move: ApproachMovement) -> str:
+    return f"{move.approach_title} {move.turn}".strip()
 
 
 def _read_rows(path: Path, index: ApproachIndex, edges: frozenset[str], kinds: frozenset[str]) -> Iterator[_Row]:

@@ -208,7 +208,7 @@ def _displayed_settings(scenario: Scenario) -> dict[str, Any]:
         "gamma": repr(scenario.gamma),
         "gamma_auto": scenario.score.gamma == "auto",
         "weights": scenario.score.weights.in_words,
-        "assumed": assumptions(scenario),
+        "assumed": assumptions(scenario, ()),
         "blindspots": scenario.score.blindspots,
         "sampled_frames": scenario.score.sampled_frames,
         "costs": scenario.costs.model_dump(mode="json"),
@@ -359,7 +359,7 @@ def _setting_values(contents: PageContents) -> dict[str, Any]:
         frames = contents.by_period.frames
     return {
         "weights": scenario.score.weights.in_words,
-        "assumed": assumptions(scenario),
+        "assumed": assumptions(scenario, _traffic_summary(contents.stages).get("signals", ())),
         "assumes_flows": assumes_flows(scenario),
         "gamma": "∞" if math.isinf(gamma) else f"{gamma:g}",
         "map_credits": read_map_credits(scenario),

@@ -14,6 +14,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -31,9 +32,11 @@ from egvs.report.ranking_check import RankingCheck
 from egvs.report.svg_figures import CurveStep, MapSite
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
+from egvs.scenario.signal_config import ASSUMED_PLANS
 from egvs.sensors.sites import Pose, Site
 from egvs.traffic.movements import MovementNames
 from egvs.traffic.network import read_net_xml
+from egvs.traffic.signal_descriptions import ASSUMED_SOURCE, plan_title
 
 COMPARED_SITES = 3
 """Number of best sites that :func:`ranking_disagreement` compares."""
@@ -203,13 +206,27 @@ def _site_detection(value: float, se: float, values: Sequence[float]) -> SiteDet
 # ---- what the ranking rests on
 
 
-def assumptions(scenario: Scenario) -> tuple[str, ...]:
-    """Return what a scenario assumes rather than measures: its key ``assumed``, and traffic without any count."""
+def assumptions(scenario: Scenario, plans: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+    """Return what a scenario assumes rather than measures: its key ``assumed``, and traffic without any count.
+
+    Parameters
+    ----------
+    scenario
+        The scenario. Where it has plans of signals, those that are still assumed are named, if there are any.
+    plans
+        Plans of the signals in the region, from the summary of the traffic
+        (:func:`egvs.traffic.signal_descriptions.describe_signals`).
+    """
     traffic = scenario.traffic
+    assumed = scenario.assumed
+    if traffic.signals and plans:
+        remaining = [plan_title(plan) for plan in plans if plan["source"] == ASSUMED_SOURCE]
+        named = (f"{ASSUMED_PLANS} of {join_names(remaining)}",) if remaining else ()
+        assumed = tuple(chain.from_iterable(named if entry == ASSUMED_PLANS else (entry,) for entry in assumed))
     has_demand = traffic.network is None or bool(traffic.counts or traffic.routes)
     if has_demand or any(period.counts or period.routes for period in traffic.periods):
-        return scenario.assumed
-    return (*scenario.assumed, "traffic (random trips)")
+        return assumed
+    return (*assumed, "traffic (random trips)")
 
 
 def describe_poles_on_road(poles: Iterable[Pole], warnings: Iterable[Diagnostic]) -> list[str]:
@@ -241,7 +258,9 @@ def describe_poles_on_road(poles: Iterable[Pole], warnings: Iterable[Diagnostic]
     return phrases
 
 
-def describe_caveats(scenario: Scenario, result: str, poles_on_road: Sequence[str] = ()) -> str:
+def describe_caveats(
+    scenario: Scenario, result: str, poles_on_road: Sequence[str] = (), plans: Sequence[Mapping[str, Any]] = ()
+) -> str:
     """Return what to check before one trusts a result, in one sentence; empty where there is nothing.
 
     Parameters
@@ -252,11 +271,13 @@ def describe_caveats(scenario: Scenario, result: str, poles_on_road: Sequence[st
         ``"ranking"`` or ``"plan"``.
     poles_on_road
         From :func:`describe_poles_on_road`.
+    plans
+        Plans of signals, as for :func:`assumptions`.
     """
     caveats = []
     if poles_on_road:
         caveats.append(join_names(poles_on_road))
-    assumed = assumptions(scenario)
+    assumed = assumptions(scenario, plans)
     if assumed:
         caveats.append(f"assumed, not measured: {'; '.join(assumed)}")
     if not caveats:

@@ -7,9 +7,36 @@ from pathlib import Path
 
 from egvs.core.errors import InputError
 from egvs.core.package_data import data_folder
+from egvs.scenario.model import SCENARIO_FILE
 
 DEMO = "demo"
 """The scenario of ``egvs demo``; its traffic was simulated in advance, so that SUMO need not run."""
+
+
+def shipped_scenario(name: str) -> Path:
+    """Return the folder of a scenario that comes with this program, for :func:`egvs.load`.
+
+    Parameters
+    ----------
+    name
+        Name of the scenario, for example ``"nishishinjuku"``.
+
+    Raises
+    ------
+    InputError
+        When there is no such scenario; names those that there are.
+
+    Examples
+    --------
+    >>> import egvs
+    >>> egvs.load(egvs.shipped_scenario("roundabout")).name
+    'roundabout'
+    """
+    folder = data_folder("scenarios")
+    names = sorted(path.parent.name for path in folder.glob(f"*/{SCENARIO_FILE}"))
+    if name not in names:
+        raise InputError("scenario", f"expected one of {', '.join(names)}, got {name!r}")
+    return folder / name
 
 
 def copy_scenario(name: str, folder: Path) -> None:

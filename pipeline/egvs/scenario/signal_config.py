@@ -10,6 +10,9 @@ from egvs.scenario.fields import Positive, StrictModel
 
 DEFAULT_MIN_GREEN_S = 5.0
 
+ASSUMED_PLANS = "signal plans"
+"""Entry of the key ``assumed`` of a scenario whose signal plans netconvert has made."""
+
 Movements = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(min_length=1)]
 
 _PLAN_KEYS = ("type", "cycle_s", "yellow_s", "all_red_s", "phases")

@@ -74,7 +74,7 @@ _BANDS = 12
 _STRIDE = 13
 """Every so manyth beam tells where bands begin; not a divisor of any common number of channels."""
 
-_MAX_HITS = 2**17
+MAX_HITS = 2**17
 """Hits that are listed at once, which bounds the memory."""
 
 
@@ -90,12 +90,15 @@ class AllBoxes:
         Centre, yaw, pitch, length, width, height, (b, 8) float64, metres and radians.
     low, high
         Corners of the axis-aligned bounding box of each, (b, 3) float64, metres.
+    are_vehicles
+        Which boxes are neither pedestrians nor bicycles, (b,) bool.
     """
 
     starts: IntArray
     values: FloatArray
     low: FloatArray
     high: FloatArray
+    are_vehicles: NDArray[np.bool_]
 
     @classmethod
     def of(cls, frames: Sequence[TrafficFrame], grid: Grid) -> AllBoxes:
@@ -106,7 +109,8 @@ class AllBoxes:
         low, high = np.empty((len(values), 3)), np.empty((len(values), 3))
         occlusion.box_bounds(values, low, high)
         ends = np.cumsum([len(frame_rows) for frame_rows in rows], dtype=np.int64)
-        return cls(np.append(0, ends), values, low, high)
+        are_vehicles = np.concatenate([np.empty(0, dtype=np.bool_), *(frame.are_vehicles() for frame in frames)])
+        return cls(np.append(0, ends), values, low, high, are_vehicles)
 
     def between(self, sensor_m: FloatArray, size_m: FloatArray) -> tuple[IntArray, IntArray]:
         """Select the boxes that can be between a sensor (3,) and the grid, the box from 0 to ``size_m`` (3,).
@@ -225,7 +229,6 @@ class TargetRecord:
         vehicles, vehicle = _index_names(names)
         kinds, kind = _index_names(kind_names)
 
-        is_vehicle = np.concatenate([np.empty(0, dtype=np.bool_), *(frame.are_vehicles() for frame in frames)])
         return cls(
             grid=grid,
             numbers=np.array([frame.number for frame in frames], dtype=np.int64),
@@ -237,7 +240,7 @@ class TargetRecord:
             part=np.concatenate([no_index, *(frame.part for frame in frames)])[row],
             boxes=np.concatenate([np.empty((0, 7)), *(frame.boxes for frame in frames)])[row],
             pitch_rad=boxes.values[row, 4],
-            gap_m=_neighbour_gaps(boxes, row, is_vehicle),
+            gap_m=_neighbour_gaps(boxes, row),
             all_boxes=boxes,
             row=row,
         )
@@ -273,7 +276,9 @@ class TargetRecord:
             boxes=boxes,
             pitch_rad=np.zeros(count),
             gap_m=np.full(count, np.inf),
-            all_boxes=AllBoxes(np.arange(count + 1, dtype=np.int64), values, low, high),
+            all_boxes=AllBoxes(
+                np.arange(count + 1, dtype=np.int64), values, low, high, np.full(count, kind not in NON_VEHICLE_KINDS)
+            ),
             row=numbers,
         )
 
@@ -285,13 +290,13 @@ def _index_names(names: Sequence[str]) -> tuple[tuple[str, ...], IntArray]:
     return tuple(distinct), np.array([index[name] for name in names], dtype=np.int64)
 
 
-def _neighbour_gaps(boxes: AllBoxes, row: IntArray, is_vehicle: NDArray[np.bool_]) -> FloatArray:
+def _neighbour_gaps(boxes: AllBoxes, row: IntArray) -> FloatArray:
     """Return the gap in plan from the boxes in ``row`` to their nearest neighbours, metres."""
     footprints, gap_m = np.empty((len(boxes.values), 6)), np.empty(len(boxes.values))
     vehicle_visibility.footprints(boxes.values, footprints)
     is_target = np.zeros(len(boxes.values), dtype=np.bool_)
     is_target[row] = True
-    vehicle_visibility.neighbour_distances(boxes.starts, footprints, is_target, is_vehicle, gap_m)
+    vehicle_visibility.neighbour_distances(boxes.starts, footprints, is_target, boxes.are_vehicles, gap_m)
     return gap_m[row]
 
 
@@ -324,6 +329,11 @@ class VisibleTargets:
     side
         Sine of the angle in plan between the line of sight and the vehicle's length, (n,) float64: 0 from ahead or
         behind, 1 broadside.
+    sensor_m
+        The sensor in the grid's frame, (3,) float64.
+    bounds_m
+        Lowest and highest coordinate of its points, along and across the vehicle from its centre, (n, 2, 2) float64;
+        infinite and minus infinite without a point.
     """
 
     record: TargetRecord
@@ -336,6 +346,8 @@ class VisibleTargets:
     range_m: FloatArray
     depression_deg: FloatArray
     side: FloatArray
+    sensor_m: FloatArray
+    bounds_m: FloatArray
 
     def __len__(self) -> int:
         """Number of vehicle-frames."""
@@ -385,6 +397,8 @@ def visible_targets(
         range_m=range_m,
         depression_deg=np.degrees(np.arctan2(-away_m[:, 2], run_m)),
         side=np.divide(across_m, run_m, out=np.zeros(len(row)), where=run_m > 0.0),
+        sensor_m=sensor_m,
+        bounds_m=np.stack([low, high], axis=1),
     )
 
 
@@ -427,7 +441,7 @@ def _count_points(
 ) -> _BoxHits:
     boxes, count = record.all_boxes, len(record.all_boxes.values)
     is_counted = site.weight is None and return_probability is None
-    beams = _sort_beams(site, _BANDS if is_counted else 1)
+    beams = sort_beams(site, _BANDS if is_counted else 1)
     is_target = np.zeros(count, dtype=np.bool_)
     is_target[record.row] = True
     size_m = np.asarray(record.grid.roi.size_m)
@@ -438,7 +452,7 @@ def _count_points(
     nearest_m = beams.length_m.copy()
     capacity = 0
     if return_probability is not None:
-        capacity = max(_MAX_HITS, len(beams.length_m))
+        capacity = max(MAX_HITS, len(beams.length_m))
     hits = (np.empty(capacity, dtype=np.int64), np.empty(capacity, dtype=np.int64), *np.empty((3, capacity)))
 
     frame = 0
@@ -453,7 +467,7 @@ def _count_points(
     return result
 
 
-class _SortedBeams(NamedTuple):
+class SortedBeams(NamedTuple):
     """Beams in the form that :func:`egvs.kernels.vehicle_visibility.first_hits` takes."""
 
     cells: IntArray
@@ -463,7 +477,7 @@ class _SortedBeams(NamedTuple):
     weight: FloatArray
 
 
-def _sort_beams(beams: Beams, bands: int) -> _SortedBeams:
+def sort_beams(beams: Beams, bands: int) -> SortedBeams:
     """Sort beams into bands of slopes and cells of azimuth; in a single band by azimuth, and with their weights."""
     ends_m, weight = beams.ends_m, np.empty(0)
     azimuth = np.arctan2(ends_m[:, 1], ends_m[:, 0])
@@ -481,7 +495,7 @@ def _sort_beams(beams: Beams, bands: int) -> _SortedBeams:
     directions, length_m = np.zeros((3, size)), np.zeros(size)
     scratch = np.empty(len(ends_m), dtype=np.int64)
     vehicle_visibility.sort_beams(ends_m, azimuth, limits, cells, slopes, directions, length_m, scratch)
-    return _SortedBeams(cells, slopes, directions, length_m, weight)
+    return SortedBeams(cells, slopes, directions, length_m, weight)
 
 
 def _band_limits(ends_m: FloatArray, bands: int) -> FloatArray:

@@ -29,6 +29,7 @@ from egvs.artefacts import parquet
 from egvs.artefacts.readers import ALL_USERS
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, IntArray
+from egvs.core.wording import list_first, number_of
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.scoring.blindspots import SpotVisibility, VehicleSpots
@@ -39,6 +40,11 @@ from egvs.scoring.zones import REPORTED_KEY
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
+
+    from egvs.world.carriageway import Carriageway
+
+PEDESTRIAN = "pedestrian"
+"""Class of people on foot."""
 
 CLASSES: Mapping[str, frozenset[str]] = {
     "car": frozenset(
@@ -60,7 +66,7 @@ CLASSES: Mapping[str, frozenset[str]] = {
     "bus": frozenset({"bus", "coach"}),
     "rail": frozenset({"tram", "rail_urban", "subway", "rail", "rail_electric", "rail_fast", "cable_car"}),
     "two-wheeler": frozenset({"bicycle", "scooter", "moped", "motorcycle"}),
-    "pedestrian": frozenset({"pedestrian", "wheelchair"}),
+    PEDESTRIAN: frozenset({"pedestrian", "wheelchair"}),
 }
 """Classes of road users: SUMO's vClasses of each, in the order of the artefact."""
 
@@ -98,15 +104,23 @@ class ZoneUsers:
         ``name``.
     empty
         Zones without a road user.
+    for_pedestrians
+        Those of them that no lane for vehicles leads through, in traffic without pedestrians: nobody can be there.
     """
 
     record: TargetRecord
     spots: VehicleSpots
     empty: tuple[str, ...]
+    for_pedestrians: tuple[str, ...] = ()
 
     @classmethod
     def of(
-        cls, record: TargetRecord, areas: Mapping[str, BaseGeometry], weight: FloatArray, period: IntArray
+        cls,
+        record: TargetRecord,
+        areas: Mapping[str, BaseGeometry],
+        weight: FloatArray,
+        period: IntArray,
+        carriageway: Carriageway | None = None,
     ) -> ZoneUsers:
         """Find the zones of the vehicle-frames of a record.
 
@@ -120,6 +134,8 @@ class ZoneUsers:
             Weight of each vehicle-frame in a mix of periods, (n,) float64; 1 without a mix.
         period
             Period of each vehicle-frame, (n,) int64.
+        carriageway
+            The lanes for vehicles, where no pedestrians are simulated; None if pedestrians may be anywhere.
         """
         import shapely
 
@@ -141,7 +157,11 @@ class ZoneUsers:
         row = np.concatenate([np.empty(0, dtype=np.int64), *rows])
         spot = np.repeat(np.arange(len(rows)), [len(spot_rows) for spot_rows in rows])
         spots = VehicleSpots.at_locations(record, locations, row, spot, weight, period)
-        return cls(record, spots, tuple(empty))
+        for_pedestrians = []
+        if carriageway is not None and PEDESTRIAN not in classes:
+            lanes = shapely.union_all([shapely.LineString(lane.shape_m[:, :2]) for lane in carriageway.lanes])
+            for_pedestrians = [name for name in empty if not shapely.intersects(areas[name], lanes)]
+        return cls(record, spots, tuple(empty), tuple(for_pedestrians))
 
     def visibility(self, visible: VisibleTargets) -> SpotVisibility:
         """Return what one site sees in each zone of each class; ``visible`` is of the same record."""
@@ -168,15 +188,23 @@ class ZoneUsers:
         }
 
     def warn_empty(self) -> Iterator[Diagnostic]:
-        """Warn about zones without a road user."""
-        if not self.empty:
+        """Warn about zones without a road user, except those for pedestrians in traffic without any."""
+        names = [name for name in self.empty if name not in self.for_pedestrians]
+        if not names:
             return
-        names = ", ".join(self.empty[:_MAX_NAMED])
-        if len(self.empty) > _MAX_NAMED:
-            names += f" and {len(self.empty) - _MAX_NAMED} more"
-        problem = f"no road user has its centre in {names} in the {len(self.record.numbers)} frames examined"
+        frames = number_of(len(self.record.numbers), "frame")
+        problem = f"no road user has its centre in {list_first(names, _MAX_NAMED)} in the {frames} examined"
         hint = "Check these zones and the traffic; pedestrians need [effects.pedestrians_bicycles]."
         yield Diagnostic("zones", f"{SCENARIO_FILE}: {REPORTED_KEY}", problem, hint)
+
+    def describe_for_pedestrians(self) -> str:
+        """Return a sentence on the zones that are left out because there are no pedestrians; empty without such."""
+        if not self.for_pedestrians:
+            return ""
+        zones = number_of(len(self.for_pedestrians), "zone")
+        names = list_first(self.for_pedestrians, _MAX_NAMED)
+        reason = "the traffic has no pedestrians ([effects.pedestrians_bicycles])"
+        return f"no results for {zones} beside the lanes, since {reason}: {names}"
 
 
 def detection_probabilities(visible: VisibleTargets) -> FloatArray:

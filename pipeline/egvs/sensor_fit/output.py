@@ -58,7 +58,7 @@ def check_name(name: str) -> None:
         raise InputError("--name", problem, "Use a name such as north-mast.")
 
 
-def write_fit(fit: SensorFit, name: str, folder: Path, *, without_empty_sector: bool = False) -> FitFolder:
+def write_fit(fit: SensorFit, name: str, folder: str | Path, *, without_empty_sector: bool = False) -> FitFolder:
     """Write all files of a fit.
 
     Parameters
@@ -77,6 +77,7 @@ def write_fit(fit: SensorFit, name: str, folder: Path, *, without_empty_sector: 
     InputError
         If the sensor has no sector without returns, or the folder cannot be written.
     """
+    folder = Path(folder)
     table = table_text(fit, name, without_empty_sector)
     files.ensure_writable_folder(folder / SENSOR_FILE)
     names = [SENSOR_FILE, REPORT_FILE]

@@ -26,7 +26,8 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.reading import COMPLETE_FILE
 from egvs.formats import point_clouds, ros_bags, velodyne_pcap
-from egvs.formats.recordings import RecordedSweep, Recording, RecordingOptions
+from egvs.formats.recording_options import RecordingOptions
+from egvs.formats.recordings import RecordedSweep, Recording
 
 MIN_RETURNS = 2000
 """Fewest returns of a sweep; sensors with rings have 30,000 or more."""
@@ -70,7 +71,7 @@ class Sweep:
         return int(np.count_nonzero(np.isfinite(self.points_m[:, 0])))
 
 
-def read_sweeps(paths: Sequence[Path], options: RecordingOptions | None = None) -> list[Sweep]:
+def read_sweeps(paths: Sequence[str | Path], options: RecordingOptions | None = None) -> list[Sweep]:
     """Read all sweeps of some files, in their order.
 
     Parameters
@@ -89,7 +90,7 @@ def read_sweeps(paths: Sequence[Path], options: RecordingOptions | None = None) 
     """
     sweeps: list[Sweep] = []
     options = options or RecordingOptions()
-    for path in paths:
+    for path in map(Path, paths):
         if ros_bags.is_recording(path):
             sweeps += _recorded(*ros_bags.read(path, path.name, options))
             continue

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from egvs.core.errors import Diagnostic, InputError
 from egvs.core.grid import Roi
+from egvs.core.wording import shorten_id
 from egvs.effects import registry
 from egvs.effects.base import Effect
 from egvs.kernels import ray_triangle
@@ -231,7 +232,7 @@ def _describe_lane(lane: str, network: Network | None) -> str:
         return f"a lane of {name}" if name else f"lane {lane}"
     node = edge_id[1:].rpartition("_")[0]
     names = dict.fromkeys(edge.name for edge in edges if edge.name and node in (edge.from_node, edge.to_node))
-    return f"the junction of {' and '.join(names)}" if names else f"junction {node}"
+    return f"the junction of {' and '.join(names)}" if names else f"junction {shorten_id(node)}"
 
 
 def warn_own_supports(inputs: CheckInputs) -> Iterator[Diagnostic]:

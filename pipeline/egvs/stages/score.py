@@ -61,7 +61,7 @@ def dependencies(context: StageContext) -> StageDependencies:
     for effect in effects:
         artefacts += effect.reads
     digests = context.digests(*artefacts)
-    if scenario.score.blindspots:
+    if scenario.score.blindspots or scenario.score.zones is not None:
         network = context.inputs.common_network_path
         if network is not None:
             digests["network"] = context.inputs.digest(network)
@@ -232,6 +232,8 @@ def _summary(
         worst = readers.worst_zones(readers.read_zones(context.folder.zones, best[0]))
         if worst:
             summary["zones"] = f"{best[0]} finds the smallest shares in: {'; '.join(zone.in_words() for zone in worst)}"
+    if scoring.zones is not None and (without_results := scoring.zones.describe_for_pedestrians()):
+        summary["zones_for_pedestrians"] = without_results
     skipped = context.scene.skipped("score")
     if skipped:
         summary["skipped"] = skipped

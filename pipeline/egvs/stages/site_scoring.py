@@ -55,6 +55,7 @@ from egvs.sensors.sites import Pose, ScannedSite
 from egvs.stages.base import StageContext
 from egvs.stages.blocked_sites import near_share
 from egvs.stages.site_scans import SiteScan, empty_scans
+from egvs.world.carriageway import Carriageway
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
@@ -104,7 +105,12 @@ def zone_users(context: StageContext) -> ZoneUsers:
     record = TargetRecord.read(trajectories, read_tpog(tpog).grid, frames, NON_VEHICLE_KINDS)
     recorded = recorded_frames(trajectories)
     weight = weights_in_mix(read_periods(tpog), recorded, record)
-    return ZoneUsers.of(record, reported_zones(context.scenario), weight, _period_of_rows(record, recorded))
+    network = context.inputs.common_network
+    carriageway = None
+    if network is not None and context.scenario.effects.pedestrians_bicycles is None:
+        carriageway = Carriageway.of(network)
+    period = _period_of_rows(record, recorded)
+    return ZoneUsers.of(record, reported_zones(context.scenario), weight, period, carriageway)
 
 
 class _PeriodRows(NamedTuple):

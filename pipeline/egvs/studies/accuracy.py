@@ -118,9 +118,9 @@ def ignore_setting(_setting: str, _state: str, _details: dict[str, Any]) -> None
 
 
 def run_accuracy_study(
-    path: Path,
+    path: str | Path,
     overrides: Sequence[str],
-    out: Path,
+    out: str | Path,
     options: StudyOptions,
     *,
     progress: ProgressCallback = no_progress,
@@ -149,6 +149,7 @@ def run_accuracy_study(
         If too many seeds fail.
     """
     plugins.require_libraries("egvs accuracy", "figure", "matplotlib")
+    path, out = Path(path), Path(out)
     scenario = SettingsSource(path, tuple(overrides)).load()
     _check_options(scenario, options)
     check_no_overwrite(scenario, out, (measurement.STUDY_FOLDER,))

@@ -79,7 +79,7 @@ class EffectChange:
 
 
 def run_ablation(
-    scenario: Scenario, out: Path, *, jobs: int | None = None, progress: ProgressCallback = no_progress
+    scenario: Scenario, out: str | Path, *, jobs: int | None = None, progress: ProgressCallback = no_progress
 ) -> list[EffectChange]:
     """Run a scenario without effects, with each effect alone, and with all of them, under ``out / "ablation"``.
 
@@ -102,7 +102,7 @@ def run_ablation(
         variants["all"] = effects
     changes = []
     for name, variant in variants.items():
-        folder = out / "ablation" / name
+        folder = Path(out) / "ablation" / name
         record = run.run(scenario.with_effects(variant), folder, jobs=jobs, progress=progress)
         seconds = sum(record.stages[stage].cost.seconds for stage in RANKING_STAGES)
         scores = read_scores(RunFolder(folder).scores)
@@ -287,7 +287,7 @@ def effect_catalogue() -> list[EffectStatus]:
 
 
 def effect_statuses(
-    scenario: Scenario, out: Path | None = None, progress: ProgressCallback = no_progress
+    scenario: Scenario, out: str | Path | None = None, progress: ProgressCallback = no_progress
 ) -> list[EffectStatus]:
     """Return the status of each effect in a scenario.
 
@@ -301,7 +301,7 @@ def effect_statuses(
         Called after each effect.
     """
     scene = build_scene(scenario)
-    trials = None if out is None else EffectTrials.from_run(scene, out)
+    trials = None if out is None else EffectTrials.from_run(scene, Path(out))
     return effect_statuses_in_scene(scene, trials, progress)
 
 

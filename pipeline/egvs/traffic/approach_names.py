@@ -32,14 +32,14 @@ def approach_name(side: str, street: str) -> str:
     Parameters
     ----------
     side
-        Side of the junction where it lies, a value of :data:`~egvs.traffic.directions.COMPASS`.
+        Side of the junction where it lies, a value of :data:`~egvs.traffic.directions.COMPASS`; may be empty.
     street
         Its street; may be empty.
 
-    >>> approach_name("north", "North Street"), approach_name("north", "")
-    ('North Street (north)', 'north')
+    >>> approach_name("north", "North Street"), approach_name("north", ""), approach_name("", "North Street")
+    ('North Street (north)', 'north', 'North Street')
     """
-    return f"{street} ({side})" if street else side
+    return f"{street} ({side})" if street and side else street or side
 
 
 def crosswalk_name(approach: str) -> str:

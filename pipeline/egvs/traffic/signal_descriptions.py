@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from egvs.core.grid import Roi
+from egvs.core.wording import shorten_id
 from egvs.scenario.model import Scenario
 from egvs.traffic import network
 from egvs.traffic.directions import CLOCKWISE, COMPASS
@@ -22,6 +23,9 @@ from egvs.traffic.signals import (
     read_signals,
 )
 
+ASSUMED_SOURCE = "assumed"
+"""Source of a plan that netconvert has made."""
+
 _MAX_GREENS = 6
 _MAX_PHASES = 100
 """A program with more phases replays a recording; it is not described phase by phase."""
@@ -36,7 +40,7 @@ def describe_simulated(scenario: Scenario, path: Path, roads: network.Network) -
         planned[signal.id] = config.file or "from the scenario"
     is_assumed = any("signal" in entry for entry in scenario.assumed)
     is_assumed |= scenario.traffic.network is not None and network.is_osm(Path(scenario.traffic.network))
-    return describe_signals(found, scenario.roi.box, planned, "assumed" if is_assumed else "from the network")
+    return describe_signals(found, scenario.roi.box, planned, ASSUMED_SOURCE if is_assumed else "from the network")
 
 
 def describe_signals(
@@ -125,8 +129,8 @@ def _intervals(letters: str, program: Program, accepted: frozenset[str]) -> list
 
 
 def plan_title(plan: Mapping[str, Any]) -> str:
-    """Return the streets of a plan of :func:`describe_signals`, or the id of its signal."""
-    return " / ".join(plan["streets"]) or str(plan["signal"])
+    """Return the streets of a plan of :func:`describe_signals`, or the id of its signal, shortened."""
+    return " / ".join(plan["streets"]) or shorten_id(str(plan["signal"]))
 
 
 def format_plan(plan: Mapping[str, Any]) -> str:
@@ -146,14 +150,14 @@ def format_plan(plan: Mapping[str, Any]) -> str:
     by_times: dict[str, list[str]] = {}
     seconds: dict[str, float] = {}
     for approach, rows in by_approach.items():
+        movements: dict[str, list[str]] = {}
         for row in rows:
             times = repr(row["green_s"])
             seconds[times] = sum(end_s - begin_s for begin_s, end_s in row["green_s"])
-            is_whole = all(each["green_s"] == row["green_s"] for each in rows)
-            name = approach if is_whole else f"{approach} ({', '.join(row['movements'])})"
-            names = by_times.setdefault(times, [])
-            if name not in names:
-                names.append(name)
+            movements.setdefault(times, []).extend(row["movements"])
+        for times, listed_movements in movements.items():
+            which = "" if len(movements) == 1 else f" {', '.join(dict.fromkeys(listed_movements))}"
+            by_times.setdefault(times, []).append(f"{approach}{which}")
     listed = [f"{seconds[times]:g} s {' and '.join(names)}" for times, names in by_times.items()]
     greens = "; ".join(listed[:_MAX_GREENS])
     if len(listed) > _MAX_GREENS:

@@ -26,6 +26,7 @@ from pydantic import ValidationError
 
 from egvs.core import files
 from egvs.core.errors import InputError
+from egvs.core.wording import list_first, number_of, shorten_id
 from egvs.formats import csv_tables, xml
 from egvs.scenario.model import Scenario
 from egvs.scenario.signal_config import SignalConfig, SignalPhaseConfig
@@ -103,28 +104,38 @@ def _programs(scenario: Scenario, path: Path, roads: network.Network) -> dict[st
         where = f"{scenario.file}: traffic.signals.{name}"
         signal = find_signal(name, signals, where)
         if signal.id in programs:
-            raise InputError(where, f"signal {signal.id!r} has two plans", "Remove one of them.")
+            raise InputError(where, f"the signal {signal.title} has two plans", "Remove one of them.")
         programs[signal.id] = _make_program(config, signal, scenario, where)
     return programs
 
 
 def find_signal(name: str, signals: Sequence[Signal], where: str) -> Signal:
-    """Return the signal of a name: its id, the id of a junction, or street names with "/" or "&" between them."""
+    """Return the signal of a name: its id, the id of a junction, or street names with "/" or "&" between them.
+
+    An id may be shortened as in messages, if it is still that of one signal.
+    """
     for signal in signals:
         if name == signal.id or name in signal.nodes:
             return signal
+    called = [signal for signal in signals if signal.is_called(name)]
+    if len(called) == 1:
+        return called[0]
     streets = {normalise_street(street) for street in re.split("[/&]", name)}
-    matches = [signal for signal in signals if streets <= {normalise_street(street) for street in signal.streets}]
+    matches = called
+    matches = matches or [s for s in signals if streets <= {normalise_street(street) for street in s.streets}]
     if len(matches) == 1:
         return matches[0]
-    known = ", ".join(_describe_signal(signal) for signal in (matches or signals)[:_MAX_NAMED]) or "none"
+    known = _list_signals(matches or signals)
     if matches:
-        raise InputError(where, f"{len(matches)} signals are at these streets: {known}", "Use an id.")
+        raise InputError(where, f"{len(matches)} signals have this name: {known}", "Use an id.")
     raise InputError(where, "the network has no such signal", f"Its signals are: {known}.")
 
 
-def _describe_signal(signal: Signal) -> str:
-    return f"{signal.id} ({' / '.join(signal.streets)})" if signal.streets else signal.id
+def _list_signals(signals: Sequence[Signal]) -> str:
+    """Return streets and ids of signals; an id is complete where its short form is not that of a single signal."""
+    short = [signal.title for signal in signals]
+    titles = [signal.titled(signal.id) if short.count(signal.title) > 1 else signal.title for signal in signals]
+    return list_first(titles, _MAX_NAMED) or "none"
 
 
 def _make_program(config: SignalConfig, signal: Signal, scenario: Scenario, where: str) -> Program:
@@ -192,7 +203,9 @@ def _links_of_approach(approach: str, signal: Signal, where: str) -> list[Link]:
             matches.append(link.approach)
     known = "; ".join(f"{name} ({', '.join(movements)})" for name, movements in signal.approaches.items())
     if not matches:
-        raise InputError(where, f"signal {signal.id} has no approach {approach!r}", f"Its approaches are: {known}.")
+        raise InputError(
+            where, f"the signal {signal.title} has no approach {approach!r}", f"Its approaches are: {known}."
+        )
     if len(matches) > 1:
         problem = f"approach {approach!r} may be {' or '.join(map(repr, matches))}"
         raise InputError(where, problem, "Use the full name.")
@@ -280,10 +293,12 @@ def _read_program(path: Path, config: SignalConfig, signal: Signal) -> Program:
             if element.tag == "tlLogic":
                 name = element.attrib["id"]
                 if name in programs:
-                    problem = f"signal {name!r} has several programs"
+                    problem = f"signal {shorten_id(name)!r} has several programs"
                     raise InputError(path, problem, "Leave the one that is to be simulated.")
                 if any("next" in phase.attrib for phase in element.iter("phase")):
-                    problem = f"signal {name!r}: phases in another order (the attribute next) are not supported"
+                    problem = (
+                        f"signal {shorten_id(name)!r}: phases in another order (the attribute next) are not supported"
+                    )
                     raise InputError(path, problem, "Write the phases in the order in which they are shown.")
                 programs[name] = Program.from_element(element)
     except (KeyError, ValueError) as error:
@@ -292,14 +307,14 @@ def _read_program(path: Path, config: SignalConfig, signal: Signal) -> Program:
     if program is None and len(programs) == 1:
         program = next(iter(programs.values()))
     if program is None or not program.phases:
-        known = ", ".join(programs) or "none"
-        raise InputError(path, f"no <tlLogic> with phases for signal {signal.id!r}", f"It has: {known}.")
+        known = ", ".join(map(shorten_id, programs)) or "none"
+        raise InputError(path, f"no <tlLogic> with phases for the signal {signal.title}", f"It has: {known}.")
     never_green = {link.index for link in signal.links}
     for number, phase in enumerate(program.phases, start=1):
         where = f"{path}: phase {number}"
         if len(phase.state) != signal.states:
-            problem = f"expected a state of {signal.states} letters, got {len(phase.state)}"
-            raise InputError(where, problem, f"The signal {signal.id} has {signal.states} links.")
+            problem = f"expected a state of {number_of(signal.states, 'letter')}, got {len(phase.state)}"
+            raise InputError(where, problem, f"The signal {signal.title} has {number_of(signal.states, 'link')}.")
         never_green -= {index for index, letter in enumerate(phase.state) if letter in network.MAY_PASS_LETTERS}
         with_right_of_way = [
             link for link in signal.links if phase.state[link.index] == "G" and link.movement != CROSSING

@@ -18,6 +18,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from egvs.core.errors import InputError
+from egvs.core.wording import shorten_id
 from egvs.formats import xml
 from egvs.traffic import network
 from egvs.traffic.approach_names import ApproachNames, disambiguate_approaches
@@ -184,8 +185,22 @@ class Signal:
 
     @property
     def streets(self) -> tuple[str, ...]:
-        """Names of its streets."""
-        return tuple(dict.fromkeys(link.street for link in self.links if link.street))
+        """Names of its streets, sorted, as in the title of a junction."""
+        return tuple(sorted({link.street for link in self.links if link.street}))
+
+    @property
+    def title(self) -> str:
+        """Its streets and its id in brackets, shortened, e.g. ``"High Street / Mill Lane (cluster_123456789_9…)"``."""
+        return self.titled(shorten_id(self.id))
+
+    def titled(self, name: str) -> str:
+        """Return its streets, and in brackets its id as it is given."""
+        return f"{' / '.join(self.streets)} ({name})" if self.streets else name
+
+    def is_called(self, name: str) -> bool:
+        """Whether a name is its id, or that of one of its junctions; also as it is shortened in messages."""
+        ids = {self.id, *self.nodes}
+        return name in ids | {shorten_id(each) for each in ids}
 
     @property
     def states(self) -> int:

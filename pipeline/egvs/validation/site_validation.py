@@ -50,7 +50,7 @@ BoxesBySite = Mapping[str, Mapping[str, DetectedBoxes]]
 
 def validate_sites(
     scenario: Scenario,
-    out: Path,
+    out: str | Path,
     *,
     sampling: FrameSampling,
     detectors: Sequence[str] = (POINT_COUNTS_NAME,),
@@ -83,6 +83,7 @@ def validate_sites(
         of interest, or the KITTI results do not belong to these sites and frames.
     """
     plugins.require_libraries("egvs validate", "validate", "matplotlib")
+    out = Path(out)
     chosen = {name: base.make_detector(name) for name in dict.fromkeys(detectors) if name != POINT_COUNTS_NAME}
     _check_no_input_overwritten(scenario, out, kitti)
 
