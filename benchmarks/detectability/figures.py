@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from egvs.core import files
 
@@ -12,6 +15,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 NAME = "detectability.png"
+
+Curves = Mapping[str, Sequence[Mapping[str, float]]]
+"""By junction, the bins of :func:`benchmarks.detectability.fitting.curve`."""
 
 _COLOURS = {"cluster": "#0072B2", "pointpillars": "#D55E00"}
 _OTHER = "#777777"
@@ -51,4 +57,48 @@ def calibration(models: dict[str, Any]) -> Figure:
         axes.grid(True, color="0.9", linewidth=0.6)
         axes.set_axisbelow(True)
         axes.tick_params(labelsize=7)
+    return figure
+
+
+def draw_reliability(path: Path, detector: str, curves: Curves) -> None:
+    """Write the reliability diagrams of a detector as PNG, one for each junction."""
+    with files.atomic_write(path) as partial:
+        reliability_diagrams(detector, curves).savefig(partial, dpi=130, format="png", metadata={"Software": None})
+
+
+def reliability_diagrams(detector: str, curves: Curves) -> Figure:
+    """Draw the share that was found by predicted probability, for each junction.
+
+    The area of a marker is the number of vehicle-frames; bars are 95 % intervals of a share of independent
+    vehicle-frames, so they are too short: frames of one queue are not independent. The title has the difference between
+    the predicted and the actual share of all vehicles.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    columns = min(len(curves), 3)
+    rows = -(-len(curves) // columns)
+    figure = Figure(figsize=(2.9 * columns, 3.1 * rows + 0.3), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(f"{detector}: each junction predicted by the model of the others", fontsize=10)
+    each_axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
+    for axes, (name, parts) in zip(each_axes, curves.items(), strict=False):
+        chance, found, count = (
+            np.array([part[key] for part in parts]) for key in ("chance", "found", "vehicle_frames")
+        )
+        axes.plot([0.0, 1.0], [0.0, 1.0], color="0.5", linewidth=0.9)
+        half = 1.96 * np.sqrt(found * (1.0 - found) / count)
+        colour = _COLOURS.get(detector, _OTHER)
+        axes.errorbar(chance, found, yerr=half, color=colour, linewidth=1.0)
+        axes.scatter(chance, found, s=4.0 + 90.0 * count / count.max(), color=colour, alpha=0.7)
+        off = 100.0 * float(((chance - found) * count).sum() / count.sum())
+        axes.set_title(f"{name}: {off:+.1f} points predicted", fontsize=8)
+        axes.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0))
+        axes.grid(True, color="0.9", linewidth=0.6)
+        axes.set_axisbelow(True)
+        axes.tick_params(labelsize=7)
+    for axes in each_axes[len(curves) :]:
+        axes.set_axis_off()
+    figure.supxlabel("predicted probability", fontsize=9)
+    figure.supylabel("share that was found", fontsize=9)
     return figure

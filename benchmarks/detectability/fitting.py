@@ -53,11 +53,25 @@ def fit_model(examples: Sequence[Examples]) -> dict[str, Any]:
     """Return the model of these junctions, in the format of the program's file."""
     x = np.concatenate([examples_ for e in examples for examples_ in e.features])
     y = np.concatenate([examples_ for e in examples for examples_ in e.hits])
-    weight, label = np.append(y, 1.0 - y), np.append(np.ones(len(y)), np.zeros(len(y)))
+    return fit_trees(x, y, np.ones(len(y)), list(MONOTONICITY.values()))
+
+
+def fit_trees(x: Floats, hits: Floats, row_weight: Floats, directions: Sequence[int]) -> dict[str, Any]:
+    """Return boosted trees in the format of the program's file.
+
+    Parameters
+    ----------
+    x, hits, row_weight
+        Features (n, f), share of the two views in which each vehicle was found, and weight of each row, (n,) float64.
+    directions
+        1, -1 or 0 for each feature, as in :data:`egvs.scoring.target_scores.MONOTONICITY`.
+    """
+    weight = np.append(hits, 1.0 - hits) * np.append(row_weight, row_weight)
+    label = np.append(np.ones(len(hits)), np.zeros(len(hits)))
     is_used = weight > 0.0
     classifier = HistGradientBoostingClassifier(
         max_iter=TREES, learning_rate=RATE, max_leaf_nodes=LEAVES, min_samples_leaf=MIN_SAMPLES,
-        monotonic_cst=list(MONOTONICITY.values()), early_stopping=False, random_state=0,
+        monotonic_cst=list(directions), early_stopping=False, random_state=0,
     ).fit(np.concatenate([x, x])[is_used], label[is_used], sample_weight=weight[is_used])  # fmt: skip
     trees = [[_node(node) for node in predictor[0].nodes] for predictor in classifier._predictors]
     return {"base": _short(classifier._baseline_prediction.item()), "trees": trees}

@@ -94,5 +94,5 @@ def test_no_cell_is_cut_off_on_a_narrow_terminal(
     table = capsys.readouterr().out.partition("\n* no cheaper")[0]
     assert max(map(len, table.splitlines())) <= width
     cells = table.replace("\n", " ").split()
-    assert {"*=", "seconds", "loss", "chooses", "~8.0", "~2.0", "~12345.6", "±0.01", "±0.20", "±10.20"} <= set(cells)
+    assert {"*=", "seconds", "loss", "chooses", "~8.0", "~2.0", "~12345.6", "0.01", "0.20", "10.20"} <= set(cells)
     assert set(long.setting.split()) <= set(cells)

@@ -264,7 +264,7 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "points from elsewhere": (
         put("cloud.csv", "x_m,y_m,z_m\n10,500,3\n", POINTS, ONE_SITE),
-        r"points: .*cloud.csv: none of 1 points lies on a beam",
+        r"points: .*cloud.csv: none of 1 point lies on a beam",
     ),
     "points missing": (
         put("sites.csv", "site,x_m,y_m,z_m\na,10,12,3\n", POINTS),

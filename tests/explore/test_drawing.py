@@ -233,4 +233,4 @@ def test_people_are_not_counted_as_vehicles() -> None:
     frame = TrafficFrame(3, ("a", "b", "c"), ("passenger", "pedestrian", "bicycle"), np.zeros((3, 7)), np.zeros(3))
     masks = ([True, True, False], [True, False, False], [False, True, True])
     counts = [drawing._count_road_users(frame, np.array(selected)) for selected in masks]
-    assert counts == ["1 vehicles, 1 people", "1 vehicles", "0 vehicles, 2 people"]
+    assert counts == ["1 vehicle, 1 person", "1 vehicle", "0 vehicles, 2 people"]

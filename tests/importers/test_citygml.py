@@ -103,7 +103,7 @@ def test_objects_outside_the_window_are_left_out(tmp_path: Path) -> None:
     assert result.counts.dropped == {"out_of_range": {"building": 1}}
     path = write_model(tmp_path / "b.gml", house("far", 1300, 0))
     result = citygml.read_solids([path], CONTEXT)
-    assert result.notes == ("b.gml: none of its 1 objects is within reach; the nearest is 1.0 km away.",)
+    assert result.notes == ("b.gml: none of its 1 object is within reach; the nearest is 1.0 km away.",)
 
 
 def test_swapped_axes_are_an_error(tmp_path: Path) -> None:
@@ -176,8 +176,8 @@ def test_templates_are_placed_along_the_axes_of_the_file(tmp_path: Path) -> None
     np.testing.assert_allclose(meshes["large"].vertices_m.min(axis=0), [60, 30, 4], atol=1e-6)
     np.testing.assert_allclose(meshes["large"].vertices_m.max(axis=0), [64, 32, 14], atol=1e-6)
     assert result.counts.dropped == {"no_surface": {"furniture": 2}}
-    assert "1 templates are in other files, which are not read." in result.notes
-    assert "1 references lead to no surface in the same object." in result.notes
+    assert "1 template is in other files, which are not read." in result.notes
+    assert "1 reference leads to no surface in the same object." in result.notes
 
 
 def test_templates_at_degrees_keep_their_size(tmp_path: Path) -> None:
@@ -187,7 +187,7 @@ def test_templates_at_degrees_keep_their_size(tmp_path: Path) -> None:
     (mesh,) = result.meshes
     np.testing.assert_allclose(mesh.vertices_m.min(axis=0), [20, 30, 3], atol=2e-3)
     np.testing.assert_allclose(mesh.vertices_m.max(axis=0), [21, 32, 8], atol=2e-3)
-    assert "1 templates are placed at degrees; their axes are taken as metres east, north and up." in result.notes
+    assert "1 template is placed at degrees; axes are taken as metres east, north and up." in result.notes
 
 
 def test_kinds_of_objects(tmp_path: Path) -> None:
@@ -218,8 +218,8 @@ def test_open_buildings_are_named_and_degenerate_rings_counted(tmp_path: Path) -
     assert [mesh.is_closed for mesh in result.meshes] == [False, True]
     assert result.notes == (
         "building: 2 at LOD 1.",
-        "1 of 2 meshes of the kind building are not closed, so a point inside cannot be recognised: open.",
-        "1 rings without area were left out.",
+        "1 of 2 meshes of the kind building is not closed, so a point inside cannot be recognised: open.",
+        "1 ring without area was left out.",
     )
 
 

@@ -136,7 +136,7 @@ def test_bridge_runs_straight_over_the_valley(tmp_path: Path) -> None:
     assert "2 edges on bridges or in tunnels run straight between their ends." in draped.notes
     assert not any("cross without a junction" in note for note in draped.notes)
     on_ground = drape_network(text, VALLEY, (0.0, 0.0))
-    assert any("4 times roads cross without a junction" in note for note in on_ground.notes)
+    assert any("In 4 places, roads cross without a junction" in note for note in on_ground.notes)
 
 
 @pytest.mark.system

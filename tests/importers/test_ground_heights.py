@@ -154,7 +154,7 @@ def test_landxml_surface_by_hand(tmp_path: Path) -> None:
     points = np.array([[5.0, 5.0], [10.0, 5.0], [2.0, 8.0], [11.0, 5.0]])
     assert terrain.height_m(points) == pytest.approx([52, 52, 50.8, math.nan], nan_ok=True)
     assert "2 triangles in the region, 50.0 to 54.0 m high" in terrain.notes[0]
-    assert terrain.notes[1].endswith("1 hidden faces were left out.")
+    assert terrain.notes[1].endswith("1 hidden face was left out.")
     with pytest.raises(InputError, match="no triangle in the region"):
         landxml_terrain.read_terrain([tmp_path / "s.xml"], MapContext(frame, box(500, 0, 510, 10)))
 
@@ -199,7 +199,7 @@ def test_surface_outside_the_region_is_left_out_and_counted(tmp_path: Path) -> N
     context = MapContext(FRAME, box(-2000, -2000, 2000, 2000))
     alone = landxml_terrain.read_terrain([near], context)
     both = landxml_terrain.read_terrain([far, near], context)
-    assert both.notes == (*alone.notes, "1 of 2 terrain surfaces are outside the region and were left out.")
+    assert both.notes == (*alone.notes, "1 of 2 terrain surfaces outside the region was left out.")
     xy_m = np.array([[1.0, 0.5]])
     assert both.height_m(xy_m) == alone.height_m(xy_m) and np.isfinite(alone.height_m(xy_m)).all()
     with pytest.raises(InputError, match=r"far.xml: the terrain has no triangle in the region"):

@@ -317,7 +317,7 @@ def test_speed_limits(tmp_path: Path) -> None:
     built = build(crossing.writer.write(tmp_path / "map.osm"))
     speeds = {edge.id: round(edge.lanes[0].speed_m_s * 3.6) for edge in built.network.edges}
     assert [speeds[f"road_{crossing.into[arm]}"] for arm in range(4)] == [36, 30, 80, 70]
-    assert built.note("Speed limits").endswith("50 km/h for 4, 80 km/h for 1 lanes.")
+    assert built.note("Speed limits").endswith("50 km/h for 4 lanes, 80 km/h for 1 lane.")
     lanelets[crossing.into[0]][2]["speed_limit"] = "fast"
     with pytest.raises(InputError, match=rf"lanelet {crossing.into[0]}: speed_limit: .*'fast'"):
         build(crossing.writer.write(tmp_path / "map.osm"))

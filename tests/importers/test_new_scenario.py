@@ -191,8 +191,8 @@ def test_buildings_without_a_height_get_that_of_their_neighbours() -> None:
     objects = collect(reader("city", SolidMap(meshes=tuple(known))), footprints)
     assert [(solid.height_m, solid.height_source) for solid in objects.solids] == [(13.0, "neighbours")]
     assert objects.counts.heights["building"] == {"neighbours": 1}
-    assert "1 of 1 buildings have neither height nor levels: the median" in scenario_notes(True, objects.counts)[0]
-    assert assumed_sizes(objects.counts) == ["heights of 1 of 1 buildings"]
+    assert "1 of 1 building has neither height nor levels: the median" in scenario_notes(True, objects.counts)[0]
+    assert assumed_sizes(objects.counts) == ["heights of 1 of 1 building"]
 
 
 def test_mesh_in_lanes_is_reported() -> None:

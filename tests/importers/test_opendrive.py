@@ -81,7 +81,7 @@ def test_recognises_name_and_root_element() -> None:
 def test_second_lane_that_leads_to_one_is_added(tmp_path: Path) -> None:
     road_map, roads = convert(tmp_path, maps.merge())
     assert turns(roads) == {("-1", 0, "-2", 0), ("-1", 1, "-2", 0)}
-    assert road_map.notes[0] == "1 of 2 turns that netconvert had lost were added, from roads 1."
+    assert road_map.notes[0] == "1 of 2 turns that netconvert had lost was added, from roads 1."
     assert "3 of 3 lanes for vehicles and 2 of 2 turns" in road_map.notes[1]
     assert not road_map.has_heights
     shapes = {name: lane.shape_m[:, :2].tolist() for name, lane in lanes(roads).items()}
@@ -154,8 +154,8 @@ def test_lane_drop_is_reported(tmp_path: Path) -> None:
     road_map, roads = convert(tmp_path, maps.lane_drop())
     notes = " ".join(road_map.notes)
     assert "8 of 8 lanes for vehicles and 5 of 5 turns" in notes
-    assert "1 lanes are closed to normal traffic" in notes  # the narrow half of the taper
-    assert "Lanes of 1 roads lie more than 0.3 m off the map, up to 0.8 m: 1." in notes
+    assert "1 lane narrower than 1.8 m is closed to normal traffic" in notes  # the narrow half of the taper
+    assert "Lanes of 1 road lie more than 0.3 m off the map, up to 0.8 m: 1." in notes
     assert [len(edge.lanes) for edge in roads.edges] == [3, 3, 3, 2]
 
 
@@ -191,8 +191,8 @@ def test_signals_become_lights_and_signs_are_counted(tmp_path: Path) -> None:
     sign = '<signal id="s2" s="50" t="-8" dynamic="no" orientation="+" type="274" subtype="50"/>'
     road_map, roads = convert(tmp_path, maps.merge(light + sign))
     notes = " ".join(road_map.notes)
-    assert "1 traffic lights: their places and programs are not in the network" in notes
-    assert "1 signs and marks are left out." in notes and "have no effect" not in notes
+    assert "1 traffic light: places and programs are not in the network" in notes
+    assert "1 sign or mark is left out." in notes and "have no effect" not in notes
     assert roads.cycle_s > 0
     # a light at the end of a road that leads nowhere
     alone = road("1", 100, geometry(0, 0, 0, 100), section([lane(-1), lane(-2)]), signals=light)
@@ -208,7 +208,7 @@ def test_road_over_another_is_reported(tmp_path: Path) -> None:
     low = road("1", 100, geometry(0, 0, 0, 100), one_way)
     over = road("2", 100, geometry(50, -50, math.pi / 2, 100), one_way, elevation=high)
     road_map, roads = convert(tmp_path, maps.opendrive(low, over))
-    assert any("1 times roads lead over others: -2 over -1." in note for note in road_map.notes)
+    assert any("In 1 place, roads lead over others: -2 over -1." in note for note in road_map.notes)
     assert not {"-1", "-2"} & {c for pair in turns(roads) for c in pair}
     flat = maps.opendrive(low, over.replace('a="6"', 'a="1"'))
     assert not any("lead over" in note for note in convert(tmp_path, flat)[0].notes)
@@ -360,7 +360,8 @@ def test_road_marks_forbid_lane_changes(marks: tuple[str, str], expected: dict[s
     road_map, _ = convert(tmp_path, three_lanes(*marks))
     assert changes(road_map) == expected
     notes = [note for note in road_map.notes if note.startswith("Road marks forbid")]
-    assert notes == ([f"Road marks forbid lane changes from {len(expected)} lanes, of -1."] if expected else [])
+    lanes = "1 lane" if len(expected) == 1 else f"{len(expected)} lanes"
+    assert notes == ([f"Road marks forbid lane changes from {lanes}, of -1."] if expected else [])
 
 
 @pytest.mark.system

@@ -551,7 +551,7 @@ def test_flow_above_capacity_is_reduced_and_said(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(assumed_traffic, "find_capacity", lambda *_: Capacity(0.155, runs[:1]))
     notes = create_scenario(tmp_path / "jammed", SMALL).notes
     assert notes[-1] == (
-        "Traffic jams occur in all 1 trials; a vehicle stood for 300 s at junction 1, Main Street from 20 s on."
+        "Traffic jams occur in the trial; a vehicle stood for 300 s at junction 1, Main Street from 20 s on."
         " Lower per_hour of traffic.counts, or check the signals and connections there."
     )
 

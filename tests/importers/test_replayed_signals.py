@@ -173,7 +173,7 @@ def test_crossings_are_green_while_vehicles_have_red(tmp_path: Path, replay: Rep
     records = {name: crossing_record(name) for name in ("a", "b")}
     signals = RecordedSignals(records, (), groups)
     plan = signal_programs.apply_signals(network, "A0", signals, None, "--signals", replay=replay)
-    assert "4 crossings have no recorded signal; they are green while the vehicles they cross have red." in plan.notes
+    assert "4 crossings without recorded signal: green while the crossed vehicles have red." in plan.notes
 
     root = ElementTree.fromstring(plan.network)
     crossed = {

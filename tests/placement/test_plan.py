@@ -255,7 +255,7 @@ REJECTED = {
     ),
     "a zone in the way of a reach": (
         ["--count", "1", "--reach", "0.01", "--set", ZONE % (0.5, 2)],
-        "placement.zones: found no plan of 1 sensors that meets the requirements of all zones",
+        "placement.zones: found no plan of 1 sensor that meets the requirements of all zones",
     ),
     "no costs": (["--budget", "50"], "placement.budget: the cost of site a is unknown"),
     "a sensor without a price": (
@@ -297,7 +297,7 @@ REJECTED = {
     ),
     "a zone beyond the count": (
         ["--count", "1", "--set", ZONE % (0.5, 2)],
-        "placement.zones: found no plan of 1 sensors that meets the requirements of all zones",
+        "placement.zones: found no plan of 1 sensor that meets the requirements of all zones",
     ),
 }
 

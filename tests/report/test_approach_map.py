@@ -60,3 +60,14 @@ def test_labels_cover_no_other_label_and_stay_on_the_map() -> None:
         assert plan.top <= top and bottom <= plan.top + plan.frame_height
     assert "Street &lt;3&gt;" in "".join(drawing)
     assert sum("<path" in part for part in drawing) >= 1  # a line to a label that is far away
+
+
+def test_long_name_in_the_middle_stays_on_the_map() -> None:
+    """A name of more than half the map fits on neither side of its disc in the middle: it goes above or below."""
+    plan = MapFrame((0.0, 0.0, 100.0, 100.0), "approaches", width=420.0, north=True)
+    covered: list[Box] = []
+    label = ApproachLabel(np.array([50.0, 50.0]), "Wehneberger Straße (north)", {"left": 299.0, "right": 76.0})
+    list(approach_map._draw_label(plan, label, covered))
+    ((left, top, right, bottom),) = covered
+    assert plan.left <= left and right <= plan.left + plan.frame_width
+    assert not top < plan.y(50.0) < bottom

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -54,6 +55,17 @@ def test_says_that_tilted_sensors_were_not_validated(pitch_deg: float, is_tilted
 def test_size_of_expected_detections_was_validated_less_than_its_order() -> None:
     (sentence,) = describe_reliability(ranked(("a", 3, 0, 0.9), ("b", 3, 0, 0.5), rank_by="expected_detections"))
     assert "the size of the score less" in sentence and "±" not in sentence
+
+
+@pytest.mark.parametrize("rank_by", ["egvs", "expected_detections"])
+@pytest.mark.parametrize("traffic", [{"seeds": [1, 7, 9]}, {"periods": {"day": {"seeds": [1, 7, 9]}}}])
+def test_says_that_errors_come_from_several_simulations(rank_by: str, traffic: dict[str, Any]) -> None:
+    ranking = ranked(("a", 3, 0, 0.9), ("b", 3, 0, 0.5), rank_by=rank_by)
+    assert not any("±" in sentence for sentence in describe_reliability(ranking, traffic))
+    with_errors = replace(ranking, sites=tuple(replace(site, egvs_se=0.1) for site in ranking.sites))
+    (sentence,) = describe_reliability(with_errors, traffic)
+    assert sentence.startswith("± is the error of finite simulations only, from the differences between 3 of them.")
+    assert ("validated" in sentence) == (rank_by == "expected_detections")
 
 
 def test_sites_that_see_nothing_or_score_the_same_need_no_further_words() -> None:

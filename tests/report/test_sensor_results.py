@@ -43,7 +43,7 @@ def test_one_more_point_costs_the_price_difference_over_the_gain() -> None:
     assert [result.cost_text for result in comparison.results] == ["4,000", "8,000", "18,000"]
     assert [result.cost_per_point_text for result in comparison.results] == ["-", "200", "560"]
     assert [result.step_cost_text for result in comparison.results] == ["-", "200", "2,000"]
-    assert [result.gain_text for result in comparison.results] == ["-", "+20.0 ±0.4", "+25.0 ±0.4"]
+    assert [result.gain_text for result in comparison.results] == ["-", "+20.0 ± 0.4", "+25.0 ± 0.4"]
 
 
 def test_costs_contain_pole_and_height() -> None:
@@ -65,7 +65,7 @@ def test_dearer_sensor_that_finds_less_has_no_cost_per_point() -> None:
 
 def test_gain_within_its_error_has_no_cost_per_point() -> None:
     comparison = compare(site("a", "medium", 0.602), site("b", "small", 0.60))
-    assert comparison.results[1].gain_text == "~ +0.2 ±0.4"
+    assert comparison.results[1].gain_text == "~ +0.2 ± 0.4"
     assert comparison.results[1].cost_per_point_text == "not clear"
 
 
@@ -123,7 +123,7 @@ def test_difference_of_unknown_error_is_shown_without_one() -> None:
 
 
 def test_difference_that_is_rounded_to_zero_has_no_minus() -> None:
-    assert format_difference(ScoreDifference(-0.0004, 0.003, 0.5), site("a", "s", 0.6)) == "~ +0.0 ±0.3"
+    assert format_difference(ScoreDifference(-0.0004, 0.003, 0.5), site("a", "s", 0.6)) == "~ +0.0 ± 0.3"
 
 
 def test_evidence_is_that_of_the_score_that_ranks() -> None:
@@ -138,7 +138,7 @@ def test_evidence_is_that_of_the_score_that_ranks() -> None:
 
 def test_difference_in_bits_has_no_percentage_points() -> None:
     bits = replace(site("a", "s", 0.65), rank_by="egvs", others=())
-    assert format_difference(ScoreDifference(1234.4, 56.0, 1.0), bits) == "+1,234 ±56"
+    assert format_difference(ScoreDifference(1234.4, 56.0, 1.0), bits) == "+1,234 ± 56"
     assert math.isclose(bits.score, 650.0)
 
 

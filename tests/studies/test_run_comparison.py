@@ -312,9 +312,9 @@ def test_tables_of_poles_fit_the_terminal(width: int, runs: int, monkeypatch: py
     assert max(len(line) for line in tables if line.startswith(("pole", "kerb"))) <= width
     first_rows = [line for line in tables if line.startswith("kerb_0")]
     for number in range(runs):
-        assert any(f"{0.8 + 0.01 * number:.1%} ±0.3%" in line for line in first_rows)
-    assert all("80.0% ±0.3%" in line for line in first_rows)  # the first run is in each table
-    assert "+1.0 ±0.4" in text
+        assert any(f"{0.8 + 0.01 * number:.1%} ± 0.3%" in line for line in first_rows)
+    assert all("80.0% ± 0.3%" in line for line in first_rows)  # the first run is in each table
+    assert "+1.0 ± 0.4" in text
     if width == 80:
         assert "4.5 m, -10°" in first_rows[0]
     else:
@@ -326,7 +326,7 @@ def test_says_at_how_many_poles_a_run_is_better(monkeypatch: pytest.MonkeyPatch)
     a, b = made_run("A", *mounts("s", 0.9, 0.8, 0.7)), made_run("B", *mounts("t", 0.93, 0.802, 0.68))
     text = printed_text(by_pole(a, b), 160, monkeypatch)
     assert "B against A at 3 common poles: better at 2 (clearly at 1), worse at 1 (clearly at 1)" in text
-    for difference in ("  +3.0 ±0.4", "~ +0.2 ±0.4", "  -2.0 ±0.4"):
+    for difference in ("  +3.0 ± 0.4", "~ +0.2 ± 0.4", "  -2.0 ± 0.4"):
         assert difference in text
 
 

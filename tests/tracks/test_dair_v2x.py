@@ -92,7 +92,7 @@ def test_boxes_without_track_are_tracks_of_one_row(tmp_path: Path) -> None:
     tracks = dair_v2x.read(path)
     assert tracks.names == ("000000-0", "000000-1", "000001-0", "000001-1")
     assert tracks.sources[1] == (
-        "4 boxes have no track_id: each is a track of one row, and counts only in a frame at exactly its time"
+        "4 boxes without track_id: each is a track of one row, and counts only in a frame at exactly its time"
     )
 
 

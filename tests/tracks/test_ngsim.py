@@ -38,7 +38,7 @@ def test_by_hand(tmp_path: Path) -> None:
                           ("5", "car", time_s + 0.2, 6.096, 33.0708, NAN, NAN, 4.572, 1.8288, NAN)])  # fmt: skip
     assert tracks.frame.crs is None
     assert "0 vehicles have an id that an earlier one had" in tracks.sources
-    assert "0 vehicles never move; they are taken to head along +y" in tracks.sources
+    assert "0 vehicles without movement: taken to head along +y" in tracks.sources
 
 
 def test_centres_lie_behind_along_the_motion_and_along_y_for_those_that_stand(tmp_path: Path) -> None:
@@ -47,7 +47,7 @@ def test_centres_lie_behind_along_the_motion_and_along_y_for_those_that_stand(tm
     assert [box[3] for box in box_list(tracks)] == [round(feet * 0.3048, 4) for feet in (15, 5, 100)]
     assert [box[4] for box in box_list(tracks)] == [round(feet * 0.3048, 4) for feet in (0, 0, 95)]
     assert tracks.classes == ("truck", "motorcycle")
-    assert "1 vehicles never move; they are taken to head along +y" in tracks.sources
+    assert "1 vehicle without movement: taken to head along +y" in tracks.sources
 
 
 def test_an_id_that_returns_is_another_vehicle(tmp_path: Path) -> None:

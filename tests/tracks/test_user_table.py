@@ -118,7 +118,7 @@ def test_fronts_without_yaw_use_the_motion(tmp_path: Path) -> None:
     tracks = user_table.read(path, mapping(**PLAIN, length="l", default_type="car", reference="front"))
     assert [box[:5] for box in box_list(tracks)] == [("k", "car", t, 5, 2 * t - 2) for t in range(4)]
     assert tracks.names == ("k",) and np.isnan(tracks.yaw_rad).all()
-    assert tracks.sources[0].startswith("4 rows are left out: they give the front only")
+    assert tracks.sources[0].startswith("4 rows left out: only the front is given")
 
 
 def test_z_at_the_bottom_without_height_is_unknown(tmp_path: Path) -> None:

@@ -85,7 +85,7 @@ def test_warns_about_counts_above_lane_capacity(cross, tmp_path):
     assert (warning["rule"], waiting["rule"]) == ("counts", "waiting")
     assert not warning["is_error"]
     assert re.search(r"the count of left0A0 to A0top0 exceeds .*: \d+(\.\d)? of 9000 vehicles an", waiting["problem"])
-    assert re.search(r"misses 1 of 1 counts .*left0A0 to A0top0: \d+(\.\d)? instead of 9000", warning["problem"])
+    assert re.search(r"misses 1 of 1 count .*left0A0 to A0top0: \d+(\.\d)? instead of 9000", warning["problem"])
 
 
 @pytest.mark.slow

@@ -187,7 +187,7 @@ def test_position_and_heading_are_converted_from_another_grid(tmp_path: Path) ->
         ),
         (
             lambda folder: (folder / "tracks.csv").write_text(interaction_csv([("a", 0.0, 1.0, 1.0, 0.0)])),
-            "last 0 s, 1 frames",
+            "last 0 s, 1 frame",
         ),
         (
             lambda folder: (folder / "tracks.csv").write_text(

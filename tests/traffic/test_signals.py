@@ -199,8 +199,23 @@ def test_summary_names_the_plan(crossing, tmp_path):
     assert (east["green_s"], east["gives_way"]) == ([[35, 55]], True)
     text = signal_descriptions.format_plan(plan)
     assert text == (
-        "Signals at Mill Lane / High Street (from the scenario): fixed, cycle 60 s; green 30 s Mill Lane (north) and"
+        "Signals at High Street / Mill Lane (from the scenario): fixed, cycle 60 s; green 30 s Mill Lane (north) and"
         " Mill Lane (south); 20 s High Street (east) and High Street (west)."
+    )
+
+
+def test_movements_with_equal_green_share_an_entry():
+    """Left turns have 10 s of their own; straight on and right have green together, one of them giving way."""
+    row = {"approach": "Mill Lane (north)", "yellow_s": [], "gives_way": False}
+    rows = [
+        row | {"movements": ["left"], "green_s": [[0, 10]]},
+        row | {"movements": ["straight"], "green_s": [[10, 40]]},
+        row | {"movements": ["right"], "green_s": [[10, 40]], "gives_way": True},
+    ]
+    plan = {"signal": "c", "streets": ["Mill Lane"], "source": "assumed", "type": "fixed", "cycle_s": 60, "rows": rows}
+    assert signal_descriptions.format_plan(plan) == (
+        "Signals at Mill Lane (assumed): fixed, cycle 60 s; green 10 s Mill Lane (north) left;"
+        " 30 s Mill Lane (north) straight, right."
     )
 
 
@@ -231,9 +246,9 @@ def test_signal_of_several_junctions_knows_its_foes(tmp_path):
 
 
 WRONG = [
-    ({"x": {"phases": [NS, EW]}}, r"traffic.signals.x: the network has no such signal. Its signals are: Mill Lane"),
+    ({"x": {"phases": [NS, EW]}}, r"traffic.signals.x: the network has no such signal. Its signals are: High Street"),
     ({"c": {"phases": [NS, EW | {"green": {"nrth": ["all"]}}]}},
-     r"Street \(c\) has no approach 'nrth'. Its approaches are: Mill Lane \(north\) \(right, straight, left"),
+     r"Lane \(c\) has no approach 'nrth'. Its approaches are: Mill Lane \(north\) \(right, straight, left"),
     ({"c": {"phases": [NS, EW | {"green": {"Mill Lane": ["all"]}}]}},
      r"approach 'Mill Lane' may be 'Mill Lane \(north\)' or 'Mill Lane \(south\)'. Use the full name"),
     ({"c": {"phases": [NS | {"green": {"north": ["sideways"]}}, EW]}},
@@ -246,7 +261,7 @@ WRONG = [
     ({"c": {"phases": [NS]}}, r"never green: High Street \(east\) right, High Street \(east\) straight"),
     ({"c": {"phases": [NS, EW], "cycle_s": 90}},
      r"cycle_s = 90: the phases with yellow and all-red add up to 60 s \(30, 3, 2, 20, 3, 2\). Use cycle_s = 60"),
-    ({"c": {"phases": [NS, EW]}, "Mill Lane": {"phases": [NS, EW]}}, r"High Street \(c\) has two plans"),
+    ({"c": {"phases": [NS, EW]}, "Mill Lane": {"phases": [NS, EW]}}, r"High Street / Mill Lane \(c\) has two plans"),
     ({"c": {"file": "missing.csv"}}, "missing.csv"),
 ]  # fmt: skip
 
@@ -287,7 +302,7 @@ CSV = "phase,approach,movement,green_s\na,north,all,30\na,south,all,30\nb,east,a
         ("p.csv", CSV.replace("b,east,all,20", "b,east,all,often"), "line 4: green_s: expected seconds, got 'often'"),
         ("p.csv", CSV.replace("b,east,all,20", "b,east,all"), "line 4: expected 4 values, got 3"),
         ("p.csv", CSV.replace("green_s", "green_s,colour").replace("0\n", "0,red\n"), "unknown column 'colour'"),
-        ("p.add.xml", "<additional/>", "no <tlLogic> with phases for the signal Mill Lane / High Street (c)"),
+        ("p.add.xml", "<additional/>", "no <tlLogic> with phases for the signal High Street / Mill Lane (c)"),
         ("p.add.xml", '<additional><tlLogic id="c"><phase duration="9" state="GG"/></tlLogic></additional>',
          "expected a state of 20 letters, got 2"),
         ("p.add.xml", f'<additional><tlLogic id="c"><phase duration="9" state="{"G" * 20}"/></tlLogic></additional>',

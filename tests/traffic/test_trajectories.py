@@ -291,7 +291,7 @@ def test_jam_at_the_end_matters_in_region_or_where_a_number_is_maintained(tmp_pa
     if not jammed:
         trajectories.check_recording(model, tally, recorded)
         return
-    message = r"traffic\.counts: the traffic is jammed: 1 vehicles stand .* at x .*, from 0 s on\. Lower per_hour of"
+    message = r"traffic\.counts: the traffic is jammed: 1 vehicle stands .* at x .*, from 0 s on\. Lower per_hour of"
     with pytest.raises(RunError, match=message):
         trajectories.check_recording(model, tally, recorded)
 

@@ -135,7 +135,7 @@ WRONG = (
         (WRONG.replace("1,", "2,"), "or -1, got 2"),
         (
             WRONG.replace("{})", "0.0, ('hits',))"),
-            "expected needs of hit_counts, log_reach, returns, vehicles, got 'hits'",
+            "expected needs of hit_counts, log_reach, returns, vehicles, vehicle_points, got 'hits'",
         ),
         (WRONG.replace("{})", "0.0, (), {'a': ()})"), "expected at least one value of a in its sweep, got none"),
         ("import no_such_library", "No module named 'no_such_library'"),

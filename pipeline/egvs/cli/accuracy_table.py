@@ -80,12 +80,12 @@ def _settings_table(title: str, rows: Sequence[SettingResult], scenario: Setting
 def _format_probability(row: SettingResult) -> str:
     if math.isnan(row.probability_se):
         return format_probability(row.probability)
-    return f"{format_probability(row.probability)} ±{row.probability_se:.0%}"
+    return f"{format_probability(row.probability)} ± {row.probability_se:.0%}"
 
 
 def _format_loss(row: SettingResult) -> str:
     mark = "" if row.draws else "'"
-    return f"{row.loss_points:.2f} ±{row.loss_se_points:.2f}{mark}"
+    return f"{row.loss_points:.2f} ± {row.loss_se_points:.2f}{mark}"
 
 
 def recommendation_sentences(study: AccuracyStudy) -> list[str]:

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from egvs.cli.console import WIDE, Column, console, make_table
+from egvs.core.wording import number_of
 from egvs.importers import junctions
 from egvs.importers.new_scenario import NewScenario
 from egvs.importers.openstreetmap.solids import OUT_OF_RANGE, ImportCounts
@@ -65,7 +66,7 @@ def print_new_city(city: NewCity) -> None:
 
 def _scenario_lines(scenario: NewScenario) -> Iterator[tuple[str, str]]:
     junction, roi = scenario.junction, scenario.roi
-    arms = f"{_count('arm', junction.arms)}, {_count('incoming lane', junction.lanes_in)}"
+    arms = f"{number_of(junction.arms, 'arm')}, {number_of(junction.lanes_in, 'incoming lane')}"
     yield "junction", f"{junction.title}: {arms}; {_position(scenario)}"
     yield "region", f"{roi.size_m[0]:g} m x {roi.size_m[1]:g} m x {scenario.height_m:g} m around the junction"
     yield "streets", _describe_streets(scenario.streets)
@@ -127,25 +128,27 @@ def _position(scenario: NewScenario) -> str:
 def _describe_streets(streets: Streets) -> str:
     signalised = sum(junction.signalised for junction in streets.junctions)
     length = f"{streets.lane_length_m / 1000:,.1f} km of lanes"
-    return f"{_count('edge', len(streets.network.edges))}, {length}, {_count('junction', signalised)} with signals"
+    return (
+        f"{number_of(len(streets.network.edges), 'edge')}, {length}, {number_of(signalised, 'junction')} with signals"
+    )
 
 
 def _describe_traffic(traffic: AssumedTraffic | None) -> str:
     if traffic is None:
         return "none: no street leads vehicles through the region"
-    movements = _count("movement", len(traffic.flows))
+    movements = number_of(len(traffic.flows), "movement")
     return f"the junction {traffic.summary}: {traffic.per_h:,} vehicles an hour in {movements} (assumed)"
 
 
 def _describe_solids(counts: ImportCounts, n_solids: int | None = None) -> str:
     """Return the objects by kind, and the number of solids that ``egvs check`` counts, if it is known."""
     objects = Counter({kind: number for kind, number in counts.objects.items() if kind != "tree_crown"})
-    texts = [_count(kind.removesuffix("_trunk"), number) for kind, number in objects.most_common()]
+    texts = [number_of(number, kind.removesuffix("_trunk").replace("_", " ")) for kind, number in objects.most_common()]
     if not texts:
         return "none"
-    total = _count("object", objects.total())
+    total = number_of(objects.total(), "object")
     if n_solids is not None:
-        total += f" ({_count('solid', n_solids)} with tree crowns, cut pieces and the ground)"
+        total += f" ({number_of(n_solids, 'solid')} with tree crowns, cut pieces and the ground)"
     return f"{total}: {', '.join(texts)}"
 
 
@@ -154,14 +157,9 @@ def _describe_dropped(counts: ImportCounts) -> str:
     texts = []
     for reason, kinds in sorted(counts.dropped.items()):
         if reason != OUT_OF_RANGE:
-            objects = ", ".join(_count(kind, number) for kind, number in kinds.most_common())
+            objects = ", ".join(number_of(number, kind.replace("_", " ")) for kind, number in kinds.most_common())
             texts.append(f"{objects} ({reason.replace('_', ' ')})")
     return "; ".join(texts)
-
-
-def _count(kind: str, number: int) -> str:
-    plural = "" if number == 1 else "s"
-    return f"{number:,} {kind.replace('_', ' ')}{plural}"
 
 
 def _scenario_warnings(scenario: NewScenario) -> Iterator[str]:

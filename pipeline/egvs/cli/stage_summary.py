@@ -13,6 +13,7 @@ from typing import Any
 
 from egvs.artefacts.run_record import StageRecord
 from egvs.core.errors import WARNINGS_KEY
+from egvs.core.wording import number_of
 from egvs.report.formatting import SCORE_LABELS
 
 COUNTS, ASSUMED_FLOWS = "the counts", "the assumed flows"
@@ -77,7 +78,7 @@ def stage_lines(
     describe = partial(describe_summary, stage, with_details=with_details, flow_source=flow_source)
     text = describe(summary)
     if periods and not with_details:
-        text = f"{_count(len(periods), 'period')}, {text}"
+        text = f"{number_of(len(periods), 'period')}, {text}"
     yield f"{_STAGE_NAMES.get(stage, stage):<10} {duration:>10}   {text}"
     if not with_details:
         return
@@ -107,11 +108,11 @@ def _detail(text: str) -> Sentence:
 
 def _check_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[Sentence]:
     sites, solids, lanes = rest.pop("sites"), summary["solids"], rest.pop("lanes")
-    yield Sentence(f"{_count(sites, 'site')}, {_count(solids, 'solid')} and {_count(lanes, 'lane')} checked")
+    yield Sentence(f"{number_of(sites, 'site')}, {number_of(solids, 'solid')} and {number_of(lanes, 'lane')} checked")
 
 
 def _statics_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[Sentence]:
-    yield Sentence(f"{rest.pop('triangles'):,} triangles in {_count(summary['solids'], 'solid')}")
+    yield Sentence(f"{rest.pop('triangles'):,} triangles in {number_of(summary['solids'], 'solid')}")
     if built := rest.pop("built", None):
         yield _detail("built: " + ", ".join(f"{kind.replace('_', ' ')} ({count:,})" for kind, count in built.items()))
     if repaired := rest.pop("mended", None):
@@ -121,7 +122,7 @@ def _statics_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterato
 
 
 def _scan_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[Sentence]:
-    yield Sentence(f"{_count(rest.pop('sites'), 'site')} scanned")
+    yield Sentence(f"{number_of(rest.pop('sites'), 'site')} scanned")
     if not rest.pop("kept", True):
         yield _detail("scans not saved")
     elif "beams" in rest:
@@ -129,7 +130,7 @@ def _scan_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[S
 
 
 def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any], flow_source: str = COUNTS) -> Iterator[Sentence]:
-    frames = _count(rest.pop("frames"), "frame")
+    frames = number_of(rest.pop("frames"), "frame")
     if seeds := rest.pop("seeds", None):
         frames += f" of {len(seeds)} simulations"
     yield Sentence(frames)
@@ -138,13 +139,13 @@ def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any], flow_sourc
         standing, longest_s = rest.pop("share_standing"), rest.pop("longest_standing_s")
         yield _detail(f"mean speed {3.6 * rest.pop('mean_speed_m_s'):.0f} km/h")
         yield _detail(f"standing {standing:.0%} of the time, for at most {longest_s:g} s")
-        yield _detail(f"vehicles overlap in {_count(rest.pop('frames_with_overlap'), 'frame')}")
+        yield _detail(f"vehicles overlap in {number_of(rest.pop('frames_with_overlap'), 'frame')}")
     if rest.get("collisions") is not None:
-        yield _detail(_count(rest.pop("collisions"), "collision"))
+        yield _detail(number_of(rest.pop("collisions"), "collision"))
     if (overlaps := rest.pop("overlapping_pairs_in_roi", None)) is not None:
-        yield _detail(f"{_count(overlaps, 'overlap')} in the region")
+        yield _detail(f"{number_of(overlaps, 'overlap')} in the region")
     if teleports := rest.pop("teleports", 0):
-        yield Sentence(f"{_count(teleports, 'vehicle')} moved on")
+        yield Sentence(f"{number_of(teleports, 'vehicle')} moved on")
     if counts := rest.pop("counts", None):
         worst = max(count["geh"] for count in counts)
         yield Sentence(f"largest GEH against {flow_source} {worst:.1f}")
@@ -158,7 +159,7 @@ def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any], flow_sourc
 
 def _track_sentences(tracks: dict[str, Any]) -> Iterator[Sentence]:
     """Yield what was read from recorded tracks, changed and left out."""
-    text = _count(tracks["tracks"], "track")
+    text = number_of(tracks["tracks"], "track")
     if coverage := tracks.get("coverage"):
         text += f" cover {coverage['share']:.0%} of the {coverage['of']}"
     else:
@@ -196,7 +197,7 @@ _TRACK_COUNTS = {
 
 def _tpog_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[Sentence]:
     yield Sentence(f"{rest.pop('boxes_in_roi'):.1f} vehicles in the region on average")
-    yield _detail(f"{_count(rest.pop('occupied_voxels'), 'voxel')} occupied at least once")
+    yield _detail(f"{number_of(rest.pop('occupied_voxels'), 'voxel')} occupied at least once")
     yield _detail(f"{rest.pop('static_voxels'):,} filled by static solids")
     memory = rest.pop("memory_frames")
     if isinstance(memory, float):
@@ -204,15 +205,15 @@ def _tpog_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[S
     yield _detail(f"autocorrelation time {memory} frames")
     if gaps := rest.pop("unknown_gaps", 0):
         scaled, left_out = rest.pop("scaled_voxels"), rest.pop("unknown_voxels")
-        text = f"counts of {_count(scaled, 'voxel')} scaled, and {left_out:,} left out, where tracks have"
-        yield _detail(f"{text} {_count(gaps, 'long gap')}")
+        text = f"counts of {number_of(scaled, 'voxel')} scaled, and {left_out:,} left out, where tracks have"
+        yield _detail(f"{text} {number_of(gaps, 'long gap')}")
 
 
 def _score_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[Sentence]:
     best = rest.pop("best")
     by = SCORE_LABELS[rest.pop("rank_by")]
     limit = rest.pop("egvs_limit")
-    yield Sentence(f"{_count(rest.pop('sites'), 'site')} ranked by {by.noun}")
+    yield Sentence(f"{number_of(rest.pop('sites'), 'site')} ranked by {by.noun}")
     if best:
         yield _detail(f"best: {', '.join(best)}")
     if by.name == "egvs":
@@ -291,8 +292,3 @@ def describe_sizes(sizes: dict[str, dict[str, Any]]) -> str:
 
 def _describe_counts(counts: dict[str, int]) -> str:
     return ", ".join(f"{count:,} {what.replace('_', ' ')}" for what, count in counts.items())
-
-
-def _count(number: int, noun: str) -> str:
-    plural = "" if number == 1 else "s"
-    return f"{number:,} {noun}{plural}"

@@ -183,11 +183,11 @@ def _describe_mount(with_pitch: bool, site: RankedSite) -> str:
 
 
 def format_score(site: RankedSite) -> str:
-    """Return the score that ranks with its standard error, e.g. "87.1% ±0.5%"."""
+    """Return the score that ranks with its standard error, e.g. "87.1% ± 0.5%"."""
     error = site.by.error(site.score, site.score_se)
     if error == "-":
         return site.by.value(site.score)
-    return f"{site.by.value(site.score)} ±{error.removeprefix('±')}"
+    return f"{site.by.value(site.score)} ± {error.removeprefix('±')}"
 
 
 def _format_gap(run: int, pole: ComparedPole) -> str:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from egvs.cli.console import NARROW, Column, console, print_sentences, print_table
 from egvs.core.remaining_time import RemainingTime
+from egvs.core.wording import number_of
 from egvs.report.formatting import SCORE_LABELS
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.validation.detection_metrics import ALL_OBJECTS
@@ -296,7 +297,7 @@ class DetectorRunDisplay(DetectionListener):
         cached = ""
         if len(pending) < len(missing):
             cached = f" ({len(missing) - len(pending)} of {len(missing)} were cached)"
-        sites = _count(len(pending), self.NOUN)
+        sites = number_of(len(pending), self.NOUN)
         workers = f"{processes} process{'es' if processes > 1 else ''}"
         self._say(f"{frames} frames from {sites}{cached}, {', '.join(detectors)}, {workers}")
 
@@ -318,11 +319,6 @@ class PlanRunDisplay(DetectorRunDisplay):
     def kind(self, name: str, detectors: Sequence[str]) -> tuple[object, ...]:
         """Return the detectors and the number of sensors, which the time of a group depends on."""
         return (*detectors, name.count(" + ") + 1)
-
-
-def _count(number: int, noun: str) -> str:
-    plural = "s" if number > 1 else ""
-    return f"{number} {noun}{plural}"
 
 
 def _format_duration(seconds: float) -> str:

@@ -23,6 +23,15 @@ def number_of(number: int, noun: str, plural: str = "") -> str:
     return f"{number:,} {noun if number == 1 else plural or f'{noun}s'}"
 
 
+def by_number(number: int, singular: str, plural: str) -> str:
+    """Return the word that agrees with a number.
+
+    >>> f"{number_of(1, 'lane')} {by_number(1, 'is', 'are')} closed"
+    '1 lane is closed'
+    """
+    return singular if number == 1 else plural
+
+
 def list_first(names: Sequence[str], most: int, separator: str = ", ") -> str:
     """Return the first names, and how many more there are.
 

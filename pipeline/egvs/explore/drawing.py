@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from egvs.artefacts.tpog import Tpog
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.grid import Grid, Roi, Vec3
+from egvs.core.wording import number_of
 from egvs.explore.road_meshes import LANE_HEIGHT_M, Mesh, junction_mesh, lane_mesh, marking_mesh
 from egvs.explore.session import MovingPlan, Playback, PoseScore, Session
 from egvs.explore.view_state import Camera, View
@@ -657,7 +658,8 @@ def _count_road_users(frame: TrafficFrame, selected: NDArray[np.bool_]) -> str:
     """Return how many of some boxes are vehicles, and how many are people on foot or on bicycles."""
     is_vehicle = frame.are_vehicles()
     vehicles, people = int((selected & is_vehicle).sum()), int((selected & ~is_vehicle).sum())
-    return f"{vehicles} vehicles, {people} people" if people else f"{vehicles} vehicles"
+    listed = number_of(vehicles, "vehicle")
+    return f"{listed}, {number_of(people, 'person', 'people')}" if people else listed
 
 
 _DRAW_FUNCTIONS: dict[str, Callable[[LayerContext], str]] = {

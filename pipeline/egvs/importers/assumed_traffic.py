@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from egvs.core.errors import InputError
+from egvs.core.wording import by_number
 from egvs.importers import junctions
 from egvs.importers.junctions import StreetJunction, Streets
 from egvs.scenario.traffic_config import CountConfig
@@ -122,7 +123,10 @@ def traffic_notes(traffic: AssumedTraffic | None) -> list[str]:
             return []
         return [f"Traffic jams are likely: the network {traffic.summary}{jam}. {hint}"]
     if not capacity.is_confirmed:
-        return [f"Traffic jams occur in all {len(capacity.runs)} trials{jam}. {hint}"]
+        return [
+            "Traffic jams occur in"
+            f" {by_number(len(capacity.runs), 'the trial', f'all {len(capacity.runs)} trials')}{jam}. {hint}"
+        ]
     if not capacity.is_everything:
         return [f"The junction does not carry the {traffic.assumed_per_h:,} vehicles an hour of its road classes."]
     return []

@@ -32,6 +32,7 @@ from shapely.geometry.base import BaseGeometry
 
 from egvs.core.errors import InputError
 from egvs.core.grid import XY, FloatArray, Roi
+from egvs.core.wording import by_number, number_of
 from egvs.formats import ply
 from egvs.importers import (
     assumed_traffic,
@@ -675,7 +676,10 @@ def _level_notes(roads: RoadSource, counts: ImportCounts) -> list[str]:
     heights = counts.heights.get("bridge", Counter())
     if heights["default"]:
         shares = f"{heights['default']} of {heights.total()}"
-        notes.append(f"No height is given for {shares} bridge decks: {osm_solids.DECK_BASE_M:g} m assumed.")
+        notes.append(
+            f"No height is given for {shares} {by_number(heights.total(), 'bridge deck', 'bridge decks')}:"
+            f" {osm_solids.DECK_BASE_M:g} m assumed."
+        )
     return notes
 
 
@@ -687,7 +691,9 @@ def _range_notes(counts: ImportCounts) -> list[str]:
     total = left_out + counts.objects.total() - counts.objects["tree_crown"]
     range_m = CATALOGUE[SENSOR].range_m
     reason = f"they are beyond the range of a {SENSOR} ({range_m:g} m) from the region of interest and change no score."
-    return [f"{left_out:,} of {total:,} static objects are left out: {reason}"]
+    return [
+        f"{left_out:,} of {number_of(total, 'static object')} {by_number(left_out, 'is', 'are')} left out: {reason}"
+    ]
 
 
 def scenario_notes(junction_fits: bool, counts: ImportCounts) -> list[str]:
@@ -706,17 +712,20 @@ def scenario_notes(junction_fits: bool, counts: ImportCounts) -> list[str]:
     heights = counts.heights.get("building", Counter())
     if heights["default"]:
         notes.append(
-            f"{heights['default']} of {heights.total()} buildings have neither height nor levels:"
+            f"{heights['default']} of {number_of(heights.total(), 'building')}"
+            f" {by_number(heights['default'], 'has', 'have')} neither height nor levels:"
             f" {osm_solids.DEFAULT_BUILDING_M:g} m assumed."
         )
     if heights[NEIGHBOURS]:
         notes.append(
-            f"{heights[NEIGHBOURS]} of {heights.total()} buildings have neither height nor levels: the median height of"
+            f"{heights[NEIGHBOURS]} of {number_of(heights.total(), 'building')}"
+            f" {by_number(heights[NEIGHBOURS], 'has', 'have')} neither height nor levels: the median height of"
             " the buildings near by assumed."
         )
     if heights[SURFACE_MODEL]:
         notes.append(
-            f"{heights[SURFACE_MODEL]} of {heights.total()} buildings have neither height nor levels: their heights are"
+            f"{heights[SURFACE_MODEL]} of {number_of(heights.total(), 'building')}"
+            f" {by_number(heights[SURFACE_MODEL], 'has', 'have')} neither height nor levels: their heights are"
             " those of the surface model above the terrain."
         )
     return notes
@@ -850,9 +859,9 @@ def assumed_sizes(counts: ImportCounts) -> list[str]:
     """Return which sizes of static objects are assumed, for the key ``assumed``; objects that can hide vehicles."""
     heights = {kind: counts.heights.get(kind, Counter()) for kind in ("building", "tree", "bridge")}
     texts = [
-        (_assumed_buildings(heights["building"]), heights["building"].total(), "heights of {} buildings"),
-        (heights["tree"]["default"], heights["tree"].total(), "heights of {} trees"),
-        (counts.assumed_crowns, heights["tree"].total(), "crown widths of {} trees"),
-        (heights["bridge"]["default"], heights["bridge"].total(), "heights of {} bridge decks"),
+        (_assumed_buildings(heights["building"]), heights["building"].total(), "heights of {}", "building"),
+        (heights["tree"]["default"], heights["tree"].total(), "heights of {}", "tree"),
+        (counts.assumed_crowns, heights["tree"].total(), "crown widths of {}", "tree"),
+        (heights["bridge"]["default"], heights["bridge"].total(), "heights of {}", "bridge deck"),
     ]
-    return [text.format(f"{number} of {total}") for number, total, text in texts if number]
+    return [text.format(f"{number} of {number_of(total, noun)}") for number, total, text, noun in texts if number]

@@ -25,6 +25,7 @@ from shapely.geometry.base import BaseGeometry
 
 from egvs.core.errors import InputError
 from egvs.core.grid import XY, FloatArray, Roi
+from egvs.core.wording import number_of
 from egvs.importers.buildings import building_heights
 from egvs.importers.junctions import Streets
 from egvs.importers.map_parts import MapContext, MappedMesh, SolidMap, Terrain
@@ -387,7 +388,8 @@ def _clear_of_carriageway(solid_map: SolidMap, streets: Streets, ground: Terrain
         more = f" and {len(in_lanes) - _MAX_NAMES:,} more" if len(in_lanes) > _MAX_NAMES else ""
         notes = (
             *notes,
-            f"{len(in_lanes)} of {len(solid_map.meshes)} objects {verb} in lanes; check the position of the map:"
+            f"{len(in_lanes)} of {number_of(len(solid_map.meshes), 'object')} {verb} in lanes; check the"
+            " position of the map:"
             f" {', '.join(in_lanes[:_MAX_NAMES])}{more}.",
         )
     return replace(solid_map, solids=tuple(solids), counts=counts, notes=notes)

@@ -108,11 +108,11 @@ class StreetCounts:
 
     def describe(self) -> str:
         """Return a sentence."""
-        movements = len({flow.title for hour in self.hours for flow in hour.flows})
+        movements = number_of(len({flow.title for hour in self.hours for flow in hour.flows}), "movement")
         if len(self.hours) == 1:
-            return f"{self.hours[0].per_h:,} vehicles an hour in {movements} movements, counted ({self.path.name})"
+            return f"{number_of(self.hours[0].per_h, 'vehicle')} an hour in {movements}, counted ({self.path.name})"
         amounts = [f"{hour.name} {hour.per_h:,}" for hour in self.hours]
-        return f"vehicles an hour in {movements} movements, counted ({self.path.name}): {', '.join(amounts)}"
+        return f"vehicles an hour in {movements}, counted ({self.path.name}): {', '.join(amounts)}"
 
 
 @dataclass(frozen=True)

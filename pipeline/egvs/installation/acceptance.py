@@ -25,6 +25,7 @@ from scipy.spatial import KDTree
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.progress import ProgressCallback, no_progress
+from egvs.core.wording import number_of
 from egvs.explore.session import Session
 from egvs.installation import scan_comparison
 from egvs.installation.acceptance_limits import MAX_VEHICLE_HEIGHT_M, Limits
@@ -540,16 +541,16 @@ def _checks(error: PoseError, comparison: ScanComparison, score: ScoreChange | N
     checks.append(
         Check(
             "blocked sectors",
-            f"{comparison.blocked_deg:g} degrees",
-            f"at most {limits.blocked_deg:g} degrees",
+            _with_unit(comparison.blocked_deg, "degrees"),
+            f"at most {_with_unit(limits.blocked_deg, 'degrees')}",
             blocked,
-            "" if blocked else f"{comparison.blocked_deg:g} degrees are blocked: {sectors}",
+            "" if blocked else f"{_with_unit(comparison.blocked_deg, 'degrees')} blocked: {sectors}",
         )
     )
     missing = comparison.missing_channels
     channels = len(missing) <= limits.missing_channels
     elevations = ", ".join(f"{elevation:g}" for elevation in missing)
-    reason = "" if channels else f"{len(missing)} channels give no returns: elevation {elevations} degrees"
+    reason = "" if channels else f"{number_of(len(missing), 'channel')} without returns: elevation {elevations} degrees"
     channels_text = "not checked" if comparison.unchecked_channels is None else f"{len(missing)}"
     checks.append(Check("missing channels", channels_text, f"at most {limits.missing_channels:g}", channels, reason))
     if not math.isnan(comparison.return_share):
@@ -579,11 +580,20 @@ def _measured_check(name: str, value: float, se: float, limit: float, unit: str)
     if not math.isfinite(se):
         passed = math.isinf(limit)
         reason = "" if passed else f"{name} cannot be measured: no surface of the static world fixes it"
-        return Check(name, "cannot be measured", f"at most {limit:g} {unit}", passed, reason)
+        return Check(name, "cannot be measured", f"at most {_with_unit(limit, unit)}", passed, reason)
     passed = abs(value) <= limit
     measured = f"{describe_error(value, se)} {unit}"
-    reason = "" if passed else f"{name} is off by {describe_error(abs(value), se)} {unit}, limit {limit:g}"
-    return Check(name, measured, f"at most {limit:g} {unit}", passed, reason, abs(abs(value) - limit) <= 2.0 * se)
+    reason = (
+        "" if passed else f"{name} is off by {describe_error(abs(value), se)} {unit}, limit {_with_unit(limit, unit)}"
+    )
+    return Check(
+        name, measured, f"at most {_with_unit(limit, unit)}", passed, reason, abs(abs(value) - limit) <= 2.0 * se
+    )
+
+
+def _with_unit(value: float, unit: str) -> str:
+    """Return a value with its unit, which is a singular for one degree."""
+    return f"{value:g} {'degree' if value == 1.0 and unit == 'degrees' else unit}"
 
 
 def _yaw_check(error: PoseError, limit_deg: float) -> Check:

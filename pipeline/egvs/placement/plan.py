@@ -27,6 +27,7 @@ from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files, plugins
 from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
+from egvs.core.wording import number_of
 from egvs.placement import problem_builder, refinement, solver
 from egvs.placement.plan_error import PlanErrors
 from egvs.placement.plan_zones import PlanZones
@@ -585,7 +586,7 @@ def _unmet_zone_error(
         hint = f"Set placement.count to {len(larger.order)}: {names} see enough."
     return InputError(
         f"{scenario.file}: placement.zones",
-        f"found no plan of {problem.rules.count} sensors that meets the requirements of all zones;"
+        f"found no plan of {number_of(problem.rules.count, 'sensor')} that meets the requirements of all zones;"
         f" the closest ({nearest}) sees {' and '.join(shares)}",
         hint,
     )

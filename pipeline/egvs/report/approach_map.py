@@ -29,6 +29,8 @@ _MARGIN_M = 25.0
 _LABEL_AT_M = 32.0
 """Distance of a label from the stop line."""
 _LINE_HEIGHT = 14.0
+_BOLD_WIDTH = 1.15
+"""Width of bold letters, relative to the others."""
 _WIDTH = 420.0
 """Small, so that the text can be read on the screen of a telephone."""
 
@@ -99,10 +101,14 @@ def _draw_label(plan: MapFrame, label: ApproachLabel, covered: list[Box]) -> Ite
     y = min(max(plan.y(float(label.at_m[1])), plan.top + 12.0), plan.top + plan.frame_height - 12.0)
     box = _free_box(plan, (x, y), label, covered)
     covered.append(box)
-    left, top, right, _ = box
+    left, top, right, bottom = box
     text_x, anchor = (left, "start") if left > x else (right, "end")
-    if abs(top - y + _LINE_HEIGHT / 2) > _LINE_HEIGHT:
-        yield f'<path {plan.style.shape("lead")} d="M{x:.1f} {y:.1f}L{text_x:.1f} {top + _LINE_HEIGHT / 2:.1f}"/>'
+    if left <= x <= right:
+        end = x, top if top > y else bottom
+    else:
+        end = text_x, top + _LINE_HEIGHT / 2
+    if abs(end[1] - y) > _LINE_HEIGHT:
+        yield f'<path {plan.style.shape("lead")} d="M{x:.1f} {y:.1f}L{end[0]:.1f} {end[1]:.1f}"/>'
     yield f'<circle {plan.style.shape("spot")} cx="{x:.1f}" cy="{y:.1f}" r="4.5"/>'
     for number, line in enumerate(label.lines):
         position = f'x="{text_x:.1f}" y="{top + (number + 0.8) * _LINE_HEIGHT:.1f}" text-anchor="{anchor}"'
@@ -113,13 +119,17 @@ def _draw_label(plan: MapFrame, label: ApproachLabel, covered: list[Box]) -> Ite
 
 def _free_box(plan: MapFrame, at: tuple[float, float], label: ApproachLabel, covered: Sequence[Box]) -> Box:
     """Return the box of a label: the one nearest to its approach that covers no other, or else the first one."""
-    width, height = max(text_width(line) for line in label.lines), _LINE_HEIGHT * len(label.lines)
+    widths = [_BOLD_WIDTH * text_width(label.lines[0]), *(text_width(line) for line in label.lines[1:])]
+    width, height = max(widths), _LINE_HEIGHT * len(label.lines)
     x, y = at
     boxes = []
     for step in range(int(plan.frame_height / _LINE_HEIGHT)):
         for shift in dict.fromkeys((step, -step)):
             top = y + (shift - 0.5) * _LINE_HEIGHT
-            for left in (x + 10.0, x - 10.0 - width):
+            beside = [x + 10.0, x - 10.0 - width]
+            if top > y + 5.0 or top + height < y - 5.0:  # a long name may be above or below its disc
+                beside.append(min(max(x - width / 2, plan.left), plan.left + plan.frame_width - width))
+            for left in beside:
                 box = (left, top, left + width, top + height)
                 fits = plan.left <= box[0] and box[2] <= plan.left + plan.frame_width
                 if fits and plan.top <= top and box[3] <= plan.top + plan.frame_height:

@@ -12,7 +12,8 @@ from egvs.scenario.score_config import DEFAULT_SCORE
 MIN_TILT_DEG = 5.0
 """A sensor is called tilted from this pitch or roll on. The sensors of the validation study were level."""
 
-_ERROR_NOTE = "± is the error of a finite {} only. "
+_ERROR_NOTE = "± is the error of a finite {} only."
+_SEEDS_NOTE = "± is the error of finite simulations only, from the differences between {} of them."
 _SIZE_NOTE = (
     "The order of sites by this score was validated, the size of the score less: in the studies, detectors found up to "
     "27 percentage points fewer vehicles than expected (docs/validity.md)."
@@ -24,6 +25,7 @@ _TILT_NOTE = "The sensor of {} is tilted; tilted sensors were not part of the va
 def describe_reliability(ranking: Ranking, traffic: Mapping[str, Any] | None = None) -> list[str]:
     """Return the reasons to be careful with a ranking, in sentences.
 
+    - With several simulations: that errors come from their differences.
     - By ``expected_detections``: what the standard errors leave out, and how far the size of the score was validated.
     - The best site is tilted.
     - The traffic was recorded: what share of the region the recording covers.
@@ -41,9 +43,16 @@ def describe_reliability(ranking: Ranking, traffic: Mapping[str, Any] | None = N
         return []
     sentences = []
     recordings = _track_summaries(traffic or {})
+    seeds = _count_seeds(traffic or {})
+    notes = []
+    if ranking.has_errors and seeds > 1:
+        notes.append(_SEEDS_NOTE.format(seeds))
+    elif ranking.has_errors and ranking.by.name == DEFAULT_SCORE:
+        notes.append(_ERROR_NOTE.format("recording" if recordings else "simulation"))
     if ranking.by.name == DEFAULT_SCORE:
-        error_note = _ERROR_NOTE.format("recording" if recordings else "simulation") if ranking.has_errors else ""
-        sentences.append(error_note + _SIZE_NOTE)
+        notes.append(_SIZE_NOTE)
+    if notes:
+        sentences.append(" ".join(notes))
     sentences += [_COVERAGE_NOTE.format(**coverage) for coverage in recordings]
     if max(abs(best.pitch_deg), abs(best.roll_deg)) >= MIN_TILT_DEG:
         sentences.append(_TILT_NOTE.format(best.site))
@@ -51,6 +60,12 @@ def describe_reliability(ranking: Ranking, traffic: Mapping[str, Any] | None = N
     if limits:
         sentences.append(f"The best site has {join_names(limits)}: a mount beyond it may be better.")
     return sentences
+
+
+def _count_seeds(traffic: Mapping[str, Any]) -> int:
+    """Return the number of simulations of the traffic, or of each of its periods; 1 if it is not known."""
+    periods = traffic.get("periods", {"": traffic})
+    return max([1, *(len(summary.get("seeds", ())) for summary in periods.values())])
 
 
 def _track_summaries(traffic: Mapping[str, Any]) -> list[dict[str, Any]]:

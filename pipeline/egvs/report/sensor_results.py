@@ -354,7 +354,7 @@ class SensorComparison:
 
 
 def format_difference(difference: ScoreDifference, site: RankedSite) -> str:
-    """Return a difference of scores with its standard error, e.g. "+3.1 ±0.4" percentage points.
+    """Return a difference of scores with its standard error, e.g. "+3.1 ± 0.4" percentage points.
 
     Parameters
     ----------
@@ -367,7 +367,7 @@ def format_difference(difference: ScoreDifference, site: RankedSite) -> str:
     factor, digits = (100.0, 1) if label.is_share else (1.0, label.digits)
     text = f"{factor * difference.value:+z,.{digits}f}"
     if difference.se is not None:
-        text += f" ±{factor * difference.se:,.{digits}f}"
+        text += f" ± {factor * difference.se:,.{digits}f}"
     return text if difference.is_clear else f"~ {text}"
 
 

@@ -78,10 +78,12 @@ def stage_diagram(plan: Mapping[str, Any], style: FigureStyle = PAGE_STYLE) -> s
 
 
 def _row_name(row: Mapping[str, Any]) -> str:
-    """Return approach and movements, with the approach cut where it is long."""
+    """Return approach and movements; the street is cut where it is long, the side of the approach is kept."""
     approach = row["approach"]
     if len(approach) > _MAX_LETTERS:
-        approach = f"{approach[: _MAX_LETTERS - 1]}…"
+        street, bracket, side = approach.rpartition(" (")
+        end = f"{bracket}{side}" if street else ""
+        approach = f"{approach[: _MAX_LETTERS - 1 - len(end)]}…{end}"
     return f"{approach}: {', '.join(row['movements'])}"
 
 

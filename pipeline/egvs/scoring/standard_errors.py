@@ -703,4 +703,4 @@ def _longer_record_hint(stratum: Stratum, frame_period_s: float, *, in_seconds: 
     better = round(GROUP_LENGTH_TIMES / WINDOW_TIMES) * enough
     if in_seconds:
         return f"Set length_s to at least {enough * frame_period_s:g}, preferably {better * frame_period_s:g}."
-    return f"Record at least {enough} frames, preferably {better}."
+    return f"Record at least {enough:,} frames, preferably {better:,}."

@@ -74,7 +74,7 @@ _BANDS = 12
 _STRIDE = 13
 """Every so manyth beam tells where bands begin; not a divisor of any common number of channels."""
 
-_MAX_HITS = 2**17
+MAX_HITS = 2**17
 """Hits that are listed at once, which bounds the memory."""
 
 
@@ -441,7 +441,7 @@ def _count_points(
 ) -> _BoxHits:
     boxes, count = record.all_boxes, len(record.all_boxes.values)
     is_counted = site.weight is None and return_probability is None
-    beams = _sort_beams(site, _BANDS if is_counted else 1)
+    beams = sort_beams(site, _BANDS if is_counted else 1)
     is_target = np.zeros(count, dtype=np.bool_)
     is_target[record.row] = True
     size_m = np.asarray(record.grid.roi.size_m)
@@ -452,7 +452,7 @@ def _count_points(
     nearest_m = beams.length_m.copy()
     capacity = 0
     if return_probability is not None:
-        capacity = max(_MAX_HITS, len(beams.length_m))
+        capacity = max(MAX_HITS, len(beams.length_m))
     hits = (np.empty(capacity, dtype=np.int64), np.empty(capacity, dtype=np.int64), *np.empty((3, capacity)))
 
     frame = 0
@@ -467,7 +467,7 @@ def _count_points(
     return result
 
 
-class _SortedBeams(NamedTuple):
+class SortedBeams(NamedTuple):
     """Beams in the form that :func:`egvs.kernels.vehicle_visibility.first_hits` takes."""
 
     cells: IntArray
@@ -477,7 +477,7 @@ class _SortedBeams(NamedTuple):
     weight: FloatArray
 
 
-def _sort_beams(beams: Beams, bands: int) -> _SortedBeams:
+def sort_beams(beams: Beams, bands: int) -> SortedBeams:
     """Sort beams into bands of slopes and cells of azimuth; in a single band by azimuth, and with their weights."""
     ends_m, weight = beams.ends_m, np.empty(0)
     azimuth = np.arctan2(ends_m[:, 1], ends_m[:, 0])
@@ -495,7 +495,7 @@ def _sort_beams(beams: Beams, bands: int) -> _SortedBeams:
     directions, length_m = np.zeros((3, size)), np.zeros(size)
     scratch = np.empty(len(ends_m), dtype=np.int64)
     vehicle_visibility.sort_beams(ends_m, azimuth, limits, cells, slopes, directions, length_m, scratch)
-    return _SortedBeams(cells, slopes, directions, length_m, weight)
+    return SortedBeams(cells, slopes, directions, length_m, weight)
 
 
 def _band_limits(ends_m: FloatArray, bands: int) -> FloatArray:

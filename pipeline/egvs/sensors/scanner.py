@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, Roi, Vec3
+from egvs.core.wording import number_of
 from egvs.formats import point_clouds
 from egvs.formats.georeference import height_unit_m
 from egvs.kernels import ray_triangle
@@ -247,7 +248,7 @@ class Scanner:
         ray_triangle.can_meet_box(o, directions * sensor.range_m, np.asarray(self.scene.roi.size_m), reaches)
         beam = np.flatnonzero(reaches)
         if not len(beam):
-            problem = f"none of {len(points)} points lies on a beam that can meet the region of interest"
+            problem = f"none of {number_of(len(points), 'point')} lies on a beam that can meet the region of interest"
             raise InputError(f"{where}: {path}", problem, "Save the points in the world frame.")
         weight = np.ones(len(beam)) if self.columns else None
         rows = EmptyScan(beam.astype(np.uint32), ends[beam], np.ones(len(beam), dtype=np.bool_), weight=weight)

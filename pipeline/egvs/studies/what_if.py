@@ -35,6 +35,7 @@ from egvs.core.numbers import parse_decimal
 from egvs.core.platform import relative_path
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.special import cosdg, sindg
+from egvs.core.wording import number_of
 from egvs.formats import csv_tables
 from egvs.report.basemap import solid_group
 from egvs.report.command_sections import DIGEST_KEY, what_if_digest
@@ -421,7 +422,8 @@ def check_positions(scenario: Scenario, name: str) -> None:
         distances_m = shapely.distance(region, shapes)
         if distances_m.min() > range_m:
             problem = (
-                f"none of {len(shapes)} solids is within {range_m:g} m of the region of interest, the range of the"
+                f"none of {number_of(len(shapes), 'solid')} is within {range_m:g} m of the region of interest,"
+                " the range of the"
                 f" sensors; this one is {distances_m[0]:,.0f} m away"
             )
             region_text = f"x {west_m:g} to {east_m:g}, y {south_m:g} to {north_m:g}"

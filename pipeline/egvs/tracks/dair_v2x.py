@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from egvs.core.errors import InputError
+from egvs.core.wording import number_of
 from egvs.tracks.boxes import Box, BoxRows, ClassNames, Pose, is_rotation
 from egvs.tracks.documents import Node, read_document
 from egvs.tracks.model import TrackFrame, Tracks
@@ -94,8 +95,8 @@ def read(path: Path) -> Tracks:
         sources.append(f"positions are in the LiDAR's frame, as there is no {folder}: they count as x, y of the map")
     if without_track:
         sources.append(
-            f"{without_track:,} boxes have no track_id: each is a track of one row, and counts only in a frame at"
-            " exactly its time"
+            f"{number_of(without_track, 'box', 'boxes')} without track_id: each is a track of one row, and counts"
+            " only in a frame at exactly its time"
         )
     if without_label:
         sources.append(f"sweeps without a label file left out: {without_label:,}")

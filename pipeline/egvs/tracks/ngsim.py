@@ -17,6 +17,7 @@ import numpy as np
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.core.wording import number_of
 from egvs.tracks import columns
 from egvs.tracks.model import TrackFrame, Tracks
 from egvs.tracks.motion import motion_yaw_rad
@@ -66,7 +67,7 @@ def read(path: Path) -> Tracks:
     sources = ["positions are local: y along the road, without a place on the Earth",
                "centres are half a length behind the recorded fronts, along the motion",
                f"{n_reused} vehicles have an id that an earlier one had",
-               f"{n_still} vehicles never move; they are taken to head along +y"]  # fmt: skip
+               f"{number_of(n_still, 'vehicle')} without movement: taken to head along +y"]  # fmt: skip
     return Tracks.from_rows(names, table.classes("v_Class", _CLASSES), values, TrackFrame(), sources)
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from egvs.core import limits, reading
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.core.wording import number_of
 from egvs.formats.georeference import WGS84, WorldFrame, parse_crs
 from egvs.scenario.track_columns import TrackColumns
 from egvs.tracks import columns
@@ -70,8 +71,8 @@ def read(path: Path, mapping: TrackColumns, where: str = "traffic.track_columns"
     if mapping.reference == "front":
         is_placed = _move_to_centres(table, mapping, values)
         if not is_placed.all():
-            sources.append(f"{np.count_nonzero(~is_placed)} rows are left out: they give the front only, and their"
-                           " tracks have no heading and do not move")  # fmt: skip
+            rows = number_of(int(np.count_nonzero(~is_placed)), "row")
+            sources.append(f"{rows} left out: only the front is given, and the track has no heading and does not move")
             names, classes = list(compress(names, is_placed)), list(compress(classes, is_placed))
             values = {key: numbers[is_placed] for key, numbers in values.items()}
     return Tracks.from_rows(names, classes, values, frame, sources)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 from egvs.core.errors import Diagnostic
+from egvs.core.wording import number_of
 from egvs.formats import xml
 from egvs.scenario.traffic_config import CountConfig, TrafficConfig
 from egvs.traffic.demand import FLEET
@@ -121,7 +122,8 @@ def missed_count_warnings(counts: Sequence[CountFit], hours: float, where: str) 
     if not descriptions:
         return []
     problem = (
-        f"the simulation misses {len(descriptions)} of {len(counts)} counts (vehicles per hour, simulated vs counted:"
+        f"the simulation misses {len(descriptions)} of {number_of(len(counts), 'count')} (vehicles per hour,"
+        " simulated vs counted:"
         f" {'; '.join(descriptions)})"
     )
     hint = "Check that the counts are consistent with each other and with the network's lanes and signals."

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from egvs.core import limits, reading
 from egvs.core.errors import InputError
+from egvs.core.wording import number_of
 from egvs.formats import xml
 from egvs.formats.georeference import WGS84, WORLD, CoordinateReading, Georeference, look_like_degrees
 from egvs.scenario.fields import MAX_COORDINATE_M
@@ -539,10 +540,11 @@ def check_span(
     available = max(0, duration_ms // window.period_ms + 1)
     if available < window.count:
         problem = (
-            f"{file} has {available} frames {period_s:g} s apart after a warm-up of {window.skip_ms / 1000:g} s"
-            f" ({time_steps} time steps in all)"
+            f"{file} has {number_of(available, 'frame')} {period_s:g} s apart after a warm-up of"
+            f" {window.skip_ms / 1000:g} s"
+            f" ({number_of(time_steps, 'time step')} in all)"
         )
-        hint = f"Use at most {available} frames, or a shorter warmup_s."
+        hint = f"Use at most {number_of(available, 'frame')}, or a shorter warmup_s."
         raise InputError(f"{where}: frames = {window.count}", problem, hint)
 
 

@@ -35,7 +35,7 @@ import numpy as np
 
 from egvs.core.errors import Diagnostic, RunError
 from egvs.core.grid import XY, FloatArray, Roi
-from egvs.core.wording import shorten_id
+from egvs.core.wording import number_of, shorten_id
 from egvs.traffic.network import Network
 from egvs.traffic.sumo_folder import RED_MARGIN_S, Timing
 from egvs.traffic.vehicle_boxes import VehicleSize
@@ -185,7 +185,8 @@ def teleport_warning(
     count = len({teleport.vehicle for teleport in teleports})
     share = f"{count / max(vehicles, 1):.1%}".replace("%", " %")
     problem = (
-        f"{count} of {vehicles:,} vehicles ({share}) stood at the head of their lane for {limit_s:g} s and were moved"
+        f"{count} of {number_of(vehicles, 'vehicle')} ({share}) stood at the head of their lane for {limit_s:g}"
+        " s and were moved"
         f" on: {'; '.join(locations)}"
     )
     return [Diagnostic("teleports", demand.where, problem, demand.hint)]

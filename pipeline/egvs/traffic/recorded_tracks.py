@@ -20,6 +20,7 @@ import pyarrow as pa
 
 from egvs.core.errors import Diagnostic, InputError
 from egvs.core.grid import FloatArray
+from egvs.core.wording import by_number, number_of
 from egvs.formats.georeference import WORLD, Georeference
 from egvs.scenario.model import Scenario
 from egvs.tracks import cleaning, coverage, resampling
@@ -301,11 +302,15 @@ def track_warnings(recorded: RecordedTracks, where: str) -> Iterator[Diagnostic]
     """
     report = recorded.tracks.report
     if report.dropped_rows:
-        problem = f"{report.dropped_rows:,} of {report.rows:,} rows have no time or position, and are left out"
+        problem = (
+            f"{report.dropped_rows:,} of {number_of(report.rows, 'row')}"
+            f" {by_number(report.dropped_rows, 'has', 'have')} no time or position: left out"
+        )
         yield Diagnostic("track rows", where, problem, "Check how the file was written.")
     if report.jumps:
         problem = (
-            f"tracks jump {report.jumps} times, faster than {cleaning.MAX_SPEED_M_S:g} m/s; they are cut there, because"
+            f"tracks jump {number_of(report.jumps, 'time')}, faster than {cleaning.MAX_SPEED_M_S:g} m/s; they"
+            " are cut there, because"
             " the identity has probably switched to another road user"
         )
         yield Diagnostic("track jumps", where, problem, "Check the tracks there.")
@@ -316,13 +321,17 @@ def track_warnings(recorded: RecordedTracks, where: str) -> Iterator[Diagnostic]
         )
         yield Diagnostic("track headings", where, problem, "No action is needed if boxes look right in the explorer.")
     if report.headings_unknown > MAX_UNCERTAIN_SHARE * max(report.rows, 1):
-        problem = f"{report.headings_unknown:,} boxes never move and have no heading, so they point east"
+        problem = (
+            f"{number_of(report.headings_unknown, 'box', 'boxes')} without heading"
+            f" {by_number(report.headings_unknown, 'never moves, so it points', 'never move, so they point')} east"
+        )
         yield Diagnostic("track headings", where, problem, "Add headings to the file.")
     boxes = recorded.boxes
     if boxes.unknown_gaps:
         frames = boxes.report()["unknown_frames"]
         problem = (
-            f"{boxes.unknown_gaps} gaps in tracks are too long to be interpolated; in {frames:,} frames of a track its"
+            f"{number_of(boxes.unknown_gaps, 'gap')} in tracks {by_number(boxes.unknown_gaps, 'is', 'are')} too"
+            f" long to be interpolated; in {number_of(frames, 'frame')} of a track its"
             " position is unknown"
         )
         yield Diagnostic("track gaps", where, problem, "Raise track_gap_s if straight lines are good enough.")
@@ -423,6 +432,8 @@ def _window(scenario: Scenario, tracks: Tracks) -> FrameWindow:
         raise InputError(f"{where}.frame_period_s", problem, "Check the times, or set a longer frame_period_s.")
     if count < 1 or count > available:
         names = ", ".join(traffic.tracks or traffic.pedestrian_tracks or ())
-        problem = f"{names} last {duration_ms / 1000:g} s, {max(available, 0)} frames after {skip_ms / 1000:g} s"
+        problem = (
+            f"{names} last {duration_ms / 1000:g} s, {number_of(max(available, 0), 'frame')} after {skip_ms / 1000:g} s"
+        )
         raise InputError(f"{where}.frames", problem, "Use fewer frames, or a shorter frame_period_s or warmup_s.")
     return FrameWindow(count, period_ms, 0, skip_ms, complete=True)

@@ -22,7 +22,7 @@ import pyarrow as pa
 from egvs.core.errors import Diagnostic, InputError, RunError
 from egvs.core.progress import ProgressCallback
 from egvs.core.resource_usage import peak_memory_of
-from egvs.core.wording import shorten_id
+from egvs.core.wording import number_of, shorten_id
 from egvs.formats import xml
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import Scenario
@@ -667,7 +667,9 @@ def _insertion_warning(prepared: SimulationFolder, scenario: Scenario, fits: Seq
     loaded, waiting = counts["loaded"], counts["waiting"]
     if waiting <= _MAX_WAITING_SHARE * loaded:
         return []
-    problem = f"{waiting} of {loaded} vehicles could not start, because the streets where they start are full"
+    problem = (
+        f"{waiting} of {number_of(loaded, 'vehicle')} could not start, because the streets where they start are full"
+    )
     if fits:
         worst = max(fits, key=lambda fit: fit.counted_per_h - fit.simulated_per_h)
         problem += (

@@ -150,14 +150,14 @@ def format_plan(plan: Mapping[str, Any]) -> str:
     by_times: dict[str, list[str]] = {}
     seconds: dict[str, float] = {}
     for approach, rows in by_approach.items():
+        movements: dict[str, list[str]] = {}
         for row in rows:
             times = repr(row["green_s"])
             seconds[times] = sum(end_s - begin_s for begin_s, end_s in row["green_s"])
-            is_whole = all(each["green_s"] == row["green_s"] for each in rows)
-            name = approach if is_whole else f"{approach} ({', '.join(row['movements'])})"
-            names = by_times.setdefault(times, [])
-            if name not in names:
-                names.append(name)
+            movements.setdefault(times, []).extend(row["movements"])
+        for times, listed_movements in movements.items():
+            which = "" if len(movements) == 1 else f" {', '.join(dict.fromkeys(listed_movements))}"
+            by_times.setdefault(times, []).append(f"{approach}{which}")
     listed = [f"{seconds[times]:g} s {' and '.join(names)}" for times, names in by_times.items()]
     greens = "; ".join(listed[:_MAX_GREENS])
     if len(listed) > _MAX_GREENS:

@@ -185,12 +185,12 @@ class Signal:
 
     @property
     def streets(self) -> tuple[str, ...]:
-        """Names of its streets."""
-        return tuple(dict.fromkeys(link.street for link in self.links if link.street))
+        """Names of its streets, sorted, as in the title of a junction."""
+        return tuple(sorted({link.street for link in self.links if link.street}))
 
     @property
     def title(self) -> str:
-        """Its streets and its id in brackets, shortened, e.g. ``"Mill Lane / High Street (cluster_123456789_9…)"``."""
+        """Its streets and its id in brackets, shortened, e.g. ``"High Street / Mill Lane (cluster_123456789_9…)"``."""
         return self.titled(shorten_id(self.id))
 
     def titled(self, name: str) -> str:

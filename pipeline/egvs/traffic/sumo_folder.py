@@ -23,6 +23,7 @@ import numpy as np
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.core.wording import number_of
 from egvs.formats import osm
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import TrafficConfig
@@ -479,7 +480,7 @@ def _write_flow(
     files.write_text(folder / TRIPS_FILE, demand.routes_xml(routed, departs_s))
     if len(routed) == len(trips):
         return []
-    return [f"{len(trips) - len(routed)} of {len(trips)} trips have no route and were left out"]
+    return [f"{len(trips) - len(routed)} of {number_of(len(trips), 'trip')} without route left out"]
 
 
 def _copy_files(

@@ -17,6 +17,7 @@ from scipy.spatial import KDTree
 
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, Roi
+from egvs.core.wording import number_of
 from egvs.traffic.network import CAR, LANE_WIDTH_M, Network
 
 FAR_M = 5.0
@@ -69,7 +70,7 @@ class Alignment:
 
     def describe(self) -> str:
         """Return a sentence."""
-        text = f"{self.share:.0%} of {self.positions:,} positions of moving vehicles lie on lanes"
+        text = f"{self.share:.0%} of {number_of(self.positions, 'position')} of moving vehicles lie on lanes"
         if self.fits_better:
             east_m, north_m = self.shift_m
             text += (

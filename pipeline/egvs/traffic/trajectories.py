@@ -20,6 +20,7 @@ from egvs.artefacts.parquet import ArtefactWriter
 from egvs.core.errors import Diagnostic, RunError
 from egvs.core.grid import Roi
 from egvs.core.progress import ProgressCallback
+from egvs.core.wording import by_number, number_of
 from egvs.scenario.model import Scenario
 from egvs.traffic import fcd, vehicle_boxes
 from egvs.traffic.locks import DemandKey, StreetNames, describe_distance, is_inside
@@ -454,7 +455,7 @@ def check_recording(scenario: Scenario, statistics: TrafficStatistics, recording
         )
         period = f" of the period {scenario.period!r}" if scenario.period else ""
         raise RunError(
-            f"{recording.where}: no vehicle of {source} is in any of {statistics.frames} frames{period}."
+            f"{recording.where}: no vehicle of {source} is in any of {number_of(statistics.frames, 'frame')}{period}."
             " Check the demand, begin_s and warmup_s"
         )
     if recording.vehicles is not None and traffic.hold == "exactly":
@@ -498,7 +499,8 @@ def traffic_warnings(
     per_thousand = 1000 * statistics.overlaps_in_region / max(statistics.rows_in_region, 1)
     if per_thousand >= MIN_OVERLAPS_PER_THOUSAND:
         problem = (
-            f"vehicles overlap {statistics.overlaps_in_region} times in the region of interest ({per_thousand:.1f} per"
+            f"vehicles overlap {number_of(statistics.overlaps_in_region, 'time')} in the region of interest"
+            f" ({per_thousand:.1f} per"
             " 1,000 vehicles and frames) with one that blocked them on a junction"
         )
         hint = "Reduce the traffic, or remove junction_blocker_s, without which the traffic may lock."
@@ -509,7 +511,8 @@ def traffic_warnings(
         centre_m = (east + 0.5) * SQUARE_M, (north + 0.5) * SQUARE_M
         where = f"{recording.where}: {describe_location(centre_m, roi)}"
         problem = (
-            f"vehicles overlap in {share:.0%} of the frames; {pairs} of {statistics.overlapping_pairs} overlaps are"
+            f"vehicles overlap in {share:.0%} of the frames; {pairs} of"
+            f" {number_of(statistics.overlapping_pairs, 'overlap')} {by_number(pairs, 'is', 'are')}"
             " here"
         )
         hint = "Enlarge the junction, or use signals where vehicles wait on it to give way."
@@ -522,7 +525,7 @@ def _check_vehicle_count(vehicles: int, statistics: TrafficStatistics, where: st
     if wrong.any():
         first = int(wrong.argmax())
         raise RunError(
-            f"{where}: expected {vehicles} vehicles in every frame, got them in"
+            f"{where}: expected {number_of(vehicles, 'vehicle')} in every frame, got them in"
             f" {statistics.frames - int(wrong.sum())} of {statistics.frames} frames (min {statistics.vehicles.min()},"
             f" max {statistics.vehicles.max()}; frame {first} has {statistics.vehicles[first]}). Lower traffic.vehicles"
             " (or vehicles_per_lane_km), increase warmup_s, trips_per_s or the demand, or set"
@@ -550,7 +553,8 @@ def _check_moving(scenario: Scenario, statistics: TrafficStatistics, recording: 
         at_m, since = statistics.standing_at_m[longest], statistics.standing_since[longest]
         where, hint = demand_key(scenario)
         raise RunError(
-            f"{where}: the traffic is jammed: {len(jammed_s)} vehicles stand for more than {limit_s:g} s up"
+            f"{where}: the traffic is jammed: {number_of(len(jammed_s), 'vehicle')}"
+            f" {by_number(len(jammed_s), 'stands', 'stand')} for more than {limit_s:g} s up"
             f" to the last frame, {longest!r} for {jammed_s[longest]:g} s"
             f" {_describe_stand(at_m, since, recording, scenario.roi.box)}. {hint}"
         )

@@ -45,6 +45,7 @@ from egvs.scenario.effects_config import MovingOcclusionParameters
 from egvs.scenario.model import Scenario
 from egvs.scoring import targets
 from egvs.scoring.egvs import EntropyField
+from egvs.scoring.target_points import TargetPoints, list_target_points
 from egvs.scoring.targets import TargetRecord, VisibleTargets
 from egvs.scoring.visibility import Beams, HitCounter, Hits
 from egvs.sensors import voxel_crossings
@@ -57,7 +58,7 @@ from egvs.studies.measurement import scenario_dependencies
 ParameterValue = float | int | bool | str
 """Value of a score's parameter."""
 
-EVIDENCE = ("hit_counts", "log_reach", "returns", "vehicles")
+EVIDENCE = ("hit_counts", "log_reach", "returns", "vehicles", "vehicle_points")
 """What a score may list in ``needs``: the parts of :class:`SiteEvidence` that take time."""
 
 VOXEL_PARAMETER, OCCLUSION_PARAMETER, GAMMA_PARAMETER = "voxel_m", "moving_occlusion", "gamma"
@@ -220,6 +221,11 @@ class SiteEvidence:
         """Points on the vehicles of the traffic that the TPOG was computed from."""
         return self.count_points(self.beams)
 
+    @cached_property
+    def vehicle_points(self) -> TargetPoints:
+        """Positions of the points on the same vehicles; where effects lose returns, those of any probability."""
+        return list_target_points(self.vehicles.record, self.beams, self.detection_probability)
+
 
 # ---- installed scores
 
@@ -227,7 +233,7 @@ SCORES_GROUP = "egvs.scores"
 
 _BUILTIN_SCORES = (
     "egvs", "entropy_seen", "coverage", "expected_visibility", "s_mig", "m_sog", "kl_obs", "density", "uniformity",
-    "perception_entropy", "points_on_target", "seen_well", "expected_detections",
+    "nuc", "perception_entropy", "vehicle_grid_occupancy", "points_on_target", "seen_well", "expected_detections",
 )  # fmt: skip
 """The scores of this program, in the order of tables."""
 

@@ -24,6 +24,7 @@ from shapely.geometry.base import BaseGeometry
 from egvs.core import limits
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.core.wording import by_number, number_of
 from egvs.formats.city_objects import CityObject, Placement, Surface, select_footprint, select_surfaces
 from egvs.formats.gml import ReferenceSystem, parse_srs_name
 from egvs.formats.surface_meshes import SurfaceMesh, triangulate_surfaces
@@ -255,22 +256,25 @@ class _Collector:
             if open_names:
                 more = f" and {len(open_names) - _MAX_NAMES:,} more" if len(open_names) > _MAX_NAMES else ""
                 yield (
-                    f"{len(open_names):,} of {len(meshes):,} meshes of the kind {kind} are not closed, so a point"
+                    f"{len(open_names):,} of {number_of(len(meshes), 'mesh', 'meshes')} of the kind {kind}"
+                    f" {by_number(len(open_names), 'is', 'are')} not closed, so a point"
                     f" inside cannot be recognised: {', '.join(open_names[:_MAX_NAMES])}{more}."
                 )
 
     def _repair_notes(self) -> Iterator[str]:
         descriptions = {
-            "degenerate": "rings without area were left out",
-            "crossing": "surfaces cross themselves; their triangles are approximate",
-            "unresolved": "references lead to no surface in the same object",
-            "library": "templates are in other files, which are not read",
-            "no surface": "geometries are points or lines, which stop no beam",
-            "placed in degrees": "templates are placed at degrees; their axes are taken as metres east, north and up",
-        }
-        for repair, description in descriptions.items():
+            "degenerate": ("ring without area was", "rings without area were", "left out"),
+            "crossing": ("surface crosses itself", "surfaces cross themselves", "with approximate triangles"),
+            "unresolved": ("reference leads", "references lead", "to no surface in the same object"),
+            "library": ("template is", "templates are", "in other files, which are not read"),
+            "no surface": ("geometry is", "geometries are", "points or lines, which stop no beam"),
+            "placed in degrees": (
+                "template is", "templates are", "placed at degrees; axes are taken as metres east, north and up",
+            ),
+        }  # fmt: skip
+        for repair, (singular, plural, rest) in descriptions.items():
             if self.repairs[repair]:
-                yield f"{self.repairs[repair]:,} {description}."
+                yield f"{number_of(self.repairs[repair], singular, plural)} {rest}."
 
 
 class _OutsideObjects:
@@ -312,8 +316,9 @@ class _OutsideObjects:
             problem = f"no object is within reach of the roads; in the order {order}, {swapped:,} would be"
             hint = f"Correct the order of the coordinates, or name a system whose axes are {order}."
             raise InputError(self._where, problem, hint)
-        yield f"{Path(self._where).name}: none of its {self._outside:,} objects is within reach; the nearest is" + (
-            f" {self._nearest_m / 1000:,.1f} km away."
+        yield (
+            f"{Path(self._where).name}: none of its {number_of(self._outside, 'object')} is within reach; the"
+            " nearest is" + (f" {self._nearest_m / 1000:,.1f} km away.")
         )
 
     def _is_inside_swapped(self, point: FloatArray, system: ReferenceSystem) -> bool:

@@ -19,6 +19,7 @@ from shapely.geometry import LineString
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.core.wording import number_of
 from egvs.formats.georeference import WorldFrame
 from egvs.formats.lanelet2 import LaneletMap
 from egvs.importers.lane_changes import NO_CHANGE
@@ -252,7 +253,7 @@ class NetworkBuilder:
         actual_m = {(edge.id, index): lane.shape_m for edge in actual.edges for index, lane in enumerate(edge.lanes)}
         missing = [key for key in wanted_m if key not in actual_m]
         if missing:
-            problem = f"netconvert dropped {len(missing)} lanes, the first of {missing[0][0]}"
+            problem = f"netconvert dropped {number_of(len(missing), 'lane')}, the first of {missing[0][0]}"
             raise InputError(self._where, problem, _EDITOR_HINT)
         quality = NetworkQuality()
         bad_nodes = set()

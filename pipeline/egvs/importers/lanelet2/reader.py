@@ -15,6 +15,7 @@ from pathlib import Path
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.reading import translate_errors
+from egvs.core.wording import number_of
 from egvs.formats.lanelet2 import LaneletMap, is_lanelet2, read_lanelet2
 from egvs.formats.lanelet2_graph import DirectedLanelet, LaneletGraph, LaneletKey, build_graph, connect_lanelets
 from egvs.formats.lanelet2_projection import ProjectedPoints, project_points
@@ -115,8 +116,9 @@ def _content_notes(lanelet_map: LaneletMap, graph: LaneletGraph, layout: RoadLay
     used = {key.id for key in graph.lanelets}
     lanes = sum(len(road.lanes) for road in layout.roads.values())
     yield (
-        f"Lanelets for motor vehicles: {len(used)}. They became {len(layout.roads)} roads with {lanes} lanes and "
-        f"{len(layout.turns)} connections."
+        f"Lanelets for motor vehicles: {len(used)}. They became {number_of(len(layout.roads), 'road')} with"
+        f" {number_of(lanes, 'lane')} and "
+        f"{number_of(len(layout.turns), 'connection')}."
     )
     others = Counter(
         lanelet.tags.get("subtype", "without subtype")
@@ -136,11 +138,15 @@ def _content_notes(lanelet_map: LaneletMap, graph: LaneletGraph, layout: RoadLay
 
 def _assumption_notes(assumed: rules.Assumptions) -> Iterator[str]:
     if assumed.speeds_km_h:
-        counts = ", ".join(f"{speed:g} km/h for {number}" for speed, number in sorted(assumed.speeds_km_h.items()))
-        yield f"Speed limits that the map does not state are assumed by subtype and location: {counts} lanes."
+        counts = ", ".join(
+            f"{speed:g} km/h for {number_of(number, 'lane')}" for speed, number in sorted(assumed.speeds_km_h.items())
+        )
+        yield f"Speed limits that the map does not state are assumed by subtype and location: {counts}."
     if assumed.classes:
-        counts = ", ".join(f"{name} for {number}" for name, number in sorted(assumed.classes.items()))
-        yield f"Road classes are assumed by subtype and number of lanes: {counts} roads."
+        counts = ", ".join(
+            f"{name} for {number_of(number, 'road')}" for name, number in sorted(assumed.classes.items())
+        )
+        yield f"Road classes are assumed by subtype and number of lanes: {counts}."
 
 
 def _crosswalks(lanelet_map: LaneletMap, xyz_m: Mapping[int, FloatArray]) -> list[DirectedLanelet]:
@@ -198,8 +204,9 @@ def _signal_notes(signals: SignalPlan) -> Iterator[str]:
 def _right_of_way_notes(right_of_way: RightOfWay) -> Iterator[str]:
     if right_of_way.prohibitions or right_of_way.all_way_stops:
         yield (
-            f"Right of way as the map states it: {len(right_of_way.prohibitions)} pairs of connections, "
-            f"{len(right_of_way.all_way_stops)} junctions where all stop. Elsewhere, smaller roads give way."
+            f"Right of way as the map states it: {number_of(len(right_of_way.prohibitions), 'pair')} of connections, "
+            f"{number_of(len(right_of_way.all_way_stops), 'junction')} where all stop. Elsewhere, smaller roads"
+            " give way."
         )
     if right_of_way.unused:
         yield f"Rules of right of way between lanelets that do not meet, left out: {_count(right_of_way.unused)}."

@@ -21,6 +21,7 @@ from xml.sax.saxutils import quoteattr
 
 from egvs.core import files, limits
 from egvs.core.errors import InputError
+from egvs.core.wording import by_number, number_of
 from egvs.formats import georeference, opendrive
 from egvs.formats.opendrive import OpenDriveMap, Road
 from egvs.formats.opendrive_copy import CopyOptions, write_copy
@@ -247,10 +248,16 @@ def _patch_notes(before: MapComparison, after: MapComparison) -> tuple[str, ...]
     added = [turn for turn in before.missing if turn not in after.missing]
     if added:
         roads = _listed(turn.source.road for turn in added)
-        notes.append(f"{len(added)} of {before.turns} turns that netconvert had lost were added, from roads {roads}.")
+        notes.append(
+            f"{len(added)} of {number_of(before.turns, 'turn')} that netconvert had lost"
+            f" {by_number(len(added), 'was', 'were')} added, from roads {roads}."
+        )
     removed = {*before.added} - {*after.added}
     if removed:
-        notes.append(f"{len(removed)} connections that are not in the map were removed.")
+        notes.append(
+            f"{number_of(len(removed), 'connection')} that {by_number(len(removed), 'is', 'are')} not in the map"
+            f" {by_number(len(removed), 'was', 'were')} removed."
+        )
     return tuple(notes)
 
 
@@ -259,7 +266,7 @@ def _lane_change_notes(changes: ForbiddenChanges) -> tuple[str, ...]:
     notes = []
     if changes.to_lanes:
         count = len(changes.to_lanes)
-        notes.append(f"Road marks forbid lane changes from {count} lanes, of {_listed(changes.edges)}.")
+        notes.append(f"Road marks forbid lane changes from {number_of(count, 'lane')}, of {_listed(changes.edges)}.")
     if changes.opened:
         lanes = _listed(f"{edge}_{lane}" for edge, lane in changes.opened)
         notes.append(
@@ -284,26 +291,37 @@ def comparison_notes(comparison: MapComparison, road_map: OpenDriveMap) -> tuple
         notes.append(f"Turns between these roads are missing: {_listed(turns)}.")
     if comparison.added:
         edges = (f"{source} to {target}" for source, _, target, _ in comparison.added)
-        notes.append(f"{len(comparison.added)} connections are not in the map: {_listed(edges)}.")
+        notes.append(
+            f"{number_of(len(comparison.added), 'connection')} {by_number(len(comparison.added), 'is', 'are')}"
+            f" not in the map: {_listed(edges)}."
+        )
     if comparison.guessed:
         edges = (f"{source} to {target}" for source, _, target, _ in comparison.guessed)
-        guessed = f"{len(comparison.guessed)} connections are guessed, from lanes that the map links to none"
+        guessed = (
+            f"{number_of(len(comparison.guessed), 'connection')}"
+            f" {by_number(len(comparison.guessed), 'is', 'are')} guessed, from lanes that the map links to none"
+        )
         notes.append(f"{guessed}: {_listed(edges)}.")
     far = {road: off_m for road, off_m in comparison.off_m.items() if off_m > OFF_M}
     if far:
         notes.append(
-            f"Lanes of {len(far)} roads lie more than {OFF_M:g} m off the map, up to {max(far.values()):.1f} m:"
+            f"Lanes of {number_of(len(far), 'road')} lie more than {OFF_M:g} m off the map, up to"
+            f" {max(far.values()):.1f} m:"
             f" {_listed(far)}."
         )
     high = {road: off_m for road, off_m in comparison.height_off_m.items() if off_m > HEIGHT_OFF_M}
     if high:
         notes.append(f"Heights of these roads differ by up to {max(high.values()):.1f} m: {_listed(high)}.")
     if comparison.restricted:
-        notes.append(f"{comparison.restricted} lanes are closed to normal traffic, since they are narrower than 1.8 m.")
+        notes.append(
+            f"{number_of(comparison.restricted, 'lane')} narrower than 1.8 m"
+            f" {by_number(comparison.restricted, 'is', 'are')} closed to normal traffic."
+        )
     signals = sum(signal.dynamic for road in road_map.roads.values() for signal in road.signals)
     if signals:
         notes.append(
-            f"{signals} traffic lights: their places and programs are not in the network; SUMO's default programs are"
+            f"{number_of(signals, 'traffic light')}: places and programs are not in the network; SUMO's default"
+            " programs are"
             " used."
         )
     if comparison.unlit_roads:
@@ -316,10 +334,12 @@ def _map_notes(road_map: OpenDriveMap) -> tuple[str, ...]:
     notes = []
     sloped = [road.id for road in road_map.roads.values() if any(any(cubic[1:]) for cubic in road.superelevations)]
     if sloped:
-        notes.append(f"The slope across {len(sloped)} roads (superelevation) is left out: {_listed(sloped)}.")
+        notes.append(
+            f"The slope across {number_of(len(sloped), 'road')} (superelevation) is left out: {_listed(sloped)}."
+        )
     signs = sum(not signal.dynamic for road in road_map.roads.values() for signal in road.signals)
     if signs:
-        notes.append(f"{signs} signs and marks are left out.")
+        notes.append(f"{number_of(signs, 'sign or mark', 'signs and marks')} {by_number(signs, 'is', 'are')} left out.")
     return tuple(notes)
 
 
@@ -330,7 +350,8 @@ def _level_notes(network_text: str) -> tuple[str, ...]:
         return ()
     listed = _listed(f"{upper} over {lower}" for upper, lower in pairs)
     return (
-        f"{len(pairs)} times roads lead over others: {listed}. Without a terrain, the ground rises to the upper one.",
+        f"In {number_of(len(pairs), 'place')}, roads lead over others: {listed}. Without a terrain, the ground rises"
+        " to the upper one.",
     )
 
 

@@ -17,6 +17,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from egvs.core.wording import by_number, number_of
 from egvs.formats.osm import OsmExtract, parse_number
 from egvs.importers.openstreetmap.street_network import EARTH_M, is_road
 
@@ -61,7 +62,9 @@ def read_elevations(extract: OsmExtract) -> RoadElevations:
     if not known:
         return RoadElevations({}, 0, total, "")
     if count < MIN_SHARE * total:
-        note = f"The heights (ele) of {count:,} of {total:,} road nodes are ignored, since too many have none."
+        note = (
+            f"The heights (ele) of {count:,} of {number_of(total, 'road node')} are ignored, since too many have none."
+        )
         return RoadElevations({}, count, total, note)
 
     heights = dict(known)
@@ -73,9 +76,12 @@ def read_elevations(extract: OsmExtract) -> RoadElevations:
     lowest = min(known.values())
     isolated = nodes - heights.keys()
     heights |= dict.fromkeys(isolated, lowest)
-    note = f"Roads have the heights of the map (ele); {total - count:,} of {total:,} nodes without were interpolated."
+    note = (
+        f"Roads have the heights of the map (ele); {total - count:,} of {number_of(total, 'node')} without"
+        f" {by_number(total - count, 'was', 'were')} interpolated."
+    )
     if isolated:
-        note += f" {len(isolated):,} nodes of roads that meet no other got the lowest height, {lowest:g} m."
+        note += f" {number_of(len(isolated), 'node')} of roads that meet no other got the lowest height, {lowest:g} m."
     return RoadElevations(dict(sorted(heights.items())), count, total, note)
 
 

@@ -27,6 +27,7 @@ from egvs.core import files, limits
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.reading import COMPLETE_FILE
+from egvs.core.wording import number_of
 from egvs.formats import point_clouds, xml
 from egvs.formats.georeference import height_unit_m
 from egvs.importers.buildings.mesh_maps import has_faces
@@ -184,7 +185,9 @@ def _read_file(survey: _Survey, path: Path, context: MapContext) -> None:
             survey.kept += len(inside) - merged
             limits.POINTS.check(where, survey.kept, f"has {survey.kept:,} points in the window")
     if survey.kept == kept_before:
-        problem = f"none of its {survey.points_read - points_before:,} points is in the window around the roads"
+        problem = (
+            f"none of its {number_of(survey.points_read - points_before, 'point')} is in the window around the roads"
+        )
         raise InputError(where, problem, "Check its coordinate reference system, or its --align.")
     survey.scans += scans.values()
 
@@ -272,7 +275,8 @@ def _mesh(kind: str, triangles: TriangleSurface) -> MappedMesh:
 def _notes(survey: _Survey, surface: CloudSurface, points: int) -> tuple[str, ...]:
     """Return sentences about the points, the stations and what follows from them."""
     read = (
-        f"{survey.points_read:,} points read from {_count(len(survey.scans), 'scan')}: {survey.dropped(OUT_OF_RANGE):,}"
+        f"{survey.points_read:,} points read from {number_of(len(survey.scans), 'scan')}:"
+        f" {survey.dropped(OUT_OF_RANGE):,}"
         f" outside the window, {survey.dropped(NOT_FINITE):,} not finite, {survey.dropped(MOVING):,} on moving objects,"
         f" {survey.dropped(THINNED):,} merged with neighbours within {THIN_CELL_M:g} m; {points:,} are used"
         f" ({surface.ground_points:,} on the ground)."
@@ -288,7 +292,7 @@ def _station_note(survey: _Survey) -> str:
     placed = [StationScan(scan.station_m, scan.points_m) for scan in survey.scans if scan.station_m is not None]
     stations = len(group_by_station(placed))
     if len(placed) < len(survey.scans):
-        share = f" for {len(survey.scans) - len(placed)} of {_count(len(survey.scans), 'scan')}" if placed else ""
+        share = f" for {len(survey.scans) - len(placed)} of {number_of(len(survey.scans), 'scan')}" if placed else ""
         unknown = (
             f"Where the scanner stood is unknown{share}: what moved there is part of the world. E57 scans and"
             " PCD files with a VIEWPOINT state it."
@@ -303,7 +307,3 @@ def _station_note(survey: _Survey) -> str:
         )
     removal = "" if survey.dropped(MOVING) else " Nothing moved between them."
     return f"The scans are from {stations} places.{removal}"
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number:,} {noun}" if number == 1 else f"{number:,} {noun}s"

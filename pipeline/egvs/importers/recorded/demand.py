@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from egvs.core.errors import InputError
+from egvs.core.wording import number_of
 from egvs.importers import junctions
 from egvs.importers.junctions import StreetJunction, Streets
 from egvs.importers.recorded.fleet import VEHICLE_CLASSES, KindEstimate, estimate_fleet
@@ -47,8 +48,8 @@ class MovementEstimate:
         """The interval in words, and a mark where there are too few vehicles."""
         text = f"95 %: {self.low_per_h:.0f} to {self.high_per_h:.0f}"
         if self.is_usable:
-            return f"{text}, from {self.vehicles:,} vehicles"
-        return f"{text} ({self.vehicles} vehicle{'' if self.vehicles == 1 else 's'} only; enter your own count)"
+            return f"{text}, from {number_of(self.vehicles, 'vehicle')}"
+        return f"{text} ({number_of(self.vehicles, 'vehicle')} only; enter your own count)"
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ class TrackDemand:
         assumed = []
         if self.marked:
             few = f"with fewer than {MIN_OBSERVATIONS} recorded vehicles"
-            assumed.append(f"counts of {self.marked} of {len(self.movements)} movements ({few})")
+            assumed.append(f"counts of {self.marked} of {number_of(len(self.movements), 'movement')} ({few})")
         names = [estimate.kind.name for estimate in self.fleet if estimate.has_default_size]
         if names:
             assumed.append(f"sizes of vehicles ({', '.join(names)})")
@@ -106,8 +107,8 @@ class TrackDemand:
         """Return a sentence."""
         vehicles = sum(movement.vehicles for movement in self.movements)
         text = (
-            f"{vehicles:,} recorded vehicles in {self.duration_s:,.0f} s became {self.per_h:,} an hour in"
-            f" {len(self.movements)} movements"
+            f"{number_of(vehicles, 'recorded vehicle')} in {self.duration_s:,.0f} s became {self.per_h:,} an hour in"
+            f" {number_of(len(self.movements), 'movement')}"
         )
         if self.marked:
             text += f", {self.marked} of them with fewer than {MIN_OBSERVATIONS} vehicles"
@@ -244,7 +245,7 @@ def _people_notes(tracks: CleanTracks) -> Iterator[str]:
     """Say which road users the counts do not contain."""
     others = Counter(name for name in tracks.classes if name not in VEHICLE_CLASSES)
     if others:
-        texts = [f"{number} {name}{'' if number == 1 else 's'}" for name, number in others.most_common()]
+        texts = [number_of(number, name) for name, number in others.most_common()]
         yield (
             f"Not part of the demand: {', '.join(texts)}. Pedestrians and bicycles are added with the effect"
             " pedestrians_bicycles."

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.grid import FloatArray, IntArray
+from egvs.core.wording import number_of
 from egvs.importers.recorded.signals import GREEN, YELLOW, GroupOfEdges, SignalRecord
 
 MIN_VEHICLES, MIN_PEOPLE = 5, 10
@@ -189,7 +190,10 @@ def _from_vehicles(
     )
     others = max((share for name, share in shares.items() if name != light), default=0.0)
     if shares[light] >= MIN_AGREEMENT:
-        reason = f"{shares[light]:.0%} of {len(times_s)} vehicles pass in its green or yellow; next light {others:.0%}"
+        reason = (
+            f"{shares[light]:.0%} of {number_of(len(times_s), 'vehicle')} pass in its green or yellow; next"
+            f" light {others:.0%}"
+        )
         yield LightGuess(edge, target, light, reason)
 
 

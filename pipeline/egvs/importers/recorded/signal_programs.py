@@ -32,6 +32,7 @@ from shapely.geometry import LineString, Point
 from egvs.core import files
 from egvs.core.errors import InputError, RunError
 from egvs.core.grid import FloatArray
+from egvs.core.wording import by_number, number_of
 from egvs.formats import xml
 from egvs.formats.georeference import WorldFrame
 from egvs.importers.plain_network import NETCONVERT_FLAGS, NETWORK_FILE
@@ -501,7 +502,7 @@ def _notes(
         seconds = f"{clock.from_s:.1f} to {clock.to_s:.1f} s"
         program = f"The signals replay the record from {seconds} on the clock of the tracks"
     yield (
-        f"{program}; median of {lengths.n} recorded cycles"
+        f"{program}; median of {number_of(lengths.n, 'recorded cycle')}"
         f" {lengths.value:.1f} s ({lengths.low:.1f} to {lengths.high:.1f} s)."
     )
     texts = []
@@ -510,7 +511,7 @@ def _notes(
         offsets_s = [(start_s - cycle.begin_s) % cycle.length_s for start_s in record.green_starts_s]
         text = f"{name}: no complete green"
         if green is not None:
-            greens = f"{green.n} {'green' if green.n == 1 else 'greens'}"
+            greens = number_of(green.n, "green")
             text = f"{name}: {green.value:.1f} s ({green.low:.1f} to {green.high:.1f}, {greens})"
         in_cycle_s = [
             start_s - cycle.begin_s for start_s in record.green_starts_s if cycle.begin_s <= start_s < cycle.end_s
@@ -521,10 +522,13 @@ def _notes(
     yield f"Green of each signal group, {meaning}: {'; '.join(texts)}."
     free = sum(link.index not in groups for link in junction.connections)
     if free:
-        yield f"{free} of {len(junction.connections)} connections have no recorded signal; vehicles there give way."
+        yield (
+            f"{free} of {number_of(len(junction.connections), 'connection')} {by_number(free, 'has', 'have')}"
+            " no recorded signal; vehicles there give way."
+        )
     crossings = sum(bool(link.crossed_edges) and link.index not in groups for link in junction.links)
     if crossings:
-        yield f"{crossings} crossings have no recorded signal; they are green while the vehicles they cross have red."
+        yield f"{number_of(crossings, 'crossing')} without recorded signal: green while the crossed vehicles have red."
 
 
 def _agreement_notes(
@@ -534,6 +538,9 @@ def _agreement_notes(
     by_edges = {(link.from_edge, link.to_edge): groups[link.index] for link in junction.links if link.index in groups}
     in_green, count = green_share(by_edges, records, motion)
     if count:
-        text = f"{in_green} of {count} recorded vehicles ({in_green / count:.0%}) pass the stop line in green or yellow"
+        text = (
+            f"{in_green} of {number_of(count, 'recorded vehicle')} ({in_green / count:.0%}) pass the stop"
+            " line in green or yellow"
+        )
         doubtful = in_green < MIN_IN_GREEN * count
         yield f"{text}{': check the clock and the assignment of the signals' if doubtful else ''}."

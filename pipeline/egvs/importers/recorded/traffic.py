@@ -17,6 +17,7 @@ from pydantic import ValidationError
 from egvs.core import reading
 from egvs.core.errors import InputError
 from egvs.core.grid import XY, Roi
+from egvs.core.wording import number_of
 from egvs.formats.georeference import Georeference
 from egvs.importers.junctions import Streets
 from egvs.importers.openstreetmap.street_network import NETWORK_FILE
@@ -170,7 +171,7 @@ def describe(recorded: RecordedTracks) -> str:
     classes = Counter(recorded.tracks.classes)
     texts = [_count(name, number) for name, number in classes.most_common()]
     duration_s = recorded.window.count * recorded.window.period_ms / 1000.0
-    text = f"{len(recorded.tracks.names):,} recorded tracks of {duration_s:,.0f} s ({', '.join(texts)})"
+    text = f"{number_of(len(recorded.tracks.names), 'recorded track')} of {duration_s:,.0f} s ({', '.join(texts)})"
     if recorded.alignment is not None:
         text += f"; {recorded.alignment.describe()}"
     return text

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.core.wording import by_number, number_of
 from egvs.importers.map_parts import Terrain
 from egvs.importers.terrain.network_heights import (
     Replacement,
@@ -115,12 +116,16 @@ def drape_network(
         f" z = 0 is a height of {zero_height_m:.2f} m, the ground at ({zero_at_m[0]:.1f}, {zero_at_m[1]:.1f})."
     ]
     if graph.raised:
-        notes.append(f"{len(graph.raised)} edges on bridges or in tunnels run straight between their ends.")
+        notes.append(
+            f"{number_of(len(graph.raised), 'edge')} on bridges or in tunnels"
+            f" {by_number(len(graph.raised), 'runs', 'run')} straight between their ends."
+        )
     crossings = graph.crossings(shapes)
     if crossings:
         pairs = ", ".join(f"{one} and {other}" for one, other in crossings[:3])
         notes.append(
-            f"{len(crossings)} times roads cross without a junction, but both lie on the ground, since the map does not"
+            f"In {number_of(len(crossings), 'place')}, roads cross without a junction, but both lie on the ground,"
+            " since the map does not"
             f" say which is above: {pairs}."
         )
     return DrapedNetwork(replace_parts(text, replacements), zero_height_m, tuple(notes))

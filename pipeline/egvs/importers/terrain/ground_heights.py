@@ -18,6 +18,7 @@ from shapely.geometry.base import BaseGeometry
 from egvs.core import limits
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
+from egvs.core.wording import by_number, number_of
 from egvs.formats.rasters import HeightGrid
 from egvs.importers.map_parts import MapContext, Terrain
 
@@ -231,7 +232,10 @@ def combine_tins(terrains: Sequence[TinTerrain | None], where: str) -> CombinedT
         raise InputError(where, "the terrain has no triangle in the region", "Use a terrain that covers the road map.")
     left_out = len(terrains) - len(inside)
     if left_out:
-        note = f"{left_out:,} of {len(terrains):,} terrain surfaces are outside the region and were left out."
+        note = (
+            f"{left_out:,} of {number_of(len(terrains), 'terrain surface')} outside the region"
+            f" {by_number(left_out, 'was', 'were')} left out."
+        )
         inside = (*inside[:-1], replace(inside[-1], notes=(*inside[-1].notes, note)))
     return CombinedTerrain(inside)
 
@@ -290,8 +294,12 @@ def _grid_notes(grids: Sequence[tuple[HeightGrid, str]], context: MapContext) ->
             continue
         heights = grid.heights_m[known]
         cells = f"{where}: terrain of {rows} x {columns} cells, {heights.min():.1f} to {heights.max():.1f} m high"
-        missing = known.size - np.count_nonzero(known)
-        yield f"{cells}; {missing:,} cells have no data." if missing else f"{cells}."
+        missing = int(known.size - np.count_nonzero(known))
+        yield (
+            f"{cells}; {number_of(missing, 'cell')} {by_number(missing, 'has', 'have')} no data."
+            if missing
+            else f"{cells}."
+        )
     points = _window_points(context.window)
     unknown = int(np.isnan(GridTerrain(tuple(grids), context).height_m(points)).sum())
     if unknown:

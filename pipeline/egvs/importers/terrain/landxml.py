@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from egvs.core.wording import by_number, number_of
 from egvs.formats import landxml
 from egvs.importers.map_parts import MapContext
 from egvs.importers.terrain.ground_heights import CombinedTerrain, combine_tins, tin_terrain
@@ -29,7 +30,14 @@ def read_terrain(paths: Sequence[Path], context: MapContext) -> CombinedTerrain:
     terrains = []
     for path in paths:
         file = landxml.read_landxml(path)
-        notes = [f"{path}: {file.hidden_faces:,} hidden faces were left out."] if file.hidden_faces else []
+        notes = (
+            [
+                f"{path}: {number_of(file.hidden_faces, 'hidden face')}"
+                f" {by_number(file.hidden_faces, 'was', 'were')} left out."
+            ]
+            if file.hidden_faces
+            else []
+        )
         for surface in file.surfaces:
             where = f"{path}: surface {surface.name!r}"
             terrains.append(tin_terrain(surface.vertices, surface.faces, file.crs, where, context, notes))

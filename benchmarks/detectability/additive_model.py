@@ -1,0 +1,149 @@
+r"""Candidates for a later version of ``expected_detections``: more features, and an additive model of them.
+
+The features include how crowded a vehicle is as seen from the sensor (:mod:`egvs.scoring.crowding`). The model of the
+probability that a detector finds the vehicle is
+
+.. math:: p(x) = \frac{1}{1 + e^{-b - \sum_k f_k(x_k) - c}}
+
+with a piecewise linear function :math:`f_k` of each feature, constant beyond its first and last knot, and an offset c
+of the vehicle's class. Where physics prescribes a direction (:data:`DIRECTIONS`), no :math:`f_k` turns: more points, a
+wider gap or a finer point spacing never lower the probability. A vehicle without any point is never detected.
+
+Its parameters are a readable table of knots and values per feature. On the training junctions measured so far it
+predicts less well than trees of the same features (docs/validation.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray, IntArray
+from egvs.core.special import expit
+from egvs.scoring.crowding import CLASSES, measure_crowding, vehicle_classes
+from egvs.scoring.target_scores import ISOLATED_GAP_M
+from egvs.scoring.targets import VisibleTargets
+
+DIRECTIONS: Mapping[str, int] = {
+    "log_points": 1,
+    "log_points_on_sides": 1,
+    "length_share": 1,
+    "width_share": 1,
+    "hole_m": -1,
+    "gap_m": 1,
+    "hidden_share": -1,
+    "front_gap_m": 1,
+    "behind_gap_m": 1,
+    "beside_gap_m": 1,
+    "beside_gap_deg": 1,
+    "link_gap": 1,
+    "log_spacing": -1,
+    "depression_deg": -1,
+    "incidence_deg": 0,
+    "length_m": 0,
+    "range_m": 0,
+    "side": 0,
+}
+"""For each feature that a model may have: 1 if the probability may only rise with it, -1 if it may only fall, 0 for
+either. ``log_spacing`` is ln(spacing / 1 m), the other logarithms are ln(1 + points)."""
+
+
+@dataclass(frozen=True, eq=False)
+class TargetFeatures:
+    """Features of vehicle-frames.
+
+    Attributes
+    ----------
+    columns
+        (n,) float64 each, by the names of :data:`DIRECTIONS`.
+    vehicle_class
+        Index in :data:`egvs.scoring.crowding.CLASSES`, -1 for people, (n,) int64.
+    """
+
+    columns: Mapping[str, FloatArray]
+    vehicle_class: IntArray
+
+
+def target_features(visible: VisibleTargets) -> TargetFeatures:
+    """Return all features of what a site sees."""
+    crowding = measure_crowding(visible)
+    columns = {
+        "log_points": np.log1p(visible.points),
+        "log_points_on_sides": np.log1p(visible.points_on_sides),
+        "length_share": visible.length_share,
+        "width_share": visible.width_share,
+        "hole_m": visible.hole_m,
+        "gap_m": np.minimum(visible.record.gap_m, ISOLATED_GAP_M),
+        "hidden_share": crowding.hidden_share,
+        "front_gap_m": crowding.front_gap_m,
+        "behind_gap_m": crowding.behind_gap_m,
+        "beside_gap_m": crowding.beside_gap_m,
+        "beside_gap_deg": crowding.beside_gap_deg,
+        "link_gap": crowding.link_gap,
+        "log_spacing": np.log(crowding.spacing_m),
+        "depression_deg": visible.depression_deg,
+        "incidence_deg": crowding.incidence_deg,
+        "length_m": visible.record.boxes[:, 3],
+        "range_m": visible.range_m,
+        "side": visible.side,
+    }
+    return TargetFeatures(columns, vehicle_classes(visible.record))
+
+
+@dataclass(frozen=True, eq=False)
+class AdditiveModel:
+    """Parameters of one detector.
+
+    Attributes
+    ----------
+    intercept
+        b of the module's equation.
+    curves
+        Knots, ascending, and the values of :math:`f_k` there, (m,) float64 each, by feature.
+    class_offsets
+        c of each of :data:`egvs.scoring.crowding.CLASSES`, (5,) float64.
+    """
+
+    intercept: float
+    curves: Mapping[str, tuple[FloatArray, FloatArray]]
+    class_offsets: FloatArray
+
+    @classmethod
+    def from_table(cls, table: Mapping[str, Any], where: str = "model") -> AdditiveModel:
+        """Parse the table of a detector.
+
+        Raises
+        ------
+        InputError
+            For an unknown feature or class, knots that do not ascend, or values against the prescribed direction.
+        """
+        curves = {}
+        for name, curve in table["features"].items():
+            key = f"{where}: features.{name}"
+            if name not in DIRECTIONS:
+                raise InputError(key, "expected a known feature", f"Use some of {', '.join(DIRECTIONS)}.")
+            knots, values = np.array(curve["knots"], dtype=np.float64), np.array(curve["values"], dtype=np.float64)
+            if knots.shape != values.shape or len(knots) < 2 or not (np.diff(knots) > 0.0).all():
+                problem = f"expected as many values as ascending knots, 2 or more, got {len(values)} and {len(knots)}"
+                raise InputError(key, problem, "Fit the model again.")
+            if (np.diff(values) * DIRECTIONS[name] < 0.0).any():
+                way = "rising" if DIRECTIONS[name] > 0 else "falling"
+                raise InputError(key, f"expected {way} values, got {values.tolist()}", "Fit the model again.")
+            curves[name] = knots, values
+        if unknown := set(table["classes"]) ^ set(CLASSES):
+            problem = f"expected the classes {', '.join(CLASSES)}; missing or unknown: {', '.join(sorted(unknown))}"
+            raise InputError(f"{where}: classes", problem, "Fit the model again.")
+        offsets = np.array([table["classes"][name] for name in CLASSES], dtype=np.float64)
+        return cls(float(table["intercept"]), curves, offsets)
+
+    def chances(self, features: TargetFeatures) -> FloatArray:
+        """Return the probability of each vehicle-frame, (n,) float64, 0 to 1; undefined for people."""
+        logit = self.intercept + self.class_offsets[features.vehicle_class]
+        for name, (knots, values) in self.curves.items():
+            logit += np.interp(features.columns[name], knots, values)
+        chance: FloatArray = expit(logit)
+        return chance

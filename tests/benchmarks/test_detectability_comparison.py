@@ -1,0 +1,187 @@
+"""Fitting and comparing additive models: planted truths, by hand, the file, the figure, arguments."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from benchmarks.detectability import additive_fitting, comparison, figures, fitting
+from benchmarks.detectability.additive_fitting import TrainingRows, choose_knots, fit_additive, ramps
+from benchmarks.detectability.additive_model import DIRECTIONS, AdditiveModel, TargetFeatures
+from benchmarks.detectability.comparison import SiteRows
+
+
+def rows(seed: int, truth, count: int = 4000) -> TrainingRows:
+    """Vehicles with random features, found by a planted probability."""
+    rng = np.random.default_rng(seed)
+    columns = {name: rng.uniform(0.0, 1.0, count) for name in DIRECTIONS}
+    columns["log_points"] = rng.uniform(0.1, 6.0, count)
+    features = TargetFeatures(columns, rng.integers(0, 2, count))
+    return TrainingRows(features, (rng.random((2, count)) < truth(features)).mean(axis=0))
+
+
+def planted(x: TargetFeatures) -> np.ndarray:
+    logit = 1.5 * (x.columns["log_points"] - 3.0) - 2.0 * x.columns["hidden_share"] + x.vehicle_class
+    return 1.0 / (1.0 + np.exp(-logit))
+
+
+def test_ramps_by_hand():
+    knots = np.array([0.0, 1.0, 3.0])
+    np.testing.assert_array_equal(ramps(np.array([-1.0, 0.5, 2.0, 9.0]), knots), [[0, 0], [0.5, 0], [1, 0.5], [1, 1]])
+    np.testing.assert_allclose(choose_knots(np.arange(101.0), 3), [1.0, 50.0, 99.0])
+    assert choose_knots(np.append(np.zeros(999), 1.0)).tolist() == [0.0, 1.0] and len(choose_knots(np.ones(5))) == 1
+
+
+def test_a_planted_dependence_is_found_in_other_data():
+    model = fit_additive([rows(1, planted), rows(2, planted)], ["log_points", "hidden_share"])
+    other = rows(3, planted)
+    assert np.abs(model.chances(other.features) - planted(other.features)).mean() < 0.03
+    assert model.class_offsets[1] - model.class_offsets[0] == pytest.approx(1.0, abs=0.25)
+
+
+def test_a_dependence_against_physics_is_not_learnt():
+    def inverted(x: TargetFeatures) -> np.ndarray:
+        return 1.0 / (1.0 + np.exp(1.5 * (x.columns["log_points"] - 3.0)))
+
+    model = fit_additive([rows(1, inverted)], ["log_points", "range_m"])
+    assert (np.diff(model.curves["log_points"][1]) == 0.0).all()  # flat rather than falling
+
+
+def test_minimum_has_no_slope():
+    """Any admissible small step from the fitted model raises the loss, evaluated by itself."""
+    data, name = rows(4, planted, 800), "log_points"
+    model = fit_additive([data], [name], with_classes=False)
+    knots, values = model.curves[name]
+
+    def loss(intercept, values) -> float:
+        logit = intercept + np.interp(data.features.columns[name], knots, values)
+        p = 1.0 / (1.0 + np.exp(-logit))
+        ridge = 0.5 * additive_fitting.RIDGE * (np.diff(values) ** 2).sum()
+        return float(-(data.hits * np.log(p) + (1 - data.hits) * np.log(1 - p)).mean() + ridge)
+
+    best = loss(model.intercept, values)
+    for k in range(len(values)):
+        step = 0.03 * (np.arange(len(values)) >= k)
+        for sign in (1, -1):
+            moved = values + sign * step
+            if k == 0:
+                assert loss(model.intercept + sign * 0.03, values) > best
+            elif (np.diff(moved) >= 0.0).all():
+                assert loss(model.intercept, moved) > best
+
+
+def test_the_file_is_read_as_it_was_fitted():
+    model = fit_additive([rows(1, planted)], ["log_points", "hidden_share", "range_m"])
+    text = additive_fitting.model_toml(
+        {"cluster": model}, {"junctions": ["one", "two"], "frames": 60, "model": "points"}
+    )
+    parsed = tomllib.loads(text)
+    assert parsed["about"] == {"junctions": ["one", "two"], "frames": 60, "model": "points"}
+    again = AdditiveModel.from_table(parsed["detectors"]["cluster"])
+    x = rows(5, planted).features
+    np.testing.assert_allclose(again.chances(x), model.chances(x), atol=1e-4)
+
+
+# ---- the comparison
+
+
+def sites(seed: int, noise: float = 0.0) -> list[SiteRows]:
+    """Eight sites at two heights that see more and more; AP is the share found, or half of it at random."""
+    rng = np.random.default_rng(seed)
+    result = []
+    for number in range(8):
+        count = 400
+        columns = {name: rng.uniform(0.0, 1.0, count) for name in DIRECTIONS}
+        columns["log_points"] = rng.uniform(0.0, 2.0 + 0.5 * number, count) * (rng.random(count) > 0.1)
+        features = TargetFeatures(columns, np.zeros(count, dtype=np.int64))
+        hits = (rng.random((2, count)) < planted(features)).mean(axis=0) * (columns["log_points"] > 0.0)
+        ap = float(hits.mean()) + noise * rng.normal()
+        result.append(SiteRows(f"g0{number}h3", f"{number % 2} m", features, hits, planted(features), ap))
+    return result
+
+
+def test_results_by_hand():
+    each = sites(1)[:4]
+    ap = [0.1, 0.2, 0.3, 0.4]
+    each = [
+        SiteRows(s.site, "3 m", TargetFeatures({"log_points": np.array([1.0, 0.0])}, np.zeros(2, dtype=np.int64)),
+                 np.array([1.0, 0.0]), np.array([0.5, 0.0]), a)
+        for s, a in zip(each, ap, strict=True)
+    ]  # fmt: skip
+    values = [np.array([0.5, 0.0]), np.array([0.7, 0.0]), np.array([0.6, 0.0]), np.array([0.8, 0.0])]
+    result = comparison.evaluate(each, values)
+    assert result.rho == pytest.approx(0.8) and result.rho_in_group == pytest.approx(0.8)  # 1 - 6 * 2 / (4 * 15)
+    # the vehicle without a point does not count
+    assert result.loss == pytest.approx(-math.log(0.5 * 0.7 * 0.6 * 0.8) / 4)
+    assert comparison.mean_and_error([0.5, 0.7, math.nan]) == "0.600 ± 0.100"
+    assert comparison.mean_and_error([0.5]) == "0.500 ± nan" and comparison.mean_and_error([math.nan]) == ""
+
+
+def test_each_junction_is_predicted_by_the_others(monkeypatch):
+    monkeypatch.setattr(
+        comparison, "MODELS", {"points": ("additive", comparison.POINTS), "shadow": ("additive", comparison.SHADOW)}
+    )
+    by_junction = {name: sites(seed) for seed, name in enumerate(("one", "two"), start=1)}
+    fitted = []
+    whole = comparison.fit
+    monkeypatch.setattr(comparison, "fit", lambda rows, *model: fitted.append(rows) or whole(rows, *model))
+    results = comparison.compare(by_junction)
+    assert [len(rows) for rows in fitted] == [1] * 4  # never on the junction itself
+    first = comparison.training_rows(by_junction["one"])
+    assert np.array_equal(fitted[-1][0].hits, first.hits) and (first.features.columns["log_points"] > 0.0).all()
+    assert results["shadow"]["one"].rho > 0.85
+    assert results["shadow"]["one"].loss < results["points"]["one"].loss
+    lines = list(comparison.table(results))
+    assert len(lines) == 2 + 4 and all(line.count("|") == lines[0].count("|") for line in lines)
+    assert "| 0.000 ± 0.000 |" in lines[2]  # points_on_target minus itself
+
+
+def test_trees_keep_the_directions_and_weight_junctions_equally(monkeypatch):
+    monkeypatch.setattr(fitting, "TREES", 10)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")  # else scikit-learn starts a program that counts the cores
+    # the same features; found always at the small junction, never at the one of ten times as many vehicles
+    small, large = rows(1, lambda x: 2.0, 400), rows(2, lambda x: -1.0, 4000)
+    model = comparison.fit([small, large], "trees", ("log_points", "hidden_share"))
+    assert model.chances(rows(3, planted).features).mean() == pytest.approx(0.5, abs=0.05)
+    monkeypatch.setattr(fitting, "MIN_SAMPLES", 50)
+    model = comparison.fit([rows(1, planted), rows(2, planted)], "trees", ("log_points", "hidden_share"))
+    x = rows(3, planted).features
+    fewer = TargetFeatures({**x.columns, "log_points": 0.5 * x.columns["log_points"]}, x.vehicle_class)
+    assert (model.chances(x) >= model.chances(fewer)).all()
+    assert (model.chances(x) - model.chances(fewer)).mean() > 0.1
+
+
+def test_reliability_diagram_shows_every_bin(tmp_path: Path):
+    curves = comparison.reliability({"one": sites(1), "two": sites(2)}, "additive", comparison.SHADOW)
+    for parts in curves.values():
+        assert sum(part["vehicle_frames"] for part in parts) == 8 * 400
+        # models of the same truth: within a few standard errors, sqrt(0.25 / 2 / 100), of well filled bins
+        assert all(abs(part["chance"] - part["found"]) < 0.2 for part in parts if part["vehicle_frames"] > 100)
+    figure = figures.reliability_diagrams("cluster", curves)
+    drawn = {axes.get_title().partition(":")[0]: axes for axes in figure.axes if axes.get_title()}
+    for name, parts in curves.items():
+        offsets = drawn[name].collections[-1].get_offsets()
+        np.testing.assert_allclose(offsets, [[part["chance"], part["found"]] for part in parts])
+    figures.draw_reliability(tmp_path / "its.png", "cluster", curves)
+    assert (tmp_path / "its.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_title_has_the_difference_in_level_by_hand():
+    parts = [{"chance": 0.2, "found": 0.1, "vehicle_frames": 30}, {"chance": 0.9, "found": 0.8, "vehicle_frames": 10}]
+    figure = figures.reliability_diagrams("cluster", {"one": parts})
+    assert figure.axes[0].get_title() == "one: +10.0 points predicted"
+
+
+def test_only_training_junctions_are_accepted(tmp_path: Path, capsys):
+    for options, said in {
+        ("--junction", "nishishinjuku,hill"): "expected a training junction, got 'nishishinjuku'",
+        ("--scenario", "scenarios/nishishinjuku"): "expected a training junction, got 'nishishinjuku'",
+        ("--junction", "hill"): "expected 2 or more different junctions, got hill",
+        (): "got none",
+    }.items():
+        assert comparison.main([str(tmp_path / "out"), *options]) == 2
+        assert said in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
