@@ -232,7 +232,7 @@ def evaluate(sites: Sequence[SiteRows], values: Sequence[Floats], is_chance: boo
 
 def compare(by_junction: Mapping[str, Sequence[SiteRows]]) -> dict[str, dict[str, ModelResult]]:
     """Return the result of every score and model at every junction, predicted by the models of the others."""
-    results: dict[str, dict[str, ModelResult]] = {COUNT_SCORE: {}, SHIPPED_SCORE: {}} | {name: {} for name in MODELS}
+    results: dict[str, dict[str, ModelResult]] = {name: {} for name in (COUNT_SCORE, SHIPPED_SCORE, *MODELS)}
     rows = {name: training_rows(sites) for name, sites in by_junction.items()}
     for name, sites in by_junction.items():
         counts = [site.features.columns["log_points"] for site in sites]
