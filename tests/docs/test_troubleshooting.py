@@ -23,11 +23,17 @@ def quoted_messages() -> list[str]:
 
 
 def text_of(node: ast.AST) -> str | None:
-    """Return the text of a string or an f-string, with an ellipsis for each value; None for other nodes."""
+    """Return the text of a string or an f-string, with an ellipsis for each value; None for other nodes.
+
+    ``number_of(x, "frame")`` becomes "… frames".
+    """
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return node.value
     if isinstance(node, ast.JoinedStr):
         return "".join(text_of(part) or VARIABLE for part in node.values)
+    match node:
+        case ast.FormattedValue(value=ast.Call(func=ast.Name(id="number_of"), args=[_, ast.Constant(str(noun)), *_])):
+            return f"{VARIABLE} {noun}s"
     return None
 
 
@@ -74,6 +80,9 @@ def test_reads_variable_parts_of_messages() -> None:
     (statement,) = ast.parse('f"{a} of {b:,} vehicles" f" ({c!r}) wait"').body
     assert isinstance(statement, ast.Expr)
     assert text_of(statement.value) == "… of … vehicles (…) wait"
+    (statement,) = ast.parse("""f"in {number_of(n, 'frame')} of it\"""").body
+    assert isinstance(statement, ast.Expr)
+    assert text_of(statement.value) == "in … frames of it"
 
 
 def quoted(beginning: str) -> re.Pattern[str]:
@@ -112,3 +121,23 @@ def test_command_prints_the_quoted_message(
     code, out, error = run_egvs(*(argument.format(mini=mini, tmp=tmp_path) for argument in command))
     assert code == 2
     assert quoted(beginning).search(out + error), out + error
+
+
+@pytest.mark.slow
+def test_run_prints_the_quoted_messages(mini: Path, tmp_path: Path, run_egvs: Any) -> None:
+    folder = tmp_path / "run"
+    code, out, error = run_egvs("run", mini, "--out", folder, "--set", "roi.center_m=[20,60,2.5]")
+    assert code == 0, error
+    assert quoted("no vehicle ever enters the region").search(out + error)
+
+    record = folder / "run.json"
+    record.write_text(record.read_text(encoding="utf-8").replace("gamma", "gamme"), encoding="utf-8")
+    code, _, error = run_egvs("verify", folder)
+    assert code == 2
+    assert quoted("was changed after the run").search(error)
+
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "scores.parquet").write_text("mine", encoding="utf-8")
+    code, _, error = run_egvs("run", mini, "--out", tmp_path / "notes")
+    assert code == 2
+    assert quoted("a run would overwrite").search(error)

@@ -360,7 +360,8 @@ def test_road_marks_forbid_lane_changes(marks: tuple[str, str], expected: dict[s
     road_map, _ = convert(tmp_path, three_lanes(*marks))
     assert changes(road_map) == expected
     notes = [note for note in road_map.notes if note.startswith("Road marks forbid")]
-    assert notes == ([f"Road marks forbid lane changes from {len(expected)} lanes, of -1."] if expected else [])
+    lanes = "1 lane" if len(expected) == 1 else f"{len(expected)} lanes"
+    assert notes == ([f"Road marks forbid lane changes from {lanes}, of -1."] if expected else [])
 
 
 @pytest.mark.system

@@ -39,15 +39,11 @@ def test_sensors_of_the_catalogue(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("trials", "limit"), [(12, 0.75), pytest.param(40, 0.85, marks=pytest.mark.nightly)])
-def test_intervals_contain_the_true_values(trials: int, limit: float) -> None:
-    """``python -m benchmarks.sensor_fit intervals`` makes 200 trials.
-
-    The limit is for what has one interval in each trial; of the others, each trial has many.
-    """
-    hits = interval_hits(trials, seed=7)
-    assert np.mean(hits["range noise, 5 to 25 m"]) >= limit
-    assert np.mean(hits["return rate, smooth surfaces"]) >= limit
+def test_intervals_contain_the_true_values() -> None:
+    """40 trials; ``python -m benchmarks.sensor_fit intervals`` makes 200."""
+    hits = interval_hits(40, seed=7)
+    assert np.mean(hits["range noise, 5 to 25 m"]) >= 0.85
+    assert np.mean(hits["return rate, smooth surfaces"]) >= 0.85
     for what in ("range noise, by range", "range noise, by channel", "return rate, by range and incidence"):
         assert np.mean(hits[what]) >= 0.91
 

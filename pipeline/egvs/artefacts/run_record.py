@@ -94,7 +94,7 @@ def _suggest_run(scenario_folder: Path) -> str:
     return f"First run egvs run {scenario_folder}, then give its run folder."
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class RunRecord:
     """Contents of ``run.json``.
 
@@ -119,6 +119,9 @@ class RunRecord:
     scenario_folder: str
     stages: dict[str, StageRecord]
     overrides: dict[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"RunRecord({self.scenario.get('name', '?')}; stages {', '.join(self.stages)})"
 
     @classmethod
     def read(cls, folder: Path) -> RunRecord:

@@ -294,7 +294,7 @@ def _grid_notes(grids: Sequence[tuple[HeightGrid, str]], context: MapContext) ->
             continue
         heights = grid.heights_m[known]
         cells = f"{where}: terrain of {rows} x {columns} cells, {heights.min():.1f} to {heights.max():.1f} m high"
-        missing = known.size - np.count_nonzero(known)
+        missing = int(known.size - np.count_nonzero(known))
         yield (
             f"{cells}; {number_of(missing, 'cell')} {by_number(missing, 'has', 'have')} no data."
             if missing
