@@ -32,7 +32,9 @@ def validate(
     spacing: Spacing = None,
     detector: Annotated[
         str,
-        typer.Option(metavar="NAME,NAME", help="Of points, cluster, pointpillars, range_image, plug-ins."),
+        typer.Option(
+            metavar="NAME,NAME", help="Detectors to run: points, cluster, pointpillars, range_image, or a plug-in."
+        ),
     ] = "points,cluster",
     detections: Annotated[
         Path | None,

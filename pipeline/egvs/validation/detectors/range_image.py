@@ -196,9 +196,9 @@ class Segments:
 
 
 class _NewPoints(NamedTuple):
-    """Points of traffic: index in the sweep, beam, sensor frame, range, plan position from the sensor, height."""
+    """Points of traffic: row in the sweep, beam, sensor frame, range, plan position from the sensor, height."""
 
-    index: IntArray
+    row: IntArray
     beam: IntArray
     at_m: FloatArray
     range_m: FloatArray
@@ -393,7 +393,7 @@ class RangeImageAtSite:
         selected = np.concatenate(
             [np.empty(0, np.int64), *(both[twice[row] : twice[row + 1]] for row in rows.tolist())]
         )
-        return Segments(new.index[selected], np.append(0, np.cumsum(sizes)), axes[rows], ends_m[rows], features[rows])
+        return Segments(new.row[selected], np.append(0, np.cumsum(sizes)), axes[rows], ends_m[rows], features[rows])
 
 
 def _orient_axes(cosine: FloatArray, sine: FloatArray, ends_m: FloatArray) -> tuple[FloatArray, FloatArray]:
