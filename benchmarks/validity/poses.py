@@ -53,10 +53,12 @@ def grid_poses(scene: Scene, carriageway: Carriageway | None, sensor: str, place
     )
 
 
-def free_at(scene: Scene, carriageway: Carriageway | None, sensor: str) -> NDArray[np.float64]:
+def free_at(
+    scene: Scene, carriageway: Carriageway | None, sensor: str, heights_m: Sequence[float] = HEIGHTS_M
+) -> NDArray[np.float64]:
     """Return the points of the lattice where a pole is possible at every height, (n, 2)."""
     near = _near_lanes(_lattice(scene), carriageway)
-    each = [_at_all_heights(scene, at_m, number, sensor) for number, at_m in enumerate(near.tolist())]
+    each = [_at_all_heights(scene, at_m, number, sensor, heights_m) for number, at_m in enumerate(near.tolist())]
     free = site_feasibility.drop_infeasible([sites[0] for sites in each], scene.world, carriageway).free
     poles = {site.pole for site in free}
     free_points = [
@@ -110,10 +112,12 @@ def _near_lanes(places_m: NDArray[np.float64], carriageway: Carriageway | None) 
     return free_points
 
 
-def _at_all_heights(scene: Scene, at_m: Sequence[float], number: int, sensor: str) -> list[Site]:
+def _at_all_heights(
+    scene: Scene, at_m: Sequence[float], number: int, sensor: str, heights_m: Sequence[float] = HEIGHTS_M
+) -> list[Site]:
     x_m, y_m = at_m
     ground_m = (
         site_feasibility.ground_height_m(scene.world, Pose(x_m, y_m, 0.0)) if scene.scenario.statics.ground else 0.0
     )
     pole = f"g{number:02d}"
-    return [Site(f"{pole}h{h:g}", Pose(x_m, y_m, ground_m + h), sensor, pole=pole) for h in HEIGHTS_M]
+    return [Site(f"{pole}h{h:g}", Pose(x_m, y_m, ground_m + h), sensor, pole=pole) for h in heights_m]

@@ -1,0 +1,278 @@
+"""The larger study, by one command: ``python -m benchmarks.across_junctions build``, ``list``, ``measure``, ``tables``.
+
+    build     make the scenarios, draw their candidates, look at their traffic in a short simulation
+    list      print the protocol and its hash
+    measure   measure what is missing, part by part; an interrupted study continues where it stopped
+    tables    write the tables from the records
+
+Junctions whose maps are not in the folder of ``--maps`` are left out, and named.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from benchmarks.across_junctions import build, candidates, costs, tables
+from benchmarks.across_junctions.measurement import Extent, PartPlan, measure
+from benchmarks.across_junctions.protocol import ROLES, Junction, Protocol, ProtocolFiles, read_protocol
+from benchmarks.across_junctions.records import NOT_DETECTORS, SCORES, VEHICLES
+from benchmarks.across_junctions.worlds import MissingMapError, make_world
+from egvs.core.errors import EgvsError, InputError, MissingBackendError
+from egvs.core.progress import ProgressCallback
+from egvs.validation.detectors import base
+
+ROOT = Path(__file__).resolve().parents[2]
+REPORT_EVERY_S = 30.0
+
+
+def main(given: Sequence[str] | None = None) -> int:
+    """Run one step of the study, and return the exit code."""
+    try:
+        arguments = _parser().parse_args(given)
+        code: int = arguments.step(arguments)
+    except EgvsError as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    return code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.across_junctions",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("--data", type=Path, default=ROOT / "runs" / "across_junctions", help="folder of the study")
+    common.add_argument("--maps", type=Path, metavar="DIR", help="folder of the maps that are not shipped")
+    common.add_argument("--junction", metavar="NAME,NAME", help="default: all")
+    steps = parser.add_subparsers(required=True, metavar="build|list|measure|tables")
+
+    step = steps.add_parser("build", parents=[common], help="make the scenarios")
+    step.add_argument(
+        "--write",
+        action="store_true",
+        help="write the rows of these junctions in candidates.csv and worlds.csv, which changes the hash",
+    )
+    step.set_defaults(step=_build)
+
+    step = steps.add_parser("list", help="print the protocol and its hash")
+    step.set_defaults(step=_list)
+
+    step = steps.add_parser("measure", parents=[common], help="measure what is missing")
+    step.add_argument(
+        "--part", metavar="NAME,NAME", help=f"detectors, {SCORES}, {VEHICLES}; default: as the protocol says"
+    )
+    step.add_argument("--role", choices=ROLES, help="only junctions of this role")
+    step.add_argument("--held-out", action="store_true", help="allow held-out junctions, which can be spent only once")
+    step.add_argument("--frames", type=int, help="fewer than the protocol says: a trial, at training junctions only")
+    step.add_argument("--candidates", type=int, help="the first of the protocol's candidates: a trial, too")
+    step.add_argument("--jobs", type=int, help="processes; default: one a core")
+    step.set_defaults(step=_measure)
+
+    step = steps.add_parser("tables", parents=[common], help="write the tables")
+    step.add_argument("--out", type=Path, metavar="DIR", help="for the tables; default: below the folder of the study")
+    step.set_defaults(step=_tables)
+    return parser
+
+
+def _selected(protocol: Protocol, names: str | None) -> list[Junction]:
+    """Return the junctions of ``--junction``, or all."""
+    if names is None:
+        return list(protocol.junctions)
+    return [protocol.junction(name.strip()) for name in names.split(",") if name.strip()]
+
+
+def _build(arguments: argparse.Namespace) -> int:
+    protocol = read_protocol()
+    built = []
+    for junction in _selected(protocol, arguments.junction):
+        start_s = time.monotonic()
+        built.append(build.build(protocol, junction, arguments.maps, arguments.data / "worlds"))
+        print(f"{junction.name}: {time.monotonic() - start_s:.0f} s", flush=True)
+    build.print_table(built)
+    incomplete = [entry for entry in built if entry.problem]
+    if arguments.write:
+        if incomplete:
+            names = ", ".join(entry.junction.name for entry in incomplete)
+            raise InputError("--write", f"{names} could not be built", "Name the folder of the maps with --maps.")
+        _write(protocol, built)
+        print(f"SHA-256 of the protocol: {ProtocolFiles().digest}")
+        return 0
+    different = _differences(built)
+    for text in different:
+        print(text)
+    return 1 if incomplete or different else 0
+
+
+def _write(protocol: Protocol, built: Sequence[build.BuiltJunction]) -> None:
+    """Replace the rows of the built junctions in the files of the protocol; rows of others stay."""
+    drawn = candidates.read_candidates() if (candidates.FOLDER / candidates.CANDIDATES_FILE).is_file() else {}
+    digests = build.read_worlds() if (build.FOLDER / build.WORLDS_FILE).is_file() else {}
+    for entry in built:
+        drawn[entry.junction.name] = dict(entry.candidates or {})
+        digests[entry.junction.name] = entry.digest
+    names = [junction.name for junction in protocol.junctions]
+    candidates.write_candidates({name: drawn[name] for name in names if name in drawn})
+    build.write_worlds({name: digests[name] for name in names if name in digests})
+
+
+def _differences(built: Sequence[build.BuiltJunction]) -> list[str]:
+    """Return what differs from the files of the protocol."""
+    drawn, digests = candidates.read_candidates(), build.read_worlds()
+    texts = []
+    for entry in built:
+        if entry.problem:
+            continue
+        if digests[entry.junction.name] != entry.digest:
+            texts.append(f"{entry.junction.name}: the scenario differs from the one of the protocol")
+        if drawn[entry.junction.name] != entry.candidates:
+            texts.append(f"{entry.junction.name}: the candidates differ from those of the protocol")
+    return texts
+
+
+def _list(_: argparse.Namespace) -> int:
+    protocol, digests = read_protocol(), ProtocolFiles()
+    rule = protocol.candidates
+    installed = base.detector_names()
+    for junction in protocol.junctions:
+        heights = ", ".join(f"{height:g}" for height in rule.heights_m[junction.heights])
+        print(f"{junction.name:16} {junction.role:11} {heights:14} m  {junction.differs_in}")
+        for entry in junction.files:
+            print(f"{'':29}{entry.name} {entry.sha256}")
+    print(f"{rule.count} candidates per junction: pitch {rule.pitch_deg[0]:g} to {rule.pitch_deg[1]:g}, roll"
+          f" {rule.roll_deg[0]:g} to {rule.roll_deg[1]:g} degrees; seed {protocol.seed}")  # fmt: skip
+    print(f"sensors: {', '.join(rule.sensors)}")
+    print(f"{protocol.frames} frames at least {protocol.apart_s:g} s apart")
+    for role, names in (("training", protocol.detectors.training), ("held out", protocol.detectors.held_out)):
+        texts = [name if name in installed else f"{name} (not installed)" for name in names]
+        print(f"detectors at {role} junctions: {', '.join(texts)}")
+    for name, digest in digests.digests.items():
+        print(f"{digest}  {name}")
+    print(f"SHA-256 of the protocol: {digests.digest}")
+    return 0
+
+
+def _measure(arguments: argparse.Namespace) -> int:
+    plans = _plans(arguments)
+    start_s = time.monotonic()
+    measured = []
+    for plan in plans:
+        print(f"{time.monotonic() - start_s:6.0f} s  {plan.name}", flush=True)
+        info = measure(plan, jobs=arguments.jobs, progress=_progress(plan.name, start_s))
+        measured.append(info)
+        took = f"{info.seconds:.0f} s, {info.vehicles} different vehicles"
+        print(f"{time.monotonic() - start_s:6.0f} s  {plan.name}: {took}")
+    print(costs.estimate(measured, read_protocol()))
+    return 0
+
+
+def _plans(arguments: argparse.Namespace) -> list[PartPlan]:
+    """Return the parts to measure; check everything before the first one."""
+    protocol = read_protocol()
+    extent = Extent(
+        protocol.frames if arguments.frames is None else arguments.frames,
+        protocol.candidates.count if arguments.candidates is None else arguments.candidates,
+    )
+    if (
+        extent.frames > protocol.frames
+        or extent.candidates > protocol.candidates.count
+        or min(extent.frames // 20, extent.candidates) < 1
+    ):
+        problem = f"expected 20 to {protocol.frames} frames and 1 to {protocol.candidates.count} candidates"
+        raise InputError("--frames, --candidates", f"{problem}, got {extent.frames} and {extent.candidates}")
+    selected = [
+        junction for junction in _selected(protocol, arguments.junction)
+        if arguments.role in (None, junction.role)
+    ]  # fmt: skip
+    is_trial = extent.is_trial(protocol)
+    for junction in selected:
+        if junction.role != "training" and is_trial:
+            problem = f"a trial at {junction.name} would spend a junction that is {junction.role}"
+            raise InputError("--frames, --candidates", problem, "Use a training junction.")
+        if junction.role == "held out" and not arguments.held_out:
+            problem = f"{junction.name} is held out, and can be measured only once"
+            raise InputError("--junction", problem, "Add --held-out when all choices are made, or use --role training.")
+    digest, each = ProtocolFiles().digest, candidates.read_candidates()
+    plans = []
+    for junction in selected:
+        folder = _world(protocol, junction, arguments)
+        if folder is not None:
+            for part in _parts(protocol, junction, arguments.part):
+                plans.append(
+                    PartPlan(
+                        protocol,
+                        digest,
+                        junction,
+                        part,
+                        folder,
+                        each[junction.name],
+                        extent,
+                        _records(arguments, is_trial),
+                    )
+                )
+    return plans
+
+
+def _records(arguments: argparse.Namespace, is_trial: bool) -> Path:
+    folder: Path = arguments.data / ("trial" if is_trial else "records")
+    return folder
+
+
+def _world(protocol: Protocol, junction: Junction, arguments: argparse.Namespace) -> Path | None:
+    """Return the scenario of a junction if its maps are there and it is the one of the protocol."""
+    try:
+        folder = make_world(protocol, junction, arguments.maps, arguments.data / "worlds")
+    except MissingMapError as error:
+        print(f"without {junction.name}: {error}")
+        return None
+    if build.read_worlds()[junction.name] != build.world_digest(folder):
+        problem = "the scenario differs from the one of the protocol"
+        raise InputError(folder, problem, "Use the versions of SUMO and of the libraries that constraints.txt names.")
+    return folder
+
+
+def _parts(protocol: Protocol, junction: Junction, names: str | None) -> list[str]:
+    """Return the requested parts of a junction, or those of the protocol; detectors must be installed."""
+    known = (*NOT_DETECTORS, *protocol.detectors_of(junction))
+    parts = list(known) if names is None else [name.strip() for name in names.split(",") if name.strip()]
+    for name in parts:
+        if name not in NOT_DETECTORS:
+            _check_detector(name)
+    return parts
+
+
+def _check_detector(name: str) -> None:
+    try:
+        base.make_detector(name, "--part")
+    except MissingBackendError as error:
+        raise InputError("--part", str(error)) from None
+
+
+def _progress(name: str, start_s: float) -> ProgressCallback:
+    """Return a callback that prints a line every half minute."""
+    reported_at = time.monotonic()
+
+    def progress(what: str, done: int, total: int) -> None:
+        nonlocal reported_at
+        if time.monotonic() - reported_at >= REPORT_EVERY_S:
+            reported_at = time.monotonic()
+            text = f"{what} {done}" + (f" of {total}" if total else "")
+            print(f"{reported_at - start_s:6.0f} s  {name}: {text}", flush=True)
+
+    return progress
+
+
+def _tables(arguments: argparse.Namespace) -> int:
+    out = arguments.out or arguments.data / "tables"
+    for text in tables.write_tables(arguments.data / "records", out):
+        print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,115 @@
+"""Candidates of a junction, drawn at random with the seed of the protocol.
+
+Steps: put a lattice over the region of interest and its surroundings (:mod:`benchmarks.validity.poses`); select the
+points near a lane where a pole is possible at every height; draw as many of them as there are candidates, without
+replacement. Heights and sensors are dealt out equally often and shuffled. Pitch and roll are uniform. The sensor faces
+a point that is uniform in the region of interest, so that narrow sensors do not look away from the junction. World
+frame, metres and degrees.
+"""
+
+from __future__ import annotations
+
+import csv
+import zlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from benchmarks.across_junctions.protocol import CANDIDATES_FILE, FOLDER, Junction, Protocol
+from benchmarks.validity import poses
+from egvs.core import files
+from egvs.core.errors import InputError
+from egvs.sensors import site_feasibility
+from egvs.sensors.scene import Scene
+from egvs.sensors.sites import Pose, Site
+from egvs.world.carriageway import Carriageway
+
+COLUMNS = ("junction", "site", "x_m", "y_m", "z_m", "height_m", "yaw_deg", "pitch_deg", "roll_deg", "sensor")
+
+T = TypeVar("T")
+
+REFERENCE_SENSOR = "VLP-32C"
+"""Its range limits how far from the region of interest a pole may stand."""
+
+
+def draw_candidates(
+    protocol: Protocol, junction: Junction, scene: Scene, carriageway: Carriageway | None
+) -> dict[Site, float]:
+    """Return the candidates of a junction, with their heights above the ground in metres.
+
+    Raises
+    ------
+    InputError
+        Where fewer places are free than there are candidates.
+    """
+    rule = protocol.candidates
+    heights_m = rule.heights_m[junction.heights]
+    free = poses.free_at(scene, carriageway, REFERENCE_SENSOR, heights_m)
+    if len(free) < rule.count:
+        problem = f"expected {rule.count} free places beside the roads, got {len(free)}"
+        raise InputError(f"junctions.toml: {junction.name}", problem, "Use a junction with more space.")
+    rng = np.random.default_rng((protocol.seed, zlib.crc32(junction.name.encode())))
+    places = free[rng.choice(len(free), rule.count, replace=False)]
+    heights = dealt(heights_m, rule.count, rng)
+    sensors = dealt(rule.sensors, rule.count, rng)
+    aims_m = np.array(scene.roi.origin_m[:2]) + rng.random((rule.count, 2)) * np.array(scene.roi.size_m[:2])
+    yaw = np.degrees(np.arctan2(*(aims_m - places).T[::-1]))
+    pitch, roll = (rng.uniform(*limits, rule.count) for limits in (rule.pitch_deg, rule.roll_deg))
+    candidates = {}
+    for number, (x_m, y_m) in enumerate(places.tolist()):
+        ground_m = (
+            site_feasibility.ground_height_m(scene.world, Pose(x_m, y_m, 0.0)) if scene.scenario.statics.ground else 0.0
+        )
+        height_m = heights[number]
+        angles = (round(float(values[number]), 2) + 0.0 for values in (yaw, pitch, roll))
+        name = f"c{number + 1:02d}"
+        pose = Pose(round(x_m, 3), round(y_m, 3), round(ground_m + height_m, 3), *angles)
+        site = Site(name, pose, sensors[number], pole=name)
+        site_feasibility.check_pose(scene, pose, scene.sensor(site.sensor), f"{junction.name} {name}")
+        candidates[site] = height_m
+    return candidates
+
+
+def dealt(values: Sequence[T], count: int, rng: np.random.Generator) -> list[T]:
+    """Return ``count`` values, each equally often up to one, in random order."""
+    order = rng.permutation(len(values))
+    deck = [values[order[number % len(values)]] for number in range(count)]
+    return [deck[number] for number in rng.permutation(count)]
+
+
+def write_candidates(each: Mapping[str, Mapping[Site, float]], folder: Path = FOLDER) -> None:
+    """Write the candidates of all junctions as CSV."""
+    with (
+        files.atomic_write(folder / CANDIDATES_FILE) as partial,
+        partial.open("w", encoding="utf-8", newline="") as out,
+    ):
+        rows = csv.writer(out, lineterminator="\n")
+        rows.writerow(COLUMNS)
+        for junction, candidates in each.items():
+            for site, height_m in candidates.items():
+                pose = site.pose
+                rows.writerow(
+                    [junction, site.name, *map(repr, (*pose.position_m, height_m, *pose.angles_deg)), site.sensor]
+                )
+
+
+def read_candidates(folder: Path = FOLDER) -> dict[str, dict[Site, float]]:
+    """Return the candidates of each junction, with their heights above the ground in metres.
+
+    Raises
+    ------
+    InputError
+        If there is no such file.
+    """
+    path = folder / CANDIDATES_FILE
+    if not path.is_file():
+        raise InputError(path, "no such file", "Write it with: python -m benchmarks.across_junctions build --write")
+    each: dict[str, dict[Site, float]] = {}
+    with path.open(encoding="utf-8", newline="") as lines:
+        for row in csv.DictReader(lines):
+            numbers = (float(row[column]) for column in ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg"))
+            site = Site(row["site"], Pose(*numbers), row["sensor"], pole=row["site"])
+            each.setdefault(row["junction"], {})[site] = float(row["height_m"])
+    return each

@@ -1,0 +1,270 @@
+"""The protocol of the study: junctions, roles, candidates, sensors, detectors and frames, and its hash.
+
+``junctions.toml`` states everything that is chosen; ``candidates.csv`` lists the poses drawn from it, and
+``worlds.csv`` the hash of every scenario made from it. The hash of the protocol covers these three files and the sensor
+catalogue, so none of them can change unnoticed after it was written down.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import tomllib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from pydantic import Field, ValidationError, model_validator
+
+from egvs.core import files
+from egvs.core.errors import InputError
+from egvs.scenario.fields import StrictModel, find_duplicates
+from egvs.scenario.loading import format_validation_error
+from egvs.scenario.traffic_config import VehicleKind
+from egvs.sensors.sensor import CATALOGUE, catalogue_digest
+
+FOLDER = Path(__file__).resolve().parent
+JUNCTIONS_FILE, CANDIDATES_FILE, WORLDS_FILE = "junctions.toml", "candidates.csv", "worlds.csv"
+
+Role = Literal["training", "held out", "comparison"]
+ROLES: tuple[Role, ...] = ("training", "held out", "comparison")
+
+MIN_SITES_OF_A_HEIGHT = 15
+"""Sites of one height at a junction that a coefficient among them needs."""
+
+
+class Arm(StrictModel):
+    """A road of a junction of arms."""
+
+    bearing_deg: float = Field(ge=0, lt=360, description="Direction from the junction, counter-clockwise from east")
+    length_m: float = Field(ge=60, le=400)
+    lanes: int = Field(ge=1, le=4)
+    speed_m_s: float = Field(13.89, gt=0)
+
+
+class Terrain(StrictModel):
+    r"""A ground of plane waves: z = sum of a sin(2 pi (x cos b + y sin b) / l + phase), in metres.
+
+    Attributes
+    ----------
+    amplitude_m, wavelength_m, bearing_deg, phase_deg
+        One value per wave.
+    """
+
+    amplitude_m: tuple[float, ...]
+    wavelength_m: tuple[float, ...]
+    bearing_deg: tuple[float, ...]
+    phase_deg: tuple[float, ...]
+
+    def height_m(self, x_m: float, y_m: float) -> float:
+        """Return the height of the ground at a point of the network's frame."""
+        total = 0.0
+        for amplitude, wavelength, bearing, phase in zip(
+            self.amplitude_m, self.wavelength_m, self.bearing_deg, self.phase_deg, strict=True
+        ):
+            angle = math.radians(bearing)
+            along = x_m * math.cos(angle) + y_m * math.sin(angle)
+            total += amplitude * math.sin(2.0 * math.pi * along / wavelength + math.radians(phase))
+        return total
+
+
+class Furniture(StrictModel):
+    """Street furniture and buildings beside the roads, drawn at random (:mod:`furniture`)."""
+
+    poles: int = Field(0, ge=0, description="Posts of lamps and signs")
+    trees: int = Field(0, ge=0)
+    kiosks: int = Field(0, ge=0, description="Shelters, cabinets and parked trailers")
+    buildings: int = Field(0, ge=0)
+
+
+class MapFile(StrictModel):
+    """A file that the study needs and the project does not ship."""
+
+    name: str
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+
+
+class Junction(StrictModel):
+    """A junction of the study, and how its scenario is made.
+
+    Attributes
+    ----------
+    scenario
+        A shipped scenario; or one of ``netgenerate``, ``arms`` and ``map``.
+    netgenerate
+        Arguments of SUMO's netgenerate, without seed and output.
+    arms
+        Roads that meet in one junction.
+    map
+        Name of a road map that is not shipped, below the folder of maps; :attr:`further_maps` names its companions.
+    at
+        Latitude and longitude, or x and y, of the junction in its map; the largest with signals by default.
+    fleet
+        A name of the table ``fleets``; the scenario's own fleet by default.
+    traffic
+        Level, or vehicles per hour, of the assumed traffic.
+    tables
+        Tables and keys that are set in scenario.toml.
+    """
+
+    name: str = Field(pattern="^[a-z0-9_]+$")
+    role: Role
+    differs_in: str = Field(description="What it adds to the others")
+    source: str = ""
+    scenario: str = ""
+    netgenerate: tuple[str, ...] = ()
+    arms: tuple[Arm, ...] = ()
+    map: MapFile | None = None
+    pedestrian_tracks: MapFile | None = None
+    signals: MapFile | None = None
+    seed: int = 1
+    at: tuple[float, float] | None = None
+    lefthand: bool = False
+    walk: bool = False
+    traffic: str | int = "medium"
+    surroundings_m: float | None = None
+    fleet: str = ""
+    terrain: Terrain | None = None
+    furniture: Furniture | None = None
+    tables: dict[str, Any] = Field(default_factory=dict)
+    heights: int = Field(description="Which row of candidates.heights_m is used, from 0", ge=0)
+
+    @model_validator(mode="after")
+    def _check_origin(self) -> Self:
+        origins = [bool(self.scenario), bool(self.netgenerate), bool(self.arms), self.map is not None]
+        if sum(origins) != 1:
+            raise ValueError("expected one of scenario, netgenerate, arms and map")
+        return self
+
+    @property
+    def files(self) -> tuple[MapFile, ...]:
+        """Files that are not shipped."""
+        return tuple(entry for entry in (self.map, self.pedestrian_tracks, self.signals) if entry is not None)
+
+
+class CandidateRule(StrictModel):
+    """How candidates are drawn; see :mod:`candidates`.
+
+    Attributes
+    ----------
+    heights_m
+        Mounting heights above the ground; each junction uses one row, and each height equally often.
+    sensors
+        Each equally often, up to one.
+    """
+
+    count: int = Field(ge=1)
+    heights_m: tuple[tuple[float, ...], ...]
+    pitch_deg: tuple[float, float]
+    roll_deg: tuple[float, float]
+    sensors: tuple[str, ...]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if unknown := [name for name in self.sensors if name not in CATALOGUE]:
+            raise ValueError(f"expected sensors of the catalogue, got {unknown[0]!r}")
+        for row in self.heights_m:
+            if self.count // len(row) < MIN_SITES_OF_A_HEIGHT:
+                raise ValueError(f"expected at least {MIN_SITES_OF_A_HEIGHT} candidates of each height")
+        return self
+
+
+class Detectors(StrictModel):
+    """Detectors by role of the junction; those of training junctions may train the model of the score."""
+
+    training: tuple[str, ...]
+    held_out: tuple[str, ...]
+
+
+class Protocol(StrictModel):
+    """The contents of ``junctions.toml``."""
+
+    seed: int
+    frames: int = Field(ge=20, description="Of unseen traffic, the same for all candidates of a junction")
+    apart_s: float = Field(ge=7.0, description="Least time between two frames")
+    tpog_frames: int = Field(ge=100, description="Of the traffic behind the scores, where a scenario is made here")
+    candidates: CandidateRule
+    detectors: Detectors
+    fleets: dict[str, tuple[VehicleKind, ...]]
+    junctions: tuple[Junction, ...]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if duplicates := find_duplicates([junction.name for junction in self.junctions]):
+            raise ValueError(f"two junctions have the same name: {duplicates[0]}")
+        for junction in self.junctions:
+            if junction.fleet and junction.fleet not in self.fleets:
+                raise ValueError(f"junction {junction.name}: there is no fleet {junction.fleet!r}")
+            if junction.heights >= len(self.candidates.heights_m):
+                raise ValueError(f"junction {junction.name}: there is no row {junction.heights} of heights")
+        return self
+
+    def junction(self, name: str) -> Junction:
+        """Return a junction by its name.
+
+        Raises
+        ------
+        InputError
+            If there is none.
+        """
+        for junction in self.junctions:
+            if junction.name == name:
+                return junction
+        known = ", ".join(junction.name for junction in self.junctions)
+        raise InputError("--junction", f"expected a junction of the study, got {name!r}", f"Use some of {known}.")
+
+    def detectors_of(self, junction: Junction) -> tuple[str, ...]:
+        """Return the detectors that are run at a junction."""
+        return self.detectors.training if junction.role == "training" else self.detectors.held_out
+
+
+def read_protocol(file: Path = FOLDER / JUNCTIONS_FILE) -> Protocol:
+    """Read and check the protocol.
+
+    Raises
+    ------
+    InputError
+        For an unknown key, or a value that is out of its limits.
+    """
+    try:
+        values = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (OSError, tomllib.TOMLDecodeError) as error:
+        raise InputError(file, f"expected a TOML file, got an error: {error}", "Restore the file.") from None
+    try:
+        return Protocol.from_dict(values)
+    except ValidationError as error:
+        raise format_validation_error(error, file.name, Protocol) from None
+
+
+@dataclass(frozen=True)
+class ProtocolFiles:
+    """The files of the protocol, and their hashes."""
+
+    folder: Path = FOLDER
+
+    @cached_property
+    def digests(self) -> dict[str, str]:
+        """SHA-256 of each file by name, and of the sensors of the catalogue.
+
+        Raises
+        ------
+        InputError
+            If a file is missing.
+        """
+        digests = {}
+        for name in (JUNCTIONS_FILE, CANDIDATES_FILE, WORLDS_FILE):
+            path = self.folder / name
+            if not path.is_file():
+                raise InputError(
+                    path, "no such file", "Write it with: python -m benchmarks.across_junctions build --write"
+                )
+            digests[name] = hashlib.sha256(path.read_bytes().replace(b"\r\n", b"\n")).hexdigest()
+        sensors = read_protocol(self.folder / JUNCTIONS_FILE).candidates.sensors
+        digests["sensors"] = files.hash_json({name: catalogue_digest(name) for name in sensors})
+        return digests
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the whole protocol."""
+        return files.hash_json(self.digests)

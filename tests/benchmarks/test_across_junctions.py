@@ -1,0 +1,520 @@
+"""The larger study: protocol and its hash, candidates, statistics and tables on made-up records, and the command."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from benchmarks.across_junctions import __main__ as command
+from benchmarks.across_junctions import (
+    build,
+    candidates,
+    costs,
+    furniture,
+    measurement,
+    records,
+    statistics,
+    tables,
+    worlds,
+)
+from benchmarks.across_junctions.protocol import (
+    JUNCTIONS_FILE,
+    MIN_SITES_OF_A_HEIGHT,
+    Furniture,
+    MapFile,
+    ProtocolFiles,
+    Terrain,
+    read_protocol,
+)
+from benchmarks.across_junctions.records import AP, MEASURES, PartInfo, write_table
+from benchmarks.across_junctions.statistics import DetectedJunction, Estimate
+from benchmarks.validity.junctions import SCENARIOS
+
+from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.core.errors import InputError
+from egvs.scenario.loading import load
+from egvs.sensors.sensor import CATALOGUE
+from egvs.sensors.sites import Pose, Site
+from egvs.traffic import sumo_folder
+from egvs.validation import surrogates
+from egvs.validation.correlation import MeasureValues
+from egvs.world.carriageway import Carriageway
+from tests.conftest import write_mini
+
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+
+
+# ---- protocol
+
+
+def test_the_protocol_has_enough_junctions_and_none_of_them_twice() -> None:
+    protocol = read_protocol()
+    by_role = {role: [j for j in protocol.junctions if j.role == role] for role in ("training", "held out")}
+    assert len(by_role["training"]) >= 12
+    assert len(by_role["held out"]) >= 6
+    maps = {role: {entry.sha256 for j in junctions for entry in j.files} for role, junctions in by_role.items()}
+    assert not maps["training"] & maps["held out"]
+    generators = {
+        role: {j.netgenerate[0] for j in junctions if j.netgenerate} | {"arms" for j in junctions if j.arms}
+        for role, junctions in by_role.items()
+    }
+    assert not generators["training"] & generators["held out"]
+    assert set(protocol.candidates.sensors) == set(CATALOGUE)
+    assert not set(protocol.detectors.held_out) <= set(protocol.detectors.training)
+
+
+def test_the_protocol_has_the_hash_that_was_written_down() -> None:
+    text = (DOCS / "validity.md").read_text(encoding="utf-8")
+    (frozen,) = re.findall(r"SHA-256 of the protocol[^`]*`([0-9a-f]{64})`", text)
+    assert ProtocolFiles().digest == frozen
+
+
+def test_every_junction_has_its_candidates_and_its_scenario() -> None:
+    protocol, drawn = read_protocol(), candidates.read_candidates()
+    names = [junction.name for junction in protocol.junctions]
+    assert list(drawn) == names
+    assert list(build.read_worlds()) == names
+    for junction in protocol.junctions:
+        sites = drawn[junction.name]
+        heights = list(sites.values())
+        assert len(sites) == protocol.candidates.count
+        assert len({site.pose.position_m[:2] for site in sites}) == len(sites)
+        for height_m in protocol.candidates.heights_m[junction.heights]:
+            assert heights.count(height_m) >= MIN_SITES_OF_A_HEIGHT
+        for site in sites:
+            assert -25.0 <= site.pose.pitch_deg <= 0.0
+            assert abs(site.pose.roll_deg) <= 3.0
+        sensors = [site.sensor for site in sites]
+        assert {sensors.count(name) for name in CATALOGUE} == {4}
+
+
+def test_candidates_stand_at_their_height_where_the_ground_is_flat() -> None:
+    for site, height_m in candidates.read_candidates()["grid_left"].items():
+        assert site.pose.z_m == height_m
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("frames = 120 ", "frames = 5 ", "junctions.toml: frames:"),
+        ("seed = 3701", "seed = 3701\nspeed = 1", "junctions.toml: speed: unknown key"),
+        ('role = "held out"', 'role = "kept"', "role:"),
+        ('scenario = "hill"', 'scenario = "hill"\nnetgenerate = ["--grid"]', "expected one of scenario, netgenerate"),
+        ('"VLP-16", ', '"VLP-17", ', "expected sensors of the catalogue, got 'VLP-17'"),
+    ],
+)
+def test_a_wrong_protocol_is_one_message(tmp_path: Path, old: str, new: str, message: str) -> None:
+    text = (ProtocolFiles().folder / JUNCTIONS_FILE).read_text(encoding="utf-8")
+    assert old in text
+    (tmp_path / JUNCTIONS_FILE).write_text(text.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        read_protocol(tmp_path / JUNCTIONS_FILE)
+    assert message in str(caught.value)
+
+
+def test_values_are_dealt_equally_often() -> None:
+    dealt = candidates.dealt(("a", "b", "c"), 48, np.random.default_rng(1))
+    assert [dealt.count(value) for value in "abc"] == [16, 16, 16]
+    assert dealt != sorted(dealt)
+    some = candidates.dealt(("a", "b", "c"), 8, np.random.default_rng(2))
+    assert sorted(some.count(value) for value in "abc") == [2, 3, 3]
+
+
+def test_terrain_by_hand() -> None:
+    terrain = Terrain(
+        amplitude_m=(4.0, 1.0), wavelength_m=(100.0, 40.0), bearing_deg=(0.0, 90.0), phase_deg=(0.0, 90.0)
+    )
+    assert terrain.height_m(25.0, 0.0) == pytest.approx(4.0 + 1.0)
+    assert terrain.height_m(75.0, 20.0) == pytest.approx(-4.0 - 1.0)
+
+
+def test_a_map_is_found_by_name_and_hash(tmp_path: Path) -> None:
+    (tmp_path / "map.osm").write_bytes(b"roads")
+    digest = "0ca5ab3a34d3cde2f4d63b8f1fd5d1a3d4e7ce1f0b3b6ae2a7a8a4ac9c5cbd3e"
+    with pytest.raises(worlds.MissingMapError, match="expected the SHA-256"):
+        worlds.find_map(MapFile(name="map.osm", sha256=digest), tmp_path)
+    with pytest.raises(worlds.MissingMapError, match=r"there is no file other\.osm"):
+        worlds.find_map(MapFile(name="other.osm", sha256=digest), tmp_path)
+    with pytest.raises(worlds.MissingMapError, match=r"map\.osm is needed"):
+        worlds.find_map(MapFile(name="map.osm", sha256=digest), None)
+
+
+def test_furniture_stands_beside_the_roads_and_apart() -> None:
+    scenario = load(SCENARIOS / "roundabout")
+    roads = sumo_folder.read_network(scenario)
+    assert roads is not None
+    config = Furniture(poles=6, trees=3, kiosks=2, buildings=2)
+    drawn = furniture.draw(config, roads, scenario.roi, (1, 2))
+    assert drawn == furniture.draw(config, roads, scenario.roi, (1, 2))
+    assert drawn != furniture.draw(config, roads, scenario.roi, (1, 3))
+    kinds = [feature["properties"]["kind"] for feature in drawn["features"]]
+    assert {kind: kinds.count(kind) for kind in kinds} == {
+        "building": 2, "kiosk": 2, "tree_trunk": 3, "tree_crown": 3, "pole": 6,
+    }  # fmt: skip
+    carriageway = shapely.union_all(Carriageway.of(roads).areas)
+    for feature in drawn["features"]:
+        if feature["properties"]["kind"] != "tree_crown":
+            shape = shapely.geometry.shape(feature["geometry"]).buffer(feature["properties"].get("radius_m", 0.0))
+            assert carriageway.distance(shape) > 0.5
+
+
+def test_vehicles_are_dense_up_to_the_gap() -> None:
+    boxes = np.array([[0.0, 0.0, 1.0, 4.0, 2.0, 1.5, 0.0], [5.5, 0.0, 1.0, 4.0, 2.0, 1.5, 0.0],
+                      [20.0, 0.0, 1.0, 4.0, 2.0, 1.5, 0.0], [24.1, 0.0, 1.0, 4.0, 2.0, 1.5, 0.0]])  # fmt: skip
+    frame = TrafficFrame(0, ("a", "b", "c", "c"), ("passenger",) * 4, boxes, np.zeros(4))
+    # a and b: 5.5 - 4 = 1.5 m apart; the two boxes named c are parts of one vehicle
+    assert build.is_dense(frame, np.array([0, 1, 2])).tolist() == [True, True, False]
+    assert build.is_dense(frame, np.array([], dtype=np.int64)).tolist() == []
+
+
+def test_the_hash_of_a_scenario_is_that_of_its_contents(tmp_path: Path) -> None:
+    folder = tmp_path / "roundabout"
+    shutil.copytree(SCENARIOS / "roundabout", folder)
+    digest = build.world_digest(folder)
+    assert digest == build.world_digest(SCENARIOS / "roundabout") == build.read_worlds()["roundabout"]
+    with (folder / "scenario.toml").open("a", encoding="utf-8") as text:
+        text.write("# a comment\n")
+    assert build.world_digest(folder) == digest
+    statics = folder / "statics.geojson"
+    text = statics.read_text(encoding="utf-8").replace('"height_m": 16', '"height_m": 17', 1)
+    statics.write_text(text, encoding="utf-8")
+    assert build.world_digest(folder) != digest
+
+
+# ---- statistics, by hand
+
+
+def rows(*values: float) -> np.ndarray:
+    return np.array([values], dtype=np.float64)
+
+
+def test_rho_by_hand() -> None:
+    # ranks 1 2 3 4 and 1 3 2 4: 1 - 6 * 2 / (4 * 15)
+    assert statistics.rho(rows(1, 2, 3, 4), rows(10, 30, 20, 40))[0] == pytest.approx(0.8)
+
+
+def test_regret_by_hand() -> None:
+    ap = rows(0.5, 0.7, 0.6)
+    assert statistics.regret(rows(1, 3, 2), ap)[0] == 0.0
+    assert statistics.regret(rows(1, 2, 3), ap)[0] == pytest.approx(10.0)
+    assert statistics.regret(rows(3, 2, 3), ap)[0] == pytest.approx(15.0)  # the mean of 20 and 10
+
+
+def test_the_first_three_by_hand() -> None:
+    ap = rows(0.1, 0.2, 0.9, 0.3, 0.4)
+    assert statistics.in_first(rows(1, 2, 3, 4, 5), ap)[0] == 1.0
+    assert statistics.in_first(rows(1, 2, 0, 4, 5), ap)[0] == 0.0
+    # two are higher, and three share the third score: a chance of 1 in 3
+    assert statistics.in_first(rows(1, 1, 1, 4, 5), ap)[0] == pytest.approx(1 / 3)
+
+
+def test_spearman_brown_by_hand() -> None:
+    assert statistics.spearman_brown(np.array([0.5]))[0] == pytest.approx(2 / 3)
+    assert statistics.spearman_brown(np.array([1.0]))[0] == 1.0
+
+
+def detected(
+    ap: np.ndarray, score: np.ndarray, *, halves: np.ndarray | None = None, noise: np.ndarray | None = None,
+    heights: np.ndarray | None = None, name: str = "j", resamples: int = 200,
+) -> DetectedJunction:  # fmt: skip
+    """Return a junction; without noise every block gives the same AP."""
+    n = len(ap)
+    left_out = np.repeat(ap[:, None], 10, axis=1) if noise is None else noise
+    return DetectedJunction(
+        name, MeasureValues(ap, left_out), np.column_stack([ap, ap]) if halves is None else halves, {"s": score},
+        np.full(n, 2.0) if heights is None else heights, np.full(n, "VLP-16"), resamples,
+    )  # fmt: skip
+
+
+def test_reliability_and_ceiling_by_hand() -> None:
+    ap = np.array([0.1, 0.2, 0.3, 0.4])
+    halves = np.column_stack([[1.0, 2.0, 3.0, 4.0], [1.0, 3.0, 2.0, 4.0]])  # rho 0.8
+    junction = detected(ap, ap, halves=halves)
+    assert junction.reliability() == pytest.approx(1.6 / 1.8)
+    assert junction.ceiling() == pytest.approx(np.sqrt(1.6 / 1.8))
+    opposite = detected(ap, ap, halves=np.column_stack([ap, -ap]))
+    assert np.isnan(opposite.reliability())
+
+
+def test_rho_within_groups_by_hand() -> None:
+    # within each height the order is right in one and wrong in the other; five and ten candidates
+    ap = np.arange(15.0) / 100
+    score = np.concatenate([-np.arange(5.0), 100.0 + np.arange(10.0)])
+    heights = np.array([2.0] * 5 + [4.0] * 10)
+    junction = detected(ap, score, heights=heights)
+    each = junction.by_group("s", heights, 5)
+    assert {name: estimate.value for name, estimate in each.items()} == pytest.approx({"2": -1.0, "4": 1.0})
+    assert junction.in_groups("s", heights, 5).value == pytest.approx((5 * -1.0 + 10 * 1.0) / 15)
+    assert junction.in_groups("s", heights, 6).value == pytest.approx(1.0)
+    assert np.isnan(junction.in_groups("s", heights, 11).value)
+
+
+def test_groups_that_are_undefined_in_a_resample_are_left_out_of_it() -> None:
+    mean = statistics._weighted_mean(np.array([[1.0, np.nan], [0.0, 0.5]]), np.array([3.0, 1.0]))
+    assert mean.tolist() == [0.75, 0.5]
+
+
+def test_junctions_are_resampled() -> None:
+    each = {name: Estimate(value, np.full(1000, value), 9) for name, value in zip("abc", (1.0, 0.0, 0.0), strict=True)}
+    mean = statistics.over_junctions(each)
+    assert mean.value == pytest.approx(1 / 3)
+    # a is drawn 0, 1, 2 or 3 times of 3
+    values, counts = np.unique(np.round(mean.resampled, 3), return_counts=True)
+    assert values.tolist() == [0.0, 0.333, 0.667, 1.0]
+    assert (counts / 1000).tolist() == pytest.approx([8 / 27, 12 / 27, 6 / 27, 1 / 27], abs=0.05)
+    assert statistics.over_junctions(each, statistics.median_of).value == 0.0
+    two = statistics.over_junctions({"a": each["a"], "b": each["b"]})
+    assert (two.value, len(two.resampled)) == (0.5, 0)
+    undefined = statistics.over_junctions({"c": Estimate(float("nan"), np.empty(0), 0)})
+    assert np.isnan(undefined.value)
+
+
+def test_noise_that_lowers_every_resample_does_not_move_the_middle() -> None:
+    lowered = {name: Estimate(0.8, np.linspace(0.5, 0.7, 1001), 9) for name in "abcd"}
+    assert np.median(statistics.over_junctions(lowered).resampled) == pytest.approx(0.8, abs=0.01)
+
+
+def synthetic(rng: np.random.Generator, name: str, junction_spread: float) -> DetectedJunction:
+    """Return a junction whose score follows the true AP with noise that differs from junction to junction."""
+    n, blocks = 40, 10
+    true = rng.normal(size=n)
+    score = true + rng.normal(size=n) * np.exp(junction_spread * rng.normal()) * 0.5
+    of_block = true[:, None] + rng.normal(size=(n, blocks)) * 0.9
+    ap = of_block.mean(axis=1)
+    left_out = (blocks * ap[:, None] - of_block) / (blocks - 1)
+    return detected(ap, score, noise=left_out, name=name, resamples=200)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("spread", "least", "most"), [(0.0, 0.92, 1.0), (1.2, 0.80, 0.97)])
+def test_intervals_over_junctions_contain_the_truth(spread: float, least: float, most: float) -> None:
+    """Six junctions that are alike, or differ much; 100 studies. The truth is the mean of 2,000 other junctions."""
+    rng = np.random.default_rng(7)
+    others = [synthetic(rng, "other", spread) for _ in range(2000)]
+    truth = np.mean([statistics.rho(o.scores["s"][None, :], o.ap.values[None, :])[0] for o in others])
+    inside = []
+    for study in range(100):
+        each = {}
+        for number in range(6):
+            name = f"s{study}j{number}"
+            each[name] = synthetic(rng, name, spread).estimate("s", statistics.rho)
+        interval = statistics.over_junctions(each).interval
+        inside.append(interval.low <= truth <= interval.high)
+    print(f"coverage with a spread of {spread}: {np.mean(inside):.2f}")
+    assert least <= np.mean(inside) <= most
+
+
+# ---- records and tables
+
+
+MACHINE = {"processor": "p", "cores": 2}
+
+
+def write_junction(
+    folder: Path,
+    name: str,
+    role: str,
+    ap: np.ndarray,
+    score: np.ndarray,
+    height_m: np.ndarray,
+    detector: str = "cluster",
+) -> None:
+    """Write records without noise: every block and half has the same AP."""
+    sites = [f"c{i}" for i in range(len(ap))]
+    write_table(folder / f"{name}.candidates.parquet", {
+        "site": sites, "sensor": ["VLP-16"] * len(ap), "height_m": height_m.tolist(),
+    })  # fmt: skip
+    names = ["expected_detections", "points_on_target", tables.EGVS_2, tables.EGVS_10, "mean_points", "less_is_better"]
+    write_table(folder / f"{name}.scores.parquet", {
+        "site": sites * len(names),
+        "score": np.repeat(names, len(ap)).tolist(),
+        "sign": np.repeat([1, 1, 1, 1, 1, -1], len(ap)).tolist(),
+        "value": np.tile(score, len(names)).tolist(),
+    })  # fmt: skip
+    values = np.tile(ap, len(MEASURES))
+    write_table(folder / f"{name}.{detector}.parquet", {
+        "site": sites * len(MEASURES), "measure": np.repeat(MEASURES, len(ap)).tolist(), "value": values.tolist(),
+        "se": [0.0] * len(values), "left_out": [np.full(10, value) for value in values],
+        "half_1": values.tolist(), "half_2": values.tolist(),
+    })  # fmt: skip
+    for part in ("scores", detector):
+        PartInfo(name, role, part, "k", "s", "p", 120, 7.0, 50, 900, len(ap), {"TPOG": 1, "unseen": 2}, False, 60.0,
+                 50.0, 2.0 if part == detector else 0.0, MACHINE).write(folder)  # fmt: skip
+
+
+@pytest.fixture
+def made_up(tmp_path: Path) -> Path:
+    """Two heights of 16 candidates each. In h, the score has the right order within each height only."""
+    folder = tmp_path / "records"
+    folder.mkdir()
+    height_m = np.repeat([2.0, 5.0], 16)
+    ap = np.concatenate([np.arange(17, 33), np.arange(1, 17)]) / 100
+    score = np.arange(1.0, 33.0)
+    write_junction(folder, "t", "training", ap, ap, height_m)
+    write_junction(folder, "h", "held out", ap, score, height_m)
+    return folder
+
+
+def test_tables_by_hand(made_up: Path, tmp_path: Path) -> None:
+    printed = tables.write_tables(made_up, tmp_path / "out", resamples=200)
+    assert printed[0].startswith("2 junctions, detectors cluster; 4 parts, 0.07 hours on p, 2 cores")
+    _, made = tables.tables.read(tmp_path / "out")
+    by_name = {table.name: table for table in made}
+    rows_of = {(row[0], row[4]): row for row in by_name["2 by junction"].rows}
+    right, wrong = rows_of["t", "expected_detections"], rows_of["h", "expected_detections"]
+    assert right[5][0] == right[6][0] == 1.0
+    # all 32 ranks differ by 16: 1 - 6 * 32 * 256 / (32 * 1023)
+    assert wrong[5][0] == pytest.approx(1 - 6 * 256 / 1023, abs=1e-4)
+    assert wrong[6][0] == 1.0
+    assert wrong[8][0] == pytest.approx(16.0)  # 0.32 is the best, 0.16 is taken
+    assert (right[9], wrong[9]) == (1.0, 0.0)
+    # lower was better at the training junction, so height alone has the order of the two heights: ties within each
+    height = rows_of["h", "height"]
+    assert height[5][0] == pytest.approx(np.sqrt(0.75 * 1024 / 1023), abs=1e-3)
+    assert height[8][0] == pytest.approx(7.5)  # 0.32 minus the mean of 0.17 to 0.32
+    (measured,) = [row for row in by_name["1 measured"].rows if row[0] == "h"]
+    assert measured[8:] == [1.0, 16.5, 32.0, 0.0, 1.0, 1.0]
+    aims = {(row[0], row[4]): row[5:] for row in by_name["7 aims"].rows}
+    assert aims["h", "rho"][1:] == [0.93, "no"]
+    assert aims["h", "rho at 2 m"] == [1.0, 0.85, "yes"]
+    assert aims["1 junctions", "regret, worst"] == [16.0, 8.0, "no"]
+    everything = {(row[0], row[2]): row[4] for row in by_name["6 all scores"].rows}
+    assert everything["training", "less_is_better"] == -1.0
+
+
+def test_tables_are_the_same_each_time(made_up: Path, tmp_path: Path) -> None:
+    tables.write_tables(made_up, tmp_path / "one", resamples=100)
+    tables.write_tables(made_up, tmp_path / "two", resamples=100)
+    for path in sorted((tmp_path / "one").iterdir()):
+        assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
+
+
+def test_tables_name_a_trial_and_several_sources(made_up: Path, tmp_path: Path) -> None:
+    info = PartInfo.read(made_up / "h.cluster.json")
+    PartInfo(**{**vars(info), "source": "other", "is_trial": True}).write(made_up)
+    printed = " ".join(tables.write_tables(made_up, tmp_path / "out", resamples=100))
+    assert "No result" in printed
+    assert "Parts cluster were measured with 2 versions of the source" in printed
+
+
+def test_a_record_that_is_damaged_is_one_message(made_up: Path, tmp_path: Path) -> None:
+    (made_up / "h.cluster.parquet").write_bytes(b"PAR1")
+    with pytest.raises(InputError, match=r"h\.cluster\.parquet"):
+        tables.write_tables(made_up, tmp_path / "out")
+    (made_up / "h.cluster.json").write_text("{}", encoding="utf-8")
+    with pytest.raises(InputError, match=r"h\.cluster\.json"):
+        tables.write_tables(made_up, tmp_path / "out")
+    with pytest.raises(InputError, match="expected records, got none"):
+        tables.write_tables(tmp_path / "nowhere", tmp_path / "out")
+
+
+def test_undefined_values_survive_a_file(tmp_path: Path) -> None:
+    write_junction(tmp_path, "n", "training", np.array([0.1, np.nan, 0.3]), np.ones(3), np.ones(3))
+    record = records.read_junction(tmp_path, "n")
+    assert np.isnan(record.detections["cluster"][AP].values).tolist() == [False, True, False]
+    assert record.detections["cluster"][AP].left_out.shape == (3, 10)
+    assert record.scores["less_is_better"].tolist() == [-1.0] * 3
+
+
+def test_halves_of_the_frames_are_alternate_blocks() -> None:
+    first, second = measurement.half_frames(20)
+    assert first == [0, 1, 4, 5, 8, 9, 12, 13, 16, 17]
+    assert second == [2, 3, 6, 7, 10, 11, 14, 15, 18, 19]
+
+
+def test_hours_by_hand() -> None:
+    protocol = read_protocol()
+    count = protocol.candidates.count
+    info = PartInfo("j", "training", "cluster", "", "", "", 20, 7.0, 1, 1, 8, {}, True, 9.0, 8.0, 0.5, MACHINE)
+    seconds = costs.estimated_s([info], protocol)
+    assert seconds == {"cluster": pytest.approx(0.5 * count * protocol.frames / 20 + costs.START_S)}
+    text = costs.estimate([info], protocol)
+    hours = seconds["cluster"] * len(protocol.junctions) / 3600 / 2
+    assert f"about {hours:.1f} hours" in text
+    assert "without pointpillars" in text
+
+
+# ---- the command
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["measure", "--junction", "nowhere"], "--junction: expected a junction of the study, got 'nowhere'"),
+        (["measure", "--junction", "town01"], "--junction: town01 is held out, and can be measured only once"),
+        (
+            ["measure", "--junction", "town01", "--held-out", "--frames", "20"],
+            "a trial at town01 would spend a junction",
+        ),
+        (["measure", "--junction", "nishishinjuku", "--candidates", "4"], "a trial at nishishinjuku would spend"),
+        (["measure", "--junction", "hill", "--frames", "10"], "--frames, --candidates: expected 20 to"),
+        (["measure", "--junction", "hill", "--part", "eyes"], "--part: unknown detector 'eyes'"),
+    ],
+)
+def test_what_must_not_be_measured_is_refused(
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command.main([*arguments, "--data", str(tmp_path / "study")]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "study").exists()
+
+
+def test_list_prints_the_hash(capsys: pytest.CaptureFixture[str]) -> None:
+    assert command.main(["list"]) == 0
+    printed = capsys.readouterr().out
+    assert f"SHA-256 of the protocol: {ProtocolFiles().digest}" in printed
+    assert "held out" in printed
+
+
+# ---- measuring
+
+
+@pytest.mark.slow
+def test_a_part_is_measured_once_and_the_same_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(measurement, "check_unseen", lambda scenario: None)  # its traffic is a finished file
+    protocol = read_protocol().model_copy(update={"apart_s": 1.0})
+    junction = protocol.junction("hill")
+    sites = {
+        Site("a", Pose(0.0, -7.0, 3.0), "small", pole="a"): 3.0,
+        Site("b", Pose(8.0, 7.0, 4.0), "small", pole="b"): 4.0,
+    }
+    scenario = write_mini(tmp_path / "mini")
+    texts: list[str] = []
+    few = [entry for entry in surrogates.score_catalogue() if entry.name == "points_on_target"]
+    monkeypatch.setattr(surrogates, "score_catalogue", lambda: few)
+
+    def measured(part: str, folder: str) -> PartInfo:
+        plan = measurement.PartPlan(
+            protocol, "hash", junction, part, scenario, sites, measurement.Extent(20, 2), tmp_path / folder
+        )
+        return measurement.measure(plan, jobs=1, report=texts.append)
+
+    infos = [measured(part, "one") for part in ("vehicles", "cluster", "scores")]
+    assert all(info.is_trial and info.frames == 20 and info.candidates == 2 for info in infos)
+    assert texts == []
+    assert measured("cluster", "one") == infos[1]
+    assert texts == ["hill cluster: measured before"]
+    for part in ("vehicles", "cluster", "scores"):
+        assert measured(part, "two").key == next(info.key for info in infos if info.part == part)
+    for path in (tmp_path / "one").glob("*.parquet"):
+        assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
+
+    record = records.read_junction(tmp_path / "one", "hill")
+    assert record.sites == ("a", "b")
+    assert record.height_m.tolist() == [3.0, 4.0]
+    assert set(record.detections["cluster"]) == set(MEASURES)
+    vehicles = records.read_table(tmp_path / "one" / "hill.vehicles.parquet")
+    features = records.read_table(tmp_path / "one" / "hill.features.parquet").to_pydict()
+    hits = records.read_table(tmp_path / "one" / "hill.cluster.hits.parquet").to_pydict()
+    assert len(vehicles) == infos[0].vehicle_frames
+    assert features["site"] == hits["site"] == ["a"] * len(vehicles) + ["b"] * len(vehicles)
+    assert features["row"] == hits["row"]
+    assert set(hits["hits"]) <= {0.0, 0.5, 1.0}
+    mean_points = np.array(features["points"]).reshape(2, -1).mean(axis=1)
+    assert (mean_points > 0).all()
+    # the traffic is a finished file, so the traffic behind the scores has the same vehicles
+    assert record.scores[measurement.MEAN_POINTS] == pytest.approx(mean_points, rel=0.5)
