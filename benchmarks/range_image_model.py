@@ -169,7 +169,7 @@ def simulate_examples(name: str, sensors: Sequence[str], poses: int, frames: int
         record = prepare_held_out_traffic(reseeded, Path(work), FRAMES, apart_s=SPACING_S, jobs=1)
         junction = TrainingJunction(record, HEIGHTS_M)
         for sensor in sensors:
-            parts = []
+            parts: list[Examples] = []
             for pose in range(poses):
                 stream = (seed, JUNCTIONS.index(name), list(CATALOGUE).index(sensor), pose)
                 rng = np.random.default_rng(np.random.SeedSequence(stream))
@@ -196,7 +196,7 @@ def _pose_examples(
         frame = junction.frames[row]
         cloud = simulator.sweep(frame, rng)
         segments = site.segments(cloud.sweep)
-        labels = label_segments(segments, cloud.owner, frame, site)
+        labels = label_segments(segments, cloud.owner.astype(np.int64), frame, site)
         yield Examples(segments.features, segments.axes, segments.ends_m, *labels, np.full(len(segments), half))
 
 
