@@ -18,7 +18,16 @@ from pathlib import Path
 
 from benchmarks.across_junctions import build, candidates, costs, tables
 from benchmarks.across_junctions.measurement import Extent, PartPlan, measure
-from benchmarks.across_junctions.protocol import ROLES, Junction, Protocol, ProtocolFiles, read_protocol
+from benchmarks.across_junctions.protocol import (
+    CANDIDATES_FILE,
+    FOLDER,
+    ROLES,
+    WORLDS_FILE,
+    Junction,
+    Protocol,
+    ProtocolFiles,
+    read_protocol,
+)
 from benchmarks.across_junctions.records import NOT_DETECTORS, SCORES, VEHICLES
 from benchmarks.across_junctions.worlds import MissingMapError, make_world
 from egvs.core.errors import EgvsError, InputError, MissingBackendError
@@ -111,8 +120,8 @@ def _build(arguments: argparse.Namespace) -> int:
 
 def _write(protocol: Protocol, built: Sequence[build.BuiltJunction]) -> None:
     """Replace the rows of the built junctions in the files of the protocol; rows of others stay."""
-    drawn = candidates.read_candidates() if (candidates.FOLDER / candidates.CANDIDATES_FILE).is_file() else {}
-    digests = build.read_worlds() if (build.FOLDER / build.WORLDS_FILE).is_file() else {}
+    drawn = candidates.read_candidates() if (FOLDER / CANDIDATES_FILE).is_file() else {}
+    digests = build.read_worlds() if (FOLDER / WORLDS_FILE).is_file() else {}
     for entry in built:
         drawn[entry.junction.name] = dict(entry.candidates or {})
         digests[entry.junction.name] = entry.digest

@@ -222,12 +222,11 @@ def _measure_scores(
 ) -> tuple[str, ...]:
     """Write all installed scores, and the mean number of points; return what could not be computed."""
     scored = surrogates.compute_surrogates(scenario, work, jobs=jobs, progress=progress)
-    rows = [(row.site, str(ScoreName(row.score, row.parameters_json)), row.sign, row.value) for row in scored.rows]
-    names = ("site", "score", "sign", "value")
-    columns = {name: [row[number] for row in rows] for number, name in enumerate(names)}
-    for site, points in _mean_points(scenario, work, jobs).items():
-        for name, value in zip(names, (site, MEAN_POINTS, 1, points), strict=True):
-            columns[name].append(value)
+    rows: list[tuple[str, str, int, float]] = [
+        (row.site, str(ScoreName(row.score, row.parameters_json)), row.sign, row.value) for row in scored.rows
+    ]
+    rows += [(site, MEAN_POINTS, 1, points) for site, points in _mean_points(scenario, work, jobs).items()]
+    columns = {name: [row[number] for row in rows] for number, name in enumerate(("site", "score", "sign", "value"))}
     write_table(_path(plan, SCORES), columns)
     costs = files.to_json_text(scored.costs_ms(), indent=1)
     files.write_text(plan.folder / f"{plan.junction.name}.costs_ms", costs + "\n")
@@ -336,8 +335,9 @@ def measures_of(held_out: HeldOutTraffic, points: DetectorResult, boxes: Detecte
     for half in half_frames(len(objects)):
         frames = EvaluationFrames.from_frames([objects[i] for i in half], [boxes.frames[i] for i in half])
         halves.append(evaluate(frames).measures)
+    first, second = halves
     return {
-        name: (whole[name].value, whole[name].se, whole[name].left_out, *(half[name].value for half in halves))
+        name: (whole[name].value, whole[name].se, whole[name].left_out, first[name].value, second[name].value)
         for name in MEASURES
     }
 

@@ -67,7 +67,7 @@ def write_tables(records_folder: Path, out: Path, resamples: int = RESAMPLES) ->
     if not names:
         raise InputError(records_folder, "expected records, got none", "Measure first: across_junctions measure.")
     records = [read_junction(records_folder, name) for name in names]
-    records.sort(key=lambda record: (ROLES.index(record.role), record.name))  # type: ignore[arg-type]
+    records.sort(key=lambda record: (ROLES.index(record.role), record.name))
     study = Study(records, resamples)
     made = list(study.tables())
     preface = study.preface()
@@ -99,7 +99,7 @@ class Study:
 
     def _height_sign(self) -> dict[str, float]:
         """Return for each detector whether higher candidates are better, 1 or -1, at the training junctions."""
-        signs = {}
+        signs: dict[str, float] = {}
         for detector in self.detectors:
             each = [
                 rho(record.height_m[None, :], record.detections[detector][AP].values[None, :])[0]

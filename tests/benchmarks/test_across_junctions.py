@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,6 +33,7 @@ from benchmarks.across_junctions.protocol import (
 )
 from benchmarks.across_junctions.records import AP, MEASURES, PartInfo, write_table
 from benchmarks.across_junctions.statistics import DetectedJunction, Estimate
+from benchmarks.validity import tables as table_files
 from benchmarks.validity.junctions import SCENARIOS
 
 from egvs.artefacts.traffic_frames import TrafficFrame
@@ -176,8 +178,8 @@ def test_the_hash_of_a_scenario_is_that_of_its_contents(tmp_path: Path) -> None:
     shutil.copytree(SCENARIOS / "roundabout", folder)
     digest = build.world_digest(folder)
     assert digest == build.world_digest(SCENARIOS / "roundabout") == build.read_worlds()["roundabout"]
-    with (folder / "scenario.toml").open("a", encoding="utf-8") as text:
-        text.write("# a comment\n")
+    with (folder / "scenario.toml").open("a", encoding="utf-8") as file:
+        file.write("# a comment\n")
     assert build.world_digest(folder) == digest
     statics = folder / "statics.geojson"
     text = statics.read_text(encoding="utf-8").replace('"height_m": 16', '"height_m": 17', 1)
@@ -362,9 +364,9 @@ def made_up(tmp_path: Path) -> Path:
 def test_tables_by_hand(made_up: Path, tmp_path: Path) -> None:
     printed = tables.write_tables(made_up, tmp_path / "out", resamples=200)
     assert printed[0].startswith("2 junctions, detectors cluster; 4 parts, 0.07 hours on p, 2 cores")
-    _, made = tables.tables.read(tmp_path / "out")
+    _, made = table_files.read(tmp_path / "out")
     by_name = {table.name: table for table in made}
-    rows_of = {(row[0], row[4]): row for row in by_name["2 by junction"].rows}
+    rows_of: dict[tuple[Any, Any], list[Any]] = {(row[0], row[4]): row for row in by_name["2 by junction"].rows}
     right, wrong = rows_of["t", "expected_detections"], rows_of["h", "expected_detections"]
     assert right[5][0] == right[6][0] == 1.0
     # all 32 ranks differ by 16: 1 - 6 * 32 * 256 / (32 * 1023)

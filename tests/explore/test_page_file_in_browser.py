@@ -14,6 +14,7 @@ from tests.conftest import write_mini
 
 pytest.importorskip("viser", reason="the page needs viser: pip install 'egvs[explore]'")
 
+from egvs.explore.drawing import HIDDEN_COLOUR, VISIBLE_COLOUR
 from egvs.explore.page_file import write_page_file
 from egvs.explore.settings import open_session
 from tests.explore.test_page_in_browser import CHROMIUM, GRAPHICS, READY_MS
@@ -26,6 +27,17 @@ pytestmark = [
 
 VISIBLE = """() => Object.entries(window.__viserSceneTree.getState())
     .filter(([name, node]) => /^\\/layers\\/[a-z]+$/.test(name) && node.effectiveVisibility).map(([name]) => name)"""
+
+
+MIN_PIXELS, MAX_COLOUR_DIFFERENCE = 10, 8
+"""A roof has this many pixels at least, and each channel differs from the legend by this much at most."""
+
+
+def count_legend_colours(picture: np.ndarray) -> int:
+    """Return the number of pixels (rows, columns, 3) that have the colour of hit or missed vehicles."""
+    colours = np.array([VISIBLE_COLOUR, HIDDEN_COLOUR])
+    differences = np.abs(picture[:, :, None, :].astype(int) - colours).max(axis=3)
+    return int((differences.min(axis=2) <= MAX_COLOUR_DIFFERENCE).sum())
 
 
 def test_opens_from_disk_without_network(tmp_path: Path) -> None:
@@ -52,9 +64,14 @@ def test_opens_from_disk_without_network(tmp_path: Path) -> None:
         tab.wait_for_function(f"({VISIBLE})().join() === '/layers/seen'")
         tab.get_by_label("none").check()
         tab.wait_for_function(f"({VISIBLE})().join() === ''")
-        tab.wait_for_timeout(500)
-        picture = np.asarray(Image.open(io.BytesIO(tab.locator("canvas").first.screenshot())).convert("RGB"))
+        tab.evaluate("document.getElementById('egvs').style.display = 'none'")
+        for _ in range(40):  # traffic plays
+            tab.wait_for_timeout(500)
+            picture = np.asarray(Image.open(io.BytesIO(tab.screenshot())).convert("RGB"))
+            if count_legend_colours(picture) >= MIN_PIXELS:
+                break
         browser.close()
-    assert len(np.unique(picture[:, :200].reshape(-1, 3), axis=0)) > 50  # beside the panel
+    assert count_legend_colours(picture) >= MIN_PIXELS, "no vehicle has a colour of the legend"
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
     assert errors == []
     assert {url.split(":")[0] for url in requests} <= {"file", "blob", "data"}

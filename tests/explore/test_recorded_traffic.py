@@ -12,7 +12,7 @@ pytest.importorskip("viser", reason="the page needs viser: pip install 'egvs[exp
 from egvs.core.progress import no_progress
 from egvs.explore import recorded_traffic
 from egvs.explore.drawing import vehicle_mesh
-from egvs.explore.recorded_traffic import TrafficClip, body_mesh, frames_per_step
+from egvs.explore.recorded_traffic import TrafficClip, body_mesh, frames_per_step, linear_colours
 from egvs.explore.session import Playback, Session
 from egvs.explore.settings import open_session
 from egvs.scoring.targets import SEEN_WELL_POINTS
@@ -91,3 +91,8 @@ def test_body_scaled_to_its_box_is_the_vehicle_of_the_explorer(session: Session)
 @pytest.mark.parametrize(("period_s", "frames"), [(0.1, 2), (0.25, 1), (2.0, 1)])
 def test_fast_frames_are_skipped(period_s: float, frames: int) -> None:
     assert frames_per_step(period_s) == frames
+
+
+def test_linear_colours_are_those_of_the_srgb_table() -> None:
+    """Known pairs: half of the light is 188 of 255; below 0.04045 the curve is straight, 1/12.92."""
+    assert linear_colours(np.array([[0, 10, 188], [90, 181, 255]])).tolist() == [[0, 1, 128], [26, 118, 255]]

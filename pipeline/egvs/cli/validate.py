@@ -31,7 +31,10 @@ def validate(
     frames: Annotated[int, typer.Option(min=10, help=_FRAMES_HELP)] = DEFAULT_FRAMES,
     spacing: Spacing = None,
     detector: Annotated[
-        str, typer.Option(metavar="NAME,NAME", help="Detectors to run: points, cluster, pointpillars, or a plug-in.")
+        str,
+        typer.Option(
+            metavar="NAME,NAME", help="Detectors to run: points, cluster, pointpillars, range_image, or a plug-in."
+        ),
     ] = "points,cluster",
     detections: Annotated[
         Path | None,

@@ -8,6 +8,7 @@ with ranking, legends and credits. The same run gives the same file on the same 
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,9 @@ MAX_RANKED = 10
 _SITE_LAYERS = ("blindspots", "seen", "missed", "traffic")
 _PLAN_LAYERS = ("overlap_car",)
 _NO_LAYER = "none"
+_AMBIENT_LIGHT, _LIGHT_FROM_ABOVE = 0.75 * math.pi, 0.25 * math.pi
+"""Brightness of the lights. A level surface, which both reach, has its own colour: a matt surface sends out 1/pi of the
+light that it receives."""
 _TEMPLATES = Path(__file__).parent / "templates"
 _TITLE = "<title>Viser</title>"
 
@@ -140,6 +144,7 @@ def _record(
     scene, roi = server.scene, session.scene.roi
     zero_m = drawing.drawing_origin(roi)
     world = drawing.SceneMeshes.draw(scene, session, zero_m)
+    _light_for_true_colours(scene)
     drawing.draw_sites(scene, session, zero_m, None)
     drawing.draw_plan(scene, plan, "", zero_m, None)
     labelled = [rating.site]
@@ -181,6 +186,19 @@ def _record(
         "script_values": Markup(_script_values(world, layers)),
     }
     return recording.as_html(), panel
+
+
+def _light_for_true_colours(scene: viser.SceneApi) -> None:
+    """Light the scene so that bodies have the colours of the legend; the page's script turns off tone mapping.
+
+    viser's own lights and surroundings are brighter than a surface can show, so tone mapping makes colours paler.
+    """
+    scene.configure_default_lights(enabled=False, cast_shadow=False)
+    scene.configure_environment_map(None)
+    scene.add_light_ambient("/lights/ambient", intensity=_AMBIENT_LIGHT)
+    scene.add_light_directional(
+        "/lights/above", intensity=_LIGHT_FROM_ABOVE, position=(0.0, 0.0, 1.0), cast_shadow=False
+    )
 
 
 def _draw_label(scene: viser.SceneApi, text: str, rating: PoseScore, zero_m: Vec3) -> None:

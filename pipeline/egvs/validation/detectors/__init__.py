@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     )
     from egvs.validation.detectors.cluster import Cluster
     from egvs.validation.detectors.pointpillars import PointPillars
+    from egvs.validation.detectors.range_image import RangeImage
 
 __all__ = [
     "Cluster",
@@ -24,6 +25,7 @@ __all__ = [
     "JointDetector",
     "JointSiteDetector",
     "PointPillars",
+    "RangeImage",
     "SiteDetector",
     "detector_names",
     "make_detector",
@@ -35,5 +37,6 @@ __getattr__, __dir__ = lazy_exports(
         "base": ["Detector", "JointDetector", "JointSiteDetector", "SiteDetector", "detector_names", "make_detector"],
         "cluster": ["Cluster"],
         "pointpillars": ["PointPillars"],
+        "range_image": ["RangeImage"],
     },
 )
