@@ -260,7 +260,7 @@ def missed_view(
         transform = 'display="none"'
         if position:
             transform = f'transform="translate({position[0]} {position[1]})"'
-        parts.append(f'<g class="worst" {transform}><circle r="8.5"/><text y="4">{number}</text></g>')
+        parts.append(_numbered_mark(transform, number))
 
     alt = f"From above: no vehicles for {site.site} to see."
     if blindspots.overall:
@@ -317,6 +317,12 @@ class MapZone:
     title: str
 
 
+def _numbered_mark(transform: str, number: int) -> str:
+    """Return a number in a circle, which is larger for two digits."""
+    classes, radius = ("worst two-digits", 10.5) if number > 9 else ("worst", 8.5)
+    return f'<g class="{classes}" {transform}><circle r="{radius}"/><text y="4">{number}</text></g>'
+
+
 def zone_map(grid: Grid, zones: Sequence[MapZone], site: MapSite, backdrop: Backdrop, box: Box, alt: str) -> str:
     """Return zones coloured by the share found, and numbered; small zones lie above large ones.
 
@@ -335,7 +341,7 @@ def zone_map(grid: Grid, zones: Sequence[MapZone], site: MapSite, backdrop: Back
         parts.append(f"<g><title>{escape(zone.title)}</title>{shape}</g>")
         middle = zone.area.representative_point()
         at = f'transform="translate({plan.x(middle.x):.1f} {plan.y(middle.y):.1f})"'
-        numbers.append(f'<g class="worst" {at}><circle r="8.5"/><text y="4">{zone.number}</text></g>')
+        numbers.append(_numbered_mark(at, zone.number))
     parts += [*numbers, _sensor_mark(plan, site.x_m, site.y_m)]
     return plan.svg(parts, alt, ColourBar(0.0, 100.0, "Share of all road users found (%)", even=True))
 

@@ -202,6 +202,7 @@ def _displayed_settings(scenario: Scenario) -> dict[str, Any]:
         "name": scenario.name,
         "description": scenario.description,
         "seed": scenario.seed,
+        "seeds": scenario.traffic.seeds,
         "roi": scenario.roi.model_dump(mode="json"),
         "frame_period_s": scenario.traffic.frame_period_s,
         "vehicles": scenario.traffic.vehicles,
