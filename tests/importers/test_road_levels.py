@@ -107,7 +107,7 @@ def test_flyover_is_no_traffic_but_a_deck(tmp_path: Path) -> None:
     assert inside == {"1001", "1002"}
     note = "Roads on another level are left out of the traffic in the region of interest: High Road (bridge)."
     assert note in made.notes
-    assert "No height is given for 1 of 1 bridge decks: 5 m assumed." in made.notes
+    assert "No height is given for 1 of 1 bridge deck: 5 m assumed." in made.notes
 
     (deck,) = decks_of(tmp_path / "flyover")
     assert {key: deck["properties"][key] for key in ("height_m", "base_m", "radius_m")} == {

@@ -261,7 +261,7 @@ def test_the_order_of_beams_is_nothing_and_lists_that_are_short_are_filled_again
     for name in COLUMNS[:6]:
         np.testing.assert_array_equal(getattr(seen(frames, beams), name), getattr(seen(frames, turned), name))
     whole = seen(frames, beams, lambda r: 1.0 / r)
-    monkeypatch.setattr(targets, "_MAX_HITS", 1)  # a list of one frame
+    monkeypatch.setattr(targets, "MAX_HITS", 1)  # a list of one frame
     again = seen(frames, beams, lambda r: 1.0 / r)
     np.testing.assert_array_equal(whole.points, again.points)
     np.testing.assert_array_equal(whole.width_share, again.width_share)

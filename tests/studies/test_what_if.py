@@ -237,13 +237,13 @@ def test_wrong_number_names_row_and_column(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "files", "message"),
     [
-        (LORRY.replace("y_m = 10", "y_m = -3950500"), {}, r"what_if.lorry.boxes.0: none of 1 solids is within 100 m .*"
+        (LORRY.replace("y_m = 10", "y_m = -3950500"), {}, r"what_if.lorry.boxes.0: none of 1 solid is within 100 m .*"
          r"this one is 3,950,489 m away. Use the world frame in metres; the region is x 0 to 40, y -10 to 10."),
         (FAR, {"parked_csv": PARKED.replace("110,60", "5,-900").replace("120,60", "900,0")},
          r"parked.csv: row 1: none of 2 solids"),
         ('[what_if.works]\nshare = 1\nfootprints = ["works.geojson"]\n', {"works_geojson": collection(feature(
             {"type": "Point", "coordinates": [-500, 0]}, kind="crane", height_m=9, radius_m=1))},
-         r"works.geojson: none of 1 solids .* this one is 499 m away"),
+         r"works.geojson: none of 1 solid .* this one is 499 m away"),
     ],
 )  # fmt: skip
 def test_solids_that_no_beam_can_meet_are_an_error(tmp_path: Path, text: str, files: Any, message: str) -> None:
