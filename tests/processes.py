@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import sys
 import tempfile
 from collections.abc import Mapping
@@ -60,6 +61,7 @@ def _work(
     code: str, arguments: list[str], beside: Path | None, folder: Path, environment: Mapping[str, str],
     printed: list[Path],
 ) -> None:  # fmt: skip
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it in what it starts in the background
     os.environ.clear()
     os.environ.update(environment)
     os.chdir(folder)
