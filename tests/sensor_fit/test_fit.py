@@ -39,6 +39,7 @@ def test_sensors_of_the_catalogue(name: str) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_intervals_contain_the_true_values() -> None:
     """40 trials; ``python -m benchmarks.sensor_fit intervals`` makes 200."""
     hits = interval_hits(40, seed=7)

@@ -62,7 +62,7 @@ def test_study_of_a_finished_file(mini: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rank_by", ["expected_detections", "egvs"])
+@pytest.mark.parametrize("rank_by", ["expected_detections", pytest.param("egvs", marks=pytest.mark.nightly)])
 def test_study_of_simulated_traffic_judges_seeds_by_others(
     junction: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], rank_by: str
 ) -> None:
