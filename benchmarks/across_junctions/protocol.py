@@ -206,7 +206,7 @@ class Protocol(StrictModel):
         Raises
         ------
         InputError
-            If there is none.
+            If the study has no junction of this name.
         """
         for junction in self.junctions:
             if junction.name == name:

@@ -338,10 +338,10 @@ class Study:
         junction = self.junctions[record.name, detector]
         start: list[Cell] = [record.name, detector, _trained(detector), score]
         estimate = self.estimate(record, detector, score, "rho")
-        yield [*start, "rho", *_judged(estimate.value, POOLED_AIM, junction.ceiling())]
+        yield [*start, "rho", *_compare_with_aim(estimate.value, POOLED_AIM, junction.ceiling())]
         for height, of_height in junction.by_group(score, junction.heights, MIN_SITES_OF_A_HEIGHT).items():
             ceiling = junction.ceiling(junction.heights == float(height))
-            yield [*start, f"rho at {height} m", *_judged(of_height.value, HEIGHT_AIM, ceiling)]
+            yield [*start, f"rho at {height} m", *_compare_with_aim(of_height.value, HEIGHT_AIM, ceiling)]
 
     def _parts(self) -> Table:
         rows: list[list[Cell]] = [
@@ -399,7 +399,7 @@ def _most(values: Sequence[float]) -> Cell:
     return number(max(defined)) if defined else None
 
 
-def _judged(value: float, aim: float, ceiling: float) -> list[Cell]:
+def _compare_with_aim(value: float, aim: float, ceiling: float) -> list[Cell]:
     """Return a value, its limit, and whether it is reached; without a ceiling, the aim is the limit."""
     limit = aim if math.isnan(ceiling) else min(aim, OF_CEILING * ceiling)
     return [number(value), number(limit), "yes" if value >= limit else "no"]

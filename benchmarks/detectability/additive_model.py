@@ -25,16 +25,11 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.special import expit
 from egvs.scoring.crowding import CLASSES, measure_crowding, vehicle_classes
-from egvs.scoring.target_scores import ISOLATED_GAP_M
+from egvs.scoring.target_scores import ISOLATED_GAP_M, MONOTONICITY
 from egvs.scoring.targets import VisibleTargets
 
 DIRECTIONS: Mapping[str, int] = {
-    "log_points": 1,
-    "log_points_on_sides": 1,
-    "length_share": 1,
-    "width_share": 1,
-    "hole_m": -1,
-    "gap_m": 1,
+    **MONOTONICITY,
     "hidden_share": -1,
     "front_gap_m": 1,
     "behind_gap_m": 1,
@@ -42,11 +37,7 @@ DIRECTIONS: Mapping[str, int] = {
     "beside_gap_deg": 1,
     "link_gap": 1,
     "log_spacing": -1,
-    "depression_deg": -1,
     "incidence_deg": 0,
-    "length_m": 0,
-    "range_m": 0,
-    "side": 0,
 }
 """For each feature that a model may have: 1 if the probability may only rise with it, -1 if it may only fall, 0 for
 either. ``log_spacing`` is ln(spacing / 1 m), the other logarithms are ln(1 + points)."""

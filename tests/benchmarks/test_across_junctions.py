@@ -134,7 +134,7 @@ def test_terrain_by_hand() -> None:
     assert terrain.height_m(75.0, 20.0) == pytest.approx(-4.0 - 1.0)
 
 
-def test_a_map_is_found_by_name_and_hash(tmp_path: Path) -> None:
+def test_map_files_are_identified_by_name_and_hash(tmp_path: Path) -> None:
     (tmp_path / "map.osm").write_bytes(b"roads")
     digest = "0ca5ab3a34d3cde2f4d63b8f1fd5d1a3d4e7ce1f0b3b6ae2a7a8a4ac9c5cbd3e"
     with pytest.raises(worlds.MissingMapError, match="expected the SHA-256"):
@@ -145,7 +145,7 @@ def test_a_map_is_found_by_name_and_hash(tmp_path: Path) -> None:
         worlds.find_map(MapFile(name="map.osm", sha256=digest), None)
 
 
-def test_furniture_stands_beside_the_roads_and_apart() -> None:
+def test_furniture_is_next_to_roads_without_overlaps() -> None:
     scenario = load(SCENARIOS / "roundabout")
     roads = sumo_folder.read_network(scenario)
     assert roads is not None

@@ -1,4 +1,4 @@
-"""Fitting and comparing additive models: planted truths, by hand, the file, the figure, arguments."""
+"""Fitting and comparing additive models: known models, by hand, the file, the figure, arguments."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from benchmarks.detectability.comparison import SiteRows
 
 
 def rows(seed: int, truth, count: int = 4000) -> TrainingRows:
-    """Vehicles with random features, found by a planted probability."""
+    """Vehicles with random features, detected with a known probability."""
     rng = np.random.default_rng(seed)
     columns = {name: rng.uniform(0.0, 1.0, count) for name in DIRECTIONS}
     columns["log_points"] = rng.uniform(0.1, 6.0, count)
@@ -23,7 +23,7 @@ def rows(seed: int, truth, count: int = 4000) -> TrainingRows:
     return TrainingRows(features, (rng.random((2, count)) < truth(features)).mean(axis=0))
 
 
-def planted(x: TargetFeatures) -> np.ndarray:
+def known_probability(x: TargetFeatures) -> np.ndarray:
     logit = 1.5 * (x.columns["log_points"] - 3.0) - 2.0 * x.columns["hidden_share"] + x.vehicle_class
     return 1.0 / (1.0 + np.exp(-logit))
 
@@ -35,10 +35,10 @@ def test_ramps_by_hand():
     assert choose_knots(np.append(np.zeros(999), 1.0)).tolist() == [0.0, 1.0] and len(choose_knots(np.ones(5))) == 1
 
 
-def test_a_planted_dependence_is_found_in_other_data():
-    model = fit_additive([rows(1, planted), rows(2, planted)], ["log_points", "hidden_share"])
-    other = rows(3, planted)
-    assert np.abs(model.chances(other.features) - planted(other.features)).mean() < 0.03
+def test_fit_recovers_a_known_model_on_new_data():
+    model = fit_additive([rows(1, known_probability), rows(2, known_probability)], ["log_points", "hidden_share"])
+    other = rows(3, known_probability)
+    assert np.abs(model.chances(other.features) - known_probability(other.features)).mean() < 0.03
     assert model.class_offsets[1] - model.class_offsets[0] == pytest.approx(1.0, abs=0.25)
 
 
@@ -52,7 +52,7 @@ def test_a_dependence_against_physics_is_not_learnt():
 
 def test_minimum_has_no_slope():
     """Any admissible small step from the fitted model raises the loss, evaluated by itself."""
-    data, name = rows(4, planted, 800), "log_points"
+    data, name = rows(4, known_probability, 800), "log_points"
     model = fit_additive([data], [name], with_classes=False)
     knots, values = model.curves[name]
 
@@ -74,14 +74,14 @@ def test_minimum_has_no_slope():
 
 
 def test_the_file_is_read_as_it_was_fitted():
-    model = fit_additive([rows(1, planted)], ["log_points", "hidden_share", "range_m"])
+    model = fit_additive([rows(1, known_probability)], ["log_points", "hidden_share", "range_m"])
     text = additive_fitting.model_toml(
         {"cluster": model}, {"junctions": ["one", "two"], "frames": 60, "model": "points"}
     )
     parsed = tomllib.loads(text)
     assert parsed["about"] == {"junctions": ["one", "two"], "frames": 60, "model": "points"}
     again = AdditiveModel.from_table(parsed["detectors"]["cluster"])
-    x = rows(5, planted).features
+    x = rows(5, known_probability).features
     np.testing.assert_allclose(again.chances(x), model.chances(x), atol=1e-4)
 
 
@@ -97,9 +97,9 @@ def sites(seed: int, noise: float = 0.0) -> list[SiteRows]:
         columns = {name: rng.uniform(0.0, 1.0, count) for name in DIRECTIONS}
         columns["log_points"] = rng.uniform(0.0, 2.0 + 0.5 * number, count) * (rng.random(count) > 0.1)
         features = TargetFeatures(columns, np.zeros(count, dtype=np.int64))
-        hits = (rng.random((2, count)) < planted(features)).mean(axis=0) * (columns["log_points"] > 0.0)
+        hits = (rng.random((2, count)) < known_probability(features)).mean(axis=0) * (columns["log_points"] > 0.0)
         ap = float(hits.mean()) + noise * rng.normal()
-        result.append(SiteRows(f"g0{number}h3", f"{number % 2} m", features, hits, planted(features), ap))
+        result.append(SiteRows(f"g0{number}h3", f"{number % 2} m", features, hits, known_probability(features), ap))
     return result
 
 
@@ -145,10 +145,12 @@ def test_trees_keep_the_directions_and_weight_junctions_equally(monkeypatch):
     # the same features; found always at the small junction, never at the one of ten times as many vehicles
     small, large = rows(1, lambda x: 2.0, 400), rows(2, lambda x: -1.0, 4000)
     model = comparison.fit([small, large], "trees", ("log_points", "hidden_share"))
-    assert model.chances(rows(3, planted).features).mean() == pytest.approx(0.5, abs=0.05)
+    assert model.chances(rows(3, known_probability).features).mean() == pytest.approx(0.5, abs=0.05)
     monkeypatch.setattr(fitting, "MIN_SAMPLES", 50)
-    model = comparison.fit([rows(1, planted), rows(2, planted)], "trees", ("log_points", "hidden_share"))
-    x = rows(3, planted).features
+    model = comparison.fit(
+        [rows(1, known_probability), rows(2, known_probability)], "trees", ("log_points", "hidden_share")
+    )
+    x = rows(3, known_probability).features
     fewer = TargetFeatures({**x.columns, "log_points": 0.5 * x.columns["log_points"]}, x.vehicle_class)
     assert (model.chances(x) >= model.chances(fewer)).all()
     assert (model.chances(x) - model.chances(fewer)).mean() > 0.1

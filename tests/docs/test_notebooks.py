@@ -117,7 +117,7 @@ def notebook_with(*outputs: nbformat.NotebookNode, **metadata: Any) -> nbformat.
         ([nbformat.v4.new_output("stream", name="stderr", text="careful\n")], "writes to standard error: careful"),
         ([output(text_plain="saved in /home/me/runs")], "prints a path of this machine"),
         ([output(text_plain="PosixPath('/tmp/egvs/runs')")], "prints a path of this machine"),
-        ([output(text_plain="'../../../../work/scenarios'")], "prints a path of this machine"),
+        ([output(text_plain="'../../../../projects/scenarios'")], "prints a path of this machine"),
         ([nbformat.v4.new_output("stream", name="stdout", text="C:\\Users\\me")], "prints a path of this machine"),
     ],
 )

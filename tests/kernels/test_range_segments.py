@@ -134,7 +134,7 @@ def test_segments_equal_slow_twin():
         assert labels(ranges) == group
 
 
-def test_point_beside_something_nearer_is_hidden():
+def test_point_next_to_a_nearer_object_is_hidden():
     points, range_m, beam, point_of_beam, starts, neighbours = line_of_beams([10.0, 10.0, np.nan, 6.0, 6.0])
     label, scene = np.array([0, 0, 2, 2]), np.array([10.0, 10.0, 9.0, 6.0, 6.0])  # a pole in the third beam
     hidden = np.empty(4, dtype=np.bool_)

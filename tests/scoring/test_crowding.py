@@ -37,7 +37,7 @@ def test_a_queue_ahead_by_hand():
     assert measure_crowding(visible).spacing_m == pytest.approx([math.sqrt(area / visible.points_alone[0])])
 
 
-def test_two_lanes_beside_each_other_by_hand():
+def test_adjacent_lanes_by_hand():
     # sides at y = 1 and 2.2 from x = 20 to 24, seen from the origin: the near corner of the upper car is at (24, 2.2),
     # the far one of the lower car at (20, 1)
     found = measure_crowding(seen([frame([box(22.0, 0.0), box(22.0, 3.2)])], fan()))

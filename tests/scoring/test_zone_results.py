@@ -81,7 +81,7 @@ def test_shares_by_hand() -> None:
     assert "no road user has its centre in nowhere in the 2 frames examined" in str(warning)
 
 
-def test_zones_beside_the_lanes_are_no_warning_without_pedestrians() -> None:
+def test_sidewalk_zones_without_pedestrians_give_no_warning() -> None:
     """The lane leads along y = 205 from x = 100 to 140: through the zone ahead, not over the sidewalk at y = 215.
 
     The car and the bus are at x = 105 to 115. With a pedestrian anywhere, both empty zones are a warning.
