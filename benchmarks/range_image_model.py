@@ -307,7 +307,7 @@ def main() -> None:
     """Train, and write the file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--junction", default=",".join(JUNCTIONS), help="training junctions, separated by commas")
-    parser.add_argument("--poses", type=int, default=4, help="poses of each sensor at each junction")
+    parser.add_argument("--poses", type=int, default=3, help="poses of each sensor at each junction")
     parser.add_argument("--frames", type=int, default=8, help="frames at each pose")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=segment_model.MODEL_FILE)

@@ -107,10 +107,6 @@ def normalise(notebook: nbformat.NotebookNode) -> None:
         cell.outputs = outputs
 
 
-def _is_stream(output: nbformat.NotebookNode) -> bool:
-    return output.output_type == "stream"
-
-
 def find_problems(notebook: nbformat.NotebookNode) -> Iterator[str]:
     """Yield what must not be published: errors, standard error, paths of this machine."""
     for number, cell in enumerate(notebook.cells, 1):

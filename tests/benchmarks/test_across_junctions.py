@@ -109,7 +109,7 @@ def test_candidates_stand_at_their_height_where_the_ground_is_flat() -> None:
         ('"VLP-16", ', '"VLP-17", ', "expected sensors of the catalogue, got 'VLP-17'"),
     ],
 )
-def test_a_wrong_protocol_is_one_message(tmp_path: Path, old: str, new: str, message: str) -> None:
+def test_rejects_invalid_protocol(tmp_path: Path, old: str, new: str, message: str) -> None:
     text = (ProtocolFiles().folder / JUNCTIONS_FILE).read_text(encoding="utf-8")
     assert old in text
     (tmp_path / JUNCTIONS_FILE).write_text(text.replace(old, new, 1), encoding="utf-8")
@@ -403,7 +403,7 @@ def test_tables_name_a_trial_and_several_sources(made_up: Path, tmp_path: Path) 
     assert "Parts cluster were measured with 2 versions of the source" in printed
 
 
-def test_a_record_that_is_damaged_is_one_message(made_up: Path, tmp_path: Path) -> None:
+def test_rejects_damaged_record(made_up: Path, tmp_path: Path) -> None:
     (made_up / "h.cluster.parquet").write_bytes(b"PAR1")
     with pytest.raises(InputError, match=r"h\.cluster\.parquet"):
         tables.write_tables(made_up, tmp_path / "out")
@@ -430,13 +430,11 @@ def test_halves_of_the_frames_are_alternate_blocks() -> None:
 
 def test_hours_by_hand() -> None:
     protocol = read_protocol()
-    count = protocol.candidates.count
     info = PartInfo("j", "training", "cluster", "", "", "", 20, 7.0, 1, 1, 8, {}, True, 9.0, 8.0, 0.5, MACHINE)
-    seconds = costs.estimated_s([info], protocol)
-    assert seconds == {"cluster": pytest.approx(0.5 * count * protocol.frames / 20 + costs.START_S)}
+    assert protocol.frames == 120 and len(protocol.junctions) == 19
+    assert costs.estimated_s([info], protocol) == {"cluster": pytest.approx(48 * 6 * 0.5 + 40)}  # 48 sites, 120 frames
     text = costs.estimate([info], protocol)
-    hours = seconds["cluster"] * len(protocol.junctions) / 3600 / 2
-    assert f"about {hours:.1f} hours" in text
+    assert "about 0.5 hours" in text  # 19 junctions of 184 s, on two cores
     assert "without pointpillars" in text
 
 
@@ -457,7 +455,7 @@ def test_hours_by_hand() -> None:
         (["measure", "--junction", "hill", "--part", "eyes"], "--part: unknown detector 'eyes'"),
     ],
 )
-def test_what_must_not_be_measured_is_refused(
+def test_rejects_measurements_that_would_spend_held_out_junctions(
     arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert command.main([*arguments, "--data", str(tmp_path / "study")]) == 2

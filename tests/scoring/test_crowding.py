@@ -12,7 +12,7 @@ from shapely import affinity
 from egvs.kernels.crowding import RAY_SHARES
 from egvs.scoring import crowding
 from egvs.scoring.crowding import MAX_BESIDE_DEG, MAX_LINK_GAP, NEIGHBOUR_M, measure_crowding
-from tests.scoring.target_scenes import GRID, axes_of, beams_to, entered_m, frame, random_boxes, seen
+from tests.scoring.target_scenes import axes_of, beams_to, entered_m, frame, random_boxes, seen
 from tests.scoring.test_visible_targets import AT, fan
 
 
@@ -234,4 +234,3 @@ def test_pairs_are_listed_once_for_all_sites():
     record = seen([frame([box(12.0, 0.0), box(18.0, 0.0)])], fan()).record
     assert crowding.neighbour_pairs(record) is crowding.neighbour_pairs(record)
     assert crowding.neighbour_pairs(record).boxes.tolist() == [1, 0]
-    assert GRID.voxel_m == 1.0

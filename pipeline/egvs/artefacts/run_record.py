@@ -5,6 +5,7 @@ It is written again after each stage, so that an interrupted run continues from 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -119,6 +120,11 @@ class RunRecord:
     scenario_folder: str
     stages: dict[str, StageRecord]
     overrides: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def traffic_summary(self) -> Mapping[str, Any]:
+        """The summary of the stage traffic; empty before it has run."""
+        return self.stages["traffic"].summary if "traffic" in self.stages else {}
 
     def __repr__(self) -> str:
         return f"RunRecord({self.scenario.get('name', '?')}; stages {', '.join(self.stages)})"

@@ -60,7 +60,7 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
     else:
         for warning in collect_warnings([summary]):
             out.print(str(warning))
-    traffic_summary = record.stages["traffic"].summary if "traffic" in record.stages else {}
+    traffic_summary = record.traffic_summary
     plans = traffic_summary.get("signals", ())
     sentences = signal_sentences(plans)
     on_road = sections.describe_poles_on_road(ranked.poles[: sections.NAMED_POLES], _check_warnings(record))

@@ -82,7 +82,7 @@ def place(
         notes.append(describe_replaced(replaced, request_now or {}))
     if exact and not (placed.solution.is_best or placed.solution.fewest_is_proved):
         notes.append(f"--exact reached its --time-limit of {time_limit} before any plan was proved optimal.")
-    plans = RunRecord.read(folder).stages["traffic"].summary.get("signals", ())
+    plans = RunRecord.read(folder).traffic_summary.get("signals", ())
     print_placement(placed, loaded.placement, notes, sections.describe_caveats(loaded, "plan", plans=plans))
 
 

@@ -1,4 +1,4 @@
-"""What is read of a recording, and the defaults; without the libraries that read it."""
+"""Options for reading recordings of sweeps; this module imports no library that reads them."""
 
 from __future__ import annotations
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from html import escape
 from typing import Any
 
+from egvs.core.wording import shorten_id
 from egvs.report.svg_figures import PAGE_STYLE, FigureStyle, round_values, svg_start_tag, text_width
 from egvs.traffic.signal_descriptions import plan_title
 
@@ -82,8 +83,8 @@ def _row_name(row: Mapping[str, Any]) -> str:
     approach = row["approach"]
     if len(approach) > _MAX_LETTERS:
         street, bracket, side = approach.rpartition(" (")
-        end = f"{bracket}{side}" if street else ""
-        approach = f"{approach[: _MAX_LETTERS - 1 - len(end)]}…{end}"
+        end = f"{bracket}{shorten_id(side)}" if street else ""
+        approach = f"{approach[: max(_MAX_LETTERS - 1 - len(end), 0)]}…{end}"
     return f"{approach}: {', '.join(row['movements'])}"
 
 

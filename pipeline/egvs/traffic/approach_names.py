@@ -98,8 +98,8 @@ class ApproachNames:
         line_m = self._line_back(edge_id)
         edge = self._edges[edge_id]
         middle_m = self._ring_middle_m(edge.to_node, edge.from_node)
-        there_m = line_m[0] if middle_m is None else middle_m
-        heading: Floats = there_m - point_along(line_m, HEADING_OVER_M)
+        junction_m = line_m[0] if middle_m is None else middle_m
+        heading: Floats = junction_m - point_along(line_m, HEADING_OVER_M)
         return heading
 
     def exit_heading(self, edge_id: str) -> Floats:
@@ -107,8 +107,8 @@ class ApproachNames:
         line_m = self._line_ahead(edge_id)
         edge = self._edges[edge_id]
         middle_m = self._ring_middle_m(edge.from_node, edge.to_node)
-        there_m = line_m[0] if middle_m is None else middle_m
-        heading: Floats = point_along(line_m, HEADING_OVER_M) - there_m
+        junction_m = line_m[0] if middle_m is None else middle_m
+        heading: Floats = point_along(line_m, HEADING_OVER_M) - junction_m
         return heading
 
     def side(self, edge_id: str) -> str:
@@ -135,7 +135,8 @@ class ApproachNames:
         for edge in crossed:
             if self._edges[edge].to_node == node:
                 return Arm(self.side(edge), self.street(edge), edge)
-        for edge in crossed:
+        if crossed:
+            edge = crossed[0]
             side = compass(self.exit_heading(edge))
             for beside in self._edges.values():
                 if not beside.function and beside.to_node == node and self.side(beside.id) == side:
@@ -151,7 +152,7 @@ class ApproachNames:
         return crosswalk_name(self.crossed_arm(crossing_id).name)
 
     def _line_back(self, edge_id: str) -> Floats:
-        """Return a line from the end of an edge backwards, (n, 2), over 30 m where a single road leads there."""
+        """Return a line from the end of an edge backwards, (n, 2), over :data:`HEADING_OVER_M`."""
         return _joined(self._edges, edge_id, self._previous, backwards=True)
 
     def _line_ahead(self, edge_id: str) -> Floats:

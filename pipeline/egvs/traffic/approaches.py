@@ -1,4 +1,4 @@
-"""The approaches of a junction by the words of planners: street, and side on which vehicles arrive.
+"""Find the approaches of a junction by the names that planners use: street, and side on which vehicles arrive.
 
 The vehicles of the approach on the north side come *from* the north and head south (southbound, "SB"); its name is
 "North Street (north)", see :mod:`egvs.traffic.approach_names`.

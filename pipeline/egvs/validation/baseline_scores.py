@@ -46,7 +46,7 @@ def nuc(evidence: SiteEvidence, sidewalk_m: float) -> float:
     Parameters
     ----------
     evidence
-        Of the site.
+        Occupancy, returns and visible vehicles of the site.
     sidewalk_m
         Width of the sidewalk beside the road.
     """
@@ -106,7 +106,7 @@ def vehicle_grid_occupancy(evidence: SiteEvidence, cell_m: float, views: str, en
     Parameters
     ----------
     evidence
-        Of the site.
+        Occupancy, returns and visible vehicles of the site.
     cell_m
         Edge of a cell. The last cells of a row may extend beyond the vehicle.
     views

@@ -215,7 +215,7 @@ class RangeImageAtSite:
     view, roi
         The site, and the region of interest.
     model
-        What it learnt; None where only segments are needed.
+        The trained model; by default the one that comes with the program.
     """
 
     view: SiteView
