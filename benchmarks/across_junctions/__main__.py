@@ -56,12 +56,13 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     common = argparse.ArgumentParser(add_help=False)
-    common.add_argument("--data", type=Path, default=ROOT / "runs" / "across_junctions", help="folder of the study")
+    data = argparse.ArgumentParser(add_help=False)
+    data.add_argument("--data", type=Path, default=ROOT / "runs" / "across_junctions", help="folder of the study")
     common.add_argument("--maps", type=Path, metavar="DIR", help="folder of the maps that are not shipped")
     common.add_argument("--junction", metavar="NAME,NAME", help="default: all")
     steps = parser.add_subparsers(required=True, metavar="build|list|measure|tables")
 
-    step = steps.add_parser("build", parents=[common], help="make the scenarios")
+    step = steps.add_parser("build", parents=[data, common], help="make the scenarios")
     step.add_argument(
         "--write",
         action="store_true",
@@ -72,7 +73,7 @@ def _parser() -> argparse.ArgumentParser:
     step = steps.add_parser("list", help="print the protocol and its hash")
     step.set_defaults(step=_list)
 
-    step = steps.add_parser("measure", parents=[common], help="measure what is missing")
+    step = steps.add_parser("measure", parents=[data, common], help="measure what is missing")
     step.add_argument(
         "--part", metavar="NAME,NAME", help=f"detectors, {SCORES}, {VEHICLES}; default: as the protocol says"
     )
@@ -83,7 +84,7 @@ def _parser() -> argparse.ArgumentParser:
     step.add_argument("--jobs", type=int, help="processes; default: one a core")
     step.set_defaults(step=_measure)
 
-    step = steps.add_parser("tables", parents=[common], help="write the tables")
+    step = steps.add_parser("tables", parents=[data], help="write the tables")
     step.add_argument("--out", type=Path, metavar="DIR", help="for the tables; default: below the folder of the study")
     step.set_defaults(step=_tables)
     return parser
@@ -250,6 +251,8 @@ def _parts(protocol: Protocol, junction: Junction, names: str | None) -> list[st
     known = (*NOT_DETECTORS, *protocol.detectors_of(junction))
     parts = list(known) if names is None else [name.strip() for name in names.split(",") if name.strip()]
     for name in parts:
+        if name not in known:
+            raise InputError("--part", f"expected some of {', '.join(known)} at {junction.name}, got {name!r}")
         if name not in NOT_DETECTORS:
             _check_detector(name)
     return parts

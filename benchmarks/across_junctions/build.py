@@ -108,7 +108,7 @@ def _traffic(scenario: Scenario, folder: Path) -> tuple[float, int, float]:
 
 
 def is_dense(frame: TrafficFrame, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return for each of these boxes whether another one is nearer than :data:`QUEUE_GAP_M` in the plane, (n,) bool."""
+    """Return for each of these vehicles whether another one is nearer than :data:`QUEUE_GAP_M` in plan, (n,) bool."""
     if not len(rows):
         return np.zeros(0, dtype=np.bool_)
     outlines = [
@@ -119,7 +119,7 @@ def is_dense(frame: TrafficFrame, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
     names = np.array(frame.vehicles, dtype=np.str_)
     tree = shapely.STRtree(outlines)
     pairs = tree.query([outlines[row] for row in rows], "dwithin", distance=QUEUE_GAP_M)
-    others = names[rows[pairs[0]]] != names[pairs[1]]
+    others = (names[rows[pairs[0]]] != names[pairs[1]]) & frame.are_vehicles()[pairs[1]]
     dense = np.zeros(len(rows), dtype=np.bool_)
     dense[pairs[0][others]] = True
     return dense

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
+from benchmarks.across_junctions.protocol import read_protocol
 from benchmarks.detectability import figures
 from benchmarks.detectability.additive_fitting import TrainingRows, fit_additive, model_toml
 from benchmarks.detectability.additive_model import DIRECTIONS, AdditiveModel, TargetFeatures, target_features
@@ -315,19 +316,27 @@ def training_folders(names: Sequence[str], scenarios: Sequence[Path]) -> dict[st
     Raises
     ------
     InputError
-        For a shipped junction that is not for training, for two of one name, or for fewer than two.
+        For a junction that is not for training in one of the studies, for two of one name, or for fewer than two.
     """
     training = [name for name, role in junctions.SHIPPED.items() if role == "training"]
-    given = [*names, *(path.resolve().name for path in scenarios)]
+    by_name = {_junction_name(path): path for path in scenarios}
+    given = [*names, *map(_junction_name, scenarios)]
+    held_out = [junction.name for junction in read_protocol().junctions if junction.role != "training"]
     for name in given:
-        if (name in names or name in junctions.SHIPPED) and name not in training:
+        if name in held_out or ((name in names or name in junctions.SHIPPED) and name not in training):
             problem = f"expected a training junction, got {name!r}"
             raise InputError("--junction", problem, f"Use some of {', '.join(training)}.")
     if len(set(given)) < max(MIN_JUNCTIONS, len(given)):
         problem = f"expected {MIN_JUNCTIONS} or more different junctions, got {', '.join(given) or 'none'}"
         raise InputError("--junction", problem, "Each is predicted by the models of the others.")
     folders = {name: path for name, _, path in junctions.shipped(names)} if names else {}
-    return folders | {path.resolve().name: path for path in scenarios}
+    return folders | by_name
+
+
+def _junction_name(scenario: Path) -> str:
+    """Return the name of a junction: of its folder, or of the one above it, as in the larger study."""
+    folder = scenario.resolve()
+    return folder.parent.name if folder.name == "scenario" else folder.name
 
 
 def _run(arguments: argparse.Namespace) -> None:

@@ -452,7 +452,7 @@ def test_hours_by_hand() -> None:
         ),
         (["measure", "--junction", "nishishinjuku", "--candidates", "4"], "a trial at nishishinjuku would spend"),
         (["measure", "--junction", "hill", "--frames", "10"], "--frames, --candidates: expected 20 to"),
-        (["measure", "--junction", "hill", "--part", "eyes"], "--part: unknown detector 'eyes'"),
+        (["measure", "--junction", "hill", "--part", "eyes"], "--part: expected some of scores, vehicles, cluster"),
     ],
 )
 def test_rejects_measurements_that_would_spend_held_out_junctions(

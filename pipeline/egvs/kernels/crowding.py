@@ -123,7 +123,8 @@ def sight_gaps(x, y, rows, pair_starts, pairs, plan, views, front_m, behind_m, b
         Scratch, (b, 4) float64.
     front_m, behind_m
         Smallest gap along the line of sight to a neighbour in front, and behind, that shares azimuths with the target,
-        metres; 0 where both overlap, the nearer one being in front. (n,) float64; the initial values are the largest ones.
+        metres; 0 where both overlap, the nearer one being in front. (n,) float64; the initial values are
+        the largest ones.
     beside_rad
         Smallest angle between the target and a neighbour that shares no azimuth with it, but ranges, radians.
         (n,) float64.
@@ -169,7 +170,7 @@ def sight_gaps(x, y, rows, pair_starts, pairs, plan, views, front_m, behind_m, b
 
 @_kernel
 def point_gaps(pair_starts, pairs, target_of_box, spanned, has_points, gap_m):  # type: ignore[no-untyped-def]
-    """Lower ``gap_m`` to the distance between the rectangles around the points of each target and its nearest neighbour.
+    """Lower ``gap_m`` to the distance between the rectangles around the points of each target and its neighbours.
 
     Parameters
     ----------
