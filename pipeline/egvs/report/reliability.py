@@ -58,7 +58,7 @@ def describe_reliability(ranking: Ranking, traffic: Mapping[str, Any] | None = N
         sentences.append(_TILT_NOTE.format(best.site))
     limits = list(_limits(best, [site for site in ranking.sites if site.pole == best.pole]))
     if limits:
-        sentences.append(f"The best site has {join_names(limits)}: a mount beyond it may be better.")
+        sentences.append(f"The best site has {join_names(limits)}: one beyond what was tried may be better.")
     return sentences
 
 
