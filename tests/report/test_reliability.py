@@ -36,7 +36,8 @@ def test_nothing_is_said_of_a_level_site_between_the_limits() -> None:
 )
 def test_names_the_limits_that_the_best_mount_of_a_pole_reaches(mounts: list[tuple[float, float]], limits: str) -> None:
     sites = [("a", z_m, pitch_deg, 9.0 - rank) for rank, (z_m, pitch_deg) in enumerate(mounts)]
-    assert describe_reliability(ranked(*sites))[-1] == f"The best site has {limits}: one beyond what was tried may be better."
+    sentence = f"The best site has {limits}: one beyond what was tried may be better."
+    assert describe_reliability(ranked(*sites))[-1] == sentence
 
 
 def test_one_mount_on_each_pole_has_no_limits() -> None:
