@@ -113,7 +113,7 @@ def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequen
     caveat
         A last sentence, on what was assumed; may be empty.
     """
-    from egvs.artefacts.readers import worst_zones
+    from egvs.artefacts.readers import describe_worst_zones, worst_zones
     from egvs.cli.console import WIDE, console, print_sentences
 
     out = console(WIDE, soft_wrap=False)
@@ -128,7 +128,7 @@ def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequen
         sensors = f" by {zone.by} sensors" if zone.by > 1 else ""
         out.print(f"zone {zone.name}: {zone.seen:.1%} of its entropy seen{sensors}, {zone.share:.1%} required")
     if worst := worst_zones(placed.zone_results):
-        print_sentences([f"The plan finds the smallest shares in: {'; '.join(zone.in_words() for zone in worst)}"])
+        print_sentences([describe_worst_zones("the plan", worst)])
     for path in placed.files:
         out.print(str(path), soft_wrap=True)
     sentences = [describe_plan(placed), *notes, *_further_sentences(placed, requested)]

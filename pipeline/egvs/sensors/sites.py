@@ -31,7 +31,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from egvs.core.errors import Diagnostic, DiagnosticsError, InputError
+from egvs.core.errors import Diagnostic, DiagnosticsError, InputError, unknown_site
 from egvs.core.grid import Vec3
 from egvs.core.numbers import parse_decimal
 from egvs.core.special import cosdg, sindg
@@ -243,8 +243,7 @@ def _check_keep_visibility(scenario: Scenario, sites: Mapping[str, Site]) -> Non
         return
     for name in kept:
         if name not in sites:
-            hint = f"Use one of {', '.join(sites)}, or 'all'."
-            raise InputError(f"{scenario.file}: score.keep_visibility", f"there is no site {name!r}", hint)
+            raise unknown_site(f"{scenario.file}: score.keep_visibility", name, list(sites))
 
 
 def _with_measured_scan(sites: tuple[Site, ...], scenario: Scenario) -> tuple[Site, ...]:
