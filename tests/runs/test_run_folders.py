@@ -201,6 +201,31 @@ def test_folders_without_a_run_are_explained(here: Path, run_egvs: Any) -> None:
     assert run_egvs("compare", "mini")[::2] == (2, message)
 
 
+@pytest.mark.parametrize("words", [("export", "runs/mini", "--to", "csv"), ("place", "runs/mini"),
+                                   ("verify", "runs/mini"), ("report", "runs/mini")])  # fmt: skip
+def test_missing_run_folder_suggests_runs_with_other_settings(
+    here: Path, run_egvs: Any, words: tuple[str, ...]
+) -> None:
+    for number, label in enumerate(("gamma=5", "frames=9", "gamma=6", "gamma=7")):
+        message = {
+            0: "egvs: runs/mini: no such folder. Give a folder",
+            1: "egvs: runs/mini: no such folder. Did you mean runs/mini@gamma=5?\n",
+            3: "egvs: runs/mini: no such folder. Runs with other settings are runs/mini@gamma=6, runs/mini@frames=9, "
+            "runs/mini@gamma=5; egvs runs lists them.\n",
+        }.get(number, "egvs: runs/mini: no such folder. ")
+        code, _, printed = run_egvs(*words)
+        assert code == 2 and printed.startswith(message)
+        run = Path(f"runs/mini@{label}")
+        run.mkdir(parents=True)
+        (run / "run.json").touch()
+        os.utime(run / "run.json", (100 + number, 100 + number))
+    (Path("runs") / "mini2@gamma=5").mkdir()
+    assert "runs/mini@frames=9 and 1 more; egvs runs lists them" in run_egvs(*words)[2]
+    assert run_egvs("verify", "mini")[2].startswith(
+        "egvs: mini: this is a scenario; expected a run folder. Runs with other settings are runs/mini@gamma=7, "
+    )
+
+
 def test_list_of_another_folder(here: Path, run_egvs: Any) -> None:
     assert run_egvs("runs", "elsewhere")[::2] == (
         2, "egvs: elsewhere: no such folder. Give a folder that contains run folders.\n"
