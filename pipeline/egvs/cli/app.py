@@ -800,13 +800,16 @@ def runs(
     folder: Annotated[
         Path | None, typer.Argument(metavar="[FOLDER]", help="Folder that contains run folders; runs by default.")
     ] = None,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Print a paragraph for each run, with all settings that differ.")
+    ] = False,
 ) -> None:
-    """List the runs: settings that differ from the scenario, the best site, size and age; the latest run first."""
+    """List the runs: state, the best site, size and age; the latest run first."""
     from egvs.artefacts.run_folder import RUNS
     from egvs.cli import run_list_table
     from egvs.runs import run_list
 
-    run_list_table.print_runs(run_list.list_runs(folder or RUNS))
+    run_list_table.print_runs(run_list.list_runs(folder or RUNS), with_details=verbose)
 
 
 @app.command()

@@ -53,7 +53,10 @@ CitySet = Annotated[
 def new(
     folder: Annotated[Path, typer.Argument(metavar="CITY", help="Folder of the new city.")],
     osm: Annotated[
-        Path, typer.Option(metavar="FILE", help="An OpenStreetMap extract (.osm, .osm.xml, .osm.pbf, also gzipped).")
+        Path,
+        typer.Option(
+            "--from", "--osm", metavar="FILE", help="An OpenStreetMap extract (.osm, .osm.xml, .osm.pbf, also gzipped)."
+        ),
     ],
     around: Annotated[
         str | None, typer.Option(metavar="LAT,LON", help="Only the streets around this point; all by default.")

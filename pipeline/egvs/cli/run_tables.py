@@ -291,7 +291,7 @@ def print_demo_hints(results: Path) -> None:
     out = console(_RESULT_FILE_WIDTH)
     out.print(f"next: egvs place {results} --count 2   (the best two sensors together)")
     out.print(f"      egvs explore {results}   (move a sensor and see its score; needs egvs[explore])")
-    out.print("      egvs new mytown --osm extract.osm.pbf   (your own junction, from OpenStreetMap)")
+    out.print("      egvs new mytown --from extract.osm.pbf   (your own junction, from OpenStreetMap)")
 
 
 def print_sensors(sensors: Iterable[Sensor]) -> None:
