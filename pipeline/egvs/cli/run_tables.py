@@ -98,7 +98,7 @@ def print_scores(folder: Path, record: RunRecord, top: int | None = None, *, bef
     for line in _outcome_sentences(folder, record, sites):
         out.print(line)
     if top is not None and len(sites) > top:
-        out.print(f"... and {len(sites) - top} more; omit --top, or see {folder / 'scores.parquet'}")
+        out.print(f"... and {len(sites) - top:,} more; omit --top, or see {folder / 'scores.parquet'}")
     if not before_answer and len({site.pole for site in sites}) < len(sites):
         out.print(poles_table(sites, top))
     by_period = PeriodRanking.read(folder)

@@ -35,6 +35,7 @@ from egvs.core.errors import Diagnostic, DiagnosticsError, InputError, unknown_s
 from egvs.core.grid import Vec3
 from egvs.core.numbers import parse_decimal
 from egvs.core.special import cosdg, sindg
+from egvs.core.wording import list_first
 from egvs.formats import vector_files
 from egvs.scenario.fields import MAX_COORDINATE_M
 from egvs.scenario.model import Scenario, SiteGrid, SiteLine
@@ -203,9 +204,8 @@ def _group_errors(errors: list[InputError]) -> Iterator[Diagnostic]:
     rows: dict[tuple[str, str], dict[str, None]] = {}
     for error in errors:
         rows.setdefault((error.problem, error.hint), {})[error.where] = None
-    for (problem, hint), (first, *more) in rows.items():
-        where = f"{first} and {len(more)} more" if more else first
-        yield Diagnostic.of("sites", InputError(where, problem, hint))
+    for (problem, hint), locations in rows.items():
+        yield Diagnostic.of("sites", InputError(list_first(list(locations), 1), problem, hint))
 
 
 _OVERRIDING_COLUMNS = {
