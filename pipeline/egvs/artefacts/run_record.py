@@ -71,6 +71,11 @@ def _is_digest_table(value: Any) -> bool:
     return isinstance(value, dict) and all(isinstance(digest, str) for digest in value.values())
 
 
+def traffic_summary(stages: Mapping[str, StageRecord]) -> Mapping[str, Any]:
+    """Return the summary of the stage traffic among ``stages``; empty before it has run."""
+    return stages["traffic"].summary if "traffic" in stages else {}
+
+
 _RECORD_TYPES = {
     "egvs": str, "seed": int, "scenario": dict, "scenario_folder": str, "stages": dict, "overrides": dict,
 }  # fmt: skip
@@ -148,7 +153,7 @@ class RunRecord:
     @property
     def traffic_summary(self) -> Mapping[str, Any]:
         """The summary of the stage traffic; empty before it has run."""
-        return self.stages["traffic"].summary if "traffic" in self.stages else {}
+        return traffic_summary(self.stages)
 
     def __repr__(self) -> str:
         return f"RunRecord({self.scenario.get('name', '?')}; stages {', '.join(self.stages)})"
