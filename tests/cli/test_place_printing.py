@@ -66,7 +66,7 @@ def test_shares_are_per_cent_with_errors_in_percentage_points(capsys: pytest.Cap
     text = printed(placed_two(), capsys)
     assert text.endswith(LAST_LINES)
     assert "adds, % points  found together  lost if it fails, % points" in text
-    assert " 4.7 ± 0.5    99.2 ± 0.3 %                        4.0" in text
+    assert " 4.7 ± 0.5    99.2 ± 0.3 %                         4.0" in text
     assert "± is one standard error, from 10 blocks of 100 frames" in text
 
 

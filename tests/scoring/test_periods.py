@@ -119,7 +119,7 @@ def test_run_with_periods_is_reproducible_and_reported(split: Path, tmp_path: Pa
     assert "in day" in head and "in night" in head
     page = (tmp_path / "out" / "report.html").read_text()
     assert "By period" in page
-    assert "night<br>(28.6 %)" in page
+    assert "night<br>(28.6\u00a0%)" in page
     assert ">40 frames<small>one every 0.5 s, 20 s in total, in 2 periods" in page
     assert "<dt>day</dt><dd>24 frames; 2 vehicles at a time, 2 in total;" in page
     assert page.index("<h2>Where the sites are") < page.index("<h2>By period")

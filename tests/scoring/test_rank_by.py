@@ -268,7 +268,7 @@ def test_terminal_and_report_show_the_score_that_ranks(mini: Path, tmp_path: Pat
     assert f"{best['site']} is the best of 2 sites: it {says}" in printed
     (head,) = (line for line in printed.splitlines() if "pole  " in line)
     assert head.index("well") < head.index("EGVS")
-    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8").replace("\u00a0", " ")
     assert f"{best['site']} is the best of 2 sites: it {says}" in page
     assert "Sites are ranked by the share of vehicles that they see well" in page
     assert 'data-label="Seen well"' in page

@@ -206,7 +206,7 @@ def test_table_has_the_areas(scored: tuple[egvs.Scenario, Path]) -> None:
 
 
 def test_report_shows_the_zones_of_the_best_site(scored: tuple[egvs.Scenario, Path]) -> None:
-    page = (scored[1] / "report.html").read_text()
+    page = (scored[1] / "report.html").read_text().replace("\u00a0", " ")
     rows = readers.read_zones(scored[1] / "zones.parquet", "pole_b")
     section = page[page.index('<section id="zones">') :]
     assert "from pole_b, the best site" in section

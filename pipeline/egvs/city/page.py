@@ -192,7 +192,7 @@ def render_page(
     )  # fmt: skip
     environment.filters |= {"svg": Markup, "percent": format_percent, "integer": formatting.format_count}
     score = results[0].best.by
-    return environment.get_template("city.html.j2").render(
+    html = environment.get_template("city.html.j2").render(
         city=city,
         results=results,
         score=score,
@@ -213,6 +213,7 @@ def render_page(
         script=Markup((CITY_TEMPLATES / "sort.js").read_text(encoding="utf-8")),
         version=__version__,
     )
+    return formatting.keep_percentages_together(html)
 
 
 def format_headline(results: Sequence[JunctionResult]) -> str:

@@ -288,7 +288,7 @@ def render_page(contents: PageContents) -> str:
         **_sentences(contents),
         **_warning_values(contents),
     }
-    return _template_environment().get_template("report.html.j2").render(values)
+    return formatting.keep_percentages_together(_template_environment().get_template("report.html.j2").render(values))
 
 
 def prepare() -> None:

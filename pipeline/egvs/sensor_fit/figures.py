@@ -227,7 +227,7 @@ def draw_map(fit: SensorFit) -> Figure | None:
         (best.on_surface, _BLUE, "returns on the static world"),
     ):
         plan.plot(points[members, 0], points[members, 1], ",", color=colour)
-        plan.plot([], [], "s", color=colour, label=f"{label}: {format_percent(np.mean(members), 0)}")
+        plan.plot([], [], "s", color=colour, label=f"{label}: {format_percent(float(np.mean(members)), 0)}")
     plan.add_collection(LineCollection(list(_wall_lines(map_pose.world)), colors="black", linewidths=0.8))
     plan.plot([], [], color="black", linewidth=0.8, label="walls of the static world")
     ahead = np.radians(pose.yaw_deg)

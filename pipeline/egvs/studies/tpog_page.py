@@ -60,13 +60,14 @@ def render_page(comparison: TpogComparison) -> str:
         "measured": format_measured, "measured_share": format_share, "measured_bit": format_bit,
         "measured_speed": format_speed,
     }  # fmt: skip
-    return environment.get_template("tpog.html.j2").render(
+    html = environment.get_template("tpog.html.j2").render(
         comparison=comparison,
         figures=draw_maps(comparison),
         speeds=draw_lane_speeds(comparison),
         style=Markup(STYLE_SHEET),
         version=__version__,
     )
+    return formatting.keep_percentages_together(html)
 
 
 def format_measured(measured: Measured | None) -> str:

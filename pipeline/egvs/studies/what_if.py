@@ -151,7 +151,7 @@ class WhatIfAnswer:
 
     def conclusion(self) -> str:
         """Return one sentence: whether the best site changes."""
-        if self.name == TOGETHER:
+        if self.share is None:  # all together
             time = TOGETHER
         else:
             time = f"{self.name} ({format_percent(self.share, 0)} of the time)"
