@@ -20,6 +20,7 @@ from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import read_periods
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, Grid
+from egvs.core.wording import format_percent
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
@@ -68,9 +69,9 @@ class LocationVisibility:
 
     def in_words(self) -> str:
         """Return the location, the share found with its standard error, and the number of vehicles, in one phrase."""
-        share = f"{self.share:.0%}"
+        share = format_percent(self.share, 0)
         if not math.isnan(self.se):
-            share = f"{100 * self.share:.0f} ± {100 * self.se:.0f}%"
+            share = f"{100 * self.share:.0f} ± {100 * self.se:.0f} %"
         return f"{self.words} ({share} of {self.vehicles:,} vehicles)"
 
 
@@ -126,9 +127,12 @@ class SiteBlindspots:
         if self.overall is None:
             return f"no vehicle in the region of interest, so none that {self.site} misses"
         if not self.worst:
-            return f"{self.site}: {self.overall.share:.0%} of the vehicles are found, on no listed lane fewer"
+            return (
+                f"{self.site}: {format_percent(self.overall.share, 0)} of the vehicles are found, on no "
+                "listed lane fewer"
+            )
         worst = "; ".join(location.in_words() for location in self.worst[:2])
-        return f"{self.site}: fewest vehicles are found here: {worst}"
+        return f"Of all lanes, turns and crossings, {self.site} finds the smallest shares of vehicles on: {worst}"
 
 
 def read_blindspots(path: Path, only: Collection[str] | None = None) -> Iterator[SiteBlindspots]:
@@ -221,9 +225,9 @@ class ZoneVisibility:
     def share_text(self) -> str:
         """The share with its standard error, where it is known."""
         if math.isnan(self.se):
-            return f"{self.share:.0%}"
+            return format_percent(self.share, 0)
         digits = 0 if 100 * self.se >= _WHOLE_PERCENT else 1
-        return f"{100 * self.share:.{digits}f} ± {100 * self.se:.{digits}f}%"
+        return f"{100 * self.share:.{digits}f} ± {100 * self.se:.{digits}f} %"
 
     def in_words(self) -> str:
         """Return zone, class, share and number of road users in one phrase."""
@@ -282,6 +286,20 @@ def worst_zones(rows: Sequence[ZoneVisibility]) -> list[ZoneVisibility]:
         if row.road_users >= MIN_VEHICLES and row.user_class != ALL_USERS:
             groups[row.user_class if row.user_class in groups else ""].append(row)
     return [min(group, key=lambda row: (row.share, row.zone)) for group in groups.values() if group]
+
+
+def describe_worst_zones(finder: str, worst: Sequence[ZoneVisibility]) -> str:
+    """Return in one line where a site or a plan finds the smallest shares.
+
+    Parameters
+    ----------
+    finder
+        Name of the site, or "the plan".
+    worst
+        From :func:`worst_zones`.
+    """
+    listed = "; ".join(zone.in_words() for zone in worst)
+    return f"Of all zones and classes of road users, {finder} finds the smallest shares in: {listed}"
 
 
 DISTINCT_PROBABILITY = 0.9

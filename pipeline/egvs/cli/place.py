@@ -13,6 +13,7 @@ import typer
 from egvs.cli import options, sources
 from egvs.cli.options import Jobs, Out, Set, SettingsPath
 from egvs.core.errors import InputError
+from egvs.core.wording import by_number, format_percent, number_of
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -100,7 +101,7 @@ def _check_request(count: int | None, budget: float | None, reach: float | None)
 
 
 def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequence[str] = (), caveat: str = "") -> None:
-    """Print the plan and the curve, the files, and what a planner should know, the answer to "how many?" last.
+    """Print the plan and the curve, what a planner should know, and the files.
 
     Parameters
     ----------
@@ -111,9 +112,9 @@ def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequen
     notes
         Sentences about the search.
     caveat
-        A last sentence, on what was assumed; may be empty.
+        The last sentence, on what was assumed; may be empty.
     """
-    from egvs.artefacts.readers import worst_zones
+    from egvs.artefacts.readers import describe_worst_zones, worst_zones
     from egvs.cli.console import WIDE, console, print_sentences
 
     out = console(WIDE, soft_wrap=False)
@@ -126,15 +127,18 @@ def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequen
     out.print()
     for zone in placed.zones:
         sensors = f" by {zone.by} sensors" if zone.by > 1 else ""
-        out.print(f"zone {zone.name}: {zone.seen:.1%} of its entropy seen{sensors}, {zone.share:.1%} required")
+        out.print(
+            f"zone {zone.name}: {format_percent(zone.seen)} of its entropy seen{sensors}, "
+            f"{format_percent(zone.share)} required"
+        )
     if worst := worst_zones(placed.zone_results):
-        print_sentences([f"The plan finds the smallest shares in: {'; '.join(zone.in_words() for zone in worst)}"])
-    for path in placed.files:
-        out.print(str(path), soft_wrap=True)
+        print_sentences([describe_worst_zones("the plan", worst)])
     sentences = [describe_plan(placed), *notes, *_further_sentences(placed, requested)]
     if caveat:
         sentences.append(caveat)
     print_sentences(sentences)
+    for path in placed.files:
+        out.print(str(path), soft_wrap=True)
 
 
 def _further_sentences(placed: Placement, requested: PlacementConfig) -> Iterator[str]:
@@ -204,7 +208,7 @@ def _curve_table(placed: Placement, width: int) -> Table:
         Column[int]("sensors", lambda i: str(steps[i].count)),
         Column[int](head(_together_head(by)), lambda i: by.with_error(steps[i].score, steps[i].score_se)),
         Column[int](head("adds", by.change_head), lambda i: by.change(steps[i].gain, steps[i].gain_se)),
-        Column[int](head("of all candidates"), lambda i: f"{_score_share(placed, steps[i].score):.1%}"),
+        Column[int](head("of all candidates"), lambda i: format_percent(_score_share(placed, steps[i].score))),
         Column[int](head("proved, of the best possible"), lambda i: _format_rounded_down(curve[i].certificate)),
     ]
     if any(placed.curve_costs):
@@ -266,7 +270,7 @@ def describe_plan(placed: Placement) -> str:
     score = by.says.format(f"{by.with_error(joint, placed.steps[-1].score_se)} {by.unit}".rstrip())
     if placed.joint_of_all > 0:
         share = _score_share(placed, joint)
-        score += f", {share:.1%} of what all {placed.candidates} candidates reach together"
+        score += f", {format_percent(share)} of what all {placed.candidates} candidates reach together"
     return f"The plan {sites}{cost} {score}; {_describe_proof(placed)}."
 
 
@@ -296,10 +300,10 @@ def _describe_proof(placed: Placement) -> str:
         fewer = len(placed.sensors) - 1
         if fewer == 0:
             return "one sensor is enough"
-        noun = "sensor is" if fewer == 1 else "sensors are"
+        sensors = f"{number_of(fewer, 'sensor')} {by_number(fewer, 'is', 'are')}"
         if solution.fewest_is_proved:
-            return f"proved: {fewer} {noun} not enough"
-        return f"not proved that {fewer} {noun} not enough"
+            return f"proved: {sensors} not enough"
+        return f"not proved that {sensors} not enough"
     if solution.is_best:
         return "proved: no plan within the rules is better"
     return f"proved: at least {_format_rounded_down(placed.certificate)} of the best possible score"
@@ -324,5 +328,5 @@ def describe_refinement(placed: Placement, summary: RefinementSummary) -> str:
 def _format_rounded_down(share: float) -> str:
     """Return a proved share in per cent, never rounded up."""
     if share >= 1.0:
-        return "100%"
-    return f"{math.floor(share * 1e4) / 1e2:.2f}%"
+        return "100 %"
+    return f"{math.floor(share * 1e4) / 1e2:.2f} %"
