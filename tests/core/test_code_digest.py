@@ -177,12 +177,12 @@ SOURCE_BEFORE = {
 
 GROWTH = {
     "check": 1.58,
-    "statics": 1.47,
+    "statics": 1.48,
     "scan": 1.46,
     "traffic": 1.85,
     "tpog": 1.45,
     "score": 1.46,
-    "report": 1.75,
+    "report": 1.76,
 }
 """Allowed growth, 1.1 for the others: a stage runs again whenever a line behind its key changes."""
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from egvs.cli.options import Set, SettingsPath
+from egvs.cli import options
+from egvs.cli.options import Detector, Set, SettingsPath
 
 if TYPE_CHECKING:
     from egvs.studies.what_if import SiteScores, WhatIfAnswer, WhatIfResult, WhatIfRun
@@ -19,6 +20,7 @@ _Values = Callable[["SiteScores"], tuple[float | None, ...]]
 
 def what_if(
     scenario: SettingsPath,
+    detector: Detector = None,
     set_: Set = None,
     only: Annotated[
         list[str] | None,
@@ -32,7 +34,7 @@ def what_if(
         from egvs.runs import run
         from egvs.studies import what_if as study
 
-        prepared = study.prepare_runs(scenario, set_ or [], only or [])
+        prepared = study.prepare_runs(scenario, options.with_detector(set_, detector), only or [])
         total = len(prepared)
         width = max(len(_run_label(what_if_run)) for what_if_run in prepared)
 

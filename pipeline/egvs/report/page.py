@@ -402,7 +402,9 @@ def _warning_values(contents: PageContents) -> dict[str, Any]:
     traffic = contents.stages.get("traffic")
     return {
         "warnings": warnings,
-        "reliability": describe_reliability(contents.ranking, traffic.summary if traffic else None),
+        "reliability": describe_reliability(
+            contents.ranking, traffic.summary if traffic else None, contents.scenario.score.ranking_detectors
+        ),
         "poles_on_road": describe_poles_on_road(contents.ranking.poles[:NAMED_POLES], warnings),
     }
 
