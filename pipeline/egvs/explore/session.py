@@ -64,7 +64,7 @@ Floats = NDArray[np.float64]
 
 
 def _score_text(name: str, value: float) -> str:
-    """Return a score with its name and unit, e.g. "egvs 1,234 bit" or "expected_detections 61.3%"."""
+    """Return a score with its name and unit, e.g. "egvs 1,234 bit" or "expected_detections 61.3 %"."""
     label = SCORE_LABELS[name]
     return f"{name} {label.value(value)} {label.unit}".strip()
 

@@ -16,13 +16,12 @@ from egvs.artefacts import parquet
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.artefacts.run_record import StageRecord
 from egvs.core.errors import InputError
-from egvs.core.wording import by_number, list_first
+from egvs.core.wording import by_number, format_percent, list_first
 from egvs.report.formatting import (
     SCORE_LABELS,
     ScoreLabel,
     format_count,
     format_number,
-    format_percent,
     format_probability,
     join_names,
 )
@@ -432,7 +431,7 @@ def lead(ranking: Ranking, hint: str = "") -> str:
         text += f" {hint}"
     if len(ranking.close) > 1:
         names = list_first([site.site for site in ranking.close], 4)
-        text += f" {len(ranking.close)} other sites score within {CLOSE_SHARE:.0%} of the best: {names}."
+        text += f" {len(ranking.close)} other sites score within {format_percent(CLOSE_SHARE, 0)} of the best: {names}."
     return text
 
 
@@ -471,7 +470,7 @@ def _format_gap(ranking: Ranking, second: RankedSite) -> str:
     if is_share:
         return f"{gap_text} percentage points"
     owner = by_number(len(ranking.best), "its", "their")
-    return f"{gap_text}% of {owner} score"
+    return f"{gap_text} % of {owner} score"
 
 
 def entropy_seen_note(ranking: Ranking) -> str:

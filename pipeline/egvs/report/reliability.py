@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from egvs.core.wording import format_percent
 from egvs.report.formatting import join_names
 from egvs.report.ranking import RankedSite, Ranking
 from egvs.scenario.score_config import DEFAULT_SCORE
@@ -23,7 +24,7 @@ _SIZE_NOTE = (
     "The order of sites by this score was validated, the size of the score less: in the studies, detectors found up to "
     "27 percentage points fewer vehicles than expected (docs/validity.md)."
 )
-_COVERAGE_NOTE = "The recorded tracks cover {share:.0%} of the {of}; elsewhere the traffic is unknown."
+_COVERAGE_NOTE = "The recorded tracks cover {} of the {}; elsewhere the traffic is unknown."
 _TILT_NOTE = "The sensor of {} is tilted; tilted sensors were not part of the validation (docs/validity.md)."
 
 
@@ -60,7 +61,9 @@ def describe_reliability(
         notes.append(_SIZE_NOTE)
     if notes:
         sentences.append(" ".join(notes))
-    sentences += [_COVERAGE_NOTE.format(**coverage) for coverage in recordings]
+    sentences += [
+        _COVERAGE_NOTE.format(format_percent(coverage["share"], 0), coverage["of"]) for coverage in recordings
+    ]
     if max(abs(best.pitch_deg), abs(best.roll_deg)) >= MIN_TILT_DEG:
         sentences.append(_TILT_NOTE.format(best.site))
     limits = list(_limits(best, [site for site in ranking.sites if site.pole == best.pole]))

@@ -19,6 +19,7 @@ from egvs.artefacts.extra_columns import extra_columns
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import Tpog
 from egvs.core.errors import WARNINGS_KEY, Diagnostic
+from egvs.core.wording import format_percent
 from egvs.effects import registry
 from egvs.effects.base import Effect
 from egvs.formats.georeference import Georeference
@@ -277,7 +278,7 @@ def warn_period_disagreements(scores: ScoreTable, rank_by: str) -> Iterator[Diag
         if not is_clear:
             continue
 
-        less = f"{100 * loss:.1f} percentage points" if is_share else f"{loss:.1%}"
+        less = f"{100 * loss:.1f} percentage points" if is_share else format_percent(loss)
         problem = (
             f"the best site is {scores.sites[period_best]}; {scores.sites[mix_best]}, the best of the mix, "
             f"has rank {column.rank[mix_best]} and scores {less} less"
@@ -341,7 +342,8 @@ def _warn_sites_in_traffic(sites: Iterable[Site], tpog: Tpog) -> Iterator[Diagno
             yield Diagnostic(
                 "sites on the road",
                 f"site {site.name}",
-                f"vehicles drive through its position ({at_m[0]:g}, {at_m[1]:g}) in {share:.1%} of the frames",
+                f"vehicles drive through its position ({at_m[0]:g}, {at_m[1]:g}) in {format_percent(share)} "
+                "of the frames",
                 f"Move it beside the road, or more than {clearances.CLEARANCE_M:g} m above it.",
             )
 
