@@ -157,6 +157,24 @@ def test_hint_names_the_setting_that_limits_the_error(mini: Path) -> None:
     assert "longer periods" in report_ranking.more_frames_hint(load(SCENARIOS / "nishishinjuku_peaks"), by, 400)
 
 
+@pytest.mark.parametrize(("by_detectors", "asks_for_traffic"), [(0.004, False), (0.0029, False), (0.0028, True)])
+def test_hint_is_not_more_traffic_where_detectors_disagree(
+    mini: Path, by_detectors: float, asks_for_traffic: bool
+) -> None:
+    """Of an error of 0.4 points, more than half of the square is due to detectors from 0.283 points on."""
+    sites = with_rivals(("a", "p", 0.9, 0.0, 0.5), ("c", "q", 0.895, 0.004, 0.6))
+    rival = replace(sites.sites[1], behind_best_detectors_se=by_detectors)
+    sites = replace(sites, sites=(sites.sites[0], rival))
+    scenario = load(mini, ["score.rank_by='expected_detections'"])
+    hint = report_ranking.recorded_frames_hint(scenario, sites, {})
+    assert (hint == "") == asks_for_traffic  # there is no record of the traffic
+    if hint:
+        assert hint == (
+            "The detectors disagree about this difference, and more traffic does not change that: see --detector "
+            "cluster and --detector pointpillars."
+        )
+
+
 def test_note_on_the_site_that_sees_most_entropy() -> None:
     """Of two with the same score, one that sees more contradicts nothing."""
     tied = ranking(("a", 100.0, 1, 0.5, 0.5), ("b", 100.0, 1, 0.6, 0.99), ("c", 80.0, 3, 0.4, 1.0))

@@ -20,6 +20,7 @@ from egvs.core.errors import InputError
 from egvs.formats import georeference
 from egvs.scenario import loading
 from egvs.scoring import zone_results, zones
+from egvs.scoring.target_scores import DETECTORS
 from egvs.scoring.targets import TargetRecord
 from egvs.scoring.zone_results import ZoneUsers
 from egvs.stages import site_scoring
@@ -117,7 +118,7 @@ def test_sensors_together_miss_what_both_miss(monkeypatch: pytest.MonkeyPatch) -
         def __init__(self, chance: float) -> None:
             self.points, self.chance = np.full(len(record), 12.0), chance
 
-    monkeypatch.setattr(zone_results, "detection_probabilities", lambda seen: np.full(len(record), seen.chance))
+    monkeypatch.setattr(zone_results, "detection_probabilities", lambda seen, _: np.full(len(record), seen.chance))
     both = users.together([Seen(0.5), Seen(0.6)])  # type: ignore[list-item]
     assert both.share == pytest.approx([0.8] * 4)
     assert both.with_points.tolist() == [4, 2, 1, 1]
@@ -155,7 +156,7 @@ def test_table_equals_a_loop_over_frames(scored: tuple[egvs.Scenario, Path]) -> 
     expected = {}
     for scan in empty_scans(context):
         visible = targets.visible(scan.beams)
-        chances = zone_results.detection_probabilities(visible)
+        chances = zone_results.detection_probabilities(visible, DETECTORS)
         row = 0
         found = defaultdict(list)
         for recorded in traffic_frames.read_frames(out / "trajectories.parquet", np.arange(40)):

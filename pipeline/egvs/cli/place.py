@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from egvs.cli import options, sources
-from egvs.cli.options import Jobs, Out, Set, SettingsPath
+from egvs.cli.options import Detector, Jobs, Out, Set, SettingsPath
 from egvs.core.errors import InputError
 from egvs.core.wording import by_number, format_percent, number_of
 
@@ -53,6 +53,7 @@ def place(
         bool,
         typer.Option("--refine", help="Afterwards, optimise each pose within the limits of \\[placement.refine]."),
     ] = False,
+    detector: Detector = None,
     set_: Set = None,
     jobs: Jobs = None,
 ) -> None:
@@ -61,11 +62,12 @@ def place(
 
     limit_s = options.duration_s(time_limit, "--time-limit")
     _check_request(count, budget, reach)
+    overrides = options.with_detector(set_, detector, scenario)
     request = []
     for key, value in zip(_REQUEST_KEYS, (count, budget, reach), strict=True):
         if value is not None:
             request.append(f"placement.{key}={value!r}")
-    loaded, folder = sources.open_source(scenario, set_, out, request)
+    loaded, folder = sources.open_source(scenario, overrides, out, request)
     with ProgressDisplay("place") as screen:
         from egvs.artefacts.run_record import RunRecord
         from egvs.cli import answer

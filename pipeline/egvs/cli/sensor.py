@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from egvs.cli.options import Jobs, Set, SettingsPath
+from egvs.cli.options import Detector, Jobs, Set, SettingsPath
 from egvs.cli.quick_help import QuickHelpGroup
 from egvs.core.errors import InputError
 from egvs.core.wording import format_percent
@@ -310,6 +310,7 @@ def design(
     elevation_evaluations: Annotated[
         int, typer.Option(metavar="N", help="Sets of elevations that are tried for free channels.")
     ] = _REQUEST.elevation_evaluations,
+    detector: Detector = None,
     set_: Set = None,
     out: Annotated[
         Path | None,
@@ -325,7 +326,7 @@ def design(
     if not pole:
         raise InputError("--pole", "no pole is given", "Use the name of a pole, or of a site on it.")
     heights_m = None if heights is None else options.heights_m(heights)
-    loaded, folder = sources.open_source(scenario, set_, None)
+    loaded, folder = sources.open_source(scenario, options.with_detector(set_, detector, scenario), None)
     with ProgressDisplay("sensor design") as screen:
         from egvs.cli import answer
         from egvs.placement import sensor_design

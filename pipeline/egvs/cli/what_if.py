@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from egvs.cli.options import Set, SettingsPath
+from egvs.cli import options
+from egvs.cli.options import Detector, Set, SettingsPath
 from egvs.core.wording import format_percent
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ _Values = Callable[["SiteScores"], tuple[float | None, ...]]
 
 def what_if(
     scenario: SettingsPath,
+    detector: Detector = None,
     set_: Set = None,
     only: Annotated[
         list[str] | None,
@@ -33,7 +35,7 @@ def what_if(
         from egvs.runs import run
         from egvs.studies import what_if as study
 
-        prepared = study.prepare_runs(scenario, set_ or [], only or [])
+        prepared = study.prepare_runs(scenario, options.with_detector(set_, detector), only or [])
         total = len(prepared)
         width = max(len(_run_label(what_if_run)) for what_if_run in prepared)
 

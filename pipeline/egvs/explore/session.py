@@ -364,7 +364,7 @@ class Session:
         beams = self.beams(site)
         probability = detection_probability(self.scene_with(site), beams.sensor)
         visible = visible_targets(targets.record, beams, probability)
-        visibility = targets.spots.visibility(visible.points, TARGET_SCORES[DEFAULT_SCORE](visible))
+        visibility = targets.spots.visibility(visible.points, TARGET_SCORES[DEFAULT_SCORE](visible, targets.detectors))
         return site_blindspots(site.name, targets.spots, visibility, self.tpog.grid)
 
     def points_map(self, site: Site, target: str) -> PointsMap | None:

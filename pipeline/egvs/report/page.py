@@ -398,7 +398,9 @@ def _warning_values(contents: PageContents) -> dict[str, Any]:
     warnings = collect_warnings(stage.summary for stage in contents.stages.values())
     return {
         "warnings": warnings,
-        "reliability": describe_reliability(contents.ranking, traffic_summary(contents.stages)),
+        "reliability": describe_reliability(
+            contents.ranking, traffic_summary(contents.stages), contents.scenario.score.ranking_detectors
+        ),
         "poles_on_road": describe_poles_on_road(contents.ranking.poles[:NAMED_POLES], warnings),
     }
 

@@ -177,7 +177,11 @@ def _write_scores(
     if egvs.estimate is not None:
         optional["egvs_bias"] = egvs.estimate.bias
         optional["beats_next"] = ranking.beats_next
-        optional["behind_best_se"], optional["best_beats"] = ranking.behind_best
+        behind_best = ranking.behind_best
+        optional["behind_best_se"] = behind_best.se
+        optional["best_beats"] = behind_best.best_beats
+        if ranking.has_detectors:
+            optional["behind_best_detectors_se"] = behind_best.detectors_se
     user_columns = _user_columns(context)
     with parquet.artefact_writer(context.folder.scores, "scores", tuple(optional), extra=user_columns) as file:
         file.write(columns | optional | user_columns)
