@@ -190,9 +190,7 @@ class TrafficRecorder:
             handle.batched_positions = _fill(positions_m, most, 0.0)
             handle.batched_wxyzs = _fill(np.reshape(turns, (-1, 4)), most, [1.0, 0.0, 0.0, 0.0])
             handle.batched_scales = _fill(scales, most, 0.0)
-            handle.batched_colors = _fill(drawing.linear_colours(colours[rows]).astype(np.float64), most, 0.0).astype(
-                np.uint8
-            )
+            handle.batched_colors = _fill(drawing.linear_colours(colours[rows]), most, 0.0).astype(np.uint8)
         if self._returns is not None:
             returns_m = self._clip.returns_m[index][:: self._clip.returns_step] - self._zero_m
             self._returns.points = returns_m.astype(np.float32)
