@@ -40,13 +40,13 @@ from egvs.core.grid import FloatArray, IntArray
 from egvs.core.special import expit
 from egvs.kernels.boosted_trees import add_tree_values
 from egvs.scoring.blindspots import SpotVisibility
-from egvs.scoring.targets import SEEN_WELL_POINTS, VisibleTargets, weighted_mean
+from egvs.scoring.targets import SEEN_WELL_POINTS, TargetVisibility, weighted_mean
 
 Gain = Callable[[FloatArray], FloatArray]
 """Gain of points (n,) on vehicles, (n,)."""
 
-TargetScore = Callable[[VisibleTargets], FloatArray]
-"""Score of each vehicle-frame that a site sees, (n,)."""
+TargetScore = Callable[[TargetVisibility], FloatArray]
+"""Score of each vehicle-frame as a site sees it, or several together, (n,)."""
 
 MODEL_FILE = Path(__file__).with_name("target_scores.json")
 
@@ -71,7 +71,7 @@ MONOTONICITY = {
 """For each feature: 1 if the probability may only rise with it, -1 if it may only fall, 0 for either."""
 
 FEATURES = tuple(MONOTONICITY)
-"""Features of the model, see :class:`egvs.scoring.targets.VisibleTargets`: logarithms of 1 + points, gaps of at most
+"""Features of the model, see :class:`egvs.scoring.targets.TargetVisibility`: logarithms of 1 + points, gaps of at most
 :data:`ISOLATED_GAP_M`."""
 
 
@@ -107,7 +107,7 @@ def saturating_gain(points: FloatArray) -> FloatArray:
     return gain
 
 
-def points_on_target(visible: VisibleTargets, gain: Gain = log_points, weight: FloatArray | None = None) -> float:
+def points_on_target(visible: TargetVisibility, gain: Gain = log_points, weight: FloatArray | None = None) -> float:
     """Return the mean gain of a site's points; NaN without any vehicle.
 
     Parameters
@@ -122,13 +122,13 @@ def points_on_target(visible: VisibleTargets, gain: Gain = log_points, weight: F
     return weighted_mean(gain(visible.points), weight)
 
 
-def seen_well(visible: VisibleTargets, weight: FloatArray | None = None) -> float:
+def seen_well(visible: TargetVisibility, weight: FloatArray | None = None) -> float:
     """Return the share of well visible vehicles, 0 to 1; parameters as in :func:`points_on_target`."""
     return points_on_target(visible, saturating_gain, weight)
 
 
 def expected_detections(
-    visible: VisibleTargets, detectors: Sequence[str] = DETECTORS, weight: FloatArray | None = None
+    visible: TargetVisibility, detectors: Sequence[str] = DETECTORS, weight: FloatArray | None = None
 ) -> float:
     """Return the share of vehicles that detectors are expected to find, 0 to 1; NaN without any vehicle.
 
@@ -146,7 +146,7 @@ def expected_detections(
     return weighted_mean(detection_chances(visible, detectors), weight)
 
 
-def detection_chances(visible: VisibleTargets, detectors: Sequence[str] = DETECTORS) -> FloatArray:
+def detection_chances(visible: TargetVisibility, detectors: Sequence[str] = DETECTORS) -> FloatArray:
     """Return the probability that each vehicle-frame is detected, averaged over detectors, (n,) float64, 0 to 1.
 
     Raises
@@ -159,7 +159,7 @@ def detection_chances(visible: VisibleTargets, detectors: Sequence[str] = DETECT
     return np.where(visible.points > 0.0, chances, 0.0)
 
 
-def detectability_features(visible: VisibleTargets) -> FloatArray:
+def detectability_features(visible: TargetVisibility) -> FloatArray:
     """Return :data:`FEATURES` of what a site sees, (n, f) float64."""
     return np.column_stack([
         np.log1p(visible.points),
@@ -232,18 +232,18 @@ def detectability_model(detector: str) -> DetectabilityModel:
     return DetectabilityModel.of(json.loads(MODEL_FILE.read_text(encoding="utf-8"))["detectors"][detector])
 
 
-def _score_detection(visible: VisibleTargets) -> FloatArray:
+def _score_detection(visible: TargetVisibility) -> FloatArray:
     """Return the probability of detection; for people, for whom there is no model, the saturating gain."""
     if not len(visible):
         return np.empty(0)
     return np.where(visible.record.are_people, saturating_gain(visible.points), detection_chances(visible))
 
 
-def _score_points(visible: VisibleTargets) -> FloatArray:
+def _score_points(visible: TargetVisibility) -> FloatArray:
     return log_points(visible.points)
 
 
-def _score_seen_well(visible: VisibleTargets) -> FloatArray:
+def _score_seen_well(visible: TargetVisibility) -> FloatArray:
     return saturating_gain(visible.points)
 
 
