@@ -3,8 +3,8 @@
     python -m benchmarks.placement.fused_scores scenarios/ingolstadt scenarios/hill --out runs/pairs
 
 Both are ``expected_detections``: of independent sensors, and of fused points (:mod:`egvs.scoring.fused_targets`). For
-the single sites and some pairs of sites of each junction, both are computed on the same vehicles in the same frames of
-held-out traffic as the detections. Pairs are drawn at random, most of them at different poles.
+some pairs of sites of each junction, and on request for the single sites, both are computed on the same vehicles in the
+same frames of held-out traffic as the detections. Pairs are drawn at random, most of them at different poles.
 
 *Level*: the share of vehicles that is expected, minus the share that is found; a vehicle is found where a detection
 overlaps it by more than 0.7, in the mean of the overlaps from above and in 3D, as in the model of detection. Standard
@@ -145,7 +145,8 @@ def measure_junction(
     )
     sites = held_out.scene.sites
     pairs = draw_pairs(sites, arguments.pairs, arguments.same_pole_pairs, arguments.seed)
-    groups = [*(SensorGroup((site,)) for site in sites), *pairs]
+    single = [SensorGroup((site,)) for site in sites] if arguments.single_sites else []
+    groups = [*single, *pairs]
     frames = list(held_out.read())
     record = TargetRecord.of(frames, scenario.roi.grid)
     views = site_views(held_out, record, sites)
@@ -240,8 +241,9 @@ def main() -> None:
     parser.add_argument("scenarios", nargs="+", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--frames", type=int, default=40)
-    parser.add_argument("--pairs", type=int, default=8, help="pairs of sites at different poles")
+    parser.add_argument("--pairs", type=int, default=6, help="pairs of sites at different poles")
     parser.add_argument("--same-pole-pairs", type=int, default=2, help="pairs of sites at the same pole")
+    parser.add_argument("--single-sites", action="store_true", help="detect from every single site as well")
     parser.add_argument("--seed", type=int, default=1, help="of the choice of pairs")
     parser.add_argument("--detectors", nargs="+", default=["cluster"])
     parser.add_argument("--jobs", type=int)
