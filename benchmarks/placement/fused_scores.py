@@ -27,9 +27,9 @@ import numpy as np
 from benchmarks.detectability.examples import hits_of
 from egvs.cli.validation_tables import PlanRunDisplay
 from egvs.core import files
-from egvs.core.grid import FloatArray
+from egvs.core.grid import FloatArray, IntArray
 from egvs.scenario.loading import load
-from egvs.scoring.fused_targets import fuse_targets
+from egvs.scoring.fused_targets import fuse_targets, fused_scores
 from egvs.scoring.target_scores import detection_chances
 from egvs.scoring.targets import TargetRecord, VisibleTargets, detection_probability, visible_targets
 from egvs.scoring.visibility import Beams
@@ -53,8 +53,9 @@ APART_S = 7.0
 
 AP_MEASURES = ("ap_bev_r40_iou70", "ap_3d_r40_iou70")
 
-INDEPENDENT, FUSED = "independent", "fused"
-"""The two joint scores."""
+INDEPENDENT, FUSED, MOST_POINTS, BEST_SINGLE = "independent", "fused", "fused, view with most points", "best sensor"
+"""The two joint scores; fused points with the view of the sensor with most points; and the highest probability of the
+single sensors, as if their points were not fused."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,12 +93,15 @@ class JunctionResult:
         Name of the scenario.
     block
         Block of frames of each vehicle-frame, (n,) int64.
+    block_frames
+        Number of frames of each block, (blocks,) int64.
     groups
         Single sensors, then pairs.
     """
 
     junction: str
-    block: FloatArray
+    block: IntArray
+    block_frames: IntArray
     groups: tuple[GroupResult, ...]
 
 
@@ -121,8 +125,13 @@ def at_same_pole(group: SensorGroup) -> bool:
 
 def expected_chances(views: Sequence[VisibleTargets], detector: str) -> dict[str, FloatArray]:
     """Return the probability that each vehicle-frame is found with several sensors, by score, (n,) float64 each."""
-    missed = np.prod([1.0 - detection_chances(view, (detector,)) for view in views], axis=0)
-    return {INDEPENDENT: 1.0 - missed, FUSED: detection_chances(fuse_targets(views), (detector,))}
+    single = np.array([detection_chances(view, (detector,)) for view in views])
+    return {
+        INDEPENDENT: 1.0 - np.prod(1.0 - single, axis=0),
+        FUSED: fused_scores(views, lambda fused: detection_chances(fused, (detector,))),
+        MOST_POINTS: detection_chances(fuse_targets(views), (detector,)),
+        BEST_SINGLE: single.max(axis=0),
+    }
 
 
 def site_views(held_out: HeldOutTraffic, record: TargetRecord, sites: Sequence[Site]) -> dict[str, VisibleTargets]:
@@ -155,7 +164,7 @@ def measure_junction(
     detections = run_detectors(groups, task, jobs=arguments.jobs, listener=PlanRunDisplay(print))
     rows, _ = measure_detection(frames, held_out.scene.roi, detections)
     measures = {(row.site, row.detector): row.measures for row in rows if row.objects_of == ALL_OBJECTS}
-    block = frame_blocks(len(frames))[record.frame]
+    block_of_frame = frame_blocks(len(frames))
 
     results = {}
     for detector in detectors:
@@ -172,7 +181,9 @@ def measure_junction(
                     ap=float(np.mean([of_group[name].value for name in AP_MEASURES])),
                 )
             )
-        results[detector] = JunctionResult(scenario.name, block, tuple(of_detector))
+        results[detector] = JunctionResult(
+            scenario.name, block_of_frame[record.frame], np.bincount(block_of_frame), tuple(of_detector)
+        )
     return results
 
 
@@ -181,11 +192,21 @@ def _boxes(result: DetectorResult) -> list[FloatArray]:
     return [frame.boxes for frame in result.frames]
 
 
-def mean_difference(first: Sequence[FloatArray], second: Sequence[FloatArray], block: FloatArray) -> JackknifeEstimate:
-    """Return the mean over groups and vehicle-frames of the first minus the second values, with its standard error."""
+def mean_difference(
+    first: Sequence[FloatArray], second: Sequence[FloatArray], block: IntArray, block_frames: IntArray
+) -> JackknifeEstimate:
+    """Return the mean over groups and vehicle-frames of the first minus the second values, with its standard error.
+
+    Parameters
+    ----------
+    first, second
+        Values of each group, (n,) float64 each.
+    block, block_frames
+        As in :class:`JunctionResult`.
+    """
     differences = np.mean([a - b for a, b in zip(first, second, strict=True)], axis=0)
     values = [differences.mean(), *(differences[block != left_out].mean() for left_out in range(BLOCKS))]
-    return JackknifeEstimate.from_values(np.array(values), np.bincount(block, minlength=BLOCKS))
+    return JackknifeEstimate.from_values(np.array(values), block_frames)
 
 
 def rank_correlation(first: Sequence[float], second: Sequence[float]) -> float:
@@ -196,8 +217,10 @@ def rank_correlation(first: Sequence[float], second: Sequence[float]) -> float:
 
 def lines(results: Sequence[JunctionResult]) -> Iterator[str]:
     """Yield the table of one detector."""
-    yield "| junction | sensors | groups | found | independent: level | fused: level | rho: independent | rho: fused |"
-    yield "|---|---|---:|---:|---:|---:|---:|---:|"
+    names = list(results[0].groups[0].expected)
+    heads = [*(f"{name}: level" for name in names), *(f"rho: {name}" for name in names)]
+    yield f"| junction | sensors | groups | found | AP | {' | '.join(heads)} |"
+    yield f"|---|---|{'---:|' * (len(heads) + 3)}"
     for result in results:
         single = [group for group in result.groups if len(group.sites) == 1]
         pairs = [group for group in result.groups if len(group.sites) > 1]
@@ -208,10 +231,11 @@ def lines(results: Sequence[JunctionResult]) -> Iterator[str]:
                 continue
             found = [group.found for group in groups]
             cells = [result.junction, name, str(len(groups)), f"{100 * np.mean(found):.1f}"]
+            cells.append(f"{100 * np.mean([group.ap for group in groups]):.1f}")
             ranks = []
-            for score in (INDEPENDENT, FUSED):
+            for score in names:
                 expected = [group.expected[score] for group in groups]
-                cells.append(_points(mean_difference(expected, found, result.block)))
+                cells.append(_points(mean_difference(expected, found, result.block, result.block_frames)))
                 rho = rank_correlation([values.mean() for values in expected], [group.ap for group in groups])
                 ranks.append(f"{rho:.2f}" if len(groups) > 3 else "")
             yield f"| {' | '.join(cells + ranks)} |"

@@ -8,13 +8,14 @@ points of all sensors of a plan S are added on each vehicle-frame i before the m
 
 People, for whom there is no model, are found with :math:`1 - e^{-n/20}` for the n points of all sensors.
 
-E_f is neither monotone nor submodular: a further sensor may open a hole between points, or be the one with most
-points although it sees the vehicle less well. So the tangents that bound the joint score of independent sensors do not
-bound E_f, and nothing is proved about plans by E_f.
+E_f is neither monotone nor submodular: a further sensor may open a hole between points, or lift a vehicle over a
+threshold of the model that neither sensor reaches alone. So the tangents that bound the joint score of independent
+sensors do not bound E_f, and nothing is proved about plans by E_f.
 
 The search is local (:func:`improve_by_fused_swaps`). It begins at the best plan of independent sensors and replaces one
 sensor at a time, by one of the :data:`SWAP_CANDIDATES` candidates that add most to the others as independent sensors,
-as long as E_f rises. Only the candidates that are tried are scanned; a value takes a few milliseconds.
+as long as E_f rises. Only the candidates that are tried are scanned. A value takes about
+6 ms per sensor for 2,000 vehicle-frames.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from egvs.artefacts.plan_step import PlanStep
 from egvs.core.grid import FloatArray
 from egvs.placement.plan_error import PlanErrors
 from egvs.placement.problem import Plan, Problem
-from egvs.scoring.fused_targets import fuse_targets
+from egvs.scoring.fused_targets import fused_scores
 from egvs.scoring.target_scores import TARGET_SCORES
 from egvs.scoring.targets import VisibleTargets, weighted_mean
 from egvs.scoring.visibility import Beams
@@ -77,7 +78,7 @@ class FusedScore:
         if not plan:
             return np.zeros(len(self.targets.record))
         self.prepare(plan)
-        return TARGET_SCORES[FUSED_SCORE](fuse_targets([self._visible[self.names[i]] for i in plan]))
+        return fused_scores([self._visible[self.names[i]] for i in plan], TARGET_SCORES[FUSED_SCORE])
 
     def value(self, plan: Sequence[int]) -> float:
         """Return the share of vehicles that a plan is expected to find, 0 to 1."""
