@@ -93,7 +93,7 @@ ACCEPTED_SITE, SCAN = "kerb_NW", "scan.pcd"
 """The site of ``egvs accept``, and a simulated scan of its sensor."""
 
 VERBS = (
-    Verb("new imported --osm small.osm"),
+    Verb("new imported --from small.osm"),
     Verb("demo example"),
     Verb("check short"),
     Verb("run short --out new", saves_results=True),
@@ -101,7 +101,7 @@ VERBS = (
     Verb("explore run --no-browser --port 0", saves_results=True, is_server=True),
     Verb("compare run other"),
     Verb("what-if short", saves_results=True),
-    Verb("city new town --osm small.osm --junctions all"),
+    Verb("city new town --from small.osm --junctions all"),
     Verb("city traffic city", saves_results=True),
     Verb("city run city --out new --cluster processes=1", saves_results=True),
     Verb("city place city --out city_run --count 2 --cluster processes=1", saves_results=True),
@@ -132,7 +132,7 @@ VERBS = (
 PREPARATION = {
     "run": "run short --out run",
     "other": "run short --out other --set score.gamma=5",
-    "city": "city new city --osm small.osm --junctions all",
+    "city": "city new city --from small.osm --junctions all",
     "city_run": "city place city --out city_run --count 2 --cluster processes=1",
     "city_other": "city place city --out city_other --count 2 --cluster processes=1 --set score.gamma=5",
 }

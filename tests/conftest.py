@@ -1,7 +1,7 @@
 """What all tests share: a small scenario that needs no simulation, the command line, and which tests are `unit` tests.
 
-A test is `system` when it says so or stands in one of SYSTEM; all others may start no process, and are `unit` unless
-they are `slow`."""
+A test is `system` when it says so or its file is in :data:`SYSTEM`; all others may start no process, and are `unit`
+unless they are `slow`."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from pathlib import Path
 
 import hypothesis
 import pytest
+
+from tests.system_tests import SYSTEM
 
 hypothesis.settings.register_profile("ci", derandomize=True, deadline=None)  # the same examples in every run
 hypothesis.settings.load_profile("ci")  # --hypothesis-profile=default draws others
@@ -58,18 +60,6 @@ gamma = 4
 """
 
 SITES = "site,x_m,y_m,z_m\npole_a,10,12,3\npole_b,30.5,-12,3\n"
-
-SYSTEM = (
-    "tests/effects/test_articulated",
-    "tests/effects/test_pedestrians_bicycles",
-    "tests/effects/test_slope",
-    "tests/importers/",
-    "tests/installation/",
-    "tests/runs/",
-    "tests/studies/",
-    "tests/traffic/",
-)
-"""Where every test counts as `system`: SUMO runs there, or whole runs are made, interrupted and compared."""
 
 BUILDING = [[[14, 5], [18, 5], [18, 8], [14, 8], [14, 5]]]
 

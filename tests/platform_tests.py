@@ -1,8 +1,8 @@
-"""Which test files ``make test-portable`` runs: those whose result can depend on the operating system.
+"""Which tests ``make test-portable`` runs: those whose result can depend on the operating system.
 
-A module depends on it when it names one of :data:`PLATFORM_NAMES`. A test file is chosen when it imports such a module,
-or when it runs commands (fixture ``run_egvs``), which lock and write run folders. All other tests only compute: they
-would repeat what ``make test`` has shown.
+A module depends on it when it names one of :data:`PLATFORM_NAMES`. A test is chosen when it uses what its file imports
+from such a module, or when it runs commands (fixture ``run_egvs``), which lock and write run folders; itself, or by a
+function or fixture of its file. All other tests only compute: they would repeat what ``make test`` has shown.
 """
 
 from __future__ import annotations
@@ -44,7 +44,39 @@ def platform_modules() -> frozenset[str]:
     )
 
 
-def depends_on_platform(test_file: Path) -> bool:
-    """Return whether the tests of a file can have other results on another operating system."""
-    source = test_file.read_text(encoding="utf-8")
-    return "run_egvs" in source or not platform_modules().isdisjoint(imported_names(source))
+@cache
+def platform_tests(test_file: Path) -> frozenset[str]:
+    """Return the names of the tests, and classes of tests, of a file that can have other results on another system."""
+    tree = ast.parse(test_file.read_text(encoding="utf-8"))
+    dependent = {"run_egvs"}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            dependent |= {alias.asname or "egvs" for alias in node.names if alias.name in platform_modules()}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            imported = {f"{node.module}.{alias.name}": alias.asname or alias.name for alias in node.names}
+            is_platform = node.module in platform_modules()
+            dependent |= {name for path, name in imported.items() if is_platform or path in platform_modules()}
+
+    uses = {name: _names_in(statement) for statement in tree.body for name in _defined_names(statement)}
+    while more := {name for name, used in uses.items() if name not in dependent and not used.isdisjoint(dependent)}:
+        dependent |= more
+    tests = {name for name in uses if name.startswith(("test_", "Test"))}
+    if any("autouse" in uses.get(name, ()) for name in dependent):
+        return frozenset(tests)
+    return frozenset(tests & dependent)
+
+
+def _defined_names(statement: ast.stmt) -> set[str]:
+    if isinstance(statement, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+        return {statement.name}
+    return {node.id for node in ast.walk(statement) if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)}
+
+
+def _names_in(statement: ast.stmt) -> set[str]:
+    """Return the names that a statement reads, its parameters, keywords and strings: all that can name a fixture."""
+    names = set()
+    for node in ast.walk(statement):
+        match node:
+            case ast.Name(id=name) | ast.arg(arg=name) | ast.keyword(arg=str(name)) | ast.Constant(value=str(name)):
+                names.add(name)
+    return names

@@ -37,6 +37,9 @@ from egvs.validation.detectors import base
 ROOT = Path(__file__).resolve().parents[2]
 REPORT_EVERY_S = 30.0
 
+MIN_FRAMES = 20
+"""Of a trial: two for each block."""
+
 
 def main(given: Sequence[str] | None = None) -> int:
     """Run one step of the study, and return the exit code."""
@@ -59,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     data = argparse.ArgumentParser(add_help=False)
     data.add_argument("--data", type=Path, default=ROOT / "runs" / "across_junctions", help="folder of the study")
     common.add_argument("--maps", type=Path, metavar="DIR", help="folder of the maps that are not shipped")
-    common.add_argument("--junction", metavar="NAME,NAME", help="default: all")
+    common.add_argument("--junction", metavar="NAME,NAME", help="default: all (build), or all with candidates")
     steps = parser.add_subparsers(required=True, metavar="build|list|measure|tables")
 
     step = steps.add_parser("build", parents=[data, common], help="make the scenarios")
@@ -81,6 +84,9 @@ def _parser() -> argparse.ArgumentParser:
     step.add_argument("--held-out", action="store_true", help="allow held-out junctions, which can be spent only once")
     step.add_argument("--frames", type=int, help="fewer than the protocol says: a trial, at training junctions only")
     step.add_argument("--candidates", type=int, help="the first of the protocol's candidates: a trial, too")
+    step.add_argument(
+        "--again", metavar="REASON", help="measure a part again that is not of a training junction; recorded"
+    )
     step.add_argument("--jobs", type=int, help="processes; default: one a core")
     step.set_defaults(step=_measure)
 
@@ -90,17 +96,17 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _selected(protocol: Protocol, names: str | None) -> list[Junction]:
-    """Return the junctions of ``--junction``, or all."""
+def _selected(protocol: Protocol, names: str | None, default: Sequence[Junction]) -> list[Junction]:
+    """Return the junctions of ``--junction``, or the default."""
     if names is None:
-        return list(protocol.junctions)
+        return list(default)
     return [protocol.junction(name.strip()) for name in names.split(",") if name.strip()]
 
 
 def _build(arguments: argparse.Namespace) -> int:
     protocol = read_protocol()
     built = []
-    for junction in _selected(protocol, arguments.junction):
+    for junction in _selected(protocol, arguments.junction, protocol.junctions):
         start_s = time.monotonic()
         built.append(build.build(protocol, junction, arguments.maps, arguments.data / "worlds"))
         print(f"{junction.name}: {time.monotonic() - start_s:.0f} s", flush=True)
@@ -124,7 +130,8 @@ def _write(protocol: Protocol, built: Sequence[build.BuiltJunction]) -> None:
     drawn = candidates.read_candidates() if (FOLDER / CANDIDATES_FILE).is_file() else {}
     digests = build.read_worlds() if (FOLDER / WORLDS_FILE).is_file() else {}
     for entry in built:
-        drawn[entry.junction.name] = dict(entry.candidates or {})
+        if entry.candidates:
+            drawn[entry.junction.name] = dict(entry.candidates)
         digests[entry.junction.name] = entry.digest
     names = [junction.name for junction in protocol.junctions]
     candidates.write_candidates({name: drawn[name] for name in names if name in drawn})
@@ -138,9 +145,9 @@ def _differences(built: Sequence[build.BuiltJunction]) -> list[str]:
     for entry in built:
         if entry.problem:
             continue
-        if digests[entry.junction.name] != entry.digest:
+        if build.digest_of(entry.junction, digests) != entry.digest:
             texts.append(f"{entry.junction.name}: the scenario differs from the one of the protocol")
-        if drawn[entry.junction.name] != entry.candidates:
+        if entry.candidates and candidates.candidates_of(entry.junction, drawn) != entry.candidates:
             texts.append(f"{entry.junction.name}: the candidates differ from those of the protocol")
     return texts
 
@@ -150,14 +157,16 @@ def _list(_: argparse.Namespace) -> int:
     rule = protocol.candidates
     installed = base.detector_names()
     for junction in protocol.junctions:
-        heights = ", ".join(f"{height:g}" for height in rule.heights_m[junction.heights])
-        print(f"{junction.name:16} {junction.role:11} {heights:14} m  {junction.differs_in}")
+        heights = ", ".join(f"{height:g}" for height in protocol.heights_m(junction))
+        frames = f"{protocol.frames_of(junction)} frames" if heights else ""
+        print(f"{junction.name:16} {junction.role:11} {f'{heights} m' if heights else '':14} {frames:11}"
+              f" {junction.differs_in}")  # fmt: skip
         for entry in junction.files:
-            print(f"{'':29}{entry.name} {entry.sha256}")
+            print(f"{'':56}{entry.name} {entry.sha256}")
     print(f"{rule.count} candidates per junction: pitch {rule.pitch_deg[0]:g} to {rule.pitch_deg[1]:g}, roll"
           f" {rule.roll_deg[0]:g} to {rule.roll_deg[1]:g} degrees; seed {protocol.seed}")  # fmt: skip
     print(f"sensors: {', '.join(rule.sensors)}")
-    print(f"{protocol.frames} frames at least {protocol.apart_s:g} s apart")
+    print(f"frames at least {protocol.apart_s:g} s apart")
     for role, names in (("training", protocol.detectors.training), ("held out", protocol.detectors.held_out)):
         texts = [name if name in installed else f"{name} (not installed)" for name in names]
         print(f"detectors at {role} junctions: {', '.join(texts)}")
@@ -184,53 +193,48 @@ def _measure(arguments: argparse.Namespace) -> int:
 def _plans(arguments: argparse.Namespace) -> list[PartPlan]:
     """Return the parts to measure; check everything before the first one."""
     protocol = read_protocol()
-    extent = Extent(
-        protocol.frames if arguments.frames is None else arguments.frames,
-        protocol.candidates.count if arguments.candidates is None else arguments.candidates,
-    )
-    if (
-        extent.frames > protocol.frames
-        or extent.candidates > protocol.candidates.count
-        or min(extent.frames // 20, extent.candidates) < 1
-    ):
-        problem = f"expected 20 to {protocol.frames} frames and 1 to {protocol.candidates.count} candidates"
-        raise InputError("--frames, --candidates", f"{problem}, got {extent.frames} and {extent.candidates}")
     selected = [
-        junction for junction in _selected(protocol, arguments.junction)
+        junction for junction in _selected(protocol, arguments.junction, protocol.measured_junctions)
         if arguments.role in (None, junction.role)
     ]  # fmt: skip
-    is_trial = extent.is_trial(protocol)
     for junction in selected:
-        if junction.role != "training" and is_trial:
-            problem = f"a trial at {junction.name} would spend a junction that is {junction.role}"
-            raise InputError("--frames, --candidates", problem, "Use a training junction.")
-        if junction.role == "held out" and not arguments.held_out:
-            problem = f"{junction.name} is held out, and can be measured only once"
-            raise InputError("--junction", problem, "Add --held-out when all choices are made, or use --role training.")
+        _check_role(junction, arguments)
     digest, each = ProtocolFiles().digest, candidates.read_candidates()
     plans = []
     for junction in selected:
+        extent = _extent(protocol, junction, arguments)
         folder = _world(protocol, junction, arguments)
         if folder is not None:
-            for part in _parts(protocol, junction, arguments.part):
-                plans.append(
-                    PartPlan(
-                        protocol,
-                        digest,
-                        junction,
-                        part,
-                        folder,
-                        each[junction.name],
-                        extent,
-                        _records(arguments, is_trial),
-                    )
-                )
+            drawn = candidates.candidates_of(junction, each)
+            records = arguments.data / ("records" if extent == Extent.of(protocol, junction) else "trial")
+            plans += [
+                PartPlan(protocol, digest, junction, part, folder, drawn, extent, records, arguments.again or "")
+                for part in _parts(protocol, junction, arguments.part)
+            ]
     return plans
 
 
-def _records(arguments: argparse.Namespace, is_trial: bool) -> Path:
-    folder: Path = arguments.data / ("trial" if is_trial else "records")
-    return folder
+def _check_role(junction: Junction, arguments: argparse.Namespace) -> None:
+    if junction.role not in ROLES:
+        problem = f"{junction.name} is for training detectors, so nothing is measured there"
+        raise InputError("--junction", problem, "Use other junctions.")
+    if junction.role != "training" and (arguments.frames is not None or arguments.candidates is not None):
+        problem = f"a trial at {junction.name} would spend a junction that is {junction.role}"
+        raise InputError("--frames, --candidates", problem, "Use a training junction.")
+    if junction.role == "held out" and not arguments.held_out:
+        problem = f"{junction.name} is held out, and can be measured only once"
+        raise InputError("--junction", problem, "Add --held-out when all choices are made, or use --role training.")
+
+
+def _extent(protocol: Protocol, junction: Junction, arguments: argparse.Namespace) -> Extent:
+    """Return what is measured at a junction: what the protocol says, or less."""
+    whole = Extent.of(protocol, junction)
+    frames = whole.frames if arguments.frames is None else arguments.frames
+    count = whole.candidates if arguments.candidates is None else arguments.candidates
+    if not (MIN_FRAMES <= frames <= whole.frames and 1 <= count <= whole.candidates):
+        problem = f"expected {MIN_FRAMES} to {whole.frames} frames and 1 to {whole.candidates} candidates"
+        raise InputError("--frames, --candidates", f"{problem}, got {frames} and {count}")
+    return Extent(frames, count)
 
 
 def _world(protocol: Protocol, junction: Junction, arguments: argparse.Namespace) -> Path | None:
@@ -240,7 +244,7 @@ def _world(protocol: Protocol, junction: Junction, arguments: argparse.Namespace
     except MissingMapError as error:
         print(f"without {junction.name}: {error}")
         return None
-    if build.read_worlds()[junction.name] != build.world_digest(folder):
+    if build.digest_of(junction, build.read_worlds()) != build.world_digest(folder):
         problem = "the scenario differs from the one of the protocol"
         raise InputError(folder, problem, "Use the versions of SUMO and of the libraries that constraints.txt names.")
     return folder
@@ -281,7 +285,7 @@ def _progress(name: str, start_s: float) -> ProgressCallback:
 
 def _tables(arguments: argparse.Namespace) -> int:
     out = arguments.out or arguments.data / "tables"
-    for text in tables.write_tables(arguments.data / "records", out):
+    for text in tables.write_tables(arguments.data / "records", out, read_protocol(), ProtocolFiles().digest):
         print(text)
     return 0
 

@@ -37,7 +37,7 @@ REFERENCE_SENSOR = "VLP-32C"
 def draw_candidates(
     protocol: Protocol, junction: Junction, scene: Scene, carriageway: Carriageway | None
 ) -> dict[Site, float]:
-    """Return the candidates of a junction, with their heights above the ground in metres.
+    """Return the candidates of a junction, with their heights above the ground in metres; none for training detectors.
 
     Raises
     ------
@@ -45,7 +45,9 @@ def draw_candidates(
         Where fewer places are free than there are candidates.
     """
     rule = protocol.candidates
-    heights_m = rule.heights_m[junction.heights]
+    heights_m = protocol.heights_m(junction)
+    if not heights_m:
+        return {}
     free = poses.free_at(scene, carriageway, REFERENCE_SENSOR, heights_m)
     if len(free) < rule.count:
         problem = f"expected {rule.count} free places beside the roads, got {len(free)}"
@@ -113,3 +115,17 @@ def read_candidates(folder: Path = FOLDER) -> dict[str, dict[Site, float]]:
             site = Site(row["site"], Pose(*numbers), row["sensor"], pole=row["site"])
             each.setdefault(row["junction"], {})[site] = float(row["height_m"])
     return each
+
+
+def candidates_of(junction: Junction, each: Mapping[str, dict[Site, float]]) -> dict[Site, float]:
+    """Return the candidates of one junction.
+
+    Raises
+    ------
+    InputError
+        If the file has none of this junction.
+    """
+    if junction.name not in each:
+        hint = f"Write them with: python -m benchmarks.across_junctions build --junction {junction.name} --write"
+        raise InputError(FOLDER / CANDIDATES_FILE, f"no candidates of {junction.name}", hint)
+    return each[junction.name]

@@ -22,7 +22,7 @@ START_S = 40.0
 
 
 def estimated_s(infos: Sequence[PartInfo], protocol: Protocol) -> dict[str, float]:
-    """Return the processor seconds of one complete junction by part; of several records of a part, the mean counts."""
+    """Return the processor seconds of a junction with the protocol's frames by part, the mean of all records."""
     count, frames = protocol.candidates.count, protocol.frames
     each: dict[str, list[float]] = {}
     for info in infos:
@@ -43,16 +43,17 @@ def estimate(infos: Sequence[PartInfo], protocol: Protocol) -> str:
     if not seconds:
         return "nothing was measured from which the time of the study can be estimated"
     total_s, unknown = 0.0, set()
-    for junction in protocol.junctions:
+    for junction in protocol.measured_junctions:
+        share = protocol.frames_of(junction) / protocol.frames
         for part in (*NOT_DETECTORS, *protocol.detectors_of(junction)):
-            total_s += seconds.get(part, 0.0)
+            total_s += seconds.get(part, 0.0) * (1.0 if part == SCORES else share)
             if part not in seconds:
                 unknown.add(part)
     machine = infos[-1].machine
     parts = ", ".join(f"{part} {value / 60 / CORES:.1f}" for part, value in seconds.items())
     text = (
         f"one junction on {CORES} cores, minutes: {parts} (limit {LIMIT_PART_MIN:g});"
-        f" the study of {len(protocol.junctions)} junctions takes about {total_s / 3600 / CORES:.1f} hours"
+        f" the study of {len(protocol.measured_junctions)} junctions takes about {total_s / 3600 / CORES:.1f} hours"
         f" (limit {LIMIT_H:g}); processor: {machine['processor']}"
     )
     return text + (f"; without {', '.join(sorted(unknown))}, which was not measured" if unknown else "")

@@ -13,21 +13,18 @@ import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from statistics import mean
 
 import numpy as np
 
-from benchmarks.across_junctions import records
+from benchmarks.across_junctions import detections, records
 from benchmarks.across_junctions.protocol import Junction, Protocol
-from benchmarks.across_junctions.records import MEASURES, SCORES, VEHICLES, PartInfo, info_path, write_table
-from benchmarks.detectability.examples import hits_of
+from benchmarks.across_junctions.records import SCORES, VEHICLES, PartInfo, info_path, write_table
 from benchmarks.records import Machine
 from benchmarks.validity.junctions import check_unseen, with_sites
 from egvs.core import files
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray
 from egvs.core.progress import ProgressCallback, no_progress
-from egvs.core.resource_usage import ResourceUsage, measure_usage
+from egvs.core.resource_usage import measure_usage
 from egvs.core.threads import map_ordered, thread_count
 from egvs.runs import stage_keys
 from egvs.scenario.loading import load
@@ -40,12 +37,8 @@ from egvs.sensors.scene import Scene
 from egvs.sensors.sites import Site
 from egvs.stages.inputs import get_scene, open_folder
 from egvs.validation import surrogates
-from egvs.validation.detection_metrics import BLOCKS, EvaluationFrames, GroundTruth, evaluate, frame_blocks
-from egvs.validation.detector_runs import DetectionListener, SiteDetectionTask, run_detectors
-from egvs.validation.detectors import base
 from egvs.validation.held_out_traffic import HeldOutTraffic, prepare_held_out_traffic
 from egvs.validation.results import ScoreName
-from egvs.validation.sweeps import POINT_COUNTS_NAME, DetectedBoxes, DetectorResult, PointCounts
 
 MEAN_POINTS = "mean_points"
 """A baseline beside the installed scores: mean number of points on a vehicle of the traffic behind the scores."""
@@ -58,9 +51,10 @@ class Extent:
     frames: int
     candidates: int
 
-    def is_trial(self, protocol: Protocol) -> bool:
-        """Whether this is less than the protocol says."""
-        return self != Extent(protocol.frames, protocol.candidates.count)
+    @classmethod
+    def of(cls, protocol: Protocol, junction: Junction) -> Extent:
+        """Return what the protocol says."""
+        return cls(protocol.frames_of(junction), protocol.candidates.count)
 
 
 @dataclass(frozen=True)
@@ -75,6 +69,8 @@ class PartPlan:
         Hash of the protocol, for the record.
     candidates
         With their heights above the ground in metres.
+    again
+        Why a part may be measured again that is not of a training junction; it is recorded.
     """
 
     protocol: Protocol
@@ -85,11 +81,17 @@ class PartPlan:
     candidates: dict[Site, float]
     extent: Extent
     folder: Path
+    again: str = ""
 
     @property
     def name(self) -> str:
         """Name for progress and messages."""
         return f"{self.junction.name} {self.part}"
+
+    @property
+    def is_trial(self) -> bool:
+        """Whether less is measured than the protocol says."""
+        return self.extent != Extent.of(self.protocol, self.junction)
 
 
 def measure(
@@ -104,7 +106,8 @@ def measure(
     Raises
     ------
     InputError
-        If the junction's traffic is a finished file, or a sensor cannot stand at a candidate.
+        If the junction's traffic is a finished file, or a sensor cannot stand at a candidate; if the part is not of a
+        training junction and was measured before, from something else.
     """
     plan.folder.mkdir(parents=True, exist_ok=True)
     with measure_usage() as usage:
@@ -129,8 +132,13 @@ def _measure(plan: PartPlan, jobs: int | None, progress: ProgressCallback) -> Pa
         )
         key = _key(plan, held_out)
         path = info_path(plan.folder, plan.junction.name, plan.part)
-        if path.is_file() and PartInfo.read(path).key == key:
+        before = PartInfo.read(path) if path.is_file() else None
+        if before is not None and before.key == key:
             return None
+        if before is not None and plan.junction.role != "training" and not plan.again:
+            problem = f"{plan.name} was measured before, by another source or from other inputs"
+            hint = 'It should be measured only once. If it must be measured again: --again "REASON", which is recorded.'
+            raise InputError(path, problem, hint)
         path.unlink(missing_ok=True)
         _write_candidates(plan, sites)
         skipped: tuple[str, ...] = ()
@@ -141,42 +149,28 @@ def _measure(plan: PartPlan, jobs: int | None, progress: ProgressCallback) -> Pa
             _measure_vehicles(plan, held_out, jobs, progress)
         else:
             site_s = _measure_detector(plan, held_out, jobs, progress)
-        return replace(_info(plan, scenario, held_out, key), skipped=skipped, site_s=round(site_s, 2))
-
-
-class _SiteCosts(DetectionListener):
-    """Collects the processor time of each candidate."""
-
-    def __init__(self) -> None:
-        self.busy_s: list[float] = []
-
-    def site_done(self, site: str, detectors: Sequence[str], cost: ResourceUsage) -> None:
-        """Add the cost of a candidate whose results were not cached."""
-        if detectors:
-            self.busy_s.append(cost.busy_s)
+        reasons = (*(before.again if before else ()), *((plan.again,) if before and plan.again else ()))
+        return replace(_info(plan, scenario, held_out, key), skipped=skipped, site_s=round(site_s, 2), again=reasons)
 
 
 def source_digest(part: str) -> str:
     """Return the digest of the source that a part depends on."""
-    modules = [__name__]
     if part not in records.NOT_DETECTORS:
-        modules.append(type(base.make_detector(part)).__module__)
-    return stage_keys.source_digest(*modules).digest
+        return detections.source_digest(part)
+    return stage_keys.source_digest(__name__).digest
 
 
 def _key(plan: PartPlan, held_out: HeldOutTraffic) -> str:
     """Return a hash of everything that a part depends on."""
     depends: object
+    sites = [[site.name, site.sensor, *site.pose.position_m, *site.pose.angles_deg] for site in held_out.scene.sites]
     if plan.part == SCORES:
         # of the scenario with its own sites: the file of the candidates has another path each time
-        sites = [
-            [site.name, site.sensor, *site.pose.position_m, *site.pose.angles_deg] for site in held_out.scene.sites
-        ]
         depends = [surrogates.surrogates_key(load(plan.scenario_folder)), sites]
+    elif plan.part == VEHICLES:
+        depends = detections.dependencies(held_out)
     else:
-        detectors = {} if plan.part == VEHICLES else {plan.part: base.make_detector(plan.part)}
-        task = SiteDetectionTask(held_out, detectors)
-        depends = [task.key(site, name) for site in held_out.scene.sites for name in (detectors or [POINT_COUNTS_NAME])]
+        depends = detections.dependencies(held_out, plan.part)
     return files.hash_json(
         {
             "part": [plan.junction.name, plan.junction.role, plan.part, asdict(plan.extent)],
@@ -194,7 +188,7 @@ def _info(plan: PartPlan, scenario: Scenario, held_out: HeldOutTraffic, key: str
     return PartInfo(
         plan.junction.name, plan.junction.role, plan.part, key, source_digest(plan.part), plan.protocol_digest,
         sample.frames, sample.apart_s, sample.vehicles, vehicle_frames, len(held_out.scene.sites),
-        {"TPOG": scenario.seed, "unseen": held_out.scenario.seed}, plan.extent.is_trial(plan.protocol),
+        {"TPOG": scenario.seed, "unseen": held_out.scenario.seed}, plan.is_trial,
         seconds=0.0, busy_s=0.0, site_s=0.0, machine=Machine.current().model_dump(mode="json"),
     )  # fmt: skip
 
@@ -228,8 +222,6 @@ def _measure_scores(
     rows += [(site, MEAN_POINTS, 1, points) for site, points in _mean_points(scenario, work, jobs).items()]
     columns = {name: [row[number] for row in rows] for number, name in enumerate(("site", "score", "sign", "value"))}
     write_table(_path(plan, SCORES), columns)
-    costs = files.to_json_text(scored.costs_ms(), indent=1)
-    files.write_text(plan.folder / f"{plan.junction.name}.costs_ms", costs + "\n")
     return tuple(str(reason) for reason in scored.skipped)
 
 
@@ -293,57 +285,9 @@ def _record(held_out: HeldOutTraffic) -> TargetRecord:
 
 
 def _measure_detector(plan: PartPlan, held_out: HeldOutTraffic, jobs: int | None, progress: ProgressCallback) -> float:
-    """Run a detector at every candidate, write its AP and its hits, and return the mean cost of a candidate."""
-    task = SiteDetectionTask(held_out, {plan.part: base.make_detector(plan.part)})
-    costs = _SiteCosts()
-    results = run_detectors(held_out.scene.sites, task, jobs=jobs, progress=progress, listener=costs)
-    record = _record(held_out)
-    measured: dict[str, list[object]] = {
-        name: [] for name in ("site", "measure", "value", "se", "left_out", "half_1", "half_2")
-    }
-    hits: list[FloatArray] = []
-    for site, by_detector in results.items():
-        boxes = by_detector[plan.part]
-        assert isinstance(boxes, DetectedBoxes)
-        for measure, values in measures_of(held_out, by_detector[POINT_COUNTS_NAME], boxes).items():
-            for name, value in zip(measured, (site, measure, *values), strict=True):
-                measured[name].append(value)
-        hits.append(hits_of(record, [frame.boxes for frame in boxes.frames]))
-    write_table(_path(plan, plan.part), measured)
-    columns = {
-        "site": np.repeat(list(results), len(record)),
-        "row": np.tile(np.arange(len(record)), len(results)),
-        "hits": np.concatenate(hits).astype(np.float32),
-    }
-    write_table(_path(plan, f"{plan.part}.hits"), columns)
-    return mean(costs.busy_s) if costs.busy_s else 0.0
-
-
-MeasuredValues = tuple[float, float, FloatArray, float, float]
-"""Value, standard error, values without each block, and those of both halves."""
-
-
-def measures_of(held_out: HeldOutTraffic, points: DetectorResult, boxes: DetectedBoxes) -> dict[str, MeasuredValues]:
-    """Return every measure of a detector at one candidate, by name; see :data:`MeasuredValues`."""
-    assert isinstance(points, PointCounts)
-    objects = [
-        GroundTruth.from_frame(frame, on_vehicles, held_out.scene.roi)
-        for frame, on_vehicles in zip(held_out.read(), points.points, strict=True)
-    ]
-    whole = evaluate(EvaluationFrames.from_frames(objects, boxes.frames)).measures
-    halves = []
-    for half in half_frames(len(objects)):
-        frames = EvaluationFrames.from_frames([objects[i] for i in half], [boxes.frames[i] for i in half])
-        halves.append(evaluate(frames).measures)
-    first, second = halves
-    return {
-        name: (whole[name].value, whole[name].se, whole[name].left_out, first[name].value, second[name].value)
-        for name in MEASURES
-    }
-
-
-def half_frames(frames: int) -> tuple[list[int], list[int]]:
-    """Return the frames of the even and of the odd blocks: both halves reach over the whole record."""
-    block = frame_blocks(frames, BLOCKS)
-    even, odd = (np.flatnonzero(block % 2 == parity).tolist() for parity in (0, 1))
-    return even, odd
+    """Run a detector at every candidate, write its AP, its hits and its boxes; return the mean cost of a candidate."""
+    part = detections.run(held_out, plan.part, jobs=jobs, progress=progress)
+    write_table(_path(plan, plan.part), part.measures)
+    write_table(_path(plan, f"{plan.part}.hits"), part.hits)
+    write_table(_path(plan, f"{plan.part}.boxes"), part.boxes)
+    return part.site_s

@@ -27,8 +27,12 @@ from egvs.sensors.sensor import CATALOGUE, catalogue_digest
 FOLDER = Path(__file__).resolve().parent
 JUNCTIONS_FILE, CANDIDATES_FILE, WORLDS_FILE = "junctions.toml", "candidates.csv", "worlds.csv"
 
-Role = Literal["training", "held out", "comparison"]
+Role = Literal["detector", "training", "held out", "comparison"]
+"""What a junction is for: training detectors, training the score, testing it once, or comparison with the source
+paper."""
+
 ROLES: tuple[Role, ...] = ("training", "held out", "comparison")
+"""Roles of junctions with candidates."""
 
 MIN_SITES_OF_A_HEIGHT = 15
 """Sites of one height at a junction that a coefficient among them needs."""
@@ -85,6 +89,9 @@ class MapFile(StrictModel):
     sha256: str = Field(pattern="^[0-9a-f]{64}$")
 
 
+_KEYS_OF_SHIPPED = {"name", "role", "differs_in", "source", "scenario", "heights", "frames"}
+
+
 class Junction(StrictModel):
     """A junction of the study, and how its scenario is made.
 
@@ -128,13 +135,18 @@ class Junction(StrictModel):
     terrain: Terrain | None = None
     furniture: Furniture | None = None
     tables: dict[str, Any] = Field(default_factory=dict)
-    heights: int = Field(description="Which row of candidates.heights_m is used, from 0", ge=0)
+    heights: int | None = Field(None, description="Which row of candidates.heights_m is used, from 0", ge=0)
+    frames: int | None = Field(None, ge=20, description="Of unseen traffic, where they differ from the other junctions")
 
     @model_validator(mode="after")
     def _check_origin(self) -> Self:
         origins = [bool(self.scenario), bool(self.netgenerate), bool(self.arms), self.map is not None]
         if sum(origins) != 1:
             raise ValueError("expected one of scenario, netgenerate, arms and map")
+        if self.scenario and (unused := sorted(self.model_fields_set - _KEYS_OF_SHIPPED)):
+            raise ValueError(f"{unused[0]} does not apply to a shipped scenario")
+        if (self.heights is None) != (self.role == "detector"):
+            raise ValueError("expected heights, except at junctions for training detectors")
         return self
 
     @property
@@ -182,6 +194,7 @@ class Protocol(StrictModel):
 
     seed: int
     frames: int = Field(ge=20, description="Of unseen traffic, the same for all candidates of a junction")
+    training_frames: int = Field(ge=20, description="The same, at training junctions")
     apart_s: float = Field(ge=7.0, description="Least time between two frames")
     tpog_frames: int = Field(ge=100, description="Of the traffic behind the scores, where a scenario is made here")
     candidates: CandidateRule
@@ -196,7 +209,7 @@ class Protocol(StrictModel):
         for junction in self.junctions:
             if junction.fleet and junction.fleet not in self.fleets:
                 raise ValueError(f"junction {junction.name}: there is no fleet {junction.fleet!r}")
-            if junction.heights >= len(self.candidates.heights_m):
+            if junction.heights is not None and junction.heights >= len(self.candidates.heights_m):
                 raise ValueError(f"junction {junction.name}: there is no row {junction.heights} of heights")
         return self
 
@@ -213,6 +226,21 @@ class Protocol(StrictModel):
                 return junction
         known = ", ".join(junction.name for junction in self.junctions)
         raise InputError("--junction", f"expected a junction of the study, got {name!r}", f"Use some of {known}.")
+
+    @property
+    def measured_junctions(self) -> tuple[Junction, ...]:
+        """The junctions with candidates."""
+        return tuple(junction for junction in self.junctions if junction.role in ROLES)
+
+    def heights_m(self, junction: Junction) -> tuple[float, ...]:
+        """Return the mounting heights at a junction; none where it has no candidates."""
+        return () if junction.heights is None else self.candidates.heights_m[junction.heights]
+
+    def frames_of(self, junction: Junction) -> int:
+        """Return the number of frames of unseen traffic at a junction."""
+        if junction.frames is not None:
+            return junction.frames
+        return self.training_frames if junction.role == "training" else self.frames
 
     def detectors_of(self, junction: Junction) -> tuple[str, ...]:
         """Return the detectors that are run at a junction."""

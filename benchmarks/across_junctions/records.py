@@ -1,9 +1,11 @@
 """Records of the parts of the study, as Parquet: a part is one junction with one detector, its scores, or its vehicles.
 
 =========================  ========================================================================================
-``J.DETECTOR.parquet``     one row per candidate and measure: value, standard error, values with each block of frames
-                           left out, and of the two halves of the frames
-``J.DETECTOR.hits.parquet``  one row per candidate and vehicle-frame: share of the two views in which it was found
+``J.DETECTOR.parquet``     one row per candidate and measure: value, values with each block of frames left out, and of
+                           the two halves of the frames
+``J.DETECTOR.hits.parquet``  one row per candidate and vehicle-frame: share of the two views in which it was found, and
+                           points on it in the sweep
+``J.DETECTOR.boxes.parquet``  one row per detection: candidate, frame, box in the world frame, score
 ``J.scores.parquet``       one row per candidate and score: sign and value
 ``J.vehicles.parquet``     one row per vehicle-frame of the unseen traffic: vehicle, class, size
 ``J.features.parquet``     one row per candidate and vehicle-frame: what the candidate sees of it, and the features of
@@ -18,7 +20,7 @@ Parquet files depend on neither clock nor machine, so a repeated part has the sa
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -35,11 +37,6 @@ SCORES, VEHICLES = "scores", "vehicles"
 """Names of the parts that belong to no detector."""
 
 NOT_DETECTORS = (SCORES, VEHICLES)
-
-AP = "ap_mean_r40_iou70"
-"""The main measure: the mean of BEV and 3D."""
-
-MEASURES = (AP, "ap_bev_r40_iou70", "ap_3d_r40_iou70", "ap_mean_r40_iou50")
 
 
 @dataclass(frozen=True)
@@ -68,6 +65,10 @@ class PartInfo:
         Mean processor time of one candidate, for a detector; 0 where all candidates were cached, and for other parts.
     machine
         Processor, cores and libraries.
+    skipped
+        Scores that could not be computed, with the reason.
+    again
+        Reasons for which a part that is not of a training junction was measured more than once.
     """
 
     junction: str
@@ -88,6 +89,7 @@ class PartInfo:
     site_s: float
     machine: dict[str, Any]
     skipped: tuple[str, ...] = ()
+    again: tuple[str, ...] = ()
 
     def write(self, folder: Path) -> None:
         """Write it as JSON. It is written last, so a part with it is complete."""
@@ -106,7 +108,7 @@ class PartInfo:
         """
         try:
             values = json.loads(path.read_text(encoding="utf-8"))
-            return cls(**(values | {"skipped": tuple(values["skipped"])}))
+            return cls(**(values | {name: tuple(values[name]) for name in ("skipped", "again")}))
         except (ValueError, TypeError, KeyError) as error:
             raise InputError(path, f"expected a record of the study, got an error: {error}", "Remove it.") from None
 
@@ -128,7 +130,7 @@ def write_table(path: Path, columns: Mapping[str, Any]) -> None:
         pq.write_table(pa.table(arrays), partial, compression="zstd", version="2.6")
 
 
-def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
+def read_table(path: Path) -> pa.Table:
     """Read a table of the study.
 
     Raises
@@ -137,7 +139,7 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
         If it is missing or damaged.
     """
     try:
-        return pq.read_table(path, columns=None if columns is None else list(columns))
+        return pq.read_table(path)
     except (OSError, pa.ArrowInvalid) as error:
         raise InputError(path, f"expected a record of the study, got an error: {error}", "Measure it again.") from None
 

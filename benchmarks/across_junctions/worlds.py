@@ -87,7 +87,7 @@ def make_world(protocol: Protocol, junction: Junction, maps: Path | None, folder
     sources = [find_map(entry, maps) for entry in junction.files]
     key = files.canonical_json(
         {
-            "junction": junction.model_dump(mode="json", exclude={"role", "differs_in", "source"}),
+            "junction": junction.model_dump(mode="json", exclude={"role", "differs_in", "source", "heights", "frames"}),
             "fleet": [kind.model_dump(mode="json") for kind in protocol.fleets.get(junction.fleet, ())],
             "tpog_frames": protocol.tpog_frames,
             "program": [
@@ -101,14 +101,15 @@ def make_world(protocol: Protocol, junction: Junction, maps: Path | None, folder
         return home / WITH_TABLES
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".work-", dir=folder) as temporary:
-        work = Path(temporary)
+        work = Path(temporary) / junction.name
+        work.mkdir()
         _make_base(junction, sources, work)
         _make_extension(protocol, junction, work)
         load(work / WITH_TABLES)
         (work / NOTE).write_bytes(key)
         if home.is_dir():
             shutil.rmtree(home)
-        shutil.copytree(work, home)
+        work.rename(home)
     return home / WITH_TABLES
 
 

@@ -2,9 +2,6 @@
 
 Steps: simulate the held-out traffic of the study; compute what each site sees of its vehicles, from the empty scan; run
 each detector (cached results are reused); determine which vehicles it found, and its AP.
-
-A vehicle in a frame is found in a view (from above, in space) if any detection overlaps it by more than :data:`IOU`.
-Vehicles do not overlap each other, so no detection overlaps two by so much, and matching would give the same.
 """
 
 from __future__ import annotations
@@ -16,28 +13,27 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.across_junctions import detections
 from benchmarks.detectability.fitting import Examples, Floats
 from benchmarks.validity.measurement import Part
 from benchmarks.validity.record import BOXED
 from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.threads import map_ordered, thread_count
-from egvs.kernels.detection import OVERLAP_TOLERANCE
 from egvs.scoring.target_scores import detectability_features
 from egvs.scoring.targets import TargetRecord, detection_probability, visible_targets
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.sites import Site
 from egvs.validation import detection_metrics
-from egvs.validation.detection_metrics import ALL_OBJECTS, IOUS, VIEWS, paired_overlap
+from egvs.validation.detection_metrics import ALL_OBJECTS
 from egvs.validation.detector_runs import SiteDetectionTask, run_detectors
 from egvs.validation.detectors.base import Detector
 from egvs.validation.held_out_traffic import HeldOutTraffic, prepare_held_out_traffic
 from egvs.validation.sweeps import DetectedBoxes, DetectorResult
 
-IOU = IOUS[0]
 AP = BOXED[0]
-"""Overlap of a found vehicle, and the measure that predictions are compared with."""
+"""The measure that predictions are compared with."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,23 +129,9 @@ def _boxes(results: DetectorResult) -> list[Floats]:
 
 
 def hits_of(record: TargetRecord, results: Sequence[Floats]) -> Floats:
-    """Return the share of the two views in which each vehicle is found, (n,) float64: 0, 0.5 or 1.
-
-    Parameters
-    ----------
-    found
-        Detections of each frame of the record, (m, 7) float64 each, as
-        :data:`egvs.artefacts.traffic_frames.BOX_COLUMNS`.
-    """
+    """Return the share of the two views in which each vehicle of a record is found; see :func:`detections.hits_of`."""
     each = np.split(record.boxes, np.searchsorted(record.frame, np.arange(1, len(record.numbers))))
-    return np.concatenate([_overlapped(boxes, result) for boxes, result in zip(each, results, strict=True)])
-
-
-def _overlapped(boxes: Floats, results: Floats) -> Floats:
-    box, result = (number.ravel() for number in np.indices((len(boxes), len(results))))
-    overlap = paired_overlap(boxes[box], results[result]).reshape(len(VIEWS), len(boxes), len(results))
-    shares: Floats = (overlap > IOU + OVERLAP_TOLERANCE).any(axis=2).mean(axis=0)
-    return shares
+    return detections.hits_of(each, results)
 
 
 def _ap(held_out: HeldOutTraffic, results: Mapping[str, Mapping[str, DetectorResult]], name: str) -> list[float]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 import shutil
+import sys
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,7 @@ from benchmarks.across_junctions import (
     build,
     candidates,
     costs,
+    detections,
     furniture,
     measurement,
     records,
@@ -22,6 +25,7 @@ from benchmarks.across_junctions import (
     tables,
     worlds,
 )
+from benchmarks.across_junctions.detections import AP, MEASURES
 from benchmarks.across_junctions.protocol import (
     JUNCTIONS_FILE,
     MIN_SITES_OF_A_HEIGHT,
@@ -31,19 +35,22 @@ from benchmarks.across_junctions.protocol import (
     Terrain,
     read_protocol,
 )
-from benchmarks.across_junctions.records import AP, MEASURES, PartInfo, write_table
+from benchmarks.across_junctions.records import PartInfo, write_table
 from benchmarks.across_junctions.statistics import DetectedJunction, Estimate
 from benchmarks.validity import tables as table_files
-from benchmarks.validity.junctions import SCENARIOS
+from benchmarks.validity.junctions import SCENARIOS, with_sites
 
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.errors import InputError
+from egvs.runs import stage_keys
 from egvs.scenario.loading import load
 from egvs.sensors.sensor import CATALOGUE
 from egvs.sensors.sites import Pose, Site
 from egvs.traffic import sumo_folder
 from egvs.validation import surrogates
 from egvs.validation.correlation import MeasureValues
+from egvs.validation.detectors import cluster
+from egvs.validation.held_out_traffic import prepare_held_out_traffic
 from egvs.world.carriageway import Carriageway
 from tests.conftest import write_mini
 
@@ -77,15 +84,14 @@ def test_the_protocol_has_the_hash_that_was_written_down() -> None:
 
 def test_every_junction_has_its_candidates_and_its_scenario() -> None:
     protocol, drawn = read_protocol(), candidates.read_candidates()
-    names = [junction.name for junction in protocol.junctions]
-    assert list(drawn) == names
-    assert list(build.read_worlds()) == names
-    for junction in protocol.junctions:
+    assert list(drawn) == [junction.name for junction in protocol.measured_junctions]
+    assert set(build.read_worlds()) == {junction.name for junction in protocol.junctions}
+    for junction in protocol.measured_junctions:
         sites = drawn[junction.name]
         heights = list(sites.values())
         assert len(sites) == protocol.candidates.count
         assert len({site.pose.position_m[:2] for site in sites}) == len(sites)
-        for height_m in protocol.candidates.heights_m[junction.heights]:
+        for height_m in protocol.heights_m(junction):
             assert heights.count(height_m) >= MIN_SITES_OF_A_HEIGHT
         for site in sites:
             assert -25.0 <= site.pose.pitch_deg <= 0.0
@@ -206,6 +212,64 @@ def test_regret_by_hand() -> None:
     assert statistics.regret(rows(3, 2, 3), ap)[0] == pytest.approx(15.0)  # the mean of 20 and 10
 
 
+def test_crossed_regret_by_hand() -> None:
+    halves = np.array([[0.5, 0.4], [0.7, 0.5], [0.6, 0.8]])
+    # the score takes the first; half 1 chooses the second (0.5 - 0.4 in half 2), half 2 the third (0.6 - 0.5 in half 1)
+    assert statistics.crossed_regret(np.array([3.0, 1.0, 2.0]), halves) == pytest.approx(10.0)
+    # taking the best of one half loses nothing there, and less than nothing in the other
+    assert statistics.crossed_regret(np.array([1.0, 3.0, 2.0]), halves) == pytest.approx(-5.0)
+
+
+def test_rho_given_groups_by_hand() -> None:
+    # both have the order 1 2 in one group and 3 4 in the other, and then opposite orders within both
+    groups = [np.array([[0, 0, 1, 1]])]
+    explained = statistics.projections(groups)
+    assert statistics.rho_given(rows(1, 2, 3, 4), rows(10, 20, 30, 40), explained)[0] == pytest.approx(1.0)
+    assert statistics.rho_given(rows(2, 1, 4, 3), rows(10, 20, 30, 40), explained)[0] == pytest.approx(-1.0)
+    assert np.isnan(statistics.rho_given(rows(1, 1, 2, 2), rows(10, 20, 30, 40), explained)[0])
+
+
+def test_rho_given_groups_is_the_correlation_of_least_squares_residuals() -> None:
+    rng = np.random.default_rng(3)
+    first, second = rng.integers(0, 4, 30), rng.integers(0, 3, 30)
+    x, y = rng.normal(size=(2, 30)) + first
+    effects = np.column_stack([first[:, None] == np.arange(4), second[:, None] == np.arange(3)]).astype(float)
+    residuals = []
+    for values in (x, y):
+        ranks = np.argsort(np.argsort(values)) + 1.0
+        residuals.append(ranks - effects @ np.linalg.lstsq(effects, ranks, rcond=None)[0])
+    explained = statistics.projections([first[None, :], second[None, :]])
+    value = statistics.rho_given(x[None, :], y[None, :], explained)[0]
+    assert value == pytest.approx(np.corrcoef(*residuals)[0, 1])
+
+
+def test_equal_values_limit_rho() -> None:
+    # three of five are equal: ranks 2 2 2 4 5 against 1 2 3 4 5
+    ap = np.array([0.0, 0.0, 0.0, 0.4, 0.5])
+    assert statistics.tie_factor(ap) == pytest.approx(np.sqrt(1 - 24 / 120))
+    assert statistics.rho(rows(1, 2, 3, 4, 5), ap[None, :])[0] == pytest.approx(statistics.tie_factor(ap))
+
+
+def test_undefined_scores_are_taken_last() -> None:
+    ap = np.arange(8.0) / 10
+    score = np.array([1.0, 2, 3, 4, 5, 6, 7, np.nan])
+    junction = detected(ap, score)
+    assert junction.regret("s").value == pytest.approx(10.0)
+    assert junction.crossed_regret("s") == pytest.approx(10.0)
+    assert junction.best_in_first("s") == 0.0
+    assert junction.by_group("s", np.full(8, 2.0), 8)["2"].count == 7
+    assert np.isnan(junction.by_group("s", np.full(8, 2.0), 8)["2"].value)
+
+
+def test_groups_of_equal_size_draw_their_own_candidates() -> None:
+    rng = np.random.default_rng(5)
+    ap = np.tile(rng.random(16), 2)
+    score = np.tile(rng.random(16), 2)
+    each = detected(ap, score).by_group("s", np.repeat([2.0, 4.0], 16), 16)
+    assert each["2"].value == pytest.approx(each["4"].value)
+    assert not np.allclose(each["2"].resampled, each["4"].resampled)
+
+
 def test_the_first_three_by_hand() -> None:
     ap = rows(0.1, 0.2, 0.9, 0.3, 0.4)
     assert statistics.in_first(rows(1, 2, 3, 4, 5), ap)[0] == 1.0
@@ -268,7 +332,6 @@ def test_junctions_are_resampled() -> None:
     values, counts = np.unique(np.round(mean.resampled, 3), return_counts=True)
     assert values.tolist() == [0.0, 0.333, 0.667, 1.0]
     assert (counts / 1000).tolist() == pytest.approx([8 / 27, 12 / 27, 6 / 27, 1 / 27], abs=0.05)
-    assert statistics.over_junctions(each, statistics.median_of).value == 0.0
     two = statistics.over_junctions({"a": each["a"], "b": each["b"]})
     assert (two.value, len(two.resampled)) == (0.5, 0)
     undefined = statistics.over_junctions({"c": Estimate(float("nan"), np.empty(0), 0)})
@@ -303,7 +366,7 @@ def test_intervals_over_junctions_contain_the_truth(spread: float, least: float,
         each = {}
         for number in range(6):
             name = f"s{study}j{number}"
-            each[name] = synthetic(rng, name, spread).estimate("s", statistics.rho)
+            each[name] = synthetic(rng, name, spread).rho("s")
         interval = statistics.over_junctions(each).interval
         inside.append(interval.low <= truth <= interval.high)
     print(f"coverage with a spread of {spread}: {np.mean(inside):.2f}")
@@ -340,7 +403,7 @@ def write_junction(
     values = np.tile(ap, len(MEASURES))
     write_table(folder / f"{name}.{detector}.parquet", {
         "site": sites * len(MEASURES), "measure": np.repeat(MEASURES, len(ap)).tolist(), "value": values.tolist(),
-        "se": [0.0] * len(values), "left_out": [np.full(10, value) for value in values],
+        "left_out": [np.full(10, value) for value in values],
         "half_1": values.tolist(), "half_2": values.tolist(),
     })  # fmt: skip
     for part in ("scores", detector):
@@ -361,8 +424,12 @@ def made_up(tmp_path: Path) -> Path:
     return folder
 
 
+def write_tables(folder: Path, out: Path) -> list[str]:
+    return tables.write_tables(folder, out, read_protocol(), "p", resamples=200)
+
+
 def test_tables_by_hand(made_up: Path, tmp_path: Path) -> None:
-    printed = tables.write_tables(made_up, tmp_path / "out", resamples=200)
+    printed = write_tables(made_up, tmp_path / "out")
     assert printed[0].startswith("2 junctions, detectors cluster; 4 parts, 0.07 hours on p, 2 cores")
     _, made = table_files.read(tmp_path / "out")
     by_name = {table.name: table for table in made}
@@ -372,25 +439,82 @@ def test_tables_by_hand(made_up: Path, tmp_path: Path) -> None:
     # all 32 ranks differ by 16: 1 - 6 * 32 * 256 / (32 * 1023)
     assert wrong[5][0] == pytest.approx(1 - 6 * 256 / 1023, abs=1e-4)
     assert wrong[6][0] == 1.0
-    assert wrong[8][0] == pytest.approx(16.0)  # 0.32 is the best, 0.16 is taken
-    assert (right[9], wrong[9]) == (1.0, 0.0)
+    assert wrong[9:11] == [16.0, 16.0]  # 0.32 is the best, 0.16 is taken; both halves agree
+    assert (right[11:], wrong[11:]) == ([1.0, 1.0], [0.0, 0.0])
+    # there is one sensor, and within heights the score is right
+    assert wrong[8][0] == pytest.approx(1.0)
     # lower was better at the training junction, so height alone has the order of the two heights: ties within each
     height = rows_of["h", "height"]
     assert height[5][0] == pytest.approx(np.sqrt(0.75 * 1024 / 1023), abs=1e-3)
-    assert height[8][0] == pytest.approx(7.5)  # 0.32 minus the mean of 0.17 to 0.32
+    assert height[9] == pytest.approx(7.5)  # 0.32 minus the mean of 0.17 to 0.32
     (measured,) = [row for row in by_name["1 measured"].rows if row[0] == "h"]
-    assert measured[8:] == [1.0, 16.5, 32.0, 0.0, 1.0, 1.0]
-    aims = {(row[0], row[4]): row[5:] for row in by_name["7 aims"].rows}
+    assert measured[8:] == [0, 1.0, 16.5, 32.0, 0.0, 1.0, 1.0, 1.0]
+    (_, aim_of_height, median, worst) = by_name["8 aims"].rows
+    # one junction has no interval
+    assert aim_of_height[4:] == ["mean rho within heights", [1.0, None, None], None, 0.85, 0.85, "undecided"]
+    assert median[4:] == ["median regret", [16.0, None, None], 16.0, 3.0, 3.0, "missed"]
+    assert worst[4:] == ["worst regret", [16.0, None, None], 16.0, 8.0, 8.0, "missed"]
+    aims = {(row[0], row[3]): row[4:] for row in by_name["9 aims by junction"].rows}
     assert aims["h", "rho"][1:] == [0.93, "no"]
     assert aims["h", "rho at 2 m"] == [1.0, 0.85, "yes"]
-    assert aims["1 junctions", "regret, worst"] == [16.0, 8.0, "no"]
-    everything = {(row[0], row[2]): row[4] for row in by_name["6 all scores"].rows}
+    less = {(row[0], row[3]): row[5:] for row in by_name["4 differences"].rows}
+    assert less["held out", "points_on_target"] == [[0.0, None, None]] * 5
+    assert less["training", "height"][4][0] == pytest.approx(-7.5)  # the regret of the main score is 0
+    everything = {(row[0], row[2]): row[4] for row in by_name["7 all scores"].rows}
     assert everything["training", "less_is_better"] == -1.0
 
 
+def test_tables_say_what_is_missing(made_up: Path, tmp_path: Path) -> None:
+    info = PartInfo.read(made_up / "h.cluster.json")
+    PartInfo(**{**vars(info), "again": ("a fault in the cable",), "skipped": ("nuc: no lanes",)}).write(made_up)
+    printed = write_tables(made_up, tmp_path / "out")
+    assert "INCOMPLETE: town01 was not measured." in printed
+    assert "h cluster was measured again: a fault in the cable" in printed
+    assert "h: skipped nuc: no lanes" in printed
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "outcome"), [(0.93, 0.99, "reached"), (0.90, 0.929, "missed"), (0.90, 0.99, "undecided")]
+)
+def test_outcomes_of_rho(low: float, high: float, outcome: str) -> None:
+    estimate = Estimate((low + high) / 2, np.linspace(low, high, 4001), 6)
+    span = estimate.interval
+    limit = {"reached": span.low, "missed": span.high + 1e-6, "undecided": (span.low + span.high) / 2}[outcome]
+    assert tables._outcome_of_rho(estimate, limit) == outcome
+
+
+def test_outcomes_of_regret() -> None:
+    assert tables._outcome_of_regret(2.9, -1.0, 3.0) == "reached"
+    assert tables._outcome_of_regret(4.0, 2.0, 3.0) == "undecided"
+    assert tables._outcome_of_regret(4.0, 3.5, 3.0) == "missed"
+    assert tables._outcome_of_regret(float("nan"), float("nan"), 3.0) == "undecided"
+
+
+def test_orders_by_sensor_and_height_are_those_of_the_training_junctions() -> None:
+    """Two sensors at two heights: the second sensor is better by two ranks, the higher site by one."""
+
+    def record(name: str, role: str, ap: list[float], detector: str) -> records.JunctionRecord:
+        values = np.array(ap)
+        measure = records.MeasureRecord(values, np.repeat(values[:, None], 10, axis=1), np.column_stack([values] * 2))
+        return records.JunctionRecord(
+            name, role, ("a", "b", "c", "d"), np.array([2.0, 4.0, 2.0, 4.0]), ("X", "X", "Y", "Y"), {},
+            {detector: {AP: measure}}, {},
+        )  # fmt: skip
+
+    training = record("t", "training", [0.1, 0.2, 0.3, 0.4], "one")
+    tested = record("h", "held out", [0.4, 0.3, 0.2, 0.1], "two")
+    baselines = tables.TrainedBaselines([training, tested], ["one", "two"])
+    for detector in ("one", "two"):  # the second was not run at the training junction
+        values = baselines.of(tested, detector)
+        assert values["sensor"] == pytest.approx([0.25, 0.25, 0.75, 0.75])
+        assert values["sensor and height"] == pytest.approx([0.125, 0.375, 0.625, 0.875])
+        assert values["height"][1] - values["height"][0] == pytest.approx(0.25)
+    assert tables.TrainedBaselines([tested], ["two"]).of(tested, "two") == {}
+
+
 def test_tables_are_the_same_each_time(made_up: Path, tmp_path: Path) -> None:
-    tables.write_tables(made_up, tmp_path / "one", resamples=100)
-    tables.write_tables(made_up, tmp_path / "two", resamples=100)
+    write_tables(made_up, tmp_path / "one")
+    write_tables(made_up, tmp_path / "two")
     for path in sorted((tmp_path / "one").iterdir()):
         assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
 
@@ -398,7 +522,7 @@ def test_tables_are_the_same_each_time(made_up: Path, tmp_path: Path) -> None:
 def test_tables_name_a_trial_and_several_sources(made_up: Path, tmp_path: Path) -> None:
     info = PartInfo.read(made_up / "h.cluster.json")
     PartInfo(**{**vars(info), "source": "other", "is_trial": True}).write(made_up)
-    printed = " ".join(tables.write_tables(made_up, tmp_path / "out", resamples=100))
+    printed = " ".join(write_tables(made_up, tmp_path / "out"))
     assert "No result" in printed
     assert "Parts cluster were measured with 2 versions of the source" in printed
 
@@ -406,12 +530,12 @@ def test_tables_name_a_trial_and_several_sources(made_up: Path, tmp_path: Path) 
 def test_rejects_damaged_record(made_up: Path, tmp_path: Path) -> None:
     (made_up / "h.cluster.parquet").write_bytes(b"PAR1")
     with pytest.raises(InputError, match=r"h\.cluster\.parquet"):
-        tables.write_tables(made_up, tmp_path / "out")
+        write_tables(made_up, tmp_path / "out")
     (made_up / "h.cluster.json").write_text("{}", encoding="utf-8")
     with pytest.raises(InputError, match=r"h\.cluster\.json"):
-        tables.write_tables(made_up, tmp_path / "out")
+        write_tables(made_up, tmp_path / "out")
     with pytest.raises(InputError, match="expected records, got none"):
-        tables.write_tables(tmp_path / "nowhere", tmp_path / "out")
+        write_tables(tmp_path / "nowhere", tmp_path / "out")
 
 
 def test_undefined_values_survive_a_file(tmp_path: Path) -> None:
@@ -423,7 +547,7 @@ def test_undefined_values_survive_a_file(tmp_path: Path) -> None:
 
 
 def test_halves_of_the_frames_are_alternate_blocks() -> None:
-    first, second = measurement.half_frames(20)
+    first, second = detections.half_frames(20)
     assert first == [0, 1, 4, 5, 8, 9, 12, 13, 16, 17]
     assert second == [2, 3, 6, 7, 10, 11, 14, 15, 18, 19]
 
@@ -431,10 +555,11 @@ def test_halves_of_the_frames_are_alternate_blocks() -> None:
 def test_hours_by_hand() -> None:
     protocol = read_protocol()
     info = PartInfo("j", "training", "cluster", "", "", "", 20, 7.0, 1, 1, 8, {}, True, 9.0, 8.0, 0.5, MACHINE)
-    assert protocol.frames == 120 and len(protocol.junctions) == 19
+    frames = [protocol.frames_of(junction) for junction in protocol.measured_junctions]
+    assert sorted(frames) == [60] * 12 + [120] * 6 + [320]
     assert costs.estimated_s([info], protocol) == {"cluster": pytest.approx(48 * 6 * 0.5 + 40)}  # 48 sites, 120 frames
     text = costs.estimate([info], protocol)
-    assert "about 0.5 hours" in text  # 19 junctions of 184 s, on two cores
+    assert "about 0.4 hours" in text  # 184 s times 12 / 2 + 6 + 320 / 120, on two cores
     assert "without pointpillars" in text
 
 
@@ -474,6 +599,35 @@ def test_list_prints_the_hash(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.slow
+def test_detections_depend_on_no_other_source(tmp_path: Path) -> None:
+    """Every module of the program that runs is followed, calls only, or reads and writes files.
+
+    Static world and traffic count by the keys of their stages.
+    """
+    scenario = with_sites(
+        load(write_mini(tmp_path / "mini")), [Site("a", Pose(0.0, -7.0, 3.0), "small", pole="a")], tmp_path / "s.csv"
+    )
+    held_out = prepare_held_out_traffic(scenario, tmp_path / "unseen", 20, apart_s=1.0)
+    executed: set[str] = set()
+
+    def record(frame: FrameType, event: str, _: object) -> None:
+        if event == "call":
+            executed.add(frame.f_globals.get("__name__", ""))
+
+    sys.setprofile(record)
+    try:
+        detections.run(held_out, "cluster", jobs=1)
+    finally:
+        sys.setprofile(None)
+    followed = set(stage_keys.source_modules(*detections.COMPUTING, cluster.__name__))
+    followed |= set(stage_keys.source_modules("egvs.stages.traffic", "egvs.stages.statics"))
+    files_only = ("egvs.core.", "egvs.artefacts.", "egvs.runs.", "egvs.kernels.jit", "egvs.kernels.kernel_cache")
+    others = {name for name in executed if name.startswith(("egvs.", "benchmarks."))} - followed - {*detections.CALLING}
+    assert {name for name in others if not name.startswith(files_only)} == set()
+    assert "egvs.validation.cloud_simulation" in executed and cluster.__name__ in executed
+
+
+@pytest.mark.slow
 def test_a_part_is_measured_once_and_the_same_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(measurement, "check_unseen", lambda scenario: None)  # its traffic is a finished file
     protocol = read_protocol().model_copy(update={"apart_s": 1.0})
@@ -487,9 +641,9 @@ def test_a_part_is_measured_once_and_the_same_again(tmp_path: Path, monkeypatch:
     few = [entry for entry in surrogates.score_catalogue() if entry.name == "points_on_target"]
     monkeypatch.setattr(surrogates, "score_catalogue", lambda: few)
 
-    def measured(part: str, folder: str) -> PartInfo:
+    def measured(part: str, folder: str, again: str = "") -> PartInfo:
         plan = measurement.PartPlan(
-            protocol, "hash", junction, part, scenario, sites, measurement.Extent(20, 2), tmp_path / folder
+            protocol, "hash", junction, part, scenario, sites, measurement.Extent(20, 2), tmp_path / folder, again
         )
         return measurement.measure(plan, jobs=1, report=texts.append)
 
@@ -500,6 +654,13 @@ def test_a_part_is_measured_once_and_the_same_again(tmp_path: Path, monkeypatch:
     assert texts == ["hill cluster: measured before"]
     for part in ("vehicles", "cluster", "scores"):
         assert measured(part, "two").key == next(info.key for info in infos if info.part == part)
+    # a junction that is not for training is measured once
+    entry = PartInfo.read(tmp_path / "one" / "hill.cluster.json")
+    PartInfo(**{**vars(entry), "key": "another"}).write(tmp_path / "one")
+    junction = junction.model_copy(update={"role": "held out"})
+    with pytest.raises(InputError, match="was measured before"):
+        measured("cluster", "one")
+    assert measured("cluster", "one", again="a fault").again == ("a fault",)
     for path in (tmp_path / "one").glob("*.parquet"):
         assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
 

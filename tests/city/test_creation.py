@@ -255,7 +255,7 @@ def test_wrong_input_gives_one_message_and_creates_nothing(extract: Path, tmp_pa
         assert not out.exists()
     out.mkdir()
     (out / "mine").touch()
-    code, _, error = run_egvs("city", "new", out, "--osm", extract)
+    code, _, error = run_egvs("city", "new", out, "--from", extract)
     assert code == 2 and "not empty" in error
 
 

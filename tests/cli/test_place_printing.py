@@ -159,3 +159,8 @@ def test_replaced_plan_is_named_by_its_options() -> None:
     assert place.describe_replaced(two, {**two, "survives": 1}) == (
         "replaces the plan for --count 2 with other settings in [placement]"
     )
+
+
+def test_files_come_last(capsys: pytest.CaptureFixture[str]) -> None:
+    text = printed(placed_two(files=("runs/r/placement.parquet", "runs/r/report.html")), capsys)
+    assert text.endswith(f"{LAST_LINES}runs/r/placement.parquet\nruns/r/report.html\n")

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 import egvs
+from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
+from egvs.artefacts.run_record import RunRecord
 from egvs.core.errors import InputError
 from egvs.formats.point_clouds import read_points
+from egvs.runs.command_results import add_to_report
 from egvs.stages import scan
 
 Call = Callable[..., tuple[int, str, str]]
@@ -86,3 +89,23 @@ def test_rejects_clouds_whose_names_differ_in_case_only() -> None:
     scan._check_cloud_names(["pole_a", "pole_b", "pole_a"])
     with pytest.raises(InputError, match="POLE_a and pole_a give the same file on Windows and macOS"):
         scan._check_cloud_names(["pole_a", "POLE_a"])
+
+
+def test_the_run_stays_complete_and_its_report_shows_later_results(mini: Path, run_egvs: Call, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    assert run_egvs("run", mini, "--out", run)[0] == 0
+    before, report = RunRecord.read(run), (run / "report.html").read_bytes()
+    assert run_egvs("scan", mini, "--out", run, "--points", "pole_a")[0] == 0
+    after = RunRecord.read(run)
+    assert list(after.stages) == list(STAGE_NAMES)
+    assert after.stages["report"] == before.stages["report"]
+    assert after.stages["scan"].cost == before.stages["scan"].cost
+
+    after.having("report", None).write(run)  # as an older version left it
+    row = egvs.read_scores(run / "scores.parquet").to_pylist()[0]
+    pose = {name: row[name] for name in ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")}
+    entry = {"sensor": "s", "passed": False, "reasons": ["too low"], "path": "", "pose": pose}
+    written = add_to_report(run, RunFolder.acceptance, {row["site"]: entry})
+    assert run / "report.html" in written
+    assert b"too low" in (run / "report.html").read_bytes() and b"too low" not in report
+    assert list(RunRecord.read(run).stages) == list(STAGE_NAMES)

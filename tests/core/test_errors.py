@@ -7,7 +7,14 @@ from dataclasses import replace
 
 from egvs.artefacts.run_record import StageRecord
 from egvs.cli.console import ProgressDisplay
-from egvs.core.errors import WARNINGS_KEY, Diagnostic, DiagnosticsError, collect_warnings, with_relative_paths
+from egvs.core.errors import (
+    WARNINGS_KEY,
+    Diagnostic,
+    DiagnosticsError,
+    collect_warnings,
+    unknown_site,
+    with_relative_paths,
+)
 from egvs.core.resource_usage import ResourceUsage
 
 ONE = Diagnostic("sites on lanes", "sites.csv: row 3 (k2)", "stands on lane e1_0", "Move it by 2 m.")
@@ -45,3 +52,17 @@ def test_warning_names_files_relative_to_scenario(tmp_path) -> None:
         ONE.where,
     ]
     assert with_relative_paths(tmp_path, {"solids": 1}) == {"solids": 1}
+
+
+def test_unknown_site_lists_the_sites_of_the_pole_that_is_meant_first() -> None:
+    sites = [f"k{pole:02d}@{height}m" for pole in range(1, 13) for height in (3, 6)]
+    assert str(unknown_site("--site", "k11", sites)) == (
+        "--site: there is no site 'k11'. Choose one of k11@3m, k11@6m, k01@3m, k01@6m, k10@3m, k10@6m, k12@3m, k12@6m"
+        " and 16 more (the most similar first)."
+    )
+
+
+def test_unknown_site_lists_all_of_a_few() -> None:
+    assert str(unknown_site("--site", "pole_z", ["b", "pole_a"], "this run has")) == (
+        "--site: this run has no site 'pole_z'. Choose one of pole_a, b."
+    )

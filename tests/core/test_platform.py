@@ -14,7 +14,7 @@ import pytest
 
 import egvs
 from egvs.core import platform
-from tests.platform_tests import depends_on_platform, platform_modules
+from tests.platform_tests import platform_modules, platform_tests
 
 ROOT = Path(__file__).parents[2]
 
@@ -72,10 +72,37 @@ def test_all_modules_can_be_imported() -> None:
 def test_portable_suite_has_tests_of_what_differs_between_systems() -> None:
     used_by = {"egvs.core.files", "egvs.core.resource_usage", "egvs.runs.locks", "egvs.formats.reader_process"}
     assert {"egvs.core.platform", *used_by} <= platform_modules()
-    tests = ROOT / "tests"
-    assert depends_on_platform(tests / "core" / "test_platform.py")
-    assert depends_on_platform(tests / "placement" / "test_plan.py")
-    assert not depends_on_platform(tests / "kernels" / "test_traversal.py")
+    folder = ROOT / "tests"
+    assert "test_peak_memory_grows_with_an_array" in platform_tests(folder / "core" / "test_platform.py")
+    assert len(platform_tests(folder / "placement" / "test_plan.py")) > 10
+    assert not platform_tests(folder / "kernels" / "test_traversal.py")
+
+
+SOME_TESTS = """
+import pytest
+from egvs.core import files
+from egvs.core.wording import number_of
+
+@pytest.fixture
+def written(tmp_path):
+    files.write_text(tmp_path / "a.txt", "text")
+
+def test_of_fixture(written): assert True
+def test_of_command(run_egvs): assert run_egvs("run")
+@pytest.mark.usefixtures("written")
+def test_of_marked_fixture(): assert True
+def test_of_words(tmp_path): assert number_of(2, "site")
+def helper(): return number_of(3, "site")
+def test_of_other_helper(): assert helper()
+"""
+
+
+def test_portable_tests_are_those_that_use_a_module_of_the_platform(tmp_path: Path) -> None:
+    path, with_setup = tmp_path / "test_some.py", tmp_path / "test_setup.py"
+    path.write_text(SOME_TESTS)
+    assert platform_tests(path) == {"test_of_fixture", "test_of_command", "test_of_marked_fixture"}
+    with_setup.write_text(SOME_TESTS.replace("@pytest.fixture", "@pytest.fixture(autouse=True)"))
+    assert len(platform_tests(with_setup)) == 5
 
 
 WITHOUT_POSIX = """

@@ -15,7 +15,11 @@ from pathlib import Path
 
 import pytest
 
-from egvs.explore import page, server
+from egvs.artefacts.run_record import StageRecord
+from egvs.core.errors import InputError
+from egvs.core.resource_usage import ResourceUsage
+from egvs.explore import page, server, settings
+from egvs.runs.run import StageListener
 from tests.processes import EGVS
 
 
@@ -44,6 +48,23 @@ def test_serves_until_interrupt_and_cleans_up(mini: Path, tmp_path: Path) -> Non
         opener.open(address)
     assert not any(tmp_path.glob("tmp/egvs-work-*"))  # temporary runs with other settings
     assert {path: path.read_bytes() for path in out.iterdir()} == before
+
+
+@pytest.mark.parametrize("options", [(), ("--to", "page.html")])
+@pytest.mark.parametrize(("entry", "source"), [("traffic (from the road classes)", "the assumed flows"),
+                                               ("positions of the poles", "the counts")])  # fmt: skip
+def test_says_what_simulated_flows_are_compared_with(
+    run_egvs, mini: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], entry: str, source: str
+) -> None:
+    record = StageRecord("", {}, {}, {"frames": 10, "counts": [{"geh": 0.21}]}, ResourceUsage(seconds=1.0, peak_mb=1.0))
+
+    def open_session(*_: object, listener: StageListener, **__: object) -> None:
+        listener("traffic", "skipped", record)
+        raise InputError("here", "the session would begin")
+
+    monkeypatch.setattr(settings, "open_session", open_session)
+    code, _, err = run_egvs("explore", mini, *options, "--set", f"assumed=['{entry}']")
+    assert code == 2 and f"10 frames; largest GEH against {source} 0.2" in err
 
 
 def test_address_is_printed_and_opened(run_egvs, mini: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from tests.conftest import write_mini
 
 pytest.importorskip("viser", reason="the page needs viser: pip install 'egvs[explore]'")
 
-from egvs.explore.drawing import HIDDEN_COLOUR, VISIBLE_COLOUR
+from egvs.explore.drawing import HIDDEN_COLOUR, VISIBLE_COLOUR, colour_scale, linear_colours
 from egvs.explore.page_file import write_page_file
 from egvs.explore.settings import open_session
 from tests.explore.test_page_in_browser import CHROMIUM, GRAPHICS, READY_MS
@@ -31,13 +31,22 @@ VISIBLE = """() => Object.entries(window.__viserSceneTree.getState())
 
 MIN_PIXELS, MAX_COLOUR_DIFFERENCE = 10, 8
 """A roof has this many pixels at least, and each channel differs from the legend by this much at most."""
+VEHICLE_COLOURS = np.array([VISIBLE_COLOUR, HIDDEN_COLOUR])
+WORST_SITE_COLOUR = colour_scale([0.0, 1.0])[0]
 
 
-def count_legend_colours(picture: np.ndarray) -> int:
-    """Return the number of pixels (rows, columns, 3) that have the colour of hit or missed vehicles."""
-    colours = np.array([VISIBLE_COLOUR, HIDDEN_COLOUR])
+def count_pixels(picture: np.ndarray, colours: np.ndarray) -> int:
+    """Return the number of pixels of a picture (rows, columns, 3) that have one of the colours (n, 3)."""
     differences = np.abs(picture[:, :, None, :].astype(int) - colours).max(axis=3)
     return int((differences.min(axis=2) <= MAX_COLOUR_DIFFERENCE).sum())
+
+
+def count_shades(picture: np.ndarray, colour: np.ndarray) -> int:
+    """Return the number of pixels of a picture (rows, columns, 3) with a colour (3,) at half of its light or more."""
+    light, full = linear_colours(picture) / 255, linear_colours(colour) / 255
+    shade = light @ full / (full @ full)
+    differences = np.abs(light - shade[:, :, None] * full).max(axis=2)
+    return int(((shade >= 0.5) & (differences <= 0.02)).sum())
 
 
 def test_opens_from_disk_without_network(tmp_path: Path) -> None:
@@ -64,14 +73,15 @@ def test_opens_from_disk_without_network(tmp_path: Path) -> None:
         tab.wait_for_function(f"({VISIBLE})().join() === '/layers/seen'")
         tab.get_by_label("none").check()
         tab.wait_for_function(f"({VISIBLE})().join() === ''")
-        tab.evaluate("document.getElementById('egvs').style.display = 'none'")
+        tab.add_style_tag(content="#egvs, .mantine-Notifications-root { display: none }")
         for _ in range(40):  # traffic plays
             tab.wait_for_timeout(500)
             picture = np.asarray(Image.open(io.BytesIO(tab.screenshot())).convert("RGB"))
-            if count_legend_colours(picture) >= MIN_PIXELS:
+            if count_pixels(picture, VEHICLE_COLOURS) >= MIN_PIXELS:
                 break
         browser.close()
-    assert count_legend_colours(picture) >= MIN_PIXELS, "no vehicle has a colour of the legend"
+    assert count_pixels(picture, VEHICLE_COLOURS) >= MIN_PIXELS, "no vehicle has a colour of the legend"
+    assert count_shades(picture, WORST_SITE_COLOUR) >= MIN_PIXELS, "the ball of the worst site has another colour"
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
     assert errors == []
     assert {url.split(":")[0] for url in requests} <= {"file", "blob", "data"}

@@ -11,8 +11,8 @@ pytest.importorskip("viser", reason="the page needs viser: pip install 'egvs[exp
 
 from egvs.core.progress import no_progress
 from egvs.explore import recorded_traffic
-from egvs.explore.drawing import vehicle_mesh
-from egvs.explore.recorded_traffic import TrafficClip, body_mesh, frames_per_step, linear_colours
+from egvs.explore.drawing import linear_colours, vehicle_mesh
+from egvs.explore.recorded_traffic import TrafficClip, body_mesh, frames_per_step
 from egvs.explore.session import Playback, Session
 from egvs.explore.settings import open_session
 from egvs.scoring.targets import SEEN_WELL_POINTS

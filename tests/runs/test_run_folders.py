@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 import egvs
 from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.artefacts.run_record import RunRecord
+from egvs.cli import run_list_table
 from egvs.core import files
 from egvs.core.errors import InputError, RunError
 from egvs.core.files import add_checksum
@@ -87,16 +90,51 @@ def test_lists_runs_latest_first_with_what_differs_and_the_best_site(here: Path,
     egvs.run(egvs.load(here, ["score.gamma=5", "traffic.frames=20"]))
     make_later(Path("runs/mini@frames=20,gamma=5"), 60)
     code, printed, _ = run_egvs("runs")
-    head, latest, plain = printed.splitlines()
+    head, latest, plain, hint = printed.splitlines()
     assert code == 0
-    assert head.split()[:3] == ["run", "scenario", "differs"]
-    assert latest.split()[:5] == ["mini@frames=20,gamma=5", "mini", "score.gamma=5,", "traffic.frames=20", "complete"]
-    assert plain.split()[:3] == ["mini", "mini", "complete"]
+    assert head.split() == ["run", "state", "best", "score", "size", "last", "run"]
+    assert latest.split()[:2] == ["mini@frames=20,gamma=5", "complete"]
+    assert "--verbose" in hint
     scores = egvs.read_scores("runs/mini/scores.parquet").to_pylist()
     best = max(scores, key=lambda row: row["egvs"])
-    assert plain.split()[3:8] == [best["site"], f"{best['egvs']:,.0f}", "bit", "egvs", "2"]
+    assert plain.split()[:6] == ["mini", "complete", best["site"], f"{best['egvs']:,.0f}", "EGVS", "bit"]
+    paragraphs = [text.splitlines() for text in run_egvs("runs", "--verbose")[1].split("\n\n")]
+    assert [lines[0] for lines in paragraphs] == ["runs/mini@frames=20,gamma=5", "runs/mini"]
+    assert paragraphs[0][1:4] == [
+        "  scenario    mini",
+        "  differs in  score.gamma=5, traffic.frames=20",
+        "  state       complete",
+    ]
+    assert paragraphs[1][3:6] == [
+        f"  best        {best['site']}",
+        f"  score       {best['egvs']:,.0f} EGVS bit",
+        "  sites       2",
+    ]
     make_later(Path("runs/mini"), 120)
     assert [run.folder.name for run in run_list.list_runs()] == ["mini", "mini@frames=20,gamma=5"]
+
+
+@pytest.mark.parametrize("width", [60, 80, 100, 140, 190])
+def test_list_fits_the_terminal_and_cuts_no_number(width: int) -> None:
+    """Names continue on the next line; numbers stay whole."""
+    label = "what_if.works.boxes.0.height_m=3.25,tall,32737403"
+    best = run_list.BestSites("egvs", tuple(f"kerb_NE{i}@4.5m+aim" for i in range(5)), 1_234_567.0, 108)
+    overrides = {"what_if.works.boxes.0.height_m": 3.25, "sites.sensor": "VLP-32C"}
+    runs = [
+        run_list.ListedRun(Path(f"runs/nishishinjuku@{label}"), 0.0, 109_000_000, Path("s"), overrides, best=best),
+        run_list.ListedRun(Path("runs/bh"), 0.0, 2_500, Path("s"), missing=("report",), best=best),
+    ]
+    text = io.StringIO()
+    Console(file=text, width=width).print(run_list_table.runs_table(runs, width, now_s=7_200.0))
+    lines = text.getvalue().splitlines()
+    assert max(map(len, lines)) <= width
+    assert "…" not in text.getvalue()
+    for number in ("1,234,567 EGVS bit", "109 MB", "2.5 KB", "2 h ago"):
+        assert any(number in line for line in lines), number
+    if width <= run_list_table.FILE_WIDTH:
+        name = "".join(line[: lines[0].index("state")].strip() for line in lines[1:])
+        assert name.startswith(runs[0].folder.name)
+    assert ("differs in" in lines[0]) == (width >= 140)
 
 
 def test_repeated_run_is_the_latest_although_no_stage_ran(here: Path) -> None:
@@ -199,6 +237,31 @@ def test_folders_without_a_run_are_explained(here: Path, run_egvs: Any) -> None:
     egvs.run(egvs.load(here))
     message = "egvs: mini: this is a scenario; expected a run folder. Did you mean runs/mini?\n"
     assert run_egvs("compare", "mini")[::2] == (2, message)
+
+
+@pytest.mark.parametrize("words", [("export", "runs/mini", "--to", "csv"), ("place", "runs/mini"),
+                                   ("verify", "runs/mini"), ("report", "runs/mini")])  # fmt: skip
+def test_missing_run_folder_suggests_runs_with_other_settings(
+    here: Path, run_egvs: Any, words: tuple[str, ...]
+) -> None:
+    for number, label in enumerate(("gamma=5", "frames=9", "gamma=6", "gamma=7")):
+        message = {
+            0: "egvs: runs/mini: no such folder. Give a folder",
+            1: "egvs: runs/mini: no such folder. Did you mean runs/mini@gamma=5?\n",
+            3: "egvs: runs/mini: no such folder. Runs with other settings are runs/mini@gamma=6, runs/mini@frames=9, "
+            "runs/mini@gamma=5; egvs runs lists them.\n",
+        }.get(number, "egvs: runs/mini: no such folder. ")
+        code, _, printed = run_egvs(*words)
+        assert code == 2 and printed.startswith(message)
+        run = Path(f"runs/mini@{label}")
+        run.mkdir(parents=True)
+        (run / "run.json").touch()
+        os.utime(run / "run.json", (100 + number, 100 + number))
+    (Path("runs") / "mini2@gamma=5").mkdir()
+    assert "runs/mini@frames=9 and 1 more; egvs runs lists them" in run_egvs(*words)[2]
+    assert run_egvs("verify", "mini")[2].startswith(
+        "egvs: mini: this is a scenario; expected a run folder. Runs with other settings are runs/mini@gamma=7, "
+    )
 
 
 def test_list_of_another_folder(here: Path, run_egvs: Any) -> None:

@@ -238,6 +238,9 @@ def test_worst_zones_of_each_group() -> None:
     worst = readers.worst_zones(rows)
     assert [(row.zone, row.user_class) for row in worst] == [("a", "pedestrian"), ("b", "bus")]
     assert worst[0].in_words() == "a, 71 ± 3% of 30 pedestrians"
+    assert readers.describe_worst_zones("the plan", worst[:1]) == (
+        "Of all zones and classes of road users, the plan finds the smallest shares in: a, 71 ± 3% of 30 pedestrians"
+    )
 
 
 BOW_TIE = {"type": "Polygon", "coordinates": [[[0, 0], [9, 9], [9, 0], [0, 9], [0, 0]]]}

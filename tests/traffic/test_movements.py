@@ -6,6 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from egvs.scenario.traffic_config import CountConfig
+from egvs.traffic.approach_names import ApproachNames
+from egvs.traffic.approaches import ApproachIndex
 from egvs.traffic.movements import MovementNames
 from tests.scoring.roads import NETWORK, read
 
@@ -52,3 +55,53 @@ def test_directions_are_those_at_the_junction(tmp_path: Path) -> None:
         )
     words = MovementNames(read(tmp_path, text), CENTER_M).describe("far", "up")
     assert words == "High Street (west) from Side Street, left to an unnamed street"
+
+
+SLIP_LANE = """<net version="1.20">
+    <edge id="in" from="w" to="f"><lane id="in_0" index="0" length="100" shape="-120,0 -20,0"/></edge>
+    <edge id="main" from="f" to="j"><lane id="main_0" index="0" length="18" shape="-20,0 -2,0"/></edge>
+    <edge id="slip" from="f" to="m"><lane id="slip_0" index="0" length="25" shape="-20,0 0,-15"/></edge>
+    <edge id="down" from="j" to="m"><lane id="down_0" index="0" length="18" shape="0,-2 0,-15"/></edge>
+    <edge id="east" from="j" to="e"><lane id="east_0" index="0" length="100" shape="2,0 100,0"/></edge>
+    <edge id="south" from="m" to="s"><lane id="south_0" index="0" length="80" shape="0,-15 0,-100"/></edge>
+    <junction id="f" type="priority" x="-20" y="0" incLanes="" intLanes="" shape="-20,-1 -20,1"/>
+    <junction id="j" type="traffic_light" x="0" y="0" incLanes="" intLanes="" shape="-2,-2 2,-2 2,2 -2,2"/>
+    <junction id="m" type="priority" x="0" y="-15" incLanes="" intLanes="" shape="-1,-15 1,-15"/>
+    <connection from="in" to="main" fromLane="0" toLane="0" dir="s" state="M"/>
+    <connection from="in" to="slip" fromLane="0" toLane="0" dir="r" state="M"/>
+    <connection from="main" to="east" fromLane="0" toLane="0" dir="s" state="M"/>
+    <connection from="slip" to="south" fromLane="0" toLane="0" dir="s" state="M"/>
+    <connection from="down" to="south" fromLane="0" toLane="0" dir="s" state="M"/>
+</net>
+"""
+"""A lane for right turns beside the signals: it leaves the approach from the west 20 m before them."""
+
+SLIP_FLOWS = (
+    CountConfig(from_edge="in", to_edge="south", per_hour=60.0),
+    CountConfig(from_edge="in", to_edge="east", per_hour=40.0),
+)
+
+
+def test_right_turns_beside_the_signals_have_the_approach_of_their_edge(tmp_path: Path) -> None:
+    """All movements of an edge lie on the side that zones and signals name, that of the edge to the signals."""
+    roads = read(tmp_path, SLIP_LANE)
+    names = MovementNames(roads, (0.0, 0.0), SLIP_FLOWS)
+    assert [names.describe("in", to) for to in ("south", "east")] == [
+        "west, right to an unnamed street",
+        "west, straight on",
+    ]
+    assert ApproachNames(roads).approach("main") == "west"
+    index = ApproachIndex.of_flows(SLIP_FLOWS, names)
+    assert index.titles == ["west"]
+    (right,) = index.find("", "west", ["right"], "counts.csv")
+    assert right.flow is SLIP_FLOWS[0]
+    alone = MovementNames(roads, (0.0, 0.0), SLIP_FLOWS[:1])
+    assert alone.describe("in", "south") == "north-west, straight on"  # nothing else is known of its edge
+
+
+def test_side_streets_with_another_name_keep_their_approach(tmp_path: Path) -> None:
+    """The name of the street tells the two approaches of one edge apart."""
+    text = SLIP_LANE.replace('id="slip" from="f" to="m"', 'id="slip" from="f" to="m" name="Mill Lane"')
+    names = MovementNames(read(tmp_path, text), (0.0, 0.0), SLIP_FLOWS)
+    assert names.describe("in", "south") == "Mill Lane (north-west), straight on to an unnamed street"
+    assert names.describe("in", "east") == "west, straight on"

@@ -258,7 +258,8 @@ WRONG = [
     ({"c": {"phases": [NS | {"green": {"north": ["left"], "east": ["straight"]}}]}}, "conflict, but both have green"),
     ({"c": {"phases": [NS | {"green": {"north": ["straight", "crossing"]}}]}},
      r"Mill Lane \(north\) straight and Mill Lane \(north\) crosswalk conflict"),
-    ({"c": {"phases": [NS]}}, r"never green: High Street \(east\) right, High Street \(east\) straight"),
+    ({"c": {"phases": [NS]}}, r"never green: High Street \(east\) right, High Street \(east\) straight.*\. "
+     r"A plan replaces all phases of the signal: add these movements to a phase\."),
     ({"c": {"phases": [NS, EW], "cycle_s": 90}},
      r"cycle_s = 90: the phases with yellow and all-red add up to 60 s \(30, 3, 2, 20, 3, 2\). Use cycle_s = 60"),
     ({"c": {"phases": [NS, EW]}, "Mill Lane": {"phases": [NS, EW]}}, r"High Street / Mill Lane \(c\) has two plans"),

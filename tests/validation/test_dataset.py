@@ -220,8 +220,8 @@ def test_openpcdet_grid_contains_labels(four_sites, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--site", "levl"], "--site: no site 'levl'. Did you mean level?"),
-        (["--site", "x9"], "--site: no site 'x9'. Use one of level, tilted, rolled, behind"),
+        (["--site", "levl"], "--site: there is no site 'levl'. Choose one of level, "),
+        (["--site", "x9"], "--site: there is no site 'x9'. Choose one of level, tilted, rolled, behind"),
         (["--frames", "11"], "--frames: expected at most 10 frames at least 2 s apart, got 11"),
         (["--frames", "0"], "--frames"),
         (["--format", "waymo"], "--format: unknown format 'waymo'. Use one of kitti, openpcdet, ply, pcd"),

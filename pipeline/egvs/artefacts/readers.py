@@ -128,7 +128,7 @@ class SiteBlindspots:
         if not self.worst:
             return f"{self.site}: {self.overall.share:.0%} of the vehicles are found, on no listed lane fewer"
         worst = "; ".join(location.in_words() for location in self.worst[:2])
-        return f"{self.site}: fewest vehicles are found here: {worst}"
+        return f"Of all lanes, turns and crossings, {self.site} finds the smallest shares of vehicles on: {worst}"
 
 
 def read_blindspots(path: Path, only: Collection[str] | None = None) -> Iterator[SiteBlindspots]:
@@ -282,6 +282,20 @@ def worst_zones(rows: Sequence[ZoneVisibility]) -> list[ZoneVisibility]:
         if row.road_users >= MIN_VEHICLES and row.user_class != ALL_USERS:
             groups[row.user_class if row.user_class in groups else ""].append(row)
     return [min(group, key=lambda row: (row.share, row.zone)) for group in groups.values() if group]
+
+
+def describe_worst_zones(finder: str, worst: Sequence[ZoneVisibility]) -> str:
+    """Return in one line where a site or a plan finds the smallest shares.
+
+    Parameters
+    ----------
+    finder
+        Name of the site, or "the plan".
+    worst
+        From :func:`worst_zones`.
+    """
+    listed = "; ".join(zone.in_words() for zone in worst)
+    return f"Of all zones and classes of road users, {finder} finds the smallest shares in: {listed}"
 
 
 DISTINCT_PROBABILITY = 0.9

@@ -15,6 +15,7 @@ from egvs.core import files, reading
 from egvs.core.errors import InputError
 from egvs.core.files import CHECKSUM_KEY, add_checksum, has_valid_checksum
 from egvs.core.resource_usage import ResourceUsage
+from egvs.core.wording import list_first
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,11 @@ def _is_digest_table(value: Any) -> bool:
     return isinstance(value, dict) and all(isinstance(digest, str) for digest in value.values())
 
 
+def traffic_summary(stages: Mapping[str, StageRecord]) -> Mapping[str, Any]:
+    """Return the summary of the stage traffic among ``stages``; empty before it has run."""
+    return stages["traffic"].summary if "traffic" in stages else {}
+
+
 _RECORD_TYPES = {
     "egvs": str, "seed": int, "scenario": dict, "scenario_folder": str, "stages": dict, "overrides": dict,
 }  # fmt: skip
@@ -79,7 +85,7 @@ _RERUN_HINT = "Remove it and run again."
 def _missing_record_error(folder: Path) -> InputError:
     """Return the error for a folder without ``run.json``: what it is, and what to do."""
     if not folder.is_dir():
-        return InputError(folder, "no such folder", "Give a folder written by egvs run.")
+        return InputError(folder, "no such folder", suggest_runs(folder) or "Give a folder written by egvs run.")
     if RunFolder(folder).lock.is_file():
         return InputError(folder, "the run in this folder never finished", "Leave it out, or repeat its egvs run.")
     if (folder / "scenario.toml").is_file():
@@ -92,7 +98,30 @@ def _suggest_run(scenario_folder: Path) -> str:
     run = Path("runs") / scenario_folder.resolve().name
     if RunFolder(run).has_record:
         return f"Did you mean {run}?"
-    return f"First run egvs run {scenario_folder}, then give its run folder."
+    return suggest_runs(run) or f"First run egvs run {scenario_folder}, then give its run folder."
+
+
+def suggest_runs(folder: Path) -> str:
+    """Return a hint at the runs with other settings of a run folder that does not exist; empty if there are none.
+
+    Parameters
+    ----------
+    folder
+        The missing folder, e.g. ``runs/crossing``, where ``runs/crossing@frames=300`` exists.
+    """
+    if not folder.parent.is_dir():
+        return ""
+    start = f"{folder.name}@"
+    runs = [path for path in folder.parent.iterdir() if path.name.startswith(start) and RunFolder(path).has_record]
+    runs.sort(key=lambda path: (-RunFolder(path).run_record.stat().st_mtime, path.name))
+    if not runs:
+        return ""
+    if len(runs) == 1:
+        return f"Did you mean {runs[0]}?"
+    return f"Runs with other settings are {list_first([str(path) for path in runs], _MAX_RUNS)}; egvs runs lists them."
+
+
+_MAX_RUNS = 3
 
 
 @dataclass(frozen=True, repr=False)
@@ -124,7 +153,7 @@ class RunRecord:
     @property
     def traffic_summary(self) -> Mapping[str, Any]:
         """The summary of the stage traffic; empty before it has run."""
-        return self.stages["traffic"].summary if "traffic" in self.stages else {}
+        return traffic_summary(self.stages)
 
     def __repr__(self) -> str:
         return f"RunRecord({self.scenario.get('name', '?')}; stages {', '.join(self.stages)})"

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from html import escape
 
 from egvs.city.results import BudgetPoint, CityPlan, gain_label
+from egvs.core.wording import number_of
 from egvs.report.svg_figures import round_values, svg_start_tag
 
 _WIDTH, _HEIGHT = 640.0, 360.0
@@ -120,7 +121,7 @@ class _BudgetChart:
             yield f'<g class="curve-marker"><title>{title}</title><circle cx="{x:.1f}" cy="{y:.1f}" r="3.6"/></g>'
 
     def _title(self, point: BudgetPoint) -> str:
-        sensors = "1 sensor" if point.sensors == 1 else f"{point.sensors} sensors"
+        sensors = number_of(point.sensors, "sensor")
         within = sensors if self._is_count else f"cost {point.cost:,.0f}, {sensors}"
         error = f" ± {self._label.value(point.score_se)}" if self._plan.has_errors else ""
         return f"{within}: {self._label.value(point.score)}{error}, at most {self._label.value(point.bound)}"

@@ -32,6 +32,7 @@ from egvs.city.worker_pool import print_to_stderr
 from egvs.core.errors import Diagnostic, InputError, collect_warnings
 from egvs.core.grid import Roi
 from egvs.core.progress import ProgressCallback, no_progress
+from egvs.core.wording import list_first
 from egvs.runs import run_names
 from egvs.runs.run import lock_run_folder
 
@@ -371,10 +372,7 @@ def overlap_warnings(jobs: Sequence[Job]) -> Iterator[Diagnostic]:
     pairs = [f"{a} and {b}" for (a, box), (b, other) in combinations(boxes, 2) if _overlap(box, other)]
     if not pairs:
         return
-    names = ", ".join(pairs[:_MAX_PAIRS])
-    if len(pairs) > _MAX_PAIRS:
-        names += f" and {len(pairs) - _MAX_PAIRS} more pairs"
-    problem = f"the regions of {names} overlap, so the overlap counts twice in the city's score"
+    problem = f"the regions of {list_first(pairs, _MAX_PAIRS)} overlap, so the overlap counts twice in the city's score"
     yield Diagnostic("regions overlap", "junctions", problem, "Use smaller regions, or drop one of the two junctions.")
 
 

@@ -33,6 +33,7 @@ from egvs.core import plugins
 from egvs.core.errors import EgvsError, InputError, RunError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.threads import thread_count
+from egvs.core.wording import by_number
 from egvs.runs import store
 from egvs.runs.store import RemoteStore, Store
 
@@ -589,7 +590,7 @@ def raise_failures(failures: Sequence[JobFailure], n_junctions: int) -> None:
         junctions_by_message.setdefault(failure.message, []).append(failure.junction)
     lines = []
     for message, names in junctions_by_message.items():
-        noun = "junction" if len(names) == 1 else "junctions"
+        noun = by_number(len(names), "junction", "junctions")
         lines.append(f"{noun} {', '.join(names)}: {message}")
     if len(failures) < n_junctions:
         lines.append(f"{len(failures)} of {n_junctions} junctions failed; the others are done")

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 from egvs.city import worker_check
 from egvs.city.worker_check import Problem, Requirements
 from egvs.core.errors import EgvsError, InputError, RunError
+from egvs.core.wording import by_number, list_first
 from egvs.runs.store import RemoteStore
 
 if TYPE_CHECKING:
@@ -316,9 +317,8 @@ def _describe_rejected(workers: dict[str, _WorkerState]) -> list[str]:
         by_problems.setdefault(tuple(worker.problems or ()), []).append(name)
     lines = []
     for problems, names in by_problems.items():
-        noun = "worker" if len(names) == 1 else "workers"
-        shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-        verb = "gets" if len(names) == 1 else "get"
+        noun, verb = by_number(len(names), "worker", "workers"), by_number(len(names), "gets", "get")
+        shown = list_first(names, 3)
         hints = " ".join(dict.fromkeys(problem.hint for problem in problems))
         lines.append(f"{noun} {shown} {verb} no tasks: {'; '.join(problem.text for problem in problems)}. {hints}")
     return lines

@@ -147,7 +147,7 @@ def _describe_tolerance(study: AccuracyStudy) -> str:
     if study.tolerance.score is not None:
         return f"{study.tolerance.score:.2%} of the score"
     points = study.tolerance.loss_points
-    return f"{points:g} percentage point{'' if points == 1 else 's'}"
+    return f"{points:g} percentage {'point' if points == 1 else 'points'}"
 
 
 def _reason_within(study: AccuracyStudy) -> str:

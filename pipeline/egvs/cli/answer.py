@@ -23,6 +23,7 @@ from egvs.cli import stage_summary
 from egvs.cli.console import Column, console, make_table, print_sentences
 from egvs.cli.options import DEFAULT_POLES
 from egvs.core.errors import Diagnostic, collect_warnings
+from egvs.core.wording import by_number, number_of
 from egvs.report import ranking, reliability, sections
 from egvs.report.formatting import ScoreLabel, join_names
 from egvs.report.ranking import Pole, RankedSite, Ranking
@@ -81,7 +82,9 @@ def signal_sentences(plans: Sequence[Mapping[str, Any]]) -> list[str]:
     sentences = [format_plan(plan) for plan in plans[:_MAX_SIGNALS]]
     more = len(plans) - _MAX_SIGNALS
     if more > 0:
-        sentences.append(f"{more} more {'signal is' if more == 1 else 'signals are'} in the region; see the report.")
+        sentences.append(
+            f"{number_of(more, 'more signal')} {by_number(more, 'is', 'are')} in the region; see the report."
+        )
     return sentences
 
 
@@ -113,7 +116,7 @@ def _print_ranking(
     out.print(poles_table(ranked, PeriodRanking.read(folder), poles))
     if poles is not None and len(ranked.poles) > poles:
         others = len(ranked.poles) - poles
-        out.print(f"{others} more {'pole' if others == 1 else 'poles'}: --all lists all")
+        out.print(f"{number_of(others, 'more pole')}: --all lists all")
     out.print()
     if location := _location(ranked.best[0]):
         out.print(location)

@@ -167,6 +167,7 @@ def demo(
 
         shipped.copy_scenario(shipped.DEMO, folder)
         results, loaded = folder / "results", load(folder)
+        screen.flow_source = answer.flow_source(loaded)
         record = run(loaded, results, jobs=jobs, progress=screen.progress, listener=screen.stage_event)
     answer.print_answer(results, loaded, record)
     run_tables.print_demo_hints(results)
@@ -439,6 +440,7 @@ def explore(
     from egvs.core import files, plugins
 
     plugins.require_libraries("egvs explore", "explore", "viser", "PIL")
+    from egvs.cli import answer
     from egvs.explore.page import Page, check_port_free
     from egvs.explore.settings import open_session
 
@@ -446,8 +448,9 @@ def explore(
         _write_page_file(folder, set_, out, jobs, to, has_page_options=bool(port or view))
         return
     check_port_free(port)
-    sources.open_source(folder, set_, out)
+    scenario, _ = sources.open_source(folder, set_, out)
     with ProgressDisplay("explore") as screen:
+        screen.flow_source = answer.flow_source(scenario)
         session = open_session(
             folder, set_ or (), out, jobs=jobs, progress=screen.progress, listener=screen.stage_event
         )  # fmt: skip
@@ -471,6 +474,7 @@ def _write_page_file(
     folder: Path, set_: list[str] | None, out: Path | None, jobs: int | None, to: Path, *, has_page_options: bool
 ) -> None:
     """Write the 3D view of a run as one HTML file, and print what is in it."""
+    from egvs.cli import answer
     from egvs.cli.console import ProgressDisplay
     from egvs.explore.page_file import check_page_file, write_page_file
     from egvs.explore.settings import open_session
@@ -478,8 +482,9 @@ def _write_page_file(
     if has_page_options:
         raise InputError("--to", "cannot be combined with --port or --view", "Leave them out: no page is served.")
     check_page_file(to)
-    sources.open_source(folder, set_, out)
+    scenario, _ = sources.open_source(folder, set_, out)
     with ProgressDisplay("explore") as screen:
+        screen.flow_source = answer.flow_source(scenario)
         session = open_session(
             folder, set_ or (), out, jobs=jobs, progress=screen.progress, listener=screen.stage_event
         )  # fmt: skip
@@ -795,13 +800,16 @@ def runs(
     folder: Annotated[
         Path | None, typer.Argument(metavar="[FOLDER]", help="Folder that contains run folders; runs by default.")
     ] = None,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Print a paragraph for each run, with all settings that differ.")
+    ] = False,
 ) -> None:
-    """List the runs: settings that differ from the scenario, the best site, size and age; the latest run first."""
+    """List the runs: state, the best site, size and age; the latest run first."""
     from egvs.artefacts.run_folder import RUNS
     from egvs.cli import run_list_table
     from egvs.runs import run_list
 
-    run_list_table.print_runs(run_list.list_runs(folder or RUNS))
+    run_list_table.print_runs(run_list.list_runs(folder or RUNS), with_details=verbose)
 
 
 @app.command()

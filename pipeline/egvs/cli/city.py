@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from egvs.cli import options
+from egvs.core.wording import number_of
 
 if TYPE_CHECKING:
     from egvs.city.city_run import CityPlacement, CityRun, CityRunOptions
@@ -53,7 +54,10 @@ CitySet = Annotated[
 def new(
     folder: Annotated[Path, typer.Argument(metavar="CITY", help="Folder of the new city.")],
     osm: Annotated[
-        Path, typer.Option(metavar="FILE", help="An OpenStreetMap extract (.osm, .osm.xml, .osm.pbf, also gzipped).")
+        Path,
+        typer.Option(
+            "--from", "--osm", metavar="FILE", help="An OpenStreetMap extract (.osm, .osm.xml, .osm.pbf, also gzipped)."
+        ),
     ],
     around: Annotated[
         str | None, typer.Option(metavar="LAT,LON", help="Only the streets around this point; all by default.")
@@ -323,7 +327,7 @@ def print_plan(placed: CityPlacement) -> None:
     if plan.joint_of_all > 0:
         share = plan.joint / plan.joint_of_all
     proved = math.floor(plan.certificate * 1e4) / 1e2  # never rounded up
-    sensors = "1 sensor" if len(plan.sensors) == 1 else f"{len(plan.sensors)} sensors"
+    sensors = number_of(len(plan.sensors), "sensor")
     out.print(
         f"{sensors} at {len(plan.by_junction)} of {plan.junctions} junctions{cost}: "
         f"{label.label} {label.value(plan.joint)}, {share:.1%} of the score of all {plan.candidates:,} candidates "

@@ -202,7 +202,7 @@ class ProgressDisplay:
     def __init__(self, verb: str = "", *, with_details: bool = False, file: TextIO | None = None) -> None:
         self.any_stage_ran = False
         self.hidden_warnings = 0
-        self.flow_source = stage_summary.COUNTS
+        self.flow_source = stage_summary.FLOWS
         self._with_details = with_details
         self._warnings: set[str] = set()
         self._stage = verb

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from egvs.cli.console import WIDE, Column, console, make_table
-from egvs.core.wording import number_of
+from egvs.core.wording import list_first, number_of
 from egvs.importers import junctions
 from egvs.importers.new_scenario import NewScenario
 from egvs.importers.openstreetmap.solids import OUT_OF_RANGE, ImportCounts
@@ -91,8 +91,7 @@ def _scenario_lines(scenario: NewScenario) -> Iterator[tuple[str, str]]:
 
 def _describe_map(summary: MapSummary) -> str:
     """Return the files of a map, its format, and its objects with their heights."""
-    first = summary.paths[0].name
-    files = first if len(summary.paths) == 1 else f"{first} and {len(summary.paths) - 1} more"
+    files = list_first([path.name for path in summary.paths], 1)
     texts = [f"{files} ({summary.reader}): {_describe_solids(summary.counts)}"]
     if summary.height_range_m is not None:
         texts.append("tops at z = {:.1f} to {:.1f} m".format(*summary.height_range_m))

@@ -13,6 +13,7 @@ import typer
 from egvs.cli import options, sources
 from egvs.cli.options import Jobs, Out, Set, SettingsPath
 from egvs.core.errors import InputError
+from egvs.core.wording import by_number, number_of
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -101,7 +102,7 @@ def _check_request(count: int | None, budget: float | None, reach: float | None)
 
 
 def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequence[str] = (), caveat: str = "") -> None:
-    """Print the plan and the curve, the files, and what a planner should know, the answer to "how many?" last.
+    """Print the plan and the curve, what a planner should know, and the files.
 
     Parameters
     ----------
@@ -112,9 +113,9 @@ def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequen
     notes
         Sentences about the search.
     caveat
-        A last sentence, on what was assumed; may be empty.
+        The last sentence, on what was assumed; may be empty.
     """
-    from egvs.artefacts.readers import worst_zones
+    from egvs.artefacts.readers import describe_worst_zones, worst_zones
     from egvs.cli.console import WIDE, console, print_sentences
 
     out = console(WIDE, soft_wrap=False)
@@ -129,13 +130,13 @@ def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequen
         sensors = f" by {zone.by} sensors" if zone.by > 1 else ""
         out.print(f"zone {zone.name}: {zone.seen:.1%} of its entropy seen{sensors}, {zone.share:.1%} required")
     if worst := worst_zones(placed.zone_results):
-        print_sentences([f"The plan finds the smallest shares in: {'; '.join(zone.in_words() for zone in worst)}"])
-    for path in placed.files:
-        out.print(str(path), soft_wrap=True)
+        print_sentences([describe_worst_zones("the plan", worst)])
     sentences = [describe_plan(placed), *notes, *_further_sentences(placed, requested)]
     if caveat:
         sentences.append(caveat)
     print_sentences(sentences)
+    for path in placed.files:
+        out.print(str(path), soft_wrap=True)
 
 
 def _further_sentences(placed: Placement, requested: PlacementConfig) -> Iterator[str]:
@@ -322,10 +323,10 @@ def _describe_proof(placed: Placement) -> str:
         fewer = len(placed.sensors) - 1
         if fewer == 0:
             return "one sensor is enough"
-        noun = "sensor is" if fewer == 1 else "sensors are"
+        sensors = f"{number_of(fewer, 'sensor')} {by_number(fewer, 'is', 'are')}"
         if solution.fewest_is_proved:
-            return f"proved: {fewer} {noun} not enough"
-        return f"not proved that {fewer} {noun} not enough"
+            return f"proved: {sensors} not enough"
+        return f"not proved that {sensors} not enough"
     if solution.is_best:
         return "proved: no plan within the rules is better"
     return f"proved: at least {_format_rounded_down(placed.certificate)} of the best possible score"

@@ -7,39 +7,80 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from rich.table import Table
+
 from egvs.city import results
-from egvs.cli.console import Column, print_table
+from egvs.cli.console import Column, console, make_table
 from egvs.cli.run_tables import format_age, format_size
 from egvs.cli.sources import format_setting
+from egvs.core.wording import list_first
 from egvs.report.formatting import SCORE_LABELS
 from egvs.runs.run_list import ListedRun
 
+FILE_WIDTH = 100
+"""Width of the table where standard output is no terminal."""
+
+_WIDE = 140
+"""Terminals of this width get the scenario, the settings and the number of sites, too."""
+
 _MAX_BEST = 3
-"""Sites of equal score that a line names."""
+"""Sites of equal score that are named."""
 
 
-def print_runs(runs: Sequence[ListedRun]) -> None:
-    """Print the run folders, or that there are none."""
+def print_runs(runs: Sequence[ListedRun], *, with_details: bool = False) -> None:
+    """Print the run folders, or that there are none.
+
+    Parameters
+    ----------
+    runs
+        The run folders.
+    with_details
+        Whether a paragraph with all settings is printed for each, instead of a line.
+    """
     if not runs:
         print("no runs")
         return
-    now = time.time()
+    now_s = time.time()
+    if with_details:
+        print("\n\n".join(describe_run(run, now_s) for run in runs))
+        return
+    out = console(FILE_WIDTH, soft_wrap=False)
+    out.print(runs_table(runs, out.width, now_s))
+    if out.width < _WIDE and any(run.overrides for run in runs):
+        out.print("egvs runs --verbose lists the settings in which each run differs from its scenario")
+
+
+def runs_table(runs: Sequence[ListedRun], width: int, now_s: float) -> Table:
+    """Return the table for a terminal of a width in characters; ``now_s`` is the time in seconds since 1970."""
     columns: list[Column[ListedRun]] = [
-        Column("run", lambda run: run.folder.name, "left"),
-        Column("scenario", _format_scenario, "left"),
-        Column("differs in", _format_overrides, "left"),
-        Column("state", _format_state, "left"),
-        Column("best", _format_best, "left"),
+        Column("run", lambda run: run.folder.name, "left", wrap=True),
+        Column("scenario", _format_scenario, "left", wrap=True, min_width=_WIDE),
+        Column("differs in", _format_overrides, "left", wrap=True, min_width=_WIDE),
+        Column("state", _format_state, "left", wrap=True),
+        Column("best", _format_best, "left", wrap=True),
         Column("score", _format_score),
-        Column("by", lambda run: "" if run.best is None else run.best.rank_by, "left"),
-        Column("sites", lambda run: "" if run.best is None else str(run.best.of_sites)),
+        Column("sites", lambda run: "" if run.best is None else str(run.best.of_sites), min_width=_WIDE),
         Column("size", lambda run: format_size(run.size_bytes)),
-        Column("last run", lambda run: f"{format_age(now - run.last_run_s)} ago"),
+        Column("last run", lambda run: _format_last_run(run, now_s)),
     ]
-    print_table(columns, runs, file_width=_FILE_WIDTH)
+    return make_table(columns, runs, width=width)
 
 
-_FILE_WIDTH = 250
+def describe_run(run: ListedRun, now_s: float) -> str:
+    """Return all that is listed of a run, in lines; ``now_s`` is the time in seconds since 1970."""
+    lines = [str(run.folder)]
+    entries = {
+        "scenario": _format_scenario(run),
+        "differs in": _format_overrides(run),
+        "state": _format_state(run),
+        "best": _format_best(run),
+        "score": _format_score(run),
+        "sites": "" if run.best is None else str(run.best.of_sites),
+        "size": format_size(run.size_bytes),
+        "last run": _format_last_run(run, now_s),
+    }
+    lines += [f"  {name:<10}  {text}" for name, text in entries.items() if text]
+    return "\n".join(lines)
 
 
 def _is_city(run: ListedRun) -> bool:
@@ -70,18 +111,16 @@ def _format_state(run: ListedRun) -> str:
 
 
 def _format_best(run: ListedRun) -> str:
-    if run.best is None:
-        return ""
-    names = ", ".join(run.best.names[:_MAX_BEST])
-    if len(run.best.names) > _MAX_BEST:
-        names += f" and {len(run.best.names) - _MAX_BEST} more"
-    return names
+    return "" if run.best is None else list_first(run.best.names, _MAX_BEST)
 
 
 def _format_score(run: ListedRun) -> str:
+    """Return the score of the best site, and by which score sites are ranked."""
     if run.best is None:
         return ""
     label = SCORE_LABELS[run.best.rank_by]
-    if label.is_share:
-        return f"{run.best.score:.1%}"
-    return f"{run.best.score:,.{label.digits}f} {label.unit}".rstrip()
+    return f"{label.value(run.best.score)} {label.head}"
+
+
+def _format_last_run(run: ListedRun, now_s: float) -> str:
+    return f"{format_age(now_s - run.last_run_s)} ago"

@@ -98,7 +98,7 @@ def print_scores(folder: Path, record: RunRecord, top: int | None = None, *, bef
     for line in _outcome_sentences(folder, record, sites):
         out.print(line)
     if top is not None and len(sites) > top:
-        out.print(f"... and {len(sites) - top} more; omit --top, or see {folder / 'scores.parquet'}")
+        out.print(f"... and {len(sites) - top:,} more; omit --top, or see {folder / 'scores.parquet'}")
     if not before_answer and len({site.pole for site in sites}) < len(sites):
         out.print(poles_table(sites, top))
     by_period = PeriodRanking.read(folder)
@@ -291,7 +291,7 @@ def print_demo_hints(results: Path) -> None:
     out = console(_RESULT_FILE_WIDTH)
     out.print(f"next: egvs place {results} --count 2   (the best two sensors together)")
     out.print(f"      egvs explore {results}   (move a sensor and see its score; needs egvs[explore])")
-    out.print("      egvs new mytown --osm extract.osm.pbf   (your own junction, from OpenStreetMap)")
+    out.print("      egvs new mytown --from extract.osm.pbf   (your own junction, from OpenStreetMap)")
 
 
 def print_sensors(sensors: Iterable[Sensor]) -> None:

@@ -322,8 +322,11 @@ def design(
     heights_m = None if heights is None else options.heights_m(heights)
     loaded, folder = sources.open_source(scenario, set_, None)
     with ProgressDisplay("sensor design") as screen:
+        from egvs.cli import answer
         from egvs.placement import sensor_design
         from egvs.sensor_fit import output
+
+        screen.flow_source = answer.flow_source(loaded)
 
         output.check_name(name)
         if channels is None:

@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from egvs.core.wording import by_number, list_first
+
 if TYPE_CHECKING:
     from egvs.runs.run_sources import SettingsSource
     from egvs.scenario.model import Scenario
@@ -64,10 +66,10 @@ def print_notes(source: SettingsSource, scenario: Scenario, folder: Path) -> Non
             _say(f"settings differ from the latest run, {latest[0]}: {_describe_differences(latest[1])}")
         return
     if edited := run_sources.edited_settings(scenario):
-        _say(f"the settings of {folder} are used; {scenario.file} now differs in {_join(edited)}")
+        _say(f"the settings of {folder} are used; {scenario.file} now differs in {list_first(edited, MAX_KEYS)}")
     if changed := run_sources.changed_files(folder, scenario):
-        verb = "has" if len(changed) == 1 else "have"
-        _say(f"warning: {_join(changed)} {verb} changed since the run in {folder}: its stages run again as needed")
+        files = f"{list_first(changed, MAX_KEYS)} {by_number(len(changed), 'has', 'have')}"
+        _say(f"warning: {files} changed since the run in {folder}: its stages run again as needed")
 
 
 def run_arguments(path: Path, overrides: Sequence[str] | None, out: Path | None) -> tuple[Path, list[str], Path | None]:
@@ -92,14 +94,7 @@ def _describe_differences(differences: dict[str, tuple[Any, Any]]) -> str:
     texts = []
     for key, (there, here) in differences.items():
         texts.append(f"{key} ({format_setting(key, there)} there, {format_setting(key, here)} here)")
-    return _join(texts)
-
-
-def _join(texts: Sequence[str]) -> str:
-    shown = list(texts[:MAX_KEYS])
-    if len(texts) > MAX_KEYS:
-        shown.append(f"{len(texts) - MAX_KEYS} more")
-    return ", ".join(shown)
+    return list_first(texts, MAX_KEYS)
 
 
 def format_setting(key: str, value: Any) -> str:

@@ -17,6 +17,8 @@ from egvs.core.wording import number_of
 from egvs.report.formatting import SCORE_LABELS
 
 COUNTS, ASSUMED_FLOWS = "the counts", "the assumed flows"
+FLOWS = "the flows of the scenario"
+"""What simulated flows are compared with where it is not known whether they were counted."""
 
 _OMITTED_KEYS = frozenset(
     (
@@ -52,7 +54,7 @@ class Sentence:
 
 
 def stage_lines(
-    stage: str, state: str, record: StageRecord, *, with_details: bool, flow_source: str = COUNTS
+    stage: str, state: str, record: StageRecord, *, with_details: bool, flow_source: str = FLOWS
 ) -> Iterator[str]:
     """Yield the line of a stage; with details, also one line for each period of its traffic.
 
@@ -63,7 +65,7 @@ def stage_lines(
     with_details
         Whether all that the stage reports is printed.
     flow_source
-        What the simulated flows are compared with: :data:`COUNTS` or :data:`ASSUMED_FLOWS`.
+        What the simulated flows are compared with: :data:`COUNTS`, :data:`ASSUMED_FLOWS` or :data:`FLOWS`.
     """
     duration = f"{record.cost.seconds:.1f} s"
     if state == "skipped":
@@ -86,7 +88,7 @@ def stage_lines(
         yield f"{name:>21}   {describe(period)}"
 
 
-def describe_summary(stage: str, summary: dict[str, Any], *, with_details: bool, flow_source: str = COUNTS) -> str:
+def describe_summary(stage: str, summary: dict[str, Any], *, with_details: bool, flow_source: str = FLOWS) -> str:
     """Return the summary of a stage in one line; see :func:`stage_lines`."""
     from egvs.cli.console import format_values
 
@@ -129,7 +131,7 @@ def _scan_sentences(rest: dict[str, Any], summary: dict[str, Any]) -> Iterator[S
         yield _detail(f"{rest.pop('returns'):,} returns from {rest.pop('beams'):,} beams towards the region")
 
 
-def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any], flow_source: str = COUNTS) -> Iterator[Sentence]:
+def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any], flow_source: str = FLOWS) -> Iterator[Sentence]:
     frames = number_of(rest.pop("frames"), "frame")
     if seeds := rest.pop("seeds", None):
         frames += f" of {len(seeds)} simulations"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from egvs.core.wording import by_number
 from egvs.report.formatting import join_names
 
 if TYPE_CHECKING:
@@ -27,7 +28,7 @@ def ablation_conclusion(changes: Sequence[EffectChange]) -> str:
     if not any(score > 0 for score in plain.scores):
         return "Conclusion: every score is 0 without effects, so there is no first site."
     first = _first_sites(plain)
-    subject, verb = join_names(first), "stays" if len(first) == 1 else "stay"
+    subject, verb = join_names(first), by_number(len(first), "stays", "stay")
     moved = [change for change in changes[1:] if _first_sites(change) != first]
     if not moved:
         return f"Conclusion: {subject} {verb} first under {scope}."
@@ -38,7 +39,7 @@ def ablation_conclusion(changes: Sequence[EffectChange]) -> str:
             f"{join_names(_first_sites(change))} under {name} (choosing {first[0]} loses {_loss(plain, change):.2%})"
         )
     return (
-        f"Conclusion: {subject} {'is' if len(first) == 1 else 'are'} first without effects, but {join_names(losses)}."
+        f"Conclusion: {subject} {by_number(len(first), 'is', 'are')} first without effects, but {join_names(losses)}."
     )
 
 

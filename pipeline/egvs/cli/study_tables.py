@@ -17,6 +17,7 @@ from rich.table import Table
 
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.cli.console import NARROW, Column, console, format_or_dash, make_table, print_sentences
+from egvs.core.wording import list_first
 from egvs.report.formatting import SCORE_LABELS, join_names
 from egvs.report.ranking import RankedSite, share_of_limit
 from egvs.report.sensor_results import (
@@ -342,10 +343,7 @@ def _format_best_sites(pair: RankAgreement) -> str:
 
 
 def _format_names(sites: tuple[str, ...]) -> str:
-    names = ", ".join(sites[:2])
-    if len(sites) > 2:
-        names += f" and {len(sites) - 2} more"
-    return names
+    return list_first(sites, 2)
 
 
 def _difference_table(comparison: Comparison) -> Table:

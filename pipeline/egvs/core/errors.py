@@ -14,10 +14,12 @@ from __future__ import annotations
 import difflib
 import os
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+
+from egvs.core.wording import list_first
 
 MAX_LINE_LENGTH, MAX_LINES = 600, 200
 """Limits of a message in characters and lines."""
@@ -205,6 +207,54 @@ def find_misspelling(names: Iterable[str], known: Collection[str]) -> tuple[str,
         if near and _name_similarity(low, near[0]) > _MIN_SIMILARITY:
             return name, missing[near[0]]
     return None
+
+
+def closest_first(name: str, known: Iterable[str]) -> list[str]:
+    """Return known names in the order of their similarity to an unknown one; those that begin with it come first.
+
+    >>> closest_first("k03", ["k01@3m", "k02@3m", "k03@3m", "k03@6m"])[:2]
+    ['k03@3m', 'k03@6m']
+    >>> closest_first("levl", ["behind", "tilted", "level"])[0]
+    'level'
+    """
+    low = name.strip().lower()
+
+    def distance(other: str) -> float:
+        return -1.0 if low and other.lower().startswith(low) else 1.0 - _name_similarity(low, other.lower())
+
+    return sorted(known, key=distance)
+
+
+def choose_one(name: str, known: Sequence[str]) -> str:
+    """Return a hint that lists known names for an unknown one, the most similar ones first.
+
+    >>> choose_one("levl", ["behind", "tilted", "level"])
+    'Choose one of level, tilted, behind.'
+    """
+    listed = list_first(closest_first(name, known), _MAX_NAMES)
+    if len(known) > _MAX_NAMES:
+        listed += " (the most similar first)"
+    return f"Choose one of {listed}."
+
+
+_MAX_NAMES = 8
+
+
+def unknown_site(where: object, name: str, known: Sequence[str], of: str = "there is") -> InputError:
+    """Return the error for an unknown site, with the sites that exist.
+
+    Parameters
+    ----------
+    where
+        Option, or file and key.
+    name
+        The unknown name.
+    known
+        The sites.
+    of
+        Beginning of the sentence, e.g. "this run has".
+    """
+    return InputError(where, f"{of} no site {name!r}", choose_one(name, known))
 
 
 def _name_similarity(a: str, b: str) -> float:

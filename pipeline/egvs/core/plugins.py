@@ -16,6 +16,7 @@ from operator import attrgetter
 from typing import Any
 
 from egvs.core.errors import InputError, MissingBackendError, MissingExtraError
+from egvs.core.wording import by_number
 
 PACKAGE_NAME = "egvs"
 """The package of this program."""
@@ -76,7 +77,7 @@ def require_libraries(what: str, extra: str, *libraries: str) -> None:
     missing = [_PACKAGES.get(name, name) for name in libraries if find_spec(name) is None]
     if not missing:
         return
-    verb = "is" if len(missing) == 1 else "are"
+    verb = by_number(len(missing), "is", "are")
     names = f"{', '.join(missing)}, which {verb} not installed"
     raise MissingExtraError(f"{what} needs {names}. Run pip install '{PACKAGE_NAME}[{extra}]'")
 

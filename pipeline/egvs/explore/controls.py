@@ -122,7 +122,7 @@ def ranking_table(ranked: Sequence[PoseScore], rank_by: str) -> str:
         score = format_score(rank_by, candidate.scores[rank_by])
         lines.append(f"| {candidate.rank} | {escape_markdown(candidate.site.name)} | {score} |")
     if len(ranked) > MAX_LISTED:
-        lines.append(f"\n... and {len(ranked) - MAX_LISTED} more")
+        lines.append(f"\n... and {len(ranked) - MAX_LISTED:,} more")
     return "\n".join(lines)
 
 

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 import trimesh
 import viser
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from egvs.artefacts.tpog import Tpog
 from egvs.artefacts.traffic_frames import TrafficFrame
@@ -348,6 +348,19 @@ def draw_plan(
         )  # fmt: skip
 
 
+def linear_colours(colours: ArrayLike) -> Bytes:
+    """Return sRGB colours (0 to 255) as linear ones, rounded; viser's viewer takes the colours of instances as linear.
+
+    The transfer function is that of IEC 61966-2-1.
+
+    >>> linear_colours(np.array([[0, 10, 188], [90, 181, 255]])).tolist()
+    [[0, 1, 128], [26, 118, 255]]
+    """
+    values = np.asarray(colours, dtype=np.float64) / 255.0
+    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    return np.round(255.0 * linear).astype(np.uint8)
+
+
 class _Balls(NamedTuple):
     """Sites, their colours (n, 3), and the radius of all balls."""
 
@@ -362,7 +375,7 @@ def _draw_balls(scene: viser.SceneApi, name: str, balls: _Balls, zero_m: Vec3, o
         name, np.asarray(ball.vertices, dtype=np.float32), np.asarray(ball.faces, dtype=np.int32),
         batched_wxyzs=np.tile([1.0, 0.0, 0.0, 0.0], (len(balls.sites), 1)),
         batched_positions=np.array([site.pose.position_m for site in balls.sites]) - zero_m,
-        batched_colors=balls.colours, lod="off",
+        batched_colors=linear_colours(balls.colours), lod="off",
     )  # fmt: skip
     if on_click is None:
         return

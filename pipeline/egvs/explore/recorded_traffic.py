@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import viser
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from viser.infra import StateSerializer
 
 from egvs.artefacts.traffic_frames import TrafficFrame
@@ -190,7 +190,7 @@ class TrafficRecorder:
             handle.batched_positions = _fill(positions_m, most, 0.0)
             handle.batched_wxyzs = _fill(np.reshape(turns, (-1, 4)), most, [1.0, 0.0, 0.0, 0.0])
             handle.batched_scales = _fill(scales, most, 0.0)
-            handle.batched_colors = _fill(linear_colours(colours[rows]), most, 0.0).astype(np.uint8)
+            handle.batched_colors = _fill(drawing.linear_colours(colours[rows]), most, 0.0).astype(np.uint8)
         if self._returns is not None:
             returns_m = self._clip.returns_m[index][:: self._clip.returns_step] - self._zero_m
             self._returns.points = returns_m.astype(np.float32)
@@ -200,20 +200,6 @@ class TrafficRecorder:
             handle.batched_scales = np.zeros((most, 3), dtype=np.float32)
         if self._returns is not None:
             self._returns.points = np.zeros((0, 3), dtype=np.float32)
-
-
-def linear_colours(colours: ArrayLike) -> NDArray[np.float64]:
-    """Return sRGB colours (0 to 255) as linear ones, rounded; viser's viewer takes the colours of instances as linear.
-
-    The transfer function is that of IEC 61966-2-1.
-
-    >>> linear_colours(np.array([[0, 10, 188], [90, 181, 255]])).astype(int).tolist()
-    [[0, 1, 128], [26, 118, 255]]
-    """
-    values = np.asarray(colours, dtype=np.float64) / 255.0
-    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
-    rounded: NDArray[np.float64] = np.round(255.0 * linear)
-    return rounded
 
 
 def _fill(values: NDArray[np.float64], rows: int, rest: float | Sequence[float]) -> NDArray[np.float32]:

@@ -30,7 +30,7 @@ from egvs.artefacts.readers import (
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import Tpog, read_periods, read_tpog
 from egvs.artefacts.traffic_frames import TrafficFrame
-from egvs.core.errors import Diagnostic, InputError
+from egvs.core.errors import Diagnostic, InputError, choose_one
 from egvs.core.grid import Grid
 from egvs.placement import problem_builder
 from egvs.placement.refinement import PlanPoses
@@ -71,8 +71,6 @@ def _score_text(name: str, value: float) -> str:
 
 _SCORES = RunFolder.scores.name
 _RECORDED = (RunFolder.trajectories.name, RunFolder.tpog.name)
-_MAX_NAMES = 20
-"""Number of candidates that a message lists."""
 
 _PLAN_STAGES = ("statics", "scan", "traffic", "tpog")
 """Stages that a plan depends on."""
@@ -302,8 +300,7 @@ class Session:
             If there is no such candidate, or no such sensor.
         """
         if name not in self.candidates:
-            names = ", ".join([*self.candidates][:_MAX_NAMES])
-            raise InputError(f"candidate {name!r}", "no such candidate", f"Use one of {names}.")
+            raise InputError(f"candidate {name!r}", "no such candidate", choose_one(name, [*self.candidates]))
         candidate = self.candidates[name].site
         site = replace(candidate, pose=pose, sensor=sensor or candidate.sensor)
         self.scene.sensor(site.sensor)

@@ -17,7 +17,7 @@ from pathlib import Path
 from egvs.artefacts import parquet
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files, plugins
-from egvs.core.errors import InputError
+from egvs.core.errors import InputError, unknown_site
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.export import drawing, scene_files
 from egvs.export.finished_run import CRS_CHOICES, SCENARIO_CRS, WGS84_CRS, ExportCrs, FinishedRun
@@ -212,16 +212,8 @@ def _selected_sites(run: FinishedRun, sites: Collection[str]) -> Collection[str]
     known = parquet.read_artefact(run.artefact(RunFolder.scores.name), "scores")[0].column("site").to_pylist()
     for name in sites:
         if name not in known:
-            raise unknown_site(name, known)
+            raise unknown_site("--site", name, known, "this run has")
     return tuple(dict.fromkeys(sites)) or (best_site(run),)
-
-
-def unknown_site(name: str, known: Sequence[str]) -> InputError:
-    """Return an error for a site that a run does not have."""
-    listed = ", ".join(known[:10])
-    if len(known) > 10:
-        listed += " and others"
-    return InputError("--site", f"this run has no site {name!r}", f"Choose one of {listed}.")
 
 
 def _default_target(folder: Path, file_format: Format, title: str) -> Path:

@@ -16,9 +16,9 @@ import numpy as np
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files, plugins
-from egvs.core.errors import InputError, MissingBackendError
+from egvs.core.errors import InputError, MissingBackendError, unknown_site
 from egvs.core.progress import ProgressCallback, no_progress
-from egvs.export.export import EXPORT_FOLDER, safe_file_name, unknown_site
+from egvs.export.export import EXPORT_FOLDER, safe_file_name
 from egvs.export.finished_run import FinishedRun
 from egvs.report import figures, maps
 from egvs.report.figures import column_entropy
@@ -116,7 +116,7 @@ def _find_site(ranking: Ranking, name: str | None) -> RankedSite:
     for site in ranking.sites:
         if site.site == name:
             return site
-    raise unknown_site(name, [site.site for site in ranking.sites])
+    raise unknown_site("--site", name, [site.site for site in ranking.sites], "this run has")
 
 
 def _figure_svg(run: FinishedRun, what: str, ranking: Ranking, site: RankedSite, style: FigureStyle) -> str:

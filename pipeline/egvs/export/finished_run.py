@@ -68,8 +68,6 @@ class FinishedRun:
     @classmethod
     def open(cls, folder: Path) -> FinishedRun:
         """Open a run folder; InputError if it has no finished run, or the scenario folder does not exist."""
-        if not folder.is_dir():
-            raise InputError(folder, "no such folder", "Give a folder written by egvs run.")
         record, record_path = RunRecord.read(folder), RunFolder(folder).run_record
         for name in _READ_STAGES:
             if name not in record.stages:

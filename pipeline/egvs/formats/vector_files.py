@@ -26,6 +26,7 @@ from egvs.core import files, plugins
 from egvs.core.errors import InputError
 from egvs.core.numbers import parse_decimal
 from egvs.core.reading import COMPLETE_FILE
+from egvs.core.wording import list_first
 
 GIS_FORMATS = {
     ".gpkg": "GeoPackage", ".shp": "Shapefile", ".kml": "KML", ".parquet": "GeoParquet", ".geoparquet": "GeoParquet",
@@ -140,7 +141,7 @@ def _choose_layer(path: Path, layers: list[list[Any]], geometry: str) -> str:
         names = fitting or names
     if len(names) == 1:
         return str(names[0])
-    listed = ", ".join(map(str, names[:_MAX_NAMED_LAYERS])) or "none"
+    listed = list_first([str(name) for name in names], _MAX_NAMED_LAYERS) or "none"
     problem = f"expected one layer of {geometry} geometries, got {listed}"
     raise InputError(path, problem, "Save the layer to use in a file of its own.")
 

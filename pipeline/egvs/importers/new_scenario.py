@@ -777,7 +777,10 @@ def _scenario_toml(
     document = scenario_files.toml_document(comments, values, tables)
     for note in scenario.signal_notes:
         document["traffic"].add(tomlkit.comment(f"{NETWORK_FILE}: {note}"))
-    names = MovementNames(scenario.streets.network, scenario.junction.at_m)
+    flows = scenario.flows
+    if scenario.counted is not None:
+        flows = tuple(flow for hour in scenario.counted.hours for flow in hour.flows)
+    names = MovementNames(scenario.streets.network, scenario.junction.at_m, flows)
     if scenario.demand is not None:
         _add_demand(document["traffic"], scenario.demand, names)
     if scenario.counted is not None:

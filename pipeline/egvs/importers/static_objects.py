@@ -25,7 +25,7 @@ from shapely.geometry.base import BaseGeometry
 
 from egvs.core.errors import InputError
 from egvs.core.grid import XY, FloatArray, Roi
-from egvs.core.wording import number_of
+from egvs.core.wording import by_number, list_first, number_of
 from egvs.importers.buildings import building_heights
 from egvs.importers.junctions import Streets
 from egvs.importers.map_parts import MapContext, MappedMesh, SolidMap, Terrain
@@ -384,13 +384,12 @@ def _clear_of_carriageway(solid_map: SolidMap, streets: Streets, ground: Terrain
     in_lanes = building_heights.objects_on_carriageway(solid_map.meshes, list(streets.areas.values()), ground_m)
     notes = solid_map.notes
     if in_lanes:
-        verb = "stands" if len(in_lanes) == 1 else "stand"
-        more = f" and {len(in_lanes) - _MAX_NAMES:,} more" if len(in_lanes) > _MAX_NAMES else ""
+        verb = by_number(len(in_lanes), "stands", "stand")
         notes = (
             *notes,
             f"{len(in_lanes)} of {number_of(len(solid_map.meshes), 'object')} {verb} in lanes; check the"
             " position of the map:"
-            f" {', '.join(in_lanes[:_MAX_NAMES])}{more}.",
+            f" {list_first(in_lanes, _MAX_NAMES)}.",
         )
     return replace(solid_map, solids=tuple(solids), counts=counts, notes=notes)
 

@@ -135,7 +135,7 @@ def read_junction_counts(path: Path, streets: Streets, junction: StreetJunction)
     if not flows:
         problem = "no street leads vehicles through the region of interest"
         raise InputError("--counts", problem, "Choose another junction with --at LAT,LON.")
-    index = ApproachIndex.of_flows(flows, MovementNames(streets.network, junction.at_m))
+    index = ApproachIndex.of_flows(flows, MovementNames(streets.network, junction.at_m, flows))
     edges = frozenset(edge.id for edge in streets.network.edges)
     kinds = frozenset(kind.name for kind in TrafficConfig.model_fields["kinds"].default)
     return read_street_counts(path, flows, index, edges, kinds)

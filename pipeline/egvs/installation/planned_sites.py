@@ -8,9 +8,8 @@ from pathlib import Path
 
 from egvs.artefacts.readers import read_placement
 from egvs.artefacts.run_folder import RunFolder
-from egvs.core.errors import InputError
+from egvs.core.errors import InputError, unknown_site
 from egvs.explore.session import Session
-from egvs.export.export import unknown_site
 from egvs.export.finished_run import FinishedRun
 from egvs.sensors import site_feasibility
 from egvs.sensors.sensor import Sensor
@@ -75,7 +74,7 @@ class PlannedSites:
         """
         candidates = self.session.candidates
         if name not in candidates:
-            raise unknown_site(name, list(candidates))
+            raise unknown_site("--site", name, list(candidates), "this run has")
         site = candidates[name].site
         return replace(site, pose=self.plan.get(name, site.pose))
 

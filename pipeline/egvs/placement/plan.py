@@ -25,7 +25,7 @@ from egvs.artefacts.planned_sensor import PlannedSensor, plan_columns
 from egvs.artefacts.readers import ZoneVisibility, read_plan_zones
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files, plugins
-from egvs.core.errors import InputError
+from egvs.core.errors import InputError, choose_one
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.wording import number_of
 from egvs.placement import fused_score, problem_builder, refinement, solver
@@ -56,9 +56,6 @@ _REFINEMENT_COLUMNS = ("moved_m", "gain_by_refining")
 
 _SENSOR_ERROR_COLUMNS = ("score_se", "gain_se")
 """Columns of a plan where standard errors are known."""
-
-_MAX_NAMES = 20
-"""Number of names that a message lists."""
 
 
 class JointScore:
@@ -166,8 +163,7 @@ class JointScore:
     def _indices(self, names: Iterable[str]) -> list[int]:
         for name in names:
             if name not in self._index_of_name:
-                hint = f"Use one of {', '.join(self.candidates[:_MAX_NAMES])}."
-                raise InputError(f"candidate {name!r}", "no such candidate", hint)
+                raise InputError(f"candidate {name!r}", "no such candidate", choose_one(name, self.candidates))
         return [self._index_of_name[name] for name in names]
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from egvs.artefacts.tpog import Tpog, read_periods, read_tpog
-from egvs.core.errors import InputError
+from egvs.core.errors import InputError, choose_one
 from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.core.threads import map_ordered
 from egvs.effects.base import Detect
@@ -50,9 +50,6 @@ _POINT_UNIT = 2.0**32
 """Expected numbers of points are rounded to multiples of 1 / _POINT_UNIT."""
 
 _MAX_PROBABILITY = 1.0 - 2.0**-53
-
-_MAX_NAMES = 20
-"""Number of names that a message lists."""
 
 
 class VoxelView:
@@ -506,10 +503,7 @@ def rules_from_config(scenario: Scenario, sites: Sequence[Site]) -> PlanRules:
 def _candidate_index(name: str, names: list[str], where: str) -> int:
     if name in names:
         return names.index(name)
-    listed = ", ".join(names[:_MAX_NAMES])
-    if len(names) > _MAX_NAMES:
-        listed += ", ..."
-    raise InputError(where, f"no candidate {name!r}", f"Use one of {listed}.")
+    raise InputError(where, f"no candidate {name!r}", choose_one(name, names))
 
 
 def _check_count(scenario: Scenario, n_allowed: int, n_sites: int, n_forced: int) -> None:

@@ -36,7 +36,7 @@ from egvs.artefacts.command_results import read_results
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import PeriodBlocks, read_periods, read_tpog
 from egvs.core import plugins
-from egvs.core.errors import InputError
+from egvs.core.errors import InputError, choose_one
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.threads import map_ordered
@@ -519,8 +519,7 @@ def _sites_at(sites: Sequence[Site], pole: str) -> tuple[Site, ...]:
     at_pole = tuple(site for site in sites if site.pole in poles and site.points is None)
     if not at_pole:
         known = list(dict.fromkeys(site.pole for site in sites))
-        listed = ", ".join(known[:10]) + (" and others" if len(known) > 10 else "")
-        raise InputError("--pole", f"expected a pole with a simulated scan, got {pole!r}", f"Choose one of {listed}.")
+        raise InputError("--pole", f"expected a pole with a simulated scan, got {pole!r}", choose_one(pole, known))
     return at_pole
 
 

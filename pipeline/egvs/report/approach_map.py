@@ -60,7 +60,7 @@ def busiest_counts(scenario: Scenario) -> tuple[str, tuple[CountConfig, ...]]:
 def approach_labels(counts: Sequence[CountConfig], network: Path, center_m: tuple[float, float]) -> list[ApproachLabel]:
     """Return the approaches of counts, in the order of the compass."""
     roads = read_net_xml(network)
-    index = ApproachIndex.of_flows(counts, MovementNames(roads, center_m))
+    index = ApproachIndex.of_flows(counts, MovementNames(roads, center_m, counts))
     paths = approach_paths(index.movements, roads)
     by_title: dict[str, list[ApproachMovement]] = {title: [] for title in index.titles}
     for movement in index.movements:

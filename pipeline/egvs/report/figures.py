@@ -23,6 +23,7 @@ from egvs.artefacts.readers import MIN_VEHICLES, LocationVisibility, SiteBlindsp
 from egvs.artefacts.tpog import Tpog
 from egvs.core.grid import Grid
 from egvs.core.threads import map_ordered
+from egvs.core.wording import by_number
 from egvs.report import colours, formatting, maps, ranking
 from egvs.report.basemap import network_file, roads_within, world_outlines
 from egvs.report.colours import ColumnValues, IndexedImage
@@ -415,7 +416,7 @@ def blindspot_note(site_blindspots: SiteBlindspots) -> str:
         )
         sentences.append(f"Share of vehicles found on each approach: {shares}.")
     if site_blindspots.off_lanes:
-        verb = "was" if site_blindspots.off_lanes == 1 else "were"
+        verb = by_number(site_blindspots.off_lanes, "was", "were")
         sentences.append(
             f"{site_blindspots.off_lanes:,} of {site_blindspots.overall.vehicle_frames:,} observed vehicles "
             f"{verb} not on a lane."

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from egvs._version import __version__
 from egvs.artefacts.readers import DISTINCT_PROBABILITY, MIN_VEHICLES, PeriodRanking
 from egvs.artefacts.run_folder import ACCURACY_FILES, COMMAND_RESULTS, PLACEMENT_FILES, VALIDATION_FILES, RunFolder
-from egvs.artefacts.run_record import RunRecord, StageRecord
+from egvs.artefacts.run_record import RunRecord, StageRecord, traffic_summary
 from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files
 from egvs.core.errors import WARNINGS_KEY, collect_warnings
@@ -283,15 +283,11 @@ def render_page(contents: PageContents) -> str:
         **_setting_values(contents),
         **_sensor_values(contents),
         **_cost_values(contents.stages),
-        "signals": signal_diagrams(_traffic_summary(contents.stages).get("signals", ())),
+        "signals": signal_diagrams(traffic_summary(contents.stages).get("signals", ())),
         **_sentences(contents),
         **_warning_values(contents),
     }
     return _template_environment().get_template("report.html.j2").render(values)
-
-
-def _traffic_summary(stages: Mapping[str, StageRecord]) -> Summary:
-    return stages["traffic"].summary if "traffic" in stages else {}
 
 
 def prepare() -> None:
@@ -360,7 +356,7 @@ def _setting_values(contents: PageContents) -> dict[str, Any]:
         frames = contents.by_period.frames
     return {
         "weights": scenario.score.weights.in_words,
-        "assumed": assumptions(scenario, _traffic_summary(contents.stages).get("signals", ())),
+        "assumed": assumptions(scenario, traffic_summary(contents.stages).get("signals", ())),
         "assumes_flows": assumes_flows(scenario),
         "gamma": "∞" if math.isinf(gamma) else f"{gamma:g}",
         "map_credits": read_map_credits(scenario),
@@ -399,10 +395,9 @@ def _cost_values(stages: Mapping[str, StageRecord]) -> dict[str, Any]:
 
 def _warning_values(contents: PageContents) -> dict[str, Any]:
     warnings = collect_warnings(stage.summary for stage in contents.stages.values())
-    traffic = contents.stages.get("traffic")
     return {
         "warnings": warnings,
-        "reliability": describe_reliability(contents.ranking, traffic.summary if traffic else None),
+        "reliability": describe_reliability(contents.ranking, traffic_summary(contents.stages)),
         "poles_on_road": describe_poles_on_road(contents.ranking.poles[:NAMED_POLES], warnings),
     }
 

@@ -16,6 +16,7 @@ from egvs.artefacts import parquet
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.artefacts.run_record import StageRecord
 from egvs.core.errors import InputError
+from egvs.core.wording import by_number, list_first
 from egvs.report.formatting import (
     SCORE_LABELS,
     ScoreLabel,
@@ -395,7 +396,7 @@ def lead(ranking: Ranking, hint: str = "") -> str:
     if ranking.is_tie or not ranking.best[0].score > 0:
         return ""
     second = ranking.sites[len(ranking.best)]
-    subject = "It leads" if len(ranking.best) == 1 else "They lead"
+    subject = by_number(len(ranking.best), "It leads", "They lead")
     text = f"{subject} the next site, {second.site}, by {_format_gap(ranking, second)}"
     text += f"{_format_probability(ranking, second, 'better')}."
     rival = _best_on_another_pole(ranking)
@@ -412,9 +413,7 @@ def lead(ranking: Ranking, hint: str = "") -> str:
     if hint and rival is not None and not is_separable and _relative_gap(ranking, rival) >= MIN_RELEVANT_LEAD:
         text += f" {hint}"
     if len(ranking.close) > 1:
-        names = ", ".join(site.site for site in ranking.close[:4])
-        if len(ranking.close) > 4:
-            names += f" and {len(ranking.close) - 4} more"
+        names = list_first([site.site for site in ranking.close], 4)
         text += f" {len(ranking.close)} other sites score within {CLOSE_SHARE:.0%} of the best: {names}."
     return text
 
@@ -453,7 +452,7 @@ def _format_gap(ranking: Ranking, second: RankedSite) -> str:
         gap_text = f"{100.0 * gap:.{decimals}f} ± {100.0 * error:.{decimals}f}"
     if is_share:
         return f"{gap_text} percentage points"
-    owner = "its" if len(ranking.best) == 1 else "their"
+    owner = by_number(len(ranking.best), "its", "their")
     return f"{gap_text}% of {owner} score"
 
 

@@ -27,6 +27,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from egvs.core.special import stdtrit
+from egvs.core.wording import by_number, number_of
 from egvs.report.formatting import SCORE_LABELS, ScoreLabel
 
 ALPHA = 0.05
@@ -226,7 +227,7 @@ def _describe_prediction(label: ScoreLabel, check: DetectorCheck) -> str:
     """Say whether the score predicts detection here, over all sites and among those of equal height."""
     rho = check.rho
     start = f"With {check.detector}, " if check.returns_boxes else "No detector ran; by points on vehicles, "
-    count = "1 site is" if rho.sites == 1 else f"{rho.sites} sites are"
+    count = f"{number_of(rho.sites, 'site')} {by_number(rho.sites, 'is', 'are')}"
     unknown = f"{start}{count} too few, or too similar, to tell whether {label.noun} predicts detection here"
     if rho.value is None:
         return f"{unknown} ({rho.why})."
@@ -250,7 +251,7 @@ def _describe_same_height(rho: RankCorrelation | None) -> str:
         return ""
     if rho.value is None:
         return f"; among sites of equal height there are too few to tell ({rho.why})"
-    heights = "1 height" if rho.groups == 1 else f"{rho.groups} heights"
+    heights = number_of(rho.groups, "height")
     clause = f"{rho.text} among sites of equal height ({rho.sites} sites at {heights})"
     if rho.is_undecided:
         return f", but {clause}, which are too few, or too similar, to tell"

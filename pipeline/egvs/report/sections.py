@@ -304,7 +304,8 @@ def describe_counts(scenario: Scenario, network: Path | None) -> dict[str, str]:
     if network is None or not periods:
         return {}
     x_m, y_m, _ = scenario.roi.center_m
-    names = MovementNames(read_net_xml(network), (x_m, y_m))
+    flows = [count for traffic in periods.values() for count in traffic.counts]
+    names = MovementNames(read_net_xml(network), (x_m, y_m), flows)
     movements = {}
     for name, traffic in periods.items():
         period = f" ({name})" if name else ""

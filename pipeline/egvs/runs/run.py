@@ -176,19 +176,22 @@ def stages_before(stage: str) -> list[str]:
 def refresh_report(out: Path) -> Path | None:
     """Draw the report of a complete run again if something that it shows has changed, for example a study.
 
-    The caller holds the lock of the folder (:func:`lock_run_folder`).
+    A report in the folder that is no longer recorded, because a stage before it ran again, is drawn again, too. The
+    caller holds the lock of the folder (:func:`lock_run_folder`).
 
     Returns
     -------
     Path, or None
-        The report; None, and nothing is done, where there is no complete run of these settings and files.
+        The report; None, and nothing is done, where there is no complete run of these settings and files, or no report.
     """
     folder = RunFolder(out)
     if not folder.has_record:
         return None
     record = RunRecord.read(out)
     source = Path(os.path.normpath(out / record.scenario_folder))
-    if not all(stage in record.stages for stage in STAGE_NAMES) or not source.is_dir():
+    if not source.is_dir() or not all(stage in record.stages for stage in STAGE_NAMES if stage != "report"):
+        return None
+    if "report" not in record.stages and not folder.report.is_file():
         return None
 
     scenario = scenario_from_dict(record.scenario, source, str(folder.run_record))
@@ -360,7 +363,10 @@ class _Run:
             result, fetched = fetch_or_run(name, self.context, key.key, self.store, make)
         stage_record = key.record(result)
         self.has_changed |= bool(stage_record.artefacts)
-        self._record_stage(name, stage_record)
+        recorded = stage_record
+        if last and (last.inputs, last.artefacts) == (stage_record.inputs, stage_record.artefacts):
+            recorded = replace(stage_record, cost=last.cost)  # which the report shows: it stays up to date
+        self._record_stage(name, recorded)
         self.listener(name, "fetched" if fetched else "done", stage_record)
 
     def _preparations(self, names: Iterable[str]) -> Iterator[Callable[[], None]]:
@@ -402,13 +408,19 @@ class _Run:
     def finish(self, keep: Collection[str]) -> RunRecord:
         """Write ``run.json`` if it changed; drop stages of other settings, except those in ``keep``."""
         for stage in list(self.record.stages):
+            if stage == "report" and stage not in keep:
+                self._write(self.record.having(stage, None))  # the key of the report depends on this record
             if stage not in keep and not _is_up_to_date(stage, self.context, self.record):
                 self.record = self.record.having(stage, None)
-        folder = self.context.folder
-        if not folder.has_record or RunRecord.read(folder.path) != self.record:
-            self.record.write(folder.path)
-        os.utime(folder.lock)  # "egvs runs" shows when a run was last at work
+        self._write(self.record)
+        os.utime(self.context.folder.lock)  # "egvs runs" shows when a run was last at work
         return self.record
+
+    def _write(self, record: RunRecord) -> None:
+        """Write ``run.json`` if it differs."""
+        folder = self.context.folder
+        if not folder.has_record or RunRecord.read(folder.path) != record:
+            record.write(folder.path)
 
 
 def _is_up_to_date(name: str, context: StageContext, record: RunRecord) -> bool:

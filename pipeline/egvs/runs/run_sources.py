@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from egvs.artefacts.run_folder import RunFolder
-from egvs.artefacts.run_record import RunRecord
+from egvs.artefacts.run_record import RunRecord, suggest_runs
 from egvs.core.errors import InputError
 from egvs.runs import stage_keys
 from egvs.runs.run import default_folder
@@ -86,8 +86,11 @@ class SettingsSource:
         Raises
         ------
         InputError
-            When a run folder is given together with one of the other two.
+            When a run folder is given together with one of the other two, or the path does not exist, but runs of its
+            name do.
         """
+        if not path.exists() and (hint := suggest_runs(path)):
+            raise InputError(path, "no such folder", hint)
         source = cls(path, tuple(overrides or ()))
         for option, is_given in (("--set", bool(overrides)), ("--out", out is not None)):
             if is_given and source.is_run:

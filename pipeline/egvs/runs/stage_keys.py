@@ -79,6 +79,20 @@ def source_digest(*modules: str) -> SourceDigest:
     return SourceDigest(hashlib.sha256(text.encode()).hexdigest(), frozenset(libraries))
 
 
+def text_digest(module: str) -> str:
+    """Return the digest of the text of one module, without what it imports.
+
+    Raises
+    ------
+    ValueError
+        If there is no such module.
+    """
+    path = _module_path(module)
+    if path is None:
+        raise ValueError(f"no source of {module}")
+    return _digest_module(path, module.rpartition(".")[0])[0]
+
+
 def source_modules(*modules: str) -> dict[str, tuple[str, tuple[str, ...]]]:
     """Return the modules and all that they import, of this package and of their own: digest and imports by name."""
     packages = {PACKAGE, *(module.partition(".")[0] for module in modules)}

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from egvs.core.errors import Diagnostic, InputError
+from egvs.core.wording import list_first
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import SCENARIO_FILE, Scenario
 from egvs.scenario.score_config import ZoneArea
@@ -206,6 +207,4 @@ def _area_of_zone(name: str, areas: Mapping[str, BaseGeometry], path: Path) -> B
 
 
 def _listed(names: Iterable[str], most: int = 8) -> str:
-    names = list(names)
-    listed = ", ".join(names[:most]) or "no area"
-    return f"{listed} and {len(names) - most} more" if len(names) > most else listed
+    return list_first(list(names), most) or "no area"

@@ -31,10 +31,11 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from egvs.core.errors import Diagnostic, DiagnosticsError, InputError
+from egvs.core.errors import Diagnostic, DiagnosticsError, InputError, unknown_site
 from egvs.core.grid import Vec3
 from egvs.core.numbers import parse_decimal
 from egvs.core.special import cosdg, sindg
+from egvs.core.wording import list_first
 from egvs.formats import vector_files
 from egvs.scenario.fields import MAX_COORDINATE_M
 from egvs.scenario.model import Scenario, SiteGrid, SiteLine
@@ -203,9 +204,8 @@ def _group_errors(errors: list[InputError]) -> Iterator[Diagnostic]:
     rows: dict[tuple[str, str], dict[str, None]] = {}
     for error in errors:
         rows.setdefault((error.problem, error.hint), {})[error.where] = None
-    for (problem, hint), (first, *more) in rows.items():
-        where = f"{first} and {len(more)} more" if more else first
-        yield Diagnostic.of("sites", InputError(where, problem, hint))
+    for (problem, hint), locations in rows.items():
+        yield Diagnostic.of("sites", InputError(list_first(list(locations), 1), problem, hint))
 
 
 _OVERRIDING_COLUMNS = {
@@ -243,8 +243,7 @@ def _check_keep_visibility(scenario: Scenario, sites: Mapping[str, Site]) -> Non
         return
     for name in kept:
         if name not in sites:
-            hint = f"Use one of {', '.join(sites)}, or 'all'."
-            raise InputError(f"{scenario.file}: score.keep_visibility", f"there is no site {name!r}", hint)
+            raise unknown_site(f"{scenario.file}: score.keep_visibility", name, list(sites))
 
 
 def _with_measured_scan(sites: tuple[Site, ...], scenario: Scenario) -> tuple[Site, ...]:

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from egvs.core.errors import WARNINGS_KEY, Diagnostic, DiagnosticsError, InputError
+from egvs.core.wording import list_first
 from egvs.effects import registry
 from egvs.scenario.model import Scenario
 from egvs.sensors.sites import Site
@@ -193,8 +194,8 @@ def _merge_findings(findings: Iterable[Diagnostic]) -> Iterator[Diagnostic]:
     for finding in findings:
         by_text.setdefault((finding.problem, finding.hint, finding.is_error), {}).setdefault(finding.where, finding)
     for equal in by_text.values():
-        first, *others = equal.values()
-        yield replace(first, where=f"{first.where} and {len(others)} more") if others else first
+        first = next(iter(equal.values()))
+        yield replace(first, where=list_first(list(equal), 1))
 
 
 IGNORED_SETTINGS = (

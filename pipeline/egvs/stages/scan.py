@@ -17,7 +17,7 @@ import pyarrow as pa
 
 from egvs.artefacts import parquet
 from egvs.artefacts.run_folder import RunFolder
-from egvs.core.errors import WARNINGS_KEY, InputError
+from egvs.core.errors import WARNINGS_KEY, InputError, unknown_site
 from egvs.core.threads import map_ordered
 from egvs.formats import point_clouds
 from egvs.sensors.scanner import Scan, Scanner
@@ -57,7 +57,7 @@ def run(context: StageContext, inputs: StageDependencies, points: tuple[str, ...
     names = [site.name for site in scene.sites]
     for name in points:
         if name not in names:
-            raise InputError(f"--points {name}", "there is no such site", f"The sites are {', '.join(names)}.")
+            raise unknown_site("--points", name, names)
     _check_cloud_names(points)
     scanner = Scanner(scene)
     scanner.check(scene.sites)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from egvs.core.errors import Diagnostic, InputError
 from egvs.core.grid import Roi
-from egvs.core.wording import shorten_id
+from egvs.core.wording import by_number, list_first, number_of, shorten_id
 from egvs.effects import registry
 from egvs.effects.base import Effect
 from egvs.kernels import ray_triangle
@@ -101,9 +101,7 @@ def check_sensors_known(inputs: CheckInputs) -> Iterator[Diagnostic]:
     for site in inputs.sites:
         sites.setdefault(site.sensor, []).append(site.name)
     for sensor_name, site_names in sites.items():
-        where = f"site {site_names[0]}"
-        if len(site_names) > 1:
-            where += f" and {len(site_names) - 1} more"
+        where = f"site {list_first(site_names, 1)}"
         try:
             scenario_sensor(sensor_name, inputs.scenario, where)
         except InputError as error:
@@ -124,9 +122,7 @@ def warn_repeated_beams(inputs: CheckInputs) -> Iterator[Diagnostic]:
         repeated = sensor.repeated_beams(table) if table is not None else ()
         if table is None or not repeated:
             continue
-        listed = ", ".join(f"beam {beam} = beam {first}" for beam, first in repeated[:MAX_LISTED_BEAMS])
-        if len(repeated) > MAX_LISTED_BEAMS:
-            listed += ", ..."
+        listed = list_first([f"beam {beam} = beam {first}" for beam, first in repeated], MAX_LISTED_BEAMS)
         problem = (
             f"{len(repeated)} of {len(table)} beams have the same direction as an earlier one ({listed})"
             " and count twice"
@@ -181,9 +177,7 @@ def check_poses(inputs: CheckInputs) -> Iterator[Diagnostic]:
         if site.points is None and not _reaches_region(inputs, site, sensor):
             blind.append(site.name)
     if blind:
-        names = ", ".join(blind[:MAX_LISTED_SITES])
-        if len(blind) > MAX_LISTED_SITES:
-            names += ", ..."
+        names = list_first(blind, MAX_LISTED_SITES)
         problem = f"{len(blind)} of {len(inputs.sites)} sites have no beam that meets the region of interest: {names}"
         yield Diagnostic("beams beside the region", "sites", problem, "Change yaw, pitch, position or sensor.")
 
@@ -307,10 +301,8 @@ def warn_solids_over_lanes(inputs: CheckInputs) -> Iterator[Diagnostic]:
         return
     covered.sort(key=lambda item: (-item[0].area, item[1]))
     share = shapely.union_all([common for common, _ in covered]).area / lanes.area
-    named = ", ".join(_describe_solid(inputs.world, common, solid) for common, solid in covered[:MAX_NAMED_SOLIDS])
-    if len(covered) > MAX_NAMED_SOLIDS:
-        named += f", and {len(covered) - MAX_NAMED_SOLIDS} more"
-    count = f"{len(covered)} solids cover" if len(covered) > 1 else "a solid covers"
+    named = list_first([_describe_solid(inputs.world, common, solid) for common, solid in covered], MAX_NAMED_SOLIDS)
+    count = f"{number_of(len(covered), 'solid')} {by_number(len(covered), 'covers', 'cover')}"
     problem = f"{count} {share:.1%} of the lanes in and around the region: {named}"
     hint = "Move or lift them, or check their coordinates: traffic would drive through them."
     yield Diagnostic("solids over lanes", "statics", problem, hint)

@@ -231,7 +231,7 @@ def _summary(
     if scoring.zones is not None and best:
         worst = readers.worst_zones(readers.read_zones(context.folder.zones, best[0]))
         if worst:
-            summary["zones"] = f"{best[0]} finds the smallest shares in: {'; '.join(zone.in_words() for zone in worst)}"
+            summary["zones"] = readers.describe_worst_zones(best[0], worst)
     if scoring.zones is not None and (without_results := scoring.zones.describe_for_pedestrians()):
         summary["zones_for_pedestrians"] = without_results
     skipped = context.scene.skipped("score")

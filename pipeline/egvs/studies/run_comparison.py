@@ -29,6 +29,7 @@ from egvs.artefacts.run_record import RunRecord
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
+from egvs.core.wording import by_number, list_first, number_of
 from egvs.report.formatting import join_names
 from egvs.report.ranking import Pole, RankedSite, Ranking
 from egvs.report.sensor_results import ScoreDifference, SensorComparison, SensorMount, best_mounts
@@ -402,7 +403,7 @@ def _check_common_poles(runs: Sequence[ComparedRun]) -> None:
     problem = f"no pole in common with {others[0].folder}: no site of one run has the x and y of a site of the other"
     moved = _moved_poles(first, others[0])
     if moved:
-        problem += f" ({_list_names(moved)})"
+        problem += f" ({list_first(moved, _NAMED)})"
     if len(others) > 1:
         problem += "; nor with the other runs"
     hint = "Compare runs with the same poles: the same scenario, or the same sites file with other sensors or heights."
@@ -418,13 +419,6 @@ def _moved_poles(a: ComparedRun, b: ComparedRun) -> list[str]:
         if other is not None and other != location:
             moved.append(f"{pole.name} is {math.dist(location, other):.2f} m away")
     return moved
-
-
-def _list_names(names: Sequence[str]) -> str:
-    text = ", ".join(names[:_NAMED])
-    if len(names) > _NAMED:
-        text += f" and {len(names) - _NAMED} more"
-    return text
 
 
 def _sites_to_subtract(
@@ -585,7 +579,8 @@ def _pole_notes(a: ComparedRun, b: ComparedRun) -> Iterator[str]:
     if not a.poles.keys() & b.poles.keys():
         yield f"{pair} have no pole in common, so their rankings cannot be compared"
     if moved := _moved_poles(a, b):
-        yield f"poles of the same name at different positions in {pair} count as different poles: {_list_names(moved)}"
+        names = list_first(moved, _NAMED)
+        yield f"poles of the same name at different positions in {pair} count as different poles: {names}"
 
 
 def _site_notes(a: ComparedRun, b: ComparedRun) -> Iterator[str]:
@@ -595,8 +590,8 @@ def _site_notes(a: ComparedRun, b: ComparedRun) -> Iterator[str]:
         hint = "; --by pole matches them by position" if a.poles.keys() & b.poles.keys() else ""
         yield f"{pair} have no site name in common, so their rankings cannot be compared{hint}"
     if moved := [site for site in shared if _has_moved(a, b, site)]:
-        count = "1 site has" if len(moved) == 1 else f"{len(moved)} sites have"
-        yield f"{count} the same name in {pair} but another position, angle or sensor: {_list_names(moved)}"
+        count = f"{number_of(len(moved), 'site')} {by_number(len(moved), 'has', 'have')}"
+        yield f"{count} the same name in {pair} but another position, angle or sensor: {list_first(moved, _NAMED)}"
 
 
 def _error_notes(runs: Sequence[ComparedRun], differences: ScoreDifferences) -> Iterator[str]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from egvs.core.errors import InputError
+from egvs.core.wording import by_number
 from egvs.report.formatting import join_names
 from egvs.runs import run
 from egvs.runs.run_sources import SettingsSource
@@ -173,7 +174,7 @@ def _notes(runs: Sequence[SensorRun], sites: Sequence[Site]) -> Iterator[str]:
         if sensor.azimuth_span_deg is not None:
             partial.append(sensor.name)
     if partial:
-        verb = "does" if len(partial) == 1 else "do"
+        verb = by_number(len(partial), "does", "do")
         yield (
             f"{join_names(partial)} {verb} not see the full circle, and every site looks east (yaw 0): give the sites "
             "a yaw_deg or an aim for a fair comparison"

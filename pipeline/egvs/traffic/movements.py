@@ -1,7 +1,9 @@
 """Movements in words: "High Street (east), left to Station Road".
 
 The approach is that at the junction (:mod:`egvs.traffic.approach_names`), not the edge of the count, which may be far
-from it.
+from it. All movements of one edge on one street have the same approach, also those that leave it before the junction,
+for example on a lane for right turns beside the signals: that of the movement that passes nearest to the middle of the
+junction, as zones and signals name it. Their turn is the change of direction from the approach to the exit.
 
 World frame, in plan: x east, y north, metres.
 """
@@ -9,12 +11,13 @@ World frame, in plan: x east, y north, metres.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from egvs.core.errors import InputError
+from egvs.scenario.traffic_config import CountConfig
 from egvs.traffic.approach_names import ApproachNames, plain_text
 from egvs.traffic.demand import RouteFinder
 from egvs.traffic.directions import TURNS, U_TURN, Floats
@@ -28,10 +31,11 @@ _STRAIGHT_DEG, _BACK_DEG = 45.0, 135.0
 
 
 class _Passage(NamedTuple):
-    """How a movement passes a junction: the edges to it and from it."""
+    """How a movement passes a junction: the edges to it and from it, and how far from its middle."""
 
     to_junction: Sequence[Edge]
     from_junction: Sequence[Edge]
+    distance_m: float = math.inf
 
 
 class Movement(NamedTuple):
@@ -64,9 +68,11 @@ class MovementNames:
         Its edges should have names (netconvert's ``--output.street-names``).
     center_m
         x, y of the junction. Of the nodes on the way from one edge to the other, the nearest one is its node.
+    flows
+        All flows of the junction, from which movements of one edge get one approach.
     """
 
-    def __init__(self, network: Network, center_m: tuple[float, float]) -> None:
+    def __init__(self, network: Network, center_m: tuple[float, float], flows: Iterable[CountConfig] = ()) -> None:
         self._center_m = center_m
         self._edges = {edge.id: edge for edge in network.edges}
         self._approaches = ApproachNames(network)
@@ -78,6 +84,14 @@ class MovementNames:
             if connection.direction in TURNS:
                 ends = network.edges[connection.source].id, network.edges[connection.target].id
                 self._turns.setdefault(ends, TURNS[connection.direction])
+        self._passages: dict[tuple[str, str], _Passage] = {}
+        self._nearest: dict[tuple[str, str], _Passage] = {}
+        for flow in flows:
+            if flow.from_edge is not None and flow.to_edge is not None:
+                passage = self._passage(flow.from_edge, flow.to_edge)
+                key = flow.from_edge, passage.to_junction[-1].name
+                if key not in self._nearest or passage.distance_m < self._nearest[key].distance_m:
+                    self._nearest[key] = passage
 
     def describe(self, from_edge: str, to_edge: str | None) -> str:
         """Return a movement in words.
@@ -100,8 +114,8 @@ class MovementNames:
         if to_edge is None:
             return self._approaches.approach(first.id)
 
-        passage = self._passage(first, self._edges[to_edge])
-        approach, way_out = passage.to_junction[-1], passage.from_junction[0]
+        passage = self._passage(from_edge, to_edge)
+        approach, way_out = self._approach(passage), passage.from_junction[0]
         words = self._approaches.approach(approach.id)
         if first.name not in ("", approach.name):
             words += f" from {_street(first)}"
@@ -118,34 +132,45 @@ class MovementNames:
         first = self._edges[from_edge]
         if to_edge is None:
             return Movement((first,), self._approaches.street(first.id), self._approaches.heading(first.id), "")
-        passage = self._passage(first, self._edges[to_edge])
-        edge = passage.to_junction[-1].id
+        passage = self._passage(from_edge, to_edge)
+        edge = self._approach(passage).id
         street, heading = self._approaches.street(edge), self._approaches.heading(edge)
         return Movement(tuple(passage.to_junction), street, heading, self._turn(passage))
 
     def _turn(self, passage: _Passage) -> str:
         """Return SUMO's turn where a connection joins the edges at the junction, otherwise that of their directions."""
-        ends = passage.to_junction[-1].id, passage.from_junction[0].id
+        ends = self._approach(passage).id, passage.from_junction[0].id
         if ends in self._turns:
             return self._turns[ends]
         return _turn_between(self._approaches.heading(ends[0]), self._approaches.exit_heading(ends[1]))
 
-    def _passage(self, first: Edge, last: Edge) -> _Passage:
+    def _approach(self, passage: _Passage) -> Edge:
+        """Return the edge whose name the approach of a movement has."""
+        first, last = passage.to_junction[0], passage.to_junction[-1]
+        return self._nearest.get((first.id, last.name), passage).to_junction[-1]
+
+    def _passage(self, from_edge: str, to_edge: str) -> _Passage:
         """Find the junction on the fastest way between two edges."""
+        if (from_edge, to_edge) not in self._passages:
+            self._passages[from_edge, to_edge] = self._find_passage(from_edge, to_edge)
+        return self._passages[from_edge, to_edge]
+
+    def _find_passage(self, from_edge: str, to_edge: str) -> _Passage:
         try:
-            ids = self._routes.locate(first.id, last.id, "movement").edges
+            ids = self._routes.locate(from_edge, to_edge, "movement").edges
         except InputError:  # cars may not drive there: the two edges describe the movement
-            return _Passage([first], [last])
+            return _Passage([self._edges[from_edge]], [self._edges[to_edge]])
         way = [self._edges[edge_id] for edge_id in ids]
         nodes = [edge.to_node for edge in way[:-1]]
         distances_m = [math.dist(self._nodes_m[node], self._center_m) for node in nodes]
-        nearest = distances_m.index(min(distances_m))
+        distance_m = min(distances_m)
+        nearest = distances_m.index(distance_m)
 
         for ring in self._roundabouts:
             if nodes[nearest] in ring:
                 on_ring = [index for index, node in enumerate(nodes) if node in ring]
-                return _Passage(way[: on_ring[0] + 1], way[on_ring[-1] + 1 :])
-        return _Passage(way[: nearest + 1], way[nearest + 1 :])
+                return _Passage(way[: on_ring[0] + 1], way[on_ring[-1] + 1 :], distance_m)
+        return _Passage(way[: nearest + 1], way[nearest + 1 :], distance_m)
 
 
 def _street(edge: Edge) -> str:

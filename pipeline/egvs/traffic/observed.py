@@ -40,7 +40,7 @@ def approach_index(scenario: Scenario, network: Network) -> ApproachIndex:
     """Return the names of the movements that a scenario counts, in all its periods."""
     x_m, y_m, _ = scenario.roi.center_m
     counts = {count.title: count for period in scenario.by_period().values() for count in period.traffic.counts}
-    return ApproachIndex.of_flows(counts.values(), MovementNames(network, (x_m, y_m)))
+    return ApproachIndex.of_flows(counts.values(), MovementNames(network, (x_m, y_m), counts.values()))
 
 
 def read_observed(scenario: Scenario, network: Network) -> tuple[Observation, ...]:

@@ -633,7 +633,7 @@ def _collision_warning(collisions: dict[tuple[str, str], Collision], scenario: S
         point_m = at_m[location]
         distance = "" if point_m is None else f" ({describe_distance(point_m, scenario.roi.box)})"
         locations.append(f"{number} at {location}{distance}")
-    pairs = "a pair" if len(collisions) == 1 else f"{len(collisions)} pairs"
+    pairs = number_of(len(collisions), "pair")
     problem = f"{pairs} of vehicles collided and drove through each other: {', '.join(locations)}"
     hint = "In sumo-gui, check right of way, signals and the waiting space on the junctions there."
     return [Diagnostic("collisions", sumo_folder.traffic_location(scenario), problem, hint)]

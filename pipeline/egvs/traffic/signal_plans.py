@@ -243,7 +243,8 @@ def _cosine(a: Floats, b: Floats) -> float:
 def _check_never_green(green: set[int], signal: Signal, where: str) -> None:
     red = dict.fromkeys(link.title for link in signal.links if link.index not in green and link.movement != CROSSING)
     if red:
-        raise InputError(where, f"never green: {', '.join(red)}", "Add these movements to a phase.")
+        hint = "A plan replaces all phases of the signal: add these movements to a phase."
+        raise InputError(where, f"never green: {', '.join(red)}", hint)
 
 
 def _phases(config: SignalConfig, greens: Sequence[set[int]], signal: Signal) -> Iterator[Phase]:

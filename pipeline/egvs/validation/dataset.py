@@ -11,7 +11,6 @@ region of interest. The classes and anchors for the configuration of a model are
 
 from __future__ import annotations
 
-import difflib
 import math
 import shlex
 import shutil
@@ -26,7 +25,7 @@ import numpy as np
 from egvs._version import __version__
 from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS
 from egvs.core import files
-from egvs.core.errors import InputError, RunError
+from egvs.core.errors import InputError, RunError, unknown_site
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.threads import thread_count
 from egvs.effects import registry
@@ -459,21 +458,13 @@ def _selected_sites(candidates: Sequence[Site], names: Sequence[str]) -> list[Si
     by_name = {site.name: site for site in candidates}
     for name in names:
         if name not in by_name:
-            raise InputError("--site", f"no site {name!r}", _site_hint(name, list(by_name)))
+            raise unknown_site("--site", name, list(by_name))
     selected = [site for site in candidates if not names or site.name in names]
     for site in selected:
         cloud_simulation.check_no_measured_scan(site)
         if site.name.startswith(".") or site.name.casefold() == README_FILE.casefold():
             raise InputError(f"site {site.name}", "its name is reserved in the exported folder", "Rename the site.")
     return selected
-
-
-def _site_hint(name: str, known: Sequence[str]) -> str:
-    similar = difflib.get_close_matches(name, known, 1, 0.4)
-    if similar:
-        return f"Did you mean {similar[0]}?"
-    others = f" and {len(known) - 20} more" if len(known) > 20 else ""
-    return f"Use one of {', '.join(known[:20])}{others}."
 
 
 def _check_feasible(scene: Scene, sites: Sequence[Site]) -> None:

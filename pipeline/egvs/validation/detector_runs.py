@@ -169,35 +169,39 @@ class SiteDetectionTask(DetectionTaskBase[Detector]):
                 detectors[name] = _first_sweep_detector(self.detectors[name], simulator, self.record)
         return self.detect([simulator], detectors, with_points=POINT_COUNTS_NAME in names)
 
-    def key(self, site: Site, name: str) -> str:
-        """Return a hash of everything that a detector's result at a site depends on."""
+    def settings(self, site: Site, name: str) -> dict[str, Any]:
+        """Return everything that a detector's result at a site depends on, besides the program."""
         scene, scenario = self.record.scene, self.record.scenario
         detector = self.detectors.get(name)
-        settings = detector.settings if detector else {}
         custom_sensor = scenario.sensors.get(site.sensor)
-        sensor_config = custom_sensor.model_dump(mode="json") if custom_sensor else None
-        effects = scene.acting(Effect)
+        return {
+            "detector": [name, detector.settings if detector else {}],
+            "record": [self.record.keys, self.record.numbers.tolist(), scenario.seed],
+            "site": [site.name, site.pose.position_m, site.pose.angles_deg],
+            "sensor": [
+                site.sensor,
+                custom_sensor.model_dump(mode="json") if custom_sensor else None,
+                sensor_digests(scenario, [site]),
+            ],
+            "bodies": cloud_simulation.hash_body_files(scenario),
+            "effects": registry.effect_settings(scene.acting(Effect)),
+            "roi": [scene.roi.origin_m, scene.roi.size_m],
+        }
 
-        modules = [__name__, *registry.effect_modules(effects)]
-        if detector:
+    def key(self, site: Site, name: str) -> str:
+        """Return a hash of everything that a detector's result at a site depends on."""
+        modules = [__name__, *registry.effect_modules(self.record.scene.acting(Effect))]
+        if detector := self.detectors.get(name):
             modules.append(type(detector).__module__)
         sources = [stage_keys.source_digest(module) for module in modules]
         libraries: frozenset[str] = frozenset()
         libraries = libraries.union(*(source.libraries for source in sources))
-
-        dependencies = {
-            "detector": [name, settings],
-            "record": [self.record.keys, self.record.numbers.tolist(), scenario.seed],
-            "site": [site.name, site.pose.position_m, site.pose.angles_deg],
-            "sensor": [site.sensor, sensor_config, sensor_digests(scenario, [site])],
-            "bodies": cloud_simulation.hash_body_files(scenario),
-            "effects": registry.effect_settings(effects),
-            "roi": [scene.roi.origin_m, scene.roi.size_m],
+        program = {
             "program": [source.digest for source in sources],
             "libraries": stage_keys.library_versions(libraries),
             "schema": parquet.SCHEMA_VERSION,
         }
-        return files.hash_json(dependencies)
+        return files.hash_json(self.settings(site, name) | program)
 
 
 def _first_sweep_detector(detector: Detector, simulator: CloudSimulator, record: HeldOutTraffic) -> SweepDetector:

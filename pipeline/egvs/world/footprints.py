@@ -20,6 +20,7 @@ import numpy as np
 
 from egvs.core.errors import Diagnostic, DiagnosticsError, InputError, find_misspelling
 from egvs.core.reading import read_json
+from egvs.core.wording import number_of
 from egvs.formats import vector_files
 from egvs.formats.georeference import WORLD_READING, CoordinateReading, Georeference, declared_crs, geojson_coordinates
 from egvs.scenario.fields import MAX_COORDINATE_M
@@ -179,7 +180,7 @@ def _report_errors(errors: list[InputError], path: Path) -> Iterator[Diagnostic]
     more = len(errors) - _MAX_REPORTED
     if more > 0:
         yield Diagnostic(
-            "statics", str(path), f"{more} more invalid features", "Correct those above first.", is_error=True
+            "statics", str(path), number_of(more, "more invalid feature"), "Correct those above first.", is_error=True
         )
 
 

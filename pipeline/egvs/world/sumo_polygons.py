@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.errors import Diagnostic, InputError
+from egvs.core.wording import list_first
 from egvs.formats import xml
 from egvs.formats.georeference import WGS84, CoordinateReading, Georeference
 from egvs.traffic.network import read_location
@@ -258,9 +259,7 @@ class _PolygonReader:
             hint = "Close them. polyconvert --osm.merge-relations 1 joins outlines that are split into several ways."
             self._warn("open outlines", problem, hint)
         if self._crossing_names:
-            shown = ", ".join(self._crossing_names[:_MAX_LISTED])
-            if len(self._crossing_names) > _MAX_LISTED:
-                shown += ", ..."
+            shown = list_first(self._crossing_names, _MAX_LISTED)
             count = len(self._crossing_names)
             problem = f"outlines that cross themselves: {count} ({shown}). All areas that they enclose are kept"
             self._warn("crossing outlines", problem, "Check and correct them in the map.")
@@ -384,7 +383,4 @@ def _count_inside(footprints: list[Footprint]) -> int:
 def _list_types(counts: Counter[str]) -> str:
     """Return types with their counts, the most frequent first."""
     by_count = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
-    shown = ", ".join(f"{name} ({count})" for name, count in by_count[:_MAX_LISTED])
-    if len(counts) > _MAX_LISTED:
-        shown += f" and {len(counts) - _MAX_LISTED} more types"
-    return shown
+    return list_first([f"{name} ({count})" for name, count in by_count], _MAX_LISTED)

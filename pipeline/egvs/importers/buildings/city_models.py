@@ -24,7 +24,7 @@ from shapely.geometry.base import BaseGeometry
 from egvs.core import limits
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.core.wording import by_number, number_of
+from egvs.core.wording import by_number, list_first, number_of
 from egvs.formats.city_objects import CityObject, Placement, Surface, select_footprint, select_surfaces
 from egvs.formats.gml import ReferenceSystem, parse_srs_name
 from egvs.formats.surface_meshes import SurfaceMesh, triangulate_surfaces
@@ -254,11 +254,10 @@ class _Collector:
             meshes = [mesh for mesh in self.meshes.values() if mesh.kind == kind]
             open_names = [mesh.name for mesh in meshes if not mesh.is_closed]
             if open_names:
-                more = f" and {len(open_names) - _MAX_NAMES:,} more" if len(open_names) > _MAX_NAMES else ""
                 yield (
                     f"{len(open_names):,} of {number_of(len(meshes), 'mesh', 'meshes')} of the kind {kind}"
                     f" {by_number(len(open_names), 'is', 'are')} not closed, so a point"
-                    f" inside cannot be recognised: {', '.join(open_names[:_MAX_NAMES])}{more}."
+                    f" inside cannot be recognised: {list_first(open_names, _MAX_NAMES)}."
                 )
 
     def _repair_notes(self) -> Iterator[str]:

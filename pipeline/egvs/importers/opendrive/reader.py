@@ -15,13 +15,13 @@ World frame: that of the network, x east, y north in metres. Without a projectio
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 from egvs.core import files, limits
 from egvs.core.errors import InputError
-from egvs.core.wording import by_number, number_of
+from egvs.core.wording import by_number, list_first, number_of
 from egvs.formats import georeference, opendrive
 from egvs.formats.opendrive import OpenDriveMap, Road
 from egvs.formats.opendrive_copy import CopyOptions, write_copy
@@ -361,6 +361,4 @@ def _has_relief(road: Road) -> bool:
 
 def _listed(names: Iterable[str]) -> str:
     """Return the first of some names, without repetitions, and the number of the others."""
-    unique: Collection[str] = dict.fromkeys(names)
-    text = ", ".join(list(unique)[:_LISTED])
-    return text if len(unique) <= _LISTED else f"{text} and {len(unique) - _LISTED} more"
+    return list_first(list(dict.fromkeys(names)), _LISTED)

@@ -159,13 +159,13 @@ def square_around(at: tuple[float, float], surroundings_m: float | None = None) 
     if not streets_m <= MAX_RADIUS_M:
         amount = "all" if math.isinf(streets_m) else f"{streets_m:g} m"
         problem = f"expected at most {MAX_RADIUS_M:g} m with --download, got {amount}"
-        raise InputError("--surroundings", problem, "Download a larger extract yourself and give it with --osm.")
+        raise InputError("--surroundings", problem, "Download a larger extract yourself and give it with --from.")
     solids_m = junctions.ROI_MAX_M / math.sqrt(2) + junctions.BEYOND_ROI_M + CATALOGUE[SENSOR].range_m
     half_m = junctions.MAX_FROM_POINT_M + max(streets_m, solids_m) + _MARGIN_M
     north_deg = math.degrees(half_m / _EARTH_RADIUS_M)
     east_deg = north_deg / math.cos(math.radians(latitude_deg))
     if abs(longitude_deg) + east_deg > 180:
-        hint = "Download an extract yourself and give it with --osm."
+        hint = "Download an extract yourself and give it with --from."
         raise InputError("--at", "the square around the point crosses the 180th meridian", hint)
     return Bounds(
         latitude_deg - north_deg, longitude_deg - east_deg, latitude_deg + north_deg, longitude_deg + east_deg
@@ -274,7 +274,7 @@ def _translate_failures(where: str) -> Iterator[None]:
         if isinstance(error.reason, TimeoutError):
             raise _timeout_error(where) from None
         reason = getattr(error.reason, "strerror", None) or str(error.reason)
-        hint = "Check the network and the address, or download the extract yourself and give it with --osm."
+        hint = "Check the network and the address, or download the extract yourself and give it with --from."
         raise InputError(where, f"the server cannot be reached ({reason})", hint) from None
     except TimeoutError:
         raise _timeout_error(where) from None

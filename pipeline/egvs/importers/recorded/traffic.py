@@ -178,9 +178,7 @@ def describe(recorded: RecordedTracks) -> str:
 
 
 def _count(name: str, number: int) -> str:
-    if number == 1:
-        return f"1 {name}"
-    return f"{number:,} {name}{'es' if name.endswith('s') else 's'}"
+    return number_of(number, name, f"{name}es" if name.endswith("s") else "")
 
 
 def read_for_summary(scenario: Scenario) -> RecordedTracks:

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.core.wording import by_number, number_of
+from egvs.core.wording import by_number, list_first, number_of
 from egvs.importers.map_parts import Terrain
 from egvs.importers.terrain.network_heights import (
     Replacement,
@@ -122,7 +122,7 @@ def drape_network(
         )
     crossings = graph.crossings(shapes)
     if crossings:
-        pairs = ", ".join(f"{one} and {other}" for one, other in crossings[:3])
+        pairs = list_first([f"{one} with {other}" for one, other in crossings], 3)
         notes.append(
             f"In {number_of(len(crossings), 'place')}, roads cross without a junction, but both lie on the ground,"
             " since the map does not"
