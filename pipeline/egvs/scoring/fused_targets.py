@@ -115,8 +115,8 @@ def _best_views(views: Sequence[TargetVisibility]) -> IntArray:
         np.array([view.range_m for view in views]),
         np.array([-view.points for view in views]),
     )
-    order: IntArray = np.lexsort(keys, axis=0)
-    return order[0]
+    best: IntArray = np.lexsort(keys, axis=0)[0]
+    return best
 
 
 def _sum(amounts: Sequence[FloatArray]) -> FloatArray:
