@@ -2,12 +2,13 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/$(if $(filter Windows_NT,$(OS)),Scripts,bin)
-INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+# To compile all modules takes a minute; those that are used are compiled when they are first imported.
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
 
-# Every test process would compile all modules again.
+# Every process would compile all modules again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run test test-slow test-nightly test-train test-lowest test-portable unit lint wheel project-files image image-test bench bench-history bench-peers scaling numerics validity detectability pictures schema reference docs notebooks fuzz clean
+.PHONY: run environment test test-slow test-nightly test-train test-lowest test-portable unit lint wheel project-files image image-test bench bench-history bench-peers scaling numerics validity detectability pictures schema reference docs notebooks fuzz clean
 
 run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
@@ -137,12 +138,20 @@ schema: $(VENV)/.installed
 reference: $(VENV)/.installed
 	$(BIN)/python docs/mkdocs/reference.py
 
-$(VENV)/.installed: pyproject.toml constraints.txt
+$(VENV)/.created: pyproject.toml constraints.txt
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'egvs needs Python 3.11 or newer; name one with: make PYTHON=...')"
 	$(PYTHON) -m venv $(VENV)
 	$(INSTALL) hatchling editables
+	@touch $@
+
+$(VENV)/.installed: $(VENV)/.created
 	$(INSTALL) --no-build-isolation --editable '.[explore]'
 	@touch $@
+
+# The environments of the tests and of the documentation at once: pip takes 10 s for each call.
+environment: $(VENV)/.created
+	$(INSTALL) --no-build-isolation --editable '.[dev,docs]'
+	@touch $(VENV)/.installed $(VENV)/.installed-dev $(VENV)/.installed-docs
 
 $(VENV)/.installed-dev: $(VENV)/.installed
 	$(INSTALL) --no-build-isolation --editable '.[dev]'

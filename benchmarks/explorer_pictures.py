@@ -1,5 +1,8 @@
 """Draw the pictures of the explorer for docs and README: the page over nishishinjuku, in a headless browser.
 
+The pictures ``view`` and ``view-dark`` show the page of one file (``make docs`` writes it as ``build/view.html``); the
+others show the page of a running explorer.
+
     python -m benchmarks.explorer_pictures [--only explore-3-lanes] [--out docs/images]
 
 Needs Chromium and playwright. Software rendering takes a minute or two.
@@ -8,6 +11,7 @@ Needs Chromium and playwright. Software rendering takes a minute or two.
 from __future__ import annotations
 
 import argparse
+import io
 import shutil
 import tempfile
 import threading
@@ -18,15 +22,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 import egvs
 from egvs.explore.page import Page
+from egvs.explore.page_file import write_page_file
 from egvs.explore.settings import open_session
 from egvs.explore.view_state import Camera
 from egvs.sensors.sites import Pose
 
 SCENARIO = Path("scenarios/nishishinjuku")
 GRAPHICS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+HIDE_NOTIFICATIONS = ".mantine-Notifications-root { display: none }"
+"""Style: viser warns of software rendering."""
 WIDTH, HEIGHT = 1200, 720
 ABOVE = Camera((203.0, 188.0, 48.0), (197.0, 237.0, 0.0))
 NEAR = Camera((216.0, 212.0, 24.0), (191.0, 240.0, 0.0))
@@ -43,15 +51,28 @@ PICTURES: dict[str, tuple[Camera, dict[str, Any]]] = {
 }
 """File name, camera, and view."""
 
+PAGE_FILE_PICTURES = {"view": "light", "view-dark": "dark"}
+"""File name, and colour scheme of the browser."""
+PAGE_WIDTH, PAGE_HEIGHT, LEFT, BOTTOM = 1100, 690, 190, 50
+"""Size of the browser's window, and what is cut off: an empty part of the scene, and the controls of the playback."""
+COLOUR_STEP = 4
+"""Colours are rounded to multiples of this, which halves the size of the file."""
+
 
 def main() -> None:
     """Draw all pictures, or some."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", nargs="*", choices=list(PICTURES), default=list(PICTURES))
+    names = [*PAGE_FILE_PICTURES, *PICTURES]
+    parser.add_argument("--only", nargs="*", choices=names, default=names)
+    parser.add_argument("--page", type=Path, help="a page of one file; a new one by default")
     parser.add_argument("--run", type=Path, help="a run folder with a plan; a new run by default")
     parser.add_argument("--out", type=Path, default=Path("docs/images"))
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
+        if pages := [name for name in PAGE_FILE_PICTURES if name in options.only]:
+            _draw_page_file(options.page or _write_page(Path(scratch)), pages, options.out)
+        if not set(options.only) & set(PICTURES):
+            return
         run = options.run or Path(scratch) / "run"
         if not (run / "placement.parquet").is_file():
             egvs.place(egvs.load(SCENARIO, ["placement.count=2"]), run)
@@ -61,25 +82,56 @@ def main() -> None:
                     _draw(page, tab, camera, view, options.out / f"{name}.png")
 
 
+def _write_page(scratch: Path) -> Path:
+    run = scratch / "run_without_plan"
+    egvs.run(egvs.load(SCENARIO), run)
+    return write_page_file(open_session(SCENARIO, (), run), scratch / "page.html").path
+
+
+def _draw_page_file(page: Path, names: list[str], out: Path) -> None:
+    with _browser() as browser:
+        for name in names:
+            tab = browser.new_page(
+                viewport={"width": PAGE_WIDTH, "height": PAGE_HEIGHT}, color_scheme=PAGE_FILE_PICTURES[name]
+            )
+            tab.set_default_timeout(300_000)
+            tab.goto(page.resolve().as_uri(), wait_until="commit")
+            tab.wait_for_function("window.__viserSceneTree?.getState()['/traffic/returns'] !== undefined")
+            tab.add_style_tag(content=HIDE_NOTIFICATIONS)
+            tab.wait_for_timeout(30_000)  # drawn in software
+            picture = Image.open(io.BytesIO(tab.screenshot())).convert("RGB")
+            shown = np.asarray(picture.crop((LEFT, 0, PAGE_WIDTH, PAGE_HEIGHT - BOTTOM))).astype(int)
+            rounded = np.minimum((shown + COLOUR_STEP // 2) // COLOUR_STEP * COLOUR_STEP, 255)
+            Image.fromarray(rounded.astype(np.uint8)).save(out / f"{name}.png", optimize=True)
+            print(out / f"{name}.png")
+            tab.close()
+
+
+@contextmanager
+def _browser() -> Iterator[Any]:
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+        browser = playwright.chromium.launch(executable_path=chromium, args=GRAPHICS)
+        yield browser
+        browser.close()
+
+
 @contextmanager
 def _tab(scratch: Path, run: Path) -> Iterator[tuple[Page, Any]]:
     """Return the page, and a browser tab that shows it."""
-    from playwright.sync_api import sync_playwright
-
     page = Page(open_session(SCENARIO, (), run), scratch / "page")
     loop = threading.Thread(target=page.run)
     loop.start()
     try:
-        with sync_playwright() as playwright:
-            chromium = shutil.which("chromium") or shutil.which("chromium-browser")
-            browser = playwright.chromium.launch(executable_path=chromium, args=GRAPHICS)
+        with _browser() as browser:
             tab = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
             tab.goto(page.address)
             tab.get_by_text("rank 1 of").wait_for(timeout=120_000)
             tab.wait_for_timeout(30_000)
-            tab.add_style_tag(content=".mantine-Notifications-root { display: none }")  # it warns of software rendering
+            tab.add_style_tag(content=HIDE_NOTIFICATIONS)
             yield page, tab
-            browser.close()
     finally:
         page.end()
         loop.join()

@@ -131,7 +131,7 @@ def compare_seeds(runner: SettingRunner, runs: Sequence[SeedScores]) -> SeedComp
     scores = np.array([run.scores for run in runs])
     ses = np.array([run.estimate.se for run in runs])
     biases = np.array([run.estimate.bias for run in runs])
-    half_widths = np.array([[run.estimate.quantile()] for run in runs]) * ses
+    half_widths = np.array([run.estimate.quantiles() for run in runs]) * ses
     return SeedComparison(
         truth=truth,
         between=scores.std(axis=0, ddof=1),

@@ -22,7 +22,7 @@ def test_results_are_one_informative_line(mini: Path, tmp_path: Path) -> None:
         f"{scan.beams_in_roi:,} of 2,880 beams towards the region, {scan.returns:,} returns)"
     )
     score = egvs.Scorer(scene, tpog).score(scan)
-    assert repr(score) == f"SiteScore(egvs {score.egvs:,.1f} bit, entropy_seen {score.entropy_seen:.1%})"
+    assert repr(score) == f"SiteScore(egvs {score.egvs:,.1f} bit, entropy_seen {100 * score.entropy_seen:.1f} %)"
 
 
 def test_comparison_names_its_runs_and_their_agreement(mini: Path, tmp_path: Path) -> None:
@@ -44,6 +44,6 @@ def test_rated_pose_shows_the_recommended_score_or_the_reason(mini: Path, tmp_pa
     rated = session.rate("pole_a", Pose(10.0, 12.0, 4.0))
     found = rated.scores["expected_detections"]
     assert repr(rated).startswith(f"PoseScore(pole_a: rank {rated.rank}, egvs {rated.scores['egvs']:,.0f} bit, ")
-    assert f"expected_detections {found:.1%}" in repr(rated)
+    assert f"expected_detections {100 * found:.1f} %" in repr(rated)
     inside = session.rate("pole_a", Pose(16.0, 6.0, 3.0))
     assert repr(inside).startswith("PoseScore(pole_a: no score, site pole_a: (16, 6, 3) is inside house")

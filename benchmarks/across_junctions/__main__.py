@@ -3,6 +3,7 @@
     build     make the scenarios, draw their candidates, look at their traffic in a short simulation
     list      print the protocol and its hash
     measure   measure what is missing, part by part; an interrupted study continues where it stopped
+    fit       compare models of the score on the training junctions, or fit them
     tables    write the tables from the records
 
 Junctions whose maps are not in the folder of ``--maps`` are left out, and named.
@@ -16,7 +17,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.across_junctions import build, candidates, costs, tables
+from benchmarks.across_junctions import build, candidates, costs, tables, training
 from benchmarks.across_junctions.measurement import Extent, PartPlan, measure
 from benchmarks.across_junctions.protocol import (
     CANDIDATES_FILE,
@@ -30,6 +31,7 @@ from benchmarks.across_junctions.protocol import (
 )
 from benchmarks.across_junctions.records import NOT_DETECTORS, SCORES, VEHICLES
 from benchmarks.across_junctions.worlds import MissingMapError, make_world
+from egvs.core import files
 from egvs.core.errors import EgvsError, InputError, MissingBackendError
 from egvs.core.progress import ProgressCallback
 from egvs.validation.detectors import base
@@ -63,7 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     data.add_argument("--data", type=Path, default=ROOT / "runs" / "across_junctions", help="folder of the study")
     common.add_argument("--maps", type=Path, metavar="DIR", help="folder of the maps that are not shipped")
     common.add_argument("--junction", metavar="NAME,NAME", help="default: all (build), or all with candidates")
-    steps = parser.add_subparsers(required=True, metavar="build|list|measure|tables")
+    steps = parser.add_subparsers(required=True, metavar="build|list|measure|fit|tables")
 
     step = steps.add_parser("build", parents=[data, common], help="make the scenarios")
     step.add_argument(
@@ -89,6 +91,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     step.add_argument("--jobs", type=int, help="processes; default: one a core")
     step.set_defaults(step=_measure)
+
+    step = steps.add_parser("fit", parents=[data], help="compare models on the training junctions, each on the others")
+    step.add_argument("--detector", metavar="NAME,NAME", help="default: those that the protocol trains with")
+    step.add_argument("--write", type=Path, metavar="FILE", help="fit the shipped form and write it, .json")
+    step.set_defaults(step=_fit)
 
     step = steps.add_parser("tables", parents=[data], help="write the tables")
     step.add_argument("--out", type=Path, metavar="DIR", help="for the tables; default: below the folder of the study")
@@ -281,6 +288,18 @@ def _progress(name: str, start_s: float) -> ProgressCallback:
             print(f"{reported_at - start_s:6.0f} s  {name}: {text}", flush=True)
 
     return progress
+
+
+def _fit(arguments: argparse.Namespace) -> int:
+    protocol, records = read_protocol(), arguments.data / "records"
+    if arguments.write is not None:
+        files.write_text(arguments.write, training.fitted_models(records, protocol))
+        print(arguments.write)
+        return 0
+    for name in (arguments.detector or ",".join(protocol.detectors.training)).split(","):
+        lines = training.compare(training.read_training(records, protocol, name), name, arguments.data / "fit")
+        print("\n".join(lines), flush=True)
+    return 0
 
 
 def _tables(arguments: argparse.Namespace) -> int:

@@ -19,6 +19,7 @@ import numpy as np
 from benchmarks.across_junctions import detections, records
 from benchmarks.across_junctions.protocol import Junction, Protocol
 from benchmarks.across_junctions.records import SCORES, VEHICLES, PartInfo, info_path, write_table
+from benchmarks.detectability.additive_model import DIRECTIONS, target_features
 from benchmarks.records import Machine
 from benchmarks.validity.junctions import check_unseen, with_sites
 from egvs.core import files
@@ -29,7 +30,6 @@ from egvs.core.threads import map_ordered, thread_count
 from egvs.runs import stage_keys
 from egvs.scenario.loading import load
 from egvs.scenario.model import Scenario
-from egvs.scoring.target_scores import FEATURES, detectability_features
 from egvs.scoring.targets import TargetRecord, VisibleTargets, detection_probability, visible_targets
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
@@ -261,14 +261,15 @@ def _measure_vehicles(plan: PartPlan, held_out: HeldOutTraffic, jobs: int | None
         **boxes,
     }
     write_table(_path(plan, VEHICLES), vehicles)
-    each = _visible(held_out.scene, record, jobs)
-    features = np.concatenate([detectability_features(visible) for _, visible in each])
+    each = [(site, target_features(seen), seen.points) for site, seen in _visible(held_out.scene, record, jobs)]
     columns: dict[str, object] = {
-        "site": np.repeat([site.name for site, _ in each], len(record)),
+        "site": np.repeat([site.name for site, _, _ in each], len(record)),
         "row": np.tile(np.arange(len(record)), len(each)),
-        "points": np.concatenate([visible.points for _, visible in each]).astype(np.float32),
+        "points": np.concatenate([points for _, _, points in each]).astype(np.float32),
+        "vehicle_class": np.concatenate([features.vehicle_class for _, features, _ in each]).astype(np.int8),
     }
-    columns |= {name: features[:, number].astype(np.float32) for number, name in enumerate(FEATURES)}
+    for name in DIRECTIONS:
+        columns[name] = np.concatenate([features.columns[name] for _, features, _ in each]).astype(np.float32)
     write_table(_path(plan, "features"), columns)
     progress("visibility of sites", len(each), len(each))
 

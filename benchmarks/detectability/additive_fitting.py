@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from benchmarks.detectability.additive_model import DIRECTIONS, AdditiveModel, TargetFeatures
+from benchmarks.detectability.crowding import CLASSES
+from egvs.core.errors import EgvsError
 from egvs.core.special import expit
-from egvs.scoring.crowding import CLASSES
 
 KNOTS = 6
 """Knots of each feature, before equal ones are merged."""
@@ -26,7 +27,9 @@ RIDGE = 1e-4
 """Lambda of the module's equation."""
 
 DIGITS = 5
-"""Significant digits in the file."""
+"""Significant digits of the parameters."""
+
+MAX_ITERATIONS = 300
 
 Floats = NDArray[np.float64]
 
@@ -74,6 +77,11 @@ def fit_additive(rows: Sequence[TrainingRows], names: Sequence[str], with_classe
         everywhere is left out.
     with_classes
         Whether classes have offsets; the mean offset is 0 by the ridge.
+
+    Raises
+    ------
+    EgvsError
+        When the optimiser does not converge within :data:`MAX_ITERATIONS`.
     """
     weight = np.concatenate([np.full(len(each.hits), 1.0 / (len(rows) * len(each.hits))) for each in rows])
     hits = np.concatenate([each.hits for each in rows])
@@ -97,7 +105,10 @@ def fit_additive(rows: Sequence[TrainingRows], names: Sequence[str], with_classe
         slope = (weight * (expit(logit) - hits)).astype(np.float32) @ design
         return value, slope.astype(np.float64) + RIDGE * ridge
 
-    result = minimize(loss, np.zeros(len(bounds)), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 300})
+    start, options = np.zeros(len(bounds)), {"maxiter": MAX_ITERATIONS}
+    result = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    if not result.success:
+        raise EgvsError(f"the additive model of {', '.join(names)} was not fitted: L-BFGS-B: {result.message}")
     rounded = [float(f"{value:.{DIGITS}g}") for value in result.x]
     curves, at = {}, 1
     for name, positions in knots.items():
@@ -106,37 +117,3 @@ def fit_additive(rows: Sequence[TrainingRows], names: Sequence[str], with_classe
         curves[name] = np.array([float(f"{p:.{DIGITS}g}") for p in positions]), np.append(0.0, np.cumsum(steps))
     offsets = np.array(rounded[at:]) if with_classes else np.zeros(len(CLASSES))
     return AdditiveModel(rounded[0], curves, offsets)
-
-
-def model_toml(models: Mapping[str, AdditiveModel], about: Mapping[str, object]) -> str:
-    """Return the file of models: a table per detector and feature.
-
-    Parameters
-    ----------
-    models
-        By detector.
-    about
-        What they were trained on; strings, numbers and lists of strings.
-    """
-    lines = ["# Written by python -m benchmarks.detectability.comparison.", "", "[about]"]
-    lines += [f"{key} = {_toml(value)}" for key, value in about.items()]
-    for detector, model in models.items():
-        lines += ["", f"[detectors.{detector}]", f"intercept = {model.intercept:.{DIGITS}g}", ""]
-        offsets = zip(CLASSES, model.class_offsets.tolist(), strict=True)
-        lines += [f"classes = {{ {', '.join(f'{name} = {value:.{DIGITS}g}' for name, value in offsets)} }}", ""]
-        lines += [f"[detectors.{detector}.features]"]
-        for name, (knots, values) in model.curves.items():
-            lines.append(f"{name} = {{ knots = {_numbers(knots)}, values = {_numbers(values)} }}")
-    return "\n".join([*lines, ""])
-
-
-def _numbers(values: Floats) -> str:
-    return f"[{', '.join(f'{value:.{DIGITS + 1}g}' for value in values.tolist())}]"
-
-
-def _toml(value: object) -> str:
-    if isinstance(value, str):
-        return f'"{value}"'
-    if isinstance(value, list):
-        return f"[{', '.join(_toml(entry) for entry in value)}]"
-    return f"{value}"

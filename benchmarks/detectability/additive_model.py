@@ -1,7 +1,7 @@
 r"""Candidates for a later version of ``expected_detections``: more features, and an additive model of them.
 
-The features include how crowded a vehicle is as seen from the sensor (:mod:`egvs.scoring.crowding`). The model of the
-probability that a detector finds the vehicle is
+The features include how crowded a vehicle is as seen from the sensor (:mod:`benchmarks.detectability.crowding`). The
+model of the probability that a detector finds the vehicle is
 
 .. math:: p(x) = \frac{1}{1 + e^{-b - \sum_k f_k(x_k) - c}}
 
@@ -9,7 +9,7 @@ with a piecewise linear function :math:`f_k` of each feature, constant beyond it
 of the vehicle's class. Where physics prescribes a direction (:data:`DIRECTIONS`), no :math:`f_k` turns: more points, a
 wider gap or a finer point spacing never lower the probability. A vehicle without any point is never detected.
 
-Its parameters are a readable table of knots and values per feature. On the training junctions measured so far it
+On the training junctions measured so far it
 predicts less well than trees of the same features (docs/validation.md).
 """
 
@@ -17,14 +17,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from egvs.core.errors import InputError
+from benchmarks.detectability.crowding import measure_crowding, vehicle_classes
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.special import expit
-from egvs.scoring.crowding import CLASSES, measure_crowding, vehicle_classes
 from egvs.scoring.target_scores import ISOLATED_GAP_M, MONOTONICITY
 from egvs.scoring.targets import VisibleTargets
 
@@ -52,7 +50,7 @@ class TargetFeatures:
     columns
         (n,) float64 each, by the names of :data:`DIRECTIONS`.
     vehicle_class
-        Index in :data:`egvs.scoring.crowding.CLASSES`, -1 for people, (n,) int64.
+        Index in :data:`benchmarks.detectability.crowding.CLASSES`, -1 for people, (n,) int64.
     """
 
     columns: Mapping[str, FloatArray]
@@ -96,40 +94,12 @@ class AdditiveModel:
     curves
         Knots, ascending, and the values of :math:`f_k` there, (m,) float64 each, by feature.
     class_offsets
-        c of each of :data:`egvs.scoring.crowding.CLASSES`, (5,) float64.
+        c of each of :data:`benchmarks.detectability.crowding.CLASSES`, (5,) float64.
     """
 
     intercept: float
     curves: Mapping[str, tuple[FloatArray, FloatArray]]
     class_offsets: FloatArray
-
-    @classmethod
-    def from_table(cls, table: Mapping[str, Any], where: str = "model") -> AdditiveModel:
-        """Parse the table of a detector.
-
-        Raises
-        ------
-        InputError
-            For an unknown feature or class, knots that do not ascend, or values against the prescribed direction.
-        """
-        curves = {}
-        for name, curve in table["features"].items():
-            key = f"{where}: features.{name}"
-            if name not in DIRECTIONS:
-                raise InputError(key, "expected a known feature", f"Use some of {', '.join(DIRECTIONS)}.")
-            knots, values = np.array(curve["knots"], dtype=np.float64), np.array(curve["values"], dtype=np.float64)
-            if knots.shape != values.shape or len(knots) < 2 or not (np.diff(knots) > 0.0).all():
-                problem = f"expected as many values as ascending knots, 2 or more, got {len(values)} and {len(knots)}"
-                raise InputError(key, problem, "Fit the model again.")
-            if (np.diff(values) * DIRECTIONS[name] < 0.0).any():
-                way = "rising" if DIRECTIONS[name] > 0 else "falling"
-                raise InputError(key, f"expected {way} values, got {values.tolist()}", "Fit the model again.")
-            curves[name] = knots, values
-        if unknown := set(table["classes"]) ^ set(CLASSES):
-            problem = f"expected the classes {', '.join(CLASSES)}; missing or unknown: {', '.join(sorted(unknown))}"
-            raise InputError(f"{where}: classes", problem, "Fit the model again.")
-        offsets = np.array([table["classes"][name] for name in CLASSES], dtype=np.float64)
-        return cls(float(table["intercept"]), curves, offsets)
 
     def chances(self, features: TargetFeatures) -> FloatArray:
         """Return the probability of each vehicle-frame, (n,) float64, 0 to 1; undefined for people."""

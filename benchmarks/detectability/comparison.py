@@ -7,8 +7,10 @@ traffic, hits and AP of a detector. Then, from the simplest to the largest, each
 all junctions but one and predicts that one: Spearman's rho of the expected detections with AP, rho among sites of one
 height and sensor, and the logistic loss per vehicle-frame. Means over junctions, and differences from
 ``points_on_target``, have a standard error over junctions; a larger model is only better where the difference exceeds
-it. ``--figure`` draws a reliability diagram of ``--model`` for every junction; an additive one is also fitted on all of
-them and written to ``additive_detection.toml``, a readable table.
+it. ``--figure`` draws a reliability diagram of ``--model`` for every junction.
+
+The shipped ``expected_detections`` was trained at some of these junctions. There its result is in-sample: the table
+marks it, and leaves it out of the means.
 
 Only for training junctions: what is chosen here may not be reported for them.
 """
@@ -16,9 +18,10 @@ Only for training junctions: what is chosen here may not be reported for them.
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, Protocol
@@ -29,8 +32,8 @@ from scipy.stats import spearmanr
 
 from benchmarks.across_junctions.protocol import read_protocol
 from benchmarks.detectability import figures
-from benchmarks.detectability.additive_fitting import TrainingRows, fit_additive, model_toml
-from benchmarks.detectability.additive_model import DIRECTIONS, AdditiveModel, TargetFeatures, target_features
+from benchmarks.detectability.additive_fitting import TrainingRows, fit_additive
+from benchmarks.detectability.additive_model import DIRECTIONS, TargetFeatures, target_features
 from benchmarks.detectability.examples import AP, hits_of
 from benchmarks.detectability.fitting import curve, fit_trees
 from benchmarks.validity import junctions
@@ -255,18 +258,41 @@ def mean_and_error(values: Sequence[float]) -> str:
     return f"{kept.mean():.3f} ± {error:.3f}"
 
 
-def table(results: Mapping[str, Mapping[str, ModelResult]]) -> Iterator[str]:
-    """Yield a Markdown table: means over junctions, and the difference of rho from ``points_on_target``."""
+def shipped_training_junctions() -> frozenset[str]:
+    """Return the junctions that the shipped ``expected_detections`` was trained at."""
+    content = json.loads(target_scores.MODEL_FILE.read_text(encoding="utf-8"))
+    return frozenset(content["about"]["learnt_on"])
+
+
+def table(
+    results: Mapping[str, Mapping[str, ModelResult]], shipped_trained_at: Collection[str] | None = None
+) -> Iterator[str]:
+    """Yield a Markdown table: means over junctions, and the difference of rho from ``points_on_target``.
+
+    Parameters
+    ----------
+    results
+        Score or model -> junction -> result.
+    shipped_trained_at
+        Junctions at which the shipped score was trained; those of its file when None. Its results there are marked,
+        and not part of its means.
+    """
     names = list(results[COUNT_SCORE])
+    trained_at = shipped_training_junctions() if shipped_trained_at is None else frozenset(shipped_trained_at)
     yield f"| model | {' | '.join(f'rho {name}' for name in names)} | rho | minus points_on_target | in groups | loss |"
     yield f"|---|{'---:|' * (len(names) + 4)}"
     for title, by_junction in results.items():
-        rho = [by_junction[name].rho for name in names]
-        less = [by_junction[name].rho - results[COUNT_SCORE][name].rho for name in names]
-        cells = [f"{value:.3f}" for value in rho] + [mean_and_error(rho), mean_and_error(less)]
-        cells += [mean_and_error([by_junction[name].rho_in_group for name in names])]
-        cells += [mean_and_error([by_junction[name].loss for name in names])]
+        in_sample = trained_at if title == SHIPPED_SCORE else frozenset()
+        cells = [f"{by_junction[name].rho:.3f}{' (in-sample)' if name in in_sample else ''}" for name in names]
+        unseen = [name for name in names if name not in in_sample]
+        cells += [mean_and_error([by_junction[name].rho for name in unseen])]
+        cells += [mean_and_error([by_junction[name].rho - results[COUNT_SCORE][name].rho for name in unseen])]
+        cells += [mean_and_error([by_junction[name].rho_in_group for name in unseen])]
+        cells += [mean_and_error([by_junction[name].loss for name in unseen])]
         yield f"| {title} | {' | '.join(cells)} |"
+    if marked := [name for name in names if name in trained_at]:
+        yield ""
+        yield f"In-sample: the shipped score was trained at {', '.join(marked)}; its means leave them out."
 
 
 def reliability(by_junction: Mapping[str, Sequence[SiteRows]], form: Form, names: tuple[str, ...]) -> figures.Curves:
@@ -304,7 +330,7 @@ def _parser() -> argparse.ArgumentParser:
         "--model",
         choices=list(MODELS),
         default=list(MODELS)[-1],
-        help="of figure and file (default %(default)s)",
+        help="of the figure (default %(default)s)",
     )
     parser.add_argument("--figure", action="store_true", help="draw reliability diagrams of --model")
     return parser
@@ -342,7 +368,6 @@ def _junction_name(scenario: Path) -> str:
 def _run(arguments: argparse.Namespace) -> None:
     names = [name for name in arguments.junction.split(",") if name]
     folders = training_folders(names, arguments.scenario)
-    models = {}
     for detector in arguments.detector.split(","):
         by_junction = {}
         for name, folder in folders.items():
@@ -353,20 +378,11 @@ def _run(arguments: argparse.Namespace) -> None:
         lines = [f"{detector}", "", *table(compare(by_junction)), ""]
         files.write_text(arguments.out / f"comparison_{detector}.md", "\n".join(lines))
         print("\n".join(lines))
-        form, features = MODELS[arguments.model]
-        if form == "additive":
-            model = fit([training_rows(sites) for sites in by_junction.values()], form, features)
-            assert isinstance(model, AdditiveModel)
-            models[detector] = model
         if arguments.figure:
+            form, features = MODELS[arguments.model]
             path = arguments.out / f"reliability_{detector}.png"
             figures.draw_reliability(path, detector, reliability(by_junction, form, features))
             print(path)
-    if models:
-        about = {"junctions": list(folders), "frames": arguments.frames, "model": arguments.model}
-        path = arguments.out / "additive_detection.toml"
-        files.write_text(path, model_toml(models, about))
-        print(path)
 
 
 if __name__ == "__main__":

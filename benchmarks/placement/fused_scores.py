@@ -19,7 +19,7 @@ import argparse
 import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,7 @@ from egvs.cli.validation_tables import PlanRunDisplay
 from egvs.core import files
 from egvs.core.grid import FloatArray, IntArray
 from egvs.scenario.loading import load
-from egvs.scoring.fused_targets import fuse_targets, fused_scores
+from egvs.scoring.fused_targets import fuse_targets
 from egvs.scoring.target_scores import detection_chances
 from egvs.scoring.targets import TargetRecord, VisibleTargets, detection_probability, visible_targets
 from egvs.scoring.visibility import Beams
@@ -53,9 +53,9 @@ APART_S = 7.0
 
 AP_MEASURES = ("ap_bev_r40_iou70", "ap_3d_r40_iou70")
 
-INDEPENDENT, FUSED, MOST_POINTS, BEST_SINGLE = "independent", "fused", "fused, view with most points", "best sensor"
-"""The two joint scores; fused points with the view of the sensor with most points; and the highest probability of the
-single sensors, as if their points were not fused."""
+INDEPENDENT, FUSED, BEST_VIEW, BEST_SINGLE = "independent", "fused", "fused, best view", "best sensor"
+"""The two joint scores; the highest probability of the fused points over the views of all sensors with a point on the
+vehicle; and the highest probability of the single sensors, as if their points were not fused."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,10 +126,15 @@ def at_same_pole(group: SensorGroup) -> bool:
 def expected_chances(views: Sequence[VisibleTargets], detector: str) -> dict[str, FloatArray]:
     """Return the probability that each vehicle-frame is found with several sensors, by score, (n,) float64 each."""
     single = np.array([detection_chances(view, (detector,)) for view in views])
+    fused = fuse_targets(views)
+    by_view = []
+    for view in views:
+        from_there = replace(fused, range_m=view.range_m, depression_deg=view.depression_deg, side=view.side)
+        by_view.append(np.where(view.points > 0.0, detection_chances(from_there, (detector,)), 0.0))
     return {
         INDEPENDENT: 1.0 - np.prod(1.0 - single, axis=0),
-        FUSED: fused_scores(views, lambda fused: detection_chances(fused, (detector,))),
-        MOST_POINTS: detection_chances(fuse_targets(views), (detector,)),
+        FUSED: detection_chances(fused, (detector,)),
+        BEST_VIEW: np.max(by_view, axis=0),
         BEST_SINGLE: single.max(axis=0),
     }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import sys
@@ -23,6 +24,7 @@ from benchmarks.across_junctions import (
     records,
     statistics,
     tables,
+    training,
     worlds,
 )
 from benchmarks.across_junctions.detections import AP, MEASURES
@@ -37,6 +39,7 @@ from benchmarks.across_junctions.protocol import (
 )
 from benchmarks.across_junctions.records import PartInfo, write_table
 from benchmarks.across_junctions.statistics import DetectedJunction, Estimate
+from benchmarks.detectability.additive_model import DIRECTIONS
 from benchmarks.validity import tables as table_files
 from benchmarks.validity.junctions import SCENARIOS, with_sites
 
@@ -44,6 +47,7 @@ from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.errors import InputError
 from egvs.runs import stage_keys
 from egvs.scenario.loading import load
+from egvs.scoring.target_scores import FEATURES, DetectabilityModel
 from egvs.sensors.sensor import CATALOGUE
 from egvs.sensors.sites import Pose, Site
 from egvs.traffic import sumo_folder
@@ -536,6 +540,51 @@ def test_rejects_damaged_record(made_up: Path, tmp_path: Path) -> None:
         write_tables(made_up, tmp_path / "out")
     with pytest.raises(InputError, match="expected records, got none"):
         write_tables(tmp_path / "nowhere", tmp_path / "out")
+
+
+def write_rows(folder: Path, name: str, detectors: tuple[str, ...], rng: np.random.Generator) -> None:
+    """Write records where detectors find a vehicle the more probably the more points it has; four per candidate."""
+    sites, count = 32, 50
+    site = np.repeat([f"c{i}" for i in range(sites)], count)
+    row = np.tile(np.arange(count), sites)
+    log_points = rng.uniform(0.0, 6.0, sites * count) * np.repeat(np.linspace(0.3, 1.0, sites), count)
+    columns = {feature: rng.uniform(0.0, 1.0, sites * count).astype(np.float32) for feature in DIRECTIONS}
+    columns["log_points"] = log_points.astype(np.float32)
+    write_table(folder / f"{name}.features.parquet", {
+        "site": site, "row": row, "vehicle_class": np.zeros(len(row), np.int8), **columns,
+    })  # fmt: skip
+    hits = (rng.random(len(row)) < log_points / 6.0).astype(np.float32)
+    share = hits.reshape(sites, count).mean(axis=1)
+    for detector in detectors:
+        write_junction(folder, name, "training", share, share, np.repeat([2.0, 5.0], sites // 2), detector)
+        write_table(folder / f"{name}.{detector}.hits.parquet", {"site": site, "row": row, "hits": hits})
+
+
+@pytest.mark.system  # scikit-learn asks the system for its cores
+def test_models_are_fitted_to_training_records(tmp_path: Path) -> None:
+    folder, detectors = tmp_path / "records", read_protocol().detectors.training
+    folder.mkdir()
+    rng = np.random.default_rng(11)
+    for name in ("hill", "xian", "town01"):  # the last is held out
+        write_rows(folder, name, detectors, rng)
+    by_junction = training.read_training(folder, read_protocol(), "cluster")
+    assert list(by_junction) == ["hill", "xian"]
+    assert [site.group for site in by_junction["hill"]] == ["2 m"] * 16 + ["5 m"] * 16
+    assert command.main(["fit", "--data", str(tmp_path), "--write", str(tmp_path / "models.json")]) == 0
+    content = json.loads((tmp_path / "models.json").read_text(encoding="utf-8"))
+    assert list(content["about"]["learnt_on"]) == ["hill", "xian"]
+    model = DetectabilityModel.of(content["detectors"]["cluster"])
+    few, many = np.full((2, len(FEATURES)), 0.5)
+    few[FEATURES.index("log_points")], many[FEATURES.index("log_points")] = 0.5, 4.0
+    few_chance, many_chance = model.chances(np.array([few, many])).tolist()
+    assert (few_chance, many_chance) == pytest.approx((0.5 / 6, 4.0 / 6), abs=0.2)
+    damaged = records.read_table(folder / "hill.cluster.hits.parquet").slice(1)
+    write_table(folder / "hill.cluster.hits.parquet", damaged.to_pydict())
+    with pytest.raises(InputError, match=r"hill\.features\.parquet: its rows are not those"):
+        training.read_training(folder, read_protocol(), "cluster")
+    (folder / "hill.cluster.json").unlink()
+    with pytest.raises(InputError, match="expected 2 training junctions with cluster, got xian"):
+        training.read_training(folder, read_protocol(), "cluster")
 
 
 def test_undefined_values_survive_a_file(tmp_path: Path) -> None:

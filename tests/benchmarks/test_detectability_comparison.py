@@ -1,17 +1,18 @@
-"""Fitting and comparing additive models: known models, by hand, the file, the figure, arguments."""
+"""Fitting and comparing additive models: known models, by hand, the table, the figure, arguments."""
 
 from __future__ import annotations
 
 import math
-import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 from benchmarks.detectability import additive_fitting, comparison, figures, fitting
 from benchmarks.detectability.additive_fitting import TrainingRows, choose_knots, fit_additive, ramps
-from benchmarks.detectability.additive_model import DIRECTIONS, AdditiveModel, TargetFeatures
+from benchmarks.detectability.additive_model import DIRECTIONS, TargetFeatures
 from benchmarks.detectability.comparison import SiteRows
+
+from egvs.core.errors import EgvsError
 
 
 def rows(seed: int, truth, count: int = 4000) -> TrainingRows:
@@ -73,16 +74,10 @@ def test_minimum_has_no_slope():
                 assert loss(model.intercept, moved) > best
 
 
-def test_the_file_is_read_as_it_was_fitted():
-    model = fit_additive([rows(1, known_probability)], ["log_points", "hidden_share", "range_m"])
-    text = additive_fitting.model_toml(
-        {"cluster": model}, {"junctions": ["one", "two"], "frames": 60, "model": "points"}
-    )
-    parsed = tomllib.loads(text)
-    assert parsed["about"] == {"junctions": ["one", "two"], "frames": 60, "model": "points"}
-    again = AdditiveModel.from_table(parsed["detectors"]["cluster"])
-    x = rows(5, known_probability).features
-    np.testing.assert_allclose(again.chances(x), model.chances(x), atol=1e-4)
+def test_a_fit_that_does_not_converge_is_an_error(monkeypatch):
+    monkeypatch.setattr(additive_fitting, "MAX_ITERATIONS", 1)
+    with pytest.raises(EgvsError, match="the additive model of log_points, hidden_share was not fitted: L-BFGS-B: "):
+        fit_additive([rows(1, known_probability)], ["log_points", "hidden_share"])
 
 
 # ---- the comparison
@@ -134,9 +129,28 @@ def test_each_junction_is_predicted_by_the_others(monkeypatch):
     assert np.array_equal(fitted[-1][0].hits, first.hits) and (first.features.columns["log_points"] > 0.0).all()
     assert results["shadow"]["one"].rho > 0.85
     assert results["shadow"]["one"].loss < results["points"]["one"].loss
-    lines = list(comparison.table(results))
+    lines = list(comparison.table(results))  # the shipped score was trained at neither
     assert len(lines) == 2 + 4 and all(line.count("|") == lines[0].count("|") for line in lines)
     assert "| 0.000 ± 0.000 |" in lines[2]  # points_on_target minus itself
+
+
+def test_table_marks_where_the_shipped_score_is_in_sample():
+    """Trained at one of three junctions: 0.9 there is marked, and the means are of 0.5 and 0.7."""
+    rhos = dict(zip(("seen", "one", "two"), (0.9, 0.5, 0.7), strict=True))
+    by_junction = {name: comparison.ModelResult(rho, rho, 1.0 - rho) for name, rho in rhos.items()}
+    results = {name: by_junction for name in (comparison.COUNT_SCORE, comparison.SHIPPED_SCORE)}
+    lines = list(comparison.table(results, {"seen", "elsewhere"}))
+    assert lines[2].startswith("| points_on_target | 0.900 | 0.500 | 0.700 | 0.700 ± 0.115 |")
+    shipped = "| expected_detections (shipped) | 0.900 (in-sample) | 0.500 | 0.700 | 0.600 ± 0.100 | 0.000 ± 0.000 "
+    assert lines[3] == f"{shipped}| 0.600 ± 0.100 | 0.400 ± 0.100 |"
+    assert lines[4:] == ["", "In-sample: the shipped score was trained at seen; its means leave them out."]
+    assert list(comparison.table(results, ())) == [line.replace(" (in-sample)", "") for line in lines[:3]] + [
+        lines[2].replace("points_on_target", "expected_detections (shipped)")
+    ]
+
+
+def test_shipped_training_junctions_are_those_of_the_file():
+    assert comparison.shipped_training_junctions() == {"ingolstadt", "hill", "roundabout", "osm_training"}
 
 
 def test_trees_keep_the_directions_and_weight_junctions_equally(monkeypatch):

@@ -33,7 +33,7 @@ def test_shows_best_junction_warnings_and_attribution() -> None:
     results = (make_result("a", 1, 90.0, "Main Street"), make_result("b", 2, 30.0))
     html = page.render_page(make_city(*results), results, [Diagnostic("rule", "where", "problem", "hint")])
     assert "Of 2 junctions, a first sensor has the largest gain at a, Main Street" in html
-    assert "33.3%" in html
+    assert "33.3\u00a0%" in html
     assert "<b>where</b>: problem. <small>hint</small>" in html
     assert "© the mappers" in html
     assert html.count('class="plan"') == 2  # by gain, and by the share that is seen
@@ -53,7 +53,7 @@ def test_shows_curve_with_errors_and_phases() -> None:
     assert 'class="curve-band"' in html and 'class="curve-installed"' in html
     assert "2 sensors: 60 ± 4, at most 62" in html
     assert html.count('class="curve-phase"') == 2
-    assert ">3.33 %<" in html  # 29 instead of 30
+    assert ">3.33\u00a0%<" in html  # 29 instead of 30
 
 
 def test_curve_without_errors_says_why() -> None:

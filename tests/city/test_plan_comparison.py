@@ -77,8 +77,8 @@ def test_values_are_joint_scores_in_the_traffic_of_each_run(city: City, tmp_path
 
     code, printed, _ = run_egvs("city", "compare", *folders)
     assert code == 0
-    assert "usual, heavy: 0% of the sensors, 0% of the poles and 0% of the junctions in common" in printed
-    assert f"({comparison.relative_values[1, 0]:.1%})" in printed
+    assert "usual, heavy: 0 % of the sensors, 0 % of the poles and 0 % of the junctions in common" in printed
+    assert f"({100 * (comparison.relative_values[1, 0]):.1f} %)" in printed
 
     with pytest.raises(InputError, match="expected two or more different folders"):
         compare_plans([folders[0], folders[0]])

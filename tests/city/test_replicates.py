@@ -20,8 +20,11 @@ from egvs.placement import problem_builder
 from egvs.placement.plan import REQUIRED_STAGES
 from egvs.placement.problem_builder import PlacementProblem
 from egvs.runs import run
+from egvs.scoring.target_scores import DETECTORS, detection_chances
 from egvs.stages.base import StageContext
 from egvs.stages.inputs import open_folder
+from egvs.stages.site_scans import empty_scans
+from egvs.stages.site_scoring import TargetScorer
 from tests.conftest import write_mini
 
 
@@ -71,6 +74,18 @@ def vehicles_found_by_plan(
     return np.array(found)
 
 
+def vehicles_found_by_each_detector(context: StageContext, sites: list[str], mean: float) -> list[float]:
+    """Return how many of the vehicles some sites together find on average, by each detector."""
+    targets = TargetScorer(context, context.scenario.roi.grid)
+    found = []
+    for detector in DETECTORS:
+        missed = np.ones(len(targets.record))
+        for scan in empty_scans(context, sites):
+            missed *= 1.0 - detection_chances(targets.visible(scan.beams), (detector,))
+        found.append(mean * float(np.mean(1.0 - missed)))
+    return found
+
+
 def slow_egvs(context: StageContext, problem: PlacementProblem, sites: list[str]) -> FloatArray:
     """Return the joint EGVS with all frames, and without each block, voxel by voxel."""
     view: Any = problem.views[-1]
@@ -111,14 +126,18 @@ def test_replicates_equal_scores_without_each_block(tmp_path: Path, score: str) 
     mean = float(run.RunRecord.read(context.folder.path).stages["tpog"].summary["boxes_in_roi"])
     sites = problem.names[:2]
     actual = JointReplicates(context, problem, blocks, mean).of_order(sites)
-    assert actual.shape == (3, 1 + period.blocks)
+    n_detectors = 2 if score == "expected_detections" else 0
+    assert actual.shape == (3, 1 + period.blocks + n_detectors)
     assert not actual[0].any()
     for n in (1, 2):
         if score == "egvs":
             expected = slow_egvs(context, problem, sites[:n])
         else:
             expected = vehicles_found_by_plan(context, problem, sites[:n], mean)
-        assert actual[n] == pytest.approx(expected, rel=1e-9)
+        assert actual[n, : 1 + period.blocks] == pytest.approx(expected, rel=1e-9)
+        if n_detectors:
+            expected = vehicles_found_by_each_detector(context, sites[:n], mean)[::-1]  # without one, by the other
+            assert actual[n, 1 + period.blocks :] == pytest.approx(expected, rel=1e-9)
     assert len(set(actual[2].tolist())) > 2
 
 
@@ -135,5 +154,12 @@ def test_blocks_are_common_or_the_reason_is_named(tmp_path: Path) -> None:
     times = [read_periods(job.out / "tpog.parquet")[0].memory_frames for job in jobs[:2]]
     assert common.periods[0].memory_frames == max(times)
     assert common_blocks(jobs) == "junctions a and c have different frames or blocks"
+    assert common.detectors == ()
+    ranked = ("tpog.blocks=10", "score.rank_by='expected_detections'")
+    by_all = [Job(job.junction, job.folder, job.out, ranked) for job in jobs[:2]]
+    both = common_blocks(by_all)
+    assert isinstance(both, CityBlocks) and both.detectors == DETECTORS
+    by_one = Job("b", jobs[1].folder, jobs[1].out, (*ranked, "score.detector='cluster'"))
+    assert common_blocks([by_all[0], by_one]) == "junctions a and b have different detectors"
     without = Job("b", jobs[1].folder, jobs[1].out, ("score.standard_error=false",))
     assert common_blocks([jobs[0], without]) == "score.standard_error is false at junction b"

@@ -36,10 +36,10 @@ def study_of(*rows: SettingResult, tolerance: Tolerance, **more: object) -> Accu
 
 def test_names_the_cheapest_setting_its_quality_and_the_reason() -> None:
     assert recommendation_sentences(study_of(OWN, SHORT, tolerance=Tolerance(1.0))) == [
-        "With all traffic of this study (6 seeds), c02 is the best pole with a probability of 98%; c10 there "
-        "should find 80.1% of the vehicles.",
+        "With all traffic of this study (6 seeds), c02 is the best pole with a probability of 98 %; c10 there "
+        "should find 80.1 % of the vehicles.",
         "Recommended: 500 frames, 2.0 processor seconds instead of 8.0. The pole that it chooses is the best one with "
-        "a probability of 80%, and is expected to lose 0.80 ± 0.20 percentage points of the vehicles found.",
+        "a probability of 80 %, and is expected to lose 0.80 ± 0.20 percentage points of the vehicles found.",
         "2 of 2 settings have an expected loss within the tolerance of 1 percentage point; this is the cheapest.",
     ]
 
@@ -73,7 +73,7 @@ def test_says_that_a_score_prefers_other_sites_however_long_the_traffic() -> Non
 def test_tolerance_of_the_score_counts_its_error() -> None:
     text = recommendation_sentences(study_of(OWN, SHORT, tolerance=Tolerance(1.0, 0.05)))
     assert text[1].startswith("Recommended: the scenario's own setting")
-    assert text[2].startswith("1 of 2 settings have an error of the score within the tolerance of 5.00% of the score")
+    assert text[2].startswith("1 of 2 settings have an error of the score within the tolerance of 5.00 % of the score")
 
 
 def test_says_where_a_model_prices_the_setting() -> None:

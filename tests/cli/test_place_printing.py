@@ -18,11 +18,11 @@ from egvs.placement.fused_score import FusedPlan
 from egvs.scenario.score_config import PlacementConfig
 
 LAST_LINES = """\
-The plan a, b should find 99.2 ± 0.3% of vehicles, 99.8% of what all 12 candidates reach together; \
+The plan a, b should find 99.2 ± 0.3 % of vehicles, 99.8 % of what all 12 candidates reach together; \
 proved: no plan within the rules is better.
-A second sensor adds 4.7 ± 0.5 percentage points to the share of vehicles found: 99.2%, against 94.5% with one. \
+A second sensor adds 4.7 ± 0.5 percentage points to the share of vehicles found: 99.2 %, against 94.5 % with one. \
 Try --count 3 to see what a third adds.
-Joint shares assume that sensors miss vehicles independently of each other; near 100% they are upper ends \
+Joint shares assume that sensors miss vehicles independently of each other; near 100 % they are upper ends \
 (docs/placement.md).
 """
 
@@ -67,7 +67,7 @@ def test_shares_are_per_cent_with_errors_in_percentage_points(capsys: pytest.Cap
     text = printed(placed_two(), capsys)
     assert text.endswith(LAST_LINES)
     assert "adds, % points  found together  lost if it fails, % points" in text
-    assert " 4.7 ± 0.5     99.2 ± 0.3%                         4.0" in text
+    assert " 4.7 ± 0.5    99.2 ± 0.3 %                         4.0" in text
     assert "± is one standard error, from 10 blocks of 100 frames" in text
 
 
@@ -82,7 +82,7 @@ def test_tables_fit_the_terminal_and_cut_no_value(width: int, monkeypatch: pytes
     lines = out.export_text().splitlines()
     assert max(len(line.rstrip()) for line in lines) <= width
     text = " ".join(" ".join(lines).split())
-    for value in ("99.2 ± 0.3%", "4.7 ± 0.5", "99.8%", "VLP-32C", "lost if"):
+    for value in ("99.2 ± 0.3 %", "4.7 ± 0.5", "99.8 %", "VLP-32C", "lost if"):
         assert value in text
     assert "…" not in text
     assert sum(line.rstrip().endswith("south@4.5m-12deg, north@4.5m-12deg") for line in lines) == (width == 160)
@@ -94,8 +94,8 @@ def test_values_in_fused_clouds_follow_the_assumption(capsys: pytest.CaptureFixt
         PlanStep(2, 0.9713, 0.0258, True, 0.004, 0.006, 0.999),
     )
     first = (
-        "Found in fused point clouds: 94.5 ± 0.9% with the first sensor, 97.1 ± 0.4% with 2 (the last one adds 2.6 ± "
-        "0.6 percentage points)"
+        "Found in fused point clouds: 94.5 ± 0.9 % with the first sensor, 97.1 ± 0.4 % with 2 (the last one adds 2.6 "
+        "± 0.6 percentage points)"
     )
     assert printed(placed_two(fused=FusedPlan(steps)), capsys).endswith(f"{LAST_LINES}{first}.\n")
     text = printed(placed_two(fused=FusedPlan(steps, searched=True)), capsys)
@@ -108,8 +108,8 @@ def test_values_in_fused_clouds_follow_the_assumption(capsys: pytest.CaptureFixt
 def test_bits_have_thousands_separators(capsys: pytest.CaptureFixture[str]) -> None:
     text = printed(placed_two("egvs", 100_000.0), capsys)
     assert "EGVS together, bit" in text
-    assert "The plan a, b scores 99,220 ± 300 bit, 99.8% of what all 12 candidates reach together;" in text
-    assert "A second sensor adds 4,670 ± 500 bit (4.7% of the plan's score) to EGVS: 99,220 bit" in text
+    assert "The plan a, b scores 99,220 ± 300 bit, 99.8 % of what all 12 candidates reach together;" in text
+    assert "A second sensor adds 4,670 ± 500 bit (4.7 % of the plan's score) to EGVS: 99,220 bit" in text
 
 
 def test_reason_is_printed_where_errors_are_unknown(capsys: pytest.CaptureFixture[str]) -> None:

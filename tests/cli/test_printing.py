@@ -37,7 +37,7 @@ def test_a_bar_takes_no_name_for_markup() -> None:
 
 
 @pytest.mark.parametrize(
-    ("beats_next", "text"), [(0.896, "~ 89%"), (0.9, "90%"), (0.612, "~ 61%"), (0.9996, "over 99%")]
+    ("beats_next", "text"), [(0.896, "~ 89 %"), (0.9, "90 %"), (0.612, "~ 61 %"), (0.9996, "over 99 %")]
 )
 def test_unclear_lead_is_not_rounded_up_to_the_limit(beats_next: float, text: str) -> None:
     site = RankedSite("a", 0.0, 0.0, 3.0, 10.0, 1, "a", 0.0, 0.0, 0.0, "s", 1e4, 1, 1, 0.5)

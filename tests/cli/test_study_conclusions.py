@@ -26,8 +26,8 @@ PLAIN = change("none", 0.5, 0.6, 0.8)
         ([change("rain", 0.4, 0.5, 0.6)], "Conclusion: c03 stays first under the effect."),
         (
             [change("rain", 0.4, 0.5, 0.6), change("fog", 0.3, 0.5, 0.4), change("all", 0.4, 0.2, 0.3)],
-            "Conclusion: c03 is first without effects, but c02 under fog (choosing c03 loses 20.00%) and c01 under all "
-            "effects together (choosing c03 loses 25.00%).",
+            "Conclusion: c03 is first without effects, but c02 under fog (choosing c03 loses 20.00 %) and c01 under "
+            "all effects together (choosing c03 loses 25.00 %).",
         ),
     ],
 )

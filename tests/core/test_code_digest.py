@@ -176,13 +176,13 @@ SOURCE_BEFORE = {
 """Code lines behind the key of each stage before the layout with one module per subject."""
 
 GROWTH = {
-    "check": 1.58,
-    "statics": 1.47,
-    "scan": 1.46,
-    "traffic": 1.85,
-    "tpog": 1.45,
+    "check": 1.59,
+    "statics": 1.48,
+    "scan": 1.47,
+    "traffic": 1.86,
+    "tpog": 1.46,
     "score": 1.46,
-    "report": 1.75,
+    "report": 1.77,
 }
 """Allowed growth, 1.1 for the others: a stage runs again whenever a line behind its key changes."""
 

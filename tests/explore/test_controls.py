@@ -12,7 +12,7 @@ def test_describes_score_and_change() -> None:
     candidate = PoseScore(site, {"egvs": 200.0, "entropy_seen": 0.5}, 2)
     moved = PoseScore(Site("a_b", Pose(0, 0, 4), "small"), {"egvs": 250.0, "entropy_seen": 0.6}, 1)
     text = controls.describe_score(moved, "egvs", candidate, 7)
-    assert text.startswith("## 250.0 bit (+25.0%)\n\nrank 1 of 7 by EGVS\n")
-    assert "| entropy seen | 60.0% |" in text
+    assert text.startswith("## 250.0 bit (+25.0 %)\n\nrank 1 of 7 by EGVS\n")
+    assert "| entropy seen | 60.0 % |" in text
     assert "a\\_b" in controls.ranking_table([candidate], "egvs")
     assert controls.describe_score(candidate, "egvs", candidate, 7).startswith("## 200.0 bit\n")

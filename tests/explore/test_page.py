@@ -177,7 +177,7 @@ def test_layers_draw_their_data(page: Page, session: Session, layer: str) -> Non
         last_s = (playback.frames - 1) * playback.period_s
         assert f"{7 * playback.period_s:,.1f} s of {last_s:,.1f} s" in page.controls.legend.content
     if layer == "blindspots":
-        assert f"{session.blindspots(site).overall.share:.1%} found" in page.controls.legend.content
+        assert f"{100 * session.blindspots(site).overall.share:.1f} % found" in page.controls.legend.content
 
 
 @pytest.mark.slow

@@ -65,7 +65,7 @@ def test_points_are_those_of_the_current_pose(session: Session) -> None:
         assert len(scene.points) == points.on_surface.sum() > 100
         expected = drawing.colour_scale(points.classes[points.on_surface], 0.0, len(CLASS_LABELS) - 1)
         assert (scene.colours == expected).all()
-        assert f"{points.share_with(20):.1%} of the surface with 20 points or more" in legend
+        assert f"{100 * points.share_with(20):.1f} % of the surface with 20 points or more" in legend
 
 
 def test_overlap_is_that_of_the_plan(session: Session) -> None:

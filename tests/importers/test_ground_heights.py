@@ -78,7 +78,7 @@ def test_tiles_complete_each_other(tmp_path: Path) -> None:
 def test_share_without_heights_is_reported(tmp_path: Path) -> None:
     path = write_tiff(tmp_path / "a.tif", plane_cells())
     terrain = rasters.read_terrain([path], MapContext(FRAME, box(0, 0, 240, 80)))
-    assert terrain.notes[-1] == "The terrain has no height in 50.0% of the region."
+    assert terrain.notes[-1] == "The terrain has no height in 50.0 % of the region."
     assert np.isnan(terrain.height_m(np.array([[121.0, 10.0], [10.0, 81.0]]))).all()
 
 

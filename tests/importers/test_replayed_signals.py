@@ -126,7 +126,7 @@ def test_signals_are_guessed_from_vehicles(tmp_path: Path, run_egvs) -> None:
     options = ["--like", tracks, "--track-crs", "world", "--signals", states]
     code, out, err = run_egvs("new", tmp_path / "new", "--from", tmp_path / "map.net.xml", *options)
     assert (code, err) == (0, "")
-    assert "note: Guessed from recorded road users: 1 governs in to out (100% of 25 vehicles pass in its green" in out
+    assert "note: Guessed from recorded road users: 1 governs in to out (100 % of 25 vehicles pass in its green" in out
     text = (tmp_path / "new" / "scenario.toml").read_text(encoding="utf-8")
     assert "which recorded light governs which road" in text
 
@@ -215,8 +215,8 @@ def test_chongqing(tmp_path: Path) -> None:
     )
     scenario = create_scenario(tmp_path / "new", SIND / "chongqing_lanelet2.osm", options=options)
     (first, second) = [note for note in scenario.signal_notes if note.startswith("Guessed")]
-    assert "vehicle traffic light 1 governs road_-100001, road_-100010 (62% of the time that 26 people" in first
-    assert "vehicle traffic light 2 governs road_-100004, road_-100007 (62%" in second
+    assert "vehicle traffic light 1 governs road_-100001, road_-100010 (62 % of the time that 26 people" in first
+    assert "vehicle traffic light 2 governs road_-100004, road_-100007 (62 %" in second
     clock = read_net_xml(tmp_path / "new" / "network.net.xml").signal_clock
     assert clock is not None
     assert clock.problem(300.0, 41.241, 1160.961) == ""

@@ -30,8 +30,6 @@ from tests.importers import network_copies as copies
 from tests.importers.network_copies import NetworkText
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
-SEEDS = range(1, 9)
-FRAMES = 1000
 STAGES = ("statics", "scan", "traffic", "tpog", "score")
 SCORES = ("expected_detections", "egvs")
 COLUMN_VOXELS = 4
@@ -44,7 +42,6 @@ MAX_RELATIVE_SE = 0.04
 RESCUES = {"roundabout": {"junction_blocker_s": JUNCTION_BLOCKER_S, "teleport_s": TELEPORT_S}}
 """More keys of the traffic, by scenario."""
 
-QUICK_SEEDS, QUICK_FRAMES = range(1, 4), 150
 QUICK_DIFFERENCE = 0.15
 """How much a score may differ, relative to the original, on average over the sites and a few short simulations."""
 
@@ -69,25 +66,39 @@ class Runs:
     occupancy: Floats
 
 
+@dataclass(frozen=True)
+class Simulations:
+    """The simulations of each network; ``warmup_s`` None for that of the scenario."""
+
+    seeds: range = range(1, 9)
+    frames: int = 1000
+    warmup_s: float | None = None
+
+
+FULL = Simulations()
+QUICK = Simulations(range(1, 4), frames=150, warmup_s=100)
+
+
 def run_network(
-    name: str, original: NetworkText, network: NetworkText, folder: Path, seeds: range = SEEDS, frames: int = FRAMES
+    name: str, original: NetworkText, network: NetworkText, folder: Path, simulations: Simulations = FULL
 ) -> Runs:
     """Run a shipped scenario on a network for some seeds; the trips are drawn on the original network."""
     values = tomllib.loads((SCENARIOS / name / "scenario.toml").read_text(encoding="utf-8"))
     settings = loading.load(SCENARIOS / name).traffic
+    warmup_s = settings.warmup_s if simulations.warmup_s is None else simulations.warmup_s
     folder.mkdir()
     (folder / "network.net.xml").write_text(network.text, encoding="utf-8")
     types = demand.vtypes_xml(settings.kinds).replace("additional", "routes")
     (folder / "types.rou.xml").write_text(types, encoding="utf-8")
     edges = copies.match_edges(copies.match_lanes(original, network))
-    count = int((settings.warmup_s + frames) * settings.trips_per_s)
+    count = int((warmup_s + simulations.frames) * settings.trips_per_s)
     departs_s = np.arange(count) / settings.trips_per_s
     for key in ("edge_weights", "kinds", "trips_per_s"):
         values["traffic"].pop(key, None)
 
     scores: dict[str, list[Floats]] = {score: [] for score in SCORES}
     occupancy = []
-    for seed in seeds:
+    for seed in simulations.seeds:
         rng = np.random.default_rng(seed)
         pairs = [
             demand.origin_destination_pairs(original.network, kind, settings, rng, name) for kind in settings.kinds
@@ -100,8 +111,9 @@ def run_network(
         values["traffic"] |= {
             "network": str(folder / "network.net.xml"),
             "routes": [str(folder / "types.rou.xml"), str(routes)],
-            "frames": frames,
+            "frames": simulations.frames,
             "frame_period_s": 1.0,
+            "warmup_s": warmup_s,
             "max_depart_delay_s": 120,
             **RESCUES.get(name, {}),
         }
@@ -168,7 +180,7 @@ class Comparison:
 
 def score_limit(sites: int) -> float:
     """Return how many standard errors the difference of any of some sites may be: Student's t, by Bonferroni."""
-    return float(stats.t.ppf(1 - (1 - CONFIDENCE) / (2 * sites), len(SEEDS) - 1))
+    return float(stats.t.ppf(1 - (1 - CONFIDENCE) / (2 * sites), len(FULL.seeds) - 1))
 
 
 def compare(original: Runs, copy: Runs) -> Comparison:
@@ -187,7 +199,7 @@ def compare(original: Runs, copy: Runs) -> Comparison:
             discordant[score] += int(is_swapped and abs(change) > score_limit(a.shape[1]) * change_se)
     distances = [
         _distance(*_swap(original.occupancy, copy.occupancy, swapped))
-        for swapped in product((False, True), repeat=len(SEEDS) - 1)
+        for swapped in product((False, True), repeat=len(FULL.seeds) - 1)
     ]
     p = float(np.mean(np.array(distances) >= distances[0] - 1e-12))
     return Comparison(difference, se, means, discordant, tau, distances[0], p)
@@ -254,12 +266,12 @@ def test_scores_are_close_after_a_round_trip(tmp_path: Path) -> None:
     """A few short simulations: enough for a road, a signal or a turn that is lost, not for details of the traffic."""
     name = "nishishinjuku"
     original = read_original(name)
-    before = run_network(name, original, original, tmp_path / "before", QUICK_SEEDS, QUICK_FRAMES)
+    before = run_network(name, original, original, tmp_path / "before", QUICK)
     for kind in ("lanelet2", "opendrive"):
         folder = tmp_path / kind
         folder.mkdir()
         copy = make_copy(kind, original, folder)
-        after = run_network(name, original, copy, folder / "runs", QUICK_SEEDS, QUICK_FRAMES)
+        after = run_network(name, original, copy, folder / "runs", QUICK)
         for score in SCORES:
             difference = after.scores[score].mean(axis=0) / before.scores[score].mean(axis=0) - 1
             assert abs(difference.mean()) < QUICK_DIFFERENCE, (kind, score, difference)

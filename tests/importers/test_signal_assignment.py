@@ -47,7 +47,7 @@ def test_vehicles_drive_in_the_green_of_their_light() -> None:
     assert [(guess.from_edge, guess.to_edge, guess.light) for guess in guesses] == [
         ("from_west", "x", "a"), ("from_west", "", "a"), ("from_east", "", "a"),
     ]  # fmt: skip
-    assert guesses[0].reason == "83% of 6 vehicles pass in its green or yellow; next light 0%"
+    assert guesses[0].reason == "83 % of 6 vehicles pass in its green or yellow; next light 0 %"
     assert green_share({("from_west", "x"): "a"}, LIGHTS, motion) == (5, 6)
     assert green_share({("from_west", "other"): "a"}, LIGHTS, motion) == (0, 0)
 
@@ -95,7 +95,7 @@ def test_people_cross_in_the_green_of_others() -> None:
     assert {guess.from_edge: guess.light for guess in guesses} == {
         "from_west": "a", "from_east": "a", "from_south": "b", "from_north": "b",
     }  # fmt: skip
-    assert guesses[0].reason.startswith("75% of the time that 12 people walked on lanes")
+    assert guesses[0].reason.startswith("75 % of the time that 12 people walked on lanes")
 
 
 @pytest.mark.parametrize("others", [2, 8])

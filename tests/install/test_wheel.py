@@ -62,13 +62,14 @@ class Installed:
             "LANG": "C.UTF-8",
             "TMPDIR": str(folder),
         }
-        subprocess.run([sys.executable, "-m", "venv", folder / "environment"], check=True)
+        subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder / "environment"], check=True)
         self.install(str(wheel))
 
     def install(self, requirement: str) -> None:
         """Install a wheel, with the versions of the constraints file."""
-        pip = [self.bin / "python", "-m", "pip", "install", "--quiet", "--no-compile", "--disable-pip-version-check"]
-        subprocess.run([*pip, "--constraint", ROOT / "constraints.txt", requirement], check=True)
+        pip = [sys.executable, "-m", "pip", "--python", self.bin / "python", "install", "--quiet", "--no-compile"]
+        options = ["--disable-pip-version-check", "--constraint", ROOT / "constraints.txt"]
+        subprocess.run([*pip, *options, requirement], check=True)
 
     def egvs(self, *arguments: object, code: int = 0) -> CompletedProcess[str]:
         """Run a command, which must end with an exit code."""
@@ -133,7 +134,7 @@ def test_commands_work_or_name_their_extra(installed: Installed, wheel: Path) ->
         assert f"pip install 'egvs[{extra}]'" in message, message
 
     installed.install(f"{wheel}[explore,gis,place]")
-    installed.egvs("place", "runs/myplace", "--count", "2", "--refine")
+    installed.egvs("place", "runs/myplace", "--count", "2", "--refine", "--set", "placement.refine.evaluations=20")
     installed.egvs("export", "runs/myplace", "--to", "gpkg")
     page = installed.start("explore", "runs/myplace", "--no-browser")
     try:

@@ -261,6 +261,8 @@ def test_command_prints_reason_and_writes_files(installed: InstalledRun, run_egv
     page = (tmp_path / "out" / "acceptance_pole_a.html").read_text()
     assert "Not accepted" in page
     assert page.count("data:image/png") == 6
+    yaw_error = report["pose_error"]["yaw_deg"]["error"]
+    assert f"<dt>Yaw error</dt><dd>{yaw_error:+z.2f} degrees</dd>" in page  # never -0.00
     code, printed, _ = run_egvs(*words, "--tilt", "2")
     assert (code, "passed" in printed) == (0, True)
 

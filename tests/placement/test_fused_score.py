@@ -15,8 +15,8 @@ import egvs
 from egvs.placement import fused_score
 from egvs.placement.fused_score import FusedScore, improve_by_fused_swaps
 from egvs.placement.problem import Plan, PlanRules, Problem
-from egvs.scoring.fused_targets import fused_scores
-from egvs.scoring.target_scores import detection_chances
+from egvs.scoring.fused_targets import fuse_targets
+from egvs.scoring.target_scores import expected_detections
 from egvs.scoring.targets import TargetRecord, visible_targets
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
@@ -124,7 +124,7 @@ def test_values_are_those_of_scans_made_by_hand(placed: SimpleNamespace) -> None
     placement, fused = placed.placement, placed.placement.fused
     names = [sensor.site for sensor in placement.sensors]
     views = [placed.views[name] for name in names]
-    values = [fused_scores(views[:count], detection_chances).mean() for count in (1, 2)]
+    values = [expected_detections(fuse_targets(views[:count])) for count in (1, 2)]
     assert [step.score for step in fused.steps] == pytest.approx(values, rel=1e-12)
     assert fused.steps[1].gain == pytest.approx(values[1] - values[0], rel=1e-9)
     assert fused.steps[0].score == pytest.approx(placement.sensors[0].score, rel=1e-9)  # one sensor is not fused
@@ -138,7 +138,7 @@ def test_no_pair_of_candidates_finds_more(placed: SimpleNamespace) -> None:
     fused = placed.placement.fused
     assert fused.searched
     pairs = {
-        pair: fused_scores([placed.views[name] for name in pair], detection_chances).mean()
+        pair: expected_detections(fuse_targets([placed.views[name] for name in pair]))
         for pair in itertools.combinations(sorted(placed.views), 2)
     }
     names = fused.better_sites or tuple(sensor.site for sensor in placed.placement.sensors)
@@ -168,5 +168,5 @@ def test_refined_sensors_are_scanned_where_they_are(placed: SimpleNamespace) -> 
         views.append(visible_targets(record, Beams.of(Scanner(scene).scan(pose, scene.sensor(sensor.sensor)))))
     fused = refined.fused
     assert fused is not None and not fused.searched and fused.better is None
-    values = [fused_scores(views[:count], detection_chances).mean() for count in (1, 2)]
+    values = [expected_detections(fuse_targets(views[:count])) for count in (1, 2)]
     assert [step.score for step in fused.steps] == pytest.approx(values, rel=1e-12)

@@ -195,7 +195,7 @@ def test_keeps_rules_and_zones(five_candidates: Path, out: Path, run_egvs) -> No
     (zone,) = plan["zones"]
     assert zone["seen"] >= zone["share"] == 0.5
     assert "zone crossing:" in text
-    assert "by 2 sensors, 50.0% required" in text
+    assert "by 2 sensors, 50.0 % required" in text
 
 
 @pytest.mark.slow

@@ -29,7 +29,7 @@ from egvs.placement.sensor_design import (
     second_half_groups,
     start_elevations,
 )
-from egvs.scoring.target_scores import TARGET_SCORES
+from egvs.scoring.target_scores import DETECTORS, TARGET_SCORES, detection_chances
 from egvs.scoring.targets import weighted_mean
 from egvs.sensors.sensor import CATALOGUE, Sensor, resolve_sensor
 from egvs.stages.inputs import open_folder
@@ -120,7 +120,7 @@ def test_designs_are_not_worse_than_their_start(designed: tuple[Path, DesignResu
     scoring = SiteScoring(context)
     assert scoring.targets is not None
     visible = scoring.targets.visible(egvs_beams(scan))
-    values = TARGET_SCORES["expected_detections"](visible)
+    values = TARGET_SCORES["expected_detections"](visible, DETECTORS)
     record = scoring.targets.record
     is_first = record.numbers[record.frame] < 20
     assert result.catalogue[0].search_score >= weighted_mean(values[is_first])
@@ -142,7 +142,7 @@ def test_scores_are_those_of_the_other_frames(designed: tuple[Path, DesignResult
     assert result.frames == (20, 20)
     for one in (*result.catalogue, result.designed):
         scan = egvs.Scanner(context.scene).scan(one.pose, one.sensor)
-        values = TARGET_SCORES["expected_detections"](scoring.targets.visible(egvs_beams(scan)))
+        values = TARGET_SCORES["expected_detections"](scoring.targets.visible(egvs_beams(scan)), DETECTORS)
         is_first = record.numbers[record.frame] < 20
         assert one.search_score == pytest.approx(weighted_mean(values[is_first]))
         assert one.score == pytest.approx(weighted_mean(values[~is_first]))
@@ -242,14 +242,18 @@ def test_scores_of_several_seeds_are_those_of_each_simulation(tmp_path: Path) ->
     assert scoring.targets is not None
     (chosen,) = result.catalogue
     scan = egvs.Scanner(context.scene).scan(chosen.pose, chosen.sensor)
-    values = TARGET_SCORES["expected_detections"](scoring.targets.visible(egvs_beams(scan)))
+    values = TARGET_SCORES["expected_detections"](scoring.targets.visible(egvs_beams(scan)), DETECTORS)
     frame = scoring.targets.record.numbers[scoring.targets.record.frame]
     simulation, number = np.divmod(frame, 20)
     assert chosen.search_score == pytest.approx(values[number < 10].mean())
     assert chosen.score == pytest.approx(values[number >= 10].mean())
     left_out = np.array([values[(number >= 10) & (simulation != one)].mean() for one in range(4)])
     pseudo = 4 * chosen.score - 3 * left_out
-    assert chosen.se == pytest.approx(math.sqrt(((pseudo - pseudo.mean()) ** 2).sum() / (4 * 3)))
+    of_traffic = ((pseudo - pseudo.mean()) ** 2).sum() / (4 * 3)
+    visible = scoring.targets.visible(egvs_beams(scan))
+    cluster, pointpillars = (detection_chances(visible, (name,))[number >= 10].mean() for name in DETECTORS)
+    assert chosen.score == pytest.approx((cluster + pointpillars) / 2)
+    assert chosen.se == pytest.approx(math.sqrt(of_traffic + ((cluster - pointpillars) / 2) ** 2))
 
 
 def test_record_without_vehicles_in_one_half_is_rejected(tmp_path: Path) -> None:

@@ -175,6 +175,7 @@ class PageReader(HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data):
+        data = data.replace("\u00a0", " ")
         self.texts.append(data)
         if "tr" in self.open:
             self.rows[-1] += f"{data.strip()}|"

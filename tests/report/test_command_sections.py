@@ -47,7 +47,7 @@ def what_if_values(scenario: Scenario) -> dict[str, Any]:
     return {
         "share": 0.25, "best_before": "a1", "best_present": "b1", "best_expected": "b1",
         "change": {"value": -12.5, "se": 3.25, "better": 0.0}, "rival": "b1", "overtakes": 0.97,
-        "conclusion": "lorry (25% of the time): b1 becomes the best site instead of a1.",
+        "conclusion": "lorry (25 % of the time): b1 becomes the best site instead of a1.",
         "tables": ["lorry"], DIGEST_KEY: what_if_digest(scenario, ["lorry"]),
     }  # fmt: skip
 
@@ -90,8 +90,8 @@ def test_shows_what_if(run: tuple[Scenario, Path]) -> None:
     write(out / "what_if.json", "lorry", what_if_values(scenario))
     text = section(render_report(scenario, out), "what-if")
     assert text is not None
-    assert "lorry 25% a1 b1 b1 -12" in text
-    assert "97% (b1)" in text
+    assert "lorry 25 % a1 b1 b1 -12" in text
+    assert "97 % (b1)" in text
     assert "b1 becomes the best site instead of a1." in text
 
 
@@ -160,8 +160,8 @@ def test_shows_sensor_design(run: tuple[Scenario, Path]) -> None:
     text = section(page, "sensor-design")
     assert text is not None
     assert "searched with 1,200 frames and scored with 1,300 others" in text
-    assert "small 4.00 90.0 -10.0 81.0% 80.2 ± 2.0% +0.0 ± 1.0" in text
-    assert "designed 4.00 90.0 -10.0 85.0% 84.3 ± 2.0% +4.1 ± 1.0" in text
+    assert "small 4.00 90.0 -10.0 81.0 % 80.2 ± 2.0 % +0.0 ± 1.0" in text
+    assert "designed 4.00 90.0 -10.0 85.0 % 84.3 ± 2.0 % +4.1 ± 1.0" in text
     assert '<tr class="top"><th scope="row">designed' in page
     assert "One was left out." in text
     other = scenario.score.model_copy(update={"sampled_frames": scenario.score.sampled_frames + 1})

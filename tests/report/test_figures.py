@@ -57,15 +57,15 @@ def test_lists_the_worst_locations_first_and_none_with_few_vehicles() -> None:
     blindspots = site([ALL, APPROACH, GOOD, FEW, CROSSING, TURN, LEFT])
     assert blindspots.worst == [LEFT, TURN, CROSSING]
     assert figures.describe_worst_locations(blindspots)[0] == (
-        "Mill Lane (west), left-turn lane: 41% found",
-        "± 8%, from 12 vehicles in 120 observations",
+        "Mill Lane (west), left-turn lane: 41 % found",
+        "± 8 %, from 12 vehicles in 120 observations",
     )
-    assert figures.format_missed_share(blindspots) == "12.5%"
-    assert figures.blindspot_note(blindspots) == "Share of vehicles found on each approach: Mill Lane (west) 63%."
+    assert figures.format_missed_share(blindspots) == "12.5 %"
+    assert figures.blindspot_note(blindspots) == "Share of vehicles found on each approach: Mill Lane (west) 63 %."
     assert blindspots.in_words() == (
         "Of all lanes, turns and crossings, p1 finds the smallest shares of vehicles on: "
-        "Mill Lane (west), left-turn lane (41 ± 8% of 12 vehicles); "
-        "Mill Lane (west), left turn in the junction (50 ± 5% of 11 vehicles)"
+        "Mill Lane (west), left-turn lane (41 ± 8 % of 12 vehicles); "
+        "Mill Lane (west), left turn in the junction (50 ± 5 % of 11 vehicles)"
     )
 
 
@@ -109,7 +109,7 @@ def test_page_has_the_blind_spots_of_each_site(tmp_path: Path) -> None:
     for name, blindspots in data["sites"].items():
         (actual,) = readers.read_blindspots(out / "blindspots.parquet", {name})
         assert actual.overall is not None and actual.overall.vehicle_frames == 40 + 33  # the second drives out
-        assert blindspots["vehicles"]["missed"] == f"{1 - actual.overall.share:.1%}"
+        assert blindspots["vehicles"]["missed"] == f"{100 * (1 - actual.overall.share):.1f} %"
         assert blindspots["vehicles"]["numbers"] == [None] * MAX_LOCATIONS
     missed = [blindspots["vehicles"]["missed"] for blindspots in data["sites"].values()]
     assert any(f"{share} of the vehicles are not found from" in text for share in missed)

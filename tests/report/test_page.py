@@ -118,7 +118,7 @@ def test_every_figure_has_a_text_alternative(plain_run):
     assert all(values["role"] == "img" and values["aria-label"] for values in drawn)
     rows = read_scores(plain_run[1] / "scores.parquet").to_pylist()
     best = next(row for row in rows if row["rank"] == 1)
-    assert any(f"{best['entropy_seen']:.1%}" in values["aria-label"] for values in drawn)
+    assert any(f"{100 * best['entropy_seen']:.1f} %" in values["aria-label"] for values in drawn)
 
 
 def test_bytes_do_not_depend_on_path_or_time(plain_run, tmp_path):
@@ -178,7 +178,7 @@ def test_ranking_has_every_site_and_equal_scores_share_a_rank(tmp_path):
     read = PageReader(render_report(scenario, out))
     for row in read_scores(out / "scores.parquet").to_pylist():
         visible_row = next(r for r in read.rows if f"|{row['site']}|" in r)
-        assert f"{row['egvs']:,.0f}|" in visible_row and f"{row['entropy_seen']:.1%}|" in visible_row
+        assert f"{row['egvs']:,.0f}|" in visible_row and f"{100 * row['entropy_seen']:.1f} %|" in visible_row
         twins = row["site"] in ("north", "twin")
         assert visible_row.strip("|").split("|")[0] == f"{row['rank']}{'=' if twins else ''}"
 
@@ -187,7 +187,7 @@ def test_headline_names_the_best_site_and_the_lead(plain_run):
     rows = sorted(read_scores(plain_run[1] / "scores.parquet").to_pylist(), key=lambda row: row["rank"])
     text = PageReader(plain_run[2]).text
     assert f"{rows[0]['site']} is the best of 4 sites" in text
-    assert f"leads the next site, {rows[1]['site']}, by {1 - rows[1]['egvs'] / rows[0]['egvs']:.1%}" in text
+    assert f"leads the next site, {rows[1]['site']}, by {100 * (1 - rows[1]['egvs'] / rows[0]['egvs']):.1f} %" in text
 
 
 def test_shows_the_record_of_the_run(plain_run):
@@ -196,7 +196,7 @@ def test_shows_the_record_of_the_run(plain_run):
         "3 to 5",
         "1,234",
         "5 m/s (18 km/h)",
-        "25.0%",
+        "25.0 %",
         "12.5 s",
         "9.8.7",
         "4 lines",

@@ -54,7 +54,7 @@ def test_first_sites_of_a_larger_plan_are_compared_with_those_that_are_enough() 
     installed = [InstalledSite("a", 0.946), InstalledSite("b", 0.99, 0.003), InstalledSite("c", 0.998)]
     assert describe_count(steps, FOUND, plans=plans, installed=installed) == (
         "Two are enough (b and c): a third adds 0.6 ± 0.1 percentage points. The first two sites of the plan of three, "
-        "a and b, reach 99.0 ± 0.3% instead of 99.2%: begin with them only if one more is to follow."
+        "a and b, reach 99.0 ± 0.3 % instead of 99.2 %: begin with them only if one more is to follow."
     )
     same = [InstalledSite("c", 0.9), InstalledSite("b", 0.992), InstalledSite("a", 0.998)]
     assert "instead of" not in describe_count(steps, FOUND, plans=plans, installed=same)
@@ -67,8 +67,8 @@ def test_first_site_of_a_plan_is_compared_with_the_best_single_one() -> None:
     plans = [CurvePlan(("a",), 0.0), CurvePlan(("b", "c"), 0.0), CurvePlan(("b", "c", "d"), 0.0)]
     installed = [InstalledSite("b", 0.93), InstalledSite("c", 0.947), InstalledSite("d", 0.948)]
     assert describe_count(steps, FOUND, plans=plans, installed=installed).endswith(
-        "The first site of the plan of three, b, reaches 93.0% instead of 94.6%: begin with it only if two more are to "
-        "follow."
+        "The first site of the plan of three, b, reaches 93.0 % instead of 94.6 %: begin with it only if two more are "
+        "to follow."
     )
 
 
@@ -91,20 +91,20 @@ def test_plan_within_a_budget_is_not_contradicted() -> None:
 def test_says_what_the_last_sensor_adds_where_it_is_still_useful() -> None:
     steps = steps_of(0.9455, 0.9922, gain_se=0.005, beats=0.999)
     assert describe_count(steps, FOUND, next_count=3) == (
-        "A second sensor adds 4.7 ± 0.5 percentage points to the share of vehicles found: 99.2%, against 94.5% with "
+        "A second sensor adds 4.7 ± 0.5 percentage points to the share of vehicles found: 99.2 %, against 94.5 % with "
         "one. Try --count 3 to see what a third adds."
     )
-    assert describe_count(steps, FOUND).endswith("against 94.5% with one.")
+    assert describe_count(steps, FOUND).endswith("against 94.5 % with one.")
 
 
 def test_bits_are_compared_with_the_score_of_the_plan() -> None:
     steps = steps_of(247397.0, 381218.0, gain_se=2100.0, beats=1.0)
     assert describe_count(steps, EGVS) == (
-        "A second sensor adds 133,821 ± 2,100 bit (35.1% of the plan's score) to EGVS: 381,218 bit, against "
+        "A second sensor adds 133,821 ± 2,100 bit (35.1 % of the plan's score) to EGVS: 381,218 bit, against "
         "247,397 bit with one."
     )
     steps = steps_of(39000.0, 39300.0, gain_se=50.0, beats=1.0)
-    assert describe_count(steps, EGVS) == "One is enough: a second adds 300 ± 50 bit (0.8% of the plan's score)."
+    assert describe_count(steps, EGVS) == "One is enough: a second adds 300 ± 50 bit (0.8 % of the plan's score)."
 
 
 def test_gain_that_may_be_chance_is_not_useful() -> None:

@@ -43,17 +43,17 @@ def test_sentences_for_a_score_over_vehicles() -> None:
     detected = by_vehicles(("a", 50.0, 0.871), ("b", 90.0, 0.8), ("c", 20.0, 0.4))
     assert (
         report_ranking.headline(detected, has_traffic=True)
-        == "a is the best of 3 sites: it should find 87.1% of vehicles"
+        == "a is the best of 3 sites: it should find 87.1 % of vehicles"
     )
     assert report_ranking.lead(detected) == "It leads the next site, b, by 7.1 percentage points."
     assert report_ranking.entropy_seen_note(detected) == ""
     assert report_ranking.site_caption(detected.sites[0], 1, 2).startswith(
-        "a: rank 1, the share of vehicles found 87.1%, at x"
+        "a: rank 1, the share of vehicles found 87.1 %, at x"
     )
     assert detected.sites[0].score_se == 0.01 and detected.companion_score is SCORE_LABELS["egvs"]
     assert (
         report_ranking.headline(by_vehicles(("a", 50.0, 0.871)), has_traffic=True)
-        == "a, the only site, should find 87.1% of vehicles"
+        == "a, the only site, should find 87.1 % of vehicles"
     )
     assert by_vehicles(("a", 50.0, 0.9), rank_by="egvs").companion_score is SCORE_LABELS["expected_detections"]
     assert ranking(("a", 50.0, 1, 0.5, 1.0)).companion_score is None
@@ -65,16 +65,16 @@ def test_gain_of_a_pole_is_in_percentage_points_for_shares_and_relative_otherwis
     assert report_ranking.Pole("p", shares).gain_text == "60.0"
     assert report_ranking.Pole("p", shares[:1]).gain_text == ""
     bits = ranking(("a", 60.0, 1, 0.5, 1.0), ("b", 40.0, 2, 0.5, 1.0), ("c", 0.0, 3, 0.0, 1.0)).sites
-    assert report_ranking.Pole("p", bits[:2]).gain_text == "50.0%"
+    assert report_ranking.Pole("p", bits[:2]).gain_text == "50.0 %"
     assert report_ranking.Pole("p", bits).gain_text == ""
 
 
 def test_lead_says_whether_the_best_is_certain() -> None:
     """Two that share the first place cannot beat each other; whether they lead is another matter."""
     ahead = ranking(("a", 100.0, 1, 0.5, 0.5), ("b", 100.0, 1, 0.6, 0.99), ("c", 80.0, 3, 0.4, 1.0))
-    assert report_ranking.lead(ahead) == "They lead the next site, c, by 20.0% of their score."
+    assert report_ranking.lead(ahead) == "They lead the next site, c, by 20.0 % of their score."
     near = ranking(("a", 100.0, 1, 0.5, 0.5), ("b", 100.0, 1, 0.6, 0.7), ("c", 98.0, 3, 0.4, 1.0))
-    assert report_ranking.lead(near).endswith("by 2.0% of their score. These poles cannot be told apart.")
+    assert report_ranking.lead(near).endswith("by 2.0 % of their score. These poles cannot be told apart.")
     alone = ranking(("a", 100.0, 1, 0.5, 0.7), ("c", 98.0, 2, 0.4, 1.0))
     assert report_ranking.lead(alone, "More helps.").endswith("These poles cannot be told apart. More helps.")
 
@@ -105,16 +105,16 @@ def with_rivals(*rows: tuple[str, str, float, float, float]) -> Ranking:
 @pytest.mark.parametrize(
     ("chance", "says"),
     [
-        (0.903, "(it is truly worse with a probability of 90%)."),
-        (0.896, "(it is truly worse with a probability of 89%). These poles cannot be told apart. More helps."),
-        (0.7, "(it is truly worse with a probability of 70%). These poles cannot be told apart. More helps."),
-        (0.9999, "(it is truly worse with a probability of over 99%)."),
+        (0.903, "(it is truly worse with a probability of 90 %)."),
+        (0.896, "(it is truly worse with a probability of 89 %). These poles cannot be told apart. More helps."),
+        (0.7, "(it is truly worse with a probability of 70 %). These poles cannot be told apart. More helps."),
+        (0.9999, "(it is truly worse with a probability of over 99 %)."),
     ],
 )
 def test_lead_over_another_pole_has_its_error_and_probability(chance: float, says: str) -> None:
     sites = with_rivals(("a", "p", 0.9, 0.0, 0.5), ("b", "p", 0.89, 0.004, 0.99), ("c", "q", 0.883, 0.013, chance))
     assert report_ranking.lead(sites, "More helps.") == (
-        "It leads the next site, b, by 1.0 ± 0.4 percentage points (it is truly better with a probability of 99%)."
+        "It leads the next site, b, by 1.0 ± 0.4 percentage points (it is truly better with a probability of 99 %)."
         f" The best site on another pole, c, is behind by 1.7 ± 1.3 percentage points {says}"
     )
 
@@ -122,7 +122,7 @@ def test_lead_over_another_pole_has_its_error_and_probability(chance: float, say
 def test_next_site_on_another_pole_is_compared_once() -> None:
     text = report_ranking.lead(with_rivals(("a", "p", 0.9, 0.0, 0.5), ("c", "q", 0.8999, 0.0001, 0.84)), "More helps.")
     assert text == (
-        "It leads the next site, c, by 0.01 ± 0.01 percentage points (it is truly better with a probability of 84%)."
+        "It leads the next site, c, by 0.01 ± 0.01 percentage points (it is truly better with a probability of 84 %)."
         " These poles cannot be told apart."
     )
 
@@ -157,19 +157,38 @@ def test_hint_names_the_setting_that_limits_the_error(mini: Path) -> None:
     assert "longer periods" in report_ranking.more_frames_hint(load(SCENARIOS / "nishishinjuku_peaks"), by, 400)
 
 
+@pytest.mark.parametrize(("by_detectors", "asks_for_traffic"), [(0.004, False), (0.0029, False), (0.0028, True)])
+def test_hint_is_not_more_traffic_where_detectors_disagree(
+    mini: Path, by_detectors: float, asks_for_traffic: bool
+) -> None:
+    """Of an error of 0.4 points, more than half of the square is due to detectors from 0.283 points on."""
+    sites = with_rivals(("a", "p", 0.9, 0.0, 0.5), ("c", "q", 0.895, 0.004, 0.6))
+    rival = replace(sites.sites[1], behind_best_detectors_se=by_detectors)
+    sites = replace(sites, sites=(sites.sites[0], rival))
+    scenario = load(mini, ["score.rank_by='expected_detections'"])
+    hint = report_ranking.recorded_frames_hint(scenario, sites, {})
+    assert (hint == "") == asks_for_traffic  # there is no record of the traffic
+    if hint:
+        assert hint == (
+            "The detectors disagree about this difference, and more traffic does not change that: see --detector "
+            "cluster and --detector pointpillars."
+        )
+
+
 def test_note_on_the_site_that_sees_most_entropy() -> None:
     """Of two with the same score, one that sees more contradicts nothing."""
     tied = ranking(("a", 100.0, 1, 0.5, 0.5), ("b", 100.0, 1, 0.6, 0.99), ("c", 80.0, 3, 0.4, 1.0))
     assert (
-        report_ranking.entropy_seen_note(tied) == "b also sees the largest share of the traffic’s uncertainty, 60.0%."
+        report_ranking.entropy_seen_note(tied) == "b also sees the largest share of the traffic’s uncertainty, 60.0 %."
     )
     other = ranking(("a", 100.0, 1, 0.5, 0.99), ("c", 80.0, 2, 0.7, 1.0))
     assert report_ranking.entropy_seen_note(other).startswith(
-        "c, rank 2, sees more of the traffic’s uncertainty (70.0% against 50.0%), but with fewer beams. One beam"
+        "c, rank 2, sees more of the traffic’s uncertainty (70.0 % against 50.0 %), but with fewer beams. One beam"
     )
     agree = ranking(("a", 100.0, 1, 0.7, 0.99), ("c", 80.0, 2, 0.5, 1.0))
     assert (
-        report_ranking.entropy_seen_note(agree) == "It also sees the largest share of the traffic’s uncertainty, 70.0%."
+        report_ranking.entropy_seen_note(agree)
+        == "It also sees the largest share of the traffic’s uncertainty, 70.0 %."
     )
 
 

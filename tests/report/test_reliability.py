@@ -69,6 +69,27 @@ def test_says_that_errors_come_from_several_simulations(rank_by: str, traffic: d
     assert ("validated" in sentence) == (rank_by == "expected_detections")
 
 
+@pytest.mark.parametrize(
+    ("seeds", "detectors", "note"),
+    [
+        ([1], ("a", "b"), "± contains the error of a finite simulation, and how far the detectors (a, b) disagree."),
+        (
+            [1, 7],
+            ("a", "b"),
+            "± contains the error of finite simulations, from the differences between 2 of them, and how far the "
+            "detectors (a, b) disagree.",
+        ),
+        ([1], ("a",), "± is the error of a finite simulation only; the score is that of the detector a."),
+        ([1], (), "± is the error of a finite simulation only."),
+    ],
+)
+def test_says_what_errors_contain(seeds: list[int], detectors: tuple[str, ...], note: str) -> None:
+    ranking = ranked(("a", 3, 0, 0.9), ("b", 3, 0, 0.5), rank_by="expected_detections")
+    ranking = replace(ranking, sites=tuple(replace(site, egvs_se=0.1) for site in ranking.sites))
+    (sentence,) = describe_reliability(ranking, {"seeds": seeds}, detectors)
+    assert sentence.startswith(f"{note} The order of sites")
+
+
 def test_sites_that_see_nothing_or_score_the_same_need_no_further_words() -> None:
     assert describe_reliability(ranked(("a", 3, -10, 0.0), ("a", 4, 0, 0.0))) == []
     tie = ranked(("a", 3, -10, 5.0), ("a", 4, 0, 5.0))

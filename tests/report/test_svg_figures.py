@@ -97,12 +97,12 @@ def test_axis_of_long_bars_starts_above_zero_and_says_so() -> None:
     figure = sensor_count_chart([CurveStep(1, 0.96, 0.96), CurveStep(2, 0.998, 1.0)], "alt")
     shorter, longer = bar_lengths(figure)
     assert shorter < 0.5 * longer
-    assert "the axis starts at 94%, not at 0" in figure
+    assert "the axis starts at 94 %, not at 0" in figure
 
 
 def test_axis_of_equal_full_bars_starts_at_most_at_95_per_cent() -> None:
     figure = sensor_count_chart([CurveStep(1, 1.0, 1.0)], "alt")
-    assert "the axis starts at 95%, not at 0" in figure and bar_lengths(figure)[0] > 100
+    assert "the axis starts at 95 %, not at 0" in figure and bar_lengths(figure)[0] > 100
 
 
 def test_axis_of_short_bars_starts_at_zero() -> None:

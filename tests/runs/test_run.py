@@ -313,7 +313,7 @@ def test_ranking_fits_terminal_width(mini: Path, tmp_path: Path, width: int, by:
     assert all(len(line) <= width for line in text.splitlines())
     if by == "egvs" or width > 130:
         assert all(f"{value:.1f}" in text for value in table["egvs"].to_pylist())
-    told = (lambda value: f"{value:.2f}") if by == "points_on_target" else (lambda value: f"{value:.1%}")
+    told = (lambda value: f"{value:.2f}") if by == "points_on_target" else (lambda value: f"{100 * value:.1f} %")
     assert by == "egvs" or all(told(value) in text for value in table[by].to_pylist())
 
 

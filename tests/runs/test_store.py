@@ -294,13 +294,14 @@ def test_the_second_run_waits_and_fetches_the_entry(
 
 
 @pytest.mark.slow
-def test_killed_at_ten_steps_the_store_is_whole_and_the_next_run_ends_in_the_same_bytes(
-    junction: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("kills", [5, pytest.param(20, marks=pytest.mark.nightly)])
+def test_killed_at_some_steps_the_store_is_whole_and_the_next_run_ends_in_the_same_bytes(
+    junction: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kills: int
 ) -> None:
     whole = children.run(Job(junction, tmp_path / "whole", tmp_path / "store"))
     assert (whole.exit_code, set(whole.states.values())) == (0, {"done"})
     assert whole.steps > 50
-    steps = random.Random(20).sample(range(1, whole.steps), 10)
+    steps = random.Random(20).sample(range(1, whole.steps), kills)
     for step in steps:
         out, store = tmp_path / str(step), tmp_path / f"store{step}"
         assert children.run(Job(junction, out, store, kill_at=step)).exit_code == -signal.SIGKILL

@@ -247,6 +247,7 @@ KEYS: dict[str, Change] = {
     "score.gamma": Change("3"),
     "score.rank_by": Change("'coverage'"),
     "score.others": Change("['coverage']"),
+    "score.detector": Change("'cluster'"),
     "score.weights.kinds": Change("{bus=2}"),
     "score.weights.zones.*.polygon_m": Change("[[0, 0], [9, 0], [9, 9]]", WEIGHTED),
     "score.weights.zones.*.file": Change("'other_zones.csv'", WEIGHTED_BY_FILE),

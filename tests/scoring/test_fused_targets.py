@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from egvs.scoring.fused_targets import fuse_targets, fused_scores
+from egvs.scoring.fused_targets import fuse_targets
 from egvs.scoring.target_scores import detection_chances, expected_detections
 from egvs.scoring.targets import TargetRecord, TargetVisibility, VisibleTargets, visible_targets
 from egvs.scoring.visibility import Beams
@@ -82,8 +82,7 @@ def test_two_equal_sensors_at_one_pole_add_points_and_nothing_else() -> None:
     assert (twice.points == 2.0 * one.points).all() and (twice.points_on_sides == 2.0 * one.points_on_sides).all()
     for name in ("length_share", "width_share", "hole_m", "range_m", "depression_deg", "side", "bounds_m", "slices"):
         assert (getattr(twice, name) == getattr(one, name)).all()
-    single, doubled = detection_chances(one), fused_scores([one, one], detection_chances)
-    assert (doubled == detection_chances(twice)).all()
+    single, doubled = detection_chances(one), detection_chances(twice)
     independent = 1.0 - (1.0 - single) ** 2
     visible = one.points > 0.0
     assert (doubled >= single).all()
@@ -93,16 +92,14 @@ def test_two_equal_sensors_at_one_pole_add_points_and_nothing_else() -> None:
 def test_one_sensor_alone_is_itself_and_an_unseen_vehicle_stays_unseen() -> None:
     record = TargetRecord.of([frame(random_boxes(np.random.default_rng(6), 12))], GRID)
     one, blind = views_of(record, rings((130.0, 215.0, 4.0)), beams_to((101.0, 201.0, 3.0), [[0.0, 0.0, 1.0]]))
-    for views in ([one], [one, blind], [blind, one]):
-        both = fuse_targets(views)
-        assert (fused_scores(views, detection_chances) == detection_chances(one)).all()
+    for both in (fuse_targets([one]), fuse_targets([one, blind]), fuse_targets([blind, one])):
         rows = one.points > 0.0
         for name in (*COLUMNS, "bounds_m", "slices"):
             assert (getattr(both, name)[rows] == getattr(one, name)[rows]).all()
         assert expected_detections(both) == expected_detections(one)
     nothing = fuse_targets([blind, blind])
     assert not nothing.points.any() and not nothing.length_share.any() and not nothing.hole_m.any()
-    assert expected_detections(nothing) == 0.0 and not fused_scores([blind, blind], detection_chances).any()
+    assert expected_detections(nothing) == 0.0
 
 
 def scans_of(rng: np.random.Generator, count: int) -> list[Beams]:
@@ -121,28 +118,6 @@ def test_all_points_thrown_together_give_the_same(seed: int) -> None:
     assert len(expected["points"]) == len(both) > 0 and both.points.any()
     for name, column in expected.items():
         assert getattr(both, name) == pytest.approx(column, rel=1e-4, abs=1e-4), name
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_the_best_view_counts_of_the_sensors_with_a_point(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    record = TargetRecord.of([frame(random_boxes(rng, 40))], GRID)
-    views = views_of(record, *scans_of(rng, 3))
-    both = fuse_targets(views)
-
-    def depth(of: TargetVisibility) -> np.ndarray:
-        """A score that tells the views apart, and grows with the points."""
-        return of.points + 0.01 * of.range_m + 0.001 * of.depression_deg**2 + of.side
-
-    scores = fused_scores(views, depth)
-    assert (both.points == 0.0).any() and (both.points > 0.0).any()
-    for row, value in enumerate(scores.tolist()):
-        of_views = [
-            both.points[row] + 0.01 * view.range_m[row] + 0.001 * view.depression_deg[row] ** 2 + view.side[row]
-            for view in views
-            if view.points[row] > 0.0
-        ]
-        assert value == pytest.approx(max(of_views, default=0.0), rel=1e-12)
 
 
 def test_the_order_of_sensors_does_not_matter() -> None:

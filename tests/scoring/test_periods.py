@@ -119,7 +119,7 @@ def test_run_with_periods_is_reproducible_and_reported(split: Path, tmp_path: Pa
     assert "in day" in head and "in night" in head
     page = (tmp_path / "out" / "report.html").read_text()
     assert "By period" in page
-    assert "night<br>(28.6%)" in page
+    assert "night<br>(28.6\u00a0%)" in page
     assert ">40 frames<small>one every 0.5 s, 20 s in total, in 2 periods" in page
     assert "<dt>day</dt><dd>24 frames; 2 vehicles at a time, 2 in total;" in page
     assert page.index("<h2>Where the sites are") < page.index("<h2>By period")
@@ -219,7 +219,7 @@ def test_warns_of_period_with_other_best_site() -> None:
     table = score_table_of(a=(9.0, 9.0, 3.0), b=(7.0, 6.0, 4.0))
     (warning,) = score.warn_period_disagreements(table, "egvs")
     assert warning.where == "scenario.toml: traffic.periods (night)"
-    assert warning.problem == "the best site is b; a, the best of the mix, has rank 2 and scores 25.0% less"
+    assert warning.problem == "the best site is b; a, the best of the mix, has rank 2 and scores 25.0 % less"
     assert not list(score.warn_period_disagreements(score_table_of(a=(9, 9, 4), b=(7, 6, 4)), "egvs"))
     assert not list(score.warn_period_disagreements(score_table_of(a=(9, 0, math.nan)), "egvs"))
 

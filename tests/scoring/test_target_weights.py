@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from egvs.artefacts.readers import read_scores, read_scores_by_period
 from egvs.core.errors import collect_warnings
 from egvs.scenario import loading
 from egvs.scenario.score_config import WeightsConfig
-from egvs.scoring.target_scores import TARGET_SCORES, saturating_gain
+from egvs.scoring.target_scores import DETECTORS, TARGET_SCORES, saturating_gain
 from egvs.scoring.targets import TargetRecord, target_weights, visible_targets, weighted_people
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
@@ -55,15 +56,23 @@ def test_people_are_to_be_seen_only_where_they_have_a_weight() -> None:
     assert not len(target_weights(WeightsConfig(), {}, TargetRecord.of([], GRID)))
 
 
-def test_people_are_found_as_well_as_they_are_seen() -> None:
-    """No chance of detection is calibrated for them."""
+def test_people_are_expected_by_points() -> None:
+    """No chance of detection is calibrated for them: from 20 points on, they count as found."""
     record = record_of({"pedestrian"})
     ends = [[x - 101.0 + 3.0 * (x - 101.0), 4 * (y - 206.0), 0.0] for x, y in record.boxes[:, :2] for _ in range(30)]
     seen = visible_targets(record, beams_to((101.0, 206.0, 1.0), ends))
-    found = TARGET_SCORES["expected_detections"](seen)
+    found = TARGET_SCORES["expected_detections"](seen, DETECTORS)
     assert seen.points[3] > 0
-    assert found[record.are_people].tolist() == saturating_gain(seen.points)[record.are_people].tolist()
-    cars = TARGET_SCORES["expected_detections"](visible_targets(record_of(), beams_to((101.0, 206.0, 1.0), ends)))
+    assert found[record.are_people].tolist() == [float(points >= 20) for points in seen.points[record.are_people]]
+    for points, expected in ((0.0, 0.0), (19.9, 0.0), (20.0, 1.0), (500.0, 1.0)):
+        changed = dataclasses.replace(seen, points=np.where(record.are_people, points, seen.points))
+        for detectors in (DETECTORS, ("cluster",)):
+            values = TARGET_SCORES["expected_detections"](changed, detectors)
+            assert set(values[record.are_people].tolist()) == {expected}
+            assert values[:3].tolist() == TARGET_SCORES["expected_detections"](seen, detectors)[:3].tolist()
+    cars = TARGET_SCORES["expected_detections"](
+        visible_targets(record_of(), beams_to((101.0, 206.0, 1.0), ends)), DETECTORS
+    )
     assert found[:3].tolist() == cars.tolist()
 
 
@@ -77,7 +86,8 @@ WEST = "score.weights.zones.west={weight=4, polygon_m=[[0, -10], [16, -10], [16,
 
 @pytest.mark.slow
 def test_scores_of_a_run_are_weighted_means_and_so_are_their_errors(mini: Path, tmp_path: Path) -> None:
-    plain, rows = run(mini, tmp_path / "plain"), run(mini, tmp_path / "run", WEST)
+    one = "score.detector='cluster'"  # so that errors are those of the traffic alone
+    plain, rows = run(mini, tmp_path / "plain", one), run(mini, tmp_path / "run", WEST, one)
     scenario = loading.load(mini)
     record = TargetRecord.read(tmp_path / "run" / "trajectories.parquet", scenario.roi.grid)
     weight = np.where(record.boxes[:, 0] <= 16.0, 4.0, 1.0)
@@ -85,7 +95,7 @@ def test_scores_of_a_run_are_weighted_means_and_so_are_their_errors(mini: Path, 
     for site in scanner.scene.sites:
         seen = visible_targets(record, Beams.of(scanner.scan_site(site)))
         for name, worth in TARGET_SCORES.items():
-            values = worth(seen)
+            values = worth(seen, ("cluster",))
             assert rows[site.name][name] == pytest.approx(np.average(values, weights=weight), rel=1e-12)
             assert plain[site.name][name] == pytest.approx(values.mean(), rel=1e-12)
             left = [np.average(values[block != b], weights=weight[block != b]) for b in range(4)]

@@ -20,6 +20,7 @@ from egvs.core.errors import InputError
 from egvs.formats import georeference
 from egvs.scenario import loading
 from egvs.scoring import zone_results, zones
+from egvs.scoring.target_scores import DETECTORS
 from egvs.scoring.targets import TargetRecord
 from egvs.scoring.zone_results import ZoneUsers
 from egvs.stages import site_scoring
@@ -117,7 +118,7 @@ def test_sensors_together_miss_what_both_miss(monkeypatch: pytest.MonkeyPatch) -
         def __init__(self, chance: float) -> None:
             self.points, self.chance = np.full(len(record), 12.0), chance
 
-    monkeypatch.setattr(zone_results, "detection_probabilities", lambda seen: np.full(len(record), seen.chance))
+    monkeypatch.setattr(zone_results, "detection_probabilities", lambda seen, _: np.full(len(record), seen.chance))
     both = users.together([Seen(0.5), Seen(0.6)])  # type: ignore[list-item]
     assert both.share == pytest.approx([0.8] * 4)
     assert both.with_points.tolist() == [4, 2, 1, 1]
@@ -155,7 +156,7 @@ def test_table_equals_a_loop_over_frames(scored: tuple[egvs.Scenario, Path]) -> 
     expected = {}
     for scan in empty_scans(context):
         visible = targets.visible(scan.beams)
-        chances = zone_results.detection_probabilities(visible)
+        chances = zone_results.detection_probabilities(visible, DETECTORS)
         row = 0
         found = defaultdict(list)
         for recorded in traffic_frames.read_frames(out / "trajectories.parquet", np.arange(40)):
@@ -206,7 +207,7 @@ def test_table_has_the_areas(scored: tuple[egvs.Scenario, Path]) -> None:
 
 
 def test_report_shows_the_zones_of_the_best_site(scored: tuple[egvs.Scenario, Path]) -> None:
-    page = (scored[1] / "report.html").read_text()
+    page = (scored[1] / "report.html").read_text().replace("\u00a0", " ")
     rows = readers.read_zones(scored[1] / "zones.parquet", "pole_b")
     section = page[page.index('<section id="zones">') :]
     assert "from pole_b, the best site" in section
@@ -237,9 +238,9 @@ def test_worst_zones_of_each_group() -> None:
     ]
     worst = readers.worst_zones(rows)
     assert [(row.zone, row.user_class) for row in worst] == [("a", "pedestrian"), ("b", "bus")]
-    assert worst[0].in_words() == "a, 71 ± 3% of 30 pedestrians"
+    assert worst[0].in_words() == "a, 71 ± 3 % of 30 pedestrians"
     assert readers.describe_worst_zones("the plan", worst[:1]) == (
-        "Of all zones and classes of road users, the plan finds the smallest shares in: a, 71 ± 3% of 30 pedestrians"
+        "Of all zones and classes of road users, the plan finds the smallest shares in: a, 71 ± 3 % of 30 pedestrians"
     )
 
 
@@ -286,7 +287,7 @@ def test_zones_that_reach_out_of_the_region_are_a_warning(mini: Path) -> None:
     path = mini / "zones.geojson"
     path.write_text(collection(feature(inside, name="inside"), feature(partly, name="partly")))
     (warning,) = zones.warn_partly_outside(scenario)
-    assert "75% of partly" in str(warning) and "of inside" not in str(warning)
+    assert "75 % of partly" in str(warning) and "of inside" not in str(warning)
     path.write_text(collection(feature(inside, name="inside")))
     assert not list(zones.warn_partly_outside(scenario))
 

@@ -255,7 +255,7 @@ def test_warns_of_solid_on_lane_with_position(street: Path) -> None:
     statics(street, box((20, 0.5), (22, 2.5), "shelter", base_m=2.4, height_m=2.6))
     share, lanes = 4 / (2 * 2.7 * 120), "of the lanes in and around the region"
     assert found(street) == {
-        "solids over lanes": [f"[statics: a solid covers {share:.1%} {lanes}: shelter (kiosk) 4 m2 at (21, 2)]"]
+        "solids over lanes": [f"[statics: 1 solid covers {100 * share:.1f} % {lanes}: shelter (kiosk) 4 m2 at (21, 2)]"]
     }
 
 
@@ -285,7 +285,7 @@ def test_open_surface_above_kerb_is_in_the_way(street: Path) -> None:
         told = found(street, "statics.footprints=[]", 'statics.meshes=[{file="sheet.obj"}]')
         assert set(told) == ({"solids over lanes"} if is_found else set())
         if is_found:
-            assert "a solid covers 100.0% of the lanes" in told["solids over lanes"][0]
+            assert "1 solid covers 100.0 % of the lanes" in told["solids over lanes"][0]
 
 
 def test_warns_of_distant_buildings(street: Path) -> None:

@@ -180,7 +180,7 @@ def test_effects_command_prints_costs_and_changes_of_a_study(mini: Path, tmp_pat
     assert code == 0, errors
     assert "egvs accuracy" not in printed
     without = next(row for row in study.rows if row.setting == "without rain")
-    assert f"scores by up to {without.error:.1%}" in " ".join(printed.split())
+    assert f"scores by up to {100 * without.error:.1f} %" in " ".join(printed.split())
     (mini / "sites.csv").write_text("site,x_m,y_m,z_m\npole_a,10,12,3\n")
     printed = run_egvs("effects", mini, "--out", tmp_path / "out", *sets)[1]
     assert "egvs accuracy" in printed  # that study is of other sites

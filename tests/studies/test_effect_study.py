@@ -61,7 +61,7 @@ def test_range_limit_beyond_region_has_little_effect_before_a_run(mini: Path) ->
     for rated_m, state in ((3000, "little"), (30, "called for")):
         statuses = states(mini, f"sensors.small.rated_range_m={rated_m}")["range_limit"]
         assert statuses[0] == state
-        assert ("100% of returns" in statuses[1]) == (state == "little")
+        assert ("100 % of returns" in statuses[1]) == (state == "little")
 
 
 def changes_of_runs(before: Path, after: Path, score: str) -> list[float]:
@@ -115,7 +115,7 @@ def test_trees_and_long_trucks_call_for_their_effects(mini: Path, tmp_path: Path
         "1 of 2 tree crowns may stand between a site and the region",
     )
     assert statuses["articulated"].state == "called for"
-    assert statuses["articulated"].change.startswith("100.0% of the boxes in the last run would be split into parts")
+    assert statuses["articulated"].change.startswith("100.0 % of the boxes in the last run would be split into parts")
 
 
 @pytest.mark.slow

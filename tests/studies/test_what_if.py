@@ -143,7 +143,7 @@ def test_command_prints_the_answer_and_repeats_it_from_the_folders(
     code, printed, error = run_egvs("what-if", "mini")
     assert code == 0, error
     assert (tmp_path / "runs" / "mini@what_if=lorry" / "what_if_1.geojson").is_file()
-    assert "lorry (100% of the time): pole_b" in printed
+    assert "lorry (100 % of the time): pole_b" in printed
     again = run_egvs("what-if", "mini", "--only", "lorry")
     assert again[1] == printed
     assert [line.split()[-2] for line in again[2].splitlines()[-2:]] == ["unchanged"] * 2

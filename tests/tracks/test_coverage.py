@@ -115,7 +115,7 @@ def test_track_that_ends_inside_is_counted() -> None:
 
 def test_warns_of_small_share() -> None:
     (warning,) = coverage.estimate(rectangle_of_tracks(), REGION, NO_LANES).warnings("scenario.toml: traffic.tracks")
-    assert "recorded positions cover about 17% of the area of the region of interest" in str(warning)
+    assert "recorded positions cover about 17 % of the area of the region of interest" in str(warning)
 
 
 def test_single_position_is_a_circle() -> None:

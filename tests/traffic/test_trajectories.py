@@ -253,7 +253,7 @@ def test_warns_about_overlaps_in_many_frames_with_location():
     (result,) = trajectories.traffic_warnings(statistics_of(sorted(rows)), recording_with(), ROI, DEMAND)
     assert result.rule == "overlaps"
     assert result.where == "s.toml: traffic: x 10 m, y 30 m (in the region of interest)"
-    assert result.problem == "vehicles overlap in 7% of the frames; 20 of 25 overlaps are here"
+    assert result.problem == "vehicles overlap in 7 % of the frames; 20 of 25 overlaps are here"
 
 
 def test_overlaps_with_blockers_in_region_are_counted():

@@ -60,7 +60,7 @@ def test_ties_count_half():
 def test_undefined_intervals_have_reason():
     assert "all resamples have the same value" in ConfidenceInterval.from_resamples(1.0, np.ones(100)).why
     draws = np.concatenate([np.full(10, math.nan), np.linspace(0, 1, 90)])
-    assert ConfidenceInterval.from_resamples(0.5, draws).why == "10% of the resamples have equal values only"
+    assert ConfidenceInterval.from_resamples(0.5, draws).why == "10 % of the resamples have equal values only"
     assert math.isnan(ConfidenceInterval.from_resamples(0.5, draws).low)
     assert math.isfinite(ConfidenceInterval.from_resamples(0.5, draws[8:]).low)
 

@@ -91,7 +91,7 @@ def test_warns_of_the_share_of_vehicles_that_both_have(run_egvs, mini, tmp_path)
     options = ("--frames", "10", "--detector", "points", "--jobs", "1", "--out", tmp_path / "out")
     code, printed, error = run_egvs("validate", mini, *options)
     assert code == 0, error
-    assert "frames that the TPOG was computed from: 2 of 2 vehicles (100%) are in both" in " ".join(printed.split())
+    assert "frames that the TPOG was computed from: 2 of 2 vehicles (100 %) are in both" in " ".join(printed.split())
 
 
 def test_departures_that_cannot_be_redrawn_are_a_warning(mini):
@@ -99,7 +99,7 @@ def test_departures_that_cannot_be_redrawn_are_a_warning(mini):
     (mini / "r.rou.xml").write_text("<routes><vehicle id='a' depart='1'/><vehicle id='b' depart='triggered'/></routes>")
     scenario = load(simulated(mini, 'routes = ["r.rou.xml"]'))
     (warning,) = validation_run._fixed_departure_warnings(scenario)
-    assert "1 of 2 vehicles and flows (50%) have departures that cannot be redrawn" in warning.problem
+    assert "1 of 2 vehicles and flows (50 %) have departures that cannot be redrawn" in warning.problem
     assert held_out_traffic.held_out_scenario(scenario, 10, 2.0).traffic.redraw_departures
 
 

@@ -20,6 +20,7 @@ from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import read_periods
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, Grid
+from egvs.core.wording import format_percent
 
 if TYPE_CHECKING:
     from shapely.geometry.base import BaseGeometry
@@ -68,9 +69,9 @@ class LocationVisibility:
 
     def in_words(self) -> str:
         """Return the location, the share found with its standard error, and the number of vehicles, in one phrase."""
-        share = f"{self.share:.0%}"
+        share = format_percent(self.share, 0)
         if not math.isnan(self.se):
-            share = f"{100 * self.share:.0f} ± {100 * self.se:.0f}%"
+            share = f"{100 * self.share:.0f} ± {100 * self.se:.0f} %"
         return f"{self.words} ({share} of {self.vehicles:,} vehicles)"
 
 
@@ -126,7 +127,10 @@ class SiteBlindspots:
         if self.overall is None:
             return f"no vehicle in the region of interest, so none that {self.site} misses"
         if not self.worst:
-            return f"{self.site}: {self.overall.share:.0%} of the vehicles are found, on no listed lane fewer"
+            return (
+                f"{self.site}: {format_percent(self.overall.share, 0)} of the vehicles are found, on no "
+                "listed lane fewer"
+            )
         worst = "; ".join(location.in_words() for location in self.worst[:2])
         return f"Of all lanes, turns and crossings, {self.site} finds the smallest shares of vehicles on: {worst}"
 
@@ -221,9 +225,9 @@ class ZoneVisibility:
     def share_text(self) -> str:
         """The share with its standard error, where it is known."""
         if math.isnan(self.se):
-            return f"{self.share:.0%}"
+            return format_percent(self.share, 0)
         digits = 0 if 100 * self.se >= _WHOLE_PERCENT else 1
-        return f"{100 * self.share:.{digits}f} ± {100 * self.se:.{digits}f}%"
+        return f"{100 * self.share:.{digits}f} ± {100 * self.se:.{digits}f} %"
 
     def in_words(self) -> str:
         """Return zone, class, share and number of road users in one phrase."""

@@ -31,6 +31,7 @@ from egvs.city.model import CITY_FILE, JUNCTIONS_FILE, JUNCTIONS_FOLDER, TRAFFIC
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
+from egvs.core.wording import format_percent
 from egvs.formats.osm import read_osm as read_extract
 from egvs.importers import assumed_traffic, junctions, new_scenario, scenario_files
 from egvs.importers.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, TRAFFIC_LEVELS
@@ -137,7 +138,7 @@ class CityFlow:
     @property
     def summary(self) -> str:
         """What is carried and used, as a sentence."""
-        share = f"{TRAFFIC_LEVELS[self.level]:.0%}".replace("%", " %")
+        share = format_percent(TRAFFIC_LEVELS[self.level], 0)
         return f"carries {self.capacity.vehicles_per_h:,} vehicles an hour; {self.level} {share} is used"
 
     def to_json(self) -> dict[str, Any]:

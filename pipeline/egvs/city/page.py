@@ -22,6 +22,7 @@ from egvs.city.model import NETWORK_FILE, City
 from egvs.city.results import RUNS_FOLDER, CityPlan, JunctionResult, counts_vehicles, gain_label
 from egvs.core import files
 from egvs.core.errors import Diagnostic
+from egvs.core.wording import format_percent
 from egvs.report import colours, formatting, maps, page
 from egvs.report.colours import STYLE_SHEET
 from egvs.report.svg_figures import Box, ColourBar, MapFrame
@@ -189,9 +190,9 @@ def render_page(
         loader=FileSystemLoader([CITY_TEMPLATES, page.TEMPLATES]), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    environment.filters |= {"svg": Markup, "percent": formatting.format_percent, "integer": formatting.format_count}
+    environment.filters |= {"svg": Markup, "percent": format_percent, "integer": formatting.format_count}
     score = results[0].best.by
-    return environment.get_template("city.html.j2").render(
+    html = environment.get_template("city.html.j2").render(
         city=city,
         results=results,
         score=score,
@@ -212,6 +213,7 @@ def render_page(
         script=Markup((CITY_TEMPLATES / "sort.js").read_text(encoding="utf-8")),
         version=__version__,
     )
+    return formatting.keep_percentages_together(html)
 
 
 def format_headline(results: Sequence[JunctionResult]) -> str:
@@ -268,7 +270,7 @@ def _map_junction(result: JunctionResult, value: float, number: str) -> MapJunct
     junction, best = result.junction, result.best
     title = (
         f"{result.rank}. {junction.title or junction.id}: {best.site}, {best.by.with_noun(result.score)}, "
-        f"sees {formatting.format_percent(best.entropy_seen)}"
+        f"sees {format_percent(best.entropy_seen)}"
     )
     return MapJunction(junction.id, junction.x_m, junction.y_m, value, number, title, report_link(result))
 

@@ -8,7 +8,8 @@ and the replicates of the junctions are added up: the replicate of the city with
 
 with the joint score S of junction j and, for scores that are means, its average number of vehicles n, both without the
 frames of group g. The block jackknife (:mod:`egvs.scoring.standard_errors`) of these sums needs no assumption about the
-correlation between junctions. Groups are at least 20 autocorrelation times long: those of the junction whose
+correlation between junctions. Where the score is a mean over detectors, each detector is left out at all junctions in
+the same way. Groups are at least 20 autocorrelation times long: those of the junction whose
 traffic has the longest one.
 
 Limits: the plan was chosen with the same traffic, and the allocation is not repeated for each replicate. So the error
@@ -33,7 +34,7 @@ from egvs.core.grid import FloatArray, Grid
 from egvs.placement.plan_error import PlanReplicates
 from egvs.placement.problem_builder import PlacementProblem
 from egvs.scoring.occupancy import near_grid
-from egvs.scoring.standard_errors import BlockGroups, ScoreUncertainty, block_groups
+from egvs.scoring.standard_errors import BlockGroups, ScoreUncertainty, block_groups, detector_groups
 from egvs.scoring.targets import recorded_frames
 from egvs.stages.base import StageContext
 
@@ -46,9 +47,12 @@ class CityBlocks:
     ----------
     periods
         The blocks of each record, with the longest autocorrelation time of any junction.
+    detectors
+        Detectors that the score that ranks averages over; empty for a score without detectors.
     """
 
     periods: tuple[PeriodBlocks, ...]
+    detectors: tuple[str, ...] = ()
 
     @property
     def groups(self) -> tuple[BlockGroups, ...]:
@@ -56,8 +60,8 @@ class CityBlocks:
         return tuple(block_groups(period) for period in self.periods)
 
     def uncertainty(self, replicates: FloatArray) -> ScoreUncertainty:
-        """Return standard errors of n scores from their replicates, (n, 1 + k)."""
-        return ScoreUncertainty.of(replicates, self.groups)
+        """Return standard errors of n scores from their replicates, (n, 1 + k + d)."""
+        return ScoreUncertainty.of(replicates, self.groups + detector_groups(len(self.detectors)))
 
 
 class _FrameTimes(NamedTuple):
@@ -75,10 +79,12 @@ def common_blocks(jobs: Sequence[Job]) -> CityBlocks | str:
     times: dict[str, _FrameTimes] = {}
     memory: list[list[float]] = []
     periods: tuple[PeriodBlocks, ...] = ()
+    detectors: dict[str, tuple[str, ...]] = {}
     for job in jobs:
         scenario = job.scenario()
         if not scenario.score.standard_error:
             return f"score.standard_error is false at junction {job.junction}"
+        detectors[job.junction] = scenario.score.ranking_detectors
         periods = read_periods(job.out / RunFolder.tpog.name)
         blocks = tuple((period.name, period.frames, period.block_frames, period.times) for period in periods)
         times[job.junction] = _FrameTimes(scenario.traffic.frame_period_s, blocks)
@@ -89,10 +95,11 @@ def common_blocks(jobs: Sequence[Job]) -> CityBlocks | str:
     for name, junction_times in times.items():
         if junction_times != times[first]:
             return f"junctions {first} and {name} have different frames or blocks"
+        if detectors[name] != detectors[first]:
+            return f"junctions {first} and {name} have different detectors"
     longest = np.max(memory, axis=0).tolist()
-    return CityBlocks(
-        tuple(replace(period, memory_frames=frames) for period, frames in zip(periods, longest, strict=True))
-    )
+    common = tuple(replace(period, memory_frames=frames) for period, frames in zip(periods, longest, strict=True))
+    return CityBlocks(common, detectors[first])
 
 
 class JointReplicates:
@@ -114,20 +121,24 @@ class JointReplicates:
         self, context: StageContext, placement_problem: PlacementProblem, blocks: CityBlocks, mean_vehicles: float
     ) -> None:
         self._joint = placement_problem.problem.joint
+        self._sites = placement_problem.sites
         self._index = {name: i for i, name in enumerate(placement_problem.names)}
         self._replicates = PlanReplicates(context, placement_problem, blocks.periods)
         self._factor: FloatArray | float = 1.0
         if placement_problem.score != "egvs":
             trajectories = context.folder.trajectories
             without = vehicles_without_groups(trajectories, context.scenario.roi.grid, blocks)
-            self._factor = np.append(mean_vehicles, without)
+            n_detectors = sum(len(group.frames) for group in self._replicates.detector_groups)
+            self._factor = np.concatenate([[mean_vehicles], without, np.full(n_detectors, mean_vehicles)])
 
     def of_order(self, sites: Sequence[str]) -> FloatArray:
-        """Return the replicates of the first 0, 1, ... n of the sites of a plan, (n + 1, 1 + k) float64.
+        """Return the replicates of the first 0, 1, ... n of the sites of a plan, (n + 1, 1 + k + d) float64.
 
         The first column is the score with all frames.
         """
-        rows = self._replicates.of_order(self._joint, [self._index[name] for name in sites])
+        order = [self._index[name] for name in sites]
+        plans = [order[:number] for number in range(len(order) + 1)]
+        rows = self._replicates.of_plans(self._joint, plans, self._sites)
         rows[np.isnan(rows)] = 0.0  # without vehicles, none is found
         return rows * self._factor
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from rich.table import Table
 
 from egvs.cli.console import NARROW, WIDE, Column, console, make_table, print_sentences
+from egvs.core.wording import format_percent
 from egvs.report.formatting import SCORE_LABELS, format_probability
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.studies.study_settings import MEASURES, SCENARIO
@@ -69,8 +70,8 @@ def _settings_table(title: str, rows: Sequence[SettingResult], scenario: Setting
         Column("score", lambda row: f"{row.score_s:.1f}", min_width=WIDE - 10),
         Column("right pole", _format_probability),
         Column("loss", _format_loss),
-        Column("chooses", lambda row: f"{row.best} ({row.best_share:.0%})", "left"),
-        Column("score error", lambda row: f"{row.error:.1%}"),
+        Column("chooses", lambda row: f"{row.best} ({format_percent(row.best_share, 0)})", "left"),
+        Column("score error", lambda row: format_percent(row.error)),
         Column("tau", lambda row: f"{row.tau:.2f}", min_width=NARROW),
         Column("draws", lambda row: str(row.draws), min_width=NARROW),
     ]
@@ -80,7 +81,7 @@ def _settings_table(title: str, rows: Sequence[SettingResult], scenario: Setting
 def _format_probability(row: SettingResult) -> str:
     if math.isnan(row.probability_se):
         return format_probability(row.probability)
-    return f"{format_probability(row.probability)} ± {row.probability_se:.0%}"
+    return f"{format_probability(row.probability)} ± {format_percent(row.probability_se, 0)}"
 
 
 def _format_loss(row: SettingResult) -> str:
@@ -102,7 +103,7 @@ def recommendation_sentences(study: AccuracyStudy) -> list[str]:
     sentences = [
         f"With all traffic of this study ({_describe_units(study)}), {best_pole.name} is the best pole with a "
         f"probability of {format_probability(best_pole.probability)}; {best_pole.mount} there should find "
-        f"{best_pole.found:.1%} of the vehicles."
+        f"{format_percent(best_pole.found)} of the vehicles."
     ]
     best = study.recommended
     name = best.label
@@ -145,7 +146,7 @@ def _describe_quality(row: SettingResult) -> str:
 
 def _describe_tolerance(study: AccuracyStudy) -> str:
     if study.tolerance.score is not None:
-        return f"{study.tolerance.score:.2%} of the score"
+        return f"{format_percent(study.tolerance.score, 2)} of the score"
     points = study.tolerance.loss_points
     return f"{points:g} percentage {'point' if points == 1 else 'points'}"
 

@@ -67,7 +67,7 @@ def print_answer(folder: Path, scenario: Scenario, record: RunRecord, *, poles: 
     on_road = sections.describe_poles_on_road(ranked.poles[: sections.NAMED_POLES], _check_warnings(record))
     if caveats := sections.describe_caveats(scenario, "ranking", on_road, plans):
         sentences.append(caveats)
-    sentences += reliability.describe_reliability(ranked, traffic_summary)
+    sentences += reliability.describe_reliability(ranked, traffic_summary, scenario.score.ranking_detectors)
     sensors = [site.sensor for site in ranked.sites]
     if note := range_note(sensors, is_modelled=scenario.effects.range_limit is not None):
         sentences.append(note)

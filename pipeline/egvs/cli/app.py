@@ -20,6 +20,7 @@ from egvs.cli import options as cli_options
 from egvs.cli.options import (
     DEFAULT_POLES,
     Audit,
+    Detector,
     Jobs,
     Out,
     Rehash,
@@ -89,6 +90,7 @@ NO_STAGE_RAN = "no stage ran: no input has changed since the last run"
 def run(
     scenario: ScenarioPath,
     out: Out = None,
+    detector: Detector = None,
     set_: Set = None,
     jobs: Jobs = None,
     audit: Audit = False,
@@ -100,14 +102,16 @@ def run(
     """Run all stages in order and print the best poles; stages with unchanged inputs are skipped."""
     from egvs.cli import repeat
 
+    overrides = cli_options.with_detector(set_, detector)
+
     def run_all() -> repeat.FinishedRun:
-        return _run_all_stages(scenario, out, set_, jobs, audit=audit, poles=None if all_ else top, verbose=verbose,
-                               rehash=rehash)  # fmt: skip
+        poles = None if all_ else top
+        return _run_all_stages(scenario, out, overrides, jobs, audit=audit, poles=poles, verbose=verbose, rehash=rehash)
 
     if audit or rehash:
         run_all()
         return
-    arguments = ["run", str(scenario), str(out), *(set_ or ()), str(top), str(all_), str(verbose)]
+    arguments = ["run", str(scenario), str(out), *overrides, str(top), str(all_), str(verbose)]
     repeat.print_or_run(arguments, out, run_all)
 
 
@@ -241,6 +245,7 @@ def scan(
 def score(
     scenario: ScenarioPath,
     out: Out = None,
+    detector: Detector = None,
     set_: Set = None,
     jobs: Jobs = None,
     audit: Audit = False,
@@ -248,7 +253,8 @@ def score(
 ) -> None:
     """Score and rank the sites, and write scores.parquet."""
     stage_options: dict[str, Any] = {"audit": True} if audit else {}
-    _run_stage("score", scenario, out, set_, jobs, top, **stage_options)
+    overrides = cli_options.with_detector(set_, detector)
+    _run_stage("score", scenario, out, overrides, jobs, top, **stage_options)
 
 
 @app.command()

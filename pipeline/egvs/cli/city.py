@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from egvs.cli import options
-from egvs.core.wording import number_of
+from egvs.core.wording import format_percent, number_of
 
 if TYPE_CHECKING:
     from egvs.city.city_run import CityPlacement, CityRun, CityRunOptions
@@ -261,7 +261,7 @@ def print_junctions(city_run: CityRun) -> None:
     if by.head != gain.head:
         columns.append(Column(by.head, lambda row: by.value(row.score)))
     if "entropy seen" not in (gain.head, by.head):
-        columns.append(Column("entropy seen", lambda row: f"{row.best.entropy_seen:.1%}"))
+        columns.append(Column("entropy seen", lambda row: format_percent(row.best.entropy_seen)))
     columns.append(Column("vehicles", lambda row: f"{row.vehicles:.1f}"))
     columns.append(Column("sites", lambda row: str(row.sites)))
 
@@ -330,7 +330,8 @@ def print_plan(placed: CityPlacement) -> None:
     sensors = number_of(len(plan.sensors), "sensor")
     out.print(
         f"{sensors} at {len(plan.by_junction)} of {plan.junctions} junctions{cost}: "
-        f"{label.label} {label.value(plan.joint)}, {share:.1%} of the score of all {plan.candidates:,} candidates "
+        f"{label.label} {label.value(plan.joint)}, {format_percent(share)} of the score of all "
+        f"{plan.candidates:,} candidates "
         f"together; proved: at least {proved:.2f} % of the best possible score"
     )
     if plan.has_errors:
@@ -343,7 +344,7 @@ def print_plan(placed: CityPlacement) -> None:
         error = f" ± {label.value(phase.point.installed_se)}" if plan.has_errors else ""
         out.print(
             f"phase {phase.number}: {names}; then {label.label} {label.value(phase.point.installed)}{error}, "
-            f"{phase.loss:.2%} below the best plan of {phase.point.limit:g} alone"
+            f"{format_percent(phase.loss, 2)} below the best plan of {phase.point.limit:g} alone"
         )
     for path in placed.files:
         out.print(str(path))
@@ -360,16 +361,16 @@ def print_comparison(comparison: PlanComparison) -> None:
 
     def value_column(j: int) -> Column[int]:
         def text(i: int) -> str:
-            return f"{label.value(comparison.values[i, j])} ({relative[i, j]:.1%})"
+            return f"{label.value(comparison.values[i, j])} ({format_percent(relative[i, j])})"
 
         return Column(f"in the traffic of {folders[j].name}", text, wrap=True)
 
     columns: list[Column[int]] = [
         Column("plan", lambda i: folders[i].name, "left"),
         Column("sensors", lambda i: str(len(plans[i].sensors))),
-        Column("in all plans", lambda i: f"{comparison.common_to_all(i).sensors:.0%}"),
-        Column("same pole", lambda i: f"{comparison.common_to_all(i).poles:.0%}"),
-        Column("same junction", lambda i: f"{comparison.common_to_all(i).junctions:.0%}"),
+        Column("in all plans", lambda i: format_percent(comparison.common_to_all(i).sensors, 0)),
+        Column("same pole", lambda i: format_percent(comparison.common_to_all(i).poles, 0)),
+        Column("same junction", lambda i: format_percent(comparison.common_to_all(i).junctions, 0)),
         *(value_column(j) for j in range(len(plans))),
     ]
     out = console(WIDE)
@@ -380,8 +381,9 @@ def print_comparison(comparison: PlanComparison) -> None:
             if i < j:
                 shares = comparison.common(i, [j])
                 out.print(
-                    f"{folder.name}, {other.name}: {shares.sensors:.0%} of the sensors, {shares.poles:.0%} of the "
-                    f"poles and {shares.junctions:.0%} of the junctions in common"
+                    f"{folder.name}, {other.name}: {format_percent(shares.sensors, 0)} of the sensors, "
+                    f"{format_percent(shares.poles, 0)} of the "
+                    f"poles and {format_percent(shares.junctions, 0)} of the junctions in common"
                 )
 
 

@@ -20,6 +20,7 @@ from rich.text import Text
 from egvs.artefacts.run_record import RunRecord, StageRecord
 from egvs.cli import stage_summary
 from egvs.core.errors import collect_warnings
+from egvs.core.wording import format_percent
 
 NARROW, WIDE = 110, 190
 """Terminals below ``NARROW`` columns get fewer columns of tables; those of about ``WIDE`` get all."""
@@ -128,10 +129,15 @@ def format_values(values: Mapping[str, Any]) -> str:
 
 
 def format_or_dash(value: float | None, spec: str) -> str:
-    """Return a number as text, with a format such as ".2%"; "-" if it is unknown."""
+    """Return a number as text, with a format such as ".2f"; "-" if it is unknown."""
     if value is None:
         return "-"
     return f"{value:{spec}}"
+
+
+def percent_or_dash(share: float | None, digits: int = 1) -> str:
+    """Return a share in per cent, as :func:`~egvs.core.wording.format_percent`; "-" if it is unknown."""
+    return "-" if share is None else format_percent(share, digits)
 
 
 def print_mapping(values: Mapping[str, Any], file_width: int) -> None:

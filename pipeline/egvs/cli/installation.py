@@ -10,6 +10,7 @@ import typer
 
 from egvs.cli.options import Run
 from egvs.core.errors import EgvsError, InputError
+from egvs.core.wording import format_percent
 from egvs.installation.acceptance_limits import MAX_VEHICLE_HEIGHT_M, Limits
 
 if TYPE_CHECKING:
@@ -154,8 +155,9 @@ def _print_acceptance(result: Acceptance) -> None:
     pose = ", ".join(parts)
     sentences = [
         f"Pose error, measured minus planned: {pose}.",
-        f"{result.on_surface_share:.0%} of {result.comparison.returns:,} returns lie on the static world; "
-        f"{result.comparison.nearer_share:.0%} are nearer than expected.",
+        f"{format_percent(result.on_surface_share, 0)} of {result.comparison.returns:,} returns lie on the "
+        "static world; "
+        f"{format_percent(result.comparison.nearer_share, 0)} are nearer than expected.",
     ]
     sentences += [f"Blocked: {describe_sector(sector)}." for sector in result.comparison.sectors]
     if result.score is not None:

@@ -7,7 +7,7 @@ import re
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
 import typer
 
@@ -32,6 +32,15 @@ Set = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Override a scenario key, e.g. traffic.frames=500 (repeatable)."),
 ]
+Detector = Annotated[
+    str | None,
+    typer.Option(
+        "--detector",
+        metavar="NAME",
+        help="Detector that expected_detections stands for: cluster, pointpillars, or all, their mean (the default). "
+        "Short for --set score.detector=NAME.",
+    ),
+]
 Jobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Number of threads; one per core by default.")]
 Top = Annotated[
     int | None, typer.Option("--top", metavar="N", min=1, help="Print only the best N sites; all by default.")
@@ -48,6 +57,37 @@ DEFAULT_POLES = 5
 Audit = Annotated[
     bool, typer.Option("--audit", help="Check the voxel traversal of every beam, and print the worst deviation.")
 ]
+
+
+def with_detector(overrides: Sequence[str] | None, detector: str | None, path: Path | None = None) -> list[str]:
+    """Return the overrides of ``--set`` with that of ``--detector``.
+
+    Parameters
+    ----------
+    overrides, detector
+        Values of the two options.
+    path
+        Scenario or run folder of a command that does not accept overrides for a run folder.
+
+    Raises
+    ------
+    InputError
+        For an unknown detector, one that ``--set`` chooses too, or a run folder.
+    """
+    from egvs.runs.run_sources import SettingsSource
+    from egvs.scenario.score_config import ALL_DETECTORS, Detector
+
+    if detector is None:
+        return list(overrides or ())
+    known = (*get_args(Detector), ALL_DETECTORS)
+    if detector not in known:
+        problem = f"expected {', '.join(known[:-1])} or {known[-1]}, got {detector[:80]!r}"
+        raise InputError("--detector", problem, f"Use --detector {known[0]}.")
+    if any(override.partition("=")[0].strip() == "score.detector" for override in overrides or ()):
+        raise InputError("--detector", "cannot be used with --set score.detector", "Remove one of the two options.")
+    if path is not None and SettingsSource(path).is_run:
+        raise InputError("--detector", f"cannot be used with a run folder ({path})", "Give the scenario instead.")
+    return [*(overrides or ()), f"score.detector={detector}"]
 
 
 def duration_s(text: str, option: str = "--budget") -> float:

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from egvs.cli import options, sources
-from egvs.cli.options import Jobs, Out, Set, SettingsPath
+from egvs.cli.options import Detector, Jobs, Out, Set, SettingsPath
 from egvs.core.errors import InputError
-from egvs.core.wording import by_number, number_of
+from egvs.core.wording import by_number, format_percent, number_of
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -54,6 +54,7 @@ def place(
         bool,
         typer.Option("--refine", help="Afterwards, optimise each pose within the limits of \\[placement.refine]."),
     ] = False,
+    detector: Detector = None,
     set_: Set = None,
     jobs: Jobs = None,
 ) -> None:
@@ -62,11 +63,12 @@ def place(
 
     limit_s = options.duration_s(time_limit, "--time-limit")
     _check_request(count, budget, reach)
+    overrides = options.with_detector(set_, detector, scenario)
     request = []
     for key, value in zip(_REQUEST_KEYS, (count, budget, reach), strict=True):
         if value is not None:
             request.append(f"placement.{key}={value!r}")
-    loaded, folder = sources.open_source(scenario, set_, out, request)
+    loaded, folder = sources.open_source(scenario, overrides, out, request)
     with ProgressDisplay("place") as screen:
         from egvs.artefacts.run_record import RunRecord
         from egvs.cli import answer
@@ -128,7 +130,10 @@ def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequen
     out.print()
     for zone in placed.zones:
         sensors = f" by {zone.by} sensors" if zone.by > 1 else ""
-        out.print(f"zone {zone.name}: {zone.seen:.1%} of its entropy seen{sensors}, {zone.share:.1%} required")
+        out.print(
+            f"zone {zone.name}: {format_percent(zone.seen)} of its entropy seen{sensors}, "
+            f"{format_percent(zone.share)} required"
+        )
     if worst := worst_zones(placed.zone_results):
         print_sentences([describe_worst_zones("the plan", worst)])
     sentences = [describe_plan(placed), *notes, *_further_sentences(placed, requested)]
@@ -231,7 +236,7 @@ def _curve_table(placed: Placement, width: int) -> Table:
         Column[int]("sensors", lambda i: str(steps[i].count)),
         Column[int](head(_together_head(by)), lambda i: by.with_error(steps[i].score, steps[i].score_se)),
         Column[int](head("adds", by.change_head), lambda i: by.change(steps[i].gain, steps[i].gain_se)),
-        Column[int](head("of all candidates"), lambda i: f"{_score_share(placed, steps[i].score):.1%}"),
+        Column[int](head("of all candidates"), lambda i: format_percent(_score_share(placed, steps[i].score))),
         Column[int](head("proved, of the best possible"), lambda i: _format_rounded_down(curve[i].certificate)),
     ]
     if any(placed.curve_costs):
@@ -293,7 +298,7 @@ def describe_plan(placed: Placement) -> str:
     score = by.says.format(f"{by.with_error(joint, placed.steps[-1].score_se)} {by.unit}".rstrip())
     if placed.joint_of_all > 0:
         share = _score_share(placed, joint)
-        score += f", {share:.1%} of what all {placed.candidates} candidates reach together"
+        score += f", {format_percent(share)} of what all {placed.candidates} candidates reach together"
     return f"The plan {sites}{cost} {score}; {_describe_proof(placed)}."
 
 
@@ -351,5 +356,5 @@ def describe_refinement(placed: Placement, summary: RefinementSummary) -> str:
 def _format_rounded_down(share: float) -> str:
     """Return a proved share in per cent, never rounded up."""
     if share >= 1.0:
-        return "100%"
-    return f"{math.floor(share * 1e4) / 1e2:.2f}%"
+        return "100 %"
+    return f"{math.floor(share * 1e4) / 1e2:.2f} %"

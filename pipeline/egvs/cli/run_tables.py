@@ -29,6 +29,7 @@ from egvs.cli.console import (
     print_table,
 )
 from egvs.core.errors import collect_warnings
+from egvs.core.wording import format_percent
 from egvs.report import sections
 from egvs.report.formatting import SCORE_LABELS, ScoreLabel, format_probability
 from egvs.report.ranking import Pole, RankedSite, companion_score, group_by_pole
@@ -173,13 +174,13 @@ def ranking_table(sites: Sequence[RankedSite], width: int = WIDE, top: int | Non
         columns.append(_score_column(companion))
     if "entropy seen" not in [column.title for column in columns]:
         min_width = 0 if companion is None else _EXTRA_COLUMNS_WIDTH
-        columns.append(Column("entropy seen", lambda site: f"{site.entropy_seen:.1%}", min_width=min_width))
+        columns.append(Column("entropy seen", lambda site: format_percent(site.entropy_seen), min_width=min_width))
     columns.append(Column("beams in ROI", lambda site: str(site.beams_in_roi), min_width=NARROW))
 
     shown = by_rank[:top]
     caption = None
     if not all(site.is_separable for site in shown):
-        chance = f"the probability that it truly scores higher is below {DISTINCT_PROBABILITY:.0%}"
+        chance = f"the probability that it truly scores higher is below {format_percent(DISTINCT_PROBABILITY, 0)}"
         caption = f"~ not separable from the next site: {chance}"
     return make_table(columns, shown, width=width, caption=caption)
 
@@ -193,7 +194,7 @@ def _ranking_score(sites: Sequence[RankedSite]) -> ScoreLabel:
 def _format_share_of_best(best_score: float, site: RankedSite) -> str:
     if not best_score > 0:
         return "-"
-    return f"{site.score / best_score:.1%}"
+    return format_percent(site.score / best_score)
 
 
 def _score_column(label: ScoreLabel) -> Column[RankedSite]:
@@ -245,7 +246,7 @@ def period_table(by_period: PeriodRanking, top: int | None = None) -> Table:
     for number, name in enumerate(by_period.periods):
         columns.append(Column(name, partial(_format_period, number)))
     weights = zip(by_period.periods, by_period.shares, strict=True)
-    mix = ", ".join(f"{name} {share:.1%}" for name, share in weights)
+    mix = ", ".join(f"{name} {format_percent(share)}" for name, share in weights)
     caption = f"rank and share of the best in each period; in the mix: {mix}"
     return make_table(columns, by_period.sites[:top], caption=caption)
 
@@ -256,7 +257,7 @@ _PeriodRow = tuple[str, int, tuple[PeriodRank, ...]]
 
 def _format_period(number: int, row: _PeriodRow) -> str:
     result = row[2][number]
-    return f"{result.rank} ({result.of_best:.1%})"
+    return f"{result.rank} ({format_percent(result.of_best)})"
 
 
 def print_verification(folder: Path, differences: list[str]) -> None:
@@ -303,14 +304,17 @@ def print_sensors(sensors: Iterable[Sensor]) -> None:
         Column("beams", lambda sensor: str(sensor.beams)),
         Column("range m", lambda sensor: f"{sensor.range_m:g}"),
         Column("rated m", _format_rating),
-        Column(f"at {DARK_REFLECTIVITY:.0%}", lambda sensor: format_or_dash(dark_range_m(sensor), ".0f")),
+        Column(
+            f"at {format_percent(DARK_REFLECTIVITY, 0)}", lambda sensor: format_or_dash(dark_range_m(sensor), ".0f")
+        ),
     ]
     print_table(columns, sensors, file_width=_LIST_FILE_WIDTH)
     print_sentences(
         (
             "view: azimuth x elevation. beams: of one turn or frame of 0.1 s, so ten times as many points per second.",
             "range: no beam is longer. rated: how far the maker's sensor still detects a target of this reflectivity; "
-            f"the last column converts it to {DARK_REFLECTIVITY:.0%} (dark vehicles), so that sensors can be compared. "
+            f"the last column converts it to {format_percent(DARK_REFLECTIVITY, 0)} (dark vehicles), so "
+            "that sensors can be compared. "
             "Scores use it only with --set effects.range_limit={}.",
             "The catalogue has no prices, and does not say which sensors are still sold. Set prices with "
             "--set 'costs.sensor={\"NAME\" = PRICE}' or in [costs].",
@@ -371,7 +375,7 @@ def _format_azimuths(sensor: Sensor) -> str:
 def _format_rating(sensor: Sensor, unit: str = "") -> str:
     if sensor.rated_range_m is None:
         return "-"
-    return f"{sensor.rated_range_m:g}{unit} at {sensor.rated_reflectivity:.0%}"
+    return f"{sensor.rated_range_m:g}{unit} at {format_percent(sensor.rated_reflectivity, 0)}"
 
 
 def print_effects(effects: Sequence[EffectStatus], costs: Mapping[str, EffectCost] | None = None) -> None:
@@ -402,7 +406,7 @@ def _format_cost_change(cost: EffectCost | None) -> str:
     if cost is None:
         return ""
     loss = f"the choice loses {cost.loss_points:.2f} points"
-    return f"scores by up to {cost.change:.1%}; {loss}; tau {cost.tau:.2f}"
+    return f"scores by up to {format_percent(cost.change)}; {loss}; tau {cost.tau:.2f}"
 
 
 def print_ablation(changes: Sequence[EffectChange]) -> None:

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from egvs.cli.options import Jobs, Set, SettingsPath
+from egvs.cli.options import Detector, Jobs, Set, SettingsPath
 from egvs.cli.quick_help import QuickHelpGroup
 from egvs.core.errors import InputError
+from egvs.core.wording import format_percent
 from egvs.formats.recording_options import RecordingOptions
 from egvs.placement.design_request import ALL_SENSORS, ELEVATION_BOUNDS_DEG, DesignRequest
 
@@ -233,7 +234,8 @@ def _map_lines(pose: MapPose) -> list[str]:
     lines = [
         f"pose in the world of {pose.scenario}: yaw {values['yaw_deg']}, pitch {values['pitch_deg']}, "
         f"roll {values['roll_deg']} degrees; x {values['x_m']}, y {values['y_m']}, z {values['z_m']} m",
-        f"fit to the map: {pose.share_on_surface:.0%} of {len(pose.points_m):,} returns on the static world, mean "
+        f"fit to the map: {format_percent(pose.share_on_surface, 0)} of {len(pose.points_m):,} returns on "
+        "the static world, mean "
         f"distance {1000 * pose.residual_m:.1f} +- {1000 * pose.residual_se_m:.1f} mm, standard deviation "
         f"{1000 * best.sigma_m:.1f} mm; {pose.shift_m:.2f} m from --site",
     ]
@@ -270,7 +272,10 @@ def _millimetres(estimate: Estimate | None) -> str:
 def _percent(estimate: Estimate | None) -> str:
     if estimate is None:
         return "unknown (too few neighbouring returns)"
-    return f"{estimate.value:.2%} of pulses (95 % interval {estimate.low:.2%} to {estimate.high:.2%})"
+    return (
+        f"{format_percent(estimate.value, 2)} of pulses (95 % interval {format_percent(estimate.low, 2)} "
+        f"to {format_percent(estimate.high, 2)})"
+    )
 
 
 @app.command()
@@ -305,6 +310,7 @@ def design(
     elevation_evaluations: Annotated[
         int, typer.Option(metavar="N", help="Sets of elevations that are tried for free channels.")
     ] = _REQUEST.elevation_evaluations,
+    detector: Detector = None,
     set_: Set = None,
     out: Annotated[
         Path | None,
@@ -320,7 +326,7 @@ def design(
     if not pole:
         raise InputError("--pole", "no pole is given", "Use the name of a pole, or of a site on it.")
     heights_m = None if heights is None else options.heights_m(heights)
-    loaded, folder = sources.open_source(scenario, set_, None)
+    loaded, folder = sources.open_source(scenario, options.with_detector(set_, detector, scenario), None)
     with ProgressDisplay("sensor design") as screen:
         from egvs.cli import answer
         from egvs.placement import sensor_design
@@ -382,8 +388,8 @@ def print_design(result: DesignResult, file: Path | None) -> None:
         Column("height m", lambda design: f"{design.pose.z_m - result.ground_m:.2f}"),
         Column("yaw deg", lambda design: f"{design.pose.yaw_deg:.1f}"),
         Column("pitch deg", lambda design: f"{design.pose.pitch_deg:.1f}"),
-        Column("found, frames of the search", lambda design: f"{design.search_score:.1%}"),
-        Column("found, other frames", lambda design: f"{100 * design.score:.1f} ± {100 * design.se:.1f}%"),
+        Column("found, frames of the search", lambda design: format_percent(design.search_score)),
+        Column("found, other frames", lambda design: f"{100 * design.score:.1f} ± {100 * design.se:.1f} %"),
         Column(f"minus {designs[0].sensor.name}, % points", _format_gain),
     ]
     out = console(_DESIGN_WIDTH, soft_wrap=False)

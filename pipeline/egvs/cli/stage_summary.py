@@ -13,7 +13,7 @@ from typing import Any
 
 from egvs.artefacts.run_record import StageRecord
 from egvs.core.errors import WARNINGS_KEY
-from egvs.core.wording import number_of
+from egvs.core.wording import format_percent, number_of
 from egvs.report.formatting import SCORE_LABELS
 
 COUNTS, ASSUMED_FLOWS = "the counts", "the assumed flows"
@@ -140,7 +140,7 @@ def _traffic_sentences(rest: dict[str, Any], summary: dict[str, Any], flow_sourc
         yield Sentence(describe_vehicles(rest.pop("vehicles")))
         standing, longest_s = rest.pop("share_standing"), rest.pop("longest_standing_s")
         yield _detail(f"mean speed {3.6 * rest.pop('mean_speed_m_s'):.0f} km/h")
-        yield _detail(f"standing {standing:.0%} of the time, for at most {longest_s:g} s")
+        yield _detail(f"standing {format_percent(standing, 0)} of the time, for at most {longest_s:g} s")
         yield _detail(f"vehicles overlap in {number_of(rest.pop('frames_with_overlap'), 'frame')}")
     if rest.get("collisions") is not None:
         yield _detail(number_of(rest.pop("collisions"), "collision"))
@@ -163,12 +163,14 @@ def _track_sentences(tracks: dict[str, Any]) -> Iterator[Sentence]:
     """Yield what was read from recorded tracks, changed and left out."""
     text = number_of(tracks["tracks"], "track")
     if coverage := tracks.get("coverage"):
-        text += f" cover {coverage['share']:.0%} of the {coverage['of']}"
+        text += f" cover {format_percent(coverage['share'], 0)} of the {coverage['of']}"
     else:
         text += " of people beside the vehicles"
     yield Sentence(text)
     if alignment := tracks.get("alignment"):
-        yield _detail(f"{alignment['share_on_lanes']:.0%} of the positions of moving vehicles lie on lanes")
+        yield _detail(
+            f"{format_percent(alignment['share_on_lanes'], 0)} of the positions of moving vehicles lie on lanes"
+        )
     yield _detail(f"{tracks['rows']:,} rows read, {tracks['step_s']:g} s apart")
     for key, words in _TRACK_COUNTS.items():
         if tracks[key]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from egvs.core.wording import by_number
+from egvs.core.wording import by_number, format_percent
 from egvs.report.formatting import join_names
 
 if TYPE_CHECKING:
@@ -36,7 +36,8 @@ def ablation_conclusion(changes: Sequence[EffectChange]) -> str:
     for change in moved:
         name = "all effects together" if change.effect == "all" else change.effect
         losses.append(
-            f"{join_names(_first_sites(change))} under {name} (choosing {first[0]} loses {_loss(plain, change):.2%})"
+            f"{join_names(_first_sites(change))} under {name} (choosing {first[0]} loses "
+            f"{format_percent(_loss(plain, change), 2)})"
         )
     return (
         f"Conclusion: {subject} {by_number(len(first), 'is', 'are')} first without effects, but {join_names(losses)}."

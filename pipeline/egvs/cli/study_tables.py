@@ -16,8 +16,8 @@ from rich.console import Console
 from rich.table import Table
 
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
-from egvs.cli.console import NARROW, Column, console, format_or_dash, make_table, print_sentences
-from egvs.core.wording import list_first
+from egvs.cli.console import NARROW, Column, console, format_or_dash, make_table, percent_or_dash, print_sentences
+from egvs.core.wording import format_percent, list_first
 from egvs.report.formatting import SCORE_LABELS, join_names
 from egvs.report.ranking import RankedSite, share_of_limit
 from egvs.report.sensor_results import (
@@ -184,7 +184,7 @@ def _describe_mount(with_pitch: bool, site: RankedSite) -> str:
 
 
 def format_score(site: RankedSite) -> str:
-    """Return the score that ranks with its standard error, e.g. "87.1% ± 0.5%"."""
+    """Return the score that ranks with its standard error, e.g. "87.1 % ± 0.5 %"."""
     error = site.by.error(site.score, site.score_se)
     if error == "-":
         return site.by.value(site.score)
@@ -216,7 +216,8 @@ def _print_pole_notes(out: Console, comparison: Comparison, top: int | None) -> 
     if compared:
         sentences.append(
             f"differences of the best mounts from {first.label} are in {difference_unit(first.ranking.best[0])}, ± "
-            f"their standard error; ~ it is not clear which is better (probability below {DISTINCT_PROBABILITY:.0%})"
+            "their standard error; ~ it is not clear which is better (probability below "
+            f"{format_percent(DISTINCT_PROBABILITY, 0)})"
         )
     print_sentences(sentences)
     out.print()
@@ -282,9 +283,7 @@ def _run_columns(run: ComparedRun, width: int) -> list[Column[str]]:
     score = Column(f"{run.label} {label.head}", partial(cell_text, lambda site: label.value(site.score)))
     error = Column(f"{run.label} error", partial(cell_text, lambda site: label.error(site.score, site.score_se)))
     egvs = Column(f"{run.label} bit", partial(cell_text, lambda site: f"{site.egvs:.1f}"))
-    share = Column(
-        f"{run.label} of limit", partial(cell_text, lambda site: format_or_dash(share_of_limit(site), ".1%"))
-    )
+    share = Column(f"{run.label} of limit", partial(cell_text, lambda site: percent_or_dash(share_of_limit(site))))
     rank = Column(f"{run.label} rank", partial(cell_text, lambda site: site.rank))
 
     columns = [score, error, egvs, rank]
@@ -325,7 +324,7 @@ def _agreement_table(comparison: Comparison) -> Table:
         Column("tau", lambda pair: format_or_dash(pair.tau, ".2f")),
         Column("rho", lambda pair: format_or_dash(pair.rho, ".2f")),
         Column("best", _format_best_sites, "left", wrap=True),
-        Column("regret of the first run's best", lambda pair: format_or_dash(pair.regret_a, ".2%"), wrap=True),
+        Column("regret of the first run's best", lambda pair: percent_or_dash(pair.regret_a, 2), wrap=True),
     ]
     first = comparison.runs[0].label
     with_first = [pair for pair in comparison.agreements if pair.a == first]

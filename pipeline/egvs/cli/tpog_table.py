@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egvs.cli.console import WIDE, Column, console, make_table
-from egvs.report.formatting import format_percent
+from egvs.core.wording import format_percent
 from egvs.studies.tpog_page import format_bit, format_measured, format_share, format_speed
 
 FULLY_COVERED = 0.95

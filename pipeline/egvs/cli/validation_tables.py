@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from egvs.cli.console import NARROW, Column, console, print_sentences, print_table
 from egvs.core.remaining_time import RemainingTime
-from egvs.core.wording import number_of
+from egvs.core.wording import format_percent, number_of
 from egvs.report.formatting import SCORE_LABELS
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.validation.detection_metrics import ALL_OBJECTS
@@ -237,7 +237,7 @@ def print_training(out: Path, metadata: Mapping[str, Any]) -> None:
 
 
 def _format_precision(name: str, entry: Mapping[str, float]) -> str:
-    return f"{entry[name]:.1%}"
+    return format_percent(entry[name])
 
 
 def print_export(dataset: WrittenDataset) -> None:

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from egvs.cli.options import Set, SettingsPath
+from egvs.cli import options
+from egvs.cli.options import Detector, Set, SettingsPath
+from egvs.core.wording import format_percent
 
 if TYPE_CHECKING:
     from egvs.studies.what_if import SiteScores, WhatIfAnswer, WhatIfResult, WhatIfRun
@@ -19,6 +21,7 @@ _Values = Callable[["SiteScores"], tuple[float | None, ...]]
 
 def what_if(
     scenario: SettingsPath,
+    detector: Detector = None,
     set_: Set = None,
     only: Annotated[
         list[str] | None,
@@ -32,7 +35,7 @@ def what_if(
         from egvs.runs import run
         from egvs.studies import what_if as study
 
-        prepared = study.prepare_runs(scenario, set_ or [], only or [])
+        prepared = study.prepare_runs(scenario, options.with_detector(set_, detector), only or [])
         total = len(prepared)
         width = max(len(_run_label(what_if_run)) for what_if_run in prepared)
 
@@ -56,7 +59,7 @@ def _run_label(what_if_run: WhatIfRun) -> str:
 
 def print_what_if(result: WhatIfResult) -> None:
     """Print the scores of the best sites, the answer of each table, and notes."""
-    from egvs.cli.console import Column, console, format_or_dash, make_table, print_sentences
+    from egvs.cli.console import Column, console, make_table, percent_or_dash, print_sentences
     from egvs.report.formatting import format_probability
     from egvs.report.sensor_results import difference_unit, format_difference
     from egvs.studies.what_if import impossible_note
@@ -84,7 +87,7 @@ def print_what_if(result: WhatIfResult) -> None:
 
     answers: list[Column[WhatIfAnswer]] = [
         Column("what if", lambda answer: answer.name, align="left"),
-        Column("share of time", lambda answer: format_or_dash(answer.share, ".0%")),
+        Column("share of time", lambda answer: percent_or_dash(answer.share, 0)),
         Column("best before", lambda answer: answer.best_before, align="left"),
         Column("best with it", lambda answer: answer.best_present or "-", align="left"),
         Column("best expected", lambda answer: answer.best_expected, align="left"),
@@ -102,7 +105,7 @@ def print_what_if(result: WhatIfResult) -> None:
 
 
 def _share(answer: WhatIfAnswer) -> str:
-    return answer.name if answer.share is None else f"{answer.name} {answer.share:.0%}"
+    return answer.name if answer.share is None else f"{answer.name} {format_percent(answer.share, 0)}"
 
 
 def _chance(format_probability: Callable[[float], str]) -> Callable[[WhatIfAnswer], str]:

@@ -32,6 +32,24 @@ def by_number(number: int, singular: str, plural: str) -> str:
     return singular if number == 1 else plural
 
 
+def format_percent(share: float, digits: int = 1, *, signed: bool = False) -> str:
+    """Return a share in per cent, as all output writes it: with a space before the sign.
+
+    Parameters
+    ----------
+    share
+        The share; 1 is 100 %.
+    digits
+        Number of decimals.
+    signed
+        Whether positive values have a plus sign.
+
+    >>> format_percent(0.1254), format_percent(0.9, 0), format_percent(0.1, signed=True), format_percent(-0.0001)
+    ('12.5 %', '90 %', '+10.0 %', '0.0 %')
+    """
+    return f"{100.0 * share:{'+' if signed else ''}z.{digits}f} %"
+
+
 def list_first(names: Sequence[str], most: int, separator: str = ", ") -> str:
     """Return the first names, and how many more there are.
 

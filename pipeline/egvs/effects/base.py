@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import numpy as np
 
 from egvs.core.errors import InputError
+from egvs.core.wording import format_percent
 from egvs.scenario.effects_config import EffectParameters
 from egvs.sensors.beam_hooks import BeamCutter, BeamExpander
 from egvs.traffic.vehicle_boxes import TrafficHook
@@ -215,7 +216,7 @@ class Detect(Effect[P]):
 
     def summary(self, scene: Scene) -> str:
         """Return the share of returns from the region of interest that is detected, as a sentence."""
-        worst, best = (f"{share:.0%}" for share in self.detection_shares(scene))
+        worst, best = (format_percent(share, 0) for share in self.detection_shares(scene))
         shares = best if worst == best else f"{worst} to {best}"
         return f"by its formula, {shares} of returns from the region are detected"
 

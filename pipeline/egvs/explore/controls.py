@@ -14,6 +14,7 @@ from typing import Any, Protocol, get_args
 
 import viser
 
+from egvs.core.wording import format_percent
 from egvs.explore.session import MovingPlan, PoseScore, Session
 from egvs.explore.settings import Settings
 from egvs.explore.view_state import LAYERS, View
@@ -83,7 +84,7 @@ def describe_score(rating: PoseScore, rank_by: str, candidate: PoseScore, candid
     title = f"{format_score(rank_by, rating.scores[rank_by])} {label.head if label.is_share else ''}".strip()
     before = candidate.scores[rank_by]
     if before > 0.0 and rating.site.pose != candidate.site.pose:
-        title += f" ({rating.scores[rank_by] / before - 1.0:+z.1%})"
+        title += f" ({format_percent(rating.scores[rank_by] / before - 1.0, signed=True)})"
     rows = [f"| {plain_name(name)} | {format_score(name, value)} |" for name, value in rating.scores.items()]
     rank = f"rank {rating.rank} of {candidates} by {plain_name(rank_by)}"
     return "\n".join([f"## {title}\n\n{rank}\n\n| score | value |\n|---|---|", *rows, "", findings_text])
@@ -140,7 +141,7 @@ def format_score(name: str, value: float) -> str:
     """Return a score with its unit and as many digits as a planner needs."""
     label = SCORE_LABELS[name]
     if label.is_share:
-        return f"{value:.1%}"
+        return format_percent(value)
     number = f"{value:,.1f}" if abs(value) >= 100.0 else f"{value:.4g}"
     return f"{number} {label.unit}".strip()
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import combinations, product
 from typing import NamedTuple
 
@@ -24,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from egvs.artefacts.tpog import Tpog
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.grid import Grid, Roi, Vec3
-from egvs.core.wording import number_of
+from egvs.core.wording import format_percent, number_of
 from egvs.explore.road_meshes import LANE_HEIGHT_M, Mesh, junction_mesh, lane_mesh, marking_mesh
 from egvs.explore.session import MovingPlan, Playback, PoseScore, Session
 from egvs.explore.view_state import Camera, View
@@ -571,10 +572,10 @@ def _draw_blindspots(context: LayerContext) -> str:
     context.draw_columns(points.astype(np.float32), point_colours, spots.cell_m)
     overall = "no vehicles were recorded"
     if spots.overall is not None:
-        overall = f"all vehicles: {spots.overall.share:.1%} found"
+        overall = f"all vehicles: {format_percent(spots.overall.share)} found"
     rows = [f"<b>{_escape_html(overall)}</b>"]
-    rows += [_escape_html(f"{location.words}: {location.share:.0%} found") for location in spots.worst]
-    return _scale_legend("share of vehicles not found", 0.0, 1.0, "{:.0%}") + text_legend(rows)
+    rows += [_escape_html(f"{location.words}: {format_percent(location.share, 0)} found") for location in spots.worst]
+    return _scale_legend("share of vehicles not found", 0.0, 1.0, partial(format_percent, digits=0)) + text_legend(rows)
 
 
 def _draw_points(context: LayerContext) -> str:
@@ -582,7 +583,9 @@ def _draw_points(context: LayerContext) -> str:
     points = context.session.points_map(context.rating.site, target)
     if points is None:
         return text_legend([_NO_NETWORK])
-    shares = [f"{points.share_with(limit):.1%} of the surface with {limit:g} points or more" for limit in (1, 20)]
+    shares = [
+        f"{format_percent(points.share_with(limit))} of the surface with {limit:g} points or more" for limit in (1, 20)
+    ]
     return _draw_classes(context, points, points.classes, CLASS_LABELS, f"points on a {target}") + text_legend(shares)
 
 
@@ -691,11 +694,11 @@ _DRAW_FUNCTIONS: dict[str, Callable[[LayerContext], str]] = {
 }
 
 
-def _scale_legend(title: str, low: float, high: float, number_format: str = "{:.3g}") -> str:
+def _scale_legend(title: str, low: float, high: float, format_number: Callable[[float], str] = "{:.3g}".format) -> str:
     """Return a colour bar with its ends."""
     stops = ", ".join(map(_css_colour, colour_scale(np.linspace(0.0, 1.0, _LEGEND_STEPS)).tolist()))
     bar = f'<div style="height:0.7em;background:linear-gradient(to right, {stops})"></div>'
-    ends = f"<span>{number_format.format(low)}</span><span>{number_format.format(high)}</span>"
+    ends = f"<span>{format_number(low)}</span><span>{format_number(high)}</span>"
     return _legend_box(f'{title}{bar}<div style="display:flex;justify-content:space-between">{ends}</div>')
 
 

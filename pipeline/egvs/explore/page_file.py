@@ -23,6 +23,7 @@ from egvs.core import files
 from egvs.core.errors import InputError, RunError
 from egvs.core.grid import Vec3
 from egvs.core.progress import ProgressCallback, no_progress
+from egvs.core.wording import format_percent
 from egvs.explore import controls, drawing, map_symbols
 from egvs.explore.access import AccessGuard
 from egvs.explore.recorded_traffic import TrafficClip, TrafficRecorder
@@ -249,7 +250,7 @@ def _traffic_legend(clip: TrafficClip, session: Session) -> str:
     if not clip.has_returns:
         return drawing.text_legend(["without returns: the empty scan was measured, so no sweep can be simulated"])
     share = clip.share_visible(session.scene.roi)
-    found = "no vehicles in the region" if share is None else f"{share:.1%} of the vehicles in the region"
+    found = "no vehicles in the region" if share is None else f"{format_percent(share)} of the vehicles in the region"
     returns = "returns on road users"
     if clip.returns_step > 1:
         returns += f", 1 in {clip.returns_step} drawn"

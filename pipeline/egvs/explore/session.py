@@ -64,7 +64,7 @@ Floats = NDArray[np.float64]
 
 
 def _score_text(name: str, value: float) -> str:
-    """Return a score with its name and unit, e.g. "egvs 1,234 bit" or "expected_detections 61.3%"."""
+    """Return a score with its name and unit, e.g. "egvs 1,234 bit" or "expected_detections 61.3 %"."""
     label = SCORE_LABELS[name]
     return f"{name} {label.value(value)} {label.unit}".strip()
 
@@ -364,7 +364,7 @@ class Session:
         beams = self.beams(site)
         probability = detection_probability(self.scene_with(site), beams.sensor)
         visible = visible_targets(targets.record, beams, probability)
-        visibility = targets.spots.visibility(visible.points, TARGET_SCORES[DEFAULT_SCORE](visible))
+        visibility = targets.spots.visibility(visible.points, TARGET_SCORES[DEFAULT_SCORE](visible, targets.detectors))
         return site_blindspots(site.name, targets.spots, visibility, self.tpog.grid)
 
     def points_map(self, site: Site, target: str) -> PointsMap | None:

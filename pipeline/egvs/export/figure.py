@@ -18,6 +18,7 @@ from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files, plugins
 from egvs.core.errors import InputError, MissingBackendError, unknown_site
 from egvs.core.progress import ProgressCallback, no_progress
+from egvs.core.wording import format_percent
 from egvs.export.export import EXPORT_FOLDER, safe_file_name
 from egvs.export.finished_run import FinishedRun
 from egvs.report import figures, maps
@@ -147,7 +148,7 @@ def _site_view_svg(
         which, share, verb = ~which, 1.0 - share, "misses"
     peak = float(column_entropy(field, np.ones(len(which), dtype=np.bool_)).max())
     view = SiteViewFigure(site, crossed, backdrop, box)
-    alt = f"From above: the {share:.1%} of the entropy {what} by {site.site}."
+    alt = f"From above: the {format_percent(share)} of the entropy {what} by {site.site}."
     label = f"Entropy in the column that {site.site} {verb} (bit)"
     return maps.site_view(tpog.grid, column_entropy(field, which), peak, view, what, alt, style, label)
 

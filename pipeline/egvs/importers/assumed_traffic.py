@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from egvs.core.errors import InputError
-from egvs.core.wording import by_number
+from egvs.core.wording import by_number, format_percent
 from egvs.importers import junctions
 from egvs.importers.junctions import StreetJunction, Streets
 from egvs.scenario.traffic_config import CountConfig
@@ -78,7 +78,7 @@ class AssumedTraffic:
             carried = "all" if self.capacity.is_everything else f"{self.carried_per_h:,}"
             return f"carries {carried} of the {self.assumed_per_h:,} requested vehicles an hour"
         at_least = "at least " if self.capacity.is_everything else ""
-        share = f"{TRAFFIC_LEVELS[self.level]:.0%}".replace("%", " %")
+        share = format_percent(TRAFFIC_LEVELS[self.level], 0)
         return f"carries {at_least}{self.carried_per_h:,} vehicles an hour; {self.level} {share} is used"
 
 

@@ -25,7 +25,7 @@ from scipy.spatial import KDTree
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.progress import ProgressCallback, no_progress
-from egvs.core.wording import number_of
+from egvs.core.wording import format_percent, number_of
 from egvs.explore.session import Session
 from egvs.installation import scan_comparison
 from egvs.installation.acceptance_limits import MAX_VEHICLE_HEIGHT_M, Limits
@@ -473,7 +473,8 @@ def _notes(fit: Registration, comparison: ScanComparison, other_yaws_deg: Sequen
         )
     if comparison.scans < scan_comparison.PERSISTENT_SCANS and comparison.nearer_share > 0.05:
         notes.append(
-            f"{comparison.nearer_share:.0%} of the returns are nearer than expected where vehicles can be: with"
+            f"{format_percent(comparison.nearer_share, 0)} of the returns are nearer than expected where "
+            "vehicles can be: with"
             f" {scan_comparison.PERSISTENT_SCANS} or more scans, some minutes apart, obstacles below the height of"
             " vehicles are found too"
         )
@@ -556,22 +557,54 @@ def _checks(error: PoseError, comparison: ScanComparison, score: ScoreChange | N
     if not math.isnan(comparison.return_share):
         share = comparison.return_share
         passed = share >= limits.returns
-        reason = "" if passed else f"only {share:.0%} of the expected returns come back"
-        checks.append(Check("expected returns", f"{share:.1%}", f"at least {limits.returns:.0%}", passed, reason))
+        reason = "" if passed else f"only {format_percent(share, 0)} of the expected returns come back"
+        checks.append(
+            Check(
+                "expected returns",
+                format_percent(share),
+                f"at least {format_percent(limits.returns, 0)}",
+                passed,
+                reason,
+            )
+        )
     off = comparison.off_beams / comparison.returns
     passed = off <= limits.off_beams
-    reason = "" if passed else f"{off:.0%} of the returns lie on no beam of the planned sensor: is it another model?"
-    checks.append(Check("returns on no beam", f"{off:.1%}", f"at most {limits.off_beams:.0%}", passed, reason))
+    reason = (
+        ""
+        if passed
+        else f"{format_percent(off, 0)} of the returns lie on no beam of the planned sensor: is it another model?"
+    )
+    checks.append(
+        Check(
+            "returns on no beam", format_percent(off), f"at most {format_percent(limits.off_beams, 0)}", passed, reason
+        )
+    )
     if score is None:
         passed = math.isinf(limits.loss)
         reason = "" if passed else "the score of the installed sensor cannot be computed"
-        checks.append(Check("score", "cannot be scored", f"at least {-limits.loss:+.0%}", passed, reason))
+        checks.append(
+            Check(
+                "score", "cannot be scored", f"at least {format_percent(-limits.loss, 0, signed=True)}", passed, reason
+            )
+        )
     else:
         label = SCORE_LABELS[score.name]
         passed = score.loss <= limits.loss
         measured = f"{label.value(score.as_installed)} instead of {label.value(score.planned)} {label.unit}".rstrip()
-        reason = "" if passed else f"the installed sensor loses {score.loss:.1%} of its planned score: {measured}"
-        checks.append(Check("score", f"{-score.loss:+z.1%}", f"at least {-limits.loss:+.0%}", passed, reason))
+        reason = (
+            ""
+            if passed
+            else f"the installed sensor loses {format_percent(score.loss)} of its planned score: {measured}"
+        )
+        checks.append(
+            Check(
+                "score",
+                format_percent(-score.loss, signed=True),
+                f"at least {format_percent(-limits.loss, 0, signed=True)}",
+                passed,
+                reason,
+            )
+        )
     return checks
 
 

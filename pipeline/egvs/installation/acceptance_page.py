@@ -23,7 +23,7 @@ from egvs.installation.planned_sites import path_in_run
 from egvs.installation.scan_comparison import NEARER_M, NEARER_SHARE, SURE_RANGE, ScanComparison
 from egvs.report import colours, command_sections, page
 from egvs.report.colours import STYLE_SHEET, IndexedImage
-from egvs.report.formatting import SCORE_LABELS
+from egvs.report.formatting import SCORE_LABELS, keep_percentages_together
 from egvs.report.svg_figures import ColourBar, svg_start_tag
 from egvs.runs.command_results import add_to_report
 
@@ -121,10 +121,11 @@ def render_page(result: Acceptance) -> str:
     environment.filters |= {"svg": Markup}
     images = range_images(result.comparison)
     label = None if result.score is None else SCORE_LABELS[result.score.name]
-    return environment.get_template("acceptance.html.j2").render(
+    html = environment.get_template("acceptance.html.j2").render(
         result=result, images=images, scale=_range_scale(images.peak_m), categories=CATEGORIES, label=label,
         pose_rows=_pose_rows(result), style=Markup(STYLE_SHEET), version=__version__,
     )  # fmt: skip
+    return keep_percentages_together(html)
 
 
 def _pose_rows(result: Acceptance) -> list[tuple[str, str, str, str]]:

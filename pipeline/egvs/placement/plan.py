@@ -34,6 +34,7 @@ from egvs.placement.plan_error import PlanErrors
 from egvs.placement.plan_zones import PlanZones
 from egvs.placement.problem import Problem
 from egvs.placement.problem_builder import PlacementProblem, TargetView
+from egvs.placement.refinement import PlanPoses
 from egvs.placement.solver import CurvePoint, Solution
 from egvs.runs import run, stage_registry
 from egvs.runs.run import StageListener, ignore_stage, lock_run_folder
@@ -406,20 +407,26 @@ def solve_placement(context: StageContext, *, exact: bool, time_limit_s: float) 
     placed = _make_placement(scenario, placement_problem, problem, sites, solution.order, solution)
     errors = PlanErrors(context, placement_problem)
     if config.refine is None or not placed.sensors:
-        placed = _with_errors(placed, errors, placement_problem, problem, solution.order)
+        placed = _with_errors(placed, errors, placement_problem, placement_problem, solution.order)
         return replace(placed, fused=_fused_plan(context, placement_problem, problem, solution.order, errors))
     return _refine_placement(context, placement_problem, config.refine, placed, errors)
 
 
 def _with_errors(
-    placed: Placement, errors: PlanErrors, placement_problem: PlacementProblem, problem: Problem, order: Sequence[int]
+    placed: Placement,
+    errors: PlanErrors,
+    placement_problem: PlacementProblem,
+    poses: PlacementProblem | PlanPoses,
+    order: Sequence[int],
 ) -> Placement:
-    """Return a plan with standard errors; ``problem`` and ``order`` as in :func:`_make_placement`."""
-    curve_errors = errors.of_plans(placement_problem.problem.joint, [point.plan for point in placed.solution.curve])
+    """Return a plan with standard errors; ``order`` as in :func:`_make_placement`, ``poses`` as given or refined."""
+    curve_plans = [point.plan for point in placed.solution.curve]
+    curve_errors = errors.of_plans(placement_problem.problem.joint, curve_plans, placement_problem.sites)
     steps = [replace(step, **error._asdict()) for step, error in zip(placed.steps, curve_errors, strict=True)]
 
     prefixes = [tuple(order[: number + 1]) for number in range(len(order))]
-    sensor_errors = errors.of_plans(problem.joint, prefixes)
+    is_moved = isinstance(poses, PlanPoses)
+    sensor_errors = errors.of_plans(poses.problem.joint, prefixes, poses.sites, moved=is_moved)
     sensors = []
     for sensor, error in zip(placed.sensors, sensor_errors, strict=True):
         sensors.append(replace(sensor, score_se=error.score_se, gain_se=error.gain_se))
@@ -479,7 +486,7 @@ def _refine_placement(
     sites = [refined.after.sites[i] for i in order]
     problem = refined.after.problem
     result = _make_placement(context.scenario, placement_problem, problem, sites, order, solution)
-    result = _with_errors(result, errors, placement_problem, problem, order)
+    result = _with_errors(result, errors, placement_problem, refined.after, order)
     sensors = []
     for sensor, i in zip(result.sensors, order, strict=True):
         sensors.append(replace(sensor, moved_m=refined.moved_m(i), gain_by_refining=refined.gain(i)))

@@ -5,6 +5,9 @@ for the score of one site (:mod:`egvs.scoring.standard_errors`). Neighbouring gr
 single candidates are correlated, as they are for ``scores.parquet``. So a plan of one sensor has the standard error
 that ``egvs run`` gives this site.
 
+Where the score is a mean over detectors, each detector is left out in turn as well: the joint score is computed again
+from the probabilities of the others. Only the sensors of the plans are scanned again for that.
+
 Gains are compared on the same groups: what a plan adds to a smaller one is the difference of their replicates, and the
 scatter that both plans have in common cancels.
 
@@ -15,8 +18,9 @@ that of the score of these sensors, without the error of the choice.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -32,17 +36,21 @@ from egvs.scoring.standard_errors import (
     BlockJackknife,
     ScoreUncertainty,
     block_groups,
+    detector_groups,
+    means_without_each,
     summarise_uncertainty,
 )
-from egvs.scoring.targets import FrameGroups, recorded_frames
+from egvs.scoring.targets import FrameGroups, recorded_frames, weighted_mean
+from egvs.sensors.sites import Site
 from egvs.stages.base import StageContext
+from egvs.stages.plan_scans import plan_beams
 
 SHORT_RECORD = "; the recorded traffic is short for its autocorrelation, so they may be too small"
 """What is added to the origin of standard errors from a short record."""
 
 
 class PlanReplicates:
-    """Computes the joint scores of plans: of all traffic, and with each group of blocks left out.
+    """Computes the joint scores of plans: of all traffic, with each group of blocks and with each detector left out.
 
     Parameters
     ----------
@@ -52,6 +60,11 @@ class PlanReplicates:
         Its candidates.
     periods
         Blocks of each record of the traffic, at least two each.
+
+    Attributes
+    ----------
+    detector_groups
+        The detectors that are left out in turn, after the groups of blocks; empty without several of them.
     """
 
     def __init__(
@@ -59,31 +72,63 @@ class PlanReplicates:
     ) -> None:
         view, score = placement_problem.views[-1], placement_problem.score
         self._values: Callable[[IntArray], FloatArray]
+        self._other_detectors: Sequence[TargetView] = ()
         if isinstance(view, TargetView):
+            self._other_detectors = view.without_each_detector()
             self._values = _target_replicates(context, view, score, periods)
         else:
             self._values = _voxel_replicates(context, view, score, periods)
+        self.detector_groups = detector_groups(len(self._other_detectors))
+        self._context = context
+        self._score = score
+        self._amounts: dict[str, list[IntArray]] = {}
 
-    def of_plan(self, term: CoverageTerm, plan: Sequence[int]) -> FloatArray:
-        """Return the replicates of a plan, (1 + k,) float64; NaN where no traffic is left.
+    def of_candidate(self, term: CoverageTerm, candidate: int) -> FloatArray:
+        """Return the replicates of one candidate, (1 + k,) float64, without those of detectors."""
+        return self._values(CoverageState([term], (candidate,)).totals(term))
+
+    def of_plans(
+        self, term: CoverageTerm, plans: Sequence[Sequence[int]], sites: Sequence[Site], *, moved: bool = False
+    ) -> FloatArray:
+        """Return the replicates of m plans, (m, 1 + k + d) float64; NaN where no traffic is left.
 
         Parameters
         ----------
         term
             The joint score.
-        plan
+        plans
             Candidates of the term.
+        sites
+            The candidates of the term.
+        moved
+            Whether they were moved from the candidates of the run.
         """
-        return self._values(CoverageState([term], plan).totals(term))
+        rows = np.array([self._values(CoverageState([term], plan).totals(term)) for plan in plans])
+        if not self._other_detectors:
+            return rows
+        used = [sites[candidate] for candidate in sorted(set().union(*plans))]
+        amounts = self._amounts_without_detectors(used, moved=moved)
+        without = []
+        for plan in plans:
+            without.append(self._scores_without_detectors([amounts[sites[candidate].name] for candidate in plan]))
+        return np.column_stack([rows, without])
 
-    def of_order(self, term: CoverageTerm, order: Sequence[int]) -> FloatArray:
-        """Return the replicates of the first 0, 1, ... n sensors of a plan, (n + 1, 1 + k) float64."""
-        state = CoverageState([term])
-        rows = [self._values(state.totals(term))]
-        for candidate in order:
-            state.add(candidate)
-            rows.append(self._values(state.totals(term)))
-        return np.array(rows)
+    def _amounts_without_detectors(self, sites: Sequence[Site], *, moved: bool) -> Mapping[str, list[IntArray]]:
+        """Return site -> its amounts without each detector, (n_cells,) int64 each."""
+        amounts = {} if moved else self._amounts
+        missing = [site for site in sites if site.name not in amounts]
+        for name, beams in plan_beams(self._context, missing, moved=moved):
+            amounts[name] = [view.row(beams).dense(view.n_cells) for view in self._other_detectors]
+        return amounts
+
+    def _scores_without_detectors(self, sensors: Sequence[Sequence[IntArray]]) -> list[float]:
+        """Return the joint score of some sensors without each detector."""
+        scores = []
+        for number, view in enumerate(self._other_detectors):
+            totals = sum((amounts[number] for amounts in sensors), np.zeros(view.n_cells, dtype=np.int64))
+            values = problem.target_values(self._score, totals, view.unit)
+            scores.append(weighted_mean(values, view.targets.weight))
+        return scores
 
 
 def _target_replicates(
@@ -176,7 +221,8 @@ class PlanErrors:
         view = placement_problem.views[-1]
         if isinstance(view, TargetView):
             self._target_groups = _target_groups(context, view, periods)
-        self._groups = tuple(block_groups(period) for period in periods)
+        blocks = tuple(block_groups(period) for period in periods)
+        self._groups = blocks + self._replicates.detector_groups
         self._candidates = _replicates_of_candidates(context, placement_problem, self._replicates)
         if np.isnan(self._candidates).any():
             self.source = "without one of the blocks of frames there are no vehicles"
@@ -188,27 +234,25 @@ class PlanErrors:
         if any(stratum.is_short or stratum.still_correlated for stratum in estimate.strata):
             self.source += SHORT_RECORD
 
-    def of_plans(self, term: CoverageTerm, plans: Sequence[Plan]) -> list[StepError]:
+    def of_plans(
+        self, term: CoverageTerm, plans: Sequence[Plan], sites: Sequence[Site], *, moved: bool = False
+    ) -> list[StepError]:
         """Return the errors of a sequence of plans, each compared with the one before it.
 
-        Parameters
-        ----------
-        term
-            The joint score.
-        plans
-            Candidates of the term.
+        Parameters are those of :meth:`PlanReplicates.of_plans`.
         """
         if not self.are_known:
             return [UNKNOWN_ERROR] * len(plans)
-        return self._step_errors([self._replicates.of_plan(term, plan) for plan in ((), *plans)])
+        return self._step_errors(self._replicates.of_plans(term, ((), *plans), sites, moved=moved))
 
-    def of_target_values(self, values: Sequence[FloatArray]) -> list[StepError]:
-        """Return the errors of mean values over vehicle-frames, each but the first compared with the one before it.
+    def of_chances(self, chances: Sequence[FloatArray]) -> list[StepError]:
+        """Return the errors of mean probabilities of detection, each but the first compared with the one before it.
 
         Parameters
         ----------
-        values
-            Of each vehicle-frame, by plan, (n,) float64 each; the first belongs to no sensor, or to another plan.
+        chances
+            Of each detector and vehicle-frame, by plan, (d, n) float64 each; the first belongs to no sensor, or to
+            another plan.
 
         Raises
         ------
@@ -216,13 +260,24 @@ class PlanErrors:
             For a joint score over voxels.
         """
         if not self.are_known:
-            return [UNKNOWN_ERROR] * (len(values) - 1)
-        if self._target_groups is None:
+            return [UNKNOWN_ERROR] * (len(chances) - 1)
+        groups = self._target_groups
+        if groups is None:
             raise ValueError("expected a joint score over vehicle-frames")
-        return self._step_errors([self._target_groups.means(of_plan) for of_plan in values])
+        rows = []
+        for by_detector in chances:
+            row = groups.means(by_detector.mean(axis=0))
+            if self._replicates.detector_groups:
+                shares = np.array([weighted_mean(of_detector, groups.weight) for of_detector in by_detector])
+                row = np.append(row, means_without_each(shares))
+            rows.append(row)
+        return self._step_errors(np.array(rows))
 
-    def _step_errors(self, rows: Sequence[FloatArray]) -> list[StepError]:
-        """Return the errors of each row of replicates but the first, (1 + k,) each, compared with the one before it."""
+    def _step_errors(self, rows: FloatArray) -> list[StepError]:
+        """Return the errors of each row of replicates but the first, each compared with the one before it.
+
+        ``rows`` has the shape (1 + m, 1 + k + d).
+        """
         n_candidates = len(self._candidates)
         all_rows = np.vstack([self._candidates, rows])
         estimate = ScoreUncertainty.of(all_rows, self._groups, n_joined_by=n_candidates)
@@ -246,10 +301,12 @@ def _why_unknown(periods: Sequence[PeriodBlocks], *, standard_error: bool) -> st
 def _replicates_of_candidates(
     context: StageContext, placement_problem: PlacementProblem, replicates: PlanReplicates
 ) -> FloatArray:
-    """Return the replicates of each candidate alone, (n, 1 + k) float64."""
-    joint = placement_problem.problem.joint
+    """Return the replicates of each candidate alone, (n, 1 + k + d) float64.
 
-    def of_candidate(candidate: int) -> FloatArray:
-        return replicates.of_plan(joint, (candidate,))
-
-    return np.array(list(map_ordered(of_candidate, range(len(placement_problem.sites)), context.threads)))
+    They only decide which groups of blocks are joined, so their scores without a detector are not computed: they are
+    those of all detectors.
+    """
+    of_candidate = partial(replicates.of_candidate, placement_problem.problem.joint)
+    rows = np.array(list(map_ordered(of_candidate, range(len(placement_problem.sites)), context.threads)))
+    n_detectors = sum(len(group.frames) for group in replicates.detector_groups)
+    return np.column_stack([rows, np.repeat(rows[:, :1], n_detectors, axis=1)])

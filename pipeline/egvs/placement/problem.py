@@ -96,6 +96,12 @@ class VisibilityRow:
         amounts = np.minimum(hits[cells].astype(np.int64), max_amount)
         return cls(cells, amounts.astype(dtype))
 
+    def dense(self, n_cells: int) -> IntArray:
+        """Return the amounts in all cells, (n_cells,) int64."""
+        amounts = np.zeros(n_cells, dtype=np.int64)
+        amounts[self.cells] = self.amounts
+        return amounts
+
 
 @dataclass(frozen=True, eq=False)
 class VisibilityMatrix:

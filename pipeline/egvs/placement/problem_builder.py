@@ -85,11 +85,27 @@ class VoxelView:
 
 
 class TargetView:
-    """Turn empty scans into amounts on vehicle-frames, as a score counts them; may be shared by threads."""
+    """Turn empty scans into amounts on vehicle-frames, as a score counts them; may be shared by threads.
 
-    def __init__(self, context: StageContext, targets: TargetScorer, score: str) -> None:
+    Parameters
+    ----------
+    context
+        The run.
+    targets
+        The vehicles.
+    score
+        The score.
+    detectors
+        Detectors whose probabilities are averaged; those of the scenario when None.
+    """
+
+    def __init__(
+        self, context: StageContext, targets: TargetScorer, score: str, detectors: Sequence[str] | None = None
+    ) -> None:
         self.targets = targets
+        self.context = context
         self._score = score
+        self._detectors = targets.detectors if detectors is None else tuple(detectors)
         scene = get_scene(context)
         if score == "expected_detections":
             self.unit = problem.CHANCE_UNIT
@@ -103,6 +119,13 @@ class TargetView:
         """Number of cells."""
         return len(self.targets.record)
 
+    def without_each_detector(self) -> list[TargetView]:
+        """Return one view for each detector of the score, by all the others; empty for a score of one, or of none."""
+        if self._score != "expected_detections" or len(self._detectors) < 2:
+            return []
+        others = [[other for other in self._detectors if other != left_out] for left_out in self._detectors]
+        return [TargetView(self.context, self.targets, self._score, names) for names in others]
+
     def row(self, beams: Beams) -> VisibilityRow:
         """Return the amounts of a scan on all vehicle-frames."""
         amounts = self._amounts(self.targets.visible(beams))
@@ -111,7 +134,7 @@ class TargetView:
     def _amounts(self, visible: VisibleTargets) -> FloatArray:
         if self._score != "expected_detections":
             return visible.points
-        probability = np.minimum(TARGET_SCORES[self._score](visible), _MAX_PROBABILITY)
+        probability = np.minimum(TARGET_SCORES[self._score](visible, self._detectors), _MAX_PROBABILITY)
         return -np.log1p(-probability)
 
 

@@ -47,10 +47,15 @@ from egvs.report.sensor_results import ScoreDifference
 from egvs.runs import run, stage_registry
 from egvs.runs.command_results import add_to_report
 from egvs.scenario.model import Scenario
-from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.scenario.sensor_config import SensorConfig
-from egvs.scoring.standard_errors import BlockGroups, ScoreUncertainty, group_sizes
-from egvs.scoring.target_scores import TARGET_SCORES
+from egvs.scoring.standard_errors import (
+    BlockGroups,
+    ScoreUncertainty,
+    detector_groups,
+    group_sizes,
+    means_without_each,
+)
+from egvs.scoring.target_scores import found_by_detector
 from egvs.scoring.targets import (
     FrameGroups,
     TargetRecord,
@@ -308,6 +313,7 @@ class _Designer:
         self._heights_m = request.heights_m or _heights_m(self._sites, self.ground_m)
         self._evaluations = request.evaluations
         self._seed = context.scenario.seed
+        self._detectors = context.scenario.score.detectors
         self._search_half, self._other_half = self._read_halves()
 
     @property
@@ -410,24 +416,33 @@ class _Designer:
 
     def _values(self, sensor: Sensor, pose: Pose, half: _Half) -> FloatArray | None:
         """Return the probability that each vehicle of a half is found, (n,); None where no sensor can be."""
+        found = self._found(sensor, pose, half)
+        return None if found is None else found.mean(axis=0)
+
+    def _found(self, sensor: Sensor, pose: Pose, half: _Half) -> FloatArray | None:
+        """Return the probability that each detector finds each vehicle of a half, (d, n); None as :meth:`_values`."""
         probability = detection_probability(self._scene, sensor)  # InputError if an effect lacks a value of the sensor
         try:
             beams = Beams.of(self._scanner.scan(pose, sensor))
         except InputError:  # the only reasons: in a solid, below the ground, out of reach
             return None
-        values: FloatArray = TARGET_SCORES[DEFAULT_SCORE](visible_targets(half.record, beams, probability))
-        return values
+        return found_by_detector(visible_targets(half.record, beams, probability), self._detectors)
 
     def evaluate(self, trials: Sequence[_Trial]) -> list[Design]:
         """Score trials on the other frames, with errors, and compare them with the first."""
         half = self._other_half
         groups = self._other_groups()
+        detectors = detector_groups(len(self._detectors))
         rows = []
         for trial in trials:
-            values = self._values(trial.sensor, trial.pose, half)
-            assert values is not None, "the search scanned from there"
-            rows.append(groups.means(values, half.weight / groups.weight))
-        uncertainty = ScoreUncertainty.of(np.array(rows), groups.groups, len(rows))
+            found = self._found(trial.sensor, trial.pose, half)
+            assert found is not None, "the search scanned from there"
+            row = groups.means(found.mean(axis=0), half.weight / groups.weight)
+            if detectors:
+                by_detector = np.array([weighted_mean(chances, half.weight) for chances in found])
+                row = np.append(row, means_without_each(by_detector))
+            rows.append(row)
+        uncertainty = ScoreUncertainty.of(np.array(rows), groups.groups + detectors, len(rows))
         number = np.arange(len(trials))
         first = np.zeros(len(trials), dtype=np.int64)
         differences, better = uncertainty.differences(number, first), uncertainty.beats(number, first)

@@ -17,6 +17,7 @@ from egvs.artefacts.run_folder import COMMAND_RESULTS, RunFile, RunFolder
 from egvs.artefacts.run_record import StageRecord
 from egvs.core import files
 from egvs.core.errors import InputError
+from egvs.core.wording import format_percent
 from egvs.report.formatting import SCORE_LABELS, format_probability
 from egvs.report.ranking import RankedSite
 from egvs.report.sensor_results import ScoreDifference, difference_unit, format_difference
@@ -233,7 +234,7 @@ def _what_if_row(name: str, values: Mapping[str, Any], site: RankedSite) -> What
         chance = "–"
         if values["overtakes"] is not None:
             chance = f"{format_probability(values['overtakes'])} ({values['rival']})"
-    share = "–" if values["share"] is None else f"{values['share']:.0%}"
+    share = "–" if values["share"] is None else format_percent(values["share"], 0)
     return WhatIfRow(
         name, share, values["best_before"], values["best_present"] or "–", values["best_expected"], change, chance,
         values["conclusion"],

@@ -23,8 +23,8 @@ from egvs.artefacts.readers import MIN_VEHICLES, LocationVisibility, SiteBlindsp
 from egvs.artefacts.tpog import Tpog
 from egvs.core.grid import Grid
 from egvs.core.threads import map_ordered
-from egvs.core.wording import by_number
-from egvs.report import colours, formatting, maps, ranking
+from egvs.core.wording import by_number, format_percent
+from egvs.report import colours, maps, ranking
 from egvs.report.basemap import network_file, roads_within, world_outlines
 from egvs.report.colours import ColumnValues, IndexedImage
 from egvs.report.maps import Backdrop, SiteViewFigure
@@ -163,7 +163,7 @@ def occupancy_map(tpog: Tpog, ranking: Ranking, backdrop: Backdrop, style: Figur
     y = tpog.grid.origin_m[1] + (iy + 0.5) * tpog.grid.voxel_m
     alt = (
         f"Occupancy of the region of interest by traffic, seen from above: "
-        f"vehicles use {np.count_nonzero(mean) / mean.size:.0%} of its area; "
+        f"vehicles use {format_percent(np.count_nonzero(mean) / mean.size, 0)} of its area; "
         f"the busiest location is near x = {x:.0f} m, y = {y:.0f} m."
     )
     label = "Occupied voxels in the column"
@@ -300,7 +300,7 @@ def _panel_data(
     plan, site = maps.site_view_frame(box), coverage.scored
     data: dict[str, Any] = {
         "at": [round(plan.x(site.x_m), 1), round(plan.y(site.y_m), 1)],
-        "share": [formatting.format_percent(site.entropy_seen), formatting.format_percent(1 - site.entropy_seen)],
+        "share": [format_percent(site.entropy_seen), format_percent(1 - site.entropy_seen)],
         "caption": coverage.caption,
     }
     if blindspots is not None:
@@ -330,11 +330,11 @@ def _draw_panel(
     share = site.entropy_seen
     visible = maps.site_view(
         grid, coverage.visible_bit, peak, view, f"{prefix}-seen",
-        f"From above: the {share:.1%} of the entropy seen by {where}.",
+        f"From above: the {format_percent(share)} of the entropy seen by {where}.",
     )  # fmt: skip
     missed = maps.site_view(
         grid, coverage.missed_bit, peak, view, f"{prefix}-missed",
-        f"From above: the {1 - share:.1%} of the entropy missed by {where}.",
+        f"From above: the {format_percent(1 - share)} of the entropy missed by {where}.",
     )  # fmt: skip
     ends = maps.scan_view(grid, scan, view, f"{prefix}-scan", f"From above: where the beams of {where} end.")
     vehicles = None
@@ -390,7 +390,7 @@ def format_missed_share(site_blindspots: SiteBlindspots) -> str:
     """Return the share of all vehicles that a site misses."""
     if site_blindspots.overall is None:
         return "–"
-    return formatting.format_percent(1.0 - site_blindspots.overall.share)
+    return format_percent(1.0 - site_blindspots.overall.share)
 
 
 def describe_worst_locations(site_blindspots: SiteBlindspots) -> tuple[tuple[str, str], ...]:
@@ -425,8 +425,11 @@ def blindspot_note(site_blindspots: SiteBlindspots) -> str:
 
 
 def _format_share(location: LocationVisibility) -> str:
-    return f"{location.share:.0%}"
+    return format_percent(location.share, 0)
 
 
 def _describe_sample(location: LocationVisibility) -> str:
-    return f"± {location.se:.0%}, from {location.vehicles:,} vehicles in {location.vehicle_frames:,} observations"
+    return (
+        f"± {format_percent(location.se, 0)}, from {location.vehicles:,} vehicles in "
+        f"{location.vehicle_frames:,} observations"
+    )

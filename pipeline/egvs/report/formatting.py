@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
+from egvs.core.wording import format_percent
 from egvs.scenario.score_config import SCORES_IN_UNITS
 
 
@@ -87,20 +89,20 @@ class ScoreLabel:
         """Return a value as text, without its unit."""
         if math.isnan(value):
             return "-"
-        return f"{value:.{self.digits}%}" if self.is_share else f"{value:,.{self.digits}f}"
+        return format_percent(value, self.digits) if self.is_share else f"{value:,.{self.digits}f}"
 
     def error(self, value: float, se: float | None) -> str:
         """Return a standard error as text: in percentage points for shares, relative to the value otherwise."""
         if se is None or math.isnan(se) or not value > 0:
             return "-"
-        return f"±{se:.1%}" if self.is_share else f"{se / value:.1%}"
+        return f"±{format_percent(se)}" if self.is_share else format_percent(se / value)
 
     def with_error(self, value: float, se: float) -> str:
-        """Return a value and its standard error, without unit, e.g. "94.6 ± 0.9%"; the value alone if ``se`` is NaN."""
+        """Return a value and its error, without unit, e.g. "94.6 ± 0.9 %"; the value alone if ``se`` is NaN."""
         if math.isnan(value) or math.isnan(se):
             return self.value(value)
         text = f"{self._number(value)} ± {self._error_number(se)}"
-        return f"{text}%" if self.is_share else text
+        return f"{text} %" if self.is_share else text
 
     def change(self, value: float, se: float = math.nan) -> str:
         """Return a difference of two values, without unit: of shares in percentage points, e.g. "4.7 ± 0.5"."""
@@ -138,7 +140,7 @@ class ScoreLabel:
         return self._number(se)
 
     def sentence(self, value: float) -> str:
-        """Return what a site with this score does, e.g. "should find 87.0% of vehicles"."""
+        """Return what a site with this score does, e.g. "should find 87.0 % of vehicles"."""
         return self.says.format(f"{self.value(value)} {self.unit}".strip())
 
 
@@ -189,30 +191,46 @@ SCORE_LABELS = {label.name: label for label in _LABELS}
 """Labels by the name of the score."""
 
 
-def format_percent(value: float) -> str:
-    """Return a share in per cent, e.g. "12.5%"."""
-    return f"{value:.1%}"
-
-
 def format_probability(probability: float) -> str:
-    """Return a probability in whole per cent; "over 99%" and "under 1%" where it rounds to 100 or 0.
+    """Return a probability in whole per cent; "over 99 %" and "under 1 %" where it rounds to 100 or 0.
 
     A value below :data:`DISTINCT_PROBABILITY` is never written as this limit.
 
     Examples
     --------
     >>> format_probability(0.578), format_probability(0.896), format_probability(0.9996)
-    ('58%', '89%', 'over 99%')
+    ('58 %', '89 %', 'over 99 %')
     """
     percent = round(100.0 * probability)
     limit = round(100.0 * DISTINCT_PROBABILITY)
     if percent >= 100:
-        return "over 99%"
+        return "over 99 %"
     if percent <= 0:
-        return "under 1%"
+        return "under 1 %"
     if percent >= limit and probability < DISTINCT_PROBABILITY:
         percent = limit - 1
-    return f"{percent}%"
+    return f"{percent} %"
+
+
+_NOT_TEXT = re.compile(r"(<(script|style)\b.*?</\2>)", re.DOTALL)
+_TEXT = re.compile(r">[^<>]+")
+_SPACE_BEFORE_SIGN = re.compile(r"(?<=\d) (?=%)")
+
+
+def keep_percentages_together(html: str) -> str:
+    """Return a page on which no line begins with the sign of a percentage: its space does not break.
+
+    Attributes, scripts and style sheets stay as they are.
+
+    >>> keep_percentages_together('<p title="5 %">5 %</p>').replace("\\u00a0", "_")
+    '<p title="5 %">5_%</p>'
+    """
+    parts = _NOT_TEXT.split(html)
+    for number in range(0, len(parts), 3):  # text, then the two groups of a script or style sheet
+        parts[number] = _TEXT.sub(lambda match: _SPACE_BEFORE_SIGN.sub("\u00a0", match[0]), parts[number])
+        if number + 2 < len(parts):
+            parts[number + 2] = ""
+    return "".join(parts)
 
 
 def format_count(value: float) -> str:

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from egvs.artefacts.readers import MAX_LOCATIONS, SiteBlindspots
 from egvs.core.grid import Grid
+from egvs.core.wording import format_percent
 from egvs.report import colours
 from egvs.report.basemap import Outlines, Roads, StreetName
 from egvs.report.colours import ColumnValues, IndexedImage
@@ -265,7 +266,7 @@ def missed_view(
     alt = f"From above: no vehicles for {site.site} to see."
     if blindspots.overall:
         missed = 1.0 - blindspots.overall.share
-        alt = f"From above: {missed:.1%} of the vehicles are not found from {site.site}; share by cell."
+        alt = f"From above: {format_percent(missed)} of the vehicles are not found from {site.site}; share by cell."
     bar = ColourBar(0.0, 100.0, "Share of vehicles not found (%)", even=True)
     return plan.svg(parts, alt, bar)
 

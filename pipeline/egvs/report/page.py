@@ -23,6 +23,7 @@ from egvs.artefacts.run_record import RunRecord, StageRecord, traffic_summary
 from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files
 from egvs.core.errors import WARNINGS_KEY, collect_warnings
+from egvs.core.wording import format_percent
 from egvs.report import figures, formatting, maps
 from egvs.report.approach_fits import ApproachFit, compare_approaches
 from egvs.report.approach_map import busiest_counts, draw_approach_map
@@ -287,7 +288,7 @@ def render_page(contents: PageContents) -> str:
         **_sentences(contents),
         **_warning_values(contents),
     }
-    return _template_environment().get_template("report.html.j2").render(values)
+    return formatting.keep_percentages_together(_template_environment().get_template("report.html.j2").render(values))
 
 
 def prepare() -> None:
@@ -315,7 +316,7 @@ def _template_environment() -> Environment:
     )
     environment.filters |= {
         "svg": Markup,
-        "share": formatting.format_percent,
+        "share": format_percent,
         "probability": formatting.format_probability,
         "whole": formatting.format_count,
         "plain": formatting.format_number,
@@ -397,7 +398,9 @@ def _warning_values(contents: PageContents) -> dict[str, Any]:
     warnings = collect_warnings(stage.summary for stage in contents.stages.values())
     return {
         "warnings": warnings,
-        "reliability": describe_reliability(contents.ranking, traffic_summary(contents.stages)),
+        "reliability": describe_reliability(
+            contents.ranking, traffic_summary(contents.stages), contents.scenario.score.ranking_detectors
+        ),
         "poles_on_road": describe_poles_on_road(contents.ranking.poles[:NAMED_POLES], warnings),
     }
 

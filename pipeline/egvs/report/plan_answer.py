@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 from egvs.artefacts.plan_step import PlanStep
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
+from egvs.core.wording import format_percent
 from egvs.report.formatting import ScoreLabel, join_names
 
 MIN_USEFUL_SHARE = 0.01
@@ -60,7 +61,7 @@ def describe_joint_score(by: ScoreLabel, sensors: int) -> str:
     if sensors < 2 or by.name not in _INDEPENDENT_SCORES:
         return ""
     return (
-        "Joint shares assume that sensors miss vehicles independently of each other; near 100% they are upper ends "
+        "Joint shares assume that sensors miss vehicles independently of each other; near 100 % they are upper ends "
         "(docs/placement.md)."
     )
 
@@ -215,7 +216,7 @@ def _describe_gain(step: PlanStep, by: ScoreLabel) -> str:
     text = f"{by.change(step.gain, step.gain_se)} {by.change_unit}".rstrip()
     if by.is_share or not step.score > 0.0:
         return text
-    return f"{text} ({step.gain / step.score:.1%} of the plan's score)"
+    return f"{text} ({format_percent(step.gain / step.score)} of the plan's score)"
 
 
 def _describe_chance(step: PlanStep, by: ScoreLabel) -> str:

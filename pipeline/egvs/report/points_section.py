@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from egvs.core.grid import Grid
+from egvs.core.wording import format_percent
 from egvs.report import maps
-from egvs.report.formatting import format_percent
 from egvs.report.maps import Backdrop
 from egvs.report.ranking import RankedSite
 from egvs.report.svg_figures import Box, ColourClasses, extent

@@ -16,13 +16,12 @@ from egvs.artefacts import parquet
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.artefacts.run_record import StageRecord
 from egvs.core.errors import InputError
-from egvs.core.wording import by_number, list_first
+from egvs.core.wording import by_number, format_percent, list_first
 from egvs.report.formatting import (
     SCORE_LABELS,
     ScoreLabel,
     format_count,
     format_number,
-    format_percent,
     format_probability,
     join_names,
 )
@@ -56,6 +55,8 @@ class RankedSite(MapSite):
     ----------
     egvs_se, beats_next, behind_best_se, best_beats
         None where no standard errors were computed; the last two also in files of earlier versions.
+    behind_best_detectors_se
+        None where no standard errors were computed, and for a score without several detectors.
     longitude_deg, latitude_deg
         None where the scenario has no reference system.
     user_columns
@@ -78,6 +79,7 @@ class RankedSite(MapSite):
     egvs_se: float | None = None
     beats_next: float | None = None
     behind_best_se: float | None = None
+    behind_best_detectors_se: float | None = None
     best_beats: float | None = None
     longitude_deg: float | None = None
     latitude_deg: float | None = None
@@ -114,6 +116,13 @@ class RankedSite(MapSite):
         """Read ``scores.parquet``."""
         scores, metadata = parquet.read_artefact(path, "scores")
         return cls.from_table(scores, metadata.get("rank_by", "egvs"))
+
+    @property
+    def is_lag_by_detectors(self) -> bool:
+        """Whether most of the squared error of the difference to the best site is due to detectors."""
+        if self.behind_best_se is None or self.behind_best_detectors_se is None:
+            return False
+        return 2.0 * self.behind_best_detectors_se**2 > self.behind_best_se**2
 
     @property
     def by(self) -> ScoreLabel:
@@ -376,7 +385,15 @@ def more_frames_hint(scenario: Scenario, by: ScoreLabel, recorded: int) -> str:
 
 
 def recorded_frames_hint(scenario: Scenario, ranking: Ranking, stages: Mapping[str, StageRecord]) -> str:
-    """Return :func:`more_frames_hint` for a run with these records of its stages; empty without the traffic's."""
+    """Return :func:`more_frames_hint` for a run with these records of its stages; empty without the traffic's.
+
+    Where differences between detectors are most of the error of the lead over the best site on another pole, more
+    frames do not help; then it names the option that compares the detectors.
+    """
+    rival = _best_on_another_pole(ranking)
+    if rival is not None and rival.is_lag_by_detectors:
+        options = " and ".join(f"--detector {name}" for name in scenario.score.ranking_detectors)
+        return f"The detectors disagree about this difference, and more traffic does not change that: see {options}."
     if "traffic" not in stages:
         return ""
     return more_frames_hint(scenario, ranking.by, stages["traffic"].summary["frames"])
@@ -414,7 +431,7 @@ def lead(ranking: Ranking, hint: str = "") -> str:
         text += f" {hint}"
     if len(ranking.close) > 1:
         names = list_first([site.site for site in ranking.close], 4)
-        text += f" {len(ranking.close)} other sites score within {CLOSE_SHARE:.0%} of the best: {names}."
+        text += f" {len(ranking.close)} other sites score within {format_percent(CLOSE_SHARE, 0)} of the best: {names}."
     return text
 
 
@@ -453,7 +470,7 @@ def _format_gap(ranking: Ranking, second: RankedSite) -> str:
     if is_share:
         return f"{gap_text} percentage points"
     owner = by_number(len(ranking.best), "its", "their")
-    return f"{gap_text}% of {owner} score"
+    return f"{gap_text} % of {owner} score"
 
 
 def entropy_seen_note(ranking: Ranking) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from egvs.core.wording import format_percent
 from egvs.report.formatting import join_names
 from egvs.report.ranking import RankedSite, Ranking
 from egvs.scenario.score_config import DEFAULT_SCORE
@@ -12,21 +13,28 @@ from egvs.scenario.score_config import DEFAULT_SCORE
 MIN_TILT_DEG = 5.0
 """A sensor is called tilted from this pitch or roll on. The sensors of the validation study were level."""
 
-_ERROR_NOTE = "± is the error of a finite {} only."
-_SEEDS_NOTE = "± is the error of finite simulations only, from the differences between {} of them."
+_ERROR_NOTE = "± is the error of a finite {} only"
+_SEEDS_NOTE = "± is the error of finite simulations only, from the differences between {} of them"
+_ERROR_NOTE_OF_DETECTORS = "± contains the error of a finite {}, and how far the detectors ({}) disagree"
+_SEEDS_NOTE_OF_DETECTORS = (
+    "± contains the error of finite simulations, from the differences between {} of them, and how far the detectors "
+    "({}) disagree"
+)
 _SIZE_NOTE = (
     "The order of sites by this score was validated, the size of the score less: in the studies, detectors found up to "
     "27 percentage points fewer vehicles than expected (docs/validity.md)."
 )
-_COVERAGE_NOTE = "The recorded tracks cover {share:.0%} of the {of}; elsewhere the traffic is unknown."
+_COVERAGE_NOTE = "The recorded tracks cover {} of the {}; elsewhere the traffic is unknown."
 _TILT_NOTE = "The sensor of {} is tilted; tilted sensors were not part of the validation (docs/validity.md)."
 
 
-def describe_reliability(ranking: Ranking, traffic: Mapping[str, Any] | None = None) -> list[str]:
+def describe_reliability(
+    ranking: Ranking, traffic: Mapping[str, Any] | None = None, detectors: Sequence[str] = ()
+) -> list[str]:
     """Return the reasons to be careful with a ranking, in sentences.
 
     - With several simulations: that errors come from their differences.
-    - By ``expected_detections``: what the standard errors leave out, and how far the size of the score was validated.
+    - By ``expected_detections``: what the standard errors contain, and how far the size of the score was validated.
     - The best site is tilted.
     - The traffic was recorded: what share of the region the recording covers.
     - The best site is the lowest, the highest or the most tilted of those on its pole, so that others may be better.
@@ -37,6 +45,8 @@ def describe_reliability(ranking: Ranking, traffic: Mapping[str, Any] | None = N
         The ranking. Without a best site, there is no reason.
     traffic
         Summary of the traffic stage, if it is known.
+    detectors
+        Detectors that the score that ranks averages over; empty for a score without detectors.
     """
     best = ranking.sites[0]
     if not best.score > 0.0 or ranking.is_tie:
@@ -45,21 +55,34 @@ def describe_reliability(ranking: Ranking, traffic: Mapping[str, Any] | None = N
     recordings = _track_summaries(traffic or {})
     seeds = _count_seeds(traffic or {})
     notes = []
-    if ranking.has_errors and seeds > 1:
-        notes.append(_SEEDS_NOTE.format(seeds))
-    elif ranking.has_errors and ranking.by.name == DEFAULT_SCORE:
-        notes.append(_ERROR_NOTE.format("recording" if recordings else "simulation"))
+    if ranking.has_errors and (seeds > 1 or ranking.by.name == DEFAULT_SCORE):
+        notes.append(_error_note(seeds, "recording" if recordings else "simulation", detectors))
     if ranking.by.name == DEFAULT_SCORE:
         notes.append(_SIZE_NOTE)
     if notes:
         sentences.append(" ".join(notes))
-    sentences += [_COVERAGE_NOTE.format(**coverage) for coverage in recordings]
+    sentences += [
+        _COVERAGE_NOTE.format(format_percent(coverage["share"], 0), coverage["of"]) for coverage in recordings
+    ]
     if max(abs(best.pitch_deg), abs(best.roll_deg)) >= MIN_TILT_DEG:
         sentences.append(_TILT_NOTE.format(best.site))
     limits = list(_limits(best, [site for site in ranking.sites if site.pole == best.pole]))
     if limits:
         sentences.append(f"The best site has {join_names(limits)}: one beyond what was tried may be better.")
     return sentences
+
+
+def _error_note(seeds: int, traffic: str, detectors: Sequence[str]) -> str:
+    """Return what standard errors contain."""
+    if len(detectors) > 1:
+        names = ", ".join(detectors)
+        if seeds > 1:
+            return f"{_SEEDS_NOTE_OF_DETECTORS.format(seeds, names)}."
+        return f"{_ERROR_NOTE_OF_DETECTORS.format(traffic, names)}."
+    note = _SEEDS_NOTE.format(seeds) if seeds > 1 else _ERROR_NOTE.format(traffic)
+    for detector in detectors:
+        note += f"; the score is that of the detector {detector}"
+    return f"{note}."
 
 
 def _count_seeds(traffic: Mapping[str, Any]) -> int:

@@ -24,6 +24,7 @@ from egvs.artefacts.run_folder import ACCURACY_FILES, PLACEMENT_FILES, VALIDATIO
 from egvs.artefacts.run_record import StageRecord
 from egvs.artefacts.tpog import Tpog
 from egvs.core.errors import Diagnostic, collect_warnings
+from egvs.core.wording import format_percent
 from egvs.report import maps, plan_answer, svg_figures
 from egvs.report.formatting import SCORE_LABELS, ScoreLabel, join_names
 from egvs.report.maps import Backdrop, PlannedPole
@@ -630,7 +631,9 @@ def _planned_poles(picks: Sequence[PlanRow], joint: float, by: ScoreLabel) -> li
             numbers.append(str(pick.order))
             sensor = f"{pick.order}. {pick.site}, {pick.z_m:g} m high, adds {by.value(pick.gain)} {by.unit}"
             sensors.append(sensor.strip())
-        poles.append(PlannedPole(x_m, y_m, ", ".join(numbers), f"{name}: {gain:.0%}", "; ".join(sensors)))
+        poles.append(
+            PlannedPole(x_m, y_m, ", ".join(numbers), f"{name}: {format_percent(gain, 0)}", "; ".join(sensors))
+        )
     return poles
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.grid import Grid
+from egvs.core.wording import format_percent
 from egvs.report import colours
 from egvs.report.colours import LIGHT, STEPS, STYLE_SHEET, Theme, opacity, shape_attributes
 from egvs.report.formatting import SCORE_LABELS, ScoreLabel, shorten_name
@@ -475,14 +476,17 @@ def sensor_count_chart(steps: Sequence[CurveStep], alt: str) -> str:
     for value, _ in round_values(100.0 * start, 100.0 * top, 5):
         y = base - scale * (value / 100.0 - start)
         parts.append(f'<path class="grid" d="M{_CURVE_LEFT:.1f} {y:.1f}h{width:.1f}"/>')
-        parts.append(_text(_CURVE_LEFT - 8, y + 4, f"{value:g}%", "end"))
+        parts.append(_text(_CURVE_LEFT - 8, y + 4, f"{value:g} %", "end"))
     label_step = 1
     if len(steps) > _MAX_LABELS:
         label_step += len(steps) // _MAX_LABELS
     for i, step in enumerate(steps):
         x, bar = _CURVE_LEFT + i * spacing, scale * (step.share - start)
         bound = base - scale * (step.bound - start)
-        title = f"{step.count} sensors: {step.share:.1%} of the score of all candidates; at most {step.bound:.1%}"
+        title = (
+            f"{step.count} sensors: {format_percent(step.share)} of the score of all candidates; at "
+            f"most {format_percent(step.bound)}"
+        )
         parts.append(
             f'<g class="step"><title>{escape(title)}</title>'
             f'<rect x="{x + 0.14 * spacing:.1f}" y="{base - bar:.1f}" width="{0.72 * spacing:.1f}" height="{bar:.1f}"/>'
@@ -493,7 +497,7 @@ def sensor_count_chart(steps: Sequence[CurveStep], alt: str) -> str:
     parts.append(f'<path class="axis" d="M{_CURVE_LEFT:.1f} {_CURVE_TOP:.1f}v{height:.1f}h{width:.1f}"/>')
     title = "sensors"
     if start > 0:
-        title += f" (the axis starts at {100.0 * start:g}%, not at 0)"
+        title += f" (the axis starts at {100.0 * start:g} %, not at 0)"
     parts.append(_text(_CURVE_LEFT + width / 2, base + 36, title))
     return "".join([*parts, "</svg>"])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import (
     AfterValidator,
@@ -34,6 +34,12 @@ DEFAULT_SCORE: OtherScore = "expected_detections"
 
 VEHICLE_SCORES: tuple[OtherScore, ...] = ("expected_detections", "seen_well", "points_on_target")
 """Scores that are means over the vehicles of recorded frames."""
+
+Detector = Literal["cluster", "pointpillars"]
+"""Detectors whose detections a model of ``expected_detections`` predicts."""
+
+ALL_DETECTORS = "all"
+"""Value of ``[score] detector``: the mean over all detectors."""
 
 SCORES_IN_UNITS = ("egvs", "points_on_target")
 """Scores that have a unit; all others are shares."""
@@ -136,6 +142,11 @@ class ScoreConfig(StrictModel):
     others: tuple[OtherScore, ...] = Field(
         (DEFAULT_SCORE,), description="Further scores in scores.parquet, besides egvs and the score of rank_by"
     )
+    detector: Literal["all", Detector] = Field(
+        "all",
+        description="Detector that expected_detections, blind spots and zones stand for. 'all' is the mean over all "
+        "detectors; its standard error contains how far they disagree",
+    )
     weights: WeightsConfig = WeightsConfig()
     keep_visibility: tuple[str, ...] | Literal["all"] = Field(
         (), description="Names of sites, or 'all', whose beams in each voxel are written to visibility.parquet"
@@ -156,8 +167,8 @@ class ScoreConfig(StrictModel):
 
     @model_serializer(mode="wrap")
     def _serialize(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out sampled_frames and zones where they are not set, so that they do not change cache keys."""
-        unset = {"sampled_frames", "zones"} - self.model_fields_set
+        """Leave out keys that are not set, so that they do not change cache keys."""
+        unset = {"sampled_frames", "zones", "detector"} - self.model_fields_set
         return {name: value for name, value in serialize(self).items() if name not in unset}
 
     @field_validator("gamma", mode="before")
@@ -183,6 +194,28 @@ class ScoreConfig(StrictModel):
                 "Remove it, or add one of them to others"
             )
         return self
+
+    @model_validator(mode="after")
+    def _check_detector(self) -> Self:
+        needs_detector = self.blindspots or self.zones is not None or DEFAULT_SCORE in self.additional
+        if self.detector != ALL_DETECTORS and not needs_detector:
+            raise ValueError(
+                f"detector has no effect without {DEFAULT_SCORE}, blind spots and zones. Remove it, or add "
+                f"{DEFAULT_SCORE} to others"
+            )
+        return self
+
+    @property
+    def detectors(self) -> tuple[Detector, ...]:
+        """The detectors that detection scores average over."""
+        if self.detector == "all":
+            return get_args(Detector)
+        return (self.detector,)
+
+    @property
+    def ranking_detectors(self) -> tuple[Detector, ...]:
+        """The detectors of the score that sites are ranked by; empty for a score without detectors."""
+        return self.detectors if self.rank_by == DEFAULT_SCORE else ()
 
     @property
     def needs_vehicles(self) -> bool:

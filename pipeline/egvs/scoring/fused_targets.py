@@ -18,24 +18,23 @@ gap to the neighbours, length          of the vehicle, the same for all sensors
 
 The first three rows are exact: sums, extremes and a bit for each slice of the vehicle contain all that these quantities
 need of the points (:class:`egvs.scoring.targets.TargetVisibility`). A fused cloud has no single range, depression and
-angle of view, and the model was trained with single sensors. A nearer, steeper sensor with more points does not make a
-vehicle harder to detect, so :func:`fused_scores` asks the model once with the view of each sensor that has a point on
-the vehicle, always with the points of all sensors, and takes the highest probability.
+angle of view, and the model was trained with single sensors; ``cluster``, too, fits a box as seen from the sensor with
+most points on it. The highest probability over the views of all sensors was farther from what detectors find
+(docs/placement.md).
 
 Limits: clocks and calibration of all sensors are exact. A fused hole may be longer than that of each sensor, where one
-sees the front only and the other the rear only; such a vehicle may be detected less often than from one of them.
+sees the front only and the other the rear only; and a nearer, steeper sensor may have most points. The probability of
+detection may therefore be lower than with one of the sensors alone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.grid import FloatArray, IntArray
-from egvs.scoring.target_scores import TargetScore
 from egvs.scoring.targets import TargetVisibility, longest_holes_m, span_shares
 
 
@@ -78,32 +77,6 @@ def fuse_targets(views: Sequence[TargetVisibility]) -> TargetVisibility:
         bounds_m=bounds_m,
         slices=slices,
     )
-
-
-def fused_scores(views: Sequence[TargetVisibility], score: TargetScore) -> FloatArray:
-    """Return the score of each vehicle-frame from the points of all sensors, (n,) float64; 0 without a point.
-
-    It is the highest of those with the range, depression and angle of view of each sensor that has a point on the
-    vehicle.
-
-    Parameters
-    ----------
-    views
-        What each sensor sees of the same record, at least one.
-    score
-        Score of each vehicle-frame, 0 or above.
-
-    Raises
-    ------
-    ValueError
-        As in :func:`fuse_targets`.
-    """
-    fused = fuse_targets(views)
-    best = np.zeros(len(fused))
-    for view in views:
-        from_there = replace(fused, range_m=view.range_m, depression_deg=view.depression_deg, side=view.side)
-        best = np.maximum(best, np.where(view.points > 0.0, score(from_there), 0.0))
-    return best
 
 
 def _best_views(views: Sequence[TargetVisibility]) -> IntArray:

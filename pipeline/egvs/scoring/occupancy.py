@@ -20,6 +20,7 @@ from egvs.artefacts import parquet
 from egvs.artefacts.frame_boxes import FrameBoxes
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, Grid, IntArray
+from egvs.core.wording import format_percent
 from egvs.kernels import occupancy
 from egvs.scenario.model import SCENARIO_FILE
 from egvs.world import clearances
@@ -171,7 +172,7 @@ def warn_traffic_through_solids(
     if not solid and share <= _MAX_SHARE_IN_GROUND:
         return
     point = ", ".join(f"{value:.1f}" for value in at_m)
-    problem = f"{share:.1%} of the volume that vehicles occupy is inside solids, most often at ({point})"
+    problem = f"{format_percent(share)} of the volume that vehicles occupy is inside solids, most often at ({point})"
     if solid:
         problem += f", in {solid}"
     yield Diagnostic("traffic through solids", "statics", problem, "Move the solids, or check the coordinates of both.")

@@ -1,9 +1,9 @@
 """All scores in one labelled table: ``scores[site, period, replicate, score, value]``.
 
 The table is long because it is ragged: in the mix, every score has one replicate for each group of blocks that is left
-out; in a period, only EGVS has replicates, with groups of that period. Arrays come from its views: a score of all sites
-(:meth:`ScoreTable.column`), the sites from best to worst (:meth:`ScoreTable.ranking`), a score in each period
-(:meth:`ScoreTable.by_period`).
+out, and a mean over several detectors one for each detector; in a period, only EGVS has replicates, with groups of that
+period. Arrays come from its views: a score of all sites (:meth:`ScoreTable.column`), the sites from best to worst
+(:meth:`ScoreTable.ranking`), a score in each period (:meth:`ScoreTable.by_period`).
 
 ``scores_by_period.parquet`` and the warnings about scores are made from the table as well.
 """
@@ -103,7 +103,8 @@ class ScoreColumn:
     values
         (n,) float64; NaN where the score is not defined.
     replicates
-        The score of all traffic, then with each group of blocks left out, (n, 1 + k) float64; None without replicates.
+        The score of all traffic, then with each group of blocks left out, then with each detector left out where the
+        score depends on several, (n, 1 + k) float64; None without replicates.
     groups
         The groups that are left out, k in all.
     """
@@ -144,8 +145,13 @@ class ScoreColumn:
         """How each site compares with the best one; NaN where it is unknown."""
         if self.estimate is None:
             unknown = np.full(len(self.values), math.nan)
-            return LagBehindBest(unknown, unknown)
+            return LagBehindBest(unknown, unknown, unknown)
         return lag_behind_best(self.estimate)
+
+    @property
+    def has_detectors(self) -> bool:
+        """Whether standard errors contain differences between detectors."""
+        return any(group.are_detectors for group in self.groups)
 
     @property
     def best(self) -> frozenset[int]:
@@ -179,6 +185,8 @@ class ScoreTable:
         Period -> groups of blocks that are left out there in turn; nothing where there are no standard errors.
     limits
         Period -> highest EGVS that any site could reach.
+    score_groups
+        Score -> groups that are left out in the mix after those of the traffic: the detectors of the score.
     """
 
     table: pa.Table
@@ -186,6 +194,7 @@ class ScoreTable:
     periods: tuple[str, ...] = ()
     groups: Mapping[str, tuple[BlockGroups, ...]] = field(default_factory=dict)
     limits: Mapping[str, float] = field(default_factory=dict)
+    score_groups: Mapping[str, tuple[BlockGroups, ...]] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -194,6 +203,7 @@ class ScoreTable:
         groups: Mapping[str, tuple[BlockGroups, ...]],
         limits: Mapping[str, float] | None = None,
         periods: Sequence[str] = (),
+        score_groups: Mapping[str, tuple[BlockGroups, ...]] | None = None,
     ) -> ScoreTable:
         """Make the table from the scores of each site; other parameters are the attributes of the same name."""
         sites = []
@@ -213,7 +223,7 @@ class ScoreTable:
                 columns["value"] += values
         types = {"replicate": pa.int32(), "value": pa.float64()}
         table = pa.table({name: pa.array(rows, types.get(name, pa.string())) for name, rows in columns.items()})
-        return cls(table, tuple(sites), tuple(periods), groups, limits or {})
+        return cls(table, tuple(sites), tuple(periods), groups, limits or {}, score_groups or {})
 
     def column(self, score: str, period: str = MIX) -> ScoreColumn:
         """Return one score of all sites in the mix, or in a period."""
@@ -224,6 +234,8 @@ class ScoreTable:
         replicate = rows.column("replicate").to_numpy()
         values = rows.column("value").to_numpy()
         groups = self.groups.get(period, ())
+        if groups and period == MIX:
+            groups += self.score_groups.get(score, ())
         replicates = None
         if groups and (len(values) > len(self.sites) or not self.sites):
             n_replicates = 1 + sum(len(record.frames) for record in groups)

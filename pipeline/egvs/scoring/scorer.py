@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from egvs.artefacts.tpog import Tpog
 from egvs.core.grid import FloatArray, IntArray
+from egvs.core.wording import format_percent
 from egvs.scoring.egvs import EntropyField
 from egvs.scoring.standard_errors import BlockJackknife
 from egvs.scoring.visibility import Beams, HitCounter, Hits
@@ -62,7 +63,7 @@ class SiteScore:
 
     def __repr__(self) -> str:
         shares = {"entropy_seen": self.entropy_seen} | {name: values[0] for name, values in self.shares.items()}
-        listed = ", ".join(f"{name} {value:.1%}" for name, value in shares.items())
+        listed = ", ".join(f"{name} {format_percent(value)}" for name, value in shares.items())
         return f"SiteScore(egvs {self.egvs:,.1f} bit, {listed})"
 
 

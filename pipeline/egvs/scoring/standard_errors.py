@@ -1,4 +1,4 @@
-r"""Standard errors of scores: the block jackknife over groups of frames.
+r"""Standard errors of scores: the block jackknife over groups of frames, and over detectors.
 
 The TPOG keeps its counts block by block. Leave one group of blocks out, compute every site's score from the rest, and
 do so for each group: the delete-a-group jackknife. With k groups of T_g frames, h_g = T / T_g, the score S of all
@@ -30,6 +30,20 @@ simulations, and the error is that of independent replications (Law, Simulation 
 9.5.1), :math:`se^2 = \sum_r (S_r - \bar S)^2 / (R (R - 1))` with R - 1 degrees of freedom. It contains all that varies
 between simulations, which blocks of a single one miss (docs/accuracy.md).
 
+A score that is the mean over the models of D detectors (``expected_detections``) is a score for "a detector". How far
+the detectors disagree is part of its error: with :math:`S_d` the score by detector d alone,
+
+.. math:: se^2 = se_{traffic}^2 + \frac{1}{D (D - 1)} \sum_d (S_d - S)^2
+
+This is a jackknife as well, with one detector left out at a time: its pseudo-values are the :math:`S_d`. Of the
+difference of two sites, :math:`S_d` is the difference by detector d. A detector that finds 10 points less at every site
+changes all scores, and no comparison: such common shifts cancel, and only detectors that disagree about the difference
+widen its error. The degrees of freedom of each score and of each difference are Satterthwaite's, from those of the
+traffic and D - 1. With two detectors, that is one: where their disagreement is most of the error, probabilities are
+those of a t distribution with one degree of freedom, and cautious. What changes with the detector and the frames at the
+same time is in both terms, so the sum is slightly too large. The detectors stand for others of their kind. Two are too
+few to say how far a third one may be off.
+
 Voxels that have equal counts in every group share one class (0.5 million occupied voxels of a real junction make 50,000
 classes), so a site costs one pass over the voxels and one over the classes. Nothing is random; the result does not
 depend on threads or on other sites. Hits are not resampled: where an effect lets traffic hide voxels, its part of the
@@ -50,7 +64,6 @@ from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
 from egvs.artefacts import tpog as tpog_file
-from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.core.special import stdtr, stdtrit
@@ -79,21 +92,24 @@ _CLASS_KEY_SEED = 0x9E3779B97F4A7C15
 
 @dataclass(frozen=True)
 class BlockGroups:
-    """Consecutive groups of one record.
+    """Consecutive groups of one record; or the detectors of a score, each of which is a group.
 
     Attributes
     ----------
     frames
-        Frames of each group, (k,) int64.
+        Frames of each group, (k,) int64; 1 for each detector.
     autocorrelation_frames
         Autocorrelation time of the traffic.
     are_seeds
         Whether each group is a simulation with a seed of its own, so that groups are independent.
+    are_detectors
+        Whether each group is a detector.
     """
 
     frames: IntArray
     autocorrelation_frames: float
     are_seeds: bool = False
+    are_detectors: bool = False
 
     @property
     def total(self) -> int:
@@ -119,6 +135,24 @@ def block_groups(period: tpog_file.PeriodBlocks) -> BlockGroups:
         return BlockGroups(frames, period.memory_frames, are_seeds=True)
     sizes = group_sizes(period.blocks, period.block_frames, period.memory_frames)
     return BlockGroups(period.block_frames * np.array(sizes, dtype=np.int64), period.memory_frames)
+
+
+def detector_groups(detectors: int) -> tuple[BlockGroups, ...]:
+    """Return the detectors of a score as groups that are left out in turn; nothing for a single detector."""
+    if detectors < 2:
+        return ()
+    return (BlockGroups(np.ones(detectors, dtype=np.int64), 0.0, are_detectors=True),)
+
+
+def means_without_each(values: FloatArray) -> FloatArray:
+    """Return the mean of all values but each, (d,) float64: the replicates of a mean over d detectors, 2 or more.
+
+    Examples
+    --------
+    >>> means_without_each(np.array([0.5, 0.7, 0.9])).round(3).tolist()
+    [0.8, 0.7, 0.6]
+    """
+    return np.array([np.delete(values, number).mean() for number in range(len(values))])
 
 
 @dataclass(frozen=True)
@@ -330,7 +364,7 @@ def _exact_entropies(counts: IntArray, frames: int, grid: Grid) -> FloatArray:
 
 @dataclass(frozen=True)
 class Stratum:
-    """The jackknife of the scores of n sites over the k groups of one record.
+    """The jackknife of the scores of n sites over the k groups of one record, or over k detectors.
 
     Attributes
     ----------
@@ -376,7 +410,7 @@ class Stratum:
 
         first_correlation = correlation = lag_one_autocorrelation(pseudo[:, :n_joined_by])
         joined = 1
-        if groups.are_seeds:
+        if groups.are_seeds or groups.are_detectors:
             return cls(pseudo, h - 1.0, centre, 1.0, groups, first_correlation, joined, still_correlated=False)
         while correlation > _critical_autocorrelation(len(pseudo)) and len(pseudo) // 2 >= MIN_GROUPS:
             pseudo, frames = _join_pairs(pseudo, frames)
@@ -402,7 +436,7 @@ class Stratum:
     @property
     def is_short(self) -> bool:
         """Whether blocks are shorter than the window in which the autocorrelation time was estimated."""
-        if self.groups.are_seeds:
+        if self.groups.are_seeds or self.groups.are_detectors:
             return False
         return self.groups.total < len(self.pseudo) * WINDOW_TIMES * self.groups.autocorrelation_frames
 
@@ -487,7 +521,8 @@ class ScoreUncertainty:
     scores
         Scores of all frames, (n,) float64.
     strata
-        The jackknife over each record of the TPOG; one unless it is a mix.
+        The jackknife over each record of the TPOG, one unless it is a mix; then that over the detectors, if there are
+        several.
     """
 
     scores: FloatArray
@@ -516,15 +551,25 @@ class ScoreUncertainty:
         return bias
 
     @property
+    def traffic_strata(self) -> tuple[Stratum, ...]:
+        """The jackknife over each record of the TPOG."""
+        return tuple(stratum for stratum in self.strata if not stratum.groups.are_detectors)
+
+    @property
+    def detector_strata(self) -> tuple[Stratum, ...]:
+        """The jackknife over detectors; empty for a score of one detector, or of none."""
+        return tuple(stratum for stratum in self.strata if stratum.groups.are_detectors)
+
+    @property
     def groups(self) -> int:
-        """Number of groups after joining."""
-        return sum(len(stratum.pseudo) for stratum in self.strata)
+        """Number of groups of frames after joining."""
+        return sum(len(stratum.pseudo) for stratum in self.traffic_strata)
 
     @cached_property
     def freedom(self) -> float:
-        """Degrees of freedom of t: k - 1; of a mix, Satterthwaite's for all sites together."""
-        free = [len(stratum.pseudo) - 1.0 for stratum in self.strata]
-        variances = np.array([stratum.variance(self._all_sites) for stratum in self.strata])
+        """Degrees of freedom of the traffic's error: k - 1; of a mix, Satterthwaite's for all sites together."""
+        free = [len(stratum.pseudo) - 1.0 for stratum in self.traffic_strata]
+        variances = np.array([stratum.variance(self._all_sites) for stratum in self.traffic_strata])
         total = variances.sum(axis=0)
         shares = (variances[:, total > 0] / total[total > 0]).sum(axis=1)
         if len(free) == 1 or not shares.any():
@@ -540,13 +585,14 @@ class ScoreUncertainty:
         """Standard error of each score, (n,) float64."""
         return self._error(self._all_sites)
 
-    def quantile(self, level: float = CONFIDENCE_LEVEL) -> float:
-        """Return the critical value of Student's t for a two-sided interval of this confidence level."""
-        return float(stdtrit(self.freedom, 0.5 + 0.5 * level))
+    def quantiles(self, level: float = CONFIDENCE_LEVEL) -> FloatArray:
+        """Return the critical values of Student's t for two-sided intervals of this confidence level, (n,) float64."""
+        critical: FloatArray = stdtrit(self._freedoms(self._all_sites), 0.5 + 0.5 * level)
+        return critical
 
     def intervals(self, level: float = CONFIDENCE_LEVEL) -> FloatArray:
         """Return the bounds of intervals of the scores in the limit of infinitely long traffic, (n, 2) float64."""
-        half_width = self.quantile(level) * self.se
+        half_width = self.quantiles(level) * self.se
         centre = self.scores - self.bias
         return np.column_stack([centre - half_width, centre + half_width])
 
@@ -554,31 +600,45 @@ class ScoreUncertainty:
         """Return the scores of sites a (m,) minus those of sites b (m,); their common scatter cancels in the errors."""
         return ScoreDifferences(self.scores[a] - self.scores[b], self._error(a, b))
 
+    def detector_error(self, a: IntArray, b: IntArray) -> FloatArray:
+        """Return the part of the errors of :meth:`differences` that is due to detectors, (m,) float64."""
+        error: FloatArray = np.sqrt(_sum_of_variances(self.detector_strata, a, b))
+        return error
+
     def beats(self, a: IntArray, b: IntArray) -> FloatArray:
         """Return the probability (m,) that sites a (m,) score higher in infinitely long traffic.
 
-        One half where the scores are equal.
+        For a score over several detectors: with a detector of their kind. One half where the scores are equal.
         """
         gap, error = self.differences(a, b)
         with np.errstate(divide="ignore", invalid="ignore"):
-            chance = stdtr(self.freedom, gap / error)
+            chance = stdtr(self._freedoms(a, b), gap / error)
         # Rounded to 1e-6, because the last bits of a t distribution depend on the machine.
         rounded: FloatArray = np.round(np.where(gap == 0.0, 0.5, chance), 6).astype(np.float64)
         return rounded
 
-    def times_needed(self, a: int, b: int, level: float = DISTINCT_PROBABILITY) -> float:
-        """Return how many times the available traffic would distinguish sites a and b; infinite for equal scores."""
-        gap, error = self.differences(np.array([a]), np.array([b]))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            times = float((stdtrit(self.freedom, level) * error[0] / gap[0]) ** 2)
-        if math.isnan(times):
-            return math.inf
-        return times
-
     def _error(self, a: IntArray, b: IntArray | None = None) -> FloatArray:
-        variance = sum((stratum.variance(a, b) for stratum in self.strata), np.zeros(len(a)))
-        error: FloatArray = np.sqrt(variance)
+        error: FloatArray = np.sqrt(_sum_of_variances(self.strata, a, b))
         return error
+
+    def _freedoms(self, a: IntArray, b: IntArray | None = None) -> FloatArray:
+        """Degrees of freedom of the scores of sites a (m,), or of their lead over sites b (m,): Satterthwaite's."""
+        freedoms = np.full(len(a), self.freedom)
+        if not self.detector_strata:
+            return freedoms
+        traffic = _sum_of_variances(self.traffic_strata, a, b)
+        denominator = traffic**2 / self.freedom
+        total = traffic.copy()
+        for stratum in self.detector_strata:
+            variance = stratum.variance(a, b)
+            denominator += variance**2 / (len(stratum.pseudo) - 1.0)
+            total += variance
+        np.divide(total**2, denominator, out=freedoms, where=denominator > 0.0)
+        return freedoms
+
+
+def _sum_of_variances(strata: Sequence[Stratum], a: IntArray, b: IntArray | None) -> FloatArray:
+    return sum((stratum.variance(a, b) for stratum in strata), np.zeros(len(a)))
 
 
 def rank_order(scores: FloatArray) -> IntArray:
@@ -603,28 +663,35 @@ class LagBehindBest(NamedTuple):
         Standard error of the difference to the best site; 0 for that site.
     best_beats
         Probability that the best site truly scores higher; one half where scores are equal.
+    detectors_se
+        The part of ``se`` that is due to differences between detectors, which more traffic does not reduce.
     """
 
     se: FloatArray
     best_beats: FloatArray
+    detectors_se: FloatArray
 
 
 def lag_behind_best(estimate: ScoreUncertainty) -> LagBehindBest:
     """Compare each site with the best one; the scatter that the two have in common cancels."""
     sites = np.arange(len(estimate.scores))
     best = np.repeat(rank_order(estimate.scores)[:1], len(sites))
-    return LagBehindBest(estimate.differences(best, sites).se, estimate.beats(best, sites))
+    differences = estimate.differences(best, sites)
+    return LagBehindBest(differences.se, estimate.beats(best, sites), estimate.detector_error(best, sites))
 
 
 def summarise_uncertainty(estimate: ScoreUncertainty, names: Sequence[str] = ("",)) -> dict[str, object]:
     """Return a stage's summary of how errors were computed; ``names`` of the periods, one per record."""
     descriptions = []
-    for name, stratum in zip(names, estimate.strata, strict=True):
+    for name, stratum in zip(names, estimate.traffic_strata, strict=True):
         description = _describe_stratum(stratum)
         if name:
             description = f"{name}: {description}"
         descriptions.append(description)
-    return {"standard_errors_from": "; ".join(descriptions)}
+    text = "; ".join(descriptions)
+    for stratum in estimate.detector_strata:
+        text += f", and the differences between {len(stratum.pseudo)} detectors"
+    return {"standard_errors_from": text}
 
 
 def _describe_stratum(stratum: Stratum) -> str:
@@ -666,7 +733,7 @@ def uncertainty_warnings(
         Period -> the key that sets its length in seconds, for those that have one.
     """
     warnings = []
-    for stratum, name in zip(estimate.strata, names, strict=True):
+    for stratum, name in zip(estimate.traffic_strata, names, strict=True):
         if not (stratum.is_short or stratum.still_correlated):
             continue
         length_key = (period_lengths or {}).get(name)

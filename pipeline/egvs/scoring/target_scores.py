@@ -17,11 +17,16 @@ one without. g(0) = 0: a vehicle without a point is in a blind spot of the site.
 x are :data:`FEATURES`, f_t the trees of a boosted model. The model rises with points, points on sides, spans and the
 gap to the neighbour, and falls with the hole between points and with the depression angle (:data:`MONOTONICITY`);
 range, length and angle of view may have either effect. A vehicle without any point is never detected.
+There is one model per detector; p is the mean over all of them, or the model that ``[score] detector`` names. The
+standard error contains how far the detectors disagree (:mod:`egvs.scoring.standard_errors`).
 
 The parameters of the model are in ``target_scores.json`` beside this module. They were trained on the detections of
 each detector at junctions that no result is quoted for (``benchmarks/detectability`` fits them again; docs/validity.md
 shows their accuracy elsewhere). A detection is a box that overlaps the vehicle by more than 0.7, in the mean of the
 overlaps from above and in 3D.
+
+*People*: pedestrians and bicycles, for whom there is no model, are expected by points. The share of them that is found
+is the share of their observations with at least :data:`PEOPLE_POINTS` points.
 """
 
 from __future__ import annotations
@@ -32,29 +37,34 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.special import expit
 from egvs.kernels.boosted_trees import add_tree_values
+from egvs.scenario.score_config import Detector
 from egvs.scoring.blindspots import SpotVisibility
 from egvs.scoring.targets import SEEN_WELL_POINTS, TargetVisibility, weighted_mean
 
 Gain = Callable[[FloatArray], FloatArray]
 """Gain of points (n,) on vehicles, (n,)."""
 
-TargetScore = Callable[[TargetVisibility], FloatArray]
-"""Score of each vehicle-frame as a site sees it, or several together, (n,)."""
+TargetScore = Callable[[TargetVisibility, Sequence[str]], FloatArray]
+"""Score of each vehicle-frame as a site sees it, or several together, by some detectors, (n,); most scores are the same
+for any detector."""
 
 MODEL_FILE = Path(__file__).with_name("target_scores.json")
 
-DETECTORS = ("cluster", "pointpillars")
+DETECTORS: tuple[str, ...] = get_args(Detector)
 """Detectors that have a model."""
 
 ISOLATED_GAP_M = 20.0
 """A neighbour farther away than this has no influence."""
+
+PEOPLE_POINTS = 20.0
+"""Pedestrians and bicycles with at least as many points count as found: there is no model of detectors of people."""
 
 MONOTONICITY = {
     "log_points": 1,
@@ -82,8 +92,9 @@ class SiteTargetScores:
     Attributes
     ----------
     scores
-        Of all vehicle-frames, then with each group of frames left out, (1 + k,) float64; (1,) without standard errors.
-        NaN where no vehicle counts.
+        Of all vehicle-frames, then with each group of frames left out, then with each detector left out where the
+        score depends on several, (1 + k,) or (1 + k + d,) float64; (1,) without standard errors. NaN where no vehicle
+        counts.
     by_period
         Scores in each period alone, in their order; empty without periods.
     missed
@@ -154,8 +165,20 @@ def detection_chances(visible: TargetVisibility, detectors: Sequence[str] = DETE
     KeyError
         For a detector without a model.
     """
+    chances: FloatArray = np.mean(chances_by_detector(visible, detectors), axis=0)
+    return chances
+
+
+def chances_by_detector(visible: TargetVisibility, detectors: Sequence[str]) -> FloatArray:
+    """Return the probability that each detector detects each vehicle-frame, (d, n) float64, 0 to 1.
+
+    Raises
+    ------
+    KeyError
+        For a detector without a model.
+    """
     features = detectability_features(visible)
-    chances: FloatArray = np.mean([detectability_model(name).chances(features) for name in detectors], axis=0)
+    chances = np.array([detectability_model(name).chances(features) for name in detectors])
     return np.where(visible.points > 0.0, chances, 0.0)
 
 
@@ -232,18 +255,39 @@ def detectability_model(detector: str) -> DetectabilityModel:
     return DetectabilityModel.of(json.loads(MODEL_FILE.read_text(encoding="utf-8"))["detectors"][detector])
 
 
-def _score_detection(visible: TargetVisibility) -> FloatArray:
-    """Return the probability of detection; for people, for whom there is no model, the saturating gain."""
+def expected_by_points(points: FloatArray) -> FloatArray:
+    """Return whether people on foot or on bicycles count as found, (n,) float64: 1 from :data:`PEOPLE_POINTS` on.
+
+    Examples
+    --------
+    >>> expected_by_points(np.array([0.0, 19.0, 20.0, 300.0])).tolist()
+    [0.0, 0.0, 1.0, 1.0]
+    """
+    is_found: FloatArray = (points >= PEOPLE_POINTS).astype(np.float64)
+    return is_found
+
+
+def found_by_detector(visible: TargetVisibility, detectors: Sequence[str]) -> FloatArray:
+    """Return the probability that each detector finds each vehicle-frame of a record, (d, n) float64, 0 to 1.
+
+    There is no model of people; see :func:`expected_by_points`.
+    """
     if not len(visible):
-        return np.empty(0)
-    return np.where(visible.record.are_people, saturating_gain(visible.points), detection_chances(visible))
+        return np.empty((len(detectors), 0))
+    chances = chances_by_detector(visible, detectors)
+    return np.where(visible.record.are_people, expected_by_points(visible.points), chances)
 
 
-def _score_points(visible: TargetVisibility) -> FloatArray:
+def _score_detection(visible: TargetVisibility, detectors: Sequence[str]) -> FloatArray:
+    chances: FloatArray = found_by_detector(visible, detectors).mean(axis=0)
+    return chances
+
+
+def _score_points(visible: TargetVisibility, _: Sequence[str]) -> FloatArray:
     return log_points(visible.points)
 
 
-def _score_seen_well(visible: TargetVisibility) -> FloatArray:
+def _score_seen_well(visible: TargetVisibility, _: Sequence[str]) -> FloatArray:
     return saturating_gain(visible.points)
 
 

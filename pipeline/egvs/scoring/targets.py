@@ -92,6 +92,8 @@ class AllBoxes:
         Corners of the axis-aligned bounding box of each, (b, 3) float64, metres.
     are_vehicles
         Which boxes are neither pedestrians nor bicycles, (b,) bool.
+    vehicle
+        Number of the road user that each box is of, the same for all parts of a vehicle and in all frames, (b,) int64.
     """
 
     starts: IntArray
@@ -99,6 +101,7 @@ class AllBoxes:
     low: FloatArray
     high: FloatArray
     are_vehicles: NDArray[np.bool_]
+    vehicle: IntArray
 
     @classmethod
     def of(cls, frames: Sequence[TrafficFrame], grid: Grid) -> AllBoxes:
@@ -110,7 +113,8 @@ class AllBoxes:
         occlusion.box_bounds(values, low, high)
         ends = np.cumsum([len(frame_rows) for frame_rows in rows], dtype=np.int64)
         are_vehicles = np.concatenate([np.empty(0, dtype=np.bool_), *(frame.are_vehicles() for frame in frames)])
-        return cls(np.append(0, ends), values, low, high, are_vehicles)
+        _, vehicle = _index_names([name for frame in frames for name in frame.vehicles])
+        return cls(np.append(0, ends), values, low, high, are_vehicles, vehicle)
 
     def between(self, sensor_m: FloatArray, size_m: FloatArray) -> tuple[IntArray, IntArray]:
         """Select the boxes that can be between a sensor (3,) and the grid, the box from 0 to ``size_m`` (3,).
@@ -277,7 +281,12 @@ class TargetRecord:
             pitch_rad=np.zeros(count),
             gap_m=np.full(count, np.inf),
             all_boxes=AllBoxes(
-                np.arange(count + 1, dtype=np.int64), values, low, high, np.full(count, kind not in NON_VEHICLE_KINDS)
+                starts=np.arange(count + 1, dtype=np.int64),
+                values=values,
+                low=low,
+                high=high,
+                are_vehicles=np.full(count, kind not in NON_VEHICLE_KINDS),
+                vehicle=numbers,
             ),
             row=numbers,
         )
@@ -556,10 +565,10 @@ def weighted_mean(values: FloatArray, weight: FloatArray | None = None) -> float
     """Return the mean over vehicle-frames (n,), independent of their order; NaN without any weight."""
     if weight is None:
         weight = np.ones(len(values))
-    total = math.fsum(weight)
+    total = math.fsum(weight.tolist())  # lists are summed several times as fast as arrays
     if not total > 0.0:
         return math.nan
-    return math.fsum(values * weight) / total
+    return math.fsum((values * weight).tolist()) / total
 
 
 def recorded_frames(trajectories: Path) -> list[int]:
@@ -660,7 +669,7 @@ class FrameGroups:
 
     def _sum_by_group(self, values: FloatArray) -> FloatArray:
         bounds = zip(self.ends[:-1], self.ends[1:], strict=True)
-        return np.array([math.fsum(values[start:end]) for start, end in bounds])
+        return np.array([math.fsum(values[start:end].tolist()) for start, end in bounds])
 
 
 def weighted_people(config: WeightsConfig) -> frozenset[str]:

@@ -5,8 +5,8 @@ Articulated vehicles count once for each part. All road users count, pedestrians
 they have a weight in ``[score.weights]``, and all count alike.
 
 The share found is the mean probability of detection, as in the score ``expected_detections``. Detectors of pedestrians
-and bicycles have no model; for them it is the share of well visible ones, the mean of :math:`1 - e^{-n / 20}` for n
-points (:func:`egvs.scoring.target_scores.saturating_gain`).
+and bicycles have no model; they are expected by points: it is the share of observations with at least 20 points
+(:func:`egvs.scoring.target_scores.expected_by_points`).
 
 With several sensors, a road user is found when at least one of them finds it, each independently of the others:
 
@@ -34,7 +34,7 @@ from egvs.scenario.model import SCENARIO_FILE
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.scoring.blindspots import SpotVisibility, VehicleSpots
 from egvs.scoring.road_locations import RoadLocation
-from egvs.scoring.target_scores import TARGET_SCORES
+from egvs.scoring.target_scores import DETECTORS, TARGET_SCORES
 from egvs.scoring.targets import TargetRecord, VisibleTargets
 from egvs.scoring.zones import REPORTED_KEY
 
@@ -106,12 +106,15 @@ class ZoneUsers:
         Zones without a road user.
     for_pedestrians
         Those of them that no lane for vehicles leads through, in traffic without pedestrians: nobody can be there.
+    detectors
+        Detectors whose probabilities are averaged.
     """
 
     record: TargetRecord
     spots: VehicleSpots
     empty: tuple[str, ...]
     for_pedestrians: tuple[str, ...] = ()
+    detectors: tuple[str, ...] = DETECTORS
 
     @classmethod
     def of(
@@ -121,6 +124,7 @@ class ZoneUsers:
         weight: FloatArray,
         period: IntArray,
         carriageway: Carriageway | None = None,
+        detectors: Sequence[str] = DETECTORS,
     ) -> ZoneUsers:
         """Find the zones of the vehicle-frames of a record.
 
@@ -136,6 +140,8 @@ class ZoneUsers:
             Period of each vehicle-frame, (n,) int64.
         carriageway
             The lanes for vehicles, where no pedestrians are simulated; None if pedestrians may be anywhere.
+        detectors
+            Detectors whose probabilities are averaged.
         """
         import shapely
 
@@ -161,17 +167,17 @@ class ZoneUsers:
         if carriageway is not None and PEDESTRIAN not in classes:
             lanes = shapely.union_all([shapely.LineString(lane.shape_m[:, :2]) for lane in carriageway.lanes])
             for_pedestrians = [name for name in empty if not shapely.intersects(areas[name], lanes)]
-        return cls(record, spots, tuple(empty), tuple(for_pedestrians))
+        return cls(record, spots, tuple(empty), tuple(for_pedestrians), tuple(detectors))
 
     def visibility(self, visible: VisibleTargets) -> SpotVisibility:
         """Return what one site sees in each zone of each class; ``visible`` is of the same record."""
-        return self.spots.visibility(visible.points, detection_probabilities(visible))
+        return self.spots.visibility(visible.points, detection_probabilities(visible, self.detectors))
 
     def together(self, sensors: Sequence[VisibleTargets]) -> SpotVisibility:
         """Return what several sensors see together in each zone of each class."""
         missed, points = np.ones(len(self.record)), np.zeros(len(self.record))
         for visible in sensors:
-            missed = missed * (1.0 - detection_probabilities(visible))
+            missed = missed * (1.0 - detection_probabilities(visible, self.detectors))
             points = points + visible.points
         return self.spots.visibility(points, 1.0 - missed)
 
@@ -207,9 +213,9 @@ class ZoneUsers:
         return f"no results for {zones} beside the lanes, since {reason}: {names}"
 
 
-def detection_probabilities(visible: VisibleTargets) -> FloatArray:
-    """Return the probability that each vehicle-frame is found, 0 to 1, (n,) float64."""
-    return TARGET_SCORES[DEFAULT_SCORE](visible)
+def detection_probabilities(visible: VisibleTargets, detectors: Sequence[str]) -> FloatArray:
+    """Return the probability that each vehicle-frame is found, averaged over detectors, 0 to 1, (n,) float64."""
+    return TARGET_SCORES[DEFAULT_SCORE](visible, detectors)
 
 
 def write_zones(

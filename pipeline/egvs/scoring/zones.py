@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from egvs.core.errors import Diagnostic, InputError
-from egvs.core.wording import list_first
+from egvs.core.wording import format_percent, list_first
 from egvs.formats.georeference import Georeference
 from egvs.scenario.model import SCENARIO_FILE, Scenario
 from egvs.scenario.score_config import ZoneArea
@@ -75,7 +75,7 @@ def warn_partly_outside(scenario: Scenario) -> Iterator[Diagnostic]:
     outside = {
         name: 1.0 - area.intersection(region).area / area.area for name, area in reported_zones(scenario).items()
     }
-    parts = [f"{share:.0%} of {name}" for name, share in outside.items() if share > _MIN_OUTSIDE]
+    parts = [f"{format_percent(share, 0)} of {name}" for name, share in outside.items() if share > _MIN_OUTSIDE]
     if parts:
         problem = (
             f"these parts of zones are outside the region of interest, so nobody in them counts: {', '.join(parts)}"

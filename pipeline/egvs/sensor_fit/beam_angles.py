@@ -23,6 +23,7 @@ import numpy as np
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
+from egvs.core.wording import format_percent
 from egvs.sensor_fit.sweep_files import Sweep
 from egvs.sensor_fit.sweep_layout import Layout, axis_distances_m, find_layout, fit_cone, nearest_ring
 
@@ -203,7 +204,7 @@ def _pool(sweeps: Sequence[Sweep], layout: Layout) -> tuple[FloatArray, FloatArr
 def _check_same_rings(sweep: Sweep, channel: IntArray) -> None:
     share = float(np.mean(channel < 0))
     if share > 0.2:
-        problem = f"{share:.0%} of its returns lie on none of the rings of the first sweep"
+        problem = f"{format_percent(share, 0)} of its returns lie on none of the rings of the first sweep"
         raise InputError(sweep.name, problem, "Give sweeps of one sensor, all in its frame.")
 
 

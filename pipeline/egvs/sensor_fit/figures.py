@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from egvs.core.grid import FloatArray
+from egvs.core.wording import format_percent
 from egvs.sensor_fit import empty_scan, return_rates
 from egvs.sensor_fit.empty_scan import TRAFFIC, UNKNOWN
 from egvs.sensor_fit.fit import SensorFit
@@ -226,7 +227,7 @@ def draw_map(fit: SensorFit) -> Figure | None:
         (best.on_surface, _BLUE, "returns on the static world"),
     ):
         plan.plot(points[members, 0], points[members, 1], ",", color=colour)
-        plan.plot([], [], "s", color=colour, label=f"{label}: {np.mean(members):.0%}")
+        plan.plot([], [], "s", color=colour, label=f"{label}: {format_percent(float(np.mean(members)), 0)}")
     plan.add_collection(LineCollection(list(_wall_lines(map_pose.world)), colors="black", linewidths=0.8))
     plan.plot([], [], color="black", linewidth=0.8, label="walls of the static world")
     ahead = np.radians(pose.yaw_deg)

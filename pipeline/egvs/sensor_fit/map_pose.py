@@ -13,6 +13,7 @@ import numpy as np
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.core.wording import format_percent
 from egvs.sensor_fit.ground_plane import GroundPlane
 from egvs.sensors.registration import (
     Registration,
@@ -102,7 +103,9 @@ class MapPose:
             messages.append(f"The fit is {self.shift_m:.1f} m from --site: check the position.")
         if self.share_on_surface < MIN_ON_SURFACE:
             share = self.share_on_surface
-            messages.append(f"Only {share:.0%} of the returns lie on the static world: check it, and the position.")
+            messages.append(
+                f"Only {format_percent(share, 0)} of the returns lie on the static world: check it, and the position."
+            )
         if not self.best.converged:
             messages.append("The registration did not converge.")
         return tuple(messages)

@@ -16,6 +16,7 @@ import numpy as np
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.core.wording import format_percent
 from egvs.formats import pcd, ply
 from egvs.scenario.sensor_config import SensorConfig
 from egvs.sensor_fit import empty_scan, figures
@@ -173,7 +174,7 @@ def _comments(fit: SensorFit, name: str) -> str:
         lines += fit.map_pose.warnings
     if fit.return_rate is not None:
         lines.append(
-            f"Lost returns on smooth surfaces: {1 - fit.return_rate.value:.2%}. To model them: "
+            f"Lost returns on smooth surfaces: {format_percent(1 - fit.return_rate.value, 2)}. To model them: "
             f"[effects.dropout] share = {1 - fit.return_rate.value:.4f}"
         )
     return "".join(f"# {line}\n" for line in lines) + "\n"

@@ -26,6 +26,7 @@ from scipy.signal import find_peaks
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
+from egvs.core.wording import format_percent
 
 MIN_CHANNELS, MAX_CHANNELS = 4, 512
 MIN_COLUMNS = 100
@@ -180,7 +181,7 @@ def find_rings(points_m: FloatArray, where: str) -> Layout:
     used = counts >= max(_MIN_RING_SHARE * np.median(counts[counts > 0]), _MIN_RETURNS_PER_CHANNEL)
     is_stray |= ~used[ring]
     if np.mean(is_stray) > _MAX_STRAY_SHARE or np.count_nonzero(used) < MIN_CHANNELS:
-        problem = f"expected points on rings, but {np.mean(is_stray):.0%} of them are on none"
+        problem = f"expected points on rings, but {format_percent(float(np.mean(is_stray)), 0)} of them are on none"
         raise InputError(where, problem, _HINT)
     number = np.cumsum(used) - 1
     channel = np.full(len(points_m), -1, dtype=np.int64)

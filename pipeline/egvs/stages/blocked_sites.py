@@ -12,6 +12,7 @@ import numpy as np
 
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray
+from egvs.core.wording import format_percent
 from egvs.world import supports
 
 NEAR_M = 0.5
@@ -36,7 +37,7 @@ def near_share(ends_m: FloatArray, weight: FloatArray | None) -> float:
 
 def warn_blocked_sites(near_shares: Mapping[str, float]) -> Iterator[Diagnostic]:
     """Warn about the sites of which most beams end near the sensor; ``near_shares`` by site."""
-    blocked = [f"{site} ({share:.0%})" for site, share in near_shares.items() if share > 0.5]
+    blocked = [f"{site} ({format_percent(share, 0)})" for site, share in near_shares.items() if share > 0.5]
     if blocked:
         count = f"{len(blocked)} of {len(near_shares)} sites"
         problem = f"most beams of {count} end within {NEAR_M:g} m of the sensor: {', '.join(blocked)}"

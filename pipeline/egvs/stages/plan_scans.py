@@ -27,7 +27,6 @@ def plan_beams(context: StageContext, sensors: Sequence[Site], *, moved: bool) -
         for scan in empty_scans(context, {sensor.name for sensor in sensors}):
             yield scan.site.name, scan.beams
         return
-    scene = context.scene
-    scanner = Scanner(scene)
+    scanner = Scanner(context.scene)
     for sensor in sensors:
-        yield sensor.name, Beams.of(scanner.scan(sensor.pose, scene.sensor(sensor.sensor)))
+        yield sensor.name, Beams.of(scanner.scan_site(sensor))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from egvs.core.errors import Diagnostic, InputError
 from egvs.core.grid import Roi
-from egvs.core.wording import by_number, list_first, number_of, shorten_id
+from egvs.core.wording import by_number, format_percent, list_first, number_of, shorten_id
 from egvs.effects import registry
 from egvs.effects.base import Effect
 from egvs.kernels import ray_triangle
@@ -303,7 +303,7 @@ def warn_solids_over_lanes(inputs: CheckInputs) -> Iterator[Diagnostic]:
     share = shapely.union_all([common for common, _ in covered]).area / lanes.area
     named = list_first([_describe_solid(inputs.world, common, solid) for common, solid in covered], MAX_NAMED_SOLIDS)
     count = f"{number_of(len(covered), 'solid')} {by_number(len(covered), 'covers', 'cover')}"
-    problem = f"{count} {share:.1%} of the lanes in and around the region: {named}"
+    problem = f"{count} {format_percent(share)} of the lanes in and around the region: {named}"
     hint = "Move or lift them, or check their coordinates: traffic would drive through them."
     yield Diagnostic("solids over lanes", "statics", problem, hint)
 

@@ -19,6 +19,7 @@ from egvs.artefacts.extra_columns import extra_columns
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import Tpog
 from egvs.core.errors import WARNINGS_KEY, Diagnostic
+from egvs.core.wording import format_percent
 from egvs.effects import registry
 from egvs.effects.base import Effect
 from egvs.formats.georeference import Georeference
@@ -176,7 +177,11 @@ def _write_scores(
     if egvs.estimate is not None:
         optional["egvs_bias"] = egvs.estimate.bias
         optional["beats_next"] = ranking.beats_next
-        optional["behind_best_se"], optional["best_beats"] = ranking.behind_best
+        behind_best = ranking.behind_best
+        optional["behind_best_se"] = behind_best.se
+        optional["best_beats"] = behind_best.best_beats
+        if ranking.has_detectors:
+            optional["behind_best_detectors_se"] = behind_best.detectors_se
     user_columns = _user_columns(context)
     with parquet.artefact_writer(context.folder.scores, "scores", tuple(optional), extra=user_columns) as file:
         file.write(columns | optional | user_columns)
@@ -273,7 +278,7 @@ def warn_period_disagreements(scores: ScoreTable, rank_by: str) -> Iterator[Diag
         if not is_clear:
             continue
 
-        less = f"{100 * loss:.1f} percentage points" if is_share else f"{loss:.1%}"
+        less = f"{100 * loss:.1f} percentage points" if is_share else format_percent(loss)
         problem = (
             f"the best site is {scores.sites[period_best]}; {scores.sites[mix_best]}, the best of the mix, "
             f"has rank {column.rank[mix_best]} and scores {less} less"
@@ -337,7 +342,8 @@ def _warn_sites_in_traffic(sites: Iterable[Site], tpog: Tpog) -> Iterator[Diagno
             yield Diagnostic(
                 "sites on the road",
                 f"site {site.name}",
-                f"vehicles drive through its position ({at_m[0]:g}, {at_m[1]:g}) in {share:.1%} of the frames",
+                f"vehicles drive through its position ({at_m[0]:g}, {at_m[1]:g}) in {format_percent(share)} "
+                "of the frames",
                 f"Move it beside the road, or more than {clearances.CLEARANCE_M:g} m above it.",
             )
 

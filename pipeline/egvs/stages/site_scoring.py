@@ -32,8 +32,8 @@ from egvs.scoring.egvs import EntropyField
 from egvs.scoring.road_locations import RoadLocations
 from egvs.scoring.score_table import MIX, ScoreTable, SiteScores
 from egvs.scoring.scorer import PeriodTpog, Scorer, SiteScore
-from egvs.scoring.standard_errors import BlockJackknife
-from egvs.scoring.target_scores import TARGET_SCORES, SiteTargetScores
+from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, detector_groups, means_without_each
+from egvs.scoring.target_scores import DETECTORS, TARGET_SCORES, SiteTargetScores, found_by_detector
 from egvs.scoring.targets import (
     FrameGroups,
     TargetRecord,
@@ -110,7 +110,8 @@ def zone_users(context: StageContext) -> ZoneUsers:
     if network is not None and context.scenario.effects.pedestrians_bicycles is None:
         carriageway = Carriageway.of(network)
     period = _period_of_rows(record, recorded)
-    return ZoneUsers.of(record, reported_zones(context.scenario), weight, period, carriageway)
+    detectors = context.scenario.score.detectors
+    return ZoneUsers.of(record, reported_zones(context.scenario), weight, period, carriageway, detectors)
 
 
 class _PeriodRows(NamedTuple):
@@ -143,6 +144,7 @@ class TargetScorer:
         self.record = TargetRecord.read(trajectories, grid, config.sampled_frames, people)
         self._scene = context.scene
         self._names: tuple[str, ...] = tuple(name for name in config.additional if name in TARGET_SCORES)
+        self.detectors = config.detectors
         self._config = config.weights
         self._zones: dict[str, BaseGeometry] = {}
 
@@ -175,6 +177,13 @@ class TargetScorer:
         """Return what an empty scan sees of each vehicle."""
         return visible_targets(self.record, beams, detection_probability(self._scene, beams.sensor))
 
+    @property
+    def score_groups(self) -> dict[str, tuple[BlockGroups, ...]]:
+        """Score -> its detectors, which are left out after the groups of frames; empty without standard errors."""
+        if self._groups is None or not detector_groups(len(self.detectors)):
+            return {}
+        return {DEFAULT_SCORE: detector_groups(len(self.detectors))}
+
     def weights_by_period(self) -> dict[str, FloatArray]:
         """Return the weight of each vehicle-frame in each period alone, (n,) float64; nothing without periods."""
         weights = {}
@@ -185,8 +194,18 @@ class TargetScorer:
 
     def scores(self, visible: VisibleTargets) -> SiteTargetScores:
         """Return the requested scores of what a site sees, and where it misses vehicles."""
-        values = {name: TARGET_SCORES[name](visible) for name in self._names}
+        found = None
+        values: dict[str, FloatArray] = {}
+        for name in self._names:
+            if name == DEFAULT_SCORE:
+                found = found_by_detector(visible, self.detectors)
+                values[name] = found.mean(axis=0)
+            else:
+                values[name] = TARGET_SCORES[name](visible, self.detectors)
         scores = {name: self._means(vehicle_values) for name, vehicle_values in values.items()}
+        if found is not None and self.score_groups:
+            by_detector = np.array([weighted_mean(chances, self.weight) for chances in found])
+            scores[DEFAULT_SCORE] = np.append(scores[DEFAULT_SCORE], means_without_each(by_detector))
         by_period = []
         for _, rows in self._periods:
             by_period.append({name: self._period_mean(values[name], rows) for name in self._names})
@@ -194,12 +213,12 @@ class TargetScorer:
         if self.spots is not None:
             chances = values.get(DEFAULT_SCORE)
             if chances is None:
-                chances = TARGET_SCORES[DEFAULT_SCORE](visible)
+                chances = TARGET_SCORES[DEFAULT_SCORE](visible, self.detectors)
             missed = self.spots.visibility(visible.points, chances)
         return SiteTargetScores(scores, tuple(by_period), missed)
 
     def _means(self, values: FloatArray) -> FloatArray:
-        """Mean of all vehicle-frames, then with each group of frames left out."""
+        """Mean over all vehicle-frames, then with each group of frames left out."""
         if self._groups is None:
             return np.array([weighted_mean(values, self.weight)])
         return self._groups.means(values, self._configured_weight)
@@ -354,7 +373,8 @@ class SiteScoring:
         periods = [period.name for period in self.periods]
         limits = {MIX: self.scorer.limit, **dict(zip(periods, self.scorer.limits_by_period, strict=True))}
         scores = (SiteScores(site.site.name, site.score, site.targets) for site in sites)
-        return ScoreTable.of(scores, groups, limits, periods)
+        score_groups = {} if self.targets is None else self.targets.score_groups
+        return ScoreTable.of(scores, groups, limits, periods, score_groups)
 
 
 _UNIT_GRID = Grid((0.0, 0.0, 0.0), 1.0, (1, 1, 1))
@@ -372,7 +392,7 @@ def prepare_targets() -> None:
     record = TargetRecord.of([TrafficFrame(0, ("car",), ("passenger",), box, np.zeros(1))], _UNIT_GRID)
     visible = visible_targets(record, _unit_beams())
     for score in TARGET_SCORES.values():
-        score(visible)
+        score(visible, DETECTORS)
 
 
 def prepare_voxels() -> None:

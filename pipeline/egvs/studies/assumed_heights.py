@@ -16,6 +16,7 @@ from typing import Any
 
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core.platform import relative_path
+from egvs.core.wording import format_percent
 from egvs.report.formatting import ScoreLabel, join_names
 from egvs.report.ranking import RankedSite, Ranking
 from egvs.runs import run_names
@@ -59,7 +60,7 @@ class HeightRun:
     @property
     def label(self) -> str:
         """The heights in words."""
-        return "as assumed" if self.factor == 1.0 else f"{(self.factor - 1) * 100:+.0f} %"
+        return "as assumed" if self.factor == 1.0 else format_percent(self.factor - 1, 0, signed=True)
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from egvs.core import files, plugins
 from egvs.core.errors import InputError, MissingBackendError, format_problem
 from egvs.core.grid import FloatArray
 from egvs.core.progress import ProgressCallback, no_progress
+from egvs.core.wording import format_percent
 from egvs.effects import registry
 from egvs.effects.articulated import Articulated
 from egvs.effects.base import Detect, Echo, Effect, Traffic
@@ -143,8 +144,8 @@ class EffectTrial:
 
     @property
     def in_words(self) -> str:
-        """The change, e.g. "EGVS by -12.1 to -24.9%"."""
-        unit = " percentage points" if self.by.is_share else "%"
+        """The change, e.g. "EGVS by -12.1 to -24.9 %"."""
+        unit = " percentage points" if self.by.is_share else " %"
         amount = f"{100 * self.least:+z.1f} to {100 * self.most:+z.1f}{unit}"
         if abs(self.most) < MIN_DISPLAYED_CHANGE:
             amount = f"less than {100 * MIN_DISPLAYED_CHANGE:.1f}{unit}"
@@ -440,7 +441,8 @@ def _try_effect(effect: Effect[Any], trials: EffectTrials) -> tuple[bool, str]:
         share = sum(share for name, (_, share) in trials.vehicle_shares.items() if name in parts)
         return (
             share == 0,
-            f"{share:.1%} of the boxes in the last run would be split into parts; only a run with it shows the change",
+            f"{format_percent(share)} of the boxes in the last run would be split into parts; only a run "
+            "with it shows the change",
         )
     trial = trials.trial(effect)
     if trial is None:

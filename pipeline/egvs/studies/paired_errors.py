@@ -2,7 +2,8 @@
 
 Runs with the same traffic have their errors in common: a busy quarter of an hour is busy for all sites and sensors. The
 block jackknife leaves out the same groups of frames in all of them, so the error of a difference is computed from the
-differences of the replicates (:mod:`egvs.scoring.standard_errors`), as within a run. Replicates are not kept in a run
+differences of the replicates (:mod:`egvs.scoring.standard_errors`), as within a run. The same holds for the detectors
+of a score. Replicates are not kept in a run
 folder. So the sites that are compared are scored again from its artefacts, and must get the recorded scores.
 
 Where that is not possible, or the traffic differs, errors are taken as independent: the squared standard errors are
@@ -151,7 +152,7 @@ class ScoreDifferences:
             if folder in self._failures:
                 return f"{folder}: {self._failures[folder]}"
         pools = {pool for key, (pool, _) in self._rows.items() if key.folder in (first, second)}
-        return "" if len(pools) == 1 else "their traffic is divided into different blocks"
+        return "" if len(pools) == 1 else "their traffic is divided into different blocks, or their detectors differ"
 
     def between(self, first: SiteOfRun, second: SiteOfRun) -> ScoreDifference:
         """Return the score of the first site minus that of the second."""

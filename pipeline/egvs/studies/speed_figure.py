@@ -8,6 +8,7 @@ from html import escape
 import numpy as np
 
 from egvs.core.grid import FloatArray
+from egvs.core.wording import format_percent
 from egvs.report.svg_figures import FigureStyle, round_values, svg_start_tag
 from egvs.studies.lane_speeds import BIN_M_S
 
@@ -38,7 +39,7 @@ def draw_speeds(cumulative: Sequence[FloatArray], top_m_s: float, alt: str) -> s
     for share in (0.0, 0.5, 1.0):
         y = base - height * share
         parts.append(f'<path class="grid" d="M{_LEFT:.1f} {y:.1f}h{width:.1f}"/>')
-        parts.append(_text(_LEFT - 7, y + 4, f"{share:.0%}", "end"))
+        parts.append(_text(_LEFT - 7, y + 4, format_percent(share, 0), "end"))
     for value, text in round_values(0.0, top_m_s, 6):
         parts.append(_text(_LEFT + width * value / top_m_s, base + 16, text))
     for shares, line in zip(cumulative, _LINES, strict=True):

@@ -18,7 +18,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
-from egvs.scoring.target_scores import DETECTORS, TARGET_SCORES
+from egvs.scoring.target_scores import TARGET_SCORES
 from egvs.studies.decision import MIN_UNITS, Draw
 from egvs.studies.study_settings import (
     APPROXIMATES,
@@ -143,8 +143,8 @@ def priced_settings(
         yield from _with_sampled_frames(scenario, run_units, values)
     if scenario.score.rank_by != DEFAULT_SCORE:
         yield from _by_vehicles_found(variant, scenario, units, values)
-    if scenario.score.rank_by == DEFAULT_SCORE and values.detectors:
-        for detector in DETECTORS:
+    if scenario.score.rank_by == DEFAULT_SCORE and values.detectors and len(scenario.score.detectors) > 1:
+        for detector in scenario.score.detectors:
             setting = Setting(f"model of {detector} alone", MEASURES, "detector")
             yield PricedSetting(setting, variant.name, run_units, 0, sampled, detector_score(detector))
 

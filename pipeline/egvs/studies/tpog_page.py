@@ -9,6 +9,7 @@ from pathlib import Path
 
 from egvs._version import __version__
 from egvs.core import files
+from egvs.core.wording import format_percent
 from egvs.report import formatting, maps, page
 from egvs.report.colours import STYLE_SHEET, ColumnValues
 from egvs.report.maps import MapScale
@@ -55,17 +56,18 @@ def render_page(comparison: TpogComparison) -> str:
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     environment.filters |= {
-        "svg": Markup, "percent": formatting.format_percent, "integer": formatting.format_count,
+        "svg": Markup, "percent": format_percent, "integer": formatting.format_count,
         "measured": format_measured, "measured_share": format_share, "measured_bit": format_bit,
         "measured_speed": format_speed,
     }  # fmt: skip
-    return environment.get_template("tpog.html.j2").render(
+    html = environment.get_template("tpog.html.j2").render(
         comparison=comparison,
         figures=draw_maps(comparison),
         speeds=draw_lane_speeds(comparison),
         style=Markup(STYLE_SHEET),
         version=__version__,
     )
+    return formatting.keep_percentages_together(html)
 
 
 def format_measured(measured: Measured | None) -> str:
@@ -80,7 +82,7 @@ def format_measured(measured: Measured | None) -> str:
 def format_share(measured: Measured) -> str:
     """Return a share in percent with its standard error: "2.4 ± 1.4 %"."""
     if measured.se is None:
-        return f"{100 * measured.value:.1f} %"
+        return format_percent(measured.value)
     return f"{100 * measured.value:.1f} ± {100 * measured.se:.1f} %"
 
 
@@ -119,7 +121,7 @@ def draw_maps(comparison: TpogComparison) -> list[str]:
     label = "Share of the frames in which the column is occupied"
     figures = []
     for side, tpog, each in zip(SIDES, comparison.tpogs, values, strict=True):
-        alt = f"The {side} occupancy from above; vehicles use {(each > 0).mean():.0%} of the region."
+        alt = f"The {side} occupancy from above; vehicles use {format_percent((each > 0).mean(), 0)} of the region."
         figures.append(
             maps.occupancy(
                 tpog.grid, each, label, comparison.backdrop, (), alt, FigureStyle(width=_MAP_WIDTH),

@@ -24,8 +24,8 @@ from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.core.threads import map_ordered
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.scoring.scorer import PeriodTpog, Scorer, SiteScore
-from egvs.scoring.target_scores import DETECTORS, TARGET_SCORES, detection_chances, saturating_gain
-from egvs.scoring.targets import VisibleTargets, recorded_frames
+from egvs.scoring.target_scores import DETECTORS, TARGET_SCORES, found_by_detector
+from egvs.scoring.targets import recorded_frames
 from egvs.stages.base import StageContext
 from egvs.stages.inputs import open_folder
 from egvs.stages.site_scans import SiteScan, empty_scans
@@ -186,9 +186,9 @@ def score_run(
 
     def score_site(scan: SiteScan) -> _SiteSums:
         visible = targets.visible(scan.beams)
-        values = {name: TARGET_SCORES[name](visible) for name in names}
+        values = {name: TARGET_SCORES[name](visible, targets.detectors) for name in names}
         if by_detector:
-            values |= {detector_score(detector): _detector_chances(visible, detector) for detector in DETECTORS}
+            values |= {detector_score(detector): found_by_detector(visible, (detector,))[0] for detector in DETECTORS}
         sums = {name: by_frame(chances * targets.weight) for name, chances in values.items()}
         voxel_scores = np.empty(0)
         if scorer is not None:
@@ -216,13 +216,6 @@ class _SiteSums(NamedTuple):
     pole: str
     sums: dict[str, FloatArray]
     voxel_scores: FloatArray
-
-
-def _detector_chances(visible: VisibleTargets, detector: str) -> FloatArray:
-    if not len(visible):
-        return np.empty(0)
-    chances = detection_chances(visible, (detector,))
-    return np.where(visible.record.are_people, saturating_gain(visible.points), chances)
 
 
 def _voxel_score(score: SiteScore, name: str, limit: float) -> float:

@@ -35,7 +35,7 @@ from egvs.core.numbers import parse_decimal
 from egvs.core.platform import relative_path
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.special import cosdg, sindg
-from egvs.core.wording import number_of
+from egvs.core.wording import format_percent, number_of
 from egvs.formats import csv_tables
 from egvs.report.basemap import solid_group
 from egvs.report.command_sections import DIGEST_KEY, what_if_digest
@@ -151,10 +151,10 @@ class WhatIfAnswer:
 
     def conclusion(self) -> str:
         """Return one sentence: whether the best site changes."""
-        if self.name == TOGETHER:
+        if self.share is None:  # all together
             time = TOGETHER
         else:
-            time = f"{self.name} ({self.share:.0%} of the time)"
+            time = f"{self.name} ({format_percent(self.share, 0)} of the time)"
         if self.change is None:
             return f"{time}: {self.best_before} is not possible with these solids; {self.best_expected} is best then."
         if self.best_expected == self.best_before:

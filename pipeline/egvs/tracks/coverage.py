@@ -20,6 +20,7 @@ from shapely.geometry.base import BaseGeometry
 from egvs.core import reading
 from egvs.core.errors import Diagnostic, InputError
 from egvs.core.grid import FloatArray, Roi
+from egvs.core.wording import format_percent
 from egvs.formats.georeference import Georeference, declared_crs, geojson_coordinates
 from egvs.tracks.cleaning import CleanTracks
 
@@ -86,7 +87,7 @@ class Coverage:
         """Warn about a small coverage, and about tracks that begin or end inside it."""
         if self.share < MIN_SHARE:
             kind = "the given coverage is" if self.is_given else "recorded positions cover about"
-            problem = f"{kind} {self.share:.0%} of the {self._of_what}; elsewhere the traffic is unknown"
+            problem = f"{kind} {format_percent(self.share, 0)} of the {self._of_what}; elsewhere the traffic is unknown"
             yield Diagnostic("coverage", where, problem, "Make the region smaller, or use more recordings.")
         if self.hidden_ends > MAX_HIDDEN_SHARE * max(self.ends, 1):
             problem = (

@@ -35,7 +35,7 @@ import numpy as np
 
 from egvs.core.errors import Diagnostic, RunError
 from egvs.core.grid import XY, FloatArray, Roi
-from egvs.core.wording import number_of, shorten_id
+from egvs.core.wording import format_percent, number_of, shorten_id
 from egvs.traffic.network import Network
 from egvs.traffic.sumo_folder import RED_MARGIN_S, Timing
 from egvs.traffic.vehicle_boxes import VehicleSize
@@ -183,7 +183,7 @@ def teleport_warning(
         period = f"{there[0].time_s:.0f} to {there[-1].time_s:.0f} s" if number > 1 else f"{there[0].time_s:.0f} s"
         locations.append(f"{number} at {location} ({period}{distance})")
     count = len({teleport.vehicle for teleport in teleports})
-    share = f"{count / max(vehicles, 1):.1%}".replace("%", " %")
+    share = format_percent(count / max(vehicles, 1))
     problem = (
         f"{count} of {number_of(vehicles, 'vehicle')} ({share}) stood at the head of their lane for {limit_s:g}"
         " s and were moved"

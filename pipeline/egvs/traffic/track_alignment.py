@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, Roi
-from egvs.core.wording import number_of
+from egvs.core.wording import format_percent, number_of
 from egvs.traffic.network import CAR, LANE_WIDTH_M, Network
 
 FAR_M = 5.0
@@ -70,12 +70,15 @@ class Alignment:
 
     def describe(self) -> str:
         """Return a sentence."""
-        text = f"{self.share:.0%} of {number_of(self.positions, 'position')} of moving vehicles lie on lanes"
+        text = (
+            f"{format_percent(self.share, 0)} of {number_of(self.positions, 'position')} of moving "
+            "vehicles lie on lanes"
+        )
         if self.fits_better:
             east_m, north_m = self.shift_m
             text += (
                 f"; moved by {east_m:+.1f} m east and {north_m:+.1f} m north and turned by {self.rotation_deg:+.2f}"
-                f" degrees, {self.fitted_share:.0%} would"
+                f" degrees, {format_percent(self.fitted_share, 0)} would"
             )
         return text
 

@@ -20,7 +20,7 @@ from egvs.artefacts.parquet import ArtefactWriter
 from egvs.core.errors import Diagnostic, RunError
 from egvs.core.grid import Roi
 from egvs.core.progress import ProgressCallback
-from egvs.core.wording import by_number, number_of
+from egvs.core.wording import by_number, format_percent, number_of
 from egvs.scenario.model import Scenario
 from egvs.traffic import fcd, vehicle_boxes
 from egvs.traffic.locks import DemandKey, StreetNames, describe_distance, is_inside
@@ -491,7 +491,7 @@ def traffic_warnings(
             )
             if statistics.stood_long:
                 number, total = len(statistics.stood_long), len(statistics.names)
-                percent = f"{100 * number / total:.1f} %"
+                percent = format_percent(number / total)
                 problem += (
                     f"; {number} of {total:,} vehicles ({percent}) stood for more than {LONG_STOP_S:g} s somewhere"
                 )
@@ -511,7 +511,7 @@ def traffic_warnings(
         centre_m = (east + 0.5) * SQUARE_M, (north + 0.5) * SQUARE_M
         where = f"{recording.where}: {describe_location(centre_m, roi)}"
         problem = (
-            f"vehicles overlap in {share:.0%} of the frames; {pairs} of"
+            f"vehicles overlap in {format_percent(share, 0)} of the frames; {pairs} of"
             f" {number_of(statistics.overlapping_pairs, 'overlap')} {by_number(pairs, 'is', 'are')}"
             " here"
         )

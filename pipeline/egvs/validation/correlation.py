@@ -59,6 +59,7 @@ from scipy.special import ndtr, ndtri
 
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, IntArray
+from egvs.core.wording import format_percent
 from egvs.validation.detection_metrics import JackknifeEstimate
 from egvs.validation.sweeps import BoolArray
 
@@ -180,7 +181,7 @@ class ConfidenceInterval:
         defined = resampled[~np.isnan(resampled)]
         if len(defined) < (1.0 - MAX_UNDEFINED_SHARE) * len(resampled):
             share = 1.0 - len(defined) / len(resampled)
-            return cls.undefined(f"{share:.0%} of the resamples have equal values only")
+            return cls.undefined(f"{format_percent(share, 0)} of the resamples have equal values only")
         if np.ptp(defined) <= _TIE_TOLERANCE:
             return cls.undefined("all resamples have the same value, which says nothing about other sites")
 

@@ -28,6 +28,7 @@ from egvs.core import files
 from egvs.core.errors import InputError, RunError, unknown_site
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.threads import thread_count
+from egvs.core.wording import format_percent
 from egvs.effects import registry
 from egvs.runs import locks
 from egvs.scenario.model import Scenario
@@ -264,7 +265,8 @@ def _files_section(layout: Layout, sites: Sequence[SiteSummary]) -> str:
             " that keeps only what a camera sees (`FOV_POINTS_ONLY`) drops most of them: turn that off."
         )
     rows += [
-        f"- `ImageSets/train.txt`, `val.txt`: the first {TRAINING_SHARE:.0%} of the frames, and the rest; `empty.txt`:"
+        f"- `ImageSets/train.txt`, `val.txt`: the first {format_percent(TRAINING_SHARE, 0)} of the frames, "
+        "and the rest; `empty.txt`:"
         f" the frames of both without labelled boxes, which many loaders cannot read ({empty} here). Each frame is in"
         " one of them.",
         "- `objects.csv`: every box of every frame, visible or not, in the frame above: its number in the frame, SUMO's"

@@ -19,6 +19,7 @@ from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core import files
 from egvs.core.errors import WARNINGS_KEY, Diagnostic, InputError, collect_warnings, with_relative_paths
 from egvs.core.progress import ProgressCallback
+from egvs.core.wording import format_percent
 from egvs.runs import stage_keys, stage_registry
 from egvs.runs.run import lock_run_folder
 from egvs.scenario.model import Scenario
@@ -114,7 +115,7 @@ def _same_traffic_warnings(
             "traffic not held out",
             f"{scenario.file}: traffic",
             "the traffic was recorded, so sites are evaluated with the frames that the TPOG was computed from: "
-            f"{n_shared:,} of {len(vehicles):,} vehicles ({n_shared / len(vehicles):.0%}) are in both",
+            f"{n_shared:,} of {len(vehicles):,} vehicles ({format_percent(n_shared / len(vehicles), 0)}) are in both",
             "Use a network or a sumocfg to simulate held-out traffic.",
         )
 
@@ -132,7 +133,8 @@ def _fixed_departure_warnings(scenario: Scenario) -> Iterator[Diagnostic]:
             yield Diagnostic(
                 "departures not redrawn",
                 sumo_folder.traffic_location(period),
-                f"{counts.fixed:,} of {total:,} vehicles and flows ({counts.fixed / total:.0%}) have departures that"
+                f"{counts.fixed:,} of {total:,} vehicles and flows "
+                f"({format_percent(counts.fixed / total, 0)}) have departures that"
                 " cannot be redrawn, so the held-out traffic and that of the TPOG have them in common",
                 "Use departure times in seconds, or flows.",
             )

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.grid import FloatArray, IntArray
-from egvs.core.wording import number_of
+from egvs.core.wording import format_percent, number_of
 from egvs.importers.recorded.signals import GREEN, YELLOW, GroupOfEdges, SignalRecord
 
 MIN_VEHICLES, MIN_PEOPLE = 5, 10
@@ -191,8 +191,9 @@ def _from_vehicles(
     others = max((share for name, share in shares.items() if name != light), default=0.0)
     if shares[light] >= MIN_AGREEMENT:
         reason = (
-            f"{shares[light]:.0%} of {number_of(len(times_s), 'vehicle')} pass in its green or yellow; next"
-            f" light {others:.0%}"
+            f"{format_percent(shares[light], 0)} of {number_of(len(times_s), 'vehicle')} pass in its green "
+            "or yellow; next"
+            f" light {format_percent(others, 0)}"
         )
         yield LightGuess(edge, target, light, reason)
 
@@ -220,7 +221,8 @@ def _from_people(
     if agreement < MIN_PEOPLE_AGREEMENT:
         return
     reason = (
-        f"{agreement:.0%} of the time that {count} people walked on lanes in some green was not in the green of these"
+        f"{format_percent(agreement, 0)} of the time that {count} people walked on lanes in some green was "
+        "not in the green of these"
         " lanes. This is weak; give a file with the groups if you know them"
     )
     for number, axis in enumerate(axes):

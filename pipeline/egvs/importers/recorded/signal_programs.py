@@ -32,7 +32,7 @@ from shapely.geometry import LineString, Point
 from egvs.core import files
 from egvs.core.errors import InputError, RunError
 from egvs.core.grid import FloatArray
-from egvs.core.wording import by_number, number_of
+from egvs.core.wording import by_number, format_percent, number_of
 from egvs.formats import xml
 from egvs.formats.georeference import WorldFrame
 from egvs.importers.plain_network import NETCONVERT_FLAGS, NETWORK_FILE
@@ -539,7 +539,8 @@ def _agreement_notes(
     in_green, count = green_share(by_edges, records, motion)
     if count:
         text = (
-            f"{in_green} of {number_of(count, 'recorded vehicle')} ({in_green / count:.0%}) pass the stop"
+            f"{in_green} of {number_of(count, 'recorded vehicle')} ({format_percent(in_green / count, 0)}) "
+            "pass the stop"
             " line in green or yellow"
         )
         doubtful = in_green < MIN_IN_GREEN * count

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.core.wording import by_number, list_first, number_of
+from egvs.core.wording import by_number, format_percent, list_first, number_of
 from egvs.importers.map_parts import Terrain
 from egvs.importers.terrain.network_heights import (
     Replacement,
@@ -236,7 +236,7 @@ def _heights(terrain: Terrain, samples: Sequence[_Sample], where: object) -> lis
 
 
 def _share(part: int, total: int) -> str:
-    return f"{part:,} of {total:,} ({part / total:.1%})"
+    return f"{part:,} of {total:,} ({format_percent(part / total)})"
 
 
 def _replacement(shape: ShapeText, sample: _Sample, z_m: FloatArray) -> Replacement:

@@ -18,7 +18,7 @@ from shapely.geometry.base import BaseGeometry
 from egvs.core import limits
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
-from egvs.core.wording import by_number, number_of
+from egvs.core.wording import by_number, format_percent, number_of
 from egvs.formats.rasters import HeightGrid
 from egvs.importers.map_parts import MapContext, Terrain
 
@@ -303,7 +303,7 @@ def _grid_notes(grids: Sequence[tuple[HeightGrid, str]], context: MapContext) ->
     points = _window_points(context.window)
     unknown = int(np.isnan(GridTerrain(tuple(grids), context).height_m(points)).sum())
     if unknown:
-        yield f"The terrain has no height in {unknown / len(points):.1%} of the region."
+        yield f"The terrain has no height in {format_percent(unknown / len(points))} of the region."
 
 
 def _window_points(window: BaseGeometry) -> FloatArray:

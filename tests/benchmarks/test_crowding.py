@@ -7,11 +7,12 @@ import math
 import numpy as np
 import pytest
 import shapely
+from benchmarks.detectability import crowding
+from benchmarks.detectability.crowding import MAX_BESIDE_DEG, MAX_LINK_GAP, NEIGHBOUR_M, measure_crowding
+from benchmarks.detectability.crowding_kernels import RAY_SHARES
 from shapely import affinity
 
-from egvs.kernels.crowding import RAY_SHARES
-from egvs.scoring import crowding
-from egvs.scoring.crowding import MAX_BESIDE_DEG, MAX_LINK_GAP, NEIGHBOUR_M, measure_crowding
+from egvs.artefacts.traffic_frames import TrafficFrame
 from tests.scoring.target_scenes import axes_of, beams_to, entered_m, frame, random_boxes, seen
 from tests.scoring.test_visible_targets import AT, fan
 
@@ -81,6 +82,19 @@ def test_people_are_no_neighbours_and_vehicles_outside_the_region_are():
     visible = seen([outside], fan())
     found = measure_crowding(visible)
     assert found.behind_gap_m == pytest.approx([2.0], rel=6e-3) and found.link_gap.tolist() == [MAX_LINK_GAP]
+
+
+def test_parts_of_one_vehicle_are_no_neighbours():
+    """A truck from x = 10 to 14 with its trailer from 14.5 to 20.5, and a car from 23 to 27, which is theirs."""
+    parts = np.array([box(12.0, 0.0), box(17.5, 0.0, length=6.0), box(25.0, 0.0)])
+    articulated = TrafficFrame(
+        0, ("lorry", "lorry", "car"), ("trailer", "trailer", "passenger"), parts, np.zeros(3), np.array([0, 1, 0])
+    )
+    found = measure_crowding(seen([articulated], fan()))
+    assert found.front_gap_m == pytest.approx([NEIGHBOUR_M, NEIGHBOUR_M, 2.5], rel=6e-3)
+    assert found.behind_gap_m == pytest.approx([9.0, 2.5, NEIGHBOUR_M], rel=6e-3)
+    apart = TrafficFrame(0, ("a", "b", "car"), ("trailer", "trailer", "passenger"), parts, np.zeros(3))
+    assert measure_crowding(seen([apart], fan())).behind_gap_m[0] == pytest.approx(0.5, rel=6e-3)
 
 
 def test_no_vehicle_and_frames_do_not_mix():

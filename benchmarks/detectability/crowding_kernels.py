@@ -1,4 +1,4 @@
-"""Gaps between vehicles as seen from a sensor, in plan view.
+"""Kernels of :mod:`benchmarks.detectability.crowding`: gaps between vehicles as seen from a sensor, in plan view.
 
 Rectangles are rows of :func:`egvs.kernels.vehicle_visibility.footprints`: centre x, y, cosine and sine of the yaw, half
 length, half width; metres and the grid's frame. A rectangle spans azimuths from its middle minus to its middle plus a
@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import math
 
+import numba
 import numpy as np
 
-from egvs.kernels.jit import njit
 from egvs.kernels.vehicle_visibility import rectangle_distance
 
-_kernel = njit()
+_kernel = numba.njit(nogil=True, error_model="numpy")
+"""Not cached on disk: numba would not notice a change of the kernels of ``egvs`` that these call."""
 
 RAY_SHARES = 0.02, 0.5, 0.98
 """Positions of the rays in the azimuths that two rectangles share; not at their ends, where a ray touches a corner."""
@@ -25,8 +26,10 @@ _TINY = 1e-12
 
 
 @_kernel
-def near_pairs(rows, frame, starts, plan, others, reach_m, pair_starts, pairs):  # type: ignore[no-untyped-def]
+def near_pairs(rows, frame, starts, plan, others, vehicle, reach_m, pair_starts, pairs):
     """Count, and list if there is room, the neighbours of each target that are at most ``reach_m`` away in plan view.
+
+    Other parts of the same vehicle are not neighbours.
 
     Parameters
     ----------
@@ -36,6 +39,8 @@ def near_pairs(rows, frame, starts, plan, others, reach_m, pair_starts, pairs): 
         Boxes starts[f] to starts[f + 1] are those of frame f, (frames + 1,) int64.
     plan, others
         Rectangle of each box, (b, 6) float64; which boxes count as neighbours, (b,) bool.
+    vehicle
+        The vehicle that each box is part of, (b,) int64.
     reach_m
         Largest distance.
     pair_starts
@@ -49,7 +54,7 @@ def near_pairs(rows, frame, starts, plan, others, reach_m, pair_starts, pairs): 
         a = plan[rows[i]]
         near_m = reach_m + math.sqrt(a[4] * a[4] + a[5] * a[5])
         for j in range(starts[frame[i]], starts[frame[i] + 1]):
-            if j == rows[i] or not others[j]:
+            if vehicle[j] == vehicle[rows[i]] or not others[j]:
                 continue
             x, y = plan[j, 0] - a[0], plan[j, 1] - a[1]
             bound_m = near_m + math.sqrt(plan[j, 4] * plan[j, 4] + plan[j, 5] * plan[j, 5])
@@ -61,7 +66,7 @@ def near_pairs(rows, frame, starts, plan, others, reach_m, pair_starts, pairs): 
 
 
 @_kernel
-def _view(x, y, box, view):  # type: ignore[no-untyped-def]
+def _view(x, y, box, view):
     """Fill middle azimuth, half width (radians), nearest and farthest range (metres) of a rectangle from x, y."""
     dx, dy = box[0] - x, box[1] - y
     c, s, half_u, half_v = box[2], box[3], box[4], box[5]
@@ -88,7 +93,7 @@ def _view(x, y, box, view):  # type: ignore[no-untyped-def]
 
 
 @_kernel
-def _crossing(x, y, direction_x, direction_y, box):  # type: ignore[no-untyped-def]
+def _crossing(x, y, direction_x, direction_y, box):
     """Where a ray enters and leaves a rectangle, metres; infinity twice where it misses it."""
     dx, dy = x - box[0], y - box[1]
     c, s = box[2], box[3]
@@ -110,7 +115,7 @@ def _crossing(x, y, direction_x, direction_y, box):  # type: ignore[no-untyped-d
 
 
 @_kernel
-def sight_gaps(x, y, rows, pair_starts, pairs, plan, views, front_m, behind_m, beside_rad):  # type: ignore[no-untyped-def]
+def sight_gaps(x, y, rows, pair_starts, pairs, plan, views, front_m, behind_m, beside_rad):
     """Fill the gaps from each target to its neighbours as seen from the sensor.
 
     Parameters
@@ -169,7 +174,7 @@ def sight_gaps(x, y, rows, pair_starts, pairs, plan, views, front_m, behind_m, b
 
 
 @_kernel
-def point_gaps(pair_starts, pairs, target_of_box, spanned, has_points, gap_m):  # type: ignore[no-untyped-def]
+def point_gaps(pair_starts, pairs, target_of_box, spanned, has_points, gap_m):
     """Lower ``gap_m`` to the distance between the rectangles around the points of each target and its neighbours.
 
     Parameters

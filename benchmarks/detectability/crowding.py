@@ -35,9 +35,10 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from benchmarks.detectability import crowding_kernels
 from egvs.artefacts.traffic_frames import NON_VEHICLE_KINDS
 from egvs.core.grid import FloatArray, IntArray
-from egvs.kernels import crowding, vehicle_visibility
+from egvs.kernels import vehicle_visibility
 from egvs.scoring.targets import TargetRecord, VisibleTargets
 
 NEIGHBOUR_M = 10.0
@@ -70,7 +71,8 @@ VEHICLE_CLASSES = {
     "motorcycle": "motorcycle",
     "moped": "motorcycle",
 }
-"""Class of each vClass of SUMO; a car for all others."""
+"""Class of each vClass of SUMO that is a vehicle (:meth:`egvs.artefacts.traffic_frames.TrafficFrame.are_vehicles`); a
+car for all others."""
 
 CLASSES = ("car", "van", "truck", "bus", "motorcycle")
 
@@ -95,7 +97,10 @@ class NeighbourPairs(NamedTuple):
 
     @classmethod
     def of(cls, record: TargetRecord) -> NeighbourPairs:
-        """List the vehicles at most :data:`NEIGHBOUR_M` from each target, in plan view; people are not neighbours."""
+        """List the vehicles at most :data:`NEIGHBOUR_M` from each target, in plan view.
+
+        People are not neighbours, nor are other parts of the same vehicle.
+        """
         boxes = record.all_boxes
         plan = np.empty((len(boxes.values), 6))
         vehicle_visibility.footprints(boxes.values, plan)
@@ -104,9 +109,10 @@ class NeighbourPairs(NamedTuple):
         starts = np.zeros(len(record) + 1, dtype=np.int64)
         listed = np.empty(0, dtype=np.int64)
         for _ in range(2):  # counts, then lists
-            crowding.near_pairs(
-                record.row, record.frame, boxes.starts, plan, boxes.are_vehicles, NEIGHBOUR_M, starts, listed
-            )
+            crowding_kernels.near_pairs(
+                record.row, record.frame, boxes.starts, plan, boxes.are_vehicles, boxes.vehicle, NEIGHBOUR_M, starts,
+                listed,
+            )  # fmt: skip
             listed = np.empty(starts[-1], dtype=np.int64) if not len(listed) else listed
         return cls(starts, listed, plan, target_of_box)
 
@@ -163,7 +169,7 @@ def measure_crowding(visible: VisibleTargets) -> Crowding:
     beside_rad = np.full(len(record), np.deg2rad(MAX_BESIDE_DEG))
     x_m, y_m = visible.sensor_m[:2].tolist()
     views = np.zeros((len(pairs.plan), 4))
-    crowding.sight_gaps(
+    crowding_kernels.sight_gaps(
         x_m, y_m, record.row, pairs.starts, pairs.boxes, pairs.plan, views, front_m, behind_m, beside_rad
     )
     length_m, width_m, height_m = record.boxes[:, 3:6].T
@@ -173,7 +179,9 @@ def measure_crowding(visible: VisibleTargets) -> Crowding:
     reach_m = np.maximum(LINK_M, LINK_PER_RANGE * flat_m)
     point_gap_m = MAX_LINK_GAP * reach_m
     has_points = visible.points > 0.0
-    crowding.point_gaps(pairs.starts, pairs.boxes, pairs.target_of_box, _spanned(visible), has_points, point_gap_m)
+    crowding_kernels.point_gaps(
+        pairs.starts, pairs.boxes, pairs.target_of_box, _spanned(visible), has_points, point_gap_m
+    )
 
     cosine = np.cos(np.deg2rad(visible.depression_deg))
     sine = np.abs(np.sin(np.deg2rad(visible.depression_deg)))

@@ -1,0 +1,111 @@
+"""Fit the models of ``expected_detections`` to the records of the training junctions, and compare their features.
+
+Each vehicle-frame of the unseen traffic, as seen from each candidate, is a row: its features, and in how many of the
+two views it was found. Every model is tested on each junction with the models of the others
+(:mod:`benchmarks.detectability.comparison`, where groups are candidates of equal height). Records of other roles are
+never read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import sklearn
+
+from benchmarks.across_junctions.detections import AP
+from benchmarks.across_junctions.protocol import Protocol
+from benchmarks.across_junctions.records import JunctionRecord, read_junction, read_table
+from benchmarks.detectability import comparison, writing
+from benchmarks.detectability.additive_model import DIRECTIONS, TargetFeatures
+from benchmarks.detectability.comparison import SiteRows
+from benchmarks.detectability.fitting import Examples, cross_validate, fit_model
+from egvs.core import files
+from egvs.core.errors import InputError
+from egvs.scoring.target_scores import FEATURES, detectability_model
+from egvs.validation.detectors import base
+
+MIN_JUNCTIONS = 2
+"""Each is predicted by the model of the others."""
+
+
+def read_training(records_folder: Path, protocol: Protocol, detector: str) -> dict[str, list[SiteRows]]:
+    """Return the rows of the training junctions where a detector was run, by junction and candidate.
+
+    Raises
+    ------
+    InputError
+        If a record is damaged, or fewer than two junctions were measured.
+    """
+    each = {}
+    for junction in protocol.junctions:
+        if junction.role == "training" and (records_folder / f"{junction.name}.{detector}.json").is_file():
+            record = read_junction(records_folder, junction.name)
+            each[junction.name] = _site_rows(records_folder, record, detector)
+    if len(each) < MIN_JUNCTIONS:
+        problem = f"expected {MIN_JUNCTIONS} training junctions with {detector}, got {', '.join(each) or 'none'}"
+        raise InputError(records_folder, problem, "Measure them: across_junctions measure --role training.")
+    return each
+
+
+def _site_rows(folder: Path, record: JunctionRecord, detector: str) -> list[SiteRows]:
+    """Return what each candidate sees and finds; a candidate with undefined AP is left out."""
+    seen = read_table(folder / f"{record.name}.features.parquet")
+    found = read_table(folder / f"{record.name}.{detector}.hits.parquet")
+    if seen["site"] != found["site"] or seen["row"] != found["row"]:
+        problem = f"its rows are not those of {record.name}.{detector}.hits.parquet"
+        raise InputError(folder / f"{record.name}.features.parquet", problem, "Measure both parts again.")
+    count = seen.num_rows // len(record.sites)
+    ap = record.detections[detector][AP].values
+    model = detectability_model(detector)
+    rows = []
+    for number, site in enumerate(record.sites):
+        of_site = seen.slice(number * count, count)
+        columns = {name: of_site[name].to_numpy().astype(np.float64) for name in DIRECTIONS}
+        shipped = model.chances(np.column_stack([columns[name] for name in FEATURES]))
+        shipped = np.where(columns["log_points"] > 0.0, shipped, 0.0)
+        hits = found["hits"].slice(number * count, count).to_numpy().astype(np.float64)
+        features = TargetFeatures(columns, of_site["vehicle_class"].to_numpy().astype(np.int64))
+        if np.isfinite(ap[number]):
+            group = f"{record.height_m[number]:g} m"
+            rows.append(SiteRows(site, group, features, hits, shipped, float(ap[number])))
+    return rows
+
+
+def compare(by_junction: Mapping[str, Sequence[SiteRows]], detector: str, out: Path) -> list[str]:
+    """Write the comparison of models of one detector as Markdown, and return its lines."""
+    lines = [f"{detector}: groups are candidates of equal height", ""]
+    lines += [*comparison.table(comparison.compare(by_junction)), ""]
+    out.mkdir(parents=True, exist_ok=True)
+    files.write_text(out / f"comparison_{detector}.md", "\n".join(lines))
+    return lines
+
+
+def fitted_models(records_folder: Path, protocol: Protocol) -> str:
+    """Return the file of models, ``target_scores.json``, fitted to all training junctions.
+
+    Raises
+    ------
+    InputError
+        As :func:`read_training`.
+    """
+    models, settings = {}, {}
+    learnt_on: dict[str, writing.TrainingJunction] = {}
+    sites: dict[str, dict[str, int]] = {}
+    for detector in protocol.detectors.training:
+        by_junction = read_training(records_folder, protocol, detector)
+        examples = {name: _examples(rows) for name, rows in by_junction.items()}
+        models[detector] = fit_model(list(examples.values())) | {"elsewhere": cross_validate(examples)}
+        settings[detector] = files.hash_json(base.make_detector(detector).settings)
+        for name, rows in by_junction.items():
+            sites.setdefault(name, {})[detector] = len(rows)
+            sensors = tuple(sorted(set(read_junction(records_folder, name).sensors)))
+            learnt_on[name] = writing.TrainingJunction(sites[name], sensors, len(rows[0].hits))
+    metadata = writing.TrainingMetadata(learnt_on, protocol.training_frames, settings, sklearn.__version__)
+    return writing.text(metadata, models)
+
+
+def _examples(rows: Sequence[SiteRows]) -> Examples:
+    features = [np.column_stack([site.features.columns[name] for name in FEATURES]) for site in rows]
+    return Examples(features, [site.hits for site in rows], [site.ap for site in rows])
