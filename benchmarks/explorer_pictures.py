@@ -38,18 +38,18 @@ HIDE_NOTIFICATIONS = ".mantine-Notifications-root { display: none }"
 WIDTH, HEIGHT = 1200, 720
 ABOVE = Camera((203.0, 188.0, 48.0), (197.0, 237.0, 0.0))
 NEAR = Camera((216.0, 212.0, 24.0), (191.0, 240.0, 0.0))
-MOVED = Pose(196.6, 251.7, 2.0, 0.0, 1.0)
+MOVED: dict[str, Any] = {"from": "c03", "pose": Pose(196.6, 251.7, 2.0, 0.0, 1.0)}
 
 PICTURES: dict[str, tuple[Camera, dict[str, Any]]] = {
-    "explore": (ABOVE, {"layer": "missed", "pose": MOVED}),
-    "explore-dark": (ABOVE, {"layer": "missed", "pose": MOVED, "is_dark": True}),
+    "explore": (ABOVE, {"layer": "missed", **MOVED}),
+    "explore-dark": (ABOVE, {"layer": "missed", **MOVED, "is_dark": True}),
     "explore-1-opened": (ABOVE, {"layer": "traffic"}),
-    "explore-2-moved": (ABOVE, {"layer": "seen", "pose": MOVED}),
-    "explore-3-lanes": (ABOVE, {"layer": "blindspots", "pose": MOVED}),
-    "explore-4-difference": (ABOVE, {"layer": "difference", "pose": MOVED, "beside": "c05"}),
-    "explore-5-traffic": (NEAR, {"layer": "replay", "pose": MOVED, "frame": 300}),
+    "explore-2-moved": (ABOVE, {"layer": "seen", **MOVED}),
+    "explore-3-lanes": (ABOVE, {"layer": "blindspots", **MOVED}),
+    "explore-4-difference": (ABOVE, {"layer": "difference", **MOVED, "beside": "c05"}),
+    "explore-5-traffic": (NEAR, {"layer": "replay", **MOVED, "frame": 300}),
 }
-"""File name, camera, and view."""
+"""File name, camera, and view; ``pose`` is that of the candidate ``from`` after it was moved."""
 
 PAGE_FILE_PICTURES = {"view": "light", "view-dark": "dark"}
 """File name, and colour scheme of the browser."""
@@ -99,12 +99,16 @@ def _draw_page_file(page: Path, names: list[str], out: Path) -> None:
             tab.wait_for_function("window.__viserSceneTree?.getState()['/traffic/returns'] !== undefined")
             tab.add_style_tag(content=HIDE_NOTIFICATIONS)
             tab.wait_for_timeout(30_000)  # drawn in software
-            picture = Image.open(io.BytesIO(tab.screenshot())).convert("RGB")
-            shown = np.asarray(picture.crop((LEFT, 0, PAGE_WIDTH, PAGE_HEIGHT - BOTTOM))).astype(int)
-            rounded = np.minimum((shown + COLOUR_STEP // 2) // COLOUR_STEP * COLOUR_STEP, 255)
-            Image.fromarray(rounded.astype(np.uint8)).save(out / f"{name}.png", optimize=True)
-            print(out / f"{name}.png")
+            picture = Image.open(io.BytesIO(tab.screenshot()))
+            _save(picture.crop((LEFT, 0, PAGE_WIDTH, PAGE_HEIGHT - BOTTOM)), out / f"{name}.png")
             tab.close()
+
+
+def _save(picture: Image.Image, path: Path) -> None:
+    shown = np.asarray(picture.convert("RGB")).astype(int)
+    rounded = np.minimum((shown + COLOUR_STEP // 2) // COLOUR_STEP * COLOUR_STEP, 255)
+    Image.fromarray(rounded.astype(np.uint8)).save(path, optimize=True)
+    print(path)
 
 
 @contextmanager
@@ -139,9 +143,10 @@ def _tab(scratch: Path, run: Path) -> Iterator[tuple[Page, Any]]:
 
 
 def _draw(page: Page, tab: Any, camera: Camera, view: dict[str, Any], path: Path) -> None:
-    site = page.session.ranked[0].site
+    best = page.session.ranked[0].site
+    site = page.session.candidates[view.get("from", best.name)].site
     pose = view.get("pose", site.pose)
-    changes = {key: value for key, value in view.items() if key != "pose"}
+    changes = {key: value for key, value in view.items() if key not in ("from", "pose")}
     blank = {"layer": "none", "beside": "", "frame": 0, "is_dark": False}
     page.request(site=replace(site, pose=pose), **{**blank, **changes})
     assert page.wait_until_idle(120)
@@ -149,8 +154,7 @@ def _draw(page: Page, tab: Any, camera: Camera, view: dict[str, Any], path: Path
     client.camera.position = np.subtract(camera.from_m, page.zero_m)
     client.camera.look_at = np.subtract(camera.at_m, page.zero_m)
     tab.wait_for_timeout(15_000)  # drawn in software
-    tab.screenshot(path=path, timeout=120_000)
-    print(path)
+    _save(Image.open(io.BytesIO(tab.screenshot(timeout=120_000))), path)
 
 
 if __name__ == "__main__":

@@ -111,13 +111,6 @@ def store(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPa
     return folder
 
 
-@pytest.fixture(autouse=True)
-def compiles_alone(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where a test may start no process, no second one compiles kernels beside a run."""
-    if request.node.get_closest_marker("system") is None:
-        monkeypatch.setattr("egvs.runs.kernel_compiler.thread_count", lambda _: 1)
-
-
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Leave out files without slow tests where ``-m`` asks for slow ones only: importing them takes half a minute."""
     marker = config.option.markexpr.split(" ")[0]
@@ -156,11 +149,18 @@ sys.addaudithook(_no_process)
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    """Remember a test that is not `system` while it is at work, so that it cannot start a process."""
+    """Remember a test that is not `system` while it and its fixtures are at work, so that they cannot start a process.
+
+    Then no second process compiles kernels beside a run, as it would where none has been compiled yet.
+    """
     global _test_without_processes
-    _test_without_processes = "" if item.get_closest_marker("system") else item.nodeid
-    try:
+    if item.get_closest_marker("system"):
         return (yield)
+    _test_without_processes = item.nodeid
+    try:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("egvs.runs.kernel_compiler.thread_count", lambda _: 1)
+            return (yield)
     finally:
         _test_without_processes = ""
 

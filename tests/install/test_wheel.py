@@ -82,8 +82,13 @@ class Installed:
         """Start a command."""
         return subprocess.Popen(
             [self.bin / "egvs", *map(str, arguments)], cwd=self.work, env=self.environment, text=True,
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, preexec_fn=_accept_interrupts,
         )  # fmt: skip
+
+
+def _accept_interrupts() -> None:
+    """A shell lets what it starts in the background ignore them."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 @pytest.fixture(scope="module")

@@ -378,7 +378,7 @@ def test_says_in_which_settings_a_scenario_differs_from_its_latest_run(here: Pat
 def test_effect_with_default_parameters_is_on(here: Path, run_egvs: Any) -> None:
     egvs.run(egvs.load(here, ["effects.moving_occlusion={}"]))
     assert [path.name for path in Path("runs").iterdir()] == ["mini@moving_occlusion=on"]
-    assert "effects.moving_occlusion=on " in run_egvs("runs")[1]
+    assert "  differs in  effects.moving_occlusion=on\n" in run_egvs("runs", "--verbose")[1]
     messages = run_egvs("place", here, "--count", 1)[2]
     assert "mini@moving_occlusion=on: effects.moving_occlusion (on there, off here)\n" in messages
 

@@ -202,7 +202,7 @@ class TrafficRecorder:
             self._returns.points = np.zeros((0, 3), dtype=np.float32)
 
 
-def _fill(values: NDArray[np.float64], rows: int, rest: float | Sequence[float]) -> NDArray[np.float32]:
+def _fill(values: NDArray[np.float64 | np.uint8], rows: int, rest: float | Sequence[float]) -> NDArray[np.float32]:
     """Return values (n, columns) as float32, followed by the same row until there are ``rows``."""
     filled = np.empty((rows, values.shape[1]), dtype=np.float32)
     filled[:] = rest
