@@ -14,6 +14,7 @@ from egvs.artefacts.plan_step import PlanStep
 from egvs.artefacts.planned_sensor import PlannedSensor
 from egvs.cli import console as cli_console
 from egvs.cli import place
+from egvs.placement.fused_score import FusedPlan
 from egvs.scenario.score_config import PlacementConfig
 
 LAST_LINES = """\
@@ -42,7 +43,7 @@ def placed_two(score: str = "expected_detections", scale: float = 1.0, **changes
     points = [SimpleNamespace(certificate=1.0, count=1), SimpleNamespace(certificate=1.0, count=2)]
     points[-1].plan_value = SimpleNamespace(joint=steps[-1].score)
     placed = SimpleNamespace(
-        score=score, steps=steps, joint_of_all=0.9942 * scale, candidates=12, refinement=None, zones=(),
+        score=score, steps=steps, joint_of_all=0.9942 * scale, candidates=12, refinement=None, fused=None, zones=(),
         zone_results=(), files=(),
         sensors=(
             sensor(1, "a", steps[0].gain, steps[0].score, gain_se=steps[0].gain_se, score_se=steps[0].score_se),
@@ -85,6 +86,23 @@ def test_tables_fit_the_terminal_and_cut_no_value(width: int, monkeypatch: pytes
         assert value in text
     assert "…" not in text
     assert sum(line.rstrip().endswith("south@4.5m-12deg, north@4.5m-12deg") for line in lines) == (width == 160)
+
+
+def test_values_in_fused_clouds_follow_the_assumption(capsys: pytest.CaptureFixture[str]) -> None:
+    steps = (
+        PlanStep(1, 0.9455, 0.9455, True, 0.009, 0.009, 1.0),
+        PlanStep(2, 0.9713, 0.0258, True, 0.004, 0.006, 0.999),
+    )
+    first = (
+        "Found in fused point clouds: 94.5 ± 0.9 % with the first sensor, 97.1 ± 0.4 % with 2 (the last one adds 2.6 "
+        "± 0.6 percentage points)"
+    )
+    assert printed(placed_two(fused=FusedPlan(steps)), capsys).endswith(f"{LAST_LINES}{first}.\n")
+    text = printed(placed_two(fused=FusedPlan(steps, searched=True)), capsys)
+    assert text.endswith(f"{first}; no exchange of a single sensor finds more there.\n")
+    better = FusedPlan(steps, ("c", "a"), PlanStep(2, 0.9753, 0.004, True, 0.004, 0.002, 0.98), searched=True)
+    text = printed(placed_two(fused=better), capsys)
+    assert text.endswith(f"{first}; c, a should find 0.4 ± 0.2 percentage points more there.\n")
 
 
 def test_bits_have_thousands_separators(capsys: pytest.CaptureFixture[str]) -> None:

@@ -112,14 +112,19 @@ def seen_slowly(frames: Sequence[TrafficFrame], beams: Beams, noticed: Noticed |
     return found
 
 
-def _of_frame(one: TrafficFrame, beams: Beams, noticed: Noticed) -> dict[int, dict[str, float]]:
+Hit = tuple[float, float, float]
+"""Share of a point that comes, and where it is along and across the box from its centre."""
+
+
+def _hits_of_frame(one: TrafficFrame, beams: Beams, noticed: Noticed) -> tuple[dict[int, list[Hit]], dict[int, float]]:
+    """Points on each box, and the sum of the beams that meet it, hidden or not."""
     origin = np.array(beams.pose.position_m)
     boxes = [
         (row, box, pitch)
         for row, (box, pitch) in enumerate(zip(one.boxes, one.pitch_rad, strict=True))
         if not holds(box, pitch, origin) and not is_beyond(box, pitch, origin)
     ]
-    hits: dict[int, list[tuple[float, float, float]]] = {row: [] for row in range(len(one.boxes))}
+    hits: dict[int, list[Hit]] = {row: [] for row in range(len(one.boxes))}
     alone = dict.fromkeys(hits, 0.0)
     for number, end in enumerate(beams.ends_m):
         length = float(np.linalg.norm(end))
@@ -133,25 +138,58 @@ def _of_frame(one: TrafficFrame, beams: Beams, noticed: Noticed) -> dict[int, di
             at = origin + end / length * met[first] - one.boxes[first, :3]
             u, v, _ = (float(value) for value in axes_of(one.boxes[first, 6], one.pitch_rad[first]) @ at)
             hits[first].append((worth, u, v))
+    return hits, alone
+
+
+def _of_points(box: NDArray[np.float64], hits: Sequence[Hit]) -> dict[str, float]:
+    """Columns that follow from the points on a box, whoever they are from."""
+    kept = np.array([hit[1:] for hit in hits if hit[0] > 0.0]).reshape(-1, 2)
+    span = np.ptp(kept, axis=0) / box[3:5] if len(kept) else (0.0, 0.0)
+    half = box[3:5] / 2 - SHRINK_M
+    on_side = [hit[0] for hit in hits if abs(hit[1]) > half[0] - 1e-6 or abs(hit[2]) > half[1] - 1e-6]
+    return {
+        "points_on_sides": sum(on_side),
+        "hole_m": box[3] * hole_slowly([(u / half[0] + 1) / 2 for u, _ in kept]),
+        "points": sum(hit[0] for hit in hits),
+        "length_share": float(span[0]),
+        "width_share": float(span[1]),
+    }
+
+
+def _of_view(box: NDArray[np.float64], origin: NDArray[np.float64]) -> dict[str, float]:
+    """Columns that follow from where a box is seen from."""
+    range_m = float(np.linalg.norm(box[:3] - origin))
+    sight = complex(box[0] - origin[0], box[1] - origin[1])
+    return {
+        "range_m": range_m,
+        "depression_deg": math.degrees(math.asin((origin[2] - box[2]) / range_m)),
+        "side": abs(math.sin(cmath.phase(sight) - box[6])),
+    }
+
+
+def _of_frame(one: TrafficFrame, beams: Beams, noticed: Noticed) -> dict[int, dict[str, float]]:
+    hits, alone = _hits_of_frame(one, beams, noticed)
     found = {}
     for row, its in hits.items():
-        range_m = float(np.linalg.norm(one.boxes[row, :3] - origin))
-        kept = np.array([hit[1:] for hit in its if hit[0] > 0.0]).reshape(-1, 2)
-        span = np.ptp(kept, axis=0) / one.boxes[row, 3:5] if len(kept) else (0.0, 0.0)
-        box, half = one.boxes[row], one.boxes[row, 3:5] / 2 - SHRINK_M
-        on_side = [hit[0] for hit in its if abs(hit[1]) > half[0] - 1e-6 or abs(hit[2]) > half[1] - 1e-6]
-        sight = complex(box[0] - origin[0], box[1] - origin[1])
-        found[row] = {
-            "points_on_sides": sum(on_side),
-            "hole_m": box[3] * hole_slowly([(u / half[0] + 1) / 2 for u, _ in kept]),
-            "depression_deg": math.degrees(math.asin((origin[2] - box[2]) / range_m)),
-            "side": abs(math.sin(cmath.phase(sight) - box[6])),
-            "points": sum(hit[0] for hit in its),
-            "points_alone": alone[row] * float(noticed(np.array([range_m]))[0]),
-            "length_share": float(span[0]),
-            "width_share": float(span[1]),
-            "range_m": range_m,
-        }
+        view = _of_view(one.boxes[row], np.array(beams.pose.position_m))
+        reached = alone[row] * float(noticed(np.array([view["range_m"]]))[0])
+        found[row] = {**_of_points(one.boxes[row], its), **view, "points_alone": reached}
+    return found
+
+
+def fused_slowly(frames: Sequence[TrafficFrame], scans: Sequence[Beams]) -> dict[str, list[float]]:
+    """Columns of what all scans see together: their points are thrown together before anything is computed of them."""
+    found: dict[str, list[float]] = {name: [] for name in COLUMNS if name != "points_alone"}
+    for one in frames:
+        by_scan = [_hits_of_frame(one, beams, lambda r: np.ones(len(r)))[0] for beams in scans]
+        for row in one.target_rows(GRID.roi).tolist():
+            counts = [sum(hit[0] for hit in hits[row]) for hits in by_scan]
+            views = [_of_view(one.boxes[row], np.array(beams.pose.position_m)) for beams in scans]
+            most = [view for view, count in zip(views, counts, strict=True) if count == max(counts)]
+            together = [hit for hits in by_scan for hit in hits[row]]
+            nearest = min(most, key=lambda view: view["range_m"])
+            for name, value in {**_of_points(one.boxes[row], together), **nearest}.items():
+                found[name].append(value)
     return found
 
 

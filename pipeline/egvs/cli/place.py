@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from egvs.artefacts.planned_sensor import PlannedSensor
+    from egvs.placement.fused_score import FusedPlan
     from egvs.placement.plan import Placement, RefinementSummary
     from egvs.report.formatting import ScoreLabel
     from egvs.scenario.score_config import PlacementConfig
@@ -170,6 +171,31 @@ def _further_sentences(placed: Placement, requested: PlacementConfig) -> Iterato
         yield answer
     if assumption := plan_answer.describe_joint_score(_label(placed), len(placed.sensors)):
         yield assumption
+    if placed.fused is not None:
+        yield describe_fused(placed.fused, _label(placed))
+
+
+def describe_fused(fused: FusedPlan, by: ScoreLabel) -> str:
+    """Return what the sensors of a plan find in their fused point clouds, and whether other sites find more there.
+
+    Parameters
+    ----------
+    fused
+        The values.
+    by
+        Label of the joint score.
+    """
+    first, *further = (by.with_error(step.score, step.score_se) for step in fused.steps)
+    values = [f"{first} with the first sensor"]
+    values += [f"{value} with {step.count}" for step, value in zip(fused.steps[1:], further, strict=True)]
+    last = by.change(fused.steps[-1].gain, fused.steps[-1].gain_se)
+    text = f"Found in fused point clouds: {', '.join(values)} (the last one adds {last} {by.change_unit})"
+    if fused.better is not None:
+        gain = by.change(fused.better.gain, fused.better.gain_se)
+        return f"{text}; {', '.join(fused.better_sites)} should find {gain} {by.change_unit} more there."
+    if fused.searched:
+        return f"{text}; no exchange of a single sensor finds more there."
+    return f"{text}."
 
 
 def _label(placed: Placement) -> ScoreLabel:

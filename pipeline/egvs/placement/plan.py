@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -28,11 +28,12 @@ from egvs.core import files, plugins
 from egvs.core.errors import InputError, choose_one
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.wording import number_of
-from egvs.placement import problem_builder, refinement, solver
+from egvs.placement import fused_score, problem_builder, refinement, solver
+from egvs.placement.fused_score import FusedPlan, FusedScore
 from egvs.placement.plan_error import PlanErrors
 from egvs.placement.plan_zones import PlanZones
 from egvs.placement.problem import Problem
-from egvs.placement.problem_builder import PlacementProblem
+from egvs.placement.problem_builder import PlacementProblem, TargetView
 from egvs.placement.refinement import PlanPoses
 from egvs.placement.solver import CurvePoint, Solution
 from egvs.runs import run, stage_registry
@@ -45,6 +46,8 @@ from egvs.sensors.scanner import Scan
 from egvs.sensors.sites import Site
 from egvs.stages.base import StageContext
 from egvs.stages.inputs import open_folder
+from egvs.stages.plan_scans import plan_beams
+from egvs.stages.site_scans import empty_scans
 
 REQUIRED_STAGES = ("check", "statics", "scan", "traffic", "tpog")
 """The stages whose artefacts a placement problem is built from."""
@@ -258,6 +261,9 @@ class Placement:
         Whether there are standard errors.
     refinement
         With refined poses, what the refinement did; ``sensors``, ``joint``, ``cost`` and ``zones`` are those after it.
+    fused
+        What the sensors are expected to find in their fused point clouds; None for one sensor, and for joint scores
+        that do not take sensors as independent.
     zone_results
         What the sensors find together in the zones of ``[score] zones``; empty without them.
     files
@@ -278,6 +284,7 @@ class Placement:
     errors_from: str
     has_errors: bool
     refinement: RefinementSummary | None = None
+    fused: FusedPlan | None = None
     zone_results: tuple[ZoneVisibility, ...] = ()
     files: tuple[Path, ...] = ()
 
@@ -400,7 +407,8 @@ def solve_placement(context: StageContext, *, exact: bool, time_limit_s: float) 
     placed = _make_placement(scenario, placement_problem, problem, sites, solution.order, solution)
     errors = PlanErrors(context, placement_problem)
     if config.refine is None or not placed.sensors:
-        return _with_errors(placed, errors, placement_problem, placement_problem, solution.order)
+        placed = _with_errors(placed, errors, placement_problem, placement_problem, solution.order)
+        return replace(placed, fused=_fused_plan(context, placement_problem, problem, solution.order, errors))
     return _refine_placement(context, placement_problem, config.refine, placed, errors)
 
 
@@ -427,6 +435,42 @@ def _with_errors(
     )
 
 
+def _fused_plan(
+    context: StageContext,
+    placement_problem: PlacementProblem,
+    problem: Problem,
+    order: Sequence[int],
+    errors: PlanErrors,
+    refined_sites: Sequence[Site] | None = None,
+) -> FusedPlan | None:
+    """Evaluate a plan in fused point clouds; None if the joint score does not take its sensors as independent.
+
+    Parameters
+    ----------
+    placement_problem
+        The candidates at their original poses.
+    problem, order
+        As in :func:`_make_placement`.
+    refined_sites
+        The sites of ``problem`` if they were refined: what was moved is scanned anew, and there are no swaps.
+    """
+    view = placement_problem.views[-1]
+    if placement_problem.score != fused_score.FUSED_SCORE or len(order) < 2:
+        return None
+    assert isinstance(view, TargetView)
+    sites = placement_problem.sites if refined_sites is None else refined_sites
+    moved = [site for site in sites if site not in placement_problem.sites]
+
+    def read_scans(names: Collection[str]) -> Iterator[tuple[str, Beams]]:
+        yield from plan_beams(context, [site for site in moved if site.name in names], moved=True)
+        unmoved = set(names) - {site.name for site in moved}
+        yield from ((scan.site.name, scan.beams) for scan in empty_scans(context, unmoved))
+
+    score = FusedScore(view.targets, [site.name for site in sites], read_scans)
+    search = refined_sites is None and not problem.survives and problem.objective == (problem.joint,)
+    return fused_score.evaluate_fused_plan(score, problem, order, errors, search=search)
+
+
 def _refine_placement(
     context: StageContext,
     placement_problem: PlacementProblem,
@@ -449,7 +493,8 @@ def _refine_placement(
     seconds = perf_counter() - start_s
     counts = (refined.tried, refined.impossible, refined.turns)
     summary = RefinementSummary(placed.joint, before.value, after.value, *counts, seconds)
-    return replace(result, sensors=tuple(sensors), refinement=summary)
+    fused = _fused_plan(context, placement_problem, problem, order, errors, refined.after.sites)
+    return replace(result, sensors=tuple(sensors), refinement=summary, fused=fused)
 
 
 def _make_placement(

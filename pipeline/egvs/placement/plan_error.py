@@ -37,6 +37,7 @@ from egvs.scoring.standard_errors import (
     ScoreUncertainty,
     block_groups,
     detector_groups,
+    means_without_each,
     summarise_uncertainty,
 )
 from egvs.scoring.targets import FrameGroups, recorded_frames, weighted_mean
@@ -134,13 +135,18 @@ def _target_replicates(
     context: StageContext, view: TargetView, score: str, periods: Sequence[PeriodBlocks]
 ) -> Callable[[IntArray], FloatArray]:
     """Return the joint score as a function of the totals of all vehicle-frames."""
-    groups = FrameGroups.of(periods, recorded_frames(context.folder.trajectories), view.targets.record)
-    groups = replace(groups, weight=view.targets.weight)
+    groups = _target_groups(context, view, periods)
 
     def replicates(totals: IntArray) -> FloatArray:
         return groups.means(problem.target_values(score, totals, view.unit))
 
     return replicates
+
+
+def _target_groups(context: StageContext, view: TargetView, periods: Sequence[PeriodBlocks]) -> FrameGroups:
+    """Return the groups of blocks of all vehicle-frames, with their weights."""
+    groups = FrameGroups.of(periods, recorded_frames(context.folder.trajectories), view.targets.record)
+    return replace(groups, weight=view.targets.weight)
 
 
 def _voxel_replicates(
@@ -205,12 +211,16 @@ class PlanErrors:
     def __init__(self, context: StageContext, placement_problem: PlacementProblem) -> None:
         self.are_known = False
         self._groups: tuple[BlockGroups, ...] = ()
+        self._target_groups: FrameGroups | None = None
         periods = read_periods(context.folder.tpog)
         self.source = _why_unknown(periods, standard_error=context.scenario.score.standard_error)
         if self.source:
             return
 
         self._replicates = PlanReplicates(context, placement_problem, periods)
+        view = placement_problem.views[-1]
+        if isinstance(view, TargetView):
+            self._target_groups = _target_groups(context, view, periods)
         blocks = tuple(block_groups(period) for period in periods)
         self._groups = blocks + self._replicates.detector_groups
         self._candidates = _replicates_of_candidates(context, placement_problem, self._replicates)
@@ -233,12 +243,46 @@ class PlanErrors:
         """
         if not self.are_known:
             return [UNKNOWN_ERROR] * len(plans)
-        rows = self._replicates.of_plans(term, ((), *plans), sites, moved=moved)
+        return self._step_errors(self._replicates.of_plans(term, ((), *plans), sites, moved=moved))
+
+    def of_chances(self, chances: Sequence[FloatArray]) -> list[StepError]:
+        """Return the errors of mean probabilities of detection, each but the first compared with the one before it.
+
+        Parameters
+        ----------
+        chances
+            Of each detector and vehicle-frame, by plan, (d, n) float64 each; the first belongs to no sensor, or to
+            another plan.
+
+        Raises
+        ------
+        ValueError
+            For a joint score over voxels.
+        """
+        if not self.are_known:
+            return [UNKNOWN_ERROR] * (len(chances) - 1)
+        groups = self._target_groups
+        if groups is None:
+            raise ValueError("expected a joint score over vehicle-frames")
+        rows = []
+        for by_detector in chances:
+            row = groups.means(by_detector.mean(axis=0))
+            if self._replicates.detector_groups:
+                shares = np.array([weighted_mean(of_detector, groups.weight) for of_detector in by_detector])
+                row = np.append(row, means_without_each(shares))
+            rows.append(row)
+        return self._step_errors(np.array(rows))
+
+    def _step_errors(self, rows: FloatArray) -> list[StepError]:
+        """Return the errors of each row of replicates but the first, each compared with the one before it.
+
+        ``rows`` has the shape (1 + m, 1 + k + d).
+        """
         n_candidates = len(self._candidates)
         all_rows = np.vstack([self._candidates, rows])
         estimate = ScoreUncertainty.of(all_rows, self._groups, n_joined_by=n_candidates)
 
-        previous = n_candidates + np.arange(len(plans), dtype=np.int64)
+        previous = n_candidates + np.arange(len(rows) - 1, dtype=np.int64)
         differences = estimate.differences(previous + 1, previous)
         beats = estimate.beats(previous + 1, previous)
         errors = zip(estimate.se[previous + 1].tolist(), differences.se.tolist(), beats.tolist(), strict=True)

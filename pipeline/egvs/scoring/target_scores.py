@@ -46,13 +46,14 @@ from egvs.core.special import expit
 from egvs.kernels.boosted_trees import add_tree_values
 from egvs.scenario.score_config import Detector
 from egvs.scoring.blindspots import SpotVisibility
-from egvs.scoring.targets import SEEN_WELL_POINTS, VisibleTargets, weighted_mean
+from egvs.scoring.targets import SEEN_WELL_POINTS, TargetVisibility, weighted_mean
 
 Gain = Callable[[FloatArray], FloatArray]
 """Gain of points (n,) on vehicles, (n,)."""
 
-TargetScore = Callable[[VisibleTargets, Sequence[str]], FloatArray]
-"""Score of each vehicle-frame that a site sees, by some detectors, (n,); most scores are the same for any detector."""
+TargetScore = Callable[[TargetVisibility, Sequence[str]], FloatArray]
+"""Score of each vehicle-frame as a site sees it, or several together, by some detectors, (n,); most scores are the same
+for any detector."""
 
 MODEL_FILE = Path(__file__).with_name("target_scores.json")
 
@@ -80,7 +81,7 @@ MONOTONICITY = {
 """For each feature: 1 if the probability may only rise with it, -1 if it may only fall, 0 for either."""
 
 FEATURES = tuple(MONOTONICITY)
-"""Features of the model, see :class:`egvs.scoring.targets.VisibleTargets`: logarithms of 1 + points, gaps of at most
+"""Features of the model, see :class:`egvs.scoring.targets.TargetVisibility`: logarithms of 1 + points, gaps of at most
 :data:`ISOLATED_GAP_M`."""
 
 
@@ -117,7 +118,7 @@ def saturating_gain(points: FloatArray) -> FloatArray:
     return gain
 
 
-def points_on_target(visible: VisibleTargets, gain: Gain = log_points, weight: FloatArray | None = None) -> float:
+def points_on_target(visible: TargetVisibility, gain: Gain = log_points, weight: FloatArray | None = None) -> float:
     """Return the mean gain of a site's points; NaN without any vehicle.
 
     Parameters
@@ -132,13 +133,13 @@ def points_on_target(visible: VisibleTargets, gain: Gain = log_points, weight: F
     return weighted_mean(gain(visible.points), weight)
 
 
-def seen_well(visible: VisibleTargets, weight: FloatArray | None = None) -> float:
+def seen_well(visible: TargetVisibility, weight: FloatArray | None = None) -> float:
     """Return the share of well visible vehicles, 0 to 1; parameters as in :func:`points_on_target`."""
     return points_on_target(visible, saturating_gain, weight)
 
 
 def expected_detections(
-    visible: VisibleTargets, detectors: Sequence[str] = DETECTORS, weight: FloatArray | None = None
+    visible: TargetVisibility, detectors: Sequence[str] = DETECTORS, weight: FloatArray | None = None
 ) -> float:
     """Return the share of vehicles that detectors are expected to find, 0 to 1; NaN without any vehicle.
 
@@ -156,7 +157,7 @@ def expected_detections(
     return weighted_mean(detection_chances(visible, detectors), weight)
 
 
-def detection_chances(visible: VisibleTargets, detectors: Sequence[str] = DETECTORS) -> FloatArray:
+def detection_chances(visible: TargetVisibility, detectors: Sequence[str] = DETECTORS) -> FloatArray:
     """Return the probability that each vehicle-frame is detected, averaged over detectors, (n,) float64, 0 to 1.
 
     Raises
@@ -168,7 +169,7 @@ def detection_chances(visible: VisibleTargets, detectors: Sequence[str] = DETECT
     return chances
 
 
-def chances_by_detector(visible: VisibleTargets, detectors: Sequence[str]) -> FloatArray:
+def chances_by_detector(visible: TargetVisibility, detectors: Sequence[str]) -> FloatArray:
     """Return the probability that each detector detects each vehicle-frame, (d, n) float64, 0 to 1.
 
     Raises
@@ -181,7 +182,7 @@ def chances_by_detector(visible: VisibleTargets, detectors: Sequence[str]) -> Fl
     return np.where(visible.points > 0.0, chances, 0.0)
 
 
-def detectability_features(visible: VisibleTargets) -> FloatArray:
+def detectability_features(visible: TargetVisibility) -> FloatArray:
     """Return :data:`FEATURES` of what a site sees, (n, f) float64."""
     return np.column_stack([
         np.log1p(visible.points),
@@ -266,7 +267,7 @@ def expected_by_points(points: FloatArray) -> FloatArray:
     return is_found
 
 
-def found_by_detector(visible: VisibleTargets, detectors: Sequence[str]) -> FloatArray:
+def found_by_detector(visible: TargetVisibility, detectors: Sequence[str]) -> FloatArray:
     """Return the probability that each detector finds each vehicle-frame of a record, (d, n) float64, 0 to 1.
 
     There is no model of people; see :func:`expected_by_points`.
@@ -277,16 +278,16 @@ def found_by_detector(visible: VisibleTargets, detectors: Sequence[str]) -> Floa
     return np.where(visible.record.are_people, expected_by_points(visible.points), chances)
 
 
-def _score_detection(visible: VisibleTargets, detectors: Sequence[str]) -> FloatArray:
+def _score_detection(visible: TargetVisibility, detectors: Sequence[str]) -> FloatArray:
     chances: FloatArray = found_by_detector(visible, detectors).mean(axis=0)
     return chances
 
 
-def _score_points(visible: VisibleTargets, _: Sequence[str]) -> FloatArray:
+def _score_points(visible: TargetVisibility, _: Sequence[str]) -> FloatArray:
     return log_points(visible.points)
 
 
-def _score_seen_well(visible: VisibleTargets, _: Sequence[str]) -> FloatArray:
+def _score_seen_well(visible: TargetVisibility, _: Sequence[str]) -> FloatArray:
     return saturating_gain(visible.points)
 
 

@@ -310,8 +310,8 @@ def _neighbour_gaps(boxes: AllBoxes, row: IntArray) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class VisibleTargets:
-    """What one site sees of the vehicle-frames of a record, row by row, n of them.
+class TargetVisibility:
+    """What one sensor, or several together, see of the vehicle-frames of a record, row by row, n of them.
 
     Attributes
     ----------
@@ -338,11 +338,12 @@ class VisibleTargets:
     side
         Sine of the angle in plan between the line of sight and the vehicle's length, (n,) float64: 0 from ahead or
         behind, 1 broadside.
-    sensor_m
-        The sensor in the grid's frame, (3,) float64.
     bounds_m
         Lowest and highest coordinate of its points, along and across the vehicle from its centre, (n, 2, 2) float64;
         infinite and minus infinite without a point.
+    slices
+        Which of the 64 equal slices of the vehicle's length, from the rear, have a point: one bit each, (n,) uint64.
+        Counted as the shares are.
     """
 
     record: TargetRecord
@@ -355,12 +356,25 @@ class VisibleTargets:
     range_m: FloatArray
     depression_deg: FloatArray
     side: FloatArray
-    sensor_m: FloatArray
     bounds_m: FloatArray
+    slices: NDArray[np.uint64]
 
     def __len__(self) -> int:
         """Number of vehicle-frames."""
         return len(self.points)
+
+
+@dataclass(frozen=True, eq=False)
+class VisibleTargets(TargetVisibility):
+    """What one site sees of the vehicle-frames of a record.
+
+    Attributes
+    ----------
+    sensor_m
+        The sensor in the grid's frame, (3,) float64.
+    """
+
+    sensor_m: FloatArray
 
 
 def visible_targets(
@@ -378,7 +392,7 @@ def visible_targets(
         Probability that a return from each range (n,) is detected; 1 where it is None.
     """
     row, boxes = record.row, record.all_boxes.values[record.row]
-    length_m, yaw_rad = boxes[:, 5], boxes[:, 3]
+    yaw_rad = boxes[:, 3]
     sensor_m = record.grid.to_grid_m(np.asarray(beams.pose.position_m))
     away_m = boxes[:, :3] - sensor_m
     range_m = np.sqrt((away_m**2).sum(axis=1))
@@ -389,12 +403,8 @@ def visible_targets(
     points_alone = hits.alone[row]
     if return_probability is not None:
         points_alone = points_alone * return_probability(range_m)
-    low, high = hits.low[row], hits.high[row]
-    has_points = high >= low
-    spans = np.zeros((len(row), 2))
-    spans[has_points] = (high[has_points] - low[has_points]) / boxes[:, 5:7][has_points]
-    hole = np.zeros(len(row))
-    vehicle_visibility.longest_slice_gaps(hits.slices[row], hole)
+    bounds_m, slices = np.stack([hits.low[row], hits.high[row]], axis=1), hits.slices[row]
+    spans = span_shares(record, bounds_m)
     return VisibleTargets(
         record=record,
         points=hits.points[row],
@@ -402,13 +412,48 @@ def visible_targets(
         points_on_sides=hits.on_sides[row],
         length_share=spans[:, 0],
         width_share=spans[:, 1],
-        hole_m=hole * length_m,
+        hole_m=longest_holes_m(record, slices),
         range_m=range_m,
         depression_deg=np.degrees(np.arctan2(-away_m[:, 2], run_m)),
         side=np.divide(across_m, run_m, out=np.zeros(len(row)), where=run_m > 0.0),
+        bounds_m=bounds_m,
+        slices=slices,
         sensor_m=sensor_m,
-        bounds_m=np.stack([low, high], axis=1),
     )
+
+
+def span_shares(record: TargetRecord, bounds_m: FloatArray) -> FloatArray:
+    """Return the share of each vehicle's length and width between its outermost points, (n, 2) float64, 0 to 1.
+
+    Parameters
+    ----------
+    record
+        The vehicles.
+    bounds_m
+        As in :class:`TargetVisibility`, (n, 2, 2) float64.
+    """
+    low_m, high_m = bounds_m[:, 0], bounds_m[:, 1]
+    has_points = high_m >= low_m
+    sizes_m = record.all_boxes.values[record.row, 5:7]
+    shares = np.zeros((len(record), 2))
+    shares[has_points] = (high_m[has_points] - low_m[has_points]) / sizes_m[has_points]
+    return shares
+
+
+def longest_holes_m(record: TargetRecord, slices: NDArray[np.uint64]) -> FloatArray:
+    """Return the longest stretch of each vehicle's length between its points without a point, (n,) float64, metres.
+
+    Parameters
+    ----------
+    record
+        The vehicles.
+    slices
+        As in :class:`TargetVisibility`, (n,) uint64.
+    """
+    share = np.zeros(len(record))
+    vehicle_visibility.longest_slice_gaps(slices, share)
+    length_m: FloatArray = record.all_boxes.values[record.row, 5]
+    return share * length_m
 
 
 def detection_probability(scene: Scene, sensor: Sensor) -> Callable[[FloatArray], FloatArray] | None:
