@@ -31,7 +31,7 @@ def test_ends_with_the_best_poles_and_the_report(six_poles: Path, tmp_path: Path
     table = [line.split() for line in lines if line[:1].isdigit() and line[1:3] == "  "]
     assert [row[0] for row in table] == ["1", "2", "3", "4", "5"]
     assert len({row[1] for row in table}) == 5, "each pole once"
-    shares = [float(row[-3].rstrip("%")) for row in table]
+    shares = [float(row[row.index("%") - 1]) for row in table]
     assert shares == sorted(shares, reverse=True)
     assert "1 more pole: --all lists all" in printed
     assert lines[-2] == f"Which sensor? egvs compare {tmp_path / 'out'} --sensors NAME,NAME (or all)"

@@ -169,7 +169,7 @@ def test_unknown_ground_is_refused_with_its_share(tmp_path: Path) -> None:
     text = build(tmp_path)
     west = Function(lambda x, y: np.where(x < 250, x, np.nan))
     with pytest.raises(
-        InputError, match=r"no height at \d+ of \d+ \(\d+\.\d%\) points of the roads, such as \((?:2[5-9]|30)\d"
+        InputError, match=r"no height at \d+ of \d+ \(\d+\.\d %\) points of the roads, such as \((?:2[5-9]|30)\d"
     ):
         drape_network(text, west, (0.0, 0.0))
     with pytest.raises(InputError, match=r"no height at \(260\.0, 0\.0\)"):
