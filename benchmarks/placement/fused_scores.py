@@ -270,7 +270,7 @@ def main() -> None:
     parser.add_argument("scenarios", nargs="+", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--frames", type=int, default=40)
-    parser.add_argument("--pairs", type=int, default=6, help="pairs of sites at different poles")
+    parser.add_argument("--pairs", type=int, default=4, help="pairs of sites at different poles")
     parser.add_argument("--same-pole-pairs", type=int, default=2, help="pairs of sites at the same pole")
     parser.add_argument("--single-sites", action="store_true", help="detect from every single site as well")
     parser.add_argument("--seed", type=int, default=1, help="of the choice of pairs")

@@ -19,8 +19,8 @@ gap to the neighbours, length          of the vehicle, the same for all sensors
 The first three rows are exact: sums, extremes and a bit for each slice of the vehicle contain all that these quantities
 need of the points (:class:`egvs.scoring.targets.TargetVisibility`). A fused cloud has no single range, depression and
 angle of view, and the model was trained with single sensors; ``cluster``, too, fits a box as seen from the sensor with
-most points on it. The highest probability over the views of all sensors was farther from what detectors find
-(docs/placement.md).
+most points on it. With the highest probability over the views of all sensors instead, the level is worse for
+``cluster`` and better for ``pointpillars`` (docs/placement.md).
 
 Limits: clocks and calibration of all sensors are exact. A fused hole may be longer than that of each sensor, where one
 sees the front only and the other the rear only; and a nearer, steeper sensor may have most points. The probability of
