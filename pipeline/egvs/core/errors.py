@@ -212,6 +212,8 @@ def find_misspelling(names: Iterable[str], known: Collection[str]) -> tuple[str,
 def closest_first(name: str, known: Iterable[str]) -> list[str]:
     """Return known names in the order of their similarity to an unknown one; those that begin with it come first.
 
+    Examples
+    --------
     >>> closest_first("k03", ["k01@3m", "k02@3m", "k03@3m", "k03@6m"])[:2]
     ['k03@3m', 'k03@6m']
     >>> closest_first("levl", ["behind", "tilted", "level"])[0]
@@ -228,6 +230,8 @@ def closest_first(name: str, known: Iterable[str]) -> list[str]:
 def choose_one(name: str, known: Sequence[str]) -> str:
     """Return a hint that lists known names for an unknown one, the most similar ones first.
 
+    Examples
+    --------
     >>> choose_one("levl", ["behind", "tilted", "level"])
     'Choose one of level, tilted, behind.'
     """
