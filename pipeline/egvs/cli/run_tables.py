@@ -304,9 +304,7 @@ def print_sensors(sensors: Iterable[Sensor]) -> None:
         Column("beams", lambda sensor: str(sensor.beams)),
         Column("range m", lambda sensor: f"{sensor.range_m:g}"),
         Column("rated m", _format_rating),
-        Column(
-            f"at {format_percent(DARK_REFLECTIVITY, 0)}", lambda sensor: format_or_dash(dark_range_m(sensor), ".0f")
-        ),
+        Column(format_percent(DARK_REFLECTIVITY, 0), lambda sensor: format_or_dash(dark_range_m(sensor), ".0f")),
     ]
     print_table(columns, sensors, file_width=_LIST_FILE_WIDTH)
     print_sentences(
