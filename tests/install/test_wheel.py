@@ -139,7 +139,7 @@ def test_commands_work_or_name_their_extra(installed: Installed, wheel: Path) ->
         assert f"pip install 'egvs[{extra}]'" in message, message
 
     installed.install(f"{wheel}[explore,gis,place]")
-    installed.egvs("place", "runs/myplace", "--count", "2", "--refine", "--set", "placement.refine.evaluations=20")
+    installed.egvs("place", "myplace", *FEW, "--count", "2", "--refine", "--set", "placement.refine.evaluations=20")
     installed.egvs("export", "runs/myplace", "--to", "gpkg")
     page = installed.start("explore", "runs/myplace", "--no-browser")
     try:

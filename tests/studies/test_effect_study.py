@@ -75,7 +75,7 @@ def changes_of_runs(before: Path, after: Path, score: str) -> list[float]:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("rank_by", "noun", "unit"),
-    [("egvs", "EGVS", "%"), ("expected_detections", "the share of vehicles found", " percentage points")],
+    [("egvs", "EGVS", " %"), ("expected_detections", "the share of vehicles found", " percentage points")],
 )
 def test_expected_changes_equal_those_of_runs(mini: Path, tmp_path: Path, rank_by: str, noun: str, unit: str) -> None:
     plain, ranked = tmp_path / "plain", f"score.rank_by='{rank_by}'"

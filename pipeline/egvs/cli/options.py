@@ -74,11 +74,12 @@ def with_detector(overrides: Sequence[str] | None, detector: str | None, path: P
     InputError
         For an unknown detector, one that ``--set`` chooses too, or a run folder.
     """
+    if detector is None:
+        return list(overrides or ())
+
     from egvs.runs.run_sources import SettingsSource
     from egvs.scenario.score_config import ALL_DETECTORS, Detector
 
-    if detector is None:
-        return list(overrides or ())
     known = (*get_args(Detector), ALL_DETECTORS)
     if detector not in known:
         problem = f"expected {', '.join(known[:-1])} or {known[-1]}, got {detector[:80]!r}"
