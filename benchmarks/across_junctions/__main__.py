@@ -27,7 +27,9 @@ from benchmarks.across_junctions.protocol import (
     Junction,
     Protocol,
     ProtocolFiles,
+    check_frozen,
     read_protocol,
+    write_frozen,
 )
 from benchmarks.across_junctions.records import NOT_DETECTORS, SCORES, VEHICLES
 from benchmarks.across_junctions.worlds import MissingMapError, make_world
@@ -76,6 +78,7 @@ def _parser() -> argparse.ArgumentParser:
     step.set_defaults(step=_build)
 
     step = steps.add_parser("list", help="print the protocol and its hash")
+    step.add_argument("--freeze", action="store_true", help="write the hashes of score, detectors and statistics")
     step.set_defaults(step=_list)
 
     step = steps.add_parser("measure", parents=[data, common], help="measure what is missing")
@@ -159,7 +162,9 @@ def _differences(built: Sequence[build.BuiltJunction]) -> list[str]:
     return texts
 
 
-def _list(_: argparse.Namespace) -> int:
+def _list(arguments: argparse.Namespace) -> int:
+    if arguments.freeze:
+        print(write_frozen())
     protocol, digests = read_protocol(), ProtocolFiles()
     rule = protocol.candidates
     installed = base.detector_names()
@@ -206,6 +211,8 @@ def _plans(arguments: argparse.Namespace) -> list[PartPlan]:
     ]  # fmt: skip
     for junction in selected:
         _check_role(junction, arguments)
+    if any(junction.role == "held out" for junction in selected):
+        check_frozen()
     digest, each = ProtocolFiles().digest, candidates.read_candidates()
     plans = []
     for junction in selected:

@@ -3,11 +3,16 @@
 ``junctions.toml`` states everything that is chosen; ``candidates.csv`` lists the poses drawn from it, and
 ``worlds.csv`` the hash of every scenario made from it. The hash of the protocol covers these three files and the sensor
 catalogue, so none of them can change unnoticed after it was written down.
+
+``frozen.json`` has the hashes of what is tested and of how it is judged: the models of the score, the detectors, and
+the statistics and tables. It is written when all choices are made; held-out junctions are only measured while it is
+there and right.
 """
 
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import tomllib
 from dataclasses import dataclass
@@ -19,13 +24,21 @@ from pydantic import Field, ValidationError, model_validator
 
 from egvs.core import files
 from egvs.core.errors import InputError
+from egvs.runs import stage_keys
 from egvs.scenario.fields import StrictModel, find_duplicates
 from egvs.scenario.loading import format_validation_error
 from egvs.scenario.traffic_config import VehicleKind
+from egvs.scoring import target_scores
+from egvs.scoring.target_scores import MODEL_FILE
 from egvs.sensors.sensor import CATALOGUE, catalogue_digest
+from egvs.validation.detectors import base
 
 FOLDER = Path(__file__).resolve().parent
 JUNCTIONS_FILE, CANDIDATES_FILE, WORLDS_FILE = "junctions.toml", "candidates.csv", "worlds.csv"
+FROZEN_FILE = "frozen.json"
+
+JUDGING = ("statistics", "tables", "records", "detections")
+"""Modules of this package that turn detections into results."""
 
 Role = Literal["detector", "training", "held out", "comparison"]
 """What a junction is for: training detectors, training the score, testing it once, or comparison with the source
@@ -296,3 +309,41 @@ class ProtocolFiles:
     def digest(self) -> str:
         """SHA-256 of the whole protocol."""
         return files.hash_json(self.digests)
+
+
+def frozen_digests() -> dict[str, str]:
+    """Return the hash of each model of the score, of each detector, and of each module of :data:`JUDGING`, by name."""
+    protocol = read_protocol()
+    digests = {"score": files.hash_file(MODEL_FILE), "features": stage_keys.text_digest(target_scores.__name__)}
+    for name in protocol.detectors.held_out:
+        detector = base.make_detector(name)
+        source = stage_keys.source_digest(type(detector).__module__).digest
+        digests[name] = files.hash_json([detector.settings, source])
+    package = __name__.rpartition(".")[0]
+    return digests | {name: stage_keys.text_digest(f"{package}.{name}") for name in JUDGING}
+
+
+def write_frozen(folder: Path = FOLDER) -> Path:
+    """Write the file of what is frozen, and return its path."""
+    path = folder / FROZEN_FILE
+    files.write_text(path, files.to_json_text(frozen_digests(), indent=1) + "\n")
+    return path
+
+
+def check_frozen(folder: Path = FOLDER) -> None:
+    """Check that nothing that is tested, or that judges it, has changed since it was frozen.
+
+    Raises
+    ------
+    InputError
+        Where the file is missing, or names another version.
+    """
+    path = folder / FROZEN_FILE
+    command = "python -m benchmarks.across_junctions list --freeze"
+    hint = f"When all choices are made: {command}, and a line in docs/validity.md."
+    if not path.is_file():
+        raise InputError(path, "score, detectors and statistics are not frozen yet", hint)
+    frozen, present = json.loads(path.read_text(encoding="utf-8")), frozen_digests()
+    changed = sorted(name for name in frozen.keys() | present.keys() if frozen.get(name) != present.get(name))
+    if changed:
+        raise InputError(path, f"{', '.join(changed)} changed since they were frozen", hint)

@@ -35,7 +35,9 @@ from benchmarks.across_junctions.protocol import (
     MapFile,
     ProtocolFiles,
     Terrain,
+    check_frozen,
     read_protocol,
+    write_frozen,
 )
 from benchmarks.across_junctions.records import PartInfo, write_table
 from benchmarks.across_junctions.statistics import DetectedJunction, Estimate
@@ -635,6 +637,18 @@ def test_rejects_measurements_that_would_spend_held_out_junctions(
     assert command.main([*arguments, "--data", str(tmp_path / "study")]) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "study").exists()
+
+
+def test_held_out_junctions_need_what_is_tested_to_be_frozen(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="are not frozen yet"):
+        check_frozen(tmp_path)
+    path = write_frozen(tmp_path)
+    check_frozen(tmp_path)
+    frozen = json.loads(path.read_text(encoding="utf-8"))
+    assert {"score", "cluster", "pointpillars", "range_image", "statistics", "tables"} <= frozen.keys()
+    path.write_text(json.dumps(frozen | {"score": "another", "tables": "another"}), encoding="utf-8")
+    with pytest.raises(InputError, match="score, tables changed since they were frozen"):
+        check_frozen(tmp_path)
 
 
 def test_list_prints_the_hash(capsys: pytest.CaptureFixture[str]) -> None:
