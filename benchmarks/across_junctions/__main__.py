@@ -28,6 +28,7 @@ from benchmarks.across_junctions.protocol import (
     Protocol,
     ProtocolFiles,
     check_frozen,
+    of_junction,
     read_protocol,
     write_frozen,
 )
@@ -155,9 +156,9 @@ def _differences(built: Sequence[build.BuiltJunction]) -> list[str]:
     for entry in built:
         if entry.problem:
             continue
-        if build.digest_of(entry.junction, digests) != entry.digest:
+        if of_junction(digests, entry.junction, WORLDS_FILE) != entry.digest:
             texts.append(f"{entry.junction.name}: the scenario differs from the one of the protocol")
-        if entry.candidates and candidates.candidates_of(entry.junction, drawn) != entry.candidates:
+        if entry.candidates and of_junction(drawn, entry.junction, CANDIDATES_FILE) != entry.candidates:
             texts.append(f"{entry.junction.name}: the candidates differ from those of the protocol")
     return texts
 
@@ -219,7 +220,7 @@ def _plans(arguments: argparse.Namespace) -> list[PartPlan]:
         extent = _extent(protocol, junction, arguments)
         folder = _world(protocol, junction, arguments)
         if folder is not None:
-            drawn = candidates.candidates_of(junction, each)
+            drawn = of_junction(each, junction, CANDIDATES_FILE)
             records = arguments.data / ("records" if extent == Extent.of(protocol, junction) else "trial")
             plans += [
                 PartPlan(protocol, digest, junction, part, folder, drawn, extent, records, arguments.again or "")
@@ -258,7 +259,7 @@ def _world(protocol: Protocol, junction: Junction, arguments: argparse.Namespace
     except MissingMapError as error:
         print(f"without {junction.name}: {error}")
         return None
-    if build.digest_of(junction, build.read_worlds()) != build.world_digest(folder):
+    if of_junction(build.read_worlds(), junction, WORLDS_FILE) != build.world_digest(folder):
         problem = "the scenario differs from the one of the protocol"
         raise InputError(folder, problem, "Use the versions of SUMO and of the libraries that constraints.txt names.")
     return folder

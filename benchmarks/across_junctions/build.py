@@ -150,20 +150,6 @@ _TABLES = ("seed", "roi", "traffic", "statics", "effects", "sensors")
 _OTHER_FILES = ("scenario.toml", "sites.csv", "zones.geojson", "README.md")
 
 
-def digest_of(junction: Junction, each: Mapping[str, str]) -> str:
-    """Return the hash of the scenario of a junction.
-
-    Raises
-    ------
-    InputError
-        If the file has none of this junction.
-    """
-    if junction.name not in each:
-        hint = f"Write it with: python -m benchmarks.across_junctions build --junction {junction.name} --write"
-        raise InputError(FOLDER / WORLDS_FILE, f"no scenario of {junction.name}", hint)
-    return each[junction.name]
-
-
 def world_digest(scenario_folder: Path) -> str:
     """Return the hash of a scenario: of its tables, without defaults, and of its files; its base scenario included."""
     folders = [scenario_folder]

@@ -115,17 +115,3 @@ def read_candidates(folder: Path = FOLDER) -> dict[str, dict[Site, float]]:
             site = Site(row["site"], Pose(*numbers), row["sensor"], pole=row["site"])
             each.setdefault(row["junction"], {})[site] = float(row["height_m"])
     return each
-
-
-def candidates_of(junction: Junction, each: Mapping[str, dict[Site, float]]) -> dict[Site, float]:
-    """Return the candidates of one junction.
-
-    Raises
-    ------
-    InputError
-        If the file has none of this junction.
-    """
-    if junction.name not in each:
-        hint = f"Write them with: python -m benchmarks.across_junctions build --junction {junction.name} --write"
-        raise InputError(FOLDER / CANDIDATES_FILE, f"no candidates of {junction.name}", hint)
-    return each[junction.name]

@@ -15,10 +15,11 @@ import hashlib
 import json
 import math
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, TypeVar
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -34,6 +35,8 @@ from egvs.sensors.sensor import CATALOGUE, catalogue_digest
 from egvs.validation.detectors import base
 
 FOLDER = Path(__file__).resolve().parent
+
+T = TypeVar("T")
 JUNCTIONS_FILE, CANDIDATES_FILE, WORLDS_FILE = "junctions.toml", "candidates.csv", "worlds.csv"
 FROZEN_FILE = "frozen.json"
 
@@ -258,6 +261,20 @@ class Protocol(StrictModel):
     def detectors_of(self, junction: Junction) -> tuple[str, ...]:
         """Return the detectors that are run at a junction."""
         return self.detectors.training if junction.role == "training" else self.detectors.held_out
+
+
+def of_junction(each: Mapping[str, T], junction: Junction, file: str) -> T:
+    """Return what a file of the protocol has for one junction.
+
+    Raises
+    ------
+    InputError
+        If it has nothing.
+    """
+    if junction.name not in each:
+        hint = f"Write it with: python -m benchmarks.across_junctions build --junction {junction.name} --write"
+        raise InputError(FOLDER / file, f"no row of {junction.name}", hint)
+    return each[junction.name]
 
 
 def read_protocol(file: Path = FOLDER / JUNCTIONS_FILE) -> Protocol:

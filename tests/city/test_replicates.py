@@ -74,7 +74,7 @@ def vehicles_found_by_plan(
     return np.array(found)
 
 
-def vehicles_found_by_each_detector(context: StageContext, sites: list[str], mean: float) -> list[float]:
+def expected_vehicles_by_detector(context: StageContext, sites: list[str], mean: float) -> list[float]:
     """Return how many of the vehicles some sites together find on average, by each detector."""
     targets = TargetScorer(context, context.scenario.roi.grid)
     found = []
@@ -136,7 +136,7 @@ def test_replicates_equal_scores_without_each_block(tmp_path: Path, score: str) 
             expected = vehicles_found_by_plan(context, problem, sites[:n], mean)
         assert actual[n, : 1 + period.blocks] == pytest.approx(expected, rel=1e-9)
         if n_detectors:
-            expected = vehicles_found_by_each_detector(context, sites[:n], mean)[::-1]  # without one, by the other
+            expected = expected_vehicles_by_detector(context, sites[:n], mean)[::-1]  # without one, by the other
             assert actual[n, 1 + period.blocks :] == pytest.approx(expected, rel=1e-9)
     assert len(set(actual[2].tolist())) > 2
 

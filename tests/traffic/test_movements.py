@@ -82,7 +82,7 @@ SLIP_FLOWS = (
 )
 
 
-def test_right_turns_beside_the_signals_have_the_approach_of_their_edge(tmp_path: Path) -> None:
+def test_right_turns_on_a_slip_lane_have_the_approach_of_their_edge(tmp_path: Path) -> None:
     """All movements of an edge lie on the side that zones and signals name, that of the edge to the signals."""
     roads = read(tmp_path, SLIP_LANE)
     names = MovementNames(roads, (0.0, 0.0), SLIP_FLOWS)

@@ -102,7 +102,7 @@ def _suggest_run(scenario_folder: Path) -> str:
 
 
 def suggest_runs(folder: Path) -> str:
-    """Return a hint at the runs with other settings of a run folder that does not exist; empty if there are none.
+    """Return a hint at the runs with other settings of a run folder that does not exist; empty without such runs.
 
     Parameters
     ----------

@@ -28,7 +28,7 @@ _MAX_BEST = 3
 
 
 def print_runs(runs: Sequence[ListedRun], *, with_details: bool = False) -> None:
-    """Print the run folders, or that there are none.
+    """Print the run folders.
 
     Parameters
     ----------

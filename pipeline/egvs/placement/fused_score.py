@@ -30,7 +30,7 @@ from egvs.core.grid import FloatArray
 from egvs.placement.plan_error import PlanErrors
 from egvs.placement.problem import Plan, Problem
 from egvs.scoring.fused_targets import fuse_targets
-from egvs.scoring.target_scores import found_by_detector
+from egvs.scoring.target_scores import expected_by_detector
 from egvs.scoring.targets import VisibleTargets, weighted_mean
 from egvs.scoring.visibility import Beams
 from egvs.stages.site_scoring import TargetScorer
@@ -80,13 +80,13 @@ class FusedScore:
             return np.zeros((len(detectors), len(self.targets.record)))
         self.prepare(plan)
         fused = fuse_targets([self._visible[self.names[i]] for i in plan])
-        return found_by_detector(fused, detectors)
+        return expected_by_detector(fused, detectors)
 
     def value(self, plan: Sequence[int]) -> float:
         """Return the share of vehicles that a plan is expected to find, 0 to 1."""
-        return self.share_found(self.chances(plan))
+        return self.mean_share(self.chances(plan))
 
-    def share_found(self, chances: FloatArray) -> float:
+    def mean_share(self, chances: FloatArray) -> float:
         """Return the mean over detectors and vehicles of :meth:`chances`."""
         return weighted_mean(chances.mean(axis=0), self.targets.weight)
 
@@ -107,9 +107,10 @@ class FusedPlan:
     steps
         The first sensor, the first two, and so on, in the order of installation.
     better_sites
-        Sites that are expected to find more together, found by swaps of one sensor at a time; empty if there are none.
+        Sites that are expected to find more together, reached by swaps of one sensor at a time; empty where no swap
+        finds more.
     better
-        What they find; ``gain`` is what they find more than the plan. None if there are none.
+        What they find; ``gain`` is what they find more than the plan. None without ``better_sites``.
     searched
         Whether swaps were tried.
     """
@@ -153,7 +154,7 @@ def evaluate_fused_plan(
 def _steps(score: FusedScore, plans: Sequence[Plan], errors: PlanErrors) -> tuple[PlanStep, ...]:
     """Return the value of each plan but the first, and what it adds to the one before it."""
     chances = [score.chances(plan) for plan in plans]
-    values = [score.share_found(of_plan) for of_plan in chances]
+    values = [score.mean_share(of_plan) for of_plan in chances]
     steps = []
     for number, error in enumerate(errors.of_chances(chances), start=1):
         gain = values[number] - values[number - 1]

@@ -55,7 +55,7 @@ from egvs.scoring.standard_errors import (
     group_sizes,
     means_without_each,
 )
-from egvs.scoring.target_scores import found_by_detector
+from egvs.scoring.target_scores import expected_by_detector
 from egvs.scoring.targets import (
     FrameGroups,
     TargetRecord,
@@ -416,17 +416,17 @@ class _Designer:
 
     def _values(self, sensor: Sensor, pose: Pose, half: _Half) -> FloatArray | None:
         """Return the probability that each vehicle of a half is found, (n,); None where no sensor can be."""
-        found = self._found(sensor, pose, half)
+        found = self._chances(sensor, pose, half)
         return None if found is None else found.mean(axis=0)
 
-    def _found(self, sensor: Sensor, pose: Pose, half: _Half) -> FloatArray | None:
+    def _chances(self, sensor: Sensor, pose: Pose, half: _Half) -> FloatArray | None:
         """Return the probability that each detector finds each vehicle of a half, (d, n); None as :meth:`_values`."""
         probability = detection_probability(self._scene, sensor)  # InputError if an effect lacks a value of the sensor
         try:
             beams = Beams.of(self._scanner.scan(pose, sensor))
         except InputError:  # the only reasons: in a solid, below the ground, out of reach
             return None
-        return found_by_detector(visible_targets(half.record, beams, probability), self._detectors)
+        return expected_by_detector(visible_targets(half.record, beams, probability), self._detectors)
 
     def evaluate(self, trials: Sequence[_Trial]) -> list[Design]:
         """Score trials on the other frames, with errors, and compare them with the first."""
@@ -435,7 +435,7 @@ class _Designer:
         detectors = detector_groups(len(self._detectors))
         rows = []
         for trial in trials:
-            found = self._found(trial.sensor, trial.pose, half)
+            found = self._chances(trial.sensor, trial.pose, half)
             assert found is not None, "the search scanned from there"
             row = groups.means(found.mean(axis=0), half.weight / groups.weight)
             if detectors:

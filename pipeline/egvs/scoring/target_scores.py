@@ -267,7 +267,7 @@ def expected_by_points(points: FloatArray) -> FloatArray:
     return is_found
 
 
-def found_by_detector(visible: TargetVisibility, detectors: Sequence[str]) -> FloatArray:
+def expected_by_detector(visible: TargetVisibility, detectors: Sequence[str]) -> FloatArray:
     """Return the probability that each detector finds each vehicle-frame of a record, (d, n) float64, 0 to 1.
 
     There is no model of people; see :func:`expected_by_points`.
@@ -279,7 +279,7 @@ def found_by_detector(visible: TargetVisibility, detectors: Sequence[str]) -> Fl
 
 
 def _score_detection(visible: TargetVisibility, detectors: Sequence[str]) -> FloatArray:
-    chances: FloatArray = found_by_detector(visible, detectors).mean(axis=0)
+    chances: FloatArray = expected_by_detector(visible, detectors).mean(axis=0)
     return chances
 
 

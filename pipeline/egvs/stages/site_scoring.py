@@ -33,7 +33,7 @@ from egvs.scoring.road_locations import RoadLocations
 from egvs.scoring.score_table import MIX, ScoreTable, SiteScores
 from egvs.scoring.scorer import PeriodTpog, Scorer, SiteScore
 from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, detector_groups, means_without_each
-from egvs.scoring.target_scores import DETECTORS, TARGET_SCORES, SiteTargetScores, found_by_detector
+from egvs.scoring.target_scores import DETECTORS, TARGET_SCORES, SiteTargetScores, expected_by_detector
 from egvs.scoring.targets import (
     FrameGroups,
     TargetRecord,
@@ -198,7 +198,7 @@ class TargetScorer:
         values: dict[str, FloatArray] = {}
         for name in self._names:
             if name == DEFAULT_SCORE:
-                found = found_by_detector(visible, self.detectors)
+                found = expected_by_detector(visible, self.detectors)
                 values[name] = found.mean(axis=0)
             else:
                 values[name] = TARGET_SCORES[name](visible, self.detectors)

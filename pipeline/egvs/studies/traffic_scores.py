@@ -24,7 +24,7 @@ from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.core.threads import map_ordered
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.scoring.scorer import PeriodTpog, Scorer, SiteScore
-from egvs.scoring.target_scores import DETECTORS, TARGET_SCORES, found_by_detector
+from egvs.scoring.target_scores import DETECTORS, TARGET_SCORES, expected_by_detector
 from egvs.scoring.targets import recorded_frames
 from egvs.stages.base import StageContext
 from egvs.stages.inputs import open_folder
@@ -188,7 +188,9 @@ def score_run(
         visible = targets.visible(scan.beams)
         values = {name: TARGET_SCORES[name](visible, targets.detectors) for name in names}
         if by_detector:
-            values |= {detector_score(detector): found_by_detector(visible, (detector,))[0] for detector in DETECTORS}
+            values |= {
+                detector_score(detector): expected_by_detector(visible, (detector,))[0] for detector in DETECTORS
+            }
         sums = {name: by_frame(chances * targets.weight) for name, chances in values.items()}
         voxel_scores = np.empty(0)
         if scorer is not None:
