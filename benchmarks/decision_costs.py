@@ -29,6 +29,7 @@ from egvs.artefacts import parquet
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
 from egvs.core.grid import FloatArray
+from egvs.core.wording import format_percent
 from egvs.report.formatting import SCORE_LABELS
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
@@ -75,7 +76,7 @@ SCENARIO_HEADINGS = (
 
 def format_share(probability: float) -> str:
     """Return a probability in per cent, e.g. ``"97 %"``."""
-    return f"{probability:.0%}".replace("%", " %")
+    return format_percent(probability, 0)
 
 
 def study_scenario(path: Path, overrides: Sequence[str], out: Path, values: SettingValues) -> AccuracyStudy:

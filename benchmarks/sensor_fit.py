@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.simulated_sweeps import Truth, simulate_sweep
+from egvs.core.wording import format_percent
 from egvs.sensor_fit.fit import SensorFit, fit_sensor
 from egvs.sensor_fit.intervals import Estimate
 from egvs.sensor_fit.sweep_files import Sweep
@@ -134,7 +135,7 @@ def intervals_table(hits: dict[str, list[bool]]) -> str:
     """Return the share of intervals that contain the true value, as a table."""
     rows = ["| interval of | intervals | contain the true value |", "|---|---|---|"]
     for what, values in hits.items():
-        rows.append(f"| {what} | {len(values):,} | {np.mean(values):.1%} |")
+        rows.append(f"| {what} | {len(values):,} | {format_percent(float(np.mean(values)))} |")
     return "\n".join(rows)
 
 

@@ -40,7 +40,7 @@ T = TypeVar("T")
 JUNCTIONS_FILE, CANDIDATES_FILE, WORLDS_FILE = "junctions.toml", "candidates.csv", "worlds.csv"
 FROZEN_FILE = "frozen.json"
 
-JUDGING = ("statistics", "tables", "records", "detections")
+JUDGING = ("statistics", "tables", "calibration", "vehicle_rows", "records", "detections")
 """Modules of this package that turn detections into results."""
 
 Role = Literal["detector", "training", "held out", "comparison"]

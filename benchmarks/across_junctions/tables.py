@@ -10,7 +10,9 @@
 7. All scores.
 8. The aims of the protocol, over junctions.
 9. The same at each junction, and each height.
-10. Parts: source, time, machine.
+10. The level: the share of vehicles that candidates are expected to find, and the share that was found.
+11. The reliability of the model's probabilities.
+12. Parts: source, time, machine.
 
 Rows of detectors that took part in training the score and of others are marked.
 """
@@ -23,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.across_junctions import calibration
 from benchmarks.across_junctions.detections import AP
 from benchmarks.across_junctions.protocol import MIN_SITES_OF_A_HEIGHT, ROLES, Protocol
 from benchmarks.across_junctions.records import JunctionRecord, junction_names, read_junction
@@ -46,7 +49,7 @@ from egvs.validation.correlation import MeasureValues, average_ranks
 MAIN = "expected_detections"
 """Its variant with the mean of all detectors is the one that the aims are for."""
 
-HEIGHT, SENSOR, SENSOR_HEIGHT = "height", "sensor", "sensor and height"
+FITTED_BASELINES = HEIGHT, SENSOR, SENSOR_HEIGHT = "height", "sensor", "sensor and height"
 """Baselines that know nothing of a place: fitted to the ranks of AP at the training junctions."""
 
 EGVS_2, EGVS_10 = (str(Setting(gamma, DEFAULT.voxel_m, False)) for gamma in (2.0, 10.0))
@@ -55,7 +58,9 @@ FIXED_BASELINES = ("mean_points", "points_on_target", "seen_well", EGVS_2, EGVS_
 
 POOLED_AIM, HEIGHT_AIM, OF_CEILING = 0.93, 0.85, 0.95
 REGRET_MEDIAN_AIM, REGRET_WORST_AIM = 3.0, 8.0
-"""Aims at the held-out junctions: each rho, or this share of the ceiling where that is lower; regret in points."""
+LEVEL_AIM = calibration.NEAR_POINTS
+"""Aims at the held-out junctions: each rho, or this share of the ceiling where that is lower; regret and the mean
+absolute error of the level in points."""
 
 REACHED, MISSED, UNDECIDED = "reached", "missed", "undecided"
 
@@ -63,7 +68,7 @@ REACHED, MISSED, UNDECIDED = "reached", "missed", "undecided"
 def write_tables(
     records_folder: Path, out: Path, protocol: Protocol, protocol_digest: str, resamples: int = RESAMPLES
 ) -> list[str]:
-    """Write all tables as CSV and Markdown, and return what to print.
+    """Write all tables as CSV and Markdown, and reliability diagrams, and return what to print.
 
     Parameters
     ----------
@@ -80,12 +85,13 @@ def write_tables(
         raise InputError(records_folder, "expected records, got none", "Measure first: across_junctions measure.")
     records = [read_junction(records_folder, name) for name in names]
     records.sort(key=lambda record: (ROLES.index(record.role), record.name))
-    study = Study(records, protocol, protocol_digest, resamples)
+    study = Study(records_folder, records, protocol, protocol_digest, resamples)
     made = list(study.tables())
     preface = study.preface()
     tables.write(out, preface, made)
     (out / "tables.md").write_text(tables.page("The larger study", preface, made), encoding="utf-8")
-    return [*preface, f"{out}: {len(made)} tables"]
+    figures = calibration.draw(records_folder, records, out)
+    return [*preface, f"{out}: {len(made)} tables", *map(str, figures)]
 
 
 class Study:
@@ -93,17 +99,21 @@ class Study:
 
     Parameters
     ----------
+    folder
+        Folder of the records.
     records
         Of the junctions, those of each role together.
     """
 
     def __init__(
         self,
+        folder: Path,
         records: Sequence[JunctionRecord],
         protocol: Protocol,
         protocol_digest: str,
         resamples: int = RESAMPLES,
     ) -> None:
+        self.folder = folder
         self.records = list(records)
         self.protocol, self.protocol_digest = protocol, protocol_digest
         self.detectors = sorted({name for record in records for name in record.detections})
@@ -181,8 +191,12 @@ class Study:
     def baselines(self, records: Sequence[JunctionRecord]) -> list[str]:
         """Return the baselines that all these junctions have."""
         known = self.all_scores(records)
-        fitted = [HEIGHT, SENSOR, SENSOR_HEIGHT] if any(r.role == "training" for r in self.records) else []
-        return [*fitted, *(name for name in FIXED_BASELINES if name in known)]
+        return [*self.fitted_baselines, *(name for name in FIXED_BASELINES if name in known)]
+
+    @property
+    def fitted_baselines(self) -> tuple[str, ...]:
+        """The baselines that need training junctions; none without."""
+        return FITTED_BASELINES if any(record.role == "training" for record in self.records) else ()
 
     def all_scores(self, records: Sequence[JunctionRecord]) -> list[str]:
         """Return the scores that all these junctions have, in the order of the first."""
@@ -191,10 +205,18 @@ class Study:
 
     def main(self, records: Sequence[JunctionRecord]) -> str:
         """Return the name of the score that the aims are for: with the most detectors."""
+        return max(self.variants(records), key=lambda name: name.count("+"))
+
+    def variants(self, records: Sequence[JunctionRecord]) -> list[str]:
+        """Return the variants of the main score that all these junctions have: one for each choice of detectors."""
         variants = [name for name in self.all_scores(records) if name.startswith(MAIN)]
         if not variants:
             raise InputError("scores", f"no {MAIN} at all of {', '.join(r.name for r in records)}", "Measure them.")
-        return max(variants, key=lambda name: name.count("+"))
+        return variants
+
+    def level(self, record: JunctionRecord, detector: str) -> calibration.Level:
+        """Return the expected and found shares of a junction's candidates."""
+        return calibration.level(record, detector, calibration.score_of(detector, self.variants([record])))
 
     def estimate(self, record: JunctionRecord, detector: str, score: str, kind: str) -> Estimate:
         """Return a statistic of :data:`STATISTICS` at one junction."""
@@ -221,6 +243,8 @@ class Study:
         yield self._all_scores()
         yield self._aims()
         yield self._aims_by_junction()
+        yield self._level()
+        yield self._reliability()
         yield self._parts()
 
     def _measured(self) -> Table:
@@ -367,7 +391,7 @@ class Study:
         rows: list[list[Cell]] = []
         for role in ROLES:
             for detector, records in self.pairs(role):
-                for score in [HEIGHT, SENSOR, SENSOR_HEIGHT, *self.all_scores(records)]:
+                for score in (*self.fitted_baselines, *self.all_scores(records)):
                     values = [self._rho(record, detector, score) for record in records]
                     defined = [value for value in values if math.isfinite(value)]
                     mean = float(np.mean(defined)) if defined else float("nan")
@@ -406,6 +430,13 @@ class Study:
                 value, least = float(summary(lost)), float(summary(crossed))
                 rows.append([*start, f"{name} regret", number(value), number(least), number(aim), number(aim),
                              _outcome_of_regret(value, least, aim)])  # fmt: skip
+            if detector in DETECTORS:
+                each = [self.level(record, detector) for record in records]
+                error = float(np.mean([level.mean_absolute_error for level in each]))
+                outcome = REACHED if error <= LEVEL_AIM else MISSED
+                start = [detector, _trained(detector), each[0].score, len(records)]
+                rows.append([*start, "error of the level", number(error), None, number(LEVEL_AIM), number(LEVEL_AIM),
+                             outcome])  # fmt: skip
         head = [Column("detector"), Column("trained the score"), Column("score"), Column("junctions", "whole"),
                 Column("what"), Column("value", "two"), Column("crossed", "two"), Column("aim", "two"),
                 Column("limit", "two"), Column("outcome")]  # fmt: skip
@@ -414,7 +445,8 @@ class Study:
             f" {OF_CEILING:.0%} of the mean ceiling where that is lower; regret of at most {REGRET_MEDIAN_AIM:g} points"
             f" in the median and {REGRET_WORST_AIM:g} at worst. Rho: {REACHED} if the whole interval is above the"
             f" limit, {MISSED} if it is below. Regret: {REACHED} if the measured one is within the aim, {MISSED} if"
-            f" the crossed one is not."
+            f" the crossed one is not. Error of the level, of detectors that have a model: the mean over junctions of"
+            f" the mean absolute error of a candidate's expected share, at most {LEVEL_AIM:g} points."
         )
         return Table("8 aims", "8. Aims", caption, head, rows)
 
@@ -439,6 +471,46 @@ class Study:
         )
         return Table("9 aims by junction", "9. Aims at each junction", caption, head, rows)
 
+    def _level(self) -> Table:
+        rows: list[list[Cell]] = []
+        for role in ROLES:
+            for detector, records in self.pairs(role):
+                for record in records:
+                    level = self.level(record, detector)
+                    rows.append([
+                        record.name, role, detector, _trained(detector), level.score, len(level.error),
+                        number(float(level.expected.mean())), number(float(level.found.mean())),
+                        number(float(level.error.mean())), number(level.mean_absolute_error), number(level.near),
+                        number(level.error_of_first),
+                    ])  # fmt: skip
+        head = [Column("junction"), Column("role"), Column("detector"), Column("trained the score"), Column("score"),
+                Column("candidates", "whole"), Column("expected", "one"), Column("found", "one"),
+                Column("mean error", "one"), Column("mean absolute error", "one"),
+                Column(f"share within {calibration.NEAR_POINTS:g} points", "two"),
+                Column("error of the first", "one")]  # fmt: skip
+        caption = (
+            "Shares of vehicles in points of 100, means over candidates: expected from the traffic behind the score,"
+            " found in the unseen traffic (mean of recall from above and in 3D, IoU 0.7). Errors are expected minus"
+            " found; that of the first candidate by score is the one that a planner gets."
+        )
+        return Table("10 level", "10. Level", caption, head, rows)
+
+    def _reliability(self) -> Table:
+        rows: list[list[Cell]] = [
+            [name, role, detector, number(part["chance"]), number(part["found"]), int(part["vehicle_frames"])]
+            for role in ROLES
+            for detector, records in self.pairs(role)
+            for name, curve in calibration.reliability(self.folder, records, detector).items()
+            for part in curve
+        ]
+        head = [Column("junction"), Column("role"), Column("detector"), Column("probability", "two"),
+                Column("share found", "two"), Column("vehicle-frames", "whole")]  # fmt: skip
+        caption = (
+            "Vehicle-frames of the unseen traffic at all candidates, in ten bins of the probability by the shipped"
+            " models: the mean probability of each bin, and the share that was found."
+        )
+        return Table("11 reliability", "11. Reliability", caption, head, rows)
+
     def _parts(self) -> Table:
         rows: list[list[Cell]] = [
             [record.name, part, info.frames, info.candidates, number(info.seconds / 60), info.source[:12],
@@ -448,7 +520,7 @@ class Study:
         ]  # fmt: skip
         head = [Column("junction"), Column("part"), Column("frames", "whole"), Column("candidates", "whole"),
                 Column("minutes", "one"), Column("source"), Column("protocol"), Column("machine")]  # fmt: skip
-        return Table("10 parts", "10. Parts", "What was measured, by which source, on which machine.", head, rows)
+        return Table("12 parts", "12. Parts", "What was measured, by which source, on which machine.", head, rows)
 
 
 RHO, WITHIN_HEIGHTS, WITHIN_SENSORS = "rho", "rho within heights", "rho within sensors"

@@ -14,16 +14,15 @@ from pathlib import Path
 import numpy as np
 import sklearn
 
-from benchmarks.across_junctions.detections import AP
 from benchmarks.across_junctions.protocol import Protocol
-from benchmarks.across_junctions.records import JunctionRecord, read_junction, read_table
+from benchmarks.across_junctions.records import read_junction
+from benchmarks.across_junctions.vehicle_rows import read_rows
 from benchmarks.detectability import comparison, writing
-from benchmarks.detectability.additive_model import DIRECTIONS, TargetFeatures
 from benchmarks.detectability.comparison import SiteRows
 from benchmarks.detectability.fitting import Examples, cross_validate, fit_model
 from egvs.core import files
 from egvs.core.errors import InputError
-from egvs.scoring.target_scores import FEATURES, detectability_model
+from egvs.scoring.target_scores import FEATURES
 from egvs.validation.detectors import base
 
 MIN_JUNCTIONS = 2
@@ -42,35 +41,11 @@ def read_training(records_folder: Path, protocol: Protocol, detector: str) -> di
     for junction in protocol.junctions:
         if junction.role == "training" and (records_folder / f"{junction.name}.{detector}.json").is_file():
             record = read_junction(records_folder, junction.name)
-            each[junction.name] = _site_rows(records_folder, record, detector)
+            each[junction.name] = read_rows(records_folder, record, detector)
     if len(each) < MIN_JUNCTIONS:
         problem = f"expected {MIN_JUNCTIONS} training junctions with {detector}, got {', '.join(each) or 'none'}"
         raise InputError(records_folder, problem, "Measure them: across_junctions measure --role training.")
     return each
-
-
-def _site_rows(folder: Path, record: JunctionRecord, detector: str) -> list[SiteRows]:
-    """Return what each candidate sees and finds; a candidate with undefined AP is left out."""
-    seen = read_table(folder / f"{record.name}.features.parquet")
-    found = read_table(folder / f"{record.name}.{detector}.hits.parquet")
-    if seen["site"] != found["site"] or seen["row"] != found["row"]:
-        problem = f"its rows are not those of {record.name}.{detector}.hits.parquet"
-        raise InputError(folder / f"{record.name}.features.parquet", problem, "Measure both parts again.")
-    count = seen.num_rows // len(record.sites)
-    ap = record.detections[detector][AP].values
-    model = detectability_model(detector)
-    rows = []
-    for number, site in enumerate(record.sites):
-        of_site = seen.slice(number * count, count)
-        columns = {name: of_site[name].to_numpy().astype(np.float64) for name in DIRECTIONS}
-        shipped = model.chances(np.column_stack([columns[name] for name in FEATURES]))
-        shipped = np.where(columns["log_points"] > 0.0, shipped, 0.0)
-        hits = found["hits"].slice(number * count, count).to_numpy().astype(np.float64)
-        features = TargetFeatures(columns, of_site["vehicle_class"].to_numpy().astype(np.int64))
-        if np.isfinite(ap[number]):
-            group = f"{record.height_m[number]:g} m"
-            rows.append(SiteRows(site, group, features, hits, shipped, float(ap[number])))
-    return rows
 
 
 def compare(by_junction: Mapping[str, Sequence[SiteRows]], detector: str, out: Path) -> list[str]:

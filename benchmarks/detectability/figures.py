@@ -19,6 +19,8 @@ NAME = "detectability.png"
 Curves = Mapping[str, Sequence[Mapping[str, float]]]
 """By junction, the bins of :func:`benchmarks.detectability.fitting.curve`."""
 
+OTHERS = "each junction predicted by the model of the others"
+
 _COLOURS = {"cluster": "#0072B2", "pointpillars": "#D55E00"}
 _OTHER = "#777777"
 
@@ -51,7 +53,7 @@ def calibration(models: dict[str, Any]) -> Figure:
         below.bar(left, [part["vehicle_frames"] / count for part in curve], width, color=colour)
     above.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0), ylabel="share that was found")
     below.set(xlabel="predicted probability", ylabel="share of them")
-    above.set_title("each junction predicted by the model of the others", fontsize=9)
+    above.set_title(OTHERS, fontsize=9)
     above.legend(fontsize=7, loc="upper left")
     for axes in (above, below):
         axes.grid(True, color="0.9", linewidth=0.6)
@@ -60,18 +62,24 @@ def calibration(models: dict[str, Any]) -> Figure:
     return figure
 
 
-def draw_reliability(path: Path, detector: str, curves: Curves) -> None:
+def draw_reliability(path: Path, detector: str, curves: Curves, model: str = OTHERS) -> None:
     """Write the reliability diagrams of a detector as PNG, one for each junction."""
+    figure = reliability_diagrams(detector, curves, model)
     with files.atomic_write(path) as partial:
-        reliability_diagrams(detector, curves).savefig(partial, dpi=130, format="png", metadata={"Software": None})
+        figure.savefig(partial, dpi=130, format="png", metadata={"Software": None})
 
 
-def reliability_diagrams(detector: str, curves: Curves) -> Figure:
+def reliability_diagrams(detector: str, curves: Curves, model: str = OTHERS) -> Figure:
     """Draw the share that was found by predicted probability, for each junction.
 
     The area of a marker is the number of vehicle-frames; bars are 95 % intervals of a share of independent
     vehicle-frames, so they are too short: frames of one queue are not independent. The title has the difference between
     the predicted and the actual share of all vehicles.
+
+    Parameters
+    ----------
+    model
+        Which model predicted, for the heading.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -80,7 +88,7 @@ def reliability_diagrams(detector: str, curves: Curves) -> Figure:
     rows = -(-len(curves) // columns)
     figure = Figure(figsize=(2.9 * columns, 3.1 * rows + 0.3), layout="constrained")
     FigureCanvasAgg(figure)
-    figure.suptitle(f"{detector}: each junction predicted by the model of the others", fontsize=10)
+    figure.suptitle(f"{detector}: {model}", fontsize=10)
     each_axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
     for axes, (name, parts) in zip(each_axes, curves.items(), strict=False):
         chance, found, count = (

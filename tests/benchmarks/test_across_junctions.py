@@ -16,6 +16,7 @@ import shapely
 from benchmarks.across_junctions import __main__ as command
 from benchmarks.across_junctions import (
     build,
+    calibration,
     candidates,
     costs,
     detections,
@@ -25,6 +26,7 @@ from benchmarks.across_junctions import (
     statistics,
     tables,
     training,
+    vehicle_rows,
     worlds,
 )
 from benchmarks.across_junctions.detections import AP, MEASURES
@@ -39,7 +41,7 @@ from benchmarks.across_junctions.protocol import (
     read_protocol,
     write_frozen,
 )
-from benchmarks.across_junctions.records import PartInfo, write_table
+from benchmarks.across_junctions.records import VEHICLES, PartInfo, write_table
 from benchmarks.across_junctions.statistics import DetectedJunction, Estimate
 from benchmarks.detectability.additive_model import DIRECTIONS
 from benchmarks.validity import tables as table_files
@@ -49,7 +51,7 @@ from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.errors import InputError
 from egvs.runs import stage_keys
 from egvs.scenario.loading import load
-from egvs.scoring.target_scores import FEATURES, DetectabilityModel
+from egvs.scoring.target_scores import DETECTORS, FEATURES, DetectabilityModel, detectability_model
 from egvs.sensors.sensor import CATALOGUE
 from egvs.sensors.sites import Pose, Site
 from egvs.traffic import sumo_folder
@@ -455,11 +457,13 @@ def test_tables_by_hand(made_up: Path, tmp_path: Path) -> None:
     assert height[9] == pytest.approx(7.5)  # 0.32 minus the mean of 0.17 to 0.32
     (measured,) = [row for row in by_name["1 measured"].rows if row[0] == "h"]
     assert measured[8:] == [0, 1.0, 16.5, 32.0, 0.0, 1.0, 1.0, 1.0]
-    (_, aim_of_height, median, worst) = by_name["8 aims"].rows
+    _, aim_of_height, median, worst, level = by_name["8 aims"].rows
     # one junction has no interval
     assert aim_of_height[4:] == ["mean rho within heights", [1.0, None, None], None, 0.85, 0.85, "undecided"]
     assert median[4:] == ["median regret", [16.0, None, None], 16.0, 3.0, 3.0, "missed"]
     assert worst[4:] == ["worst regret", [16.0, None, None], 16.0, 8.0, 8.0, "missed"]
+    # the made-up score is 1, 2, ..., 32, "expected" shares of 100 % and more; recall is AP here
+    assert level[4:] == ["error of the level", [1650.0 - 16.5, None, None], None, 5.0, 5.0, "missed"]
     aims = {(row[0], row[3]): row[4:] for row in by_name["9 aims by junction"].rows}
     assert aims["h", "rho"][1:] == [0.93, "no"]
     assert aims["h", "rho at 2 m"] == [1.0, 0.85, "yes"]
@@ -468,6 +472,44 @@ def test_tables_by_hand(made_up: Path, tmp_path: Path) -> None:
     assert less["training", "height"][4][0] == pytest.approx(-7.5)  # the regret of the main score is 0
     everything = {(row[0], row[2]): row[4] for row in by_name["7 all scores"].rows}
     assert everything["training", "less_is_better"] == -1.0
+
+
+def test_level_by_hand() -> None:
+    level = calibration.Level("s", np.array([90.0, 50.0, 20.0, 90.0]), np.array([84.0, 48.0, 25.0, 80.0]))
+    assert level.error.tolist() == [6.0, 2.0, -5.0, 10.0]
+    assert (level.mean_absolute_error, level.near, level.error_of_first) == (5.75, 0.5, 8.0)
+    nothing = calibration.Level("s", np.empty(0), np.empty(0))
+    assert np.isnan([nothing.mean_absolute_error, nothing.near, nothing.error_of_first]).all()
+
+
+def test_each_detector_is_compared_with_its_own_model() -> None:
+    variants = [f"expected_detections (detectors {names})" for names in ("cluster+pointpillars", "cluster")]
+    assert calibration.score_of("cluster", variants) == variants[1]
+    assert calibration.score_of("pointpillars", variants) == variants[0]  # its own was not computed
+    assert calibration.score_of("range_image", variants) == variants[0]
+
+
+@pytest.mark.system  # draws with matplotlib
+def test_reliability_of_made_up_vehicles(tmp_path: Path) -> None:
+    folder = tmp_path / "records"
+    folder.mkdir()
+    write_rows(folder, "h", ("cluster", "range_image"), np.random.default_rng(12), role="held out")
+    printed = write_tables(folder, tmp_path / "out")
+    assert printed[-2:] == [str(tmp_path / "out" / f"reliability_{name}.png") for name in ("cluster", "range_image")]
+    _, made = table_files.read(tmp_path / "out")
+    (table,) = [table for table in made if table.name == "11 reliability"]
+    record = records.read_junction(folder, "h")
+    sites = vehicle_rows.read_rows(folder, record, "range_image")
+    chances = np.concatenate([site.shipped for site in sites])
+    hits = np.concatenate([site.hits for site in sites])
+    columns = sites[3].features.columns
+    features = np.column_stack([columns[name] for name in FEATURES])
+    each = [detectability_model(name).chances(features) for name in DETECTORS]
+    np.testing.assert_allclose(sites[3].shipped, np.where(columns["log_points"] > 0.0, np.mean(each, axis=0), 0.0))
+    for _, _, _, chance, found, count in [row for row in table.rows if row[2] == "range_image"]:
+        members = np.floor(np.minimum(chances, 0.999) * 10) == np.floor(min(chance, 0.999) * 10)
+        assert (members.sum(), hits[members].mean()) == (count, pytest.approx(found, abs=1e-4))
+        assert chances[members].mean() == pytest.approx(chance, abs=1e-4)
 
 
 def test_tables_say_what_is_missing(made_up: Path, tmp_path: Path) -> None:
@@ -544,7 +586,9 @@ def test_rejects_damaged_record(made_up: Path, tmp_path: Path) -> None:
         write_tables(tmp_path / "nowhere", tmp_path / "out")
 
 
-def write_rows(folder: Path, name: str, detectors: tuple[str, ...], rng: np.random.Generator) -> None:
+def write_rows(
+    folder: Path, name: str, detectors: tuple[str, ...], rng: np.random.Generator, role: str = "training"
+) -> None:
     """Write records where detectors find a vehicle the more probably the more points it has; four per candidate."""
     sites, count = 32, 50
     site = np.repeat([f"c{i}" for i in range(sites)], count)
@@ -558,7 +602,9 @@ def write_rows(folder: Path, name: str, detectors: tuple[str, ...], rng: np.rand
     hits = (rng.random(len(row)) < log_points / 6.0).astype(np.float32)
     share = hits.reshape(sites, count).mean(axis=1)
     for detector in detectors:
-        write_junction(folder, name, "training", share, share, np.repeat([2.0, 5.0], sites // 2), detector)
+        write_junction(folder, name, role, share, share, np.repeat([2.0, 5.0], sites // 2), detector)
+        scored = PartInfo.read(folder / f"{name}.scores.json")
+        PartInfo(**{**vars(scored), "part": VEHICLES}).write(folder)
         write_table(folder / f"{name}.{detector}.hits.parquet", {"site": site, "row": row, "hits": hits})
 
 

@@ -99,7 +99,7 @@ def test_values_in_fused_clouds_follow_the_assumption(capsys: pytest.CaptureFixt
     )
     assert printed(placed_two(fused=FusedPlan(steps)), capsys).endswith(f"{LAST_LINES}{first}.\n")
     text = printed(placed_two(fused=FusedPlan(steps, searched=True)), capsys)
-    assert text.endswith(f"{first}; no exchange of a single sensor finds more there.\n")
+    assert text.endswith(f"{first}; swapping a single sensor finds no more there.\n")
     better = FusedPlan(steps, ("c", "a"), PlanStep(2, 0.9753, 0.004, True, 0.004, 0.002, 0.98), searched=True)
     text = printed(placed_two(fused=better), capsys)
     assert text.endswith(f"{first}; c, a should find 0.4 ± 0.2 percentage points more there.\n")

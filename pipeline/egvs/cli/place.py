@@ -194,7 +194,7 @@ def describe_fused(fused: FusedPlan, by: ScoreLabel) -> str:
         gain = by.change(fused.better.gain, fused.better.gain_se)
         return f"{text}; {', '.join(fused.better_sites)} should find {gain} {by.change_unit} more there."
     if fused.searched:
-        return f"{text}; no exchange of a single sensor finds more there."
+        return f"{text}; swapping a single sensor finds no more there."
     return f"{text}."
 
 

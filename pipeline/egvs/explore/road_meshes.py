@@ -7,7 +7,7 @@ relative to ``zero_m``; each layer is a few centimetres above the one below, so 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -16,6 +16,7 @@ import shapely
 import trimesh
 from numpy.typing import NDArray
 
+from egvs.core import polylines
 from egvs.core.grid import Vec3
 from egvs.traffic.network import LANE_WIDTH_M, Edge, Lane, Network
 from egvs.world.carriageway import Carriageway, is_carriageway
@@ -128,22 +129,15 @@ def _distance_m(side: Floats, other: Lane) -> float:
 
 def _dashes(line: Floats) -> Iterator[Floats]:
     """Yield the dashes of a broken line (n, 3); corners between their ends are cut."""
-    along_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
-    for start_m in np.arange(0.0, along_m[-1] - _DASH_M, _DASH_M + _GAP_M):
-        yield _points_at(line, along_m, (start_m, start_m + _DASH_M))
+    for start_m in np.arange(0.0, polylines.stations_m(line)[-1] - _DASH_M, _DASH_M + _GAP_M):
+        yield polylines.points_at(line, (start_m, start_m + _DASH_M))
 
 
 def _crossing_stripes(lane: Lane) -> Iterator[Floats]:
     """Yield the stripes of a crossing, as strips across its middle line."""
     line = lane.shape_m
-    along_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line[:, :2], axis=0).T))])
-    for start_m in np.arange(_STRIPE_M / 2.0, along_m[-1] - _STRIPE_M, 2.0 * _STRIPE_M):
-        yield _strip(_points_at(line, along_m, (start_m, start_m + _STRIPE_M)), _width_m(lane))
-
-
-def _points_at(line: Floats, along_m: Floats, distances_m: Sequence[float]) -> Floats:
-    """Return points of a line (n, 3) at distances from its start, (k, 3)."""
-    return np.column_stack([np.interp(distances_m, along_m, line[:, axis]) for axis in range(3)])
+    for start_m in np.arange(_STRIPE_M / 2.0, polylines.stations_m(line)[-1] - _STRIPE_M, 2.0 * _STRIPE_M):
+        yield _strip(polylines.points_at(line, (start_m, start_m + _STRIPE_M)), _width_m(lane))
 
 
 def _strip(line: Floats, width_m: float) -> Floats:

@@ -25,6 +25,7 @@ import shapely
 from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 
+from egvs.core import polylines
 from egvs.core.grid import FloatArray
 from egvs.formats.lanelet2 import Lanelet, LaneletMap
 from egvs.formats.osm import Tags
@@ -129,7 +130,7 @@ class DirectedLanelet:
     @property
     def length_m(self) -> float:
         """Length of the centre line, seen from above."""
-        return float(np.hypot(*np.diff(self.center_m[:, :2], axis=0).T).sum())
+        return polylines.length_m(self.center_m)
 
     @property
     def users(self) -> frozenset[str]:
@@ -298,7 +299,7 @@ def orient_lanelet(lanelet: Lanelet, lanelet_map: LaneletMap, xyz_m: Mapping[int
 
 def split_line(line_m: FloatArray, share: float) -> tuple[FloatArray, FloatArray]:
     """Cut a line (n, 3) at a share of its length into two lines that have the point of the cut in common."""
-    stations_m = _stations_m(line_m)
+    stations_m = polylines.stations_m(line_m)
     at_m = share * stations_m[-1]
     point = _points_at(line_m, np.array([share]))
     before, after = line_m[stations_m < at_m - _SAME_M], line_m[stations_m > at_m + _SAME_M]
@@ -321,19 +322,12 @@ def _signed_area_m2(ring_m: FloatArray) -> float:
 
 def _middle_line(left_m: FloatArray, right_m: FloatArray) -> FloatArray:
     """Return points between those at equal shares of two lines' lengths, about a metre apart."""
-    length_m = max(_stations_m(left_m)[-1], _stations_m(right_m)[-1])
+    length_m = max(polylines.stations_m(left_m)[-1], polylines.stations_m(right_m)[-1])
     steps = min(max(int(np.ceil(length_m / _STEP_M)), 1), _MAX_STEPS)
     shares = np.linspace(0.0, 1.0, steps + 1)
     return (_points_at(left_m, shares) + _points_at(right_m, shares)) / 2
 
 
-def _stations_m(line_m: FloatArray) -> FloatArray:
-    """Return the distance along a line of each of its points, seen from above."""
-    return np.concatenate([[0.0], np.hypot(*np.diff(line_m[:, :2], axis=0).T).cumsum()])
-
-
 def _points_at(line_m: FloatArray, shares: FloatArray) -> FloatArray:
     """Return the points (n, 3) at shares (n,) of a line's length."""
-    stations_m = _stations_m(line_m)
-    at_m = shares * stations_m[-1]
-    return np.column_stack([np.interp(at_m, stations_m, axis) for axis in line_m.T])
+    return polylines.points_at(line_m, shares * polylines.stations_m(line_m)[-1])

@@ -13,12 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
+from egvs.core import polylines
 from egvs.report import maps
 from egvs.report.basemap import roads_within
 from egvs.report.svg_figures import Box, MapFrame, text_width
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import CountConfig
-from egvs.traffic.approach_queues import approach_paths, path_points
+from egvs.traffic.approach_queues import approach_paths
 from egvs.traffic.approaches import ApproachIndex, ApproachMovement
 from egvs.traffic.directions import U_TURN, Floats
 from egvs.traffic.movements import MovementNames
@@ -70,7 +71,7 @@ def approach_labels(counts: Sequence[CountConfig], network: Path, center_m: tupl
         per_hour = {turn: 0.0 for turn in _TURN_LABELS}
         for movement in movements:
             per_hour[movement.turn] += movement.flow.per_hour
-        at_m = path_points(paths[title].line_m, np.array([_LABEL_AT_M]))[0]
+        at_m = polylines.points_at(paths[title].line_m, np.array([_LABEL_AT_M]))[0]
         labels.append(ApproachLabel(at_m, title, per_hour))
     return labels
 

@@ -31,6 +31,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from egvs.core import polylines
 from egvs.core.errors import Diagnostic, DiagnosticsError, InputError, unknown_site
 from egvs.core.grid import Vec3
 from egvs.core.numbers import parse_decimal
@@ -572,14 +573,12 @@ def _line_rows(rules: tuple[SiteLine, ...]) -> Iterator[SiteRow]:
     for rule in rules:
         reason = f"spacing_m = {rule.spacing_m:g}"
         line = np.asarray(rule.line_m)
-        distance_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
-        site_files.check_site_count(float(distance_m[-1]) / rule.spacing_m, "sites.along", reason)
-        count = math.floor(distance_m[-1] / rule.spacing_m + 1e-9) + 1
+        stations_m = polylines.stations_m(line)
+        site_files.check_site_count(float(stations_m[-1]) / rule.spacing_m, "sites.along", reason)
+        count = math.floor(stations_m[-1] / rule.spacing_m + 1e-9) + 1
         site_files.check_site_count(len(points) + count, "sites.along", reason)
         at_m = np.arange(count) * rule.spacing_m
-        xs = np.interp(at_m, distance_m, line[:, 0])
-        ys = np.interp(at_m, distance_m, line[:, 1])
-        points += [_RulePoint(float(x), float(y), rule.heights_m) for x, y in zip(xs, ys, strict=True)]
+        points += [_RulePoint(float(x), float(y), rule.heights_m) for x, y in polylines.points_at(line, at_m)]
     yield from _numbered_rows("a", points, "sites.along")
 
 

@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from egvs.core import polylines
 from egvs.traffic.directions import Floats, arrival_side, compass
 from egvs.traffic.network import TURNAROUNDS, Edge, Network
 
@@ -99,7 +100,7 @@ class ApproachNames:
         edge = self._edges[edge_id]
         middle_m = self._ring_middle_m(edge.to_node, edge.from_node)
         junction_m = line_m[0] if middle_m is None else middle_m
-        heading: Floats = junction_m - point_along(line_m, HEADING_OVER_M)
+        heading: Floats = junction_m - polylines.points_at(line_m, HEADING_OVER_M)[0]
         return heading
 
     def exit_heading(self, edge_id: str) -> Floats:
@@ -108,7 +109,7 @@ class ApproachNames:
         edge = self._edges[edge_id]
         middle_m = self._ring_middle_m(edge.from_node, edge.to_node)
         junction_m = line_m[0] if middle_m is None else middle_m
-        heading: Floats = point_along(line_m, HEADING_OVER_M) - junction_m
+        heading: Floats = polylines.points_at(line_m, HEADING_OVER_M)[0] - junction_m
         return heading
 
     def side(self, edge_id: str) -> str:
@@ -177,7 +178,7 @@ def _joined(edges: dict[str, Edge], edge_id: str, following: dict[str, str], *, 
         visited.add(next_id)
         line_m = _middle_line(edges[next_id])
         parts.append(line_m[::-1] if backwards else line_m)
-        length_m = float(line_lengths_m(np.vstack(parts))[-1])
+        length_m = float(polylines.stations_m(np.vstack(parts))[-1])
         next_id = following.get(next_id) if length_m < HEADING_OVER_M else None
     return np.vstack(parts)
 
@@ -186,17 +187,6 @@ def _middle_line(edge: Edge) -> Floats:
     """Return the first lane for vehicles of an edge in plan, or its first lane if it has none, (n, 2)."""
     lane = next((lane for lane in edge.lanes if not lane.is_pavement and len(lane.shape_m) > 1), edge.lanes[0])
     return lane.shape_m[:, :2]
-
-
-def line_lengths_m(line_m: Floats) -> Floats:
-    """Return the distance of each point of a line from its start, measured along the line, (n,)."""
-    return np.append(0.0, np.cumsum(np.hypot(*np.diff(line_m, axis=0).T)))
-
-
-def point_along(line_m: Floats, distance_m: float) -> Floats:
-    """Return the point of a line at a distance from its start, or its end if it is shorter, (2,)."""
-    lengths_m = line_lengths_m(line_m)
-    return np.array([np.interp(distance_m, lengths_m, line_m[:, axis]) for axis in (0, 1)])
 
 
 def disambiguate_approaches(names: Sequence[str], ids: Sequence[str]) -> list[str]:

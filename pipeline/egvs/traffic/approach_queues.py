@@ -23,6 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from egvs.core import polylines
 from egvs.traffic.approaches import ApproachMovement
 from egvs.traffic.network import LANE_WIDTH_M, Edge, Network
 
@@ -150,7 +151,7 @@ def approach_paths(movements: Sequence[ApproachMovement], network: Network) -> M
 
 def _make_path(title: str, edges: list[Edge], before: Mapping[str, Edge], signals: set[str]) -> ApproachPath:
     parts = [_middle_lane(edge) for edge in reversed(edges)]
-    length_m = sum(_length_m(part) for part in parts)
+    length_m = sum(polylines.length_m(part) for part in parts)
     known = {edge.id for edge in edges}
     first = edges[0]
     while length_m < MAX_QUEUE_M and first.from_node not in signals and first.id in before:
@@ -159,7 +160,7 @@ def _make_path(title: str, edges: list[Edge], before: Mapping[str, Edge], signal
             break
         known.add(first.id)
         parts.append(_middle_lane(first))
-        length_m += _length_m(parts[-1])
+        length_m += polylines.length_m(parts[-1])
     widest = max(len(edge.lanes) for edge in edges)
     width_m = max(lane.width_m or LANE_WIDTH_M for edge in edges for lane in edge.lanes)
     return ApproachPath(title, np.vstack(parts), (widest / 2 + 0.5) * width_m)
@@ -169,10 +170,6 @@ def _middle_lane(edge: Edge) -> Floats:
     """Return the lane in the middle of an edge from its end to its start, shape (n, 2)."""
     line: Floats = edge.lanes[len(edge.lanes) // 2].shape_m[::-1, :2]
     return line
-
-
-def _length_m(line_m: Floats) -> float:
-    return float(np.hypot(*np.diff(line_m, axis=0).T).sum())
 
 
 def _straight_predecessors(network: Network) -> dict[str, Edge]:
@@ -203,8 +200,8 @@ def measure_approach(path: ApproachPath, boxes: VehicleFrames, first: int, end: 
     points = shapely.points(boxes.at_m)
     distance_m = shapely.line_locate_point(line, points)
     near = shapely.dwithin(line, points, path.half_width_m) & (distance_m > 0) & (distance_m < MAX_QUEUE_M)
-    ahead_m = path_points(path.line_m, np.maximum(distance_m - 1.0, 0.0))
-    there_m = path_points(path.line_m, distance_m)
+    ahead_m = polylines.points_at(path.line_m, np.maximum(distance_m - 1.0, 0.0))
+    there_m = polylines.points_at(path.line_m, distance_m)
     heading = ahead_m - there_m
     scale = np.hypot(*heading.T)
     along = np.cos(boxes.yaw_rad) * heading[:, 0] + np.sin(boxes.yaw_rad) * heading[:, 1]
@@ -222,12 +219,6 @@ def measure_approach(path: ApproachPath, boxes: VehicleFrames, first: int, end: 
         3.6 * mean_m_s,
         len(np.unique(boxes.vehicle[near])),
     )
-
-
-def path_points(line_m: Floats, along_m: Floats) -> Floats:
-    """Return the points of a line at distances from its start, shape (n, 2)."""
-    at_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(line_m, axis=0).T)))
-    return np.column_stack([np.interp(along_m, at_m, line_m[:, axis]) for axis in (0, 1)])
 
 
 def queue_lengths_m(frame: Integers, distance_m: Floats, half_m: Floats, frames: int) -> Floats:

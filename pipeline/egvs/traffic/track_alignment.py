@@ -15,6 +15,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
+from egvs.core import polylines
 from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, Roi
 from egvs.core.wording import format_percent, number_of
@@ -157,9 +158,7 @@ def road_heights(roads: Network, xy_m: FloatArray) -> FloatArray:
 
 def _divide(line_m: FloatArray) -> FloatArray:
     """Return points every :data:`_SPACING_M` on a line (n, 2) or (n, 3)."""
-    along_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line_m[:, :2], axis=0).T))])
-    at_m = np.arange(0.0, along_m[-1], _SPACING_M)
-    return np.column_stack([np.interp(at_m, along_m, column) for column in line_m.T])
+    return polylines.points_at(line_m, np.arange(0.0, polylines.stations_m(line_m)[-1], _SPACING_M))
 
 
 def _centre_lines(roads: Network) -> tuple[FloatArray, FloatArray]:

@@ -21,6 +21,7 @@ from functools import cached_property
 
 import numpy as np
 
+from egvs.core import polylines
 from egvs.core.grid import FloatArray, IntArray
 from egvs.tracks.resampling import ResampledTracks
 from egvs.traffic.network import CAR, DEFAULT_SPEED_M_S, Lane, Network
@@ -72,8 +73,7 @@ class DrivenLane:
     @cached_property
     def along_m(self) -> FloatArray:
         """Distance of the points of the line from its start, (n,)."""
-        distances: FloatArray = np.append(0.0, np.cumsum(np.hypot(*np.diff(self.line_m, axis=0).T)))
-        return distances
+        return polylines.stations_m(self.line_m)
 
     @property
     def length_m(self) -> float:

@@ -26,6 +26,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from egvs.core import polylines
 from egvs.core.limits import GROUND_POINTS
 from egvs.traffic.network import LANE_WIDTH_M, Edge, Lane, Network
 
@@ -221,7 +222,7 @@ def _interpolate(points: Floats, at: Floats) -> Floats:
 def _check_point_count(roads: Network, low_m: Floats | None, high_m: Floats | None, where: object) -> None:
     """Raise an InputError when lanes are so long, or the rectangle so wide, that there are too many points."""
     shapes = [lane.shape_m for edge in roads.all_edges for lane in edge.lanes]
-    length = sum(float(np.hypot(*np.diff(shape[:, :2], axis=0).T).sum()) for shape in shapes)
+    length = sum(polylines.length_m(shape) for shape in shapes)
     vertices = np.concatenate(shapes)[:, :2]
     low = vertices.min(axis=0) if low_m is None else low_m
     high = vertices.max(axis=0) if high_m is None else high_m

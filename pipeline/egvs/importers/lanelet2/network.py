@@ -16,7 +16,7 @@ from itertools import pairwise
 import numpy as np
 from shapely.geometry import LineString
 
-from egvs.core import files
+from egvs.core import files, polylines
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.wording import number_of
@@ -287,7 +287,7 @@ class NetworkBuilder:
 
 def simplify_line(line_m: FloatArray) -> FloatArray:
     """Drop points (n, 3) within 1 cm of the line through the others, in plan and in height."""
-    stations_m = np.concatenate([[0.0], np.hypot(*np.diff(line_m[:, :2], axis=0).T).cumsum()])
+    stations_m = polylines.stations_m(line_m)
     keep = np.zeros(len(line_m), dtype=bool)
     for flat in (line_m[:, :2], np.column_stack([stations_m, line_m[:, 2]])):
         points = np.asarray(LineString(flat).simplify(_SIMPLIFY_M, preserve_topology=False).coords)

@@ -12,6 +12,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from egvs.core import polylines
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.reading import translate_errors
@@ -28,7 +29,7 @@ from egvs.importers.lanelet2.network import (
     unused_relations,
 )
 from egvs.importers.lanelet2.right_of_way import RightOfWay
-from egvs.importers.lanelet2.roads import RoadLayout, line_length_m, make_roads
+from egvs.importers.lanelet2.roads import RoadLayout, make_roads
 from egvs.importers.lanelet2.signals import SignalPlan, plan_signals
 from egvs.importers.map_parts import RoadMap, RoadOptions
 from egvs.importers.openstreetmap.reader import is_osm_xml
@@ -102,7 +103,7 @@ def _without_tiny(graph: LaneletGraph) -> tuple[LaneletGraph, list[LaneletKey]]:
     """Return the graph without lanelets below :data:`MIN_SIZE_M`, and these."""
     tiny = []
     for key, lanelet in graph.lanelets.items():
-        shortest_bound_m = min(line_length_m(lanelet.left_m), line_length_m(lanelet.right_m))
+        shortest_bound_m = min(polylines.length_m(lanelet.left_m), polylines.length_m(lanelet.right_m))
         if min(lanelet.length_m, lanelet.width_m) < MIN_SIZE_M or shortest_bound_m <= 0:
             tiny.append(key)
     if tiny:

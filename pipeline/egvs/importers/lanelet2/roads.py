@@ -30,6 +30,7 @@ import numpy as np
 import shapely
 from shapely.geometry import Point
 
+from egvs.core import polylines
 from egvs.core.grid import FloatArray
 from egvs.formats.lanelet2_graph import DirectedLanelet, LaneletGraph, LaneletKey, split_lanelets
 from egvs.importers.lanelet2.arms import Groups, join_arms
@@ -95,7 +96,7 @@ class Road:
     @property
     def length_m(self) -> float:
         """Mean length of its lanes, seen from above."""
-        return float(np.mean([line_length_m(lane.center_m) for lane in self.lanes]))
+        return float(np.mean([polylines.length_m(lane.center_m) for lane in self.lanes]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +168,7 @@ class RoadLayout:
         walked_m = 0.0
         while not turn.path:
             lane = self.roads[turn.target].lanes[turn.target_lane]
-            walked_m += line_length_m(lane.center_m)
+            walked_m += polylines.length_m(lane.center_m)
             following = self.turns_from.get((turn.target, turn.target_lane), [])
             if walked_m > APPROACH_M or not following:
                 return []
@@ -219,11 +220,6 @@ def make_roads(graph: LaneletGraph, *, lefthand: bool, crosswalks: Sequence[Dire
     turns = tuple(_find_turns(graph, placed, inner))
     used = {key for turn in turns for key in turn.path}
     return RoadLayout(graph, placed, node_of_inner, turns, tuple(sorted(inner - used)), stubs)
-
-
-def line_length_m(line_m: FloatArray) -> float:
-    """Return the length of a line (n, 2 or 3), seen from above."""
-    return float(np.hypot(*np.diff(line_m[:, :2], axis=0).T).sum())
 
 
 def _find_overlaps(graph: LaneletGraph) -> list[Overlap]:

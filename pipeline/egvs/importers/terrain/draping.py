@@ -27,6 +27,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from egvs.core import polylines
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.wording import by_number, format_percent, list_first, number_of
@@ -200,8 +201,7 @@ def roads_above_others(text: str, least_m: float = 3.0) -> tuple[tuple[str, str]
 def _height_at(line_m: FloatArray, at: shapely.Geometry) -> float:
     """Return the height of a line (n, 3) at a point near it."""
     line = shapely.LineString(line_m[:, :2])
-    along_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line_m[:, :2], axis=0).T))])
-    return float(np.interp(line.project(shapely.centroid(at)), along_m, line_m[:, 2]))
+    return float(np.interp(line.project(shapely.centroid(at)), polylines.stations_m(line_m), line_m[:, 2]))
 
 
 @dataclass(frozen=True)
@@ -304,8 +304,7 @@ class _EdgeGraph:
         for shape in shapes:
             edge = _edge_of_lane(shape)
             if edge in nodes:
-                length_m = float(np.hypot(*np.diff(shape.points_m[:, :2], axis=0).T).sum())
-                lengths_m.setdefault(edge, max(length_m, 0.1))
+                lengths_m.setdefault(edge, max(polylines.length_m(shape.points_m), 0.1))
         raised = frozenset(edge for edge in nodes if levels.get(edge, 0))
         return cls(nodes, lengths_m, raised)
 

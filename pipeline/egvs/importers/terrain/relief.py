@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from egvs.core import polylines
 from egvs.core.grid import FloatArray
 from egvs.importers import junctions
 from egvs.importers.junctions import JunctionRegion, KerbsidePole, StreetJunction, Streets
@@ -125,9 +126,7 @@ def _heights_inside(edge: Edge, roi: JunctionRegion) -> FloatArray:
     (x_m, y_m), (width_m, depth_m) = roi.center_m, roi.size_m
     heights = [np.empty(0)]
     for lane in edge.lanes:
-        shape_m = lane.shape_m
-        along_m = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(shape_m[:, :2], axis=0).T))])
-        at_m = np.linspace(0.0, along_m[-1], int(along_m[-1]) + 2)
-        x, y, z = (np.interp(at_m, along_m, shape_m[:, axis]) for axis in range(3))
+        length_m = polylines.stations_m(lane.shape_m)[-1]
+        x, y, z = polylines.points_at(lane.shape_m, np.linspace(0.0, length_m, int(length_m) + 2)).T
         heights.append(z[(np.abs(x - x_m) <= width_m / 2) & (np.abs(y - y_m) <= depth_m / 2)])
     return np.concatenate(heights)

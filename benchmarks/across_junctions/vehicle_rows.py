@@ -1,0 +1,53 @@
+"""What each candidate sees of the vehicle-frames of the unseen traffic, and which of them a detector finds there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.across_junctions.detections import AP
+from benchmarks.across_junctions.records import JunctionRecord, read_table
+from benchmarks.detectability.additive_model import DIRECTIONS, TargetFeatures
+from benchmarks.detectability.comparison import SiteRows
+from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray
+from egvs.scoring.target_scores import DETECTORS, FEATURES, detectability_model
+
+
+def read_rows(folder: Path, record: JunctionRecord, detector: str) -> list[SiteRows]:
+    """Return the rows of each candidate; one whose AP is undefined is left out.
+
+    The shipped probability is that of the detector's own model, or the mean over all models for a detector that has
+    none.
+
+    Raises
+    ------
+    InputError
+        If a record is missing or damaged, or the rows of its parts differ.
+    """
+    seen = read_table(folder / f"{record.name}.features.parquet")
+    found = read_table(folder / f"{record.name}.{detector}.hits.parquet")
+    if seen["site"] != found["site"] or seen["row"] != found["row"]:
+        problem = f"its rows are not those of {record.name}.{detector}.hits.parquet"
+        raise InputError(folder / f"{record.name}.features.parquet", problem, "Measure both parts again.")
+    count = seen.num_rows // len(record.sites)
+    ap = record.detections[detector][AP].values
+    rows = []
+    for number, site in enumerate(record.sites):
+        of_site = seen.slice(number * count, count)
+        columns = {name: of_site[name].to_numpy().astype(np.float64) for name in DIRECTIONS}
+        hits = found["hits"].slice(number * count, count).to_numpy().astype(np.float64)
+        features = TargetFeatures(columns, of_site["vehicle_class"].to_numpy().astype(np.int64))
+        if np.isfinite(ap[number]):
+            group = f"{record.height_m[number]:g} m"
+            rows.append(SiteRows(site, group, features, hits, _shipped(detector, columns), float(ap[number])))
+    return rows
+
+
+def _shipped(detector: str, columns: dict[str, FloatArray]) -> FloatArray:
+    """Return the probability of each vehicle-frame by the shipped models; 0 without a point."""
+    features = np.column_stack([columns[name] for name in FEATURES])
+    named = [detector] if detector in DETECTORS else DETECTORS
+    chances = np.mean([detectability_model(name).chances(features) for name in named], axis=0)
+    return np.where(columns["log_points"] > 0.0, chances, 0.0)

@@ -1,0 +1,32 @@
+"""Lengths along a line of points, seen from above: heights do not count.
+
+A *station* is the distance of a point of a line from its start, measured along the line.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+
+
+def stations_m(line_m: Floats) -> Floats:
+    """Return the station of each point of a line (n, 2 or more), (n,)."""
+    return np.append(0.0, np.cumsum(_steps_m(line_m)))
+
+
+def length_m(line_m: Floats) -> float:
+    """Return the length of a line (n, 2 or more)."""
+    return float(_steps_m(line_m).sum())
+
+
+def points_at(line_m: Floats, at_m: ArrayLike) -> Floats:
+    """Return the points of a line (n, c) at stations (k,), (k, c); its first or last point for those beyond."""
+    known_m = stations_m(line_m)
+    return np.column_stack([np.interp(at_m, known_m, column) for column in line_m.T])
+
+
+def _steps_m(line_m: Floats) -> Floats:
+    steps_m: Floats = np.hypot(*np.diff(line_m[:, :2], axis=0).T)
+    return steps_m
