@@ -88,7 +88,7 @@ def reliability_diagrams(detector: str, curves: Curves, model: str = OTHERS) -> 
     rows = -(-len(curves) // columns)
     figure = Figure(figsize=(2.9 * columns, 3.1 * rows + 0.3), layout="constrained")
     FigureCanvasAgg(figure)
-    figure.suptitle(f"{detector}: {model}", fontsize=10)
+    figure.suptitle(f"{detector}\n{model}", fontsize=9)
     each_axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
     for axes, (name, parts) in zip(each_axes, curves.items(), strict=False):
         chance, found, count = (

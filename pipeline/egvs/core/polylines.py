@@ -23,8 +23,8 @@ def length_m(line_m: Floats) -> float:
 
 def points_at(line_m: Floats, at_m: ArrayLike) -> Floats:
     """Return the points of a line (n, c) at stations (k,), (k, c); its first or last point for those beyond."""
-    known_m = stations_m(line_m)
-    return np.column_stack([np.interp(at_m, known_m, column) for column in line_m.T])
+    known_m, wanted_m = stations_m(line_m), np.asarray(at_m, dtype=np.float64)
+    return np.column_stack([np.interp(wanted_m, known_m, column) for column in line_m.T])
 
 
 def _steps_m(line_m: Floats) -> Floats:
