@@ -13,6 +13,8 @@ make it quicker.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +23,12 @@ from scipy.stats import kendalltau, spearmanr
 import egvs
 from egvs.artefacts.readers import read_scores
 from egvs.artefacts.run_folder import RunFolder
+from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.core.grid import FloatArray, Roi
 from egvs.core.progress import no_progress
 from egvs.runs import run
 from egvs.scenario.model import Scenario
+from egvs.sensors.sites import Site
 from egvs.validation.detection_metrics import (
     ALL_OBJECTS,
     JackknifeEstimate,
@@ -34,6 +39,7 @@ from egvs.validation.detection_metrics import (
 from egvs.validation.detector_runs import SiteDetectionTask, run_detectors
 from egvs.validation.detectors.base import make_detector
 from egvs.validation.held_out_traffic import FrameSampling
+from egvs.validation.sweeps import DetectorResult
 from egvs.validation.validation_run import validation_run
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
@@ -48,16 +54,39 @@ VARIANTS: dict[str, dict[str, dict[str, float]]] = {
 }
 
 
-def site_ap(scenario: Scenario, out: Path, frames: int) -> dict[str, JackknifeEstimate]:
-    """Return the AP of the detector at each site."""
-    with validation_run(scenario, out, FrameSampling(frames), jobs=1, progress=no_progress) as validation:
-        record = validation.record
-        task = SiteDetectionTask(record, {DETECTOR: make_detector(DETECTOR)})
-        results = run_detectors(record.scene.sites, task, jobs=1)
-        rows, _ = measure_detection(validation.frames, record.scene.roi, results)
-    return {
-        row.site: row.measures[MEASURE] for row in rows if row.detector == DETECTOR and row.objects_of == ALL_OBJECTS
-    }
+@dataclass(frozen=True)
+class SiteDetections:
+    """What the detector finds at each site on the same frames.
+
+    Attributes
+    ----------
+    sites
+        The sites, in the order of the results.
+    results
+        By site and detector, with the points on vehicles.
+    """
+
+    sites: Sequence[Site]
+    frames: Sequence[TrafficFrame]
+    roi: Roi
+    results: Mapping[str, Mapping[str, DetectorResult]]
+
+    @classmethod
+    def measure(cls, scenario: Scenario, out: Path, frames: int) -> SiteDetections:
+        """Run the detector."""
+        with validation_run(scenario, out, FrameSampling(frames), jobs=1, progress=no_progress) as validation:
+            scene = validation.record.scene
+            task = SiteDetectionTask(validation.record, {DETECTOR: make_detector(DETECTOR)})
+            return cls(scene.sites, validation.frames, scene.roi, run_detectors(scene.sites, task, jobs=1))
+
+    def ap_by_site(self) -> dict[str, JackknifeEstimate]:
+        """Return the AP of the detector at each site."""
+        rows, _ = measure_detection(self.frames, self.roi, self.results)
+        return {
+            row.site: row.measures[MEASURE]
+            for row in rows
+            if row.detector == DETECTOR and row.objects_of == ALL_OBJECTS
+        }
 
 
 def mean_over_sites(by_site: dict[str, JackknifeEstimate], frames: int) -> JackknifeEstimate:
@@ -66,28 +95,53 @@ def mean_over_sites(by_site: dict[str, JackknifeEstimate], frames: int) -> Jackk
     return JackknifeEstimate.from_values(np.mean(values, axis=0), np.bincount(frame_blocks(frames)))
 
 
+def planned_scores(scenario: Scenario, out: Path) -> FloatArray:
+    """Run a scenario, and return the score that ranks its sites, (n,)."""
+    run.run(scenario, out, jobs=1)
+    return np.array(read_scores(RunFolder(out).scores).column(scenario.score.rank_by).to_pylist())
+
+
+HEADING = (
+    "| junction | {} | AP, mean of sites | change | change by site | Kendall's tau with none | "
+    "largest change of rank | best site | rho of the score |\n|---|---|---|---|---|---|---|---|---|"
+)
+
+
+def row(
+    names: tuple[str, str],
+    by_site: dict[str, JackknifeEstimate],
+    plain: dict[str, JackknifeEstimate],
+    score: FloatArray,
+    frames: int,
+) -> str:
+    """Return a row of the table: AP with an effect, compared with that without, and with the score.
+
+    Parameters
+    ----------
+    names
+        Junction and effect.
+    """
+    ap, plain_ap = (np.array([100.0 * estimate.value for estimate in each.values()]) for each in (by_site, plain))
+    mean = mean_over_sites(by_site, frames)
+    change = estimate_difference(mean, mean_over_sites(plain, frames), frames)
+    ranks, plain_ranks = (np.argsort(np.argsort(-values)) for values in (ap, plain_ap))
+    best = list(by_site)[int(ap.argmax())]
+    return (
+        f"| {' | '.join(names)} | {mean.value:.1f} ± {mean.se:.1f} | {change.value:+.1f} ± {change.se:.1f} | "
+        f"{np.min(ap - plain_ap):+.1f} to {np.max(ap - plain_ap):+.1f} | {kendalltau(ap, plain_ap)[0]:.2f} | "
+        f"{np.abs(ranks - plain_ranks).max()} | {best} | {spearmanr(ap, score)[0]:.2f} |"
+    )
+
+
 def compare(scenario: Scenario, out: Path, frames: int, variants: list[str]) -> None:
     """Print a row of the table for each variant."""
-    run.run(scenario, out, jobs=1)
-    table = read_scores(RunFolder(out).scores)
-    score = np.array(table.column(scenario.score.rank_by).to_pylist())
+    score = planned_scores(scenario, out)
     named = scenario.effects.named
-    plain = site_ap(scenario, out, frames)
-    plain_ap = np.array([100.0 * estimate.value for estimate in plain.values()])
+    plain = SiteDetections.measure(scenario, out, frames).ap_by_site()
     for name in variants:
         changed = scenario.with_effects(scenario.effects.model_validate({**named, **VARIANTS[name]}))
-        by_site = site_ap(changed, out, frames)
-        ap = np.array([100.0 * estimate.value for estimate in by_site.values()])
-        mean = mean_over_sites(by_site, frames)
-        change = estimate_difference(mean, mean_over_sites(plain, frames), frames)
-        ranks, plain_ranks = (np.argsort(np.argsort(-values)) for values in (ap, plain_ap))
-        best = list(by_site)[int(ap.argmax())]
-        print(
-            f"| {scenario.name} | {name} | {mean.value:.1f} ± {mean.se:.1f} | {change.value:+.1f} ± {change.se:.1f} | "
-            f"{np.min(ap - plain_ap):+.1f} to {np.max(ap - plain_ap):+.1f} | {kendalltau(ap, plain_ap)[0]:.2f} | "
-            f"{np.abs(ranks - plain_ranks).max()} | {best} | {spearmanr(ap, score)[0]:.2f} |",
-            flush=True,
-        )
+        by_site = SiteDetections.measure(changed, out, frames).ap_by_site()
+        print(row((scenario.name, name), by_site, plain, score, frames), flush=True)
 
 
 def main() -> None:
@@ -98,10 +152,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=FRAMES)
     parser.add_argument("--effects", choices=list(VARIANTS), nargs="+", default=list(VARIANTS))
     given = parser.parse_args()
-    print(
-        "| junction | effects | AP, mean of sites | change | change by site | Kendall's tau with no effects | "
-        "largest change of rank | best site | rho of the score |\n|---|---|---|---|---|---|---|---|---|"
-    )
+    print(HEADING.format("effects"))
     for path in given.scenarios:
         scenario = egvs.load(path, [f"traffic.frames={TRAFFIC_FRAMES}"])
         compare(scenario, given.out / scenario.name, given.frames, given.effects)
