@@ -3,14 +3,16 @@
 ``python -m benchmarks.pose_errors [SCENARIO...]``: for each scenario (by default the training junctions roundabout and
 hill), the detector ``cluster`` runs at all sites on the same 200 frames of held-out traffic.
 
-*Installed elsewhere*: every sensor stands 0.1 m from where it was planned, in a random direction, and is turned by 1
-degree about each of its axes, each way at random. The detector knows where it is; only the scores were computed for the
+*Installed elsewhere*: every sensor stands 0.1 m from where it was planned, in a random direction, and its yaw, pitch
+and roll differ by 1 degree, each way at random. The detector knows where it is; only the scores were computed for the
 plan. *Badly calibrated*: every sensor stands as planned, but the detector's boxes are where they would be if the pose
-had these errors: the centre and the heading of a box turn and move with the pose, and the box stays upright. The empty
-scan is measured, so it has no error. Boxes that would move into the region of interest are not among them.
+had these errors: the centre and the heading of a box turn and move with the pose, and the box stays upright, with its
+size (a detector would fit its boxes to tilted points, a matter of centimetres). The empty scan is measured, so it has
+no error. Detections are cut to the region of interest before they move, so boxes that would move in are missing: 0.9 m
+wide at 50 m.
 
 Prints the same columns as :mod:`benchmarks.realism`; the score is that of the planned poses. Each of ``--draws`` draws
-is a row.
+is a row; standard errors are those of the frames.
 """
 
 from __future__ import annotations

@@ -45,6 +45,7 @@ from egvs.validation.validation_run import validation_run
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 FRAMES, TRAFFIC_FRAMES = 200, 1000
 DETECTOR, MEASURE = "cluster", "ap_mean_r40_iou70"
+SCORE = "expected_detections"
 VARIANTS: dict[str, dict[str, dict[str, float]]] = {
     "none": {},
     "surface_losses": {"surface_losses": {}},
@@ -96,14 +97,14 @@ def mean_over_sites(by_site: dict[str, JackknifeEstimate], frames: int) -> Jackk
 
 
 def planned_scores(scenario: Scenario, out: Path) -> FloatArray:
-    """Run a scenario, and return the score that ranks its sites, (n,)."""
+    """Run a scenario, and return :data:`SCORE` of its sites, (n,)."""
     run.run(scenario, out, jobs=1)
-    return np.array(read_scores(RunFolder(out).scores).column(scenario.score.rank_by).to_pylist())
+    return np.array(read_scores(RunFolder(out).scores).column(SCORE).to_pylist())
 
 
 HEADING = (
     "| junction | {} | AP, mean of sites | change | change by site | Kendall's tau with none | "
-    "largest change of rank | best site | rho of the score |\n|---|---|---|---|---|---|---|---|---|"
+    "largest change of rank | best site | rho of `expected_detections` |\n|---|---|---|---|---|---|---|---|---|"
 )
 
 

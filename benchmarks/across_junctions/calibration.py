@@ -1,13 +1,20 @@
 """Whether the level of the score is right: the share of vehicles that it expects, beside the share that was found.
 
 *Candidates*: a candidate's expected share comes from the traffic behind the scores, the share found from the unseen
-traffic: the mean of recall from above and in 3D (IoU 0.7) over all vehicles, hidden ones too. The difference is what a
-planner would see who installs there.
+traffic: the mean of recall from above and in 3D (IoU 0.7) over all vehicles, hidden ones too. The error, expected minus
+found, is what a planner would see who installs there. Part of it is the model's, part the difference between the two
+traffics: the mean probability of the model over the unseen vehicle-frames is in between.
 
-*Vehicle-frames* (reliability): the model's probability for each vehicle-frame of the unseen traffic, in ten bins,
-beside the share of those that was found. It leaves out that the two traffics differ.
+A candidate that sees nothing is expected to find nothing, and finds nothing. So the root mean square error is that of
+the half of the candidates with the highest expected shares. As measured it contains the noise of the share found, so it
+is too high; less the mean square of the standard errors, it is right on average, but for the noise of the expected
+share.
 
-A detector with a model is compared with its own model, another one with the mean of all.
+*Vehicle-frames* (reliability): the model's probability for each vehicle-frame of the unseen traffic with points, in ten
+bins, beside the share of those that was found.
+
+A detector with a model is compared with its own model, another one with the mean of all. All detectors with a model
+together are compared with that mean, which is the level that users see.
 """
 
 from __future__ import annotations
@@ -19,33 +26,37 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.across_junctions.records import VEHICLES, JunctionRecord
+from benchmarks.across_junctions.statistics import POINTS, standard_errors
 from benchmarks.across_junctions.vehicle_rows import read_rows
 from benchmarks.detectability import figures
 from benchmarks.detectability.fitting import curve
+from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.scoring.target_scores import DETECTORS
+from egvs.validation.correlation import MeasureValues
 
 RECALLS = ("recall_bev_iou70", "recall_3d_iou70")
-
-NEAR_POINTS = 5.0
-"""An expected share is near what was found if it is at most so many points of 100 away."""
 
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """Expected and found shares of the candidates of one junction, in points of 100.
+    """Expected and found shares of the n candidates of one junction where both are defined, in points of 100.
 
     Attributes
     ----------
     score
         Name of the score that expects.
-    expected, found
-        (n,) float64, of the candidates where both are defined.
+    expected, found, found_se
+        (n,) float64; the standard error comes from blocks of frames.
+    first_error
+        Mean error of the candidates with the highest main score.
     """
 
     score: str
     expected: FloatArray
     found: FloatArray
+    found_se: FloatArray
+    first_error: float
 
     @property
     def error(self) -> FloatArray:
@@ -53,40 +64,85 @@ class Level:
         return self.expected - self.found
 
     @property
-    def mean_absolute_error(self) -> float:
-        """Mean of the absolute errors; NaN without candidates."""
-        return float(np.abs(self.error).mean()) if len(self.error) else float("nan")
+    def upper_half(self) -> FloatArray:
+        """Rows of the half of the candidates with the highest expected shares; of equal ones, the first."""
+        return np.argsort(-self.expected, kind="stable")[: -(-len(self.expected) // 2)]
 
     @property
-    def near(self) -> float:
-        """Share of the candidates within :data:`NEAR_POINTS`, 0 to 1."""
-        return float((np.abs(self.error) <= NEAR_POINTS).mean()) if len(self.error) else float("nan")
+    def rms_error(self) -> float:
+        """Root mean square error of the upper half; NaN without candidates."""
+        return float(np.sqrt(np.mean(self.error[self.upper_half] ** 2))) if len(self.error) else float("nan")
 
     @property
-    def error_of_first(self) -> float:
-        """Mean error of the candidates with the highest expected share: where a planner would install."""
-        is_first = self.expected == self.expected.max(initial=-np.inf)
-        return float(self.error[is_first].mean()) if len(self.error) else float("nan")
+    def corrected_rms_error(self) -> float:
+        """The same without the noise of the share found; NaN without candidates."""
+        if not len(self.error):
+            return float("nan")
+        rows = self.upper_half
+        square = float(np.mean(self.error[rows] ** 2) - np.mean(self.found_se[rows] ** 2))
+        return float(np.sqrt(max(0.0, square)))
 
 
-def level(record: JunctionRecord, detector: str, score: str) -> Level:
-    """Return the level of a score at a junction where a detector was run."""
-    found = np.mean([record.detections[detector][name].values for name in RECALLS], axis=0)
-    expected = record.scores[score]
-    defined = np.isfinite(found) & np.isfinite(expected)
-    return Level(score, 100.0 * expected[defined], 100.0 * found[defined])
+def named_models(detectors: Sequence[str]) -> tuple[str, ...]:
+    """Return the detectors whose models stand for some detectors: their own, or all where one has none."""
+    return tuple(detectors) if set(detectors) <= set(DETECTORS) else DETECTORS
 
 
-def score_of(detector: str, variants: Sequence[str]) -> str:
-    """Return the variant of ``expected_detections`` that expects what a detector finds.
+def level(record: JunctionRecord, detectors: Sequence[str], main: str) -> Level:
+    """Return the level of ``expected_detections`` at a junction, for the mean over detectors that were run there.
 
     Parameters
     ----------
-    variants
-        Names of all variants; the one with most detectors is used for a detector that has none of its own.
+    main
+        Name of the score that chooses the first candidate.
+
+    Raises
+    ------
+    InputError
+        If the score was not computed with these models.
     """
-    own = [name for name in variants if name.endswith(f"(detectors {detector})")] if detector in DETECTORS else []
-    return own[0] if own else max(variants, key=lambda name: name.count("+"))
+    score = f"expected_detections (detectors {'+'.join(named_models(detectors))})"
+    if score not in record.scores:
+        raise InputError(f"{record.name}.scores", f"no {score}", "Measure the part scores again.")
+    measures = [record.detections[detector][name] for detector in detectors for name in RECALLS]
+    found = MeasureValues(
+        np.mean([measure.values for measure in measures], axis=0),
+        np.mean([measure.left_out for measure in measures], axis=0),
+    )
+    expected, choosing = record.scores[score], record.scores[main]
+    defined = found.defined & np.isfinite(expected)
+    is_first = defined & (choosing == np.nanmax(choosing[defined], initial=-np.inf))
+    error = POINTS * (expected - found.values)
+    return Level(
+        score, POINTS * expected[defined], POINTS * found.values[defined], POINTS * standard_errors(found)[defined],
+        float(error[is_first].mean()) if is_first.any() else float("nan"),
+    )  # fmt: skip
+
+
+def predicted_share(folder: Path, record: JunctionRecord, detectors: Sequence[str]) -> float:
+    """Return the mean probability of the models over all candidates and unseen vehicle-frames, in points of 100.
+
+    NaN for a junction without the part ``vehicles``.
+    """
+    if VEHICLES not in record.infos:
+        return float("nan")
+    each = [site.shipped.mean() for detector in detectors for site in read_rows(folder, record, detector)]
+    return POINTS * float(np.mean(each)) if each else float("nan")
+
+
+def reliability(folder: Path, records: Sequence[JunctionRecord], detector: str) -> figures.Curves:
+    """Return probability, share found and number of vehicle-frames with points in each bin, by junction.
+
+    Junctions without the part ``vehicles`` or without the detector are left out.
+    """
+    curves = {}
+    for record in records:
+        if VEHICLES in record.infos and detector in record.detections:
+            rows = read_rows(folder, record, detector)
+            seen = np.concatenate([site.has_points for site in rows])
+            chances, hits = (np.concatenate([getattr(site, name) for site in rows]) for name in ("shipped", "hits"))
+            curves[record.name] = curve(chances[seen], hits[seen])
+    return curves
 
 
 def draw(folder: Path, records: Sequence[JunctionRecord], out: Path) -> list[Path]:
@@ -98,17 +154,3 @@ def draw(folder: Path, records: Sequence[JunctionRecord], out: Path) -> list[Pat
             paths.append(out / f"reliability_{detector}.png")
             figures.draw_reliability(paths[-1], detector, curves, "predicted by the shipped models")
     return paths
-
-
-def reliability(folder: Path, records: Sequence[JunctionRecord], detector: str) -> figures.Curves:
-    """Return probability, share found and number of vehicle-frames in each bin, by junction.
-
-    Junctions without the part ``vehicles`` or without the detector are left out.
-    """
-    curves = {}
-    for record in records:
-        if VEHICLES in record.infos and detector in record.detections:
-            rows = read_rows(folder, record, detector)
-            chances, hits = (np.concatenate([getattr(site, name) for site in rows]) for name in ("shipped", "hits"))
-            curves[record.name] = curve(chances, hits)
-    return curves

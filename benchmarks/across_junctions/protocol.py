@@ -40,8 +40,21 @@ T = TypeVar("T")
 JUNCTIONS_FILE, CANDIDATES_FILE, WORLDS_FILE = "junctions.toml", "candidates.csv", "worlds.csv"
 FROZEN_FILE = "frozen.json"
 
-JUDGING = ("statistics", "tables", "calibration", "vehicle_rows", "records", "detections")
-"""Modules of this package that turn detections into results."""
+JUDGING = (
+    "benchmarks.across_junctions.statistics",
+    "benchmarks.across_junctions.tables",
+    "benchmarks.across_junctions.calibration",
+    "benchmarks.across_junctions.vehicle_rows",
+    "benchmarks.across_junctions.records",
+    "benchmarks.across_junctions.detections",
+    "benchmarks.detectability.additive_model",
+    "benchmarks.detectability.fitting",
+    "benchmarks.validity.tables",
+    "egvs.scoring.targets",
+    "egvs.validation.correlation",
+    "egvs.validation.detection_metrics",
+)
+"""Modules that turn detections into results."""
 
 Role = Literal["detector", "training", "held out", "comparison"]
 """What a junction is for: training detectors, training the score, testing it once, or comparison with the source
@@ -336,8 +349,7 @@ def frozen_digests() -> dict[str, str]:
         detector = base.make_detector(name)
         source = stage_keys.source_digest(type(detector).__module__).digest
         digests[name] = files.hash_json([detector.settings, source])
-    package = __name__.rpartition(".")[0]
-    return digests | {name: stage_keys.text_digest(f"{package}.{name}") for name in JUDGING}
+    return digests | {name: stage_keys.text_digest(name) for name in JUDGING}
 
 
 def write_frozen(folder: Path = FOLDER) -> Path:

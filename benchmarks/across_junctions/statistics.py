@@ -167,6 +167,14 @@ def tie_factor(values: FloatArray) -> float:
     return float(np.sqrt(1.0 - (counts**3 - counts).sum() / (n**3 - n)))
 
 
+def standard_errors(measure: MeasureValues) -> FloatArray:
+    """Return the jackknife's standard error of each candidate, (n,)."""
+    blocks = measure.left_out.shape[1]
+    spread = measure.left_out - measure.left_out.mean(axis=1, keepdims=True)
+    errors: FloatArray = np.sqrt((blocks - 1) / blocks * (spread**2).sum(axis=1))
+    return errors
+
+
 @dataclass(frozen=True)
 class Estimate:
     """A value with the values of its resamples.

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -386,6 +387,8 @@ def test_intervals_over_junctions_contain_the_truth(spread: float, least: float,
 
 MACHINE = {"processor": "p", "cores": 2}
 
+VARIANTS = [f"expected_detections (detectors {names})" for names in ("cluster+pointpillars", "cluster", "pointpillars")]
+
 
 def write_junction(
     folder: Path,
@@ -401,11 +404,11 @@ def write_junction(
     write_table(folder / f"{name}.candidates.parquet", {
         "site": sites, "sensor": ["VLP-16"] * len(ap), "height_m": height_m.tolist(),
     })  # fmt: skip
-    names = ["expected_detections", "points_on_target", tables.EGVS_2, tables.EGVS_10, "mean_points", "less_is_better"]
+    names = [*VARIANTS, "points_on_target", tables.EGVS_2, tables.EGVS_10, "mean_points", "less_is_better"]
     write_table(folder / f"{name}.scores.parquet", {
         "site": sites * len(names),
         "score": np.repeat(names, len(ap)).tolist(),
-        "sign": np.repeat([1, 1, 1, 1, 1, -1], len(ap)).tolist(),
+        "sign": np.repeat([1] * (len(names) - 1) + [-1], len(ap)).tolist(),
         "value": np.tile(score, len(names)).tolist(),
     })  # fmt: skip
     values = np.tile(ap, len(MEASURES))
@@ -442,7 +445,7 @@ def test_tables_by_hand(made_up: Path, tmp_path: Path) -> None:
     _, made = table_files.read(tmp_path / "out")
     by_name = {table.name: table for table in made}
     rows_of: dict[tuple[Any, Any], list[Any]] = {(row[0], row[4]): row for row in by_name["2 by junction"].rows}
-    right, wrong = rows_of["t", "expected_detections"], rows_of["h", "expected_detections"]
+    right, wrong = rows_of["t", VARIANTS[0]], rows_of["h", VARIANTS[0]]
     assert right[5][0] == right[6][0] == 1.0
     # all 32 ranks differ by 16: 1 - 6 * 32 * 256 / (32 * 1023)
     assert wrong[5][0] == pytest.approx(1 - 6 * 256 / 1023, abs=1e-4)
@@ -457,13 +460,15 @@ def test_tables_by_hand(made_up: Path, tmp_path: Path) -> None:
     assert height[9] == pytest.approx(7.5)  # 0.32 minus the mean of 0.17 to 0.32
     (measured,) = [row for row in by_name["1 measured"].rows if row[0] == "h"]
     assert measured[8:] == [0, 1.0, 16.5, 32.0, 0.0, 1.0, 1.0, 1.0]
-    _, aim_of_height, median, worst, level = by_name["8 aims"].rows
+    _, aim_of_height, median, worst, level, _ = by_name["8 aims"].rows
     # one junction has no interval
     assert aim_of_height[4:] == ["mean rho within heights", [1.0, None, None], None, 0.85, 0.85, "undecided"]
     assert median[4:] == ["median regret", [16.0, None, None], 16.0, 3.0, 3.0, "missed"]
     assert worst[4:] == ["worst regret", [16.0, None, None], 16.0, 8.0, 8.0, "missed"]
-    # the made-up score is 1, 2, ..., 32, "expected" shares of 100 % and more; recall is AP here
-    assert level[4:] == ["error of the level", [1650.0 - 16.5, None, None], None, 5.0, 5.0, "missed"]
+    # the upper half are 17 to 32 by a score that is 100 times a share; recall is AP here, 1 to 16 of 100
+    error = 100.0 * np.arange(17, 33) - np.arange(1, 17)
+    rms = round(float(np.sqrt((error**2).mean())), 4)
+    assert level[4:] == ["mean error of the level", [rms, None, None], rms, 5.0, 5.0, "undecided"]
     aims = {(row[0], row[3]): row[4:] for row in by_name["9 aims by junction"].rows}
     assert aims["h", "rho"][1:] == [0.93, "no"]
     assert aims["h", "rho at 2 m"] == [1.0, 0.85, "yes"]
@@ -475,18 +480,30 @@ def test_tables_by_hand(made_up: Path, tmp_path: Path) -> None:
 
 
 def test_level_by_hand() -> None:
-    level = calibration.Level("s", np.array([90.0, 50.0, 20.0, 90.0]), np.array([84.0, 48.0, 25.0, 80.0]))
-    assert level.error.tolist() == [6.0, 2.0, -5.0, 10.0]
-    assert (level.mean_absolute_error, level.near, level.error_of_first) == (5.75, 0.5, 8.0)
-    nothing = calibration.Level("s", np.empty(0), np.empty(0))
-    assert np.isnan([nothing.mean_absolute_error, nothing.near, nothing.error_of_first]).all()
+    found = np.array([84.0, 48.0, 25.0, 80.0, 3.0])
+    level = calibration.Level("s", np.array([90.0, 50.0, 20.0, 90.0, 3.0]), found, np.full(5, 2.0), 8.0)
+    assert level.error.tolist() == [6.0, 2.0, -5.0, 10.0, 0.0]
+    assert level.upper_half.tolist() == [0, 3, 1]
+    assert level.rms_error == pytest.approx(np.sqrt((36 + 100 + 4) / 3))
+    assert level.corrected_rms_error == pytest.approx(np.sqrt((36 + 100 + 4) / 3 - 4))
+    nothing = calibration.Level("s", *np.empty((3, 0)), np.nan)
+    assert np.isnan([nothing.rms_error, nothing.corrected_rms_error]).all()
 
 
-def test_each_detector_is_compared_with_its_own_model() -> None:
-    variants = [f"expected_detections (detectors {names})" for names in ("cluster+pointpillars", "cluster")]
-    assert calibration.score_of("cluster", variants) == variants[1]
-    assert calibration.score_of("pointpillars", variants) == variants[0]  # its own was not computed
-    assert calibration.score_of("range_image", variants) == variants[0]
+def test_level_is_that_of_the_detectors_own_model(tmp_path: Path) -> None:
+    ap = np.array([0.2, 0.4, np.nan])
+    for detector, found in (("cluster", ap), ("pointpillars", ap / 2), ("range_image", ap / 4)):
+        write_junction(tmp_path, "h", "held out", found, np.array([0.3, 0.4, 0.9]), np.ones(3), detector)
+    record = records.read_junction(tmp_path, "h")
+    own = calibration.level(record, ["cluster"], VARIANTS[0])
+    assert (own.score, own.found.tolist(), own.expected.tolist()) == (VARIANTS[1], [20.0, 40.0], [30.0, 40.0])
+    assert own.first_error == pytest.approx(0.0)
+    together = calibration.level(record, ["cluster", "pointpillars"], VARIANTS[0])
+    assert (together.score, together.found.tolist()) == (VARIANTS[0], [15.0, 30.0])
+    assert calibration.level(record, ["range_image"], VARIANTS[0]).score == VARIANTS[0]
+    lacking = replace(record, scores={VARIANTS[0]: record.scores[VARIANTS[0]]})
+    with pytest.raises(InputError, match=r"no expected_detections \(detectors cluster\)"):
+        calibration.level(lacking, ["cluster"], VARIANTS[0])
 
 
 @pytest.mark.system  # draws with matplotlib
@@ -495,13 +512,15 @@ def test_reliability_of_made_up_vehicles(tmp_path: Path) -> None:
     folder.mkdir()
     write_rows(folder, "h", ("cluster", "range_image"), np.random.default_rng(12), role="held out")
     printed = write_tables(folder, tmp_path / "out")
+    assert any(text.startswith("NOT AS FROZEN: ") for text in printed)
     assert printed[-2:] == [str(tmp_path / "out" / f"reliability_{name}.png") for name in ("cluster", "range_image")]
     _, made = table_files.read(tmp_path / "out")
     (table,) = [table for table in made if table.name == "11 reliability"]
     record = records.read_junction(folder, "h")
     sites = vehicle_rows.read_rows(folder, record, "range_image")
-    chances = np.concatenate([site.shipped for site in sites])
-    hits = np.concatenate([site.hits for site in sites])
+    seen = np.concatenate([site.has_points for site in sites])
+    chances = np.concatenate([site.shipped for site in sites])[seen]
+    hits = np.concatenate([site.hits for site in sites])[seen]
     columns = sites[3].features.columns
     features = np.column_stack([columns[name] for name in FEATURES])
     each = [detectability_model(name).chances(features) for name in DETECTORS]
@@ -691,9 +710,16 @@ def test_held_out_junctions_need_what_is_tested_to_be_frozen(tmp_path: Path) -> 
     path = write_frozen(tmp_path)
     check_frozen(tmp_path)
     frozen = json.loads(path.read_text(encoding="utf-8"))
-    assert {"score", "cluster", "pointpillars", "range_image", "statistics", "tables"} <= frozen.keys()
-    path.write_text(json.dumps(frozen | {"score": "another", "tables": "another"}), encoding="utf-8")
-    with pytest.raises(InputError, match="score, tables changed since they were frozen"):
+    assert {
+        "score",
+        "cluster",
+        "pointpillars",
+        "range_image",
+        "egvs.validation.correlation",
+        "benchmarks.across_junctions.tables",
+    } <= frozen.keys()
+    path.write_text(json.dumps(frozen | {"score": "another", "cluster": "another"}), encoding="utf-8")
+    with pytest.raises(InputError, match="cluster, score changed since they were frozen"):
         check_frozen(tmp_path)
 
 
