@@ -31,7 +31,7 @@ from benchmarks.across_junctions.vehicle_rows import read_rows
 from benchmarks.detectability import figures
 from benchmarks.detectability.fitting import curve
 from egvs.core.errors import InputError
-from egvs.core.grid import FloatArray
+from egvs.core.grid import FloatArray, IntArray
 from egvs.scoring.target_scores import DETECTORS
 from egvs.validation.correlation import MeasureValues
 
@@ -64,7 +64,7 @@ class Level:
         return self.expected - self.found
 
     @property
-    def upper_half(self) -> FloatArray:
+    def upper_half(self) -> IntArray:
         """Rows of the half of the candidates with the highest expected shares; of equal ones, the first."""
         return np.argsort(-self.expected, kind="stable")[: -(-len(self.expected) // 2)]
 
