@@ -8,8 +8,8 @@ and roll differ by 1 degree, each way at random. The detector knows where it is;
 plan. *Badly calibrated*: every sensor stands as planned, but the detector's boxes are where they would be if the pose
 had these errors: the centre and the heading of a box turn and move with the pose, and the box stays upright, with its
 size (a detector would fit its boxes to tilted points, a matter of centimetres). The empty scan is measured, so it has
-no error. Detections are cut to the region of interest before they move, so boxes that would move in are missing: 0.9 m
-wide at 50 m.
+no error. Detections are cut to the region of interest before they move, so boxes that would move in are missing: those of
+a strip of 0.9 m at 50 m.
 
 Prints the same columns as :mod:`benchmarks.realism`; the score is that of the planned poses. Each of ``--draws`` draws
 is a row; standard errors are those of the frames.
@@ -32,7 +32,7 @@ from benchmarks.realism import (
     TRAFFIC_FRAMES,
     SiteDetections,
     planned_scores,
-    row,
+    table_row,
 )
 from benchmarks.validity.junctions import with_sites
 from egvs.core.grid import FloatArray, Roi
@@ -45,7 +45,7 @@ POSITION_M, ANGLE_DEG = 0.1, 1.0
 
 
 def with_error(pose: Pose, rng: np.random.Generator) -> Pose:
-    """Return a pose that is :data:`POSITION_M` away, and turned by :data:`ANGLE_DEG` about each axis, at random."""
+    """Return a pose that is :data:`POSITION_M` away, and whose angles differ by :data:`ANGLE_DEG`, at random."""
     direction = rng.normal(size=3)
     x_m, y_m, z_m = np.asarray(pose.position_m) + POSITION_M * direction / np.linalg.norm(direction)
     yaw_deg, pitch_deg, roll_deg = np.asarray(pose.angles_deg) + rng.choice([-ANGLE_DEG, ANGLE_DEG], 3)
@@ -92,7 +92,7 @@ def main() -> None:
         score = planned_scores(scenario, out)
         planned = SiteDetections.measure(scenario, out, given.frames)
         plain = planned.ap_by_site()
-        print(row((scenario.name, "none"), plain, plain, score, given.frames), flush=True)
+        print(table_row((scenario.name, "none"), plain, plain, score, given.frames), flush=True)
         for draw in range(given.draws):
             rng = np.random.default_rng((SEED, draw))
             poses = {site.name: with_error(site.pose, rng) for site in planned.sites}
@@ -103,7 +103,7 @@ def main() -> None:
                 ("badly calibrated", badly_calibrated(planned, poses)),
             ):
                 ap = detections.ap_by_site()
-                print(row((scenario.name, name), ap, plain, score, given.frames), flush=True)
+                print(table_row((scenario.name, name), ap, plain, score, given.frames), flush=True)
 
 
 if __name__ == "__main__":

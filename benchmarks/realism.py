@@ -108,7 +108,7 @@ HEADING = (
 )
 
 
-def row(
+def table_row(
     names: tuple[str, str],
     by_site: dict[str, JackknifeEstimate],
     plain: dict[str, JackknifeEstimate],
@@ -142,7 +142,7 @@ def compare(scenario: Scenario, out: Path, frames: int, variants: list[str]) -> 
     for name in variants:
         changed = scenario.with_effects(scenario.effects.model_validate({**named, **VARIANTS[name]}))
         by_site = SiteDetections.measure(changed, out, frames).ap_by_site()
-        print(row((scenario.name, name), by_site, plain, score, frames), flush=True)
+        print(table_row((scenario.name, name), by_site, plain, score, frames), flush=True)
 
 
 def main() -> None:

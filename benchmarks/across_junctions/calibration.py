@@ -3,12 +3,12 @@
 *Candidates*: a candidate's expected share comes from the traffic behind the scores, the share found from the unseen
 traffic: the mean of recall from above and in 3D (IoU 0.7) over all vehicles, hidden ones too. The error, expected minus
 found, is what a planner would see who installs there. Part of it is the model's, part the difference between the two
-traffics: the mean probability of the model over the unseen vehicle-frames is in between.
+traffics: the mean probability of the model over the unseen vehicle-frames separates the two.
 
 A candidate that sees nothing is expected to find nothing, and finds nothing. So the root mean square error is that of
 the half of the candidates with the highest expected shares. As measured it contains the noise of the share found, so it
-is too high; less the mean square of the standard errors, it is right on average, but for the noise of the expected
-share.
+is too high. A second one is without it: the mean square of the standard errors is subtracted. The noise of the expected
+share stays in both.
 
 *Vehicle-frames* (reliability): the model's probability for each vehicle-frame of the unseen traffic with points, in ten
 bins, beside the share of those that was found.
@@ -19,6 +19,7 @@ together are compared with that mean, which is the level that users see.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,11 +29,11 @@ import numpy as np
 from benchmarks.across_junctions.records import VEHICLES, JunctionRecord
 from benchmarks.across_junctions.statistics import POINTS, standard_errors
 from benchmarks.across_junctions.vehicle_rows import read_rows
-from benchmarks.detectability import figures
+from benchmarks.detectability.comparison import models_for
+from benchmarks.detectability.figures import Curves
 from benchmarks.detectability.fitting import curve
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
-from egvs.scoring.target_scores import DETECTORS
 from egvs.validation.correlation import MeasureValues
 
 RECALLS = ("recall_bev_iou70", "recall_3d_iou70")
@@ -65,8 +66,8 @@ class Level:
 
     @property
     def upper_half(self) -> IntArray:
-        """Rows of the half of the candidates with the highest expected shares; of equal ones, the first."""
-        return np.argsort(-self.expected, kind="stable")[: -(-len(self.expected) // 2)]
+        """Rows of the half of the candidates with the highest expected shares, (ceil(n / 2),) int64."""
+        return np.argsort(-self.expected, kind="stable")[: math.ceil(len(self.expected) / 2)]
 
     @property
     def rms_error(self) -> float:
@@ -83,11 +84,6 @@ class Level:
         return float(np.sqrt(max(0.0, square)))
 
 
-def named_models(detectors: Sequence[str]) -> tuple[str, ...]:
-    """Return the detectors whose models stand for some detectors: their own, or all where one has none."""
-    return tuple(detectors) if set(detectors) <= set(DETECTORS) else DETECTORS
-
-
 def level(record: JunctionRecord, detectors: Sequence[str], main: str) -> Level:
     """Return the level of ``expected_detections`` at a junction, for the mean over detectors that were run there.
 
@@ -101,7 +97,7 @@ def level(record: JunctionRecord, detectors: Sequence[str], main: str) -> Level:
     InputError
         If the score was not computed with these models.
     """
-    score = f"expected_detections (detectors {'+'.join(named_models(detectors))})"
+    score = f"expected_detections (detectors {'+'.join(models_for(detectors))})"
     if score not in record.scores:
         raise InputError(f"{record.name}.scores", f"no {score}", "Measure the part scores again.")
     measures = [record.detections[detector][name] for detector in detectors for name in RECALLS]
@@ -130,7 +126,7 @@ def predicted_share(folder: Path, record: JunctionRecord, detectors: Sequence[st
     return POINTS * float(np.mean(each)) if each else float("nan")
 
 
-def reliability(folder: Path, records: Sequence[JunctionRecord], detector: str) -> figures.Curves:
+def reliability(folder: Path, records: Sequence[JunctionRecord], detector: str) -> Curves:
     """Return probability, share found and number of vehicle-frames with points in each bin, by junction.
 
     Junctions without the part ``vehicles`` or without the detector are left out.
@@ -143,14 +139,3 @@ def reliability(folder: Path, records: Sequence[JunctionRecord], detector: str) 
             chances, hits = (np.concatenate([getattr(site, name) for site in rows]) for name in ("shipped", "hits"))
             curves[record.name] = curve(chances[seen], hits[seen])
     return curves
-
-
-def draw(folder: Path, records: Sequence[JunctionRecord], out: Path) -> list[Path]:
-    """Write the reliability diagrams of each detector at junctions that did not train the score; return the files."""
-    paths = []
-    unseen = [record for record in records if record.role != "training"]
-    for detector in sorted({name for record in unseen for name in record.detections}):
-        if curves := reliability(folder, unseen, detector):
-            paths.append(out / f"reliability_{detector}.png")
-            figures.draw_reliability(paths[-1], detector, curves, "predicted by the shipped models")
-    return paths

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,7 @@ from benchmarks.across_junctions.statistics import (
     rho,
     standard_errors,
 )
+from benchmarks.detectability.figures import Curves, draw_reliability
 from benchmarks.validity import tables
 from benchmarks.validity.pools import DEFAULT, Setting
 from benchmarks.validity.tables import Cell, Column, Table, number, with_interval
@@ -93,8 +95,10 @@ def write_tables(
     preface = study.preface()
     tables.write(out, preface, made)
     (out / "tables.md").write_text(tables.page("The larger study", preface, made), encoding="utf-8")
-    figures = calibration.draw(records_folder, records, out)
-    return [*preface, f"{out}: {len(made)} tables", *map(str, figures)]
+    diagrams = {out / f"reliability_{detector}.png": detector for detector in study.reliability}
+    for path, detector in diagrams.items():
+        draw_reliability(path, detector, study.reliability[detector], "predicted by the shipped models")
+    return [*preface, f"{out}: {len(made)} tables", *map(str, diagrams)]
 
 
 class Study:
@@ -239,6 +243,13 @@ class Study:
         """Return the mean over junctions."""
         each = {record.name: self.estimate(record, detector, score, kind) for record in records}
         return over_junctions(each)
+
+    @cached_property
+    def reliability(self) -> dict[str, Curves]:
+        """The reliability of each detector at the junctions that did not train the score."""
+        unseen = [record for record in self.records if record.role in UNSEEN_ROLES]
+        each = {detector: calibration.reliability(self.folder, unseen, detector) for detector in self.detectors}
+        return {detector: curves for detector, curves in each.items() if curves}
 
     # ---- tables
 
@@ -432,14 +443,13 @@ class Study:
             for kind, aim, ceiling in ((RHO, POOLED_AIM, ceilings), (WITHIN_HEIGHTS, HEIGHT_AIM, within)):
                 estimate = self.over(records, detector, main, kind)
                 limit = _limit(aim, float(np.mean(ceiling)))
-                outcome = _outcome_of_rho(estimate, limit)
+                outcome = _outcome_of_rho(estimate, limit) if self.is_complete(records) else UNDECIDED
                 rows.append([*start, f"mean {kind}", _cell(estimate), None, number(aim), number(limit), outcome])
             lost = [self.estimate(record, detector, main, REGRET).value for record in records]
             crossed = [junction.crossed_regret(main) for junction in junctions]
             for name, summary, aim in (("median", np.median, REGRET_MEDIAN_AIM), ("worst", np.max, REGRET_WORST_AIM)):
-                value, least = float(summary(lost)), float(summary(crossed))
-                rows.append([*start, f"{name} regret", number(value), number(least), number(aim), number(aim),
-                             _outcome_of_regret(value, least, aim)])  # fmt: skip
+                loss = float(summary(lost)), float(summary(crossed))
+                rows.append([*start, f"{name} regret", *self._loss_aim(records, *loss, aim)])
         rows += self._level_aims()
         head = [Column("detector"), Column("trained the score"), Column("score"), Column("junctions", "whole"),
                 Column("what"), Column("value", "two"), Column("crossed or corrected", "two"), Column("aim", "two"),
@@ -452,23 +462,31 @@ class Study:
             f" the crossed one is not. Error of the level, of detectors that have a model: the root mean square error"
             f" of the upper half of the candidates, at most {LEVEL_MEAN_AIM:g} points in the mean over junctions and"
             f" {LEVEL_WORST_AIM:g} at worst; {MISSED} if the one without the noise of the share found is above."
+            f" Everything is {UNDECIDED} until all of the protocol's held-out junctions are there."
         )
         return Table("8 aims", "8. Aims", caption, head, rows)
 
     def _level_aims(self) -> Iterator[list[Cell]]:
-        wanted = {junction.name for junction in self.protocol.junctions if junction.role == "held out"}
         for detectors, each in self.levels("held out"):
             if not set(detectors) <= set(DETECTORS):
                 continue
-            is_complete = {record.name for record, _ in each} == wanted
+            records = [record for record, _ in each]
             start: list[Cell] = [", ".join(detectors), "yes", each[0][1].score, len(each)]
             measured = [level.rms_error for _, level in each]
             corrected = [level.corrected_rms_error for _, level in each]
             for name, summary, aim in (("mean", np.mean, LEVEL_MEAN_AIM), ("worst", np.max, LEVEL_WORST_AIM)):
-                value, least = float(summary(measured)), float(summary(corrected))
-                outcome = _outcome_of_regret(value, least, aim) if is_complete else UNDECIDED
-                yield [*start, f"{name} error of the level", number(value), number(least), number(aim), number(aim),
-                       outcome]  # fmt: skip
+                loss = float(summary(measured)), float(summary(corrected))
+                yield [*start, f"{name} error of the level", *self._loss_aim(records, *loss, aim)]
+
+    def _loss_aim(self, records: Sequence[JunctionRecord], measured: float, least: float, aim: float) -> list[Cell]:
+        """Return the cells of a loss: as measured (too high), without its noise, aim and limit, and outcome."""
+        outcome = _outcome_of_loss(measured, least, aim) if self.is_complete(records) else UNDECIDED
+        return [number(measured), number(least), number(aim), number(aim), outcome]
+
+    def is_complete(self, records: Sequence[JunctionRecord]) -> bool:
+        """Return whether these are all held-out junctions of the protocol."""
+        wanted = {junction.name for junction in self.protocol.junctions if junction.role == "held out"}
+        return {record.name for record in records} == wanted
 
     def _aims_by_junction(self) -> Table:
         rows: list[list[Cell]] = []
@@ -519,13 +537,12 @@ class Study:
 
     def _reliability(self) -> Table:
         rows: list[list[Cell]] = [
-            [name, role, detector, number(part["chance"]), number(part["found"]), int(part["vehicle_frames"])]
-            for role in UNSEEN_ROLES
-            for detector, records in self.pairs(role)
-            for name, curve in calibration.reliability(self.folder, records, detector).items()
+            [name, detector, number(part["chance"]), number(part["found"]), int(part["vehicle_frames"])]
+            for detector, curves in self.reliability.items()
+            for name, curve in curves.items()
             for part in curve
         ]
-        head = [Column("junction"), Column("role"), Column("detector"), Column("probability", "two"),
+        head = [Column("junction"), Column("detector"), Column("probability", "two"),
                 Column("share found", "two"), Column("vehicle-frames", "whole")]  # fmt: skip
         caption = (
             "Vehicle-frames of the unseen traffic with points, at all candidates (each counts once for each), in ten"
@@ -672,10 +689,10 @@ def _outcome_of_rho(estimate: Estimate, limit: float) -> str:
     return MISSED if interval.high < limit else UNDECIDED
 
 
-def _outcome_of_regret(measured: float, crossed: float, aim: float) -> str:
+def _outcome_of_loss(measured: float, least: float, aim: float) -> str:
     if measured <= aim:
         return REACHED
-    return MISSED if crossed > aim else UNDECIDED
+    return MISSED if least > aim else UNDECIDED
 
 
 def _compare_with_aim(value: float, aim: float, ceiling: float) -> list[Cell]:

@@ -9,10 +9,10 @@ import numpy as np
 from benchmarks.across_junctions.detections import AP
 from benchmarks.across_junctions.records import JunctionRecord, read_table
 from benchmarks.detectability.additive_model import DIRECTIONS, TargetFeatures
-from benchmarks.detectability.comparison import SiteRows
+from benchmarks.detectability.comparison import SiteRows, models_for
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
-from egvs.scoring.target_scores import DETECTORS, FEATURES, detectability_model
+from egvs.scoring.target_scores import FEATURES, detectability_model
 
 
 def read_rows(folder: Path, record: JunctionRecord, detector: str) -> list[SiteRows]:
@@ -48,6 +48,5 @@ def read_rows(folder: Path, record: JunctionRecord, detector: str) -> list[SiteR
 def _shipped(detector: str, columns: dict[str, FloatArray]) -> FloatArray:
     """Return the probability of each vehicle-frame by the shipped models; 0 without a point."""
     features = np.column_stack([columns[name] for name in FEATURES])
-    named = [detector] if detector in DETECTORS else DETECTORS
-    chances = np.mean([detectability_model(name).chances(features) for name in named], axis=0)
+    chances = np.mean([detectability_model(name).chances(features) for name in models_for([detector])], axis=0)
     return np.where(columns["log_points"] > 0.0, chances, 0.0)

@@ -166,11 +166,15 @@ def _site_rows(site: Site, held_out: HeldOutTraffic, record: TargetRecord, detec
     assert isinstance(boxes, DetectedBoxes)
     beams = Beams.of(Scanner(held_out.scene).scan_site(site))
     visible = visible_targets(record, beams, detection_probability(held_out.scene, beams.sensor))
-    trained = detector if detector in target_scores.DETECTORS else "+".join(target_scores.DETECTORS)
-    shipped = target_scores.detection_chances(visible, trained.split("+"))
+    shipped = target_scores.detection_chances(visible, models_for([detector]))
     group = f"{site.name.partition('h')[2].partition('_')[0]} m, {site.sensor}"
     hits = hits_of(record, [frame.boxes for frame in boxes.frames])
     return SiteRows(site.name, group, target_features(visible), hits, shipped, ap)
+
+
+def models_for(detectors: Sequence[str]) -> tuple[str, ...]:
+    """Return the detectors whose models stand for some detectors: their own, or all where one has none."""
+    return tuple(detectors) if set(detectors) <= set(target_scores.DETECTORS) else target_scores.DETECTORS
 
 
 def training_rows(sites: Sequence[SiteRows]) -> TrainingRows:
