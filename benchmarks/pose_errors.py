@@ -8,8 +8,8 @@ and roll differ by 1 degree, each way at random. The detector knows where it is;
 plan. *Badly calibrated*: every sensor stands as planned, but the detector's boxes are where they would be if the pose
 had these errors: the centre and the heading of a box turn and move with the pose, and the box stays upright, with its
 size (a detector would fit its boxes to tilted points, a matter of centimetres). The empty scan is measured, so it has
-no error. Detections are cut to the region of interest before they move, so boxes that would move in are missing: those of
-a strip of 0.9 m at 50 m.
+no error. Detections are cut to the region of interest before they move, so boxes that would move in are missing: at
+50 m, those of a strip of 0.9 m.
 
 Prints the same columns as :mod:`benchmarks.realism`; the score is that of the planned poses. Each of ``--draws`` draws
 is a row; standard errors are those of the frames.
