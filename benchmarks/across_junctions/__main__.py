@@ -1,6 +1,7 @@
 """The larger study, by one command: ``python -m benchmarks.across_junctions build``, ``list``, ``measure``, ``tables``.
 
     build     make the scenarios, draw their candidates, look at their traffic in a short simulation
+    detector  train PointPillars (needs PyTorch); an interrupted training continues where it stopped
     list      print the protocol and its hash
     measure   measure what is missing, part by part; an interrupted study continues where it stopped
     fit       compare models of the score on the training junctions, or fit them
@@ -28,19 +29,25 @@ from benchmarks.across_junctions.protocol import (
     Protocol,
     ProtocolFiles,
     check_frozen,
+    detector_junctions,
     of_junction,
     read_protocol,
     write_frozen,
 )
 from benchmarks.across_junctions.records import NOT_DETECTORS, SCORES, VEHICLES
 from benchmarks.across_junctions.worlds import MissingMapError, make_world
-from egvs.core import files
+from benchmarks.detectability import figures
+from egvs.core import files, plugins
 from egvs.core.errors import EgvsError, InputError, MissingBackendError
 from egvs.core.progress import ProgressCallback
+from egvs.scenario.loading import load
 from egvs.validation.detectors import base
 
 ROOT = Path(__file__).resolve().parents[2]
 REPORT_EVERY_S = 30.0
+
+TRAINING_STEPS = 4000
+"""Of PointPillars; the shipped model was trained with as many."""
 
 MIN_FRAMES = 20
 """Of a trial: two for each block."""
@@ -68,7 +75,7 @@ def _parser() -> argparse.ArgumentParser:
     data.add_argument("--data", type=Path, default=ROOT / "runs" / "across_junctions", help="folder of the study")
     common.add_argument("--maps", type=Path, metavar="DIR", help="folder of the maps that are not shipped")
     common.add_argument("--junction", metavar="NAME,NAME", help="default: all (build), or all with candidates")
-    steps = parser.add_subparsers(required=True, metavar="build|list|measure|fit|tables")
+    steps = parser.add_subparsers(required=True, metavar="build|list|detector|measure|fit|tables")
 
     step = steps.add_parser("build", parents=[data, common], help="make the scenarios")
     step.add_argument(
@@ -81,6 +88,11 @@ def _parser() -> argparse.ArgumentParser:
     step = steps.add_parser("list", help="print the protocol and its hash")
     step.add_argument("--freeze", action="store_true", help="write the hashes of score, detectors and statistics")
     step.set_defaults(step=_list)
+
+    step = steps.add_parser("detector", parents=[data, common], help="train PointPillars (needs PyTorch)")
+    step.add_argument("--steps", type=int, default=TRAINING_STEPS, help="of the training (default %(default)s)")
+    step.add_argument("--write", type=Path, metavar="FILE", required=True, help="the model, .onnx")
+    step.set_defaults(step=_detector)
 
     step = steps.add_parser("measure", parents=[data, common], help="measure what is missing")
     step.add_argument(
@@ -99,6 +111,7 @@ def _parser() -> argparse.ArgumentParser:
     step = steps.add_parser("fit", parents=[data], help="compare models on the training junctions, each on the others")
     step.add_argument("--detector", metavar="NAME,NAME", help="default: those that the protocol trains with")
     step.add_argument("--write", type=Path, metavar="FILE", help="fit the shipped form and write it, .json")
+    step.add_argument("--figure", type=Path, metavar="FILE", help="draw the calibration of --write, .png")
     step.set_defaults(step=_fit)
 
     step = steps.add_parser("tables", parents=[data], help="write the tables")
@@ -186,6 +199,23 @@ def _list(arguments: argparse.Namespace) -> int:
     for name, digest in digests.digests.items():
         print(f"{digest}  {name}")
     print(f"SHA-256 of the protocol: {digests.digest}")
+    return 0
+
+
+def _detector(arguments: argparse.Namespace) -> int:
+    plugins.require_libraries("training", "train", "torch", "onnx", "onnxscript", "onnxruntime")
+    from egvs.validation.training.train import Recipe, train
+
+    protocol = read_protocol()
+    scenarios = []
+    for junction in detector_junctions(protocol):
+        folder = _world(protocol, junction, arguments)
+        if folder is None:
+            raise InputError("--maps", f"{junction.name} has no scenario", "Name the folder of the maps.")
+        scenarios.append(load(folder).model_copy(update={"name": junction.name}))
+    recipe = Recipe(steps=arguments.steps)
+    train(scenarios, arguments.write, recipe, progress=_progress("detector", time.monotonic()))
+    print(arguments.write)
     return 0
 
 
@@ -303,6 +333,9 @@ def _fit(arguments: argparse.Namespace) -> int:
     if arguments.write is not None:
         files.write_text(arguments.write, training.fitted_models(records, protocol))
         print(arguments.write)
+        if arguments.figure is not None:
+            figures.draw(arguments.figure, arguments.write)
+            print(arguments.figure)
         return 0
     for name in (arguments.detector or ",".join(protocol.detectors.training)).split(","):
         lines = training.compare(training.read_training(records, protocol, name), name, arguments.data / "fit")

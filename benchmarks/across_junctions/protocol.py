@@ -276,6 +276,12 @@ class Protocol(StrictModel):
         return self.detectors.training if junction.role == "training" else self.detectors.held_out
 
 
+def detector_junctions(protocol: Protocol) -> tuple[Junction, ...]:
+    """Return the junctions where detectors are trained: those of the role, and the training junctions shipped."""
+    shipped = [junction for junction in protocol.junctions if junction.role == "training" and junction.scenario]
+    return (*shipped, *(junction for junction in protocol.junctions if junction.role == "detector"))
+
+
 def of_junction(each: Mapping[str, T], junction: Junction, file: str) -> T:
     """Return what a file of the protocol has for one junction.
 

@@ -172,7 +172,8 @@ class JunctionRecord:
     sites, height_m, sensors
         Name, height above the ground and sensor of each of the n candidates.
     scores
-        Values of each score, (n,) float64, with a sign such that more is better; NaN where undefined.
+        Values of each score, (n,) float64, with a sign such that more is better; NaN where undefined. Empty where the
+        part was not measured.
     detections
         By detector and measure.
     infos
@@ -195,19 +196,19 @@ def read_junction(folder: Path, name: str) -> JunctionRecord:
     Raises
     ------
     InputError
-        If its scores were not measured, or a file is damaged.
+        If nothing was measured there, or a file is damaged.
     """
     infos = {
         path.name.removeprefix(f"{name}.").removesuffix(".json"): PartInfo.read(path)
         for path in sorted(folder.glob(f"{name}.*.json"))
     }
-    if SCORES not in infos:
-        raise InputError(folder, f"{name} has no scores", f"Measure them: measure --junction {name} --part {SCORES}")
+    if not infos:
+        raise InputError(folder, f"{name} has no records", f"Measure them: measure --junction {name}")
     candidates = read_table(folder / f"{name}.candidates.parquet").to_pydict()
     sites = tuple(candidates["site"])
     return JunctionRecord(
-        name, infos[SCORES].role, sites, np.array(candidates["height_m"]), tuple(candidates["sensor"]),
-        _read_scores(folder, name, sites),
+        name, next(iter(infos.values())).role, sites, np.array(candidates["height_m"]), tuple(candidates["sensor"]),
+        _read_scores(folder, name, sites) if SCORES in infos else {},
         {part: _read_measures(folder, name, part, sites) for part in infos if part not in NOT_DETECTORS}, infos,
     )  # fmt: skip
 
@@ -237,4 +238,4 @@ def _read_measures(folder: Path, name: str, part: str, sites: tuple[str, ...]) -
 
 def junction_names(folder: Path) -> list[str]:
     """Return the names of the junctions with records, sorted."""
-    return sorted({path.name.split(".")[0] for path in folder.glob(f"*.{SCORES}.json")})
+    return sorted({path.name.split(".")[0] for path in folder.glob("*.json")})

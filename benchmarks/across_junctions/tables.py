@@ -109,7 +109,8 @@ class Study:
     folder
         Folder of the records.
     records
-        Of the junctions, those of each role together.
+        Of the junctions, those of each role together. Junctions without scores are in no table; their detections are
+        used for the baselines that are fitted to training junctions.
     """
 
     def __init__(
@@ -121,10 +122,10 @@ class Study:
         resamples: int = RESAMPLES,
     ) -> None:
         self.folder = folder
-        self.records = list(records)
+        self.records = [record for record in records if record.scores]
         self.protocol, self.protocol_digest = protocol, protocol_digest
         self.detectors = sorted({name for record in records for name in record.detections})
-        baselines = TrainedBaselines(self.records, self.detectors)
+        baselines = TrainedBaselines(records, self.detectors)
         self.junctions = {
             (record.name, detector): _detected(record, detector, baselines.of(record, detector), resamples)
             for record in self.records
@@ -201,12 +202,13 @@ class Study:
     def baselines(self, records: Sequence[JunctionRecord]) -> list[str]:
         """Return the baselines that all these junctions have."""
         known = self.all_scores(records)
-        return [*self.fitted_baselines, *(name for name in FIXED_BASELINES if name in known)]
+        return [*self.fitted_baselines(records), *(name for name in FIXED_BASELINES if name in known)]
 
-    @property
-    def fitted_baselines(self) -> tuple[str, ...]:
-        """The baselines that need training junctions; none without."""
-        return FITTED_BASELINES if any(record.role == "training" for record in self.records) else ()
+    def fitted_baselines(self, records: Sequence[JunctionRecord]) -> list[str]:
+        """Return the baselines that are fitted to other training junctions; none where there are no others."""
+        names = {record.name for record in records}
+        of = [junction for (name, _), junction in self.junctions.items() if name in names]
+        return [baseline for baseline in FITTED_BASELINES if all(baseline in junction.scores for junction in of)]
 
     def all_scores(self, records: Sequence[JunctionRecord]) -> list[str]:
         """Return the scores that all these junctions have, in the order of the first."""
@@ -314,7 +316,8 @@ class Study:
             "By junction. Rho with measured AP; intervals of 95 % resample candidates and blocks of frames (within"
             f" sensors: frames only). Heights of at least {MIN_SITES_OF_A_HEIGHT} candidates, sensors of at least"
             f" {MIN_SITES_OF_A_SENSOR}. Regret in points of AP: as measured (too high), and crossed between halves of"
-            " the frames (too low). Height, sensor, and both: fitted to the ranks of AP at the training junctions."
+            " the frames (too low). Height, sensor, and both: fitted to the ranks of AP at the training junctions (at"
+            " one of these, to those of the others)."
         )
         return Table("2 by junction", "2. By junction", caption, head, rows)
 
@@ -412,7 +415,7 @@ class Study:
         rows: list[list[Cell]] = []
         for role in ROLES:
             for detector, records in self.pairs(role):
-                for score in (*self.fitted_baselines, *self.all_scores(records)):
+                for score in (*self.fitted_baselines(records), *self.all_scores(records)):
                     values = [self._rho(record, detector, score) for record in records]
                     defined = [value for value in values if math.isfinite(value)]
                     mean = float(np.mean(defined)) if defined else float("nan")
@@ -582,7 +585,7 @@ class TrainedBaselines:
 
     A rank counts as a share of the candidates, from 0 to 1. *Sensor* is the mean share of a sensor, *height* the slope
     of the share over height, and *sensor and height* the least-squares sum of both. A detector that was not run at
-    training junctions gets the mean over the others.
+    training junctions gets the mean over the others. A training junction gets what is fitted to the others.
 
     Parameters
     ----------
@@ -592,16 +595,15 @@ class TrainedBaselines:
 
     def __init__(self, records: Sequence[JunctionRecord], detectors: Sequence[str]) -> None:
         self._sensors = sorted({sensor for record in records for sensor in record.sensors})
-        training = [record for record in records if record.role == "training"]
-        self._fits: dict[str, dict[str, FloatArray]] = {}
-        for detector in detectors:
-            of = [record for record in training if detector in record.detections]
-            if of:
-                self._fits[detector] = self._fit(of, detector)
+        self._training = [record for record in records if record.role == "training"]
+        self._detectors = detectors
 
     def of(self, record: JunctionRecord, detector: str) -> dict[str, FloatArray]:
-        """Return the baselines of the candidates of a junction, by name; none without training junctions."""
-        fits = [self._fits[detector]] if detector in self._fits else list(self._fits.values())
+        """Return the baselines of the candidates of a junction, by name; none without other training junctions."""
+        others = [each for each in self._training if each.name != record.name]
+        detectors = [name for name in self._detectors if any(name in each.detections for each in others)]
+        used = [detector] if detector in detectors else detectors
+        fits = [self._fit([each for each in others if name in each.detections], name) for name in used]
         if not fits:
             return {}
         effects = self._effects(record.sensors, record.height_m)

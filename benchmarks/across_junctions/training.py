@@ -1,5 +1,7 @@
 """Fit the models of ``expected_detections`` to the records of the training junctions, and compare their features.
 
+The detector PointPillars is trained before, at other junctions and some of these.
+
 Each vehicle-frame of the unseen traffic, as seen from each candidate, is a row: its features, and in how many of the
 two views it was found. Every model is tested on each junction with the models of the others
 (:mod:`benchmarks.detectability.comparison`, where groups are candidates of equal height). Records of other roles are
@@ -17,7 +19,7 @@ import sklearn
 from benchmarks.across_junctions.protocol import Protocol
 from benchmarks.across_junctions.records import read_junction
 from benchmarks.across_junctions.vehicle_rows import read_rows
-from benchmarks.detectability import comparison, writing
+from benchmarks.detectability import comparison, figures, writing
 from benchmarks.detectability.comparison import SiteRows
 from benchmarks.detectability.fitting import Examples, cross_validate, fit_model
 from egvs.core import files
@@ -49,11 +51,13 @@ def read_training(records_folder: Path, protocol: Protocol, detector: str) -> di
 
 
 def compare(by_junction: Mapping[str, Sequence[SiteRows]], detector: str, out: Path) -> list[str]:
-    """Write the comparison of models of one detector as Markdown, and return its lines."""
+    """Write the comparison of models of one detector as Markdown, with a figure, and return its lines."""
     lines = [f"{detector}: groups are candidates of equal height", ""]
     lines += [*comparison.table(comparison.compare(by_junction)), ""]
     out.mkdir(parents=True, exist_ok=True)
     files.write_text(out / f"comparison_{detector}.md", "\n".join(lines))
+    curves = comparison.reliability(by_junction, comparison.MODELS[comparison.SHIPPED_FORM])
+    figures.draw_reliability(out / f"reliability_{detector}.png", detector, curves)
     return lines
 
 

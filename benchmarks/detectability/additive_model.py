@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks.detectability.crowding import measure_crowding, vehicle_classes
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.special import expit
-from egvs.scoring.target_scores import ISOLATED_GAP_M, MONOTONICITY
+from egvs.scoring.target_scores import ISOLATED_GAP_M, MONOTONICITY, point_spacing_m
 from egvs.scoring.targets import VisibleTargets
 
 DIRECTIONS: Mapping[str, int] = {
@@ -34,7 +34,6 @@ DIRECTIONS: Mapping[str, int] = {
     "beside_gap_m": 1,
     "beside_gap_deg": 1,
     "link_gap": 1,
-    "log_spacing": -1,
     "incidence_deg": 0,
 }
 """For each feature that a model may have: 1 if the probability may only rise with it, -1 if it may only fall, 0 for
@@ -73,7 +72,7 @@ def target_features(visible: VisibleTargets) -> TargetFeatures:
         "beside_gap_m": crowding.beside_gap_m,
         "beside_gap_deg": crowding.beside_gap_deg,
         "link_gap": crowding.link_gap,
-        "log_spacing": np.log(crowding.spacing_m),
+        "log_spacing": np.log(point_spacing_m(visible)),
         "depression_deg": visible.depression_deg,
         "incidence_deg": crowding.incidence_deg,
         "length_m": visible.record.boxes[:, 3],

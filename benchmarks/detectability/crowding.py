@@ -13,14 +13,6 @@ both become one cluster. The points of a vehicle are bounded by a rectangle alon
 
 *Hidden share*: the share of the vehicle's beams that other road users stop.
 
-*Point spacing*: the mean distance of neighbouring points on the vehicle, perpendicular to the line of sight,
-
-.. math:: d = \sqrt{A / n_{alone}}, \quad A = \cos\delta\,(L H s + W H \sqrt{1 - s^2}) + L W |\sin\delta|
-
-with the silhouette A of a level box of length L, width W and height H, seen at the angle :math:`\delta` below the
-horizon and with the sine s between line of sight and length. It puts sensors of any number of rings, and ranges, on one
-scale.
-
 *Incidence*: the angle between the line of sight and the normal of the upright side that is seen best.
 
 Limits: gaps and silhouettes are those of boxes. Neighbours outside the region of interest count for gaps, but have no
@@ -52,9 +44,6 @@ LINK_M, LINK_PER_RANGE = 0.6, 0.02
 
 MAX_LINK_GAP = 4.0
 """The largest gap between points, in linking distances."""
-
-MAX_SPACING_M = 5.0
-"""The largest spacing, also for a vehicle that no beam would meet."""
 
 VEHICLE_CLASSES = {
     "passenger": "car",
@@ -144,8 +133,6 @@ class Crowding:
         :data:`MAX_LINK_GAP`.
     hidden_share
         Share of the beams on the vehicle that other road users stop, 0 to 1; 0 where no beam would meet it.
-    spacing_m
-        Mean distance of neighbouring points without occlusion by other road users, up to :data:`MAX_SPACING_M`.
     incidence_deg
         Angle of incidence on the upright side that is seen best, 0 to 90.
     """
@@ -156,7 +143,6 @@ class Crowding:
     beside_gap_m: FloatArray
     link_gap: FloatArray
     hidden_share: FloatArray
-    spacing_m: FloatArray
     incidence_deg: FloatArray
 
 
@@ -172,7 +158,6 @@ def measure_crowding(visible: VisibleTargets) -> Crowding:
     crowding_kernels.sight_gaps(
         x_m, y_m, record.row, pairs.starts, pairs.boxes, pairs.plan, views, front_m, behind_m, beside_rad
     )
-    length_m, width_m, height_m = record.boxes[:, 3:6].T
     flat_m = np.hypot(*(pairs.plan[record.row, :2] - visible.sensor_m[:2]).T)
     beside_gap_m = np.where(beside_rad < np.deg2rad(MAX_BESIDE_DEG), beside_rad * views[record.row, 2], NEIGHBOUR_M)
 
@@ -184,12 +169,9 @@ def measure_crowding(visible: VisibleTargets) -> Crowding:
     )
 
     cosine = np.cos(np.deg2rad(visible.depression_deg))
-    sine = np.abs(np.sin(np.deg2rad(visible.depression_deg)))
     end_on = np.sqrt(np.maximum(1.0 - visible.side**2, 0.0))
-    area_m2 = cosine * height_m * (length_m * visible.side + width_m * end_on) + length_m * width_m * sine
     alone = visible.points_alone
     is_met = alone > 0.0
-    spacing_m = np.sqrt(np.divide(area_m2, alone, out=np.full(len(record), np.inf), where=is_met))
     hidden = 1.0 - np.divide(visible.points, alone, out=np.ones(len(record)), where=is_met)
     return Crowding(
         front_gap_m=front_m,
@@ -198,7 +180,6 @@ def measure_crowding(visible: VisibleTargets) -> Crowding:
         beside_gap_m=np.minimum(beside_gap_m, NEIGHBOUR_M),
         link_gap=point_gap_m / reach_m,
         hidden_share=np.clip(hidden, 0.0, 1.0),
-        spacing_m=np.minimum(spacing_m, MAX_SPACING_M),
         incidence_deg=np.rad2deg(np.arccos(np.minimum(cosine * np.maximum(visible.side, end_on), 1.0))),
     )
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.stats import spearmanr
 from sklearn.ensemble import HistGradientBoostingClassifier
 
-from egvs.scoring.target_scores import MONOTONICITY, DetectabilityModel
+from egvs.scoring.target_scores import FEATURES, MONOTONICITY, DetectabilityModel
 
 TREES, LEAVES, RATE, MIN_SAMPLES = 60, 12, 0.15, 600
 """Trees, leaves per tree, learning rate, and vehicle-frames per leaf (a hit and a miss count as two)."""
@@ -50,13 +50,43 @@ class Examples:
 
 
 def fit_model(examples: Sequence[Examples]) -> dict[str, Any]:
-    """Return the model of these junctions, in the format of the program's file."""
-    x = np.concatenate([examples_ for e in examples for examples_ in e.features])
-    y = np.concatenate([examples_ for e in examples for examples_ in e.hits])
-    return fit_trees(x, y, np.ones(len(y)), list(MONOTONICITY.values()))
+    """Return the model of these junctions, in the format of the program's file.
+
+    Only vehicle-frames with points take part, since the program gives the others probability 0. All junctions have
+    equal weight, whatever their traffic.
+    """
+    each_x = [np.concatenate([x[has_points(x)] for x in e.features]) for e in examples]
+    each_y = [np.concatenate([y[has_points(x)] for x, y in zip(e.features, e.hits, strict=True)]) for e in examples]
+    weight = equal_weights([len(y) for y in each_y])
+    return fit_trees(np.concatenate(each_x), np.concatenate(each_y), weight, list(MONOTONICITY.values()))
 
 
-def fit_trees(x: Floats, hits: Floats, row_weight: Floats, directions: Sequence[int]) -> dict[str, Any]:
+def has_points(features: Floats) -> NDArray[np.bool_]:
+    """Return which vehicle-frames have points, (n,), from their features (n, f)."""
+    is_seen: NDArray[np.bool_] = features[:, FEATURES.index("log_points")] > 0.0
+    return is_seen
+
+
+def equal_weights(counts: Sequence[int]) -> Floats:
+    """Return a weight for each row of some junctions, (sum of counts,), with mean 1 and an equal sum for each junction.
+
+    Examples
+    --------
+    >>> equal_weights([1, 3]).tolist()
+    [2.0, 0.6666666666666666, 0.6666666666666666, 0.6666666666666666]
+    """
+    return np.concatenate([np.full(count, sum(counts) / (len(counts) * count)) for count in counts])
+
+
+def fit_trees(
+    x: Floats,
+    hits: Floats,
+    row_weight: Floats,
+    directions: Sequence[int],
+    *,
+    trees: int | None = None,
+    leaves: int | None = None,
+) -> dict[str, Any]:
     """Return boosted trees in the format of the program's file.
 
     Parameters
@@ -65,16 +95,18 @@ def fit_trees(x: Floats, hits: Floats, row_weight: Floats, directions: Sequence[
         Features (n, f), share of the two views in which each vehicle was found, and weight of each row, (n,) float64.
     directions
         1, -1 or 0 for each feature, as in :data:`egvs.scoring.target_scores.MONOTONICITY`.
+    trees, leaves
+        Size of the model; :data:`TREES` and :data:`LEAVES` by default.
     """
     weight = np.append(hits, 1.0 - hits) * np.append(row_weight, row_weight)
     label = np.append(np.ones(len(hits)), np.zeros(len(hits)))
     is_used = weight > 0.0
     classifier = HistGradientBoostingClassifier(
-        max_iter=TREES, learning_rate=RATE, max_leaf_nodes=LEAVES, min_samples_leaf=MIN_SAMPLES,
+        max_iter=trees or TREES, learning_rate=RATE, max_leaf_nodes=leaves or LEAVES, min_samples_leaf=MIN_SAMPLES,
         monotonic_cst=list(directions), early_stopping=False, random_state=0,
     ).fit(np.concatenate([x, x])[is_used], label[is_used], sample_weight=weight[is_used])  # fmt: skip
-    trees = [[_node(node) for node in predictor[0].nodes] for predictor in classifier._predictors]
-    return {"base": _short(classifier._baseline_prediction.item()), "trees": trees}
+    fitted = [[_node(node) for node in predictor[0].nodes] for predictor in classifier._predictors]
+    return {"base": _short(classifier._baseline_prediction.item()), "trees": fitted}
 
 
 def _node(node: Any) -> list[float | int]:
@@ -93,7 +125,7 @@ def cross_validate(examples: Mapping[str, Examples]) -> dict[str, Any]:
     chances, hits = list[Floats](), list[Floats]()
     for name, examples_ in examples.items():
         model = DetectabilityModel.of(fit_model([e for other, e in examples.items() if other != name]))
-        each = [model.chances(features) for features in examples_.features]
+        each = [np.where(has_points(x), model.chances(x), 0.0) for x in examples_.features]
         rho[name] = round(float(spearmanr([c.mean() for c in each], examples_.ap).statistic), 3)
         chances += each
         hits += examples_.hits

@@ -12,7 +12,7 @@ from typing import Any
 
 from egvs.scoring.target_scores import FEATURES
 
-MADE_BY = "python -m benchmarks.detectability"
+MADE_BY = "python -m benchmarks.across_junctions fit"
 FINDS = "a box that overlaps the vehicle by more than 0.7, in the mean of seen from above and in space"
 
 
@@ -67,8 +67,8 @@ def text(metadata: TrainingMetadata, models: Mapping[str, Mapping[str, Any]]) ->
     Parameters
     ----------
     models
-        By detector: ``base`` and ``trees`` of :func:`benchmarks.detectability.fitting.fitted`, and ``elsewhere`` of
-        :func:`benchmarks.detectability.fitting.elsewhere`.
+        By detector: ``base`` and ``trees`` of :func:`benchmarks.detectability.fitting.fit_model`, and ``elsewhere`` of
+        :func:`benchmarks.detectability.fitting.cross_validate`.
     """
     head = json.dumps(metadata.to_json(), indent=1).replace("\n", "\n ")
     each = ",\n".join(f'  "{name}": {_model(model)}' for name, model in models.items())

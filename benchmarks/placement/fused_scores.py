@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.detectability.examples import hits_of
+from benchmarks.across_junctions.detections import hits_of
 from egvs.cli.validation_tables import PlanRunDisplay
 from egvs.core import files
 from egvs.core.grid import FloatArray, IntArray
@@ -163,6 +163,7 @@ def measure_junction(
     groups = [*single, *pairs]
     frames = list(held_out.read())
     record = TargetRecord.of(frames, scenario.roi.grid)
+    targets = np.split(record.boxes, np.searchsorted(record.frame, np.arange(1, len(frames))))
     views = site_views(held_out, record, sites)
 
     task = FusedDetectionTask(held_out, joint_detectors(detectors))
@@ -182,7 +183,7 @@ def measure_junction(
                     sites=tuple(site.name for site in group.sites),
                     same_pole=at_same_pole(group),
                     expected=expected_chances([views[site.name] for site in group.sites], detector),
-                    found=hits_of(record, boxes),
+                    found=hits_of(targets, boxes),
                     ap=float(np.mean([of_group[name].value for name in AP_MEASURES])),
                 )
             )

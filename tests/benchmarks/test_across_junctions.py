@@ -474,7 +474,8 @@ def test_tables_by_hand(made_up: Path, tmp_path: Path) -> None:
     assert aims["h", "rho at 2 m"] == [1.0, 0.85, "yes"]
     less = {(row[0], row[3]): row[5:] for row in by_name["4 differences"].rows}
     assert less["held out", "points_on_target"] == [[0.0, None, None]] * 5
-    assert less["training", "height"][4][0] == pytest.approx(-7.5)  # the regret of the main score is 0
+    assert less["held out", "height"][4][0] == pytest.approx(16.0 - 7.5)
+    assert ("training", "height") not in less  # there is no other training junction to fit it to
     everything = {(row[0], row[2]): row[4] for row in by_name["7 all scores"].rows}
     assert everything["training", "less_is_better"] == -1.0
 
@@ -588,6 +589,11 @@ def test_orders_by_sensor_and_height_are_those_of_the_training_junctions() -> No
         assert values["sensor and height"] == pytest.approx([0.125, 0.375, 0.625, 0.875])
         assert values["height"][1] - values["height"][0] == pytest.approx(0.25)
     assert tables.TrainedBaselines([tested], ["two"]).of(tested, "two") == {}
+    # a training junction gets what the others say
+    other = record("u", "training", [0.4, 0.3, 0.2, 0.1], "one")
+    baselines = tables.TrainedBaselines([training, other], ["one"])
+    assert baselines.of(training, "one")["sensor"] == pytest.approx([0.75, 0.75, 0.25, 0.25])
+    assert tables.TrainedBaselines([training], ["one"]).of(training, "one") == {}
 
 
 def test_tables_are_the_same_each_time(made_up: Path, tmp_path: Path) -> None:

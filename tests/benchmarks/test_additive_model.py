@@ -11,8 +11,9 @@ from benchmarks.detectability.additive_model import (
     TargetFeatures,
     target_features,
 )
-from benchmarks.detectability.crowding import CLASSES, measure_crowding
+from benchmarks.detectability.crowding import CLASSES
 
+from egvs.scoring.target_scores import point_spacing_m
 from tests.scoring.target_scenes import frame, seen
 from tests.scoring.test_visible_targets import car, fan
 
@@ -48,7 +49,7 @@ def test_probability_by_hand():
 
 def test_features_by_hand():
     visible = seen([frame([car(21.0, 0.0)], ("bus",))], fan())
-    x, crowding = target_features(visible), measure_crowding(visible)
+    x = target_features(visible)
     assert set(x.columns) == set(DIRECTIONS) and x.vehicle_class.tolist() == [CLASSES.index("bus")]
     assert x.columns["log_points"].tolist() == [math.log(115)] and x.columns["length_m"].tolist() == [4.0]
-    assert x.columns["log_spacing"].tolist() == [math.log(crowding.spacing_m[0])]
+    assert x.columns["log_spacing"].tolist() == [math.log(point_spacing_m(visible)[0])]

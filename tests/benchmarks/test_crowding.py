@@ -13,6 +13,7 @@ from benchmarks.detectability.crowding_kernels import RAY_SHARES
 from shapely import affinity
 
 from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.scoring.target_scores import MAX_SPACING_M, point_spacing_m
 from tests.scoring.target_scenes import axes_of, beams_to, entered_m, frame, random_boxes, seen
 from tests.scoring.test_visible_targets import AT, fan
 
@@ -35,7 +36,7 @@ def test_a_queue_ahead_by_hand():
     visible = seen([frame(queue[:1])], fan())
     tilt = math.atan(0.25 / 12.0)
     area = math.cos(tilt) * 3.0 + math.sin(tilt) * 8.0
-    assert measure_crowding(visible).spacing_m == pytest.approx([math.sqrt(area / visible.points_alone[0])])
+    assert point_spacing_m(visible) == pytest.approx([math.sqrt(area / visible.points_alone[0])])
 
 
 def test_adjacent_lanes_by_hand():
@@ -62,9 +63,10 @@ def test_points_closer_than_the_linking_distance_by_hand():
 def test_a_vehicle_hidden_by_half_and_one_that_no_beam_would_meet():
     beams = beams_to(AT, [[30.0, -1.5, 0.0], [30.0, 1.5, 0.0]])
     hidden, near = box(20.0, 0.0, width=6.0), box(10.0, 1.0, length=2.0, width=1.5)
-    found = measure_crowding(seen([frame([hidden, near, box(20.0, -9.0)])], beams))
+    visible = seen([frame([hidden, near, box(20.0, -9.0)])], beams)
+    found, spacing_m = measure_crowding(visible), point_spacing_m(visible)
     assert found.hidden_share.tolist() == [0.5, 0.0, 0.0]
-    assert found.spacing_m[2] == crowding.MAX_SPACING_M and found.link_gap[2] == MAX_LINK_GAP
+    assert spacing_m[2] == MAX_SPACING_M and found.link_gap[2] == MAX_LINK_GAP
     assert found.front_gap_m[0] == pytest.approx(7.0, rel=2e-3)  # from x = 11 to 18
 
 
@@ -200,7 +202,7 @@ def test_shares_spacing_and_point_gaps_agree_with_the_twin(seed):
     at = (92.0, 190.0, 5.0)
     ends = np.column_stack([rng.uniform(5, 60, 900), rng.uniform(5, 50, 900), rng.uniform(-9, 0, 900)])
     visible = seen([frame(boxes)], beams_to(at, ends))
-    found = measure_crowding(visible)
+    found, spacing_m = measure_crowding(visible), point_spacing_m(visible)
     origin = np.array(at)
     first, alone = {}, dict.fromkeys(range(len(boxes)), 0)
     for end in ends:
@@ -237,8 +239,8 @@ def test_shares_spacing_and_point_gaps_agree_with_the_twin(seed):
         sight = away / np.linalg.norm(away)
         faces = np.abs(axes_of(b[6], 0.0) @ sight)  # cosines of the incidence on front, side, roof
         area = faces @ [b[4] * b[5], b[3] * b[5], b[3] * b[4]]
-        spacing = min(math.sqrt(area / alone[row]), crowding.MAX_SPACING_M) if alone[row] else crowding.MAX_SPACING_M
-        assert found.spacing_m[i] == pytest.approx(spacing)
+        spacing = min(math.sqrt(area / alone[row]), MAX_SPACING_M) if alone[row] else MAX_SPACING_M
+        assert spacing_m[i] == pytest.approx(spacing)
         assert found.incidence_deg[i] == pytest.approx(math.degrees(math.acos(max(faces[:2]))))
         share = 1.0 - len(first.get(row, [])) / alone[row] if alone[row] else 0.0
         assert found.hidden_share[i] == pytest.approx(share)

@@ -1,4 +1,4 @@
-"""How likely a detector finds a vehicle, learnt: hits, curve and fit on made-up data, the file, the command."""
+"""How likely a detector finds a vehicle, learnt: hits, curve and fit on made-up data, the file, the picture."""
 
 from __future__ import annotations
 
@@ -7,34 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from benchmarks.detectability import __main__ as command
-from benchmarks.detectability import examples, figures, fitting, writing
+from benchmarks.across_junctions.detections import hits_of
+from benchmarks.detectability import figures, fitting, writing
 from benchmarks.detectability.fitting import Examples
-from benchmarks.validity import junctions, study
 
-from egvs.artefacts.traffic_frames import TrafficFrame
-from egvs.core.grid import Grid
 from egvs.scoring import target_scores
 from egvs.scoring.target_scores import DETECTORS, FEATURES, DetectabilityModel
-from egvs.scoring.targets import TargetRecord
-from tests.conftest import write_mini
-
-GRID = Grid((0.0, 0.0, 0.0), 1.0, (60, 60, 5))
 
 
 def car(x: float, length: float = 4.0, z: float = 0.75, height: float = 1.5) -> tuple[float, ...]:
     """Along x, 2 m wide."""
     return (x, 30.0, z, length, 2.0, height, 0.0)
-
-
-def record_of(*frames: list[tuple[float, ...]]) -> TargetRecord:
-    """Passenger cars alone."""
-    made = [
-        TrafficFrame(n, tuple(f"v{i}" for i in range(len(its))), ("passenger",) * len(its),
-                     np.array(its, dtype=np.float64).reshape(-1, 7), np.zeros(len(its)))
-        for n, its in enumerate(frames)
-    ]  # fmt: skip
-    return TargetRecord.of(made, GRID)
 
 
 def boxes(*its: tuple[float, ...]) -> np.ndarray:
@@ -44,9 +27,8 @@ def boxes(*its: tuple[float, ...]) -> np.ndarray:
 # what was found
 
 
-@pytest.mark.slow
 def test_hits_by_hand() -> None:
-    record = record_of([car(10.0), car(20.0)], [], [car(30.0), car(40.0), car(50.0)])
+    vehicles = [boxes(car(10.0), car(20.0)), boxes(), boxes(car(30.0), car(40.0), car(50.0))]
     found = [
         boxes(car(20.0)),
         boxes(car(10.0)),  # nobody is there in this frame
@@ -57,19 +39,18 @@ def test_hits_by_hand() -> None:
             car(50.0, z=1.1),  # nor does a second one take the hit away
         ),
     ]
-    assert examples.hits_of(record, found).tolist() == [0.0, 1.0, 1.0, 0.0, 1.0]
+    assert hits_of(vehicles, found).tolist() == [0.0, 1.0, 1.0, 0.0, 1.0]
 
 
-@pytest.mark.slow
 def test_a_box_too_high_is_found_from_above_alone_and_the_bound_itself_is_not_enough() -> None:
-    record = record_of([car(10.0), car(20.0, length=10.0), car(40.0, length=10.0)])
+    vehicles = [boxes(car(10.0), car(20.0, length=10.0), car(40.0, length=10.0))]
     found = [boxes(car(10.0, z=1.25), car(20.0, length=7.0), car(40.0, length=7.001))]  # 0.5 in space; 0.7 and more
-    assert examples.hits_of(record, found).tolist() == [0.5, 0.0, 1.0]
+    assert hits_of(vehicles, found).tolist() == [0.5, 0.0, 1.0]
 
 
 def test_no_detections_and_no_vehicles() -> None:
-    assert examples.hits_of(record_of([car(10.0)]), [boxes()]).tolist() == [0.0]
-    assert examples.hits_of(record_of([], []), [boxes(car(10.0)), boxes()]).tolist() == []
+    assert hits_of([boxes(car(10.0))], [boxes()]).tolist() == [0.0]
+    assert hits_of([boxes(), boxes()], [boxes(car(10.0)), boxes()]).tolist() == []
 
 
 # what is learnt
@@ -131,6 +112,23 @@ def test_a_planted_dependence_is_found_and_holds_elsewhere() -> None:
     assert sum(part["vehicle_frames"] * abs(part["chance"] - part["found"]) for part in parts) < 0.03 * 3 * 4 * 500
 
 
+def test_vehicles_without_points_and_busy_junctions_do_not_change_a_model() -> None:
+    """Those without points have probability 0 in the program; ten times as much of the same traffic counts as one."""
+    first, second = random_detections(1), random_detections(2)
+    hidden = np.zeros((900, len(FEATURES)))  # no points, but always found
+    with_hidden = Examples([*first.features, hidden], [*first.hits, np.ones(900)], [*first.ap, 1.0])
+    assert fitting.fit_model([with_hidden, second]) == fitting.fit_model([first, second])
+
+    never = Examples(second.features * 10, [np.zeros(len(hits)) for hits in second.hits] * 10, second.ap * 10)
+    always = Examples(first.features, [np.ones(len(hits)) for hits in first.hits], first.ap)
+    x = np.full((1, len(FEATURES)), 0.5)
+    assert DetectabilityModel.of(fitting.fit_model([always, never])).chances(x)[0] == pytest.approx(0.5, abs=0.05)
+
+    left_out = fitting.cross_validate({"one": with_hidden, "two": second, "three": random_detections(3)})
+    (lowest, *_) = left_out["calibration"]
+    assert lowest["vehicle_frames"] >= 900 and lowest["found"] > 0.3  # predicted 0, found nevertheless
+
+
 # the file
 
 
@@ -169,42 +167,3 @@ def test_the_picture_shows_every_part_of_the_curves(tmp_path: Path) -> None:
     assert sum(bar.get_height() for bar in below.patches) == pytest.approx(len(DETECTORS))
     figures.draw(tmp_path / "its.png", target_scores.MODEL_FILE)
     assert (tmp_path / "its.png").read_bytes().startswith(b"\x89PNG")
-
-
-# the command
-
-
-def test_wrong_arguments_are_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    paths = ["--data", str(tmp_path / "data"), "--out", str(tmp_path / "out")]
-    for options, said in {
-        ("--junction", "nishishinjuku"): "got 'nishishinjuku'. Use some of ingolstadt, hill, roundabout",
-        ("--junction", "hill"): "--junction: expected at least 2 junctions, got hill",
-        ("--junction", "hill", "--osm-training", str(tmp_path / "no.osm")): "--osm-training: no such file",
-        ("--osm-training-at", "50.1,9.2"): "--osm-training-at: used without --osm-training",
-        ("--osm-training-at", "here", "--osm-training", "east.osm"): "here",
-        ("--only-draw",): "--only-draw: no such file",
-    }.items():
-        assert command.main([*paths, *options]) == 2
-        assert said in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.slow
-def test_complete_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    (tmp_path / "scenarios").mkdir()
-    for name in ("ingolstadt", "hill"):
-        write_mini(tmp_path / "scenarios" / name)
-    monkeypatch.setattr(junctions, "SCENARIOS", tmp_path / "scenarios")
-    monkeypatch.setattr(junctions, "check_unseen", lambda scenario: None)  # these have a finished file
-    monkeypatch.setattr(study, "APART_S", 2.0)
-    monkeypatch.setattr(command, "DETECTORS", ("cluster",))
-    options = ["--frames", "10", "--places", "1", "--jobs", "1", "--data", str(tmp_path / "data")]
-    assert command.main([*options, "--out", str(tmp_path / "out")]) == 0
-    assert (tmp_path / "out" / "detectability.png").is_file()
-    learnt = json.loads((tmp_path / "out" / "target_scores.json").read_text(encoding="utf-8"))
-    its = learnt["about"]["learnt_on"]["hill"]
-    assert its["sites"] == {"cluster": 6} and its["sensors"] == ["small"] and learnt["about"]["frames"] == 10
-    curve = learnt["detectors"]["cluster"]["elsewhere"]["calibration"]
-    assert sum(part["vehicle_frames"] for part in curve) == 2 * 6 * its["vehicle_frames"] > 0
-    said = capsys.readouterr().out
-    assert "hill: 10 frames 2 s apart, cluster from 6" in said and "cluster: rho with AP at other junctions" in said

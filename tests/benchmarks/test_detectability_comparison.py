@@ -10,9 +10,12 @@ import pytest
 from benchmarks.detectability import additive_fitting, comparison, figures, fitting
 from benchmarks.detectability.additive_fitting import TrainingRows, choose_knots, fit_additive, ramps
 from benchmarks.detectability.additive_model import DIRECTIONS, TargetFeatures
-from benchmarks.detectability.comparison import SiteRows
+from benchmarks.detectability.comparison import ModelForm, SiteRows
 
 from egvs.core.errors import EgvsError
+
+POINTS, SHADOW = ModelForm("additive", comparison.POINTS), ModelForm("additive", comparison.SHADOW)
+TREES = ModelForm("trees", ("log_points", "hidden_share"), trees=10)
 
 
 def rows(seed: int, truth, count: int = 4000) -> TrainingRows:
@@ -111,42 +114,54 @@ def test_results_by_hand():
     assert result.rho == pytest.approx(0.8) and result.rho_in_group == pytest.approx(0.8)  # 1 - 6 * 2 / (4 * 15)
     # the vehicle without a point does not count
     assert result.loss == pytest.approx(-math.log(0.5 * 0.7 * 0.6 * 0.8) / 4)
-    assert comparison.mean_and_error([0.5, 0.7, math.nan]) == "0.600 ± 0.100"
-    assert comparison.mean_and_error([0.5]) == "0.500 ± nan" and comparison.mean_and_error([math.nan]) == ""
+    assert comparison.mean_and_error([0.5, 0.7, math.nan]) == "0.6000 ± 0.1000"
+    assert comparison.mean_and_error([0.5]) == "0.5000 ± nan" and comparison.mean_and_error([math.nan]) == ""
 
 
 def test_each_junction_is_predicted_by_the_others(monkeypatch):
-    monkeypatch.setattr(
-        comparison, "MODELS", {"points": ("additive", comparison.POINTS), "shadow": ("additive", comparison.SHADOW)}
-    )
+    monkeypatch.setattr(comparison, "MODELS", {"points": POINTS, "shadow": SHADOW, comparison.SHIPPED_FORM: SHADOW})
     by_junction = {name: sites(seed) for seed, name in enumerate(("one", "two"), start=1)}
     fitted = []
     whole = comparison.fit
-    monkeypatch.setattr(comparison, "fit", lambda rows, *model: fitted.append(rows) or whole(rows, *model))
+    monkeypatch.setattr(comparison, "fit", lambda rows, model: fitted.append(rows) or whole(rows, model))
     results = comparison.compare(by_junction)
-    assert [len(rows) for rows in fitted] == [1] * 4  # never on the junction itself
+    assert [len(rows) for rows in fitted] == [1] * 6  # never on the junction itself
     first = comparison.training_rows(by_junction["one"])
     assert np.array_equal(fitted[-1][0].hits, first.hits) and (first.features.columns["log_points"] > 0.0).all()
     assert results["shadow"]["one"].rho > 0.85
     assert results["shadow"]["one"].loss < results["points"]["one"].loss
     lines = list(comparison.table(results))  # the shipped score was trained at neither
-    assert len(lines) == 2 + 4 and all(line.count("|") == lines[0].count("|") for line in lines)
-    assert "| 0.000 ± 0.000 |" in lines[2]  # points_on_target minus itself
+    assert len(lines) == 2 + 5 and all(line.count("|") == lines[0].count("|") for line in lines)
+    assert "| 0.0000 ± 0.0000 |" in lines[2]  # points_on_target minus itself
 
 
 def test_table_marks_where_the_shipped_score_is_in_sample():
     """Trained at one of three junctions: 0.9 there is marked, and the means are of 0.5 and 0.7."""
     rhos = dict(zip(("seen", "one", "two"), (0.9, 0.5, 0.7), strict=True))
     by_junction = {name: comparison.ModelResult(rho, rho, 1.0 - rho) for name, rho in rhos.items()}
-    results = {name: by_junction for name in (comparison.COUNT_SCORE, comparison.SHIPPED_SCORE)}
+    results = dict.fromkeys((comparison.COUNT_SCORE, comparison.SHIPPED_SCORE, comparison.SHIPPED_FORM), by_junction)
     lines = list(comparison.table(results, {"seen", "elsewhere"}))
-    assert lines[2].startswith("| points_on_target | 0.900 | 0.500 | 0.700 | 0.700 ± 0.115 |")
-    shipped = "| expected_detections (shipped) | 0.900 (in-sample) | 0.500 | 0.700 | 0.600 ± 0.100 | 0.000 ± 0.000 "
-    assert lines[3] == f"{shipped}| 0.600 ± 0.100 | 0.400 ± 0.100 |"
-    assert lines[4:] == ["", "In-sample: the shipped score was trained at seen; its means leave them out."]
-    assert list(comparison.table(results, ())) == [line.replace(" (in-sample)", "") for line in lines[:3]] + [
-        lines[2].replace("points_on_target", "expected_detections (shipped)")
-    ]
+    assert lines[2].startswith("| points_on_target | 0.900 | 0.500 | 0.700 | 0.7000 ± 0.1155 |")
+    same = "0.0000 ± 0.0000"
+    shipped = (
+        f"| expected_detections (shipped) | 0.900 (in-sample) | 0.500 | 0.700 | 0.6000 ± 0.1000 | {same} | {same} "
+    )
+    assert lines[3] == f"{shipped}| 0.6000 ± 0.1000 | 0.4000 ± 0.1000 | {same} |"
+    assert lines[5:] == ["", "In-sample: the shipped score was trained at seen; its means leave them out."]
+    assert list(comparison.table(results, ()))[3] == lines[2].replace(
+        "points_on_target", "expected_detections (shipped)"
+    )
+
+
+def test_differences_are_from_the_shipped_form():
+    results = {
+        name: {"one": comparison.ModelResult(rho, rho, loss), "two": comparison.ModelResult(rho, rho, loss + 0.1)}
+        for name, rho, loss in (
+            (comparison.COUNT_SCORE, 0.5, math.nan), (comparison.SHIPPED_FORM, 0.8, 0.3), ("larger", 0.9, 0.28)
+        )
+    }  # fmt: skip
+    cells = list(comparison.table(results, ()))[4].split(" | ")
+    assert cells[4:6] == ["0.4000 ± 0.0000", "0.1000 ± 0.0000"] and cells[-1].startswith("-0.0200 ± 0.0000")
 
 
 def test_shipped_training_junctions_are_those_of_the_file():
@@ -154,16 +169,13 @@ def test_shipped_training_junctions_are_those_of_the_file():
 
 
 def test_trees_keep_the_directions_and_weight_junctions_equally(monkeypatch):
-    monkeypatch.setattr(fitting, "TREES", 10)
     monkeypatch.setenv("OMP_NUM_THREADS", "1")  # else scikit-learn starts a program that counts the cores
     # the same features; found always at the small junction, never at the one of ten times as many vehicles
     small, large = rows(1, lambda x: 2.0, 400), rows(2, lambda x: -1.0, 4000)
-    model = comparison.fit([small, large], "trees", ("log_points", "hidden_share"))
+    model = comparison.fit([small, large], TREES)
     assert model.chances(rows(3, known_probability).features).mean() == pytest.approx(0.5, abs=0.05)
     monkeypatch.setattr(fitting, "MIN_SAMPLES", 50)
-    model = comparison.fit(
-        [rows(1, known_probability), rows(2, known_probability)], "trees", ("log_points", "hidden_share")
-    )
+    model = comparison.fit([rows(1, known_probability), rows(2, known_probability)], TREES)
     x = rows(3, known_probability).features
     fewer = TargetFeatures({**x.columns, "log_points": 0.5 * x.columns["log_points"]}, x.vehicle_class)
     assert (model.chances(x) >= model.chances(fewer)).all()
@@ -171,7 +183,7 @@ def test_trees_keep_the_directions_and_weight_junctions_equally(monkeypatch):
 
 
 def test_reliability_diagram_shows_every_bin(tmp_path: Path):
-    curves = comparison.reliability({"one": sites(1), "two": sites(2)}, "additive", comparison.SHADOW)
+    curves = comparison.reliability({"one": sites(1), "two": sites(2)}, SHADOW)
     for parts in curves.values():
         assert sum(part["vehicle_frames"] for part in parts) == 8 * 400
         # models of the same truth: within a few standard errors, sqrt(0.25 / 2 / 100), of well filled bins
@@ -189,15 +201,3 @@ def test_title_has_the_difference_in_level_by_hand():
     parts = [{"chance": 0.2, "found": 0.1, "vehicle_frames": 30}, {"chance": 0.9, "found": 0.8, "vehicle_frames": 10}]
     figure = figures.reliability_diagrams("cluster", {"one": parts})
     assert figure.axes[0].get_title() == "one: +10.0 points predicted"
-
-
-def test_only_training_junctions_are_accepted(tmp_path: Path, capsys):
-    for options, said in {
-        ("--junction", "nishishinjuku,hill"): "expected a training junction, got 'nishishinjuku'",
-        ("--scenario", "scenarios/nishishinjuku"): "expected a training junction, got 'nishishinjuku'",
-        ("--junction", "hill"): "expected 2 or more different junctions, got hill",
-        (): "got none",
-    }.items():
-        assert comparison.main([str(tmp_path / "out"), *options]) == 2
-        assert said in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())

@@ -15,7 +15,8 @@ from tests.scoring.test_visible_targets import AT, car, fan
 
 DATA = json.loads(target_scores.MODEL_FILE.read_text(encoding="utf-8"))
 HIGH = {"log_points": 8.0, "log_points_on_sides": 8.0, "length_share": 1.0, "width_share": 1.0, "hole_m": 6.0,
-        "gap_m": 20.0, "depression_deg": 60.0, "length_m": 18.0, "range_m": 120.0, "side": 1.0}  # fmt: skip
+        "gap_m": 20.0, "depression_deg": 60.0, "length_m": 18.0, "range_m": 120.0, "side": 1.0,
+        "log_spacing": 1.6}  # fmt: skip
 
 
 def rows(count: int, seed: int = 1) -> np.ndarray:
@@ -81,7 +82,10 @@ def test_features_by_hand():
     found = seen([frame([car(21.0, 0.0), car(22.0, 40.0)])], fan())  # the second lies beyond the region
     x = target_scores.detectability_features(found)
     hole_m, slope = 4.0 / 64, math.degrees(math.atan(0.25 / 21.0))
-    right = [math.log(115), math.log(115), found.length_share[0], 0.0, hole_m, 20.0, slope, 4.0, found.range_m[0], 1.0]
+    # 114 points on a side of 4 m by 1.5 m, and a little of the roof
+    area_m2 = math.cos(math.radians(slope)) * 6.0 + math.sin(math.radians(slope)) * 8.0
+    right = [math.log(115), math.log(115), found.length_share[0], 0.0, hole_m, 20.0, slope, 4.0, found.range_m[0], 1.0,
+             0.5 * math.log(area_m2 / 114)]  # fmt: skip
     np.testing.assert_allclose(x, [right], atol=1e-9)
     assert FEATURES[5] == "gap_m" and found.record.gap_m[0] == 36.0  # 40 m between centres, 4 m long; 20 m is alone
 

@@ -136,7 +136,7 @@ def train(
     frames: Annotated[int, typer.Option(min=10, help="Training frames per junction.")] = 400,
     heights: Annotated[
         str, typer.Option(metavar="LOW,HIGH", help="Range of mounting heights, in metres above the ground.")
-    ] = "2,7",
+    ] = "2,8",
     convention: Annotated[
         str, typer.Option(help="Origin of point heights: ground, or sensor (as for detectors on cars).")
     ] = "ground",

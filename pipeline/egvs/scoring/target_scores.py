@@ -15,15 +15,25 @@ one without. g(0) = 0: a vehicle without a point is in a blind spot of the site.
 .. math:: \frac{1}{N} \sum_{i=1}^{N} p(x_i), \qquad p(x) = \frac{1}{1 + e^{-b - \sum_t f_t(x)}}
 
 x are :data:`FEATURES`, f_t the trees of a boosted model. The model rises with points, points on sides, spans and the
-gap to the neighbour, and falls with the hole between points and with the depression angle (:data:`MONOTONICITY`);
-range, length and angle of view may have either effect. A vehicle without any point is never detected.
+gap to the neighbour, and falls with the hole between points, with the depression angle and with the spacing of points
+(:data:`MONOTONICITY`); range, length and angle of view may have either effect. A vehicle without any point is never
+detected.
+
+*Point spacing*: the mean distance of neighbouring points on the vehicle, perpendicular to the line of sight,
+
+.. math:: d = \sqrt{A / n_{alone}}, \quad A = \cos\delta\,(L H s + W H \sqrt{1 - s^2}) + L W |\sin\delta|
+
+with the points :math:`n_{alone}` that it has without other road users in the way, and the silhouette A of a level box
+of length L, width W and height H, seen at the angle :math:`\delta` below the horizon and with the sine s between line
+of sight and length. It puts sensors of any number of channels, and ranges, on one scale.
+
 There is one model per detector; p is the mean over all of them, or the model that ``[score] detector`` names. The
 standard error contains how far the detectors disagree (:mod:`egvs.scoring.standard_errors`).
 
 The parameters of the model are in ``target_scores.json`` beside this module. They were trained on the detections of
-each detector at junctions that no result is quoted for (``benchmarks/detectability`` fits them again; docs/validity.md
-shows their accuracy elsewhere). A detection is a box that overlaps the vehicle by more than 0.7, in the mean of the
-overlaps from above and in 3D.
+each detector at junctions that no result is quoted for (``benchmarks/across_junctions`` fits them again;
+docs/validity.md shows their accuracy elsewhere). A detection is a box that overlaps the vehicle by more than 0.7, in
+the mean of the overlaps from above and in 3D.
 
 *People*: pedestrians and bicycles, for whom there is no model, are expected by points. The share of them that is found
 is the share of their observations with at least :data:`PEOPLE_POINTS` points.
@@ -63,6 +73,9 @@ DETECTORS: tuple[str, ...] = get_args(Detector)
 ISOLATED_GAP_M = 20.0
 """A neighbour farther away than this has no influence."""
 
+MAX_SPACING_M = 5.0
+"""Largest spacing of points, also of a vehicle that no beam would meet."""
+
 PEOPLE_POINTS = 20.0
 """Pedestrians and bicycles with at least as many points count as found: there is no model of detectors of people."""
 
@@ -77,12 +90,13 @@ MONOTONICITY = {
     "length_m": 0,
     "range_m": 0,
     "side": 0,
+    "log_spacing": -1,
 }
 """For each feature: 1 if the probability may only rise with it, -1 if it may only fall, 0 for either."""
 
 FEATURES = tuple(MONOTONICITY)
 """Features of the model, see :class:`egvs.scoring.targets.TargetVisibility`: logarithms of 1 + points, gaps of at most
-:data:`ISOLATED_GAP_M`."""
+:data:`ISOLATED_GAP_M`, and the logarithm of :func:`point_spacing_m`."""
 
 
 @dataclass(frozen=True)
@@ -195,7 +209,24 @@ def detectability_features(visible: TargetVisibility) -> FloatArray:
         visible.record.boxes[:, 3],
         visible.range_m,
         visible.side,
+        np.log(point_spacing_m(visible)),
     ])  # fmt: skip
+
+
+def point_spacing_m(visible: TargetVisibility) -> FloatArray:
+    """Return the spacing of the points on each vehicle without other road users in the way, (n,) float64.
+
+    It is in metres, at most :data:`MAX_SPACING_M`. Several sensors together have the spacing of all their points.
+    """
+    length_m, width_m, height_m = visible.record.boxes[:, 3:6].T
+    depression_rad = np.deg2rad(visible.depression_deg)
+    end_on = np.sqrt(np.maximum(1.0 - visible.side**2, 0.0))
+    upright_m2 = height_m * (length_m * visible.side + width_m * end_on)
+    area_m2 = np.cos(depression_rad) * upright_m2 + np.abs(np.sin(depression_rad)) * length_m * width_m
+    alone = visible.points_alone
+    per_point_m2 = np.divide(area_m2, alone, out=np.full(len(visible), np.inf), where=alone > 0.0)
+    spacing_m: FloatArray = np.minimum(np.sqrt(per_point_m2), MAX_SPACING_M)
+    return spacing_m
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,7 +46,7 @@ CROP_CELLS = 128
 BATCH = 8
 
 _MAX_ROAD_DISTANCE_M = 12.0  # of a pose from the region of interest
-_PITCH_DEG = (-15.0, 3.0)
+_PITCH_DEG = (-25.0, 3.0)
 _ROLL_DEG = 2.0
 _MAX_ATTEMPTS = 1000
 _SAMPLES_PER_POSE = 20

@@ -23,6 +23,7 @@ from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.runs import stage_keys
 from egvs.scenario.model import Scenario
+from egvs.sensors.sensor import CATALOGUE
 from egvs.validation.cloud_simulation import CloudSimulator
 from egvs.validation.detection_metrics import EvaluationFrames, GroundTruth, evaluate
 from egvs.validation.detectors.pointpillars import Convention, PointPillars
@@ -31,8 +32,6 @@ from egvs.validation.sweeps import Detections, detections_in_roi
 from egvs.validation.training import pillar_net
 from egvs.validation.training.pillar_net import Batch, PillarNet, compute_loss
 from egvs.validation.training.samples import BATCH, CROP_CELLS, Samples, TrainingJunction
-
-SENSORS = ("VLP-32C", "Pandar XT-32", "OS1-64")
 
 _TRAINING_STREAM, _HELD_OUT_STREAM = 0x7EAC, 0x401D
 """Make the seeds of the training traffic and of the held-out traffic differ from each other and from all others."""
@@ -62,7 +61,7 @@ class Recipe:
     convention
         Where the detector measures heights from.
     sensors
-        Names of sensors.
+        Names of sensors; the whole catalogue by default.
     seed
         Seed of traffic, poses, samples and initial weights.
     look_every
@@ -71,9 +70,9 @@ class Recipe:
 
     steps: int = 3000
     frames: int = 400
-    heights_m: tuple[float, float] = (2.0, 7.0)
+    heights_m: tuple[float, float] = (2.0, 8.0)
     convention: Convention = "ground"
-    sensors: tuple[str, ...] = SENSORS
+    sensors: tuple[str, ...] = tuple(CATALOGUE)
     seed: int = 1
     look_every: int = 500
 
