@@ -85,11 +85,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     step.set_defaults(step=_build)
 
-    step = steps.add_parser("list", help="print the protocol and its hash")
+    step = steps.add_parser("list", parents=[data], help="print the protocol and its hash")
     step.add_argument("--freeze", action="store_true", help="write the hashes of score, detectors and statistics")
     step.set_defaults(step=_list)
 
-    step = steps.add_parser("detector", parents=[data, common], help="train PointPillars (needs PyTorch)")
+    step = steps.add_parser("detector", parents=[data], help="train PointPillars (needs PyTorch)")
+    step.add_argument("--maps", type=Path, metavar="DIR", help="folder of the maps that are not shipped")
     step.add_argument("--steps", type=int, default=TRAINING_STEPS, help="of the training (default %(default)s)")
     step.add_argument("--write", type=Path, metavar="FILE", required=True, help="the model, .onnx")
     step.set_defaults(step=_detector)
@@ -109,7 +110,8 @@ def _parser() -> argparse.ArgumentParser:
     step.set_defaults(step=_measure)
 
     step = steps.add_parser("fit", parents=[data], help="compare models on the training junctions, each on the others")
-    step.add_argument("--detector", metavar="NAME,NAME", help="default: those that the protocol trains with")
+    step.add_argument("--detector", metavar="NAME,NAME", help="to compare for; default: those that train the score")
+    step.add_argument("--without", metavar="NAME,NAME", help="leave these junctions out of the comparison")
     step.add_argument("--write", type=Path, metavar="FILE", help="fit the shipped form and write it, .json")
     step.add_argument("--figure", type=Path, metavar="FILE", help="draw the calibration of --write, .png")
     step.set_defaults(step=_fit)
@@ -178,7 +180,7 @@ def _differences(built: Sequence[build.BuiltJunction]) -> list[str]:
 
 def _list(arguments: argparse.Namespace) -> int:
     if arguments.freeze:
-        print(write_frozen())
+        print(write_frozen(arguments.data / "records"))
     protocol, digests = read_protocol(), ProtocolFiles()
     rule = protocol.candidates
     installed = base.detector_names()
@@ -330,6 +332,14 @@ def _progress(name: str, start_s: float) -> ProgressCallback:
 
 def _fit(arguments: argparse.Namespace) -> int:
     protocol, records = read_protocol(), arguments.data / "records"
+    without = [name.strip() for name in (arguments.without or "").split(",") if name.strip()]
+    for name in without:
+        protocol.junction(name)
+    if arguments.write is not None and (without or arguments.detector):
+        problem = "the shipped models are of all detectors and training junctions"
+        raise InputError("--write", problem, "Leave out --detector and --without.")
+    if arguments.figure is not None and arguments.write is None:
+        raise InputError("--figure", "it shows the models of --write", "Add --write FILE.")
     if arguments.write is not None:
         files.write_text(arguments.write, training.fitted_models(records, protocol))
         print(arguments.write)
@@ -338,7 +348,8 @@ def _fit(arguments: argparse.Namespace) -> int:
             print(arguments.figure)
         return 0
     for name in (arguments.detector or ",".join(protocol.detectors.training)).split(","):
-        lines = training.compare(training.read_training(records, protocol, name), name, arguments.data / "fit")
+        rows = training.read_training(records, protocol, name, without)
+        lines = training.compare(rows, name, arguments.data / ("fit_without" if without else "fit"))
         print("\n".join(lines), flush=True)
     return 0
 

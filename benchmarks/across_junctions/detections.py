@@ -60,6 +60,11 @@ def source_digest(detector: str) -> str:
     return files.hash_json([computing.digest, calling])
 
 
+def settings_digest(detector: str) -> str:
+    """Return the hash of a detector's settings, or of its model."""
+    return files.hash_json(base.make_detector(detector).settings)
+
+
 def dependencies(held_out: HeldOutTraffic, detector: str = POINT_COUNTS_NAME) -> list[dict[str, Any]]:
     """Return what the results at each candidate depend on, besides the source; without a detector, those of sweeps."""
     detectors = {} if detector == POINT_COUNTS_NAME else {detector: base.make_detector(detector)}

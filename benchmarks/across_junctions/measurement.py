@@ -135,7 +135,8 @@ def _measure(plan: PartPlan, jobs: int | None, progress: ProgressCallback) -> Pa
         before = PartInfo.read(path) if path.is_file() else None
         if before is not None and before.key == key:
             return None
-        if before is not None and plan.junction.role != "training" and not plan.again:
+        was_measured = before is not None or _path(plan, plan.part).is_file()
+        if was_measured and plan.junction.role != "training" and not plan.again:
             problem = f"{plan.name} was measured before, by another source or from other inputs"
             hint = 'It should be measured only once. If it must be measured again: --again "REASON", which is recorded.'
             raise InputError(path, problem, hint)
@@ -149,7 +150,7 @@ def _measure(plan: PartPlan, jobs: int | None, progress: ProgressCallback) -> Pa
             _measure_vehicles(plan, held_out, jobs, progress)
         else:
             site_s = _measure_detector(plan, held_out, jobs, progress)
-        reasons = (*(before.again if before else ()), *((plan.again,) if before and plan.again else ()))
+        reasons = (*(before.again if before else ()), *((plan.again,) if was_measured and plan.again else ()))
         return replace(_info(plan, scenario, held_out, key), skipped=skipped, site_s=round(site_s, 2), again=reasons)
 
 
@@ -186,7 +187,8 @@ def _info(plan: PartPlan, scenario: Scenario, held_out: HeldOutTraffic, key: str
     sample = held_out.sample(frames)
     vehicle_frames = sum(len(frame.target_rows(held_out.scene.roi)) for frame in frames)
     return PartInfo(
-        plan.junction.name, plan.junction.role, plan.part, key, source_digest(plan.part), plan.protocol_digest,
+        plan.junction.name, plan.junction.role, plan.part, key, source_digest(plan.part),
+        "" if plan.part in records.NOT_DETECTORS else detections.settings_digest(plan.part), plan.protocol_digest,
         sample.frames, sample.apart_s, sample.vehicles, vehicle_frames, len(held_out.scene.sites),
         {"TPOG": scenario.seed, "unseen": held_out.scenario.seed}, plan.is_trial,
         seconds=0.0, busy_s=0.0, site_s=0.0, machine=Machine.current().model_dump(mode="json"),

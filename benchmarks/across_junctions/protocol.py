@@ -47,14 +47,22 @@ JUDGING = (
     "benchmarks.across_junctions.vehicle_rows",
     "benchmarks.across_junctions.records",
     "benchmarks.across_junctions.detections",
+    "benchmarks.across_junctions.measurement",
     "benchmarks.detectability.additive_model",
+    "benchmarks.detectability.comparison",
     "benchmarks.detectability.fitting",
+    "benchmarks.validity.pools",
     "benchmarks.validity.tables",
+    "egvs.kernels.boosted_trees",
+    "egvs.kernels.vehicle_visibility",
     "egvs.scoring.targets",
+    "egvs.scoring.visibility",
     "egvs.validation.correlation",
     "egvs.validation.detection_metrics",
+    "egvs.validation.surrogate_scores",
+    "egvs.validation.surrogates",
 )
-"""Modules that turn detections into results."""
+"""Modules that compute scores and visibility, and turn detections into results."""
 
 Role = Literal["detector", "training", "held out", "comparison"]
 """What a junction is for: training detectors, training the score, testing it once, or comparison with the source
@@ -358,9 +366,19 @@ def frozen_digests() -> dict[str, str]:
     return digests | {name: stage_keys.text_digest(name) for name in JUDGING}
 
 
-def write_frozen(folder: Path = FOLDER) -> Path:
-    """Write the file of what is frozen, and return its path."""
+def write_frozen(records_folder: Path, folder: Path = FOLDER) -> Path:
+    """Write the file of what is frozen, and return its path.
+
+    Raises
+    ------
+    InputError
+        If a held-out junction was measured already.
+    """
     path = folder / FROZEN_FILE
+    held_out = [junction.name for junction in read_protocol().junctions if junction.role == "held out"]
+    if spent := [name for name in held_out if any(records_folder.glob(f"{name}.*"))]:
+        problem = f"{', '.join(spent)} measured already"
+        raise InputError(records_folder, problem, "What is frozen after the results are known is not frozen.")
     files.write_text(path, files.to_json_text(frozen_digests(), indent=1) + "\n")
     return path
 

@@ -51,6 +51,8 @@ class PartInfo:
         Hash of everything that the part depends on.
     source
         Digest of the source of the program and of the study.
+    settings
+        Hash of the detector's settings, or of its model; empty for other parts.
     protocol
         Hash of the protocol.
     frames, apart_s, vehicles, vehicle_frames
@@ -76,6 +78,7 @@ class PartInfo:
     part: str
     key: str
     source: str
+    settings: str
     protocol: str
     frames: int
     apart_s: float

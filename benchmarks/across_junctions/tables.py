@@ -109,8 +109,8 @@ class Study:
     folder
         Folder of the records.
     records
-        Of the junctions, those of each role together. Junctions without scores are in no table; their detections are
-        used for the baselines that are fitted to training junctions.
+        Of the junctions, those of each role together. Junctions without the main score are listed, and the detections
+        of training junctions are used for the baselines that are fitted to them; they are in no other table.
     """
 
     def __init__(
@@ -122,7 +122,8 @@ class Study:
         resamples: int = RESAMPLES,
     ) -> None:
         self.folder = folder
-        self.records = [record for record in records if record.scores]
+        self.measured = list(records)
+        self.records = [record for record in records if any(name.startswith(MAIN) for name in record.scores)]
         self.protocol, self.protocol_digest = protocol, protocol_digest
         self.detectors = sorted({name for record in records for name in record.detections})
         baselines = TrainedBaselines(records, self.detectors)
@@ -136,11 +137,11 @@ class Study:
 
     def preface(self) -> list[str]:
         """Return the conditions of the study, and what to know before trusting its numbers."""
-        infos = [info for record in self.records for info in record.infos.values()]
+        infos = [info for record in self.measured for info in record.infos.values()]
         hours = sum(info.seconds for info in infos) / 3600
         machines = sorted({f"{info.machine['processor']}, {info.machine['cores']} cores" for info in infos})
         texts = [
-            f"{len(self.records)} junctions, detectors {', '.join(self.detectors) or 'none'}; {len(infos)} parts,"
+            f"{len(self.measured)} junctions, detectors {', '.join(self.detectors) or 'none'}; {len(infos)} parts,"
             f" {hours:.2f} hours on {'; '.join(machines)}."
         ]
         if any(info.is_trial for info in infos):
@@ -151,7 +152,7 @@ class Study:
             if len(digests) > 1:
                 texts.append(f"Parts {part} were measured with {len(digests)} versions of the source.")
         texts += [f"INCOMPLETE: {problem}." for problem in self.missing()]
-        if any(record.role == "held out" for record in self.records):
+        if any(record.role == "held out" for record in self.measured):
             texts += _freeze_problems()
         for info in infos:
             texts += [f"{info.junction}: skipped {reason}" for reason in info.skipped]
@@ -161,7 +162,7 @@ class Study:
     def missing(self) -> list[str]:
         """Return what the aims need and is not there, or was measured under another protocol."""
         texts = []
-        by_name = {record.name: record for record in self.records}
+        by_name = {record.name: record for record in self.measured}
         for junction in self.protocol.junctions:
             if junction.role != "held out":
                 continue
@@ -557,7 +558,7 @@ class Study:
         rows: list[list[Cell]] = [
             [record.name, part, info.frames, info.candidates, number(info.seconds / 60), info.source[:12],
              info.protocol[:12], f"{info.machine['processor']}, {info.machine['cores']} cores"]
-            for record in self.records
+            for record in self.measured
             for part, info in record.infos.items()
         ]  # fmt: skip
         head = [Column("junction"), Column("part"), Column("frames", "whole"), Column("candidates", "whole"),
@@ -584,8 +585,9 @@ class TrainedBaselines:
     """Orders of candidates by sensor and height alone, fitted to the ranks of AP at the training junctions.
 
     A rank counts as a share of the candidates, from 0 to 1. *Sensor* is the mean share of a sensor, *height* the slope
-    of the share over height, and *sensor and height* the least-squares sum of both. A detector that was not run at
-    training junctions gets the mean over the others. A training junction gets what is fitted to the others.
+    of the share over the height above the junction's mean, and *sensor and height* the least-squares sum of both. A
+    detector that was not run at training junctions gets the mean over the others. A training junction gets what is
+    fitted to the others.
 
     Parameters
     ----------
@@ -610,8 +612,10 @@ class TrainedBaselines:
         return {name: effects @ np.mean([fit[name] for fit in fits], axis=0) for name in fits[0]}
 
     def _effects(self, sensors: Sequence[str], height_m: FloatArray) -> FloatArray:
+        """Return a column for each sensor, and the height above the mean of the junction, since shares have the same
+        mean at each."""
         is_sensor = np.array([[sensor == name for name in self._sensors] for sensor in sensors], dtype=np.float64)
-        return np.column_stack([is_sensor, height_m])
+        return np.column_stack([is_sensor, height_m - height_m.mean()])
 
     def _fit(self, records: Sequence[JunctionRecord], detector: str) -> dict[str, FloatArray]:
         """Return the weights of the columns of :meth:`_effects`, by baseline."""
@@ -631,8 +635,8 @@ class TrainedBaselines:
             return weights
 
         slope = np.zeros(count + 1)
-        centred = effect[:, count] - effect[:, count].mean()
-        slope[count] = (centred @ share) / (centred @ centred) if centred.any() else 0.0
+        height = effect[:, count]
+        slope[count] = (height @ share) / (height @ height) if height.any() else 0.0
         return {HEIGHT: slope, SENSOR: solve(range(count)), SENSOR_HEIGHT: solve(range(count + 1))}
 
 

@@ -10,14 +10,15 @@ never read.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import sklearn
 
-from benchmarks.across_junctions.protocol import Protocol
-from benchmarks.across_junctions.records import read_junction
+from benchmarks.across_junctions.detections import settings_digest
+from benchmarks.across_junctions.protocol import Protocol, ProtocolFiles
+from benchmarks.across_junctions.records import info_path, read_junction
 from benchmarks.across_junctions.vehicle_rows import read_rows
 from benchmarks.detectability import comparison, figures, writing
 from benchmarks.detectability.comparison import SiteRows
@@ -25,29 +26,57 @@ from benchmarks.detectability.fitting import Examples, cross_validate, fit_model
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.scoring.target_scores import FEATURES
-from egvs.validation.detectors import base
 
 MIN_JUNCTIONS = 2
 """Each is predicted by the model of the others."""
 
 
-def read_training(records_folder: Path, protocol: Protocol, detector: str) -> dict[str, list[SiteRows]]:
+def read_training(
+    records_folder: Path, protocol: Protocol, detector: str, without: Collection[str] = ()
+) -> dict[str, list[SiteRows]]:
     """Return the rows of the training junctions where a detector was run, by junction and candidate.
+
+    Parameters
+    ----------
+    without
+        Junctions to leave out.
 
     Raises
     ------
     InputError
-        If a record is damaged, or fewer than two junctions were measured.
+        If a record is damaged, is a trial, or was measured with another version of the detector or of the protocol; or
+        if fewer than two junctions were measured.
     """
     each = {}
+    settings, protocol_digest = settings_digest(detector), ProtocolFiles().digest
     for junction in protocol.junctions:
-        if junction.role == "training" and (records_folder / f"{junction.name}.{detector}.json").is_file():
-            record = read_junction(records_folder, junction.name)
-            each[junction.name] = read_rows(records_folder, record, detector)
+        path = info_path(records_folder, junction.name, detector)
+        if junction.role != "training" or junction.name in without or not path.is_file():
+            continue
+        record = read_junction(records_folder, junction.name)
+        info = record.infos[detector]
+        if (info.settings, info.protocol, info.is_trial) != (settings, protocol_digest, False):
+            problem = f"expected {detector} as it is installed, under this protocol, with all frames and candidates"
+            raise InputError(path, problem, f"Measure it again: measure --junction {junction.name} --part {detector}.")
+        each[junction.name] = read_rows(records_folder, record, detector)
     if len(each) < MIN_JUNCTIONS:
         problem = f"expected {MIN_JUNCTIONS} training junctions with {detector}, got {', '.join(each) or 'none'}"
         raise InputError(records_folder, problem, "Measure them: across_junctions measure --role training.")
     return each
+
+
+def check_complete(by_junction: Mapping[str, Sequence[SiteRows]], protocol: Protocol, detector: str) -> None:
+    """Check that every training junction was measured.
+
+    Raises
+    ------
+    InputError
+        Otherwise.
+    """
+    names = [junction.name for junction in protocol.junctions if junction.role == "training"]
+    if missing := [name for name in names if name not in by_junction]:
+        problem = f"{', '.join(missing)} not measured with {detector}"
+        raise InputError("--write", problem, "The shipped models need all training junctions.")
 
 
 def compare(by_junction: Mapping[str, Sequence[SiteRows]], detector: str, out: Path) -> list[str]:
@@ -67,16 +96,17 @@ def fitted_models(records_folder: Path, protocol: Protocol) -> str:
     Raises
     ------
     InputError
-        As :func:`read_training`.
+        As :func:`read_training` and :func:`check_complete`.
     """
     models, settings = {}, {}
     learnt_on: dict[str, writing.TrainingJunction] = {}
     sites: dict[str, dict[str, int]] = {}
     for detector in protocol.detectors.training:
         by_junction = read_training(records_folder, protocol, detector)
+        check_complete(by_junction, protocol, detector)
         examples = {name: _examples(rows) for name, rows in by_junction.items()}
         models[detector] = fit_model(list(examples.values())) | {"elsewhere": cross_validate(examples)}
-        settings[detector] = files.hash_json(base.make_detector(detector).settings)
+        settings[detector] = settings_digest(detector)
         for name, rows in by_junction.items():
             sites.setdefault(name, {})[detector] = len(rows)
             sensors = tuple(sorted(set(read_junction(records_folder, name).sensors)))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.across_junctions.detections import AP
-from benchmarks.across_junctions.records import JunctionRecord, read_table
+from benchmarks.across_junctions.records import VEHICLES, JunctionRecord, read_table
 from benchmarks.detectability.additive_model import DIRECTIONS, TargetFeatures
 from benchmarks.detectability.comparison import SiteRows, models_for
 from egvs.core.errors import InputError
@@ -28,7 +28,11 @@ def read_rows(folder: Path, record: JunctionRecord, detector: str) -> list[SiteR
     """
     seen = read_table(folder / f"{record.name}.features.parquet")
     found = read_table(folder / f"{record.name}.{detector}.hits.parquet")
-    if seen["site"] != found["site"] or seen["row"] != found["row"]:
+    traffics = {
+        (info.frames, info.vehicles, info.vehicle_frames, tuple(info.seeds.items()))
+        for info in (record.infos[VEHICLES], record.infos[detector])
+    }
+    if seen["site"] != found["site"] or seen["row"] != found["row"] or len(traffics) > 1:
         problem = f"its rows are not those of {record.name}.{detector}.hits.parquet"
         raise InputError(folder / f"{record.name}.features.parquet", problem, "Measure both parts again.")
     count = seen.num_rows // len(record.sites)

@@ -252,11 +252,10 @@ def table(
 
 
 def reliability(by_junction: Mapping[str, Sequence[SiteRows]], form: ModelForm) -> figures.Curves:
-    """Return the calibration of each junction predicted by the others: probability, share found, and number."""
-    rows = {name: training_rows(sites) for name, sites in by_junction.items()}
+    """Return the calibration of each junction predicted by the others, of vehicle-frames with points."""
+    each = {name: training_rows(sites) for name, sites in by_junction.items()}
     curves = {}
-    for name, sites in by_junction.items():
-        model = fit([each for other, each in rows.items() if other != name], form)
-        chances = np.concatenate([chances_of(model, site) for site in sites])
-        curves[name] = curve(chances, np.concatenate([site.hits for site in sites]))
+    for name, rows in each.items():
+        model = fit([others for other, others in each.items() if other != name], form)
+        curves[name] = curve(model.chances(rows.features), rows.hits)
     return curves

@@ -390,6 +390,10 @@ MACHINE = {"processor": "p", "cores": 2}
 VARIANTS = [f"expected_detections (detectors {names})" for names in ("cluster+pointpillars", "cluster", "pointpillars")]
 
 
+def _settings(part: str) -> str:
+    return "" if part in records.NOT_DETECTORS else detections.settings_digest(part)
+
+
 def write_junction(
     folder: Path,
     name: str,
@@ -418,8 +422,8 @@ def write_junction(
         "half_1": values.tolist(), "half_2": values.tolist(),
     })  # fmt: skip
     for part in ("scores", detector):
-        PartInfo(name, role, part, "k", "s", "p", 120, 7.0, 50, 900, len(ap), {"TPOG": 1, "unseen": 2}, False, 60.0,
-                 50.0, 2.0 if part == detector else 0.0, MACHINE).write(folder)  # fmt: skip
+        PartInfo(name, role, part, "k", "s", _settings(part), "p", 120, 7.0, 50, 900, len(ap), {"TPOG": 1, "unseen": 2},
+                 False, 60.0, 50.0, 2.0 if part == detector else 0.0, MACHINE).write(folder)  # fmt: skip
 
 
 @pytest.fixture
@@ -645,16 +649,30 @@ def write_rows(
 
 
 @pytest.mark.system  # scikit-learn asks the system for its cores
-def test_models_are_fitted_to_training_records(tmp_path: Path) -> None:
+def test_models_are_fitted_to_training_records(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder, detectors = tmp_path / "records", read_protocol().detectors.training
     folder.mkdir()
     rng = np.random.default_rng(11)
     for name in ("hill", "xian", "town01"):  # the last is held out
         write_rows(folder, name, detectors, rng)
+        for part in detectors:
+            info = PartInfo.read(folder / f"{name}.{part}.json")
+            replace(info, protocol=ProtocolFiles().digest).write(folder)
+    write = ["fit", "--data", str(tmp_path), "--write", str(tmp_path / "models.json")]
+    assert command.main(write) == 2
+    assert "roundabout" in (text := capsys.readouterr().err) and "not measured with cluster" in text
+    assert command.main([*write, "--without", "hill"]) == 2
+    assert "the shipped models are of all" in capsys.readouterr().err
+    of_two = [junction for junction in read_protocol().junctions if junction.name in ("hill", "xian", "town01")]
+    small = read_protocol().model_copy(update={"junctions": tuple(of_two)})
+    monkeypatch.setattr(command, "read_protocol", lambda: small)
     by_junction = training.read_training(folder, read_protocol(), "cluster")
     assert list(by_junction) == ["hill", "xian"]
     assert [site.group for site in by_junction["hill"]] == ["2 m"] * 16 + ["5 m"] * 16
-    assert command.main(["fit", "--data", str(tmp_path), "--write", str(tmp_path / "models.json")]) == 0
+    assert command.main([*write, "--figure", str(tmp_path / "its.png")]) == 0
+    assert (tmp_path / "its.png").read_bytes().startswith(b"\x89PNG")
     content = json.loads((tmp_path / "models.json").read_text(encoding="utf-8"))
     assert list(content["about"]["learnt_on"]) == ["hill", "xian"]
     model = DetectabilityModel.of(content["detectors"]["cluster"])
@@ -662,6 +680,19 @@ def test_models_are_fitted_to_training_records(tmp_path: Path) -> None:
     few[FEATURES.index("log_points")], many[FEATURES.index("log_points")] = 0.5, 4.0
     few_chance, many_chance = model.chances(np.array([few, many])).tolist()
     assert (few_chance, many_chance) == pytest.approx((0.5 / 6, 4.0 / 6), abs=0.2)
+    info = PartInfo.read(folder / "hill.cluster.json")
+    replace(info, vehicles=51).write(folder)
+    with pytest.raises(InputError, match=r"hill\.features\.parquet: its rows are not those"):  # of other traffic
+        training.read_training(folder, read_protocol(), "cluster")
+    for other in (
+        replace(info, settings="of another version"),
+        replace(info, protocol="p"),
+        replace(info, is_trial=True),
+    ):
+        other.write(folder)
+        with pytest.raises(InputError, match=r"hill\.cluster\.json: expected cluster as it is installed"):
+            training.read_training(folder, read_protocol(), "cluster")
+    info.write(folder)
     damaged = records.read_table(folder / "hill.cluster.hits.parquet").slice(1)
     write_table(folder / "hill.cluster.hits.parquet", damaged.to_pydict())
     with pytest.raises(InputError, match=r"hill\.features\.parquet: its rows are not those"):
@@ -687,7 +718,7 @@ def test_halves_of_the_frames_are_alternate_blocks() -> None:
 
 def test_hours_by_hand() -> None:
     protocol = read_protocol()
-    info = PartInfo("j", "training", "cluster", "", "", "", 20, 7.0, 1, 1, 8, {}, True, 9.0, 8.0, 0.5, MACHINE)
+    info = PartInfo("j", "training", "cluster", "", "", "", "", 20, 7.0, 1, 1, 8, {}, True, 9.0, 8.0, 0.5, MACHINE)
     frames = [protocol.frames_of(junction) for junction in protocol.measured_junctions]
     assert sorted(frames) == [60] * 12 + [120] * 6 + [320]
     assert costs.estimated_s([info], protocol) == {"cluster": pytest.approx(48 * 6 * 0.5 + 40)}  # 48 sites, 120 frames
@@ -724,7 +755,7 @@ def test_rejects_measurements_that_would_spend_held_out_junctions(
 def test_held_out_junctions_need_what_is_tested_to_be_frozen(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="are not frozen yet"):
         check_frozen(tmp_path)
-    path = write_frozen(tmp_path)
+    path = write_frozen(tmp_path / "records", tmp_path)
     check_frozen(tmp_path)
     frozen = json.loads(path.read_text(encoding="utf-8"))
     assert {
@@ -738,6 +769,10 @@ def test_held_out_junctions_need_what_is_tested_to_be_frozen(tmp_path: Path) -> 
     path.write_text(json.dumps(frozen | {"score": "another", "cluster": "another"}), encoding="utf-8")
     with pytest.raises(InputError, match="cluster, score changed since they were frozen"):
         check_frozen(tmp_path)
+    (tmp_path / "records").mkdir()
+    (tmp_path / "records" / "town01.cluster.json").touch()
+    with pytest.raises(InputError, match="town01 measured already"):
+        write_frozen(tmp_path / "records", tmp_path)
 
 
 def test_list_prints_the_hash(capsys: pytest.CaptureFixture[str]) -> None:

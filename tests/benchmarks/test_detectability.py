@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -108,8 +109,8 @@ def test_a_planted_dependence_is_found_and_holds_elsewhere() -> None:
     held = fitting.cross_validate(given)
     assert list(held["rho_with_ap"]) == list(given) and min(held["rho_with_ap"].values()) == 1.0
     parts = held["calibration"]
-    assert sum(part["vehicle_frames"] for part in parts) == 3 * 4 * 500
-    assert sum(part["vehicle_frames"] * abs(part["chance"] - part["found"]) for part in parts) < 0.03 * 3 * 4 * 500
+    count = sum(part["vehicle_frames"] for part in parts)
+    assert sum(part["vehicle_frames"] * abs(part["chance"] - part["found"]) for part in parts) < 0.03 * count
 
 
 def test_vehicles_without_points_and_busy_junctions_do_not_change_a_model() -> None:
@@ -125,8 +126,14 @@ def test_vehicles_without_points_and_busy_junctions_do_not_change_a_model() -> N
     assert DetectabilityModel.of(fitting.fit_model([always, never])).chances(x)[0] == pytest.approx(0.5, abs=0.05)
 
     left_out = fitting.cross_validate({"one": with_hidden, "two": second, "three": random_detections(3)})
-    (lowest, *_) = left_out["calibration"]
-    assert lowest["vehicle_frames"] >= 900 and lowest["found"] > 0.3  # predicted 0, found nevertheless
+    assert sum(part["vehicle_frames"] for part in left_out["calibration"]) == sum(
+        int(fitting.has_points(x).sum()) for seed in (1, 2, 3) for x in random_detections(seed).features
+    )
+
+
+def test_thresholds_are_not_rounded_below_a_value_of_the_data() -> None:
+    assert fitting._short_above(math.log(2.0)) == 0.693148  # 0.69314718: one point stays below or on it
+    assert fitting._short_above(2.5) == 2.5 and fitting._short_above(-0.1234564) == -0.123456
 
 
 # the file
@@ -147,7 +154,8 @@ def test_the_shipped_file_is_as_it_would_be_written_again() -> None:
     assert writing.text(about_of(shipped), shipped["detectors"]) == text
     for name, its in shipped["detectors"].items():
         counts = {n: j["sites"][name] * j["vehicle_frames"] for n, j in shipped["about"]["learnt_on"].items()}
-        assert sum(part["vehicle_frames"] for part in its["elsewhere"]["calibration"]) == sum(counts.values())
+        seen = sum(part["vehicle_frames"] for part in its["elsewhere"]["calibration"])  # those with points
+        assert 0.3 * sum(counts.values()) < seen < sum(counts.values())
 
 
 def test_the_shipped_models_are_of_the_detectors_that_are_shipped() -> None:
