@@ -39,6 +39,7 @@ from benchmarks.across_junctions.protocol import (
     ProtocolFiles,
     Terrain,
     check_frozen,
+    detector_junctions,
     read_protocol,
     write_frozen,
 )
@@ -59,6 +60,7 @@ from egvs.traffic import sumo_folder
 from egvs.validation import surrogates
 from egvs.validation.correlation import MeasureValues
 from egvs.validation.detectors import cluster
+from egvs.validation.detectors.pointpillars import SHIPPED_MODEL, OnnxModel
 from egvs.validation.held_out_traffic import prepare_held_out_traffic
 from egvs.world.carriageway import Carriageway
 from tests.conftest import write_mini
@@ -89,6 +91,13 @@ def test_the_protocol_has_the_hash_that_was_written_down() -> None:
     text = (DOCS / "validity.md").read_text(encoding="utf-8")
     (frozen,) = re.findall(r"SHA-256 of the protocol[^`]*`([0-9a-f]{64})`", text)
     assert ProtocolFiles().digest == frozen
+
+
+def test_the_shipped_detector_was_trained_as_the_command_trains_it() -> None:
+    metadata = OnnxModel.load(SHIPPED_MODEL).metadata
+    assert metadata["junctions"] == [junction.name for junction in detector_junctions(read_protocol())]
+    assert metadata["recipe"]["steps"] == command.TRAINING_STEPS
+    assert metadata["recipe"]["sensors"] == list(CATALOGUE)
 
 
 def test_every_junction_has_its_candidates_and_its_scenario() -> None:
