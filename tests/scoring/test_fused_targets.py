@@ -86,7 +86,7 @@ def test_two_equal_sensors_at_one_pole_add_points_and_nothing_else() -> None:
     independent = 1.0 - (1.0 - single) ** 2
     visible = one.points > 0.0
     assert (doubled >= single).all()
-    assert doubled[visible].mean() < independent[visible].mean() - 0.02
+    assert doubled[visible].mean() < 0.9 * independent[visible].mean()
 
 
 def test_one_sensor_alone_is_itself_and_an_unseen_vehicle_stays_unseen() -> None:
