@@ -87,6 +87,7 @@ def _parser() -> argparse.ArgumentParser:
 
     step = steps.add_parser("list", parents=[data], help="print the protocol and its hash")
     step.add_argument("--freeze", action="store_true", help="write the hashes of score, detectors and statistics")
+    step.add_argument("--again", metavar="REASON", help="freeze after a held-out junction was measured; recorded")
     step.set_defaults(step=_list)
 
     step = steps.add_parser("detector", parents=[data], help="train PointPillars (needs PyTorch)")
@@ -180,7 +181,7 @@ def _differences(built: Sequence[build.BuiltJunction]) -> list[str]:
 
 def _list(arguments: argparse.Namespace) -> int:
     if arguments.freeze:
-        print(write_frozen(arguments.data / "records"))
+        print(write_frozen(arguments.data / "records", again=arguments.again or ""))
     protocol, digests = read_protocol(), ProtocolFiles()
     rule = protocol.candidates
     installed = base.detector_names()

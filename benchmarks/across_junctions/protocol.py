@@ -40,6 +40,9 @@ T = TypeVar("T")
 JUNCTIONS_FILE, CANDIDATES_FILE, WORLDS_FILE = "junctions.toml", "candidates.csv", "worlds.csv"
 FROZEN_FILE = "frozen.json"
 
+AGAIN = "frozen again"
+"""Key of the reasons in the file of what is frozen."""
+
 JUDGING = (
     "benchmarks.across_junctions.statistics",
     "benchmarks.across_junctions.tables",
@@ -366,21 +369,37 @@ def frozen_digests() -> dict[str, str]:
     return digests | {name: stage_keys.text_digest(name) for name in JUDGING}
 
 
-def write_frozen(records_folder: Path, folder: Path = FOLDER) -> Path:
+def write_frozen(records_folder: Path, folder: Path = FOLDER, again: str = "") -> Path:
     """Write the file of what is frozen, and return its path.
+
+    Parameters
+    ----------
+    again
+        Why something may be frozen again after a held-out junction was measured; it is recorded.
 
     Raises
     ------
     InputError
-        If a held-out junction was measured already.
+        If a held-out junction was measured already, and no reason is given.
     """
     path = folder / FROZEN_FILE
     held_out = [junction.name for junction in read_protocol().junctions if junction.role == "held out"]
-    if spent := [name for name in held_out if any(records_folder.glob(f"{name}.*"))]:
+    spent = [name for name in held_out if any(records_folder.glob(f"{name}.*"))]
+    if spent and not again:
         problem = f"{', '.join(spent)} measured already"
-        raise InputError(records_folder, problem, "What is frozen after the results are known is not frozen.")
-    files.write_text(path, files.to_json_text(frozen_digests(), indent=1) + "\n")
+        hint = 'What is frozen after that is hardly frozen. If it must be: --again "REASON", which is recorded.'
+        raise InputError(records_folder, problem, hint)
+    reasons = [*frozen_again(folder), *([again] if again else [])]
+    content = frozen_digests() | ({AGAIN: reasons} if reasons else {})
+    files.write_text(path, files.to_json_text(content, indent=1) + "\n")
     return path
+
+
+def frozen_again(folder: Path = FOLDER) -> list[str]:
+    """Return why something was frozen again after a held-out junction was measured."""
+    path = folder / FROZEN_FILE
+    reasons: list[str] = json.loads(path.read_text(encoding="utf-8")).get(AGAIN, []) if path.is_file() else []
+    return reasons
 
 
 def check_frozen(folder: Path = FOLDER) -> None:
@@ -397,6 +416,7 @@ def check_frozen(folder: Path = FOLDER) -> None:
     if not path.is_file():
         raise InputError(path, "score, detectors and statistics are not frozen yet", hint)
     frozen, present = json.loads(path.read_text(encoding="utf-8")), frozen_digests()
-    changed = sorted(name for name in frozen.keys() | present.keys() if frozen.get(name) != present.get(name))
+    names = (frozen.keys() | present.keys()) - {AGAIN}
+    changed = sorted(name for name in names if frozen.get(name) != present.get(name))
     if changed:
         raise InputError(path, f"{', '.join(changed)} changed since they were frozen", hint)

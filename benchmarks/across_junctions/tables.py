@@ -28,7 +28,7 @@ import numpy as np
 
 from benchmarks.across_junctions import calibration
 from benchmarks.across_junctions.detections import AP
-from benchmarks.across_junctions.protocol import MIN_SITES_OF_A_HEIGHT, ROLES, Protocol, check_frozen
+from benchmarks.across_junctions.protocol import MIN_SITES_OF_A_HEIGHT, ROLES, Protocol, check_frozen, frozen_again
 from benchmarks.across_junctions.records import VEHICLES, JunctionRecord, junction_names, read_junction
 from benchmarks.across_junctions.statistics import (
     MIN_SITES_OF_A_SENSOR,
@@ -153,6 +153,7 @@ class Study:
                 texts.append(f"Parts {part} were measured with {len(digests)} versions of the source.")
         texts += [f"INCOMPLETE: {problem}." for problem in self.missing()]
         if any(record.role == "held out" for record in self.measured):
+            texts += [f"Frozen again after a held-out junction was measured: {reason}" for reason in frozen_again()]
             texts += _freeze_problems()
         for info in infos:
             texts += [f"{info.junction}: skipped {reason}" for reason in info.skipped]

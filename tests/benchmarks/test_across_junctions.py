@@ -40,6 +40,7 @@ from benchmarks.across_junctions.protocol import (
     Terrain,
     check_frozen,
     detector_junctions,
+    frozen_again,
     read_protocol,
     write_frozen,
 )
@@ -782,6 +783,10 @@ def test_held_out_junctions_need_what_is_tested_to_be_frozen(tmp_path: Path) -> 
     (tmp_path / "records" / "town01.cluster.json").touch()
     with pytest.raises(InputError, match="town01 measured already"):
         write_frozen(tmp_path / "records", tmp_path)
+    write_frozen(tmp_path / "records", tmp_path, again="a fault in the cable")
+    check_frozen(tmp_path)
+    write_frozen(tmp_path / "records", tmp_path, again="another one")
+    assert frozen_again(tmp_path) == ["a fault in the cable", "another one"]
 
 
 def test_list_prints_the_hash(capsys: pytest.CaptureFixture[str]) -> None:
