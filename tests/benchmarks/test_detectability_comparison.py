@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmarks.across_junctions.protocol import read_protocol
 from benchmarks.detectability import additive_fitting, comparison, figures, fitting
 from benchmarks.detectability.additive_fitting import TrainingRows, choose_knots, fit_additive, ramps
 from benchmarks.detectability.additive_model import DIRECTIONS, TargetFeatures
@@ -165,7 +166,8 @@ def test_differences_are_from_the_shipped_form():
 
 
 def test_shipped_training_junctions_are_those_of_the_file():
-    assert comparison.shipped_training_junctions() == {"ingolstadt", "hill", "roundabout", "osm_training"}
+    training = {junction.name for junction in read_protocol().junctions if junction.role == "training"}
+    assert comparison.shipped_training_junctions() == training
 
 
 def test_trees_keep_the_directions_and_weight_junctions_equally(monkeypatch):

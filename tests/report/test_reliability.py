@@ -44,12 +44,12 @@ def test_one_mount_on_each_pole_has_no_limits() -> None:
     assert describe_reliability(ranked(("a", 3, 0, 9.0), ("b", 6, 0, 5.0))) == []
 
 
-@pytest.mark.parametrize(("pitch_deg", "is_tilted"), [(-5.0, True), (5.0, True), (-4.9, False), (0.0, False)])
-def test_says_that_tilted_sensors_were_not_validated(pitch_deg: float, is_tilted: bool) -> None:
+@pytest.mark.parametrize(("pitch_deg", "is_tilted"), [(-29.0, True), (5.0, True), (-10.0, False), (0.0, False)])
+def test_says_that_larger_tilts_were_not_validated(pitch_deg: float, is_tilted: bool) -> None:
     sentences = describe_reliability(ranked(("a", 3, pitch_deg, 9.0), ("b", 3, 0, 5.0)))
     assert sentences == is_tilted * [
-        f"The sensor of a@3m{pitch_deg:+g}deg is tilted; tilted sensors were not part of the validation "
-        "(docs/validity.md)."
+        f"The sensor of a@3m{pitch_deg:+g}deg is tilted by more than those of the validation (pitch -25 to 0 degrees, "
+        "roll up to 3 degrees; docs/validity.md)."
     ]
 
 

@@ -11,7 +11,12 @@ from egvs.report.ranking import RankedSite, Ranking
 from egvs.scenario.score_config import DEFAULT_SCORE
 
 MIN_TILT_DEG = 5.0
-"""A sensor is called tilted from this pitch or roll on. The sensors of the validation study were level."""
+"""A sensor is called tilted from this pitch on."""
+
+VALIDATED_PITCH_DEG, VALIDATED_ROLL_DEG = (-25.0, 0.0), 3.0
+"""Limits of pitch, and of roll to either side, of the sensors in the validation study."""
+
+_PITCH_TOLERANCE_DEG = 3.0  # no note on a mount that is aimed slightly up
 
 _ERROR_NOTE = "± is the error of a finite {} only"
 _SEEDS_NOTE = "± is the error of finite simulations only, from the differences between {} of them"
@@ -25,7 +30,10 @@ _SIZE_NOTE = (
     "27 percentage points fewer vehicles than expected (docs/validity.md)."
 )
 _COVERAGE_NOTE = "The recorded tracks cover {} of the {}; elsewhere the traffic is unknown."
-_TILT_NOTE = "The sensor of {} is tilted; tilted sensors were not part of the validation (docs/validity.md)."
+_TILT_NOTE = (
+    "The sensor of {} is tilted by more than those of the validation (pitch -25 to 0 degrees, roll up to 3 degrees; "
+    "docs/validity.md)."
+)
 
 
 def describe_reliability(
@@ -35,7 +43,7 @@ def describe_reliability(
 
     - With several simulations: that errors come from their differences.
     - By ``expected_detections``: what the standard errors contain, and how far the size of the score was validated.
-    - The best site is tilted.
+    - The best site is tilted by more than the sensors of the validation study.
     - The traffic was recorded: what share of the region the recording covers.
     - The best site is the lowest, the highest or the most tilted of those on its pole, so that others may be better.
 
@@ -64,7 +72,9 @@ def describe_reliability(
     sentences += [
         _COVERAGE_NOTE.format(format_percent(coverage["share"], 0), coverage["of"]) for coverage in recordings
     ]
-    if max(abs(best.pitch_deg), abs(best.roll_deg)) >= MIN_TILT_DEG:
+    low_deg, high_deg = VALIDATED_PITCH_DEG
+    is_pitched = not low_deg - _PITCH_TOLERANCE_DEG <= best.pitch_deg <= high_deg + _PITCH_TOLERANCE_DEG
+    if is_pitched or abs(best.roll_deg) > VALIDATED_ROLL_DEG:
         sentences.append(_TILT_NOTE.format(best.site))
     limits = list(_limits(best, [site for site in ranking.sites if site.pole == best.pole]))
     if limits:
