@@ -122,9 +122,9 @@ def test_shipped_model_has_metadata():
 
 @pytest.mark.slow
 def test_shipped_model_detects_cars(mini, tmp_path):
-    """From both sites, with a sensor of the catalogue: every car with 100 points, to half a metre."""
+    """From both sites, with a sensor of the catalogue: every car with 100 points to a metre, nearly all to half."""
     record = prepare_held_out_traffic(load(mini, ["sites.sensor=VLP-32C"]), tmp_path / "r", 10)
-    task, checked = SiteDetectionTask(record, {"pointpillars": pointpillars.PointPillars()}), 0
+    task, distances_m = SiteDetectionTask(record, {"pointpillars": pointpillars.PointPillars()}), []
     for site in record.scene.sites:
         results = task.at(site, [POINTS_ON, "pointpillars"])
         boxes, points = results["pointpillars"], results[POINTS_ON]
@@ -132,6 +132,7 @@ def test_shipped_model_detects_cars(mini, tmp_path):
         for frame, detections, on in zip(record.read(), boxes.frames, points.points, strict=True):
             certain = detections.boxes[detections.scores > 0.3]
             for box in frame.boxes[frame.target_rows(record.scene.roi)][on >= 100]:
-                assert np.hypot(*(certain[:, :2] - box[:2]).T).min(initial=9.0) < 0.5, (site.name, frame.number)
-                checked += 1
-    assert checked > 20
+                distances_m.append(np.hypot(*(certain[:, :2] - box[:2]).T).min(initial=9.0))
+                assert distances_m[-1] < 1.0, (site.name, frame.number)
+    assert len(distances_m) > 20
+    assert np.quantile(distances_m, 0.9) < 0.5
