@@ -10,6 +10,7 @@ from benchmarks import sensor_heights
 from benchmarks.validity import low_models
 
 
+@pytest.mark.system
 @pytest.mark.slow
 def test_measures_every_detector_at_every_site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sensor_heights, "DETECTORS", (low_models.SENSOR, "cluster"))

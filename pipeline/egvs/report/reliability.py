@@ -26,8 +26,8 @@ _SEEDS_NOTE_OF_DETECTORS = (
     "({}) disagree"
 )
 _SIZE_NOTE = (
-    "The order of sites by this score was validated, the size of the score less: in the studies, detectors found up to "
-    "27 percentage points fewer vehicles than expected (docs/validity.md)."
+    "The order of sites by this score was validated better than its size: in the study, which was simulated, the "
+    "shares that detectors found differed from the expected ones by 3 to 8 percentage points (docs/validity.md)."
 )
 _COVERAGE_NOTE = "The recorded tracks cover {} of the {}; elsewhere the traffic is unknown."
 _TILT_NOTE = (

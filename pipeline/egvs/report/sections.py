@@ -49,10 +49,9 @@ RHO: Mapping[str, Mapping[str, float]] = json.loads(
 -> rho with AP (mean of BEV and 3D, IoU 0.7), from the table of all scores under F in docs/validity-tables.md. The EGVS
 has one entry per setting, named by :func:`egvs_setting`."""
 
-RHO_RANGE = (
-    "0.83 to 0.97, depending on junction and detector; among sites of equal height in dense queues, about 0.2 to 0.96"
-)
-"""Rank correlation of the recommended score with detection, over junctions and detectors (docs/validity.md, F)."""
+RHO_RANGE = "0.93 to 0.98, depending on junction and detector; among sites of equal height, 0.90 to 0.97"
+"""Rank correlation of the recommended score with detection, over the held-out junctions and the detectors of the larger
+study (docs/validity.md)."""
 
 NAMED_POLES = 5
 """Poles at the head of the ranking whose location in a lane is stated with the result."""
