@@ -27,12 +27,13 @@ _SEEDS_NOTE_OF_DETECTORS = (
 )
 _SIZE_NOTE = (
     "The order of sites by this score was validated better than its size: in the study, which was simulated, the "
-    "shares that detectors found differed from the expected ones by 3 to 8 percentage points (docs/validity.md)."
+    "shares found differed from the expected ones by 3 to 8 percentage points for the detectors that it stands for, "
+    "and by up to 14 for another one (docs/validity.md)."
 )
 _COVERAGE_NOTE = "The recorded tracks cover {} of the {}; elsewhere the traffic is unknown."
 _TILT_NOTE = (
-    "The sensor of {} is tilted by more than those of the validation (pitch -25 to 0 degrees, roll up to 3 degrees; "
-    "docs/validity.md)."
+    "The tilt of {} is outside the range of the validation (pitch -25 to 0 degrees, positive is up; roll up to 3 "
+    "degrees; docs/validity.md)."
 )
 
 
@@ -43,7 +44,7 @@ def describe_reliability(
 
     - With several simulations: that errors come from their differences.
     - By ``expected_detections``: what the standard errors contain, and how far the size of the score was validated.
-    - The best site is tilted by more than the sensors of the validation study.
+    - The tilt of the best site is outside the range of the validation study.
     - The traffic was recorded: what share of the region the recording covers.
     - The best site is the lowest, the highest or the most tilted of those on its pole, so that others may be better.
 
