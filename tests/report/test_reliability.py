@@ -48,8 +48,8 @@ def test_one_mount_on_each_pole_has_no_limits() -> None:
 def test_says_that_larger_tilts_were_not_validated(pitch_deg: float, is_tilted: bool) -> None:
     sentences = describe_reliability(ranked(("a", 3, pitch_deg, 9.0), ("b", 3, 0, 5.0)))
     assert sentences == is_tilted * [
-        f"The tilt of a@3m{pitch_deg:+g}deg is outside the range of the validation (pitch -25 to 0 degrees, positive is "
-        "up; roll up to 3 degrees; docs/validity.md)."
+        f"The tilt of a@3m{pitch_deg:+g}deg is outside the range of the validation (pitch -25 to 0 degrees, positive "
+        "is up; roll up to 3 degrees; docs/validity.md)."
     ]
 
 
