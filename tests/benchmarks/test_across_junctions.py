@@ -101,6 +101,25 @@ def test_the_shipped_detector_was_trained_as_the_command_trains_it() -> None:
     assert metadata["recipe"]["sensors"] == list(CATALOGUE)
 
 
+def test_the_results_of_each_junction_are_those_of_the_tables() -> None:
+    page = (DOCS / "validity.md").read_text(encoding="utf-8")
+    results = page.partition("\n## The larger study: results\n")[2].partition("\n## The larger study: protocol\n")[0]
+    protocol, shown = read_protocol(), {}
+    names = {junction.name for junction in protocol.junctions}
+    for line in results.splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if len(cells) == 10 and cells[0] in names:
+            for number, detector in enumerate(protocol.detectors.held_out):
+                shown[cells[0], detector] = cells[3 * number + 1 : 3 * number + 4]
+    (table,) = (each for each in table_files.read(DOCS / "data" / "larger_study")[1] if each.name == "2 by junction")
+    for name, role, detector, _, score, rho, within, _, _, regret, crossed, *_ in table.rows:
+        if role != "training" and score == VARIANTS[0]:
+            value, low, high = rho
+            expected = [f"{value:.2f} ({low:.2f} to {high:.2f})", f"{within[0]:.2f}", f"{regret:.1f}, {crossed:.1f}"]
+            assert shown.pop((name, detector)) == expected
+    assert all(cells == ["", "", ""] for cells in shown.values())  # not measured
+
+
 def test_every_junction_has_its_candidates_and_its_scenario() -> None:
     protocol, drawn = read_protocol(), candidates.read_candidates()
     assert list(drawn) == [junction.name for junction in protocol.measured_junctions]
