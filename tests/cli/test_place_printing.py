@@ -22,8 +22,8 @@ The plan a, b should find 99.2 ± 0.3 % of vehicles, 99.8 % of what all 12 candi
 proved: no plan within the rules is better.
 A second sensor adds 4.7 ± 0.5 percentage points to the share of vehicles found: 99.2 %, against 94.5 % with one. \
 Try --count 3 to see what a third adds.
-Joint shares assume that sensors miss vehicles independently of each other; near 100 % they are upper ends \
-(docs/placement.md).
+Joint shares are for sensors that detect each by itself, and assume that they miss vehicles independently of each \
+other; near 100 % they are upper ends (docs/placement.md).
 """
 
 
@@ -94,8 +94,8 @@ def test_values_in_fused_clouds_follow_the_assumption(capsys: pytest.CaptureFixt
         PlanStep(2, 0.9713, 0.0258, True, 0.004, 0.006, 0.999),
     )
     first = (
-        "Found in fused point clouds: 94.5 ± 0.9 % with the first sensor, 97.1 ± 0.4 % with 2 (the last one adds 2.6 "
-        "± 0.6 percentage points)"
+        "Found where all point clouds are fused before detection: 94.5 ± 0.9 % with the first sensor, 97.1 ± 0.4 % "
+        "with 2 (the last one adds 2.6 ± 0.6 percentage points)"
     )
     assert printed(placed_two(fused=FusedPlan(steps)), capsys).endswith(f"{LAST_LINES}{first}.\n")
     text = printed(placed_two(fused=FusedPlan(steps, searched=True)), capsys)

@@ -462,7 +462,7 @@ def test_kml_has_footprints_in_range_and_blindspots_of_the_best_on_each_pole(tmp
     best = {pole: min((r for r in rows if r["pole"] == pole), key=lambda r: r["rank"]) for pole in ("pole_a", "pole_b")}
     folders = {folder.find(f"{KML}name").text for folder in ET.fromstring(text).iter(f"{KML}Folder")}
     assert {name for name in folders if "@" in name} == {row["site"] for row in best.values()}
-    assert "footprints: 2 of 3, those within the range of a sensor; the other formats have all" in kml.notes
+    assert "footprints: 2 of 3, those within the range of a sensor; GeoPackage and GeoJSON files have all" in kml.notes
     assert any(note.startswith("blindspots: ") and "best candidate on each of" in note for note in kml.notes)
 
     everything = export_run(tmp_path / "run", "geojson", out=tmp_path / "all")

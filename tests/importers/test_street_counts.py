@@ -75,6 +75,7 @@ def test_lane_groups_name_the_heading(group: str, expected: tuple[str, str], rea
 def test_ids_of_edges_still_work(read: Read) -> None:
     counts = read("edge,from_edge,to_edge,count", f"{FROM_WEST},,,50", f",{FROM_NORTH},{TO_SOUTH},70")
     assert rates(counts) == {(FROM_WEST, ""): 50.0, (FROM_NORTH, TO_SOUTH): 70.0}
+    assert counts.describe() == "120 vehicles an hour in 1 movement and 1 approach without turns, counted (counts.csv)"
 
 
 # --- numbers ---------------------------------------------------------------------------------------------------------

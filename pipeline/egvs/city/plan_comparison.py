@@ -109,7 +109,7 @@ def compare_plans(folders: Sequence[Path], progress: ProgressCallback = no_progr
     """
     if len(folders) < 2 or len({folder.resolve() for folder in folders}) < len(folders):
         problem = f"expected two or more different folders, got {', '.join(map(str, folders))}"
-        raise InputError("egvs city compare", problem, "Give one folder for each traffic demand.")
+        raise InputError("RUN", problem, "Give one folder for each traffic demand.")
     junctions = _check_equal_junctions(folders)
     plans = tuple(_read_plan(folder, junctions) for folder in folders)
     for folder, plan in zip(folders, plans, strict=True):

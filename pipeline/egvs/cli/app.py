@@ -596,7 +596,7 @@ def sensors(
     if not names:
         run_tables.print_sensors(CATALOGUE.values())
         return
-    check_sensor_names(names, (), "egvs sensors")
+    check_sensor_names(names, (), "NAME")
     run_tables.print_sensor_details([CATALOGUE[name] for name in names])
 
 

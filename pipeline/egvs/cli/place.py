@@ -189,7 +189,10 @@ def describe_fused(fused: FusedPlan, by: ScoreLabel) -> str:
     values = [f"{first} with the first sensor"]
     values += [f"{value} with {step.count}" for step, value in zip(fused.steps[1:], further, strict=True)]
     last = by.change(fused.steps[-1].gain, fused.steps[-1].gain_se)
-    text = f"Found in fused point clouds: {', '.join(values)} (the last one adds {last} {by.change_unit})"
+    text = (
+        f"Found where all point clouds are fused before detection: {', '.join(values)} (the last one adds {last} "
+        f"{by.change_unit})"
+    )
     if fused.better is not None:
         gain = by.change(fused.better.gain, fused.better.gain_se)
         return f"{text}; {', '.join(fused.better_sites)} should find {gain} {by.change_unit} more there."

@@ -274,7 +274,7 @@ def _draw_footprints(model: Modelspace, layer: Layer | None, box: Box, reference
         return []
     return [
         f"{FOOTPRINTS}: {is_near.sum():,} of {len(is_near):,}, those within {MAP_MARGIN_M:g} m of the region and the "
-        "sites; the other formats have all"
+        "sites; GeoPackage and GeoJSON files have all"
     ]
 
 

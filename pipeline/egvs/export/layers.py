@@ -123,7 +123,7 @@ def kml_layers(run: FinishedRun, layers: Sequence[Layer], notes: list[str]) -> l
             kept = np.ones(len(layer.rows), dtype=np.bool_)
         if not kept.all():
             counts = f"{kept.sum():,} of {len(kept):,}"
-            notes.append(f"{layer.name}: {counts}, {_KML_REASONS[layer.name]}; the other formats have all")
+            notes.append(f"{layer.name}: {counts}, {_KML_REASONS[layer.name]}; GeoPackage and GeoJSON files have all")
         if kept.any():
             shown.append(replace(layer, geometries=layer.geometries[kept], rows=layer.rows.filter(pa.array(kept))))
     return shown

@@ -108,11 +108,16 @@ class StreetCounts:
 
     def describe(self) -> str:
         """Return a sentence."""
-        movements = number_of(len({flow.title for hour in self.hours for flow in hour.flows}), "movement")
+        is_approach = {flow.title: flow.edge is not None for hour in self.hours for flow in hour.flows}
+        approaches = sum(is_approach.values())
+        ways = [number_of(len(is_approach) - approaches, "movement")] if approaches < len(is_approach) else []
+        if approaches:
+            ways.append(f"{number_of(approaches, 'approach', 'approaches')} without turns")
+        counted = f"in {' and '.join(ways)}, counted ({self.path.name})"
         if len(self.hours) == 1:
-            return f"{number_of(self.hours[0].per_h, 'vehicle')} an hour in {movements}, counted ({self.path.name})"
+            return f"{number_of(self.hours[0].per_h, 'vehicle')} an hour {counted}"
         amounts = [f"{hour.name} {hour.per_h:,}" for hour in self.hours]
-        return f"vehicles an hour in {movements}, counted ({self.path.name}): {', '.join(amounts)}"
+        return f"vehicles an hour {counted}: {', '.join(amounts)}"
 
 
 @dataclass(frozen=True)
