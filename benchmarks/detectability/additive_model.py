@@ -23,7 +23,7 @@ import numpy as np
 from benchmarks.detectability.crowding import measure_crowding, vehicle_classes
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.special import expit
-from egvs.scoring.target_scores import ISOLATED_GAP_M, MONOTONICITY, point_spacing_m
+from egvs.scoring.target_scores import ISOLATED_GAP_M, MONOTONICITY, column_spacing_m, point_spacing_m
 from egvs.scoring.targets import VisibleTargets
 
 DIRECTIONS: Mapping[str, int] = {
@@ -37,7 +37,7 @@ DIRECTIONS: Mapping[str, int] = {
     "incidence_deg": 0,
 }
 """For each feature that a model may have: 1 if the probability may only rise with it, -1 if it may only fall, 0 for
-either. ``log_spacing`` is ln(spacing / 1 m), the other logarithms are ln(1 + points)."""
+either. ``log_spacing`` and ``log_column_spacing`` are ln(spacing / 1 m), the other logarithms are ln(1 + points)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +73,7 @@ def target_features(visible: VisibleTargets) -> TargetFeatures:
         "beside_gap_deg": crowding.beside_gap_deg,
         "link_gap": crowding.link_gap,
         "log_spacing": np.log(point_spacing_m(visible)),
+        "log_column_spacing": np.log(column_spacing_m(visible)),
         "depression_deg": visible.depression_deg,
         "incidence_deg": crowding.incidence_deg,
         "length_m": visible.record.boxes[:, 3],

@@ -35,8 +35,8 @@ SHAPE = (*POINTS, "log_points_on_sides", "length_share", "width_share", "hole_m"
 SHADOW = (*POINTS, "hidden_share", "log_spacing")
 VIEW = ("depression_deg", "incidence_deg", "length_m", "range_m")
 GAPS = ("front_gap_m", "behind_gap_m", "beside_gap_m", "link_gap")
-SPACING = ("log_spacing",)
-WITHOUT_SPACING = tuple(name for name in FEATURES if name not in SPACING)
+WITHOUT_COLUMNS = tuple(name for name in FEATURES if name != "log_column_spacing")
+WITHOUT_SPACINGS = tuple(name for name in WITHOUT_COLUMNS if name != "log_spacing")
 
 
 class ModelForm(NamedTuple):
@@ -57,7 +57,8 @@ MODELS: Mapping[str, ModelForm] = {
     "points, extent, hidden share, spacing": ModelForm("additive", (*SHADOW, *SHAPE[1:])),
     "the same, view": ModelForm("additive", (*SHADOW, *SHAPE[1:], *VIEW)),
     "the same, view, gaps": ModelForm("additive", (*SHADOW, *SHAPE[1:], *VIEW, *GAPS)),
-    "trees: without spacing": ModelForm("trees", WITHOUT_SPACING),
+    "trees: without spacings": ModelForm("trees", WITHOUT_SPACINGS),
+    "trees: without column spacing": ModelForm("trees", WITHOUT_COLUMNS),
     "trees: as shipped": ModelForm("trees", FEATURES),
     "trees: the same, hidden share": ModelForm("trees", (*FEATURES, "hidden_share")),
     "trees: the same, hidden share, gaps": ModelForm("trees", (*FEATURES, "hidden_share", *GAPS)),
@@ -237,14 +238,15 @@ def table(
         in_sample = trained_at if title == SHIPPED_SCORE else frozenset()
         cells = [f"{by_junction[name].rho:.3f}{' (in-sample)' if name in in_sample else ''}" for name in names]
         unseen = [name for name in names if name not in in_sample]
-        of, count = [by_junction[name] for name in unseen], [results[COUNT_SCORE][name] for name in unseen]
-        form = [results[SHIPPED_FORM][name] for name in unseen]
-        cells += [mean_and_error([each.rho for each in of])]
-        cells += [mean_and_error([each.rho - other.rho for each, other in zip(of, count, strict=True)])]
-        cells += [mean_and_error([each.rho - other.rho for each, other in zip(of, form, strict=True)])]
-        cells += [mean_and_error([each.rho_in_group for each in of])]
-        cells += [mean_and_error([each.loss for each in of])]
-        cells += [mean_and_error([each.loss - other.loss for each, other in zip(of, form, strict=True)])]
+        found = [by_junction[name] for name in unseen]
+        by_points = [results[COUNT_SCORE][name] for name in unseen]
+        as_shipped = [results[SHIPPED_FORM][name] for name in unseen]
+        cells += [mean_and_error([each.rho for each in found])]
+        cells += [mean_and_error([each.rho - other.rho for each, other in zip(found, by_points, strict=True)])]
+        cells += [mean_and_error([each.rho - other.rho for each, other in zip(found, as_shipped, strict=True)])]
+        cells += [mean_and_error([each.rho_in_group for each in found])]
+        cells += [mean_and_error([each.loss for each in found])]
+        cells += [mean_and_error([each.loss - other.loss for each, other in zip(found, as_shipped, strict=True)])]
         yield f"| {title} | {' | '.join(cells)} |"
     if marked := [name for name in names if name in trained_at]:
         yield ""
