@@ -3,8 +3,9 @@
 ``python -m benchmarks.sensor_heights``: at the 13 sites of nishishinjuku, ``pointpillars_sensor`` (trained with sensors
 2 m above the ground, heights relative to the sensor), ``pointpillars_2m`` (the same, heights above the ground) and the
 installed detectors run on the same frames of unseen traffic, 7 s apart. Prints Spearman's rho with AP (mean of BEV and
-3D, IoU 0.7) of ``expected_detections`` and of EGVS with gamma 10 and 2, and their difference, with intervals of 95 %
-that resample sites and blocks of frames.
+3D, IoU 0.7) of ``expected_detections``, as the mean over models and by that of ``pointpillars_sensor``, and of EGVS
+with gamma 10 and 2, and differences of the first two from EGVS, with intervals of 95 % that resample sites and blocks
+of frames.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 
 import egvs
 from benchmarks.validity import low_models
+from egvs.artefacts import parquet
 from egvs.core.progress import no_progress
 from egvs.validation import surrogates
 from egvs.validation.correlation import Correlation, CorrelationStudy, JunctionScores, MeasureValues
@@ -30,6 +32,7 @@ SCENARIO = Path(__file__).parents[1] / "scenarios" / "nishishinjuku"
 FRAMES, APART_S, SEED = 250, 7.0, 3704
 MEASURE = "ap_mean_r40_iou70"
 MAIN = "expected_detections (detectors cluster+pointpillars)"
+FROM_SENSOR = f"expected_detections (detector {low_models.SENSOR})"
 EGVS = tuple(f"egvs (gamma {gamma}, voxel 0.25)" for gamma in (10, 2))
 DETECTORS = (low_models.SENSOR, low_models.LOW, *base.detector_names())
 
@@ -41,11 +44,14 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=FRAMES)
     given = parser.parse_args()
     study = CorrelationStudy([measure(given.out, given.frames)], SEED)
-    print(f"| detector | mean AP | {' | '.join((MAIN, *EGVS))} | {' | '.join(f'minus {name}' for name in EGVS)} |")
-    print("|---|---:|" + "---:|" * (1 + 2 * len(EGVS)))
+    own = (MAIN, FROM_SENSOR)
+    pairs = [(score, other) for score in own for other in EGVS]
+    heads = ["detector", "mean AP", *own, *EGVS, *(f"{score} minus {other}" for score, other in pairs)]
+    print(f"| {' | '.join(heads)} |")
+    print("|---|" + "---:|" * (len(heads) - 1))
     for detector, values in study.junctions[0].measures.items():
-        cells = [_text(study.correlation(score, detector, "spearman")) for score in (MAIN, *EGVS)]
-        cells += [_text(study.difference(MAIN, score, detector, "spearman")) for score in EGVS]
+        cells = [_text(study.correlation(score, detector, "spearman")) for score in (*own, *EGVS)]
+        cells += [_text(study.difference(score, other, detector, "spearman")) for score, other in pairs]
         print(f"| `{detector}` | {100.0 * values.values.mean():.1f} | {' | '.join(cells)} |", flush=True)
 
 
@@ -57,11 +63,14 @@ def measure(out: Path, frames: int) -> JunctionScores:
         task = SiteDetectionTask(validation.record, {name: low_models.make(name) for name in DETECTORS})
         rows, _ = measure_detection(validation.frames, scene.roi, run_detectors(scene.sites, task))
         scored = surrogates.compute_surrogates(scenario, validation.folder / "scores", ("expected_detections", "egvs"))
+    egvs.run(egvs.load(SCENARIO, [f"score.detector={low_models.SENSOR}"]), out / low_models.SENSOR)
+    by_sensor = parquet.read_artefact(out / low_models.SENSOR / "scores.parquet", "scores")[0].to_pylist()
     sites = tuple(site.name for site in scene.sites)
     ap = {(row.detector, row.site): row.measures[MEASURE] for row in rows if row.objects_of == ALL_OBJECTS}
     measures = {name: MeasureValues.from_estimates([ap[name, site] for site in sites]) for name in DETECTORS}
     values = {(str(ScoreName(row.score, row.parameters_json)), row.site): row.sign * row.value for row in scored.rows}
-    scores = {name: np.array([values[name, site] for site in sites]) for name in (MAIN, *EGVS)}
+    values |= {(FROM_SENSOR, row["site"]): row["expected_detections"] for row in by_sensor}
+    scores = {name: np.array([values[name, site] for site in sites]) for name in (MAIN, FROM_SENSOR, *EGVS)}
     return JunctionScores(scenario.name, sites, scores, measures)
 
 

@@ -37,6 +37,7 @@ from benchmarks.across_junctions.protocol import (
 from benchmarks.across_junctions.records import NOT_DETECTORS, SCORES, VEHICLES
 from benchmarks.across_junctions.worlds import MissingMapError, make_world
 from benchmarks.detectability import figures
+from benchmarks.validity import low_models
 from egvs.core import files, plugins
 from egvs.core.errors import EgvsError, InputError, MissingBackendError
 from egvs.core.progress import ProgressCallback
@@ -300,8 +301,9 @@ def _world(protocol: Protocol, junction: Junction, arguments: argparse.Namespace
 
 def _parts(protocol: Protocol, junction: Junction, names: str | None) -> list[str]:
     """Return the requested parts of a junction, or those of the protocol; detectors must be installed."""
-    known = (*NOT_DETECTORS, *protocol.detectors_of(junction))
-    parts = list(known) if names is None else [name.strip() for name in names.split(",") if name.strip()]
+    of_protocol = (*NOT_DETECTORS, *protocol.detectors_of(junction))
+    known = (*of_protocol, low_models.SENSOR) if junction.role == "training" else of_protocol
+    parts = list(of_protocol) if names is None else [name.strip() for name in names.split(",") if name.strip()]
     for name in parts:
         if name not in known:
             raise InputError("--part", f"expected some of {', '.join(known)} at {junction.name}, got {name!r}")
@@ -312,7 +314,7 @@ def _parts(protocol: Protocol, junction: Junction, names: str | None) -> list[st
 
 def _check_detector(name: str) -> None:
     try:
-        base.make_detector(name, "--part")
+        low_models.make(name)
     except MissingBackendError as error:
         raise InputError("--part", str(error)) from None
 

@@ -23,6 +23,7 @@ from benchmarks.across_junctions.vehicle_rows import read_rows
 from benchmarks.detectability import comparison, figures, writing
 from benchmarks.detectability.comparison import SiteRows
 from benchmarks.detectability.fitting import Examples, cross_validate, fit_model
+from benchmarks.validity import low_models
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.scoring.target_scores import FEATURES
@@ -101,7 +102,7 @@ def fitted_models(records_folder: Path, protocol: Protocol) -> str:
     models, settings = {}, {}
     learnt_on: dict[str, writing.TrainingJunction] = {}
     sites: dict[str, dict[str, int]] = {}
-    for detector in protocol.detectors.training:
+    for detector in (*protocol.detectors.training, low_models.SENSOR):
         by_junction = read_training(records_folder, protocol, detector)
         check_complete(by_junction, protocol, detector)
         examples = {name: _examples(rows) for name, rows in by_junction.items()}

@@ -17,7 +17,8 @@ import json
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol
+from functools import cache
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,7 +121,7 @@ class ModelResult:
 
 def models_for(detectors: Sequence[str]) -> tuple[str, ...]:
     """Return the detectors whose models stand for some detectors: their own, or all where one has none."""
-    return tuple(detectors) if set(detectors) <= set(target_scores.DETECTORS) else target_scores.DETECTORS
+    return tuple(detectors) if set(detectors) <= set(_shipped()["detectors"]) else target_scores.DETECTORS
 
 
 def training_rows(sites: Sequence[SiteRows]) -> TrainingRows:
@@ -212,8 +213,14 @@ def mean_and_error(values: Sequence[float]) -> str:
 
 def shipped_training_junctions() -> frozenset[str]:
     """Return the junctions that the shipped ``expected_detections`` was trained at."""
-    content = json.loads(target_scores.MODEL_FILE.read_text(encoding="utf-8"))
-    return frozenset(content["about"]["learnt_on"])
+    return frozenset(_shipped()["about"]["learnt_on"])
+
+
+@cache
+def _shipped() -> dict[str, Any]:
+    """Return the content of the file of models."""
+    content: dict[str, Any] = json.loads(target_scores.MODEL_FILE.read_text(encoding="utf-8"))
+    return content
 
 
 def table(

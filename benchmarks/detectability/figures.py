@@ -21,7 +21,7 @@ Curves = Mapping[str, Sequence[Mapping[str, float]]]
 
 OTHERS = "each junction predicted by the model of the others"
 
-_COLOURS = {"cluster": "#0072B2", "pointpillars": "#D55E00"}
+_COLOURS = {"cluster": "#0072B2", "pointpillars": "#D55E00", "pointpillars_sensor": "#009E73"}
 _OTHER = "#777777"
 
 

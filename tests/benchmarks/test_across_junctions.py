@@ -47,6 +47,7 @@ from benchmarks.across_junctions.protocol import (
 from benchmarks.across_junctions.records import VEHICLES, PartInfo, write_table
 from benchmarks.across_junctions.statistics import DetectedJunction, Estimate
 from benchmarks.detectability.additive_model import DIRECTIONS
+from benchmarks.validity import low_models
 from benchmarks.validity import tables as table_files
 from benchmarks.validity.junctions import SCENARIOS, with_sites
 
@@ -54,7 +55,7 @@ from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.errors import InputError
 from egvs.runs import stage_keys
 from egvs.scenario.loading import load
-from egvs.scoring.target_scores import DETECTORS, FEATURES, DetectabilityModel, detectability_model
+from egvs.scoring.target_scores import DETECTORS, FEATURES, MODELLED, DetectabilityModel, detectability_model
 from egvs.sensors.sensor import CATALOGUE
 from egvs.sensors.sites import Pose, Site
 from egvs.traffic import sumo_folder
@@ -685,7 +686,7 @@ def write_rows(
 def test_models_are_fitted_to_training_records(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder, detectors = tmp_path / "records", read_protocol().detectors.training
+    folder, detectors = tmp_path / "records", (*read_protocol().detectors.training, low_models.SENSOR)
     folder.mkdir()
     rng = np.random.default_rng(11)
     for name in ("hill", "xian", "town01"):  # the last is held out
@@ -708,6 +709,7 @@ def test_models_are_fitted_to_training_records(
     assert (tmp_path / "its.png").read_bytes().startswith(b"\x89PNG")
     content = json.loads((tmp_path / "models.json").read_text(encoding="utf-8"))
     assert list(content["about"]["learnt_on"]) == ["hill", "xian"]
+    assert tuple(content["detectors"]) == MODELLED
     model = DetectabilityModel.of(content["detectors"]["cluster"])
     few, many = np.full((2, len(FEATURES)), 0.5)
     few[FEATURES.index("log_points")], many[FEATURES.index("log_points")] = 0.5, 4.0

@@ -13,7 +13,7 @@ from benchmarks.detectability import figures, fitting, writing
 from benchmarks.detectability.fitting import Examples
 
 from egvs.scoring import target_scores
-from egvs.scoring.target_scores import DETECTORS, FEATURES, DetectabilityModel
+from egvs.scoring.target_scores import FEATURES, MODELLED, DetectabilityModel
 
 
 def car(x: float, length: float = 4.0, z: float = 0.75, height: float = 1.5) -> tuple[float, ...]:
@@ -159,11 +159,12 @@ def test_the_shipped_file_is_as_it_would_be_written_again() -> None:
 
 
 def test_the_shipped_models_are_of_the_detectors_that_are_shipped() -> None:
+    from benchmarks.validity import low_models
+
     from egvs.core import files
-    from egvs.validation.detectors import base
 
     shipped = json.loads(target_scores.MODEL_FILE.read_text(encoding="utf-8"))["about"]["settings"]
-    assert shipped == {name: files.hash_json(base.make_detector(name).settings) for name in DETECTORS}
+    assert shipped == {name: files.hash_json(low_models.make(name).settings) for name in MODELLED}
 
 
 def test_the_picture_shows_every_part_of_the_curves(tmp_path: Path) -> None:
@@ -172,6 +173,6 @@ def test_the_picture_shows_every_part_of_the_curves(tmp_path: Path) -> None:
     lines = {line.get_label().partition(",")[0]: line.get_xydata().tolist() for line in above.lines}
     for name, its in shipped["detectors"].items():
         assert lines[name] == [[part["chance"], part["found"]] for part in its["elsewhere"]["calibration"]]
-    assert sum(bar.get_height() for bar in below.patches) == pytest.approx(len(DETECTORS))
+    assert sum(bar.get_height() for bar in below.patches) == pytest.approx(len(MODELLED))
     figures.draw(tmp_path / "its.png", target_scores.MODEL_FILE)
     assert (tmp_path / "its.png").read_bytes().startswith(b"\x89PNG")

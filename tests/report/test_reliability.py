@@ -80,6 +80,12 @@ def test_says_that_errors_come_from_several_simulations(rank_by: str, traffic: d
             "detectors (a, b) disagree.",
         ),
         ([1], ("a",), "± is the error of a finite simulation only; the score is that of the detector a."),
+        (
+            [1],
+            ("pointpillars_sensor",),
+            "± is the error of a finite simulation only; the score is that of the detector pointpillars_sensor, which "
+            "measures heights from the sensor (tested at 13 sites of one junction, docs/validity.md).",
+        ),
         ([1], (), "± is the error of a finite simulation only."),
     ],
 )

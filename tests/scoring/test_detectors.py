@@ -221,6 +221,7 @@ def test_a_detector_alone_has_its_own_score_and_the_error_of_the_traffic(mini: P
 def test_all_is_the_default_and_recorded_only_where_set() -> None:
     assert ScoreConfig().detectors == ScoreConfig(detector="all").detectors == DETECTORS
     assert ScoreConfig(detector="pointpillars").detectors == ("pointpillars",)
+    assert ScoreConfig(detector="pointpillars_sensor").detectors == ("pointpillars_sensor",)
     assert "detector" not in ScoreConfig().model_dump(mode="json")
     assert ScoreConfig(detector="cluster").model_dump(mode="json")["detector"] == "cluster"
 
@@ -233,7 +234,10 @@ def test_ranking_detectors_are_those_of_the_score_that_ranks() -> None:
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (["score.detector='yolo'"], "score.detector: expected 'all', 'cluster' or 'pointpillars'"),
+        (
+            ["score.detector='yolo'"],
+            "score.detector: expected 'all', 'cluster', 'pointpillars' or 'pointpillars_sensor'",
+        ),
         (
             ["score.detector='cluster'", "score.others=['coverage']", "score.blindspots=false"],
             "score: detector has no effect without expected_detections, blind spots and zones",
@@ -267,7 +271,8 @@ def test_option_sets_the_key(mini: Path, tmp_path: Path, run_egvs: Any) -> None:
     [
         (
             ("--detector", "yolo"),
-            "--detector: expected cluster, pointpillars or all, got 'yolo'. Use --detector cluster.",
+            "--detector: expected cluster, pointpillars, pointpillars_sensor or all, got 'yolo'. "
+            "Use --detector cluster.",
         ),
         (
             ("--detector", "all", "--set", "score.detector=cluster"),

@@ -37,8 +37,8 @@ Detector = Annotated[
     typer.Option(
         "--detector",
         metavar="NAME",
-        help="Detector that expected_detections stands for: cluster, pointpillars, or all, their mean (the default). "
-        "Short for --set score.detector=NAME.",
+        help="Detector that expected_detections stands for: cluster, pointpillars, all (their mean, the default), or "
+        "pointpillars_sensor, which measures heights from the sensor. Short for --set score.detector=NAME.",
     ),
 ]
 Jobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Number of threads; one per core by default.")]

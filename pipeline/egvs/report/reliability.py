@@ -8,7 +8,7 @@ from typing import Any
 from egvs.core.wording import format_percent
 from egvs.report.formatting import join_names
 from egvs.report.ranking import RankedSite, Ranking
-from egvs.scenario.score_config import DEFAULT_SCORE
+from egvs.scenario.score_config import DEFAULT_SCORE, Detector
 
 MIN_TILT_DEG = 5.0
 """A sensor is called tilted from this pitch on."""
@@ -30,6 +30,7 @@ _SIZE_NOTE = (
     "shares found differed from the expected ones by 3 to 8 percentage points for the detectors that it stands for, "
     "and by up to 14 for another one (docs/validity.md)."
 )
+_FROM_SENSOR: Detector = "pointpillars_sensor"
 _COVERAGE_NOTE = "The recorded tracks cover {} of the {}; elsewhere the traffic is unknown."
 _TILT_NOTE = (
     "The tilt of {} is outside the range of the validation (pitch -25 to 0 degrees, positive is up; roll up to 3 "
@@ -93,6 +94,8 @@ def _error_note(seeds: int, traffic: str, detectors: Sequence[str]) -> str:
     note = _SEEDS_NOTE.format(seeds) if seeds > 1 else _ERROR_NOTE.format(traffic)
     for detector in detectors:
         note += f"; the score is that of the detector {detector}"
+        if detector == _FROM_SENSOR:
+            note += ", which measures heights from the sensor (tested at 13 sites of one junction, docs/validity.md)"
     return f"{note}."
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -35,11 +35,15 @@ DEFAULT_SCORE: OtherScore = "expected_detections"
 VEHICLE_SCORES: tuple[OtherScore, ...] = ("expected_detections", "seen_well", "points_on_target")
 """Scores that are means over the vehicles of recorded frames."""
 
-Detector = Literal["cluster", "pointpillars"]
-"""Detectors whose detections a model of ``expected_detections`` predicts."""
+Detector = Literal["cluster", "pointpillars", "pointpillars_sensor"]
+"""Detectors whose detections a model of ``expected_detections`` predicts. ``pointpillars_sensor`` is not installed: it
+measures heights from the sensor and was trained with sensors 2 m above the ground, as detectors for cars are."""
+
+MEAN_DETECTORS: tuple[Detector, ...] = ("cluster", "pointpillars")
+"""The detectors that ``"all"`` stands for; both measure heights from the ground."""
 
 ALL_DETECTORS = "all"
-"""Value of ``[score] detector``: the mean over all detectors."""
+"""Value of ``[score] detector``: the mean over :data:`MEAN_DETECTORS`."""
 
 SCORES_IN_UNITS = ("egvs", "points_on_target")
 """Scores that have a unit; all others are shares."""
@@ -144,8 +148,9 @@ class ScoreConfig(StrictModel):
     )
     detector: Literal["all", Detector] = Field(
         "all",
-        description="Detector that expected_detections, blind spots and zones stand for. 'all' is the mean over all "
-        "detectors; its standard error contains how far they disagree",
+        description="Detector that expected_detections, blind spots and zones stand for. 'all' is the mean over "
+        "cluster and pointpillars; its standard error contains how far they disagree. pointpillars_sensor measures "
+        "heights from the sensor, as detectors for cars do, and misses most from high mounts",
     )
     weights: WeightsConfig = WeightsConfig()
     keep_visibility: tuple[str, ...] | Literal["all"] = Field(
@@ -209,7 +214,7 @@ class ScoreConfig(StrictModel):
     def detectors(self) -> tuple[Detector, ...]:
         """The detectors that detection scores average over."""
         if self.detector == "all":
-            return get_args(Detector)
+            return MEAN_DETECTORS
         return (self.detector,)
 
     @property

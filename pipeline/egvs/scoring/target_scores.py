@@ -31,8 +31,8 @@ of sight and length. It puts sensors of any number of channels, and ranges, on o
 vehicle that is covered evenly from one with the same number of points in a few dense rings, which detectors find less
 often. Sensors whose beams form no rings have the point spacing here.
 
-There is one model per detector; p is the mean over all of them, or the model that ``[score] detector`` names. The
-standard error contains how far the detectors disagree (:mod:`egvs.scoring.standard_errors`).
+There is one model per detector; p is the mean over :data:`DETECTORS`, or the model that ``[score] detector`` names. The
+standard error contains how far they disagree (:mod:`egvs.scoring.standard_errors`).
 
 The parameters of the model are in ``target_scores.json`` beside this module. They were trained on the detections of
 each detector at junctions that no result is quoted for (``benchmarks/across_junctions`` fits them again;
@@ -58,7 +58,7 @@ import numpy as np
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.special import expit
 from egvs.kernels.boosted_trees import add_tree_values
-from egvs.scenario.score_config import Detector
+from egvs.scenario.score_config import MEAN_DETECTORS, Detector
 from egvs.scoring.blindspots import SpotVisibility
 from egvs.scoring.targets import SEEN_WELL_POINTS, TargetVisibility, weighted_mean
 
@@ -71,8 +71,11 @@ for any detector."""
 
 MODEL_FILE = Path(__file__).with_name("target_scores.json")
 
-DETECTORS: tuple[str, ...] = get_args(Detector)
-"""Detectors that have a model."""
+DETECTORS: tuple[str, ...] = MEAN_DETECTORS
+"""Detectors that the score is the mean over, unless one is chosen."""
+
+MODELLED: tuple[str, ...] = get_args(Detector)
+"""All detectors that have a model."""
 
 ISOLATED_GAP_M = 20.0
 """A neighbour farther away than this has no influence."""
@@ -301,7 +304,7 @@ class DetectabilityModel:
 
 @cache
 def detectability_model(detector: str) -> DetectabilityModel:
-    """Return the model of one of :data:`DETECTORS`."""
+    """Return the model of one of :data:`MODELLED`."""
     return DetectabilityModel.of(json.loads(MODEL_FILE.read_text(encoding="utf-8"))["detectors"][detector])
 
 

@@ -408,7 +408,7 @@ def visible_targets(
     if return_probability is not None:
         points_alone = points_alone * return_probability(range_m)
     bounds_m, slices = np.stack([hits.low[row], hits.high[row]], axis=1), hits.slices[row]
-    step_deg = beams.sensor.azimuth_step_deg
+    step_deg = beams.sensor.column_step_deg
     spans = span_shares(record, bounds_m)
     return VisibleTargets(
         record=record,
