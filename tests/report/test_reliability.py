@@ -80,12 +80,6 @@ def test_says_that_errors_come_from_several_simulations(rank_by: str, traffic: d
             "detectors (a, b) disagree.",
         ),
         ([1], ("a",), "± is the error of a finite simulation only; the score is that of the detector a."),
-        (
-            [1],
-            ("pointpillars_sensor",),
-            "± is the error of a finite simulation only; the score is that of the detector pointpillars_sensor, which "
-            "measures heights from the sensor (tested at 13 sites of one junction, docs/validity.md).",
-        ),
         ([1], (), "± is the error of a finite simulation only."),
     ],
 )
@@ -94,6 +88,15 @@ def test_says_what_errors_contain(seeds: list[int], detectors: tuple[str, ...], 
     ranking = replace(ranking, sites=tuple(replace(site, egvs_se=0.1) for site in ranking.sites))
     (sentence,) = describe_reliability(ranking, {"seeds": seeds}, detectors)
     assert sentence.startswith(f"{note} The order of sites")
+
+
+def test_says_how_little_the_score_for_heights_from_the_sensor_was_tested() -> None:
+    ranking = ranked(("a", 3, 0, 0.9), ("b", 3, 0, 0.5), rank_by="expected_detections")
+    (sentence,) = describe_reliability(ranking, None, ("pointpillars_sensor",))
+    assert sentence == (
+        "This detector measures heights from the sensor, and the score for it was tested at 13 sites of one junction "
+        "only (docs/validity.md)."
+    )
 
 
 def test_sites_that_see_nothing_or_score_the_same_need_no_further_words() -> None:

@@ -31,6 +31,10 @@ _SIZE_NOTE = (
     "and by up to 14 for another one (docs/validity.md)."
 )
 _FROM_SENSOR: Detector = "pointpillars_sensor"
+_FROM_SENSOR_NOTE = (
+    "This detector measures heights from the sensor, and the score for it was tested at 13 sites of one junction only "
+    "(docs/validity.md)."
+)
 _COVERAGE_NOTE = "The recorded tracks cover {} of the {}; elsewhere the traffic is unknown."
 _TILT_NOTE = (
     "The tilt of {} is outside the range of the validation (pitch -25 to 0 degrees, positive is up; roll up to 3 "
@@ -68,7 +72,7 @@ def describe_reliability(
     if ranking.has_errors and (seeds > 1 or ranking.by.name == DEFAULT_SCORE):
         notes.append(_error_note(seeds, "recording" if recordings else "simulation", detectors))
     if ranking.by.name == DEFAULT_SCORE:
-        notes.append(_SIZE_NOTE)
+        notes.append(_FROM_SENSOR_NOTE if _FROM_SENSOR in detectors else _SIZE_NOTE)
     if notes:
         sentences.append(" ".join(notes))
     sentences += [
@@ -94,8 +98,6 @@ def _error_note(seeds: int, traffic: str, detectors: Sequence[str]) -> str:
     note = _SEEDS_NOTE.format(seeds) if seeds > 1 else _ERROR_NOTE.format(traffic)
     for detector in detectors:
         note += f"; the score is that of the detector {detector}"
-        if detector == _FROM_SENSOR:
-            note += ", which measures heights from the sensor (tested at 13 sites of one junction, docs/validity.md)"
     return f"{note}."
 
 
