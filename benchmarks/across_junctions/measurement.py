@@ -34,6 +34,7 @@ from egvs.scoring.targets import TargetRecord, VisibleTargets, detection_probabi
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.scene import Scene
+from egvs.sensors.sensor import Sensor
 from egvs.sensors.sites import Site
 from egvs.stages.inputs import get_scene, open_folder
 from egvs.validation import surrogates
@@ -242,17 +243,17 @@ def _mean_points(scenario: Scenario, work: Path, jobs: int | None) -> dict[str, 
     record = TargetRecord.read(work / "trajectories.parquet", scenario.roi.grid)
     return {
         site.name: float(visible.points.mean()) if len(visible) else float("nan")
-        for site, visible in _visible(scene, record, jobs)
+        for site, _, visible in _visible(scene, record, jobs)
     }
 
 
-def _visible(scene: Scene, record: TargetRecord, jobs: int | None) -> list[tuple[Site, VisibleTargets]]:
-    """Return what each site sees of the vehicle-frames of a record."""
+def _visible(scene: Scene, record: TargetRecord, jobs: int | None) -> list[tuple[Site, Sensor, VisibleTargets]]:
+    """Return each site, its sensor, and what it sees of the vehicle-frames of a record."""
     scanner = Scanner(scene)
 
-    def of(site: Site) -> tuple[Site, VisibleTargets]:
+    def of(site: Site) -> tuple[Site, Sensor, VisibleTargets]:
         beams = Beams.of(scanner.scan_site(site))
-        return site, visible_targets(record, beams, detection_probability(scene, beams.sensor))
+        return site, beams.sensor, visible_targets(record, beams, detection_probability(scene, beams.sensor))
 
     return list(map_ordered(of, scene.sites, thread_count(jobs)))
 
@@ -272,7 +273,10 @@ def _measure_vehicles(plan: PartPlan, held_out: HeldOutTraffic, jobs: int | None
         **boxes,
     }
     write_table(_path(plan, VEHICLES), vehicles)
-    each = [(site, target_features(seen), seen.points) for site, seen in _visible(held_out.scene, record, jobs)]
+    each = [
+        (site, target_features(seen, sensor.azimuth_step_deg), seen.points)
+        for site, sensor, seen in _visible(held_out.scene, record, jobs)
+    ]
     columns: dict[str, object] = {
         "site": np.repeat([site.name for site, _, _ in each], len(record)),
         "row": np.tile(np.arange(len(record)), len(each)),

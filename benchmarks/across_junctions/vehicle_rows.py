@@ -27,6 +27,9 @@ def read_rows(folder: Path, record: JunctionRecord, detector: str) -> list[SiteR
         If a record is missing or damaged, or the rows of its parts differ.
     """
     seen = read_table(folder / f"{record.name}.features.parquet")
+    if missing := [name for name in DIRECTIONS if name not in seen.column_names]:
+        path = folder / f"{record.name}.features.parquet"
+        raise InputError(path, f"has no column {missing[0]}", "Measure the part vehicles again.")
     found = read_table(folder / f"{record.name}.{detector}.hits.parquet")
     traffics = {
         (info.frames, info.vehicles, info.vehicle_frames, tuple(info.seeds.items()))

@@ -15,6 +15,7 @@ predicts less well than trees of the same features (docs/validation.md).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -23,11 +24,12 @@ import numpy as np
 from benchmarks.detectability.crowding import measure_crowding, vehicle_classes
 from egvs.core.grid import FloatArray, IntArray
 from egvs.core.special import expit
-from egvs.scoring.target_scores import ISOLATED_GAP_M, MONOTONICITY, column_spacing_m, point_spacing_m
+from egvs.scoring.target_scores import ISOLATED_GAP_M, MONOTONICITY, point_spacing_m
 from egvs.scoring.targets import VisibleTargets
 
 DIRECTIONS: Mapping[str, int] = {
     **MONOTONICITY,
+    "log_column_spacing": 0,
     "hidden_share": -1,
     "front_gap_m": 1,
     "behind_gap_m": 1,
@@ -56,9 +58,17 @@ class TargetFeatures:
     vehicle_class: IntArray
 
 
-def target_features(visible: VisibleTargets) -> TargetFeatures:
-    """Return all features of what a site sees."""
-    crowding = measure_crowding(visible)
+def target_features(visible: VisibleTargets, column_step_deg: float | None = None) -> TargetFeatures:
+    """Return all features of what a site sees.
+
+    Parameters
+    ----------
+    column_step_deg
+        Azimuth between neighbouring beams of a ring; None for a sensor without rings, whose columns count as far apart
+        as all points.
+    """
+    crowding, spacing_m = measure_crowding(visible), point_spacing_m(visible)
+    columns_m = spacing_m if column_step_deg is None else visible.range_m * math.radians(column_step_deg)
     columns = {
         "log_points": np.log1p(visible.points),
         "log_points_on_sides": np.log1p(visible.points_on_sides),
@@ -72,8 +82,8 @@ def target_features(visible: VisibleTargets) -> TargetFeatures:
         "beside_gap_m": crowding.beside_gap_m,
         "beside_gap_deg": crowding.beside_gap_deg,
         "link_gap": crowding.link_gap,
-        "log_spacing": np.log(point_spacing_m(visible)),
-        "log_column_spacing": np.log(column_spacing_m(visible)),
+        "log_spacing": np.log(spacing_m),
+        "log_column_spacing": np.log(columns_m),
         "depression_deg": visible.depression_deg,
         "incidence_deg": crowding.incidence_deg,
         "length_m": visible.record.boxes[:, 3],

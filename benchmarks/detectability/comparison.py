@@ -36,8 +36,7 @@ SHAPE = (*POINTS, "log_points_on_sides", "length_share", "width_share", "hole_m"
 SHADOW = (*POINTS, "hidden_share", "log_spacing")
 VIEW = ("depression_deg", "incidence_deg", "length_m", "range_m")
 GAPS = ("front_gap_m", "behind_gap_m", "beside_gap_m", "link_gap")
-WITHOUT_COLUMNS = tuple(name for name in FEATURES if name != "log_column_spacing")
-WITHOUT_SPACINGS = tuple(name for name in WITHOUT_COLUMNS if name != "log_spacing")
+WITHOUT_SPACING = tuple(name for name in FEATURES if name != "log_spacing")
 
 
 class ModelForm(NamedTuple):
@@ -58,9 +57,9 @@ MODELS: Mapping[str, ModelForm] = {
     "points, extent, hidden share, spacing": ModelForm("additive", (*SHADOW, *SHAPE[1:])),
     "the same, view": ModelForm("additive", (*SHADOW, *SHAPE[1:], *VIEW)),
     "the same, view, gaps": ModelForm("additive", (*SHADOW, *SHAPE[1:], *VIEW, *GAPS)),
-    "trees: without spacings": ModelForm("trees", WITHOUT_SPACINGS),
-    "trees: without column spacing": ModelForm("trees", WITHOUT_COLUMNS),
+    "trees: without spacing": ModelForm("trees", WITHOUT_SPACING),
     "trees: as shipped": ModelForm("trees", FEATURES),
+    "trees: the same, spacing of columns": ModelForm("trees", (*FEATURES, "log_column_spacing")),
     "trees: the same, hidden share": ModelForm("trees", (*FEATURES, "hidden_share")),
     "trees: the same, hidden share, gaps": ModelForm("trees", (*FEATURES, "hidden_share", *GAPS)),
     "trees: as shipped, 120 of 12 leaves": ModelForm("trees", FEATURES, 120, 12),
@@ -120,7 +119,7 @@ class ModelResult:
 
 
 def models_for(detectors: Sequence[str]) -> tuple[str, ...]:
-    """Return the detectors whose models stand for some detectors: their own, or all where one has none."""
+    """Return whose models stand for some detectors: their own, or those of the mean where one has none."""
     return tuple(detectors) if set(detectors) <= set(_shipped()["detectors"]) else target_scores.DETECTORS
 
 

@@ -728,6 +728,13 @@ def test_models_are_fitted_to_training_records(
         with pytest.raises(InputError, match=r"hill\.cluster\.json: expected cluster as it is installed"):
             training.read_training(folder, read_protocol(), "cluster")
     info.write(folder)
+    features = records.read_table(folder / "hill.features.parquet").to_pydict()
+    write_table(folder / "hill.features.parquet", {name: features[name] for name in features if name != "side"})
+    with pytest.raises(
+        InputError, match=r"hill\.features\.parquet: has no column side\. Measure the part vehicles again"
+    ):
+        training.read_training(folder, read_protocol(), "cluster")
+    write_table(folder / "hill.features.parquet", features)
     damaged = records.read_table(folder / "hill.cluster.hits.parquet").slice(1)
     write_table(folder / "hill.cluster.hits.parquet", damaged.to_pydict())
     with pytest.raises(InputError, match=r"hill\.features\.parquet: its rows are not those"):

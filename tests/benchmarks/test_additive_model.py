@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 from benchmarks.detectability.additive_model import (
     DIRECTIONS,
     AdditiveModel,
@@ -13,7 +14,7 @@ from benchmarks.detectability.additive_model import (
 )
 from benchmarks.detectability.crowding import CLASSES
 
-from egvs.scoring.target_scores import column_spacing_m, point_spacing_m
+from egvs.scoring.target_scores import point_spacing_m
 from tests.scoring.target_scenes import frame, seen
 from tests.scoring.test_visible_targets import car, fan
 
@@ -53,4 +54,6 @@ def test_features_by_hand():
     assert set(x.columns) == set(DIRECTIONS) and x.vehicle_class.tolist() == [CLASSES.index("bus")]
     assert x.columns["log_points"].tolist() == [math.log(115)] and x.columns["length_m"].tolist() == [4.0]
     assert x.columns["log_spacing"].tolist() == [math.log(point_spacing_m(visible)[0])]
-    assert x.columns["log_column_spacing"].tolist() == [math.log(column_spacing_m(visible)[0])]
+    assert x.columns["log_column_spacing"].tolist() == x.columns["log_spacing"].tolist()  # without rings
+    in_rings = target_features(visible, column_step_deg=0.5).columns["log_column_spacing"]
+    assert in_rings == pytest.approx([math.log(visible.range_m[0] * math.pi / 360.0)])

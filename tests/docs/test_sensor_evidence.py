@@ -94,6 +94,7 @@ def test_evidence_is_that_of_the_larger_study() -> None:
     losses = sorted(float(row["regret"]) for row in rows)
     assert [round(loss) for loss in losses[-2:]] == [7, 20] and max(losses[:-1]) < 8.0
     assert "lost up to 8 points of AP, and 20 once" in SENSOR_EVIDENCE
+    assert "less than about 10 points" in SENSOR_EVIDENCE
 
 
 def test_page_has_the_numbers_of_the_table() -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from egvs.artefacts import parquet
-from egvs.report.sections import RHO, RHO_RANGE, egvs_setting, ranking_disagreement
+from egvs.report.sections import FROM_SENSOR_NOTE, RHO, RHO_RANGE, egvs_setting, ranking_disagreement
 from egvs.studies import study_settings
 from egvs.studies.accuracy import StudyOptions
 from tests.report.test_ranking import by_vehicles, ranking
@@ -76,6 +76,8 @@ def test_reports_scores_with_different_best_sites() -> None:
         "How well this setting of the EGVS predicts detection was not measured."
     )
     assert ranking_disagreement(by_vehicles(*rows, rank_by="egvs").sites, EGVS, {}) == text  # whichever ranks
+    other = ranking_disagreement(by_vehicles(*rows).sites, EGVS, detectors=("pointpillars_sensor",))
+    assert other.endswith(f"they are a, b and c. {FROM_SENSOR_NOTE}")
     rho = {"expected_detections": {"cluster": 0.9, "pointpillars": 0.8}, EGVS: {"cluster": 0.7, "pointpillars": 0.6}}
     assert ranking_disagreement(by_vehicles(*rows).sites, EGVS, rho).endswith(
         " At the held-out junctions of the validation study, the share of vehicles found was the better "

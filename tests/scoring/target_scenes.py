@@ -92,7 +92,7 @@ def is_beyond(box, pitch, origin) -> bool:
 
 
 COLUMNS = ("points", "points_alone", "points_on_sides", "length_share", "width_share", "hole_m", "range_m",
-           "depression_deg", "side", "column_step_rad")  # fmt: skip
+           "depression_deg", "side")  # fmt: skip
 
 
 def hole_slowly(along: Sequence[float]) -> float:
@@ -156,16 +156,14 @@ def _of_points(box: NDArray[np.float64], hits: Sequence[Hit]) -> dict[str, float
     }
 
 
-def _of_view(box: NDArray[np.float64], beams: Beams) -> dict[str, float]:
-    """Columns that follow from the sensor and where it sees a box from."""
-    origin = np.array(beams.pose.position_m)
+def _of_view(box: NDArray[np.float64], origin: NDArray[np.float64]) -> dict[str, float]:
+    """Columns that follow from where a box is seen from."""
     range_m = float(np.linalg.norm(box[:3] - origin))
     sight = complex(box[0] - origin[0], box[1] - origin[1])
     return {
         "range_m": range_m,
         "depression_deg": math.degrees(math.asin((origin[2] - box[2]) / range_m)),
         "side": abs(math.sin(cmath.phase(sight) - box[6])),
-        "column_step_rad": 2.0 * math.pi / beams.sensor.azimuths,  # those of the tests see the full circle
     }
 
 
@@ -173,7 +171,7 @@ def _of_frame(one: TrafficFrame, beams: Beams, noticed: Noticed) -> dict[int, di
     hits, alone = _hits_of_frame(one, beams, noticed)
     found = {}
     for row, its in hits.items():
-        view = _of_view(one.boxes[row], beams)
+        view = _of_view(one.boxes[row], np.array(beams.pose.position_m))
         reached = alone[row] * float(noticed(np.array([view["range_m"]]))[0])
         found[row] = {**_of_points(one.boxes[row], its), **view, "points_alone": reached}
     return found
@@ -186,7 +184,7 @@ def fused_slowly(frames: Sequence[TrafficFrame], scans: Sequence[Beams]) -> dict
         by_scan = [_hits_of_frame(one, beams, lambda r: np.ones(len(r)))[0] for beams in scans]
         for row in one.target_rows(GRID.roi).tolist():
             counts = [sum(hit[0] for hit in hits[row]) for hits in by_scan]
-            views = [_of_view(one.boxes[row], beams) for beams in scans]
+            views = [_of_view(one.boxes[row], np.array(beams.pose.position_m)) for beams in scans]
             most = [view for view, count in zip(views, counts, strict=True) if count == max(counts)]
             together = [hit for hits in by_scan for hit in hits[row]]
             nearest = min(most, key=lambda view: view["range_m"])

@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from egvs.scoring import target_scores
 from egvs.scoring.target_scores import DETECTORS, FEATURES, MODELLED, MONOTONICITY, DetectabilityModel
-from egvs.sensors.sensor import BeamTable, Sensor
 from tests.scoring.target_scenes import beams_to, frame, seen
 from tests.scoring.test_visible_targets import AT, car, fan
 
 DATA = json.loads(target_scores.MODEL_FILE.read_text(encoding="utf-8"))
 HIGH = {"log_points": 8.0, "log_points_on_sides": 8.0, "length_share": 1.0, "width_share": 1.0, "hole_m": 6.0,
         "gap_m": 20.0, "depression_deg": 60.0, "length_m": 18.0, "range_m": 120.0, "side": 1.0,
-        "log_spacing": 1.6, "log_column_spacing": 0.0}  # fmt: skip
-LOW = dict.fromkeys(HIGH, 0.0) | {"log_spacing": -4.0, "log_column_spacing": -4.0}
+        "log_spacing": 1.6}  # fmt: skip
+LOW = dict.fromkeys(HIGH, 0.0) | {"log_spacing": -4.0}
 
 
 def rows(count: int, seed: int = 1) -> np.ndarray:
@@ -90,23 +88,9 @@ def test_features_by_hand():
     # 114 points on a side of 4 m by 1.5 m, and a little of the roof
     area_m2 = math.cos(math.radians(slope)) * 6.0 + math.sin(math.radians(slope)) * 8.0
     right = [math.log(115), math.log(115), found.length_share[0], 0.0, hole_m, 20.0, slope, 4.0, found.range_m[0], 1.0,
-             0.5 * math.log(area_m2 / 114), math.log(found.range_m[0] * math.radians(0.2))]  # fmt: skip
+             0.5 * math.log(area_m2 / 114)]  # fmt: skip
     np.testing.assert_allclose(x, [right], atol=1e-9)
     assert FEATURES[5] == "gap_m" and found.record.gap_m[0] == 36.0  # 40 m between centres, 4 m long; 20 m is alone
-
-
-def test_spacing_of_columns_by_hand():
-    vehicles, beams = [frame([car(21.0, 0.0)])], fan()
-    ring = replace(beams.sensor, azimuths=90, azimuth_deg=(0.0, 89.0))  # every degree
-    found = seen(vehicles, replace(beams, sensor=ring))
-    np.testing.assert_allclose(target_scores.column_spacing_m(found), found.range_m * math.pi / 180.0)
-    coarse = seen(vehicles, replace(beams, sensor=replace(ring, azimuths=2)))  # 89 degrees
-    assert target_scores.column_spacing_m(coarse).tolist() == [target_scores.MAX_SPACING_M]
-    table = Sensor("table", (), (), 0, 100.0, "", table=BeamTable(np.zeros(1), np.zeros(1)))
-    without_rings = seen(vehicles, replace(beams, sensor=table))
-    spacing_m = target_scores.point_spacing_m(without_rings)
-    assert target_scores.column_spacing_m(without_rings).tolist() == spacing_m.tolist()
-    assert target_scores.column_spacing_m(replace(found, range_m=np.zeros(1))) > 0.0  # a logarithm exists
 
 
 def test_a_vehicle_without_a_point_is_missed_and_one_well_seen_is_found():
@@ -128,7 +112,7 @@ def test_a_detector_that_measures_heights_from_the_sensor_misses_from_high_mount
         depression_rad = math.atan2(height_m - 0.75, 15.0)
         row = dict(LOW, log_points=6.0, log_points_on_sides=5.5, length_share=0.98, width_share=0.9, gap_m=20.0,
                    depression_deg=math.degrees(depression_rad), length_m=4.5, range_m=15.0 / math.cos(depression_rad),
-                   side=0.7, log_spacing=-2.2, log_column_spacing=-2.9)  # fmt: skip
+                   side=0.7, log_spacing=-2.2)  # fmt: skip
         return target_scores.detectability_model(detector).chances(np.array([[row[name] for name in FEATURES]]))[0]
 
     assert chance("pointpillars_sensor", 2.0) > 0.5

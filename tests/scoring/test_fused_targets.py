@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -81,7 +80,7 @@ def test_two_equal_sensors_at_one_pole_add_points_and_nothing_else() -> None:
     twice = fuse_targets([one, one])
     assert (one.points > 0.0).any() and (one.points == 0.0).any()
     assert (twice.points == 2.0 * one.points).all() and (twice.points_on_sides == 2.0 * one.points_on_sides).all()
-    for name in (*COLUMNS[3:], "bounds_m", "slices"):
+    for name in ("length_share", "width_share", "hole_m", "range_m", "depression_deg", "side", "bounds_m", "slices"):
         assert (getattr(twice, name) == getattr(one, name)).all()
     single, doubled = detection_chances(one), detection_chances(twice)
     independent = 1.0 - (1.0 - single) ** 2
@@ -142,14 +141,3 @@ def test_sensors_have_to_see_the_same_record() -> None:
         fuse_targets(views)
     with pytest.raises(ValueError, match="at least one sensor"):
         fuse_targets([])
-
-
-def test_spacing_of_columns_is_that_of_the_sensor_with_most_points() -> None:
-    record = TargetRecord.of([frame(random_boxes(np.random.default_rng(5), 40))], GRID)
-    few, many = rings((110.0, 205.0, 5.0), count=1000), rings((110.0, 205.0, 5.0), count=4000)
-    coarse = replace(few, sensor=replace(few.sensor, azimuths=100))
-    views = views_of(record, coarse, many)
-    fused = fuse_targets(views)
-    most = np.where(views[0].points > views[1].points, 2.0 * math.pi / 100, views[1].column_step_rad)
-    seen = views[0].points != views[1].points
-    assert seen.any() and np.array_equal(fused.column_step_rad[seen], most[seen])

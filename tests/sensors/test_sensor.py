@@ -366,17 +366,6 @@ def test_middle_of_a_table_is_that_of_its_smallest_arc() -> None:
     assert BeamTable(np.zeros(1), np.array([270.0])).azimuth_span_deg == (-90.0, -90.0)
 
 
-def test_rings_of_a_table() -> None:
-    elevation, azimuth = (np.ravel(grid) for grid in np.meshgrid([-10.0, 0.0, 10.0], np.arange(60.0)))
-    assert BeamTable(elevation, azimuth).ring_step_deg == 1.0
-    assert BeamTable(elevation[::-1], azimuth[::-1]).ring_step_deg == 1.0
-    twice = BeamTable(np.repeat(elevation, 2), np.repeat(azimuth, 2))  # two beams at every place
-    assert twice.ring_step_deg == 1.0
-    assert BeamTable(elevation + np.arange(180.0) / 1000, azimuth).ring_step_deg is None  # no two are equally high
-    assert CATALOGUE["OS1-64"].column_step_deg == 0.3515625
-    assert CATALOGUE["Livox HAP"].column_step_deg is None and CATALOGUE["Livox Tele-15"].column_step_deg is None
-
-
 def test_ring_sensor_as_table_has_the_same_scores(mini: Path, tmp_path: Path) -> None:
     """The table of the small sensor, beam by beam: the same scans to the last bit, so the same scores."""
     by_rings = egvs.run(egvs.load(mini), tmp_path / "rings")

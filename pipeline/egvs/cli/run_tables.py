@@ -34,6 +34,7 @@ from egvs.report import sections
 from egvs.report.formatting import SCORE_LABELS, ScoreLabel, format_probability
 from egvs.report.ranking import Pole, RankedSite, companion_score, group_by_pole
 from egvs.scenario.effects_config import RangeLimitParameters
+from egvs.scenario.score_config import ALL_DETECTORS
 
 if TYPE_CHECKING:
     from egvs.runs.store import Store, StoreEntry
@@ -135,7 +136,8 @@ def _outcome_sentences(folder: Path, record: RunRecord, sites: Sequence[RankedSi
         metadata["grid"]["voxel_m"],
         moving_occlusion="moving_occlusion" in record.scenario.get("effects", {}),
     )
-    if disagreement := sections.ranking_disagreement(sites, egvs_setting):
+    detectors = [record.scenario.get("score", {}).get("detector", ALL_DETECTORS)]
+    if disagreement := sections.ranking_disagreement(sites, egvs_setting, detectors=detectors):
         sentences.append(disagreement)
     return sentences
 

@@ -415,7 +415,7 @@ def _sentences(contents: PageContents) -> dict[str, str]:
         "contradiction": "" if contents.detected is None else contents.detected.check.contradiction,
         "lead": lead(ranking, recorded_frames_hint(scenario, ranking, contents.stages)),
         "entropy_seen_note": entropy_seen_note(ranking),
-        "disagreement": ranking_disagreement(ranking.sites, setting),
+        "disagreement": ranking_disagreement(ranking.sites, setting, detectors=scenario.score.detectors),
     }
 
 

@@ -8,7 +8,8 @@ from typing import Any
 from egvs.core.wording import format_percent
 from egvs.report.formatting import join_names
 from egvs.report.ranking import RankedSite, Ranking
-from egvs.scenario.score_config import DEFAULT_SCORE, Detector
+from egvs.report.sections import FROM_SENSOR_NOTE
+from egvs.scenario.score_config import DEFAULT_SCORE, FROM_SENSOR
 
 MIN_TILT_DEG = 5.0
 """A sensor is called tilted from this pitch on."""
@@ -29,11 +30,6 @@ _SIZE_NOTE = (
     "The order of sites by this score was validated better than its size: in the study, which was simulated, the "
     "shares found differed from the expected ones by 3 to 8 percentage points for the detectors that it stands for, "
     "and by up to 14 for another one (docs/validity.md)."
-)
-_FROM_SENSOR: Detector = "pointpillars_sensor"
-_FROM_SENSOR_NOTE = (
-    "This detector measures heights from the sensor, and the score for it was tested at 13 sites of one junction only "
-    "(docs/validity.md)."
 )
 _COVERAGE_NOTE = "The recorded tracks cover {} of the {}; elsewhere the traffic is unknown."
 _TILT_NOTE = (
@@ -72,7 +68,7 @@ def describe_reliability(
     if ranking.has_errors and (seeds > 1 or ranking.by.name == DEFAULT_SCORE):
         notes.append(_error_note(seeds, "recording" if recordings else "simulation", detectors))
     if ranking.by.name == DEFAULT_SCORE:
-        notes.append(_FROM_SENSOR_NOTE if _FROM_SENSOR in detectors else _SIZE_NOTE)
+        notes.append(FROM_SENSOR_NOTE if FROM_SENSOR in detectors else _SIZE_NOTE)
     if notes:
         sentences.append(" ".join(notes))
     sentences += [

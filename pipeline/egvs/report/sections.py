@@ -32,7 +32,7 @@ from egvs.report.ranking import Pole, RankedSite
 from egvs.report.ranking_check import RankingCheck
 from egvs.report.svg_figures import CurveStep, MapSite
 from egvs.scenario.model import Scenario
-from egvs.scenario.score_config import DEFAULT_SCORE
+from egvs.scenario.score_config import DEFAULT_SCORE, FROM_SENSOR
 from egvs.scenario.signal_config import ASSUMED_PLANS
 from egvs.sensors.sites import Pose, Site
 from egvs.traffic.movements import MovementNames
@@ -52,6 +52,11 @@ has one entry per setting, named by :func:`egvs_setting`."""
 RHO_RANGE = "0.93 to 0.98, depending on junction and detector; among sites of equal height, 0.90 to 0.97"
 """Rank correlation of the recommended score with detection, over the held-out junctions and the detectors of the larger
 study (docs/validity.md)."""
+
+FROM_SENSOR_NOTE = (
+    "This detector measures heights from the sensor, and the score for it was tested at 13 sites of one junction only "
+    "(docs/validity.md)."
+)
 
 NAMED_POLES = 5
 """Poles at the head of the ranking whose location in a lane is stated with the result."""
@@ -323,7 +328,9 @@ def egvs_setting(gamma: float, voxel_m: float, *, moving_occlusion: bool = False
     return f"egvs (gamma {gamma:g}, {occlusion}voxel {voxel_m:g})"
 
 
-def ranking_disagreement(sites: Sequence[RankedSite], egvs: str, rho: Mapping[str, Mapping[str, float]] = RHO) -> str:
+def ranking_disagreement(
+    sites: Sequence[RankedSite], egvs: str, rho: Mapping[str, Mapping[str, float]] = RHO, detectors: Sequence[str] = ()
+) -> str:
     """Return sentences if the EGVS and the recommended score have different best sites; empty otherwise.
 
     Parameters
@@ -334,15 +341,15 @@ def ranking_disagreement(sites: Sequence[RankedSite], egvs: str, rho: Mapping[st
         The EGVS setting of the run, from :func:`egvs_setting`.
     rho
         The evidence; :data:`RHO` by default.
+    detectors
+        Detectors that the recommended score stands for.
     """
     by_egvs, by_other = best_sites(sites, "egvs"), best_sites(sites, DEFAULT_SCORE)
     if not by_egvs or not by_other or (by_egvs[0] == by_other[0] and set(by_egvs) == set(by_other)):
         return ""
     noun = SCORE_LABELS[DEFAULT_SCORE].noun
-    return (
-        f"The best sites by EGVS are {join_names(by_egvs)}; by {noun} they are {join_names(by_other)}. "
-        f"{_describe_evidence(noun, egvs, rho)}"
-    )
+    evidence = FROM_SENSOR_NOTE if FROM_SENSOR in detectors else _describe_evidence(noun, egvs, rho)
+    return f"The best sites by EGVS are {join_names(by_egvs)}; by {noun} they are {join_names(by_other)}. {evidence}"
 
 
 def best_sites(sites: Sequence[RankedSite], name: str) -> tuple[str, ...]:

@@ -36,8 +36,11 @@ VEHICLE_SCORES: tuple[OtherScore, ...] = ("expected_detections", "seen_well", "p
 """Scores that are means over the vehicles of recorded frames."""
 
 Detector = Literal["cluster", "pointpillars", "pointpillars_sensor"]
-"""Detectors whose detections a model of ``expected_detections`` predicts. ``pointpillars_sensor`` is not installed: it
-measures heights from the sensor and was trained with sensors 2 m above the ground, as detectors for cars are."""
+"""Detectors whose detections a model of ``expected_detections`` predicts. ``pointpillars_sensor`` has a model, but is
+not installed: it measures heights from the sensor and was trained 2 m above the ground, as detectors for cars are."""
+
+FROM_SENSOR: Detector = "pointpillars_sensor"
+"""The detector that measures heights from the sensor."""
 
 MEAN_DETECTORS: tuple[Detector, ...] = ("cluster", "pointpillars")
 """The detectors that ``"all"`` stands for; both measure heights from the ground."""

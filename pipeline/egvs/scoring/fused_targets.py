@@ -12,8 +12,7 @@ quantity                               of the fused points
 points, points on sides                the sum over sensors
 length share, width share              between the lowest and the highest coordinate of the points of any sensor
 hole                                   the longest run of slices of the length in which no sensor has a point
-range, depression, angle of view,      of the sensor with most points; of equal ones the nearest
-spacing of columns
+range, depression, angle of view       of the sensor with most points; of equal ones the nearest
 gap to the neighbours, length          of the vehicle, the same for all sensors
 =====================================  =============================================================================
 
@@ -75,7 +74,6 @@ def fuse_targets(views: Sequence[TargetVisibility]) -> TargetVisibility:
         range_m=np.array([view.range_m for view in views])[best, rows],
         depression_deg=np.array([view.depression_deg for view in views])[best, rows],
         side=np.array([view.side for view in views])[best, rows],
-        column_step_rad=np.array([view.column_step_rad for view in views])[best, rows],
         bounds_m=bounds_m,
         slices=slices,
     )

@@ -16,8 +16,8 @@ one without. g(0) = 0: a vehicle without a point is in a blind spot of the site.
 
 x are :data:`FEATURES`, f_t the trees of a boosted model. The model rises with points, points on sides, spans and the
 gap to the neighbour, and falls with the hole between points, with the depression angle and with the spacing of points
-(:data:`MONOTONICITY`); range, length, angle of view and the spacing of columns may have either effect. A vehicle
-without any point is never detected.
+(:data:`MONOTONICITY`); range, length and angle of view may have either effect. A vehicle without any point is never
+detected.
 
 *Point spacing*: the mean distance of neighbouring points on the vehicle, perpendicular to the line of sight,
 
@@ -26,10 +26,6 @@ without any point is never detected.
 with the points :math:`n_{alone}` that it has without other road users in the way, and the silhouette A of a level box
 of length L, width W and height H, seen at the angle :math:`\delta` below the horizon and with the sine s between line
 of sight and length. It puts sensors of any number of channels, and ranges, on one scale.
-
-*Column spacing*: range times the azimuth between neighbouring beams of a ring. With the point spacing, it tells a
-vehicle that is covered evenly from one with the same number of points in a few dense rings, which detectors find less
-often. Sensors whose beams form no rings have the point spacing here.
 
 There is one model per detector; p is the mean over :data:`DETECTORS`, or the model that ``[score] detector`` names. The
 standard error contains how far they disagree (:mod:`egvs.scoring.standard_errors`).
@@ -83,9 +79,6 @@ ISOLATED_GAP_M = 20.0
 MAX_SPACING_M = 5.0
 """Largest spacing of points, also of a vehicle that no beam would meet."""
 
-MIN_RANGE_M = 0.01
-"""Shorter ranges count as this one, so that the spacing of columns has a logarithm."""
-
 PEOPLE_POINTS = 20.0
 """Pedestrians and bicycles with at least as many points count as found: there is no model of detectors of people."""
 
@@ -101,13 +94,12 @@ MONOTONICITY = {
     "range_m": 0,
     "side": 0,
     "log_spacing": -1,
-    "log_column_spacing": 0,
 }
 """For each feature: 1 if the probability may only rise with it, -1 if it may only fall, 0 for either."""
 
 FEATURES = tuple(MONOTONICITY)
 """Features of the model, see :class:`egvs.scoring.targets.TargetVisibility`: logarithms of 1 + points, gaps of at most
-:data:`ISOLATED_GAP_M`, and the logarithms of :func:`point_spacing_m` and :func:`column_spacing_m`."""
+:data:`ISOLATED_GAP_M`, and the logarithm of :func:`point_spacing_m`."""
 
 
 @dataclass(frozen=True)
@@ -221,7 +213,6 @@ def detectability_features(visible: TargetVisibility) -> FloatArray:
         visible.range_m,
         visible.side,
         np.log(point_spacing_m(visible)),
-        np.log(column_spacing_m(visible)),
     ])  # fmt: skip
 
 
@@ -239,16 +230,6 @@ def point_spacing_m(visible: TargetVisibility) -> FloatArray:
     per_point_m2 = np.divide(area_m2, alone, out=np.full(len(visible), np.inf), where=alone > 0.0)
     spacing_m: FloatArray = np.minimum(np.sqrt(per_point_m2), MAX_SPACING_M)
     return spacing_m
-
-
-def column_spacing_m(visible: TargetVisibility) -> FloatArray:
-    """Return the distance of neighbouring beams of one ring at each vehicle, (n,) float64.
-
-    It is in metres, at most :data:`MAX_SPACING_M`. A sensor whose beams form no rings has the spacing of all points.
-    """
-    along_ring_m = np.maximum(visible.range_m, MIN_RANGE_M) * visible.column_step_rad
-    spacing_m: FloatArray = np.where(np.isnan(along_ring_m), point_spacing_m(visible), along_ring_m)
-    return np.minimum(spacing_m, MAX_SPACING_M)
 
 
 @dataclass(frozen=True, eq=False)

@@ -338,9 +338,6 @@ class TargetVisibility:
     side
         Sine of the angle in plan between the line of sight and the vehicle's length, (n,) float64: 0 from ahead or
         behind, 1 broadside.
-    column_step_rad
-        Azimuth between neighbouring beams of a ring of the sensor, (n,) float64; NaN for a sensor whose beams form no
-        rings.
     bounds_m
         Lowest and highest coordinate of its points, along and across the vehicle from its centre, (n, 2, 2) float64;
         infinite and minus infinite without a point.
@@ -359,7 +356,6 @@ class TargetVisibility:
     range_m: FloatArray
     depression_deg: FloatArray
     side: FloatArray
-    column_step_rad: FloatArray
     bounds_m: FloatArray
     slices: NDArray[np.uint64]
 
@@ -408,7 +404,6 @@ def visible_targets(
     if return_probability is not None:
         points_alone = points_alone * return_probability(range_m)
     bounds_m, slices = np.stack([hits.low[row], hits.high[row]], axis=1), hits.slices[row]
-    step_deg = beams.sensor.column_step_deg
     spans = span_shares(record, bounds_m)
     return VisibleTargets(
         record=record,
@@ -421,7 +416,6 @@ def visible_targets(
         range_m=range_m,
         depression_deg=np.degrees(np.arctan2(-away_m[:, 2], run_m)),
         side=np.divide(across_m, run_m, out=np.zeros(len(row)), where=run_m > 0.0),
-        column_step_rad=np.full(len(row), math.nan if step_deg is None else math.radians(step_deg)),
         bounds_m=bounds_m,
         slices=slices,
         sensor_m=sensor_m,

@@ -29,7 +29,7 @@ import math
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -79,14 +79,6 @@ class BeamTable:
 
     def __hash__(self) -> int:
         return hash(self._digest)
-
-    @cached_property
-    def ring_step_deg(self) -> float | None:
-        """Median azimuth between neighbouring beams of equal elevation; None unless most beams have such neighbours."""
-        beams = np.unique(np.column_stack([self.elevation_deg, self.azimuth_deg]), axis=0)
-        rise, step = np.diff(beams, axis=0).T
-        steps = step[rise == 0.0]
-        return float(np.median(steps)) if 2 * len(steps) >= len(beams) else None
 
     @property
     def azimuth_span_deg(self) -> tuple[float, float] | None:
@@ -300,11 +292,6 @@ class Sensor:
             return None
         first, last = self.azimuth_deg
         return (last - first) / (self.azimuths - 1)
-
-    @property
-    def column_step_deg(self) -> float | None:
-        """Angle between two beams of a ring, also of the rings of a table; None where beams form no rings."""
-        return self.azimuth_step_deg if self.table is None else self.table.ring_step_deg
 
     @property
     def middle_deg(self) -> tuple[float, float]:
