@@ -48,7 +48,7 @@ MEASURES = (
 )  # fmt: skip
 
 COMPUTING = (cloud_simulation.__name__, sweeps.__name__, detection_metrics.__name__, scene_inputs.__name__)
-CALLING = (__name__, detector_runs.__name__, held_out_traffic.__name__)
+CALLING = (__name__, low_models.__name__, detector_runs.__name__, held_out_traffic.__name__)
 
 Columns = dict[str, Any]
 
