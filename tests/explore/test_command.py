@@ -22,12 +22,15 @@ from egvs.explore import page, server, settings
 from egvs.runs.run import StageListener
 from tests.processes import EGVS
 
+INTERRUPTIBLE = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler); {EGVS}"
+"""A shell ignores the interrupt in what it starts in the background, and so do the processes of its tests."""
+
 
 @pytest.mark.system
 @pytest.mark.slow
 def test_serves_until_interrupt_and_cleans_up(mini: Path, tmp_path: Path) -> None:
     out = tmp_path / "run"
-    command = [sys.executable, "-c", EGVS, "explore", mini, "--no-browser", "--out", out]
+    command = [sys.executable, "-c", INTERRUPTIBLE, "explore", mini, "--no-browser", "--out", out]
     (tmp_path / "tmp").mkdir()
     started = subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
@@ -39,7 +42,7 @@ def test_serves_until_interrupt_and_cleans_up(mini: Path, tmp_path: Path) -> Non
     opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
     assert opener.open(address).status == 200
     os.kill(started.pid, signal.SIGINT)
-    printed, errors = started.communicate()
+    printed, errors = started.communicate(timeout=120)
     assert (started.returncode, printed.strip()) == (0, "")
     assert errors.splitlines()[-1].startswith("score")  # no message about the interrupt
     with pytest.raises(ProcessLookupError):
