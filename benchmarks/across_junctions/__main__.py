@@ -314,7 +314,7 @@ def _parts(protocol: Protocol, junction: Junction, names: str | None) -> list[st
 
 def _check_detector(name: str) -> None:
     try:
-        low_models.make(name)
+        low_models.make(name, "--part")
     except MissingBackendError as error:
         raise InputError("--part", str(error)) from None
 

@@ -10,11 +10,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from egvs.core.errors import MissingBackendError
+from egvs.scenario.score_config import FROM_SENSOR
 from egvs.validation.detectors import base
 from egvs.validation.detectors.base import Detector
 from egvs.validation.detectors.pointpillars import PointPillars
 
-LOW, SENSOR = "pointpillars_2m", "pointpillars_sensor"
+LOW, SENSOR = "pointpillars_2m", FROM_SENSOR
 NAMES = (LOW, SENSOR)
 
 
@@ -23,8 +24,15 @@ def model(name: str) -> Path:
     return Path(__file__).with_name(f"{name}.onnx")
 
 
-def make(name: str) -> Detector:
+def make(name: str, where: str = "--detector") -> Detector:
     """A detector of the study: one of these, or one that is installed.
+
+    Parameters
+    ----------
+    name
+        Its name.
+    where
+        The option that names it, for messages.
 
     Raises
     ------
@@ -32,7 +40,7 @@ def make(name: str) -> Detector:
         Also where the file of the model is not there.
     """
     if name not in NAMES:
-        return base.make_detector(name)
+        return base.make_detector(name, where)
     base.make_detector(PointPillars.NAME)  # needs what that needs
     if not model(name).is_file():
         raise MissingBackendError(f"{model(name).name} is not there")

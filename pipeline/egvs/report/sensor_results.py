@@ -27,7 +27,7 @@ from egvs.scenario.score_config import COST_COLUMN, DEFAULT_SCORE, CostsConfig
 SENSOR_EVIDENCE = (
     "How far to trust this: in simulation, at six held-out junctions with twelve sensors, the mean of cluster and "
     "pointpillars ranked sites nearly as three detectors do (rank correlation 0.93 to 0.98). But the first of a "
-    "ranking lost up to 8 points of AP, and 20 once; shares found with OS0-128 and OS1-64 are 7 to 9 points higher "
+    "ranking lost up to 8 points of AP, and 20 once; shares found with OS0-128 and OS1-64 are 6 to 9 points higher "
     "than expected. Do not decide between sensors by less than about 10 points, nor by the cost of one more point. "
     "See docs/validity.md."
 )
