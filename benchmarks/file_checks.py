@@ -22,8 +22,9 @@ from typing import Any
 from unittest.mock import patch
 
 import egvs
+from egvs.core import sandbox
 from egvs.runs import run as runs_run
-from egvs.traffic import recording, sandbox, sumo, user_files
+from egvs.traffic import recording, sumo, user_files
 
 SCENARIO = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku"
 STARTS, MAX_SHARE = 15, 0.03
@@ -86,7 +87,7 @@ def measure_checks() -> Iterator[dict[str, float]]:
 
 def launcher_s() -> float:
     """Return the additional processor seconds of starting a program with the launcher."""
-    program, launcher = ["/bin/true"], [sys.executable, "-I", "-S", sandbox.__file__, os.curdir, str(os.getpid())]
+    program, launcher = ["/bin/true"], [sys.executable, "-I", "-S", sandbox.__file__, "write=.", str(os.getpid())]
     times_s: dict[bool, list[float]] = {False: [], True: []}
     for _ in range(STARTS):
         for by_launcher, seconds_taken in times_s.items():

@@ -16,6 +16,8 @@ from egvs.core.grid import FloatArray
 from egvs.formats import xml
 from egvs.formats.rasters import HeightGrid, is_ascii_grid, is_geotiff, read_ascii_grid, read_geotiff
 
+pytestmark = pytest.mark.system
+
 EAST, NORTH, CELL_M = 500_000.0, 5_400_000.0, 10.0
 
 

@@ -289,6 +289,14 @@ def print_check(checked: CheckReport) -> None:
     out.print(f"checked {checked.sites} sites, {checked.solids} solids and {checked.lanes} lanes")
 
 
+def print_protections(missing: Sequence[str]) -> None:
+    """Print whether this system confines the programs that read a user's files, and what it cannot enforce."""
+    if not missing:
+        print_sentences(["SUMO and the readers of foreign formats are confined to their files."])
+    for protection in missing:
+        print_sentences([f"not protected: {protection}"])
+
+
 def print_demo_hints(results: Path) -> None:
     """Print what to try after ``egvs demo``."""
     out = console(_RESULT_FILE_WIDTH)

@@ -89,7 +89,8 @@ MAP_OBJECTS = Limit("EGVS_MAX_MAP_OBJECTS", 5_000_000, "objects", "an OpenStreet
 GROUND_POINTS = Limit("EGVS_MAX_GROUND_POINTS", 2_000_000, "points", "the ground surface built from a network")
 DOWNLOAD = Limit("EGVS_MAX_DOWNLOAD_MB", 200, "MB", "a downloaded map")
 DOWNLOAD_TIME = Limit("EGVS_MAX_DOWNLOAD_S", 120, "s", "the download of a map")
-READER_MEMORY = Limit("EGVS_MAX_READER_MB", 2000, "MB", "the program that reads a LAZ or E57 file or a recording")
+READER_MEMORY = Limit("EGVS_MAX_READER_MB", 2000, "MB", "a process that reads a file with another library")
+READER_TIME = Limit("EGVS_MAX_READER_S", 120, "s", "work of such a process, beside 1 s for each MB of the file")
 
 
 def checked_size(path: Path, limit: Limit, where: object = "") -> int:

@@ -115,7 +115,7 @@ def _read_scan(file: Any, number: int, header: Any, pose: _Pose | None) -> Itera
         with np.errstate(invalid="ignore", over="ignore"):
             if pose is not None:
                 points = _rotated(points, pose.rotation) + pose.translation
-        yield Block({"scan": number, "station_m": station}, points)
+        yield Block.of_points({"scan": number, "station_m": station}, points)
     reader.close()
 
 

@@ -163,4 +163,4 @@ def _number_at(file: BinaryIO, kind: str, offset: int) -> int:
 
 
 if __name__ == "__main__":
-    serve(lambda path: (Block({}, chunk) for chunk in _chunks(path)))
+    serve(lambda path: (Block.of_points({}, chunk) for chunk in _chunks(path)))

@@ -1,4 +1,4 @@
-"""Read rasters of heights: GeoTIFF (with rasterio, extra ``gis``) and ASCII grids of Esri (``.asc``).
+"""Read rasters of heights: GeoTIFF (rasterio in a process of its own, extra ``gis``) and ASCII grids (``.asc``).
 
 A raster is a grid of cells; the height of a cell is that at its middle. Between the middles of four cells, heights are
 interpolated bilinearly; up to half a cell outside the outermost middles, they are constant. A height is unknown (NaN)
@@ -12,10 +12,11 @@ ASCII raster format
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO, Any
 
@@ -27,7 +28,11 @@ from egvs.core.grid import FloatArray
 from egvs.core.numbers import parse_decimal
 from egvs.core.reading import COMPLETE_FILE, translate_errors
 from egvs.formats import georeference, xml
+from egvs.formats.gdal_drivers import keep_driver
+from egvs.formats.reader_process import Block, read_blocks, serve
 
+_DRIVER = "GTiff"
+_CANNOT_READ = "cannot be read as GeoTIFF"
 _TIFF_STARTS = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")
 _FOOT_M, _SURVEY_FOOT_M = 0.3048, 1200 / 3937
 _UNITS_M = {
@@ -118,8 +123,7 @@ def read_geotiff_header(path: Path) -> RasterHeader:
     MissingExtraError
         When rasterio is not installed.
     """
-    with _open_tiff(path) as file:
-        return _tiff_header(file, path)
+    return _header(_read_tiff(path, None).values)
 
 
 def read_geotiff(path: Path, bounds: tuple[float, float, float, float]) -> HeightGrid:
@@ -144,16 +148,13 @@ def read_geotiff(path: Path, bounds: tuple[float, float, float, float]) -> Heigh
     MissingExtraError
         When rasterio is not installed.
     """
-    with _open_tiff(path) as file:
-        header = _tiff_header(file, path)
-        top, bottom, left, right = _window(header, bounds)
-        if top >= bottom or left >= right:
-            return HeightGrid(np.empty((0, 0)), header.transform, header.crs)
-        limits.POINTS.check(path, (bottom - top) * (right - left), "has too many cells in the region")
-        cells = file.read(1, window=((top, bottom), (left, right)), masked=True)
-        heights_m = np.ma.filled(cells.astype(np.float64), np.nan)
-        heights_m = heights_m * file.scales[0] + file.offsets[0]
-        heights_m *= _tiff_unit_m(file, header.crs, path)
+    part = _read_tiff(path, bounds)
+    header = _header(part.values)
+    top, bottom, left, right = part.values["window"]
+    if top >= bottom or left >= right:
+        return HeightGrid(np.empty((0, 0)), header.transform, header.crs)
+    heights_m = np.frombuffer(part.content).reshape(bottom - top, right - left) * part.values["scale"]
+    heights_m = (heights_m + part.values["offset"]) * _tiff_unit_m(part.values["unit"], header.crs, path)
     heights_m[~np.isfinite(heights_m)] = np.nan
     a, b, c, d, e, f = header.transform
     transform = (a, b, c + a * left + b * top, d, e, f + d * left + e * top)
@@ -204,47 +205,25 @@ def _window(header: RasterHeader, bounds: tuple[float, float, float, float]) -> 
     return top, bottom, left, right
 
 
-@contextmanager
-def _open_tiff(path: Path) -> Iterator[Any]:
-    """Open a TIFF alone, without the files beside it."""
+def _read_tiff(path: Path, bounds: tuple[float, float, float, float] | None) -> Block:
+    """Return the header of a TIFF and, within bounds, its cells; another process reads the file."""
     plugins.require_libraries(f"{path.name}: reading GeoTIFF", "gis", "rasterio")
-    import warnings
-
-    import rasterio
-    from rasterio.errors import NotGeoreferencedWarning
-
     limits.checked_size(path, limits.FILE)
-    alone = {"GDAL_PAM_ENABLED": "NO", "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_NUM_THREADS": "1"}
-    with translate_errors(path, COMPLETE_FILE, "cannot be read as GeoTIFF"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with rasterio.Env(**alone), rasterio.open(path, driver="GTiff") as file:
-            yield file
+    with path.open("rb") as file:
+        if not is_geotiff(file.read(4)):
+            raise InputError(path, f"{_CANNOT_READ} (it does not begin like a TIFF)", COMPLETE_FILE)
+    blocks = list(read_blocks(__name__, path, str(path), _CANNOT_READ, [json.dumps(bounds)]))
+    if len(blocks) != 1:
+        raise InputError(path, _CANNOT_READ, COMPLETE_FILE)
+    return blocks[0]
 
 
-def _tiff_header(file: Any, path: Path) -> RasterHeader:
-    if file.count != 1:
-        problem = f"expected one band of heights, got {file.count}"
-        raise InputError(path, problem, "Save the heights alone, for example with gdal_translate -b 1.")
-    if np.dtype(file.dtypes[0]).kind not in "iuf":
-        raise InputError(path, f"expected heights as real numbers, got {file.dtypes[0]}")
-    rows, columns = int(file.height), int(file.width)
-    block_rows, block_columns = file.block_shapes[0]
-    limits.POINTS.check(path, block_rows * block_columns, "has too many cells in one block")
-    transform = tuple(float(value) for value in file.transform[:6])
-    a, b, c, d, e, f = transform
-    if (a, b, c, d, e, f) == (1.0, 0.0, 0.0, 0.0, 1.0, 0.0):
-        hint = "Export it with its georeference, as GeoTIFF."
-        raise InputError(path, "the image has no georeference", hint)
-    is_small = all(abs(value) <= _MAX_COORDINATE for value in transform)  # false for NaN
-    if not is_small or not abs(a * e - b * d) > _MIN_CELL_AREA:
-        raise InputError(path, f"invalid georeference {transform}", COMPLETE_FILE)
-    crs = file.crs.to_wkt() if file.crs else None
-    return RasterHeader(rows, columns, (a, b, c, d, e, f), crs)
+def _header(values: Mapping[str, Any]) -> RasterHeader:
+    return RasterHeader(values["rows"], values["columns"], tuple(values["transform"]), values["crs"])
 
 
-def _tiff_unit_m(file: Any, crs: str | None, path: Path) -> float:
+def _tiff_unit_m(unit: str, crs: str | None, path: Path) -> float:
     """Return the unit of heights: of the band, else of the reference system."""
-    unit = (file.units[0] or "").strip().lower()
     if unit not in _UNITS_M:
         raise InputError(path, f"expected heights in metres or feet, got {unit!r}", "Convert the heights to metres.")
     unit_m = _UNITS_M[unit]
@@ -337,3 +316,64 @@ def _crs_beside(path: Path) -> str | None:
     crs = limits.read_bytes(beside, limits.DOCUMENT).decode("utf-8", "replace").strip()
     georeference.parse_crs(crs, str(beside))
     return crs
+
+
+# --- in the other process ---
+
+
+def _keep_one_driver() -> None:
+    import rasterio
+
+    with rasterio.Env() as environment:
+        keep_driver(_DRIVER, environment.drivers())
+
+
+def _read_file(path: Path) -> Iterator[Block]:
+    import warnings
+
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning
+
+    bounds = json.loads(sys.argv[2])
+    alone = {"GDAL_PAM_ENABLED": "NO", "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_NUM_THREADS": "1"}
+    warnings.simplefilter("ignore", NotGeoreferencedWarning)
+    with rasterio.Env(**alone), rasterio.open(path, driver=_DRIVER) as file:
+        header = _tiff_header(file, path)
+        values: dict[str, Any] = asdict(header)
+        if bounds is None:
+            yield Block(values)
+            return
+        top, bottom, left, right = _window(header, bounds)
+        values["window"] = (top, bottom, left, right)
+        if top >= bottom or left >= right:
+            yield Block(values)
+            return
+        limits.POINTS.check(path, (bottom - top) * (right - left), "has too many cells in the region")
+        cells = file.read(1, window=((top, bottom), (left, right)), masked=True)
+        values |= {"scale": file.scales[0], "offset": file.offsets[0], "unit": (file.units[0] or "").strip().lower()}
+        yield Block(values, np.ma.filled(cells.astype(np.float64), np.nan).tobytes())
+
+
+def _tiff_header(file: Any, path: Path) -> RasterHeader:
+    if file.count != 1:
+        problem = f"expected one band of heights, got {file.count}"
+        raise InputError(path, problem, "Save the heights alone, for example with gdal_translate -b 1.")
+    if np.dtype(file.dtypes[0]).kind not in "iuf":
+        raise InputError(path, f"expected heights as real numbers, got {file.dtypes[0]}")
+    rows, columns = int(file.height), int(file.width)
+    block_rows, block_columns = file.block_shapes[0]
+    limits.POINTS.check(path, block_rows * block_columns, "has too many cells in one block")
+    transform = tuple(float(value) for value in file.transform[:6])
+    a, b, c, d, e, f = transform
+    if (a, b, c, d, e, f) == (1.0, 0.0, 0.0, 0.0, 1.0, 0.0):
+        hint = "Export it with its georeference, as GeoTIFF."
+        raise InputError(path, "the image has no georeference", hint)
+    is_small = all(abs(value) <= _MAX_COORDINATE for value in transform)  # false for NaN
+    if not is_small or not abs(a * e - b * d) > _MIN_CELL_AREA:
+        raise InputError(path, f"invalid georeference {transform}", COMPLETE_FILE)
+    crs = file.crs.to_wkt() if file.crs else None
+    return RasterHeader(rows, columns, (a, b, c, d, e, f), crs)
+
+
+if __name__ == "__main__":
+    serve(_read_file, _keep_one_driver)

@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from egvs.core import limits
-from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.formats.reader_process import Block, read_blocks
 from egvs.formats.recording_options import RecordingOptions
@@ -92,8 +91,6 @@ def read_recording(
     try:
         for block in blocks:
             values = block.values
-            if "problem" in values:
-                raise InputError(values.get("where") or where, values["problem"], values["hint"])
             if "stamps_s" in values:
                 header = values
             elif "label" in values:
@@ -121,13 +118,8 @@ def _plausible_times(time_s: FloatArray) -> FloatArray | None:
 
 def process_options() -> RecordingOptions:
     """Return the options that this process was started with."""
-    topic, max_sweeps, range_m = json.loads(sys.argv[3])
+    topic, max_sweeps, range_m = json.loads(sys.argv[2])
     return RecordingOptions(topic, max_sweeps, range_m)
-
-
-def problem_block(problem: str, hint: str, where: str = "") -> Block:
-    """Return the block that makes the reader raise an InputError with this problem and hint."""
-    return Block({"problem": problem, "hint": hint, "where": where})
 
 
 def header_block(source: str, stamps_s: Sequence[float], notes: Sequence[str] = ()) -> Block:
@@ -137,8 +129,8 @@ def header_block(source: str, stamps_s: Sequence[float], notes: Sequence[str] = 
 
 def sweep_blocks(label: str, points_m: FloatArray, time_s: FloatArray | None) -> Iterator[Block]:
     """Yield the blocks of a sweep."""
-    yield Block({"label": label}, points_m)
+    yield Block.of_points({"label": label}, points_m)
     if time_s is not None:
         columns = np.zeros((len(time_s), 3))
         columns[:, 0] = time_s
-        yield Block({}, columns)
+        yield Block.of_points({}, columns)

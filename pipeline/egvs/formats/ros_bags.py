@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from egvs.core import limits, plugins
+from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.formats.reader_process import Block, serve
 from egvs.formats.recording_options import RecordingOptions
@@ -24,7 +25,6 @@ from egvs.formats.recordings import (
     Recording,
     chosen_sweeps,
     header_block,
-    problem_block,
     process_options,
     read_recording,
     sweep_blocks,
@@ -74,15 +74,13 @@ def _read_file(path: Path) -> Iterator[Block]:
         topics = sorted({connection.topic for connection in connections})
         topic = options.topic or (topics[0] if len(topics) == 1 else None)
         if topic not in topics:
-            yield _topic_problem(topics, topic, sorted({connection.topic for connection in reader.connections}))
-            return
+            raise _topic_error(topics, topic, sorted({connection.topic for connection in reader.connections}))
         chosen = [connection for connection in connections if connection.topic == topic]
         stamps_s: list[float] = []
         for connection, _, data in reader.messages(chosen):
             stamps_s.append(_stamp_s(reader.deserialize(data, connection.msgtype)))
         if not stamps_s:
-            yield problem_block(f"the topic {topic} has no messages", "Choose another topic with --topic.")
-            return
+            raise InputError("", f"the topic {topic} has no messages", "Choose another topic with --topic.")
         selected = set(chosen_sweeps(len(stamps_s), options.max_sweeps).tolist())
         frames: set[str] = set()
         blocks: list[Block] = []
@@ -98,18 +96,19 @@ def _read_file(path: Path) -> Iterator[Block]:
         yield from blocks
 
 
-def _topic_problem(topics: list[str], topic: str | None, all_topics: list[str]) -> Block:
+def _topic_error(topics: list[str], topic: str | None, all_topics: list[str]) -> InputError:
     if not topics:
         others = ", ".join(all_topics) or "none"
-        return problem_block(
+        return InputError(
+            "",
             f"expected a topic of {_TYPE.replace('/msg', '')}, got none (topics: {others})",
             "Record the driver's point clouds, not its packets.",
         )
     names = ", ".join(topics)
     if topic is None:
         problem = f"expected one topic with point clouds, got {len(topics)}: {names}"
-        return problem_block(problem, "Choose one with --topic.")
-    return problem_block(f"expected one of {names}, got {topic!r}", "Choose one of these.", "--topic")
+        return InputError("", problem, "Choose one with --topic.")
+    return InputError("--topic", f"expected one of {names}, got {topic!r}", "Choose one of these.")
 
 
 def _stamp_s(message: Any) -> float:

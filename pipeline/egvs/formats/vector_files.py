@@ -1,8 +1,9 @@
 """Layers of GIS files as GeoJSON documents: GeoPackage, Shapefile, KML and GeoParquet.
 
-GeoPackage, Shapefile and KML are read by GDAL (pyogrio, extra ``gis``), GeoParquet (https://geoparquet.org) by pyarrow.
-The result is a FeatureCollection with the member ``crs``, as GeoJSON files of this program have it. So the same rules
-apply to all formats. Coordinates stay in the system of the file, x before y.
+GeoPackage, Shapefile and KML are read by GDAL in a process of its own (:mod:`egvs.formats.gdal_layers`, extra ``gis``),
+GeoParquet (https://geoparquet.org) by pyarrow. The result is a FeatureCollection with the member ``crs``, as GeoJSON
+files of this program have it. So the same rules apply to all formats. Coordinates stay in the system of the file, x
+before y.
 
 KML: the altitude of a point counts only where it is ``relativeToGround``; Google Earth writes 0 where it is clamped to
 the ground. The fields of LIBKML that describe how a placemark is drawn are left out.
@@ -26,7 +27,7 @@ from egvs.core import files, plugins
 from egvs.core.errors import InputError
 from egvs.core.numbers import parse_decimal
 from egvs.core.reading import COMPLETE_FILE
-from egvs.core.wording import list_first
+from egvs.formats.gdal_layers import read_layer
 
 GIS_FORMATS = {
     ".gpkg": "GeoPackage", ".shp": "Shapefile", ".kml": "KML", ".parquet": "GeoParquet", ".geoparquet": "GeoParquet",
@@ -37,7 +38,6 @@ _SHAPEFILE_PARTS = (".dbf", ".prj", ".cpg", ".shx")
 _KML_FIELDS = (
     "id", "timestamp", "begin", "end", "altitudeMode", "tessellate", "extrude", "visibility", "drawOrder", "icon",
 )  # fmt: skip
-_MAX_NAMED_LAYERS = 10
 
 
 def is_gis_file(path: Path) -> bool:
@@ -90,19 +90,9 @@ def read_gis_file(path: Path, geometry: str) -> dict[str, Any]:
 def _read_gdal(path: Path, kind: str, geometry: str) -> tuple[pa.Table, str, str | None]:
     """Return the table of a layer, the name of its geometry column, and its reference system."""
     plugins.require_libraries(f"{path.name}: reading {kind}", "gis", "pyogrio")
-    import pyogrio
-    from pyogrio.errors import DataLayerError, DataSourceError
-
     if kind == "Shapefile":
         _check_shapefile_complete(path)
-    try:
-        layer = _choose_layer(path, pyogrio.list_layers(path).tolist(), geometry)
-        metadata, table = pyogrio.read_arrow(path, layer=layer)
-        table.validate(full=True)
-    except (DataSourceError, DataLayerError, pa.ArrowException, UnicodeDecodeError) as error:
-        problem = f"the file cannot be read as {kind} ({error})"
-        raise InputError(path, problem, "Export it again, with the encoding UTF-8, or use GeoJSON or CSV.") from None
-    return table, metadata["geometry_name"] or "wkb_geometry", metadata["crs"]
+    return read_layer(path, kind, geometry, companion_files(path))
 
 
 def _check_shapefile_complete(path: Path) -> None:
@@ -131,19 +121,6 @@ def _check_shapefile_complete(path: Path) -> None:
         if size < declared:
             problem = f"the header declares {declared:,} bytes, but the file contains {size:,}"
             raise InputError(part, problem, COMPLETE_FILE)
-
-
-def _choose_layer(path: Path, layers: list[list[Any]], geometry: str) -> str:
-    """Return the only layer with geometries, or the only one with geometries of a kind."""
-    names = [name for name, layer_type in layers if layer_type is not None]
-    if len(names) > 1:
-        fitting = [name for name, layer_type in layers if geometry in (layer_type or "")]
-        names = fitting or names
-    if len(names) == 1:
-        return str(names[0])
-    listed = list_first([str(name) for name in names], _MAX_NAMED_LAYERS) or "none"
-    problem = f"expected one layer of {geometry} geometries, got {listed}"
-    raise InputError(path, problem, "Save the layer to use in a file of its own.")
 
 
 def _read_geoparquet(path: Path) -> tuple[pa.Table, str, str | None]:

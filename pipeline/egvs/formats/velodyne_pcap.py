@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from egvs.core import limits, plugins
+from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.formats.reader_process import Block, serve
 from egvs.formats.recording_options import RecordingOptions
@@ -25,7 +26,6 @@ from egvs.formats.recordings import (
     Recording,
     chosen_sweeps,
     header_block,
-    problem_block,
     process_options,
     read_recording,
     sweep_blocks,
@@ -67,8 +67,7 @@ def _read_file(path: Path) -> Iterator[Block]:
     if len(stamps_s) < 2:
         actual = "no packets of a Velodyne sensor" if not stamps_s else "less than one"
         hint = "Save UDP packets of at least two turns (port 2368) as .pcap, not .pcapng."
-        yield problem_block(f"expected a complete turn, got {actual}", hint)
-        return
+        raise InputError("", f"expected a complete turn, got {actual}", hint)
     complete = len(stamps_s) - 1
     selected = set(chosen_sweeps(complete, options.max_sweeps).tolist())
     blocks: list[Block] = []

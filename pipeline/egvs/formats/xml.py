@@ -140,6 +140,33 @@ def iter_elements(
         When the root has another tag, the XML is malformed or declares entities or a document type, a child is too
         large or too deep, its gzip is damaged, or its encoding is unknown.
     """
+    where = name or path
+    with _parse(path, name) as (events, meter):
+        _, top = next(events)
+        if root and top.tag != root:
+            raise InputError(where, f"expected the root element <{root}>, got <{top.tag}>", "Check the file name.")
+        if on_root is not None:
+            on_root(top)
+        depth = 0
+        for event, element in events:
+            depth += 1 if event == "start" else -1
+            if depth > MAX_DEPTH:
+                raise InputError(where, f"elements are nested more than {MAX_DEPTH} deep", COMPLETE_FILE)
+            if event == "end" and depth == 0:
+                meter.bytes_since_child = 0
+                yield element
+                top.clear()
+
+
+def read_root_tag(path: Path) -> str:
+    """Return the tag of the root, with its namespace as in ``{http://...}kml``; errors are those of iter_elements."""
+    with _parse(path, None) as (events, _):
+        return str(next(events)[1].tag)
+
+
+@contextmanager
+def _parse(path: Path, name: Path | None) -> Iterator[tuple[Iterator[tuple[str, Any]], _ElementMeter]]:
+    """Yield the starts and ends of elements, and what counts the bytes of each child of the root."""
     from defusedxml.common import DefusedXmlException
     from defusedxml.ElementTree import DefusedXMLParser, iterparse
 
@@ -149,22 +176,8 @@ def iter_elements(
         is_decoded = encoding not in PARSER_ENCODINGS
         meter = _ElementMeter(Utf8Reader(file, encoding) if is_decoded else file, where)
         parser = DefusedXMLParser(target=TreeBuilder(), encoding="utf-8" if is_decoded else None, forbid_dtd=True)
-        events: Iterator[tuple[str, Any]] = iterparse(meter, ("start", "end"), parser)
         try:
-            _, top = next(events)
-            if root and top.tag != root:
-                raise InputError(where, f"expected the root element <{root}>, got <{top.tag}>", "Check the file name.")
-            if on_root is not None:
-                on_root(top)
-            depth = 0
-            for event, element in events:
-                depth += 1 if event == "start" else -1
-                if depth > MAX_DEPTH:
-                    raise InputError(where, f"elements are nested more than {MAX_DEPTH} deep", COMPLETE_FILE)
-                if event == "end" and depth == 0:
-                    meter.bytes_since_child = 0
-                    yield element
-                    top.clear()
+            yield iterparse(meter, ("start", "end"), parser), meter
         except ParseError as error:
             raise InputError(where, f"is not well-formed XML: {error}", COMPLETE_FILE) from None
         except DefusedXmlException:

@@ -21,17 +21,17 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import IO, Any
 
-from egvs.core import files
+from egvs.core import files, sandbox
+from egvs.core.child_process import Confinement, start_program
 from egvs.core.errors import InputError, MissingBackendError, RunError
 from egvs.core.sumo_home import sumo_home
 from egvs.core.threads import checkpoint
-from egvs.traffic import sandbox
 from egvs.traffic.vehicle_boxes import VehicleSize
 
 APT_COMMAND = "apt-get install libatomic1 libx11-6 libxext6 libxrender1 libgl1"
@@ -247,27 +247,12 @@ def _run_command(
     return output.decode("utf-8", "replace")
 
 
-@contextmanager
-def _start_program(command: Sequence[str], folder: Path, stdout: Any, stderr: Any) -> Iterator[subprocess.Popen[bytes]]:
+def _start_program(
+    command: Sequence[str], folder: Path, stdout: Any, stderr: Any
+) -> AbstractContextManager[subprocess.Popen[bytes]]:
     """Start a program that may write to its folder only, and that ends with the block or with this process."""
-    launcher = [sys.executable, "-I", "-S", sandbox.__file__, os.curdir, str(os.getpid())]
-    read_end, write_end = os.pipe()
-    try:
-        process = subprocess.Popen(
-            [*launcher, *command], cwd=folder, env=sumo_environment(), stdin=read_end, stdout=stdout, stderr=stderr
-        )
-    except BaseException:
-        os.close(write_end)
-        raise
-    finally:
-        os.close(read_end)
-    with process:
-        try:
-            yield process
-        finally:
-            os.close(write_end)
-            if sandbox.REPLACES_PROCESS:  # else the launcher kills the program when the pipe is closed
-                process.kill()
+    confinement = Confinement(writable=Path(os.curdir))
+    return start_program(command, folder, confinement, sumo_environment(), stdout, stderr)
 
 
 def _wait(process: subprocess.Popen[bytes], watch: Callable[[int], None] | None) -> tuple[bytes, bytes]:

@@ -9,9 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from egvs.core import sandbox
 from egvs.core.errors import RunError
-from egvs.traffic import sandbox, sumo
+from egvs.traffic import sumo
 from tests.traffic.helpers import fake_sumo
+
+pytestmark = pytest.mark.system
 
 LINUX = sys.platform.startswith("linux")
 
@@ -68,7 +71,7 @@ def test_sumo_ends_with_a_killed_parent(tmp_path, monkeypatch):
 
 WATCHED = """
 import sys
-from egvs.traffic import sandbox
+from egvs.core import sandbox
 sys.exit(sandbox.run_watched(sys.argv[1:]))
 """
 
