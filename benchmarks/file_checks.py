@@ -22,8 +22,9 @@ from typing import Any
 from unittest.mock import patch
 
 import egvs
+from egvs.core import sandbox
 from egvs.runs import run as runs_run
-from egvs.traffic import recording, sandbox, sumo, user_files
+from egvs.traffic import recording, sumo, user_files
 
 SCENARIO = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku"
 STARTS, MAX_SHARE = 15, 0.03

@@ -12,21 +12,21 @@ from typing import TYPE_CHECKING
 
 from egvs.cli.console import WIDE, Column, console, make_table
 from egvs.core.wording import list_first, number_of
-from egvs.importers import junctions
-from egvs.importers.new_scenario import NewScenario
-from egvs.importers.openstreetmap.solids import OUT_OF_RANGE, ImportCounts
-from egvs.importers.openstreetmap.street_network import ATTRIBUTION
-from egvs.importers.recorded import traffic as recorded_traffic
-from egvs.importers.scenario_files import PITCHES_DEG, SENSOR, STATICS_FILE
+from egvs.creation import junctions
+from egvs.creation.new_scenario import NewScenario
+from egvs.creation.openstreetmap.solids import OUT_OF_RANGE, ImportCounts
+from egvs.creation.openstreetmap.street_network import ATTRIBUTION
+from egvs.creation.scenario_files import PITCHES_DEG, SENSOR, STATICS_FILE
+from egvs.extensions.tracks.new import files as recorded_traffic
+from egvs.extensions.tracks.recorded_tracks import track_warnings
 from egvs.traffic.estimates import MIN_OBSERVATIONS
-from egvs.traffic.recorded_tracks import track_warnings
 
 if TYPE_CHECKING:
-    from egvs.city.creation import NewCity, NewJunction
-    from egvs.importers.assumed_traffic import AssumedTraffic
-    from egvs.importers.junctions import Streets
-    from egvs.importers.recorded.demand import TrackDemand
-    from egvs.importers.static_objects import MapSummary
+    from egvs.creation.assumed_traffic import AssumedTraffic
+    from egvs.creation.junctions import Streets
+    from egvs.creation.static_objects import MapSummary
+    from egvs.extensions.city.creation import NewCity, NewJunction
+    from egvs.extensions.tracks.new.demand import TrackDemand
 
 _FILE_WIDTH = 160
 
@@ -99,7 +99,7 @@ def _describe_map(summary: MapSummary) -> str:
 
 
 def _city_lines(city: NewCity) -> Iterator[tuple[str, str]]:
-    from egvs.city.creation import IMPORT_FILE
+    from egvs.extensions.city.creation import IMPORT_FILE
 
     poles = sum(len(row.poles) for row in city.junctions)
     sites = sum(row.n_candidates for row in city.junctions)

@@ -27,11 +27,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import IO, Any
 
-from egvs.core import files
+from egvs.core import files, sandbox
 from egvs.core.errors import InputError, MissingBackendError, RunError
 from egvs.core.sumo_home import sumo_home
 from egvs.core.threads import checkpoint
-from egvs.traffic import sandbox
 from egvs.traffic.vehicle_boxes import VehicleSize
 
 APT_COMMAND = "apt-get install libatomic1 libx11-6 libxext6 libxrender1 libgl1"
