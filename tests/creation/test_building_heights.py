@@ -12,8 +12,7 @@ from egvs.creation.building_heights import (
     objects_on_carriageway,
     sample_points,
 )
-from egvs.creation.map_parts import MappedMesh
-from egvs.creation.openstreetmap.solids import ImportCounts, MappedSolid
+from egvs.creation.map_parts import ImportCounts, MappedMesh, MappedSolid
 from egvs.world.extrusion import extrude_polygon
 
 

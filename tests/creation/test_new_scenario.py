@@ -17,10 +17,9 @@ from shapely.geometry import box
 
 from egvs.core.errors import InputError
 from egvs.creation import alignment, static_objects, sumo_network
-from egvs.creation.map_parts import MapContext, MappedMesh, SolidMap
+from egvs.creation.map_parts import ImportCounts, MapContext, MappedMesh, MappedSolid, SolidMap
 from egvs.creation.map_readers import MapFile
 from egvs.creation.new_scenario import assumed_sizes, scenario_notes
-from egvs.creation.openstreetmap.solids import ImportCounts, MappedSolid
 from egvs.creation.road_source import NetworkRoads
 from egvs.creation.static_objects import REPLACED
 from egvs.formats import meshes

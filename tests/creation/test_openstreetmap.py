@@ -20,8 +20,8 @@ from shapely.geometry import LineString, Point, shape
 from egvs.cli import app, new_summary
 from egvs.core.errors import InputError
 from egvs.creation import assumed_traffic, new_scenario
+from egvs.creation.map_parts import ImportCounts
 from egvs.creation.openstreetmap import reader as openstreetmap
-from egvs.creation.openstreetmap.solids import ImportCounts
 from egvs.formats import osm
 from egvs.scenario import loading
 from egvs.sensors import sites

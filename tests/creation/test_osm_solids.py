@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from egvs.creation.map_parts import ImportCounts, MappedSolid
 from egvs.creation.openstreetmap import solids as osm_solids
-from egvs.creation.openstreetmap.solids import ImportCounts, MappedSolid, find_buildings
+from egvs.creation.openstreetmap.solids import find_buildings
 from egvs.formats.osm import Bounds, OsmExtract, Tags, Way
 
 XY = {1: (0.0, 0.0), 2: (10.0, 0.0), 3: (10.0, 10.0), 4: (0.0, 10.0)}

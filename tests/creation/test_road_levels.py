@@ -11,6 +11,7 @@ import pytest
 from shapely.geometry import LineString
 
 from egvs.creation import junctions, road_levels
+from egvs.creation.map_parts import ImportCounts, MappedSolid
 from egvs.creation.openstreetmap import solids, street_network
 from egvs.formats import osm
 from egvs.traffic import network as road_network
@@ -146,10 +147,10 @@ def test_width_of_deck(tags: dict[str, str], width_m: float) -> None:
     assert deck.radius_m == width_m / 2
 
 
-def make_decks(tags: dict[str, str]) -> list[solids.MappedSolid]:
+def make_decks(tags: dict[str, str]) -> list[MappedSolid]:
     """Return the deck of a bridge 50 m long."""
     way = osm.Way(1, (1, 2), {"bridge": "yes", **tags})
-    return list(solids.make_decks([way], {1: (0.0, 0.0), 2: (50.0, 0.0)}, solids.ImportCounts()))
+    return list(solids.make_decks([way], {1: (0.0, 0.0), 2: (50.0, 0.0)}, ImportCounts()))
 
 
 @pytest.mark.parametrize(

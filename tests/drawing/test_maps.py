@@ -11,7 +11,8 @@ import numpy as np
 from egvs.core.grid import Grid
 from egvs.drawing import maps
 from egvs.drawing.maps import Backdrop
-from egvs.drawing.svg_figures import FigureStyle, MapFrame, MapSite
+from egvs.drawing.svg_figures import FigureStyle, MapFrame
+from egvs.results.ranking import MapSite
 from tests.drawing.test_basemap import roads
 from tests.report.small_runs import EMPTY_BACKDROP, decode_png
 

@@ -8,7 +8,8 @@ import xml.etree.ElementTree as ET
 import pytest
 
 from egvs.drawing import svg_figures
-from egvs.drawing.svg_figures import Bar, CurveStep, FigureStyle, MapSite, sensor_count_chart
+from egvs.drawing.svg_figures import Bar, CurveStep, FigureStyle, sensor_count_chart
+from egvs.results.ranking import MapSite
 from tests.report.small_runs import SITES, PageReader, render_report, run_to_scores
 
 

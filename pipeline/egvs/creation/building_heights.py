@@ -14,8 +14,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core.grid import FloatArray
-from egvs.creation.map_parts import MappedMesh, Terrain
-from egvs.creation.openstreetmap.solids import ImportCounts, MappedSolid
+from egvs.creation.map_parts import ImportCounts, MappedMesh, MappedSolid, Terrain
 from egvs.world.clearances import CLEARANCE_M, KERB_M
 
 ASSUMED = "default"

@@ -10,23 +10,140 @@ first; the ``<location>`` of their network states the frame. The other readers c
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+import shapely
 from shapely.geometry.base import BaseGeometry
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
 from egvs.creation.junctions import Streets
-from egvs.creation.openstreetmap.solids import ImportCounts, MappedSolid
 from egvs.formats.georeference import WorldFrame, parse_crs
 from egvs.scenario.fields import MAX_COORDINATE_M
+from egvs.scenario.model import StaticsConfig
 
 HEAD_BYTES = 4096
 """How much of a file :meth:`MapReader.can_open` gets, after gunzip."""
+
+DEFAULT_BUILDING_M: float = StaticsConfig.model_fields["polygon_height_m"].default
+"""Height of a building without a height in the map, and of no special type."""
+
+DECK_BASE_M = 5.0
+"""Height of the underside of a bridge without a height in the map: above lorries."""
+
+OUT_OF_RANGE = "out_of_range"
+"""The reason to leave out objects outside the window of a map."""
+
+GROUND_KIND, OBJECT_KIND = "ground", "as_built"
+"""Kinds of the meshes of a point cloud: its ground, and all else."""
+
+
+@dataclass(frozen=True)
+class MappedSolid:
+    """An area, line or point of the map, extruded from ``base_m`` to ``height_m``.
+
+    Attributes
+    ----------
+    name
+        Unique, e.g. ``"way/12"``.
+    kind
+        ``building``, ``roof``, ``barrier``, ``bridge``, ``pole``, ``tree_trunk`` or ``tree_crown``.
+    geometry
+        World frame, metres.
+    height_m, base_m
+        Top and bottom above the ground.
+    height_source
+        Where the height comes from: ``height`` or ``levels`` (tags of the map), ``type`` or ``default``.
+    radius_m
+        Half the width of a line, radius of a point; None for an area.
+    assumed_radius
+        Whether the radius of a tree crown is assumed.
+    """
+
+    name: str
+    kind: str
+    geometry: BaseGeometry
+    height_m: float
+    height_source: str
+    base_m: float = 0.0
+    radius_m: float | None = None
+    assumed_radius: bool = False
+
+    @property
+    def area(self) -> BaseGeometry:
+        """The area covered, seen from above."""
+        return self.geometry.buffer(self.radius_m) if self.radius_m else self.geometry
+
+    def to_geojson(self) -> dict[str, Any]:
+        """Return a GeoJSON feature in world-frame metres."""
+        properties = {"name": self.name, "kind": self.kind, "height_m": round(self.height_m, 3)}
+        if self.base_m:
+            properties["base_m"] = round(self.base_m, 3)
+        if self.radius_m is not None:
+            properties["radius_m"] = round(self.radius_m, 3)
+        properties["height_from"] = self.height_source
+        return {"type": "Feature", "properties": properties, "geometry": shapely.geometry.mapping(self.geometry)}
+
+
+@dataclass
+class ImportCounts:
+    """Counts of what happened to the mapped objects."""
+
+    objects: Counter[str] = field(default_factory=Counter)
+    heights: dict[str, Counter[str]] = field(default_factory=dict)
+    unreadable: Counter[str] = field(default_factory=Counter)
+    repaired: int = 0
+    cut: Counter[str] = field(default_factory=Counter)
+    dropped: dict[str, Counter[str]] = field(default_factory=dict)
+    slivers: int = 0
+    raised_crowns: int = 0
+    assumed_crowns: int = 0
+    not_modelled: Counter[str] = field(default_factory=Counter)
+
+    def keep(self, solid: MappedSolid) -> None:
+        """Count an object that is used; a tree is counted once, by its trunk."""
+        self.objects[solid.kind] += 1
+        self.assumed_crowns += solid.assumed_radius
+        if solid.kind != "tree_crown":
+            kind = solid.kind.removesuffix("_trunk")
+            self.heights.setdefault(kind, Counter())[solid.height_source] += 1
+
+    def remove(self, solid: MappedSolid) -> None:
+        """Take back what :meth:`keep` counted."""
+        self.objects -= Counter({solid.kind: 1})
+        self.assumed_crowns -= solid.assumed_radius
+        if solid.kind != "tree_crown":
+            self.heights[solid.kind.removesuffix("_trunk")] -= Counter({solid.height_source: 1})
+
+    def drop(self, kind: str, reason: str) -> None:
+        """Count an object that is left out."""
+        self.dropped.setdefault(reason, Counter())[kind] += 1
+
+    def plus(self, other: ImportCounts) -> ImportCounts:
+        """Return the sums of two maps."""
+        return ImportCounts(**{key: _add_counts(value, vars(other)[key]) for key, value in vars(self).items()})
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON, sorted by key."""
+        return {key: _sort_keys(value) for key, value in vars(self).items()}
+
+
+def _add_counts(one: Any, other: Any) -> Any:
+    """Return the sum of two numbers, counters, or dictionaries of counters."""
+    if isinstance(one, Counter) or not isinstance(one, dict):
+        return one + other
+    return {key: one.get(key, Counter()) + other.get(key, Counter()) for key in {**one, **other}}
+
+
+def _sort_keys(value: Any) -> Any:
+    if not isinstance(value, dict):
+        return value
+    return {key: _sort_keys(value[key]) for key in sorted(value)}
 
 
 @dataclass(frozen=True)

@@ -47,14 +47,20 @@ from egvs.creation.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, T
 from egvs.creation.building_heights import ASSUMED, NEIGHBOURS, SURFACE_MODEL
 from egvs.creation.junction_zones import Zone
 from egvs.creation.junctions import JunctionRegion, KerbsidePole, StreetJunction, Streets
-from egvs.creation.map_parts import MapContext, RoadOptions, Terrain
+from egvs.creation.map_parts import (
+    DECK_BASE_M,
+    DEFAULT_BUILDING_M,
+    OUT_OF_RANGE,
+    ImportCounts,
+    MapContext,
+    RoadOptions,
+    Terrain,
+)
 from egvs.creation.map_readers import MapFile, MapFiles
 from egvs.creation.openstreetmap import overpass
 from egvs.creation.openstreetmap import reader as openstreetmap
-from egvs.creation.openstreetmap import solids as osm_solids
 from egvs.creation.openstreetmap.overpass import DownloadedExtract
 from egvs.creation.openstreetmap.reader import OsmRoads
-from egvs.creation.openstreetmap.solids import ImportCounts
 from egvs.creation.openstreetmap.street_network import ATTRIBUTION, NETWORK_FILE
 from egvs.creation.road_source import NetworkRoads, RoadSource
 from egvs.creation.scenario_files import (
@@ -677,13 +683,13 @@ def _level_notes(roads: RoadSource, counts: ImportCounts) -> list[str]:
         shares = f"{heights['default']} of {heights.total()}"
         notes.append(
             f"No height is given for {shares} {by_number(heights.total(), 'bridge deck', 'bridge decks')}:"
-            f" {osm_solids.DECK_BASE_M:g} m assumed."
+            f" {DECK_BASE_M:g} m assumed."
         )
     return notes
 
 
 def _range_notes(counts: ImportCounts) -> list[str]:
-    dropped = counts.dropped.get(osm_solids.OUT_OF_RANGE, Counter())
+    dropped = counts.dropped.get(OUT_OF_RANGE, Counter())
     left_out = dropped.total() - dropped["point"]  # a point cloud counts its own
     if not left_out:
         return []
@@ -713,7 +719,7 @@ def scenario_notes(junction_fits: bool, counts: ImportCounts) -> list[str]:
         notes.append(
             f"{heights['default']} of {number_of(heights.total(), 'building')}"
             f" {by_number(heights['default'], 'has', 'have')} neither height nor levels:"
-            f" {osm_solids.DEFAULT_BUILDING_M:g} m assumed."
+            f" {DEFAULT_BUILDING_M:g} m assumed."
         )
     if heights[NEIGHBOURS]:
         notes.append(

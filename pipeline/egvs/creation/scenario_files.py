@@ -22,7 +22,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.creation import junctions
 from egvs.creation.junctions import JunctionRegion, KerbsidePole
-from egvs.creation.openstreetmap.solids import ImportCounts, MappedSolid
+from egvs.creation.map_parts import ImportCounts, MappedSolid
 from egvs.creation.openstreetmap.street_network import ATTRIBUTION, NETWORK_FILE
 from egvs.scenario.fields import Name
 from egvs.scenario.model import RoiConfig

@@ -28,15 +28,13 @@ from egvs.core.grid import XY, FloatArray, Roi
 from egvs.core.wording import by_number, list_first, number_of
 from egvs.creation import building_heights
 from egvs.creation.junctions import Streets
-from egvs.creation.map_parts import MapContext, MappedMesh, SolidMap, Terrain
+from egvs.creation.map_parts import OBJECT_KIND, ImportCounts, MapContext, MappedMesh, MappedSolid, SolidMap, Terrain
 from egvs.creation.map_readers import MapFile
 from egvs.creation.openstreetmap import reader as openstreetmap
 from egvs.creation.openstreetmap import solids as osm_solids
 from egvs.creation.openstreetmap.reader import OsmRoads
-from egvs.creation.openstreetmap.solids import ImportCounts, MappedSolid
 from egvs.creation.road_source import RoadSource
 from egvs.extensions.maps.point_clouds.as_built_view import AsBuiltMap
-from egvs.extensions.maps.point_clouds.reader import OBJECT_KIND
 from egvs.world.terrain import TerrainSurface
 
 REPLACED = "replaced_by_another_map"

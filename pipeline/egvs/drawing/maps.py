@@ -37,12 +37,12 @@ from egvs.drawing.svg_figures import (
     ColourClasses,
     FigureStyle,
     MapFrame,
-    MapSite,
     Rectangle,
     extent,
     text_width,
 )
 from egvs.results.labels import shorten_name
+from egvs.results.ranking import MapSite
 
 StackedSites = list[MapSite]
 """Sites at the same x, y, the best first."""

@@ -28,9 +28,9 @@ from egvs.drawing import colours, maps
 from egvs.drawing.basemap import network_file, roads_within, world_outlines
 from egvs.drawing.colours import ColumnValues, IndexedImage
 from egvs.drawing.maps import Backdrop, SiteViewFigure
-from egvs.drawing.svg_figures import PAGE_STYLE, Box, FigureStyle, MapSite, extent, shared_scale
+from egvs.drawing.svg_figures import PAGE_STYLE, Box, FigureStyle, extent, shared_scale
 from egvs.results import ranking
-from egvs.results.ranking import RankedSite, Ranking
+from egvs.results.ranking import MapSite, RankedSite, Ranking
 from egvs.scoring.egvs import EntropyField
 from egvs.scoring.scorer import Scorer
 from egvs.scoring.visibility import Beams

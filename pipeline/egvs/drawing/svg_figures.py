@@ -19,7 +19,8 @@ from egvs.core.grid import Grid
 from egvs.core.wording import format_percent
 from egvs.drawing import colours
 from egvs.drawing.colours import LIGHT, STEPS, STYLE_SHEET, Theme, opacity, shape_attributes
-from egvs.results.labels import SCORE_LABELS, ScoreLabel, shorten_name
+from egvs.results.labels import shorten_name
+from egvs.results.ranking import MapSite
 
 Box = tuple[float, float, float, float]
 """x0, y0, x1, y1: in the world frame, metres, or in a figure's units."""
@@ -87,28 +88,6 @@ class FigureStyle:
 
 
 PAGE_STYLE = FigureStyle()
-
-
-@dataclass(frozen=True)
-class MapSite:
-    """A candidate site on a map, with its score."""
-
-    site: str
-    x_m: float
-    y_m: float
-    z_m: float
-    egvs: float
-    rank: int
-
-    @property
-    def score(self) -> float:
-        """Value of the score that ranks."""
-        return self.egvs
-
-    @property
-    def by(self) -> ScoreLabel:
-        """Label of the score that ranks."""
-        return SCORE_LABELS["egvs"]
 
 
 def extent(grid: Grid, sites: Sequence[MapSite]) -> Box:

@@ -26,12 +26,12 @@ from egvs.core.errors import Diagnostic, collect_warnings
 from egvs.core.wording import format_percent
 from egvs.drawing import maps, svg_figures
 from egvs.drawing.maps import Backdrop, PlannedPole
-from egvs.drawing.svg_figures import CurveStep, MapSite
+from egvs.drawing.svg_figures import CurveStep
 from egvs.extensions.validation.ranking_check import RankingCheck
 from egvs.report import plan_answer
 from egvs.results.labels import SCORE_LABELS, ScoreLabel, join_names
 from egvs.results.plans import PlanStep, plan_steps
-from egvs.results.ranking import Pole, RankedSite
+from egvs.results.ranking import MapSite, Pole, RankedSite
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE, FROM_SENSOR
 from egvs.scenario.signal_config import ASSUMED_PLANS

@@ -17,7 +17,6 @@ from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.artefacts.run_record import StageRecord
 from egvs.core.errors import InputError
 from egvs.core.wording import by_number, format_percent, list_first
-from egvs.drawing.svg_figures import MapSite
 from egvs.results.labels import SCORE_LABELS, ScoreLabel, format_count, format_number, format_probability, join_names
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
@@ -38,6 +37,28 @@ class ScoreValue(NamedTuple):
     name: str
     value: float
     se: float | None
+
+
+@dataclass(frozen=True)
+class MapSite:
+    """A candidate site on a map, with its score."""
+
+    site: str
+    x_m: float
+    y_m: float
+    z_m: float
+    egvs: float
+    rank: int
+
+    @property
+    def score(self) -> float:
+        """Value of the score that ranks."""
+        return self.egvs
+
+    @property
+    def by(self) -> ScoreLabel:
+        """Label of the score that ranks."""
+        return SCORE_LABELS["egvs"]
 
 
 @dataclass(frozen=True)

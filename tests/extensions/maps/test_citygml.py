@@ -11,8 +11,7 @@ import pytest
 import shapely
 
 from egvs.core.errors import InputError
-from egvs.creation.map_parts import Alignment, MapContext, MapReader, SolidReader
-from egvs.creation.openstreetmap.solids import DEFAULT_BUILDING_M
+from egvs.creation.map_parts import DEFAULT_BUILDING_M, Alignment, MapContext, MapReader, SolidReader
 from egvs.extensions.maps.buildings import citygml, cityjson
 from egvs.extensions.maps.formats.city_objects import select_surfaces
 from egvs.extensions.maps.formats.citygml import CityGmlFile

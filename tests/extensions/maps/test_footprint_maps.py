@@ -11,8 +11,7 @@ import pytest
 import shapely
 
 from egvs.core.errors import InputError
-from egvs.creation.map_parts import Alignment, MapContext, SolidReader
-from egvs.creation.openstreetmap.solids import DEFAULT_BUILDING_M
+from egvs.creation.map_parts import DEFAULT_BUILDING_M, Alignment, MapContext, SolidReader
 from egvs.extensions.maps.buildings import footprint_maps
 from egvs.formats.georeference import WorldFrame
 

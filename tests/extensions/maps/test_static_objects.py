@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from egvs.core.errors import InputError
-from egvs.creation.map_parts import MappedMesh, SolidMap
+from egvs.creation.map_parts import OBJECT_KIND, MappedMesh, SolidMap
 from egvs.creation.static_objects import ReadMap, _lower_to_ground
-from egvs.extensions.maps.point_clouds.reader import OBJECT_KIND
 
 WALL = np.array([[0.0, 0.0, 40.0], [4.0, 0.0, 40.0], [4.0, 0.0, 43.0]])
 

@@ -18,11 +18,10 @@ from shapely.geometry.base import BaseGeometry
 from egvs.core.errors import InputError
 from egvs.creation import junctions, road_levels
 from egvs.creation.junctions import StreetJunction, Streets
-from egvs.creation.map_parts import MapContext, RoadMap, RoadOptions, SolidMap
+from egvs.creation.map_parts import ImportCounts, MapContext, MappedSolid, RoadMap, RoadOptions, SolidMap
 from egvs.creation.openstreetmap import elevation
 from egvs.creation.openstreetmap import solids as osm_solids
 from egvs.creation.openstreetmap import street_network as osm_network
-from egvs.creation.openstreetmap.solids import ImportCounts, MappedSolid
 from egvs.creation.openstreetmap.street_network import ATTRIBUTION
 from egvs.creation.road_levels import OtherLevels
 from egvs.formats import osm as osm_files

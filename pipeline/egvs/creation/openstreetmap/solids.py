@@ -4,9 +4,9 @@ Steps of :func:`map_solids`: find buildings (ways, multipolygons, parts), barrie
 covers the carriageway below :data:`egvs.world.clearances.CLEARANCE_M`, because vehicles drive there; the same with the
 decks of bridges; find trees, and lift the crowns that overhang the carriageway, as street trees are trimmed.
 
-:class:`ImportCounts` counts every object that is used, changed or left out, and every default size. What is solid, and
-how high it is where the map gives no height, is defined in :mod:`egvs.world.map_features`. The defaults are round
-figures for ordinary towns, not measurements.
+:class:`~egvs.creation.map_parts.ImportCounts` counts every object that is used, changed or left out, and every default
+size. What is solid, and how high it is where the map gives no height, is defined in :mod:`egvs.world.map_features`. The
+defaults are round figures for ordinary towns, not measurements.
 
 Building parts replace their outline where they are. Multipolygons are assembled here, because osmium builds no area
 from a ring that crosses itself (here it is repaired and counted) nor from tags on the outer way only.
@@ -20,10 +20,8 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import shapely
 from shapely.geometry import LineString, Point, Polygon
@@ -31,28 +29,23 @@ from shapely.geometry.base import BaseGeometry
 
 from egvs.core.grid import XY
 from egvs.creation.junctions import Streets
+from egvs.creation.map_parts import DECK_BASE_M, DEFAULT_BUILDING_M, OUT_OF_RANGE, ImportCounts, MappedSolid
 from egvs.creation.openstreetmap.street_network import PATH_HIGHWAYS
 from egvs.formats.osm import OsmExtract, Relation, Tags, Way, parse_number
-from egvs.scenario.model import StaticsConfig
 from egvs.world import map_features
 from egvs.world.clearances import CLEARANCE_M
 from egvs.world.map_features import SolidType, SolidTypes, VerticalExtent
 
-DEFAULT_BUILDING_M: float = StaticsConfig.model_fields["polygon_height_m"].default
-"""Height of a building without a height in the map, and of no special type."""
-
 TREE = map_features.SOLID_TYPES["natural.tree"]
 ROW_SPACING_M = 8.0
 
-DECK_BASE_M, DECK_THICKNESS_M = 5.0, 1.0
+DECK_THICKNESS_M = 1.0
 DECK = SolidType(DECK_BASE_M + DECK_THICKNESS_M, thickness_m=DECK_THICKNESS_M)
 """A bridge without a height in the map: above the region of interest, and above lorries."""
 
 _DECK_LANE_M, _DECK_EDGE_M, _TRACK_M, _PATH_M = 3.5, 1.0, 5.0, 3.0
 """Widths of bridges without a width in the map: of each lane, of each edge, of a railway track, and of a path."""
 
-OUT_OF_RANGE = "out_of_range"
-"""The reason to leave out objects outside the window of :func:`map_solids`."""
 
 _SOLID_TYPES = SolidTypes()
 _BUILDING_KEYS = ("building:part", "building", "man_made")
@@ -63,109 +56,6 @@ _GRID_M = 0.001
 _SLIVER_M2 = 0.25
 _SHORT_M = 0.1
 _MARGIN_M = 0.01
-
-
-@dataclass(frozen=True)
-class MappedSolid:
-    """An area, line or point of the map, extruded from ``base_m`` to ``height_m``.
-
-    Attributes
-    ----------
-    name
-        Unique, e.g. ``"way/12"``.
-    kind
-        ``building``, ``roof``, ``barrier``, ``bridge``, ``pole``, ``tree_trunk`` or ``tree_crown``.
-    geometry
-        World frame, metres.
-    height_m, base_m
-        Top and bottom above the ground.
-    height_source
-        Where the height comes from: ``height`` or ``levels`` (tags of the map), ``type`` or ``default``.
-    radius_m
-        Half the width of a line, radius of a point; None for an area.
-    assumed_radius
-        Whether the radius of a tree crown is assumed.
-    """
-
-    name: str
-    kind: str
-    geometry: BaseGeometry
-    height_m: float
-    height_source: str
-    base_m: float = 0.0
-    radius_m: float | None = None
-    assumed_radius: bool = False
-
-    @property
-    def area(self) -> BaseGeometry:
-        """The area covered, seen from above."""
-        return self.geometry.buffer(self.radius_m) if self.radius_m else self.geometry
-
-    def to_geojson(self) -> dict[str, Any]:
-        """Return a GeoJSON feature in world-frame metres."""
-        properties = {"name": self.name, "kind": self.kind, "height_m": round(self.height_m, 3)}
-        if self.base_m:
-            properties["base_m"] = round(self.base_m, 3)
-        if self.radius_m is not None:
-            properties["radius_m"] = round(self.radius_m, 3)
-        properties["height_from"] = self.height_source
-        return {"type": "Feature", "properties": properties, "geometry": shapely.geometry.mapping(self.geometry)}
-
-
-@dataclass
-class ImportCounts:
-    """Counts of what happened to the mapped objects."""
-
-    objects: Counter[str] = field(default_factory=Counter)
-    heights: dict[str, Counter[str]] = field(default_factory=dict)
-    unreadable: Counter[str] = field(default_factory=Counter)
-    repaired: int = 0
-    cut: Counter[str] = field(default_factory=Counter)
-    dropped: dict[str, Counter[str]] = field(default_factory=dict)
-    slivers: int = 0
-    raised_crowns: int = 0
-    assumed_crowns: int = 0
-    not_modelled: Counter[str] = field(default_factory=Counter)
-
-    def keep(self, solid: MappedSolid) -> None:
-        """Count an object that is used; a tree is counted once, by its trunk."""
-        self.objects[solid.kind] += 1
-        self.assumed_crowns += solid.assumed_radius
-        if solid.kind != "tree_crown":
-            kind = solid.kind.removesuffix("_trunk")
-            self.heights.setdefault(kind, Counter())[solid.height_source] += 1
-
-    def remove(self, solid: MappedSolid) -> None:
-        """Take back what :meth:`keep` counted."""
-        self.objects -= Counter({solid.kind: 1})
-        self.assumed_crowns -= solid.assumed_radius
-        if solid.kind != "tree_crown":
-            self.heights[solid.kind.removesuffix("_trunk")] -= Counter({solid.height_source: 1})
-
-    def drop(self, kind: str, reason: str) -> None:
-        """Count an object that is left out."""
-        self.dropped.setdefault(reason, Counter())[kind] += 1
-
-    def plus(self, other: ImportCounts) -> ImportCounts:
-        """Return the sums of two maps."""
-        return ImportCounts(**{key: _add_counts(value, vars(other)[key]) for key, value in vars(self).items()})
-
-    def to_json(self) -> dict[str, Any]:
-        """Return plain JSON, sorted by key."""
-        return {key: _sort_keys(value) for key, value in vars(self).items()}
-
-
-def _add_counts(one: Any, other: Any) -> Any:
-    """Return the sum of two numbers, counters, or dictionaries of counters."""
-    if isinstance(one, Counter) or not isinstance(one, dict):
-        return one + other
-    return {key: one.get(key, Counter()) + other.get(key, Counter()) for key in {**one, **other}}
-
-
-def _sort_keys(value: Any) -> Any:
-    if not isinstance(value, dict):
-        return value
-    return {key: _sort_keys(value[key]) for key in sorted(value)}
 
 
 def map_solids(

@@ -1,13 +1,12 @@
-"""Heights of the ground, from grids and from triangulated surfaces, at points of the world frame.
+"""Heights of the ground, from triangulated surfaces, at points of the world frame.
 
-Between the cells of a grid, heights are interpolated bilinearly (:mod:`egvs.extensions.maps.formats.rasters`). In a
-triangle they are linear; where triangles lie above each other, the lowest counts. World frame, metres; heights as in
-the files.
+In a triangle, heights are linear; where triangles lie above each other, the lowest counts. World frame, metres; heights
+as in the files.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -19,9 +18,8 @@ from shapely.geometry.base import BaseGeometry
 from egvs.core import limits
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
-from egvs.core.wording import by_number, format_percent, number_of
+from egvs.core.wording import by_number, number_of
 from egvs.creation.map_parts import MapContext, Terrain
-from egvs.extensions.maps.formats.rasters import HeightGrid
 
 _EDGE_SHARE = 1e-9
 """A point may be outside a triangle by this share of it: it is on a side."""
@@ -31,35 +29,6 @@ LOWEST_M, HIGHEST_M = -1000.0, 9000.0
 
 _QUERY = 100_000
 _MIN_AREA_M2 = 1e-9
-
-
-@dataclass(frozen=True)
-class GridTerrain:
-    """Heights from grids; of several at a point, from the first that knows its height.
-
-    Attributes
-    ----------
-    grids
-        The grids, each with the file that it is from.
-    context
-        The region, for coordinates.
-    notes
-        Sentences for the user.
-    """
-
-    grids: tuple[tuple[HeightGrid, str], ...]
-    context: MapContext
-    notes: tuple[str, ...] = ()
-
-    def height_m(self, xy_m: FloatArray) -> FloatArray:
-        """Return the heights (n,) of the ground at world-frame points (n, 2); NaN where unknown."""
-        heights = np.full(len(xy_m), np.nan)
-        for grid, where in self.grids:
-            unknown = np.flatnonzero(np.isnan(heights))
-            if not len(unknown):
-                break
-            heights[unknown] = grid.height_m(self.context.from_world(xy_m[unknown], grid.crs, where))
-        return heights
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,24 +120,6 @@ class CombinedTerrain:
         return heights
 
 
-def grid_terrain(grids: Sequence[tuple[HeightGrid, str]], context: MapContext) -> GridTerrain:
-    """Return the terrain of grids that cover the region, with notes on them.
-
-    Raises
-    ------
-    InputError
-        When none of them has a height in the region, a height is impossible, or their coordinates cannot be converted.
-    """
-    for grid, where in grids:
-        _check_heights(grid.heights_m, where)
-    present = [(grid, where) for grid, where in grids if grid.heights_m.size]
-    terrain = GridTerrain(tuple(present), context)
-    if not present or not np.isfinite(terrain.height_m(_window_points(context.window))).any():
-        places = ", ".join(where for _, where in grids)
-        raise InputError(places, "the terrain has no height in the region", "Use a terrain that covers the road map.")
-    return GridTerrain(tuple(present), context, tuple(_grid_notes(present, context)))
-
-
 def tin_terrain(
     vertices: FloatArray, faces: IntArray, crs: str | None, where: str, context: MapContext, notes: Sequence[str] = ()
 ) -> TinTerrain | None:
@@ -204,7 +155,7 @@ def tin_terrain(
     if not is_used.any():
         return None
     heights = corners[is_used, :, 2]
-    _check_heights(heights, where)
+    check_heights(heights, where)
     summary = (
         f"{where}: terrain of {np.count_nonzero(is_used):,} triangles in the region, {heights.min():.1f} to"
         f" {heights.max():.1f} m high; {np.count_nonzero(~is_used):,} outside it or without area were left out."
@@ -272,7 +223,7 @@ def ground_points(terrain: Terrain, window: BaseGeometry, step_m: float) -> Floa
     return np.column_stack([xy_m[is_known], heights_m[is_known]])
 
 
-def _check_heights(heights_m: FloatArray, where: str) -> None:
+def check_heights(heights_m: FloatArray, where: str) -> None:
     """Raise an InputError if a known height cannot be one."""
     wrong = heights_m[(heights_m < LOWEST_M) | (heights_m > HIGHEST_M)]
     if len(wrong):
@@ -286,28 +237,7 @@ def _cross(one: FloatArray, other: FloatArray) -> FloatArray:
     return product
 
 
-def _grid_notes(grids: Sequence[tuple[HeightGrid, str]], context: MapContext) -> Iterator[str]:
-    for grid, where in grids:
-        known = np.isfinite(grid.heights_m)
-        rows, columns = grid.heights_m.shape
-        if not known.any():
-            yield f"{where}: all {rows} x {columns} cells in the region have no data."
-            continue
-        heights = grid.heights_m[known]
-        cells = f"{where}: terrain of {rows} x {columns} cells, {heights.min():.1f} to {heights.max():.1f} m high"
-        missing = int(known.size - np.count_nonzero(known))
-        yield (
-            f"{cells}; {number_of(missing, 'cell')} {by_number(missing, 'has', 'have')} no data."
-            if missing
-            else f"{cells}."
-        )
-    points = _window_points(context.window)
-    unknown = int(np.isnan(GridTerrain(tuple(grids), context).height_m(points)).sum())
-    if unknown:
-        yield f"The terrain has no height in {format_percent(unknown / len(points))} of the region."
-
-
-def _window_points(window: BaseGeometry) -> FloatArray:
+def window_points(window: BaseGeometry) -> FloatArray:
     """Return some 2,500 points in a window."""
     x0, y0, x1, y1 = window.bounds
     return _grid_inside(window, np.linspace(x0, x1, 50), np.linspace(y0, y1, 50))

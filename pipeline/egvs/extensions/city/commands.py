@@ -89,8 +89,7 @@ def new(
     if radius is not None:
         radius_m = options.length_m(radius, "--radius")
     with ProgressDisplay("city") as screen:
-        from egvs.cli import new_summary
-        from egvs.extensions.city import creation
+        from egvs.extensions.city import creation, new_summary
 
         new_options = creation.NewCityOptions(centre, radius_m, junctions, lefthand, walk, traffic, screen.progress)
         created = creation.create_city(folder, osm, new_options)

@@ -33,10 +33,10 @@ from egvs.core.wording import format_percent
 from egvs.creation import assumed_traffic, junctions, new_scenario, scenario_files
 from egvs.creation.assumed_traffic import DEFAULT_TRAFFIC, JUNCTION_BLOCKER_S, TELEPORT_S, TRAFFIC_LEVELS
 from egvs.creation.junctions import HEIGHTS_M, JunctionRegion, KerbsidePole, NearbyJunction, StreetJunction, Streets
+from egvs.creation.map_parts import ImportCounts, MappedSolid
 from egvs.creation.openstreetmap import solids as osm_solids
 from egvs.creation.openstreetmap import street_network as osm_network
 from egvs.creation.openstreetmap.reader import check_inside_extract
-from egvs.creation.openstreetmap.solids import ImportCounts, MappedSolid
 from egvs.creation.openstreetmap.street_network import ATTRIBUTION, NETWORK_FILE, NetworkExcerpts
 from egvs.creation.scenario_files import PITCHES_DEG, SITES_FILE, STATICS_FILE, TomlTable, reachable_area
 from egvs.extensions.city import model

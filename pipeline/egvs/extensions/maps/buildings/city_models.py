@@ -25,14 +25,16 @@ from egvs.core import limits
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.wording import by_number, list_first, number_of
-from egvs.creation.map_parts import MapContext, MappedMesh, SolidMap
-from egvs.creation.openstreetmap.solids import (
+from egvs.creation.map_parts import (
     DEFAULT_BUILDING_M,
     OUT_OF_RANGE,
     ImportCounts,
+    MapContext,
+    MappedMesh,
     MappedSolid,
-    geometry_pieces,
+    SolidMap,
 )
+from egvs.creation.openstreetmap.solids import geometry_pieces
 from egvs.extensions.maps.formats.city_objects import (
     CityObject,
     Placement,

@@ -2,7 +2,7 @@
 
 Columns are recognised by their names, whatever their case: :data:`HEIGHT_COLUMNS`, :data:`LEVEL_COLUMNS`,
 :data:`BASE_COLUMNS`. An outline without a usable height gets
-:data:`~egvs.creation.openstreetmap.solids.DEFAULT_BUILDING_M`; :mod:`egvs.creation.building_heights` has
+:data:`~egvs.creation.map_parts.DEFAULT_BUILDING_M`; :mod:`egvs.creation.building_heights` has
 better assumptions.
 
 GeoJSON without the member ``crs`` is in longitude and latitude (RFC 7946, 4). With ``"crs": null`` it is in metres of
@@ -23,14 +23,8 @@ from shapely.geometry.base import BaseGeometry
 
 from egvs.core.errors import InputError
 from egvs.core.reading import read_json, translate_errors
-from egvs.creation.map_parts import MapContext, SolidMap
-from egvs.creation.openstreetmap.solids import (
-    DEFAULT_BUILDING_M,
-    OUT_OF_RANGE,
-    ImportCounts,
-    MappedSolid,
-    geometry_pieces,
-)
+from egvs.creation.map_parts import DEFAULT_BUILDING_M, OUT_OF_RANGE, ImportCounts, MapContext, MappedSolid, SolidMap
+from egvs.creation.openstreetmap.solids import geometry_pieces
 from egvs.formats import vector_files
 from egvs.formats.georeference import WGS84, WORLD, declared_crs
 from egvs.formats.osm import parse_length_m, parse_number

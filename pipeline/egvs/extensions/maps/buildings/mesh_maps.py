@@ -20,8 +20,7 @@ import numpy as np
 import shapely
 
 from egvs.core.grid import FloatArray
-from egvs.creation.map_parts import MapContext, MappedMesh, SolidMap
-from egvs.creation.openstreetmap.solids import OUT_OF_RANGE, ImportCounts
+from egvs.creation.map_parts import OUT_OF_RANGE, ImportCounts, MapContext, MappedMesh, SolidMap
 from egvs.formats import meshes
 from egvs.scenario.fields import MAX_COORDINATE_M
 

@@ -29,8 +29,7 @@ from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.reading import COMPLETE_FILE
 from egvs.core.wording import number_of
-from egvs.creation.map_parts import MapContext, MappedMesh
-from egvs.creation.openstreetmap.solids import OUT_OF_RANGE, ImportCounts
+from egvs.creation.map_parts import GROUND_KIND, OBJECT_KIND, OUT_OF_RANGE, ImportCounts, MapContext, MappedMesh
 from egvs.creation.terrain.ground_heights import HIGHEST_M, LOWEST_M
 from egvs.extensions.maps.buildings.mesh_maps import has_faces
 from egvs.extensions.maps.point_clouds.as_built_view import AsBuiltMap
@@ -48,8 +47,6 @@ from egvs.scenario.fields import MAX_COORDINATE_M
 
 NAME = "point cloud"
 
-GROUND_KIND, OBJECT_KIND = "ground", "as_built"
-"""Kinds of the two meshes."""
 
 THIN_CELL_M = 0.075
 """Large scans are thinned to one point in each cube of this size while they are read."""
