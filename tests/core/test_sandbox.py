@@ -69,7 +69,7 @@ def test_sumo_ends_with_a_killed_parent(tmp_path, monkeypatch):
 
 WATCHED = """
 import sys
-from egvs.traffic import sandbox
+from egvs.core import sandbox
 sys.exit(sandbox.run_watched(sys.argv[1:]))
 """
 
