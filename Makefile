@@ -14,19 +14,19 @@ run: $(VENV)/.installed
 	$(BIN)/egvs run scenarios/nishishinjuku
 
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -m "not slow" --ignore=tests/validation/training
+	$(BIN)/python -m pytest -m "not slow" --ignore=tests/extensions/validation/training
 
 # Sweeps, whole studies, browsers, kills: what takes more than some tenths of a second each.
 test-slow: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -m "slow and not nightly" --ignore=tests/validation/training
+	$(BIN)/python -m pytest -m "slow and not nightly" --ignore=tests/extensions/validation/training
 
 # Statistics over many simulations, which take minutes each.
 test-nightly: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -m nightly --ignore=tests/validation/training
+	$(BIN)/python -m pytest -m nightly --ignore=tests/extensions/validation/training
 
 # PyTorch is large, and only those who train a detector need it.
 test-train: $(VENV)/.installed-train
-	$(BIN)/python -m pytest -n 0 tests/validation/training
+	$(BIN)/python -m pytest -n 0 tests/extensions/validation/training
 
 # The lowest versions that pyproject.toml allows, in an environment of its own. Old libraries warn about newer ones.
 test-lowest: $(VENV)/.installed
@@ -39,7 +39,7 @@ test-lowest: $(VENV)/.installed
 
 # Without the modules and flags that only POSIX systems have: the unit tests of what depends on the system.
 test-portable: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest -m unit -p tests.without_posix --ignore=tests/validation/training
+	$(BIN)/python -m pytest -m unit -p tests.without_posix --ignore=tests/extensions/validation/training
 
 # The quick loop: no other program is started, nothing takes long.
 unit: $(VENV)/.installed-dev
@@ -127,7 +127,7 @@ fuzz: $(VENV)/.installed-dev
 
 schema: $(VENV)/.installed
 	$(BIN)/python -c "from egvs.scenario.loading import json_schema; print(json_schema(), end='')" > data_schemas/scenario.schema.json
-	$(BIN)/python -c "from egvs.city.model import city_json_schema; print(city_json_schema(), end='')" > data_schemas/city_file.schema.json
+	$(BIN)/python -c "from egvs.extensions.city.model import city_json_schema; print(city_json_schema(), end='')" > data_schemas/city_file.schema.json
 
 # The reference pages: every scenario key, every artefact column. Run it after `make schema`.
 reference: $(VENV)/.installed

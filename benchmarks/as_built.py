@@ -22,14 +22,14 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from tests.importers import as_built_clouds
+from tests.extensions.maps import as_built_clouds
 
 import egvs
 from egvs.core.grid import FloatArray, IntArray, Roi
-from egvs.importers.point_clouds.as_built_view import AsBuiltMap
-from egvs.importers.point_clouds.moving_points import StationScan, not_shared
-from egvs.importers.point_clouds.reader import make_meshes
-from egvs.importers.point_clouds.surface import SURFEL_SPACING_M, triangulate_cloud
+from egvs.extensions.maps.point_clouds.as_built_view import AsBuiltMap
+from egvs.extensions.maps.point_clouds.moving_points import StationScan, not_shared
+from egvs.extensions.maps.point_clouds.reader import make_meshes
+from egvs.extensions.maps.point_clouds.surface import SURFEL_SPACING_M, triangulate_cloud
 from egvs.world.mesh import World
 from egvs.world.ray_casting import Caster
 from egvs.world.static_world import build_world

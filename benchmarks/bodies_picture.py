@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from egvs.validation import cloud_simulation
+from egvs.clouds import simulation as cloud_simulation
 
 COLOURS = {
     "paint": (0.36, 0.47, 0.68),

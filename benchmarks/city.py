@@ -42,15 +42,15 @@ from scipy.stats import qmc
 
 from benchmarks.scaling import Size, prepare, sides
 from egvs.artefacts.run_record import RunRecord
-from egvs.city import scheduler, tasks, traffic_split
-from egvs.city.city_run import CityRunOptions, run_city
-from egvs.city.costs import CityCosts
-from egvs.city.creation import NewCityOptions, create_city
-from egvs.city.model import CITY_FILE, TRAFFIC_FOLDER, City, load_city
-from egvs.city.tasks import Job, JobResult
-from egvs.cli.city import print_costs
 from egvs.core import files
 from egvs.core.resource_usage import ResourceUsage
+from egvs.extensions.city import scheduler, tasks, traffic_split
+from egvs.extensions.city.city_run import CityRunOptions, run_city
+from egvs.extensions.city.commands import print_costs
+from egvs.extensions.city.costs import CityCosts
+from egvs.extensions.city.creation import NewCityOptions, create_city
+from egvs.extensions.city.model import CITY_FILE, TRAFFIC_FOLDER, City, load_city
+from egvs.extensions.city.tasks import Job, JobResult
 from egvs.runs import run
 from egvs.runs.stage_registry import StageResult
 from egvs.runs.store import Store

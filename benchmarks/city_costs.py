@@ -20,8 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from egvs.city.costs import ROUTES_STEP, SPLIT_STEP, SUMO_STEP
-from egvs.city.tasks import EARLY_SCANS, SCENE_CHECK, SCORED_PARTS
+from egvs.extensions.city.costs import ROUTES_STEP, SPLIT_STEP, SUMO_STEP
+from egvs.extensions.city.tasks import EARLY_SCANS, SCENE_CHECK, SCORED_PARTS
 
 JUNCTIONS = (1_000, 10_000)
 

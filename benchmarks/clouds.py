@@ -11,7 +11,7 @@ import numpy as np
 import egvs
 from egvs.artefacts import traffic_frames
 from egvs.artefacts.traffic_frames import TrafficFrame
-from egvs.validation.cloud_simulation import CloudSimulator, sweep_rng
+from egvs.clouds.simulation import CloudSimulator, sweep_rng
 
 BOUND_S = 0.003
 FRAMES = 100

@@ -13,9 +13,14 @@ from collections import defaultdict
 from typing import Any
 
 import numpy as np
-from tests.validation import simulated_studies
+from tests.extensions.validation import simulated_studies
 
-from egvs.validation.correlation import COEFFICIENT_KINDS, ConfidenceInterval, Correlation, CorrelationStudy
+from egvs.extensions.validation.correlation import (
+    COEFFICIENT_KINDS,
+    ConfidenceInterval,
+    Correlation,
+    CorrelationStudy,
+)
 
 SITES, RHOS, STUDIES, RESAMPLES = (13, 40), (0.0, 0.5, 0.8, 0.95), 1000, 1000
 PAIR = (0.8, 0.5)

@@ -30,15 +30,15 @@ from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
 from egvs.core.grid import FloatArray
 from egvs.core.wording import format_percent
-from egvs.report.formatting import SCORE_LABELS
+from egvs.extensions.validation.held_out_traffic import FrameSampling
+from egvs.extensions.validation.site_validation import validate_sites
+from egvs.results.labels import SCORE_LABELS
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.sensors import sites
 from egvs.studies.accuracy import AccuracyStudy, StudyOptions, run_accuracy_study
 from egvs.studies.recommendation import SettingResult, Tolerance
 from egvs.studies.study_settings import DEFAULT_VALUES, SettingValues
-from egvs.validation.held_out_traffic import FrameSampling
-from egvs.validation.site_validation import validate_sites
 
 TOLERANCE = Tolerance(1.0)
 BUDGET_S = 120.0

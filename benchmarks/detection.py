@@ -10,8 +10,8 @@ import time
 
 import numpy as np
 
-from egvs.validation.detection_metrics import EvaluationFrames, GroundTruth, evaluate
-from egvs.validation.sweeps import Detections
+from egvs.clouds.sweeps import Detections
+from egvs.extensions.validation.detection_metrics import EvaluationFrames, GroundTruth, evaluate
 
 SITES, FRAMES, DETECTORS, MAX_S = 13, 1000, 3, 60.0
 

@@ -66,9 +66,11 @@ class Process:
 PROCESSES = (
     Process("`egvs run`", ("egvs.runs.run", "egvs.stages.scan")),
     Process("`egvs place`", ("egvs.placement.plan", "egvs.placement.refinement")),
-    Process("worker of `egvs city run`", ("egvs.city.tasks",)),
+    Process("worker of `egvs city run`", ("egvs.extensions.city.tasks",)),
     Process(
-        "`egvs validate`", ("egvs.validation.validation_run", "egvs.validation.detector_runs"), (("full_sweep", True),)
+        "`egvs validate`",
+        ("egvs.extensions.validation.validation_run", "egvs.extensions.validation.detector_runs"),
+        (("full_sweep", True),),
     ),
     Process("`egvs explore`", ("egvs.explore.session",), (("mounts", 1),)),
 )

@@ -27,13 +27,13 @@ from benchmarks.measured_vehicles import (
     find_candidates,
     ground_heights,
 )
+from egvs.clouds.sweeps import BoolArray, Detections, SiteView, Sweep, detections_in_roi
 from egvs.core.grid import FloatArray, Roi
-from egvs.sensor_fit import empty_scan, output
-from egvs.sensor_fit.empty_scan import EmptyScanFit
-from egvs.sensor_fit.fit import SensorFit
+from egvs.extensions.hardware.fit import empty_scan, output
+from egvs.extensions.hardware.fit.empty_scan import EmptyScanFit
+from egvs.extensions.hardware.fit.fit import SensorFit
+from egvs.extensions.validation.detectors.cluster import Cluster
 from egvs.sensors.sites import Pose
-from egvs.validation.detectors.cluster import Cluster
-from egvs.validation.sweeps import BoolArray, Detections, SiteView, Sweep, detections_in_roi
 
 NEAR_M = 1.0
 BARRIERS_M = {"outer barrier": ((-16.5, -15.0), (15.5, 17.0)), "median": ((-2.2, 2.2),)}

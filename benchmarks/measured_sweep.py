@@ -28,18 +28,18 @@ from scipy.stats import t
 
 from egvs.core.files import temporary_folder
 from egvs.core.grid import FloatArray, Roi
-from egvs.importers.point_clouds.as_built_view import AsBuiltMap
-from egvs.importers.point_clouds.reader import make_meshes
-from egvs.importers.point_clouds.surface import triangulate_cloud
+from egvs.extensions.hardware.fit import empty_scan, output
+from egvs.extensions.hardware.fit.empty_scan import EmptyScanFit
+from egvs.extensions.hardware.fit.fit import SensorFit, fit_sensor
+from egvs.extensions.hardware.fit.range_noise import VARIANCE_FACTOR, range_residuals
+from egvs.extensions.hardware.fit.return_rates import ROAD_BAND_M
+from egvs.extensions.hardware.fit.sweep_files import read_sweeps
+from egvs.extensions.maps.point_clouds.as_built_view import AsBuiltMap
+from egvs.extensions.maps.point_clouds.reader import make_meshes
+from egvs.extensions.maps.point_clouds.surface import triangulate_cloud
 from egvs.scenario.sensor_config import SensorConfig
-from egvs.sensor_fit import empty_scan, output
-from egvs.sensor_fit.empty_scan import EmptyScanFit
-from egvs.sensor_fit.fit import SensorFit, fit_sensor
-from egvs.sensor_fit.intervals import estimate_scale
-from egvs.sensor_fit.range_noise import VARIANCE_FACTOR, range_residuals
-from egvs.sensor_fit.return_rates import ROAD_BAND_M
-from egvs.sensor_fit.sweep_files import read_sweeps
 from egvs.sensors.sensor import Sensor, resolve_sensor
+from egvs.statistics.intervals import estimate_scale
 from egvs.world.mesh import World
 from egvs.world.ray_casting import Caster, EmptyScan
 

@@ -33,16 +33,16 @@ from scipy.stats import binomtest, t
 
 from benchmarks.measured_sweep import build_world, cast_static, fit_sweeps, fitted_sensor
 from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.clouds.simulation import BodyCaster, VehicleMeshes, builtin_bodies
 from egvs.core.grid import FloatArray, IntArray
 from egvs.effects.base import Echoes
 from egvs.effects.surface_losses import SurfaceLosses
+from egvs.extensions.hardware.fit import empty_scan, output
+from egvs.extensions.hardware.fit.empty_scan import EmptyScanFit
+from egvs.extensions.hardware.fit.fit import SensorFit
+from egvs.extensions.validation.detectors.clustering import Density, find_clusters
 from egvs.scenario.effects_config import SurfaceLossesParameters
-from egvs.sensor_fit import empty_scan, output
-from egvs.sensor_fit.empty_scan import EmptyScanFit
-from egvs.sensor_fit.fit import SensorFit
 from egvs.sensors.sensor import Sensor
-from egvs.validation.cloud_simulation import BodyCaster, VehicleMeshes, builtin_bodies
-from egvs.validation.detectors.clustering import Density, find_clusters
 from egvs.world.ray_casting import EmptyScan
 
 LIST = Path(__file__).parents[1] / "docs" / "data" / "chengdu_vehicles.csv"

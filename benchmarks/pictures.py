@@ -21,12 +21,12 @@ from benchmarks import bodies_picture
 from egvs.artefacts.readers import read_scores
 from egvs.artefacts.tpog import read_tpog
 from egvs.artefacts.traffic_frames import read_trajectories
+from egvs.drawing.basemap import network_file, roads_within, world_outlines
+from egvs.drawing.maps import Backdrop, SiteViewFigure, site_view
+from egvs.drawing.svg_figures import extent, standalone_svg
 from egvs.effects import registry
 from egvs.effects.registry import AUTO_ENABLED
-from egvs.report.basemap import network_file, roads_within, world_outlines
-from egvs.report.maps import Backdrop, SiteViewFigure, site_view
-from egvs.report.ranking import RankedSite
-from egvs.report.svg_figures import extent, standalone_svg
+from egvs.results.ranking import RankedSite
 from egvs.runs import run
 from egvs.scenario.effects_config import EffectsConfig
 from egvs.scenario.model import Scenario

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tests.importers.overpass_server import overpass_server, recorded_answer, send
+from tests.creation.overpass_server import overpass_server, recorded_answer, send
 
 import egvs
 from benchmarks.pictures import IMAGES, ROOT, figure

@@ -35,10 +35,10 @@ from benchmarks.realism import (
     table_row,
 )
 from benchmarks.validity.junctions import with_sites
+from egvs.clouds.sweeps import DetectedBoxes, Detections, detections_in_roi
 from egvs.core.grid import FloatArray, Roi
 from egvs.sensors.sensor import rotation_world_sensor
 from egvs.sensors.sites import Pose
-from egvs.validation.sweeps import DetectedBoxes, Detections, detections_in_roi
 
 SEED, DRAWS = 3703, 3
 POSITION_M, ANGLE_DEG = 0.1, 1.0

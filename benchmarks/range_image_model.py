@@ -1,9 +1,9 @@
 """Train the model of the detector ``range_image`` on simulated sweeps of the training junctions.
 
-``python -m benchmarks.range_image_model`` writes ``pipeline/egvs/validation/detectors/range_image.json``: ingolstadt,
-hill and roundabout, every sensor of the catalogue, random poses, and traffic with a seed that nothing else uses. The
-same seed gives the same file. It takes some five minutes on one core. ``--out`` writes elsewhere, ``--junction`` trains
-on some of the junctions: ``--junction hill,roundabout`` for a test at ingolstadt.
+``python -m benchmarks.range_image_model`` writes ``pipeline/egvs/extensions/validation/detectors/range_image.json``:
+ingolstadt, hill and roundabout, every sensor of the catalogue, random poses, and traffic with a seed that nothing else
+uses. The same seed gives the same file. It takes some five minutes on one core. ``--out`` writes elsewhere,
+``--junction`` trains on some of the junctions: ``--junction hill,roundabout`` for a test at ingolstadt.
 
 Steps: simulate sweeps; find their segments, as the detector does; label each segment with the road users that its
 points are on (:func:`label_segments`); fit trees for kinds and margins on half of the poses, and measure the boxes that
@@ -25,17 +25,17 @@ from sklearn.ensemble import HistGradientBoostingClassifier, HistGradientBoostin
 
 import egvs
 from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.clouds.simulation import CloudSimulator
+from egvs.clouds.sweeps import BoolArray, frame_classes
 from egvs.core import files
 from egvs.core.grid import FloatArray, IntArray
+from egvs.extensions.validation.detection_metrics import paired_overlap
+from egvs.extensions.validation.detectors import range_image, segment_model
+from egvs.extensions.validation.detectors.range_image import FEATURES, RangeImageAtSite, Segments, box_features
+from egvs.extensions.validation.detectors.segment_model import MARGINS, SEGMENT_KINDS, VEHICLE_KINDS, SegmentModel
+from egvs.extensions.validation.held_out_traffic import prepare_held_out_traffic
+from egvs.extensions.validation.training.samples import TrainingJunction
 from egvs.sensors.sensor import CATALOGUE
-from egvs.validation.cloud_simulation import CloudSimulator
-from egvs.validation.detection_metrics import paired_overlap
-from egvs.validation.detectors import range_image, segment_model
-from egvs.validation.detectors.range_image import FEATURES, RangeImageAtSite, Segments, box_features
-from egvs.validation.detectors.segment_model import MARGINS, SEGMENT_KINDS, VEHICLE_KINDS, SegmentModel
-from egvs.validation.held_out_traffic import prepare_held_out_traffic
-from egvs.validation.sweeps import BoolArray, frame_classes
-from egvs.validation.training.samples import TrainingJunction
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 JUNCTIONS = ("ingolstadt", "hill", "roundabout")

@@ -24,23 +24,23 @@ import egvs
 from egvs.artefacts.readers import read_scores
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.clouds.sweeps import DetectorResult
 from egvs.core.grid import FloatArray, Roi
 from egvs.core.progress import no_progress
-from egvs.runs import run
-from egvs.scenario.model import Scenario
-from egvs.sensors.sites import Site
-from egvs.validation.detection_metrics import (
+from egvs.extensions.validation.detection_metrics import (
     ALL_OBJECTS,
     JackknifeEstimate,
     estimate_difference,
     frame_blocks,
     measure_detection,
 )
-from egvs.validation.detector_runs import SiteDetectionTask, run_detectors
-from egvs.validation.detectors.base import make_detector
-from egvs.validation.held_out_traffic import FrameSampling
-from egvs.validation.sweeps import DetectorResult
-from egvs.validation.validation_run import validation_run
+from egvs.extensions.validation.detector_runs import SiteDetectionTask, run_detectors
+from egvs.extensions.validation.detectors.base import make_detector
+from egvs.extensions.validation.held_out_traffic import FrameSampling
+from egvs.extensions.validation.validation_run import validation_run
+from egvs.runs import run
+from egvs.scenario.model import Scenario
+from egvs.sensors.sites import Site
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 FRAMES, TRAFFIC_FRAMES = 200, 1000

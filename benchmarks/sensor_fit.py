@@ -16,10 +16,10 @@ import numpy as np
 
 from benchmarks.simulated_sweeps import Truth, simulate_sweep
 from egvs.core.wording import format_percent
-from egvs.sensor_fit.fit import SensorFit, fit_sensor
-from egvs.sensor_fit.intervals import Estimate
-from egvs.sensor_fit.sweep_files import Sweep
+from egvs.extensions.hardware.fit.fit import SensorFit, fit_sensor
+from egvs.extensions.hardware.fit.sweep_files import Sweep
 from egvs.sensors.sensor import CATALOGUE, Sensor
+from egvs.statistics.intervals import Estimate
 
 SENSORS = ("VLP-16", "VLP-32C", "AT128", "Pandar128", "OS1-64", "RS-Ruby Plus")
 RANGE_STEPS_M = (0.0, 0.002, 0.004)

@@ -19,14 +19,14 @@ import egvs
 from benchmarks.validity import low_models
 from egvs.artefacts import parquet
 from egvs.core.progress import no_progress
-from egvs.validation import surrogates
-from egvs.validation.correlation import Correlation, CorrelationStudy, JunctionScores, MeasureValues
-from egvs.validation.detection_metrics import ALL_OBJECTS, measure_detection
-from egvs.validation.detector_runs import SiteDetectionTask, run_detectors
-from egvs.validation.detectors import base
-from egvs.validation.held_out_traffic import FrameSampling
-from egvs.validation.results import ScoreName
-from egvs.validation.validation_run import validation_run
+from egvs.extensions.validation import surrogates
+from egvs.extensions.validation.correlation import Correlation, CorrelationStudy, JunctionScores, MeasureValues
+from egvs.extensions.validation.detection_metrics import ALL_OBJECTS, measure_detection
+from egvs.extensions.validation.detector_runs import SiteDetectionTask, run_detectors
+from egvs.extensions.validation.detectors import base
+from egvs.extensions.validation.held_out_traffic import FrameSampling
+from egvs.extensions.validation.results import ScoreName
+from egvs.extensions.validation.validation_run import validation_run
 
 SCENARIO = Path(__file__).parents[1] / "scenarios" / "nishishinjuku"
 FRAMES, APART_S, SEED = 250, 7.0, 3704

@@ -1,6 +1,6 @@
 """Sweeps of a sensor whose angles, noise and losses are known, in a yard with a tilted ground and four walls.
 
-Nothing is shared with ``egvs.sensor_fit``: surfaces are planes, met by solving for the range of each ray.
+Nothing is shared with ``egvs.extensions.hardware.fit``: surfaces are planes, met by solving for the range of each ray.
 """
 
 from __future__ import annotations

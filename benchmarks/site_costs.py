@@ -21,7 +21,12 @@ from typing import Any
 import egvs
 from egvs.artefacts.tpog import read_tpog
 from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.clouds.sweeps import POINT_COUNTS_NAME
 from egvs.core.resource_usage import measure_usage
+from egvs.extensions.validation import detection_metrics
+from egvs.extensions.validation.detector_runs import SiteDetectionTask
+from egvs.extensions.validation.detectors import base
+from egvs.extensions.validation.held_out_traffic import MIN_SPACING_S, HeldOutTraffic, prepare_held_out_traffic
 from egvs.runs.run import ensure_stages
 from egvs.scenario.score_config import DEFAULT_SAMPLED_FRAMES
 from egvs.scoring import target_scores
@@ -32,11 +37,6 @@ from egvs.sensors.scanner import Scanner
 from egvs.sensors.sites import Site
 from egvs.stages import inputs
 from egvs.stages.inputs import open_folder
-from egvs.validation import detection_metrics
-from egvs.validation.detector_runs import SiteDetectionTask
-from egvs.validation.detectors import base
-from egvs.validation.held_out_traffic import MIN_SPACING_S, HeldOutTraffic, prepare_held_out_traffic
-from egvs.validation.sweeps import POINT_COUNTS_NAME
 from egvs.world.mesh import read_ply
 
 SCENARIO = Path(__file__).resolve().parent.parent / "scenarios" / "nishishinjuku"

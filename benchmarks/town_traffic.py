@@ -17,9 +17,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from egvs.city.creation import CITY_LATERAL_RESOLUTION_M, CITY_STEP_S
 from egvs.core import files
 from egvs.core.progress import no_progress
+from egvs.extensions.city.creation import CITY_LATERAL_RESOLUTION_M, CITY_STEP_S
 from egvs.formats import xml
 from egvs.scenario.loading import scenario_from_dict
 from egvs.scenario.model import Scenario

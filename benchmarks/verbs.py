@@ -28,18 +28,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from tests.installation.simulated_scan import simulate_scan
+from tests.extensions.hardware.installation.simulated_scan import simulate_scan
 
 from benchmarks import page_tables
 from benchmarks.page_tables import Cells
 from benchmarks.simulated_sweeps import Truth, simulate_sweep
+from egvs.extensions.hardware.installation.planned_sites import PlannedSites
 from egvs.formats import point_clouds
-from egvs.installation.planned_sites import PlannedSites
 from egvs.sensors.sensor import CATALOGUE
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENARIO = ROOT / "scenarios" / "roundabout"
-EXTRACT = ROOT / "tests" / "importers" / "data" / "small.osm"
+EXTRACT = ROOT / "tests" / "creation" / "data" / "small.osm"
 MARKS = ("<!-- verbs -->", "<!-- end of verbs -->")
 HEADINGS = ("command", "cold s", "warm s", "up to date s")
 

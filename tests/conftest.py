@@ -64,8 +64,8 @@ SITES = "site,x_m,y_m,z_m\npole_a,10,12,3\npole_b,30.5,-12,3\n"
 
 LONGEST = (
     "tests/install/",
-    "tests/installation/test_story",
-    "tests/importers/test_round_trip_scores",
+    "tests/extensions/hardware/installation/test_story",
+    "tests/extensions/maps/test_round_trip_scores",
     "tests/studies/test_accuracy",
     "tests/test_architecture.py::test_each_public_name",
 )

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 SYSTEM = (
+    "tests/core/test_sandbox",
+    "tests/creation/",
     "tests/effects/test_articulated",
     "tests/effects/test_pedestrians_bicycles",
     "tests/effects/test_slope",
-    "tests/importers/",
-    "tests/installation/",
+    "tests/extensions/hardware/installation/",
+    "tests/extensions/maps/test_",
+    "tests/extensions/tracks/new/",
+    "tests/extensions/tracks/test_recorded_tracks",
     "tests/runs/",
     "tests/studies/",
     "tests/traffic/",

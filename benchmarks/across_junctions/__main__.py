@@ -41,8 +41,8 @@ from benchmarks.validity import low_models
 from egvs.core import files, plugins
 from egvs.core.errors import EgvsError, InputError, MissingBackendError
 from egvs.core.progress import ProgressCallback
+from egvs.extensions.validation.detectors import base
 from egvs.scenario.loading import load
-from egvs.validation.detectors import base
 
 ROOT = Path(__file__).resolve().parents[2]
 REPORT_EVERY_S = 30.0
@@ -208,7 +208,7 @@ def _list(arguments: argparse.Namespace) -> int:
 
 def _detector(arguments: argparse.Namespace) -> int:
     plugins.require_libraries("training", "train", "torch", "onnx", "onnxscript", "onnxruntime")
-    from egvs.validation.training.train import Recipe, train
+    from egvs.extensions.validation.training.train import Recipe, train
 
     protocol = read_protocol()
     scenarios = []

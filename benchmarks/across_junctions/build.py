@@ -19,13 +19,13 @@ from benchmarks.across_junctions.worlds import BASE, WITH_TABLES, make_world
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core import files
 from egvs.core.errors import EgvsError, InputError
+from egvs.extensions.validation.held_out_traffic import prepare_held_out_traffic
 from egvs.runs.run import ensure_stages
 from egvs.scenario.loading import load
 from egvs.scenario.model import Scenario
 from egvs.sensors.sites import Site
 from egvs.stages.inputs import get_scene, open_folder
 from egvs.traffic import sumo_folder
-from egvs.validation.held_out_traffic import prepare_held_out_traffic
 from egvs.world.carriageway import Carriageway
 
 TRIAL_FRAMES, TRIAL_APART_S = 40, 7.0

@@ -34,7 +34,7 @@ from benchmarks.detectability.figures import Curves
 from benchmarks.detectability.fitting import curve
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, IntArray
-from egvs.validation.correlation import MeasureValues
+from egvs.extensions.validation.correlation import MeasureValues
 
 RECALLS = ("recall_bev_iou70", "recall_3d_iou70")
 

@@ -17,15 +17,15 @@ import numpy as np
 
 from benchmarks.validity import low_models
 from egvs.artefacts.traffic_frames import BOX_COLUMNS, TrafficFrame
+from egvs.clouds import simulation as cloud_simulation
+from egvs.clouds import sweeps
+from egvs.clouds.sweeps import POINT_COUNTS_NAME, DetectedBoxes, Detections, PointCounts
 from egvs.core import files
 from egvs.core.grid import FloatArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.resource_usage import ResourceUsage
-from egvs.kernels.detection import OVERLAP_TOLERANCE
-from egvs.runs import stage_keys
-from egvs.stages import scene_inputs
-from egvs.validation import cloud_simulation, detection_metrics, detector_runs, held_out_traffic, sweeps
-from egvs.validation.detection_metrics import (
+from egvs.extensions.validation import detection_metrics, detector_runs, held_out_traffic
+from egvs.extensions.validation.detection_metrics import (
     BLOCKS,
     IOUS,
     VIEWS,
@@ -35,9 +35,11 @@ from egvs.validation.detection_metrics import (
     frame_blocks,
     paired_overlap,
 )
-from egvs.validation.detector_runs import DetectionListener, SiteDetectionTask, run_detectors
-from egvs.validation.held_out_traffic import HeldOutTraffic
-from egvs.validation.sweeps import POINT_COUNTS_NAME, DetectedBoxes, Detections, PointCounts
+from egvs.extensions.validation.detector_runs import DetectionListener, SiteDetectionTask, run_detectors
+from egvs.extensions.validation.held_out_traffic import HeldOutTraffic
+from egvs.kernels.detection import OVERLAP_TOLERANCE
+from egvs.runs import stage_keys
+from egvs.stages import scene_inputs
 
 AP = "ap_mean_r40_iou70"
 """The main measure: the mean of BEV and 3D."""
@@ -182,8 +184,8 @@ def hits_of(targets: Sequence[FloatArray], results: Sequence[FloatArray]) -> Flo
     """Return the share of the two views in which each vehicle is found, (n,) float64: 0, 0.5 or 1.
 
     A vehicle is found in a view (from above, in space) if any detection overlaps it by more than the largest of
-    :data:`egvs.validation.detection_metrics.IOUS`. Vehicles do not overlap each other, so no detection overlaps two by
-    so much, and matching would give the same.
+    :data:`egvs.extensions.validation.detection_metrics.IOUS`. Vehicles do not overlap each other, so no detection
+    overlaps two by so much, and matching would give the same.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
 """Measure one part of the study: one junction with one detector, its scores, or what its candidates see of vehicles.
 
-Detections of each candidate are cached (:mod:`egvs.validation.detector_runs`), so an interrupted part continues where
-it stopped. A complete part is not measured again while nothing that it depends on has changed.
+Detections of each candidate are cached (:mod:`egvs.extensions.validation.detector_runs`), so an interrupted part
+continues where it stopped. A complete part is not measured again while nothing that it depends on has changed.
 
-All parts of a junction use the same unseen traffic (:mod:`egvs.validation.held_out_traffic`): other departures than
-those of the traffic behind the scores.
+All parts of a junction use the same unseen traffic (:mod:`egvs.extensions.validation.held_out_traffic`): other
+departures than those of the traffic behind the scores.
 """
 
 from __future__ import annotations
@@ -27,6 +27,9 @@ from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.resource_usage import measure_usage
 from egvs.core.threads import map_ordered, thread_count
+from egvs.extensions.validation import surrogates
+from egvs.extensions.validation.held_out_traffic import HeldOutTraffic, prepare_held_out_traffic
+from egvs.extensions.validation.results import ScoreName
 from egvs.runs import stage_keys
 from egvs.scenario.loading import load
 from egvs.scenario.model import Scenario
@@ -37,9 +40,6 @@ from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import Sensor
 from egvs.sensors.sites import Site
 from egvs.stages.inputs import get_scene, open_folder
-from egvs.validation import surrogates
-from egvs.validation.held_out_traffic import HeldOutTraffic, prepare_held_out_traffic
-from egvs.validation.results import ScoreName
 
 FEWER_FRAMES = {"chongqing": 1000}
 """Frames of the traffic behind the scores, where the protocol's number does not fit: the recorded people of chongqing

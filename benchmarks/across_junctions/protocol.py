@@ -25,6 +25,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from egvs.core import files
 from egvs.core.errors import InputError
+from egvs.extensions.validation.detectors import base
 from egvs.runs import stage_keys
 from egvs.scenario.fields import StrictModel, find_duplicates
 from egvs.scenario.loading import format_validation_error
@@ -32,7 +33,6 @@ from egvs.scenario.traffic_config import VehicleKind
 from egvs.scoring import target_scores
 from egvs.scoring.target_scores import MODEL_FILE
 from egvs.sensors.sensor import CATALOGUE, catalogue_digest
-from egvs.validation.detectors import base
 
 FOLDER = Path(__file__).resolve().parent
 
@@ -60,10 +60,10 @@ JUDGING = (
     "egvs.kernels.vehicle_visibility",
     "egvs.scoring.targets",
     "egvs.scoring.visibility",
-    "egvs.validation.correlation",
-    "egvs.validation.detection_metrics",
-    "egvs.validation.surrogate_scores",
-    "egvs.validation.surrogates",
+    "egvs.extensions.validation.correlation",
+    "egvs.extensions.validation.detection_metrics",
+    "egvs.extensions.validation.surrogate_scores",
+    "egvs.extensions.validation.surrogates",
 )
 """Modules that compute scores and visibility, and turn detections into results."""
 

@@ -21,15 +21,15 @@ equal values of AP leave to a score without ties, with t candidates in each grou
 
 .. math:: R = \frac{2 r}{1 + r}, \qquad \rho_{max} = \sqrt{R} \sqrt{1 - \frac{\sum (t^3 - t)}{n^3 - n}}
 
-**Intervals** of one junction resample candidates and blocks of frames together, as :mod:`egvs.validation.correlation`
-does, and are for rho with measured AP. Groups of fewer than five candidates resample blocks of frames only. A resample
-has the noise of the frames twice, so its rho is too low on average: resamples are moved so that their median is the
-value. Over several junctions, the junctions are resampled too: each resample draws as many junctions as there are, with
-one resample of each. The noise of candidates and frames is in the spread of the values of the junctions already, so it
-counts twice; in turn, the spread of a few junctions is underestimated. Measured on synthetic studies of six junctions
-(in the tests), nominal intervals of 95 % of mean rho contain the truth in 99 of 100 studies where junctions are alike,
-and in 85 where they differ much. Those of a median regret contain it in 70 to 80 of 100, so the six values are printed
-instead.
+**Intervals** of one junction resample candidates and blocks of frames together, as
+:mod:`egvs.extensions.validation.correlation` does, and are for rho with measured AP. Groups of fewer than five
+candidates resample blocks of frames only. A resample has the noise of the frames twice, so its rho is too low on
+average: resamples are moved so that their median is the value. Over several junctions, the junctions are resampled too:
+each resample draws as many junctions as there are, with one resample of each. The noise of candidates and frames is in
+the spread of the values of the junctions already, so it counts twice; in turn, the spread of a few junctions is
+underestimated. Measured on synthetic studies of six junctions (in the tests), nominal intervals of 95 % of mean rho
+contain the truth in 99 of 100 studies where junctions are alike, and in 85 where they differ much. Those of a median
+regret contain it in 70 to 80 of 100, so the six values are printed instead.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core.grid import FloatArray
-from egvs.validation.correlation import (
+from egvs.extensions.validation.correlation import (
     MIN_POLES,
     MIN_VALUES,
     ConfidenceInterval,

@@ -46,8 +46,8 @@ from benchmarks.validity.pools import DEFAULT, Setting
 from benchmarks.validity.tables import Cell, Column, Table, number, with_interval
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.extensions.validation.correlation import MeasureValues, average_ranks
 from egvs.scoring.target_scores import DETECTORS
-from egvs.validation.correlation import MeasureValues, average_ranks
 
 UNSEEN_ROLES = tuple(role for role in ROLES if role != "training")
 

@@ -15,18 +15,23 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from egvs.cli.validation_tables import PlanRunDisplay
+from egvs.clouds.sweeps import POINT_COUNTS_NAME
 from egvs.core import files
+from egvs.extensions.validation import detection_metrics
+from egvs.extensions.validation.detection_metrics import (
+    ALL_OBJECTS,
+    JackknifeEstimate,
+    SiteDetection,
+    estimate_difference,
+)
+from egvs.extensions.validation.detector_runs import run_detectors
+from egvs.extensions.validation.held_out_traffic import prepare_held_out_traffic
+from egvs.extensions.validation.plan_validation import FusedDetectionTask, SensorGroup, joint_detectors
+from egvs.extensions.validation.results import main_measure
+from egvs.extensions.validation.tables import PlanRunDisplay
 from egvs.placement import plan
 from egvs.scenario.loading import load
 from egvs.sensors.sites import candidate_sites
-from egvs.validation import detection_metrics
-from egvs.validation.detection_metrics import ALL_OBJECTS, JackknifeEstimate, SiteDetection, estimate_difference
-from egvs.validation.detector_runs import run_detectors
-from egvs.validation.held_out_traffic import prepare_held_out_traffic
-from egvs.validation.plan_validation import FusedDetectionTask, SensorGroup, joint_detectors
-from egvs.validation.results import main_measure
-from egvs.validation.sweeps import POINT_COUNTS_NAME
 
 SCORES = ("egvs", "points_on_target", "expected_detections")
 APART_S = 7.0

@@ -25,9 +25,21 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.across_junctions.detections import hits_of
-from egvs.cli.validation_tables import PlanRunDisplay
+from egvs.clouds.sweeps import DetectedBoxes, DetectorResult
 from egvs.core import files
 from egvs.core.grid import FloatArray, IntArray
+from egvs.extensions.validation.correlation import StandardisedValues
+from egvs.extensions.validation.detection_metrics import (
+    ALL_OBJECTS,
+    BLOCKS,
+    JackknifeEstimate,
+    frame_blocks,
+    measure_detection,
+)
+from egvs.extensions.validation.detector_runs import run_detectors
+from egvs.extensions.validation.held_out_traffic import HeldOutTraffic, prepare_held_out_traffic
+from egvs.extensions.validation.plan_validation import FusedDetectionTask, SensorGroup, joint_detectors
+from egvs.extensions.validation.tables import PlanRunDisplay
 from egvs.scenario.loading import load
 from egvs.scoring.fused_targets import fuse_targets
 from egvs.scoring.target_scores import detection_chances
@@ -35,18 +47,6 @@ from egvs.scoring.targets import TargetRecord, VisibleTargets, detection_probabi
 from egvs.scoring.visibility import Beams
 from egvs.sensors.scanner import Scanner
 from egvs.sensors.sites import Site
-from egvs.validation.correlation import StandardisedValues
-from egvs.validation.detection_metrics import (
-    ALL_OBJECTS,
-    BLOCKS,
-    JackknifeEstimate,
-    frame_blocks,
-    measure_detection,
-)
-from egvs.validation.detector_runs import run_detectors
-from egvs.validation.held_out_traffic import HeldOutTraffic, prepare_held_out_traffic
-from egvs.validation.plan_validation import FusedDetectionTask, SensorGroup, joint_detectors
-from egvs.validation.sweeps import DetectedBoxes, DetectorResult
 
 APART_S = 7.0
 """Between frames, as in the study of validity."""

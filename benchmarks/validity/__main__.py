@@ -20,8 +20,8 @@ from benchmarks.validity.measurement import Part, measure
 from benchmarks.validity.record import Record
 from benchmarks.validity.study import Extent
 from egvs.cli import options
+from egvs.clouds.sweeps import POINT_COUNTS_NAME
 from egvs.core.errors import EgvsError, InputError, MissingBackendError
-from egvs.validation.sweeps import POINT_COUNTS_NAME
 
 ROOT = Path(__file__).resolve().parents[2]
 DATA = Path("data", "validity")

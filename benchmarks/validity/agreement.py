@@ -11,7 +11,7 @@ from benchmarks.validity.pools import DEFAULT, Pools, Setting
 from benchmarks.validity.poses import HEIGHTS_M
 from benchmarks.validity.record import Record, StudySite, measures_of
 from benchmarks.validity.tables import Cell, Column, Table, with_interval
-from egvs.validation.correlation import Correlation
+from egvs.extensions.validation.correlation import Correlation
 
 TRAINING, HELD_OUT = "training", "held out"
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from benchmarks.validity import low_models, poses
 from benchmarks.validity.junctions import Role, StudyJunction
+from egvs.clouds.sweeps import POINT_COUNTS_NAME
 from egvs.sensors.sites import Site
-from egvs.validation.sweeps import POINT_COUNTS_NAME
 
 FAST = (POINT_COUNTS_NAME, "cluster")
 """Detectors that run at every site, with every sensor; others run at some."""

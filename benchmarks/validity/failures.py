@@ -16,7 +16,7 @@ from benchmarks.validity.agreement import TRAINING, WORDS, candidates
 from benchmarks.validity.pools import DEFAULT, Pools, Setting
 from benchmarks.validity.record import Record, measures_of
 from benchmarks.validity.tables import Cell, Column, Table, number
-from egvs.validation.sweeps import POINT_COUNTS_NAME
+from egvs.clouds.sweeps import POINT_COUNTS_NAME
 
 WORST = 3
 """Number of sites per junction and score."""

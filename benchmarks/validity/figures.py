@@ -13,8 +13,8 @@ from benchmarks.validity import junctions
 from benchmarks.validity.agreement import WORDS
 from benchmarks.validity.record import measures_of
 from benchmarks.validity.tables import Table
+from egvs.clouds.sweeps import POINT_COUNTS_NAME
 from egvs.core import files
-from egvs.validation.sweeps import POINT_COUNTS_NAME
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -19,8 +19,8 @@ from benchmarks.validity.pools import SEED
 from benchmarks.validity.poses import HEIGHTS_M
 from benchmarks.validity.record import Record, measures_of
 from benchmarks.validity.tables import Cell, Column, Table, with_interval
-from egvs.validation.correlation import MIN_POLES, RESAMPLES, ConfidenceInterval, MeasureValues, Resamples
-from egvs.validation.detectors.pointpillars import PointPillars
+from egvs.extensions.validation.correlation import MIN_POLES, RESAMPLES, ConfidenceInterval, MeasureValues, Resamples
+from egvs.extensions.validation.detectors.pointpillars import PointPillars
 
 Floats = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from typing import Literal
 from benchmarks.validity import poses
 from egvs.core import files
 from egvs.core.errors import InputError
-from egvs.importers import new_scenario
+from egvs.creation import new_scenario
 from egvs.runs.run import ensure_stages
 from egvs.scenario.loading import load
 from egvs.scenario.model import Scenario, SitesConfig

@@ -10,10 +10,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from egvs.core.errors import MissingBackendError
+from egvs.extensions.validation.detectors import base
+from egvs.extensions.validation.detectors.base import Detector
+from egvs.extensions.validation.detectors.pointpillars import PointPillars
 from egvs.scenario.score_config import FROM_SENSOR
-from egvs.validation.detectors import base
-from egvs.validation.detectors.base import Detector
-from egvs.validation.detectors.pointpillars import PointPillars
 
 LOW, SENSOR = "pointpillars_2m", FROM_SENSOR
 NAMES = (LOW, SENSOR)

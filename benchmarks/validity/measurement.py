@@ -1,6 +1,7 @@
 """Measure one part of the study: the sites of one junction with one sensor, with all detectors and scores.
 
-Detections from a site are cached (:mod:`egvs.validation.detector_runs`), so an interrupted part continues site by site.
+Detections from a site are cached (:mod:`egvs.extensions.validation.detector_runs`), so an interrupted part continues
+site by site.
 A complete part is saved in the study's folder, with a hash of everything that it depends on.
 """
 
@@ -17,19 +18,19 @@ import numpy as np
 from benchmarks.validity import low_models
 from benchmarks.validity.record import Estimates, Record, StudySite, further_measures, measures_of
 from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.clouds.sweeps import POINT_COUNTS_NAME, DetectorResult
 from egvs.core import files
 from egvs.core.progress import ProgressCallback, no_progress
+from egvs.extensions.validation import detection_metrics, surrogates
+from egvs.extensions.validation.detection_metrics import ALL_OBJECTS, SiteDetection
+from egvs.extensions.validation.detector_runs import SiteDetectionTask, run_detectors
+from egvs.extensions.validation.held_out_traffic import HeldOutTraffic, prepare_held_out_traffic
+from egvs.extensions.validation.results import ScoreName
+from egvs.extensions.validation.surrogates import Surrogates
 from egvs.runs import stage_keys
 from egvs.scenario.model import Scenario
 from egvs.sensors import site_feasibility
 from egvs.sensors.sites import Site
-from egvs.validation import detection_metrics, surrogates
-from egvs.validation.detection_metrics import ALL_OBJECTS, SiteDetection
-from egvs.validation.detector_runs import SiteDetectionTask, run_detectors
-from egvs.validation.held_out_traffic import HeldOutTraffic, prepare_held_out_traffic
-from egvs.validation.results import ScoreName
-from egvs.validation.surrogates import Surrogates
-from egvs.validation.sweeps import POINT_COUNTS_NAME, DetectorResult
 
 
 @dataclass(frozen=True)

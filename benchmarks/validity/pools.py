@@ -10,8 +10,8 @@ from functools import cached_property
 from benchmarks.validity.junctions import ROLES
 from benchmarks.validity.record import Record
 from egvs.core import files
-from egvs.validation.correlation import RESAMPLES, CoefficientKind, Correlation, CorrelationStudy
-from egvs.validation.results import ScoreName
+from egvs.extensions.validation.correlation import RESAMPLES, CoefficientKind, Correlation, CorrelationStudy
+from egvs.extensions.validation.results import ScoreName
 
 SEED = 2504
 """Seed of the resamples of sites and blocks."""

@@ -17,9 +17,9 @@ from benchmarks.validity.failures import COLUMNS, worst
 from benchmarks.validity.pools import DEFAULT, Pools, Setting
 from benchmarks.validity.record import Record, StudySite, measures_of
 from benchmarks.validity.tables import Cell, Column, Table
+from egvs.clouds.sweeps import POINT_COUNTS_NAME
+from egvs.extensions.validation.results import ScoreName
 from egvs.scoring.target_scores import DETECTORS
-from egvs.validation.results import ScoreName
-from egvs.validation.sweeps import POINT_COUNTS_NAME
 
 RECOMMENDED = str(ScoreName("expected_detections", f'{{"detectors": "{"+".join(DETECTORS)}"}}'))
 """The recommended score: the mean probability over the detectors that have a model."""

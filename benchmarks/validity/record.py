@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
+from egvs.clouds.sweeps import POINT_COUNTS_NAME
 from egvs.core import files
-from egvs.validation.correlation import JunctionScores, MeasureValues
-from egvs.validation.detection_metrics import BLOCKS
-from egvs.validation.sweeps import POINT_COUNTS_NAME
+from egvs.extensions.validation.correlation import JunctionScores, MeasureValues
+from egvs.extensions.validation.detection_metrics import BLOCKS
 
 COUNTED = ("seen_20", "log_points")
 BOXED = ("ap_mean_r40_iou70", "ap_mean_r40_iou50")

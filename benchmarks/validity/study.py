@@ -27,10 +27,10 @@ from benchmarks.validity.measurement import Part
 from benchmarks.validity.pools import SEED, Pools
 from benchmarks.validity.record import FURTHER_BOX_MEASURES, Record, measures_of
 from benchmarks.validity.tables import Cell, Column, Table, number
+from egvs.clouds.sweeps import POINT_COUNTS_NAME
+from egvs.extensions.validation.correlation import RESAMPLES
+from egvs.extensions.validation.results import ScoreName
 from egvs.sensors.sites import Site
-from egvs.validation.correlation import RESAMPLES
-from egvs.validation.results import ScoreName
-from egvs.validation.sweeps import POINT_COUNTS_NAME
 
 FRAMES, SENSOR_FRAMES = 250, 60
 APART_S, SENSOR_APART_S = 7.0, 29.0

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from egvs.core import files
-from egvs.validation.correlation import ConfidenceInterval
+from egvs.extensions.validation.correlation import ConfidenceInterval
 
 Form = Literal["text", "whole", "one", "two"]
 Cell = str | float | int | None | list[float | None]

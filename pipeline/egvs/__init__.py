@@ -63,24 +63,26 @@ if TYPE_CHECKING:
     from egvs.artefacts.tpog import Tpog, read_tpog
     from egvs.artefacts.traffic_frames import read_trajectories
     from egvs.core.errors import EgvsError, InputError, RunError
+    from egvs.creation.new_scenario import NewScenarioOptions, create_scenario
     from egvs.explore.settings import open_session
     from egvs.export.figure import draw_figure
-    from egvs.importers.new_scenario import NewScenarioOptions, create_scenario
-    from egvs.installation.acceptance import accept
-    from egvs.installation.acceptance_page import write_acceptance
-    from egvs.installation.sheet import write_sheets
-    from egvs.placement.design_request import DesignRequest
+    from egvs.extensions.hardware.design import design_sensor
+    from egvs.extensions.hardware.design_request import DesignRequest
+    from egvs.extensions.hardware.fit.fit import fit_sensor
+    from egvs.extensions.hardware.fit.output import write_fit
+    from egvs.extensions.hardware.fit.sweep_files import read_sweeps
+    from egvs.extensions.hardware.installation.acceptance import accept
+    from egvs.extensions.hardware.installation.acceptance_page import write_acceptance
+    from egvs.extensions.hardware.installation.sheet import write_sheets
+    from egvs.extensions.validation.held_out_traffic import FrameSampling
+    from egvs.extensions.validation.site_validation import validate_sites
     from egvs.placement.plan import JointScore, place
-    from egvs.placement.sensor_design import design_sensor
     from egvs.runs.run import run
     from egvs.runs.verification import verify
     from egvs.scenario.loading import load
     from egvs.scenario.model import Scenario
     from egvs.scenario.shipped import shipped_scenario
     from egvs.scoring.scorer import Scorer
-    from egvs.sensor_fit.fit import fit_sensor
-    from egvs.sensor_fit.output import write_fit
-    from egvs.sensor_fit.sweep_files import read_sweeps
     from egvs.sensors.scanner import Scanner
     from egvs.sensors.scene import Scene
     from egvs.sensors.sensor import Sensor
@@ -91,8 +93,6 @@ if TYPE_CHECKING:
     from egvs.studies.recommendation import Tolerance
     from egvs.studies.run_comparison import compare_runs
     from egvs.studies.what_if import what_if
-    from egvs.validation.held_out_traffic import FrameSampling
-    from egvs.validation.site_validation import validate_sites
     from egvs.world.mesh import World
 
 __all__ = [
@@ -152,24 +152,26 @@ __getattr__, __dir__ = lazy_exports(
         "artefacts.tpog": ["Tpog", "read_tpog"],
         "artefacts.traffic_frames": ["read_trajectories"],
         "core.errors": ["EgvsError", "InputError", "RunError"],
+        "creation.new_scenario": ["NewScenarioOptions", "create_scenario"],
         "explore.settings": ["open_session"],
         "export.figure": ["draw_figure"],
-        "importers.new_scenario": ["NewScenarioOptions", "create_scenario"],
-        "installation.acceptance": ["accept"],
-        "installation.acceptance_page": ["write_acceptance"],
-        "installation.sheet": ["write_sheets"],
-        "placement.design_request": ["DesignRequest"],
+        "extensions.hardware.design": ["design_sensor"],
+        "extensions.hardware.design_request": ["DesignRequest"],
+        "extensions.hardware.fit.fit": ["fit_sensor"],
+        "extensions.hardware.fit.output": ["write_fit"],
+        "extensions.hardware.fit.sweep_files": ["read_sweeps"],
+        "extensions.hardware.installation.acceptance": ["accept"],
+        "extensions.hardware.installation.acceptance_page": ["write_acceptance"],
+        "extensions.hardware.installation.sheet": ["write_sheets"],
+        "extensions.validation.held_out_traffic": ["FrameSampling"],
+        "extensions.validation.site_validation": ["validate_sites"],
         "placement.plan": ["JointScore", "place"],
-        "placement.sensor_design": ["design_sensor"],
         "runs.run": ["run"],
         "runs.verification": ["verify"],
         "scenario.loading": ["load"],
         "scenario.model": ["Scenario"],
         "scenario.shipped": ["shipped_scenario"],
         "scoring.scorer": ["Scorer"],
-        "sensor_fit.fit": ["fit_sensor"],
-        "sensor_fit.output": ["write_fit"],
-        "sensor_fit.sweep_files": ["read_sweeps"],
         "sensors.scanner": ["Scanner"],
         "sensors.scene": ["Scene"],
         "sensors.sensor": ["Sensor"],
@@ -180,8 +182,6 @@ __getattr__, __dir__ = lazy_exports(
         "studies.recommendation": ["Tolerance"],
         "studies.run_comparison": ["compare_runs"],
         "studies.what_if": ["what_if"],
-        "validation.held_out_traffic": ["FrameSampling"],
-        "validation.site_validation": ["validate_sites"],
         "world.mesh": ["World"],
         "_version": ["__version__"],
     },

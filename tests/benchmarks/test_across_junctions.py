@@ -53,17 +53,17 @@ from benchmarks.validity.junctions import SCENARIOS, with_sites
 
 from egvs.artefacts.traffic_frames import TrafficFrame
 from egvs.core.errors import InputError
+from egvs.extensions.validation import surrogates
+from egvs.extensions.validation.correlation import MeasureValues
+from egvs.extensions.validation.detectors import cluster
+from egvs.extensions.validation.detectors.pointpillars import SHIPPED_MODEL, OnnxModel
+from egvs.extensions.validation.held_out_traffic import prepare_held_out_traffic
 from egvs.runs import stage_keys
 from egvs.scenario.loading import load
 from egvs.scoring.target_scores import DETECTORS, FEATURES, MODELLED, DetectabilityModel, detectability_model
 from egvs.sensors.sensor import CATALOGUE
 from egvs.sensors.sites import Pose, Site
 from egvs.traffic import sumo_folder
-from egvs.validation import surrogates
-from egvs.validation.correlation import MeasureValues
-from egvs.validation.detectors import cluster
-from egvs.validation.detectors.pointpillars import SHIPPED_MODEL, OnnxModel
-from egvs.validation.held_out_traffic import prepare_held_out_traffic
 from egvs.world.carriageway import Carriageway
 from tests.conftest import write_mini
 
@@ -805,7 +805,7 @@ def test_held_out_junctions_need_what_is_tested_to_be_frozen(tmp_path: Path) -> 
         "cluster",
         "pointpillars",
         "range_image",
-        "egvs.validation.correlation",
+        "egvs.extensions.validation.correlation",
         "benchmarks.across_junctions.tables",
     } <= frozen.keys()
     path.write_text(json.dumps(frozen | {"score": "another", "cluster": "another"}), encoding="utf-8")
@@ -857,7 +857,7 @@ def test_detections_depend_on_no_other_source(tmp_path: Path) -> None:
     files_only = ("egvs.core.", "egvs.artefacts.", "egvs.runs.", "egvs.kernels.jit", "egvs.kernels.kernel_cache")
     others = {name for name in executed if name.startswith(("egvs.", "benchmarks."))} - followed - {*detections.CALLING}
     assert {name for name in others if not name.startswith(files_only)} == set()
-    assert "egvs.validation.cloud_simulation" in executed and cluster.__name__ in executed
+    assert "egvs.clouds.simulation" in executed and cluster.__name__ in executed
 
 
 @pytest.mark.slow

@@ -106,7 +106,7 @@ def test_no_vehicle_and_frames_do_not_mix():
 
 
 def test_linking_distance_is_that_of_the_detector():
-    from egvs.validation.detectors.clustering import Density
+    from egvs.extensions.validation.detectors.clustering import Density
 
     assert Density().reach_m == crowding.LINK_M and Density().reach_per_range == crowding.LINK_PER_RANGE
 

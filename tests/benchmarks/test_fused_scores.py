@@ -9,9 +9,9 @@ import pytest
 from benchmarks.placement import fused_scores
 from benchmarks.placement.fused_scores import FUSED, INDEPENDENT, GroupResult, JunctionResult
 
+from egvs.extensions.validation.detection_metrics import BLOCKS
+from egvs.extensions.validation.plan_validation import SensorGroup
 from egvs.sensors.sites import Pose, Site
-from egvs.validation.detection_metrics import BLOCKS
-from egvs.validation.plan_validation import SensorGroup
 
 
 def site(name: str, x_m: float, z_m: float = 3.0) -> Site:

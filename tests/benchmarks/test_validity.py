@@ -38,9 +38,9 @@ from benchmarks.validity.record import (
 
 import egvs
 from egvs.core.errors import InputError, MissingBackendError
+from egvs.extensions.validation.detector_runs import SiteDetectionTask
+from egvs.extensions.validation.detectors.pointpillars import SHIPPED_MODEL, OnnxModel
 from egvs.sensors.sites import Pose, Site
-from egvs.validation.detector_runs import SiteDetectionTask
-from egvs.validation.detectors.pointpillars import SHIPPED_MODEL, OnnxModel
 from tests.conftest import write_mini
 
 pytestmark = pytest.mark.slow  # a study is made for all of them

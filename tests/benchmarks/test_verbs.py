@@ -9,8 +9,8 @@ import pytest
 from benchmarks import verbs
 from benchmarks.verbs import Row, Verb
 
-from egvs.cli import city
 from egvs.cli.app import COMMAND_GROUPS
+from egvs.extensions.city import commands as city
 
 PAGE = Path(__file__).parents[2] / "docs" / "scaling.md"
 

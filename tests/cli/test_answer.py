@@ -6,9 +6,9 @@ import pytest
 
 import egvs
 from egvs.cli import answer
+from egvs.extensions.validation.ranking_check import RankingCheck
 from egvs.report import sections
-from egvs.report.ranking_check import RankingCheck
-from tests.report.test_ranking import by_vehicles
+from tests.results.test_ranking import by_vehicles
 
 MOUNTS = "site,x_m,y_m,z_m,pitch_deg\n" + "".join(
     f"{pole}_{z_m},{x_m},{y_m},{z_m},-10\n"

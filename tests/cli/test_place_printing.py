@@ -10,11 +10,10 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from egvs.artefacts.plan_step import PlanStep
-from egvs.artefacts.planned_sensor import PlannedSensor
 from egvs.cli import console as cli_console
 from egvs.cli import place
 from egvs.placement.fused_score import FusedPlan
+from egvs.results.plans import PlannedSensor, PlanStep
 from egvs.scenario.score_config import PlacementConfig
 
 LAST_LINES = """\

@@ -8,7 +8,7 @@ import pytest
 
 from egvs.cli.console import Column, console, make_table
 from egvs.cli.run_tables import print_effects, ranking_table
-from egvs.report.ranking import RankedSite
+from egvs.results.ranking import RankedSite
 from egvs.studies.effect_study import EffectStatus
 
 

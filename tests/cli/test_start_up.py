@@ -29,7 +29,7 @@ OF_RESULTS = {"numpy", "pyarrow", "jinja2"}
 OF_MARKDOWN = {"attr", "markdown_it", "pygments"}
 """Libraries that no text of this program needs."""
 
-OF_KEYS = {"egvs.scenario.model", "egvs.runs.run", "egvs.runs.stage_keys", "egvs.report.ranking", "rich.console"}
+OF_KEYS = {"egvs.scenario.model", "egvs.runs.run", "egvs.runs.stage_keys", "egvs.results.ranking", "rich.console"}
 """Modules that load a scenario, compute the keys of its stages, or print its results."""
 
 RUN_AND_LIST_MODULES = """

@@ -16,7 +16,7 @@ PACKAGES = [
     "egvs.scenario",
     "egvs.scoring",
     "egvs.sensors",
-    "egvs.validation.detectors",
+    "egvs.extensions.validation.detectors",
 ]
 HEAVY = ["numpy", "numba", "pyarrow", "pydantic", "shapely", "trimesh", "matplotlib", "embreex", "scipy", "onnxruntime"]
 

@@ -138,10 +138,10 @@ def test_a_format_of_tracks_of_another_package_is_read(tmp_path: Path) -> None:
     beside = install(package("A format of recorded tracks"), tmp_path / "installed")
     code = """
 import math, sys, pathlib
-from egvs.tracks import track_readers
+from egvs.extensions.tracks import sources
 path = pathlib.Path(sys.argv[1])
-reader = track_readers.find_reader(path)
-assert reader.NAME == "radar tracks" and "SinD tracks" in track_readers.describe_formats()
+reader = sources.find_reader(path)
+assert reader.NAME == "radar tracks" and "SinD tracks" in sources.describe_formats()
 tracks = reader.read(path)
 assert tracks.names == ("7",) and tracks.classes == ("car",) and tracks.frame.offset_m == (5e5, 5.6e6)
 box = [float(column[0]) for column in (tracks.time_s, tracks.x_m, tracks.y_m, tracks.yaw_rad, tracks.length_m)]
@@ -172,8 +172,8 @@ import numpy as np
 from egvs.core.grid import Roi
 from egvs.sensors.sensor import CATALOGUE
 from egvs.sensors.sites import Pose
-from egvs.validation.detectors import base
-from egvs.validation.sweeps import SiteView, Sweep
+from egvs.extensions.validation.detectors import base
+from egvs.clouds.sweeps import SiteView, Sweep
 assert "middle" in base.detector_names(), base.detector_names()
 sensor = CATALOGUE["VLP-32C"]
 view = SiteView("s", Pose(1.0, 2.0, 3.0), sensor, np.full(sensor.beams, 50.0))

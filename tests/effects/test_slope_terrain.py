@@ -13,10 +13,10 @@ import egvs
 from egvs.artefacts import parquet
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.creation.terrain.draping import drape_network
+from egvs.creation.terrain.ground_heights import ground_points
 from egvs.effects.slope import Slope, read_ground_points
 from egvs.formats import ply
-from egvs.importers.terrain.draping import drape_network
-from egvs.importers.terrain.ground_heights import ground_points
 from egvs.scenario.effects_config import SlopeParameters
 from egvs.scenario.loading import scenario_from_dict
 from egvs.scenario.model import Scenario
@@ -24,8 +24,8 @@ from egvs.stages import statics, traffic
 from egvs.traffic import network
 from egvs.world import terrain
 from egvs.world.mesh import read_ply
+from tests.creation.draped_roads import Function
 from tests.effects.road_helpers import SMALL, road_scenario
-from tests.importers.test_draping import Function
 from tests.stage_runner import inputs_of, run_stage
 
 

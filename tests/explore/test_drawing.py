@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 import egvs
 from egvs.artefacts.tpog import Tpog
 from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.clouds import simulation as cloud_simulation
 from egvs.core.grid import Grid, Roi
 from egvs.explore import drawing, road_meshes
 from egvs.sensors.sensor import rotation_world_sensor
 from egvs.sensors.sites import Pose
 from egvs.traffic.network import Lane, Permission
-from egvs.validation import cloud_simulation
 from egvs.world import static_world
 from egvs.world.carriageway import Carriageway
 from egvs.world.mesh import World

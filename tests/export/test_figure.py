@@ -13,9 +13,9 @@ from PIL import Image
 
 from egvs.artefacts.readers import read_scores
 from egvs.core import plugins
+from egvs.drawing.svg_figures import Bar, FigureStyle, bar_chart
 from egvs.export import figure
 from egvs.export.figure import FIGURES, draw_figure
-from egvs.report.svg_figures import Bar, FigureStyle, bar_chart
 
 Call = Callable[..., tuple[int, str, str]]
 SVG = "{http://www.w3.org/2000/svg}"

@@ -5,104 +5,32 @@ Each attack is a file that a scenario may name. A server and a folder are watche
 
 from __future__ import annotations
 
-import socket
 import sqlite3
-import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-import shapely
 
 from egvs.core import limits, sandbox
 from egvs.core.errors import InputError
-from egvs.formats import rasters, vector_files
+from egvs.formats import vector_files
 from egvs.formats.gdal_layers import read_layer
 from egvs.formats.reader_process import read_blocks
+from tests.formats.foreign_files import Watched, attacks, points, vrt, watch
 
-geopandas = pytest.importorskip("geopandas", reason="geopandas is not installed (egvs[gis])")
-rasterio = pytest.importorskip("rasterio", reason="rasterio is not installed (egvs[gis])")
+pytest.importorskip("geopandas", reason="geopandas is not installed (egvs[gis])")
 
 pytestmark = pytest.mark.system
 
-GEOJSON = (
-    '{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {"site": "stolen", "z_m": 3.0},'
-    ' "geometry": {"type": "Point", "coordinates": [9.0, 50.0]}}]}'
-)
 VECTOR_SUFFIXES = (".kml", ".gpkg", ".shp", ".parquet")
-
-
-@dataclass
-class Watched:
-    """A folder with a secret, and a server, neither of which may be reached."""
-
-    folder: Path
-    server: socket.socket
-
-    @property
-    def url(self) -> str:
-        return f"http://127.0.0.1:{self.server.getsockname()[1]}"
-
-    def check(self) -> None:
-        assert sorted(path.name for path in self.folder.iterdir()) == ["db.gpkg", "secret", "secret.geojson", "z.zip"]
-        with pytest.raises(BlockingIOError):
-            self.server.accept()
 
 
 @pytest.fixture
 def watched(tmp_path: Path) -> Iterator[Watched]:
-    folder = tmp_path / "canary"
-    folder.mkdir()
-    (folder / "secret").write_text("secret")
-    (folder / "secret.geojson").write_text(GEOJSON)
-    with zipfile.ZipFile(folder / "z.zip", "w") as archive:
-        archive.writestr("x.geojson", GEOJSON)
-    points(folder / "db.gpkg")
-    with closing(socket.create_server(("127.0.0.1", 0))) as server:
-        server.setblocking(False)
-        yield Watched(folder, server)
-
-
-def points(path: Path) -> Path:
-    frame = geopandas.GeoDataFrame({"site": ["a"], "z_m": [3.0]}, geometry=[shapely.Point(9, 50)], crs=4326)
-    frame.to_file(path, driver="GPKG")
-    return path
-
-
-def vrt(source: str, sql: str = "") -> bytes:
-    """An OGR VRT: https://gdal.org/en/stable/drivers/vector/vrt.html."""
-    query = f"<SrcSQL>{sql}</SrcSQL>" if sql else ""
-    layer = f'<OGRVRTLayer name="a"><SrcDataSource>{source}</SrcDataSource>{query}</OGRVRTLayer>'
-    return f"<OGRVRTDataSource>{layer}</OGRVRTDataSource>".encode()
-
-
-def attacks(folder: Path, url: str) -> dict[str, bytes]:
-    """Contents of files by what they try."""
-    database = folder / "db.gpkg"
-    plain = vrt(f"{folder}/secret.geojson")
-    raster = (
-        '<VRTDataset rasterXSize="2" rasterYSize="2"><VRTRasterBand dataType="Float64" band="1"><SimpleSource>'
-        f"<SourceFilename>/vsicurl/{url}/x.tif</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"
-    )
-    return {
-        "another file": plain,
-        "byte order mark": b"\xef\xbb\xbf" + plain,
-        "comment first": b"<!-- <kml> -->" + plain,
-        "as KML": b"<kml>" + plain + b"</kml>",
-        "network": vrt(f"/vsicurl/{url}/x.geojson"),
-        "network, streamed": vrt(f"/vsicurl_streaming/{url}/x.geojson"),
-        "archive": vrt(f"/vsizip/{folder}/z.zip/x.geojson"),
-        "VACUUM INTO": vrt(str(database), f"VACUUM INTO '{folder}/new.db'"),
-        "ATTACH": vrt(str(database), f"ATTACH DATABASE '{folder}/new.db' AS x"),
-        "load_extension": vrt(str(database), f"SELECT load_extension('{folder}/secret')"),
-        "web service": f"<OGRWFSDataSource><URL>{url}</URL></OGRWFSDataSource>".encode(),
-        "raster": raster.encode(),
-        "GeoJSON by address": f"{url}/x.geojson".encode(),
-    }
+    with watch(tmp_path) as folder_and_server:
+        yield folder_and_server
 
 
 ATTACKS = tuple(attacks(Path(), ""))
@@ -118,15 +46,6 @@ def test_vector_file_of_another_kind_is_rejected(watched: Watched, tmp_path: Pat
     watched.check()
 
 
-@pytest.mark.parametrize("attack", ["another file", "network", "VACUUM INTO", "raster"])
-def test_raster_of_another_kind_is_rejected(watched: Watched, tmp_path: Path, attack: str) -> None:
-    path = tmp_path / "heights.tif"
-    path.write_bytes(attacks(watched.folder, watched.url)[attack])
-    with pytest.raises(InputError, match=r"heights\.tif: cannot be read as GeoTIFF"):
-        rasters.read_geotiff_header(path)
-    watched.check()
-
-
 def test_only_one_driver_is_left_if_the_signature_is_right(watched: Watched, tmp_path: Path, monkeypatch) -> None:
     """Without the check of signatures, the list of drivers alone rejects a VRT."""
     monkeypatch.setattr("egvs.formats.gdal_layers._check_signature", lambda *_: None)
@@ -136,17 +55,6 @@ def test_only_one_driver_is_left_if_the_signature_is_right(watched: Watched, tmp
         companions = (watched.folder / "secret.geojson",)  # so that the process may read what the VRT names
         with pytest.raises(InputError, match=rf"cannot be read as {kind} \("):
             read_layer(path, kind, "Point", companions)
-
-
-def test_overviews_that_a_tiff_names_are_not_opened(watched: Watched, tmp_path: Path) -> None:
-    path = tmp_path / "heights.tif"
-    transform = rasterio.Affine(10, 0, 500_000, 0, -10, 5_400_000)
-    profile = {"width": 8, "height": 8, "count": 1, "dtype": "float64", "crs": "EPSG:32632", "transform": transform}
-    with rasterio.open(path, "w", driver="GTiff", **profile) as file:
-        file.write(np.ones((1, 8, 8)))
-        file.update_tags(ns="OVERVIEWS", OVERVIEW_FILE=f"/vsicurl/{watched.url}/x.tif")
-    assert rasters.read_geotiff(path, (0, 0, 1e6, 1e7)).heights_m.sum() == 64.0
-    watched.check()
 
 
 # --- GeoPackages -----------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ import pytest
 from egvs.core.errors import InputError
 from egvs.formats import osm
 
-SMALL = Path(__file__).parents[1] / "importers" / "data" / "small.osm"
+SMALL = Path(__file__).parents[1] / "creation" / "data" / "small.osm"
 NODE = '<node id="1" lat="1" lon="2"/>'
 
 

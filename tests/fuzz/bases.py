@@ -21,12 +21,12 @@ import numpy as np
 import pyarrow.csv
 import pyarrow.parquet as pq
 
-from tests.city.conftest import write_city
 from tests.conftest import SCENARIO, SITES, collection, fcd, feature, write_mini
+from tests.extensions.city.conftest import write_city
+from tests.extensions.maps.lanelet2_maps import make_crossing
+from tests.extensions.tracks.boxes import moving_boxes
+from tests.extensions.tracks.writers import TrackRows, write_sind, write_user_table
 from tests.fuzz import read_signals, read_tracks
-from tests.importers.lanelet2_maps import make_crossing
-from tests.tracks.boxes import moving_boxes
-from tests.tracks.writers import TrackRows, write_sind, write_user_table
 
 _KINDS = SCENARIO[SCENARIO.index("[[traffic.kinds]]") : SCENARIO.index("[statics]")]
 _TRAFFIC = SCENARIO[SCENARIO.index("[traffic]") : SCENARIO.index("[statics]")]
@@ -388,9 +388,9 @@ def recording(name: str):
     """Two sweeps of a LiDAR: a recording of ROS with times of points, or a capture of a VLP-16 that turns fast."""
 
     def make(folder: Path) -> None:
-        from tests.sensor_fit.ros_recordings import write_recording
-        from tests.sensor_fit.small_sensor import TRUTH, coarse_sensor, sweep_of
-        from tests.sensor_fit.velodyne_packets import packets, write_pcap
+        from tests.extensions.hardware.fit.small_sensor import TRUTH, coarse_sensor, sweep_of
+        from tests.extensions.hardware.recordings.ros_recordings import write_recording
+        from tests.extensions.hardware.recordings.velodyne_packets import packets, write_pcap
 
         if name.endswith(".pcap"):
             rng = np.random.default_rng(0)
@@ -416,7 +416,7 @@ def sweep(name: str):
 
     def make(folder: Path) -> None:
         from egvs.formats.point_clouds import write_points
-        from tests.sensor_fit.small_sensor import TRUTH, coarse_sensor, sweep_of
+        from tests.extensions.hardware.fit.small_sensor import TRUTH, coarse_sensor, sweep_of
 
         points = sweep_of(TRUTH, coarse_sensor())
         path = folder / name.removesuffix(".gz")
@@ -436,7 +436,7 @@ def sweep(name: str):
 # ---- maps
 
 
-SMALL_OSM = Path(__file__).parents[1] / "importers" / "data" / "small.osm"
+SMALL_OSM = Path(__file__).parents[1] / "creation" / "data" / "small.osm"
 
 
 def extract(name: str):
@@ -545,8 +545,8 @@ def on_terrain(name: str):
     """The crossing, and beside it its terrain, which rises to the north."""
 
     def make(folder: Path) -> None:
-        from tests.formats.test_landxml import landxml
-        from tests.formats.test_rasters import write_tiff
+        from tests.extensions.maps.formats.test_landxml import landxml
+        from tests.extensions.maps.formats.test_rasters import write_tiff
 
         (folder / "roads.net.xml").write_bytes(roads())
         east_m, north_m = (round(value) for value in _utm_m(_LAT, _LON))
@@ -609,7 +609,7 @@ def vectors(name: str):
 
 def with_roads_map(name: str):
     """A map of roads, and beside it a file with a house north-east of the signals, and a lamp or a ground."""
-    from tests.formats import small_city_models as models
+    from tests.extensions.maps.formats import small_city_models as models
 
     lat, lon = 52.0006, 10.0008
     corners = [(lat, lon), (lat, lon + 2e-4), (lat + 1e-4, lon + 2e-4), (lat + 1e-4, lon)]

@@ -267,7 +267,7 @@ def warm_up(folder: Path) -> None:
     import typer.main
 
     from egvs.cli.app import main
-    from egvs.importers import assumed_traffic
+    from egvs.creation import assumed_traffic
     from tests.conftest import write_mini
 
     os.environ["EGVS_STORE"] = ""

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.extensions.tracks import writers, writers_json
 from tests.fuzz import bases, meaning, read_signals, read_tracks
 from tests.fuzz.meaning import Meaning
-from tests.tracks import writers, writers_json
 
 Maker = Callable[[str], Callable[[Path], None]]
 """Returns what writes the base of a kind, by the name of its file."""

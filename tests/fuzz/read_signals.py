@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from egvs.cli import exit
+from egvs.extensions.tracks.new import signal_programs
+from egvs.extensions.tracks.new import signals as recorded_signals
 from egvs.formats.georeference import WorldFrame
-from egvs.importers.recorded import signal_programs
-from egvs.importers.recorded import signals as recorded_signals
 from tests.traffic.crossing import NETWORK
 
 VERB = "read-signals"

@@ -13,8 +13,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from egvs.cli import exit
+from egvs.extensions.tracks import sources as track_readers
+from egvs.extensions.tracks import user_table
 from egvs.scenario.track_columns import TrackColumns
-from egvs.tracks import track_readers, user_table
 
 VERB = "read-tracks"
 RESULT = "boxes.parquet"

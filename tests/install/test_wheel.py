@@ -18,7 +18,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 MAX_WHEEL_MB = 15
-EXTRACT = ROOT / "tests" / "importers" / "data" / "small.osm"
+EXTRACT = ROOT / "tests" / "creation" / "data" / "small.osm"
 FEW = ("--set", "traffic.frames=60", "--set", "traffic.warmup_s=20", "--set", "roi.voxel_m=0.5")
 
 COMMANDS_WITH_EXTRAS = {

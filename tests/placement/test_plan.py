@@ -16,7 +16,7 @@ import egvs
 from egvs.artefacts import parquet
 from egvs.artefacts.readers import read_scores
 from egvs.artefacts.tpog import read_tpog
-from egvs.report import svg_figures
+from egvs.drawing import svg_figures
 from egvs.scoring.egvs import EntropyField
 
 SITES = """site,x_m,y_m,z_m,cost

@@ -15,12 +15,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import egvs
-from egvs.artefacts.planned_sensor import PlannedSensor
 from egvs.core.errors import InputError
 from egvs.placement import plan as placement_plan
 from egvs.placement import refinement
 from egvs.placement.plan import Placement
 from egvs.placement.refinement import Freedom, minimise, sensor_freedoms
+from egvs.results.plans import PlannedSensor
 from egvs.scenario.score_config import RefinementConfig
 from egvs.sensors.sites import Pose, Site
 from egvs.sensors.sites import candidate_sites as sites_of

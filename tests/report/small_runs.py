@@ -13,9 +13,9 @@ import numpy as np
 
 from egvs.artefacts import parquet
 from egvs.core.files import add_checksum
+from egvs.drawing.basemap import Roads
+from egvs.drawing.maps import Backdrop
 from egvs.report import page
-from egvs.report.basemap import Roads
-from egvs.report.maps import Backdrop
 from egvs.scenario.loading import scenario_from_dict
 from egvs.stages import scan, score
 from egvs.world.mesh import World, write_ply

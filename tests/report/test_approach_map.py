@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from egvs.creation import junctions
+from egvs.creation.openstreetmap import street_network
+from egvs.drawing.svg_figures import Box, MapFrame
 from egvs.formats import osm
-from egvs.importers import junctions
-from egvs.importers.openstreetmap import street_network
 from egvs.report import approach_map
 from egvs.report.approach_map import ApproachLabel
-from egvs.report.svg_figures import Box, MapFrame
 from egvs.scenario.traffic_config import CountConfig
-from tests.importers.overpass_server import SMALL
+from tests.creation.overpass_server import SMALL
 
 COUNTS = (
     CountConfig(from_edge="-1002#1", to_edge="1001#1", per_hour=80),

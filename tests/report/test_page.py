@@ -13,12 +13,12 @@ import pytest
 from egvs.artefacts.readers import read_scores
 from egvs.artefacts.tpog import read_tpog
 from egvs.core.files import add_checksum
+from egvs.drawing.run_figures import Figures
+from egvs.extensions.validation.ranking_check import DetectorCheck, RankCorrelation, RankingCheck
 from egvs.report import page
-from egvs.report.figures import Figures
 from egvs.report.page import PageContents
-from egvs.report.ranking import Ranking
-from egvs.report.ranking_check import DetectorCheck, RankCorrelation, RankingCheck
 from egvs.report.sections import DetectorSummary, MeasureColumn, SiteDetection, ValidationSummary
+from egvs.results.ranking import Ranking
 from egvs.scenario.effects_config import EffectsConfig
 from tests.report.small_runs import (
     EMPTY_BACKDROP,

@@ -7,8 +7,6 @@ from dataclasses import replace
 
 import pytest
 
-from egvs.artefacts.plan_step import PlanStep
-from egvs.report.formatting import SCORE_LABELS
 from egvs.report.plan_answer import (
     CurvePlan,
     InstalledSite,
@@ -17,6 +15,8 @@ from egvs.report.plan_answer import (
     is_useful,
     next_count,
 )
+from egvs.results.labels import SCORE_LABELS
+from egvs.results.plans import PlanStep
 
 FOUND = SCORE_LABELS["expected_detections"]
 EGVS = SCORE_LABELS["egvs"]

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from egvs.report.ranking import RankedSite, Ranking, ScoreValue
 from egvs.report.reliability import describe_reliability
+from egvs.results.ranking import RankedSite, Ranking, ScoreValue
 
 
 def ranked(*mounts: tuple[str, float, float, float], rank_by: str = "egvs") -> Ranking:

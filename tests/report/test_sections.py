@@ -15,7 +15,7 @@ from egvs.artefacts import parquet
 from egvs.report.sections import FROM_SENSOR_NOTE, RHO, RHO_RANGE, egvs_setting, ranking_disagreement
 from egvs.studies import study_settings
 from egvs.studies.accuracy import StudyOptions
-from tests.report.test_ranking import by_vehicles, ranking
+from tests.results.test_ranking import by_vehicles, ranking
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ import pytest
 import egvs
 from egvs.core.errors import InputError
 from egvs.formats.georeference import WorldFrame
-from egvs.report.ranking import Ranking
+from egvs.results.ranking import Ranking
 from egvs.stages import traffic
 from tests.conftest import write_mini
 from tests.stage_runner import inputs_of

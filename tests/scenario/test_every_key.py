@@ -15,20 +15,20 @@ import pytest
 from pydantic import BaseModel
 
 import egvs
+from egvs.clouds import simulation as cloud_simulation
 from egvs.placement.plan import solve_placement
 from egvs.runs import stage_keys
 from egvs.scenario.loading import load
 from egvs.scenario.model import Scenario
 from egvs.stages.inputs import Inputs, open_folder
 from egvs.studies import what_if
-from egvs.validation import cloud_simulation
 from tests.conftest import SCENARIO, SITES, collection, feature, write_mini
 
 pytestmark = pytest.mark.system  # the version of SUMO is part of a stage key
 
 EXCEPTIONS = {
     "extends": "cannot be set on the command line; tests/scenario/test_loading.py shows what it takes over",
-    "sensors.*.range_sigma_m": "it is in point clouds only; see tests/validation/test_cloud_simulation.py",
+    "sensors.*.range_sigma_m": "it is in point clouds only; see tests/clouds/test_simulation.py",
 }
 """Keys that this test leaves out, each with the reason."""
 

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from egvs.scoring import autocorrelation, standard_errors
+from egvs.scoring import standard_errors
 from egvs.scoring.standard_errors import (
     GROUP_LENGTH_TIMES,
     MIN_GROUPS,
@@ -21,6 +21,7 @@ from egvs.scoring.standard_errors import (
     summarise_uncertainty,
     uncertainty_warnings,
 )
+from egvs.statistics import blocks as autocorrelation
 
 
 def autoregressive_series(records: int, frames: int, keeps: float, seed: int) -> np.ndarray:

@@ -19,7 +19,7 @@ from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.cli.run_tables import ranking_table
 from egvs.core.errors import InputError
 from egvs.core.grid import Grid
-from egvs.report.ranking import RankedSite
+from egvs.results.ranking import RankedSite
 from egvs.scoring import egvs as scoring_egvs
 from egvs.scoring import standard_errors
 from egvs.scoring.egvs import EntropyField, binary_entropy

@@ -9,8 +9,8 @@ import pytest
 
 from egvs.artefacts.run_record import RunRecord
 from egvs.core.errors import InputError
-from egvs.report.formatting import SCORE_LABELS
-from egvs.report.ranking import Ranking
+from egvs.results.labels import SCORE_LABELS
+from egvs.results.ranking import Ranking
 from egvs.scenario import loading
 from egvs.studies.assumed_heights import (
     HeightRun,

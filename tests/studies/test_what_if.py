@@ -16,7 +16,7 @@ import pytest
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.core.errors import InputError
-from egvs.report.ranking import RankedSite, Ranking
+from egvs.results.ranking import RankedSite, Ranking
 from egvs.runs import run
 from egvs.scenario.loading import load
 from egvs.scoring.standard_errors import standard_error_inflation

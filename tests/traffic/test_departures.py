@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from egvs.artefacts.traffic_frames import read_trajectories
+from egvs.extensions.validation import held_out_traffic
 from egvs.scenario.model import Scenario
 from egvs.stages import traffic
 from egvs.traffic import departures
 from egvs.traffic.departures import DepartureCounts
-from egvs.validation import held_out_traffic
 from tests.stage_runner import run_stage
 from tests.traffic.helpers import netgenerate, scenario
 

@@ -15,8 +15,8 @@ from egvs.traffic import observed
 from egvs.traffic.approaches import ApproachIndex
 from egvs.traffic.movements import MovementNames
 from egvs.traffic.network import read_net_xml
-from tests.importers.creation import create_scenario
-from tests.importers.overpass_server import SMALL
+from tests.creation.new_scenarios import create_scenario
+from tests.creation.overpass_server import SMALL
 
 APPROACHES = ["North Street (north)", "East Street (east)", "North Street (south)", "East Street (west)"]
 

@@ -20,8 +20,8 @@ from egvs.artefacts.tpog import read_tpog
 from egvs.runs import run
 from egvs.scenario.track_columns import TrackColumns
 from egvs.traffic import sumo
-from tests.tracks import writers, writers_json
-from tests.tracks.writers import TrackRows
+from tests.extensions.tracks import writers, writers_json
+from tests.extensions.tracks.writers import TrackRows
 from tests.traffic.helpers import netgenerate
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]

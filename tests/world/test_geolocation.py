@@ -21,7 +21,7 @@ from egvs.traffic import network, sumo_folder
 from egvs.traffic.network import Location
 from egvs.world import geolocation
 
-SMALL = Path(__file__).parents[1] / "importers" / "data" / "small.osm"
+SMALL = Path(__file__).parents[1] / "creation" / "data" / "small.osm"
 REAL = Path(__file__).parents[3] / "shared" / "real" / "bad_hersfeld.osm"
 INGOLSTADT = "tools/game/fkk_in/ingolstadt.net.xml.gz"
 

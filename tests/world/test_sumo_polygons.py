@@ -28,7 +28,7 @@ from egvs.world.map_features import SolidTypes
 from egvs.world.mesh import World
 from egvs.world.sumo_polygons import read_poly_xml
 
-SMALL = Path(__file__).parents[1] / "importers" / "data" / "small.osm"
+SMALL = Path(__file__).parents[1] / "creation" / "data" / "small.osm"
 SQUARE = "0,0 4,0 4,4 0,4"
 HERE = Roi((0.0, 0.0, 0.0), (20.0, 20.0, 5.0))
 NOWHERE = Georeference(None, HERE, "scenario.toml")

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from egvs.cli.console import NARROW, WIDE, Column, console, make_table, print_sentences
 from egvs.core.wording import format_percent
-from egvs.report.formatting import SCORE_LABELS, format_probability
+from egvs.results.labels import SCORE_LABELS, format_probability
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.studies.study_settings import MEASURES, SCENARIO
 

@@ -24,10 +24,11 @@ from egvs.cli.console import Column, console, make_table, print_sentences
 from egvs.cli.options import DEFAULT_POLES
 from egvs.core.errors import Diagnostic, collect_warnings
 from egvs.core.wording import by_number, number_of
-from egvs.report import ranking, reliability, sections
-from egvs.report.formatting import ScoreLabel, join_names
-from egvs.report.ranking import Pole, RankedSite, Ranking
-from egvs.report.sensor_results import range_note
+from egvs.report import reliability, sections
+from egvs.results import ranking
+from egvs.results.labels import ScoreLabel, join_names
+from egvs.results.ranking import Pole, RankedSite, Ranking
+from egvs.results.sensors import range_note
 from egvs.scenario.model import Scenario
 from egvs.traffic.signal_descriptions import format_plan
 

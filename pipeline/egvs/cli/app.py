@@ -15,7 +15,7 @@ from typer.core import TyperCommand
 from typer.models import CommandInfo
 
 from egvs._version import __version__
-from egvs.cli import city, compare, exit, installation, place, sensor, sources, validate, what_if
+from egvs.cli import compare, exit, place, sources, what_if
 from egvs.cli import options as cli_options
 from egvs.cli.options import (
     DEFAULT_POLES,
@@ -33,6 +33,10 @@ from egvs.cli.options import (
 )
 from egvs.cli.quick_help import QuickHelpCommand, QuickHelpGroup
 from egvs.core.errors import InputError
+from egvs.extensions.city import commands as city
+from egvs.extensions.hardware import installation_commands as installation
+from egvs.extensions.hardware import sensor_commands as sensor
+from egvs.extensions.validation import commands as validate
 
 if TYPE_CHECKING:
     from egvs.cli import repeat
@@ -762,9 +766,9 @@ def new(
     Its scenario.toml has a template for peaks and other parts of the day (traffic.periods).
     """
     from egvs.cli import new_summary
-    from egvs.importers import new_scenario
-    from egvs.importers.assumed_traffic import DEFAULT_TRAFFIC
-    from egvs.importers.new_scenario import NewScenarioOptions
+    from egvs.creation import new_scenario
+    from egvs.creation.assumed_traffic import DEFAULT_TRAFFIC
+    from egvs.creation.new_scenario import NewScenarioOptions
 
     paths = [*(maps or []), *(more or [])]
     if not paths and not download:

@@ -1,4 +1,4 @@
-"""What ``egvs new`` and ``egvs city new`` print: what was found in the map, and what was assumed.
+"""What ``egvs new`` prints: what was found in the map, and what was assumed.
 
 One line for each part of the new scenario. Where a part needs more words (what happened to every object of the map),
 the line says which file has them.
@@ -10,23 +10,21 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from egvs.cli.console import WIDE, Column, console, make_table
+from egvs.cli.console import console
 from egvs.core.wording import list_first, number_of
-from egvs.importers import junctions
-from egvs.importers.new_scenario import NewScenario
-from egvs.importers.openstreetmap.solids import OUT_OF_RANGE, ImportCounts
-from egvs.importers.openstreetmap.street_network import ATTRIBUTION
-from egvs.importers.recorded import traffic as recorded_traffic
-from egvs.importers.scenario_files import PITCHES_DEG, SENSOR, STATICS_FILE
+from egvs.creation import junctions
+from egvs.creation.map_parts import OUT_OF_RANGE, ImportCounts
+from egvs.creation.new_scenario import NewScenario
+from egvs.creation.scenario_files import PITCHES_DEG, SENSOR, STATICS_FILE
+from egvs.extensions.tracks.new import files as recorded_traffic
+from egvs.extensions.tracks.recorded_tracks import track_warnings
 from egvs.traffic.estimates import MIN_OBSERVATIONS
-from egvs.traffic.recorded_tracks import track_warnings
 
 if TYPE_CHECKING:
-    from egvs.city.creation import NewCity, NewJunction
-    from egvs.importers.assumed_traffic import AssumedTraffic
-    from egvs.importers.junctions import Streets
-    from egvs.importers.recorded.demand import TrackDemand
-    from egvs.importers.static_objects import MapSummary
+    from egvs.creation.assumed_traffic import AssumedTraffic
+    from egvs.creation.junctions import Streets
+    from egvs.creation.static_objects import MapSummary
+    from egvs.extensions.tracks.new.demand import TrackDemand
 
 _FILE_WIDTH = 160
 
@@ -45,31 +43,12 @@ def print_new_scenario(scenario: NewScenario, map_notes: Sequence[str] = ()) -> 
     out.print(f"next: egvs run {scenario.folder}")
 
 
-def print_new_city(city: NewCity) -> None:
-    """Print what ``egvs city new`` created."""
-    columns: list[Column[NewJunction]] = [
-        Column("junction", lambda row: row.id, "left"),
-        Column("title", lambda row: row.junction.title, "left", wrap=True),
-        Column("lanes in", lambda row: str(row.junction.lanes_in)),
-        Column("poles", lambda row: str(len(row.poles))),
-        Column("sites", lambda row: str(row.n_candidates)),
-    ]
-    out = console(WIDE)
-    out.print(make_table(columns, city.junctions))
-    for name, text in _city_lines(city):
-        out.print(f"{name:<9} {text}")
-    for note in city.notes:
-        out.print(f"note: {note}")
-    out.print(f"Map data {ATTRIBUTION}")
-    out.print(f"next: egvs city run {city.folder}")
-
-
 def _scenario_lines(scenario: NewScenario) -> Iterator[tuple[str, str]]:
     junction, roi = scenario.junction, scenario.roi
     arms = f"{number_of(junction.arms, 'arm')}, {number_of(junction.lanes_in, 'incoming lane')}"
     yield "junction", f"{junction.title}: {arms}; {_position(scenario)}"
     yield "region", f"{roi.size_m[0]:g} m x {roi.size_m[1]:g} m x {scenario.height_m:g} m around the junction"
-    yield "streets", _describe_streets(scenario.streets)
+    yield "streets", describe_streets(scenario.streets)
     traffic = _describe_traffic(scenario.traffic)
     if scenario.recorded is not None:
         traffic = recorded_traffic.describe(scenario.recorded)
@@ -80,8 +59,8 @@ def _scenario_lines(scenario: NewScenario) -> Iterator[tuple[str, str]]:
     yield "traffic", traffic
     mounts = f"{len(junctions.HEIGHTS_M)} heights x {len(PITCHES_DEG)} tilts"
     yield "sites", f"{scenario.n_candidates:,} candidates: {scenario.poles} poles x {mounts}, sensor {SENSOR}"
-    yield "solids", _describe_solids(scenario.statics, scenario.n_solids)
-    if left_out := _describe_dropped(scenario.statics):
+    yield "solids", describe_solids(scenario.statics, scenario.n_solids)
+    if left_out := describe_dropped(scenario.statics):
         yield "", f"left out: {left_out} (all counts: {STATICS_FILE})"
     for summary in scenario.maps if len(scenario.maps) > 1 or scenario.maps_have_notes else ():
         yield "map", _describe_map(summary)
@@ -92,27 +71,10 @@ def _scenario_lines(scenario: NewScenario) -> Iterator[tuple[str, str]]:
 def _describe_map(summary: MapSummary) -> str:
     """Return the files of a map, its format, and its objects with their heights."""
     files = list_first([path.name for path in summary.paths], 1)
-    texts = [f"{files} ({summary.reader}): {_describe_solids(summary.counts)}"]
+    texts = [f"{files} ({summary.reader}): {describe_solids(summary.counts)}"]
     if summary.height_range_m is not None:
         texts.append("tops at z = {:.1f} to {:.1f} m".format(*summary.height_range_m))
     return ", ".join(texts)
-
-
-def _city_lines(city: NewCity) -> Iterator[tuple[str, str]]:
-    from egvs.city.creation import IMPORT_FILE
-
-    poles = sum(len(row.poles) for row in city.junctions)
-    sites = sum(row.n_candidates for row in city.junctions)
-    yield "junctions", f"{len(city.junctions):,} with {poles:,} poles and {sites:,} candidate sites"
-    if city.left_out:
-        reasons = [f"{len(ids):,} ({reason})" for reason, ids in city.left_out.items()]
-        yield "", f"left out: {', '.join(reasons)}"
-    yield "streets", _describe_streets(city.streets)
-    used = f"{city.traffic.vehicles_per_h:,} vehicles start per hour (assumed)"
-    yield "traffic", f"the network {city.traffic.summary}: {used}"
-    yield "solids", _describe_solids(city.statics)
-    if left_out := _describe_dropped(city.statics):
-        yield "", f"left out: {left_out} (all counts: {IMPORT_FILE})"
 
 
 def _position(scenario: NewScenario) -> str:
@@ -124,7 +86,7 @@ def _position(scenario: NewScenario) -> str:
     return f"{position}, {scenario.from_at_m:,.0f} m from --at"
 
 
-def _describe_streets(streets: Streets) -> str:
+def describe_streets(streets: Streets) -> str:
     signalised = sum(junction.signalised for junction in streets.junctions)
     length = f"{streets.lane_length_m / 1000:,.1f} km of lanes"
     return (
@@ -139,7 +101,7 @@ def _describe_traffic(traffic: AssumedTraffic | None) -> str:
     return f"the junction {traffic.summary}: {traffic.per_h:,} vehicles an hour in {movements} (assumed)"
 
 
-def _describe_solids(counts: ImportCounts, n_solids: int | None = None) -> str:
+def describe_solids(counts: ImportCounts, n_solids: int | None = None) -> str:
     """Return the objects by kind, and the number of solids that ``egvs check`` counts, if it is known."""
     objects = Counter({kind: number for kind, number in counts.objects.items() if kind != "tree_crown"})
     texts = [number_of(number, kind.removesuffix("_trunk").replace("_", " ")) for kind, number in objects.most_common()]
@@ -151,7 +113,7 @@ def _describe_solids(counts: ImportCounts, n_solids: int | None = None) -> str:
     return f"{total}: {', '.join(texts)}"
 
 
-def _describe_dropped(counts: ImportCounts) -> str:
+def describe_dropped(counts: ImportCounts) -> str:
     """Return what is left out and why, except objects out of range, which a note names."""
     texts = []
     for reason, kinds in sorted(counts.dropped.items()):

@@ -18,10 +18,10 @@ from egvs.core.wording import by_number, format_percent, number_of
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from egvs.artefacts.planned_sensor import PlannedSensor
     from egvs.placement.fused_score import FusedPlan
     from egvs.placement.plan import Placement, RefinementSummary
-    from egvs.report.formatting import ScoreLabel
+    from egvs.results.labels import ScoreLabel
+    from egvs.results.plans import PlannedSensor
     from egvs.scenario.score_config import PlacementConfig
 
 _NARROW_HEAD_WIDTH = 10
@@ -202,7 +202,7 @@ def describe_fused(fused: FusedPlan, by: ScoreLabel) -> str:
 
 
 def _label(placed: Placement) -> ScoreLabel:
-    from egvs.report.formatting import SCORE_LABELS
+    from egvs.results.labels import SCORE_LABELS
 
     return SCORE_LABELS[placed.score]
 

@@ -9,12 +9,12 @@ from pathlib import Path
 
 from rich.table import Table
 
-from egvs.city import results
 from egvs.cli.console import Column, console, make_table
 from egvs.cli.run_tables import format_age, format_size
 from egvs.cli.sources import format_setting
 from egvs.core.wording import list_first
-from egvs.report.formatting import SCORE_LABELS
+from egvs.extensions.city import results
+from egvs.results.labels import SCORE_LABELS
 from egvs.runs.run_list import ListedRun
 
 FILE_WIDTH = 100

@@ -31,8 +31,8 @@ from egvs.cli.console import (
 from egvs.core.errors import collect_warnings
 from egvs.core.wording import format_percent
 from egvs.report import sections
-from egvs.report.formatting import SCORE_LABELS, ScoreLabel, format_probability
-from egvs.report.ranking import Pole, RankedSite, companion_score, group_by_pole
+from egvs.results.labels import SCORE_LABELS, ScoreLabel, format_probability
+from egvs.results.ranking import Pole, RankedSite, companion_score, group_by_pole
 from egvs.scenario.effects_config import RangeLimitParameters
 from egvs.scenario.score_config import ALL_DETECTORS
 

@@ -14,7 +14,7 @@ from typing import Any
 from egvs.artefacts.run_record import StageRecord
 from egvs.core.errors import WARNINGS_KEY
 from egvs.core.wording import format_percent, number_of
-from egvs.report.formatting import SCORE_LABELS
+from egvs.results.labels import SCORE_LABELS
 
 COUNTS, ASSUMED_FLOWS = "the counts", "the assumed flows"
 FLOWS = "the flows of the scenario"

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from egvs.core.wording import by_number, format_percent
-from egvs.report.formatting import join_names
+from egvs.results.labels import join_names
 
 if TYPE_CHECKING:
     from egvs.studies.effect_study import EffectChange

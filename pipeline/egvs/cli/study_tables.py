@@ -18,9 +18,9 @@ from rich.table import Table
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.cli.console import NARROW, Column, console, format_or_dash, make_table, percent_or_dash, print_sentences
 from egvs.core.wording import format_percent, list_first
-from egvs.report.formatting import SCORE_LABELS, join_names
-from egvs.report.ranking import RankedSite, share_of_limit
-from egvs.report.sensor_results import (
+from egvs.results.labels import SCORE_LABELS, join_names
+from egvs.results.ranking import RankedSite, share_of_limit
+from egvs.results.sensors import (
     ScoreDifference,
     SensorComparison,
     SensorResult,

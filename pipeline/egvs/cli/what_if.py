@@ -60,8 +60,8 @@ def _run_label(what_if_run: WhatIfRun) -> str:
 def print_what_if(result: WhatIfResult) -> None:
     """Print the scores of the best sites, the answer of each table, and notes."""
     from egvs.cli.console import Column, console, make_table, percent_or_dash, print_sentences
-    from egvs.report.formatting import format_probability
-    from egvs.report.sensor_results import difference_unit, format_difference
+    from egvs.results.labels import format_probability
+    from egvs.results.sensors import difference_unit, format_difference
     from egvs.studies.what_if import impossible_note
 
     label, best = result.label, result.best

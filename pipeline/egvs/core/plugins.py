@@ -28,19 +28,19 @@ _REQUIREMENTS = {
     ),
     "egvs.detectors": (
         ("NAME", "SOURCE", "settings", "at_site"),
-        "a class with NAME, SOURCE, settings and at_site, see egvs.validation.detectors.base",
+        "a class with NAME, SOURCE, settings and at_site, see egvs.extensions.validation.detectors.base",
     ),
     "egvs.scores": (
         ("name", "formula", "source", "sign", "function"),
-        "a SurrogateScore, see egvs.validation.surrogates",
+        "a SurrogateScore, see egvs.extensions.validation.surrogates",
     ),
     "egvs.maps": (
         ("NAME", "can_open"),
-        "a module with NAME, can_open and read_roads, read_solids or read_terrain, see egvs.importers.map_parts",
+        "a module with NAME, can_open and read_roads, read_solids or read_terrain, see egvs.creation.map_parts",
     ),
     "egvs.tracks": (
         ("NAME", "can_open", "companions", "read"),
-        "a module with NAME, can_open, companions and read, see egvs.tracks.model",
+        "a module with NAME, can_open, companions and read, see egvs.extensions.tracks.model",
     ),
     "egvs.point_clouds": (("read",), "a module or an object with a function read"),
 }

@@ -18,7 +18,7 @@ from egvs.core.wording import format_percent
 from egvs.explore.session import MovingPlan, PoseScore, Session
 from egvs.explore.settings import Settings
 from egvs.explore.view_state import LAYERS, View
-from egvs.report.formatting import SCORE_LABELS
+from egvs.results.labels import SCORE_LABELS
 from egvs.scenario.score_config import OtherScore
 from egvs.sensors.sensor import CATALOGUE
 from egvs.sensors.sites import Pose, Site

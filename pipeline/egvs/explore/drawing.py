@@ -24,16 +24,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from egvs.artefacts.tpog import Tpog
 from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.clouds.simulation import MeshPart
 from egvs.core.grid import Grid, Roi, Vec3
 from egvs.core.wording import format_percent, number_of
+from egvs.drawing import colours
 from egvs.explore.road_meshes import LANE_HEIGHT_M, Mesh, junction_mesh, lane_mesh, marking_mesh
 from egvs.explore.session import MovingPlan, Playback, PoseScore, Session
 from egvs.explore.view_state import Camera, View
-from egvs.report import colours
 from egvs.scoring.points_map import CLASS_LABELS, OVERLAP_POINTS, PointsMap, overlap_map
 from egvs.scoring.targets import SEEN_WELL_POINTS
 from egvs.sensors.sites import Pose, Site
-from egvs.validation.cloud_simulation import MeshPart
 from egvs.world.mesh import World
 
 Points = NDArray[np.float32]

@@ -31,7 +31,7 @@ from egvs.explore.server import start_server, stop_server
 from egvs.explore.session import MovingPlan, Playback, PoseScore, Session
 from egvs.explore.settings import Settings
 from egvs.explore.view_state import LAYERS, View
-from egvs.report.map_credits import read_map_credits
+from egvs.results.map_credits import read_map_credits
 from egvs.scoring.targets import SEEN_WELL_POINTS
 
 MAX_RANKED = 10

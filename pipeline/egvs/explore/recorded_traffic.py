@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from viser.infra import StateSerializer
 
 from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.clouds.simulation import MeshPart
 from egvs.core.grid import Roi, Vec3
 from egvs.core.progress import ProgressCallback
 from egvs.explore import drawing
 from egvs.explore.road_meshes import Mesh
 from egvs.explore.session import Playback
 from egvs.sensors.sites import Pose, Site
-from egvs.validation.cloud_simulation import MeshPart
 
 CLIP_S = 60.0
 """Longest recording."""

@@ -4,7 +4,7 @@
 scan from there; score it with the TPOG, and with recorded vehicles if the scenario requests such scores; rank it among
 the candidates, as if the sensor replaced its own candidate. :class:`MovingPlan` is a plan of ``egvs place`` whose
 sensors are moved, with the joint score of :mod:`egvs.placement.refinement`. :class:`Playback` shows recorded traffic
-with simulated returns, as in the point clouds of :mod:`egvs.validation.cloud_simulation`.
+with simulated returns, as in the point clouds of :mod:`egvs.clouds.simulation`.
 
 Nothing here depends on a page or a browser. World frame, metres.
 """
@@ -30,11 +30,13 @@ from egvs.artefacts.readers import (
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import Tpog, read_periods, read_tpog
 from egvs.artefacts.traffic_frames import TrafficFrame
+from egvs.clouds import simulation as cloud_simulation
+from egvs.clouds.simulation import CloudSimulator, VehicleMeshes, sweep_rng
 from egvs.core.errors import Diagnostic, InputError, choose_one
 from egvs.core.grid import Grid
 from egvs.placement import problem_builder
 from egvs.placement.refinement import PlanPoses
-from egvs.report.formatting import SCORE_LABELS
+from egvs.results.labels import SCORE_LABELS
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.scoring import blindspots
@@ -56,8 +58,6 @@ from egvs.stages.points_maps import target_positions
 from egvs.stages.site_scoring import TargetScorer
 from egvs.traffic import sumo_folder
 from egvs.traffic.network import Network
-from egvs.validation import cloud_simulation
-from egvs.validation.cloud_simulation import CloudSimulator, VehicleMeshes, sweep_rng
 from egvs.world.carriageway import Carriageway
 
 Floats = NDArray[np.float64]

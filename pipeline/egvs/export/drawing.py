@@ -32,9 +32,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from egvs.drawing.basemap import network_file, roads_within, solid_group
 from egvs.export.finished_run import ExportCrs, FinishedRun
 from egvs.export.layers import FOOTPRINTS, PLAN, REGION, SITES, Layer
-from egvs.report.basemap import network_file, roads_within, solid_group
 from egvs.sensors.sensor import Sensor, scenario_sensor
 from egvs.sensors.site_feasibility import ground_height_m
 from egvs.sensors.sites import Pose, grid_bearing_deg
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from ezdxf.document import Drawing
     from ezdxf.layouts.layout import Modelspace
 
-    from egvs.report.svg_figures import Box
+    from egvs.drawing.svg_figures import Box
 
 Points = NDArray[np.float64]
 

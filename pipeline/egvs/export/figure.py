@@ -1,7 +1,8 @@
 """``egvs figure``: a figure of a run for a paper or a slide, as SVG, PDF with its fonts, or PNG.
 
 The drawing functions of the report draw the figure for the width on paper, with letters of
-:data:`egvs.report.svg_figures.FONT_SIZE_PT`, in the colours of light pages, and with all colours written on the shapes.
+:data:`egvs.drawing.svg_figures.FONT_SIZE_PT`, in the colours of light pages, and with all colours written on the
+shapes.
 """
 
 from __future__ import annotations
@@ -19,13 +20,14 @@ from egvs.core import files, plugins
 from egvs.core.errors import InputError, MissingBackendError, unknown_site
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.wording import format_percent
+from egvs.drawing import maps
+from egvs.drawing import run_figures as figures
+from egvs.drawing.maps import Backdrop, SiteViewFigure
+from egvs.drawing.run_figures import column_entropy
+from egvs.drawing.svg_figures import Bar, Box, FigureStyle, bar_chart, extent
 from egvs.export.export import EXPORT_FOLDER, safe_file_name
 from egvs.export.finished_run import FinishedRun
-from egvs.report import figures, maps
-from egvs.report.figures import column_entropy
-from egvs.report.maps import Backdrop, SiteViewFigure
-from egvs.report.ranking import RankedSite, Ranking
-from egvs.report.svg_figures import Bar, Box, FigureStyle, bar_chart, extent
+from egvs.results.ranking import RankedSite, Ranking
 from egvs.stages.site_scans import empty_scans
 
 FIGURES = ("ranking", "map", "tpog", "seen", "missed")

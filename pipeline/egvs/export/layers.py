@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
 from egvs.artefacts.run_folder import RunFolder
-from egvs.city import results
 from egvs.core.errors import InputError
+from egvs.drawing import colours
+from egvs.drawing.basemap import network_file, union_of_triangles
 from egvs.export.finished_run import FinishedRun
-from egvs.report import colours
-from egvs.report.basemap import network_file, union_of_triangles
+from egvs.extensions.city import results
 from egvs.sensors.sensor import scenario_sensor
 from egvs.traffic import network
 

@@ -26,10 +26,10 @@ from egvs.artefacts import readers
 from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.tpog import read_tpog
 from egvs.core.grid import Grid
+from egvs.drawing import colours
+from egvs.drawing.run_figures import column_entropy
 from egvs.export.finished_run import ExportCrs, FinishedRun
 from egvs.export.layers import raster_qml
-from egvs.report import colours
-from egvs.report.figures import column_entropy
 from egvs.scoring.points_map import OVERLAP_POINTS, overlap_map
 from egvs.sensors.sites import Pose, Site
 from egvs.stages.plan_scans import plan_beams

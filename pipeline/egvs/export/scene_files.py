@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from egvs.artefacts import parquet
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
+from egvs.drawing.basemap import solid_group
 from egvs.export.extrinsics import (
     R_GLTF_WORLD,
     PosedSensor,
@@ -34,7 +35,6 @@ from egvs.export.extrinsics import (
     transform_world_sensor,
 )
 from egvs.export.finished_run import ExportCrs, FinishedRun
-from egvs.report.basemap import solid_group
 from egvs.sensors.sites import Pose
 
 if TYPE_CHECKING:

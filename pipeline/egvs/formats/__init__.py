@@ -1,1 +1,1 @@
-"""Files of other programs: coordinates, OpenStreetMap, meshes, point clouds, KITTI."""
+"""Files of other programs: coordinates, OpenStreetMap, meshes, point clouds."""

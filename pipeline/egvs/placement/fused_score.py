@@ -25,10 +25,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from egvs.artefacts.plan_step import PlanStep
 from egvs.core.grid import FloatArray
 from egvs.placement.plan_error import PlanErrors
 from egvs.placement.problem import Plan, Problem
+from egvs.results.plans import PlanStep
 from egvs.scoring.fused_targets import fuse_targets
 from egvs.scoring.target_scores import expected_by_detector
 from egvs.scoring.targets import VisibleTargets, weighted_mean

@@ -20,8 +20,6 @@ from typing import Any
 import numpy as np
 
 from egvs.artefacts import checksums, parquet
-from egvs.artefacts.plan_step import ERROR_COLUMNS, PlanStep
-from egvs.artefacts.planned_sensor import PlannedSensor, plan_columns
 from egvs.artefacts.readers import ZoneVisibility, read_plan_zones
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files, plugins
@@ -36,6 +34,7 @@ from egvs.placement.problem import Problem
 from egvs.placement.problem_builder import PlacementProblem, TargetView
 from egvs.placement.refinement import PlanPoses
 from egvs.placement.solver import CurvePoint, Solution
+from egvs.results.plans import ERROR_COLUMNS, PlannedSensor, PlanStep, plan_columns
 from egvs.runs import run, stage_registry
 from egvs.runs.run import StageListener, ignore_stage, lock_run_folder
 from egvs.scenario.model import Scenario

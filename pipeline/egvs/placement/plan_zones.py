@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from egvs.artefacts import parquet
-from egvs.artefacts.planned_sensor import PlannedSensor
 from egvs.core.grid import FloatArray
+from egvs.results.plans import PlannedSensor
 from egvs.scoring.blindspots import SpotVisibility
 from egvs.scoring.targets import detection_probability, visible_targets
 from egvs.scoring.zone_results import PLAN_ZONES, ZoneUsers

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from egvs.core import polylines
-from egvs.report import maps
-from egvs.report.basemap import roads_within
-from egvs.report.svg_figures import Box, MapFrame, text_width
+from egvs.drawing import maps
+from egvs.drawing.basemap import roads_within
+from egvs.drawing.svg_figures import Box, MapFrame, text_width
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import CountConfig
 from egvs.traffic.approach_queues import approach_paths

@@ -18,9 +18,9 @@ from egvs.artefacts.run_record import StageRecord
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.wording import format_percent
-from egvs.report.formatting import SCORE_LABELS, format_probability
-from egvs.report.ranking import RankedSite
-from egvs.report.sensor_results import ScoreDifference, difference_unit, format_difference
+from egvs.results.labels import SCORE_LABELS, format_probability
+from egvs.results.ranking import RankedSite
+from egvs.results.sensors import ScoreDifference, difference_unit, format_difference
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.sensors.sites import Pose

@@ -1,6 +1,6 @@
 """The report stage: writes ``report.html``, one file that presents a run and loads nothing from elsewhere.
 
-Steps: read the artefacts, draw the figures (:mod:`egvs.report.figures`), fill the template.
+Steps: read the artefacts, draw the figures (:mod:`egvs.drawing.run_figures`), fill the template.
 
 The page depends on the artefacts and on the records of the earlier stages in ``run.json``, including their costs, but
 on no time, path or machine: the same costs give the same bytes. Stages that were run one by one from a notebook leave
@@ -24,24 +24,15 @@ from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files
 from egvs.core.errors import WARNINGS_KEY, collect_warnings
 from egvs.core.wording import format_percent
-from egvs.report import figures, formatting, maps
+from egvs.drawing import maps
+from egvs.drawing import run_figures as figures
+from egvs.drawing.basemap import network_file
+from egvs.drawing.colours import STYLE_SHEET
+from egvs.drawing.run_figures import Figures
 from egvs.report.approach_fits import ApproachFit, compare_approaches
 from egvs.report.approach_map import busiest_counts, draw_approach_map
-from egvs.report.basemap import network_file
-from egvs.report.colours import STYLE_SHEET
 from egvs.report.command_sections import CommandSections, current_entries
-from egvs.report.figures import Figures
-from egvs.report.map_credits import read_map_credits
 from egvs.report.points_section import MAPPED_POLES, PointsSection
-from egvs.report.ranking import (
-    RankedSite,
-    Ranking,
-    entropy_seen_note,
-    headline,
-    lead,
-    recorded_frames_hint,
-    share_of_limit,
-)
 from egvs.report.reliability import describe_reliability
 from egvs.report.sections import (
     NAMED_POLES,
@@ -55,9 +46,20 @@ from egvs.report.sections import (
     egvs_setting,
     ranking_disagreement,
 )
-from egvs.report.sensor_results import SensorComparison, costs_option, range_note
 from egvs.report.signal_diagram import signal_diagrams
 from egvs.report.zone_section import ZoneSection
+from egvs.results import labels as formatting
+from egvs.results.map_credits import read_map_credits
+from egvs.results.ranking import (
+    RankedSite,
+    Ranking,
+    entropy_seen_note,
+    headline,
+    lead,
+    recorded_frames_hint,
+    share_of_limit,
+)
+from egvs.results.sensors import SensorComparison, costs_option, range_note
 from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.scene_inputs import scan_dependencies
@@ -304,7 +306,7 @@ def _template_environment() -> Environment:
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
-    from egvs.report.template_cache import open_template_cache
+    from egvs.drawing.template_cache import open_template_cache
 
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),

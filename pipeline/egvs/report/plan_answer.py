@@ -12,10 +12,10 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-from egvs.artefacts.plan_step import PlanStep
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.core.wording import format_percent
-from egvs.report.formatting import ScoreLabel, join_names
+from egvs.results.labels import ScoreLabel, join_names
+from egvs.results.plans import PlanStep
 
 MIN_USEFUL_SHARE = 0.01
 """A useful sensor adds at least 1 percentage point; to scores that are no shares, at least 1 % of the plan's score."""

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 from egvs.core.grid import Grid
 from egvs.core.wording import format_percent
-from egvs.report import maps
-from egvs.report.maps import Backdrop
-from egvs.report.ranking import RankedSite
-from egvs.report.svg_figures import Box, ColourClasses, extent
+from egvs.drawing import maps
+from egvs.drawing.maps import Backdrop
+from egvs.drawing.svg_figures import Box, ColourClasses, extent
+from egvs.results.ranking import RankedSite
 from egvs.scoring.points_map import CLASS_LABELS, OVERLAP_POINTS, PointsMap, overlap_map
 from egvs.sensors.sites import Site
 from egvs.stages.base import StageContext

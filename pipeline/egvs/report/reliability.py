@@ -6,9 +6,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from egvs.core.wording import format_percent
-from egvs.report.formatting import join_names
-from egvs.report.ranking import RankedSite, Ranking
 from egvs.report.sections import FROM_SENSOR_NOTE
+from egvs.results.labels import join_names
+from egvs.results.ranking import RankedSite, Ranking
 from egvs.scenario.score_config import DEFAULT_SCORE, FROM_SENSOR
 
 MIN_TILT_DEG = 5.0

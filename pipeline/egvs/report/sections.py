@@ -18,19 +18,20 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from egvs.artefacts.plan_step import PlanStep, plan_steps
 from egvs.artefacts.readers import read_accuracy, read_placement, read_validation
 from egvs.artefacts.run_folder import ACCURACY_FILES, PLACEMENT_FILES, VALIDATION_FILES
 from egvs.artefacts.run_record import StageRecord
 from egvs.artefacts.tpog import Tpog
 from egvs.core.errors import Diagnostic, collect_warnings
 from egvs.core.wording import format_percent
-from egvs.report import maps, plan_answer, svg_figures
-from egvs.report.formatting import SCORE_LABELS, ScoreLabel, join_names
-from egvs.report.maps import Backdrop, PlannedPole
-from egvs.report.ranking import Pole, RankedSite
-from egvs.report.ranking_check import RankingCheck
-from egvs.report.svg_figures import CurveStep, MapSite
+from egvs.drawing import maps, svg_figures
+from egvs.drawing.maps import Backdrop, PlannedPole
+from egvs.drawing.svg_figures import CurveStep
+from egvs.extensions.validation.ranking_check import RankingCheck
+from egvs.report import plan_answer
+from egvs.results.labels import SCORE_LABELS, ScoreLabel, join_names
+from egvs.results.plans import PlanStep, plan_steps
+from egvs.results.ranking import MapSite, Pole, RankedSite
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE, FROM_SENSOR
 from egvs.scenario.signal_config import ASSUMED_PLANS

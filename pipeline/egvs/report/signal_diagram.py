@@ -8,7 +8,7 @@ from html import escape
 from typing import Any
 
 from egvs.core.wording import shorten_id
-from egvs.report.svg_figures import PAGE_STYLE, FigureStyle, round_values, svg_start_tag, text_width
+from egvs.drawing.svg_figures import PAGE_STYLE, FigureStyle, round_values, svg_start_tag, text_width
 from egvs.traffic.signal_descriptions import plan_title
 
 _TOP, _BOTTOM, _ROW, _RIGHT = 8.0, 44.0, 22.0, 16.0

@@ -9,10 +9,10 @@ from pathlib import Path
 from egvs.artefacts.readers import ALL_USERS, ZoneVisibility, read_plan_zones, read_zone_areas, read_zones
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core.grid import Grid
-from egvs.report import maps
-from egvs.report.maps import Backdrop, MapZone
-from egvs.report.ranking import RankedSite
-from egvs.report.svg_figures import extent
+from egvs.drawing import maps
+from egvs.drawing.maps import Backdrop, MapZone
+from egvs.drawing.svg_figures import extent
+from egvs.results.ranking import RankedSite
 from egvs.stages.base import StageContext
 
 

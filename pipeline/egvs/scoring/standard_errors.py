@@ -15,7 +15,7 @@ Why not the bootstrap, resampling blocks with replacement? Measured over indepen
 with 10 blocks its standard errors are too small, its 90 % intervals cover 81 %, it takes hundreds of scores per site
 instead of ten, and it needs random numbers. The jackknife's intervals cover 89 %.
 
-Groups must be longer than the traffic's autocorrelation time (:mod:`egvs.scoring.autocorrelation`). Up to 19
+Groups must be longer than the traffic's autocorrelation time (:mod:`egvs.statistics.blocks`). Up to 19
 blocks are taken as they are, more are joined to ten groups - with fifty the same intervals cover 83 % - and neighbours
 are joined further where groups would be shorter than :data:`GROUP_LENGTH_TIMES` of it, down to
 :data:`MIN_GROUPS` groups: the t quantile accounts for the uncertainty of few groups. The correlation that remains
@@ -68,8 +68,8 @@ from egvs.core.errors import Diagnostic
 from egvs.core.grid import FloatArray, Grid, IntArray
 from egvs.core.special import stdtr, stdtrit
 from egvs.kernels.occupancy import accumulate
-from egvs.scoring.autocorrelation import WINDOW_TIMES
 from egvs.scoring.egvs import EntropyField, Hits, sum_hits_by_class
+from egvs.statistics.blocks import WINDOW_TIMES
 
 TARGET_GROUPS = 10
 """Number of groups that blocks are joined to when there are at least twice as many."""

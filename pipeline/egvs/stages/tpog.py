@@ -25,10 +25,10 @@ from egvs.core.grid import Grid, IntArray
 from egvs.core.progress import ProgressCallback
 from egvs.scenario.model import Scenario
 from egvs.scoring import occupancy
-from egvs.scoring.autocorrelation import autocorrelation_time
 from egvs.scoring.occupancy import BlockCounts, count_blocks, static_voxels
 from egvs.scoring.unknown_occupancy import UnknownOccupancy
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
+from egvs.statistics.blocks import autocorrelation_time
 from egvs.world.mesh import World
 
 

@@ -98,7 +98,7 @@ def _reader_modules(scenario: Scenario) -> list[str]:
     """The modules that read the recorded tracks of one period; they are loaded by name."""
     if scenario.traffic.tracks is None and scenario.traffic.pedestrian_tracks is None:
         return []
-    from egvs.traffic import recorded_tracks
+    from egvs.extensions.tracks import recorded_tracks
 
     return recorded_tracks.track_source(scenario).reader_modules()
 
@@ -107,7 +107,7 @@ def _source_files(scenario: Scenario) -> list[Path]:
     """The files that the traffic of one period comes from."""
     traffic = scenario.traffic
     if traffic.tracks is not None:
-        from egvs.traffic import recorded_tracks
+        from egvs.extensions.tracks import recorded_tracks
 
         sources = recorded_tracks.track_files(scenario)
         if traffic.coverage is not None:
@@ -122,7 +122,7 @@ def _source_files(scenario: Scenario) -> list[Path]:
     if traffic.sumocfg is not None:
         sources.append(scenario.find(traffic.sumocfg, "traffic.sumocfg"))
     if traffic.pedestrian_tracks is not None:
-        from egvs.traffic import recorded_tracks
+        from egvs.extensions.tracks import recorded_tracks
 
         sources += recorded_tracks.track_files(scenario)
     return [*sources, *sumo_folder.demand_files(scenario).all(), *signal_plans.signal_files(scenario)]

@@ -168,7 +168,7 @@ def check_finished_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
     scenario = inputs.scenario
     errors = ErrorCollector()
     if scenario.traffic.tracks is not None:
-        from egvs.traffic import recorded_tracks
+        from egvs.extensions.tracks import recorded_tracks
 
         where = f"{sumo_folder.traffic_location(scenario)}.tracks"
         world = geolocation.scenario_georeference(scenario)
@@ -176,7 +176,7 @@ def check_finished_files(inputs: CheckInputs) -> Iterator[Diagnostic]:
         if tracks is not None:
             yield from recorded_tracks.track_warnings(tracks, where)
     if scenario.traffic.pedestrian_tracks is not None:
-        from egvs.traffic import recorded_tracks
+        from egvs.extensions.tracks import recorded_tracks
 
         where = f"{sumo_folder.traffic_location(scenario)}.pedestrian_tracks"
         world = geolocation.scenario_georeference(scenario)

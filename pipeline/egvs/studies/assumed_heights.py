@@ -17,8 +17,8 @@ from typing import Any
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core.platform import relative_path
 from egvs.core.wording import format_percent
-from egvs.report.formatting import ScoreLabel, join_names
-from egvs.report.ranking import RankedSite, Ranking
+from egvs.results.labels import ScoreLabel, join_names
+from egvs.results.ranking import RankedSite, Ranking
 from egvs.runs import run_names
 from egvs.runs.run_sources import SettingsSource
 from egvs.scenario.model import Scenario

@@ -30,7 +30,7 @@ from egvs.core.wording import format_percent
 from egvs.effects import registry
 from egvs.effects.articulated import Articulated
 from egvs.effects.base import Detect, Echo, Effect, Traffic
-from egvs.report.formatting import SCORE_LABELS, ScoreLabel
+from egvs.results.labels import SCORE_LABELS, ScoreLabel
 from egvs.runs import run, stage_keys, stage_registry
 from egvs.runs.stage_registry import RANKING_STAGES
 from egvs.scenario.effects_config import GROUP, EffectParameters

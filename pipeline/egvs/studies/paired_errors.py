@@ -25,8 +25,8 @@ from egvs.artefacts.run_record import RunRecord
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
 from egvs.core.progress import ProgressCallback, no_progress
-from egvs.report.ranking import RankedSite
-from egvs.report.sensor_results import ScoreDifference
+from egvs.results.ranking import RankedSite
+from egvs.results.sensors import ScoreDifference
 from egvs.runs.stage_registry import recorded_digests
 from egvs.scenario.loading import scenario_from_dict
 from egvs.scoring.score_table import ScoreColumn

@@ -30,16 +30,16 @@ from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.wording import by_number, list_first, number_of
-from egvs.report.formatting import join_names
-from egvs.report.ranking import Pole, RankedSite, Ranking
-from egvs.report.sensor_results import ScoreDifference, SensorComparison, SensorMount, best_mounts
+from egvs.results.labels import join_names
+from egvs.results.ranking import Pole, RankedSite, Ranking
+from egvs.results.sensors import ScoreDifference, SensorComparison, SensorMount, best_mounts
 from egvs.runs.run_sources import PLAN_REQUEST
 from egvs.scenario.costs import costs_from_dict
 from egvs.scenario.score_config import CostsConfig
 from egvs.scenario.settings import flatten_settings
 from egvs.sensors.sensor import check_sensor_names
+from egvs.statistics.ranks import best_sites, rank_agreement, regret
 from egvs.studies.paired_errors import ScoreDifferences, SiteOfRun
-from egvs.studies.score_errors import best_sites, rank_agreement, regret
 
 SCORES = RunFolder.scores.name
 

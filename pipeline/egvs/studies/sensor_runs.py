@@ -13,7 +13,7 @@ from pathlib import Path
 
 from egvs.core.errors import InputError
 from egvs.core.wording import by_number
-from egvs.report.formatting import join_names
+from egvs.results.labels import join_names
 from egvs.runs import run
 from egvs.runs.run_sources import SettingsSource
 from egvs.scenario.model import Scenario

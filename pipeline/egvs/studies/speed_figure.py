@@ -9,7 +9,7 @@ import numpy as np
 
 from egvs.core.grid import FloatArray
 from egvs.core.wording import format_percent
-from egvs.report.svg_figures import FigureStyle, round_values, svg_start_tag
+from egvs.drawing.svg_figures import FigureStyle, round_values, svg_start_tag
 from egvs.studies.lane_speeds import BIN_M_S
 
 _WIDTH, _HEIGHT = 360.0, 190.0

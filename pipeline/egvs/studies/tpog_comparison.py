@@ -38,20 +38,21 @@ from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray, Grid
 from egvs.core.progress import ProgressCallback, no_progress
-from egvs.report.basemap import network_file, roads_within, world_outlines
-from egvs.report.maps import Backdrop
-from egvs.report.ranking import RankedSite, Ranking
-from egvs.report.svg_figures import extent
+from egvs.drawing.basemap import network_file, roads_within, world_outlines
+from egvs.drawing.maps import Backdrop
+from egvs.drawing.svg_figures import extent
+from egvs.extensions.tracks import recorded_tracks
+from egvs.results.ranking import RankedSite, Ranking
 from egvs.runs.stage_registry import recorded_digests
 from egvs.scenario.loading import scenario_from_dict
 from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, ScoreUncertainty
 from egvs.stages.base import StageContext
 from egvs.stages.inputs import open_folder
+from egvs.statistics.ranks import rank_agreement, regret
 from egvs.studies import lane_speeds
 from egvs.studies.lane_bins import LaneBins, column_centres_m, lane_bins, lane_distances, mean_groups, sum_groups
 from egvs.studies.paired_errors import SiteReplicates, read_replicates
-from egvs.studies.score_errors import rank_agreement, regret
-from egvs.traffic import network, recorded_tracks
+from egvs.traffic import network
 from egvs.world import geolocation
 
 

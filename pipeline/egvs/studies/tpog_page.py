@@ -10,10 +10,12 @@ from pathlib import Path
 from egvs._version import __version__
 from egvs.core import files
 from egvs.core.wording import format_percent
-from egvs.report import formatting, maps, page
-from egvs.report.colours import STYLE_SHEET, ColumnValues
-from egvs.report.maps import MapScale
-from egvs.report.svg_figures import FigureStyle
+from egvs.drawing import maps
+from egvs.drawing.colours import STYLE_SHEET, ColumnValues
+from egvs.drawing.maps import MapScale
+from egvs.drawing.svg_figures import FigureStyle
+from egvs.report import page
+from egvs.results import labels as formatting
 from egvs.studies import speed_figure
 from egvs.studies.tpog_comparison import LaneComparison, Measured, TpogComparison
 

@@ -36,12 +36,12 @@ from egvs.core.platform import relative_path
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.special import cosdg, sindg
 from egvs.core.wording import format_percent, number_of
+from egvs.drawing.basemap import solid_group
 from egvs.formats import csv_tables
-from egvs.report.basemap import solid_group
 from egvs.report.command_sections import DIGEST_KEY, what_if_digest
-from egvs.report.formatting import ScoreLabel, format_probability, join_names
-from egvs.report.ranking import RankedSite, Ranking
-from egvs.report.sensor_results import ScoreDifference
+from egvs.results.labels import ScoreLabel, format_probability, join_names
+from egvs.results.ranking import RankedSite, Ranking
+from egvs.results.sensors import ScoreDifference
 from egvs.runs import run, run_names
 from egvs.runs.command_results import add_to_report
 from egvs.runs.run_sources import SettingsSource
@@ -55,7 +55,7 @@ from egvs.sensors.sensor import scenario_sensor
 from egvs.sensors.sites import candidate_sites
 from egvs.studies.footprint_files import read_document, write_if_changed
 from egvs.studies.paired_errors import SiteReplicates, read_replicates
-from egvs.tracks.sizes import class_sizes
+from egvs.traffic.class_sizes import class_sizes
 from egvs.world import geolocation
 from egvs.world.footprints import read_footprints
 

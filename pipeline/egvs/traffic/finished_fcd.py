@@ -460,7 +460,7 @@ def recorded_frames(scenario: Scenario) -> int:
     if scenario.traffic.frames is not None:
         return scenario.traffic.frames
     if scenario.traffic.tracks is not None:
-        from egvs.traffic import recorded_tracks
+        from egvs.extensions.tracks import recorded_tracks
 
         return recorded_tracks.tracks_window(scenario).count
     return fcd_window(scenario)[0].count

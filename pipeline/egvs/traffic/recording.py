@@ -34,7 +34,7 @@ from egvs.traffic.sumo_folder import SimulationFolder, Timing
 from egvs.traffic.vehicle_boxes import TrafficHook, VehicleSize
 
 if TYPE_CHECKING:
-    from egvs.traffic.recorded_tracks import RecordedTracks
+    from egvs.extensions.tracks.recorded_tracks import RecordedTracks
 
 _MIN_STANDING_LIMIT_S = 180.0
 _MAX_WAITING_SHARE = 0.02
@@ -203,7 +203,7 @@ def _record_finished(scenario: Scenario, folder: Path, world: Georeference) -> I
 
 @contextmanager
 def _record_tracks(scenario: Scenario, folder: Path, world: Georeference) -> Iterator[Recording]:
-    from egvs.traffic import recorded_tracks
+    from egvs.extensions.tracks import recorded_tracks
 
     where = sumo_folder.traffic_location(scenario)
     sumo_folder.copy_network(scenario, folder)
@@ -303,7 +303,7 @@ def _recorded_people(
     """Read the recorded pedestrians of a scenario, if there are any; InputError where others are simulated."""
     if scenario.traffic.pedestrian_tracks is None:
         return None
-    from egvs.traffic import recorded_tracks
+    from egvs.extensions.tracks import recorded_tracks
 
     are_simulated = any(extension.ADDS_TRAFFIC for extension in extensions)
     recorded_tracks.check_recorded_people(scenario, are_simulated=are_simulated)
@@ -311,7 +311,7 @@ def _recorded_people(
 
 
 def _people_warnings(people: RecordedTracks, timing: Timing, where: str) -> Iterator[Diagnostic]:
-    from egvs.traffic import recorded_tracks
+    from egvs.extensions.tracks import recorded_tracks
 
     yield from recorded_tracks.track_warnings(people, where)
     yield from recorded_tracks.pedestrian_warnings(people, timing.first_ms / 1000.0, where)

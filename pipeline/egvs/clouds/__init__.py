@@ -1,0 +1,1 @@
+"""Simulated point clouds with traffic."""

@@ -1,0 +1,132 @@
+"""Assume the traffic through a junction that nobody has counted, and find how much of it the network carries.
+
+The flows between the streets come from :func:`egvs.creation.junctions.assumed_flows`. A new scenario uses a share of
+what the network carries of them without a lock, see :mod:`egvs.traffic.capacity`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+from egvs.core.errors import InputError
+from egvs.core.wording import by_number, format_percent
+from egvs.creation import junctions
+from egvs.creation.junctions import StreetJunction, Streets
+from egvs.scenario.traffic_config import CountConfig
+from egvs.traffic.capacity import Capacity, distribute_total, find_capacity, scale_flows
+
+JUNCTION_BLOCKER_S, TELEPORT_S = 10.0, 120.0
+"""What ends locks in new scenarios; the second is longer than any red phase and most waits to give way."""
+
+TRAFFIC_LEVELS = {"light": 0.4, "medium": 0.75, "heavy": 1.0}
+"""Shares of the carried flow. The queues of a junction get long, and rare locks possible, near its capacity."""
+
+DEFAULT_TRAFFIC = "medium"
+
+MAX_VEHICLES_PER_H = 100_000
+"""More do not pass any junction."""
+
+
+@dataclass(frozen=True)
+class AssumedTraffic:
+    """The traffic of a new scenario.
+
+    Attributes
+    ----------
+    assumed
+        Flows from the classes of the streets, or in their proportions if their sum is given.
+    capacity
+        What the network carries of them.
+    level
+        A key of :data:`TRAFFIC_LEVELS`; None if the sum of the flows is given, and they are used in full.
+    """
+
+    assumed: tuple[CountConfig, ...]
+    capacity: Capacity
+    level: str | None
+
+    @cached_property
+    def flows(self) -> tuple[CountConfig, ...]:
+        """The flows of the scenario."""
+        if self.level is None:
+            return self.assumed
+        return tuple(scale_flows(self.assumed, self.capacity.share * TRAFFIC_LEVELS[self.level]))
+
+    @property
+    def assumed_per_h(self) -> int:
+        """Sum of the assumed flows."""
+        return round(math.fsum(flow.per_hour for flow in self.assumed))
+
+    @property
+    def carried_per_h(self) -> int:
+        """Sum of the flows that the network carries, in steps of 10."""
+        if self.capacity.is_everything:
+            return self.assumed_per_h
+        return round(self.capacity.share * self.assumed_per_h / 10) * 10
+
+    @property
+    def per_h(self) -> int:
+        """Sum of the flows of the scenario."""
+        return round(math.fsum(flow.per_hour for flow in self.flows))
+
+    @property
+    def summary(self) -> str:
+        """What is carried and used, as a sentence."""
+        if self.level is None:
+            carried = "all" if self.capacity.is_everything else f"{self.carried_per_h:,}"
+            return f"carries {carried} of the {self.assumed_per_h:,} requested vehicles an hour"
+        at_least = "at least " if self.capacity.is_everything else ""
+        share = format_percent(TRAFFIC_LEVELS[self.level], 0)
+        return f"carries {at_least}{self.carried_per_h:,} vehicles an hour; {self.level} {share} is used"
+
+
+def check_traffic_level(level: str) -> None:
+    """Raise an InputError unless a text is a key of :data:`TRAFFIC_LEVELS`."""
+    if level not in TRAFFIC_LEVELS:
+        raise InputError("--traffic", f"expected light, medium or heavy, got {level!r}", "Use --traffic medium.")
+
+
+def check_traffic(traffic: str | int) -> None:
+    if isinstance(traffic, str):
+        check_traffic_level(traffic)
+    elif not 1 <= traffic <= MAX_VEHICLES_PER_H:
+        problem = f"expected 1 to {MAX_VEHICLES_PER_H:,} vehicles an hour, got {traffic:,}"
+        raise InputError("--vehicles-per-hour", problem, "Give the vehicles that pass the junction from all sides.")
+
+
+def assume_traffic(
+    network: str, streets: Streets, junction: StreetJunction, traffic: str | int
+) -> AssumedTraffic | None:
+    """Assume flows through the region of a junction, and find how much of them the network carries."""
+    flows = junctions.assumed_flows(streets, junctions.region_around(junction), junction.ring)
+    if isinstance(traffic, int):
+        if not flows:
+            problem = "no street leads vehicles through the region of interest"
+            raise InputError("--vehicles-per-hour", problem, "Choose another junction with --at LAT,LON.")
+        flows = distribute_total(flows, traffic)
+    if not flows:
+        return None
+    level = traffic if isinstance(traffic, str) else None
+    return AssumedTraffic(tuple(flows), find_capacity(network, flows, JUNCTION_BLOCKER_S), level)
+
+
+def traffic_notes(traffic: AssumedTraffic | None) -> list[str]:
+    if traffic is None:
+        return []
+    capacity = traffic.capacity
+    jam = f"; {capacity.jam}" if capacity.jam else ""
+    hint = "Lower per_hour of traffic.counts, or check the signals and connections there."
+    if traffic.level is None:
+        if capacity.is_everything:
+            return []
+        return [f"Traffic jams are likely: the network {traffic.summary}{jam}. {hint}"]
+    if not capacity.is_confirmed:
+        return [
+            "Traffic jams occur in"
+            f" {by_number(len(capacity.runs), 'the trial', f'all {len(capacity.runs)} trials')}{jam}. {hint}"
+        ]
+    if not capacity.is_everything:
+        return [f"The junction does not carry the {traffic.assumed_per_h:,} vehicles an hour of its road classes."]
+    return []

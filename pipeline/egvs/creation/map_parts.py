@@ -1,0 +1,414 @@
+"""What the readers of map files return: roads, solids and terrain, all in one world frame.
+
+A reader is a module with ``NAME`` and ``can_open``, and with one or more of ``read_roads``, ``read_solids`` and
+``read_terrain``. It is declared as an entry point of the group ``egvs.maps``.
+
+The world frame is that of the network: x east, y north in metres (see :mod:`egvs.formats.georeference`). Roads are read
+first; the ``<location>`` of their network states the frame. The other readers convert their coordinates with
+:meth:`MapContext.to_world`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray, IntArray
+from egvs.creation.junctions import Streets
+from egvs.formats.georeference import WorldFrame, parse_crs
+from egvs.scenario.fields import MAX_COORDINATE_M
+from egvs.scenario.model import StaticsConfig
+
+HEAD_BYTES = 4096
+"""How much of a file :meth:`MapReader.can_open` gets, after gunzip."""
+
+DEFAULT_BUILDING_M: float = StaticsConfig.model_fields["polygon_height_m"].default
+"""Height of a building without a height in the map, and of no special type."""
+
+DECK_BASE_M = 5.0
+"""Height of the underside of a bridge without a height in the map: above lorries."""
+
+OUT_OF_RANGE = "out_of_range"
+"""The reason to leave out objects outside the window of a map."""
+
+GROUND_KIND, OBJECT_KIND = "ground", "as_built"
+"""Kinds of the meshes of a point cloud: its ground, and all else."""
+
+
+@dataclass(frozen=True)
+class MappedSolid:
+    """An area, line or point of the map, extruded from ``base_m`` to ``height_m``.
+
+    Attributes
+    ----------
+    name
+        Unique, e.g. ``"way/12"``.
+    kind
+        ``building``, ``roof``, ``barrier``, ``bridge``, ``pole``, ``tree_trunk`` or ``tree_crown``.
+    geometry
+        World frame, metres.
+    height_m, base_m
+        Top and bottom above the ground.
+    height_source
+        Where the height comes from: ``height`` or ``levels`` (tags of the map), ``type`` or ``default``.
+    radius_m
+        Half the width of a line, radius of a point; None for an area.
+    assumed_radius
+        Whether the radius of a tree crown is assumed.
+    """
+
+    name: str
+    kind: str
+    geometry: BaseGeometry
+    height_m: float
+    height_source: str
+    base_m: float = 0.0
+    radius_m: float | None = None
+    assumed_radius: bool = False
+
+    @property
+    def area(self) -> BaseGeometry:
+        """The area covered, seen from above."""
+        return self.geometry.buffer(self.radius_m) if self.radius_m else self.geometry
+
+    def to_geojson(self) -> dict[str, Any]:
+        """Return a GeoJSON feature in world-frame metres."""
+        properties = {"name": self.name, "kind": self.kind, "height_m": round(self.height_m, 3)}
+        if self.base_m:
+            properties["base_m"] = round(self.base_m, 3)
+        if self.radius_m is not None:
+            properties["radius_m"] = round(self.radius_m, 3)
+        properties["height_from"] = self.height_source
+        return {"type": "Feature", "properties": properties, "geometry": shapely.geometry.mapping(self.geometry)}
+
+
+@dataclass
+class ImportCounts:
+    """Counts of what happened to the mapped objects."""
+
+    objects: Counter[str] = field(default_factory=Counter)
+    heights: dict[str, Counter[str]] = field(default_factory=dict)
+    unreadable: Counter[str] = field(default_factory=Counter)
+    repaired: int = 0
+    cut: Counter[str] = field(default_factory=Counter)
+    dropped: dict[str, Counter[str]] = field(default_factory=dict)
+    slivers: int = 0
+    raised_crowns: int = 0
+    assumed_crowns: int = 0
+    not_modelled: Counter[str] = field(default_factory=Counter)
+
+    def keep(self, solid: MappedSolid) -> None:
+        """Count an object that is used; a tree is counted once, by its trunk."""
+        self.objects[solid.kind] += 1
+        self.assumed_crowns += solid.assumed_radius
+        if solid.kind != "tree_crown":
+            kind = solid.kind.removesuffix("_trunk")
+            self.heights.setdefault(kind, Counter())[solid.height_source] += 1
+
+    def remove(self, solid: MappedSolid) -> None:
+        """Take back what :meth:`keep` counted."""
+        self.objects -= Counter({solid.kind: 1})
+        self.assumed_crowns -= solid.assumed_radius
+        if solid.kind != "tree_crown":
+            self.heights[solid.kind.removesuffix("_trunk")] -= Counter({solid.height_source: 1})
+
+    def drop(self, kind: str, reason: str) -> None:
+        """Count an object that is left out."""
+        self.dropped.setdefault(reason, Counter())[kind] += 1
+
+    def plus(self, other: ImportCounts) -> ImportCounts:
+        """Return the sums of two maps."""
+        return ImportCounts(**{key: _add_counts(value, vars(other)[key]) for key, value in vars(self).items()})
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON, sorted by key."""
+        return {key: _sort_keys(value) for key, value in vars(self).items()}
+
+
+def _add_counts(one: Any, other: Any) -> Any:
+    """Return the sum of two numbers, counters, or dictionaries of counters."""
+    if isinstance(one, Counter) or not isinstance(one, dict):
+        return one + other
+    return {key: one.get(key, Counter()) + other.get(key, Counter()) for key in {**one, **other}}
+
+
+def _sort_keys(value: Any) -> Any:
+    if not isinstance(value, dict):
+        return value
+    return {key: _sort_keys(value[key]) for key in sorted(value)}
+
+
+@dataclass(frozen=True)
+class RoadMap:
+    """A SUMO network made from a road map.
+
+    Attributes
+    ----------
+    network
+        The text of a ``.net.xml`` without dates and paths. Its ``<location>`` states the projection, unless the map
+        has none.
+    attribution
+        Who made the map, and its licence; empty if unknown.
+    notes
+        Sentences for the user: what was assumed, left out or is wrong in the map.
+    has_heights
+        Whether the z of its lanes comes from the map.
+    """
+
+    network: str
+    attribution: str = ""
+    notes: tuple[str, ...] = ()
+    has_heights: bool = False
+
+
+@dataclass(frozen=True)
+class RoadOptions:
+    """Options for reading roads.
+
+    Attributes
+    ----------
+    lefthand
+        Whether traffic drives on the left.
+    walk
+        Whether the network gets sidewalks and crossings.
+    has_terrain
+        Whether the roads will be laid on a terrain: heights of OpenStreetMap are not needed then, but its bridges and
+        tunnels stay edges of their own.
+    """
+
+    lefthand: bool = False
+    walk: bool = False
+    has_terrain: bool = False
+
+
+@dataclass(frozen=True)
+class MappedMesh:
+    """A triangle mesh of one object, e.g. a building with its roof.
+
+    Attributes
+    ----------
+    name
+        Unique in its file, e.g. a ``gml:id``.
+    kind
+        ``building``, ``bridge``, ``furniture``, ``vegetation``, ``ground`` or another name.
+    vertices_m
+        (n, 3) float64: world-frame x, y; z in the file's heights.
+    faces
+        (m, 3) int64.
+    is_closed
+        Whether the triangles enclose a volume.
+    group
+        Meshes of one group, such as the parts of a file, keep their heights to each other on a sloping ground.
+        By default each mesh is a group of its own.
+    """
+
+    name: str
+    kind: str
+    vertices_m: FloatArray
+    faces: IntArray
+    is_closed: bool
+    group: str = ""
+
+
+@dataclass(frozen=True)
+class SolidMap:
+    """Static objects of one map.
+
+    Attributes
+    ----------
+    solids
+        Footprints with heights above the ground.
+    meshes
+        Meshes, whose z is a height in the file's vertical system if ``has_absolute_heights``, else above the ground.
+    counts
+        What happened to the objects of the map.
+    has_absolute_heights
+        Whether the heights of the meshes count from sea level.
+    notes
+        Sentences for the user.
+    attribution
+        Who made the map, and its licence; empty if unknown.
+    """
+
+    solids: tuple[MappedSolid, ...] = ()
+    meshes: tuple[MappedMesh, ...] = ()
+    counts: ImportCounts = field(default_factory=ImportCounts)
+    has_absolute_heights: bool = False
+    notes: tuple[str, ...] = ()
+    attribution: str = ""
+
+
+class Terrain(Protocol):
+    """Heights of the ground."""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences for the user."""
+        raise NotImplementedError
+
+    def height_m(self, xy_m: FloatArray) -> FloatArray:
+        """Return the heights (n,) of the ground at world-frame points (n, 2), in metres; NaN where unknown."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Two points of files without a reference system, and where they are in the world frame.
+
+    A rotation and a translation take the middle of the first pair to that of the second; lengths are kept.
+
+    Attributes
+    ----------
+    local_m, world_m
+        (2, 2) float64: x, y in the file and in the world frame, in metres.
+    """
+
+    local_m: FloatArray
+    world_m: FloatArray
+
+    def to_world(self, xy: FloatArray) -> FloatArray:
+        """Return world-frame x, y (n, 2) of x, y (n, 2) in the file."""
+        rotation = self._rotation
+        moved: FloatArray = (xy - self.local_m.mean(axis=0)) @ rotation.T + self.world_m.mean(axis=0)
+        return moved
+
+    def from_world(self, xy_m: FloatArray) -> FloatArray:
+        """Return x, y (n, 2) in the file of world-frame x, y (n, 2); the inverse of :meth:`to_world`."""
+        moved: FloatArray = (xy_m - self.world_m.mean(axis=0)) @ self._rotation + self.local_m.mean(axis=0)
+        return moved
+
+    @property
+    def scale(self) -> float:
+        """Distance of the points in the world, divided by that in the file; 1 if both are metres."""
+        local_m, world_m = np.diff(self.local_m, axis=0)[0], np.diff(self.world_m, axis=0)[0]
+        return float(np.hypot(*world_m) / np.hypot(*local_m))
+
+    @property
+    def _rotation(self) -> FloatArray:
+        (x0, y0), (x1, y1) = np.diff(self.local_m, axis=0)[0], np.diff(self.world_m, axis=0)[0]
+        angle = np.arctan2(y1, x1) - np.arctan2(y0, x0)
+        return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+@dataclass(frozen=True)
+class MapContext:
+    """Where the region is, for readers of solids and terrain.
+
+    Attributes
+    ----------
+    frame
+        The world frame of the network; None if the road map has no reference system.
+    window
+        World frame, metres: what sensors can reach. Objects outside it are left out, with a count.
+    alignment
+        From ``--align``; used for files without a reference system.
+    streets
+        The roads, for objects that are cut at the carriageway.
+    aligned
+        Files that the alignment placed; filled while files are read.
+    """
+
+    frame: WorldFrame | None
+    window: BaseGeometry
+    alignment: Alignment | None = None
+    streets: Streets | None = None
+    aligned: set[str] = field(default_factory=set)
+
+    def to_world(self, xy: FloatArray, crs: str | None, where: str) -> FloatArray:
+        """Convert coordinates of a file to world-frame x, y in metres.
+
+        Parameters
+        ----------
+        xy
+            (n, 2), in the order x (easting, longitude), y (northing, latitude).
+        crs
+            The reference system that the file declares, in a form that PROJ knows; None if it declares none.
+        where
+            The file, for messages.
+
+        Returns
+        -------
+        ndarray of float64
+            (n, 2). The heights of points do not change.
+
+        Raises
+        ------
+        InputError
+            When there is neither a system nor an alignment, when the network has no reference system, or where the
+            projection is undefined or the result is not on the Earth.
+        """
+        frame = self._frame_or_alignment(crs, where)
+        xy_m = frame.to_world(xy) if isinstance(frame, Alignment) else frame.from_crs(xy, str(crs))
+        undefined = np.flatnonzero(~(np.abs(xy_m) <= MAX_COORDINATE_M).all(axis=1))
+        if len(undefined):
+            point = xy[undefined[0]]
+            problem = f"({point[0]:.10g}, {point[1]:.10g}) cannot be converted from {crs or 'local metres'}"
+            raise InputError(where, problem, "Check the file's coordinates and its reference system.")
+        return xy_m
+
+    def from_world(self, xy_m: FloatArray, crs: str | None, where: str) -> FloatArray:
+        """Convert world-frame x, y (n, 2) to the coordinates of a file; the inverse of :meth:`to_world`.
+
+        Not finite where the projection is undefined; InputError as there.
+        """
+        frame = self._frame_or_alignment(crs, where)
+        return frame.from_world(xy_m) if isinstance(frame, Alignment) else frame.to_crs(xy_m, str(crs))
+
+    def _frame_or_alignment(self, crs: str | None, where: str) -> WorldFrame | Alignment:
+        """Return what converts coordinates of a system; the alignment for files without one."""
+        if crs is None or parse_crs(crs, where).is_engineering:
+            if self.alignment is None:
+                hint = "Give two of its points and where they are: --align X,Y=LAT,LON --align X,Y=LAT,LON."
+                raise InputError(where, "the file declares no coordinate reference system", hint)
+            self.aligned.add(where)
+            return self.alignment
+        if self.frame is None:
+            problem = f"the file is in {crs}, but the road map has no reference system"
+            raise InputError(where, problem, "Use a road map with a reference system.")
+        return self.frame
+
+
+@runtime_checkable
+class MapReader(Protocol):
+    """What every reader has."""
+
+    NAME: str
+
+    def can_open(self, path: Path, head: bytes) -> bool:
+        """Return whether a file with this name and beginning (:data:`HEAD_BYTES`) is in the reader's format."""
+        raise NotImplementedError
+
+
+@runtime_checkable
+class RoadReader(MapReader, Protocol):
+    """A reader of roads."""
+
+    def read_roads(self, path: Path, options: RoadOptions) -> RoadMap:
+        """Return the network of a road map; InputError when it is damaged."""
+        raise NotImplementedError
+
+
+@runtime_checkable
+class SolidReader(MapReader, Protocol):
+    """A reader of static objects. Files of one format are read together, since objects may be cut at their borders."""
+
+    def read_solids(self, paths: Sequence[Path], context: MapContext) -> SolidMap:
+        """Return the objects in the window; InputError when a file is damaged."""
+        raise NotImplementedError
+
+
+@runtime_checkable
+class TerrainReader(MapReader, Protocol):
+    """A reader of ground heights."""
+
+    def read_terrain(self, paths: Sequence[Path], context: MapContext) -> Terrain:
+        """Return the ground in the window; InputError when a file is damaged."""
+        raise NotImplementedError

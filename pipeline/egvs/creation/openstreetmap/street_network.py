@@ -1,0 +1,467 @@
+"""Turn the streets of an OpenStreetMap extract into a SUMO network: all of them, or those around a junction.
+
+Streets are cut around a junction so that its traffic does not depend on the size of the extract. Steps of
+:func:`cut_surroundings`: cut each street where it crosses a circle around the junction, with a new node there; keep the
+pieces inside; of the roads for cars, keep those connected to the middle. Objects other than streets stay unchanged.
+
+Distances are metres on a sphere, in the tangent plane at the middle. Within 1 km of it they differ by less than half a
+percent from those on the ellipsoid; the exact point where a street is cut does not matter.
+
+Frame of a network: its own x, y in metres. The text of a network contains neither dates nor paths.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+from shapely.geometry import LineString
+from shapely.geometry.base import BaseGeometry
+
+from egvs.core import files
+from egvs.core.errors import InputError, RunError
+from egvs.core.grid import XY
+from egvs.creation import junctions
+from egvs.creation.junctions import StreetJunction, Streets
+from egvs.formats import xml
+from egvs.formats.osm import OsmExtract, Way, parse_number, write_streets
+from egvs.traffic import sumo, sumo_folder
+from egvs.traffic.network import Location
+
+ATTRIBUTION = "(c) OpenStreetMap contributors, ODbL"
+NETWORK_FILE = "network.net.xml"
+
+NETCONVERT_FLAGS = (
+    "--geometry.remove", "--junctions.join", *sumo_folder.OSM_SIGNALS,
+    "--keep-edges.by-vclass", "passenger,bus,truck", "--remove-edges.isolated",
+    "--output.street-names", "--precision", "3",
+    "--no-turnarounds.except-deadend", "--junctions.right-before-left.speed-threshold", "0",
+)  # fmt: skip
+"""How netconvert makes a network of streets.
+
+The last two prevent locks: vehicles turn back at dead ends only, since one that waits for a gap to turn back on a busy
+street blocks all behind it; and a minor street gives way by a sign, since four vehicles that give way to each other
+from the right wait forever.
+"""
+
+JOINED_SIGNALS_FLAG = "--tls.join"
+LONGEST_PROGRAM_S = 120.0
+"""A signal program for several nodes may not be longer: one of 16 phases and 272 s, one approach after another, let
+less than half of the usual traffic pass.
+"""
+
+SIDEWALK_FLAGS = ("--sidewalks.guess", "--sidewalks.guess.max-speed", "28", "--crossings.guess")
+"""Sidewalks, walking areas at their corners, and crossings between these.
+
+The limit is 28 m/s instead of 13.89 m/s: netconvert assumes up to that speed on a main street without ``maxspeed``, but
+more on a motorway.
+"""
+
+EARTH_M = 6371008.8
+
+PATH_HIGHWAYS = {
+    "footway", "path", "cycleway", "steps", "pedestrian", "bridleway", "corridor", "platform", "elevator", "proposed",
+    "construction", "via_ferrata",
+}  # fmt: skip
+"""Values of ``highway`` that are no roads for vehicles."""
+
+_NET_OFFSET = re.compile(r'netOffset="[^"]*"')
+_NOTHING_LOADED = re.compile(r"No (nodes|edges) loaded|has no road")
+_ELEMENT = re.compile(r"^    <(edge|junction|connection) [^\n]*?(?:/>|>\n.*?^    </\1>)\n", re.MULTILINE | re.DOTALL)
+
+
+def netconvert_flags(extract: OsmExtract, *, lefthand: bool, walk: bool) -> list[str]:
+    """Return netconvert's flags for an extract.
+
+    Parameters
+    ----------
+    extract
+        The map.
+    lefthand
+        Whether traffic drives on the left.
+    walk
+        Whether the network gets sidewalks and crossings.
+    """
+    flags = [*NETCONVERT_FLAGS]
+    if extract.declared:
+        # keep streets that reach beyond the bounds, drop those completely outside
+        b = extract.bounds
+        flags += ["--keep-edges.in-geo-boundary", f"{b.west_deg!r},{b.south_deg!r},{b.east_deg!r},{b.north_deg!r}"]
+    if lefthand:
+        flags.append("--lefthand")
+    if walk:
+        flags += SIDEWALK_FLAGS
+    return flags
+
+
+def build_network(
+    extract: OsmExtract, osm: Path, flags: Sequence[str], frame: Location | None = None
+) -> tuple[str, Streets]:
+    """Run netconvert on the streets of an extract.
+
+    Parameters
+    ----------
+    extract
+        The map.
+    osm
+        Its file, for messages.
+    flags
+        Flags of netconvert. :data:`JOINED_SIGNALS_FLAG` is dropped if a signal program gets longer than
+        :data:`LONGEST_PROGRAM_S`.
+    frame
+        The frame of the network; by default, netconvert chooses one.
+
+    Returns
+    -------
+    text : str
+        The SUMO network.
+    streets : Streets
+        The same network, read.
+
+    Raises
+    ------
+    InputError
+        When the extract has no drivable streets, or netconvert rejects them.
+    """
+    no_streets = InputError(
+        osm,
+        "the extract has no drivable streets that meet",
+        "Choose an extract with streets for cars (ways with highway=...).",
+    )
+    if not any("highway" in way.tags for way in extract.ways.values()):
+        raise no_streets
+
+    with files.temporary_folder() as folder:
+        write_streets(extract, folder / "streets.osm.xml")
+        try:
+            arguments = ["--osm-files", "streets.osm.xml", *flags, *_frame_flags(frame)]
+            sumo.run_netconvert(arguments, folder, NETWORK_FILE)
+            if JOINED_SIGNALS_FLAG in arguments and longest_program_s(folder / NETWORK_FILE) > LONGEST_PROGRAM_S:
+                arguments.remove(JOINED_SIGNALS_FLAG)
+                sumo.run_netconvert(arguments, folder, NETWORK_FILE)
+            if frame is not None:
+                _state_offset(folder / NETWORK_FILE, frame)
+            streets = junctions.read_streets(folder / NETWORK_FILE)
+        except (RunError, InputError) as error:
+            if _NOTHING_LOADED.search(str(error)):
+                raise no_streets from None
+            if isinstance(error, sumo.SumoInputError):
+                problem = f"netconvert cannot use the streets: {error}"
+                raise InputError(osm, problem, "Choose another extract.") from None
+            raise
+        text = (folder / NETWORK_FILE).read_text(encoding="utf-8")
+
+    # the first comment of netconvert contains the date and paths
+    text = re.sub(r"<!-- generated on .*?-->", f"<!-- {ATTRIBUTION} -->", text, count=1, flags=re.DOTALL)
+    return text, streets
+
+
+def longest_program_s(path: Path) -> float:
+    """Return the duration of the longest signal program of a network, in seconds; 0 without signals.
+
+    An actuated phase counts with the duration that it has in the fixed-time program.
+    """
+    longest_s = 0.0
+    for element in xml.iter_elements(path, "net"):
+        if element.tag == "tlLogic":
+            longest_s = max(longest_s, math.fsum(float(phase.get("duration", "0")) for phase in element.iter("phase")))
+    return longest_s
+
+
+def crop_network(
+    extract: OsmExtract, osm: Path, flags: Sequence[str], streets: Streets, junction: StreetJunction, radius_m: float
+) -> tuple[str, Streets]:
+    """Build the network around a junction, in the frame of the complete network.
+
+    Parameters
+    ----------
+    extract, osm, flags
+        As for :func:`build_network`.
+    streets
+        The complete network.
+    junction
+        The junction in the middle.
+    radius_m
+        Distance at which streets end.
+
+    Returns
+    -------
+    text : str
+        The SUMO network.
+    streets : Streets
+        The same network, read.
+    """
+    location = streets.network.location
+    assert location is not None, "netconvert writes a location"
+
+    ((lon_deg, lat_deg),) = streets.to_degrees([junction.at_m])
+    surroundings = cut_surroundings(extract, (lat_deg, lon_deg), radius_m)
+    return build_network(surroundings, osm, flags, location)
+
+
+def _frame_flags(frame: Location | None) -> list[str]:
+    if frame is None:
+        return []
+    east_m, north_m = frame.offset_m
+    return [
+        "--proj", frame.projection, "--offset.disable-normalization",
+        "--offset.x", f"{east_m!r}", "--offset.y", f"{north_m!r}",
+    ]  # fmt: skip
+
+
+def _state_offset(path: Path, frame: Location) -> None:
+    """Write the offset of a frame into a network: for left-hand traffic, netconvert negates that of y."""
+    east_m, north_m = frame.offset_m
+    text = path.read_text(encoding="utf-8")
+    files.write_text(path, _NET_OFFSET.sub(f'netOffset="{east_m:.3f},{north_m:.3f}"', text, count=1))
+
+
+def cut_surroundings(extract: OsmExtract, middle: tuple[float, float], radius_m: float) -> OsmExtract:
+    """Return the extract with only those pieces of streets that are within a radius.
+
+    Parameters
+    ----------
+    extract
+        The map.
+    middle
+        Latitude, longitude in degrees.
+    radius_m
+        Distance at which streets end.
+
+    Returns
+    -------
+    OsmExtract
+        With all other objects unchanged, and a new node wherever a street was cut.
+    """
+    circle = _Circle(extract, middle, radius_m)
+    ways: dict[int, Way] = {}
+    next_id = max(extract.ways) + 1
+    for way in extract.ways.values():
+        if "highway" not in way.tags:
+            ways[way.id] = way
+            continue
+        pieces = _pieces_as_ways(way, _pieces_inside(way, circle, extract), next_id)
+        next_id += max(0, len(pieces) - 1)
+        ways |= pieces
+
+    node_tags = dict(sorted((extract.node_tags | circle.cut_tags).items()))
+    inside = replace(extract, nodes=extract.nodes | circle.cuts, node_tags=node_tags, ways=dict(sorted(ways.items())))
+    connected = _connected_roads(inside, circle)
+    return replace(inside, ways={i: way for i, way in inside.ways.items() if i in connected or not is_road(way)})
+
+
+def cut_out_roads(extract: OsmExtract, streets: Streets, roads: Sequence[Way], region: BaseGeometry) -> OsmExtract:
+    """Return the extract without those segments of some roads that touch a region.
+
+    Parameters
+    ----------
+    extract
+        The map.
+    streets
+        Its network, for the frame of the region.
+    roads
+        The roads to cut.
+    region
+        World frame, metres.
+    """
+    xy = streets.node_positions(extract.nodes)
+    ways = dict(extract.ways)
+    next_id = max(ways) + 1
+    for road in roads:
+        del ways[road.id]
+        pieces = _pieces_as_ways(road, _pieces_outside(road, xy, region), next_id)
+        next_id += max(0, len(pieces) - 1)
+        ways |= pieces
+    return replace(extract, ways=dict(sorted(ways.items())))
+
+
+def _pieces_outside(way: Way, xy: Mapping[int, XY], region: BaseGeometry) -> Iterator[tuple[int, ...]]:
+    """Yield the runs of a way's nodes whose segments do not touch a region."""
+    nodes = [node for node in way.nodes if node in xy]
+    piece = nodes[:1]
+    for start, end in pairwise(nodes):
+        if LineString([xy[start], xy[end]]).intersects(region):
+            yield tuple(piece)
+            piece = []
+        piece.append(end)
+    yield tuple(piece)
+
+
+def _pieces_as_ways(way: Way, pieces: Iterable[tuple[int, ...]], next_id: int) -> dict[int, Way]:
+    """Make ways of the pieces of a way that have at least two nodes.
+
+    The longest keeps the identifier, which turn restrictions refer to; the others are numbered from ``next_id``.
+    """
+    longest_first = sorted((piece for piece in pieces if len(piece) > 1), key=len, reverse=True)
+    ids = [way.id, *range(next_id, next_id + len(longest_first))]
+    return {way_id: Way(way_id, nodes, way.tags) for way_id, nodes in zip(ids, longest_first, strict=False)}
+
+
+class _Circle:
+    """A circle on the ground, and the nodes where streets are cut."""
+
+    def __init__(self, extract: OsmExtract, middle: tuple[float, float], radius_m: float) -> None:
+        self._nodes = extract.nodes
+        self._lat_deg, self._lon_deg = middle
+        self._radius_m = radius_m
+        self._shrink = math.cos(math.radians(self._lat_deg))
+        self._next_id = max(extract.nodes) + 1
+        self.cuts: dict[int, tuple[float, float]] = {}
+        self.cut_tags: dict[int, dict[str, str]] = {}
+        self._tags = extract.node_tags
+
+    def at_m(self, node: int) -> XY:
+        """Metres east and north of the middle."""
+        lat_deg, lon_deg = self._nodes[node]
+        east_deg, north_deg = lon_deg - self._lon_deg, lat_deg - self._lat_deg
+        return EARTH_M * math.radians(east_deg) * self._shrink, EARTH_M * math.radians(north_deg)
+
+    def contains(self, node: int) -> bool:
+        return math.hypot(*self.at_m(node)) <= self._radius_m
+
+    def crossings(self, start: int, end: int) -> list[int]:
+        """Make new nodes where the line between two nodes crosses the circle, in the order of the line."""
+        x0, y0 = self.at_m(start)
+        x1, y1 = self.at_m(end)
+        dx, dy = x1 - x0, y1 - y0
+
+        # |start + t (end - start)|^2 = radius^2 is a t^2 + 2 b t + c = 0
+        a = dx * dx + dy * dy
+        b = x0 * dx + y0 * dy
+        c = x0 * x0 + y0 * y0 - self._radius_m**2
+        discriminant = b * b - a * c
+        if a == 0.0 or discriminant <= 0.0:
+            return []
+
+        nodes = []
+        for sign in (-1.0, 1.0):
+            t = (-b + sign * math.sqrt(discriminant)) / a
+            if 0.0 < t < 1.0:
+                node = self._add_cut(x0 + t * dx, y0 + t * dy)
+                self._interpolate_height(node, start, end, t)
+                nodes.append(node)
+        return nodes
+
+    def _interpolate_height(self, node: int, start: int, end: int, t: float) -> None:
+        """Give a new node a height (``ele``) if both of its neighbours have one."""
+        heights_m = [parse_number(self._tags.get(neighbour, {}).get("ele", "")) for neighbour in (start, end)]
+        before_m, after_m = heights_m
+        if before_m is not None and after_m is not None:
+            self.cut_tags[node] = {"ele": f"{before_m + t * (after_m - before_m):.3f}"}
+
+    def _add_cut(self, x_m: float, y_m: float) -> int:
+        lat_deg = self._lat_deg + math.degrees(y_m / EARTH_M)
+        lon_deg = self._lon_deg + math.degrees(x_m / EARTH_M / self._shrink)
+        node = self._next_id
+        self._next_id += 1
+        self.cuts[node] = (round(lat_deg, 7), round(lon_deg, 7))
+        return node
+
+
+def _pieces_inside(way: Way, circle: _Circle, extract: OsmExtract) -> Iterator[tuple[int, ...]]:
+    """Yield the runs of a way's nodes inside the circle, each ending on it where the way goes on."""
+    nodes = [node for node in way.nodes if node in extract.nodes]
+    piece = [node for node in nodes[:1] if circle.contains(node)]
+    for start, end in pairwise(nodes):
+        cuts = circle.crossings(start, end)
+        starts_inside, ends_inside = circle.contains(start), circle.contains(end)
+        if starts_inside and ends_inside:
+            piece.append(end)
+        elif starts_inside:
+            yield (*piece, *cuts[-1:])
+            piece = []
+        elif ends_inside:
+            piece = [*cuts[:1], end]
+        elif len(cuts) == 2:
+            yield tuple(cuts)
+    yield tuple(piece)
+
+
+def is_road(way: Way) -> bool:
+    """Return whether a way is a road for vehicles."""
+    return way.tags.get("highway", "footway") not in PATH_HIGHWAYS
+
+
+def _connected_roads(extract: OsmExtract, circle: _Circle) -> set[int]:
+    """Return the ids of the roads connected to the one nearest to the middle."""
+    roads = [way for way in extract.ways.values() if is_road(way)]
+    roads_at_node: dict[int, list[Way]] = {}
+    for way in roads:
+        for node in way.nodes:
+            roads_at_node.setdefault(node, []).append(way)
+
+    mapped = [node for node in roads_at_node if node in extract.nodes and node not in circle.cuts]
+    if not mapped:
+        return {way.id for way in roads}
+
+    nearest = min(mapped, key=lambda node: (math.hypot(*circle.at_m(node)), node))
+    reached: set[int] = set()
+    queue = list(roads_at_node[nearest])
+    while queue:
+        way = queue.pop()
+        if way.id in reached:
+            continue
+        reached.add(way.id)
+        for node in way.nodes:
+            queue += roads_at_node[node]
+    return reached
+
+
+class NetworkExcerpts:
+    """Parts of a network as text: roads for maps and checks, not for a simulation.
+
+    Elements stay as netconvert wrote them.
+
+    Parameters
+    ----------
+    text
+        A network that netconvert wrote.
+    """
+
+    def __init__(self, text: str) -> None:
+        elements = list(_ELEMENT.finditer(text))
+        head = text[: elements[0].start()] if elements else text
+        self._head = re.sub(r"^    <type .*\n", "", head, flags=re.MULTILINE)
+        self._edges: dict[str, str] = {}
+        self._junctions: dict[str, str] = {}
+        self._connections: list[tuple[str, str, str]] = []
+        for match in elements:
+            element, tag = match[0], match[1]
+            if tag == "edge":
+                self._edges[_attribute(element, "id")] = element
+            elif tag == "junction":
+                self._junctions[_attribute(element, "id")] = element
+            else:
+                self._connections.append((_attribute(element, "from"), _attribute(element, "to"), element))
+
+    def near(self, streets: Streets) -> str:
+        """Return the part with these streets (from :meth:`egvs.creation.junctions.Streets.near`)."""
+        nodes = {node.id for node in streets.network.junctions}
+        roads = {edge.id for edge in streets.network.edges}
+        edge_ids = [i for i in self._edges if i in roads or _node_of_internal_id(i, 1) in nodes]
+        edges = {edge_id: self._edges[edge_id] for edge_id in edge_ids}
+        texts = [self._head, *edges.values()]
+        for junction_id, element in self._junctions.items():
+            if junction_id in nodes or _node_of_internal_id(junction_id, 2) in nodes:
+                texts.append(element)
+        for source, target, element in self._connections:
+            if source in edges and target in edges:
+                texts.append(element)
+        return "".join([*texts, "\n</net>\n"])
+
+
+def _attribute(element: str, name: str) -> str:
+    match = re.search(rf' {name}="([^"]*)"', element)
+    return html.unescape(match[1]) if match else ""
+
+
+def _node_of_internal_id(internal_id: str, numbers: int) -> str:
+    """Return the junction of an internal edge (":J_3") or, with two numbers, of an internal junction (":J_3_0")."""
+    if not internal_id.startswith(":"):
+        return ""
+    return internal_id[1:].rsplit("_", numbers)[0]

@@ -1,0 +1,124 @@
+"""The roads of a map, from which those around a junction are taken."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+from egvs.core import files
+from egvs.core.errors import InputError, RunError
+from egvs.creation import junctions
+from egvs.creation.junctions import StreetJunction, Streets
+from egvs.creation.map_parts import RoadMap
+from egvs.creation.openstreetmap.street_network import NETWORK_FILE
+from egvs.traffic import sumo
+
+_GENERATED = re.compile(r"<!-- generated on .*?-->\n*", re.DOTALL)
+"""Date and paths that netconvert writes at the top of a network."""
+
+
+class RoadSource(Protocol):
+    """A road map, read."""
+
+    @property
+    def network(self) -> str:
+        """The text of the network."""
+        raise NotImplementedError
+
+    @property
+    def streets(self) -> Streets:
+        """The same network, read."""
+        raise NotImplementedError
+
+    @property
+    def attribution(self) -> str:
+        """Who made the map, and its licence; empty if unknown."""
+        raise NotImplementedError
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences for the user about the complete map."""
+        raise NotImplementedError
+
+    def on_level_of(self, junction: StreetJunction) -> RoadSource:
+        """Return the roads without those that cross a junction's region on another level."""
+        raise NotImplementedError
+
+    def around(self, junction: StreetJunction, radius_m: float | None) -> RoadSource:
+        """Return the roads within a radius of a junction, in the same frame: all if it is inf, the default if None."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class NetworkRoads:
+    """Roads of a map that is converted as a whole; they are not divided by level, and cut on request only."""
+
+    road_map: RoadMap
+    streets: Streets
+    path: Path
+
+    @classmethod
+    def read(cls, road_map: RoadMap, path: Path) -> NetworkRoads:
+        """Read the network of a road map.
+
+        Parameters
+        ----------
+        road_map
+            The road map.
+        path
+            Its file, for messages.
+
+        Raises
+        ------
+        InputError
+            When the network has no road, or SUMO cannot have written it.
+        """
+        with files.temporary_folder() as folder:
+            (folder / NETWORK_FILE).write_text(road_map.network, encoding="utf-8")
+            try:
+                return cls(road_map, junctions.read_streets(folder / NETWORK_FILE), path)
+            except InputError as error:
+                raise InputError(path, f"the network cannot be used: {error}", "Check the roads of the map.") from None
+
+    @property
+    def network(self) -> str:
+        """The text of the network."""
+        return self.road_map.network
+
+    @property
+    def attribution(self) -> str:
+        """Who made the map, and its licence; empty if unknown."""
+        return self.road_map.attribution
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences of the reader."""
+        return self.road_map.notes
+
+    def on_level_of(self, junction: StreetJunction) -> NetworkRoads:
+        """Return all roads: heights of lanes tell levels apart."""
+        del junction
+        return self
+
+    def around(self, junction: StreetJunction, radius_m: float | None) -> NetworkRoads:
+        """Return the roads that reach into a square around a junction, in the same frame; all if the radius is None."""
+        if radius_m is None or math.isinf(radius_m):
+            return self
+        (x_m, y_m), name = junction.at_m, "whole.net.xml"
+        square = f"{x_m - radius_m:.2f},{y_m - radius_m:.2f},{x_m + radius_m:.2f},{y_m + radius_m:.2f}"
+        flags = ["-s", name, "--keep-edges.in-boundary", square, "--offset.disable-normalization", "true"]
+        with files.temporary_folder() as folder:
+            (folder / name).write_text(self.network, encoding="utf-8")
+            try:
+                sumo.run_netconvert(flags, folder, NETWORK_FILE)
+            except RunError as error:
+                hint = "Use another radius, or --surroundings all."
+                raise InputError("--surroundings", f"netconvert cannot cut the network: {error}", hint) from None
+            network = (folder / NETWORK_FILE).read_text(encoding="utf-8")
+        note = f"The network is cut {radius_m:g} m from the junction."
+        network = _GENERATED.sub("", network, count=1)
+        road_map = replace(self.road_map, network=network, notes=(*self.road_map.notes, note))
+        return NetworkRoads.read(road_map, self.path)

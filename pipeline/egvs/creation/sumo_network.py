@@ -1,0 +1,57 @@
+"""Read roads of a SUMO network (``.net.xml``), which is used as it is."""
+
+from __future__ import annotations
+
+import gzip
+import re
+from pathlib import Path
+
+from egvs.core import files
+from egvs.core.errors import InputError
+from egvs.creation.map_parts import RoadMap, RoadOptions
+from egvs.traffic import network
+
+NAME = "SUMO network"
+
+_GENERATOR = re.compile(r"<!-- generated on .*?-->\s*", re.DOTALL)
+_GZIP = b"\x1f\x8b"
+
+
+def can_open(path: Path, head: bytes) -> bool:
+    """Return whether a file is named ``.net.xml``, or begins as a network."""
+    return path.name.lower().removesuffix(".gz").endswith(".net.xml") or b"<net " in head
+
+
+def read_roads(path: Path, options: RoadOptions) -> RoadMap:
+    """Return a network without netconvert's comment, which contains a date and paths.
+
+    Parameters
+    ----------
+    path
+        The network, gzipped or not.
+    options
+        ``lefthand`` and ``walk`` must be off: both are fixed in a network.
+
+    Raises
+    ------
+    InputError
+        When the network is damaged, or an option is set.
+    """
+    if options.lefthand or options.walk:
+        option = "--lefthand" if options.lefthand else "--walk"
+        hint = "Leave it out, or make the network anew with netconvert."
+        raise InputError(option, f"the SUMO network {path} has its own side of the road and sidewalks", hint)
+    roads = network.read_net_xml(path)
+    text = _GENERATOR.sub("", _read_text(path), count=1)
+    return RoadMap(text, has_heights=roads.has_heights)
+
+
+def _read_text(path: Path) -> str:
+    with files.open_input(path) as content:
+        data = content.read()
+    if data.startswith(_GZIP):
+        data = gzip.decompress(data)  # its size was checked when the network was read
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError:
+        raise InputError(path, "the network is not UTF-8 text", "Write it again with netconvert.") from None

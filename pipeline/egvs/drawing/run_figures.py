@@ -1,0 +1,436 @@
+"""Figures of the report: maps of the traffic and of the sites, and views of what each site sees and misses.
+
+For each site that a reader can choose, its beams are traced once more; the entropy, summed along z, is split into what
+the beams cross and what they do not; blind spots come from ``blindspots.parquet``. The views of the best and of the
+last site are drawn here. For the other sites the page has the data of the images without palettes, and joins both when
+a reader chooses a site, in its light or dark colours. If there are many sites, these images have fewer pixels, so that
+the page stays small.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egvs.artefacts import readers
+from egvs.artefacts.readers import MIN_VEHICLES, LocationVisibility, SiteBlindspots
+from egvs.artefacts.tpog import Tpog
+from egvs.core.grid import Grid
+from egvs.core.threads import map_ordered
+from egvs.core.wording import by_number, format_percent
+from egvs.drawing import colours, maps
+from egvs.drawing.basemap import network_file, roads_within, world_outlines
+from egvs.drawing.colours import ColumnValues, IndexedImage
+from egvs.drawing.maps import Backdrop, SiteViewFigure
+from egvs.drawing.svg_figures import PAGE_STYLE, Box, FigureStyle, extent, shared_scale
+from egvs.results import ranking
+from egvs.results.ranking import MapSite, RankedSite, Ranking
+from egvs.scoring.egvs import EntropyField
+from egvs.scoring.scorer import Scorer
+from egvs.scoring.visibility import Beams
+from egvs.stages.base import StageContext
+from egvs.stages.site_scans import SiteScan, empty_scans
+
+MAX_FULL_IMAGES = 40
+"""With more sites than this, only the best and the last have images in full resolution."""
+
+_SCAN_CELLS, _COARSE_SCAN_CELLS = 300, 150
+"""Cells of the image of an empty scan, from west to east."""
+_COARSE_PIXELS = 30_000
+"""Maximum number of pixels of the other images in coarse resolution."""
+
+_PALETTES = {
+    "field": colours.FIELD_PALETTES,
+    "scan": colours.DOT_PALETTES,
+    "vehicles": colours.SHARE_PALETTES,
+    "shade": colours.SHADE_PALETTES,
+}
+"""Palettes by view; views that are not listed use that of ``field``."""
+
+_WIDE_FIGURE = 680.0
+"""A figure of at least this width has room for a longer label."""
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Figures of a run.
+
+    Attributes
+    ----------
+    occupancy, sites
+        Maps, SVG text; ``occupancy`` is empty if there is no traffic.
+    views
+        Views of single sites; None if nothing is uncertain.
+    backdrop
+        Background of the maps, which the legend explains.
+    """
+
+    occupancy: str
+    sites: str
+    views: SiteViews | None
+    backdrop: Backdrop
+
+
+@dataclass(frozen=True)
+class SiteViews:
+    """Views of single sites.
+
+    Attributes
+    ----------
+    panels
+        Those of the best and of the last site.
+    scale
+        Their colour scale, SVG text.
+    data
+        JSON from which the page draws any other site.
+    is_coarse
+        Whether the images of the other sites have a coarse resolution.
+    """
+
+    panels: tuple[SitePanel, ...]
+    scale: str
+    data: str
+    is_coarse: bool
+
+
+@dataclass(frozen=True)
+class SitePanel:
+    """Figures of one site, SVG text, and the texts next to them."""
+
+    scored: RankedSite
+    visible: str
+    missed: str
+    scan: str
+    caption: str
+    vehicles: BlindspotView | None
+
+
+@dataclass(frozen=True)
+class BlindspotView:
+    """Blind spots of one site.
+
+    Attributes
+    ----------
+    figure
+        SVG text.
+    missed
+        Share of all vehicles that the site misses.
+    worst
+        The worst locations, and the sample that each is based on.
+    note
+        A remark on what the list does not show.
+    """
+
+    figure: str
+    missed: str
+    worst: tuple[tuple[str, str], ...]
+    note: str
+
+
+def draw_figures(work: StageContext, ranking: Ranking, choosable: Sequence[RankedSite], tpog: Tpog) -> Figures:
+    """Draw the figures of a run; views are made of the ``choosable`` sites."""
+    backdrop = make_backdrop(work, ranking, tpog)
+    scorer = Scorer(work.scene, tpog, work.folder.trajectories)
+    occupancy, views = "", None
+    if tpog.counts.any():
+        occupancy = occupancy_map(tpog, ranking, backdrop)
+    if len(scorer.field.cells):
+        views = site_views(work, ranking, choosable, scorer, backdrop)
+    return Figures(occupancy, sites_map(tpog, ranking, backdrop), views, backdrop)
+
+
+def make_backdrop(work: StageContext, ranking: Ranking, tpog: Tpog) -> Backdrop:
+    """Return the background of the maps of a run."""
+    box = extent(tpog.grid, ranking.sites)
+    return Backdrop(world_outlines(work.world, box), roads_within(network_file(work.folder.path), box))
+
+
+def _mean_occupancy(tpog: Tpog) -> ColumnValues:
+    mean: ColumnValues = tpog.counts.sum(axis=2) / tpog.frames
+    return mean
+
+
+def occupancy_map(tpog: Tpog, ranking: Ranking, backdrop: Backdrop, style: FigureStyle = PAGE_STYLE) -> str:
+    """Return a map of the traffic, SVG text."""
+    mean = _mean_occupancy(tpog)
+    ix, iy = np.unravel_index(int(mean.argmax()), mean.shape)
+    x = tpog.grid.origin_m[0] + (ix + 0.5) * tpog.grid.voxel_m
+    y = tpog.grid.origin_m[1] + (iy + 0.5) * tpog.grid.voxel_m
+    alt = (
+        f"Occupancy of the region of interest by traffic, seen from above: "
+        f"vehicles use {format_percent(np.count_nonzero(mean) / mean.size, 0)} of its area; "
+        f"the busiest location is near x = {x:.0f} m, y = {y:.0f} m."
+    )
+    label = "Occupied voxels in the column"
+    if style.width >= _WIDE_FIGURE:
+        label += ", on average: probabilities summed along z"
+    return maps.occupancy(tpog.grid, mean, label, backdrop, ranking.sites, alt, style)
+
+
+def sites_map(tpog: Tpog, ranking: Ranking, backdrop: Backdrop, style: FigureStyle = PAGE_STYLE) -> str:
+    """Return a map of the candidate sites, SVG text."""
+    best, last = ranking.best[0], ranking.last
+    alt = (
+        f"Map of {len(ranking.sites)} candidate sites by score. "
+        f"Best: {best.site} at x = {best.x_m:g} m, y = {best.y_m:g} m; "
+        f"last: {last.site} at x = {last.x_m:g} m, y = {last.y_m:g} m."
+    )
+    return maps.site_map(tpog.grid, _mean_occupancy(tpog), backdrop, ranking.sites, alt, style)
+
+
+# ---- views of single sites
+
+
+@dataclass(frozen=True)
+class _SiteCoverage:
+    """Voxels that the beams of a site cross, and where the beams end."""
+
+    scored: RankedSite
+    crossed: NDArray[np.bool_]
+    visible_bit: ColumnValues
+    missed_bit: ColumnValues
+    caption: str
+    ends_m: NDArray[np.float64]
+
+
+def site_views(
+    work: StageContext, ranking: Ranking, choosable: Sequence[RankedSite], scorer: Scorer, backdrop: Backdrop
+) -> SiteViews:
+    """Draw the views of the best and of the last site, and return the data of all ``choosable`` sites."""
+    box = extent(scorer.field.grid, choosable)
+    is_coarse = len(choosable) > MAX_FULL_IMAGES
+    peak = float(column_entropy(scorer.field, np.ones(len(scorer.field.cells), dtype=np.bool_)).max())
+    blindspots = read_blindspots(work, choosable)
+
+    site_of_name = {site.site: site for site in choosable}
+
+    def draw_images(scan: SiteScan) -> tuple[_SiteCoverage, dict[str, IndexedImage]]:
+        site = site_of_name[scan.site.name]
+        coverage = _site_coverage(site, scan.beams, scorer)
+        return coverage, _site_images(coverage, peak, box, in_full=site in ranking.extremes or not is_coarse)
+
+    panels: dict[str, SitePanel] = {}
+    site_data: dict[str, dict[str, Any]] = {}
+    for coverage, images in map_ordered(draw_images, empty_scans(work, site_of_name.keys()), work.threads):
+        site = coverage.scored
+        site_data[site.site] = _panel_data(coverage, images, blindspots, box)
+        if site in ranking.extremes:
+            prefix = f"view-{ranking.extremes.index(site)}"
+            panels[site.site] = _draw_panel(
+                coverage, scorer.field.grid, peak, images["scan"], blindspots, backdrop, box, prefix
+            )
+
+    palettes: dict[str, dict[str, str]] = {}
+    for theme in colours.THEMES:
+        palettes[theme] = {view: _to_base64(palette[theme]) for view, palette in _PALETTES.items()}
+    data = {
+        "sites": {site.site: site_data[site.site] for site in choosable},
+        "palettes": palettes,
+        "end": _to_base64(colours.PNG_END),
+    }
+    return SiteViews(
+        panels=tuple(panels[site.site] for site in ranking.extremes),
+        scale=shared_scale(peak, "Entropy in the column (bit)"),
+        data=json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),  # a name must not end the script
+        is_coarse=is_coarse,
+    )
+
+
+def _site_coverage(site: RankedSite, beams: Beams, scorer: Scorer) -> _SiteCoverage:
+    field, crossed = scorer.field, scorer.hits(beams) > 0
+    visible = crossed.ravel()[field.cells]
+    return _SiteCoverage(
+        scored=site,
+        crossed=crossed,
+        visible_bit=column_entropy(field, visible),
+        missed_bit=column_entropy(field, ~visible),
+        caption=ranking.site_caption(site, int(visible.sum()), len(visible)),
+        ends_m=_hit_positions_m(beams),
+    )
+
+
+def _hit_positions_m(beams: Beams) -> NDArray[np.float64]:
+    """Positions where beams hit something, x and y in the world frame, shape (n, 2)."""
+    is_hit = np.linalg.norm(beams.ends_m, axis=1) < beams.sensor.range_m * (1 - 1e-9)
+    ends: NDArray[np.float64] = beams.ends_m[is_hit, :2] + np.asarray(beams.pose.position_m[:2])
+    return ends
+
+
+def column_entropy(field: EntropyField, which: NDArray[np.bool_]) -> ColumnValues:
+    """Return the entropy of some of the uncertain voxels, summed along z.
+
+    Parameters
+    ----------
+    field
+        Entropy of the uncertain voxels.
+    which
+        The voxels that count, shape (n_voxels,).
+
+    Returns
+    -------
+    ndarray
+        Bits, shape (nx, ny).
+    """
+    nx, ny, nz = field.grid.shape
+    summed = np.bincount(field.cells[which] // nz, weights=field.per_cell_bit[which], minlength=nx * ny)
+    return summed.astype(np.float64).reshape(nx, ny)
+
+
+def _site_images(coverage: _SiteCoverage, peak: float, box: Box, *, in_full: bool) -> dict[str, IndexedImage]:
+    pixels, cells = _COARSE_PIXELS, _COARSE_SCAN_CELLS
+    if in_full:
+        pixels, cells = colours.MAX_PIXELS, _SCAN_CELLS
+    return {
+        "seen": colours.field_image(coverage.visible_bit, peak, pixels),
+        "missed": colours.field_image(coverage.missed_bit, peak, pixels),
+        "scan": colours.dots_image(coverage.ends_m, box, cells),
+        "shade": colours.shade_image(np.logical_not(coverage.crossed.any(axis=2)), pixels),
+    }
+
+
+def _panel_data(
+    coverage: _SiteCoverage, images: dict[str, IndexedImage], blindspots: Blindspots | None, box: Box
+) -> dict[str, Any]:
+    """Data from which the page draws the figures of one site."""
+    plan, site = maps.site_view_frame(box), coverage.scored
+    data: dict[str, Any] = {
+        "at": [round(plan.x(site.x_m), 1), round(plan.y(site.y_m), 1)],
+        "share": [format_percent(site.entropy_seen), format_percent(1 - site.entropy_seen)],
+        "caption": coverage.caption,
+    }
+    if blindspots is not None:
+        images = images | {"vehicles": blindspots.image(site.site)}
+        data["vehicles"] = blindspots.panel_data(site.site, box)
+    data["images"] = {name: [_to_base64(image.head), _to_base64(image.data)] for name, image in images.items()}
+    return data
+
+
+def _to_base64(data: bytes) -> str:
+    return base64.b64encode(data).decode("ascii")
+
+
+def _draw_panel(
+    coverage: _SiteCoverage,
+    grid: Grid,
+    peak: float,
+    scan: IndexedImage,
+    blindspots: Blindspots | None,
+    backdrop: Backdrop,
+    box: Box,
+    prefix: str,
+) -> SitePanel:
+    site = coverage.scored
+    view = SiteViewFigure(site, coverage.crossed, backdrop, box)
+    where = f"{site.site} at x = {site.x_m:g} m, y = {site.y_m:g} m"
+    share = site.entropy_seen
+    visible = maps.site_view(
+        grid, coverage.visible_bit, peak, view, f"{prefix}-seen",
+        f"From above: the {format_percent(share)} of the entropy seen by {where}.",
+    )  # fmt: skip
+    missed = maps.site_view(
+        grid, coverage.missed_bit, peak, view, f"{prefix}-missed",
+        f"From above: the {format_percent(1 - share)} of the entropy missed by {where}.",
+    )  # fmt: skip
+    ends = maps.scan_view(grid, scan, view, f"{prefix}-scan", f"From above: where the beams of {where} end.")
+    vehicles = None
+    if blindspots is not None:
+        vehicles = blindspots.view(site, grid, backdrop, box, f"{prefix}-vehicles")
+    return SitePanel(site, visible, missed, ends, coverage.caption, vehicles)
+
+
+# ---- blind spots
+
+
+@dataclass(frozen=True)
+class Blindspots:
+    """Blind spots of all choosable sites."""
+
+    sites: dict[str, SiteBlindspots]
+
+    def view(self, site: MapSite, grid: Grid, backdrop: Backdrop, box: Box, prefix: str) -> BlindspotView:
+        """Return the figure and the texts of one site."""
+        blindspots = self.sites[site.site]
+        return BlindspotView(
+            figure=maps.missed_view(grid, blindspots, site, backdrop, box, prefix),
+            missed=format_missed_share(blindspots),
+            worst=describe_worst_locations(blindspots),
+            note=blindspot_note(blindspots),
+        )
+
+    def panel_data(self, site: str, box: Box) -> dict[str, Any]:
+        """Return what the page needs to draw one site, except the image."""
+        blindspots = self.sites[site]
+        return {
+            "numbers": maps.label_positions(maps.site_view_frame(box), blindspots),
+            "missed": format_missed_share(blindspots),
+            "worst": describe_worst_locations(blindspots),
+            "note": blindspot_note(blindspots),
+        }
+
+    def image(self, site: str) -> IndexedImage:
+        """Return the image of the share of vehicles that a site misses in each cell."""
+        return colours.share_image(self.sites[site].share_missed)
+
+
+def read_blindspots(work: StageContext, choosable: Sequence[MapSite]) -> Blindspots | None:
+    """Return the blind spots of some sites; None if the scenario does not enable ``score.blindspots``."""
+    if not work.scenario.score.blindspots:
+        return None
+    names = {site.site for site in choosable}
+    sites = {site.site: site for site in readers.read_blindspots(work.folder.blindspots, names)}
+    return Blindspots(sites)
+
+
+def format_missed_share(site_blindspots: SiteBlindspots) -> str:
+    """Return the share of all vehicles that a site misses."""
+    if site_blindspots.overall is None:
+        return "–"
+    return format_percent(1.0 - site_blindspots.overall.share)
+
+
+def describe_worst_locations(site_blindspots: SiteBlindspots) -> tuple[tuple[str, str], ...]:
+    """Return the worst locations, and the sample that each is based on."""
+    described = []
+    for location in site_blindspots.worst:
+        described.append((f"{location.words}: {_format_share(location)} found", _describe_sample(location)))
+    return tuple(described)
+
+
+def blindspot_note(site_blindspots: SiteBlindspots) -> str:
+    """Return a remark on what the list of the worst locations does not show."""
+    if site_blindspots.overall is None:
+        return "No vehicle in the region."
+    if len(site_blindspots.locations) == 1:
+        return "The traffic does not come from one road network, so there are no lanes to list; see the map."
+    sentences = []
+    if not site_blindspots.worst:
+        sentences.append(f"No lane, turn or crossing with {MIN_VEHICLES} vehicles or more is below the average.")
+    if approaches := site_blindspots.of_kind("approach"):
+        shares = ", ".join(
+            f"{approach.words.removesuffix(' approach')} {_format_share(approach)}" for approach in approaches
+        )
+        sentences.append(f"Share of vehicles found on each approach: {shares}.")
+    if site_blindspots.off_lanes:
+        verb = by_number(site_blindspots.off_lanes, "was", "were")
+        sentences.append(
+            f"{site_blindspots.off_lanes:,} of {site_blindspots.overall.vehicle_frames:,} observed vehicles "
+            f"{verb} not on a lane."
+        )
+    return " ".join(sentences)
+
+
+def _format_share(location: LocationVisibility) -> str:
+    return format_percent(location.share, 0)
+
+
+def _describe_sample(location: LocationVisibility) -> str:
+    return (
+        f"± {format_percent(location.se, 0)}, from {location.vehicles:,} vehicles in "
+        f"{location.vehicle_frames:,} observations"
+    )

@@ -1,0 +1,1 @@
+"""Real sensors: fitted to their sweeps, designed, installed and accepted."""

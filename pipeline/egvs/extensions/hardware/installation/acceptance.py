@@ -1,0 +1,664 @@
+r"""Accept an installed sensor: compare one measured scan, or several, with the empty scan that was planned.
+
+Steps: read the scans (sensor frame: x forward, y left, z up, metres); register them to the static world
+(:mod:`egvs.extensions.hardware.registration`), which gives the measured pose with standard errors; compare them with
+the empty scan that is expected from there (:mod:`egvs.extensions.hardware.installation.scan_comparison`); score the
+measured pose, and the sensor with its obstacles and missing channels; check each value against its limit.
+
+The tilt error is the angle between the planned and the measured z axis of the sensor. Errors of the pose are measured
+minus planned; those of angles are from -180 to 180 degrees. Standard errors cover the scatter of the returns about the
+static world, not an error of the whole map.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray
+from egvs.core.progress import ProgressCallback, no_progress
+from egvs.core.wording import format_percent, number_of
+from egvs.explore.session import Session
+from egvs.extensions.hardware import registration
+from egvs.extensions.hardware.fit import sweep_files
+from egvs.extensions.hardware.installation import scan_comparison
+from egvs.extensions.hardware.installation.acceptance_limits import MAX_VEHICLE_HEIGHT_M, Limits
+from egvs.extensions.hardware.installation.planned_sites import PlannedSites
+from egvs.extensions.hardware.installation.scan_comparison import BlockedSector, ScanComparison, StaticWorld
+from egvs.extensions.hardware.registration import PARAMETERS, Registration, StaticSurfaces, parameter_name_and_unit
+from egvs.results.labels import SCORE_LABELS
+from egvs.scoring.visibility import Beams
+from egvs.sensors.sensor import Sensor, rotation_world_sensor
+from egvs.sensors.sites import Pose, Site
+
+MIN_STRUCTURE_SHARE = 0.3
+"""A scan is of another place if it agrees with less of the walls, poles and other solids of the static world."""
+
+MAX_DISPLACEMENT_M = 3.0
+"""A registration that ends farther from the planned position has not found the pose."""
+
+_GOOD_STRUCTURE_SHARE = 0.6
+"""Below it, other yaws are tried, and whether the scan is mirrored."""
+_MIRROR = np.array([1.0, -1.0, 1.0])
+_BLOCKED_BEAM_DEG = 0.3
+"""An expected beam is stopped by the return of an obstacle that is at most this far beside it."""
+_SEARCH_POINTS = 6_000
+"""Of a scan that fits near the planned pose, about as many points tell whether other yaws fit as well."""
+_STEP = 1e-4
+_METRES_HINT = "Export the scan in metres, in the sensor's frame: x forward, y left, z up."
+
+
+@dataclass(frozen=True)
+class PoseError:
+    """Measured minus planned pose.
+
+    Attributes
+    ----------
+    planned, measured
+        The poses, world frame.
+    values, standard_errors
+        By parameter (:data:`egvs.extensions.hardware.registration.PARAMETERS`), metres and degrees. A standard error is
+        infinite where no surface fixes the parameter.
+    position_m, position_se_m
+        Distance of the positions.
+    tilt_deg, tilt_se_deg
+        Angle between the z axes of the sensor. Standard errors are infinite if no surface fixes a part of the quantity.
+    other_yaws_deg
+        Measured minus planned yaw of the other poses at which the scans fit as well.
+    """
+
+    planned: Pose
+    measured: Pose
+    values: dict[str, float]
+    standard_errors: dict[str, float]
+    position_m: float
+    position_se_m: float
+    tilt_deg: float
+    tilt_se_deg: float
+    other_yaws_deg: tuple[float, ...] = ()
+
+    @classmethod
+    def of(cls, planned: Pose, fit: Registration, other_yaws_deg: Sequence[float] = ()) -> PoseError:
+        """Return the error of a registered pose; ``other_yaws_deg`` are those of poses that fit as well."""
+        values = {name: getattr(fit.pose, name) - getattr(planned, name) for name in PARAMETERS}
+        for name in PARAMETERS[3:]:
+            values[name] = _signed_angle_deg(values[name])
+        position_m, position_se_m = _propagate(lambda pose: _distance_m(planned, pose), fit)
+        tilt_deg, tilt_se_deg = _propagate(lambda pose: _tilt_deg(planned, pose), fit)
+        # A parameter that is not fixed has its planned value, where the derivatives of distance and tilt are 0.
+        if {"x_m", "y_m", "z_m"} & set(fit.not_fixed):
+            position_se_m = math.inf
+        if {"pitch_deg", "roll_deg"} & set(fit.not_fixed):
+            tilt_se_deg = math.inf
+        others = tuple(_signed_angle_deg(yaw_deg - planned.yaw_deg) for yaw_deg in other_yaws_deg)
+        return cls(
+            planned, fit.pose, values, fit.standard_errors, position_m, position_se_m, tilt_deg, tilt_se_deg, others
+        )  # fmt: skip
+
+
+def _signed_angle_deg(angle_deg: float) -> float:
+    return (angle_deg + 180.0) % 360.0 - 180.0
+
+
+def _distance_m(planned: Pose, pose: Pose) -> float:
+    return math.dist(planned.position_m, pose.position_m)
+
+
+def _tilt_deg(planned: Pose, pose: Pose) -> float:
+    up = rotation_world_sensor(*planned.angles_deg)[:, 2]
+    measured_up = rotation_world_sensor(*pose.angles_deg)[:, 2]
+    return math.degrees(math.atan2(float(np.linalg.norm(np.cross(up, measured_up))), float(up @ measured_up)))
+
+
+def _propagate(function: Callable[[Pose], float], fit: Registration) -> tuple[float, float]:
+    """Return a function of the fitted pose, and its standard error to first order."""
+    gradient = np.zeros(len(PARAMETERS))
+    for index, name in enumerate(PARAMETERS):
+        ahead = replace(fit.pose, **{name: getattr(fit.pose, name) + _STEP})
+        behind = replace(fit.pose, **{name: getattr(fit.pose, name) - _STEP})
+        gradient[index] = (function(ahead) - function(behind)) / (2.0 * _STEP)
+    gradient[np.abs(gradient) < 1e-6] = 0.0  # so that a parameter without influence may have an infinite variance
+    used = np.flatnonzero(gradient)
+    variance = gradient[used] @ fit.covariance[np.ix_(used, used)] @ gradient[used] if len(used) else 0.0
+    return function(fit.pose), math.sqrt(max(float(variance), 0.0)) if math.isfinite(variance) else math.inf
+
+
+@dataclass(frozen=True)
+class ScoreChange:
+    """The score that ranks, as planned and as installed.
+
+    Attributes
+    ----------
+    name
+        Name of the score.
+    planned
+        At the planned pose.
+    at_measured_pose
+        At the measured pose, with the whole sensor.
+    as_installed
+        At the measured pose, without the beams that obstacles stop or that missing channels lack.
+    """
+
+    name: str
+    planned: float
+    at_measured_pose: float
+    as_installed: float
+
+    @property
+    def loss(self) -> float:
+        """Share of the planned score that the installed sensor loses; negative for a gain."""
+        return 1.0 - self.as_installed / self.planned if self.planned else 0.0
+
+
+@dataclass(frozen=True)
+class Check:
+    """One measured quantity against its limit.
+
+    Attributes
+    ----------
+    name
+        Name of the quantity.
+    measured, limit
+        Both, in words.
+    passed
+        Whether the value is within its limit.
+    reason
+        Why it is not; empty if it is.
+    is_close
+        Whether the limit is within two standard errors of the measured value.
+    """
+
+    name: str
+    measured: str
+    limit: str
+    passed: bool
+    reason: str = ""
+    is_close: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Acceptance:
+    """The result of an acceptance check.
+
+    Attributes
+    ----------
+    site
+        The site, at its planned pose.
+    sensor
+        Its sensor.
+    files
+        Names of the measured scans.
+    pose
+        The error of the pose.
+    residual_m
+        Robust standard deviation of the distances of returns from the static world.
+    on_surface_share
+        Share of the returns that lie on the static world.
+    comparison
+        The scans against the expected one.
+    score
+        What the installation costs; None if it cannot be scored, for the reason in ``notes``.
+    limits
+        The limits.
+    checks
+        Each quantity against its limit.
+    notes
+        Remarks for the reader.
+    """
+
+    site: Site
+    sensor: Sensor
+    files: tuple[str, ...]
+    pose: PoseError
+    residual_m: float
+    on_surface_share: float
+    comparison: ScanComparison
+    score: ScoreChange | None
+    limits: Limits
+    checks: tuple[Check, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def passed(self) -> bool:
+        """Whether all checks pass."""
+        return all(check.passed for check in self.checks)
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why the sensor is not accepted; empty if it is."""
+        return tuple(check.reason for check in self.checks if not check.passed)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the result as JSON values; infinite and missing numbers are null."""
+        errors = {
+            name: {"error": _finite(value), "standard_error": _finite(self.pose.standard_errors[name])}
+            for name, value in self.pose.values.items()
+        }
+        errors["position_m"] = {"error": self.pose.position_m, "standard_error": _finite(self.pose.position_se_m)}
+        errors["tilt_deg"] = {"error": self.pose.tilt_deg, "standard_error": _finite(self.pose.tilt_se_deg)}
+        comparison = self.comparison
+        return {
+            "site": self.site.name,
+            "sensor": self.sensor.name,
+            "scans": list(self.files),
+            "passed": self.passed,
+            "reasons": list(self.reasons),
+            "planned_pose": asdict(self.pose.planned),
+            "measured_pose": asdict(self.pose.measured),
+            "pose_error": errors,
+            "other_yaw_errors_deg": list(self.pose.other_yaws_deg),
+            "residual_m": self.residual_m,
+            "on_surface_share": self.on_surface_share,
+            "blocked_sectors": [_sector_json(sector) for sector in comparison.sectors],
+            "missing_channels_deg": list(comparison.missing_channels),
+            "unchecked_channels": comparison.unchecked_channels,
+            "return_share": _finite(comparison.return_share),
+            "returns": comparison.returns,
+            "returns_off_beams": comparison.off_beams,
+            "returns_nearer_than_expected": comparison.nearer,
+            "score": None if self.score is None else {**asdict(self.score), "loss": self.score.loss},
+            "limits": {name: _finite(value) for name, value in asdict(self.limits).items()},
+            "checks": [asdict(check) for check in self.checks],
+            "notes": list(self.notes),
+        }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _sector_json(sector: BlockedSector) -> dict[str, Any]:
+    low, high = sector.elevation_deg
+    return {
+        "first_azimuth_deg": sector.first_deg,
+        "last_azimuth_deg": sector.last_deg,
+        "width_deg": sector.width_deg,
+        "bearing_deg": sector.bearing_deg,
+        "distance_m": _finite(sector.distance_m),
+        "elevation_deg": [_finite(low), _finite(high)],
+        "share_of_beams": sector.share,
+    }
+
+
+def accept(
+    run: str | Path,
+    site: str,
+    scans: Sequence[str | Path],
+    limits: Limits | None = None,
+    *,
+    max_vehicle_height_m: float = MAX_VEHICLE_HEIGHT_M,
+    progress: ProgressCallback = no_progress,
+) -> Acceptance:
+    """Compare measured scans of an installed sensor with the empty scan that was planned.
+
+    Parameters
+    ----------
+    run
+        Folder of a finished run.
+    site
+        Name of the site. If it is part of the plan in the folder, its pose there is the planned one.
+    scans
+        Files of measured scans in the sensor's frame, see :func:`egvs.extensions.hardware.fit.sweep_files.read_sweeps`.
+    limits
+        The limits; by default :class:`Limits`.
+    max_vehicle_height_m
+        A return in front of the static world that is higher above the ground is of an obstacle, not of a vehicle.
+    progress
+        Called after each step.
+
+    Raises
+    ------
+    InputError
+        If the run or a file cannot be read, there is no such site, the points are not metres in the sensor's frame, or
+        the scans do not fit the static world around the site.
+    """
+    limits = limits or Limits()
+    steps = 4
+    planned_sites = PlannedSites.open(Path(run))
+    planned = planned_sites.site(site)
+    sensor = planned_sites.sensor(planned)
+    sweeps = sweep_files.read_sweeps([Path(scan) for scan in scans])
+    clouds = [sweep.points_m[np.isfinite(sweep.points_m[:, 0])] for sweep in sweeps]
+    for sweep, cloud in zip(sweeps, clouds, strict=True):
+        _check_units(sweep.name, cloud, sensor)
+    files = tuple(sweep.name for sweep in sweeps)
+    where = ", ".join(files)
+    progress("scans read", 1, steps)
+
+    scene = planned_sites.session.scene
+    world = StaticWorld(scene, planned.pose)
+    surfaces = StaticSurfaces(scene.world, planned.pose.position_m)
+    fit, comparison, others = _register(clouds, sensor, planned, surfaces, world, where, max_vehicle_height_m)
+    progress("registered", 2, steps)
+
+    error = PoseError.of(planned.pose, fit, others)
+    notes = list(_notes(fit, comparison, others))
+    score = _score_change(planned_sites.session, planned, fit.pose, comparison, notes)
+    progress("scored", 3, steps)
+    checks = tuple(_checks(error, comparison, score, limits))
+    progress("checked", steps, steps)
+    return Acceptance(
+        planned, sensor, files, error, fit.sigma_m, float(np.mean(fit.on_surface)), comparison, score, limits, checks,
+        tuple(notes),
+    )  # fmt: skip
+
+
+def _check_units(name: str, points_m: FloatArray, sensor: Sensor) -> None:
+    """Raise an InputError if the points of a scan cannot be metres around a sensor."""
+    range_m = np.linalg.norm(points_m, axis=1)
+    typical_m = float(np.quantile(range_m, 0.95))
+    if typical_m > 3.0 * sensor.range_m:
+        problem = (
+            f"expected returns within the {sensor.range_m:g} m of {sensor.name}, got ranges up to {typical_m:,.0f}"
+        )
+        raise InputError(name, problem, f"{_METRES_HINT} These look like millimetres or a map's coordinates.")
+    spread_m = np.quantile(points_m, 0.95, axis=0) - np.quantile(points_m, 0.05, axis=0)
+    if max(spread_m[0], spread_m[1]) < 1.0:
+        problem = f"expected returns around the sensor, got x and y within {max(spread_m[0], spread_m[1]):.3g} m"
+        raise InputError(name, problem, f"{_METRES_HINT} These look like longitude and latitude, or kilometres.")
+
+
+def _register(
+    clouds: Sequence[FloatArray],
+    sensor: Sensor,
+    planned: Site,
+    surfaces: StaticSurfaces,
+    world: StaticWorld,
+    where: str,
+    max_vehicle_height_m: float,
+) -> tuple[Registration, ScanComparison, tuple[float, ...]]:
+    """Return the measured pose, the comparison there, and the yaws at which the scans fit as well."""
+    points_m = np.concatenate(list(clouds))
+    start = planned.pose
+    try:
+        fit = registration.register_scan(points_m, surfaces, start, where=where)
+    except InputError:  # the yaw may be far off, which the search below finds
+        fit = None
+    if fit is not None:
+        comparison = scan_comparison.compare_scans(clouds, sensor, fit.pose, world, max_vehicle_height_m)
+        if _is_plausible(fit, start) and _structure(comparison) >= _GOOD_STRUCTURE_SHARE:
+            others = _other_yaws(points_m, surfaces, fit, start, where)
+            if others is not None:
+                return fit, comparison, others
+
+    problem = f"the scan does not fit the static world around {planned.name} at any yaw"
+    hint = (
+        f"Check that it was measured at this site, in the sensor's frame in metres, less than {MAX_DISPLACEMENT_M:g} m"
+        " and about 5 degrees of tilt from the planned pose."
+    )
+    search, share = None, 0.0
+    with contextlib.suppress(InputError):  # where at no yaw enough points lie on the static world
+        search = registration.search_yaw(points_m, surfaces, start, where=where)
+    if search is not None:
+        best = search.best
+        comparison = scan_comparison.compare_scans(clouds, sensor, best.pose, world, max_vehicle_height_m)
+        share = _structure(comparison) if _is_plausible(best, start) else 0.0
+    if share < _GOOD_STRUCTURE_SHARE:
+        mirrored = [cloud * _MIRROR for cloud in clouds]
+        if _mirror_share(mirrored, sensor, start, surfaces, world) > max(share, _GOOD_STRUCTURE_SHARE):
+            problem = "the scan fits the static world as its mirror image only"
+            raise InputError(where, problem, "Export y to the left of x: azimuths count counter-clockwise from above.")
+    if search is None or share < MIN_STRUCTURE_SHARE:
+        raise InputError(where, problem, hint)
+    equally_good = [other.registration for other in search.equally_good]
+    return best, comparison, tuple(other.pose.yaw_deg for other in equally_good if _is_near(other, start))
+
+
+def _other_yaws(
+    points_m: FloatArray, surfaces: StaticSurfaces, fit: Registration, planned: Pose, where: str
+) -> tuple[float, ...] | None:
+    """Return the other yaws at which the scans fit as well as in ``fit``; None if they fit better at another yaw."""
+    few = points_m[:: max(1, len(points_m) // _SEARCH_POINTS)]
+    try:
+        search = registration.search_yaw(few, surfaces, fit.pose, where=where)
+    except InputError:  # too few of these points lie on the static world
+        return ()
+    found = [search.best, *(other.registration for other in search.equally_good)]
+    near = [other for other in found if _is_near(other, planned)]
+    others = [other for other in near if not registration.is_same_pose(other.pose, fit.pose)]
+    if others and len(others) == len(near):
+        return None
+    return tuple(other.pose.yaw_deg for other in others)
+
+
+def _is_near(fit: Registration, planned: Pose) -> bool:
+    return _distance_m(planned, fit.pose) <= MAX_DISPLACEMENT_M
+
+
+def _is_plausible(fit: Registration, planned: Pose) -> bool:
+    """Return whether a registration ended, and where it can have started."""
+    return fit.converged and _is_near(fit, planned)
+
+
+def _mirror_share(
+    mirrored: Sequence[FloatArray], sensor: Sensor, start: Pose, surfaces: StaticSurfaces, world: StaticWorld
+) -> float:
+    """Return how well mirrored scans agree with the structure of the static world; 0 if they cannot be registered."""
+    try:
+        fit = registration.search_yaw(np.concatenate(list(mirrored)), surfaces, start).best
+    except InputError:
+        return 0.0
+    if not _is_plausible(fit, start):
+        return 0.0
+    return scan_comparison.compare_scans(mirrored, sensor, fit.pose, world).structure_share
+
+
+def _structure(comparison: ScanComparison) -> float:
+    """Return the share of the structure that agrees; where nothing stands, the ground has to do."""
+    share = comparison.structure_share
+    return 1.0 if math.isnan(share) else share
+
+
+def _notes(fit: Registration, comparison: ScanComparison, other_yaws_deg: Sequence[float]) -> list[str]:
+    notes = []
+    if fit.not_fixed:
+        names = " and ".join(parameter_name_and_unit(name)[0] for name in fit.not_fixed)
+        notes.append(f"no surface of the static world fixes {names}: planned values are used instead")
+    if other_yaws_deg:
+        yaws = ", ".join(f"{yaw:.0f}" for yaw in other_yaws_deg)
+        notes.append(f"the scan fits as well at a yaw of {yaws} degrees: check where the front of the sensor points")
+    if comparison.unchecked_channels is None:
+        notes.append("the sensor has no channels, so none is checked")
+    elif comparison.unchecked_channels:
+        notes.append(
+            f"{comparison.unchecked_channels} channels are not checked: too few surfaces within half the range"
+        )
+    if comparison.scans < scan_comparison.PERSISTENT_SCANS and comparison.nearer_share > 0.05:
+        notes.append(
+            f"{format_percent(comparison.nearer_share, 0)} of the returns are nearer than expected where "
+            "vehicles can be: with"
+            f" {scan_comparison.PERSISTENT_SCANS} or more scans, some minutes apart, obstacles below the height of"
+            " vehicles are found too"
+        )
+    return notes
+
+
+# ---- score
+
+
+def _score_change(
+    session: Session, planned: Site, measured: Pose, comparison: ScanComparison, notes: list[str]
+) -> ScoreChange | None:
+    """Return what the installation costs; None, with a note, if one of the poses cannot be scored."""
+    name = session.rank_by
+    before = session.rate(planned.name, planned.pose)
+    after = session.rate(planned.name, measured)
+    for rated, pose in ((before, "planned"), (after, "measured")):
+        if not rated.is_feasible:
+            problems = "; ".join(finding.problem for finding in rated.findings if finding.is_error)
+            notes.append(f"the {pose} pose cannot be scored: {problems}")
+            return None
+    moved = replace(planned, pose=measured)
+    installed = _installed_beams(session.beams(moved), comparison)
+    as_installed = session.score_beams(moved, installed)[name]
+    return ScoreChange(name, before.scores[name], after.scores[name], as_installed)
+
+
+def _installed_beams(beams: Beams, comparison: ScanComparison) -> Beams:
+    """Return the empty scan with the beams that obstacles stop cut there, and without those of missing channels."""
+    rotation = rotation_world_sensor(*beams.pose.angles_deg)
+    range_m = np.linalg.norm(beams.ends_m, axis=1)
+    directions = beams.ends_m @ rotation / range_m[:, None]
+    azimuth_deg = np.mod(np.degrees(np.arctan2(directions[:, 1], directions[:, 0])), 360.0)
+    elevation_deg = np.degrees(np.arcsin(np.clip(directions[:, 2], -1.0, 1.0)))
+    ends_m = beams.ends_m.copy()
+    if len(comparison.obstacle_ranges_m):
+        reach = 2.0 * math.sin(math.radians(_BLOCKED_BEAM_DEG) / 2.0)
+        distance, nearest = KDTree(comparison.obstacle_directions).query(directions, distance_upper_bound=reach)
+        stopped = np.flatnonzero(np.isfinite(distance))
+        share = np.minimum(comparison.obstacle_ranges_m[nearest[stopped]] / range_m[stopped], 1.0)
+        ends_m[stopped] *= share[:, None]
+    lost = np.zeros(len(ends_m), dtype=np.bool_)
+    for sector in comparison.sectors:
+        if not sector.has_returns:
+            lost |= np.mod(azimuth_deg - sector.first_deg, 360.0) < sector.width_deg
+    if comparison.missing_channels:
+        channels_deg = scan_comparison.channel_elevations_deg(beams.sensor)
+        channel = np.abs(elevation_deg[:, None] - channels_deg).argmin(axis=1)
+        lost |= np.isin(channels_deg[channel], comparison.missing_channels)
+    weight = None if beams.weight is None else beams.weight[~lost]
+    return replace(beams, ends_m=ends_m[~lost], weight=weight)
+
+
+# ---- limits
+
+
+def _checks(error: PoseError, comparison: ScanComparison, score: ScoreChange | None, limits: Limits) -> list[Check]:
+    checks = [
+        _measured_check("position", error.position_m, error.position_se_m, limits.position_m, "m"),
+        _measured_check("tilt", error.tilt_deg, error.tilt_se_deg, limits.tilt_deg, "degrees"),
+        _yaw_check(error, limits.yaw_deg),
+    ]
+    sectors = "; ".join(describe_sector(sector) for sector in comparison.sectors)
+    blocked = comparison.blocked_deg <= limits.blocked_deg
+    checks.append(
+        Check(
+            "blocked sectors",
+            _with_unit(comparison.blocked_deg, "degrees"),
+            f"at most {_with_unit(limits.blocked_deg, 'degrees')}",
+            blocked,
+            "" if blocked else f"{_with_unit(comparison.blocked_deg, 'degrees')} blocked: {sectors}",
+        )
+    )
+    missing = comparison.missing_channels
+    channels = len(missing) <= limits.missing_channels
+    elevations = ", ".join(f"{elevation:g}" for elevation in missing)
+    reason = "" if channels else f"{number_of(len(missing), 'channel')} without returns: elevation {elevations} degrees"
+    channels_text = "not checked" if comparison.unchecked_channels is None else f"{len(missing)}"
+    checks.append(Check("missing channels", channels_text, f"at most {limits.missing_channels:g}", channels, reason))
+    if not math.isnan(comparison.return_share):
+        share = comparison.return_share
+        passed = share >= limits.returns
+        reason = "" if passed else f"only {format_percent(share, 0)} of the expected returns come back"
+        checks.append(
+            Check(
+                "expected returns",
+                format_percent(share),
+                f"at least {format_percent(limits.returns, 0)}",
+                passed,
+                reason,
+            )
+        )
+    off = comparison.off_beams / comparison.returns
+    passed = off <= limits.off_beams
+    reason = (
+        ""
+        if passed
+        else f"{format_percent(off, 0)} of the returns lie on no beam of the planned sensor: is it another model?"
+    )
+    checks.append(
+        Check(
+            "returns on no beam", format_percent(off), f"at most {format_percent(limits.off_beams, 0)}", passed, reason
+        )
+    )
+    if score is None:
+        passed = math.isinf(limits.loss)
+        reason = "" if passed else "the score of the installed sensor cannot be computed"
+        checks.append(
+            Check(
+                "score", "cannot be scored", f"at least {format_percent(-limits.loss, 0, signed=True)}", passed, reason
+            )
+        )
+    else:
+        label = SCORE_LABELS[score.name]
+        passed = score.loss <= limits.loss
+        measured = f"{label.value(score.as_installed)} instead of {label.value(score.planned)} {label.unit}".rstrip()
+        reason = (
+            ""
+            if passed
+            else f"the installed sensor loses {format_percent(score.loss)} of its planned score: {measured}"
+        )
+        checks.append(
+            Check(
+                "score",
+                format_percent(-score.loss, signed=True),
+                f"at least {format_percent(-limits.loss, 0, signed=True)}",
+                passed,
+                reason,
+            )
+        )
+    return checks
+
+
+def _measured_check(name: str, value: float, se: float, limit: float, unit: str) -> Check:
+    """Return the check of a quantity with a standard error; one that no surface fixes keeps an infinite limit only."""
+    if not math.isfinite(se):
+        passed = math.isinf(limit)
+        reason = "" if passed else f"{name} cannot be measured: no surface of the static world fixes it"
+        return Check(name, "cannot be measured", f"at most {_with_unit(limit, unit)}", passed, reason)
+    passed = abs(value) <= limit
+    measured = f"{describe_error(value, se)} {unit}"
+    reason = (
+        "" if passed else f"{name} is off by {describe_error(abs(value), se)} {unit}, limit {_with_unit(limit, unit)}"
+    )
+    return Check(
+        name, measured, f"at most {_with_unit(limit, unit)}", passed, reason, abs(abs(value) - limit) <= 2.0 * se
+    )
+
+
+def _with_unit(value: float, unit: str) -> str:
+    """Return a value with its unit, which is a singular for one degree."""
+    return f"{value:g} {'degree' if value == 1.0 and unit == 'degrees' else unit}"
+
+
+def _yaw_check(error: PoseError, limit_deg: float) -> Check:
+    """Return the check of the yaw; it fails if the scans fit as well at a yaw beyond the limit."""
+    value_deg = error.values["yaw_deg"]
+    check = _measured_check("yaw", value_deg, error.standard_errors["yaw_deg"], limit_deg, "degrees")
+    beyond_deg = [other_deg for other_deg in error.other_yaws_deg if abs(other_deg) > limit_deg]
+    if not beyond_deg or not math.isfinite(error.standard_errors["yaw_deg"]):
+        return check
+    errors = " or ".join(f"{error_deg:z.1f}" for error_deg in (value_deg, *beyond_deg))
+    reason = f"yaw cannot be told: it is off by {errors} degrees, the scan fits as well at each"
+    return replace(check, measured=f"{errors} degrees", passed=False, reason=reason, is_close=False)
+
+
+def describe_error(value: float, se: float, unit: str = "") -> str:
+    """Return an error of the pose with its standard error, e.g. "1.502 ± 0.004"; digits end at a thousandth.
+
+    Examples
+    --------
+    >>> describe_error(1.5021, 0.0041), describe_error(-0.0001, 0.00001)
+    ('1.502 ± 0.004', '0.000 ± <0.001')
+    """
+    if math.isinf(se):
+        return "cannot be measured"
+    scatter = f"{se:.3f}" if se >= 0.0005 or se == 0.0 else "<0.001"
+    return f"{value:z.3f} ± {scatter} {unit}".rstrip()
+
+
+def describe_sector(sector: BlockedSector) -> str:
+    """Return a blocked sector in words."""
+    azimuths = f"azimuth {sector.first_deg:g} to {sector.last_deg:g} (bearing {sector.bearing_deg:.0f})"
+    if sector.has_returns:
+        low, high = sector.elevation_deg
+        return f"{azimuths}, {sector.distance_m:.1f} m away, elevation {low:.0f} to {high:.0f}"
+    return f"{azimuths}, without returns"

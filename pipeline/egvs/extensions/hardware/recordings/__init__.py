@@ -1,0 +1,1 @@
+"""Recordings of sweeps: ROS bags and network captures."""

@@ -1,0 +1,150 @@
+"""Write a copy of an OpenDRIVE map with only what SUMO's netconvert reads, and as netconvert expects it.
+
+netconvert (1.28) knows a projection only as a PROJ string with ``+proj=``; ignores the heading of the header's offset;
+imports parking and other lanes that no traffic uses; takes lanes in their order, whatever their ids; and, for left-hand
+traffic, expects the ids of lanes of right-hand traffic, which it draws on the other side of the reference line. What it
+need not know is left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+from xml.etree.ElementTree import Element, tostring
+
+from egvs.formats import xml
+
+_ROAD_PARTS = frozenset({"link", "type", "planView", "elevationProfile", "lanes", "signals"})
+_PARTS = frozenset({"header", "road", "junction", "controller"})
+_IGNORED_TYPE = "none"
+_SWAPPED_CHANGES = {"increase": "decrease", "decrease": "increase"}
+
+
+@dataclass(frozen=True)
+class CopyOptions:
+    """What a copy changes.
+
+    Attributes
+    ----------
+    reference
+        The text of ``<geoReference>``. If it is empty, the header's offset is left out.
+    rotation_rad
+        Angle by which the plan is turned about the origin, counter-clockwise.
+    swap_lanes
+        Whether the ids of lanes change their sign.
+    keeps_type
+        Whether a lane of this type is imported.
+    """
+
+    reference: str
+    rotation_rad: float
+    swap_lanes: bool
+    keeps_type: Callable[[str], bool]
+
+
+def write_copy(path: Path, to: Path, options: CopyOptions) -> None:
+    """Write a copy of a map that :func:`egvs.extensions.maps.formats.opendrive.read_opendrive` has read."""
+    with to.open("wb") as file:
+        file.write(b'<?xml version="1.0" encoding="UTF-8"?>\n<OpenDRIVE>\n')
+        for element in xml.iter_elements(path, ""):
+            for inner in element.iter():
+                inner.tag = inner.tag.rpartition("}")[2]
+            if element.tag in _PARTS:
+                _change(element, options)
+                _write(element, file)
+        file.write(b"</OpenDRIVE>\n")
+
+
+def _write(element: Element, file: IO[bytes]) -> None:
+    element.tail = "\n"
+    file.write(tostring(element, encoding="utf-8", xml_declaration=False))
+
+
+def _change(element: Element, options: CopyOptions) -> None:
+    match element.tag:
+        case "header":
+            _change_header(element, options)
+        case "road":
+            _change_road(element, options)
+        case "junction" if options.swap_lanes:
+            for link in element.iter("laneLink"):
+                _negate(link, "from")
+                _negate(link, "to")
+
+
+def _change_header(header: Element, options: CopyOptions) -> None:
+    for child in list(header):
+        if child.tag != "offset" or not options.reference:
+            header.remove(child)
+    if options.reference:
+        reference = Element("geoReference")
+        reference.text = options.reference
+        header.insert(0, reference)
+    offset = header.find("offset")
+    if offset is not None:
+        offset.set("hdg", "0")
+        for key in ("x", "y", "z"):
+            offset.set(key, offset.get(key, "0"))
+
+
+def _change_road(road: Element, options: CopyOptions) -> None:
+    for child in list(road):
+        if child.tag not in _ROAD_PARTS:
+            road.remove(child)
+    road.attrib.pop("rule", None)
+    for lane in road.iter("lane"):
+        if not options.keeps_type(lane.get("type", _IGNORED_TYPE)):
+            lane.set("type", _IGNORED_TYPE)
+    if options.rotation_rad:
+        for geometry in road.iter("geometry"):
+            _rotate(geometry, options.rotation_rad)
+    if options.swap_lanes:
+        _swap_lanes(road)
+    _sort_lanes(road)
+
+
+def _rotate(geometry: Element, angle_rad: float) -> None:
+    x, y, heading = (float(geometry.attrib[key]) for key in ("x", "y", "hdg"))
+    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
+    turned = {"x": x * cos - y * sin, "y": x * sin + y * cos, "hdg": heading + angle_rad}
+    for key, value in turned.items():
+        geometry.set(key, repr(value))
+
+
+def _sort_lanes(road: Element) -> None:
+    """Put lanes on the side of their id, from the left to the right: netconvert goes by their order."""
+    for section in road.iter("laneSection"):
+        lanes = sorted(section.iter("lane"), key=lambda lane: -int(lane.attrib["id"]))
+        section[:] = []
+        for tag, sign in (("left", 1), ("center", 0), ("right", -1)):
+            side = Element(tag)
+            side.extend(lane for lane in lanes if _sign(int(lane.attrib["id"])) == sign)
+            if len(side):
+                section.append(side)
+
+
+def _sign(number: int) -> int:
+    return (number > 0) - (number < 0)
+
+
+def _swap_lanes(road: Element) -> None:
+    for lane in road.iter("lane"):
+        _negate(lane, "id")
+        for link in lane.iterfind("link/*"):
+            _negate(link, "id")
+        for mark in lane.iterfind("roadMark"):
+            change = mark.get("laneChange", "")
+            if change in _SWAPPED_CHANGES:
+                mark.set("laneChange", _SWAPPED_CHANGES[change])
+    for validity in road.iter("validity"):
+        _negate(validity, "fromLane")
+        _negate(validity, "toLane")
+
+
+def _negate(element: Element, key: str) -> None:
+    value = element.get(key)
+    if value is not None:
+        element.set(key, str(-int(value)))

@@ -1,0 +1,1 @@
+"""Terrain from rasters, LandXML and CityGML."""

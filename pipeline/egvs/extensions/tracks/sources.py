@@ -1,0 +1,131 @@
+"""Find the reader of a file of recorded tracks: entry points of the group ``egvs.tracks``."""
+
+from __future__ import annotations
+
+import gzip
+import zlib
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from egvs.core import files, plugins
+from egvs.core.errors import InputError
+from egvs.extensions.tracks import user_table
+from egvs.extensions.tracks.model import HEAD_BYTES, TrackReader, Tracks
+from egvs.scenario.track_columns import TrackColumns
+
+GROUP = "egvs.tracks"
+
+_GZIP = b"\x1f\x8b"
+
+
+def find_reader(path: Path) -> TrackReader:
+    """Return the reader of a file, the first in the order of names that accepts it.
+
+    Raises
+    ------
+    InputError
+        When the file does not exist, or no reader accepts it.
+    """
+    reader = _find(path)
+    if reader is None:
+        raise InputError(path, "the format of the tracks is unknown", _format_hint())
+    return reader
+
+
+def can_read(path: Path) -> bool:
+    """Return whether a reader accepts a file; InputError when it does not exist."""
+    return _find(path) is not None
+
+
+def _format_hint() -> str:
+    return f"Formats: {describe_formats()}. For your own table, name its columns in [traffic.track_columns]."
+
+
+def _find(path: Path) -> TrackReader | None:
+    head = _read_head(path)
+    for name in plugins.plugin_names(GROUP):
+        reader: TrackReader = plugins.load_plugin(GROUP, name)
+        if reader.can_open(path, head):
+            return reader
+    return None
+
+
+@dataclass(frozen=True)
+class TrackSource:
+    """Files of recorded tracks on one clock, and how to read them.
+
+    Attributes
+    ----------
+    paths
+        Files with tracks.
+    columns
+        Meaning of their columns, where they are a user's own tables; None for files in a known format.
+    crs
+        Coordinate system instead of the one of the format; "world" for the world frame; None for that of the format.
+    """
+
+    paths: tuple[Path, ...]
+    columns: TrackColumns | None = None
+    crs: str | None = None
+
+    def companions(self) -> list[Path]:
+        """Return the files beside the tracks that their readers need."""
+        if self.columns is not None:
+            return []
+        companions: dict[Path, None] = {}
+        for path in self.paths:
+            companions |= dict.fromkeys(find_reader(path).companions(path))
+        return [path for path in companions if path not in self.paths]
+
+    def reader_modules(self) -> list[str]:
+        """Return the modules that read the files."""
+        if self.columns is not None:
+            return [user_table.__name__]
+        return sorted({find_reader(path).__name__ for path in self.paths})
+
+    def read(self) -> list[Tracks]:
+        """Read each file; one that was read before is read again only when it has changed.
+
+        Raises
+        ------
+        InputError
+            When a file is damaged, or has no row with a time and a position.
+        """
+        key = None if self.columns is None else self.columns.model_dump_json()
+        modified_ns = tuple(path.stat().st_mtime_ns for path in (*self.paths, *self.companions()))
+        return [_read_file(path, modified_ns, key) for path in self.paths]
+
+
+@lru_cache(maxsize=8)
+def _read_file(path: Path, _modified_ns: tuple[int, ...], columns: str | None) -> Tracks:
+    """Read a file, by the JSON of the columns of a user's own table."""
+    if columns is None:
+        tracks = find_reader(path).read(path)
+    else:
+        tracks = user_table.read(path, TrackColumns.model_validate_json(columns))
+    if not (np.isfinite(tracks.time_s) & np.isfinite(tracks.x_m) & np.isfinite(tracks.y_m)).any():
+        raise InputError(path, "contains no row with a time and a position", "Use a file with at least one track.")
+    return tracks
+
+
+def describe_formats() -> str:
+    """Return the names of the formats that can be read."""
+    return ", ".join(plugins.load_plugin(GROUP, name).NAME for name in plugins.plugin_names(GROUP))
+
+
+def _read_head(path: Path) -> bytes:
+    """Return the first bytes of a file, after gunzip where possible."""
+    if not path.is_file():
+        raise InputError(path, "no such file", "Check the path.")
+    with files.open_input(path) as content:
+        head: bytes = content.read(HEAD_BYTES)
+    if not head.startswith(_GZIP):
+        return head
+    try:
+        with files.open_input(path) as content, gzip.open(content) as unzipped:
+            return unzipped.read(HEAD_BYTES)
+    except (EOFError, OSError, zlib.error):  # damaged: its reader says so
+        return head

@@ -1,0 +1,176 @@
+"""``egvs validate``, ``clouds``, ``scores`` and ``train``: does a score predict what detectors find?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from egvs.cli import options, sources
+from egvs.cli.options import Jobs, Out, ScenarioPath, Set, SettingsPath
+from egvs.core.errors import InputError, MissingBackendError
+
+DEFAULT_FRAMES = 250
+"""Frames of a validation or a dataset."""
+
+_FRAMES_HELP = "Number of frames of held-out traffic."
+
+Spacing = Annotated[
+    float | None,
+    typer.Option(
+        metavar="SECONDS", help="Minimum time between two frames. [default: 7, or what the traffic allows, at least 2]"
+    ),
+]
+
+
+def validate(
+    scenario: SettingsPath,
+    out: Out = None,
+    set_: Set = None,
+    frames: Annotated[int, typer.Option(min=10, help=_FRAMES_HELP)] = DEFAULT_FRAMES,
+    spacing: Spacing = None,
+    detector: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME,NAME", help="Detectors to run: points, cluster, pointpillars, range_image, or a plug-in."
+        ),
+    ] = "points,cluster",
+    detections: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="KITTI results of other detectors: DIR/SITE/DETECTOR/FRAME.txt."),
+    ] = None,
+    keep: Annotated[
+        bool, typer.Option("--keep", help="Also write ground truth and detections as KITTI labels and results.")
+    ] = False,
+    plan: Annotated[
+        bool,
+        typer.Option(
+            "--plan",
+            help="Validate this run's plan (egvs place), in the fused clouds of its first 1, 2, ... sensors.",
+        ),
+    ] = False,
+    plan_from: Annotated[
+        Path | None, typer.Option("--plan-from", metavar="DIR", help="Validate the plan in another run's folder.")
+    ] = None,
+    jobs: Jobs = None,
+) -> None:
+    """Simulate detection from each site, and test which score predicts it; or validate a plan."""
+    from egvs.cli.console import ProgressDisplay
+
+    of_plan = plan or plan_from is not None
+    if of_plan and (detections is not None or keep):
+        option = "--keep" if keep else "--detections"
+        raise InputError(option, "not available with a plan", f"Omit {option}, or omit --plan and --plan-from.")
+    detectors = [name.strip() for name in detector.split(",") if name.strip()]
+    loaded, folder = sources.open_source(scenario, set_, out)
+    with ProgressDisplay("validate") as screen:
+        from egvs.extensions.validation import plan_validation, site_validation
+        from egvs.extensions.validation import tables as validation_tables
+        from egvs.extensions.validation.held_out_traffic import FrameSampling
+        from egvs.extensions.validation.kitti_results import KittiFiles
+
+        sampling = FrameSampling(frames, spacing)
+        if of_plan:
+            plan_result = plan_validation.validate_plan(
+                loaded, folder, plan_from or folder, sampling=sampling, detectors=detectors, jobs=jobs,
+                progress=screen.progress, listener=validation_tables.PlanRunDisplay(screen.say),
+            )  # fmt: skip
+        else:
+            validation = site_validation.validate_sites(
+                loaded, folder, sampling=sampling, detectors=detectors, kitti=KittiFiles(detections, keep), jobs=jobs,
+                progress=screen.progress, listener=validation_tables.DetectorRunDisplay(screen.say),
+            )  # fmt: skip
+    if of_plan:
+        validation_tables.print_plan_validation(plan_result)
+    else:
+        validation_tables.print_validation(loaded, folder, validation)
+
+
+def clouds(
+    scenario: ScenarioPath,
+    out: Annotated[Path, typer.Option("--out", metavar="DIR", help="A new or empty folder.")],
+    site: Annotated[
+        list[str] | None, typer.Option(metavar="SITE", help="Only this site (repeatable); all by default.")
+    ] = None,
+    frames: Annotated[int, typer.Option(min=1, help=_FRAMES_HELP)] = DEFAULT_FRAMES,
+    spacing: Spacing = None,
+    kind: Annotated[str, typer.Option("--format", metavar="FORMAT", help="kitti, openpcdet, ply or pcd.")] = "kitti",
+    set_: Set = None,
+    jobs: Jobs = None,
+) -> None:
+    """Write labelled point clouds with traffic, for use with any detector."""
+    from egvs.cli.console import ProgressDisplay
+    from egvs.extensions.validation import tables as validation_tables
+    from egvs.extensions.validation.dataset import write_dataset
+    from egvs.scenario.loading import load
+
+    loaded = load(scenario, set_ or ())
+    with ProgressDisplay("clouds") as screen:
+        dataset = write_dataset(
+            loaded,
+            out,
+            sites=site or (),
+            frames=frames,
+            spacing_s=spacing,
+            kind=kind,
+            jobs=jobs,
+            progress=screen.progress,
+        )
+    validation_tables.print_export(dataset)
+
+
+def scores() -> None:
+    """Print the scores that a validation compares: formula, whether higher or lower is better, and source."""
+    from egvs.extensions.validation import surrogates
+    from egvs.extensions.validation import tables as validation_tables
+
+    validation_tables.print_scores(surrogates.score_catalogue())
+
+
+def train(
+    scenarios: Annotated[list[Path], typer.Argument(metavar="SCENARIO...", help="One or more training junctions.")],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The model file to write, .onnx.")],
+    set_: Set = None,
+    steps: Annotated[int, typer.Option(min=10, help="Training steps, each on 8 crops of sweeps.")] = 3000,
+    frames: Annotated[int, typer.Option(min=10, help="Training frames per junction.")] = 400,
+    heights: Annotated[
+        str, typer.Option(metavar="LOW,HIGH", help="Range of mounting heights, in metres above the ground.")
+    ] = "2,8",
+    convention: Annotated[
+        str, typer.Option(help="Origin of point heights: ground, or sensor (as for detectors on cars).")
+    ] = "ground",
+    seed: Annotated[int, typer.Option(min=0, help="Seed for traffic, poses, samples and initial weights.")] = 1,
+    jobs: Jobs = None,
+) -> None:
+    """Train the PointPillars detector on simulated sweeps of junctions (needs the extra `train`)."""
+    from egvs.cli.console import ProgressDisplay
+    from egvs.core import files, plugins
+    from egvs.extensions.validation import tables as validation_tables
+    from egvs.scenario.loading import load
+
+    model = options.model_file(out)
+    plugins.require_libraries("training", "train", "torch", "onnx", "onnxscript", "onnxruntime")
+    try:
+        from egvs.extensions.validation.training import train
+    except ImportError as error:
+        raise MissingBackendError(f"training cannot start: {error}. Run pip install 'egvs[train]'") from None
+
+    if convention not in ("ground", "sensor"):
+        raise InputError("--convention", f"expected ground or sensor, got {convention!r}", "Use --convention ground.")
+    recipe = train.Recipe(
+        steps=steps,
+        frames=frames,
+        heights_m=options.heights_m(heights),
+        seed=seed,
+        convention="sensor" if convention == "sensor" else "ground",
+    )
+    loaded = [load(path, set_ or ()) for path in scenarios]
+    files.ensure_writable_folder(model)
+    with ProgressDisplay("train") as screen:
+        metadata = train.train(loaded, model, recipe, jobs=jobs, progress=screen.progress)
+    validation_tables.print_training(model, metadata)
+
+
+VERBS = (validate, clouds, scores, train)
+"""In the order of the help."""

@@ -1,0 +1,384 @@
+r"""The best mount of each sensor, and what one more percentage point of vehicles found costs.
+
+Sensor i has the cost :math:`c_i` (with its pole and height, as ``[costs]`` says), and its best mount the score
+:math:`s_i`, a share. Compared with the cheapest sensor b, one more percentage point costs
+
+.. math:: \frac{c_i - c_b}{100 \, (s_i - s_b)}
+
+This is undefined where sensor i finds no more than b, and not stated where it is not clear which of them finds more.
+The same is computed for the best of all sensors that are cheaper than i: a large gain over the cheapest can hide that
+the last step costs much and adds little. Without costs, the sensor that finds least takes the place of the cheapest.
+
+:attr:`SensorComparison.evidence` says how well scores of different sensors predict detection.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from statistics import NormalDist
+
+from egvs.artefacts.readers import DISTINCT_PROBABILITY
+from egvs.results.labels import SCORE_LABELS, format_count
+from egvs.results.ranking import RankedSite
+from egvs.scenario.score_config import COST_COLUMN, DEFAULT_SCORE, CostsConfig
+
+SENSOR_EVIDENCE = (
+    "How far to trust this: in simulation, at six held-out junctions with twelve sensors, the mean of cluster and "
+    "pointpillars ranked sites nearly as three detectors do (rank correlation 0.93 to 0.98). But the first of a "
+    "ranking lost up to 8 points of AP, and 20 once; shares found with OS0-128 and OS1-64 are 6 to 9 points higher "
+    "than expected. Do not decide between sensors by less than about 10 points, nor by the cost of one more point. "
+    "See docs/validity.md."
+)
+"""What is known about rankings of sensors by the recommended score (docs/validity.md)."""
+
+_NO_EVIDENCE = (
+    "How far to trust this: whether {} ranks different sensors as detectors do was not measured; docs/validity.md has "
+    "a measurement for {}."
+)
+
+_RANGE_NOTE = (
+    "Ranges on dark vehicles are not modelled: sensors with a short rated range look better than they are. Try --set "
+    "effects.range_limit={}."
+)
+
+_PROBABILITY_DIGITS = 6
+"""The last bits of a distribution function depend on the machine."""
+
+
+def range_note(sensors: Iterable[str], *, is_modelled: bool) -> str:
+    """Return a sentence where sensors are compared without their range on dark vehicles; empty otherwise.
+
+    Parameters
+    ----------
+    sensors
+        Names of the sensors.
+    is_modelled
+        Whether the effect ``range_limit`` is enabled in all runs.
+    """
+    if is_modelled or len(set(sensors)) < 2:
+        return ""
+    return _RANGE_NOTE
+
+
+@dataclass(frozen=True)
+class ScoreDifference:
+    """A score minus another.
+
+    Attributes
+    ----------
+    value
+        The difference.
+    se
+        Its standard error; None if unknown.
+    better
+        Probability that the first score is truly higher; None if unknown.
+    is_paired
+        Whether both scores come from the same traffic, so that their common scatter cancels in the error.
+    """
+
+    value: float
+    se: float | None = None
+    better: float | None = None
+    is_paired: bool = False
+
+    @classmethod
+    def of_independent(cls, first: RankedSite, second: RankedSite) -> ScoreDifference:
+        """Return the difference of two sites, with the error that it has if their errors are independent."""
+        value = first.score - second.score
+        if first.score_se is None or second.score_se is None:
+            return cls(value)
+        se = math.hypot(first.score_se, second.score_se)
+        if se > 0.0:
+            better = NormalDist().cdf(value / se)
+        else:
+            better = 0.5 * (1.0 + math.copysign(1.0, value)) if value else 0.5
+        return cls(value, se, round(better, _PROBABILITY_DIGITS))
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether it is known which score is higher, or errors are unknown."""
+        if self.better is None:
+            return True
+        return max(self.better, 1.0 - self.better) >= DISTINCT_PROBABILITY
+
+
+@dataclass(frozen=True)
+class SensorMount:
+    """The best mount of a sensor in a run.
+
+    Attributes
+    ----------
+    run
+        Label of the run; empty where there is only one.
+    site
+        The best site with this sensor.
+    cost
+        Its cost; None if unknown.
+    """
+
+    run: str
+    site: RankedSite
+    cost: float | None
+
+    @property
+    def sensor(self) -> str:
+        """Name of the sensor."""
+        return self.site.sensor
+
+
+def best_mounts(sites: Iterable[RankedSite], costs: CostsConfig, run: str = "") -> tuple[SensorMount, ...]:
+    """Return the best mount of each sensor.
+
+    Parameters
+    ----------
+    sites
+        Sites in the order of their ranks.
+    costs
+        Costs of the scenario.
+    run
+        Label of the run.
+    """
+    best: dict[str, RankedSite] = {}
+    for site in sites:
+        best.setdefault(site.sensor, site)
+    return tuple(SensorMount(run, site, site_cost(site, costs)) for site in best.values())
+
+
+def site_cost(site: RankedSite, costs: CostsConfig) -> float | None:
+    """Return the cost of a site, from its column ``cost`` or ``[costs]``; None if that of its sensor is unknown."""
+    text = dict(site.user_columns).get(COST_COLUMN)
+    if text:
+        try:
+            cost = float(text)
+        except ValueError:
+            return None
+        return cost if 0.0 <= cost < math.inf else None
+    if site.sensor not in costs.sensor:
+        return None
+    return costs.of_mount(site.sensor, site.z_m)
+
+
+@dataclass(frozen=True)
+class SensorGain:
+    """A mount compared with a cheaper one.
+
+    Attributes
+    ----------
+    difference
+        Its score minus that of the cheaper one.
+    cost_per_point
+        Cost of one more percentage point; None where it is undefined, not clear or unknown.
+    """
+
+    difference: ScoreDifference
+    cost_per_point: float | None
+
+    @classmethod
+    def of(cls, mount: SensorMount, cheaper: SensorMount, difference: ScoreDifference) -> SensorGain:
+        """Return the gain of a mount over a cheaper one, from the difference of their scores."""
+        if mount.cost is None or cheaper.cost is None or not mount.site.by.is_share:
+            return cls(difference, None)
+        if difference.value <= 0.0 or not difference.is_clear:
+            return cls(difference, None)
+        return cls(difference, (mount.cost - cheaper.cost) / (100.0 * difference.value))
+
+    @property
+    def cost_text(self) -> str:
+        """The cost of one more percentage point, or why there is none."""
+        if self.cost_per_point is not None:
+            return format_count(self.cost_per_point)
+        if not self.difference.is_clear:
+            return "not clear"
+        return "no gain" if self.difference.value <= 0.0 else "-"
+
+
+@dataclass(frozen=True)
+class SensorResult:
+    """A sensor compared with the baseline.
+
+    Attributes
+    ----------
+    mount
+        Its best mount.
+    gain
+        Compared with the baseline; None for the baseline.
+    step
+        Compared with the best of all cheaper ones; None for the baseline, and where a cost is unknown.
+    """
+
+    mount: SensorMount
+    gain: SensorGain | None = None
+    step: SensorGain | None = None
+
+    @property
+    def cost_text(self) -> str:
+        """The cost of the mount."""
+        return "-" if self.mount.cost is None else format_count(self.mount.cost)
+
+    @property
+    def gain_text(self) -> str:
+        """The gain with its standard error: in percentage points for shares; ``~`` marks one that is not clear."""
+        return "-" if self.gain is None else format_difference(self.gain.difference, self.mount.site)
+
+    @property
+    def cost_per_point_text(self) -> str:
+        """The cost of one more percentage point than the baseline."""
+        if self.gain is None or self.mount.cost is None:
+            return "-"
+        return self.gain.cost_text
+
+    @property
+    def step_cost_text(self) -> str:
+        """The cost of one more percentage point than the best cheaper mount."""
+        return "-" if self.step is None else self.step.cost_text
+
+
+@dataclass(frozen=True)
+class SensorComparison:
+    """The best mount of each sensor, the baseline first: the cheapest, or that finding least with fewer than two costs.
+
+    Attributes
+    ----------
+    results
+        By cost, followed by those without a cost by score; all by score with fewer than two costs.
+    has_costs
+        Whether at least two costs are known, so that they can be compared.
+    """
+
+    results: tuple[SensorResult, ...]
+    has_costs: bool
+
+    @classmethod
+    def of(
+        cls, mounts: Sequence[SensorMount], difference: Callable[[SensorMount, SensorMount], ScoreDifference]
+    ) -> SensorComparison | None:
+        """Compare sensors; None for fewer than two.
+
+        Parameters
+        ----------
+        mounts
+            Best mounts; several of one sensor if there are several runs.
+        difference
+            Returns the score of the first mount minus that of the second.
+        """
+        if len({mount.sensor for mount in mounts}) < 2:
+            return None
+        has_costs = sum(mount.cost is not None for mount in mounts) > 1
+
+        def order(mount: SensorMount) -> tuple[float, float]:
+            if not has_costs:
+                return mount.site.score, 0.0
+            if mount.cost is None:
+                return math.inf, mount.site.score
+            return mount.cost, -mount.site.score
+
+        baseline, *others = sorted(mounts, key=order)
+        best_cheaper = baseline
+        results = [SensorResult(baseline)]
+        for mount in others:
+            gain = SensorGain.of(mount, baseline, difference(mount, baseline))
+            step = None
+            if has_costs and mount.cost is not None:
+                step = SensorGain.of(mount, best_cheaper, difference(mount, best_cheaper))
+            results.append(SensorResult(mount, gain, step))
+            if mount.site.score > best_cheaper.site.score:
+                best_cheaper = mount
+        return cls(tuple(results), has_costs)
+
+    @classmethod
+    def of_run(cls, sites: Sequence[RankedSite], costs: CostsConfig) -> SensorComparison | None:
+        """Compare the sensors of one run, whose sites are by rank; errors of differences as if independent."""
+        return cls.of(
+            best_mounts(sites, costs), lambda mount, other: ScoreDifference.of_independent(mount.site, other.site)
+        )
+
+    @property
+    def baseline(self) -> SensorMount:
+        """The mount that the others are compared with."""
+        return self.results[0].mount
+
+    @property
+    def baseline_name(self) -> str:
+        """The sensor of the baseline, and its run if a sensor is in several runs, e.g. "VLP-16 of A"."""
+        if len(self.results) > len(self.sensors):
+            return f"{self.baseline.sensor} of {self.baseline.run}"
+        return self.baseline.sensor
+
+    @property
+    def has_yaw_or_pitch(self) -> bool:
+        """Whether a mount is turned or tilted."""
+        return any(result.mount.site.yaw_deg or result.mount.site.pitch_deg for result in self.results)
+
+    @property
+    def explanation(self) -> str:
+        """What the difference, and the cost of one more point, refer to."""
+        kind = "the cheapest" if self.has_costs else "which finds least"
+        unpriced = ""
+        if self.has_costs and self.unpriced:
+            kind = "the cheapest with a known cost"
+            unpriced = f" Without a known cost: {', '.join(self.unpriced)}."
+        return (
+            f"Differences from {self.baseline_name} ({kind}) are in {difference_unit(self.baseline.site)}, ± their "
+            f"standard error; ~ it is not clear which is better.{unpriced}"
+        )
+
+    @property
+    def evidence(self) -> str:
+        """What is known about rankings of sensors by this score."""
+        by = self.baseline.site.by
+        if by.name == DEFAULT_SCORE:
+            return SENSOR_EVIDENCE
+        return _NO_EVIDENCE.format(by.noun, SCORE_LABELS[DEFAULT_SCORE].noun)
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of the sensors."""
+        return tuple(dict.fromkeys(result.mount.sensor for result in self.results))
+
+    @property
+    def unpriced(self) -> tuple[str, ...]:
+        """Names of the sensors whose cost is unknown."""
+        return tuple(dict.fromkeys(result.mount.sensor for result in self.results if result.mount.cost is None))
+
+    @property
+    def shows_cost_per_point(self) -> bool:
+        """Whether one more percentage point can have a cost: costs are known, and the score is a share."""
+        return self.has_costs and self.baseline.site.by.is_share
+
+    @property
+    def has_steps(self) -> bool:
+        """Whether some mount has a better cheaper one than the baseline."""
+        return any(result.step is not None and result.step != result.gain for result in self.results)
+
+
+def format_difference(difference: ScoreDifference, site: RankedSite) -> str:
+    """Return a difference of scores with its standard error, e.g. "+3.1 ± 0.4" percentage points.
+
+    Parameters
+    ----------
+    difference
+        The difference.
+    site
+        One of the two sites, whose score has the unit: percentage points for a share, else that of the score.
+    """
+    label = site.by
+    factor, digits = (100.0, 1) if label.is_share else (1.0, label.digits)
+    text = f"{factor * difference.value:+z,.{digits}f}"
+    if difference.se is not None:
+        text += f" ± {factor * difference.se:,.{digits}f}"
+    return text if difference.is_clear else f"~ {text}"
+
+
+def difference_unit(site: RankedSite) -> str:
+    """Return the unit of differences of the score by which a site is ranked."""
+    if site.by.is_share:
+        return "percentage points"
+    return site.by.unit or f"units of {site.by.noun}"
+
+
+def costs_option(sensors: Iterable[str]) -> str:
+    """Return the option that sets the costs of sensors, with a word in place of each price."""
+    prices = ", ".join(f'"{name}" = PRICE' for name in sensors)
+    return f"--set 'costs.sensor={{{prices}}}'"

@@ -1,0 +1,62 @@
+"""Object classes by vClass; detections and point counts in their files."""
+
+import tomllib
+
+import numpy as np
+import pytest
+
+from egvs.clouds import simulation as cloud_simulation
+from egvs.clouds import sweeps
+from egvs.clouds.sweeps import CAR_VCLASSES, DetectedBoxes, Detections, PointCounts
+from egvs.core.errors import InputError
+
+
+def test_every_vclass_with_body_has_class():
+    known = tomllib.loads(cloud_simulation.BODIES_FILE.read_text())["classes"]
+    assert {name for name in known if sweeps.object_class(name) == "Misc"} == set()
+    assert {name for name in known if sweeps.object_class(name) == "Car"} == CAR_VCLASSES
+    assert {sweeps.object_class(name) for name in known} | {"Trailer", "Misc"} == set(sweeps.CLASSES)
+
+
+def test_rear_parts_are_trailers_except_of_buses():
+    assert [sweeps.object_class("truck", part) for part in (0, 1)] == ["Truck", "Trailer"]
+    assert [sweeps.object_class("bus", part) for part in (0, 1)] == ["Bus", "Bus"]
+    assert sweeps.object_class("ship") == "Misc"
+
+
+def _same(detections, again):
+    assert len(detections.frames) == len(again.frames)
+    for one, other in zip(detections.frames, again.frames, strict=True):
+        np.testing.assert_array_equal(one.boxes, other.boxes)
+        np.testing.assert_array_equal(one.scores, other.scores)
+        assert other.boxes.shape == (len(other.scores), 7)
+
+
+@pytest.mark.parametrize("counts", [[2, 0, 1], [0, 0, 3], [3, 0, 0], [0, 0, 0], [1]])
+def test_points_survive_file(tmp_path, counts):
+    detections = PointCounts(tuple(np.arange(count, dtype=np.int64) * 7 for count in counts))
+    detections.write(tmp_path / "points.parquet", {"inputs": "x"})
+    again = PointCounts.read(tmp_path / "points.parquet")
+    assert [entry.tolist() for entry in again.points] == [entry.tolist() for entry in detections.points]
+
+
+@pytest.mark.parametrize("counts", [[2, 0, 1], [0, 0, 3], [3, 0, 0], [0, 0, 0], [1]])
+def test_boxes_survive_file(tmp_path, counts):
+    random = np.random.default_rng(1)
+    detections = DetectedBoxes(tuple(Detections(random.normal(size=(n, 7)), random.uniform(size=n)) for n in counts))
+    detections.write(tmp_path / "detections.parquet", {"inputs": "x"})
+    _same(detections, DetectedBoxes.read(tmp_path / "detections.parquet"))
+
+
+def test_equal_detections_have_equal_bytes(tmp_path):
+    detections = DetectedBoxes((Detections(np.ones((2, 7)), np.ones(2)), Detections.empty()))
+    for name in "ab":
+        detections.write(tmp_path / name, {"inputs": "x"})
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+
+
+def test_rejects_file_of_other_artefact(tmp_path):
+    path = tmp_path / "points.parquet"
+    DetectedBoxes((Detections.empty(),)).write(path, {"inputs": "x"})
+    with pytest.raises(InputError, match=r"points.parquet: the column 'points' is missing"):
+        PointCounts.read(path)

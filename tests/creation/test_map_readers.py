@@ -1,0 +1,108 @@
+"""Which reader opens a map file, and what a set of files is rejected for."""
+
+import gzip
+from pathlib import Path
+
+import pytest
+
+from egvs.core import files
+from egvs.core.errors import InputError
+from egvs.creation import map_readers, sumo_network
+from egvs.creation.openstreetmap import reader as openstreetmap
+
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
+NETWORK = SCENARIOS / "roundabout" / "network.net.xml"
+SMALL = Path(__file__).parent / "data" / "small.osm"
+
+
+def test_finds_readers_by_name_and_content(tmp_path: Path) -> None:
+    renamed = tmp_path / "roads.xml"
+    renamed.write_bytes(NETWORK.read_bytes())
+    packed = tmp_path / "packed.xml.gz"
+    packed.write_bytes(gzip.compress(NETWORK.read_bytes()))
+    for path in (NETWORK, renamed, packed):
+        assert map_readers.find_reader(path) is sumo_network
+    assert map_readers.find_reader(SMALL) is openstreetmap
+
+
+def test_openstreetmap_with_another_road_map_has_static_objects_only() -> None:
+    maps = map_readers.open_maps([SMALL, NETWORK])
+    assert maps.roads.path == NETWORK
+    assert [file.path for file in maps.solids] == [SMALL]
+
+
+def test_folder_stands_for_its_maps(tmp_path: Path) -> None:
+    (tmp_path / "roads.net.xml").write_bytes(NETWORK.read_bytes())
+    (tmp_path / "notes.txt").write_text("not a map")
+    assert map_readers.list_files([tmp_path]) == [tmp_path / "roads.net.xml"]
+
+
+@pytest.mark.parametrize(
+    ("names", "problem"),
+    [
+        ((), "no road map"),
+        (("a.net.xml", "b.net.xml"), "expected one road map"),
+        (("a.net.xml", "photo.jpg"), "format of the file is unknown"),
+        (("a.net.xml", "missing.gml"), "no such file"),
+    ],
+)
+def test_rejects_files(tmp_path: Path, names: tuple[str, ...], problem: str) -> None:
+    for name in names:
+        if name.endswith(".net.xml"):
+            (tmp_path / name).write_bytes(NETWORK.read_bytes())
+        if name.endswith(".jpg"):
+            (tmp_path / name).write_bytes(b"\xff\xd8\xff")
+    with pytest.raises(InputError, match=problem):
+        map_readers.open_maps([tmp_path / name for name in names])
+
+
+def test_rejects_truncated_file_in_folder_by_name(tmp_path: Path, run_egvs) -> None:
+    """Also if it is not needed: what it would add is unknown."""
+    (tmp_path / "maps").mkdir()
+    (tmp_path / "maps" / "roads.net.xml").write_bytes(NETWORK.read_bytes())
+    (tmp_path / "maps" / "town.osm.gz").write_bytes(gzip.compress(SMALL.read_bytes())[:-200])
+    code, _, error = run_egvs("new", tmp_path / "made", "--from", tmp_path / "maps")
+    assert code == 2 and f"{tmp_path / 'maps' / 'town.osm.gz'}: damaged gzip file" in error and "Traceback" not in error
+    assert not (tmp_path / "made").exists()
+
+
+def test_rejects_unreadable_file_in_folder_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "locked.gml").write_text("<CityModel/>")
+    real = files.open_input
+
+    def open_input(path: Path) -> object:
+        if path.name == "locked.gml":
+            raise PermissionError(13, "Permission denied", str(path))
+        return real(path)
+
+    monkeypatch.setattr(files, "open_input", open_input)
+    with pytest.raises(InputError, match=r"locked.gml: the file cannot be read \(Permission denied\)"):
+        map_readers.list_files([tmp_path])
+
+
+def test_surface_model_has_heights(tmp_path: Path) -> None:
+    (tmp_path / "surface.asc").write_text("ncols 2")
+    (file,) = map_readers.open_surface([tmp_path / "surface.asc"])
+    assert file.reader.NAME == "GeoTIFF or ASCII grid"
+    with pytest.raises(InputError, match=r"small.osm: expected a surface model, got OpenStreetMap"):
+        map_readers.open_surface([SMALL])
+
+
+def test_rejects_folder_without_maps(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no map that can be read"):
+        map_readers.list_files([tmp_path])
+
+
+def test_network_made_from_openstreetmap_is_a_network(tmp_path: Path) -> None:
+    """netconvert names the option ``osm-files`` in a comment at the top of the network."""
+    path = tmp_path / "roads.xml"
+    head, root, rest = NETWORK.read_text(encoding="utf-8").partition("<net ")
+    path.write_text(f'{head}<!-- <osm-files value="town.osm"/> -->\n{root}{rest}', encoding="utf-8")
+    assert map_readers.find_reader(path) is sumo_network
+
+
+@pytest.mark.parametrize(("faces", "reader"), [(0, "point cloud"), (1, "triangle mesh")])
+def test_ply_is_a_mesh_if_it_has_faces(tmp_path: Path, faces: int, reader: str) -> None:
+    path = tmp_path / "a.ply"
+    path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\nelement face %d\nend_header\n" % faces)
+    assert reader == map_readers.find_reader(path).NAME

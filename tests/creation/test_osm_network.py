@@ -1,0 +1,108 @@
+"""Streets of an extract, cut at a circle around the junction."""
+
+import math
+from pathlib import Path
+
+import pytest
+
+from egvs.creation.openstreetmap import street_network
+from egvs.formats import osm
+from egvs.formats.osm import Bounds, OsmExtract, Way
+
+CENTRE = (52.0, 10.0)
+
+
+def node(east_m: float, north_m: float) -> tuple[float, float]:
+    """Latitude, longitude of a place beside the middle."""
+    lat = CENTRE[0] + math.degrees(north_m / street_network.EARTH_M)
+    return lat, CENTRE[1] + math.degrees(east_m / street_network.EARTH_M / math.cos(math.radians(CENTRE[0])))
+
+
+def extract(ways: dict[int, list[tuple[float, float]]], tags: dict[int, dict[str, str]] | None = None) -> OsmExtract:
+    """Streets through places in metres beside the middle; equal places are one node."""
+    places = list(dict.fromkeys(to_metres for way in ways.values() for to_metres in way))
+    nodes = {i: node(*point) for i, point in enumerate(places, 1)}
+    made = {
+        name: Way(
+            name,
+            tuple(places.index(point) + 1 for point in way),
+            (tags or {}).get(name, {"highway": "primary"}),
+        )
+        for name, way in ways.items()
+    }
+    return OsmExtract(nodes, {}, made, (), Bounds(51, 9, 53, 11), True)
+
+
+def lines_m(cut: OsmExtract) -> dict[int, list[tuple[float, float]]]:
+    """Where each way leads, metres beside the middle."""
+    shrink = math.cos(math.radians(CENTRE[0]))
+
+    def to_metres(lat: float, lon: float) -> tuple[float, float]:
+        east, north = math.radians(lon - CENTRE[1]) * shrink, math.radians(lat - CENTRE[0])
+        return round(east * street_network.EARTH_M, 1), round(north * street_network.EARTH_M, 1)
+
+    return {name: [to_metres(*cut.nodes[n]) for n in way.nodes] for name, way in cut.ways.items()}
+
+
+def test_streets_end_on_the_circle() -> None:
+    cut = street_network.cut_surroundings(
+        extract({7: [(-500, 0), (0, 0), (80, 0)], 8: [(0, -90), (0, 0), (0, 200)]}), CENTRE, 100
+    )
+    assert lines_m(cut) == {7: [(-100, 0), (0, 0), (80, 0)], 8: [(0, -90), (0, 0), (0, 100)]}
+
+
+def test_longer_piece_of_street_keeps_its_id() -> None:
+    way = [(-50, 0), (0, 0), (60, 0), (300, 0), (300, 80), (0, 80), (0, 70)]
+    joining = [(0, 0), (0, 70)]
+    cut = lines_m(street_network.cut_surroundings(extract({7: way, 9: joining}), CENTRE, 100))
+    assert cut == {7: [(-50, 0), (0, 0), (60, 0), (100, 0)], 9: joining, 10: [(60, 80), (0, 80), (0, 70)]}
+
+
+def test_cuts_street_across_circle_without_node_inside() -> None:
+    ways = {7: [(-300, 60), (300, 60)], 8: [(0, 0), (0, 50)]}
+    everything = lines_m(street_network.cut_surroundings(extract(ways, {8: {"highway": "footway"}}), CENTRE, 100))
+    assert everything[8] == ways[8]  # a path goes where it likes
+    assert everything[7] == [(-80, 60), (80, 60)]
+
+
+def test_drops_roads_connected_only_outside_circle() -> None:
+    ways = {7: [(0, 0), (300, 0)], 8: [(0, 60), (300, 60)], 9: [(300, 0), (300, 60)], 10: [(5, 5), (9, 5), (5, 9)]}
+    cut = street_network.cut_surroundings(extract(ways, {10: {"building": "yes"}}), CENTRE, 100)
+    assert lines_m(cut) == {7: [(0, 0), (100, 0)], 10: ways[10]}
+    assert street_network.cut_surroundings(extract(ways), CENTRE, 1000).ways.keys() >= {7, 8, 9}
+
+
+PROGRAMS = """<net version="1.20">
+  <edge id="in" from="a" to="j"><lane id="in_0" index="0" speed="9" length="9" shape="0,0 9,0"/></edge>
+  <tlLogic id="a" type="actuated" programID="0" offset="0">
+    <phase duration="42" maxDur="50" state="G"/><phase duration="3" state="y"/></tlLogic>
+  <tlLogic id="b" type="actuated" programID="0" offset="0">{}</tlLogic>
+</net>
+"""
+
+
+@pytest.mark.parametrize(("phases", "longest_s"), [(16, 272.0), (2, 45.0)])
+def test_longest_signal_program_counts_planned_durations(tmp_path: Path, phases: int, longest_s: float) -> None:
+    path = tmp_path / "n.net.xml"
+    path.write_text(PROGRAMS.format('<phase duration="17" minDur="5" maxDur="50" state="G"/>' * phases))
+    assert street_network.longest_program_s(path) == longest_s
+
+
+@pytest.mark.parametrize(("longest_s", "runs"), [(120.0, 1), (121.0, 2)])
+def test_signals_are_not_joined_if_a_program_gets_too_long(
+    monkeypatch: pytest.MonkeyPatch, longest_s: float, runs: int
+) -> None:
+    calls = []
+    convert = street_network.sumo.run_netconvert
+
+    def recorded(arguments: list[str], folder: Path, name: str) -> None:
+        calls.append(list(arguments))
+        convert(arguments, folder, name)
+
+    monkeypatch.setattr(street_network.sumo, "run_netconvert", recorded)
+    monkeypatch.setattr(street_network, "longest_program_s", lambda _: longest_s)
+    small = osm.read_osm(Path(__file__).parent / "data" / "small.osm")
+    flags = street_network.netconvert_flags(small, lefthand=False, walk=False)
+    street_network.build_network(small, Path("small.osm"), flags)
+    assert [("--tls.join" in arguments) for arguments in calls] == [True, False][:runs]
+    assert set(calls[0]) - set(calls[-1]) == ({"--tls.join"} if runs == 2 else set())

@@ -1,0 +1,248 @@
+"""Counts by street, side of arrival and turn: the numbers of a crossing that can be checked by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from egvs.core.errors import InputError
+from egvs.creation import assumed_traffic, junctions, street_counts
+from egvs.creation.junctions import StreetJunction, Streets
+from egvs.creation.openstreetmap import street_network
+from egvs.creation.street_counts import StreetCounts
+from egvs.formats import osm
+from egvs.scenario import loading
+from tests.creation.overpass_server import SMALL
+
+FROM_NORTH, FROM_SOUTH, FROM_EAST, FROM_WEST = "-1002#1", "1002#0", "-1001#1", "1001#0"
+TO_NORTH, TO_SOUTH, TO_EAST, TO_WEST = "1002#1", "-1002#0", "1001#1", "-1001#0"
+
+Read = Callable[..., StreetCounts]
+
+
+@pytest.fixture(scope="module")
+def crossing() -> tuple[Streets, StreetJunction]:
+    """North Street and East Street cross."""
+    extract = osm.read_osm(SMALL)
+    flags = street_network.netconvert_flags(extract, lefthand=False, walk=False)
+    _, streets = street_network.build_network(extract, SMALL, flags)
+    junction = junctions.largest_junction(streets)
+    assert junction is not None
+    return streets, junction
+
+
+@pytest.fixture
+def read(crossing: tuple[Streets, StreetJunction], tmp_path: Path) -> Read:
+    """Read counts from lines of text."""
+
+    def read_lines(*lines: str, encoding: str = "utf-8") -> StreetCounts:
+        path = tmp_path / "counts.csv"
+        path.write_text("\n".join(lines) + "\n", encoding=encoding)
+        return street_counts.read_junction_counts(path, *crossing)
+
+    return read_lines
+
+
+def rates(counts: StreetCounts, hour: int = 0) -> dict[tuple[str, str], float]:
+    """Vehicles per hour by the ids of both edges."""
+    return {(flow.edge or flow.from_edge or "", flow.to_edge or ""): flow.per_hour for flow in counts.hours[hour].flows}
+
+
+# --- names -----------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    "location",
+    [
+        "North Street,N,left", "NORTH ST.,north,L", "North  Str.,from north,left",
+        ",southbound,left", ",SB,L", ",from the north,LEFT",
+    ],
+)  # fmt: skip
+def test_same_movement_by_any_of_its_names(location: str, read: Read) -> None:
+    counts = read("street,approach,turn,count", f"{location},120")
+    assert rates(counts) == {(FROM_NORTH, TO_EAST): 120.0}  # a left turn of a southbound vehicle leads east
+
+
+@pytest.mark.parametrize(
+    ("group", "expected"),
+    [("SBL", (FROM_NORTH, TO_EAST)), ("NBT", (FROM_SOUTH, TO_NORTH)), ("ebr", (FROM_WEST, TO_SOUTH))],
+)
+def test_lane_groups_name_the_heading(group: str, expected: tuple[str, str], read: Read) -> None:
+    assert rates(read("lane_group,count", f"{group},60")) == {expected: 60.0}
+
+
+def test_ids_of_edges_still_work(read: Read) -> None:
+    counts = read("edge,from_edge,to_edge,count", f"{FROM_WEST},,,50", f",{FROM_NORTH},{TO_SOUTH},70")
+    assert rates(counts) == {(FROM_WEST, ""): 50.0, (FROM_NORTH, TO_SOUTH): 70.0}
+    assert counts.describe() == "120 vehicles an hour in 1 movement and 1 approach without turns, counted (counts.csv)"
+
+
+# --- numbers ---------------------------------------------------------------------------------------------------------
+def test_approach_count_is_divided_by_the_assumed_shares(read: Read, crossing: tuple[Streets, StreetJunction]) -> None:
+    streets, junction = crossing
+    flows = junctions.assumed_flows(streets, junctions.region_around(junction))
+    assumed = {flow.to_edge: flow.per_hour for flow in flows if flow.from_edge == FROM_SOUTH}
+    counts = read("approach,count", "S,300")
+    for (_, to_edge), per_hour in rates(counts).items():
+        assert per_hour == pytest.approx(300 * assumed[to_edge] / sum(assumed.values()), abs=0.05)
+    assert sum(rates(counts).values()) == pytest.approx(300, abs=0.2)
+    assert counts.assumptions == ["turns of the approaches North Street (south)"]
+    assert "divided by the assumed shares: North Street (south)" in counts.notes[0]
+
+
+def test_quarter_hours_become_vehicles_per_hour_of_each_hour(read: Read) -> None:
+    rows = [f"N,left,{start},{n}" for start, n in (("07:00", 10), ("07:15", 20), ("07:30", 30), ("07:45", 15))]
+    counts = read("approach,turn,start,count", *rows, "N,left,08:00,7", "N,left,08:15,9")
+    assert [(hour.name, rates(counts, number)) for number, hour in enumerate(counts.hours)] == [
+        ("07-08", {(FROM_NORTH, TO_EAST): 75.0}),
+        ("08-09", {(FROM_NORTH, TO_EAST): 32.0}),  # 16 in half an hour
+    ]
+    assert counts.notes[0] == (
+        "Counts of a part of the hour 08-09 are scaled up to an hour for 1 movement:"
+        " North Street (north) left (30 min)."
+    )
+    assert "hour 07-08" not in str(counts.notes)
+
+
+def test_note_on_scaled_counts_names_four_movements_and_how_many_more(read: Read) -> None:
+    """Six movements were counted for a quarter of an hour, and one for the complete hour."""
+    partial = ["N,left", "N,through", "N,right", "S,left", "S,through", "S,right"]
+    rows = [f"{move},07:00,5" for move in partial]
+    rows += [f"E,through,07:{minute:02d},10" for minute in (0, 15, 30, 45)]
+    (note,) = [text for text in read("approach,turn,start,count", *rows).notes if "scaled up" in text]
+    assert note == (
+        "Counts of a part of the hour 07-08 are scaled up to an hour for 6 movements:"
+        " North Street (north) left (15 min), North Street (north) straight (15 min),"
+        " North Street (north) right (15 min), North Street (south) left (15 min) and 2 more."
+    )
+
+
+def test_columns_named_by_their_start_mean_the_same_as_rows(read: Read) -> None:
+    wide = read("approach;turn;07:00;07:15", "N;left;10;20", "S;right;1;2")
+    long = read("approach,turn,start,count", "N,left,07:00,10", "N,left,7:15,20", "S,right,07:00,1", "S,right,0715,2")
+    assert (wide.hours, wide.notes) == (long.hours, long.notes)
+    assert rates(wide)[FROM_NORTH, TO_EAST] == 60.0
+
+
+def test_hourly_counts_and_kinds(read: Read) -> None:
+    counts = read("approach,turn,start,count,kind", "E,right,07:00,50,", "E,right,08:00,60,", "E,right,08:00,6,truck")
+    assert [[(flow.kind, flow.per_hour) for flow in hour.flows] for hour in counts.hours] == [
+        [("", 50.0)],
+        [("", 60.0), ("truck", 6.0)],
+    ]
+
+
+def test_hours_without_a_vehicle_are_left_out_with_a_note(read: Read) -> None:
+    counts = read("approach,turn,start,count", "N,left,02:00,0", "N,left,03:00,0", "N,left,07:00,40", "N,left,08:00,9")
+    assert [hour.name for hour in counts.hours] == ["07-08", "08-09"]
+    assert "Hours without a vehicle are left out: 02-03, 03-04." in counts.notes
+
+
+def test_movements_without_a_count_are_named(read: Read) -> None:
+    lines = ["approach,turn,count", "N,,10", "S,,10", "E,,10", "W,left,10", "W,right,10"]
+    assert "Movements without a count get no vehicles: East Street (west) straight." in read(*lines).notes
+
+
+# --- the scenario ----------------------------------------------------------------------------------------------------
+def test_scenario_has_the_counts_as_periods(tmp_path: Path, run_egvs: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(assumed_traffic, "find_capacity", lambda *_: pytest.fail("counts are not reduced"))
+    (tmp_path / "c.csv").write_text("approach,turn,start,count\nN,left,07:00,40\nN,left,08:00,80\nS,,08:00,90\n")
+    code, printed, error = run_egvs("new", tmp_path / "new", "--osm", SMALL, "--counts", tmp_path / "c.csv")
+    assert (code, error) == (0, "")
+    printed = " ".join(printed.split())
+    assert "traffic vehicles an hour in 4 movements, counted (c.csv): 07-08 40, 08-09 170" in printed
+    assert "Movements that were not counted in an hour get no vehicles in it: 07-08." in printed
+    assert "the traffic is assumed" not in printed
+    scenario = loading.load(tmp_path / "new")
+    assert [period.name for period in scenario.traffic.periods] == ["07-08", "08-09"]
+    assert scenario.traffic.periods[0].counts[0].per_hour == 40.0
+    assert "turns of the approaches North Street (south)" in scenario.assumed
+    assert not [text for text in scenario.assumed if text.startswith("traffic")]
+
+
+def test_counts_of_one_hour_are_no_period(tmp_path: Path, run_egvs: Any) -> None:
+    (tmp_path / "c.csv").write_text("approach,turn,count\nN,left,40\n")
+    assert run_egvs("new", tmp_path / "new", "--osm", SMALL, "--counts", tmp_path / "c.csv")[0] == 0
+    traffic = loading.load(tmp_path / "new").traffic
+    assert (traffic.periods, [count.per_hour for count in traffic.counts]) == ((), [40.0])
+    text = (tmp_path / "new" / "scenario.toml").read_text()
+    assert "North Street (north), left to East Street" in text
+
+
+# --- bad input -------------------------------------------------------------------------------------------------------
+NAMES = (
+    r"The approaches are: North Street \(north\), East Street \(east\), North Street \(south\), East Street \(west\)\."
+)
+HEAD = "street,approach,turn,start,count"
+BAD: dict[str, tuple[list[str], str]] = {
+    "empty": ([""], r"header: expected a column count"),
+    "no rows": ([HEAD], r"counts.csv: has no counts"),
+    "unknown column": (["street,aproach,count", "a,N,1"], r"header: unknown column 'aproach'. Did you mean approach\?"),
+    "two columns": (["street,street,count", "a,b,1"], r"two columns are called 'street'"),
+    "no number": (["street,approach", "a,N"], r"expected a column count, or columns named by their start, got none"),
+    "both": (["approach,count,07:00", "N,1,1"], r"got both"),
+    "no location": (["count", "1"], r"no column gives the location of the counts"),
+    "empty location": ([HEAD, ",,left,,5"], r"line 2: has no location"),
+    "unknown street": ([HEAD, "High St,,,,5"], rf"line 2: no approach of the junction is called 'High St'. {NAMES}"),
+    "ambiguous street": (
+        [HEAD, "North Street,,left,,5"],
+        rf"may be North Street \(north\) or North Street \(south\). Give street and approach. {NAMES}",
+    ),
+    "contradiction": ([HEAD, "North Street,W,left,,5"], rf"no approach .* is 'North Street from the west'. {NAMES}"),
+    "unknown side": ([HEAD, ",up,left,,5"], r"line 2: approach: expected the side on which vehicles arrive, got 'up'"),
+    "between two": ([HEAD, ",NE,left,,5"], r"'from the north-east' may be"),
+    "unknown turn": ([HEAD, ",N,sideways,,5"], r"line 2: turn: expected left, straight, right, U-turn or all"),
+    "no such turn": ([HEAD, ",N,u-turn,,5"], r"North Street .* has no movement U-turn\. Its turns are: left, right"),
+    "unknown group": (["lane_group,count", "XBL,5"], r"line 2: lane_group: expected a lane group such as NBL or EBTR"),
+    "negative": ([HEAD, ",N,left,,-5"], r"line 2: count: expected a number of vehicles of 0 to 100,000, got '-5'"),
+    "text": ([HEAD, ",N,left,,many"], r"count: expected a number of vehicles .* got 'many'"),
+    "nan": ([HEAD, ",N,left,,nan"], r"count: expected a number of vehicles .* got 'nan'"),
+    "all zero": ([HEAD, ",N,left,,0"], r"all counts are 0"),
+    "time": ([HEAD, ",N,left,25:00,5"], r"line 2: start: expected a time of the day, got '25:00'"),
+    "one start": ([HEAD, ",N,left,07:00,5"], r"intervals of one length .* got a single start. Add a column min"),
+    "odd interval": ([HEAD, ",N,left,07:00,5", ",N,left,07:07,5"], r"expected intervals of one length .* got 7"),
+    "across an hour": ([HEAD, ",N,left,07:30,5", ",N,left,08:30,5"], r"interval of 60 minutes ends in another hour"),
+    "some starts": ([HEAD, ",N,left,07:00,5", ",S,left,,5"], r"only some rows have a start"),
+    "minutes": (["approach,turn,start,minutes,count", "N,left,07:00,7,1"], r"minutes: expected one of 5, 10, 15"),
+    "no starts": (["approach,turn,minutes,count", "N,left,15,30"], r"minutes has no effect without a start. Add a"),
+    "twice": (
+        [HEAD, "North St,N,left,,5", ",N,left,,6"],
+        r"line 3: N left is counted twice, also in line 2",
+    ),
+    "twice by approach": ([HEAD, ",N,,,5", ",N,left,,6"], r"line 3: N left is counted twice, also in line 2"),
+    "unknown kind": (["approach,count,kind", "N,5,tram"], r"kind: expected a kind of the fleet, got 'tram'"),
+    "unknown edge": (["edge,count", "77,5"], r"line 2: edge: the network has no edge '77'"),
+    "one edge": (["from_edge,to_edge,count", f"{FROM_NORTH},,5"], r"expected either edge, or from_edge and to_edge"),
+    "edge and street": (["edge,street,count", f"{FROM_NORTH},North St,5"], r"names a street and an edge"),
+    "few values": ([HEAD, ",N,left,5"], r"line 2: expected 5 values, got 4"),
+    "quotes": ([HEAD, '"N"x,,,,5'], r"is not CSV"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_counts_give_one_message(name: str, read: Read) -> None:
+    lines, expected = BAD[name]
+    with pytest.raises(InputError, match=expected):
+        read(*lines)
+
+
+def test_other_encoding_is_named(read: Read) -> None:
+    with pytest.raises(InputError, match="is not UTF-8 text"):
+        read("street,approach,count", "Breite Straße,N,5", encoding="latin-1")
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["--traffic", "light"], "--traffic: has no effect on counted traffic"),
+        (["--vehicles-per-hour", "9"], "--vehicles-per-hour: has no effect on counted traffic"),
+        (["--like", "tracks.csv"], "--counts: cannot be combined with --like"),
+        ([], "missing.csv: cannot be read"),
+    ],
+)
+def test_wrong_options_write_nothing(words: list[str], expected: str, tmp_path: Path, run_egvs: Any) -> None:
+    outcome = run_egvs("new", tmp_path / "new", "--osm", SMALL, "--counts", tmp_path / "missing.csv", *words)
+    assert outcome[0] == 2
+    assert expected in " ".join(outcome[2].split())
+    assert not (tmp_path / "new").exists()

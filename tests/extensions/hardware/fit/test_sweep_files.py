@@ -1,0 +1,140 @@
+"""Sweeps are read alike from every format; missing returns keep their slots; each bad file gives one message.
+
+Evidence: the same 3,000 points by every writer, with NaN, infinite and zero points in known slots.
+"""
+
+from __future__ import annotations
+
+import gzip
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egvs.core.errors import InputError
+from egvs.core.grid import FloatArray
+from egvs.extensions.hardware.fit.sweep_files import read_sweeps
+from egvs.formats import pcd, ply
+
+MISSING = (0, 7, 2999)
+
+
+def points() -> FloatArray:
+    """3,000 points, three of which are missing returns in different notations."""
+    made = np.round(np.random.default_rng(0).uniform(1.0, 30.0, (3000, 3)), 3)
+    made[0] = np.nan
+    made[7] = 0.0
+    made[2999, 1] = np.inf
+    return made
+
+
+def write(path: Path, array: FloatArray) -> None:
+    """Write points in the format of the suffix."""
+    match path.suffix:
+        case ".pcd":
+            pcd.write(path, array)
+        case ".ply":
+            ply.write(path, array)
+        case ".csv":
+            rows = "\n".join(f"{x!r},{y!r},{z!r}" for x, y, z in array.tolist())
+            path.write_text(f"x_m,y_m,z_m\n{rows}\n", encoding="utf-8")
+        case ".npz":
+            np.savez(path, first=array, second=array.astype(np.float32))
+
+
+@pytest.mark.parametrize("suffix", [".pcd", ".ply", ".csv", ".npz"])
+@pytest.mark.parametrize("packed", [False, True])
+def test_formats_give_same_points(tmp_path: Path, suffix: str, packed: bool) -> None:
+    path = tmp_path / f"sweep{suffix}"
+    write(path, points())
+    if packed:
+        path = tmp_path / f"sweep{suffix}.gz"
+        path.write_bytes(gzip.compress((tmp_path / f"sweep{suffix}").read_bytes()))
+    sweep = read_sweeps([path])[0]
+    expected = points()
+    expected[list(MISSING)] = np.nan
+    np.testing.assert_array_equal(sweep.points_m, expected)
+    assert sweep.returns == 2997
+    assert not sweep.is_coarse
+
+
+def test_each_array_is_a_sweep(tmp_path: Path) -> None:
+    path = tmp_path / "frames.npz"
+    np.savez(path, a=points().astype(np.float16), b=np.column_stack([points(), np.ones(3000)]))
+    first, second = read_sweeps([path])
+    assert (first.name, second.name) == ("frames.npz: a", "frames.npz: b")
+    assert first.is_coarse and not second.is_coarse
+    assert second.points_m.shape == (3000, 3)
+
+
+def test_sweeps_keep_their_order(tmp_path: Path) -> None:
+    for name in ("b.ply", "a.ply"):
+        write(tmp_path / name, points())
+    assert [sweep.name for sweep in read_sweeps([tmp_path / "b.ply", tmp_path / "a.ply"])] == ["b.ply", "a.ply"]
+
+
+def _few(path: Path) -> Path:
+    write(path.with_suffix(".ply"), points()[:500])
+    return path.with_suffix(".ply")
+
+
+def _viewpoint(path: Path) -> Path:
+    path = path.with_suffix(".pcd")
+    pcd.write(path, points())
+    path.write_bytes(path.read_bytes().replace(b"VIEWPOINT 0 0 0 1", b"VIEWPOINT 0 0 5 1"))
+    return path
+
+
+def _flat(path: Path) -> Path:
+    path = path.with_suffix(".npz")
+    np.savez(path, a=np.ones((3000, 2)))
+    return path
+
+
+def _far(path: Path) -> Path:
+    made = points()
+    made[100, 1] = 2e154
+    np.savez(path.with_suffix(".npz"), a=made)
+    return path.with_suffix(".npz")
+
+
+def _other_member(path: Path) -> Path:
+    path = path.with_suffix(".npz")
+    np.savez(path, a=points())
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr("notes.txt", "no array")
+    return path
+
+
+def _bytes(suffix: str, data: bytes):
+    def write_bytes(path: Path) -> Path:
+        path = path.with_name(f"sweep{suffix}")
+        path.write_bytes(data)
+        return path
+
+    return write_bytes
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (_few, "at least 2,000 returns, got 498"),
+        (_viewpoint, "in the sensor's frame, got a VIEWPOINT"),
+        (_flat, "shape (n, 3), got float64 of shape (3000, 2)"),
+        (_bytes(".npz", b"PK\x03\x04 no archive"), "cannot be read as .npz"),
+        (_far, "within 10,000 m of the sensor, got 2e+154"),
+        (_other_member, "notes.txt: expected an array"),
+        (_bytes(".npz", b""), "cannot be read as .npz"),
+        (_bytes(".pcd.gz", b"\x1f\x8b no gzip"), "cannot be unpacked"),
+        (_bytes(".pcd.gz", gzip.compress(b"# .PCD v0.7\n")[:-6]), "cannot be unpacked"),
+        (_bytes(".docx", b"words"), "unknown file format"),
+        (lambda path: path / "nowhere.pcd", "cannot be read"),
+    ],
+)
+def test_rejects_bad_file(tmp_path: Path, make, message: str) -> None:
+    path = make(tmp_path / "sweep")
+    with pytest.raises(InputError) as caught:
+        read_sweeps([path])
+    assert message in str(caught.value)
+    assert path.name in str(caught.value)

@@ -1,0 +1,206 @@
+"""Sentences about rankings made by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from egvs.core.errors import Diagnostic
+from egvs.report.sections import describe_poles_on_road
+from egvs.results import ranking as report_ranking
+from egvs.results.labels import SCORE_LABELS
+from egvs.results.ranking import RankedSite, Ranking, ScoreValue
+from egvs.scenario.loading import load
+
+SCENARIOS = Path(__file__).parents[2] / "scenarios"
+
+
+def ranking(*rows: tuple[str, float, int, float, float]) -> Ranking:
+    """From (site, score, rank, entropy seen, chance to beat the next), best first."""
+    sites = tuple(
+        RankedSite(site, 0.0, 0.0, 3.0, egvs, rank, site, 0.0, 0.0, 0.0, "s", 200.0, 1, 1, entropy_seen, 1.0, beats)
+        for site, egvs, rank, entropy_seen, beats in rows
+    )
+    return Ranking(sites, tuple(site for site in sites if site.rank == 1), ())
+
+
+def by_vehicles(*rows: tuple[str, float, float], rank_by: str = "expected_detections") -> Ranking:
+    """From (site, EGVS, share of vehicles found), ranked by the latter, best first."""
+    sites = tuple(
+        replace(site, rank_by=rank_by, others=(ScoreValue("expected_detections", detected, 0.01),))
+        for site, (_, _, detected) in zip(
+            ranking(*((name, egvs, i + 1, 0.5, 0.99) for i, (name, egvs, _) in enumerate(rows))).sites,
+            rows,
+            strict=True,
+        )
+    )
+    return Ranking(sites, sites[:1], ())
+
+
+def test_sentences_for_a_score_over_vehicles() -> None:
+    detected = by_vehicles(("a", 50.0, 0.871), ("b", 90.0, 0.8), ("c", 20.0, 0.4))
+    assert (
+        report_ranking.headline(detected, has_traffic=True)
+        == "a is the best of 3 sites: it should find 87.1 % of vehicles"
+    )
+    assert report_ranking.lead(detected) == "It leads the next site, b, by 7.1 percentage points."
+    assert report_ranking.entropy_seen_note(detected) == ""
+    assert report_ranking.site_caption(detected.sites[0], 1, 2).startswith(
+        "a: rank 1, the share of vehicles found 87.1 %, at x"
+    )
+    assert detected.sites[0].score_se == 0.01 and detected.companion_score is SCORE_LABELS["egvs"]
+    assert (
+        report_ranking.headline(by_vehicles(("a", 50.0, 0.871)), has_traffic=True)
+        == "a, the only site, should find 87.1 % of vehicles"
+    )
+    assert by_vehicles(("a", 50.0, 0.9), rank_by="egvs").companion_score is SCORE_LABELS["expected_detections"]
+    assert ranking(("a", 50.0, 1, 0.5, 1.0)).companion_score is None
+
+
+def test_gain_of_a_pole_is_in_percentage_points_for_shares_and_relative_otherwise() -> None:
+    shares = by_vehicles(("a", 50.0, 0.6), ("b", 90.0, 0.4), ("c", 20.0, 0.0)).sites
+    assert report_ranking.Pole("p", shares[:2]).gain_text == "20.0"
+    assert report_ranking.Pole("p", shares).gain_text == "60.0"
+    assert report_ranking.Pole("p", shares[:1]).gain_text == ""
+    bits = ranking(("a", 60.0, 1, 0.5, 1.0), ("b", 40.0, 2, 0.5, 1.0), ("c", 0.0, 3, 0.0, 1.0)).sites
+    assert report_ranking.Pole("p", bits[:2]).gain_text == "50.0 %"
+    assert report_ranking.Pole("p", bits).gain_text == ""
+
+
+def test_lead_says_whether_the_best_is_certain() -> None:
+    """Two that share the first place cannot beat each other; whether they lead is another matter."""
+    ahead = ranking(("a", 100.0, 1, 0.5, 0.5), ("b", 100.0, 1, 0.6, 0.99), ("c", 80.0, 3, 0.4, 1.0))
+    assert report_ranking.lead(ahead) == "They lead the next site, c, by 20.0 % of their score."
+    near = ranking(("a", 100.0, 1, 0.5, 0.5), ("b", 100.0, 1, 0.6, 0.7), ("c", 98.0, 3, 0.4, 1.0))
+    assert report_ranking.lead(near).endswith("by 2.0 % of their score. These poles cannot be told apart.")
+    alone = ranking(("a", 100.0, 1, 0.5, 0.7), ("c", 98.0, 2, 0.4, 1.0))
+    assert report_ranking.lead(alone, "More helps.").endswith("These poles cannot be told apart. More helps.")
+
+
+def test_lead_names_the_best_site_on_another_pole_if_the_next_site_is_on_the_same_one() -> None:
+    sites = by_vehicles(("a", 50.0, 0.9), ("b", 50.0, 0.88), ("c", 50.0, 0.85), ("d", 50.0, 0.8)).sites
+    on_one_pole = [replace(site, pole=pole) for site, pole in zip(sites, ("p", "p", "q", "q"), strict=True)]
+    text = report_ranking.lead(report_ranking.Ranking(tuple(on_one_pole), (on_one_pole[0],), ()))
+    assert text == (
+        "It leads the next site, b, by 2.0 percentage points."
+        " The best site on another pole, c, is behind by 5.0 percentage points."
+    )
+    single_pole = tuple(replace(site, pole="p") for site in sites)
+    text = report_ranking.lead(report_ranking.Ranking(single_pole, single_pole[:1], ()))
+    assert text == "It leads the next site, b, by 2.0 percentage points."
+
+
+def with_rivals(*rows: tuple[str, str, float, float, float]) -> Ranking:
+    """From (site, pole, share found, error of the difference to the best, chance that the best is better)."""
+    sites = by_vehicles(*((site, 50.0, share) for site, _, share, _, _ in rows)).sites
+    compared = tuple(
+        replace(site, pole=pole, behind_best_se=se, best_beats=chance)
+        for site, (_, pole, _, se, chance) in zip(sites, rows, strict=True)
+    )
+    return Ranking(compared, compared[:1], ())
+
+
+@pytest.mark.parametrize(
+    ("chance", "says"),
+    [
+        (0.903, "(it is truly worse with a probability of 90 %)."),
+        (0.896, "(it is truly worse with a probability of 89 %). These poles cannot be told apart. More helps."),
+        (0.7, "(it is truly worse with a probability of 70 %). These poles cannot be told apart. More helps."),
+        (0.9999, "(it is truly worse with a probability of over 99 %)."),
+    ],
+)
+def test_lead_over_another_pole_has_its_error_and_probability(chance: float, says: str) -> None:
+    sites = with_rivals(("a", "p", 0.9, 0.0, 0.5), ("b", "p", 0.89, 0.004, 0.99), ("c", "q", 0.883, 0.013, chance))
+    assert report_ranking.lead(sites, "More helps.") == (
+        "It leads the next site, b, by 1.0 ± 0.4 percentage points (it is truly better with a probability of 99 %)."
+        f" The best site on another pole, c, is behind by 1.7 ± 1.3 percentage points {says}"
+    )
+
+
+def test_next_site_on_another_pole_is_compared_once() -> None:
+    text = report_ranking.lead(with_rivals(("a", "p", 0.9, 0.0, 0.5), ("c", "q", 0.8999, 0.0001, 0.84)), "More helps.")
+    assert text == (
+        "It leads the next site, c, by 0.01 ± 0.01 percentage points (it is truly better with a probability of 84 %)."
+        " These poles cannot be told apart."
+    )
+
+
+@pytest.mark.parametrize(("behind", "helps"), [(0.0009, False), (0.0011, True), (0.0, False)])
+def test_hint_is_given_where_poles_differ_by_a_tenth_of_a_point(behind: float, helps: bool) -> None:
+    sites = with_rivals(("a", "p", 0.9, 0.0, 0.5), ("c", "q", 0.9 - behind, 0.004, 0.6))
+    text = report_ranking.lead(sites, "More helps.")
+    assert "These poles cannot be told apart." in text
+    assert text.endswith("More helps.") == helps
+
+
+def test_no_hint_for_mounts_of_one_pole() -> None:
+    sites = with_rivals(("a", "p", 0.9, 0.0, 0.5), ("b", "p", 0.895, 0.004, 0.6), ("c", "q", 0.8, 0.004, 0.999))
+    text = report_ranking.lead(sites, "More helps.")
+    assert "These sites cannot be told apart." in text
+    assert "More helps." not in text
+
+
+def test_hint_names_the_setting_that_limits_the_error(mini: Path) -> None:
+    by, egvs = SCORE_LABELS["expected_detections"], SCORE_LABELS["egvs"]
+    recorded = load(mini)
+    more = "More frames may separate them: --set score.sampled_frames="
+    assert report_ranking.more_frames_hint(recorded, by, 5000) == f"{more}1000."
+    assert report_ranking.more_frames_hint(recorded, by, 600) == f"{more}600."
+    assert report_ranking.more_frames_hint(recorded, by, 500) == "A longer recording may separate them."
+    assert report_ranking.more_frames_hint(recorded, egvs, 5000) == "A longer recording may separate them."
+    many = load(mini, ["score.sampled_frames=1000"])
+    assert report_ranking.more_frames_hint(many, by, 5000) == f"{more}4000."
+    simulated = load(SCENARIOS / "roundabout")
+    assert report_ranking.more_frames_hint(simulated, egvs, 5000).endswith("--set traffic.frames=20000.")
+    assert "longer periods" in report_ranking.more_frames_hint(load(SCENARIOS / "nishishinjuku_peaks"), by, 400)
+
+
+@pytest.mark.parametrize(("by_detectors", "asks_for_traffic"), [(0.004, False), (0.0029, False), (0.0028, True)])
+def test_hint_is_not_more_traffic_where_detectors_disagree(
+    mini: Path, by_detectors: float, asks_for_traffic: bool
+) -> None:
+    """Of an error of 0.4 points, more than half of the square is due to detectors from 0.283 points on."""
+    sites = with_rivals(("a", "p", 0.9, 0.0, 0.5), ("c", "q", 0.895, 0.004, 0.6))
+    rival = replace(sites.sites[1], behind_best_detectors_se=by_detectors)
+    sites = replace(sites, sites=(sites.sites[0], rival))
+    scenario = load(mini, ["score.rank_by='expected_detections'"])
+    hint = report_ranking.recorded_frames_hint(scenario, sites, {})
+    assert (hint == "") == asks_for_traffic  # there is no record of the traffic
+    if hint:
+        assert hint == (
+            "The detectors disagree about this difference, and more traffic does not change that: see --detector "
+            "cluster and --detector pointpillars."
+        )
+
+
+def test_note_on_the_site_that_sees_most_entropy() -> None:
+    """Of two with the same score, one that sees more contradicts nothing."""
+    tied = ranking(("a", 100.0, 1, 0.5, 0.5), ("b", 100.0, 1, 0.6, 0.99), ("c", 80.0, 3, 0.4, 1.0))
+    assert (
+        report_ranking.entropy_seen_note(tied) == "b also sees the largest share of the traffic’s uncertainty, 60.0 %."
+    )
+    other = ranking(("a", 100.0, 1, 0.5, 0.99), ("c", 80.0, 2, 0.7, 1.0))
+    assert report_ranking.entropy_seen_note(other).startswith(
+        "c, rank 2, sees more of the traffic’s uncertainty (70.0 % against 50.0 %), but with fewer beams. One beam"
+    )
+    agree = ranking(("a", 100.0, 1, 0.7, 0.99), ("c", 80.0, 2, 0.5, 1.0))
+    assert (
+        report_ranking.entropy_seen_note(agree)
+        == "It also sees the largest share of the traffic’s uncertainty, 70.0 %."
+    )
+
+
+def test_poles_in_lanes_are_named_once_with_their_street() -> None:
+    ranked = by_vehicles(*((name, 50.0, 0.9) for name in ("a", "b", "c", "d")))
+    warnings = [
+        Diagnostic("sites on lanes", "sites.csv: site a and 2 more", "(0, 0, 3) is in a lane of An der Warth", ""),
+        Diagnostic("sites on lanes", "sites.csv: site d", "(0, 9, 3) is within a junction", ""),
+        Diagnostic("sites on lanes", "sites.csv", "2 more of 9 are in lanes or junctions: c, z", ""),
+        Diagnostic("sites in solids", "sites.csv: site b", "(0, 9, 3) is in a house", ""),
+    ]
+    assert describe_poles_on_road(ranked.poles[:3], warnings) == [
+        "a stands in a lane of An der Warth",
+        "c stands in a lane or junction",
+    ]
