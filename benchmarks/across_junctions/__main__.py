@@ -181,6 +181,8 @@ def _differences(built: Sequence[build.BuiltJunction]) -> list[str]:
 
 
 def _list(arguments: argparse.Namespace) -> int:
+    if not arguments.freeze and (arguments.again or arguments.renamed):
+        raise InputError("--again, --renamed", "expected --freeze beside them", "Add it.")
     if arguments.freeze:
         renamed = dict(_renamed_module(pair) for pair in (arguments.renamed or "").split(",") if pair.strip())
         print(write_frozen(arguments.data / "records", again=arguments.again or "", renamed=renamed))

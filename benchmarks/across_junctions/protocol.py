@@ -385,8 +385,8 @@ def write_frozen(
     Raises
     ------
     InputError
-        If a held-out junction was measured already, and no reason is given; for a renamed module whose names are not
-        its former and its present one.
+        If a held-out junction was measured already or a module was renamed, and no reason is given; for a renamed
+        module whose names are not its former and its present one.
     """
     path = folder / FROZEN_FILE
     held_out = [junction.name for junction in read_protocol().junctions if junction.role == "held out"]
@@ -395,6 +395,8 @@ def write_frozen(
         problem = f"{', '.join(spent)} measured already"
         hint = 'What is frozen after that is hardly frozen. If it must be: --again "REASON", which is recorded.'
         raise InputError(records_folder, problem, hint)
+    if renamed and not again:
+        raise InputError("--renamed", "is recorded with a reason only", 'Give one: --again "REASON".')
     frozen, changes = _read_frozen(folder)
     present = frozen_digests()
     for old, new in (renamed or {}).items():

@@ -912,6 +912,8 @@ def test_moved_modules_are_recorded_with_both_names(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match="expected the former and the present name of a frozen module"):
             write_frozen(tmp_path / "records", tmp_path, again="moved", renamed=wrong)
+    with pytest.raises(InputError, match="is recorded with a reason only"):
+        write_frozen(tmp_path / "records", tmp_path, renamed={"benchmarks.former": tables_name})
     write_frozen(tmp_path / "records", tmp_path, again="moved", renamed={"benchmarks.former": tables_name})
     check_frozen(tmp_path)
     ((entry,), digest) = json.loads(path.read_text(encoding="utf-8"))["frozen again"], present[tables_name]
@@ -935,6 +937,12 @@ def test_each_recorded_change_starts_where_the_one_before_ended() -> None:
     # of commit 7996a952, which froze the modules first
     assert hashes["benchmarks.across_junctions.tables"].startswith("2b4022f6")
     assert hashes["score"].startswith("d277d0d0")
+
+
+def test_list_records_changes_only_when_it_freezes(capsys: pytest.CaptureFixture[str]) -> None:
+    for option in (["--again", "moved"], ["--renamed", "a=b"]):
+        assert command.main(["list", *option]) == 2
+        assert "--again, --renamed: expected --freeze beside them" in capsys.readouterr().err
 
 
 def test_list_prints_the_hash(capsys: pytest.CaptureFixture[str]) -> None:
