@@ -27,7 +27,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import IO, Any
 
-from egvs.core import files
 from egvs.core.errors import InputError, MissingBackendError, RunError
 from egvs.core.sumo_home import sumo_home
 from egvs.core.threads import checkpoint
@@ -112,25 +111,17 @@ def sumo_environment() -> dict[str, str]:
     return {**defaults, **os.environ}
 
 
+@cache
 def sumo_version() -> str:
     """Return SUMO's version, e.g. ``"1.28.0"``: that of the wheel, or what ``sumo --version`` prints."""
-    version, is_wheel = _installed_version()
-    if not is_wheel:
-        files.observe_content(sumo_binary("sumo"))
-    return version
-
-
-@cache
-def _installed_version() -> tuple[str, bool]:
-    """Return SUMO's version, and whether it is that of the wheel."""
     program = sumo_binary("sumo")
     try:
         wheel = metadata.distribution("eclipse-sumo")
         if Path(str(wheel.locate_file("sumo"))).resolve() in program.resolve().parents:
-            return wheel.version, True
+            return wheel.version
     except metadata.PackageNotFoundError:
         pass
-    return parse_version(run_program("sumo", ["--version"], Path())), False
+    return parse_version(run_program("sumo", ["--version"], Path()))
 
 
 def parse_version(text: str) -> str:
