@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperCommand
 from typer.models import CommandInfo
 
 from egvs._version import __version__
@@ -31,7 +30,6 @@ from egvs.cli.options import (
     Top,
     Verbose,
 )
-from egvs.cli.quick_help import QuickHelpCommand, QuickHelpGroup
 from egvs.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -41,7 +39,6 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="egvs",
-    cls=QuickHelpGroup,
     help="Rank candidate sites for roadside LiDARs by how well they see the traffic.",
     no_args_is_help=True,
     add_completion=False,
@@ -844,8 +841,6 @@ def _group_commands() -> None:
     app.registered_commands.sort(key=lambda info: order.index(command_name(info)))
     for command in app.registered_commands:
         command.rich_help_panel = group_of[command_name(command)]
-        if command.cls is TyperCommand:
-            command.cls = QuickHelpCommand
     for group in app.registered_groups:
         assert group.name is not None
         group.rich_help_panel = group_of[group.name]
