@@ -419,7 +419,10 @@ def _attach(process: subprocess.Popen[bytes], port: int) -> Any:
 
 
 def _connect(host: str, port: int) -> Any:
-    """Return a connection, or None where no server listens."""
+    """Return a connection, or None where no server listens.
+
+    Its socket is reached by a private name, here and above: traci has no other way to set a time limit.
+    """
     import traci
 
     default_s = socket.getdefaulttimeout()
