@@ -86,12 +86,6 @@ def temporary_folder() -> Iterator[Path]:
             return
 
 
-def is_temporary(path: Path) -> bool:
-    """Return whether a file is, or was, in a folder of :func:`temporary_folder`."""
-    parent = Path(tempfile.gettempdir())
-    return any(folder.parent == parent and folder.name.startswith(_TEMP_PREFIX) for folder in path.parents)
-
-
 @cache
 def _remove_stale_folders(parent: Path) -> None:
     """Remove the temporary folders of killed programs; once in a process."""
@@ -171,19 +165,10 @@ def hash_file(path: Path) -> str:
     An input that :func:`open_input` holds in memory is not opened again, nor one whose digest is known
     (:func:`use_digests`).
     """
-    if not is_input_file(path):
+    if not path.is_file():
         raise InputError(path, "no such file", f"Run the stage that writes {path.name} first.")
     known = _KNOWN_DIGEST.get()
-    digest = _hash_content(path) if known is None else known(path, _hash_content)
-    tell_observers(path, digest)
-    return digest
-
-
-def is_input_file(path: Path) -> bool:
-    """Return whether a file exists that an input names or that may accompany one."""
-    exists = path.is_file()
-    tell_observers(path, PRESENT if exists else ABSENT)
-    return exists
+    return _hash_content(path) if known is None else known(path, _hash_content)
 
 
 def _hash_content(path: Path) -> str:
@@ -208,32 +193,6 @@ def use_digests(digest: Callable[[Path, Callable[[Path], str]], str]) -> Iterato
         yield
     finally:
         _KNOWN_DIGEST.reset(token)
-
-
-FileObserver = Callable[[Path | None, str], None]
-"""Called with each input file that is looked for, opened or hashed, and its sha256, :data:`PRESENT` or :data:`ABSENT`;
-without a file where something is used that no file tells."""
-
-PRESENT, ABSENT = "present", "absent"
-
-_OBSERVERS: list[FileObserver] = []
-"""For the whole process, whichever thread reads a file."""
-
-
-@contextmanager
-def observe_files(observer: FileObserver) -> Iterator[None]:
-    """Call a function with each input file that is used within the block."""
-    _OBSERVERS.append(observer)
-    try:
-        yield
-    finally:
-        _OBSERVERS.remove(observer)
-
-
-def tell_observers(path: Path | None, state: str = "") -> None:
-    """Call all observers; see :data:`FileObserver`."""
-    for observer in _OBSERVERS:
-        observer(path, state)
 
 
 _MAX_HELD_BYTES = 128_000_000
@@ -286,7 +245,6 @@ def open_input(path: Path) -> io.BufferedReader | io.BytesIO:
     """Open a file to read its bytes; from memory, where :func:`hold_inputs` holds it."""
     held = _HELD_FILES.get()
     if held is None:
-        observe_content(path)
         return path.open("rb")
     stamp = _file_stamp(path)
     if stamp.real_path.is_relative_to(held.except_in):
@@ -294,17 +252,8 @@ def open_input(path: Path) -> io.BufferedReader | io.BytesIO:
     if stamp not in held.contents and stamp.is_regular and held.size + stamp.size <= _MAX_HELD_BYTES:
         held.contents[stamp] = path.read_bytes()
         held.size += stamp.size
-    observe_content(path)
     content = held.contents.get(stamp)
     return path.open("rb") if content is None else io.BytesIO(content)
-
-
-def observe_content(path: Path) -> None:
-    """Tell observers the digest of a file that is opened."""
-    if _OBSERVERS and path.is_file():
-        hash_file(path)
-    else:
-        tell_observers(None)  # a pipe, for example
 
 
 def hash_json(value: Any) -> str:

@@ -152,7 +152,7 @@ def _existing_files(source: Path, names: Iterable[str]) -> list[Path]:
 
 def _is_file(path: Path) -> bool:
     try:
-        return files.is_input_file(path)
+        return path.is_file()
     except (OSError, ValueError):  # not a valid file name, or too long
         return False
 

@@ -50,7 +50,7 @@ def companion_files(path: Path) -> list[Path]:
     if path.suffix.lower() != ".shp":
         return []
     parts = [path.with_suffix(suffix) for suffix in _SHAPEFILE_PARTS]
-    return [part for part in parts if files.is_input_file(part)]
+    return [part for part in parts if part.is_file()]
 
 
 def read_gis_file(path: Path, geometry: str) -> dict[str, Any]:
@@ -104,7 +104,7 @@ def _check_shapefile_complete(path: Path) -> None:
     """
     for suffix in (".shp", ".shx", ".dbf"):
         part = path.with_suffix(suffix)
-        if not files.is_input_file(part):
+        if not part.is_file():
             continue
         with files.open_input(part) as content:
             head = content.read(32)

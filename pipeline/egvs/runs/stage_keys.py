@@ -227,8 +227,6 @@ def program_inputs(name: str, scenario: Scenario, loaded: tuple[str, ...] = ()) 
     described = stage(name)
     effects = registry.scenario_effects(scenario, *(described.effect_stages or (name,)))
     modules = sorted({*loaded, *registry.effect_modules(effects)})
-    if any(module.partition(".")[0] != PACKAGE for module in modules):
-        files.tell_observers(None)  # the source of plug-ins is found anew in each run
     source = source_digest(described.module, *described.code)
     loaded_sources = [source_digest(module) for module in modules]
     libraries = source.libraries.union(*(part.libraries for part in loaded_sources))

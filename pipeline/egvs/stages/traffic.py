@@ -24,7 +24,6 @@ import pyarrow as pa
 
 from egvs.artefacts import parquet
 from egvs.artefacts.frame_boxes import UNKNOWN_BOXES_KEY
-from egvs.core import files
 from egvs.core.errors import WARNINGS_KEY, InputError, MissingBackendError
 from egvs.core.platform import relative_path
 from egvs.core.progress import SummedProgress
@@ -90,7 +89,6 @@ def _installed_sumo_version() -> str | None:
     try:
         return sumo.sumo_version()
     except MissingBackendError:
-        files.tell_observers(None)  # SUMO may be installed later
         return None
 
 

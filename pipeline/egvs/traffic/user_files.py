@@ -214,7 +214,7 @@ def read_sumocfg(path: Path) -> DemandFiles:
         elif option in FILE_OPTIONS:
             paths[option] = tuple(path.parent / name.strip() for name in value.split(",") if name.strip())
             for file in paths[option]:
-                if not files.is_input_file(file):
+                if not file.is_file():
                     raise InputError(where, f"no such file ({file})", "Use a path relative to the configuration.")
         elif option in ACCEPTED_OPTIONS:
             options[option] = value
