@@ -21,10 +21,10 @@ from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.creation import new_scenario
 from egvs.runs.run import ensure_stages
+from egvs.runs.run_context import open_folder
 from egvs.scenario.loading import load
 from egvs.scenario.model import Scenario, SitesConfig
 from egvs.sensors.sites import Site
-from egvs.stages.inputs import get_scene, open_folder
 from egvs.traffic import network, sumo_folder
 from egvs.world.carriageway import Carriageway
 
@@ -142,7 +142,7 @@ def ready(name: str, role: Role, scenario_folder: Path, folder: Path, places: in
     folder.mkdir(parents=True, exist_ok=True)
     work = open_folder(scenario, folder)
     ensure_stages(work, "statics")
-    scene = get_scene(work)
+    scene = work.scene
     given = tuple(site for site in scene.sites if site.pose.pitch_deg == site.pose.roll_deg == 0.0 and not site.points)
     roads = sumo_folder.read_network(scenario)
     carriageway = None if roads is None else Carriageway.of(roads)

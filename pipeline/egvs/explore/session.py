@@ -51,9 +51,9 @@ from egvs.sensors.scanner import Scanner
 from egvs.sensors.scene import Scene
 from egvs.sensors.sensor import rotation_world_sensor
 from egvs.sensors.sites import Pose, Site
-from egvs.stages import inputs, scene_checks
+from egvs.stages import scene_checks, scene_inputs
 from egvs.stages.base import StageContext
-from egvs.stages.inputs import CheckInputs, get_scene
+from egvs.stages.inputs import CheckInputs
 from egvs.stages.points_maps import target_positions
 from egvs.stages.site_scoring import TargetScorer
 from egvs.traffic import sumo_folder
@@ -100,7 +100,7 @@ class MovingPlan:
         if any(metadata["stages"].get(name) != stages.get(name) for name in _PLAN_STAGES):
             return None
         plan = cls.of_candidates(work, [row["site"] for row in rows])
-        scanner = Scanner(replace(get_scene(work), sites=()))
+        scanner = Scanner(replace(work.scene, sites=()))
         for row, site in zip(rows, plan.poses.sites, strict=True):
             pose = Pose(**{field.name: row[field.name] for field in fields(Pose)})
             if pose != site.pose:  # after --refine
@@ -231,7 +231,7 @@ class Session:
     def __init__(self, work: StageContext, stages: Mapping[str, str], period: str = "") -> None:
         self.work, self._stages, self.period = work, stages, period
         self.scenario: Scenario = work.scenario
-        self.scene: Scene = get_scene(work)
+        self.scene: Scene = work.scene
         self.periods: tuple[str, ...] = tuple(entry.name for entry in read_periods(work.folder.tpog) if entry.name)
         self.tpog: Tpog = read_tpog(work.folder.tpog, period or None)
         self.candidates: dict[str, PoseScore] = self._read_candidates()
@@ -434,7 +434,7 @@ class Session:
     def _engine(self, site: Site) -> Engine:
         """Return scanner and scorer with the effects that act when a candidate is moved to ``site``."""
         sites = tuple(site if other.name == site.name else other for other in self.scene.sites)
-        scene = inputs.with_effects(replace(self.scene, sites=sites, effects=(), inactive_effects=()))
+        scene = scene_inputs.with_effects(replace(self.scene, sites=sites, effects=(), inactive_effects=()))
         key = tuple(effect.NAME for effect in scene.effects)
         if key not in self.engines:
             scene = replace(scene, sites=())  # one scanner for all poses

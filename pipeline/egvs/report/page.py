@@ -62,7 +62,7 @@ from egvs.results.ranking import (
 from egvs.results.sensors import SensorComparison, costs_option, range_note
 from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
-from egvs.stages.scene_inputs import scan_dependencies
+from egvs.stages.scene_dependencies import scan_dependencies
 from egvs.traffic import observed
 
 if TYPE_CHECKING:
@@ -437,5 +437,6 @@ STAGE = Stage(
         RunFolder.zones,
     ),
     effect_stages=("scan", "score"),
+    code=("egvs.stages.scene_inputs",),
     prepare=(prepare,),
 )

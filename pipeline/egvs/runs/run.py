@@ -34,6 +34,7 @@ from egvs.runs import locks, run_names, stage_keys, stage_registry, store
 from egvs.runs.background import BackgroundStage, run_in_background
 from egvs.runs.digest_cache import remember_digests
 from egvs.runs.kernel_compiler import KernelCompiler
+from egvs.runs.run_context import open_folder
 from egvs.runs.stage_keys import StageKey
 from egvs.runs.stage_registry import StageResult
 from egvs.runs.store import Store
@@ -41,7 +42,7 @@ from egvs.scenario.loading import scenario_from_dict
 from egvs.scenario.model import Scenario
 from egvs.stages import inputs as stage_inputs
 from egvs.stages.base import StageContext
-from egvs.stages.inputs import Inputs, open_folder
+from egvs.stages.inputs import Inputs
 from egvs.traffic.sumo_folder import NETWORK_FILE
 
 StageListener = Callable[[str, str, StageRecord | None], None]

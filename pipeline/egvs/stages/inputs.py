@@ -7,7 +7,7 @@ errors and leaves out what cannot be read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -28,9 +28,6 @@ from egvs.sensors.scene import ActiveEffect, InactiveEffect, Scene
 from egvs.sensors.sensor import Sensor
 from egvs.sensors.sites import Site
 from egvs.stages import scene_inputs
-from egvs.stages.base import StageContext
-from egvs.stages.scene_inputs import resolve_scene as resolve_scene
-from egvs.stages.scene_inputs import with_effects as with_effects
 from egvs.traffic import sumo_folder
 from egvs.traffic.network import Network
 from egvs.world import geolocation, mesh, static_world
@@ -153,25 +150,6 @@ class Inputs:
         if path not in self._digests:
             self._digests[path] = files.hash_file(path)
         return self._digests[path]
-
-
-def open_folder(
-    scenario: Scenario,
-    folder: Path,
-    *,
-    jobs: int | None = None,
-    progress: ProgressCallback = no_progress,
-    recorded: Mapping[str, str] | None = None,
-) -> StageContext:
-    """Return the context of stages that work in a run folder; parameters as of :class:`StageContext`."""
-    run_folder = RunFolder(folder)
-    inputs = Inputs(scenario, run_folder, progress)
-    return StageContext(inputs, run_folder, jobs=jobs, progress=progress, recorded=recorded)
-
-
-def get_scene(context: StageContext) -> Scene:
-    """Return :attr:`StageContext.scene`."""
-    return context.scene
 
 
 def build_scene(scenario: Scenario) -> Scene:

@@ -46,6 +46,7 @@ from egvs.report.command_sections import DIGEST_KEY, design_digest
 from egvs.results.sensors import ScoreDifference
 from egvs.runs import run, stage_registry
 from egvs.runs.command_results import add_to_report
+from egvs.runs.run_context import open_folder
 from egvs.scenario.model import Scenario
 from egvs.scenario.sensor_config import SensorConfig
 from egvs.scoring.standard_errors import (
@@ -74,7 +75,6 @@ from egvs.sensors.sensor import CATALOGUE, Sensor, check_sensor_names
 from egvs.sensors.site_feasibility import ground_height_m
 from egvs.sensors.sites import Pose, Site
 from egvs.stages.base import StageContext
-from egvs.stages.inputs import open_folder
 
 STAGES = ("check", "statics", "traffic", "tpog")
 MAX_PIECES = 7

@@ -38,9 +38,9 @@ from egvs.extensions.validation.surrogates import Surrogates
 from egvs.extensions.validation.validation_run import ValidationRun, validation_metadata, validation_run
 from egvs.runs import run as runs
 from egvs.runs import stage_keys, stage_registry
+from egvs.runs.run_context import open_folder
 from egvs.scenario.model import Scenario
 from egvs.sensors.sites import Site
-from egvs.stages.inputs import open_folder
 
 CORRELATION_TABLE = RunFolder.correlation.name
 
