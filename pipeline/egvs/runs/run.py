@@ -25,7 +25,7 @@ from egvs._version import __version__
 from egvs.artefacts.origin import foreign_files
 from egvs.artefacts.run_folder import STAGE_NAMES, RunFolder
 from egvs.artefacts.run_record import RunRecord, StageRecord
-from egvs.core import files
+from egvs.core.digests import use_digests
 from egvs.core.errors import EgvsError, InputError, RunError
 from egvs.core.platform import relative_path
 from egvs.core.progress import ProgressCallback, no_progress
@@ -110,8 +110,8 @@ def run(
     """
     folder = Path(out) if out is not None else default_folder(scenario)
     check_no_overwrite(scenario, folder)
-    with lock_run_folder(folder, wait_s), files.hold_inputs(except_in=folder), remember_digests(RunFolder(folder)):
-        context = open_folder(scenario, folder, jobs=jobs, progress=progress)
+    with lock_run_folder(folder, wait_s), remember_digests(RunFolder(folder)) as digests:
+        context = open_folder(scenario, folder, jobs=jobs, progress=progress, digests=digests)
         current = _Run(context, start_record(scenario, folder), listener)
         stages = [stage for stage in STAGE_NAMES if stage in only]
         key = None
@@ -141,15 +141,16 @@ def run_one(
     Parameters are those of :func:`run`; ``options`` are further keyword arguments of the stage.
     """
     check_no_overwrite(scenario, out)
-    with lock_run_folder(out), files.hold_inputs(except_in=out):
+    with lock_run_folder(out):
         record = start_record(scenario, out)
         recorded = stage_registry.recorded_digests(record)
         context = open_folder(scenario, out, jobs=jobs, progress=progress, recorded=recorded)
         current = _Run(context, record, listener)
-        for earlier in stages_before(stage):
-            current.restore_stage(earlier)
-        current.ensure_stage(stage, options, again=True)
-        return current.finish(keep=(stage,))
+        with use_digests(context.inputs.digests):
+            for earlier in stages_before(stage):
+                current.restore_stage(earlier)
+            current.ensure_stage(stage, options, again=True)
+            return current.finish(keep=(stage,))
 
 
 def stages_before(stage: str) -> list[str]:

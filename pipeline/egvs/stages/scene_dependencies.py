@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from egvs.artefacts.run_folder import RunFolder
-from egvs.core import files
+from egvs.core.digests import hash_input
 from egvs.effects import registry
 from egvs.effects.base import Effect
 from egvs.formats import point_clouds, vector_files
@@ -58,12 +58,12 @@ def site_digests(scenario: Scenario, sites: Iterable[Site]) -> dict[str, str]:
     digests = {}
     if scenario.sites.file is not None:
         path = scenario.find(scenario.sites.file, "sites.file")
-        digests[scenario.sites.file] = files.hash_file(path)
+        digests[scenario.sites.file] = hash_input(path)
         for part in vector_files.companion_files(path):
-            digests[f"sites.file: {part.name}"] = files.hash_file(part)
+            digests[f"sites.file: {part.name}"] = hash_input(part)
     for site in sites:
         if site.points is not None:
-            digests[site.points] = files.hash_file(scenario.find(site.points, f"site {site.name}: points"))
+            digests[site.points] = hash_input(scenario.find(site.points, f"site {site.name}: points"))
     return digests | sensor_digests(scenario, sites)
 
 
@@ -73,7 +73,7 @@ def sensor_digests(scenario: Scenario, sites: Iterable[Site]) -> dict[str, str]:
     for name in dict.fromkeys(site.sensor for site in sites):
         config = scenario.sensors.get(name)
         if config is not None and config.beams is not None:
-            digests[config.beams] = files.hash_file(scenario.find(config.beams, f"sensors.{name}.beams"))
+            digests[config.beams] = hash_input(scenario.find(config.beams, f"sensors.{name}.beams"))
         elif config is None and name in sensor.catalogue_entries():
             digests[f"catalogue: {name}"] = sensor.catalogue_digest(name)
     return digests

@@ -65,7 +65,7 @@ def dependencies(context: StageContext) -> StageDependencies:
     if scenario.score.blindspots or scenario.score.zones is not None:
         network = context.inputs.common_network_path
         if network is not None:
-            digests["network"] = context.inputs.digest(network)
+            digests["network"] = context.inputs.digests.of(network)
     if effects:
         settings["effects"] = registry.effect_settings(effects)
         settings["sensors"] = sensor_settings(scenario)

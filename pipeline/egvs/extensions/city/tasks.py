@@ -397,10 +397,8 @@ def score_stored_scans(scoring: SiteScoring, only: Collection[str] | None = None
 
 def _keeping_scans(context: StageContext) -> StageContext:
     """Return a context of the same scene in which scans are kept."""
-    keeping = StageContext(context.inputs, context.folder, jobs=context.threads)
-    scan_config = context.scenario.scan.model_copy(update={"keep": True})
-    keeping.scenario = context.scenario.model_copy(update={"scan": scan_config})
-    return keeping
+    scan = context.scenario.scan.model_copy(update={"keep": True})
+    return context.with_scenario(context.scenario.model_copy(update={"scan": scan}))
 
 
 def _fetch_or_score(scoring: SiteScoring, score_key: str, names: tuple[str, ...], folder: Path) -> ResourceUsage:
