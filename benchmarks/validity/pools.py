@@ -10,8 +10,9 @@ from functools import cached_property
 from benchmarks.validity.junctions import ROLES
 from benchmarks.validity.record import Record
 from egvs.core import files
-from egvs.extensions.validation.correlation import RESAMPLES, CoefficientKind, Correlation, CorrelationStudy
+from egvs.extensions.validation.correlation import RESAMPLES, Correlation, CorrelationStudy
 from egvs.extensions.validation.results import ScoreName
+from egvs.statistics.ranks import CoefficientKind
 
 SEED = 2504
 """Seed of the resamples of sites and blocks."""

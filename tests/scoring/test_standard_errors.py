@@ -25,8 +25,9 @@ from egvs.scoring import egvs as scoring_egvs
 from egvs.scoring import standard_errors
 from egvs.scoring.egvs import EntropyField, binary_entropy
 from egvs.scoring.scorer import Scorer
-from egvs.scoring.standard_errors import MIN_GROUPS, BlockGroups, BlockJackknife, ScoreUncertainty, group_sizes
+from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, ScoreUncertainty
 from egvs.stages.site_scans import empty_scans
+from egvs.statistics.blocks import MIN_GROUPS, group_sizes
 
 GRID = Grid.from_json({"origin_m": [0.0, 0.0, 0.0], "voxel_m": 1.0, "shape": [6, 5, 2]})
 CELLS = np.arange(60)
