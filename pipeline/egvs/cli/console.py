@@ -1,4 +1,4 @@
-"""What all output of the command line shares: the console, tables, values as text, and the progress display.
+"""What all output of the command line shares: the console, tables, and the progress display.
 
 Results go to standard output; progress, stage lines and warnings go to standard error.
 """
@@ -18,6 +18,7 @@ from rich.text import Text
 
 from egvs.artefacts.run_record import StageRecord
 from egvs.cli import stage_summary
+from egvs.cli.value_text import format_value, format_values
 from egvs.core.errors import collect_warnings
 from egvs.core.wording import format_percent
 
@@ -118,15 +119,6 @@ def print_table(columns: Sequence[Column[Row]], rows: Iterable[Row], *, file_wid
     out.print(make_table(columns, rows, width=out.width))
 
 
-def format_values(values: Mapping[str, Any]) -> str:
-    """Return the entries of a mapping in one line, without empty ones."""
-    shown = []
-    for key, value in values.items():
-        if value not in ("", [], {}, None):
-            shown.append(f"{key.replace('_', ' ')} {format_value(value)}")
-    return "; ".join(shown)
-
-
 def format_or_dash(value: float | None, spec: str) -> str:
     """Return a number as text, with a format such as ".2f"; "-" if it is unknown."""
     if value is None:
@@ -147,23 +139,6 @@ def print_mapping(values: Mapping[str, Any], file_width: int) -> None:
         if isinstance(value, dict):
             text = format_values(value)
         out.print(f"{key}: {text}")
-
-
-def format_value(value: Any) -> str:
-    """Return a value as text; a mapping of counts as "3 pole, 2 sign"."""
-    if isinstance(value, dict):
-        return ", ".join(_format_entry(str(key).replace("_", " "), entry) for key, entry in value.items())
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, list | tuple):
-        return ", ".join(format_value(entry) for entry in value)
-    return str(value)
-
-
-def _format_entry(key: str, value: Any) -> str:
-    if isinstance(value, dict):
-        return f"{key} ({format_value(value)})"
-    return f"{format_value(value)} {key}"
 
 
 class _ElapsedColumn(ProgressColumn):

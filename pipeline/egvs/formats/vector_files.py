@@ -23,7 +23,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from egvs.core import files, plugins
+from egvs.core import plugins
+from egvs.core.digests import open_input
 from egvs.core.errors import InputError
 from egvs.core.numbers import parse_decimal
 from egvs.core.reading import COMPLETE_FILE
@@ -106,7 +107,7 @@ def _check_shapefile_complete(path: Path) -> None:
         part = path.with_suffix(suffix)
         if not part.is_file():
             continue
-        with files.open_input(part) as content:
+        with open_input(part) as content:
             head = content.read(32)
             size = content.seek(0, io.SEEK_END)
         if len(head) < 32:

@@ -24,6 +24,7 @@ from typing import Any
 from egvs.artefacts import parquet
 from egvs.artefacts.run_record import StageRecord
 from egvs.core import files
+from egvs.core.digests import hash_input
 from egvs.effects import registry
 from egvs.runs.stage_registry import StageResult, stage
 from egvs.scenario.model import Scenario
@@ -234,7 +235,7 @@ def program_inputs(name: str, scenario: Scenario, loaded: tuple[str, ...] = ()) 
         "source": source.digest,
         "loaded": [part.digest for part in loaded_sources],
         "named": registry.effect_settings(effects),
-        "files": {path.name: files.hash_file(path) for path in _data_files(described)},
+        "files": {path.name: hash_input(path) for path in _data_files(described)},
         "libraries": library_versions(libraries),
     }
 

@@ -27,7 +27,8 @@ from typing import Any
 
 import numpy as np
 
-from egvs.core import files, limits
+from egvs.core import limits
+from egvs.core.digests import open_input
 from egvs.core.errors import InputError, find_misspelling
 from egvs.core.grid import FloatArray
 from egvs.core.numbers import parse_decimal
@@ -96,7 +97,7 @@ def read_csv(path: Path, world: Georeference) -> Iterator[SiteRow]:
     located = []
     try:
         with (
-            files.open_input(path) as content,
+            open_input(path) as content,
             io.TextIOWrapper(content, encoding="utf-8-sig", newline="") as file,
         ):
             reader = csv.DictReader(file, skipinitialspace=True)

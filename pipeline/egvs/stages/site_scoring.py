@@ -32,7 +32,7 @@ from egvs.scoring.egvs import EntropyField
 from egvs.scoring.road_locations import RoadLocations
 from egvs.scoring.score_table import MIX, ScoreTable, SiteScores
 from egvs.scoring.scorer import PeriodTpog, Scorer, SiteScore
-from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, detector_groups, means_without_each
+from egvs.scoring.standard_errors import BlockGroups, BlockJackknife, detector_groups
 from egvs.scoring.target_scores import DETECTORS, TARGET_SCORES, SiteTargetScores, expected_by_detector
 from egvs.scoring.targets import (
     FrameGroups,
@@ -55,6 +55,7 @@ from egvs.sensors.sites import Pose, ScannedSite
 from egvs.stages.base import StageContext
 from egvs.stages.blocked_sites import near_share
 from egvs.stages.site_scans import SiteScan, empty_scans
+from egvs.statistics.blocks import means_without_each
 from egvs.world.carriageway import Carriageway
 
 if TYPE_CHECKING:

@@ -70,10 +70,10 @@ def dependencies(context: StageContext) -> StageDependencies:
 
     digests = {}
     if scenario.statics.terrain is not None:
-        digests["terrain"] = context.inputs.digest(scenario.find(scenario.statics.terrain, TERRAIN_KEY))
+        digests["terrain"] = context.inputs.digests.of(scenario.find(scenario.statics.terrain, TERRAIN_KEY))
     for period_scenario in periods:
         for path in _source_files(period_scenario):
-            digests[_relative_name(path, scenario)] = context.inputs.digest(path)
+            digests[_relative_name(path, scenario)] = context.inputs.digests.of(path)
     needs_sumo = any(not period.traffic.is_finished or period.traffic.vtypes for period in periods)
     versions = {"sumo": sumo.sumo_version() if needs_sumo else None}
     if scenario.is_recorded:

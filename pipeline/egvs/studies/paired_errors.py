@@ -27,11 +27,11 @@ from egvs.core.grid import FloatArray
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.results.ranking import RankedSite
 from egvs.results.sensors import ScoreDifference
+from egvs.runs.run_context import open_folder
 from egvs.runs.stage_registry import recorded_digests
 from egvs.scenario.loading import scenario_from_dict
 from egvs.scoring.score_table import ScoreColumn
 from egvs.scoring.standard_errors import BlockGroups, ScoreUncertainty
-from egvs.stages.inputs import open_folder
 from egvs.stages.site_scoring import SiteScoring
 
 
