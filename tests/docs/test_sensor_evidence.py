@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from egvs.report.sections import RHO_RANGE
-from egvs.results.sensors import SENSOR_EVIDENCE
+from egvs.report.sensor_text import SENSOR_EVIDENCE
 
 DOCS = Path(__file__).parents[2] / "docs"
 DETECTORS = ("cluster", "pointpillars")

@@ -29,7 +29,7 @@ from egvs.drawing.basemap import network_file, roads_within, world_outlines
 from egvs.drawing.colours import ColumnValues, IndexedImage
 from egvs.drawing.maps import Backdrop, SiteViewFigure
 from egvs.drawing.svg_figures import PAGE_STYLE, Box, FigureStyle, extent, shared_scale
-from egvs.results import ranking
+from egvs.results.labels import format_count, format_number
 from egvs.results.ranking import MapSite, RankedSite, Ranking
 from egvs.scoring.egvs import EntropyField
 from egvs.scoring.scorer import Scorer
@@ -250,7 +250,7 @@ def _site_coverage(site: RankedSite, beams: Beams, scorer: Scorer) -> _SiteCover
         crossed=crossed,
         visible_bit=column_entropy(field, visible),
         missed_bit=column_entropy(field, ~visible),
-        caption=ranking.site_caption(site, int(visible.sum()), len(visible)),
+        caption=site_caption(site, int(visible.sum()), len(visible)),
         ends_m=_hit_positions_m(beams),
     )
 
@@ -433,4 +433,15 @@ def _describe_sample(location: LocationVisibility) -> str:
     return (
         f"± {format_percent(location.se, 0)}, from {location.vehicles:,} vehicles in "
         f"{location.vehicle_frames:,} observations"
+    )
+
+
+def site_caption(site: RankedSite, visible_voxels: int, voxels: int) -> str:
+    """Return the position and the counts of one site."""
+    return (
+        f"{site.site}: rank {site.rank}, {site.by.with_noun(site.score)}, at x = {format_number(site.x_m)} m, "
+        f"y = {format_number(site.y_m)} m, z = {format_number(site.z_m)} m, with a {site.sensor}. "
+        f"It sees {format_count(visible_voxels)} of {format_count(voxels)} uncertain voxels. "
+        f"{format_count(site.beams_in_roi)} of its beams can reach the region; {format_count(site.returns)} of "
+        "them hit the ground or an object."
     )

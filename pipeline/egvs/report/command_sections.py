@@ -114,10 +114,7 @@ class CommandSections:
             Poses of the sensors of the plan, by site.
         """
         ranked = tuple(sites)
-        poses = {
-            site.site: Pose(site.x_m, site.y_m, site.z_m, site.yaw_deg, site.pitch_deg, site.roll_deg)
-            for site in ranked
-        } | dict(plan)
+        poses = {site.site: site.pose for site in ranked} | dict(plan)
 
         def entries(file: RunFile) -> Entries:
             return current.get(file.name, {})
@@ -130,7 +127,10 @@ class CommandSections:
             tuple(_what_if_row(name, values, ranked[0]) for name, values in what_ifs.items()),
             difference_unit(ranked[0]),
             tuple(_installation_row(name, values) for name, values in installed(RunFolder.sheets).items()),
-            tuple(_acceptance_row(name, values) for name, values in installed(RunFolder.acceptance).items()),
+            tuple(
+                AcceptanceRow(name, values["sensor"], values["passed"], tuple(values["reasons"]), values["path"])
+                for name, values in installed(RunFolder.acceptance).items()
+            ),
             tuple(_design_table(name, values) for name, values in entries(RunFolder.sensor_design).items()),
         )
 
@@ -175,10 +175,6 @@ def _installation_row(name: str, values: Mapping[str, Any]) -> InstallationRow:
         tuple(f"{quantity} {limit}" for quantity, limit in values["tolerances"].items()), values["file"],
         values["path"],
     )  # fmt: skip
-
-
-def _acceptance_row(name: str, values: Mapping[str, Any]) -> AcceptanceRow:
-    return AcceptanceRow(name, values["sensor"], values["passed"], tuple(values["reasons"]), values["path"])
 
 
 def _design_table(pole: str, values: Mapping[str, Any]) -> DesignTable:

@@ -30,34 +30,29 @@ from egvs.report.approach_fits import ApproachFit, compare_approaches
 from egvs.report.approach_map import busiest_counts, draw_approach_map
 from egvs.report.command_sections import CommandSections
 from egvs.report.points_section import MAPPED_POLES, PointsSection
+from egvs.report.ranking_text import entropy_seen_note, headline, lead, recorded_frames_hint
 from egvs.report.reliability import describe_reliability
 from egvs.report.sections import (
     NAMED_POLES,
-    PlacementSummary,
-    StudySummary,
     ValidationSummary,
     assumes_flows,
     assumptions,
     describe_counts,
     describe_poles_on_road,
     egvs_setting,
+    plan_values,
     ranking_disagreement,
+    study_values,
 )
+from egvs.report.sensor_text import costs_option, describe_evidence, explain_differences, range_note
 from egvs.report.signal_diagram import signal_diagrams
 from egvs.report.zone_section import ZoneSection
 from egvs.results import labels as formatting
 from egvs.results.command_entries import current_entries
 from egvs.results.map_credits import read_map_credits
-from egvs.results.ranking import (
-    RankedSite,
-    Ranking,
-    entropy_seen_note,
-    headline,
-    lead,
-    recorded_frames_hint,
-    share_of_limit,
-)
-from egvs.results.sensors import SensorComparison, costs_option, range_note
+from egvs.results.plans import SensorPlan
+from egvs.results.ranking import RankedSite, Ranking, share_of_limit
+from egvs.results.sensors import SensorComparison
 from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.scene_inputs import scan_dependencies
@@ -127,10 +122,10 @@ class PageContents:
     tpog: Tpog
     figures: Figures
     stages: Mapping[str, StageRecord]
-    study: StudySummary | None = None
+    study: Mapping[str, Any] = field(default_factory=lambda: {"study": None})
     by_period: PeriodRanking | None = None
     detected: ValidationSummary | None = None
-    plan: PlacementSummary | None = None
+    plan: Mapping[str, Any] | None = None
     movements: Mapping[str, str] = field(default_factory=dict)
     commands: CommandSections = field(default_factory=CommandSections)
     zones: ZoneSection | None = None
@@ -242,10 +237,12 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
     drawn = figures.draw_figures(work, ranking, SiteListing.from_ranking(ranking).choices, tpog)
     work.progress("figures drawn", 2, 3)
 
-    plan = PlacementSummary.read(out, stages, ranking.sites, tpog, drawn.backdrop)
+    plan = SensorPlan.read(work.folder)
+    if plan is not None and not plan.belongs_to(stages):
+        plan = None
     mapped = [pole.best for pole in ranking.poles[:MAPPED_POLES]]
-    mounts = [] if plan is None else [pick.mount for pick in plan.picks]
-    moved = plan is not None and plan.before is not None
+    mounts = [] if plan is None else [sensor.mount for sensor in plan.sensors]
+    moved = plan is not None and plan.refinement is not None
     approaches = compare_approaches(work.scenario, work.folder.trajectories, network_file(out))
     contents = PageContents(
         work.scenario,
@@ -253,10 +250,10 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
         tpog,
         drawn,
         stages,
-        study=StudySummary.read(out, stages),
+        study=study_values(work.folder, stages),
         by_period=PeriodRanking.read(out),
         detected=ValidationSummary.read(out, stages),
-        plan=plan,
+        plan=None if plan is None else plan_values(plan, ranking.sites, tpog, drawn.backdrop),
         commands=CommandSections.of(
             current_entries(work.folder, work.scenario, stages),
             ranking.sites,
@@ -284,6 +281,8 @@ def render_page(contents: PageContents) -> str:
     """Return the complete page, HTML text."""
     values = {
         **vars(contents),
+        **contents.study,
+        **(contents.plan or {}),
         **_ranking_values(contents.ranking),
         **_setting_values(contents),
         **_sensor_values(contents),
@@ -361,6 +360,8 @@ def _sensor_values(contents: PageContents) -> dict[str, Any]:
         "sensors": sensors,
         "range_note": range_note(names, is_modelled=contents.scenario.effects.range_limit is not None),
         "costs_option": costs_option(sensors.sensors) if sensors is not None else "",
+        "sensors_explanation": explain_differences(sensors) if sensors is not None else "",
+        "sensors_evidence": describe_evidence(sensors) if sensors is not None else "",
     }
 
 

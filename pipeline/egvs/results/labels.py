@@ -82,7 +82,7 @@ class ScoreLabel:
 
     def with_noun(self, value: float) -> str:
         """Return a value with name and unit, e.g. "EGVS 247,397 bit"."""
-        return f"{self.noun} {self.value(value)} {self.unit}".strip()
+        return f"{self.noun} {self.with_unit(value)}"
 
     def value(self, value: float) -> str:
         """Return a value as text, without its unit."""
@@ -102,6 +102,10 @@ class ScoreLabel:
             return self.value(value)
         text = f"{self._number(value)} ± {self._error_number(se)}"
         return f"{text} %" if self.is_share else text
+
+    def with_unit(self, value: float, se: float = math.nan) -> str:
+        """Return a value with its error, if that is known, and its unit, e.g. "99,220 ± 300 bit"."""
+        return f"{self.with_error(value, se)} {self.unit}".rstrip()
 
     def change(self, value: float, se: float = math.nan) -> str:
         """Return a difference of two values, without unit: of shares in percentage points, e.g. "4.7 ± 0.5"."""
@@ -140,7 +144,7 @@ class ScoreLabel:
 
     def sentence(self, value: float) -> str:
         """Return what a site with this score does, e.g. "should find 87.0 % of vehicles"."""
-        return self.says.format(f"{self.value(value)} {self.unit}".strip())
+        return self.says.format(self.with_unit(value))
 
 
 _MAX_LETTERS = 18
