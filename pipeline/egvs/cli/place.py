@@ -208,12 +208,12 @@ def _curve_table(placed: SensorPlan, width: int) -> Table:
     from egvs.cli.console import Column, make_table
 
     by, head = placed.by, partial(_head, width)
-    columns = [
-        Column[PlanStep]("sensors", lambda step: str(step.count)),
-        Column[PlanStep](head(_together_head(by)), lambda step: by.with_error(step.score, step.score_se)),
-        Column[PlanStep](head("adds", by.change_head), lambda step: by.change(step.gain, step.gain_se)),
-        Column[PlanStep](head("of all candidates"), lambda step: format_percent(placed.share_of_all(step.score))),
-        Column[PlanStep](head("proved, of the best possible"), lambda step: _format_rounded_down(step.certificate)),
+    columns: list[Column[PlanStep]] = [
+        Column("sensors", lambda step: str(step.count)),
+        Column(head(_together_head(by)), lambda step: by.with_error(step.score, step.score_se)),
+        Column(head("adds", by.change_head), lambda step: by.change(step.gain, step.gain_se)),
+        Column(head("of all candidates"), lambda step: format_percent(placed.share_of_all(step.score))),
+        Column(head("proved, of the best possible"), lambda step: _format_rounded_down(step.certificate)),
     ]
     if any(step.cost for step in placed.curve):
         columns.append(Column("cost", lambda step: f"{step.cost:g}"))

@@ -105,8 +105,8 @@ def _points_rasters(run: FinishedRun, sites: Collection[str], grid: Grid) -> Ite
     plan = run.plan
     if plan is None or not plan.sensors or not positions:
         return
-    sites = [sensor.mount for sensor in plan.sensors]
-    beams = plan_beams(run.work, sites, moved=plan.refinement is not None)
+    planned = [sensor.mount for sensor in plan.sensors]
+    beams = plan_beams(run.work, planned, moved=plan.refinement is not None)
     rows = list(points_maps(run.work, positions, beams))
     for place in positions:
         overlap = overlap_map([row.points for row in rows if row.points.target is place.target])

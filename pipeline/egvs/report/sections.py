@@ -31,7 +31,7 @@ from egvs.extensions.validation.ranking_check import RankingCheck
 from egvs.report import plan_answer
 from egvs.results.labels import SCORE_LABELS, join_names
 from egvs.results.plans import PlannedSensor, SensorPlan
-from egvs.results.ranking import MapSite, Pole, RankedSite
+from egvs.results.ranking import Pole, RankedSite
 from egvs.results.studies import AccuracyResults
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE, FROM_SENSOR
@@ -383,7 +383,7 @@ def _describe_evidence(noun: str, egvs: str, rho: Mapping[str, Mapping[str, floa
 
 
 def plan_values(
-    plan: SensorPlan, candidates: Sequence[MapSite], tpog: Tpog, backdrop: Backdrop
+    plan: SensorPlan, candidates: Sequence[RankedSite], tpog: Tpog, backdrop: Backdrop
 ) -> dict[str, SensorPlan | str]:
     """Return what the page shows of a plan, by the names of the template: the plan, sentences, and figures (SVG text).
 

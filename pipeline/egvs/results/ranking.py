@@ -33,29 +33,7 @@ class ScoreValue(NamedTuple):
 
 
 @dataclass(frozen=True)
-class MapSite:
-    """A candidate site on a map, with its score."""
-
-    site: str
-    x_m: float
-    y_m: float
-    z_m: float
-    egvs: float
-    rank: int
-
-    @property
-    def score(self) -> float:
-        """Value of the score that ranks."""
-        return self.egvs
-
-    @property
-    def by(self) -> ScoreLabel:
-        """Label of the score that ranks."""
-        return SCORE_LABELS["egvs"]
-
-
-@dataclass(frozen=True)
-class RankedSite(MapSite):
+class RankedSite:
     """A row of ``scores.parquet``; its schema has the units.
 
     Attributes
@@ -74,6 +52,12 @@ class RankedSite(MapSite):
         Scores other than the EGVS.
     """
 
+    site: str
+    x_m: float
+    y_m: float
+    z_m: float
+    egvs: float
+    rank: int
     pole: str
     yaw_deg: float
     pitch_deg: float
