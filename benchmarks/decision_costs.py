@@ -33,11 +33,11 @@ from egvs.core.wording import format_percent
 from egvs.extensions.validation.held_out_traffic import FrameSampling
 from egvs.extensions.validation.site_validation import validate_sites
 from egvs.results.labels import SCORE_LABELS
+from egvs.results.studies import SettingResult, Tolerance
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.sensors import sites
 from egvs.studies.accuracy import AccuracyStudy, StudyOptions, run_accuracy_study
-from egvs.studies.recommendation import SettingResult, Tolerance
 from egvs.studies.study_settings import DEFAULT_VALUES, SettingValues
 
 TOLERANCE = Tolerance(1.0)

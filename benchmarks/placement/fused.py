@@ -59,7 +59,7 @@ def best_plans(scenario_folder: Path, folder: Path, counts: Sequence[int], jobs:
             placed = plan.place(scenario, folder / score, exact=True, jobs=jobs)
             sites = {site.name: site for site in candidate_sites(scenario)}
             group = SensorGroup(tuple(sites[sensor.site] for sensor in placed.sensors))
-            yield BestPlan(score, group, placed.joint / placed.joint_of_all, placed.solution.is_best)
+            yield BestPlan(score, group, placed.joint / placed.joint_of_all, placed.is_best)
 
 
 def detect(

@@ -77,6 +77,7 @@ if TYPE_CHECKING:
     from egvs.extensions.validation.held_out_traffic import FrameSampling
     from egvs.extensions.validation.site_validation import validate_sites
     from egvs.placement.plan import JointScore, place
+    from egvs.results.studies import Tolerance
     from egvs.runs.run import run
     from egvs.runs.verification import verify
     from egvs.scenario.loading import load
@@ -90,7 +91,6 @@ if TYPE_CHECKING:
     from egvs.stages.inputs import build_scene
     from egvs.studies.accuracy import StudyOptions, run_accuracy_study
     from egvs.studies.effect_study import effect_statuses, run_ablation
-    from egvs.studies.recommendation import Tolerance
     from egvs.studies.run_comparison import compare_runs
     from egvs.studies.what_if import what_if
     from egvs.world.mesh import World
@@ -166,6 +166,7 @@ __getattr__, __dir__ = lazy_exports(
         "extensions.validation.held_out_traffic": ["FrameSampling"],
         "extensions.validation.site_validation": ["validate_sites"],
         "placement.plan": ["JointScore", "place"],
+        "results.studies": ["Tolerance"],
         "runs.run": ["run"],
         "runs.verification": ["verify"],
         "scenario.loading": ["load"],
@@ -179,7 +180,6 @@ __getattr__, __dir__ = lazy_exports(
         "stages.inputs": ["build_scene"],
         "studies.accuracy": ["StudyOptions", "run_accuracy_study"],
         "studies.effect_study": ["effect_statuses", "run_ablation"],
-        "studies.recommendation": ["Tolerance"],
         "studies.run_comparison": ["compare_runs"],
         "studies.what_if": ["what_if"],
         "world.mesh": ["World"],

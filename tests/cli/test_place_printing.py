@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from io import StringIO
-from types import SimpleNamespace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,8 +13,7 @@ from rich.console import Console
 
 from egvs.cli import console as cli_console
 from egvs.cli import place
-from egvs.placement.fused_score import FusedPlan
-from egvs.results.plans import PlannedSensor, PlanStep
+from egvs.results.plans import FusedPlan, PlannedSensor, PlanStep, SensorPlan
 from egvs.scenario.score_config import PlacementConfig
 
 LAST_LINES = """\
@@ -33,32 +33,34 @@ def sensor(order: int, site: str, gain: float, score: float, **values: float) ->
     )
 
 
-def placed_two(score: str = "expected_detections", scale: float = 1.0, **changes: Any) -> Any:
-    """A proved plan of two sensors; of its joint scores, errors and gains, 1 is ``scale``."""
-    steps = (
-        PlanStep(1, 0.9455 * scale, 0.9455 * scale, True, 0.009 * scale, 0.009 * scale, 1.0),
-        PlanStep(2, 0.9922 * scale, 0.0467 * scale, True, 0.003 * scale, 0.005 * scale, 0.999),
-    )
-    points = [SimpleNamespace(certificate=1.0, count=1), SimpleNamespace(certificate=1.0, count=2)]
-    points[-1].plan_value = SimpleNamespace(joint=steps[-1].score)
-    placed = SimpleNamespace(
-        score=score, steps=steps, joint_of_all=0.9942 * scale, candidates=12, refinement=None, fused=None, zones=(),
-        zone_results=(), files=(),
-        sensors=(
-            sensor(1, "a", steps[0].gain, steps[0].score, gain_se=steps[0].gain_se, score_se=steps[0].score_se),
-            sensor(2, "b", steps[1].gain, steps[1].score, gain_se=steps[1].gain_se, score_se=steps[1].score_se),
+def placed_two(
+    score: str = "expected_detections",
+    scale: float = 1.0,
+    sites: tuple[tuple[str, ...], ...] = (("a",), ("a", "b")),
+    cost: float = 0.0,
+    **changes: Any,
+) -> SensorPlan:
+    """A proved plan of two sensors; of its joint scores, errors and gains, 1 is ``scale``; a sensor costs ``cost``."""
+    curve = (
+        PlanStep(1, 0.9455 * scale, 0.9455 * scale, True, 0.009 * scale, 0.009 * scale, 1.0, sites[0], cost, 1.0, 1.0),
+        PlanStep(
+            2, 0.9922 * scale, 0.0467 * scale, True, 0.003 * scale, 0.005 * scale, 0.999, sites[1], 2 * cost, 1.0, 1.0
         ),
-        curve_sites=(("a",), ("a", "b")), curve_costs=(0.0, 0.0),
-        has_errors=True, errors_from="10 blocks of 100 frames",
-        solution=SimpleNamespace(curve=points, point=points[-1], fewest_is_proved=None, is_best=True),
+    )
+    placed = SensorPlan(
+        sensors=(
+            sensor(1, "a", curve[0].gain, curve[0].score, gain_se=curve[0].gain_se, score_se=curve[0].score_se),
+            sensor(2, "b", curve[1].gain, curve[1].score, gain_se=curve[1].gain_se, score_se=curve[1].score_se),
+        ),
+        curve=curve, score=score, request=PlacementConfig(count=2).model_dump(mode="json"), joint=curve[1].score,
+        joint_of_all=0.9942 * scale, cost=2 * cost, candidates=12, zones=(), is_best=True, fewest_is_proved=None,
+        errors_from="10 blocks of 100 frames",
     )  # fmt: skip
-    for name, value in changes.items():
-        setattr(placed, name, value)
-    return placed
+    return replace(placed, **changes)
 
 
-def printed(placed: Any, capsys: pytest.CaptureFixture[str]) -> str:
-    place.print_placement(placed, PlacementConfig(count=2))
+def printed(placed: SensorPlan, capsys: pytest.CaptureFixture[str]) -> str:
+    place.print_placement(placed)
     return capsys.readouterr().out
 
 
@@ -75,9 +77,9 @@ def test_tables_fit_the_terminal_and_cut_no_value(width: int, monkeypatch: pytes
     out = Console(width=width, record=True, file=StringIO(), highlight=False)
     monkeypatch.setattr(cli_console, "console", lambda *_, **__: out)
     sites = ("south@4.5m-12deg", "north@4.5m-12deg")
-    placed = placed_two(curve_sites=(sites[:1], sites))
-    placed.sensors = tuple(replace(row, site=site) for row, site in zip(placed.sensors, sites, strict=True))
-    place.print_placement(placed, PlacementConfig(count=2))
+    placed = placed_two(sites=(sites[:1], sites))
+    sensors = tuple(replace(row, site=site) for row, site in zip(placed.sensors, sites, strict=True))
+    place.print_placement(replace(placed, sensors=sensors))
     lines = out.export_text().splitlines()
     assert max(len(line.rstrip()) for line in lines) <= width
     text = " ".join(" ".join(lines).split())
@@ -113,18 +115,16 @@ def test_bits_have_thousands_separators(capsys: pytest.CaptureFixture[str]) -> N
 
 def test_reason_is_printed_where_errors_are_unknown(capsys: pytest.CaptureFixture[str]) -> None:
     placed = placed_two()
-    steps = tuple(PlanStep(step.count, step.score, step.gain, True) for step in placed.steps)
+    curve = tuple(replace(step, score_se=math.nan, gain_se=math.nan, beats_previous=math.nan) for step in placed.curve)
     sensors = tuple(sensor(row.order, row.site, row.gain, row.score) for row in placed.sensors)
-    text = printed(
-        placed_two(steps=steps, sensors=sensors, has_errors=False, errors_from="score.standard_error is false"), capsys
-    )
+    text = printed(replace(placed, curve=curve, sensors=sensors, errors_from="score.standard_error is false"), capsys)
     assert "no standard errors: score.standard_error is false" in text
     assert "±" not in text
     assert "A second sensor adds 4.7 percentage points" in text
 
 
 def test_best_single_site_that_is_not_part_of_the_plan_is_named() -> None:
-    text = place.describe_absent_best(placed_two(curve_sites=(("c",), ("a", "b"))))
+    text = place.describe_absent_best(placed_two(sites=(("c",), ("a", "b"))))
     assert text is not None
     assert text.startswith("The best single site, c, is not part of this plan")
 
@@ -132,21 +132,19 @@ def test_best_single_site_that_is_not_part_of_the_plan_is_named() -> None:
 def test_best_single_site_in_the_plan_or_a_single_sensor_needs_no_sentence() -> None:
     assert place.describe_absent_best(placed_two()) is None
     one = placed_two()
-    one.sensors = one.sensors[:1]
-    one.curve_sites = (("a",),)
-    assert place.describe_absent_best(one) is None
+    assert place.describe_absent_best(replace(one, sensors=one.sensors[:1], curve=one.curve[:1])) is None
 
 
 def test_costs_are_printed_only_where_they_are_set(capsys: pytest.CaptureFixture[str]) -> None:
     assert "cost" not in printed(placed_two(), capsys)
-    text = printed(placed_two(curve_costs=(3000.0, 6000.0)), capsys)
+    text = printed(placed_two(cost=3000.0), capsys)
     assert sum("  cost" in line for line in text.splitlines()) == 2
     assert "The plan a, b for 6000 should find" in text
 
 
 def test_ends_with_what_was_assumed(capsys: pytest.CaptureFixture[str]) -> None:
     caveat = "Before you trust this plan: assumed, not measured: positions of the poles."
-    place.print_placement(placed_two(), PlacementConfig(count=2), caveat=caveat)
+    place.print_placement(placed_two(), caveat=caveat)
     assert capsys.readouterr().out.splitlines()[-1] == caveat
 
 
@@ -161,5 +159,5 @@ def test_replaced_plan_is_named_by_its_options() -> None:
 
 
 def test_files_come_last(capsys: pytest.CaptureFixture[str]) -> None:
-    text = printed(placed_two(files=("runs/r/placement.parquet", "runs/r/report.html")), capsys)
+    text = printed(placed_two(files=(Path("runs/r/placement.parquet"), Path("runs/r/report.html"))), capsys)
     assert text.endswith(f"{LAST_LINES}runs/r/placement.parquet\nruns/r/report.html\n")

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from egvs.results.sensors import SENSOR_EVIDENCE
+from egvs.report.sensor_text import SENSOR_EVIDENCE
 from egvs.results.study_results import STUDY
 
 DOCS = Path(__file__).parents[2] / "docs"

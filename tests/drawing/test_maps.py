@@ -12,16 +12,16 @@ from egvs.core.grid import Grid
 from egvs.drawing import maps
 from egvs.drawing.maps import Backdrop
 from egvs.drawing.svg_figures import FigureStyle, MapFrame
-from egvs.results.ranking import MapSite
+from egvs.results.ranking import RankedSite
 from tests.drawing.test_basemap import roads
-from tests.report.small_runs import EMPTY_BACKDROP, decode_png
+from tests.report.small_runs import EMPTY_BACKDROP, decode_png, ranked_site
 
 
 def test_north_is_up_and_east_is_right():
     grid = Grid((0.0, 0.0, 0.0), 1.0, (4, 3, 1))
     field = np.zeros((4, 3))
     field[3, 2], field[0, 0] = 4.0, 1.0
-    drawn = maps.occupancy(grid, field, "voxels", EMPTY_BACKDROP, [MapSite("a", 0, 0, 1, 1.0, 1)], "")
+    drawn = maps.occupancy(grid, field, "voxels", EMPTY_BACKDROP, [ranked_site("a", 0, 0, 1, 1.0, 1)], "")
     for png in re.findall(r'href="([^"]+)"', drawn):
         index = decode_png(png)
         assert index.shape == (3, 4) and index[0, 3] == 254 and index[2, 0] == 1 + 253.999 // 2
@@ -29,7 +29,7 @@ def test_north_is_up_and_east_is_right():
 
 
 def test_labels_do_not_overlap():
-    candidates = [MapSite(f"c{n:02}", 5.0 * n, 50.0, 2.0, 100.0 - n, n + 1) for n in range(8)]
+    candidates = [ranked_site(f"c{n:02}", 5.0 * n, 50.0, 2.0, 100.0 - n, n + 1) for n in range(8)]
     grid = Grid((0.0, 0.0, 0.0), 0.5, (200, 100, 4))
     drawn = maps.site_map(grid, np.zeros((200, 100)), EMPTY_BACKDROP, candidates, "")
     labels = [(float(x), float(y)) for x, y in re.findall(r'class="label" x="([\d.]+)" y="([\d.]+)"', drawn)]
@@ -41,9 +41,9 @@ def test_labels_do_not_overlap():
 
 def test_sites_at_one_location_are_rings_with_the_best_innermost():
     candidates = [
-        MapSite("low", 5.0, 5.0, 2.0, 10.0, 2),
-        MapSite("high", 5.0, 5.0, 4.0, 20.0, 1),
-        MapSite("else", 9.0, 9.0, 4.0, 5.0, 3),
+        ranked_site("low", 5.0, 5.0, 2.0, 10.0, 2),
+        ranked_site("high", 5.0, 5.0, 4.0, 20.0, 1),
+        ranked_site("else", 9.0, 9.0, 4.0, 5.0, 3),
     ]
     drawn = maps.site_map(Grid((0.0, 0.0, 0.0), 0.5, (20, 20, 4)), np.zeros((20, 20)), EMPTY_BACKDROP, candidates, "")
     both = re.search(r'<g class="site first"[^>]*>.*?</g>', drawn).group()
@@ -67,14 +67,14 @@ def test_line_to_a_label_begins_at_the_edge_of_the_spot() -> None:
         assert min(abs(math.hypot(x - spot[0], y - spot[1]) - RADIUS) for spot in row) < 0.1
 
 
-def drawn(folder: Path, sites: list[MapSite]) -> str:
+def drawn(folder: Path, sites: list[RankedSite]) -> str:
     grid = Grid((0.0, -10.0, 0.0), 0.5, (100, 40, 4))
     backdrop = Backdrop((), roads(folder, (-10.0, -20.0, 60.0, 20.0)))
     return maps.site_map(grid, np.zeros((100, 40)), backdrop, sites, "")
 
 
 def test_lanes_are_drawn_in_their_width(tmp_path: Path) -> None:
-    figure = drawn(tmp_path, [MapSite("a", 5.0, 8.0, 3.0, 1.0, 1)])
+    figure = drawn(tmp_path, [ranked_site("a", 5.0, 8.0, 3.0, 1.0, 1)])
     widths = dict(re.findall(r'class="lane (\w+)" style="stroke-width:([\d.]+)px"', figure))
     scale = float(re.search(r'class="edge" style="stroke-width:([\d.]+)px"', figure).group(1)) / 4.0  # the crossing's
     assert float(widths["drive"]) == round(3.2 * scale - 1.0, 2)
@@ -86,8 +86,8 @@ def test_street_name_avoids_sites(tmp_path: Path) -> None:
         folder.mkdir()
         return re.findall(r'class="street" transform="translate\(([\d.]+) ', drawn(folder, [site_at(x_m)]))
 
-    def site_at(x_m: float) -> MapSite:
-        return MapSite("a", x_m, -1.6, 3.0, 1.0, 1)
+    def site_at(x_m: float) -> RankedSite:
+        return ranked_site("a", x_m, -1.6, 3.0, 1.0, 1)
 
     (free,), (moved,) = places(tmp_path / "beside", 49.0), places(tmp_path / "on", 23.0)
     assert free != moved
@@ -95,7 +95,7 @@ def test_street_name_avoids_sites(tmp_path: Path) -> None:
 
 def test_narrow_map_names_poles_instead_of_candidates() -> None:
     names = ["k1@3m+0deg", "k1@3m-10deg", "k1@6m+aim"]
-    candidates = [MapSite(name, 5.0, 5.0, 3.0, 9.0 - i, i + 1) for i, name in enumerate(names)]
+    candidates = [ranked_site(name, 5.0, 5.0, 3.0, 9.0 - i, i + 1) for i, name in enumerate(names)]
     grid = Grid((0.0, 0.0, 0.0), 0.5, (20, 20, 4))
     labels = {}
     for width_mm in (85.0, 170.0):

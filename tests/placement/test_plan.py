@@ -527,8 +527,8 @@ def test_folder_instead_of_file_keeps_old_plan(three_candidates: Path, tmp_path:
 def test_says_that_time_limit_was_reached(three_candidates: Path, tmp_path: Path, run_egvs, monkeypatch) -> None:
     scenario = egvs.load(three_candidates, ["placement.count=2"])
     placed = egvs.place(scenario, tmp_path / "out")
-    interrupted = replace(placed, solution=replace(placed.solution, is_best=False, fewest_is_proved=None))
-    proved = replace(placed, solution=replace(placed.solution, is_best=True, fewest_is_proved=None))
+    interrupted = replace(placed, is_best=False, fewest_is_proved=None)
+    proved = replace(placed, is_best=True, fewest_is_proved=None)
     for result, has_note in ((interrupted, True), (proved, False)):
         monkeypatch.setattr("egvs.placement.plan.place", lambda *_, result=result, **__: result)
         _, text, _ = run_egvs(

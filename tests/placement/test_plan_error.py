@@ -40,10 +40,10 @@ def test_plan_of_one_sensor_has_standard_error_of_its_site(mini: Path, tmp_path:
     assert len(set(site_se.values())) > 1
 
     placed = egvs.place(scenario, tmp_path / "out")
-    expected = site_se[placed.curve_sites[0][0]]
+    expected = site_se[placed.curve[0].sites[0]]
     if score == "expected_detections":  # chances are rounded to 2**-44 to add up exactly
         expected = pytest.approx(expected, rel=1e-9)
-    assert placed.steps[0].score_se == placed.steps[0].gain_se == expected
+    assert placed.curve[0].score_se == placed.curve[0].gain_se == expected
 
 
 def egvs_without_blocks(folder: Path, hits: dict[tuple[int, int, int], float], gamma: float) -> list[float]:
@@ -91,11 +91,11 @@ def test_disjoint_sensors_add_their_scores_without_each_block(mini: Path, tmp_pa
 
     placed = egvs.place(scenario, out)
     together = [a + b for a, b in zip(left, right, strict=True)]
-    first, second = (left, right) if placed.curve_sites[0] == ("left",) else (right, left)
+    first, second = (left, right) if placed.curve[0].sites == ("left",) else (right, left)
     assert min(standard_error(first), standard_error(second)) > 0.0
-    assert [step.score_se for step in placed.steps] == pytest.approx([standard_error(first), standard_error(together)])
-    assert placed.steps[1].gain_se == pytest.approx(standard_error(second))
-    assert placed.joint_se == placed.steps[1].score_se
+    assert [step.score_se for step in placed.curve] == pytest.approx([standard_error(first), standard_error(together)])
+    assert placed.curve[1].gain_se == pytest.approx(standard_error(second))
+    assert placed.joint_se == placed.curve[1].score_se
     assert [sensor.gain_se for sensor in placed.sensors] == pytest.approx(
         [standard_error(first), standard_error(second)]
     )
@@ -108,8 +108,8 @@ def test_tables_have_errors_of_each_number_of_sensors(mini: Path, tmp_path: Path
     assert metadata["plan"]["standard_errors"] == placed.errors_from
     assert placed.errors_from.startswith("4 blocks of 10 frames")
     rows = curve.to_pylist()
-    assert plan_steps(rows) == placed.steps
-    for before, row, step in zip([None, *rows[:-1]], rows, placed.steps, strict=True):
+    assert plan_steps(rows) == placed.curve
+    for before, row, step in zip([None, *rows[:-1]], rows, placed.curve, strict=True):
         assert step.gain == row["score"] - (0.0 if before is None else before["score"])
         assert row["score_se"] > 0.0
         assert 0.5 < row["beats_previous"] <= 1.0
@@ -130,7 +130,7 @@ def test_reason_is_named_where_errors_are_unknown(mini: Path, tmp_path: Path, ov
     placed = egvs.place(egvs.load(mini, ["placement.count=2", override]), tmp_path / "out")
     assert placed.errors_from == WITHOUT_ERRORS[override]
     assert not placed.has_errors
-    assert np.isnan([placed.joint_se, *(step.score_se for step in placed.steps)]).all()
+    assert np.isnan([placed.joint_se, *(step.score_se for step in placed.curve)]).all()
     curve, _ = parquet.read_artefact(tmp_path / "out" / "curve.parquet", "curve")
     assert not set(ERROR_COLUMNS) & set(curve.column_names)
 

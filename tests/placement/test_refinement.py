@@ -18,9 +18,8 @@ import egvs
 from egvs.core.errors import InputError
 from egvs.placement import plan as placement_plan
 from egvs.placement import refinement
-from egvs.placement.plan import Placement
 from egvs.placement.refinement import Freedom, minimise, sensor_freedoms
-from egvs.results.plans import PlannedSensor
+from egvs.results.plans import PlannedSensor, SensorPlan
 from egvs.scenario.score_config import RefinementConfig
 from egvs.sensors.sites import Pose, Site
 from egvs.sensors.sites import candidate_sites as sites_of
@@ -32,7 +31,7 @@ HALVES = 'traffic.periods=[{name="a", length_s=12, weight=3}, {name="b", begin_s
 FEW = "placement.refine.evaluations=60"
 
 
-def make_plan(folder: Path, *settings: str, jobs: int = 1, out: str = "run") -> Placement:
+def make_plan(folder: Path, *settings: str, jobs: int = 1, out: str = "run") -> SensorPlan:
     """Return a refined plan, with few evaluations."""
     overrides = ["placement.count=2", FEW, *settings]
     return placement_plan.place(egvs.load(folder, overrides), folder / out, jobs=jobs)
@@ -64,15 +63,15 @@ def write_sites(folder: Path, poses: dict[str, Pose]) -> None:
 def test_refined_plan_is_never_worse(mini: Path, settings: tuple[str, ...]) -> None:
     placed = make_plan(mini, *settings)
     assert placed.refinement is not None
-    point = placed.solution.point
-    assert placed.refinement.joint_before == point.plan_value.joint
-    assert placed.refinement.value_before == point.plan_value.value
+    point = placed.curve[-1]
+    assert placed.refinement.joint_before == point.score
+    assert placed.refinement.value_before == point.value
     assert placed.refinement.value_after > placed.refinement.value_before
-    if point.plan_value.value == point.plan_value.joint:
+    if point.value == point.score:
         assert (placed.refinement.value_after, placed.joint > placed.refinement.joint_before) == (placed.joint, True)
     assert placed.sensors[-1].score == placed.joint
     assert all(zone.seen >= zone.share for zone in placed.zones)
-    assert {sensor.site for sensor in placed.sensors} == set(placed.curve_sites[-1])
+    assert {sensor.site for sensor in placed.sensors} == set(placed.curve[-1].sites)
 
 
 @pytest.mark.slow
@@ -104,7 +103,7 @@ def pose_of(sensor: PlannedSensor) -> Pose:
     return Pose(sensor.x_m, sensor.y_m, sensor.z_m, sensor.yaw_deg, sensor.pitch_deg, sensor.roll_deg)
 
 
-def _place_without_refinement(folder: Path, poses: dict[str, Pose]) -> Placement:
+def _place_without_refinement(folder: Path, poses: dict[str, Pose]) -> SensorPlan:
     text = (folder / "sites.csv").read_text()
     write_sites(folder, poses)
     placed = placement_plan.place(egvs.load(folder, [f"placement.count={len(poses)}"]), folder / "again", jobs=1)

@@ -16,6 +16,7 @@ from egvs.core.files import add_checksum
 from egvs.drawing.basemap import Roads
 from egvs.drawing.maps import Backdrop
 from egvs.report import page
+from egvs.results.ranking import RankedSite
 from egvs.scenario.loading import scenario_from_dict
 from egvs.stages import scan, score
 from egvs.world.mesh import World, write_ply
@@ -205,3 +206,8 @@ def decode_png(png):
     rows = np.frombuffer(zlib.decompress(chunks[b"IDAT"]), dtype=np.uint8).reshape(height, width + 1)
     assert not rows[:, 0].any() and len(chunks[b"PLTE"]) <= 768
     return rows[:, 1:]
+
+
+def ranked_site(name: str, x_m: float, y_m: float, z_m: float, egvs: float, rank: int) -> RankedSite:
+    """A site of a ranking by EGVS, with a level sensor on a pole of the same name."""
+    return RankedSite(name, x_m, y_m, z_m, egvs, rank, name, 0.0, 0.0, 0.0, "VLP-32C", 1e6, 1, 1, 0.5)

@@ -4,23 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
-from egvs.report.plan_answer import (
-    CurvePlan,
-    InstalledSite,
-    describe_count,
-    describe_joint_score,
-    is_useful,
-    next_count,
-)
+from egvs.report.plan_answer import describe_count, describe_joint_score, is_useful, next_count
 from egvs.results.labels import SCORE_LABELS
-from egvs.results.plans import PlanStep
+from egvs.results.plans import PlannedSensor, PlanStep, SensorPlan
 
 FOUND = SCORE_LABELS["expected_detections"]
 EGVS = SCORE_LABELS["egvs"]
-NO_LIMIT = {"budget": None, "reach": None}
+NO_LIMIT: dict[str, Any] = {"budget": None, "reach": None, "objective": "joint", "survives": 0}
 
 
 def steps_of(*scores: float, gain_se: float = math.nan, beats: float = math.nan) -> list[PlanStep]:
@@ -32,6 +26,23 @@ def steps_of(*scores: float, gain_se: float = math.nan, beats: float = math.nan)
     return steps
 
 
+def with_sites(steps: list[PlanStep], *plans: str, cost: float = 0.0) -> list[PlanStep]:
+    """The plans of these sites, each a letter of which every one costs ``cost``."""
+    return [replace(step, sites=tuple(sites), cost=cost * len(sites)) for step, sites in zip(steps, plans, strict=True)]
+
+
+def sensor(site: str, score: float, score_se: float = math.nan) -> PlannedSensor:
+    pose = (0.0, 0.0, 3.0, 0.0, 0.0, 0.0)
+    return PlannedSensor(1, site, site, *pose, "OS1", False, gain=0.0, score=score, cost=0.0, score_se=score_se)
+
+
+def plan_of(steps: list[PlanStep], sensors: int, candidates: int, **request: float) -> SensorPlan:
+    return SensorPlan(
+        (sensor("a", 0.9),) * sensors, tuple(steps), "expected_detections", NO_LIMIT | request, joint=0.9,
+        joint_of_all=1.0, cost=0.0, candidates=candidates, zones=(), is_best=True, fewest_is_proved=None,
+    )  # fmt: skip
+
+
 def test_says_how_many_are_enough() -> None:
     steps = steps_of(0.946, 0.992, 0.997, gain_se=0.002, beats=0.99)
     assert describe_count(steps, FOUND) == "Two are enough: a third adds 0.5 ± 0.2 percentage points."
@@ -40,33 +51,30 @@ def test_says_how_many_are_enough() -> None:
 
 def test_names_the_plan_that_is_enough_where_it_is_smaller_than_the_one_shown() -> None:
     steps = steps_of(0.946, 0.992, 0.998, gain_se=0.001, beats=0.99)
-    plans = [CurvePlan(("a",), 0.0), CurvePlan(("b", "c"), 0.0), CurvePlan(("a", "b", "c"), 0.0)]
-    assert describe_count(steps, FOUND, plans=plans) == (
+    assert describe_count(with_sites(steps, "a", "bc", "abc"), FOUND) == (
         "Two are enough (b and c): a third adds 0.6 ± 0.1 percentage points."
     )
-    same = [*plans[:2], plans[1]]  # a third sensor is not used
-    assert describe_count(steps, FOUND, plans=same).startswith("Two are enough: a third")
+    same = with_sites(steps, "a", "bc", "bc")  # a third sensor is not used
+    assert describe_count(same, FOUND).startswith("Two are enough: a third")
 
 
 def test_first_sites_of_a_larger_plan_are_compared_with_those_that_are_enough() -> None:
-    steps = steps_of(0.946, 0.992, 0.998, gain_se=0.001, beats=0.99)
-    plans = [CurvePlan(("a",), 0.0), CurvePlan(("b", "c"), 0.0), CurvePlan(("a", "b", "c"), 0.0)]
-    installed = [InstalledSite("a", 0.946), InstalledSite("b", 0.99, 0.003), InstalledSite("c", 0.998)]
-    assert describe_count(steps, FOUND, plans=plans, installed=installed) == (
+    steps = with_sites(steps_of(0.946, 0.992, 0.998, gain_se=0.001, beats=0.99), "a", "bc", "abc")
+    installed = [sensor("a", 0.946), sensor("b", 0.99, 0.003), sensor("c", 0.998)]
+    assert describe_count(steps, FOUND, installed=installed) == (
         "Two are enough (b and c): a third adds 0.6 ± 0.1 percentage points. The first two sites of the plan of three, "
         "a and b, reach 99.0 ± 0.3 % instead of 99.2 %: begin with them only if one more is to follow."
     )
-    same = [InstalledSite("c", 0.9), InstalledSite("b", 0.992), InstalledSite("a", 0.998)]
-    assert "instead of" not in describe_count(steps, FOUND, plans=plans, installed=same)
-    bought = describe_count(steps, FOUND, plans=plans, installed=installed, has_budget=True)
+    same = [sensor("c", 0.9), sensor("b", 0.992), sensor("a", 0.998)]
+    assert "instead of" not in describe_count(steps, FOUND, installed=same)
+    bought = describe_count(steps, FOUND, installed=installed, has_budget=True)
     assert bought.endswith("begin with them only if one more is to follow.")
 
 
 def test_first_site_of_a_plan_is_compared_with_the_best_single_one() -> None:
-    steps = steps_of(0.946, 0.947, 0.948, gain_se=0.001, beats=0.6)
-    plans = [CurvePlan(("a",), 0.0), CurvePlan(("b", "c"), 0.0), CurvePlan(("b", "c", "d"), 0.0)]
-    installed = [InstalledSite("b", 0.93), InstalledSite("c", 0.947), InstalledSite("d", 0.948)]
-    assert describe_count(steps, FOUND, plans=plans, installed=installed).endswith(
+    steps = with_sites(steps_of(0.946, 0.947, 0.948, gain_se=0.001, beats=0.6), "a", "bc", "bcd")
+    installed = [sensor("b", 0.93), sensor("c", 0.947), sensor("d", 0.948)]
+    assert describe_count(steps, FOUND, installed=installed).endswith(
         "The first site of the plan of three, b, reaches 93.0 % instead of 94.6 %: begin with it only if two more are "
         "to follow."
     )
@@ -79,13 +87,12 @@ def test_only_several_sensors_ranked_by_vehicles_found_assume_independence() -> 
 
 
 def test_plan_within_a_budget_is_not_contradicted() -> None:
-    steps = steps_of(0.946, 0.992, 0.998, gain_se=0.001, beats=0.99)
-    plans = [CurvePlan(("a",), 1e4), CurvePlan(("b", "c"), 2e4), CurvePlan(("a", "b", "c"), 3e4)]
-    assert describe_count(steps, FOUND, plans=plans, has_budget=True) == (
+    steps = with_sites(steps_of(0.946, 0.992, 0.998, gain_se=0.001, beats=0.99), "a", "bc", "abc", cost=1e4)
+    assert describe_count(steps, FOUND, has_budget=True) == (
         "The budget buys three sensors; the third adds only 0.6 ± 0.1 percentage points, so two are enough: "
         "b and c for 20000."
     )
-    assert describe_count(steps[:2], FOUND, plans=plans[:2], has_budget=True).startswith("A second sensor adds 4.6 ")
+    assert describe_count(steps[:2], FOUND, has_budget=True).startswith("A second sensor adds 4.6 ")
 
 
 def test_says_what_the_last_sensor_adds_where_it_is_still_useful() -> None:
@@ -150,11 +157,11 @@ def test_single_number_of_sensors_has_only_a_hint() -> None:
 
 def test_next_count_only_where_the_count_is_the_limit() -> None:
     steps = steps_of(0.8, 0.9)
-    assert next_count(steps, 2, 13, NO_LIMIT) == 3
-    assert next_count(steps, 2, 2, NO_LIMIT) is None
-    assert next_count(steps, 1, 13, NO_LIMIT) is None  # a second one adds nothing
-    assert next_count(steps, 2, 13, {"budget": 100.0, "reach": None}) is None
-    assert next_count(steps, 2, 13, {"budget": None, "reach": 0.9}) is None
+    assert next_count(plan_of(steps, 2, 13)) == 3
+    assert next_count(plan_of(steps, 2, 2)) is None
+    assert next_count(plan_of(steps, 1, 13)) is None  # a second one adds nothing
+    assert next_count(plan_of(steps, 2, 13, budget=100.0)) is None
+    assert next_count(plan_of(steps, 2, 13, reach=0.9)) is None
 
 
 @pytest.mark.parametrize(

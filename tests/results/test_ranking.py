@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 from egvs.core.errors import Diagnostic
+from egvs.drawing.run_figures import site_caption
+from egvs.report import ranking_text
 from egvs.report.sections import describe_poles_on_road
-from egvs.results import ranking as report_ranking
 from egvs.results.labels import SCORE_LABELS
-from egvs.results.ranking import RankedSite, Ranking, ScoreValue
+from egvs.results.ranking import Pole, RankedSite, Ranking, ScoreValue
 from egvs.scenario.loading import load
 
 SCENARIOS = Path(__file__).parents[2] / "scenarios"
@@ -42,17 +43,15 @@ def by_vehicles(*rows: tuple[str, float, float], rank_by: str = "expected_detect
 def test_sentences_for_a_score_over_vehicles() -> None:
     detected = by_vehicles(("a", 50.0, 0.871), ("b", 90.0, 0.8), ("c", 20.0, 0.4))
     assert (
-        report_ranking.headline(detected, has_traffic=True)
+        ranking_text.headline(detected, has_traffic=True)
         == "a is the best of 3 sites: it should find 87.1 % of vehicles"
     )
-    assert report_ranking.lead(detected) == "It leads the next site, b, by 7.1 percentage points."
-    assert report_ranking.entropy_seen_note(detected) == ""
-    assert report_ranking.site_caption(detected.sites[0], 1, 2).startswith(
-        "a: rank 1, the share of vehicles found 87.1 %, at x"
-    )
+    assert ranking_text.lead(detected) == "It leads the next site, b, by 7.1 percentage points."
+    assert ranking_text.entropy_seen_note(detected) == ""
+    assert site_caption(detected.sites[0], 1, 2).startswith("a: rank 1, the share of vehicles found 87.1 %, at x")
     assert detected.sites[0].score_se == 0.01 and detected.companion_score is SCORE_LABELS["egvs"]
     assert (
-        report_ranking.headline(by_vehicles(("a", 50.0, 0.871)), has_traffic=True)
+        ranking_text.headline(by_vehicles(("a", 50.0, 0.871)), has_traffic=True)
         == "a, the only site, should find 87.1 % of vehicles"
     )
     assert by_vehicles(("a", 50.0, 0.9), rank_by="egvs").companion_score is SCORE_LABELS["expected_detections"]
@@ -61,34 +60,34 @@ def test_sentences_for_a_score_over_vehicles() -> None:
 
 def test_gain_of_a_pole_is_in_percentage_points_for_shares_and_relative_otherwise() -> None:
     shares = by_vehicles(("a", 50.0, 0.6), ("b", 90.0, 0.4), ("c", 20.0, 0.0)).sites
-    assert report_ranking.Pole("p", shares[:2]).gain_text == "20.0"
-    assert report_ranking.Pole("p", shares).gain_text == "60.0"
-    assert report_ranking.Pole("p", shares[:1]).gain_text == ""
+    assert Pole("p", shares[:2]).gain_text == "20.0"
+    assert Pole("p", shares).gain_text == "60.0"
+    assert Pole("p", shares[:1]).gain_text == ""
     bits = ranking(("a", 60.0, 1, 0.5, 1.0), ("b", 40.0, 2, 0.5, 1.0), ("c", 0.0, 3, 0.0, 1.0)).sites
-    assert report_ranking.Pole("p", bits[:2]).gain_text == "50.0 %"
-    assert report_ranking.Pole("p", bits).gain_text == ""
+    assert Pole("p", bits[:2]).gain_text == "50.0 %"
+    assert Pole("p", bits).gain_text == ""
 
 
 def test_lead_says_whether_the_best_is_certain() -> None:
     """Two that share the first place cannot beat each other; whether they lead is another matter."""
     ahead = ranking(("a", 100.0, 1, 0.5, 0.5), ("b", 100.0, 1, 0.6, 0.99), ("c", 80.0, 3, 0.4, 1.0))
-    assert report_ranking.lead(ahead) == "They lead the next site, c, by 20.0 % of their score."
+    assert ranking_text.lead(ahead) == "They lead the next site, c, by 20.0 % of their score."
     near = ranking(("a", 100.0, 1, 0.5, 0.5), ("b", 100.0, 1, 0.6, 0.7), ("c", 98.0, 3, 0.4, 1.0))
-    assert report_ranking.lead(near).endswith("by 2.0 % of their score. These poles cannot be told apart.")
+    assert ranking_text.lead(near).endswith("by 2.0 % of their score. These poles cannot be told apart.")
     alone = ranking(("a", 100.0, 1, 0.5, 0.7), ("c", 98.0, 2, 0.4, 1.0))
-    assert report_ranking.lead(alone, "More helps.").endswith("These poles cannot be told apart. More helps.")
+    assert ranking_text.lead(alone, "More helps.").endswith("These poles cannot be told apart. More helps.")
 
 
 def test_lead_names_the_best_site_on_another_pole_if_the_next_site_is_on_the_same_one() -> None:
     sites = by_vehicles(("a", 50.0, 0.9), ("b", 50.0, 0.88), ("c", 50.0, 0.85), ("d", 50.0, 0.8)).sites
     on_one_pole = [replace(site, pole=pole) for site, pole in zip(sites, ("p", "p", "q", "q"), strict=True)]
-    text = report_ranking.lead(report_ranking.Ranking(tuple(on_one_pole), (on_one_pole[0],), ()))
+    text = ranking_text.lead(Ranking(tuple(on_one_pole), (on_one_pole[0],), ()))
     assert text == (
         "It leads the next site, b, by 2.0 percentage points."
         " The best site on another pole, c, is behind by 5.0 percentage points."
     )
     single_pole = tuple(replace(site, pole="p") for site in sites)
-    text = report_ranking.lead(report_ranking.Ranking(single_pole, single_pole[:1], ()))
+    text = ranking_text.lead(Ranking(single_pole, single_pole[:1], ()))
     assert text == "It leads the next site, b, by 2.0 percentage points."
 
 
@@ -113,14 +112,14 @@ def with_rivals(*rows: tuple[str, str, float, float, float]) -> Ranking:
 )
 def test_lead_over_another_pole_has_its_error_and_probability(chance: float, says: str) -> None:
     sites = with_rivals(("a", "p", 0.9, 0.0, 0.5), ("b", "p", 0.89, 0.004, 0.99), ("c", "q", 0.883, 0.013, chance))
-    assert report_ranking.lead(sites, "More helps.") == (
+    assert ranking_text.lead(sites, "More helps.") == (
         "It leads the next site, b, by 1.0 ± 0.4 percentage points (it is truly better with a probability of 99 %)."
         f" The best site on another pole, c, is behind by 1.7 ± 1.3 percentage points {says}"
     )
 
 
 def test_next_site_on_another_pole_is_compared_once() -> None:
-    text = report_ranking.lead(with_rivals(("a", "p", 0.9, 0.0, 0.5), ("c", "q", 0.8999, 0.0001, 0.84)), "More helps.")
+    text = ranking_text.lead(with_rivals(("a", "p", 0.9, 0.0, 0.5), ("c", "q", 0.8999, 0.0001, 0.84)), "More helps.")
     assert text == (
         "It leads the next site, c, by 0.01 ± 0.01 percentage points (it is truly better with a probability of 84 %)."
         " These poles cannot be told apart."
@@ -130,14 +129,14 @@ def test_next_site_on_another_pole_is_compared_once() -> None:
 @pytest.mark.parametrize(("behind", "helps"), [(0.0009, False), (0.0011, True), (0.0, False)])
 def test_hint_is_given_where_poles_differ_by_a_tenth_of_a_point(behind: float, helps: bool) -> None:
     sites = with_rivals(("a", "p", 0.9, 0.0, 0.5), ("c", "q", 0.9 - behind, 0.004, 0.6))
-    text = report_ranking.lead(sites, "More helps.")
+    text = ranking_text.lead(sites, "More helps.")
     assert "These poles cannot be told apart." in text
     assert text.endswith("More helps.") == helps
 
 
 def test_no_hint_for_mounts_of_one_pole() -> None:
     sites = with_rivals(("a", "p", 0.9, 0.0, 0.5), ("b", "p", 0.895, 0.004, 0.6), ("c", "q", 0.8, 0.004, 0.999))
-    text = report_ranking.lead(sites, "More helps.")
+    text = ranking_text.lead(sites, "More helps.")
     assert "These sites cannot be told apart." in text
     assert "More helps." not in text
 
@@ -146,15 +145,15 @@ def test_hint_names_the_setting_that_limits_the_error(mini: Path) -> None:
     by, egvs = SCORE_LABELS["expected_detections"], SCORE_LABELS["egvs"]
     recorded = load(mini)
     more = "More frames may separate them: --set score.sampled_frames="
-    assert report_ranking.more_frames_hint(recorded, by, 5000) == f"{more}1000."
-    assert report_ranking.more_frames_hint(recorded, by, 600) == f"{more}600."
-    assert report_ranking.more_frames_hint(recorded, by, 500) == "A longer recording may separate them."
-    assert report_ranking.more_frames_hint(recorded, egvs, 5000) == "A longer recording may separate them."
+    assert ranking_text.more_frames_hint(recorded, by, 5000) == f"{more}1000."
+    assert ranking_text.more_frames_hint(recorded, by, 600) == f"{more}600."
+    assert ranking_text.more_frames_hint(recorded, by, 500) == "A longer recording may separate them."
+    assert ranking_text.more_frames_hint(recorded, egvs, 5000) == "A longer recording may separate them."
     many = load(mini, ["score.sampled_frames=1000"])
-    assert report_ranking.more_frames_hint(many, by, 5000) == f"{more}4000."
+    assert ranking_text.more_frames_hint(many, by, 5000) == f"{more}4000."
     simulated = load(SCENARIOS / "roundabout")
-    assert report_ranking.more_frames_hint(simulated, egvs, 5000).endswith("--set traffic.frames=20000.")
-    assert "longer periods" in report_ranking.more_frames_hint(load(SCENARIOS / "nishishinjuku_peaks"), by, 400)
+    assert ranking_text.more_frames_hint(simulated, egvs, 5000).endswith("--set traffic.frames=20000.")
+    assert "longer periods" in ranking_text.more_frames_hint(load(SCENARIOS / "nishishinjuku_peaks"), by, 400)
 
 
 @pytest.mark.parametrize(("by_detectors", "asks_for_traffic"), [(0.004, False), (0.0029, False), (0.0028, True)])
@@ -166,7 +165,7 @@ def test_hint_is_not_more_traffic_where_detectors_disagree(
     rival = replace(sites.sites[1], behind_best_detectors_se=by_detectors)
     sites = replace(sites, sites=(sites.sites[0], rival))
     scenario = load(mini, ["score.rank_by='expected_detections'"])
-    hint = report_ranking.recorded_frames_hint(scenario, sites, {})
+    hint = ranking_text.recorded_frames_hint(scenario, sites, {})
     assert (hint == "") == asks_for_traffic  # there is no record of the traffic
     if hint:
         assert hint == (
@@ -178,17 +177,14 @@ def test_hint_is_not_more_traffic_where_detectors_disagree(
 def test_note_on_the_site_that_sees_most_entropy() -> None:
     """Of two with the same score, one that sees more contradicts nothing."""
     tied = ranking(("a", 100.0, 1, 0.5, 0.5), ("b", 100.0, 1, 0.6, 0.99), ("c", 80.0, 3, 0.4, 1.0))
-    assert (
-        report_ranking.entropy_seen_note(tied) == "b also sees the largest share of the traffic’s uncertainty, 60.0 %."
-    )
+    assert ranking_text.entropy_seen_note(tied) == "b also sees the largest share of the traffic’s uncertainty, 60.0 %."
     other = ranking(("a", 100.0, 1, 0.5, 0.99), ("c", 80.0, 2, 0.7, 1.0))
-    assert report_ranking.entropy_seen_note(other).startswith(
+    assert ranking_text.entropy_seen_note(other).startswith(
         "c, rank 2, sees more of the traffic’s uncertainty (70.0 % against 50.0 %), but with fewer beams. One beam"
     )
     agree = ranking(("a", 100.0, 1, 0.7, 0.99), ("c", 80.0, 2, 0.5, 1.0))
     assert (
-        report_ranking.entropy_seen_note(agree)
-        == "It also sees the largest share of the traffic’s uncertainty, 70.0 %."
+        ranking_text.entropy_seen_note(agree) == "It also sees the largest share of the traffic’s uncertainty, 70.0 %."
     )
 
 

@@ -8,15 +8,13 @@ from dataclasses import replace
 
 import pytest
 
+from egvs.report.sensor_text import SENSOR_EVIDENCE, costs_option, describe_evidence, explain_differences, range_note
 from egvs.results.ranking import RankedSite, ScoreValue
 from egvs.results.sensors import (
-    SENSOR_EVIDENCE,
     ScoreDifference,
     SensorComparison,
     best_mounts,
-    costs_option,
     format_difference,
-    range_note,
     site_cost,
 )
 from egvs.scenario.score_config import CostsConfig
@@ -73,7 +71,7 @@ def test_without_a_cost_the_sensor_that_finds_least_is_the_baseline() -> None:
     comparison = compare(site("a", "large", 0.85), site("b", "small", 0.60), prices={"small": 4000.0})
     assert not comparison.has_costs
     assert comparison.baseline.sensor == "small"
-    assert "which finds least" in comparison.explanation
+    assert "which finds least" in explain_differences(comparison)
     assert [result.cost_text for result in comparison.results] == ["4,000", "-"]
     assert not comparison.shows_cost_per_point
     assert costs_option(comparison.sensors) == """--set 'costs.sensor={"small" = PRICE, "large" = PRICE}'"""
@@ -86,8 +84,8 @@ def test_sensors_with_a_cost_are_compared_without_that_of_another() -> None:
     assert comparison.shows_cost_per_point
     assert [result.cost_per_point_text for result in comparison.results] == ["-", "560", "-"]
     assert [result.step_cost_text for result in comparison.results] == ["-", "560", "-"]
-    assert "the cheapest with a known cost" in comparison.explanation
-    assert comparison.explanation.endswith("Without a known cost: medium.")
+    assert "the cheapest with a known cost" in explain_differences(comparison)
+    assert explain_differences(comparison).endswith("Without a known cost: medium.")
 
 
 def test_one_sensor_is_not_compared() -> None:
@@ -128,10 +126,10 @@ def test_difference_that_is_rounded_to_zero_has_no_minus() -> None:
 
 def test_evidence_is_that_of_the_score_that_ranks() -> None:
     by_share = compare(site("a", "large", 0.85), site("b", "small", 0.60))
-    assert by_share.evidence is SENSOR_EVIDENCE
+    assert describe_evidence(by_share) is SENSOR_EVIDENCE
     sites = [replace(result.mount.site, rank_by="egvs", others=()) for result in by_share.results]
     by_egvs = compare(*sites)
-    assert "whether EGVS ranks different sensors as detectors do was not measured" in by_egvs.evidence
+    assert "whether EGVS ranks different sensors as detectors do was not measured" in describe_evidence(by_egvs)
     assert not by_egvs.shows_cost_per_point
     assert [result.cost_per_point_text for result in by_egvs.results] == ["-", "-"]
 

@@ -416,7 +416,7 @@ def outcome(key: str, small: Path, file: str, overrides: tuple[str, ...]) -> obj
             return Inputs(scenario).plain_scene.sites
         case "costs" | "placement":
             placed = solve_placement(open_folder(scenario, run_folder), exact=True, time_limit_s=60)
-            return placed.sensors, placed.joint, placed.cost, placed.zones, placed.curve_costs
+            return placed.sensors, placed.joint, placed.cost, placed.zones, [step.cost for step in placed.curve]
         case "what_if":
             runs = what_if.prepare_runs(small / file, overrides)
             statics = [(one.share, one.scenario.statics.footprints) for one in runs]

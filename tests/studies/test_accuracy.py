@@ -21,11 +21,11 @@ from egvs.artefacts import parquet
 from egvs.artefacts.readers import read_accuracy
 from egvs.cli import accuracy_table
 from egvs.core.errors import InputError, RunError
+from egvs.results.studies import Tolerance
 from egvs.runs.run import lock_run_folder
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.studies import accuracy
 from egvs.studies.accuracy import StudyOptions
-from egvs.studies.recommendation import Tolerance
 from tests.studies.short_studies import FEW_VALUES, compared, count_progress, run_study
 
 

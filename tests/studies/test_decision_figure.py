@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from egvs.results.studies import APPROXIMATES, MEASURES, SCENARIO, SettingResult, Tolerance
 from egvs.studies.decision_figure import draw_figure
-from egvs.studies.recommendation import SettingResult, Tolerance
-from egvs.studies.study_settings import APPROXIMATES, MEASURES, SCENARIO
 from tests.studies.test_recommendation import row
 
 

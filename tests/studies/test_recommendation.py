@@ -6,7 +6,8 @@ from dataclasses import fields
 
 import pytest
 
-from egvs.studies.recommendation import SettingResult, Tolerance, mark_rows
+from egvs.results.studies import SettingResult, Tolerance
+from egvs.studies.recommendation import mark_rows
 
 BLANK = {"str": "", "float": 0.0, "int": 0, "bool": False}
 

@@ -22,8 +22,8 @@ from egvs.cli import console as cli_console
 from egvs.cli import study_tables
 from egvs.core.errors import InputError
 from egvs.core.files import add_checksum
+from egvs.report.sensor_text import SENSOR_EVIDENCE
 from egvs.results.ranking import RankedSite, Ranking, ScoreValue, share_of_limit
-from egvs.results.sensors import SENSOR_EVIDENCE
 from egvs.scenario.score_config import CostsConfig
 from egvs.studies import run_comparison
 from egvs.studies.paired_errors import ScoreDifferences

@@ -82,6 +82,11 @@ _RECORD_TYPES = {
 _RERUN_HINT = "Remove it and run again."
 
 
+def have_inputs(stages: Mapping[str, StageRecord], keys: Mapping[str, str]) -> bool:
+    """Whether recorded stages have these keys, so that what was computed from those inputs belongs to the run."""
+    return all(name in stages and stages[name].inputs == key for name, key in keys.items())
+
+
 def _missing_record_error(folder: Path) -> InputError:
     """Return the error for a folder without ``run.json``: what it is, and what to do."""
     if not folder.is_dir():

@@ -11,12 +11,13 @@ from rich.table import Table
 from egvs.cli.console import NARROW, WIDE, Column, console, make_table, print_sentences
 from egvs.core.wording import format_percent
 from egvs.results.labels import SCORE_LABELS, format_probability
+from egvs.results.studies import MEASURES, SCENARIO
 from egvs.scenario.score_config import DEFAULT_SCORE
-from egvs.studies.study_settings import MEASURES, SCENARIO
 
 if TYPE_CHECKING:
+    from egvs.results.studies import SettingResult
     from egvs.studies.accuracy import AccuracyStudy
-    from egvs.studies.recommendation import NeededTraffic, SettingResult
+    from egvs.studies.recommendation import NeededTraffic
 
 _MAX_FRAMES = 1e8
 """Traffic with more frames than this cannot be simulated in practice."""
@@ -99,9 +100,9 @@ def recommendation_sentences(study: AccuracyStudy) -> list[str]:
     """
     if study.all_zero:
         return ["Every score is 0, so there is nothing to decide: check the region of interest and the traffic."]
-    best_pole = study.best_pole
+    best_pole, units = study.best_pole, "parts of the recording" if study.is_recorded else "seeds"
     sentences = [
-        f"With all traffic of this study ({_describe_units(study)}), {best_pole.name} is the best pole with a "
+        f"With all traffic of this study ({study.units} {units}), {best_pole.name} is the best pole with a "
         f"probability of {format_probability(best_pole.probability)}; {best_pole.mount} there should find "
         f"{format_percent(best_pole.found)} of the vehicles."
     ]
@@ -118,10 +119,6 @@ def recommendation_sentences(study: AccuracyStudy) -> list[str]:
     if study.needed is not None:
         sentences.append(_describe_needed(study, study.needed))
     return sentences
-
-
-def _describe_units(study: AccuracyStudy) -> str:
-    return f"{study.units} {'parts of the recording' if study.is_recorded else 'seeds'}"
 
 
 def _describe_cost(study: AccuracyStudy) -> str:

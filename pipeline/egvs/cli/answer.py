@@ -24,11 +24,10 @@ from egvs.cli.console import Column, console, make_table, print_sentences
 from egvs.cli.options import DEFAULT_POLES
 from egvs.core.errors import Diagnostic, collect_warnings
 from egvs.core.wording import by_number, number_of
-from egvs.report import reliability, sections
-from egvs.results import ranking
+from egvs.report import ranking_text, reliability, sections
+from egvs.report.sensor_text import range_note
 from egvs.results.labels import ScoreLabel, join_names
 from egvs.results.ranking import Pole, RankedSite, Ranking
-from egvs.results.sensors import range_note
 from egvs.scenario.model import Scenario
 from egvs.traffic.signal_descriptions import format_plan
 
@@ -106,7 +105,7 @@ def _print_ranking(
     out: Console, folder: Path, ranked: Ranking, scenario: Scenario, record: RunRecord, poles: int | None
 ) -> None:
     """Print the verdict, the best poles, the lanes seen worst, and how the order by EGVS differs."""
-    print_sentences([verdict(ranked, ranking.recorded_frames_hint(scenario, ranked, record.stages))])
+    print_sentences([verdict(ranked, ranking_text.recorded_frames_hint(scenario, ranked, record.stages))])
     validation = sections.ValidationSummary.read(folder, record.stages)
     if validation is not None and validation.check.warning:
         print_sentences([f"{validation.check.warning} See {RunFolder(folder).report}#detected"])
@@ -132,8 +131,8 @@ def _print_ranking(
 
 def verdict(ranked: Ranking, hint: str = "") -> str:
     """Return a few sentences: the best site, how clearly it leads and, if unclear, the ``hint`` on what helps."""
-    sentences = [f"{ranking.headline(ranked, has_traffic=True)}."]
-    if lead := ranking.lead(ranked, hint):
+    sentences = [f"{ranking_text.headline(ranked, has_traffic=True)}."]
+    if lead := ranking_text.lead(ranked, hint):
         sentences.append(lead)
     return " ".join(sentences)
 

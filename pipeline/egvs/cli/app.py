@@ -324,8 +324,8 @@ def accuracy(
     _, folder = sources.open_source(scenario, set_, out)
     with ProgressDisplay("accuracy") as screen:
         from egvs.cli import accuracy_table
+        from egvs.results.studies import Tolerance
         from egvs.studies.accuracy import StudyOptions, run_accuracy_study
-        from egvs.studies.recommendation import Tolerance
 
         options = StudyOptions(Tolerance(tolerance, score_tolerance), budget_s, seeds, jobs)
         study = run_accuracy_study(

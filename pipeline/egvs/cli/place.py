@@ -18,11 +18,8 @@ from egvs.core.wording import by_number, format_percent, number_of
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from egvs.placement.fused_score import FusedPlan
-    from egvs.placement.plan import Placement, RefinementSummary
     from egvs.results.labels import ScoreLabel
-    from egvs.results.plans import PlannedSensor
-    from egvs.scenario.score_config import PlacementConfig
+    from egvs.results.plans import FusedPlan, PlannedSensor, PlanStep, RefinementSummary, SensorPlan
 
 _NARROW_HEAD_WIDTH = 10
 """Characters of a line of the head of a column on a narrow terminal."""
@@ -84,10 +81,10 @@ def place(
     notes = []
     if replaced is not None and (request_now := plan.planned_request(folder)) != replaced:
         notes.append(describe_replaced(replaced, request_now or {}))
-    if exact and not (placed.solution.is_best or placed.solution.fewest_is_proved):
+    if exact and not (placed.is_best or placed.fewest_is_proved):
         notes.append(f"--exact reached its --time-limit of {time_limit} before any plan was proved optimal.")
     plans = RunRecord.read(folder).traffic_summary.get("signals", ())
-    print_placement(placed, loaded.placement, notes, sections.describe_caveats(loaded, "plan", plans=plans))
+    print_placement(placed, notes, sections.describe_caveats(loaded, "plan", plans=plans))
 
 
 def _check_request(count: int | None, budget: float | None, reach: float | None) -> None:
@@ -103,15 +100,13 @@ def _check_request(count: int | None, budget: float | None, reach: float | None)
         raise InputError("--reach", f"expected a share above 0, at most 1, got {reach:g}", hint)
 
 
-def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequence[str] = (), caveat: str = "") -> None:
+def print_placement(placed: SensorPlan, notes: Sequence[str] = (), caveat: str = "") -> None:
     """Print the plan and the curve, what a planner should know, and the files.
 
     Parameters
     ----------
     placed
         The plan.
-    requested
-        The ``[placement]`` that it solves.
     notes
         Sentences about the search.
     caveat
@@ -136,7 +131,7 @@ def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequen
         )
     if worst := worst_zones(placed.zone_results):
         print_sentences([describe_worst_zones("the plan", worst)])
-    sentences = [describe_plan(placed), *notes, *_further_sentences(placed, requested)]
+    sentences = [describe_plan(placed), *notes, *_further_sentences(placed)]
     if caveat:
         sentences.append(caveat)
     print_sentences(sentences)
@@ -144,35 +139,20 @@ def print_placement(placed: Placement, requested: PlacementConfig, notes: Sequen
         out.print(str(path), soft_wrap=True)
 
 
-def _further_sentences(placed: Placement, requested: PlacementConfig) -> Iterator[str]:
+def _further_sentences(placed: SensorPlan) -> Iterator[str]:
     """Yield what is known beside the plan and its proof."""
     from egvs.report import plan_answer
-    from egvs.report.sections import describe_objective
 
     if placed.refinement is not None:
         yield describe_refinement(placed, placed.refinement)
     if absent := describe_absent_best(placed):
         yield absent
-    request = requested.model_dump(mode="json")
-    next_count = plan_answer.next_count(placed.steps, len(placed.sensors), placed.candidates, request)
-    installed = []
-    if placed.refinement is None:
-        installed = [plan_answer.InstalledSite(row.site, row.score, row.score_se) for row in placed.sensors]
-    answer = plan_answer.describe_count(
-        placed.steps,
-        _label(placed),
-        plans=list(map(plan_answer.CurvePlan, placed.curve_sites, placed.curve_costs)),
-        installed=installed,
-        has_budget=requested.budget is not None,
-        objective=describe_objective(request),
-        next_count=next_count,
-    )
-    if answer:
+    if answer := plan_answer.describe_plan_count(placed):
         yield answer
-    if assumption := plan_answer.describe_joint_score(_label(placed), len(placed.sensors)):
+    if assumption := plan_answer.describe_joint_score(placed.by, len(placed.sensors)):
         yield assumption
     if placed.fused is not None:
-        yield describe_fused(placed.fused, _label(placed))
+        yield describe_fused(placed.fused, placed.by)
 
 
 def describe_fused(fused: FusedPlan, by: ScoreLabel) -> str:
@@ -201,16 +181,10 @@ def describe_fused(fused: FusedPlan, by: ScoreLabel) -> str:
     return f"{text}."
 
 
-def _label(placed: Placement) -> ScoreLabel:
-    from egvs.results.labels import SCORE_LABELS
-
-    return SCORE_LABELS[placed.score]
-
-
-def _sensor_table(placed: Placement, width: int) -> Table:
+def _sensor_table(placed: SensorPlan, width: int) -> Table:
     from egvs.cli.console import Column, make_table
 
-    by, head = _label(placed), partial(_head, width)
+    by, head = placed.by, partial(_head, width)
     columns: list[Column[PlannedSensor]] = [
         Column("", lambda row: row.marked_order),
         Column("site", lambda row: row.site, "left", wrap=True),
@@ -222,7 +196,7 @@ def _sensor_table(placed: Placement, width: int) -> Table:
         Column(head(_together_head(by)), lambda row: by.with_error(row.score, row.score_se)),
         Column(head("lost if it fails", by.change_head), lambda row: by.change(row.loss)),
     ]
-    if any(placed.curve_costs):
+    if any(step.cost for step in placed.curve):
         columns.append(Column("cost", lambda row: f"{row.cost:g}"))
     if placed.refinement is not None:
         columns.append(Column(head("moved m"), lambda row: f"{row.moved_m:.2f}"))
@@ -230,22 +204,21 @@ def _sensor_table(placed: Placement, width: int) -> Table:
     return make_table(columns, placed.sensors)
 
 
-def _curve_table(placed: Placement, width: int) -> Table:
+def _curve_table(placed: SensorPlan, width: int) -> Table:
     from egvs.cli.console import Column, make_table
 
-    by, curve, steps = _label(placed), placed.solution.curve, placed.steps
-    head = partial(_head, width)
-    columns = [
-        Column[int]("sensors", lambda i: str(steps[i].count)),
-        Column[int](head(_together_head(by)), lambda i: by.with_error(steps[i].score, steps[i].score_se)),
-        Column[int](head("adds", by.change_head), lambda i: by.change(steps[i].gain, steps[i].gain_se)),
-        Column[int](head("of all candidates"), lambda i: format_percent(_score_share(placed, steps[i].score))),
-        Column[int](head("proved, of the best possible"), lambda i: _format_rounded_down(curve[i].certificate)),
+    by, head = placed.by, partial(_head, width)
+    columns: list[Column[PlanStep]] = [
+        Column("sensors", lambda step: str(step.count)),
+        Column(head(_together_head(by)), lambda step: by.with_error(step.score, step.score_se)),
+        Column(head("adds", by.change_head), lambda step: by.change(step.gain, step.gain_se)),
+        Column(head("of all candidates"), lambda step: format_percent(placed.share_of_all(step.score))),
+        Column(head("proved, of the best possible"), lambda step: _format_rounded_down(step.certificate)),
     ]
-    if any(placed.curve_costs):
-        columns.append(Column("cost", lambda i: f"{placed.curve_costs[i]:g}"))
-    columns.append(Column("sites", lambda i: ", ".join(placed.curve_sites[i]), "left", wrap=True))
-    return make_table(columns, range(len(curve)))
+    if any(step.cost for step in placed.curve):
+        columns.append(Column("cost", lambda step: f"{step.cost:g}"))
+    columns.append(Column("sites", lambda step: ", ".join(step.sites), "left", wrap=True))
+    return make_table(columns, placed.curve)
 
 
 def _together_head(by: ScoreLabel) -> str:
@@ -271,13 +244,6 @@ def _with_unit(head: str, unit: str) -> str:
     return f"{head}, {unit}"
 
 
-def _score_share(placed: Placement, joint: float) -> float:
-    """Return a joint score as a share of that of all candidates together."""
-    if not placed.joint_of_all > 0:
-        return 0.0
-    return joint / placed.joint_of_all
-
-
 def describe_replaced(replaced: Mapping[str, Any], requested: Mapping[str, Any]) -> str:
     """Return which plan was replaced, by the options that request it.
 
@@ -292,32 +258,31 @@ def describe_replaced(replaced: Mapping[str, Any], requested: Mapping[str, Any])
     return f"replaces the plan for {' '.join(options)}{settings}"
 
 
-def describe_plan(placed: Placement) -> str:
+def describe_plan(placed: SensorPlan) -> str:
     """Return the plan, its joint score with its standard error, and its certificate, in one sentence."""
-    by = _label(placed)
-    joint = placed.solution.point.plan_value.joint
+    by, last = placed.by, placed.curve[-1]
     sites = ", ".join(sensor.site for sensor in placed.sensors) or "no sensor"
-    cost = f" for {placed.curve_costs[-1]:g}" if placed.curve_costs[-1] else ""
-    score = by.says.format(f"{by.with_error(joint, placed.steps[-1].score_se)} {by.unit}".rstrip())
+    cost = f" for {last.cost:g}" if last.cost else ""
+    score = by.says.format(by.with_unit(last.score, last.score_se))
     if placed.joint_of_all > 0:
-        share = _score_share(placed, joint)
+        share = placed.share_of_all(last.score)
         score += f", {format_percent(share)} of what all {placed.candidates} candidates reach together"
     return f"The plan {sites}{cost} {score}; {_describe_proof(placed)}."
 
 
-def describe_errors(placed: Placement) -> str:
+def describe_errors(placed: SensorPlan) -> str:
     """Return what follows "±", or why there are no standard errors."""
     if placed.has_errors:
         return f"± is one standard error, from {placed.errors_from}"
     return f"no standard errors: {placed.errors_from}"
 
 
-def describe_absent_best(placed: Placement) -> str | None:
+def describe_absent_best(placed: SensorPlan) -> str | None:
     """Return a sentence where the best single site is not part of the plan; None where it is, or is not known."""
-    first = placed.solution.curve[0]
+    first = placed.curve[0]
     if first.count != 1 or len(placed.sensors) < 2:
         return None
-    (best,) = placed.curve_sites[0]
+    (best,) = first.sites
     if best in {sensor.site for sensor in placed.sensors}:
         return None
     return (
@@ -325,32 +290,31 @@ def describe_absent_best(placed: Placement) -> str | None:
     )
 
 
-def _describe_proof(placed: Placement) -> str:
-    solution = placed.solution
-    if solution.fewest_is_proved is not None:
+def _describe_proof(placed: SensorPlan) -> str:
+    if placed.fewest_is_proved is not None:
         fewer = len(placed.sensors) - 1
         if fewer == 0:
             return "one sensor is enough"
         sensors = f"{number_of(fewer, 'sensor')} {by_number(fewer, 'is', 'are')}"
-        if solution.fewest_is_proved:
+        if placed.fewest_is_proved:
             return f"proved: {sensors} not enough"
         return f"not proved that {sensors} not enough"
-    if solution.is_best:
+    if placed.is_best:
         return "proved: no plan within the rules is better"
     return f"proved: at least {_format_rounded_down(placed.certificate)} of the best possible score"
 
 
-def describe_refinement(placed: Placement, summary: RefinementSummary) -> str:
+def describe_refinement(placed: SensorPlan, summary: RefinementSummary) -> str:
     """Return what the refinement of poses changed."""
-    by = _label(placed)
+    by = placed.by
     cost = objective = ""
     if placed.cost:
         cost = f", for {placed.cost:g}"
     if (summary.value_before, summary.value_after) != (summary.joint_before, placed.joint):
         objective = f"; objective {summary.value_before:.6g} before, {summary.value_after:.6g} after"
-    after = f"{by.with_error(placed.joint, placed.joint_se)} {by.unit}".rstrip()
     return (
-        f"Refined: {by.noun} {by.value(summary.joint_before)} before, {after} after{objective}{cost}; "
+        f"Refined: {by.noun} {by.value(summary.joint_before)} before, {by.with_unit(placed.joint, placed.joint_se)} "
+        f"after{objective}{cost}; "
         f"{summary.poses_tried} poses tried in {summary.turns} rounds and {summary.seconds:.1f} s, "
         f"{summary.poses_infeasible} of them infeasible; the proof applies to the candidates at their original poses."
     )

@@ -18,16 +18,15 @@ from rich.table import Table
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.cli.console import NARROW, Column, console, format_or_dash, make_table, percent_or_dash, print_sentences
 from egvs.core.wording import format_percent, list_first
+from egvs.report.sensor_text import costs_option, describe_evidence, explain_differences, range_note
 from egvs.results.labels import SCORE_LABELS, join_names
 from egvs.results.ranking import RankedSite, share_of_limit
 from egvs.results.sensors import (
     ScoreDifference,
     SensorComparison,
     SensorResult,
-    costs_option,
     difference_unit,
     format_difference,
-    range_note,
 )
 from egvs.runs.run_names import effect_state
 
@@ -254,7 +253,7 @@ def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparis
     if sensors.shows_cost_per_point and sensors.has_steps:
         columns.append(Column("… from the best cheaper sensor", lambda result: result.step_cost_text, wrap=True))
     out.print(make_table(columns, sensors.results, width=out.width, title="the best mount of each sensor"))
-    print_sentences([sensors.explanation])
+    print_sentences([explain_differences(sensors)])
     if sensors.unpriced:
         words = command or ["egvs", "compare", *dict.fromkeys(str(run.folder) for run in comparison.runs)]
         option = costs_option(sensors.sensors if not sensors.has_costs else sensors.unpriced)
@@ -263,7 +262,7 @@ def _print_sensors(out: Console, comparison: Comparison, sensors: SensorComparis
     is_modelled = all(run.has_range_limit for run in comparison.runs)
     if note := range_note(sensors.sensors, is_modelled=is_modelled):
         print_sentences([note])
-    print_sentences([sensors.evidence])
+    print_sentences([describe_evidence(sensors)])
     out.print()
 
 

@@ -42,9 +42,9 @@ from egvs.drawing.svg_figures import (
     text_width,
 )
 from egvs.results.labels import shorten_name
-from egvs.results.ranking import MapSite
+from egvs.results.ranking import RankedSite
 
-StackedSites = list[MapSite]
+StackedSites = list[RankedSite]
 """Sites at the same x, y, the best first."""
 
 _MAX_HEIGHT = 560.0
@@ -75,7 +75,7 @@ class Backdrop:
 class SiteViewFigure:
     """A sensor, the voxels that its beams cross (shape (nx, ny, nz)), and the background of the figure."""
 
-    site: MapSite
+    site: RankedSite
     crossed: NDArray[np.bool_]
     backdrop: Backdrop
     box: Box
@@ -93,7 +93,7 @@ def occupancy(
     values: ColumnValues,
     label: str,
     backdrop: Backdrop,
-    sites: Sequence[MapSite],
+    sites: Sequence[RankedSite],
     alt: str,
     style: FigureStyle = PAGE_STYLE,
     scale: MapScale | None = None,
@@ -137,7 +137,7 @@ def site_map(
     grid: Grid,
     values: ColumnValues,
     backdrop: Backdrop,
-    sites: Sequence[MapSite],
+    sites: Sequence[RankedSite],
     alt: str,
     style: FigureStyle = PAGE_STYLE,
 ) -> str:
@@ -243,7 +243,7 @@ def scan_view(grid: Grid, image: IndexedImage, view: SiteViewFigure, prefix: str
 
 
 def missed_view(
-    grid: Grid, blindspots: SiteBlindspots, site: MapSite, backdrop: Backdrop, box: Box, prefix: str
+    grid: Grid, blindspots: SiteBlindspots, site: RankedSite, backdrop: Backdrop, box: Box, prefix: str
 ) -> str:
     """Return the share of vehicles that a site misses in each cell, with the worst locations numbered.
 
@@ -324,7 +324,7 @@ def _numbered_mark(transform: str, number: int) -> str:
     return f'<g class="{classes}" {transform}><circle r="{radius}"/><text y="4">{number}</text></g>'
 
 
-def zone_map(grid: Grid, zones: Sequence[MapZone], site: MapSite, backdrop: Backdrop, box: Box, alt: str) -> str:
+def zone_map(grid: Grid, zones: Sequence[MapZone], site: RankedSite, backdrop: Backdrop, box: Box, alt: str) -> str:
     """Return zones coloured by the share found, and numbered; small zones lie above large ones.
 
     See :func:`classes_view` for the parameters.
@@ -398,7 +398,9 @@ def road_paths(plan: MapFrame, roads: Roads) -> str:
     return f"<g {plan.style.shape('roads')}>{''.join(edges)}{junctions}{''.join(lanes)}</g>"
 
 
-def _street_names(plan: MapFrame, names: Sequence[StreetName], sites: Sequence[MapSite]) -> tuple[list[str], list[Box]]:
+def _street_names(
+    plan: MapFrame, names: Sequence[StreetName], sites: Sequence[RankedSite]
+) -> tuple[list[str], list[Box]]:
     """Street names and the boxes that they cover: within the map, clear of sites and of each other.
 
     Names on the longest streets come first; a name that finds no room is left out.
@@ -470,7 +472,7 @@ def _site_rings(plan: MapFrame, stack: StackedSites, low: float, high: float, ra
     return f'<g {group} data-site="{escape(best.site)}">{title}{"".join(shapes)}</g>'
 
 
-def _stack_sites(sites: Sequence[MapSite]) -> list[StackedSites]:
+def _stack_sites(sites: Sequence[RankedSite]) -> list[StackedSites]:
     """Sites by location, the location of the best site first."""
     stacks: dict[tuple[float, float], StackedSites] = {}
     for site in sorted(sites, key=lambda site: site.rank):
@@ -478,17 +480,17 @@ def _stack_sites(sites: Sequence[MapSite]) -> list[StackedSites]:
     return list(stacks.values())
 
 
-def is_crowded(sites: Sequence[MapSite]) -> bool:
+def is_crowded(sites: Sequence[RankedSite]) -> bool:
     """Return whether the sites have too many locations for numbers and names."""
     return len(_stack_sites(sites)) > _CROWDED
 
 
-def has_stacked_sites(sites: Sequence[MapSite]) -> bool:
+def has_stacked_sites(sites: Sequence[RankedSite]) -> bool:
     """Return whether several sites have the same location."""
     return len(_stack_sites(sites)) < len(sites)
 
 
-def describe_names(sites: Sequence[MapSite]) -> str:
+def describe_names(sites: Sequence[RankedSite]) -> str:
     """Return rank and name of the best site at each location, for screens where a map has no labels.
 
     Empty for a crowded map, which has no numbers.
@@ -625,7 +627,7 @@ def plan_map(
     grid: Grid,
     values: ColumnValues,
     backdrop: Backdrop,
-    candidates: Sequence[MapSite],
+    candidates: Sequence[RankedSite],
     poles: Sequence[PlannedPole],
     alt: str,
 ) -> str:

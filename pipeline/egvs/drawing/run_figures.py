@@ -29,8 +29,8 @@ from egvs.drawing.basemap import network_file, roads_within, world_outlines
 from egvs.drawing.colours import ColumnValues, IndexedImage
 from egvs.drawing.maps import Backdrop, SiteViewFigure
 from egvs.drawing.svg_figures import PAGE_STYLE, Box, FigureStyle, extent, shared_scale
-from egvs.results import ranking
-from egvs.results.ranking import MapSite, RankedSite, Ranking
+from egvs.results.labels import format_count, format_number
+from egvs.results.ranking import RankedSite, Ranking
 from egvs.scoring.egvs import EntropyField
 from egvs.scoring.scorer import Scorer
 from egvs.scoring.visibility import Beams
@@ -101,36 +101,17 @@ class SiteViews:
 
 @dataclass(frozen=True)
 class SitePanel:
-    """Figures of one site, SVG text, and the texts next to them."""
+    """Figures of one site, SVG text, and the texts next to them.
+
+    ``vehicles`` has the ``figure`` of its blind spots, and :func:`blindspot_texts`.
+    """
 
     scored: RankedSite
     visible: str
     missed: str
     scan: str
     caption: str
-    vehicles: BlindspotView | None
-
-
-@dataclass(frozen=True)
-class BlindspotView:
-    """Blind spots of one site.
-
-    Attributes
-    ----------
-    figure
-        SVG text.
-    missed
-        Share of all vehicles that the site misses.
-    worst
-        The worst locations, and the sample that each is based on.
-    note
-        A remark on what the list does not show.
-    """
-
-    figure: str
-    missed: str
-    worst: tuple[tuple[str, str], ...]
-    note: str
+    vehicles: dict[str, Any] | None
 
 
 def draw_figures(work: StageContext, ranking: Ranking, choosable: Sequence[RankedSite], tpog: Tpog) -> Figures:
@@ -206,9 +187,10 @@ def site_views(
     box = extent(scorer.field.grid, choosable)
     is_coarse = len(choosable) > MAX_FULL_IMAGES
     peak = float(column_entropy(scorer.field, np.ones(len(scorer.field.cells), dtype=np.bool_)).max())
-    blindspots = read_blindspots(work, choosable)
-
     site_of_name = {site.site: site for site in choosable}
+    blindspots: dict[str, SiteBlindspots] = {}
+    if work.scenario.score.blindspots:
+        blindspots = {spots.site: spots for spots in readers.read_blindspots(work.folder.blindspots, set(site_of_name))}
 
     def draw_images(scan: SiteScan) -> tuple[_SiteCoverage, dict[str, IndexedImage]]:
         site = site_of_name[scan.site.name]
@@ -219,11 +201,11 @@ def site_views(
     site_data: dict[str, dict[str, Any]] = {}
     for coverage, images in map_ordered(draw_images, empty_scans(work, site_of_name.keys()), work.threads):
         site = coverage.scored
-        site_data[site.site] = _panel_data(coverage, images, blindspots, box)
+        site_data[site.site] = _panel_data(coverage, images, blindspots.get(site.site), box)
         if site in ranking.extremes:
             prefix = f"view-{ranking.extremes.index(site)}"
             panels[site.site] = _draw_panel(
-                coverage, scorer.field.grid, peak, images["scan"], blindspots, backdrop, box, prefix
+                coverage, scorer.field.grid, peak, images["scan"], blindspots.get(site.site), backdrop, box, prefix
             )
 
     palettes: dict[str, dict[str, str]] = {}
@@ -250,7 +232,7 @@ def _site_coverage(site: RankedSite, beams: Beams, scorer: Scorer) -> _SiteCover
         crossed=crossed,
         visible_bit=column_entropy(field, visible),
         missed_bit=column_entropy(field, ~visible),
-        caption=ranking.site_caption(site, int(visible.sum()), len(visible)),
+        caption=site_caption(site, int(visible.sum()), len(visible)),
         ends_m=_hit_positions_m(beams),
     )
 
@@ -295,7 +277,7 @@ def _site_images(coverage: _SiteCoverage, peak: float, box: Box, *, in_full: boo
 
 
 def _panel_data(
-    coverage: _SiteCoverage, images: dict[str, IndexedImage], blindspots: Blindspots | None, box: Box
+    coverage: _SiteCoverage, images: dict[str, IndexedImage], blindspots: SiteBlindspots | None, box: Box
 ) -> dict[str, Any]:
     """Data from which the page draws the figures of one site."""
     plan, site = maps.site_view_frame(box), coverage.scored
@@ -305,8 +287,8 @@ def _panel_data(
         "caption": coverage.caption,
     }
     if blindspots is not None:
-        images = images | {"vehicles": blindspots.image(site.site)}
-        data["vehicles"] = blindspots.panel_data(site.site, box)
+        images = images | {"vehicles": colours.share_image(blindspots.share_missed)}
+        data["vehicles"] = {"numbers": maps.label_positions(plan, blindspots), **blindspot_texts(blindspots)}
     data["images"] = {name: [_to_base64(image.head), _to_base64(image.data)] for name, image in images.items()}
     return data
 
@@ -320,7 +302,7 @@ def _draw_panel(
     grid: Grid,
     peak: float,
     scan: IndexedImage,
-    blindspots: Blindspots | None,
+    blindspots: SiteBlindspots | None,
     backdrop: Backdrop,
     box: Box,
     prefix: str,
@@ -340,51 +322,28 @@ def _draw_panel(
     ends = maps.scan_view(grid, scan, view, f"{prefix}-scan", f"From above: where the beams of {where} end.")
     vehicles = None
     if blindspots is not None:
-        vehicles = blindspots.view(site, grid, backdrop, box, f"{prefix}-vehicles")
+        figure = maps.missed_view(grid, blindspots, site, backdrop, box, f"{prefix}-vehicles")
+        vehicles = {"figure": figure, **blindspot_texts(blindspots)}
     return SitePanel(site, visible, missed, ends, coverage.caption, vehicles)
 
 
 # ---- blind spots
 
 
-@dataclass(frozen=True)
-class Blindspots:
-    """Blind spots of all choosable sites."""
+def blindspot_texts(site_blindspots: SiteBlindspots) -> dict[str, Any]:
+    """Return what the page says about the blind spots of a site.
 
-    sites: dict[str, SiteBlindspots]
-
-    def view(self, site: MapSite, grid: Grid, backdrop: Backdrop, box: Box, prefix: str) -> BlindspotView:
-        """Return the figure and the texts of one site."""
-        blindspots = self.sites[site.site]
-        return BlindspotView(
-            figure=maps.missed_view(grid, blindspots, site, backdrop, box, prefix),
-            missed=format_missed_share(blindspots),
-            worst=describe_worst_locations(blindspots),
-            note=blindspot_note(blindspots),
-        )
-
-    def panel_data(self, site: str, box: Box) -> dict[str, Any]:
-        """Return what the page needs to draw one site, except the image."""
-        blindspots = self.sites[site]
-        return {
-            "numbers": maps.label_positions(maps.site_view_frame(box), blindspots),
-            "missed": format_missed_share(blindspots),
-            "worst": describe_worst_locations(blindspots),
-            "note": blindspot_note(blindspots),
-        }
-
-    def image(self, site: str) -> IndexedImage:
-        """Return the image of the share of vehicles that a site misses in each cell."""
-        return colours.share_image(self.sites[site].share_missed)
-
-
-def read_blindspots(work: StageContext, choosable: Sequence[MapSite]) -> Blindspots | None:
-    """Return the blind spots of some sites; None if the scenario does not enable ``score.blindspots``."""
-    if not work.scenario.score.blindspots:
-        return None
-    names = {site.site for site in choosable}
-    sites = {site.site: site for site in readers.read_blindspots(work.folder.blindspots, names)}
-    return Blindspots(sites)
+    Returns
+    -------
+    dict
+        ``missed``, the share of all vehicles that the site misses; ``worst``, the worst locations, and the sample that
+        each is based on; and a ``note`` on what this list does not show.
+    """
+    return {
+        "missed": format_missed_share(site_blindspots),
+        "worst": describe_worst_locations(site_blindspots),
+        "note": blindspot_note(site_blindspots),
+    }
 
 
 def format_missed_share(site_blindspots: SiteBlindspots) -> str:
@@ -433,4 +392,15 @@ def _describe_sample(location: LocationVisibility) -> str:
     return (
         f"± {format_percent(location.se, 0)}, from {location.vehicles:,} vehicles in "
         f"{location.vehicle_frames:,} observations"
+    )
+
+
+def site_caption(site: RankedSite, visible_voxels: int, voxels: int) -> str:
+    """Return the position and the counts of one site."""
+    return (
+        f"{site.site}: rank {site.rank}, {site.by.with_noun(site.score)}, at x = {format_number(site.x_m)} m, "
+        f"y = {format_number(site.y_m)} m, z = {format_number(site.z_m)} m, with a {site.sensor}. "
+        f"It sees {format_count(visible_voxels)} of {format_count(voxels)} uncertain voxels. "
+        f"{format_count(site.beams_in_roi)} of its beams can reach the region; {format_count(site.returns)} of "
+        "them hit the ground or an object."
     )

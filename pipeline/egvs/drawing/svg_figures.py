@@ -20,7 +20,7 @@ from egvs.core.wording import format_percent
 from egvs.drawing import colours
 from egvs.drawing.colours import LIGHT, STEPS, STYLE_SHEET, Theme, opacity, shape_attributes
 from egvs.results.labels import shorten_name
-from egvs.results.ranking import MapSite
+from egvs.results.ranking import RankedSite
 
 Box = tuple[float, float, float, float]
 """x0, y0, x1, y1: in the world frame, metres, or in a figure's units."""
@@ -90,7 +90,7 @@ class FigureStyle:
 PAGE_STYLE = FigureStyle()
 
 
-def extent(grid: Grid, sites: Sequence[MapSite]) -> Box:
+def extent(grid: Grid, sites: Sequence[RankedSite]) -> Box:
     """Return a box around the region of interest and all sites, with a margin, in metres."""
     (x0, y0, _), (width, height, _) = grid.origin_m, grid.roi.size_m
     xs = [x0, x0 + width, *(site.x_m for site in sites)]

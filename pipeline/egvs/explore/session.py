@@ -12,7 +12,7 @@ Nothing here depends on a page or a browser. World frame, metres.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -22,7 +22,6 @@ from egvs.artefacts import parquet, traffic_frames
 from egvs.artefacts.readers import (
     LocationVisibility,
     SiteBlindspots,
-    read_placement,
     read_scores,
     read_scores_by_period,
 )
@@ -36,6 +35,7 @@ from egvs.core.grid import Grid
 from egvs.placement import problem_builder
 from egvs.placement.refinement import PlanPoses
 from egvs.results.labels import SCORE_LABELS
+from egvs.results.plans import SensorPlan
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.scoring import blindspots
@@ -57,12 +57,6 @@ from egvs.stages.points_maps import target_positions
 from egvs.stages.site_scoring import TargetScorer
 
 Floats = NDArray[np.float64]
-
-
-def _score_text(name: str, value: float) -> str:
-    """Return a score with its name and unit, e.g. "egvs 1,234 bit" or "expected_detections 61.3 %"."""
-    label = SCORE_LABELS[name]
-    return f"{name} {label.value(value)} {label.unit}".strip()
 
 
 _SCORES = RunFolder.scores.name
@@ -88,18 +82,14 @@ class MovingPlan:
         stages
             Keys of its stages.
         """
-        placement = read_placement(work.folder.placement, work.folder.curve)
-        if placement is None:
+        planned = SensorPlan.read(work.folder)
+        if planned is None or any(planned.stages.get(name) != stages.get(name) for name in _PLAN_STAGES):
             return None
-        rows, _, metadata = placement
-        if any(metadata["stages"].get(name) != stages.get(name) for name in _PLAN_STAGES):
-            return None
-        plan = cls.of_candidates(work, [row["site"] for row in rows])
+        plan = cls.of_candidates(work, [sensor.site for sensor in planned.sensors])
         scanner = Scanner(replace(work.scene, sites=()))
-        for row, site in zip(rows, plan.poses.sites, strict=True):
-            pose = Pose(**{field.name: row[field.name] for field in fields(Pose)})
-            if pose != site.pose:  # after --refine
-                moved = replace(site, pose=pose)
+        for sensor, site in zip(planned.sensors, plan.poses.sites, strict=True):
+            if sensor.mount.pose != site.pose:  # after --refine
+                moved = replace(site, pose=sensor.mount.pose)
                 plan = plan.with_moved(moved, Beams.of(scanner.scan_site(moved)))
         return plan
 
@@ -185,7 +175,7 @@ class PoseScore:
         if not self.is_feasible:
             problems = "; ".join(str(finding) for finding in self.findings if finding.is_error)
             return f"PoseScore({self.site.name}: no score, {problems})"
-        scores = ", ".join(_score_text(name, value) for name, value in self.scores.items())
+        scores = ", ".join(f"{name} {SCORE_LABELS[name].with_unit(value)}" for name, value in self.scores.items())
         return f"PoseScore({self.site.name}: rank {self.rank}, {scores})"
 
     @property

@@ -8,19 +8,19 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egvs.artefacts import parquet
-from egvs.artefacts.readers import read_placement
-from egvs.artefacts.run_folder import PLACEMENT_FILES, RunFolder
+from egvs.artefacts.run_folder import RunFolder
 from egvs.artefacts.run_record import RunRecord
 from egvs.artefacts.tpog import Tpog
 from egvs.core.errors import InputError
 from egvs.formats import georeference
 from egvs.formats.georeference import WorldFrame
+from egvs.results.plans import SensorPlan
 from egvs.runs import stage_registry
 from egvs.runs.run_context import open_folder
 from egvs.scenario.loading import scenario_from_dict
@@ -35,13 +35,6 @@ _READ_STAGES = ("statics", "tpog", "score")
 
 _TOLERANCE_DEG = 1e-8
 """About a millimetre."""
-
-
-class RunPlan(NamedTuple):
-    """Rows of ``placement.parquet``, and its metadata."""
-
-    rows: list[dict[str, Any]]
-    metadata: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -103,22 +96,15 @@ class FinishedRun:
         raise InputError(path, problem, 'Repeat "egvs run".')
 
     @property
-    def plan(self) -> RunPlan | None:
+    def plan(self) -> SensorPlan | None:
         """The plan in the folder; None without one, or where it is for other traffic, sites or settings."""
-        plan = read_placement(*(self.work.path(name) for name in PLACEMENT_FILES))
-        if plan is None:
-            return None
-        rows, _, metadata = plan
-        for name, key in metadata["stages"].items():
-            if name not in self.record.stages or self.record.stages[name].inputs != key:
-                return None
-        return RunPlan(rows, metadata)
+        plan = SensorPlan.read(self.work.folder)
+        return plan if plan is not None and plan.belongs_to(self.record.stages) else None
 
     @property
     def has_outdated_plan(self) -> bool:
         """Whether the folder has a plan for other traffic, sites or settings."""
-        has_files = read_placement(*(self.work.path(name) for name in PLACEMENT_FILES)) is not None
-        return has_files and self.plan is None
+        return SensorPlan.read(self.work.folder) is not None and self.plan is None
 
     def scorer(self, tpog: Tpog) -> Scorer:
         """Return a scorer with the settings of the run.

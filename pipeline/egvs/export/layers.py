@@ -186,10 +186,10 @@ def _with_periods(run: FinishedRun, scores: pa.Table) -> pa.Table:
 def _plan_layers(run: FinishedRun, notes: list[str]) -> Iterator[Layer]:
     if run.has_outdated_plan:
         notes.append("the plan is left out: it is for other traffic, sites or settings. Run egvs place again")
-    plan = run.plan
-    if plan is None:
+    if run.plan is None:
         return
-    table = pa.Table.from_pylist(plan.rows)
+    rows = parquet.read_artefact(run.work.folder.placement, "placement")[0].to_pylist()
+    table = pa.Table.from_pylist(rows)
     yield Layer(PLAN, point_geometries(table), to_plain_table(table))
 
 

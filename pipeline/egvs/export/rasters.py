@@ -31,7 +31,6 @@ from egvs.drawing.run_figures import column_entropy
 from egvs.export.finished_run import ExportCrs, FinishedRun
 from egvs.export.layers import raster_qml
 from egvs.scoring.points_map import OVERLAP_POINTS, overlap_map
-from egvs.sensors.sites import Pose, Site
 from egvs.stages.plan_scans import plan_beams
 from egvs.stages.points_maps import points_maps, target_positions
 from egvs.stages.site_scans import empty_scans
@@ -104,24 +103,17 @@ def _points_rasters(run: FinishedRun, sites: Collection[str], grid: Grid) -> Ite
         yield Raster(name, description, "1", points.values, points.origin_m, points.cell_m, _max_value(points.values))
 
     plan = run.plan
-    if plan is None or not plan.rows or not positions:
+    if plan is None or not plan.sensors or not positions:
         return
-    sensors = [_planned_site(row) for row in plan.rows]
-    moved = "moves" in plan.metadata["plan"]
-    beams = plan_beams(run.work, sensors, moved=moved)
+    planned = [sensor.mount for sensor in plan.sensors]
+    beams = plan_beams(run.work, planned, moved=plan.refinement is not None)
     from_sensors = [points for _, points in points_maps(run.work, positions, beams)]
     for place in positions:
         overlap = overlap_map([points for points in from_sensors if points.target is place.target])
         target = place.target.name
         description = f"Sensors of the plan from which a {target} gets {OVERLAP_POINTS:g} points or more"
-        peak = float(len(sensors))
+        peak = float(len(plan.sensors))
         yield Raster(f"overlap_{target}", description, "1", overlap.values, overlap.origin_m, overlap.cell_m, peak)
-
-
-def _planned_site(row: Mapping[str, Any]) -> Site:
-    """A row of ``placement.parquet`` as a site."""
-    pose = Pose(**{name: row[name] for name in ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")})
-    return Site(row["site"], pose, row["sensor"])
 
 
 def _max_value(values: CellValues) -> float:

@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from egvs.artefacts import parquet
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files
 from egvs.drawing.basemap import solid_group
@@ -35,7 +34,7 @@ from egvs.export.extrinsics import (
     transform_world_sensor,
 )
 from egvs.export.finished_run import ExportCrs, FinishedRun
-from egvs.sensors.sites import Pose
+from egvs.results.ranking import RankedSite
 
 if TYPE_CHECKING:
     import trimesh
@@ -104,18 +103,9 @@ def write_scene(folder: Path, run: FinishedRun, reference: ExportCrs, *, is_usd:
 def posed_sensors(run: FinishedRun) -> list[PosedSensor]:
     """Return the sensors of all sites of a run, in the order of its scores; those of a plan at their poses in it."""
     plan = run.plan
-    planned = {} if plan is None else {row["site"]: row for row in plan.rows}
-    scores = parquet.read_artefact(run.artefact(RunFolder.scores.name), "scores")[0]
-    angles = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
-    return [
-        PosedSensor(
-            row["site"],
-            row["sensor"],
-            Pose(*(float(planned.get(row["site"], row)[name]) for name in angles)),
-            int(row["rank"]),
-        )
-        for row in scores.select(["site", "sensor", "rank", *angles]).to_pylist()
-    ]
+    planned = {} if plan is None else {sensor.site: sensor.mount.pose for sensor in plan.sensors}
+    sites = RankedSite.read(run.artefact(RunFolder.scores.name))
+    return [PosedSensor(site.site, site.sensor, planned.get(site.site, site.pose), site.rank) for site in sites]
 
 
 def scene_origin_m(run: FinishedRun) -> Floats:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from egvs.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from egvs.placement.plan import JointScore, Placement, place
+    from egvs.placement.plan import JointScore, place
 
-__all__ = ["JointScore", "Placement", "place"]
+__all__ = ["JointScore", "place"]
 
-__getattr__, __dir__ = lazy_exports(__name__, {"plan": ["JointScore", "Placement", "place"]})
+__getattr__, __dir__ = lazy_exports(__name__, {"plan": ["JointScore", "place"]})

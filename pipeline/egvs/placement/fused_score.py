@@ -21,14 +21,13 @@ as long as E_f rises. Only the candidates that are tried are scanned. A value ta
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from egvs.core.grid import FloatArray
 from egvs.placement.plan_error import PlanErrors
 from egvs.placement.problem import Plan, Problem
-from egvs.results.plans import PlanStep
+from egvs.results.plans import FusedPlan, PlanStep
 from egvs.scoring.fused_targets import fuse_targets
 from egvs.scoring.target_scores import expected_by_detector
 from egvs.scoring.targets import VisibleTargets, weighted_mean
@@ -96,29 +95,6 @@ class FusedScore:
         if missing:
             for name, beams in self._read_scans(missing):
                 self._visible[name] = self.targets.visible(beams)
-
-
-@dataclass(frozen=True)
-class FusedPlan:
-    """What a plan is expected to find in the fused point clouds of its sensors.
-
-    Attributes
-    ----------
-    steps
-        The first sensor, the first two, and so on, in the order of installation.
-    better_sites
-        Sites that are expected to find more together, reached by swaps of one sensor at a time; empty where no swap
-        finds more.
-    better
-        What they find; ``gain`` is what they find more than the plan. None without ``better_sites``.
-    searched
-        Whether swaps were tried.
-    """
-
-    steps: tuple[PlanStep, ...]
-    better_sites: tuple[str, ...] = ()
-    better: PlanStep | None = None
-    searched: bool = False
 
 
 def evaluate_fused_plan(

@@ -9,10 +9,8 @@ the run, if there is one.
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -20,21 +18,31 @@ from typing import Any
 import numpy as np
 
 from egvs.artefacts import checksums, parquet
-from egvs.artefacts.readers import ZoneVisibility, read_plan_zones
+from egvs.artefacts.readers import read_plan_zones
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files, plugins
 from egvs.core.errors import InputError, choose_one
 from egvs.core.progress import ProgressCallback, no_progress
 from egvs.core.wording import number_of
 from egvs.placement import fused_score, problem_builder, refinement, solver
-from egvs.placement.fused_score import FusedPlan, FusedScore
+from egvs.placement.fused_score import FusedScore
 from egvs.placement.plan_error import PlanErrors
 from egvs.placement.plan_zones import PlanZones
 from egvs.placement.problem import Problem
 from egvs.placement.problem_builder import PlacementProblem, TargetView
 from egvs.placement.refinement import PlanPoses
-from egvs.placement.solver import CurvePoint, Solution
-from egvs.results.plans import ERROR_COLUMNS, PlannedSensor, PlanStep, plan_columns
+from egvs.placement.solver import Solution
+from egvs.results.plans import (
+    ERROR_COLUMNS,
+    FusedPlan,
+    PlannedSensor,
+    PlanStep,
+    RefinementSummary,
+    SensorPlan,
+    ZoneCoverage,
+    curve_columns,
+    plan_columns,
+)
 from egvs.runs import run, stage_registry
 from egvs.runs.run import StageListener, ignore_stage, lock_run_folder
 from egvs.runs.run_context import open_folder
@@ -180,126 +188,6 @@ def planned_request(folder: Path) -> dict[str, Any] | None:
     return request
 
 
-@dataclass(frozen=True)
-class ZoneCoverage:
-    """How a plan covers a required zone.
-
-    Attributes
-    ----------
-    name
-        Name of the zone.
-    seen, share
-        The share of the zone's entropy that the plan sees, and the required share.
-    by
-        Number of sensors that have to see it.
-    """
-
-    name: str
-    seen: float
-    share: float
-    by: int
-
-
-@dataclass(frozen=True)
-class RefinementSummary:
-    """What the refinement of a plan's poses did.
-
-    Attributes
-    ----------
-    joint_before
-        Joint score of the plan at the poses of its candidates.
-    value_before, value_after
-        The objective (:attr:`egvs.placement.problem.PlanValue.value`) before and after. It never drops; the joint score
-        may.
-    poses_tried, poses_infeasible
-        Number of poses that were tried, and of those that break a rule or cannot be scanned.
-    turns
-        Number of turns; each moves one sensor.
-    seconds
-        Duration.
-    """
-
-    joint_before: float
-    value_before: float
-    value_after: float
-    poses_tried: int
-    poses_infeasible: int
-    turns: int
-    seconds: float
-
-
-@dataclass(frozen=True)
-class Placement:
-    """A plan and its certificate.
-
-    Attributes
-    ----------
-    sensors
-        In the order of installation: forced ones first, then each time the one with the largest gain.
-    score
-        Name of the joint score.
-    joint
-        Joint score of the plan.
-    joint_of_all
-        Joint score of all candidates that are not excluded.
-    cost
-        Cost of the plan.
-    candidates
-        Number of candidates that are not excluded.
-    zones
-        The required zones.
-    solution
-        The curve and the bounds; they apply to the candidates at their original poses.
-    curve_sites, curve_costs
-        Names of the sites, and the cost, of each plan of the curve.
-    steps
-        Joint score of each plan of the curve, and what it adds to the one before it, with standard errors.
-    errors_from
-        How the standard errors were computed; or the reason why there are none.
-    has_errors
-        Whether there are standard errors.
-    refinement
-        With refined poses, what the refinement did; ``sensors``, ``joint``, ``cost`` and ``zones`` are those after it.
-    fused
-        What the sensors are expected to find in their fused point clouds; None for one sensor, and for joint scores
-        that do not take sensors as independent.
-    zone_results
-        What the sensors find together in the zones of ``[score] zones``; empty without them.
-    files
-        The files that were written.
-    """
-
-    sensors: tuple[PlannedSensor, ...]
-    score: str
-    joint: float
-    joint_of_all: float
-    cost: float
-    candidates: int
-    zones: tuple[ZoneCoverage, ...]
-    solution: Solution
-    curve_sites: tuple[tuple[str, ...], ...]
-    curve_costs: tuple[float, ...]
-    steps: tuple[PlanStep, ...]
-    errors_from: str
-    has_errors: bool
-    refinement: RefinementSummary | None = None
-    fused: FusedPlan | None = None
-    zone_results: tuple[ZoneVisibility, ...] = ()
-    files: tuple[Path, ...] = ()
-
-    @property
-    def certificate(self) -> float:
-        """Proved share of the best possible objective."""
-        return self.solution.point.certificate
-
-    @property
-    def joint_se(self) -> float:
-        """Standard error of the joint score of the plan; NaN where it is unknown, and without sensors."""
-        if not self.sensors:
-            return math.nan
-        return self.sensors[-1].score_se
-
-
 def place(
     scenario: Scenario,
     out: str | Path | None = None,
@@ -310,7 +198,7 @@ def place(
     jobs: int | None = None,
     progress: ProgressCallback = no_progress,
     listener: StageListener = ignore_stage,
-) -> Placement:
+) -> SensorPlan:
     """Choose the sensors that a scenario's ``[placement]`` asks for, and write the plan.
 
     Parameters
@@ -367,7 +255,7 @@ def place(
         return replace(placed, files=written)
 
 
-def solve_placement(context: StageContext, *, exact: bool, time_limit_s: float) -> Placement:
+def solve_placement(context: StageContext, *, exact: bool, time_limit_s: float) -> SensorPlan:
     """Find the plan that ``[placement]`` asks for; nothing is written.
 
     Parameters
@@ -406,22 +294,23 @@ def solve_placement(context: StageContext, *, exact: bool, time_limit_s: float) 
     placed = _make_placement(scenario, placement_problem, problem, sites, solution.order, solution)
     errors = PlanErrors(context, placement_problem)
     if config.refine is None or not placed.sensors:
-        placed = _with_errors(placed, errors, placement_problem, placement_problem, solution.order)
+        placed = _with_errors(placed, errors, placement_problem, solution, placement_problem, solution.order)
         return replace(placed, fused=_fused_plan(context, placement_problem, problem, solution.order, errors))
-    return _refine_placement(context, placement_problem, config.refine, placed, errors)
+    return _refine_placement(context, placement_problem, solution, config.refine, placed, errors)
 
 
 def _with_errors(
-    placed: Placement,
+    placed: SensorPlan,
     errors: PlanErrors,
     placement_problem: PlacementProblem,
+    solution: Solution,
     poses: PlacementProblem | PlanPoses,
     order: Sequence[int],
-) -> Placement:
+) -> SensorPlan:
     """Return a plan with standard errors; ``order`` as in :func:`_make_placement`, ``poses`` as given or refined."""
-    curve_plans = [point.plan for point in placed.solution.curve]
+    curve_plans = [point.plan for point in solution.curve]
     curve_errors = errors.of_plans(placement_problem.problem.joint, curve_plans, placement_problem.sites)
-    steps = [replace(step, **error._asdict()) for step, error in zip(placed.steps, curve_errors, strict=True)]
+    curve = [replace(step, **error._asdict()) for step, error in zip(placed.curve, curve_errors, strict=True)]
 
     prefixes = [tuple(order[: number + 1]) for number in range(len(order))]
     is_moved = isinstance(poses, PlanPoses)
@@ -429,9 +318,7 @@ def _with_errors(
     sensors = []
     for sensor, error in zip(placed.sensors, sensor_errors, strict=True):
         sensors.append(replace(sensor, score_se=error.score_se, gain_se=error.gain_se))
-    return replace(
-        placed, sensors=tuple(sensors), steps=tuple(steps), errors_from=errors.source, has_errors=errors.are_known
-    )
+    return replace(placed, sensors=tuple(sensors), curve=tuple(curve), errors_from=errors.source)
 
 
 def _fused_plan(
@@ -473,19 +360,19 @@ def _fused_plan(
 def _refine_placement(
     context: StageContext,
     placement_problem: PlacementProblem,
+    solution: Solution,
     config: RefinementConfig,
-    placed: Placement,
+    placed: SensorPlan,
     errors: PlanErrors,
-) -> Placement:
+) -> SensorPlan:
     start_s = perf_counter()
-    solution = placed.solution
     refined = refinement.refine_plan(context, placement_problem, solution.order, config)
     before, after = refined.before.plan_value, refined.after.plan_value
     order = solver.greedy_order(refined.after.problem, tuple(range(len(refined.after.sites))))
     sites = [refined.after.sites[i] for i in order]
     problem = refined.after.problem
     result = _make_placement(context.scenario, placement_problem, problem, sites, order, solution)
-    result = _with_errors(result, errors, placement_problem, refined.after, order)
+    result = _with_errors(result, errors, placement_problem, solution, refined.after, order)
     sensors = []
     for sensor, i in zip(result.sensors, order, strict=True):
         sensors.append(replace(sensor, moved_m=refined.moved_m(i), gain_by_refining=refined.gain(i)))
@@ -503,7 +390,7 @@ def _make_placement(
     sites: Sequence[Site],
     order: Sequence[int],
     solution: Solution,
-) -> Placement:
+) -> SensorPlan:
     """Describe a plan.
 
     Parameters
@@ -535,32 +422,36 @@ def _make_placement(
             required_by = scenario.placement.zones[name].by
             zones.append(ZoneCoverage(name, state.value(demand.term), demand.least, required_by))
     given = placement_problem.problem
-    return Placement(
+    curve = []
+    score_before = 0.0
+    for point in solution.curve:
+        score = point.plan_value.joint
+        curve.append(
+            PlanStep(
+                point.count,
+                score,
+                score - score_before,
+                met=point.plan_value.met >= 0.0,
+                sites=_site_names(placement_problem, point.plan),
+                cost=given.rules.cost_of(point.plan),
+                value=point.plan_value.value,
+                bound=point.bound,
+            )
+        )
+        score_before = score
+    return SensorPlan(
         sensors=tuple(sensors),
+        curve=tuple(curve),
         score=placement_problem.score,
+        request=scenario.placement.model_dump(mode="json"),
         joint=joint,
         joint_of_all=placement_problem.joint_of_all,
         cost=problem.rules.cost_of(order),
         candidates=len(given.candidates),
         zones=tuple(zones),
-        solution=solution,
-        curve_sites=tuple(_site_names(placement_problem, point.plan) for point in solution.curve),
-        curve_costs=tuple(given.rules.cost_of(point.plan) for point in solution.curve),
-        steps=_plan_steps(solution.curve),
-        errors_from="",
-        has_errors=False,
+        is_best=solution.is_best,
+        fewest_is_proved=solution.fewest_is_proved,
     )
-
-
-def _plan_steps(curve: Sequence[CurvePoint]) -> tuple[PlanStep, ...]:
-    """Return the steps of a curve, without standard errors."""
-    steps = []
-    score_before = 0.0
-    for point in curve:
-        score = point.plan_value.joint
-        steps.append(PlanStep(point.count, score, score - score_before, met=point.plan_value.met >= 0.0))
-        score_before = score
-    return tuple(steps)
 
 
 def planned_sensors(problem: Problem, sites: Sequence[Site], order: Sequence[int]) -> Iterator[PlannedSensor]:
@@ -642,7 +533,7 @@ def _unmet_zone_error(
 def write_placement(
     folder: Path,
     scenario: Scenario,
-    placed: Placement,
+    placed: SensorPlan,
     stage_keys: Mapping[str, str],
     zones: PlanZones | None = None,
 ) -> tuple[Path, ...]:
@@ -674,7 +565,7 @@ def write_placement(
         out.write(plan_columns(placed.sensors))
         out.describe(metadata)
     with parquet.artefact_writer(paths.curve, "curve", ERROR_COLUMNS if placed.has_errors else ()) as out:
-        out.write(_curve_columns(placed))
+        out.write(curve_columns(placed.curve))
         out.describe(metadata)
     written: tuple[Path, ...] = (paths.placement, paths.curve)
     if zones is None:
@@ -686,61 +577,19 @@ def write_placement(
     return written
 
 
-def _curve_columns(placed: Placement) -> dict[str, list[Any]]:
-    points, steps = placed.solution.curve, placed.steps
-    columns: dict[str, list[Any]] = {
-        "count": [step.count for step in steps],
-        "score": [step.score for step in steps],
-        "value": [point.plan_value.value for point in points],
-        "bound": [point.bound for point in points],
-        "cost": list(placed.curve_costs),
-        "met": [step.met for step in steps],
-        "sites": [json.dumps(list(names), ensure_ascii=False) for names in placed.curve_sites],
-    }
-    for name in ERROR_COLUMNS:
-        columns[name] = [getattr(step, name) for step in steps]
-    return columns
-
-
-def _placement_metadata(scenario: Scenario, placed: Placement, stage_keys: Mapping[str, str]) -> dict[str, Any]:
-    requested = scenario.placement.model_dump(mode="json")
+def _placement_metadata(scenario: Scenario, placed: SensorPlan, stage_keys: Mapping[str, str]) -> dict[str, Any]:
     settings = {
-        "placement": requested,
+        "placement": placed.request,
         "costs": scenario.costs.model_dump(mode="json"),
         "score": scenario.score.model_copy(update={"gamma": scenario.gamma}).model_dump(mode="json"),
     }
     settings |= zone_files.file_settings(scenario.placement.zones, zone_files.placement_zones(scenario))
     settings |= zone_files.reported_settings(scenario)
-    solution, refined = placed.solution, placed.refinement
-    plan = {
-        "score": placed.score,
-        "asked": requested,
-        "candidates": placed.candidates,
-        "joint": placed.joint,
-        "value": solution.point.plan_value.value,
-        "bound": solution.point.bound,
-        "certificate": placed.certificate,
-        "together": placed.joint_of_all,
-        "cost": placed.cost,
-        "is_best": solution.is_best,
-        "fewest_is_proved": solution.fewest_is_proved,
-        "zones": [asdict(zone) for zone in placed.zones],
-        "standard_errors": placed.errors_from,
-    }
-    if refined is not None:  # without its duration: equal plans are equal files
-        plan["moves"] = {
-            "before": refined.joint_before,
-            "value_before": refined.value_before,
-            "value": refined.value_after,
-            "tried": refined.poses_tried,
-            "impossible": refined.poses_infeasible,
-            "turns": refined.turns,
-        }
     return {
         "schema": parquet.SCHEMA_VERSION,
         "scenario": {"name": scenario.name, "hash": files.hash_json(settings)},
         "inputs": files.hash_json({**settings, "stages": dict(stage_keys)}),
         "seed": scenario.seed,
         "stages": dict(stage_keys),
-        "plan": plan,
+        "plan": placed.to_json(),
     }

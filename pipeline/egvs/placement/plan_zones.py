@@ -18,7 +18,6 @@ from egvs.results.plans import PlannedSensor
 from egvs.scoring.blindspots import SpotVisibility
 from egvs.scoring.targets import detection_probability, visible_targets
 from egvs.scoring.zone_results import PLAN_ZONES, ZoneUsers
-from egvs.sensors.sites import Pose, Site
 from egvs.stages.base import StageContext
 from egvs.stages.plan_scans import plan_beams
 from egvs.stages.site_scoring import zone_users
@@ -57,7 +56,7 @@ class PlanZones:
         """
         users = zone_users(context)
         scene = context.scene
-        sites = [_site(sensor) for sensor in sensors]
+        sites = [sensor.mount for sensor in sensors]
         visible = []
         for _, beams in plan_beams(context, sites, moved=moved):
             visible.append(visible_targets(users.record, beams, detection_probability(scene, beams.sensor)))
@@ -68,8 +67,3 @@ class PlanZones:
         """Write ``plan_zones.parquet``."""
         columns = {**self.users.columns(self.together), "best_single": self.best_single}
         parquet.write_artefact(path, PLAN_ZONES, columns, metadata)
-
-
-def _site(sensor: PlannedSensor) -> Site:
-    pose = Pose(sensor.x_m, sensor.y_m, sensor.z_m, sensor.yaw_deg, sensor.pitch_deg, sensor.roll_deg)
-    return Site(sensor.site, pose, sensor.sensor)

@@ -23,6 +23,7 @@ from egvs.core.grid import FloatArray, IntArray
 from egvs.placement import branch_and_bound
 from egvs.placement.branch_and_bound import Bound, BoundSettings
 from egvs.placement.problem import AdditionValues, CoverageState, Plan, PlanValue, Problem, tie_break_key
+from egvs.results.plans import proved_share
 
 SelectionRule = Callable[[CoverageState, IntArray, AdditionValues], tuple[FloatArray, ...]]
 """From a plan, some candidates, and its values with each: the sort keys of the candidates, the primary key last."""
@@ -79,9 +80,7 @@ class CurvePoint:
     @property
     def certificate(self) -> float:
         """Proved share of the best possible value, 0 to 1; 1 if the bound is tight up to rounding."""
-        if self.bound <= self.plan_value.value * (1.0 + 2.0 * branch_and_bound.BOUND_ROUNDING):
-            return 1.0
-        return self.plan_value.value / self.bound
+        return proved_share(self.plan_value.value, self.bound)
 
 
 @dataclass(frozen=True)

@@ -16,50 +16,43 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from egvs._version import __version__
 from egvs.artefacts.readers import DISTINCT_PROBABILITY, MIN_VEHICLES, PeriodRanking
 from egvs.artefacts.run_folder import ACCURACY_FILES, COMMAND_RESULTS, PLACEMENT_FILES, VALIDATION_FILES, RunFolder
 from egvs.artefacts.run_record import RunRecord, StageRecord, traffic_summary
 from egvs.artefacts.tpog import Tpog, read_tpog
 from egvs.core import files
 from egvs.core.errors import WARNINGS_KEY, collect_warnings
-from egvs.core.wording import format_percent
-from egvs.drawing import maps
+from egvs.drawing import maps, pages
 from egvs.drawing import run_figures as figures
 from egvs.drawing.basemap import network_file
-from egvs.drawing.colours import STYLE_SHEET
 from egvs.drawing.run_figures import Figures
 from egvs.report.approach_fits import ApproachFit, compare_approaches
 from egvs.report.approach_map import busiest_counts, draw_approach_map
-from egvs.report.command_sections import CommandSections, current_entries
+from egvs.report.command_sections import CommandSections
 from egvs.report.points_section import MAPPED_POLES, PointsSection
+from egvs.report.ranking_text import entropy_seen_note, headline, lead, recorded_frames_hint
 from egvs.report.reliability import describe_reliability
 from egvs.report.sections import (
     NAMED_POLES,
-    PlacementSummary,
-    StudySummary,
     ValidationSummary,
     assumes_flows,
     assumptions,
     describe_counts,
     describe_poles_on_road,
     egvs_setting,
+    plan_values,
     ranking_disagreement,
+    study_values,
 )
+from egvs.report.sensor_text import costs_option, describe_evidence, explain_differences, range_note
 from egvs.report.signal_diagram import signal_diagrams
 from egvs.report.zone_section import ZoneSection
 from egvs.results import labels as formatting
+from egvs.results.command_entries import current_entries
 from egvs.results.map_credits import read_map_credits
-from egvs.results.ranking import (
-    RankedSite,
-    Ranking,
-    entropy_seen_note,
-    headline,
-    lead,
-    recorded_frames_hint,
-    share_of_limit,
-)
-from egvs.results.sensors import SensorComparison, costs_option, range_note
+from egvs.results.plans import SensorPlan
+from egvs.results.ranking import RankedSite, Ranking, share_of_limit
+from egvs.results.sensors import SensorComparison
 from egvs.scenario.model import Scenario
 from egvs.stages.base import Stage, StageContext, StageDependencies, Summary
 from egvs.stages.scene_dependencies import scan_dependencies
@@ -129,10 +122,10 @@ class PageContents:
     tpog: Tpog
     figures: Figures
     stages: Mapping[str, StageRecord]
-    study: StudySummary | None = None
+    study: Mapping[str, Any] = field(default_factory=lambda: {"study": None})
     by_period: PeriodRanking | None = None
     detected: ValidationSummary | None = None
-    plan: PlacementSummary | None = None
+    plan: Mapping[str, Any] | None = None
     movements: Mapping[str, str] = field(default_factory=dict)
     commands: CommandSections = field(default_factory=CommandSections)
     zones: ZoneSection | None = None
@@ -173,7 +166,7 @@ def dependencies(work: StageContext) -> StageDependencies:
         settings["counts"] = describe_counts(scenario, network_file(work.folder.path))
     if map_credits := read_map_credits(scenario):
         settings["map_credits"] = map_credits
-    if current := current_entries(work, stages):
+    if current := current_entries(work.folder, scenario, stages):
         settings["command_results"] = {name: list(entries) for name, entries in current.items()}
     hashes: dict[str, str] = {}
     if scenario.scan.keep:
@@ -244,10 +237,12 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
     drawn = figures.draw_figures(work, ranking, SiteListing.from_ranking(ranking).choices, tpog)
     work.progress("figures drawn", 2, 3)
 
-    plan = PlacementSummary.read(out, stages, ranking.sites, tpog, drawn.backdrop)
+    plan = SensorPlan.read(work.folder)
+    if plan is not None and not plan.belongs_to(stages):
+        plan = None
     mapped = [pole.best for pole in ranking.poles[:MAPPED_POLES]]
-    mounts = [] if plan is None else [pick.mount for pick in plan.picks]
-    moved = plan is not None and plan.before is not None
+    mounts = [] if plan is None else [sensor.mount for sensor in plan.sensors]
+    moved = plan is not None and plan.refinement is not None
     approaches = compare_approaches(work.scenario, work.folder.trajectories, network_file(out))
     contents = PageContents(
         work.scenario,
@@ -255,11 +250,15 @@ def run(work: StageContext, inputs: StageDependencies) -> Summary:
         tpog,
         drawn,
         stages,
-        study=StudySummary.read(out, stages),
+        study=study_values(work.folder, stages),
         by_period=PeriodRanking.read(out),
         detected=ValidationSummary.read(out, stages),
-        plan=plan,
-        commands=CommandSections.read(work, stages, ranking.sites, {mount.name: mount.pose for mount in mounts}),
+        plan=None if plan is None else plan_values(plan, ranking.sites, tpog, drawn.backdrop),
+        commands=CommandSections.of(
+            current_entries(work.folder, work.scenario, stages),
+            ranking.sites,
+            {mount.name: mount.pose for mount in mounts},
+        ),
         movements=describe_counts(work.scenario, network_file(out)),
         zones=ZoneSection.read(work, ranking.sites[0], tpog.grid, drawn.backdrop, has_plan=plan is not None),
         points=PointsSection.draw(work, mapped, mounts, tpog.grid, drawn.backdrop, moved=moved),
@@ -282,6 +281,8 @@ def render_page(contents: PageContents) -> str:
     """Return the complete page, HTML text."""
     values = {
         **vars(contents),
+        **contents.study,
+        **(contents.plan or {}),
         **_ranking_values(contents.ranking),
         **_setting_values(contents),
         **_sensor_values(contents),
@@ -290,44 +291,21 @@ def render_page(contents: PageContents) -> str:
         **_sentences(contents),
         **_warning_values(contents),
     }
-    return formatting.keep_percentages_together(_template_environment().get_template("report.html.j2").render(values))
+    return pages.render(_template_environment(), "report.html.j2", **values)
 
 
 def prepare() -> None:
     """Load the templates, and the library that fills them."""
     environment = _template_environment()
-    for path in TEMPLATES.glob("*.html.j2"):
-        environment.get_template(path.name)
+    for name in environment.list_templates(["j2"]):
+        environment.get_template(name)
 
 
 @cache
 def _template_environment() -> Environment:
-    """Templates and filters; jinja2 is imported only when a page is written."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-    from markupsafe import Markup
-
-    from egvs.drawing.template_cache import open_template_cache
-
-    environment = Environment(
-        loader=FileSystemLoader(TEMPLATES),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        bytecode_cache=open_template_cache(Path(__file__)),
-    )
-    environment.filters |= {
-        "svg": Markup,
-        "share": format_percent,
-        "probability": formatting.format_probability,
-        "whole": formatting.format_count,
-        "plain": formatting.format_number,
-        "degrees": formatting.format_degrees,
-    }
+    environment = pages.page_environment(TEMPLATES)
     environment.globals |= {
-        "style": Markup(STYLE_SHEET),
-        "choose": Markup((TEMPLATES / "choose.js").read_text(encoding="utf-8")),
-        "version": __version__,
+        "choose": (TEMPLATES / "choose.js").read_text(encoding="utf-8"),
         "separable": DISTINCT_PROBABILITY,
         "min_vehicles": MIN_VEHICLES,
     }
@@ -382,6 +360,8 @@ def _sensor_values(contents: PageContents) -> dict[str, Any]:
         "sensors": sensors,
         "range_note": range_note(names, is_modelled=contents.scenario.effects.range_limit is not None),
         "costs_option": costs_option(sensors.sensors) if sensors is not None else "",
+        "sensors_explanation": explain_differences(sensors) if sensors is not None else "",
+        "sensors_evidence": describe_evidence(sensors) if sensors is not None else "",
     }
 
 
@@ -438,5 +418,6 @@ STAGE = Stage(
     ),
     effect_stages=("scan", "score"),
     code=("egvs.stages.scene_inputs",),
+    is_view=True,
     prepare=(prepare,),
 )

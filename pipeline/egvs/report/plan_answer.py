@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
 from egvs.core.wording import format_percent
 from egvs.results.labels import ScoreLabel, join_names
-from egvs.results.plans import PlanStep
+from egvs.results.plans import PlannedSensor, PlanStep, SensorPlan
 
 MIN_USEFUL_SHARE = 0.01
 """A useful sensor adds at least 1 percentage point; to scores that are no shares, at least 1 % of the plan's score."""
@@ -27,25 +27,26 @@ _NUMBERS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight"
 _ORDINALS = ("", "first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth")
 
 
-class CurvePlan(NamedTuple):
-    """Sites of the best plan with at most so many sensors, and their cost (0 without costs)."""
+def describe_plan_count(plan: SensorPlan) -> str:
+    """Return how many sensors are enough (:func:`describe_count`), judged from the curve of a plan."""
+    return describe_count(
+        plan.curve,
+        plan.by,
+        installed=plan.sensors if plan.refinement is None else (),
+        has_budget=plan.request["budget"] is not None,
+        objective=describe_objective(plan.request),
+        next_count=next_count(plan),
+    )
 
-    sites: tuple[str, ...]
-    cost: float
 
-    @property
-    def text(self) -> str:
-        """Sites and cost, e.g. "a and b for 6000"."""
-        cost = f" for {self.cost:g}" if self.cost else ""
-        return f"{join_names(self.sites)}{cost}"
-
-
-class InstalledSite(NamedTuple):
-    """A site of a plan in the order of installation, and the joint score of the sites up to this one."""
-
-    site: str
-    score: float
-    score_se: float = math.nan
+def describe_objective(request: Mapping[str, Any]) -> str:
+    """Return what a plan maximises, if not the joint score; empty otherwise. ``request`` is its ``[placement]``."""
+    parts = []
+    if request["objective"] == "worst":
+        parts.append("the score in the period with the lowest share")
+    if request["survives"]:
+        parts.append("the score that remains if the most important sensor fails")
+    return " and ".join(parts)
 
 
 def describe_joint_score(by: ScoreLabel, sensors: int) -> str:
@@ -97,8 +98,7 @@ def describe_count(
     steps: Sequence[PlanStep],
     by: ScoreLabel,
     *,
-    plans: Sequence[CurvePlan] = (),
-    installed: Sequence[InstalledSite] = (),
+    installed: Sequence[PlannedSensor] = (),
     has_budget: bool = False,
     objective: str = "",
     next_count: int | None = None,
@@ -108,13 +108,12 @@ def describe_count(
     Parameters
     ----------
     steps
-        The best plans of each number of sensors, at least one.
+        The best plans of each number of sensors, at least one. If fewer sensors than those of the last plan are enough,
+        their sites are named.
     by
         Label of the joint score.
-    plans
-        The plan of each step: if fewer sensors than those of the last plan are enough, their sites are named.
     installed
-        The sites of the last plan in the order of installation: if the first ones are others than those that are
+        The sensors of the last plan in the order of installation: if the first ones are others than those that are
         enough, a sentence compares them.
     has_budget
         Whether a budget limits the number of sensors of the last plan.
@@ -138,16 +137,16 @@ def describe_count(
     if enough < len(steps) - 1:
         gain = f"{_describe_gain(steps[enough + 1], by)}{_describe_chance(steps[enough + 1], by)}"
         further = _ordinal(steps[enough + 1].count)
-        is_smaller = bool(plans) and 0 < len(plans[enough].sites) < len(plans[-1].sites)
-        first_ones = _describe_first_ones(plans[enough], steps[enough], installed, by) if is_smaller else ""
+        is_smaller = 0 < len(steps[enough].sites) < len(last.sites)
+        first_ones = _describe_first_ones(steps[enough], installed, by) if is_smaller else ""
         if is_smaller and has_budget:
             only = "only " if steps[enough + 1].gain else ""
             _, _, ordinal = further.partition(" ")
             return (
-                f"The budget buys {_number(len(plans[-1].sites))} sensors; the {ordinal} adds {only}{gain}, so "
-                f"{_count_is(steps[enough].count)} enough: {plans[enough].text}.{first_ones}"
+                f"The budget buys {_number(len(last.sites))} sensors; the {ordinal} adds {only}{gain}, so "
+                f"{_count_is(steps[enough].count)} enough: {_name_sites(steps[enough])}.{first_ones}"
             )
-        names = f" ({plans[enough].text})" if is_smaller else ""
+        names = f" ({_name_sites(steps[enough])})" if is_smaller else ""
         return f"{_capitalise(_count_is(steps[enough].count))} enough{names}: {further} adds {gain}.{first_ones}"
     if not before.met:
         sensor = _capitalise(_ordinal(last.count))
@@ -155,45 +154,40 @@ def describe_count(
     else:
         answer = (
             f"{_capitalise(_ordinal(last.count))} sensor adds {_describe_gain(last, by)} to {by.noun}: "
-            f"{_value_with_unit(last.score, by)}, against {_value_with_unit(before.score, by)} with "
+            f"{by.with_unit(last.score)}, against {by.with_unit(before.score)} with "
             f"{_number(before.count)}."
         )
     return f"{answer} {try_next}".rstrip()
 
 
-def _describe_first_ones(plan: CurvePlan, step: PlanStep, installed: Sequence[InstalledSite], by: ScoreLabel) -> str:
+def _name_sites(step: PlanStep) -> str:
+    """Return the sites of a plan and their cost, e.g. "a and b for 6000"."""
+    cost = f" for {step.cost:g}" if step.cost else ""
+    return f"{join_names(step.sites)}{cost}"
+
+
+def _describe_first_ones(step: PlanStep, installed: Sequence[PlannedSensor], by: ScoreLabel) -> str:
     """Return how the first sites of a larger plan compare with a plan of as many; empty if they are the same."""
-    count = len(plan.sites)
+    count = len(step.sites)
     first = installed[:count]
-    if len(first) < count or {site.site for site in first} == set(plan.sites):
+    if len(first) < count or {sensor.site for sensor in first} == set(step.sites):
         return ""
     which, verb = ("site", "reaches") if count == 1 else (f"{_number(count)} sites", "reach")
-    reached = f"{by.with_error(first[-1].score, first[-1].score_se)} {by.unit}".rstrip()
-    best = f"{by.with_error(step.score, step.score_se)} {by.unit}".rstrip()
-    follow = _number(len(installed) - count)
+    reached = by.with_unit(first[-1].score, first[-1].score_se)
+    best = by.with_unit(step.score, step.score_se)
+    names, follow = join_names([sensor.site for sensor in first]), _number(len(installed) - count)
     return (
-        f" The first {which} of the plan of {_number(len(installed))}, {join_names([site.site for site in first])}, "
+        f" The first {which} of the plan of {_number(len(installed))}, {names}, "
         f"{verb} {reached} instead of {best}: begin with {'it' if count == 1 else 'them'} only if {follow} more "
         f"{'is' if follow == 'one' else 'are'} to follow."
     )
 
 
-def next_count(steps: Sequence[PlanStep], sensors: int, candidates: int, requested: Mapping[str, Any]) -> int | None:
-    """Return the number of sensors to try next; None if the plan is not limited by its count alone.
-
-    Parameters
-    ----------
-    steps
-        The best plans of each number of sensors.
-    sensors
-        Number of sensors of the plan.
-    candidates
-        Number of candidates.
-    requested
-        The keys of ``[placement]``.
-    """
-    is_limited_otherwise = requested["budget"] is not None or requested["reach"] is not None
-    if is_limited_otherwise or sensors < steps[-1].count or sensors >= candidates:
+def next_count(plan: SensorPlan) -> int | None:
+    """Return the number of sensors to try next; None if the plan is not limited by its count alone."""
+    sensors = len(plan.sensors)
+    is_limited_otherwise = plan.request["budget"] is not None or plan.request["reach"] is not None
+    if is_limited_otherwise or sensors < plan.curve[-1].count or sensors >= plan.candidates:
         return None
     return sensors + 1
 
@@ -224,10 +218,6 @@ def _describe_chance(step: PlanStep, by: ScoreLabel) -> str:
     if _is_large(step, by) and not _is_separable(step):
         return ", which may be chance"
     return ""
-
-
-def _value_with_unit(value: float, by: ScoreLabel) -> str:
-    return f"{by.value(value)} {by.unit}".rstrip()
 
 
 def _number(count: int) -> str:

@@ -22,21 +22,16 @@ MAPPED_POLES = 2
 """The best site on each of this number of best poles is mapped."""
 
 
-@dataclass(frozen=True)
-class PointsFigure:
-    """A map, SVG text, with a title and a summary."""
-
-    title: str
-    figure: str
-    summary: str
+Map = tuple[str, str, str]
+"""Title of a map, the map (SVG text), and a summary."""
 
 
 @dataclass(frozen=True)
 class PointsSection:
     """Maps of points on target of the best sites, and of the overlap of a plan; at least one map of a site."""
 
-    sites: tuple[PointsFigure, ...]
-    overlap: tuple[PointsFigure, ...]
+    sites: tuple[Map, ...]
+    overlap: tuple[Map, ...]
     overlap_points: int = int(OVERLAP_POINTS)
 
     @classmethod
@@ -72,12 +67,12 @@ class PointsSection:
         by_name = {site.site: site for site in best}
         scans = ((scan.site.name, scan.beams) for scan in empty_scans(work, by_name.keys()))
         mapped = {(site, points.target.name): points for site, points in points_maps(work, positions, scans)}
-        figures: list[PointsFigure] = []
+        figures: list[Map] = []
         for site in best:
             for positions_of_target in positions:
                 points = mapped[site.site, positions_of_target.target.name]
                 figures.append(_site_figure(site, points, backdrop, box, f"points-{len(figures)}"))
-        overlap: list[PointsFigure] = []
+        overlap: list[Map] = []
         if len(plan) > 1:
             from_sensors = [points for _, points in points_maps(work, positions, plan_beams(work, plan, moved=moved))]
             for positions_of_target in positions:
@@ -92,19 +87,19 @@ def cell_grid(points: PointsMap) -> Grid:
     return Grid((*points.origin_m, 0.0), points.cell_m, (nx, ny, 1))
 
 
-def _site_figure(site: RankedSite, points: PointsMap, backdrop: Backdrop, box: Box, prefix: str) -> PointsFigure:
+def _site_figure(site: RankedSite, points: PointsMap, backdrop: Backdrop, box: Box, prefix: str) -> Map:
     classes = ColourClasses(CLASS_LABELS, f"Points on a {points.target.name}")
     shares = {limit: format_percent(points.share_with(limit)) for limit in (1.0, OVERLAP_POINTS)}
     summary = f"{shares[1.0]} of the surface with any point, {shares[OVERLAP_POINTS]} with {OVERLAP_POINTS:g} or more"
     alt = f"From above: points that a {points.target.name} gets from {site.site}; {summary}."
     at_m = [(site.x_m, site.y_m)]
     figure = maps.classes_view(cell_grid(points), points.classes, classes, at_m, backdrop, box, prefix, alt)
-    return PointsFigure(f"{site.site}: {points.target.name}", figure, summary)
+    return (f"{site.site}: {points.target.name}", figure, summary)
 
 
 def _overlap_figure(
     sensors: Sequence[PointsMap], plan: Sequence[Site], backdrop: Backdrop, box: Box, prefix: str
-) -> PointsFigure:
+) -> Map:
     overlap = overlap_map(sensors)
     target = overlap.target.name
     classes = ColourClasses(
@@ -115,4 +110,4 @@ def _overlap_figure(
     alt = f"From above: number of sensors of the plan that see a {target} well; {summary}."
     at_m = [(site.pose.x_m, site.pose.y_m) for site in plan]
     figure = maps.classes_view(cell_grid(overlap), overlap.values, classes, at_m, backdrop, box, prefix, alt)
-    return PointsFigure(f"The plan: {target}", figure, summary)
+    return (f"The plan: {target}", figure, summary)

@@ -1,6 +1,6 @@
 """Sections of the page on the results of other commands: ``egvs validate``, ``egvs place``, ``egvs accuracy``.
 
-A result is shown if it was computed from the same inputs as the run (:func:`_is_current`).
+A result is shown if it was computed from the same inputs as the run.
 
 :func:`ranking_disagreement` compares the EGVS with the recommended score by the evidence of the validation study
 (:mod:`egvs.results.study_results`); a setting that was not measured is not in it.
@@ -9,18 +9,17 @@ A result is shown if it was computed from the same inputs as the run (:func:`_is
 from __future__ import annotations
 
 import base64
-import json
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from egvs.artefacts.readers import read_accuracy, read_placement, read_validation
-from egvs.artefacts.run_folder import ACCURACY_FILES, PLACEMENT_FILES, VALIDATION_FILES
-from egvs.artefacts.run_record import StageRecord
+from egvs.artefacts.readers import read_validation
+from egvs.artefacts.run_folder import VALIDATION_FILES, RunFolder
+from egvs.artefacts.run_record import StageRecord, have_inputs
 from egvs.artefacts.tpog import Tpog
 from egvs.core.errors import Diagnostic, collect_warnings
 from egvs.core.wording import format_percent
@@ -29,14 +28,14 @@ from egvs.drawing.maps import Backdrop, PlannedPole
 from egvs.drawing.svg_figures import CurveStep
 from egvs.extensions.validation.ranking_check import RankingCheck
 from egvs.report import plan_answer
-from egvs.results.labels import SCORE_LABELS, ScoreLabel, join_names
-from egvs.results.plans import PlanStep, plan_steps
-from egvs.results.ranking import MapSite, Pole, RankedSite
+from egvs.results.labels import SCORE_LABELS, join_names
+from egvs.results.plans import PlannedSensor, SensorPlan
+from egvs.results.ranking import Pole, RankedSite
+from egvs.results.studies import AccuracyResults
 from egvs.results.study_results import STUDY
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE, FROM_SENSOR
 from egvs.scenario.signal_config import ASSUMED_PLANS
-from egvs.sensors.sites import Pose, Site
 from egvs.traffic.movements import MovementNames
 from egvs.traffic.network import read_net_xml
 from egvs.traffic.signal_descriptions import ASSUMED_SOURCE, plan_title
@@ -77,11 +76,6 @@ _MEASURE_TITLES = {"ap_mean_r40_iou70": "mean AP", "seen_20": "20 points"}
 
 _FURTHER_MEASURES = {"ap_mean_r40_iou70": (("ap_bev_r40_iou70", "BEV AP"), ("ap_3d_r40_iou70", "3D AP"))}
 """Columns and titles of measures that are shown beside a main one."""
-
-
-def _is_current(metadata: Mapping[str, Any], stages: Mapping[str, StageRecord]) -> bool:
-    """Whether a result was computed from the same inputs as the run."""
-    return all(name in stages and stages[name].inputs == key for name, key in metadata["stages"].items())
 
 
 def _read_base64(path: Path) -> str:
@@ -175,7 +169,7 @@ class ValidationSummary:
         if result is None:
             return None
         detection_rows, _, metadata = result
-        if not _is_current(metadata, stages):
+        if not have_inputs(stages, metadata["stages"]):
             return None
         rows = [row for row in detection_rows if row["objects_of"] == _ALL_OBJECTS]
         names = dict.fromkeys(row["detector"] for row in rows)
@@ -388,259 +382,75 @@ def _describe_evidence(noun: str, egvs: str, rho: Mapping[str, Mapping[str, floa
 # ---- egvs place
 
 
-@dataclass(frozen=True)
-class PlanRow:
-    """One sensor of a plan: the columns of ``placement.parquet`` that the page shows."""
+def plan_values(
+    plan: SensorPlan, candidates: Sequence[RankedSite], tpog: Tpog, backdrop: Backdrop
+) -> dict[str, SensorPlan | str]:
+    """Return what the page shows of a plan, by the names of the template: the plan, sentences, and figures (SVG text).
 
-    order: int
-    site: str
-    pole: str
-    sensor: str
-    x_m: float
-    y_m: float
-    z_m: float
-    yaw_deg: float
-    pitch_deg: float
-    roll_deg: float
-    forced: bool
-    gain: float
-    score: float
-    cost: float
-    loss: float
-    score_se: float = math.nan
-    gain_se: float = math.nan
-
-    @classmethod
-    def from_row(cls, row: Mapping[str, Any]) -> PlanRow:
-        """Return a row of ``placement.parquet``; standard errors are NaN where it has none."""
-        return cls(**{field.name: row[field.name] for field in fields(cls) if field.name in row})
-
-    @property
-    def mount(self) -> Site:
-        """The sensor as a site, with the name of its candidate."""
-        pose = Pose(self.x_m, self.y_m, self.z_m, self.yaw_deg, self.pitch_deg, self.roll_deg)
-        return Site(self.site, pose, self.sensor)
-
-
-@dataclass(frozen=True)
-class CurveRow:
-    """The best plan of each number of sensors; ``share`` is its part of the score of all candidates together."""
-
-    step: PlanStep
-    sites: tuple[str, ...]
-    share: float
-    certificate: float
-    cost: float
-
-
-@dataclass(frozen=True)
-class PlacementSummary:
-    """Results of ``egvs place``.
-
-    Attributes
+    Parameters
     ----------
-    by
-        Label of the joint score.
-    picks
-        Sensors in the order of the plan.
-    curve
-        Best plans of 1, 2, ... sensors.
-    joint, together
-        Joint score of the plan, and of all candidates together.
-    errors_from
-        How the standard errors were computed; or the reason why there are none.
-    answer
-        How many sensors are enough, in one or two sentences; may be empty.
-    cost
-        Total cost; 0 without costs.
-    candidates
-        Number of candidates.
-    proof
-        What is proved about the plan, in a sentence.
-    objective
-        What the plan maximises, if not the joint score; empty otherwise.
-    zones
-        Zones with a minimum share.
-    before
-        Joint score before the sensors were moved; None if they were not.
-    map, chart
-        Figures, SVG text.
+    plan
+        The plan.
+    candidates, tpog, backdrop
+        Contents of the map.
     """
-
-    by: ScoreLabel
-    picks: tuple[PlanRow, ...]
-    curve: tuple[CurveRow, ...]
-    joint: float
-    together: float
-    errors_from: str
-    answer: str
-    cost: float
-    candidates: int
-    proof: str
-    objective: str
-    zones: tuple[Mapping[str, Any], ...]
-    before: float | None
-    map: str
-    chart: str
-
-    @classmethod
-    def read(
-        cls,
-        out: Path,
-        stages: Mapping[str, StageRecord],
-        candidates: Sequence[MapSite],
-        tpog: Tpog,
-        backdrop: Backdrop,
-    ) -> PlacementSummary | None:
-        """Read the plan in a run folder; None if there is none of this run.
-
-        Parameters
-        ----------
-        out
-            The run folder.
-        stages
-            Records of the stages of the run.
-        candidates, tpog, backdrop
-            Contents of the map.
-        """
-        result = read_placement(*(out / name for name in PLACEMENT_FILES))
-        if result is None:
-            return None
-        rows, curve_rows, metadata = result
-        if not _is_current(metadata, stages):
-            return None
-        plan = metadata["plan"]
-        by, joint = SCORE_LABELS[plan["score"]], plan["joint"]
-        picks = tuple(PlanRow.from_row(row) for row in rows)
-        names = ", ".join(pick.site for pick in picks)
-        before = None
-        if "moves" in plan:
-            before = plan["moves"]["before"]
-        occupied = tpog.counts.sum(axis=2) / tpog.frames
-        poles = _planned_poles(picks, joint, by)
-        steps, objective = plan_steps(curve_rows), describe_objective(plan["asked"])
-        curve = _curve(steps, curve_rows, plan["together"] or math.inf)
-        installed = [plan_answer.InstalledSite(pick.site, pick.score, pick.score_se) for pick in picks]
-        answer = plan_answer.describe_count(
-            steps,
-            by,
-            plans=[plan_answer.CurvePlan(row.sites, row.cost) for row in curve],
-            installed=[] if before is not None else installed,
-            has_budget=plan["asked"]["budget"] is not None,
-            objective=objective,
-            next_count=plan_answer.next_count(steps, len(picks), plan["candidates"], plan["asked"]),
-        )
-        return cls(
-            by=by,
-            picks=picks,
-            curve=curve,
-            joint=joint,
-            together=plan["together"],
-            errors_from=plan.get("standard_errors", "the plan was made by an older version of egvs place"),
-            answer=answer,
-            cost=plan["cost"],
-            candidates=plan["candidates"],
-            proof=_describe_proof(plan, len(picks)),
-            objective=objective,
-            zones=tuple(plan["zones"]),
-            before=before,
-            map=maps.plan_map(tpog.grid, occupied, backdrop, candidates, poles, f"Map of the plan: {names}."),
-            chart=_curve_chart(curve_rows, plan),
-        )
-
-    @property
-    def share(self) -> float:
-        """Joint score as a share of that of all candidates together."""
-        if not self.together:
-            return 0.0
-        return self.joint / self.together
-
-    @property
-    def assumption(self) -> str:
-        """What the joint score assumes, in a sentence; may be empty."""
-        return plan_answer.describe_joint_score(self.by, len(self.picks))
-
-    @property
-    def has_errors(self) -> bool:
-        """Whether there are standard errors."""
-        return not any(math.isnan(row.step.score_se) for row in self.curve)
-
-    @property
-    def joint_text(self) -> str:
-        """Joint score of the plan with its standard error and its unit."""
-        se = self.picks[-1].score_se if self.picks else math.nan
-        return f"{self.by.with_error(self.joint, se)} {self.by.unit}".rstrip()
+    occupied = tpog.counts.sum(axis=2) / tpog.frames
+    alt = f"Map of the plan: {', '.join(sensor.site for sensor in plan.sensors)}."
+    return {
+        "plan": plan,
+        "plan_proof": _describe_proof(plan),
+        "plan_objective": plan_answer.describe_objective(plan.request),
+        "plan_answer": plan_answer.describe_plan_count(plan),
+        "plan_assumption": plan_answer.describe_joint_score(plan.by, len(plan.sensors)),
+        "plan_map": maps.plan_map(tpog.grid, occupied, backdrop, candidates, _planned_poles(plan), alt),
+        "plan_chart": _curve_chart(plan),
+    }
 
 
-def _curve(steps: Sequence[PlanStep], rows: Sequence[Mapping[str, Any]], together: float) -> tuple[CurveRow, ...]:
-    curve = []
-    for step, row in zip(steps, rows, strict=True):
-        sites = tuple(json.loads(row["sites"]))
-        certificate = _certificate(row["value"], row["bound"])
-        curve.append(CurveRow(step, sites, step.score / together, certificate, row["cost"]))
-    return tuple(curve)
-
-
-def _curve_chart(rows: Sequence[Mapping[str, Any]], plan: Mapping[str, Any]) -> str:
-    together = plan["together"] or math.inf
-    if plan["asked"]["objective"] == "worst":
-        together = 1.0  # the values of this objective are shares already
-    steps = [CurveStep(row["count"], row["value"] / together, row["bound"] / together) for row in rows]
+def _curve_chart(plan: SensorPlan) -> str:
+    whole = plan.joint_of_all or math.inf
+    if plan.request["objective"] == "worst":
+        whole = 1.0  # the values of this objective are shares already
+    steps = [CurveStep(step.count, step.value / whole, step.bound / whole) for step in plan.curve]
     alt = "Score of the best plan for each number of sensors, and its upper bound."
     return svg_figures.sensor_count_chart(steps, alt)
 
 
-def _certificate(value: float, bound: float) -> float:
-    """Share of the best possible value that is proved to be reached; 1 up to the rounding of bounds."""
-    if bound <= value * (1.0 + 2e-9):
-        return 1.0
-    return value / bound
-
-
-def _describe_proof(plan: Mapping[str, Any], sensors: int) -> str:
-    if plan["fewest_is_proved"] is None:
-        if plan["is_best"]:
+def _describe_proof(plan: SensorPlan) -> str:
+    sensors = len(plan.sensors)
+    if plan.fewest_is_proved is None:
+        if plan.is_best:
             return "it is proved that no plan within the rules is better"
-        percent = math.floor(1e4 * plan["certificate"]) / 1e2
+        percent = math.floor(1e4 * plan.certificate) / 1e2
         return f"the plan is proved to reach at least {percent:.2f} % of the best possible score"
     if sensors == 1:
         return "one sensor is enough"
     fewer = "1 sensor is" if sensors == 2 else f"{sensors - 1} sensors are"
-    if plan["fewest_is_proved"]:
+    if plan.fewest_is_proved:
         return f"it is proved that {fewer} not enough"
     return f"it is not proved that {fewer} not enough"
 
 
-def describe_objective(request: Mapping[str, Any]) -> str:
-    """What the plan maximises, if not the joint score; empty otherwise."""
-    parts = []
-    if request["objective"] == "worst":
-        parts.append("the score in the period with the lowest share")
-    if request["survives"]:
-        parts.append("the score that remains if the most important sensor fails")
-    return " and ".join(parts)
-
-
-def _planned_poles(picks: Sequence[PlanRow], joint: float, by: ScoreLabel) -> list[PlannedPole]:
+def _planned_poles(plan: SensorPlan) -> list[PlannedPole]:
     """One mark per location; sensors at the same location share it."""
-    picks_of: dict[tuple[float, float], list[PlanRow]] = {}
-    for pick in picks:
-        picks_of.setdefault((pick.x_m, pick.y_m), []).append(pick)
+    sensors_at: dict[tuple[float, float], list[PlannedSensor]] = {}
+    for sensor in plan.sensors:
+        sensors_at.setdefault((sensor.x_m, sensor.y_m), []).append(sensor)
     poles = []
-    for (x_m, y_m), members in picks_of.items():
+    for (x_m, y_m), members in sensors_at.items():
         name = members[0].site
         if len(members) > 1:
             name += f" +{len(members) - 1}"
         gain = 0.0
-        if joint:
-            gain = sum(pick.gain for pick in members) / joint
-        numbers, sensors = [], []
-        for pick in members:
-            numbers.append(str(pick.order))
-            sensor = f"{pick.order}. {pick.site}, {pick.z_m:g} m high, adds {by.value(pick.gain)} {by.unit}"
-            sensors.append(sensor.strip())
+        if plan.joint:
+            gain = sum(sensor.gain for sensor in members) / plan.joint
+        numbers, details = [], []
+        for sensor in members:
+            numbers.append(str(sensor.order))
+            adds = plan.by.with_unit(sensor.gain)
+            details.append(f"{sensor.order}. {sensor.site}, {sensor.z_m:g} m high, adds {adds}")
         poles.append(
-            PlannedPole(x_m, y_m, ", ".join(numbers), f"{name}: {format_percent(gain, 0)}", "; ".join(sensors))
+            PlannedPole(x_m, y_m, ", ".join(numbers), f"{name}: {format_percent(gain, 0)}", "; ".join(details))
         )
     return poles
 
@@ -648,72 +458,14 @@ def _planned_poles(picks: Sequence[PlanRow], joint: float, by: ScoreLabel) -> li
 # ---- egvs accuracy
 
 
-@dataclass(frozen=True)
-class StudiedSetting:
-    """One setting of an accuracy study: the columns of ``accuracy.parquet`` that the page shows."""
-
-    setting: str
-    kind: str
-    overrides: str
-    seconds: float
-    draws: int
-    probability: float
-    loss_points: float
-    loss_se_points: float
-    error: float
-    best: str
-    front: bool
-    recommended: bool
-
-    @property
-    def is_listed(self) -> bool:
-        """Whether the page shows it."""
-        return self.kind == "scenario" or self.front or self.recommended
-
-    @property
-    def label(self) -> str:
-        """Name in a sentence or a table."""
-        return "the scenario’s own setting" if self.kind == "scenario" else self.setting
-
-
-@dataclass(frozen=True)
-class StudySummary:
-    """Results of ``egvs accuracy``: the settings that the page shows, and the figure (PNG in base 64)."""
-
-    settings: tuple[StudiedSetting, ...]
-    best: StudiedSetting
-    tolerance_points: float
-    score_tolerance: float | None
-    figure: str
-
-    @classmethod
-    def read(cls, out: Path, stages: Mapping[str, StageRecord]) -> StudySummary | None:
-        """Read the study in a run folder; None if there is none of this run."""
-        table, figure = (out / name for name in ACCURACY_FILES)
-        if not figure.is_file():
-            return None
-        study = read_accuracy(table)
-        if study is None:
-            return None
-        rows, metadata = study
-        if not _is_current(metadata, stages):
-            return None
-        names = [field.name for field in fields(StudiedSetting)]
-        settings = [StudiedSetting(**{name: row[name] for name in names}) for row in rows]
-        listed = tuple(setting for setting in settings if setting.is_listed)
-        best = next(setting for setting in settings if setting.recommended)
-        return cls(listed, best, metadata["tolerance"], metadata.get("score_tolerance"), _read_base64(figure))
-
-    @property
-    def is_within(self) -> bool:
-        """Whether the recommended setting is within the tolerance."""
-        if self.score_tolerance is not None:
-            return self.best.error <= self.score_tolerance
-        return self.best.loss_points <= self.tolerance_points
-
-    @property
-    def tolerance_text(self) -> str:
-        """The tolerance with its unit."""
-        if self.score_tolerance is not None:
-            return f"{100 * self.score_tolerance:g} % of the score"
-        return f"{self.tolerance_points:g} percentage points of vehicles found"
+def study_values(folder: RunFolder, stages: Mapping[str, StageRecord]) -> dict[str, Any]:
+    """Return what the page shows of the accuracy study of a run; ``study`` is None without one."""
+    study = None
+    if folder.accuracy_figure.is_file():
+        study = AccuracyResults.read(folder, stages)
+    if study is None:
+        return {"study": None}
+    tolerance = f"{study.tolerance.loss_points:g} percentage points of vehicles found"
+    if study.tolerance.score is not None:
+        tolerance = f"{100 * study.tolerance.score:g} % of the score"
+    return {"study": study, "study_tolerance": tolerance, "study_figure": _read_base64(folder.accuracy_figure)}

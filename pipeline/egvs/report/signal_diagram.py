@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
 from typing import Any
 
@@ -19,17 +18,14 @@ _GREEN, _GIVES_WAY, _YELLOW, _RED = "#1f7a4d", "#8fd0ae", "#e0a800", "#c8453b"
 """Colours of signals, which are the same in the light and in the dark theme."""
 
 
-@dataclass(frozen=True)
-class SignalDiagram:
-    """The diagram of a signal on the page: its title, how it is controlled, and the figure."""
+def signal_diagrams(plans: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str]]:
+    """Return title, way of control and diagram (SVG text) of the plans that do not replay.
 
-    title: str
-    description: str
-    svg: str
-
-
-def signal_diagrams(plans: Sequence[Mapping[str, Any]]) -> tuple[SignalDiagram, ...]:
-    """Return the diagrams of plans (:func:`egvs.traffic.signal_descriptions.describe_signals`) that do not replay."""
+    Parameters
+    ----------
+    plans
+        From :func:`egvs.traffic.signal_descriptions.describe_signals`.
+    """
     diagrams = []
     for plan in plans:
         if not plan["rows"]:
@@ -38,8 +34,8 @@ def signal_diagrams(plans: Sequence[Mapping[str, Any]]) -> tuple[SignalDiagram, 
         if plan["type"] != "fixed":
             cycle += f", {plan['type']}: up to {plan['max_cycle_s']:g} s, drawn without extensions"
         cycle += f"; offset {plan['offset_s']:g} s; {plan['source']}."
-        diagrams.append(SignalDiagram(plan_title(plan), cycle, stage_diagram(plan)))
-    return tuple(diagrams)
+        diagrams.append((plan_title(plan), cycle, stage_diagram(plan)))
+    return diagrams
 
 
 def stage_diagram(plan: Mapping[str, Any], style: FigureStyle = PAGE_STYLE) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -83,7 +82,7 @@ class ScoreLabel:
 
     def with_noun(self, value: float) -> str:
         """Return a value with name and unit, e.g. "EGVS 247,397 bit"."""
-        return f"{self.noun} {self.value(value)} {self.unit}".strip()
+        return f"{self.noun} {self.with_unit(value)}"
 
     def value(self, value: float) -> str:
         """Return a value as text, without its unit."""
@@ -103,6 +102,10 @@ class ScoreLabel:
             return self.value(value)
         text = f"{self._number(value)} ± {self._error_number(se)}"
         return f"{text} %" if self.is_share else text
+
+    def with_unit(self, value: float, se: float = math.nan) -> str:
+        """Return a value with its error, if that is known, and its unit, e.g. "99,220 ± 300 bit"."""
+        return f"{self.with_error(value, se)} {self.unit}".rstrip()
 
     def change(self, value: float, se: float = math.nan) -> str:
         """Return a difference of two values, without unit: of shares in percentage points, e.g. "4.7 ± 0.5"."""
@@ -141,7 +144,7 @@ class ScoreLabel:
 
     def sentence(self, value: float) -> str:
         """Return what a site with this score does, e.g. "should find 87.0 % of vehicles"."""
-        return self.says.format(f"{self.value(value)} {self.unit}".strip())
+        return self.says.format(self.with_unit(value))
 
 
 _MAX_LETTERS = 18
@@ -210,27 +213,6 @@ def format_probability(probability: float) -> str:
     if percent >= limit and probability < DISTINCT_PROBABILITY:
         percent = limit - 1
     return f"{percent} %"
-
-
-_NOT_TEXT = re.compile(r"(<(script|style)\b.*?</\2>)", re.DOTALL)
-_TEXT = re.compile(r">[^<>]+")
-_SPACE_BEFORE_SIGN = re.compile(r"(?<=\d) (?=%)")
-
-
-def keep_percentages_together(html: str) -> str:
-    """Return a page on which no line begins with the sign of a percentage: its space does not break.
-
-    Attributes, scripts and style sheets stay as they are.
-
-    >>> keep_percentages_together('<p title="5 %">5 %</p>').replace("\\u00a0", "_")
-    '<p title="5 %">5_%</p>'
-    """
-    parts = _NOT_TEXT.split(html)
-    for number in range(0, len(parts), 3):  # text, then the two groups of a script or style sheet
-        parts[number] = _TEXT.sub(lambda match: _SPACE_BEFORE_SIGN.sub("\u00a0", match[0]), parts[number])
-        if number + 2 < len(parts):
-            parts[number + 2] = ""
-    return "".join(parts)
 
 
 def format_count(value: float) -> str:

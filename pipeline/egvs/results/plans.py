@@ -1,14 +1,35 @@
-"""Plans of several sensors: the sensors of a plan, and the best plan of each number of sensors."""
+"""Plans of several sensors: what ``egvs place`` finds, writes and reads again.
+
+:class:`SensorPlan` is the plan for the command line, the report, exports and the explorer.
+"""
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
 from typing import Any
+
+from egvs.artefacts.readers import ZoneVisibility, read_placement
+from egvs.artefacts.run_folder import RunFolder
+from egvs.artefacts.run_record import StageRecord, have_inputs
+from egvs.results.labels import SCORE_LABELS, ScoreLabel
+from egvs.sensors.sites import Pose, Site
 
 ERROR_COLUMNS = ("score_se", "gain_se", "beats_previous")
 """Columns of ``curve.parquet`` that exist where standard errors are known."""
+
+_TIGHT = 1.0 + 2e-9
+"""A bound that exceeds a value by less is tight: both are rounded (``egvs.placement.branch_and_bound``)."""
+
+
+def proved_share(value: float, bound: float) -> float:
+    """Return the share of the best possible value that is proved to be reached, given an upper bound of it."""
+    if bound <= value * _TIGHT:
+        return 1.0
+    return value / bound
 
 
 @dataclass(frozen=True)
@@ -77,6 +98,12 @@ class PlannedSensor:
             return f"{self.order}*"
         return str(self.order)
 
+    @property
+    def mount(self) -> Site:
+        """The sensor as a site, with the name of its candidate."""
+        pose = Pose(self.x_m, self.y_m, self.z_m, self.yaw_deg, self.pitch_deg, self.roll_deg)
+        return Site(self.site, pose, self.sensor)
+
 
 def plan_columns(sensors: Sequence[PlannedSensor]) -> dict[str, list[Any]]:
     """Return the columns of the table of these sensors, by name."""
@@ -104,6 +131,10 @@ class PlanStep:
         Standard errors of ``score`` and ``gain``; NaN where they are unknown.
     beats_previous
         Probability that the plan truly scores higher than the plan before it; NaN where it is unknown.
+    sites, cost
+        Names of its sites, and their cost (0 without costs).
+    value, bound
+        The objective, and an upper bound of it for every such plan; NaN where the plan is not the best one of a search.
     """
 
     count: int
@@ -113,6 +144,15 @@ class PlanStep:
     score_se: float = math.nan
     gain_se: float = math.nan
     beats_previous: float = math.nan
+    sites: tuple[str, ...] = ()
+    cost: float = 0.0
+    value: float = math.nan
+    bound: float = math.nan
+
+    @property
+    def certificate(self) -> float:
+        """Proved share of the best possible objective, 0 to 1."""
+        return proved_share(self.value, self.bound)
 
 
 def plan_steps(rows: Sequence[Mapping[str, Any]]) -> tuple[PlanStep, ...]:
@@ -120,7 +160,245 @@ def plan_steps(rows: Sequence[Mapping[str, Any]]) -> tuple[PlanStep, ...]:
     steps = []
     score_before = 0.0
     for row in rows:
-        errors = {name: row[name] for name in ERROR_COLUMNS if name in row}
-        steps.append(PlanStep(row["count"], row["score"], row["score"] - score_before, row["met"], **errors))
+        values = {**row, "sites": tuple(json.loads(row["sites"]))}
+        steps.append(PlanStep(gain=row["score"] - score_before, **values))
         score_before = row["score"]
     return tuple(steps)
+
+
+def curve_columns(steps: Sequence[PlanStep]) -> dict[str, list[Any]]:
+    """Return the columns of ``curve.parquet``, by name."""
+    columns = {field.name: [getattr(step, field.name) for step in steps] for field in fields(PlanStep)}
+    del columns["gain"]
+    columns["sites"] = [json.dumps(list(step.sites), ensure_ascii=False) for step in steps]
+    return columns
+
+
+@dataclass(frozen=True)
+class ZoneCoverage:
+    """How a plan covers a required zone.
+
+    Attributes
+    ----------
+    name
+        Name of the zone.
+    seen, share
+        The share of the zone's entropy that the plan sees, and the required share.
+    by
+        Number of sensors that have to see it.
+    """
+
+    name: str
+    seen: float
+    share: float
+    by: int
+
+
+@dataclass(frozen=True)
+class RefinementSummary:
+    """What the refinement of a plan's poses did.
+
+    Attributes
+    ----------
+    joint_before
+        Joint score of the plan at the poses of its candidates.
+    value_before, value_after
+        The objective (:attr:`egvs.placement.problem.PlanValue.value`) before and after. It never drops; the joint score
+        may.
+    poses_tried, poses_infeasible
+        Number of poses that were tried, and of those that break a rule or cannot be scanned.
+    turns
+        Number of turns; each moves one sensor.
+    seconds
+        Duration; NaN in a plan that was read, because equal plans are equal files.
+    """
+
+    joint_before: float
+    value_before: float
+    value_after: float
+    poses_tried: int
+    poses_infeasible: int
+    turns: int
+    seconds: float = math.nan
+
+
+@dataclass(frozen=True)
+class FusedPlan:
+    """What a plan is expected to find in the fused point clouds of its sensors.
+
+    Attributes
+    ----------
+    steps
+        The first sensor, the first two, and so on, in the order of installation.
+    better_sites
+        Sites that are expected to find more together, reached by swaps of one sensor at a time; empty where no swap
+        finds more.
+    better
+        What they find; ``gain`` is what they find more than the plan. None without ``better_sites``.
+    searched
+        Whether swaps were tried.
+    """
+
+    steps: tuple[PlanStep, ...]
+    better_sites: tuple[str, ...] = ()
+    better: PlanStep | None = None
+    searched: bool = False
+
+
+@dataclass(frozen=True)
+class SensorPlan:
+    """A plan of several sensors and its certificate.
+
+    Attributes
+    ----------
+    sensors
+        In the order of installation: forced ones first, then each time the one with the largest gain.
+    curve
+        The best plans of 1, 2, ... sensors; the last one is this plan, with the candidates at their original poses.
+    score
+        Name of the joint score.
+    request
+        The ``[placement]`` that the plan solves, JSON values.
+    joint
+        Joint score of the plan.
+    joint_of_all
+        Joint score of all candidates that are not excluded.
+    cost
+        Cost of the plan; 0 without costs.
+    candidates
+        Number of candidates that are not excluded.
+    zones
+        The required zones.
+    is_best
+        Whether it is proved that no plan is better.
+    fewest_is_proved
+        Whether it is proved that one sensor fewer cannot meet the requirements; None if this was not requested.
+    errors_from
+        How the standard errors were computed; or the reason why there are none.
+    stages
+        Keys of the stages that the plan was made from, by name; empty before it is written.
+    refinement
+        With refined poses, what the refinement did; ``sensors``, ``joint``, ``cost`` and ``zones`` are those after it.
+    fused
+        What the sensors are expected to find in their fused point clouds; None in a plan that was read, for one sensor,
+        and for joint scores that do not take sensors as independent.
+    zone_results
+        What the sensors find together in the zones of ``[score] zones``; empty in a plan that was read.
+    files
+        The files that were written; empty in a plan that was read.
+    """
+
+    sensors: tuple[PlannedSensor, ...]
+    curve: tuple[PlanStep, ...]
+    score: str
+    request: Mapping[str, Any]
+    joint: float
+    joint_of_all: float
+    cost: float
+    candidates: int
+    zones: tuple[ZoneCoverage, ...]
+    is_best: bool
+    fewest_is_proved: bool | None
+    errors_from: str = ""
+    stages: Mapping[str, str] = field(default_factory=dict)
+    refinement: RefinementSummary | None = None
+    fused: FusedPlan | None = None
+    zone_results: tuple[ZoneVisibility, ...] = ()
+    files: tuple[Path, ...] = ()
+
+    @classmethod
+    def read(cls, folder: RunFolder) -> SensorPlan | None:
+        """Read the plan in a run folder; None if there is none.
+
+        Raises
+        ------
+        InputError
+            If a file is damaged or was changed.
+        """
+        result = read_placement(folder.placement, folder.curve)
+        if result is None:
+            return None
+        rows, curve_rows, metadata = result
+        plan = metadata["plan"]
+        refinement = None
+        if "moves" in plan:
+            moves = plan["moves"]
+            names = ("before", "value_before", "value", "tried", "impossible", "turns")
+            refinement = RefinementSummary(*(moves[name] for name in names))
+        return cls(
+            sensors=tuple(PlannedSensor(**row) for row in rows),
+            curve=plan_steps(curve_rows),
+            score=plan["score"],
+            request=plan["asked"],
+            joint=plan["joint"],
+            joint_of_all=plan["together"],
+            cost=plan["cost"],
+            candidates=plan["candidates"],
+            zones=tuple(ZoneCoverage(**zone) for zone in plan["zones"]),
+            is_best=plan["is_best"],
+            fewest_is_proved=plan["fewest_is_proved"],
+            errors_from=plan.get("standard_errors", "the plan was made by an older version of egvs place"),
+            stages=metadata["stages"],
+            refinement=refinement,
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what the metadata of ``placement.parquet`` and ``curve.parquet`` says about the plan."""
+        last = self.curve[-1]
+        plan = {
+            "score": self.score,
+            "asked": self.request,
+            "candidates": self.candidates,
+            "joint": self.joint,
+            "value": last.value,
+            "bound": last.bound,
+            "certificate": self.certificate,
+            "together": self.joint_of_all,
+            "cost": self.cost,
+            "is_best": self.is_best,
+            "fewest_is_proved": self.fewest_is_proved,
+            "zones": [asdict(zone) for zone in self.zones],
+            "standard_errors": self.errors_from,
+        }
+        if self.refinement is not None:  # without its duration: equal plans are equal files
+            plan["moves"] = {
+                "before": self.refinement.joint_before,
+                "value_before": self.refinement.value_before,
+                "value": self.refinement.value_after,
+                "tried": self.refinement.poses_tried,
+                "impossible": self.refinement.poses_infeasible,
+                "turns": self.refinement.turns,
+            }
+        return plan
+
+    def belongs_to(self, stages: Mapping[str, StageRecord]) -> bool:
+        """Whether the plan was made from the same traffic, sites and settings as a run with these stages."""
+        return have_inputs(stages, self.stages)
+
+    @property
+    def by(self) -> ScoreLabel:
+        """Label of the joint score."""
+        return SCORE_LABELS[self.score]
+
+    @property
+    def certificate(self) -> float:
+        """Proved share of the best possible objective."""
+        return self.curve[-1].certificate
+
+    @property
+    def has_errors(self) -> bool:
+        """Whether there are standard errors."""
+        return not any(math.isnan(step.score_se) for step in self.curve)
+
+    @property
+    def joint_se(self) -> float:
+        """Standard error of the joint score of the plan; NaN where it is unknown, and without sensors."""
+        if not self.sensors:
+            return math.nan
+        return self.sensors[-1].score_se
+
+    def share_of_all(self, joint: float) -> float:
+        """Return a joint score as a share of that of all candidates together."""
+        if not self.joint_of_all > 0:
+            return 0.0
+        return joint / self.joint_of_all

@@ -8,8 +8,6 @@ Sensor i has the cost :math:`c_i` (with its pole and height, as ``[costs]`` says
 This is undefined where sensor i finds no more than b, and not stated where it is not clear which of them finds more.
 The same is computed for the best of all sensors that are cheaper than i: a large gain over the cheapest can hide that
 the last step costs much and adds little. Without costs, the sensor that finds least takes the place of the cheapest.
-
-:attr:`SensorComparison.evidence` says how well scores of different sensors predict detection.
 """
 
 from __future__ import annotations
@@ -20,48 +18,12 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 from egvs.artefacts.readers import DISTINCT_PROBABILITY
-from egvs.results.labels import SCORE_LABELS, format_count
+from egvs.results.labels import format_count
 from egvs.results.ranking import RankedSite
-from egvs.results.study_results import STUDY
-from egvs.scenario.score_config import COST_COLUMN, DEFAULT_SCORE, CostsConfig
-
-SENSOR_EVIDENCE = (
-    "How far to trust this: in simulation, at six held-out junctions with twelve sensors, the mean of cluster and "
-    "pointpillars ranked sites nearly as three detectors do (rank correlation {rho[0]:.2f} to {rho[1]:.2f}). But the "
-    "first of a ranking lost up to {loss_points} points of AP, and {largest_loss_points} once; shares found with "
-    "{underrated_sensors[0]} and {underrated_sensors[1]} are {underrated_points[0]} to {underrated_points[1]} points "
-    "higher than expected. Do not decide between sensors by less than about 10 points, nor by the cost of one more "
-    "point. See docs/validity.md."
-).format(**dict(STUDY.larger_study))
-"""What is known about rankings of sensors by the recommended score (docs/validity.md)."""
-
-_NO_EVIDENCE = (
-    "How far to trust this: whether {} ranks different sensors as detectors do was not measured; docs/validity.md has "
-    "a measurement for {}."
-)
-
-_RANGE_NOTE = (
-    "Ranges on dark vehicles are not modelled: sensors with a short rated range look better than they are. Try --set "
-    "effects.range_limit={}."
-)
+from egvs.scenario.score_config import COST_COLUMN, CostsConfig
 
 _PROBABILITY_DIGITS = 6
 """The last bits of a distribution function depend on the machine."""
-
-
-def range_note(sensors: Iterable[str], *, is_modelled: bool) -> str:
-    """Return a sentence where sensors are compared without their range on dark vehicles; empty otherwise.
-
-    Parameters
-    ----------
-    sensors
-        Names of the sensors.
-    is_modelled
-        Whether the effect ``range_limit`` is enabled in all runs.
-    """
-    if is_modelled or len(set(sensors)) < 2:
-        return ""
-    return _RANGE_NOTE
 
 
 @dataclass(frozen=True)
@@ -314,27 +276,6 @@ class SensorComparison:
         return any(result.mount.site.yaw_deg or result.mount.site.pitch_deg for result in self.results)
 
     @property
-    def explanation(self) -> str:
-        """What the difference, and the cost of one more point, refer to."""
-        kind = "the cheapest" if self.has_costs else "which finds least"
-        unpriced = ""
-        if self.has_costs and self.unpriced:
-            kind = "the cheapest with a known cost"
-            unpriced = f" Without a known cost: {', '.join(self.unpriced)}."
-        return (
-            f"Differences from {self.baseline_name} ({kind}) are in {difference_unit(self.baseline.site)}, ± their "
-            f"standard error; ~ it is not clear which is better.{unpriced}"
-        )
-
-    @property
-    def evidence(self) -> str:
-        """What is known about rankings of sensors by this score."""
-        by = self.baseline.site.by
-        if by.name == DEFAULT_SCORE:
-            return SENSOR_EVIDENCE
-        return _NO_EVIDENCE.format(by.noun, SCORE_LABELS[DEFAULT_SCORE].noun)
-
-    @property
     def sensors(self) -> tuple[str, ...]:
         """Names of the sensors."""
         return tuple(dict.fromkeys(result.mount.sensor for result in self.results))
@@ -378,9 +319,3 @@ def difference_unit(site: RankedSite) -> str:
     if site.by.is_share:
         return "percentage points"
     return site.by.unit or f"units of {site.by.noun}"
-
-
-def costs_option(sensors: Iterable[str]) -> str:
-    """Return the option that sets the costs of sensors, with a word in place of each price."""
-    prices = ", ".join(f'"{name}" = PRICE' for name in sensors)
-    return f"--set 'costs.sensor={{{prices}}}'"

@@ -19,6 +19,7 @@ from egvs.artefacts.run_folder import RunFolder
 from egvs.core import files, plugins
 from egvs.core.errors import InputError
 from egvs.core.progress import ProgressCallback, no_progress
+from egvs.results.studies import SCENARIO, SettingResult, Tolerance
 from egvs.runs.run import check_no_overwrite, lock_run_folder, refresh_report
 from egvs.runs.run_sources import SettingsSource
 from egvs.scenario.model import Scenario
@@ -26,9 +27,9 @@ from egvs.studies import decision_figure, measurement
 from egvs.studies.decision import MIN_UNITS
 from egvs.studies.measurement import SettingListener, SettingRunner, scenario_dependencies
 from egvs.studies.pricing import BestPole, Pricing
-from egvs.studies.recommendation import NeededTraffic, SettingResult, Tolerance, mark_rows
+from egvs.studies.recommendation import NeededTraffic, mark_rows
 from egvs.studies.study_runs import MAX_SEEDS, StudyRuns
-from egvs.studies.study_settings import DEFAULT_VALUES, SCENARIO, SettingValues
+from egvs.studies.study_settings import DEFAULT_VALUES, SettingValues
 
 
 @dataclass(frozen=True)

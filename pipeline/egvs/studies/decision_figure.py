@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egvs.core import files
-from egvs.studies.recommendation import SettingResult, Tolerance
-from egvs.studies.study_settings import SCENARIO
+from egvs.results.studies import SCENARIO, SettingResult, Tolerance
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

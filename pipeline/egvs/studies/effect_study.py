@@ -31,6 +31,7 @@ from egvs.effects import registry
 from egvs.effects.articulated import Articulated
 from egvs.effects.base import Detect, Echo, Effect, Traffic
 from egvs.results.labels import SCORE_LABELS, ScoreLabel
+from egvs.results.studies import SCENARIO
 from egvs.runs import run, stage_keys, stage_registry
 from egvs.runs.run_context import open_folder
 from egvs.runs.stage_registry import RANKING_STAGES
@@ -40,7 +41,7 @@ from egvs.sensors.scene import Scene
 from egvs.stages.inputs import build_scene
 from egvs.stages.site_scoring import SiteScoring
 from egvs.studies.measurement import scenario_dependencies
-from egvs.studies.study_settings import SCENARIO, WITH_PREFIX, WITHOUT_PREFIX
+from egvs.studies.study_settings import WITH_PREFIX, WITHOUT_PREFIX
 from egvs.traffic.vehicle_boxes import VehicleSize
 
 MAX_TRIAL_SITES = 6

@@ -10,14 +10,15 @@ import numpy as np
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.results.studies import MEASURES, SCENARIO, SettingResult
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.statistics.ranks import rank_agreement, relative_errors
 from egvs.studies import decision, study_draws, study_settings
 from egvs.studies.decision import Draw, Reference
-from egvs.studies.recommendation import NeededTraffic, SettingResult
+from egvs.studies.recommendation import NeededTraffic
 from egvs.studies.study_runs import StudyRuns, simulation_steps
-from egvs.studies.study_settings import MEASURES, SCENARIO, SCENARIO_AS_IS, PricedSetting, Setting, SettingValues
+from egvs.studies.study_settings import SCENARIO_AS_IS, PricedSetting, Setting, SettingValues
 
 
 @dataclass(frozen=True)

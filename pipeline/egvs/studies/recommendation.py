@@ -1,4 +1,4 @@
-"""Rows of an accuracy study, and the setting that it recommends.
+"""The setting that an accuracy study recommends.
 
 The cheapest setting that approximates the scenario's scores and whose expected loss is within the tolerance is
 recommended; if no setting is within the tolerance, the one with the smallest expected loss. With a tolerance of the
@@ -10,73 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from egvs.studies.study_settings import APPROXIMATES, MEASURES, SCENARIO
-
-
-@dataclass(frozen=True)
-class SettingResult:
-    """One setting: a row of ``accuracy.parquet``, whose schema describes the columns."""
-
-    setting: str
-    kind: str
-    knob: str
-    overrides: str
-    seconds: float
-    statics_s: float
-    scan_s: float
-    traffic_s: float
-    tpog_s: float
-    score_s: float
-    measured: bool
-    frames: int
-    sampled_frames: int
-    draws: int
-    probability: float
-    probability_se: float
-    loss_points: float
-    loss_se_points: float
-    error: float
-    tau: float
-    best: str
-    best_share: float
-    front: bool = False
-    recommended: bool = False
-
-    @property
-    def label(self) -> str:
-        """Name in a sentence."""
-        return "the scenario's own setting" if self.kind == SCENARIO else self.setting
-
-    @property
-    def approximates(self) -> bool:
-        """Whether it may be recommended: it gives the scenario's scores, with more or less accuracy."""
-        return self.kind in (SCENARIO, APPROXIMATES)
-
-
-@dataclass(frozen=True)
-class Tolerance:
-    """What a setting must meet.
-
-    Attributes
-    ----------
-    loss_points
-        Largest expected loss, in percentage points of vehicles found.
-    score
-        Largest relative error of the score, which counts instead if it is given.
-    """
-
-    loss_points: float
-    score: float | None = None
-
-    def admits(self, row: SettingResult) -> bool:
-        """Whether a setting is within the tolerance."""
-        if self.score is not None:
-            return row.error <= self.score
-        return row.loss_points <= self.loss_points
-
-    def excess(self, row: SettingResult) -> float:
-        """Return the loss or error that counts."""
-        return row.loss_points if self.score is None else row.error
+from egvs.results.studies import APPROXIMATES, MEASURES, SCENARIO, SettingResult, Tolerance
 
 
 def mark_rows(rows: Sequence[SettingResult], tolerance: Tolerance) -> list[SettingResult]:

@@ -16,15 +16,13 @@ import numpy as np
 
 from egvs.core.errors import InputError
 from egvs.core.grid import FloatArray
+from egvs.results.studies import APPROXIMATES, MEASURES, SCENARIO
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.scoring.target_scores import TARGET_SCORES
 from egvs.studies.decision import MIN_UNITS, Draw
 from egvs.studies.study_settings import (
-    APPROXIMATES,
-    MEASURES,
     PERIOD_KNOB,
-    SCENARIO,
     STEP_KNOB,
     SUBLANES_KNOB,
     PricedSetting,

@@ -15,6 +15,7 @@ from typing import Any
 
 from egvs.core.errors import EgvsError, InputError, RunError
 from egvs.effects import registry
+from egvs.results.studies import MEASURES, SCENARIO
 from egvs.scenario.model import Scenario
 from egvs.scenario.score_config import DEFAULT_SCORE
 from egvs.scoring.target_scores import TARGET_SCORES
@@ -23,7 +24,7 @@ from egvs.studies import study_settings, traffic_options
 from egvs.studies.decision import MIN_UNITS
 from egvs.studies.measurement import SettingListener, SettingRunner
 from egvs.studies.study_draws import TrafficUnits
-from egvs.studies.study_settings import MEASURES, PERIOD_KNOB, SCENARIO, SCENARIO_AS_IS, Setting, SettingValues
+from egvs.studies.study_settings import PERIOD_KNOB, SCENARIO_AS_IS, Setting, SettingValues
 from egvs.studies.traffic_scores import RunScores, score_run
 
 BEYOND_BUDGET = "beyond the budget"

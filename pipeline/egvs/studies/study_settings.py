@@ -33,13 +33,12 @@ from egvs.core.grid import Grid
 from egvs.effects import registry
 from egvs.effects.base import Echo
 from egvs.effects.registry import AUTO_ENABLED
+from egvs.results.studies import APPROXIMATES, MEASURES, SCENARIO
 from egvs.scenario.model import Scenario
 from egvs.sensors import sites
 from egvs.sensors.sensor import Sensor, scenario_sensor
 from egvs.stages.inputs import build_scene
 from egvs.traffic.finished_fcd import recorded_frames
-
-APPROXIMATES, MEASURES, SCENARIO = "approximates", "measures", "scenario"
 
 PERIOD_KNOB, STEP_KNOB, SUBLANES_KNOB, ROUTING_KNOB = "period", "step", "sublanes", "routing"
 """What is changed: the frame period, SUMO's step, sublanes, and routing."""

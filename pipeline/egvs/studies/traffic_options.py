@@ -8,16 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from egvs.results.studies import APPROXIMATES, MEASURES
 from egvs.scenario.model import Scenario
 from egvs.scenario.traffic_config import TrafficConfig
-from egvs.studies.study_settings import (
-    APPROXIMATES,
-    MEASURES,
-    ROUTING_KNOB,
-    SUBLANES_KNOB,
-    Setting,
-    SettingValues,
-)
+from egvs.studies.study_settings import ROUTING_KNOB, SUBLANES_KNOB, Setting, SettingValues
 
 _SUBLANES_KEY, _ROUTING_KEY, _STEP_KEY = "lateral_resolution_m", "reroute_at_departure", "step_s"
 

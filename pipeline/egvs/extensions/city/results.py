@@ -27,9 +27,8 @@ from egvs.artefacts.run_record import RunRecord
 from egvs.core import files
 from egvs.core.errors import InputError
 from egvs.extensions.city.model import City, CityJunction
-from egvs.placement.branch_and_bound import BOUND_ROUNDING
 from egvs.results.labels import SCORE_LABELS
-from egvs.results.plans import PlannedSensor, plan_columns
+from egvs.results.plans import PlannedSensor, plan_columns, proved_share
 from egvs.results.ranking import RankedSite
 from egvs.scoring.scorer import ranks
 
@@ -45,7 +44,6 @@ _PLAN_SCHEMA, _CURVE_SCHEMA = "city_plan", "city_curve"
 _INPUT_STAGES = ("statics", "scan", "traffic", "tpog")
 """The stages that a plan is made from."""
 
-_ROUNDING_FACTOR = 1.0 + 2.0 * BOUND_ROUNDING
 """Bounds are larger than the optimum by their rounding."""
 
 _VEHICLE_LABELS = {"expected_detections": "vehicles found", "seen_well": "vehicles seen well"}
@@ -201,9 +199,7 @@ class CityPlan:
     @property
     def certificate(self) -> float:
         """Proved share of the best possible sum; 1 up to the rounding of bounds."""
-        if self.bound <= self.joint * _ROUNDING_FACTOR:
-            return 1.0
-        return self.joint / self.bound
+        return proved_share(self.joint, self.bound)
 
     @property
     def cost(self) -> float:

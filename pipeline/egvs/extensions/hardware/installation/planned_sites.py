@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-from egvs.artefacts.readers import read_placement
 from egvs.artefacts.run_folder import RunFolder
 from egvs.core.errors import InputError, unknown_site
 from egvs.explore.session import Session
 from egvs.export.finished_run import FinishedRun
+from egvs.results.plans import SensorPlan
 from egvs.sensors import site_feasibility
 from egvs.sensors.sensor import Sensor
 from egvs.sensors.sites import Pose, Site
@@ -48,16 +48,13 @@ class PlannedSites:
             If the plan is for other traffic, sites or settings than the run.
         """
         folder = self.run.work.folder
-        placement = read_placement(folder.placement, folder.curve)
-        if placement is None:
+        plan = SensorPlan.read(folder)
+        if plan is None:
             return {}
-        rows, _, metadata = placement
-        stages = self.run.record.stages
-        for name, key in metadata["stages"].items():
-            if name not in stages or stages[name].inputs != key:
-                problem = "the plan is for other traffic, sites or settings than the run"
-                raise InputError(folder.placement, problem, "Run egvs place again, or remove the file.")
-        return {row["site"]: Pose(**{field.name: row[field.name] for field in fields(Pose)}) for row in rows}
+        if not plan.belongs_to(self.run.record.stages):
+            problem = "the plan is for other traffic, sites or settings than the run"
+            raise InputError(folder.placement, problem, "Run egvs place again, or remove the file.")
+        return {sensor.site: sensor.mount.pose for sensor in plan.sensors}
 
     def site(self, name: str) -> Site:
         """Return a candidate by its name, at its pose in the plan if it is part of the plan.

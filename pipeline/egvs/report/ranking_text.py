@@ -1,0 +1,178 @@
+"""Sentences about a ranking, for the report and the terminal: the best site, its lead, and what makes it clearer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from egvs.artefacts.run_record import StageRecord
+from egvs.core.wording import by_number, format_percent, list_first
+from egvs.results.labels import ScoreLabel, format_probability, join_names
+from egvs.results.ranking import CLOSE_SHARE, RankedSite, Ranking
+from egvs.scenario.model import Scenario
+
+MIN_RELEVANT_LEAD = 0.001
+"""Poles whose scores differ by less are equally good; of shares as it is, of others relative to the best score."""
+
+_MIN_LEAD = 0.0005
+"""Shares that differ by less than this look the same with one decimal."""
+
+
+def headline(ranking: Ranking, has_traffic: bool) -> str:
+    """Return the result in one sentence."""
+    best, count = ranking.best, len(ranking.sites)
+    top = best[0]
+    if not has_traffic:
+        return "No traffic in the region: the sites cannot be ranked"
+    if not top.score > 0:
+        return "No site sees any of the traffic" if count > 1 else f"{top.site} sees none of the traffic"
+
+    by_egvs = top.rank_by == "egvs"
+    result = top.by.sentence(top.score)
+    if by_egvs:
+        result = f"sees {format_percent(top.entropy_seen)} of the traffic’s uncertainty"
+    if count == 1:
+        return f"{top.site}, the only site, {result}"
+    if ranking.is_tie:
+        text = f"All {count} sites score the same"
+        if by_egvs and len({site.entropy_seen for site in best}) > 1:
+            return text
+        return f"{text}: each {result}"
+    if len(best) > 4:
+        return f"{top.site} and {len(best) - 1} others share first place among {count} sites: {top.site} {result}"
+    if len(best) > 1:
+        names = join_names([site.site for site in best])
+        return f"{names} share first place among {count} sites: {top.site} {result}"
+    text = f"{top.site} is the best of {count} sites"
+    return text if by_egvs else f"{text}: it {result}"
+
+
+def more_frames_hint(scenario: Scenario, by: ScoreLabel, recorded: int) -> str:
+    """Return a sentence on the setting that reduces the standard errors of a score.
+
+    It is ``score.sampled_frames`` for a score over vehicles of less than half of the recorded frames, otherwise longer
+    traffic. Four times as many frames halve the errors, if they are independent.
+
+    Parameters
+    ----------
+    scenario
+        The scenario of the run.
+    by
+        The score that ranks.
+    recorded
+        Number of recorded frames.
+    """
+    sampled = scenario.score.sampled_frames
+    if by.counts_vehicles and 2 * sampled < recorded:
+        return f"More frames may separate them: --set score.sampled_frames={min(4 * sampled, recorded)}."
+    if scenario.is_recorded:
+        return "A longer recording may separate them."
+    if scenario.traffic.periods:
+        return "More traffic may separate them: longer periods, or more traffic.frames."
+    return f"More traffic may separate them: --set traffic.frames={4 * recorded}."
+
+
+def recorded_frames_hint(scenario: Scenario, ranking: Ranking, stages: Mapping[str, StageRecord]) -> str:
+    """Return :func:`more_frames_hint` for a run with these records of its stages; empty without the traffic's.
+
+    Where differences between detectors are most of the error of the lead over the best site on another pole, more
+    frames do not help; then it names the option that compares the detectors.
+    """
+    rival = _best_on_another_pole(ranking)
+    if rival is not None and rival.is_lag_by_detectors:
+        options = " and ".join(f"--detector {name}" for name in scenario.score.ranking_detectors)
+        return f"The detectors disagree about this difference, and more traffic does not change that: see {options}."
+    if "traffic" not in stages:
+        return ""
+    return more_frames_hint(scenario, ranking.by, stages["traffic"].summary["frames"])
+
+
+def lead(ranking: Ranking, hint: str = "") -> str:
+    """Return sentences about the lead of the best site and the sites close to it; empty if none leads.
+
+    Parameters
+    ----------
+    ranking
+        The sites.
+    hint
+        Sentence on what helps where poles cannot be told apart; left out for mounts of one pole, and where the poles
+        differ by less than :data:`MIN_RELEVANT_LEAD`.
+    """
+    if ranking.is_tie or not ranking.best[0].score > 0:
+        return ""
+    second = ranking.sites[len(ranking.best)]
+    subject = by_number(len(ranking.best), "It leads", "They lead")
+    text = f"{subject} the next site, {second.site}, by {_format_gap(ranking, second)}"
+    text += f"{_format_probability(ranking, second, 'better')}."
+    rival = _best_on_another_pole(ranking)
+    # ``beats_next`` of the last of the best refers to the second
+    is_separable = ranking.best[-1].is_separable and second.is_below_best
+    if not is_separable:
+        text += f" These {'poles' if second is rival else 'sites'} cannot be told apart."
+    if rival is not None and rival is not second:
+        text += f" The best site on another pole, {rival.site}, is behind by {_format_gap(ranking, rival)}"
+        text += f"{_format_probability(ranking, rival, 'worse')}."
+        is_separable = rival.is_below_best
+        if not is_separable:
+            text += " These poles cannot be told apart."
+    if hint and rival is not None and not is_separable and _relative_gap(ranking, rival) >= MIN_RELEVANT_LEAD:
+        text += f" {hint}"
+    if len(ranking.close) > 1:
+        names = list_first([site.site for site in ranking.close], 4)
+        text += f" {len(ranking.close)} other sites score within {format_percent(CLOSE_SHARE, 0)} of the best: {names}."
+    return text
+
+
+def _best_on_another_pole(ranking: Ranking) -> RankedSite | None:
+    """Return the best site that is on no pole of a best one; None without such a site."""
+    best_poles = {site.pole for site in ranking.best}
+    return next((site for site in ranking.sites if site.pole not in best_poles), None)
+
+
+def _format_probability(ranking: Ranking, site: RankedSite, comparison: str) -> str:
+    """Return how probable the lead of the best site is, in brackets; empty if that is unknown."""
+    if site.best_beats is None:
+        return ""
+    owner = "it is" if len(ranking.best) == 1 or comparison == "worse" else "they are"
+    return f" ({owner} truly {comparison} with a probability of {format_probability(site.best_beats)})"
+
+
+def _relative_gap(ranking: Ranking, site: RankedSite) -> float:
+    """Return how far a site is behind the best one: in share, or relative to the best score for scores in units."""
+    best_score = ranking.best[0].score
+    gap = best_score - site.score
+    return gap if ranking.by.is_share else gap / best_score
+
+
+def _format_gap(ranking: Ranking, second: RankedSite) -> str:
+    """Return the lead of the best site: in percentage points for shares, relative to its score otherwise."""
+    best_score = ranking.best[0].score
+    is_share = ranking.by.is_share
+    gap, error = _relative_gap(ranking, second), second.behind_best_se
+    gap_text = f"{100.0 * gap:.1f}" if gap >= _MIN_LEAD else "less than 0.1"
+    if error is not None:
+        if not is_share:
+            error /= best_score
+        decimals = 1 if error >= _MIN_LEAD else 2
+        gap_text = f"{100.0 * gap:.{decimals}f} ± {100.0 * error:.{decimals}f}"
+    if is_share:
+        return f"{gap_text} percentage points"
+    owner = by_number(len(ranking.best), "its", "their")
+    return f"{gap_text} % of {owner} score"
+
+
+def entropy_seen_note(ranking: Ranking) -> str:
+    """Return a sentence on the site that sees most entropy; empty if a score other than the EGVS ranks."""
+    top = max(ranking.best, key=lambda site: site.entropy_seen)
+    most = max(ranking.sites, key=lambda site: site.entropy_seen)
+    if ranking.is_tie or top.rank_by != "egvs" or not top.egvs > 0:
+        return ""
+    if most.entropy_seen - top.entropy_seen < _MIN_LEAD:
+        subject = "It" if len(ranking.best) == 1 else top.site
+        return (
+            f"{subject} also sees the largest share of the traffic’s uncertainty, {format_percent(top.entropy_seen)}."
+        )
+    return (
+        f"{most.site}, rank {most.rank}, sees more of the traffic’s uncertainty "
+        f"({format_percent(most.entropy_seen)} against {format_percent(top.entropy_seen)}), but with fewer beams. "
+        "One beam is enough for a voxel to count as seen, but not to detect a vehicle."
+    )
