@@ -145,5 +145,5 @@ USES = {
 
 @pytest.mark.slow
 @pytest.mark.system
-def test_each_public_name_works_as_first_import_and_has_docstring(run_folder: Path) -> None:
+def test_each_public_name_works_as_first_import_and_has_docstring(run_folder: Path) -> None:  # noqa: F811
     public_names.check(egvs, {name: USES[name] for name in set(egvs.__all__) - {"__version__"}}, run_folder)
